@@ -1,16 +1,17 @@
 // SPDX-License-Identifier: GPL-3.0-or-later
 //
-// A Flamenco 3 job type: bakes, comparisons or shadings by LTSH, in as many tasks as there are shards, and a last task
+// A Flamenco 3 job type: bakes, comparisons or pictures by LTSH, in as many tasks as there are shards, and a last task
 // that merges them. README.md in this folder says how to install and submit it.
 
 const JOB_TYPE = {
     label: "LTSH Bake",
-    description: "Bake, compare or shade with LTSH: a task for each shard, then one that merges",
+    description: "Bake, compare, shade, render or view with LTSH: a task for each shard, then one that merges",
     settings: [
         {
-            key: "command", label: "What", type: "string", choices: ["bake", "compare", "shade"], default: "bake",
-            required: true,
-            description: "bake: textures of objects; compare: pictures beside Cycles; shade: pictures alone",
+            key: "command", label: "What", type: "string", choices: ["bake", "compare", "shade", "render", "view"],
+            default: "bake", required: true,
+            description: "bake: textures of objects; compare: pictures beside Cycles; shade: pictures alone; "
+                + "render: finished pictures, with the rest by Cycles; view: quick ones, as the viewport draws them",
         },
         {
             key: "output", label: "Output Folder", type: "string", subtype: "dir_path", required: true,
@@ -31,11 +32,12 @@ const JOB_TYPE = {
         },
         {
             key: "techniques", label: "Techniques", type: "string", default: "ltsh4",
-            description: "Some of ltc, ltsh2, ltsh4, ltsh4c, reference, separated by commas",
+            description: "Some of ltc, ltsh2, ltsh4, ltsh4c, reference, separated by commas; render takes one, and "
+                + "render and view no reference",
         },
         {
             key: "passes", label: "Passes", type: "string", default: "specular,diffuse",
-            description: "Some of specular, diffuse and, of a bake, diffuse_light, combined",
+            description: "Bake, compare, shade: some of specular, diffuse and, of a bake, diffuse_light, combined",
         },
         {
             key: "objects", label: "Objects", type: "string", default: "",
@@ -54,12 +56,12 @@ const JOB_TYPE = {
             description: "Bake: also a copy of the .blend whose materials show the textures",
         },
         {
-            key: "cycles_samples", label: "Cycles Samples", type: "int32", default: 512, propargs: { min: 2 },
-            description: "Of both halves of the Cycles reference together, where there is one",
+            key: "cycles_samples", label: "Cycles Samples", type: "int32", default: 0, propargs: { min: 0 },
+            description: "Compare, bake beside Cycles, render; 0: 512, of a bake 256, of render as in the file",
         },
         {
             key: "arguments", label: "Further Arguments", type: "string", default: "",
-            description: "Other options of the command, separated by spaces, such as --aa 16 --camera Left",
+            description: "Other options of the command, separated by spaces, such as --shadow-rays 64 --camera Left",
         },
         {
             key: "blendfile", label: "Scene", type: "string", required: true, visible: "web",
@@ -124,6 +126,9 @@ function checkSettings(settings) {
     if (!(settings.shards >= 1)) {
         throw new Error("shards is " + settings.shards + ", expected 1 or more");
     }
+    if (settings.cycles_samples !== 0 && !(settings.cycles_samples >= 2)) {
+        throw new Error("cycles_samples is " + settings.cycles_samples + ", expected 0, or 2 or more");
+    }
 }
 
 // `blender --command ltsh ...`: it ends with a code other than 0 where something failed, which fails the task.
@@ -138,10 +143,12 @@ function ltshTask(name, settings, args) {
 
 function sharedArguments(settings) {
     const baking = settings.command === "bake";
+    const withPasses = !["render", "view"].includes(settings.command);
+    const withCycles = ["compare", "render"].includes(settings.command) || (baking && settings.error);
     const args = [settings.command, settings.blendfile, "-o", settings.output];
     for (const key of ["techniques", "passes", "frames"]) {
         // With = also a first frame below 0 is a value, not an option.
-        if (settings[key]) {
+        if (settings[key] && (key !== "passes" || withPasses)) {
             args.push("--" + key + "=" + settings[key]);
         }
     }
@@ -156,7 +163,7 @@ function sharedArguments(settings) {
             }
         }
     }
-    if (settings.command === "compare" || (baking && settings.error)) {
+    if (withCycles && settings.cycles_samples) {
         args.push("--cycles-samples", String(settings.cycles_samples));
     }
     return args.concat(settings.arguments.split(/\s+/).filter((word) => word !== ""));

@@ -3,14 +3,15 @@
 #
 #   slurm_submit.sh 4 bake room.blend -o /shared/out/room --size 2048
 #   slurm_submit.sh 12 compare room.blend -o /shared/out/room --frames 1-240
+#   slurm_submit.sh 24 render room.blend -o /shared/out/final --frames 1-240
 #   slurm_submit.sh 12 run night.toml
 #
 # SBATCH_OPTIONS goes to both, such as "--partition=night --cpus-per-task=8". Prints the numbers of both Slurm jobs.
 set -euo pipefail
 
 usage() {
-    echo "slurm_submit.sh: $1; usage: slurm_submit.sh SHARDS bake|compare|shade SCENE.blend -o OUT [OPTION ...]," \
-        "or: slurm_submit.sh SHARDS run JOB.toml" >&2
+    echo "slurm_submit.sh: $1; usage: slurm_submit.sh SHARDS bake|compare|shade|render|view SCENE.blend -o OUT" \
+        "[OPTION ...], or: slurm_submit.sh SHARDS run JOB.toml" >&2
     exit 2
 }
 
@@ -18,7 +19,7 @@ shards=${1:-}
 [[ $shards =~ ^[1-9][0-9]*$ ]] || usage "SHARDS is '$shards', expected a whole number above 0"
 shift
 case ${1:-} in
-    bake | compare | shade)
+    bake | compare | shade | render | view)
         merged=
         for ((i = 1; i <= $#; i++)); do
             case ${!i} in
@@ -35,7 +36,7 @@ case ${1:-} in
         [ -f "$merged" ] || usage "JOB.toml is '$merged', expected a file"
         logs=$(dirname "$merged")
         ;;
-    *) usage "the command is '${1:-}', expected bake, compare, shade or run" ;;
+    *) usage "the command is '${1:-}', expected bake, compare, shade, render, view or run" ;;
 esac
 
 here=$(cd "$(dirname "${BASH_SOURCE[0]}")" && pwd)

@@ -1,16 +1,16 @@
 """`python -m ltsh_addon ...`: the command line, with pip's bpy."""
 
-# Not signal: while that is imported, Ctrl-C would be a traceback.
+# Not `signal`: Ctrl-C while that is imported would print a traceback.
 import _signal as signal
 import os
 import sys
 
-# What a signal says until the command line takes over, and after it; there is nothing to clear up then.
+# Messages of signals before and after the command line handles them itself; there is nothing to clean up then.
 WORDS = {signal.SIGINT: b"ltsh: interrupted\n", signal.SIGTERM: b"ltsh: terminated\n"}
 
 
 def _end(number, frame):
-    """An exception would be a traceback of the import that it hit."""
+    """End the process at once: an exception would print the traceback of an import."""
     os.write(2, WORDS[number])
     os._exit(128 + number)
 

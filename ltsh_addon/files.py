@@ -1,9 +1,9 @@
-"""How files are written: under a temporary name, which becomes the name of the file once it is whole.
+"""Writing files atomically: under a temporary name, which becomes the name of the file once it is whole.
 
-A temporary name holds the mark of this machine and eight random digits, `.room.exr.<mark>-1f2e3d4c.tmp`. The process
-that writes the file holds its lock. A free lock means that this process is dead: the next one that writes the same file
-then deletes the leftover. Names with the mark of another machine are left alone, since locks need not reach from one
-machine to another. Temporary folders are treated in the same way.
+A temporary name has the mark of this machine and eight random digits, `.room.exr.<mark>-1f2e3d4c.tmp`. The process
+that writes the file holds its lock. A free lock means that this process is dead; the next process that writes the same
+file then deletes the leftover. Names with the mark of another machine are left alone, since locks may not work across
+machines. Temporary folders are treated in the same way.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ RUN_PREFIX = "ltsh-run-"  # of temporary folders
 
 
 class NotWritten(OSError):
-    """A file could not be written; the text names the file and says why."""
+    """A file could not be written; the message names the file and says why."""
 
 
 @contextmanager
 def replacing(path: str | os.PathLike) -> Iterator[Path]:
     """Yield an empty temporary file in the folder of `path` that takes the name `path` when the block succeeds.
 
-    When the block raises, the temporary file is deleted and whatever stood at `path` is untouched. A symbolic link at
-    `path` is followed. Raises OSError with one line of text.
+    If the block raises, the temporary file is deleted and a file at `path` stays unchanged. A symbolic link at `path`
+    is followed. Raises OSError with one line of text.
     """
     target = Path(os.path.realpath(path))
     temporary, lock = None, None
@@ -72,9 +72,9 @@ def replacing(path: str | os.PathLike) -> Iterator[Path]:
 
 @contextmanager
 def replacing_by_copy(path: str | os.PathLike) -> Iterator[Path]:
-    """As `replacing`, for programs that rename a file of their own to the name that they are given, as Blender does.
+    """As `replacing`, for programs like Blender that write a file of their own and rename it to the given name.
 
-    The yielded file does not exist yet. Nobody holds a lock on what the program puts there, so it is copied.
+    The yielded path does not exist yet. The program's file has no lock, so it is copied into the locked one.
     """
     with replacing(path) as temporary:
         made = temporary.with_name(f"{temporary.name}.saved")
@@ -108,7 +108,7 @@ def load_samples(path: str | os.PathLike) -> SurfaceSamples:
 
 
 def check_takes_files(folder: str | os.PathLike) -> None:
-    """Make the folder where it is missing, then make and delete an empty file in it. Raises OSError."""
+    """Create the folder if needed, then create and delete an empty file in it. Raises OSError."""
     check_name(folder)
     Path(folder).mkdir(parents=True, exist_ok=True)
     path, lock = _locked_file(Path(folder), ".ltsh-write-test.")
@@ -118,7 +118,7 @@ def check_takes_files(folder: str | os.PathLike) -> None:
 
 @contextmanager
 def no_empty_folder(folder: str | os.PathLike) -> Iterator[None]:
-    """Meanwhile `folder` may be made; where the block raises and has left it empty, it is deleted again."""
+    """Context in which `folder` may be created; if the block raises, the new folder is deleted if it is empty."""
     path = Path(folder).absolute()
     missing = [part for part in (path, *path.parents) if not os.path.exists(part)]
     try:
@@ -132,9 +132,9 @@ def no_empty_folder(folder: str | os.PathLike) -> Iterator[None]:
 
 @contextmanager
 def temporary_folder() -> Iterator[Path]:
-    """A temporary folder that only this user may open, deleted at the end.
+    """Context with a temporary folder that only this user may open; it is deleted at the end.
 
-    Raises OSError; where the disk is full, its text names the folder and the remedy.
+    Raises OSError. If the disk is full, its message names the folder and a remedy.
     """
     parent = tempfile.gettempdir()
     try:
@@ -146,17 +146,17 @@ def temporary_folder() -> Iterator[Path]:
     try:
         yield path
     except OSError as error:
-        # Errors of other files have their names in the text, and no number.
+        # Errors about other files come from `replacing`: they have no errno.
         if disk_is_full(error) and str(error.filename or path).startswith(str(path)):
             raise OSError(no_room(path, error)) from error
         raise
     finally:
-        _closed(lock)  # before: deleting may need its descriptor
+        _closed(lock)  # first, since deleting may need its descriptor
         shutil.rmtree(path, ignore_errors=True)
 
 
 def disk_is_full(error: OSError) -> bool:
-    """True where the disk is full, a quota is used up, or a file is as large as files may be."""
+    """True if the disk is full, a quota is used up, or a file has the largest size that is allowed."""
     return error.errno in (errno.ENOSPC, errno.EFBIG, getattr(errno, "EDQUOT", None))
 
 
@@ -167,7 +167,7 @@ def no_room(folder: Path, error: OSError) -> str:
 
 
 def check_room_after(path: Path) -> None:
-    """Raise OSError where the file `path` cannot grow: its writer may have said nothing of the same error."""
+    """Raise OSError if the file `path` cannot grow, because its writer may have hidden the same error."""
     with path.open("ab", buffering=0) as file:
         end, more = file.tell(), bytes(1 << 16)
         try:
@@ -178,7 +178,7 @@ def check_room_after(path: Path) -> None:
 
 
 def save_array(path: Path, values: np.ndarray) -> None:
-    """Write `values` as .npy. The OSError for a full disk has its number, unlike that of `np.save`."""
+    """Write `values` as .npy. Unlike that of `np.save`, the OSError for a full disk has its errno."""
     values = np.ascontiguousarray(values)
     with path.open("wb") as file:
         np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(values))
@@ -186,7 +186,7 @@ def save_array(path: Path, values: np.ndarray) -> None:
 
 
 def _machine() -> str:
-    """Eight hexadecimal digits for this machine: its name, and where Linux has it the number of the installation."""
+    """Eight hexadecimal digits for this machine, from its name and, on Linux, the ID of the installation."""
     number = ""
     with suppress(OSError):
         number = Path("/etc/machine-id").read_text(encoding="ascii")
@@ -209,7 +209,8 @@ def _locked_file(folder: Path, prefix: str) -> tuple[Path, int]:
 
 
 def _locked_folder(folder: Path) -> tuple[Path, int | None]:
-    """The same for a folder; Windows has no locks for folders, and their leftovers stay there."""
+    """A new folder and the descriptor that holds its lock. Deletes leftovers first, except on Windows, which cannot
+    lock folders. Raises OSError."""
     if fcntl is None:
         return Path(tempfile.mkdtemp(prefix=RUN_PREFIX, dir=folder)), None
     flags = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW
@@ -230,7 +231,7 @@ def _locked_folder(folder: Path) -> tuple[Path, int | None]:
 
 
 def _is_held(path: Path, lock: int) -> bool:
-    """Take the lock of the new file `path`; False where another process took it for a leftover before that."""
+    """Take the lock of the new file `path`; False if another process has taken the file for a leftover before."""
     try:
         _take(lock)
     except BlockingIOError:
@@ -258,7 +259,7 @@ def _delete_leftovers(folder: Path, prefix: str, suffix: str, flags: int) -> Non
                 found.setdefault(Path(folder, match[1]), []).append(Path(entry.path))
     for path, names in found.items():
         lock = None
-        # What is in use, belongs to another user or lies on a file system without locks stays.
+        # Files stay that are in use, belong to another user, or are on a file system without locks.
         with suppress(OSError):
             with suppress(FileNotFoundError):  # only what a program added is left
                 lock = os.open(path, flags) if fcntl is not None else None

@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM as exceptions, so that a command clears up and ends within seconds, whatever it is doing."""
+"""Ctrl-C and SIGTERM as exceptions, so that any command cleans up and ends within seconds."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-# What cannot be interrupted and takes longer than this is left where it is.
+# PATIENCE_SECONDS: after a signal the process is ended if it has not cleaned up by then.
 PATIENCE_SECONDS = 3.0
 _WORDS = {"SIGINT": "interrupted", "SIGTERM": "terminated", "SIGHUP": "the terminal is gone"}
 _NUMBERS = {getattr(signal, name): text for name, text in _WORDS.items() if hasattr(signal, name)}
 
 
 class Interrupted(KeyboardInterrupt):
-    """A signal arrived; `code` is the exit code that shells know for it."""
+    """A signal has arrived; `code` is its conventional exit code, 128 + its number."""
 
     def __init__(self, number: int):
         super().__init__(_NUMBERS[number])
@@ -30,17 +30,16 @@ def exit_code(error: KeyboardInterrupt) -> int:
 
 
 def message(error: KeyboardInterrupt) -> str:
-    """What happened, in a word."""
+    """What happened, in a few words: "interrupted", "terminated"."""
     return str(error) or _NUMBERS[signal.SIGINT]
 
 
 @contextmanager
 def raised(program: str) -> Iterator[None]:
-    """Meanwhile the first signal raises Interrupted in the main thread; the next ones do not disturb the clearing up.
+    """Context in which the first signal raises Interrupted in the main thread; further signals are ignored.
 
-    Where that takes too long, a line of `program` goes to stderr and the process ends as it is: child processes then
-    end by themselves. Signals that are ignored stay so. In another thread than the main one, or within another
-    `raised`, nothing is done.
+    If cleaning up takes too long, `program` says so on stderr and the process ends at once; child processes then end by
+    themselves. Ignored signals stay ignored. Outside of the main thread, or within another `raised`, it does nothing.
     """
     handlers = {number: signal.getsignal(number) for number in _NUMBERS}
     ours = any(getattr(handler, "raises", False) for handler in handlers.values())
@@ -63,13 +62,16 @@ def raised(program: str) -> Iterator[None]:
             yield
         finally:
             for number, handler in handlers.items():
-                # None: Blender's own handler, which cannot be put back from here; the command is its last deed.
+                # None is Blender's own handler, which Python cannot restore; Blender quits after the command anyway.
                 signal.signal(number, signal.SIG_DFL if handler is None else handler)
 
 
 @contextmanager
 def _watched(program):
-    """Meanwhile a thread ends this process some time after a signal: the main thread may be far from Python code."""
+    """Context with a thread that ends this process PATIENCE_SECONDS after a signal.
+
+    It is needed because the main thread may be in C code, where no exception is raised.
+    """
     reading, writing = socket.socketpair()
     writing.setblocking(False)
     finished = threading.Event()

@@ -1,4 +1,4 @@
-"""What the second process of Blender's panels runs: `panel_job.py job.json`, with pip's bpy or inside Blender."""
+"""Entry point of the process that a panel starts: `panel_job.py job.json`, with pip's bpy or inside Blender."""
 
 from __future__ import annotations
 
@@ -14,8 +14,10 @@ PACKAGE_FOLDER = Path(__file__).resolve().parent
 
 
 def perform(job: dict) -> None:
-    """Run the command lines of job["runs"], each {"arguments", "output", "partial"}, until one fails; job["temporary"]
-    is the folder of the job."""
+    """Run the command lines of job["runs"] until one fails; each is {"arguments", "output", "partial"}.
+
+    job["temporary"] is the temporary folder of the job.
+    """
     from .blender.process.blender_process import listen_to_parent, tell
     from .cli.progress import MessageProgress
     from .pipeline import display_layers
@@ -44,7 +46,7 @@ def perform(job: dict) -> None:
 
 
 def _command(arguments: list[str], progress) -> tuple[dict | None, str]:
-    """The report of a command line, None where it failed, and the last thing that it said."""
+    """The report of a command line, None if it failed; and the last line of its messages."""
     from . import cli
 
     progress.notes.clear()
@@ -57,14 +59,14 @@ def _command(arguments: list[str], progress) -> tuple[dict | None, str]:
         document = json.loads(out.getvalue())
     except ValueError:
         document = {"errors": lines}
-    # A bake that left objects out ends with code 1 and has a report all the same.
+    # A bake that leaves objects out ends with code 1, but has a report.
     return (None, complaint.removeprefix("ltsh: ")) if "errors" in document else (document, complaint)
 
 
 def main() -> None:
-    """Perform the job; what there is to say goes to stdout (see `blender_process`)."""
+    """Perform the job; messages go to stdout (see `blender_process`)."""
     job = json.loads(Path(sys.argv[-1]).read_text(encoding="utf-8"))
-    # Running a script puts its own folder first, where `scene` and others would be found as top-level modules.
+    # Python puts the folder of a script first, where it would find `scene` and others as top-level modules.
     inherited = [entry for entry in sys.path if entry != str(PACKAGE_FOLDER)]
     sys.path[:] = [str(PACKAGE_FOLDER.parent), *inherited, *job["path"]]
     importlib.import_module(f"{PACKAGE_FOLDER.name}.panel_job").perform(job)
@@ -74,5 +76,5 @@ if __name__ == "__main__":
     main()
     sys.stdout.flush()
     sys.stderr.flush()
-    # As in worker.py: nothing is left to save, and bpy 4.5 can hang at the end.
+    # As in worker.py: there is nothing left to save, and bpy 4.5 can hang at exit.
     os._exit(0)

@@ -1,7 +1,7 @@
-"""How files are read that others may have written: jobs, records, reports, tables. Their limits stand here.
+"""Reading files that others may have written (jobs, records, reports, tables), and the limits of their sizes.
 
-Each reader refuses in one line, within about a second, what is no such file, whatever it claims to hold. OSError means
-that there is nothing to read, Malformed that it is not what was expected; who asked for the file names it.
+Each reader refuses malformed files within about a second, with an error of one line, whatever they claim to hold.
+OSError means that the file cannot be read, Malformed that its contents are wrong; the caller adds the file's name.
 """
 
 from __future__ import annotations
@@ -24,12 +24,13 @@ import numpy as np
 
 from .scene import error_line, shortened
 
-# What a file may have, in bytes. A report of 5,000 comparisons has 25 MiB, a job of 300,000 tasks 100 MiB, a job file
-# 150 bytes for each of its jobs, the largest shipped table 1.2 MiB, and 2.5 MiB unpacked.
+# Limits of files in bytes. For comparison: a report of 5,000 comparisons has 25 MiB, a job of 300,000 tasks 100 MiB, a
+# job file 150 bytes per job, the largest shipped table 1.2 MiB packed and 2.5 MiB unpacked.
 MOST_JSON, MOST_TOML, MOST_PACKED, MOST_UNPACKED = 128 << 20, 1 << 20, 8 << 20, 64 << 20
-# In a document, whose values take longer than its bytes; that job has 2.4 million.
+# MOST_COMMAS: limit of the values of a document, whose parsing takes longer than reading its bytes. A job of 300,000
+# tasks has 2.4 million.
 MOST_COMMAS = 4_000_000
-# Lists and tables within one another, also as parts of one TOML key: the parser's time grows with their square.
+# MOST_LEVELS: nested lists and tables, or parts of a TOML key, with whose square the time of the parser grows.
 MOST_LEVELS = 32
 INTEGERS = -(2**63), 2**63 - 1
 
@@ -41,16 +42,16 @@ _NAMES |= {type(None): "nothing", NUMBER: "a number", NUMBER | None: "a number o
 
 
 class Malformed(ValueError):
-    """A file is not what was expected; the text says what is wrong, without the file's name."""
+    """The contents of a file are wrong; the message says how, without the file's name."""
 
 
 def read_json(path: str | os.PathLike, shape: Any = dict) -> Any:
-    """The document of a JSON file, which has the `shape` (see `check`). Raises OSError, Malformed."""
+    """The document of a JSON file, checked for its `shape` (see `check`). Raises OSError, Malformed."""
     return parse_json(_text(path, MOST_JSON), shape)
 
 
 def parse_json(text: str, shape: Any = dict) -> Any:
-    """The document of a JSON text, which has the `shape`. Raises Malformed."""
+    """The document of a JSON text, checked for its `shape`. Raises Malformed."""
 
     def refuse(constant):
         raise ValueError(f"{constant} is no number")
@@ -89,7 +90,7 @@ def read_toml(path: str | os.PathLike) -> dict:
 def read_arrays(path: str | os.PathLike, names: Iterable[str]) -> dict[str, np.ndarray]:
     """The arrays `names` of a .npz file. Raises OSError, Malformed.
 
-    Nothing is unpacked before the sizes of all arrays are known to fit together.
+    The sizes of all arrays are checked before anything is unpacked.
     """
     content = _content(path, MOST_PACKED)
     try:
@@ -106,18 +107,18 @@ def read_arrays(path: str | os.PathLike, names: Iterable[str]) -> dict[str, np.n
         raise Malformed(f"is no .npz: {error_line(error)}") from None
 
 
-# What a document must have:
+# The shape of a document:
 
 
 def check(value: Any, shape: Any, place: str = "") -> None:
-    """Raise Malformed, naming the place, where `value` has not the `shape`, which is one of
+    """Raise Malformed, naming the place, if `value` does not have the `shape`, which is one of
 
-    - a type, or several (`int | None`), for values of it; True is no int,
-    - [shape], for a list of such,
-    - {"key": shape, "other?": shape, str: shape}, for a table with the key and perhaps the other; all else in it
-      has the last shape, or any where none is given,
-    - a tuple, for one of its values,
-    - a function check(value, place).
+    - a type or several (`int | None`): a value of this type; True is not an int,
+    - [shape]: a list of values of this shape,
+    - {"key": shape, "other?": shape, str: shape}: a table with "key" and optionally "other"; all other values have the
+      shape of `str`, or any shape without it,
+    - a tuple: one of its values,
+    - a function check(value, place), which raises Malformed itself.
     """
     if isinstance(shape, dict):
         _expect(value, dict, place)
@@ -143,7 +144,7 @@ def check(value: Any, shape: Any, place: str = "") -> None:
 
 
 def some(shape: Any) -> Callable[[Any, str], None]:
-    """The shape of a list or table that is not empty."""
+    """The shape of a non-empty list or table of this `shape`."""
 
     def check_some(value, place):
         check(value, shape, place)
@@ -154,7 +155,7 @@ def some(shape: Any) -> Callable[[Any, str], None]:
 
 
 def file_name(value: Any, place: str) -> None:
-    """The shape of the name of a file below a folder."""
+    """The shape of the name of a file below a folder, without `..`."""
     _expect(value, str, place)
     path = PurePosixPath(value)
     if not path.parts or path.is_absolute() or ".." in path.parts or "\0" in value:
@@ -171,11 +172,11 @@ def _shown(value) -> str:
     return shortened(repr(value), 60)
 
 
-# What any file may hold:
+# The limits of all files:
 
 
 def is_text(name: str | os.PathLike) -> bool:
-    """True where a name is UTF-8 on the disk: Blender, EXR files and reports take no others."""
+    """True if a name is UTF-8 on disk; Blender, EXR files and reports need that."""
     try:
         return os.fsencode(name) == os.fspath(name).encode()
     except UnicodeError:
@@ -183,7 +184,7 @@ def is_text(name: str | os.PathLike) -> bool:
 
 
 def check_name(path: str | os.PathLike) -> None:
-    """Raise OSError where the whole path of a file is no text (see `is_text`): OpenEXR would end the process."""
+    """Raise OSError if the whole path of a file is not `is_text`: OpenEXR would end the process."""
     if not is_text(os.path.realpath(path)):
         raise OSError(errno.EILSEQ, "its path has bytes that are not UTF-8; rename it")
 
@@ -210,7 +211,7 @@ def _text(path, most_bytes) -> str:
 
 
 def _check_contents(document) -> None:
-    """Whatever has more levels would end in a RecursionError somewhere; JSON and TOML have numbers of 64 bits."""
+    """Raise Malformed for integers beyond 64 bits, and for more than MOST_LEVELS levels, against RecursionErrors."""
     level = [[document]]
     for _ in range(MOST_LEVELS + 1):
         below = []
@@ -241,7 +242,7 @@ def _entry(archive, name) -> zipfile.ZipInfo:
 
 
 def _array(archive, entry) -> np.ndarray:
-    """The array of an entry whose size is what the shape says."""
+    """The array of an entry; raises Malformed if the entry's size does not match the array's shape."""
     name = entry.filename.removesuffix(".npy")
     with archive.open(entry) as file:
         version = np.lib.format.read_magic(file)

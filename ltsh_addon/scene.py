@@ -21,25 +21,25 @@ class Cancelled(Exception):
 
 
 class SceneError(Exception):
-    """The scene, its file or the Blender at hand is not fit for the task; the message is one line."""
+    """The task cannot be done with this scene, file or Blender; the message is one line."""
 
 
-# Called with a stage and the share of it that is done; returns False to stop the work.
+# progress(stage, fraction of the stage that is done); returning False stops the work.
 Progress = Callable[[str, float], "bool | None"]
 
 
 def error_line(error: BaseException) -> str:
-    """The message of an error in one line of a readable length; its class where it has none."""
+    """The message of an error in one line of readable length; the name of its class where the message is empty."""
     return shortened(" ".join(str(error).split())) or type(error).__name__
 
 
 def shortened(text: str, most: int = 1000) -> str:
-    """`text`, without its middle where it has more than so many letters."""
+    """`text`, its middle replaced by " ... " where it is longer than `most` characters."""
     return text if len(text) <= most else f"{text[: most // 2]} ... {text[len(text) - most // 2 :]}"
 
 
 def listed(texts: Iterable[str], most: int = 8, separator: str = ", ") -> str:
-    """At most so many of `texts` and how many more there are; "none" for no texts."""
+    """The first `most` of `texts` and the number of those left out: "a, b and 3 more"; "none" for no texts."""
     texts = list(texts)
     more = f" and {len(texts) - most} more" if len(texts) > most else ""
     return (separator.join(texts[:most]) or "none") + more
@@ -47,14 +47,14 @@ def listed(texts: Iterable[str], most: int = 8, separator: str = ", ") -> str:
 
 @dataclass(frozen=True)
 class Technique:
-    """How a technique is called: on buttons, on comparison sheets and as a stage of progress, and what it does."""
+    """The texts that users see of a technique."""
 
-    label: str
-    title: str
-    description: str
+    label: str  # on buttons
+    title: str  # on comparison sheets and as a stage of progress
+    description: str  # what it does
 
 
-# By the names that options, layers of files and reports have. REFERENCE is the only one without a table.
+# Techniques by the name that they have in options, layers of files and reports. All but REFERENCE have a table.
 REFERENCE = "reference"
 TECHNIQUES = {
     "ltc": Technique("LTC", "LTC", "Linearly transformed cosines, as EEVEE has them: fastest, least accurate"),
@@ -78,22 +78,22 @@ TECHNIQUES = {
     ),
 }
 SHIPPED_TABLES = tuple(name for name in TECHNIQUES if name != REFERENCE)
-CYCLES = "cycles"  # pictures of Cycles, beside those of techniques
+CYCLES = "cycles"  # the name of Cycles' pictures beside those of techniques
 PASSES = ("specular", "diffuse")
 BAKE_PASSES = (*PASSES, "diffuse_light", "combined")
 
 
-# In m. Squares of what is much farther away, or larger, do not fit into single precision.
+# FARTHEST: the largest distance or size in m. Squares of much larger numbers overflow single precision.
 FARTHEST = 1e15
-AREA_LIGHT_SHAPES = ("SQUARE", "RECTANGLE", "DISK", "ELLIPSE")  # of Blender's area lights
-FACING_SHAPES = ("BALL", "FACING_DISK")  # of Blender's points and spots
+AREA_LIGHT_SHAPES = ("SQUARE", "RECTANGLE", "DISK", "ELLIPSE")  # shapes of Blender's area lights
+FACING_SHAPES = ("BALL", "FACING_DISK")  # shapes of Blender's point and spot lights
 LIGHT_SHAPES = (*AREA_LIGHT_SHAPES, *FACING_SHAPES, "POLYGON")
 
 
 @dataclass(frozen=True)
 class SpotCone:
-    """Where a light shines that sees a point in the direction w: with v = axes w and c = v_z / |v| its radiance is
-    multiplied by x^2 (3 - 2 x), x = (c - cosine) sharpness, from 0 to 1."""
+    """The cone of a spot light. In the direction w from the light its radiance is multiplied by x^2 (3 - 2 x), where
+    x = (c - cosine) sharpness, clamped to [0, 1], c = v_z / |v| and v = axes w."""
 
     axes: np.ndarray  # (3, 3), of any length
     cosine: float
@@ -108,12 +108,15 @@ class SpotCone:
 
 @dataclass(frozen=True)
 class Pattern:
-    """By what the radiance of a place on a ball is multiplied, by its normal n: of v = axes n the angle from z selects
-    the row, from 0 to pi, and the angle around z, from x, the column. Rows and columns are equal angles."""
+    """Factors of the radiance of a light, by the normal n of the place on a ball, or by the direction n of the light.
+
+    With v = axes n, the polar angle of v from z, 0 to pi, selects the row of `values`; the azimuth of v around z,
+    counted from x, selects the column. Rows and columns are equal steps of these angles.
+    """
 
     axes: np.ndarray  # (3, 3), of any length
     values: np.ndarray  # (H, W)
-    by_ray: bool = False  # by the direction in which the light goes in the place of the normal
+    by_ray: bool = False  # n is the direction in which the light travels, not the normal
 
     def __post_init__(self):
         axes, values = np.asarray(self.axes, dtype=np.float64), np.asarray(self.values, dtype=np.float32)
@@ -127,16 +130,22 @@ class Pattern:
 class AreaLight:
     """A one-sided, uniformly emitting, flat area light, or one that looks flat from every point.
 
-    The surface is ``center + s * half_u + t * half_v`` with |s|, |t| <= 1 for SQUARE and RECTANGLE and
-    s^2 + t^2 <= 1 for DISK and ELLIPSE. That of a POLYGON is inside `corners`, in the plane of center, half_u and
-    half_v, which say how far it reaches. A `spread` below pi focuses the light as in Cycles: the radiance is multiplied
-    by max(0, (tan h - tan theta) / (tan h - h)), h = spread / 2, theta the angle from `direction` at the light.
-    At the distance t from its points it is also multiplied by t^`falloff` t^2 / (`smooth` + t^2), as by Blender's Light
+    Surface: ``center + s * half_u + t * half_v`` with |s|, |t| <= 1 for SQUARE and RECTANGLE, and s^2 + t^2 <= 1 for
+    DISK and ELLIPSE. A POLYGON is the area inside `corners`, in the plane of center, half_u and half_v; the half axes
+    tell its extent.
+
+    Spread: a `spread` below pi focuses the light as in Cycles. The radiance is multiplied by
+    max(0, (tan h - tan theta) / (tan h - h)), h = spread / 2, theta the angle from `direction` at the light.
+
+    Falloff: at the distance t the radiance is multiplied by t^`falloff` t^2 / (`smooth` + t^2), as by Blender's Light
     Falloff node: 0 is quadratic, 1 linear, 2 constant.
-    A BALL has |half_u| = |half_v| for its radius. Of a FACING_DISK with that radius every point sees the front.
-    Of both the half axes and the direction say no more; they may have a `cone` and a `pattern`, and no spread.
-    A light that `is_distant` is infinitely far away: center, half_u, half_v and corners are directions to it, of any
-    length, and every point is where it is seen from.
+
+    Facing lights: a BALL has the radius |half_u| = |half_v|. A FACING_DISK is a disk with that radius which turns its
+    front to every point. Directions of the half axes and `direction` mean nothing for these two. They may have a
+    `cone` and a `pattern`, but no spread.
+
+    Distant lights: a light that `is_distant` is infinitely far away. Its center, half_u, half_v and corners are
+    directions toward it, of any length, the same for every point.
     """
 
     name: str
@@ -152,12 +161,12 @@ class AreaLight:
     corners: np.ndarray | None = None  # (V, 3) m, a simple polygon, either way around; POLYGON only
     spread: float = np.pi  # rad, full angle of the cone into which the light shines
     receivers: tuple[int, ...] | None = None  # values of SurfaceSamples.receiver that it lights, None: all
-    detail: tuple[AreaLight, ...] = ()
+    detail: tuple[AreaLight, ...] = ()  # finer lights that together are this one
     falloff: int = 0  # power of the distance in m
     smooth: float = 0.0  # m^2
     is_distant: bool = False
     cone: SpotCone | None = None
-    pattern: Pattern | None = None  # of a disk by the direction in which it shines
+    pattern: Pattern | None = None  # for a FACING_DISK always by the direction in which the light travels
 
     def __post_init__(self):
         if self.shape not in LIGHT_SHAPES:
@@ -204,11 +213,11 @@ class AreaLight:
 
     @property
     def patches(self) -> tuple[AreaLight, ...]:
-        """The lights without a detail that together are this one; itself where it has none."""
+        """The finest lights that together are this one: the leaves of `detail`, or this light where it has none."""
         return tuple(patch for part in self.detail for patch in part.patches) if self.detail else (self,)
 
     def moved(self, offset: np.ndarray) -> AreaLight:
-        """The same light elsewhere by `offset` (3,) in m."""
+        """The same light moved by `offset` (3,) in m; distant lights stay as they are."""
         if self.is_distant or not np.any(offset):
             return self
         corners = None if self.corners is None else self.corners + offset
@@ -216,17 +225,17 @@ class AreaLight:
         return self.altered(center=self.center + offset, corners=corners, detail=detail)
 
     def altered(self, **changes) -> AreaLight:
-        """A copy with other values, which are not checked: `dataclasses.replace` takes too long for 100,000 lights."""
+        """A copy with the fields `changes`, unchecked: `dataclasses.replace` takes too long for 100,000 lights."""
         light = object.__new__(AreaLight)
         light.__dict__.update({name: self.__dict__[name] for name in _LIGHT_FIELDS}, **changes)
         return light
 
     def origins(self, position: np.ndarray) -> np.ndarray:
-        """From where the light is seen at `position` (...): there, or where directions start."""
+        """What to subtract from the light's vectors at `position` (..., 3): that position; zero for distant lights."""
         return np.zeros_like(position) if self.is_distant else position
 
     def record(self) -> dict:
-        """This light as JSON has it; AreaLight(**record) reads it back."""
+        """This light as a JSON-able dict; AreaLight(**record) restores it."""
         values = {item.name: getattr(self, item.name) for item in fields(self)}
         record = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in values.items()}
         if self.cone is not None:
@@ -238,7 +247,7 @@ class AreaLight:
 
     @property
     def radius(self) -> float:
-        """A distance from the center in m that no point of the light exceeds."""
+        """Radius in m of a sphere around the center that holds the whole light."""
         if self.is_facing:
             return float(np.linalg.norm(self.half_u))
         if self.is_round:
@@ -247,42 +256,42 @@ class AreaLight:
 
     @property
     def is_round(self) -> bool:
-        """True for what looks like an ellipse."""
+        """True for lights with the outline of an ellipse."""
         return self.shape in ("DISK", "ELLIPSE", *FACING_SHAPES)
 
     @property
     def is_facing(self) -> bool:
-        """True for lights that face every point, see `shading.facing`."""
+        """True for BALL and FACING_DISK, which face every point (see `shading.facing`)."""
         return self.shape in FACING_SHAPES
 
     @property
     def is_even(self) -> bool:
-        """False for lights that face every point and are not equally bright all over."""
+        """True where all of a facing light is equally bright: no cone, pattern or falloff."""
         return self.cone is None and self.pattern is None and not self.has_falloff
 
     @property
     def is_focused(self) -> bool:
-        """True where the spread matters: closer to pi the factor is 1 but for directions along the light's plane."""
+        """True where the spread matters. Closer to pi its factor is 1, except along the light's plane."""
         return self.spread < np.pi - 1e-5
 
     @property
     def has_falloff(self) -> bool:
-        """True where the distance matters: the light is not plainly quadratic."""
+        """True unless the falloff is plainly quadratic."""
         return self.falloff != 0 or self.smooth > 0.0
 
     @property
     def is_profiled(self) -> bool:
-        """True where it depends on the place on a flat light how bright a point sees it: by its spread or falloff."""
+        """True for flat lights with a spread or falloff: a point sees some places of them brighter than others."""
         return (self.is_focused or self.has_falloff) and not self.is_facing
 
     def receives(self, receiver: np.ndarray, index=slice(None)) -> np.ndarray | None:
-        """Mask (Q,) of the samples `index` whose `receiver` (P,) the light lights; None: it lights all."""
+        """Mask (Q,) of the samples at `index` that the light may light, by their `receiver` (P,); None: all."""
         return None if self.receivers is None else np.isin(receiver[index], self.receivers)
 
     @cached_property
     def area_vector(self) -> np.ndarray:
-        """Normal (3,), the area in m^2 long, around which `corners`, or half_u and half_v, run counterclockwise."""
-        # numpy's own cross product of two vectors takes twenty times as long, and there may be 100,000 lights.
+        """Normal (3,), as long as the area in m^2; `corners`, or half_u to half_v, run counterclockwise around it."""
+        # np.cross of two vectors takes twenty times as long, and there may be 100,000 lights.
         if self.corners is not None:
             x, y, z = (self.corners - self.corners[0]).T
             a, b, c = (np.concatenate([values[1:], values[:1]]) for values in (x, y, z))
@@ -293,7 +302,7 @@ class AreaLight:
     def polygon(self, round_vertices: int = 32) -> np.ndarray:
         """Corners (V, 3) in m, counterclockwise as seen from the lit side.
 
-        A disk or ellipse becomes a regular polygon of `round_vertices` corners, stretched to the area of the ellipse.
+        A disk or ellipse becomes an affine image of a regular polygon of `round_vertices` corners, with its own area.
         """
         corners = self.corners
         if corners is None:
@@ -310,12 +319,13 @@ class AreaLight:
 
 _LIGHT_FIELDS = tuple(item.name for item in fields(AreaLight))
 _VECTORS = ("center", "half_u", "half_v", "direction", "radiance")
-# In a row: more lights that differ in their vectors and corners alone have one record.
+# _FEW_ALIKE: up to so many consecutive lights that differ only in vectors and corners have a record each; more share
+# one record.
 _FEW_ALIKE = 16
 
 
 def light_records(lights: Iterable[AreaLight]) -> list[dict]:
-    """What JSON has of `lights`, for `lights_of`."""
+    """`lights` as JSON-able records, which `lights_of` reads."""
     found = []
     for own in (list(alike) for _, alike in itertools.groupby(lights, _kind)):
         if len(own) <= _FEW_ALIKE or own[0].detail or own[0].cone is not None or own[0].pattern is not None:
@@ -335,7 +345,7 @@ def _kind(light) -> tuple:
 
 
 def lights_of(records: Iterable[dict]) -> tuple[AreaLight, ...]:
-    """The lights of `light_records`. Raises ValueError and TypeError where they are not whole."""
+    """The lights of records of `light_records`. Raises ValueError or TypeError for malformed records."""
     found = []
     for record in records:
         if "like" not in record:
@@ -361,7 +371,7 @@ def round_outline(count: int) -> np.ndarray:
     return radius * np.stack([np.cos(angle), np.sin(angle)])
 
 
-# Fields of SurfaceSamples with one number per sample; all others are vectors or colors.
+# Fields of SurfaceSamples with one number per sample. All other fields are vectors or colors.
 SCALAR_FIELDS = (
     "roughness", "ior", "bump_alpha2", "receiver", "diffuse_roughness", "sheen_a", "sheen_b", "anisotropy",
 )  # fmt: skip
@@ -371,17 +381,21 @@ SCALAR_FIELDS = (
 class SurfaceSamples:
     """P surface points with all that shading needs. Vectors are unit, in world space; last axis is space or color.
 
-    The specular lobe is single-scatter GGX with alpha = roughness^2 and the Fresnel factor
-    ``f0 + (f90 - f0) (1 - c)^5 - dip c (1 - c)^6 + dielectric F_d(c, ior)``, c = cosine of the half angle, F_d the
-    exact unpolarized reflectance of a dielectric, with total reflection where `ior` is below 1; negative terms may
-    stand for a tint. Where the first three fall below 0 and there is no dielectric, they are 0. A
-    surface with several lobes has one sample for each. `diffuse_albedo` already includes what the specular layer takes
-    away. As in Cycles the specular lobe ends at the horizons of both the shading and the geometric normal, and a
-    bump-mapped diffuse lobe at the horizon of the smooth normal; toward that it is shadowed by
+    A surface with several lobes has one sample for each of them.
+
+    Specular lobe: single-scatter GGX with alpha = roughness^2 and the Fresnel factor
+    ``f0 + (f90 - f0) (1 - c)^5 - dip c (1 - c)^6 + dielectric F_d(c, ior)``. c is the cosine of the half angle, F_d
+    the exact unpolarized reflectance of a dielectric, with total reflection where `ior` is below 1. Negative terms may
+    stand for a tint. Without a dielectric, a sum of the first three terms below 0 counts as 0. With an `anisotropy`
+    the alpha of GGX is roughness^2 / (1 - anisotropy) along the `tangent` and roughness^2 (1 - anisotropy) across it.
+
+    Diffuse lobe: Lambert's; with a `diffuse_roughness` that of a rough surface, with a `sheen_a` that of sheen (see
+    `shading.diffuse`). `diffuse_albedo` is what the specular layer leaves.
+
+    Horizons, as in Cycles: the specular lobe ends at the horizons of both the shading and the geometric normal, a
+    bump-mapped diffuse lobe at the horizon of the smooth normal. Toward that horizon the diffuse lobe is shadowed by
     2 / (1 + sqrt(1 + bump_alpha2 tan^2 theta_i)), theta_i the angle of the light from the smooth normal (Estevez,
-    Lecocq and Stein 2019). The diffuse lobe is Lambert's, but that of a rough surface where there is a
-    `diffuse_roughness`, and that of sheen where there is a `sheen_a` (see `shading.diffuse`). With an `anisotropy` the
-    alpha of GGX is roughness^2 / (1 - anisotropy) along the `tangent` and roughness^2 (1 - anisotropy) across it.
+    Lecocq and Stein 2019).
     """
 
     position: np.ndarray  # (P, 3) m
@@ -394,17 +408,17 @@ class SurfaceSamples:
     dielectric: np.ndarray  # (P, 3) weight of the dielectric lobe; (P,) is taken for all colors
     ior: np.ndarray  # (P,) relative index of refraction of the dielectric lobe
     diffuse_albedo: np.ndarray  # (P, 3)
-    geometric_normal: np.ndarray | None = None  # (P, 3) for the horizon of the specular lobe; left out: `normal`
-    smooth_normal: np.ndarray | None = None  # (P, 3) interpolated, without bump maps; left out: `diffuse_normal`
-    bump_alpha2: np.ndarray | None = None  # (P,); left out: 0
-    specular_dip: np.ndarray | None = None  # (P, 3) of F82 metals; left out: 0
-    diffuse_roughness: np.ndarray | None = None  # (P,) sigma of Oren and Nayar in [0, 1]; left out: 0
-    diffuse_rebound: np.ndarray | None = None  # (P, 3) multiple scattering of such a surface; left out: 0
-    sheen_a: np.ndarray | None = None  # (P,) left out, or 0: no sheen; below 0 the sigma of velvet, times -1
-    sheen_b: np.ndarray | None = None  # (P,)
-    receiver: np.ndarray | None = None  # (P,) integers that `AreaLight.receivers` names; left out: 0
-    anisotropy: np.ndarray | None = None  # (P,) in (-1, 1); left out: 0
-    tangent: np.ndarray | None = None  # (P, 3); what of it runs along `normal` does not matter; left out: 0
+    geometric_normal: np.ndarray | None = None  # (P, 3) for the horizon of the specular lobe; default: `normal`
+    smooth_normal: np.ndarray | None = None  # (P, 3) interpolated, without bump maps; default: `diffuse_normal`
+    bump_alpha2: np.ndarray | None = None  # (P,); default: 0
+    specular_dip: np.ndarray | None = None  # (P, 3) of F82 metals; default: 0
+    diffuse_roughness: np.ndarray | None = None  # (P,) sigma of Oren and Nayar in [0, 1]; default: 0
+    diffuse_rebound: np.ndarray | None = None  # (P, 3) multiple scattering of such a surface; default: 0
+    sheen_a: np.ndarray | None = None  # (P,) 0: no sheen; below 0: -sigma of velvet; default: 0
+    sheen_b: np.ndarray | None = None  # (P,); default: 0
+    receiver: np.ndarray | None = None  # (P,) integers that `AreaLight.receivers` names; default: 0
+    anisotropy: np.ndarray | None = None  # (P,) in (-1, 1); default: 0
+    tangent: np.ndarray | None = None  # (P, 3); its part along `normal` does not matter; default: 0
 
     def __post_init__(self):
         count = np.shape(self.position)[0]
@@ -438,7 +452,7 @@ class SurfaceSamples:
 
     @property
     def sharpest_roughness(self) -> np.ndarray:
-        """Roughness (P,) by the smaller alpha of GGX."""
+        """Roughness (P,): the square root of the smaller of the two alphas of GGX."""
         if not self.anisotropy.any():
             return self.roughness
         across = np.maximum(1.0 - self.anisotropy, 1e-6)
@@ -459,7 +473,7 @@ class SurfaceSamples:
 
 
 def is_constant(values: np.ndarray) -> bool:
-    """True for one number, that was broadcast: what most samples have of most lobes."""
+    """True for a broadcast scalar, which most fields of samples are."""
     return values.size > 0 and not any(values.strides)
 
 
@@ -477,20 +491,20 @@ def _one_after_another(parts: list[np.ndarray]) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Film:
-    """Where samples lie in an image: `pixel` (P,) counts row by row from the top left; a pixel is the mean of
-    `sub_samples` samples, of which those that hit nothing are absent. Where a surface has several lobes, `first` (P,)
-    is true for one sample of each hit; left out: for all. Where samples stand for several, `count` (P,) says for how
-    many, below 1 where a pixel has more than others; left out: one each. Where pixels share their samples, `spread`
-    (P, D, D) are the weights of each in the pixels around its own, rows from top to bottom, and `whole` (H, W) their
-    sums, with those of samples that are absent."""
+    """Where P samples lie in an image. A pixel is the mean of `sub_samples` samples, or their weighted mean where
+    pixels share samples. Samples that hit nothing are absent and count as 0."""
 
     width: int
     height: int
-    pixel: np.ndarray  # (P,) integers
+    pixel: np.ndarray  # (P,) integers, counted row by row from the top left
     sub_samples: int = 1
-    first: np.ndarray | None = None  # (P,) bool
-    count: np.ndarray | None = None  # (P,)
+    # (P,) bool: true for one sample of each hit, as surfaces with several lobes have several samples; None: all true.
+    first: np.ndarray | None = None
+    # (P,) how many samples each one stands for, below 1 in pixels that have more than `sub_samples`; None: 1 each.
+    count: np.ndarray | None = None
+    # (P, D, D) weights of each sample in the pixels around its own, rows from top to bottom; None: its own pixel only.
     spread: np.ndarray | None = None
+    # (H, W) sums of these weights per pixel, absent samples included.
     whole: np.ndarray | None = None
 
     def take(self, index) -> Film:
@@ -500,24 +514,24 @@ class Film:
         return replace(self, pixel=self.pixel[index], **own)
 
     def with_more(self, more: Film) -> Film:
-        """The samples of this film, and those of another of the same pixels."""
+        """A film with the samples of this one and of `more`, which has the same pixels."""
         arrays = {name: (getattr(self, name), getattr(more, name)) for name in ("pixel", "first", "count", "spread")}
         joined = {name: None if one is None else np.concatenate([one, other]) for name, (one, other) in arrays.items()}
         return replace(self, whole=more.whole, **joined)
 
     def has_more(self) -> np.ndarray:
-        """The pixels (H, W) with more samples than `sub_samples`, which `with_more` has brought."""
+        """Mask (H, W) of the pixels that have more than `sub_samples` samples, by `with_more`."""
         first = self.pixel if self.first is None else self.pixel[self.first]
         count = np.bincount(first, minlength=self.width * self.height)
         return count.reshape(self.height, self.width) > self.sub_samples
 
     def unspread(self) -> Film:
-        """The same samples, each in its own pixel alone."""
+        """The same samples, each only in its own pixel."""
         return replace(self, spread=None, whole=None)
 
     @property
     def points(self) -> int:
-        """How many samples a pixel has, about."""
+        """The approximate number of samples of a pixel."""
         if self.count is None or not len(self.count):
             return self.sub_samples
         return max(1, round(self.sub_samples * len(self.count) / self.count.sum()))
@@ -548,26 +562,26 @@ class Film:
         return np.moveaxis(sums.reshape(-1, *shape), 0, -1)[inside]
 
     def shared(self, weights: np.ndarray, sub_sample: np.ndarray, seen: np.ndarray) -> Film:
-        """The film whose pixels share their samples, by weights (N, D, D) of those with the number `sub_sample` (P,);
-        rendered were the pixels `seen` (H, W)."""
+        """The film whose pixels share their samples. `weights` (N, D, D) are those of the N points of a pixel,
+        `sub_sample` (P,) is the point of each sample, `seen` (H, W) the mask of the rendered pixels."""
         whole = self.sums_around(np.flatnonzero(seen), weights.sum(axis=0))
         spread = weights.astype(np.float32)[sub_sample]
         return replace(self, spread=spread, whole=np.where(seen, whole, np.inf))
 
     def sums_around(self, pixel: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Sums (H, W) of the same weights (D, D) of each `pixel` (Q,) in the pixels around its own."""
+        """Sums (H, W) of `weights` (D, D) laid around each `pixel` (Q,)."""
         every = replace(self, pixel=pixel)
         return every._sums(np.ones((len(pixel), 1)), np.broadcast_to(weights, (len(pixel), *weights.shape)))[..., 0]
 
     def reached(self, mask: np.ndarray) -> np.ndarray:
-        """The pixels (H, W) that have samples of those of the `mask` (H, W)."""
+        """Mask (H, W) of the pixels that share samples with a pixel of `mask` (H, W)."""
         around = 0 if self.spread is None else self.spread.shape[1] // 2
         grid = np.pad(mask, around)
         steps = itertools.product(range(2 * around + 1), repeat=2)
         return np.any([grid[y : y + self.height, x : x + self.width] for y, x in steps], axis=0)
 
     def variance(self, values: np.ndarray) -> np.ndarray:
-        """Image (H, W) of the variance of `image` by those (P,) of the samples, of which each is independent."""
+        """Variance (H, W) of `image`, from the variances `values` (P,) of independent samples."""
         if self.spread is not None:
             return self._sums(np.asarray(values)[:, None], np.square(self.spread))[..., 0] / np.square(self.whole)
         return self.image(values if self.count is None else values * self.count) / self.sub_samples
@@ -579,9 +593,9 @@ class Film:
 
 @dataclass(frozen=True)
 class Border:
-    """The rectangle of the whole picture that was rendered, in pixels from its top left corner.
+    """The rectangle of the picture that was rendered, in pixels from the top left corner of the whole picture.
 
-    `cropped` pictures have the size of the rectangle; others have that of the whole, with nothing around it.
+    A `cropped` picture has the size of the rectangle. Others have the full size and are empty outside of it.
     """
 
     left: int
@@ -601,7 +615,7 @@ class Border:
 
 @dataclass(frozen=True)
 class ColorSpace:
-    """The linear RGB space that all colors of a file are in, by its name and the matrix to linear Rec.709."""
+    """The linear RGB space of all colors of a file: its name and the matrix to linear Rec.709."""
 
     name: str
     to_rec709: np.ndarray  # (3, 3), with both spaces' white points made equal; applied to column vectors

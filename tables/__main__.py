@@ -1,4 +1,4 @@
-"""`python -m tables fit|validate|optimum|plot ...`, what `ltsh tables` runs from the source checkout."""
+"""`python -m tables fit|validate|optimum|plot ...`, which `ltsh tables` runs from the source checkout."""
 
 from __future__ import annotations
 
@@ -101,10 +101,10 @@ def _jobs(text):
 
 
 def _fit_all(options) -> int:
-    """Fit every table in an interpreter of its own: with one thread each, so that the bytes do not depend on them."""
+    """Fit each table in an interpreter of its own with a single thread, so that the bytes do not depend on threads."""
     folder = options.output.resolve()
     folder.mkdir(parents=True, exist_ok=True)
-    # The largest first: the others then share the remaining time.
+    # The largest first, so that the others share the remaining time.
     names = sorted(dict.fromkeys(options.names or SHIPPED_TABLES), key=lambda name: -families.family_named(name).size)
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
     running, waiting, failed = {}, list(names), False
@@ -136,7 +136,8 @@ def _fit_all(options) -> int:
 
 
 def _show(shares, shown):
-    """Print where the fits stand, when that has changed: on one line of a terminal, else a line at the end of each."""
+    """Print the progress of the fits if it has changed: on one line of a terminal, otherwise a line per finished
+    fit."""
     text = ", ".join(f"{name} {share}" for name, share in shares.items())
     if sys.stderr.isatty():
         if text != shown:
@@ -184,7 +185,7 @@ def _validate(options) -> int:
         basis = validate.fresnel_basis_error(table, max(options.count // 4, 2))
         results[name]["layouts"] = validate.layout_errors(table, options.count)
         results[name]["fresnel_basis"] = {str(ior): error for ior, error in basis.items()}
-    # No table knows of them: all techniques that have one shade them alike.
+    # These errors belong to no table: all techniques with a table shade such lobes alike.
     brushed = {} if options.names else validate.validate_anisotropic(max(options.count // 9, 2))
     if options.json:
         print(json.dumps({**results, "anisotropic": brushed} if brushed else results, indent=2))
@@ -250,7 +251,7 @@ def _optimum(options) -> int:
 
 
 def _grazing(options) -> int:
-    """Shaded errors and L2 errors of a table beside those of the lobe solved at the point itself."""
+    """Print shaded errors and L2 errors of a table, and those of the lobe solved at the point itself."""
     names = [name for name in options.names or ["ltsh4"] if name in SHIPPED_TABLES and name != "ltc"]
     if not names:
         print("ltsh tables: --grazing needs a shipped table of spherical harmonics: ltsh2 or ltsh4", file=sys.stderr)

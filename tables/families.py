@@ -1,4 +1,4 @@
-"""What is fitted to what: BRDFs with their quadrature, and the families of original distributions under a warp."""
+"""The BRDFs with their quadrature, and the families of original distributions under a warp that are fitted to them."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ class Family:
     """A space of original distributions, even in y.
 
     kind "ltc": the clamped cosine, whose axis may tilt (fourth parameter of the warp). kind "ltsh": the polynomials in
-    x, z of a degree, which are the spherical harmonics even in y; `powers` restricts them to some monomials
-    x^p z^q: their integral needs fewer terms per edge. A table stores spherical harmonics coefficients in any case.
-    With a `bend` the two functions of `lookup_table.bent_cosines` are added to the spherical harmonics. With a `second`
-    family its lobe is added, under one more warp of three parameters (log xx, xz / xx, log yy) in the original domain:
-    a sum of two lobes, for which there are no tables.
+    x and z of a degree, which are the spherical harmonics even in y. `powers` restricts them to some monomials x^p z^q,
+    whose integral needs fewer terms per edge; a table stores spherical harmonics coefficients in any case. A `bend`
+    adds the two functions of `lookup_table.bent_cosines` to the spherical harmonics. A `second` family adds its lobe
+    under one more warp, with three parameters (log xx, xz / xx, log yy), in the original domain. There are no tables
+    for such sums of two lobes.
     """
 
     name: str
@@ -45,7 +45,7 @@ class Family:
 
     @cached_property
     def span(self) -> np.ndarray:
-        """Matrix (size, K): the family's basis functions as combinations of what a table stores."""
+        """Matrix (size, K): the family's basis functions as combinations of the functions that a table stores."""
         if self.kind == "ltc":
             return np.eye(1)
         count = spherical_harmonics.coefficient_count(self.degree)
@@ -54,14 +54,14 @@ class Family:
         generator = np.random.default_rng(1)
         directions = generator.normal(size=(8 * count, 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        # On the hemisphere x^p z^q is taken as it stands: on the sphere it is the same polynomial.
+        # x^p z^q is taken without change: it is the same polynomial on the sphere as on the hemisphere.
         values = np.stack([directions[:, 0] ** p * directions[:, 2] ** q for p, q in self.powers], axis=1)
         harmonics = spherical_harmonics.evaluate(self.degree, directions).T
         return np.linalg.lstsq(harmonics, values, rcond=None)[0].T
 
     @cached_property
     def round(self) -> np.ndarray:
-        """(size,) whether a basis function may be used at normal incidence, where the lobe is rotation-symmetric."""
+        """Mask (size,) of the basis functions allowed at normal incidence, where the lobe is rotation-symmetric."""
         if self.kind == "ltc":
             return np.ones(1, dtype=bool)
         zonal = [m == 0 for l in range(self.degree + 1) for m in range(l + 1)]  # noqa: E741
@@ -69,8 +69,8 @@ class Family:
         return np.abs(self.span[:, ~np.array(zonal)]).max(axis=1, initial=0.0) < 1e-9
 
     def basis(self, unit, tilt):
-        """Basis functions (P, S, size) at unit directions (P, S, 3) of the original domain; tilt (P,), or (P, 3): the
-        warp of the second lobe."""
+        """Basis functions (P, S, size) at unit directions (P, S, 3) of the original domain. `tilt` is (P,), or (P, 3),
+        the warp of the second lobe."""
         if self.second is not None:
             xx, xz, yy = np.exp(tilt[:, 0]), np.exp(tilt[:, 0]) * tilt[:, 1], np.exp(tilt[:, 2])
             warped = np.moveaxis(bent((xx[:, None], xz[:, None], yy[:, None]), np.moveaxis(unit, -1, 0)), 0, -1)
@@ -95,24 +95,24 @@ class Family:
         return np.broadcast_to(integrals, (len(tilt), len(integrals)))
 
 
-# What lobes at grazing views lack most beside spherical harmonics, found by search over 6 x 6 points: a broad lobe that
-# leans away from the view and is narrow across. Around these numbers the error hardly changes.
+# What spherical harmonics lack most at grazing views, found by search over 6 x 6 points: a broad lobe that leans away
+# from the view and is narrow across. The error hardly changes around these numbers.
 BEND = (0.4, 0.2, 1.4)
 
 
 def two_ridges(degree: int) -> Family:
-    """Polynomials h_x(x) + h_z(z): 2 degree + 1 coefficients."""
+    """Polynomials h_x(x) + h_z(z), with 2 degree + 1 coefficients."""
     powers = tuple((0, q) for q in range(degree + 1)) + tuple((p, 0) for p in range(1, degree + 1))
     return Family(f"ridges{degree}", "ltsh", degree, powers)
 
 
 def zonal(degree: int) -> Family:
-    """Polynomials h(z): degree + 1 coefficients."""
+    """Polynomials h(z), with degree + 1 coefficients."""
     return Family(f"zonal{degree}", "ltsh", degree, tuple((0, q) for q in range(degree + 1)))
 
 
 def odd_in_z(degree: int) -> Family:
-    """Polynomials odd in z: on the upper hemisphere these need no solid angle."""
+    """Polynomials odd in z. On the upper hemisphere these need no solid angle."""
     powers = tuple((n - q, q) for n in range(1, degree + 1) for q in range(1, n + 1, 2))
     return Family(f"odd{degree}", "ltsh", degree, powers)
 
@@ -138,12 +138,12 @@ def family_named(name: str) -> Family:
 def polar_samples(cos_theta_o, alpha, radial: int = 28, angular: int = 28):
     """Directions (P, S, 3) with y > 0 and weights (P, S) for cos_theta_o (P,) and alpha (P,).
 
-    The weighted sum of a function that is even in y is its integral over the upper hemisphere. The plane x = 0 cuts it
-    in two; each half has polar coordinates of its own, around the mirror direction and around the view direction: at
-    grazing angles a warped lobe can wrap around, and what it then does near the horizon under the view must be seen.
-    The angle r to the pole crowds there like sinh on the scale of the lobe. Every ray ends at the horizon or at the
-    plane between the halves, on either side of azimuth 90 degrees, so that the integrand is smooth on it.
-    The half of the view direction has a third of the S points, about radial * angular * 3 / 2.
+    The weighted sum of a function that is even in y is its integral over the upper hemisphere. The plane x = 0 cuts the
+    hemisphere in two. Each half has its own polar coordinates, around the mirror direction and around the view
+    direction. The second half matters because at grazing angles a warped lobe can wrap around to the horizon under the
+    view. Near the pole, the angle r to it is dense like sinh on the scale of the lobe. Every ray ends at the horizon or
+    at the plane between the halves, on either side of azimuth 90 degrees, so the integrand is smooth on it. The half of
+    the view direction has a third of the S points; S is about radial * angular * 3 / 2.
     """
     mirror = _half(cos_theta_o, alpha, radial, angular // 2)
     view = _half(cos_theta_o, alpha, (2 * radial + 2) // 3, (3 * angular + 4) // 8)
@@ -187,14 +187,14 @@ class Brdf:
     description: str
     # BRDF times cosine: cos_theta_o (P,), alpha (P,), unit directions (P, S, 3) -> (P, S) in sr^-1
     value: Callable
-    # cos_theta_o (P,), alpha (P,), counts -> directions (P, S, 3) with y > 0, weights (P, S): `hemisphere_quadrature`
+    # Quadrature: cos_theta_o (P,), alpha (P,), counts -> directions (P, S, 3) with y > 0, weights (P, S)
     samples: Callable
-    # GGX times cosine becomes a warped clamped cosine as alpha -> 0: A = B = C = 1 is then the known limit.
+    # True for GGX: as alpha -> 0, BRDF times cosine becomes a warped clamped cosine with the known limit A = B = C = 1.
     cosine_limit: bool = False
 
 
 def beckmann_cosine(cos_theta_o, alpha, directions):
-    """Beckmann BRDF times cosine with F = 1, height-correlated Smith masking-shadowing; as `brdf.ggx_brdf_cosine`.
+    """Beckmann BRDF times cosine with F = 1 and height-correlated Smith masking-shadowing, as `brdf.ggx_brdf_cosine`.
 
     Walter et al. 2007, "Microfacet Models for Refraction through Rough Surfaces", eq. 25; the masking is Heitz 2014,
     "Understanding the Masking-Shadowing Function", eq. 72 and 99, with the error function instead of its rational fit.

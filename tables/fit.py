@@ -1,4 +1,4 @@
-"""Writes fitted tables, reproducible byte by byte, and keeps the state of fits that are under way."""
+"""Fits tables and writes them, reproducibly byte by byte. Keeps the state of unfinished fits."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from .projection import (
 
 
 def write_table(path: Path, fitted) -> None:
-    """Write a `fit.Fitted` with its metadata: the same arrays give the same bytes."""
+    """Write a `Fitted` with its metadata. The same arrays give the same bytes."""
     family = fitted.family
     metadata = {
         "format_version": FORMAT_VERSION,
@@ -59,7 +59,7 @@ def _options(fitted):
 
 
 def settings(family, model, size) -> dict:
-    """What a fit depends on, beside the code."""
+    """The settings on which a fit depends, apart from the code."""
     return {
         "family": family.name,
         **({} if family.bend is None else {"bend": list(family.bend)}),
@@ -78,14 +78,14 @@ def settings(family, model, size) -> dict:
 
 
 class Checkpoint:
-    """The state of one fit in a file beside its table; ignored where it was made with other settings."""
+    """The state of one fit, in a file beside its table. A file of other settings is ignored."""
 
     def __init__(self, path: Path, settings: dict):
         self.path = path
         self.settings = json.dumps(settings, sort_keys=True)
 
     def load(self) -> dict[str, np.ndarray]:
-        """The arrays saved last; none where there is no readable file of the same settings."""
+        """The arrays saved last; {} if there is no readable file of the same settings."""
         try:
             with open(self.path, "rb") as file, np.load(file) as archive:
                 arrays = {key: archive[key] for key in archive.files}
@@ -99,7 +99,7 @@ class Checkpoint:
         _write_npz(self.path, {**arrays, "settings": np.array(self.settings)}, compress=False)
 
     def remove(self) -> None:
-        """Remove the file: the fit is complete."""
+        """Remove the file, because the fit is complete."""
         self.path.unlink(missing_ok=True)
 
 
@@ -114,7 +114,8 @@ def _write_npz(path, arrays, compress=True):
             archive.writestr(entry, stream.getvalue())
 
 
-# Beyond 89.4 degrees smooth lobes are cut by the horizon on the scale of alpha; their fits would hide needles.
+# Least cosine of the nodes. Beyond 89.4 degrees the horizon cuts smooth lobes on the scale of alpha, and fits would
+# hide needles.
 GRAZING_COSINE = 0.01
 WALK_SHARE = 0.25
 ALBEDO_NODES = 48
@@ -134,7 +135,7 @@ def fit(family: Family, size: int = 64, *, model: Brdf = GGX, progress=None, che
     """Fit one table of size x size nodes.
 
     `progress(fraction)` is called now and then. `checkpoint` has load() -> dict of arrays (empty at first) and
-    save(dict): a fit that was stopped goes on from there and gives the same numbers.
+    save(dict). A fit that was stopped resumes from there and gives the same numbers.
     """
     curves, weights = fresnel_basis()
     roughness, cosine = _nodes(size)
@@ -153,7 +154,7 @@ def fit(family: Family, size: int = 64, *, model: Brdf = GGX, progress=None, che
 
 def _nodes(size):
     roughness = roughness_nodes(size)
-    # At roughness 0 the lobe is a delta; its limit is taken close by.
+    # At roughness 0 the lobe is a delta; use a point close by instead.
     roughness = np.concatenate([[0.25 * roughness[1]], roughness[1:]])
     return roughness, np.maximum(np.cos(theta_nodes(size)), GRAZING_COSINE)
 
@@ -196,7 +197,7 @@ def _fitted_nodes(family, model, nodes, curves, progress, checkpoint):
 
 
 def project_nodes(family, model, roughness, cosine, warp, curves):
-    """Coefficients (R, T, F, size) solved at every node for its warp, and the albedo (R, T, F) there."""
+    """Coefficients (R, T, F, size) solved at each node for its warp, and the albedo (R, T, F) there."""
     coefficients, albedo = [], []
     for value, channels in zip(roughness, warp, strict=True):
         points = Points.at(model, cosine, np.full_like(cosine, value**2), curves)
@@ -208,7 +209,7 @@ def project_nodes(family, model, roughness, cosine, warp, curves):
 
 
 def node_errors(family, model, roughness, cosine, warp, coefficients):
-    """Relative L2 error (R, T) of the nodes, F = 1."""
+    """Relative L2 error (R, T) of the nodes for F = 1."""
     errors = []
     for value, channels, row in zip(roughness, warp, coefficients, strict=True):
         points = Points.at(model, cosine, np.full_like(cosine, value**2), FLAT)
@@ -224,7 +225,7 @@ def _row(family, points, channels):
 
 
 def average_albedo(model, roughness, curves):
-    """Integral (R, F) of 2 mu albedo(mu) over mu in [0, 1]: Gauss-Legendre in sqrt(mu), which is dense at grazing."""
+    """Integral (R, F) of 2 mu albedo(mu) over mu in [0, 1], by Gauss-Legendre in sqrt(mu), dense at grazing angles."""
     nodes, weights = np.polynomial.legendre.leggauss(ALBEDO_NODES)
     root, weights = 0.5 * (nodes + 1.0), 0.5 * weights
     mu, weights = root**2, weights * 2.0 * root

@@ -1,12 +1,13 @@
-"""How good a family of lobes can be: the best warp and coefficients at single points, with no table in between.
+"""The best that a family of lobes can do: the best warp and coefficients at single points, with no table in between.
 
-The lookup of a table cannot be better than this. Every point of a 12 x 12 grid like that of `validate` is searched by
-plain L2 error, for a lobe whose albedo is exact: from several starts, then from the best warps of its neighbors.
+The lookup of a table cannot be better. Each point of a 12 x 12 grid, like that of `validate`, is searched for the least
+plain L2 error of a lobe with exact albedo. The search starts from several warps, then from the best ones of the
+point's neighbors.
 
-At grazing views (n.v 0.04 to 0.2) lobes are long, bent and cut by the horizon, and errors are largest: there a table is
-set beside the lobes *solved* so at the same points (`tables optimum --grazing`). Shaded errors are those of integrals
-over disks of 10, 20 and 35 degrees, all over the hemisphere, relative to their root mean square. The search knows
-nothing of lights and the fit of the tables does, so ratios below 1 are possible.
+At grazing views (n.v 0.04 to 0.2) lobes are long, bent and cut by the horizon, and errors are largest. There
+`tables optimum --grazing` compares a table with such *solved* lobes at the same points. Shaded errors are those of
+integrals over disks of 10, 20 and 35 degrees, all over the hemisphere, relative to their root mean square. Ratios below
+1 are possible, because the fit of the tables takes lights into account and the search does not.
 """
 
 from __future__ import annotations
@@ -28,13 +29,13 @@ from .validate import disks, grid, hemisphere_samples
 from .walk import bounds, minimize, warp_of
 
 COUNT = 12
-# What `tables optimum --all` found for every family of CURVES at COUNT_OF_ALL x COUNT_OF_ALL points: {family: errors}.
+# Results of `tables optimum --all` for every family of CURVES at COUNT_OF_ALL x COUNT_OF_ALL points: {family: errors}.
 ALL, COUNT_OF_ALL = Path(__file__).with_name("optimum.json"), 6
-# Start of a search: beta as a share of -theta_o, and the logarithms of a cos^2(beta) / (2 alpha) and c / (2 alpha).
+# Starts of a search: beta as a share of -theta_o, and the logarithms of a cos^2(beta) / (2 alpha) and c / (2 alpha).
 STARTS = ((1.0, 0.0), (0.8, -0.3), (0.5, -0.6), (0.2, -1.0))
-# Of the warp of a second lobe, beside the best one of the first lobe alone.
+# Starts for the warp of a second lobe; the first lobe starts from the best one on its own.
 SECOND_STARTS = ((1, 0, 1), (-1, 0, -1), (-1, 0.7, 0.2), (0.5, -0.2, -0.4), (-1.5, 1, -1.5), (2, 0, 2))
-# Grazing views at which tables are set beside solved lobes, and the ratio of their errors that is good.
+# Grazing views at which tables are compared with solved lobes, and the largest ratio of errors that is good.
 ROUGHNESS = (0.1, 0.15, 0.2, 0.3, 0.4, 0.6, 0.8, 1.0)
 COSINES = (0.04, 0.06, 0.09, 0.13, 0.2)
 GOAL = 1.2
@@ -64,25 +65,25 @@ class Optimum:
 
 
 def optimum(name: str, count: int = COUNT) -> Optimum:
-    """The least errors found for the family called `name` at count x count points."""
+    """The least errors found for the family `name` at count x count points."""
     cosine, roughness = np.array(grid(count)).T
     errors, _ = best_lobes(family_named(name), cosine, roughness, (count, count))
     return Optimum(name, errors, edge_terms(name))
 
 
 def all_families() -> list[str]:
-    """Those of CURVES."""
+    """The families of CURVES."""
     return list(dict.fromkeys(name for names in CURVES.values() for name in names))
 
 
 def known_optima() -> dict[str, Optimum]:
-    """Those that stand in ALL, by family."""
+    """The optima in the file ALL, by family."""
     found = json.loads(ALL.read_text(encoding="utf-8"))
     return {name: Optimum(name, np.array(errors), edge_terms(name)) for name, errors in found.items()}
 
 
 def keep_optimum(found: Optimum) -> None:
-    """Write one found at COUNT_OF_ALL into ALL."""
+    """Write an optimum found at COUNT_OF_ALL into the file ALL."""
     kept = json.loads(ALL.read_text(encoding="utf-8")) if ALL.exists() else {}
     kept[found.name] = [float(f"{error:.4g}") for error in found.errors]
     lines = ",\n".join(f"{json.dumps(name)}: {json.dumps(kept[name])}" for name in sorted(kept))
@@ -90,9 +91,9 @@ def keep_optimum(found: Optimum) -> None:
 
 
 def best_lobes(family, cosine, roughness, shape, starts=()):
-    """Least errors (P,) and the warp parameters (P, n) that have them, at cosine (P,) and roughness (P,).
+    """Least errors (P,) at cosine (P,) and roughness (P,), and the warp parameters (P, n) that reach them.
 
-    The points are a grid of `shape`, row by row; further `starts` (P, n) of the search can be given.
+    The points are a grid of `shape`, row by row. The search also tries further `starts` (P, n).
     """
     theta = np.arccos(cosine)
     best = np.full(len(cosine), np.inf)
@@ -120,7 +121,7 @@ def best_lobes(family, cosine, roughness, shape, starts=()):
 
 
 def _search(family, cosine, roughness, start):
-    """Errors (P,) and warp parameters (P, n) of the minima next to `start`."""
+    """Errors (P,) and warp parameters (P, n) of the minima that the search finds from `start`."""
     points = Points.at(GGX, cosine, roughness**2, FLAT)
     start = np.clip(start, *bounds(family))
     found = minimize(family, points, start, np.zeros(start.shape, dtype=bool), penalty=0.0, iterations=40)
@@ -145,7 +146,7 @@ def edge_terms(name: str) -> int:
 
 @dataclass(frozen=True)
 class GrazingError:
-    """Relative errors of a table and of the solved lobe at one point; `lobe` stands for the L2 error of the lobe."""
+    """Relative errors of a table and of the solved lobe at one point. Names with `lobe` are L2 errors of the lobe."""
 
     roughness: float
     cosine: float
@@ -156,12 +157,12 @@ class GrazingError:
 
     @property
     def ratio(self) -> float:
-        """Error of the table over that of the lobe solved at the point."""
+        """Error of the table divided by that of the lobe solved at the point."""
         return self.table / self.solved
 
 
 def grazing_errors(table: LookupTable, count: int = len(ROUGHNESS)) -> list[GrazingError]:
-    """Errors at `count` of the values of ROUGHNESS, spread over them, and at all COSINES; spherical harmonics only."""
+    """Errors at `count` values spread over ROUGHNESS and at all COSINES. For tables of spherical harmonics only."""
     chosen = np.unique(np.linspace(0, len(ROUGHNESS) - 1, max(count, 2)).round().astype(int))
     roughness, cosine = (grid.ravel() for grid in np.meshgrid(np.array(ROUGHNESS)[chosen], COSINES, indexing="ij"))
     family = family_named(f"ltsh{table.degree}" if table.bend is None else f"ltsh{table.degree}c")
@@ -179,7 +180,7 @@ def grazing_errors(table: LookupTable, count: int = len(ROUGHNESS)) -> list[Graz
 
 
 def _warp_of_table(table, cosine, roughness):
-    """Parameters (P, 3) of the warp that the table has at the points, as `walk.warp_of` reads them."""
+    """Parameters (P, 3) of the table's warp at the points, in the form that `walk.warp_of` takes."""
     lobe = table.lookup(cosine, roughness)
     scale = 2.0 * roughness**2 / lobe.zz
     xx, xz, yy = (np.asarray(entry, dtype=np.float64) * scale for entry in (lobe.xx, lobe.xz, lobe.yy))

@@ -22,7 +22,7 @@ LOBES = [(0.25, 80.0), (0.5, 80.0), (0.5, 87.0), (0.8, 80.0)]
 
 
 def draw_all(folder: Path, report) -> list[Path]:
-    """Draw every figure into `folder`; `report(text)` says what is being drawn. Returns the paths."""
+    """Draw every figure into `folder`, and return the paths. `report(text)` says what is being drawn."""
     figures = {"error_maps": draw_error_maps, "lobes": draw_lobes, "error_against_cost": draw_error_against_cost}
     paths = []
     with plt.rc_context(STYLE):
@@ -30,7 +30,7 @@ def draw_all(folder: Path, report) -> list[Path]:
             report(f"drawing {name}")
             path = folder / f"tables_{name}.png"
             figure = draw()
-            # Without the version of the program the same figure has the same bytes.
+            # Without the program's version, the same figure has the same bytes.
             figure.savefig(path, bbox_inches="tight", metadata={"Software": None})
             plt.close(figure)
             paths.append(path)
@@ -53,8 +53,8 @@ def draw_error_maps():
 
 
 def draw_lobes():
-    """The lobes in the plane of incidence against the BRDF at grazing angles, like Figure 2 of Allmenroeder and Peters
-    2021; radius: the square root of BRDF times cosine, which shows the tail."""
+    """The lobes and the BRDF in the plane of incidence at grazing angles, like Figure 2 of Allmenroeder and Peters
+    2021. The radius is the square root of BRDF times cosine, which shows the tail."""
     figure, axes = plt.subplots(1, len(LOBES), figsize=(12.0, 2.9), constrained_layout=True)
     elevation = np.linspace(1e-4, np.pi - 1e-4, 1500)
     directions = np.stack([-np.cos(elevation), np.zeros_like(elevation), np.sin(elevation)], axis=-1)
@@ -75,8 +75,8 @@ def draw_lobes():
 
 
 def draw_error_against_cost():
-    """Error against the number of terms that an edge of a polygon costs: what each family can reach at a point, as
-    `tables optimum --all` has found it, and what the shipped tables reach between their nodes, at the same points."""
+    """Error against cost, the number of moments of a polygon. It shows what each family can reach at a point, as found
+    by `tables optimum --all`, and what the shipped tables reach between their nodes, at the same points."""
     figure, axis = plt.subplots(figsize=(6.4, 4.0), constrained_layout=True)
     known = optimum.known_optima()
     for title, names in optimum.CURVES.items():

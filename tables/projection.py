@@ -1,10 +1,10 @@
-"""Fresnel curves that share one warp: 1 and (1 - c)^5 for Schlick, c (1 - c)^6 for the F82 tint, two for dielectrics.
+"""Fresnel curves that share one warp: 1 and (1 - c)^5 (Schlick), c (1 - c)^6 (F82 tint), and two for dielectrics.
 
-A lobe is linear in its coefficients, so a reflectance that is a combination of the curves costs nothing beyond the fit
+A lobe is linear in its coefficients. So a reflectance that is a combination of the curves costs nothing beyond the fit
 of the curves themselves. The F82 tint of metals is Kutz, Hasan and Edmondson 2021, "Novel Aspects of the Adobe Standard
-Material". The two curves for dielectrics, on top of the fixed three, minimize the squared relative error of the exact
-dielectric reflectance over index of refraction and angle: weighted low-rank approximation by alternating least squares
-(Srebro and Jaakkola 2003).
+Material". The two curves for dielectrics come on top of the three fixed ones. They minimize the squared relative error
+of the exact dielectric reflectance over index of refraction and angle, by weighted low-rank approximation with
+alternating least squares (Srebro and Jaakkola 2003).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from ltsh_addon.shading.lookup_table import theta_at
 
 COSINES = np.linspace(0.0, 1.0, 257)
 FLAT = np.ones((1, len(COSINES)))
-# Fitted on this range; weights are tabulated on a wider one, where the error grows.
+# The curves are fitted on FITTED_IOR. The weights are tabulated on a wider range, where the error grows.
 FITTED_IOR = np.linspace(1.05, 3.0, 196)
 TABULATED_IOR = np.concatenate([np.linspace(1.0, 1.05, 11), np.linspace(1.06, 1.6, 109), np.linspace(1.62, 4.0, 120)])
 CURVE_NAMES = ["1", "(1-c)^5", "c(1-c)^6", "dielectric 1", "dielectric 2"]
@@ -48,7 +48,8 @@ def fresnel_basis(sweeps: int = 800):
 
 
 def combine(curves, reflectance):
-    """Weights (I, F) that approximate reflectance (I, C) by the curves (F, C), least squares of the relative error."""
+    """Weights (I, F) with which the curves (F, C) approximate reflectance (I, C): least squares of the relative
+    error."""
     squared_weight = 1.0 / np.maximum(reflectance, 1e-6) ** 2
     system = np.tensordot(squared_weight, _outer(curves.T), axes=(1, 0))
     target = (squared_weight * reflectance) @ curves.T
@@ -64,13 +65,13 @@ def _damped(system):
     return system + 1e-12 * np.trace(system, axis1=1, axis2=2)[:, None, None] * np.eye(size)
 
 
-# Relative to the normalized Gram matrix: keeps directions that hardly matter from growing.
+# Regularization relative to the normalized Gram matrix. It keeps directions that hardly matter from growing.
 RIDGE = 1e-6
 
 
 @dataclass(frozen=True)
 class Points:
-    """Quadrature and target of a batch of points (roughness, theta_o) of the table."""
+    """Quadrature and target of a batch of table points (roughness, theta_o)."""
 
     cosine: np.ndarray  # (P,)
     alpha: np.ndarray  # (P,)
@@ -81,7 +82,8 @@ class Points:
 
     @classmethod
     def at(cls, model, cosine, alpha, curves, *, albedo=None, counts=(28, 28)):
-        """Points of a BRDF at cosine (P,) and alpha (P,) for Fresnel curves (F, C), with counts of directions."""
+        """Points of a BRDF at cosine (P,) and alpha (P,), for Fresnel curves (F, C). `counts` are those of
+        directions."""
         directions, quadrature = model.samples(cosine, alpha, *counts)
         lobes = _lobes(model, cosine, alpha, directions, curves)
         if albedo is None:
@@ -105,7 +107,7 @@ def _lobes(model, cosine, alpha, directions, curves):
 
 
 def warped_basis(family, directions, entries, tilt):
-    """Basis functions (P, S, size) of the lobes with warp entries (xx, xz, yy, zz), (P,) each, at `directions`."""
+    """Basis functions (P, S, size) of lobes at `directions`. The warp entries are (xx, xz, yy, zz), (P,) each."""
     xx, xz, yy, zz = (entry[:, None] for entry in entries)
     x, y, z = (directions[..., axis] for axis in range(3))
     warped = np.stack([xx * x + xz * z, yy * y, zz * z], axis=-1)
@@ -114,8 +116,8 @@ def warped_basis(family, directions, entries, tilt):
 
 
 def project(family, points, entries, tilt, curves=slice(0, 1)):
-    """Coefficients (P, F, size) of least squared error whose albedo is exact, and residuals
-    (P, S, F) relative to each lobe's norm."""
+    """Coefficients (P, F, size) of least squared error with exact albedo, and residuals (P, S, F) relative to the norm
+    of each lobe."""
     root = np.sqrt(points.quadrature)[..., None]
     basis = warped_basis(family, points.directions, entries, tilt) * root
     target = points.lobes[..., curves] * root
@@ -137,7 +139,7 @@ def project(family, points, entries, tilt, curves=slice(0, 1)):
 
 
 def relative_error(points, values):
-    """Relative L2 error (P,) over the upper hemisphere of lobes with values (P, S), F = 1."""
+    """Relative L2 error (P,) over the upper hemisphere of lobes with values (P, S), for F = 1."""
     target = points.lobes[..., 0]
     squared = (points.quadrature * (values - target) ** 2).sum(axis=1)
     return np.sqrt(squared / (points.quadrature * target**2).sum(axis=1))
@@ -145,7 +147,7 @@ def relative_error(points, values):
 
 # Positions of the two Gauss points of a cell along each axis
 GAUSS = np.array([0.5 - 0.5 / np.sqrt(3.0), 0.5 + 0.5 / np.sqrt(3.0)])
-# Points that are worked on at a time
+# Points of a batch
 BATCH = 126
 
 
@@ -193,7 +195,8 @@ class Cells:
         return result
 
     def node_blocks(self, matrices):
-        """Diagonal blocks (R, T, d, d) of the nodes in the normal matrix whose blocks at the points are (P, d, d)."""
+        """Diagonal blocks (R, T, d, d) of the nodes in the normal matrix. `matrices` (P, d, d) are its blocks at the
+        points."""
         rows, columns = self.shape
         size = matrices.shape[-1]
         matrices = matrices.reshape(rows - 1, 2, columns - 1, 2, size, size)

@@ -1,14 +1,14 @@
-"""What is minimized between the nodes of a table, and its normal equations.
+"""The error between the nodes of a table, its normal equations, and their solution.
 
 The squared error of a point is a sum of four terms, all relative to the true lobe:
 
-- the squared L2 error over the upper hemisphere, where directions in which the fitted lobe is negative count
+- the squared L2 error over the upper hemisphere; directions in which the fitted lobe is negative count
   1 + NEGATIVE_WEIGHT times;
-- LIGHT_WEIGHT times the squared error of what a renderer computes, integrals over lights: soft windows of three widths,
-  spread evenly over the hemisphere. An L2 norm alone sells the tail of the lobe for a little at the peak, but a light
-  is often seen in the tail alone;
+- LIGHT_WEIGHT times the squared error of integrals over lights, which is what a renderer computes. The lights are soft
+  windows of three widths, spread evenly over the hemisphere. An L2 norm alone would trade much of the tail for little
+  at the peak, but a light is often seen in the tail alone;
 - ALBEDO_WEIGHT times the squared error of the albedo;
-- EXCESS_WEIGHT times the square of what the negative mass, relative to the albedo, has above NEGATIVE_SHARE.
+- EXCESS_WEIGHT times the square of the excess of the negative mass, relative to the albedo, above NEGATIVE_SHARE.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from ltsh_addon.shading.lookup_table import warp_entries
 
 from .projection import FLAT, Points, batches, warped_basis
 
-# An error below this one is good enough: points count by 1 / max(error, ERROR_FLOOR).
+# Errors below this are good enough: points count by 1 / max(error, ERROR_FLOOR).
 ERROR_FLOOR = 2e-3
 LIGHT_WEIGHT = 0.4
 ALBEDO_WEIGHT = 9.0
@@ -34,9 +34,9 @@ WINDOW_WIDTHS = np.radians([8.0, 16.0, 28.0])
 
 @dataclass(frozen=True)
 class Linearization:
-    """Normal equations of P points, each for the d values that are interpolated there, and the errors measured.
+    """Normal equations of P points, each for the d values that are interpolated there, and their errors.
 
-    `right` has one column per Fresnel curve: for curve 0, F = 1, it is the negative gradient; for the others it is the
+    `right` has one column per Fresnel curve. For curve 0, F = 1, it is the negative gradient; for the others, it is the
     projection of the whole target on the derivatives.
     """
 
@@ -67,7 +67,7 @@ def _linearize(family, points, values, derivatives):
     basis = _basis(family, points, warp)
     lobe = np.einsum("psk,pk->ps", basis, coefficients)
     functionals, scales = _functionals(points)
-    # Missing: of every curve for the right-hand side, of F = 1 for the error
+    # What the lobe misses for F = 1, and the whole target of the other curves.
     targets = points.lobes.copy()
     targets[..., 0] -= lobe
     weights = points.quadrature * (1.0 + NEGATIVE_WEIGHT * (lobe < 0.0))
@@ -138,7 +138,7 @@ def _functionals(points):
     sharpness = 1.0 / np.resize(WINDOW_WIDTHS, WINDOWS)[:, None] ** 2
     mirrored = centers * np.array([1.0, -1.0, 1.0])
     directions = np.swapaxes(points.directions, 1, 2)
-    # Windows of single precision are as good: they weigh the lobe and what is fitted to it alike.
+    # Windows in single precision suffice, because they weigh the lobe and its target alike.
     exponents = [((np.matmul(side, directions) - 1.0) * sharpness).astype(np.float32) for side in (centers, mirrored)]
     windows = (np.exp(exponents[0]) + np.exp(exponents[1])) * points.quadrature[:, None, :]
     seen = np.matmul(windows, points.lobes[..., :1])[..., 0]
@@ -147,13 +147,13 @@ def _functionals(points):
 
 ITERATIONS = 3
 FIRST_DAMPING = 1e-3
-# Of conjugate gradients: the residual, relative to the first one, at which they end, and the most steps.
+# End of conjugate gradients: SOLVED is the residual relative to the first one, MOST_STEPS the number of steps.
 SOLVED, MOST_STEPS = 1e-6, 400
 
 
 @dataclass(frozen=True)
 class State:
-    """Where the refinement stands: enough to go on from there."""
+    """State of the refinement, enough to resume it."""
 
     nodes: np.ndarray  # (R, T, n + size)
     damping: float = FIRST_DAMPING
@@ -161,7 +161,7 @@ class State:
 
 
 def refine(family, model, cells, state: State, progress=None) -> np.ndarray:
-    """Nodes (R, T, n + size), channels of the warp and coefficients, of least mean error between them, for F = 1.
+    """Nodes (R, T, n + size), channels of the warp and coefficients, with the least mean error between them for F = 1.
 
     `progress(fraction, state)` is called after every iteration.
     """
@@ -181,8 +181,8 @@ def refine(family, model, cells, state: State, progress=None) -> np.ndarray:
 
 
 def fresnel_coefficients(family, model, cells, nodes, limit, curves) -> np.ndarray:
-    """Coefficients (R, T, F, size) for Fresnel curves (F, C), curve 0 being F = 1: the same least squares problem with
-    the warps of `nodes` held. `limit` (R, T, F, size) has the rows that are fixed."""
+    """Coefficients (R, T, F, size) for Fresnel curves (F, C), of which curve 0 is F = 1. They solve the same least
+    squares problem with the warps of `nodes` held fixed. `limit` (R, T, F, size) has the rows that are fixed."""
     free = free_entries(family, model, cells.shape)[..., family.parameters :]
     here = linearize(family, model, cells, nodes, curves)
     matrices = here.matrices[:, family.parameters :, family.parameters :]
@@ -196,7 +196,8 @@ def fresnel_coefficients(family, model, cells, nodes, limit, curves) -> np.ndarr
 
 
 def with_exact_albedo(family, model, cells, nodes, coefficients, albedo) -> np.ndarray:
-    """Coefficients (R, T, F, size), moved as little as the error allows, so that the nodes have `albedo` (R, T, F)."""
+    """Coefficients (R, T, F, size) with which the nodes have `albedo` (R, T, F), changed where that costs least
+    error."""
     free = free_entries(family, model, cells.shape)[..., family.parameters :]
     here = linearize(family, model, cells, nodes)
     blocks = cells.node_blocks(here.matrices[:, family.parameters :, family.parameters :])
@@ -211,7 +212,7 @@ def with_exact_albedo(family, model, cells, nodes, coefficients, albedo) -> np.n
 
 
 def free_entries(family, model, shape) -> np.ndarray:
-    """(R, T, n + size) which entries of the nodes may move."""
+    """Mask (R, T, n + size) of the entries of the nodes that may change."""
     free = np.ones((*shape, family.parameters + family.size), dtype=bool)
     free[:, 0, 3 : family.parameters] = False
     free[:, 0, family.parameters :] &= family.round
@@ -248,8 +249,8 @@ def _solve(cells, matrices, right, free, damping, *, tie_round_warp=False):
 
 
 def _admissible(change, free, tie_round_warp):
-    """The orthogonal projection of a change to those that keep fixed entries and, for the warp at normal incidence,
-    A = C."""
+    """The orthogonal projection of a change onto admissible ones. These keep fixed entries, and A = C for the warp at
+    normal incidence."""
     change = np.where(free, change, 0.0)
     if tie_round_warp:
         change[:, 0, [0, 2]] = change[:, 0, [0, 2]].mean(axis=1, keepdims=True)

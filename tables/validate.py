@@ -1,8 +1,8 @@
-"""Measures a lookup table where a renderer uses it, between the nodes: `python -m ltsh_addon tables validate`.
+"""Measures a lookup table between its nodes, where a renderer uses it: `python -m ltsh_addon tables validate`.
 
-The quadrature shares nothing with the fit. Two sets of points are combined by the balance heuristic (Veach 1997):
-visible normals of GGX (Dupuy and Benyoub 2023, "Sampling Visible GGX Normals with Spherical Caps"), and points that
-crowd at the horizon and at the plane of incidence. The second set matters: a linearly transformed lobe can hide a
+The quadrature shares nothing with the fit. The balance heuristic (Veach 1997) combines two sets of points: visible
+normals of GGX (Dupuy and Benyoub 2023, "Sampling Visible GGX Normals with Spherical Caps"), and points that are dense
+at the horizon and at the plane of incidence. The second set matters because a linearly transformed lobe can hide a
 needle at the horizon that samples of the BRDF alone never see.
 """
 
@@ -19,18 +19,18 @@ from ltsh_addon.shading.lookup_table import LookupTable
 from .families import gauss_legendre
 
 IOR = (1.1, 1.2, 1.33, 1.5, 1.8, 2.4, 3.0)
-# The largest theta_o of the points, in degrees.
+# Largest theta_o of the points, in degrees.
 MOST_THETA = 88.0
-# Samples of the hemisphere by visible normals, in radius and angle, and by the height above the horizon.
+# Samples of the hemisphere. RADIAL, ANGULAR: of visible normals. HORIZON: of heights above the horizon.
 RADIAL, ANGULAR, HORIZON = 56, 56, 40
-# Disk-shaped lights of the light error: as many directions, and the radii in degrees that they take in turn.
+# Disk-shaped lights of the light error. LIGHTS: how many directions. LIGHT_RADII: their radii in degrees, in turn.
 LIGHTS = 96
 LIGHT_RADII = (10.0, 20.0, 35.0)
 
 
 @dataclass(frozen=True)
 class TableStatistics:
-    """What a lookup between the nodes gets wrong; relative to the lobe's L2 norm or to its albedo."""
+    """Errors of lookups between the nodes, relative to the lobe's L2 norm or to its albedo."""
 
     mean: float  # L2 error over the upper hemisphere, F = 1
     median: float
@@ -68,19 +68,19 @@ def validate(table: LookupTable, count: int = 28) -> TableStatistics:
 
 
 def grid(count, roughness=(0.1, 1.0)):
-    """(cos_theta_o, roughness) of count x count cell-centered points, roughness by roughness."""
+    """(cos_theta_o, roughness) of count x count cell-centered points, sorted by roughness."""
     center = (np.arange(count) + 0.5) / count
     rough = roughness[0] + center * (roughness[1] - roughness[0])
     return [(mu, value) for value in rough for mu in np.cos(np.radians(center * MOST_THETA))]
 
 
 def error_map(table: LookupTable, count: int = 28, roughness=(0.1, 1.0)) -> np.ndarray:
-    """Relative L2 errors (count, count) of the points of `validate`: rows roughness, columns theta_o."""
+    """Relative L2 errors (count, count) at the points of `validate`: roughness by row, theta_o by column."""
     return np.array([_measure(table, *point)[0] for point in grid(count, roughness)]).reshape(count, count)
 
 
 def layout_errors(table: LookupTable, count: int = 28) -> dict[str, float]:
-    """Mean errors of `validate` of the layouts for other engines, by their names."""
+    """Mean L2 errors, as in `validate`, of the layouts for other engines by name."""
     halves = header.half_layers(table)
     rows, columns, parameters = table.warp.shape
     channels = np.moveaxis(halves, 0, 2).reshape(rows, columns, -1).astype(np.float32)
@@ -96,7 +96,7 @@ def layout_errors(table: LookupTable, count: int = 28) -> dict[str, float]:
 
 
 def _textures_error(textures, mu, roughness) -> float:
-    """L2 error of the two textures, looked up as in the shaders that they are made for."""
+    """L2 error of the two textures when shaders look them up."""
     directions, weights = (part[0] for part in hemisphere_samples(np.array([mu]), np.array([roughness**2])))
     lobe = brdf.ggx_brdf_cosine(mu, roughness**2, directions)
     size = textures.shape[1]
@@ -151,7 +151,7 @@ def _basis_at(table, mu, roughness, directions):
 
 
 def disks(directions):
-    """(D, S) share of a pair of mirror-symmetric disk-shaped lights that covers each direction, spread evenly."""
+    """Coverage (D, S) of each direction by D pairs of mirror-symmetric disk-shaped lights, spread evenly."""
     centers, radii = _centers_of_disks()
     reach = np.cos(radii)[:, None]
     mirrored = directions * np.array([1.0, -1.0, 1.0])
@@ -159,7 +159,7 @@ def disks(directions):
 
 
 def _centers_of_disks():
-    """Directions (D, 3) and radii (D,) in radians."""
+    """Directions (D, 3) of the disks and their radii (D,) in radians."""
     k = np.arange(LIGHTS) + 0.5
     z, azimuth = 1.0 - k / LIGHTS, np.pi * (1.0 + np.sqrt(5.0)) * k
     radius = np.sqrt(1.0 - z * z)
@@ -169,7 +169,7 @@ def _centers_of_disks():
 
 @dataclass(frozen=True)
 class CornerStatistics:
-    """Smooth surfaces and the corner of the table where they are seen at grazing angles."""
+    """Errors for smooth surfaces, and figures of the corner of the table where these are seen at grazing angles."""
 
     smooth_mean: float  # L2 error, roughness 0.02 .. 0.1, theta_o 0 .. 88 degrees
     smooth_maximum: float
@@ -184,7 +184,7 @@ class CornerStatistics:
 
 
 def validate_corners(table: LookupTable, count: int = 14) -> CornerStatistics:
-    """Statistics of smooth surfaces, and of the mirror-like ones at grazing angles."""
+    """Statistics of smooth surfaces, and of mirror-like ones at grazing angles."""
     errors = error_map(table, count, (0.02, 0.1))
     rough, theta = np.meshgrid(np.linspace(0.0, 0.02, 65), np.radians(np.linspace(88.0, 90.0, 65)), indexing="ij")
     lobe = table.lookup(np.cos(theta).ravel().clip(0.0), rough.ravel())
@@ -199,8 +199,9 @@ def validate_corners(table: LookupTable, count: int = 14) -> CornerStatistics:
 
 
 def fresnel_basis_error(table: LookupTable, count: int = 7) -> dict[float, tuple[float, float]]:
-    """For each index of refraction the largest relative error of the directional albedo and of the lobe (L2) that the
-    combination of the table's Fresnel curves has, with the exact GGX lobe, at count x count points of `validate`."""
+    """For each index of refraction, the largest relative errors of the directional albedo and of the lobe (L2). These
+    are the errors of combining the table's Fresnel curves with the exact GGX lobe, at count x count points of
+    `validate`."""
     worst = {index: (0.0, 0.0) for index in IOR}
     cosines = np.linspace(0.0, 1.0, table.fresnel_curves.shape[1])
     weights_of = table.dielectric_weights(np.array(IOR))
@@ -220,7 +221,7 @@ def fresnel_basis_error(table: LookupTable, count: int = 7) -> dict[float, tuple
 def hemisphere_samples(cos_theta_o, alpha):
     """Directions (P, S, 3) with y > 0 and weights (P, S), for cos_theta_o (P,) and alpha (P,).
 
-    The weighted sum of a function that is even in y is its integral over the upper hemisphere; S = RADIAL * ANGULAR +
+    The weighted sum of a function that is even in y is its integral over the upper hemisphere. S = RADIAL * ANGULAR +
     HORIZON * (3 HORIZON / 2). Directions below the horizon have weight 0.
     """
     visible, visible_share = _visible_normal_samples(cos_theta_o, alpha)
@@ -278,19 +279,20 @@ def _horizon_density(directions):
     return 0.5 / (2.0 * np.sqrt(z)) / (0.5 * np.pi**2 * crowding)
 
 
-# Settings of the nodes, and how many azimuths of the view from the tangent each point of a sweep has.
+# ANISOTROPIES: settings of the nodes. AZIMUTHS: directions of the view around the normal at each point.
 ANISOTROPIES, AZIMUTHS = (0.2, 0.5, 0.75, 0.95), 4
-# Points of the quadrature beside which they are set: rings of visible normals, and points of each.
+# Points of the independent quadrature: rings of visible normals, and points of each ring.
 RINGS = (160, 320)
 
 
 def validate_anisotropic(count: int = 3, anisotropies=ANISOTROPIES) -> dict[str, dict[float, dict[str, float]]]:
-    """Errors of integrals of anisotropic lobes over disks, by kind of node and anisotropy: root mean square over all
-    points of `grid` (count x count) and AZIMUTHS, relative to their root mean square, and the largest of a point.
+    """Errors of integrals of anisotropic lobes over disks, by kind of node and anisotropy. They are the root mean
+    square over all points of `grid` (count x count) and AZIMUTHS, relative to that of the integrals, and the largest of
+    a point.
 
-    *technique*: of shading with a table (the same with every one), *reference*: of the technique `reference`, both
-    against a quadrature of the textbook's formulas over visible normals. Roughness is that of the node; both alphas are
-    as Cycles has them.
+    *technique* is shading with a table (the same for every table), *reference* is the technique `reference`. Both are
+    compared with a quadrature of the textbook formulas over visible normals. Roughness is that of the node; the alphas
+    are those of Cycles.
     """
     found = {}
     for kind in ("principled", "glossy"):
@@ -342,8 +344,8 @@ def _disk_lights():
 
 
 def _integrals_over_disks(view, tangent, alphas):
-    """Integrals (D,) of one anisotropic lobe: visible normals of GGX (Dupuy and Benyoub 2023), of which each stands for
-    as much, times the share of them that is masked."""
+    """Integrals (D,) of one anisotropic lobe over disks: sums over equally important visible normals of GGX (Dupuy and
+    Benyoub 2023), times the share of each that is not masked."""
     frame = np.stack([tangent, np.cross([0.0, 0.0, 1.0], tangent), [0.0, 0.0, 1.0]])
     own, stretch = frame @ view, np.array([*alphas, 1.0])
     axis = own * stretch / np.linalg.norm(own * stretch)

@@ -1,12 +1,12 @@
 """Continuation over the table: a first fit, node by node.
 
-For every node (roughness, theta_o) the warp minimizes the L2 error of the cosine-weighted BRDF over the upper
+For every node (roughness, theta_o), the warp minimizes the L2 error of the cosine-weighted BRDF over the upper
 hemisphere; the coefficients are projected out (`projection`). The nodes are visited along anti-diagonals, from rough to
-smooth and from normal to grazing incidence: each starts from what its neighbors predict, and a small penalty on the
+smooth and from normal to grazing incidence. Each starts from what its neighbors predict, and a small penalty on the
 distance to the prediction keeps it in their basin.
 
-Parameters of a node: log(a cos^2(beta) / (2 alpha)), log(c / (2 alpha)), beta, tilt, for
-M = [[a, 0, tan(beta)], [0, c, 0], [0, 0, 1]]: all of them tend to simple limits as alpha -> 0.
+The parameters of a node are log(a cos^2(beta) / (2 alpha)), log(c / (2 alpha)), beta, and tilt, for
+M = [[a, 0, tan(beta)], [0, c, 0], [0, 0, 1]]. All of them tend to simple limits as alpha -> 0.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from .projection import FLAT, Points, project
 
 PENALTY = 1e-3
 MAX_BETA = 1.5705
-# Where the lobe is cut by the horizon on the scale of alpha, free parameters would run away for no gain.
+# Bounds of the parameters. Where the horizon cuts the lobe on the scale of alpha, free ones would run away for no gain.
 LOWEST = np.array([-2.0, -2.5, -MAX_BETA, -1.5])
 HIGHEST = np.array([6.0, 2.0, 0.5, 1.5])
-# The same for the warp of a second lobe.
+# The same for the warp of a second lobe, either sign.
 MOST_OF_SECOND = np.array([4.0, 30.0, 4.0])
 
 
@@ -34,9 +34,10 @@ def bounds(family):
 
 
 def minimize(family, points, start, frozen, *, penalty=PENALTY, iterations=14):
-    """Levenberg-Marquardt over the warp parameters (P, n) from `start`, all points of the batch at once.
+    """Warp parameters (P, n) found by Levenberg-Marquardt from `start`, for all points of the batch at once.
 
-    `penalty` times the squared distance to `start` is added to the squared relative error; `frozen` (P, n) stay.
+    `penalty` times the squared distance to `start` is added to the squared relative error. Parameters that are `frozen`
+    (P, n) do not change.
     """
     identity = np.eye(family.parameters)
     lowest, highest = bounds(family)
@@ -74,8 +75,8 @@ def minimize(family, points, start, frozen, *, penalty=PENALTY, iterations=14):
 
 
 def warp_of(family, points, parameters):
-    """Entries (xx, xz, yy, zz) of W and the tilt, (P,) each, for parameters (P, n); for sums of two lobes the
-    parameters (P, 3) of the second one in place of the tilt."""
+    """Entries (xx, xz, yy, zz) of W and the tilt, (P,) each, for parameters (P, n). For sums of two lobes, the
+    parameters (P, 3) of the second one replace the tilt."""
     xx = np.exp(-parameters[:, 0]) * np.cos(parameters[:, 2]) ** 2
     entries = (xx, -xx * np.tan(parameters[:, 2]), np.exp(-parameters[:, 1]), 2.0 * points.alpha)
     if family.second is not None:
@@ -86,7 +87,7 @@ def warp_of(family, points, parameters):
 def walk(family, model, roughness, cosine, progress=None, state=None):
     """Warp parameters (R, T, n) of a table with nodes at roughness (R,), increasing, and cosine (T,), decreasing.
 
-    `progress(fraction)` is called after every anti-diagonal with `state()`: what to pass to go on from there.
+    `progress(fraction, state)` is called after every anti-diagonal. A later call with this `state` resumes from there.
     """
     rows, columns = len(roughness), len(cosine)
     parameters, first = state or (np.zeros((rows, columns, family.parameters)), 0)
@@ -107,7 +108,7 @@ def walk(family, model, roughness, cosine, progress=None, state=None):
 
 
 def _predict(parameters, i, j, last):
-    """What the neighbors that are already fitted say about node (i, j); `last` is the roughest row."""
+    """Prediction for node (i, j) from the neighbors that are already fitted; `last` is the roughest row."""
     if i == last and j == 0:
         return np.concatenate([[np.log(0.3), np.log(0.3)], np.zeros(parameters.shape[2] - 2)])
     if i == last:
@@ -128,7 +129,7 @@ def _search(family, points, prediction, symmetric):
 
 
 def _limit(family, cosine, alpha):
-    """Parameters (P, n) of A = B = C = 1 without tilt: what GGX tends to as alpha -> 0."""
+    """Parameters (P, n) of A = B = C = 1 without tilt, the limit of GGX as alpha -> 0."""
     sine = np.sqrt(1.0 - cosine**2)
     regularized = _regularized(cosine, alpha)
     parameters = np.zeros((len(alpha), family.parameters))
@@ -144,7 +145,7 @@ def _regularized(cosine, alpha):
 def stored_warp(parameters, roughness, cosine):
     """Channels (R, T, n) A, B, C (and the tilt) of `lookup_table` for parameters (R, T, n).
 
-    At normal incidence, where b = 0, B is extrapolated: it is even in theta_o.
+    At normal incidence b = 0; there B is extrapolated as an even function of theta_o.
     """
     sine = np.sqrt(1.0 - cosine**2)
     regularized = _regularized(cosine, (roughness**2)[:, None])

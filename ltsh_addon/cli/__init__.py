@@ -1,7 +1,7 @@
 """The command line, the same for `python -m ltsh_addon` and `blender --command ltsh`.
 
-Exit codes: 0 done; 1 the world is wrong (a file, a scene, a folder); 2 the arguments are; 130 interrupted by Ctrl-C;
-143 ended by SIGTERM.
+Exit codes: 0 done; 1 a file, scene or folder is wrong; 2 the arguments are wrong; 130 interrupted by Ctrl-C; 143 ended
+by SIGTERM.
 """
 
 from __future__ import annotations
@@ -50,9 +50,10 @@ exit codes: 0 done; 1 a file, scene or folder is wrong; 2 the arguments are; 130
 
 
 def main(arguments: list[str], program: str = "ltsh", open_file: str | None = None, bar=None) -> int:
-    """Run the command line; `open_file` is the .blend that the running Blender has open. Returns the exit code.
+    """Run the command line and return the exit code.
 
-    `bar` shows progress in place of a ProgressBar on stderr.
+    `open_file` is the .blend that the running Blender has open. `bar` shows progress in place of a ProgressBar on
+    stderr.
     """
     try:
         with interruption.raised(program):
@@ -63,7 +64,7 @@ def main(arguments: list[str], program: str = "ltsh", open_file: str | None = No
 
 
 class _Parser(argparse.ArgumentParser):
-    """Says what is wrong with arguments in one line, and help as results are said."""
+    """A parser that reports wrong arguments in one line (Misuse), and prints help on stdout like results."""
 
     def _print_message(self, message, file=None):
         print_out(message.rstrip("\n"))
@@ -102,7 +103,7 @@ def _run(options, program: str, bar: ProgressBar, open_file: str | None) -> int:
 
 
 def _explained(error) -> tuple[list[str], int]:
-    """What is to be said about an error, and the exit code."""
+    """The lines to print about an error, and the exit code."""
     text = error_line(error)
     if isinstance(error, OSError) and error.errno == errno.EMFILE:
         text = "this process may not open as many files as it needs; raise the limit (ulimit -n)"
@@ -119,7 +120,7 @@ def _explained(error) -> tuple[list[str], int]:
 
 
 def _fail(as_json: bool, bar, lines: list[str], code: int) -> int:
-    """Say what is wrong on stderr, and on stdout where a document is expected there; the exit code."""
+    """Print errors on stderr, and with --json as a document on stdout; returns the exit code."""
     for line in lines:
         bar.note(line)
     if as_json:
@@ -129,7 +130,7 @@ def _fail(as_json: bool, bar, lines: list[str], code: int) -> int:
 
 
 def _parsed(program: str, arguments: list[str]) -> argparse.Namespace:
-    """What the arguments mean. Raises Misuse."""
+    """The parsed arguments. Raises Misuse."""
     if wrong := [word for word in arguments if not is_text(word)]:
         raise Misuse(f"{program}: argument {wrong[0]!r} has bytes that are not UTF-8; rename what it names")
     parser, commands = _parser(program)
@@ -143,7 +144,7 @@ def _parsed(program: str, arguments: list[str]) -> argparse.Namespace:
 
 
 def _unknown_argument(options, unknown: list[str], commands: dict) -> str:
-    """What is wrong with arguments that the command does not have."""
+    """Error text for arguments that the command does not have."""
     program = commands[options.command].prog
     name = next((word.partition("=")[0] for word in unknown if word.startswith("-")), None)
     if name is None:
@@ -156,7 +157,7 @@ def _unknown_argument(options, unknown: list[str], commands: dict) -> str:
 
 
 def _parser(program: str) -> tuple[argparse.ArgumentParser, dict[str, argparse.ArgumentParser]]:
-    """The parser, and those of the commands by name."""
+    """The parser, and the parsers of the commands by name."""
     parser = _Parser(
         prog=program,
         description="Shade scenes under area lights with linearly transformed lobes and compare with Cycles.",

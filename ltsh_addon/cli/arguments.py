@@ -1,4 +1,4 @@
-"""Arguments of the command line: those of the declared options, and those that say how a job is run."""
+"""Arguments of the command line: those of the declared options, and those about how a job is run."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from ..pipeline.options import arguments_of
 
 
 class Misuse(Exception):
-    """The arguments do not make sense together."""
+    """The arguments are wrong, or do not make sense together."""
 
 
 def from_text(parse: Callable[[str], object]) -> Callable[[str], object]:
-    """`parse` as argparse wants it: the message of its ValueError is shown."""
+    """`parse` for argparse, which then shows the message of its ValueError."""
 
     def value(text):
         try:
@@ -29,14 +29,14 @@ def from_text(parse: Callable[[str], object]) -> Callable[[str], object]:
 
 
 def add_options(parser, kind: type, *, but: Iterable[str] = (), **changes) -> None:
-    """The arguments of all options of `kind`, PictureOptions or BakeOptions, `but` for some; `changes` by name."""
+    """Add the arguments of the options class `kind`, except `but`; `changes` are keywords for `add_option` by name."""
     for name in arguments_of(kind):
         if name not in but:
             add_option(parser, kind, name, **changes.get(name, {}))
 
 
 def add_option(parser, kind: type, name: str, **changes) -> None:
-    """The arguments of one option, with `changes` of what argparse is told."""
+    """Add the arguments of one option, with `changes` of argparse's keywords."""
     default, arguments = arguments_of(kind)[name]
     group = parser.add_mutually_exclusive_group() if len(arguments) > 1 else parser
     for argument in arguments:
@@ -45,13 +45,13 @@ def add_option(parser, kind: type, name: str, **changes) -> None:
             keywords["type"] = from_text(keywords["type"])
         if argument.flags[0].startswith("-"):
             keywords = {"dest": name, **keywords}
-            # Of several arguments none has the default, which `options_from` knows.
+            # Several arguments of one option have no default; `options_from` fills it in.
             keywords.setdefault("default", None if len(arguments) > 1 or "append" in keywords.values() else default)
         group.add_argument(*argument.flags, **keywords)
 
 
 def scenes_of(arguments, open_file: str | None) -> tuple[Path, ...]:
-    """The files to work on: those named, or the one that Blender has open. Raises Misuse."""
+    """The files to work on: those on the command line, or the one that Blender has open. Raises Misuse."""
     if arguments.scenes and open_file:
         raise Misuse(f"SCENE is {arguments.scenes[0]!r}, but Blender has {open_file!r} open already; give one of them")
     if not (arguments.scenes or open_file):
@@ -60,7 +60,7 @@ def scenes_of(arguments, open_file: str | None) -> tuple[Path, ...]:
 
 
 def shard(text: str) -> tuple[int, int]:
-    """I/N with 1 <= I <= N."""
+    """The shard (I, N) of the text I/N with 1 <= I <= N."""
     number, separator, count = text.partition("/")
     if separator and number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count):
         return int(number), int(count)
@@ -68,7 +68,7 @@ def shard(text: str) -> tuple[int, int]:
 
 
 def tolerance(text: str) -> Tolerance:
-    """A number, or a percentage of what it is compared with."""
+    """The tolerance of a number, or of a percentage of the baseline's error."""
     number, relative = text.removesuffix("%"), text.endswith("%")
     try:
         value = float(number) / (100.0 if relative else 1.0)
@@ -80,7 +80,7 @@ def tolerance(text: str) -> Tolerance:
 
 
 def add_batch(parser) -> None:
-    """What becomes of finished tasks, and which tasks are done."""
+    """Add the arguments about finished tasks and shards."""
     chosen = parser.add_mutually_exclusive_group()
     for flag, existing, meaning in (
         ("--overwrite", batch.OVERWRITE, "do all again (default)"),
@@ -94,7 +94,7 @@ def add_batch(parser) -> None:
 
 
 def add_baseline(parser) -> None:
-    """Regression of a comparison."""
+    """Add the arguments about the baseline of a comparison."""
     meaning = "report.json of an earlier comparison: exit code 1 where an error got worse"
     parser.add_argument("--baseline", type=Path, metavar="REPORT", help=meaning)
     meaning = "how much worse is let pass: 0.002 (a fifth of a percent) or 10%% of the baseline's error "
@@ -103,7 +103,7 @@ def add_baseline(parser) -> None:
 
 
 def add_talk(parser, json_meaning: str = "print the report on stdout as one JSON document") -> None:
-    """What is printed."""
+    """Add the arguments about what is printed."""
     parser.add_argument("--json", action="store_true", help=json_meaning)
     parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
     parser.add_argument("--log", type=Path, metavar="FILE", help="append to FILE what was done when")

@@ -1,4 +1,4 @@
-"""The commands. `add_<command>` declares the arguments of one and names the function that runs it.
+"""The commands. `add_<command>` declares the arguments of a command and the function that runs it.
 
 That function takes the arguments, the progress bar and the file that Blender has open, and returns the exit code.
 """
@@ -134,7 +134,7 @@ def add_render(parser) -> None:
 
 
 def _add_job(parser, kind, *, but=(), **changes) -> None:
-    """The options `kind` `but` for some, with `changes`, and how the job is run."""
+    """Add the arguments of the options class `kind`, except `but`, with `changes`, and those about running a job."""
     add_options(parser, kind, but=(*but, "scripts"), **changes)
     add_batch(parser)
     add_option(parser, kind, "scripts")
@@ -166,7 +166,7 @@ def _demo(arguments, bar, open_file) -> int:
 
 
 def job_of(arguments, scenes: tuple[Path, ...]) -> Job:
-    """The job that the arguments of demo, compare, shade, bake, view or render describe. Raises Misuse."""
+    """The job of the arguments of demo, compare, shade, bake, view or render. Raises Misuse."""
     kinds = {"bake": BakeOptions, "view": ViewOptions, "render": RenderOptions}
     kind = kinds.get(arguments.command, PictureOptions)
     command = "compare" if arguments.command == "demo" else arguments.command
@@ -180,7 +180,7 @@ def job_of(arguments, scenes: tuple[Path, ...]) -> Job:
 
 
 def _printed(arguments, document: dict, code: int) -> int:
-    """`code`, after the document of --json was printed."""
+    """Print the document if --json is given; returns `code`."""
     if arguments.json:
         print_json(document)
     return code
@@ -218,8 +218,8 @@ def _merge(arguments, bar, open_file) -> int:
 
 
 RELIGHT = """Write pictures anew with other powers and colors of their lights, without Blender and
-without a ray. OUT is what shade or compare wrote with --keep-visibility. Lights have
-the names that report.json tells."""
+without a ray. OUT is what shade, compare or render wrote with --keep-visibility.
+Lights have the names that report.json tells."""
 RELIGHT_EXAMPLES = """examples:
   %(prog)s out/room --light Key --power x2 --color 1,.8,.6
   %(prog)s out/room --light Fill --exposure -1.5 --mute Rim --mute Lamp
@@ -233,7 +233,7 @@ own, whose brightest channel counts as 1; each step of exposure doubles the powe
 def add_relight(parser) -> None:
     """`ltsh relight`."""
     with_examples(parser, RELIGHT, RELIGHT_EXAMPLES)
-    parser.add_argument("folder", type=Path, metavar="OUT", help="the folder that -o of shade or compare named")
+    parser.add_argument("folder", type=Path, metavar="OUT", help="the folder that -o of shade, compare or render named")
     parser.add_argument(
         "-o", dest="output", type=Path, metavar="OUT2", help="folder for the results; default: OUT/relit"
     )
@@ -254,7 +254,7 @@ def _light(name: str) -> dict:
 
 
 class _OfLight(argparse.Action):
-    """Keeps a value for the light that was named last."""
+    """Stores a value for the light that was named last."""
 
     def __call__(self, parser, namespace, value, option_string=None):
         if not namespace.changes:
@@ -374,7 +374,7 @@ def job_parsers() -> dict[str, argparse.ArgumentParser]:
 
 
 def _for_each(jobs: list[FileJob], do, arguments, bar) -> int:
-    """Call do(job, settings, baseline) for every job; what is wrong with one does not keep the others from it."""
+    """Call do(job, settings, baseline) for every job; the others go on if one fails. Returns the worst exit code."""
     baselines = [baseline_of(wanted.arguments) for wanted in jobs]
     documents, worst = [], 0
     for number, (wanted, baseline) in enumerate(zip(jobs, baselines, strict=True), 1):
@@ -416,7 +416,7 @@ def add_tables(parser) -> None:
     with_examples(parser, TABLES, TABLES_EXAMPLES)
     actions = parser.add_subparsers(dest="action", required=True)
     for action, meaning in SCRIPTS.items():
-        # The script parses its own options: nothing starts with this prefix, so that all of them are taken as they are.
+        # The script parses its own options. No argument starts with this prefix, so all are passed on unchanged.
         script = actions.add_parser(action, help=meaning, add_help=False, prefix_chars="\0")
         script.add_argument("arguments", nargs="*")
         script.set_defaults(run=_run_table_script, quiet=False, log=None)
@@ -461,7 +461,7 @@ def _export_tables(arguments, bar, open_file) -> int:
 
 
 def do_job(job: Job, arguments, bar, baseline: Baseline | None = None) -> tuple[dict, int]:
-    """Do the job, or its shard; the document for --json, and the exit code: 1 where something is wrong."""
+    """Do the job, or its shard. Returns the document for --json and the exit code, 1 if something is wrong."""
     shard = arguments.shard or (1, 1)
 
     def tell(state):
@@ -485,7 +485,7 @@ def do_job(job: Job, arguments, bar, baseline: Baseline | None = None) -> tuple[
 
 
 def merge_job(output: Path, arguments, bar, baseline: Baseline | None = None) -> tuple[dict, int]:
-    """Assemble and print what a whole job has made; the document for --json, and the exit code as of `do_job`."""
+    """Assemble and print the results of a whole job. Returns the document for --json and the exit code, as `do_job`."""
     merged = merge(output, bar)
     bar.finish()
     _complain(bar, "not baked" if merged.command == "bake" else "failed", merged.problems)
@@ -508,7 +508,7 @@ def merge_job(output: Path, arguments, bar, baseline: Baseline | None = None) ->
 
 
 def baseline_of(arguments) -> Baseline | None:
-    """What --baseline names, read before anything is done."""
+    """The baseline of --baseline, or None. Call it before anything is done, since it may raise."""
     path = getattr(arguments, "baseline", None)
     return None if path is None else Baseline.read(path)
 

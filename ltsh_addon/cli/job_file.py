@@ -1,4 +1,4 @@
-"""Job files (TOML): a job stands for a command line; all mistakes are named before anything starts."""
+"""Job files (TOML): each job is like a command line. All mistakes are reported before anything starts."""
 
 from __future__ import annotations
 
@@ -14,30 +14,30 @@ from ..scene import SceneError, shortened
 from ..shading import TableError
 from .arguments import Misuse
 
-# Options that name files, relative to the job file.
+# Options whose values are paths relative to the job file.
 _PATHS = ("baseline",)
-# Options of the run as a whole, which are given to `ltsh run`.
-# Among these is that scripts may run: a job file, like the .blend, may come from anyone.
+# Options of the run as a whole, which only `ltsh run` itself takes. Running scripts is among them, because a job file,
+# like a .blend, may come from anyone.
 _OF_THE_RUN = ("overwrite", "resume", "skip-existing", "shard", "json", "quiet", "log", "help", "enable-autoexec")
 _OF_EVERY_JOB = ("command", "scene", "scenes", "output")
 
-MOST_LINES = 50  # about one file
+MOST_LINES = 50  # of mistakes that are printed about one file
 
 JobOf = Callable[[argparse.Namespace, tuple[Path, ...]], Job]
 
 
 @dataclass(frozen=True)
 class FileJob:
-    """One job of a file: the job, and its options as of a command line."""
+    """One job of a file."""
 
     job: Job
-    arguments: argparse.Namespace
+    arguments: argparse.Namespace  # as parsed from a command line
 
 
 class Mistakes(Misuse):
-    """What is wrong in a job file; `lines` holds a line for each mistake.
+    """The mistakes in a job file, one of the `lines` for each.
 
-    `of_the_world` is True where the file is right and only what it names is missing or damaged.
+    `of_the_world` is True if the job file is right, and only files that it names are missing or damaged.
     """
 
     def __init__(self, lines: list[str], of_the_world: bool = False):
@@ -46,9 +46,9 @@ class Mistakes(Misuse):
 
 
 def read_jobs(path: Path, parsers: dict[str, argparse.ArgumentParser], job_of: JobOf) -> list[FileJob]:
-    """The jobs of a file, by the parsers of commands and what makes a job of parsed arguments and scenes.
+    """The jobs of a file. `parsers` are those of the commands; `job_of` makes a job of parsed arguments and scenes.
 
-    Raises Mistakes with all that is wrong in the file, OSError where it cannot be read.
+    Raises Mistakes with all mistakes in the file, OSError if it cannot be read.
     """
     try:
         document = read_toml(path)
@@ -59,7 +59,7 @@ def read_jobs(path: Path, parsers: dict[str, argparse.ArgumentParser], job_of: J
     reader = _Reader(path, parsers, job_of)
     wanted = reader.read(document)
     if reader.mistakes:
-        # Those of the defaults are found with every job.
+        # Mistakes in the defaults are found again with every job.
         lines = list(dict.fromkeys(reader.mistakes))
         more = [f"{path}: {len(lines) - MOST_LINES} more mistakes"] if len(lines) > MOST_LINES else []
         raise Mistakes(lines[:MOST_LINES] + more, reader.of_the_world)
@@ -67,7 +67,7 @@ def read_jobs(path: Path, parsers: dict[str, argparse.ArgumentParser], job_of: J
 
 
 class _Reader:
-    """Reads one file and collects all mistakes, a line for each, which names the job and the key."""
+    """Reads one file and collects all mistakes, each a line that names the job and the key."""
 
     def __init__(self, path, parsers, job_of):
         self.path, self.parsers, self.job_of = path, parsers, job_of
@@ -75,7 +75,7 @@ class _Reader:
         self.of_the_world = True
 
     def read(self, document) -> list[FileJob]:
-        """The jobs that are right."""
+        """The jobs without mistakes."""
         for key in document:
             if key not in ("defaults", "job"):
                 self._complain("", f"table {key!r} is unknown here; expected defaults and job")
@@ -112,7 +112,7 @@ class _Reader:
         return self._checked(where, parser, words, scenes) if len(self.mistakes) == before else None
 
     def _checked(self, where, parser, words, scenes) -> FileJob | None:
-        """The job, if its options make sense together and its files are there."""
+        """The job, if its options make sense together and its files are there; else None."""
         from ..blender.process.client import check_readable
 
         try:
@@ -152,7 +152,7 @@ class _Reader:
         self._complain(where, f"option {key!r} is unknown here; {hint}")
 
     def _words(self, where, key, value, action) -> list[str]:
-        """The option as on a command line; complains where its value is wrong."""
+        """The option as words of a command line; [] and a mistake if its value is wrong."""
         if action.nargs == 0:
             if not isinstance(value, bool):
                 self._complain(where, f"{key} is {value!r}, expected true or false")
@@ -181,7 +181,7 @@ class _Reader:
         return item
 
     def _check_outputs(self, jobs) -> None:
-        """Every folder holds the results of one job."""
+        """Check that every output folder belongs to one job."""
         first: dict[Path, int] = {}
         for number, output in enumerate((job.get("output") for job in jobs), 1):
             if isinstance(output, str) and "\0" not in output:
@@ -191,20 +191,20 @@ class _Reader:
                     self._complain(f"job {number}", text)
 
     def _complain(self, where: str, text: str, of_the_world: bool = False) -> None:
-        """`where` is "job 2", "defaults", or "" for the file as a whole."""
+        """Note a mistake; `where` is "job 2", "defaults", or "" for the file as a whole."""
         self.of_the_world &= of_the_world
         place = f"{self.path}, {where}" if where else str(self.path)
         self.mistakes.append(f"{place}: {shortened(' '.join(text.split()), 500)}")
 
 
 def _options(parser) -> dict[str, argparse.Action]:
-    """Actions by the names of options without dashes, but for those of the run as a whole."""
+    """Actions by the names of options without dashes, except those of the run as a whole."""
     actions = {name[2:]: action for action in parser._actions for name in action.option_strings}
     return {name: action for name, action in actions.items() if name and name not in _OF_THE_RUN}
 
 
 def _parse(parser, words) -> argparse.Namespace:
-    """What the parser makes of `words`; it raises instead of ending the program."""
+    """The arguments parsed from `words`. Raises Misuse where the parser would end the program."""
 
     def refuse(message):
         raise Misuse(message)

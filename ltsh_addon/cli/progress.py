@@ -1,4 +1,4 @@
-"""What the command line says: a bar and lines of a log meanwhile, documents on stdout."""
+"""The output of the command line: a progress bar, a log, and documents on stdout."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from ..scene import shortened
 
 
 class RunLog:
-    """Lines for the file `path`; without one they go nowhere. A context, which closes it.
+    """Context: a log in the file `path`; None: no log.
 
-    A log that cannot be written does not end what it is about: `problem` then says why, and no more is written.
+    A log that cannot be written does not stop the command: `problem` says why, and nothing more is written.
     """
 
     def __init__(self, path: Path | None):
         self._path, self._file, self.problem = path, None, None
         try:
-            # Unbuffered, so that a line is one write, however long: several shards may write to one log.
+            # Unbuffered, so that every line is a single write: several shards may write to one log.
             self._file = None if path is None else open(path, "ab", buffering=0)
         except OSError as error:
             self._fail(error)
@@ -41,7 +41,7 @@ class RunLog:
         if self._file is not None and self.problem is None:
             stamp = datetime.now().astimezone().isoformat(timespec="seconds")
             try:
-                # Names of files may hold bytes that are no UTF-8.
+                # File names may have bytes that are not UTF-8.
                 self._file.write(f"{stamp} {' '.join(text.split())}\n".encode(errors="backslashreplace"))
             except OSError as error:
                 self._fail(error)
@@ -52,14 +52,14 @@ class RunLog:
 
 BAR_WIDTH = 28
 LONGEST_LINE = 1000
-# Seconds between two drawings of the bar, and between two lines of a log that tell that a long stage goes on.
+# Seconds between two updates: of the bar on a terminal, and of the lines of a long stage on other streams.
 BAR_INTERVAL, LOG_INTERVAL = 0.1, 10.0
 
 
 class ProgressBar:
     """Callable as progress(stage, fraction); `finish` ends the line.
 
-    Of a job with several tasks, announced by `begin_task`, it shows where the job stands, and the stage beside it.
+    For a job with several tasks, announced by `begin_task`, it shows the progress of the job, with the stage beside it.
     """
 
     def __init__(self, stream, *, quiet: bool = False, log: RunLog | None = None):
@@ -75,7 +75,7 @@ class ProgressBar:
         self._line_open = False
 
     def __call__(self, stage: str, fraction: float) -> bool:
-        """Show where `stage` stands, fraction in [0, 1]; returns True: a bar never stops the work."""
+        """Show the progress of `stage`, a fraction in [0, 1]. Always returns True, since a bar never stops the work."""
         if self._quiet:
             return True
         now = time.monotonic()
@@ -85,7 +85,7 @@ class ProgressBar:
                 self._draw(f"{self._task} of {self._tasks} {stage}", (self._task - 1) / self._tasks, now)
             return True
         if stage != self._stage:
-            if self._line_open and self._fraction < 1.0:  # many stages end without a last word
+            if self._line_open and self._fraction < 1.0:  # many stages never report their end
                 self._draw(self._stage, 1.0, now)
             self.finish()
             self._stage, self._stage_start, self._last_shown = stage, now, -1e9
@@ -99,7 +99,7 @@ class ProgressBar:
         return True
 
     def begin_job(self, label: str) -> None:
-        """Another job begins: a line, unless quiet."""
+        """Begin another job: print a line, unless quiet, and log it."""
         self.finish()
         self._tasks, self._stage = 1, None
         self.log.line(label)
@@ -107,14 +107,14 @@ class ProgressBar:
             self._say(label)
 
     def begin_task(self, number: int, tasks: int) -> None:
-        """Task `number`, from 1, of so many begins."""
+        """Begin task `number` of `tasks`, counted from 1."""
         if number == 1:
             self.finish()
             self._stage_start = time.monotonic()
         self._task, self._tasks = number, tasks
 
     def end_task(self, name: str, seconds: float, failed: bool = False) -> None:
-        """The task has ended; where the stream is no terminal, that is a line."""
+        """End the task: update the bar, or print a line if the stream is not a terminal; and log it."""
         name = f"{name} failed" if failed else name
         self.log.line(f"{self._task} of {self._tasks}: {name} in {seconds:.1f} s")
         if self._quiet or self._tasks == 1:
@@ -137,9 +137,9 @@ class ProgressBar:
             self._say(text)
 
     def note(self, text: str) -> None:
-        """Print a line that is no progress, also when quiet, and log it.
+        """Print a line that is not progress, even if quiet, and log it.
 
-        It may hold names from files of others: those do not speak to the terminal.
+        Control characters are escaped, since names from other people's files must not control the terminal.
         """
         self.finish()
         text = shortened(" ".join(text.split()), LONGEST_LINE)
@@ -163,7 +163,7 @@ class ProgressBar:
         return f"({duration(elapsed / fraction - elapsed)} left)"
 
     def finish(self) -> None:
-        """End the current line, so that what follows starts on its own."""
+        """End the current line, so that further output starts on a new one."""
         if self._line_open:
             self._write("\n")
             self._line_open = False
@@ -172,7 +172,7 @@ class ProgressBar:
         self._write(f"{text}\n")
 
     def _write(self, text: str) -> None:
-        """Nobody is left to be told where the stream takes no more: its terminal is closed, its disk is full."""
+        """Write to the stream. If that fails (closed terminal, full disk), stay silent from then on."""
         if self._stream is not None:
             try:
                 self._stream.write(_in_letters_of(self._stream, text))
@@ -182,14 +182,14 @@ class ProgressBar:
 
 
 def duration(seconds: float) -> str:
-    """Seconds as people read them: 40 s, 12 min, 3.3 h."""
+    """Seconds as text: 40 s, 12 min, 3.3 h."""
     if seconds < 100.0:
         return f"{seconds:.0f} s"
     return f"{seconds / 60.0:.0f} min" if seconds < 6000.0 else f"{seconds / 3600.0:.1f} h"
 
 
 def print_out(text: str) -> None:
-    """Print on stdout, if there is one, at once. Raises OSError where it takes no more, and nothing goes there then."""
+    """Print on stdout, if there is one, and flush. Raises OSError if that fails; later output is discarded then."""
     stdout = sys.stdout
     if stdout is None:
         return
@@ -197,25 +197,25 @@ def print_out(text: str) -> None:
         stdout.write(_in_letters_of(stdout, f"{text}\n"))
         stdout.flush()
     except OSError as error:
-        # What is left in its buffer would raise again at the end of the process.
+        # The rest of the buffer would raise again at the end of the process.
         with contextlib.suppress(OSError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), stdout.fileno())
         raise OSError(f"stdout: cannot be written ({error.strerror})") from error
 
 
 def print_json(document) -> None:
-    """One document on stdout, in ASCII: a redirected stdout may lack the letters of a light's name."""
+    """Print a document on stdout, in ASCII: the encoding of a redirected stdout may lack characters of names."""
     print_out(json.dumps(json.loads(json_text(document)), indent=2))
 
 
 def _in_letters_of(stream, text: str) -> str:
-    """Letters that the encoding of the stream lacks are spelled out."""
+    """`text` with characters escaped that the encoding of the stream lacks."""
     encoding = stream.encoding or "ascii"
     return text.encode(encoding, "backslashreplace").decode(encoding)
 
 
 def reserve_stdout() -> None:
-    """Keep stdout for what sys.stdout prints: from now on, Blender's own lines (from C) go to stderr."""
+    """Reserve stdout for sys.stdout: from now on, Blender's own lines (from C) go to stderr."""
     if sys.stdout is None:
         return
     sys.stdout.flush()
@@ -228,7 +228,7 @@ REPORT_SECONDS = 0.1
 
 
 class MessageProgress(ProgressBar):
-    """Sends progress as {"stage", "fraction"} a few times per second; keeps the commands' other lines as `notes`."""
+    """Sends progress as {"stage", "fraction"} a few times per second, and collects all other lines as `notes`."""
 
     def __init__(self, send: Callable[[dict], None]):
         super().__init__(None)
@@ -245,5 +245,5 @@ class MessageProgress(ProgressBar):
         return True
 
     def note(self, text: str) -> None:
-        """Keep the line."""
+        """Append the line to `notes`."""
         self.notes.append(text)

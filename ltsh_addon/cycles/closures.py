@@ -1,4 +1,4 @@
-"""Reflectance of Cycles' closures: Fresnel terms, albedos of microfacet, glass and sheen lobes."""
+"""Reflectance of Cycles' closures: Fresnel terms, and albedos of microfacet, glass and sheen lobes."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ DIELECTRIC_AVERAGE = 4.08567, 1.00071
 class GlassAlbedos:
     """Tables by roughness, cosine of the view and ((ior - 1) / (ior + 1))^(1/2), for one side of the surface."""
 
-    albedo: np.ndarray  # (R, C, Z) of all light
+    albedo: np.ndarray  # (R, C, Z) share of the light that is reflected or transmitted
     average: np.ndarray  # (R, Z) integral of 2 mu albedo(mu)
 
 
 @cache
 def glass_albedos(inside: bool) -> GlassAlbedos:
-    """Tables of a surface seen from outside, or from inside."""
+    """Tables of a surface seen from outside, or from `inside`."""
     nodes = np.clip(np.linspace(0.0, 1.0, GLASS_NODES), SMALLEST_COSINE, 1.0)
     albedo = np.empty((GLASS_NODES, GLASS_NODES, GLASS_NODES))
     root = np.sqrt(np.minimum(nodes**4, MAX_F0))
@@ -37,7 +37,7 @@ def glass_albedos(inside: bool) -> GlassAlbedos:
         normals = _visible_normals(roughness**2, nodes)
         for column, ior in enumerate((1.0 + root) / (1.0 - root)):
             albedo[row, :, column] = _albedo(normals, nodes, roughness**2, 1.0 / ior if inside else ior)
-    # The albedo is linear between nodes, mu times it is not: Simpson's rule for each piece.
+    # The albedo is linear between nodes, but mu times it is not, so each piece takes Simpson's rule.
     middle = 0.5 * (nodes[1:] + nodes[:-1])
     ends = nodes[:, None] * albedo
     between = middle[:, None] * 0.5 * (albedo[:, 1:] + albedo[:, :-1])
@@ -46,7 +46,7 @@ def glass_albedos(inside: bool) -> GlassAlbedos:
 
 
 def _visible_normals(alpha, cosine):
-    """Visible normals (N, C, 3) for views with y = 0 and `cosine` (C,), each as probable as the others."""
+    """Equally probable visible normals (N, C, 3) for views with y = 0 and `cosine` (C,)."""
     steps = (np.arange(NORMALS_PER_AXIS) + 0.5) / NORMALS_PER_AXIS
     radius, turn = np.meshgrid(np.sqrt(steps), 2.0 * np.pi * steps)
     s, t = (radius * np.cos(turn)).reshape(-1, 1), (radius * np.sin(turn)).reshape(-1, 1)
@@ -64,7 +64,7 @@ def _visible_normals(alpha, cosine):
 
 
 def _albedo(normals, cosine, alpha, ior):
-    """Albedo (C,) for views under `cosine` (C,)."""
+    """Albedo (C,) for views with `cosine` (C,); `normals` are the `_visible_normals`."""
     view = np.stack([np.sqrt(1.0 - cosine**2), np.zeros_like(cosine), cosine], axis=-1)
     towards = np.maximum((normals * view).sum(axis=-1), 0.0)
     fresnel = dielectric_reflectance(towards, ior)
@@ -76,8 +76,8 @@ def _albedo(normals, cosine, alpha, ior):
 
 
 def _seen(height, cosine, alpha):
-    """Share of the light towards directions with cosine `height` that height-correlated Smith masking lets through,
-    given that the normal is seen; none below the horizon."""
+    """Share of the light towards directions with cosine `height` that height-correlated Smith masking lets through, if
+    the normal is visible; 0 below the horizon."""
     entering, leaving = (_masked(value, alpha) for value in (cosine, np.maximum(height, 1e-9)))
     return np.where(height > 0.0, (1.0 + entering) / (1.0 + entering + leaving), 0.0)
 
@@ -92,11 +92,12 @@ SMALLEST_ROUGHNESS = 1e-3
 
 
 def sheen_lobe(cosine: np.ndarray, roughness: np.ndarray) -> np.ndarray:
-    """Albedo, a and b (3, P) of sheen of `roughness` (P,), as in Blender, seen under the cosine (P,) from the normal.
+    """Albedo, a and b (3, P) of sheen, for `cosine` (P,) between view and normal and for Blender's `roughness` (P,).
 
-    The lobe times cosine is albedo z / pi (a / ((a x + b z)^2 + (a y)^2 + z^2))^2, z the normal and x the side of the
-    view: a linearly transformed cosine (Zeltner, Burley and Chiang 2022, "Practical multiple-scattering sheen using
-    linearly transformed cosines"). Albedos are within 1e-4 of Cycles 4.5 and 5.2, and so is the lobe.
+    The lobe times cosine is albedo z / pi (a / ((a x + b z)^2 + (a y)^2 + z^2))^2, where z is along the normal and x
+    points to the side of the view. It is a linearly transformed cosine (Zeltner, Burley and Chiang 2022, "Practical
+    multiple-scattering sheen using linearly transformed cosines"). Albedo and lobe agree with Cycles 4.5 and 5.2 to
+    1e-4.
     """
     tables = _sheen_tables()
     x, y = np.clip(cosine, 0.0, 1.0), np.clip(roughness, SMALLEST_ROUGHNESS, 1.0)
@@ -108,15 +109,15 @@ def sheen_lobe(cosine: np.ndarray, roughness: np.ndarray) -> np.ndarray:
 
 
 def sheen_albedo(cosine: np.ndarray, roughness: np.ndarray) -> np.ndarray:
-    """The albedo (P,) of `sheen_lobe`."""
+    """The albedo (P,) of `sheen_lobe`, with its arguments."""
     return sheen_lobe(cosine, roughness)[0]
 
 
 def velvet_albedo(cosine: np.ndarray, roughness: np.ndarray) -> np.ndarray:
-    """Albedo (P,) of velvet of `roughness` (P,) seen under the cosine (P,) from the normal, within 1 % of Cycles
-    from a roughness of 0.3 on (5 % at 0.1).
+    """Albedo (P,) of velvet, for `cosine` (P,) between view and normal and for `roughness` (P,).
 
-    Ashikhmin, Premoze and Shirley 2000, "A microfacet-based BRDF generator", section 4.3, without Fresnel.
+    It agrees with Cycles to 1 % from a roughness of 0.3 on, and to 5 % at 0.1. Ashikhmin, Premoze and Shirley 2000, "A
+    microfacet-based BRDF generator", section 4.3, without Fresnel.
     """
     table, found = _velvet_table(), 0.0
     for index, weight in corners(np.clip(cosine, 0.0, 1.0), np.clip(roughness, 0.0, 1.0)):
@@ -125,7 +126,7 @@ def velvet_albedo(cosine: np.ndarray, roughness: np.ndarray) -> np.ndarray:
 
 
 def corners(x: np.ndarray, y: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """The nodes, as numbers (P,) in the table, around points of the unit square, with their bilinear weights (P,)."""
+    """Bilinear interpolation at points of the unit square: numbers (P,) of four nodes in the table and weights (P,)."""
     x, y = (SHEEN_NODES - 1) * x, (SHEEN_NODES - 1) * y
     column, row = (np.minimum(value.astype(int), SHEEN_NODES - 2) for value in (x, y))
     return [
@@ -142,15 +143,15 @@ def _sheen_tables() -> np.ndarray:
 
 @cache
 def _velvet_table() -> np.ndarray:
-    """Albedos of velvet at the nodes (cosine, roughness) of `corners`, by midpoints in both angles of the other ray."""
+    """Albedos of velvet at the nodes (cosine, roughness) of `corners`, by the midpoint rule over light directions."""
     steps = np.linspace(0.0, 1.0, SHEEN_NODES)
     view, sigma = np.meshgrid(np.maximum(steps, 0.5 / SHEEN_NODES), np.maximum(steps, 0.01), indexing="ij")
     view, sigma = view.reshape(-1, 1), sigma.reshape(-1, 1)
     angle = (np.arange(VELVET_STEPS) + 0.5) / VELVET_STEPS
     theta, phi = (part.ravel() for part in np.meshgrid(0.5 * np.pi * angle, np.pi * angle))
     light, across = np.cos(theta), np.sin(theta) * np.cos(phi)
-    half2 = 0.5 * (1.0 + view * light + np.sqrt(1.0 - view**2) * across)  # squared cosine of half the angle between
-    normal2 = np.clip((view + light) ** 2 / (4.0 * half2), 0.0, 1.0 - 1e-9)  # squared cosine of the normal to the half
+    half2 = 0.5 * (1.0 + view * light + np.sqrt(1.0 - view**2) * across)  # squared cosine of view and half vector
+    normal2 = np.clip((view + light) ** 2 / (4.0 * half2), 0.0, 1.0 - 1e-9)  # squared cosine of normal and half vector
     ratio = 2.0 * np.sqrt(normal2 / half2)
     masked = np.minimum(1.0, ratio * np.minimum(view, light))
     density = np.exp(-normal2 / ((1.0 - normal2) * sigma**2)) / (np.pi * (sigma * (1.0 - normal2)) ** 2)
@@ -160,7 +161,7 @@ def _velvet_table() -> np.ndarray:
 
 VELVET_STEPS = 48
 ALBEDO_NODES = 32
-# Cosines at which conductors are fitted (fewer at grazing angles), and the index of the dielectric curve in the fit.
+# FIT_COSINES: where conductors are fitted. CONDUCTOR_FIT_IOR: index of the dielectric curve in that fit.
 FIT_COSINES = (np.arange(64) + 0.5) / 64.0
 CONDUCTOR_FIT_IOR = 1.5
 
@@ -171,7 +172,7 @@ def f0_of_ior(ior: np.ndarray) -> np.ndarray:
 
 
 def specular_level_applied(ior: np.ndarray, level: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(index of refraction (Q,), f0 (Q,)) of a Principled dielectric: f0 is that of `ior` times 2 `level`."""
+    """Index of refraction (Q,) and f0 (Q,) of a Principled dielectric; f0 is that of `ior` times 2 `level`."""
     f0 = f0_of_ior(ior) * np.where(level == 0.5, 1.0, 2.0 * np.maximum(level, 0.0))
     root = np.sqrt(np.minimum(f0, MAX_F0))
     scaled = (1.0 + root) / (1.0 - root)
@@ -179,27 +180,27 @@ def specular_level_applied(ior: np.ndarray, level: np.ndarray) -> tuple[np.ndarr
 
 
 def f82_dip(f0: np.ndarray, tint: np.ndarray) -> np.ndarray:
-    """Factor (Q, 3) of -c (1 - c)^6 in the reflectance of a metal whose Schlick curve is multiplied by `tint` at
-    c = 1 / 7 (Kutz, Hasan and Edmondson 2021, "Novel aspects of the Adobe Standard Material", the F82-tint model)."""
+    """Factor (Q, 3) of -c (1 - c)^6 in the reflectance of a metal, which is Schlick's times `tint` at c = 1 / 7 (Kutz,
+    Hasan and Edmondson 2021, "Novel aspects of the Adobe Standard Material", the F82-tint model)."""
     schlick = f0 + (1.0 - f0) * (6.0 / 7.0) ** 5
     return schlick * (1.0 - tint) * 7.0 / (6.0 / 7.0) ** 6
 
 
 def metal_average(f0: np.ndarray, dip: np.ndarray) -> np.ndarray:
-    """Integral of 2 c F(c) of an F82 metal."""
+    """Integral (Q, 3) of 2 c F(c) for an F82 metal."""
     return f0 + (1.0 - f0) / 21.0 - dip / 126.0
 
 
 def dielectric_average(ior: np.ndarray) -> np.ndarray:
-    """Integral of 2 c F(c) of a dielectric, by the fit of Kulla and Conty 2017 ("Revisiting physically based shading at
-    Imageworks"), which Cycles uses; good to 0.006 for an `ior` of 1 to 3."""
+    """Integral of 2 c F(c) for a dielectric, from the fit that Cycles uses (Kulla and Conty 2017, "Revisiting
+    physically based shading at Imageworks"). It is accurate to 0.006 for an `ior` of 1 to 3."""
     start, slope = DIELECTRIC_AVERAGE
     below = 0.997118 + ior * (0.1014 - ior * (0.965241 + ior * 0.130607))
     return np.where(ior < 1.0, below, (ior - 1.0) / (start + slope * ior))
 
 
 def dielectric_blend_average(f0: np.ndarray, ior: np.ndarray) -> np.ndarray:
-    """Integral (Q, 3) of 2 c F(c) of a dielectric whose reflectance runs from `f0` (Q, 3) to 1."""
+    """Integral (Q, 3) of 2 c F(c) for a dielectric whose reflectance runs from `f0` (Q, 3) to 1."""
     plain = f0_of_ior(ior)
     share = np.clip((dielectric_average(ior) - plain) / (1.0 - plain), 0.0, 1.0)
     return f0 + (1.0 - f0) * share[:, None]
@@ -208,8 +209,8 @@ def dielectric_blend_average(f0: np.ndarray, ior: np.ndarray) -> np.ndarray:
 def multiple_scattering(average: np.ndarray, albedo: np.ndarray, average_albedo: np.ndarray) -> np.ndarray:
     """Factor (Q, 3) that Multiscatter GGX puts on a lobe of mean reflectance `average` (Q, 3).
 
-    1 + Fms (1 - E) / E, Fms = F Ea / (1 - F (1 - Ea)), F = `average`, E = `albedo` (Q,), Ea = `average_albedo` (Q,)
-    (Kulla and Conty 2017, with one F less since the lobe brings it).
+    It is 1 + Fms (1 - E) / E, where Fms = F Ea / (1 - F (1 - Ea)), F = `average`, E = `albedo` (Q,), and Ea =
+    `average_albedo` (Q,) (Kulla and Conty 2017, with one factor F less, because the lobe brings it).
     """
     mean = average_albedo[:, None]
     scattered = average * mean / (1.0 - average * (1.0 - mean))
@@ -219,8 +220,8 @@ def multiple_scattering(average: np.ndarray, albedo: np.ndarray, average_albedo:
 def conductor_reflectance(cosine, index: np.ndarray, extinction: np.ndarray, exact: bool = True) -> np.ndarray:
     """Unpolarized Fresnel reflectance of a conductor of complex index `index` + i `extinction`; broadcasts.
 
-    Cycles 5 has the exact formula (Born and Wolf, "Principles of optics", section 14.2), Cycles 4.5 its limit for
-    |index + i extinction| much larger than 1.
+    `exact` is the formula of Cycles 5 (Born and Wolf, "Principles of optics", section 14.2). Otherwise it is the
+    formula of Cycles 4.5, the limit for |index + i extinction| much larger than 1.
     """
     index, extinction = np.maximum(index, 1e-6), np.maximum(extinction, 0.0)
     squares, cosine2 = index * index + extinction * extinction, cosine * cosine
@@ -238,16 +239,16 @@ def conductor_reflectance(cosine, index: np.ndarray, extinction: np.ndarray, exa
 
 
 def conductor_fit(index: np.ndarray, extinction: np.ndarray, exact: bool):
-    """(f0, f90, dip, dielectric), each (Q, 3): least squares for the reflectance of a conductor, with the dielectric
-    curve of CONDUCTOR_FIT_IOR."""
+    """(f0, f90, dip, dielectric), each (Q, 3): the least-squares fit of a conductor's reflectance. Its dielectric curve
+    is that of CONDUCTOR_FIT_IOR."""
     values = conductor_reflectance(FIT_COSINES[:, None, None], index, extinction, exact)
     constant, schlick, dip, dielectric = np.einsum("kc,cqx->kqx", _fit_matrix(), values)
     return constant, constant + schlick, -dip, dielectric
 
 
 def conductor_average(index: np.ndarray, extinction: np.ndarray, exact: bool) -> np.ndarray:
-    """Mean reflectance (Q, 3) by which Cycles scales multiple scattering of conductors: of an F82 metal that agrees at
-    the cosines 1 and 1 / 7."""
+    """Mean reflectance (Q, 3) by which Cycles scales the multiple scattering of conductors: that of an F82 metal with
+    the same reflectance at the cosines 1 and 1 / 7."""
     f0, low = (conductor_reflectance(cosine, index, extinction, exact) for cosine in (1.0, 1.0 / 7.0))
     schlick = f0 + (1.0 - f0) * (6.0 / 7.0) ** 5
     return np.clip(metal_average(f0, (schlick - low) * 7.0 / (6.0 / 7.0) ** 6), 0.0, 1.0)
@@ -256,7 +257,7 @@ def conductor_average(index: np.ndarray, extinction: np.ndarray, exact: bool) ->
 def dielectric_terms(f0: np.ndarray, ior: np.ndarray):
     """(f0, f90, dip, dielectric) (Q, 3) of a dielectric whose reflectance runs from `f0` (Q, 3) to 1.
 
-    Cycles has F = mix(f0, 1, (F_d - f_d) / (1 - f_d)), f_d the value of F_d at normal incidence; that is linear in F_d.
+    Cycles has F = mix(f0, 1, (F_d - f_d) / (1 - f_d)), where f_d is F_d at normal incidence; this is linear in F_d.
     """
     plain = f0_of_ior(ior)[:, None]
     constant, factor = (f0 - plain) / (1.0 - plain), (1.0 - f0) / (1.0 - plain)
@@ -276,13 +277,13 @@ def glass_scattering(tint: np.ndarray, ior: np.ndarray, roughness: np.ndarray, c
 
 
 def albedos(roughness: np.ndarray, cosine: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """E (Q,) and its average (Q,) over the directions, as Cycles interpolates them."""
+    """E (Q,), and its average (Q,) over directions, interpolated as in Cycles."""
     directional, average = albedo_tables()
     return _interpolate(directional, roughness, cosine), _interpolate(average, roughness)
 
 
 def dielectric_albedo(f0: np.ndarray, ior: np.ndarray, roughness: np.ndarray, cosine: np.ndarray) -> np.ndarray:
-    """Albedo (Q, 3) divided by E of a dielectric whose reflectance runs from `f0` (Q, 3) to 1, as Cycles has it."""
+    """Albedo (Q, 3) divided by E of a dielectric whose reflectance runs from `f0` (Q, 3) to 1, as in Cycles."""
     share = _interpolate(_blend_table(), roughness, cosine, _ior_coordinate(ior))[:, None]
     return f0 + (1.0 - f0) * share
 
@@ -299,7 +300,7 @@ def albedo_tables() -> tuple[np.ndarray, np.ndarray]:
 
 @cache
 def _blend_table():
-    """Where between f0 and 1 the albedo of a dielectric lies: roughness, cosine, ((ior - 1) / (ior + 1))^(1/2)."""
+    """Position of a dielectric's albedo between f0 and 1, by roughness, cosine, and ((ior - 1) / (ior + 1))^(1/2)."""
     table = shading.load_table("ltsh4")
     nodes = np.clip(np.linspace(0.0, 1.0, GLASS_NODES), SMALLEST_COSINE, 1.0)
     roughness, cosine = np.meshgrid(nodes, nodes, indexing="ij")
@@ -317,7 +318,7 @@ def _ior_coordinate(ior):
 
 @cache
 def _fit_matrix():
-    """Matrix (4, C): values at FIT_COSINES -> coefficients of the four curves that samples have."""
+    """Matrix (4, C) that turns values at FIT_COSINES into the coefficients of the four curves of samples."""
     c, weight = FIT_COSINES, np.sqrt(FIT_COSINES)
     curves = [np.ones_like(c), schlick_curve(c), schlick_curve(c) * c * (1.0 - c)]
     curves.append(dielectric_reflectance(c, CONDUCTOR_FIT_IOR))

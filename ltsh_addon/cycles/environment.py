@@ -1,8 +1,8 @@
-"""Light from all directions, of which square pictures are known, as distant lights. Needs no bpy.
+"""Light from all directions, given by square pictures, as distant lights. Needs no bpy.
 
-Six pictures make up the cube around a sample. Each becomes a distant rectangle with its mean radiance; the tree of its
-`detail` has the parts that differ from it, each of which has its own mean. Where something as small and bright as the
-sun stands, it becomes a light of its own, and the pictures keep the rest.
+Six pictures make up the cube around a sample. Each becomes a distant rectangle with its mean radiance. The `detail` of
+the rectangle is a tree of parts, each with its own mean; parts like their whole are not cut further. Something as small
+and bright as the sun becomes a light of its own, and the pictures keep the rest.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 
 from ..scene import AreaLight
 
-# Half axes (right, up) of the pictures of a cube, by where they look.
+# Axes (ahead, right, up) of the pictures of a cube; right and up are half a side long.
 CUBE = tuple(
     (np.array(ahead, float), np.array(right, float), np.array(up, float))
     for ahead, right, up in (
@@ -25,22 +25,25 @@ CUBE = tuple(
         ((0, 0, -1), (1, 0, 0), (0, 1, 0)),
     )
 )
-# Mean absolute difference of the radiance from that of the smallest patches, by the mean radiance.
+# Mean absolute difference between the smallest patches and the picture, relative to the mean radiance, at which cutting
+# stops.
 ERROR = 0.02
-# Of all pictures together.
+# Most patches of all pictures together.
 MOST_PATCHES = 6144
-# Levels of halving both sides of a patch from a patch to its parts.
+# A patch and its parts are at most this many halvings of both sides apart.
 LEVELS = 2
-# What is so many times as bright as the mean, has this share of the light and fits into this angle, in rad, is a spot.
+# A spot is brighter than the mean by SPOT_BRIGHTNESS, has at least the share SPOT_SHARE of the light, and fits into the
+# angle SPOT_RADIUS in rad.
 SPOT_BRIGHTNESS, SPOT_SHARE, SPOT_RADIUS = 100.0, 0.01, 0.06
+# MOST_SPOTS: most spots of a sky. SPOT_PATCHES: most patches of a spot that is no disk.
 MOST_SPOTS, SPOT_PATCHES = 8, 40
-# What a disk of constant radiance may miss of a spot.
+# A spot becomes a disk of constant radiance if the disk misses at most this share of its light.
 DISK_ERROR = 0.25
 
 
 @dataclass(frozen=True)
 class SkyPicture:
-    """Radiance (N, N, 3) from the directions ahead + s right + t up, s and t in [-1, 1]; row 0 is at t = 1."""
+    """Radiance (N, N, 3) from the directions ahead + s right + t up for s and t in [-1, 1]; row 0 is at t = 1."""
 
     ahead: np.ndarray  # (3,) unit
     right: np.ndarray  # (3,)
@@ -62,11 +65,10 @@ class SkyPicture:
 
 @dataclass(frozen=True)
 class Spot:
-    """Something small and bright: where it is, how far (in rad) its parts are from there, and its radiance above
-    which it is one."""
+    """A small bright part of a sky. What exceeds the radiance `least` within `radius` belongs to it."""
 
-    direction: np.ndarray  # (3,) unit
-    radius: float
+    direction: np.ndarray  # (3,) unit, to its center
+    radius: float  # rad
     least: float  # mean of the three colors
 
 
@@ -76,13 +78,13 @@ def luminance(radiance: np.ndarray) -> np.ndarray:
 
 
 def above(radiance: np.ndarray, least: float) -> np.ndarray:
-    """What colors (..., 3) have above the luminance `least`."""
+    """The part of colors (..., 3) above the luminance `least`."""
     own = luminance(radiance)
     return radiance * np.maximum(1.0 - least / np.maximum(own, 1e-30), 0.0)[..., None]
 
 
 def bright_spots(pictures: list[SkyPicture]) -> list[Spot]:
-    """The spots in the pictures of a cube, the one with the most light first."""
+    """The spots in the pictures of a cube; the first has the most light."""
     values = np.concatenate([luminance(picture.radiance).ravel() for picture in pictures])
     angles = np.concatenate([picture.solid_angles().ravel() for picture in pictures])
     power = values * angles
@@ -110,7 +112,7 @@ def bright_spots(pictures: list[SkyPicture]) -> list[Spot]:
 
 
 def spot_frame(spot: Spot) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Ahead, right and up of the picture that has all of a spot."""
+    """Ahead, right and up of a picture that shows the whole spot."""
     axis = np.eye(3)[np.argmin(np.abs(spot.direction))]
     right = np.cross(spot.direction, axis)
     right *= np.tan(spot.radius) / np.linalg.norm(right)
@@ -118,7 +120,7 @@ def spot_frame(spot: Spot) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def without_spots(picture: SkyPicture, spots: list[Spot]) -> SkyPicture:
-    """The picture with no more than the least radiance of each spot where it is."""
+    """The picture without `spots`: where a spot is, radiance is cut off at its `least`."""
     radiance = picture.radiance
     offsets = picture.offsets()
     for spot in spots:
@@ -132,14 +134,14 @@ def without_spots(picture: SkyPicture, spots: list[Spot]) -> SkyPicture:
 
 
 def spot_light(like: AreaLight, picture: SkyPicture, spot: Spot) -> list[AreaLight]:
-    """What a close `picture` of a spot shows of it as a light with the name and traits of `like`: a disk, where that is
-    what it looks like; [] where it shows none."""
+    """The spot that a close `picture` shows, as lights with the name and traits of `like`: a disk if it looks like one,
+    otherwise patches; [] if the picture shows no spot."""
     radiance, angles = above(picture.radiance, spot.least), picture.solid_angles()
     values = luminance(radiance)
     power = (values * angles).sum()
     if power <= 0.0:
         return []
-    # The edge of the sun is dark: it counts up to a fourth of the mean.
+    # The edge of the sun is dark: only what is brighter than a fourth of the mean counts for the size.
     mean = (values * values * angles).sum() / power
     solid_angle = min(angles[values > 0.25 * mean].sum(), np.pi)
     offsets = picture.offsets()
@@ -157,8 +159,8 @@ def spot_light(like: AreaLight, picture: SkyPicture, spot: Spot) -> list[AreaLig
 
 
 def sky_lights(like: AreaLight, pictures: list[SkyPicture], most: int = MOST_PATCHES) -> tuple[list[AreaLight], float]:
-    """A distant light with a `detail` for each of the pictures that is not dark, with the name and traits of `like`,
-    and the mean absolute difference of the smallest patches from the pictures, by the mean radiance."""
+    """A distant light with a `detail` for each picture that is not dark, with the name and traits of `like`; and the
+    mean absolute difference between the smallest patches and the pictures, relative to the mean radiance."""
     trees = [_Tree.of(picture) for picture in pictures]
     total = sum((luminance(picture.radiance) * picture.solid_angles()).sum() for picture in pictures)
     limit, error = _limit(trees, ERROR * total, most)
@@ -169,14 +171,14 @@ def sky_lights(like: AreaLight, pictures: list[SkyPicture], most: int = MOST_PAT
 
 @dataclass(frozen=True)
 class _Tree:
-    """Squares of a picture by level: 2^k of them along each side."""
+    """Squares of a picture by level: level k has 2^k along each side."""
 
-    means: list[np.ndarray]  # (2^k, 2^k, 3)
-    errors: list[np.ndarray]  # (2^k, 2^k), about, of the luminance, by sr
+    means: list[np.ndarray]  # (2^k, 2^k, 3) radiance
+    errors: list[np.ndarray]  # (2^k, 2^k) about the mean absolute difference from the mean, times solid angle
 
     @classmethod
     def of(cls, picture: SkyPicture) -> _Tree:
-        """Of a picture with a power of two of pixels along each side."""
+        """For a picture whose side is a power of two pixels."""
         weight = picture.solid_angles()
         light, squares = picture.radiance * weight[..., None], np.square(picture.radiance).mean(axis=-1) * weight
         means, errors = [], []
@@ -184,7 +186,7 @@ class _Tree:
             mean = light / weight[..., None]
             variance = np.maximum(squares / weight - np.square(mean).mean(axis=-1), 0.0)
             means.append(mean)
-            # The mean absolute difference is less than the standard deviation, by about so much.
+            # The mean absolute difference is about this factor smaller than the standard deviation.
             errors.append(0.8 * weight * np.sqrt(variance))
             if len(weight) == 1:
                 break
@@ -200,7 +202,7 @@ def _summed(values):
 
 
 def _leaves(trees, limit: float) -> tuple[int, float]:
-    """How many squares there are, and their error, where those with an error beyond the limit are cut."""
+    """Number of squares, and their total error, if those with an error above `limit` are cut."""
     count, error = 0, 0.0
     for tree in trees:
         exists = np.ones((1, 1), bool)
@@ -216,11 +218,12 @@ def _leaves(trees, limit: float) -> tuple[int, float]:
 
 
 def _limit(trees, wanted: float, most: int) -> tuple[float, float]:
-    """The largest error of a square, so that all together have the error `wanted`, or are `most`; and theirs."""
+    """The largest error of a square at which the total error is `wanted`, or at which there are `most` squares; and the
+    total error."""
     low, high = 0.0, max(float(errors.max()) for tree in trees for errors in tree.errors)
     if high <= wanted * 1e-6 or high == 0.0:
         return high, _leaves(trees, high)[1]
-    # All squares are cut at 0; none at `high`.
+    # At 0 all squares are cut; at `high` none is.
     low = high * 1e-9
     for _ in range(40):
         middle = np.sqrt(low * high)
@@ -232,7 +235,7 @@ def _limit(trees, wanted: float, most: int) -> tuple[float, float]:
 
 
 def _light(like: AreaLight, picture: SkyPicture, tree: _Tree, limit: float, place) -> AreaLight:
-    """The square `place` (level, row, column) of a picture as a light, with its parts as detail."""
+    """The square `place` (level, row, column) of a picture as a light; its parts are the detail."""
     level, row, column = place
     size = 2.0**-level
     across, upward = (2 * column + 1) * size - 1.0, 1.0 - (2 * row + 1) * size

@@ -1,7 +1,7 @@
-"""From the channels that a 1-sample Cycles render wrote to `SurfaceSamples` and `Film`. Needs no bpy.
+"""Turns the channels of a 1-sample Cycles render into `SurfaceSamples` and `Film`. Needs no bpy.
 
-Cycles evaluates every texture, bump map and node group itself; the values arrive through the AOVs of `aovs`, one hit
-per pixel and file, so nothing is averaged across an edge.
+Cycles evaluates every texture, bump map and node group itself. The values arrive through AOVs, one hit per pixel and
+file, so nothing is averaged across an edge.
 """
 
 from __future__ import annotations
@@ -18,24 +18,24 @@ from ..shading.light_polygons import has_lobe
 from .horizons import unit
 from .lobes import AOV_PREFIX, HIT_AOVS, KEPT_AOV, Hits, lobe_aov, lobe_names, read_aov, read_layer, samples_of_lobes
 
-# Arrays of one block stay in the cache.
+# Few enough for the arrays of one block to stay in the cache.
 HITS_PER_BLOCK = 65536
-# Smooth normals farther from those of the faces, on more than this share of the samples, are worth a warning. Measured
-# on a smooth-shaded cube: diffuse light is 1.5 % off beyond 35 degrees, 0.3 % between 20 and 35.
+# A warning is worth it if smooth and face normals differ by more than COARSE_ANGLE on the share COARSE_SHARE of
+# samples. Measured on a smooth-shaded cube: diffuse light is 1.5 % off beyond 35 degrees, 0.3 % between 20 and 35.
 COARSE_ANGLE, COARSE_SHARE = math.radians(35.0), 0.02
-# Positions that are rounded to more than this share of the distance from the nearest light, if there are more than that
-# share of them, are worth a warning.
+# A position counts as rounded if its rounding error exceeds the share ROUNDED of the distance to the nearest light. A
+# warning is worth it if more than the share ROUNDED_SHARE of the positions are.
 ROUNDED, ROUNDED_SHARE = 2e-3, 0.02
-FEW_SAMPLES, MOST_PAIRS = 1000, 2_000_000  # are asked, the latter of samples and lights
-RIBBON_TOLERANCE = 1e-6  # rounding of unit vectors in float32, squared angle
+FEW_SAMPLES, MOST_PAIRS = 1000, 2_000_000  # about how many samples, and at most how many pairs with lights, are tested
+RIBBON_TOLERANCE = 1e-6  # squared angle, for the rounding of unit vectors in float32
 
 
 def surface_samples(channels: dict[str, np.ndarray], diffuse_color: str) -> tuple[SurfaceSamples, np.ndarray, int]:
-    """Samples (P) of one render, the pixel (P,) of each (row by row from the top left), and how many were unusable.
+    """Samples (P) of one render, the pixel (P,) of each (row by row from the top left), and the count of unusable hits.
 
-    The samples of a hit, one for each of its lobes, follow one another. `diffuse_color` is the name of the pass with
-    the diffuse albedo. Unusable are hits whose ray met several surfaces (transparency adds the AOVs of both) and hits
-    with values that are not finite or too far away.
+    Each hit has one sample per lobe; these are consecutive. `diffuse_color` is the name of the pass with the diffuse
+    albedo. A hit is unusable if its ray met several surfaces (transparency adds the AOVs of both), or if its values are
+    not finite or too far away.
     """
     hit = read_aov(channels, "hit").ravel()
     pixel = np.flatnonzero(hit != 0.0)
@@ -79,28 +79,29 @@ def _hits_of(values: dict[str, np.ndarray]) -> Hits:
 
 
 def clear_holdouts(channels: dict[str, np.ndarray]) -> None:
-    """Take the hits on holdouts out of the `channels` of a render with an opaque background.
+    """Remove the hits on holdouts from the `channels` of a render with an opaque background.
 
-    Cycles evaluates the shaders of holdouts, AOVs included, and then shows a hole; nothing else has alpha 0.
+    Cycles evaluates the shaders of holdouts, AOVs included, and then shows a hole. Only there is alpha 0.
     """
     read_aov(channels, "hit")[read_layer(channels, "Combined", "A") == 0.0] = 0.0
 
 
 def surfaces_without_sample(channels: dict[str, np.ndarray]) -> int:
-    """Pixels of a one-sample render that show a surface (it has a normal) which wrote no AOV and is no holdout."""
+    """Number of pixels of a one-sample render with a surface (it has a normal) that wrote no AOV and is no holdout."""
     return int(np.count_nonzero(_shows_surface(channels) & (read_aov(channels, "hit") == 0.0)))
 
 
 def _shows_surface(channels: dict[str, np.ndarray]) -> np.ndarray:
-    """Mask (H, W)."""
-    # Depth is that of the first sample of a pixel, whichever is rendered.
+    """Mask (H, W) of the pixels that show a surface."""
+    # Depth does not tell: it is always the depth of the first sample of a pixel.
     normal = read_layer(channels, "Normal", "XYZ")
     return normal.any(axis=-1) & (read_layer(channels, "Combined", "A") != 0.0)
 
 
 def not_reflected(channels: dict[str, np.ndarray], names: dict[str, str], is_transparent: bool) -> np.ndarray:
-    """Of a one-sample render (H, W, 7): what surfaces and lights in sight emit, what is seen of the world behind them,
-    and the alpha of the picture; `names` are those of passes, and the film may be transparent."""
+    """Light of a one-sample render that is not reflected, (H, W, 7): emission of surfaces and visible lights (3), the
+    world seen behind them (3), and the alpha of the picture. `names` are those of the passes; `is_transparent` is that
+    of the film."""
     emission, background = (read_layer(channels, names[key], "RGB") for key in ("emission", "background"))
     if is_transparent:
         background, alpha = np.zeros_like(background), _shows_surface(channels)
@@ -110,8 +111,8 @@ def not_reflected(channels: dict[str, np.ndarray], names: dict[str, str], is_tra
 
 
 def unshaded_hits(channels: dict[str, np.ndarray], count: int) -> np.ndarray:
-    """Hits (count,) of a one-sample render on each of the materials that are not shaded, as `inject_aovs` numbers
-    them."""
+    """Number of hits (count,) of a one-sample render on each material that is not shaded, in the order in which
+    `inject_aovs` numbers them."""
     if not count:
         return np.zeros(0, dtype=int)
     number = -np.rint(read_aov(channels, lobe_aov("kind", 0))[read_aov(channels, "hit") == 1.0]).astype(int)
@@ -119,45 +120,46 @@ def unshaded_hits(channels: dict[str, np.ndarray], count: int) -> np.ndarray:
 
 
 def kept_by_cycles(channels: dict[str, np.ndarray]) -> np.ndarray:
-    """Sum (H, W) of the KEPT_BITS of the passes in which what a one-sample render shows is not shaded as in Cycles."""
+    """Sum (H, W) of KEPT_BITS: the passes that are left to Cycles, because we do not shade the surface as it does."""
     hit = read_aov(channels, "hit")
     kept = read_aov(channels, KEPT_AOV) if any(f"{AOV_PREFIX}{KEPT_AOV}." in key for key in channels) else 0.0 * hit
     kept = np.minimum(np.rint(kept), 3).astype(int)
-    # Several surfaces, or one that wrote nothing.
+    # The pixel shows several surfaces, or one that wrote nothing.
     kept[(hit != 0.0) & (np.abs(hit - 1.0) > 1e-6)] = 3
     kept[_shows_surface(channels) & (hit == 0.0)] = 3
     return kept
 
 
 def join(renders: list[tuple[SurfaceSamples, np.ndarray]], width: int, height: int) -> tuple[SurfaceSamples, Film]:
-    """All samples of `renders` (samples, pixel), one per sub-sample, and the film they lie on."""
+    """All samples of `renders`, one (samples, pixel) per sub-sample, and the film they lie on."""
     if not renders:
         shapes = {item.name: (0,) if item.name in SCALAR_FIELDS else (0, 3) for item in fields(SurfaceSamples)}
         nothing = SurfaceSamples(**{name: np.zeros(shape) for name, shape in shapes.items()})
         return nothing, Film(width, height, np.zeros(0, int))
     pixel = np.concatenate([pixel for _, pixel in renders])
-    # A render has one hit per pixel, whose samples follow one another.
+    # A render has one hit per pixel, whose samples are consecutive.
     of_hit = [np.concatenate([np.ones(len(own[:1]), bool), own[1:] != own[:-1]]) for _, own in renders]
     of_hit = np.concatenate(of_hit)
     first = None if of_hit.all() else of_hit
     return SurfaceSamples.joined([samples for samples, _ in renders]), Film(width, height, pixel, len(renders), first)
 
 
-# Hits of a pixel whose normals are closer than this share of the width of their lobes (alpha), and at most so many
-# radians apart, and whose points lie this close to the same plane, get one shading. Sharper lobes than so never do.
+# Hits of a pixel are shaded as one if their normals and positions agree. LOBE_SHARE: largest angle between normals in
+# units of the lobe's width alpha. MOST_ANGLE: largest such angle in rad. OFF_PLANE: largest distance from the plane of
+# the other hit, in units of their distance. LEAST_ALPHA: sharper lobes are never shaded as one.
 LOBE_SHARE, MOST_ANGLE, OFF_PLANE, LEAST_ALPHA = 0.02, 0.01, 0.2, 0.01
-MERGED_ROUNDS = 3  # surfaces of a pixel
-SHADOW_LOOSENESS = 40.0  # so many times farther apart normals may be to get one shadow
+MERGED_ROUNDS = 3  # most surfaces of a pixel that are merged
+SHADOW_LOOSENESS = 40.0  # hits share their shadow rays up to this many times the angle for shading
 COLORS = ("specular_f0", "specular_f90", "specular_dip", "dielectric", "diffuse_albedo", "diffuse_rebound")
 SAME = ("roughness", "ior", "diffuse_roughness", "sheen_a", "sheen_b", "receiver", "anisotropy")
 
 
 def merged(samples: SurfaceSamples, film: Film) -> tuple[SurfaceSamples, Film]:
-    """The samples of which one stands for all hits of a pixel on one smooth surface, with their mean colors.
+    """Fewer samples: one stands for all hits of a pixel on one smooth surface, with their mean colors.
 
-    Edges keep all of their samples. What varies within a pixel but colors, such as the edge of a shadow, is as at the
-    first of the hits, which is the center of the pixel where that shows the surface. On the example scene with 8 points
-    half of the samples remain, and without shadows specular light is 1 % off, diffuse 0.5 %.
+    Pixels at edges keep one sample for each surface. Everything but colors is taken from the first of the hits, at the
+    center of the pixel if that shows the surface; so is the edge of a shadow in the pixel. On the example scene with 8
+    points, half of the samples remain; without shadows, specular light is 1 % off and diffuse light 0.5 %.
     """
     kept, place = _groups(samples, film, 1.0)
     found, own = samples.take(kept), _together(film, kept, place)
@@ -166,14 +168,14 @@ def merged(samples: SurfaceSamples, film: Film) -> tuple[SurfaceSamples, Film]:
 
 
 def with_one_shadow(samples: SurfaceSamples, film: Film) -> tuple[SurfaceSamples, Film, np.ndarray]:
-    """The samples (Q) of which one stands for all of a pixel that see about the same part of lights, their film, and of
-    which of them each of the `samples` is (P,)."""
+    """Fewer samples (Q), their film, and for each of `samples` the number (P,) of the one that stands for it. One
+    sample stands for those of a pixel that see about the same part of each light."""
     kept, place = _groups(samples, film, SHADOW_LOOSENESS)
     return samples.take(kept), _together(film, kept, place), place
 
 
 def _together(film: Film, kept: np.ndarray, place: np.ndarray) -> Film:
-    """The film of the samples `kept` (Q,), each of which stands for those with its `place` (P,)."""
+    """The film of the samples `kept` (Q,). Each of them stands for the samples (P,) whose `place` is its number."""
     count = np.bincount(place, weights=film.count, minlength=len(kept))
     count = count if film.count is not None and film.count.dtype.kind == "f" else count.astype(int)
     own = replace(film.take(kept), count=count)
@@ -185,14 +187,14 @@ def _together(film: Film, kept: np.ndarray, place: np.ndarray) -> Film:
 
 
 def _groups(samples: SurfaceSamples, film: Film, looseness: float) -> tuple[np.ndarray, np.ndarray]:
-    """The samples (Q,) that stand for others of their pixel, and the place there of each sample's own, (P,)."""
+    """The samples (Q,) that stand for others of their pixel, and for each sample the place (P,) of its own in them."""
     starts = np.arange(len(samples)) if film.first is None else np.flatnonzero(film.first)
     lengths = np.diff(starts, append=len(samples))
     pixel, target = film.pixel[starts], np.arange(len(starts))
     free, shines = np.ones(len(starts), bool), has_lobe(samples)[1]
     for _ in range(MERGED_ROUNDS):
         waiting = np.flatnonzero(free)
-        # Of the hits of a pixel that stand for themselves the first.
+        # The first unmerged hit of each pixel leads.
         pixels, first = np.unique(pixel[waiting], return_index=True)
         leaders = waiting[first]
         free[leaders] = False
@@ -205,7 +207,7 @@ def _groups(samples: SurfaceSamples, film: Film, looseness: float) -> tuple[np.n
             same[there] = one_shading(samples, shines, *pairs, looseness)
         target[others[same]] = leader[same]
         free[others[same]] = False
-    # From hits to their samples.
+    # Go from hits to their samples.
     lobe = np.arange(len(samples)) - np.repeat(starts, lengths)
     of_sample = np.repeat(starts[target], lengths) + lobe
     kept = np.flatnonzero(of_sample == np.arange(len(samples)))
@@ -213,7 +215,8 @@ def _groups(samples: SurfaceSamples, film: Film, looseness: float) -> tuple[np.n
 
 
 def one_shading(samples: SurfaceSamples, shines: np.ndarray, one, other, looseness: float) -> np.ndarray:
-    """Mask of pairs of samples that get one shading, or with a `looseness` above 1 one shadow; which `shines` (P,)."""
+    """Mask of the pairs of samples that are shaded as one or, with a `looseness` above 1, share their shadow. `shines`
+    (P,) marks samples with a specular lobe."""
     same = np.ones(len(one), bool)
     for name in SAME:
         values = getattr(samples, name)
@@ -235,36 +238,37 @@ def one_shading(samples: SurfaceSamples, shines: np.ndarray, one, other, loosene
 
 
 def _means(values: np.ndarray, place: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Means (Q, 3) of the rows of `values` (P, 3) by their `place` (P,)."""
+    """Means (Q, 3) of the rows of `values` (P, 3) with the same `place` (P,)."""
     sums = [np.bincount(place, weights=column, minlength=len(count)) for column in values.T]
     return np.stack(sums, axis=1) / count[:, None]
 
 
-# Points of a pixel take all but place and view from a sample of the pixel, or of those around it, whose surface is flat
-# and goes through them: no more rad are between its normals, or off its plane. Among these a pixel across it counts as
-# much as so many pixels along it. A pixel whose center is not where its sample says, in pixels, or with a point on no
-# such surface, stays as it is.
+# A finer point takes all values but position and view from a sample, in its pixel or around it, whose flat surface goes
+# through the point. FLAT: largest angle in rad between that sample's normals, and between its plane and the direction
+# to the point. ACROSS: weight of the distance across the plane, relative to the distance along it, in the choice of the
+# nearest sample. OFF_CENTER: distance in pixels. A pixel stays as it is if its center is farther than that from where
+# its sample is, or if one of its points lies on no such surface.
 FLAT, ACROSS, OFF_CENTER = 4e-3, 10.0, 0.1
 
 
 @dataclass(frozen=True)
 class FinerPoints:
-    """More points of a pixel than a picture is rendered with."""
+    """More points per pixel than a picture is rendered with."""
 
-    starts: np.ndarray  # (3, 3) m, of the ray at the top left corner, and what a pixel right and one down add
-    directions: np.ndarray  # (3, 3) the same, of any length
-    offsets: np.ndarray  # (N, 2) pixels right and up of the center
-    weights: np.ndarray | None  # (N, D, D) as of `Film.shared`
-    sums: np.ndarray | None = None  # (D, D) of the weights of a pixel without more points
+    starts: np.ndarray  # (3, 3) m: ray origin at the top left corner, its change per pixel right and per pixel down
+    directions: np.ndarray  # (3, 3) the same for ray directions, of any length
+    offsets: np.ndarray  # (N, 2) pixels right of and above the center
+    weights: np.ndarray | None  # (N, D, D) as in `Film.shared`
+    sums: np.ndarray | None = None  # (D, D) of the weights of a pixel without finer points
 
     @classmethod
     def of(cls, values: dict) -> FinerPoints:
-        """That of a manifest."""
+        """The points that a manifest describes."""
         return cls(**{name: None if value is None else np.array(value, float) for name, value in values.items()})
 
     def rays(self, pixel: np.ndarray, offsets: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Origins and unit directions (Q, 3) of rays through `offsets` (Q, 2) of pixels (Q,); and how wide a pixel is
-        (Q,) one m away."""
+        """Origins and unit directions (Q, 3) of rays through `offsets` (Q, 2) of pixels (Q,), and the width (Q,) of a
+        pixel at a distance of 1 m."""
         place = np.stack([np.ones(len(pixel)), pixel % width + 0.5, pixel // width + 0.5], axis=1)
         place[:, 1:] += offsets * [1.0, -1.0]
         origin, direction = place @ self.starts, place @ self.directions
@@ -275,10 +279,10 @@ class FinerPoints:
 def finer(
     samples: SurfaceSamples, film: Film, points: FinerPoints, pixels: dict[str, np.ndarray], met: Callable
 ) -> tuple[SurfaceSamples, Film, np.ndarray]:
-    """Samples at the first `number` (E,) of the `points` of each `pixel` (E,) of which it is known what they show,
-    their film, and mask (P,) of the `samples` whose place they take.
+    """Samples at finer points, their film, and the mask (P,) of the `samples` that they replace.
 
-    `met(origins, directions)` is as of `visibility.rays.Tracer.first_met`.
+    Each `pixel` (E,) gets the first `number` (E,) of `points`, unless it is unknown what one of them shows.
+    `met(origins, directions)` is that of `visibility.rays.Tracer.first_met`.
     """
     known, (pixels, number) = _Hits.of(samples, film), (pixels["pixel"], pixels["number"])
     center, direction, width = points.rays(pixels, np.zeros((len(pixels), 2)), film.width)
@@ -309,7 +313,7 @@ def finer(
     values = {"pixel": pixel[of_point], "count": film.sub_samples / number[own]}
     values["first"] = None if film.first is None else film.first[index]
     if film.spread is not None:
-        # Whatever their number, together they weigh the same.
+        # The points of a pixel together weigh the same, however many there are.
         whole, columns = film.sub_samples * points.weights.mean(axis=0), points.weights.reshape(len(points.weights), -1)
         sums = np.stack([np.bincount(row, column[point], len(pixels)) for column in columns.T], axis=1)
         scale = np.divide(whole.ravel(), sums, out=np.zeros(sums.shape), where=sums > 0.0)
@@ -326,19 +330,19 @@ def _along(origin, direction, distance):
 
 @dataclass(frozen=True)
 class _Hits:
-    """The hits of samples: the first sample of each (H,), and how many it has; those of a pixel."""
+    """The hits (H) of samples (P), and which hits each pixel has."""
 
     samples: SurfaceSamples
-    starts: np.ndarray
-    lengths: np.ndarray
-    is_flat: np.ndarray  # (P,) of the samples: none of their normals are others a little farther on
-    order: np.ndarray  # (H,) by pixel
-    first: np.ndarray  # (W * H,) place in the order of the first of a pixel
-    number: np.ndarray  # (W * H,) of a pixel
+    starts: np.ndarray  # (H,) the first sample of each hit
+    lengths: np.ndarray  # (H,) the number of samples of each hit
+    is_flat: np.ndarray  # (P,) True for samples whose normals agree, so that they hold for points around, too
+    order: np.ndarray  # (H,) the hits sorted by pixel
+    first: np.ndarray  # (W * H,) place in `order` of the first hit of each pixel
+    number: np.ndarray  # (W * H,) of hits of each pixel
 
     @classmethod
     def of(cls, samples: SurfaceSamples, film: Film) -> _Hits:
-        """Those of a film."""
+        """The hits of `samples` on `film`."""
         starts = np.arange(len(samples)) if film.first is None else np.flatnonzero(film.first)
         number = np.bincount(film.pixel[starts], minlength=film.width * film.height)
         order = np.argsort(film.pixel[starts], kind="stable")
@@ -348,8 +352,8 @@ class _Hits:
         return cls(samples, starts, lengths, is_flat, order, np.cumsum(number) - number, number)
 
     def nearest(self, place: np.ndarray, pixel: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Of points (Q, 3) the hit in a pixel (Q,) on the same surface, -1 for none or without the `mask`; and how far
-        it is."""
+        """For points `place` (Q, 3): the nearest hit (Q,) of `pixel` (Q,) on the same flat surface, and its distance
+        (Q,) in m. It is -1 if there is none, and where `mask` is False."""
         hit, apart, least = np.full(len(pixel), -1), np.full(len(pixel), np.inf), np.full(len(pixel), np.inf)
         rows = np.flatnonzero(mask & (pixel >= 0) & (pixel < len(self.number)))
         for step in range(int(self.number[pixel[rows]].max(initial=0))):
@@ -367,9 +371,9 @@ class _Hits:
 
 
 def coarse_meshes(samples: SurfaceSamples) -> list[str]:
-    """The warning about smooth-shaded meshes so coarse that Cycles' own sampling decides about their light."""
+    """The warning about smooth-shaded meshes so coarse that their light depends on how Cycles samples."""
     cosine = np.abs(np.sum(samples.smooth_normal * samples.geometric_normal, axis=-1))
-    # The geometric normal of ribbons that pretend to be round hair is the view direction.
+    # Hair ribbons that pretend to be round have the view direction as their geometric normal.
     is_ribbon = np.abs(np.sum(samples.view * samples.geometric_normal, axis=-1)) > 1.0 - RIBBON_TOLERANCE
     count = np.count_nonzero((cosine < math.cos(COARSE_ANGLE)) & ~is_ribbon)
     if count <= COARSE_SHARE * len(samples):
@@ -383,7 +387,7 @@ def coarse_meshes(samples: SurfaceSamples) -> list[str]:
 
 
 def rounded_positions(position: np.ndarray, lights) -> list[str]:
-    """The warning about positions (P, 3) so far from the origin that single precision tells them badly apart."""
+    """The warning about positions (P, 3) so far from the origin that single precision rounds them noticeably."""
     lights = [light for light in lights if not light.is_distant]
     some = position[:: max(1, len(position) // FEW_SAMPLES, len(position) * len(lights) // MOST_PAIRS)]
     if len(some) == 0 or not lights:
@@ -399,7 +403,7 @@ def rounded_positions(position: np.ndarray, lights) -> list[str]:
         offset = point - center
         distance = np.linalg.norm(offset, axis=1) - reach
         height = np.where(facing, distance, np.abs((offset * direction).sum(axis=1)))
-        # A surface that shines does not light itself.
+        # A shining surface does not light itself.
         is_own = (distance < 0.0) & (height < 2.0 * apart[row]) & ~facing
         nearest[row] = np.where(is_own, np.inf, np.maximum(distance, height)).min()
     share = apart / np.maximum(nearest, 1e-30)

@@ -1,4 +1,4 @@
-"""Which normals and which parts of a lobe Cycles takes where a smooth normal leaves the face's horizon."""
+"""The normals that Cycles bends, and the horizons that end its lobes where smooth normals differ from the mesh's."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ from ..shading.light_tree import stand_ins
 from .light_tree import light_chances, light_rows
 
 SPECULAR_FIELDS = ("specular_f0", "specular_f90", "specular_dip", "dielectric")
-# Reflected rays stay at least this far above the true surface, or this share of the view's own elevation.
+# Cycles keeps mirrored views at least this high (as a sine) above the true surface.
 MINIMUM_REFLECTION_ELEVATION = 0.01
+# For flat views the limit is lower: this share of the view's own elevation.
 ELEVATION_SHARE = 0.9
 
 
@@ -27,11 +28,11 @@ def unit(vectors: np.ndarray) -> np.ndarray:
 def valid_specular_normal(normal: np.ndarray, true_normal: np.ndarray, view: np.ndarray) -> np.ndarray:
     """Unit normals (P, 3) bent towards `true_normal` just enough that the mirrored view leaves the surface.
 
-    In the plane of both normals let phi be the angle of the normal from the true normal and (x, z) the view's
-    components. The mirrored view's elevation is x sin 2phi + z cos 2phi = a cos(2phi - delta) with a = |(x, z)| and
-    tan delta = x / z. It starts at z for phi = 0 and first falls to the threshold t at phi = (delta + acos(t / a)) / 2.
-    Cycles bends specular normals (not diffuse ones) by this rule; t = min(0.9 z, 0.01). Inputs are unit (P, 3) with
-    `view . true_normal` > 0. Agrees with Cycles' own normals to 1e-4, 99 % of them to 1e-5.
+    Let phi be the angle of the normal from the true normal, in the plane of both, and (x, z) the view's components in
+    that plane. The mirrored view's elevation is x sin 2phi + z cos 2phi = a cos(2phi - delta), where a = |(x, z)| and
+    tan delta = x / z. It is z at phi = 0 and first falls to the threshold t at phi = (delta + acos(t / a)) / 2.
+    Cycles bends specular normals (not diffuse ones) by this rule with t = min(0.9 z, 0.01). Inputs are unit (P, 3) with
+    `view . true_normal` > 0. The result agrees with Cycles' own normals to 1e-4, and 99 % of it to 1e-5.
     """
     elevation = np.sum(view * true_normal, axis=-1)
     threshold = np.minimum(ELEVATION_SHARE * elevation, MINIMUM_REFLECTION_ELEVATION)
@@ -49,30 +50,34 @@ def valid_specular_normal(normal: np.ndarray, true_normal: np.ndarray, view: np.
 def bump_alpha2(normal: np.ndarray, smooth_normal: np.ndarray) -> np.ndarray:
     """Squared GGX roughness (P,) of the shadowing that Cycles puts on a bump-mapped diffuse lobe; 0 means none.
 
-    The lobe is multiplied by 2 / (1 + sqrt(1 + alpha^2 tan^2 theta_i)), theta_i the angle between light direction and
-    smooth normal, and is 0 below the smooth horizon; alpha^2 = tan^2 theta_d / 8, at most 1, theta_d the angle between
-    both normals (Estevez, Lecocq and Stein 2019, "A Microfacet-Based Shadowing Function to Solve the Bump Terminator
-    Problem", doi:10.1007/978-1-4842-4427-2_12). Agrees with Cycles 4.5.15 and 5.2.3 to 1e-4 of the total.
+    The lobe is multiplied by 2 / (1 + sqrt(1 + alpha^2 tan^2 theta_i)), where theta_i is the angle between light
+    direction and smooth normal, and is 0 below the smooth horizon. alpha^2 = tan^2 theta_d / 8, at most 1, where
+    theta_d is the angle between both normals (Estevez, Lecocq and Stein 2019, "A Microfacet-Based Shadowing Function to
+    Solve the Bump Terminator Problem", doi:10.1007/978-1-4842-4427-2_12). Agrees with Cycles 4.5.15 and 5.2.3 to 1e-4
+    of the total.
     """
     cosine2 = np.square(np.sum(normal * smooth_normal, axis=-1))
     tangent2 = np.divide(1.0 - cosine2, cosine2, out=np.full_like(cosine2, np.inf), where=cosine2 > 0.0)
     return np.clip(tangent2 / 8.0, 0.0, 1.0)
 
 
+# Least alpha in the probabilities of directions.
 SMALLEST_ALPHA = 1e-3
-# Directions at which both probabilities are compared: around the horizon, closest to each other near the highlight,
-# at heights between the two horizons.
+# Directions at which the two probabilities are compared. AROUND: angles around the smooth normal. CONCENTRATION: how
+# dense these are near the highlight. HEIGHTS: elevations as shares of the gap between the two horizons.
 AROUND, CONCENTRATION = 48, 6.0
 HEIGHTS = (1.0 / 6.0, 0.5, 5.0 / 6.0)
-# In rad. What lies between horizons that are closer is not worth a look.
+# Largest difference of the components of two normals whose horizons count as equal.
 SMALLEST_ANGLE = 1e-4
-# Of what lies between the horizons. A sample is split where more than this comes from below either.
+# A sample is split only if both parts have at least this share of the light from between the horizons.
 SMALLEST_SHARE = 5e-3
-UNSPLIT = 0.1  # of all light that splitting moves, where it is to be quick
+# Share of the light that splitting would move and that a quick run leaves where it is.
+UNSPLIT = 0.1
+# Samples per block.
 BLOCK = 2048
-# Of more flat lights so many rectangles are looked at that stand for them: no finer than the directions are.
+# If there are more flat lights of one spread, this many rectangles stand for them, about as fine as the directions.
 MOST_LIGHTS = 512
-# Pairs of samples and lights that are looked at at once, roughly and closely.
+# Pairs of samples and lights in one chunk: MOST_PAIRS where few arrays are needed for each, PAIRS where many are.
 MOST_PAIRS, PAIRS = 2**21, 2**14
 
 
@@ -83,14 +88,16 @@ def end_at_horizons_of_cycles(
     is_baked: bool = False,
     is_quick: bool = False,
 ) -> tuple[SurfaceSamples, np.ndarray]:
-    """Samples (Q) whose specular lobes end where those of Cycles do, and for each the index (Q,) of its sample (P).
+    """Samples (Q) whose specular lobes end where those of Cycles do, and the index (Q,) of each one's sample (P).
 
-    Between the horizons of the smooth normal and of the mesh Cycles counts directions that a light chose above the
-    former, and directions that the surface chose above the latter, each with its weight of multiple importance
-    sampling. Where this leaves a part, a sample becomes two: one that ends at the mesh's horizon, and one without
-    diffuse light that ends at the smooth one. They follow one another and add up to the sample. `hit` (P,) are
-    the numbers of the hits on surfaces; left out: each sample is one. Of what is `is_baked`, Cycles chooses directions
-    by the specular lobes alone. `is_quick` takes a third of the time, and splits only samples that this changes.
+    The smooth normal and the mesh have different horizons. Between them, Cycles counts a direction that a light chose
+    if it is above the smooth horizon, and one that the surface chose if it is above the mesh's, each with its weight of
+    multiple importance sampling. Where both kinds count, a sample becomes two consecutive ones that add up to it: one
+    ends at the mesh's horizon; the other ends at the smooth one and has no diffuse light.
+
+    `hit` (P,) numbers the surface hit of each sample; without it, each sample is its own hit. With `is_baked`, Cycles
+    chooses directions by the specular lobes alone. `is_quick` takes a third of the time, and leaves samples unsplit
+    where splitting changes little.
     """
     index = np.arange(len(samples))
     reflects = (samples.specular_f90 != 0.0).any(axis=1) | (samples.dielectric != 0.0).any(axis=1)
@@ -117,15 +124,15 @@ def end_at_horizons_of_cycles(
 
 
 def smooth_share(by_lobe: np.ndarray, by_light: np.ndarray) -> np.ndarray:
-    """Share (P,) of a lobe that ends at the smooth horizon, the rest at the mesh's, from `horizon_excess`."""
+    """Share (P,) of a lobe that ends at the smooth horizon; the rest ends at the mesh's. Takes `horizon_excess`."""
     both = by_lobe + by_light
-    # Where none of the directions meets a light, all are far from the highlight: the light's choice counts.
+    # Where no direction meets a light, all lights are far from the highlight: the light's choice decides.
     return np.clip(np.divide(by_light, both, out=np.ones_like(both), where=both != 0.0), 0.0, 1.0)
 
 
 def _with_few_splits(share: np.ndarray, excess: np.ndarray) -> np.ndarray:
-    """The shares (P,) of `smooth_share`, rounded to 0 or 1 where splitting changes least: all these together change
-    UNSPLIT of what splitting every sample would."""
+    """The shares (P,) of `smooth_share`, rounded to 0 or 1 for the samples where splitting matters least. Together they
+    account for UNSPLIT of the change that splitting every sample would make."""
     changed = np.minimum(share, 1.0 - share) * excess
     order = np.argsort(changed)
     sums = np.cumsum(changed[order])
@@ -136,8 +143,8 @@ def _with_few_splits(share: np.ndarray, excess: np.ndarray) -> np.ndarray:
 
 
 def lobe_chances(samples: SurfaceSamples, hit: np.ndarray, is_baked: bool) -> np.ndarray:
-    """How likely Cycles chooses directions by the specular and the diffuse lobe of the samples, (2, P): about as their
-    albedos are to those of all samples with the same `hit` (P,)."""
+    """Probabilities (2, P) with which Cycles chooses directions by the specular and by the diffuse lobe of each sample:
+    approximately its albedo relative to the sum over all samples with the same `hit` (P,)."""
     specular = _reflectance(samples, np.clip((samples.normal * samples.view).sum(axis=1), 0.0, 1.0))
     diffuse = np.zeros_like(specular) if is_baked else samples.diffuse_albedo.mean(axis=1)
     _, hit = np.unique(hit, return_inverse=True)
@@ -146,7 +153,7 @@ def lobe_chances(samples: SurfaceSamples, hit: np.ndarray, is_baked: bool) -> np
 
 
 def _reflectance(samples, cosine) -> np.ndarray:
-    """Mean reflectance (P, ...) of the lobes for cosines (P, ...) of the half angle."""
+    """Mean reflectance (P, ...) of the lobes for the cosines (P, ...) of half the angle between light and view."""
     names = ("specular_f0", "specular_f90", "dielectric")
     values = [getattr(samples, name).mean(axis=1) for name in names] + [np.maximum(samples.ior, 1.0)]
     f0, f90, weight, ior = (value.reshape(-1, *[1] * (cosine.ndim - 1)) for value in values)
@@ -157,12 +164,12 @@ def _reflectance(samples, cosine) -> np.ndarray:
 def horizon_excess(
     samples: SurfaceSamples, lights: tuple[AreaLight, ...], chances: np.ndarray, choose=None, is_quick: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What only one of the horizons lets through (P,), of directions that a lobe chose and of those that the light
-    chose: the smooth horizon is wrong about the former, that of the mesh about the latter.
+    """The light (P,) that only one of the horizons lets through, split by who chose its direction: a lobe or the light.
+    The smooth horizon is wrong about the first part, the mesh's horizon about the second.
 
-    `chances` (2, P) as of `lobe_chances`; `choose` tells those of the lights, left out: `light_tree.light_chances`.
-    Where both horizons make no difference the first is 1 and the second 0. `is_quick` asks a third of the directions:
-    on the example scene the shares are then 0.4 % off, weighted by the light.
+    `chances` (2, P) come from `lobe_chances`. `choose` returns the chances of the lights; by default it is
+    `light_tree.light_chances`. Where the horizons make no difference, the first part is 1 and the second 0. `is_quick`
+    looks at a third of the directions; on the example scene the shares are then 0.4 % off, weighted by the light.
     """
     lights, shares = _few(lights)
     shapes = [_Shapes.of(lights, numbers, shares[numbers]) for numbers in _alike(lights)]
@@ -177,8 +184,8 @@ def horizon_excess(
 
 
 def _excess(samples, shapes, chances, choose, is_quick):
-    """As `horizon_excess` of a few samples, with lights of these shapes, of which `choose(position, normal)` tells the
-    chances."""
+    """As `horizon_excess`, for one block of samples and lights in these `shapes`. `choose(position, normal)` returns
+    the chances of the lights."""
     crossings = [shape.crossings(samples) for shape in shapes]
     index = np.unique(np.concatenate([sample for _, sample in crossings]))
     by_lobe, by_light = np.ones(len(samples)), np.zeros(len(samples))
@@ -187,7 +194,7 @@ def _excess(samples, shapes, chances, choose, is_quick):
     by_lobe[index] = 0.0
     samples, chances = samples.take(index), chances[:, index]
     directions = _Directions.of(samples, is_quick)
-    # A few tell enough of a light as large as a side of the sky.
+    # A few directions suffice for a light as large as a side of the sky.
     for own, is_side in ((directions, False), (directions if is_quick else directions.few(), True)):
         hits = [
             shape.hits(number, np.searchsorted(index, sample), samples.position, own)
@@ -215,7 +222,7 @@ def _excess(samples, shapes, chances, choose, is_quick):
 
 
 def _few(lights) -> tuple[tuple[AreaLight, ...], np.ndarray]:
-    """Lights (L), of which stand for many flat ones at most MOST_LIGHTS, and which share of each (L,) shines."""
+    """Lights (L) and the share (L,) of each that shines. At most MOST_LIGHTS stand-ins replace many flat lights."""
     others, kinds = [], {}
     for light in lights:
         if light.is_facing or light.is_distant:
@@ -233,14 +240,14 @@ def _few(lights) -> tuple[tuple[AreaLight, ...], np.ndarray]:
 
 
 def _numbered(values, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """The numbers below `count` that are among the `values`, sorted, and the place there of each value."""
+    """The distinct `values`, sorted, which are below `count`; and the place of each value among them."""
     there = np.zeros(count, bool)
     there[values] = True
     return np.flatnonzero(there), (np.cumsum(there) - 1)[values]
 
 
 def _alike(lights) -> list[np.ndarray]:
-    """The numbers of the lights of the same outline that are near or distant, face points or not."""
+    """Groups of the numbers of lights that have the same kind of outline and are equally near, distant or facing."""
     kinds = {}
     for number, light in enumerate(lights):
         outline = light.shape if light.is_facing else 0 if light.is_round else len(light.polygon())
@@ -259,23 +266,23 @@ def _is_side(light) -> bool:
 
 @dataclass(frozen=True)
 class _Shapes:
-    """Lights of one kind: where they are seen from points."""
+    """Lights of one kind, as arrays for tests of which directions meet them."""
 
     number: np.ndarray  # (L,)
-    kind: str  # "BALL", "FACING_DISK" or that of the first flat one
+    kind: str  # "BALL", "FACING_DISK" or the shape of the first flat light
     is_distant: bool
     brightness: np.ndarray  # (L,)
     center: np.ndarray  # (L, 3)
     corners: np.ndarray  # (L, V, 3)
-    radius: np.ndarray  # (L,) of a ball that they are in
-    axes: np.ndarray  # (L, 3, 3) two in the plane, and back from where they shine
-    scales: np.ndarray  # (L, 2, 3) of offsets from the center: how many half_u and half_v they are
-    share: np.ndarray  # (L,) of them that shines
-    is_side: bool  # of the cube around the world, of which a direction meets one
+    radius: np.ndarray  # (L,) of a ball around the light
+    axes: np.ndarray  # (L, 3, 3) two unit vectors in the plane, and the reverse of the emitting direction
+    scales: np.ndarray  # (L, 2, 3) turn an offset from the center into multiples of half_u and half_v
+    share: np.ndarray  # (L,) of the light's area that shines
+    is_side: bool  # True for sides of the cube around the world; a direction meets exactly one
 
     @classmethod
     def of(cls, lights, number, share) -> _Shapes:
-        """The lights of these numbers, which are of one kind; a `share` (L,) of each shines."""
+        """The lights of these numbers, which are of one kind; the `share` (L,) of each shines."""
         own = [lights[n] for n in number]
         center, corners = (np.array([light.center for light in own]), np.array([light.polygon() for light in own]))
         radius = np.linalg.norm(corners - center[:, None], axis=2).max(axis=1)
@@ -293,8 +300,8 @@ class _Shapes:
         return self.kind in FACING_SHAPES
 
     def crossings(self, samples) -> tuple[np.ndarray, np.ndarray]:
-        """Pairs of lights, numbers among these, and samples from where a light is not wholly on one side of both
-        horizons."""
+        """Pairs of a light and a sample whose horizons differ on the light: part of it is above one of them, and part
+        of it below one. Both are numbers, the light's among these."""
         position = 0.0 * samples.position if self.is_distant else samples.position
         normals = samples.smooth_normal, samples.geometric_normal
         starts = [(normal * position).sum(axis=1) for normal in normals]
@@ -302,7 +309,7 @@ class _Shapes:
         for start in range(0, len(self.center), step):
             center, radius = self.center[start : start + step], self.radius[start : start + step, None]
             smooth, true = (center @ normal.T - at for normal, at in zip(normals, starts, strict=True))
-            # A little more, as the sums are rounded.
+            # A little more, because the sums are rounded.
             reach = radius if self.is_facing else radius + 1e-9 * (np.abs(smooth) + np.abs(true))
             between = (np.minimum(smooth, true) <= reach) & (np.maximum(smooth, true) > -reach)
             if not self.is_facing:
@@ -321,8 +328,8 @@ class _Shapes:
         return tuple(np.concatenate(found, axis=1))
 
     def hits(self, light, sample, position, directions) -> tuple[np.ndarray, ...]:
-        """Of the pairs (R,) of lights and samples that cross: number of the light, sample, number of the direction,
-        brightness and solid angle of the whole light, for each direction that meets a light."""
+        """One entry for each direction that meets its light, from the pairs (R,) `light` and `sample` of `crossings`:
+        number of the light, sample, number of the direction, brightness and solid angle in sr of the whole light."""
         if self.is_side:
             return self._side_hits(np.unique(sample), directions)
         found = [(np.zeros(0, int), np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(0))]
@@ -339,7 +346,7 @@ class _Shapes:
         return tuple(np.concatenate(values) for values in zip(*found, strict=True))
 
     def _side_hits(self, sample, directions) -> tuple[np.ndarray, ...]:
-        """As `hits`, for all directions of samples (R,): each meets the side along its longest component."""
+        """As `hits`, for all directions of the samples (R,): each meets the side along its largest component."""
         towards = directions.towards[sample]
         size = np.abs(towards)
         longest = np.where(size[..., 0] >= np.maximum(size[..., 1], size[..., 2]), 0, 1 + (size[..., 2] > size[..., 1]))
@@ -354,13 +361,13 @@ class _Shapes:
         return self.number[own], sample[row], ray, self.brightness[own], angle[own]
 
     def _cosine(self, light, distance) -> np.ndarray:
-        """Cosine (R,) of half the width of lights that face every point."""
+        """Cosine (R,) of the angular radius of lights that face every point."""
         ratio = np.minimum(self.radius[light] / np.maximum(distance, 1e-30), 1.0)
         return np.sqrt(1.0 - ratio**2) if self.kind == "BALL" else 1.0 / np.sqrt(1.0 + ratio**2)
 
     def _meets(self, light, offset, pair, towards) -> np.ndarray:
-        """Mask (K,): which rays along `towards` (K, 3), of the pairs (K,) among (R,), meet their light, whose center is
-        `offset` (R, 3) away."""
+        """Mask (K,) of the rays that meet their light. The ray k goes along `towards` (K, 3) from the pair `pair[k]`
+        (of R), whose light has its center at `offset` (R, 3)."""
         if self.is_facing:
             distance = np.linalg.norm(offset, axis=1)
             along = (towards * offset[pair]).sum(axis=1)
@@ -385,7 +392,7 @@ class _Shapes:
         return inside & (steepness > 0.0)
 
     def _solid_angle(self, light, offset) -> np.ndarray:
-        """Solid angle (R,) of lights in sr whose center is `offset` (R, 3) away, 0 from behind."""
+        """Solid angle (R,) in sr of lights whose center is at `offset` (R, 3); 0 as seen from behind."""
         if self.is_facing:
             return 2.0 * np.pi * (1.0 - self._cosine(light, np.linalg.norm(offset, axis=1)))
         corners = self.corners[light] - self.center[light, None] + offset[:, None]
@@ -402,7 +409,7 @@ def _plane_axes(light) -> np.ndarray:
 
 
 def _lobe_density(samples, towards) -> np.ndarray:
-    """Probability (P, N) per sr that the lobe chooses the directions."""
+    """Probability (P, N) per sr with which the specular lobe chooses the directions."""
     half = towards + samples.view[:, None]
     vertical = np.square(np.maximum(np.einsum("pni,pi->pn", half, samples.normal), 0.0))
     horizontal = np.maximum(np.square(half).sum(axis=2) - vertical, 0.0)
@@ -412,8 +419,8 @@ def _lobe_density(samples, towards) -> np.ndarray:
 
 
 def _seen_by_light(samples, towards) -> np.ndarray:
-    """Share (P, N) of the microfacets seen by the eye, in the middle of the directions, that these reach: 0 below
-    the horizon of the lobe."""
+    """Share (P, N) of the microfacets visible from the eye that are also visible from directions `towards` (P, N, 3);
+    0 below the horizon of the lobe."""
     alpha2 = np.square(np.maximum(samples.roughness**2, SMALLEST_ALPHA))[:, None]
     to_eye = np.maximum((samples.normal * samples.view).sum(axis=1), 1e-3)[:, None]
     to_light = np.maximum(np.einsum("pni,pi->pn", towards, samples.normal), 0.0)
@@ -423,8 +430,8 @@ def _seen_by_light(samples, towards) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Directions:
-    """Unit directions (P, N, 3) between the horizons, AROUND for each of HEIGHTS or for all, and the solid angle (P, N)
-    of each, negative where the horizon of the mesh is the lower one."""
+    """Unit directions (P, N, 3) between the horizons, AROUND of them for each of HEIGHTS or in total, and the solid
+    angle (P, N) in sr of each; it is negative where the mesh's horizon is the lower one."""
 
     towards: np.ndarray
     width: np.ndarray
@@ -433,7 +440,7 @@ class _Directions:
 
     @classmethod
     def of(cls, samples, is_quick: bool = False) -> _Directions:
-        """Those of samples; `is_quick`: at heights that take turns around the normal."""
+        """The directions of `samples`. With `is_quick`, each angle around the normal has only one of HEIGHTS."""
         mirrored = 2.0 * (samples.normal * samples.view).sum(axis=1, keepdims=True) * samples.normal - samples.view
         flat = mirrored - (mirrored * samples.smooth_normal).sum(axis=1, keepdims=True) * samples.smooth_normal
         flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)
@@ -442,7 +449,7 @@ class _Directions:
         angle = np.pi * np.sinh(CONCENTRATION * step) / np.sinh(CONCENTRATION)
         span = np.pi * CONCENTRATION * np.cosh(CONCENTRATION * step) / np.sinh(CONCENTRATION) * 2.0 / AROUND
         around = np.cos(angle)[:, None] * flat[:, None] + np.sin(angle)[:, None] * across[:, None]
-        # How high above the smooth horizon that of the mesh lies there.
+        # Elevation of the mesh's horizon over the smooth one at these angles.
         rise = -np.arctan2(
             np.einsum("pni,pi->pn", around, samples.geometric_normal),
             np.einsum("pi,pi->p", samples.smooth_normal, samples.geometric_normal)[:, None],
@@ -456,14 +463,14 @@ class _Directions:
         return cls(towards.reshape(count, -1, 3), width.reshape(count, -1), np.stack([flat, across], axis=1), angle)
 
     def few(self) -> _Directions:
-        """A third of them, at heights that take turns, each for three; without angles."""
+        """A third of the directions, each with the solid angle of three, at alternating heights and without angles."""
         around = np.arange(AROUND)
         chosen = (around % len(HEIGHTS)) * AROUND + around
         return _Directions(self.towards[:, chosen], len(HEIGHTS) * self.width[:, chosen], self.flat, self.angle[:0])
 
     def near(self, sample, offset, radius) -> tuple[np.ndarray, np.ndarray]:
-        """Numbers (K,) of pairs and of the directions that may meet a ball of the `radius` (R,), `offset` (R, 3) away
-        from the samples (R,): at no other angles around the smooth normal does it stand."""
+        """Numbers (K,) of pairs, and of the directions of each pair that may meet its ball. The balls have the `radius`
+        (R,) and are at `offset` (R, 3) from the samples (R,). Only the angle around the smooth normal is tested."""
         x, y = np.einsum("rai,ri->ar", self.flat[sample], offset)
         ratio = np.minimum(radius / np.maximum(np.hypot(x, y), 1e-30), 1.0)
         reach = np.where(ratio < 1.0, np.arcsin(ratio), np.pi) + 1e-6

@@ -1,7 +1,7 @@
-"""Image textures as Cycles samples them: which pixels, how blended, decoded when. Needs no bpy.
+"""Image textures as Cycles samples them: extension, interpolation and decoding. Needs no bpy.
 
-Measured with 4.5.15 and 5.2.3: images of 8 bits in sRGB are decoded after interpolation; CLIP is black outside and
-blends towards it within half a pixel.
+Measured with 4.5.15 and 5.2.3: 8-bit images in sRGB are decoded after interpolation; with CLIP, the image is black
+outside and blends to black within half a pixel.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-# Cycles' gray of a color, Rec.709 (luminance).
+# Weights of Cycles' gray of a color: Rec.709 luminance.
 GRAY = np.array([0.2126729, 0.7151522, 0.0721750])
 EXTENSIONS = ("REPEAT", "EXTEND", "CLIP", "MIRROR")
 INTERPOLATIONS = ("Linear", "Closest")
@@ -19,7 +19,7 @@ INTERPOLATIONS = ("Linear", "Closest")
 
 @dataclass(frozen=True)
 class ImageTexture:
-    """Pixels (H, W, 3), uint8 or float32, row 0 below, and how they are read."""
+    """Pixels (H, W, 3), uint8 or float32, row 0 at the bottom, and how they are read."""
 
     pixels: np.ndarray
     extension: str  # one of EXTENSIONS
@@ -33,7 +33,7 @@ class ImageTexture:
         return _decoded(found) if self.srgb else found
 
     def _at(self, x, y):
-        """Values (Q, 3) of pixels anywhere in the plane."""
+        """Values (Q, 3) of pixels at integers x, y (Q,), which may lie outside the image."""
         height, width = self.pixels.shape[:2]
         columns, rows = (within(index, size, self.extension) for index, size in ((x, width), (y, height)))
         found = self.pixels[rows, columns].astype(np.float64)
@@ -45,7 +45,8 @@ class ImageTexture:
 
 
 def interpolated(uv: np.ndarray, size: tuple[int, int], interpolation: str, pixel: Callable) -> np.ndarray:
-    """Values at uv (Q, 2) of an image of `size` (width, height); `pixel(x, y)` gives those of pixels in the plane."""
+    """Values at uv (Q, 2) of an image of `size` (width, height). `pixel(x, y)` returns the values of pixels, which may
+    lie outside the image."""
     place = uv * np.array(size, uv.dtype)
     if interpolation == "Closest":
         return pixel(*np.floor(place).astype(np.int64).T)
@@ -58,7 +59,7 @@ def interpolated(uv: np.ndarray, size: tuple[int, int], interpolation: str, pixe
 
 
 def within(index: np.ndarray, size: int, extension: str) -> np.ndarray:
-    """The columns or rows (Q,) of an image that stand for those at `index` (Q,) anywhere in the plane."""
+    """The columns or rows (Q,) of an image that extend it to `index` (Q,), which may lie outside."""
     if extension == "REPEAT":
         return index % size
     if extension == "MIRROR":
@@ -68,5 +69,5 @@ def within(index: np.ndarray, size: int, extension: str) -> np.ndarray:
 
 
 def _decoded(encoded):
-    """Linear values of sRGB (IEC 61966-2-1)."""
+    """Linear values of sRGB values (IEC 61966-2-1)."""
     return np.where(encoded <= 0.04045, encoded / 12.92, ((np.maximum(encoded, 0.0) + 0.055) / 1.055) ** 2.4)

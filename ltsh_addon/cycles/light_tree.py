@@ -1,7 +1,7 @@
-"""How likely Cycles chooses a light for a point: the chances that its light tree gives (Conty Estevez and Kulla 2018,
+"""How likely Cycles chooses a light for a point: the probabilities of its light tree (Conty Estevez and Kulla 2018,
 "Importance Sampling of Many Lights with Adaptive Tree Splitting", doi:10.1145/3233305).
 
-Chances do not change what renders converge to but between two horizons, see `horizons`.
+These do not change what a render converges to, except for directions between two horizons, see `horizons`.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ import numpy as np
 from ..scene import AreaLight
 from ..shading.facing import cone_angle
 
-# Of these Cycles makes a leaf at most, and tries so many places along each axis where clusters may be cut.
+# LIGHTS_OF_LEAF: most lights of a leaf in Cycles. BUCKETS: along each axis Cycles tries to cut a cluster between these.
 LIGHTS_OF_LEAF = 8
 BUCKETS = 12
-# More are all taken for one leaf: none of them matters much.
+# If there are more lights, all count as one leaf: none of them matters much.
 MOST_LIGHTS = 64
-# Pairs of points and lights that are looked at at once.
+# Pairs of points and lights in one chunk.
 PAIRS = 2**14
 
 
 @dataclass(frozen=True)
 class Cluster:
-    """Lights in a box, their directions within the angle `spread` around `axis`, each of which shines as far as `reach`
-    from its own."""
+    """Lights in a box. Their directions are within the angle `spread` of `axis`, and each shines as far as the angle
+    `reach` from its own direction."""
 
     lights: tuple[int, ...]
     low: np.ndarray  # (3,) m
@@ -38,7 +38,7 @@ class Cluster:
     halves: tuple[Cluster, Cluster] | None = None
 
     def joined(self, other: Cluster) -> Cluster:
-        """Both clusters in one."""
+        """Both clusters as one."""
         wide, narrow = (other, self) if other.spread > self.spread else (self, other)
         cosine = float(np.clip(wide.axis @ narrow.axis, -1.0, 1.0))
         apart, axis, spread = np.arccos(cosine), wide.axis, wide.spread
@@ -64,7 +64,7 @@ class Cluster:
         return self.power * (area if area > 0.0 else np.linalg.norm(self.high - self.low)) * directions
 
     def bounds(self, position: np.ndarray, normal: np.ndarray) -> np.ndarray:
-        """The most and the least (2, P) that points (P, 3) with normals may get from lights around the box's center."""
+        """Upper and lower bound (2, P) on what points (P, 3) with normals get from lights in the box."""
         center, radius = 0.5 * (self.low + self.high), 0.5 * np.linalg.norm(self.high - self.low)
         offset = center - position
         distance = np.linalg.norm(offset, axis=1)
@@ -76,7 +76,8 @@ class Cluster:
 
 
 def _bounds(cluster, offset, normal, width, near, far):
-    """Bounds (2, P) of a cluster that reaches a cone of cosine `width` (P,) around the offset."""
+    """Bounds (2, P) for a cluster that lies within a cone around the offset; `width` (P,) is the cosine of its
+    angle."""
     axis = offset / np.maximum(np.linalg.norm(offset, axis=1), 1e-30)[:, None]
     here, there = (axis * normal).sum(axis=1), -(axis @ cluster.axis)
     most_here = np.where(here >= width, 1.0, _cosine_of_sum(here, width, -1.0))
@@ -96,16 +97,16 @@ def _bounds(cluster, offset, normal, width, near, far):
 
 
 def _cosine_of_sum(first, second, sign):
-    """Cosine of the sum of two angles of 0 to pi, or with the sign -1 of their difference, from their cosines."""
+    """Cosine of the sum of two angles in [0, pi], or of their difference for `sign` -1, from their cosines."""
     return first * second - sign * np.sqrt(np.maximum(1.0 - first**2, 0.0) * np.maximum(1.0 - second**2, 0.0))
 
 
 def light_chances(
     position: np.ndarray, normal: np.ndarray, lights: tuple[AreaLight, ...], rows: np.ndarray | None = None
 ) -> np.ndarray:
-    """How likely each of the lights (L, P) is chosen for points (P, 3) with smooth normals: by the most and by the
-    least that a half of the lights may send, each half of the time, down to the leaves. `rows` are their
-    `light_rows`."""
+    """Probability (L, P) with which each light is chosen for points (P, 3) with smooth normals. Down to the leaves, the
+    halves of a cluster are chosen by their upper bounds half of the time, and by their lower bounds the other half.
+    `rows` are the `light_rows` of the lights."""
     rows = light_rows(lights) if rows is None else rows
     own = own_bounds(position, normal, lights, rows)
     if len(lights) > MOST_LIGHTS:
@@ -114,7 +115,7 @@ def light_chances(
     if distant.all():
         return chances_of(own)
     if distant.any():
-        # Next to the tree of the others, as one of the halves of the whole.
+        # The distant lights and the tree of the others are the two halves of the whole.
         near, chances = np.flatnonzero(~distant), np.zeros((len(lights), len(position)))
         shares = chances_of(np.stack([own[near].sum(axis=0), own[distant].sum(axis=0)]))
         chances[near] = shares[0] * light_chances(
@@ -138,22 +139,22 @@ def light_chances(
 
 
 def chances_of(bounds: np.ndarray) -> np.ndarray:
-    """Chances (N, P) of alternatives by the most and the least, (N, 2, P), that they may send."""
+    """Probabilities (N, P) of alternatives, given upper and lower bounds (N, 2, P) on their light."""
     most, least = bounds[:, 0], bounds[:, 1]
-    # Where all may send nothing, all that may send something are alike.
+    # If all lower bounds are 0, all alternatives with an upper bound above 0 are equally likely.
     least = np.where(least.sum(axis=0) > 0.0, least, most > 0.0)
     return sum(0.5 * part / np.maximum(part.sum(axis=0), 1e-30) for part in (most, least))
 
 
 def own_bounds(position: np.ndarray, normal: np.ndarray, lights: tuple[AreaLight, ...], rows: np.ndarray) -> np.ndarray:
-    """The most and the least (L, 2, P) that points (P, 3) with normals may get from each light, from a flat one by its
-    rectangle; in single precision where there are more than MOST_LIGHTS."""
+    """Upper and lower bound (L, 2, P) on what points (P, 3) with normals get from each light. A flat light counts as
+    its rectangle. In single precision if there are more than MOST_LIGHTS."""
     kind = np.float32 if len(lights) > MOST_LIGHTS else np.float64
     own = np.empty((len(lights), 2, len(position)), kind)
     distant, facing = (np.array([getattr(light, name) for light in lights]) for name in ("is_distant", "is_facing"))
     for number in np.flatnonzero(facing):
         own[number] = _facing_bounds(lights[number], position, normal)
-    # Large numbers are subtracted before they lose digits.
+    # Subtract large coordinates in double precision.
     middle = position.mean(axis=0) if len(position) else np.zeros(3)
     step = max(PAIRS // max(len(position), 1), 1)
     for flat, points, origin in ((~distant, position - middle, middle), (distant, 0.0 * position, 0.0)):
@@ -166,7 +167,7 @@ def own_bounds(position: np.ndarray, normal: np.ndarray, lights: tuple[AreaLight
 
 
 def _flat_bounds(rows, position, normal):
-    """As `own_bounds` (N, 2, P) of flat lights from their `_row`s (N, 16), for points (3, P) with normals."""
+    """As `own_bounds`, (N, 2, P), for flat lights given by `light_rows` (N, 16) and points (3, P) with normals."""
     center, half_u, half_v, direction = (rows[:, start : start + 3].T[..., None] for start in (0, 3, 6, 9))
     reach, power = np.maximum(np.cos(rows[:, 12, None]), 0.0), rows[:, 13, None]
     x, y, z = center - position[:, None]
@@ -197,7 +198,7 @@ def _flat_bounds(rows, position, normal):
 
 
 def _facing_bounds(light, position, normal):
-    """As `own_bounds` (2, P) of one point or spot light."""
+    """As `own_bounds`, (2, P), for one point or spot light."""
     offset = light.center - position
     distance = np.linalg.norm(offset, axis=1)
     axis = offset / np.maximum(distance, 1e-30)[:, None]
@@ -221,7 +222,7 @@ def _facing_bounds(light, position, normal):
 
 
 def light_rows(lights: tuple[AreaLight, ...]) -> np.ndarray:
-    """What the tree knows of lights (L, 16)."""
+    """What the tree needs to know of each light, (L, 16)."""
     return np.array([_row(light) for light in lights])
 
 
@@ -242,13 +243,13 @@ def _cluster_of(row, number: int) -> Cluster:
 
 @lru_cache(maxsize=4)
 def _tree(rows: bytes, count: int) -> Cluster:
-    """The tree of `count` lights, of which `_row` gave the bytes."""
+    """The tree of `count` lights, given the bytes of their `light_rows`."""
     rows = np.frombuffer(rows).reshape(count, -1)
     return _grown([_cluster_of(row, number) for number, row in enumerate(rows)], rows[:, :3])
 
 
 def _all(clusters) -> Cluster:
-    """All clusters in one, as wide as those with power are."""
+    """All clusters as one. Those without power do not widen it."""
     lights = tuple(number for cluster in clusters for number in cluster.lights)
     return replace(
         reduce(Cluster.joined, [cluster for cluster in clusters if cluster.power] or clusters[:1]), lights=lights
@@ -256,7 +257,8 @@ def _all(clusters) -> Cluster:
 
 
 def _grown(clusters: list[Cluster], centers: np.ndarray) -> Cluster:
-    """The clusters, of one light each, in one whose halves are those that cost least; `centers` (L, 3) of all."""
+    """The tree over `clusters` of one light each, cut where it costs least; `centers` (L, 3) are those of all
+    lights."""
     whole = _all(clusters)
     if len(clusters) < 2:
         return whole

@@ -1,4 +1,4 @@
-"""Lobes of a surface as AOVs carry them, and the samples that they make."""
+"""The lobes of a surface as AOVs carry them, and the samples that follow from them."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ HIT_AOVS = {
     "smooth_normal": "COLOR",
     "true_normal": "COLOR",
 }
-# Of finished pictures alone: the sum of the bits of the passes in which Cycles keeps its direct light.
+# Only for finished pictures: the sum of the bits of the passes whose direct light is left to Cycles.
 KEPT_AOV, KEPT_BITS = "kept", {"specular": 1, "diffuse": 2}
-# Name of the quantity -> type of the AOV, and the value that changes nothing: an AOV that no material needs is left out
-# (None: never left out).
+# Name of the quantity -> type of the AOV, and the neutral value, which changes nothing. An AOV that no material needs
+# is left out, unless its neutral value is None.
 LOBE_AOVS = {
     "kind": ("VALUE", 0.0),  # one of LOBE_KINDS
     "weight": ("VALUE", 1.0),  # product of the factors of mixes
     "normal": ("COLOR", (0.0, 0.0, 0.0)),  # the Normal socket; zero: the smooth normal
-    "color": ("COLOR", None),  # of conductors the refractive index
+    "color": ("COLOR", None),  # for conductors, the refractive index
     "roughness": ("VALUE", None),
     "anisotropy": ("VALUE", 0.0),
     "rotation": ("VALUE", 0.0),  # of the tangent, in turns
@@ -43,7 +43,7 @@ LOBE_AOVS = {
     "ior": ("VALUE", 1.5),
     "diffuse_roughness": ("VALUE", 0.0),
     "specular_level": ("VALUE", 0.5),
-    "tint": ("COLOR", (1.0, 1.0, 1.0)),  # of conductors the extinction coefficient
+    "tint": ("COLOR", (1.0, 1.0, 1.0)),  # for conductors, the extinction coefficient
     "multiple_scattering": ("VALUE", 0.0),  # 1 for Multiscatter GGX
     "transmission": ("VALUE", 0.0),
     "backfacing": ("VALUE", 0.0),
@@ -64,7 +64,7 @@ LOBE_KINDS = {
     "translucent": 4.0,
     "metal": 5.0,
     "conductor": 6.0,
-    "conductor_4_5": 7.0,  # with the approximate reflectance of Cycles 4.5
+    "conductor_4_5": 7.0,  # with the approximate reflectance that Cycles 4.5 uses
     "glass": 8.0,
     "sheen": 9.0,
     "velvet": 10.0,
@@ -72,12 +72,12 @@ LOBE_KINDS = {
 
 
 def lobe_aov(name: str, slot: int) -> str:
-    """The AOV of the quantity `name` of LOBE_AOVS in a slot."""
+    """Name of the AOV of the quantity `name` of LOBE_AOVS in a slot."""
     return f"{name}_{slot}"
 
 
 def aov_kind(name: str) -> str:
-    """Type of an AOV: of HIT_AOVS, or as `lobe_aov` names it."""
+    """Type of an AOV, whose name is from HIT_AOVS or `lobe_aov`."""
     if name == KEPT_AOV:
         return "VALUE"
     return HIT_AOVS[name] if name in HIT_AOVS else LOBE_AOVS[name.rpartition("_")[0]][0]
@@ -86,7 +86,7 @@ def aov_kind(name: str) -> str:
 def read_layer(channels: dict[str, np.ndarray], name: str, components: str) -> np.ndarray:
     """Pass `name` as (H, W) float32, or (H, W, 3) for three components, from EXR `channels` of one view layer.
 
-    Blender writes `<view layer>.<pass>.<component>`; the view layer's name is of no interest.
+    Blender writes `<view layer>.<pass>.<component>`; any view layer will do. Raises ValueError.
     """
     planes = []
     for component in components:
@@ -101,33 +101,33 @@ def read_layer(channels: dict[str, np.ndarray], name: str, components: str) -> n
 
 
 def read_aov(channels: dict[str, np.ndarray], name: str) -> np.ndarray:
-    """The AOV `name` (see `aov_kind`): (H, W) or (H, W, 3) float32."""
+    """The AOV `name` (as in `aov_kind`): (H, W) or (H, W, 3) float32."""
     return read_layer(channels, AOV_PREFIX + name, "RGB" if aov_kind(name) == "COLOR" else "X")
 
 
 def lobe_names(channels: dict[str, np.ndarray]) -> list[list[str]]:
-    """For each slot in EXR `channels` the names of LOBE_AOVS that were written."""
+    """For each slot in EXR `channels`, the names of LOBE_AOVS that were written."""
     written = {key.rpartition(".")[0].rpartition(AOV_PREFIX)[2] for key in channels if AOV_PREFIX in key}
     slots = [[name for name in LOBE_AOVS if lobe_aov(name, slot) in written] for slot in range(MAX_LOBES)]
     return [names for names in slots if names]
 
 
-LEAST_VELVET = 0.01  # of its roughness, as in Cycles
-# Below this weight Cycles drops a closure.
+LEAST_VELVET = 0.01  # the least roughness of velvet, as in Cycles
+# Cycles drops closures below this weight.
 SMALLEST_WEIGHT = 1e-5
 
 
 @dataclass(frozen=True)
 class Hits:
-    """What each of P hits has once."""
+    """What all lobes of a hit share, for P hits."""
 
     position: np.ndarray  # (P, 3)
     view: np.ndarray  # (P, 3)
     smooth_normal: np.ndarray  # (P, 3)
     true_normal: np.ndarray  # (P, 3)
-    corrected: np.ndarray  # (P,) bool: specular normals are bent
+    corrected: np.ndarray  # (P,) bool: Cycles bends the specular normals
     receiver: np.ndarray  # (P,) integers
-    diffuse_albedo: np.ndarray | None  # (P, 3) of all lobes together; None: as estimated from each lobe's own
+    diffuse_albedo: np.ndarray | None  # (P, 3) sum over all lobes; None: estimated lobe by lobe
 
     def take(self, index) -> Hits:
         """The hits at `index`."""
@@ -135,12 +135,12 @@ class Hits:
         return Hits(**{name: None if value is None else value[index] for name, value in values.items()})
 
 
-# Those that may be anisotropic.
+# The kinds of lobes that may be anisotropic.
 BRUSHED_KINDS = ("glossy", "principled", "metal", "conductor", "conductor_4_5")
 
 
 def aspect_of(kind: str, anisotropy):
-    """By what alpha is divided along the tangent, and multiplied across it, in a lobe of one of BRUSHED_KINDS."""
+    """Factor by which a lobe of one of BRUSHED_KINDS divides alpha along the tangent and multiplies it across."""
     if kind != "glossy":
         return np.sqrt(1.0 - 0.9 * np.clip(anisotropy, 0.0, 1.0))
     share = np.clip(anisotropy, -0.99, 0.99)
@@ -161,7 +161,7 @@ class LobeSlot:
 
     @cached_property
     def alphas(self) -> np.ndarray:
-        """Alpha (2, Q) of GGX along the tangent and across it."""
+        """Alphas (2, Q) of GGX along the tangent and across it."""
         alpha = self.roughness**2
         if not self._has_anisotropy():
             return np.stack([alpha, alpha])
@@ -172,19 +172,19 @@ class LobeSlot:
 
     @cached_property
     def gloss(self) -> np.ndarray:
-        """Roughness (Q,) of all but what is transmitted: by the mean of both alphas."""
+        """Roughness (Q,) of the reflecting lobes, from the geometric mean of both alphas."""
         return np.sqrt(np.sqrt(self.alphas[0] * self.alphas[1]))
 
     def _has_anisotropy(self):
         return "anisotropy" in self.lobe and bool((np.abs(self.value("anisotropy")) > 0.0).any())
 
     def stretch(self) -> dict[str, np.ndarray]:
-        """Anisotropy and tangent as `SurfaceSamples` have them, {} without."""
+        """Anisotropy and tangent as in `SurfaceSamples`; {} if no lobe is anisotropic."""
         along, across = self.alphas
         if (along == across).all():
             return {}
         ratio = np.sqrt(np.divide(across, along, out=np.ones_like(along), where=along > 0.0))
-        # Cycles turns the tangent of a Glossy BSDF around the normal that it has bent.
+        # Cycles rotates the tangent of a Glossy BSDF around its bent normal.
         axis = np.where(self.of("glossy"), self.specular_normal, self.normal)
         tangent, angle = self.value("tangent"), 2.0 * np.pi * self.value("rotation")[:, None]
         beside = np.sum(axis * tangent, axis=1, keepdims=True) * axis
@@ -192,7 +192,7 @@ class LobeSlot:
         return {"anisotropy": np.where(ratio > 0.0, 1.0 - ratio, 0.0), "tangent": turned}
 
     def value(self, name: str, default=None) -> np.ndarray:
-        """The quantity `name`; where the lobe has none, its neutral value, or else `default`."""
+        """The quantity `name`, (Q,) or (Q, 3). If it was not written: its neutral value or, without one, `default`."""
         if name in self.lobe:
             return self.lobe[name][self.index]
         kind, neutral = LOBE_AOVS[name]
@@ -200,7 +200,7 @@ class LobeSlot:
         return np.broadcast_to(np.float64(neutral), (len(self.index), 3) if kind == "COLOR" else (len(self.index),))
 
     def has(self, name: str) -> bool:
-        """True where some sample has more than a vanishing `name`."""
+        """True if the quantity `name` exceeds SMALLEST_WEIGHT at some hit."""
         return name in self.lobe and bool((self.value(name) > SMALLEST_WEIGHT).any())
 
     def of(self, kind: str) -> np.ndarray:
@@ -220,28 +220,28 @@ class LobeSlot:
         return self._bent(self._normal("coat_normal"))
 
     def sheen_normal(self) -> np.ndarray:
-        """Shading normal (Q, 3) of the sheen: that of the base, and under a coat partly that of the coat."""
+        """Shading normal (Q, 3) of the sheen: that of the base, blended with the coat's by the coat's weight."""
         coat = np.clip(self.value("coat_weight"), 0.0, 1.0)[:, None]
         return unit((1.0 - coat) * self.normal + coat * self.coat_normal())
 
     def cosine(self, normal) -> np.ndarray:
-        """Cosine (Q,) of the view."""
+        """Cosine (Q,) of the angle between `normal` and the view, in [0, 1]."""
         return np.clip(np.sum(normal * self.hits.view, axis=-1), 0.0, 1.0)
 
     @cached_property
     def color(self) -> np.ndarray:
-        """(Q, 3), never negative."""
+        """Color (Q, 3), never negative."""
         return np.maximum(self.value("color", 0.0), 0.0)
 
     @cached_property
     def metallic(self) -> np.ndarray:
-        """Share (Q,) of the metal."""
+        """Share (Q,) of metal."""
         clipped = np.clip(self.value("metallic"), 0.0, 1.0)
         return np.where(self.of("metal")[:, 0], 1.0, np.where(self.of("principled")[:, 0], clipped, 0.0))
 
     @cached_property
     def transmission(self) -> np.ndarray:
-        """Share (Q,) of the transmission in what is no metal."""
+        """Share (Q,) of transmission in what is not metal."""
         return np.where(self.of("principled")[:, 0], np.clip(self.value("transmission"), 0.0, 1.0), 0.0)
 
     @cached_property
@@ -250,15 +250,15 @@ class LobeSlot:
         return closures.albedos(self.gloss, self.cosine(self.specular_normal))
 
     def scattered(self, mean: np.ndarray) -> np.ndarray:
-        """Factor (Q, 3) of multiple scattering for the mean reflectance `mean` (Q, 3); 1 where there is none."""
+        """Factor (Q, 3) of multiple scattering for the mean reflectance `mean` (Q, 3); 1 for lobes without it."""
         if not self.has("multiple_scattering"):
             return np.ones_like(mean)
         factor = closures.multiple_scattering(mean, *self.albedos)
         return np.where((self.value("multiple_scattering") > 0.5)[:, None], factor, 1.0)
 
 
-# What of SurfaceSamples makes another diffuse lobe than Lambert's, and another specular one than isotropic GGX; how
-# many numbers each is.
+# Fields of SurfaceSamples that make a diffuse lobe differ from Lambert's, or a specular lobe from isotropic GGX; how
+# many numbers each has.
 SHAPE = {
     "diffuse_roughness": 1, "diffuse_rebound": 3, "sheen_a": 1, "sheen_b": 1, "anisotropy": 1, "tangent": 3,
 }  # fmt: skip
@@ -266,7 +266,7 @@ SHAPE = {
 
 @dataclass
 class _Part:
-    """Samples of one kind at the hits `index` (Q,); what is left out is zero or that of the hit."""
+    """Samples of one kind at the hits `index` (Q,). Fields that are left out are zero, or those of the hit."""
 
     index: np.ndarray
     normal: np.ndarray  # (Q, 3) of the specular lobe
@@ -274,9 +274,9 @@ class _Part:
     roughness: np.ndarray
     ior: np.ndarray
     specular: np.ndarray = field(default=None)  # (4, Q, 3): f0, f90, dip, dielectric
-    diffuse: np.ndarray = field(default=None)  # (Q, 3) estimate of the diffuse albedo
-    behind: np.ndarray = field(default=None)  # (Q,) bool: the diffuse lobe is that of the other side
-    shape: dict[str, np.ndarray] = field(default_factory=dict)  # those of SHAPE that are not 0
+    diffuse: np.ndarray = field(default=None)  # (Q, 3) estimated diffuse albedo
+    behind: np.ndarray = field(default=None)  # (Q,) bool: the diffuse lobe is on the other side of the surface
+    shape: dict[str, np.ndarray] = field(default_factory=dict)  # the fields of SHAPE that are not 0
 
     def __post_init__(self):
         count = len(self.index)
@@ -286,9 +286,9 @@ class _Part:
 
 
 def samples_of_lobes(hits: Hits, lobes: list[dict[str, np.ndarray]]) -> tuple[SurfaceSamples, np.ndarray]:
-    """Samples and the hit (S,) of each, those of a hit one after another: the lobes with a weight, at least one.
+    """Samples (S), and the hit (S,) of each: one for each lobe with a weight, at least one per hit, consecutive.
 
-    `lobes` has for each slot the quantities of LOBE_AOVS that were written, (P,) or (P, 3).
+    `lobes` has the quantities of LOBE_AOVS that were written, (P,) or (P, 3), for each slot.
     """
     slots = [slot for slot in (_slot_of(hits, lobe) for lobe in lobes) if slot is not None]
     parts_of_slots = [_parts_of(slot) for slot in slots]
@@ -304,7 +304,7 @@ def samples_of_lobes(hits: Hits, lobes: list[dict[str, np.ndarray]]) -> tuple[Su
 
 
 def _joined(hits: Hits, parts: list[_Part]) -> tuple[SurfaceSamples, np.ndarray]:
-    """The samples of all parts and the hit of each, in the order of the hits."""
+    """The samples of all parts, and the hit of each, in the order of the hits."""
     index = np.concatenate([part.index for part in parts])
     order = np.argsort(index, kind="stable")
     joined = {
@@ -342,9 +342,9 @@ def _joined(hits: Hits, parts: list[_Part]) -> tuple[SurfaceSamples, np.ndarray]
 
 
 def _split(albedo: np.ndarray, estimate: np.ndarray, index: np.ndarray) -> np.ndarray:
-    """The diffuse albedo (S, 3) of each sample: that of its hit (P, 3) in proportion to the `estimate` (S, 3).
+    """The diffuse albedo (S, 3) of each sample: a share of its hit's (P, 3), in proportion to the `estimate` (S, 3).
 
-    The sum over a hit's samples stays what Cycles says; where no sample expects any, the first gets it.
+    The samples of a hit add up to what Cycles says. If all of its estimates are 0, the first sample gets it.
     """
     count = len(albedo)
     sums = np.stack([np.bincount(index, weights=column, minlength=count) for column in estimate.T], axis=-1)[index]
@@ -354,21 +354,21 @@ def _split(albedo: np.ndarray, estimate: np.ndarray, index: np.ndarray) -> np.nd
 
 
 def _bare_part(hits, index) -> _Part:
-    """Hits on surfaces without a lobe."""
+    """Samples at hits on surfaces without a lobe."""
     normal = hits.smooth_normal[index]
     ones = np.ones(len(index))
     return _Part(index, normal, normal, ones, ones)
 
 
 def _slot_of(hits: Hits, lobe: dict[str, np.ndarray]) -> LobeSlot | None:
-    """The hits that have a lobe in one slot, or None."""
+    """The hits that have a lobe in one slot; None if there are none."""
     weight = lobe["weight"] if "weight" in lobe else np.ones(len(hits.position))
     index = np.nonzero((np.rint(lobe["kind"]) > 0) & (weight > SMALLEST_WEIGHT))[0]
     return LobeSlot(hits, lobe, index, weight[index]) if len(index) else None
 
 
 def _parts_of(slot: LobeSlot) -> list[_Part]:
-    """The parts of one slot, its base first."""
+    """The parts of one slot. Its base comes first."""
     coat, under = _coat_part(slot)
     transmitted = _transmission_part(slot, under)
     base = _base_part(slot, under)
@@ -376,7 +376,8 @@ def _parts_of(slot: LobeSlot) -> list[_Part]:
 
 
 def _dark_metal(slot: LobeSlot, under: np.ndarray, base: _Part) -> _Part | None:
-    """The metal of a slot, taken out of its `base`, where Cycles clips its reflectance at 0 and it is not alone."""
+    """The metal of a slot as a part of its own, None if there is none. It is taken out of `base` where Cycles clips its
+    reflectance at 0 and where it is mixed with a dielectric."""
     if not slot.metallic.any() or not (slot.value("tint") < 1.0).any():
         return None
     terms = _metal_terms(slot) * under
@@ -390,7 +391,7 @@ def _dark_metal(slot: LobeSlot, under: np.ndarray, base: _Part) -> _Part | None:
 
 
 def _with_velvet(hits: Hits, slots: list[LobeSlot], parts_of_slots: list[list[_Part]]) -> Hits:
-    """The hits with a diffuse albedo that has velvet too, which Cycles counts as specular."""
+    """The hits with a diffuse albedo that includes velvet, which Cycles counts as specular."""
     if hits.diffuse_albedo is None or not any(slot.of("velvet").any() for slot in slots):
         return hits
     albedo = hits.diffuse_albedo.copy()
@@ -400,7 +401,7 @@ def _with_velvet(hits: Hits, slots: list[LobeSlot], parts_of_slots: list[list[_P
 
 
 def _put_under_sheen(hits: Hits, slot: LobeSlot, own: list[_Part], parts: list[_Part]) -> None:
-    """Take away from the slot's `own` parts what its sheen reflects, and add a part that reflects it."""
+    """Take what the slot's sheen reflects away from its `own` parts, and add a part that reflects it to `parts`."""
     base = own[0]
     shine = np.maximum(slot.value("sheen_weight"), 0.0)[:, None] * np.maximum(slot.value("sheen_tint"), 0.0)
     shine = np.where(slot.of("principled"), shine, 0.0)
@@ -423,19 +424,20 @@ def _put_under_sheen(hits: Hits, slot: LobeSlot, own: list[_Part], parts: list[_
 
 
 def _tilted(a: np.ndarray) -> np.ndarray:
-    """`a` (Q,) of sheen, which is never quite 0: that means no sheen."""
+    """`a` (Q,) of sheen, kept away from 0, which would mean no sheen."""
     return np.where(np.abs(a) < 1e-5, 1e-5, a)
 
 
 def _albedo_of_sheen(hits, slot, shine, base, parts) -> np.ndarray:
-    """The albedo R (Q, 1) of the sheen; it follows from the diffuse albedo of the hit, which is linear in R.
+    """Albedo R (Q, 1) of the sheen. It follows from the diffuse albedo of the hit, which is linear in R.
 
-    Without the sheen it would be what all `parts` expect together, with it the slot's own diffuse part D becomes
-    w s R + (1 - max(s) R) D, s (`shine`) the weight times the tint of the sheen, w the weight of the slot.
+    Without the sheen, the diffuse albedo would be the sum that all `parts` expect. With it, the slot's own diffuse part
+    D becomes w s R + (1 - max(s) R) D, where s (`shine`) is the weight times the tint of the sheen, and w is the weight
+    of the slot.
     """
     expected = np.zeros_like(hits.diffuse_albedo)
     for part in parts:
-        # To Cycles velvet is no diffuse lobe.
+        # Cycles does not count velvet as diffuse.
         is_velvet = np.broadcast_to(np.asarray(part.shape.get("sheen_a", 0.0)) < 0.0, len(part.index))
         expected[part.index] += np.where(is_velvet[:, None], 0.0, part.diffuse)
     change = slot.weight[:, None] * shine - shine.max(axis=1, keepdims=True) * base.diffuse
@@ -446,7 +448,7 @@ def _albedo_of_sheen(hits, slot, shine, base, parts) -> np.ndarray:
 
 
 def _coat_part(slot: LobeSlot):
-    """The coat (None without), and the share (Q, 3) of the lobe's weight that is left under it."""
+    """The coat (None if there is none), and the share (Q, 3) of the lobe's weight that is left under it."""
     under = np.repeat(slot.weight[:, None], 3, axis=1)
     if not slot.has("coat_weight"):
         return None, under
@@ -474,7 +476,7 @@ def _coat_part(slot: LobeSlot):
 
 
 def _transmission_part(slot: LobeSlot, under: np.ndarray):
-    """What the transmission of a Principled BSDF reflects, None without."""
+    """What the transmission of a Principled BSDF reflects; None if there is none."""
     if not slot.has("transmission"):
         return None
     weight = slot.transmission * (1.0 - slot.metallic)
@@ -485,8 +487,8 @@ def _transmission_part(slot: LobeSlot, under: np.ndarray):
 
 
 def _glass_terms(slot: LobeSlot, tint: np.ndarray, through: np.ndarray):
-    """Specular terms (4, Q, 3) of a glass surface and its index (Q,), seen from the side where the view is; `tint` is
-    that of the reflectance at normal incidence, `through` that of the light that passes."""
+    """Specular terms (4, Q, 3) of a glass surface, and its index (Q,) as seen from the side of the view. `tint`
+    multiplies the reflectance at normal incidence, `through` the light that passes."""
     ior = np.maximum(slot.value("ior"), 1e-5)
     f0 = np.clip(closures.f0_of_ior(ior)[:, None] * tint, 0.0, 1.0)
     ior = np.where(slot.value("backfacing") > 0.5, 1.0 / ior, ior)
@@ -499,7 +501,7 @@ def _glass_terms(slot: LobeSlot, tint: np.ndarray, through: np.ndarray):
 
 
 def _base_part(slot: LobeSlot, under: np.ndarray) -> _Part:
-    """Everything but coat and transmission."""
+    """The part of everything but coat and transmission."""
     specular = _metal_terms(slot)
     diffuse = np.where(slot.of("diffuse") | slot.of("translucent") | slot.of("velvet"), slot.color, 0.0)
     if slot.of("sheen").any():
@@ -524,7 +526,7 @@ def _base_part(slot: LobeSlot, under: np.ndarray) -> _Part:
     return _Part(
         slot.index,
         slot.specular_normal,
-        # Cycles bends the normal of translucent lobes too.
+        # Cycles also bends the normals of translucent lobes.
         np.where(behind, -slot.specular_normal, slot.normal),
         slot.gloss,
         ior,
@@ -536,7 +538,7 @@ def _base_part(slot: LobeSlot, under: np.ndarray) -> _Part:
 
 
 def _diffuse_shape(slot: LobeSlot) -> dict[str, np.ndarray]:
-    """What of the diffuse SHAPE the base of the slot has."""
+    """The diffuse fields of SHAPE for the base of the slot."""
     shape = {}
     if slot.has("diffuse_roughness"):
         roughness = np.clip(slot.value("diffuse_roughness"), 0.0, 1.0)
@@ -552,7 +554,7 @@ def _diffuse_shape(slot: LobeSlot) -> dict[str, np.ndarray]:
 
 
 def _metal_terms(slot: LobeSlot) -> np.ndarray:
-    """Specular terms (4, Q, 3) of F82 metals and of Glossy BSDF, which reflects its color at all angles."""
+    """Specular terms (4, Q, 3) of F82 metals, and of Glossy BSDFs, which reflect their color at all angles."""
     terms = np.zeros((4, len(slot.index), 3))
     if slot.metallic.any():
         f0, tint = np.minimum(slot.color, 1.0), np.clip(slot.value("tint"), 0.0, 1.0)
@@ -565,15 +567,15 @@ def _metal_terms(slot: LobeSlot) -> np.ndarray:
 
 
 def _conductor_terms(slot: LobeSlot, exact: bool) -> np.ndarray:
-    """Specular terms (4, Q, 3) of conductors, whose complex index is `color` + i `tint`."""
+    """Specular terms (4, Q, 3) of conductors with the complex refractive index `color` + i `tint`."""
     extinction = np.maximum(slot.value("tint"), 0.0)
     terms = np.stack(closures.conductor_fit(slot.color, extinction, exact))
     return terms * slot.scattered(closures.conductor_average(slot.color, extinction, exact))
 
 
 def _dielectric_terms(slot: LobeSlot):
-    """Specular terms (4, Q, 3) of the dielectric part of Principled BSDF, its index (Q,), and the share (Q, 1) of the
-    light that is left for the diffuse part."""
+    """Specular terms (4, Q, 3) of the dielectric part of a Principled BSDF, its index (Q,), and the share (Q, 1) of the
+    light left for the diffuse part."""
     ior, f0 = closures.specular_level_applied(np.maximum(slot.value("ior"), 1e-5), slot.value("specular_level"))
     f0 = np.clip(f0[:, None] * np.maximum(slot.value("tint"), 0.0), 0.0, 1.0)
     factor = slot.scattered(closures.dielectric_blend_average(f0, ior))

@@ -1,8 +1,8 @@
 """Flat lights whose radiance varies, as patches of constant radiance. Needs no bpy.
 
-An image of the light is cut in halves, again and again where the error is largest, until the mean of |radiance - that
-of its patch| is below `ERROR` of the mean radiance. The larger patches on the way there stay: each surface point takes
-those that its lobe cannot tell from the smaller ones (`shading.light_detail`).
+An image of the light is cut in halves, always where the error is largest, until the mean absolute difference between
+the radiance and its patch is below `ERROR` of the mean radiance. The larger patches on the way stay: each surface point
+uses the coarsest ones that its lobe cannot resolve (`shading.light_polygons`).
 """
 
 from __future__ import annotations
@@ -16,27 +16,29 @@ import numpy as np
 
 from ..scene import AreaLight
 
+# Mean absolute error at which cutting stops, as a share of the mean radiance.
 ERROR = 0.02
-# Cells along each side at most, and so 64 x 64 patches.
+# Most cells along each side; so there are at most 64 x 64 patches.
 GRID = 64
-# So many cuts one after another lead from a patch to its parts.
+# Cuts that lead from a patch to its parts.
 CUTS = 4
-# Corners of the polygon that stands for an ellipse cut into patches: 2e-3 of its radius from it, with its area.
+# Corners of the polygon that stands for an ellipse cut into patches. It has the area of the ellipse and is within 2e-3
+# of the radius from it.
 ROUND_CORNERS = 64
-# Largest rectangle at the edge of a round light with a spread, whose half axes are 1.
+# Largest side of a rectangle at the edge of a round light with a spread; the light's half axes are 1.
 FOCUSED_EDGE = 0.125
 
 
 @dataclass(frozen=True)
 class Patch:
-    """A rectangle `cell` (left, right, bottom, top in [-1, 1]), its mean radiance (3,) and the parts of it."""
+    """A rectangle `cell` (left, right, bottom, top in [-1, 1]), its mean radiance (3,) and its parts."""
 
     cell: tuple[float, float, float, float]
     radiance: np.ndarray
     parts: tuple[Patch, ...] = ()
 
     def smallest(self) -> Iterator[Patch]:
-        """The patches in it that were not cut."""
+        """The uncut patches in this one."""
         if not self.parts:
             yield self
         for part in self.parts:
@@ -45,27 +47,27 @@ class Patch:
 
 @dataclass(frozen=True)
 class Patches:
-    """The patch that is the whole image, None of a dark one, and the relative L1 error of the smallest patches."""
+    """The patch of the whole image, None if that is dark, and the relative L1 error of the smallest patches."""
 
     whole: Patch | None
     error: float
 
     @property
     def smallest(self) -> list[Patch]:
-        """The patches that were not cut."""
+        """The uncut patches."""
         return [] if self.whole is None else list(self.whole.smallest())
 
 
 def cut_into_patches(image: np.ndarray, covered: np.ndarray, most: int = GRID * GRID) -> Patches:
-    """At most `most` smallest patches of an `image` (H, W, 3), row 0 on top, of which only the pixels `covered` (H, W)
-    count; dark ones are left out."""
+    """Patches of an `image` (H, W, 3), row 0 on top, of which only the pixels `covered` (H, W) count. Dark patches are
+    left out. There are at most `most` uncut patches."""
     pixels = _Pixels(image, covered)
     height, width = covered.shape
     total = np.abs(image[covered]).sum()
     number = itertools.count()
     whole = (0, height, 0, width)
     error = pixels.error(whole)
-    # A heap of (-error, tie breaker, cell); what cannot be cut any more is laid aside.
+    # A heap of (-error, tie breaker, cell). Cells that are too small to cut are removed and counted in `done`.
     open_cells, done, halves_of = [(-error, next(number), whole)], 0, {}
     while open_cells and error > ERROR * total and len(open_cells) + done < most:
         own, _, cell = heapq.heappop(open_cells)
@@ -106,32 +108,32 @@ class _Pixels:
         self._least = tuple(-(-count // GRID) for count in covered.shape)
 
     def _sum(self, cell) -> np.ndarray:
-        """Sums (7,) of the colors, of their squares, and of 1."""
+        """Sums (7,) over covered pixels of the colors, of their squares, and of 1."""
         top, bottom, left, right = cell
         return self._sums[bottom, right] - self._sums[top, right] - self._sums[bottom, left] + self._sums[top, left]
 
     def mean(self, cell) -> np.ndarray:
-        """Mean color (3,), 0 where nothing is covered."""
+        """Mean color (3,); 0 if no pixel is covered."""
         rows, columns = slice(cell[0], cell[1]), slice(cell[2], cell[3])
         inside = self.image[rows, columns][self.covered[rows, columns]]
         return inside.mean(axis=0) if len(inside) else np.zeros(3)
 
     def error(self, cell) -> float:
-        """Sum of the absolute differences from the mean."""
+        """Sum of the absolute differences from the mean color."""
         rows, columns = slice(cell[0], cell[1]), slice(cell[2], cell[3])
         values = self.image[rows, columns]
         values = values.reshape(-1, 3) if self.full else values[self.covered[rows, columns]]
         return float(np.abs(values - values.mean(axis=0)).sum()) if len(values) else 0.0
 
     def _squares(self, cell) -> float:
-        """Sum of the squares of the differences from the mean."""
+        """Sum of the squared differences from the mean color."""
         sums = self._sum(cell)
         return float((sums[3:6] - np.square(sums[:3]) / max(sums[6], 1.0)).sum())
 
     def best_halves(self, cell):
-        """The two halves of `cell` by the cut that leaves the smaller squares of differences; None: too small to cut.
+        """The halves of `cell` with the smaller sum of squared differences; None if the cell is too small to cut.
 
-        Squares never grow by a cut, unlike the absolute differences that say when to stop.
+        A cut never increases the squares. It may increase the absolute differences, which decide when to stop.
         """
         top, bottom, left, right = cell
         choices = []
@@ -145,9 +147,9 @@ class _Pixels:
 
 
 def split_light(light: AreaLight, patches: Patches) -> list[AreaLight]:
-    """`light` as one with its mean radiance, and with a light for every patch in the tree of its `detail`; [] if dark.
+    """`light` with its mean radiance and a tree of its patches as `detail`; [] if it is dark.
 
-    Cells are along its half_u and half_v; those wholly inside become rectangles, others polygons.
+    Cells are along its half_u and half_v. Those wholly inside the light become rectangles, others polygons.
     """
     if patches.whole is None:
         return []
@@ -157,7 +159,7 @@ def split_light(light: AreaLight, patches: Patches) -> list[AreaLight]:
 
 
 def _lights_of(light: AreaLight, outline: np.ndarray, patch: Patch) -> list[AreaLight]:
-    """One light for `patch` with those of its parts as detail, or these alone where the patch has no simple shape."""
+    """One light for `patch` with its parts as detail; only the parts if the patch has no simple shape."""
     whole = _light_of_cell(replace(light, radiance=patch.radiance), outline, patch.cell)
     if not patch.parts:
         return whole
@@ -166,7 +168,7 @@ def _lights_of(light: AreaLight, outline: np.ndarray, patch: Patch) -> list[Area
 
 
 def _light_of_cell(light: AreaLight, outline: np.ndarray, cell) -> list[AreaLight]:
-    """The part of `light` in `cell`; `outline` (V, 2) is that of the light where it is no rectangle."""
+    """The part of `light` in `cell`. `outline` (V, 2) is that of a light that is no rectangle."""
     size = (cell[1] - cell[0]) * (cell[3] - cell[2])
     inside = outline if light.shape in ("SQUARE", "RECTANGLE") else clip_to_cell(outline, cell)
     share = polygon_area(inside) / size
@@ -177,7 +179,7 @@ def _light_of_cell(light: AreaLight, outline: np.ndarray, cell) -> list[AreaLigh
     if not light.is_profiled:
         whole = _rectangle(light, cell)
         return [replace(whole, shape="POLYGON", corners=_in_space(light, inside))]
-    # Polygons may have no spread: small rectangles with the same power stand for the edge.
+    # Polygons cannot have a spread, so small rectangles with the same power stand for the edge.
     if max(cell[1] - cell[0], cell[3] - cell[2]) > FOCUSED_EDGE:
         return [part for half in _halves(cell) for part in _light_of_cell(light, outline, half)]
     bounds = np.stack([inside.min(axis=0), inside.max(axis=0)], axis=-1).ravel()
@@ -207,7 +209,7 @@ def _rectangle(light: AreaLight, cell) -> AreaLight:
 
 
 def _outline(light: AreaLight) -> np.ndarray:
-    """Corners (V, 2) of `light` along half_u and half_v."""
+    """Corners (V, 2) of `light` in units of half_u and half_v."""
     if light.shape == "POLYGON":
         offset = light.corners - light.center
         axes = np.stack([light.half_u, light.half_v], axis=-1)
@@ -228,7 +230,7 @@ def _in_space(light: AreaLight, outline: np.ndarray) -> np.ndarray:
 def clip_to_cell(outline: np.ndarray, cell) -> np.ndarray:
     """The part (W, 2) of a polygon (V, 2) in the rectangle left, right, bottom, top (Sutherland and Hodgman 1974).
 
-    Of a concave polygon that falls apart the parts hang together by edges that run there and back.
+    If a concave polygon falls into several parts, edges that run there and back connect them.
     """
     left, right, bottom, top = cell
     for axis, sign, bound in ((0, 1.0, left), (0, -1.0, right), (1, 1.0, bottom), (1, -1.0, top)):

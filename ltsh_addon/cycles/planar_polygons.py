@@ -1,4 +1,4 @@
-"""Flat polygons of a triangle mesh, as large as they come, and which side of it is outside. Needs no bpy."""
+"""The largest flat polygons of a triangle mesh, and its outer side. Needs no bpy."""
 
 from __future__ import annotations
 
@@ -6,18 +6,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-# Triangles that share an edge are in one plane up to this angle in rad, and this distance by edge length: vertices are
-# stored in single precision.
+# Two triangles with a common edge are in one plane if the angle between them is below PLANE_ANGLE, in rad, and if they
+# are off it by at most PLANE_DISTANCE of their size. The limits allow for vertices in single precision.
 PLANE_ANGLE = 1e-3
 PLANE_DISTANCE = 1e-5
-# A union of triangles is flat up to this distance by its extent.
+# A union of triangles is flat if it is off its plane by at most this share of its extent.
 FLATNESS = 1e-4
-# A corner this close to the line between its neighbors is on a straight edge, by the size of the coordinates.
+# A corner is on a straight edge if its distance from the line between its neighbors is at most this share of the
+# largest coordinate.
 STRAIGHT = 1e-6
-# Volume by the cube of its extent below which a closed surface is a sheet.
+# A closed surface is a sheet if its volume is below this share of the cube of its extent.
 SHEET = 1e-6
-# Products of triangles and vertices in the test for hollows; beyond, it looks at a share of the triangles.
+# Products of triangles and vertices in the test for hollows. For larger meshes it tests a share of the triangles.
 HOLLOW_PRODUCTS = 20_000_000
+# Most connected parts of a surface that this test looks at.
 MOST_ISLANDS = 64
 
 
@@ -31,9 +33,11 @@ class FlatPolygon:
 
 
 def flat_polygons(vertices: np.ndarray, triangles: np.ndarray, labels: np.ndarray) -> list[FlatPolygon]:
-    """Polygons that cover the `triangles` (T, 3), indices of `vertices` (N, 3); none has two labels (T,).
+    """Polygons that cover the `triangles` (T, 3), indices of `vertices` (N, 3). None has more than one of the `labels`
+    (T,).
 
-    Neighbors in one plane become one polygon where their union has one outline that meets itself nowhere.
+    Neighbors in one plane become one polygon if their union is simple, that is, has one outline that does not touch
+    itself.
     """
     crossed = np.cross(
         vertices[triangles[:, 1]] - vertices[triangles[:, 0]], vertices[triangles[:, 2]] - vertices[triangles[:, 0]]
@@ -46,7 +50,7 @@ def flat_polygons(vertices: np.ndarray, triangles: np.ndarray, labels: np.ndarra
     order = np.argsort(groups, kind="stable")
     starts = np.flatnonzero(np.diff(groups[order], prepend=-1))
     ends = np.append(starts[1:], len(order))[: len(starts)]
-    polygons: dict[int, FlatPolygon] = {}  # by their place in the order
+    polygons: dict[int, FlatPolygon] = {}  # by their place in `order`
     labels, triangle_corners = labels.tolist(), vertices[triangles]
     pairs = starts[ends - starts == 2]
     corners, pair_normals, are_quads = _quads(vertices, triangles[order[pairs]], triangles[order[pairs + 1]])
@@ -66,8 +70,8 @@ def flat_polygons(vertices: np.ndarray, triangles: np.ndarray, labels: np.ndarra
 
 
 def _quads(vertices, first, second) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Corners (G, 4, 3), unit normals (G, 3) and a mask (G,): of pairs of coplanar triangles (G, 3) those that plainly
-    are a flat polygon of four corners. `_outline` looks at the others, one by one."""
+    """Corners (G, 4, 3), unit normals (G, 3) and mask (G,) of pairs of coplanar triangles (G, 3) that clearly are a
+    flat polygon of four corners. `_outline` looks at the other pairs one by one."""
     matches = (first[:, :, None] == np.roll(second, -1, axis=1)[:, None]) & (
         np.roll(first, -1, axis=1)[:, :, None] == second[:, None]
     )
@@ -90,7 +94,7 @@ def _quads(vertices, first, second) -> tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 def _coplanar_neighbors(vertices, triangles, labels, normals) -> np.ndarray:
-    """Pairs (M, 2) of triangles with a common edge, run through in opposite directions, in one plane."""
+    """Pairs (M, 2) of coplanar triangles that run through a common edge in opposite directions."""
     count = len(triangles)
     start, end = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
     owner, apex = np.repeat(np.arange(count), 3), np.roll(triangles, -2, axis=1).ravel()
@@ -111,7 +115,7 @@ def _coplanar_neighbors(vertices, triangles, labels, normals) -> np.ndarray:
 
 
 def _connected(count: int, pairs: np.ndarray) -> np.ndarray:
-    """The smallest index (count,) that each item is connected with by `pairs` (M, 2)."""
+    """The smallest index (count,) to which `pairs` (M, 2) connect each item."""
     group = np.arange(count)
     while len(pairs):
         least = np.minimum(group[pairs[:, 0]], group[pairs[:, 1]])
@@ -126,7 +130,7 @@ def _connected(count: int, pairs: np.ndarray) -> np.ndarray:
 
 
 def _outline(vertices, triangles) -> np.ndarray | None:
-    """Corners (V, 3) of the union of coplanar `triangles`, or None where they are no simple, flat polygon."""
+    """Corners (V, 3) of the union of coplanar `triangles`; None if that is no simple, flat polygon."""
     edges = {(int(a), int(b)) for triangle in triangles for a, b in zip(triangle, np.roll(triangle, -1), strict=True)}
     follow: dict[int, int] = {}
     for a, b in edges:
@@ -163,15 +167,15 @@ def _normal(corners: np.ndarray) -> np.ndarray:
 
 
 def welded(vertices: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """The `triangles` (T, 3) with one index for all vertices (N, 3) in the same place."""
+    """The `triangles` (T, 3) with the same index for all vertices (N, 3) at the same place."""
     _, first, number = np.unique(vertices, axis=0, return_index=True, return_inverse=True)
     return first[number.ravel()[triangles]]
 
 
 def outward_side(vertices: np.ndarray, triangles: np.ndarray) -> int:
-    """The side on which closed `triangles` (T, 3) are seen: 1 where their normals point, -1 the other.
+    """The side from which closed `triangles` (T, 3) are seen: 1 if their normals point there, otherwise -1.
 
-    A sheet of two layers, front and back, has no volume: each layer is seen from where its normal points.
+    A sheet of two layers, front and back, has no volume. Each layer is seen from the side of its normal.
     """
     return -1 if signed_volume(vertices, triangles) < -SHEET * np.ptp(vertices, axis=0).max() ** 3 else 1
 
@@ -197,7 +201,7 @@ def signed_volume(vertices: np.ndarray, triangles: np.ndarray) -> float:
 def is_inside(point: np.ndarray, vertices: np.ndarray, triangles: np.ndarray) -> bool:
     """True if closed `triangles` (T, 3) surround `point` (3,).
 
-    By the sum of their solid angles (Van Oosterom and Strackee 1983, doi:10.1109/TBME.1983.325207).
+    Uses the sum of solid angles (Van Oosterom and Strackee 1983, doi:10.1109/TBME.1983.325207).
     """
     a, b, c = (vertices[triangles[:, side]] - point for side in range(3))
     la, lb, lc = (np.linalg.norm(side, axis=-1) for side in (a, b, c))
@@ -207,14 +211,14 @@ def is_inside(point: np.ndarray, vertices: np.ndarray, triangles: np.ndarray) ->
 
 
 def hides_itself(vertices: np.ndarray, triangles: np.ndarray, closed: bool) -> bool:
-    """True if a part of the surface may stand in the light of another part that it hangs together with."""
+    """True if a part of the surface may shadow another part of the same connected surface."""
     islands = _islands(triangles)
     names = np.unique(islands)
     return any(_is_hollow(vertices, triangles[islands == name], closed) for name in names[:MOST_ISLANDS])
 
 
 def _islands(triangles: np.ndarray) -> np.ndarray:
-    """A number (T,) that is the same for triangles which common edges connect."""
+    """A number (T,) that triangles connected by common edges share."""
     edges = np.sort(np.stack([triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()], axis=-1), axis=-1)
     _, edge = np.unique(edges, axis=0, return_inverse=True)
     order = np.argsort(edge.ravel(), kind="stable")
@@ -224,7 +228,7 @@ def _islands(triangles: np.ndarray) -> np.ndarray:
 
 
 def _is_hollow(vertices, triangles, closed: bool) -> bool:
-    """True unless all vertices are behind (or, of an open surface, in) the plane of every triangle."""
+    """True unless all vertices are behind the plane of every triangle (or in it, for an open surface)."""
     used = vertices[np.unique(triangles)]
     used_center = used.mean(axis=0)
     extent = np.ptp(used, axis=0).max(initial=0.0)

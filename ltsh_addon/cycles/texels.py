@@ -1,4 +1,4 @@
-"""From a mesh, its materials and the texels that its triangles cover to surface samples. Needs no bpy."""
+"""Surface samples at texels, from a mesh, its materials and the texels that its triangles cover. Needs no bpy."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from .images import GRAY, ImageTexture
 from .lobes import LOBE_AOVS, Hits, samples_of_lobes
 from .uv import Texels
 
-# What the texels that Cycles' bake leaves out have in its maps and its radiance.
+# Value of texels that Cycles' bake left out, in its maps and its radiance.
 NOT_BAKED = -1e9
-# Cycles' bake bends the view to at least this cosine from the normal where it looks from the camera.
+# When Cycles bakes from the camera, it bends the view to at least this cosine from the normal.
 SMALLEST_BAKED_COSINE = 0.2
-# And then to this one from the face.
+# Then it bends the view to at least this cosine from the normal of the face.
 SMALLEST_FACE_COSINE = 1e-5
 
 
@@ -27,16 +27,15 @@ class TexelMesh:
     """Triangles of one evaluated object in world space."""
 
     corners: np.ndarray  # (T, 3, 3) m
-    normals: np.ndarray  # (T, 3, 3) unit, as shaded, custom normals included
+    normals: np.ndarray  # (T, 3, 3) unit shading normals, custom normals included
     uv: np.ndarray  # (T, 3, 2)
     material: np.ndarray  # (T,) number of the material
-    vertices: np.ndarray  # (T, 3) numbers in the mesh
-    mirrored: bool | np.ndarray = False  # the transform turns right hands into left ones
-    receiver: int | np.ndarray = 0  # of `SurfaceSamples`
+    vertices: np.ndarray  # (T, 3) numbers of the vertices in the mesh
+    mirrored: bool | np.ndarray = False  # True: the transform turns right hands into left ones
+    receiver: int | np.ndarray = 0  # as in `SurfaceSamples`
 
     def true_normals(self) -> np.ndarray:
-        """Unit normals (T, 3) of the faces. Smooth normals may point to the other side of a face, as where a quad is
-        bent."""
+        """Unit normals (T, 3) of the faces. A smooth normal may point to the other side, for example on a bent quad."""
         sides = self.corners[:, 1:] - self.corners[:, :1]
         return unit(np.cross(sides[:, 0], sides[:, 1])) * (-1.0 if self.mirrored else 1.0)
 
@@ -53,15 +52,16 @@ class TexelMesh:
 
 @dataclass(frozen=True)
 class BakeView:
-    """From where a surface is seen: `kind` "above" (along its normal), "point" (from a position) or "direction" (from
-    afar, unit vector towards the viewer). `bent` as Cycles' bake has it, see SMALLEST_BAKED_COSINE."""
+    """From where a surface is seen. `kind` is "above" (along its normal), "point" (from a position) or "direction"
+    (from afar; a unit vector towards the viewer). `bent` views are bent as in Cycles' bake, see
+    SMALLEST_BAKED_COSINE."""
 
     kind: str
     vector: tuple[float, float, float] = (0.0, 0.0, 0.0)
     bent: bool = False
 
     def towards(self, position: np.ndarray, normal: np.ndarray, true_normal: np.ndarray) -> np.ndarray:
-        """Unit vectors (P, 3) from positions (P, 3) with normals (P, 3) of the shading and the face to the viewer."""
+        """Unit vectors (P, 3) to the viewer from positions (P, 3) with shading normals and face normals (P, 3)."""
         if self.kind == "above":
             return normal
         vector = np.array(self.vector, dtype=np.float64)
@@ -70,7 +70,7 @@ class BakeView:
             return view
         cosine = np.sum(view * normal, axis=-1, keepdims=True)
         bent = unit(view - normal * (cosine - SMALLEST_BAKED_COSINE))
-        # Surfaces that face away are seen the more along their normal, the more they do.
+        # The more a surface faces away, the closer to its normal it is seen from.
         behind = np.clip(-cosine, 0.0, 1.0)
         view = np.where(cosine > SMALLEST_BAKED_COSINE, view, unit(bent * (1.0 - behind) + normal * behind))
         cosine = np.sum(view * true_normal, axis=-1, keepdims=True)
@@ -80,16 +80,16 @@ class BakeView:
 
 @dataclass(frozen=True)
 class BakeMaterial:
-    """What one material writes: `aovs.LOBE_AOVS` for each of its lobes. A value is a number, a color, or where it
-    varies its map or one of the `textures`, and which part of their color."""
+    """The lobes of one material, each with values for `lobes.LOBE_AOVS`. A value that varies names its baked map, or
+    one of the `textures`, and which part of its color it is. Any other value is a number or a color."""
 
     corrected: bool
     lobes: tuple[dict, ...]
-    textures: tuple[tuple[ImageTexture, np.ndarray], ...] = ()  # with the UV map (T, 3, 2)
+    textures: tuple[tuple[ImageTexture, np.ndarray], ...] = ()  # each with its UV map (T, 3, 2)
 
     @classmethod
     def of(cls, record: dict, images: Path, uv_maps: dict[str, Path]) -> BakeMaterial:
-        """From what JSON makes of it, the folder of `images`, and the files of UV maps by name."""
+        """From a JSON record, the folder of `images`, and the files of UV maps by name."""
         textures = []
         for texture in record["textures"]:
             pixels = np.load(images / texture["file"], mmap_mode="r")
@@ -98,7 +98,7 @@ class BakeMaterial:
         return cls(record["corrected"], tuple(record["lobes"]), tuple(textures))
 
     def colors(self, number: int, triangle: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Colors (Q, 3) of texture `number` at points of triangles (Q,) with barycentric weights (Q, 3)."""
+        """Colors (Q, 3) of texture `number` at points of triangles (Q,), given by barycentric weights (Q, 3)."""
         texture, uv = self.textures[number]
         return texture.colors(_interpolated(uv, triangle, weights))
 
@@ -111,9 +111,9 @@ def texel_samples(
     view: BakeView,
     lights: tuple[AreaLight, ...],
 ) -> tuple[SurfaceSamples, np.ndarray]:
-    """Samples (S) of texels (Q) and the texel (S,), 0 to Q - 1, of each; those of a texel follow one another.
+    """Samples (S) of texels (Q), and the texel (S,) of each, 0 to Q - 1. The samples of a texel are consecutive.
 
-    read_map(number) returns the baked map of that number at the texels, (Q, 3).
+    read_map(number) returns a baked map at the texels, (Q, 3).
     """
     true_normals = mesh.true_normals()
     corrected = np.array([material.corrected for material in materials], dtype=bool)
@@ -150,12 +150,12 @@ def _maps_read(materials) -> set[int]:
 
 
 def _interpolated(values, triangle, weights):
-    """Values (T, 3, C) at the points with barycentric weights (Q, 3) of triangles (Q,)."""
+    """Values (Q, C) at points of triangles (Q,), from `values` (T, 3, C) and barycentric weights (Q, 3)."""
     return sum(values[triangle, corner] * weights[:, corner, None] for corner in range(3))
 
 
 def _lobes(materials, number, maps, triangle, weights) -> list[dict[str, np.ndarray]]:
-    """For each slot its quantities at texels of materials `number` (Q,), of which `maps` has the baked ones (Q, 3)."""
+    """The quantities of each slot at texels of the materials `number` (Q,). `maps` has the baked maps (Q, 3)."""
     texels = [np.flatnonzero(number == which) for which in range(len(materials))]
     colors = {}
 

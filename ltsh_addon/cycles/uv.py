@@ -1,4 +1,4 @@
-"""UV maps: which texel lies on which face, and what lies beyond a seam."""
+"""UV maps: which face a texel lies on, and where the surface goes on beyond a seam."""
 
 from __future__ import annotations
 
@@ -7,36 +7,36 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-# Blender's bake moves its sampling points by this much, in texels, so that centers exactly on an edge belong to one
-# side. The same here, for the same texels.
+# Blender's bake shifts its sampling points by this much, in texels, so that centers exactly on an edge belong to one
+# side. The same shift here gives the same texels.
 NUDGE = (0.001, 0.002)
-# How many points Cycles' bake tries that are not on the triangle, before it takes the center.
+# Number of points off the triangle after which Cycles' bake takes the center.
 ATTEMPTS = 10
-# Triangles of less than half this area, in texels, Blender bakes at the center alone.
+# Blender bakes triangles of less than half this area, in texels, at the center alone.
 SMALLEST_AREA = float(np.finfo(np.float32).eps)
-# Points that stand for what Cycles takes the mean of, and what keeps the weights of others from growing: moments of
-# the unit square are about a tenth.
+# Points that stand for those over which Cycles takes the mean.
 LATTICE = 64
+# Regularization that keeps point weights from growing; the moments of the unit square are about a tenth.
 STIFFNESS = 1e-3
 GOLDEN_RATIO = 0.5 * (5.0**0.5 - 1.0)
 _NO_ROW = 1 << 40
-# How far a triangle may stick out of its tile, in tiles: rounding, and no texel.
+# How far a triangle may stick out of its tile, in tiles: more than rounding, less than a texel.
 TILE_TOLERANCE = 1e-4
 
 
 @dataclass(frozen=True)
 class Texels:
-    """Q texels of a block of rows and where they lie on the triangles."""
+    """Q texels of a block of rows, and where they lie on the triangles."""
 
     index: np.ndarray  # (Q,) increasing: (y - first row) * W + x
     triangle: np.ndarray  # (Q,)
     barycentric: np.ndarray  # (Q, 3) weights of the triangle's corners, none negative
-    covers: int  # how often texels were covered, all together
-    overlaps: int  # how many of them were covered more than once
-    unbaked: int = 0  # how many more Cycles left out
+    covers: int  # sum over all texels of how often each is covered
+    overlaps: int  # number of texels that are covered more than once
+    unbaked: int = 0  # number of further texels that Cycles left out
 
     def baked(self, is_baked: np.ndarray) -> Texels:
-        """Those that Cycles baked, by `is_baked` (Q,)."""
+        """The texels that Cycles baked, given by the mask `is_baked` (Q,)."""
         unbaked = int(np.count_nonzero(~is_baked))
         kept = self.index[is_baked], self.triangle[is_baked], self.barycentric[is_baked]
         return Texels(*kept, self.covers, self.overlaps, unbaked)
@@ -44,7 +44,7 @@ class Texels:
 
 @dataclass(frozen=True)
 class UvTriangles:
-    """Triangles of a UV map in texels of one tile; `texels` finds those of a block of rows."""
+    """Triangles of a UV map in texels of one tile. `texels` finds the texels of a block of rows."""
 
     corners: np.ndarray  # (T, 3, 2) float64, in texels
     width: int
@@ -53,16 +53,17 @@ class UvTriangles:
     @classmethod
     def in_tile(cls, uv: np.ndarray, width: int, height: int, tile: tuple[int, int] = (0, 0)) -> UvTriangles:
         """Triangles uv (T, 3, 2) on a texture of width x height texels that fills the unit square at `tile`."""
-        # In single precision like Blender, so that rounding moves no texel from one side of an edge to the other.
+        # Single precision, as in Blender: otherwise rounding would move texels from one side of an edge to the other.
         size = np.array([width, height], dtype=np.float32)
         corners = (np.asarray(uv, dtype=np.float32) - np.asarray(tile, dtype=np.float32)) * size
         return cls(corners.astype(np.float64), width, height)
 
     def texels(self, first_row: int, row_count: int, conservative: bool = False) -> Texels:
-        """The texels of some rows whose centers are covered; where triangles overlap the last one wins, as in Blender.
+        """The texels of `row_count` rows whose centers are covered. Where triangles overlap, the last one wins, as in
+        Blender.
 
-        With `conservative` also texels that a triangle touches without covering their center: their
-        sample is the point of the triangle nearest to the center.
+        `conservative` adds the texels that a triangle touches without covering their center. Their sample is the point
+        of the triangle nearest to the center.
         """
         owner = np.full(row_count * self.width, -1, dtype=np.int64)
         shifted = self.corners.astype(np.float32) - (np.float32(0.5) + np.array(NUDGE, np.float32))
@@ -84,15 +85,15 @@ class UvTriangles:
         return Texels(found, triangle, barycentric_of_nearest(self.corners[triangle], center), covers, overlaps)
 
     def spread(self, texels: Texels, number: int, count: int, width: float) -> Texels:
-        """`texels` at point `number` of `count`, whose mean tends to that of Cycles' bake.
+        """`texels` at point `number` of `count`. With more points, their mean tends to that of Cycles' bake.
 
-        Measured with Cycles 4.5.15 and 5.2.3: samples of a texel fill the part of a square of `width` texels around
-        its center that lies on the triangle of the center. Where ATTEMPTS random points of the square in a row miss
+        Measured with Cycles 4.5.15 and 5.2.3: the samples of a texel fill the part of a square of `width` texels around
+        its center that lies on the triangle of the center. If ATTEMPTS random points of the square in a row miss
         the triangle, a sample is at the center.
         """
         if count == 1:
             return texels
-        # A lattice of golden ratios, symmetric about (1/2, 1/2).
+        # A golden-ratio lattice, symmetric about (1/2, 1/2).
         u, v = (number + 0.5) / count, ((number - 0.5 * (count - 1)) * GOLDEN_RATIO + 0.5) % 1.0
         half = 0.5 * width
         moved = np.full((len(texels.index), 2), ((u - 0.5) * width, (v - 0.5) * width))
@@ -102,27 +103,28 @@ class UvTriangles:
         return replace(texels, barycentric=barycentric_of_nearest(corners, moved))
 
     def places(self, texels: Texels) -> np.ndarray:
-        """Where the samples of texels are (Q, 2), in texels."""
+        """Places (Q, 2) of the samples of texels, in texels."""
         return np.einsum("qcx,qc->qx", self.corners[texels.triangle], texels.barycentric)
 
     def at(self, texels: Texels, points: np.ndarray) -> Texels:
-        """`texels` at points (Q, 2), in texels, of their triangles."""
+        """`texels` moved to points (Q, 2) of their triangles, in texels."""
         return replace(texels, barycentric=barycentric_of_nearest(self.corners[texels.triangle], points))
 
 
 @dataclass(frozen=True)
 class PointWeights:
-    """Weights of other points than those of `UvTriangles.spread`, with which what changes linearly or quadratically
-    over a texel has the same mean: least squares, as near to equal weights as can be."""
+    """Weights for other points than those of `UvTriangles.spread`. With them, whatever changes linearly or
+    quadratically over a texel has the same mean, in the least-squares sense; they are as close to equal weights as
+    possible."""
 
     center: np.ndarray  # (Q, 2) in texels
-    half: float  # texels that stand for 1
-    mean: np.ndarray  # (Q, 5) of the `_moments` of the points
-    slope: np.ndarray  # (Q, 5)
+    half: float  # half the side of the square, in texels
+    mean: np.ndarray  # (Q, 5) mean of the `_moments` of the points
+    slope: np.ndarray  # (Q, 5) change of the weight with each moment
 
     @classmethod
     def of(cls, triangles: UvTriangles, texels: Texels, points: Iterable[np.ndarray], width: float) -> PointWeights:
-        """For the `points`, each (Q, 2), in a square of `width` texels."""
+        """The weights for `points`, each (Q, 2), in a square of `width` texels."""
         center, half = triangles.places(texels), 0.5 * width
         wanted = np.tile((0.0, 0.0, 1.0 / 3.0, 0.0, 1.0 / 3.0), (len(center), 1))
         edge = np.flatnonzero(~_contains_square(triangles.corners[texels.triangle] - center[:, None], half))
@@ -140,7 +142,7 @@ class PointWeights:
         return cls(center, half, mean, np.linalg.solve(spread, (wanted - mean)[..., None])[..., 0])
 
     def at(self, points: np.ndarray) -> np.ndarray:
-        """Of points (Q, 2), 1 on average."""
+        """Weights (Q,) of points (Q, 2), 1 on average."""
         return 1.0 + np.sum((_moments((points - self.center) / self.half) - self.mean) * self.slope, axis=1)
 
 
@@ -151,16 +153,18 @@ def _moments(offsets):
 
 
 def _contains_square(corners, half):
-    """Whether triangles (Q, 3, 2) contain the square of +-half around the origin, which is on each of them."""
+    """Mask (Q,) of the triangles (Q, 3, 2) that contain the square of +-half around the origin. The origin is on each
+    of them."""
     start, side = corners, np.roll(corners, -1, axis=1) - corners
-    # Of the square the corner that is farthest beyond a side decides.
+    # The corner of the square that is farthest beyond a side decides.
     reach = half * np.abs(side).sum(axis=-1)
     return (np.abs(cross(start, side)) >= reach).all(axis=1)
 
 
 def _covered_point(corners, half, u, v):
-    """The point (Q, 2) at (u, v), each from 0 to 1, of what triangles (Q, 3, 2) with the origin on them cover of the
-    square of +-half around it; equal areas for equal parts of the unit square but for what stands for the origin."""
+    """The points (Q, 2) at (u, v), each in [0, 1], of the parts of the square of +-half around the origin that
+    triangles (Q, 3, 2) cover; the origin is on each of them. Equal areas of the unit square give equal areas of the
+    part, except for the area that stands for the origin."""
     ends = _borders(corners, half)
     areas = np.abs(cross(ends[:, :, 0], ends[:, :, 1]))
     total = areas.sum(axis=1)
@@ -179,8 +183,9 @@ def _covered_point(corners, half, u, v):
 
 
 def _borders(corners, half):
-    """Ends (Q, 7, 2, 2) of the borders of what triangles (Q, 3, 2) cover of the square of +-half around the origin:
-    the parts of the triangle's sides in the square, and of the square's in the triangle; equal ends where is none.
+    """Ends (Q, 7, 2, 2) of the borders of the parts of the square of +-half around the origin that triangles (Q, 3, 2)
+    cover. These are the parts of the triangle's sides in the square, and of the square's sides in the triangle; both
+    ends are equal if there is none.
     """
     square = half * np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
     square = np.broadcast_to(square, (len(corners), 4, 2))
@@ -190,8 +195,8 @@ def _borders(corners, half):
 
 
 def _clipped(polygons, clips, turn):
-    """Ends (Q, V, 2, 2) of the parts of the sides of `polygons` (Q, V, 2) inside of `clips` (Q, C, 2), of which `turn`
-    (Q, 1) is the sense of rotation."""
+    """Ends (Q, V, 2, 2) of the parts of the sides of `polygons` (Q, V, 2) inside `clips` (Q, C, 2). `turn` (Q, 1) is
+    the sense of rotation of `clips`."""
     start, side = polygons, np.roll(polygons, -1, axis=1) - polygons
     first, last = np.zeros(polygons.shape[:2]), np.ones(polygons.shape[:2])
     for corner, following in zip(np.moveaxis(clips, 1, 0), np.moveaxis(np.roll(clips, -1, axis=1), 1, 0), strict=True):
@@ -211,8 +216,8 @@ def _center_spans(corners, first_row, row_count, size):
     """(triangle, row, first x, last x) of the runs of integer points in triangles (T, 3, 2), float32, of a texture of
     `size` (width, height).
 
-    As Blender's rasterizer does it, down to the rounding: a side is followed from its upper end row by row, in single
-    precision, and a point on the left side is outside.
+    It follows Blender's rasterizer down to the rounding. A side is followed from its upper end row by row in single
+    precision; a point on the left side is outside.
     """
     width, height = size
     sides = [_side_rows(corners[:, k], corners[:, (k + 1) % 3], first_row, row_count, height) for k in range(3)]
@@ -234,12 +239,12 @@ def _center_spans(corners, first_row, row_count, size):
 
 @dataclass(frozen=True)
 class _Side:
-    """Where one side of every triangle meets the rows of the block."""
+    """Where one side of each triangle meets the rows of the block."""
 
-    first: np.ndarray  # (T,) first row, _NO_ROW where there is none
-    last: np.ndarray  # (T,) last row, -_NO_ROW where there is none
-    start: np.ndarray  # (T,) place of the first row's x in `x`
-    x: np.ndarray
+    first: np.ndarray  # (T,) first row; _NO_ROW if there is none
+    last: np.ndarray  # (T,) last row; -_NO_ROW if there is none
+    start: np.ndarray  # (T,) place in `x` of the first row
+    x: np.ndarray  # one for each row of each side
 
 
 def _side_rows(start, end, first_row, row_count, height):
@@ -250,7 +255,7 @@ def _side_rows(start, end, first_row, row_count, height):
     last = np.minimum(top, first_row + row_count - 1.0)
     with np.errstate(invalid="ignore"):
         seen = np.flatnonzero(np.isfinite(low).all(axis=1) & np.isfinite(high).all(axis=1) & (first <= last))
-    # The longest way down first, so that those still under way are always the first ones.
+    # Sides with the most rows come first, so that those still being followed are always the first ones.
     seen = seen[np.argsort(first[seen] - top[seen], kind="stable")]
     low, high, top = low[seen], high[seen], top[seen].astype(np.float32)
     rise = high[:, 1] - low[:, 1]
@@ -280,7 +285,7 @@ def _touching_spans(corners, first_row, row_count, width):
     area = cross(middle - low, high - low)
     solid = np.flatnonzero(np.isfinite(area) & (area != 0.0))
     low, middle, high = low[solid], middle[solid], high[solid]
-    # A triangle that ends on the border between two rows does not reach into the next.
+    # A triangle that ends on the border between two rows does not reach into the next row.
     last = np.maximum(np.ceil(high[:, 1]) - 1.0, np.floor(low[:, 1]))
     triangle, row = _rows_of(np.floor(low[:, 1]), last, first_row, row_count)
     low, middle, high = low[triangle], middle[triangle], high[triangle]
@@ -311,7 +316,7 @@ def _rows_of(first, last, first_row, row_count):
 
 
 def repeated(counts):
-    """Numbers 0 0 0 1 1 3 ... as often as counts (N,) say, and 0 1 2 0 1 0 ... within each."""
+    """Numbers 0 0 0 1 1 3 ..., each repeated as `counts` (N,) says, and positions 0 1 2 0 1 0 ... within each."""
     counts = np.where(counts > 0.0, counts, 0.0).astype(np.int64)
     number = np.repeat(np.arange(len(counts)), counts)
     ends = np.cumsum(counts)
@@ -319,7 +324,7 @@ def repeated(counts):
 
 
 def _chain_ends(low, middle, high, y):
-    """x where a horizontal line at y (S,) meets the long side and the two short sides of triangles."""
+    """Where a horizontal line at y (S,) meets the long side and one of the two short sides of triangles: two x (S,)."""
     below = y <= middle[:, 1]
     start, end = np.where(below[:, None], low, middle), np.where(below[:, None], middle, high)
     return _x_on(low, high, y), _x_on(start, end, y)
@@ -340,9 +345,9 @@ def _expand(span_triangle, row, first_x, last_x, width, first_row):
 
 
 def barycentric_of_nearest(corners: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Weights (Q, 3), none negative, of the point of each triangle (Q, 3, 2) that is nearest to points (Q, 2).
+    """Barycentric weights (Q, 3), none negative, of the point of each triangle (Q, 3, 2) nearest to `points` (Q, 2).
 
-    Of a triangle without area the nearest point of its sides.
+    For a triangle without area it is the nearest point of its sides.
     """
     a, b, c = np.moveaxis(corners, 1, 0)
     area = cross(b - a, c - a)
@@ -377,10 +382,10 @@ def cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 
 def tiles_of(uv: np.ndarray) -> tuple[list[int], float]:
-    """UDIM tiles (1001 is the unit square, ten to a row) that triangles uv (T, 3, 2) lie in, and the area that they
-    have in all, 1 for a tile, where some of it may be outside of these tiles; else 0.
+    """UDIM tiles (1001 is the unit square, ten to a row) in which triangles uv (T, 3, 2) lie, and an area: 0 if all
+    triangles lie within tiles, otherwise the area of all triangles, in tiles.
 
-    Where a triangle reaches over a border the texture repeats, or is wrong: then only the unit square counts.
+    If a triangle reaches over a border, the texture repeats or is wrong. Then only the unit square counts.
     """
     uv = np.asarray(uv, dtype=np.float64)
     area = np.abs(cross(uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]))
@@ -396,30 +401,30 @@ def tiles_of(uv: np.ndarray) -> tuple[list[int], float]:
     return ([1001] if touching.any() else []), float(0.5 * area.sum())
 
 
-# UV coordinates closer than this are one point.
+# UV coordinates closer than this are the same.
 SAME_UV = 1e-6
-# Points looked up at a time.
+# Points in one chunk.
 POINTS_PER_BLOCK = 32768
 _NEIGHBORS = [(x, y) for y in (-1, 0, 1) for x in (-1, 0, 1)]
 
 
 @dataclass(frozen=True)
 class UvSeams:
-    """E edges of triangles at which a UV map is cut and the surface is not, in texels of one tile."""
+    """E edges of triangles where a UV map is cut but the surface is not, in texels of one tile."""
 
     edges: np.ndarray  # (E, 2, 2) both ends
     outward: np.ndarray  # (E, 2) unit
     beyond: np.ndarray  # (E, 2, 2) the same ends on the other side of the cut
     inward: np.ndarray  # (E, 2) unit, into the triangle on the other side
-    island: np.ndarray  # (E,) that the other side belongs to
-    islands: np.ndarray  # (T,) number of the part of the UV map that each triangle belongs to
+    island: np.ndarray  # (E,) number of the island on the other side
+    islands: np.ndarray  # (T,) number of the island, the connected part of the UV map, of each triangle
     size: tuple[int, int]  # width, height
-    cells: np.ndarray  # (N,) increasing: texels that edges pass through, (y + 1) * (W + 2) + x + 1
-    crossing: np.ndarray  # (N,) the edges
+    cells: np.ndarray  # (N,) increasing: texels through which edges pass, (y + 1) * (W + 2) + x + 1
+    crossing: np.ndarray  # (N,) number of the edge
 
     @classmethod
     def of(cls, uv: np.ndarray, vertices: np.ndarray, width: int, height: int, tile=(0, 0)) -> UvSeams:
-        """Seams of triangles uv (T, 3, 2) with vertices (T, 3) of the mesh, on a texture that fills the unit square at
+        """Seams of triangles uv (T, 3, 2) with mesh vertices (T, 3), on a texture that fills the unit square at
         `tile`."""
         uv = np.asarray(uv, dtype=np.float64)
         edge, partner = _paired(vertices)
@@ -441,8 +446,9 @@ class UvSeams:
         return cls(*parts, (width, height), cells, crossing)
 
     def reflected(self, points: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """For points (P, 2) in texels, outside of all triangles, and for each the covered texel `near` (P, 2) closest
-        to it: the points (Q,) that have an edge in front of them, where the surface goes on (Q, 2), and the island."""
+        """Where the surface goes on beyond a seam. Points (P, 2) in texels lie outside all triangles; `near` (P, 2) is
+        the covered texel closest to each. Returns the numbers (Q,) of the points that face an edge, the places (Q, 2)
+        beyond it, and the islands (Q,) there."""
         found = [
             self._reflected(points[first : first + POINTS_PER_BLOCK], near[first : first + POINTS_PER_BLOCK], first)
             for first in range(0, max(len(points), 1), POINTS_PER_BLOCK)
@@ -463,7 +469,7 @@ class UvSeams:
         return point + first, beyond + distance * self.inward[edge], self.island[edge]
 
     def _candidates(self, near):
-        """(point, edge) for the edges through the texels around `near`; a pair may come several times."""
+        """Pairs (point, edge) for the edges through the texels around `near`; a pair may occur several times."""
         stride = self.size[0] + 2
         cell = np.concatenate([(near[:, 1] + 1 + y) * stride + near[:, 0] + 1 + x for x, y in _NEIGHBORS])
         low = np.searchsorted(self.cells, cell, side="left")
@@ -472,13 +478,13 @@ class UvSeams:
 
 
 def _paired(vertices):
-    """Numbers (N,) 3 * triangle + corner of the edges that some other triangle has too, and those of the others."""
+    """Numbers (N,) 3 * triangle + corner of edges that other triangles share, and the number of the other's edge."""
     ends = np.sort(np.stack([vertices, np.roll(vertices, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
     order = np.lexsort((ends[:, 1], ends[:, 0]))
     new = np.concatenate([[True], (np.diff(ends[order], axis=0) != 0).any(axis=1)]) if len(order) else order
     start = np.flatnonzero(new)
     count = np.diff(start, append=len(order))
-    # Of an edge with more than two triangles every one goes on into the next.
+    # If more than two triangles share an edge, each is paired with the next.
     last = start + count - 1
     following = np.arange(len(order)) + 1
     following[last] = start
@@ -496,7 +502,7 @@ def _third(values, edge):
 
 
 def _towards(ends, corner):
-    """Unit vectors (N, 2) perpendicular to edges (N, 2, 2) towards the side of a corner (N, 2); NaN without area."""
+    """Unit vectors (N, 2) perpendicular to edges (N, 2, 2), towards `corner` (N, 2); NaN for triangles without area."""
     side = ends[:, 1] - ends[:, 0]
     turn = np.sign(cross(side, corner - ends[:, 0]))
     length = np.linalg.norm(side, axis=1)
@@ -505,7 +511,7 @@ def _towards(ends, corner):
 
 
 def _connected(count, first, second):
-    """The smallest number (count,) that each is connected to by pairs first (N,), second (N,)."""
+    """The smallest number (count,) to which the pairs first (N,), second (N,) connect each item."""
     label = np.arange(count)
     while True:
         a, b = label[first], label[second]
@@ -519,7 +525,7 @@ def _connected(count, first, second):
 
 
 def _cells(edges, width, height):
-    """(cells, edges) as in UvSeams, found by points half a texel apart on the part of each edge that is in the tile."""
+    """(cells, edges) as in UvSeams, from points half a texel apart on the part of each edge in the tile."""
     start, side = edges[:, 0], edges[:, 1] - edges[:, 0]
     first, last = np.zeros(len(edges)), np.ones(len(edges))
     for axis, limit in ((0, width), (1, height)):

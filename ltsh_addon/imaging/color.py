@@ -21,9 +21,10 @@ CHROMATICITIES = {
     "ACEScg": (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767),
     "ACES2065-1": (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767),
 }
-# The cone responses of Bradford (Lam 1985), in which white points are made equal.
+# BRADFORD: from XYZ to the cone responses in which white points are adapted (Lam 1985).
 BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
-# Entries of a matrix to Rec.709 that differ by less are the same: white points are published with 4 or 5 digits.
+# SAME_MATRIX: matrices to Rec.709 are the same if no entry differs by more. White points are published with 4 or 5
+# digits.
 SAME_MATRIX = 2e-3
 
 
@@ -46,9 +47,9 @@ def matrix_to_rec709(chromaticities) -> np.ndarray:
 
 
 def identified(matrix, name: str = "") -> ColorSpace:
-    """The color space whose `matrix` (3, 3) to linear Rec.709 is known: named after the matrix where that is known too.
+    """The color space with this `matrix` (3, 3) to linear Rec.709, named after a known space with the same matrix.
 
-    `name` is what the file calls it, used for other matrices.
+    For other matrices it has the `name` from the file.
     """
     for known, chromaticities in CHROMATICITIES.items():
         if np.abs(np.asarray(matrix) - matrix_to_rec709(chromaticities)).max() < SAME_MATRIX:
@@ -57,7 +58,7 @@ def identified(matrix, name: str = "") -> ColorSpace:
 
 
 def chromaticities(space: ColorSpace) -> tuple[float, ...]:
-    """xy of red, green, blue and white (8,): the published ones, or what the matrix says with the white of Rec.709."""
+    """xy of red, green, blue and white (8,): the published ones, else those of the matrix and the white of Rec.709."""
     if space.name in CHROMATICITIES:
         return CHROMATICITIES[space.name]
     rec709 = CHROMATICITIES["Linear Rec.709"]
@@ -67,7 +68,7 @@ def chromaticities(space: ColorSpace) -> tuple[float, ...]:
 
 
 LUMINANCE_WEIGHTS = np.array([0.2126, 0.7152, 0.0722])  # linear Rec.709, ITU-R BT.709
-_WHITE = 0.9  # display value that the bright end of the reference is brought to
+_WHITE = 0.9  # value to which the bright end of the reference is scaled
 _BRIGHT_PERCENTILE = 99.0
 
 
@@ -77,9 +78,9 @@ def luminance(color: np.ndarray) -> np.ndarray:
 
 
 def exposure_factor(reference: np.ndarray) -> float:
-    """Factor that brings the 99th percentile of the luminance of lit pixels of `reference` (..., 3) to 0.9.
+    """Factor that scales the 99th percentile of the luminance of lit pixels of `reference` (..., 3) to 0.9.
 
-    1 when nothing is lit. NaN and Inf are left out.
+    It is 1 if no pixel is lit. NaN and Inf are left out.
     """
     lit = luminance(np.where(np.isfinite(reference), reference, 0.0))
     lit = lit[lit > 0.0]
@@ -118,9 +119,9 @@ NOT_FINITE_COLOR = (1.0, 0.0, 1.0)
 
 
 def signed_error_colors(error: np.ndarray, scale: float) -> np.ndarray:
-    """sRGB colors (H, W, 3) in [0, 1] of errors (H, W), or (H, W, 3) by their luminance; saturated beyond +-scale.
+    """sRGB colors (H, W, 3) in [0, 1] of errors (H, W), or (H, W, 3) by their luminance; clamped to +-scale.
 
-    NaN and Inf are magenta, which no error is.
+    NaN and Inf are magenta, a color that no error has.
     """
     if not scale > 0.0:
         raise ValueError(f"scale of the error colors is {scale}, expected a positive number")
@@ -142,15 +143,15 @@ _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
 def write_png(path: str | os.PathLike, image: np.ndarray) -> None:
-    """Write `image` (H, W, 3) uint8, sRGB, row 0 on top. The file appears complete or not at all.
+    """Write `image` (H, W, 3) uint8, sRGB, row 0 on top, atomically.
 
-    Raises ValueError for another shape or type, OSError when the file cannot be written.
+    Raises ValueError for another shape or type, OSError if the file cannot be written.
     """
     write_bytes(path, encode_png(image))
 
 
 def encode_png(image: np.ndarray) -> bytes:
-    """The bytes of a PNG file that shows `image` (H, W, 3) uint8."""
+    """The bytes of a PNG file of `image` (H, W, 3) uint8."""
     image = np.asarray(image)
     if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or not 0 < min(image.shape[:2]):
         raise ValueError(f"PNG: expected an image (height, width, 3) of uint8, found {image.shape} of {image.dtype}")
@@ -174,9 +175,9 @@ def _chunk(kind: bytes, data: bytes) -> bytes:
 
 
 def _filtered(image: np.ndarray) -> np.ndarray:
-    """Rows (H, 1 + 3 W) of differences from the pixel to the left, modulo 256, with that filter's number in front.
+    """Rows (H, 1 + 3 W) of PNG's filter 1: its number, then differences from the pixel to the left, modulo 256.
 
-    Choosing a filter for every row makes photographs 2 % smaller and sheets 2 % larger.
+    Choosing a filter for every row would make photographs 2 % smaller and sheets 2 % larger.
     """
     height, width = image.shape[:2]
     rows = np.ones((height, 1 + 3 * width), dtype=np.uint8)

@@ -1,7 +1,7 @@
-"""Pictures without noise, by the library Open Image Denoise that Blender ships, called through ctypes.
+"""Denoising by the library Open Image Denoise that Blender ships, called through ctypes.
 
-Its functions and their arguments are those of oidn.h of Open Image Denoise 2. Like Blender's own, a picture is denoised
-with the help of the albedo and the normal that are seen, which are denoised before.
+Functions and arguments are those of oidn.h of Open Image Denoise 2. As in Blender, pictures are denoised with the help
+of their albedo and normal, which are denoised first.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _FUNCTIONS = {
 
 
 class NoDenoiser(Exception):
-    """No library can be used; the text says why."""
+    """No library is usable; the message says why."""
 
 
 class Denoiser:
@@ -55,7 +55,7 @@ class Denoiser:
         self._device = self._NewDevice(_CPU)
         if not self._device:
             raise NoDenoiser(f"{library}: it makes no device")
-        # Threads stay where the system puts them: other work goes on beside them.
+        # Threads are not pinned to cores, because other work runs beside them.
         self._SetDeviceBool(self._device, b"setAffinity", False)
         self._SetDeviceInt(self._device, b"numThreads", threads)
         self._CommitDevice(self._device)
@@ -64,12 +64,14 @@ class Denoiser:
         self.name = f"Open Image Denoise {version // 10000}.{version // 100 % 100}.{version % 100}"
 
     def close(self) -> None:
-        """Give its memory back."""
+        """Free the memory of the library."""
         self._ReleaseDevice(self._device)
 
     def all_denoised(self, colors: Sequence[np.ndarray], albedo: np.ndarray, normal: np.ndarray) -> list[np.ndarray]:
-        """Pictures of the same surfaces, radiance (H, W, 3), without their noise: float32, never negative. `albedo` and
-        `normal` (H, W, 3) may be noisy too. Values that are not finite count as 0."""
+        """The denoised pictures, float32 and never negative, of pictures `colors` (H, W, 3) of the same surfaces.
+
+        `albedo` and `normal` (H, W, 3) may be noisy, too. NaN and Inf count as 0.
+        """
         guides = {"albedo": self._filtered({"albedo": albedo}), "normal": self._filtered({"normal": normal})}
         return [self._filtered({"color": color, **guides}, hdr=True, cleanAux=True) for color in colors]
 
@@ -106,7 +108,7 @@ def _plain(image: np.ndarray) -> np.ndarray:
 
 @contextmanager
 def open_denoiser(libraries: Iterable[Path], threads: int) -> Iterator[Denoiser]:
-    """The first library that works: of `libraries`, then of the system. Raises NoDenoiser."""
+    """Context with the first library that works, of `libraries` and then of the system. Raises NoDenoiser."""
     reasons = []
     for library in (*map(str, libraries), *SYSTEM_LIBRARIES):
         try:

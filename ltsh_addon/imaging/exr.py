@@ -1,6 +1,6 @@
-"""Multi-layer EXR files of 32-bit floats: layers, single channels, and rows as they come.
+"""Multi-layer EXR files of 32-bit floats: read and written by layers, by channels, or row by row.
 
-Files are written as one part of scanlines with ZIP compression. Each of them appears complete or not at all.
+Files are written atomically, as one part of scanlines with ZIP compression.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from ..files import replacing
 _DEFAULT_CHANNELS = {1: "V", 3: "RGB", 4: "RGBA"}
 _CHANNEL_ORDERS = ("RGBA", "XYZW", "UVW")
 _BLOCK_VALUES = 1 << 22
-_ZIP_ROWS = 16  # are compressed together
+_ZIP_ROWS = 16  # rows that are compressed together
 _LONGEST_NAME = 255  # bytes, OpenEXR's limit
-_HEADER_BYTES = 1 << 22  # more than the header of a file with thousands of channels has
+_HEADER_BYTES = 1 << 22  # more than the header of a file with thousands of channels
 _OF_THE_FORMAT = {"channels", "chromaticities", "compression", "dataWindow", "displayWindow", "lineOrder", "name",
                   "pixelAspectRatio", "type", "version"}  # fmt: skip
 
@@ -74,7 +74,7 @@ def write_channels(path: str | os.PathLike, channels: Mapping[str, np.ndarray], 
     planes = {name: np.asarray(plane) for name, plane in channels.items()}
     _check_planes(planes)
     height, width = next(iter(planes.values())).shape
-    # A block at a time, so that a signal need not wait for a large file.
+    # Block by block, so that signals are handled before a large file is complete.
     rows = max(1, _BLOCK_VALUES // (width * len(planes)) // _ZIP_ROWS) * _ZIP_ROWS
     with writing_rows(path, list(planes), (width, height), *header) as writer:
         for first in range(0, height, rows):
@@ -90,9 +90,9 @@ def writing_rows(
     chromaticities: Sequence[float] | None = None,
     pixel_aspect: float = 1.0,
 ) -> Iterator[RowWriter]:
-    """Meanwhile a RowWriter for a file of `size` (width, height) with the channels `names`; else as `write_layers`.
+    """Context with a RowWriter for a file of `size` (width, height) with the channels `names`.
 
-    Raises ValueError also where rows are missing at the end of the block.
+    The other arguments are those of `write_layers`. Also raises ValueError if rows are missing at the end.
     """
     OpenEXR = _openexr()
     metadata = {str(key): str(value) for key, value in (metadata or {}).items()}
@@ -136,7 +136,7 @@ class RowWriter:
     done: int = 0  # rows
 
     def write(self, planes: Mapping[str, np.ndarray]) -> None:
-        """The next rows, (R, W) for every channel; raises ValueError for other channels or shapes."""
+        """Write the next rows, (R, W) for every channel; raises ValueError for other channels or shapes."""
         height, width = self.shape
         rows = len(next(iter(planes.values()))) if planes else 0
         if set(planes) != set(self.names) or rows == 0 or self.done + rows > height:
@@ -175,7 +175,7 @@ def _check_planes(planes: Mapping[str, np.ndarray]) -> None:
 
 
 def _put_chromaticities(path: Path, values: bytes) -> None:
-    """Put them into the header of a file: OutputFile writes zeros, whatever it is given (OpenEXR 3.5)."""
+    """Put chromaticities into the header of a file, since OutputFile always writes zeros (OpenEXR 3.5)."""
     attribute = b"\0chromaticities\0chromaticities\0" + len(values).to_bytes(4, "little")
     with path.open("r+b") as file:
         file.seek(file.read(_HEADER_BYTES).index(attribute) + len(attribute))
@@ -183,16 +183,16 @@ def _put_chromaticities(path: Path, values: bytes) -> None:
 
 
 def _reason(error: Exception, temporary: os.PathLike) -> str:
-    """Why OpenEXR could not write: of "Cannot open image file "NAME". Reason." the part without the file's name."""
+    """Why OpenEXR could not write: the reason in its message `Cannot open image file "NAME". Reason.`"""
     return str(error).rpartition(f'"{temporary}". ')[2].strip().rstrip(".")
 
 
 def read_channels(path: str | os.PathLike) -> dict[str, np.ndarray]:
-    """All channels by full name, each (H, W) of the file's type, row 0 on top; of all parts of a multi-part file.
+    """All channels of all parts by full name, each (H, W) of the file's type, row 0 on top.
 
     Blender 4.5 writes one part, Blender 5 may write one part per pass; both give names like ``ViewLayer.Position.X``. A
-    channel without a layer in a named part gets the part's name in front. Raises OSError when the file is missing or
-    unreadable, ValueError, naming the file, when it is damaged, incomplete or no EXR.
+    channel without a layer gets the name of its part in front. Raises OSError if the file is missing or unreadable, and
+    ValueError, naming the file, if it is damaged, incomplete or no EXR.
     """
     with open(path, "rb") as stream:  # the system's own error for a missing or unreadable file
         if stream.read(4) != b"\x76\x2f\x31\x01":

@@ -19,7 +19,7 @@ import numpy as np
 
 ASCENT = 16.0  # highest stroke center: brackets
 DESCENT = 4.4  # lowest stroke center: g, p, q
-DIGIT_WIDTH = 8.4  # all digits take the same room, so that numbers stand in columns
+DIGIT_WIDTH = 8.4  # of all digits, so that numbers form columns
 SPACE_WIDTH = 3.0
 
 _BOWL_RIGHT = "M0 5v3.8 10h7.6 5v3.8 0h0 5"
@@ -217,7 +217,7 @@ def _glyph(character: str, size: float, bold: bool) -> tuple[np.ndarray, int]:
 
 
 def _coverage(segments: np.ndarray, shape: tuple[int, int], stroke_width: float) -> np.ndarray:
-    """Share of each pixel that lies within half a stroke of one of the `segments` (S, 2, 2), from the distance."""
+    """Share of each pixel, estimated from its distance, that lies within half a stroke of a segment (S, 2, 2)."""
     rows, columns = np.indices(shape) + 0.5
     pixels = np.stack([columns, rows], axis=-1)[..., None, :]
     start, along = segments[:, 0], segments[:, 1] - segments[:, 0]

@@ -17,7 +17,7 @@ import numpy as np
 
 from .color import exposure_factor, luminance
 
-# Relative errors of single pixels are taken where the reference's luminance is above this share of its maximum.
+# LIT_SHARE: pixels are lit, and have relative errors, if the reference's luminance is above this share of its maximum.
 LIT_SHARE = 1e-4
 
 
@@ -70,7 +70,7 @@ def error_statistics(technique, reference, mask=None) -> ErrorStatistics:
 
 
 def noisy_error_statistics(technique, half_a, half_b, mask=None) -> ErrorStatistics:
-    """Figures against the mean of two independent halves; only the unbiased ones are free of their noise."""
+    """Figures against the mean of two independent halves; only the unbiased figures are free of the halves' noise."""
     return _statistics(technique, half_a, half_b, mask)
 
 
@@ -148,7 +148,7 @@ def flip(reference: np.ndarray, test: np.ndarray, pixels_per_degree: float = PIX
     reference, test = (np.clip(np.asarray(image, dtype=np.float32), 0.0, 1.0) for image in (reference, test))
     if reference.shape != test.shape or reference.ndim != 3 or reference.shape[2] != 3:
         raise ValueError(f"pictures of shape {reference.shape} and {test.shape}, expected both (height, width, 3)")
-    # In these filters for contrast sensitivity are linear.
+    # In opponent colors the filters for contrast sensitivity are linear.
     opponents = [_opponents(image @ _TO_RATIO.astype(np.float32)) for image in (reference, test)]
     color = _color_difference(*(_filtered(image, pixels_per_degree) for image in opponents))
     lightness = [(image[..., 0] + 16.0) / 116.0 for image in opponents]
@@ -157,8 +157,10 @@ def flip(reference: np.ndarray, test: np.ndarray, pixels_per_degree: float = PIX
 
 
 def mean_flip(reference: np.ndarray, test: np.ndarray, mask: np.ndarray | None = None) -> float | None:
-    """Mean FLIP of two radiance pictures (H, W, 3) over the pixels of `mask`, exposed so that the 99th percentile of
-    the reference is nearly white; None without pixels. What is not finite counts as black."""
+    """Mean FLIP of two radiance pictures (H, W, 3) over the pixels of `mask`; None without pixels.
+
+    Both are exposed so that the 99th percentile of the reference is nearly white. NaN and Inf count as black.
+    """
     factor = exposure_factor(reference)
     shown = [factor * np.where(np.isfinite(image), image, 0.0) for image in (reference, test)]
     values = flip(*shown)
@@ -167,7 +169,7 @@ def mean_flip(reference: np.ndarray, test: np.ndarray, mask: np.ndarray | None =
 
 
 def _opponents(ratio: np.ndarray) -> np.ndarray:
-    """Y Cx Cz of shares of the white's XYZ; CIELAB where these were bent before."""
+    """Y Cx Cz from XYZ relative to white; CIELAB if the nonlinearity of CIELAB has been applied to `ratio` before."""
     x, y, z = np.moveaxis(ratio, -1, 0)
     return np.stack([116.0 * y - 16.0, 500.0 * (x - y), 200.0 * (y - z)], axis=-1)
 
@@ -179,7 +181,7 @@ def _linear_of_opponents(opponents: np.ndarray) -> np.ndarray:
 
 
 def _filtered(opponent: np.ndarray, pixels_per_degree: float) -> np.ndarray:
-    """What of a picture the eye resolves (Section 4.1): CIELAB with the Hunt effect."""
+    """The picture as far as the eye resolves it (Section 4.1), in CIELAB with the Hunt effect."""
     radius = int(np.ceil(3.0 * np.sqrt(_WIDEST / (2.0 * np.pi**2)) * pixels_per_degree))
     distance = np.arange(-radius, radius + 1) / pixels_per_degree
     planes = []
@@ -204,7 +206,7 @@ def _lab(linear: np.ndarray) -> np.ndarray:
 
 
 def _hunt(lab: np.ndarray) -> np.ndarray:
-    """Colors seem stronger where it is bright (4)."""
+    """CIELAB with the Hunt effect (4): colors seem stronger where it is bright."""
     return np.concatenate([lab[..., :1], _HUNT * lab[..., :1] * lab[..., 1:]], axis=-1)
 
 
@@ -239,24 +241,24 @@ def _feature_difference(first: np.ndarray, second: np.ndarray, pixels_per_degree
 
 
 def _feature_strength(image: np.ndarray, kernel: np.ndarray, smooth: np.ndarray) -> np.ndarray:
-    """Length of the filter's answers along both axes; positive and negative weights of the filter sum to 1 each."""
+    """Magnitude of the filter's responses along both axes; its positive and negative weights sum to 1 each."""
     smooth = smooth / smooth.sum()
     kernel = np.where(kernel > 0.0, kernel / kernel[kernel > 0.0].sum(), -kernel / kernel[kernel < 0.0].sum())
     return np.hypot(_convolved(image, kernel, smooth), _convolved(image, smooth, kernel))
 
 
 def _convolved(image: np.ndarray, along_x: np.ndarray, along_y: np.ndarray) -> np.ndarray:
-    """`image` (H, W) with two odd kernels, its borders continued."""
+    """`image` (H, W) convolved with kernels of odd size along x and y; values at the borders are repeated outside."""
     return _convolved_rows(np.ascontiguousarray(_convolved_rows(np.ascontiguousarray(image.T), along_x).T), along_y)
 
 
 def _convolved_rows(image: np.ndarray, kernel: np.ndarray) -> np.ndarray:
-    """Along the first axis."""
+    """`image` convolved with `kernel` along the first axis."""
     radius = len(kernel) // 2
     padded = np.pad(image, ((radius, radius), (0, 0)), mode="edge")
     result = np.zeros(image.shape, dtype=image.dtype)
     weights = kernel.astype(image.dtype)
-    for start in range(0, image.shape[1], _COLUMNS):  # what is added up stays in the cache
+    for start in range(0, image.shape[1], _COLUMNS):  # so few that the sums stay in the cache
         columns = slice(start, start + _COLUMNS)
         part = np.empty_like(result[:, columns])
         for offset, weight in enumerate(weights):

@@ -38,7 +38,7 @@ def json_text(document) -> str:
 
 
 def write_json(path: str | os.PathLike, document) -> None:
-    """Write `json_text(document)`, complete or not at all."""
+    """Write `json_text(document)` atomically."""
     write_bytes(path, (json_text(document) + "\n").encode())
 
 
@@ -55,9 +55,9 @@ def _plain(value):
 
 
 def write_html(folder: str | os.PathLike, page: str, sheet: str, layers: str, report: Mapping) -> None:
-    """Write the page `page` of a comparison's `report`, complete or not at all.
+    """Write the page `page` of a comparison's `report`, atomically.
 
-    It links the `sheet` (PNG) and the `layers` (EXR); all three are paths below `folder`, where report.json lies.
+    It links the `sheet` (PNG) and the `layers` (EXR). All three are paths below `folder`, which has report.json.
     """
     sheet, layers, figures = (_link(page, name) for name in (sheet, layers, "report.json"))
     width, height = report["resolution"]
@@ -85,7 +85,7 @@ def write_html(folder: str | os.PathLike, page: str, sheet: str, layers: str, re
 
 
 def write_overview(folder: str | os.PathLike, page: str, report: Mapping) -> None:
-    """Write the page of many comparisons: a line for each, with the errors of one pass and a link to its own page."""
+    """Write the page of many comparisons: one line each, with the errors of one pass and a link to its own page."""
     pictures, rows = report["reports"], []
     techniques = list(dict.fromkeys(name for picture in pictures for name in _shown(picture)[1]["techniques"]))
     for picture in pictures:
@@ -111,7 +111,7 @@ def write_overview(folder: str | os.PathLike, page: str, report: Mapping) -> Non
 
 
 def _shown(picture: Mapping) -> tuple[str, Mapping]:
-    """Name and figures of the pass that is shown of a picture: specular where there is one."""
+    """Name and figures of the pass of a picture that the overview shows: specular if there is one, else the first."""
     name = "specular" if "specular" in picture["passes"] else next(iter(picture["passes"]))
     return name, picture["passes"][name]
 
@@ -125,12 +125,12 @@ def _page(title: str, body: list[str]) -> bytes:
 
 
 def _link(page: str, name: str) -> str:
-    """The file `name` as the page names it; both lie below the same folder."""
+    """The link from the page to the file `name`; both are paths below the same folder."""
     return _text(urllib.parse.quote(posixpath.relpath(name, posixpath.dirname(page) or ".")))
 
 
 def _picture_facts(report: Mapping) -> list[str]:
-    """What to know about the picture where it is not the plain one."""
+    """Facts about a picture: its color space, and render region, pixel aspect and exposure if they are not plain."""
     facts, border = [f"colors in {report['color_space']}"], report["border"]
     if border is not None:
         facts.append(
@@ -208,6 +208,6 @@ def read_index(folder: Path) -> dict:
 
 
 def index_stamp(folder: Path) -> tuple[int, int]:
-    """Changes when the index does. Raises OSError."""
+    """Modification time and size of the index, which tell whether it has changed. Raises OSError."""
     status = (Path(folder) / FILE).stat()
     return status.st_mtime_ns, status.st_size

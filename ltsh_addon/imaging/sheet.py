@@ -13,7 +13,7 @@ from .font import draw_text, shorten, text_size, wrap
 COLUMNS = 5
 TILE_WIDTHS = (240, 480)  # tiny images are enlarged to the first, large ones reduced to the second
 _PAPER, _INK, _FAINT, _FRAME = (250, 250, 249), (28, 28, 30), (106, 106, 112), (198, 198, 202)
-_GRAY = (128, 128, 128)  # what is not known
+_GRAY = (128, 128, 128)  # pixels without values
 _MARGIN, _GUTTER, _BAR = 28, 16, 18
 _TITLE, _LABEL, _TEXT = 26.0, 18.0, 14.0
 _SCALE_PERCENTILE = 99.5
@@ -21,16 +21,13 @@ _SCALE_PERCENTILE = 99.5
 
 @dataclass(frozen=True)
 class Tile:
-    """One technique: linear image (H, W, 3), signed error (H, W, 3), lines of text.
-
-    Pixels that `missing` (H, W) names have neither and are gray; None: there are none.
-    """
+    """One technique on the sheet."""
 
     label: str
-    image: np.ndarray
-    error: np.ndarray
-    caption: Sequence[str] = field(default=())
-    missing: np.ndarray | None = None
+    image: np.ndarray  # (H, W, 3) linear
+    error: np.ndarray  # (H, W, 3) signed
+    caption: Sequence[str] = field(default=())  # lines of text
+    missing: np.ndarray | None = None  # mask (H, W) of pixels without values, which become gray; None: there are none
 
 
 def comparison_sheet(
@@ -73,7 +70,7 @@ def _wrapped(texts: Sequence[str], width: int) -> list[str]:
 
 
 def _known(image: np.ndarray, missing: np.ndarray | None) -> np.ndarray:
-    """`image` resized, where it is reduced the mean of pixels that are not `missing`."""
+    """`image` resized; reduced images are means over the pixels that are not `missing`."""
     if missing is None:
         return _resized(image)
     known = np.where(missing, 0.0, 1.0)[..., None]
@@ -92,7 +89,10 @@ def _with_gray(pixels: np.ndarray, missing: np.ndarray | None) -> np.ndarray:
 
 
 def common_error_scale(errors, image) -> float:
-    """A round number near the 99.5th percentile of the luminance of all `errors`, each (H, W, 3), of an image."""
+    """A round number near the 99.5th percentile of the luminance of all `errors` (H, W, 3) that are not 0.
+
+    Without errors it is the largest value of the `image`, at least 1.
+    """
     values = [np.abs(luminance(error[np.isfinite(error).all(axis=-1)])) for error in errors]
     values = np.concatenate([part[part > 0.0] for part in values]) if values else np.empty(0)
     if not values.size:
@@ -103,7 +103,7 @@ def common_error_scale(errors, image) -> float:
 
 
 def _resized(image: np.ndarray) -> np.ndarray:
-    """Enlarged by whole factors (nearest), or reduced by box filtering, to a width between TILE_WIDTHS."""
+    """`image` enlarged by a whole factor (nearest), or reduced by a box filter, to a width within TILE_WIDTHS."""
     smallest, largest = TILE_WIDTHS
     height, width = image.shape[:2]
     if width < smallest:
@@ -117,7 +117,7 @@ def _resized(image: np.ndarray) -> np.ndarray:
 
 
 def _box_filtered(image: np.ndarray, rows: int) -> np.ndarray:
-    """Rows averaged over equal intervals, pixels on a border shared by their overlap."""
+    """`image` with its rows averaged over `rows` equal intervals; rows on a border are shared by overlap."""
     sums = np.concatenate([np.zeros_like(image[:1], dtype=np.float64), np.cumsum(image, axis=0, dtype=np.float64)])
     borders = np.linspace(0.0, image.shape[0], rows + 1)
     whole = np.minimum(borders.astype(int), image.shape[0] - 1)
@@ -130,7 +130,7 @@ def _to_8bit(colors: np.ndarray) -> np.ndarray:
 
 
 class _Sheet:
-    """The paper and where things go on it."""
+    """The pixels of a sheet, and the layout."""
 
     def __init__(self, title: str, width: int, height: int, *, count: int, lines: tuple[int, int]):
         legend_lines, caption_lines = lines
@@ -142,7 +142,7 @@ class _Sheet:
         self.caption_height = caption_lines * self.line + 10
         below = 2 * height + 10 + self.caption_height
         legend = height + 10 + _BAR + 12 + (1 + legend_lines) * self.line
-        # The legend stands in the first row, and may need more room than the errors beside it.
+        # The first row has the legend, which may need more room than the errors beside it.
         self.heights = [self.label_height + max(below, legend) + 18]
         self.heights += (self.rows - 1) * [self.label_height + below + 18]
         page_width = 2 * _MARGIN + self.columns * width + (self.columns - 1) * _GUTTER
@@ -159,7 +159,7 @@ class _Sheet:
         return _MARGIN + column * (self.width + _GUTTER), self.top + sum(self.heights[:row])
 
     def place(self, index: int, label: str, picture: np.ndarray, error: np.ndarray | None, caption) -> None:
-        """Put label, picture, error and caption into cell `index`."""
+        """Draw label, picture, error and caption into cell `index`."""
         x, y = self._corner(index)
         draw_text(self.pixels, (x, y), shorten(label, self.width, _LABEL, bold=True), _INK, _LABEL, bold=True)
         y += self.label_height
@@ -178,7 +178,7 @@ class _Sheet:
         self.pixels[y : y + height, x : x + width] = picture
 
     def legend(self, lines: Sequence[str], scale: float) -> None:
-        """Below the reference: the color bar with numbers, then the `lines`."""
+        """Draw the color bar with its numbers and the `lines` below the reference."""
         x, y = self._corner(0)
         y += self.label_height + self.height + 10
         self._picture(x, y + 1, _to_8bit(color_bar(self.width, _BAR)))

@@ -1,11 +1,11 @@
-"""A .blend in, files out. What scripts call: the functions do with a file what the commands of these names do.
+"""A .blend in, files out: the functions for scripts, which do the same as the commands of these names.
 
     from pathlib import Path
     from ltsh_addon.pipeline import PictureOptions, compare_scene
 
     report = compare_scene(PictureOptions(Path("room.blend"), Path("out/room"), techniques=("ltc", "ltsh4")))
 
-Blender runs in a process of its own, so that nothing here needs bpy to be imported.
+Blender runs in a process of its own, so nothing here imports bpy.
 """
 
 from .bake import bake_scene

@@ -1,4 +1,4 @@
-"""Bakes: the texels of objects, block by block, into the files of `bake_files`."""
+"""Bakes: shades the texels of objects, block by block, into the files of `bake_files`."""
 
 from __future__ import annotations
 
@@ -29,18 +29,20 @@ from .options import BAKE_PASSES, MARGIN_TYPES, TEXTURE_SIDES, BakeOptions, chil
 from .picture import TaskResult, percent
 from .tasks import Records, contents_digest, file_stems, options_digest
 
-# Texels that a thread shades at a time: arrays of this size are used again, larger ones are new memory each time.
+# BLOCK_TEXELS: texels that a thread shades at a time. The allocator reuses arrays of this size; larger ones would be
+# new memory each time.
 BLOCK_TEXELS = 1 << 18
-# Texels along the border of a UV map count or not by where their centers lie: less than this is no finding.
+# NOTED_SHARE_OUTSIDE: a larger share of the UV map outside of the texture is reported. Less may come from texels along
+# the border, which count by their centers.
 NOTED_SHARE_OUTSIDE = 0.01
 
 
 def bake_scene(options: BakeOptions, progress: Progress | None = None) -> dict:
-    """Bake the objects of a scene, write OUT/<object>.exr (<object>.<tile>.exr with several tiles), report.json and
-    timing.json; return the report with the times as "seconds".
+    """Bake the objects of a scene: OUT/<object>.exr (<object>.<tile>.exr with several tiles), report.json, timing.json.
 
-    An object that cannot be baked is named in the report under "problems"; the others are baked all the same. Nothing
-    but timing.json depends on the machine's speed. Raises SceneError, TableError, OSError, Cancelled, ValueError.
+    Returns the report, with the times under "seconds". An object that cannot be baked is named in the report under
+    "problems"; the others are baked all the same. Only timing.json depends on the machine's speed. Raises SceneError,
+    TableError, OSError, Cancelled, ValueError.
     """
     made = bake_objects(options, progress)
     document = made.report
@@ -60,10 +62,10 @@ def bake_objects(
     tile: int | None = None,
     following: tuple[str, ...] = (),
 ) -> TaskResult:
-    """Bake the objects and write their files, but no report.json; `tile` is the one UDIM tile that is wanted.
+    """Bake the objects and write their files, but no report.json; `tile` is the only UDIM tile to bake, None: all.
 
-    In `kept_blender` the scene stays open for the next call with the same options: for objects that are named here, or
-    announced as `following`. Raises as `bake_scene` does.
+    Within `kept_blender` the scene stays open for the next call with the same options, for the objects named here and
+    those announced as `following`. Raises as `bake_scene` does.
     """
     from ..blender.process import client
 
@@ -95,7 +97,7 @@ def bake_objects(
 
 
 def _shadow_tracer(options, manifest, folder):
-    """What finds shadows, for a with-statement that gets None without shadows."""
+    """A context with the ShadowTracer; it gives None where shadows are off."""
     if manifest["occluders"] is None:
         return nullcontext()
     occluders = Occluders.load(folder / manifest["occluders"])
@@ -139,7 +141,7 @@ def block_rows(options) -> int:
 
 
 def shaded_passes(options) -> set[str]:
-    """Passes of `shading.shade` that the wanted ones are made of."""
+    """The passes of `shading.shade` from which the wanted passes follow; `diffuse_light` is shaded apart."""
     wanted = set(options.passes)
     if "combined" in wanted:
         wanted |= {"specular", "diffuse"}
@@ -147,7 +149,7 @@ def shaded_passes(options) -> set[str]:
 
 
 class ObjectBaker:
-    """Bakes the tiles of one object, `record` of the `manifest`, block of rows by block of rows from the top."""
+    """Bakes the tiles of one object, the `record` of the `manifest`, in blocks of rows from the bottom."""
 
     def __init__(self, options, tables, manifest, record, folder, tracer=None):
         self.options, self.tables, self.manifest, self.record, self.folder = options, tables, manifest, record, folder
@@ -163,9 +165,9 @@ class ObjectBaker:
             self.compared = ()
 
     def bake(self, stem: str, tiles: list[int], records: TileRecords, progress) -> TaskResult:
-        """Write the files of `tiles` (empty: of all) that are not finished according to `records`.
+        """Write the files of `tiles` (empty: all tiles), except those that `records` has as finished.
 
-        The report of the result is the object's part of the report.
+        The report of the result is the object's entry in the whole report.
         """
         name, files, seconds = self.record["name"], [], {}
         result = {"name": name, "uv": self.record["uv"], "outside": 0.0, "tiles": {}}
@@ -189,7 +191,7 @@ class ObjectBaker:
         return "" if len(self.tiles) == 1 else f".{tile}"
 
     def _tile(self, tile, stem, progress):
-        """Write the files of one tile; its record and their names."""
+        """Write the files of one tile; returns its record and the names of the files."""
         options, file = self.options, f"{stem}{self._suffix(tile)}.exr"
         path = options.output / file
         errors, written = ErrorSums(), [file]
@@ -216,7 +218,7 @@ class ObjectBaker:
         return Planes(self.folder / f"planes_{tile}", self.channels(), *options.size, seams)
 
     def _shade(self, tile, planes, errors, progress) -> dict:
-        """Shade a tile block by block into `planes`; how many texels there were."""
+        """Shade a tile block by block into `planes`; returns its counts of texels for the record."""
         options, covered, covers, overlaps, unshaded, unbaked, lit = self.options, 0, 0, 0, 0, 0, False
         is_unshaded = np.array([bool(reason) for reason in self.record["unshaded"]])
         rows, height = block_rows(options), options.size[1]
@@ -251,11 +253,11 @@ class ObjectBaker:
         return {**found, "unshaded_texels": unshaded, "unbaked_texels": unbaked, "is_lit": lit}
 
     def _threads(self) -> int:
-        """Blocks to shade at a time; one where the shading of a block takes all cores itself."""
+        """Blocks to shade at a time: one with the reference, whose shading of a block takes all cores itself."""
         return 1 if REFERENCE in self.tables.values() else cores()
 
     def channels(self) -> list[str]:
-        """Names of the channels of the EXR but for the coverage."""
+        """Names of the channels of the EXR, without the coverage."""
         layers = [f"{name}.{pass_name}" for name in self.tables for pass_name in self.options.passes]
         if len(self.groups) > 1:
             layers += [f"{layer}@{group}" for layer in layers for group in lighting.group_names(self.groups)]
@@ -265,7 +267,7 @@ class ObjectBaker:
         return [f"{layer}.{letter}" for layer in layers for letter in "RGB"]
 
     def _block(self, spread, first, point) -> dict[str, np.ndarray]:
-        """Layers (Q, 3) at one point of each of the texels (Q) of a block."""
+        """Layers (Q, 3) of the Q texels of a block, shaded at one point of each texel."""
         texels, maps, weights = spread.at(first, point)
 
         def read_map(number):
@@ -293,7 +295,7 @@ class ObjectBaker:
         return layers if weights is None else {name: values * weights[:, None] for name, values in layers.items()}
 
     def _add_cycles(self, layers, tile, first, texels) -> dict[str, np.ndarray]:
-        """Add Cycles' bake of the texels and the signed errors to the layers (Q, 3); its halves as of `_halves`."""
+        """Add Cycles' bake and the signed errors to the `layers` (Q, 3); returns the halves of `_halves`."""
         halves = self._halves(tile, first, texels)
         for pass_name, (a, b) in halves.items():
             mean = 0.5 * (a + b)
@@ -302,7 +304,7 @@ class ObjectBaker:
         return halves
 
     def _halves(self, tile, first, texels) -> dict[str, np.ndarray]:
-        """Cycles' bake of the texels by compared pass: two independent halves (2, Q, 3)."""
+        """Cycles' bake of the texels by pass: two independent halves (2, Q, 3)."""
         halves = {}
         for pass_name in shaded_passes(self.options) if self.compared else ():
             baked = np.load(self.folder / f"cycles_{pass_name}_{tile}_{first}.npy")
@@ -348,7 +350,7 @@ class ObjectBaker:
 
 
 class TilePoints:
-    """The points of the texels of a tile: of `UvTriangles.spread`, or where there are maps, those that they show."""
+    """The points of the texels of a tile: those of `UvTriangles.spread`, or those at which maps were baked."""
 
     def __init__(self, baker: ObjectBaker, tile: int, threads: int):
         options = baker.options
@@ -356,13 +358,16 @@ class TilePoints:
         self._width = baker.manifest["sampled_texels"]
         self._triangles = uv.UvTriangles.in_tile(baker.mesh.uv, *options.size, _place(tile))
         self._at_centers = bakes_centers_alone(options, baker.record)
-        # Points of one block follow one another.
+        # The points of a block are shaded one after another, so few blocks need to be cached.
         kept = functools.lru_cache(maxsize=2 + threads // options.sub_samples)
         self.texels, self._weights_of = kept(self._covered), kept(self._fitted_weights)
 
     def at(self, first: int, point: int):
-        """The texels (Q) of the block from row `first` on at one of their points, the maps there (N, rows, W, 3), and
-        weights (Q,), 1 on average; None without maps, and where all points count the same."""
+        """One point of the Q texels of the block from row `first` on.
+
+        Returns the texels at this point, the maps there (N, rows, W, 3; None without maps), and the weights (Q,) of
+        the point, 1 on average (None: all points count alike).
+        """
         texels = self.texels(first)
         if not self._mapped:
             return self._triangles.spread(texels, point, self._options.sub_samples, self._width), None, None
@@ -385,7 +390,7 @@ class TilePoints:
         return self._folder / f"maps_{self._tile}_{first}_{point}.npy"
 
     def _places(self, texels, maps, first, point):
-        """Where the maps of a point show the texels, (Q, 2)."""
+        """Places (Q, 2) in the texture, in texels, at which the maps of a point were baked."""
         if point == 0:
             return self._triangles.places(texels)
         rows, width = maps.shape[1:3]
@@ -399,7 +404,7 @@ class TilePoints:
 
 
 def bakes_centers_alone(options: BakeOptions, record: dict) -> bool:
-    """Whether Cycles has to bake texels of an object, which it does where their centers are covered."""
+    """True where an object needs Cycles' own bake, which has only texels whose centers are covered."""
     return record["maps"] or options.error
 
 
@@ -409,7 +414,7 @@ def _place(tile: int) -> tuple[int, int]:
 
 
 def _in_order(function, items, threads: int):
-    """Yield function(item) in the order of `items`, of which `threads` are worked on at a time."""
+    """Yield function(item) in the order of `items`, computed by `threads` threads."""
     with ThreadPoolExecutor(threads) as pool:
         waiting, items = deque(), iter(items)
         try:
@@ -426,12 +431,12 @@ def _in_order(function, items, threads: int):
 
 
 def _channels(layers) -> dict[str, np.ndarray]:
-    """Values (Q,) by the names of channels, of layers (Q, 3)."""
+    """Channel values (Q,) by name, from layers (Q, 3)."""
     return {f"{name}.{letter}": pixels[:, n] for name, pixels in layers.items() for n, letter in enumerate("RGB")}
 
 
 def _summed(radiance, texel, count):
-    """Radiance (G, count, 3) of texels from that of their samples (G, S, 3)."""
+    """Radiance (G, count, 3) of texels: the sums over their samples (G, S, 3)."""
     if len(texel) == count:
         return radiance
     first = np.flatnonzero(np.concatenate([[True], texel[1:] != texel[:-1]])) if len(texel) else texel
@@ -439,9 +444,9 @@ def _summed(radiance, texel, count):
 
 
 class TileRecords:
-    """Which tiles of objects the same job has finished (with `resume`), and those that follow.
+    """Records of finished tiles: reads those of the same job (with `resume`) and writes new ones.
 
-    Where the options have a `name`, no records of other names are looked at.
+    Where the options have a `name`, only records of that name are read.
     """
 
     def __init__(self, options: BakeOptions):
@@ -452,23 +457,23 @@ class TileRecords:
         self.finished = {(record["task"]["object"], record["task"]["tile"]): record for record in whole}
 
     def take(self, name: str, tile: int, file: str) -> dict | None:
-        """What was found for a finished tile of the object `name` in `file`, and its files; else None."""
+        """The record of a finished tile of the object `name` with the `file`, else None."""
         record = self.finished.get((name, tile))
         return record if record is not None and file in record["files"] else None
 
     def write(self, name: str, tile: int, stem: str, files, report: dict) -> dict:
-        """Record that a tile is finished."""
+        """Write the record of a finished tile; returns it."""
         return self._records.write(f"{stem}.{tile}", self._key, {"object": name, "tile": tile}, files, report=report)
 
 
 def applied_layer(options) -> str:
-    """The layer that `apply` shows: of the first technique all light, or the first pass where only some is baked."""
+    """The layer that `apply` shows: the first technique's combined light, or its first pass where only one is baked."""
     parts = _applied_parts(options)
     return parts[0] if len(parts) == 1 else f"{parts[0].rpartition('.')[0]}.combined"
 
 
 def _applied_parts(options) -> list[str]:
-    """The layers of the file whose sum `apply` shows."""
+    """The layers whose sum `apply` shows."""
     names = [name for name in PASSES if name in options.passes]
     if "combined" in options.passes or len(names) < len(PASSES):
         names = ["combined"] if "combined" in options.passes else options.passes[:1]
@@ -476,7 +481,7 @@ def _applied_parts(options) -> list[str]:
 
 
 def apply_textures(scene: Path, output: Path, records: list[dict], layer: str, progress=None) -> str:
-    """Save the copy of the .blend whose objects show the textures of `records`, those of a report; its name."""
+    """Save a copy of the .blend whose objects show the textures of the report's `records`; returns its file name."""
     from ..blender.process import client
 
     textures = []
@@ -540,8 +545,7 @@ def _report(options, manifest, records) -> dict:
 
 
 def _darkness(record, reasons) -> tuple[list[str], list[str]]:
-    """The problem of an object whose texels are mostly not shaded for the `reasons` of its materials, or the warning
-    about one that no light reaches."""
+    """Problems and warnings of a dark object: most of its texels are not shaded, for `reasons`, or no light arrives."""
     tiles, name = record["tiles"].values(), f"object {record['name']!r}"
     texels, unshaded = (sum(tile[key] for tile in tiles) for key in ("texels", "unshaded_texels"))
     if 2 * unshaded > texels:
@@ -567,7 +571,7 @@ def _tiles(value, place) -> None:
         raise Malformed(f"{place} has {wrong[0]!r}, expected the number of a tile")
 
 
-# What `merge` and a summary need of a report (see `reading.check`).
+# What `merge` and a summary need in a report (see `reading.check`).
 REPORT = {
     "objects": [{"name": str, "uv": str, "tiles": _tiles}],
     **dict.fromkeys(("problems", "warnings"), [str]),
@@ -576,7 +580,7 @@ REPORT = {
 
 
 def summary(report: dict, seconds: dict) -> list[str]:
-    """Of one scene, camera and frame: a line per file, and errors where there are any."""
+    """Lines of text about the bake of one scene, camera and frame: a line per file, and the errors if there are any."""
     found = []
     for record in report["objects"]:
         for tile in record["tiles"].values():
@@ -593,5 +597,5 @@ def summary(report: dict, seconds: dict) -> list[str]:
 
 
 def brief(report: dict) -> list[str]:
-    """The same without times, for one of several."""
+    """The lines of `summary` without times, under the name of the bake, for one of several."""
     return [f"{report['name']}:", *(f"  {line}" for line in summary(report, {}))]

@@ -1,4 +1,4 @@
-"""Files of a bake: planes of texels with margins, signed errors."""
+"""Files of a bake: planes of texels with margins, and pictures of signed errors."""
 
 from __future__ import annotations
 
@@ -11,25 +11,26 @@ import numpy as np
 from .. import imaging
 from ..imaging.exr import writing_rows
 
-# Texels that are in memory while the file is written.
+# WRITTEN_TEXELS: texels that are in memory while a file is written.
 WRITTEN_TEXELS = 1 << 18
 COVERAGE = "coverage.hit.V"
-_OWNER = "owner"  # 1 + the number of the island, 0 where nothing is covered
-LARGEST_PICTURE = 2048
-# The darkest and brightest colors stand for this share of what Cycles' brightest texels show.
+_OWNER = "owner"  # channel with 1 + the number of the island, 0 where nothing is covered
+LARGEST_PICTURE = 2048  # the most texels of a side of an error picture
+# PICTURE_SCALE: the ends of the color scale of an error picture, as a share of the radiance of Cycles' brightest
+# texels, their percentile PICTURE_PERCENTILE.
 PICTURE_SCALE = 0.1
 PICTURE_PERCENTILE = 99.0
 EMPTY_COLOR = 0.55
 
 
 class Planes:
-    """Channels of an image as files, so that only some rows of them need be in memory; a context. Row 0 is below."""
+    """Context: the channels of an image as files, so that memory holds only some rows. Row 0 is at the bottom."""
 
     def __init__(self, folder: Path, names: list[str], width: int, height: int, seams=None):
-        """`seams` (UvSeams): margins show the adjacent faces; None: the nearest texel."""
+        """With `seams` (UvSeams) margins show the adjacent faces; None: the nearest texel."""
         folder.mkdir()
         self.names, self.shape, self._seams = names, (height, width), seams
-        # A bit per texel, for all that is in memory of the whole image.
+        # One bit per texel: the only data of the whole image in memory.
         self._covered = np.zeros((height, -(-width // 8)), dtype=np.uint8)
         files = [*names, _OWNER] if seams is not None else names
         self._paths = {name: folder / f"{number}.bin" for number, name in enumerate(files)}
@@ -44,7 +45,7 @@ class Planes:
             self._paths[name].unlink()
 
     def put(self, first: int, count: int, texels, values) -> None:
-        """Rows from `first`: `values` by channel at the `texels` (Texels)."""
+        """Store `count` rows from `first`: `values` by channel at the `texels` (Texels), 0 elsewhere."""
         width = self.shape[1]
         covered = np.zeros((count, width), dtype=bool)
         covered.reshape(-1)[texels.index] = True
@@ -69,14 +70,16 @@ class Planes:
         return np.memmap(self._paths[name], dtype, mode="r")[index]
 
     def write(self, path: Path, margin: int, metadata, pictures, texture=None) -> None:
-        """Write the EXR with the margin filled, the ErrorPictures (or None) of it, and as `texture`, (path, layers), an
-        EXR with the sum of some layers."""
+        """Write the EXR with its margin filled, the ErrorPictures `pictures` (or None), and the `texture`.
+
+        `texture` is (path, layers): an EXR with the sum of these layers. None: no texture.
+        """
         height, width = self.shape
         rows = max(1, WRITTEN_TEXELS // width)
         for file in self._files.values():
             file.flush()
         with ExitStack() as files:
-            # The last to be entered is the first to take its name: with the large file the tile counts as finished.
+            # The files take their names in reverse order, the large one last: with it the tile counts as finished.
             writer = files.enter_context(writing_rows(path, [*self.names, COVERAGE], (width, height), metadata))
             small = None
             if texture is not None:
@@ -93,7 +96,7 @@ class Planes:
                 pictures.write()
 
     def _filled(self, bottom, top, margin) -> dict[str, np.ndarray]:
-        """Rows from `bottom` to `top` of all channels with the margin, row 0 on top."""
+        """Rows `bottom` to `top` of all channels by name, margin filled, flipped so that row 0 is on top."""
         height, width = self.shape
         low, high = max(bottom - margin, 0), min(top + margin, height)
         target, source = nearest_covered(self.coverage(low, high), margin)
@@ -114,8 +117,8 @@ class Planes:
         return block
 
     def _beyond(self, target, source):
-        """Which of the texels `target` show an adjacent face (Q,), and the texels (Q, 4) that each shows, with weights.
-        `source` are the nearest covered texels."""
+        """Margin texels that show an adjacent face: their indices (Q,) in `target`, and the texels (Q, 4) that each
+        shows with weights (Q, 4). `source` are the nearest covered texels of `target`."""
         height, width = self.shape
         points, near = (np.stack([index % width, index // width], axis=-1) for index in (target, source))
         which, place, island = self._seams.reflected(points + 0.5, near)
@@ -128,7 +131,7 @@ class Planes:
             index[:, number] = np.where(within, row * width + column, 0.0)
             weight = np.abs(1 - x - share[:, 0]) * np.abs(1 - y - share[:, 1])
             weights[:, number] = np.where(within, weight, 0.0)
-        # Texels that no face covers, or one beyond another cut, show something else.
+        # Drop texels of other islands, and those that no face covers.
         weights[self._at(_OWNER, index, np.int32) != 1 + island[:, None]] = 0.0
         total = weights.sum(axis=1)
         found = np.flatnonzero(total > 1e-3)
@@ -136,26 +139,26 @@ class Planes:
 
 
 class ErrorSums:
-    """Sums over texels, from which the figures of `imaging.metrics` follow."""
+    """Sums over texels that give the figures of `imaging.metrics`."""
 
     def __init__(self):
         self._products: dict[tuple[str, str], np.ndarray] = {}
         self._halves: dict[str, np.ndarray] = {}
 
     def add_halves(self, pass_name: str, a: np.ndarray, b: np.ndarray) -> None:
-        """Two independent halves (Q, 3) of Cycles' bake."""
+        """Add two independent halves (Q, 3) of Cycles' bake."""
         a, b = a.astype(np.float64), b.astype(np.float64)
         sums = np.array([(a * b).sum(), ((a - b) ** 2).sum(), ((a + b) ** 2).sum(), 0.5 * (a + b).sum()])
         self._halves[pass_name] = self._halves.get(pass_name, 0.0) + sums
 
     def add(self, name: str, pass_name: str, shaded: np.ndarray, a: np.ndarray, b: np.ndarray) -> None:
-        """What a technique has at the same texels (Q, 3)."""
+        """Add the radiance `shaded` (Q, 3) of a technique at the same texels."""
         shaded, a, b = (values.astype(np.float64) for values in (shaded, a, b))
         sums = np.array([((shaded - a) * (shaded - b)).sum(), shaded.sum()])
         self._products[name, pass_name] = self._products.get((name, pass_name), 0.0) + sums
 
     def report(self) -> dict:
-        """Per pass: noise of Cycles and for each technique the error without that noise, and the bias."""
+        """Per pass: the noise of Cycles, and for each technique its bias and its error without that noise."""
         found = {}
         for pass_name, (norm, difference, total, light) in self._halves.items():
             techniques = {}
@@ -173,7 +176,7 @@ class ErrorSums:
 
 
 class ErrorPictures:
-    """Every n-th texel of errors as PNG beside the EXR `path`: red too bright, blue too dark, gray not baked."""
+    """PNGs of the errors beside the EXR `path`, of every n-th texel: red too bright, blue too dark, gray not baked."""
 
     def __init__(self, width: int, height: int, path: Path, techniques: list[str], passes: list[str]):
         self.folder = path.parent
@@ -188,7 +191,7 @@ class ErrorPictures:
         return list(self._pictures)
 
     def add(self, first: int, planes: dict[str, np.ndarray]) -> None:
-        """Rows (R, W) of the EXR's channels from the row `first`, counted from the top."""
+        """Add rows (R, W) of the EXR's channels, from row `first` counted from the top."""
         picked = slice(-first % self.step, None, self.step), slice(None, None, self.step)
         for error, pass_name in self._pictures.values():
             for layer in (error, f"cycles.{pass_name}"):
@@ -209,11 +212,11 @@ class ErrorPictures:
 
 
 def nearest_covered(coverage: np.ndarray, margin: int) -> tuple[np.ndarray, np.ndarray]:
-    """Flat indices (Q,) of the texels of `coverage` (H, W) that are not covered and at most `margin` texels from one
-    that is, and the flat indices (Q,) of the nearest (Euclidean distance; of several the first in memory).
+    """Flat indices (Q,) of the margin texels, and the flat indices (Q,) of the nearest covered texel of each.
 
-    Exact: along the rows first, then over the rows within reach (Felzenszwalb and Huttenlocher 2012, "Distance
-    Transforms of Sampled Functions").
+    Margin texels are those not covered in `coverage` (H, W) and at most `margin` texels from a covered one, by
+    Euclidean distance. Of several nearest texels the first in memory is taken. Exact: along the rows first, then over
+    the rows within reach (Felzenszwalb and Huttenlocher 2012, "Distance Transforms of Sampled Functions").
     """
     height, width = coverage.shape
     if margin <= 0 or not coverage.any() or coverage.all():
@@ -248,7 +251,7 @@ def _nearest_in_row(coverage, margin):
 
 
 def _within_reach(found, margin):
-    """Mask (H, W) of the texels with a true one of `found` (H, W) at most `margin` rows above or below."""
+    """Mask (H, W) of the texels that have a true value of `found` (H, W) at most `margin` rows above or below."""
     height = len(found)
     counts = np.zeros((height + 1, found.shape[1]), dtype=np.int32)
     np.cumsum(found, axis=0, out=counts[1:])

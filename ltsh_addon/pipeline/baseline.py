@@ -1,4 +1,4 @@
-"""Errors of a comparison beside those of an earlier one: what got worse, and where."""
+"""Compares the errors of a comparison with those of an earlier one: what got worse, and where."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from pathlib import Path
 from ..reading import Malformed, check, read_json
 from .picture import REPORT, percent
 
-# What two comparisons must have in common for their errors to mean the same.
+# Facts that two comparisons must share for their errors to be comparable.
 _SAME = ("resolution", "sub_samples", "cycles_samples", "surface_samples", "reference")
 _CLASSES = ("metals", "dielectrics")
 
 
 @dataclass(frozen=True)
 class Tolerance:
-    """By how much an error may be larger than before: an absolute number, 0.01 for one percent, or a share of it."""
+    """By how much an error may grow: an absolute number, 0.01 for one percent, or a `relative` share of the error."""
 
     value: float = 0.001
     relative: bool = False
@@ -85,7 +85,7 @@ class Baseline:
 
 
 def _pictures(document: dict) -> dict[tuple, dict]:
-    """The pictures that were compared with Cycles, of a report of one or of many."""
+    """The pictures of a report, of one or many, that were compared with Cycles; by scene, camera and frame."""
     reports = document.get("reports", [document])
     pictures = {}
     for report in reports:
@@ -98,13 +98,13 @@ def _pictures(document: dict) -> dict[tuple, dict]:
 
 def _is_same(name, before, now) -> bool:
     if name == "reference":
-        # Its error estimate is a result; that it took other samples, or none, is not.
+        # Only its presence and number of samples must agree; its error estimate is a result.
         return (before or {}).get("of") == (now or {}).get("of") and (before is None) == (now is None)
     return before == now
 
 
 def _errors(picture: dict) -> Iterator[tuple[str, float | None]]:
-    """What was measured and the error, of each pass and technique."""
+    """Label and value of each error of a picture; None where nothing was lit."""
     for pass_name, figures in picture["passes"].items():
         for technique, row in figures["techniques"].items():
             label = f"{pass_name} of {technique}"

@@ -33,17 +33,17 @@ OVERWRITE, RESUME, SKIP = "overwrite", "resume", "skip"
 
 @dataclass(frozen=True)
 class RunResult:
-    """How many tasks of the shard were done now, how many were there already, and what was wrong with others."""
+    """The numbers of tasks of a shard, and the problems of those that failed."""
 
-    tasks: int
-    done: int
-    kept: int
+    tasks: int  # all
+    done: int  # attempted now
+    kept: int  # finished before
     problems: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class TaskState:
-    """Task `number` of `tasks`, from 1, begins, or, where there are `seconds`, has ended."""
+    """Task `number` of `tasks`, counted from 1: it has ended if there are `seconds`, else it begins."""
 
     number: int
     tasks: int
@@ -62,11 +62,10 @@ def run_tasks(
 ) -> RunResult:
     """Do the tasks of shard (I, N) of `job`, I from 1 to N.
 
-    `existing` says what becomes of tasks that are done already: "overwrite" does them again, "resume" keeps what the
-    same options, version, scene and tables have made, "skip" all that is whole. A task whose scene fails, or whose
-    files cannot be written, is a problem and the others are done all the same, unless it is the only one: then
-    SceneError or OSError is raised. Raises TableError, ValueError, Cancelled at once, and OSError where not even a
-    record can be written.
+    `existing` decides about tasks that are done already: "overwrite" does them again, "resume" keeps those of the same
+    options, version, scene and tables, "skip" keeps all whose files are whole. A task whose scene fails, or whose files
+    cannot be written, becomes a problem and the others go on; if it is the only task, SceneError or OSError is raised.
+    Raises TableError, ValueError and Cancelled at once, and OSError where not even a record can be written.
     """
     from ..blender.process.blender_process import kept_blender
 
@@ -87,7 +86,7 @@ def run_tasks(
             following = tuple(other.object for other in wanted[number:] if other.unit == task.unit)
             found, seconds, files = _attempt(job, task, following, existing, progress, alone=len(tasks) == 1)
             try:
-                # Once: it holds all tasks, which may be thousands.
+                # Only once: the document holds all tasks, perhaps thousands.
                 if not told:
                     _write_job(job, tasks, existing)
                     told = True
@@ -103,7 +102,7 @@ def run_tasks(
 
 
 def _attempt(job, task, following, existing, progress, alone) -> tuple[dict, dict, tuple[str, ...]]:
-    """What is to be recorded of a task, its seconds and files; a failure is a "problem", unless `alone`."""
+    """Do a task; returns its "report" or "problem" for the record, its seconds and files. `alone`: failures raise."""
     start = time.perf_counter()
     try:
         made = _perform(job, task, following, existing, progress)
@@ -117,7 +116,7 @@ def _attempt(job, task, following, existing, progress, alone) -> tuple[dict, dic
 
 def _is_done(records, task, existing) -> bool:
     record = records.whole(task.name, task.key if existing == RESUME else None)
-    # What was wrong may be put right by now.
+    # Tasks with problems are done again: their cause may be gone.
     return record is not None and "report" in record and not record["report"].get("problems")
 
 
@@ -134,7 +133,7 @@ def _perform(job: Job, task: Task, following: tuple, existing: str, progress) ->
 
 
 def _write_job(job, tasks, existing) -> None:
-    """Say what the whole job is: the same from every shard, so that `merge` knows what to wait for."""
+    """Write job.json, the description of the whole job for `merge`; every shard writes the same."""
     applied = job.command == "bake" and job.options.apply
     document = {
         "format": FORMAT,
@@ -149,22 +148,22 @@ def _write_job(job, tasks, existing) -> None:
 
 @dataclass(frozen=True)
 class Merged:
-    """The report, the seconds, the names of tasks that are not done, and what was wrong with others."""
+    """The results of a whole job."""
 
     report: dict
     seconds: dict
-    missing: tuple[str, ...]
-    problems: tuple[str, ...]
+    missing: tuple[str, ...]  # names of the tasks that are not done
+    problems: tuple[str, ...]  # of its tasks, and of results of different versions
     command: str
     single: bool
 
 
 def merge(output: Path, progress=None) -> Merged:
-    """Assemble report.json and timing.json of the job in the folder `output`; of comparisons of several pictures also
-    report.html, and of a bake with `apply` the .blend.
+    """Write report.json and timing.json of the job in the folder `output`, from the records of its tasks.
 
-    A report from which something is missing says so under "missing". Raises OSError, and ValueError where there is
-    no job in the folder or nothing of it is done.
+    Comparisons of several pictures also get report.html, a bake with `apply` its .blend. An incomplete report lists
+    the tasks that are not done under "missing". Raises OSError, and ValueError where the folder has no job or no task
+    is done.
     """
     output = Path(output)
     job = _read_job(output)
@@ -178,7 +177,7 @@ def merge(output: Path, progress=None) -> Merged:
         _unit(job, output, list(members), found, progress) for _, members in groupby(tasks, key=lambda task: task.unit)
     ]
     units = [unit for unit in units if unit is not None]
-    # Of a bake they name the objects.
+    # The problems of a bake name its objects already.
     is_plain = job["single"] or job["command"] == "bake"
     problems = [
         problem if is_plain else f"{name}: {problem}"
@@ -217,13 +216,13 @@ def _read_job(output: Path) -> dict:
 
 
 def _task_records(output, command) -> Records:
-    """Those of shade, compare, view and render hold the report of a picture; what failed has a problem instead."""
+    """The records of the tasks: with the report of a bake or, for all other commands, of a picture; or a problem."""
     report = bake.REPORT if command == "bake" else picture.REPORT
     return Records(output, "tasks", {**TASK_RECORD, "report?": report})
 
 
 def _unit(job, output, tasks, found, progress) -> tuple[str, dict] | None:
-    """Name and report of one picture, or of the objects of one bake; None where nothing of it is done."""
+    """Name and report of one picture, or of all objects of one bake; None where none of its tasks is done."""
     records = [found[task.name] for task in tasks if found[task.name] and "report" in found[task.name]]
     if not records:
         return None
@@ -246,7 +245,7 @@ def _unit(job, output, tasks, found, progress) -> tuple[str, dict] | None:
 
 
 def _objects(items) -> list[dict]:
-    """Reports of objects, each once with all of its tiles."""
+    """The reports of objects, merged so that each object comes once with all of its tiles."""
     objects: dict[str, dict] = {}
     for item in items:
         known = objects.setdefault(item["name"], {**item, "tiles": {}})
@@ -255,7 +254,7 @@ def _objects(items) -> list[dict]:
 
 
 def _different_versions(found) -> list[str]:
-    """What to say where shards ran on different versions: their results must not be mixed."""
+    """The problem where shards ran on different versions, whose results must not be mixed; empty if they agree."""
     names = {}
     for name, record in found.items():
         if record and "report" in record:
@@ -278,7 +277,7 @@ def _read_seconds(output, task) -> dict:
 
 
 def _sum_of(seconds) -> dict:
-    """The seconds of several tasks as those of one."""
+    """The sums of the seconds of several tasks, name by name."""
     total: dict = {}
     for part in seconds:
         for name, value in part.items():

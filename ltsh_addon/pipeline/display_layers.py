@@ -1,4 +1,4 @@
-"""Results as one small EXR per picture, which Blender's Image Editor shows as they are, and an index of them."""
+"""Results as one small EXR per picture, for Blender's Image Editor, and an index of them."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ FILES = {"shade": "shade.exr", "compare": "compare.exr"}
 
 
 def write(command: str, output: Path, report: dict, partial: str = "") -> Path:
-    """Write OUT/images/<layer>.exr and index.json for what `command` left in `output`; the folder.
+    """Write OUT/images/<layer>.exr and index.json for the results of `command` in `output`; returns the folder.
 
-    `partial` says what is missing, where something is.
+    `partial` says what is missing; empty: nothing.
     """
     folder = output / FOLDER
     folder.mkdir(parents=True, exist_ok=True)
@@ -45,8 +45,8 @@ def write(command: str, output: Path, report: dict, partial: str = "") -> Path:
 
 
 def write_lights(folder: Path, arguments: Sequence[str], progress: Progress | None = None) -> None:
-    """Write what the light mixer needs into the `folder` of `write`, where the command with these `arguments` kept
-    samples; else remove it."""
+    """Write the file of the light mixer into the `folder` of `write`, if the command with these `arguments` kept its
+    samples; else remove an old one."""
     path = folder / MIXER_FILE
     if "--keep-visibility" in arguments:
         kept = Path(FILES[arguments[0]]).with_suffix(KEPT_SUFFIX)
@@ -56,9 +56,9 @@ def write_lights(folder: Path, arguments: Sequence[str], progress: Progress | No
 
 
 def _group(path: Path, folder: Path, prefix: str, report: dict) -> dict:
-    """Write the pictures of one EXR, their file names starting with `prefix`; what there is of it."""
+    """Write the pictures of one EXR, with `prefix` before their file names; returns their entry of the index."""
     layers = {name: pixels for name, pixels in imaging.read_layers(path).items() if "@" not in name}
-    # What is shown has emission and background, too; figures and scales are those of the light.
+    # The files show emission and background, too. Figures and scales are those of the reflected light.
     shown = {name: layers.pop(name)[..., :3] for name in _whole_pictures(layers)}
     names = [name for name in _techniques(layers) if not name.startswith(("cycles_", ERROR))]
     names = [name for name in names if not name.endswith(UNSHADOWED)]
@@ -85,19 +85,19 @@ def _group(path: Path, folder: Path, prefix: str, report: dict) -> dict:
 
 
 def _whole_pictures(layers) -> list[str]:
-    """Names of the layers with all that a picture shows: they have alpha."""
+    """Names of the layers of whole pictures: the combined ones with alpha."""
     return [name for name, pixels in layers.items() if name.endswith(f".{COMBINED}") and pixels.shape[-1] == 4]
 
 
 def _techniques(layers) -> list[str]:
-    """Names that have radiance, techniques in their usual order, then tables of the user, Cycles last."""
+    """Names of the layers of radiance: techniques in their usual order, then the user's tables, Cycles last."""
     found = {name.rpartition(".")[0] for name in layers if name.rpartition(".")[2] in BAKE_PASSES}
     others = sorted(found - {*TECHNIQUES, CYCLES})
     return [name for name in (*TECHNIQUES, *others, CYCLES) if name in found]
 
 
 def _add_combined(layers, names, passes) -> None:
-    """Specular and diffuse together, where both are there and their sum is not."""
+    """Add the sums of specular and diffuse to `layers` and `passes`, where both are there and their sum is not."""
     if COMBINED in passes or not {"specular", "diffuse"} <= set(passes):
         return
     for name in names:
@@ -108,12 +108,12 @@ def _add_combined(layers, names, passes) -> None:
 
 
 def _unnamed(pixels: np.ndarray) -> dict:
-    """Channels R, G and B without a layer's name, as any program reads them."""
+    """Channels R, G and B without a layer's name, which any program reads."""
     return {letter: pixels[..., index] for index, letter in enumerate("RGB")}
 
 
 def _scale(layers, names, pass_name) -> float:
-    """The radiance at which the colors of the error end."""
+    """The radiance of an error at the ends of its color scale."""
     picture = layers[f"{names[-1]}.{pass_name}"]
     errors = [layers[layer] for name in names if (layer := f"{ERROR}{name}.{pass_name}") in layers]
     if not errors:
@@ -122,7 +122,7 @@ def _scale(layers, names, pass_name) -> float:
 
 
 def _figures(layers, names, passes, report) -> dict:
-    """Errors against Cycles by pass and technique: those of the report by pass, and of what is not in it."""
+    """Errors against Cycles by pass and technique: from the `report` by pass, measured where it has none."""
     figures = {}
     for pass_name in passes if CYCLES in names else ():
         known = report.get(pass_name)
@@ -140,14 +140,14 @@ def _measured(layers, names, pass_name) -> dict:
     for name in names:
         if name != CYCLES:
             picture = layers[f"{name}.{pass_name}"]
-            # The reference may stand for a part of the pixels only, the others are black.
+            # The reference may cover a part of the pixels only; the others are black.
             mask = hit & picture.any(axis=-1) if name == REFERENCE else hit
             rows[name] = against_cycles(picture, halves, mask)
     return {"noise": imaging.reference_noise(*halves, hit), "techniques": rows}
 
 
 def _remove_others(folder: Path, groups: dict) -> None:
-    """Remove pictures of an earlier run, which would be taken for those of this one."""
+    """Remove pictures of an earlier run, which would be mistaken for those of this one."""
     kept = {FILE} | {name for group in groups.values() for name in group["files"].values()}
     for path in folder.iterdir():
         if path.name not in kept and path.suffix == ".exr":

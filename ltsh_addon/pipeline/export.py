@@ -1,7 +1,7 @@
-"""Lookup tables for other engines: what `ltsh tables export` writes (tables/EXPORT.md).
+"""Lookup tables for other engines: the files of `ltsh tables export` (tables/EXPORT.md).
 
-The EXR holds every stored quantity as a channel over the grid of the table, the header all numbers and the functions
-that shade with them, the .wgsl these functions, the .dds the numbers as textures.
+The EXR has every stored quantity as a channel over the grid of the table. The header (.h) has all numbers and the
+functions that shade with them, the .wgsl these functions, the .dds the numbers as textures.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ _WARP_NAMES = ("A", "B", "C", "tilt")
 def export_tables(
     prefixes: Mapping[str, str], folder: str | os.PathLike, progress: Callable[[str, float], object] | None = None
 ) -> dict[str, list[Path]]:
-    """Write the tables of `export_prefixes` into `folder`, which is made; returns the files by table.
+    """Write the tables of `export_prefixes` into `folder`, created if needed; returns the files by table.
 
-    All tables are read before anything is written, and of each table both files appear or none. Raises TableError,
+    All tables are read before anything is written. The files of a table appear all or none. Raises TableError,
     OSError.
     """
     folder = Path(folder)
@@ -47,7 +47,10 @@ def export_tables(
 
 
 def export_prefixes(given: list[str] | tuple[str, ...]) -> dict[str, str]:
-    """What the names in the header of each table, shipped or a path, begin with; raises ValueError where two agree."""
+    """The prefix of the names in the header of each table, a shipped one or a path.
+
+    Raises ValueError where two tables have the same prefix.
+    """
     prefixes: dict[str, str] = {}
     for name in dict.fromkeys(given):
         prefix = identifier(Path(name).stem)
@@ -59,7 +62,7 @@ def export_prefixes(given: list[str] | tuple[str, ...]) -> dict[str, str]:
 
 
 def identifier(name: str) -> str:
-    """`name` as the beginning of identifiers in C and GLSL, apart from those that both headers and GLSL use."""
+    """`name` as a prefix of identifiers in C and GLSL that does not clash with "gl" or "ltsh"."""
     words = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_")
     return words if re.match(r"[a-z]", words) and words not in ("gl", "ltsh") else f"table_{words}".rstrip("_")
 
@@ -79,7 +82,7 @@ def export_table(table: LookupTable, name: str, prefix: str, folder: Path) -> li
     with ExitStack() as stack:
         for own, data in contents.items():
             stack.enter_context(replacing(folder / own)).write_bytes(data)
-        # The last to be written is the first to get its name.
+        # The image takes its name here, the other files when their contexts end.
         write_channels(image, table_channels(table), _attributes(table))
     return [image, *(folder / own for own in contents)]
 
@@ -105,7 +108,7 @@ def _coefficient_suffixes(table) -> list[str]:
 
 
 def _directional_albedo(table) -> np.ndarray:
-    """(R, T, F): integral over the hemisphere of the lobe of every node and curve."""
+    """(R, T, F): the integral of the lobe of every node and curve over the hemisphere."""
     coefficients = table.coefficients.astype(float)
     if table.family == "ltc":
         return coefficients[..., 0] * (0.5 + 0.5 * np.cos(table.warp[..., 3:].astype(float)))
@@ -113,7 +116,7 @@ def _directional_albedo(table) -> np.ndarray:
 
 
 def _attributes(table) -> dict[str, str]:
-    """EXR attributes; arrays as JSON, so that the image alone is enough to rebuild the table."""
+    """EXR attributes as JSON; with them the image alone is enough to rebuild the table."""
     conventions = {
         "license": "CC0-1.0",
         "table": table.name,

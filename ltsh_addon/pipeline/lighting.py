@@ -1,4 +1,4 @@
-"""From samples, lights and occluders to radiance: what pictures and bakes have in common.
+"""Radiance of samples under lights and occluders, for pictures and bakes; and the file of a kept picture.
 
 radiance = closed form x the share of the light that the sample sees. The shares are the same for every technique.
 """
@@ -36,64 +36,73 @@ from ..scene import (
 )
 from ..shading.light_tree import FEWEST
 
-# Of the files of `keep_picture`: all that shading needs, and what shadow rays meet.
-FILM_ARRAYS = ("first", "count", "spread", "whole")  # that a film may have
+FILM_ARRAYS = ("first", "count", "spread", "whole")  # the optional arrays of a film
+# The two files of `keep_picture`: the samples with all that shading needs, and the occluders.
 KEPT_SUFFIX, OCCLUDERS_SUFFIX = ".samples.npz", ".occluders.npz"
-# Pairs of a sample and a light whose radiance is kept at a time.
+# MOST_PAIRS: how many pairs of a sample and a light have their radiance in memory at a time.
 MOST_PAIRS = 1 << 25
-# Of one sample, however many a pixel has, unless all of them have fewer: the first eight say where more are needed.
+# FEWEST_RAYS: a sample gets at least so many of the rays of its pixel, or all of them if they are fewer. The first
+# eight only tell whether more are needed.
 FEWEST_RAYS = 32
 
 
 @dataclass(frozen=True)
 class Shadows:
-    """The shares of the lights that samples see, and how they were found."""
+    """The share of each light that each sample sees. Lights that share their rays have one row of shares."""
 
     shares: dict[str, np.ndarray]  # (E, P) by pass, in [0, 1]
-    numbers: tuple[tuple[int, ...], ...]  # of the lights that share each of them
-    noise: dict[str, float]  # estimated, relative to the pass
+    numbers: tuple[tuple[int, ...], ...]  # E tuples: the numbers of the lights of each row
+    noise: dict[str, float]  # by pass, estimated relative error of its shadows
     rays: int
-    tracer: str  # what traced them
+    tracer: str  # name of the ray tracer
     seconds: float = 0.0
     warnings: tuple[str, ...] = ()
-    # By pass: the light that the film shows (H, W), and its variance, about; nothing without a film.
+    # By pass, estimates (H, W) of the radiance on the film and of its variance; empty without a film.
     light: dict[str, np.ndarray] = field(default_factory=dict)
     variance: dict[str, np.ndarray] = field(default_factory=dict)
 
     def take(self, index: np.ndarray) -> Shadows:
-        """Those of the samples at `index` (Q,)."""
+        """The shadows of the samples at `index` (Q,)."""
         return replace(self, shares={name: values[:, index] for name, values in self.shares.items()})
 
     def with_more(self, kept: np.ndarray, more: Shadows) -> Shadows:
-        """Those of the samples of the mask `kept` (P,), and others; what the film shows is as before."""
+        """The shadows of the samples in the mask `kept` (P,), then those of `more`; `light` and `variance` stay."""
         shares = {name: np.concatenate([one[:, kept], more.shares[name]], 1) for name, one in self.shares.items()}
         return replace(self, shares=shares, rays=self.rays + more.rays, seconds=self.seconds + more.seconds)
 
     def of_lights(self, numbers: Sequence[int]) -> Shadows:
-        """Those of the lights with the sorted `numbers`, which hold all or none of those that share their rays."""
+        """The shadows of the lights with these sorted `numbers`, renumbered from 0.
+
+        Of lights that share their rays, `numbers` must hold all or none.
+        """
         place = {number: index for index, number in enumerate(numbers)}
         rows = [row for row, own in enumerate(self.numbers) if own[0] in place]
         shares = {name: values[rows] for name, values in self.shares.items()}
         return replace(self, shares=shares, numbers=tuple(tuple(place[n] for n in self.numbers[row]) for row in rows))
 
     def report(self) -> dict:
-        """For report.json."""
+        """The entry of report.json."""
         return {"rays": self.rays, "noise": self.noise, "tracer": self.tracer}
 
 
 def rays_of_point(rays: int, points: int) -> int:
-    """Of `rays` those of one of the `points` of a pixel or texel."""
+    """Rays of one point, where the `points` of a pixel or texel share `rays`."""
     return max(min(FEWEST_RAYS, rays), rays // points)
 
 
 def rays_of_samples(rays: int, film: Film) -> int:
-    """Of `rays` for a pixel the most that one of its samples may take; where these stand for several, they get theirs
-    by how many."""
+    """The most rays that one sample may take, where the samples of a pixel share `rays`.
+
+    On a film with counts that is all of `rays`: the tracer scales them by the count of each sample.
+    """
     return rays if film.count is not None else rays_of_point(rays, film.sub_samples)
 
 
 class ShadowTracer:
-    """Finds which shares of `lights` samples see past `occluders`, both around `origin` (3,) in m."""
+    """Context that finds the shares of `lights` that samples see past `occluders`.
+
+    Positions of the occluders are relative to `origin` (3,) in m; lights and samples are in world space.
+    """
 
     def __init__(self, occluders: visibility.Occluders, lights: Sequence[AreaLight], origin: np.ndarray):
         self.warnings: list[str] = []
@@ -113,7 +122,7 @@ class ShadowTracer:
         return self._ending.__exit__(*error)
 
     def finer(self, samples: SurfaceSamples, film: Film, points, pixels: np.ndarray):
-        """As of `gbuffer.finer`."""
+        """`gbuffer.finer` with this tracer's rays, for samples in world space."""
         samples = replace(samples, position=samples.position - self._origin)
         found, film, replaced = finer(samples, film, points, pixels, self._tracer.first_met)
         return replace(found, position=found.position + self._origin), film, replaced
@@ -126,7 +135,7 @@ class ShadowTracer:
         workers: int | None = None,
         progress: Progress | None = None,
     ) -> Shadows:
-        """The shares of all lights that `samples` see; the rest as of `visibility.visible_shares`."""
+        """The shadows of `samples` under all lights; see `visibility.visible_shares` for the other arguments."""
         start = time.perf_counter()
         samples = replace(samples, position=samples.position - self._origin)
         found = visibility.visible_shares(
@@ -145,8 +154,7 @@ class ShadowTracer:
 
 
 def trace_shadows(extraction, passes: Sequence[str], rays: int, progress: Progress | None) -> Shadows:
-    """The shares of the lights of an `Extraction` that its samples see, of which those that stand for few points of
-    their pixel get few of the `rays`."""
+    """The shadows of the samples of an `Extraction`; the samples of a pixel share `rays` per light."""
     film = extraction.film
     sampling = visibility.ShadowSampling(passes, rays_of_samples(rays, film), film)
     with ShadowTracer(extraction.occluders, extraction.lights, extraction.origin) as tracer:
@@ -163,12 +171,13 @@ def shade_lights(
     workers: int | None = None,
     progress: Callable[[float], bool | None] | None = None,
 ) -> list[shading.Shading]:
-    """Radiance of `samples` (P) under `lights` (L), one for each of `seen`: the shares of the lights that the samples
-    see, all of the same lights together; None: everything.
+    """Radiance of `samples` (P) under `lights` (L): one Shading for each entry of `seen`.
 
-    Those that share their rays first, so that a sample that sees all of its lights gets the same bits as without
-    shadows; but many lights without shadows all at once, of which `shade` takes those together that a sample cannot
-    tell apart.
+    An entry is the shadows of the samples, or None for no shadows. All shadows must group the lights alike.
+
+    Lights that share their rays are shaded together and then multiplied by their share, so that a sample that sees
+    them whole gets the same bits as without shadows. Exception: many lights without any shadows go to `shade` at once,
+    which then merges those that a sample cannot tell apart.
     """
     if lights and all(shares is None for shares in seen):
         if max(Counter(light.group for light in lights).values()) >= FEWEST:
@@ -203,7 +212,7 @@ def shade_lights(
 
 
 def layer_names(names: Iterable[str]) -> list[str]:
-    """Different names for layers, without the dots that separate their parts."""
+    """`names` made unique for layers, with _ for the dots that separate the parts of a layer's name."""
     found: list[str] = []
     for name in names:
         plain = name.replace(".", "_")
@@ -213,7 +222,7 @@ def layer_names(names: Iterable[str]) -> list[str]:
 
 
 def group_names(groups: Sequence[str]) -> list[str]:
-    """Names of light groups for layers; lights without a group get one that no group has."""
+    """Layer names of light groups. The empty group becomes "ungrouped", or a longer name that is free."""
     ungrouped = "ungrouped"
     while ungrouped in groups:
         ungrouped += "_"
@@ -222,29 +231,30 @@ def group_names(groups: Sequence[str]) -> list[str]:
 
 @dataclass(frozen=True)
 class KeptPicture:
-    """What `keep_picture` has kept: all that shading needs, so that neither Blender nor a ray is.
+    """A picture kept by `keep_picture`: all that shading needs, without Blender and without rays.
 
-    The whole picture is that of the samples, each pass times `shown`, and `rest`: all of these times the exposure.
+    whole picture = sum over passes of `shown` x image of the samples, + sum of `rest`; all include the exposure.
     """
 
     extraction: Any  # blender.process.client.Extraction, without reference and occluders
     shadows: Shadows | None
     options: dict  # fields of PictureOptions
     had_cycles: bool
-    # (H, W, 3), or 4 with alpha, by light group: its bounced light; by "": what depends on no light.
+    # By light group: its bounced light (H, W, 3). By "": what depends on no light group (H, W, 3 or 4 with alpha).
     rest: dict[str, np.ndarray] = field(default_factory=dict)
-    taken: dict[str, np.ndarray] = field(default_factory=dict)  # (H, W) by pass; left out: 1
-    # The same, of lights where they were: by what hard edges differ from those of the samples.
+    # By pass (H, W): the share of the pass that is ours and not Cycles'; left out: 1.
+    taken: dict[str, np.ndarray] = field(default_factory=dict)
+    # By pass (H, W): a factor of hard edges of light, valid only while the lights stay where they were; left out: 1.
     edges: dict[str, np.ndarray] = field(default_factory=dict)
 
     @property
     def technique(self) -> str:
-        """The most accurate of those that the picture was made with."""
+        """The last technique of the picture except the reference: by convention the most accurate."""
         names = [name for name in self.options["techniques"] if name != REFERENCE]
         return names[-1] if names else "ltsh4"
 
     def shown(self, name: str, *, moved: bool = False) -> np.ndarray | float:
-        """By what (H, W, 1) a pass of the samples is multiplied, for lights where they were, or `moved` ones."""
+        """Factor (H, W, 1) of the image of a pass of the samples; without `edges` for `moved` lights."""
         taken = self.taken[name][..., None] if name in self.taken else 1.0
         return taken if moved or name not in self.edges else taken * self.edges[name][..., None]
 
@@ -299,21 +309,19 @@ class KeptPicture:
 
 
 def _compact(values: np.ndarray) -> np.ndarray:
-    """`values`, or one zero that stands for all of them."""
+    """`values`; a broadcast zero where all are zero."""
     return values if values.any() else np.broadcast_to(values.dtype.type(0), values.shape)
 
 
-# Of an Extraction, where it has them.
-NOT_REFLECTED = ("emission", "background")
-# What pictures have that are finished.
-FINISHED = ("rest", "taken", "edges")
+NOT_REFLECTED = ("emission", "background")  # optional arrays of an Extraction
+FINISHED = ("rest", "taken", "edges")  # fields of a KeptPicture that only finished pictures have
 KEPT_OPTIONS = ("techniques", "passes", "sub_samples", "reference_samples", "shadows", "shadow_rays")
 
 
 def keep_picture(extraction, shadows: Shadows | None, options, path: Path, **finished) -> list[Path]:
-    """Write the .npz that `KeptPicture.load` reads, at once or not at all, and beside it the occluders; both paths.
+    """Write the .npz that `KeptPicture.load` reads, atomically, and the occluders beside it; returns the paths.
 
-    Of a `finished` picture `rest`, `taken` and `edges` are as of KeptPicture. Raises OSError.
+    `finished` are the fields `rest`, `taken` and `edges` of the KeptPicture of a finished picture. Raises OSError.
     """
     from ..blender.process.client import UNCHANGED
 
@@ -344,7 +352,7 @@ def keep_picture(extraction, shadows: Shadows | None, options, path: Path, **fin
     for kind, parts in finished.items():
         arrays |= {f"{kind}.{name}": np.asarray(values, np.float32) for name, values in parts.items()}
     arrays["document"] = np.array(json.dumps(document))
-    # As np.savez_compressed, but half as slow for files that are 5 % larger.
+    # np.savez_compressed would take twice as long, for files 5 % smaller.
     with (
         replacing(path) as temporary,
         zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,

@@ -1,6 +1,6 @@
-"""The light mixer: a picture as the sum of those of its lights, and a `Mixer` that changes them while one looks.
+"""The light mixer: a picture as the sum of one picture per light, which a `Mixer` weights interactively.
 
-Radiance is linear in that of each light: each of these pictures is multiplied by a factor per color.
+Radiance is linear in that of each light: each picture is multiplied by a factor per color channel.
 """
 
 from __future__ import annotations
@@ -20,12 +20,13 @@ from .lighting import KeptPicture, Shadows, shade_lights
 from .relight import GRAIN, own_color
 
 MIXER_FILE = "lights.npz"
-# Rows of a mixer, and of large pictures: of more lights the weakest are one. Values of all of its pictures.
+# MOST_VALUES: numbers in all pictures of a mixer together; they limit the rows to between FEWEST_ROWS and MOST_ROWS.
+# Where there are more lights, the weakest share one row.
 MOST_ROWS, FEWEST_ROWS, MOST_VALUES = 64, 8, 1 << 28
 REST = "Everything else"
-# Pairs of a sample and a row whose radiance is kept at a time.
+# MOST_PAIRS: how many pairs of a sample and a row have their radiance in memory at a time.
 MOST_PAIRS = 1 << 23
-# Of pictures, that are summed at a time: as many as stay in the processor's cache.
+# LINES: lines of the pictures that are summed at a time: as many as stay in the processor's cache.
 LINES = 16
 SHARED = "they share their shadow rays, so they change together"
 WEAKEST = "the weakest lights of the picture, which change together"
@@ -39,21 +40,21 @@ NOT_SHADED = "Cycles' light of a light group none of whose lights is shaded here
 
 @dataclass(frozen=True)
 class Row:
-    """What a mixer changes as one: the lights called `lights`, or what hangs on no light where there are none."""
+    """A row of the mixer: lights that change together, or the part of the picture that depends on no light."""
 
     name: str
-    lights: tuple[str, ...]
+    lights: tuple[str, ...]  # names; empty: depends on no light
     color: tuple[float, float, float] = (1.0, 1.0, 1.0)  # of their light, the brightest channel 1
-    settings: dict[str, list[float]] = field(default_factory=dict)  # of those that are lights in Blender
-    light: dict | None = None  # record of the only one, where it is plain
+    settings: dict[str, list[float]] = field(default_factory=dict)  # by name, of lights that are light objects
+    light: dict | None = None  # record of the only light, without detail and pattern; None: others
     note: str = ""
-    group: str = ""  # whose bounced light it has this share of
-    share: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    group: str = ""  # light group of whose bounced light the row has a share
+    share: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of this bounced light, per channel
 
 
 @dataclass(frozen=True)
 class LightPictures:
-    """A picture as the sum of one for each row."""
+    """A picture as the sum of one layer for each row."""
 
     rows: tuple[Row, ...]
     layers: np.ndarray  # (R, H, W, 3) float32, row 0 on top
@@ -61,7 +62,7 @@ class LightPictures:
     facts: dict  # "camera", "frame", "technique", "notes"
 
     def save(self, path: Path) -> None:
-        """Write what `load` reads, at once or not at all. Raises OSError."""
+        """Write the file that `load` reads, atomically. Raises OSError."""
         document = {**self.facts, "rows": [asdict(row) for row in self.rows]}
         with replacing(path) as temporary, temporary.open("wb") as file:
             np.savez(file, document=json.dumps(document), layers=self.layers, alpha=self.alpha)
@@ -84,7 +85,7 @@ class LightPictures:
 
 
 def light_pictures(kept: KeptPicture, progress: Progress | None = None) -> LightPictures:
-    """The pictures of the lights of `kept`, shaded anew by its most accurate table. Raises TableError, Cancelled."""
+    """The pictures of the lights of `kept`, shaded by its most accurate table. Raises TableError, Cancelled."""
     extraction, shadows = kept.extraction, kept.shadows
     shape, technique = (extraction.film.height, extraction.film.width), kept.technique
     most = min(max(MOST_VALUES // (4 * shape[0] * shape[1]), FEWEST_ROWS), MOST_ROWS)
@@ -122,7 +123,10 @@ def light_pictures(kept: KeptPicture, progress: Progress | None = None) -> Light
 
 
 def _members(lights: Sequence[AreaLight], shadows: Shadows | None, most: int = MOST_ROWS) -> list[list[int]]:
-    """Numbers of the lights of each of at most `most` rows: those of one name, and those that share their rays."""
+    """Numbers of the lights of each of at most `most` rows.
+
+    Lights of one name share a row, and so do lights that share their rays. The weakest rows are merged where needed.
+    """
     root = {light.name: light.name for light in lights}
 
     def first(name):
@@ -160,7 +164,7 @@ def _row(extraction, own: list[int]) -> Row:
 
 
 def _layers(kept: KeptPicture, table, members: list[list[int]], report) -> np.ndarray:
-    """Radiance (R, H, W, 3) of rows of lights times the exposure."""
+    """Direct light (R, H, W, 3) of the rows with these `members`, times the exposure."""
     extraction = kept.extraction
     numbers = sorted(number for own in members for number in own)
     row_of = {number: row for row, own in enumerate(members) for number in own}
@@ -177,7 +181,7 @@ def _layers(kept: KeptPicture, table, members: list[list[int]], report) -> np.nd
 
 
 def _with_bounces(kept: KeptPicture, rows: list[Row], members, layers) -> list[Row]:
-    """The rows with their shares of what their light groups bounce, by their `layers` of direct light."""
+    """The rows with their shares of the bounced light of their groups, in proportion to the direct light `layers`."""
     found = list(rows)
     for group in filter(None, kept.rest):
         own = [row for row, (first, *_) in enumerate(members) if kept.extraction.lights[first].group == group]
@@ -190,18 +194,21 @@ def _with_bounces(kept: KeptPicture, rows: list[Row], members, layers) -> list[R
 
 
 def bounced_light(kept: KeptPicture, row: Row) -> np.ndarray:
-    """The part (H, W, 3) of the picture of a row that is bounced light; 0.0 where it has none."""
+    """The bounced light (H, W, 3) of a row; 0.0 where it has none."""
     return (np.array(row.share) * kept.rest[row.group][..., :3]).astype(np.float32) if row.group else np.float32(0.0)
 
 
 class Mixer:
-    """The pictures of the lights, ready to be mixed: a change of one row costs one multiplication and one addition per
-    pixel and channel, because the sum of the others is kept."""
+    """The weighted sum of the pictures of lights.
+
+    A change of one row costs one multiplication and one addition per pixel and channel, because the sum of the others
+    is kept.
+    """
 
     def __init__(self, pictures: LightPictures):
         count, height, width, _ = pictures.layers.shape
         self.rows, self.facts, self._width = pictures.rows, pictures.facts, width
-        # As images of Blender are: row 0 below, four channels one after another.
+        # The layout of Blender's images: row 0 at the bottom, four interleaved channels.
         self._layers = np.zeros((count, height, width, 4), np.float32)
         self._layers[..., :3] = pictures.layers[:, ::-1]
         self._background = np.zeros((height, width, 4), np.float32)
@@ -212,18 +219,18 @@ class Mixer:
 
     @property
     def pictures(self) -> LightPictures:
-        """What was given, and what came in its place since."""
+        """The current pictures: those given, with the rows that `replace` has changed."""
         layers, alpha = self._layers[:, ::-1, :, :3], self._background[::-1, :, 3]
         return LightPictures(self.rows, layers, alpha, self.facts)
 
     def replace(self, number: int, row: Row, layer: np.ndarray) -> None:
-        """Put another row, and its picture (H, W, 3), in the place of one."""
+        """Replace row `number` by `row` with the picture `layer` (H, W, 3), row 0 on top."""
         self.rows = (*self.rows[:number], row, *self.rows[number + 1 :])
         self._layers[number, ..., :3] = layer[::-1]
         self._factors[:], self._changing = np.nan, None
 
     def mixed(self, factors: np.ndarray) -> np.ndarray:
-        """The sum (H, W, 4) of all rows times `factors` (R, 3), row 0 below; the next call overwrites it."""
+        """The sum (H, W, 4) of all rows times `factors` (R, 3), row 0 at the bottom; the next call overwrites it."""
         factors = np.array(factors, dtype=float)
         changed = np.flatnonzero((self._factors != factors).any(axis=1))
         self._factors = factors
@@ -239,7 +246,7 @@ class Mixer:
         return self._whole
 
     def _sum(self, out: np.ndarray, start: np.ndarray, rows: Sequence[int]) -> None:
-        """Set `out` to `start` and the `rows` times their factors."""
+        """Set `out` to `start` plus the `rows` times their factors."""
         tiles = [np.tile(np.append(self._factors[row], 0.0).astype(np.float32), (self._width, 1)) for row in rows]
         term = np.empty((LINES, self._width, 4), np.float32)
         for first in range(0, len(out), LINES):

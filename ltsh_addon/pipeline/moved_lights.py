@@ -1,7 +1,7 @@
-"""Lights of a finished picture that have moved: `MovedLights` shades them where they are, by their own rays alone.
+"""`MovedLights`: pictures of the lights of a kept picture at new places, by rays of these lights alone.
 
-A draft comes first: of every second pixel of every second row, and of all that differs from these, the others are
-between them. Then come all samples, block after block, those with the most light first.
+A draft comes first: it shades every second pixel of every second row, and all samples that differ from these; the
+others are interpolated. Then all samples are shaded, block after block, the brightest blocks first.
 """
 
 from __future__ import annotations
@@ -26,29 +26,30 @@ from . import picture
 from .lighting import KEPT_SUFFIX, OCCLUDERS_SUFFIX, KeptPicture, rays_of_samples
 from .mixer import Row, bounced_light
 
-# So many, that all processes take about as long; with fewer samples a block costs more than they do.
+# BLOCKS: enough that all processes end at about the same time. FEWEST_OF_BLOCK: the overhead of smaller blocks exceeds
+# the cost of their samples.
 BLOCKS, FEWEST_OF_BLOCK = 16, 1 << 11
-# Of a draft: the distance of its pixels, and the most rays of a sample.
+# STEP: distance of the pixels of a draft. DRAFT_RAYS: the most rays of one of its samples.
 STEP, DRAFT_RAYS = 2, 32
-# Samples of a pixel of which one is looked for that is like another, and the least weight of those that are found.
+# MOST_LIKE: a similar sample is looked for among so many of a grid pixel. LEAST_WEIGHT: a sample is interpolated if the
+# weights of the similar samples around it add up to at least this.
 MOST_LIKE, LEAST_WEIGHT = 4, 0.5
-# Between two pictures that get better.
+# SECONDS: time between two pictures that are yielded.
 SECONDS = 1.0
 
 
 @dataclass(frozen=True)
 class Draft:
-    """Samples at `index` (Q,), and how all P follow from them: each is the sum of those with the numbers `sources`
-    (4, P) among them times `weights` (4, P), in light over color."""
+    """Q of P samples, from which the radiance of all P is interpolated: radiance over color, times the own color."""
 
-    index: np.ndarray
-    sources: np.ndarray
-    weights: np.ndarray
+    index: np.ndarray  # (Q,) of the samples of the draft
+    sources: np.ndarray  # (4, P) numbers of samples of the draft, 0 to Q - 1
+    weights: np.ndarray  # (4, P) of the sources
     colors: dict[str, np.ndarray]  # by pass, (P, 3)
 
     @classmethod
     def of(cls, samples: SurfaceSamples, film: Film) -> Draft:
-        """Those of the pixels of a grid, and those that differ from all of them around."""
+        """The draft with the samples of a grid of pixels, and all samples that differ from the grid's around them."""
         lobes, pixels = has_lobe(samples), film.width * film.height
         order = np.argsort(film.pixel, kind="stable")
         count = np.bincount(film.pixel, minlength=pixels)
@@ -81,7 +82,7 @@ class Draft:
         return cls(index, number[like], weights, colors)
 
     def all_samples(self, name: str, radiance: np.ndarray) -> np.ndarray:
-        """Radiance (P, 3) of a pass of all samples by that of the draft's, (Q, 3)."""
+        """Radiance (P, 3) of all samples in the pass `name`, from the `radiance` (Q, 3) of the draft's."""
         color = self.colors[name]
         light = np.divide(radiance, color[self.index], out=np.zeros_like(radiance), where=color[self.index] > 0.0)
         found = np.zeros_like(color)
@@ -91,14 +92,18 @@ class Draft:
 
 
 def _coarse(film: Film) -> Film:
-    """The same samples in pixels as large as the grid of a draft is wide."""
+    """The same samples on a film with pixels STEP times as wide and high."""
     width, height = (-(-size // STEP) for size in (film.width, film.height))
     x, y = film.pixel % film.width, film.pixel // film.width
     return replace(film, width=width, height=height, pixel=y // STEP * width + x // STEP)
 
 
 def _blocks(samples: SurfaceSamples, starting: SurfaceSamples, film: Film, place: np.ndarray) -> Iterator[tuple]:
-    """Yield blocks as of a `Setting`, each with which of the `samples` it has."""
+    """Yield the indices of the `samples` of a block, and the block as `Setting` has it.
+
+    Shadow rays start from the samples `starting` (Q); `place` (P,) is the number of the one whose shares each of the
+    `samples` takes.
+    """
     order = np.argsort(place, kind="stable")
     size = min(BLOCK_SAMPLES, max(len(starting) // BLOCKS, FEWEST_OF_BLOCK))
     for first in range(0, max(len(starting), 1), size):
@@ -108,23 +113,26 @@ def _blocks(samples: SurfaceSamples, starting: SurfaceSamples, film: Film, place
 
 
 class MovedLights:
-    """Pictures of lights of a kept picture where they are now, by their own rays and lobes alone.
+    """Pictures of single lights of a kept picture at new places, by rays of the light alone.
 
-    With the first of them processes start that keep the samples, so that others take less; `close` ends them. Threads
-    may share it: who asks for a picture ends what others wait for, which raises Cancelled there.
+    The first picture starts processes that hold the samples, so that later pictures take less; `close` ends them.
+    Threads may share an object: a new request cancels the one in progress, which raises Cancelled.
     """
 
     def __init__(self, read: Callable[[], tuple[KeptPicture, Occluders | None]]):
-        """`read` is called when the first picture is asked for, which raises what it raises."""
+        """`read` is called at the first picture; its exceptions are raised there."""
         self._read, self._kept, self._occluders = read, None, None
         self._company, self._ending = None, ExitStack()
-        # Also for who forgets to, and where Python ends.
+        # Without `close`, the processes end with this object or with Python.
         weakref.finalize(self, self._ending.close)
         self._lock, self._is_ready, self._turn = threading.Lock(), False, 0
 
     @classmethod
     def load(cls, path: Path) -> MovedLights:
-        """Those of the picture that kept its samples in `path`: OSError and ValueError where that cannot be read."""
+        """The moved lights of the picture whose samples are in `path`.
+
+        The first picture raises OSError or ValueError where the file cannot be read.
+        """
 
         def read():
             kept, occluders = KeptPicture.load(path), None
@@ -135,18 +143,18 @@ class MovedLights:
         return cls(read)
 
     def get_ready(self, light: AreaLight) -> None:
-        """Begin, once and in a thread, with what the first picture takes; `light` is any of those that there are."""
+        """Start, once and in a thread, what the first picture needs; `light` is any light of the picture."""
         if not self._is_ready:
             pictures = self.pictures(light)
             threading.Thread(target=self._try, args=(pictures,), name="LTSH lights", daemon=True).start()
 
     def _try(self, pictures) -> None:
-        # Who asks for a picture gets to know.
+        # The next request for a picture raises the same error.
         with suppress(Exception), closing(pictures):
             next(pictures)
 
     def picture(self, light: AreaLight, row: Row | None = None) -> np.ndarray:
-        """The picture (H, W, 3) of one light, with what the `row` of it bounced before. Raises SceneError."""
+        """The picture (H, W, 3) of one light, plus the unchanged bounced light of its `row`. Raises SceneError."""
         turn = self._next_turn()
         with self._lock:
             light, task = self._prepared(light, turn)
@@ -156,7 +164,7 @@ class MovedLights:
             return self._image(values, row)
 
     def pictures(self, light: AreaLight, row: Row | None = None) -> Iterator[tuple[np.ndarray, float]]:
-        """Yield what `picture` returns, at first as a draft, at last as it is, and how much of it is done."""
+        """Yield the result of `picture`, first as a draft and at last complete, and the fraction that is done."""
         self._is_ready = True
         return self._pictures(light, row, self._next_turn())
 
@@ -177,7 +185,7 @@ class MovedLights:
                     shown = time.monotonic()
 
     def stop(self) -> None:
-        """Raise Cancelled where somebody waits for a picture."""
+        """Cancel the picture in progress: its request raises Cancelled."""
         self._next_turn()
 
     def _next_turn(self) -> int:
@@ -189,7 +197,7 @@ class MovedLights:
             raise Cancelled("the light has moved again, or the picture was stopped")
 
     def _prepared(self, light: AreaLight, turn: int):
-        """The light around the origin of the samples, and what finds its shares."""
+        """The light relative to the origin of the samples, and its shadow task; None without occluders."""
         self._check(turn)
         if self._company is None:
             self._start()
@@ -199,7 +207,7 @@ class MovedLights:
             return light, None
         rays = rays_of_samples(kept.options["shadow_rays"], kept.extraction.film)
         task = task_of_lights(self._starting, (light,), self._tracer, kept.options["passes"], rays)
-        # As many rays as the light gets beside the others in a new picture.
+        # The light gets as many rays as it would get in a new picture, beside the other lights.
         typical = {name: max(value, self._typical[name]) for name, value in task.typical.items()}
         return light, replace(task, typical=typical)
 
@@ -207,7 +215,7 @@ class MovedLights:
         return {name: np.zeros((self._count, 3), np.float32) for name in self._kept.options["passes"]}
 
     def _blocks_lit(self, light, task, numbers: Sequence[int], values, turn: int) -> Iterator[None]:
-        """Put the radiance of blocks into `values`, (P, 3) by pass, one after another."""
+        """Put the radiance of the blocks `numbers` into `values`, (P, 3) by pass; yields after each block."""
         for number, radiance in self._company.lit(light, task, numbers):
             self._check(turn)
             for name, found in radiance.items():
@@ -222,7 +230,7 @@ class MovedLights:
         return image if row is None else image + bounced_light(kept, row)
 
     def close(self) -> None:
-        """End the processes; the next light starts others."""
+        """End the processes; the next picture starts new ones."""
         self.stop()
         with self._lock:
             self._company, self._is_ready = None, False
@@ -237,7 +245,7 @@ class MovedLights:
         samples = kept.extraction.samples
         samples = replace(samples, position=samples.position - kept.extraction.origin)
         starting, place = samples, np.arange(len(samples))
-        # Which samples are neighbors is all that rays ask of their film.
+        # Rays use the film only to know which samples are neighbors.
         film = film.unspread()
         self._draft = draft = Draft.of(samples, film)
         if film.count is not None:

@@ -1,7 +1,7 @@
-"""What a picture and a bake can be asked for. Each option is declared once, as a field of a dataclass here.
+"""The options of pictures, bakes, views and renders. Each option is declared once, as a field of a dataclass here.
 
-The command line makes an argument of every such field, job files have the same names without the dashes, the second
-Blender's job takes the fields that it has too, and records of finished tasks hold a digest of all that matter.
+The command line has an argument for every such field, and job files have the same names without the dashes. The job of
+the second Blender takes the fields that it shares. Records of finished tasks hold a digest of the fields that matter.
 """
 
 from __future__ import annotations
@@ -15,30 +15,30 @@ from typing import Any
 
 from ..scene import BAKE_PASSES, PASSES, SHIPPED_TABLES, TECHNIQUES
 
-# Blender's own limits: of a side of the picture in pixels, and of frames.
+# Blender's own limits. PICTURE_SIDES: the smallest and largest side of a picture in pixels. LAST_FRAME: of frames.
 PICTURE_SIDES = (4, 65536)
 LAST_FRAME = 1048574
 MOST_FRAMES = 100_000
-# Of both halves of a Cycles reference: Cycles takes so many for each.
+# MOST_CYCLES_SAMPLES: of both halves of a Cycles reference; Cycles itself allows half as many for each.
 MOST_CYCLES_SAMPLES = 2 << 24
 TEXTURE_SIDES = (64, 8192)
 SHADOW_RAYS = 8, 1024
-# Points at most of a pixel of a finished picture that an edge runs through.
+# EDGE_POINTS: the most points of a pixel of a finished picture that an edge runs through.
 EDGE_POINTS = 64
 MOST_REFINEMENTS = 4096
 MOST_MARGIN = 512
-# Texels beside what is baked show the nearest texel, or the adjacent face of the mesh.
+# MARGIN_TYPES: texels of the margin show the nearest texel, or the adjacent face of the mesh.
 MARGIN_TYPES = ("extend", "adjacent")
-# Fields of the names of files.
+# NAME_FIELDS: the fields of patterns of file names.
 NAME_FIELDS = ("scene", "camera", "frame", "object")
 LONGEST_NAME = 200
-# Letters that some file system refuses or takes for something else: separators, wildcards, quotes.
+# Characters that some file system refuses or treats specially: separators, wildcards, quotes.
 _REFUSED = '\\:*?"<>|'
 _FRAME_DIGITS = re.compile(r"0?(?:[1-9]\d?)?d?", re.ASCII)
 _FRAMES = re.compile(r"(-?\d+)(?:-(-?\d+)(?::(\d+))?)?", re.ASCII)
 
 
-# From text to values: each raises ValueError with what was found and what was expected.
+# From text to values. Each function raises ValueError that says what was found and what was expected.
 
 
 def techniques(text: str) -> tuple[str, ...]:
@@ -158,14 +158,14 @@ def positive(text: str) -> int:
 
 
 def refinements(text: str) -> int:
-    """Pictures of which a view is the mean."""
+    """Number of pictures whose mean is a view."""
     if text.isdecimal() and 1 <= int(text) <= MOST_REFINEMENTS:
         return int(text)
     raise ValueError(f"refine is {text!r}, expected a whole number from 1 to {MOST_REFINEMENTS}")
 
 
 def shadow_rays(text: str) -> int:
-    """Rays of a light and a point."""
+    """Number of rays per light and point."""
     fewest, most = SHADOW_RAYS
     if text.isdecimal() and fewest <= int(text) <= most:
         return int(text)
@@ -173,7 +173,7 @@ def shadow_rays(text: str) -> int:
 
 
 def cycles_samples(text: str) -> int:
-    """Samples of both halves of a Cycles reference together."""
+    """Number of samples of both halves of a Cycles reference together."""
     value = positive(text)
     if value < 2:
         raise ValueError("1 was given, expected at least 2: one for each half")
@@ -183,7 +183,7 @@ def cycles_samples(text: str) -> int:
 
 
 def margin(text: str) -> int:
-    """Texels around islands."""
+    """Width of the margin around islands in texels."""
     if text.isdecimal() and int(text) <= MOST_MARGIN:
         return int(text)
     raise ValueError(f"margin is {text!r}, expected a whole number from 0 to {MOST_MARGIN}")
@@ -220,7 +220,7 @@ def bake_name(text: str) -> str:
 
 
 def _name(pattern: str, known: tuple[str, ...]) -> str:
-    """`pattern` itself, where it has only `known` fields and names files below the output folder."""
+    """`pattern`, checked: it has only `known` fields and names files below the output folder. Raises ValueError."""
     expected = f"expected fields {', '.join('{' + name + '}' for name in known)}, such as {{scene}}_{{frame:04d}}"
     if not pattern or len(pattern) > LONGEST_NAME:
         raise ValueError(f"name has {len(pattern)} letters, expected 1 to {LONGEST_NAME}")
@@ -264,9 +264,9 @@ def argument(*flags: str, **keywords) -> Argument:
 def option(
     *flags: str, either: tuple[Argument, ...] = (), matters: bool = True, default: Any = MISSING, **keywords
 ) -> Any:
-    """A field with one argument, or several of which one may be given (`either`), or none.
+    """A dataclass field with one argument, with none, or with several of which one may be given (`either`).
 
-    `matters` is False where results do not depend on it. Only a field without a `default` may be given by position.
+    `matters` is False where results do not depend on the field. Only a field without a `default` is positional.
     """
     arguments = (argument(*flags, **keywords),) if flags else either
     metadata = {"arguments": arguments, "matters": matters}
@@ -274,7 +274,7 @@ def option(
 
 
 def flag(name: str, meaning: str) -> Any:
-    """A field that is True where the flag is given."""
+    """A field that is True if the flag is given."""
     return option(name, default=False, action="store_true", help=meaning)
 
 
@@ -303,7 +303,7 @@ def _resolution() -> Any:
 
 def _frame() -> Any:
     meaning = "such as 12 or 1-240:2,300 (--frames=-10--1 where the first is negative); default: the file's current one"
-    # The command line takes several: each is a task, of which this is the one.
+    # The command line takes several frames. Each is a task of its own, with one frame in this field.
     return option("--frames", "--frame", default=None, dest="frames", type=frames, metavar="F", help=meaning)
 
 
@@ -351,7 +351,7 @@ def _scripts() -> Any:
 
 @dataclass(frozen=True)
 class CameraOptions:
-    """Through which camera to look; None means as in the file."""
+    """Scene, camera, frame and output; None means as in the file."""
 
     scene: Path = _scene("one or more; left out when Blender has a file open")
     frame: int | None = _frame()
@@ -364,7 +364,7 @@ class CameraOptions:
 class PictureOptions(CameraOptions):
     """What to shade and how; None means as in the file."""
 
-    # Names, paths of tables, or from Python a `shading.OwnTechnique`.
+    # Names, paths of tables, or (only from Python) a `shading.OwnTechnique`.
     techniques: tuple[Any, ...] = _techniques(tuple(TECHNIQUES))
     passes: tuple[str, ...] = _passes_of(PASSES, passes, "both")
     resolution: tuple[int, int] | None = _resolution()
@@ -378,7 +378,7 @@ class PictureOptions(CameraOptions):
     shadow_rays: int = _shadow_rays()
     keep_visibility: bool = flag("--keep-visibility", "also keep what `relight` needs, beside the EXR as two .npz")
     scripts: bool = _scripts()
-    page: str = option(default="report.html", matters=False)  # of a comparison
+    page: str = option(default="report.html", matters=False)  # file name of a comparison's HTML page
 
 
 @dataclass(frozen=True)
@@ -447,7 +447,7 @@ class ViewOptions(CameraOptions):
 
 @dataclass(frozen=True)
 class RenderOptions(CameraOptions):
-    """What to finish and how; None means as in the file."""
+    """What finished picture to render and how; None means as in the file."""
 
     techniques: tuple[str, ...] = option(
         "--techniques", default=("ltsh4",), type=one_table, metavar="T",
@@ -473,24 +473,24 @@ class RenderOptions(CameraOptions):
     scripts: bool = _scripts()
 
 
-# What follows from the declarations:
+# Derived from the declarations:
 
 
 def arguments_of(kind: type) -> dict[str, tuple[Any, tuple[Argument, ...]]]:
-    """Default and arguments by the names of the fields that have any, in the order of --help."""
+    """Default and arguments of the fields that have arguments, by field name, in the order of --help."""
     declared = {item.name: (item.default, item.metadata["arguments"]) for item in fields(kind)}
     return {name: (default, arguments) for name, (default, arguments) in declared.items() if arguments}
 
 
 def options_from(kind: type, values: dict[str, Any], **settings) -> Any:
-    """The options `kind` with `values` (of a parsed command line, None: the default) and `settings`."""
+    """Options of the class `kind` with `values` of a parsed command line (None: the default) and `settings`."""
     found = {item.name: values[item.name] for item in fields(kind) if values.get(item.name) is not None}
     found = {name: tuple(dict.fromkeys(value)) if isinstance(value, list) else value for name, value in found.items()}
     return kind(**{**found, **settings})
 
 
 def command_line(options: Any) -> list[str]:
-    """The arguments that give `options` back, without those that have their defaults; scene and output come first."""
+    """The command line that gives `options`: scene, output, then all options that differ from their defaults."""
     words = [str(options.scene), "-o", str(options.output)]
     for name, (default, arguments) in arguments_of(type(options)).items():
         value, first = getattr(options, name), arguments[0]
@@ -519,6 +519,6 @@ def what_matters(options: Any) -> dict[str, Any]:
 
 
 def child_job(kind: type, options: Any, **settings) -> Any:
-    """The second Blender's job `kind`: the options that it has too, and `settings`."""
+    """The second Blender's job of the class `kind`, with the `options` that it shares, and `settings`."""
     shared = {item.name: getattr(options, item.name) for item in fields(kind) if hasattr(options, item.name)}
     return kind(**{**shared, **settings})

@@ -1,4 +1,4 @@
-"""Pictures: techniques beside each other and beside Cycles, and the files of a comparison."""
+"""Pictures of techniques, beside each other and beside Cycles, and the files and figures of a comparison."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ from . import lighting
 from .options import PictureOptions, child_job
 
 REFERENCE_SEED = 20160725
-# Pairs of a sample and a light that the reference takes, some 30 us each, and samples that it takes at least.
+# Limits of the reference: MOST_PAIRS pairs of a sample and a light, some 30 us each, but always FEWEST_SAMPLES samples.
 MOST_PAIRS, FEWEST_SAMPLES = 3_000_000, 32
-# Lights up to which the picture has a layer for the visibility of each.
+# MOST_VISIBILITY_LAYERS: with more lights the EXR has no visibility layers.
 MOST_VISIBILITY_LAYERS = 64
-# Follows the name of a technique in layers without shadows beside those with.
+# UNSHADOWED: suffix of a technique's name in the layers without shadows, where others have shadows.
 UNSHADOWED = "_unshadowed"
-# All that a picture shows, through the view transform of its scene.
+# COMBINED: the layers of whole pictures. SHOWN: the temporary PNG of one, through the view transform of its scene.
 COMBINED, SHOWN = "combined", "shown.png"
 # Layers of the G-buffer: field of SurfaceSamples and its channel letters.
 SAMPLE_LAYERS = {
@@ -69,7 +69,7 @@ SAMPLE_LAYERS = {
 
 @dataclass(frozen=True)
 class TaskResult:
-    """What a task has done: its report, the seconds it took, and its files by their names below the output folder."""
+    """The result of a task: its report, the seconds it took, and the names of its files below the output folder."""
 
     report: dict
     seconds: dict
@@ -77,15 +77,15 @@ class TaskResult:
 
 
 def shade_scene(options: PictureOptions, progress: Progress | None = None) -> dict:
-    """Shade a scene per pixel, write shade.exr, shade.png, report.json and timing.json; the report with "seconds".
+    """Shade a scene per pixel and write shade.exr, shade.png, report.json and timing.json.
 
-    Raises SceneError, TableError, OSError, Cancelled.
+    Returns the report, with the times under "seconds". Raises SceneError, TableError, OSError, Cancelled.
     """
     return _with_report(options, False, progress)
 
 
 def compare_scene(options: PictureOptions, progress: Progress | None = None) -> dict:
-    """As `shade_scene`, beside Cycles: writes compare.exr, compare.png and report.html."""
+    """As `shade_scene`, with Cycles beside the techniques: writes compare.exr, compare.png and report.html."""
     return _with_report(options, True, progress)
 
 
@@ -96,14 +96,14 @@ def _with_report(options, with_cycles, progress):
     return {**picture.report, "seconds": picture.seconds}
 
 
-# What shades: the reference by its name, a table, or what a script has given.
+# A shader is the name of the reference, a table, or a technique that a script has given.
 Shader = str | shading.LookupTable | shading.OwnTechnique
 
 
 def prepare(options) -> dict[str, Shader]:
-    """Tables by the names under which techniques appear in results; proves that the output folder takes files.
+    """The shaders by the names of their techniques in results. Also checks that the output folder takes files.
 
-    Done before anything takes long. Raises TableError, OSError.
+    Call it before anything that takes long. Raises TableError, OSError.
     """
     tables = load_tables(options.techniques)
     try:
@@ -115,14 +115,14 @@ def prepare(options) -> dict[str, Shader]:
 
 
 def load_tables(techniques: Sequence[str | shading.OwnTechnique]) -> dict[str, Shader]:
-    """The tables by the names of their techniques; the reference stands for itself. Raises TableError."""
+    """The shaders by the names of their techniques in results. Raises TableError."""
     return {name: _table(given) for name, given in technique_names(techniques).items()}
 
 
 def _table(given) -> Shader:
     if shading.is_own(given) or given == REFERENCE:
         return given
-    # A job of many frames needs the shipped ones for each; a table of the user may change meanwhile.
+    # Shipped tables are cached: a job of many frames loads them for each. A user's table may change meanwhile.
     return _shipped_table(given) if given in SHIPPED_TABLES else shading.load_table(given)
 
 
@@ -130,7 +130,7 @@ _shipped_table = cache(shading.load_table)
 
 
 def technique_names(techniques: Sequence[str | shading.OwnTechnique]) -> dict[str, str | shading.OwnTechnique]:
-    """What was given, by the names under which techniques appear in results: those of tables are short."""
+    """The given techniques by their names in results; the name of a user's table is the stem of its path."""
     names = {}
     for given in techniques:
         own = shading.is_own(given)
@@ -140,7 +140,7 @@ def technique_names(techniques: Sequence[str | shading.OwnTechnique]) -> dict[st
 
 
 def check_named(techniques: Sequence, what: str) -> None:
-    """Raises ValueError where `what` would have to call a technique of the user later."""
+    """Raise ValueError where a technique is a user's own, which `what` could not call later."""
     if own := [_described(given) for given in techniques if shading.is_own(given)]:
         raise ValueError(
             f"technique {own[0]}: {what} cannot call it later, expected {', '.join(TECHNIQUES)} or the path of a table "
@@ -149,7 +149,7 @@ def check_named(techniques: Sequence, what: str) -> None:
 
 
 def _short_name(stem: str, taken) -> str:
-    """A name without dots, which separate the parts of a layer's name, that nothing else has."""
+    """A free name from `stem`, with _ for the dots that separate the parts of a layer's name."""
     stem = stem.replace(".", "_")
     candidates = (f"{stem}_{number}" if number > 1 else stem for number in itertools.count(1))
     reserved = {*TECHNIQUES, CYCLES, *taken}
@@ -157,7 +157,7 @@ def _short_name(stem: str, taken) -> str:
 
 
 def make_picture(options: PictureOptions, with_cycles: bool, progress: Progress | None = None) -> TaskResult:
-    """Shade one picture, beside Cycles where asked for, and write its files but report.json.
+    """Shade one picture, beside Cycles where asked for, and write all its files except report.json.
 
     Raises as `shade_scene` does.
     """
@@ -172,7 +172,7 @@ def make_picture(options: PictureOptions, with_cycles: bool, progress: Progress 
     with ExitStack() as stack:
         folder = None
         if not with_cycles:
-            # The Blender that finds the samples shows the picture, too.
+            # One Blender for both: it extracts the samples and makes the PNG of the picture.
             folder = stack.enter_context(temporary_folder())
             stack.enter_context(kept_blender(folder))
         extraction = _extracted(options, with_cycles, progress)
@@ -199,7 +199,7 @@ def make_picture(options: PictureOptions, with_cycles: bool, progress: Progress 
 
 
 def _extracted(options: PictureOptions, with_cycles: bool, progress):
-    """The samples and lights of a scene, and what Cycles makes of them where asked for."""
+    """The `Extraction` of a scene: samples and lights, with Cycles' picture where asked for."""
     from ..blender.process import client
 
     width, height = options.resolution or (None, None)
@@ -210,7 +210,7 @@ def _extracted(options: PictureOptions, with_cycles: bool, progress):
 
 
 def _shown(comparison: Comparison, folder: Path, progress) -> bytes:
-    """The PNG of the most accurate picture, through the view transform of its scene; `folder` is a temporary one."""
+    """PNG bytes of the most accurate picture, through the view transform of its scene; `folder` is temporary."""
     from ..blender.process import client
 
     options = comparison.options
@@ -222,15 +222,15 @@ def _shown(comparison: Comparison, folder: Path, progress) -> bytes:
 
 @dataclass(frozen=True)
 class Result:
-    """One technique on the samples, or on a subset (Q,) of them: radiance per pass (G, Q, 3), time per pass."""
+    """Radiance of one technique on all samples, or on a subset (Q,) of them."""
 
-    shading: shading.Shading
-    seconds: dict[str, float]
+    shading: shading.Shading  # radiance (G, Q, 3) per pass
+    seconds: dict[str, float]  # per pass
     subset: np.ndarray | None  # (Q,) sorted indices of the samples that were evaluated, None for all
-    unshadowed: shading.Shading | None = None  # where `shading` has shadows
+    unshadowed: shading.Shading | None = None  # the same without shadows, where `shading` has shadows
 
     def with_more(self, kept: np.ndarray, more: Result) -> Result:
-        """The samples of the mask `kept` (P,), and those of another; of neither a subset."""
+        """The samples in the mask `kept` (P,), then those of `more`; both results must be without a subset."""
         seconds = {name: value + more.seconds[name] for name, value in self.seconds.items()}
         own = [(self.shading, more.shading), (self.unshadowed, more.unshadowed)]
         shaded = [None if one is None else one.with_more(kept, other) for one, other in own]
@@ -238,12 +238,12 @@ class Result:
 
 
 def evaluated(tables, extraction, shadows, options, progress) -> dict[str, Result]:
-    """The results of all techniques, of which `tables` (see `prepare`) has the names."""
+    """The results of all techniques in `tables` (see `prepare`), by name."""
     return {name: _evaluate(name, table, extraction, shadows, options, progress) for name, table in tables.items()}
 
 
 def _evaluate(name, table, extraction, shadows, options, progress) -> Result:
-    """Shade all samples, or for the reference those of randomly chosen pixels where the image is large."""
+    """Shade all samples; the reference shades those of randomly chosen pixels where there are too many."""
     samples, subset = extraction.samples, None
     limit = min(options.reference_samples, max(FEWEST_SAMPLES, MOST_PAIRS // max(len(extraction.lights), 1)))
     if name == REFERENCE and len(samples) > limit:
@@ -269,7 +269,7 @@ def _evaluate(name, table, extraction, shadows, options, progress) -> Result:
 
 
 def _joined(shaded: dict[str, shading.Shading]) -> shading.Shading:
-    """One Shading of those of single passes."""
+    """Several Shadings of one pass each as one Shading."""
     first = next(iter(shaded.values()))
     passes = {name: getattr(part, name) for name, part in shaded.items()}
     error = shaded["specular"].quadrature_error if "specular" in shaded else None
@@ -277,7 +277,7 @@ def _joined(shaded: dict[str, shading.Shading]) -> shading.Shading:
 
 
 def _samples_of_random_pixels(film: Film, limit: int) -> np.ndarray:
-    """Sorted indices of at most `limit` samples: all those of some pixels, which a seeded generator chose."""
+    """Sorted indices of at most `limit` samples: all samples of pixels that a seeded generator chooses."""
     generator = np.random.default_rng(REFERENCE_SEED)
     order = generator.permutation(film.width * film.height)
     count = np.bincount(film.pixel, minlength=len(order))[order]
@@ -323,7 +323,7 @@ class Comparison:
         return self.extraction.film
 
     def with_more(self, kept: np.ndarray, more: Comparison) -> Comparison:
-        """The samples of the mask `kept` (P,), and those of another of the same scene and film."""
+        """The samples in the mask `kept` (P,), then those of `more`, a comparison of the same scene and film."""
         one, other = self.extraction, more.extraction
         samples = SurfaceSamples.joined([one.samples.take(kept), other.samples])
         film = one.film.take(kept).with_more(other.film)
@@ -333,21 +333,21 @@ class Comparison:
 
     @property
     def cycles(self) -> dict[str, np.ndarray]:
-        """Halves (2, H, W, 3) per pass; empty without a Cycles reference."""
+        """The two halves (2, H, W, 3) of Cycles' picture per pass; empty without a Cycles reference."""
         return self.extraction.reference or {}
 
     @cached_property
     def rest(self) -> np.ndarray | None:
-        """What of the picture (H, W, 4) is no reflected light; None where it is not known."""
+        """The picture (H, W, 4) without reflected light: emission, lights in sight, background; None if unknown."""
         return None if self.extraction.background is None else self.extraction.rest
 
     def whole(self, name: str) -> np.ndarray:
-        """All (H, W, 4) that the picture of a technique shows: its passes, over `rest` where that is known."""
+        """The whole picture (H, W, 4) of a technique: the sum of its passes, plus `rest` where that is known."""
         light = sum(self.images[name, pass_name] for pass_name in self.options.passes)
         return self._with_rest(light)
 
     def _with_rest(self, light: np.ndarray) -> np.ndarray:
-        """Reflected light (H, W, 3) and all else of the picture (H, W, 4)."""
+        """The picture (H, W, 4) with this reflected `light` (H, W, 3); alpha is the coverage where `rest` is None."""
         if self.rest is None:
             return np.concatenate([light, self.film.coverage()[..., None]], axis=-1)
         return np.concatenate([self.rest[..., :3] + light, self.rest[..., 3:]], axis=-1)
@@ -376,7 +376,7 @@ class Comparison:
         return self.film.take(result.subset)
 
     def _mask(self, result) -> np.ndarray:
-        """Pixels (H, W) that see a surface and, for a subset, were evaluated."""
+        """Mask (H, W) of the pixels whose surfaces the technique has shaded."""
         return self._film_of(result).coverage() > 0.0
 
     # Figures:
@@ -421,7 +421,7 @@ class Comparison:
         }
 
     def _subset_notice(self) -> str:
-        """What to know about the reference where it stands for a part of the samples only, else nothing."""
+        """Note that the reference covers only some of the samples; empty where it covers all or is not there."""
         facts = self._reference_facts()
         if facts is None or facts["samples"] == facts["of"]:
             return ""
@@ -459,7 +459,7 @@ class Comparison:
     # Files:
 
     def write(self, output: Path, document: dict, with_cycles: bool, progress: Callable | None) -> list[str]:
-        """Write all files into the folder `output`, once all that goes into them is there; their names."""
+        """Write all files into the folder `output`; returns their names. All contents are computed first."""
         if progress is not None and progress("write", 0.0) is False:
             raise Cancelled("stopped before the files were written")
         name = self.options.name or ("compare" if with_cycles else "shade")
@@ -510,7 +510,7 @@ class Comparison:
             for name in self.results:
                 layers[f"error_{name}.{pass_name}"] = self._error(name, pass_name)
         layers |= self._whole_layers() | self._visibility_layers()
-        # Of a surface with several lobes its first.
+        # A surface with several lobes shows the first of them.
         first = slice(None) if self.film.first is None else np.nonzero(self.film.first)[0]
         film = self.film.take(first)
         for field, letters in SAMPLE_LAYERS.items():
@@ -520,7 +520,10 @@ class Comparison:
         return layers
 
     def _whole_layers(self) -> dict[str, np.ndarray]:
-        """What the pictures show, of Cycles with its direct light; none where the passes are not all of the light."""
+        """Layers of the whole pictures of the techniques and of Cycles' direct light, and their errors.
+
+        Empty where `rest` is not known: then the passes are not all of the light.
+        """
         if self.rest is None:
             return {}
         layers, is_surface = {}, self.film.coverage() > 0.0
@@ -535,13 +538,15 @@ class Comparison:
         return layers
 
     def _error(self, name: str, pass_name: str) -> np.ndarray:
-        """Technique minus Cycles (H, W, 3), 0 where it did not shade."""
+        """Technique minus Cycles (H, W, 3); 0 where the technique did not shade."""
         error = self.images[name, pass_name] - self.cycles[pass_name].mean(axis=0)
         return np.where(self._mask(self.results[name])[..., None], error, 0.0)
 
     def _visibility_layers(self) -> dict[str, imaging.Layer]:
-        """The share of each light that is seen, 1 where no surface is; none where there are very many. Lights that
-        share their rays have one layer, with the name of the first."""
+        """Layers of the share of each light that is seen, 1 where there is no surface; none for very many lights.
+
+        Lights that share their rays have one layer, named after the first of them.
+        """
         shadows, found = self.shadows, {}
         if shadows is None or len(shadows.numbers) > MOST_VISIBILITY_LAYERS:
             return found
@@ -556,7 +561,7 @@ class Comparison:
         return found
 
     def sheet(self) -> np.ndarray:
-        """The comparison sheet (H, W, 3), 8 bit: all light together where it was shaded, then each pass."""
+        """The comparison sheet (H, W, 3), 8 bit: both passes together where both were shaded, then each pass."""
         wanted = [name for name in PASSES if name in self.options.passes]
         parts = [(name,) for name in wanted] if len(wanted) == 1 else [PASSES, *((name,) for name in wanted)]
         return np.concatenate([self._sheet_of(passes) for passes in parts])
@@ -566,7 +571,7 @@ class Comparison:
         halves = sum(self.cycles[name] for name in passes)
         mean, rec709 = halves.mean(axis=0), self.extraction.color_space.rec709
         hit, tiles = self.film.coverage() > 0.0, []
-        # All light together is shown as the picture is seen; its errors are those of the light.
+        # The picture of all passes also shows the background and lights in sight. Its errors are those of the light.
         behind = 0.0 if self.rest is None or len(passes) == 1 else self.rest[..., :3]
         for name, result in self.results.items():
             image, missing = sum(self.images[name, part] for part in passes) + behind, None
@@ -587,7 +592,7 @@ class Comparison:
         return imaging.comparison_sheet(title, ("Cycles", rec709(mean + behind)), tiles, notes=notes)
 
     def _caption(self, name: str, passes: tuple[str, ...]) -> list[str]:
-        """The errors of a technique in the sum of `passes`."""
+        """Caption lines: the errors of a technique in the sum of `passes`."""
         result, halves = self.results[name], sum(self.cycles[part] for part in passes)
         image = sum(self.images[name, part] for part in passes)
         beside = imaging.noisy_error_statistics(image, *halves, self._mask(result)).to_dict()
@@ -601,25 +606,25 @@ class Comparison:
 
 
 def most_accurate(names) -> str:
-    """Of the techniques that a picture was made with the one that shows it: the last but the reference, which may stand
-    for a part of the pixels only."""
+    """The last of the technique names, by convention the most accurate. The reference comes only if it is alone,
+    because it may cover a part of the pixels only."""
     names = list(names)
     return next((name for name in reversed(names) if name != REFERENCE), names[-1])
 
 
 def against_cycles(image, halves, mask, rec709=np.asarray) -> dict:
-    """Figures of an image (H, W, 3) beside the halves (2, H, W, 3) of Cycles, where `mask` (H, W) says it is shaded."""
+    """Error figures of an image (H, W, 3) against the halves (2, H, W, 3) of Cycles, in the shaded `mask` (H, W)."""
     statistics, mean = imaging.noisy_error_statistics(image, *halves, mask), halves.mean(axis=0)
     shaded = np.where(mask[..., None], image, mean)
     return {**statistics.to_dict(), "flip": imaging.mean_flip(rec709(mean), rec709(shaded), mask)}
 
 
 def _light_reports(lights) -> list[dict]:
-    """What report.json says about `lights`, once about all faces of a lamp; `radiance` is the mean of the patches."""
+    """Entries of report.json for `lights`. The faces of a mesh light are one entry, with their mean radiance."""
     found = []
     for kind, own in itertools.groupby(lights, lambda light: (light.name, light.shape, light.group)):
         own = list(own)
-        # Faces are polygons; several other lights of one name are instances.
+        # Polygons of one name are faces of one light. Other lights of one name are instances.
         for part in [own] if kind[1] == "POLYGON" else [[light] for light in own]:
             radiance = part[0].radiance
             if len(part) > 1:
@@ -632,12 +637,12 @@ def _light_reports(lights) -> list[dict]:
 
 
 def _described(given) -> str:
-    """A technique in report.json: its name, the path of its table, or the class of a user's own."""
+    """How report.json names a technique: its name, the path of its table, or the class of a user's own."""
     return f"{type(given).__module__}.{type(given).__qualname__}" if shading.is_own(given) else str(given)
 
 
 def _title(name: str) -> str:
-    """What a technique is called on sheets and by progress; a table of the user by its name."""
+    """The title of a technique on sheets and in progress; for a user's table its name."""
     return TECHNIQUES[name].title if name in TECHNIQUES else name
 
 
@@ -649,12 +654,12 @@ _ROW = {
 
 
 def _shadows(value, place) -> None:
-    """What `Shadows.report` gives, or nothing."""
+    """Check for the document of `Shadows.report`, or null."""
     if value is not None:
         check(value, {"noise": {str: NUMBER}}, place)
 
 
-# What `merge`, a baseline and a summary need of a report (see `reading.check`).
+# What `merge`, a baseline and a summary need in a report (see `reading.check`).
 REPORT = {
     "scene": str,
     "camera": str | None,
@@ -670,11 +675,11 @@ REPORT = {
 
 
 def _seconds(value, place) -> None:
-    """A number, or a table of them."""
+    """Check for a number, or nested dicts of numbers."""
     check(value, {str: _seconds} if isinstance(value, dict) else NUMBER, place)
 
 
-# What a picture or a bake took.
+# The seconds of a picture or a bake (see `reading.check`).
 SECONDS = {"techniques?": {str: {str: NUMBER}}, str: _seconds}
 
 
@@ -684,13 +689,13 @@ def percent(value) -> str:
 
 
 def unbiased(figures: dict) -> str:
-    """The error against two noisy halves; its square is negative where the noise is all there is to see."""
+    """The error against two noisy halves as text; "in noise" where the unbiased square of the error is negative."""
     squared = figures.get("unbiased_squared_error")
     return "in noise" if squared is not None and squared < 0.0 else percent(figures.get("unbiased_relative_error"))
 
 
 def summary(report: dict, seconds: dict) -> list[str]:
-    """A table of one picture: errors and seconds per pass and technique."""
+    """Lines of text about one picture: errors and seconds per pass and technique."""
     found = []
     shadows = report.get("shadows")
     for pass_name, figures in report["passes"].items():
@@ -710,7 +715,7 @@ def summary(report: dict, seconds: dict) -> list[str]:
 
 
 def brief(report: dict) -> list[str]:
-    """A line for a picture: the errors of one pass, against Cycles where there is one."""
+    """One line about a picture: the errors of one pass, against Cycles where possible, else the reference."""
     passes = report["passes"]
     pass_name = "specular" if "specular" in passes else next(iter(passes))
     errors = []

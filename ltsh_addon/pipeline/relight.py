@@ -1,4 +1,4 @@
-"""Finished pictures in another light: `relight` writes them anew, without a ray."""
+"""`relight`: kept pictures with changed powers and colors of their lights, without tracing a ray."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ KEPT_WEIGHTS = (
 
 @dataclass(frozen=True)
 class LightChange:
-    """What becomes of the lights called `name`."""
+    """How the lights called `name` are changed."""
 
     name: str
     power: float = 1.0  # factor
-    color: tuple[float, float, float] | None = None  # in place of its own, whose brightest channel counts as 1
+    color: tuple[float, float, float] | None = None  # replaces its color, whose brightest channel counts as 1
     exposure: float = 0.0  # each step doubles the power
     muted: bool = False
 
     @property
     def factor(self) -> float:
-        """Of the power."""
+        """Factor of the power by `power`, `exposure` and `muted`."""
         return 0.0 if self.muted else self.power * 2.0**self.exposure
 
 
@@ -52,16 +52,17 @@ def relight(
     *,
     solo: Sequence[str] = (),
 ) -> dict:
-    """Write the pictures that `folder` has kept samples of with changed lights into `output`; where there are `solo`
-    lights, all others are dark.
+    """Write the pictures whose samples are kept in `folder` into `output`, with changed lights.
 
-    Files and layers have the same names, but for those of Cycles. Returns report.json of the only picture, else
-    {"reports": [...]}. Raises ValueError for an unknown light or where nothing was kept, OSError, TableError.
+    Where there are `solo` lights, all others are dark. Files and layers keep their names; those of Cycles are left
+    out. Returns the report of the only picture, else {"reports": [...]}. Raises ValueError for an unknown light or
+    where nothing was kept, OSError, TableError.
     """
     folder, output = Path(folder), Path(output)
     files = sorted(folder.rglob(f"*{KEPT_SUFFIX}"))
     if not files:
-        raise ValueError(f"{folder}: no picture kept its samples there; run shade or compare with --keep-visibility")
+        fix = "run shade, compare or render with --keep-visibility"
+        raise ValueError(f"{folder}: no picture kept its samples there; {fix}")
     reports = [_relit(path, path.relative_to(folder), (changes, solo), output, progress) for path in files]
     report = reports[0] if len(reports) == 1 else {"reports": reports}
     imaging.write_json(output / "report.json", report)
@@ -69,7 +70,7 @@ def relight(
 
 
 def _relit(path: Path, place: Path, wanted, output: Path, progress) -> dict:
-    """The report of the picture that kept its samples in `path`; its files are at the same `place` below `output`."""
+    """Write the picture whose samples are in `path`, at the same `place` below `output`; returns its report."""
     kept = KeptPicture.load(path)
     changes = [*wanted[0], *others_muted(kept.extraction.lights, wanted[1])]
     lights = changed_lights(kept.extraction.lights, changes)
@@ -101,7 +102,7 @@ def _relit(path: Path, place: Path, wanted, output: Path, progress) -> dict:
 
 @dataclass(frozen=True)
 class _Finished(picture.Comparison):
-    """A finished picture, of which the `rest` (H, W, 4) is not ours."""
+    """A finished picture: our passes, and Cycles' `rest` (H, W, 4)."""
 
     kept: KeptPicture | None = None
     rest: np.ndarray | None = None
@@ -120,8 +121,10 @@ class _Finished(picture.Comparison):
 
 
 def _changed_rest(kept: KeptPicture, lights: Sequence[AreaLight], table, shaded, progress) -> np.ndarray:
-    """What is not ours (H, W, 4) with changed lights: what a light group bounces follows its direct light, which is
-    `shaded` with them by `table`."""
+    """Cycles' rest (H, W, 4) under the changed `lights`: the bounced light of a group scales with its direct light.
+
+    `shaded` is the direct light of the changed lights by `table`.
+    """
     rest, before = kept.rest[""].copy(), None
     for group, bounced in kept.rest.items():
         pairs = [pair for pair in zip(kept.extraction.lights, lights, strict=True) if pair[0].group == group]
@@ -142,15 +145,17 @@ def _changed_rest(kept: KeptPicture, lights: Sequence[AreaLight], table, shaded,
 
 
 def _light_of_group(kept: KeptPicture, shaded, group: str) -> np.ndarray:
-    """The light (3,) of a light group in the whole picture."""
+    """Direct light (3,) of a light group, summed over the picture."""
     number, film = shaded.groups.index(group), kept.extraction.film
     images = {name: film.image(getattr(shaded, name)[number]) for name in kept.options["passes"]}
     return sum((kept.shown(name) * image).sum(axis=(0, 1)) for name, image in images.items())
 
 
 def others_muted(lights: Sequence[AreaLight], solo: Sequence[str]) -> list[LightChange]:
-    """What makes all lights dark but those called `solo`; nothing where there are none. Raises ValueError for a light
-    that is not there."""
+    """Changes that mute all lights except those called `solo`; none where `solo` is empty.
+
+    Raises ValueError for an unknown light.
+    """
     names = dict.fromkeys(light.name for light in lights)
     for name in solo:
         _check_known(name, names)
@@ -163,7 +168,7 @@ def _check_known(name: str, names) -> None:
 
 
 def _split_at_horizons(samples: SurfaceSamples) -> int:
-    """How many samples are the second part of what `cycles.horizons` has split by the chances of the lights."""
+    """How many samples `cycles.horizons` has split in two, by the chances of the lights."""
     same = [
         (getattr(samples, name)[1:] == getattr(samples, name)[:-1]).all(axis=1)
         for name in ("position", "normal", "smooth_normal", "geometric_normal")
@@ -187,7 +192,7 @@ def _check_shared(kept: KeptPicture, lights: Sequence[AreaLight]) -> None:
 
 
 def changed_lights(lights: Sequence[AreaLight], changes: Sequence[LightChange]) -> tuple[AreaLight, ...]:
-    """`lights` with all `changes`. Raises ValueError for a light that is not there."""
+    """`lights` with all `changes`. Raises ValueError for an unknown light."""
     names = list(dict.fromkeys(light.name for light in lights))
     found = list(lights)
     for change in changes:
@@ -199,7 +204,7 @@ def changed_lights(lights: Sequence[AreaLight], changes: Sequence[LightChange]) 
 
 
 def _tint(own: list[AreaLight], change: LightChange) -> np.ndarray:
-    """By what the radiance of a light of several parts is multiplied to get the color."""
+    """Factor (3,) of the radiance that gives the lights `own` the color of `change`. Raises ValueError."""
     if change.color is None:
         return np.ones(3)
     color = own_color(own)
@@ -210,14 +215,14 @@ def _tint(own: list[AreaLight], change: LightChange) -> np.ndarray:
 
 
 def own_color(lights: Sequence[AreaLight]) -> np.ndarray:
-    """The color (3,) of `lights` together, its brightest channel 1; white where they are dark."""
+    """The color (3,) of the mean radiance of `lights`, its brightest channel 1; white where they are dark."""
     weights = [np.linalg.norm(light.area_vector) for light in lights]
     mean = np.average([light.radiance for light in lights], axis=0, weights=weights)
     return mean / np.max(np.abs(mean)) if mean.any() else np.ones(3)
 
 
 def tint(own: np.ndarray, color: Sequence[float]) -> np.ndarray:
-    """By what light of the color `own` (3,) is multiplied to get another; nothing where it has nothing."""
+    """Factor (3,) from the color `own` to `color`; 0 in channels where `own` is 0."""
     return np.divide(color, own, out=np.zeros(3), where=np.asarray(own) != 0.0)
 
 

@@ -2,16 +2,16 @@
 
     combined = ours + rest,  rest = denoised(Combined of Cycles - its direct light where ours takes its place)
 
-The same is done with the Combined pass of each light group of the view layer, of which Cycles writes no direct light:
-that of all lights is shared out as ours is. So what a light group bounces can change with its lights.
+Ours is a specular and a diffuse picture. It takes the place of Cycles' direct light pixel by pixel. Where LTSH does not
+shade as Cycles does, ours is black and Cycles keeps its own: nothing is there twice, and nothing is lost.
 
-With depth of field, of which few points of the lens leave noise in ours too, the sum is denoised as a whole.
+The Combined pass of each light group of the view layer is treated in the same way. Cycles writes no direct light of a
+group, so its direct light of all lights is shared out as ours is. What a group bounces can then change with its lights.
 
-Ours, a specular and a diffuse picture, takes the place of Cycles' direct light pixel by pixel. Where something is not
-shaded as in Cycles, ours is black and Cycles keeps its own: nothing is there twice, and nothing is lost.
+With depth of field ours is noisy too, since it has few points of the lens. Then the sum is denoised as a whole.
 
-What shines in sight, lamps and the world, has no noise but that of jagged edges, of which a denoiser makes nothing
-better. It stays out of it, and is rendered apart, with many samples where it has edges.
+What shines in sight, lamps and the world, has no noise, only jagged edges, which a denoiser makes worse. It stays out
+of the denoiser. Cycles renders it once more by itself, with many samples at its edges.
 """
 
 from __future__ import annotations
@@ -37,44 +37,49 @@ from ..visibility import ShadowSampling
 from . import lighting, picture
 from .options import EDGE_POINTS, SHADOW_RAYS, PictureOptions, RenderOptions, child_job
 
-# Names of the passes of Cycles in `pass_names`: light and color of each pass of ours.
+# DIRECT: for each pass of ours, the keys of Cycles' light and color in `pass_names`.
 DIRECT = {"specular": ("specular_light", "specular_color"), "diffuse": ("diffuse_light", "diffuse_color")}
 ALBEDO, NORMAL = ("Denoising Albedo", "RGB"), ("Denoising Normal", "XYZ")
-# A pass of Cycles, followed by the name of a light group.
+# OF_GROUP: how the name of a light group's pass begins.
 OF_GROUP = "Combined_"
 REST = "rest"
-# Points of a pixel where nothing is said; of a budget those of the first look, and at most.
-SUB_SAMPLES, FIRST_SUB_SAMPLES, MOST_SUB_SAMPLES = 9, 2, 17
-# Processor seconds that denoising and writing take at least, for a million pixels, and those of each further denoising.
-START_SECONDS, LAST_SECONDS, MORE_SECONDS = 0.5, 12.0, 4.0
-# Of a budget: what the shadows may take; what a shadow ray takes, and how many of those of a pixel soft shadows need.
+# Points of a pixel. SUB_SAMPLES: without a budget. With one, FIRST_SUB_SAMPLES: of the first look at the scene, and
+# MOST_SUB_SAMPLES: at most.
+SUB_SAMPLES, FIRST_SUB_SAMPLES, MOST_SUB_SAMPLES = 9, 3, 17
+# Processor seconds of denoising. START_SECONDS: always. LAST_SECONDS: for a picture of a million pixels. MORE_SECONDS:
+# for each further picture of that size.
+START_SECONDS, LAST_SECONDS, MORE_SECONDS = 0.25, 12.0, 4.0
+# SHADOWS_SHARE: the share of a budget that goes to the rays of soft shadows. RAY_SECONDS: processor time of a ray.
+# SOFT_SHARE: the share of the pairs of a pixel and a light that lie in soft shadows.
 SHADOWS_SHARE, RAY_SECONDS, SOFT_SHARE = 0.02, 6e-7, 0.1
-# Direct light with more noise than this is left to Cycles and the denoiser, with twice as much all of it; noise is told
-# from so many pixels around each.
+# Noisy direct light is left to Cycles and the denoiser: a part of it from this relative noise on, all of it from twice
+# as much on. The noise is told from the pixels that are at most AROUND away.
 MOST_NOISE, AROUND = 0.06, 4
-# At edges of diffuse light, which our few points and the samples of Cycles place apart from each other, half of each is
-# nearer than either. Of how much light bends from pixel to pixel so much is the error of an edge, where that is more
-# than a share of the light; the mean of so many pixels around each.
+# Our few points and the samples of Cycles place an edge of diffuse light differently, so the mean of both is nearer
+# than either. LEAST_BEND: how much the light must bend from pixel to pixel, relative to the light, to count as an edge.
+# EDGE_ERROR: the error of an edge relative to that bend. AROUND_EDGE: the pixels on each side that are averaged.
 EDGE_ERROR, LEAST_BEND, AROUND_EDGE = 0.2, 0.1, 1
-# Where our points have so much of the variance of both pictures, Cycles keeps its own; of the squared slope from pixel
-# to pixel the variance in a pixel, twice what it is.
-FEW_POINTS, SLOPE = (0.5, 0.75), 1.0 / 6.0
-# Points that a pixel with an edge gets at least. Of all samples so many more for such pixels, and less where these
-# would take more than a share of what is left of a budget. Where more than a share of the pixels has edges they are the
-# detail of surfaces, and the samples of Cycles that the time buys are worth more.
+# FEW_POINTS: Cycles keeps its own specular light where the variance of our points is a larger part of the difference to
+# Cycles than this; it begins to do so at the first number. SLOPE: the variance within a pixel, relative to the squared
+# slope from pixel to pixel; it is twice the true one, to be safe. SHARED: points that pixels share are worth so many.
+FEW_POINTS, SLOPE, SHARED = (0.5, 0.75), 1.0 / 6.0, 2.25
+# More points for pixels with an edge. FEWEST_POINTS: what such a pixel gets at least. MOST_FINER: how many samples more
+# they may take, relative to all. FINER_SHARE: the share of what is left of a budget that they may take. MOST_EDGES:
+# where a larger share of the pixels has edges, these are the detail of surfaces, and samples of Cycles are worth more.
 FEWEST_POINTS, MOST_FINER, FINER_SHARE, MOST_EDGES = 8, 1.0, 0.3, 0.3
-MOST_OF_EDGE = 3.0  # of ours, that Cycles' part of an edge is
-MOST_OVER = 1.1  # of a budget, before a warning
-# What direct light will take is told from squares of so many pixels on a side that have a share of its samples: with
-# these the time grows to a power, from the first squares at least 0.5, from the second 0.49 to 0.84 in six scenes of
-# two sizes. Of what is left it may take so much.
-SQUARE, PROBES, DIRECT_SHARE = 8, ((0.01, 0.5), (0.04, 0.7)), 0.45
-# Where the two points of a pixel differ from their mean by more than so much of the light of the picture, both as root
+MOST_OF_EDGE = 3.0  # Cycles' part of an edge is at most this many times ours
+MOST_OVER = 1.1  # how many times the budget a picture may take without a warning
+# How long direct light will take is told from squares of the picture, SQUARE pixels on a side. PROBES: the share of the
+# samples that these have, and the power of the number of samples with which the time grows from there: from the first
+# squares at least 0.45, from the second 0.49 to 0.7 in six scenes of 32,400 pixels, and 0.84 with nine times as many.
+SQUARE, PROBES = 8, ((0.01, 0.45), (0.04, 0.6))
+# Of what is left of a budget: the share that direct light may take with the points of the first look, and with more
+# points. More of it is worth less than more samples of Cycles. Light that is left to Cycles for its noise counts less.
+DIRECT_SHARE, MORE_SHARE = 0.5, 0.2
+# Where the points of a pixel differ from their mean by more than this share of the light of the picture, both as root
 # mean squares, its highlights are thinner than pixels, and time tells more as samples of Cycles. In five scenes at most
 # 0.18, on the example scene 0.9, and 0.4 with 1280 x 720 pixels.
 THIN = 0.35
-# Of what is left of a budget: so much may a second look at the scene take, for more points.
-AGAIN_SHARE = 0.15
 NAMED = 8  # of what Cycles keeps, in a warning
 
 
@@ -85,7 +90,7 @@ class Finished:
     combined: np.ndarray  # (H, W, 4)
     rest: np.ndarray  # (H, W, 4), what is not ours
     ours: dict[str, np.ndarray]  # (H, W, 3) by layer: ltsh4.specular, ltsh4.specular@Key, ...
-    channels: dict[str, np.ndarray]  # (H, W) of Cycles, with ours in place of its direct light
+    channels: dict[str, np.ndarray]  # (H, W) of Cycles' passes, with ours in place of its direct light
     report: dict
     seconds: dict[str, Any]
     kept: dict[str, dict[str, np.ndarray]]  # `rest`, `taken` and `edges` of a KeptPicture
@@ -94,9 +99,9 @@ class Finished:
 
 
 def render_scene(options: RenderOptions, progress: Progress | None = None) -> dict:
-    """Write render.exr, render.png, report.json and timing.json of a scene; the report with times as "seconds".
+    """Write render.exr, render.png, report.json and timing.json of a scene.
 
-    Raises SceneError, TableError, OSError, Cancelled.
+    Returns the report, with times as "seconds". Raises SceneError, TableError, OSError, Cancelled.
     """
     made = make_finished(options, progress)
     imaging.write_json(Path(options.output) / "report.json", made.report)
@@ -138,8 +143,10 @@ def finish(
     view_layer: str | None = None,
     shaded: Callable[[picture.Comparison], None] = lambda comparison: None,
 ) -> Finished:
-    """The finished picture of a scene and view layer, by default those of the file; `shaded` gets the direct light
-    before Cycles begins. Raises as `render_scene` does."""
+    """The finished picture of a scene and view layer, by default those of the file. Raises as `render_scene` does.
+
+    `shaded` is called with the direct light before Cycles begins.
+    """
     from ..blender.process import client
     from ..blender.process.blender_process import kept_blender
 
@@ -185,7 +192,7 @@ def finish(
 
 
 def _left(options: RenderOptions, extraction, clock: _ProcessorClock) -> float | None:
-    """Processor seconds of a budget that are left until denoising, None without a budget."""
+    """Processor seconds of the budget that are left before denoising; None without a budget."""
     if options.budget is None:
         return None
     million = extraction.film.width * extraction.film.height / 1e6
@@ -198,7 +205,7 @@ def _too_long(options: RenderOptions, extraction, cycles, clock: _ProcessorClock
     took = clock.seconds()
     if options.budget is None or took <= MOST_OVER * options.budget:
         return []
-    # Starting Blender, opening the file, a few samples of Cycles, denoising.
+    # The least is to start Blender, open the file, render the first samples of Cycles, and denoise.
     least = extraction.processor_seconds - extraction.direct_seconds + cycles.least_seconds + clock.stages["denoise"]
     if least > options.budget:
         found = f"takes at least {least:.1f} s of processor time, however few samples, and took {took:.1f} s"
@@ -208,7 +215,8 @@ def _too_long(options: RenderOptions, extraction, cycles, clock: _ProcessorClock
 
 
 def _denoisings(extraction) -> int:
-    """How many pictures `_rest` denoises at most: two for each way to take passes, and one for each light group."""
+    """How many pictures `_rest` denoises at most: two for each combination of passes that are ours, and one for each
+    light group."""
     if extraction.kept.everything:
         return 1
     ways = np.unique([mask.ravel() for mask in extraction.kept.by_pass.values()], axis=1)
@@ -216,7 +224,7 @@ def _denoisings(extraction) -> int:
 
 
 class _ProcessorClock:
-    """Processor seconds of this process and of children that have ended, from now on."""
+    """Counts processor seconds of this process, and of children that have ended, from its creation on."""
 
     def __init__(self):
         self._start, self._others, self.stages = self._now(), 0.0, {}
@@ -232,7 +240,7 @@ class _ProcessorClock:
         return seconds
 
     def end(self, stage: str, of_child: float = 0.0) -> None:
-        """A stage has ended, for which a child, which has not, took so many seconds."""
+        """Note that a stage has ended; `of_child` are its seconds in a child that goes on."""
         self._others += of_child
         self.stages[stage] = self.stages.get(stage, 0.0) + self.seconds() - sum(self.stages.values())
 
@@ -241,16 +249,17 @@ class _ProcessorClock:
 
 
 def _ours(options: RenderOptions, where: dict, clock: _ProcessorClock, progress) -> picture.Comparison:
-    """The direct light by the technique, with shadows."""
+    """The direct light by the technique, with shadows; without results where all of it is left to Cycles."""
     from ..blender.process import client
 
     tables = picture.load_tables(options.techniques)
     width, height = options.resolution or (None, None)
     most = options.sub_samples or (SUB_SAMPLES if options.budget is None else MOST_SUB_SAMPLES)
-    # Depth of field takes all points or none.
+    # Depth of field needs all of its points from the start.
     first = most if options.budget is None or most > MOST_SUB_SAMPLES else min(FIRST_SUB_SAMPLES, most)
     own = child_job(PictureOptions, options, passes=PASSES, sub_samples=most, shadows="on", cycles_samples=2)
     size = {"width": width, "height": height, "seconds": options.budget, "sub_samples": first}
+    size |= {"reserve": LAST_SECONDS / 1e6}
     size |= {"cycles_samples": 0, "for_finished": True, "edge_points": EDGE_POINTS}
     job = child_job(client.ExtractOptions, own, **where, **size)
     extraction = client.extract(job, progress=progress)
@@ -285,7 +294,7 @@ def _ours(options: RenderOptions, where: dict, clock: _ProcessorClock, progress)
 
 @dataclass(frozen=True)
 class _How:
-    """How direct light is made."""
+    """What direct light is made with."""
 
     options: RenderOptions
     own: PictureOptions
@@ -293,7 +302,7 @@ class _How:
     tracer: lighting.ShadowTracer
 
     def shadows(self, extraction, progress=None) -> lighting.Shadows:
-        """The shares of the lights that the samples see: points of a pixel that see about the same share their rays."""
+        """The shares of the lights that the samples see. Points of a pixel that see about the same have common rays."""
         samples, film, place = extraction.samples, extraction.film, slice(None)
         if not extraction.has_lens:
             samples, film, place = with_one_shadow(samples, film)
@@ -301,34 +310,45 @@ class _How:
         return self.tracer.trace(samples, ShadowSampling(PASSES, rays, film), progress=progress).take(place)
 
     def affordable(self, look, seconds: float | None, looked: float) -> tuple[int, str]:
-        """The points of a pixel that processor `seconds` allow (None: any), after a `look` at the first of them for
-        which it took `looked`; or why Cycles does better with that time."""
+        """How many points of a pixel processor `seconds` (None: without limit) allow, and ""; or 0, and why Cycles does
+        better with that time.
+
+        `look` has the first points, for which it took `looked` seconds.
+        """
         from ..blender.process import client
 
         points, most = look.film.sub_samples, self.own.sub_samples
         whole = client.with_points(look, points)
         if seconds is None or len(whole.samples) == 0:
             return points, ""
-        # Cycles will look at the scene about as long as was done here.
-        allowed, reason = DIRECT_SHARE * (seconds - look.direct_seconds), client.too_small(self.options.budget)
-        if allowed <= 0.0:
+        reason = client.too_small(self.options.budget)
+        # Cycles will look at the scene half as long as was done here, and render what shines in sight.
+        seconds -= 0.5 * look.direct_seconds + client.EDGE_SECONDS * look.film.width * look.film.height / 1e6
+        if seconds <= 0.0:
             return 0, reason
         one = np.count_nonzero(look.point == 0)
-        # Each point that a pixel gets beside its first makes about as many samples.
+        # All points of a pixel but the first make about equally many samples.
         counts = np.arange(1, max(points, most) + 1) if not look.has_lens else np.array([points])
         samples = one + (counts - 1) * (len(whole.samples) - one) / max(points - 1, 1)
-        again = np.where(counts > points, 0.5 * looked * (1.0 + counts / points), 0.0)
-        counts, samples, again = (each[again <= AGAIN_SHARE * seconds] for each in (counts, samples, again))
-        for share, power in PROBES:
-            number, took, thin = self._probe(whole, share)
-            fits = counts[again + took * (samples / number) ** power <= allowed]
-            if len(fits) == 0:
-                return 0, reason
+        again = np.where(counts > points, looked * (1.0 + counts / points), 0.0)
+        allowed = np.where(counts > points, MORE_SHARE, DIRECT_SHARE) * seconds - again
+        (some, least), (more, power) = PROBES
+        number, took, *_ = self._probe(whole, some)
+        if took * (samples[0] / number) ** least > allowed[0]:
+            return 0, reason
+        number, took, thin, share = self._probe(whole, more)
+        fits = counts[took * (samples / number) ** power <= share * allowed]
+        if len(fits) == 0:
+            return 0, reason
         return (0, client.TOO_THIN) if thin > THIN else (int(fits[-1]), "")
 
-    def _probe(self, extraction, share: float) -> tuple[int, float, float]:
-        """Of a few squares of the picture: how many samples there are, the processor seconds that they take, and by how
-        much of their light specular light differs from point to point of a pixel."""
+    def _probe(self, extraction, share: float) -> tuple[int, float, float, float]:
+        """Shades a few squares of the picture that have a `share` of its samples. Returns
+
+        - how many samples these are, and the processor seconds that they took,
+        - by how much specular light differs among the points of a pixel, relative to the light (root mean squares),
+        - the share of the light that is not too noisy.
+        """
         from ..blender.process import client
 
         film, start = extraction.film, time.process_time()
@@ -344,13 +364,19 @@ class _How:
         (technique, result), *_ = results.items()
         variance, _ = _of_points(part.film, _seen(part, result, "specular"))
         variance = variance[~part.kept.by_pass["specular"]].sum()
-        light = np.square(sum(images[technique, name].mean(axis=-1) for name in PASSES)).sum()
-        thin = float(np.sqrt(variance / light)) if light > 0.0 else 0.0
-        return int(np.count_nonzero(there)), time.process_time() - start, thin
+        light = {name: images[technique, name].mean(axis=-1) for name in PASSES}
+        whole, squared = sum(light.values()).sum(), np.square(sum(light.values())).sum()
+        number, took = int(np.count_nonzero(there)), time.process_time() - start
+        if not whole > 0.0:
+            return number, took, 0.0, 1.0
+        certain = sum((_certain(shadows, name) * light[name]).sum() for name in PASSES)
+        return number, took, float(np.sqrt(variance / squared)), float(certain / whole)
 
     def with_fine_edges(self, comparison: picture.Comparison, more: float, progress) -> picture.Comparison:
-        """The same with more points of the pixels that edges of diffuse light run through: those of shadows, and of
-        what is seen; at most `more` times as many as there are."""
+        """The same with more points for the pixels that edges of diffuse light run through, of shadows or of objects.
+
+        There are at most `more` times as many new samples as samples.
+        """
         extraction, film = comparison.extraction, comparison.film
         light = comparison.images[next(iter(comparison.results)), "diffuse"].mean(axis=-1)
         bend = (_bend(light) * _certain(comparison.shadows, "diffuse")).ravel()
@@ -373,8 +399,11 @@ class _How:
 
 
 def _numbers_of_points(bend: np.ndarray, covered: np.ndarray, most: float) -> np.ndarray:
-    """How many points (Q,) pixels get, by how much light bends there and what share of them is `covered` (Q,), at most
-    so many together: the error of an edge falls with their number to the power -0.75."""
+    """How many points pixels (Q,) get, at most `most` together, by how much the light bends there, `bend` (Q,).
+
+    `covered` (Q,) is the share of a pixel that has a surface. The error of an edge falls with the number of points to
+    the power -0.75.
+    """
     worth = bend**0.8
     least, largest = 0.0, EDGE_POINTS / max(worth.max(initial=0.0), 1e-30) * 1e3
     for _ in range(40):
@@ -385,25 +414,25 @@ def _numbers_of_points(bend: np.ndarray, covered: np.ndarray, most: float) -> np
 
 
 def _whole_numbers(wanted: np.ndarray) -> np.ndarray:
-    """At most EDGE_POINTS, 0 where it is too few."""
+    """The `wanted` numbers of points as integers: at most EDGE_POINTS, and 0 below FEWEST_POINTS."""
     return np.where(wanted >= FEWEST_POINTS, np.minimum(wanted, EDGE_POINTS), 0.0).astype(int)
 
 
 def _bend(light: np.ndarray) -> np.ndarray:
-    """How much (H, W) light bends from pixel to pixel, 0 where that is little of it."""
+    """How much `light` (H, W) bends from pixel to pixel, (H, W); 0 where that is below LEAST_BEND of the light."""
     grid, (height, width) = np.pad(light, 1, mode="edge"), light.shape
     rows = [grid[y : y + height, x : x + width] for y in range(3) for x in range(3)]
-    # Opposite neighbors of the nine.
+    # The pairs of opposite neighbors of a pixel.
     bend = np.max([np.abs(one + other - 2.0 * light) for one, other in zip(rows[:4], rows[:4:-1], strict=True)], axis=0)
     bend[bend < LEAST_BEND * _around(light, AROUND_EDGE)] = 0.0
     return bend
 
 
 def _rays(options: RenderOptions, extraction) -> int:
-    """At most so many shadow rays for a light and a pixel, as the options and the budget allow."""
+    """The most shadow rays for a light and a pixel, by the options and the budget."""
     if options.budget is None:
         return options.shadow_rays
-    # Lights of one name, such as the sides of a sky, share their rays.
+    # Lights of one name, such as the sides of a sky, have common rays.
     pairs = extraction.film.coverage().sum() * len({light.name for light in extraction.lights})
     affordable = SHADOWS_SHARE * options.budget / max(SOFT_SHARE * RAY_SECONDS * pairs, 1e-9)
     return int(np.clip(affordable, SHADOW_RAYS[0], options.shadow_rays))
@@ -415,53 +444,55 @@ class _Part:
 
     image: np.ndarray  # (H, W, 3), black elsewhere
     groups: dict[str, np.ndarray]  # the same by light group
-    is_taken: np.ndarray  # (H, W) bool
-    certain: np.ndarray  # (H, W) smooth share of Cycles' direct light that it takes the place of there
+    is_taken: np.ndarray  # (H, W) bool, where ours takes its place
+    certain: np.ndarray  # (H, W) the share of Cycles' direct light whose place it takes there, smooth
     light: np.ndarray  # (H, W, 3)
     color: np.ndarray  # (H, W, 3)
-    weight: np.ndarray | float = 1.0  # (H, W) beside the picture with Cycles' direct light in its place, denoised
+    weight: np.ndarray | float = 1.0  # (H, W) of ours; the rest of 1 is Cycles' direct light, denoised
 
     @property
     def share(self) -> np.ndarray:
-        """What share (H, W) of Cycles' direct light it takes the place of."""
+        """The share (H, W) of Cycles' direct light whose place it takes."""
         return np.where(self.is_taken, self.certain * self.weight, 0.0)
 
     @property
     def direct(self) -> np.ndarray:
-        """The share of Cycles' direct light (H, W, 3) that it takes the place of, or would where it does not."""
+        """Cycles' direct light (H, W, 3) whose place it takes, or would take where `is_taken` is false."""
         return _share_of(self.certain, self.light.astype(np.float64) * self.color)
 
     @property
     def replaced(self) -> np.ndarray:
-        """What of Cycles (H, W, 3) it takes the place of."""
+        """Cycles' direct light (H, W, 3) whose place it takes."""
         return np.where(self.is_taken[..., None], self.direct, 0.0)
 
     def share_of_group(self, group: str) -> np.ndarray:
-        """What share (H, W, 3) of it is the light of a light group."""
+        """The share (H, W, 3) of it that is light of a light group."""
         return np.divide(self.groups[group], self.image, out=np.zeros_like(self.image), where=self.image != 0.0)
 
 
 def _share_of(share: np.ndarray, image: np.ndarray) -> np.ndarray:
-    """A share (H, W) of an image (H, W, 3), black where it is 0, whatever is there."""
+    """`share` (H, W) times `image` (H, W, 3); 0 where the share is 0, even if the image is not finite there."""
     return np.where(share[..., None] > 0.0, share[..., None] * image, 0.0)
 
 
 def _certain(shadows: lighting.Shadows, name: str) -> np.ndarray:
-    """Share (H, W) of a pass that is not left to the denoiser for the noise of its shadows, smooth over the picture."""
+    """The share (H, W) of a pass that is kept in spite of the noise of its shadows, smooth over the picture."""
     light, variance = (_around(image) for image in (np.square(shadows.light[name]), shadows.variance[name]))
     noise = np.sqrt(np.divide(variance, light, out=np.zeros_like(light), where=light > 0.0))
     return _around(np.clip(2.0 - noise / MOST_NOISE, 0.0, 1.0))
 
 
 def _beside_points(film, radiance: np.ndarray, direct: np.ndarray) -> np.ndarray:
-    """The weight (H, W) of our `radiance` (P,) beside Cycles' own (H, W): 0 where its samples tell more.
+    """The weight (H, W) of our specular `radiance` (P,) beside Cycles' `direct` (H, W): 0 where its samples tell more.
 
-    Highlights thinner than a pixel need many. The variance of ours is that of the points of a pixel, by their number,
-    but for a slope, of which even few points find the mean; that of both is how much the pictures differ.
+    Highlights thinner than a pixel need many points. The variance of ours is that of the points of a pixel, divided by
+    their number. What a slope adds to it does not count: even few points find the mean of a slope. The variance of both
+    pictures together is their squared difference.
     """
     whole, (variance, mean) = film.image(radiance), _of_points(film, radiance)
     slope = sum(np.square(one) for one in np.gradient(mean)) if min(mean.shape) > 1 else 0.0
     variance = np.maximum(variance - SLOPE * slope, 0.0) / max(film.sub_samples - 1, 1)
+    variance /= 1.0 if film.spread is None else SHARED
     variance = _around(np.where(film.has_more(), 0.0, variance))
     both = _around(np.square(direct.astype(np.float64) - whole))
     share = np.divide(variance, both, out=np.zeros_like(both), where=both > 0.0)
@@ -470,7 +501,7 @@ def _beside_points(film, radiance: np.ndarray, direct: np.ndarray) -> np.ndarray
 
 
 def _of_points(film, radiance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Variance and mean (H, W) of the `radiance` (P,) of the points of each pixel."""
+    """The variance and the mean (H, W) of the `radiance` (P,) of the points of each pixel."""
     hits = film.unspread()
     if film.first is not None:
         radiance, hits = np.bincount(np.cumsum(film.first) - 1, radiance), hits.take(film.first)
@@ -479,12 +510,12 @@ def _of_points(film, radiance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _seen(extraction, result, name: str) -> np.ndarray:
-    """The light (P,) of a pass, of all lights and colors, that the samples show."""
+    """The exposed radiance (P,) of a pass: the sum over light groups, the mean over color channels."""
     return extraction.exposure * getattr(result.shading, name).sum(axis=0).mean(axis=-1)
 
 
 def _around(image: np.ndarray, around: int = AROUND) -> np.ndarray:
-    """Means (H, W) over squares of 2 `around` + 1 pixels."""
+    """Means (H, W) over squares with sides of 2 `around` + 1 pixels."""
     side = 2 * around + 1
     sums = np.pad(image, ((around + 1, around), (around + 1, around)), mode="edge").cumsum(axis=0).cumsum(axis=1)
     whole = sums[side:, side:] - sums[:-side, side:] - sums[side:, :-side] + sums[:-side, :-side]
@@ -492,8 +523,10 @@ def _around(image: np.ndarray, around: int = AROUND) -> np.ndarray:
 
 
 def _beside(ours: np.ndarray, direct: np.ndarray) -> np.ndarray:
-    """The weight (H, W) of a pass of ours (H, W, 3) beside Cycles' own: half of it at edges, but where much more than
-    those is between both, which is noise of Cycles."""
+    """The weight (H, W) of a pass of ours (H, W, 3) beside Cycles' own: 1 away from edges, down to 1/2 at edges.
+
+    Where both differ by much more than an edge explains, the difference is noise of Cycles, and the weight is near 1.
+    """
     bend = _bend(ours.mean(axis=-1))
     between = _around(np.square((ours - direct).mean(axis=-1)), AROUND_EDGE)
     edge = _around(np.square(EDGE_ERROR * bend), AROUND_EDGE)
@@ -501,7 +534,7 @@ def _beside(ours: np.ndarray, direct: np.ndarray) -> np.ndarray:
 
 
 def _taken(comparison: picture.Comparison, cycles, is_denoised: bool) -> dict[str, _Part]:
-    """Ours by pass; where all else is denoised, what is too noisy is left to that."""
+    """Ours by pass. Where Cycles' part is denoised, what is too noisy of ours is left to it."""
     kept, found = comparison.extraction.kept, {}
     shape = comparison.film.height, comparison.film.width
     keeps_all = bool(cycles.everything or kept.everything)
@@ -512,7 +545,7 @@ def _taken(comparison: picture.Comparison, cycles, is_denoised: bool) -> dict[st
         light, color = (read_layer(cycles.channels, cycles.names[key], "RGB") for key in (light, color))
         if result is not None and not keeps_all:
             is_taken = ~kept.by_pass[name]
-            # With depth of field ours is denoised as well.
+            # With depth of field ours is denoised too, so its noise does not matter.
             if is_denoised and not comparison.extraction.has_lens:
                 certain = _certain(comparison.shadows, name)
             image = comparison.images[next(iter(comparison.results)), name]
@@ -535,22 +568,28 @@ def _taken(comparison: picture.Comparison, cycles, is_denoised: bool) -> dict[st
 def _rest(
     cycles, ours: dict[str, _Part], extraction, denoise: str, progress
 ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray], str, list[str]]:
-    """What is not ours (H, W, 4), denoised; of that Cycles' diffuse light at edges (H, W, 3); all of it by light group,
-    and by "" of what is in none; the name of the denoiser ("" for none), and what was wrong with it."""
+    """What is not ours, denoised. Returns
+
+    - all of it (H, W, 4),
+    - the part of it that is Cycles' direct diffuse light at edges (H, W, 3),
+    - all of it by light group, with "" for what is in none,
+    - the name of the denoiser, "" for none, and what was wrong with it.
+    """
     from ..blender.process.blender_process import denoiser_libraries
 
     if progress is not None and progress("denoise", 0.0) is False:
         raise Cancelled("stopped before the picture was denoised")
     rest, is_noisy = read_layer(cycles.channels, "Combined", "RGBA").astype(np.float64), extraction.has_lens
     shining = _shining(cycles, extraction)
-    # Second, with the diffuse light of Cycles, of which edges have a part.
+    # Once without and once with Cycles' direct diffuse light, of which edges need a part.
     taken = np.stack([ours["specular"].is_taken, ours["diffuse"].is_taken, shining.is_taken], axis=-1)
     taken = np.stack([taken, taken & [True, np.ndim(ours["diffuse"].weight) == 0, True]])
     ways, way = np.unique(taken.reshape(-1, taken.shape[-1]), axis=0, return_inverse=True)
     groups = sorted(
         {key.rpartition(".")[0].removeprefix(OF_GROUP) for key in cycles.channels if key.startswith(OF_GROUP)}
     )
-    # Each way to take passes for the whole picture: denoised together, one would bleed into another at its borders.
+    # Each combination of passes that are ours is denoised for the whole picture: in one picture, they would bleed into
+    # each other at their borders.
     found = [_without_taken(rest[..., :3], [*ours.values(), shining], one, is_noisy) for one in ways]
     found += [_rest_of_group(cycles, ours, group) for group in groups]
     name, problems = "", []
@@ -564,7 +603,7 @@ def _rest(
     without, within = np.choose(way.reshape(taken.shape[:3])[..., None], found[: len(ways)])
     left = (1.0 - np.broadcast_to(ours["diffuse"].weight, without.shape[:2]))[..., None] * (within - without)
     rest[..., :3] = without + left + shining.image
-    # What of ours went through the denoiser too.
+    # With depth of field ours went through the denoiser too.
     rest[..., :3] -= sum(part.image for part in ours.values()) if is_noisy else 0.0
     of_groups = dict(zip(groups, found[len(ways) :], strict=True))
     for group in of_groups.keys() & ours["diffuse"].groups.keys():
@@ -573,7 +612,8 @@ def _rest(
 
 
 def _shining(cycles, extraction) -> _Part:
-    """What shines in sight, where no noise is in the way of it: that of surfaces that some light passes."""
+    """What shines in sight, on the pixels where it can stay out of the denoiser: not behind surfaces that light passes,
+    where it is noisy."""
     names = {key: cycles.names[key] for key in cycles.shining}
     own = sum((read_layer(cycles.channels, name, "RGB") for name in names.values()), np.zeros((1, 1, 3)))
     kept = extraction.kept
@@ -586,8 +626,8 @@ def _shining(cycles, extraction) -> _Part:
 
 
 def _without_taken(combined: np.ndarray, parts: list[_Part], way: np.ndarray, is_noisy: bool) -> np.ndarray:
-    """Cycles' picture (H, W, 3) without its light of the `parts` that are taken one `way`, on all pixels; with
-    ours in its place, where that is noisy and there."""
+    """Cycles' picture (H, W, 3) without its light of those of the `parts` that `way` names, on all pixels; where
+    ours `is_noisy`, with ours in its place."""
     left = combined.copy()
     for part, is_taken in zip(parts, way, strict=True):
         if is_taken and is_noisy:
@@ -598,7 +638,7 @@ def _without_taken(combined: np.ndarray, parts: list[_Part], way: np.ndarray, is
 
 
 def _rest_of_group(cycles, ours: dict[str, _Part], group: str) -> np.ndarray:
-    """What is not ours (H, W, 3) of the light of a light group."""
+    """The light (H, W, 3) of a light group that is not ours."""
     found = read_layer(cycles.channels, f"{OF_GROUP}{group}", "RGB").astype(np.float64)
     for part in ours.values():
         if group in part.groups:
@@ -607,7 +647,7 @@ def _rest_of_group(cycles, ours: dict[str, _Part], group: str) -> np.ndarray:
 
 
 def _shared_out(rest: np.ndarray, groups: dict[str, np.ndarray], is_clean: bool) -> dict[str, np.ndarray]:
-    """`groups` (H, W, 3), and by "" what they leave of `rest` (H, W, 4): of what is clean never more than there is."""
+    """`groups` (H, W, 3), and as "" what they leave of `rest` (H, W, 4); of one that `is_clean` no more than all."""
     if is_clean and groups:
         whole = np.maximum(sum(groups.values()), 1e-30)
         groups = {name: one * np.clip(rest[..., :3] / whole, 0.0, 1.0) for name, one in groups.items()}
@@ -618,7 +658,8 @@ def _shared_out(rest: np.ndarray, groups: dict[str, np.ndarray], is_clean: bool)
 
 
 def _kept(ours: dict[str, _Part], rests: dict[str, np.ndarray], of_edges: np.ndarray) -> dict:
-    """`rest`, `taken` and `edges` of a KeptPicture: Cycles' part of an edge depends on the lights as ours does."""
+    """`rest`, `taken` and `edges` of a KeptPicture. Cycles' part of an edge is kept as a factor of our light, so that
+    it changes with the lights as ours does."""
     taken = {name: np.where(part.is_taken, part.certain, 0.0) for name, part in ours.items()}
     part = ours["diffuse"]
     if np.ndim(part.weight) == 0:
@@ -626,7 +667,7 @@ def _kept(ours: dict[str, _Part], rests: dict[str, np.ndarray], of_edges: np.nda
     light = part.image.mean(axis=-1)
     more = np.divide(of_edges.mean(axis=-1), light, out=np.zeros_like(light), where=light > 0.0)
     more = np.clip(more, 0.0, MOST_OF_EDGE)
-    # What is left in the rest stays as it is: of other colors, or where ours is dark.
+    # What this factor cannot hold stays in the rest: light of other colors, and light where ours is dark.
     of_lights, rest = more[..., None] * part.image, {group: one.copy() for group, one in rests.items()}
     for group in rest.keys() & part.groups.keys() - {""}:
         own = part.share_of_group(group) * of_lights
@@ -637,7 +678,7 @@ def _kept(ours: dict[str, _Part], rests: dict[str, np.ndarray], of_edges: np.nda
 
 
 def _layers(comparison: picture.Comparison, ours: dict[str, _Part]) -> dict[str, np.ndarray]:
-    """Ours by the names of layers, also by light group where there are several."""
+    """Ours by the names of the layers, and also by light group where there are several."""
     if not comparison.results:
         return {}
     name, layers = next(iter(comparison.results)), {}
@@ -652,7 +693,7 @@ def _layers(comparison: picture.Comparison, ours: dict[str, _Part]) -> dict[str,
 
 
 def _replaced(cycles, ours: dict[str, _Part], rests: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The channels of Cycles, but for its noisy Combined, with ours in place of its direct light."""
+    """Cycles' channels with ours in place of its direct light, without its noisy Combined."""
     channels = {name: plane for name, plane in cycles.channels.items() if not name.startswith("Combined.")}
     for name, (light, _) in DIRECT.items():
         part = ours[name]
@@ -668,7 +709,7 @@ def _replaced(cycles, ours: dict[str, _Part], rests: dict[str, np.ndarray]) -> d
 
 
 def _report(comparison: picture.Comparison, cycles, ours: dict[str, _Part], problems: list[str]) -> dict:
-    """That of a picture, and under "finished" what came from where."""
+    """The report of a picture, and under "finished" what is ours and what is Cycles'."""
     kept = comparison.extraction.kept
     everything = [*cycles.everything, *kept.everything]
     warnings = [*cycles.warnings, *kept.warnings, *problems]
@@ -714,7 +755,7 @@ def _write_exr(path: Path, made: Finished, options: RenderOptions) -> None:
 
 
 def summary(report: dict, seconds: dict) -> list[str]:
-    """What one picture is made of, and how long it took."""
+    """Lines about what a picture is made of, and how long it took."""
     found, (width, height) = report["finished"], report["resolution"]
     shares = ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in found["share_of_ours"].items())
     took = f", {seconds['processor']['total']:.1f} s of processor time" if "processor" in seconds else ""
@@ -727,5 +768,5 @@ def summary(report: dict, seconds: dict) -> list[str]:
 
 
 def brief(report: dict) -> list[str]:
-    """A line for one picture of several."""
+    """The line for one of several pictures."""
     return [f"{report['name']:<32} frame {report['frame']}, camera {report['camera']}"]

@@ -1,4 +1,4 @@
-"""Tasks of a job: names of their files, shards, records of what is done."""
+"""Tasks of a job: the names of their files, shards, and records of finished tasks."""
 
 from __future__ import annotations
 
@@ -20,9 +20,10 @@ from .options import what_matters
 
 FOLDER = ".ltsh"
 FORMAT = 1
-# In bytes: file names have at most 255, with what is added to them.
+# Limits in bytes: of a stem from a name in the scene, and of a part of a path. File systems allow 255, suffixes
+# included.
 LONGEST_STEM, LONGEST_NAME = 100, 200
-# What documents must have (see `reading.check`).
+# Shapes that documents must have (see `reading.check`).
 _TASK = {
     **dict.fromkeys(("scene", "key"), str),
     **dict.fromkeys(("camera", "object"), str | None),
@@ -50,23 +51,18 @@ _digests: dict[tuple, str] = {}
 
 @dataclass(frozen=True)
 class Job:
-    """What is to be done: one command for every combination of scene, camera, frame (and object of a bake).
-
-    `options` are PictureOptions, BakeOptions, ViewOptions or RenderOptions, of which scene, camera, frame and name are
-    set for each task. No cameras or frames means those of the file. `name` is a pattern of names of files, None the
-    default one.
-    """
+    """One command for every combination of scene, camera and frame (and object of a bake)."""
 
     command: str  # "shade", "compare", "bake", "view" or "render"
-    options: Any
+    options: Any  # Picture-, Bake-, View- or RenderOptions; each task sets its own scene, camera, frame and name
     scenes: tuple[Path, ...]
-    cameras: tuple[str, ...] = ()
-    frames: tuple[int, ...] = ()
-    name: str | None = None
+    cameras: tuple[str, ...] = ()  # empty: the camera of the file
+    frames: tuple[int, ...] = ()  # empty: the frame of the file
+    name: str | None = None  # pattern of file names; None: the default
 
     @property
     def single(self) -> bool:
-        """True where all is one picture or one bake of some objects."""
+        """True where the job is one picture, or one bake of some objects."""
         return len(self.scenes) * max(len(self.cameras), 1) * max(len(self.frames), 1) == 1
 
     @property
@@ -80,17 +76,14 @@ class Job:
 
 @dataclass(frozen=True)
 class Task:
-    """One picture, or one object of a bake, or of that one of several UDIM tiles.
-
-    `name` is the stem of its files, below the output folder.
-    """
+    """One picture, one object of a bake, or one of several UDIM tiles of such an object."""
 
     scene: str
     camera: str | None
     frame: int | None
     object: str | None
-    name: str
-    key: str
+    name: str  # stem of its files, below the output folder
+    key: str  # digest of all that its results depend on, see `options_digest`
     tile: int | None = None
 
     @property
@@ -100,7 +93,7 @@ class Task:
 
     @property
     def unit(self) -> tuple:
-        """What the objects of a bake have in common."""
+        """Scene, camera and frame: the same for all objects of one bake."""
         return self.scene, self.camera, self.frame
 
     def options(self, job: Job) -> Any:
@@ -114,11 +107,11 @@ class Task:
 
 
 class NameClash(ValueError):
-    """Tasks cannot have the names that they would get."""
+    """Several tasks would get the same name, or one gets a name that is too long."""
 
 
 def tasks_of(job: Job, progress=None) -> list[Task]:
-    """All tasks of `job`. Opens the files in Blender where tasks or names depend on what is in them.
+    """All tasks of `job`. Opens the files in Blender if tasks or names depend on their contents.
 
     Raises NameClash where two tasks would write the same file, or a name is too long, SceneError, OSError.
     """
@@ -144,13 +137,13 @@ def tasks_of(job: Job, progress=None) -> list[Task]:
 
 
 def shard_of(tasks: list[Task], shard: tuple[int, int]) -> list[Task]:
-    """The tasks of shard (I, N), I from 1 to N: every N-th."""
+    """Every N-th of the tasks, from number I on: shard (I, N), I from 1 to N."""
     number, count = shard
     return tasks[number - 1 :: count]
 
 
 def _facts(job, scene, progress) -> list[dict]:
-    """What the file says, per frame: camera, frame and objects; empty where nothing of it is needed."""
+    """Facts of the file per frame: camera, frame, objects and tiles. Empty dicts where none are needed."""
     from ..blender.process import client
 
     fields = fields_of(job.pattern)
@@ -163,7 +156,7 @@ def _facts(job, scene, progress) -> list[dict]:
 
 
 def _tasks(job, unit, fields, facts, contents) -> list[Task]:
-    """The tasks of one scene, camera and frame: one for each of the objects of a bake, or of their UDIM tiles."""
+    """The tasks of one scene, camera and frame: one picture, or one per object or UDIM tile of a bake."""
     scene, camera, frame = unit
     key = options_digest(job.command, replace(job.options, scene=Path(scene), camera=camera, frame=frame), contents)
     if job.command != "bake":
@@ -193,7 +186,7 @@ def _check_names(job, tasks) -> None:
 
 
 def file_stems(names: Iterable[str]) -> list[str]:
-    """A file name for each of `names`: only letters that every file system takes, each once, in any case."""
+    """A file name for each of `names`: valid on every file system, and unique even if case is ignored."""
     stems, taken = [], set()
     for name in names:
         stem = "".join(letter if letter.isalnum() or letter in " -_" else "_" for letter in name).strip() or "object"
@@ -208,27 +201,27 @@ def file_stems(names: Iterable[str]) -> list[str]:
 
 
 def fields_of(pattern: str) -> set[str]:
-    """The fields that a pattern has."""
+    """The names of the fields of a pattern."""
     return {name for _, name, _, _ in string.Formatter().parse(pattern) if name}
 
 
 def default_pattern(first: str, varying: Iterable[str]) -> str:
-    """`first` alone, or followed by the fields of which there are several: compare, compare_{frame:04d}."""
+    """The pattern `first`, followed by the `varying` fields: compare, or compare_{frame:04d}."""
     parts = {"scene": "{scene}", "camera": "{camera}", "frame": "{frame:04d}"}
     return "_".join([first, *(text for name, text in parts.items() if name in set(varying))])
 
 
 class Records:
-    """Records of one kind ("tasks", "tiles") in the folder `output`; `shape` is that of their "task" and "report"."""
+    """Records of one kind ("tasks", "tiles") in the folder `output`; `shape` is the shape of "task" and "report"."""
 
     def __init__(self, output: Path, kind: str, shape: dict):
         self.output, self._folder = Path(output), Path(output) / FOLDER / kind
         self._shape = {**_RECORD, **shape}
 
     def write(self, name: str, key: str, task: dict, files: Iterable[str], **found) -> dict:
-        """Write the record `name`: the task's `files`, by names below the folder, are there; returns it.
+        """Write the record `name` of a task that has finished, and return it.
 
-        What was `found` is stored with it, "report" or "problem".
+        `files` are the names of its files below the output folder, `found` its "report" or "problem".
         """
         digests = {}
         for file in sorted(files):
@@ -236,7 +229,7 @@ class Records:
             digests[file] = {"bytes": path.stat().st_size, "sha256": file_digest(path)}
         record = {"format": FORMAT, "key": key, "task": task, "files": digests, **found}
         write_record(self._path(name), record)
-        # As it will be read: numbers and letters are what JSON makes of them.
+        # Returned as it will be read: JSON may change the types of values.
         return json.loads(self._path(name).read_text(encoding="utf-8"))
 
     def whole(self, name: str, key: str | None) -> dict | None:
@@ -249,7 +242,7 @@ class Records:
     def has_files(self, record: dict) -> bool:
         """True where the files are there, with the sizes and digests of the record."""
         try:
-            # A pipe or a device may be as large as it likes, and endless.
+            # `is_file` first: reading a pipe or a device may never end.
             return all(
                 (path := self.output / file).is_file()
                 and path.stat().st_size == facts["bytes"]
@@ -264,7 +257,7 @@ class Records:
         if stems is None:
             paths = sorted(self._folder.rglob("*.json"))
         else:
-            # A name may hold anything that a pattern would take for more.
+            # Names may contain wildcards.
             found = (self._path(stem).parent.glob(f"{escape(PurePath(stem).name)}.*.json") for stem in stems)
             paths = sorted(path for group in found for path in group)
         records = map(self._read, paths)
@@ -282,7 +275,7 @@ class Records:
 
 
 def write_record(path: Path, document: dict) -> None:
-    """Write `document` into a folder that is made if need be."""
+    """Write `document` as JSON; creates the folder if needed."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_json(path, document)
 
@@ -297,7 +290,7 @@ def read_document(path: Path, shape: dict) -> dict:
 
 
 def options_digest(command: str, options, contents: str) -> str:
-    """Digest of the options of a task on which its results depend, the version and `contents_digest`."""
+    """Digest of all that the results of a task depend on: version, command, options that matter, `contents`."""
     found = [VERSION, command, what_matters(options), contents]
     return hashlib.sha256(json.dumps(found, sort_keys=True, default=str).encode()).hexdigest()
 
@@ -309,7 +302,7 @@ def contents_digest(options) -> str:
 
 
 def _known_digest(path: Path) -> str:
-    """`file_digest`, computed again only where the file has changed: it is asked for every object of a bake."""
+    """`file_digest`, cached until the file changes, because every object of a bake asks for it."""
     status = path.stat()
     key = str(path.absolute()), status.st_mtime_ns, status.st_size, status.st_ino
     if key not in _digests:

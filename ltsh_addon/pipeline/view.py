@@ -15,16 +15,15 @@ from ..scene import SHIPPED_TABLES, VERSION, Cancelled, Progress
 from . import picture
 from .options import ViewOptions, child_job
 
-# Of a report, with the seconds of a task: its own names for them.
+# Names of times in a report, and in the seconds of a task.
 TIMES = {"draw_s": "draw", "refined_s": "refined"}
 
 
 def draw_view(options: ViewOptions, progress: Progress | None = None) -> picture.TaskResult:
     """Draw a scene as the viewport does and write its EXR and PNG.
 
-    The seconds have "draw", the median of a redraw with the first technique and without rays, "shadows", of all rays,
-    and "refined", of as many redraws as are asked for and of the rays.
-    Raises SceneError, TableError, OSError, Cancelled.
+    The seconds have "draw": the median of a redraw with the first technique, without rays; "shadows": all rays; and
+    "refined": all `refine` redraws and the rays. Raises SceneError, TableError, OSError, Cancelled.
     """
     from ..blender.process import client
 
@@ -75,7 +74,7 @@ def draw_view(options: ViewOptions, progress: Progress | None = None) -> picture
 
 
 def _report(options: ViewOptions, tables, manifest: dict, coverage: np.ndarray) -> dict:
-    """The report as of a picture, as far as a view has what that tells."""
+    """The report of a view: the entries of a picture's report that a view has, and "graphics"."""
     return {
         "scene": str(options.scene),
         "camera": manifest["camera"],
@@ -103,12 +102,12 @@ def _report(options: ViewOptions, tables, manifest: dict, coverage: np.ndarray) 
 
 
 def _shadow_facts(found: dict | None) -> dict | None:
-    """What a report tells of shadows."""
+    """The entry of the report about shadows."""
     return None if found is None else {name: found[name] for name in ("rays", "noise", "tracer")}
 
 
 def with_times(report: dict, seconds: dict) -> dict:
-    """The report of one view, or of several, with "draw_s" and "refined_s" of each; `seconds` are as of `merge`."""
+    """The report of one view or of several, with "draw_s" and "refined_s" of each; `seconds` are those of `merge`."""
     if "reports" not in report:
         return {**report, **_times(seconds)}
     reports = [{**one, **_times(seconds.get(one["name"], {}))} for one in report["reports"]]
@@ -121,7 +120,7 @@ def _times(seconds: dict) -> dict:
 
 
 def summary(report: dict, seconds: dict) -> list[str]:
-    """A line of one view."""
+    """One line about a view."""
     times = _times(seconds)
     took = (
         f": a redraw {times['draw_s']:.3f} s, all of {report['sub_samples']} {times['refined_s']:.2f} s"
@@ -132,5 +131,5 @@ def summary(report: dict, seconds: dict) -> list[str]:
 
 
 def brief(report: dict) -> list[str]:
-    """A line for one view of several."""
+    """One line about a view of several."""
     return [f"{report['name']:<32} frame {report['frame']}, camera {report['camera']}"]

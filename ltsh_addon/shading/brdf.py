@@ -1,18 +1,20 @@
 """GGX microfacet reflection and Fresnel curves, in the local frame (see the package's conventions).
 
-Anisotropic GGX, exactly, in the space of stretched half vectors.
+Anisotropic GGX is exact in the space of stretched half vectors.
 
-A surface with alpha_x along a tangent and alpha_y across it is the one of alpha = 1, stretched (Heitz 2014). So is its
-half vector h: with h' along (h_x / alpha_x, h_y / alpha_y, h_z) the lobe BRDF times cosine is, per solid angle of h',
+A surface with alpha_x along a tangent and alpha_y across it is a stretched surface of alpha = 1 (Heitz 2014). Its half
+vector h is stretched in the same way: let h' be along (h_x / alpha_x, h_y / alpha_y, h_z). Then the lobe, BRDF times
+cosine, per solid angle of h' is
 
-    P(h') = 2 mu_i (o'.h') / (pi (mu_o S_i + mu_i S_o)),  o' = (alpha_x o_x, alpha_y o_y, o_z), S_o = |o'|,
+    P(h') = 2 mu_i (o'.h') / (pi (mu_o S_i + mu_i S_o)),  o' = (alpha_x o_x, alpha_y o_y, o_z), S_o = |o'|.
 
-S_i likewise, o the view and i its mirror image at h. That is a smooth function on the hemisphere, however narrow and
-long the lobe is: a linear one, visible normals, times masking. The edges of a light become arcs of conics in h'.
+S_i is defined likewise; o is the view and i its mirror image at h. P is a smooth function on the hemisphere, however
+narrow and long the lobe is: a linear function (visible normals) times masking. The edges of a light become arcs of
+conics in h'.
 
-In the frame of the view h' is along (h_x, v h_x + u h_y, a h_z) with u = k^2 cos^2(phi) + sin^2(phi) / k^2,
-v = (k^2 - 1 / k^2) cos(phi) sin(phi), a = roughness^2 sqrt(u); phi is the azimuth of the view from the tangent and
-k = 1 / (1 - anisotropy). It is turned so that o' has y = 0. Isotropic lobes have u = 1, v = 0.
+In the frame of the view, h' is along (h_x, v h_x + u h_y, a h_z), where u = k^2 cos^2(phi) + sin^2(phi) / k^2,
+v = (k^2 - 1 / k^2) cos(phi) sin(phi) and a = roughness^2 sqrt(u). Here phi is the azimuth of the view from the tangent
+and k = 1 / (1 - anisotropy). The frame of h' is turned so that o' has y = 0. Isotropic lobes have u = 1 and v = 0.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ import numpy as np
 from .lookup_table import MIN_ALPHA
 from .polygon import dot, project_to_sphere
 
-# Arcs of conics are cut in two until they turn by at most so many radians, or so often.
+# Arcs of conics are halved until they turn by at most LONGEST_ARC, in rad, but at most MOST_HALVINGS times.
 LONGEST_ARC, MOST_HALVINGS = 0.8, 14
 
 
@@ -33,7 +35,7 @@ def ggx_brdf_cosine(cos_theta_o, alpha, directions):
 
     cos_theta_o (...), alpha = roughness^2 (...), directions (..., S, 3) unit -> (..., S). Height-correlated Smith
     masking-shadowing (Heitz 2014, "Understanding the Masking-Shadowing Function", eq. 99; Walter et al. 2007, eq. 33).
-    Written with S(mu) = sqrt(mu^2 + alpha^2 (1 - mu^2)), so that nothing is divided by a vanishing cosine:
+    Written with S(mu) = sqrt(mu^2 + alpha^2 (1 - mu^2)), nothing is divided by a vanishing cosine:
     f cos = D(h) mu_i / (2 (mu_o S(mu_i) + mu_i S(mu_o))).
     """
     mu_o = np.asarray(cos_theta_o)[..., None]
@@ -62,10 +64,10 @@ def ggx_distribution(horizontal, vertical, alpha_squared):
 
 
 def visible_normal_density(cos_theta_o, horizontal, vertical, alpha_squared):
-    """Density in sr^-1 with which directions are chosen by reflection at visible normals: G1(o) D(h) / (4 cos theta_o).
+    """Density in sr^-1 of directions chosen by reflection at visible normals: G1(o) D(h) / (4 cos theta_o).
 
-    Heitz 2018, "Sampling the GGX Distribution of Visible Normals", eq. 17 and 18; cos_theta_o > 0, the half vectors as
-    for `ggx_distribution`; broadcasts.
+    Heitz 2018, "Sampling the GGX Distribution of Visible Normals", eq. 17 and 18. cos_theta_o > 0; half vectors are
+    given as for `ggx_distribution`; broadcasts.
     """
     distribution = ggx_distribution(horizontal, vertical, alpha_squared)
     return distribution / (2.0 * (cos_theta_o + _slope_length(cos_theta_o, alpha_squared)))
@@ -91,25 +93,25 @@ def schlick_curve(cosine):
 
 
 def f82_reflectance(cosine, f0, f90, dip):
-    """f0 + (f90 - f0) (1 - c)^5 - dip c (1 - c)^6, which may be negative; broadcasts."""
+    """f0 + (f90 - f0) (1 - c)^5 - dip c (1 - c)^6, not clipped at 0; broadcasts."""
     return f0 + schlick_curve(cosine) * (f90 - f0 - dip * cosine * (1.0 - cosine))
 
 
-# Of c (1 - c)^6 on [0, 1], rounded up.
+# Maximum of c (1 - c)^6 on [0, 1], rounded up.
 MOST_OF_DIP = 0.0567
 
 
 def clipped_metals(samples):
-    """Mask (P,) of the samples that are F82 metals alone, and clipped at 0 where their reflectance falls below."""
+    """Mask (P,) of the samples that are F82 metals without a dielectric and whose reflectance is clipped at 0."""
     if not samples.specular_dip.any():
         return np.zeros(len(samples), bool)
     return is_clipped(samples.specular_f0, samples.specular_f90, samples.specular_dip) & ~samples.dielectric.any(axis=1)
 
 
 def is_clipped(f0, f90, dip):
-    """Where (P,) the reflectance of F82 metals, each (P, 3), falls below 0 at some angle."""
+    """Mask (P,) of the F82 metals, each (P, 3), whose reflectance falls below 0 at some angle."""
     found = np.zeros(len(f0), bool)
-    # What the dip takes away can bring only these below 0: the angles of the others need not be tried.
+    # The dip cannot bring other metals below 0, so their angles need not be tried.
     may_fall = np.minimum(f0, f90) < MOST_OF_DIP * np.maximum(dip, 0.0)
     at = np.nonzero((dip > 0.0).any(axis=-1) & may_fall.any(axis=-1))[0]
     cosines = np.linspace(0.0, 1.0, 33)[:, None, None]
@@ -119,8 +121,8 @@ def is_clipped(f0, f90, dip):
 
 
 def dielectric_reflectance(cosine, ior):
-    """Exact unpolarized Fresnel reflectance of a dielectric of relative `ior`, with total reflection below 1;
-    broadcasts."""
+    """Exact unpolarized Fresnel reflectance of a dielectric of relative `ior`. If that is below 1, there is total
+    reflection. Broadcasts."""
     cosine = np.asarray(cosine)
     g = np.sqrt(np.maximum(ior * ior - 1.0 + cosine * cosine, 0.0))
     total, found = g + cosine, g - cosine
@@ -135,9 +137,9 @@ def dielectric_reflectance(cosine, ior):
 
 
 def stretch(x, y, anisotropy):
-    """u and v of the module's docstring for tangents with coordinates x and y along the local frame, of any length."""
+    """u and v of the module's docstring, for tangents with coordinates x and y in the local frame, of any length."""
     squared = x * x + y * y
-    # Without a tangent there is no direction to be stretched in.
+    # Without a tangent there is no stretching.
     flat = squared <= 1e-12
     squared, share = np.where(flat, 1.0, squared), np.square(1.0 / (1.0 - anisotropy))
     across = np.where(flat, 1.0, (share * x * x + y * y / share) / squared)
@@ -147,7 +149,7 @@ def stretch(x, y, anisotropy):
 
 @dataclass(frozen=True)
 class HalfVectors:
-    """How directions in the local frames of P samples become stretched half vectors."""
+    """The map from directions in the local frames of P samples to stretched half vectors."""
 
     sine: np.ndarray  # (P,) of theta_o
     cosine: np.ndarray  # (P,)
@@ -157,7 +159,7 @@ class HalfVectors:
 
     @classmethod
     def of(cls, samples, frame, cosine) -> HalfVectors:
-        """Those of SurfaceSamples (P) in local frames (3, 3, P): rows tangent, bitangent, normal."""
+        """For SurfaceSamples (P) in local frames (3, 3, P): rows tangent, bitangent, normal."""
         x, y = (sum(row[axis] * samples.tangent[:, axis] for axis in range(3)) for row in frame[:2])
         across, along = stretch(x, y, samples.anisotropy)
         alpha = np.maximum(samples.roughness**2 * np.sqrt(across), MIN_ALPHA)
@@ -165,7 +167,7 @@ class HalfVectors:
         return cls(np.sqrt(1.0 - cosine * cosine), cosine, alpha, across, along)
 
     def take(self, index) -> HalfVectors:
-        """Those of the samples `index`."""
+        """For the samples `index`."""
         values = self.sine, self.cosine, self.alpha, self.across, self.along
         return HalfVectors(*(value[index] for value in values))
 
@@ -175,15 +177,15 @@ class HalfVectors:
         return HalfVectors(*(value.astype(dtype) for value in values))
 
     def to_original_domain(self, vectors: np.ndarray, length=None) -> np.ndarray:
-        """Stretched half vectors (3, ..., P), of any length, for vectors (3, ..., P) in local frames; `length` is that
-        of the vectors, where it is known."""
+        """Stretched half vectors (3, ..., P), of any length, of vectors (3, ..., P) in local frames. `length` is that
+        of the vectors, if it is known."""
         x, y, z = vectors
         length = np.sqrt(dot(vectors, vectors)) if length is None else length
         x = x + length * self.sine
         return np.stack([x, self.along * x + self.across * y, self.alpha * (z + length * self.cosine)])
 
     def lobe(self, stretched):
-        """P (...) at unit stretched half vectors [x, y, z] (..., P), the cosine (...) of the half angle, and the unit
+        """For unit stretched half vectors [x, y, z] (..., P): P (...), the cosine (...) of the half angle, and the unit
         directions [x, y, z]."""
         x, y, z = stretched
         up, turn, side = 1.0 / self.alpha, 1.0 / self.across, self.along / self.across
@@ -206,18 +208,18 @@ class HalfBoundary:
 
         (1 - s)^2 first + 2 s (1 - s) middle + s^2 last,  0 <= s <= 1,  up to the length of vectors.
 
-    A great circle is such a conic, and so are the half vectors of its directions and their linear image."""
+    A great circle is such a conic. The half vectors of its directions form one too, and so does their linear image."""
 
     halves: HalfVectors  # (P,)
     first: np.ndarray  # (3, A) unit
     middle: np.ndarray  # (3, A)
     last: np.ndarray  # (3, A) unit
-    owner: np.ndarray  # (A,) the polygon of each
-    encloses: np.ndarray  # (P,) is e_z, the mirrored view, inside?
+    owner: np.ndarray  # (A,) number of the polygon
+    encloses: np.ndarray  # (P,) True if e_z, the mirrored view, is inside
 
     @classmethod
     def of(cls, halves: HalfVectors, polygon: np.ndarray) -> HalfBoundary:
-        """Of polygons (3, V, P) above the horizon of local frames."""
+        """For polygons (3, V, P) above the horizon of local frames."""
         corner = project_to_sphere(polygon)
         following = np.roll(corner, -1, axis=1)
         both = corner + following
@@ -234,8 +236,8 @@ class HalfBoundary:
         return cls(halves, *_short_arcs(arcs, owner), encloses)
 
     def apex(self) -> np.ndarray:
-        """Unit vectors (3, P) from which all of the boundary is well to be seen: e_z where it is inside, else a mean of
-        the boundary that is near to e_z."""
+        """Unit vectors (3, P) that see the whole boundary well: e_z if it is inside, otherwise a mean of the boundary
+        near e_z."""
         halfway = project_to_sphere(self.first + 2.0 * self.middle + self.last)
         chord = self.last - self.first
         weight = np.sqrt(dot(chord, chord)) * np.maximum(halfway[2], 0.0) + 1e-30
@@ -245,12 +247,12 @@ class HalfBoundary:
 
     def nodes(self, order: int, arcs, apex, dtype):
         """Unit vectors w (3, order, A) on the chosen `arcs` (A,), and apex . (w x dw) times the quadrature weight
-        (order, A), for apices (3, A), all in `dtype`."""
+        (order, A). `apex` is (3, A). All are in `dtype`."""
         nodes, weights = np.polynomial.legendre.leggauss(order)
         far, weights = (0.5 * values[:, None].astype(dtype) for values in (nodes + 1.0, weights))
         near = 1.0 - far
         first, middle, last = (vectors[:, arcs] for vectors in (self.first, self.middle, self.last))
-        # Differences of vectors that are close are exact.
+        # Differences of close vectors are exact.
         start = 2.0 * triple(apex - first, first, middle - first)
         across = 2.0 * triple(apex - first, first, last - first)
         end = 2.0 * triple(apex - last, middle - last, last)
@@ -263,7 +265,7 @@ class HalfBoundary:
 
 
 def _short_arcs(arcs, owner):
-    """The `arcs`, first, middle and last (3, A), cut in two until none turns by more than LONGEST_ARC, and their
+    """The `arcs` (first, middle and last, each (3, A)), halved until none turns by more than LONGEST_ARC, and their
     owners."""
     finished = []
     for _ in range(MOST_HALVINGS):

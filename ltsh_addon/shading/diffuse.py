@@ -1,17 +1,18 @@
-"""Diffuse lobes that are not Lambert's, over polygons: sheen, velvet, and rough surfaces.
+"""Integrals over polygons of diffuse lobes other than Lambert's: sheen, velvet, and rough surfaces.
 
-Sheen is a linearly transformed cosine (Zeltner, Burley and Chiang 2022). Rough surfaces are Fujii's variant of Oren and
-Nayar 1994 with multiple scattering, as in OpenPBR and in Cycles. With the normal z and the view direction
-(sin theta_o, 0, cos theta_o) its lobe times cosine is
+Sheen is a linearly transformed cosine (Zeltner, Burley and Chiang 2022). Rough surfaces follow Fujii's variant of Oren
+and Nayar 1994 with multiple scattering, as in OpenPBR and in Cycles. With the normal z and the view direction
+(sin theta_o, 0, cos theta_o), the lobe times cosine is
 
-    z (A + B t + R (1 - E(z))),   t = x sin(theta_o), over max(z, cos(theta_o)) where it is positive,
+    z (A + B t + R (1 - E(z))),   t = x sin(theta_o), divided by max(z, cos(theta_o)) if positive,
 
-A = 1 / (pi + sigma (pi / 2 - 2 / 3)), B = sigma A, E(z) = pi A + B G(z) the albedo of A + B t. On the sphere
-d omega = dz dphi, so that by Green's theorem the integral of x h(z) is that of y h(z) dz around the polygon, and the
-integral of h(z) that of the normal's z times (integral of h above z) / (1 - z^2) along its arcs: integrals over arcs of
-functions without poles, which Gauss-Legendre nodes do. What t has for x > 0 needs the polygon cut there.
+where A = 1 / (pi + sigma (pi / 2 - 2 / 3)), B = sigma A, and E(z) = pi A + B G(z) is the albedo of A + B t. On the
+sphere d omega = dz dphi. By Green's theorem, the integral of x h(z) is therefore that of y h(z) dz around the polygon.
+The integral of h(z) is that of the normal's z times (integral of h above z) / (1 - z^2) along its arcs. Both are
+integrals over arcs of functions without poles, and Gauss-Legendre nodes do them. The division in t for x > 0 requires a
+cut of the polygon at x = 0.
 
-Velvet, Ashikhmin's sheen, has no closed form: Gauss-Legendre nodes in the triangles of the polygon.
+Velvet, Ashikhmin's sheen, has no closed form. It takes Gauss-Legendre nodes in the triangles of the polygon.
 """
 
 from __future__ import annotations
@@ -23,9 +24,9 @@ import numpy as np
 from .lobes import form_factor
 from .polygon import project_to_sphere, split_at_horizon
 
-# Of an arc, or of each part where it is cut at the kink of t, z = cos(theta_o).
+# Nodes of an arc, or of each of its parts if it is cut at the kink of t, z = cos(theta_o).
 ARC_NODES = 8
-# Along both sides of a triangle.
+# Nodes along both sides of a triangle.
 VELVET_NODES = 16
 _ANGLES = 2048
 
@@ -37,13 +38,13 @@ def sheen_form_factor(polygon: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.n
 
 
 def velvet_lobe(x, z, cosine, sigma):
-    """BRDF times cosine of velvet, in sr^-1, toward unit directions with x toward the view and z, of surfaces seen
-    under the cosine; all arrays broadcast.
+    """BRDF times cosine of velvet, in sr^-1, toward unit directions with the coordinates x, toward the view, and z.
+    `cosine` is that of the view; all arrays broadcast.
 
     Ashikhmin, Premoze and Shirley 2000, "A microfacet-based BRDF generator", section 4.3, without Fresnel.
     """
     cosine = np.maximum(cosine, 1e-4)
-    # Squared cosines of half the angle between both rays, and of the normal to the half vector.
+    # Squared cosines of half the angle between both rays, and between normal and half vector.
     half = np.maximum(0.5 * (1.0 + cosine * z + np.sqrt(1.0 - np.minimum(cosine, 1.0) ** 2) * x), 1e-12)
     normal = np.clip((cosine + z) ** 2 / (4.0 * half), 0.0, 1.0 - 1e-9)
     masked = np.minimum(1.0, 2.0 * np.sqrt(normal / half) * np.minimum(cosine, z))
@@ -61,7 +62,7 @@ def velvet_integral(polygon: np.ndarray, cosine: np.ndarray, sigma: np.ndarray) 
         first, second, third = corners[:, 0], corners[:, place], corners[:, place + 1]
         volume = (first * np.cross(second, third, axis=0)).sum(axis=0)
         for share, weight in zip(nodes[:, 0], weights[:, 0], strict=True):
-            # Toward the second corner, and from there toward the third.
+            # Go toward the second corner, and from there toward the third.
             x, y, z = first[:, None] + share * ((second - first)[:, None] + nodes * (third - second)[:, None])
             inverse = 1.0 / np.sqrt(np.maximum(x * x + y * y + z * z, 1e-30))
             values = velvet_lobe(x * inverse, z * inverse, cosine, sigma) * inverse**3
@@ -70,14 +71,14 @@ def velvet_integral(polygon: np.ndarray, cosine: np.ndarray, sigma: np.ndarray) 
 
 
 def rough_terms(roughness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A and B (P,) of a surface whose sigma is `roughness` (P,), 0 to 1."""
+    """A and B (P,) of a surface whose sigma is `roughness` (P,), in [0, 1]."""
     sigma = np.clip(roughness, 0.0, 1.0)
     a = 1.0 / (np.pi + sigma * (np.pi / 2.0 - 2.0 / 3.0))
     return a, sigma * a
 
 
 def albedo_slope(cosine: np.ndarray) -> np.ndarray:
-    """G (P,): what B adds to the directional albedo of A + B t."""
+    """G (P,), the factor of B in the directional albedo of A + B t."""
     cosine = np.clip(cosine, 0.0, 1.0)
     sine, angle = np.sqrt(1.0 - cosine * cosine), np.arccos(cosine)
     tangent = sine / np.maximum(cosine, 1e-6)
@@ -86,12 +87,12 @@ def albedo_slope(cosine: np.ndarray) -> np.ndarray:
 
 
 def rebound(color: np.ndarray, cosine: np.ndarray, roughness: np.ndarray) -> np.ndarray:
-    """R (P, 3): what light that is scattered several times adds, of a surface of `color` (P, 3) seen under the cosine
-    (P,)."""
+    """R (P, 3), the factor of light that is scattered several times, for a surface of `color` (P, 3) and the `cosine`
+    (P,) of the view."""
     a, b = rough_terms(roughness)
     color = np.clip(color, 0.0, 1.0)
     average = (np.pi * a + (2.0 * np.pi - 5.6) / 3.0 * b)[:, None]
-    # What a smooth surface reflects it does not catch again.
+    # A smooth surface does not catch again what it reflects.
     lost = np.maximum(1.0 - average, 1e-9)
     scattered = color**2 / np.pi * average / lost / (1.0 - color * lost)
     return scattered * (1.0 - np.pi * a - b * albedo_slope(cosine))[:, None]
@@ -117,14 +118,14 @@ def rough_integrals(polygon: np.ndarray, cosine: np.ndarray, roughness: np.ndarr
 
 def _arcs(polygon, kink=None):
     """y, z and dz / d angle (N, V, P) at nodes of the edges of polygons (3, V, P), the z of the edges' normals (V, P),
-    and weights (N, V, P). Edges are cut where their z is a `kink` (P,)."""
+    and weights (N, V, P). If a `kink` (P,) is given, edges are cut where their z equals it."""
     start = project_to_sphere(polygon)
     end = np.roll(start, -1, axis=1)
     normal = np.cross(start, end, axis=0)
     sine, cosine = np.sqrt((normal * normal).sum(axis=0)), (start * end).sum(axis=0)
     length = np.arctan2(sine, cosine)
     normal = normal / np.maximum(sine, 1e-300)
-    # At a right angle to the start, toward the end.
+    # Perpendicular to the start, toward the end.
     side = np.cross(normal, start, axis=0)
     nodes, weights = np.polynomial.legendre.leggauss(ARC_NODES)
     cuts = [np.zeros_like(length), length]
@@ -142,7 +143,7 @@ def _arcs(polygon, kink=None):
 
 
 def mean_slope_above(z):
-    """Integral of z G(z) from z to 1, over 1 - z^2."""
+    """Integral of z G(z) from z to 1, divided by 1 - z^2."""
     return np.interp(np.arccos(np.clip(z, -1.0, 1.0)), *_slope_table())
 
 
@@ -161,12 +162,12 @@ def _slope_table():
 
 
 def diffuse_factor(directions, height, normal, view, shape):
-    """Lobe over cosine, times pi (S, Q), toward unit directions (3, S, Q) of the cosines `height` (S, Q), of Q samples
-    with the axes (3, Q) and the `shape` (4, Q): sigma, a and b of sheen, R. It is 1 where all these are 0; velvet has
-    a below 0."""
+    """Lobe divided by cosine, times pi (S, Q), toward unit directions (3, S, Q) with the cosines `height` (S, Q), for Q
+    samples with normals and views (3, Q). `shape` (4, Q) is sigma, a and b of sheen, and R. The factor is 1 if all of
+    these are 0. Velvet has a below 0."""
     sigma, sheen_a, sheen_b, scattered = shape
     cosine = (normal * view).sum(axis=0)
-    # The part of the view along the surface, of a length that is the sine.
+    # The part of the view along the surface; its length is the sine.
     along = ((view - cosine * normal)[:, None] * directions).sum(axis=0)
     sine = np.sqrt(np.maximum(1.0 - cosine * cosine, 1e-12))
     x = along / sine

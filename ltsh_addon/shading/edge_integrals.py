@@ -1,13 +1,13 @@
 """Integrals of low-degree polynomials over spherical polygons, in closed form, as sums over edges.
 
-On the sphere a spherical harmonics expansion that is even in y is a polynomial in x and z, hence a sum of ridge
-functions (u . w)^n, u = (u_x, 0, u_z). With X = a x b for an edge from a to b, Stokes' theorem gives
+On the sphere, a spherical harmonics expansion that is even in y is a polynomial in x and z, and therefore a sum of
+ridge functions (u . w)^n with u = (u_x, 0, u_z). With X = a x b for an edge from a to b, Stokes' theorem gives
 
     int (u.w)^n dw = (n - 1)/(n + 1) |u|^2 int (u.w)^(n-2) dw + 1/(n + 1) sum_edges (u.X) K_{n-1},
-    K_k = 1/sin(theta) int_edge (u.w)^k ds,
+    K_k = 1/sin(theta) int_edge (u.w)^k ds.
 
-so a polygon is known by its moments: the solid angle and sum_edges (u.X) K_k for k + 2 directions u per k. (The same
-integrals as Wang and Ramamoorthi 2018 and Belcour et al. 2018, without zonal rotations.)
+So the moments of a polygon determine its integrals: the solid angle, and sum_edges (u.X) K_k for k + 2 directions u per
+k. (These are the same integrals as in Wang and Ramamoorthi 2018 and Belcour et al. 2018, without zonal rotations.)
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from .polygon import edge_sums, one_plus_cosine, solid_angle
 
 RIDGE_DIRECTIONS = np.array([[1, 0], [0, 1], [1, 1], [1, -1], [1, 2], [2, 1], [1, -2], [2, -1], [1, 3]], dtype=float)
 MAX_DEGREE = len(RIDGE_DIRECTIONS) - 1
-# 6e-15 on half a circle for powers up to 7.
+# Accurate to 6e-15 on half a circle for powers up to 7.
 _ARC_QUADRATURE = np.polynomial.legendre.leggauss(18)
 
 
@@ -32,9 +32,10 @@ SINGLE_PSI_DEGREE, _DOUBLE_PSI_DEGREE = 9, 22
 
 @cache
 def arc_polynomial(factor: str, degree: int, longest: float = 1.0) -> np.ndarray:
-    """Coefficients (degree + 1,), highest power first, in v = `longest` cos(theta / 2) of v phi or v psi of an edge.
+    """Coefficients (degree + 1,), highest power first, of v phi or v psi of an edge as a polynomial in
+    v = `longest` cos(theta / 2).
 
-    `factor` is "phi" or "psi", as in `arc_factors`. Interpolated at Chebyshev points.
+    `factor` is "phi" or "psi", as in `arc_factors`. The polynomial interpolates at Chebyshev points.
     """
 
     def values(v):
@@ -56,8 +57,8 @@ def arc_polynomial(factor: str, degree: int, longest: float = 1.0) -> np.ndarray
 def arc_factors(one_plus_cosine: np.ndarray):
     """(phi, psi, q) of edges of length theta: theta / sin(theta), (phi - 1) / (1 - cos theta), 1 / (1 + cos theta).
 
-    Relative error below 1e-6 (float32; phi 4e-7) and 4e-14 (float64); finite at theta = 0; theta is kept off pi, where
-    the edge has no direction.
+    The relative error is below 1e-6 (float32; phi 4e-7) and 4e-14 (float64). Results are finite at theta = 0. theta is
+    kept off pi, where the edge has no direction.
     """
     dtype = one_plus_cosine.dtype
     shifted = np.maximum(one_plus_cosine, np.finfo(dtype).eps ** 2)
@@ -88,7 +89,8 @@ def vector_irradiance(unit: np.ndarray) -> np.ndarray:
 def moments(unit: np.ndarray, degree: int) -> np.ndarray:
     """Moments (K, P) of spherical polygons (3, V, P) in z >= 0; K = (degree + 1)(degree + 2) / 2.
 
-    Order: solid angle; then for k = 0 .. degree - 1 the sums of (u.X) K_k over the first k + 2 `RIDGE_DIRECTIONS`.
+    Order: the solid angle; then, for k = 0 .. degree - 1, the sums of (u.X) K_k over the first k + 2
+    `RIDGE_DIRECTIONS`.
     """
     total = edge_sums(unit)
     phi, psi, q = arc_factors(one_plus_cosine(total))
@@ -125,7 +127,7 @@ def _arc_power(k, start, total, phi, psi, q):
 
 
 class _ArcNodes:
-    """Gauss-Legendre nodes along edges: there u.w is a sinusoid, so that K_k / phi, a mean, is exact to rounding."""
+    """Gauss-Legendre nodes along edges. u.w is a sinusoid there, so that K_k / phi, a mean, is exact to rounding."""
 
     def __init__(self, q):
         half = np.arctan2(np.sqrt(np.maximum(1.0 - 0.5 / q, 0.0)), np.sqrt(0.5 / q))
@@ -139,7 +141,8 @@ class _ArcNodes:
         self.sines = [np.sin(angle) * per_sine for angle in angles]
 
     def powers(self, start, total, first, last):
-        """Means (V, P) of (u.w)^k along the edges for k = first .. last - 1, u.w from `start` to `total - start`."""
+        """Means (V, P) of (u.w)^k along the edges for k = first .. last - 1. u.w runs from `start` to
+        `total - start`."""
         middle, half_difference = 0.5 * total, 0.5 * total - start
         result = [np.zeros_like(middle) for _ in range(first, last)]
         for cosine, sine, weight in zip(self.cosines, self.sines, self.weights, strict=False):
@@ -165,7 +168,7 @@ def ridge_matrix(degree: int) -> np.ndarray:
     if not 0 <= degree <= MAX_DEGREE:
         raise ValueError(f"spherical harmonics degree is {degree}, expected 0 to {MAX_DEGREE}")
     count = spherical_harmonics.coefficient_count(degree)
-    # Expand the basis in powers of ridges: interpolation at generic points of the sphere.
+    # Expand the basis in powers of ridges, by interpolation at generic points of the sphere.
     generator = np.random.default_rng(1)
     directions = generator.normal(size=(4 * count, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -197,7 +200,8 @@ def _power_integrals(degree: int) -> np.ndarray:
 
 
 def _in_moment_directions(u: np.ndarray, k: int) -> np.ndarray:
-    """Weights (k + 1,) that give the moment along `u` with K_{k-1}, a form of degree k in u, from the first k + 1."""
+    """Weights (k + 1,) of the first k + 1 moments with K_{k-1} that give the moment along `u`, a form of degree k in
+    u."""
     exponents = np.arange(k + 1)
     binomials = np.array([comb(k, int(e)) for e in exponents], dtype=float)
 

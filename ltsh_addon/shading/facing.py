@@ -1,7 +1,7 @@
-"""Lights that face every point: balls and disks, of point and spot lights, and what a spot's cone leaves of them.
+"""Lights that face every point: the balls and disks of point and spot lights, and the cones of spots.
 
-A ball is seen as the disk in its outline. From within it light comes from everywhere: a disk that all but fills the
-half space over the lobe's normal.
+A ball is seen as the disk in its outline. From within a ball, light comes from everywhere; a disk that almost fills the
+half space over the lobe's normal stands for it.
 """
 
 from __future__ import annotations
@@ -13,26 +13,27 @@ import numpy as np
 from .brdf import ggx_distribution, masking
 from .polygon import dot
 
-# Of a ball's radius: how far the disk is that stands for the half space, seen from within.
+# Distance, in units of a ball's radius, of the disk that stands for the half space seen from within.
 NEAR_DISK = 1e-3
-# Of the squared distance: what a point on a ball is at least outside of it.
+# Least share of the squared distance by which a point counts as outside a ball.
 LEAST_SHRINKING = 1e-6
-# Radius of a disk by its distance, at least: the edges of smaller ones differ by too few digits of double precision.
+# Least radius of a disk in units of its distance: in smaller ones too few digits of double precision tell edges apart.
 LEAST_SIZE = 1e-5
-# Shares of the brightest place of a disk: what changes by less has a mean, what falls below has a step.
+# Shares of the brightest place of a disk. CHANGING: emission that varies by less takes a plain mean. STEP: emission
+# that falls below counts as having a step.
 CHANGING, STEP = 0.01, 0.1
-# Rules of Chebyshev (second kind) along the first axis of a disk, of Legendre across: their orders. The second is for
-# what goes all the way from bright to dark on the disk, perhaps in a step.
+# Orders of the quadrature rules on a disk: Chebyshev (second kind) along its first axis, Legendre across. The second
+# rule is for emission that goes all the way from bright to dark on the disk, perhaps in a step.
 ORDERS = ((16, 4), (64, 5))
-# Points around a disk.
+# The center of a disk, and points around it.
 _RIM = np.array([[0.0, 1.0, -1.0, 0.0, 0.0, 0.7, -0.7, 0.7, -0.7], [0.0, 0.0, 0.0, 1.0, -1.0, 0.7, 0.7, -0.7, -0.7]])
 NODES_CHUNK = 1 << 17
-# The point nearest to the peak counts little for wide lobes, of which others meet the peak.
+# Weight of the point nearest to the lobe's peak. It counts little for wide lobes, whose peak other points meet.
 PEAK_WEIGHT = 1.0 / 400.0
 
 
 def _disk_rule(along: int, across: int) -> tuple[np.ndarray, np.ndarray]:
-    """Places (2, N) and weights (N,), 1 together, of integrals over the unit disk."""
+    """Places (2, N) and weights (N,) of integrals over the unit disk; the weights add up to 1."""
     angle = np.pi * np.arange(1, along + 1) / (along + 1)
     nodes, weights = np.polynomial.legendre.leggauss(across)
     places = np.stack(np.broadcast_arrays(np.cos(angle)[:, None], np.sin(angle)[:, None] * nodes))
@@ -45,18 +46,18 @@ _RULES = [_disk_rule(*orders) for orders in ORDERS]
 
 @dataclass(frozen=True)
 class FacingDisk:
-    """The disks that Q points see; corners and half axes in the order of `AreaLight.polygon`."""
+    """The disks that Q points see. Corners and half axes have the order of `AreaLight.polygon`."""
 
     offset: np.ndarray  # (3, Q) from the points to the centers
     half_u: np.ndarray  # (3, Q)
     half_v: np.ndarray  # (3, Q)
     length: np.ndarray  # (Q,) of the offset
     radius: np.ndarray  # (Q,)
-    gain: np.ndarray  # (Q,) by which the radiance is multiplied of disks that are drawn larger than they are
+    gain: np.ndarray  # (Q,) factor of the radiance, below 1 for disks that are enlarged
 
     @classmethod
     def of(cls, light, offset: np.ndarray, normal: np.ndarray) -> FacingDisk:
-        """Of `light` for points with its center at offset (3, Q), whose lobes have a normal (3, Q)."""
+        """For points from which the center of `light` is at `offset` (3, Q). Their lobes have the `normal` (3, Q)."""
         radius = offset.dtype.type(np.sqrt((light.half_u**2).sum()))
         squared = dot(offset, offset)
         if light.shape == "BALL":
@@ -90,12 +91,12 @@ class FacingDisk:
         return self.length, self.radius, self.gain
 
     def take(self, part) -> FacingDisk:
-        """Those of the points `part`."""
+        """The disks of the points `part`."""
         vectors = (self.offset[:, part], self.half_u[:, part], self.half_v[:, part])
         return FacingDisk(*vectors, *(values[part] for values in self._sizes()))
 
     def along(self, cone) -> FacingDisk:
-        """The same disks with the half axis u where the factor of a cone changes most; of no cone as they are."""
+        """The same disks turned so that the factor of `cone` changes most along u; unchanged without a cone."""
         if cone is None:
             return self
         axes = cone.axes.astype(self.offset.dtype)
@@ -108,7 +109,7 @@ class FacingDisk:
         return FacingDisk(self.offset, half_u, s * self.half_v - t * self.half_u, *self._sizes())
 
     def corners(self, outline: np.ndarray) -> np.ndarray:
-        """Offsets (3, V, Q) to places (2, V) in units of the half axes."""
+        """Offsets (3, V, Q) from the points to places (2, V) of the disks, in units of the half axes."""
         s, t = outline.astype(self.offset.dtype)[:, :, None]
         return self.offset[:, None] + s * self.half_u[:, None] + t * self.half_v[:, None]
 
@@ -119,7 +120,7 @@ class FacingDisk:
 
 
 def cone_factor(light, directions: np.ndarray) -> np.ndarray:
-    """What the cone of a spot leaves (...) of light that arrives from `directions` (3, ...), of any length."""
+    """The factor (...) of a spot's cone for light that arrives from `directions` (3, ...), of any length."""
     axes = light.cone.axes.astype(directions.dtype)
     x, y, z = (dot(row, directions) for row in axes)
     cosine = z / np.sqrt(np.maximum(x * x + y * y + z * z, np.finfo(directions.dtype).tiny))
@@ -128,14 +129,14 @@ def cone_factor(light, directions: np.ndarray) -> np.ndarray:
 
 
 def cone_angle(cone) -> float:
-    """Half the angle in rad of a cone, along its wider axis."""
+    """Half the opening angle in rad of a cone, along its wider axis."""
     angle = np.arccos(np.clip(cone.cosine, -1.0, 1.0))
     sizes = np.sqrt((cone.axes**2).sum(axis=1))
     return float(np.arctan2(np.sin(angle) * sizes[2], np.cos(angle) * min(sizes[:2])))
 
 
 def may_reach(light, offset: np.ndarray) -> np.ndarray:
-    """Mask (Q,): False for points with the center of the light at offset (3, Q) that its cone is far from."""
+    """Mask (Q,): False for points that the cone surely misses. The center of the light is at `offset` (3, Q)."""
     if light.cone is None:
         return np.ones(offset.shape[1], bool)
     distance = np.sqrt(np.maximum(dot(offset, offset), np.finfo(offset.dtype).tiny))
@@ -147,21 +148,21 @@ def may_reach(light, offset: np.ndarray) -> np.ndarray:
 
 
 def ray_length(light, offset: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """How far (...) the light is along unit `directions` (3, ...) that meet it, its center at offset (3, ...)."""
+    """Distance (...) of a light along unit `directions` (3, ...) that meet it; its center is at `offset` (3, ...)."""
     along = dot(offset, directions)
     squared = dot(offset, offset)
-    # Directions that pass by have no length: one that can be squared.
+    # Directions that miss the light have no distance; give them one that can be squared.
     least = 1e-9 * np.sqrt(squared) + np.finfo(offset.dtype).tiny
     if light.shape != "BALL":
         return squared / np.maximum(along, least)
     rest = light.radius**2 - squared
     root = np.sqrt(np.maximum(rest + along * along, 0.0))
-    # The near side, or from within the far one, without a difference of nearly equal numbers.
+    # The near side or, from within, the far one, computed without a difference of nearly equal numbers.
     return np.where(rest < 0.0, -rest / np.maximum(along + root, least), along + root)
 
 
 def emission(light, offset: np.ndarray, directions: np.ndarray) -> np.ndarray | float:
-    """By what the radiance (...) is multiplied along unit `directions` (3, ...) that meet the light; 1.0: nothing."""
+    """Factor (...) of the radiance along unit `directions` (3, ...) that meet the light; 1.0 if it is 1 everywhere."""
     factor = 1.0
     if light.cone is not None:
         factor = cone_factor(light, directions)
@@ -184,7 +185,7 @@ def _normals(light, offset, directions):
     along = dot(directions, axis)
     across = directions - along * axis
     sine = np.sqrt(dot(across, across))
-    # By the law of sines: seen from the center, the place is so far from the point.
+    # The law of sines gives the sine of the angle at the place between the point and the light's center.
     ratio = np.clip(sine * distance / np.maximum(light.radius, LEAST_SIZE * distance), 0.0, 1.0)
     root = np.sqrt(1.0 - ratio * ratio) * np.where(distance > light.radius, 1.0, -1.0)
     cosine, beside = root * along + ratio * sine, ratio * along - root * sine
@@ -192,7 +193,7 @@ def _normals(light, offset, directions):
 
 
 def pattern_values(pattern, normals: np.ndarray) -> np.ndarray:
-    """Values (...) of a pattern for normals (3, ...), between its own linearly."""
+    """Values (...) of a pattern for normals (3, ...), by linear interpolation."""
     x, y, z = (dot(row, normals) for row in pattern.axes.astype(normals.dtype))
     rows, columns = pattern.values.shape
     row = np.arctan2(np.sqrt(x * x + y * y), z) * (rows / np.pi) - 0.5
@@ -208,9 +209,11 @@ def pattern_values(pattern, normals: np.ndarray) -> np.ndarray:
 
 
 def mean_emission(light, offset: np.ndarray, disk: FacingDisk, lobe: Lobe) -> np.ndarray | float:
-    """By what the radiance of the light, its center at offset (3, Q), is multiplied for the lobes; 1.0: nothing.
+    """Mean factor (Q,) of the light's radiance for the lobes; 1.0 if it is 1 everywhere. The light's center is at
+    `offset` (3, Q).
 
-    Where it changes over the disk it is the mean over points of the disk, weighted by what the lobes make of them.
+    Where the factor changes over the disk, this is its mean over points of the disk, weighted by the values of the
+    lobe.
     """
     if light.is_even:
         return 1.0
@@ -224,7 +227,7 @@ def mean_emission(light, offset: np.ndarray, disk: FacingDisk, lobe: Lobe) -> np
 
     few = factors(_RIM, slice(None))[0]
     least, most = few.min(axis=0), few.max(axis=0)
-    # Half of the disk is farther out than the other half: right for what bends evenly.
+    # The center stands for half of the disk's area, the points around it for the other half: right for smooth changes.
     result = 0.5 * few[0] + 0.5 * few[1:].mean(axis=0)
     rule = np.where(most - least > CHANGING * most, np.where(least < STEP * most, 1, 0), -1)
     for part, (places, shares) in _parts(rule):
@@ -243,7 +246,7 @@ def mean_emission(light, offset: np.ndarray, disk: FacingDisk, lobe: Lobe) -> np
 
 
 def _parts(rule):
-    """Yield (index, rule): the points for which each of the rules is chosen, not too many at a time."""
+    """Yield (index, rule): the points for which each rule is chosen, in chunks."""
     for number, (places, shares) in enumerate(_RULES):
         chosen = np.nonzero(rule == number)[0]
         step = NODES_CHUNK // len(shares)
@@ -252,7 +255,7 @@ def _parts(rule):
 
 
 def factors_at(light, offset, places):
-    """Emission (Q,), unit directions (3, Q) and distances (Q,) of points of the light at `places` (3, Q)."""
+    """Emission (Q,) of points of the light at `places` (3, Q), and their unit directions (3, Q) and distances (Q,)."""
     length = np.sqrt(dot(places, places))
     directions = places / length
     return emission(light, offset, directions), directions, length
@@ -260,26 +263,26 @@ def factors_at(light, offset, places):
 
 @dataclass(frozen=True)
 class Lobe:
-    """Diffuse lobes, or GGX with a view and alpha, of Q samples."""
+    """Lobes of Q samples: diffuse, or GGX if there are a view and alpha."""
 
     normal: np.ndarray  # (3, Q)
     view: np.ndarray | None = None  # (3, Q)
     alpha: np.ndarray | None = None  # (Q,)
 
     def take(self, part) -> Lobe:
-        """Those of the samples `part`."""
+        """The lobes of the samples `part`."""
         if self.view is None:
             return Lobe(self.normal[:, part])
         return Lobe(self.normal[:, part], self.view[:, part], self.alpha[part])
 
     def values(self, directions: np.ndarray) -> np.ndarray:
-        """BRDF times cosine (S, Q) for unit directions (3, S, Q), of white lobes."""
+        """BRDF times cosine (S, Q) of white lobes, for unit directions (3, S, Q)."""
         normal = self.normal[:, None]
         cosine = np.maximum(dot(normal, directions), 0.0)
         if self.view is None:
             return cosine * (1.0 / np.pi)
         half = directions + self.view[:, None]
-        # Not as a difference, which has no digits of what a sharp lobe sees.
+        # Cross products keep the digits that matter to sharp lobes; a difference would lose them.
         across = [normal[a] * half[b] - normal[b] * half[a] for a, b in ((0, 1), (1, 2), (2, 0))]
         vertical, squared = np.square(dot(normal, half)), self.alpha * self.alpha
         distribution = ggx_distribution(dot(across, across), vertical, squared)
@@ -287,7 +290,7 @@ class Lobe:
         return distribution * cosine / np.maximum(2.0 * masking(facing, cosine, squared), 1e-30)
 
     def peak(self, disk: FacingDisk) -> np.ndarray:
-        """The points (3, Q) of disks that are nearest to the lobe's peak."""
+        """The points (3, Q) of disks nearest to the lobe's peak."""
         if self.view is None:
             return disk.offset
         mirrored = 2.0 * dot(self.normal, self.view) * self.normal - self.view

@@ -1,9 +1,9 @@
 """The fast path of `shade`: float32 frames, lookups and edge sums in chunks that fit the cache.
 
-The warp and, for "ltc", the tilt of the lobe are multiplied into the local frame of a sample once, for all lights: a
-light's corners come out of one product. What single precision cannot do is left to `float64`: points so close to a
-light's plane that an edge spans half a circle, tiny lights, sharp lobes. Few such pairs of samples and lights are
-handed back, for `shade_pairs` takes those of many blocks together.
+The warp of the lobe (and its tilt, for "ltc") is multiplied into the local frame of a sample once for all lights. One
+product then gives a light's corners. `float64` shades what single precision cannot: points so close to a light's plane
+that an edge spans half a circle, tiny lights, and sharp lobes. If a block has few such pairs of a sample and a light,
+they are handed back, because `shade_pairs` shades the pairs of many blocks together.
 """
 
 from __future__ import annotations
@@ -32,25 +32,26 @@ from .polygon import convex_pieces, dot
 from .sky_map import SkyMap
 from .tails import SeenLight, TailLimits
 
-# With more different indices of refraction in a block the dielectric's weights are summed up per sample.
+# If a block has more different indices of refraction, the dielectric's weights are summed up per sample.
 SEPARATE_IORS = 8
-# Samples and corners per chunk. Large, for a call of numpy costs as much as some thousand elements; rows are not a
-# multiple of a page long, where the cache would hold few of them.
+# Samples per chunk. It is large because a call of numpy costs as much as some thousand elements. Its rows are not a
+# multiple of a page long, because the cache would hold few of such rows.
 CHUNK = 24592
+# Corners per chunk.
 CORNERS = 4 * CHUNK
 # Samples per chunk for small lights.
 SMALL_CHUNK = 6144
-# Points of lights with a profile at a time.
+# Points per chunk for lights with a profile.
 POINT_CHUNK = 40960
-# The light of narrower cones, in rad, is too bright for the absolute error of single precision.
+# In rad. Lights with a narrower cone are too bright for the absolute error of single precision.
 NARROW_SPREAD = 0.35
 
 
 def shade_diffuse(samples, lights, radiance, scratch, leftovers=None):
-    """Add to radiance (G, P, 3) what the diffuse lobes of `samples` reflect of `lights`, (light, group, corners).
+    """Add to `radiance` (G, P, 3) what the diffuse lobes of `samples` reflect of `lights`, (light, group, corners).
 
-    To the list `leftovers`, if there is one, come pairs that are left to `shade_pairs`, fewer than FLOAT64_CHUNK: the
-    samples (N,) and the positions (N,) of the lights among those that affect diffuse lobes.
+    A list `leftovers` receives the pairs that are left to `shade_pairs`, if they are fewer than FLOAT64_CHUNK: (samples
+    (N,), lights (N,)), where a light's number is its position among those that affect diffuse lobes.
     """
     lights = Lights.of(lights, "diffuse")
     lit = np.nonzero(_any_component(samples.diffuse_albedo))[0]
@@ -77,7 +78,7 @@ def shade_diffuse(samples, lights, radiance, scratch, leftovers=None):
 
 
 def shade_specular(samples, lights, table, radiance, scratch, leftovers=None):
-    """As `shade_diffuse` for the specular lobes of `table`."""
+    """As `shade_diffuse`, for the specular lobes of `table`."""
     lights = Lights.of(lights, "specular")
     ridges = moments32.prepare(table)
     terms = (samples.specular_f90, samples.specular_f0, samples.specular_dip, samples.dielectric)
@@ -103,8 +104,8 @@ def shade_specular(samples, lights, table, radiance, scratch, leftovers=None):
 
 
 def _specular_lobes(samples, index, kind, colors, scratch) -> Lobes:
-    """The specular lobes of the samples `index` (Q,) with colors (F, 3, Q); kind: a table, the same prepared, and the
-    Fresnel terms as `fresnel_kinds` has them."""
+    """The specular lobes of the samples `index` (Q,) with `colors` (F, 3, Q). `kind` is a table, its `RidgeTable`, and
+    the Fresnel terms as `fresnel_kinds` yields them."""
     table, ridges, vectors = kind
     axes = _columns(samples.normal, index), _columns(samples.view, index)
     rows, clip_rows, weights = _lobe_rows(samples, index, axes, ridges, vectors, scratch)
@@ -121,7 +122,8 @@ def _specular_lobes(samples, index, kind, colors, scratch) -> Lobes:
 
 
 def specular_in_float64(table):
-    """What `shade_pairs` wants for specular lobes of `table`; for diffuse lobes that is `float64.shade_diffuse`."""
+    """The argument `shade_in_float64` of `shade_pairs` for specular lobes of `table`. For diffuse lobes it is
+    `float64.shade_diffuse`."""
 
     def shade(samples, lights, radiance):
         float64.shade_specular(samples, lights, table, radiance)
@@ -135,23 +137,23 @@ def _chunks(members):
 
 @dataclass(frozen=True)
 class Lobes:
-    """The lobes of Q samples; integrate(columns, corners, index, smallest) gives (F, Q') integrals and a mask."""
+    """The lobes of Q samples."""
 
     index: np.ndarray  # (Q,) of the samples
-    rows: np.ndarray  # (C, 3, Q) axes of the coordinates that `integrate` wants
-    clip_rows: tuple[int, ...]  # the coordinates that are positive above the horizons
-    integrate: Callable
+    rows: np.ndarray  # (C, 3, Q) axes of the coordinates that `integrate` takes
+    clip_rows: tuple[int, ...]  # numbers of the coordinates that are positive above a horizon
+    integrate: Callable  # integrate(columns, corners, index, smallest) -> integrals (F, Q') and mask of what to redo
     at_point: Callable  # integrals (F, Q') over small lights by columns and `small_lights.Rays`
-    colors: np.ndarray  # (F, 3, Q) reflectances of the integrals
-    width: np.ndarray | float  # as for `light_levels`
+    colors: np.ndarray  # (F, 3, Q) reflectances by which the integrals are multiplied
+    width: np.ndarray | float  # rad, as for `light_levels`
     limits: TailLimits | None = None
-    sharpest: small_lights.SharpestLobes | None = None  # of specular lobes
-    only_tails: bool = False  # elsewhere single precision does not suffice
-    others: tuple = ()  # (Q,) each: what they depend on beside rows and widths
+    sharpest: small_lights.SharpestLobes | None = None  # only for specular lobes
+    only_tails: bool = False  # True: single precision suffices for lights in the tails of the lobes only
+    others: tuple = ()  # (Q,) arrays of what the lobes depend on besides rows and widths
 
     @cached_property
     def shape(self) -> np.ndarray:
-        """What the lobes depend on (S, Q), by the lengths over which they change."""
+        """What the lobes depend on (S, Q), each divided by the length over which the lobes change with it."""
         rows = [self.rows[row] / self.lengths[row] for row in self.clip_rows]
         if self.sharpest is not None:
             rows += [self.sharpest.mirrored / self.sharpest.width, np.log(self.sharpest.width)[None]]
@@ -165,23 +167,23 @@ class Lobes:
 
 @dataclass(frozen=True)
 class AlikeLights:
-    """L lights with equally many corners: vectors (3, L) and numbers (L,), single precision but for the first."""
+    """L lights with equally many corners: vectors (3, L) and numbers (L,), all but `centers` in single precision."""
 
     centers: np.ndarray  # (2, 3, L) center and centroid
-    corners: np.ndarray  # (V, 3, L) as of `AreaLight.polygon`, from the center
+    corners: np.ndarray  # (V, 3, L) of `AreaLight.polygon`, relative to the center
     half_u: np.ndarray
     half_v: np.ndarray
     direction: np.ndarray
     radiance: np.ndarray
     area_vector: np.ndarray
     radius: np.ndarray  # m, around the centroid
-    diagonal: np.ndarray  # as of `small_lights.SmallLight`
+    diagonal: np.ndarray  # as in `small_lights.SmallLight`
     numbers: np.ndarray  # among all lights
-    place: np.ndarray  # (N,) here, of N lights in all; -1 of others, and of those that are too narrow
+    place: np.ndarray  # (N,) place here of each of the N lights; -1 for those not here or too narrow
 
     @classmethod
     def of(cls, lights, numbers) -> AlikeLights:
-        """The `numbers` (L,) of (light, group, corners)."""
+        """Those of `lights`, (light, group, corners), with these `numbers` (L,)."""
         own = [lights[number][0] for number in numbers]
         centroid, area, _, diagonal = small_lights.all_of(own)
         center = np.array([light.center for light in own])
@@ -199,18 +201,18 @@ class AlikeLights:
 
 
 class Lights(list):
-    """Lights (light, group, corners) that affect one pass; trees of many of them are made once."""
+    """Lights (light, group, corners) that affect one pass. Trees of many lights are built once."""
 
     @classmethod
     def of(cls, lights, name) -> Lights:
-        """Those of `lights` that affect the pass `name`; of Lights for that pass they are the same ones."""
+        """Those of `lights` that affect the pass `name`. A Lights object is returned as it is."""
         return (
             lights if isinstance(lights, Lights) else cls(one for one in lights if getattr(one[0], f"affects_{name}"))
         )
 
     @cached_property
     def trees(self) -> list[tuple[LightTree, list[int]]]:
-        """Trees, and the positions here of their lights."""
+        """Trees of many lights, and the positions here of their lights."""
         kinds: dict[tuple, list[int]] = {}
         for number, (light, group, _) in enumerate(self):
             is_plain = not (light.is_profiled or light.is_distant or light.is_facing or light.cone is not None)
@@ -221,7 +223,7 @@ class Lights(list):
 
     @cached_property
     def alike(self) -> list[AlikeLights]:
-        """Of trees those lights with equally many corners of which single precision can tell all."""
+        """The lights in trees that are not round, grouped by their number of corners."""
         kinds: dict[int, list[int]] = {}
         for number in (number for _, numbers in self.trees for number in numbers):
             kinds.setdefault(0 if self[number][0].is_round else len(self[number][2]), []).append(number)
@@ -229,13 +231,13 @@ class Lights(list):
 
     @cached_property
     def alone(self) -> list[int]:
-        """The positions here of lights that are in no tree."""
+        """The positions here of the lights that are in no tree."""
         taken = {number for _, numbers in self.trees for number in numbers}
         return [number for number in range(len(self)) if number not in taken]
 
     @cached_property
     def skies(self) -> list[tuple[SkyMap, object, int]]:
-        """Maps of the distant lights with a detail, one of their lights, and the group."""
+        """Maps of the distant lights with a detail, each with one of its lights and their group."""
         kinds: dict[tuple, list] = {}
         for light, group, _ in self:
             if float64.has_patches(light):
@@ -244,8 +246,8 @@ class Lights(list):
 
 
 class _Lighting:
-    """Adds the light of `lights` at `samples` to radiance (G, P, 3); shade_in_float64(samples, lights, radiance) is
-    what points that need it are left to."""
+    """Adds the light of `lights` at `samples` to `radiance` (G, P, 3). shade_in_float64(samples, lights, radiance)
+    shades points that need double precision."""
 
     def __init__(self, samples, lights, radiance, scratch, shade_in_float64):
         self.samples, self.lights, self.radiance, self.scratch = samples, lights, radiance, scratch
@@ -273,7 +275,7 @@ class _Lighting:
             self.radiance[group, index] += reflected.T
 
     def _add_light(self, lobes, number, position, columns, sums) -> None:
-        """Add one light to the sums (F, 3, Q) by group; `columns` (Q',) are those for which that is left to do."""
+        """Add one light to the `sums` (F, 3, Q) by group, at the `columns` (Q',), None for all."""
         (light, group, corners), index = self.lights[number], lobes.index
         allowed = light.receives(self.samples.receiver, index)
         if light.is_focused or light.cone is not None:
@@ -298,8 +300,8 @@ class _Lighting:
                 self.needs_float64[number].append(index[batch[0]][redo])
 
     def _add_polygons(self, lobes, light, position, batch, allowed, total) -> np.ndarray:
-        """Add the light, seen as polygons, to total (F, 3, Q) for a batch of `_batches`; mask of the columns for which
-        that takes double precision, and which get nothing."""
+        """Add the light, seen as polygons, to `total` (F, 3, Q) for a batch of `_batches`. Returns the mask of the
+        columns that need double precision; they get nothing."""
         part, outline, effort = batch
         offset = (light.center[:, None] - light.origins(position[:, part])).astype(np.float32)
         seen, factor = light, 1.0
@@ -330,7 +332,7 @@ class _Lighting:
         return redo
 
     def _add_skies(self, lobes, sums) -> None:
-        """Add the light of skies to the sums (F, 3, Q) by group."""
+        """Add the light of skies to the `sums` (F, 3, Q) by group."""
         for sky, light, group in self.lights.skies:
             allowed = light.receives(self.samples.receiver, lobes.index)
             chosen = np.arange(len(lobes.index)) if allowed is None else np.nonzero(allowed)[0]
@@ -341,8 +343,8 @@ class _Lighting:
                 sky.add(lobes, chosen, sums[group])
 
     def _add_far(self, lobes, position, sums) -> dict[int, np.ndarray]:
-        """Add to the sums (F, 3, Q) by group the light of many lights; by number of the light the columns (Q',) for
-        which it is left to do."""
+        """Add the light of trees to the `sums` (F, 3, Q) by group. Returns the columns (Q',) that are left to do, by
+        number of the light."""
         left = {}
         for tree, numbers in self.lights.trees:
             light, group, _ = self.lights[numbers[0]]
@@ -367,7 +369,7 @@ class _Lighting:
         return left
 
     def _add_near(self, lobes, position, pairs, total) -> None:
-        """Add to total (F, 3, Q) the light of pairs of a column (K,) and a light (K,) of `AlikeLights`, the third."""
+        """Add to `total` (F, 3, Q) the light of `pairs`: columns (K,), numbers (K,) of lights, and the AlikeLights."""
         columns, number, lights = pairs
         extent, left = np.abs(position).sum(axis=0), [np.empty(0, np.intp)]
         for piece in moments32.pieces(len(columns), SMALL_CHUNK):
@@ -404,8 +406,8 @@ class _Lighting:
             _scatter(found, part, lights.radiance[:, own], total)
 
     def _add_small(self, lobes, light, position, among, total) -> np.ndarray | None:
-        """Add the light to total (F, 3, Q) where it is small, `among` those columns (Q',), None for all, and those of
-        a mask (Q,), None for all; the columns that are left, None for all."""
+        """Add the light to `total` (F, 3, Q) where it is small, and return the columns that are left, None for all.
+        `among` restricts where: columns (Q',), None for all, and a mask (Q,), None for all."""
         columns, allowed = among
         seen, left = small_lights.SmallLight.of(light), []
         count = position.shape[1] if columns is None else len(columns)
@@ -443,7 +445,7 @@ class _Lighting:
         return None if columns is None and len(left) == count else left
 
     def _add_points(self, lobes, light, position, among, total) -> np.ndarray:
-        """As `_add_small` for a light with a profile where few points of it suffice: the columns that are left."""
+        """As `_add_small`, for a light with a profile: add it where few points of the light suffice."""
         columns, allowed = among
         columns = np.arange(position.shape[1]) if columns is None else columns
         columns = columns if allowed is None else columns[allowed[columns]]
@@ -471,13 +473,13 @@ class _Lighting:
         return np.concatenate(left)
 
     def _seen(self, light, index, position) -> tuple[FacingDisk, np.ndarray | float]:
-        """A light that faces the samples `index` as they see it from position (3, Q), and its `mean_emission`."""
+        """The FacingDisk as which the samples `index` see a light from `position` (3, Q), and its `mean_emission`."""
         offset, lobe = (light.center[:, None] - position).astype(np.float32), self._lobe(index)
         disk = FacingDisk.of(light, offset, lobe.normal)
         return disk, mean_emission(light, offset, disk, lobe)
 
     def _lobe(self, index) -> Lobe:
-        """The lobes of the samples `index`, as they are but for their colors."""
+        """The lobes of the samples `index`, without their colors."""
         samples = self.samples
         if self.shade_in_float64 is float64.shade_diffuse:
             return Lobe(_columns(samples.diffuse_normal, index))
@@ -501,7 +503,7 @@ class _Lighting:
             self.radiance[:, index] += target.astype(np.float32)
 
     def finish(self, leftovers) -> None:
-        """Add what was left to float64, or put it into `leftovers`."""
+        """Add what was left to float64, or put it into the list `leftovers`."""
         counts = [sum(map(len, parts)) for parts in self.needs_float64]
         pairs = [own for own in self.pairs_in_float64 if len(own[0])]
         if not any(counts) and not pairs:
@@ -514,14 +516,15 @@ class _Lighting:
             return
         group = np.array([group for _, group, _ in self.lights])
         for pairs, found in shade_pairs(self.samples, members, number, self.lights, self.shade_in_float64):
-            # A sample may be there for several lights.
+            # A sample may occur with several lights.
             np.add.at(self.radiance, (group[number[pairs]], members[pairs]), found.astype(np.float32))
 
 
 def shade_pairs(samples, members, number, lights, shade_in_float64):
-    """Yield (pairs (Q,), radiance (Q, 3)) of samples `members` (N,) under the one light each that `number` (N,) says.
+    """Yield (pairs (Q,), radiance (Q, 3)) of the samples `members` (N,), each under the one light `number` (N,).
 
-    Lights with equally many corners make one batch, but for those whose corners depend on the sample.
+    Lights with equally many corners make one batch. Round lights and lights with a profile are shaded one by one,
+    because their corners depend on the sample.
     """
     batches: dict[tuple, list[int]] = {}
     for position, (light, _, corners) in enumerate(lights):
@@ -542,7 +545,8 @@ def shade_pairs(samples, members, number, lights, shade_in_float64):
 
 
 def _light_of_each(items, number):
-    """One (light, group, corners) in place of several with equally many corners, of which each sample has its own."""
+    """One (light, group, corners) that stands for several with equally many corners, so that sample i sees the light
+    `number[i]`."""
     fields = {
         name: np.stack([getattr(light, name) for light, _, _ in items])[number]
         for name in ("center", "direction", "radiance", "half_u", "half_v", "area_vector")
@@ -553,38 +557,38 @@ def _light_of_each(items, number):
 
 
 def _scatter(found, columns, radiance, total) -> None:
-    """Add to total (F, 3, Q) integrals (F, K) times radiance (3, K) in the columns (K,), some of them several times."""
+    """Add integrals (F, K) times radiance (3, K) to `total` (F, 3, Q), at the columns (K,), which may repeat."""
     for own, values in zip(total, found, strict=True):
         for channel in range(3):
             own[channel] += np.bincount(columns, values * radiance[channel], own.shape[1])
 
 
 def _is_narrow(light, corners) -> bool:
-    """True for lights whose long edges cancel beyond what single precision can tell."""
+    """True for lights so narrow that the terms of their long edges cancel beyond single precision."""
     sides = corners - corners[0]
     return np.linalg.norm(light.area_vector) < NARROWEST * (sides * sides).sum(axis=1).max()
 
 
 def _is_in_pieces(light, corners) -> bool:
-    """True for lights that `light_levels` takes apart: what double precision does, it does for all pieces."""
+    """True for lights that `light_levels` cuts into pieces. Double precision must then shade all of the pieces."""
     return light.is_profiled and light.shape == "POLYGON" and len(convex_pieces(corners)) > 1
 
 
 def _chosen(part, index):
-    """Those of the columns `part`, a slice or integers, at `index` (Q,)."""
+    """The columns at `index` (Q,) among the columns `part`, a slice or integers."""
     return part.start + index if isinstance(part, slice) else part[index]
 
 
 def _both(allowed, rest):
-    """The columns `rest` of which the mask `allowed` is true; either may be None, for all."""
+    """The columns of `rest` for which the mask `allowed` is True; either may be None, for all."""
     if allowed is None or rest is None:
         return allowed if rest is None else rest
     return rest[allowed[rest]]
 
 
 def _batches(light, corners, position, width, rest=None):
-    """Yield (columns of position (3, Q): a slice or integers, corners (V, 3), effort) of the columns `rest` (Q',), None
-    for all, in batches."""
+    """Yield (columns, corners (V, 3), effort) in batches, for the columns `rest` (Q',) of `position` (3, Q), None for
+    all. The yielded columns are a slice or integers."""
     if rest is not None:
         position, width = position[:, rest], width if np.ndim(width) == 0 else width[rest]
     for outline, effort, chosen in light_levels(light, corners, position, width):
@@ -598,9 +602,9 @@ def _batches(light, corners, position, width, rest=None):
 
 
 def fresnel_kinds(samples, members):
-    """Yield (vectors, members, colors): which Fresnel terms the samples `members` need.
+    """Yield (vectors, members, colors): the samples `members` grouped by the Fresnel terms that they need.
 
-    `vectors` as in `RidgeTable`, colors(index) (F, 3, Q) their reflectances.
+    `vectors` are those of `RidgeTable`; colors(index) returns the reflectances (F, 3, Q) of the terms.
     """
     dipped = _any_component(samples.specular_dip)[members]
     metal = (_any_component(samples.specular_f90) | _any_component(samples.specular_f0))[members] | dipped
@@ -636,7 +640,8 @@ def fresnel_kinds(samples, members):
 
 
 def _by_ior(ior, members):
-    """Yield (vector, members): the dielectric's weight vector, one per index of refraction where there are few."""
+    """Yield (vector, members): the dielectric's weight vector of the samples. There is one per index of refraction if
+    there are few of these."""
     values = ior[members]
     if len(members) == 0:
         return
@@ -652,7 +657,7 @@ def _by_ior(ior, members):
 
 
 def _normal_frame(normal):
-    """Frames (3, 3, P) around normals (3, P), without a preferred tangent (Duff et al. 2017)."""
+    """Frames (3, 3, P) around normals (3, P), with an arbitrary tangent (Duff et al. 2017)."""
     x, y, z = normal
     sign = np.copysign(np.float32(1.0), z)
     a = np.float32(-1.0) / (sign + z)
@@ -662,17 +667,17 @@ def _normal_frame(normal):
 
 
 def _lobe_rows(samples, index, axes, ridges, vectors, scratch):
-    """Axes (C, 3, Q) of the warped local frames, the coordinates that are clipped, and the weights (F, K, Q), of
+    """Axes (C, 3, Q) of the warped local frames, the numbers of the coordinates to clip, and the weights (F, K, Q), for
     samples with the normals and views `axes`."""
     normal, view = axes
     cosine = dot(normal, view)
-    # The difference of vectors that are close is exact, so that nothing of it runs along the normal.
+    # Differences of close vectors are exact, so nothing of this one runs along the normal.
     tangent = view - normal
     tangent -= dot(normal, tangent) * normal
     sine = np.sqrt(dot(tangent, tangent))
     straight = np.nonzero(sine < 1e-6)[0]
     if len(straight):
-        # The lobe is round there: any tangent serves.
+        # The lobe is round there, so any tangent serves.
         tangent[:, straight] = _normal_frame(normal[:, straight])[0]
     tangent /= np.where(sine < 1e-6, np.float32(1.0), sine)
     bitangent = np.stack([
@@ -698,7 +703,7 @@ def _lobe_rows(samples, index, axes, ridges, vectors, scratch):
 
 
 def _any_component(vectors):
-    """Mask (P,) of the vectors (P, 3) with an element that is not 0; numpy's own reduction of short rows is slow."""
+    """Mask (P,) of the vectors (P, 3) with an element other than 0; numpy's own reduction of short rows is slow."""
     return (vectors[:, 0] != 0) | (vectors[:, 1] != 0) | (vectors[:, 2] != 0)
 
 
@@ -708,13 +713,14 @@ def _columns(vectors, index):
 
 
 def _selected(values, part, index):
-    """Columns `index` (None: all) of the columns `part`, a slice, of values (..., Q)."""
+    """Values (..., Q) at the columns `index` (None: all) of the slice `part` of columns."""
     values = values[..., part]
     return values if index is None else np.take(values, index, axis=-1)
 
 
 class FormFactor:
-    """Form factors (1, Q) of polygons whose corners run clockwise as seen from the point (`AreaLight.polygon`)."""
+    """Form factors (1, Q) of polygons whose corners run counterclockwise as seen from the point
+    (`AreaLight.polygon`)."""
 
     def __init__(self, scratch):
         self.scratch = scratch
@@ -726,7 +732,7 @@ class FormFactor:
 
 
 class ShadowedFormFactor:
-    """Form factors (1, Q) times the bump shadowing of `SurfaceSamples`, taken at the mean direction of the polygon."""
+    """Form factors (1, Q) times the bump shadowing of `SurfaceSamples` in the mean direction of the polygon."""
 
     def __init__(self, rows, bump_alpha2, scratch):
         self.smooth = np.stack([dot(row, rows[3]) for row in rows[:3]])
@@ -744,9 +750,9 @@ class ShadowedFormFactor:
 
 
 class LobeIntegral:
-    """Integrals (F, Q) of lobes with F weight vectors over polygons, never negative; winding as in `FormFactor`.
+    """Integrals (F, Q) of lobes with F weight vectors over polygons, never negative. Winding is as in `FormFactor`.
 
-    The first one is that for F = 1.
+    The first integral is the one for F = 1.
     """
 
     def __init__(self, ridges, weights, scratch):
@@ -762,9 +768,9 @@ class LobeIntegral:
 
 
 class ProfiledIntegral:
-    """Integrals (F, Q) over polygons times the profile of the light, by integrals over parts of the light.
+    """Integrals (F, Q) over polygons times the profile of the light, as sums of integrals over parts of the light.
 
-    The polygons have two more coordinates than the frames `axes` (C, 3, P), along `rows`: those in the light's plane.
+    The polygons need the coordinates along `rows`: those along `axes` (C, 3, P), then two in the light's plane.
     """
 
     def __init__(self, light, effort, offset, axes, integrate, count):
@@ -784,7 +790,7 @@ class ProfiledIntegral:
             flat, view = corners[-2:, :, part], self.view.take(index[part])
             layers = light_cone.layers(view, flat, self.profile, self.effort)
             for number, (near, weights, polygons) in enumerate(layers):
-                # The small disks count little, so that the rounding of their edges is lost in the sum.
+                # Small disks count little, so the rounding of their edges is lost in the sum.
                 smallest = 0.0 if number < self.effort.layers - 1 else moments32.SMALLEST_SAFE
                 found, redo = self.integrate(polygons, index[part][near], smallest=smallest)
                 values[:, start + near] += weights * found

@@ -1,6 +1,6 @@
 """Shading in double precision: exact polygons, any degree, and the reference quadrature.
 
-`float32` is the fast path; the points for which that is not accurate come here.
+`float32` is the fast path; it leaves the points for which it is not accurate to this module.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ from .reference import anisotropic_integrals, reference_integrals
 from .spherical_harmonics import coefficient_index
 from .tails import SeenLight, TailLimits
 
-# How far toward the corners of a light a Fresnel curve with a step is looked up.
+# Where a Fresnel curve with a step is looked up: at these shares of the way from a light's center to its corners.
 POINTS_TO_CORNERS = (0.2, 0.5, 0.8)
-# Of the roughness by which the effort for a lobe is chosen.
+# Least roughness in the choice of the effort for a lobe.
 LEAST_ROUGHNESS = 1e-3
-# Coefficient of Y_10 that makes it z / pi
+# Coefficient of Y_10 for z / pi
 _COSINE = 2.0 / np.sqrt(3.0 * np.pi)
 
 
 @dataclass(frozen=True)
 class LightOfEachSample:
-    """One light per sample, in place of an AreaLight for all; its corners are (V, P, 3)."""
+    """One light per sample, used instead of one AreaLight for all. Its corners are (V, P, 3)."""
 
     center: np.ndarray  # (P, 3)
     direction: np.ndarray  # (P, 3)
@@ -65,22 +65,22 @@ class LightOfEachSample:
         return replace(self, **{name: getattr(self, name)[index] for name in names})
 
     def origins(self, position: np.ndarray) -> np.ndarray:
-        """As of an AreaLight."""
+        """As `AreaLight.origins`."""
         return np.zeros_like(position) if self.is_distant else position
 
     def receives(self, receiver, index):
-        """None, as of a light without receivers: those that the light does not reach were left out before."""
+        """None, as for a light without receivers: samples that the light does not reach were left out before."""
         return None
 
 
 def has_patches(light) -> bool:
-    """True for a distant light with a detail: the paths of both precisions choose its patches themselves."""
+    """True for a distant light with a detail. The paths of both precisions choose its patches themselves."""
     return light.is_distant and len(light.detail) > 0
 
 
 def shade_patches(samples, members, patches, tree: PatchTree, radiance, shade) -> None:
-    """Add to radiance (P, 3) what samples `members` (N,) reflect of one patch each; shade(samples, lights, radiance,
-    members) does it for one light per sample."""
+    """Add to `radiance` (P, 3) what the samples `members` (N,) reflect of one patch each. shade(samples, lights,
+    radiance, members) does so for one light per sample."""
     for start in range(0, len(members), FLOAT64_CHUNK):
         index, patch = members[start : start + FLOAT64_CHUNK], patches[start : start + FLOAT64_CHUNK]
         vectors = (tree.center, tree.half_u, tree.half_v, tree.radiance)
@@ -95,12 +95,12 @@ def shade_patches(samples, members, patches, tree: PatchTree, radiance, shade) -
 
 
 def _of(vector, index):
-    """The vector (3,) that is the same for all samples, or those of the samples `index`."""
+    """`vector` if it is (3,), the same for all samples; otherwise its rows for the samples `index`."""
     return vector if vector.ndim == 1 else vector[index]
 
 
 def shade_diffuse(samples, lights, radiance):
-    """Add to radiance (G, P, 3) what the diffuse lobes of `samples` reflect of `lights`, (light, group, corners)."""
+    """Add to `radiance` (G, P, 3) what the diffuse lobes of `samples` reflect of `lights`, (light, group, corners)."""
     framed = Framed.of(samples, samples.diffuse_normal)
     lit = np.nonzero(samples.diffuse_albedo.any(axis=1))[0]
     kinds = list(_diffuse_kinds(framed, lit))
@@ -141,8 +141,8 @@ def shade_diffuse(samples, lights, radiance):
 
 
 def _diffuse_kinds(framed, lit):
-    """Yield (candidates (Q,), second normal, count, integral) of the samples `lit` by their diffuse lobes:
-    integral(polygon, index) is (count, Q)."""
+    """Yield (candidates (Q,), second normal, count, integral) for each kind of diffuse lobe among the samples `lit`.
+    integral(polygon, index) returns (count, Q)."""
 
     samples = framed.samples
 
@@ -173,26 +173,26 @@ def _diffuse_kinds(framed, lit):
 
 
 def _mean_emission(light, samples, index, lobe):
-    """As `facing.mean_emission`, of a light as the samples `index` see it."""
+    """`facing.mean_emission` of a light as the samples `index` see it."""
     offset = (light.center - samples.position[index]).T
     disk = FacingDisk.of(light, offset, lobe.normal)
     return disk.gain * facing.mean_emission(light, offset, disk, lobe)
 
 
 def _receiving(samples, light, index):
-    """Those of the samples `index` that the light lights."""
+    """The samples of `index` that the light lights."""
     allowed = light.receives(samples.receiver, index)
     return index if allowed is None else index[allowed]
 
 
 def lobe_width(samples, index) -> np.ndarray:
-    """About how many radians (Q,) wide the specular lobes are: alpha."""
+    """Approximate width (Q,) in rad of the specular lobes: alpha."""
     return np.maximum(samples.sharpest_roughness[index].astype(np.float64), LEAST_ROUGHNESS) ** 2
 
 
 def _profiled(light, view, part, integral, count):
-    """Integrals (count, Q) over polygons (5, W, Q) times the profile of the light; `part` as of `seen_parts`, and
-    integral(polygons, index) is that without the profile."""
+    """Integrals (count, Q) over polygons (5, W, Q) times the profile of the light. `part` is from `seen_parts`;
+    integral(polygons, index) is the integral without the profile."""
     index, polygon, effort = part
     result = np.zeros((count, len(index)))
     for near, weights, corners in light_cone.layers(view, polygon[3:], light_cone.Profile.of(light), effort):
@@ -201,7 +201,7 @@ def _profiled(light, view, part, integral, count):
 
 
 def _bump_shadowing(framed, index, polygon):
-    """The bump shadowing (Q,) of `SurfaceSamples`, taken at the mean direction of the polygon."""
+    """The bump shadowing (Q,) of `SurfaceSamples` in the mean direction of the polygon."""
     samples, direction = framed.samples, -integrals_on_sphere(vector_irradiance, polygon)
     smooth = to_local(framed.frame[:, :, index], samples.smooth_normal[index].T)
     along = (direction * smooth).sum(axis=0)
@@ -211,7 +211,8 @@ def _bump_shadowing(framed, index, polygon):
 
 
 def shade_specular(samples, lights, table, radiance, error=None):
-    """As `shade_diffuse` for the specular lobes; `table` or REFERENCE, which adds its estimates to error (P,)."""
+    """As `shade_diffuse`, for the specular lobes. If `table` is REFERENCE, its error estimates are added to `error`
+    (P,)."""
     cosine = (samples.normal * samples.view).sum(axis=1)
     framed = Framed.of(samples, samples.normal)
     lit = np.nonzero((cosine > 0.0) & has_lobe(samples)[1])[0]
@@ -266,7 +267,7 @@ def shade_specular(samples, lights, table, radiance, error=None):
 
 
 def _finished(parts, table, samples, light):
-    """Yield (index, integrals (4, Q)) of the `parts` of a light with all that is not of the polygon."""
+    """Yield (index, integrals (4, Q)) of the `parts` of a light, limited in tails and times the light's emission."""
     for index, integrals in parts:
         if table.family == "ltsh":
             _limit(integrals, samples, index, light)
@@ -278,8 +279,8 @@ def _finished(parts, table, samples, light):
 
 
 def has_bent_fresnel(samples) -> np.ndarray:
-    """Mask (P,) of the samples whose Fresnel factor no sum of the tables' curves follows: dielectrics with an index of
-    refraction below 1, where total reflection makes nearly a step of it, and metals that are clipped at black."""
+    """Mask (P,) of the samples whose Fresnel factor no sum of the tables' curves follows. These are dielectrics with an
+    index of refraction below 1, where total reflection makes it nearly a step, and metals that are clipped at black."""
     below = samples.ior < 1.0
     if below.any():
         below = below & samples.dielectric.any(axis=1)
@@ -287,7 +288,7 @@ def has_bent_fresnel(samples) -> np.ndarray:
 
 
 def _bent_reflectance(framed, light, corners, at):
-    """Mean Fresnel factor (Q, 3) of the samples `at` (Q,) over points of the light, by the lobe there."""
+    """Mean Fresnel factor (Q, 3) of the samples `at` (Q,) over points of the light, weighted by the lobe there."""
     center = light.center if light.center.ndim == 1 else light.center[at]
     places = [center] if light.is_facing else [
         center + fraction * ((corner if corner.ndim == 1 else corner[at]) - center)
@@ -313,7 +314,7 @@ def _bent_reflectance(framed, light, corners, at):
 
 
 def _joined(parts, count):
-    """Yield (index, integrals (4, Q)) of a light of `count` samples as a whole, from those of its convex pieces."""
+    """Yield (index, integrals (4, Q)) of a whole light for `count` samples, from those of its convex pieces."""
     total = np.zeros((4, count))
     for index, integrals in parts:
         total[:, index] += integrals
@@ -322,7 +323,7 @@ def _joined(parts, count):
 
 
 def _limit(integrals, samples, index, light):
-    """Limit integrals (4, Q) over the light of the samples `index` as `TailLimits` does."""
+    """Apply `TailLimits` to integrals (4, Q) over the light, as seen from the samples `index`."""
     own = light if light.center.ndim == 1 else light.take(index)
     axes = samples.normal[index].T, samples.view[index].T
     offset = (own.center - own.origins(samples.position[index])).T
@@ -335,7 +336,7 @@ def _limit(integrals, samples, index, light):
 
 
 def _fresnel_lobe(table: LookupTable, cosine, samples) -> Lobe:
-    """Lobes with four coefficient vectors: F = 1, (1 - c)^5, c (1 - c)^6 and the dielectric of each sample's IOR."""
+    """Lobes with four coefficient vectors: F = 1, (1 - c)^5, c (1 - c)^6, and the dielectric of each sample's IOR."""
     if not samples.dielectric.any():
         lobe = table.lookup(cosine, samples.roughness.astype(cosine.dtype), curves=3)
         return lobe.with_coefficients(np.concatenate([lobe.coefficients, np.zeros_like(lobe.coefficients[:1])]))
@@ -346,10 +347,10 @@ def _fresnel_lobe(table: LookupTable, cosine, samples) -> Lobe:
 
 
 def _table_integrals(table, lobe, framed, light, part):
-    """Integrals (4, Q), never negative, over a `part` as of `seen_parts`, whose corners run counterclockwise as seen
-    from the point (`AreaLight.polygon`)."""
+    """Integrals (4, Q), never negative, over a `part` from `seen_parts`. Its corners run counterclockwise as seen from
+    the point (`AreaLight.polygon`)."""
 
-    # z / pi, of which the clamped cosine of mass 1 consists
+    # Coefficients of z / pi, the clamped cosine of mass 1.
     cosine = np.zeros((1, lobe.coefficients.shape[1], 1))
     cosine[0, 0 if table.family == "ltc" else coefficient_index(1, 0)] = 1.0 if table.family == "ltc" else _COSINE
 

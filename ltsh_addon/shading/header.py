@@ -1,13 +1,12 @@
-"""Tables for other engines: a header for C, C++, GLSL and HLSL with the code that evaluates them, WGSL, and textures.
+"""Tables for other engines: a header for C, C++, GLSL and HLSL with the code that evaluates them; WGSL; and textures.
 
-The text stands in `glsl/`: core.h is what no table changes, which the viewport's shaders contain too, and table.h what
-every table adds. This chapter reads such files, and writes the lines that follow from a table's numbers and degree.
+The text is in `glsl/`. core.h is the same for all tables, and the viewport's shaders contain it too; table.h is what
+each table adds. This module reads these files and writes the lines that depend on a table's numbers and degree.
 
-The two textures of LTC have the layout of the shaders of Heitz et al. 2016 and of those made after them. Row j of N is
-theta_o with
-sqrt(1 - cos(theta_o)) = j / (N - 1), column i is roughness i / (N - 1). The first holds m00, m20, m02 and m22 of M^-1,
-over m11. The second holds the integrals of the lobe for F = 1 and (1 - c)^5 over the whole sphere, zero, and by
-what the shader multiplies the form factor of a sphere that the horizon cuts.
+The two textures of LTC have the layout of the shaders of Heitz et al. 2016 and of their successors. Row j of N is
+theta_o with sqrt(1 - cos(theta_o)) = j / (N - 1); column i is roughness i / (N - 1). The first texture holds m00, m20,
+m02 and m22 of M^-1, divided by m11. The second holds the integrals of the lobe over the whole sphere for F = 1 and for
+(1 - c)^5, then zero, then the factor of the form factor of a sphere that the horizon cuts.
 """
 
 from __future__ import annotations
@@ -25,12 +24,12 @@ from .lobes import LEAST_SHARE
 from .lookup_table import LookupTable, TableError
 from .spherical_harmonics import coefficient_index, normalization
 
-# Raise it when a function of core.h changes: headers of different versions refuse to be included together.
+# Raise this when a function of core.h changes: headers of different versions then refuse to be included together.
 CORE_VERSION = 7
 _HALF_ARC_NODES = 16
 _TERMS_PER_LINE = 3
 _VALUES_PER_LINE = 8
-TEXTURE_SIZE = 64  # of the two textures
+TEXTURE_SIZE = 64  # texels along each side of the two textures
 
 
 @cache
@@ -40,7 +39,7 @@ def source_text(path: Path) -> str:
 
 
 def filled(text: str, values: Mapping[str, object]) -> str:
-    """`text` with values in the place of their names, written @NAME@; KeyError: a name has no value."""
+    """`text` with each name, written @NAME@, replaced by its value. Raises KeyError if a name has no value."""
     return re.sub(r"@(\w+)@", lambda found: str(values[found[1]]), text)
 
 
@@ -50,7 +49,8 @@ def float_literal(value) -> str:
 
 
 def core_text() -> str:
-    """The language layer, types, vectors, frames, polygons, edges, cells and warps; their names begin with ltsh_."""
+    """The core: language layer, types, vectors, frames, polygons, edges, cells and warps. All names begin with
+    ltsh_."""
     psi = [float_literal(value) for value in edge_integrals.arc_polynomial("psi", edge_integrals.SINGLE_PSI_DEGREE)]
     values = {
         "VERSION": CORE_VERSION,
@@ -69,7 +69,7 @@ def core_text() -> str:
 
 
 def header_text(table: LookupTable, prefix: str, about: str) -> str:
-    """The header; `prefix` begins every name of its own, `about` are the lines of its first comment."""
+    """The header. `prefix` begins all of its own names; `about` is the text of its first comment."""
     blocks = data_blocks(table)
     about = about.encode("ascii", "backslashreplace").decode("ascii").replace("*/", "* /").replace("/*", "/ *")
     values = {
@@ -93,7 +93,7 @@ def header_text(table: LookupTable, prefix: str, about: str) -> str:
     return filled(_of_family(_text("table.h"), table.family), values)
 
 
-# Here ends what is the same for all tables in WGSL, and in a header what shaders need.
+# Markers: the end of what is the same for all tables in WGSL, and the end of what shaders need in a header.
 _OWN = "/* What stands above is the same for all tables: leave it out of a second one. */"
 _END_OF_SHADERS = "/* GLSL and HLSL may end here"
 
@@ -112,7 +112,7 @@ def _text(name) -> str:
 
 
 def _of_family(text, family) -> str:
-    """What `text` has for a family of tables: of the lines `@if ltsh`, ..., `@else`, ..., `@end` one of the parts."""
+    """`text` for a family of tables: keeps one of the two parts between the lines `@if ltsh`, `@else` and `@end`."""
     kept = 1 if family == "ltsh" else 2
     return re.sub(
         r"^@if ltsh\n(.*?)^@else\n(.*?)^@end\n", lambda found: found[kept], text, flags=re.DOTALL | re.MULTILINE
@@ -120,7 +120,7 @@ def _of_family(text, family) -> str:
 
 
 def data_blocks(table: LookupTable) -> dict[str, np.ndarray]:
-    """The parts of the data array in order, float32 (), by the name of the macro that holds their offset."""
+    """The parts of the data array in order, flat float32, by the name of the macro that holds their offset."""
     nodes = table.warp.shape[0] * table.warp.shape[1]
     blocks = {
         "NODES": np.concatenate([table.warp.reshape(nodes, -1), table.coefficients.reshape(nodes, -1)], axis=1),
@@ -133,14 +133,14 @@ def data_blocks(table: LookupTable) -> dict[str, np.ndarray]:
 
 
 def table_sizes(table: LookupTable) -> dict[str, int]:
-    """How much of everything a table has, by the names that C and GLSL know it by."""
+    """The sizes of a table, by their names in C and GLSL."""
     rows, columns, parameters = table.warp.shape
     curves, count = table.coefficients.shape[2:]
     return {"ROWS": rows, "COLUMNS": columns, "PARAMETERS": parameters, "CURVES": curves, "COEFFICIENTS": count}
 
 
 def definitions(values: Mapping[str, object], prefix: str = "LTSH") -> str:
-    """Lines that define macros."""
+    """Lines that define the macros `prefix`_name."""
     return "".join(f"#define {prefix}_{name} {value}\n" for name, value in values.items())
 
 
@@ -169,7 +169,7 @@ def _data_lines(blocks):
 
 
 def _arc_node_lines():
-    """Gauss-Legendre nodes come in pairs of opposite sign."""
+    """Statements that add the nodes. Gauss-Legendre nodes come in pairs of opposite sign."""
     nodes, weights = np.polynomial.legendre.leggauss(_HALF_ARC_NODES)
     for node, weight in zip(nodes, weights, strict=True):
         if node > 0.0:
@@ -178,14 +178,14 @@ def _arc_node_lines():
 
 
 def _weight_lines(ridge_weights):
-    """Moment weights are coefficients @ ridge_weights, a sparse matrix."""
+    """Statements that set the moment weights: coefficients @ ridge_weights, a sparse matrix."""
     least = 1e-12 * np.abs(ridge_weights).max()
     for moment, column in enumerate(ridge_weights.T):
         yield f"    weights.values[{moment}] = {_sum(column, least)};"
 
 
 def _sum(factors, least) -> str:
-    """The sum of the coefficients times those `factors` that are larger than `least`."""
+    """The sum of coefficients times `factors`, without factors of at most `least`."""
     terms = [
         f"{float_literal(factor)} * coefficients.values[{k}]" for k, factor in enumerate(factors) if abs(factor) > least
     ]
@@ -194,7 +194,7 @@ def _sum(factors, least) -> str:
 
 
 def moment_lines(degree: int):
-    """Statements that add an edge to all moments but the solid angle, rows as in `edge_integrals.moments`."""
+    """Statements that add an edge to all moments except the solid angle, in the order of `edge_integrals.moments`."""
     for k in range(degree):
         for j, (u_x, u_z) in enumerate(edge_integrals.RIDGE_DIRECTIONS[: k + 2]):
             row = 1 + k * (k + 3) // 2 + j
@@ -202,12 +202,12 @@ def moment_lines(degree: int):
 
 
 def bend_literals(table) -> str:
-    """The numbers of the bend of a table as arguments of ltsh_bent."""
+    """The numbers of a table's bend, as arguments of ltsh_bent."""
     return ", ".join(float_literal(entry) for entry in table.bend)
 
 
 def bent_factor(table, times: float) -> str:
-    """`times` the factor of the functions of a bend: they are this times v_x and v_z over |v|^4, v = ltsh_bent(w)."""
+    """`times` the factor of a bend's functions: these are the factor times v_x and v_z over |v|^4, v = ltsh_bent(w)."""
     xx, _, yy = table.bend
     return float_literal(times * xx * yy / np.pi)
 
@@ -233,7 +233,7 @@ def bent_moment_lines(table):
 
 
 def _bent_expansion_lines(table):
-    """The same for the functions themselves: see `lookup_table.bent_cosines`."""
+    """Statements that add the functions of the bend themselves, see `lookup_table.bent_cosines`."""
     if table.bend is None:
         return
     count = table.coefficients.shape[3]
@@ -244,7 +244,8 @@ def _bent_expansion_lines(table):
 
 
 def _expansion_lines(degree):
-    """The recurrences of `spherical_harmonics.evaluate`; legendre_l_m is the m-th derivative of P_l at unit.z."""
+    """Statements of the recurrences of `spherical_harmonics.evaluate`. legendre_l_m is the m-th derivative of P_l at
+    unit.z."""
     turns = ["", " * unit.x", *(f" * turn_{m}" for m in range(2, degree + 1))]
     for m in range(degree + 1):
         if m == 2:
@@ -277,9 +278,9 @@ _FORMATS = {np.dtype(np.float32): 2, np.dtype(np.float16): 10}
 
 
 def half_layers(table: LookupTable) -> np.ndarray:
-    """(N, R, T, 4) float16: the channels of the nodes, warp first, then every curve's coefficients, four to a layer.
+    """The channels of the nodes, (N, R, T, 4) float16, four to a layer: the warp, then each curve's coefficients.
 
-    Raises TableError where a number is too large.
+    Raises TableError if a number is too large.
     """
     rows, columns = table.warp.shape[:2]
     channels = np.concatenate([table.warp, table.coefficients.reshape(rows, columns, -1)], axis=2)
@@ -299,7 +300,7 @@ def two_textures(table: LookupTable) -> np.ndarray:
     theta, roughness = (grid.ravel() for grid in np.meshgrid(nodes, nodes, indexing="ij"))
     lobe = table.lookup(1.0 - theta * theta, roughness, curves=2)
     sine, cosine = np.sin(lobe.tilt), np.cos(lobe.tilt)
-    # The axis of the cosine turned into z.
+    # Rotate the axis of the cosine into z.
     across = cosine * lobe.xx, cosine * lobe.xz - sine * lobe.zz
     along = sine * lobe.xx, sine * lobe.xz + cosine * lobe.zz
     inverse = np.stack([across[0], along[0], across[1], along[1]], axis=-1) / lobe.yy[:, None]
@@ -309,8 +310,8 @@ def two_textures(table: LookupTable) -> np.ndarray:
 
 
 def clipped_sphere_factor(height: np.ndarray, form_factor: np.ndarray) -> np.ndarray:
-    """Form factor of a sphere in the direction of z = `height` above the horizon, relative to `form_factor`, which it
-    has straight above.
+    """Form factor of a sphere in a direction with z = `height` over the horizon, relative to `form_factor`, its form
+    factor straight above.
 
     Snyder 1996, "Area light sources for real-time graphics", Microsoft Research MSR-TR-96-11, as in Heitz et al. 2016.
     """
@@ -318,7 +319,7 @@ def clipped_sphere_factor(height: np.ndarray, form_factor: np.ndarray) -> np.nda
     sigma = np.arcsin(np.sqrt(np.minimum(squared, 1.0)))
     omega = np.arccos(np.clip(height, -1.0, 1.0))
     whole = np.maximum(height, 0.0) * squared
-    # Where the horizon cuts the sphere.
+    # This is for spheres that the horizon cuts.
     ratio = np.clip(np.cos(sigma) / np.maximum(np.sin(omega), 1e-9), -1.0, 1.0)
     gamma = np.arcsin(ratio)
     under_root = np.maximum(squared - np.cos(gamma) ** 2, 0.0)
@@ -332,7 +333,7 @@ def clipped_sphere_factor(height: np.ndarray, form_factor: np.ndarray) -> np.nda
 
 
 def dds(layers: np.ndarray) -> bytes:
-    """A DDS file of RGBA textures (N, H, W, 4), float16 or float32: an array texture where there are several."""
+    """A DDS file of RGBA textures (N, H, W, 4), float16 or float32; an array texture if N > 1."""
     count, height, width, _ = layers.shape
     pitch = width * 4 * layers.itemsize
     # DDSCAPS_TEXTURE; DDSD_CAPS | HEIGHT | WIDTH | PITCH | PIXELFORMAT; DDPF_FOURCC

@@ -1,6 +1,6 @@
-"""`shade`: samples and lights in, radiance per light group out, block by block.
+"""`shade`: takes samples and lights, returns radiance per light group, block by block.
 
-A block is shaded by a `Task`, which is the same in this process and in a worker process.
+A `Task` shades each block. It is the same in this process and in worker processes.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ from .light_polygons import fitting_patches
 from .lobes import FLOAT64_CHUNK
 from .lookup_table import LookupTable, load_table
 
-# Samples of a block, which is what one process takes at a time, and what is shaded between two calls of `progress`:
-# one or two chunks; towards the end they get shorter, so that all processes end at about the same time.
+# Least and greatest number of samples of a block, one or two chunks. One process takes a block at a time, and calls of
+# `progress` come between blocks. Towards the end blocks get shorter, so that all processes end at about the same time.
 BLOCK_LIMITS = (24592, 49184)
 REFERENCE_BLOCK_LIMITS = (256, 2048)
-# Nanoseconds that a light, and a corner of it, takes per sample and pass: rough, to tell short tasks from long ones.
-# In single precision for degree 0, and that for every degree more.
+# Nanoseconds per sample and pass, for each light and for each of its corners. They are rough; they tell short tasks
+# from long ones. _SINGLE_COST: in single precision for degree 0. _COST_PER_DEGREE: what each degree adds to that.
 _SINGLE_COST, _COST_PER_DEGREE = (20.0, 15.0), (10.0, 7.0)
 _DOUBLE_COST, _REFERENCE_COST = (100.0, 120.0), (20_000.0, 1000.0)
-# About how many patches of a light a sample takes at most.
+# Estimate of the most patches of a light that a sample takes.
 PATCHES = 60
-# Half the side of a distant light, by its distance: smaller ones are too small for a `SkyMap`.
+# Distant lights with a smaller half side, in units of their distance, are too small for a `SkyMap`.
 SPOT = 0.3
 
 
 @dataclass(frozen=True)
 class Task:
-    """What to do with every block of samples."""
+    """The lights, table and passes with which to shade every block of samples."""
 
     lights: tuple[AreaLight, ...]
     groups: tuple[str, ...]
@@ -54,11 +54,11 @@ class Task:
 
     @property
     def has_error(self) -> bool:
-        """True where the result comes with an estimate of its error."""
+        """True if the result comes with an estimate of its error."""
         return self.is_reference and "specular" in self.passes
 
     def seconds(self, count: int) -> float:
-        """About how long `count` samples take one process."""
+        """Estimated time in s that one process needs for `count` samples."""
         per_light, per_corner = _REFERENCE_COST if self.is_reference else _DOUBLE_COST
         if self.single:
             degree = self.table.degree if "specular" in self.passes else 0
@@ -69,8 +69,8 @@ class Task:
         return 1e-9 * count * len(self.passes) * (per_light * len(self.lights) + per_corner * corners)
 
     def shade(self, samples: SurfaceSamples, scratch) -> tuple[dict[str, np.ndarray], np.ndarray | None, dict]:
-        """Radiance (G, B, 3) by pass of one block of B samples, the error (B,) of the reference, and by pass the list
-        of what is left to `shade_pairs`: samples (N,) and numbers (N,) of lights."""
+        """Radiance (G, B, 3) by pass of a block of B samples; the error (B,) of the reference, else None; and, by pass,
+        a list of what is left to `shade_pairs`: samples (N,) and numbers (N,) of lights."""
         radiance = {name: np.zeros((len(self.groups), len(samples), 3), self.dtype) for name in self.passes}
         error = np.zeros(len(samples)) if self.has_error else None
         leftovers: dict[str, list] = {name: [] for name in self.passes}
@@ -84,7 +84,7 @@ class Task:
         return radiance, error, leftovers
 
     def lights_of_pairs(self, name: str) -> list[AreaLight]:
-        """The lights that `shade_pairs` knows by their number."""
+        """The lights to which the numbers in `shade_pairs` refer."""
         return [light for light in self.lights if getattr(light, f"affects_{name}") and not light.detail]
 
     def shade_pairs(self, samples: SurfaceSamples, name: str, number: np.ndarray) -> np.ndarray:
@@ -108,7 +108,7 @@ class Task:
         return self._by_pass(lights) if lights else None
 
     def prepare(self) -> None:
-        """Make now what all processes need."""
+        """Compute now what all processes need."""
         if self.single:
             for lights in (self._with_patches or {}).values():
                 _ = lights.skies
@@ -116,7 +116,7 @@ class Task:
     def _by_pass(self, lights):
         lights = self._prepared(lights)
         found = {name: float32.Lights.of(lights, name) for name in self.passes}
-        # Where all lights affect both passes their trees are the same.
+        # If all lights affect both passes, these share their trees.
         return found if len({len(own) for own in found.values()}) > 1 else dict.fromkeys(found, found[self.passes[0]])
 
     def _prepared(self, lights):
@@ -127,7 +127,7 @@ class Task:
         for index, patches in fitting_patches(light, samples, name == "specular"):
             own = {name: np.zeros((len(self.groups), len(index), 3), self.dtype)}
             own_error = None if error is None else np.zeros(len(index))
-            # Of the group of the whole light, whatever theirs are.
+            # The patches count for the group of the whole light, whatever their own is.
             group = self.groups.index(light.group)
             prepared = float32.Lights((patch, group, patch.polygon()) for patch in patches)
             self._add(samples.take(index), {name: prepared}, own, own_error, scratch, {})
@@ -136,7 +136,7 @@ class Task:
                 error[index] += own_error
 
     def _add(self, samples, prepared, radiance, error, scratch, leftovers) -> None:
-        """Add the light of the `prepared` lights by pass to the passes in `radiance`, but for `leftovers`."""
+        """Add the light of the `prepared` lights by pass to `radiance`, except for pairs put into `leftovers`."""
         if self.single:
             if "diffuse" in radiance:
                 left = leftovers.get("diffuse")
@@ -157,7 +157,7 @@ class Task:
 
 
 def _corners_integrated(light, is_reference):
-    """About how many corners the integrals over a light have."""
+    """Estimated number of corners in the integrals over a light."""
     count = len(light.polygon()) * min(len(light.patches), PATCHES)
     if light.is_profiled:
         effort = light_cone.EFFORTS[1]
@@ -167,12 +167,12 @@ def _corners_integrated(light, is_reference):
 
 @dataclass(frozen=True)
 class Shading:
-    """Reflected radiance in W m^-2 sr^-1 per light group; a pass that was not asked for is None."""
+    """Reflected radiance in W m^-2 sr^-1 per light group. A pass that was not asked for is None."""
 
     groups: tuple[str, ...]
     specular: np.ndarray | None  # (G, P, 3)
     diffuse: np.ndarray | None  # (G, P, 3)
-    quadrature_error: np.ndarray | None = None  # (P,) estimate for F = 1 and unit radiance, of "reference" only
+    quadrature_error: np.ndarray | None = None  # (P,) estimate for F = 1 and unit radiance; "reference" only
 
     @property
     def combined(self) -> np.ndarray:
@@ -180,7 +180,7 @@ class Shading:
         return sum(part.sum(axis=0) for part in (self.specular, self.diffuse) if part is not None)
 
     def with_more(self, kept: np.ndarray, more: Shading) -> Shading:
-        """The samples of the mask `kept` (P,), and those of another with the same groups and passes."""
+        """The samples for which the mask `kept` (P,) is True, then those of `more`, with the same groups and passes."""
 
         def joined(name, axis):
             one, other = getattr(self, name), getattr(more, name)
@@ -191,13 +191,13 @@ class Shading:
 
 
 class OwnTechnique(Protocol):
-    """A technique of the user: anything with this method, and a `name` if it shall have another than its class."""
+    """A technique of the user: anything with this method. An attribute `name` replaces the name of its class."""
 
     def evaluate(self, samples: SurfaceSamples, lights: tuple[AreaLight, ...]) -> Shading:
-        """Radiance of `samples` (P) under `lights` together: its light groups are added up.
+        """Radiance of `samples` (P) under all `lights` together; its light groups are added up.
 
-        The lights have no `detail`. What is left to the caller: whether the passes or the receivers of a light
-        include a sample, and a diffuse pass that is None, which then is the exact one.
+        The lights have no `detail`. The caller takes care of samples that a light's passes or receivers leave out. If
+        the diffuse pass is None, the caller uses the exact one.
         """
         ...
 
@@ -220,14 +220,14 @@ def shade(
     """Direct, unoccluded reflected radiance of `samples` (P) under `lights`.
 
     `technique` is "reference" (quadrature of the true BRDF), a shipped table, a table's path, a LookupTable or an
-    OwnTechnique. Diffuse is exact for polygons in every technique but those. `workers` processes (default: all
-    cores) give the same result bit for bit; few samples are shaded in this process. `progress(fraction)` may return
-    False to stop: Cancelled is raised.
-    With `dtype` float32 radiance is float32 and within 2e-5 of that with float64, per unit of the lights' radiance,
-    for lights with a spread of that straight ahead; their spread is exact to 0.3 % (see `light_cone`);
-    points where single precision does not suffice are computed in double, and so are lights a thousand times as long
-    as wide, which in single have an error of 4e-4 of their light. "reference" and degrees above 4 always are.
-    Raises TableError and ValueError.
+    OwnTechnique. Diffuse light is exact for polygons in all techniques except the last. `workers` processes (default:
+    all cores) give the same result bit for bit; this process shades few samples alone. `progress(fraction)` may return
+    False to stop: Cancelled is raised. Also raises TableError and ValueError.
+
+    With `dtype` float32, radiance is float32 and within 2e-5 of that with float64, per unit of the lights' radiance;
+    for lights with a spread, of their radiance straight ahead. Spreads are accurate to 0.3 % (see `light_cone`). Points
+    for which single precision does not suffice are computed in double. So are lights a thousand times as long as wide,
+    whose error in single precision is 4e-4 of their light, and always "reference" and degrees above 4.
     """
     if is_own(technique):
         return _shade_with(technique, samples, tuple(lights), tuple(passes), (workers, progress, dtype))
@@ -241,7 +241,7 @@ def shade(
 
 
 def _shade_with(technique, samples, lights, passes, how) -> Shading:
-    """What an OwnTechnique gives, one light after another."""
+    """The result of an OwnTechnique, computed light by light."""
     _check_passes(passes)
     workers, progress, dtype = how
     groups = tuple(dict.fromkeys(light.group for light in lights)) or ("",)
@@ -263,7 +263,7 @@ def _shade_with(technique, samples, lights, passes, how) -> Shading:
 
 
 def _own_pass(technique, found, name, count) -> np.ndarray | None:
-    """A pass (G, P, 3) of what an OwnTechnique has returned. Raises ValueError where it is not fit."""
+    """A pass (G, P, 3) of what an OwnTechnique returned. Raises ValueError if it is not usable."""
     subject = f"technique {type(technique).__name__}: evaluate"
     if not isinstance(found, Shading):
         raise ValueError(f"{subject} returned {type(found).__name__}, expected a ltsh_addon.shading.Shading")
@@ -277,7 +277,7 @@ def _own_pass(technique, found, name, count) -> np.ndarray | None:
 
 
 class _Result:
-    """Puts blocks together, and what they leave for the end."""
+    """Collects blocks, and what they leave for the end."""
 
     def __init__(self, task: Task, count: int, dtype: np.dtype):
         self._task = task
@@ -286,7 +286,7 @@ class _Result:
         self._leftovers: dict[int, dict] = {}  # by start of the block
 
     def keep(self, block: slice, radiance, error, leftovers) -> None:
-        """Take what `Task.shade` returns."""
+        """Keep what `Task.shade` returned."""
         for name, values in radiance.items():
             self.radiance[name][:, block] = values
         if self.error is not None:
@@ -294,8 +294,8 @@ class _Result:
         self._leftovers[block.start] = leftovers
 
     def pairs(self) -> list[parallel.Pairs]:
-        """What all blocks have left, in batches. Neither these nor the order in them depends on which block was done
-        first, and all that is left of a block is in one of them."""
+        """What all blocks left, in batches. Neither the batches nor their order depend on which block was done first.
+        Each batch contains whole blocks."""
         found = []
         for name in self._task.passes:
             batch: list[tuple] = []
@@ -308,16 +308,16 @@ class _Result:
         return [parallel.Pairs(name, *map(np.concatenate, zip(*batch, strict=True))) for name, batch in found if batch]
 
     def keep_pairs(self, pairs: parallel.Pairs, radiance: np.ndarray) -> None:
-        """Add what `Task.shade_pairs` returns."""
+        """Add what `Task.shade_pairs` returned."""
         lights = self._task.lights_of_pairs(pairs.name)
         group = np.array([self._task.groups.index(light.group) for light in lights])
-        # A sample may be there for several lights.
+        # A sample may occur with several lights.
         np.add.at(self.radiance[pairs.name], (group[pairs.number], pairs.index), radiance)
 
 
 def _blocks(count: int, least: int, most: int) -> list[slice]:
-    """Slices that make up `count` samples: `most` long, and half of that, down to `least`, where fewer than four such
-    blocks are left. They do not depend on how many processes there are."""
+    """Slices that make up `count` samples. They are `most` long; when fewer than four such blocks are left, their
+    length is halved, down to `least`. They do not depend on the number of processes."""
     blocks, start, size = [], 0, most
     while start < count:
         while size // 2 >= least and 4 * size > count - start:
@@ -333,8 +333,8 @@ def _check_passes(passes) -> None:
 
 
 def _parts(light) -> tuple[AreaLight, ...]:
-    """The patches of a small distant light, each of which gets its own integral; others are whole. Sheared ones with
-    a profile stand upright."""
+    """The parts of a light that get an integral each: the patches of a small distant light; otherwise the light itself.
+    Sheared lights with a profile are returned `upright`."""
     if light.is_profiled and not light.detail and light_cone.has_shear(light):
         return (light_cone.upright(light),)
     is_spot = float64.has_patches(light) and np.linalg.norm(light.half_u) < SPOT * np.linalg.norm(light.center)
@@ -349,7 +349,7 @@ def _task(lights, technique, passes, dtype) -> Task:
     if isinstance(technique, str | Path) and technique != REFERENCE:
         table = load_table(technique)
     if not isinstance(table, str) and table.family == "ltsh":
-        # Workers get this matrix with the table: LAPACK need not give the same last bits in every process.
+        # Workers get this matrix with the table, because LAPACK need not give the same last bits in every process.
         _ = table.ridge_weights
     groups = tuple(dict.fromkeys(light.group for light in lights)) or ("",)
     lights = tuple(part for light in lights if light.area_vector.any() for part in _parts(light))

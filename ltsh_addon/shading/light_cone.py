@@ -1,18 +1,18 @@
 """Lights with a spread or a falloff: integrals over the light times a profile.
 
-Double precision takes integrals over parts of the light, `layers`. Single precision takes points of the light where few
-of them suffice, `ConeRegions`, at a tenth to a hundredth of the cost.
+There are two methods. In double precision, `layers` integrates over parts of the light. In single precision,
+`ConeRegions` sums over points of the light wherever few of them suffice, at a tenth to a hundredth of the cost.
 
-With the distance d of the point from the light's plane and r the distance in that plane from the foot of the point,
-the factors of `AreaLight` are a profile p(r): that of the spread is (R - r)+ / (d (tan h - h)), R = d tan h and h half
-the spread; that of the falloff is a function of t = sqrt(d^2 + r^2). Integration by parts makes of any lobe integral
-over the light one over disks around the foot,
+Let d be the distance of the shading point from the light's plane, and r the distance in that plane from the foot of
+the point. The factors of `AreaLight` are a profile p(r). The profile of a spread is (R - r)+ / (d (tan h - h)), where
+R = d tan h and h is half the spread. The profile of a falloff is a function of t = sqrt(d^2 + r^2). Integration by
+parts turns any lobe integral over the light into one over disks around the foot,
 
-    int f p = p(r_1) J(r_1) - int_0^r_1 p'(rho) J(rho) drho,   J(rho) = int of f over the part with r < rho,
+    int f p = p(r_1) J(r_1) - int_0^r_1 p'(rho) J(rho) drho,   J(rho) = int of f over the part with r < rho.
 
-where J is 0 up to the least distance in the light, and r_1 is the largest, or R where that is less and p(R) = 0. Closed
-forms give J; the integral over rho takes a Gauss-Legendre rule whose nodes are dense where the lobe meets the light,
-for a sharp lobe makes J a step there.
+J is 0 up to the least distance in the light. r_1 is the largest distance, or R if that is less; p(R) = 0. Closed forms
+give J. A Gauss-Legendre rule integrates over rho; its nodes are dense where the lobe meets the light, because a sharp
+lobe makes J a step there.
 """
 
 from __future__ import annotations
@@ -25,33 +25,34 @@ import numpy as np
 from ..scene import AREA_LIGHT_SHAPES
 from .polygon import dot
 
-# Half angle in rad below which Cycles takes the series of tan h - h.
+# Half angle in rad up to which Cycles takes the series of tan h - h.
 _SERIES = 0.05
+# Least and greatest width of a lobe, in units of the interval over which it is integrated.
 WIDTH_RANGE = (1e-4, 1e3)
-# A round light is a polygon of the same area, whose corners stand out a little.
+# A polygon of the same area replaces a round light. Its corners reach beyond the light by at most this factor.
 ROUND_MARGIN = 1.02
 
 
 def cone(spread: float) -> tuple[float, float]:
-    """tan h, and tan h - h by which the factor is divided."""
+    """tan h, and tan h - h, the divisor of the factor, where h is half the `spread` in rad."""
     half = 0.5 * spread
     tangent = float(np.tan(half))
     return tangent, half**3 / 3.0 if half <= _SERIES else tangent - half
 
 
-# In place of tan h and tan h - h of a light without a spread: its factor is 1 up to far beyond any light.
+# Stands for tan h and for tan h - h of a light without a spread: its factor is then 1 up to far beyond any light.
 _WIDE_OPEN = 1e15
-# In m^2: squares in single precision do not become 0.
+# Least squared length in m^2: it is still above 0 in single precision.
 _TINY = 1e-30
-# In m.
+# Least width of a peak in m.
 _TINY_WIDTH = 1e-9
-# Cosine between half axes from which on a light counts as sheared: above what rounding makes of right angles.
+# A light counts as sheared if the cosine between its half axes is above this, more than rounding makes of right angles.
 SHEAR = 1e-6
 
 
 @dataclass(frozen=True)
 class Profile:
-    """By what the radiance of a light is multiplied; all methods take arrays that broadcast."""
+    """The factor by which the radiance of a light is multiplied. All methods take arrays that broadcast."""
 
     tangent: float
     share: float
@@ -60,16 +61,16 @@ class Profile:
 
     @classmethod
     def of(cls, light) -> Profile:
-        """That of `light`."""
+        """The profile of `light`."""
         tangent, share = cone(light.spread) if light.is_focused else (_WIDE_OPEN, _WIDE_OPEN)
         return cls(tangent, share, light.falloff, light.smooth)
 
     def at(self, radius, distance):
-        """The factor at `radius` from the foot of a point that is at `distance` from the plane of the light."""
+        """The factor at `radius` from the foot of a point whose distance from the light's plane is `distance`."""
         return self._spread(radius / distance) * self._falloff(distance * distance + radius * radius)
 
     def range(self, nearest, farthest, distance):
-        """The least and the greatest factor where the radius is from `nearest` to `farthest`."""
+        """The least and the greatest factor for radii from `nearest` to `farthest`."""
         squared = distance * distance
         return tuple(
             self._spread(shaded / distance) * self._falloff(squared + faded * faded)
@@ -77,7 +78,7 @@ class Profile:
         )
 
     def descent(self, radius, distance):
-        """By how much the factor sinks per `radius`, inside of the cone."""
+        """The negative derivative of the factor by `radius`, inside the cone."""
         squared = np.maximum(distance * distance + radius * radius, _TINY)
         share = self.falloff / squared
         if self.smooth > 0.0:
@@ -106,14 +107,14 @@ def plane_axes(light) -> np.ndarray:
 
 
 def has_shear(light) -> bool:
-    """Whether the half axes are at no right angle, by more than rounding."""
+    """Whether the angle between the half axes differs from a right angle by more than rounding."""
     u, v = light.half_u, light.half_v
     return abs(u @ v) > SHEAR * np.linalg.norm(u) * np.linalg.norm(v)
 
 
 def upright(light):
-    """The same light as `ConeRegions` wants it, for transforms may shear it: an ellipse by its principal axes, at right
-    angles; of a parallelogram half_u is the shorter side."""
+    """The same light in the form that `ConeRegions` needs. The half axes of an ellipse become its principal axes, at
+    right angles even if a transform sheared the light; half_u of a parallelogram becomes the shorter side."""
     u, v = light.half_u, light.half_v
     if not light.is_round:
         return light if u @ u <= v @ v else light.altered(half_u=v, half_v=u)
@@ -124,22 +125,25 @@ def upright(light):
 
 @dataclass(frozen=True)
 class Effort:
-    """Layers per cone, and chords per arc of a layer, 2 or more."""
+    """Number of layers per cone, and of chords per arc of a layer; at least 2 chords."""
 
     layers: int
     chords: int
 
 
-# Well inside the cone, and far away, the profile hardly varies over a light. Sharp lobes see the difference of chords
-# from a circle.
+# From the cheapest to the most accurate. The profile hardly varies over a light that is well inside the cone or far
+# away. Sharp lobes see the difference between chords and a circle.
 EFFORTS = (Effort(5, 2), Effort(8, 2), Effort(8, 4), Effort(8, 12))
+# Largest extent of a light well inside the cone, as a share of its distance from the cone's edge or from the point.
 WELL_INSIDE = 0.25
+# Widths in rad from which on a lobe is wide, and below which it is sharp.
 WIDE_LOBE, SHARP_LOBE = 0.09, 0.01
 
 
 def efforts(light, position, width):
-    """Yield (effort, chosen (Q',)) that keep the error of the profile at about 0.3 % for points with x, y, z in
-    `position` (3, Q), all in double precision, with lobes that are `width` (Q,) or a number of radians wide."""
+    """Yield (effort, chosen (Q',)) for points with x, y, z in `position` (3, Q): `chosen` are the numbers of the points
+    that need `effort` for a profile error of about 0.3 %. Their lobes are `width` (Q,) or a number of radians wide.
+    All arrays are in double precision."""
     extent, reach, beside = _place_in_cone(light, position)
     length = reach - beside
     if light.has_falloff:
@@ -158,8 +162,8 @@ def may_reach(light, position) -> np.ndarray:
 
 
 def _place_in_cone(light, position):
-    """How far the light extends from its center, and for points (3, Q) the radius of their cones in the light's plane
-    and the distance of the center from the cone's axis."""
+    """How far the light extends from its center; for points (3, Q), the radius (Q,) of the cone in the light's plane
+    and the distance (Q,) of the light's center from the cone's axis."""
     offset = [position[axis] - light.center[axis] for axis in range(3)]
     distance = sum(offset[axis] * light.direction[axis] for axis in range(3))
     beside = np.sqrt(np.maximum(sum(component * component for component in offset) - distance * distance, 0.0))
@@ -169,18 +173,19 @@ def _place_in_cone(light, position):
 
 @dataclass(frozen=True)
 class LightView:
-    """A light seen from points: where the points lie, and the light's plane in their coordinates."""
+    """A light seen from points: where the points lie, and the light's plane in the coordinates of the integrals."""
 
-    distance: np.ndarray  # (P,) from the plane
-    center: np.ndarray  # (2, P) of the light, from the foot along `plane_axes`
-    extent: tuple[float, float]  # of the light along the axes
-    foot: np.ndarray  # (C, P) in the coordinates of the integrals; in the first three a lobe is some radian wide
-    axis_u: np.ndarray  # (C, P)
-    axis_v: np.ndarray  # (C, P)
+    distance: np.ndarray  # (P,) of the points from the plane
+    center: np.ndarray  # (2, P) of the light, relative to the foot, along `plane_axes`
+    extent: tuple[float, float]  # lengths of the light's half axes
+    foot: np.ndarray  # (C, P) in the coordinates of the integrals; in the first three, lobes are about a radian wide
+    axis_u: np.ndarray  # (C, P) the first of `plane_axes` in these coordinates
+    axis_v: np.ndarray  # (C, P) the second
 
     @classmethod
     def of(cls, light, offset, along) -> LightView:
-        """From the offsets (3, P) of the light's center, and along(vector (3,)) -> (C, P), its coordinates."""
+        """The view from points at which the light's center has the offsets (3, P). along(vector (3,)) -> (C, P) returns
+        the coordinates of a vector."""
         axes = plane_axes(light)
         distance = -dot(offset, light.direction.astype(offset.dtype))
         center = np.stack([dot(offset, axis) for axis in axes.astype(offset.dtype)])
@@ -194,12 +199,12 @@ class LightView:
         return LightView(self.distance[index], self.center[:, index], self.extent, *columns)
 
     def corners(self, flat: np.ndarray) -> np.ndarray:
-        """Coordinates (C, V, P) of points (2, V, P) of the plane."""
+        """Coordinates (C, V, P) of points `flat` (2, V, P) of the plane."""
         return self.foot[:, None] + flat[0] * self.axis_u[:, None] + flat[1] * self.axis_v[:, None]
 
     def peak(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Where the axis e_z meets the plane: (2, P), its height (P,), the mask (P,) of points for which it does, and
-        the determinant (P,) of the plane's axes seen along it."""
+        """Where the lobe's axis e_z meets the plane: place (2, P), height (P,), mask (P,) of the points for which it
+        does, and determinant (P,) of the plane's axes seen along e_z."""
         foot, u, v = self.foot, self.axis_u, self.axis_v
         determinant = u[0] * v[1] - v[0] * u[1]
         size = np.sqrt((u[:3] * u[:3]).sum(axis=0) * (v[:3] * v[:3]).sum(axis=0))
@@ -210,8 +215,8 @@ class LightView:
         return peak, height, seen & (height > 0.0), determinant
 
     def lobe_range(self) -> tuple[np.ndarray, np.ndarray]:
-        """Distance (P,) from the foot at which a lobe around e_z meets the light best, and how far (P,) it reaches
-        there: infinitely where it does not face the light's plane."""
+        """Distance (P,) from the foot at which a lobe around e_z meets the light best, and the lobe's width (P,) there;
+        the width is infinite if the lobe does not face the light's plane."""
         u, v = self.axis_u, self.axis_v
         peak, height, seen, determinant = self.peak()
         extent = np.array(self.extent, dtype=peak.dtype)[:, None]
@@ -219,7 +224,7 @@ class LightView:
         off = peak - nearest
         distance = np.sqrt(_dot(nearest, nearest))
         toward = nearest / np.where(distance > 0.0, distance, 1.0)
-        # Of a lobe with the covariance (A^T A)^-1 the width along a unit vector e is |A^-T e|.
+        # A lobe with the covariance (A^T A)^-1 has the width |A^-T e| along a unit vector e.
         across = v[1] * toward[0] - u[1] * toward[1], u[0] * toward[1] - v[0] * toward[0]
         width = height / determinant
         width = np.sqrt(width * width * _dot(across, across) + _dot(off, off))
@@ -227,8 +232,9 @@ class LightView:
 
 
 def layers(view: LightView, flat: np.ndarray, profile: Profile, effort: Effort):
-    """Yield (index (Q,), weights (Q,), corners (C, W, Q)): lobe integrals over the corners times the weights add up to
-    the integral over the convex part `flat` (2, V, P) of the light times its profile. The polygons grow.
+    """Yield (index (Q,), weights (Q,), corners (C, W, Q)) from the innermost polygon to the outermost. The lobe
+    integrals over these polygons, times the weights, add up to the integral over the convex part `flat` (2, V, P) of
+    the light times its profile.
     """
     part = DiskParts(flat)
     reach = profile.tangent * view.distance
@@ -266,7 +272,7 @@ class DiskParts:
         self.encloses = self._encloses(squared)
         length = np.sqrt(np.take_along_axis(square, closest[None], axis=0)[0])
         self.least = np.where(self.encloses, 0.0, length)
-        # Seen from a foot outside, all lies within a quarter turn of the nearest point.
+        # From a foot outside, the whole polygon lies within a quarter turn of the direction to its nearest point.
         forward = np.take_along_axis(nearest, closest[None, None], axis=1)[:, 0]
         forward = forward / np.where(length > 0.0, length, 1.0)
         forward[0] += length == 0.0
@@ -274,7 +280,7 @@ class DiskParts:
         self.angle = self._angle(flat)
 
     def _encloses(self, squared):
-        """Mask (P,): is the foot inside? Edges between corners that rounding alone tells apart have no sides."""
+        """Mask (P,): is the foot inside? Edges no longer than rounding errors have no sides and are skipped."""
         short = squared <= np.finfo(self.flat.dtype).eps * self.largest**2
         left, right = (((way * self.side >= 0.0) | short).all(axis=0) for way in (1.0, -1.0))
         return (left | right) & ~short.all(axis=0)
@@ -283,11 +289,11 @@ class DiskParts:
         return np.arctan2(_cross(self.forward, points), _dot(self.forward, points))
 
     def inside(self, radius: np.ndarray, chords: int) -> np.ndarray:
-        """The parts (2, V (2 chords + 1), P) inside the disks of `radius` (P,), their boundaries in order.
+        """The parts (2, V (2 chords + 1), P) inside the disks of `radius` (P,), as corners in the order of their edges.
 
-        What lies outside is drawn to the circle along radii: the winding numbers inside stay. Of every edge the arc up
-        to where it enters the disk, the part inside, and the arc after it remain; an arc becomes `chords` chords that
-        enclose its area.
+        What lies outside is moved to the circle along radii, which keeps the winding numbers inside. Each edge leaves
+        the arc up to where it enters the disk, its part inside, and the arc after it. An arc becomes `chords` chords
+        that enclose its area.
         """
         reach = np.maximum(self.squared * radius * radius - self.side * self.side, 0.0)
         root = np.sqrt(reach)
@@ -303,19 +309,19 @@ class DiskParts:
         return np.stack(points, axis=2).reshape(2, -1, self.flat.shape[2])
 
     def _seen_from_foot(self, entry, leave, meets):
-        """Bounds (P,) of the angles at which the parts are seen. Arcs beyond would cancel, but for their chords."""
+        """Bounds (P,) of the angles at which the parts are seen. Arcs beyond these would cancel, their chords not."""
         ends = np.stack([entry, leave])
         lowest = np.where(meets, ends, np.pi).min(axis=(0, 1))
         highest = np.where(meets, ends, -np.pi).max(axis=(0, 1))
         return np.where(self.encloses, -4.0, lowest), np.where(self.encloses, 4.0, np.maximum(lowest, highest))
 
     def _arc(self, start, end, size, chords):
-        """Corners (2, V, P), chords + 1 of them, from angle to angle (V, P) at the distance `size` (V, P)."""
+        """Corners of arcs, chords + 1 arrays (2, V, P) from angle `start` to `end` (V, P) at distance `size` (V, P)."""
         turn = end - start
         turn -= np.where(np.abs(turn) > np.pi, np.copysign(2.0 * np.pi, turn), 0.0).astype(turn.dtype)
         step = turn / chords
         cosine, sine = np.cos(step), np.sin(step)
-        # The corners between the ends lie so far out that the chords enclose the area of the arc.
+        # The inner corners lie outside the circle, so far that the chords enclose the area of the arc.
         total = chords * np.where(sine == 0.0, 1.0, step / np.where(sine == 0.0, 1.0, sine))
         out = 0.5 * total if chords == 2 else (np.sqrt(1.0 + (chords - 2) * total) - 1.0) / (chords - 2)
         x, y = np.cos(start), np.sin(start)
@@ -328,12 +334,13 @@ class DiskParts:
         return corners
 
     def _turned(self, x, y):
-        """Points (2, V, P) with the coordinates x, y along `forward` and across it."""
+        """Points (2, V, P) whose coordinates along `forward` and across it are x and y."""
         return np.stack([self.forward[0] * x - self.forward[1] * y, self.forward[0] * y + self.forward[1] * x])
 
 
 def _graded_nodes(low, high, center, width, count):
-    """Nodes and weights (count, P) of an integral over [low, high], dense within `width` of `center`; all (P,)."""
+    """Nodes and weights (count, P) of an integral over [low, high]. The nodes are dense within `width` of `center`; all
+    arguments are (P,)."""
     nodes, weights = (values.astype(low.dtype)[:, None] for values in gauss_legendre(count))
     span = high - low
     center = np.clip(center, low, high)
@@ -359,39 +366,41 @@ def _cross(a, b):
     return a[0] * b[1] - a[1] * b[0]
 
 
-# Rules with points on chords of a light; of cones that lie in it, with points on rays; and with points that are dense
-# where the lobe peaks; SPLIT is EVEN with the chords on either side of the foot apart. Each is within 0.3 % but for 1
-# in 100 places, most of them at faint edges.
+# Kinds of quadrature rules. EVEN: points on chords of the light. SPLIT: like EVEN, with separate points on either side
+# of the foot. WHOLE_CONE: points on rays from the foot, for cones that lie in the light. GRADED: points that are dense
+# where the lobe peaks. Each is accurate to 0.3 % except at 1 in 100 places, mostly at faint edges.
 EVEN, SPLIT, WHOLE_CONE, GRADED = range(4)
-# Points per axis by the size of what is seen, in units of its distance, in the coordinates in which lobes are a radian
-# wide; then of GRADED by half the range of arsinh(place by width of the peak). The layers do what has 0 of them.
+# SIZES: size of the visible region in units of its distance, in the coordinates in which lobes are a radian wide.
+# POINTS, ROUND_POINTS: points per axis up to each of SIZES and beyond; 0 stands for `layers` instead.
 SIZES = (0.2, 0.4, 0.6)
 POINTS, ROUND_POINTS = np.array([3, 4, 6, 0]), np.array([5, 6, 8, 0])
+# RANGES: half the range of arsinh(place / width of the peak). GRADED_POINTS: points per axis of GRADED for these.
 RANGES = (1.0, 1.5, 2.0, 3.0, 4.0, 5.0)
 GRADED_POINTS, ROUND_GRADED_POINTS = np.array([8, 8, 12, 14, 14, 20, 0]), np.array([10, 12, 14, 20, 0, 0, 0])
-# Where the foot is in what is seen, or closer than its size, the tip of the profile needs these, even numbers, by the
-# size in units of the cone's radius.
+# The tip of the profile needs more points where the foot is in the visible region, or closer to it than its size.
+# TIP_SIZES: that size in units of the cone's radius. TIP_POINTS: least points per axis for these, even numbers.
 TIP_SIZES = (0.15, 0.5)
 TIP_POINTS, ROUND_TIP_POINTS = np.array([0, 6, 10]), np.array([0, 8, 16])
-# The longer side of a light by the other.
+# A light is long if its longer side is more than this many times the other.
 LONG = 2.0
-# Of WHOLE_CONE there are this many radii, and twice as many angles.
+# Radii of WHOLE_CONE up to each of SIZES; there are twice as many angles.
 RADII = np.array([3, 4, 5])
 
 
 class ConeRegions:
-    """What points see of a light: the part in their cones and above their horizons, where its profile is not 0.
+    """The region of a light that each point sees: the part in its cone and above its horizons, where the profile is
+    not 0.
 
-    A point of the light's plane is at s `along_s` + t `along_t` from the foot. Chords t of s in the span [low, high]
-    fill the region. The light is a parallelogram or an ellipse, both as `upright` has them.
+    The foot of the point plus s `along_s` plus t `along_t` is a point of the light's plane. The region consists of the
+    chords along t for every s in [low, high]. The light is a parallelogram or an ellipse, as returned by `upright`.
     """
 
     def __init__(self, light, view: LightView, horizons):
-        """horizons: the coordinates that are positive above them."""
+        """horizons: numbers of the coordinates of `view` that are positive above a horizon."""
         self.view, self.profile, self.is_round, self.horizons = view, Profile.of(light), light.is_round, horizons
         self.is_sheared = not light.is_round and has_shear(light)
         dtype = view.distance.dtype.type
-        # Half extents along the axes in the plane; by how much chords shift per step from one to the next.
+        # Half extents along the axes of the plane, and by how much chords shift along t per unit of s.
         u, v, self.skew = *view.extent, dtype(0.0)
         if self.is_sheared:
             along, v = (float(axis @ light.half_v) for axis in plane_axes(light))
@@ -408,17 +417,18 @@ class ConeRegions:
 
     @staticmethod
     def suit(light) -> bool:
-        """Whether the light is a parallelogram or an ellipse in a place, as `upright` has them."""
+        """Whether the light is a parallelogram or an ellipse as returned by `upright`, and not distant."""
         is_upright = not (light.is_round and has_shear(light))
         return is_upright and not light.is_distant and light.shape in AREA_LIGHT_SHAPES
 
     def _turns(self, dtype):
-        """Unit vectors (2, P) along s: along the longer side, or where there is none of a round light away from the
-        foot, so that the cone's chords are symmetric, of others along the side that horizons cut less."""
+        """Unit vectors (2, P) along s. They follow the longer side of a long light. For other round lights they point
+        away from the foot, which makes the cone's chords symmetric; for other rectangles they follow the side that
+        horizons cut less."""
         view = self.view
         u, v = self.extent
         if self.is_long or self.is_sheared:
-            # Chords of a parallelogram are along half_u.
+            # Chords of a sheared parallelogram run along half_u.
             across = np.full(len(view.distance), v > u or self.is_sheared)
             return np.stack([~across, across]).astype(dtype)
         if self.is_round:
@@ -432,7 +442,7 @@ class ConeRegions:
         return np.stack([~across, across]).astype(dtype)
 
     def _bound(self, u, v):
-        """Bounds (P,) of s, and of t for any s: `low`, `high`, `lowest` and `highest`."""
+        """Set the bounds (P,) of s, `low` and `high`, and those of t for any s, `lowest` and `highest`."""
         (s, t), reach, (e, f) = self.center, self.reach, self.turn
         half_s, half_t = (np.sqrt((u * along_u) ** 2 + (v * along_v) ** 2) for along_u, along_v in ((e, f), (f, e)))
         if self.is_round:
@@ -463,8 +473,8 @@ class ConeRegions:
         self.low, self.high = low, high
 
     def rules(self):
-        """Yield (points per axis, or 0 where such rules do not suffice, kind, index (Q,)): of what is missing nothing
-        is seen."""
+        """Yield (points per axis, kind, index (Q,)): which rule suits which points. 0 points per axis means that no
+        such rule suffices. Points that are missing see nothing of the light."""
         half_s, half_t = 0.5 * (self.high - self.low), 0.5 * (self.highest - self.lowest)
         seen = np.nonzero((half_s > 0.0) & (half_t > 0.0) & (self.view.distance > 0.0))[0]
         half_s, half_t, reach = half_s[seen], half_t[seen], self.reach[seen]
@@ -496,11 +506,11 @@ class ConeRegions:
             yield int(key // 4), int(key % 4), seen[4 * number + kind == key]
 
     def _axes(self, index):
-        """Of the points `index` (Q,), `foot`, `along_s` and `along_t` (3, Q) in the coordinates of their lobes."""
+        """`foot`, `along_s` and `along_t` (3, Q) of the points `index` (Q,), in the coordinates of their lobes."""
         return self.view.foot[:3, index], self.along_s[:3, index], self.along_t[:3, index]
 
     def _ranges(self, index):
-        """Half the range (Q,) of nodes of graded rules, see RANGES."""
+        """Half the range (Q,) of the nodes of graded rules, see RANGES."""
         axes = self._axes(index)
         line = _nearest_line(*axes)
         low, high = self.low[index], self.high[index]
@@ -509,8 +519,8 @@ class ConeRegions:
         return 0.5 * np.maximum(*(last - first for first, last in ranges))
 
     def points(self, count, kind, index):
-        """(s, t, weights) that broadcast to (S, T, Q), of a rule for integrals over the regions `index` (Q,) times the
-        profile."""
+        """Rule (s, t, weights) for integrals over the regions `index` (Q,) times the profile. The arrays broadcast to
+        (S, T, Q)."""
         dtype = self.reach.dtype
         nodes, weights = (values.astype(dtype)[:, None] for values in gauss_legendre(count))
         reach, distance = self.reach[index], self.view.distance[index]
@@ -524,7 +534,7 @@ class ConeRegions:
         if kind == SPLIT:
             places, weights_s = (values.astype(dtype)[:, None] for values in gauss_legendre(count // 2))
         if self.is_round:
-            # Chords grow from 0 as a root; so they grow as a line.
+            # Near its ends a chord's length grows as a square root of s; with these nodes it grows linearly.
             places, weights_s = 0.5 * places * (3.0 - places * places), weights_s * (1.5 - 1.5 * places * places)
         low, high = self.low[index], self.high[index]
         axes = self._axes(index)
@@ -550,7 +560,7 @@ class ConeRegions:
         return s, t, profile
 
     def _chords(self, s, index):
-        """Ends (S, Q) of the chords at s (S, Q) of the regions `index` (Q,)."""
+        """Ends (S, Q) of the chords at `s` (S, Q) of the regions `index` (Q,)."""
         reach = self.reach[index]
         half = np.sqrt(np.maximum((reach - s) * (reach + s), 0.0))
         low, high = np.maximum(self.lowest[index], -half), np.minimum(self.highest[index], half)
@@ -573,7 +583,7 @@ class ConeRegions:
         return low, np.maximum(high, low)
 
     def coordinates(self, s, t, index):
-        """Coordinates (C, S, T, Q) of the points s, t of the light's plane, seen from the points `index` (Q,)."""
+        """Coordinates (C, S, T, Q) of the points s, t of the light's plane, for the shading points `index` (Q,)."""
         result = np.empty((len(self.along_s), *np.broadcast_shapes(s.shape, t.shape)), s.dtype)
         for out, foot, along_s, along_t in zip(result, self.view.foot, self.along_s, self.along_t, strict=True):
             np.multiply(along_t[index], t, out=out)
@@ -582,8 +592,8 @@ class ConeRegions:
 
 
 def _spaced(nodes, low, high, pole):
-    """Places on [low, high] (..., P) of nodes on [-1, 1], and by how much they are stretched; dense around the `pole`,
-    a pair of a center and a width, if there is one."""
+    """Places on [low, high] (..., P) of nodes on [-1, 1], and their derivatives by the nodes. With a `pole`, a pair of
+    a center and a width, they are dense around it; without one they are evenly stretched."""
     if pole is None:
         half = 0.5 * (high - low)
         return 0.5 * (low + high) + half * nodes, half
@@ -591,7 +601,7 @@ def _spaced(nodes, low, high, pole):
     first, last = _pole_range(low, high, pole)
     half = 0.5 * (last - first)
     place = 0.5 * (first + last) + half * nodes
-    # Rounding must not leave the chord.
+    # Rounding must not move a place beyond the ends.
     return np.clip(center + width * np.sinh(place), low, high), half * width * np.cosh(place)
 
 
@@ -601,7 +611,8 @@ def _pole_range(low, high, pole):
 
 
 def _nearest_point(foot, along_s, along_t, s):
-    """Where t on the lines of s (..., P) comes closest to the origin, and how close, in units of t."""
+    """The t (..., P) at which the line of each s (..., P) comes closest to the origin, and its distance there, in units
+    of t."""
     squared = dot(along_t, along_t)
     place = -(dot(along_t, foot) + dot(along_t, along_s) * s) / squared
     off = [foot[axis] + s * along_s[axis] + place * along_t[axis] for axis in range(3)]
@@ -609,7 +620,7 @@ def _nearest_point(foot, along_s, along_t, s):
 
 
 def _nearest_line(foot, along_s, along_t):
-    """The s (P,) of the line along t that comes closest to the origin, and how close, in units of s."""
+    """The s (P,) of the line along t that comes closest to the origin, and the distance of that line, in units of s."""
     along_t = along_t / np.sqrt(dot(along_t, along_t))
     foot, along_s = (vector - dot(vector, along_t) * along_t for vector in (foot, along_s))
     squared = np.maximum(dot(along_s, along_s), _TINY)

@@ -1,10 +1,11 @@
-"""Area lights as samples see them: their corners, what lies above the horizon, patches as fine as a lobe needs.
+"""Area lights as samples see them: corners, parts above the horizon, and patches as fine as a lobe needs.
 
-First what both precisions share, then the corners and parts of lights in single and in double precision, last the
-patches of lights with a detail, textures near and far: the coarsest that the lobe of a sample cannot resolve. Each
-sample gets all of the light that is above its horizons. A patch has the mean radiance of its parts. What the mean loses
-is second order in the size of the patch by the length over which the rest of the integrand changes: the distance for
-diffuse lobes; for specular ones the width of the lobe, or the angle from its peak where that is larger.
+This file starts with what both precisions share. The corners and parts of lights in single and in double precision
+follow. Last come the patches of lights with a detail, textures near and far. Each sample gets the coarsest patches that
+its lobe cannot resolve; together they are all of the light above its horizons. A patch has the mean radiance of its
+parts. The error of the mean is second order in the size of the patch, in units of the length over which the rest of the
+integrand changes. For diffuse lobes that length is the distance. For specular lobes it is the width of the lobe, or the
+angle from its peak if that is larger.
 """
 
 from __future__ import annotations
@@ -20,44 +21,48 @@ from . import facing, light_cone
 from .facing import FacingDisk
 from .polygon import convex_pieces, dot, split_at_horizon
 
-# Where at least this share of the points sees all of a light, all are computed as if they did: cheaper than gathering.
+# If at least this share of the points sees all of a light, the light is computed as if all points did: that is cheaper
+# than gathering them.
 MOSTLY_WHOLE = 0.6
-# Corners of a round light by how far it reaches, in units of the lobe's width where it meets the light: below 8 of them
-# 32 corners are within 0.1 % of an ellipse, and so on.
+# Corners of the polygon for a round light up to each of ROUND_LIMITS and beyond. These limit the radius of the light in
+# units of the lobe's width where it meets the light. The polygon is within 0.1 % of the ellipse.
 ROUND_CORNERS = (32, 64, 128, 256)
 ROUND_LIMITS = (8.0, 40.0, 300.0)
+# Corners for a round light with a spread: for efforts with few chords and with many.
 FOCUSED_ROUND_CORNERS = (32, 64)
-# By coordinates, how far rounding takes points from the plane that they are in, some of them in front of it: a flat
-# surface that shines must not light itself. Those of scenes beyond that, in m, were rounded nearer to the origin (see
-# `blender.extract.origin`).
+# ROUNDING: how far rounding moves points off their plane, in units of their coordinates. A flat surface that shines
+# must not light itself because of this. FARTHEST_ROUNDED: greatest sum of coordinates in m; points of larger scenes
+# were rounded relative to an origin nearby (see `blender.extract.origin`).
 ROUNDING, FARTHEST_ROUNDED = 4e-7, 4000.0
-# The product of the contrast of a patch (see `_largest_sizes`) and the square of its size by that length is at most
-# this. Measured on random surfaces at a light's size from it, with the contrasts of a photograph: the patches that a
-# sample takes then give what the smallest ones do to 0.2 % (relative L2); with 0.006, 150 on average of 1024.
+# Greatest product of a patch's contrast (see `_largest_sizes`) and the square of its size in units of that length.
+# Measured on random surfaces at a light's size from it, with the contrasts of a photograph: the patches of a sample
+# agree with the smallest ones to 0.2 % (relative L2). With 0.006, a sample takes 150 patches of 1024 on average.
 PATCH_PRODUCT = 0.004
-# Half the diagonal of a patch by that length, at most: also where the means of its parts are equal.
+# Greatest half diagonal of a patch in units of that length, which also holds if the means of its parts are equal.
 LARGEST_PATCH = 0.5
-# The same for the sky, which is all around: what patches lose on one side of a lobe they gain on another. Measured on
-# skies with and without fine detail: 0.15 and 0.3 % (relative L2) off the smallest ones, with 200 patches a lobe.
+# The same two limits for the sky, which is all around: what patches lose on one side of a lobe they gain on the other.
+# Measured on skies with and without fine detail: 0.15 % and 0.3 % (relative L2) from the smallest patches, with 200
+# patches a lobe.
 SKY_PRODUCT, LARGEST_OF_SKY = 0.1, 0.6
-# In rad: mirrors meet patches without parts, too.
+# Least width of a lobe in rad, so that mirrors find patches without parts.
 LEAST_WIDTH = 1e-7
-# Normals along each side of a cube's face of which the diffuse reflection is known, directions that are added at a
-# time, and how large a patch is, half its diagonal in rad, for which one of them stands.
+# The diffuse reflection of a sky is tabulated by normals on a cube. GRID: normals along each side of a face.
+# GRID_POINTS: directions that are added at a time. POINT_SIZE: largest half diagonal in rad of what counts as a single
+# direction.
 GRID, GRID_POINTS, POINT_SIZE = 33, 512, 0.04
 # Samples whose patches are chosen at a time.
 PATCH_CHUNK = 1024
-# The width of GGX lobes in rad, by alpha: where the normal distribution has a quarter of its peak.
+# Width of GGX lobes in rad, in units of alpha: where the normal distribution has a quarter of its peak.
 LOBE_WIDTH = 2.0
-# Lobes seen at grazing angles are narrower across the view; below this cosine they become no narrower.
+# Lobes get narrower across the view toward grazing angles, but not below this cosine.
 LEAST_COSINE = 0.1
 
 
 def light_levels(light, corners, position, width):
-    """Yield (corners (V, 3), effort for its cone, chosen (Q',) of the points, None for all) as lobes need them.
+    """Yield (corners (V, 3), effort for the cone, chosen (Q',) of the points, None for all), as their lobes need.
 
-    The lobes are `width` (Q,) or a number of radians wide, at points with x, y, z in `position` (3, Q), all in double
-    precision, so that both paths come to the same decisions.
+    The lobes are `width` (Q,) or a number of radians wide, at points with x, y, z in `position` (3, Q). All arrays are
+    in double precision, so that both paths make the same decisions.
     """
     if light.is_profiled:
         for effort, chosen in light_cone.efforts(light, position, width):
@@ -74,8 +79,8 @@ def light_levels(light, corners, position, width):
 
 
 def round_levels(light, position, width):
-    """Yield (corners (V, 3), chosen (Q',), None for all) of a round light for points with x, y, z in `position`
-    (3, Q), all in double precision, with lobes that are `width` (Q,) or a number of radians wide."""
+    """Yield (corners (V, 3), chosen (Q',) of the points, None for all) for a round light. Points have x, y, z in
+    `position` (3, Q); their lobes are `width` (Q,) or a number of radians wide. All arrays are in double precision."""
     position = light.origins(position)
     offset = [position[axis] - light.center[axis] for axis in range(3)]
     reach = np.sqrt(max((light.half_u**2).sum(), (light.half_v**2).sum()))
@@ -92,10 +97,11 @@ def round_levels(light, position, width):
 
 
 def local_corners(light, corners: np.ndarray, offset: np.ndarray, rows: np.ndarray, scratch) -> np.ndarray:
-    """Corners (C, V, P) of a light: coordinates along rows (C, 3, P), float32.
+    """Corners (C, V, P) float32 of a light: coordinates along `rows` (C, 3, P).
 
-    corners (V, 3) in the world, or (V, 3, P) from the center; offset (3, P) from the points to the light's center,
-    which for "POLYGON" may lie anywhere near. Of a FacingDisk the corners are their own number, the offset its own.
+    `corners` are (V, 3) in the world, or (V, 3, P) relative to the center. `offset` (3, P) goes from the points to the
+    light's center, which may lie anywhere near a "POLYGON". For a FacingDisk, `corners` gives only their number, and
+    `offset` is that of the disk.
     """
     coordinates, _, points = rows.shape
     center = _along(rows, offset, scratch("center", (coordinates, points)), scratch)
@@ -114,7 +120,7 @@ def local_corners(light, corners: np.ndarray, offset: np.ndarray, rows: np.ndarr
             out = _along(rows, corner, scratch("axis", (coordinates, points)), scratch)
             np.add(center, out, out=result[:, number])
         return result
-    # Corners 0 and 2 are opposite, and so are 1 and 3: half diagonals from the center.
+    # Corners 0 and 2 are opposite, and so are 1 and 3: two half diagonals give all four.
     for number in (0, 1):
         half = ((corners[number] - corners[number + 2]) * 0.5).astype(np.float32)
         out = _along(rows, half, scratch("axis", (coordinates, points)), scratch)
@@ -124,7 +130,7 @@ def local_corners(light, corners: np.ndarray, offset: np.ndarray, rows: np.ndarr
 
 
 def _along(rows, vector, out, scratch):
-    """Products (C, P) of rows (C, 3, P) with a vector (3,) or vectors (3, P)."""
+    """Dot products (C, P) of rows (C, 3, P) with a vector (3,) or vectors (3, P)."""
     product = scratch("product", out.shape)
     np.multiply(rows[:, 0], vector[0], out=out)
     for axis in (1, 2):
@@ -133,9 +139,9 @@ def _along(rows, vector, out, scratch):
 
 
 def integrate_visible(corners: np.ndarray, facing: np.ndarray, clip_rows, count: int, integrate):
-    """Integrals (count, P) over what is seen of polygons (C, V, P), and the mask (P,) of points that need float64.
+    """Integrals (count, P) over the visible parts of polygons (C, V, P), and the mask (P,) of points that need float64.
 
-    A point sees the part of its polygon where all coordinates `clip_rows` are positive, if it is `facing` (P,) it.
+    A point that is `facing` (P,) its polygon sees the part where all coordinates `clip_rows` are positive.
     `integrate(polygons (C, W, Q), index)` returns (count, Q) and a mask (Q,) for the points `index` (None: all).
     """
     whole = facing.copy()
@@ -164,7 +170,7 @@ def integrate_visible(corners: np.ndarray, facing: np.ndarray, clip_rows, count:
 
 
 def _clipped(corners, clip_rows):
-    """Yield (index, polygons) of the parts of polygons (C, V, P) where all coordinates `clip_rows` are positive."""
+    """Yield (index, polygons): the parts of polygons (C, V, P) where all coordinates `clip_rows` are positive."""
     if not clip_rows:
         yield np.arange(corners.shape[2]), corners
         return
@@ -175,12 +181,12 @@ def _clipped(corners, clip_rows):
 
 def local_frames(normal, view):
     """Local frames (3, 3, P): rows tangent, bitangent, normal; the view has y = 0 and x >= 0."""
-    # The difference of vectors that are close is exact. The length of a normal from single precision is not quite 1.
+    # Differences of close vectors are exact. A single-precision normal is not quite a unit vector.
     across = view - normal
     squared = (normal * normal).sum(axis=1, keepdims=True)
     tangent = across - (across * normal).sum(axis=1, keepdims=True) / squared * normal
     length = np.sqrt((tangent * tangent).sum(axis=1, keepdims=True))
-    # Where view and normal coincide any tangent serves: take the axis that the normal is farthest from.
+    # If view and normal coincide, any tangent serves: take the axis that is farthest from the normal.
     axis = np.eye(3)[np.argmin(np.abs(normal), axis=1)]
     other = axis - (axis * normal).sum(axis=1, keepdims=True) / squared * normal
     tangent = np.where(length > 1e-7, tangent, other)
@@ -190,7 +196,7 @@ def local_frames(normal, view):
 
 
 def in_front(samples, light, candidates):
-    """The candidate points on the side to which the light shines, in its cone, and among its receivers."""
+    """The points of `candidates` on the side to which the light shines, in its cone, and among its receivers."""
     center, direction = (
         vector if vector.ndim == 1 else vector[candidates] for vector in (light.center, light.direction)
     )
@@ -206,8 +212,8 @@ def in_front(samples, light, candidates):
 
 
 def off_plane(center, extent) -> np.ndarray:
-    """How far in front of a light, in m, points are that surely see it; its center is (3,) or (3, Q), and `extent` (Q,)
-    the sum of their coordinates, without signs."""
+    """Distance (Q,) in m in front of a light from which on points surely see it. The light's center is (3,) or (3, Q);
+    `extent` (Q,) is the sum of the absolute coordinates of the points."""
     return ROUNDING * np.minimum(np.abs(center).sum(axis=0) + extent, FARTHEST_ROUNDED)
 
 
@@ -218,7 +224,7 @@ def may_reach(light, position) -> np.ndarray:
     return light_cone.may_reach(light, position)
 
 
-# Samples at which lights are tried first, and pairs of samples and lights that are tried at all.
+# FEW_SAMPLES: about how many samples are tried first. MOST_PAIRS: how many pairs of a sample and a light are tried.
 FEW_SAMPLES, MOST_PAIRS = 1024, 2 * 10**7
 CHUNK = 16384
 
@@ -230,9 +236,9 @@ def has_lobe(samples: SurfaceSamples) -> np.ndarray:
 
 
 def lights_that_reach_nothing(samples: SurfaceSamples, lights: tuple[AreaLight, ...]) -> list[str]:
-    """Names of the `lights` of which no part is above the horizon of a lobe of any sample, in front of it.
+    """Names of the `lights` of which no part is in front of a sample and above the horizons of one of its lobes.
 
-    Lights of one name are one light. Where there are more than MOST_PAIRS left to try, the others are taken as seen.
+    Lights of one name are one light. After MOST_PAIRS pairs, all other lights count as seen.
     """
     reached = set()
     for part in (samples.take(slice(None, None, max(1, len(samples) // FEW_SAMPLES))), samples):
@@ -241,7 +247,7 @@ def lights_that_reach_nothing(samples: SurfaceSamples, lights: tuple[AreaLight, 
         for light in lights:
             if light.name in reached:
                 continue
-            # How far the box around the samples reaches in front of the light.
+            # How far the box around the samples extends in front of the light.
             ahead = ((light.origins(ends) - light.center) * light.direction).max(axis=0).sum()
             if light.is_facing or ahead > 0.0:
                 pairs += len(part)
@@ -251,7 +257,7 @@ def lights_that_reach_nothing(samples: SurfaceSamples, lights: tuple[AreaLight, 
 
 
 def _reaches(light: AreaLight, samples: SurfaceSamples, lobes: np.ndarray) -> bool:
-    """True where a corner of the light is above both horizons of one of the `lobes` (2, P)."""
+    """True if a corner of the light is above both horizons of one of the `lobes` (2, P)."""
     diffuse = lobes[0] & light.affects_diffuse, (samples.diffuse_normal, samples.smooth_normal)
     specular = lobes[1] & light.affects_specular, (samples.normal, samples.geometric_normal)
     corners = light.polygon()[:, None]
@@ -278,20 +284,20 @@ class Framed:
 
     @classmethod
     def of(cls, samples: SurfaceSamples, normal: np.ndarray) -> Framed:
-        """In the frames around the normals (P, 3) of one of their lobes."""
+        """Frames around the normals (P, 3) of one of the lobes."""
         return cls(samples, local_frames(normal, samples.view))
 
 
 def to_local(axes, vectors):
-    """World vectors (3, ..., P) in local frames (3, 3, P)."""
+    """World vectors (3, ..., P) in the local frames `axes` (3, 3, P)."""
     return np.stack([sum(row[k] * vectors[k] for k in range(3)) for row in axes])
 
 
 def visible_parts(framed: Framed, light, corners, candidates, second_normal=None):
-    """Yield (index, polygons (3, W, Q) in local frames) of the candidate points that the light shines on.
+    """Yield (index, polygons (3, W, Q) in local frames) for the points of `candidates` that the light shines on.
 
-    Polygons are clipped at the shading horizon, and before that at the horizon of `second_normal` (P, 3). Those of a
-    profiled light have two more coordinates, in the light's plane with the foot of the point as the origin.
+    Polygons are clipped at the horizon of `second_normal` (P, 3), if there is one, and at the shading horizon. Those of
+    a profiled light have two more coordinates, in the light's plane relative to the foot of the point.
     """
     samples, frame = framed.samples, framed.frame
     index = in_front(samples, light, candidates)
@@ -318,7 +324,7 @@ def visible_parts(framed: Framed, light, corners, candidates, second_normal=None
 
 
 def seen_parts(framed: Framed, light, corners, candidates, width, second_normal=None):
-    """As `visible_parts`, (index, polygons, effort), with what lobes of `width` (Q,) or a number need of the light."""
+    """As `visible_parts`, but (index, polygons, effort), at the level that lobes of `width` (Q,) or a number need."""
     position = framed.samples.position[candidates].T
     for outline, effort, chosen in light_levels(light, corners, position, width):
         of_level = candidates if chosen is None else candidates[chosen]
@@ -327,8 +333,8 @@ def seen_parts(framed: Framed, light, corners, candidates, width, second_normal=
 
 
 def light_view(framed: Framed, light, index, to_lobe) -> light_cone.LightView:
-    """The view of a profiled light from the points `index`; the first three coordinates are those of the lobe,
-    to_lobe(vectors (3, Q)), the others local."""
+    """The view of a profiled light from the points `index`. The first three coordinates are those of the lobe, from
+    to_lobe(local vectors (3, Q)); the others are local."""
     axes = framed.frame[:, :, index]
     offset = (light.center - light.origins(framed.samples.position[index])).T
 
@@ -341,8 +347,8 @@ def light_view(framed: Framed, light, index, to_lobe) -> light_cone.LightView:
 
 @dataclass(frozen=True)
 class PatchTree:
-    """The N patches of a light with a detail; the first is all of it. Those of distant lights are rectangles, in single
-    precision."""
+    """The N patches of a light with a detail; the first is the whole light. Those of distant lights are rectangles in
+    single precision."""
 
     lights: tuple[AreaLight, ...]  # (N,)
     center: np.ndarray  # (3, N)
@@ -351,21 +357,21 @@ class PatchTree:
     radiance: np.ndarray  # (3, N) W m^-2 sr^-1
     direction: np.ndarray  # (3,) unit, toward the samples
     half: np.ndarray  # (N,) half the diagonal
-    reach: np.ndarray  # (N,) rad, from the center, of distant ones
-    largest: np.ndarray  # (N,) what the size may be, by the width of a lobe; infinite for patches without parts
-    first: np.ndarray  # (N,) the first of the parts
-    count: np.ndarray  # (N,) of the parts
+    reach: np.ndarray  # (N,) rad, about the angle from the center to the corners; distant lights only
+    largest: np.ndarray  # (N,) largest size in units of the lobe's length; infinite for patches without parts
+    first: np.ndarray  # (N,) number of the first part
+    count: np.ndarray  # (N,) number of parts
 
     @classmethod
     def of(cls, light: AreaLight) -> PatchTree:
-        """That of a light with a detail, made once."""
+        """The patches of a light with a detail, built once."""
         return kept("_patch_tree", [light], cls._made)
 
     @classmethod
     def _made(cls, lights) -> PatchTree:
         (light,), first = lights, []
         patches = [light]
-        for patch in patches:  # which grows meanwhile
+        for patch in patches:  # the list grows meanwhile
             first.append(len(patches))
             patches += patch.detail
         count, first = np.array([len(patch.detail) for patch in patches]), np.array(first)
@@ -378,7 +384,7 @@ class PatchTree:
         largest = _largest_sizes(area, radiance, first, count, light.is_distant)
         reach = np.zeros(len(patches), np.float32)
         if light.is_distant:
-            # Right-handed with the direction.
+            # Make the axes right-handed with the direction.
             half_u *= np.copysign(1.0, np.cross(half_u[:, 0], half_v[:, 0]) @ light.direction)
             reach = (diagonal / np.abs(light.direction @ center)).astype(np.float32)
             center, half_u, half_v, radiance = (v.astype(np.float32) for v in (center, half_u, half_v, radiance))
@@ -387,13 +393,13 @@ class PatchTree:
 
     @property
     def size_on_plane(self) -> np.ndarray:
-        """Half the diagonals (N,) by that of the whole."""
+        """Diagonals (N,) in units of that of the whole light."""
         squares = dot(self.half_u, self.half_u) + dot(self.half_v, self.half_v)
         return np.sqrt(squares / squares[0])
 
     def places(self, toward):
-        """Where directions (3, ...) meet the plane, s and t (...) along the half axes of the whole, and whether that is
-        in the light."""
+        """Where directions (3, ...) meet the plane: s and t (...) along the half axes of the whole light, and the mask
+        (...) of those inside it."""
         whole = (self.center[:, 0], self.half_u[:, 0], self.half_v[:, 0], -self.direction)
         center, half_u, half_v, away = (vector.astype(np.float64) for vector in whole)
         ahead = np.tensordot(away, toward, 1)
@@ -402,25 +408,25 @@ class PatchTree:
         return s, t, (ahead > 0.0) & (np.maximum(np.abs(s), np.abs(t)) < 1.0)
 
     def area_vectors(self, patch) -> np.ndarray:
-        """Areas (3, Q), by the square of the distance of the plane, toward the samples."""
+        """Area vectors (3, Q) of patches, toward the samples; the unit is the square of the plane's distance."""
         half_u, half_v = self.half_u[:, patch], self.half_v[:, patch]
         lengths = 4.0 * np.sqrt(dot(half_u, half_u) * dot(half_v, half_v))
         return self.direction[:, None] * lengths.astype(np.float32)
 
     def corners(self, patch) -> np.ndarray:
-        """Corners (3, 4, Q), counterclockwise as seen from the samples."""
+        """Corners (3, 4, Q) of patches, counterclockwise as seen from the samples."""
         center, half_u, half_v = (values[:, patch] for values in (self.center, self.half_u, self.half_v))
         ways = ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))
         return np.stack([center + np.float32(s) * half_u + np.float32(t) * half_v for s, t in ways], axis=1)
 
     def form_factors(self, normals: np.ndarray) -> np.ndarray:
-        """Radiance (3, P) that a white diffuse surface with `normals` (P, 3) reflects of all of the light, within 0.1 %
-        of the largest."""
+        """Radiance (3, P) that a white diffuse surface with `normals` (P, 3) reflects of the whole light, accurate to
+        0.1 % of the largest."""
         return interpolated(self.reflected, normals)
 
     @cached_property
     def reflected(self) -> np.ndarray:
-        """Radiance (6, GRID, GRID, 3) that white diffuse surfaces reflect, by the normal as `interpolated` has it."""
+        """Radiance (6, GRID, GRID, 3) that white diffuse surfaces reflect, by normals as in `interpolated`."""
         place = np.linspace(-1.0, 1.0, GRID)
         normals = np.ones((3, 2, GRID, GRID, 3))
         for axis in range(3):
@@ -436,7 +442,7 @@ class PatchTree:
         return result.reshape(6, GRID, GRID, 3)
 
     def _points(self):
-        """Yield unit directions (3, Q) and radiance times solid angle by pi (3, Q) that stand for the leaves."""
+        """Yield (unit directions (3, Q), radiance times solid angle over pi (3, Q)), which stand for the leaves."""
         leaves = np.flatnonzero(self.count == 0)
         distance = np.sqrt(dot(self.center[:, leaves], self.center[:, leaves]))
         steps = np.ceil(self.half[leaves] / distance / POINT_SIZE).astype(int)
@@ -455,8 +461,8 @@ class PatchTree:
             )
 
     def pairs(self, samples, horizons, index: np.ndarray, is_specular: bool) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Yield (columns (Q,) of `index`, patches (Q,)): the coarsest that the lobes of the samples `index` (M,) cannot
-        resolve. Distant ones below any of the `horizons`, normals (P, 3), are left out."""
+        """Yield (columns (Q,) of `index`, patches (Q,)): the coarsest patches that the lobes of the samples `index`
+        (M,) cannot resolve. Distant patches below any of the `horizons`, normals (P, 3), are left out."""
         light = self.lights[0]
         narrowest = np.tan(0.5 * light.spread) if light.is_focused else 1.0
         for start in range(0, len(index), PATCH_CHUNK):
@@ -488,13 +494,13 @@ class PatchTree:
 
 def fitting_patches(light: AreaLight, samples: SurfaceSamples, specular: bool) -> Iterator[tuple]:
     """Yield (index (Q,), lights): the coarsest patches of a near `light` that the lobes of the samples `index` cannot
-    resolve. Each sample gets all of the light."""
+    resolve. Each sample gets the whole light."""
     if len(samples) == 0:
         return
     tree = PatchTree.of(light)
     pairs = tree.pairs(samples, (), np.arange(len(samples)), specular)
     index, patch = (np.concatenate(values) for values in zip(*pairs, strict=True))
-    # The smallest parts of a patch go together: the same samples take them.
+    # Parts that have no parts share a key with the others of their patch, because the same samples take them.
     key, owner = np.arange(len(tree.count)), np.repeat(np.arange(len(tree.count)), tree.count)
     key[1:] = np.where(tree.count[1:] == 0, -1 - owner, key[1:])
     order = np.argsort(key[patch], kind="stable")
@@ -504,7 +510,7 @@ def fitting_patches(light: AreaLight, samples: SurfaceSamples, specular: bool) -
 
 
 class _Peaks:
-    """Where the specular lobes of Q samples are narrowest."""
+    """Peaks of the specular lobes of Q samples: the mirrored views, and the least widths."""
 
     def __init__(self, samples, index):
         normal, view = (np.ascontiguousarray(values[index].T, np.float32) for values in (samples.normal, samples.view))
@@ -515,17 +521,18 @@ class _Peaks:
         self.width = np.maximum(LOBE_WIDTH * width, LEAST_WIDTH).astype(np.float32)
 
     def lengths(self, column, toward, size) -> np.ndarray:
-        """The least angle (R,) in rad, at most 1, over which lobes change where they meet patches."""
+        """The least angle (R,) in rad, at most 1, over which the lobe changes within a patch of this size (R,)."""
         chord = np.sqrt(np.maximum(np.float32(2.0) - np.float32(2.0) * dot(self.mirrored[:, column], toward), 0.0))
         return np.minimum(np.maximum(chord - size, np.float32(0.0)) + self.width[column], np.float32(1.0))
 
 
 def _largest_sizes(area, radiance, first, count, is_distant) -> np.ndarray:
-    """What sizes may be (N,): by the contrast, which is how much the parts of a patch differ from it, by the whole."""
+    """Largest sizes (N,) of patches by their contrast: the difference between a patch and its parts, relative to the
+    whole light."""
     brightness, owner = np.abs(radiance).sum(axis=0), np.repeat(np.arange(len(count)), count)
     part = np.arange(1, len(count))
     different = area[part] * np.abs(radiance[:, part] - radiance[:, owner]).sum(axis=0)
-    # What is missing of a patch is dark.
+    # The part of a patch that its parts do not cover is dark.
     dark = np.maximum(area - np.bincount(owner, area[part], len(count)), 0.0) * brightness
     contrast = (np.bincount(owner, different, len(count)) + dark) / np.maximum(area * brightness[0], 1e-30)
     product, most = (SKY_PRODUCT, LARGEST_OF_SKY) if is_distant else (PATCH_PRODUCT, LARGEST_PATCH)
@@ -534,7 +541,7 @@ def _largest_sizes(area, radiance, first, count, is_distant) -> np.ndarray:
 
 
 def kept(name, lights, made):
-    """What made(lights) gives, kept with the parts of the first of them, which copies of it share."""
+    """The result of made(lights). It is kept with the parts of the first light, which its copies share."""
     key = [light.detail[0] for light in lights], [(*light.center, *light.radiance) for light in lights]
     kept = vars(lights[0].detail[0])
     old = kept.get(name)
@@ -545,8 +552,8 @@ def kept(name, lights, made):
 
 
 def interpolated(grid: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Values (3, P) for `normals` (P, 3) from those of a grid (6, GRID, GRID, 3) on a cube: of sides +x, -x, +y ...,
-    along the two axes that follow."""
+    """Values (3, P) for `normals` (P, 3), interpolated from a `grid` (6, GRID, GRID, 3) on a cube. Its sides are +x,
+    -x, +y ...; its rows and columns run along the two axes that follow that of the side."""
     size = len(grid[0])
     axis = np.argmax(np.abs(normals), axis=1)
     rows = np.arange(len(normals))

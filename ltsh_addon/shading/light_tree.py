@@ -1,15 +1,18 @@
-"""Many lights at once: what is far away, faces away or counts little is taken together.
+"""Many lights at once: lights that are far away, face away or count little are shaded together.
 
-The lights of a group are the leaves of a tree. A tile of neighboring samples takes, of every branch, the coarsest node
-that is small, or whose error is at most ERROR of what the tile gets of the group on average: far fewer than there are
-lights. A node is then one point, two or four, which have the mean and the variances of its brightness; how its lights
-face is taken as uniform around their mean. The error is estimated as the light of the node times the fourth power of
-its size by the length over which the integrand changes (see `small_lights`), with bounds on distance and angles that
-hold for the whole tile, and some of its light where a horizon or the plane of one of its lights may cross it. Points in
-the tail of an "ltsh" lobe get its true value there, as `tails` has it. Leaves that are yet too large are looked at
-again in smaller tiles, where there are many of them; what is left are polygons, shaded together. On smooth surfaces ten
-samples of a tile tell what the others get, but of nodes that are near. (Walter et al. 2005, "Lightcuts", for tiles in
-place of points, doi:10.1145/1073204.1073318.)
+The lights of a group are the leaves of a binary tree. Neighboring samples form a tile. In every branch, a tile takes
+the coarsest node that is small, or whose error is at most ERROR of the light that the tile gets from the group on
+average. These are far fewer nodes than there are lights. A node becomes one point, two or four, with the mean and the
+variances of its brightness; the normals of its lights count as uniform around their mean.
+
+The error is estimated as the light of the node times the fourth power of its size, in units of the length over which
+the integrand changes (see `small_lights`). Distances and angles are bounded for the whole tile. Where a horizon or the
+plane of one of the lights may cross the node, some of the node's light adds to the error. Points in the tail of an
+"ltsh" lobe get its true value there, as in `tails`.
+
+If a tile has many leaves that are still too large, smaller tiles look at them again. The leaves that remain are shaded
+together as polygons. On smooth surfaces, the light of ten samples of a tile is interpolated to the others, except for
+near nodes. (Walter et al. 2005, "Lightcuts", with tiles instead of points, doi:10.1145/1073204.1073318.)
 """
 
 from __future__ import annotations
@@ -24,63 +27,65 @@ from . import small_lights
 from .polygon import dot
 from .tails import NEAR_RADII
 
-# Fewer lights of a group are shaded one by one.
+# A group with fewer lights is shaded light by light.
 FEWEST = 64
-# Size of a node by the length over which the integrand changes: up to SMALL whatever its light is; up to LARGEST where
-# its error is at most ERROR of the light of a group that a tile gets, of diffuse and of specular lobes.
+# Size of a node in units of the length over which the integrand changes. SMALL: such nodes are used whatever their
+# light. LARGEST: no larger node is used. ERROR: in between, a node is used if its error is at most this share of the
+# light that a tile gets from the group, for diffuse and for specular lobes.
 SMALL, LARGEST, ERROR = 0.25, 3.0, (4e-4, 2.5e-4)
-# Size of the nodes that tell how much light that is.
+# Size of the nodes from which that light is estimated.
 COARSE = 0.6
-# Smaller ones are one point, others four.
+# Smaller nodes are one point, others two or four.
 POINT = 0.08
-# The error of a node's points, by its light and the fourth power of that size.
+# The error of a node's points, in units of its light times the fourth power of its size.
 FOURTH_ORDER = 1.0
-# Angle in rad from the peak of a sharp lobe beyond which single precision tells its tail to 2e-4.
+# Angle in rad from the peak of a sharp lobe beyond which single precision finds its tail to 2e-4.
 SHARP_TAIL = 0.05
-# Leaves whose error or size is larger are shaded as polygons; their error also in the finer tiles below, which are told
-# apart by where their lobes point, so that their light may be far less than its bound.
+# Leaves are shaded as polygons if their error exceeds LEAF_ERROR of the tile's light, or their size LEAF_SIZE. In the
+# finer tiles below the limit is FINER_LEAF_ERROR: these differ in where their lobes point, so that their light may be
+# far below its bound.
 LEAF_ERROR, FINER_LEAF_ERROR, LEAF_SIZE = 2e-3, 5e-4, 1.0
-# What a tile gets of a node is interpolated between ten of its samples where it is so small, as seen from there, that
-# the error of cubics, INTERPOLATED times the fourth power of that size, is at most ERROR.
+# The light of a node is interpolated between ten samples if the error of cubics is at most ERROR. That error is
+# INTERPOLATED times the fourth power of the tile's size as seen from the node.
 INTERPOLATED = 0.3
-# How far all that lobes hang on may be off such cubics, by the lengths over which lobes change; and how much the
-# weights of the ten may be together.
+# ROUGHEST: how far all that the lobes depend on may differ from such cubics, in units of the lengths over which lobes
+# change. LARGEST_WEIGHTS: limit for the sum of the absolute weights of the ten samples.
 ROUGHEST, LARGEST_WEIGHTS = 1e-3, 8.0
-# Lengths in m and cosines that are divided by are not less.
+# Lower limit of divisors: lengths in m, and cosines.
 LEAST = np.float32(1e-12)
-# Samples of a tile, for diffuse and specular lobes, and pairs of a sample and a node that are shaded at a time.
+# TILE: most samples of a tile, for diffuse and for specular lobes. PAIRS: pairs of a sample and a point per chunk.
 TILE, PAIRS = (400, 200), 32768
-# For these leaves, tiles that need more than MANY_LEAVES whole are cut into such of at most so many samples.
+# A tile that must shade more than MANY_LEAVES leaves as polygons is cut into tiles of at most FINER_TILE samples.
 FINER_TILE, MANY_LEAVES = 25, 20
-# Of nodes that swing by less of their light the lights are taken as parallel.
+# Least swing of a node, as a share of its power. Up to twice that, its lights count as parallel.
 TURNED = 1e-6
-# Of a node that a horizon crosses this share of its light, times the sine of its radius, is wrong at most; and this of
-# the swing of its lights where some may face away.
+# CROSSED: largest error of a node that a horizon crosses, as a share of its light times the sine of its radius. SWUNG:
+# the same as a share of the swing of its lights, if some of them may face away.
 CROSSED, SWUNG = 0.1, 0.02
 
-# Where the points of a node are along its axes, (W, P, 3), and in how many ways: they have its variances. Those of a
-# square are Gauss's.
+# The points of a node along its axes, (W, P, 3), in W alternative ways. They have the node's variances; for a square
+# they are the Gauss points.
 CORNERS = np.array([[[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]]])
-# For specular lobes two of eight corners of a box are enough, others for the next node.
+# For specular lobes two opposite corners of a box are enough. The next node takes another pair.
 PAIRS_OF_CORNERS = np.stack([CORNERS[0], -CORNERS[0]], axis=1)
 
 
 @dataclass(frozen=True)
 class LightTree:
-    """N nodes, the root first; the lights of a leaf are `number`, -1 in branches."""
+    """N nodes with the root first. `number` is the light of a leaf, and -1 for a branch."""
 
     center: np.ndarray  # (N, 3) m, of brightness
-    reach: np.ndarray  # (N,) m: sqrt(3) standard deviations of the brightness from there; half the diagonal of a square
-    axes: np.ndarray  # (3, 3, N) m: principal axes of the brightness, a standard deviation long; the first is the axis
-    axis: np.ndarray  # (N, 3) mean direction to which the lights shine
-    cone: np.ndarray  # (N,) rad: no direction is farther from that; reach, axis and cone in single precision
+    reach: np.ndarray  # (N,) m: sqrt(3) standard deviations of the brightness; for a square, half its diagonal
+    axes: np.ndarray  # (3, 3, N) m: principal axes of the brightness (first axis), a standard deviation long
+    axis: np.ndarray  # (N, 3) mean direction into which the lights shine
+    cone: np.ndarray  # (N,) rad: largest angle of a light's direction from `axis`; reach, axis and cone are float32
     vector: np.ndarray  # (N, 3): mean radiance times area vectors
     swing: np.ndarray  # (N,) mean radiance times area: how much of a vector may belong to lights that face away
     color: np.ndarray  # (3, N) of the light, 1 on average
     power: np.ndarray  # (N,) mean radiance times area
-    diagonal: np.ndarray  # (N,) as of `SmallLight`, mean; in single precision, as are swing and color
+    diagonal: np.ndarray  # (N,) mean of `SmallLight.diagonal`; float32, as are swing and color
     children: np.ndarray  # (N, 2) numbers of nodes
-    number: np.ndarray  # (N,) numbers of the lights as given
+    number: np.ndarray  # (N,) of the light
 
     @classmethod
     def of(cls, lights) -> LightTree:
@@ -107,7 +112,7 @@ class LightTree:
         axis = np.where(length > 1e-9 * total[:, None], axis / np.maximum(length, 1e-300), normal[order[start]])
         vector = sums(brightness[:, None] * area)
         color = (sums(radiance * size[:, None]).T / total).astype(np.float32)
-        # The cosines of directions that differ by so much are taken as uniform, sqrt(3) standard deviations either way.
+        # Cosines are taken as uniform over sqrt(3) standard deviations of the directions on either side of the mean.
         turned = np.maximum(1.0 - (length[:, 0] / total) ** 2, 0.0) * (end - start > 1)
         swing = (total * np.maximum(np.sqrt(1.5 * turned), TURNED)).astype(np.float32)
         cone = cones(axis, normal[order], start, end)
@@ -124,10 +129,10 @@ class LightTree:
 
     @cached_property
     def places(self) -> list[np.ndarray]:
-        """Points (N W, 3), W of each node, for diffuse and for specular lobes."""
+        """Points (N W, 3), W for each node; one array for diffuse and one for specular lobes."""
         number, found = np.arange(len(self.center)), []
         for corners in (CORNERS, PAIRS_OF_CORNERS):
-            # Each of the ways that there are for some of the nodes, so that what one does wrong others mend.
+            # Nodes take the ways in turn, so that their errors cancel.
             ways = corners[number % len(corners)]
             points = np.stack([(ways * self.axes[:, axis].T[:, None]).sum(axis=2) for axis in range(3)], axis=2)
             found.append((self.center[:, None] + points).reshape(-1, 3))
@@ -135,13 +140,13 @@ class LightTree:
 
 
 class _Sums:
-    """Sums over the lights of nodes, which are `order[start:end]`."""
+    """Sums over the lights of nodes. The lights of a node are `order[start:end]`."""
 
     def __init__(self, order, start, end):
         self.order, self.start, self.end = order, start, end
 
     def __call__(self, values):
-        """Sums (N, ...) of values (L, ...) of the lights."""
+        """Sums (N, ...) of the lights' `values` (L, ...)."""
         running = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values[self.order], axis=0)])
         found = running[self.end] - running[self.start]
         alone = self.end - self.start == 1
@@ -150,8 +155,8 @@ class _Sums:
 
 
 def stand_ins(lights, most: int) -> tuple[list[AreaLight], np.ndarray]:
-    """Rectangles that stand for many flat AreaLights with an area, neighbors that face alike together, and which share
-    of each (N,) shines: `most`, a power of two and at most as many as there are lights."""
+    """Rectangles that stand for many flat AreaLights with an area, and the share (N,) of each that shines. Each stands
+    for neighbors that face alike. There are N = `most`, a power of two and at most as many as there are lights."""
     center, area, covariance, _ = small_lights.all_of(lights)
     size = np.linalg.norm(area, axis=1)
     normal = area / size[:, None]
@@ -169,7 +174,7 @@ def stand_ins(lights, most: int) -> tuple[list[AreaLight], np.ndarray]:
     axis = np.where(length > 1e-9 * whole[:, None], axis / np.maximum(length, 1e-300), normal[order[sums.start]])
     along = np.eye(3) - axis[:, :, None] * axis[:, None, :]
     variances, axes = np.linalg.eigh(along @ spread @ along)
-    # Uniform rectangles with these variances, none of them smaller than what shines of it.
+    # Uniform rectangles with these variances, but no smaller than their shining area.
     half_v, half_u = (np.sqrt(3.0 * np.maximum(variances[:, k], 0.0)) for k in (1, 2))
     half_u = np.maximum(half_u, 1e-6 * np.sqrt(whole))
     half_v = np.maximum(half_v, 0.25 * whole / half_u)
@@ -186,8 +191,9 @@ def stand_ins(lights, most: int) -> tuple[list[AreaLight], np.ndarray]:
 
 
 def ranges(center, normal, most=np.inf):
-    """Lights in an order (L,) in which those of every node are start to end (N,), and the children (N, 2) of nodes:
-    halves along where the lights differ most, level by level, down to one that has `most`."""
+    """The order (L,) of the lights, the starts and the ends (N,) of the nodes in that order, and the children (N, 2) of
+    the nodes. Each level halves the nodes above it where their lights differ most. The last level is the first that has
+    `most` nodes."""
     count = len(center)
     order = np.arange(count)
     starts, ends, children = [np.array([0])], [np.array([count])], []
@@ -208,7 +214,7 @@ def ranges(center, normal, most=np.inf):
         bounds = np.concatenate([[0], np.cumsum(size)[:-1]])
         values = np.concatenate([center[order[places]], normal[order[places]]], axis=1)
         extent = np.maximum.reduceat(values, bounds) - np.minimum.reduceat(values, bounds)
-        # A turn by 1 rad counts as half as much as the whole width of a node.
+        # A turn by 1 rad counts half as much as the whole width of a node.
         extent[:, 3:] *= 0.5 * np.linalg.norm(extent[:, :3], axis=1, keepdims=True)
         key = values[np.arange(len(values)), extent.argmax(axis=1)[member]]
         order[places] = order[places][np.lexsort((key, member))]
@@ -218,12 +224,12 @@ def ranges(center, normal, most=np.inf):
 
 
 def cones(axis, normals, start, end):
-    """The largest angles (N,) in rad between the axes (N, 3) and the normals (L, 3) from start to end."""
+    """The largest angles (N,) in rad between the axes (N, 3) and the normals (L, 3) `start` to `end` of each node."""
     least, largest = np.ones(len(axis)), 1 << 16
     size = end - start
     for first in range(0, len(axis), largest):
         chosen = np.arange(first, min(first + largest, len(axis)))
-        # A level at a time: all lights are in it at most once.
+        # Go level by level: each level has every light at most once.
         member = np.repeat(chosen, size[chosen])
         offset = np.concatenate([[0], np.cumsum(size[chosen])[:-1]])
         places = np.arange(len(member)) + np.repeat(start[chosen] - offset, size[chosen])
@@ -233,20 +239,20 @@ def cones(axis, normals, start, end):
 
 @dataclass(frozen=True)
 class Tiles:
-    """T tiles of samples, and what bounds the lobes in them."""
+    """T tiles of samples, and bounds on the lobes in them."""
 
-    columns: list[np.ndarray]
+    columns: list[np.ndarray]  # of the samples of each tile
     center: np.ndarray  # (T, 3) m
     half: np.ndarray  # (T, 3) m: half the box around the samples; this and what follows in single precision
     radius: np.ndarray  # (T,) m: half the diagonal of the box
-    horizons: list[tuple[np.ndarray, np.ndarray]]  # axes (T, 3) and angles (T,) of cones of normals
-    mirrored: tuple[np.ndarray, np.ndarray] | None  # the same of the mirrored views; None for diffuse lobes
+    horizons: list[tuple[np.ndarray, np.ndarray]]  # cones around the normals of each horizon: axes (T, 3), angles (T,)
+    mirrored: tuple[np.ndarray, np.ndarray] | None  # cones around the mirrored views; None for diffuse lobes
     width: np.ndarray | None  # (T,) rad, of the narrowest specular lobe
-    only_tails: bool  # nodes must be in the tails of the lobes, `SHARP_TAIL` from their peaks
+    only_tails: bool  # True: nodes must be in the tails of the lobes, at least `SHARP_TAIL` from their peaks
 
     @classmethod
     def of(cls, lobes, position, columns) -> Tiles:
-        """Those of lists of columns of samples with x, y, z in `position` (3, Q)."""
+        """The tiles with these `columns`, of samples with x, y, z in `position` (3, Q)."""
         every = np.concatenate(columns)
         first = np.concatenate([[0], np.cumsum([len(own) for own in columns])[:-1]])
         place = position[:, every]
@@ -261,7 +267,7 @@ class Tiles:
 
 
 def _keys(lobes, position, chosen) -> np.ndarray:
-    """What tells the columns `chosen` (Q',) apart, (D, Q')."""
+    """Keys (D, Q') by which the columns `chosen` (Q',) are grouped: places, and directions of the lobes."""
     direction = lobes.rows[lobes.clip_rows[-1]] if lobes.sharpest is None else lobes.sharpest.mirrored
     place = position[:, chosen]
     extent = np.ptp(place, axis=1)
@@ -272,16 +278,16 @@ def _keys(lobes, position, chosen) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Cubics:
-    """Ten samples of each of T tiles, between which the others are interpolated: cubics of two coordinates."""
+    """Ten samples of each of T tiles, and cubics of two coordinates that interpolate to its other samples."""
 
-    anchors: np.ndarray  # (T, 10) places in the tile
+    anchors: np.ndarray  # (T, 10) places of the ten samples in the tile
     weights: np.ndarray  # (T, R, 10) for the at most R samples of a tile
-    are_smooth: np.ndarray  # (T,) whether all that the lobes hang on is such a cubic
+    are_smooth: np.ndarray  # (T,) True if all that the lobes depend on is close to such a cubic
 
     @classmethod
     def of(cls, parts, keys, shape) -> Cubics:
-        """Those of tiles of the samples `parts`, with keys (D, Q) that tell them apart; shape (S, Q): what their lobes
-        hang on, by the lengths over which they change."""
+        """For tiles of the samples `parts`. `keys` (D, Q) come from `_keys`; `shape` (S, Q) is what the lobes
+        depend on, in units of the lengths over which they change."""
         count = max(map(len, parts))
         index = np.stack([np.resize(part, count) for part in parts])
         own = np.moveaxis(keys[:, index], 0, -1)
@@ -293,7 +299,7 @@ class Cubics:
         one = np.ones_like(u)
         powers = [one, u, u * u, u * u * u, v, v * u, v * u * u, v * v, v * v * u, v * v * v]
         values = np.stack(powers, axis=-1)
-        # The samples that tell most about cubics, one after another: a Cholesky decomposition with pivots.
+        # Choose the samples that determine cubics best, one after another, by a pivoted Cholesky decomposition.
         tile, left = np.arange(len(parts)), (values * values).sum(axis=2)
         found, anchors, least = np.zeros_like(values), np.zeros((len(parts), len(powers)), int), np.inf
         for step in range(len(powers)):
@@ -314,7 +320,7 @@ class Cubics:
 
 
 def _halves(keys, part, most):
-    """Parts of at most so many columns each, neighbors in keys (D, Q)."""
+    """Parts of the columns `part` that are neighbors in `keys` (D, Q), at most `most` columns each."""
     if len(part) <= most:
         return [part]
     own = keys[:, part]
@@ -325,7 +331,7 @@ def _halves(keys, part, most):
 
 
 def _cones_of(vectors, first):
-    """Axes (T, 3) and angles (T,) of cones around the vectors (3, Q) of every tile, from the column `first` (T,) on."""
+    """Axes (T, 3) and angles (T,) of cones around the vectors (3, Q) of each tile. `first` (T,) is its first column."""
     own = vectors.astype(np.float64)
     own /= np.maximum(np.sqrt(dot(own, own)), 1e-30)
     axis = np.add.reduceat(own, first, axis=1)
@@ -336,12 +342,12 @@ def _cones_of(vectors, first):
 
 
 def _angles(offset, distance, axis):
-    """Angles (K,) between vectors (K, 3) of a length (K,) and unit vectors (K, 3)."""
+    """Angles (K,) in rad between vectors `offset` (K, 3), `distance` (K,) long, and the unit vectors `axis` (K, 3)."""
     return np.arccos(np.clip(_products(offset, axis) / distance, -1.0, 1.0))
 
 
 def _products(one, two):
-    """Products (K,) of vectors (K, 3)."""
+    """Dot products (K,) of vectors (K, 3)."""
     return np.einsum("ki,ki->k", one, two)
 
 
@@ -351,9 +357,9 @@ def _lengths(vectors):
 
 
 def _heights(ranges, offset, axis, cone):
-    """Heights (K,) of nodes at an offset (K, 3) over planes through tiles with normals `axis` (K, 3), and by how much
-    these may differ within the ranges: the reach (K,) of a node, half the box (K, 3) of a tile, the largest distance
-    (K,); and where normals are in cones (K,) in rad."""
+    """Heights (K,) of nodes at `offset` (K, 3) over planes through tiles with the normals `axis` (K, 3), and how much
+    they may differ (K,) within `ranges`: the reach (K,) of the node, half the box (K, 3) of the tile, and the largest
+    distance (K,) between them. Normals are within `cone` (K,) in rad of the axis."""
     reach, half, farthest = ranges
     slack = reach + _products(half, np.abs(axis)) + np.sin(np.minimum(cone, 0.5 * np.pi)) * farthest
     return _products(offset, axis), slack
@@ -361,19 +367,19 @@ def _heights(ranges, offset, axis, cone):
 
 @dataclass(frozen=True)
 class _Between:
-    """How nodes lie from tiles, by pairs (K,); lengths in m."""
+    """Where nodes are as seen from tiles, for K pairs; lengths in m."""
 
     offset: np.ndarray  # (K, 3) from center to center
     half: np.ndarray  # (K, 3) half the box of the tile
     reach: np.ndarray  # of the node
     radius: np.ndarray  # of the tile
-    distance: np.ndarray  # of the centers
+    distance: np.ndarray  # between the centers
     nearest: np.ndarray  # from the box to the center of the node
-    parallax: np.ndarray  # rad: by how much directions differ between points of the tile and of the node
+    parallax: np.ndarray  # rad: how much directions from points of the tile to points of the node may differ
 
     @classmethod
     def of(cls, tree: LightTree, tiles: Tiles, tile, node) -> _Between:
-        """That of the numbers (K,) of tiles and nodes."""
+        """For the numbers (K,) of tiles and nodes."""
         offset = (tree.center[node] - tiles.center[tile]).astype(np.float32)
         half, reach, radius = tiles.half[tile], tree.reach[node], tiles.radius[tile]
         gap = np.maximum(np.abs(offset) - half, 0.0)
@@ -383,39 +389,39 @@ class _Between:
         return cls(offset, half, reach, radius, distance, nearest, parallax)
 
     def away(self, axes, cones):
-        """The least angles (K,) in rad between the directions to nodes and cones of directions, negative within."""
+        """Lower bound (K,) in rad on angles between directions to nodes and cones of directions; negative within."""
         return _angles(self.offset, self.distance, axes) - cones - self.parallax
 
     @property
     def ranges(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """As of `_heights`."""
+        """The ranges for `_heights`."""
         return self.reach, self.half, self.distance + (self.radius + self.reach)
 
 
 @dataclass
 class _Pairs:
-    """Pairs (K,) of a tile and a node: how much light that is at most, and how much of it may be wrong."""
+    """K pairs of a tile and a node: upper bounds on their light and on its error."""
 
     tile: np.ndarray
     node: np.ndarray
     are_leaves: np.ndarray
     is_dark: np.ndarray
-    are_crossed: np.ndarray  # a horizon goes through the node
+    are_crossed: np.ndarray  # a horizon may cross the node
     is_smooth: np.ndarray  # light may be interpolated between samples
     are_in_tail: np.ndarray  # of all lobes
     is_wrong: np.ndarray  # no points may stand for the node
-    size: np.ndarray  # of the node, by the length over which the integrand changes
+    size: np.ndarray  # of the node, in units of the length over which the integrand changes
     change: np.ndarray  # of the integrand over the tile
-    light: np.ndarray  # that any sample gets at most
-    mean: np.ndarray  # about that of all samples: of a large tile beside its distance few get the most
-    crossed: np.ndarray  # light that is wrong where horizons and planes are crossed
+    light: np.ndarray  # upper bound for any sample
+    mean: np.ndarray  # estimated mean over all samples; near a large tile few samples get the most
+    crossed: np.ndarray  # light that is wrong where horizons and planes cross the node
 
     @classmethod
     def of(cls, tree: LightTree, tiles: Tiles, tile, node) -> _Pairs:
-        """Those of the numbers (K,) of tiles and nodes."""
+        """For the numbers (K,) of tiles and nodes."""
         between = _Between.of(tree, tiles, tile, node)
         size, seen = between.reach / between.nearest, between.radius / between.nearest
-        # What is crossed is near the horizon or the plane of the light: the share of it in the light.
+        # Where a horizon or its own plane crosses a light, the cosine is at most this.
         rim = np.minimum(2.0 * size, 1.0)
         light, plane, crossed, is_dark = _shining(tree, node, between, rim)
         are_crossed = np.zeros(len(node), bool)
@@ -430,14 +436,14 @@ class _Pairs:
                 light *= steepest
                 is_crossed = is_crossed * np.minimum(rim / np.maximum(steepest, LEAST), 1.0)
             crossed += CROSSED * is_crossed
-        # A light alone is dark behind its plane; where many are turned differently, they are so one after another.
+        # One light goes dark all at once behind its plane; lights that face differently go dark one after another.
         is_smooth = ~are_crossed & ((plane == 0.0) | tree.is_turned[node])
         are_in_tail, is_wrong = np.zeros((2, len(node)), bool)
         if tiles.mirrored is not None:
             axes, cones = tiles.mirrored
             turn, width = cones[tile], tiles.width[tile]
             away = np.maximum(between.away(axes[tile], turn), 0.0)
-            # As `TailLimits` has it, for each of the lights.
+            # The criterion of `TailLimits`, for each of the lights.
             near = NEAR_RADII * np.sqrt(tree.diagonal[node])
             are_in_tail = np.sin(np.minimum(away, 0.5 * np.pi)) * between.nearest > near
             if tiles.only_tails:
@@ -454,17 +460,17 @@ class _Pairs:
 
     @property
     def are_points(self) -> np.ndarray:
-        """Mask (K,) of the nodes that are one point."""
+        """Mask (K,) of the nodes that are a single point."""
         return self.size < POINT
 
     def are_fine(self, most) -> np.ndarray:
-        """Mask (K,) of those whose error is at most so much (K,)."""
+        """Mask (K,) of the nodes that may be used: their error is at most `most` (K,), or they are small."""
         small = (self.size < SMALL) & (self.crossed <= most)
         error = self.light * FOURTH_ORDER * np.minimum(self.size, 1.0) ** 4 + self.crossed
         return (small | (self.size < LARGEST) & (error <= most)) & ~self.is_wrong
 
     def are_near(self, most) -> np.ndarray:
-        """Mask (K,) of the leaves that are no points, where their error may be so much (K,)."""
+        """Mask (K,) of the leaves to shade as polygons; their error as points may be `most` (K,)."""
         are_points = self.are_fine(most) & (self.size < LEAF_SIZE)
         return self.are_leaves & ~are_points
 
@@ -476,7 +482,7 @@ class _Pairs:
             yield number, pairs.take(slice(start, end))
 
     def take(self, index) -> _Pairs:
-        """Those at the index (Q,)."""
+        """The pairs at `index` (Q,)."""
         return _Pairs(*(getattr(self, own.name)[index] for own in fields(self)))
 
     @classmethod
@@ -486,8 +492,8 @@ class _Pairs:
 
 
 def _shining(tree: LightTree, node, between: _Between, rim):
-    """Of pairs (K,): the light at most; the share of all light that may be wrong where a sample may be in the plane of
-    a light, and the share of this light; whether the nodes face away."""
+    """For K pairs: an upper bound on the light; the share of all light, and of this light, that may be wrong because a
+    sample may be in the plane of a light; and whether the nodes face away."""
     angle, cone = _angles(-between.offset, between.distance, tree.axis[node]), tree.cone[node]
     shining = np.cos(np.clip(angle - cone - between.parallax, 0.0, 0.5 * np.pi))
     power = tree.power[node]
@@ -498,7 +504,7 @@ def _shining(tree: LightTree, node, between: _Between, rim):
 
 
 def _refined(tree, tiles, is_fine) -> _Pairs:
-    """The coarsest `_Pairs` of all tiles of which is_fine(pairs) holds, or which are leaves; none that is dark."""
+    """The coarsest `_Pairs` of all tiles for which is_fine(pairs) holds or which are leaves, without dark ones."""
     fine, tile, node = [], np.arange(len(tiles.columns)), np.zeros(len(tiles.columns), int)
     while len(node) or not fine:
         pairs = _Pairs.of(tree, tiles, tile, node)
@@ -510,8 +516,8 @@ def _refined(tree, tiles, is_fine) -> _Pairs:
 
 
 def add_far_lights(tree: LightTree, lobes, position, chosen, total) -> tuple[np.ndarray, np.ndarray]:
-    """Add to total (F, 3, Q) what the columns `chosen` (Q',) of `lobes`, at x, y, z in `position` (3, Q), get of the
-    lights of the tree; pairs (K,) of a column and the number of a light that it needs whole."""
+    """Add the light of the tree to `total` (F, 3, Q), for the columns `chosen` (Q',) of `lobes`, at x, y, z in
+    `position` (3, Q). Returns the pairs (K,) that are left: columns, and numbers of the lights to shade as polygons."""
     is_specular = lobes.sharpest is not None
     keys = _keys(lobes, position, chosen)
     parts = _halves(keys, np.arange(len(chosen)), TILE[is_specular])
@@ -561,10 +567,10 @@ def add_far_lights(tree: LightTree, lobes, position, chosen, total) -> tuple[np.
 
 @dataclass(frozen=True)
 class _Fan:
-    """As `small_lights.Rays`, (Q, K), from Q samples of a tile to K points."""
+    """Like `small_lights.Rays`, arrays (Q, K) from Q samples of a tile to K points."""
 
-    ends: np.ndarray  # (4, K): offsets of the points from the middle of the tile, and 1
-    place: np.ndarray  # (4, Q): those of the samples, and 1
+    ends: np.ndarray  # (4, K): offsets of the points from the middle of the tile, then 1
+    place: np.ndarray  # (4, Q): offsets of the samples, then 1
     squares: np.ndarray
     distance: np.ndarray
     flux: np.ndarray
@@ -572,18 +578,18 @@ class _Fan:
     slack: None = None
 
     def heights(self, vectors) -> np.ndarray:
-        """Products (Q, K) of the offsets with vectors (3, Q, 1)."""
+        """Products (Q, K) of the rays with `vectors` (3, Q, 1)."""
         vectors = vectors[..., 0]
         return np.concatenate([vectors, -dot(vectors, self.place)[None]]).T @ self.ends
 
 
 class _Points:
-    """What nodes of a tree are for a tile: K points."""
+    """The K points that stand for nodes of a tree in a tile."""
 
     def __init__(self, tree, pairs: _Pairs, middle, is_specular):
         nodes, single, crossed = pairs.node, pairs.are_points, pairs.are_crossed
         places, turned = tree.places[is_specular], tree.is_turned[nodes]
-        # What takes longer comes last.
+        # Nodes that take longer come last.
         order = np.argsort(2 * turned + crossed, kind="stable")
         most = len(places) // len(tree.center)
         count = np.where(single, 1, most)[order]
@@ -603,9 +609,9 @@ class _Points:
         self.swing, self.diagonal = tree.swing[node], tree.diagonal[node]
 
     def fan(self, part, place) -> _Fan:
-        """Rays to the points `part`, a slice, from the places (4, Q)."""
+        """Rays from `place` (4, Q) to the points `part`, a slice."""
         ends, size = self.ends[:, part], dot(place, place)
-        # In products of matrices squares lose digits where points are near, by the size of the tile.
+        # Matrix products lose digits of the squares if points are near compared with the size of the tile.
         if self.squared[part].min() > 4.0 * size.max():
             squares = place.T @ self.from_squares[:, part]
             squares += size[:, None]
@@ -622,14 +628,14 @@ class _Points:
 
 
 def _light_of(tree, lobes, position, tile) -> np.ndarray:
-    """The light (F, 3, Q) of nodes; tile: its columns (Q,), at x, y, z in `position` (3, Q), and `_Pairs` with the
-    nodes."""
+    """The light (F, 3, Q) of nodes. `tile` is the columns (Q,), at x, y, z in `position` (3, Q), and the `_Pairs` with
+    the nodes."""
     columns, pairs = tile
     middle = position.mean(axis=1)
     place = np.ones((4, len(columns)), np.float32)
     place[:3] = position - middle[:, None]
     clipped = lobes.clip_rows if lobes.sharpest is not None or len(lobes.clip_rows) > 1 else ()
-    # Samples come first, so that what the same samples are for many points is read once.
+    # Samples are the first axis: their values for many points are then read once.
     columns = columns[:, None]
     horizons = [lobes.rows[row][:, columns] for row in clipped]
     sums = np.zeros((len(lobes.colors), 3, len(columns)), np.float32)

@@ -1,7 +1,7 @@
 """Linearly transformed lobes: their values, and their integrals over polygons in closed form.
 
-LTC is Heitz et al. 2016 (doi:10.1145/2897824.2925895), LTSH is Allmenroeder and Peters 2021: both integrate the
-original distribution over the transformed polygon, which is clipped at the horizon first.
+LTC is Heitz et al. 2016 (doi:10.1145/2897824.2925895), LTSH is Allmenroeder and Peters 2021. Both clip the polygon at
+the horizon, transform it, and integrate the original distribution over it.
 """
 
 from __future__ import annotations
@@ -23,25 +23,25 @@ from .polygon import (
     split_long_edges,
 )
 
-# Edges with a smaller 1 + cos(theta), 11 degrees short of a half circle, get a corner in between.
+# Edges with a smaller 1 + cos(theta), which are within 11 degrees of a half circle, get a corner in between.
 LONG_EDGE = 0.02
 # Polygons whose area is a smaller share of their squared length are computed in float64. In single precision the error
-# is some 1e-7 of their length: of the integral 4e-4 (median over directions and lobes) at this limit.
+# is about 1e-7 of their length; at this limit that is 4e-4 of the integral (median over directions and lobes).
 NARROWEST = 1e-3
-# Samples whose arrays in float64 stay in the cache.
+# Samples per chunk in float64, so few that their arrays stay in the cache.
 FLOAT64_CHUNK = 4096
-# Corners per chunk in float32: a compromise between calls of numpy and arrays that stay in the cache.
+# Corners per chunk in float32: a compromise between few calls of numpy and arrays that stay in the cache.
 _FLOAT32_CORNERS = 49216
-# Shading takes the integral for F = 1 to be at least this share of that of a clamped cosine under the same warp: the
-# true lobe is not darker but where both are, while the tail of a fitted one may fall below zero.
+# Least integral for F = 1 in shading, as a share of the integral of a clamped cosine under the same warp. The tail of a
+# fitted lobe may fall below zero, but the true lobe is dark only where that cosine is dark too.
 LEAST_SHARE = 0.02
 
 
 def evaluate_lobe(table: LookupTable, cos_theta_o, roughness, directions) -> np.ndarray:
-    """The lobe, approximating BRDF times cosine with F = 1, in sr^-1.
+    """The lobe in sr^-1, which approximates BRDF times cosine with F = 1; 0 below the horizon.
 
     cos_theta_o and roughness (P,) in [0, 1], unit directions (P, S, 3) in the local frame -> (P, S), float32 if the
-    directions are, else float64; 0 below the horizon. Raises ValueError where the shapes do not fit.
+    directions are, else float64. Raises ValueError if the shapes do not fit.
     """
     cosine, roughness, directions = _as_float(cos_theta_o, roughness, directions)
     if directions.ndim != 3 or directions.shape[2] != 3 or directions.shape[0] != cosine.shape[0]:
@@ -64,15 +64,18 @@ def integrate_polygon(table: LookupTable, cos_theta_o, roughness, vertices, *, s
     """Integral of `evaluate_lobe` over the part of a polygon above the horizon: reflected radiance per radiance.
 
     cos_theta_o (P,), roughness (P,), vertices (P, V, 3) in the local frame in any length unit, either winding -> (P,),
-    float32 if the vertices are, else float64. The signed integral, positive for corners counterclockwise as seen from
-    outside the unit sphere, is multiplied by the sign of the polygon's solid angle and clamped at zero; `signed`
-    returns it as it is. Polygons need not be convex. In a self-intersecting one every part counts as often as the
-    boundary winds around it, with that sign, in the solid angle as in the integral: a square traced twice has twice
-    the integral; of a figure of eight the difference of its halves remains, or 0 where the half that the lobe prefers
-    is the smaller one. A polygon whose plane goes through the point has the mean of the limits from both sides, or one
-    of them.
-    Absolute error below 2e-5 in float32, where points that need it are computed in float64: among them narrow polygons,
-    see `NARROWEST`. Raises ValueError where the shapes do not fit.
+    float32 if the vertices are, else float64. Raises ValueError if the shapes do not fit.
+
+    The signed integral is positive for corners that run counterclockwise as seen from outside the unit sphere. With
+    `signed` it is returned; without, it is multiplied by the sign of the polygon's solid angle and clamped at zero.
+
+    Polygons need not be convex. In a self-intersecting polygon, each part counts as often as the boundary winds around
+    it, with that sign, both in the solid angle and in the integral. A square traced twice has twice the integral. A
+    figure of eight gives the difference of its halves, or 0 if the lobe prefers the smaller half. A polygon whose plane
+    goes through the point gives the mean of the limits from both sides, or one of them.
+
+    The absolute error is below 2e-5 in float32. Points that need float64 for that are computed in it, among them those
+    with narrow polygons, see `NARROWEST`.
     """
     cosine, roughness, vertices = _as_float(cos_theta_o, roughness, vertices)
     if vertices.ndim != 3 or vertices.shape[2] != 3 or vertices.shape[1] < 3 or len(vertices) != len(cosine):
@@ -102,7 +105,8 @@ def _integrate_in_float64(table, cosine, roughness, vertices, signed):
 
 
 def polygon_integrals(table: LookupTable, lobe: Lobe, polygon: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
-    """Signed integrals (F, P) over polygons (3, V, P) in z >= 0, for coefficient vectors (F, K, P) under one warp."""
+    """Signed integrals (F, P) over polygons (3, V, P) in z >= 0 of lobes with coefficients (F, K, P) and the same
+    warp."""
     warped = lobe.to_original_domain(polygon)
     if lobe.tilt is not None:
         return coefficients[:, 0] * _tilted_cosine_integral(warped, lobe.tilt)
@@ -111,13 +115,13 @@ def polygon_integrals(table: LookupTable, lobe: Lobe, polygon: np.ndarray, coeff
         leaning = integrals_on_sphere(edge_integrals.vector_irradiance, bent(table.bend, warped))[::2]
         moments = np.concatenate([moments, 2.0 * leaning])
     weights = table.ridge_weights.astype(moments.dtype)
-    # Not a matrix product: with BLAS the bits of a point may depend on how many points share its batch.
+    # No matrix product: with BLAS, the bits of a point may depend on how many points share its batch.
     ridge_moments = sum(column[:, None] * row for column, row in zip(weights.T, moments, strict=True))
     return np.stack([(vector * ridge_moments).sum(axis=0) for vector in coefficients])
 
 
 def integrals_on_sphere(integral, vertices: np.ndarray) -> np.ndarray:
-    """integral(unit) (..., P) of polygons (3, V, P) projected to the sphere; edges near half a circle are split."""
+    """integral(unit) (..., P) of polygons (3, V, P) projected to the sphere. Edges near half a circle are split."""
     unit = project_to_sphere(vertices)
     result = integral(unit)
     long = np.nonzero(one_plus_cosine(edge_sums(unit)).min(axis=0) < LONG_EDGE)[0]
@@ -127,13 +131,14 @@ def integrals_on_sphere(integral, vertices: np.ndarray) -> np.ndarray:
 
 
 def tilted(warped: np.ndarray, tilt: np.ndarray) -> np.ndarray:
-    """Vectors (3, V, P) or (3, P) turned so that the axis (sin tilt, 0, cos tilt) becomes e_z."""
+    """Vectors (3, V, P) or (3, P), turned so that the axis (sin tilt, 0, cos tilt) becomes e_z."""
     sine, cosine = np.sin(tilt), np.cos(tilt)
     return np.stack([cosine * warped[0] - sine * warped[2], warped[1], sine * warped[0] + cosine * warped[2]])
 
 
 def _tilted_cosine_integral(warped, tilt):
-    """Signed integral (P,) of the unit-mass clamped cosine around (sin tilt, 0, cos tilt): clipped a second time."""
+    """Signed integral (P,) of the unit-mass clamped cosine around (sin tilt, 0, cos tilt). The polygon is clipped again
+    at the horizon of that axis."""
     result = np.zeros_like(tilt)
     for index, polygon in split_at_horizon(tilted(warped, tilt)):
         result[index] = form_factor(polygon)
@@ -146,7 +151,7 @@ def form_factor(polygon: np.ndarray) -> np.ndarray:
 
 
 def clamped_form_factor(vertices) -> np.ndarray:
-    """Form factor (P,) of the part above the horizon of polygons (P, V, 3), either winding."""
+    """Form factor (P,) of the part of polygons (P, V, 3) above the horizon, for either winding."""
     vertices = np.asarray(vertices)
     result = np.zeros(len(vertices), dtype=vertices.dtype)
     for index, polygon in split_at_horizon(np.ascontiguousarray(vertices.transpose(2, 1, 0))):
@@ -161,8 +166,7 @@ def _as_float(cos_theta_o, roughness, vectors):
 
 
 def _integrate_in_float32(table, cosine, roughness, vertices, signed):
-    """Integrals (P,) as `integrate_polygon` returns them, all arrays float32, and the indices of the points that need
-    float64."""
+    """Integrals (P,) as in `integrate_polygon`, for float32 arrays, and the indices of the points that need float64."""
     count, corners = vertices.shape[:2]
     ridges, scratch = moments32.prepare(table), moments32.Scratch()
     result, redo = np.zeros(count, np.float32), np.zeros(count, bool)
@@ -171,7 +175,7 @@ def _integrate_in_float32(table, cosine, roughness, vertices, signed):
         chosen = weights if index is None else np.take(weights, index, axis=2)
         values, angle, _, needs_float64 = ridges.integrals(corners, chosen, scratch)
         if vertices.shape[1] > 4 and tilt is None:
-            # Only here do polygons wind several times around a point, beyond the range of one arc tangent.
+            # Only such polygons wind several times around a point, beyond the range of one arc tangent.
             angle = solid_angle(project_to_sphere(corners[:3]))
             needs_float64 |= np.abs(angle) > np.float32(moments32.LARGEST_SAFE_ANGLE)
         return np.stack([values[0], np.sign(angle)]), needs_float64
@@ -200,8 +204,8 @@ def _integrate_in_float32(table, cosine, roughness, vertices, signed):
 
 @np.errstate(over="ignore", invalid="ignore")
 def _narrow_and_turning_back(vertices):
-    """Masks (P,) of polygons (P, V, 3) that are narrow, and of those that do not fan out from their first corner one
-    way around: only of these may parts that are cut off or warped change the sign of the solid angle."""
+    """Two masks (P,) of polygons (P, V, 3): those that are narrow, and those that do not fan out from their first
+    corner one way around. Clipping or warping can change the sign of the solid angle of the latter only."""
     corners = np.ascontiguousarray(vertices.transpose(2, 1, 0))
     sides = corners[:, 1:] - corners[:, :1]
     longest = dot(sides, sides).max(axis=0)
@@ -222,7 +226,8 @@ def _orientations(vertices):
 
 
 def _warped(vertices, warp, tilt, scratch):
-    """Polygons (3 or 4, V, P) in the domain of the lobe's original distribution, and the coordinates to clip at 0."""
+    """Polygons (3 or 4, V, P) in the domain of the original distribution, and the numbers of the coordinates to clip at
+    0."""
     points, count = vertices.shape[:2]
     rows = scratch("rows", (3 if tilt is None else 4, count, points))
     x, y, z = (vertices[..., axis].T for axis in range(3))

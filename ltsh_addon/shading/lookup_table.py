@@ -1,20 +1,23 @@
 """The lookup table of a fitted BRDF: axes, stored quantities, bilinear lookup.
 
-The lobe is D(w) = D_orig(w') |W| / |W w|^3, w' = W w / |W w| (Heitz et al. 2016, eq. 1), where the warp W = M^-1,
-known up to a factor, is upper triangular: it leaves the horizon in place.
+The lobe is D(w) = D_orig(w') |W| / |W w|^3, w' = W w / |W w| (Heitz et al. 2016, eq. 1). The warp W = M^-1 is known up
+to a factor. It is upper triangular, so it leaves the horizon in place:
 
     W = [[A g^2, 0, A B g sin(theta_o)], [0, C, 0], [0, 0, 2 alpha]],
     g^2 = cos^2(theta_o) + sin^2(theta_o) alpha^2 / 4
 
-The stored A, B, C tend to 1 as alpha -> 0, where GGX becomes an exactly transformed clamped cosine; that is why they
-may be interpolated. At normal incidence A = C. D_orig is a spherical harmonics expansion ("ltsh"), or a clamped cosine
-around the axis (sin(tilt), 0, cos(tilt)) ("ltc": tilt is the fourth parameter of M). A table with a `bend` adds to the
-spherical harmonics two linear functions under one more warp, the same for the whole table: see `bent_cosines`.
+The table stores A, B and C. They tend to 1 as alpha -> 0, where GGX becomes an exactly transformed clamped cosine;
+therefore they can be interpolated. At normal incidence A = C. D_orig is a spherical harmonics expansion ("ltsh"), or a
+clamped cosine around the axis (sin(tilt), 0, cos(tilt)) ("ltc"; tilt is the fourth parameter of M). A table with a
+`bend` adds two linear functions under one more warp to the spherical harmonics; that warp is the same for the whole
+table, see `bent_cosines`.
 
 Axes: roughness is uniform; theta_o is uniform in 1 - sqrt(1 - theta_o / 90 deg), which is dense at grazing angles.
-One coefficient vector per Fresnel curve shares the warp: a lobe is linear in its coefficients, so that a reflectance
-sum_f w_f F_f(c), c the cosine of the half angle, has the coefficients sum_f w_f c_f. Curves 0, 1 and 2 are 1 and
-(1 - c)^5 (Schlick 1994) and c (1 - c)^6 (the F82 tint of metals); `dielectric_weights` gives w_f for dielectrics.
+
+There is one coefficient vector per Fresnel curve; all share the warp. A lobe is linear in its coefficients. So a
+reflectance sum_f w_f F_f(c), where c is the cosine of the half angle, has the coefficients sum_f w_f c_f. Curves 0, 1
+and 2 are 1, (1 - c)^5 (Schlick 1994) and c (1 - c)^6 (the F82 tint of metals). `dielectric_weights` gives w_f for
+dielectrics.
 """
 
 from __future__ import annotations
@@ -32,10 +35,10 @@ from .spherical_harmonics import coefficient_count, degree_of, evaluate, hemisph
 
 FORMAT_VERSION = 2
 WARP_REGULARIZATION = 0.5
-# Below this alpha every surface is a mirror at the size of real lights; the warp stays invertible.
+# Below this alpha every surface counts as a mirror at the size of real lights; above it, the warp is invertible.
 MIN_ALPHA = 1e-5
 _MOST_BENT = 1e3
-# Arrays by name, and what each of their axes has at least.
+# Arrays by name, and the least length of each of their axes.
 _FEWEST = {
     "warp": (2, 2, 3),
     "coefficients": (2, 2, 2, 1),
@@ -55,7 +58,7 @@ class TableError(ValueError):
 
 @dataclass(frozen=True)
 class Lobe:
-    """Lobes of P points: the entries of W, the tilt of the clamped cosine (None for "ltsh"), the coefficients."""
+    """Lobes of P points: the entries of W, the tilt of the clamped cosine (None for "ltsh"), and the coefficients."""
 
     xx: np.ndarray  # (P,)
     xz: np.ndarray  # (P,)
@@ -81,7 +84,7 @@ class Lobe:
         return Lobe(*entries, tilt, self.coefficients[:, :, index])
 
     def albedo(self) -> np.ndarray:
-        """Integrals (F, P) over the hemisphere: the directional albedo for every Fresnel curve."""
+        """Integrals (F, P) over the hemisphere: the directional albedo for each Fresnel curve."""
         if self.tilt is not None:
             return self.coefficients[:, 0] * (0.5 + 0.5 * np.cos(self.tilt))
         integrals = basis_integrals(self.coefficients.shape[1]).astype(self.coefficients.dtype)
@@ -91,7 +94,7 @@ class Lobe:
 
 @dataclass(frozen=True)
 class LookupTable:
-    """Arrays of one fitted table; see the module's docstring."""
+    """The arrays of one fitted table; see the module's docstring."""
 
     name: str
     family: str  # "ltc" or "ltsh"
@@ -100,13 +103,13 @@ class LookupTable:
     coefficients: np.ndarray  # (R, T, F, K) in sr^-1: of Y_lm ("ltsh") or of the unit-mass clamped cosine ("ltc")
     fresnel_curves: np.ndarray  # (F, C) sampled at C uniform cosines of the half angle in [0, 1]
     fresnel_ior: np.ndarray  # (I,) increasing
-    fresnel_weights: np.ndarray  # (I, F): the reflectance of a dielectric of that IOR as a combination of the curves
+    fresnel_weights: np.ndarray  # (I, F): weights of the curves that give the reflectance of a dielectric of that IOR
     average_albedo: np.ndarray  # (R, F) integral of 2 mu albedo(mu) over mu in [0, 1]
     metadata: dict
-    bend: tuple[float, float, float] | None = None  # of `bent_cosines`, whose two coefficients are then the last ones
+    bend: tuple[float, float, float] | None = None  # warp of `bent_cosines`; the last two coefficients are then theirs
 
     def basis(self, unit: np.ndarray) -> np.ndarray:
-        """Values (K, ...) at unit directions (..., 3) of what the coefficients of an "ltsh" table multiply."""
+        """Values (K, ...), at unit directions (..., 3), of the functions that the coefficients of "ltsh" multiply."""
         return basis_values(self.degree, self.bend, unit)
 
     @cached_property
@@ -117,7 +120,7 @@ class LookupTable:
 
     @cached_property
     def ridge_weights(self) -> np.ndarray:
-        """Matrix (K, K) from coefficients of "ltsh" to weights of the polygon's moments: those of
+        """Matrix (K, K) that turns coefficients of "ltsh" into weights of a polygon's moments. These are the moments of
         `edge_integrals.moments`, then twice the integrals of x and z over the bent polygon."""
         matrix = ridge_matrix(self.degree)
         if self.bend is None:
@@ -129,8 +132,8 @@ class LookupTable:
         return bent
 
     def lookup(self, cos_theta_o: np.ndarray, roughness: np.ndarray, curves: int | None = None) -> Lobe:
-        """Bilinearly interpolated lobes at cos_theta_o (P,) and roughness (P,), both clamped to [0, 1], with the
-        coefficients of the first `curves` Fresnel curves (None: all)."""
+        """Bilinearly interpolated lobes at cos_theta_o (P,) and roughness (P,), both clamped to [0, 1], with
+        coefficients for the first `curves` Fresnel curves (None: all)."""
         cosine = np.clip(cos_theta_o, 0.0, 1.0)
         dtype = cosine.dtype
         roughness = np.clip(roughness, 0.0, 1.0).astype(dtype, copy=False)
@@ -162,9 +165,9 @@ def bent(bend, vectors) -> np.ndarray:
 
 
 def bent_cosines(bend, unit) -> np.ndarray:
-    """Values (2, ...) at unit directions (..., 3) of x / pi and z / pi under the warp [[xx, 0, xz], [0, yy, 0],
-    [0, 0, 1]] of `bend` (xx, xz, yy): a linearly transformed cosine, and its derivative by the direction to which it
-    leans. Their integrals over the hemisphere are 0 and 1."""
+    """Values (2, ...), at unit directions (..., 3), of x / pi and z / pi under the warp [[xx, 0, xz], [0, yy, 0],
+    [0, 0, 1]] of `bend` (xx, xz, yy). The second is a linearly transformed cosine, the first its derivative by the
+    direction to which it leans. Their integrals over the hemisphere are 0 and 1."""
     warped = bent(bend, np.moveaxis(unit, -1, 0))
     squares = (warped * warped).sum(axis=0)
     return warped[::2] * (bend[0] * bend[2] / np.pi / (squares * squares)).astype(unit.dtype)
@@ -185,8 +188,8 @@ def basis_integrals(count: int) -> np.ndarray:
 
 
 def warp_entries(cosine, alpha, a, b, c, sine=None):
-    """Entries (xx, xz, yy, zz) of W for the stored A, B, C; all arrays broadcast. In single precision the sine does not
-    follow from a cosine close to one: give it."""
+    """Entries (xx, xz, yy, zz) of W for the stored A, B, C; all arrays broadcast. Give the `sine` in single precision,
+    where it does not follow from a cosine close to one."""
     if sine is None:
         sine = np.sqrt(np.maximum(1.0 - cosine * cosine, 0.0))
     squared = cosine * cosine + (WARP_REGULARIZATION * alpha * sine) ** 2

@@ -1,8 +1,8 @@
 """The hot path in float32: moments of polygons, and the tables that weight them.
 
-The moments are those of `edge_integrals`, as coefficients of forms, from the cosines of the edges instead of the sums
-of their ends, and without any branch. Where that is not accurate the mask `needs_float64` tells so: the caller computes
-these points again in double precision. Arrays that are needed for a moment come from a `Scratch`, whose next user
+The moments are those of `edge_integrals`, but as coefficients of forms. They are computed without any branch, from the
+cosines of the edges instead of the sums of their ends. The mask `needs_float64` marks points for which that is not
+accurate; the caller computes these again in double precision. Temporary arrays come from a `Scratch`, whose next user
 overwrites them.
 """
 
@@ -19,19 +19,20 @@ from .lookup_table import MIN_ALPHA, LookupTable, warp_entries
 from .spherical_harmonics import coefficient_count
 
 MAX_DEGREE = 4
-# An edge short of a half circle, here by 8 degrees, has no direction: least 1 + cos(theta). The edges of a tiny polygon
-# cancel: least sum of their angles, if all are equal. Corners are as exact as the farthest of them: least distance of a
-# corner, as a share of that.
+# Limits beyond which a polygon needs float64. SHORTEST_SAFE: least 1 + cos(theta) of an edge; an edge of nearly half a
+# circle, here by 8 degrees, has no direction. SMALLEST_SAFE: least sum of the edges' angles in rad, if all are equal;
+# the edges of a tiny polygon cancel. NEAREST_SAFE: least distance of a corner in units of the distance of the farthest
+# corner, to which the rounding of all corners is proportional.
 SHORTEST_SAFE = 0.01
 SMALLEST_SAFE = 0.08
 NEAREST_SAFE = 0.01
-# Solid angles close to 2 pi are close to the branch cut of the arc tangent.
+# Larger solid angles, close to 2 pi, are close to the branch cut of the arc tangent.
 LARGEST_SAFE_ANGLE = 5.9
-# Sharper lobes amplify the rounding of directions too much for single precision: at this roughness 2 alpha = 0.02.
+# Lobes below this roughness, where 2 alpha = 0.02, amplify the rounding of directions too much for single precision.
 SHARP_ROUGHNESS = 0.1
-# Beyond these the angle of one edge is below what single precision tells from 0, and products leave its range.
+# With more corners, single precision cannot tell the angle of one edge from 0, and products leave its range.
 MANY_CORNERS = 64
-# Corners of the polygons whose moments are computed at a time: their arrays stay in a second-level cache of 1 MiB.
+# Corners of the polygons in one piece: its arrays stay in a second-level cache of 1 MiB.
 PIECE_CORNERS = 24624
 _VIEWS_KEPT = 1000
 _DIELECTRICS_KEPT = 64
@@ -39,7 +40,7 @@ _TINY = np.float32(1e-30)
 
 
 class Scratch:
-    """Float32 arrays by name that are made once and reused: `scratch("name", shape)`."""
+    """Float32 arrays by name, made once and reused: `scratch("name", shape)`."""
 
     def __init__(self):
         self._arrays: dict[str, np.ndarray] = {}
@@ -53,7 +54,7 @@ class Scratch:
         size = prod(shape)
         array = self._arrays.get(name)
         if array is None or array.size < size:
-            # A larger array replaces this one: views of it would keep it alive.
+            # Views of the smaller array would keep it alive.
             self._views = {key: view for key, view in self._views.items() if key[0] != name}
             array = self._arrays[name] = np.empty(size, dtype=np.float32)
         elif len(self._views) > _VIEWS_KEPT:
@@ -63,7 +64,7 @@ class Scratch:
 
 
 def pieces(count: int, most: int) -> list[slice]:
-    """Slices of about equal length, at most `most` (or 512, where that is less), that make up `count` elements."""
+    """Slices of about equal length that make up `count` elements; at most `most` long, or 512 if that is more."""
     number = max(-(-count // max(most, 512)), 1)
     size = max(-(-count // number), 1)
     return [slice(start, min(start + size, count)) for start in range(0, count, size)]
@@ -71,7 +72,7 @@ def pieces(count: int, most: int) -> list[slice]:
 
 @cache
 def _arc_coefficients(factor: str, degree: int) -> np.ndarray:
-    """Coefficients as of `arc_polynomial` in s = sqrt(1 + cos theta); relative errors 8e-7 of phi and 6e-7 of psi."""
+    """Coefficients of `arc_polynomial` in s = sqrt(1 + cos theta); the relative error is 8e-7 for phi, 6e-7 for psi."""
     return arc_polynomial(factor, degree, np.sqrt(2.0)).astype(np.float32)
 
 
@@ -85,7 +86,7 @@ def _horner(coefficients, variable, out):
 
 
 def _arc_factor(factor, degree, shifted, scratch):
-    """phi or psi of edges with 1 + cos(theta) in `shifted` (V, P), from a polynomial."""
+    """phi or psi, from a polynomial, of edges with 1 + cos(theta) in `shifted` (V, P)."""
     root = np.sqrt(shifted, out=scratch("root", shifted.shape))
     values = _horner(_arc_coefficients(factor, degree), root, scratch(factor, shifted.shape))
     values /= root
@@ -97,7 +98,7 @@ def _phi(shifted, scratch):
 
 
 class _ArcFactors:
-    """What all ridges share: phi, q = 1 / (1 + cos), psi, q (1 + psi) / 2 and (q + 1) / 3; None where unused."""
+    """Factors that all ridges share: phi, q = 1 / (1 + cos), psi, q (1 + psi) / 2 and (q + 1) / 3; None if unused."""
 
     def __init__(self, degree, shifted, scratch):
         shape = shifted.shape
@@ -121,9 +122,9 @@ class _ArcFactors:
 
 
 def _edges(corners, scratch, smallest):
-    """Unit vectors (3, V + 1, P) along the corners (>= 3 rows, V, P), the first once more at the end, 1 + cos(theta)
-    (V, P) of the edges, kept positive, and the mask (P,) of polygons that need float64, among them those whose edges
-    are shorter than `smallest` in all."""
+    """Unit vectors (3, V + 1, P) along the corners (>= 3 rows, V, P), where the first corner is repeated at the end;
+    1 + cos(theta) (V, P) of the edges, kept positive; and the mask (P,) of polygons that need float64, among them those
+    whose edges add up to less than `smallest`."""
     _, count, points = corners.shape
     unit = scratch("unit", (3, count + 1, points))
     length = scratch("two", (count, points))
@@ -186,10 +187,11 @@ def _direction_integrals(corners, axes, scratch, smallest):
 
 
 def form_matrix(degree: int, more: int = 0) -> np.ndarray:
-    """Matrix (K, K) from the `moments` here to those of `edge_integrals.moments`, and `more` that are the same.
+    """Matrix (K, K) from the `moments` of this module to those of `edge_integrals.moments`, and `more` equal ones.
 
-    The sum of (u.X) K_k over the edges is a form in u, homogeneous of degree k + 1. Here are the coefficients of
-    u_x^(k+1), u_x^k u_z, ..., u_z^(k+1), there the values for the first k + 2 directions.
+    The sum of (u.X) K_k over the edges is a homogeneous form of degree k + 1 in u. The moments of this module are its
+    coefficients of u_x^(k+1), u_x^k u_z, ..., u_z^(k+1). Those of `edge_integrals` are its values for the first k + 2
+    directions.
     """
     matrix = np.eye(coefficient_count(degree) + more)
     for k in range(degree):
@@ -202,9 +204,9 @@ def form_matrix(degree: int, more: int = 0) -> np.ndarray:
 def moments(
     corners: np.ndarray, degree: int, scratch: Scratch, smallest: float = SMALLEST_SAFE, bend: tuple | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Moments (K, P) of polygons (>= 3 rows, V, P) in z >= 0 that need not be unit, in the order of `form_matrix`, and
-    the mask (P,) of points that need float64. `degree` 1 to 4. With the `bend` of a table its two moments follow. The
-    result is overwritten by the next call."""
+    """Moments (K, P) of polygons (>= 3 rows, V, P) in z >= 0, in the order of `form_matrix`, and the mask (P,) of
+    points that need float64. Corners need not be unit vectors; `degree` is 1 to 4. With the `bend` of a table, its two
+    moments follow. The next call overwrites the result."""
     unit, shifted, needs_float64 = _edges(corners, scratch, smallest)
     count, bent_count = coefficient_count(degree), 0 if bend is None else 2
     result = scratch("moments", (count + bent_count, shifted.shape[1]))
@@ -216,7 +218,7 @@ def moments(
 
 
 def _polynomial_moments(unit, shifted, degree, scratch, result):
-    """Put the moments into result (>= K, P); returns the x and z components (2, V, P) of the edges' normals."""
+    """Write the moments into `result` (>= K, P). Returns the x and z components (2, V, P) of the edges' normals."""
     shape = shifted.shape
     normal = scratch("normal", (2, *shape))
     for row, (first, second) in zip(normal, ((1, 2), (0, 1)), strict=True):
@@ -249,8 +251,9 @@ def _polynomial_moments(unit, shifted, degree, scratch, result):
 
 
 def _bent_moments(unit, normal, bend, scratch, out):
-    """Put twice the integrals of x and z over the polygons that `lookup_table.bent` makes of those with corners `unit`
-    (3, V + 1, P) into out (2, P); the mask (P,) of points that need float64. Overwrites `normal`, see above."""
+    """Write twice the integrals of x and z over bent polygons into `out` (2, P), and return the mask (P,) of points
+    that need float64. `lookup_table.bent` bends the polygons with the corners `unit` (3, V + 1, P). Overwrites
+    `normal`, the result of `_polynomial_moments`."""
     xx, xz, yy = (np.float32(entry) for entry in bend)
     shape = normal.shape[1:]
     rows, length = scratch("bent", (2, *unit.shape[1:])), scratch("bent_length", unit.shape[1:])
@@ -275,7 +278,7 @@ def _bent_moments(unit, normal, bend, scratch, out):
     shifted += np.float32(1e-12)
     phi = _phi(shifted, scratch)
     phi *= scale
-    # The cross product of warped vectors is that of the vectors under the warp's cofactors.
+    # The cross product of warped vectors is the cofactor matrix of the warp times the cross product of the vectors.
     normal[1] *= xx
     normal[1] -= np.multiply(normal[0], xz, out=scratch("one", shape))
     normal *= phi
@@ -293,8 +296,8 @@ def _product(a, b, out, scratch):
 
 
 def _quartic(linear, product, squared, cube, pair, scratch):
-    """Coefficients (5, V, P) of (u.X) K_3 for a quadratic form `linear` (3, V, P), q (u.X) (u.c) with c = a + b, and
-    those of (u.a) (u.b) and (u.c)^2; `pair` (2, V, P) is overwritten."""
+    """Coefficients (5, V, P) of (u.X) K_3. `linear` (3, V, P) is the quadratic form q (u.X) (u.c), where c = a + b;
+    `product` is that of (u.a) (u.b), `squared` that of (u.c)^2. `pair` (2, V, P) is overwritten."""
     inner = np.multiply(squared, cube, out=scratch("inner", linear.shape))
     inner -= product
     result = scratch("quartic", (5, *cube.shape))
@@ -309,7 +312,7 @@ def _quartic(linear, product, squared, cube, pair, scratch):
 
 
 def _normalize(real, imaginary, scratch):
-    """Divide complex numbers (V, P) by about their magnitude: only their arguments matter."""
+    """Divide complex numbers (V, P) by roughly their magnitude: only their arguments matter."""
     size = np.abs(real, out=scratch("one", real.shape))
     size += np.abs(imaginary)
     size += _TINY
@@ -318,7 +321,7 @@ def _normalize(real, imaginary, scratch):
 
 
 def _solid_angle(shifted, total_z, normal_z, scratch):
-    """Signed solid angle (P,): the product over the edges of (1 + a_z + b_z + a.b) + i X_z has half of it."""
+    """Signed solid angle (P,): twice the argument of the product over the edges of (1 + a_z + b_z + a.b) + i X_z."""
     count, points = shifted.shape
     real = np.add(shifted, total_z, out=scratch("real", shifted.shape))
     imaginary = scratch("imaginary", shifted.shape)
@@ -355,8 +358,8 @@ def weighted_moments(
     smallest: float = SMALLEST_SAFE,
     bend: tuple | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Sums (F, P) of the `moments` of polygons (>= 3 rows, V, P) times weights (F, K, P), the signed solid angles (P,)
-    in sr, the signed integrals (P,) of z / pi, and the mask (P,) of points that need float64. `degree` 1 to 4."""
+    """Sums (F, P) of the `moments` of polygons (>= 3 rows, V, P) times weights (F, K, P); the signed solid angles (P,)
+    in sr; the signed integrals (P,) of z / pi; and the mask (P,) of points that need float64. `degree` is 1 to 4."""
     vectors, _, points = weights.shape
     sums = np.empty((vectors, points), np.float32)
     angle, cosine, needs_float64 = np.empty(points, np.float32), np.empty(points, np.float32), np.empty(points, bool)
@@ -372,22 +375,22 @@ def weighted_moments(
 
 @dataclass(frozen=True)
 class RidgeTable:
-    """One table, ready for the hot path; `fetch` interpolates chosen vectors of its weights.
+    """One table prepared for the hot path; `fetch` interpolates chosen vectors of its weights.
 
-    Coefficients of spherical harmonics become weights of the moments once, at the nodes of the table: both steps are
-    linear, so they may change places with the interpolation. Only those Fresnel curves are fetched that a batch of
-    points needs. A vector is a Fresnel curve's number, ("dielectric", ior), or "dielectric", the last, for each
-    sample's own IOR.
+    Coefficients of spherical harmonics become weights of the moments once, at the nodes of the table. Both this and the
+    interpolation are linear, so their order may be swapped. Only the Fresnel curves that a batch of points needs are
+    fetched. A vector is the number of a Fresnel curve, or ("dielectric", ior), or, in the last place, "dielectric" for
+    each sample's own IOR.
     """
 
     source: LookupTable
-    parameters: np.ndarray  # (3 or 4, R * T): A, B, C and the tilt of "ltc"
-    weights: np.ndarray  # (F, K, R * T): weights of the moments; of the clamped cosine for "ltc"
+    parameters: np.ndarray  # (3 or 4, R * T): A, B, C and, for "ltc", the tilt
+    weights: np.ndarray  # (F, K, R * T): weights of the moments; for "ltc", of the clamped cosine
     _stacked: dict = field(default_factory=dict)
 
     @property
     def degree(self) -> int:
-        """Degree of the moments; 1 for "ltc", which needs the integral of z alone."""
+        """Degree of the moments; 1 for "ltc", which needs only the integral of z."""
         return self.source.degree
 
     def channels(self, vectors: tuple) -> np.ndarray:
@@ -408,10 +411,10 @@ class RidgeTable:
         return sum(share * weights for share, weights in zip(shares, self.weights, strict=True))
 
     def fetch(self, vectors, cosine, sine, roughness, ior, scratch) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-        """Warp entries (4, P) xx, xz, yy, zz, weights (len(vectors), K, P), and the tilt (P,) of "ltc", else None.
+        """Warp entries xx, xz, yy, zz (4, P), weights (len(vectors), K, P), and the tilt (P,) of "ltc", else None.
 
-        cosine and sine (P,) of theta_o and roughness (P,) in float32; ior (P,). Valid until the next call with this
-        scratch.
+        cosine and sine (P,) of theta_o and roughness (P,) are float32; ior is (P,). The next call with this scratch
+        overwrites the result.
         """
         many = vectors[-1] == "dielectric"
         curves = tuple(range(len(self.weights)))
@@ -434,19 +437,20 @@ class RidgeTable:
     def integrals(
         self, corners, weights, scratch, smallest=SMALLEST_SAFE
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Signed integrals (F, P) of lobes with weights (F, K, P) over polygons (>= 3 rows, V, P), numbers (P,) with
-        the sign of the solid angle, signed integrals (P,) of a clamped cosine of mass 1 under the same warp, and the
+        """Signed integrals (F, P) of lobes with weights (F, K, P) over polygons (>= 3 rows, V, P); numbers (P,) with
+        the sign of the solid angle; signed integrals (P,) of a clamped cosine of mass 1 under the same warp; and the
         mask (P,) of points that need float64."""
         if self.source.family == "ltsh":
             return weighted_moments(corners, weights, self.degree, scratch, smallest, self.source.bend)
-        # The clamped cosine is not negative: its integral has the sign of the solid angle.
+        # The clamped cosine is not negative, so its integral has the sign of the solid angle.
         integral, needs_float64 = cosine_integral(corners, scratch, smallest)
         integral *= np.float32(1.0 / np.pi)
         return weights[:, 0] * integral, integral, integral, needs_float64
 
 
 def prepare(table: LookupTable) -> RidgeTable:
-    """The table with weights of the `moments` here, made once per table. Degrees above MAX_DEGREE: ValueError."""
+    """The table with weights for the `moments` of this module, made once per table. Raises ValueError for a degree
+    above MAX_DEGREE."""
 
     def matrix():
         forms = form_matrix(table.degree, 0 if table.bend is None else 2)
@@ -456,18 +460,18 @@ def prepare(table: LookupTable) -> RidgeTable:
 
 
 def along_directions(table: LookupTable) -> RidgeTable:
-    """As `prepare`, with weights of `edge_integrals.moments`, which shaders use."""
+    """As `prepare`, with weights for `edge_integrals.moments`, which shaders use."""
     return _kept(table, "_direction_table", lambda: table.ridge_weights)
 
 
 def _kept(table, name, matrix):
-    """The table made once, weights of moments by matrix() (K, K)."""
+    """The RidgeTable stored under `name`, made on first use; matrix() (K, K) turns coefficients into weights."""
     if table.degree > MAX_DEGREE:
         raise ValueError(
             f"table {table.name} has degree {table.degree}, the single precision path goes up to "
             f"{MAX_DEGREE}: use float64"
         )
-    # Stored with the table, which is frozen but for what it caches, so that both end together.
+    # Stored with the table (frozen except for what it caches), so that both are freed together.
     ridges = table.__dict__.get(name)
     if ridges is None:
         ridges = table.__dict__[name] = _build(table, matrix)
@@ -483,12 +487,12 @@ def _build(table, matrix):
 
 
 def _product_in_order(vectors, matrix):
-    """Vectors (..., K) times a matrix (K, K). Not a matrix product of numpy's: the same bits on every machine."""
+    """Vectors (..., K) times a matrix (K, K). Unlike numpy's product, it gives the same bits on every machine."""
     return sum(vectors[..., k, None] * row for k, row in enumerate(matrix))
 
 
 def _bilinear(channels, shape, roughness, coordinate, scratch):
-    """Channels (C, P) at roughness and theta coordinate (P,) in [0, 1]."""
+    """Channels (C, P) at roughness and theta coordinate (P,), both in [0, 1]."""
     rows, columns = shape
     row_position = roughness * np.float32(rows - 1)
     column_position = coordinate * np.float32(columns - 1)

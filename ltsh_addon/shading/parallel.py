@@ -1,10 +1,10 @@
 """Blocks of samples on all cores: this process and child processes take them from one list.
 
-Threads do not pay off here, numpy's calls are too short. Children are interpreters started by path, never forked:
-inside Blender a fork would copy a process with threads and a window. The blocks and what happens in each do not depend
-on how many processes there are, so the result does not either; where no child can be started this process does it all.
-A block reaches a child, and its radiance comes back, through memory that both share. When all blocks are done, all
-processes take what those have left for double precision: few pairs of a sample and a light each, many together.
+Threads do not pay off here, because numpy's calls are too short. Children are interpreters started by path, never
+forked: inside Blender, a fork would copy a process with threads and a window. Neither the blocks nor what happens in
+each depends on the number of processes, so the result does not either. If no child can be started, this process does
+everything. Each block and its radiance go through memory that both processes share. When all blocks are done, all
+processes take the pairs of a sample and a light that the blocks left for double precision, many together.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ from ..scene import SCALAR_FIELDS, Cancelled, SurfaceSamples
 from . import moments32, worker
 from .lobes import FLOAT64_CHUNK
 
-# A child takes some 0.2 s to start: shorter tasks are done in this process.
+# A child takes about 0.2 s to start, so shorter tasks are done in this process alone.
 SECONDS_WORTH_A_CHILD = 0.5
-# About as many isotropic samples take as long as an anisotropic one.
+# An anisotropic sample takes about as long as this many isotropic ones.
 ANISOTROPIC_EFFORT = 6
 PATIENCE_SECONDS = 0.1
 ENDING_SECONDS = 5.0
 CORES_VARIABLE = "LTSH_CORES"
 _logger = logging.getLogger(__name__)
-# Fields of SurfaceSamples that only one of the passes reads: they need not travel for the other.
+# Fields of SurfaceSamples that only one pass reads. Tasks without that pass need not send them.
 _ONLY_DIFFUSE = {
     "diffuse_normal", "smooth_normal", "bump_alpha2", "diffuse_albedo", "diffuse_roughness", "diffuse_rebound",
     "sheen_a", "sheen_b",
@@ -51,9 +51,9 @@ _ALIGNMENT = 64
 
 
 class SharedBlock:
-    """`size` bytes of shared memory; `handle` is what a child process needs to attach to them.
+    """`size` bytes of shared memory; a child process attaches to them with `handle`.
 
-    On Linux and macOS it is a file without a name that the child inherits, on Windows a named mapping: in either case
+    On Linux and macOS this is a file without a name that the child inherits, on Windows a named mapping. In either case
     the system frees it as soon as both processes are gone, however they end.
     """
 
@@ -80,7 +80,7 @@ class SharedBlock:
         return arrays_in(self._memory, layout)
 
     def close(self) -> None:
-        """Let go of the memory; arrays in it keep it until they are gone."""
+        """Release the memory. Arrays in it keep it alive until they are gone."""
         self._memory = None
         if self._file is not None:
             self._file.close()
@@ -104,16 +104,16 @@ def layout_of(arrays: dict[str, tuple[tuple[int, ...], np.dtype]]) -> tuple[list
 
 
 def arrays_in(memory, layout) -> dict[str, np.ndarray]:
-    """Arrays by name in a buffer."""
+    """Arrays by name in the buffer `memory`."""
     return {name: np.ndarray(shape, dtype, memory, offset) for name, shape, dtype, offset in layout}
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """Samples, each to be shaded under one light in one of the passes; fewer than two FLOAT64_CHUNK."""
+    """Samples, each to be shaded under one light, in one pass; fewer than two FLOAT64_CHUNK of them."""
 
     name: str
-    index: np.ndarray  # (N,) of the samples, some several times
+    index: np.ndarray  # (N,) of the samples; some occur several times
     number: np.ndarray  # (N,) of the lights
 
 
@@ -126,7 +126,7 @@ def _size(work):
 
 
 class ParentSide:
-    """Sends blocks and pairs of `samples`, of `block_size` samples at most, to one child that works on `task`."""
+    """Sends blocks and pairs of `samples` to one child that works on `task`, at most `block_size` samples at a time."""
 
     def __init__(self, task, samples: SurfaceSamples, block_size: int):
         self.samples = samples
@@ -140,10 +140,10 @@ class ParentSide:
         self.sent, self.same, first = [], {}, {}
         for field in fields(samples):
             values = getattr(samples, field.name)
-            # What is left out counts as 0 on the other side.
+            # A field that is left out is 0 on the other side.
             if field.name in unread or _is_zero_everywhere(values):
                 continue
-            # A normal that stands for another is the same array: sent once.
+            # Equal normals are one array, which is sent once.
             if id(values) in first:
                 self.same[field.name] = first[id(values)]
             else:
@@ -154,7 +154,7 @@ class ParentSide:
         self.size = self._layouts(block_size)[2]
 
     def _layouts(self, count):
-        """Layouts of the samples sent and of the results, and the bytes of both."""
+        """Layout of the samples, layout of samples and results, and the size of both in bytes."""
         arrays = {}
         for name in self.sent:
             values = getattr(self.samples, name)
@@ -168,7 +168,7 @@ class ParentSide:
         return [entry for entry in layout if entry[0].startswith("in ")], layout, size
 
     def put(self, work: slice | Pairs) -> dict:
-        """Copy the samples into the shared memory; the message that tells the child."""
+        """Copy the samples of `work` into the shared memory, and return the message for the child."""
         inputs, layout, _ = self._layouts(_size(work))
         for name, values in self.memory.arrays(inputs).items():
             np.copyto(values, getattr(self.samples, name.removeprefix("in "))[_index(work)])
@@ -176,7 +176,7 @@ class ParentSide:
         return {"layout": layout, "same": self.same, "count": _size(work), "pairs": pairs}
 
     def take(self, work: slice | Pairs, leftovers):
-        """What the task returns, as views of the shared memory, once the child has answered with `leftovers`."""
+        """The task's result, as views of the shared memory, once the child has answered with `leftovers`."""
         _, layout, _ = self._layouts(_size(work))
         arrays = self.memory.arrays([entry for entry in layout if not entry[0].startswith("in ")])
         if isinstance(work, Pairs):
@@ -188,7 +188,7 @@ class ParentSide:
 
 
 class ChildSide:
-    """Shades the samples that the parent puts into the memory."""
+    """Shades the samples that the parent puts into the shared memory."""
 
     def __init__(self, task, handle, size: int):
         self.task = task
@@ -196,7 +196,7 @@ class ChildSide:
         self.scratch = moments32.Scratch()
 
     def shade(self, message: dict) -> dict:
-        """Shade what `message` describes; the result goes into the memory, but for the leftovers."""
+        """Shade what `message` describes. The result goes into the memory; the leftovers are returned."""
         arrays, count = arrays_in(self.memory, message["layout"]), message["count"]
         values = {name.removeprefix("in "): array for name, array in arrays.items() if name.startswith("in ")}
         values.update({name: values[other] for name, other in message["same"].items()})
@@ -217,7 +217,7 @@ class ChildSide:
 
 
 def _is_zero_everywhere(values) -> bool:
-    """True for one zero that stands for all elements, as `SurfaceSamples` has it for what is left out."""
+    """True for a single zero broadcast to all elements, which `SurfaceSamples` uses for fields that are left out."""
     return values.size > 0 and not any(values.strides) and not values.flat[0]
 
 
@@ -229,17 +229,17 @@ def run(
     result,
     progress: Callable[[float], bool | None] | None = None,
 ) -> None:
-    """Call result.keep(block, *task.shade()) for every block, from this thread or another one; then result.pairs()
-    once, and result.keep_pairs(pairs, task.shade_pairs()) for all that it returns.
+    """Call result.keep(block, *task.shade()) for every block, from any thread. Then call result.pairs() once, and
+    result.keep_pairs(pairs, task.shade_pairs()) for all pairs that it returns.
 
-    `workers` processes in all (None: as many as `cores` says). After every block `progress` is called from this
-    thread; where it returns False Cancelled is raised. No child is left when this returns or raises.
+    `workers` is the total number of processes (None: `cores`). After every block, `progress` is called from this
+    thread; if it returns False, Cancelled is raised. No child is left when this returns or raises.
     """
     queue = _Queue(blocks, result)
     with helpers(queue) as children:
         effort = len(samples) + ANISOTROPIC_EFFORT * np.count_nonzero(samples.anisotropy)
         wanted = _children_wanted(task, effort, blocks, workers)
-        # By this thread: it will keep more in the task while it shades.
+        # Pack it in this thread, before shading adds cached values to the task.
         packed = worker.packed(task) if wanted else b""
         for _ in range(wanted):
             most = max(2 * FLOAT64_CHUNK if task.single else 0, *map(_size, blocks))
@@ -249,7 +249,7 @@ def run(
 
 @contextmanager
 def helpers(queue) -> Iterator[list[Child]]:
-    """A list for children that work for `queue`, which are ended in any case."""
+    """A list for children that work for `queue`; they are ended in any case."""
     children: list[Child] = []
     try:
         yield children
@@ -268,14 +268,14 @@ def _children_wanted(task, count, blocks, workers) -> int:
 
 
 def cores() -> int:
-    """Cores that this process may use: those it may run on, at most as many as the environment's LTSH_CORES says."""
+    """Number of cores that this process may use, at most the environment's LTSH_CORES."""
     there = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     limit = os.environ.get(CORES_VARIABLE, "").strip()
     return min(there, int(limit)) if limit.isdecimal() and int(limit) > 0 else there
 
 
 def interpreter() -> str | None:
-    """The Python that runs children: inside Blender the one it brings along. None where there is none."""
+    """The Python that runs children; inside Blender, the one that Blender brings along. None if there is none."""
     path = sys.executable
     if not path or not Path(path).stem.lower().startswith("python"):
         return None
@@ -283,7 +283,7 @@ def interpreter() -> str | None:
 
 
 def _work(task, samples, queue, progress):
-    """Shade blocks and pairs in this thread until all are done, by whomever."""
+    """Shade blocks and pairs in this thread until all are done, by any process."""
     scratch = moments32.Scratch()
     while not queue.finished():
         work = queue.next()
@@ -298,7 +298,7 @@ def _work(task, samples, queue, progress):
 
 
 class Queue:
-    """What is left to do, for several threads."""
+    """The work left to do, shared by several threads."""
 
     def __init__(self, work):
         self._left = deque(work)
@@ -306,12 +306,12 @@ class Queue:
         self.stopped = False
 
     def next(self):
-        """Something that nobody works on, or None."""
+        """A piece of work that nobody has taken, or None."""
         with self._changed:
             return self._left.popleft() if self._left and not self.stopped else None
 
     def next_for_child(self):
-        """As `next`; after None a child is not needed any more."""
+        """As `next`; None means that the child is not needed any more."""
         return self.next()
 
     def give_back(self, work):
@@ -325,7 +325,7 @@ class Queue:
 
 
 class _Queue(Queue):
-    """The blocks, and after the last one the pairs that they leave."""
+    """The blocks, then the pairs that they leave."""
 
     def __init__(self, blocks, result):
         super().__init__(blocks)
@@ -348,13 +348,13 @@ class _Queue(Queue):
             self._changed.notify_all()
 
     def wait(self, seconds):
-        """Until something changes, or some seconds have passed."""
+        """Wait until something changes, at most `seconds`."""
         with self._changed:
             if not self._left and self._done < self._total:
                 self._changed.wait(seconds)
 
     def share(self) -> float:
-        """Of the blocks: what they leave takes little time."""
+        """Share of the blocks that is done. What they leave takes little time and does not count."""
         return min(self._done / self._blocks, 1.0)
 
     def finished(self) -> bool:
@@ -362,7 +362,8 @@ class _Queue(Queue):
 
 
 class Child:
-    """A worker process, and the thread that feeds it in `_feed`. The class of the package at `side` does its work."""
+    """A worker process, and the thread that feeds it in `_feed`. `side` names the class of the package that does the
+    work in that process."""
 
     side = ""
 
@@ -376,9 +377,9 @@ class Child:
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
                 pass_fds=inherited,
-                # Nothing here uses BLAS, whose threads take time to start.
+                # Nothing here uses BLAS, and its threads take time to start.
                 env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
-                # Ctrl-C goes to the parent alone, which ends the child; no console window on Windows.
+                # Ctrl-C goes to the parent alone, which ends the child. No console window on Windows.
                 process_group=0,
                 creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
             )
@@ -393,7 +394,7 @@ class Child:
         except (OSError, EOFError, ValueError, _ChildError) as error:
             if self._is_unwanted():
                 return  # `end` has killed the process
-            # This process computes it instead, and meets the same error if the samples are at fault.
+            # Others compute the work instead, and meet the same error if the samples are at fault.
             self._give_back()
             _logger.warning("worker process ended early (%s); the others go on", error or type(error).__name__)
 
@@ -402,15 +403,15 @@ class Child:
         raise NotImplementedError
 
     def _is_unwanted(self) -> bool:
-        """True when nobody waits for the child any more."""
+        """True if nobody waits for the child any more."""
         raise NotImplementedError
 
     def _give_back(self) -> None:
-        """Leave the work that the child has not done to others."""
+        """Leave the child's unfinished work to others."""
         raise NotImplementedError
 
     def begin(self, task: bytes, *arguments) -> None:
-        """Send the task, `worker.packed`; `arguments` are what the class at `side` takes beside it."""
+        """Send the task, as `worker.packed` returns it, and the other `arguments` of the class at `side`."""
         first = {"path": sys.path, "package": worker.PACKAGE, "side": self.side, "arguments": arguments}
         worker.send(self._process.stdin, first)
         self.ask(task)
@@ -424,7 +425,7 @@ class Child:
         return answer
 
     def end(self):
-        """End and reap the process, wherever it is."""
+        """End and reap the process, whatever it is doing."""
         if self._process is not None:
             self._process.kill()
             self._process.wait(ENDING_SECONDS)
@@ -433,11 +434,11 @@ class Child:
                 try:
                     stream.close()
                 except OSError:
-                    pass  # what could not be sent any more
+                    pass  # data that could not be sent any more
 
 
 class Helper(Child):
-    """A child that takes work from a `queue`, which gets what `_do` returns; `first` is what `begin` takes."""
+    """A child that takes work from `queue` and gives it the results of `_do`. `first` are the arguments of `begin`."""
 
     def __init__(self, queue, first: tuple, inherited: tuple[int, ...] = ()):
         self._queue, self._first, self._work = queue, first, None
@@ -451,7 +452,7 @@ class Helper(Child):
             self._work = None
 
     def _do(self, work) -> tuple:
-        """Let the child do some work."""
+        """The results of `work`, done by the child."""
         raise NotImplementedError
 
     def _is_unwanted(self):
@@ -480,7 +481,7 @@ class _Shader(Helper):
 
 
 class Keeper(Child):
-    """A child that keeps its task, and answers one question after another until `end`."""
+    """A child that keeps its task and answers one question after another until `end`."""
 
     def __init__(self, side: str, task: bytes):
         self.side, self._task = side, task
@@ -494,27 +495,27 @@ class Keeper(Child):
         self._questions.put(question)
 
     def take_back(self):
-        """A question that the child has not been asked yet, None where there is none."""
+        """A question that the child has not been asked yet; None if there is none."""
         with suppress(Empty):
             return self._questions.get_nowait()
         return None
 
     def answers(self, seconds: float) -> list:
-        """All answers since; where there are none, wait some seconds for one."""
+        """All answers so far. If there are none, waits up to `seconds` for one."""
         found = []
         while (answer := self.poll(0.0 if found else seconds)) is not None:
             found.append(answer)
         return found
 
     def poll(self, seconds: float):
-        """An answer, None where there is none within some seconds."""
+        """The next answer; None if there is none within `seconds`."""
         with suppress(Empty):
             return self._answers.get(timeout=seconds) if seconds > 0.0 else self._answers.get_nowait()
         return None
 
     @property
     def is_gone(self) -> bool:
-        """Will there be no answer any more?"""
+        """True if there will be no answer any more."""
         return not self._thread.is_alive() and self._answers.empty()
 
     def _feed(self):
@@ -527,14 +528,14 @@ class Keeper(Child):
         return self._is_ended
 
     def _give_back(self):
-        pass  # `get` tells
+        pass  # `is_gone` tells the caller
 
     def end(self):
         self._is_ended = True
-        # Wakes the thread: what it sends then nobody reads.
+        # Wakes the thread; nobody reads what it sends then.
         self._questions.put(None)
         super().end()
 
 
 class _ChildError(Exception):
-    """A child met an error; the text is its last line."""
+    """A child met an error. The text is the last line of its report."""

@@ -1,7 +1,7 @@
-"""Polygons seen from shading points: cut at the horizon, projected to the sphere, solid angle, convex pieces.
+"""Polygons seen from shading points: clipping at the horizon, projection to the sphere, solid angle, convex pieces.
 
-Batches of polygons are arrays (3, V, P): coordinate, corner, point. Unused corners repeat a neighbor: an edge between
-equal corners contributes exactly zero to every integral.
+Batches of polygons are arrays (3, V, P): coordinate, corner, point. Unused corners repeat a neighbor, because an edge
+between equal corners contributes exactly zero to every integral.
 """
 
 from __future__ import annotations
@@ -10,24 +10,26 @@ from functools import cache
 
 import numpy as np
 
-# Up to this many corners a bit pattern tells which are above the horizon.
+# Most corners for which a bit pattern tells which are above the horizon.
 PATTERN_CORNERS = 8
+# Kinds of polygons. DARK: no corner is above the horizon. WHOLE: all are. SINGLE_RUN: those above are consecutive.
+# SEVERAL_RUNS: those above may form several runs.
 DARK, WHOLE, SINGLE_RUN, SEVERAL_RUNS = range(4)
 # Turns below this share of the squared size of the polygon count as straight.
 STRAIGHT = 1e-12
 
 
 def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Scalar products (...) of vectors (3, ...)."""
+    """Dot products (...) of vectors (3, ...)."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def clip_to_horizon(vertices: np.ndarray, axis: int = 2) -> np.ndarray:
-    """The part of polygons (C, V, P) with C coordinates where coordinate `axis` is positive, as (C, W, P).
+    """The parts (C, W, P) of polygons (C, V, P) with C coordinates where coordinate `axis` is positive.
 
-    Sutherland and Hodgman 1974; W <= V + 1 where all are convex, else W <= 2 V. Each polygon needs a corner above. New
-    corners have coordinate 0 exactly. A non-convex polygon may get coincident edges on the horizon, which cancel in a
-    signed integral.
+    Sutherland and Hodgman 1974; W <= V + 1 if all are convex, otherwise W <= 2 V. Each polygon needs a corner above.
+    New corners have coordinate 0 exactly. A non-convex polygon may get coincident edges on the horizon; these cancel in
+    a signed integral.
     """
     height = vertices[axis]
     above = height > 0.0
@@ -43,7 +45,7 @@ def clip_to_horizon(vertices: np.ndarray, axis: int = 2) -> np.ndarray:
 
 
 def _compact(slots: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Move the used slots to the front, in order; repeat the last one up to the largest count of the batch."""
+    """Move the used slots to the front in order, and repeat the last one up to the largest count of the batch."""
     count = used.sum(axis=0)
     order = np.argsort(~used, axis=0, kind="stable")
     row = np.minimum(np.arange(max(int(count.max(initial=1)), 1))[:, None], count - 1)
@@ -53,7 +55,7 @@ def _compact(slots: np.ndarray, used: np.ndarray) -> np.ndarray:
 
 @cache
 def _pattern_kinds(corners: int) -> np.ndarray:
-    """DARK, WHOLE, SINGLE_RUN or SEVERAL_RUNS (2^V,) by pattern, in which bit n is set where corner n is above."""
+    """DARK, WHOLE, SINGLE_RUN or SEVERAL_RUNS (2^V,) by pattern; bit n of a pattern is set if corner n is above."""
     patterns = np.arange(2**corners)
     following = (patterns >> 1) | ((patterns & 1) << (corners - 1))
     crossings = np.array([bin(changes).count("1") for changes in patterns ^ following])
@@ -64,8 +66,9 @@ def _pattern_kinds(corners: int) -> np.ndarray:
 
 @cache
 def _run_corners(corners: int) -> np.ndarray:
-    """Corners (V + 3, 2^V) of clipped polygons by pattern: the last and the first above, the run above with its last
-    one repeated (V - 1 in all), the corners below next to the last and the first above."""
+    """Corners (V + 3, 2^V) of clipped polygons by pattern. Their order is: the last corner above, the first corner
+    above, the run of corners above with its last one repeated (V - 1 in all), the corner below after the run, and the
+    corner below before it."""
     table = np.zeros((corners + 3, 2**corners), dtype=np.intp)
     for first in range(corners):
         for count in range(1, corners):
@@ -77,7 +80,7 @@ def _run_corners(corners: int) -> np.ndarray:
 
 
 def horizon_patterns(heights: np.ndarray) -> np.ndarray:
-    """Which of at most `PATTERN_CORNERS` corners are above the horizon, as bits (P,), from their heights (V, P)."""
+    """Bit patterns (P,) of the corners above the horizon, at most `PATTERN_CORNERS`, from their heights (V, P)."""
     above = (heights > 0.0).view(np.uint8)
     result = above[0].copy()
     for corner in range(1, len(above)):
@@ -86,9 +89,9 @@ def horizon_patterns(heights: np.ndarray) -> np.ndarray:
 
 
 def clip_single_run(vertices: np.ndarray, patterns: np.ndarray, axis: int = 2) -> np.ndarray:
-    """As `clip_to_horizon` for polygons (C, V, P) whose corners above are one run, V + 1 corners each: cheaper.
+    """As `clip_to_horizon`, but cheaper, for polygons (C, V, P) whose corners above form one run; V + 1 corners each.
 
-    All convex polygons that cross the horizon are of this kind. `patterns` (P,) as from `horizon_patterns`.
+    All convex polygons that cross the horizon are of this kind. `patterns` (P,) come from `horizon_patterns`.
     """
     coordinates, corners, points = vertices.shape
     index = np.take(_run_corners(corners), patterns, axis=1)
@@ -105,8 +108,8 @@ def clip_single_run(vertices: np.ndarray, patterns: np.ndarray, axis: int = 2) -
 
 
 def split_at_horizon(vertices: np.ndarray, axis: int = 2):
-    """Yield (index (Q,), polygons (C, W, Q)) for the points that see a part of their polygon (C, V, P) where coordinate
-    `axis` is positive: first those that see all of it, then those whose polygon is clipped."""
+    """Yield (index (Q,), polygons (C, W, Q)): the parts of polygons (C, V, P) where coordinate `axis` is positive, for
+    the points that see some of theirs. Whole polygons come first, then clipped ones."""
     corners = vertices.shape[1]
     if corners > PATTERN_CORNERS:
         patterns, kinds = None, _kinds_of_many_corners(vertices[axis])
@@ -131,16 +134,16 @@ def _kinds_of_many_corners(heights):
 
 
 def split_long_edges(vertices: np.ndarray) -> np.ndarray:
-    """Polygons (3, V, P) with a corner added on every edge (3, 2 V, P): the point of the edge nearest to the origin.
+    """Polygons (3, V, P) with a corner added on every edge (3, 2 V, P): its point nearest to the origin.
 
-    An edge that passes by the origin closely is an arc of almost half a circle, whose plane is lost to rounding. With
-    this corner, itself rounded, all integrals are those of one and the same polygon.
+    An edge that passes close by the origin is an arc of almost half a circle, whose plane is lost to rounding. With the
+    new corner, itself rounded, all integrals are those of the same polygon.
     """
     following = np.roll(vertices, -1, axis=1)
     along = following - vertices
     squared = dot(along, along)
     squared = np.where(squared > 0.0, squared, 1.0)
-    # Written so that both directions of an edge give the same bits.
+    # Both directions of an edge give the same bits.
     start, end = (np.clip(side / squared, 0.0, 1.0) for side in (dot(following, along), -dot(vertices, along)))
     nearest = start * vertices + end * following
     return np.stack([vertices, nearest], axis=2).reshape(3, -1, vertices.shape[2])
@@ -154,8 +157,8 @@ def project_to_sphere(vertices: np.ndarray) -> np.ndarray:
 def edge_sums(unit: np.ndarray) -> np.ndarray:
     """Sums (3, V, P) of the two ends of every edge of spherical polygons (3, V, P).
 
-    What an edge contributes is computed from its start and this sum, which is exact where the ends are nearly opposite:
-    a x b = a x (a + b) and 1 + a . b = |a + b|^2 / 2 keep their digits there.
+    The contribution of an edge is computed from its start and this sum, which is exact if the ends are nearly opposite:
+    a x b = a x (a + b) and 1 + a . b = |a + b|^2 / 2 keep their digits then.
     """
     return unit + np.roll(unit, -1, axis=1)
 
@@ -168,9 +171,9 @@ def one_plus_cosine(total: np.ndarray) -> np.ndarray:
 def solid_angle(unit: np.ndarray) -> np.ndarray:
     """Signed solid angle (P,) in sr of spherical polygons (3, V, P) in the hemisphere z >= 0.
 
-    Positive where the corners run counterclockwise about +z as seen from outside the sphere. What the boundary winds
-    around several times counts as often. Sum over the edges of the spherical triangles with apex e_z (Van Oosterom and
-    Strackee 1983), each of which has pi at most.
+    It is positive if the corners run counterclockwise about +z as seen from outside the sphere. An area around which
+    the boundary winds several times counts as often. It is the sum over the edges of the spherical triangles with apex
+    e_z (Van Oosterom and Strackee 1983), each at most pi.
     """
     total = edge_sums(unit)
     imaginary = unit[0] * total[1] - unit[1] * total[0]
@@ -178,11 +181,11 @@ def solid_angle(unit: np.ndarray) -> np.ndarray:
 
 
 def convex_pieces(corners: np.ndarray) -> list[np.ndarray]:
-    """Convex polygons (W, 3), all the same way around as the simple, flat polygon `corners` (V, 3) that they make up.
+    """Convex polygons (W, 3) that make up the simple, flat polygon `corners` (V, 3), with its sense of rotation.
 
     Repeated corners and corners on straight edges are left out. A polygon without area gives no pieces. Ears are
-    clipped off, then pieces are joined as long as they stay convex (Hertel and Mehlhorn 1983): there are at most four
-    times as many as needed.
+    clipped off, then pieces are joined as long as they stay convex (Hertel and Mehlhorn 1983). There are at most four
+    times as many pieces as needed.
     """
     flat = _in_its_plane(corners)
     size = np.ptp(flat, axis=0).max()
@@ -208,7 +211,7 @@ def _in_its_plane(corners):
 
 
 def _turn(a, b, c):
-    """Twice the area of triangles, positive where they run counterclockwise."""
+    """Twice the area of triangles, positive if they run counterclockwise."""
     return (b[..., 0] - a[..., 0]) * (c[..., 1] - a[..., 1]) - (b[..., 1] - a[..., 1]) * (c[..., 0] - a[..., 0])
 
 
@@ -219,7 +222,7 @@ def _without_straight_corners(ring, flat, limit):
         before, corner, after = (ring[(position + step) % len(ring)] for step in (-1, 0, 1))
         if abs(_turn(flat[before], flat[corner], flat[after])) <= limit:
             del ring[position]
-            # The neighbor before may be straight now.
+            # The corner before may be straight now.
             position = max(position - 2, 0)
         else:
             position += 1
@@ -238,7 +241,7 @@ def _ears(ring, flat, limit):
 
 
 def _next_ear(ring, flat):
-    """Position of the best ear: of those without another corner inside, the one that is the least like a sliver."""
+    """Position of the best ear: the one least like a sliver among those without another corner inside."""
     points = flat[ring]
     before, after = np.roll(points, 1, axis=0), np.roll(points, -1, axis=0)
     area = _turn(before, points, after)
@@ -252,7 +255,7 @@ def _next_ear(ring, flat):
         own = (points == a).all(axis=1) | (points == b).all(axis=1) | (points == c).all(axis=1)
         if not (inside & ~own).any():
             return int(position)
-    # Not a simple polygon: the smallest triangle does the least harm.
+    # The polygon is not simple: the smallest triangle does the least harm.
     return int(np.argmin(np.abs(area)))
 
 
@@ -273,7 +276,7 @@ def _joined(pieces, flat, limit):
 
 
 def _union(a, b, flat, limit):
-    """The two polygons as one, if they share an edge and make a convex polygon; else None."""
+    """The two polygons as one if they share an edge and their union is convex, otherwise None."""
     for position, start in enumerate(a):
         end = a[(position + 1) % len(a)]
         for other, corner in enumerate(b):

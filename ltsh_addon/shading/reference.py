@@ -1,13 +1,14 @@
 """Quadrature of the true BRDF over area lights, with an estimate of its error: the technique `reference`.
 
-The light is warped by W (see `lookup_table`) with A = B = C = 1, the limit of GGX for alpha -> 0, which flattens the
-lobe's peak; no fitted number enters. With an apex p inside the warped light and its boundary w(t),
+W (see `lookup_table`) with A = B = C = 1, the limit of GGX for alpha -> 0, warps the light, which flattens the lobe's
+peak. No fitted number enters. With an apex p inside the warped light and the light's boundary w(t),
 
     int f dw = contour_integral (w x dw) . p  int_0^rho f J sin(r) dr / sin^2(rho),
 
 where rho is the angle between p and w(t), the inner integral runs along the arc from p to w(t), and J is the Jacobian
-of the warp. The integrands are analytic on every piece of the boundary, so Gauss-Legendre rules converge fast; their
-order grows until two orders agree. Lights are exact ellipses, convex pieces of polygons, and their parts in a cone.
+of the warp. The integrands are analytic on every piece of the boundary, so Gauss-Legendre rules converge fast. Their
+order grows until two orders agree. Lights are exact ellipses, convex pieces of polygons, and the parts of these in a
+cone.
 """
 
 from __future__ import annotations
@@ -27,53 +28,54 @@ from .lookup_table import MIN_ALPHA, WARP_REGULARIZATION, Lobe
 from .polygon import convex_pieces, dot, one_plus_cosine, project_to_sphere, split_at_horizon
 
 _ELLIPSE_PIECES = 8
-# Evaluations per batch: the arrays of one batch stay in the cache.
+# Evaluations per batch, few enough for the arrays of one batch to stay in the cache.
 _BATCH = 30_000
-# Per arc of a cone's edge, where the factor of the spread is 0.
+# Chords per arc of a cone's edge, where the factor of the spread is 0.
 _CONE_CHORDS = 4
 
 
 @dataclass(frozen=True)
 class Effort:
-    """How much is done for an integral."""
+    """The orders tried for an integral, and the error at which that ends."""
 
-    orders: tuple[tuple[int, int], ...]  # Gauss-Legendre, along each piece of the boundary and a radius; in turn
+    orders: tuple[tuple[int, int], ...]  # Gauss-Legendre orders along each piece of the boundary and a radius, in turn
     tolerance: float
-    round_corners: int  # of the polygon that a round light is, where it is no exact ellipse
+    round_corners: int  # of the polygon for a round light that is not integrated as an exact ellipse
 
 
 EXACT = Effort(((5, 6), (8, 10), (14, 16), (24, 26), (40, 44), (72, 72)), 1e-4, 128)
-# For anisotropic lobes in techniques with a table: orders for an arc, and for one that is within NEAR of the apex.
+# For anisotropic lobes in techniques with a table. QUICK: orders for an arc. QUICK_NEAR: orders for an arc whose ends
+# are less than NEAR from the apex. QUICK_CORNERS: corners of a round light.
 QUICK, QUICK_NEAR = (3, 4), (2, 3)
 QUICK_CORNERS, NEAR = 32, 0.35
 
 
 @dataclass(frozen=True)
 class PolygonBoundary:
-    """Warped spherical polygons, corners `unit` (3, V, P)."""
+    """Warped spherical polygons with the corners `unit` (3, V, P)."""
 
     unit: np.ndarray
 
     @classmethod
     def warped(cls, warp: Lobe, polygon: np.ndarray) -> PolygonBoundary:
-        """Of polygons (3, V, P) in the local frame."""
+        """For polygons (3, V, P) in the local frame."""
         return cls(project_to_sphere(warp.to_original_domain(polygon)))
 
     pieces = property(lambda self: self.unit.shape[1])
 
     def take(self, index) -> PolygonBoundary:
-        """Those of the points `index` (Q,)."""
+        """The boundaries of the points `index` (Q,)."""
         return PolygonBoundary(self.unit[:, :, index])
 
     def apex(self) -> np.ndarray:
-        """Unit vectors (3, P) inside: the peak of the lobe, e_z, where it is inside, else the mean corner."""
+        """Unit vectors (3, P) inside: the peak of the lobe, e_z, if it is inside, otherwise the mean corner."""
         following = np.roll(self.unit, -1, axis=1)
         side = self.unit[0] * following[1] - self.unit[1] * following[0]
         inside = (side >= 0.0).all(axis=0) | (side <= 0.0).all(axis=0)
         return _peak_or_mean(inside, self.unit)
 
     def nodes(self, order: int):
-        """Unit vectors (3, B, P) on the boundary and (w x dw) times the quadrature weight, (3, B, P)."""
+        """Unit vectors w (3, B, P) on the boundary, and (w x dw) times the quadrature weight (3, B, P)."""
         fractions, weights = _unit_interval(order)
         start, end = self.unit[:, :, None], np.roll(self.unit, -1, axis=1)[:, :, None]
         cosine = (start * end).sum(axis=0)
@@ -87,18 +89,18 @@ class PolygonBoundary:
 
 @dataclass(frozen=True)
 class EllipseBoundary:
-    """Warped ellipses center + cos(t) half_u + sin(t) half_v, each (3, P), seen above the horizon for |t - middle| <
-    reach; a chord along the horizon closes the rest."""
+    """Warped ellipses center + cos(t) half_u + sin(t) half_v, each (3, P). They are above the horizon for
+    |t - middle| < reach; a chord along the horizon closes the boundary."""
 
     center: np.ndarray
     half_u: np.ndarray
     half_v: np.ndarray
     middle: np.ndarray  # (P,)
-    reach: np.ndarray  # (P,), pi where all of the ellipse is above the horizon, 0 where none is
+    reach: np.ndarray  # (P,), pi if the whole ellipse is above the horizon, 0 if none of it is
 
     @classmethod
     def warped(cls, warp: Lobe, center, half_u, half_v) -> EllipseBoundary:
-        """Of ellipses with centers and half axes (3, P) in the local frame."""
+        """For ellipses with centers and half axes (3, P) in the local frame."""
         center, half_u, half_v = (warp.to_original_domain(vector) for vector in (center, half_u, half_v))
         swing = np.hypot(half_u[2], half_v[2])
         ratio = np.divide(-center[2], swing, out=np.where(center[2] > 0.0, -1.0, 1.0), where=swing > 0.0)
@@ -107,12 +109,12 @@ class EllipseBoundary:
     pieces = _ELLIPSE_PIECES + 1
 
     def take(self, index) -> EllipseBoundary:
-        """Those of the points `index` (Q,)."""
+        """The boundaries of the points `index` (Q,)."""
         vectors = (self.center[:, index], self.half_u[:, index], self.half_v[:, index])
         return EllipseBoundary(*vectors, self.middle[index], self.reach[index])
 
     def apex(self) -> np.ndarray:
-        """As `PolygonBoundary.apex`; e_z is inside where the z axis meets the ellipse."""
+        """As `PolygonBoundary.apex`; e_z is inside if the z axis meets the ellipse."""
         normal = np.cross(self.half_u, self.half_v, axis=0)
         height = dot(normal, self.center) / np.where(normal[2] != 0.0, normal[2], 1.0)
         offset = -self.center + height * np.array([0.0, 0.0, 1.0])[:, None]
@@ -135,7 +137,7 @@ class EllipseBoundary:
         measure = np.cross(vectors, velocity, axis=0) * step / dot(vectors, vectors)
         closing = PolygonBoundary(project_to_sphere(self._at(np.array([[1.0], [-1.0]]))))
         points, closing_measure = closing.nodes(order)
-        # The polygon of two corners has two edges; only the first is the chord, and only of a clipped ellipse.
+        # A polygon of two corners has two edges. Only the first is the chord, and only if the ellipse is clipped.
         closing_measure = np.where(self.reach < np.pi, closing_measure[:, :order], 0.0)
         return (
             np.concatenate([project_to_sphere(vectors), points[:, :order]], axis=1),
@@ -149,7 +151,7 @@ class EllipseBoundary:
 
 @dataclass(frozen=True)
 class FacingEmission:
-    """As `Cone`, of lights that face every point: seen in local frames, from points with their centers at `offset`."""
+    """As `Cone`, for lights that face every point, in local frames. `offset` goes from the points to their centers."""
 
     light: AreaLight
     frame: np.ndarray  # (3, 3, P)
@@ -157,16 +159,16 @@ class FacingEmission:
 
     @property
     def axis(self) -> np.ndarray:
-        """Of no meaning."""
+        """Zero: it has no meaning here."""
         return np.zeros_like(self.offset)
 
     @property
     def at_foot(self) -> np.ndarray:
-        """Nowhere is there a tip."""
+        """False everywhere: there is no tip."""
         return np.zeros(self.offset.shape[1], bool)
 
     def take(self, index) -> FacingEmission:
-        """Those of the points `index` (Q,)."""
+        """The emission for the points `index` (Q,)."""
         return FacingEmission(self.light, self.frame[:, :, index], self.offset[:, index])
 
     def factor(self, direction: np.ndarray) -> np.ndarray:
@@ -178,15 +180,15 @@ class FacingEmission:
 
 @dataclass(frozen=True)
 class Cone:
-    """The profiles of lights, by the angle theta from `axis`."""
+    """The profiles of lights as functions of the angle from `axis`."""
 
     axis: np.ndarray  # (3, P) from the points straight to the lights' planes
-    distance: np.ndarray  # (P,) of those
+    distance: np.ndarray  # (P,) from the points to the planes
     profile: light_cone.Profile
-    at_foot: np.ndarray  # (P,) points whose lights are best integrated around the axis, where the factor has its tip
+    at_foot: np.ndarray  # (P,) True if the light is best integrated around `axis`, where the factor has its tip
 
     def take(self, index) -> Cone:
-        """Those of the points `index` (Q,)."""
+        """The cones of the points `index` (Q,)."""
         return Cone(self.axis[:, index], self.distance[index], self.profile, self.at_foot[index])
 
     def factor(self, direction: np.ndarray) -> np.ndarray:
@@ -210,12 +212,12 @@ def lobe_integrals(
 ):
     """Integrals (4, P) of the GGX BRDF times cosine over lights, and error estimates (P,).
 
-    `setting` are cos_theta_o, alpha and the relative ior of a dielectric, (P,) each. `make_boundary(warp)` returns the
-    boundary, warped, of the part with z >= 0 of each light in the local frame of cos_theta_o. The rows have the Fresnel
-    factors 1, (1 - c)^5, c (1 - c)^6 and that of the dielectric. The order grows until two successive orders differ by
-    less than the tolerance of the first row plus 1e-6; the estimate is the last difference, infinite after one order.
-    Lights must be convex. With a `cone` the integrand has its factor, too. With a `metal`, f0, f90 and dip (P, 3), come
-    three rows more: what its reflectance falls below 0.
+    `setting` is cos_theta_o, alpha and the relative ior of a dielectric, (P,) each. `make_boundary(warp)` returns the
+    warped boundary of the part with z >= 0 of each light, which must be convex, in the local frame of cos_theta_o. The
+    rows have the Fresnel factors 1, (1 - c)^5, c (1 - c)^6 and that of the dielectric. The order grows until two
+    successive orders differ by less than the tolerance times the first row plus 1e-6. The estimate is the last
+    difference, infinite after a single order. With a `cone`, the integrand includes its factor. With a `metal`, f0, f90
+    and dip (P, 3), three more rows follow: how far its reflectance falls below 0.
     """
     cos_theta_o, alpha, ior = setting
     warp = limit_warp(cos_theta_o, alpha)
@@ -244,9 +246,9 @@ def lobe_integrals(
 
 
 def half_vector_integrals(halves: HalfVectors, polygon, ior, *, cone=None, metal=None, quick=False):
-    """As `lobe_integrals`, of the anisotropic lobes of `halves` (P,) over polygons (3, V, P) above the horizon.
+    """As `lobe_integrals`, for the anisotropic lobes of `halves` (P,) over polygons (3, V, P) above the horizon.
 
-    In a `quick` way: in single precision, with few points and without estimates.
+    `quick` uses single precision and few points, and gives no estimates.
     """
     boundary = HalfBoundary.of(halves, polygon)
     apex = boundary.apex()
@@ -284,7 +286,7 @@ def half_vector_integrals(halves: HalfVectors, polygon, ior, *, cone=None, metal
 
 
 def _taken(part, index, dtype):
-    """The points `index` of `part`: None, an array (P, ...) or an object with `take`; in `dtype`, cones as they are."""
+    """The points `index` of `part`: None, an array (P, ...) or an object with `take`. In `dtype`, except for cones."""
     if isinstance(part, HalfVectors):
         return part.take(index).astype(dtype)
     if isinstance(part, list):
@@ -293,7 +295,7 @@ def _taken(part, index, dtype):
 
 
 def _arc_sums(order, fan, setting):
-    """The rows of `lobe_integrals` (4, A), or (7, A), with a sign, of triangles of arcs of a boundary and apices;
+    """The rows of `lobe_integrals`, (4, A) or (7, A), with a sign, over triangles of an arc of a boundary and an apex.
     `fan` is (boundary, arcs, apices (3, A))."""
     boundary, arcs, apex = fan
     halves, ior, cone, metal = setting
@@ -314,7 +316,7 @@ def _arc_sums(order, fan, setting):
 
 
 def limit_warp(cosine, alpha) -> Lobe:
-    """The warp of the limit alpha -> 0 for cosines (P,) of theta_o and alpha (P,)."""
+    """The warp in the limit alpha -> 0, for cosines (P,) of theta_o and alpha (P,)."""
     alpha = np.maximum(alpha, MIN_ALPHA)
     squared = cosine**2 + WARP_REGULARIZATION**2 * alpha**2
     sine = np.sqrt(np.maximum(1.0 - cosine**2, 0.0))
@@ -327,7 +329,7 @@ def _peak_or_mean(inside, unit):
 
 
 def _fixed_order(order, boundary, apex, setting, cone, metal):
-    """Integrals (4, P), or (7, P), with fixed Gauss-Legendre orders."""
+    """Integrals (4, P) or (7, P) with fixed Gauss-Legendre orders."""
     warp, cos_theta_o, alpha, ior = setting
     points, measure = boundary.nodes(order[0])
     wedge = dot(measure, apex[:, None])  # (B, P)
@@ -347,7 +349,7 @@ def _fixed_order(order, boundary, apex, setting, cone, metal):
 
 
 def _sums(values, half, ior, metal):
-    """The rows of `lobe_integrals` of values (B, m, P) that are weighted."""
+    """The rows of `lobe_integrals` from weighted values (B, m, P)."""
     schlick = values * brdf.schlick_curve(half)
     dip = (schlick * (half * (1.0 - half))).sum(axis=(0, 1))
     schlick = schlick.sum(axis=(0, 1))
@@ -365,7 +367,7 @@ def _unit_interval(count):
 
 
 def _slerp(start, end, angle, fraction):
-    """Points at `fraction` of arcs of length `angle`; the ends coincide where the angle is zero."""
+    """Points at `fraction` of arcs of length `angle`. The ends coincide if the angle is zero."""
     sine = np.sin(angle)
     curved = sine > 1e-9
     safe = np.where(curved, sine, 1.0)
@@ -375,23 +377,24 @@ def _slerp(start, end, angle, fraction):
 
 
 def _unwarped_lobe(warped, warp, cos_theta_o, alpha):
-    """BRDF times cosine times Jacobian, the cosine of the half angle, and the unit direction, last axis, at warped unit
-    vectors [x, y, z]."""
+    """At warped unit vectors [x, y, z]: BRDF times cosine times Jacobian, the cosine of the half angle, and the unit
+    direction as the last axis."""
     z = warped[2] / warp.zz
     x = (warped[0] - warp.xz * z) / warp.xx
     y = warped[1] / warp.yy
     length = np.sqrt(x * x + y * y + z * z)
     direction = np.stack([x / length, y / length, z / length], axis=-1)
-    # Axes (B, m, P): the kernels of `brdf` broadcast over leading axes and end with the sample axis.
+    # Axes (B, m, P): the kernels of `brdf` broadcast over leading axes, of which the last is the sample axis.
     values = brdf.ggx_brdf_cosine(cos_theta_o, alpha, direction[..., None, :])[..., 0]
     half = brdf.half_angle_cosine(cos_theta_o, direction[..., None, :])[..., 0]
     return values / ((warp.xx * warp.yy * warp.zz) * length**3), half, direction
 
 
 def reference_integrals(framed, cosine, light, corners, candidates, error):
-    """Yield (index, integrals (4, Q)) by quadrature; integrals of the same point add up. Adds to error (P,).
+    """Yield (index, integrals (4, Q)) by quadrature. Integrals of the same point add up. Adds estimates to `error`
+    (P,).
 
-    Where the reflectance of metals falls below 0, there are three rows more, which are missing in their sum.
+    If the reflectance of metals falls below 0, three rows follow: what their sum misses because of that.
     """
     is_anisotropic = framed.samples.anisotropy[candidates] != 0.0
     for halves, chosen in ((False, candidates[~is_anisotropic]), (True, candidates[is_anisotropic])):
@@ -403,14 +406,14 @@ def reference_integrals(framed, cosine, light, corners, candidates, error):
 
 
 def anisotropic_integrals(framed, halves, light, corners, candidates):
-    """As `reference_integrals` of anisotropic lobes, the HalfVectors of all samples, in the quick way."""
+    """As `reference_integrals`, for anisotropic lobes, in the quick way. `halves` are those of all samples."""
     for index, integrals, _ in _integrals(framed, (halves.cosine, halves, True), light, corners, candidates):
         yield index, integrals
 
 
 def _integrals(framed, lobes, light, corners, candidates):
-    """Yield (index, integrals, error estimates (Q,)) for `lobes`: cosines (P,) of theta_o, the HalfVectors of
-    anisotropic ones, and whether they are done in the quick way."""
+    """Yield (index, integrals, error estimates (Q,)). `lobes` is the cosines (P,) of theta_o, the HalfVectors of
+    anisotropic lobes, and whether to do these in the quick way."""
     samples, frame = framed.samples, framed.frame
     cosine, halves, quick = lobes
     terms = (samples.specular_f0, samples.specular_f90, samples.specular_dip)
@@ -448,7 +451,7 @@ def _integrals(framed, lobes, light, corners, candidates):
 
 
 def _whole_cone(framed, light, index, profile) -> Cone:
-    """The falloff of a light without a spread, smooth all over it."""
+    """The falloff of a light without a spread, which is smooth over the whole light."""
     axis = to_local(framed.frame[:, :, index], -light.direction[:, None])
     distance = ((framed.samples.position[index] - light.center) * light.direction).sum(axis=1)
     return Cone(axis, distance, profile, np.zeros(len(index), bool))
@@ -461,8 +464,8 @@ def _polygons(framed, light, corners, candidates):
 
 
 def _ellipses(framed, light, corners, candidates):
-    """As `_polygons`; where the geometric horizon does not cut them exact ellipses, as functions of a warp that make
-    their boundaries."""
+    """As `_polygons`. If the geometric horizon does not cut an ellipse, the outline is a function that makes the exact
+    ellipse's boundary from a warp."""
     cut, whole, local = _uncut_ellipses(framed, light, candidates)
     if len(whole):
         yield whole, lambda warp: EllipseBoundary.warped(warp, *local), None
@@ -470,8 +473,8 @@ def _ellipses(framed, light, corners, candidates):
 
 
 def _uncut_ellipses(framed, light, candidates):
-    """Split the candidates: (those whose light is cut by the geometric horizon, the others that see it, for these the
-    center and half axes in local frames)."""
+    """The candidates whose light the geometric horizon cuts; the others that see it; and for these, the center and half
+    axes of the ellipse in local frames."""
     samples, frame = framed.samples, framed.frame
     index = in_front(samples, light, candidates)
     offset = (light.center - light.origins(samples.position[index])).T
@@ -490,15 +493,15 @@ def _uncut_ellipses(framed, light, candidates):
 
 
 def _ellipse_extent(normal, ellipse):
-    """Heights (P,) of centers over the planes with `normal` (3, P), and how far ellipses, centers and half axes
-    (3, 3, P), reach up and down."""
+    """Heights (P,) of centers over the planes with `normal` (3, P), and how far (P,) the ellipses reach up and down.
+    `ellipse` is centers and half axes, (3, 3, P)."""
     offset, half_u, half_v = ellipse
     return dot(normal, offset), np.hypot(dot(normal, half_u), dot(normal, half_v))
 
 
 def _cone_parts(framed, cosine, light, corners, candidates):
-    """As `_polygons`, with the cone: the part of a light in the cone of each point, cut in two where both the foot, at
-    which the factor has its tip, and the peak of the lobe lie in it."""
+    """As `_polygons`, but with the cone: the part of a light in the cone of each point. It is cut in two if both the
+    foot, where the factor has its tip, and the peak of the lobe lie in it."""
     profile = light_cone.Profile.of(light)
     tangent = profile.tangent
     for index, polygon in visible_parts(framed, light, corners, candidates, framed.samples.geometric_normal):

@@ -1,9 +1,10 @@
-"""Distant lights with a detail, the sky, as a map of all directions, for single precision.
+"""The sky, that is distant lights with a detail, as a map of all directions, for single precision.
 
-Lobes get its means around so many directions as cover a lobe evenly, whatever its width (Krivanek and Colbert 2008,
-"Real-time Shading with Filtered Importance Sampling", doi:10.1111/j.1467-8659.2008.01252.x, with fixed points in the
-domain in which lobes are spherical harmonics). Between the centers of patches the map is interpolated, so that sharp
-reflections show no facets. Double precision takes the patches themselves, `light_polygons.PatchTree`.
+A lobe is integrated over a fixed number of directions that cover it evenly, whatever its width; each gets the mean of
+the map around it (Krivanek and Colbert 2008, "Real-time Shading with Filtered Importance Sampling",
+doi:10.1111/j.1467-8659.2008.01252.x, but with fixed points in the domain in which lobes are spherical harmonics). The
+map is interpolated between the centers of patches, so that sharp reflections show no facets. Double precision uses the
+patches themselves, `light_polygons.PatchTree`.
 """
 
 from __future__ import annotations
@@ -17,35 +18,36 @@ from .light_cone import gauss_legendre
 from .light_polygons import PatchTree, kept
 from .polygon import dot
 
-# Texels along each side of a side of a map, at most and at least.
+# Greatest and least number of texels along each side of a side of a map.
 MOST_TEXELS, FEWEST_TEXELS = 256, 2
-# Directions that a lobe takes of a map, and how much denser they are at its peak: their heights are equal steps to this
-# power. Measured with a window as bright as all the rest: 1.2 % (relative L2) off the smallest patches where the cosine
-# of the view is at least 0.2; 0.5 % without windows.
+# DIRECTIONS: how many a lobe takes of a map. DENSE: how much denser they are at its peak; their heights are equal steps
+# to this power. Measured with a window as bright as all the rest: 1.2 % (relative L2) off the smallest patches where
+# the cosine of the view is at least 0.2; 0.5 % without windows.
 DIRECTIONS, DENSE = 224, 0.85
-# Standard deviation of what is looked up around each of them, by the side of a square of its solid angle.
+# Standard deviation of the mean around each direction, in units of the side of a square with its solid angle.
 BLUR = 0.6
-# Samples at a time.
+# Samples per chunk.
 MAP_CHUNK = 96
 
 
 @dataclass(frozen=True)
 class SkyMap:
-    """Radiance (3, 6, n, n) of distant lights from all directions, by the side of a cube as `interpolated` has them, in
-    levels, each smoother than the one before it: rows of `width` texels, with a border of those of the other sides."""
+    """Radiance (3, 6, n, n) of distant lights from all directions, in levels of which each is smoother than the one
+    before. The sides of the cube are in the order of `interpolated`. Rows have `width` texels, with a border of texels
+    of the neighboring sides."""
 
     texels: np.ndarray  # (3, T)
     width: int
-    first: np.ndarray  # (N,) texel of levels
-    rows: np.ndarray  # (N,) of a side
+    first: np.ndarray  # (N,) first texel of each level
+    rows: np.ndarray  # (N,) rows of a side
     scale: np.ndarray  # (N,) half the texels along a side
-    sharpest: float  # area on a cube of half side 1 over which the second level is smooth, a standard deviation squared
-    reflected: np.ndarray  # as of PatchTree
+    sharpest: float  # variance of the second level's blur, as an area on a cube of half side 1
+    reflected: np.ndarray  # as in PatchTree
     nodes: tuple[np.ndarray, np.ndarray]  # see `_nodes`; LAPACK need not give the same last bits in every process
 
     @classmethod
     def of(cls, lights) -> SkyMap:
-        """That of distant AreaLights with a detail, made once."""
+        """The map of distant AreaLights with a detail, made once."""
         return kept("_sky_map", lights, cls._made)
 
     @classmethod
@@ -62,7 +64,7 @@ class SkyMap:
             radiance[:, seen] += grid[:, row, column]
         levels = [radiance]
         while True:
-            # With the interpolation between texels the variances are 3/4 and 3/2 of their square.
+            # With the interpolation between texels, the variances are 3/4 and 3/2 of the square of a texel.
             levels += [_blurred(radiance, 0.5), _blurred(_blurred(_blurred(radiance, 0.5), 0.5), 0.25)]
             if len(radiance[0, 0]) == FEWEST_TEXELS:
                 break
@@ -81,8 +83,8 @@ class SkyMap:
         )
 
     def means(self, toward, area) -> np.ndarray:
-        """Mean radiance (3, ...) around directions `toward` (3, ...), by the `area` (...) around each: a solid angle in
-        sr times the cube of the length of `toward`."""
+        """Mean radiance (3, ...) around directions `toward` (3, ...). `area` (...) is the solid angle in sr over which
+        the mean is taken, times the cube of the length of `toward`."""
         x, y, z = toward
         size_x, size_y, size_z = np.abs(toward)
         is_x, is_y = (size_x >= size_y) & (size_x >= size_z), size_y >= size_z
@@ -94,7 +96,7 @@ class SkyMap:
         inverse = np.float32(1.0) / np.abs(along)
         s *= inverse
         t *= inverse
-        # From here on the area on a cube of half side 1, then the level.
+        # The area on a cube of half side 1, then the level.
         level = inverse * inverse
         level *= inverse
         level *= area
@@ -137,7 +139,7 @@ class SkyMap:
         return found
 
     def add(self, lobes, chosen: np.ndarray, total: np.ndarray) -> None:
-        """Add to total (F, 3, Q) what the columns `chosen` (Q',) of `float32.Lobes` reflect of the sky."""
+        """Add what the columns `chosen` (Q',) of `float32.Lobes` reflect of the sky to `total` (F, 3, Q)."""
         nodes, angle = self.nodes
         for start in range(0, len(chosen), MAP_CHUNK):
             part = chosen[start : start + MAP_CHUNK]
@@ -149,7 +151,7 @@ class SkyMap:
             inverse = np.float32(1.0) / np.sqrt(dot(directions, directions))
             directions = [place * inverse for place in directions]
             own = angle * (inverse * inverse * inverse)
-            # The world direction of each node, by the inverse of the lobe's axes but for a factor.
+            # The world direction of each node: the inverse of the lobe's axes gives it up to a factor.
             toward = sum(place * axis[:, None] for place, axis in zip(directions, axes, strict=True))
             area = own * (determinant * determinant)
             values = lobes.at_point.at_nodes(part, directions, toward) * own
@@ -162,15 +164,15 @@ class SkyMap:
 
 
 def _stretch(axes):
-    """The factor (Q,) by which directions are stretched along the first axis (3, Q) of lobes, and shrunk along the
-    second: the root of the one that would make the area they cover round in the world."""
+    """Factor (Q,) by which directions are stretched along the first axis (3, Q) of lobes and shrunk along the second.
+    It is the root of the factor that would make the area they cover round in the world."""
     across = _cross(axes[0], axes[2])
     squares = dot(across, across) / (dot(axes[1], axes[1]) * dot(axes[2], axes[2]))
     return squares ** np.float32(-0.125)
 
 
 def _share_above(lobes, part, toward, area) -> np.ndarray:
-    """Which share (N, Q) of the `area` around directions (3, N, Q) is above the horizons of lobes but their own."""
+    """Share (N, Q) of the `area` around directions (3, N, Q) above the horizons of lobes, except for their own."""
     squares = dot(toward, toward)
     radius = np.sqrt(area / (np.float32(np.pi) * np.sqrt(squares)))
     share = np.float32(1.0)
@@ -182,8 +184,8 @@ def _share_above(lobes, part, toward, area) -> np.ndarray:
 
 
 def _nodes(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Unit vectors (3, N, 1) above z = 0 and the solid angles (N, 1) around them, sums over which are exact for
-    polynomials of degree 4: a spiral of golden angles."""
+    """Unit vectors (3, N, 1) above z = 0, a spiral of golden angles, and the solid angles (N, 1) around them. Sums over
+    them are exact for polynomials of degree 4."""
     number = np.arange(count) + 0.5
     z = (1.0 - number / count) ** DENSE
     turn = np.pi * (np.sqrt(5.0) - 1.0) * number
@@ -208,7 +210,8 @@ def _cross(a, b):
 
 
 def _cells(count: int, more: int = 0) -> np.ndarray:
-    """Centers (3, 6, n, n) of `count` texels along each side of the sides of a cube, and of `more` around them."""
+    """Centers (3, 6, n, n) of `count` texels along each side of the sides of a cube, and of `more` texels around
+    them."""
     place = (np.arange(-more, count + more) + 0.5) * (2.0 / count) - 1.0
     t, s = np.meshgrid(place, place, indexing="ij")
     found = np.empty((3, 6, *s.shape))
@@ -220,7 +223,7 @@ def _cells(count: int, more: int = 0) -> np.ndarray:
 
 @cache
 def _bordered(count: int) -> np.ndarray:
-    """Texels (6, n + 2, n + 2), numbers of those of the sides of a cube, with those of the other sides around."""
+    """Numbers (6, n + 2, n + 2) of the texels of the sides of a cube, with texels of the neighboring sides around."""
     directions = _cells(count, 1)
     axis = np.argmax(np.abs(directions), axis=0)
     along, s, t = (np.take_along_axis(directions, ((axis + step) % 3)[None], axis=0)[0] for step in range(3))
@@ -229,12 +232,12 @@ def _bordered(count: int) -> np.ndarray:
 
 
 def _with_border(radiance):
-    """Radiance (3, 6, n + 2, n + 2) from that (3, 6, n, n) of the texels of a cube."""
+    """Radiance (3, 6, n + 2, n + 2) with a border, from radiance (3, 6, n, n) of the texels of a cube."""
     return radiance.reshape(3, -1)[:, _bordered(radiance.shape[2])]
 
 
 def _blurred(radiance, variance):
-    """Radiance (3, 6, n, n) with a variance added, at most 1/2 of the square of a texel."""
+    """Radiance (3, 6, n, n) blurred by `variance`, at most 1/2, in units of the square of a texel."""
     values, share = _with_border(radiance), 0.5 * variance
     values = (1.0 - variance) * values[:, :, 1:-1] + share * (values[:, :, :-2] + values[:, :, 2:])
     return (1.0 - variance) * values[..., 1:-1] + share * (values[..., :-2] + values[..., 2:])
@@ -254,8 +257,8 @@ def _sums_of_four(values):
 
 
 def _grid(tree: PatchTree) -> np.ndarray:
-    """Radiance (3, n, n) of a light cut into halves and halves again, by place along half_v and half_u: between the
-    centers of patches it changes evenly, and they keep their means."""
+    """Radiance (3, n, n) of a light that was halved repeatedly, by place along half_v and half_u. It changes smoothly
+    between the centers of patches, and patches keep their means."""
     leaves = np.flatnonzero(tree.count == 0)
     s, t, _ = tree.places(tree.center[:, leaves])
     level = np.rint(-np.log2(tree.size_on_plane[leaves])).astype(int)
@@ -278,7 +281,7 @@ def _grid(tree: PatchTree) -> np.ndarray:
 
 
 def _doubled(grid):
-    """Values (3, 2 n, 2 n) from those (3, n, n): each changes as its neighbors do, where those on both sides agree."""
+    """Values (3, 2 n, 2 n) from values (3, n, n). Each gets a slope where its neighbors on both sides agree on one."""
     around = np.pad(grid, ((0, 0), (1, 1), (1, 1)), mode="edge")
     found = np.empty((3, 2 * grid.shape[1], 2 * grid.shape[2]))
     steps = []

@@ -1,10 +1,10 @@
-"""Lights so small, as a sample sees them, that their center stands for all of them: no integral over a polygon.
+"""Lights so small, as a sample sees them, that their center stands for the whole light: no integral over a polygon.
 
-The integral is the lobe at the center times the solid angle. What that neglects is second order in the light's radius
-by the length over which the integrand changes: the distance, and for specular lobes their width, or the angle from
-their peak where that is larger. For a cosine or the peak of GGX it is 2/3 LARGEST^2 = 0.2 % of the light, which has
-then 2 LARGEST^2 sr at most: 3e-6 per unit of radiance.
-The dots in shapes (...) stand for lights, samples or both, over which arrays broadcast.
+The integral is the lobe at the center times the solid angle. The error is second order in the light's radius, in units
+of the length over which the integrand changes. That length is the distance; for specular lobes it is their width, or
+the angle from their peak if that is larger. For a cosine or the peak of GGX, the error is 2/3 LARGEST^2 = 0.2 % of the
+light. Such a light has at most 2 LARGEST^2 sr, so the error is 3e-6 per unit of radiance.
+The dots in shapes (...) stand for lights, samples or both; arrays broadcast over them.
 """
 
 from __future__ import annotations
@@ -19,25 +19,25 @@ from .lookup_table import bent_cosines
 from .polygon import dot
 from .spherical_harmonics import degree_of
 
-# Radius of a light by the length over which the integrand changes, at most.
+# Greatest radius of a small light in units of the length over which the integrand changes.
 LARGEST = 0.05
-# By which share of itself GGX changes toward the rim of such a light, by that quotient.
+# Relative change of GGX toward the rim of such a light, divided by that size.
 VARIATION = 4.0
 
 
 @dataclass(frozen=True)
 class SmallLight:
-    """What is to be known of a light that is small."""
+    """The quantities of a light that matter if it is small."""
 
     center: np.ndarray  # (3,) m: the centroid
-    radius: float  # m, from there
+    radius: float  # m, around the centroid
     area_vector: np.ndarray  # (3,) m^2, toward where it shines
-    diagonal: float  # m^2: the longer half diagonal of the parallelogram around it, squared
+    diagonal: float  # m^2: square of the longer half diagonal of the parallelogram around it
     covariance: np.ndarray  # (3, 3) m^2, of its points
 
     @classmethod
     def of(cls, light) -> SmallLight:
-        """That of an AreaLight."""
+        """For an AreaLight."""
         area = light.area_vector * np.copysign(1.0, light.area_vector @ light.direction)
         u, v = light.half_u, light.half_v
         diagonal = max(((u + v) ** 2).sum(), ((u - v) ** 2).sum())
@@ -51,7 +51,7 @@ class SmallLight:
 
 
 def all_of(lights) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Centers (L, 3), area vectors (L, 3), covariances (L, 3, 3) and diagonals (L,) as of `SmallLight`."""
+    """Centers (L, 3), area vectors (L, 3), covariances (L, 3, 3) and diagonals (L,), as in `SmallLight`."""
     center, u, v, direction = (
         np.array([getattr(light, name) for light in lights]) for name in ("center", "half_u", "half_v", "direction")
     )
@@ -69,7 +69,8 @@ def all_of(lights) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
 
 def _moments(corners, area):
     """Centroids (L, 3) and covariances (L, 3, 3) of polygons with corners (L, V, 3) and area vectors (L, 3)."""
-    # A fan of triangles: the mean of products over one is a twelfth of those of its corners and of their sum.
+    # A fan of triangles. The mean of products over a triangle is a twelfth of the products at its corners and their
+    # sum.
     first = corners - corners[:, :1]
     second = np.roll(first, -1, axis=1)
     x, y, z = np.moveaxis(first, -1, 0)
@@ -86,21 +87,21 @@ class Rays:
     """Rays (...) from samples to the centers of small lights."""
 
     offset: np.ndarray  # (3, ...) m
-    squares: np.ndarray  # (...) m^2, of their lengths
+    squares: np.ndarray  # (...) m^2, squared lengths
     distance: np.ndarray  # (...) m
-    flux: np.ndarray  # (...) m^3: the distance times the area that the sample sees; its cube makes that a solid angle
+    flux: np.ndarray  # (...) m^3: distance times projected area; divided by the cubed distance it is the solid angle
     diagonal: np.ndarray | float  # (...) m^2, see `SmallLight`
-    slack: np.ndarray | None = None  # (...): by which share of itself a specular lobe varies over the light
+    slack: np.ndarray | None = None  # (...): relative change of a specular lobe over the light
 
     @classmethod
     def along(cls, offset, area_vector, diagonal) -> Rays:
-        """Those of lights with `area_vector` (3, ...) whose centers are at `offset` from the samples."""
+        """Rays to lights with `area_vector` (3, ...) whose centers are at `offset` from the samples."""
         squares = dot(offset, offset)
         flux = np.maximum(-dot(area_vector, offset), np.float32(0.0))
         return cls(offset, squares, np.sqrt(squares), flux, diagonal)
 
     def heights(self, vectors) -> np.ndarray:
-        """Products (...) of the offsets with vectors (3, Q)."""
+        """Dot products (...) of the offsets with vectors (3, Q)."""
         return dot(vectors, self.offset)
 
     def take(self, index) -> Rays:
@@ -119,8 +120,8 @@ class SharpestLobes:
         self.width = (LOBE_WIDTH * width * np.maximum(np.abs(cosine), LEAST_COSINE)).astype(np.float32)
 
     def lengths(self, part, rays: Rays, size) -> np.ndarray:
-        """The least angle in rad (...), at most 1, over which the lobes `part` change where they meet lights of a
-        radius of `size` rad."""
+        """The least angle (...) in rad, at most 1, over which the lobes `part` change within lights of a radius of
+        `size` rad."""
         toward = dot(self.mirrored[:, part], rays.offset)
         toward /= rays.distance
         chord = np.sqrt(np.maximum(np.float32(2.0) - np.float32(2.0) * toward, np.float32(0.0)))
@@ -129,13 +130,14 @@ class SharpestLobes:
 
 
 def seen_sizes(lobes, part, rays: Rays, radius) -> np.ndarray:
-    """Radii (...) of lights, `radius` m, by the length over which the lobes `part` change."""
+    """Radii (...) of lights of `radius` m, in units of the length over which the lobes `part` change."""
     size = np.float32(radius) / rays.distance
     return size if lobes.sharpest is None else size / lobes.sharpest.lengths(part, rays, size)
 
 
 def small_and_lit(lobes, part, rays: Rays, radius, size) -> tuple[np.ndarray, np.ndarray]:
-    """Masks (...) of the lights that are small, by their `seen_sizes`, and of the small ones that shine at the samples.
+    """Masks (...) of the lights that are small, given `size` from `seen_sizes`, and of those that also light the
+    samples.
 
     Lights that cross a horizon are not small.
     """
@@ -167,13 +169,13 @@ class CosineAtPoint:
         return (nodes[2] * np.float32(1.0 / np.pi))[None]
 
     def integral(self, part, coordinates, weights):
-        """Sums (1, Q) over points with coordinates (C, S, T, Q) along the rows of the lobes `part` (Q,): of the lobe by
-        the cubed distance times weights that broadcast to (S, T, Q)."""
+        """Sums (1, Q) over points of the lobe divided by the cubed distance, times `weights` that broadcast to (S, T,
+        Q). The points have `coordinates` (C, S, T, Q) along the rows of the lobes `part` (Q,)."""
         return _sum(self.at(coordinates), weights)[None]
 
     @staticmethod
     def at(coordinates):
-        """The lobe (...) by the cubed distance at coordinates (C, ...)."""
+        """The lobe divided by the cubed distance (...) at `coordinates` (C, ...)."""
         x, y, z = coordinates[:3]
         squares = x * x
         squares += y * y
@@ -186,7 +188,7 @@ class CosineAtPoint:
 
 
 class ShadowedCosineAtPoint:
-    """As `CosineAtPoint` times the bump shadowing of `SurfaceSamples`."""
+    """As `CosineAtPoint`, times the bump shadowing of `SurfaceSamples`."""
 
     def __init__(self, rows, bump_alpha2):
         self.plain, self.smooth, self.bump_alpha2 = CosineAtPoint(rows), rows[3], bump_alpha2
@@ -196,18 +198,19 @@ class ShadowedCosineAtPoint:
         return self.plain(part, rays) * self._shadowing(part, along, rays.squares)
 
     def at_nodes(self, part, nodes, toward):
-        """As of `CosineAtPoint`, with the world directions `toward` (3, N, Q) of the nodes."""
+        """As in `CosineAtPoint`. `toward` (3, N, Q) are the world directions of the nodes."""
         along = dot(self.smooth[:, None, part], toward)
         return self.plain.at_nodes(part, nodes, toward) * self._shadowing(part, along, dot(toward, toward))
 
     def integral(self, part, coordinates, weights):
-        """As of `CosineAtPoint`; the coordinates are one more, along the smooth normal."""
+        """As in `CosineAtPoint`. There is one more coordinate, along the smooth normal."""
         values = self.plain.at(coordinates)
         values *= self._shadowing(part, coordinates[3], dot(coordinates[:3], coordinates[:3]))
         return _sum(values, weights)[None]
 
     def _shadowing(self, part, along, squares):
-        """By the height (...) over the plane of the smooth normal and the squared distance (...)."""
+        """Bump shadowing (...), given the height (...) over the plane of the smooth normal and the squared distance
+        (...)."""
         along = np.maximum(along, np.float32(1e-15) * np.sqrt(squares))
         tangent2 = np.maximum(squares / (along * along) - np.float32(1.0), np.float32(0.0))
         shadowing = np.sqrt(np.float32(1.0) + self.bump_alpha2[part] * tangent2)
@@ -215,7 +218,7 @@ class ShadowedCosineAtPoint:
 
 
 class LobeAtPoint:
-    """Integrals (F, ...) of lobes over small lights, with the weights (F, K, ...) of a `moments32.RidgeTable`."""
+    """Integrals (F, ...) of lobes over small lights, with weights (F, K, ...) of a `moments32.RidgeTable`."""
 
     def __init__(self, rows, weights, table, limits):
         self.rows, self.limits = rows, limits
@@ -238,7 +241,7 @@ class LobeAtPoint:
             return np.stack([terms[part] * cosine for terms in self.terms[:, 0]])
         x *= inverse
         leaning = None if self.bend is None else self._leaning(x, y * inverse, z)
-        # Of points the others follow from the first.
+        # For points of a light tree, the other integrals follow from the first.
         needed = self.terms[:1] if rays.slack is None else self.terms
         values = np.stack([self._value(terms[..., part], x, z, leaning) for terms in needed])
         values *= angle
@@ -250,7 +253,7 @@ class LobeAtPoint:
         return values
 
     def at_nodes(self, part, nodes, toward):
-        """As of `CosineAtPoint`, (F, N, Q) and without limits."""
+        """As in `CosineAtPoint`, but (F, N, Q), without limits."""
         x, y, z = nodes
         cosine = z * np.float32(1.0 / np.pi)
         if self.is_cosine:
@@ -262,7 +265,7 @@ class LobeAtPoint:
         return values
 
     def integral(self, part, coordinates, weights):
-        """As that of `CosineAtPoint`, (F, Q) and without limits."""
+        """As in `CosineAtPoint`, but (F, Q), without limits."""
         x, y, z = coordinates[:3]
         inverse = x * x
         inverse += y * y
@@ -285,7 +288,7 @@ class LobeAtPoint:
         return values
 
     def _leaning(self, x, y, z):
-        """The two functions (2, ...) of the bend whose terms come last, in a direction (x, y, z)."""
+        """The two functions (2, ...) of the bend, whose terms come last, in direction (x, y, z)."""
         return (2.0 * np.pi) * bent_cosines(self.bend, np.stack([x, y, z], axis=-1))
 
     @staticmethod
@@ -308,8 +311,8 @@ def polynomial_terms(weights: np.ndarray) -> np.ndarray:
     """Coefficients (..., K, P) of 1; x, z; x^2, xz, z^2; x^3, ... of a lobe with weights (..., K, P) of `moments`.
     Weights of the two moments of a bend stay as they are.
 
-    The moments of a patch around the direction (x, y, z) are its solid angle times 1; 2 x, 2 z; and for k > 1 the
-    coefficients of the form (k + 1) (u.w)^k - (k - 1) |u|^2 (u.w)^(k - 2) in u, w = (x, z).
+    The moments of a patch around the direction (x, y, z) are its solid angle times 1; 2 x, 2 z; and, for k > 1, the
+    coefficients of the form (k + 1) (u.w)^k - (k - 1) |u|^2 (u.w)^(k - 2) in u, where w = (x, z).
     """
     w = np.moveaxis(weights, -2, 0)
     terms = w.copy()
@@ -335,7 +338,8 @@ def polynomial(terms: np.ndarray, x, z) -> np.ndarray:
     degree = int(np.sqrt(2 * len(terms))) - 1
     result = None
     for power in range(degree, -1, -1):
-        # The factor of z^power: those of x^k z^power are the last but `degree - power - k` of the degree k + power.
+        # The factor of z^power. Among the terms of degree k + power, in order, the one of x^k z^power is number
+        # `power`.
         rows = [(k + power) * (k + power + 1) // 2 + power for k in range(degree - power, -1, -1)]
         factor = terms[rows[0]]
         for row in rows[1:]:

@@ -1,8 +1,8 @@
 """The real, orthonormal spherical harmonics that are even in y: THE convention of this package.
 
-Y_lm = K_lm * P_l^(m)(z) * Re((x + i y)^m), m = 0..l, with P_l^(m) the m-th derivative of the Legendre polynomial (no
-Condon-Shortley phase) and K_lm = sqrt((2 - [m = 0]) (2 l + 1) (l - m)! / (4 pi (l + m)!)). Coefficients are ordered
-(0,0), (1,0), (1,1), (2,0), (2,1), (2,2), ...: the BRDF is mirror-symmetric in y, so sine terms never appear.
+Y_lm = K_lm * P_l^(m)(z) * Re((x + i y)^m), m = 0..l, where P_l^(m) is the m-th derivative of the Legendre polynomial
+(no Condon-Shortley phase) and K_lm = sqrt((2 - [m = 0]) (2 l + 1) (l - m)! / (4 pi (l + m)!)). Coefficients are ordered
+(0,0), (1,0), (1,1), (2,0), (2,1), (2,2), ... The BRDF is mirror-symmetric in y, so sine terms never appear.
 """
 
 from __future__ import annotations

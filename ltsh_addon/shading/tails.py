@@ -1,8 +1,8 @@
 """Limits for integrals over lights in the tails of lobes.
 
 In its tail a fitted lobe may be off by more than its value, which shows as bright and dark rings at rims. There the
-true lobe changes so slowly over a light that its values at a few points of the light confine the integral. This holds
-where none of GGX's peak is between the points: where the mirrored view ray misses the light by more than its size.
+true lobe changes so slowly over a light that its values at a few points of the light bound the integral. This holds if
+none of GGX's peak is between the points, that is, if the mirrored view ray misses the light by more than its size.
 """
 
 from __future__ import annotations
@@ -16,27 +16,27 @@ from .light_cone import Profile
 from .lookup_table import MIN_ALPHA
 from .polygon import dot
 
-# Of the sphere that the mirrored view ray must miss, in units of that around the light.
+# Radius of the sphere that the mirrored view ray must miss, in units of the radius of the sphere around the light.
 NEAR_RADII = 2.0
-# Of the turn toward one of a light's corners: what lies along a direction, on average over directions.
+# Share of the turn toward a light's corner that lies along a direction, averaged over directions.
 ALONG = 0.9
 _TINY = 1e-12
 
 
 @dataclass(frozen=True)
 class SeenLight:
-    """A light as Q points see it, or one of each; for "..." stands Q or 1."""
+    """Lights as Q points see them: one light for all points, or one for each. "..." stands for Q or 1."""
 
-    offset: np.ndarray  # (3, Q) of its center
-    toward: np.ndarray  # (Q,) product of that with the direction to which it shines, negative
-    diagonals: np.ndarray  # (2, 3, ...) half of those of the parallelogram around it
-    squares: np.ndarray  # (2, ...) of their lengths
+    offset: np.ndarray  # (3, Q) of the light's center from the points
+    toward: np.ndarray  # (Q,) dot product of `offset` and the direction into which the light shines; negative
+    diagonals: np.ndarray  # (2, 3, ...) half diagonals of the parallelogram around the light
+    squares: np.ndarray  # (2, ...) their squared lengths
     area: np.ndarray  # (...)
     profile: Profile | None
 
     @classmethod
     def of(cls, light, offset, toward) -> SeenLight:
-        """That of an AreaLight, or of a `float64.LightOfEachSample`, in the precision of `offset`."""
+        """For an AreaLight or a `float64.LightOfEachSample`, in the precision of `offset`."""
         vectors = np.stack([light.half_u + light.half_v, light.half_u - light.half_v, light.area_vector])
         vectors = vectors[..., None] if vectors.ndim == 2 else vectors.transpose(0, 2, 1)
         squares = (vectors * vectors).sum(axis=1).astype(offset.dtype)
@@ -45,14 +45,14 @@ class SeenLight:
 
     @classmethod
     def of_plain(cls, halves, area, offset, toward) -> SeenLight:
-        """That of lights without a profile by their half axes, two (3, Q), and area vectors (3, Q)."""
+        """For lights without a profile, given by two half axes (3, Q) and area vectors (3, Q)."""
         u, v = halves
         diagonals = np.stack([u + v, u - v])
         return cls(offset, toward, diagonals, (diagonals * diagonals).sum(axis=1), np.sqrt(dot(area, area)), None)
 
     @classmethod
     def of_disk(cls, disk) -> SeenLight:
-        """That of a FacingDisk."""
+        """For a FacingDisk."""
         u, v = disk.half_u, disk.half_v
         square = disk.radius * disk.radius
         diagonals, squares = np.stack([u + v, u - v]), np.stack([2.0 * square] * 2)
@@ -78,16 +78,16 @@ class TailLimits:
 
     normal: np.ndarray  # (3, Q)
     view: np.ndarray  # (3, Q)
-    cosine: np.ndarray  # (Q,) their product
+    cosine: np.ndarray  # (Q,) dot product of normal and view
     alpha_squared: np.ndarray  # (Q,)
     second: np.ndarray | None  # (3, Q) normals of second horizons
-    schlick: bool  # whether the second integral is that of Schlick's curve
-    ior: np.ndarray | None  # (Q,), where the last integral is that of a dielectric
+    schlick: bool  # True if the second integral is that of Schlick's curve
+    ior: np.ndarray | None  # (Q,) if the last integral is that of a dielectric
 
     @classmethod
     def of(cls, axes, roughness, second, schlick, ior) -> TailLimits:
-        """Those of samples with the normals and views `axes`, which tell the precision, `roughness` (Q,), and `ior`
-        (Q,) or None."""
+        """For samples with the normals and views `axes` (whose precision it takes), `roughness` (Q,), and `ior` (Q,) or
+        None."""
         normal, view = axes
         roughness = roughness.astype(normal.dtype)
         alpha = np.maximum(roughness * roughness, normal.dtype.type(MIN_ALPHA))
@@ -95,33 +95,33 @@ class TailLimits:
         return cls(normal, view, dot(normal, view), alpha * alpha, second, schlick, ior)
 
     def take(self, part) -> TailLimits:
-        """Those of the samples `part`: integers (Q',) or a slice."""
+        """The limits of the samples `part`: integers (Q',) or a slice."""
         values = self.normal, self.view, self.cosine, self.alpha_squared, self.second, self.ior
         *values, ior = (value if value is None else value[..., part] for value in values)
         return TailLimits(*values, self.schlick, ior)
 
     def apply(self, integrals, part, light: SeenLight, scratch) -> None:
-        """Limit integrals (F, Q') over the light as the samples `part` see it.
+        """Limit integrals (F, Q') over the light as the samples `part` see it, in place.
 
-        In the tail the first, for F = 1, is brought between the least and the greatest integrand over the area, of
-        those at the center and the corners, times the area and the least and the greatest value of a profile. The
-        others are at most the greatest reflectance there times the first, and nowhere more than the first. That of a
-        dielectric is at least its reflectance head on times the first.
-        scratch(name, shape) gives an array whose content does not matter.
+        In the tail, the first integral (for F = 1) is brought between two bounds: the least and the greatest integrand
+        over the area, of its values at the center and the corners, times the area, times the least and the greatest
+        value of the profile. In the tail, the others are at most the greatest reflectance there times the first.
+        Everywhere, they are at most the first; a dielectric's is at least its reflectance head on times the first.
+        scratch(name, shape) returns an array of any content.
         """
-        # Outside of the tail, where nothing is limited, points may coincide.
+        # Outside the tail nothing is limited, but points may coincide.
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             _LightPoints(self.take(part), light, scratch).limit(integrals)
 
     def apply_at_centers(self, integrals, part, rays) -> None:
-        """As `apply` for integrals (F, ...) over lights so small that their centers stand for all of them, at the ends
-        of `small_lights.Rays`."""
+        """As `apply`, for integrals (F, ...) over lights so small that their center stands for all of them. The centers
+        are the ends of `rays`, `small_lights.Rays`."""
         lobes = self.take(part)
         tail, value, cosine = lobes.true_and_tail(rays)
         margin = rays.slack * value
         value = np.minimum(np.maximum(integrals[0], value - margin), value + margin)
         np.copyto(integrals[0], value, where=tail & (integrals[0] > 0.0))
-        # Toward the corners half vectors turn by up to half their angle, which rarely lies along the turn.
+        # Toward a corner the half vector turns by up to half the angle, which rarely lies along its turn.
         sine = np.sqrt(np.maximum(np.float32(1.0) - cosine * cosine, np.float32(0.0)))
         sine *= np.float32(0.5 * ALONG) * np.sqrt(rays.diagonal) / rays.distance
         cosine = np.maximum(cosine - sine, np.float32(0.0))
@@ -129,15 +129,15 @@ class TailLimits:
         lobes.limit_others(integrals, cosine)
 
     def true_in_tails(self, plain, part, rays, count) -> list:
-        """`count` integrals (...) over points: the first, `plain`, becomes true in the tail, and the others are that
-        times their Fresnel curves."""
+        """`count` integrals (...) over points. The first is `plain`, replaced by the true value in the tail; the others
+        are the first times their Fresnel curves."""
         lobes = self.take(part)
         tail, value, cosine = lobes.true_and_tail(rays)
         np.copyto(plain, value, where=tail)
         return lobes.curves(plain, cosine, count)
 
     def true_and_tail(self, rays):
-        """Which lights are in the tail (...), and their `true_values`."""
+        """Mask (...) of the lights in the tail, and their `true_values`."""
         heights, views = rays.heights(self.normal), rays.heights(self.view)
         beyond = rays.squares - np.float32(NEAR_RADII**2) * rays.diagonal
         mirrored = np.float32(2.0) * self.cosine * heights
@@ -146,14 +146,14 @@ class TailLimits:
         return (mirrored < beyond) & (beyond > 0.0), *self.true_values(heights, views, rays)
 
     def at_centers(self, part, rays, count) -> list:
-        """True integrals, `count` arrays (...), over small lights that are all in the tail."""
+        """`count` true integrals (...) over small lights that are all in the tail."""
         lobes = self.take(part)
         value, cosine = lobes.true_values(rays.heights(lobes.normal), rays.heights(lobes.view), rays)
         return lobes.curves(value, cosine, count)
 
     def true_values(self, heights, views, rays):
-        """GGX's integrals (...) over small lights, F = 1, and cosines (...) of the half angles; by heights over the
-        horizon and along the view, both of which change."""
+        """GGX's integrals (...) over small lights for F = 1, and cosines (...) of the half angles. `heights` over the
+        horizon and `views` along the view are overwritten."""
         inverse = np.float32(1.0) / rays.distance
         cosines = np.multiply(heights, inverse, out=heights)
         # Half the square of the half vector's length.
@@ -186,7 +186,8 @@ class TailLimits:
         return value, np.sqrt(halves, out=halves)
 
     def curves(self, value, cosine, count) -> list:
-        """The values (...) times the `count` Fresnel curves of the lobes at cosines (...) of the half angle."""
+        """`count` arrays: `value` (...), then `value` times the other Fresnel curves of the lobes. `cosine` (...) is
+        that of the half angle."""
         found = [value]
         if self.schlick:
             found.append(schlick_curve(cosine) * value)
@@ -197,8 +198,8 @@ class TailLimits:
         return found
 
     def limit_others(self, integrals, cosine) -> None:
-        """Limit all but the first of integrals (F, ...) by that, where `cosine` (...) of the half angle is the least
-        over the light; 0 where that is not in the tail."""
+        """Limit all but the first of integrals (F, ...) by the first, in place. `cosine` (...) is the least cosine of
+        the half angle over the light, or 0 outside the tail."""
         plain = integrals[0]
         if self.schlick:
             np.minimum(integrals[1], schlick_curve(cosine) * plain, out=integrals[1])
@@ -209,8 +210,8 @@ class TailLimits:
 
 
 class _LightPoints:
-    """The centers of lights as seen from samples, then also their corners: (5, Q) heights over the horizons, products
-    with the views, squared distances."""
+    """The centers of lights as seen from samples, later their corners too: (5, Q) heights over the horizons, dot
+    products with the views, and squared distances."""
 
     def __init__(self, lobes, light, scratch):
         self.lobes, self.light = lobes, light
@@ -239,7 +240,7 @@ class _LightPoints:
         self.lobes.limit_others(integrals, cosine)
 
     def are_in_tail(self) -> np.ndarray:
-        """Mask (Q,) of the lights that the mirrored view ray misses far enough."""
+        """Mask (Q,) of the lights that the mirrored view ray misses by far enough."""
         mirrored = np.multiply(self.lobes.cosine, self.heights[0], out=self.one)
         mirrored += mirrored
         mirrored -= self.views[0]
@@ -250,7 +251,7 @@ class _LightPoints:
         return tail
 
     def add_corners(self) -> None:
-        """Fill in what is of the corners, and what follows from it."""
+        """Fill in the rows of the corners, and what follows from them."""
         self._add_corners(self.heights, self.lobes.normal)
         self._add_corners(self.views, self.lobes.view)
         # |offset +- diagonal|^2
@@ -273,7 +274,8 @@ class _LightPoints:
         return np.sqrt(least, out=least)
 
     def limits(self):
-        """The least and the greatest integrand over the area (Q,), times the area and a profile. Changes all arrays."""
+        """The least and the greatest integrand over the area (Q,), times the area and the profile. Overwrites all
+        arrays."""
         cosine, alpha_squared = self.lobes.cosine, self.lobes.alpha_squared
         profile = None if self.light.profile is None else self.light.range_of_profile(self.squares[0])
         values = _integrands(
@@ -285,36 +287,38 @@ class _LightPoints:
         factor *= (-0.5 / np.pi) * self.light.area
         least *= factor
         most *= factor
-        # Those below the horizon are negative.
+        # Integrands below the horizon are negative.
         np.maximum(most, 0.0, out=most)
         if profile is not None:
             least *= profile[0]
             most *= profile[1]
         if self.lobes.second is not None:
-            # What is below the second horizon is not seen.
+            # Nothing below the second horizon is visible.
             self._add_center(self.heights, self.lobes.second)
             self._add_corners(self.heights, self.lobes.second)
             least *= np.minimum.reduce(self.heights, axis=0) > 0.0
         return least, most
 
     def _add_center(self, values, vectors):
-        """Products of vectors (3, Q) with the offset of the center."""
+        """Set values[0] to the dot products of vectors (3, Q) with the center's offset."""
         offset = self.light.offset
         np.multiply(vectors[0], offset[0], out=values[0])
         for axis in (1, 2):
             values[0] += np.multiply(vectors[axis], offset[axis], out=self.two)
 
     def _add_corners(self, values, vectors):
-        """Products of vectors (3, Q) with the offsets of the corners, where that of the center is there."""
+        """Set values[1:] to dot products of vectors (3, Q) with the corners' offsets. values[0] has the center's."""
         along = self.light.along_diagonals(vectors, *self.work[:4].reshape(2, 2, -1))
         np.add(values[0], along, out=values[1:3])
         np.subtract(values[0], along, out=values[3:])
 
 
 def _integrands(cosine, alpha_squared, at_points, work=None):
-    """GGX's BRDF times both cosines by the squared distance (...), but for constants; negative below horizons.
+    """GGX's BRDF times both cosines divided by the squared distance (...), without constant factors; negative below
+    horizons.
 
-    At points with given heights over the horizon, halves, squared distances and distances, all (...); all change.
+    `at_points` is the heights over the horizon, halves, squared distances and distances of points, all (...); all are
+    overwritten.
     """
     heights, halves, squares, distances = at_points
     rest = 1.0 - alpha_squared

@@ -1,7 +1,7 @@
-"""The exported header in WGSL, translated from its own text: the language has no preprocessor and other declarations.
+"""The exported header in WGSL, translated from its text: WGSL has no preprocessor, and its declarations differ.
 
-Only what the texts in `glsl/` use is understood: structures, functions by value, declarations of one name, `for`,
-`while`, `if`, assignments and the conditional operator, which becomes select().
+The translation understands only what the texts in `glsl/` use: structures, functions by value, declarations of one
+name, `for`, `while`, `if`, assignments and the conditional operator, which becomes select().
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ _CLOSING = {"(": ")", "[": "]", "{": "}"}
 
 
 def translated(text: str, prefix: str) -> str:
-    """The WGSL of a header `text` whose names begin with `prefix`; <prefix>_data(index) is for others to define."""
+    """The WGSL of a header `text` whose names begin with `prefix`. The user must define <prefix>_data(index)."""
     return _Translation(_TOKEN.findall(_preprocessed(text, prefix))).text()
 
 
 def _preprocessed(text, prefix) -> str:
-    """What a shader's preprocessor leaves; numbers that are defined become constants."""
+    """The output of a shader's preprocessor. Macros that are whole numbers become constants."""
     lines, kept = [], [True]
     for line in text.splitlines():
         words = line.split(maxsplit=2)
         if not line.startswith("#"):
             lines += [line] if all(kept) else []
         elif words[0] in ("#if", "#ifdef", "#ifndef"):
-            # Nothing is defined but that this is no C.
+            # Only LTSH_SHADER is defined: this is not C.
             kept.append(words[1] == "LTSH_SHADER" if words[0] == "#ifdef" else words[1] != "LTSH_SHADER")
             kept[-1] = kept[-1] and words[0] != "#if"
         elif words[0] in ("#else", "#elif"):
@@ -46,14 +46,14 @@ def _preprocessed(text, prefix) -> str:
 
 
 class _Translation:
-    """Goes once over the tokens of a text."""
+    """Translates the tokens of a text in one pass."""
 
     def __init__(self, tokens: list[str]):
         self._tokens, self._at = tokens, 0
         self._types = dict(_TYPES)
 
     def text(self) -> str:
-        """The translation of all that stands outside of functions."""
+        """The translation of all tokens; functions and structures are translated by the other methods."""
         parts = []
         while self._at < len(self._tokens):
             word = self._tokens[self._at]
@@ -106,7 +106,7 @@ class _Translation:
         return f"struct {name} {{\n{''.join(members)}}}"
 
     def _member(self, kind: str, *ends: str) -> str:
-        """`name: type` of a declaration, up to one of the `ends`, which is taken."""
+        """`name: type` of a declaration. Takes the tokens up to one of `ends`, included."""
         name, kind = self._word(), self._types[kind]
         if self._peek() == "[":
             self._word()
@@ -140,7 +140,7 @@ class _Translation:
     # Statements:
 
     def _block(self) -> str:
-        """Statements up to the closing brace, with what stands before the opening one."""
+        """Statements up to the closing brace, with the text before the opening brace."""
         parts = [self._until("{")]
         while self._peek() != "}":
             token = self._take()
@@ -179,7 +179,7 @@ class _Translation:
     # Expressions:
 
     def _expression(self, end: str) -> str:
-        """An expression up to `end`, which is taken; several where commas are in it."""
+        """An expression up to `end`, which is taken too; several expressions if there are commas."""
         parts, choices = [""], []
         while True:
             token = self._take()
@@ -204,7 +204,7 @@ class _Translation:
 
 
 def _chosen(last: str, choices: list[tuple[str, str]]) -> str:
-    """`a ? b : c` as select(c, b, a), where `choices` has the parts before each sign; such may follow one another."""
+    """`a ? b : c` as select(c, b, a); may be nested. `choices` has the part before each `?` or `:`, `last` the rest."""
     if not choices:
         return last.strip()
     (condition, _), (first, _), *others = choices

@@ -1,8 +1,8 @@
-"""What a worker process runs, started by path: does one piece of work after another until its input ends.
+"""The program of a worker process, started by path: it does one piece of work after another until its input ends.
 
-Messages are pickles with their length in front. The first one brings the search path and says which class does the
-work, the second the task; each later one goes to that class's `shade`, for example `shading.parallel.ChildSide`. The
-answer is what that returns, or the text of an error.
+Messages are pickles, each after its length. The first message has the search path and names the class that does the
+work. The second is the task. Each later one goes to the class's `shade`, for example that of
+`shading.parallel.ChildSide`. The answer is the result, or the text of an error.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ import traceback
 from pathlib import Path
 
 PACKAGE_FOLDER = Path(__file__).resolve().parents[1]
-# How the package is called here: as its folder, but in the parent, where Blender may have loaded it under another name.
+# Name of the package in this process: its folder's name, except in the parent, where Blender may use another name.
 PACKAGE = (__package__ or "").rpartition(".")[0] or PACKAGE_FOLDER.name
 _LENGTH = struct.Struct("<Q")
 
 
 def packed(message) -> bytes:
-    """What `send` takes in the place of the message: for what may change until then."""
+    """A message in the form that `send` accepts too. Use it if the message may change before it is sent."""
     return pickle.dumps(message, protocol=pickle.HIGHEST_PROTOCOL)
 
 
@@ -36,7 +36,7 @@ def send(stream, message) -> None:
 
 
 class _Unpickler(pickle.Unpickler):
-    """Finds the modules of the other process, where the package is called `package`, under the name it has here."""
+    """Finds modules of the other process, which knows the package as `package`, under their name in this process."""
 
     def __init__(self, stream, package):
         super().__init__(stream)
@@ -49,7 +49,7 @@ class _Unpickler(pickle.Unpickler):
 
 
 def receive(stream, package: str = ""):
-    """Read one message from a process that knows the package as `package`. EOFError: the other side is gone."""
+    """Read one message from a process that knows the package as `package`. Raises EOFError if that process is gone."""
     header = stream.read(_LENGTH.size)
     if len(header) < _LENGTH.size:
         raise EOFError("the other process has ended")
@@ -62,7 +62,7 @@ def receive(stream, package: str = ""):
 
 def _serve(commands, answers) -> None:
     first = receive(commands)
-    # The parent's search path, so that numpy is the same one; running a script puts its own folder first.
+    # Use the parent's search path, so that numpy is the same. A script would put its own folder first.
     sys.path[:] = [str(PACKAGE_FOLDER.parent), *first["path"]]
     module, _, name = first["side"].rpartition(".")
     side_class = getattr(importlib.import_module(f"{PACKAGE_FOLDER.name}.{module}"), name)
@@ -78,14 +78,14 @@ def _serve(commands, answers) -> None:
 
 
 def main() -> None:
-    """Serve the parent on standard input and output; what others print goes to the error output."""
+    """Serve the parent on standard input and output. Whatever else is printed goes to the error output."""
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
     try:
         _serve(sys.stdin.buffer, answers)
     except (EOFError, BrokenPipeError, KeyboardInterrupt):
         pass
-    # Nothing is left to save; the parent may be gone and with it whoever reads what an orderly end would print.
+    # Nothing is left to save. An orderly end might print, and the reader may be gone with the parent.
     os._exit(0)
 
 

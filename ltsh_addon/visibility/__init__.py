@@ -1,7 +1,7 @@
-"""Which share of a light is seen: occluders, rays through them, and what they leave of each light.
+"""The share of each light that is visible: occluders, rays through them, and what they leave of each light.
 
-`occluders` is what stands in the way, `rays` traces it, `starts` tells where rays start. `directions` chooses where
-they go, `ratio` makes shares of what they meet (`visible_shares`), and `crew` does all of it on several cores.
+`occluders` holds what stands in the way. `starts` says where rays start, and `directions` chooses where they go. `rays`
+traces them. `ratio` turns what they meet into shares (`visible_shares`), and `crew` does all of it on several cores.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Blocks of samples on all cores: this process and child processes that trace rays take them from one list.
 
-Embree is called with Python's lock held, so that threads would not help. Children are started as those of
-`shading.parallel`, and open a tracer of their own. What happens in a block does not depend on who takes it.
-Those of a `Company` stay: each has some of the blocks, which one light after another lights. A `Mate` stays, too: it
-takes blocks as those of `run` do, and keeps them from one picture to the next.
+Embree is called with Python's lock held, so threads would not help. Children are started as in `shading.parallel`, and
+each opens its own tracer. What happens in a block does not depend on who takes it.
+The children of a `Company` stay: each keeps some of the blocks, which one light after another lights. A `Mate` stays
+too: it takes blocks as the children of `run` do, and keeps them from one picture to the next.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _STAGE = "shadows"
 
 @dataclass(frozen=True)
 class Errand:
-    """What a child is told first."""
+    """The first message to a child."""
 
     task: object
     occluders: Occluders
@@ -32,28 +32,28 @@ class Errand:
 
 
 class ChildSide:
-    """Answers each block (samples, film) with what the task finds."""
+    """Answers each block (samples, film) with what the task finds in it."""
 
     def __init__(self, errand: Errand):
         self._task, self._tracer = errand.task, open_tracer(errand.occluders, [errand.library])
 
     def shade(self, block):
-        """What `task.shares` returns, by the tracer of this process."""
+        """The result of `task.shares`, with the tracer of this process."""
         return self._task.shares(*block, self._tracer)
 
 
 def run(task, tracer, blocks: Sequence, workers: int | None, progress: Progress | None) -> Iterator[tuple]:
     """Yield (number, task.shares(*block, tracer)) for each of `blocks`, in any order.
 
-    `workers` processes in all; None: as many as there are cores. `progress` is called from this thread; where it
-    returns False Cancelled is raised. No child is left when this ends.
+    `workers` is the total number of processes; None: as many as there are cores. `progress` is called from this thread;
+    if it returns False, Cancelled is raised. No child is left when this ends.
     """
     wanted = min(parallel.cores() if workers is None else workers, len(blocks)) - 1
     if parallel.interpreter() is None or getattr(tracer, "library", None) is None:
         wanted = 0
     queue = _Queue(len(blocks))
     with parallel.helpers(queue) as children:
-        # By this thread: it will keep more in the task while it traces.
+        # Pack it in this thread, before tracing adds cached values to the task.
         errand = worker.packed(Errand(task, tracer.occluders, tracer.library)) if wanted > 0 else b""
         for _ in range(wanted):
             children.append(_Tracing(errand, blocks, queue))
@@ -70,7 +70,7 @@ def run(task, tracer, blocks: Sequence, workers: int | None, progress: Progress 
 
 
 class _Queue(parallel.Queue):
-    """The numbers of the blocks that are left, and what was found in others."""
+    """The numbers of the blocks that are left, and the results that children found."""
 
     def __init__(self, count: int):
         super().__init__(range(count))
@@ -82,7 +82,7 @@ class _Queue(parallel.Queue):
             self._changed.notify_all()
 
     def found(self, wait: bool) -> list:
-        """What has been found since the last call; `wait` for something new, or to do."""
+        """The results since the last call. With `wait`, waits a while for a result or for work to do."""
         with self._changed:
             if wait and not self._found and not self._left:
                 self._changed.wait(parallel.PATIENCE_SECONDS)
@@ -105,21 +105,22 @@ class _Tracing(parallel.Helper):
 
 # Processes that stay:
 
-# Blocks that a mate has ahead: it need not wait for this process, and little is done in vain when a picture is stopped.
+# Blocks that a mate is asked for in advance: two keep it busy, and few are lost when a picture is stopped.
 AHEAD = 2
 
 
 class KeptBlocks:
-    """Answers blocks of samples with what a task finds; keeps them, and where their rays start, by key."""
+    """Answers blocks of samples with what a task finds in them. Keeps the blocks, and where their rays start, by
+    key."""
 
     def __init__(self, errand: Errand, tracer=None):
         self._tracer = open_tracer(errand.occluders, [errand.library]) if tracer is None else tracer
         self._blocks: dict[tuple, dict[int, tuple]] = {}
 
     def shade(self, message):
-        """The answer to (run, task, key, number, block, normal): run, number, and what is found in the block (samples,
-        film), with `normal` as its geometric normals. The block may be left out where it is kept; without a key none
-        is."""
+        """The answer to (run, task, key, number, block, normal): run, number, and what the task finds in the block
+        (samples, film) with `normal` as its geometric normals. A block that is kept may be left out. Without a key, no
+        block is kept."""
         run, task, key, number, block, normal = message
         blocks = {} if key is None else _kept_of(self._blocks, key)
         if number not in blocks:
@@ -129,7 +130,7 @@ class KeptBlocks:
 
 
 def _kept_of(kept: dict[tuple, dict], key: tuple) -> dict:
-    """What is kept by `key`, at first nothing; what other pictures than its own, its first part, have is forgotten."""
+    """The blocks kept for `key`, empty at first. Those of other pictures (the first part of a key) are forgotten."""
     for other in [other for other in kept if other[0] != key[0]]:
         del kept[other]
     return kept.setdefault(key, {})
@@ -138,8 +139,9 @@ def _kept_of(kept: dict[tuple, dict], key: tuple) -> dict:
 class Mate:
     """A process that traces beside this one, picture after picture, past the occluders of `tracer`, until `close`.
 
-    Both keep the samples of a picture by its `key`, the picture and a layer of it: these are sent once, but for their
-    geometric normals, which depend on the lights. The process is started where it is worth it.
+    Both processes keep the samples of a picture by its `key`, the picture and one of its layers. So samples are sent
+    only once, except for their geometric normals, which depend on the lights. The process is started when it is worth
+    it.
     """
 
     def __init__(self, tracer):
@@ -151,7 +153,7 @@ class Mate:
         self.key: tuple | None = None
 
     def run(self, task, blocks: Sequence, is_worth: bool, progress: Progress | None) -> Iterator[tuple]:
-        """As the function `run`, of blocks of `key`; a process `is_worth` its start."""
+        """As the function `run`, for blocks of `key`. `is_worth` says whether a process is worth its start."""
         if is_worth and self._child is None and self._is_possible:
             errand = Errand(None, self._tracer.occluders, self._tracer.library)
             self._child, self._is_up = parallel.Keeper("visibility.crew.KeptBlocks", worker.packed(errand)), False
@@ -160,7 +162,7 @@ class Mate:
         while missing:
             if progress is not None and progress(_STAGE, 1.0 - len(missing) / len(blocks)) is False:
                 raise Cancelled("shadows were stopped")
-            # One block is for this process.
+            # The last block is left to this process.
             while self._child is not None and len(asked) < AHEAD and len(left) > 1:
                 asked.append(left.pop())
                 self._ask(task, asked[-1], blocks[asked[-1]])
@@ -184,7 +186,7 @@ class Mate:
         sent[number] = True
 
     def _answers(self, wait: bool) -> list:
-        """What the process has found for this run; `wait` a little for it."""
+        """The answers of the process for this run. With `wait`, waits a little for one."""
         found = []
         while self._child is not None:
             answer = self._child.poll(parallel.PATIENCE_SECONDS if wait and self._is_up and not found else 0.0)
@@ -199,22 +201,22 @@ class Mate:
         return found
 
     def close(self) -> None:
-        """End the process; a later run may start another one."""
+        """End the process. A later run may start another one."""
         if self._child is not None:
             self._child.end()
         self._child, self._sent = None, {}
 
 
-# With fewer samples a process takes longer to start than to help.
+# With fewer samples, starting a process takes longer than its help saves.
 SAMPLES_WORTH_A_CHILD = 1 << 13
 
 
 @dataclass(frozen=True)
 class Setting:
-    """Blocks of samples, by number, that one light after another lights, and how.
+    """Blocks of samples by number, which one light after another lights, and how to light them.
 
-    A block has samples (B), around the origin of the occluders, those (Q) that rays start from, their film, and of
-    which of them each of the former takes its shares, (B,).
+    A block is: samples (B), relative to the origin of the occluders; the samples (Q) from which rays start; their film;
+    and for each of the former the number (B,) of the one whose shares it takes.
     """
 
     blocks: dict[int, tuple[SurfaceSamples, SurfaceSamples, Film, np.ndarray]]
@@ -223,9 +225,9 @@ class Setting:
 
 
 class LitBlocks:
-    """Answers a light, and the task that finds its shares, with radiance (B, 3) by pass of a block.
+    """Answers a light, and the task that finds its shares, with the radiance (B, 3) by pass of a block.
 
-    `setting` comes with the occluders and the library that traces; None: everything is seen.
+    The `setting` comes with the occluders and the library that traces; both are None if everything is visible.
     """
 
     def __init__(self, setting: tuple[Setting, Occluders | None, str | None], tracer=None):
@@ -236,7 +238,7 @@ class LitBlocks:
         self._starts: dict = {}
 
     def shade(self, message) -> tuple[int, int, dict[str, np.ndarray]]:
-        """The answer to (run, number, light, task): run, number, radiance."""
+        """The answer to (run, number, light, task): run, number, and radiance."""
         run, number, light, task = message
         return run, number, self._lit(number, light, task)
 
@@ -256,9 +258,9 @@ class LitBlocks:
 
 
 class Company:
-    """This process and others, as many as there are cores, which keep the blocks of a setting until `close`.
+    """This process and others, one per core in all, which keep the blocks of a setting until `close`.
 
-    `tracer` knows what stands in the way; None: nothing does.
+    `tracer` knows what stands in the way; None if nothing does.
     """
 
     def __init__(self, setting: Setting, tracer):
@@ -267,7 +269,7 @@ class Company:
         cannot_help = parallel.interpreter() is None or (tracer is not None and library is None)
         if cannot_help or sum(len(block[0]) for block in setting.blocks.values()) < SAMPLES_WORTH_A_CHILD:
             count = 1
-        # This process knows all blocks: what others have not begun when it has done its own it does for them.
+        # This process knows all blocks. After its own, it does those that others have not begun.
         self._own, self._count, self._run = LitBlocks((setting, occluders, library), tracer), count, 0
         parts = [{n: block for n, block in setting.blocks.items() if n % count == own} for own in range(1, count)]
         self._children = [
@@ -278,9 +280,9 @@ class Company:
         ]
 
     def lit(self, light: AreaLight, task, numbers: Sequence[int]) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
-        """Yield what the blocks `numbers` reflect of a light, see `LitBlocks`, the first ones first, about.
+        """Yield what the blocks `numbers` reflect of a light, see `LitBlocks`, roughly in that order.
 
-        Who stops to ask leaves no work behind but what has begun.
+        If the caller stops early, only work that has begun is left behind.
         """
         self._run += 1
         missing, own = set(numbers), deque()
@@ -303,7 +305,7 @@ class Company:
                         missing.remove(number)
                         yield number, radiance
                 if message is None and not found:
-                    # What a process that is gone had begun.
+                    # Do what a process that is gone had begun.
                     gone = [number for number in missing if self._children[number % self._count - 1].is_gone]
                     own.extend((self._run, number, light, task) for number in gone)
         finally:
@@ -311,7 +313,7 @@ class Company:
                 pass
 
     def _taken_back(self):
-        """A message that no process has begun with, None where there is none."""
+        """A message that no process has begun to answer; None if there is none."""
         return next((message for child in self._children if (message := child.take_back()) is not None), None)
 
     def close(self) -> None:

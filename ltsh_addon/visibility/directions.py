@@ -1,14 +1,17 @@
 """Directions from surface points to a light, few and well spread, and how bright each is for the lobes of the point.
 
-A light is a quadrilateral; what a round, polygonal or textured one leaves dark of it has the weight 0. Half of the
-directions are spread evenly over the solid angle of the light, as diffuse lobes need them. The other half are spread
-evenly over the light after the warp that flattens the peak of GGX (`shading.lookup_table`), as specular lobes need
-them: none misses the light, however sharp the lobe. The balance heuristic (Veach and Guibas 1995) joins both.
+Directions aim at a quadrilateral around the light. Where a round, polygonal or textured light leaves it dark, the
+direction has the weight 0. Half of the directions are spread evenly over the solid angle of the quadrilateral, which
+suits diffuse lobes. The other half are spread evenly over its solid angle after the warp that flattens the peak of GGX
+(`shading.lookup_table`), which suits specular lobes: none misses the light, however sharp the lobe. The balance
+heuristic (Veach and Guibas 1995) combines both.
 
-The sides of a sky, which surround all samples, are one light: half of the directions that are not by the specular lobe
-are by its picture, half by the cosine. Many plain lights of one color are one light too (`Cluster`).
+The sides of a sky surround all samples and count as one light. The specular lobe chooses its directions as above; of
+the other directions, half follow the picture of the sky and half the cosine. Many plain lights of one color also count
+as one light (`Cluster`).
 
-All is in single precision, arrays are (S, Q): S directions from each of Q points, or (Q,). Vectors are lists of three.
+Everything is in single precision. Arrays are (S, Q), S directions from each of Q points, or (Q,). Vectors have their
+components first.
 """
 
 from __future__ import annotations
@@ -26,28 +29,30 @@ from ..shading import brdf, light_cone, light_tree
 from ..shading.lookup_table import WARP_REGULARIZATION
 from ..shading.polygon import convex_pieces
 
-# Bits of a point of the sequence: what fits into single precision.
+# Bits of a coordinate of the sequence, as many as single precision holds.
 BITS = 23
 _ZERO, _ONE, _TINY = np.float32(0.0), np.float32(1.0), np.float32(1e-30)
-# In sr: what is smaller is not seen.
+# In sr. Quadrilaterals with a smaller solid angle count as invisible.
 _LEAST_SOLID_ANGLE = np.float32(1e-20)
-# Of a sequence
+# Length of each sequence
 MOST_POINTS = 1024
-# Cells along each side of the picture of a light with a texture.
+# Cells along each side of the picture of a textured light.
 _PICTURE = 128
-# Cells along each side of a side of the sky; and how far from a sample the light is that stands for the sky, a plane,
-# by half its side.
+# CELLS: cells along each edge of a side of the sky. NEXT_TO: distance from a sample to the plane that stands for the
+# sky, in units of half the plane's side.
 CELLS, NEXT_TO = 64, 1e-3
-# Of the color of lights that are taken together, by its largest channel: 0.05 % of what they give may have another.
+# Decimals of a color, as a share of its largest channel, that must agree for lights to count as one: their colors
+# differ by at most 0.05 %.
 COLOR_DIGITS = 3
-# Corners of an ellipse to aim at
+# Corners of the outline of an ellipse
 _ROUND_CORNERS = 16
 
 
 def sequence(count: int, seed: int = 1) -> np.ndarray:
     """The first `count` points (2, count) of the Sobol sequence, uint32 of 23 bits, scrambled as by Owen (1995).
 
-    Every 2^k points, counted from the first, are stratified as well as can be. XOR with any number keeps that.
+    Each block of 2^k points that starts at a multiple of 2^k is stratified as well as can be. XOR with any number keeps
+    this property.
     """
     number = np.arange(count, dtype=np.uint32)
     points = np.zeros((2, count), np.uint32)
@@ -62,7 +67,8 @@ def sequence(count: int, seed: int = 1) -> np.ndarray:
 
 
 def _nested_scramble(values, seed):
-    """Laine and Karras 2011, "Stratified sampling for stochastic transparency", with the constants of Vegdahl."""
+    """Scrambled uint32 values: Laine and Karras 2011, "Stratified sampling for stochastic transparency", with the
+    constants of Vegdahl."""
     values = _reversed_bits(values) + np.uint32(seed * 0x9E3779B1 & 0xFFFFFFFF)
     for factor in (0x6C50B47C, 0xB82F1E52, 0xC7AFE638, 0x8D22F6E6):
         values = values ^ (values * np.uint32(factor))
@@ -80,8 +86,8 @@ _POINTS = [sequence(MOST_POINTS, seed) for seed in (1, 2)]
 
 
 def unit_points(seeds: np.ndarray, stream: int, first: int, last: int) -> list[np.ndarray]:
-    """Numbers x, y (S, Q) in (0, 1): points `first` to `last` of the sequence `stream`, 0 or 1, changed by the seeds
-    (Q,)."""
+    """Numbers x, y (S, Q) in (0, 1): the points `first` to `last` of the sequence `stream`, 0 or 1, scrambled by the
+    seeds (Q,)."""
     found = []
     for axis, points in enumerate(_POINTS[stream][:, first:last]):
         own = mixed_bits(seeds + np.uint32((2 * stream + axis) * 0x9E3779B1 & 0xFFFFFFFF)) >> np.uint32(32 - BITS)
@@ -93,7 +99,7 @@ def unit_points(seeds: np.ndarray, stream: int, first: int, last: int) -> list[n
 
 
 def seeds_of(position: np.ndarray) -> np.ndarray:
-    """Seeds (P,) uint32 of points (P, 3): the same wherever a point stands in a picture or a block."""
+    """Seeds (P,) uint32 of points (P, 3). They do not depend on the place of a point in a picture or a block."""
     bits = np.ascontiguousarray(position, dtype=np.float32).view(np.uint32)
     return mixed_bits(mixed_bits(mixed_bits(bits[:, 0]) ^ bits[:, 1]) ^ bits[:, 2])
 
@@ -106,10 +112,10 @@ def mixed_bits(values):
 
 
 class Emitter:
-    """What directions need of a light, the same for all points: a quadrilateral, and how bright the light is in it.
+    """The quadrilateral at which directions to a light aim, and the brightness of the light in it, for all points.
 
-    It is the light itself where that is a rectangle without a texture, a triangle or a convex quadrilateral; else
-    center + s axes[0] + t axes[1], |s|, |t| <= 1, around it.
+    The quadrilateral is the light itself if that is an untextured triangle or convex quadrilateral; a triangle repeats
+    its last corner. Otherwise it is the parallelogram center + s axes[0] + t axes[1], |s|, |t| <= 1, around the light.
     """
 
     def __init__(self, light: AreaLight):
@@ -125,19 +131,20 @@ class Emitter:
             self._edge = self._places(light.corners - light.center).astype(np.float32)
 
     def _own_corners(self) -> np.ndarray | None:
-        """Corners (4, 3) of a polygon that has no more, from the center of the light; a triangle repeats the last."""
+        """Corners (4, 3), relative to the center, of an untextured convex polygon of three or four corners; else None.
+        A triangle repeats its last corner."""
         if self.light.shape != "POLYGON" or self.light.detail:
             return None
         pieces = convex_pieces(self.outline)
         return pieces[0][[0, 1, 2, -1]] if len(pieces) == 1 and len(pieces[0]) <= 4 else None
 
     def _places(self, offset: np.ndarray) -> np.ndarray:
-        """Numbers s, t (..., 2) of points of the light's plane, (..., 3) from its center."""
+        """Coordinates s, t (..., 2) of points of the light's plane, given by offsets (..., 3) from its center."""
         return (offset - self.center) @ np.linalg.pinv(self.axes)
 
     def corners_from(self, offset: np.ndarray, height: np.ndarray) -> np.ndarray:
-        """Corners (3, 4, Q) of the quadrilateral from points with the center of the light at offset (3, Q), at height
-        (Q,) over its plane."""
+        """Corners (3, 4, Q) of the quadrilateral relative to points. The center of the light is at `offset` (3, Q) from
+        the points, and the points are at `height` (Q,) over its plane."""
         if self.corners is not None:
             return offset[:, None] + self.corners.T.astype(np.float32)[:, :, None]
         u, v = self.axes.astype(np.float32)[:, :, None]
@@ -147,7 +154,7 @@ class Emitter:
         return np.stack([middle + s * u + t * v for s, t in ends], axis=1)
 
     def _ranges(self, middle, height):
-        """From where to where along both axes the quadrilateral reaches: as far as the cone of a spread."""
+        """Ranges of s and t over which the quadrilateral extends: no farther than the cone of a spread reaches."""
         squares = (self.axes * self.axes).sum(axis=1)
         if not self.light.is_focused or abs(self.axes[0] @ self.axes[1]) > 1e-6 * squares.max():
             return ((-_ONE, _ONE), (-_ONE, _ONE))
@@ -159,8 +166,8 @@ class Emitter:
         return ranges
 
     def brightness(self, towards: np.ndarray, distance: np.ndarray, offset: np.ndarray, height: np.ndarray):
-        """Factors (S, Q) of the mean radiance along directions (3, S, Q) that meet the light's plane at `distance`
-        (S, Q), the others as for `corners_from`; None: all 1."""
+        """Radiance as factors (S, Q) of its mean, along directions (3, S, Q) that meet the light's plane at `distance`
+        (S, Q); None if all are 1. `offset` and `height` are as in `corners_from`."""
         factor = None
         if self.profile is not None:
             radius = np.sqrt(np.maximum(distance * distance - height * height, _ZERO))
@@ -178,8 +185,8 @@ class Emitter:
 
 
 def _parallelogram(light: AreaLight):
-    """Center, seen from that of the light, and half axes (2, 3) of a parallelogram around it: of a polygon the smallest
-    rectangle along an edge."""
+    """Center, relative to that of the light, and half axes (2, 3) of a parallelogram around the light. Around a polygon
+    it is the smallest rectangle along one of the edges."""
     if light.shape != "POLYGON":
         return np.zeros(3), np.stack([light.half_u, light.half_v])
     outline, best = light.corners - light.center, (np.inf, np.zeros(3), np.zeros((2, 3)))
@@ -194,7 +201,7 @@ def _parallelogram(light: AreaLight):
 
 
 def _inside(outline, s, t):
-    """Mask of the places s, t in a polygon (V, 2)."""
+    """Mask of the places s, t that lie in a polygon (V, 2)."""
     inside = np.zeros(s.shape, bool)
     for (x0, y0), (x1, y1) in zip(outline, np.roll(outline, -1, axis=0), strict=True):
         if y0 != y1:
@@ -203,12 +210,13 @@ def _inside(outline, s, t):
 
 
 def _cells(place):
-    """Rows or columns of the picture of a light at places from -1 to 1."""
+    """Rows or columns of a light's picture at coordinates from -1 to 1."""
     return np.clip((0.5 * _PICTURE) * (place + _ONE), 0, _PICTURE - 1).astype(np.intp)
 
 
 def picture_of(light, places_of):
-    """Brightness (_PICTURE, _PICTURE) of a textured light by the places of its patches, as a share of its mean."""
+    """Brightness (_PICTURE, _PICTURE) of a textured light in units of its mean. `places_of` returns the coordinates of
+    points."""
     grid = (np.arange(_PICTURE) + 0.5) * (2.0 / _PICTURE) - 1.0
     picture = np.zeros((_PICTURE, _PICTURE), np.float32)
     mean = max(np.abs(light.radiance).mean(), 1e-30)
@@ -221,10 +229,11 @@ def picture_of(light, places_of):
 
 
 def shared_numbers(lights: Sequence[AreaLight], tracer=None) -> tuple[tuple[int, ...], ...]:
-    """Which of the `lights` share their rays, and so the share of them that is seen: the squares of a sky, and lights
-    of one color, group and pass that light and are blocked by the same things, where there are FEWEST of them.
+    """Which of the `lights` share their rays, and so the share of them that is visible, as tuples of numbers.
 
-    Without a tracer everything is blocked by the same things.
+    The sides of a sky do. So do plain lights that have the same color, group and pass and are blocked by the same
+    things, if there are at least `light_tree.FEWEST` of them. Without a tracer, all lights count as blocked by the same
+    things.
     """
     shared: dict[tuple, list[int]] = {}
     masks: dict[str, tuple] = {}
@@ -241,7 +250,7 @@ def shared_numbers(lights: Sequence[AreaLight], tracer=None) -> tuple[tuple[int,
 
 
 def _kind(light, number, masks) -> tuple:
-    """What lights that share their rays have in common."""
+    """A key that is equal for lights that share their rays."""
     if _is_side(light):
         return "sky", light.name
     is_even = light.is_even and not (light.is_distant or light.is_facing or light.is_profiled or light.detail)
@@ -255,7 +264,7 @@ def _kind(light, number, masks) -> tuple:
 def emitters_of(
     lights: Sequence[AreaLight], tracer=None
 ) -> tuple[tuple[Emitter | Cluster, ...], tuple[tuple[int, ...], ...]]:
-    """Emitters, and which of the `lights` each stands for."""
+    """The emitters, and for each the numbers of the `lights` it stands for."""
     numbers, emitters = shared_numbers(lights, tracer), []
     for own in numbers:
         members = [lights[number] for number in own]
@@ -265,7 +274,7 @@ def emitters_of(
 
 
 def _is_side(light: AreaLight) -> bool:
-    """True for a side of the cube around all samples."""
+    """True for a side of the sky, a cube around all samples."""
     if not light.is_distant or light.shape != "RECTANGLE":
         return False
     axes = np.stack([light.center, light.half_u, light.half_v])
@@ -273,7 +282,7 @@ def _is_side(light: AreaLight) -> bool:
 
 
 class Sky(Emitter):
-    """The sides of a cube as one emitter; its `light` has their mean radiance and next to nothing else of them."""
+    """The sides of a cube as one emitter. Its `light` has their mean radiance; its shape is a mere placeholder."""
 
     def __init__(self, sides: Sequence[AreaLight]):
         self.ahead = np.repeat(np.eye(3, dtype=np.float32), 2, axis=0)
@@ -311,8 +320,8 @@ class Sky(Emitter):
         self.chosen_as = tuple(sides)
 
     def directions(self, x: np.ndarray, y: np.ndarray, normal: np.ndarray) -> np.ndarray:
-        """Unit vectors (3, S, Q) for numbers (S, Q) in [0, 1): half of them by their brightness, of which those below
-        the horizon of `normal` (3, Q) are mirrored, half of them by their cosine."""
+        """Unit vectors (3, S, Q) for numbers (S, Q) in [0, 1). Half of them follow the brightness of the sky; those
+        below the horizon of `normal` (3, Q) are mirrored. The other half follow the cosine."""
         by_picture = x < np.float32(0.5)
         x = np.where(by_picture, np.float32(2.0) * x, np.float32(2.0) * x - _ONE)
         return np.where(by_picture, self._by_picture(x, y, normal), _by_cosine(x, y, normal))
@@ -333,7 +342,7 @@ class Sky(Emitter):
         return found
 
     def density(self, directions: np.ndarray, normal: np.ndarray) -> np.ndarray:
-        """Of `directions` per sr, for unit directions (3, S, Q) above the horizon of `normal`."""
+        """Probability density (S, Q) per sr of unit directions (3, S, Q) above the horizon of `normal`."""
         height = dot(directions, normal[:, None])
         mirrored = directions - np.float32(2.0) * height * normal[:, None]
         found = self._plain_density(directions) + self._plain_density(mirrored)
@@ -346,11 +355,11 @@ class Sky(Emitter):
         return self.chances[cell] * np.float32(CELLS * CELLS / 4.0) / (along * along * along)
 
     def brightness_along(self, directions: np.ndarray) -> np.ndarray:
-        """Factors (S, Q) of the mean radiance along unit directions (3, S, Q)."""
+        """Radiance as factors (S, Q) of its mean, along unit directions (3, S, Q)."""
         return self.values[self._cells(directions)[0]]
 
     def _cells(self, directions):
-        """Number (S, Q) of the cell, and the largest component, of unit directions (3, S, Q)."""
+        """Numbers (S, Q) of the cells that unit directions (3, S, Q) meet, and the largest components of these."""
         sizes = np.abs(directions)
         axis = np.argmax(sizes, axis=0)
         along = np.take_along_axis(sizes, axis[None], axis=0)[0]
@@ -367,7 +376,7 @@ class Sky(Emitter):
 
 
 def _by_cosine(x, y, normal):
-    """Unit vectors (3, S, Q) around normals (3, Q), by the cosine."""
+    """Unit vectors (3, S, Q) around normals (3, Q), distributed as the cosine."""
     sign = np.copysign(_ONE, normal[2])
     a = -_ONE / (sign + normal[2])
     b = normal[0] * normal[1] * a
@@ -380,7 +389,7 @@ def _by_cosine(x, y, normal):
 
 
 def _cells_of(side: AreaLight) -> np.ndarray:
-    """Brightness (CELLS, CELLS) by the mean, rows along half_v, columns along half_u."""
+    """Brightness (CELLS, CELLS) in units of the mean; rows along half_v, columns along half_u."""
     if not side.detail:
         return np.ones((CELLS, CELLS))
     axes = np.linalg.pinv(np.stack([side.half_u, side.half_v]))
@@ -390,12 +399,13 @@ def _cells_of(side: AreaLight) -> np.ndarray:
 
 
 class Cluster:
-    """Many plain lights of one color as one emitter: a ray goes to one of them, chosen by what it may give the sample.
+    """Many plain lights of one color as one emitter: each ray goes to one light, chosen by what it may give the sample.
 
-    The lights, cut into quadrilaterals, are the leaves of a tree. Down from its root a ray takes either half of a node
-    as likely as the bounds on distance, on cosines and on the lobe say that it is bright: 0 only where nothing arrives
-    (Conty Estevez and Kulla 2018, "Importance sampling of many lights with adaptive tree splitting",
-    doi:10.1145/3233305). `light` stands for all of them: it has their mean power, and reaches as far.
+    The lights, cut into quadrilaterals, are the leaves of a binary tree. A ray goes down from the root. It takes a half
+    of a node with a probability proportional to a bound on the light of that half; the bound covers distance, cosines
+    and the lobe, and is 0 only where no light arrives (Conty Estevez and Kulla 2018, "Importance sampling of many
+    lights with adaptive tree splitting", doi:10.1145/3233305). `light` stands for all of them: it has their total
+    power, and reaches as far as they do.
     """
 
     def __init__(self, lights: Sequence[AreaLight]):
@@ -434,7 +444,7 @@ class Cluster:
         self._build(corners, normal, values * area)
 
     def _build(self, corners, normal, power):
-        """The nodes, the root first."""
+        """Set the arrays of the nodes, with the root first."""
         low, high = corners.min(axis=1), corners.max(axis=1)
         order, start, end, self.children = light_tree.ranges(0.5 * (low + high), normal)
         alone = end - start == 1
@@ -455,8 +465,8 @@ class Cluster:
         self.power = (sums / sums[0]).astype(np.float32)
 
     def pick(self, x: np.ndarray, lobes: Sequence[ClusterLobe], own: np.ndarray):
-        """Leaves (R,), by lobe how likely (R,) each is taken, and what is left of the numbers x (R,) in [0, 1), for
-        rays that go by the lobe `own` (R,)."""
+        """The leaves (R,) that rays take, the probability (R,) of each by lobe, and the numbers x (R,) in [0, 1),
+        rescaled for reuse. Ray r chooses by the lobe `own[r]`."""
         node, chances = np.zeros(len(x), np.intp), np.ones((len(lobes), len(x)), np.float32)
         while True:
             inner = np.flatnonzero(self.leaf[node] < 0)
@@ -475,7 +485,7 @@ class Cluster:
             node[inner] = np.where(is_first, one, other)
 
     def _bounds(self, node, lobes, rays):
-        """By lobe, about how much light (R,) of a node, at most, the `rays` (R,) get."""
+        """By lobe, an approximate upper bound (R,) on the light that the `rays` (R,) get from their nodes."""
         offset = self.center[:, node] + lobes[0].offset[:, rays]
         squares = np.maximum(dot(offset, offset), _TINY)
         distance, radius = np.sqrt(squares), self.radius[node]
@@ -487,21 +497,21 @@ class Cluster:
         return np.stack([light * lobe.at_most(offset, spread, rays) for lobe in lobes])
 
 
-# In rad, for what single precision leaves of angles.
+# In rad, the error of angles in single precision.
 _SLACK = np.float32(2e-3)
 
 
 @dataclass(frozen=True)
 class ClusterLobe:
-    """What bounds a lobe of rays: vectors (3, R) and values (R,)."""
+    """What bounds the lobe of each ray: vectors (3, R) and values (R,)."""
 
-    offset: np.ndarray  # m, to the center of the cluster
+    offset: np.ndarray  # m, from the sample to the center of the cluster
     normal: np.ndarray
-    mirrored: np.ndarray | None = None  # the mirrored view, of specular lobes
+    mirrored: np.ndarray | None = None  # the mirrored view; specular lobes only
     width: np.ndarray | None = None  # in rad
 
     def at_most(self, directions, spread, rays):
-        """Of the lobe (R,) in cones of an angle `spread` (R,) around `directions` (3, R)."""
+        """Upper bound (R,) of the lobe within angles `spread` (R,) of `directions` (3, R)."""
         cosine = _cosine_at_most(dot(directions, self.normal[:, rays]), spread)
         if self.mirrored is None:
             return cosine
@@ -512,13 +522,13 @@ class ClusterLobe:
 
 
 def _cosine_at_most(cosine, spread):
-    """The largest cosine (R,), not below 0, of angles that differ by at most `spread` (R,) from those of `cosine`."""
+    """Upper bound (R,), not below 0, on the cosines of angles within `spread` (R,) of arccos `cosine` (R,)."""
     angle = np.maximum(np.arccos(np.clip(cosine, -_ONE, _ONE)) - spread, _ZERO)
     return np.where(angle < np.float32(0.5 * np.pi), np.maximum(np.cos(angle), _ZERO), _ZERO)
 
 
 def _levels(children):
-    """First and last number of the nodes of each level."""
+    """First number and end of the nodes of each level."""
     levels = [(0, 1)]
     while True:
         first, last = levels[-1]
@@ -529,8 +539,8 @@ def _levels(children):
 
 
 def _quads_of(light: AreaLight) -> list[np.ndarray]:
-    """Convex quadrilaterals (4, 3), of which triangles repeat the last corner, that a light consists of; the
-    parallelogram around a round one."""
+    """Convex quadrilaterals (4, 3) that make up a light; triangles repeat their last corner. A round light gives the
+    parallelogram around it."""
     if light.shape != "POLYGON":
         u, v = light.half_u, light.half_v
         return [light.center + np.stack([-u - v, u - v, u + v, v - u])]
@@ -546,14 +556,14 @@ def _quads_of(light: AreaLight) -> list[np.ndarray]:
 class SphericalQuads:
     """Quadrilaterals (3, 4, Q) as points see them, for directions spread evenly over their solid angles (Q,).
 
-    Two triangles on either side of a diagonal, sampled as in Peters 2021, "BRDF importance sampling for polygonal
+    A diagonal splits each into two triangles, sampled as in Peters 2021, "BRDF importance sampling for polygonal
     lights", section 3 (after Arvo 1995), doi:10.1145/3450626.3459672.
     """
 
     def __init__(self, corners: np.ndarray):
         unit = corners / np.maximum(np.sqrt(dot(corners, corners)), _TINY)
         self.apex, far, self.near = unit[:, 0], unit[:, 2], (unit[:, 1], unit[:, 3])
-        # By sums and differences: corners may be close to each other, or nearly opposite.
+        # Sums and differences stay accurate for corners that are close to each other or nearly opposite.
         self.both, chord = self.apex + far, far - self.apex
         self.gap = np.float32(0.5) * dot(self.both, self.both)
         self.terms, angles = [], []
@@ -568,7 +578,7 @@ class SphericalQuads:
         np.maximum(self.solid_angle, _LEAST_SOLID_ANGLE, out=self.solid_angle)
 
     def part(self, rows: slice) -> SphericalQuads:
-        """The `rows` of quadrilaterals (3, 4, S, Q), of which each sample has several."""
+        """The quadrilaterals of these `rows`, if they are (3, 4, S, Q): each sample sees several."""
         found = copy.copy(self)
         for name in ("apex", "both"):
             setattr(found, name, getattr(self, name)[:, rows])
@@ -579,14 +589,14 @@ class SphericalQuads:
         return found
 
     def directions(self, x: np.ndarray, y: np.ndarray, out: np.ndarray) -> np.ndarray:
-        """Unit vectors `out` (3, S, Q) for numbers (S, Q) in [0, 1), which are lost."""
+        """Unit vectors `out` (3, S, Q) for numbers x, y (S, Q) in [0, 1), which are overwritten."""
         x *= self.solid_angle
         is_second = x > self.first
         x -= np.where(is_second, self.first, _ZERO)
         x *= np.float32(0.5)
         volume, near_gap, near_both = (np.where(is_second, b, a) for a, b in zip(*self.terms, strict=True))
         cosine, sine = np.cos(x), np.sin(x, out=x)
-        # The third corner of the part of the triangle that has the solid angle: `apex` and `both` times these.
+        # The third corner of the subtriangle with this solid angle is on_apex `apex` + on_both `both`.
         on_apex = np.multiply(cosine, volume, out=volume)
         on_apex -= (self.gap + near_both) * sine
         on_both = sine
@@ -602,7 +612,7 @@ class SphericalQuads:
         on_apex *= scale
         on_apex -= _ONE
         on_both *= scale
-        # Between the corner `near` and that one.
+        # The cosine between the corner `near` and that third corner.
         near_gap -= _ONE
         near_gap *= on_apex
         near_both *= on_both
@@ -624,18 +634,19 @@ class SphericalQuads:
             np.multiply(near, height, out=out[k])
             out[k] += on_apex * self.apex[k]
             out[k] += on_both * self.both[k]
-        # Rounding leaves a little.
+        # Correct what rounding changed.
         length = np.sqrt(dot(out, out))
         out /= np.maximum(length, _TINY, out=length)
         return out
 
 
 class Warps:
-    """The maps from the world to where GGX lobes have no peak: local frames, then the warps of `shading.lookup_table`
-    with A, B and C = 1, the limit for alpha -> 0."""
+    """Maps from the world to coordinates in which GGX lobes have no peak: the local frames, then the warps of
+    `shading.lookup_table` with A, B and C = 1, the limit for alpha -> 0."""
 
     def __init__(self, rows: np.ndarray, cosine: np.ndarray, sine: np.ndarray, alpha: np.ndarray):
-        """Local frames (3, 3, Q); cosine and sine of the view's angle from the normal, and alpha, (Q,)."""
+        """`rows` are local frames (3, 3, Q); `cosine` and `sine` are of the view's angle from the normal, (Q,) as is
+        `alpha`."""
         self.rows = rows
         self.xx = cosine * cosine + np.float32(WARP_REGULARIZATION**2) * alpha * alpha
         self.xz = np.sqrt(self.xx) * sine
@@ -643,11 +654,11 @@ class Warps:
         self.determinant = self.xx * self.zz
 
     def local(self, vectors: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-        """Vectors (3, S, Q) along the local frames of those in the world."""
+        """World vectors (3, S, Q) in the local frames."""
         return self._turned(vectors, self.rows, out)
 
     def world(self, vectors: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
-        """Vectors (3, S, Q) in the world of those in the local frames."""
+        """Local vectors (3, S, Q) in the world."""
         return self._turned(vectors, self.rows.transpose(1, 0, 2), out)
 
     def _turned(self, vectors, rows, out):
@@ -659,17 +670,17 @@ class Warps:
         return out
 
     def warped(self, local: np.ndarray) -> np.ndarray:
-        """Vectors (3, S, Q) after the warp of those in the local frames."""
+        """Local vectors (3, S, Q) after the warp."""
         return np.stack([self.xx * local[0] + self.xz * local[2], local[1], self.zz * local[2]])
 
     def lengths(self, local: np.ndarray) -> np.ndarray:
-        """Lengths (S, Q) after the warp of unit vectors (3, S, Q) in the local frames."""
+        """Lengths (S, Q) that unit local vectors (3, S, Q) have after the warp."""
         warped = self.warped(local)
         warped *= warped
         return np.sqrt(warped[0] + warped[1] + warped[2])
 
     def unwarped(self, vectors: np.ndarray) -> np.ndarray:
-        """Turn warped unit vectors (3, S, Q) into unit vectors in the local frames, and return their `lengths`."""
+        """Turn warped unit vectors (3, S, Q) in place into unit local vectors, and return the `lengths` of these."""
         x, y, z = vectors
         z /= self.zz
         x -= self.xz * z
@@ -685,9 +696,9 @@ class Warps:
 
 
 def frames(normal: np.ndarray, view: np.ndarray):
-    """Cosine and sine (Q,) of the view's angle from the normal, both (3, Q), and local frames (3, 3, Q): rows tangent,
+    """Cosine and sine (Q,) of the angle between view and normal, both (3, Q), and local frames (3, 3, Q): rows tangent,
     bitangent, normal."""
-    # The difference of vectors that are close is exact; a normal from single precision is not quite a unit vector.
+    # Differences of close vectors are exact. A single-precision normal is not quite a unit vector.
     across = view - normal
     squared = dot(normal, normal)
     across -= dot(across, normal) / squared * normal
@@ -712,9 +723,8 @@ def _cross(a, b):
 class Choices:
     """How likely Cycles chooses directions from samples (P) by `lights` (L) and by the lobes of the surface.
 
-    Both see the light past different things. Rays that the light chose start above a curved surface, and nothing
-    blocks them where the light casts no shadow; rays that the surface chose start at the surface, and are always
-    blocked.
+    Who chose a ray decides what it meets. Rays that the light chose start above a curved surface, and are not blocked
+    if the light casts no shadow. Rays that the surface chose start at the surface, and are always blocked.
     """
 
     def __init__(self, samples: SurfaceSamples, lights: Sequence[AreaLight], is_baked: bool):
@@ -722,10 +732,10 @@ class Choices:
         self._first = None
 
     def _prepare(self):
-        """What is needed once something is asked for, which in most scenes is never."""
+        """Compute the chances on first use; most scenes never need them."""
         samples = self._samples
         moved = np.any(samples.position[1:] != samples.position[:-1], axis=1)
-        # The samples of a hit follow one another.
+        # The samples of one hit are consecutive.
         self._hit = np.concatenate([np.zeros(min(len(samples), 1), int), np.cumsum(moved)])
         self._count = np.bincount(self._hit)
         self._first = np.cumsum(self._count) - self._count
@@ -734,8 +744,8 @@ class Choices:
         self._rows = light_rows(self._lights)
 
     def by_surface(self, name: str, number: int, index, directions, solid_angle) -> np.ndarray:
-        """Share (R,) of the light of light `number`, which has the `solid_angle` (R,), that a pass gets because the
-        surface chose the unit directions (3, R), from the samples `index` (R,)."""
+        """Share (R,) of the light of light `number` that a pass gets because the surface chose the unit directions
+        (3, R), seen from the samples `index` (R,). The light has the `solid_angle` (R,) in sr."""
         if self._first is None:
             self._prepare()
         by_light = self._chance(number, index) / np.maximum(solid_angle, 1e-12)
@@ -750,13 +760,13 @@ class Choices:
         return self._chances[number, index]
 
     def _density(self, name, index, directions):
-        """Probability (R,) per sr that the lobes of a hit choose the directions (R, 3)."""
+        """Probability density (R,) per sr with which the lobes of a hit choose the directions (R, 3)."""
         hit, density = self._hit[index], np.zeros(len(index))
         for number in range(self._count[hit].max(initial=0)):
             here = np.flatnonzero(self._count[hit] > number)
             own = self._first[hit[here]] + number
             specular, diffuse = self._lobes[:, own]
-            # Bakes of a pass choose by its lobes alone.
+            # A bake of one pass chooses by the lobes of that pass alone.
             if self._is_baked:
                 whole = np.maximum(self._sum_of_hit(name, hit[here]), 1e-12)
                 specular, diffuse = (

@@ -1,4 +1,4 @@
-"""What stands in the way of light: triangle meshes, instances of them, and how much light they let through."""
+"""Occluders: triangle meshes, instances of them, and how much light they let through."""
 
 from __future__ import annotations
 
@@ -12,26 +12,26 @@ import numpy as np
 from ..cycles.images import EXTENSIONS, INTERPOLATIONS, interpolated, within
 from ..files import replacing
 
-# Bits of a mask: all kinds of rays.
+# Mask of all kinds of rays.
 ALL_RAYS = 0xFFFFFFFF
 # Cycles' default of `Object.cycles.shadow_terminator_geometry_offset`.
 TERMINATOR_OFFSET = 0.1
-# Cycles' default of transparent bounces: further transparent surfaces block.
+# Cycles' default of transparent bounces. A ray that meets more transparent surfaces is blocked.
 TRANSPARENT_SURFACES = 8
-# So many transparent surfaces are as good as any number: what lets all light through need not be counted.
+# From this number of transparent surfaces on, parts that let all light through are dropped and no longer count.
 UNLIMITED = 1024
-# Of all meshes with an image
+# Most parts of all meshes with an image
 MOST_PARTS = 1 << 17
-# A ray goes on from a transparent surface by so much of its distance.
+# A ray continues behind a transparent surface at this multiple of its distance.
 STEP = np.float32(1.0 + 2.0**-21)
 
 
 @dataclass(frozen=True)
 class Transparency:
-    """Share of light that a surface lets through: `share`, where there is an image times what it has at `uv`.
+    """Share of light that a surface lets through: `share`, times the value of `image` at `uv` if there is one.
 
-    Colors count by their mean. The image (H, W) holds shares, row 0 below; `uv` (T, 3, 2) has the corners of the
-    triangles on it.
+    Colors count by their mean. The image (H, W) holds shares, with row 0 at the bottom. `uv` (T, 3, 2) places the
+    corners of the triangles on it.
     """
 
     share: float = 1.0
@@ -39,8 +39,8 @@ class Transparency:
     uv: np.ndarray | None = None
     extension: str = "REPEAT"  # one of EXTENSIONS
     interpolation: str = "Linear"  # one of INTERPOLATIONS
-    outside: float = 1.0  # what stands for the image beside it, where `extension` is CLIP
-    # Places and shares, both increasing or the shares decreasing: those of the image are looked up after interpolation.
+    outside: float = 1.0  # value beside the image if `extension` is CLIP
+    # Values and shares, both increasing, or the shares decreasing: turns interpolated values of the image into shares.
     curve: tuple[tuple[float, ...], tuple[float, ...]] | None = None
 
     def __post_init__(self):
@@ -55,7 +55,7 @@ class Transparency:
             )
 
     def shares(self, triangle: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Shares (Q,) at the points (1 - u - v) a + u b + v c of the triangles (Q,)."""
+        """Shares (Q,) at the points (1 - u - v) a + u b + v c of triangles (Q,) with corners a, b, c."""
         if self.image is None:
             return np.full(len(triangle), self.share, np.float32)
         a, b, c = np.moveaxis(self.uv[triangle], 1, 0)
@@ -72,7 +72,7 @@ class Transparency:
         return interpolated(uv, (width, height), self.interpolation, self._pixel)
 
     def _pixel(self, x, y):
-        """Shares of pixels anywhere in the plane; all light passes where there is no image."""
+        """Values of pixels, which may lie outside the image."""
         height, width = self.image.shape
         columns, rows = within(x, width, self.extension), within(y, height, self.extension)
         found = self.image[rows, columns]
@@ -85,13 +85,13 @@ class Transparency:
 class OccluderMesh:
     """Triangles in the space of an object.
 
-    `normals` are those of smooth shading, at vertices (V, 3) or at corners (T, 3, 3); left out: it is flat. Triangles
-    that stand for a hair or a point have a `thickness` (T,): what is shaded is no farther from them.
+    `normals` are those of smooth shading, at vertices (V, 3) or at corners (T, 3, 3); a flat mesh has none. Triangles
+    that stand for hairs or points have a `thickness` (T,): the largest distance of a shaded point from them.
     """
 
     vertices: np.ndarray  # (V, 3) float32
     triangles: np.ndarray  # (T, 3) uint32
-    transparency: Transparency | None = None  # None: it blocks
+    transparency: Transparency | None = None  # None: it blocks all light
     normals: np.ndarray | None = None
     thickness: np.ndarray | None = None
 
@@ -121,8 +121,8 @@ class OccluderMesh:
 
 @dataclass(frozen=True)
 class ChosenBy:
-    """Which shadow rays Cycles sends to a light: `light`, rays that the light chooses (off without Cast Shadow), and
-    `surface`, rays that the surface chooses (off without multiple importance sampling)."""
+    """Which shadow rays Cycles sends to a light: rays that the `light` chooses (not without Cast Shadow), and rays that
+    the `surface` chooses (not without multiple importance sampling)."""
 
     light: bool = True
     surface: bool = True
@@ -130,13 +130,14 @@ class ChosenBy:
 
 @dataclass(frozen=True)
 class Occluders:
-    """`meshes` and I instances: `mesh` (I,) is the number of each one's mesh, `matrices` (I, 3, 4) take it to world
-    space. An instance blocks rays that have a bit of its `masks` (I,) uint32; left out: all.
+    """`meshes`, and I instances. `mesh` (I,) is the number of each one's mesh; `matrices` (I, 3, 4) take it to world
+    space. An instance blocks rays that share a bit with its `masks` (I,) uint32; by default, all rays.
 
-    `terminators` (I,) are as `shadow_terminator_geometry_offset` of Cycles; left out: its default.
-    A ray through more than `transparent_surfaces` ends. `light_masks` are the masks of rays to lights, by their names,
-    and `lone_choices` says which lights are met by rays that the "light" or the "surface" chooses alone. Rays that the
-    surface chooses have the mask of the light shifted by `surface_shift` bits: some objects block them alone, or not.
+    `terminators` (I,) are Cycles' `shadow_terminator_geometry_offset`; by default, its default. A ray through more than
+    `transparent_surfaces` is blocked. `light_masks` are the masks of rays to lights, by their names. `lone_choices`
+    names the lights that only rays chosen by the "light", or only rays chosen by the "surface", can meet. Rays that the
+    surface chooses have the mask of the light shifted by `surface_shift` bits, because some objects block only these,
+    or all but these.
     """
 
     meshes: tuple[OccluderMesh, ...]
@@ -169,27 +170,28 @@ class Occluders:
         object.__setattr__(self, "meshes", tuple(self.meshes))
 
     def split(self) -> tuple[np.ndarray, np.ndarray]:
-        """Numbers of the instances that block, and of those that let light through; without triangles: neither."""
+        """Numbers of the instances that block, and of those that let light through. Those without triangles are in
+        neither."""
         is_clear = np.array([mesh.transparency is not None for mesh in self.meshes], bool)[self.mesh]
         is_there = np.array([len(mesh.triangles) > 0 for mesh in self.meshes], bool)[self.mesh]
         return np.flatnonzero(is_there & ~is_clear), np.flatnonzero(is_there & is_clear)
 
     def mask_of(self, light: str) -> int:
-        """Mask of the rays to the light of that name; 0: nothing is in its way."""
+        """Mask of the rays to the light of that name; 0 if nothing is in its way."""
         return self.light_masks.get(light, 1)
 
     def surface_mask_of(self, light: str) -> int:
-        """As `mask_of`, of rays that the surface chooses."""
+        """As `mask_of`, for rays that the surface chooses."""
         return self.mask_of(light) << self.surface_shift
 
     def chosen_by(self, light: str) -> ChosenBy:
-        """Which rays to the light of that name there are."""
+        """Which kinds of rays to the light of that name exist."""
         alone = self.lone_choices.get(light)
         return ChosenBy(light=alone != "surface", surface=alone != "light")
 
     @property
     def triangle_count(self) -> int:
-        """Number of triangles, those of each instance counted."""
+        """Number of triangles over all instances."""
         sizes = np.array([len(mesh.triangles) for mesh in self.meshes], np.int64)
         return int(sizes[self.mesh].sum()) if len(self.mesh) else 0
 
@@ -224,7 +226,7 @@ class Occluders:
 
     @classmethod
     def load(cls, path: str | os.PathLike) -> Occluders:
-        """What `save` wrote. Raises OSError, ValueError."""
+        """The occluders that `save` wrote. Raises OSError and ValueError."""
         with np.load(Path(path)) as data:
             arrays = {name: data[name] for name in data.files}
         if "about" not in arrays:
@@ -251,20 +253,20 @@ _SETTINGS = "transparent_surfaces", "light_masks", "lone_choices", "surface_shif
 
 @dataclass(frozen=True)
 class Hits:
-    """What H of R rays meet: the `ray`, how far away, which triangle of which instance, where on it."""
+    """What H of R rays meet: the number of the `ray`, the distance, the instance, its triangle, and the place on it."""
 
     ray: np.ndarray  # (H,)
     distance: np.ndarray  # (H,) m
     instance: np.ndarray  # (H,)
     triangle: np.ndarray  # (H,)
-    u: np.ndarray  # (H,) share of the second corner
-    v: np.ndarray  # (H,) share of the third
+    u: np.ndarray  # (H,) weight of the second corner
+    v: np.ndarray  # (H,) weight of the third corner
 
 
 @dataclass(frozen=True)
 class Parts:
-    """Triangles (T) to be traced for a mesh: the `triangle` (T,) of it that each is a part of, and where: the numbers
-    u, v of its corners there, (T, 3, 2)."""
+    """T triangles to trace instead of a mesh. Each is a part of a `triangle` (T,) of the mesh; `corners` (T, 3, 2) are
+    the weights u, v of its corners there."""
 
     triangle: np.ndarray
     corners: np.ndarray
@@ -274,20 +276,21 @@ class Parts:
         return _placed(mesh.vertices[mesh.triangles[self.triangle]].astype(np.float64), self.corners)
 
     def take(self, mask: np.ndarray) -> Parts:
-        """Those where `mask` (T,) is true."""
+        """The parts for which `mask` (T,) is True."""
         return Parts(self.triangle[mask], self.corners[mask])
 
     def quarters(self) -> Parts:
-        """The four parts (4 T) of each into which the middles of its sides cut it."""
+        """The four parts (4 T) into which the midpoints of its sides cut each."""
         middles = 0.5 * (self.corners + self.corners[:, [1, 2, 0]])
         a, b, c = (np.stack([self.corners[:, k], middles[:, k], middles[:, k - 1]], axis=1) for k in range(3))
         return Parts(np.tile(self.triangle, 4), np.concatenate([a, b, c, middles]))
 
 
 def cut_outs(occluders: Occluders) -> dict[int, tuple[Parts, Parts]]:
-    """By number, for meshes with an image: the parts that block all light, and the parts that may let some through.
+    """For meshes with an image, by number: the parts that block all light, and the parts that may let some through.
 
-    So that few rays have to look at the image. Parts overlap a little: no ray slips between those of different sizes.
+    With them, few rays have to look at the image. Parts overlap a little, so that no ray slips between parts of
+    different sizes.
     """
     cut = [
         number
@@ -330,14 +333,15 @@ def _cut_out(mesh, most, drops_clear):
     )
 
 
-# Corners of a triangle, how often one is cut into four, and how large in pixels it still is then.
+# _WHOLE: corners of a triangle. _LEVELS: most cuts of a triangle into four. _FINEST: size in pixels at which cutting
+# stops.
 _WHOLE, _LEVELS, _FINEST = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), 8, 1.5
-# The most that parts may overlap, as a share of their triangle
+# Largest overlap of parts as a share of their triangle.
 _WIDEST = 2.0**-12
 
 
 def _overlaps(mesh):
-    """Shares (T,) of triangles by which their parts overlap: more than the rounding of coordinates."""
+    """Shares (T,) of triangles by which their parts overlap, more than the rounding of coordinates."""
     a, b, c = np.moveaxis(mesh.vertices[mesh.triangles].astype(np.float64), 1, 0)
     longest = np.sqrt(np.maximum.reduce([np.square(side).sum(axis=1) for side in (b - a, c - b, a - c)]))
     height = np.linalg.norm(np.cross(b - a, c - a), axis=1) / np.maximum(longest, 1e-30)
@@ -346,7 +350,7 @@ def _overlaps(mesh):
 
 
 def _placed(corners, places):
-    """Points (T, N, K) at the numbers u, v (T, N, 2) of triangles (T, 3, K)."""
+    """Points (T, N, K) with the weights u, v (T, N, 2) of triangles (T, 3, K)."""
     a, b, c = np.moveaxis(corners[:, :, None], 1, 0)
     u, v = places[..., :1], places[..., 1:]
     return (1.0 - u - v) * a + u * b + v * c
@@ -354,15 +358,15 @@ def _placed(corners, places):
 
 @dataclass(frozen=True)
 class _Counts:
-    """How many pixels of an image are of a kind, left of and below each."""
+    """How many pixels of an image are of a kind, to the left of and below each pixel."""
 
     sums: np.ndarray  # (H + 1, W + 1)
     repeats: bool
-    reach: float  # of a pixel from its middle, beyond which it counts no more
+    reach: float  # distance in pixels from its center up to which a pixel counts
 
     @classmethod
     def of(cls, mask, clear: Transparency, is_outside: bool) -> _Counts:
-        """Of a mask (H, W), with a pixel around it for what is beside the image."""
+        """For a mask (H, W). If the image does not repeat, a border of one pixel stands for what is beside it."""
         if clear.extension != "REPEAT":
             mode = {"constant_values": is_outside} if clear.extension == "CLIP" else {"mode": "edge"}
             mask = np.pad(mask, 1, **mode)
@@ -371,7 +375,7 @@ class _Counts:
         return cls(sums, clear.extension == "REPEAT", 0.5 if clear.interpolation == "Closest" else 1.0)
 
     def all_within(self, low, high):
-        """Mask (T,) of boxes from `low` to `high` (T, 2), in pixels, that see nothing else."""
+        """Mask (T,) of the boxes from `low` to `high` (T, 2), in pixels, that see only pixels of the kind."""
         slack = 0.01 + 1e-6 * np.maximum(np.abs(low), np.abs(high))
         first = np.ceil(low - 0.5 - self.reach - slack).astype(np.int64)
         last = np.floor(high - 0.5 + self.reach + slack).astype(np.int64) + 1
@@ -385,7 +389,7 @@ class _Counts:
         return found == (last - first).prod(axis=1)
 
     def _below(self, x, y):
-        """How many there are left of columns x (T,) and below rows y (T,)."""
+        """Number (T,) of pixels of the kind to the left of columns x (T,) and below rows y (T,)."""
         if not self.repeats:
             return self.sums[y, x]
         (rows, y), (columns, x) = np.divmod(y, self.sums.shape[0] - 1), np.divmod(x, self.sums.shape[1] - 1)

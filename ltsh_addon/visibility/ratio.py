@@ -1,12 +1,13 @@
 """The share of each light that each sample sees: `visible_shares`.
 
 The ratio estimator (Heitz, Hill and McGuire 2018, "Combining analytic direct illumination and stochastic shadows",
-doi:10.1145/3190834.3190852): shadowed radiance = closed form x sum(w V) / sum(w), V the transmittance of rays to the
-light, w what the pass makes of the light along them, over the density of the rays. The same rays serve both passes.
+doi:10.1145/3190834.3190852): shadowed radiance = closed form x sum(w V) / sum(w). V is the transmittance of a ray to
+the light. w is what the pass reflects of the light along the ray, divided by the probability density of the ray. Both
+passes use the same rays.
 
-A few probes go to every pair of a sample and a light. Those that all arrive, or are all blocked, settle it, unless a
-neighbor in the picture found otherwise. The pairs that are left take as many rays as they are worth by their light.
-The place of a sample in a picture or a block decides nothing but which samples are its neighbors there.
+Every pair of a sample and a light gets a few probe rays. If all arrive, or all are blocked, the pair is settled, unless
+a neighbor in the picture found otherwise. The other pairs get more rays, the more light they reflect.
+The result for a sample depends on its neighbors, but not on its place in the picture or in a block.
 """
 
 from __future__ import annotations
@@ -39,40 +40,43 @@ from .directions import (
 )
 from .starts import Starts
 
-# Rays of the first look at a pair, and between two looks at the memory.
+# Number of rays of the first look at a pair. More rays come in multiples of it.
 PROBES = 8
 MOST_RAYS = 1024
-# Rays of a block: its arrays stay in the cache.
+# Rays of a block, few enough for its arrays to stay in the cache.
 BLOCK_RAYS = 1 << 15
-# Samples of a block that one process takes at a time.
+# Samples that one process takes at a time.
 BLOCK_SAMPLES = 1 << 14
-# What probes for all pairs take, in processor seconds, where a process that helps is worth its start.
+# Processor seconds for the probes of all pairs from which on a helping process is worth its start.
 SECONDS_WORTH_A_CHILD = 1.0
-# How many of PROBES rays are chosen evenly: for pairs with both lobes, a diffuse and a specular one; when both count
-# alike, as at first, when the specular one counts more, and when the diffuse one does.
+# How many of PROBES rays are spread evenly over the light; the specular lobe chooses the others. Rows: pairs with both
+# lobes, with a diffuse lobe only, with a specular lobe only. Columns: both lobes count alike (always so for the
+# probes), the specular lobe counts more, the diffuse lobe counts more.
 EVENLY = np.array([[4, 2, 6], [8, 8, 8], [2, 2, 2]])
-# Pairs are worth rays by their light over that of a typical sample, to this power: the square root of the variance of
-# stratified rays falls with their number to the power -0.8.
+# A pair gets rays in proportion to this power of its light relative to that of a typical sample. The reason: the square
+# root of the variance of stratified rays falls with their number to the power -0.8.
 WORTH_POWER = 0.75
-# Of the most rays a pair can take, how many one takes that is as bright as a typical sample.
+# Rays of a pair as bright as a typical sample, as a share of the most rays of a pair.
 TYPICAL_SHARE = 0.4
+# Numbers of rays that a pair may get, besides the probes and the most rays.
 LEVELS = (16, 32, 64, 128, 256, 512)
-# How many times the most rays of a pair the brightest ones take: where lobes are narrow and lights half seen few pixels
-# have most of the noise of a picture.
+# The brightest pairs may get this many times the most rays of a pair: where lobes are narrow and lights half visible, a
+# few pixels cause most of the noise of a picture.
 BRIGHTEST = 4
-# Samples that tell what is typical, and pairs of them and a light.
+# Most samples, and most pairs of a sample and a light, that are traced to find the typical radiance.
 TYPICAL_SAMPLES, TYPICAL_PAIRS = 2048, 1 << 20
-# How often neighbors of mixed pairs that turn out mixed pass that on.
+# Rounds in which neighbors of mixed pairs get more rays. Neighbors that turn out mixed pass this on in the next round.
 ROUNDS = 4
-# Rays end this share of their length before the light.
+# Rays end at this share of their distance to the light, just before it.
 END = np.float32(1.0 - 1e-4)
 _ZERO, _ONE, _TINY = np.float32(0.0), np.float32(1.0), np.float32(1e-30)
 _MIN_ALPHA = np.float32(1e-5)
-# Corners of lights that face the points, to aim at, and around them.
+# OUTLINE: points of the unit disk to aim at. SQUARE: corners of the square around it. Both are for lights that face the
+# points.
 OUTLINE = 0.99 * round_outline(16)
 SQUARE = np.array([[-1.0, 1.0, 1.0, -1.0], [-1.0, -1.0, 1.0, 1.0]])
 _FARTHEST = np.float32(FARTHEST)
-# Of unit vectors after a warp.
+# Least and greatest length of a unit vector after a warp.
 _LENGTHS = np.float32(1e-11), np.float32(4.0)
 
 
@@ -80,22 +84,23 @@ _LENGTHS = np.float32(1e-11), np.float32(4.0)
 class Visibility:
     """Shares of E emitters that P samples see by pass, in [0, 1]; None for a pass that was not asked for.
 
-    An emitter is one light, or several that share their rays: those of its `numbers`.
+    An emitter is one light, or several lights that share their rays; `numbers` lists them.
 
-    Exactly 1 where nothing is in the way, and where no light arrives anyway; exactly 0 where all is blocked.
+    The share is exactly 1 where nothing is in the way and where no light would arrive anyway. It is exactly 0 where
+    everything is blocked.
     """
 
     specular: np.ndarray | None  # (E, P) float32
     diffuse: np.ndarray | None
-    # By pass, for the light of all lights that each sample reflects, about: (P,) radiance, and its standard deviation
+    # By pass, over all lights: the approximate radiance (P,) that each sample reflects, and its standard deviation
     radiance: dict[str, np.ndarray]
     deviation: dict[str, np.ndarray]
-    rays: int  # that were traced
+    rays: int  # number of rays traced
     mixed: np.ndarray  # (E, P) bool: pairs of which some rays arrived and some did not
-    numbers: tuple[tuple[int, ...], ...] = ()  # of the lights of each emitter
+    numbers: tuple[tuple[int, ...], ...] = ()  # the numbers of the lights of each emitter
 
     def of_lights(self, name: str) -> np.ndarray:
-        """The shares (L, P) of a pass."""
+        """The shares (L, P) of pass `name` by light."""
         shares = getattr(self, name)
         found = np.empty((sum(map(len, self.numbers)), shares.shape[1]), np.float32)
         for own, share in zip(self.numbers, shares, strict=True):
@@ -103,10 +108,11 @@ class Visibility:
         return found
 
     def noise(self, name: str, film: Film | None = None) -> float:
-        """Estimated relative L2 error of a pass, by the two halves of the rays: of samples, or of pixels of a film."""
+        """Relative L2 error of a pass, estimated from the two halves of the rays, over the samples, or over the pixels
+        of `film`."""
         light, variance = self.radiance[name], np.square(self.deviation[name])
         if film is not None:
-            # The errors of the samples of a pixel do not depend on each other.
+            # The errors of the samples of a pixel are independent.
             light, variance = film.image(light), film.variance(variance)
         power = np.square(light, dtype=np.float64).sum()
         return float(np.sqrt(variance.sum(dtype=np.float64) / max(power, 1e-30)))
@@ -114,14 +120,14 @@ class Visibility:
 
 @dataclass(frozen=True)
 class ShadowSampling:
-    """How the shares of samples are found. Raises ValueError."""
+    """How to find the shares of samples. Raises ValueError for a number of `rays` out of range."""
 
     passes: Sequence[str] = PASSES
-    # At most so many for a pair of a sample and a light: 8 to 1024, in eights. From 16 on pairs that are much brighter
-    # than the picture get four times as many, 1024 at most.
+    # Most rays for a pair of a sample and a light: 8 to 1024, in eights. From 16 on, pairs that are much brighter than
+    # the picture get up to four times as many, but never more than 1024.
     rays: int = 256
-    film: Film | None = None  # tells which samples are neighbors; None: those before and after
-    is_baked: bool = False  # each pass by itself: Cycles chooses rays by its lobes alone
+    film: Film | None = None  # tells which samples are neighbors; without it, consecutive samples are
+    is_baked: bool = False  # True: each pass is baked by itself, so Cycles chooses rays by its lobes alone
 
     def __post_init__(self):
         if not PROBES <= self.rays <= MOST_RAYS:
@@ -137,10 +143,10 @@ def visible_shares(
     workers: int | crew.Mate | None = None,
     progress: Progress | None = None,
 ) -> Visibility:
-    """The shares of P samples. `tracer` is as `visibility.open_tracer` returns it.
+    """The shares of `lights` that P samples see. `tracer` comes from `visibility.open_tracer`.
 
-    `workers` processes (None: all cores; or a Mate of the tracer) give the same result bit for bit; few samples are
-    left to this process. `progress` may return False to stop: Cancelled is raised.
+    `workers` is a number of processes (None: all cores) or a Mate of the tracer; the result is the same bit for bit.
+    If there are few samples, this process does them alone. `progress` may return False to stop: Cancelled is raised.
     """
     (emitters, numbers), passes = emitters_of(lights, tracer), tuple(sampling.passes)
     film = None if sampling.film is None else sampling.film.unspread()
@@ -173,7 +179,7 @@ def visible_shares(
 
 @dataclass(frozen=True)
 class ShadowTask:
-    """What to do with every block of samples."""
+    """The emitters and settings with which to find the shares of every block of samples."""
 
     emitters: tuple[Emitter | Cluster, ...]
     passes: tuple[str, ...]
@@ -182,13 +188,13 @@ class ShadowTask:
     is_baked: bool
 
     def shares(self, samples: SurfaceSamples, film: Film | None, tracer, starts: Starts | None = None) -> Visibility:
-        """Those of a block, all in this thread; `starts` as of `tracer.starts(samples)`, where they are known."""
+        """The shares of a block, found in this thread. `starts` is `tracer.starts(samples)` if it is known already."""
         shape = len(self.emitters), len(samples)
         shares = {name: np.ones(shape, np.float32) for name in self.passes}
         radiance, variance = ({name: np.zeros(shape[1], np.float32) for name in self.passes} for _ in range(2))
         mixed, traced = np.zeros(shape, bool), 0
         surface, neighbors = Surface(samples, self.passes, tracer, starts), Neighbors.of(film, shape[1])
-        # Of samples for their pixels.
+        # What each sample counts for its pixel.
         importance = np.ones(shape[1], np.float32)
         if film is not None and film.count is not None:
             importance = (film.count / film.sub_samples).astype(np.float32)
@@ -211,7 +217,8 @@ class ShadowTask:
 
 
 def typical_radiance(samples: SurfaceSamples, task: ShadowTask, tracer) -> tuple[dict[str, float], int]:
-    """By pass, the root mean square of what samples reflect, from some of them and the first rays alone; how many."""
+    """By pass, the root mean square radiance that samples reflect, estimated from the probes of some samples; and the
+    number of these samples."""
     most = max(min(TYPICAL_SAMPLES, TYPICAL_PAIRS // max(len(task.emitters), 1)), 1)
     chosen = slice(None, None, -(-len(samples) // most) or 1)
     some = samples.take(chosen)
@@ -223,7 +230,7 @@ def typical_radiance(samples: SurfaceSamples, task: ShadowTask, tracer) -> tuple
 def task_of_lights(
     samples: SurfaceSamples, lights: Sequence[AreaLight], tracer, passes: Sequence[str], rays: int
 ) -> ShadowTask:
-    """What finds the shares of `lights`, at most `rays` for each of the `samples`, as in `visible_shares`."""
+    """The task that finds the shares of `lights` with at most `rays` per pair, as `visible_shares` does."""
     (emitters, _), passes = emitters_of(lights, tracer), tuple(passes)
     task = ShadowTask(emitters, passes, rays // PROBES * PROBES, dict.fromkeys(passes, 1.0), False)
     return replace(task, typical=typical_radiance(samples, task, tracer)[0])
@@ -231,7 +238,7 @@ def task_of_lights(
 
 @dataclass(frozen=True)
 class Neighbors:
-    """Which samples are close to each other: those of a pixel and of the pixels around it."""
+    """Which samples are close to each other: those in the same pixel and in the eight pixels around it."""
 
     pixel: np.ndarray  # (P,)
     width: int
@@ -239,16 +246,16 @@ class Neighbors:
 
     @classmethod
     def of(cls, film: Film | None, count: int) -> Neighbors:
-        """Those of a film; without one, samples before and after each other."""
+        """The neighbors in `film`; without one, each sample is close to those before and after it."""
         if film is None:
             return cls(np.arange(count), count, 1)
-        # Of a part of a picture the rows that it has.
+        # The film may hold a part of a picture: count only its rows.
         top = int(film.pixel.min(initial=film.width * film.height)) // film.width
         height = int(film.pixel.max(initial=0)) // film.width + 1 - top
         return cls(film.pixel - top * film.width, film.width, max(height, 0))
 
     def any_around(self, index: np.ndarray, mask: np.ndarray) -> np.ndarray:
-        """Mask (Q,) of the samples `index` (Q,) around which `mask` (Q,) is true for one of them."""
+        """Mask (Q,) of the samples `index` (Q,): is `mask` (Q,) true for at least one of the samples around?"""
         pixel = self.pixel[index]
         marked = np.zeros(self.width * self.height, bool)
         marked[pixel[mask]] = True
@@ -258,7 +265,7 @@ class Neighbors:
 
 
 class Surface:
-    """Samples as arrays in single precision, each component by itself: vectors are (3, P)."""
+    """Samples in single precision with components first: vectors are (3, P)."""
 
     def __init__(self, samples: SurfaceSamples, passes: Sequence[str], tracer, starts: Starts | None = None):
         self.tracer, self.starts = tracer, tracer.starts(samples) if starts is None else starts
@@ -289,7 +296,7 @@ class Surface:
         self.lobes = {"specular": specular & ("specular" in passes), "diffuse": diffuse & ("diffuse" in passes)}
 
     def _rows(self, vectors):
-        # Normals that stand for each other are the same array.
+        # Equal normals share one array, so that identity tells whether they differ.
         found = np.ascontiguousarray(vectors.T, dtype=np.float32)
         same = next((known for known in self._known if np.array_equal(known, found)), None)
         if same is None:
@@ -297,7 +304,7 @@ class Surface:
         return found if same is None else same
 
     def horizons(self, name: str) -> tuple[np.ndarray, ...]:
-        """The normals (3, P) below whose horizons the lobe of a pass is 0."""
+        """The normals (3, P) whose horizons bound the lobe of pass `name`: below any of them it is 0."""
         if name == "diffuse":
             return _different(self.diffuse_normal, self.smooth_normal)
         return _different(self.normal, self.geometric_normal)
@@ -309,25 +316,26 @@ def _different(first, second):
 
 @dataclass(frozen=True)
 class _ChosenBySurface:
-    """Rays (R,) that meet other things where the surface chooses them than where the light does."""
+    """Rays (R,) that meet different things depending on who chooses them: the surface or the light."""
 
-    place: np.ndarray  # in the flat (S, Q) of all rays
-    arriving: np.ndarray  # of the light, where the surface chooses them
-    index: np.ndarray  # of the sample
+    place: np.ndarray  # in the flattened (S, Q) of all rays
+    arriving: np.ndarray  # transmittance of the ray that the surface chooses
+    index: np.ndarray  # number of the sample
     directions: np.ndarray  # (3, R)
-    solid_angle: np.ndarray  # of the light
-    is_alone: np.ndarray  # the light does not choose them
+    solid_angle: np.ndarray  # of the light, sr
+    is_alone: np.ndarray  # True where the light never chooses this direction
 
 
 class Pairs:
-    """The samples that an emitter may reach, and what their rays have found so far; `choices` knows it by `number`."""
+    """The samples that an emitter may reach, and what their rays have found so far. `number` is the emitter's number in
+    `choices`."""
 
     def __init__(self, surface: Surface, emitter: Emitter | Cluster, number: int, choices: Choices):
         light = emitter.light
         self.surface, self.emitter, self.light = surface, emitter, light
         self.mask = np.uint32(surface.tracer.mask_of(light.name))
         self.surface_mask = np.uint32(surface.tracer.surface_mask_of(light.name))
-        # The faces of meshes are in the way of rays to themselves.
+        # The faces of a mesh light block rays to the mesh itself.
         self.at_surface = isinstance(emitter, Cluster) or light.shape == "POLYGON"
         self.chosen_by, self.number, self.choices = surface.tracer.chosen_by(light.name), number, choices
         origins = light.origins(surface.position)
@@ -351,15 +359,15 @@ class Pairs:
         self.index = np.flatnonzero(self.wanted["specular"] | self.wanted["diffuse"])
         self.wanted = {name: wanted[self.index] for name, wanted in self.wanted.items()}
         count = len(self.index)
-        # Of the weights, and of those of the light that arrives, by pass and half of the rays
+        # Sums of all weights, and of the weights times transmittance, by pass and half of the rays
         self.weights, self.arriving = np.zeros((2, 2, 2, count), np.float32)
         self.visible, self.blocked = np.zeros(count, bool), np.zeros(count, bool)
         self.count = np.zeros(count, np.int32)
         self.traced = 0
 
     def trace(self, rays: int, neighbors: Neighbors, typical: dict[str, float], importance: np.ndarray) -> None:
-        """Probes for all pairs, and up to `rays` for those that need them, by their light times their `importance`
-        (P,); `typical` as from `typical_radiance`."""
+        """Trace the probes of all pairs, then up to `rays` rays for pairs that need them. How many depends on the light
+        and the `importance` (P,) of the sample. `typical` comes from `typical_radiance`."""
         if self.mask == 0 or not self.light.area_vector.any():
             return
         self._add_rays(np.arange(len(self.index)), 0, PROBES, 0)
@@ -378,18 +386,18 @@ class Pairs:
         self._aim_at_corners()
 
     def _plan(self, rays, typical, importance):
-        """How many rays (Q,) the pairs are worth, and which columns (Q,) of EVENLY, by what they reflect unshadowed and
-        by their `importance` (Q,)."""
+        """Number of rays (Q,) that each pair is worth, and its column (Q,) of EVENLY. Both depend on the unshadowed
+        light that the pair reflects, the number also on its `importance` (Q,)."""
         worth = {name: self.unshadowed(name) / max(typical.get(name, 0.0), 1e-30) for name in PASSES}
         most = importance * np.maximum(worth["specular"], worth["diffuse"])
-        # They are there for all that they are made of.
+        # A sky or a cluster stands for many lights and gets the rays of all of them.
         share = 1.0 if isinstance(self.emitter, Sky | Cluster) else TYPICAL_SHARE
         wanted = rays * share * most**WORTH_POWER
         limit = rays
         if share < 1.0 and rays > PROBES:
             limit = min(BRIGHTEST * rays, MOST_RAYS)
         if isinstance(self.emitter, Sky):
-            # What only the sky lights is dark beside what a sun in it does.
+            # Points lit by the sky alone are dark beside those lit by a sun in it: do not let them go short.
             wanted = np.maximum(wanted, 0.25 * rays * importance)
         levels = [level for level in LEVELS if level < limit] + [limit]
         number = np.take(levels, np.searchsorted(levels, np.minimum(wanted, limit)))
@@ -398,14 +406,15 @@ class Pairs:
         return number, choice
 
     def _unmet(self):
-        """Mask (Q,) of the pairs with a lobe that no ray met so far."""
+        """Mask (Q,) of the pairs with a lobe that no ray has met so far."""
         unmet = np.zeros(len(self.index), bool)
         for number, name in enumerate(PASSES):
             unmet |= self.wanted[name] & (self.weights[number].sum(axis=0) == 0.0)
         return unmet
 
     def _corner_heights(self, name, members):
-        """Least height (V, M) of the light's corners over the horizons of a lobe, and offsets (3, V, M) to them."""
+        """Least height (V, M) of the light's corners over the horizons of a lobe, and the offsets (3, V, M) from the
+        samples to the corners."""
         surface, index = self.surface, self.index[members]
         if isinstance(self.emitter, Cluster):
             return View(surface, index, self.emitter, (name,)).corner_heights(surface.horizons(name))
@@ -419,13 +428,14 @@ class Pairs:
         return np.minimum.reduce(heights), offset
 
     def _leave_out_unlit(self):
-        """Forget lobes for which all of the light is below the horizon."""
+        """Drop lobes for which the whole light is below the horizon."""
         for number, name in enumerate(PASSES):
             unmet = np.flatnonzero(self.wanted[name] & (self.weights[number].sum(axis=0) == 0.0))
             self.wanted[name][unmet] = self._corner_heights(name, unmet)[0].max(axis=0) > 0.0
 
     def _aim_at_corners(self):
-        """For lobes that no ray met, which see but a corner of the light: a ray to the corner that is highest."""
+        """Trace one ray to the highest corner of the light for each lobe that no ray met so far: such a lobe sees only
+        a corner of the light."""
         for number, name in enumerate(PASSES):
             unmet = np.flatnonzero(self.wanted[name] & (self.weights[number].sum(axis=0) == 0.0))
             if len(unmet) == 0:
@@ -440,18 +450,18 @@ class Pairs:
             found = (
                 self._transmittance(self.mask, *(rows[..., 0, :] for rows in aimed)) if self.chosen_by.light else _ONE
             )
-            # Next to no light: it counts in no sum of samples.
+            # Next to nothing, so that it does not count in sums over samples.
             self.weights[number][:, unmet] = _TINY
             self.arriving[number][:, unmet] = found * _TINY
 
     def _transmittance(self, mask, origins, directions, distances):
-        """Of rays with a mask: origins and directions (3, R), distances (R,)."""
+        """Transmittance (R,) of rays with a mask, `origins` and `directions` (3, R) and `distances` (R,)."""
         self.traced += len(distances)
         masks = np.broadcast_to(mask, distances.shape)
         return self.surface.tracer.transmittance(origins.T, directions.T, distances * END, masks)
 
     def _add_rays(self, members, first, last, split):
-        """Rays `first` to `last` for the pairs `members` (M,); `split` is a column of EVENLY."""
+        """Trace the rays `first` to `last` of the pairs `members` (M,). `split` is a column of EVENLY."""
         diffuse, specular = (self.wanted[name][members] for name in ("diffuse", "specular"))
         for kind, chosen in enumerate((diffuse & specular, diffuse & ~specular, ~diffuse & specular)):
             chosen = members[chosen]
@@ -468,7 +478,7 @@ class Pairs:
         self.count[members] = last
 
     def _add_block(self, block, view, rays):
-        """Some rays for the pairs `block` (B,) of a view."""
+        """Trace some `rays` of the pairs `block` (B,) of a view."""
         directions, distance, weights = view.rays(rays)
         arriving, others = np.zeros(distance.shape, np.float32), None
         met = np.logical_or.reduce([weight > 0.0 for weight in weights.values()])
@@ -499,8 +509,8 @@ class Pairs:
                 weight *= passing
 
     def _chosen_by_surface(self, view, rays, flat, origins, arriving):
-        """What those of the `rays` at the places `flat` (R,) meet that the surface chooses: of those for which this is
-        not what rays from `origins` (3, R) have met, which the light chooses."""
+        """The rays at the places `flat` (R,) that the surface would choose and that then meet something else than the
+        light's rays did; None if there are none. The light's rays start at `origins` (3, R) and found `arriving`."""
         starts = self.surface.starts
         meet_the_same = self.chosen_by.light and self.mask == self.surface_mask
         if meet_the_same and not starts.terminator[view.index].any():
@@ -509,7 +519,7 @@ class Pairs:
         column = flat % arriving.shape[1]
         index = view.index[column]
         start, toward, distance = starts.from_surface(index, directions, distance)
-        # The light chooses directions above the smooth horizon, the surface those above that of the mesh.
+        # The light chooses directions above the smooth horizon; the surface chooses directions above the mesh's.
         smooth, flat_facing = (
             dot(np.take(normal, index, axis=0).T, directions)
             for normal in (starts.smooth_normal, starts.geometric_normal)
@@ -528,32 +538,32 @@ class Pairs:
         return _ChosenBySurface(flat[chosen], found, index[chosen], directions[:, chosen], angle, is_alone[chosen])
 
     def unshadowed(self, name: str) -> np.ndarray:
-        """Radiance (Q,) that a pass reflects without shadows, about; 0 for pairs without that lobe."""
+        """Approximate radiance (Q,) that a pass reflects without shadows; 0 for pairs without that lobe."""
         scale = self.surface.albedo[self.index] if name == "diffuse" else np.float32(0.5)
         scale = scale * np.float32(np.abs(self.light.radiance).mean() / np.pi) / np.maximum(self.count, 1)
         return self.weights[PASSES.index(name)].sum(axis=0) * scale * self.wanted[name]
 
     def found(self, name: str):
-        """Shares (Q,) of a pass, and their standard deviations, about."""
+        """Shares (Q,) of a pass, and their approximate standard deviations (Q,)."""
         weights, arriving = self.weights[PASSES.index(name)], self.arriving[PASSES.index(name)]
         whole = weights.sum(axis=0)
         share = np.divide(arriving.sum(axis=0), whole, out=np.ones_like(whole), where=whole > 0.0)
         halves = np.divide(arriving, weights, out=np.stack([share, share]), where=weights > 0.0)
-        # Probes alone have no second half: as of independent rays.
+        # Pairs with probes only have no second half of rays: take the deviation of independent rays.
         usual = np.sqrt(share * (_ONE - share) / np.maximum(self.count, 1).astype(np.float32))
         return share, np.where((weights > 0.0).all(axis=0), 0.5 * np.abs(halves[0] - halves[1]), usual)
 
 
 def _taken(rows, flat):
-    """Values (3, R) or (R,) of rows (3, S, Q) or (S, Q) at places in the flat (S, Q)."""
+    """Values (3, R) or (R,) at the places `flat` of the flattened last two axes of `rows`, (3, S, Q) or (S, Q)."""
     return np.take(rows.reshape(*rows.shape[:-2], -1), flat, axis=-1)
 
 
 @dataclass(frozen=True)
 class Rays:
-    """The rays `first` to `last` of each pair, PROBES and again PROBES; of each of these some are chosen by the lobe.
+    """The rays `first` to `last` of each pair, in looks of PROBES rays. In each look the lobe chooses some of the rays.
 
-    `probes` and `later` say how many of the first PROBES, and of all later ones, are chosen evenly.
+    `probes` is how many rays of the first look are chosen evenly, `later` the same for each later look.
     """
 
     first: int
@@ -564,12 +574,12 @@ class Rays:
 
     @property
     def looks(self) -> int:
-        """How many times PROBES rays these are."""
+        """Number of looks of PROBES rays each."""
         return (self.last - self.first) // PROBES
 
     @property
     def evenly(self) -> tuple[int, int]:
-        """First and last number of the points that choose directions evenly."""
+        """First and last number of the points that choose directions evenly over the light."""
         return tuple(self.probes + self.later * (n // PROBES - 1) if n else 0 for n in (self.first, self.last))
 
     @property
@@ -578,7 +588,7 @@ class Rays:
         return tuple(n - even for n, even in zip((self.first, self.last), self.evenly, strict=True))
 
     def add_to(self, halves, weight):
-        """Add weights (S, Q) to the sums (2, Q) of the first and the second half of the total, one after another."""
+        """Add weights (S, Q) to the sums (2, Q) of the first and of the second half of all rays."""
         start, stop = self.evenly
         parts = np.zeros((self.looks, weight.shape[1]), np.float32)
         for rows in (weight[: stop - start], weight[stop - start :]):
@@ -611,7 +621,7 @@ class View:
             self.quads = SphericalQuads(corners)
             self.is_seen, self.solid_angle = self.quads.is_seen, self.quads.solid_angle
         if isinstance(emitter, Sky):
-            # Of one of the sides, of which `Choices` knows one.
+            # The solid angle of one side: `Choices` knows the sides one by one.
             self.solid_angle = np.full(len(index), 4.0 * np.pi / 6.0, np.float32)
         self.seeds = surface.seeds[index]
         if "diffuse" in lobes:
@@ -640,7 +650,7 @@ class View:
             self.dielectric, self.ior = surface.dielectric[index], surface.ior[index]
 
     def rays(self, rays: Rays):
-        """Unit directions (3, S, Q) of some rays, distances (S, Q), and weights (S, Q) by lobe."""
+        """Unit directions (3, S, Q) of `rays`, distances to the light (S, Q), and weights (S, Q) by lobe."""
         if isinstance(self.emitter, Sky):
             return self._rays_to_sky(rays)
         if isinstance(self.emitter, Cluster):
@@ -691,7 +701,7 @@ class View:
         return weights
 
     def _rays_to_sky(self, rays: Rays):
-        """As `rays`: by the picture of the sky, and evenly over the cosine after the warp."""
+        """As `rays`, for a sky: by its picture and cosine, and by the cosine after the warp of the lobe."""
         evenly, by_lobe = (last - first for first, last in (rays.evenly, rays.by_lobe))
         shape, local = (evenly + by_lobe, len(self.index)), None
         normal = self.horizons[0] if "diffuse" in self.lobes else self.geometric_normal
@@ -719,11 +729,12 @@ class View:
         return directions, distance, self._weights(directions, local, factor)
 
     def solid_angles(self, flat):
-        """One by the density (R,) of the rays at places in the flat (S, Q) that the light chooses, about."""
+        """Approximate solid angles (R,): the inverse density, in sr, of the rays that the light chooses at the places
+        `flat` (R,) of the flattened (S, Q)."""
         return self.solid_angle.ravel()[flat % self.solid_angle.size]
 
     def _rays_to_cluster(self, rays: Rays):
-        """As `rays`: each to a leaf of its own."""
+        """As `rays`, for a cluster: each ray goes to a leaf of its own."""
         even, sharp = (
             unit_points(self.seeds, stream, *part) for stream, part in enumerate((rays.evenly, rays.by_lobe))
         )
@@ -758,7 +769,7 @@ class View:
         return directions, distance, self._weights(directions, local, factor)
 
     def _inside_round(self, leaf, corners, place):
-        """False (S, Q) for places (3, S, Q) outside of the ellipses in their parallelograms."""
+        """Mask (S, Q): False for places (3, S, Q) outside the ellipse in the parallelogram of a round light."""
         u, v = 0.5 * (corners[:, 1] - corners[:, 0]), 0.5 * (corners[:, 3] - corners[:, 0])
         offset = place - 0.5 * (corners[:, 0] + corners[:, 2])
         uu, uv, vv, us, vs = dot(u, u), dot(u, v), dot(v, v), dot(u, offset), dot(v, offset)
@@ -767,8 +778,9 @@ class View:
         return (s * s + t * t <= _ONE) | ~self.emitter.is_round[leaf]
 
     def _leaves(self, x, evenly):
-        """Leaves (S, Q) that rays go to by numbers x (S, Q), `evenly` of them by the diffuse lobe if there is one; by
-        lobe how likely; and what is left of x."""
+        """The leaves (S, Q) that rays go to, by lobe their probabilities, and the numbers x (S, Q) rescaled for reuse.
+        x chooses the leaves: the first `evenly` rays by the diffuse lobe if there is one, the others by the specular
+        lobe."""
         columns = np.tile(np.arange(len(self.index)), len(x))
         lobes, own = [], np.zeros(x.shape, np.intp)
         if "diffuse" in self.lobes:
@@ -784,7 +796,8 @@ class View:
         return leaf.reshape(x.shape), chances.reshape(len(lobes), *x.shape), rest.reshape(x.shape)
 
     def corner_heights(self, horizons):
-        """As of `Pairs`, for the corners of the leaves that the probes go to and that face the samples."""
+        """As `Pairs._corner_heights`, for the corners of the leaves that the probes go to. Leaves that face away have
+        height -1."""
         x = unit_points(self.seeds, 0, 0, PROBES)[0]
         leaf, chances, _ = self._leaves(x, PROBES)
         corners = self.emitter.corners[:, :, leaf] + self.offset[:, None, None]
@@ -794,12 +807,12 @@ class View:
         return np.where(is_lit, heights, -_ONE), corners
 
     def _axis(self):
-        """Unit vectors (3, 1, Q) to the light."""
+        """Unit vectors (3, 1, Q) to the center of the light."""
         return (self.disk.offset / self.disk.length)[:, None]
 
     def _of_disk(self, directions, distance):
-        """How bright (S, Q) a light that faces the points is along directions (3, S, Q) which meet its plane at
-        `distance`, and where they meet the light itself."""
+        """Brightness (S, Q) of a light that faces the points, and distances (S, Q) to it, along directions (3, S, Q)
+        that meet its plane at `distance`."""
         disk, offset = self.disk, np.broadcast_to(self.offset[:, None], directions.shape)
         place = directions * distance - disk.offset[:, None]
         inside = dot(place, place) <= disk.radius * disk.radius
@@ -808,7 +821,8 @@ class View:
         return factor, np.where(inside, own, distance).astype(np.float32)
 
     def _diffuse(self, directions):
-        """The lobe (S, Q), the cosine for most, shadowed where a bump map has another horizon."""
+        """Diffuse lobe times cosine (S, Q): a plain cosine for most surfaces, with the shadowing of a bump map where
+        the smooth normal has another horizon."""
         cosine = dot(directions, self.horizons[0])
         np.maximum(cosine, _ZERO, out=cosine)
         if self.shape is not None:
@@ -866,7 +880,7 @@ class View:
         return ratio
 
     def _reflectance(self, squared):
-        """The Fresnel factor for squared lengths (S, Q) of unit view plus unit light, which are lost."""
+        """Fresnel factor (S, Q) by the `squared` lengths (S, Q) of unit view plus unit light, which are overwritten."""
         cosine = np.sqrt(squared, out=squared)
         cosine *= np.float32(0.5)
         np.minimum(cosine, _ONE, out=cosine)

@@ -1,9 +1,9 @@
-"""Rays through occluders, by the library Embree 4 that Blender ships, called through ctypes.
+"""Rays through occluders, traced by the library Embree 4 that Blender ships, called through ctypes.
 
 Embree is a C library; its functions and their arguments are those of the headers rtcore_*.h of Embree 4. A ray packet
-is a block of rows, one for each component, of as many rays as the processor takes at once. Python calls Embree once
-for each packet, and these calls are too short for threads to share a process: a `Tracer` uses one core, and each
-process that traces opens its own.
+has one row for each component; a row holds as many rays as the processor takes at once. Python calls Embree once for
+each packet. These calls are too short for threads to share a process, so a `Tracer` uses one core, and each process
+that traces opens its own.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from .starts import StartFinder, Starts
 
 # Names under which the system may know the library.
 SYSTEM_LIBRARIES = ("libembree4.so.4", "libembree4.4.dylib", "libembree4.dylib", "embree4.dll")
-# Rays in a chunk: its packets stay in the second-level cache.
+# Rays in a chunk, few enough for its packets to stay in the second-level cache.
 CHUNK = 4096
-# Rows of a packet of rays, and of one of rays with what they hit; the last two are room for what some builds add.
+# Rows of a packet of rays, and of a packet of rays with their hits. The last two rows are for what some builds add.
 ORIGIN, NEAR, DIRECTION, FAR, MASK = slice(0, 3), 3, slice(4, 7), 8, 9
 RAY_ROWS, U, V, TRIANGLE, GEOMETRY, INSTANCE, HIT_ROWS = 12, 15, 16, 17, 18, 19, 22
 NONE, MOST_LEVELS = 0xFFFFFFFF, 32
@@ -65,13 +65,13 @@ class _Unfit(Exception):
 
 
 class _Embree:
-    """The functions of one library, and a device of it."""
+    """The functions of one library, and a device made by it."""
 
     def __init__(self, library: str):
         self.path = library
         try:
             self._library = ctypes.CDLL(library)
-            # Keeps Python's lock during a call, which is too short to hand it over.
+            # PyDLL keeps Python's lock during a call; the calls are too short to release it.
             quick = ctypes.PyDLL(library)
             for name, (result, *arguments) in _FUNCTIONS.items():
                 function = getattr(self._library, name)
@@ -102,7 +102,7 @@ class _Embree:
         return function
 
     def check(self) -> None:
-        """Raise MemoryError or RuntimeError where a call since the last check has failed."""
+        """Raise MemoryError or RuntimeError if a call since the last check has failed."""
         code = self.GetDeviceError(self.device)
         if code == 4:
             raise MemoryError("occluders: Embree found no memory for them")
@@ -111,18 +111,18 @@ class _Embree:
 
 
 def _aligned(count: int, dtype=np.float32) -> np.ndarray:
-    """Zeros (count,) of 4 bytes each from an address that 64 divides."""
+    """Zeros (count,) of 4 bytes each, at an address that is a multiple of 64."""
     memory = np.zeros(count + 16, dtype)
     start = -(memory.ctypes.data // 4) % 16
     return memory[start : start + count]
 
 
 class _Packets:
-    """Room for CHUNK rays in packets of `width`, with `rows` rows, and the addresses of the packets."""
+    """Room for CHUNK rays in packets of `width` rays and `rows` rows, and the addresses of the packets."""
 
     def __init__(self, width: int, rows: int):
         count = CHUNK // width
-        # A build of Embree with more levels of instances would write beyond the last packet, before it is found unfit.
+        # A build of Embree with more levels of instances would write beyond the last packet before `_probe` rejects it.
         values = _aligned((count * rows + 2 * MOST_LEVELS) * width)
         self.values = values[: count * rows * width].reshape(count, rows, width)
         self.numbers = self.values.view(np.uint32)
@@ -134,7 +134,7 @@ class _Packets:
         self._width = width
 
     def set(self, row, values) -> None:
-        """Write `values` (R,) or (R, 3) to a row, or three."""
+        """Write `values` (R,) to one row, or (R, 3) to three rows."""
         width, target = self._width, self.values if values.dtype == np.float32 else self.numbers
         whole = len(values) // width
         if values.ndim == 1:
@@ -151,7 +151,7 @@ class _Packets:
             target[whole, row, rest.shape[1] :] = rest[:, -1:]
 
     def get(self, row, count: int, numbers: bool = False) -> np.ndarray:
-        """A copy (count,) of a row."""
+        """The first `count` values of a row, as a copy."""
         whole = -(-count // self._width)
         return (self.numbers if numbers else self.values)[:whole, row].reshape(-1)[:count]
 
@@ -163,7 +163,7 @@ class _Packets:
 
 
 class _Scene:
-    """The instances `index` of `occluders` as a scene of Embree; of some meshes, by number, only `parts`."""
+    """The instances `index` of `occluders` as an Embree scene. For meshes in `parts`, by number, only these parts."""
 
     def __init__(self, embree: _Embree, occluders: Occluders, index: np.ndarray, parts: dict[int, Parts]):
         self._embree, self._kept, self._scenes = embree, [], []
@@ -232,7 +232,7 @@ class _Scene:
         embree.ReleaseGeometry(geometry)
 
     def hits(self, ray, distance, number, triangle, u, v) -> Hits:
-        """What rays have met, on the meshes themselves; `number` (H,) counts the instances here."""
+        """Hits by triangles and places on the meshes themselves. `number` (H,) counts the instances of this scene."""
         own = self._mesh[number] if self._parts else ()
         for mesh in self._parts.keys() & set(np.unique(own).tolist()):
             here = np.flatnonzero(own == mesh)
@@ -249,9 +249,9 @@ class _Scene:
 
 
 class EmbreeCaster:
-    """Casts rays through both scenes of `occluders`: what blocks, and what is transparent.
+    """Casts rays through the two scenes of `occluders`: what blocks, and what is transparent.
 
-    A caster tells what at most `chunk` rays meet; `Tracer` makes shares of light of that.
+    A caster tells what at most `chunk` rays meet; `Tracer` turns that into shares of light.
     """
 
     chunk = CHUNK
@@ -271,7 +271,7 @@ class EmbreeCaster:
         self._hits = _Packets(embree.width, HIT_ROWS)
 
     def close(self) -> None:
-        """Free the memory that Embree has taken."""
+        """Free the memory that Embree holds."""
         for scene in self._scenes:
             scene.close()
 
@@ -284,7 +284,8 @@ class EmbreeCaster:
         return packets.get(FAR, count) < 0.0  # Embree writes -inf
 
     def closest(self, is_clear: bool, origins, directions, near, far, masks) -> Hits:
-        """The first hits of the rays from `near` to `far`: on transparent surfaces, or on those that block."""
+        """The first hits of rays between `near` and `far`: on transparent surfaces if `is_clear`, otherwise on surfaces
+        that block."""
         packets, count, scene = self._hits, len(origins), self._scenes[is_clear]
         for row, values in ((ORIGIN, origins), (NEAR, near), (DIRECTION, directions), (FAR, far), (MASK, masks)):
             packets.set(row, values)
@@ -298,10 +299,10 @@ class EmbreeCaster:
 
 
 class Tracer:
-    """Rays through `occluders`; see `open_tracer`. Use it as a context, or call `close`.
+    """Rays through `occluders`; see `open_tracer`. Use it as a context manager, or call `close`.
 
-    `caster` is as EmbreeCaster, and `description` says which it is. Other processes can open the file `library`; None:
-    they cannot.
+    `caster` is an EmbreeCaster or the like; `description` names it. `library` is a file that other processes can open;
+    None if they cannot.
     """
 
     def __init__(self, occluders: Occluders, caster):
@@ -317,18 +318,18 @@ class Tracer:
         self.close()
 
     def close(self) -> None:
-        """Free what the caster has taken."""
+        """Free what the caster holds."""
         with self._lock:
             self._caster.close()
 
     def transmittance(
         self, origins: np.ndarray, directions: np.ndarray, distances: np.ndarray, masks: np.ndarray | None = None
     ) -> np.ndarray:
-        """Share (R,) float32 of light that comes from `distances` (R,) in m, which may be inf, along unit `directions`
-        (R, 3) to `origins` (R, 3): 0 where something blocks it, 1 where nothing is met.
+        """Share (R,) float32 of light that reaches `origins` (R, 3) along unit `directions` (R, 3) from `distances`
+        (R,) in m, which may be inf. It is 0 if something blocks the light, and 1 if nothing is met.
 
-        `masks` (R,) are as those of `Occluders`; left out: everything counts. Rays of the same origin, one after
-        another, are faster.
+        `masks` (R,) are those of `Occluders`; by default, everything counts. It is faster if rays of the same origin
+        are consecutive.
         """
         origins, directions, distances = (np.asarray(values, np.float32) for values in (origins, directions, distances))
         count, chunk = len(origins), self._caster.chunk
@@ -367,8 +368,8 @@ class Tracer:
         shares[index] = 0.0
 
     def first_met(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """How far (R,) in m rays go along unit `directions` (R, 3) until something blocks them, inf where nothing does;
-        and where something transparent is in their way before (R,)."""
+        """Distance (R,) in m along unit `directions` (R, 3) to what blocks rays, inf if nothing does; and mask (R,) of
+        the rays with something transparent before that."""
         found = np.full((2, len(origins)), np.inf, np.float32)
         rays = [np.asarray(values, np.float32) for values in (origins, directions)]
         masks, chunk = np.full(len(origins), ALL_RAYS, np.uint32), self._caster.chunk
@@ -383,15 +384,15 @@ class Tracer:
         return found[0], found[1] < found[0]
 
     def mask_of(self, light: str) -> int:
-        """Mask of the rays to the light of that name, which `transmittance` takes; 0: nothing is in its way."""
+        """Mask for `transmittance` of the rays to the light of that name; 0 if nothing is in its way."""
         return self.occluders.mask_of(light)
 
     def surface_mask_of(self, light: str) -> int:
-        """As `mask_of`, of the rays that the surface chooses."""
+        """As `mask_of`, for rays that the surface chooses."""
         return self.occluders.surface_mask_of(light)
 
     def chosen_by(self, light: str) -> ChosenBy:
-        """Which rays to the light of that name there are."""
+        """Which kinds of rays to the light of that name exist."""
         return self.occluders.chosen_by(light)
 
     def starts(self, samples: SurfaceSamples) -> Starts:
@@ -406,9 +407,9 @@ _trusted: dict[str, _Embree] = {}
 
 
 def open_tracer(occluders: Occluders, libraries: Iterable[str | os.PathLike] = ()) -> Tracer:
-    """A tracer by the first of `libraries`, files of Embree 4, that passes a test; the system's own comes last.
+    """A tracer that uses the first of `libraries`, files of Embree 4, that passes a test. The system's own come last.
 
-    Raises SceneError where there is none; names what is wrong with each.
+    Raises SceneError if there is none, which says what is wrong with each.
     """
     reasons = []
     for library in (*map(str, libraries), *SYSTEM_LIBRARIES):
@@ -424,7 +425,7 @@ def open_tracer(occluders: Occluders, libraries: Iterable[str | os.PathLike] = (
 
 
 def _probe(embree: _Embree) -> None:
-    """Raise _Unfit where rays of known answer get another one."""
+    """Raise _Unfit if rays with known answers get others."""
     square = OccluderMesh([[0, 0, 0], [4, 0, 0], [0, 4, 0], [4, 4, 0]], [[0, 1, 2], [1, 3, 2]])
     clear = OccluderMesh(square.vertices, square.triangles, Transparency(0.25))
     here, higher, highest = np.eye(3, 4), np.eye(3, 4), np.eye(3, 4)

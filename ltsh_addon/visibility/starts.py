@@ -1,4 +1,4 @@
-"""Where shadow rays start: on the triangle that a sample lies on, or as far above it as Cycles lets them."""
+"""Where shadow rays start: on the triangle of a sample, or as far above it as Cycles lifts them."""
 
 from __future__ import annotations
 
@@ -9,15 +9,16 @@ import numpy as np
 from ..scene import SurfaceSamples
 from .occluders import ALL_RAYS, STEP, Hits, Occluders
 
-# Of the size of coordinates: 8 times their rounding in single precision; 2 times are too few, 4 seem to suffice.
+# Distance from its triangle at which a ray does not meet it, as a share of the size of coordinates: 8 times their
+# rounding in single precision. 2 times are too few; 4 seem to suffice.
 CLEARANCE = 2.0**-21
-# A sample is looked for so far from its place, in m for one near the origin, in so many surfaces, until it is as near
-# to one as that share of the way.
+# NEARBY: distance from a sample, in m near the origin, within which its surface is looked for. LAYERS: most surfaces
+# looked at. CERTAIN: share of that distance at which a surface is close enough to stop looking.
 NEARBY, LAYERS, CERTAIN = 2.0**-14, 4, 2.0**-3
 
 
 class StartFinder:
-    """Finds the triangles of `occluders` that samples lie on; `caster` is as `rays.EmbreeCaster`."""
+    """Finds the triangles of `occluders` on which samples lie. `caster` is a `rays.EmbreeCaster` or the like."""
 
     def __init__(self, occluders: Occluders, caster):
         self._occluders, self._caster = occluders, caster
@@ -31,10 +32,10 @@ class StartFinder:
     def starts(self, samples: SurfaceSamples) -> Starts:
         """Where rays from `samples` start: as in Cycles, on the triangle, which they leave without meeting it.
 
-        Where a smooth surface is about to hide the light that falls on its triangles at a grazing angle, they start
-        from a curved surface above them (`shadow_terminator_geometry_offset`). A sample that is on no triangle of the
-        occluders keeps a small distance from its surface. Triangles have their own normals here: that of a sample is
-        the smooth one where a lobe ends at the smooth horizon.
+        A smooth surface would hide light that falls on its triangles at a grazing angle. There, rays start on a curved
+        surface above the triangles (`shadow_terminator_geometry_offset`). A sample that is on no triangle of the
+        occluders keeps a small distance from its surface. The triangles' own normals are used, because a sample has the
+        smooth one where a lobe ends at the smooth horizon.
         """
         position, normal, smooth_normal = (
             np.array(values, np.float32, order="C")
@@ -50,7 +51,7 @@ class StartFinder:
             index, shape = start + found.ray, _Shape.of(self._occluders, found, self._is_applied)
             clearance[index] = CLEARANCE * (reach[index] + shape.size)
             is_thick = self._thickness[found.instance] > 0.0
-            # Graphics cards interpolate positions less exactly than Cycles: those would meet their own surface.
+            # Graphics cards interpolate positions less exactly than Cycles; such rays would meet their own surface.
             moved = shape.point - position[index]
             off = (_dot(moved, moved) > (0.5 * clearance[index]) ** 2) & ~is_thick
             position[index[off]] = shape.point[off]
@@ -73,7 +74,7 @@ class StartFinder:
         return thickness[triangle] * np.float32(scale)
 
     def _triangles_at(self, position, normal, reach) -> Hits:
-        """Which triangles samples lie on, within `reach` (P,) m or their thickness, as if rays had met them."""
+        """Hits on the triangles on which samples lie, within `reach` (P,) m or within the triangles' thickness."""
         found = self._nearest(position, normal, reach)
         thickest = np.float32(self._thickness.max(initial=0.0))
         if thickest == 0.0:
@@ -91,14 +92,14 @@ class StartFinder:
         return Hits(*(np.concatenate([one, other[within]]) for one, other in joined))
 
     def _nearest(self, position, normal, reach) -> Hits:
-        """The triangles nearest to samples along their normals, up to `reach`; `distance` is how near."""
+        """Hits on the triangles nearest to samples along their normals, up to `reach` m away."""
         count = len(position)
         origins, everything = position + reach[:, None] * normal, np.full(count, ALL_RAYS, np.uint32)
         off = np.full(count, np.inf, np.float32)
         best = Hits(np.arange(count), off, *(np.zeros(count, kind) for kind in (int, int, np.float32, np.float32)))
         for is_clear in (False, True):
             near, index = np.zeros(count, np.float32), np.arange(count)
-            # The first triangle may be that of another surface, close above.
+            # The first triangle may belong to another surface close above.
             for _ in range(LAYERS if self._caster.has[is_clear] else 0):
                 rays = origins[index], -normal[index], near[index], 2.0 * reach[index], everything[index]
                 hits = self._caster.closest(is_clear, *rays)
@@ -116,17 +117,17 @@ class StartFinder:
 
 @dataclass(frozen=True)
 class Starts:
-    """Where shadow rays of P samples start, see `StartFinder.starts`; `origins` tells it for each ray."""
+    """Where shadow rays of P samples start, see `StartFinder.starts`. `origins` returns the start of each ray."""
 
     position: np.ndarray  # (P, 3) float32
     geometric_normal: np.ndarray  # (P, 3)
     smooth_normal: np.ndarray  # (P, 3)
-    clearance: np.ndarray  # (P,) m, so far from its plane a ray surely does not meet the sample's own triangle
+    clearance: np.ndarray  # (P,) m, distance from its plane at which a ray surely misses the sample's own triangle
     lift: np.ndarray  # (2, P, 3) m, to where a smooth surface would be: for light from outside, and from inside
-    terminator: np.ndarray  # (P,) as Occluders.terminators, 0 for all that is flat
+    terminator: np.ndarray  # (P,) as Occluders.terminators; 0 on flat triangles
 
     def take(self, index) -> Starts:
-        """Those of the samples at `index`: integers (Q,) or a slice."""
+        """The starts of the samples at `index`: integers (Q,) or a slice."""
         own = {field.name: getattr(self, field.name) for field in fields(self)}
         return Starts(**{name: values[:, index] if name == "lift" else values[index] for name, values in own.items()})
 
@@ -135,7 +136,7 @@ class Starts:
         return self.origins_of_rows(index, directions.T[:, None])[:, 0].T
 
     def origins_of_rows(self, index: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Origins (3, S, Q) of S rays each from the samples `index` (Q,), along unit `directions` (3, S, Q)."""
+        """Origins (3, S, Q) of S rays from each of the samples `index` (Q,), along unit `directions` (3, S, Q)."""
         normal, terminator = self.geometric_normal[index].T[:, None], self.terminator[index]
         facing = _dot_rows(normal, directions)
         side = np.copysign(self.clearance[index], facing)
@@ -155,8 +156,8 @@ class Starts:
     def from_surface(
         self, index: np.ndarray, directions: np.ndarray, distances: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """As `aimed`, for rays (R,) that each start at a sample itself, as rays do that Cycles sends on from a
-        surface."""
+        """As `aimed`, for one ray per sample, (R,), that starts at the sample itself. Rays that Cycles sends on from a
+        surface do so."""
         normal = self.geometric_normal[index].T
         moved = np.copysign(self.clearance[index], _dot_rows(normal, directions)) * normal
         return moved + self.position[index].T, *_toward(directions, distances, moved)
@@ -164,11 +165,11 @@ class Starts:
     def aimed(
         self, index: np.ndarray, directions: np.ndarray, distances: np.ndarray, at_surface: bool = False
     ) -> tuple[np.ndarray, ...]:
-        """Origins and unit directions (3, S, Q) and distances (S, Q) of S rays each from the samples `index` (Q,).
+        """Origins and unit directions (3, S, Q) and distances (S, Q) of S rays from each of the samples `index` (Q,).
 
-        They end at `distances`, finite, along `directions` from the sample, wherever they start. Rays that start only
-        the clearance above the sample keep their direction. Not so where they end on a face that is itself in the way
-        (`at_surface`), as those of lamps are: at a grazing angle they would meet it too early.
+        Wherever a ray starts, it ends at `distances`, finite, along `directions` from the sample. Rays that start just
+        the clearance above the sample keep their direction. With `at_surface` they do not: they end on a face that
+        blocks rays itself, as the faces of mesh lights do, and at a grazing angle would meet it too early.
         """
         origins = self.origins_of_rows(index, directions)
         moved = origins - self.position[index].T[:, None]
@@ -182,8 +183,8 @@ class Starts:
         return origins, directions, distances
 
     def _lifts(self, index, directions, facing, terminator):
-        """How far (3, S, Q) rays of smooth samples start from the sample, and where they start not to pass their own
-        triangle (S, Q): above it (1), below (-1) or where the direction tells (0)."""
+        """How far above the sample (3, S, Q) rays of smooth samples start; and on which side of their own triangle (S,
+        Q) they start so as not to meet it: above (1), below (-1), or as the direction says (0)."""
         smooth_facing = _dot_rows(self.smooth_normal[index].T[:, None], directions)
         is_inside = smooth_facing < 0.0
         flipped = np.where(is_inside, np.float32(-1.0), np.float32(1.0))
@@ -191,44 +192,44 @@ class Starts:
         grazing = 1.0 + np.maximum(1.0 - smooth_facing / terminator, 0.0) - facing / terminator
         amount = np.clip(grazing, 0.0, 1.0)
         outside, inside = self.lift[:, index].transpose(0, 2, 1)[:, :, None]
-        # As in Cycles, light from behind the own triangle meets it.
+        # As in Cycles, light from behind the sample's own triangle meets it.
         own = np.where((amount > 0.0) & (facing <= 0.0), flipped, np.float32(0.0))
         return amount * np.where(is_inside, inside, outside), own
 
 
 def _toward(directions, distances, moved):
-    """Unit directions (3, ...) and distances (...) of rays to where others end, that start `moved` (3, ...) m away."""
+    """Unit directions (3, ...) and distances (...) of rays that start `moved` (3, ...) m away from others, and end
+    where these end."""
     toward = directions * distances - moved
     length = np.sqrt(_dot_rows(toward, toward))
     return toward / np.maximum(length, np.float32(1e-30)), length
 
 
 def _dot_rows(first, second):
-    """Scalar products (S, Q) of vectors (3, S, Q)."""
+    """Dot products (S, Q) of vectors (3, S, Q)."""
     return first[0] * second[0] + first[1] * second[1] + first[2] * second[2]
 
 
 def _dot(first, second):
-    """Scalar products (R,) of vectors (R, 3)."""
+    """Dot products (R,) of vectors (R, 3)."""
     return np.einsum("rk,rk->r", first, second)
 
 
 @dataclass(frozen=True)
 class _Shape:
-    """Q points on triangles: corners (Q, 3, 3), and where `is_smooth` (Q,) normals there, all in the space in which
-    Cycles has them; shares (Q, 3) of the corners; and what takes directions to world space."""
+    """Q points on triangles. Corners and normals are in the space in which Cycles has them."""
 
-    corners: np.ndarray
-    normals: np.ndarray
-    is_smooth: np.ndarray
-    shares: np.ndarray
-    to_world: np.ndarray  # (Q, 3, 3)
+    corners: np.ndarray  # (Q, 3, 3)
+    normals: np.ndarray  # (Q, 3, 3) at the corners, if `is_smooth`
+    is_smooth: np.ndarray  # (Q,)
+    shares: np.ndarray  # (Q, 3) weights of the corners
+    to_world: np.ndarray  # (Q, 3, 3) takes directions to world space
     point: np.ndarray  # (Q, 3) in world space
-    size: np.ndarray  # (Q,) m, how far a corner is from the point, or the point from the origin of the instance
+    size: np.ndarray  # (Q,) m, extent of the triangle, plus its distance from the origin of the instance if not applied
 
     @classmethod
     def of(cls, occluders: Occluders, hits: Hits, is_applied: np.ndarray) -> _Shape:
-        """Those of `hits`. Where `is_applied` (I,) instances are in world space."""
+        """For `hits`. Instances for which `is_applied` (I,) is True are in world space."""
         corners, normals = np.zeros((2, len(hits.ray), 3, 3))
         is_smooth, mesh = np.zeros(len(hits.ray), bool), occluders.mesh[hits.instance]
         order = np.argsort(mesh, kind="stable")
@@ -257,14 +258,15 @@ class _Shape:
         )
 
     def take(self, index: np.ndarray) -> _Shape:
-        """Those at `index`."""
+        """The points at `index`."""
         return _Shape(*(getattr(self, each.name)[index] for each in fields(self)))
 
     def face_normals(self, geometric_normal: np.ndarray, smooth_normal: np.ndarray) -> np.ndarray:
-        """Unit normals (Q, 3) of the triangles in world space: on the side of `geometric_normal` (Q, 3) where they are
-        flat, else of the side that has `smooth_normal` (Q, 3), which may point to the other side of its triangle.
+        """Unit normals (Q, 3) of the triangles in world space. Those of flat triangles point to the side of
+        `geometric_normal` (Q, 3). Those of smooth ones have the sign with which `smooth_normal` (Q, 3) agrees with the
+        interpolated normal, which may be on the other side of the triangle.
 
-        Where a triangle has no area it is the former.
+        A triangle without area gets `geometric_normal`.
         """
         first, second = np.moveaxis(_turned(self.corners[:, 1:] - self.corners[:, :1], self.to_world), 1, 0)
         normal = _crossed(first, second)
@@ -276,8 +278,8 @@ class _Shape:
         return np.divide(normal, length, out=geometric_normal.astype(np.float64), where=length > 0.0)
 
     def lifts(self, geometric_normal: np.ndarray) -> np.ndarray:
-        """How far (2, Q, 3) a smooth surface would be above the points, for light from the side of `geometric_normal`
-        (Q, 3), and from the other: `shadow_ray_smooth_surface_offset` of Cycles."""
+        """How far (2, Q, 3) above the points a smooth surface would be, for light from the side of `geometric_normal`
+        (Q, 3) and from the other side: Cycles' `shadow_ray_smooth_surface_offset`."""
         (v0, v1, v2), (n0, n1, n2) = np.moveaxis(self.corners, 1, 0), np.moveaxis(self.normals, 1, 0)
         point, normal = (np.einsum("qc,qck->qk", self.shares, values) for values in (self.corners, self.normals))
         s, t = self.shares[:, 0], self.shares[:, 1]
@@ -302,12 +304,12 @@ class _Shape:
 
 
 def _turned(vectors, matrices):
-    """Vectors (Q, N, 3) by the first three columns of matrices (Q, 3, ...)."""
+    """Vectors (Q, N, 3) times the first three columns of matrices (Q, 3, ...)."""
     return sum(vectors[:, :, k, None] * matrices[:, None, :, k] for k in range(3))
 
 
 def _cofactors(matrices):
-    """What takes normals along with points (Q, 3, 3): the inverse transposed times the determinant."""
+    """Matrices (Q, 3, 3) that take normals along with points: the inverse transposed times the determinant."""
     a, b, c = np.moveaxis(matrices[:, :, :3], 1, 0)
     return np.stack([_crossed(b, c), _crossed(c, a), _crossed(a, b)], axis=1)
 

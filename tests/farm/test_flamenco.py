@@ -47,7 +47,9 @@ def test_settings_have_labels_and_descriptions_and_are_refused_where_they_make_n
     assert all(setting["description"] for setting in settings if setting.get("visible") != "hidden")
     keys = [setting["key"] for setting in settings]
     assert len(set(keys)) == len(keys) and {"blendfile", "output", "shards"} <= set(keys)
-    assert "command is render, expected one of bake, compare, shade" in compiled(tmp_path, command="render")["error"]
+    commands = "bake, compare, shade, render, view"
+    assert f"command is merge, expected one of {commands}" in compiled(tmp_path, command="merge")["error"]
+    assert "cycles_samples is 1, expected 0, or 2 or more" in compiled(tmp_path, cycles_samples=1)["error"]
     for name, found in (("shards", "0, expected 1 or more"), ("output", "empty"), ("blendfile", "empty")):
         assert f"{name} is {found}" in compiled(tmp_path, **{name: 0 if name == "shards" else ""})["error"]
 
@@ -77,6 +79,15 @@ BAKE = {"objects": "Floor; Big Wall;", "size": 256, "error": True, "apply": True
          {"frames": (-2, -1, 0, 1), "cycles_samples": 32, "sub_samples": 4, "cameras": ("Left",)}),
         ({"command": "shade", "techniques": "ltc,ltsh2", "arguments": "--resolution=96x54", "frames": ""},
          {"techniques": ("ltc", "ltsh2"), "resolution": (96, 54), "frames": ()}),
+        ({"command": "compare"}, {"cycles_samples": 512}),
+        ({"error": True}, {"error": True, "cycles_samples": 256}),
+        ({"command": "render", "frames": "1-3"},
+         {"techniques": ("ltsh4",), "frames": (1, 2, 3), "cycles_samples": None, "budget": None}),
+        ({"command": "render", "cycles_samples": 64, "arguments": "--denoise off"},
+         {"cycles_samples": 64, "budget": None, "denoise": "off"}),
+        ({"command": "render", "arguments": "--budget 30"}, {"cycles_samples": None, "budget": 30.0}),
+        ({"command": "view", "techniques": "ltc,ltsh4", "arguments": "--refine 4", "cycles_samples": 64},
+         {"techniques": ("ltc", "ltsh4"), "refine": 4}),
     ],
 )  # fmt: skip
 def test_every_task_is_a_command_line_that_ltsh_takes(tmp_path, settings, expected):
@@ -89,7 +100,12 @@ def test_every_task_is_a_command_line_that_ltsh_takes(tmp_path, settings, expect
         assert {name: found[name] for name in expected} == expected
 
 
-@pytest.mark.parametrize("command", ["bake", "compare", "shade"])
+def test_the_commands_are_those_that_a_job_file_may_have(tmp_path):
+    (setting,) = (setting for setting in compiled(tmp_path)["settings"] if setting["key"] == "command")
+    assert set(setting["choices"]) == set(cli_commands.job_parsers())
+
+
+@pytest.mark.parametrize("command", sorted(cli_commands.job_parsers()))
 def test_the_example_of_further_arguments_is_taken_by_every_command(tmp_path, command):
     (described,) = (s["description"] for s in compiled(tmp_path)["settings"] if s["key"] == "arguments")
     example = described.partition("such as ")[2]

@@ -11,6 +11,8 @@ import pytest
 import slurm_cluster
 from kills import contents
 
+from ltsh_addon.cli.commands import job_parsers
+
 ROOT = Path(__file__).resolve().parents[2]
 FARM = ROOT / "farm"
 WANTED = os.environ.get("LTSH_TEST_SLURM") == "1"
@@ -86,6 +88,7 @@ OBJECTS += [f"cabinet left {number} plastic screen" for number in (1, 2, 3, 4)]
     [
         (["bake", "a b.blend", "-o", "{out}/x y"], "{out}/x y", "{out}/x y"),
         (["shade", "a.blend", "-o{out}/x", "--aa", "4"], "{out}/x", "{out}/x"),
+        *(([command, "a.blend", "-o", "{out}/x"], "{out}/x", "{out}/x") for command in sorted(job_parsers())),
         (["run", "{out}/night.toml", "--quiet"], "{out}", "{out}/night.toml"),
     ],
 )

@@ -192,7 +192,7 @@ def test_wrong_changes_are_named(capsys, monkeypatch, room, out, arguments, code
 def test_folders_and_files_that_keep_nothing_are_refused(capsys, monkeypatch, room, out):
     shade(capsys, monkeypatch, room, out)
     code, _, stderr = run(capsys, "relight", out, "--light", "Light 0")
-    assert code == 1 and "run shade or compare with --keep-visibility" in stderr
+    assert code == 1 and "run shade, compare or render with --keep-visibility" in stderr
     for content in (b"", b"no archive", (out / "shade.exr").read_bytes()[:2000]):
         (out / "shade.samples.npz").write_bytes(content)
         code, _, stderr = run(capsys, "relight", out, "--light", "Light 0")

@@ -1,4 +1,4 @@
-"""F12: a final picture by the command line's own way, and the engine's class."""
+"""The engine's class, and final renders (F12), which take the same way as the command line."""
 
 from __future__ import annotations
 
@@ -44,17 +44,16 @@ from . import view
 from .view import EngineView
 
 PASS_LABELS = {"specular": "Specular", "diffuse": "Diffuse"}
-# Passes of the samples themselves, under Blender's names: channels and type, and the setting of the view layer.
+# Passes from the samples themselves, by Blender's names: their channels and type, and their settings of the view layer.
 DEPTH, NORMAL, POSITION = "Depth", "Normal", "Position"
 DATA_PASSES = {DEPTH: ("Z", "VALUE"), NORMAL: ("XYZ", "VECTOR"), POSITION: ("XYZ", "VECTOR")}
 DATA_SETTINGS = {DEPTH: "use_pass_z", NORMAL: "use_pass_normal", POSITION: "use_pass_position"}
-# Passes that Cycles writes with the samples, by the names of `names_in_files`.
+# Passes that Cycles writes with the samples, by the keys of `names_in_files`.
 INDICES = ("object_index", "material_index")
 BEHIND = 1e10  # depth of the background, as in Cycles
 EMISSION = "LTSH Emission"
-ASK_SECONDS = 0.05
-# A line in the console each.
-REPORT_SECONDS = 1.0
+ASK_SECONDS = 0.05  # between two calls of `progress` in `stoppable`
+REPORT_SECONDS = 1.0  # between two status texts, each a line in the console
 _logger = logging.getLogger(__name__)
 
 
@@ -68,7 +67,7 @@ class LTSH_RenderEngine(bpy.types.RenderEngine):
     bl_use_spherical_stereo = False
     # Material Preview stays EEVEE's.
     bl_use_eevee_viewport = True
-    # With the GPU's context Blender's window would stand still during a final render.
+    # With a GPU context Blender's window would freeze during a final render.
     bl_use_gpu_context = False
 
     # Viewport:
@@ -100,7 +99,7 @@ class LTSH_RenderEngine(bpy.types.RenderEngine):
 
     def render(self, depsgraph):
         """Render one view layer of one frame."""
-        # What is raised here would be printed and the picture saved as if all were well.
+        # Blender only prints exceptions of this method, and saves the picture as if all were well.
         try:
             self._render(depsgraph)
         except Cancelled:
@@ -141,7 +140,7 @@ class LTSH_RenderEngine(bpy.types.RenderEngine):
             comparison.mix_render(job.scene, picture.lights, picture.kept)
 
     def _show(self, picture: FinalPicture, view_layer: str) -> None:
-        """Let Blender have the picture: the last one stays."""
+        """Give Blender the picture; the last one stays."""
         height, width = picture.combined.shape[:2]
         result = self.begin_result(0, 0, width, height, layer=view_layer)
         passes = result.layers[0].passes
@@ -152,7 +151,7 @@ class LTSH_RenderEngine(bpy.types.RenderEngine):
         self.end_result(result)
 
     def _progress(self, plan: Plan, show_new: Callable[[], None]):
-        """A progress callback that shows where the render stands, and stops it when the user does."""
+        """A progress callback that shows the progress of the render, and stops it if the user cancels."""
         began, told, last = time.monotonic(), [float("-inf")], [("", 0.0)]
 
         def progress(stage: str, fraction: float) -> bool:
@@ -171,7 +170,7 @@ class LTSH_RenderEngine(bpy.types.RenderEngine):
 
 
 def _passes_of(scene, layer) -> list[tuple[str, str, str]]:
-    """Name, channels and type of all passes but Combined."""
+    """Name, channels and type of all passes except Combined."""
     settings = scene.ltsh_view
     if not settings.complete:
         own = [(name, "RGB", "COLOR") for name in pass_names(_prefixes(settings))]
@@ -182,12 +181,12 @@ def _passes_of(scene, layer) -> list[tuple[str, str, str]]:
 
 
 def _indices_of(layer) -> tuple[str, ...]:
-    """Those of `INDICES` that `layer` has."""
+    """The passes of `INDICES` that `layer` has."""
     return tuple(key for key in INDICES if getattr(layer, f"use_pass_{key}"))
 
 
 def _passes_of_cycles(scene, layer) -> list[tuple[str, str, str]]:
-    """The passes that `layer` has with Cycles; none where its add-on is off."""
+    """The passes that `layer` has with Cycles; none if its add-on is off."""
     if not hasattr(layer, "cycles"):
         return []
     from cycles.engine import list_render_passes
@@ -228,7 +227,7 @@ def _job_of(engine, depsgraph) -> FinalJob:
 
 @dataclass(frozen=True)
 class FinalJob:
-    """What the render of one view layer needs to know of the scene."""
+    """The facts of the scene that the render of one view layer needs."""
 
     scene: str
     view_layer: str
@@ -239,20 +238,20 @@ class FinalJob:
     other_techniques: tuple[str, ...] = ()  # with passes of their own
     shadows: str = "off"
     shadow_rays: int = 256  # see `PictureOptions`
-    # (3,) radiance behind the surfaces while Cycles has not rendered what is there; None: transparent
+    # (3,) radiance behind the surfaces until Cycles has rendered it; None: transparent
     background: np.ndarray | None = None
-    cycles_samples: int = 0  # of what is not direct light; 0: nothing but direct light
-    cycles_passes: tuple[tuple[str, str], ...] = ()  # name and channels of those of the view layer
+    cycles_samples: int = 0  # of Cycles' part, which is not direct light; 0: only direct light
+    cycles_passes: tuple[tuple[str, str], ...] = ()  # name and channels of the view layer's passes of Cycles
     keeps_lights: bool = False  # for the light mixer
-    resolution: tuple[int, int] = (1920, 1080)  # about, for the time that it takes
-    data_passes: bool = False  # also those of `DATA_PASSES`
-    indices: tuple[str, ...] = ()  # also those of `INDICES`
+    resolution: tuple[int, int] = (1920, 1080)  # approximate, to estimate the time
+    data_passes: bool = False  # make the passes of `DATA_PASSES`
+    indices: tuple[str, ...] = ()  # passes of `INDICES` to make
     to_camera: np.ndarray | None = None  # (4, 4) from the world; None: no depth
 
     def steps(self) -> list[Step]:
-        """What the render goes through."""
+        """The stages of the render."""
         pixels, techniques = 1e-6 * math.prod(self.resolution), dict.fromkeys(self.shaded_as().values())
-        # What is not direct light has shadows in any case.
+        # Pictures with Cycles' part always have shadows.
         rays = self.shadow_rays if self.shadows == "on" or self.cycles_samples else 0
         sampling, shading = shading_steps(pixels * self.sub_samples, self.sub_samples, rays, techniques)
         rest = finished_steps(pixels, self.cycles_samples) if self.cycles_samples else []
@@ -260,7 +259,7 @@ class FinalJob:
         return [Step(STARTING, START_SECONDS), *sampling, *shading, *rest]
 
     def shaded_as(self) -> dict[str, str]:
-        """Names of passes start with -> technique."""
+        """The techniques by the prefix of their passes' names."""
         return {"LTSH": self.technique, **{TECHNIQUES[name].label: name for name in self.other_techniques}}
 
 
@@ -271,23 +270,23 @@ def pass_names(prefixes) -> list[str]:
 
 @dataclass(frozen=True)
 class FinalPicture:
-    """Pictures with row 0 on top: RGBA (H, W, 4), passes (H, W, C) by name."""
+    """A final picture and its passes, row 0 on top."""
 
-    combined: np.ndarray
-    passes: dict[str, np.ndarray]
+    combined: np.ndarray  # RGBA (H, W, 4)
+    passes: dict[str, np.ndarray]  # (H, W, C) by name
     warnings: tuple[str, ...]
     problems: tuple[str, ...] = ()
-    lights: LightPictures | None = None
-    kept: KeptPicture | None = None  # what the lights are shaded from
+    lights: LightPictures | None = None  # for the light mixer
+    kept: KeptPicture | None = None  # the samples, for lights that move
 
 
 def final_picture(
     job: FinalJob, scene_file: Path, progress: Progress, show: Callable[[FinalPicture], None] = lambda picture: None
 ) -> FinalPicture:
-    """Take samples of the .blend `scene_file` and shade them. Uses no bpy.
+    """Extract samples of the .blend `scene_file` and shade them. Uses no bpy.
 
-    `progress(stage, fraction of the stage)` returns False to stop; `show` gets the picture whenever more of it is
-    there. Raises SceneError, TableError, Cancelled, OSError.
+    `progress(stage, fraction of the stage)` returns False to stop. `show` gets every preliminary picture. Raises
+    SceneError, TableError, Cancelled, OSError.
     """
     if job.cycles_samples:
         return _complete_picture(job, scene_file, progress, show)
@@ -314,7 +313,7 @@ def final_picture(
     passes |= {name: inside_border(plane[..., None], extraction.border) for name, plane in indices}
 
     def picture() -> FinalPicture:
-        """What there is so far."""
+        """The picture so far."""
         combined = inside_border(rest, extraction.border).copy()
         for part in shown:
             combined[..., :3] += passes.get(f"LTSH {PASS_LABELS[part]}", 0.0)
@@ -342,8 +341,11 @@ def _kept_options(job: FinalJob, passes) -> dict:
 
 
 def data_passes(extraction, to_camera: np.ndarray | None) -> dict[str, np.ndarray]:
-    """Depth (H, W, 1), normal and position (H, W, 3) of what the samples see, as Cycles has them: of the first hit of a
-    pixel, but for the normal, which is the mean. Depth is that of the camera `to_camera` (4, 4) is for."""
+    """Depth (H, W, 1), normal and position (H, W, 3) of the samples, as in Cycles.
+
+    Depth and position are those of the first hit of a pixel, the normal is the mean. `to_camera` (4, 4) leads from the
+    world to the camera of the depth.
+    """
     film, samples = extraction.film, extraction.samples
     weight = np.ones(len(samples)) if film.first is None else film.first.astype(float)
     normal = film.image(samples.normal * weight[:, None])
@@ -359,7 +361,7 @@ def data_passes(extraction, to_camera: np.ndarray | None) -> dict[str, np.ndarra
 
 
 def _direct_light(job: FinalJob, comparison) -> FinalPicture:
-    """What of a complete picture is there before Cycles begins."""
+    """The preliminary picture of a complete one before Cycles begins: its direct light."""
     extraction = comparison.extraction
     images = {f"LTSH {PASS_LABELS[part]}": image for (_, part), image in comparison.images.items()}
     coverage = extraction.film.coverage()
@@ -371,7 +373,7 @@ def _direct_light(job: FinalJob, comparison) -> FinalPicture:
 
 
 def _complete_picture(job: FinalJob, scene_file: Path, progress: Progress, show) -> FinalPicture:
-    """The same with everything that Cycles renders, and its passes."""
+    """The final picture with everything that Cycles renders, and its passes."""
     options = RenderOptions(
         scene_file,
         frame=job.frame,
@@ -388,7 +390,7 @@ def _complete_picture(job: FinalJob, scene_file: Path, progress: Progress, show)
     passes = {f"LTSH {label}": made.ours.get(f"{job.technique}.{part}", zero) for part, label in PASS_LABELS.items()}
     for name, channels in job.cycles_passes:
         planes = {key[-1].upper(): plane for key, plane in made.channels.items() if key.rpartition(".")[0] == name}
-        # The only channel has one letter or another.
+        # The letter of a single channel varies.
         letters = channels.upper() if len(channels) > 1 else tuple(planes)
         if planes and set(letters) <= set(planes):
             passes[name] = np.stack([planes[letter] for letter in letters], axis=-1)
@@ -402,7 +404,7 @@ def _complete_picture(job: FinalJob, scene_file: Path, progress: Progress, show)
 
 
 def _part(progress: Progress, start: float, share: float) -> Progress:
-    """A progress callback for a stage that takes `share` of the whole from `start` on."""
+    """A progress callback for a part of a stage: the `share` of it from `start` on."""
     return lambda stage, fraction: progress(stage, start + share * fraction)
 
 
@@ -420,7 +422,7 @@ def _image(extraction, technique: str, part: str, shadows, progress: Progress) -
 
 
 def _over_background(color: np.ndarray, coverage: np.ndarray, background, exposure: float) -> np.ndarray:
-    """RGBA (H, W, 4) of `color` over what is behind the surfaces: radiance (3,), or None: nothing."""
+    """RGBA (H, W, 4) of `color` over the radiance `background` (3,) behind the surfaces; None: transparent."""
     if background is None:
         return np.concatenate([color, coverage[..., None]], axis=-1)
     seen = background * (1.0 - coverage)[..., None]
@@ -428,22 +430,23 @@ def _over_background(color: np.ndarray, coverage: np.ndarray, background, exposu
 
 
 def inside_border(image: np.ndarray, border) -> np.ndarray:
-    """The part of `image` (H, W, ...) inside the render region: what Blender takes from engines, cropped or not."""
+    """The part of `image` (H, W, ...) inside the render region, which Blender expects of engines, cropped or not."""
     if border is None or border.cropped:
         return image
     return image[border.top : border.top + border.height, border.left : border.left + border.width]
 
 
 def blender_pixels(image: np.ndarray) -> np.ndarray:
-    """`image` (H, W, C), row 0 on top, as Blender's flat float32 list that starts at the bottom left."""
+    """`image` (H, W, C), row 0 on top, as a flat float32 array that starts at the bottom left, for Blender."""
     return np.ascontiguousarray(image[::-1], dtype=np.float32).ravel()
 
 
 def stoppable(work: Callable[[Progress], object], progress: Progress):
-    """What `work(report)` returns; it runs in a thread of its own and must not use bpy.
+    """Run `work(report)` in a thread of its own, and return its result. The work must not use bpy.
 
-    `progress(stage, fraction)` gets what the work reported last, again and again, in the thread of the caller. Raises
-    what the work raises, and Cancelled as soon as `progress` returns False: the work then ends at its next report.
+    `progress(stage, fraction)` is called regularly in the caller's thread with the last report of the work. When it
+    returns False, Cancelled is raised at once, and the work ends at its next report. Exceptions of the work are raised
+    here.
     """
     state: dict = {"last": ("", 0.0)}
     stop = threading.Event()
@@ -477,7 +480,7 @@ _copy: dict = {}
 
 @persistent
 def _save_copy(*_) -> None:
-    """Save a copy where a scene of the file has our engine."""
+    """Save a copy of the file if any of its scenes has our engine."""
     _delete_copy()
     if all(scene.render.engine != ENGINE for scene in bpy.data.scenes):
         return
@@ -500,7 +503,7 @@ def _delete_copy(*_) -> None:
 
 
 def saved_copy() -> Path:
-    """The copy of the file as it was when the render started. Raises SceneError."""
+    """The copy of the file that was saved when the render started. Raises SceneError."""
     if "error" in _copy:
         raise SceneError(f"a copy of the open file could not be saved for the render: {_copy['error']}")
     if "folder" not in _copy:
@@ -512,7 +515,7 @@ HANDLERS = (("render_init", _save_copy), ("render_complete", _delete_copy), ("re
 
 
 def register() -> None:
-    """Add the engine and what its renders and views need."""
+    """Add the engine and the handlers of its renders and views."""
     bpy.utils.register_class(LTSH_RenderEngine)
     for name, function in HANDLERS:
         getattr(bpy.app.handlers, name).append(function)

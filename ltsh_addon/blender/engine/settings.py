@@ -1,4 +1,4 @@
-"""Settings of the view, the panels of others that it shows too, and the line that splits it."""
+"""Settings of the view and final renders, the panels of Cycles that our engine shares, and the line of a split view."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from gpu_extras.batch import batch_for_shader
 from ...scene import CYCLES, SHIPPED_TABLES, TECHNIQUES
 from ..ui.preview import ENGINE
 
-# Files keep the numbers: they stay as they are.
+# Files store these numbers, so they must not change.
 _NUMBERS = {"ltc": 0, "ltsh2": 1, "ltsh4": 2, CYCLES: 3, "ltsh4c": 4}
 TECHNIQUE_ITEMS = tuple(
     (name, TECHNIQUES[name].label, TECHNIQUES[name].description, _NUMBERS[name]) for name in SHIPPED_TABLES
@@ -36,7 +36,7 @@ SECOND_ITEMS = (
 
 
 def _redraw(settings, context) -> None:
-    """Show a changed setting at once: the viewport does not redraw for properties of add-ons."""
+    """Show a changed setting at once: Blender does not redraw 3D views for properties of add-ons."""
     for window in context.window_manager.windows:
         for area in window.screen.areas:
             if area.type == "VIEW_3D":
@@ -86,17 +86,17 @@ class LTSH_ViewSettings(bpy.types.PropertyGroup):
     )
 
 
-# Settings of Cycles' renders in these tabs mean nothing to other engines.
+# Tabs whose panels of Cycles are about its own renders, which mean nothing to other engines.
 RENDER_TABS = ("render", "view_layer", "output")
 
 
 def _is_cycles(panel) -> bool:
-    """True for panels that Cycles' add-on brings along."""
+    """True for panels of Cycles' add-on."""
     return "cycles" in panel.__module__.split(".")
 
 
 def shared_panels() -> list[type]:
-    """Panels of things that LTSH shades too: all that Cycles shows, without its own render settings."""
+    """The panels to show with our engine: all that Cycles shows, except its own render settings."""
     panels = [panel for panel in _below(bpy.types.Panel) if ENGINE not in getattr(panel, "COMPAT_ENGINES", (ENGINE,))]
     shown = [panel for panel in panels if "CYCLES" in panel.COMPAT_ENGINES]
     if not shown:
@@ -106,7 +106,7 @@ def shared_panels() -> list[type]:
 
 
 def _is_about_scene(panel) -> bool:
-    """False for the settings of Cycles' own renders."""
+    """True for panels about objects, materials and lights; False for settings of Cycles' own renders."""
     tab, space = getattr(panel, "bl_context", ""), getattr(panel, "bl_space_type", "")
     return (space == "PROPERTIES" and tab not in ("", *RENDER_TABS)) or space == "NODE_EDITOR"
 
@@ -121,7 +121,7 @@ def _below(panel) -> list[type]:
 
 
 class _AsCycles:
-    """A context in which the engine is Cycles."""
+    """A context whose engine is Cycles."""
 
     engine = "CYCLES"
 
@@ -133,7 +133,7 @@ class _AsCycles:
 
 
 def _asked_as_cycles(poll):
-    """The class method `poll` of a panel, to which our engine is Cycles."""
+    """The class method `poll` of a panel, changed to treat our engine as Cycles."""
 
     def poll_of_both(cls, context):
         return poll.__func__(cls, _AsCycles(context) if context.engine == ENGINE else context)
@@ -141,17 +141,17 @@ def _asked_as_cycles(poll):
     return classmethod(poll_of_both)
 
 
-# Panels that show themselves under our engine, and what they had of their own of these (None: inherited).
+# Panels that are changed to appear with our engine, with their former attributes (None: inherited).
 _changed: dict[type, dict] = {}
 
 
 def _share_panels() -> None:
-    """Show them."""
+    """Show the shared panels with our engine."""
     for panel in shared_panels():
-        # A set of its own: Cycles' panels share one, those for its render settings included.
+        # Each panel gets its own set, because all panels of Cycles share one, also those of its render settings.
         shown = {"COMPAT_ENGINES": {*panel.COMPAT_ENGINES, ENGINE}}
         if _is_cycles(panel):
-            # Most ask the class that they all share whether the engine is right.
+            # Most of them poll by their common base class, which checks the engine.
             shown["poll"] = _asked_as_cycles(panel.poll)
         _changed[panel] = {name: vars(panel).get(name) for name in shown}
         for name, value in shown.items():
@@ -159,7 +159,7 @@ def _share_panels() -> None:
 
 
 def _unshare_panels() -> None:
-    """Hide them again."""
+    """Restore the shared panels."""
     while _changed:
         panel, former = _changed.popitem()
         for name, value in former.items():
@@ -174,7 +174,7 @@ HANDLE = 12.0
 
 
 def is_split(context) -> bool:
-    """True in 3D views that show a split picture."""
+    """True if the space of `context` is a 3D view with a split picture."""
     space = context.space_data
     shown = space is not None and space.type == "VIEW_3D" and space.shading.type == "RENDERED"
     return shown and context.engine == ENGINE and context.scene.ltsh_view.mode == "split"
@@ -246,7 +246,7 @@ _add_classes, _remove_classes = bpy.utils.register_classes_factory(CLASSES)
 
 
 def register() -> None:
-    """Add the settings and the gizmo; show the panels that others have for the same things."""
+    """Add the settings and the gizmo, and show the shared panels."""
     _add_classes()
     bpy.types.Scene.ltsh_view = bpy.props.PointerProperty(type=LTSH_ViewSettings)
     _share_panels()

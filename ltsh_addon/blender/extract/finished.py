@@ -13,30 +13,33 @@ from ..evaluated import SURFACE_TYPES
 from ..materials.aovs import give_default_material, objects_without_material
 from ..materials.bsdfs import emits, is_emission
 from ..materials.graph import cut, ensure_nodes, is_seen_through, material_output, shaders_behind, tree_in_use
+from ..process.client import EDGE_SECONDS
 from ..render_settings import enable_passes, render_exr
 from .pixels import REST_PASSES, open_scene, scene_named
 
-# Samples of the first file where progress is to be told, or the time of the next ones to be known, and the seconds of
-# the others.
-FIRST, PROBE, CHUNK_SECONDS, MOST_CHUNKS = 16, 2, 6.0, 6
-# Of a budget: so much of it is left for what comes after the last sample. A last file takes what others have left.
-SPENT, MOST_FILES = 0.97, 4
-# Passes that a finished picture takes its parts from, those that artists put together, and what the denoiser wants.
+# A given number of samples is rendered in files, so that progress can be told: the samples of the first file, the
+# seconds that each further one takes, and the most of these.
+FIRST, CHUNK_SECONDS, MOST_CHUNKS = 16, 6.0, 6
+# A budget is spent in files as well: the samples of the first one, which tells what a sample takes; the most files; the
+# share of the time after which none begins; the processor seconds that a file takes beside its samples, for a million
+# pixels.
+PROBE, MOST_FILES, SPENT, FILE_SECONDS = 2, 4, 0.97, 3.0
+# PASSES: what a finished picture takes its parts from, and artists put together. GUIDES: what the denoiser needs.
 LIGHT_PASSES = tuple(
     f"{kind}_{part}" for kind in ("diffuse", "glossy", "transmission") for part in ("direct", "indirect", "color")
 )
 PASSES = (*LIGHT_PASSES, "emit", "environment")
 GUIDES = ("Denoising Albedo", "Denoising Normal")
 NOT_WRITTEN = (*GUIDES, "Denoising Depth", "Denoising Specular Albedo", "Denoising Roughness")
-# What shines in sight is rendered apart: a pixel takes more than the fewest samples where it is at an edge, up to the
-# most, until its noise is below the limit. Processor seconds that it takes for a million pixels.
-EDGES, EDGE_SAMPLES, EDGE_LIMIT, EDGE_SECONDS = "edges.exr", (16, 512), 0.003, 12.0
-# Inputs of nodes that also shine which make them reflect.
+# What shines in sight is rendered apart, into the file EDGES. EDGE_SAMPLES: the fewest and the most samples of a pixel;
+# those at edges take more than the fewest, until their noise is below EDGE_LIMIT.
+EDGES, EDGE_SAMPLES, EDGE_LIMIT = "edges.exr", (16, 512), 0.003
+# REFLECTING: the inputs that make nodes which shine reflect as well.
 REFLECTING = ("Color", "Base Color", "Metallic", "Specular IOR Level", "Transmission Weight", "Subsurface Weight")
 
 
 def render_finished(job: dict, folder: Path, progress) -> dict:
-    """Do the `job` (see `client.FinishedJob`), write EXRs into `folder`; the manifest as a dictionary."""
+    """Do the `job` (see `client.FinishedJob`) and write EXRs into `folder`. Returns the manifest."""
     warnings, started, seconds = [], time.process_time(), job["seconds"]
     progress("open scene", 0.0)
     open_scene(Path(job["scene"]), warnings, job["scripts"])
@@ -101,24 +104,24 @@ def _kept_by_cycles(scene, layer) -> list[str]:
 
 
 def _prepare(scene, layer, warnings: list[str]) -> None:
-    """Let Cycles write all passes; nothing changes what it renders."""
+    """Let Cycles write all passes. Nothing here changes the light that it renders."""
     render, cycles = scene.render, scene.cycles
     warnings.extend(render_settings.steps_after_rendering(scene))
     if render.use_multiview:
         warnings.append("stereoscopy is switched off")
-    # A render evaluates its animation again, and would undo what is set.
+    # A render evaluates the scene's animation again, which would undo these settings.
     if scene.animation_data is not None:
         scene.animation_data_clear()
     render.engine = "CYCLES"
     render.threads_mode, render.threads = "FIXED", render_settings.cores()
     render.use_compositing = render.use_sequencer = render.use_multiview = False
     render.use_file_extension = render.use_overwrite = True
-    # The second and further files need no second look at the scene.
+    # Cycles keeps the scene for the second and further files.
     render.use_persistent_data = True
     if cycles.device != "CPU":
         warnings.append("Cycles renders on the processor, the file asks for a graphics card")
     cycles.device = "CPU"
-    # We denoise what remains without our light. The same noise in each frame does not flicker.
+    # The parent denoises what remains without our light. Noise that is the same in each frame does not flicker.
     cycles.use_denoising = cycles.use_animated_seed = cycles.use_sample_subset = False
     for name in PASSES:
         setattr(layer, f"use_pass_{name}", True)
@@ -126,8 +129,10 @@ def _prepare(scene, layer, warnings: list[str]) -> None:
 
 
 def _render_chunks(scene, layer, folder: Path, samples, end, progress) -> tuple[list[list], float]:
-    """[file name in `folder`, samples in it]: so many samples, or as many as there is time for until the processor time
-    `end`, or those of the file in one go with all that it says of them; and the processor time after the first file."""
+    """Render `samples` samples; or as many as fit until the processor time `end`; or, without both, what the file says.
+
+    Returns [file name in `folder`, samples in it] for each file, and the processor time after the first one.
+    """
     cycles, files, done, first, seed = scene.cycles, [], 0, 0.0, scene.cycles.seed
     if samples is None and end is None:
         render_exr(scene, folder / "cycles_0.exr")
@@ -135,12 +140,13 @@ def _render_chunks(scene, layer, folder: Path, samples, end, progress) -> tuple[
     layer.samples, cycles.use_adaptive_sampling, cycles.time_limit = 0, False, 0.0
     cycles.use_sample_subset = True
     chunk = min(FIRST, samples) if end is None else PROBE
+    of_file = 0.0 if end is None else FILE_SECONDS * scene.render.resolution_x * scene.render.resolution_y / 1e6
     while samples is None or done < samples:
         progress("Cycles", done / samples if samples else min(len(files) / 3, 1.0))
         clock = time.process_time if end is not None else time.monotonic
         started = clock()
         if samples is None:
-            # Each file is whole in itself: of a part of more samples the noise is not spread as evenly.
+            # Each file has a whole sequence of its own, whose noise is spread more evenly than that of a part of one.
             cycles.samples, cycles.seed, offset = chunk, (seed + len(files)) % 2**31, 0
         else:
             cycles.samples, offset = samples, done
@@ -149,10 +155,12 @@ def _render_chunks(scene, layer, folder: Path, samples, end, progress) -> tuple[
         render_exr(scene, folder / files[-1][0])
         first = first or time.process_time()
         done += chunk
-        each = (clock() - started) / chunk
+        took = clock() - started
+        each = max(took - of_file, 0.1 * took) / chunk
         if end is not None:
-            # The first time holds the look at the scene, so the next one tells better what a sample takes.
-            left = int((end - time.process_time()) / each)
+            # The first file takes longer, since Cycles looks at the scene, so only the second one tells what a sample
+            # takes.
+            left = int((end - time.process_time() - of_file) / each)
             chunk = left if len(files) > 1 else min(left, 4 * PROBE)
             if chunk < 1 + done // 10 or len(files) == MOST_FILES:
                 break
@@ -163,7 +171,7 @@ def _render_chunks(scene, layer, folder: Path, samples, end, progress) -> tuple[
 
 
 def _render_edges(scene, layer, folder: Path, progress) -> None:
-    """Render EDGES, what shines in sight and nothing else: surfaces that only reflect are black from now on."""
+    """Render EDGES, only what shines in sight. From now on surfaces that only reflect are black."""
     progress("edges", 0.0)
     bare = [ob for ob in bpy.data.objects if ob.type in SURFACE_TYPES and ob.data.library is None]
     give_default_material(objects_without_material(bare))

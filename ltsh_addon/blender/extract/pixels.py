@@ -76,22 +76,23 @@ def render_pixel_samples(
 
 # FINISHED_LENS: fewest points per pixel for depth of field in a finished picture; with fewer Cycles has less noise.
 FINISHED_LENS = 32
-# Processor seconds of direct light. START_SECONDS: always. LOOKS: how many looks at the scene there are, by us and by
-# Cycles (for the first points, for more points, and for its picture). POINT_SECONDS: for a point of a pixel, which
-# grows by LIGHT_SHARE with each light, up to MOST_LIGHTS.
-# Shares of a budget. POINTS_SHARE: at most for points. DIRECT_SHARE: at most for all of direct light.
-START_SECONDS, LOOKS, POINT_SECONDS, LIGHT_SHARE = 1.2, 5, 6e-6, 0.125
-POINTS_SHARE, DIRECT_SHARE, MOST_LIGHTS = 0.25, 0.8, 100
+# Processor seconds of direct light. START_SECONDS: always. LOOKS: how many more looks at the scene there are, by us for
+# more points, and by Cycles for these and for its picture. POINT_SECONDS: for a point of a pixel, which grows by
+# LIGHT_SHARE with each light, up to MOST_LIGHTS.
+# Shares of the seconds that are left. POINTS_SHARE: at most for points. DIRECT_SHARE: at most for all of direct light.
+START_SECONDS, LOOKS, POINT_SECONDS, LIGHT_SHARE = 0.5, 3, 6e-6, 0.125
+POINTS_SHARE, DIRECT_SHARE, MOST_LIGHTS = 0.25, 0.5, 100
 
 
-def affordable_points(budget: float, pixels: int, lights: int, looked: float = 0.0) -> int:
-    """How many points of each pixel a `budget` of processor seconds allows; 0: too little would be left for Cycles.
+def affordable_points(left: float, pixels: int, lights: int, looked: float = 0.0) -> int:
+    """How many points of each pixel processor seconds that are `left` allow; 0: too few would remain for Cycles.
 
-    Each look at the scene is expected to take as long as the first, `looked` seconds.
+    Each further look at the scene is expected to take as long as the first, `looked` seconds.
     """
     each = POINT_SECONDS * pixels * (1.0 + LIGHT_SHARE * min(lights, MOST_LIGHTS))
-    left, looks = budget - LOOKS * looked, LOOKS * looked
-    return max(int(POINTS_SHARE * left / each), 1) if DIRECT_SHARE * left > START_SECONDS + looks + each else 0
+    if DIRECT_SHARE * left < START_SECONDS + LOOKS * looked + each:
+        return 0
+    return max(int(POINTS_SHARE * (left - LOOKS * looked) / each), 1)
 
 
 # REST_PASSES: passes of Cycles with the parts of the picture that are not reflected light.
@@ -286,21 +287,23 @@ def extract(job: dict, folder: Path, progress) -> dict:
     lens, fewest = camera.data.dof, FINISHED_LENS if for_finished else 2
     has_lens = lens.use_dof and job["sub_samples"] >= fewest and not job["cycles_samples"]
     is_sharp = lens.use_dof = lens.use_dof and not has_lens
-    budget, pixels = job["seconds"], picture["width"] * picture["height"]
+    end, pixels = None, picture["width"] * picture["height"]
+    if job["seconds"] is not None:
+        end = job["since"] + job["seconds"] - (job["reserve"] + 1e-6 * client.EDGE_SECONDS) * pixels
     inventory, count = LightInventory(), 0
-    if budget is None or affordable_points(budget, pixels, 1):  # otherwise a look at the scene would be wasted
+    if end is None or affordable_points(end - opened, pixels, 1):  # otherwise a look at the scene would be wasted
         with_occluders, count = job["shadows"] == "on", job["sub_samples"]
         inventory = prepare_scene(
             scene, view_layer, camera, warnings, with_occluders=with_occluders, for_finished=for_finished
         )
-        if budget is not None and not has_lens:
-            looked = time.process_time() - opened
-            count = min(affordable_points(budget, pixels, len(inventory.lights), looked), count)
+        if end is not None and not has_lens:
+            now = time.process_time()
+            count = min(affordable_points(end - now, pixels, len(inventory.lights), now - opened), count)
     if is_sharp and for_finished:
         points = f"with fewer than {FINISHED_LENS} points per pixel (--aa)"
         inventory.kept.everything.append(f"depth of field of camera {camera.name!r} {points}")
     if count == 0:
-        inventory.kept.everything.append(client.too_small(budget))
+        inventory.kept.everything.append(client.too_small(job["seconds"]))
     has_shadows = inventory.occluders is not None
     if has_shadows:
         inventory.occluders.save(folder / OCCLUDERS)

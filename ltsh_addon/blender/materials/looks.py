@@ -139,7 +139,7 @@ class Look:
 
     @property
     def uv_map(self) -> str:
-        """The UV map of its images and its tangent ("": the active one)."""
+        """The UV map of its images and its tangent ("": the one that renders)."""
         return next((use.uv_map for use in self.images.values()), "" if self.brush is None else self.brush.uv_map)
 
     @property

@@ -21,7 +21,7 @@ ROUNDED = 1e-6
 
 @dataclass(frozen=True)
 class ImageUse:
-    """A flat image on a UV map ("": the active one); `mapping` (2, 3) maps (u, v, 1) to image coordinates."""
+    """A flat image on a UV map ("": the one active for rendering); `mapping` (2, 3) maps (u, v, 1) to the image."""
 
     image: Any
     uv_map: str
@@ -275,7 +275,7 @@ def coordinates(source: Source | None):
         return None
     node = source.node
     if node is None:
-        # A texture whose vector is not linked takes the active UV map.
+        # A texture whose vector is not linked takes the UV map that is active for rendering.
         return ("", IDENTITY) if source.socket.hide_value else None
     if node.bl_idname == "ShaderNodeUVMap" and not node.from_instancer:
         return node.uv_map, IDENTITY

@@ -55,6 +55,7 @@ class ExtractOptions:
     for_finished: bool = False  # also what a finished picture leaves to Cycles; no light is needed
     edge_points: int = 0  # points of a pixel of a finished picture that has an edge
     seconds: float | None = None  # processor time for the whole picture, which limits its sub-samples
+    reserve: float = 0.0  # the seconds of it that each pixel takes last, for denoising
 
 
 @dataclass(frozen=True)
@@ -385,6 +386,9 @@ def _rendered(path: Path) -> dict[str, np.ndarray]:
         return read_channels(path)
     except ValueError as error:
         raise OSError(errno.ENOSPC, "a picture was not written whole") from error
+
+
+EDGE_SECONDS = 12.0  # processor seconds that a million pixels of `FinishedJob.edges` take
 
 
 @dataclass(frozen=True)

@@ -38,6 +38,7 @@ def main() -> None:
     while True:
         job = json.loads(path.read_text(encoding="utf-8"))
         temporary[:] = map(Path, job["temporary"])
+        job["since"] = _told[0]
         process.tell(_answer(job, path.parent, progress))
         path = Path(jobs.get())
 

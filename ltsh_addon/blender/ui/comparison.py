@@ -1,4 +1,4 @@
-"""The picture of a comparison in the image editor: composed, wiped, probed."""
+"""The picture of a comparison in the Image Editor: composes two results, and draws the wipe line and the probe."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def changed(settings, context) -> None:
 
 
 def mixed(item, context) -> None:
-    """Called by Blender when a value of the light mixer changes: the mix is shown at once."""
+    """Called by Blender when a value of the light mixer changes; shows the mix at once."""
     settings = item.id_data.ltsh
     if results.is_silent():
         return
@@ -47,7 +47,7 @@ def mixed(item, context) -> None:
 
 
 def mix_render(name: str, pictures: LightPictures, kept: KeptPicture) -> None:
-    """Let the mixer change the lights of a final render of the scene `name`; called while Blender renders."""
+    """Give the mixer the lights of a final render of the scene `name`; called while Blender renders."""
 
     def take() -> None:
         scene = bpy.data.scenes.get(name)
@@ -60,12 +60,12 @@ def mix_render(name: str, pictures: LightPictures, kept: KeptPicture) -> None:
 
 
 def _warn(error: RuntimeError) -> None:
-    """A picture is gone; the panels say so when the results are shown anew."""
+    """Log that a picture is gone; the panels say so when the results are shown again."""
     logging.getLogger(__name__).warning("%s", error_line(error))
 
 
 def refresh(scene) -> bool:
-    """Bring the image up to date; False where there are no results."""
+    """Update the image of `scene`; False where there are no results."""
     mixture = results.mixed_pixels(scene) if scene.ltsh.mode == "MIX" else None
     if mixture is not None:
         _show(scene, mixture, True)
@@ -92,7 +92,7 @@ def _show(scene, pixels: np.ndarray, as_render: bool) -> None:
 
 
 def _chosen_images(scene, result, choice) -> list:
-    """The two images that are compared; none where the results lack one."""
+    """The two images that are compared; [] where the results lack one of them."""
     layers = [f"{name}.{choice.pass_name}" for name in (choice.first, choice.second)]
     if any(layer not in result.groups[choice.group]["files"] for layer in layers):
         return []
@@ -100,7 +100,7 @@ def _chosen_images(scene, result, choice) -> list:
 
 
 def read_a_picture(scene) -> bool:
-    """Read the pixels of a picture that `refresh` needs; False where it has them all."""
+    """Read the pixels of one picture that `refresh` needs; False where it needs no more."""
     result = results.result_of(scene)
     images = [] if result is None else _chosen_images(scene, result, results.choice_of(scene.ltsh, result))
     unread = next((image for image in images if not results.is_read(image)), None)
@@ -108,14 +108,15 @@ def read_a_picture(scene) -> bool:
 
 
 def split_of(scene) -> float:
-    """Where the line of the wipe is, as a share of the width: also while the mouse drags it."""
+    """Position of the wipe line as a share of the width, also while the mouse drags it."""
     return scene.ltsh.split if _state["dragged"] is None else _state["dragged"]
 
 
 def drag_split(scene, position: float | None) -> None:
-    """Show the line at `position` meanwhile; None: where the settings have it.
+    """Show the line at `position` while it is dragged; None: at its place in the settings.
 
-    With the settings themselves Blender would evaluate the scene anew and draw all windows for every step of the mouse.
+    If the settings changed at every step of the mouse, Blender would evaluate the scene and redraw all windows each
+    time.
     """
     _state["dragged"] = None if position is None else min(max(position, 0.0), 1.0)
     try:
@@ -125,7 +126,7 @@ def drag_split(scene, position: float | None) -> None:
 
 
 def compose(first: np.ndarray, second: np.ndarray, mode: str, split: float, scale: float) -> np.ndarray:
-    """The picture (H, W', 4) of both (H, W, 4): linear colors; W' is 2 W side by side."""
+    """The picture (H, W', 4) of two pictures (H, W, 4) in linear colors; W' is 2 W side by side, else W."""
     if mode in ("A", "MIX"):
         return first
     if mode == "SIDE":
@@ -140,12 +141,12 @@ def compose(first: np.ndarray, second: np.ndarray, mode: str, split: float, scal
 
 
 def error_scale(settings, group: dict, choice) -> float:
-    """The difference at which the colors end: the artist's own, or that of the report."""
+    """The difference at the ends of the color scale: the artist's, or that of the report."""
     return settings.error_scale if settings.error_scale > 0.0 else group["scales"][choice.pass_name]
 
 
 def viewer_image(scene):
-    """The image of `scene`, made where it is not there yet."""
+    """The image of `scene`, created if needed."""
     for image in results.our_images(scene):
         if image[results.LAYER] == "":
             return image
@@ -162,7 +163,7 @@ def is_viewer(image) -> bool:
 
 def _store(image, pixels: np.ndarray, as_render: bool) -> None:
     height, width = pixels.shape[:2]
-    # Either makes new pixels, so neither may come after they are written.
+    # Changing the color space or the size makes new pixels, so both come before the pixels are written.
     if image.colorspace_settings.name != results.linear_space():
         image.colorspace_settings.name = results.linear_space()
     if tuple(image.size) != (width, height):
@@ -173,7 +174,7 @@ def _store(image, pixels: np.ndarray, as_render: bool) -> None:
 
 
 def _lookup_index(difference: np.ndarray, scale: float) -> np.ndarray:
-    """Index into the colors; the last one is for what is not finite."""
+    """Index into the table of colors; NaN and Inf have the last one."""
     finite = np.isfinite(difference)
     position = np.clip(np.where(finite, difference, 0.0) / scale, -1.0, 1.0)
     index = np.rint((0.5 + 0.5 * position) * (_LOOKUP_SIZE - 2)).astype(np.int32)
@@ -181,7 +182,7 @@ def _lookup_index(difference: np.ndarray, scale: float) -> np.ndarray:
 
 
 def _error_lookup() -> np.ndarray:
-    """Linear colors (N, 3) that Blender's default display shows as those of `signed_error_colors`."""
+    """Linear colors (N, 3) that Blender's default display shows as the colors of `signed_error_colors`."""
     if _state["lookup"] is None:
         values = np.append(np.linspace(-1.0, 1.0, _LOOKUP_SIZE - 1), np.nan)
         colors = signed_error_colors(values[None], 1.0)[0]
@@ -191,7 +192,7 @@ def _error_lookup() -> np.ndarray:
 
 
 def _settle_later(scene) -> None:
-    """Pack the image once nothing has changed for a moment: Blender would else ask to save it before it quits."""
+    """Pack the image once nothing has changed for a moment. Blender asks to save unpacked changes when it quits."""
     _state["settling"].add(scene.name)
     if not bpy.app.background:
         if bpy.app.timers.is_registered(settle):
@@ -214,8 +215,10 @@ ARRANGE_SECONDS, ARRANGE_TRIES = 0.2, 50
 
 
 def put_in_editor(context, scene) -> bool:
-    """Show the image of `scene` in an Image Editor that shows nothing, a render or a picture of ours; False where none
-    does. The window of `context` comes first."""
+    """Show the image of `scene` in an Image Editor that is empty or shows a render or one of our pictures.
+
+    The window of `context` comes first. Returns False where there is no such editor.
+    """
     windows = [] if context.window is None else [context.window, *bpy.context.window_manager.windows]
     for area in (area for window in windows for area in window.screen.areas):
         if area.ui_type == "IMAGE_EDITOR":
@@ -227,7 +230,7 @@ def put_in_editor(context, scene) -> bool:
 
 
 def open_editor(context, scene) -> bool:
-    """Show the image of `scene` in an Image Editor, if need be in a new window; False where none can be opened."""
+    """Show the image of `scene` in an Image Editor, if needed in a new window; False where none can be opened."""
     if put_in_editor(context, scene):
         return True
     windows = bpy.context.window_manager.windows
@@ -243,14 +246,14 @@ def open_editor(context, scene) -> bool:
     area.ui_type = "IMAGE_EDITOR"
     area.spaces.active.image = viewer_image(scene)
     area.spaces.active.show_region_ui = True
-    # Blender knows the size and the tabs of the new area after it has drawn it.
+    # Blender knows the size and the tabs of the new area only after drawing it.
     tries = iter(range(ARRANGE_TRIES))
     bpy.app.timers.register(lambda: _arrange(window, area, next(tries, None)), first_interval=ARRANGE_SECONDS)
     return True
 
 
 def _arrange(window, area, attempt: int | None) -> float | None:
-    """Fit the picture into its new area and open our tab; seconds until the next attempt where it is not drawn."""
+    """Fit the picture into its new area and open our tab. Returns the seconds until the next attempt; None: done."""
     try:
         regions = {region.type: region for region in area.regions}
         regions["UI"].active_panel_category = "LTSH"
@@ -271,7 +274,7 @@ def redraw_image_editors() -> None:
 
 
 def redraw_panels() -> None:
-    """Draw everything again that shows progress, and nothing else: a viewport may take long."""
+    """Draw all regions again that show progress, and no others: a viewport may take long."""
     for area in _areas():
         wanted = PANEL_REGIONS.get(area.type)
         for region in area.regions:
@@ -285,7 +288,7 @@ def _areas() -> list:
 
 @contextlib.contextmanager
 def kept_as_it_is():
-    """Meanwhile saving leaves the images alone: for a copy that no artist opens, in which they do not matter."""
+    """Context in which saving leaves the images as they are, for copies of the file that no artist opens."""
     _state["kept"] = True
     try:
         yield
@@ -295,7 +298,7 @@ def kept_as_it_is():
 
 @bpy.app.handlers.persistent
 def _shrink(*_):
-    """Before saving: pixels that can be made again have no place in the file."""
+    """Before saving, remove pixels that can be made again from the file."""
     for scene in bpy.data.scenes if not _state["kept"] else ():
         for image in results.our_images(scene):
             if is_viewer(image) and results.result_of(scene) is not None:
@@ -305,7 +308,7 @@ def _shrink(*_):
 
 @bpy.app.handlers.persistent
 def _restore(*_):
-    """After saving and loading."""
+    """After saving and loading, make the pixels again."""
     if _state["kept"]:
         return
     for scene in bpy.data.scenes:
@@ -362,16 +365,17 @@ class LTSH_OT_probe(bpy.types.Operator):
         return outcome
 
 
-# Over an image, in pixels of the region, at the interface's scale.
+# Text and shapes drawn over an image, in pixels of the region at the interface's scale.
 FONT = 0
 TEXT_SIZE = 11.0
-# Readable on any picture and in any theme. Blender blends linear colors: a thinner plate is pale on a white picture.
+# Colors that are readable on any picture in any theme. The plate is nearly opaque: Blender blends linear colors, so a
+# more transparent one would be pale on a white picture.
 INK, PLATE = (1.0, 1.0, 1.0, 1.0), (0.0, 0.0, 0.0, 0.97)
 PAPER, LINE = (0.0, 0.0, 0.0, 0.6), (1.0, 1.0, 1.0, 0.9)
 
 
 def draw_rectangle(left: float, bottom: float, right: float, top: float, color) -> None:
-    """A filled rectangle."""
+    """Draw a filled rectangle."""
     corners = [(left, bottom), (right, bottom), (right, top), (left, top)]
     shader = gpu.shader.from_builtin("UNIFORM_COLOR")
     batch = batch_for_shader(shader, "TRIS", {"pos": corners}, indices=[(0, 1, 2), (0, 2, 3)])
@@ -382,7 +386,7 @@ def draw_rectangle(left: float, bottom: float, right: float, top: float, color) 
 
 
 def draw_gradient(left: float, bottom: float, right: float, top: float, colors) -> None:
-    """Colors (N, 3) in display values from left to right."""
+    """Draw colors (N, 3), display values, from left to right."""
     count = len(colors)
     steps = [left + (right - left) * index / (count - 1) for index in range(count)]
     positions = [(x, y) for x in steps for y in (bottom, top)]
@@ -392,13 +396,13 @@ def draw_gradient(left: float, bottom: float, right: float, top: float, colors) 
 
 
 def text_width(text: str, scale: float) -> float:
-    """Pixels that `text` takes."""
+    """Width of `text` in pixels."""
     blf.size(FONT, TEXT_SIZE * scale)
     return blf.dimensions(FONT, text)[0]
 
 
 def draw_text(x: float, y: float, text: str, scale: float, color=INK) -> None:
-    """`text` from the left end of its base line."""
+    """Draw `text`, with the left end of its base line at (x, y)."""
     blf.size(FONT, TEXT_SIZE * scale)
     blf.color(FONT, *color)
     blf.position(FONT, x, y, 0.0)
@@ -406,7 +410,7 @@ def draw_text(x: float, y: float, text: str, scale: float, color=INK) -> None:
 
 
 def draw_label(x: float, y: float, text: str, scale: float, align: float = 0.0) -> None:
-    """`text` on a dark plate whose left (`align` 0) or right (1) lower corner is at (x, y)."""
+    """Draw `text` on a dark plate whose lower left (`align` 0) or lower right (1) corner is at (x, y)."""
     pad, height = 6.0 * scale, 20.0 * scale
     width = text_width(text, scale) + 2.0 * pad
     left = x - align * width
@@ -415,7 +419,7 @@ def draw_label(x: float, y: float, text: str, scale: float, align: float = 0.0) 
 
 
 def values_at(scene, result, choice, point) -> tuple[tuple[int, int], list[tuple[str, tuple[float, ...]]]]:
-    """The pixel (column, row from below) at `point` in [0, 1]^2, and (label, RGB) of every picture there."""
+    """The pixel (column, row from the bottom) at `point` in [0, 1]^2, and (label, RGB) of every picture there."""
     group = result.groups[choice.group]
     width, height = group["size"]
     column, row = (min(int(share * size), size - 1) for share, size in zip(point, (width, height), strict=True))
@@ -430,7 +434,7 @@ def values_at(scene, result, choice, point) -> tuple[tuple[int, int], list[tuple
 
 
 def draw_probe(context, result, choice, corners) -> None:
-    """A cross at the probed pixel and a table of its values, while the probe is on."""
+    """Draw a cross at the probed pixel and a table of its values, while the probe is on."""
     if not _state["probing"]:
         return
     scene, scale = context.scene, context.preferences.system.ui_scale
@@ -465,7 +469,7 @@ def _draw_values(title: str, rows, x: float, top: float, scale: float) -> None:
 
 
 def _compared_in(context):
-    """Result and choice where the space of `context` shows the comparison of its scene, else None."""
+    """Result and choice if the space of `context` shows the comparison of its scene, else None."""
     space, scene = context.space_data, context.scene
     if space is None or space.type != "IMAGE_EDITOR" or not is_viewer(space.image):
         return None
@@ -476,7 +480,7 @@ def _compared_in(context):
 
 
 def line_position(context) -> float:
-    """Where the line is, in pixels from the left of the region."""
+    """Position of the wipe line in pixels from the left of the region."""
     return context.region.view2d.view_to_region(split_of(context.scene), 0.0, clip=False)[0]
 
 
@@ -486,7 +490,7 @@ class LTSH_GT_wipe(bpy.types.Gizmo):
     bl_idname = "LTSH_GT_wipe"
 
     def draw(self, context):
-        """Nothing beside what `_draw` shows."""
+        """Draw nothing: `_draw` shows the line."""
 
     def test_select(self, context, location):
         grip = GRIP_PIXELS * context.preferences.system.ui_scale
@@ -527,7 +531,7 @@ class LTSH_GGT_wipe(bpy.types.GizmoGroup):
 
 
 def _draw() -> None:
-    """Called by Blender for every Image Editor."""
+    """Draw over the picture; called by Blender for every Image Editor."""
     context = bpy.context
     shown = _compared_in(context)
     if shown is None:
@@ -570,7 +574,7 @@ def _draw_line(x: float, bottom: float, top: float, scale: float) -> None:
 
 
 def _draw_legend(left: float, below: float, limit: float, scale: float) -> None:
-    """The colors of the difference between their ends, from `left` on."""
+    """Draw the color scale of the difference with its ends, from `left` on."""
     width, height, gap = 160.0 * scale, 20.0 * scale, 12.0 * scale
     start, end = f"too dark \u2212{limit:g}", f"+{limit:g} too bright"
     draw_label(left, below, start, scale)
@@ -584,7 +588,7 @@ _add_classes, _remove_classes = bpy.utils.register_classes_factory((LTSH_OT_prob
 
 @bpy.app.handlers.persistent
 def _mix_again(*_):
-    """After undo: the mixer has other values."""
+    """After undo and redo the mixer may have other values."""
     for scene in bpy.data.scenes:
         if scene.ltsh.mode == "MIX":
             refresh(scene)
@@ -592,7 +596,7 @@ def _mix_again(*_):
 
 @bpy.app.handlers.persistent
 def _forget_file(*_):
-    """Before loading: the next file may have scenes of the same names."""
+    """Before loading, forget the file: the next one may have scenes of the same names."""
     results.forget_renders()
     _state["settling"].clear()
     _state.update(dragged=None, probing=False)
@@ -606,7 +610,7 @@ HANDLERS = (
 
 
 def register() -> None:
-    """Add the probe, the line and what files need before and after they are saved."""
+    """Add the probe, the line and the handlers."""
     for name, function in HANDLERS:
         getattr(bpy.app.handlers, name).append(function)
     _add_classes()

@@ -1,4 +1,4 @@
-"""A job in a second Blender: its arguments, its plan, the process, its stages."""
+"""A job in a second Blender: its arguments, its process, and the plan that estimates the time left."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from . import preflight
 from .settings import preferences
 
 STARTING = "Starting"
-# Before, nobody knows how long a job will take, and no time left is told that is not sure.
+# The time left is shown after SURE_SECONDS if it is sure, else after ROUGH_SECONDS.
 SURE_SECONDS, ROUGH_SECONDS = 3.0, 10.0
-# Of the time left at least so much must be measured: it is then right within a factor of two, though a guess for the
-# rest may be three times too short.
+# KNOWN_SHARE: the time left is sure if at least this share of it rests on measurements. Then it is right within a
+# factor of two, even if the guess for the rest is three times too short.
 KNOWN_SHARE = 0.5
 SCRIPT = Path(__file__).resolve().parents[2] / "panel_job.py"
 ENDING_SECONDS = 10.0
 NO_CYCLES = "Not complete: without Cycles"
-# What stages of the command line are called there and here; others keep their names.
+# Titles of the command line's stages; others are shown by their names.
 STAGE_TITLES = {
     "open scene": "Open Scene",
     "samples": "Sample Surfaces",
@@ -47,33 +47,33 @@ STAGE_TITLES = {
     "images": "Make Pictures",
     "lights": "Light Mixer",
 }
-# Costs count as if so many seconds had been measured.
+# Estimated costs enter paces with the weight of so many measured seconds: PRIOR_SECONDS for all stages together,
+# LITTLE_SECONDS for each kind.
 PRIOR_SECONDS, LITTLE_SECONDS = 5.0, 1.0
-# Below, what a stage reports says too little about its length.
+# A stage's progress tells its length only from LEAST_FRACTION and LEAST_SECONDS on.
 LEAST_FRACTION, LEAST_SECONDS = 0.02, 1.0
-# An end that is not reported is not shown.
-MOST = 0.99
-# Seconds on two cores: once, and for each million points, or points and samples. Plans learn the machine's own pace.
+MOST = 0.99  # the largest share that is shown before the end is reported
+# Costs in seconds on two cores: once, or per million points, or per million points times samples. Plans learn the pace
+# of the machine.
 START_SECONDS, OPEN_SECONDS, RENDER_SECONDS = 1.5, 2.0, 0.5
 SAMPLE_SECONDS, FILE_SECONDS = 16.0, 3.0
-DIRECT_SECONDS = 3.0  # of a sample of Cycles' direct light
+CYCLES_SECONDS = 3.0  # per sample of Cycles, of direct light or of all
 SHADING_SECONDS = {"ltc": 6.5, "ltsh2": 8.0, "ltsh4": 10.0, "ltsh4c": 11.5, REFERENCE: 160.0}
-SHADOW_SECONDS, DENOISE_SECONDS = 30.0, 4.0  # of shadows with `USUAL_RAYS`
+SHADOW_SECONDS, DENOISE_SECONDS = 30.0, 4.0  # shadows: with USUAL_RAYS rays
 USUAL_RAYS = 256
-PATHS = 2.0  # a sample of all light costs so many of direct light
 REFERENCE_POINTS = 0.15
 
 
 @dataclass(frozen=True)
 class Run:
-    """One command of a job; `partial` says what its pictures lack, where a later one of the job has more."""
+    """One command of a job."""
 
     command: str
     options: PictureOptions | BakeOptions
-    partial: str = ""
+    partial: str = ""  # what its pictures lack, if a later command of the job adds it
 
     def to_dict(self) -> dict:
-        """As `panel_job.perform` takes it."""
+        """The dictionary that `panel_job.perform` takes."""
         arguments = [self.command, *command_line(self.options)]
         return {"arguments": arguments, "output": str(self.options.output), "partial": self.partial}
 
@@ -86,13 +86,13 @@ def runs_of(context, command: str, scene_file: Path) -> list[Run]:
     first = tuple(name for name in wanted.techniques if name != REFERENCE)
     if command == "shade" or not first:
         return [Run(command, wanted)]
-    # The techniques are there long before Cycles is: they are shown, and stay where the rest is stopped.
+    # The techniques are ready long before Cycles. A first run shows them, and they stay if the second is stopped.
     early = replace(picture_options(context.scene, "shade", scene_file), techniques=first, keep_visibility=False)
     return [Run("shade", early, NO_CYCLES), Run(command, wanted)]
 
 
 def picture_options(scene, command: str, scene_file: Path) -> PictureOptions:
-    """What "shade" or "compare" is asked for."""
+    """The options of "shade" or "compare" by the settings of `scene`."""
     settings = scene.ltsh
     samples = {"cycles_samples": settings.cycles_samples} if command == "compare" else {}
     return PictureOptions(
@@ -109,7 +109,7 @@ def picture_options(scene, command: str, scene_file: Path) -> PictureOptions:
 
 
 def bake_options(context, scene_file: Path) -> BakeOptions:
-    """What "bake" is asked for: the selected objects that can be baked."""
+    """The options of "bake" by the settings of the scene, for the selected objects that can be baked."""
     settings = context.scene.ltsh
     side = int(settings.bake_size)
     return BakeOptions(
@@ -131,14 +131,16 @@ def bake_options(context, scene_file: Path) -> BakeOptions:
 
 
 def chosen(settings, key: str) -> tuple[str, ...]:
-    """The members of a set of choices, in the order in which they are offered."""
+    """The chosen members of a set property, in the order in which they are offered."""
     items = settings.bl_rna.properties[key].enum_items.keys()
     return tuple(name for name in items if name in getattr(settings, key))
 
 
 def output_folder(scene, command: str) -> Path:
-    """Where `command` writes: the folder of the settings, or that of the preferences where it is empty or where the
-    .blend that it is relative to is not saved."""
+    """The folder for the results of `command`, below that of the settings.
+
+    The folder of the preferences takes its place if it is empty, or relative to a .blend that is not saved.
+    """
     folder = scene.ltsh.output_folder.strip()
     if folder and (bpy.data.filepath or not folder.startswith("//")):
         root = Path(bpy.path.abspath(folder))
@@ -151,14 +153,14 @@ def output_folder(scene, command: str) -> Path:
 
 @dataclass(frozen=True)
 class Step:
-    """A stage of a job; of its `cost`, about seconds, only the proportion to that of the others matters."""
+    """A stage of a job."""
 
     stage: str
-    cost: float
+    cost: float  # about seconds; only its proportion to the other costs matters
 
 
 def steps(runs: list[Run]) -> list[Step]:
-    """What a job goes through, in order."""
+    """The stages of a job, in order."""
     found = [Step(STARTING, START_SECONDS)]
     for run in runs:
         found += _bake(run.options) if run.command == "bake" else _picture(run.options, run.command == "compare")
@@ -168,7 +170,7 @@ def steps(runs: list[Run]) -> list[Step]:
 def _picture(options: PictureOptions, with_cycles: bool) -> list[Step]:
     pixels = 1e-6 * math.prod(options.resolution)
     points, rendered = pixels * options.sub_samples, RENDER_SECONDS * options.sub_samples
-    half = rendered + DIRECT_SECONDS * pixels * max(options.cycles_samples // 2, options.sub_samples)
+    half = rendered + CYCLES_SECONDS * pixels * max(options.cycles_samples // 2, options.sub_samples)
     sampling, shading = shading_steps(points, options.sub_samples, _rays(options), options.techniques)
     return [
         *sampling,
@@ -181,22 +183,22 @@ def _picture(options: PictureOptions, with_cycles: bool) -> list[Step]:
 
 
 def shading_steps(points: float, sub_samples: int, shadow_rays: int, techniques) -> tuple[list[Step], list[Step]]:
-    """How so many million points are sampled, and how they are shaded; without shadows there are 0 rays."""
+    """The stages that sample `points` million points, and those that shade them; 0 rays: without shadows."""
     sampling = [
         Step("open scene", OPEN_SECONDS),
         Step("samples", RENDER_SECONDS * sub_samples + SAMPLE_SECONDS * points),
     ]
     shading = [Step(TECHNIQUES[name].title, _shading(name, points)) for name in techniques]
-    # Rays go where a light is neither seen whole nor not at all, and elsewhere a few ask for that.
+    # Most rays go to points that see a part of a light; elsewhere a few suffice.
     shadows = SHADOW_SECONDS * points * math.sqrt(shadow_rays / USUAL_RAYS)
     return sampling, [*([Step("shadows", shadows)] if shadow_rays else []), *shading]
 
 
 def finished_steps(pixels: float, cycles_samples: int) -> list[Step]:
-    """How Cycles adds the rest to a picture of so many million pixels."""
+    """The stages in which Cycles adds the rest to a picture of `pixels` million pixels."""
     return [
         Step("open scene", OPEN_SECONDS),
-        Step("Cycles", RENDER_SECONDS + PATHS * SAMPLE_SECONDS * pixels * cycles_samples),
+        Step("Cycles", RENDER_SECONDS + CYCLES_SECONDS * pixels * cycles_samples),
         Step("denoise", DENOISE_SECONDS * pixels),
     ]
 
@@ -213,36 +215,37 @@ def _bake(options: BakeOptions) -> list[Step]:
     for name in options.objects:
         found.append(Step(f"bake {name}", RENDER_SECONDS + SAMPLE_SECONDS * texels * samples))
         found.append(Step(f"shade {name}", shading + FILE_SECONDS * texels))
-    return [*found, Step("images", FILE_SECONDS * texels * len(found))]
+    return [*found, Step("images", FILE_SECONDS * texels * len(options.objects))]
 
 
 def _shading(technique: str, points: float) -> float:
     return SHADING_SECONDS[technique] * (min(points, REFERENCE_POINTS) if technique == REFERENCE else points)
 
 
-# Seconds and costs of the stages of the jobs that have ended in this session, by kind.
+# Seconds and costs of the stages of jobs that have ended in this session, by kind of stage.
 Seen = dict[str, tuple[float, float]]
 seen: Seen = {}
 
 
 def _kind(stage: str) -> str:
-    """What stages have in common that take as long for their cost: those of all objects of a bake are alike, and
-    the halves of Cycles."""
+    """The kind of a stage; stages of one kind have one pace: those of all objects of a bake, both halves of Cycles."""
     first = stage.partition(" ")[0]
     return first if first in ("bake", "shade", "Cycles") else stage
 
 
 def paces(seen: Seen) -> dict[str, float]:
-    """Seconds for a cost of 1 by kind of stage, and by "" that of all others."""
-    # Small stages say little about large ones.
+    """Seconds per cost by kind of stage, and by "" for all others."""
+    # Short stages say little about long ones.
     found = {kind: (seconds + LITTLE_SECONDS) / (cost + LITTLE_SECONDS) for kind, (seconds, cost) in seen.items()}
     seconds, cost = (sum(values) for values in zip(*seen.values(), strict=True)) if seen else (0.0, 0.0)
     return {**found, "": (seconds + PRIOR_SECONDS) / (cost + PRIOR_SECONDS)}
 
 
 class Plan:
-    """Follows a job through its `steps`; the first begins at once, some may never be reported. For their cost they are
-    expected to take as long as in the jobs `seen` before."""
+    """Follows a job through its `steps` and estimates the time left, with the paces of the jobs `seen` before.
+
+    The first step begins at once. Some steps may never be reported.
+    """
 
     def __init__(self, steps: Sequence[Step], now: Callable[[], float] = time.monotonic, seen: Seen | None = None):
         pace, self._asked, self._before = paces(seen or {}), tuple(steps), dict(seen or {})
@@ -257,16 +260,16 @@ class Plan:
 
     @property
     def number(self) -> int:
-        """Of the step that runs, from 1."""
+        """Number of the step that runs, counted from 1."""
         return self._at + 1
 
     @property
     def count(self) -> int:
-        """Of all steps."""
+        """Number of all steps."""
         return len(self._steps)
 
     def report(self, stage: str, fraction: float) -> None:
-        """`stage` has done `fraction` of its work."""
+        """Note that `stage` has done `fraction` of its work."""
         later = range(self._at, self.count)
         at = next((index for index in later if self._steps[index].stage == stage), self._at)
         self._reported = self._now()
@@ -285,31 +288,31 @@ class Plan:
         self._done_seconds += seconds
 
     def end(self, seen: Seen) -> None:
-        """The job has ended well; `seen` gets what its stages took."""
+        """Note that the job has succeeded, and add the times of its stages to `seen`."""
         self._reported = self._now()
         if self._at == self.count - 1:
             self._end_step()
         seen.update(self._seen)
 
     def share(self) -> float:
-        """Of the whole job that is done, in [0, `MOST`]."""
+        """The share of the whole job that is done, in [0, `MOST`]; it never falls."""
         elapsed = self._now() - self._started
         whole = elapsed + self.seconds_left()
         self._share = max(self._share, min(elapsed / whole, MOST) if whole > 0.0 else 0.0)
         return self._share
 
     def seconds_left(self) -> float:
-        """Until the job will have ended, as far as can be told."""
+        """Estimated seconds until the end of the job."""
         return sum(self._parts_left())
 
     @property
     def is_sure(self) -> bool:
-        """Is enough of the time left measured?"""
+        """True if enough of the time left rests on measurements."""
         known, guessed = self._parts_left()
         return known >= KNOWN_SHARE * (known + guessed)
 
     def _parts_left(self) -> tuple[float, float]:
-        """Seconds that are known by what was measured, and those that are guessed by costs."""
+        """Seconds left that rest on measurements, and those that are guessed by costs."""
         measured = self._measured_costs()
         kind = _kind(self._steps[self._at].stage)
         parts = {True: 0.0, False: 0.0}
@@ -320,13 +323,13 @@ class Plan:
         return parts[True], parts[False]
 
     def _expected(self, step: Step, measured: dict[str, tuple[float, float]]) -> float:
-        """Seconds: as long as the same stage took before, or by its cost as those of its kind, or as all."""
+        """Expected seconds of a step: as the same stage took, else by its cost and the pace of its kind, or of all."""
         seconds, cost = measured.get(_kind(step.stage), (0.0, 0.0))
         pace = seconds / cost if seconds > 0.0 and cost > 0.0 else self._pace()
         return self._measured.get(step.stage, step.cost * pace)
 
     def _measured_costs(self) -> dict[str, tuple[float, float]]:
-        """Seconds and costs by kind of the steps of this job, that which runs included as far as it tells."""
+        """Measured seconds and costs by kind, with an estimate for the step that runs if it tells enough."""
         found: dict[str, tuple[float, float]] = {}
         for step in self._steps[: self._at + 1]:
             seconds = self._measured.get(step.stage)
@@ -339,17 +342,17 @@ class Plan:
 
     @property
     def _is_followed(self) -> bool:
-        """Has the step that runs told enough to say how long it will take?"""
+        """True if the step that runs has told enough to estimate its length."""
         return self._fraction >= LEAST_FRACTION and self._reported - self._stage_started >= LEAST_SECONDS
 
     def _pace(self) -> float:
-        """Seconds for a cost of 1; a step that takes longer than expected tells that all will."""
+        """Seconds per cost over all steps; a step that takes longer than expected raises it at once."""
         seconds, cost = self._done_seconds + PRIOR_SECONDS, self._done_cost + PRIOR_SECONDS
         so_far = seconds + self._now() - self._stage_started
         return max(seconds / cost, so_far / (cost + self._steps[self._at].cost))
 
     def _rest_of_step(self, measured: dict[str, tuple[float, float]]) -> float:
-        """Seconds; between reports the rest melts away and never becomes nothing."""
+        """Seconds left of the step that runs; between reports they decay exponentially and never reach 0."""
         if self._is_followed:
             done = self._reported - self._stage_started
             rest, since = done / self._fraction - done, self._reported
@@ -360,28 +363,24 @@ class Plan:
 
 @dataclass
 class Job:
-    """A job that runs, has ended (`finished`), or was `cancelled`.
-
-    `results` are the folders of pictures so far, `error` is "" or one line that says why there are no more. Of the
-    results the window has `shown` so many; they belong to the scene with the session uid `scene`.
-    """
+    """A job that runs, has ended (`finished`), or was `cancelled`."""
 
     title: str
     plan: Plan
     folder: Path  # temporary, removed at the end
     command: str  # shade, compare or bake
-    scene: int
-    shown: int = 0
-    output: Path | None = None  # where files for the user go
+    scene: int  # session uid of its scene
+    shown: int = 0  # how many of the results the window shows
+    output: Path | None = None  # folder of files for the user
     stage: str = STARTING
-    results: list[Path] = field(default_factory=list)
-    error: str = ""
+    results: list[Path] = field(default_factory=list)  # folders of pictures so far
+    error: str = ""  # one line that says why the job failed; "" if it did not
     finished: bool = False
     cancelled: bool = False
     started: float = field(default_factory=time.monotonic)
 
     def start(self, runs: list[dict], *, background: bool) -> None:
-        """Start the process on `Run`s as dictionaries; in the `background` this process comes first.
+        """Start the process with `runs` (see `Run.to_dict`); in the `background` it has a lower priority.
 
         Raises SceneError and OSError.
         """
@@ -405,7 +404,7 @@ class Job:
         self._messages.put({"end": True})
 
     def poll(self) -> bool:
-        """Take in what the process has said since; True where that is anything."""
+        """Handle all new messages of the process; True if there were any."""
         changed = False
         while not self.finished:
             try:
@@ -437,15 +436,15 @@ class Job:
                 time.sleep(seconds)
 
     def cancel(self) -> None:
-        """Stop at once; the process ends, and its folder goes, in the background."""
+        """Stop at once. A thread ends the process and removes its folder."""
         if self.finished:
             return
         self.finished = self.cancelled = True
-        # No daemon: a Blender that quits now waits for it.
+        # Not a daemon thread: a Blender that quits now waits for it.
         threading.Thread(target=self._end, name="ltsh-job-end").start()
 
     def _end(self) -> None:
-        # What the process has started itself ends with it: each of them reads the other end of a pipe.
+        # The processes that it has started end with it, as each of them reads the other end of a pipe.
         self._process.stdin.close()
         try:
             self._process.wait(ENDING_SECONDS)
@@ -455,19 +454,19 @@ class Job:
         self.remove_folder()
 
     def end_now(self) -> None:
-        """As `cancel`, for a Blender that is about to quit: everything is gone on return."""
+        """As `cancel`, but waits for the end: for a Blender that is about to quit."""
         if not self.finished:
             self.finished = self.cancelled = True
             self._end()
 
     def remove_folder(self) -> None:
-        """Remove what the job wrote for itself."""
+        """Remove the temporary folder of the job."""
         shutil.rmtree(self.folder, ignore_errors=True)
 
     # What is shown:
 
     def seconds(self) -> float:
-        """Since the start."""
+        """Seconds since the start."""
         return time.monotonic() - self.started
 
 
@@ -477,7 +476,7 @@ def new_folder() -> Path:
 
 
 def _library_folders() -> list[str]:
-    """Where the process finds what this Blender got with the extension."""
+    """Folders in which the process finds the libraries of the extension."""
     spec = importlib.util.find_spec("OpenEXR")
     return [str(Path(spec.origin).parent)] if spec is not None and spec.origin else []
 
@@ -490,12 +489,12 @@ def clock(seconds: float) -> str:
 
 
 def stage_title(stage: str) -> str:
-    """What a job does in that stage."""
+    """The translated title of a stage."""
     return translated(STAGE_TITLES.get(stage, stage))
 
 
 def progress_text(plan: Plan, seconds: float) -> str:
-    """Percent and time left of a whole job that began so many seconds ago."""
+    """Percent and time left of a job that began `seconds` ago."""
     text, left, is_sure = f"{100.0 * plan.share():.0f} %", plan.seconds_left(), plan.is_sure
     if seconds < (SURE_SECONDS if is_sure else ROUGH_SECONDS):
         return text
@@ -504,6 +503,6 @@ def progress_text(plan: Plan, seconds: float) -> str:
 
 
 def rounded(seconds: float) -> float:
-    """`seconds` to ten of them, or from two minutes on to minutes."""
+    """`seconds` rounded to tens, or to minutes from about two minutes on."""
     step = 10.0 if seconds < 115.0 else 60.0
     return step * max(1, round(seconds / step))

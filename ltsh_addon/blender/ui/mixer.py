@@ -1,4 +1,4 @@
-"""The light mixer: power, exposure and color of each light in a finished picture, changed while one looks."""
+"""The panel of the light mixer: changes power, exposure and color of each light in a finished picture at once."""
 
 from __future__ import annotations
 
@@ -18,16 +18,15 @@ from . import comparison, results
 from .panels import draw_text, gray, in_both_places, split_names
 
 UPDATE, MOVED = "Update Moved Lights", "moved since this picture"
-# By what share of its distance and size a light may be elsewhere that has not moved.
+# UNMOVED: smaller changes, relative to a light's distance and size, do not count as a move.
 UNMOVED = 1e-5
 TIMER_SECONDS = 0.1
-# The moved lights that are shaded now; None where there are none.
+# The `results.Update` that shades moved lights now, or None.
 _updating: dict = {"update": None}
 
 
 def plain_lights(depsgraph) -> dict[str, AreaLight]:
-    """The lights that the scene has now, without what node trees make of them, by the names of objects that are one
-    light each."""
+    """The current lights of the scene without their node trees, by name. Only objects that are exactly one light."""
     receivers = Receivers([instance.object.original for instance in depsgraph.object_instances])
     found: dict[str, list[AreaLight]] = {}
     for instance in depsgraph.object_instances:
@@ -52,7 +51,10 @@ def has_moved(kept: AreaLight, now: AreaLight) -> bool:
 
 
 def light_where_it_is(kept: AreaLight, now: AreaLight, normalized: bool) -> AreaLight:
-    """The light `kept`, with its own power, linking and light group, where it is `now`."""
+    """The light at its place `now`, with the power, linking and light group of `kept`.
+
+    Where its power is `normalized`, the radiance is scaled with the area.
+    """
     before, area = (np.linalg.norm(light.area_vector) for light in (kept, now))
     names = "group", "receivers", "affects_diffuse", "affects_specular", "falloff", "smooth"
     own = {name: getattr(kept, name) for name in names}
@@ -60,7 +62,7 @@ def light_where_it_is(kept: AreaLight, now: AreaLight, normalized: bool) -> Area
 
 
 def moved_rows(context, rows) -> dict[int, AreaLight]:
-    """The rows whose light has moved, by their number, and where it is now."""
+    """The moved lights at their new places, by the numbers of their rows."""
     found, lights = {}, plain_lights(context.evaluated_depsgraph_get())
     for number, row in enumerate(rows):
         if row.light is not None and row.name in lights:
@@ -71,19 +73,19 @@ def moved_rows(context, rows) -> dict[int, AreaLight]:
 
 
 def targets(row: Row, item) -> dict[str, tuple[float, float, tuple[float, ...]]]:
-    """Power, exposure and color of each light object of a row that give what the mixer shows."""
-    # A channel that the light has not got in the picture is left as it is.
+    """Power, exposure and color with which each light object of a row looks as the mixer shows it."""
+    # Channels that the light lacks in the picture stay as they are.
     found, factor = {}, np.where(np.array(row.color) != 0.0, results.tint_of(row, item), 1.0)
     for name, (power, exposure, *color) in row.settings.items():
         mixed = factor * color
-        # Colors stay within what Blender's color fields show.
+        # Blender's color fields show values up to 1, so brighter colors go into the power.
         bright = max(1.0, mixed.max()) if not np.allclose(factor, 1.0) else 1.0
         found[name] = power * item.power * bright, exposure + item.exposure, tuple((mixed / bright).tolist())
     return found
 
 
 def _stands_elsewhere(ob, kept: dict) -> bool:
-    """True where a light object has moved or turned since its light was kept: what is known at once."""
+    """True if a light object has moved or turned since its light was kept. A fast check, without the depsgraph."""
     if ob is None or ob.type != "LIGHT":
         return False
     matrix = np.array(ob.matrix_world)
@@ -94,7 +96,7 @@ def _stands_elsewhere(ob, kept: dict) -> bool:
 
 
 def state_of(row: Row, item) -> tuple[str, str]:
-    """An icon, and a sentence where the light in the scene is not that of the picture."""
+    """An icon, and a sentence if the light in the scene differs from that of the picture."""
     if not row.lights:
         return "INFO", row.note
     lost = [name for name in row.lights if name not in bpy.data.objects]
@@ -114,7 +116,7 @@ def state_of(row: Row, item) -> tuple[str, str]:
 class LTSH_UL_mixer(bpy.types.UIList):
     """Lights of a finished picture"""
 
-    # By their names, of the panel that is drawn: to find them looks at files.
+    # Rows by name, found once per draw of the panel, because that looks at files.
     rows: ClassVar[dict[str, Row]] = {}
 
     def draw_item(self, context, layout, data, item, icon, active_data, active_property, index):
@@ -167,7 +169,7 @@ class _Mixer:
 
 
 def _draw_update(layout) -> None:
-    """The button that shades moved lights, or in its place how much of that is done."""
+    """The button that shades moved lights, or its progress while that is done."""
     update = _updating["update"]
     if update is None:
         layout.operator("ltsh.update_moved_lights", icon="ORIENTATION_GLOBAL")
@@ -179,7 +181,7 @@ def _draw_update(layout) -> None:
 
 
 def notes(scene) -> list[str]:
-    """What to know about the mix as a whole."""
+    """Notes about the mix as a whole."""
     facts = results.mixer_of(scene).facts
     found, camera = list(facts["notes"]), scene.camera
     if facts["frame"] != scene.frame_current:
@@ -237,7 +239,7 @@ class LTSH_OT_apply_mixer(_NeedsMixer, bpy.types.Operator):
 
 
 def applied(scene) -> list[str]:
-    """Write what the mixer shows to the lights of the scene; what could not be written.
+    """Write the values of the mixer to the lights of the scene; returns problems about those that cannot be written.
 
     Lights that the mixer never changed stay as they are.
     """
@@ -262,7 +264,7 @@ def applied(scene) -> list[str]:
 
 
 def _reason_not_to_apply(ob, values, given: dict) -> str:
-    """Why a light cannot get `values`; "" where it can. `given` are those of the data of lights before it."""
+    """Why a light cannot get `values`; "" if it can. `given` are the values of the data of earlier lights."""
     if ob is None or ob.type != "LIGHT":
         return "not in the scene any more"
     if ob.library is not None or ob.data.library is not None:
@@ -299,7 +301,7 @@ class LTSH_OT_update_moved_lights(_NeedsMixer, bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def execute(self, context):
-        """Without a window, from scripts: waits for the end."""
+        """Without a window, as from scripts, wait for the end."""
         self._timer = None
         if not self._begin(context):
             return {"CANCELLED"}
@@ -311,7 +313,7 @@ class LTSH_OT_update_moved_lights(_NeedsMixer, bpy.types.Operator):
     def modal(self, context, event):
         update, scene = self._update, self._scene()
         if _updating["update"] is not update or scene is None or results.mixer_of(scene) is not update.mixer:
-            # The cross, another picture, another file.
+            # Cancelled by the cross, or another picture or file is open.
             update.stop()
             return self._finish(context)
         if event.type == "ESC" and event.value == "PRESS":
@@ -331,12 +333,12 @@ class LTSH_OT_update_moved_lights(_NeedsMixer, bpy.types.Operator):
         return {"PASS_THROUGH"}
 
     def cancel(self, context):
-        """Blender ends the operator, for its window was closed."""
+        """Called by Blender when the window is closed."""
         self._update.stop()
         self._finish(context)
 
     def _scene(self):
-        """The scene of the picture, also after it was renamed; None where it was removed."""
+        """The scene of the picture, even if it was renamed; None if it was removed."""
         return next((scene for scene in bpy.data.scenes if scene.session_uid == self._scene_uid), None)
 
     def _begin(self, context) -> bool:

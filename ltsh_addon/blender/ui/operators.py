@@ -1,4 +1,4 @@
-"""Operators that start, follow and stop jobs, that look at results and keep them, and that help."""
+"""Operators that start, follow and stop jobs, that show and save results, and that open the manual."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _running: dict = {"job": None}
 
 
 def running_job() -> Job | None:
-    """The job that runs now, None where there is none."""
+    """The job that runs now, or None."""
     return _running["job"]
 
 
@@ -43,7 +43,7 @@ class _JobOperator:
     # Not REGISTER: "Repeat Last" would run `execute`, which waits.
     bl_options = {"UNDO"}
     command = ""
-    _opened = False  # the next results are those of the scene, but the comparison does not show them yet
+    _opened = False  # the next results are set in the scene, but the comparison does not show them yet
 
     @classmethod
     def poll(cls, context):
@@ -63,7 +63,7 @@ class _JobOperator:
         return {"RUNNING_MODAL"}
 
     def execute(self, context):
-        """Without a window, from scripts: waits for the end."""
+        """Without a window, as from scripts, wait for the end."""
         self._timer = None
         if not self._begin(context):
             return {"CANCELLED"}
@@ -97,14 +97,14 @@ class _JobOperator:
         return {"PASS_THROUGH"}
 
     def cancel(self, context):
-        """Blender ends the operator, for its window was closed: another one watches the job from now on."""
+        """Called by Blender when the window is closed: another window watches the job from now on."""
         self._end_timer(context)
         job = self._job
-        # Only once this window is gone; a Blender that quits calls no timers any more.
+        # By a timer, once this window is gone. A Blender that quits calls no timers any more.
         bpy.app.timers.register(lambda: _watch_elsewhere(job), first_interval=0.0)
 
     def _fail(self, context, error: Exception):
-        """End the job with one line, whatever happened here; preferences say whether the console gets more."""
+        """End the job with one line about the unexpected `error`; the console shows more by its log level."""
         logging.getLogger(__name__).info("unexpected error", exc_info=error)
         self._job.cancel()
         self._job.error = f"{self._job.title} failed: {error_line(error)}"
@@ -131,7 +131,7 @@ class _JobOperator:
         return True
 
     def _show_progress(self, context) -> None:
-        """Draw progress again where it has changed, at most a few times per second."""
+        """Redraw progress if its text has changed."""
         job = self._job
         done = f"{job.title}: {stage_title(job.stage)}  {progress_text(job.plan, job.seconds())}"
         text = f"{done}    {translated('Esc')}: {translated('Cancel')}"
@@ -142,8 +142,10 @@ class _JobOperator:
             comparison.redraw_panels()
 
     def _show_some_results(self, context) -> bool:
-        """Show a part of what is new, as much as the window may wait for: large files are read one at a time. True
-        where something was, or will be."""
+        """Show the next part of new results. Large files are read one per call, so that the window need not wait long.
+
+        Returns True if there was something to show, or will be.
+        """
         scene, job = self._scene(), self._job
         if scene is None or job.shown == len(job.results):
             return False
@@ -154,7 +156,7 @@ class _JobOperator:
             self._opened = True
         elif not comparison.read_a_picture(scene):
             comparison.refresh(scene)
-            # Only the first pictures open a window, which may be closed before the next ones are there.
+            # Only the first pictures open a window: it may have been closed before the next ones are there.
             show = comparison.open_editor if job.shown == 0 and self._timer is not None else comparison.put_in_editor
             show(context, scene)
             self._opened = False
@@ -198,7 +200,7 @@ class _JobOperator:
         return f"kept: {', '.join(names)}"
 
     def _scene(self):
-        """The scene of the job, also after it was renamed; None where it was removed."""
+        """The scene of the job, even if it was renamed; None if it was removed."""
         return next((scene for scene in bpy.data.scenes if scene.session_uid == self._job.scene), None)
 
     def _report_success(self) -> None:
@@ -269,7 +271,7 @@ class LTSH_OT_cancel(bpy.types.Operator):
 
 
 def _watch_elsewhere(job: Job) -> None:
-    """Let the first window that is left watch `job`."""
+    """Let the first remaining window watch `job`."""
     windows = bpy.context.window_manager.windows
     if running_job() is job and windows:
         with bpy.context.temp_override(window=windows[0]):
@@ -278,7 +280,7 @@ def _watch_elsewhere(job: Job) -> None:
 
 @bpy.app.handlers.persistent
 def _stop(*_):
-    """Another file is about to be opened: the job's scene goes."""
+    """Stop the job before another file is opened, since its scene goes."""
     job = running_job()
     if job is not None:
         _running["job"] = None
@@ -293,7 +295,7 @@ def _end_now() -> None:
 
 
 MANUAL = Path(__file__).resolve().parents[3] / "docs" / "manual.md"
-# Text editors show no pictures.
+# Lines of pictures, which Blender's Text Editor cannot show.
 PICTURE_LINE = re.compile(r"^!\[.*\)\n\n?", re.MULTILINE)
 COMMANDS = (
     ("shade", "Shade", "What Shade Camera View left last"),
@@ -457,14 +459,16 @@ class LTSH_OT_restore_materials(bpy.types.Operator):
 
 
 def last_bake(scene):
-    """The results of the last bake of `scene`; None where there is none."""
+    """The results of the last bake of `scene`; None if there is none."""
     result = results.result_in(str(output_folder(scene, "bake") / "images"))
     return result if result is not None and result.command == "bake" and result.report["objects"] else None
 
 
 def baked_texture(result, record: dict) -> dict:
-    """What `show_texture` takes: all baked light of the object of `record`, or its first pass. Copies the pictures to
-    files of their own, which stay when the next bake replaces the pictures. Raises OSError."""
+    """The texture of an object for `show_texture`: its combined light, or its first pass.
+
+    The pictures are copied to files of their own, which stay when the next bake replaces the pictures. Raises OSError.
+    """
     files = []
     for number, tile in record["tiles"].items():
         stem = Path(tile["file"]).stem

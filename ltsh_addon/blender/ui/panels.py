@@ -14,16 +14,17 @@ from .preflight import APPROXIMATED, EXACT, LEFT_OUT, overview
 from .preview import ENGINE, is_previewing
 from .settings import active_light
 
-LETTER_PIXELS = 6.6  # mean width of a letter of Blender's interface at scale 1
+# Widths in pixels at interface scale 1.
+LETTER_PIXELS = 6.6  # mean width of a letter of Blender's interface
 MARGIN_PIXELS = 70.0  # icon, scroll bar and borders
-BUTTON_PIXELS = 50.0  # of a button beside text, without its label
+BUTTON_PIXELS = 50.0  # a button beside text, without its label
 TEXT_PIXELS = 110.0  # the least width of text beside a button
-TOGGLE_PIXELS, SHORT_PIXELS = 85.0, 62.0  # of a button, of one with a short name
-SPLIT_PIXELS = 250.0
+TOGGLE_PIXELS, SHORT_PIXELS = 85.0, 62.0  # a button, and one with a short name
+SPLIT_PIXELS = 250.0  # the least width of a region that shows names of properties beside their fields
 
 
 def draw_text(layout, context, text: str, icon: str = "NONE", reserved: float = 0.0) -> None:
-    """`text` in as many lines as the region needs; `reserved` pixels are taken by something beside it."""
+    """Draw `text`, wrapped to the width of the region; `reserved` pixels are left for something beside it."""
     width = region_width(context) - MARGIN_PIXELS - reserved
     column = layout.column(align=True)
     column.scale_y = 0.85
@@ -34,7 +35,7 @@ def draw_text(layout, context, text: str, icon: str = "NONE", reserved: float = 
 
 
 def draw_problems(layout, context, command: str) -> bool:
-    """What stands in the way of `command`, each with its fix; True where nothing does."""
+    """Draw the problems of `command`, each with its fix; True if none of them blocks it."""
     found = preflight.problems(context, command)
     if found:
         box = layout.box()
@@ -44,7 +45,7 @@ def draw_problems(layout, context, command: str) -> bool:
 
 
 def _draw_problem(layout, context, problem) -> None:
-    """The text, and the button beside it where there is room for both."""
+    """Draw the text of a problem, and its button beside it if there is room for both, else below."""
     label = translated(problem.fix_label)
     button = LETTER_PIXELS * len(label) + BUTTON_PIXELS if problem.fix else 0.0
     beside = region_width(context) - MARGIN_PIXELS - button >= TEXT_PIXELS
@@ -60,25 +61,27 @@ def _draw_problem(layout, context, problem) -> None:
 
 
 def toggles(layout, context, count: int, width: float = TOGGLE_PIXELS):
-    """A layout for `count` buttons of a set of choices, each so wide: one row where they fit, else two columns."""
+    """A layout for `count` buttons of `width` pixels: one row if they fit, else two columns."""
     fits = region_width(context) >= width * count
     return layout.grid_flow(row_major=True, columns=count if fits else 2, even_columns=True, align=True)
 
 
 def split_names(layout, context) -> None:
-    """Names of properties beside their fields, as Blender's panels have them, or inside where that is too narrow."""
+    """Show names of properties beside their fields, as in Blender's panels, or inside if the region is too narrow."""
     layout.use_property_split = region_width(context) >= SPLIT_PIXELS
     layout.use_property_decorate = False
 
 
 def region_width(context) -> float:
-    """Of the region that is drawn, in pixels at interface scale 1."""
+    """Width of the region that is drawn, in pixels at interface scale 1."""
     return context.region.width / context.preferences.system.ui_scale
 
 
 def draw_job(layout, *commands: str) -> bool:
-    """The job that runs, if it is one of `commands`, with its Cancel button: two rows as high as the buttons in whose
-    place they are, so that nothing else in the panel moves. False where none of them runs."""
+    """Draw the progress of the job that runs and its Cancel button, if it is one of `commands`; else return False.
+
+    It takes two rows, as high as the buttons that it replaces, so that nothing else in the panel moves.
+    """
     job = operators.running_job()
     if job is None or job.command not in commands:
         return False
@@ -93,28 +96,28 @@ def draw_job(layout, *commands: str) -> bool:
 
 
 def draw_share(layout, *commands: str) -> None:
-    """The percent that is done of a job, in the header of its panel, which may be closed."""
+    """Draw the percentage of a job that is done into the header of its panel, which may be closed."""
     job = operators.running_job()
     if job is not None and job.command in commands:
         gray(layout).label(text=f"{100.0 * job.plan.share():.0f} %", translate=False)
 
 
 def gray(layout):
-    """A row for what is less important."""
+    """A gray row, for less important things."""
     row = layout.row()
     row.active = False
     return row
 
 
 def draw_right(layout, text: str) -> None:
-    """Gray text at the right end."""
+    """Draw gray text at the right end."""
     side = gray(layout)
     side.alignment = "RIGHT"
     side.label(text=text, translate=False)
 
 
 def draw_button(layout, operator: str, icon: str, ready: bool, scale: float = 1.0) -> None:
-    """A button, gray while it cannot run."""
+    """Draw a button, gray while it cannot run."""
     row = layout.row()
     row.scale_y = scale
     row.enabled = ready and operators.running_job() is None
@@ -165,7 +168,7 @@ class _Main:
 
 
 def draw_view_settings(layout, context) -> None:
-    """What shades, and what of it is seen where the engine is ours."""
+    """Draw the technique, and with our engine what the view shows."""
     scene, view = context.scene, context.scene.ltsh_view
     column = layout.column()
     toggles(column, context, 4, SHORT_PIXELS).prop(view, "technique", expand=True)
@@ -231,7 +234,7 @@ class _Bake:
             self.draw_settings(body, context)
 
     def draw_settings(self, layout, context):
-        """What is baked."""
+        """Draw the settings of bakes."""
         settings, ob = context.scene.ltsh, context.object
         toggles(layout, context, 4).prop(settings, "bake_passes")
         split_names(layout, context)
@@ -309,7 +312,7 @@ class _Entries:
         if not entries:
             layout.label(text="None that render")
         column = layout.column()
-        # What there is something to say about comes first.
+        # Entries with notes come first.
         for entry in sorted(entries, key=lambda entry: entry.state == EXACT)[:ENTRIES_SHOWN]:
             row = column.row()
             row.label(text=entry.name, icon=STATE_ICONS[entry.state], translate=False)
@@ -321,7 +324,7 @@ class _Entries:
 
 
 LIGHT_ICONS = {"AREA": "LIGHT_AREA", "POINT": "LIGHT_POINT", "SPOT": "LIGHT_SPOT", "SUN": "LIGHT_SUN"}
-# Widths in a row of the list, as Blender counts them.
+# Widths in a row of the list, in Blender's interface units.
 NAME_UNITS, POWER_UNITS, COLOR_UNITS = 4.2, 3.8, 1.2
 LIGHT_ROWS = 4
 
@@ -343,7 +346,7 @@ class LTSH_UL_lights(bpy.types.UIList):
         name = row.row()
         name.active, name.ui_units_x = not item.hide_render, NAME_UNITS
         name.prop(item, "name", text="", emboss=False, icon=_light_icon(context, item))
-        # Where there is no room for both, the name is what tells lights apart.
+        # In narrow regions the name needs the room of the power, since it tells lights apart.
         fields = (("energy", POWER_UNITS), ("color", COLOR_UNITS))
         for key, units in fields if region_width(context) >= SPLIT_PIXELS else fields[1:]:
             field = row.row()
@@ -354,23 +357,23 @@ class LTSH_UL_lights(bpy.types.UIList):
 
 
 def _light_icon(context, ob) -> str:
-    """What kind of light it is, or that it is not exact."""
+    """The icon of a light: its type, or a sign that it is not exact."""
     entry = _entry_of(context, ob)
     noted = entry is not None and entry.state != EXACT
     return STATE_ICONS[entry.state] if noted else LIGHT_ICONS[ob.data.type]
 
 
 def _entry_of(context, ob):
-    """What the overview says of the light `ob`; None where it is hidden in renders."""
+    """The entry of the light `ob` in the overview; None if it is hidden in renders."""
     return next((entry for entry in overview(context.scene).lights if entry.name == ob.name), None)
 
 
-# As Blender's own panel has them.
+# Labels of Blender's own panel.
 SHORT_NAMES = {"shadow_soft_size": "Radius", "spot_size": "Spot Size", "spot_blend": "Blend"}
 
 
 def light_properties(light) -> dict[str, str]:
-    """What can be set at a light, by its type and shape, with the labels."""
+    """The properties of a light of this type and shape, with their labels."""
     names, labels = ["energy", "exposure", "color"], dict(SHORT_NAMES)
     if light.type == "AREA":
         names += ["shape", "size"]
@@ -412,11 +415,11 @@ class _Materials(_Entries):
 
 
 FIGURES = (("relative_l2", "L2 %"), ("bias", "Bias %"), ("flip", "FLIP"))
-TABLE_PIXELS = 270.0  # below, there is a sentence for each technique
+TABLE_PIXELS = 270.0  # narrower regions show a sentence for each technique
 
 
 def draw_figures(layout, context, result, choice) -> None:
-    """Errors of the pass that is shown against Cycles, a row for each technique."""
+    """Draw the errors of the shown pass against Cycles, a row for each technique."""
     group = result.groups[choice.group]
     figures = group["figures"].get(choice.pass_name, {})
     if not figures:
@@ -452,7 +455,7 @@ def _draw_table(layout, rows) -> None:
 
 
 def _noise_text(group, figures) -> str:
-    """How much of the error is the noise of Cycles, and what is left without it."""
+    """The noise of Cycles, and the errors without it."""
     rest = []
     for name, row in figures["techniques"].items():
         squared = row.get("unbiased_squared_error")
@@ -500,7 +503,7 @@ class _Results:
         row.operator("ltsh.open_folder", text="", icon="FILE_FOLDER")
 
     def draw_choice(self, context, result):
-        """Which pictures; in the Image Editor, where they are seen."""
+        """Draw the choice of pictures; only the Image Editor, which shows them, has it."""
 
     def draw_warnings(self, context, result):
         warnings = [*result.report.get("problems", ()), *result.report["warnings"]]

@@ -1,7 +1,8 @@
-"""What is known before a job starts: what keeps it from starting, with buttons that mend it, and what will be exact.
+"""Checks before a job starts: problems that block it, with buttons that fix them, and which lights and materials are
+exact.
 
-Lights and materials are read from the nodes without evaluating the scene, so it takes no time; the report of a job also
-knows what instances, textures and the render's own state add.
+Lights and materials are read from the nodes without evaluating the scene, so it takes no time. The report of a job
+also knows about instances, textures and the state of the render.
 """
 
 from __future__ import annotations
@@ -41,9 +42,10 @@ EXACT, APPROXIMATED, LEFT_OUT = "exact", "approximated", "left out"
 
 @functools.cache
 def missing_libraries() -> str | None:
-    """What is missing and what to do, in one line beside gray buttons; None where all is there.
+    """One line that says what is missing and what to do; None if nothing is.
 
-    Tried once, since panels ask with every redraw: what comes later is found when the add-on is enabled again.
+    Checked once, since panels ask with every redraw. A library installed later is found when the add-on is enabled
+    again.
     """
     try:
         import OpenEXR
@@ -60,17 +62,17 @@ def missing_libraries() -> str | None:
 
 @dataclass(frozen=True)
 class Problem:
-    """One thing to know; `fix` is the operator that mends it, with its label and properties."""
+    """A problem, and the operator that fixes it."""
 
     text: str
-    blocks: bool = True
-    fix: str = ""
+    blocks: bool = True  # the job cannot start; False: only a note
+    fix: str = ""  # identifier of the operator; "": none
     fix_label: str = ""
-    fix_values: dict = field(default_factory=dict)
+    fix_values: dict = field(default_factory=dict)  # properties of the operator
 
 
 def problems(context, command: str) -> list[Problem]:
-    """What stands in the way of "shade", "compare" or "bake" (`blocks`), and what is good to know."""
+    """The problems that block "shade", "compare" or "bake", and notes."""
     scene, settings = context.scene, context.scene.ltsh
     missing = missing_libraries()
     found = [Problem(missing)] if missing else []
@@ -89,7 +91,7 @@ def problems(context, command: str) -> list[Problem]:
 
 
 def blocking(context, command: str) -> str:
-    """The first reason why `command` cannot run, "" where it can."""
+    """The first reason why `command` cannot run; "" if it can."""
     return next((problem.text for problem in problems(context, command) if problem.blocks), "")
 
 
@@ -101,7 +103,7 @@ def picture_of(scene) -> tuple[int, int]:
 
 
 def bake_objects(context) -> tuple[list, list[Problem]]:
-    """Selected objects that can be baked, and what is wrong with the others."""
+    """The selected objects that can be baked, and the problems of the others."""
     selected = [ob for ob in context.selected_objects if ob.type == "MESH"]
     if not selected:
         return [], [Problem("No mesh is selected: select the objects to bake")]
@@ -121,7 +123,7 @@ def bake_objects(context) -> tuple[list, list[Problem]]:
 
 
 def _textures_shown(baked) -> Problem:
-    """Said once for all these objects, since one click restores them all."""
+    """One problem for all objects that show baked textures, since one click restores them all."""
     if len(baked) == 1:
         text = f"Object {baked[0].name!r} shows a baked texture in place of its materials"
     else:
@@ -176,7 +178,7 @@ def _lights(scene) -> list[Problem]:
 
 
 def materials_of(scene) -> list:
-    """Materials of the objects of `scene` that render, each once, in the order of their names."""
+    """Materials of the objects of `scene` that render, each once, sorted by name."""
     found = {}
     for ob in scene.objects:
         if not ob.hide_render and ob.type not in ("LIGHT", "CAMERA"):
@@ -187,7 +189,7 @@ def materials_of(scene) -> list:
 
 
 def glows(material) -> bool:
-    """True where the surface of the material may emit light."""
+    """True if the surface of the material may emit light."""
     return emission_of(material).emits
 
 
@@ -343,17 +345,17 @@ class LTSH_OT_pack_image(bpy.types.Operator):
 
 @dataclass(frozen=True)
 class Entry:
-    """One light or material; `notes` say why it is not exact."""
+    """One light or material in the overview."""
 
     name: str
-    kind: str  # of a light: its shape
-    state: str
-    notes: tuple[str, ...] = ()
+    kind: str  # shape of a light; "emissive" or "" for a material
+    state: str  # EXACT, APPROXIMATED or LEFT_OUT
+    notes: tuple[str, ...] = ()  # why it is not exact
 
 
 @dataclass(frozen=True)
 class Overview:
-    """What the panels list."""
+    """The lights and materials that the panels list."""
 
     lights: tuple[Entry, ...]
     materials: tuple[Entry, ...]
@@ -363,7 +365,7 @@ _known: dict[str, Overview] = {}
 
 
 def overview(scene) -> Overview:
-    """Lights and materials of `scene`, read again once something in the file has changed."""
+    """Lights and materials of `scene`; read again after any change of the file."""
     if scene.name not in _known:
         _known[scene.name] = Overview(
             tuple(_light(ob) for ob in scene.objects if ob.type == "LIGHT" and not ob.hide_render),
@@ -392,7 +394,7 @@ def _material(material) -> Entry:
     if surface is None:
         return Entry(material.name, "", EXACT)
     shaders = shaders_behind(surface)
-    # Whether it lights the scene is the kind of a material and no defect.
+    # An emissive material is a kind, not a defect: leave out the note that it does not light the scene.
     notes = tuple(dict.fromkeys(notes_of_material(surface.node, shaders, emitter=True)))
     shown = [bsdf_of(leaf.node) or is_emission(leaf.node) or leaf.is_transparent for leaf in shaders.leaves]
     state = LEFT_OUT if shown and not any(shown) else APPROXIMATED if notes else EXACT

@@ -1,4 +1,4 @@
-"""The button "Preview with LTSH": shows the scene with our engine and gives back the artist's afterwards.
+"""The button "Preview with LTSH": shows the scene with our engine, and restores the artist's engine afterwards.
 
 Files are saved with the artist's engine and viewport shading, so that they open and render elsewhere as before.
 """
@@ -14,7 +14,7 @@ ENGINE = "LTSH"
 
 
 def is_previewing(scene) -> bool:
-    """True where the engine of `scene` is lent."""
+    """True while `scene` has our engine for a preview."""
     return scene.render.engine == ENGINE and bool(scene.ltsh_view.artist_engine)
 
 
@@ -45,8 +45,8 @@ class LTSH_OT_preview(bpy.types.Operator):
         return {"FINISHED"}
 
 
-# Address of a 3D view that was switched to a preview -> its scene, and the shading to give back. Only kept here: undo
-# does not reach views, and files are saved without previews.
+# By the address of a 3D view that shows a preview: its scene, and the shading to restore. Kept only in memory, since
+# undo does not change views, and files are saved without previews.
 _lent_views: dict[int, tuple[int, str]] = {}
 
 
@@ -61,9 +61,9 @@ def view_of(context):
 
 
 def _shading_before(scene) -> list:
-    """Give the views that show a preview of `scene` the shading that they had before, and return them.
+    """Restore the shading of the views that show a preview of `scene`, and return them.
 
-    Views whose shading was changed by hand since stay as they are.
+    Views whose shading was changed by hand since then stay as they are.
     """
     found = []
     for space in (space for screen in bpy.data.screens for area in screen.areas for space in area.spaces):
@@ -75,7 +75,7 @@ def _shading_before(scene) -> list:
 
 
 def _give_back_views(scene) -> None:
-    """End what the preview of `scene` did to views."""
+    """Restore the views of the preview of `scene`, and forget them."""
     _shading_before(scene)
     _forget_views(scene)
 
@@ -86,14 +86,14 @@ def _forget_views(scene) -> None:
 
 
 def stop_preview(scene) -> None:
-    """Give `scene` the artist's engine back, and its views their shading."""
+    """End the preview of `scene`: restore the artist's engine and the shading of views."""
     _give_back_views(scene)
     wanted = scene.ltsh_view.artist_engine
     scene.ltsh_view.artist_engine = ""
     try:
         scene.render.engine = wanted
     except TypeError:
-        # The engine that was there is not registered any more.
+        # The former engine is not registered any more.
         scene.render.engine = "CYCLES"
 
 
@@ -128,7 +128,7 @@ def _after_saving(*_) -> None:
 
 @persistent
 def _after_undo(*_) -> None:
-    """Undo takes the engine of a preview back, but does not reach the view."""
+    """Undo may end a preview: it restores the engine, but not the views."""
     for scene in bpy.data.scenes:
         if not is_previewing(scene):
             _give_back_views(scene)
@@ -145,7 +145,7 @@ def _after_loading(*_) -> None:
 
 
 def _engine_changed() -> None:
-    """Whoever chooses another engine by hand has ended the preview; Blender calls this when all that is done."""
+    """End the preview if another engine was chosen by hand; called by Blender after every change of the engine."""
     for scene in bpy.data.scenes:
         if scene.render.engine != ENGINE and scene.ltsh_view.artist_engine:
             scene.ltsh_view.artist_engine = ""
@@ -156,7 +156,7 @@ _subscriber = object()
 
 
 def _subscribe() -> None:
-    """Blender forgets who wants to hear of changes when it opens a file."""
+    """Subscribe to changes of the engine; needed again after loading, when Blender drops subscriptions."""
     bpy.msgbus.clear_by_owner(_subscriber)
     bpy.msgbus.subscribe_rna(
         key=(bpy.types.RenderSettings, "engine"), owner=_subscriber, args=(), notify=_engine_changed
@@ -181,7 +181,7 @@ def register() -> None:
 
 
 def unregister() -> None:
-    """Give all scenes and views back what they had; remove operator and handlers."""
+    """End all previews; remove operator and handlers."""
     bpy.msgbus.clear_by_owner(_subscriber)
     for scene in bpy.data.scenes:
         if is_previewing(scene):

@@ -1,4 +1,4 @@
-"""Results as images of Blender: each picture that a job left is a float image, loaded from its own EXR."""
+"""Results as images of Blender: each picture of a job is a float image, loaded from its own EXR."""
 
 from __future__ import annotations
 
@@ -20,29 +20,29 @@ from ...pipeline.moved_lights import MovedLights
 from ...pipeline.relight import tint
 from ...scene import AreaLight, SceneError, SurfaceSamples
 
-LAYER, SCENE = "ltsh_layer", "ltsh_scene"  # custom properties by which our images are known
+LAYER, SCENE = "ltsh_layer", "ltsh_scene"  # custom properties that mark our images
 PREFIX = "LTSH "
 ERROR = "error_"
 
 
 @dataclass(frozen=True)
 class Result:
-    """What is in a folder of pictures, as `display_layers.write` left it."""
+    """The contents of a folder of pictures, written by `display_layers.write`."""
 
     folder: Path
     command: str  # that made them: shade, compare or bake
-    partial: str  # what is missing, "" where nothing is
+    partial: str  # what is missing; "": nothing
     report: dict  # of the command
-    groups: dict  # pictures of each baked texture by file name, or of the camera's picture by ""
+    groups: dict  # groups of pictures: of baked textures by the stem of their files, of the camera's picture by ""
 
     def group(self, name: str) -> tuple[str, dict]:
-        """The group `name`, or the first where it is not there."""
+        """Name and contents of the group `name`; of the first group if there is no such one."""
         return (name, self.groups[name]) if name in self.groups else next(iter(self.groups.items()))
 
 
 @dataclass(frozen=True)
 class Choice:
-    """The pictures to look at, brought to what the result has: `first` and `second` may be the same."""
+    """The pictures to look at, all of which the result has; `first` and `second` may be the same."""
 
     group: str
     first: str
@@ -56,12 +56,12 @@ PIXELS_KEPT = 8
 
 
 def result_of(scene) -> Result | None:
-    """The results of `scene`, None where there are none or their folder is gone. Files are read once."""
+    """The results of `scene`; None if there are none or their folder is gone. Files are read once."""
     return result_in(scene.ltsh.result_folder) if scene.ltsh.result_folder else None
 
 
 def result_in(folder: str) -> Result | None:
-    """The results in a folder as Blender names it, None where there are none."""
+    """The results in a folder, given as a path of Blender; None if there are none."""
     path = Path(bpy.path.abspath(folder))
     try:
         stamp = index_stamp(path)
@@ -75,7 +75,7 @@ def result_in(folder: str) -> Result | None:
 
 
 def choice_of(settings, result: Result) -> Choice:
-    """What `settings` (Scene.ltsh) choose, or what comes nearest."""
+    """The choice in `settings` (Scene.ltsh), with other pictures in place of those that the result lacks."""
     name, group = result.group(settings.group)
     names, passes = group["names"], group["passes"]
     first = settings.first if settings.first in names else names[0]
@@ -96,7 +96,7 @@ def show(scene, folder: Path) -> None:
     for name in result.groups:
         settings.groups.add().name = name
     choice = choice_of(settings, result)
-    # What the artist chose stays wherever the new results have it, or will have it when they are complete.
+    # The artist's choice stays if the new results have it, or will have it once they are complete.
     for key in ("group", "first", "second", "pass_name") if not result.partial else ():
         if getattr(settings, key) != getattr(choice, key) and _offers(settings, key, getattr(choice, key)):
             settings[key] = _stored(settings, key, getattr(choice, key))
@@ -111,7 +111,7 @@ def show(scene, folder: Path) -> None:
 
 
 def images_of_pass(scene, result: Result, choice: Choice) -> None:
-    """Make sure that all pictures of the chosen pass are images."""
+    """Load all pictures of the chosen pass as images."""
     files = result.group(choice.group)[1]["files"]
     for layer in files:
         if layer.rpartition(".")[2] == choice.pass_name:
@@ -119,7 +119,7 @@ def images_of_pass(scene, result: Result, choice: Choice) -> None:
 
 
 def layer_image(scene, result: Result, group: str, layer: str):
-    """The image of a layer, loaded if it is not there yet."""
+    """The image of a layer, loaded if needed."""
     path = result.folder / result.groups[group]["files"][layer]
     full = _full(group, layer)
     image = next((image for image in our_images(scene) if image[LAYER] == full), None)
@@ -136,7 +136,7 @@ def layer_image(scene, result: Result, group: str, layer: str):
 
 
 def _set(owner, name: str, value) -> None:
-    """Set a property that is another one: Blender reads the whole file again, also for the same path."""
+    """Set a property if its value differs: Blender reads the whole file again even for the same path."""
     if getattr(owner, name) != value:
         setattr(owner, name, value)
 
@@ -147,13 +147,16 @@ def our_images(scene) -> list:
 
 
 def belongs(image, scene) -> bool:
-    """True for an image of `scene`; one whose scene was renamed or removed belongs to all."""
+    """True for an image of `scene`. An image whose scene was renamed or removed belongs to all scenes."""
     name = image.get(SCENE)
     return LAYER in image and name is not None and (name == scene.name or name not in bpy.data.scenes)
 
 
 def pixels_of(image) -> np.ndarray:
-    """Pixels (H, W, 4) float32 of an image, row 0 below; kept for the last few. Empty where they cannot be read."""
+    """Pixels (H, W, 4) float32 of an image, row 0 at the bottom; empty if they cannot be read.
+
+    Those of the last few images are cached.
+    """
     path = bpy.path.abspath(image.filepath)
     try:
         stamp = Path(path).stat().st_mtime_ns, tuple(image.size)
@@ -173,7 +176,7 @@ def pixels_of(image) -> np.ndarray:
 
 
 def is_read(image) -> bool:
-    """Are the pixels of an image known, without a look into its file?"""
+    """True if the pixels of an image are cached, so that its file need not be read."""
     path = bpy.path.abspath(image.filepath)
     try:
         return path in _pixels and _pixels[path][0][0] == Path(path).stat().st_mtime_ns
@@ -182,7 +185,7 @@ def is_read(image) -> bool:
 
 
 def linear_space() -> str:
-    """Name of the scene-linear color space of the open file, in which pixels are stored as they are."""
+    """Name of the open file's scene-linear color space, in which pixels are stored unchanged."""
     spaces = bpy.types.ColorManagedInputColorspaceSettings.bl_rna.properties["name"].enum_items.keys()
     wanted = bpy.data.colorspace.working_space if bpy.app.version >= (5, 0, 0) else "Linear Rec.709"
     return next((name for name in (wanted, "Linear Rec.709", "Linear") if name in spaces), "Non-Color")
@@ -193,7 +196,7 @@ def _full(group: str, layer: str) -> str:
 
 
 def _blender_path(path: Path) -> str:
-    """Relative to the .blend where that is possible: both may move together."""
+    """`path` relative to the .blend if possible, so that both can move together."""
     if not bpy.data.filepath:
         return str(path)
     try:
@@ -208,25 +211,26 @@ def _offers(settings, key: str, value: str) -> bool:
 
 
 def _stored(settings, key: str, value: str):
-    """As `settings[key]` has it, which sets without calling what updates."""
+    """`value` as it is stored in `settings[key]`; setting it there does not call the property's update function."""
     items = getattr(settings.bl_rna.properties[key], "enum_items", None)
     return value if items is None else items[value].value
 
 
 # The light mixer:
 
-# Of the picture that was asked for last, and what shades lights that have moved.
+# The mixer of the picture that was asked for last, and its MovedLights.
 _mixer: dict = {"stamp": None, "mixer": None, "moved": None, "is_silent": False}
-# What threads read of it, by its stamp.
+# Mixers that threads read, by the stamp of their file.
 _readings: dict[tuple, Future] = {}
-# Of final renders by the name of their scene, as long as nothing else is shown; they are in no file.
+# Mixers and MovedLights of final renders by the name of their scene, while nothing else is shown. They are in no file.
 _rendered: dict[str, tuple[Mixer, MovedLights | None]] = {}
-# Bytes of the samples of a final render that stay for lights that move, and seconds that their processes wait for one.
+# MOST_BYTES: final renders with larger samples do not keep them for moved lights. IDLE_SECONDS: the processes for moved
+# lights end after so long without use.
 MOST_BYTES, IDLE_SECONDS = 1 << 31, 60.0
 
 
 def mixer_of(scene) -> Mixer | None:
-    """The light mixer of the results of `scene`; None where they have no pictures of the lights."""
+    """The light mixer of the results of `scene`; None if they have no pictures of the lights."""
     if scene.name in _rendered:
         return _rendered[scene.name][0]
     result = result_of(scene)
@@ -248,7 +252,7 @@ def mixer_of(scene) -> Mixer | None:
 
 
 def is_mixer_read(folder: Path) -> bool:
-    """Whether `mixer_of` knows the results in `folder` at once: a thread begins to read what it takes."""
+    """True if `mixer_of` can return the mixer of the results in `folder` at once; else a thread begins to read it."""
     path = folder / MIXER_FILE
     try:
         stamp = str(path), path.stat().st_mtime_ns
@@ -262,7 +266,7 @@ def is_mixer_read(folder: Path) -> bool:
 
 
 def mix_render(scene, pictures: LightPictures, kept: KeptPicture) -> None:
-    """Let the mixer of `scene` change the lights of a final render, and shade those that move."""
+    """Give the mixer of `scene` the lights of a final render, and the samples for lights that move."""
     forget_renders()
     size = sum(getattr(kept.extraction.samples, item.name).nbytes for item in fields(SurfaceSamples))
     moved = MovedLights(lambda: (kept, kept.extraction.occluders)) if size <= MOST_BYTES else None
@@ -271,13 +275,13 @@ def mix_render(scene, pictures: LightPictures, kept: KeptPicture) -> None:
 
 
 def forget_renders() -> None:
-    """Another picture is shown, or another file opened: its scenes may have the same names."""
+    """Forget final renders, because another picture is shown, or a file is opened whose scenes may have these names."""
     end_processes()
     _rendered.clear()
 
 
 def end_processes() -> None:
-    """End those that wait for lights that move; they start again when one does."""
+    """End the processes that wait for moved lights. They start again when a light moves."""
     for moved in (_mixer["moved"], *(moved for _, moved in _rendered.values())):
         if moved is not None:
             moved.close()
@@ -286,10 +290,10 @@ def end_processes() -> None:
 
 
 class Update:
-    """Lights of the mixer of a scene that have moved, by the numbers of their rows: a thread shades them where they
-    are, first as drafts; `take` shows what is new.
+    """Shades lights of a scene's mixer that have moved, by the numbers of their rows.
 
-    Raises SceneError.
+    A thread shades them at their new places, first as drafts; `take` puts new pictures into the mixer. Raises
+    SceneError.
     """
 
     def __init__(self, scene, moved: dict[int, AreaLight]):
@@ -313,7 +317,7 @@ class Update:
         self._made.put((None, error, 1.0))
 
     def take(self) -> bool:
-        """Put what is new into the mixer, and where that is all, into its file; True where anything was."""
+        """Put new pictures into the mixer, and at the end into its file; True if there were any, or all are done."""
         newest = {}
         while not self.is_finished and not self._made.empty():
             number, found, self.done = self._made.get()
@@ -333,7 +337,7 @@ class Update:
         return bool(newest) or self.is_finished
 
     def stop(self) -> None:
-        """End the thread soon, and show these lights as they were."""
+        """Make the thread end soon, and restore the lights in the mixer."""
         self.is_finished = True
         self._source.stop()
         self._take_back()
@@ -351,7 +355,7 @@ class Update:
 
 
 def get_ready(scene, row: Row) -> None:
-    """Begin with what shading lights that have moved takes: the light of a `row` is elsewhere, or still moving."""
+    """Start what shading moved lights needs, because the light of `row` has moved or is still moving."""
     with suppress(SceneError):
         _moved_lights(scene).get_ready(AreaLight(**row.light))
         _end_later()
@@ -376,13 +380,13 @@ def _moved_lights(scene) -> MovedLights:
 
 
 def mixer_pairs(scene) -> list:
-    """Each row of the mixer with its values in `scene` (Scene.ltsh.mixed), None where there are none."""
+    """Each row of the mixer with its values in `scene` (an item of Scene.ltsh.mixed, or None)."""
     mixer, items = mixer_of(scene), {item.name: item for item in scene.ltsh.mixed}
     return [(row, items.get(row.name)) for row in (mixer.rows if mixer is not None else ())]
 
 
 def mixed_pixels(scene) -> np.ndarray | None:
-    """The picture (H, W, 4) with the lights as the mixer of `scene` has them, row 0 below; None without a mixer."""
+    """The picture (H, W, 4) as the mixer of `scene` sets the lights, row 0 at the bottom; None without a mixer."""
     mixer = mixer_of(scene)
     return None if mixer is None else mixer.mixed([_factor(scene, row, item) for row, item in mixer_pairs(scene)])
 
@@ -396,30 +400,30 @@ def _factor(scene, row: Row, item) -> np.ndarray:
 
 
 def tint_of(row: Row, item) -> np.ndarray:
-    """By what the mixer multiplies red, green and blue of a row to get its color."""
-    # Blender holds colors in single precision.
+    """Factors (3,) that give a row the color of the mixer."""
+    # Blender stores colors in single precision.
     same = np.allclose(item.color, row.color, rtol=1e-6, atol=1e-6)
     return np.ones(3) if same else tint(np.array(row.color), item.color)
 
 
 def is_on(scene, item) -> bool:
-    """False for what is muted, and where others are solo."""
+    """False for an item that is muted, or that is not solo while others are."""
     return not item.muted and (item.solo or not any(other.solo for other in scene.ltsh.mixed))
 
 
 def is_neutral(row: Row, item) -> bool:
-    """True where power, exposure and color are as rendered."""
+    """True if power, exposure and color are as rendered."""
     return item.power == 1.0 and item.exposure == 0.0 and bool((tint_of(row, item) == 1.0).all())
 
 
 def reset_mixer(scene) -> None:
-    """Show all lights as they were rendered, and forget those that are not in the picture."""
+    """Reset all lights to how they were rendered, and forget lights that are not in the picture."""
     scene.ltsh.mixed.clear()
     _take_rows(scene)
 
 
 def _take_rows(scene) -> None:
-    """Give each row of the mixer values: those that it has, unless its light was changed in the scene since."""
+    """Give each row of the mixer an item. Existing values stay, unless the light was changed in the scene since."""
     items, _mixer["is_silent"] = scene.ltsh.mixed, True
     for row, item in mixer_pairs(scene):
         settings = next(iter(row.settings.values()), [0.0] * 5)
@@ -434,12 +438,12 @@ def _take_rows(scene) -> None:
 
 
 def is_silent() -> bool:
-    """True while values of the mixer are set by this module."""
+    """True while this module sets values of the mixer."""
     return _mixer["is_silent"]
 
 
 def mix_label(scene) -> str:
-    """What is written below the mixed picture."""
+    """The label below the mixed picture."""
     pairs = [(row, item) for row, item in mixer_pairs(scene) if item is not None]
     changed = sum(not is_on(scene, item) or not is_neutral(row, item) for row, item in pairs)
     return f"Mix: {changed} of {len(pairs)} changed" if pairs else "No lights were kept: shade again"

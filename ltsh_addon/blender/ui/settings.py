@@ -25,7 +25,7 @@ from ...scene import CYCLES, REFERENCE, TECHNIQUES
 from ...shading.parallel import CORES_VARIABLE
 from .comparison import changed, mixed
 
-# "bl_ext.user_default.ltsh" in Blender, where add-ons are known by it; "ltsh_addon" when imported from elsewhere.
+# The name of the add-on: "bl_ext.user_default.ltsh" in Blender, "ltsh_addon" when imported from elsewhere.
 ADDON = __package__.rsplit(".", 3)[0]
 LOGGER = __package__.rsplit(".", 2)[0]
 RESULTS = "results"
@@ -40,15 +40,15 @@ _DEFAULT_LOG_LEVEL = "WARNING"
 
 @dataclass(frozen=True)
 class Preferences:
-    """What is set; 0 cores mean all. `output_folder` is absolute and need not exist."""
+    """The values of the preferences."""
 
-    cores: int
-    output_folder: Path
+    cores: int  # 0: all
+    output_folder: Path  # absolute; need not exist
     log_level: str
 
 
 def preferences(context) -> Preferences:
-    """The preferences of the running Blender, or the defaults where the add-on is loaded without being enabled."""
+    """The preferences of the running Blender; the defaults if the add-on is loaded without being enabled."""
     addon = context.preferences.addons.get(ADDON)
     stored = addon.preferences if addon is not None else None
     if stored is None:
@@ -59,7 +59,7 @@ def preferences(context) -> Preferences:
 
 
 def default_output_folder() -> Path:
-    """The folder for files of this extension, which stays when it is updated."""
+    """The folder for files of this extension; it survives updates."""
     if ADDON.startswith("bl_ext."):
         return Path(bpy.utils.extension_path_user(ADDON, path=RESULTS))
     return Path(bpy.utils.user_resource("DATAFILES", path="ltsh")) / RESULTS
@@ -102,7 +102,7 @@ _log_handlers: list[logging.Handler] = []
 
 
 def apply(context) -> None:
-    """Put the limit and the log level into effect, here and for processes started from now on."""
+    """Apply the limit of cores and the log level, here and for processes started from now on."""
     chosen = preferences(context)
     before = _variables_before.setdefault(CORES_VARIABLE, os.environ.get(CORES_VARIABLE))
     _set_variable(CORES_VARIABLE, str(chosen.cores) if chosen.cores else before)
@@ -122,7 +122,7 @@ def _set_variable(name: str, value: str | None) -> None:
         os.environ[name] = value
 
 
-# Members of sets of choices: name, label, description, bit. Files keep the bits: they stay as they are.
+# Members of set properties: name, label, description, bit. Files store the bits, so they must not change.
 _BITS = {"ltc": 1, "ltsh2": 2, "ltsh4": 4, REFERENCE: 8, CYCLES: 16, "ltsh4c": 32}
 TECHNIQUE_ITEMS = tuple(
     (name, technique.label, technique.description, _BITS[name]) for name, technique in TECHNIQUES.items()
@@ -152,7 +152,7 @@ MODES = (
 
 
 def _redraw_views(settings, context) -> None:
-    """Show a changed setting at once: 3D views are not drawn again for properties of add-ons."""
+    """Show a changed setting at once: Blender does not redraw 3D views for properties of add-ons."""
     for window in context.window_manager.windows:
         for area in window.screen.areas:
             if area.type == "VIEW_3D":
@@ -177,7 +177,7 @@ class LTSH_PG_mixed_light(bpy.types.PropertyGroup):
     muted: BoolProperty(name="Mute", description="This light is dark", update=mixed)
     solo: BoolProperty(name="Solo", description="All other lights are dark, unless they are solo too", update=mixed)
     applied: BoolProperty(description="The scene has values of the mixer", options={"HIDDEN"})
-    # Of the light in Blender when the picture was made that the values above are for.
+    # Settings of the light in Blender when the picture was made; the values above belong to them.
     settings: FloatVectorProperty(size=5, options={"HIDDEN"})
 
 
@@ -185,25 +185,25 @@ NOT_HELD = -1
 
 
 def lights_of(scene) -> list:
-    """The light objects of `scene`, hidden ones too."""
+    """The light objects of `scene`, hidden ones included."""
     return [ob for ob in scene.objects if ob.type == "LIGHT"]
 
 
 def active_light(context):
-    """The light that is chosen in the list of lights, which is the active object; None where that is no light."""
+    """The active object, which is the chosen one in the list of lights; None if it is not a light."""
     ob = context.view_layer.objects.active
     return ob if ob is not None and ob.type == "LIGHT" else None
 
 
 def _active_index(settings) -> int:
-    """Place of the active light among the objects of the scene, -1 where there is none."""
+    """Index of the active light among the objects of the scene; -1 if there is none."""
     scene = settings.id_data
     ob = active_light(bpy.context) if bpy.context.scene == scene else None
     return -1 if ob is None else scene.objects.find(ob.name)
 
 
 def _select(settings, index: int) -> None:
-    """Select the light at that place among the objects of the scene, and nothing else."""
+    """Select only the light at this index among the objects of the scene, and make it active."""
     objects, layer = settings.id_data.objects, bpy.context.view_layer
     if not 0 <= index < len(objects) or objects[index].name not in layer.objects:
         return
@@ -217,7 +217,7 @@ def _select(settings, index: int) -> None:
 
 
 def _hidden(ob) -> int:
-    """Whether `ob` is hidden in views (1) and in renders (2)."""
+    """The bits 1, if `ob` is hidden in views, and 2, if it is hidden in renders."""
     return int(ob.hide_viewport) + 2 * int(ob.hide_render)
 
 
@@ -228,7 +228,7 @@ def _hide(ob, hidden: int) -> None:
 
 
 def _follow_solo(own, context) -> None:
-    """Hide all lights but those on solo; where none is, each is as it was before."""
+    """Hide all lights except those on solo; without any, restore all lights."""
     lights = lights_of(context.scene)
     solo = any(ob.ltsh_light.solo for ob in lights)
     for ob in lights:
@@ -241,7 +241,7 @@ def _follow_solo(own, context) -> None:
 
 
 def _release(ob) -> None:
-    """Give back what `ob` was before a solo of others."""
+    """Restore the visibility that `ob` had before others were solo."""
     if ob.ltsh_light.held != NOT_HELD:
         _hide(ob, ob.ltsh_light.held)
         ob.ltsh_light.held = NOT_HELD
@@ -269,7 +269,7 @@ class LTSH_PG_light(bpy.types.PropertyGroup):
         name="Solo", description="Hide all lights that are not on solo, in views and renders, until this is off again",
         update=_follow_solo,
     )  # fmt: skip
-    held: IntProperty(default=NOT_HELD, options={"HIDDEN"})  # what to give back after a solo of others
+    held: IntProperty(default=NOT_HELD, options={"HIDDEN"})  # bits of `_hidden` to restore after a solo of others
 
 
 class LTSH_PG_scene(bpy.types.PropertyGroup):
@@ -322,7 +322,7 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
     bake_view: EnumProperty(name="View From", description="From where surfaces are seen", items=VIEWS, default="camera")
     bake_uv_map: StringProperty(
         name="UV Map",
-        description="Name of the UV map to bake into; empty for the one that is active for rendering",
+        description="Name of the UV map to bake into; empty for the active one, highlighted in the list UV Maps",
     )
     bake_passes: EnumProperty(
         name="Bake Passes", description="Parts of the reflected light. Shift-click to choose several",
@@ -347,7 +347,7 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
         name="Results", description="Folder of the pictures that are shown",
         subtype="DIR_PATH", options={"HIDDEN", "PATH_SUPPORTS_BLEND_RELATIVE"},
     )  # fmt: skip
-    # What the Image Editor shows of it:
+    # What the Image Editor shows of the results:
 
     mode: EnumProperty(
         name="View", description="How the two pictures are shown", items=MODES, default="WIPE", update=changed
@@ -414,12 +414,12 @@ CLASSES = (
     LTSH_PT_presets,
 )
 _add_classes, _remove_classes = bpy.utils.register_classes_factory(CLASSES)
-# Blender looks for a folder "presets" in it.
+# The folder in which Blender looks for a folder "presets".
 PRESETS_PARENT = str(Path(__file__).parent)
 
 
 def register() -> None:
-    """Add settings, preferences and presets; preferences take effect."""
+    """Add settings, preferences and presets, and apply the preferences."""
     _add_classes()
     apply(bpy.context)
     bpy.types.Scene.ltsh = PointerProperty(type=LTSH_PG_scene, name="LTSH")
@@ -428,7 +428,7 @@ def register() -> None:
 
 
 def unregister() -> None:
-    """Remove what `register` added; environment, log, and lights that a solo hides are as before."""
+    """Remove what `register` added, and restore the environment, the log, and lights that a solo hides."""
     for ob in bpy.data.objects:
         if ob.type == "LIGHT":
             _release(ob)

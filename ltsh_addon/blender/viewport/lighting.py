@@ -1,6 +1,6 @@
-"""The second pass: reflected radiance of a G-buffer under area lights, and before it which horizons end its lobes.
+"""The second pass: reflected radiance of a G-buffer under lights. Before it, the choice of the horizons of its lobes.
 
-Same lights, tables and integrals as `shading.shade`, in float32 throughout.
+Lights, tables and integrals are those of `shading.shade`, in float32 throughout.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from .textures import (
 
 _RESULTS = {BOUNDS: "light_bounds", EXCESS: "excesses", CHOICE: "horizons"}
 _SHOWN_PASSES = (*PASSES, "combined")
-# By which the points at which lobes meet the world differ from one picture to the next: share of a step, and radians.
+# From one picture to the next, the points at which lobes sample the world shift by GOLDEN steps and turn by TURN rad.
 GOLDEN, TURN = 0.618034, 2.0
 
 
@@ -54,7 +54,7 @@ class HorizonPass:
         self._size, self._textures, self._buffers = None, {}, {}
 
     def free(self) -> None:
-        """Let go of everything."""
+        """Free all textures and shaders."""
         self._size, self._shaders, self._textures, self._buffers = None, {}, {}, {}
 
     def draw(self, gbuffer: GBufferTextures, lights: UploadedLights, view: Sequence[float]) -> gpu.types.GPUTexture:
@@ -104,28 +104,27 @@ class LightingPass:
     """One technique, ready to draw. Needs an active GPU context; `free` before that goes."""
 
     def __init__(self, technique: str | LookupTable, iors: Sequence[float] = (1.5, 1.45)):
-        """`technique` is "ltc", "ltsh2", "ltsh4", "ltsh4c", a table's path or a table of degree up to 4.
+        """`technique` is "ltc", "ltsh2", "ltsh4", "ltsh4c", the path of a table, or a table of degree up to 4.
 
-        Dielectrics of the indices of refraction `iors`, multiples of 0.005, are faster; others are as exact.
+        Dielectrics with the indices of refraction `iors`, multiples of 0.005, are faster; others are as exact.
         Raises TableError and ValueError.
         """
         self.table = technique if isinstance(technique, LookupTable) else load_table(technique)
         self._shaders: dict[Features, tuple] = {}
         self._iors: tuple[float, ...] = ()
-        # Pictures that differ in it meet the world in other directions.
-        self.number = 0
+        self.number = 0  # of the picture: selects the directions in which lobes sample the world
         self._table = self._dielectrics = None
         self._sky = None
         self.set_iors(iors)
         self.set_lights(())
 
     def free(self) -> None:
-        """Let go of shaders and textures; the pass cannot draw any more."""
+        """Free shaders and textures; the pass cannot draw any more."""
         self._shaders.clear()
         self._table = self._dielectrics = self._lights = self._sky = None
 
     def set_iors(self, iors: Sequence[float]) -> None:
-        """The indices of refraction that most dielectrics have, as for the constructor."""
+        """Set the indices of refraction of the faster dielectrics, as in the constructor."""
         iors = tuple(dict.fromkeys(float(ior) for ior in iors))
         if self._table is not None and iors == self._iors:
             return
@@ -134,7 +133,7 @@ class LightingPass:
         self._dielectrics = float_texture(dielectric_texels(self.table, iors))
 
     def set_lights(self, lights: Iterable[AreaLight] | UploadedLights) -> None:
-        """The lights from now on. Light groups are added up."""
+        """Set the lights. Light groups are added up."""
         uploaded = lights if isinstance(lights, UploadedLights) else upload_lights(lights)
         self._lights, self._sky = uploaded.texture, uploaded.sky
         self._shares = shares([_loops(light) for light in uploaded.lights])
@@ -154,10 +153,10 @@ class LightingPass:
     ) -> None:
         """Write RGB radiance in W m^-2 sr^-1 and alpha 1 where the G-buffer has a surface, 0 elsewhere.
 
-        `passes` is "specular", "diffuse" or "combined", `view` as of `HorizonPass.draw`. `rect` (x, y, width, height)
-        is where the lower left of the G-buffer comes to lie in `target` (None: what is bound), left out: (0, 0, its
-        size). `blend` is "NONE", or "ADDITIVE" to add the radiance to what is there (a further lobe of the same
-        surfaces), or "ADDITIVE_PREMULT" to add the alpha too.
+        `passes` is "specular", "diffuse" or "combined"; `view` is that of `HorizonPass.draw`. `target` None draws into
+        the bound frame buffer. `rect` (x, y, width, height) is the place of the G-buffer in the target; None: (0, 0)
+        and its own size. `blend` is "NONE", "ADDITIVE" to add the radiance (a further lobe of the same surfaces), or
+        "ADDITIVE_PREMULT" to add radiance and alpha.
         """
         if passes not in _SHOWN_PASSES:
             raise ValueError(f"lighting pass: passes is {passes!r}, expected one of {', '.join(_SHOWN_PASSES)}")
@@ -180,10 +179,10 @@ class LightingPass:
         )
         parts = [features]
         if features.specular and gbuffer.tangent is not None:
-            # Anisotropic lobes are integrated with Fresnel's factor.
+            # Anisotropic lobes have a shader of their own, which integrates Fresnel's factor with them.
             parts = [replace(features, brushing=True), replace(features, brushing=True, brushed=True, bent=False)]
         if features.specular and features.rough:
-            # By itself: together they may read more textures than there can be.
+            # Draw the rough diffuse lobe by itself: both lobes together may read too many textures.
             none = {"diffuse": False, "bumped": False, "turned": False, "sheen": False, "rough": False, "velvet": False}
             alone = replace(features, specular=False, geometric=False, bent=False)
             parts = [*(replace(part, **none) for part in parts), alone]
@@ -226,7 +225,7 @@ class LightingPass:
 
 
 def _loops(light: AreaLight) -> int:
-    """About how many times the loops over a light's corners go round at the most."""
+    """Approximate upper limit of the iterations of the loops over a light's corners."""
     if light.is_profiled:
         return 16000 if light.is_round else 2000
     return 1200 if light.is_round else 10 * len(light.polygon())

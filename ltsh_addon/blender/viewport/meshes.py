@@ -10,13 +10,16 @@ import numpy as np
 from ...cycles.horizons import unit
 from ..evaluated import interpolated_normals, read_values
 
-# Between the normals of a face and of its triangles, where they count as one.
+# _SAME: normals of a face and of its triangle count as equal if no component differs by more.
 _SAME = 1e-5
 
 
 def own_normals(mesh, flat: np.ndarray, triangles: np.ndarray, place: np.ndarray, normal: np.ndarray):
-    """Triangles (K,) that need corners of their own, and their normals (K, 3): those of faces `flat` (F,) that are not
-    plane. `triangles` (T, 3) are corners with places and normals (C, 3)."""
+    """Triangles (K,) that need corners of their own, and their normals (K, 3): triangles of non-planar flat faces.
+
+    `flat` (F,) is the mask of flat faces. `triangles` (T, 3) are numbers of corners, which have the positions `place`
+    and the normals `normal`, (C, 3).
+    """
     candidates = np.arange(len(triangles))
     if not flat.all():
         face = read_values(mesh.loop_triangle_polygons, "value", (len(triangles),), np.int32)
@@ -36,12 +39,13 @@ def own_normals(mesh, flat: np.ndarray, triangles: np.ndarray, place: np.ndarray
 
 
 def corner_tangents(place, normal, uv, triangles) -> np.ndarray:
-    """Tangents (C, 4) for corners with places (C, 3), unit normals (C, 3) and UV coordinates (C, 2), in the frame of
-    the places; the last number is the sign of the bitangent. (1, 0, 0, -1) where no triangle (T, 3) has an area in UV.
-    As MikkTSpace has them (Mikkelsen 2008), which Cycles uses.
+    """Tangents (C, 4) of corners by MikkTSpace (Mikkelsen 2008), which Cycles uses; w is the sign of the bitangent.
 
-    Triangles that share a place, a normal, UV coordinates and their orientation in UV share a tangent there: the mean
-    of theirs, each projected onto the plane of the normal and weighted by its angle.
+    Corners have positions (C, 3), unit normals (C, 3) and UV coordinates (C, 2). Tangents are in the frame of the
+    positions. They are (1, 0, 0, -1) where no triangle (T, 3) has an area in UV.
+
+    Corners with the same position, normal, UV coordinates and orientation in UV share a tangent: the mean over their
+    triangles, each projected onto the plane of the normal and weighted by its angle.
     """
     corner, area = triangles.ravel(), _uv_area(uv, triangles)
     of_triangle = unit(_towards_u(place, uv, triangles) * np.sign(area)[:, None])
@@ -82,8 +86,8 @@ def _angles(place, triangles, upward):
 
 
 def _groups(place, normal, uv, corner, area):
-    """Numbers (3 T,) that are equal for corners of triangles which share a tangent."""
-    # Negative zeros count as zero.
+    """Numbers (3 T,) of the groups of corners that share a tangent."""
+    # Adding 0 turns negative zeros into zeros, as the rows are compared bytewise.
     rows = np.concatenate([place, normal, uv], axis=1, dtype=np.float32)[corner] + np.float32(0.0)
     rows = np.concatenate([rows, np.sign(area).astype(np.float32).repeat(3)[:, None]], axis=1)
     as_one = np.ascontiguousarray(rows).view(np.dtype((np.void, rows.shape[1] * rows.itemsize))).ravel()
@@ -96,23 +100,23 @@ def _projected(vectors, normals):
 
 @dataclass
 class MeshBatches:
-    """One evaluated mesh; `slots` are the material slots that have faces."""
+    """One evaluated mesh on the graphics card."""
 
-    slots: tuple[int, ...]
+    slots: tuple[int, ...]  # material slots that have faces
     triangles: int
     indices: dict[int, gpu.types.GPUIndexBuf]
     corners: gpu.types.GPUVertBuf | None
     corner_count: int
-    uv: dict[str, np.ndarray]  # (C, 2) by name; "" is the active one
+    uv: dict[str, np.ndarray]  # (C, 2) by name; "" is the one that renders
     middle: np.ndarray  # (3,) of the bounding box
-    is_smooth: bool  # do normals differ from those of the faces?
+    is_smooth: bool  # some normals differ from those of their faces
     _uv_buffers: dict[str, gpu.types.GPUVertBuf] = field(default_factory=dict)
     _tangents: dict[str, gpu.types.GPUVertBuf] = field(default_factory=dict)
     _batches: dict[tuple[int, str], gpu.types.GPUBatch] = field(default_factory=dict)
     _around: gpu.types.GPUVertBuf | None = None
 
     def batch(self, slot: int, uv_map: str) -> gpu.types.GPUBatch:
-        """What draws the faces of `slot` with a UV map; maps that the mesh lacks are zero, as in Cycles."""
+        """The batch of the faces of `slot` with a UV map. A map that the mesh lacks is zero, as in Cycles."""
         key = slot, uv_map
         if key not in self._batches:
             batch = gpu.types.GPUBatch(type="TRIS", buf=self.corners, elem=self.indices[slot])
@@ -125,13 +129,13 @@ class MeshBatches:
         return self._batches[key]
 
     def add_around(self, ob) -> None:
-        """Make sure that tangents around the axes of the object are there; `ob` is as for `add_tangents`."""
+        """Add the generated coordinates for tangents around axes of the object; `ob` is as for `add_tangents`."""
         if self._around is None:
             self._around = _vertex_buffer({"around": texture_space(ob, _arrays(ob).vertex)})
             self._batches.clear()
 
     def add_tangents(self, ob, uv_map: str) -> None:
-        """Make sure that normal maps on `uv_map` have tangents; `ob` is an evaluated object with this mesh."""
+        """Add the tangents for normal maps on `uv_map`; `ob` is an evaluated object with this mesh."""
         if uv_map in self._tangents or uv_map not in self.uv:
             return
         found = _arrays(ob)
@@ -160,7 +164,7 @@ def _vertex_buffer(attributes: dict[str, np.ndarray]) -> gpu.types.GPUVertBuf:
 
 @dataclass
 class _Arrays:
-    """Corners and triangles of an evaluated mesh; flat faces that are not plane have corners of their own."""
+    """Corners and triangles of an evaluated mesh. Triangles of non-planar flat faces have corners of their own."""
 
     triangles: np.ndarray  # (T, 3) of corners
     slots: np.ndarray  # (T,)
@@ -173,7 +177,7 @@ class _Arrays:
 
 
 def mesh_batches(ob) -> MeshBatches | None:
-    """Those of the evaluated object `ob`; None where it has no faces."""
+    """The mesh of the evaluated object `ob` on the graphics card; None where it has no faces."""
     found = _arrays(ob)
     if found is None:
         return None
@@ -201,7 +205,7 @@ def _arrays(ob) -> _Arrays | None:
             return None
         triangles = read_values(mesh.loop_triangles, "loops", (count, 3), np.int32)
         slots = _slots(mesh, count, max(len(ob.material_slots), 1))
-        # Attributes are copied as they lie in memory, `mesh.loops` and `mesh.vertices` one by one.
+        # Reading attributes is a copy of memory; `mesh.loops` and `mesh.vertices` would be read one by one.
         vertex = read_values(mesh.attributes[".corner_vert"].data, "value", (len(mesh.loops),), np.int32)
         place = read_values(mesh.attributes["position"].data, "vector", (len(mesh.vertices), 3), np.float32)
         middle = 0.5 * (place.min(axis=0) + place.max(axis=0)).astype(np.float64)
@@ -221,7 +225,7 @@ def _arrays(ob) -> _Arrays | None:
 
 
 def texture_space(ob, vertex: np.ndarray) -> np.ndarray:
-    """Generated coordinates (C, 3), less 0.5, of the vertices `vertex` (C,) of the evaluated object `ob`."""
+    """Generated coordinates minus 0.5, (C, 3), of the vertices `vertex` (C,) of the evaluated object `ob`."""
     mesh = ob.to_mesh()
     try:
         place = read_values(mesh.vertices, "undeformed_co", (len(mesh.vertices), 3), np.float32)

@@ -1,6 +1,6 @@
-"""The scene as the viewport keeps it: only what a change touches is read again.
+"""The viewport's copy of a scene: after a change only what it touches is read again.
 
-First its area lights and flat emissive meshes, as far as constants and images tell what they emit, then all the rest.
+First its lights: area lights and flat emissive meshes, with nodes as far as they can be resolved. Then all the rest.
 """
 
 from __future__ import annotations
@@ -44,28 +44,28 @@ from .meshes import MeshBatches, mesh_batches
 from .sky import REST_SECONDS, ShownSky, constant_sky, written
 from .textures import look_values, uniform_buffer
 
-# Where nothing says on which side of closed emissive meshes the eye is, it is outside.
+# FAR_AWAY: the eye where there is no camera, outside of all closed emissive meshes.
 FAR_AWAY = np.full(3, 1e6)
-# Patches and faces included. A frame takes as long as all of them do.
+# MOST_LIGHTS: patches and faces included. The time of a frame grows with their number.
 MOST_LIGHTS = 2048
-# Why a light has no pattern.
+# Reasons why a light has no pattern.
 NOT_RESOLVED = "its nodes are not resolved, it shines as without them"
 NOT_YET = "it shines as without its nodes until Cycles has looked at them"
-# Gives what Cycles sees of evaluated data with nodes, or says why it is not known.
+# Patterns: a function that returns how Cycles sees the nodes of evaluated light data, or why that is not known.
 Patterns = Callable[[bpy.types.Light, UnseenLight], SeenNodes | str]
 
 
 def no_patterns(data, source: UnseenLight) -> str:
-    """For views that ask nobody."""
+    """The `Patterns` of views that resolve no nodes."""
     return NOT_RESOLVED
 
 
 def view_lights(
     depsgraph, in_view: Callable, textures: ShownTextures, patterns: Patterns = no_patterns
 ) -> tuple[tuple[AreaLight, ...], tuple[str, ...]]:
-    """The lights among the instances that `in_view` says yes to, and what is not shown as Cycles has it.
+    """The lights among the instances that `in_view` accepts, and notes about what differs from Cycles.
 
-    `textures` are those of the last time.
+    `textures` are those of the last call, for reuse.
     """
     notes: list[str] = []
     receivers = Receivers([ob.original for ob in depsgraph.objects])
@@ -97,7 +97,7 @@ def view_lights(
 
 
 def strongest(lights: list[AreaLight], notes: list[str], most: int = MOST_LIGHTS) -> list[AreaLight]:
-    """The `most` lights with the largest power, in their order; the others are named in `notes`."""
+    """The `most` lights with the largest power, in their order; what is missing is told in `notes`."""
     if len(lights) <= most:
         return lights
     power = np.array([np.linalg.norm(light.area_vector) * np.abs(light.radiance).sum() for light in lights])
@@ -127,8 +127,10 @@ def _mesh_lights(depsgraph, receivers: Receivers, notes: list[str]) -> list[Area
 
 
 def patterns_of(scene, depsgraph) -> dict[tuple, SeenNodes]:
-    """What Cycles sees of the nodes of lights of which views must be told, by the `key` of the `UnseenLight`;
-    afterwards `scene` is as it was."""
+    """How Cycles sees the nodes of lights that views cannot read themselves, by the `key` of the `UnseenLight`.
+
+    `scene` is left as it was.
+    """
     wanted: dict[tuple, UnseenLight] = {}
 
     def note(data, source: UnseenLight) -> str:
@@ -151,28 +153,31 @@ def patterns_of(scene, depsgraph) -> dict[tuple, SeenNodes]:
 
 @dataclass
 class _Look:
-    """A second Blender at work."""
+    """A second Blender that looks at lights."""
 
-    states: dict[tuple, tuple]  # of the lights that it has not told about yet, by their keys
-    found: list[tuple[tuple, SeenNodes]] = field(default_factory=list)  # what it has told
+    states: dict[tuple, tuple]  # states by key of the lights without results so far
+    found: list[tuple[tuple, SeenNodes]] = field(default_factory=list)  # new results, with the keys of their lights
     error: str = ""
     is_stopped: bool = False
     thread: threading.Thread | None = None
 
 
 class LiveLamps:
-    """Lights as Cycles sees their nodes, for all windows: a second Blender looks at those that are new or changed while
-    the views go on. Lights are told by the `key` of `UnseenLight`."""
+    """The nodes of lights as Cycles sees them, for all windows.
+
+    A second Blender looks at new and changed lights while the views go on. Lights are identified by the `key` of
+    `UnseenLight`.
+    """
 
     def __init__(self):
-        self._known: dict[tuple, tuple[tuple, SeenNodes | str]] = {}  # state of its nodes, and what was found
-        self._wanted: dict[tuple, tuple] = {}
-        self._sources: dict[tuple, UnseenLight] = {}  # as of what is wanted
-        self._changed, self._images = 0.0, 0
+        self._known: dict[tuple, tuple[tuple, SeenNodes | str]] = {}  # state of a light's nodes, and the result
+        self._wanted: dict[tuple, tuple] = {}  # states of lights to look at
+        self._sources: dict[tuple, UnseenLight] = {}  # the lights of these states
+        self._changed, self._images = 0.0, 0  # time of the last change; counts changes of images
         self._look: _Look | None = None
 
     def pattern(self, data, source: UnseenLight) -> SeenNodes | str:
-        """What was found last, or that nothing is known yet; lights that have changed since are looked at."""
+        """The last result for a light, or a note that there is none yet. Requests a new look if the light changed."""
         key, state = source.key, self._state(data, source)
         known, found = self._known.get(key, ((), NOT_YET))
         on_its_way = self._wanted.get(key) or (self._look.states.get(key) if self._look is not None else None)
@@ -194,22 +199,22 @@ class LiveLamps:
         return data.type, *(getattr(data, name) for name in names), *source.flags.values(), where, text, images
 
     def note_images(self) -> None:
-        """Lights with images are looked at again."""
+        """Images have changed: look at lights with images again."""
         self._images += 1
 
     @property
     def is_busy(self) -> bool:
-        """Is there anything to be waited for?"""
+        """True while results are to come."""
         return bool(self._wanted) or self._look is not None
 
     def stop(self) -> None:
-        """Nobody waits any more."""
+        """Drop all requests: nobody waits for results any more."""
         self._wanted.clear()
         if self._look is not None:
             self._look.is_stopped, self._look = True, None
 
     def step(self, frame: int) -> bool:
-        """Do what is next, in the main thread; True: there is news."""
+        """Do the next step, in the main thread; True if there is news."""
         look = self._look
         if look is None:
             return bool(self._wanted) and time.monotonic() - self._changed > REST_SECONDS and self._begin(frame)
@@ -226,12 +231,12 @@ class LiveLamps:
                 else:
                     self._wanted.setdefault(key, state)
             news |= bool(look.error)
-        # What has changed meanwhile is not worth finishing.
+        # Stop if a light has changed again since.
         look.is_stopped |= any(key in look.states for key in self._wanted)
         return news
 
     def _begin(self, frame: int) -> bool:
-        """Start a second Blender; True: that failed, and is to be said."""
+        """Start a second Blender; True if that failed, which is news."""
         present = {light.session_uid: light for light in bpy.data.lights}
         self._known = {key: known for key, known in self._known.items() if key[0] in present}
         look = _Look({key: state for key, state in self._wanted.items() if key[0] in present})
@@ -274,8 +279,10 @@ class LiveLamps:
 
 
 def _with_nodes(light: AreaLight, instance, looked: tuple, notes: list[str]) -> list[AreaLight]:
-    """`light`, of a depsgraph `instance`, with what its node tree makes of it; `looked` are the textures and patterns
-    of `view_lights`."""
+    """The lights that the node tree of a depsgraph `instance` makes of `light`; [] where it emits nothing.
+
+    `looked` are the textures and patterns of `view_lights`.
+    """
     ob, (textures, patterns) = instance.object, looked
     data = ob.data
     emission = None if tree_in_use(data) is None else emission_of(data)
@@ -311,34 +318,34 @@ def _with_nodes(light: AreaLight, instance, looked: tuple, notes: list[str]) -> 
     return textures.split_seen(light, found, notes)
 
 
-# Types of objects that views leave out, and what is said of them; so many names of each.
+# NOT_SHOWN: notes about types of objects that views leave out. NAMED: the most names of objects in such a note.
 NOT_SHOWN = {
     "CURVES": "hair is not shown in views",
     "POINTCLOUD": "point clouds are not shown in views",
     "VOLUME": "volumes are not shown in views",
 }
 NAMED = 3
-# In place of a receiver's number: nothing is seen there, nor behind it.
+# HOLDOUT: the receiver number of holdouts, which hide what is behind them and show nothing themselves.
 HOLDOUT = -1
 
 
 @dataclass
 class ShownLook:
-    """A look with its uniform buffer; `textures` by slot come when it is first drawn."""
+    """A look on the graphics card."""
 
     look: Look
-    uniforms: object
-    textures: dict | None = None
+    uniforms: object  # its uniform buffer
+    textures: dict | None = None  # by slot; made at the first draw
     further: tuple[ShownLook, ...] = ()  # the other lobes
 
     @property
     def lobes(self) -> tuple[ShownLook, ...]:
-        """This lobe and the further ones; none of what is seen through."""
+        """This lobe and the further ones; none where the look is clear."""
         return () if self.look.is_clear else (self, *self.further)
 
     @property
     def is_glass(self) -> bool:
-        """Is anything seen through it, but not as if it were not there?"""
+        """True if light from behind comes through a lobe; clear looks, which are not drawn, do not count."""
         return any(lobe.look.through > 0.0 for lobe in self.lobes)
 
 
@@ -351,13 +358,13 @@ class ShownInstance:
     looks: tuple[ShownLook, ...]  # one for each slot of the mesh
     receiver: int  # or HOLDOUT
     side: float  # -1 where the transform mirrors
-    center: np.ndarray  # (4,) of the bounding box in the world
-    is_only_user: bool  # of the mesh
+    center: np.ndarray  # (4,) homogeneous, of the bounding box in the world
+    is_only_user: bool  # no other instance has the mesh
 
 
 @dataclass
 class Changes:
-    """What an update of the depsgraph touches."""
+    """What an update of the depsgraph changes."""
 
     everything: bool = False
     geometry: set[int] = field(default_factory=set)  # session uids of original objects and their data
@@ -369,19 +376,19 @@ class Changes:
 
     @property
     def surfaces(self) -> bool:
-        """Is anything of the G-buffer different?"""
+        """True if the G-buffer changes."""
         return self.everything or self.instances or self.images or bool(self.geometry or self.materials)
 
 
 def changes_of(depsgraph, first: bool) -> Changes:
-    """What `depsgraph.updates` says; all of it on the `first` call, where the list is empty."""
+    """The changes in `depsgraph.updates`; everything on the `first` call, where that list is empty."""
     changes = Changes(everything=first)
     for update in depsgraph.updates:
         block = update.id.original
         if isinstance(block, bpy.types.Object):
             _note_object(changes, block, update)
         elif isinstance(block, bpy.types.Light | bpy.types.NodeTree):
-            # Materials and worlds are named beside their node trees.
+            # Node trees of materials and worlds come with their owners, so others belong to lights.
             changes.lights = True
         elif isinstance(block, bpy.types.Material):
             changes.materials.add(block.name_full)
@@ -400,7 +407,7 @@ def _note_object(changes: Changes, block, update) -> None:
     if block.type == "LIGHT":
         changes.lights = True
         return
-    # Objects may be mesh lights, or instance lights.
+    # Other objects may be mesh lights, or instance lights.
     changes.lights |= update.is_updated_transform or update.is_updated_geometry
     changes.instances = True
     if update.is_updated_geometry:
@@ -408,7 +415,7 @@ def _note_object(changes: Changes, block, update) -> None:
 
 
 def object_notes(depsgraph) -> list[str]:
-    """What views do not show of the objects that renders of `depsgraph` show, kind by kind."""
+    """Notes about objects that renders of `depsgraph` show and views do not, kind by kind."""
     found: dict[str, list[str]] = {}
     for ob in depsgraph.objects:
         kind = NOT_SHOWN.get(ob.type)
@@ -424,12 +431,12 @@ def object_notes(depsgraph) -> list[str]:
 
 
 def _has_lost_balls(ob, depsgraph) -> bool:
-    """Is a ball of the metaballs `ob` smaller than the steps of a view, but not than those of a render?"""
-    # All of one name, but for the number, have the steps of the first.
+    """True if a ball of the metaballs `ob` is smaller than the resolution of views, but not than that of renders."""
+    # Metaballs whose names differ only in the number share the resolution of the first.
     family = [one for one in depsgraph.objects if one.type == "META" and _family(one) == _family(ob)]
     first = min(family, key=lambda one: one.name).data
     balls = [ball for ball in ob.data.elements if not (ball.hide or ball.use_negative)]
-    # Where the field of a ball is as strong as the threshold of the surface.
+    # A ball's surface is where its field equals the threshold.
     radii = [ball.radius * max(1.0 - (first.threshold / ball.stiffness) ** (1.0 / 3.0), 0.0) ** 0.5 for ball in balls]
     return any(first.render_resolution < radius < first.resolution for radius in radii)
 
@@ -439,15 +446,15 @@ def _family(ob) -> str:
 
 
 class SceneMirror:
-    """Meshes, looks, instances and lights of one view of a scene."""
+    """The meshes, looks, instances, lights and world of one view of a scene."""
 
     def __init__(self, look: Callable = lambda world: None, patterns: Patterns = no_patterns):
-        """`look(world)` gives the `ShownSky` of worlds that are more than one constant; None while it is not known."""
+        """`look(world)` returns the `ShownSky` of a world that is not constant; None while it is not known."""
         self._patterns = patterns
         self.instances: list[ShownInstance] = []
-        self.lights: tuple[AreaLight, ...] = ()  # those that are small and bright in the world included
+        self.lights: tuple[AreaLight, ...] = ()  # with the small bright lights of the world
         self.sky = ShownSky()
-        self.own_lights: tuple[AreaLight, ...] = ()
+        self.own_lights: tuple[AreaLight, ...] = ()  # without those of the world
         self._look = look
         self.surfaces_version = 0
         self._meshes: dict[tuple, MeshBatches | None] = {}
@@ -455,19 +462,19 @@ class SceneMirror:
         self._object_notes: tuple[str, ...] = ()
         self._light_notes: tuple[str, ...] = ()
         self._light_textures = ShownTextures()
-        self.has_old_lights = False  # more is known of them than is shown
+        self.has_old_lights = False  # True: there are new results about lights, which are to be read again
         self._world_note: tuple[str, ...] = ()
         self._synced = False
 
     @property
     def notes(self) -> list[str]:
-        """What is not shown as Cycles has it, each once."""
+        """Notes about what differs from Cycles, each once."""
         notes = self.material_notes, self._object_notes, self._light_notes, self._world_note
         return list(dict.fromkeys(note for kind in notes for note in kind))
 
     @property
     def material_notes(self) -> list[str]:
-        """Those of `notes` that are about materials."""
+        """The notes about materials."""
         return [note for shown in self._looks.values() for note in shown.look.notes]
 
     @property
@@ -476,16 +483,16 @@ class SceneMirror:
 
     @property
     def most_lobes(self) -> int:
-        """How many lobes the material with the most has."""
+        """The largest number of lobes of a material."""
         return max((len(shown.lobes) for shown in self._looks.values()), default=0)
 
     @property
     def has_glass(self) -> bool:
-        """Is anything seen through a surface?"""
+        """True if anything is seen through a surface."""
         return any(shown.is_glass for shown in self._looks.values())
 
     def sync(self, depsgraph, space=None) -> None:
-        """Take over what has changed; `space` is the 3D view, whose local view counts."""
+        """Take over all changes; `space` is the 3D view, for its local view."""
         changes = changes_of(depsgraph, not self._synced)
         self._drop_changed(changes)
         in_view = visibility(depsgraph, space)
@@ -499,7 +506,7 @@ class SceneMirror:
         self._synced = True
 
     def read_lights(self, depsgraph, in_view: Callable) -> None:
-        """Take over the lights that `in_view` says yes to."""
+        """Read the lights of the instances that `in_view` accepts."""
         self.own_lights, self._light_notes = view_lights(depsgraph, in_view, self._light_textures, self._patterns)
         self.lights = (*self.own_lights, *self.sky.lights)
         self.has_old_lights = False
@@ -519,7 +526,7 @@ class SceneMirror:
         override = depsgraph.view_layer_eval.material_override
         receivers = Receivers([ob for ob in _originals(depsgraph) if ob.type == "LIGHT"])
         found, meshes, looks = [], {}, {}
-        users = Counter()  # of evaluated data, also those that are not in view
+        users = Counter()  # instances by evaluated data, those out of view included
         for instance in depsgraph.object_instances:
             ob = instance.object
             if not is_surface(instance):
@@ -570,7 +577,7 @@ class SceneMirror:
             self.take_sky(sky)
 
     def take_sky(self, sky: ShownSky, *notes: str) -> None:
-        """Show this world from now on; `notes` say what is not as Cycles has it."""
+        """Show this world from now on; `notes` tell how it differs from Cycles."""
         self.sky, self._world_note = sky, notes
         self.lights = (*self.own_lights, *sky.lights)
 
@@ -582,7 +589,7 @@ def _shown_look(material) -> ShownLook:
 
 
 def _materials(ob, mesh: MeshBatches, override) -> list:
-    """The material of every slot of `mesh`, None where there is none."""
+    """The material of every slot of `mesh`; None for empty slots."""
     slots = [slot.material for slot in ob.material_slots] or [None]
     return [override or slots[slot] for slot in mesh.slots]
 

@@ -1,5 +1,8 @@
-"""One frame of a view: G-buffer, lighting, picture. What has not changed is not drawn again, but may be refined: every
-further frame then adds other points of the pixels, and the picture is their mean."""
+"""One frame of a view: G-buffer, lighting, picture.
+
+Only what has changed is drawn again. While nothing changes, every further frame adds another point of each pixel, and
+the picture is their mean.
+"""
 
 from __future__ import annotations
 
@@ -20,17 +23,17 @@ from .surfaces import SurfacePass, View, has_bent_lobes
 from .textures import GBufferTextures, ShareGrid, UploadedLights, float_texture, read_texture, upload_lights
 
 MODES = ("single", "split", "difference")
-# The lighting pass is fast for so many indices of refraction, and exact for all.
+# MOST_IORS: indices of refraction for which the lighting pass is fast. It is exact for all.
 MOST_IORS = 6
-# Of pixels: right and up by half of the picture, and its center.
+# RAYS: the shader constants with the rays of `View.rays`.
 RAYS = ("ray_x", "ray_y", "ray_center")
-# Of pixels: where they are seen, right and up of their centers.
+# CENTERS: the points of pixels of a single frame, their centers, in pixels right and up of them.
 CENTERS = np.zeros((1, 2))
 
 
 @dataclass(frozen=True)
 class ShownPicture:
-    """What of the lighting is shown, and how."""
+    """Which parts of the lighting are shown, and how."""
 
     technique: str
     passes: str  # combined, specular or diffuse
@@ -41,14 +44,14 @@ class ShownPicture:
     exposure: float
     transparent: bool
     line_width: float = 1.0
-    second_picture: gpu.types.GPUTexture | None = None  # in the place of the second technique's; without emission
-    white: float = 1.0  # brightness of no difference, before the scene's own exposure
-    also: tuple[tuple[str, str], ...] = ()  # techniques and passes that are drawn beside, for `read`
-    world: bool = True  # its light is shown
+    second_picture: gpu.types.GPUTexture | None = None  # replaces the second technique's picture; without emission
+    white: float = 1.0  # brightness that shows no difference, before the scene's own exposure
+    also: tuple[tuple[str, str], ...] = ()  # further techniques and passes to draw, for `read`
+    world: bool = True  # show the light of the world
 
 
 def _origin_of(lights, view: View) -> np.ndarray:
-    """Near what is seen: single precision tells places far from the origin badly apart."""
+    """An origin near what is seen, because single precision is coarse far from the origin."""
     places = np.array([light.center for light in lights if not light.is_distant])
     if len(places) == 0:
         return np.zeros(3)
@@ -56,7 +59,7 @@ def _origin_of(lights, view: View) -> np.ndarray:
 
 
 class PicturePass:
-    """Draws one or two pictures into what is bound; needs an active GPU context."""
+    """Draws one or two pictures into the bound frame buffer; needs an active GPU context."""
 
     def __init__(self):
         constants = {"mode": "INT", "scales": "VEC4", "opacity": "FLOAT", "white": "FLOAT", "weights": "VEC2"}
@@ -66,8 +69,11 @@ class PicturePass:
         self._shader, self._batch = pixel_shader(source, ("first_picture", "second_picture", "sky"), constants)
 
     def draw(self, pictures, weights, view: View, shown: ShownPicture, background) -> None:
-        """Fill what is bound, scene-linear, from one or two textures RGBA times their `weights`, whose alpha then is
-        the share of a pixel that shows a surface. `background` is a picture of what is behind, as of `sky`."""
+        """Fill the bound frame buffer, scene-linear, from one or two RGBA textures times their `weights`.
+
+        The weighted alpha is the share of a pixel that shows a surface. `background` is a texture of
+        `sky.background_texels`.
+        """
         size = pictures[0].width, pictures[0].height
         gpu.state.viewport_set(0, 0, *size)
         gpu.state.blend_set("NONE")
@@ -91,7 +97,7 @@ class PicturePass:
 
 
 class VeilPass:
-    """Draws what is seen through glass; needs an active GPU context."""
+    """Draws what is behind glass; needs an active GPU context."""
 
     def __init__(self):
         constants = {"is_seen": "FLOAT", **dict.fromkeys(RAYS, "VEC4")}
@@ -99,9 +105,11 @@ class VeilPass:
         self._shader, self._batch = pixel_shader(glsl("octahedron") + glsl("veil"), samplers, constants)
 
     def draw(self, textures, target, view: View, is_seen: bool, blend: str) -> None:
-        """Draw a picture RGBA of what is behind into `target`, where there is glass times what is `left` of it, and
-        over the background. What is behind `is_seen`, or black. `textures` are these, positions of the glass and the
-        background."""
+        """Draw the picture of the surfaces, over the background, into `target`, dimmed where there is glass.
+
+        `textures` are the picture (RGBA), the share that glass lets through (RGB), the positions of the glass, and the
+        background. Without `is_seen` the background behind glass is black.
+        """
         shader = self._shader
         with target.bind():
             gpu.state.viewport_set(0, 0, textures[0].width, textures[0].height)
@@ -120,7 +128,7 @@ class VeilPass:
 
 
 class _Layer:
-    """The G-buffer of some surfaces, and which horizons end their lobes."""
+    """The G-buffer of one layer, surfaces or glass, and the horizons that end its lobes."""
 
     def __init__(self, before: _Layer | None = None):
         self._surfaces = SurfacePass(None if before is None else before._surfaces)
@@ -128,8 +136,8 @@ class _Layer:
         self._lobe_horizons: HorizonPass | None = None
         self._gbuffer: GBufferTextures | None = None
         self._lit: GBufferTextures | None = None
-        self.smooth_normal: gpu.types.GPUTexture | None = None  # of the surfaces that are lit
-        self.shares: ShareGrid | None = None  # those that all lobes have
+        self.smooth_normal: gpu.types.GPUTexture | None = None  # of the lobe that is lit
+        self.shares: ShareGrid | None = None  # shares for all lobes
         self.through, self.add_emission = self._surfaces.through, self._surfaces.add_emission
 
     def draw(self, mirror, view: View, size) -> None:
@@ -138,7 +146,10 @@ class _Layer:
         self._gbuffer = self._surfaces.draw(mirror.instances, view, size)
 
     def choose_horizons(self, mirror, view: View, lights: UploadedLights) -> None:
-        """End specular lobes where Cycles does, and let only those diffuse lobes have two horizons that need them."""
+        """Choose the horizons of specular lobes as Cycles does; diffuse lobes keep a second one only if they need it.
+
+        Only bump-mapped and translucent looks need it.
+        """
         self._lit = None
         if self._horizons is None and self._gbuffer.geometric_normal is not None:
             self._horizons = HorizonPass()
@@ -146,11 +157,11 @@ class _Layer:
 
     @property
     def is_ready(self) -> bool:
-        """Have the horizons been chosen?"""
+        """True if the horizons are chosen."""
         return self._lit is not None
 
     def lobe(self, number: int, mirror, view: View, lights: UploadedLights) -> GBufferTextures:
-        """What is to be lit of the lobes `number`; valid until the next call."""
+        """The G-buffer of the lobes `number`, with their horizons; valid until the next call."""
         if number == 0:
             self.smooth_normal = self._gbuffer.smooth_normal
             return self._lit
@@ -168,7 +179,7 @@ class _Layer:
         return replace(gbuffer, geometric_normal=horizon, smooth_normal=smooth_normal)
 
     def free(self) -> None:
-        """Let go of everything."""
+        """Free all textures and shaders."""
         self._surfaces.free()
         for horizons in (self._horizons, self._lobe_horizons):
             if horizons is not None:
@@ -198,8 +209,8 @@ class ViewRenderer:
     ) -> None:
         """Draw the scene into `frame_buffer`, which has `size` pixels.
 
-        Pixels are first seen at the first of `points` (N, 2), in pixels right and up of their centers, then, as long as
-        nothing changes, at one more with every call. The picture is their mean; `samples` is their number.
+        The first call shows pixels at the first of `points` (N, 2), in pixels right and up of their centers. While
+        nothing changes, every further call adds the next point. The picture is their mean; `samples` is their number.
         """
         view = view.around(_origin_of(mirror.lights, view))
         wanted = [(shown.technique, shown.passes)]
@@ -218,29 +229,29 @@ class ViewRenderer:
         if not _same(still, self._still):
             self.samples = 0
         if self.samples < len(points):
-            self._still = None  # until all of the sample is there
+            self._still = None  # until the sample is complete
             is_drawn = self._draw_sample(mirror, view.shifted(points[self.samples], size), size, *asked)
             self._still, self.samples = still, self.samples + is_drawn
         self._show([self._targets[number][0] for number in range(pictures)], view, shown, frame_buffer)
 
     def show(self, number: int, view: View, shown: ShownPicture, frame_buffer) -> None:
-        """Draw the picture of one of the techniques that were drawn last, as `draw` does; `shown` has its passes."""
+        """Draw the picture `number` of those drawn last, as `draw` does; `shown` must have its passes."""
         self._show([self._targets[number][0]], view, shown, frame_buffer)
 
     def _show(self, pictures, view, shown, frame_buffer) -> None:
         weights = [1.0 / self.samples] * len(pictures)
         if shown.mode != "single" and shown.second_picture is not None:
             pictures, weights = [*pictures, shown.second_picture], [*weights, 1.0]
-        # Drawing elsewhere has bound other buffers, and what is bound need not be what is bound in Python.
+        # The sample has bound other buffers, and Blender's own binding is unknown to Python.
         with frame_buffer.bind():
             self._picture.draw(pictures, weights, view, shown, self._background)
 
     def _draw_sample(
         self, mirror, view: View, size, wanted: list[tuple[str, str]], with_emission: bool, world: bool
     ) -> bool:
-        """Add one point of every pixel to the targets of `wanted` techniques and passes; the first one replaces all.
+        """Add one point of every pixel to the targets of `wanted` techniques and passes; the first point replaces them.
 
-        False: it was not drawn, since its shadows are on their way.
+        Returns False where nothing was drawn because its shadows are not ready.
         """
         surfaces_changed = self._draw_surfaces(mirror, view, size)
         lights_changed = self._upload_lights(mirror, view, world)
@@ -272,7 +283,7 @@ class ViewRenderer:
         return True
 
     def _draw_surfaces(self, mirror, view: View, size) -> bool:
-        """Draw the G-buffers if anything has changed, and tell that."""
+        """Draw the G-buffers if anything has changed; True if so."""
         drawn = (mirror,), (mirror.surfaces_version, *_key(view, size))
         if _same(drawn, self._drawn):
             return False
@@ -294,7 +305,7 @@ class ViewRenderer:
         self._background = float_texture(background_texels(sky))
 
     def _upload_lights(self, mirror, view: View, world: bool) -> bool:
-        """Upload the lights if they, or the origin of the view, have changed, and tell that."""
+        """Upload the lights if they or the origin of the view have changed; True if so."""
         lights = mirror.lights if world else mirror.own_lights
         known, sky, origin = self._uploaded
         wanted = self._sky_light if world else None
@@ -306,15 +317,17 @@ class ViewRenderer:
         return True
 
     def _shares(self, layer: _Layer, gbuffer: GBufferTextures, mirror, view: View) -> ShareGrid | None:
-        """Which shares of the lights lobes of a layer see."""
+        """The shares of the lights that the lobe `gbuffer` of a layer sees."""
         shadows = self.shadows.of_glass if layer is self._glass else self.shadows
         sides = () if self._lights.sky is None else mirror.sky.sides
         whole = replace(gbuffer, smooth_normal=layer.smooth_normal)
         return shadows.shares(whole, view, self._lights.lights, sides, self.samples)
 
     def _light(self, layer: _Layer, wanted: list[tuple[str, str]], buffers: list, seen: tuple, first: str) -> None:
-        """Light a layer into the buffers of techniques and passes, with the blending `first`, as of a `seen` mirror and
-        view; surfaces of a lobe are those of all."""
+        """Light all lobes of a layer into the `buffers` of `wanted` techniques and passes.
+
+        The first lobe is blended by `first`, the others are added. `seen` are mirror and view.
+        """
         mirror, view = seen
         lightings = [self._lighting_of(technique, mirror) for technique, _ in wanted]
         for lighting in lightings:
@@ -345,7 +358,7 @@ class ViewRenderer:
 
     @staticmethod
     def _target(targets: list, number: int, size):
-        """The frame buffer `number` of `targets`; those that a technique is drawn into have the sum of its samples."""
+        """The frame buffer `number` of `targets`, created if needed. It holds the sum of the samples."""
         while len(targets) <= number:
             targets.append(None)
         if targets[number] is None or targets[number][2] != size:
@@ -354,11 +367,11 @@ class ViewRenderer:
         return targets[number][1]
 
     def read(self, number: int = 0) -> np.ndarray:
-        """The last picture (H, W, 4) of the first technique, the second, or one beside; row 0 at the bottom."""
+        """The last picture (H, W, 4) of target `number`: the techniques, then those of `also`; row 0 at the bottom."""
         return read_texture(self._targets[number][0]) / np.float32(self.samples)
 
     def free(self) -> None:
-        """Let go of everything."""
+        """Free all textures and shaders."""
         for part in (*self._lighting.values(), self._surfaces, *([self._glass] if self._glass else [])):
             part.free()
         self._lighting.clear()
@@ -375,12 +388,12 @@ def _key(view: View, size) -> tuple:
 
 
 def _same(new, old) -> bool:
-    """Do two states have the same things of the scene, their first part, and equal values, their second one?"""
+    """True if two states have identical objects of the scene, their first part, and equal values, their second."""
     return old is not None and new[1] == old[1] and all(a is b for a, b in zip(new[0], old[0], strict=True))
 
 
 def common_iors(mirror: SceneMirror) -> tuple[float, ...]:
-    """The constant indices of refraction of most instances, as the lighting pass takes them."""
+    """The most frequent constant indices of refraction, rounded to the steps of the lighting pass."""
     counts: dict[float, int] = {}
     for instance in mirror.instances:
         for lobe in (lobe for shown in instance.looks for lobe in shown.look.lobes):

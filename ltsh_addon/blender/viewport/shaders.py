@@ -1,7 +1,7 @@
 """The shaders that run once per pixel: lighting, and the choice of horizons before it.
 
-Their text stands in `glsl/`; it contains `core.h` of exported headers. Constants of Python become macros LTSH_..., and
-so do the features that a shader is compiled for. What is written here is what repeats per horizon, moment or corner.
+Their text is in `glsl/`, with `core.h` of the exported headers. Constants of Python and the features that a shader is
+compiled for become macros LTSH_... Python generates only lines that repeat per horizon, moment or corner.
 """
 
 from __future__ import annotations
@@ -37,18 +37,20 @@ from ...shading.lookup_table import MIN_ALPHA, LookupTable
 from ...shading.tails import NEAR_RADII
 from . import sky, textures
 
-# Half diagonals of a light, as the lobe sees it, up to which it is sampled: there both that and the rounding of edges,
-# which grows with the inverse of the size, are below 2e-4 of the result.
+# Limits of the half diagonal of a light, as the lobe sees it, for cheaper ways of integration.
+# TINY_LIGHT: up to it lights are sampled by triangles. There the errors of that and of the rounding of edges, which
+# grows with the inverse of the size, are below 2e-4 of the result.
 TINY_LIGHT = 0.2
-# The same for those of which four points, and of round ones the center, are all that counts: 5e-4 of the result.
+# SMALL_LIGHT: up to it four points stand for a light that no horizon cuts. POINT_LIGHT: up to it the center stands for
+# a round light. The error is 5e-4 of the result.
 SMALL_LIGHT = 0.12
 POINT_LIGHT = 2e-4
-# Of anisotropic lobes: least alpha in single precision; radians by which an arc may turn; how many arcs an edge becomes
-# at most, and how often it is halved for each.
+# Anisotropic lobes. LEAST_ALPHA: the least alpha in single precision. SHORT_ARC: radians by which an arc may turn.
+# MOST_ARCS: arcs of an edge. MOST_HALVINGS: how often an edge is halved for each arc.
 LEAST_ALPHA, SHORT_ARC, MOST_ARCS, MOST_HALVINGS = 1e-4, 1.2, 16, 6
-# Of the polynomials for the albedo of rough diffuse lobes: good to 5e-6.
+# SLOPE_DEGREE: of the polynomials for the albedo of rough diffuse lobes; their error is 5e-6.
 SLOPE_DEGREE = 8
-# Nodes along disks over which a cone ends, see `shading.facing`.
+# NODES_ALONG: quadrature nodes along a disk on which the cone of a spot ends, see `shading.facing`.
 NODES_ALONG = 20
 _TRIANGLE = ((-1.0, -1.0), (3.0, -1.0), (-1.0, 3.0))
 _AXES = "xyz"
@@ -62,8 +64,8 @@ def glsl(name: str) -> str:
 def pixel_shader(source: str, samplers: Iterable[str], constants: Mapping[str, str]):
     """A shader that runs `source` for every pixel of the viewport, and the batch that draws it.
 
-    `samplers` are the names of its textures, `constants` its push constants: their types by name. Give only those that
-    are used: others are not there for whom sets them.
+    `samplers` are the names of its textures, `constants` the types of its push constants by name. Name only those that
+    the source uses: the compiler removes others, and setting them is an error.
     """
     info = gpu.types.GPUShaderCreateInfo()
     info.vertex_in(0, "VEC2", "corner")
@@ -80,24 +82,24 @@ def pixel_shader(source: str, samplers: Iterable[str], constants: Mapping[str, s
 
 @dataclass(frozen=True)
 class Features:
-    """What a lighting shader is compiled for."""
+    """The features that a lighting shader is compiled with."""
 
     specular: bool
     diffuse: bool
-    geometric: bool  # a horizon of its own for the specular lobe
-    bumped: bool  # a horizon of its own for the diffuse lobe
+    geometric: bool  # the specular lobe has a second horizon
+    bumped: bool  # the diffuse lobe has a second horizon
     focused: bool = False  # lights with a spread or a falloff
-    turned: bool = False  # a diffuse normal of its own
-    shadowed: bool = False  # a share of each light that is seen
+    turned: bool = False  # the diffuse lobe has a normal of its own
+    shadowed: bool = False  # shares of the lights that are seen
     facing: bool = False  # lights that face every point
-    patterned: bool = False  # some of them with a pattern
+    patterned: bool = False  # some of these have a pattern
     sky: bool = False  # the light of the world
     sheen: bool = False  # diffuse lobes that are sheen
     rough: bool = False  # rough diffuse lobes
     velvet: bool = False  # diffuse lobes that are velvet; only with `rough`
     bent: bool = False  # dielectrics with an index of refraction below 1
-    brushing: bool = False  # there are anisotropic lobes
-    brushed: bool = False  # of these the pixels; else the others
+    brushing: bool = False  # there are anisotropic lobes, which take a shader of their own
+    brushed: bool = False  # this is that shader; False: the shader for all other pixels
 
     @property
     def samplers(self) -> tuple[str, ...]:
@@ -125,7 +127,7 @@ class Features:
 
     @property
     def constants(self) -> dict[str, str]:
-        """The push constants that the shader reads: types by name."""
+        """The types of the push constants that the shader reads, by name."""
         needed = {
             "place": ("IVEC4", True),
             "view": ("VEC4", self.specular or self.sheen or self.rough),
@@ -205,7 +207,7 @@ def _lighting_constants(table) -> dict:
         "MIN_ALPHA": float_literal(MIN_ALPHA),
         "CHANGING": float_literal(facing.CHANGING),
         "NODES_ALONG": NODES_ALONG,
-        # Those of the nodes are 9 (NODES_ALONG + 1) together.
+        # The weights of the nodes add up to 9 (NODES_ALONG + 1).
         "PEAK_WEIGHT": float_literal(9.0 * (NODES_ALONG + 1) * facing.PEAK_WEIGHT),
         "FEW_LAYERS": plain.layers,
         "MANY_LAYERS": beyond.layers,
@@ -224,13 +226,13 @@ def _lighting_constants(table) -> dict:
         "MANY_CORNERS": many_corners,
         "FEW_CORNERS_FIRST": textures.circle_first(few_corners),
         "MANY_CORNERS_FIRST": textures.circle_first(many_corners),
-        # One more for each of three horizons.
+        # Each of three horizons may add a corner.
         "MOST_CORNERS": many_corners + 3,
     }
 
 
 def _level_lines() -> Iterator[str]:
-    """Statements that choose the corners of a round light from how wide it is seen."""
+    """Statements that choose the corners of a round light by its apparent width."""
     for first, count, limit in reversed(textures.ROUND_LEVELS):
         condition = "round && whole" if count < ROUND_CORNERS[0] else "round"
         if not np.isinf(limit):
@@ -239,7 +241,7 @@ def _level_lines() -> Iterator[str]:
             yield f"    light.{name} = {condition} ? {value} : light.{name};"
 
 
-# Of the lights of `ltsh_todo`: their corners where they need some, and how they are integrated.
+# The GLSL expression of the integral by the way in which `ltsh_todo` has a light integrated.
 _WAYS = {
     "spots": "{name}_in_spots(sight, light.is_round)",
     "whole": "{name}_of_whole(sight, light)",
@@ -249,7 +251,7 @@ _WAYS = {
 
 
 def _loop(way: str, body: Iterable[str]) -> Iterator[str]:
-    """A loop over the lights that `ltsh_todo` has for a way. It runs once without any, then left is 0."""
+    """A loop over the lights that `ltsh_todo` has for a way. Without lights it runs once, with left = 0."""
     yield f"    left = todo.{way};"
     yield "    do {"
     yield "        number = ltsh_next(left);"
@@ -261,7 +263,7 @@ def _loop(way: str, body: Iterable[str]) -> Iterator[str]:
 
 
 def _loops(name: str, lobe: str, light: Callable, features: Features) -> Iterator[str]:
-    """A loop over the lights of each way; `light(integral)` says what they add."""
+    """A loop over the lights of each way; `light(integral)` yields the statements that compute `reflected`."""
     ways = {way: integral.format(name=name, lobe=lobe) for way, integral in _WAYS.items()}
     if features.focused:
         ways["focused"] = ""
@@ -286,7 +288,7 @@ def _loops(name: str, lobe: str, light: Callable, features: Features) -> Iterato
 def _uneven_loop(normal: str, width: str, others: Iterable[str], is_done: str) -> Iterator[str]:
     """A loop that finds the factors of lights that are not equally bright all over; `others` are further statements.
 
-    Where `is_done` holds for a light the loops after this one leave it out.
+    Later loops leave out the lights for which the GLSL condition `is_done` holds.
     """
 
     def body():
@@ -361,7 +363,7 @@ def _specular_text(table, is_cosine, features) -> str:
     lines = {"MOMENT_LINES": moments, "SPOT_LINES": spots, "FETCHES": fetches, "TERMS": terms}
     values = {name: "\n".join(texts) for name, texts in lines.items()}
     values["SUM"] = filled(glsl("cosine_sum" if is_cosine else "moment_sum"), values)
-    # A tilt turns around the second axis of the frame, and so does the horizon.
+    # A tilt turns the horizon around the second axis of the frame, so both horizons meet there.
     seam = "lobe.row_y" if is_cosine else None
     values["INTEGRAL"] = _integral_text("specular", 1 + is_cosine + features.geometric, seam)
     values["FOCUSED"] = ""
@@ -371,7 +373,7 @@ def _specular_text(table, is_cosine, features) -> str:
     return filled(glsl("specular"), values)
 
 
-# In units of the lobe's width, by its smaller alpha and by both.
+# Statements that put sizes in units of the lobe's width, by its smaller alpha and by both.
 _BRUSHED_SIZES = "    view.size *= lobe.sharpness;\n    view.wide *= lobe.mean_sharpness;\n"
 
 
@@ -394,7 +396,7 @@ def _bent_edge_lines(table):
 
 
 def _bent_spot_lines(table):
-    """The same for a spot; moments are 2 pi times the integrals of `lookup_table.bent_cosines`."""
+    """Statements that add a spot to these moments: 2 pi times the integrals of `lookup_table.bent_cosines`."""
     yield f"    vec3 bent = ltsh_bent(direction, {bend_literals(table)});"
     yield "    float squares = dot(bent, bent);"
     yield f"    float share = {bent_factor(table, 2.0 * np.pi)} * solid_angle / (squares * squares);"
@@ -431,7 +433,7 @@ def _vector(values) -> str:
 
 
 def _root_polynomial(function) -> str:
-    """Statements for the value of which sqrt(1 - z) times is function(z), by a polynomial in that root."""
+    """Statements for value = function(z) / root, root = sqrt(1 - z), as a polynomial in root."""
     domain = [0.01, 1.0]
     fit = np.polynomial.chebyshev.Chebyshev.interpolate(lambda u: function(1.0 - u * u) / u, SLOPE_DEGREE, domain)
     highest = fit.convert(kind=np.polynomial.Polynomial).coef[::-1]
@@ -441,8 +443,8 @@ def _root_polynomial(function) -> str:
 def _focused_text(name, arguments, value, frame, tiny="LTSH_TINY") -> str:
     """GLSL of vec4 `name`_focused(`name`_lobe lobe, `arguments` ltsh_light light, int header, float width, bool used).
 
-    Expects spread.glsl and what `_integral_text` expects. `value` is the vec4 that a `name`_sum `sum` stands for, and
-    `frame` a matrix to the coordinates in which the lobe lies around e_z, of vectors that `name`_warped gives.
+    Expects spread.glsl and what `_integral_text` expects. `value` is the vec4 that a `name`_sum `sum` stands for.
+    `frame` is the matrix from vectors of `name`_warped to coordinates in which the lobe lies around e_z.
     """
     return filled(glsl("focused"), {"name": name, "ARGUMENTS": arguments, "VALUE": value, "FRAME": frame, "TINY": tiny})
 
@@ -452,9 +454,9 @@ def _integral_text(name: str, planes: int, seam: str | None = None, sizes: str =
 
     Expects, in GLSL, `name`_lobe with normals plane_0 .. of the horizons, `name`_sum, `name`_empty(),
     `name`_with_edge(sum, start, end), `name`_with_spot(sum, direction, solid angle), `name`_warped(lobe, v) and
-    `name`_heights(lobe, v, warped v, rest), whose unused components are `rest`. `seam` is the direction in which the
-    first two horizons meet, if that is known; `sizes` are statements that put the sizes of a `name`_view in units of
-    the lobe's width.
+    `name`_heights(lobe, v, warped v, rest), which sets unused components to `rest`. `seam` is the direction in which
+    the first two horizons meet, if known. `sizes` are statements that put the sizes of a `name`_view in units of the
+    lobe's width.
     """
     values = {
         "name": name,
@@ -469,12 +471,12 @@ def _integral_text(name: str, planes: int, seam: str | None = None, sizes: str =
 
 
 def _apex_lines(name, planes, seam):
-    """Directions in which two horizons meet: warped, seen from `origin`, with their heights."""
+    """Statements for the directions in which two horizons meet, warped and seen from `origin`, and their heights."""
     if planes > 1:
         yield "    vec3 normal = cross(along_u, along_v);"
         yield "    float height_of_center = tiny ? dot(normal, center) : 0.0;"
     for k, j in combinations(range(planes), 2):
-        # The difference of normals that are close is exact.
+        # The difference of close normals is exact in floating point.
         meeting = seam if seam and (k, j) == (0, 1) else f"cross(lobe.plane_{k}, lobe.plane_{j} - lobe.plane_{k})"
         yield f"    vec3 meeting_{k}{j} = {meeting};"
         yield f"    meeting_{k}{j} *= dot(meeting_{k}{j}, light.direction) < 0.0 ? 1.0 : -1.0;"
@@ -486,7 +488,7 @@ def _apex_lines(name, planes, seam):
 
 
 def _interval_lines(planes):
-    """From `enter` to `leave` an edge is above all horizons."""
+    """Statements that narrow the part of an edge that is above all horizons, from `enter` to `leave`."""
     for a in _AXES[:planes]:
         yield f"        enter = max(enter, start_height.{a} <= 0.0 && end_height.{a} > 0.0 ? share.{a} : 0.0);"
         yield f"        leave = min(leave, start_height.{a} > 0.0 && end_height.{a} <= 0.0 ? share.{a} : 1.0);"
@@ -494,10 +496,10 @@ def _interval_lines(planes):
 
 
 def _closing_lines(planes):
-    """The piece of horizon number slot - 1 that an edge's crossing gives.
+    """Statements for the piece of horizon number slot - 1 that the crossing of an edge adds.
 
-    Where an edge crosses two horizons, the order of the crossings says where it is below the other one. Both horizons
-    use the same comparison, so that rounding cannot leave the polygon open, however close they are.
+    Where an edge crosses two horizons, the order of the crossings tells where it is below the other one. Both horizons
+    use the same comparison, so rounding cannot leave the polygon open, however close they are.
     """
     for k, a in enumerate(_AXES[:planes]):
         yield f"            if (slot == {k + 1}) {{"
@@ -513,7 +515,7 @@ def _closing_lines(planes):
 
 
 def _moving_lines(k, others):
-    """Move a crossing of horizon k that is below another one to where both meet."""
+    """Statements that move a crossing of horizon k that is below another one to where both meet."""
     a = _AXES[k]
     if others:
         yield "                bool below;"
@@ -533,7 +535,7 @@ def _moving_lines(k, others):
         yield f"                crossing.xyz = below ? apex_{pair} : crossing.xyz;"
 
 
-# The steps that choose horizons, and the textures that they read: lights where there is a loop over them.
+# The steps that choose horizons, and the textures that they read. The last step has no loop over lights.
 BOUNDS, EXCESS, CHOICE = "bounds", "excess", "choice"
 _SEEN = ("positions", "smooth_normals", "geometric_normals", "f90s", "dielectric_weights", "lights")
 HORIZON_SAMPLERS = {
@@ -542,12 +544,11 @@ HORIZON_SAMPLERS = {
     CHOICE: ("smooth_normals", "geometric_normals", "excesses"),
 }
 _HORIZON_CONSTANTS = {BOUNDS: {"place": "IVEC2"}, EXCESS: {"place": "IVEC2", "view": "VEC4"}, CHOICE: {}}
-# Of round lights, as in `AreaLight.polygon`.
-HORIZON_CORNERS = 32
+HORIZON_CORNERS = 32  # of round lights, as in `AreaLight.polygon`
 
 
 def horizon_shader(step: str):
-    """The shader of one of the steps, and its batch."""
+    """The shader of one step, and its batch."""
     values = {
         step.upper(): 1,
         **textures.constants(),

@@ -1,4 +1,4 @@
-"""Shadows of a view: the share of each light that its pixels see, by the rays and the occluders of pictures."""
+"""Shadows of a view: the share of each light that its pixels see, traced as for pictures, with the same occluders."""
 
 from __future__ import annotations
 
@@ -18,13 +18,16 @@ from .surfaces import View
 from .textures import GBufferTextures, ShareGrid, float_texture, read_texture
 
 Lights = Sequence[AreaLight]
-# Of the shares of all lights, in half precision, on the card.
+# MOST_BYTES: graphics memory for the shares of all lights. _SHARE_BYTES: of a light and a pixel, two half floats.
 MOST_BYTES = 1 << 30
 _SHARE_BYTES = 4
 
 
 class _Tracing:
-    """A tracer of occluders around an origin, which changes rarely: single precision is best near it; and its mate."""
+    """A tracer of occluders, and the process (mate) that helps it.
+
+    Positions are relative to an origin near the view, where single precision is best. The origin changes rarely.
+    """
 
     def __init__(self, occluders: Occluders):
         self._occluders = occluders
@@ -33,7 +36,7 @@ class _Tracing:
         self._origin = np.zeros(3)
 
     def around(self, origin: np.ndarray) -> Tracer:
-        """The tracer around `origin` (3,). Raises SceneError where Embree is not there."""
+        """The tracer with positions relative to `origin` (3,). Raises SceneError where Embree is missing."""
         if self._tracer is None or not np.array_equal(origin, self._origin):
             matrices = np.array(self._occluders.matrices, np.float64)
             matrices[:, :, 3] -= origin
@@ -49,29 +52,32 @@ class _Tracing:
 
 
 class ShadowRays:
-    """Traces the shares of lights that the pixels of G-buffers see past `occluders`, with at most `rays` for each."""
+    """Traces, at once, the shares of lights that the pixels of G-buffers see past `occluders`.
+
+    A pixel takes at most `rays` rays per light.
+    """
 
     version, waits, traces_lobes = 0, False, True
 
     @property
     def of_glass(self) -> ShadowRays:
-        """What traces those of the glass before the surfaces."""
+        """The tracer for the glass in front of the surfaces: the same."""
         return self
 
     def take_news(self) -> None:
-        """There are none: all is traced at once."""
+        """Do nothing: there is never news, because everything is traced at once."""
 
     def __init__(self, occluders: Occluders, rays: int):
         self._tracing, self._rays = _Tracing(occluders), rays
         self.seconds, self.traced, self.description = 0.0, 0, ""
-        # By pass: squares of the light that pixels reflect and of its standard deviation, added up over all calls.
+        # By pass, summed over all calls: squares of the reflected light of pixels, and of its standard deviation.
         self._power = {name: np.zeros(2) for name in PASSES}
 
     def shares(
         self, gbuffer: GBufferTextures, view: View, lights: Lights, sides: Lights = (), number: int = 0
     ) -> ShareGrid | None:
-        """Those of `lights`, around the origin of `view`, then that of the `sides` of a sky, if there are any; None
-        where there is nothing to see. Raises SceneError."""
+        """The shares of `lights`, and last that of the `sides` of a sky if there are any; None without surfaces or
+        lights. Positions are relative to the origin of `view`. Raises SceneError."""
         start = time.perf_counter()
         samples, pixel = gbuffer_samples(gbuffer, view)
         if not len(samples) or not (lights or sides):
@@ -91,7 +97,7 @@ class ShadowRays:
         return ShareGrid(_upload(values, gbuffer.size), gbuffer.position, view.projection)
 
     def noise(self, samples: int) -> dict[str, float]:
-        """Estimated relative L2 error by pass of the mean of `samples` pictures."""
+        """Estimated relative L2 error by pass of the shadows in the mean of `samples` pictures."""
         return {
             name: float(np.sqrt(variance / max(power, 1e-30) / samples))
             for name, (power, variance) in self._power.items()
@@ -99,34 +105,36 @@ class ShadowRays:
 
 
 def _upload(values: np.ndarray, size: tuple[int, int]) -> gpu.types.GPUTexture:
-    """The texture of shares (L, H W, 2)."""
+    """Array texture of shares (L, H W, 2) on pictures of `size`."""
     buffer = gpu.types.Buffer("FLOAT", values.size, np.ascontiguousarray(values, np.float32).reshape(-1))
     return gpu.types.GPUTexture(size, layers=len(values), format="RG16F", data=buffer)
 
 
 def _blank() -> ShareGrid:
-    """A grid without a point: every light is seen."""
+    """A grid without surface points, with which every light is seen whole."""
     return ShareGrid(_upload(np.ones((1, 2), np.float32)[None], (1, 1)), float_texture(np.zeros((1, 1, 4))), np.eye(4))
 
 
-# What is traced one after another while nothing changes: pixels between points in either direction (None: so many that
-# there are `COARSE_POINTS`), and rays of a light and a point.
+# LEVELS: traced one after another while nothing changes. Each is the distance of the points in pixels, and the rays of
+# a light and a point. None: the distance that gives COARSE_POINTS points.
 LEVELS = ((None, 8), (1, 32))
 COARSE_POINTS = 8000
-# Edges become smooth at once by the first points of pixels. The others wait for rays of their own, so many points
-# together: new rays from new places.
+# FIRST_POINTS: sub-pixel points that a view at rest draws with the shares of its first picture, so that edges become
+# smooth soon. The later points come in groups of GROUP, each group with new shares of GROUP_RAYS rays.
 FIRST_POINTS, GROUP, GROUP_RAYS = 8, 4, 64
-# Occluders that take longer to collect are collected when no object moves any more.
+# QUICK_SECONDS: occluders that take longer to collect are only collected once no object moves any more.
 QUICK_SECONDS = 0.03
-# Emitters whose shares are kept where those of the next ones are stopped.
+# BATCH: emitters that are traced together. The shares of finished batches are kept when the rest is stopped.
 BATCH = 4
-# Where a light does not move for so long after its coarse shadows, finer ones follow.
+# PAUSE_SECONDS: finer shadows follow the coarse ones of a light if it stays still for so long.
 PAUSE_SECONDS = 0.15
 
 
 class _Points:
-    """Every `step`-th pixel of a G-buffer in either direction. The thread of the window reads them, the thread that
-    traces makes samples of them."""
+    """Every `step`-th pixel of a G-buffer in either direction.
+
+    The window's thread reads the pixels; the tracing thread turns them into samples.
+    """
 
     def __init__(self, step: int, gbuffer: GBufferTextures, view: View):
         self._step, self._view, (width, height) = step, view, gbuffer.size
@@ -137,16 +145,16 @@ class _Points:
         for axis, (whole, part) in enumerate(((width, columns), (height, rows))):
             stretch[axis, axis] = whole / (part * step)
             stretch[axis, 3] = 2.0 / part * ((0.5 * whole - 0.5 - first) / step + 0.5) - 1.0
-        # The grid that these pixels are: positions (H, W, 4) and projection.
+        # The grid of these pixels: positions (H, W, 4), and the projection to its clip space.
         self.grid = positions, stretch @ view.projection
 
     def follow(self, gbuffer: GBufferTextures) -> None:
-        """Read again what depends on the lights."""
+        """Read again what depends on the lights: the normals of the horizons."""
         if gbuffer.geometric_normal is not None:
             self._normal = _every(gbuffer.geometric_normal, self._step)
 
     def samples(self) -> tuple[SurfaceSamples, Film]:
-        """The samples, and their film."""
+        """The samples and their film."""
         if self._samples is None:
             self._samples, self._texels = _samples_of(self._texels, self._view), None
         samples, pixel = self._samples
@@ -159,29 +167,31 @@ class _Points:
 
 @dataclass(frozen=True)
 class _Request:
-    """What the thread is to trace: `lights`, which are those of some numbers, by `keys`, at points of a picture. What
-    counts as one light are the sides of a sky."""
+    """Work for the thread: the shares of some lights at points of a picture. The sides of a sky are one light."""
 
-    state: tuple
-    level: int  # of LEVELS, or the next one: for a group of points
+    state: tuple  # of scene and view, see `LiveShadows._wanted`
+    level: int  # number in LEVELS; len(LEVELS): for a group of further points
     group: int
-    numbers: tuple
-    keys: tuple
+    numbers: tuple  # of the lights in the view
+    keys: tuple  # of the lights, see `_shape_of`
     lights: tuple[Lights, ...]
     points: _Points
     rays: int
     tracing: _Tracing
     origin: np.ndarray
-    layer: int  # 1: of glass
+    layer: int  # 1: glass, 0: the surfaces behind
 
     @property
     def is_own(self) -> bool:
-        """Is it for a group of points?"""
+        """True for a group of further points."""
         return self.level == len(LEVELS)
 
     def shares(self, progress: Callable) -> dict[int, np.ndarray]:
-        """(H, W, 2), row 0 at the bottom, by the place of a light in `keys`. Where they are stopped those of the first
-        lights; Cancelled is raised where there are none, or not all for a group of points."""
+        """Shares (H, W, 2), row 0 at the bottom, by the index of a light in `keys`.
+
+        If `progress` stops the work, the result has only the lights that are finished; without any, Cancelled is
+        raised.
+        """
         samples, film = self.points.samples()
         tracer, found = self.tracing.around(self.origin), {}
         self.tracing.mate.key = (self.state, self.layer) if self.level == 1 else None
@@ -216,7 +226,7 @@ class _Request:
 
 
 class _Followed:
-    """The scene whose shadows are seen, and what traces them."""
+    """The scene whose shadows are shown, and its tracer."""
 
     def __init__(self):
         self.scene, self.collect, self.collected, self.before = None, None, None, None
@@ -224,14 +234,14 @@ class _Followed:
         self.collect_seconds = 0.0
 
     def may_collect(self) -> bool:
-        """Are occluders known, or quick to collect, or did nothing move since the last call?"""
+        """True if the occluders are known or quick to collect, or if nothing has moved since the last call."""
         if self.collected == self.scene or self.collect_seconds <= QUICK_SECONDS or self.scene == self.before:
             return True
         self.before = self.scene
         return False
 
     def collect_now(self) -> None:
-        """Collect the occluders unless they are known."""
+        """Collect the occluders, unless they are known."""
         if self.collected == self.scene:
             return
         start = time.perf_counter()
@@ -240,7 +250,7 @@ class _Followed:
         self.collect_seconds = time.perf_counter() - start
 
     def close(self) -> None:
-        """End the process that helps to trace."""
+        """End the process that helps the tracer."""
         if self.tracing is not None:
             self.tracing.close()
 
@@ -248,43 +258,41 @@ class _Followed:
 class LiveShadows:
     """Shadows while an artist works: a thread traces them, coarse at first, finer while nothing changes.
 
-    Until new ones are there, the old ones are seen where the same surfaces are. Recoloring a light traces nothing but
-    what refines the view at rest. Those of the glass before the surfaces are of another one, `of_glass`, for whom all
-    is told and asked here but the shares. One of both traces at a time.
+    Until new shares are there, the old ones are shown on the same surfaces. A recolored light keeps its shares; only
+    those of further points of a view at rest are traced again. The glass in front of the surfaces has an object of its
+    own, `of_glass`: only `shares` is called there, all else is asked and told here. Only one of the two traces at a
+    time.
     """
 
-    traces_lobes = False  # all lobes have the shadows of the first
+    traces_lobes = False  # all lobes use the shadows of the first lobe
 
     def __init__(self, behind: LiveShadows | None = None):
         self._behind, self._glass = behind, None
         self._followed = _Followed() if behind is None else behind._followed
         self._version, self._problem = 0, ""
-        self._waits = False  # for the thread: the picture for which shares were asked last cannot be drawn yet
-        self._own: tuple[int, ShareGrid | None] = (0, None)  # of a group of further points
+        self._waits = False  # the picture whose shares were asked for last must wait for the thread
+        self._own: tuple[int, ShareGrid | None] = (0, None)  # number and shares of a group of further points
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
-        self._request: _Request | None = None  # that the thread does, or has done last
+        self._request: _Request | None = None  # the current one of the thread, or its last
         self._outcomes: deque[tuple[_Request, dict[int, np.ndarray] | Exception]] = deque()
         self._is_left = False
-        # The lights, those of a sky as one, and what was given.
+        # The lights, with those of a sky as one, their keys, and the arguments that they come from.
         self._lights, self._keys, self._given = (), (), None
-        self._wanted: tuple = ()
-        # By whether they are coarse the points of a state.
-        self._pixels: dict[bool, tuple[tuple, _Points]] = {}
-        # Of the state that was traced last: shares (H, W, 2) by the key of a light and level, and by whether they are
-        # coarse the positions and the projection of their points.
-        self._state: tuple = ()
-        self._known: dict[tuple, dict[int, np.ndarray]] = {}
-        self._points: dict[bool, tuple[np.ndarray, np.ndarray]] = {}
-        self._latest: dict[int, dict[int, np.ndarray]] = {}  # by the number of a light
-        self._layers = np.ones((0, 0, 0, 2), np.float32)  # of the grid
+        self._wanted: tuple = ()  # state of scene and view that is to be shown
+        self._pixels: dict[bool, tuple[tuple, _Points]] = {}  # state and points, by whether they are coarse
+        self._state: tuple = ()  # state that was traced last; the next two belong to it
+        self._known: dict[tuple, dict[int, np.ndarray]] = {}  # shares (H, W, 2), by the key of a light and level
+        self._points: dict[bool, tuple[np.ndarray, np.ndarray]] = {}  # grids of points, by whether they are coarse
+        self._latest: dict[int, dict[int, np.ndarray]] = {}  # latest shares by the number of a light and level
+        self._layers = np.ones((0, 0, 0, 2), np.float32)  # shares in `_grid`
         self._grid: ShareGrid | None = None
         self._blank: ShareGrid | None = None
         self._origin = np.zeros(3)
 
     @property
     def of_glass(self) -> LiveShadows:
-        """Those of the glass before the surfaces."""
+        """The shadows of the glass in front of the surfaces."""
         if self._glass is None:
             self._glass = LiveShadows(self)
         return self._glass
@@ -295,21 +303,21 @@ class LiveShadows:
 
     @property
     def version(self) -> int:
-        """Another one where pictures are to be drawn anew."""
+        """A number that changes when pictures must be drawn anew."""
         return sum(one._version for one in self._both)
 
     @property
     def problem(self) -> str:
-        """Why there are no shadows, or nothing."""
+        """Why there are no shadows; empty where there are."""
         return next((one._problem for one in self._both if one._problem), "")
 
     @property
     def waits(self) -> bool:
-        """Can the picture for which shares were asked last not be drawn yet?"""
+        """True if the picture whose shares were asked for last cannot be drawn yet."""
         return any(one._waits for one in self._both)
 
     def follow(self, scene: tuple, collect: Callable[[], Occluders]) -> None:
-        """To be told before a picture is drawn: `collect()` gives the occluders of `scene`, which compares."""
+        """To be called before a picture is drawn. `scene` changes with its occluders; `collect()` returns them."""
         if scene != self._followed.scene:
             for one in self._both:
                 one._problem = ""
@@ -317,16 +325,16 @@ class LiveShadows:
 
     @property
     def is_busy(self) -> bool:
-        """Does a thread work, or has it found something that no picture shows yet?"""
+        """True if a thread works, or has results that no picture shows yet."""
         return any(one._thread is not None for one in self._both)
 
     @property
     def has_news(self) -> bool:
-        """Has a thread found something, or ended?"""
+        """True if a thread has results or has ended."""
         return any(one._thread is not None and (one._outcomes or not one._thread.is_alive()) for one in self._both)
 
     def stop(self) -> None:
-        """Let the thread end soon, and what helps it; let go of the textures at once, and of the glass."""
+        """Make the thread and its helping process end soon, and free the textures and the glass at once."""
         for one in self._both:
             one._is_left = True
             one._stop.set()
@@ -336,19 +344,19 @@ class LiveShadows:
         self._glass = None
 
     def rest(self) -> None:
-        """End what helps the thread, unless that works: it is started again where it is worth it."""
+        """End the helping process unless the thread works. It is started again when it pays."""
         if all(one._thread is None or not one._thread.is_alive() for one in self._both):
             self._followed.close()
 
     def take_news(self) -> None:
-        """Take over what has been found; pictures are to be drawn anew where `version` is another one then."""
+        """Take over the results of the thread. If `version` changes, pictures must be drawn anew."""
         for one in self._both:
             before, has_ended = one._version, one._thread is not None and not one._thread.is_alive()
             if has_ended:
                 one._thread = None
             while one._outcomes:
                 one._take(*one._outcomes.popleft())
-            # What could not begin beside the thread begins with the first picture.
+            # Work that had to wait for the thread begins with a new first picture.
             if has_ended and one._version == before and any(other._next_level() is not None for other in self._both):
                 one._version += 1
 
@@ -377,8 +385,10 @@ class LiveShadows:
     def shares(
         self, gbuffer: GBufferTextures, view: View, lights: Lights, sides: Lights = (), number: int = 0
     ) -> ShareGrid | None:
-        """The shares as far as they are known, as of `ShadowRays.shares`; `number` counts the pictures of a view at
-        rest. Before they are there, a grid without a point: with another shader they would come when it is compiled."""
+        """The shares known so far, as `ShadowRays.shares` returns them; `number` counts the pictures of a view at rest.
+
+        Before any are known, a grid without points: with it the shader with shadows is compiled from the start.
+        """
         if self._given is None or lights is not self._given[0] or sides is not self._given[1]:
             self._given = lights, sides
             self._lights = (*((light,) for light in lights), *((sides,) if sides else ()))
@@ -414,7 +424,7 @@ class LiveShadows:
 
     @property
     def _is_outdated(self) -> bool:
-        """Does the thread refine shadows of another view, or of a light that has moved?"""
+        """True if the thread refines shadows of an old view, or of a light that has moved."""
         request = self._request
         return request.level > 0 and (request.state != self._wanted or not set(request.keys) <= set(self._keys))
 
@@ -423,7 +433,7 @@ class LiveShadows:
         return not self._keys or bool(self._problem) or bool(too_many(len(self._keys), self._wanted[-1]))
 
     def _next_level(self) -> int | None:
-        """The coarsest level that a light does not have for what is wanted; None: all is there."""
+        """The coarsest level that some light lacks in the wanted state; None: all are there."""
         if self._is_off:
             return None
         if self._state != self._wanted:
@@ -433,13 +443,15 @@ class LiveShadows:
 
     @property
     def _is_free(self) -> bool:
-        """Does no thread work, here or for the other layer?"""
+        """True if no thread works, here or for the other layer."""
         other = self._behind or self._glass
         return self._thread is None and (other is None or other._thread is None)
 
     def _may_begin(self, level: int, number: int) -> bool:
-        """The points of finer levels must be those of the first picture, and while objects move the window must not
-        wait for occluders."""
+        """True if `level` may be traced now: no thread works, and occluders do not hold up a scene that moves.
+
+        Finer levels need the points of the first picture, `number` 0.
+        """
         if not self._is_free:
             if self._thread is None and self._glass is not None and self._glass._request.level > 0:
                 self._glass._stop.set()
@@ -454,7 +466,7 @@ class LiveShadows:
         self._start(requests)
 
     def _request_of(self, level: int, gbuffer: GBufferTextures, view: View) -> _Request:
-        """For the lights that do not have a level yet."""
+        """The request of `level` for the lights that lack it."""
         step, rays = LEVELS[level]
         state, points = self._pixels.get(level == 0, (None, None))
         if state == self._wanted:
@@ -472,7 +484,7 @@ class LiveShadows:
         self._start([replace(request, group=group)])
 
     def _request_for(self, numbers: tuple, points: _Points, rays: int, view: View, level: int) -> _Request:
-        """For the lights of some numbers."""
+        """The request for the lights with these `numbers`."""
         return _Request(
             state=self._wanted,
             level=level,
@@ -488,7 +500,7 @@ class LiveShadows:
         )
 
     def _start(self, requests: list[_Request]) -> None:
-        """Let the thread trace, one request after another."""
+        """Start the thread, which traces one request after another."""
         self._stop.clear()
         self._request, self._is_left = requests[0], False
         self._thread = threading.Thread(target=self._trace, args=(requests,), name="LTSH shadows", daemon=True)
@@ -502,7 +514,7 @@ class LiveShadows:
             try:
                 outcome = request.shares(lambda stage, fraction: not self._stop.is_set())
             except Exception as error:
-                # With its traceback it is part of a circle, which keeps the samples of the picture.
+                # Its traceback would make a reference cycle, which keeps the samples of the picture alive.
                 outcome = error.with_traceback(None)
             self._outcomes.append((request, outcome))
             if isinstance(outcome, Exception):
@@ -511,7 +523,7 @@ class LiveShadows:
             requests[0].tracing.close()
 
     def _show(self) -> None:
-        """Make the grid of what is known; a light of which nothing is known keeps what is known of its place."""
+        """Make the grid of all known shares. A light without any keeps the latest shares of the light of its number."""
         known = [self._known.get(key) or self._latest.get(number, {}) for number, key in enumerate(self._keys)]
         if not any(known):
             return
@@ -531,17 +543,17 @@ class LiveShadows:
 
 
 def coarse_step(size: tuple[int, int]) -> int:
-    """Pixels between the points of the coarsest level, of a picture of `size`."""
+    """Distance in pixels of the points of the coarsest level, in a picture of `size`."""
     return max(2, round((size[0] * size[1] / COARSE_POINTS) ** 0.5))
 
 
 def _shape_of(light: AreaLight) -> str:
-    """What tells where and how `light` shines, but not how brightly."""
+    """A key of all that the shares of `light` depend on: everything but its brightness."""
     return repr({name: value for name, value in light.record().items() if name not in ("radiance", "detail")})
 
 
 def _shape_of_sky(sides: Lights) -> str:
-    """What tells how a sky shines, but not how brightly."""
+    """A key of all that the share of a sky depends on: the relative, not the absolute brightness of its patches."""
     values = np.array([patch.radiance.mean() for side in sides for patch in side.patches])
     seen = sides[0].affects_diffuse, sides[0].affects_specular, sides[0].name
     return repr((seen, np.round(values / max(np.abs(values).mean(), 1e-30), 4).tobytes()))
@@ -553,7 +565,7 @@ def _every(texture: gpu.types.GPUTexture, step: int) -> np.ndarray:
 
 
 def too_many(lights: int, size: tuple[int, int]) -> str:
-    """What to say where the shares of so many lights do not fit; empty where they do."""
+    """Note that the shares of so many lights do not fit into memory; empty where they do."""
     needed = lights * size[0] * size[1] * _SHARE_BYTES
     if needed <= MOST_BYTES:
         return ""
@@ -561,7 +573,7 @@ def too_many(lights: int, size: tuple[int, int]) -> str:
 
 
 def _texels(gbuffer: GBufferTextures, step: int = 1) -> dict[str, np.ndarray]:
-    """What every `step`-th texel of a G-buffer holds, by name, (H, W, 4)."""
+    """Every `step`-th texel of a G-buffer, (H, W, 4) by name of the texture."""
     textures = {name: getattr(gbuffer, name) for name in (*_ALWAYS, *_PERHAPS)}
     return {name: _every(texture, step) for name, texture in textures.items() if texture is not None}
 
@@ -571,8 +583,8 @@ _PERHAPS = ("diffuse_normal", "smooth_normal", "geometric_normal", "tangent", "r
 
 
 def gbuffer_samples(gbuffer: GBufferTextures, view: View) -> tuple[SurfaceSamples, np.ndarray]:
-    """The samples (P) that a G-buffer holds, around the origin of `view`, and the numbers of their texels from the
-    lower left."""
+    """The samples (P) of a G-buffer, relative to the origin of `view`, and their texels (P,), counted from the lower
+    left."""
     return _samples_of(_texels(gbuffer), view)
 
 
@@ -609,7 +621,7 @@ def _samples_of(texels: dict[str, np.ndarray], view: View) -> tuple[SurfaceSampl
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
-    """Unit vectors of the first three columns; a zero vector stays one."""
+    """Unit vectors of the first three columns; zero vectors stay zero."""
     vectors = vectors[:, :3]
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     return vectors / np.where(length > 0.0, length, 1.0)

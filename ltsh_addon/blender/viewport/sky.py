@@ -1,7 +1,7 @@
-"""The world in a view: its light, and what is seen of it behind the surfaces.
+"""The world in a view: its light, and the background behind the surfaces.
 
-Pictures of all directions are squares onto which an octahedron around the eye is unfolded: x and y of the upper half
-lie inside the inner square turned by 45 degrees.
+Pictures of all directions are octahedral maps: an octahedron around the eye, unfolded onto a square. Its upper half is
+the inner square, which is turned by 45 degrees.
 """
 
 from __future__ import annotations
@@ -21,16 +21,15 @@ from ...scene import AreaLight, error_line
 from ..lights.world import light_of_world
 from ..process import client
 
-# Sides of the largest picture of the light, of the smallest, of that of the irradiance, and of what it is made of.
+# Texels of a side of maps. SIZE, LEAST_SIZE: the largest and the smallest map of the light. IRRADIANCE_SIZE: the map of
+# the irradiance. IRRADIANCE_SOURCE: the map of the light from which the irradiance is computed.
 SIZE, LEAST_SIZE, IRRADIANCE_SIZE, IRRADIANCE_SOURCE = 256, 4, 32, 64
 LEVELS = (SIZE // LEAST_SIZE).bit_length()
-# Directions in which a lobe meets the picture.
-POINTS = 16
-# For so long a world must not change before Cycles looks at it.
+POINTS = 16  # directions in which a lobe samples the map
+# REST_SECONDS: how long worlds and lights must stay unchanged before Cycles looks at them.
 REST_SECONDS = 0.3
-# Of all sides together, for shadows.
-MOST_PATCHES = 1536
-# Sides of the pictures of a cube that is enough for the light, and of the largest picture of a background.
+MOST_PATCHES = 1536  # of all sides together, for shadows
+# CUBE_SIZE: pixels of a side of the cube's pictures, enough for the light. BACKGROUND_SIZE: of the largest background.
 CUBE_SIZE, BACKGROUND_SIZE = 128, 2048
 
 
@@ -38,14 +37,15 @@ CUBE_SIZE, BACKGROUND_SIZE = 128, 2048
 class ShownSky:
     """A world as a view shows it."""
 
-    sides: tuple[AreaLight, ...] = ()  # of a cube around all points, for shadows; none of a dark world
-    lights: tuple[AreaLight, ...] = ()  # what is small and bright in it
-    light: np.ndarray = field(default_factory=lambda: np.zeros((1, 1, 3)))  # without that, (N, N, 3); N = 1: constant
-    background: np.ndarray = field(default_factory=lambda: np.zeros((1, 1, 3)))  # as cameras see it
+    sides: tuple[AreaLight, ...] = ()  # of a cube around all points, for shadows; empty for a dark world
+    lights: tuple[AreaLight, ...] = ()  # the small bright lights in it
+    # (N, N, 3) map of the light without these lights; N = 1: constant.
+    light: np.ndarray = field(default_factory=lambda: np.zeros((1, 1, 3)))
+    background: np.ndarray = field(default_factory=lambda: np.zeros((1, 1, 3)))  # (N, N, 3) map as cameras see it
 
 
 def constant_sky(like: AreaLight | None, radiance: np.ndarray, background: np.ndarray) -> ShownSky:
-    """A world that is the same everywhere; `like` has the name and the traits of its light, None: it is dark."""
+    """A world that is the same in all directions. `like` has the name and traits of its light; None: it is dark."""
     picture = np.array(radiance, np.float64).reshape(1, 1, 3)
     sides = [] if like is None else sky_lights(like, [SkyPicture(*axes, picture) for axes in CUBE])[0]
     shown = np.array(background, np.float64).reshape(1, 1, 3)
@@ -53,8 +53,8 @@ def constant_sky(like: AreaLight | None, radiance: np.ndarray, background: np.nd
 
 
 def varied_sky(like: AreaLight | None, light, lights, background: np.ndarray) -> ShownSky:
-    """A world of which there are a cube of coarse pictures of its `light` without the `lights` in it, and the
-    `background` (N, N, 3)."""
+    """A world from a cube of coarse pictures of its `light`, the small bright `lights` that these leave out, and the
+    map `background` (N, N, 3)."""
     sides = () if like is None else tuple(sky_lights(like, light, MOST_PATCHES)[0])
     if not sides:
         return ShownSky(lights=tuple(lights), background=background)
@@ -62,12 +62,12 @@ def varied_sky(like: AreaLight | None, light, lights, background: np.ndarray) ->
 
 
 def background_of(pictures: list[SkyPicture]) -> np.ndarray:
-    """The background (N, N, 3) of a cube of pictures of it."""
+    """The map (N, N, 3) of a background from the pictures of a cube."""
     return unfolded(pictures, min(2 * len(pictures[0].radiance), BACKGROUND_SIZE))
 
 
 def coarse(picture: SkyPicture) -> SkyPicture:
-    """With at most `CUBE_SIZE` pixels along each side."""
+    """The picture, reduced to at most `CUBE_SIZE` pixels along each side."""
     while len(picture.radiance) > CUBE_SIZE:
         weight = picture.solid_angles()[..., None]
         picture = replace(picture, radiance=_summed(picture.radiance * weight) / _summed(weight))
@@ -75,13 +75,13 @@ def coarse(picture: SkyPicture) -> SkyPicture:
 
 
 def _summed(values: np.ndarray) -> np.ndarray:
-    """Sums over 2 x 2."""
+    """Sums over blocks of 2 x 2."""
     rows = values[0::2] + values[1::2]
     return rows[:, 0::2] + rows[:, 1::2]
 
 
 def directions(size: int) -> np.ndarray:
-    """Unit directions (N, N, 3) of the texels of a picture with `size` texels along each side, row 0 at v = -1."""
+    """Unit directions (N, N, 3) of the texels of a map with N = `size` texels along each side, row 0 at v = -1."""
     place = (np.arange(size) + 0.5) * (2.0 / size) - 1.0
     u, v = np.meshgrid(place, place)
     height = 1.0 - np.abs(u) - np.abs(v)
@@ -93,12 +93,12 @@ def directions(size: int) -> np.ndarray:
 
 
 def solid_angles(size: int) -> np.ndarray:
-    """Of these texels, (N, N) in sr; about."""
+    """Approximate solid angles (N, N) in sr of the texels of `directions`."""
     return (2.0 / size) ** 2 * np.abs(directions(size)).sum(axis=-1) ** 3
 
 
 def unfolded(pictures: list[SkyPicture], size: int) -> np.ndarray:
-    """The six pictures of a cube as one (size, size, 3), interpolated."""
+    """The map (size, size, 3) interpolated from the six pictures of a cube."""
     toward = directions(size).reshape(-1, 3)
     found = np.zeros((len(toward), 3))
     side = np.argmax(np.stack([toward @ picture.ahead for picture in pictures]), axis=0)
@@ -124,28 +124,28 @@ def _interpolated(values: np.ndarray, row: np.ndarray, column: np.ndarray) -> np
 
 
 def halved(picture: np.ndarray) -> np.ndarray:
-    """Means over 2 x 2 texels, by their solid angles."""
+    """Means over blocks of 2 x 2 texels, weighted by their solid angles."""
     weight = solid_angles(len(picture))[..., None]
     return _summed(picture * weight) / _summed(weight)
 
 
 def mean_of(picture: np.ndarray) -> np.ndarray:
-    """(3,) over all directions."""
+    """The mean (3,) of a map over all directions."""
     return np.average(picture.reshape(-1, 3), axis=0, weights=solid_angles(len(picture)).ravel())
 
 
 def irradiance(picture: np.ndarray, size: int) -> np.ndarray:
-    """Irradiance over pi, (size, size, 3), of surfaces with the normals of the texels."""
+    """Irradiance divided by pi, (size, size, 3), of surfaces whose normals are the directions of the texels."""
     toward, weight = directions(len(picture)).reshape(-1, 3), solid_angles(len(picture)).ravel()
     mean = mean_of(picture)
     cosines = np.maximum(directions(size).reshape(-1, 3) @ toward.T, 0.0)
-    # What differs from the mean: of that no error of the sum is seen where the world is the same everywhere.
+    # Only differences from the mean are summed: a world that is the same everywhere then has no error.
     rest = (picture.reshape(-1, 3) - mean) * weight[:, None] / np.pi
     return np.maximum(mean + cosines @ rest, 0.0).reshape(size, size, 3)
 
 
 def with_border(picture: np.ndarray) -> np.ndarray:
-    """With one texel more on each side: what lies beyond the fold."""
+    """The map with one more texel on each side, from beyond the fold."""
     wide = np.concatenate([picture[:1, ::-1], picture, picture[-1:, ::-1]])
     return np.concatenate([wide[::-1, :1], wide, wide[::-1, -1:]], axis=1)
 
@@ -153,8 +153,9 @@ def with_border(picture: np.ndarray) -> np.ndarray:
 def sky_texels(sky: ShownSky) -> np.ndarray:
     """Texels (H, W, 4) of the light of `sky`.
 
-    The first row has the mean radiance, w = 1 where it is not everywhere the same, and whether glossy and diffuse lobes
-    see it. Below are pictures with borders: the largest, with the smaller ones beside it, and the irradiance over pi.
+    Texel 0 of the first row: mean radiance, w = 1 if the light is not constant. Texel 1: whether glossy lobes and
+    diffuse lobes see the light. The next rows are maps with borders, absent for constant light: the largest with the
+    smaller ones beside it, then the irradiance divided by pi.
     """
     traits = sky.sides[0]
     header = np.zeros((1, 2, 4))
@@ -179,20 +180,20 @@ def sky_texels(sky: ShownSky) -> np.ndarray:
 
 
 def background_texels(sky: ShownSky) -> np.ndarray:
-    """The background with its border, (N + 2, N + 2, 4)."""
+    """Texels (N + 2, N + 2, 4) of the background, with a border."""
     wide = with_border(sky.background)
     return np.concatenate([wide, np.ones((*wide.shape[:2], 1))], axis=-1)
 
 
 def written(path: Path, blocks: list) -> list[Path]:
-    """Write data-blocks into the .blend `path`; where each can be loaded from: linked ones from their libraries."""
+    """Write data-blocks into the .blend `path`; returns the .blend to load each from, for linked ones their library."""
     own = {block for block in blocks if block.library is None}
     bpy.data.libraries.write(str(path), own, path_remap="ABSOLUTE", fake_user=True)
     return [path if block in own else Path(bpy.path.abspath(block.library.filepath)) for block in blocks]
 
 
 class LiveWorld:
-    """Worlds as Cycles sees them, for a window: a second Blender renders them while the view goes on."""
+    """The world as Cycles sees it, for a window: a second Blender renders it while the view goes on."""
 
     def __init__(self):
         self._wanted, self._changed = "", 0.0
@@ -202,22 +203,22 @@ class LiveWorld:
         self._stopped = threading.Event()
 
     def stop(self) -> None:
-        """Nobody waits any more."""
+        """Cancel the work: nobody waits for it any more."""
         self._wanted = ""
         self._stopped.set()
 
     def look(self, world) -> ShownSky | None:
-        """To be told of a new or changed `world`: what it looked like the last time, None where nobody has looked."""
+        """Request a look at a new or changed `world`. Returns its last result; None where there is none."""
         self._wanted, self._changed = world.name_full, time.monotonic()
         return self._sky if self._of == self._wanted else None
 
     @property
     def is_busy(self) -> bool:
-        """Is there anything to be waited for?"""
+        """True while a result is to come."""
         return bool(self._wanted) or self._thread is not None
 
     def step(self, frame: int) -> tuple[ShownSky | None, list[str]] | None:
-        """Do what is next, in the main thread: what was found and what is to be said of it, if there is news."""
+        """Do the next step, in the main thread. Returns the sky that was found and notes about it; None: no news."""
         if self._thread is not None:
             return None if self._thread.is_alive() else self._take()
         if self._wanted and time.monotonic() - self._changed > REST_SECONDS:

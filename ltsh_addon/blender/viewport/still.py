@@ -30,16 +30,15 @@ from .sky import ShownSky, background_of, coarse, varied_sky
 from .surfaces import View
 from .textures import read_texture
 
-# Redraws of which the median is told.
-TIMED = 3
-# Of a light and one point of a pixel, however many it has.
+TIMED = 3  # redraws whose median time is reported
+# FEWEST_RAYS: a point of a pixel takes at least so many rays per light, however many points share those of the pixel.
 FEWEST_RAYS = 32
-# Where scripts may always use graphics, its compiled shaders serve the next picture.
+# The last renderer, kept for its compiled shaders. Only where scripts may always use graphics.
 _renderer: list[ViewRenderer] = []
 
 
 def draw_view(job: dict, folder: Path, progress) -> dict:
-    """Do the `job` (see `client.ViewJob`), write arrays and a PNG into `folder`; the manifest as a dictionary."""
+    """Do the `job` (see `client.ViewJob`) and write arrays and a PNG into `folder`; returns the manifest."""
     started, warnings = time.monotonic(), []
     progress("open scene", 0.0)
     open_scene(Path(job["scene"]), warnings, job["scripts"])
@@ -77,9 +76,9 @@ def draw_view(job: dict, folder: Path, progress) -> dict:
 
 
 def with_graphics(function: Callable):
-    """What `function()` returns, called where the graphics card may be used. Raises SceneError where there is none.
+    """Call `function()` where the graphics card may be used, and return its result. Raises SceneError without a card.
 
-    Before Blender 5.2 scripts without a window may use it only inside a render of an engine that asks for it.
+    Before Blender 5.2, scripts without a window may use the card only inside a render whose engine asks for it.
     """
     if not hasattr(gpu, "init"):
         return _inside_render(function)
@@ -88,7 +87,7 @@ def with_graphics(function: Callable):
     except (RuntimeError, SystemError) as error:
         raise SceneError(error_line(error)) from None
     if not _has_context():
-        # Lost in a render with grease pencil, found again after one that asks for it.
+        # A render with grease pencil loses the context; a render whose engine asks for it brings it back.
         _inside_render(lambda: None)
     return function()
 
@@ -108,7 +107,7 @@ def _inside_render(function: Callable):
         bl_idname, bl_label, bl_use_gpu_context = "LTSH_GRAPHICS", "LTSH graphics", True
 
         def render(self, depsgraph):
-            # What is raised in here would only be printed.
+            # Blender only prints exceptions that are raised in here.
             try:
                 outcome["value"] = function()
             except Exception as error:
@@ -132,7 +131,7 @@ def _inside_render(function: Callable):
 
 
 def _not_shown(scene, camera) -> list[str]:
-    """What the file asks of a picture and a view does not have."""
+    """Notes about settings of the file that views do not show."""
     asked = {
         "motion blur": scene.render.use_motion_blur,
         "stereoscopy": scene.render.use_multiview,
@@ -147,7 +146,7 @@ def _not_shown(scene, camera) -> list[str]:
 
 
 def _sky(scene, warnings: list[str]) -> ShownSky | None:
-    """What Cycles sees of the world of `scene`; None where that is one constant."""
+    """The world of `scene` as Cycles sees it; None where it is one constant."""
     world = _layer(scene).world_override or scene.world
     if world_radiance(world)[1]:
         return None
@@ -155,8 +154,8 @@ def _sky(scene, warnings: list[str]) -> ShownSky | None:
 
 
 def look_at_world(scene, world, warn: Callable) -> tuple[list[SkyPicture], list[AreaLight], np.ndarray]:
-    """The light of `world`, [] where it gives none, what is small and bright in it, and the background (N, N, 3), as
-    Cycles renders them; afterwards `scene` is as it was."""
+    """The `world` as Cycles renders it: pictures of its light ([] where it is dark), the small bright lights in it, and
+    its background (N, N, 3). `scene` is left as it was."""
     like, light, lights = light_of_world(world), [], []
     if like is not None:
         light, lights = light_pictures(scene, world, like, warn)
@@ -164,7 +163,7 @@ def look_at_world(scene, world, warn: Callable) -> tuple[list[SkyPicture], list[
 
 
 def show_world(job: dict, folder: Path) -> dict:
-    """Do the `job` (see `client.look_at_world`): pictures as files in `folder`, the rest as a dictionary."""
+    """Do the `job` (see `client.look_at_world`): writes pictures into `folder`, returns lights and warnings."""
     warnings: list[str] = []
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
@@ -179,7 +178,7 @@ def show_world(job: dict, folder: Path) -> dict:
 
 
 def show_lamps(job: dict, folder: Path, progress: Callable) -> dict:
-    """Do the `job` (see `client.look_at_lamps`): what nodes make of each light as a file in `folder`."""
+    """Do the `job` (see `client.look_at_lamps`): writes the factors of each light's nodes into `folder`."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene, count = bpy.context.scene, len(job["lamps"])
     scene.frame_set(job["frame"])
@@ -203,7 +202,7 @@ def _layer(scene):
 
 
 def _draw(job: dict, seen: tuple, size: tuple[int, int], progress) -> dict:
-    """Pictures (H, W, 4), row 0 on top, of every technique by pass, seconds of redraws, shadows, lights and notes."""
+    """Pictures (H, W, 4), row 0 on top, of all techniques and passes, and the facts of the manifest about them."""
     progress("draw", 0.0)
     scene, camera, sky, patterns = seen
     with bpy.context.temp_override(scene=scene, view_layer=_layer(scene)):
@@ -246,13 +245,13 @@ def _draw(job: dict, seen: tuple, size: tuple[int, int], progress) -> dict:
 
 
 def _facts(shadows: ShadowRays, samples: int) -> dict:
-    """As `pipeline.lighting.Shadows.report` has them, and the seconds."""
+    """The facts of `pipeline.lighting.Shadows.report`, and the seconds."""
     noise = shadows.noise(samples)
     return {"rays": shadows.traced, "noise": noise, "tracer": shadows.description, "seconds": shadows.seconds}
 
 
 def view_of_camera(camera, depsgraph, size: tuple[int, int]) -> View:
-    """What the evaluated object `camera` renders in a picture of `size`."""
+    """The view of the evaluated object `camera` in a picture of `size`."""
     render = depsgraph.scene_eval.render
     aspect = {"scale_x": render.pixel_aspect_x, "scale_y": render.pixel_aspect_y}
     window = camera.calc_matrix_camera(depsgraph, x=size[0], y=size[1], **aspect)
@@ -273,7 +272,7 @@ def _shown(scene, technique: str) -> ShownPicture:
 
 
 class _Canvas:
-    """A picture of floats that a view is drawn into; needs an active GPU context."""
+    """A floating-point picture that a view is drawn into; needs an active GPU context."""
 
     def __init__(self, mirror: SceneMirror, view: View, size: tuple[int, int]):
         self._mirror, self._view, self._size = mirror, view, size
@@ -282,7 +281,7 @@ class _Canvas:
         self._buffer = gpu.types.GPUFrameBuffer(color_slots=[self._texture])
 
     def seconds_of_redraws(self, shown: ShownPicture) -> list[float]:
-        """The seconds of `TIMED` redraws of a view that moves, after one that compiles shaders."""
+        """The seconds of `TIMED` redraws of a moving view, after a first one that compiles the shaders."""
         seconds = []
         for number in range(TIMED + 1):
             start = time.perf_counter()
@@ -291,8 +290,10 @@ class _Canvas:
         return seconds[1:]
 
     def draw(self, shown: ShownPicture, points: np.ndarray, shadows: ShadowRays | None, progress: Callable) -> list:
-        """The mean of `points` as of a view at rest: pictures (H, W, 4), row 0 on top, in the order of `shown`, times
-        the exposure."""
+        """Pictures (H, W, 4) of a view at rest, the means over `points`: the one `shown`, then its `also`.
+
+        Row 0 is on top; the exposure is included.
+        """
         self._renderer.shadows = shadows
         try:
             for number in range(len(points)):
@@ -312,12 +313,12 @@ class _Canvas:
         return [picture[::-1] for picture in pictures]
 
     def _redraw(self, shown, view, points) -> None:
-        """Draw once more, to the end of what the card does for it."""
+        """Draw once more, and wait until the card has finished."""
         self._renderer.draw(self._mirror, view, self._size, shown, self._buffer, points)
         self._buffer.read_color(0, 0, 1, 1, 4, 0, "FLOAT")
 
     def free(self) -> None:
-        """Let go of everything, but keep what the next canvas can use."""
+        """Free everything except a renderer that the next canvas can use."""
         if hasattr(gpu, "init"):
             _renderer[:] = [self._renderer]
         else:

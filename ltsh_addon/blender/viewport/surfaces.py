@@ -25,57 +25,57 @@ from .textures import (
     uniform_buffer,
 )
 
-# No more than six textures can be drawn into at once.
+# Outputs of the surface shader, in groups that are drawn into at once. A group has at most six textures.
 SURFACES = ("position", "normal", "base", "f0", "f90", "dielectric")
 NORMALS = ("diffuse_normal", "smooth_normal", "geometric_normal")
 TANGENTS, REBOUNDS, EMISSION, THROUGH = ("tangent",), ("rebound",), ("emission",), ("through",)
 _ADDED = (EMISSION, THROUGH)
-# What a corner of a mesh has, and its type.
+# Types of the attributes of a mesh's corners.
 _CORNER = {"position": "VEC3", "normal": "VEC3", "uv": "VEC2", "tangent": "VEC4"}
-# The same for anisotropic lobes: generated coordinates around the middle.
+# The further attribute for anisotropic lobes: generated coordinates relative to the middle.
 _AROUND = {"around": "VEC3"}
-# Before, Cycles left interpolated normals as long as they are.
+# Before Blender 5.0, Cycles did not normalize interpolated normals for normal maps.
 NORMAL_MAPS_BEND_UNIT_NORMALS = bpy.app.version >= (5, 0, 0)
-# That of images which are not found, as in Cycles.
-MISSING_COLOR = (1.0, 0.0, 1.0, 1.0)
+MISSING_COLOR = (1.0, 0.0, 1.0, 1.0)  # of images that are not found, as in Cycles
 
 
 @dataclass(frozen=True)
 class View:
-    """From where a picture is seen: the eye's place or, in parallel views, the way to it. All places that are drawn are
-    relative to `origin`."""
+    """The camera of a picture. All positions that are drawn are relative to `origin`."""
 
     projection: np.ndarray  # (4, 4) to clip space
-    eye: np.ndarray  # (3,)
+    eye: np.ndarray  # (3,) position of the eye, or in parallel views the unit direction toward it
     is_parallel: bool
     origin: np.ndarray = field(default_factory=lambda: np.zeros(3))  # (3,) in the world
 
     @classmethod
     def of(cls, view_matrix: Matrix, window_matrix: Matrix, is_parallel: bool) -> View:
-        """That of a region's matrices."""
+        """The view of a region with these matrices."""
         to_view = np.array(view_matrix, np.float64)
         to_world = np.linalg.inv(to_view)
         eye = to_world[:3, 2] / np.linalg.norm(to_world[:3, 2]) if is_parallel else to_world[:3, 3]
         return cls(np.array(window_matrix, np.float64) @ to_view, eye, is_parallel)
 
     def around(self, origin: np.ndarray) -> View:
-        """The same view of the world, with places relative to `origin` (3,)."""
+        """The same view of the world, with positions relative to `origin` (3,)."""
         to_world = np.eye(4)
         to_world[:3, 3] = origin - self.origin
         eye = self.eye if self.is_parallel else self.eye - to_world[:3, 3]
         return View(self.projection @ to_world, eye, self.is_parallel, origin)
 
     def shifted(self, offset: np.ndarray, size: tuple[int, int]) -> View:
-        """The same view whose pixels, of `size` in all, show the points `offset` (2,) pixels right and up of their
-        centers."""
+        """The same view, in which pixels show the point `offset` (2,) pixels right and up of their centers.
+
+        `size` is that of the picture in pixels.
+        """
         shift = np.eye(4)
         shift[:2, 3] = -2.0 * np.asarray(offset) / size
         return View(shift @ self.projection, self.eye, self.is_parallel, self.origin)
 
     @property
     def rays(self) -> np.ndarray:
-        """(3, 3): what a ray of the eye, of any length, changes by from the center of the picture to its right end and
-        to its upper one, and that of the center."""
+        """(3, 3): the change of the eye's ray from the center of the picture to its right end, the change to its upper
+        end, and the ray of the center. Rays may have any length."""
         if self.is_parallel:
             return np.stack([np.zeros(3), np.zeros(3), -self.eye])
         back = np.linalg.inv(self.projection)
@@ -84,14 +84,15 @@ class View:
 
     @property
     def homogeneous_eye(self) -> tuple[float, ...]:
-        """The eye's place and 1, or the way to it and 0."""
+        """The eye's position and 1, or the direction toward it and 0."""
         return (*self.eye, 0.0 if self.is_parallel else 1.0)
 
 
 class SurfacePass:
     """Shaders and textures of one view's G-buffer; needs an active GPU context.
 
-    Glass before the surfaces of another pass has one of its own, which is made with that and draws into its depth.
+    Glass in front of the surfaces has a pass of its own. It is made with the pass of the surfaces, `before`, and shares
+    its depth buffer.
     """
 
     def __init__(self, before: SurfacePass | None = None):
@@ -112,9 +113,9 @@ class SurfacePass:
         self._targets: dict = {}
 
     def draw(self, instances: list[ShownInstance], view: View, size: tuple[int, int]) -> GBufferTextures:
-        """The G-buffer of `instances`, `size` pixels wide and high; valid until the next call.
+        """The G-buffer of `instances`, `size` (width, height) in pixels; valid until the next call.
 
-        Normals of their own are there where a surface is smooth or bent.
+        It has further normals if any surface is smooth or bent.
         """
         if size != self._size:
             self._size, self._targets = size, {}
@@ -124,21 +125,21 @@ class SurfacePass:
         return self._gbuffer(0, instances, view)
 
     def draw_lobe(self, number: int, instances: list[ShownInstance], view: View) -> GBufferTextures:
-        """The G-buffer of the lobes `number`, from 1 on, of what `draw` drew last; valid until the next call.
+        """The G-buffer of the lobes `number`, from 1 on, of the surfaces drawn last; valid until the next call.
 
-        There is no surface where a material has fewer lobes.
+        Pixels whose material has fewer lobes have no surface.
         """
         having = [instance for instance in instances if any(len(look.lobes) > number for look in instance.looks)]
         return self._gbuffer(number, having, view)
 
     def add_emission(self, instances: list[ShownInstance], view: View, size: tuple[int, int], frame_buffer) -> None:
-        """Add what the surfaces drawn last emit to `frame_buffer`."""
+        """Add the emission of the surfaces drawn last to `frame_buffer`."""
         shining = [instance for instance in instances if any(map(_shines, instance.looks))]
         if shining:
             self._add(EMISSION, [(0, shining)], view, frame_buffer)
 
     def through(self, instances: list[ShownInstance], view: View) -> gpu.types.GPUTexture:
-        """The texture (RGB) of what is left of the light from behind the surfaces drawn last."""
+        """The texture (RGB) of the share of light from behind that the surfaces drawn last let through."""
         if (THROUGH, False) not in self._shaders:
             self._shaders[THROUGH, False] = _shader(THROUGH)
         if self._through is None or (self._through[0].width, self._through[0].height) != self._size:
@@ -151,7 +152,7 @@ class SurfacePass:
         return self._through[0]
 
     def _add(self, outputs, parts, view: View, frame_buffer) -> None:
-        """Add what the lobes (number, instances) of `parts` give where they are the surfaces drawn last."""
+        """Add `outputs` of the lobes (number, instances) of `parts` to `frame_buffer`, on the surfaces drawn last."""
         with frame_buffer.bind():
             gpu.state.viewport_set(0, 0, *self._size)
             gpu.state.depth_test_set("NONE")
@@ -163,7 +164,7 @@ class SurfacePass:
                 gpu.state.blend_set("NONE")
 
     def free(self) -> None:
-        """Let go of everything."""
+        """Free all textures and shaders."""
         self._targets, self._tables, self._shaders = {}, {}, {}
         self._size = self._nothing = self._missing = self._depth = self._through = None
 
@@ -185,7 +186,7 @@ class SurfacePass:
         return GBufferTextures(**textures, **marks)
 
     def _target(self, outputs, is_further: bool):
-        """Textures by name and the frame buffer that `outputs` are drawn into; those of further lobes have no depth."""
+        """Textures by name, and the frame buffer that `outputs` are drawn into; without depth for further lobes."""
         if (outputs, is_further) not in self._targets:
             textures = {name: gpu.types.GPUTexture(self._size, format="RGBA32F") for name in outputs}
             depth = {} if is_further else {"depth_slot": self._depth}
@@ -194,14 +195,14 @@ class SurfacePass:
         return self._targets[outputs, is_further]
 
     def _draw_into(self, outputs, instances, view: View, number: int) -> dict:
-        """Draw the lobes `number`; the textures by name."""
+        """Draw the lobes `number`; returns the textures by name."""
         is_further = number > 0
         textures, buffer = self._target(outputs, is_further)
         if (outputs, is_further) not in self._shaders:
             self._shaders[outputs, is_further] = _shader(outputs, is_further)
         with buffer.bind():
             gpu.state.viewport_set(0, 0, *self._size)
-            # Only the position tells where there is a surface, but no number may be left that is not one.
+            # Only the position tells where there is a surface. The others are cleared because old texels may be NaN.
             buffer.clear(color=(0.0, 0.0, 0.0, 0.0), **({} if is_further or self._is_glass else {"depth": 1.0}))
             gpu.state.blend_set("NONE")
             gpu.state.depth_test_set("NONE" if is_further else "LESS_EQUAL")
@@ -221,13 +222,13 @@ class SurfacePass:
         if is_later:
             shader.uniform_sampler("positions", self._target(SURFACES, False)[0]["position"])
         values = np.vstack([view.projection.T, view.homogeneous_eye])
-        # Kept until all is drawn: the card reads it then.
+        # Kept alive, because the card reads it only when it draws.
         self._view_values = uniform_buffer(values)
         shader.uniform_block("view", self._view_values)
         for name, table in self._tables.items() if not is_emission else ():
             shader.uniform_sampler(name, table)
         to_view = Matrix.Translation(-view.origin)
-        # From near to far: what is hidden need not be computed.
+        # From near to far, so that hidden pixels are not computed.
         for instance in sorted(instances, key=lambda item: np.dot(view.projection[3], item.center)):
             looks = [pair for pair in zip(instance.mesh.slots, instance.looks, strict=True) if self._draws(pair[1])]
             if not looks:
@@ -260,27 +261,27 @@ def _shines(shown: ShownLook) -> bool:
 
 
 def has_normals(instances: list[ShownInstance]) -> bool:
-    """True where the diffuse lobe or a horizon has a normal of its own."""
+    """True if any diffuse lobe or horizon has a normal of its own."""
     return has_bent_lobes(instances) or any(instance.mesh.is_smooth for instance in instances)
 
 
 def has_bent_lobes(instances: list[ShownInstance]) -> bool:
-    """True where a diffuse lobe does not end at its own normal's horizon."""
+    """True if any diffuse lobe does not end at the horizon of its own normal."""
     return any(_bends(lobe) for instance in instances for look in instance.looks for lobe in look.lobes)
 
 
 def _is_brushed(shown: ShownLook, number: int) -> bool:
-    """True where the lobe `number` is anisotropic."""
+    """True if the lobe `number` is anisotropic."""
     return any(lobe.look.brush is not None for lobe in shown.lobes[number : number + 1])
 
 
 def _is_rough(shown: ShownLook, number: int) -> bool:
-    """True where the diffuse part of the lobe `number` is rough, or velvet."""
+    """True if the diffuse part of the lobe `number` is rough, or velvet."""
     return any(lobe.look.is_rough or lobe.look.kind == "velvet" for lobe in shown.lobes[number : number + 1])
 
 
 def _bends(shown: ShownLook) -> bool:
-    """True where the diffuse lobe has a normal of its own."""
+    """True if the diffuse lobe has a normal of its own."""
     return shown.look.normal is not None or shown.look.kind == "translucent"
 
 
@@ -299,7 +300,7 @@ def _shader(outputs, is_further: bool = False):
     info.uniform_buf(0, "SurfaceView", "view")
     info.uniform_buf(1, "SurfaceLook", "look")
     info.push_constant("MAT4", "model")
-    # What a shader does not use is not there for whom sets it.
+    # The compiler removes unused constants, and setting them is an error.
     if outputs != EMISSION:
         info.push_constant("VEC4", "placement")
     info.define("UNIT_NORMALS", "true" if NORMAL_MAPS_BEND_UNIT_NORMALS else "false")

@@ -1,4 +1,4 @@
-"""What the shaders read: samples, lights, tables and looks as textures and buffers."""
+"""The inputs of shaders: samples, lights, tables and looks as textures and buffers."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ...shading.lookup_table import LookupTable
 from ..materials.looks import COAT, IMAGE_SLOTS, REFRACTION, Look
 from ..materials.values import EXTENSIONS, Value
 
-# Field of `GBufferTextures` by its name in shaders.
+# Fields of `GBufferTextures` by their names in shaders.
 SAMPLERS = {
     "positions": "position",
     "normals": "normal",
@@ -33,7 +33,7 @@ SAMPLERS = {
     "tangents": "tangent",
     "rebounds": "rebound",
 }
-# The same of `ShareGrid`.
+# Fields of `ShareGrid` by their names in shaders.
 SHARE_SAMPLERS = {"shares": "shares", "grid_positions": "positions"}
 
 
@@ -46,18 +46,18 @@ def read_texture(texture: gpu.types.GPUTexture) -> np.ndarray:
 
 @dataclass(frozen=True)
 class ShareGrid:
-    """Which shares of lights are seen at points of a picture, which may be another one of the same surfaces."""
+    """The shares of lights that are seen at the points of a picture. Other pictures of the same surfaces may use it."""
 
     shares: gpu.types.GPUTexture  # RG, a layer for each light: the specular and the diffuse share
-    positions: gpu.types.GPUTexture  # of the points, around the same origin; w = 0 where there is no surface
-    projection: np.ndarray  # (4, 4) to clip space, in which the texels fill what is seen
+    positions: gpu.types.GPUTexture  # of the points, relative to the view's origin; w = 0 where there is no surface
+    projection: np.ndarray  # (4, 4) to the clip space that the texels fill
 
 
 @dataclass(frozen=True)
 class GBufferTextures:
-    """The surface points of a picture as textures of one size: what `scene.SurfaceSamples` holds.
+    """The surface points of a picture as textures of one size, with the fields of `scene.SurfaceSamples`.
 
-    RGBA32F, one texel per pixel, row 0 at the bottom. What is None is everywhere what its comment names.
+    RGBA32F, one texel per pixel, row 0 at the bottom. A texture may be None where its default holds everywhere.
     """
 
     position: gpu.types.GPUTexture  # in the world, m; w = 1 + receiver, 0 where there is no surface
@@ -66,15 +66,15 @@ class GBufferTextures:
     f0: gpu.types.GPUTexture  # specular_f0; w = red of specular_dip
     f90: gpu.types.GPUTexture  # specular_f90; w = green of specular_dip
     dielectric: gpu.types.GPUTexture  # weight of the dielectric lobe; w = blue of specular_dip
-    geometric_normal: gpu.types.GPUTexture | None = None  # `normal`; w is not read
-    diffuse_normal: gpu.types.GPUTexture | None = None  # `normal`; w = bump_alpha2
-    smooth_normal: gpu.types.GPUTexture | None = None  # `diffuse_normal`; w is not read
-    tangent: gpu.types.GPUTexture | None = None  # of anisotropic lobes; w = anisotropy, None: 0 everywhere
-    rebound: gpu.types.GPUTexture | None = None  # diffuse_rebound; w = diffuse_roughness, None: 0 everywhere
-    shares: ShareGrid | None = None  # all of each light is seen
-    has_sheen: bool = False  # in its texels base.w is -sheen_a, and normal.w is sheen_b
-    has_velvet: bool = False  # where rebound.w is -sigma of velvet, and its rgb the albedo
-    has_bent: bool = False  # dielectrics with an index of refraction between 0 and 1
+    geometric_normal: gpu.types.GPUTexture | None = None  # w is not read; None: `normal`
+    diffuse_normal: gpu.types.GPUTexture | None = None  # w = bump_alpha2; None: `normal`, bump_alpha2 0
+    smooth_normal: gpu.types.GPUTexture | None = None  # w is not read; None: `diffuse_normal`
+    tangent: gpu.types.GPUTexture | None = None  # of anisotropic lobes; w = anisotropy; None: 0
+    rebound: gpu.types.GPUTexture | None = None  # diffuse_rebound; w = diffuse_roughness; None: 0
+    shares: ShareGrid | None = None  # None: every light is seen whole
+    has_sheen: bool = False  # there are texels of sheen: base.w = -sheen_a, normal.w = sheen_b
+    has_velvet: bool = False  # there are texels of velvet: rebound.w = -sigma, rebound.rgb = albedo
+    has_bent: bool = False  # there are dielectrics with an index of refraction between 0 and 1
 
     def __post_init__(self):
         if self.diffuse_normal is None and self.smooth_normal is not None:
@@ -105,7 +105,10 @@ def float_texture(values: np.ndarray) -> gpu.types.GPUTexture:
 
 
 def upload_samples(samples: SurfaceSamples, width: int, pixel: np.ndarray | None = None) -> GBufferTextures:
-    """Textures of `samples` (P), `width` wide, at `pixel` (P,), counted from the lower left; left out: in order."""
+    """Textures, `width` texels wide, of `samples` (P) at the texels `pixel` (P,), counted from the lower left.
+
+    Without `pixel` the samples are stored in order.
+    """
     pixel = np.arange(len(samples)) if pixel is None else np.asarray(pixel)
     height = -(-(int(pixel.max(initial=0)) + 1) // width)
 
@@ -149,10 +152,12 @@ def _albedo_of_velvet(samples) -> np.ndarray:
     return closures.velvet_albedo(cosine, np.maximum(-samples.sheen_a, 0.0))
 
 
-HEADER = 7
-WIDTH = 256
+HEADER = 7  # texels of a light's header, see `light_texels`
+WIDTH = 256  # texels of a row of the texture of lights
+# Flags of a light.
 DIFFUSE, SPECULAR, ROUND, DISTANT, FACING, BALL, CONE = 1, 2, 4, 8, 16, 32, 64
-# Not equally bright all over; with a spread or a falloff; seen as a cap of the sphere; with a pattern by the place.
+# UNEVEN: not equally bright all over. PROFILE: with a spread or a falloff. CAP: seen as a cap of the sphere.
+# PLACED: with a pattern by the place on the light.
 UNEVEN, PROFILE, CAP, PLACED = 128, 256, 512, 1024
 _QUAD = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
@@ -164,9 +169,10 @@ def _circle(count):
     return np.sqrt(step / np.sin(step)) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
-# A polygon of the area of a circle has its second moments to 2e-3 with 8 corners, to 1.4e-4 with 16: lobes see that of
-# lights that no horizon cuts and that are so wide after the warp (the squares of half diagonals by distances, see
-# integral.glsl). Lobes make lights on their axis twice as large, and the half diagonal is longer than the radius.
+# _FEW_SIZES: the apparent width up to which round lights that no horizon cuts get 8 or 16 corners. Width is the squared
+# half diagonal over distance after the warp, see integral.glsl. A polygon with the area of a circle has its second
+# moments to 2e-3 with 8 corners, to 1.4e-4 with 16. Note that lobes make lights on their axis twice as large, and that
+# the half diagonal is longer than the radius.
 _FEW_SIZES = {8: 0.15, 16: 1.0}
 _CIRCLES = (*_FEW_SIZES, *ROUND_CORNERS)
 _SIZES = (*_FEW_SIZES.values(), *(0.25 * limit * limit for limit in ROUND_LIMITS), np.inf)
@@ -178,15 +184,15 @@ _SHARED = [
 ]
 _FIRST = np.concatenate([[0], np.cumsum([len(part) for part in _SHARED])])[:-1].tolist()
 QUAD_FIRST, _CIRCLE_FIRST = _FIRST[0], _FIRST[1 : 1 + len(_CIRCLES)]
-# Texel of the first node by the number of nodes.
+# Texel of the first node of a quadrature, by its number of nodes.
 NODES_FIRST = dict(zip(_NODES, _FIRST[1 + len(_CIRCLES) :], strict=True))
 FIRST_LIGHT = sum(len(part) for part in _SHARED)
-# Texel of the first corner, number of corners, and up to which width they are taken.
+# Texel of the first corner, number of corners, and the largest apparent width for which they are used.
 ROUND_LEVELS = tuple(zip(_CIRCLE_FIRST, _CIRCLES, _SIZES, strict=True))
 
 
 def constants() -> dict[str, int | str]:
-    """What GLSL that reads the texture needs to know, by name."""
+    """The constants that GLSL needs to read the texture of lights, by name."""
     return {
         "LIGHT_HEADER": HEADER,
         "FIRST_LIGHT": FIRST_LIGHT,
@@ -213,12 +219,11 @@ def circle_first(count: int) -> int:
 
 
 def light_texels(lights: Iterable[AreaLight]) -> np.ndarray:
-    """Texels (H, `WIDTH`, 4) of `lights` in float32; leave out lights without area by `visible_lights`.
+    """Texels (H, `WIDTH`, 4) of `lights` in float32. Lights must have an area, see `visible_lights`.
 
-    A corner of a light is center + s * half_u + t * half_v. First come lists of corners s, t that lights share, nodes
-    and weights of quadratures over cones, then `HEADER` texels per light, then corners and receivers of single lights;
-    in the place of corners, where a light has a `SpotCone`, its axes with the cosine, the sharpness and 0.
-    Headers:
+    The order is: corners s, t that lights share; nodes and weights of quadratures over cones; `HEADER` texels per
+    light; then the corners, receivers and pattern of each light. A corner is center + s * half_u + t * half_v. A light
+    with a `SpotCone` has in place of corners the axes of the cone, with cosine, sharpness and 0 as w. Headers:
 
         0   center; texel of the first corner
         1   half_u; number of corners, 0: chosen per pixel from the circles
@@ -228,9 +233,10 @@ def light_texels(lights: Iterable[AreaLight]) -> np.ndarray:
         5   tan h and 1 / (tan h - h) of the spread, 0 without profile; largest half length; bound
         6   power of the falloff; its smoothing; area; first texel of the pattern, 0: there is none
 
-    A pattern has its axes, with its height, width and whether it goes by the ray in the place of w, then its values.
+    A pattern is three texels of its axes, with height, width and `by_ray` as w, then its values, four per texel.
 
-    No corner is farther from the center along any axis than the bound times the sum of those of half_u and half_v.
+    Bound: along any axis no corner is farther from the center than the bound times the sum of the extents of half_u
+    and half_v.
     """
     lights = list(lights)
     headers, lists = [], []
@@ -259,13 +265,15 @@ def _pattern_texels(pattern) -> np.ndarray:
 
 
 def visible_lights(lights: Iterable[AreaLight]) -> list[AreaLight]:
-    """Those lights that have an area."""
+    """The lights that have an area."""
     return [light for light in lights if light.area_vector.any()]
 
 
 def _outline(light, place):
-    """First texel and number of corners, half_v so that corners run counterclockwise as seen from the lit side, and
-    the light's own corners (V, 2)."""
+    """First texel and number of corners, half_v, and the light's own corners (V, 2).
+
+    half_v has the sign with which corners run counterclockwise as seen from the lit side.
+    """
     half_v = light.half_v
     if light.shape == "POLYGON":
         axes = np.stack([light.half_u, half_v], axis=1)
@@ -302,7 +310,7 @@ def _header(light, first, count, half_v, first_receiver):
 
 
 def _is_cap(light) -> bool:
-    """True for what is seen as a cap of the sphere: balls, facing disks, and suns."""
+    """True for lights that are seen as a cap of the sphere: balls, facing disks, and suns."""
     if light.is_facing or not (light.is_round and light.is_distant):
         return light.is_facing
     axes = np.stack([light.half_u, light.half_v, light.center])
@@ -319,15 +327,16 @@ def _bound(light):
     return 1.01 * np.abs(np.linalg.lstsq(axes, (light.corners - light.center).T, rcond=None)[0]).max()
 
 
-# Indices of refraction per unit in the texture of the dielectrics' weights; those of the shipped tables are among them.
+# IOR_STEPS: steps per unit of the index of refraction in the texture of the dielectrics' weights. They include the
+# indices of the shipped tables.
 IOR_STEPS = 200
 
 
 def table_texels(table: LookupTable, iors: tuple[float, ...] = ()) -> np.ndarray:
-    """Texels (N, R, T, 4) in float32, with one more curve for every index of refraction of `iors`.
+    """Texels (N, R, T, 4) of a table in float32, with one more curve for every index of refraction of `iors`.
 
-    The first layer holds the warp, then each curve takes as many layers as its weights need, four in each. An integral
-    over a polygon is the product of these weights with `edge_integrals.moments`.
+    The first layer is the warp. Then come the layers of each curve, with four weights per layer. An integral over a
+    polygon is the product of these weights with `edge_integrals.moments`.
     """
     ridges = moments32.along_directions(table)
     rows, columns, parameters = table.warp.shape
@@ -339,8 +348,10 @@ def table_texels(table: LookupTable, iors: tuple[float, ...] = ()) -> np.ndarray
 
 
 def dielectric_texels(table: LookupTable, iors: tuple[float, ...] = ()) -> np.ndarray:
-    """Texels (S, 2, 4), column x for the index of refraction 1 + y / `IOR_STEPS`, y the row: weights of the table's
-    first four curves and, in the second texel, of the fifth; its w is 1 + n where the index is number n of `iors`.
+    """Texels (S, 2, 4) of the weights of the table's curves for dielectrics; row y: ior = 1 + y / `IOR_STEPS`.
+
+    The first texel of a row has the weights of curves 0 to 3, the second those of curves 4 to 6, if there are any. The
+    w of the second is 1 + n where ior is number n of `iors`, else 0.
     """
     count = table.fresnel_weights.shape[1]
     if count > 7:
@@ -355,13 +366,12 @@ def dielectric_texels(table: LookupTable, iors: tuple[float, ...] = ()) -> np.nd
     return texels.reshape(len(grid), 2, 4)
 
 
-# Of a draw call: loops, and lights.
-MOST_LOOPS, MOST_LIGHTS = 40000, 32
+MOST_LOOPS, MOST_LIGHTS = 40000, 32  # limits of a draw call
 
 
 @dataclass(frozen=True)
 class UploadedLights:
-    """Lights that have an area, their texture, and that of the world's light, if there is any."""
+    """Lights that have an area, their texture, and the texture of the world's light, if there is any."""
 
     lights: tuple[AreaLight, ...]
     texture: gpu.types.GPUTexture
@@ -375,9 +385,11 @@ def upload_lights(lights: Iterable[AreaLight], sky: gpu.types.GPUTexture | None 
 
 
 def shares(loops: Sequence[int]) -> list[tuple[int, int]]:
-    """The lights (first, end) of each draw call, of which each goes round as many `loops`: llvmpipe breaks off those
-    of a pixel that go round more than 65535 times, and other cards do not like long ones. The first call is there
-    without lights, too."""
+    """The lights (first, end) of each draw call; `loops` are the iterations of each light. At least one call.
+
+    Calls are limited because llvmpipe aborts loops of a pixel after 65535 iterations, and long loops are bad for other
+    cards, too.
+    """
     starts, total = [0], 0
     for number, count in enumerate(loops):
         if number > starts[-1] and (total + count > MOST_LOOPS or number - starts[-1] == MOST_LIGHTS):
@@ -387,12 +399,13 @@ def shares(loops: Sequence[int]) -> list[tuple[int, int]]:
     return list(zip(starts, [*starts[1:], len(loops)], strict=True))
 
 
-# In units of vec4: where slots start, the size of one, where the terms of conductors and where the coat starts, all.
+# The layout of a look's uniform buffer in units of vec4: start and size of the slots, start of the terms of conductors,
+# start of the layers (coat and others), whole size.
 FIRST_SLOT, SLOT_SIZE = 3, 6
 FIRST_TERM = FIRST_SLOT + SLOT_SIZE * len(IMAGE_SLOTS)
 LAYERS = FIRST_TERM + 5
 LOOK_SIZE = LAYERS + 5
-# Where the tangents of anisotropic lobes run, by `Brush.direction`; 0: there are none.
+# Numbers for the direction of tangents of anisotropic lobes, by `Brush.direction`; 0: not anisotropic.
 DIRECTIONS = {"X": 1, "Y": 2, "Z": 3, "": 4}
 VIEW_FACTORS = {"fresnel": 1, "facing": 2}
 KINDS = {**LOBE_KINDS, COAT: max(LOBE_KINDS.values()) + 1, REFRACTION: max(LOBE_KINDS.values()) + 2}
@@ -468,7 +481,7 @@ def _slot_values(value: Value) -> np.ndarray:
 
 
 def is_encoded(image) -> bool:
-    """True for images that Cycles interpolates before it makes them linear."""
+    """True for images that Cycles interpolates before it converts them to linear values."""
     return not image.is_float and image.colorspace_settings.name == "sRGB"
 
 
@@ -480,12 +493,13 @@ def float_table(values: np.ndarray) -> gpu.types.GPUTexture:
 
 
 def albedo_table() -> np.ndarray:
-    """(33, 32): directional albedo of GGX by roughness and cosine, then its average by roughness."""
+    """(33, 32): directional albedo of GGX by roughness and cosine; the last row is its average by roughness."""
     return np.vstack(closures.albedo_tables())
 
 
 def sheen_table() -> np.ndarray:
-    """(N, N, 4): albedo, a and b of sheen by cosine, rows, and roughness, see `closures.sheen_lobe`; that of velvet."""
+    """(N, N, 4): albedo, a and b of sheen (see `closures.sheen_lobe`), albedo of velvet; rows by cosine, columns by
+    roughness."""
     nodes = np.linspace(0.0, 1.0, closures.SHEEN_NODES)
     cosine, roughness = (axis.ravel() for axis in np.meshgrid(nodes, nodes, indexing="ij"))
     found = np.concatenate([closures.sheen_lobe(cosine, roughness), closures.velvet_albedo(cosine, roughness)[None]])
@@ -493,7 +507,10 @@ def sheen_table() -> np.ndarray:
 
 
 def blend_table() -> np.ndarray:
-    """(256, 16): where between f0 and 1 the albedo of a dielectric lies, rows by roughness and cosine."""
+    """(256, 16): the place of a dielectric's albedo between f0 and 1; rows by roughness and cosine.
+
+    Columns are uniform in the fourth root of f0.
+    """
     count = closures.GLASS_NODES
     nodes = np.linspace(0.0, 1.0, count)
     roughness, cosine, coordinate = (axis.ravel() for axis in np.meshgrid(nodes, nodes, nodes, indexing="ij"))

@@ -2,7 +2,7 @@
 #ifndef LTSH_SHARED
 #define LTSH_SHARED @VERSION@
 
-/* Corners a polygon has room for, those that clipping adds included: define it before the first header if 8 are few. */
+/* Most corners of a polygon, including those from clipping. Define it before the first header if 8 are too few. */
 #ifndef LTSH_MAX_CORNERS
 #define LTSH_MAX_CORNERS 8
 #endif
@@ -35,24 +35,24 @@ typedef struct ltsh_vec3 ltsh_vec3;
 struct ltsh_vec3 { float x; float y; float z; };
 #endif
 
-/* Axes of a local frame: the normal is z, the view direction has y = 0 and x >= 0. */
+/* Axes of a local frame. The normal is z; the view direction has y = 0 and x >= 0. */
 struct ltsh_frame { ltsh_vec3 tangent; ltsh_vec3 bitangent; ltsh_vec3 normal; };
-/* The first `count` corners are in use; any winding. */
+/* A polygon with any winding. The first `count` corners are in use. */
 struct ltsh_polygon { int count; ltsh_vec3 corners[LTSH_MAX_CORNERS]; };
-/* Where a lookup falls: the node of lower roughness and theta_o, and how far it is to the next one of each. */
+/* Place of a lookup: the node of lower roughness and theta_o, and the weights of the next row and the next column. */
 struct ltsh_cell {
     float cos_theta_o; float sin_theta_o; float roughness; int node; float row_weight; float column_weight;
 };
-/* W of the lobe D_orig(W w / |W w|) |W| / |W w|^3, upper triangular; tilt in radians is 0 but for LTC. */
+/* Upper triangular W of the lobe D_orig(W w / |W w|) |W| / |W w|^3. The tilt in radians is 0 except for LTC. */
 struct ltsh_warp { float xx; float xz; float yy; float zz; float tilt; };
 /* An edge of a spherical polygon of length theta: phi = theta / sin(theta), psi = (phi - 1) / (1 - cos(theta)),
-   q = 1 / (1 + cos(theta)); `total` is the sum of its ends, `normal` the cross product start x end. */
+   q = 1 / (1 + cos(theta)). `total` is the sum of its ends; `normal` is the cross product start x end. */
 struct ltsh_edge { ltsh_vec3 start; ltsh_vec3 total; ltsh_vec3 normal; float phi; float psi; float q; };
-/* A light around the point: its center, half sides of the parallelogram around it, its area times the direction to which
-   it shines. */
+/* A light seen from the point: its center, half sides of the parallelogram around it, and its area times the direction
+   in which it shines. */
 struct ltsh_extent { ltsh_vec3 center; ltsh_vec3 half_u; ltsh_vec3 half_v; ltsh_vec3 area; };
-/* Bounds of the integral for F = 1, and the least cosine between the view and the half vectors; without bounds 0, 1e30
-   and 0. */
+/* Bounds of the integral for F = 1, and the least cosine between the view and the half vectors. Without bounds these
+   are 0, 1e30 and 0. */
 struct ltsh_limits { float least; float most; float cosine; };
 
 #ifndef LTSH_SHADER
@@ -106,11 +106,11 @@ LTSH_FUNCTION ltsh_vec3 ltsh_unit(ltsh_vec3 v)
 LTSH_FUNCTION ltsh_frame ltsh_make_frame(ltsh_vec3 normal, ltsh_vec3 view)
 {
     ltsh_frame frame;
-    /* The difference of vectors that are close is exact, and so is what it has across the normal. */
+    /* Differences of close vectors are exact, and so is the part of this one across the normal. */
     ltsh_vec3 across = ltsh_add_scaled(view, -1.0f, normal);
     across = ltsh_add_scaled(across, -ltsh_dot(normal, across), normal);
     if (ltsh_dot(across, across) < 1e-14f) {
-        /* View and normal coincide: any tangent serves. */
+        /* View and normal coincide, so any tangent serves. */
         across = normal.x * normal.x < 0.5f ? ltsh_make_vec3(1.0f, 0.0f, 0.0f) : ltsh_make_vec3(0.0f, 1.0f, 0.0f);
         across = ltsh_add_scaled(across, -ltsh_dot(normal, across), normal);
     }
@@ -135,7 +135,7 @@ LTSH_FUNCTION ltsh_polygon ltsh_empty_polygon(void)
     return polygon;
 }
 
-/* The polygon with one corner more; one that finds no room is left out. */
+/* The polygon with one more corner. A corner that finds no room is left out. */
 LTSH_FUNCTION ltsh_polygon ltsh_with_corner(ltsh_polygon polygon, ltsh_vec3 corner)
 {
     if (polygon.count < LTSH_MAX_CORNERS) {
@@ -145,7 +145,7 @@ LTSH_FUNCTION ltsh_polygon ltsh_with_corner(ltsh_polygon polygon, ltsh_vec3 corn
     return polygon;
 }
 
-/* The part of a polygon where z > 0, count 0 if there is none. One of V corners gets at most V + 1 if it is convex. */
+/* The part of a polygon where z > 0; count 0 if there is none. A convex polygon of V corners gets at most V + 1. */
 LTSH_FUNCTION ltsh_polygon ltsh_clip_to_horizon(ltsh_polygon polygon)
 {
     ltsh_polygon result = ltsh_empty_polygon();
@@ -181,8 +181,8 @@ LTSH_FUNCTION ltsh_vec3 ltsh_edge_sum(ltsh_polygon unit, int i)
     return ltsh_add_scaled(unit.corners[i], 1.0f, unit.corners[i + 1 < unit.count ? i + 1 : 0]);
 }
 
-/* Signed solid angle of a spherical polygon in z >= 0: positive where the corners run counterclockwise about +z as seen
-   from outside the sphere. What the boundary winds around several times counts as often. */
+/* Signed solid angle of a spherical polygon in z >= 0. It is positive if the corners run counterclockwise about +z as
+   seen from outside the sphere. An area around which the boundary winds several times counts as often. */
 LTSH_FUNCTION float ltsh_solid_angle(ltsh_polygon unit)
 {
     float real = 1.0f;
@@ -194,11 +194,11 @@ LTSH_FUNCTION float ltsh_solid_angle(ltsh_polygon unit)
         float edge_imaginary = unit.corners[i].x * total.y - unit.corners[i].y * total.x;
         float next_real = real * edge_real - imaginary * edge_imaginary;
         float next_imaginary = real * edge_imaginary + imaginary * edge_real;
-        /* Only the argument matters: keep the magnitude near one. */
+        /* Only the argument matters, so keep the magnitude near one. */
         float magnitude = (next_real < 0.0f ? -next_real : next_real)
             + (next_imaginary < 0.0f ? -next_imaginary : next_imaginary);
         float scale = magnitude > 0.0f ? 1.0f / magnitude : 1.0f;
-        /* The argument grows by a quarter turn at most: it passes the branch cut only from a negative real part. */
+        /* The argument grows by at most a quarter turn, so it passes the branch cut only from a negative real part. */
         if (real < 0.0f && imaginary >= 0.0f && edge_imaginary > 0.0f && next_imaginary < 0.0f) {
             turns += 1;
         }
@@ -214,7 +214,7 @@ LTSH_FUNCTION float ltsh_solid_angle(ltsh_polygon unit)
     return 2.0f * LTSH_ATAN2(imaginary, real) + @FOUR_PI@ * LTSH_FLOAT(turns);
 }
 
-/* 1, -1 or 0: the sign of the solid angle of a polygon in z >= 0, in any length unit. */
+/* The sign of the solid angle of a polygon in z >= 0, in any length unit: 1, -1 or 0. */
 LTSH_FUNCTION float ltsh_orientation(ltsh_polygon polygon)
 {
     float solid_angle = ltsh_solid_angle(ltsh_project_to_sphere(polygon));
@@ -227,7 +227,7 @@ LTSH_FUNCTION ltsh_edge ltsh_edge_between(ltsh_vec3 start, ltsh_vec3 end)
     ltsh_edge edge;
     edge.start = start;
     edge.total = ltsh_add_scaled(start, 1.0f, end);
-    /* start x end from the difference of ends that are close, which is exact, or the sum of ends nearly opposite. */
+    /* start x end, from the difference of ends if they are close, which is exact, otherwise from their sum. */
     float sign = ltsh_dot(edge.total, edge.total) > 2.0f ? -1.0f : 1.0f;
     edge.normal = ltsh_cross(start, ltsh_add_scaled(end, sign, start));
     float shifted = ltsh_larger(ltsh_one_plus_cosine(edge.total), @TINY_SHIFT@);
@@ -256,14 +256,14 @@ LTSH_FUNCTION float ltsh_clamped_cosine_integral(ltsh_polygon unit)
     return 0.5f * sum;
 }
 
-/* Form factor, 0 to 1, of a polygon in z >= 0: the irradiance of unit radiance divided by pi. For diffuse surfaces. */
+/* Form factor in [0, 1] of a polygon in z >= 0: the irradiance of unit radiance divided by pi. For diffuse surfaces. */
 LTSH_FUNCTION float ltsh_form_factor(ltsh_polygon polygon)
 {
     float integral = ltsh_clamped_cosine_integral(ltsh_project_to_sphere(polygon));
     return @ONE_OVER_PI@ * (integral < 0.0f ? -integral : integral);
 }
 
-/* Signed integral over a polygon in z >= 0 of the clamped cosine of mass 1 around (sin(tilt), 0, cos(tilt)). */
+/* Signed integral of the clamped cosine of mass 1 around (sin(tilt), 0, cos(tilt)) over a polygon in z >= 0. */
 LTSH_FUNCTION float ltsh_tilted_cosine_integral(ltsh_polygon polygon, float tilt)
 {
     float sine = LTSH_SIN(tilt);
@@ -285,7 +285,7 @@ LTSH_FUNCTION float ltsh_integer_power(float value, int exponent)
     return power;
 }
 
-/* What the points of an arc at `angle` on both sides of its middle add to the mean of the k-th power. */
+/* Contribution to the mean of the k-th power from the two points of an arc at `angle` on either side of its middle. */
 LTSH_FUNCTION float ltsh_arc_pair(int k, float middle, float across, float angle, float weight)
 {
     float even = middle * LTSH_COS(angle);
@@ -293,7 +293,8 @@ LTSH_FUNCTION float ltsh_arc_pair(int k, float middle, float across, float angle
     return weight * (ltsh_integer_power(even + odd, k) + ltsh_integer_power(even - odd, k));
 }
 
-/* Integral over the edge of the k-th power of what runs from `start` to `total - start`, divided by sin(theta). */
+/* Integral over the edge of the k-th power of a linear function, divided by sin(theta). The function runs from `start`
+   to `total - start`. */
 LTSH_FUNCTION float ltsh_arc_power(ltsh_edge edge, int k, float start, float total)
 {
     float product = start * (total - start);
@@ -309,7 +310,7 @@ LTSH_FUNCTION float ltsh_arc_power(ltsh_edge edge, int k, float start, float tot
     if (k == 3) {
         return edge.q * total * ((edge.q + 1.0f) * (1.0f / 3.0f) * total * total - product);
     }
-    /* Degrees above 4: Gauss-Legendre quadrature of a trigonometric polynomial, exact to rounding. */
+    /* For degrees above 4: Gauss-Legendre quadrature of a trigonometric polynomial, exact to rounding. */
     float cos_half = LTSH_SQRT(0.5f / edge.q);
     float sin_half = LTSH_SQRT(ltsh_larger(1.0f - 0.5f / edge.q, 0.0f));
     float half_angle = LTSH_ATAN2(sin_half, cos_half);
@@ -320,7 +321,7 @@ LTSH_FUNCTION float ltsh_arc_power(ltsh_edge edge, int k, float start, float tot
     return edge.phi * sum;
 }
 
-/* What an edge adds to the moment of the ridge direction (u_x, 0, u_z) and the power k. */
+/* Contribution of an edge to the moment of the ridge direction (u_x, 0, u_z) and the power k. */
 LTSH_FUNCTION float ltsh_edge_moment(ltsh_edge edge, float u_x, float u_z, int k)
 {
     float start = u_x * edge.start.x + u_z * edge.start.z;
@@ -335,7 +336,7 @@ LTSH_FUNCTION ltsh_vec3 ltsh_bent(ltsh_vec3 v, float xx, float xz, float yy)
     return ltsh_make_vec3(xx * v.x + xz * v.z, yy * v.y, v.z);
 }
 
-/* A polygon on the sphere under that warp, on the sphere again. */
+/* A polygon on the sphere under that warp, projected to the sphere again. */
 LTSH_FUNCTION ltsh_polygon ltsh_bent_polygon(ltsh_polygon unit, float xx, float xz, float yy)
 {
     for (int i = 0; i < unit.count; ++i) {
@@ -344,14 +345,14 @@ LTSH_FUNCTION ltsh_polygon ltsh_bent_polygon(ltsh_polygon unit, float xx, float 
     return unit;
 }
 
-/* As ltsh_make_cell, for who knows the sine better than it follows from a cosine close to one; both from 0 to 1. */
+/* As ltsh_make_cell, for a sine that is known better than from a cosine close to one. Both are in [0, 1]. */
 LTSH_FUNCTION ltsh_cell ltsh_make_cell_at(float cos_theta_o, float sin_theta_o, float roughness, int rows, int columns)
 {
     ltsh_cell cell;
     cell.cos_theta_o = cos_theta_o;
     cell.sin_theta_o = sin_theta_o;
     cell.roughness = ltsh_clamped(roughness, 1.0f);
-    /* 1 - theta_o / 90 deg as an elevation keeps its digits at grazing angles. */
+    /* Computed as an elevation, 1 - theta_o / 90 deg keeps its digits at grazing angles. */
     float elevation = @TWO_OVER_PI@ * LTSH_ATAN2(cell.cos_theta_o, sin_theta_o);
     float column_position = ltsh_clamped(1.0f - LTSH_SQRT(elevation), 1.0f) * LTSH_FLOAT(columns - 1);
     float row_position = cell.roughness * LTSH_FLOAT(rows - 1);
@@ -410,15 +411,16 @@ LTSH_FUNCTION float ltsh_dielectric_reflectance(float cosine, float ior)
     return 0.5f * perpendicular * perpendicular * (1.0f + quotient * quotient);
 }
 
-/* The value, or what is nearest to it from `least` to `most`. */
+/* The value clamped to the range from `least` to `most`. */
 LTSH_FUNCTION float ltsh_between(float value, float least, float most)
 {
     return value < least ? least : (value > most ? most : value);
 }
 
-/* Limits for integrals over the light in the tail of a lobe, where the mirrored view ray misses the light by far and a
-   fitted lobe may be off by more than its value: least and greatest GGX BRDF times both cosines by the squared distance,
-   of the center and the corners, times the area. Below the horizon of `second`, or else of `normal`, nothing is seen. */
+/* Limits for integrals over the light in the tail of a lobe. In the tail the mirrored view ray misses the light by far,
+   and a fitted lobe may be off by more than its value. The limits are the least and the greatest GGX BRDF times both
+   cosines divided by the squared distance, at the center and the corners, times the area. Points below the horizon of
+   `normal` count as 0, and in the least value those below the horizon of `second` too. */
 LTSH_FUNCTION ltsh_limits ltsh_tail_limits(
     ltsh_vec3 normal, ltsh_vec3 second, ltsh_vec3 view, float roughness, ltsh_extent light)
 {

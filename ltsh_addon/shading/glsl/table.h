@@ -44,13 +44,13 @@ LTSH_FUNCTION float @prefix@_data_at(int index);
 #endif
 #endif
 
-/* Where cos_theta_o and roughness, both clamped to 0 .. 1, fall in the table. */
+/* The cell of the table at cos_theta_o and roughness, both clamped to [0, 1]. */
 LTSH_FUNCTION ltsh_cell @prefix@_cell(float cos_theta_o, float roughness)
 {
     return ltsh_make_cell(cos_theta_o, roughness, @PREFIX@_ROWS, @PREFIX@_COLUMNS);
 }
 
-/* One channel, interpolated bilinearly: first the warp, then @PREFIX@_COEFFICIENTS of every curve. */
+/* One channel, interpolated bilinearly. The warp comes first, then @PREFIX@_COEFFICIENTS for every curve. */
 LTSH_FUNCTION float @prefix@_channel(ltsh_cell cell, int channel)
 {
     int lower = cell.node * @PREFIX@_CHANNELS + channel;
@@ -80,7 +80,7 @@ LTSH_FUNCTION @prefix@_coefficients @prefix@_lookup_curve(ltsh_cell cell, int cu
     return coefficients;
 }
 
-/* Linear interpolation among `count` values `stride` apart, at a position from 0 to count - 1. */
+/* Linear interpolation between `count` values `stride` apart, at a position from 0 to count - 1. */
 LTSH_FUNCTION float @prefix@_interpolated(int offset, int stride, int count, float position)
 {
     float clamped = ltsh_clamped(position, LTSH_FLOAT(count - 1));
@@ -90,7 +90,7 @@ LTSH_FUNCTION float @prefix@_interpolated(int offset, int stride, int count, flo
     return @PREFIX@_DATA(offset + index * stride) * (1.0f - share) + @PREFIX@_DATA(offset + following * stride) * share;
 }
 
-/* Position of an index of refraction among those tabulated, clamped to their range. */
+/* Position of an index of refraction among the tabulated ones, clamped to their range. */
 LTSH_FUNCTION float @prefix@_ior_position(float ior)
 {
     int low = 0;
@@ -137,7 +137,7 @@ LTSH_FUNCTION @prefix@_coefficients @prefix@_lookup_dielectric(ltsh_cell cell, f
     return sum;
 }
 
-/* The Fresnel curve itself at the cosine of the half angle, 0 .. 1. */
+/* The Fresnel curve itself, at a cosine of the half angle in [0, 1]. */
 LTSH_FUNCTION float @prefix@_fresnel_curve(int curve, float cosine)
 {
     int offset = @PREFIX@_FRESNEL_OFFSET + curve * @PREFIX@_COSINE_COUNT;
@@ -145,14 +145,14 @@ LTSH_FUNCTION float @prefix@_fresnel_curve(int curve, float cosine)
     return @prefix@_interpolated(offset, 1, @PREFIX@_COSINE_COUNT, position);
 }
 
-/* Directional albedo of a curve averaged over the hemisphere: the integral of 2 mu albedo(mu) over mu in 0 .. 1. */
+/* Directional albedo of a curve averaged over the hemisphere: the integral of 2 mu albedo(mu) over mu in [0, 1]. */
 LTSH_FUNCTION float @prefix@_average_albedo(float roughness, int curve)
 {
     float position = ltsh_clamped(roughness, 1.0f) * LTSH_FLOAT(@PREFIX@_ROWS - 1);
     return @prefix@_interpolated(@PREFIX@_AVERAGE_ALBEDO_OFFSET + curve, @PREFIX@_CURVES, @PREFIX@_ROWS, position);
 }
 
-/* Weights of the moments of a polygon: once per coefficient vector, for any number of lights. */
+/* Weights of the moments of a polygon. Compute them once per coefficient vector, for any number of lights. */
 LTSH_FUNCTION @prefix@_weights @prefix@_moment_weights(@prefix@_coefficients coefficients)
 {
     @prefix@_weights weights;
@@ -164,7 +164,7 @@ LTSH_FUNCTION @prefix@_weights @prefix@_moment_weights(@prefix@_coefficients coe
     return weights;
 }
 
-/* Moments of a polygon in z >= 0 under the warp: once per light, for any number of coefficient vectors. */
+/* Moments of a polygon in z >= 0 under the warp. Compute them once per light, for any number of coefficient vectors. */
 LTSH_FUNCTION @prefix@_moments @prefix@_polygon_moments(ltsh_warp warp, ltsh_polygon polygon)
 {
 @if ltsh
@@ -216,7 +216,7 @@ LTSH_FUNCTION float @prefix@_albedo(ltsh_cell cell, int curve)
 @end
 }
 
-/* Signed integral of a lobe over a polygon: positive where the corners run counterclockwise about +z as seen from
+/* Signed integral of a lobe over a polygon. It is positive if the corners run counterclockwise about +z as seen from
    outside the unit sphere. */
 LTSH_FUNCTION float @prefix@_integral(@prefix@_weights weights, @prefix@_moments moments)
 {
@@ -227,7 +227,7 @@ LTSH_FUNCTION float @prefix@_integral(@prefix@_weights weights, @prefix@_moments
     return sum;
 }
 
-/* Integral of the lobe for F = 1 over the part of a polygon above the horizon, either winding, never negative. */
+/* Integral of the lobe for F = 1 over the part of a polygon above the horizon. Either winding; never negative. */
 LTSH_FUNCTION float @prefix@_integrate_polygon(float cos_theta_o, float roughness, ltsh_polygon polygon)
 {
     ltsh_polygon visible = ltsh_clip_to_horizon(polygon);
@@ -237,8 +237,8 @@ LTSH_FUNCTION float @prefix@_integrate_polygon(float cos_theta_o, float roughnes
     return ltsh_larger(ltsh_orientation(visible) * @prefix@_integral(weights, moments), 0.0f);
 }
 
-/* Integral for F = 1 as shading takes it, from the weights of curve 0; `orientation` is ltsh_orientation of the polygon.
-   In the tail of a lobe, where the fit may be off by more than the lobe, it stays above a share of a clamped cosine. */
+/* Integral for F = 1 for shading, from the weights of curve 0; `orientation` is ltsh_orientation of the polygon. It is
+   at least a share of the integral of a clamped cosine, because in its tail a fit may be off by more than the lobe. */
 LTSH_FUNCTION float @prefix@_plain_integral(@prefix@_weights plain, @prefix@_moments moments, float orientation)
 {
     float integral = ltsh_larger(orientation * @prefix@_integral(plain, moments), 0.0f);
@@ -250,7 +250,7 @@ LTSH_FUNCTION float @prefix@_plain_integral(@prefix@_weights plain, @prefix@_mom
 }
 
 /* The same for a dielectric of index of refraction `ior`, from the weights of its coefficients and the integral for
-   F = 1: no dielectric reflects less than head on. */
+   F = 1. It is bounded below because no dielectric reflects less than head on. */
 LTSH_FUNCTION float @prefix@_dielectric_integral(
     @prefix@_weights dielectric, @prefix@_moments moments, float orientation, float ior, float plain_integral)
 {
@@ -261,7 +261,7 @@ LTSH_FUNCTION float @prefix@_dielectric_integral(
     return ltsh_larger(orientation * @prefix@_integral(dielectric, moments), root * root * plain_integral);
 }
 
-/* GLSL and HLSL may end here, with the #endif of the last line: what follows is for C and C++ only. */
+/* GLSL and HLSL may end here, with the #endif of the last line. What follows is for C and C++ only. */
 #ifdef @PREFIX@_DATA_FOLLOWS
 static const float @prefix@_data[@PREFIX@_DATA_COUNT] = {
 @VALUES@

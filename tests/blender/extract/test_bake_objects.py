@@ -224,6 +224,20 @@ def test_scenes_that_cannot_be_baked_say_why(tmp_path):
         baked(save(tmp_path), tmp_path / "out")
 
 
+def test_without_a_name_the_active_uv_map_is_baked_whichever_one_renders(tmp_path):
+    """As in Blender's own bake."""
+    start()
+    layers = add_plane().data.uv_layers
+    corners = np.float32([0, 0, 0.5, 0, 0.5, 0.5, 0, 0.5])
+    layers.new(name="Quarter").data.foreach_set("uv", corners)
+    layers.active, layers["UVMap"].active_render = layers["Quarter"], True
+    path = save(tmp_path)
+    for name, uv, share in ((None, "Quarter", 0.25), ("UVMap", "UVMap", 1.0)):
+        report, files = baked(path, tmp_path / uv, uv=name)
+        assert report["objects"][0]["uv"] == uv
+        assert files["Plane.exr"]["coverage.hit"].mean() == share
+
+
 def test_stopping_leaves_no_file(tmp_path):
     start()
     add_plane()

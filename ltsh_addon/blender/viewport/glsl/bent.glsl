@@ -1,18 +1,18 @@
-/* Dielectrics with an index of refraction below 1, where total reflection makes nearly a step of Fresnel's factor: its mean
-   over points of the light, by the lobe there, as in `shading.float64`. */
+/* Dielectrics with an index of refraction below 1. Total reflection makes Fresnel's factor nearly a step; its mean is
+   taken over points of the light, weighted by the lobe, as in `shading.float64`. */
 
 bool ltsh_is_bent(ltsh_point point)
 {
     return point.ior > 0.0 && point.ior < 1.0 && any(notEqual(point.dielectric.xyz, vec3(0.0)));
 }
 
-/* Fresnel's factor of light from a unit direction. */
+/* Fresnel's factor for light from the unit direction `toward`. */
 float ltsh_bent_fresnel(ltsh_point point, vec3 toward)
 {
     return ltsh_dielectric_reflectance(sqrt(clamp(0.5 + 0.5 * dot(toward, point.view), 0.0, 1.0)), point.ior);
 }
 
-/* What the lobe gives of a point of the light, but for a factor, and that times Fresnel's factor. */
+/* The reflected light of a point of the light, up to a common factor: without and with Fresnel's factor. */
 vec2 ltsh_bent_sample(ltsh_point point, ltsh_light light, vec3 offset)
 {
     float inverse = inversesqrt(max(dot(offset, offset), 1e-37));

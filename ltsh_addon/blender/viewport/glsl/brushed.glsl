@@ -1,19 +1,19 @@
-/* The anisotropic lobe, in place of the one of specular.glsl: few points in the space of stretched half vectors, where it
-   is smooth, as `shading.brdf` describes and `shading.reference` does. The frame is that of the tangent, in which the
-   stretch is diagonal. */
+/* The anisotropic lobe, in place of the one of specular.glsl. It is integrated by few points in the space of stretched
+   half vectors, where it is smooth; see `shading.brdf` and `shading.reference`. The frame is that of the tangent, in
+   which the stretch is diagonal. */
 struct specular_lobe {
     vec3 row_x; vec3 row_y; vec3 row_z; vec3 plane_0; vec3 plane_1; bool is_spare; float sharpness; float mean_sharpness;
 };
-/* How wide the lobe is in radians. */
+/* The width of the lobe in radians. */
 struct specular_weights { float width; };
 /* Integrals of the plain, the Schlick, the dip and the dielectric term. */
 struct specular_sum { vec4 values; };
 
-/* Of the point: the view, both alphas with 1, and the index of refraction. */
+/* Set for each point: the view, both alphas and 1, and the index of refraction. */
 vec3 ltsh_own_view;
 vec3 ltsh_alphas;
 float ltsh_own_ior;
-/* Of the light: the stretched half vector from which its triangles spread. */
+/* Set for each light: the stretched half vector that all of its triangles share as a corner. */
 vec3 ltsh_apex;
 
 vec3 specular_warped(specular_lobe lobe, vec3 v)
@@ -21,7 +21,7 @@ vec3 specular_warped(specular_lobe lobe, vec3 v)
     return vec3(dot(lobe.row_x, v), dot(lobe.row_y, v), dot(lobe.row_z, v));
 }
 
-/* Heights of v above the horizons. The geometric one is left out where it is the smooth one's. */
+/* Heights of v above the horizons. The geometric horizon is left out where it equals the first. */
 vec3 specular_heights(specular_lobe lobe, vec3 v, vec3 warped, float rest)
 {
 #ifdef LTSH_GEOMETRIC
@@ -31,7 +31,7 @@ vec3 specular_heights(specular_lobe lobe, vec3 v, vec3 warped, float rest)
 #endif
 }
 
-/* The terms per solid angle of unit stretched half vectors. */
+/* The four terms of the lobe per solid angle of unit stretched half vectors. */
 vec4 ltsh_lobe_at(vec3 stretched)
 {
     vec3 h = ltsh_unit(ltsh_alphas * stretched);
@@ -56,7 +56,7 @@ specular_sum specular_empty()
     return sum;
 }
 
-/* How solid angles grow from directions of light, of which h is the half vector, to stretched half vectors. */
+/* The factor by which solid angles grow from directions of light, with half vector h, to stretched half vectors. */
 float ltsh_stretching(vec3 h, float cosine)
 {
     vec3 stretched = h / ltsh_alphas;
@@ -72,10 +72,10 @@ specular_sum specular_with_spot(specular_sum sum, vec3 direction, float solid_an
     return sum;
 }
 
-/* A conic (1 - s)^2 first + 2 s (1 - s) middle + s^2 last, up to the length of vectors; first and last are unit. */
+/* The conic (1 - s)^2 first + 2 s (1 - s) middle + s^2 last; lengths do not matter, first and last are unit vectors. */
 struct ltsh_conic { vec3 first; vec3 middle; vec3 last; };
 
-/* Half vectors of a great circle are a conic, and so is their linear image. */
+/* The half vectors of a great circle form a conic, and so does their linear image. */
 ltsh_conic ltsh_conic_between(vec3 start, vec3 end)
 {
     vec3 both = start + end;
@@ -98,10 +98,10 @@ bool ltsh_is_short(vec3 first, vec3 middle, vec3 last)
     return toward >= LTSH_SHORT_ARC * sqrt(dot(middle, middle));
 }
 
-/* The triangle of the apex and an arc: 3 x 3 points. */
+/* Adds the triangle of the apex and an arc, by 3 x 3 points. */
 specular_sum ltsh_with_arc(specular_sum sum, ltsh_conic arc)
 {
-    /* Differences of vectors that are close are exact. */
+    /* Differences of close vectors are exact in floating point. */
     vec3 to_first = ltsh_apex - arc.first;
     vec3 to_last = ltsh_apex - arc.last;
     float c_first = 2.0 * dot(to_first, cross(arc.first, arc.middle - arc.first));
@@ -132,7 +132,7 @@ specular_sum specular_with_edge(specular_sum sum, vec3 start, vec3 end)
     bool left = true;
     for (int arcs = 0; arcs < LTSH_MOST_ARCS && left; ++arcs) {
         left = arcs + 1 < LTSH_MOST_ARCS && !ltsh_is_short(rest.first, rest.middle, rest.last);
-        /* Halved until the first part is short: as far as s. */
+        /* Halve until the first part, from 0 to s, is short. */
         float s = left ? 0.5 : 1.0;
         vec3 to_middle;
         vec3 place;
@@ -160,15 +160,15 @@ specular_sum specular_with_edge(specular_sum sum, vec3 start, vec3 end)
     return sum;
 }
 
-/* Sets the apex for a light: the stretched half vector of the mirrored view, where that is inside, else a mean of the
-   boundary that is near to it. */
+/* Sets the apex for a light: the stretched half vector of the mirrored view if that direction is inside the light, else
+   a mean of the light's boundary. */
 void ltsh_set_apex(specular_lobe lobe, ltsh_light light)
 {
     vec3 center = specular_warped(lobe, light.offset);
     vec3 along_u = specular_warped(lobe, light.half_u);
     vec3 along_v = specular_warped(lobe, light.half_v);
     vec3 mirror = vec3(-ltsh_own_view.xy, ltsh_own_view.z);
-    /* Of many corners every other one, and so on. */
+    /* Of many corners only every n-th is used. */
     int step = max(light.count / 8, 1);
     vec2 place = ltsh_corner(light.first + step * ((light.count - 1) / step));
     vec3 start = ltsh_unit(center + place.x * along_u + place.y * along_v);
@@ -191,7 +191,7 @@ void ltsh_set_apex(specular_lobe lobe, ltsh_light light)
     ltsh_apex = is_left || is_right ? vec3(0.0, 0.0, 1.0) : ltsh_unit(mean);
 }
 
-/* `tangent` is a texel of the G-buffer. */
+/* The lobe at a point; `tangent` is a texel of the G-buffer. */
 specular_lobe specular_along(ltsh_point point, vec4 tangent)
 {
     vec3 flat_part = tangent.xyz - dot(tangent.xyz, point.normal) * point.normal;
@@ -234,7 +234,7 @@ vec4 specular_values(specular_weights weights, specular_sum sum)
 }
 
 @INTEGRAL@
-/* To coordinates in which the lobe lies around e_z and is about one wide. */
+/* The matrix to coordinates in which the lobe lies around e_z and has a width of about 1. */
 mat3 ltsh_toward_mirror(float width)
 {
     vec3 mirror = vec3(-ltsh_own_view.xy, ltsh_own_view.z);

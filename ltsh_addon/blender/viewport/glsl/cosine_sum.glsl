@@ -1,4 +1,4 @@
-/* Integral of z over a polygon, times 2. */
+/* Twice the integral of z over a polygon. */
 struct specular_sum { float values[1]; };
 
 specular_sum specular_empty()

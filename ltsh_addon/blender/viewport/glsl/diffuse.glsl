@@ -1,15 +1,15 @@
 struct diffuse_lobe {
     vec3 plane_0; vec3 plane_1; vec3 plane_2; bool is_spare; float bump_alpha2;
 #ifdef LTSH_SHEEN
-    /* Around the normal, with the view on the side of the first axis; 1 and 0 are Lambert's. */
+    /* The frame around the normal, with the view on the side of the first axis. a = 1 and b = 0 are Lambert's lobe. */
     ltsh_frame frame; float a; float b;
 #endif
 };
 #ifdef LTSH_ROUGH
-/* Integral of the direction over a polygon, times 2, and those of rough.glsl. */
+/* Twice the integral of the direction over a polygon, and the integrals of rough.glsl. */
 struct diffuse_sum { vec3 total; vec2 rough; };
 #else
-/* Integral of the direction over a polygon, times 2. */
+/* Twice the integral of the direction over a polygon. */
 struct diffuse_sum { vec3 total; };
 #endif
 
@@ -26,7 +26,7 @@ vec3 diffuse_warped(diffuse_lobe lobe, vec3 v)
 }
 
 #ifdef LTSH_ROUGH
-/* The summands of a lobe per solid angle, and form factors from their sum. */
+/* The summands of the rough or velvet lobe per solid angle; below, the form factors from their sum. */
 vec2 ltsh_diffuse_spot(vec3 direction)
 {
 #ifdef LTSH_VELVET
@@ -80,7 +80,7 @@ diffuse_sum diffuse_with_spot(diffuse_sum sum, vec3 direction, float solid_angle
     return sum;
 }
 
-/* Heights of v above the horizons. The smooth one is left out where it is the bent one's. */
+/* Heights of v above the horizons. The smooth horizon is left out where it equals the bent one. */
 vec3 diffuse_heights(diffuse_lobe lobe, vec3 v, vec3 warped, float rest)
 {
 #ifdef LTSH_BUMPED
@@ -120,7 +120,7 @@ diffuse_lobe diffuse_at(ltsh_point point, ivec2 texel)
     return lobe;
 }
 
-/* Bump shadowing, that of `scene.SurfaceSamples`, is taken at the mean direction of the light. */
+/* The form factor of a sum. Bump shadowing, see `scene.SurfaceSamples`, is evaluated at the light's mean direction. */
 float diffuse_form_factor(diffuse_lobe lobe, diffuse_sum sum)
 {
 #ifdef LTSH_BUMPED
@@ -135,7 +135,7 @@ float diffuse_form_factor(diffuse_lobe lobe, diffuse_sum sum)
 }
 
 #ifdef LTSH_ROUGH
-/* The form factors of light that is scattered once, and of the rest. */
+/* The form factors of light that is scattered once, and of light that is scattered several times. */
 vec2 diffuse_rough_factors(diffuse_lobe lobe, diffuse_sum sum)
 {
     float plain = max(-0.5 * LTSH_ONE_OVER_PI * dot(lobe.plane_0, sum.total), 0.0);
@@ -144,7 +144,7 @@ vec2 diffuse_rough_factors(diffuse_lobe lobe, diffuse_sum sum)
 }
 #endif
 
-/* Can the lobe be integrated over a cap of the sphere by `diffuse_of_cap`? */
+/* True if `diffuse_of_cap` can integrate the lobe over a cap of the sphere. */
 bool diffuse_has_caps(diffuse_lobe lobe, bool whole)
 {
     bool has = whole || (lobe.is_spare && lobe.bump_alpha2 == 0.0);
@@ -160,7 +160,7 @@ bool diffuse_has_caps(diffuse_lobe lobe, bool whole)
     return has;
 }
 
-/* The form factor of a light that is seen as a cap of the sphere, above all horizons or cut by one (Snyder 1996). */
+/* The form factor of a light that is seen as a cap of the sphere, above the horizon or cut by it (Snyder 1996). */
 float diffuse_of_cap(diffuse_lobe lobe, ltsh_light light)
 {
     float squared = max(dot(light.offset, light.offset), 1e-37);
@@ -179,7 +179,7 @@ float diffuse_of_cap(diffuse_lobe lobe, ltsh_light light)
 }
 
 #ifdef LTSH_FOCUSED
-/* To coordinates around the diffuse normal. */
+/* The matrix to coordinates around the diffuse normal. */
 mat3 diffuse_frame(diffuse_lobe lobe)
 {
     ltsh_frame frame = ltsh_make_frame(lobe.plane_0, lobe.plane_0);

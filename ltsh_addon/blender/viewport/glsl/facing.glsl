@@ -1,4 +1,4 @@
-/* What the cone and the falloff of lights that face every point leave of them: `mean_emission` of `shading.facing`. */
+/* Factors of lights that face every point, by their cone, falloff and pattern: `mean_emission` of `shading.facing`. */
 
 #ifdef LTSH_PATTERNED
 float ltsh_pattern_value(int first, int number)
@@ -8,8 +8,9 @@ float ltsh_pattern_value(int first, int number)
     return part == 0 ? four.x : (part == 1 ? four.y : (part == 2 ? four.z : four.w));
 }
 
-/* What the pattern of a light, if it has one, makes of light along a unit direction that meets the light, its own center
-   at `offset` and `beside` that of the disk that is seen: `pattern_values` of `shading.facing`. */
+/* The factor of the light's pattern along a unit direction that meets the light, 1 without a pattern: `pattern_values`
+   of `shading.facing`. The light's own center is at `offset`; `beside` leads from the center of the disk seen to the
+   place on it, in units of the place's distance. */
 float ltsh_pattern(int header, int flags, vec3 offset, float radius, vec3 direction, vec3 beside)
 {
     int first = int(ltsh_light_texel(header + 6).w);
@@ -21,7 +22,7 @@ float ltsh_pattern(int header, int flags, vec3 offset, float radius, vec3 direct
     float along = dot(direction, axis);
     vec3 across = distance > radius ? beside : direction - along * axis;
     float sine = length(across);
-    /* By the law of sines: seen from the center, the place is so far from the point. */
+    /* The sine of the angle at the place on the ball, by the law of sines. */
     float ratio = clamp(sine * distance / max(radius, 1e-30), 0.0, 1.0);
     float root = sqrt(1.0 - ratio * ratio) * (distance > radius ? 1.0 : -1.0);
     vec3 normal = across * ((ratio * along - root * sine) / max(sine, 1e-20)) - (root * along + ratio * sine) * axis;
@@ -41,7 +42,8 @@ float ltsh_pattern(int header, int flags, vec3 offset, float radius, vec3 direct
 }
 #endif
 
-/* The factor along the ray to the place `beside` the center of the disk that is seen, its own center at `offset`. */
+/* The factor along the ray to the place center + beside on the disk that is seen. The light's own center is at
+   `offset`. */
 float ltsh_emission(int header, int flags, vec3 offset, vec3 center, vec3 beside)
 {
     vec3 place = center + beside;
@@ -78,7 +80,7 @@ float ltsh_emission(int header, int flags, vec3 offset, vec3 center, vec3 beside
     return factor;
 }
 
-/* BRDF times cosine of a white lobe, but for constants: GGX, or a cosine where alpha is negative. */
+/* BRDF times cosine of a white lobe, up to constant factors: GGX, or a cosine where alpha is negative. */
 float ltsh_lobe_value(vec3 normal, vec3 view, float alpha, vec3 direction)
 {
     float cosine = max(dot(normal, direction), 0.0);
@@ -108,7 +110,7 @@ float ltsh_mean_emission(int header, ltsh_point point, ltsh_light light, vec3 no
 {
     int flags = light.flags;
     vec3 own = ltsh_light_texel(header).xyz - point.position;
-    /* Toward the axis of the cone, where its factor changes most. */
+    /* u points toward the axis of the cone: along it the cone's factor changes most. */
     vec3 u = light.half_u;
     if ((flags & LTSH_CONE_FLAG) != 0) {
         int first = int(ltsh_light_texel(header).w);
@@ -134,7 +136,8 @@ float ltsh_mean_emission(int header, ltsh_point point, ltsh_light light, vec3 no
         most = max(most, value);
         rim += value / 6.0;
     } while (++i < 6);
-    /* The point nearest to the peak of a specular lobe, whose width may be far below the distance of the others. */
+    /* One more node at the point nearest to the peak of a specular lobe, which may be narrower than the gaps of the
+       others. */
     float squared = max(dot(light.offset, light.offset), 1e-37);
     float inverse_size = 1.0 / max(dot(light.half_u, light.half_u), 1e-37);
     vec3 mirrored = 2.0 * dot(normal, point.view) * normal - point.view;

@@ -1,7 +1,7 @@
 /* The integral of a lobe over a light with a spread or a falloff, as in `shading.light_cone`, node by node.
 
    The part of the light above all horizons is kept as a list of corners, since every disk around the foot of the point
-   cuts it anew. What lies outside a disk is drawn to its circle along radii, edge by edge, and arcs become chords. */
+   cuts it anew. Edges outside of a disk are moved along radii to its circle, and arcs become chords. */
 vec4 @name@_focused(@name@_lobe lobe, @ARGUMENTS@ltsh_light light, int header, float width, bool used)
 {
     vec4 cone = ltsh_light_texel(header + 5);
@@ -35,7 +35,7 @@ vec4 @name@_focused(@name@_lobe lobe, @ARGUMENTS@ltsh_light light, int header, f
     }
     part = ltsh_measured(part);
 
-    /* Where the lobe meets the light best, and how far it reaches there. */
+    /* The point of the light's plane at the peak of the lobe, and the width of the lobe there. */
     vec3 warped_u = @name@_warped(lobe, axis_u);
     vec3 warped_v = @name@_warped(lobe, axis_v);
     mat3 to_lobe = @FRAME@;
@@ -68,7 +68,7 @@ vec4 @name@_focused(@name@_lobe lobe, @ARGUMENTS@ltsh_light light, int header, f
     vec3 pivot_warped = foot + pivot.x * warped_u + pivot.y * warped_v;
     vec4 values = vec4(0.0);
     bool seen = part.count > 2 && part.least < reach;
-    /* After the disks comes all of the part, where the cone contains it. */
+    /* After the disks, one more layer for the whole part if the cone contains it. */
     int layers = seen ? effort.layers + (part.largest < reach ? 1 : 0) : 0;
     for (int layer = 0; layer < layers; ++layer) {
         bool all_of_it = layer == effort.layers;

@@ -1,8 +1,9 @@
-/* Which horizon ends the specular lobe of a pixel, as `cycles.horizons` decides for samples.
+/* Chooses the horizon that ends the specular lobe of a pixel, as `cycles.horizons` does for samples.
 
-   Three steps, of which the first two add up over draw calls so that lights may be many: bounds of what the lights send
-   to the pixel, what only one of both horizons lets through of the directions that lobes and lights choose, and which
-   normal that gives: where samples become two, the pixel ends at the horizon of the larger part. */
+   There are three steps. BOUNDS: bounds of the light that the lights send to the pixel. EXCESS: the light that only one
+   of both horizons lets through, by the directions that Cycles chooses by lobes and by lights. CHOICE: the normal of
+   the horizon. The first two add up over draw calls, so there may be many lights. Where `cycles.horizons` splits a
+   sample in two, the pixel takes the horizon of the larger part. */
 
 #ifndef LTSH_CHOICE
 /* A light as seen from a point; its corners are center + s * half_u + t * half_v. */
@@ -36,7 +37,7 @@ seen_light light_from(int number, vec3 position, vec3 normal)
     return light;
 }
 
-/* Does it matter for the pixel which horizon counts? */
+/* True if the choice of the horizon matters for the pixel. */
 bool has_two_horizons(ivec2 texel)
 {
     vec3 apart = abs(texelFetch(smooth_normals, texel, 0).xyz - texelFetch(geometric_normals, texel, 0).xyz);
@@ -49,8 +50,8 @@ bool has_two_horizons(ivec2 texel)
 
 #ifndef LTSH_CHOICE
 #ifdef LTSH_EXCESS
-/* Solid angle in sr. Van Oosterom and Strackee 1983, eq. 8; the volumes are those of a pyramid, exact for small lights,
-   too. */
+/* Solid angle in sr (Van Oosterom and Strackee 1983, eq. 8). Volumes are computed as those of pyramids, which is exact
+   for small lights, too. */
 float solid_angle(seen_light light)
 {
     vec3 normal = cross(light.half_u, light.half_v);
@@ -80,13 +81,14 @@ float solid_angle(seen_light light)
 }
 #endif
 
-/* Cosines of the sums of two angles of 0 to pi, with the sign -1 of their differences, from their cosines. */
+/* Cosines of the sums of two angles in [0, pi], or of their differences with the sign -1, from the cosines of both. */
 vec2 cosines_of_sums(vec2 first, float second, float sign)
 {
     return first * second - sign * sqrt(max(1.0 - first * first, 0.0) * max(1.0 - second * second, 0.0));
 }
 
-/* The most and the least that the light may send to the pixel, as `light_tree.light_bounds`; whether it sends anything. */
+/* The upper and the lower bound of the light that a light sends to the pixel, as `light_tree.light_bounds`, and whether
+   it sends any. */
 vec3 bounds(seen_light light, vec3 smooth_normal)
 {
     float far = length(light.offset);
@@ -128,7 +130,7 @@ void main()
 #endif
 
 #ifdef LTSH_EXCESS
-/* Whether neither horizon has all of the light on one side, or they differ about it. */
+/* True if a horizon cuts the light, or if the light is above one horizon and below the other. */
 bool crosses(seen_light light, vec3 smooth_normal, vec3 true_normal)
 {
     vec2 height = vec2(dot(smooth_normal, light.offset), dot(true_normal, light.offset));
@@ -151,7 +153,7 @@ bool crosses(seen_light light, vec3 smooth_normal, vec3 true_normal)
     return some && !every && light.faces;
 }
 
-/* Does the ray from the point meet the light? */
+/* True if the ray from the point meets the light. */
 bool hits(seen_light light, vec3 ray)
 {
     float steepness = dot(ray, light.direction);
@@ -181,7 +183,7 @@ bool hits(seen_light light, vec3 ray)
     return inside && steepness < 0.0;
 }
 
-/* Probability per sr that the lobe chooses a direction, GGX's visible normals (Heitz 2018, eq. 17). */
+/* Probability per sr of a direction sampled by the lobe, with GGX's visible normals (Heitz 2018, eq. 17). */
 float lobe_density(vec3 towards, vec3 towards_eye, vec3 normal, float roughness)
 {
     vec3 middle = towards + towards_eye;
@@ -214,7 +216,7 @@ float dielectric_reflectance(float cosine, float ior)
     return 0.5 * (straight * straight + along * along);
 }
 
-/* Mean reflectance for the cosine of the half angle, of mean f0, f90, weight and index of the dielectric lobe. */
+/* Mean reflectance for the cosine of the half angle; `means` are f0, f90, weight and index of the dielectric lobe. */
 float reflectance(vec4 means, float cosine)
 {
     float schlick = means.x + (means.y - means.x) * pow(1.0 - cosine, 5.0);
@@ -243,8 +245,8 @@ void main()
     vec2 chances = vec2(reflectance(means, clamp(dot(bent.xyz, towards_eye), 0.0, 1.0)), dot(base.xyz, third));
     chances /= max(chances.x + chances.y, 1e-12);
     int count = has_two_horizons(texel) ? place.y - place.x : 0;
-    /* The lights that matter, a bit for each: what stands for a graphics card runs all that is not in a loop of its own
-       for every light. */
+    /* A bit for each light that matters. Software renderers execute both sides of a branch for every light, so the
+       lights that matter have a loop of their own. */
     uint left = 0u;
     int number = 0;
     do {
@@ -291,7 +293,7 @@ void main()
     vec4 smooth_normal = texelFetch(smooth_normals, texel, 0);
     vec4 true_normal = texelFetch(geometric_normals, texel, 0);
     vec2 excess = texelFetch(excesses, texel, 0).xy;
-    /* The share of the lights' choice is more than a half, or nothing was seen of any light. */
+    /* Smooth if the lights' choice has at least half of the excess, or if there is none. */
     bool is_smooth = excess.x + excess.y == 0.0 || excess.y / (excess.x + excess.y) >= 0.5;
     color = is_smooth ? smooth_normal : true_normal;
 }

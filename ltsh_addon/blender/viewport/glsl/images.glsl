@@ -1,5 +1,5 @@
 /* Quantities of a look, from constants and images. The uniform buffer `look` is an array of vec4, see
-   `textures.look_values`. Images are read by texelFetch: Blender 4.5 has no say in a texture's filter and extension. */
+   `textures.look_values`. Images are read by texelFetch, as Blender 4.5 cannot set a texture's filter and extension. */
 
 int wrapped(int texel, int size, int extension)
 {
@@ -26,7 +26,8 @@ float decoded(float value)
   return value <= 0.04045 ? value / 12.92 : pow((value + 0.055) / 1.055, 2.4);
 }
 
-/* `encode`: as the sRGB value that Cycles interpolates; `by_alpha`: times its alpha, as Cycles has it then. */
+/* A texel of an image. With `encode` as the sRGB value, which Cycles interpolates; with `by_alpha` times its alpha, as
+   in Cycles. */
 vec4 texel_at(sampler2D image, ivec2 texel, ivec2 size, int extension, bool encode, bool by_alpha)
 {
   if (extension == EXTENSION_CLIP && (any(lessThan(texel, ivec2(0))) || any(greaterThanEqual(texel, size)))) {

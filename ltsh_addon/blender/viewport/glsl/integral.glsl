@@ -1,19 +1,21 @@
 /* The integral of a lobe over the part of a light above some horizons.
 
-   No polygon is stored: edges are integrated as they come. Every edge is cut to its part above all horizons, and what
-   closes the polygon comes from crossings: on each horizon the region's boundary is an arc, of which the part inside the
-   light adds up from where edges cross it,
+   No polygon is stored: edges are integrated as they come. Every edge is cut to its part above all horizons. The edges
+   that close the polygon run along the horizons. On each horizon the region's boundary is an arc, and the part of the
+   arc inside the light follows from the crossings of edges with the horizon:
 
        sum over crossings of +- the integral along the arc from a fixed point to the crossing, moved into the arc.
 
-   Any fixed point serves, since crossings come in pairs; the first one found is taken, which for one horizon gives the
-   closing edges of Sutherland and Hodgman (1974). A crossing beyond another horizon moves to where both horizons meet,
-   of the two such directions the one from which the light can be seen. Polygons need not be convex.
+   Any fixed point serves, since crossings come in pairs. The first crossing is taken, which for one horizon gives the
+   closing edges of Sutherland and Hodgman (1974). A crossing below another horizon is moved to the direction in which
+   both horizons meet: of the two such directions the one whose ray meets the light's plane. Polygons need not be
+   convex.
 
-   Loops end with their conditions: what stands for a graphics card may run the body once more where they begin so. */
+   Loops test their conditions at the end (do-while): with a test at the start, software renderers may execute the body
+   once more. */
 
-/* A light as the lobe sees it: is it above all horizons, below one, and the squares of its half diagonals by the distances
-   of its center and of its nearest point, at most. */
+/* A light as the lobe sees it. `whole`: above all horizons. `dark`: below one of them. `size` and `wide`: upper bounds
+   of the squared half diagonal over the distance of its center, and over that of its nearest point. */
 struct @name@_view {
     vec3 center; vec3 along_u; vec3 along_v; vec3 height; vec3 height_u; vec3 height_v; bool whole; bool dark;
     float size; float wide;
@@ -43,7 +45,7 @@ struct @name@_view {
 @SIZES@    return view;
 }
 
-/* The integral over a light that is so small that its center stands for all of it. */
+/* The integral over a light so small that its center stands for all of it. */
 @name@_sum @name@_at_center(@name@_view view, float area)
 {
     float inverse = inversesqrt(max(dot(view.center, view.center), 1e-37));
@@ -52,7 +54,7 @@ struct @name@_view {
     return @name@_with_spot(@name@_empty(), direction, solid_angle);
 }
 
-/* That over a small ellipse or parallelogram by four spots, exact for polynomials of degree 3 on it. */
+/* The integral over a small ellipse or parallelogram by four spots, exact for polynomials of degree 3 on it. */
 @name@_sum @name@_in_spots(@name@_view view, bool is_round)
 {
     float scale = inversesqrt(max(dot(view.center, view.center), 1e-37));
@@ -71,7 +73,7 @@ struct @name@_view {
     return sum;
 }
 
-/* That over a light above all horizons, by its edges. */
+/* The integral over a light above all horizons, by its edges. */
 @name@_sum @name@_of_whole(@name@_view view, ltsh_light light)
 {
     @name@_sum sum = @name@_empty();
@@ -87,7 +89,7 @@ struct @name@_view {
     return sum;
 }
 
-/* The triangle of `center` and an edge given from there, by quadrature exact for polynomials of degree 2. */
+/* Adds the triangle of `center` and an edge, whose ends are relative to it. Exact for polynomials of degree 2. */
 @name@_sum @name@_with_triangle(@name@_sum sum, vec3 center, vec3 start, vec3 end)
 {
     vec3 both = (1.0 / 6.0) * (start + end);
@@ -100,8 +102,8 @@ struct @name@_view {
     return sum;
 }
 
-/* That over the part of any light above all horizons, of `tiny` ones by triangles: of directions that lie so close
-   together rounding leaves too little of edges, and the lobe hardly varies over them. */
+/* The integral over the part of any light above all horizons. `tiny` lights are integrated by triangles: their edges
+   would lose too many digits to rounding, and the lobe hardly varies over them. */
 @name@_sum @name@_of_part(@name@_lobe lobe, @name@_view view, ltsh_light light, bool tiny)
 {
     vec3 center = view.center;
@@ -140,7 +142,7 @@ struct @name@_view {
             if (tiny) {
                 sum = @name@_with_triangle(sum, center, from, to);
             } else {
-                /* An arc of almost half a circle is split where it is nearest: its ends alone do not say where it runs. */
+                /* An arc of almost half a circle is split at its nearest point: its ends hardly tell its plane. */
                 vec3 last = ltsh_unit(to);
                 vec3 before = ltsh_unit(from);
                 vec3 both = before + last;

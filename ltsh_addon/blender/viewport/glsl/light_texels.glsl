@@ -5,14 +5,14 @@ vec4 ltsh_light_texel(int index)
 
 vec2 ltsh_corner(int texel) { return ltsh_light_texel(texel).xy; }
 
-/* Horizons of normals that are this close meet nowhere in single precision, and count as one. */
+/* True if two horizons count as one: in single precision, horizons of such close normals have no intersection. */
 bool ltsh_is_same(vec3 a, vec3 b) { return all(lessThan(abs(a - b), vec3(1e-6))); }
 
-/* A light as the point sees it: where its center is, its half axes, and the direction to which it shines. */
+/* A light as seen from a point: the vector to its center, its half axes, and the direction in which it shines. */
 struct ltsh_placed { vec3 offset; vec3 half_u; vec3 half_v; vec3 direction; };
 
-/* Of lights that face every point the disk that is seen, as by `FacingDisk` of `shading.facing`; of distant ones the
-   center is a direction. `normal` is that of the lobe. */
+/* A light as seen from `position`. For lights that face every point it is the disk that is seen, as by `FacingDisk` of
+   `shading.facing`; for distant ones the center is a direction. `normal` is that of the lobe. */
 ltsh_placed ltsh_place_light(int header, vec3 position, vec3 normal)
 {
     vec4 half_v = ltsh_light_texel(header + 2);

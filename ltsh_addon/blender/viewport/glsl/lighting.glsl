@@ -1,6 +1,6 @@
 #ifdef LTSH_SHADOWED
-/* The texels of the grid of shares around a point, and how much each counts: those of its own surface, where there are
-   any. */
+/* The four texels of the grid of shares around a point, and their weights. Texels of the point's own surface weigh
+   most. */
 struct ltsh_nearby { ivec2 first; ivec2 last; vec4 weights; };
 
 ltsh_nearby ltsh_grid_at(ltsh_point point)
@@ -27,7 +27,7 @@ ltsh_nearby ltsh_grid_at(ltsh_point point)
     return near;
 }
 
-/* The shares of a light that are seen, specular and diffuse. */
+/* The specular and the diffuse share of a light that are seen; 1 without texels around the point. */
 vec2 ltsh_seen(ltsh_nearby near, int light)
 {
     vec2 seen = near.weights.x * texelFetch(shares, ivec3(near.first, light), 0).xy
@@ -38,12 +38,13 @@ vec2 ltsh_seen(ltsh_nearby near, int light)
 }
 #endif
 
-/* Of up to 32 lights those that a lobe needs by four spots, by their edges, by those of the part above horizons, by
-   triangles of that, and by their profile; and those that are not equally bright all over: a bit for each. What stands
-   for a graphics card runs all that is not in a loop of its own for every light. */
+/* Sets of up to 32 lights, a bit for each, by the way in which a lobe is integrated over them. `spots`: by four spots.
+   `whole`: by their edges. `cut`: by the edges of the part above horizons. `tiny`: by triangles of that part.
+   `focused`: by their profile. `uneven`: not equally bright all over. Each way has a loop of its own, because software
+   renderers execute both sides of a branch for every light. */
 struct ltsh_todo { uint spots; uint whole; uint cut; uint tiny; uint focused; uint uneven; };
 
-/* Those of the lights in `kept`. */
+/* The same sets, reduced to the lights in `kept`. */
 ltsh_todo ltsh_todo_among(ltsh_todo todo, uint kept)
 {
     todo.spots &= kept;
@@ -80,7 +81,7 @@ float ltsh_area(int header, ltsh_light light)
 }
 
 #ifdef LTSH_FACING
-/* Of lights that are not equally bright all over, by their place among those of a draw call: their mean. */
+/* The mean factors of lights that are not equally bright all over, by their number in a draw call. */
 float ltsh_factors[32];
 #endif
 
@@ -128,7 +129,7 @@ void main()
     vec4 tangent = texelFetch(tangents, texel, 0);
 #ifdef LTSH_BRUSHED
     here = here && tangent.w != 0.0;
-    /* The others have been drawn. */
+    /* The other pixels have been drawn by another shader. */
     if (!here) {
         discard;
     }
@@ -226,7 +227,7 @@ void main()
     }
 #endif
 #ifdef LTSH_SKY
-    /* It comes with the first lights. */
+    /* The world's light is added in the draw call of the first lights. */
     vec4 mean = texelFetch(sky, ivec2(0, 0), 0);
     vec4 traits = texelFetch(sky, ivec2(1, 0), 0);
     if (here && place.z == 0) {

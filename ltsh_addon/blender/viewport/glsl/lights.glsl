@@ -1,9 +1,9 @@
-/* A light as seen from a point: vectors in the world, the first corner's texel and how many there are, 0 of round ones
-   for which they have not been chosen. */
+/* A light as seen from a point, with vectors in the world. `first`: texel of the first corner. `count`: number of
+   corners, 0 for round lights whose corners have not been chosen yet. */
 struct ltsh_light {
     vec3 offset; vec3 half_u; vec3 half_v; vec3 direction; int flags; int first; int count; float bound; bool is_round;
 };
-/* What is read of the surface point of a pixel. */
+/* The surface point of a pixel. */
 struct ltsh_point {
     vec3 position; vec3 view; vec3 normal; vec3 geometric; float roughness; float ior; float receiver;
     vec4 f0; vec4 f90; vec4 dielectric;
@@ -25,7 +25,7 @@ ltsh_light ltsh_seen_light(int header, ltsh_point point)
     return light;
 }
 
-/* Its corners as lobes need them that see it so `wide` (as in `specular_view`), `whole` or cut. */
+/* The light with its corners chosen, for a lobe that sees it so `wide` (see `specular_view`), and `whole` or cut. */
 ltsh_light ltsh_with_corners(ltsh_light light, float wide, bool whole)
 {
     bool round = light.is_round;
@@ -33,12 +33,12 @@ ltsh_light ltsh_with_corners(ltsh_light light, float wide, bool whole)
     return light;
 }
 
-/* Whether the light shines on the side and on the receiver that the point is on. */
+/* True if the point is on the side to which the light shines, and belongs to one of its receivers. */
 bool ltsh_receives(int header, ltsh_light light, ltsh_point point)
 {
     vec3 center = ltsh_light_texel(header).xyz;
     vec3 position = (light.flags & LTSH_DISTANT_FLAG) != 0 ? vec3(0.0) : point.position;
-    /* A flat surface that shines must not light itself where its points are rounded to behind it. */
+    /* A flat surface that emits must not light itself where rounding moves its points behind it. */
     float rounding = 4e-7 * dot(abs(center) + abs(position), vec3(1.0));
     bool facing = (light.flags & LTSH_FACING_FLAG) != 0 || dot(light.offset, light.direction) < -rounding;
     int count = int(ltsh_light_texel(header + 4).w);

@@ -1,4 +1,4 @@
-/* Moments of a polygon; to the first, the solid angle, comes twice the argument of the complex number `turn`. */
+/* Moments of a polygon. The first, the solid angle, lacks twice the argument of the complex number `turn`. */
 struct specular_sum { float values[LTSH_COEFFICIENTS]; vec2 turn; };
 
 specular_sum specular_empty()
@@ -23,7 +23,8 @@ specular_sum specular_with_edge(specular_sum moments, vec3 start, vec3 end)
     return moments;
 }
 
-/* What moments integrate: where an edge adds K_{n-1} of `edge_integrals`, (n + 1) x^n - (n - 1) |u|^2 x^(n-2). */
+/* The integrand of the moment k. Where an edge adds K_{n-1} of `edge_integrals`, it is
+   (n + 1) x^n - (n - 1) |u|^2 x^(n-2). */
 float ltsh_spot_moment(vec3 direction, float u_x, float u_z, int k)
 {
     float x = u_x * direction.x + u_z * direction.z;

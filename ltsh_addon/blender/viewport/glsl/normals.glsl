@@ -1,4 +1,4 @@
-/* Normal of a tangent space normal map. As in Cycles it bends the normal of the object before that is transformed, and
+/* Normal of a tangent space normal map. As in Cycles it bends the object's normal before the transformation, and
  * interpolated tangents are not made unit vectors. */
 vec3 mapped_normal(vec3 normal, bool backfacing)
 {
@@ -46,7 +46,7 @@ float bump_alpha2(vec3 normal, vec3 smooth_normal)
 }
 
 #ifdef DRAWS_TANGENTS
-/* The tangent of the anisotropic lobe as Cycles has it, turned around an axis. */
+/* The tangent of the anisotropic lobe as in Cycles, turned around an axis. */
 vec3 turned_tangent(vec3 smooth_normal, vec3 axis)
 {
   vec4 brush = look.data[LAYERS + 4];

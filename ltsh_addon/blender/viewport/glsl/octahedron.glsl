@@ -1,4 +1,4 @@
-/* The picture of all directions that lies around `corner` + 1, `size` texels wide, see `viewport.sky`. */
+/* The value of an octahedral map (see `viewport.sky`) `size` texels wide, whose first texel is at `corner` + 1. */
 vec3 ltsh_sky_at(vec3 direction, ivec2 corner, int size)
 {
     vec3 unit = direction / (abs(direction.x) + abs(direction.y) + abs(direction.z));

@@ -1,4 +1,4 @@
-/* What light that is scattered several times adds to a rough diffuse lobe: `shading.diffuse.rebound`. */
+/* The part of a rough diffuse lobe from light that is scattered several times: `shading.diffuse.rebound`. */
 vec3 rebound_of(vec3 color, float cosine, float sigma)
 {
   const float pi = 3.14159265;

@@ -1,4 +1,4 @@
-/* The lobe that a look has, with the weights that Cycles gives it: what `cycles.closures` does for samples. */
+/* The lobe of a look with Cycles' weights, as `cycles.closures` computes it for samples. */
 
 float table_at(sampler2D table, int row, float column)
 {
@@ -20,7 +20,7 @@ vec2 lobe_albedo(float roughness, float cosine)
   return vec2(directional, table_at(albedo_table, last + 1, roughness));
 }
 
-/* Where between f0 and 1 the albedo of a dielectric lies; the rows are those of all roughnesses and cosines. */
+/* The place of a dielectric's albedo between f0 and 1. The rows of the table are pairs of roughness and cosine. */
 float dielectric_share(float roughness, float cosine, float ior)
 {
   int last = textureSize(blend_table, 0).x - 1;
@@ -77,7 +77,8 @@ vec4 sheen_at(float cosine, float roughness)
   return mix(first, second, share.y);
 }
 
-/* What Fresnel and Layer Weight say: kind (0: 1), number, whether it is taken from 1. */
+/* The value of a Fresnel or Layer Weight node. `factor` is its kind (0: no node, value 1), its parameter, and whether
+   the result is 1 minus the value. */
 float view_factor(vec3 factor, float cosine, bool backfacing)
 {
   if (factor.x < 0.5) {
@@ -88,7 +89,7 @@ float view_factor(vec3 factor, float cosine, bool backfacing)
   return factor.z > 0.5 ? 1.0 - share : share;
 }
 
-/* The share of a lobe that is left under its coat, whose normal is seen under `cosine`. */
+/* The share of a lobe that is left under its coat, for the cosine of view and the coat's normal. */
 vec3 left_under_coat(float cosine)
 {
   float weight = look.data[LAYERS].y;
@@ -150,7 +151,7 @@ void add_dielectric(inout Lobe lobe, vec3 color, float share, float ior, float r
   vec3 reflected = tinted + (1.0 - tinted) * dielectric_share(roughness, cosine, used);
   reflected *= look.data[0].y < 0.5 ? vec3(1.0) : factor * albedo.x;
   float left = clamp(1.0 - max(max(reflected.r, reflected.g), reflected.b), 0.0, 1.0);
-  /* What the transmission reflects has the same lobe; its light goes through and is not seen. */
+  /* The reflection of the transmission has the same lobe. Transmitted light itself is not seen. */
   float through = look.data[1].w;
   vec3 constant_part = (tinted - plain) / (1.0 - plain) * factor * share;
   lobe.f0 += constant_part;
@@ -196,7 +197,7 @@ Lobe lobe_of_look(vec3 color, float roughness, float metallic, float ior, float 
   else if (kind == SHEEN) {
     vec4 fuzz = sheen_at(cosine, roughness);
     lobe.diffuse = color * max(fuzz.x, 0.0);
-    /* As `GBufferTextures` has it. */
+    /* The layout of `GBufferTextures` for sheen. */
     lobe.ior = -max(fuzz.y, 1e-6);
     lobe.roughness = fuzz.z;
   }
@@ -206,7 +207,7 @@ Lobe lobe_of_look(vec3 color, float roughness, float metallic, float ior, float 
   return lobe;
 }
 
-/* What is seen of things behind: light crosses the surface twice, before and behind what is inside. */
+/* The share of light from behind that is seen: it crosses the surface twice, on its way in and on its way out. */
 vec3 let_through(vec3 color, float metallic, float ior, float cosine)
 {
   int kind = int(look.data[0].x + 0.5);

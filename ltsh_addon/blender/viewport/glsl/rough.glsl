@@ -1,21 +1,21 @@
-/* The rough diffuse lobe, as `shading.diffuse` describes it: integrals over arcs of functions without poles. Arcs run by
-   the tangent of half the angle from their middle, so that nothing is asked of arc functions. */
+/* The rough diffuse lobe, as `shading.diffuse` describes it, by integrals over arcs of functions without poles. Arcs
+   are parametrized by the tangent of half the angle from their middle, without inverse trigonometric functions. */
 
-/* Of the point: the axes with the normal z and the view beside x, the view's cosine and sine, and A and B of the lobe, 0
-   where it is Lambert's. */
+/* Set for each point: the axes, z along the normal and x toward the view; cosine and sine of the view; A and B of the
+   lobe, 0 for Lambert's. */
 vec3 ltsh_rough_x;
 vec3 ltsh_rough_y;
 vec3 ltsh_rough_z;
 vec2 ltsh_rough_view;
 vec2 ltsh_rough_terms;
-/* What light that is scattered several times adds. */
+/* The part of light that is scattered several times. */
 vec3 ltsh_rebound;
 #ifdef LTSH_VELVET
-/* Sigma, 0 where there is no velvet. */
+/* Sigma of velvet; 0: no velvet. */
 float ltsh_velvet;
 #endif
 
-/* `texel` is one of the G-buffer. */
+/* Sets these values; `texel` is the G-buffer's texel of the rebound. */
 void ltsh_set_rough(vec3 normal, vec3 view, vec4 texel)
 {
     ltsh_frame frame = ltsh_make_frame(normal, view);
@@ -32,7 +32,7 @@ void ltsh_set_rough(vec3 normal, vec3 view, vec4 texel)
 #endif
 }
 
-/* Integral of z G(z) from z to 1, over 1 - z^2: G is `rough_slope`. */
+/* The integral of z G(z) from z to 1, divided by 1 - z^2; G is `rough_slope`. */
 float ltsh_mean_slope_above(float z)
 {
     float root = sqrt(max(1.0 - z, 0.0));
@@ -41,11 +41,12 @@ float ltsh_mean_slope_above(float z)
     return root * value;
 }
 
-/* t / x, over the sine of the view, times z. */
+/* z t / (x sine of the view). */
 float ltsh_rough_share(float x, float z) { return x > 0.0 ? z / max(z, ltsh_rough_view.x) : z; }
 
-/* What is added where a polygon leaves the side of the view at (0, y, z), and taken away where it comes back: the
-   integral of sin^2 (z / max(z, cosine of the view) - z) over the angle from the normal, of the sign of y. */
+/* The term of a polygon that crosses the plane x = 0 at (0, y, z): added where it leaves the side of the view,
+   subtracted where it comes back. It is the integral of sin^2 (z / max(z, cosine of the view) - z) over the angle from
+   the normal, with the sign of y. */
 float ltsh_rough_closing(float y, float z)
 {
     float least = max(z, ltsh_rough_view.x);
@@ -56,8 +57,9 @@ float ltsh_rough_closing(float y, float z)
     return y < 0.0 ? -whole : whole;
 }
 
-/* Where an arc, given by its middle and the direction at a right angle to that, is as high as the view: by the tangent
-   of half the angle from the middle, at most `reach`. */
+/* The places where an arc is as high as the view, where the integrand has kinks; as tangents of half the angle from the
+   middle, limited to `reach`. `middle` and `along` are the heights of the arc's middle and of the direction at a right
+   angle to it. */
 vec2 ltsh_rough_kinks(float middle, float along, float reach)
 {
     float discriminant = along * along + middle * middle - ltsh_rough_view.x * ltsh_rough_view.x;
@@ -67,7 +69,7 @@ vec2 ltsh_rough_kinks(float middle, float along, float reach)
     return discriminant > 0.0 ? kinks : vec2(reach);
 }
 
-/* Of an edge what adds up to integrals of z t over the sine of the view, and of z G(z). */
+/* The summands of an edge for the integrals of z t / (sine of the view) and of z G(z). */
 vec2 ltsh_rough_edge(vec3 start, vec3 end)
 {
     vec3 along = vec3(dot(ltsh_rough_x, end - start), dot(ltsh_rough_y, end - start), dot(ltsh_rough_z, end - start));
@@ -88,7 +90,7 @@ vec2 ltsh_rough_edge(vec3 start, vec3 end)
     float from = -reach;
     bool left = ltsh_rough_terms.y > 0.0 && chord > 0.0;
     while (left) {
-        /* To what comes first of where it crosses and where it has a kink. */
+        /* Up to the next crossing or kink. */
         float to = cut > from ? cut : reach;
         to = kinks.x > from ? min(to, kinks.x) : to;
         to = kinks.y > from ? min(to, kinks.y) : to;
@@ -99,7 +101,7 @@ vec2 ltsh_rough_edge(vec3 start, vec3 end)
             float place = k % 2 == 0 ? nodes[k / 2] : -nodes[k / 2];
             float t = 0.5 * (from + to + place * (to - from));
             float inverse = 1.0 / (1.0 + t * t);
-            /* The angle changes by twice the inverse. */
+            /* The angle changes by 2 inverse dt. */
             float weight = (to - from) * weights[k / 2] * inverse;
             vec3 node = inverse * ((1.0 - t * t) * middle + 2.0 * t * along);
             float rise = inverse * ((1.0 - t * t) * along.z - 2.0 * t * middle.z);
@@ -116,7 +118,7 @@ vec2 ltsh_rough_edge(vec3 start, vec3 end)
     return sum;
 }
 
-/* The same of a direction, per solid angle. */
+/* The integrands for a direction, per solid angle. */
 vec2 ltsh_rough_spot(vec3 direction)
 {
     float x = dot(ltsh_rough_x, direction);
@@ -124,7 +126,7 @@ vec2 ltsh_rough_spot(vec3 direction)
     return vec2(x * ltsh_rough_share(x, z), z * rough_slope(z));
 }
 
-/* Integrals of z (A + B t) and of z (1 - E(z)), from the form factor and the sum of edges or spots. */
+/* The integrals of z (A + B t) and of z (1 - E(z)), from the form factor and the sum of edges or spots. */
 vec2 ltsh_rough_factors(float form_factor, vec2 sum)
 {
     float a = LTSH_PI * ltsh_rough_terms.x;

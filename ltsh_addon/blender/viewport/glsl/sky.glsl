@@ -1,7 +1,7 @@
-/* The light of the world, from a texture that `textures.sky_texels` describes: its mean is integrated exactly, what
-   differs from that at points of the lobe, each over as much of the picture as it stands for. */
+/* The light of the world, from a texture of `sky.sky_texels`. Its mean is integrated exactly. The difference from the
+   mean is sampled at points of the lobe, each averaged over the part of the map that the point stands for. */
 
-/* The mean of the picture over about so large a solid angle around a unit direction; `dither` between 0 and 1. */
+/* The mean of the map over about this solid angle around a unit direction. `dither` in [0, 1] selects the level. */
 vec3 ltsh_sky_around(vec3 direction, float solid_angle, float dither)
 {
     float stretch = abs(direction.x) + abs(direction.y) + abs(direction.z);
@@ -15,7 +15,7 @@ vec3 ltsh_sky_around(vec3 direction, float solid_angle, float dither)
 }
 
 #ifdef LTSH_SPECULAR
-/* All directions above a normal as a light: a rectangle so large that next to nothing is beside it. */
+/* All directions above a normal as a light: a rectangle so large that it covers practically all of them. */
 ltsh_light ltsh_whole_sky(vec3 normal)
 {
     vec3 tangent = ltsh_unit(cross(normal, abs(normal.x) < 0.7 ? vec3(1.0, 0.0, 0.0) : vec3(0.0, 1.0, 0.0)));
@@ -87,7 +87,8 @@ vec3 ltsh_sky_specular(ltsh_point point, specular_lobe lobe, specular_weights we
 #endif
 
 #ifdef LTSH_ROUGH
-/* What another diffuse lobe reflects more than Lambert's, at points as they lie for that. */
+/* The difference between the light that a rough or velvet lobe reflects and that of Lambert's lobe, by points that are
+   distributed as for Lambert's. */
 vec3 ltsh_rough_sky(vec4 mean)
 {
     vec2 terms = ltsh_rough_terms;
@@ -96,7 +97,8 @@ vec3 ltsh_rough_sky(vec4 mean)
     bool other = terms.y > 0.0;
     float lambert = 1.0;
 #ifdef LTSH_VELVET
-    /* There the rebound is the albedo. Nothing is like Lambert's: it is taken away whole. */
+    /* For velvet the rebound is the albedo. Its lobe has no Lambertian part, so Lambert's lobe is replaced, not
+       corrected. */
     other = other || ltsh_velvet > 0.0;
     lambert = ltsh_velvet > 0.0 ? 0.0 : 1.0;
     all_of_it = ltsh_velvet > 0.0 ? vec2(0.0, 1.0) : all_of_it;
@@ -106,7 +108,7 @@ vec3 ltsh_rough_sky(vec4 mean)
     for (int k = 0; k < count; ++k) {
         float squared = (float(k) + jitter.x) / float(LTSH_SKY_POINTS);
         float angle = 2.3999632 * float(k) + jitter.y;
-        /* Velvet reflects most at grazing angles. */
+        /* Velvet reflects most at grazing angles, so its points are uniform in height. */
         float height = lambert > 0.0 ? sqrt(1.0 - squared) : 1.0 - squared;
         vec3 local = vec3(sqrt(1.0 - height * height) * vec2(cos(angle), sin(angle)), height);
         vec3 direction = local.x * ltsh_rough_x + local.y * ltsh_rough_y + height * ltsh_rough_z;
@@ -121,7 +123,7 @@ vec3 ltsh_rough_sky(vec4 mean)
 #endif
 
 #ifdef LTSH_DIFFUSE
-/* Of the part below a second horizon as much is missing as of a world that is the same everywhere. */
+/* The diffuse light of the world. A second horizon takes the same share as it would from a constant world. */
 vec3 ltsh_sky_diffuse(diffuse_lobe lobe, vec4 mean)
 {
     diffuse_sum sum;

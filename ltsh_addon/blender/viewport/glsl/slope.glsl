@@ -1,4 +1,4 @@
-/* What B adds to the albedo of a rough diffuse surface, seen or lit under `cosine`: `shading.diffuse.albedo_slope`. */
+/* The term of B in the albedo of a rough diffuse surface under `cosine`: `shading.diffuse.albedo_slope`. */
 float rough_slope(float cosine)
 {
     float root = sqrt(max(1.0 - cosine, 0.0));

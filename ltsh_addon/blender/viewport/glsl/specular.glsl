@@ -1,7 +1,7 @@
 @SUM@
 /* Axes of the warped local frame, and the normals of the horizons. */
 struct specular_lobe { vec3 row_x; vec3 row_y; vec3 row_z; vec3 plane_0; vec3 plane_1; vec3 plane_2; bool is_spare; };
-/* Weights of the moments by Fresnel term, and how wide the lobe is in radians. */
+/* Weights of the moments by Fresnel term, and the width of the lobe in radians. */
 struct specular_weights {
     float plain[LTSH_COEFFICIENTS]; float schlick[LTSH_COEFFICIENTS]; float dip[LTSH_COEFFICIENTS];
     float dielectric[LTSH_COEFFICIENTS]; float width;
@@ -12,7 +12,7 @@ vec3 specular_warped(specular_lobe lobe, vec3 v)
     return vec3(dot(lobe.row_x, v), dot(lobe.row_y, v), dot(lobe.row_z, v));
 }
 
-/* Heights of v above the horizons. The geometric one is left out where it is the smooth one's. */
+/* Heights of v above the horizons. The geometric horizon is left out where it equals that of the shading normal. */
 vec3 specular_heights(specular_lobe lobe, vec3 v, vec3 warped, float rest)
 {
 #if defined(LTSH_COSINE) && defined(LTSH_GEOMETRIC)
@@ -45,7 +45,8 @@ specular_sum ltsh_curve_at(ltsh_cell cell, int curve)
     return weights;
 }
 
-/* Weights of four curves for a dielectric; w of column 1 is 1 + the number of its own curve, if it has one. */
+/* A texel of `textures.dielectric_texels`: weights of curves for a dielectric. The w of column 1 is 1 + the number of
+   the dielectric's own curve, if it has one. */
 vec4 ltsh_dielectric_texel(float position, int column)
 {
     int last = textureSize(dielectrics, 0).y - 1;
@@ -151,7 +152,7 @@ vec4 specular_values(specular_weights weights, specular_sum sum)
     sum = specular_finished(sum);
     float plain = ltsh_product(weights.plain, sum);
 #ifndef LTSH_COSINE
-    /* As in `lobes.LEAST_SHARE`: the third moment is twice the integral of z. */
+    /* The lower limit of `lobes.LEAST_SHARE`: the third moment is twice the integral of z. */
     plain = max(plain, -LTSH_LEAST_OF_COSINE * sum.values[2]);
 #endif
     float dielectric = ltsh_product(weights.dielectric, sum);
@@ -159,7 +160,7 @@ vec4 specular_values(specular_weights weights, specular_sum sum)
 }
 
 #ifndef LTSH_COSINE
-/* As `tails.TailLimits.apply`; `profile` are the least and the greatest value of that of the light. */
+/* The values within their limits, as by `tails.TailLimits.apply`; `profile` is the range of the light's profile. */
 vec4 specular_limited(vec4 values, ltsh_point point, ltsh_light light, float area, vec2 profile)
 {
     ltsh_extent extent;
@@ -181,7 +182,7 @@ vec4 specular_limited(vec4 values, ltsh_point point, ltsh_light light, float are
 #endif
 
 #ifndef LTSH_COSINE
-/* The same for lights so small that their center stands for all of them: in the tail the values are the true ones. */
+/* The same for lights so small that their center stands for all of them; exact in the tail of the lobe. */
 vec4 specular_true_in_tails(vec4 values, ltsh_point point, ltsh_light light, float area)
 {
     float squared = dot(light.offset, light.offset);

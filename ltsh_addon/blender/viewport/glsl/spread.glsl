@@ -1,24 +1,27 @@
-/* Parts of lights in their planes, and what disks leave of them: `DiskParts` of `shading.light_cone`. */
+/* Parts of lights in their planes, cut by disks: `DiskParts` of `shading.light_cone`. */
 
-/* A part of a light in coordinates of its plane with the foot of the point as the origin, and what disks need of it.
-   Its corners are a variable of their own: compilers take minutes over structures that hold arrays. */
+/* A part of a light, in coordinates of its plane with the foot of the point as the origin: number of corners, least and
+   largest distance from the foot, whether it contains the foot, and the direction toward its nearest point. The corners
+   are a separate variable, because compilers take minutes for structures that hold arrays. */
 vec2 ltsh_corners[LTSH_MOST_CORNERS];
 struct ltsh_part { int count; float least; float largest; bool encloses; vec2 forward; };
-/* How a light is taken apart: texels of nodes and corners, and how many there are of each. */
+/* The resolution of the quadrature over a light: layers and the texel of their nodes, chords per arc, and the texel and
+   number of corners. */
 struct ltsh_effort { int layers; int nodes; int chords; int first; int count; };
-/* Of an edge: its part inside a disk, and the angles from `forward` of its ends and of those of that part. */
+/* An edge and a disk: the part inside the disk as shares `first` to `last` of the edge, and the angles from `forward`
+   of the ends of the edge (`start`, `end`) and of this part (`entry`, `leave`). */
 struct ltsh_cut { float first; float last; float start; float entry; float leave; float end; };
 
 float ltsh_cross2(vec2 a, vec2 b) { return a.x * b.y - a.y * b.x; }
 
-/* By what the falloff, its power and smoothing, multiplies the light of places at the square of a distance. */
+/* The factor of the falloff (power, smoothing) for a squared distance. */
 float ltsh_falloff(vec2 falloff, float squared)
 {
     float power = falloff.x < 0.5 ? 1.0 : (falloff.x < 1.5 ? sqrt(squared) : squared);
     return power * (falloff.y > 0.0 ? squared / (squared + falloff.y) : 1.0);
 }
 
-/* The profile of a light, and by how much it sinks per radius, as in `shading.light_cone`. */
+/* The profile of a light at a radius, as in `shading.light_cone`; `ltsh_descent` is its negative derivative. */
 float ltsh_profile(vec4 cone, vec2 falloff, float radius, float distance)
 {
     return max((cone.x - radius / distance) * cone.y, 0.0) * ltsh_falloff(falloff, distance * distance + radius * radius);
@@ -71,7 +74,7 @@ ltsh_effort ltsh_effort_of(ltsh_light light, vec2 falloff, float width, float ex
     return effort;
 }
 
-/* The convex part in which height + s * height_u + t * height_v is positive; corners are s, t. */
+/* The convex part where height + s * height_u + t * height_v is positive; corners are s, t. */
 ltsh_part ltsh_above(ltsh_part part, float height, float height_u, float height_v)
 {
     int kept = 0;
@@ -80,7 +83,7 @@ ltsh_part ltsh_above(ltsh_part part, float height, float height_u, float height_
     vec2 current = ltsh_corners[0];
     for (int i = 0; i < part.count; ++i) {
         float current_height = height + current.x * height_u + current.y * height_v;
-        /* Up to two corners are written: the next is read before. */
+        /* Read the next corner first, since up to two corners are written below. */
         vec2 next = ltsh_corners[min(i + 1, part.count - 1)];
         if ((previous_height > 0.0) != (current_height > 0.0)) {
             float share = previous_height / (previous_height - current_height);
@@ -99,7 +102,7 @@ ltsh_part ltsh_above(ltsh_part part, float height, float height_u, float height_
     return part;
 }
 
-/* Nearest and farthest distance of the part from the foot, and whether that lies in it. */
+/* The part with its distances from the foot, `encloses` and `forward`. */
 ltsh_part ltsh_measured(ltsh_part part)
 {
     part.largest = 0.0;
@@ -115,7 +118,7 @@ ltsh_part ltsh_measured(ltsh_part part)
         vec2 start = ltsh_corners[i];
         vec2 along = ltsh_corners[i + 1 < part.count ? i + 1 : 0] - start;
         float squared = dot(along, along);
-        /* An edge between corners that rounding alone tells apart has no sides. */
+        /* An edge so short that only rounding separates its corners has no sides. */
         bool has_side = squared > 1.2e-7 * part.largest;
         float side = ltsh_cross2(start, along);
         left = left && (side >= 0.0 || !has_side);
@@ -159,7 +162,7 @@ ltsh_cut ltsh_cut_of(ltsh_part part, int i, float radius)
     return edge;
 }
 
-/* Corner number k of `chords` chords from angle to angle that enclose the area of the arc. */
+/* Corner number k of `chords` chords that enclose the area of the arc from `start` to `end`. */
 vec2 ltsh_arc_corner(ltsh_part part, float start, float end, float size, int chords, int k)
 {
     float turn = end - start;

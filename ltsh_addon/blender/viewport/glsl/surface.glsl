@@ -1,7 +1,7 @@
-/* Surfaces into the G-buffer, lobe by lobe: what `cycles.lobes` does for samples. */
+/* Draws surfaces into the G-buffer, lobe by lobe, as `cycles.lobes` computes samples. */
 
 #if defined(IS_FURTHER) || defined(DRAWS_EMISSION) || defined(DRAWS_THROUGH)
-/* What is drawn later is drawn where it is the surface of the G-buffer. */
+/* True if this is the surface of the G-buffer, for everything that is drawn after the first lobe. */
 bool is_seen()
 {
   vec4 seen = texelFetch(positions, ivec2(gl_FragCoord.xy), 0);
@@ -30,7 +30,7 @@ void main()
   vec3 smooth_normal = normalize(v_normal) * (backfacing ? -1.0 : 1.0);
   vec3 true_normal = normalize(cross(dFdx(v_position), dFdy(v_position)));
   true_normal *= dot(true_normal, towards_eye) < 0.0 ? -1.0 : 1.0;
-  /* Exact where it can be: derivatives are rounded. */
+  /* Derivatives are rounded: for flat meshes the normals of the mesh are exact. */
   true_normal = placement.z > 0.0 ? true_normal : smooth_normal;
   vec3 diffuse_normal = smooth_normal;
   vec3 specular_normal = smooth_normal;
@@ -88,7 +88,7 @@ void main()
   out_rebound = vec4(rebound_of(color, cosine, sigma), sigma);
   if (int(look.data[0].x + 0.5) == VELVET) {
     float roughness = clamp(slot_value(roughness_image, ROUGHNESS_SLOT, v_uv).x, LEAST_VELVET, 1.0);
-    /* As `GBufferTextures` has it. */
+    /* The layout of `GBufferTextures` for velvet. */
     out_rebound = vec4(vec3(sheen_at(cosine, roughness).w), -roughness);
   }
 #else

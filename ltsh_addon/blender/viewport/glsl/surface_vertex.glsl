@@ -3,7 +3,7 @@ void main()
   vec4 world = model * vec4(position, 1.0);
   v_position = world.xyz;
   v_normal = transpose(inverse(mat3(model))) * normal;
-  /* A mesh with one user Cycles moves into the world, and there its normals have unit length again. */
+  /* Cycles transforms meshes with one user to world space, and normalizes their normals there. */
   v_normal /= ONLY_USER ? max(length(v_normal), 1e-30) : 1.0;
   v_object_normal = normal;
   v_uv = uv;

@@ -1,4 +1,4 @@
-/* What is lit behind, in front of the background, through glass where there is any. */
+/* The lit surfaces over the background, dimmed by glass where there is any. */
 void main()
 {
   ivec2 texel = ivec2(gl_FragCoord.xy);

@@ -1,6 +1,6 @@
-/* Ashikhmin's sheen, by quadrature in the triangles between the edges of a light and a direction near to its middle. */
+/* Ashikhmin's sheen, by quadrature over the triangles between the edges of a light and a direction near its middle. */
 
-/* Of the light: that direction. */
+/* Set for each light: that direction. */
 vec3 ltsh_velvet_apex;
 
 /* `shading.diffuse.velvet_lobe`. */
@@ -9,7 +9,7 @@ float ltsh_velvet_lobe(vec3 direction)
     float x = dot(ltsh_rough_x, direction);
     float z = max(dot(ltsh_rough_z, direction), 0.0);
     float cosine = ltsh_rough_view.x;
-    /* Squared cosines of half the angle between both rays, and of the normal to the half vector. */
+    /* Squared cosines of half the angle between both rays, and of the angle between normal and half vector. */
     float halved = max(0.5 * (1.0 + cosine * z + ltsh_rough_view.y * x), 1e-6);
     float normal = clamp((cosine + z) * (cosine + z) / (4.0 * halved), 0.0, 1.0 - 1e-6);
     float masked = min(1.0, 2.0 * sqrt(normal / halved) * min(cosine, z));
@@ -20,7 +20,7 @@ float ltsh_velvet_lobe(vec3 direction)
 
 void ltsh_set_velvet_apex(ltsh_light light)
 {
-    /* Between the middle and what is nearest. */
+    /* Between the light's center and its point nearest to the shaded point. */
     float u = clamp(-dot(light.offset, light.half_u) / max(dot(light.half_u, light.half_u), 1e-37), -1.0, 1.0);
     float v = clamp(-dot(light.offset, light.half_v) / max(dot(light.half_v, light.half_v), 1e-37), -1.0, 1.0);
     vec3 near = light.offset + u * light.half_u + v * light.half_v;
@@ -49,7 +49,7 @@ float ltsh_velvet_triangle(vec3 start, vec3 end)
     return volume * sum;
 }
 
-/* Long edges in four. */
+/* The integral over the triangle of an edge; long edges are divided into four. */
 float ltsh_velvet_edge(vec3 start, vec3 end)
 {
     bool is_long = dot(start, end) < 0.6;

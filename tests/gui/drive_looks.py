@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import bpy
-from hands import close_window, drag, operate, over, results_opened, select, settings
+from hands import close_window, drag, module, operate, over, results_opened, select, settings
 
 SECONDS = 1200
 SIZE = "1600x900"
@@ -31,6 +31,7 @@ def main(rig):
     select(rig, bpy.data.objects["Sunset"])
     yield 6
     rig.shot("1_dark_preview.png")
+    quiet_line_is_clear(rig, "beside the sidebar")
     theme("Blender_Light")
     yield 3
     rig.shot("2_light.png")
@@ -42,6 +43,7 @@ def main(rig):
     # Panels move to their new places, slowly on a busy machine.
     yield 6
     rig.shot("4_twice_the_scale.png")
+    quiet_line_is_clear(rig, "at twice the scale")
     # Those that are further down.
     yield from over(rig, "VIEW_3D", "UI")
     rig.xdo("click", "--repeat", 20, 5)
@@ -82,6 +84,17 @@ def two_windows(rig):
     yield 1
 
 
+def quiet_line_is_clear(rig, where):
+    """What the view leaves out stands beside Blender's own regions."""
+    view, region = module("engine.view"), rig.region()
+    sides = view.covered(rig.area("VIEW_3D"), region)
+    place = view._places.get(region.as_pointer())
+    rig.fact(f"quiet line {where}: left and right, px", place and (round(place[0]), round(place[2])))
+    left, right = max(sides["LEFT"], sides["FLOAT"]), region.width - sides["RIGHT"]
+    rig.fact(f"room for it {where}, px", (left, right))
+    rig.check(place is not None and left <= place[0] and place[2] <= right, f"the quiet line is clear {where}")
+
+
 def theme(name):
     """Choose one of Blender's own themes."""
     folder = Path(bpy.utils.resource_path("LOCAL")) / "scripts" / "presets" / "interface_theme"
@@ -110,9 +123,9 @@ def preferences(rig):
     import addon_utils
 
     addon_utils.modules_refresh()
-    for module in addon_utils.modules():
-        if module.__name__ == "bl_ext.user_default.ltsh":
-            addon_utils.module_bl_info(module)["show_expanded"] = True
+    for addon in addon_utils.modules():
+        if addon.__name__ == "bl_ext.user_default.ltsh":
+            addon_utils.module_bl_info(addon)["show_expanded"] = True
     yield 2
     rig.shot("6_preferences.png")
     close_window(window)

@@ -381,6 +381,21 @@ def draw_rectangle(left: float, bottom: float, right: float, top: float, color) 
     gpu.state.blend_set("NONE")
 
 
+def covered(area, region) -> dict[str, int]:
+    """Pixels of `region` that other regions of its area lie over, by their side; FLOAT: at the left, too."""
+    sides = {"LEFT": 0, "RIGHT": 0, "BOTTOM": 0, "TOP": 0, "FLOAT": 0}
+    x, y, width, height = region.x, region.y, region.width, region.height
+    for part in area.regions:
+        is_over = part.x < x + width and x < part.x + part.width and part.y < y + height and y < part.y + part.height
+        if part.type == "WINDOW" or not is_over or min(part.width, part.height) <= 1:
+            continue
+        reach = {"LEFT": part.x + part.width - x, "RIGHT": x + width - part.x, "BOTTOM": part.y + part.height - y,
+                 "TOP": y + height - part.y, "FLOAT": part.x + part.width - x}  # fmt: skip
+        if part.alignment in sides:
+            sides[part.alignment] = max(sides[part.alignment], reach[part.alignment])
+    return sides
+
+
 def draw_gradient(left: float, bottom: float, right: float, top: float, colors) -> None:
     """Colors (N, 3) in display values from left to right."""
     count = len(colors)

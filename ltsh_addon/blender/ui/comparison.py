@@ -364,7 +364,7 @@ class LTSH_OT_probe(bpy.types.Operator):
 
 # Over an image, in pixels of the region, at the interface's scale.
 FONT = 0
-TEXT_SIZE = 11.0
+TEXT_SIZE, ROW = 11.0, 26.0  # and from label to label
 # Readable on any picture and in any theme. Blender blends linear colors: a thinner plate is pale on a white picture.
 INK, PLATE = (1.0, 1.0, 1.0, 1.0), (0.0, 0.0, 0.0, 0.97)
 PAPER, LINE = (0.0, 0.0, 0.0, 0.6), (1.0, 1.0, 1.0, 0.9)
@@ -418,6 +418,17 @@ def draw_text(x: float, y: float, text: str, scale: float, color=INK) -> None:
     blf.color(FONT, *color)
     blf.position(FONT, x, y, 0.0)
     blf.draw(FONT, text)
+
+
+def label_places(corners, area, region, scale: float, rows: int) -> tuple[float, float, float, float]:
+    """Where labels of a picture begin and end from left to right, and the lower ends of the first of `rows` below it
+    and of the one above it: beside what is seen of it, on it where there is no room. `corners` of the picture are left,
+    bottom, right and top in pixels of `region`."""
+    left, bottom, right, top = corners
+    sides, gap = covered(area, region), 6.0 * scale
+    start, end = max(left, sides["LEFT"] + gap), min(right, region.width - sides["RIGHT"] - gap)
+    below = max(bottom - ROW * scale, sides["BOTTOM"] + gap + (rows - 1) * ROW * scale)
+    return start, end, below, min(top + gap, region.height - sides["TOP"] - ROW * scale)
 
 
 def draw_label(x: float, y: float, text: str, scale: float, align: float = 0.0) -> None:
@@ -553,24 +564,25 @@ def _draw() -> None:
     first, second = labels[choice.first], labels[choice.second]
     left, bottom = region.view2d.view_to_region(0.0, 0.0, clip=False)
     right, top = region.view2d.view_to_region(1.0, 1.0, clip=False)
-    below, gap = bottom - 26.0 * scale, 6.0 * scale
+    rows = 2 if settings.mode == "ERROR" else 1
+    start, end, below, above = label_places((left, bottom, right, top), context.area, region, scale, rows)
     if settings.mode == "WIPE":
         _draw_line(line_position(context), bottom, top, scale)
-        draw_label(left, below, first, scale)
-        draw_label(right, below, second, scale, align=1.0)
+        draw_label(start, below, first, scale)
+        draw_label(end, below, second, scale, align=1.0)
     elif settings.mode == "SIDE":
-        draw_label(left, below, first, scale)
-        draw_label((left + right) / 2.0, below, second, scale)
+        draw_label(start, below, first, scale)
+        draw_label(max((left + right) / 2.0, start), below, second, scale)
     elif settings.mode == "MIX":
-        draw_label(left, below, results.mix_label(context.scene), scale)
+        draw_label(start, below, results.mix_label(context.scene), scale)
     elif settings.mode == "A":
-        draw_label(left, below, first, scale)
+        draw_label(start, below, first, scale)
     else:
-        draw_label(left, below, f"{first} \u2212 {second}", scale)
+        draw_label(start, below, f"{first} \u2212 {second}", scale)
         limit = error_scale(settings, result.groups[choice.group], choice)
-        _draw_legend(left, below - 26.0 * scale, limit, scale)
+        _draw_legend(start, below - ROW * scale, limit, scale)
     if result.partial:
-        draw_label(left, top + gap, result.partial, scale)
+        draw_label(start, above, result.partial, scale)
     draw_probe(context, result, choice, (left, bottom, right, top))
 
 

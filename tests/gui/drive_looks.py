@@ -29,7 +29,7 @@ def main(rig):
     rig.shot("1_dark.png")
     operate(rig, bpy.ops.ltsh.preview)
     select(rig, bpy.data.objects["Sunset"])
-    yield 6
+    yield from at_rest()
     rig.shot("1_dark_preview.png")
     quiet_line_is_clear(rig, "beside the sidebar")
     theme("Blender_Light")
@@ -40,8 +40,7 @@ def main(rig):
     rig.shot("3_narrow.png")
     settings().mode = "ERROR"
     bpy.context.preferences.view.ui_scale = 2.0
-    # Panels move to their new places, slowly on a busy machine.
-    yield 6
+    yield from at_rest()
     rig.shot("4_twice_the_scale.png")
     quiet_line_is_clear(rig, "at twice the scale")
     # Those that are further down.
@@ -64,6 +63,12 @@ def main(rig):
     yield 1
     yield from two_windows(rig)
     yield from preferences(rig)
+
+
+def at_rest(redraws=8):
+    """Wait until panels have moved to their new places: that takes some redraws, which a busy machine makes slowly."""
+    for _ in range(redraws):
+        yield 1
 
 
 def two_windows(rig):

@@ -79,9 +79,8 @@ def refresh(scene) -> bool:
     pictures = [results.pixels_of(image) for image in _chosen_images(scene, result, choice)]
     if len(pictures) < 2 or pictures[0].shape != pictures[1].shape or not pictures[0].size:
         return False
-    mode = scene.ltsh.mode
-    pixels = compose(*pictures, mode, split_of(scene), error_scale(scene.ltsh, group, choice))
-    _show(scene, pixels, mode != "ERROR")
+    pixels = compose(*pictures, choice.mode, split_of(scene), error_scale(scene.ltsh, group, choice))
+    _show(scene, pixels, choice.mode != "ERROR")
     return True
 
 
@@ -340,7 +339,8 @@ class LTSH_OT_probe(bpy.types.Operator):
         region = next(region for region in self._area.regions if region.type == "WINDOW")
         if event.type == "MOUSEMOVE":
             x, y = region.view2d.region_to_view(event.mouse_x - region.x, event.mouse_y - region.y)
-            if context.scene.ltsh.mode == "SIDE":
+            result = results.result_of(context.scene)
+            if result is not None and results.choice_of(context.scene.ltsh, result).mode == "SIDE":
                 x = 2.0 * x % 1.0
             context.scene.ltsh.probe = min(max(x, 0.0), 1.0), min(max(y, 0.0), 1.0)
             self._area.tag_redraw()
@@ -462,7 +462,7 @@ def draw_probe(context, result, choice, corners) -> None:
     scene, scale = context.scene, context.preferences.system.ui_scale
     left, bottom, right, top = corners
     (column, row), rows = values_at(scene, result, choice, scene.ltsh.probe)
-    share = 0.5 if scene.ltsh.mode == "SIDE" else 1.0
+    share = 0.5 if choice.mode == "SIDE" else 1.0
     x = left + share * scene.ltsh.probe[0] * (right - left)
     y = bottom + scene.ltsh.probe[1] * (top - bottom)
     half, arm, gap = 0.75 * scale, 9.0 * scale, 3.0 * scale
@@ -546,7 +546,8 @@ class LTSH_GGT_wipe(bpy.types.GizmoGroup):
 
     @classmethod
     def poll(cls, context):
-        return context.scene is not None and context.scene.ltsh.mode == "WIPE" and _compared_in(context) is not None
+        shown = None if context.scene is None else _compared_in(context)
+        return shown is not None and shown[1].mode == "WIPE"
 
     def setup(self, context):
         self.gizmos.new(LTSH_GT_wipe.bl_idname)
@@ -564,18 +565,18 @@ def _draw() -> None:
     first, second = labels[choice.first], labels[choice.second]
     left, bottom = region.view2d.view_to_region(0.0, 0.0, clip=False)
     right, top = region.view2d.view_to_region(1.0, 1.0, clip=False)
-    rows = 2 if settings.mode == "ERROR" else 1
+    rows = 2 if choice.mode == "ERROR" else 1
     start, end, below, above = label_places((left, bottom, right, top), context.area, region, scale, rows)
-    if settings.mode == "WIPE":
+    if choice.mode == "WIPE":
         _draw_line(line_position(context), bottom, top, scale)
         draw_label(start, below, first, scale)
         draw_label(end, below, second, scale, align=1.0)
-    elif settings.mode == "SIDE":
+    elif choice.mode == "SIDE":
         draw_label(start, below, first, scale)
         draw_label(max((left + right) / 2.0, start), below, second, scale)
-    elif settings.mode == "MIX":
+    elif choice.mode == "MIX":
         draw_label(start, below, results.mix_label(context.scene), scale)
-    elif settings.mode == "A":
+    elif choice.mode == "A":
         draw_label(start, below, first, scale)
     else:
         draw_label(start, below, f"{first} \u2212 {second}", scale)

@@ -22,7 +22,7 @@ from .relight import GRAIN, own_color
 MIXER_FILE = "lights.npz"
 # Rows of a mixer, and of large pictures: of more lights the weakest are one. Values of all of its pictures.
 MOST_ROWS, FEWEST_ROWS, MOST_VALUES = 64, 8, 1 << 28
-REST = "Everything else"
+REST = "The rest"
 # Pairs of a sample and a row whose radiance is kept at a time.
 MOST_PAIRS = 1 << 23
 # Of pictures, that are summed at a time: as many as stay in the processor's cache.

@@ -23,7 +23,7 @@ MIXER_FILE = "lights.npz"
 # MOST_VALUES: numbers in all pictures of a mixer together; they limit the rows to between FEWEST_ROWS and MOST_ROWS.
 # Where there are more lights, the weakest share one row.
 MOST_ROWS, FEWEST_ROWS, MOST_VALUES = 64, 8, 1 << 28
-REST = "Everything else"
+REST = "The rest"
 # MOST_PAIRS: how many pairs of a sample and a row have their radiance in memory at a time.
 MOST_PAIRS = 1 << 23
 # LINES: lines of the pictures that are summed at a time: as many as stay in the processor's cache.

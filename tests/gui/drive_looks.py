@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import bpy
-from hands import close_window, drag, operate, over, results_opened, select, settings
+from hands import close_window, drag, module, operate, over, results_opened, select, settings
 
 SECONDS = 1200
 SIZE = "1600x900"
@@ -29,8 +29,9 @@ def main(rig):
     rig.shot("1_dark.png")
     operate(rig, bpy.ops.ltsh.preview)
     select(rig, bpy.data.objects["Sunset"])
-    yield 6
+    yield from at_rest()
     rig.shot("1_dark_preview.png")
+    quiet_line_is_clear(rig, "beside the sidebar")
     theme("Blender_Light")
     yield 3
     rig.shot("2_light.png")
@@ -39,9 +40,9 @@ def main(rig):
     rig.shot("3_narrow.png")
     settings().mode = "ERROR"
     bpy.context.preferences.view.ui_scale = 2.0
-    # Panels move to their new places, slowly on a busy machine.
-    yield 6
+    yield from at_rest()
     rig.shot("4_twice_the_scale.png")
+    quiet_line_is_clear(rig, "at twice the scale")
     # Those that are further down.
     yield from over(rig, "VIEW_3D", "UI")
     rig.xdo("click", "--repeat", 20, 5)
@@ -64,6 +65,12 @@ def main(rig):
     yield from preferences(rig)
 
 
+def at_rest(redraws=8):
+    """Wait until panels have moved to their new places: that takes some redraws, which a busy machine makes slowly."""
+    for _ in range(redraws):
+        yield 1
+
+
 def two_windows(rig):
     """Two views of a scene, the preview in the second."""
     operate(rig, bpy.ops.screen.area_dupli, "INVOKE_DEFAULT")
@@ -80,6 +87,17 @@ def two_windows(rig):
         bpy.ops.ltsh.preview()
     close_window(second)
     yield 1
+
+
+def quiet_line_is_clear(rig, where):
+    """What the view leaves out stands beside Blender's own regions."""
+    view, region = module("engine.view"), rig.region()
+    sides = view.covered(rig.area("VIEW_3D"), region)
+    place = view._places.get(region.as_pointer())
+    rig.fact(f"quiet line {where}: left and right, px", place and (round(place[0]), round(place[2])))
+    left, right = max(sides["LEFT"], sides["FLOAT"]), region.width - sides["RIGHT"]
+    rig.fact(f"room for it {where}, px", (left, right))
+    rig.check(place is not None and left <= place[0] and place[2] <= right, f"the quiet line is clear {where}")
 
 
 def theme(name):
@@ -110,9 +128,9 @@ def preferences(rig):
     import addon_utils
 
     addon_utils.modules_refresh()
-    for module in addon_utils.modules():
-        if module.__name__ == "bl_ext.user_default.ltsh":
-            addon_utils.module_bl_info(module)["show_expanded"] = True
+    for addon in addon_utils.modules():
+        if addon.__name__ == "bl_ext.user_default.ltsh":
+            addon_utils.module_bl_info(addon)["show_expanded"] = True
     yield 2
     rig.shot("6_preferences.png")
     close_window(window)

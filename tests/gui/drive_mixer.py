@@ -106,7 +106,7 @@ def rendered(rig):
     rig.check(bool(results._rendered), "the mixer has the lights of the final render")
     yield 2
     rig.shot("7_rendered.png")
-    rig.check(hands.settings().mixed[-1].name == "Everything else", f"the rest is a row: {list(items())}")
+    rig.check(hands.settings().mixed[-1].name == "The rest", f"the rest is a row: {list(items())}")
     hands.settings().mixed[1].muted = True
     yield 2
     rig.shot("8_render_mixed.png")

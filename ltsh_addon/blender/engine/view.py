@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import hashlib
 import logging
-import textwrap
 import time
 import weakref
 from dataclasses import dataclass
@@ -23,7 +22,7 @@ from ..extract.occluders import collect_occluders
 from ..lights.world import blocks_nothing
 from ..render_settings import cycles_setting, sub_pixel_offsets
 from ..ui import results
-from ..ui.comparison import PLATE, draw_rectangle
+from ..ui.comparison import PLATE, covered, draw_rectangle
 from ..ui.job import output_folder
 from ..ui.preview import ENGINE
 from ..viewport.mirror import LiveLamps, SceneMirror
@@ -47,8 +46,9 @@ NO_LIGHTS = "No light and no glowing mesh shines here: add a light"
 # Shares by which the shapes of two pictures may differ: sizes are whole pixels.
 SAME_SHAPE = 0.01
 MOST_NOTES = 4
-FEWEST_LETTERS, LONG_WORD = 8, 20  # no line is broken into shorter ones, and shorter words are not broken
 TEXT_SIZE, LINE = 11.0, 1.4  # and from line to line
+SHARES = 1.0, 0.9, 0.8, 0.7, 0.6  # of that size, for views that are narrower than a word
+LONG_WORD = 20  # letters; longer ones are rather broken
 CAPTION_SIZE = 13.0
 MARGIN = 12.0
 ERROR_COLOR = (1.0, 0.35, 0.3, 1.0)
@@ -501,10 +501,28 @@ def wrapped(lines: list[tuple[str, tuple]], width: float, width_of) -> list[tupl
     """`lines` broken where they are wider than `width` pixels; `width_of(text)` says how wide one is."""
     broken = []
     for text, color in lines:
-        letters = max(FEWEST_LETTERS, int(width * len(text) / max(width_of(text), 1.0)))
-        parts = textwrap.wrap(text, letters, subsequent_indent="  ", break_long_words=letters >= LONG_WORD)
-        broken += [(part, color) for part in parts]
+        line = ""
+        for word in text.split():
+            longer = f"{line} {word}" if line else word
+            if line and width_of(longer) > width:
+                broken.append((line, color))
+                longer = word
+            # A word that is too wide by itself.
+            while width_of(longer) > width and len(longer) > 1:
+                letters = next((n for n in range(len(longer) - 1, 1, -1) if width_of(longer[:n]) <= width), 1)
+                broken.append((longer[:letters], color))
+                longer = longer[letters:]
+            line = longer
+        broken.append((line, color))
     return broken
+
+
+def share_of_size(lines: list[tuple[str, tuple]], width: float, margin: float, width_of) -> float:
+    """The largest of `SHARES` at which all words of `lines` but long ones have room in `width` pixels, with a `margin`
+    on both sides that shrinks with them; `width_of(text, share)` says how wide text is. The smallest where none is."""
+    words = {word[:LONG_WORD] for text, _ in lines for word in text.split()}
+    fitting = (s for s in SHARES if all(width_of(word, s) + 2.0 * s * margin <= width for word in words))
+    return next(fitting, SHARES[-1])
 
 
 def is_drawn(context) -> bool:
@@ -521,44 +539,39 @@ def _draw() -> None:
         return
     error, notes, captions, quiet = _texts.get(region.as_pointer(), ("", [], Captions(), QuietLine()))
     scale = context.preferences.system.ui_scale
-    font, size = 0, TEXT_SIZE * scale
-    blf.size(font, size)
-    sides = covered(context.area, region)
-    # Blender's own boxes are at the left and above.
-    right, bottom = region.width - sides["RIGHT"] - MARGIN * scale, sides["BOTTOM"] + MARGIN * scale
-    free = right - max(sides["LEFT"], sides["FLOAT"]) - MARGIN * scale
-
-    def broken(lines):
-        return wrapped(lines, free, lambda text: blf.dimensions(font, text)[0])
-
-    is_pointed = _pointed.get("region") == region.as_pointer()
-    quiet_lines = broken([(quiet.text, POINTED_COLOR if is_pointed else QUIET_COLOR)]) if quiet.text else []
-    most = int((region.height - sides["TOP"] - bottom) / (LINE * size)) - len(quiet_lines)
-    lines = [*broken(lines_of(error, notes))[: max(most, 0)], *quiet_lines]
-    widths = [blf.dimensions(font, line)[0] for line, _ in lines]
-    if quiet_lines:
-        left = right - max(widths[-len(quiet_lines) :]) - 0.5 * size
-        top = bottom + (LINE * (len(quiet_lines) - 1) + 1.05) * size
-        _places[region.as_pointer()] = left, bottom - 0.35 * size, right, top
-    for number, ((line, color), width) in enumerate(zip(reversed(lines), reversed(widths), strict=True)):
-        _write(font, line, right - width, bottom + number * LINE * size, size, color)
+    sides, font = covered(context.area, region), 0
+    _draw_lines(font, lines_of(error, notes), quiet.text, region, sides, scale)
     blf.size(font, CAPTION_SIZE * scale)
     _draw_captions(font, captions, region, sides, scale)
 
 
-def covered(area, region) -> dict[str, int]:
-    """Pixels of `region` that other regions of its area lie over, by their side; FLOAT: at the left, too."""
-    sides = {"LEFT": 0, "RIGHT": 0, "BOTTOM": 0, "TOP": 0, "FLOAT": 0}
-    x, y, width, height = region.x, region.y, region.width, region.height
-    for part in area.regions:
-        is_over = part.x < x + width and x < part.x + part.width and part.y < y + height and y < part.y + part.height
-        if part.type == "WINDOW" or not is_over or min(part.width, part.height) <= 1:
-            continue
-        reach = {"LEFT": part.x + part.width - x, "RIGHT": x + width - part.x, "BOTTOM": part.y + part.height - y,
-                 "TOP": y + height - part.y, "FLOAT": part.x + part.width - x}  # fmt: skip
-        if part.alignment in sides:
-            sides[part.alignment] = max(sides[part.alignment], reach[part.alignment])
-    return sides
+def _draw_lines(font: int, notes: list[tuple[str, tuple]], quiet: str, region, sides: dict[str, int], scale: float):
+    """The notes and below them the quiet line, at the lower right: Blender's own boxes are at the left and above."""
+
+    def width_of(text: str, share: float = 1.0) -> float:
+        blf.size(font, share * size)
+        return blf.dimensions(font, text)[0]
+
+    pointer = region.as_pointer()
+    last = [(quiet, POINTED_COLOR if _pointed.get("region") == pointer else QUIET_COLOR)] if quiet else []
+    size, margin = TEXT_SIZE * scale, MARGIN * scale
+    free = region.width - sides["RIGHT"] - max(sides["LEFT"], sides["FLOAT"])
+    share = share_of_size([*notes, *last], free, margin, width_of)
+    size, margin = share * size, share * margin
+    free -= 2.0 * margin
+    # Better no quiet line than one of broken words.
+    last = wrapped(last, free, width_of) if all(width_of(word) <= free for word in quiet.split()) else []
+    right, bottom = region.width - sides["RIGHT"] - margin, sides["BOTTOM"] + margin
+    most = int((region.height - sides["TOP"] - bottom) / (LINE * size)) - len(last)
+    lines = [*(wrapped(notes, free, width_of)[: max(most, 0)] if free > size else []), *last]
+    widths = [width_of(line) for line, _ in lines]
+    _places.pop(pointer, None)
+    if last:
+        left = right - max(widths[-len(last) :]) - 0.5 * size
+        top = bottom + (LINE * (len(last) - 1) + 1.05) * size
+        _places[pointer] = left, bottom - 0.35 * size, right, top
+    for number, ((line, color), width) in enumerate(zip(reversed(lines), reversed(widths), strict=True)):
+        _write(font, line, right - width, bottom + number * LINE * size, size, color)
 
 
 def _draw_captions(font: int, captions: Captions, region, sides: dict[str, int], scale: float) -> None:

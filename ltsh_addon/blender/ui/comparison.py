@@ -79,9 +79,8 @@ def refresh(scene) -> bool:
     pictures = [results.pixels_of(image) for image in _chosen_images(scene, result, choice)]
     if len(pictures) < 2 or pictures[0].shape != pictures[1].shape or not pictures[0].size:
         return False
-    mode = scene.ltsh.mode
-    pixels = compose(*pictures, mode, split_of(scene), error_scale(scene.ltsh, group, choice))
-    _show(scene, pixels, mode != "ERROR")
+    pixels = compose(*pictures, choice.mode, split_of(scene), error_scale(scene.ltsh, group, choice))
+    _show(scene, pixels, choice.mode != "ERROR")
     return True
 
 
@@ -343,7 +342,8 @@ class LTSH_OT_probe(bpy.types.Operator):
         region = next(region for region in self._area.regions if region.type == "WINDOW")
         if event.type == "MOUSEMOVE":
             x, y = region.view2d.region_to_view(event.mouse_x - region.x, event.mouse_y - region.y)
-            if context.scene.ltsh.mode == "SIDE":
+            result = results.result_of(context.scene)
+            if result is not None and results.choice_of(context.scene.ltsh, result).mode == "SIDE":
                 x = 2.0 * x % 1.0
             context.scene.ltsh.probe = min(max(x, 0.0), 1.0), min(max(y, 0.0), 1.0)
             self._area.tag_redraw()
@@ -367,7 +367,7 @@ class LTSH_OT_probe(bpy.types.Operator):
 
 # Text and shapes drawn over an image, in pixels of the region at the interface's scale.
 FONT = 0
-TEXT_SIZE = 11.0
+TEXT_SIZE, ROW = 11.0, 26.0  # ROW: from label to label
 # Colors that are readable on any picture in any theme. The plate is nearly opaque: Blender blends linear colors, so a
 # more transparent one would be pale on a white picture.
 INK, PLATE = (1.0, 1.0, 1.0, 1.0), (0.0, 0.0, 0.0, 0.97)
@@ -383,6 +383,21 @@ def draw_rectangle(left: float, bottom: float, right: float, top: float, color) 
     shader.uniform_float("color", color)
     batch.draw(shader)
     gpu.state.blend_set("NONE")
+
+
+def covered(area, region) -> dict[str, int]:
+    """Pixels of `region` that other regions of its area lie over, by their side; FLOAT: at the left, too."""
+    sides = {"LEFT": 0, "RIGHT": 0, "BOTTOM": 0, "TOP": 0, "FLOAT": 0}
+    x, y, width, height = region.x, region.y, region.width, region.height
+    for part in area.regions:
+        is_over = part.x < x + width and x < part.x + part.width and part.y < y + height and y < part.y + part.height
+        if part.type == "WINDOW" or not is_over or min(part.width, part.height) <= 1:
+            continue
+        reach = {"LEFT": part.x + part.width - x, "RIGHT": x + width - part.x, "BOTTOM": part.y + part.height - y,
+                 "TOP": y + height - part.y, "FLOAT": part.x + part.width - x}  # fmt: skip
+        if part.alignment in sides:
+            sides[part.alignment] = max(sides[part.alignment], reach[part.alignment])
+    return sides
 
 
 def draw_gradient(left: float, bottom: float, right: float, top: float, colors) -> None:
@@ -407,6 +422,17 @@ def draw_text(x: float, y: float, text: str, scale: float, color=INK) -> None:
     blf.color(FONT, *color)
     blf.position(FONT, x, y, 0.0)
     blf.draw(FONT, text)
+
+
+def label_places(corners, area, region, scale: float, rows: int) -> tuple[float, float, float, float]:
+    """Where labels of a picture begin and end from left to right, and the lower ends of the first of `rows` below it
+    and of the one above it: beside what is seen of it, on it where there is no room. `corners` of the picture are left,
+    bottom, right and top in pixels of `region`."""
+    left, bottom, right, top = corners
+    sides, gap = covered(area, region), 6.0 * scale
+    start, end = max(left, sides["LEFT"] + gap), min(right, region.width - sides["RIGHT"] - gap)
+    below = max(bottom - ROW * scale, sides["BOTTOM"] + gap + (rows - 1) * ROW * scale)
+    return start, end, below, min(top + gap, region.height - sides["TOP"] - ROW * scale)
 
 
 def draw_label(x: float, y: float, text: str, scale: float, align: float = 0.0) -> None:
@@ -440,7 +466,7 @@ def draw_probe(context, result, choice, corners) -> None:
     scene, scale = context.scene, context.preferences.system.ui_scale
     left, bottom, right, top = corners
     (column, row), rows = values_at(scene, result, choice, scene.ltsh.probe)
-    share = 0.5 if scene.ltsh.mode == "SIDE" else 1.0
+    share = 0.5 if choice.mode == "SIDE" else 1.0
     x = left + share * scene.ltsh.probe[0] * (right - left)
     y = bottom + scene.ltsh.probe[1] * (top - bottom)
     half, arm, gap = 0.75 * scale, 9.0 * scale, 3.0 * scale
@@ -524,7 +550,8 @@ class LTSH_GGT_wipe(bpy.types.GizmoGroup):
 
     @classmethod
     def poll(cls, context):
-        return context.scene is not None and context.scene.ltsh.mode == "WIPE" and _compared_in(context) is not None
+        shown = None if context.scene is None else _compared_in(context)
+        return shown is not None and shown[1].mode == "WIPE"
 
     def setup(self, context):
         self.gizmos.new(LTSH_GT_wipe.bl_idname)
@@ -542,24 +569,25 @@ def _draw() -> None:
     first, second = labels[choice.first], labels[choice.second]
     left, bottom = region.view2d.view_to_region(0.0, 0.0, clip=False)
     right, top = region.view2d.view_to_region(1.0, 1.0, clip=False)
-    below, gap = bottom - 26.0 * scale, 6.0 * scale
-    if settings.mode == "WIPE":
+    rows = 2 if choice.mode == "ERROR" else 1
+    start, end, below, above = label_places((left, bottom, right, top), context.area, region, scale, rows)
+    if choice.mode == "WIPE":
         _draw_line(line_position(context), bottom, top, scale)
-        draw_label(left, below, first, scale)
-        draw_label(right, below, second, scale, align=1.0)
-    elif settings.mode == "SIDE":
-        draw_label(left, below, first, scale)
-        draw_label((left + right) / 2.0, below, second, scale)
-    elif settings.mode == "MIX":
-        draw_label(left, below, results.mix_label(context.scene), scale)
-    elif settings.mode == "A":
-        draw_label(left, below, first, scale)
+        draw_label(start, below, first, scale)
+        draw_label(end, below, second, scale, align=1.0)
+    elif choice.mode == "SIDE":
+        draw_label(start, below, first, scale)
+        draw_label(max((left + right) / 2.0, start), below, second, scale)
+    elif choice.mode == "MIX":
+        draw_label(start, below, results.mix_label(context.scene), scale)
+    elif choice.mode == "A":
+        draw_label(start, below, first, scale)
     else:
-        draw_label(left, below, f"{first} \u2212 {second}", scale)
+        draw_label(start, below, f"{first} \u2212 {second}", scale)
         limit = error_scale(settings, result.groups[choice.group], choice)
-        _draw_legend(left, below - 26.0 * scale, limit, scale)
+        _draw_legend(start, below - ROW * scale, limit, scale)
     if result.partial:
-        draw_label(left, top + gap, result.partial, scale)
+        draw_label(start, above, result.partial, scale)
     draw_probe(context, result, choice, (left, bottom, right, top))
 
 

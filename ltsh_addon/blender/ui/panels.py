@@ -529,22 +529,27 @@ class LTSH_PT_IMAGE_results(_Results, bpy.types.Panel):
         if not comparison.is_viewer(context.space_data.image):
             layout.operator("ltsh.open_results", text="Show Comparison", icon="IMAGE_DATA")
         column = layout.column()
-        toggles(column, context, 5).prop(settings, "mode", expand=True)
-        if settings.mode == "MIX":
+        choice = results.choice_of(settings, result)
+        group = result.groups[choice.group]
+        modes = toggles(column, context, 5)
+        for item in settings.bl_rna.properties["mode"].enum_items:
+            row = modes.row(align=True)
+            row.enabled = len(group["names"]) > 1 or item.identifier in results.OF_ONE_PICTURE
+            row.prop_enum(settings, "mode", item.identifier)
+        if choice.mode == "MIX":
             column.prop(context.scene.view_settings, "exposure", text="Exposure of the Scene")
             return
-        group = result.groups[results.choice_of(settings, result).group]
         self._draw_names(column, settings, "first", "A", group)
-        if settings.mode != "A":
+        if choice.mode != "A":
             self._draw_names(column, settings, "second", "B", group)
         row = column.row(align=True)
         for name in group["passes"]:
             row.prop_enum(settings, "pass_name", name)
-        if settings.mode == "WIPE":
+        if choice.mode == "WIPE":
             row = column.row(align=True)
             row.prop(settings, "split", slider=True)
             row.operator("ltsh.swap", text="", icon="ARROW_LEFTRIGHT")
-        elif settings.mode == "ERROR":
+        elif choice.mode == "ERROR":
             column.prop(settings, "error_scale", text="Scale (0: Automatic)")
         view = context.scene.view_settings
         column.prop(view, "exposure", text="Exposure of the Scene")

@@ -40,14 +40,19 @@ class Result:
         return (name, self.groups[name]) if name in self.groups else next(iter(self.groups.items()))
 
 
+# Modes that need no second picture.
+OF_ONE_PICTURE = "A", "MIX"
+
+
 @dataclass(frozen=True)
 class Choice:
-    """The pictures to look at, all of which the result has; `first` and `second` may be the same."""
+    """The pictures to look at and how, as far as the result has them; `first` and `second` may be the same."""
 
     group: str
     first: str
     second: str
     pass_name: str
+    mode: str
 
 
 _read: dict[str, tuple[tuple, Result]] = {}
@@ -80,7 +85,10 @@ def choice_of(settings, result: Result) -> Choice:
     names, passes = group["names"], group["passes"]
     first = settings.first if settings.first in names else names[0]
     second = settings.second if settings.second in names else next((n for n in names[::-1] if n != first), first)
-    return Choice(name, first, second, settings.pass_name if settings.pass_name in passes else passes[-1])
+    pass_name = settings.pass_name if settings.pass_name in passes else passes[-1]
+    # A picture alone is not compared.
+    mode = settings.mode if len(names) > 1 or settings.mode in OF_ONE_PICTURE else "A"
+    return Choice(name, first, second, pass_name, mode)
 
 
 def show(scene, folder: Path) -> None:

@@ -448,7 +448,7 @@ def test_a_render_is_what_the_mixer_changes_until_results_are_shown(scene, monke
     (take,) = [one for one in later if one.__name__ == "take"]
     take()
     mixer = results.mixer_of(scene)
-    assert [row.name for row in mixer.rows][-1] == "Everything else" and len(scene.ltsh.mixed) == len(mixer.rows)
+    assert [row.name for row in mixer.rows][-1] == "The rest" and len(scene.ltsh.mixed) == len(mixer.rows)
     scene.ltsh.mixed[0].muted = True
     assert scene.ltsh.mode == "MIX"
     found, expected = image_pixels("LTSH Comparison"), mixer.pictures.layers[1:].sum(axis=0)

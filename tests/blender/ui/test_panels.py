@@ -5,7 +5,7 @@ import pytest
 import scene_parts as parts
 from recorded_layout import Layout, buttons, context_of, drawn, stand_in, texts
 
-from ltsh_addon.blender.ui import operators, panels, preflight
+from ltsh_addon.blender.ui import operators, panels, preflight, results
 from ltsh_addon.blender.ui.job import Job, Plan, Step
 
 MAIN_3D, MAIN_RENDER, *PARTS = panels.CLASSES[1:-1]
@@ -301,3 +301,14 @@ def test_the_image_editor_offers_the_pictures_that_are_there(scene, add_results)
     scene.ltsh.mode = "ERROR"
     shown = [item.what for item in drawn(panel)]
     assert "error_scale" in shown and "split" not in shown
+
+
+@pytest.mark.parametrize("mode", ["WIPE", "SIDE", "ERROR", "A"])
+def test_a_picture_alone_is_shown_whole_whatever_the_mode(scene, add_results, mode):
+    add_results(names=("ltsh4",))
+    scene.ltsh.mode = mode
+    shown = drawn(panels.LTSH_PT_IMAGE_results)
+    assert not {"second", "split", "error_scale"} & {item.what for item in shown}
+    # Single and Mix.
+    assert [item.enabled for item in shown if item.what == "mode"] == [True, False, False, False, True]
+    assert results.choice_of(scene.ltsh, results.result_of(scene)).mode == "A"

@@ -205,6 +205,25 @@ def test_figures_of_passes_that_the_report_lacks_are_measured(scene, tmp_path):
     assert 0.0 < row["flip"] < 1.0
 
 
+@pytest.mark.parametrize(
+    ("corners", "places"),
+    [
+        ((100.0, 200.0, 500.0, 400.0), (100.0, 500.0, 148.0, 412.0)),
+        # The picture goes on behind the sidebar, the header, and out of the region.
+        ((-50.0, -20.0, 900.0, 640.0), (12.0, 588.0, 64.0, 508.0)),
+    ],
+)
+def test_labels_of_a_picture_stay_where_they_are_seen(corners, places):
+    def part(kind, alignment, x, y, width, height):
+        return SimpleNamespace(type=kind, alignment=alignment, x=x, y=y, width=width, height=height)
+
+    window = part("WINDOW", "NONE", 10, 20, 800, 600)
+    area = SimpleNamespace(
+        regions=(window, part("UI", "RIGHT", 610, 20, 200, 600), part("HEADER", "TOP", 10, 580, 800, 40))
+    )
+    assert comparison.label_places(corners, area, window, 2.0, 2 if corners[0] < 0.0 else 1) == places
+
+
 def test_results_open_in_an_image_editor_that_is_free(scene):
     """Not in a UV Editor, nor in one that shows a picture of the artist's."""
     texture, render = bpy.data.images.new("Texture", 4, 4), SimpleNamespace(type="RENDER_RESULT")

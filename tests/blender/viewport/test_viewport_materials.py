@@ -379,11 +379,28 @@ def test_long_lines_of_the_view_are_broken():
     assert lines[-1] == ("short", "blue") and len(lines) > 2
     assert all(6.0 * len(part) <= 200.0 for part, _ in lines)
     assert " ".join(part.strip() for part, color in lines if color == "red") == text
-    # Between a toolbar and a sidebar of twice the scale there may be room for a word alone.
-    assert view.wrapped([("No bounces", "red")], 110.0, lambda part: 15.0 * len(part)) == [
-        ("No", "red"),
-        ("  bounces", "red"),
-    ]
+    # Between a toolbar and a sidebar of twice the scale there may be room for a word alone, or not even for that.
+    narrow = [("No bounces", "red")]
+    assert view.wrapped(narrow, 110.0, lambda part: 15.0 * len(part)) == [("No", "red"), ("bounces", "red")]
+    assert [part for part, _ in view.wrapped(narrow, 50.0, lambda part: 15.0 * len(part))] == ["No", "bou", "nce", "s"]
+    # What counts is how wide the letters are.
+    wide = view.wrapped([("ill ill ill WWW WWW WWW", "red")], 60.0, lambda part: sum(3 + 9 * (c == "W") for c in part))
+    assert [part for part, _ in wide] == ["ill ill ill", "WWW", "WWW", "WWW"]
+
+
+@pytest.mark.parametrize(("width", "share"), [(500.0, 1.0), (153.0, 1.0), (152.0, 0.9), (97.0, 0.6), (20.0, 0.6)])
+def test_text_of_views_narrower_than_a_word_is_smaller(width, share):
+    lines = [("No bounces", "red"), ("/a/very/long/path/that/is/broken.png", "blue")]
+
+    def width_of(text, share):
+        return 15.0 * share * len(text)
+
+    assert view.share_of_size(lines[:1], width, 24.0, width_of) == share
+    if share > view.SHARES[-1]:
+        free = width - 2.0 * share * 24.0
+        parts = view.wrapped(lines, free, lambda text: width_of(text, share))
+        assert "bounces" in {part.split()[-1] for part, _ in parts}
+        assert all(width_of(part, share) <= free for part, _ in parts)
 
 
 @edits_with_graphics

@@ -1,5 +1,10 @@
-"""Finished pictures beside Cycles with Open Image Denoise at equal processor time, each against converged Cycles."""
+"""Finished pictures beside Cycles with Open Image Denoise at equal processor time, each against converged Cycles.
 
+python tests/benchmarks/finished.py [SCENE ...]    2, 8 and 30 s, 240 x 135 pixels
+python tests/benchmarks/finished.py picture        the first picture of the README, and Cycles' time at equal error
+"""
+
+import itertools
 import os
 import subprocess
 import sys
@@ -75,35 +80,69 @@ def seeded(path: Path, seed: int) -> Path:
     return copy
 
 
-def errors(image: np.ndarray, halves: tuple[np.ndarray, np.ndarray]) -> str:
-    """Relative L2 without the noise of the truth, known as two halves that share no noise, and FLIP with it."""
+def error(image: np.ndarray, halves: tuple[np.ndarray, np.ndarray]) -> float:
+    """Relative L2 without the noise of the truth, known as two halves that share no noise."""
     first, second = halves
     squared = ((image - first) * (image - second)).sum() / (first * second).sum()
-    return f"{100.0 * np.sqrt(max(squared, 0.0)):7.2f} %{imaging.mean_flip(0.5 * (first + second), image):9.4f}"
+    return float(np.sqrt(max(squared, 0.0)))
+
+
+def errors(image: np.ndarray, halves: tuple[np.ndarray, np.ndarray]) -> str:
+    """The same in words, and FLIP with the noise of the truth."""
+    return f"{100.0 * error(image, halves):7.2f} %{imaging.mean_flip(0.5 * sum(halves), image):9.4f}"
+
+
+def truth(name: str, folder: Path, samples: int) -> tuple[Path, tuple[np.ndarray, np.ndarray]]:
+    """The .blend of a scene, and its converged halves; tells what they took."""
+    path = folder / f"{name}.blend"
+    build(name, path)
+    halves = [
+        by_cycles(seeded(path, OTHER_SEED + half), folder, samples=samples // 2, denoise=False) for half in range(2)
+    ]
+    seconds = sum(half[1] for half in halves)
+    print(f"  {name:<10}{'':>8}  Cycles, {samples} samples, {seconds:.0f} s: the truth", flush=True)
+    return path, tuple(half[0] for half in halves)
+
+
+def beside(name: str, budget: float, path: Path, folder: Path, true, *, is_ours: bool) -> float:
+    """Print what one of both makes in a budget; its error."""
+    if is_ours:
+        image, seconds, report = ours(path, folder, budget=budget)
+        label, took = f"LTSH {report['sub_samples']} + {report['cycles_samples']}", seconds["total"]
+    else:
+        image, took, samples = by_cycles(path, folder, seconds=budget)
+        label = f"Cycles {samples}"
+    print(f"  {name:<10}{budget:>6.0f} s  {label:<18}{took:>8.1f} s{errors(image, true)}", flush=True)
+    return error(image, true)
+
+
+def heading() -> None:
+    print(f"finished pictures of {SIZE[0]} x {SIZE[1]}, load {os.getloadavg()[0]:.1f}")
+    print(f"  {'scene':<10}{'budget':>8}  {'':<18}{'processor':>10}{'rel. L2':>10}{'FLIP':>9}")
 
 
 def main(names=SCENES, true_samples=TRUE_SAMPLES, budgets=BUDGETS) -> None:
-    print(f"finished pictures of {SIZE[0]} x {SIZE[1]}, load {os.getloadavg()[0]:.1f}")
-    print(f"  {'scene':<10}{'budget':>8}  {'':<18}{'processor':>10}{'rel. L2':>10}{'FLIP':>9}")
+    heading()
     with tempfile.TemporaryDirectory() as folder:
         for name in names:
-            path = Path(folder) / f"{name}.blend"
-            build(name, path)
-            halves = [
-                by_cycles(seeded(path, OTHER_SEED + half), Path(folder), samples=true_samples // 2, denoise=False)
-                for half in range(2)
-            ]
-            seconds, true = sum(half[1] for half in halves), tuple(half[0] for half in halves)
-            print(f"  {name:<10}{'':>8}  Cycles, {true_samples} samples, {seconds:.0f} s: the truth", flush=True)
-            for budget in budgets:
-                image, seconds, samples = by_cycles(path, Path(folder), seconds=budget)
-                label = f"Cycles {samples}"
-                print(f"  {name:<10}{budget:>6.0f} s  {label:<18}{seconds:>8.1f} s{errors(image, true)}", flush=True)
-                image, seconds, report = ours(path, Path(folder), budget=budget)
-                label = f"LTSH {report['sub_samples']} + {report['cycles_samples']}"
-                took = seconds["total"]
-                print(f"  {name:<10}{budget:>6.0f} s  {label:<18}{took:>8.1f} s{errors(image, true)}", flush=True)
+            path, true = truth(name, Path(folder), true_samples)
+            for budget, is_ours in itertools.product(budgets, (False, True)):
+                beside(name, budget, path, Path(folder), true, is_ours=is_ours)
+
+
+def picture(name="artist", budget=40.0) -> None:
+    """A larger picture, and Cycles with longer and longer budgets until it is as near."""
+    heading()
+    with tempfile.TemporaryDirectory() as folder:
+        path, true = truth(name, Path(folder), TRUE_SAMPLES)
+        found = beside(name, budget, path, Path(folder), true, is_ours=True)
+        while beside(name, budget, path, Path(folder), true, is_ours=False) > found and budget < 1000.0:
+            budget *= np.sqrt(2.0)
 
 
 if __name__ == "__main__":
-    main(*([sys.argv[1:]] if sys.argv[1:] else []))
+    if sys.argv[1:] == ["picture"]:
+        SIZE = 640, 360
+        picture()
+    else:
+        main(*([sys.argv[1:]] if sys.argv[1:] else []))

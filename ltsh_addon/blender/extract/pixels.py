@@ -273,7 +273,10 @@ def no_light(scene, reasons: list[str]) -> SceneError:
 
 
 def extract(job: dict, folder: Path, progress) -> dict:
-    """Do the `job` (see `client.extract`) and write its files into `folder`; returns the manifest."""
+    """Do the `job` (see `client.extract`) and write its files into `folder`; returns the manifest.
+
+    The budget of the job counts from the processor time `since` on.
+    """
     started, warnings, seconds = time.monotonic(), [], {}
     progress("open scene", 0.0)
     open_scene(Path(job["scene"]), warnings, job["scripts"])

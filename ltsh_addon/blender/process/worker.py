@@ -38,7 +38,6 @@ def main() -> None:
     while True:
         job = json.loads(path.read_text(encoding="utf-8"))
         temporary[:] = map(Path, job["temporary"])
-        job["since"] = _told[0]
         process.tell(_answer(job, path.parent, progress))
         path = Path(jobs.get())
 
@@ -88,7 +87,7 @@ def _perform(job: dict, folder: Path, progress) -> dict:
         return _module("blender.viewport.still").show_lamps(job, folder, progress)
     if job["task"] == "apply":
         return _module("blender.extract.apply").apply_bake(job, progress)
-    return _module("blender.extract.pixels").extract(job, folder, progress)
+    return _module("blender.extract.pixels").extract({**job, "since": _told[0]}, folder, progress)
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from pathlib import Path
 
@@ -140,7 +141,7 @@ def _render_chunks(scene, layer, folder: Path, samples, end, progress) -> tuple[
     layer.samples, cycles.use_adaptive_sampling, cycles.time_limit = 0, False, 0.0
     cycles.use_sample_subset = True
     chunk = min(FIRST, samples) if end is None else PROBE
-    of_file = 0.0 if end is None else FILE_SECONDS * scene.render.resolution_x * scene.render.resolution_y / 1e6
+    of_file = 0.0 if end is None else FILE_SECONDS * math.prod(render_settings.picture_size(scene)) / 1e6
     while samples is None or done < samples:
         progress("Cycles", done / samples if samples else min(len(files) / 3, 1.0))
         clock = time.process_time if end is not None else time.monotonic

@@ -31,7 +31,9 @@ from .textures import (
     GBufferTextures,
     UploadedLights,
     dielectric_texels,
+    empty_texture,
     float_texture,
+    frame_buffer,
     shares,
     table_texels,
     upload_lights,
@@ -41,6 +43,8 @@ _RESULTS = {BOUNDS: "light_bounds", EXCESS: "excesses", CHOICE: "horizons"}
 _SHOWN_PASSES = (*PASSES, "combined")
 # From one picture to the next, the points at which lobes sample the world shift by GOLDEN steps and turn by TURN rad.
 GOLDEN, TURN = 0.618034, 2.0
+# The depth test without a mask and with one: pixels are drawn at the depth 1/2.
+WITHIN = ("NONE", "LESS")
 
 
 class HorizonPass:
@@ -51,39 +55,36 @@ class HorizonPass:
 
     def __init__(self):
         self._shaders = {step: horizon_shader(step) for step in _RESULTS}
-        self._size, self._textures, self._buffers = None, {}, {}
+        self._size, self._mask, self._textures, self._buffers = None, None, {}, {}
 
     def free(self) -> None:
         """Free all textures and shaders."""
-        self._size, self._shaders, self._textures, self._buffers = None, {}, {}, {}
+        self._size, self._mask, self._shaders, self._textures, self._buffers = None, None, {}, {}, {}
 
     def draw(self, gbuffer: GBufferTextures, lights: UploadedLights, view: Sequence[float]) -> gpu.types.GPUTexture:
         """Normals of the horizons (RGB) of a G-buffer with smooth and geometric normals; valid until the next call.
 
         `view` is the camera's place and 1, or for parallel views the unit direction toward it and 0.
         """
-        self._resize(gbuffer.size)
+        self._resize(gbuffer.size, gbuffer.mask)
         corners = [len(light.corners) if light.shape == "POLYGON" else 1 for light in lights.lights]
-        directions = horizons.AROUND * len(horizons.HEIGHTS)
         self._run(BOUNDS, gbuffer, lights, shares([1] * len(corners)))
-        self._run(EXCESS, gbuffer, lights, shares([directions * count for count in corners]), view)
+        self._run(EXCESS, gbuffer, lights, shares([horizons.AROUND * count for count in corners]), view)
         self._run(CHOICE, gbuffer, lights, [(0, 0)])
         return self._textures[_RESULTS[CHOICE]]
 
-    def _resize(self, size) -> None:
-        if size != self._size:
-            self._textures = {name: gpu.types.GPUTexture(size, format="RGBA32F") for name in _RESULTS.values()}
-            self._buffers = {
-                step: gpu.types.GPUFrameBuffer(color_slots=[self._textures[name]]) for step, name in _RESULTS.items()
-            }
-            self._size = size
+    def _resize(self, size, mask) -> None:
+        if size != self._size or mask is not self._mask:
+            self._textures = {name: empty_texture(size) for name in _RESULTS.values()}
+            self._buffers = {step: frame_buffer(self._textures[name], mask) for step, name in _RESULTS.items()}
+            self._size, self._mask = size, mask
 
     def _run(self, step, gbuffer, lights, light_shares, view=None) -> None:
         shader, batch = self._shaders[step]
         with self._buffers[step].bind():
             gpu.state.viewport_set(0, 0, *self._size)
             gpu.state.blend_set("NONE")
-            gpu.state.depth_test_set("NONE")
+            gpu.state.depth_test_set(WITHIN[gbuffer.mask is not None])
             try:
                 shader.bind()
                 for name in HORIZON_SAMPLERS[step]:
@@ -98,6 +99,7 @@ class HorizonPass:
                     gpu.state.blend_set("ADDITIVE_PREMULT")
             finally:
                 gpu.state.blend_set("NONE")
+                gpu.state.depth_test_set("NONE")
 
 
 class LightingPass:
@@ -154,7 +156,8 @@ class LightingPass:
         """Write RGB radiance in W m^-2 sr^-1 and alpha 1 where the G-buffer has a surface, 0 elsewhere.
 
         `passes` is "specular", "diffuse" or "combined"; `view` is that of `HorizonPass.draw`. `target` None draws into
-        the bound frame buffer. `rect` (x, y, width, height) is the place of the G-buffer in the target; None: (0, 0)
+        the bound frame buffer. Of a G-buffer with a mask only surfaces are written; the mask must be the target's depth
+        buffer. `rect` (x, y, width, height) is the place of the G-buffer in the target; None: (0, 0)
         and its own size. `blend` is "NONE", "ADDITIVE" to add the radiance (a further lobe of the same surfaces), or
         "ADDITIVE_PREMULT" to add radiance and alpha.
         """
@@ -187,15 +190,17 @@ class LightingPass:
             alone = replace(features, specular=False, geometric=False, bent=False)
             parts = [*(replace(part, **none) for part in parts), alone]
         with nullcontext() if target is None else target.bind():
-            previous = gpu.state.viewport_get(), gpu.state.blend_get()
+            previous = gpu.state.viewport_get(), gpu.state.blend_get(), gpu.state.depth_test_get()
             gpu.state.viewport_set(x, y, width, height)
             gpu.state.blend_set(blend)
+            gpu.state.depth_test_set(WITHIN[gbuffer.mask is not None])
             try:
                 for features in parts:
                     self._draw(features, gbuffer, view, (x, y))
             finally:
                 gpu.state.viewport_set(*previous[0])
                 gpu.state.blend_set(previous[1])
+                gpu.state.depth_test_set(previous[2])
 
     def _draw(self, features: Features, gbuffer: GBufferTextures, view, place: tuple[int, int]) -> None:
         if features not in self._shaders:

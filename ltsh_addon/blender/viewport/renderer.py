@@ -20,7 +20,16 @@ from .shaders import glsl, pixel_shader
 from .shadows import LiveShadows, ShadowRays
 from .sky import background_texels, sky_texels
 from .surfaces import SurfacePass, View, has_bent_lobes
-from .textures import GBufferTextures, ShareGrid, UploadedLights, float_texture, read_texture, upload_lights
+from .textures import (
+    GBufferTextures,
+    ShareGrid,
+    UploadedLights,
+    empty_texture,
+    float_texture,
+    frame_buffer,
+    read_texture,
+    upload_lights,
+)
 
 MODES = ("single", "split", "difference")
 # MOST_IORS: indices of refraction for which the lighting pass is fast. It is exact for all.
@@ -104,8 +113,8 @@ class VeilPass:
         samplers = ("behind", "left", "glass", "sky")
         self._shader, self._batch = pixel_shader(glsl("octahedron") + glsl("veil"), samplers, constants)
 
-    def draw(self, textures, target, view: View, is_seen: bool, blend: str) -> None:
-        """Draw the picture of the surfaces, over the background, into `target`, dimmed where there is glass.
+    def draw(self, textures, target, view: View, is_seen: bool) -> None:
+        """Add the picture of the surfaces, over the background, to `target`, dimmed where there is glass.
 
         `textures` are the picture (RGBA), the share that glass lets through (RGB), the positions of the glass, and the
         background. Without `is_seen` the background behind glass is black.
@@ -113,7 +122,7 @@ class VeilPass:
         shader = self._shader
         with target.bind():
             gpu.state.viewport_set(0, 0, textures[0].width, textures[0].height)
-            gpu.state.blend_set(blend)
+            gpu.state.blend_set("ADDITIVE_PREMULT")
             gpu.state.depth_test_set("NONE")
             try:
                 shader.bind()
@@ -187,6 +196,23 @@ class _Layer:
         self._gbuffer = self._lit = self.smooth_normal = self._horizons = self._lobe_horizons = None
 
 
+class _Target:
+    """A picture that holds the sum of the samples."""
+
+    def __init__(self, size: tuple[int, int]):
+        self.texture, self._buffers = empty_texture(size), {}
+
+    def within(self, mask: gpu.types.GPUTexture | None = None) -> gpu.types.GPUFrameBuffer:
+        """The frame buffer of the picture, with `mask` as its depth buffer."""
+        if mask not in self._buffers:
+            self._buffers[mask] = frame_buffer(self.texture, mask)
+        return self._buffers[mask]
+
+    def clear(self) -> None:
+        """Begin a new sum."""
+        self.texture.clear(format="FLOAT", value=(0.0, 0.0, 0.0, 0.0))
+
+
 class ViewRenderer:
     """The GPU's side of one view; needs an active GPU context."""
 
@@ -232,11 +258,11 @@ class ViewRenderer:
             self._still = None  # until the sample is complete
             is_drawn = self._draw_sample(mirror, view.shifted(points[self.samples], size), size, *asked)
             self._still, self.samples = still, self.samples + is_drawn
-        self._show([self._targets[number][0] for number in range(pictures)], view, shown, frame_buffer)
+        self._show([self._targets[number].texture for number in range(pictures)], view, shown, frame_buffer)
 
     def show(self, number: int, view: View, shown: ShownPicture, frame_buffer) -> None:
         """Draw the picture `number` of those drawn last, as `draw` does; `shown` must have its passes."""
-        self._show([self._targets[number][0]], view, shown, frame_buffer)
+        self._show([self._targets[number].texture], view, shown, frame_buffer)
 
     def _show(self, pictures, view, shown, frame_buffer) -> None:
         weights = [1.0 / self.samples] * len(pictures)
@@ -265,19 +291,23 @@ class ViewRenderer:
                 if self.shadows.waits:
                     return False
         targets = [self._target(self._targets, number, size) for number in range(len(wanted))]
-        first = "NONE" if self.samples == 0 else "ADDITIVE_PREMULT"
+        if self.samples == 0:
+            for target in targets:
+                target.clear()
         if not mirror.has_glass:
-            self._light(self._surfaces, wanted, targets, (mirror, view), first)
+            self._light(self._surfaces, wanted, targets, (mirror, view))
             self._add_emission(self._surfaces, wanted, targets, (mirror, view, size), with_emission)
             return True
         behind = [self._target(self._behind, number, size) for number in range(len(wanted))]
-        self._light(self._surfaces, wanted, behind, (mirror, view), "NONE")
+        for target in behind:
+            target.clear()
+        self._light(self._surfaces, wanted, behind, (mirror, view))
         self._add_emission(self._surfaces, wanted, behind, (mirror, view, size), with_emission)
         through = self._glass.through(mirror.instances, view)
         glass = self._glass.lobe(0, mirror, view, self._lights).position
-        for (texture, _, _), target, (_, passes) in zip(self._behind, targets, wanted, strict=False):
+        for picture, target, (_, passes) in zip(behind, targets, wanted, strict=True):
             is_seen = passes == "combined" and with_emission
-            self._veil.draw((texture, through, glass, self._background), target, view, is_seen, first)
+            self._veil.draw((picture.texture, through, glass, self._background), target.within(), view, is_seen)
         self._light(self._glass, wanted, targets, (mirror, view), "ADDITIVE")
         self._add_emission(self._glass, wanted, targets, (mirror, view, size), with_emission)
         return True
@@ -323,10 +353,12 @@ class ViewRenderer:
         whole = replace(gbuffer, smooth_normal=layer.smooth_normal)
         return shadows.shares(whole, view, self._lights.lights, sides, self.samples)
 
-    def _light(self, layer: _Layer, wanted: list[tuple[str, str]], buffers: list, seen: tuple, first: str) -> None:
-        """Light all lobes of a layer into the `buffers` of `wanted` techniques and passes.
+    def _light(
+        self, layer: _Layer, wanted: list[tuple[str, str]], targets: list, seen: tuple, first: str = "ADDITIVE_PREMULT"
+    ) -> None:
+        """Add the light of all lobes of a layer to the `targets` of `wanted` techniques and passes.
 
-        The first lobe is blended by `first`, the others are added. `seen` are mirror and view.
+        The first lobe is blended by `first`. `seen` are mirror and view.
         """
         mirror, view = seen
         lightings = [self._lighting_of(technique, mirror) for technique, _ in wanted]
@@ -337,16 +369,16 @@ class ViewRenderer:
             gbuffer = layer.lobe(number, mirror, view, self._lights)
             shares = self._shares(layer, gbuffer, mirror, view) if traces else layer.shares
             gbuffer = replace(gbuffer, shares=shares)
-            for lighting, buffer, (_, passes) in zip(lightings, buffers, wanted, strict=True):
-                lighting.draw(
-                    gbuffer, buffer, passes, view=view.homogeneous_eye, blend=first if number == 0 else "ADDITIVE"
-                )
+            blend = first if number == 0 else "ADDITIVE"
+            for lighting, target, (_, passes) in zip(lightings, targets, wanted, strict=True):
+                buffer = target.within(gbuffer.mask)
+                lighting.draw(gbuffer, buffer, passes, view=view.homogeneous_eye, blend=blend)
 
-    def _add_emission(self, layer: _Layer, wanted, buffers, seen: tuple, with_emission: bool) -> None:
+    def _add_emission(self, layer: _Layer, wanted, targets, seen: tuple, with_emission: bool) -> None:
         mirror, view, size = seen
-        for (_, passes), buffer in zip(wanted, buffers, strict=True):
+        for (_, passes), target in zip(wanted, targets, strict=True):
             if with_emission and passes == "combined":
-                layer.add_emission(mirror.instances, view, size, buffer)
+                layer.add_emission(mirror.instances, view, size, target.within())
 
     def _lighting_of(self, technique: str, mirror) -> LightingPass:
         if technique not in self._lighting:
@@ -357,18 +389,17 @@ class ViewRenderer:
         return lighting
 
     @staticmethod
-    def _target(targets: list, number: int, size):
-        """The frame buffer `number` of `targets`, created if needed. It holds the sum of the samples."""
+    def _target(targets: list[_Target], number: int, size) -> _Target:
+        """The picture `number` of `targets`, created if needed."""
+        if len(targets) > number and (targets[number].texture.width, targets[number].texture.height) != size:
+            targets.clear()
         while len(targets) <= number:
-            targets.append(None)
-        if targets[number] is None or targets[number][2] != size:
-            texture = gpu.types.GPUTexture(size, format="RGBA32F")
-            targets[number] = texture, gpu.types.GPUFrameBuffer(color_slots=[texture]), size
-        return targets[number][1]
+            targets.append(_Target(size))
+        return targets[number]
 
     def read(self, number: int = 0) -> np.ndarray:
         """The last picture (H, W, 4) of target `number`: the techniques, then those of `also`; row 0 at the bottom."""
-        return read_texture(self._targets[number][0]) / np.float32(self.samples)
+        return read_texture(self._targets[number].texture) / np.float32(self.samples)
 
     def free(self) -> None:
         """Free all textures and shaders."""

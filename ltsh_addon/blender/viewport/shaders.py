@@ -61,15 +61,19 @@ def glsl(name: str) -> str:
     return source_text(Path(__file__).with_name("glsl") / f"{name}.glsl")
 
 
-def pixel_shader(source: str, samplers: Iterable[str], constants: Mapping[str, str]):
+def pixel_shader(source: str, samplers: Iterable[str], constants: Mapping[str, str], is_depth: bool = False):
     """A shader that runs `source` for every pixel of the viewport, and the batch that draws it.
 
     `samplers` are the names of its textures, `constants` the types of its push constants by name. Name only those that
-    the source uses: the compiler removes others, and setting them is an error.
+    the source uses: the compiler removes others, and setting them is an error. The source writes `color`, or with
+    `is_depth` gl_FragDepth.
     """
     info = gpu.types.GPUShaderCreateInfo()
     info.vertex_in(0, "VEC2", "corner")
-    info.fragment_out(0, "VEC4", "color")
+    if is_depth:
+        info.depth_write("ANY")
+    else:
+        info.fragment_out(0, "VEC4", "color")
     for name, kind in constants.items():
         info.push_constant(kind, name)
     for slot, name in enumerate(samplers):
@@ -273,6 +277,7 @@ def _loops(name: str, lobe: str, light: Callable, features: Features) -> Iterato
             yield f"{name}_view sight = {name}_viewed({lobe}, light);"
         if way in ("whole", "cut", "tiny"):
             yield "light = ltsh_with_corners(light, sight.wide, sight.whole);"
+            yield "light.count = left != 0u ? light.count : 1;"
         yield from light(integral)
         factor = "factor"
         yield "float factor = ltsh_factor(number, todo);"

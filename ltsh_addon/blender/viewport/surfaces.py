@@ -12,7 +12,7 @@ from mathutils import Matrix
 from ...shading.header import filled
 from ..materials.looks import IMAGE_SLOTS, is_missing
 from .mirror import ShownInstance, ShownLook
-from .shaders import glsl, slope_text
+from .shaders import glsl, pixel_shader, slope_text
 from .textures import (
     DEFINES,
     LOOK_SIZE,
@@ -30,6 +30,7 @@ SURFACES = ("position", "normal", "base", "f0", "f90", "dielectric")
 NORMALS = ("diffuse_normal", "smooth_normal", "geometric_normal")
 TANGENTS, REBOUNDS, EMISSION, THROUGH = ("tangent",), ("rebound",), ("emission",), ("through",)
 _ADDED = (EMISSION, THROUGH)
+MASK = ("mask",)
 # Types of the attributes of a mesh's corners.
 _CORNER = {"position": "VEC3", "normal": "VEC3", "uv": "VEC2", "tangent": "VEC4"}
 # The further attribute for anisotropic lobes: generated coordinates relative to the middle.
@@ -101,12 +102,14 @@ class SurfacePass:
         if before is not None:
             self._shaders, self._tables = before._shaders, before._tables
             self._nothing, self._missing = before._nothing, before._missing
+            self._mask_shader = before._mask_shader
             self._size = self._depth = None
             self._targets: dict = {}
             return
         self._shaders = {(outputs, False): _shader(outputs) for outputs in (SURFACES, NORMALS, EMISSION)}
         self._tables = {"albedo_table": float_table(albedo_table()), "blend_table": float_table(blend_table())}
         self._tables["sheen_table"] = float_texture(sheen_table())
+        self._mask_shader = pixel_shader(glsl("mask"), ("positions",), {}, is_depth=True)
         self._nothing = float_texture(np.zeros((1, 1, 4)))
         self._missing = float_texture(np.array(MISSING_COLOR).reshape(1, 1, 4))
         self._size = self._depth = None
@@ -166,7 +169,7 @@ class SurfacePass:
     def free(self) -> None:
         """Free all textures and shaders."""
         self._targets, self._tables, self._shaders = {}, {}, {}
-        self._size = self._nothing = self._missing = self._depth = self._through = None
+        self._size = self._nothing = self._missing = self._depth = self._through = self._mask_shader = None
 
     def _gbuffer(self, number, instances, view) -> GBufferTextures:
         textures = self._draw_into(SURFACES, instances, view, number)
@@ -183,7 +186,27 @@ class SurfacePass:
             "has_velvet": any(look.kind == "velvet" for look in lobes),
             "has_bent": any(look.is_bent for look in lobes),
         }
-        return GBufferTextures(**textures, **marks)
+        return GBufferTextures(**textures, **marks, mask=self._draw_mask(textures["position"], number > 0))
+
+    def _draw_mask(self, position, is_further: bool) -> gpu.types.GPUTexture:
+        """A depth buffer with 1 where there is a surface, else 0: cards skip other pixels before they shade."""
+        if (MASK, is_further) not in self._targets:
+            texture = gpu.types.GPUTexture(self._size, format="DEPTH_COMPONENT32F")
+            self._targets[MASK, is_further] = texture, gpu.types.GPUFrameBuffer(depth_slot=texture)
+        texture, buffer = self._targets[MASK, is_further]
+        shader, batch = self._mask_shader
+        with buffer.bind():
+            gpu.state.viewport_set(0, 0, *self._size)
+            gpu.state.depth_test_set("ALWAYS")
+            gpu.state.depth_mask_set(True)
+            try:
+                shader.bind()
+                shader.uniform_sampler("positions", position)
+                batch.draw(shader)
+            finally:
+                gpu.state.depth_test_set("NONE")
+                gpu.state.depth_mask_set(False)
+        return texture
 
     def _target(self, outputs, is_further: bool):
         """Textures by name, and the frame buffer that `outputs` are drawn into; without depth for further lobes."""

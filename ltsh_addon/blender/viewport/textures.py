@@ -72,6 +72,7 @@ class GBufferTextures:
     tangent: gpu.types.GPUTexture | None = None  # of anisotropic lobes; w = anisotropy; None: 0
     rebound: gpu.types.GPUTexture | None = None  # diffuse_rebound; w = diffuse_roughness; None: 0
     shares: ShareGrid | None = None  # None: every light is seen whole
+    mask: gpu.types.GPUTexture | None = None  # depth buffer, 0 where there is no surface; None: all pixels are lit
     has_sheen: bool = False  # there are texels of sheen: base.w = -sheen_a, normal.w = sheen_b
     has_velvet: bool = False  # there are texels of velvet: rebound.w = -sigma, rebound.rgb = albedo
     has_bent: bool = False  # there are dielectrics with an index of refraction between 0 and 1
@@ -93,6 +94,18 @@ class GBufferTextures:
     def size(self) -> tuple[int, int]:
         """Width and height in pixels."""
         return self.position.width, self.position.height
+
+
+def empty_texture(size: tuple[int, int]) -> gpu.types.GPUTexture:
+    """RGBA32F texture of zeros; `size` is (width, height)."""
+    texture = gpu.types.GPUTexture(size, format="RGBA32F")
+    texture.clear(format="FLOAT", value=(0.0, 0.0, 0.0, 0.0))
+    return texture
+
+
+def frame_buffer(color: gpu.types.GPUTexture, depth: gpu.types.GPUTexture | None = None) -> gpu.types.GPUFrameBuffer:
+    """A frame buffer of the textures."""
+    return gpu.types.GPUFrameBuffer(color_slots=[color], **({} if depth is None else {"depth_slot": depth}))
 
 
 def float_texture(values: np.ndarray) -> gpu.types.GPUTexture:

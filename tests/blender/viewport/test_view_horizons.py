@@ -45,7 +45,7 @@ def shares(samples, lights):
     """Shares (P,) of the lobes that end at the smooth horizon; a mask (P,) of samples for which neither rounding can
     turn the choice nor no light is between the horizons."""
     of_lobes = lobe_chances(samples, np.arange(len(samples)), False)
-    by_lobe, by_light = horizon_excess(samples, lights, of_lobes, partial(chances_in_one_leaf, lights=lights))
+    by_lobe, by_light = horizon_excess(samples, lights, of_lobes, partial(chances_in_one_leaf, lights=lights), True)
     # Of what is between the horizons where they cross, one part may cancel the other.
     is_sum = np.abs(by_lobe + by_light) >= TIE * (np.abs(by_lobe) + np.abs(by_light))
     share = smooth_share(by_lobe, by_light)
@@ -108,6 +108,7 @@ def low_poly_sphere():
 def samples_in(gbuffer, eye):
     """Samples and pixels of the surfaces in `gbuffer`."""
     textures = {field.name: getattr(gbuffer, field.name) for field in fields(gbuffer)}
+    textures.pop("mask")
     read_textures = {name: read(one) for name, one in textures.items() if isinstance(one, gpu.types.GPUTexture)}
     pixel = np.flatnonzero(read_textures["position"][:, 3] > 0.0)
     at = {name: values[pixel] for name, values in read_textures.items()}

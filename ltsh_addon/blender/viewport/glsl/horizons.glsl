@@ -8,7 +8,8 @@
 #ifndef LTSH_CHOICE
 /* A light as seen from a point; its corners are center + s * half_u + t * half_v. */
 struct seen_light {
-    vec3 offset; vec3 half_u; vec3 half_v; vec3 direction; int first; int count; float area; float radiance; float end;
+    vec3 offset; vec3 half_u; vec3 half_v; vec3 direction; int first; int count; float area; float radiance; float radius;
+    float end;
     bool faces; bool is_round; bool is_disk;
 };
 
@@ -31,7 +32,10 @@ seen_light light_from(int number, vec3 position, vec3 normal)
     light.count = half_u.w > 0.0 ? int(half_u.w) : LTSH_ROUND_CORNERS;
     light.first = half_u.w > 0.0 ? int(center.w) : LTSH_ROUND_FIRST;
     light.radiance = radiance.x + radiance.y + radiance.z;
-    float tangent = ltsh_light_texel(header + 5).x;
+    vec4 bounds_of_light = ltsh_light_texel(header + 5);
+    float squares = dot(light.half_u, light.half_u) + dot(light.half_v, light.half_v);
+    light.radius = bounds_of_light.w * sqrt(squares + 2.0 * abs(dot(light.half_u, light.half_v)));
+    float tangent = bounds_of_light.x;
     light.end = tangent > 0.0 ? inversesqrt(1.0 + tangent * tangent) : 0.0;
     light.faces = dot(light.offset, light.direction) < 0.0;
     return light;
@@ -183,6 +187,29 @@ bool hits(seen_light light, vec3 ray)
     return inside && steepness < 0.0;
 }
 
+/* Number of the direction at an angle around the smooth normal, between those of its neighbors. The directions of all
+   turns are numbered on. */
+float direction_at(float angle)
+{
+    float turns = floor(0.5 * angle / LTSH_PI + 0.5);
+    float grown = (angle - 2.0 * LTSH_PI * turns) * LTSH_SINH / LTSH_PI;
+    float turn = sign(grown) * log(abs(grown) + sqrt(grown * grown + 1.0)) / LTSH_CONCENTRATION;
+    return (turns + 0.5 + 0.5 * turn) * float(LTSH_AROUND) - 0.5;
+}
+
+/* The first of the directions that may meet the light, by their angle around the smooth normal, and their count. */
+ivec2 directions_around(seen_light light, vec3 along, vec3 across)
+{
+    vec2 flat_offset = vec2(dot(light.offset, along), dot(light.offset, across));
+    float reach = asin(min(light.radius / max(length(flat_offset), 1e-30), 1.0));
+    bool is_beside = light.radius < length(flat_offset);
+    float middle = atan(flat_offset.y, is_beside ? flat_offset.x : 1.0);
+    int first = int(ceil(direction_at(middle - reach) - 0.01));
+    int last = int(floor(direction_at(middle + reach) + 0.01));
+    ivec2 some = ivec2((first + LTSH_AROUND) % LTSH_AROUND, min(last - first + 1, LTSH_AROUND));
+    return is_beside ? some : ivec2(0, LTSH_AROUND);
+}
+
 /* Probability per sr of a direction sampled by the lobe, with GGX's visible normals (Heitz 2018, eq. 17). */
 float lobe_density(vec3 towards, vec3 towards_eye, vec3 normal, float roughness)
 {
@@ -255,14 +282,16 @@ void main()
     } while (++number < count);
     vec2 excess = vec2(0.0);
     do {
-        int directions = left != 0u ? LTSH_AROUND * LTSH_HEIGHTS : 0;
         seen_light light = light_from(place.x + (left != 0u ? findLSB(left) : 0), position, smooth_normal);
         vec3 own = bounds(light, smooth_normal);
         float by_least = all_bounds.y > 0.0 ? own.y / all_bounds.y : own.z / max(all_bounds.z, 1.0);
         float density = 0.5 * (own.x / max(all_bounds.x, 1e-30) + by_least) / max(solid_angle(light), 1e-12);
-        int k = 0;
+        ivec2 around_light = directions_around(light, along, across);
+        int directions = left != 0u ? around_light.y : 0;
+        int i = 0;
         do {
-            float turn = (float(k / LTSH_HEIGHTS) + 0.5) / float(LTSH_AROUND) * 2.0 - 1.0;
+            int k = (around_light.x + i) % LTSH_AROUND;
+            float turn = (float(k) + 0.5) / float(LTSH_AROUND) * 2.0 - 1.0;
             float grown = exp(LTSH_CONCENTRATION * turn);
             float angle = LTSH_PI * 0.5 * (grown - 1.0 / grown) / LTSH_SINH;
             float span = LTSH_PI * LTSH_CONCENTRATION * (grown + 1.0 / grown) / (LTSH_SINH * float(LTSH_AROUND));
@@ -270,16 +299,16 @@ void main()
             float rise = -atan(dot(around, true_normal), dot(smooth_normal, true_normal));
             float elevation = rise * (LTSH_FIRST_HEIGHT + LTSH_HEIGHT_STEP * float(k % LTSH_HEIGHTS));
             vec3 towards = cos(elevation) * around + sin(elevation) * smooth_normal;
-            float width = rise * span * cos(elevation) / float(LTSH_HEIGHTS);
+            float width = rise * span * cos(elevation);
             float lobe = lobe_density(towards, towards_eye, bent.xyz, bent.w);
             float chosen = chances.x * lobe + chances.y * max(dot(towards, diffuse_normal), 0.0) / LTSH_PI;
             float reflected = lobe * seen_by_light(towards, towards_eye, bent.xyz, bent.w)
                 * reflectance(means, sqrt(max(0.5 + 0.5 * dot(towards, towards_eye), 0.0)));
-            bool counts = k < directions && hits(light, towards);
+            bool counts = i < directions && hits(light, towards);
             float amount = light.radiance * reflected * width;
             float share = density * density / max(density * density + chosen * chosen, 1e-30);
             excess += counts ? amount * vec2(1.0 - share, share) : vec2(0.0);
-        } while (++k < directions);
+        } while (++i < directions);
         left &= left - 1u;
     } while (left != 0u);
     color = vec4(excess, 0.0, 0.0);

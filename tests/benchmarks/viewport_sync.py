@@ -6,6 +6,7 @@ all shadows of one moved light take, without the drawing, and by how much the th
 
 from __future__ import annotations
 
+import resource
 import statistics
 import sys
 import time
@@ -156,6 +157,11 @@ def _processor(live) -> float:
     return time.process_time() + (int(fields[11]) + int(fields[12])) / 100.0
 
 
+def _memory() -> float:
+    """The most memory that this process has had at once, in MiB; without a card its graphics memory is part of it."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1 << 10)  # Linux counts in KiB
+
+
 def _seconds(work) -> tuple[float, float]:
     start = time.perf_counter(), time.process_time()
     work()
@@ -176,12 +182,14 @@ def main(arguments: list[str]) -> int:
     counts = [int(argument) for argument in arguments] or [1_000_000, 100, 32]
     scene = build(*counts)
     gpu.init()
+    before = _memory()
     print(f"{'':<42}{'clock':>10}{'processor':>13}")
     for name, (clock, processor) in measure(scene).items():
         print(f"{name:<42}{1000.0 * clock:10.1f} ms{1000.0 * processor:10.1f} ms")
     clock, processor, late = measure_shadows(scene)
     print(f"{'shadows of one moved light':<42}{1000.0 * clock:10.1f} ms{1000.0 * processor:10.1f} ms, "
           f"this thread at most {1000.0 * late:.0f} ms late")  # fmt: skip
+    print(f"most memory of this process: {before:.0f} MiB with the scene, {_memory():.0f} MiB with its view and shadows")
     return 0
 
 

@@ -126,7 +126,7 @@ FIRST_POINTS, GROUP, GROUP_RAYS = 8, 4, 64
 QUICK_SECONDS = 0.03
 # BATCH: emitters that are traced together. The shares of finished batches are kept when the rest is stopped.
 BATCH = 4
-# PAUSE_SECONDS: finer shadows follow the coarse ones of a light if it stays still for so long.
+# PAUSE_SECONDS: finer shadows follow the coarse ones of a light if it has stayed still for so long.
 PAUSE_SECONDS = 0.15
 
 
@@ -507,8 +507,9 @@ class LiveShadows:
         self._thread.start()
 
     def _trace(self, requests: list[_Request]) -> None:
+        start = time.monotonic()
         for number, request in enumerate(requests):
-            if number > 0 and self._stop.wait(PAUSE_SECONDS):
+            if number > 0 and self._stop.wait(max(PAUSE_SECONDS - (time.monotonic() - start), 0.0)):
                 break
             self._request = request
             try:

@@ -5,11 +5,12 @@ Lights, tables and integrals are those of `shading.shade`, in float32 throughout
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
 
 import gpu
+import numpy as np
 from mathutils import Matrix
 
 from ...cycles import horizons
@@ -138,7 +139,7 @@ class LightingPass:
         """Set the lights. Light groups are added up."""
         uploaded = lights if isinstance(lights, UploadedLights) else upload_lights(lights)
         self._lights, self._sky = uploaded.texture, uploaded.sky
-        self._shares = shares([_loops(light) for light in uploaded.lights])
+        self._loops = [_loops(light) for light in uploaded.lights]
         self._has_focused = any(light.is_profiled for light in uploaded.lights)
         self._has_facing = any(light.is_facing for light in uploaded.lights)
         self._has_patterns = any(light.pattern is not None for light in uploaded.lights)
@@ -152,6 +153,7 @@ class LightingPass:
         view: Sequence[float],
         rect: tuple[int, int, int, int] | None = None,
         blend: str = "NONE",
+        numbers: Collection[int] | None = None,
     ) -> None:
         """Write RGB radiance in W m^-2 sr^-1 and alpha 1 where the G-buffer has a surface, 0 elsewhere.
 
@@ -159,7 +161,8 @@ class LightingPass:
         the bound frame buffer. Of a G-buffer with a mask only surfaces are written; the mask must be the target's depth
         buffer. `rect` (x, y, width, height) is the place of the G-buffer in the target; None: (0, 0)
         and its own size. `blend` is "NONE", "ADDITIVE" to add the radiance (a further lobe of the same surfaces), or
-        "ADDITIVE_PREMULT" to add radiance and alpha.
+        "ADDITIVE_PREMULT" to add radiance and alpha. `numbers` are those of the lights to draw, at least one; None:
+        all. The world's light is drawn with light 0.
         """
         if passes not in _SHOWN_PASSES:
             raise ValueError(f"lighting pass: passes is {passes!r}, expected one of {', '.join(_SHOWN_PASSES)}")
@@ -196,13 +199,25 @@ class LightingPass:
             gpu.state.depth_test_set(WITHIN[gbuffer.mask is not None])
             try:
                 for features in parts:
-                    self._draw(features, gbuffer, view, (x, y))
+                    self._draw(features, gbuffer, view, (x, y), self._ranges(numbers))
             finally:
                 gpu.state.viewport_set(*previous[0])
                 gpu.state.blend_set(previous[1])
                 gpu.state.depth_test_set(previous[2])
 
-    def _draw(self, features: Features, gbuffer: GBufferTextures, view, place: tuple[int, int]) -> None:
+    def _ranges(self, numbers: Collection[int] | None) -> list[tuple[int, int]]:
+        """The lights (first, end) of each draw call."""
+        if numbers is None:
+            return shares(self._loops)
+        chosen = np.array(sorted(numbers))
+        runs = np.split(chosen, np.flatnonzero(np.diff(chosen) > 1) + 1)
+        return [
+            (int(run[0]) + first, int(run[0]) + end)
+            for run in runs
+            for first, end in shares(self._loops[run[0] : run[-1] + 1])
+        ]
+
+    def _draw(self, features: Features, gbuffer: GBufferTextures, view, place: tuple[int, int], ranges) -> None:
         if features not in self._shaders:
             self._shaders[features] = lighting_shader(self.table, features)
         shader, batch = self._shaders[features]
@@ -215,7 +230,7 @@ class LightingPass:
             shader.uniform_float("jitter", ((0.5 + self.number * GOLDEN) % 1.0, self.number * TURN))
         if features.shadowed:
             shader.uniform_float("grid", Matrix(gbuffer.shares.projection.tolist()))
-        for first, end in self._shares:
+        for first, end in ranges:
             shader.uniform_int("place", (*place, first, end))
             batch.draw(shader)
             gpu.state.blend_set("ADDITIVE")

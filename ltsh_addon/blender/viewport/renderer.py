@@ -6,11 +6,13 @@ the picture is their mean.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Collection
+from dataclasses import dataclass, fields, replace
 
 import gpu
 import numpy as np
 
+from ...scene import AreaLight
 from ...shading.header import definitions
 from ..extract.origin import new_origin
 from ..materials.values import Value
@@ -105,6 +107,23 @@ class PicturePass:
         self._batch.draw(shader)
 
 
+class CopyPass:
+    """Copies a picture into another one; needs an active GPU context."""
+
+    def __init__(self):
+        self._shader, self._batch = pixel_shader(glsl("copy"), ("picture",), {})
+
+    def draw(self, picture: gpu.types.GPUTexture, target: gpu.types.GPUFrameBuffer) -> None:
+        """Copy `picture` into `target`, which has its size."""
+        with target.bind():
+            gpu.state.viewport_set(0, 0, picture.width, picture.height)
+            gpu.state.blend_set("NONE")
+            gpu.state.depth_test_set("NONE")
+            self._shader.bind()
+            self._shader.uniform_sampler("picture", picture)
+            self._batch.draw(self._shader)
+
+
 class VeilPass:
     """Draws what is behind glass; needs an active GPU context."""
 
@@ -165,6 +184,11 @@ class _Layer:
         self._lit = self._with_horizons(self._gbuffer, self._horizons, mirror, view, lights)
 
     @property
+    def size(self) -> tuple[int, int]:
+        """Width and height in pixels."""
+        return self._gbuffer.size
+
+    @property
     def is_ready(self) -> bool:
         """True if the horizons are chosen."""
         return self._lit is not None
@@ -213,6 +237,53 @@ class _Target:
         self.texture.clear(format="FLOAT", value=(0.0, 0.0, 0.0, 0.0))
 
 
+# With more lights, telling which of them have changed takes longer than it saves.
+MOST_COMPARED = 512
+
+
+@dataclass(frozen=True)
+class _Lit:
+    """What a picture was lit with: state of surfaces and view (see `_same`), lights, and sources of their shares."""
+
+    state: tuple
+    lights: tuple
+    sources: tuple
+
+    def changes(self, new: _Lit) -> frozenset[int] | None:
+        """Numbers of the lights that are others in the picture `new`; None where more has changed."""
+        count = len(self.lights)
+        if not _same(new.state, self.state) or len(new.lights) != count or count > MOST_COMPARED:
+            return None
+        pairs = zip(self.lights, new.lights, strict=True)
+        return frozenset(number for number, (a, b) in enumerate(pairs) if not _is_same_light(a, b))
+
+    def has_same_shares(self, new: _Lit, left_out: frozenset[int]) -> bool:
+        """True if the shares are the same, but for those of the lights `left_out`."""
+        kept = [number for number in range(len(self.sources)) if number not in left_out]
+        same = all(a is b for number in kept for a, b in zip(self.sources[number], new.sources[number], strict=True))
+        return len(self.sources) == len(new.sources) and same
+
+
+def _is_same_light(a: AreaLight, b: AreaLight) -> bool:
+    names = (item.name for item in fields(AreaLight) if item.name != "detail")
+    values = ((getattr(a, name), getattr(b, name)) for name in names)
+    return a is b or all(x is y or np.array_equal(x, y) for x, y in values)
+
+
+@dataclass(frozen=True)
+class _Held:
+    """The light of all lights but the `moving` ones, kept while these change."""
+
+    lit: _Lit
+    moving: frozenset[int]
+    targets: list[_Target]
+
+    def fits(self, new: _Lit) -> bool:
+        """True if it is a part of the picture `new`."""
+        changes = self.lit.changes(new)
+        return changes is not None and changes <= self.moving and self.lit.has_same_shares(new, self.moving)
+
+
 class ViewRenderer:
     """The GPU's side of one view; needs an active GPU context."""
 
@@ -221,12 +292,16 @@ class ViewRenderer:
         self._glass: _Layer | None = None
         self._picture = PicturePass()
         self._veil: VeilPass | None = None
+        self._copy: CopyPass | None = None
         self._lighting: dict[str, LightingPass] = {}
         self._targets: list = []
         self._behind: list = []  # what is lit behind glass
         self._lights: UploadedLights | None = None
         self._drawn, self._uploaded = None, (None, None, None)
         self._still, self.samples = None, 0
+        self._lit: _Lit | None = None
+        self._held: _Held | None = None
+        self._is_split = False
         self._sky, self._sky_light, self._background = None, None, None
         self.shadows: ShadowRays | LiveShadows | None = None
 
@@ -237,6 +312,9 @@ class ViewRenderer:
 
         The first call shows pixels at the first of `points` (N, 2), in pixels right and up of their centers. While
         nothing changes, every further call adds the next point. The picture is their mean; `samples` is their number.
+
+        Where only some lights have changed, the others are not drawn again: their light keeps the horizons that were
+        chosen before. The next call without a change begins anew with all lights.
         """
         view = view.around(_origin_of(mirror.lights, view))
         wanted = [(shown.technique, shown.passes)]
@@ -252,11 +330,14 @@ class ViewRenderer:
             traced = self.shadows.version
         things = mirror, mirror.lights, mirror.sky, self.shadows
         still = things, (mirror.surfaces_version, *_key(view, size), asked, traced)
-        if not _same(still, self._still):
+        is_same = _same(still, self._still)
+        if not is_same or self._is_split:
             self.samples = 0
         if self.samples < len(points):
             self._still = None  # until the sample is complete
-            is_drawn = self._draw_sample(mirror, view.shifted(points[self.samples], size), size, *asked)
+            state = (mirror, mirror.sky, self.shadows), (mirror.surfaces_version, *_key(view, size), asked)
+            shifted = view.shifted(points[self.samples], size)
+            is_drawn = self._draw_sample(mirror, shifted, size, *asked, None if is_same else state)
             self._still, self.samples = still, self.samples + is_drawn
         self._show([self._targets[number].texture for number in range(pictures)], view, shown, frame_buffer)
 
@@ -273,10 +354,11 @@ class ViewRenderer:
             self._picture.draw(pictures, weights, view, shown, self._background)
 
     def _draw_sample(
-        self, mirror, view: View, size, wanted: list[tuple[str, str]], with_emission: bool, world: bool
+        self, mirror, view: View, size, wanted: list[tuple[str, str]], with_emission: bool, world: bool, state
     ) -> bool:
         """Add one point of every pixel to the targets of `wanted` techniques and passes; the first point replaces them.
 
+        The first point may keep the light of lights that have not changed, in the same `state`; None: it may not.
         Returns False where nothing was drawn because its shadows are not ready.
         """
         surfaces_changed = self._draw_surfaces(mirror, view, size)
@@ -295,13 +377,13 @@ class ViewRenderer:
             for target in targets:
                 target.clear()
         if not mirror.has_glass:
-            self._light(self._surfaces, wanted, targets, (mirror, view))
+            self._light_surfaces(wanted, targets, (mirror, view), state)
             self._add_emission(self._surfaces, wanted, targets, (mirror, view, size), with_emission)
             return True
         behind = [self._target(self._behind, number, size) for number in range(len(wanted))]
         for target in behind:
             target.clear()
-        self._light(self._surfaces, wanted, behind, (mirror, view))
+        self._light_surfaces(wanted, behind, (mirror, view), state)
         self._add_emission(self._surfaces, wanted, behind, (mirror, view, size), with_emission)
         through = self._glass.through(mirror.instances, view)
         glass = self._glass.lobe(0, mirror, view, self._lights).position
@@ -353,12 +435,43 @@ class ViewRenderer:
         whole = replace(gbuffer, smooth_normal=layer.smooth_normal)
         return shadows.shares(whole, view, self._lights.lights, sides, self.samples)
 
+    def _light_surfaces(self, wanted, targets: list[_Target], seen: tuple, state: tuple | None) -> None:
+        """Light the surfaces as `_light` does; with a `state` (see `_draw_sample`) perhaps only by what has changed."""
+        layer, lights = self._surfaces, self._lights.lights
+        self._is_split = False
+        if state is None or self.samples > 0 or (self.shadows is not None and self.shadows.traces_lobes):
+            self._light(layer, wanted, targets, seen)
+            return
+        shares = layer.shares
+        sources = () if shares is None else shares.sources or ((shares,),) * (len(lights) + 1)
+        before, self._lit = self._lit, _Lit(state, lights, sources)
+        if self._held is None or not self._held.fits(self._lit):
+            moving, self._held = None if before is None else before.changes(self._lit), None
+            if not moving or len(moving) == len(lights):
+                self._light(layer, wanted, targets, seen)
+                return
+            held = [_Target(layer.size) for _ in wanted]
+            self._light(layer, wanted, held, seen, numbers=frozenset(range(len(lights))) - moving)
+            self._held = _Held(self._lit, moving, held)
+        if self._copy is None:
+            self._copy = CopyPass()
+        for held, target in zip(self._held.targets, targets, strict=True):
+            self._copy.draw(held.texture, target.within())
+        self._light(layer, wanted, targets, seen, first="ADDITIVE", numbers=self._held.moving)
+        self._is_split = True
+
     def _light(
-        self, layer: _Layer, wanted: list[tuple[str, str]], targets: list, seen: tuple, first: str = "ADDITIVE_PREMULT"
+        self,
+        layer: _Layer,
+        wanted: list[tuple[str, str]],
+        targets: list[_Target],
+        seen: tuple,
+        first: str = "ADDITIVE_PREMULT",
+        numbers: Collection[int] | None = None,
     ) -> None:
         """Add the light of all lobes of a layer to the `targets` of `wanted` techniques and passes.
 
-        The first lobe is blended by `first`. `seen` are mirror and view.
+        The first lobe is blended by `first`. `seen` are mirror and view. `numbers` are those of the lights, None: all.
         """
         mirror, view = seen
         lightings = [self._lighting_of(technique, mirror) for technique, _ in wanted]
@@ -372,7 +485,7 @@ class ViewRenderer:
             blend = first if number == 0 else "ADDITIVE"
             for lighting, target, (_, passes) in zip(lightings, targets, wanted, strict=True):
                 buffer = target.within(gbuffer.mask)
-                lighting.draw(gbuffer, buffer, passes, view=view.homogeneous_eye, blend=blend)
+                lighting.draw(gbuffer, buffer, passes, view=view.homogeneous_eye, blend=blend, numbers=numbers)
 
     def _add_emission(self, layer: _Layer, wanted, targets, seen: tuple, with_emission: bool) -> None:
         mirror, view, size = seen
@@ -412,6 +525,7 @@ class ViewRenderer:
         self._drawn, self._uploaded = None, (None, None, None)
         self._sky = self._sky_light = self._background = None
         self._still, self.samples = None, 0
+        self._lit = self._held = self._copy = None
 
 
 def _key(view: View, size) -> tuple:

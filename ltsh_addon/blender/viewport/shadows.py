@@ -286,6 +286,7 @@ class LiveShadows:
         self._points: dict[bool, tuple[np.ndarray, np.ndarray]] = {}  # grids of points, by whether they are coarse
         self._latest: dict[int, dict[int, np.ndarray]] = {}  # latest shares by the number of a light and level
         self._layers = np.ones((0, 0, 0, 2), np.float32)  # shares in `_grid`
+        self._sources: list[np.ndarray | None] = []  # what each was made from
         self._grid: ShareGrid | None = None
         self._blank: ShareGrid | None = None
         self._origin = np.zeros(3)
@@ -532,15 +533,16 @@ class LiveShadows:
         positions, projection = self._points[is_coarse]
         height, width = positions.shape[:2]
         step = coarse_step(self._state[-1]) if is_coarse else 1
-        layers = np.ones((len(known), height, width, 2), np.float32)
+        layers, sources = np.ones((len(known), height, width, 2), np.float32), [None] * len(known)
         for number, levels in enumerate(known):
             if levels:
-                values = levels[max(levels)]
+                values = sources[number] = levels[max(levels)]
                 layers[number] = values[step // 2 :: step, step // 2 :: step] if is_coarse and max(levels) else values
             elif self._layers.shape == layers.shape:
-                layers[number] = self._layers[number]
-        self._layers = layers
-        self._grid = ShareGrid(_upload(layers, (width, height)), float_texture(positions), projection)
+                layers[number], sources[number] = self._layers[number], self._sources[number]
+        self._layers, self._sources = layers, sources
+        grid = _upload(layers, (width, height)), float_texture(positions)
+        self._grid = ShareGrid(*grid, projection, tuple((positions, source) for source in sources))
 
 
 def coarse_step(size: tuple[int, int]) -> int:

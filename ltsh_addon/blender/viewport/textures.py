@@ -51,6 +51,7 @@ class ShareGrid:
     shares: gpu.types.GPUTexture  # RG, a layer for each light: the specular and the diffuse share
     positions: gpu.types.GPUTexture  # of the points, relative to the view's origin; w = 0 where there is no surface
     projection: np.ndarray  # (4, 4) to the clip space that the texels fill
+    sources: tuple = ()  # of each layer: a layer whose source is the same object is the same
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ from ltsh_addon import imaging
 from ltsh_addon.blender.extract.occluders import collect_occluders
 from ltsh_addon.blender.render_settings import filter_points
 from ltsh_addon.blender.viewport import shadows
+from ltsh_addon.blender.viewport.lighting import LightingPass
 from ltsh_addon.blender.viewport.mirror import SceneMirror
 from ltsh_addon.blender.viewport.renderer import CENTERS, ShownPicture, ViewRenderer
 from ltsh_addon.blender.viewport.shadows import LiveShadows, ShadowRays, too_many
@@ -340,6 +341,64 @@ def test_live_shadows_come_coarse_and_end_as_those_of_pictures():
     assert after_move == [((0,), 0), ((0,), 1)] and relative(picture, expected) < 0.05
     assert partial == [None, {0, 1}]
     assert problem == "shadows: division by zero"
+
+
+def kept_pictures(has_shadows):
+    """After each change of light 0: the numbers of the lights that were drawn, the picture, and that of the next call,
+    which draws them all."""
+    scene, numbers, found = LiveView(), [], []
+    draw = LightingPass.draw
+
+    def listening(*arguments, **keywords):
+        numbers.append(keywords["numbers"])
+        draw(*arguments, **keywords)
+
+    def moved(light, step):
+        return replace(light, center=light.center + [0.0, 0.05 * step, 0.0])
+
+    def after(edit):
+        first, *others = scene.mirror.lights
+        # Objects of the other lights are new, as after every update of a scene.
+        scene.mirror.lights = (edit(first), *map(replace, others))
+        numbers.clear()
+        picture = scene.drawn(live)
+        if live is not None:  # the coarse shadows of the light that was moved
+            while live.is_busy and not live.has_news:
+                time.sleep(0.01)
+            live._stop.set()
+            if live._thread is not None:
+                live._thread.join()
+            numbers.clear()
+            picture = scene.drawn(live)
+        return list(numbers), picture, scene.drawn(live), numbers[-1]
+
+    live = scene.live if has_shadows else None
+    edits = [lambda light, step=step: moved(light, step) for step in range(1, 4)]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(LightingPass, "draw", listening)
+        try:
+            scene.drawn(live)
+            for edit in (*edits, lambda light: replace(light, radiance=0.5 * light.radiance), *edits[:1]):
+                found.append(after(edit))
+            return found
+        finally:
+            scene.live.stop()
+            scene.renderer.free()
+
+
+@edits_with_graphics
+@pytest.mark.parametrize("has_shadows", [False, True])
+def test_while_one_light_changes_the_others_are_not_drawn_again(has_shadows):
+    found = with_graphics(lambda: kept_pictures(has_shadows))
+    asked = [set(numbers) for numbers, _, _, _ in found]
+    # The first move is drawn in two parts. With shadows it is drawn as a whole, because then they are all coarse.
+    assert asked[0] == ({None} if has_shadows else {frozenset({1, 2, 3}), frozenset({0})})
+    assert asked[2:] == [{frozenset({0})}] * 3
+    for _, kept, whole, last in found:
+        assert last is None, "at rest all lights are drawn"
+        np.testing.assert_allclose(kept, whole, rtol=1e-4, atol=1e-6)
+    steps = [relative(first[2], second[2]) for first, second in zip(found, found[1:], strict=False)]
+    assert min(steps) > 1e-3, "each change is seen"
 
 
 def late_pictures():

@@ -166,7 +166,8 @@ class Mate:
             while self._child is not None and len(asked) < AHEAD and len(left) > 1:
                 asked.append(left.pop())
                 self._ask(task, asked[-1], blocks[asked[-1]])
-            found = self._answers(wait=not left)
+            # What the process has not begun is begun here at once.
+            found = self._answers(wait=not left and len(asked) < AHEAD)
             if not found and (left or asked):
                 number = left.popleft() if left else asked.pop()
                 found = [self._own.shade(self._message(task, number, blocks[number], True))[1:]]

@@ -42,6 +42,7 @@ LOOK_SECONDS = 0.05
 IDLE_SECONDS = 60.0
 # Width of the line of the split view in pixels of an unscaled interface.
 LINE_WIDTH = 2.0
+COMPILING = "Compiling shaders"
 NO_LIGHTS = "No light and no glowing mesh shines here: add a light"
 # Shares by which the shapes of two pictures may differ: sizes are whole pixels.
 SAME_SHAPE = 0.01
@@ -51,6 +52,7 @@ SHARES = 1.0, 0.9, 0.8, 0.7, 0.6  # of that size, for views that are narrower th
 LONG_WORD = 20  # letters; longer ones are rather broken
 CAPTION_SIZE = 13.0
 MARGIN = 12.0
+EMPTY_COLOR = (0.05, 0.05, 0.05, 1.0)
 ERROR_COLOR = (1.0, 0.35, 0.3, 1.0)
 NOTE_COLOR = (0.95, 0.85, 0.45, 0.95)
 QUIET_COLOR, POINTED_COLOR = (0.7, 0.7, 0.7, 0.95), (1.0, 1.0, 1.0, 1.0)
@@ -121,6 +123,13 @@ class EngineView:
         start = time.monotonic()
         frame_buffer = gpu.state.active_framebuffer_get()
         region = context.region
+        if not _has_drawn[0]:
+            _has_drawn[0] = True
+            with frame_buffer.bind():
+                frame_buffer.clear(color=EMPTY_COLOR)
+            show(region, "", [COMPILING], Captions(), QuietLine())
+            _redraw_at(start)
+            return
         error, notes, captions = self._error, [], Captions()
         try:
             if self._renderer is None:
@@ -142,7 +151,7 @@ class EngineView:
         except Exception as problem:
             error = self._note(problem)
             with frame_buffer.bind():
-                frame_buffer.clear(color=(0.05, 0.05, 0.05, 1.0))
+                frame_buffer.clear(color=EMPTY_COLOR)
         if not error and not self.mirror.lights and not self.mirror.sky.sides:
             notes = [NO_LIGHTS, *notes]
         lines = [*notes, *self.mirror.notes, *self._notes_of_shadows(size)]
@@ -396,11 +405,19 @@ def _redraw_later(start: float, samples: int) -> None:
     else:
         # The first one of all compiles shaders.
         wait = min(max(REST_SECONDS, 2.0 * took), LONGEST_REST)
-    _next["at"], _next["drawn"] = now + wait, now
+    _next["drawn"] = now
+    _redraw_at(now + wait)
+
+
+def _redraw_at(moment: float) -> None:
+    """Let all views be drawn again at the `moment`, as `time.monotonic` has it."""
+    _next["at"] = moment
     if not bpy.app.timers.is_registered(_redraw):
-        bpy.app.timers.register(_redraw, first_interval=wait)
+        bpy.app.timers.register(_redraw, first_interval=max(moment - time.monotonic(), 0.0))
 
 
+# The first view of a session says that shaders are compiled, which holds up the window, before they are.
+_has_drawn = [bpy.app.background]
 # When a view was drawn last, the shadows of all views, the views, and what they know of lights with nodes.
 _drawn = [0.0]
 _at_work: weakref.WeakSet = weakref.WeakSet()

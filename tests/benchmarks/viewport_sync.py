@@ -189,9 +189,7 @@ def main(arguments: list[str]) -> int:
     clock, processor, late = measure_shadows(scene)
     print(f"{'shadows of one moved light':<42}{1000.0 * clock:10.1f} ms{1000.0 * processor:10.1f} ms, "
           f"this thread at most {1000.0 * late:.0f} ms late")  # fmt: skip
-    print(
-        f"most memory of this process: {before:.0f} MiB with the scene, {_memory():.0f} MiB with view and shadows"
-    )
+    print(f"most memory of this process: {before:.0f} MiB with the scene, {_memory():.0f} MiB with view and shadows")
     return 0
 
 

@@ -62,16 +62,19 @@ class HorizonPass:
         """Free all textures and shaders."""
         self._size, self._mask, self._shaders, self._textures, self._buffers = None, None, {}, {}, {}
 
-    def draw(self, gbuffer: GBufferTextures, lights: UploadedLights, view: Sequence[float]) -> gpu.types.GPUTexture:
+    def draw(
+        self, gbuffer: GBufferTextures, lights: UploadedLights, view: Sequence[float], threshold: float = 0.5
+    ) -> gpu.types.GPUTexture:
         """Normals of the horizons (RGB) of a G-buffer with smooth and geometric normals; valid until the next call.
 
-        `view` is the camera's place and 1, or for parallel views the unit direction toward it and 0.
+        Pixels take the smooth horizon where its share is at least `threshold`. `view` is the camera's place and 1, or
+        for parallel views the unit direction toward it and 0.
         """
         self._resize(gbuffer.size, gbuffer.mask)
         corners = [len(light.corners) if light.shape == "POLYGON" else 1 for light in lights.lights]
-        self._run(BOUNDS, gbuffer, lights, shares([1] * len(corners)))
-        self._run(EXCESS, gbuffer, lights, shares([horizons.AROUND * count for count in corners]), view)
-        self._run(CHOICE, gbuffer, lights, [(0, 0)])
+        self._run(BOUNDS, gbuffer, lights, shares([1] * len(corners)), {})
+        self._run(EXCESS, gbuffer, lights, shares([horizons.AROUND * count for count in corners]), {"view": view})
+        self._run(CHOICE, gbuffer, lights, [(0, 0)], {"threshold": threshold})
         return self._textures[_RESULTS[CHOICE]]
 
     def _resize(self, size, mask) -> None:
@@ -80,7 +83,7 @@ class HorizonPass:
             self._buffers = {step: frame_buffer(self._textures[name], mask) for step, name in _RESULTS.items()}
             self._size, self._mask = size, mask
 
-    def _run(self, step, gbuffer, lights, light_shares, view=None) -> None:
+    def _run(self, step, gbuffer, lights, light_shares, constants) -> None:
         shader, batch = self._shaders[step]
         with self._buffers[step].bind():
             gpu.state.viewport_set(0, 0, *self._size)
@@ -91,8 +94,8 @@ class HorizonPass:
                 for name in HORIZON_SAMPLERS[step]:
                     own = self._textures.get(name) or (lights.texture if name == "lights" else None)
                     shader.uniform_sampler(name, own or getattr(gbuffer, SAMPLERS[name]))
-                if view is not None:
-                    shader.uniform_float("view", view)
+                for name, value in constants.items():
+                    shader.uniform_float(name, value)
                 for first, end in light_shares:
                     if step != CHOICE:
                         shader.uniform_int("place", (first, end))

@@ -16,7 +16,7 @@ from ...scene import AreaLight
 from ...shading.header import definitions
 from ..extract.origin import new_origin
 from ..materials.values import Value
-from .lighting import HorizonPass, LightingPass
+from .lighting import GOLDEN, HorizonPass, LightingPass
 from .mirror import SceneMirror
 from .shaders import glsl, pixel_shader
 from .shadows import LiveShadows, ShadowRays
@@ -166,6 +166,7 @@ class _Layer:
         self._lit: GBufferTextures | None = None
         self.smooth_normal: gpu.types.GPUTexture | None = None  # of the lobe that is lit
         self.shares: ShareGrid | None = None  # shares for all lobes
+        self.threshold = 0.5  # see `HorizonPass.draw`
         self.through, self.add_emission = self._surfaces.through, self._surfaces.add_emission
 
     def draw(self, mirror, view: View, size) -> None:
@@ -207,7 +208,7 @@ class _Layer:
         self.smooth_normal = gbuffer.smooth_normal
         if gbuffer.geometric_normal is None:
             return gbuffer
-        horizon = horizons.draw(gbuffer, lights, view.homogeneous_eye)
+        horizon = horizons.draw(gbuffer, lights, view.homogeneous_eye, self.threshold)
         smooth_normal = gbuffer.smooth_normal if has_bent_lobes(mirror.instances) else None
         return replace(gbuffer, geometric_normal=horizon, smooth_normal=smooth_normal)
 
@@ -365,6 +366,7 @@ class ViewRenderer:
         lights_changed = self._upload_lights(mirror, view, world)
         layers = [self._surfaces, self._glass] if mirror.has_glass else [self._surfaces]
         for layer in layers:
+            layer.threshold = (0.5 + self.samples * GOLDEN) % 1.0
             if surfaces_changed or lights_changed or not layer.is_ready:
                 layer.choose_horizons(mirror, view, self._lights)
             layer.shares = None

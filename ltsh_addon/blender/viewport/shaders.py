@@ -548,7 +548,11 @@ HORIZON_SAMPLERS = {
     EXCESS: (*_SEEN, "normals", "f0s", "bases", "diffuse_normals", "light_bounds"),
     CHOICE: ("smooth_normals", "geometric_normals", "excesses"),
 }
-_HORIZON_CONSTANTS = {BOUNDS: {"place": "IVEC2"}, EXCESS: {"place": "IVEC2", "view": "VEC4"}, CHOICE: {}}
+_HORIZON_CONSTANTS = {
+    BOUNDS: {"place": "IVEC2"},
+    EXCESS: {"place": "IVEC2", "view": "VEC4"},
+    CHOICE: {"threshold": "FLOAT"},
+}
 HORIZON_CORNERS = 32  # of round lights, as in `AreaLight.polygon`
 
 

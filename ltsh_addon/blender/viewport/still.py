@@ -13,7 +13,7 @@ import numpy as np
 
 from ...cycles.environment import SkyPicture
 from ...files import save_array
-from ...scene import AreaLight, SceneError, error_line
+from ...scene import AreaLight, SceneError, error_line, listed
 from .. import render_settings
 from ..extract.occluders import collect_occluders
 from ..extract.pixels import no_light, open_scene
@@ -139,10 +139,23 @@ def _not_shown(scene, camera) -> list[str]:
         "the render region": scene.render.use_border,
     }
     found = [f"{name} is not shown in views" for name, is_asked in asked.items() if is_asked]
+    finer = sorted(ob.name for ob in _layer(scene).objects if not ob.hide_render and _is_finer_in_renders(ob))
+    if finer:
+        found.append(f"views and renders have other modifiers or levels of subdivision of {listed(finer, 4, ', ')}")
     used = [layer.name for layer in scene.view_layers if layer.use]
     if len(used) > 1:
         found.append(f"scene {scene.name!r}: only view layer {used[0]!r} of {len(used)} is shown")
     return found
+
+
+def _is_finer_in_renders(ob) -> bool:
+    """True if a modifier of the object gives renders another mesh than views."""
+    return any(
+        modifier.show_viewport != modifier.show_render
+        or modifier.type in ("SUBSURF", "MULTIRES")
+        and modifier.levels != modifier.render_levels
+        for modifier in ob.modifiers
+    )
 
 
 def _sky(scene, warnings: list[str]) -> ShownSky | None:

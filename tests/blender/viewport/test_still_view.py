@@ -181,6 +181,9 @@ def test_what_a_view_leaves_out_is_named(capsys, tmp_path):
     with_graphics(lambda: None)
     camera = set_up_scene()
     camera.data.dof.use_dof = True
+    same, other = (parts.add_plane(parts.principled(name)[0], name=name).modifiers.new("", "SUBSURF")
+                   for name in ("Same", "Other"))  # fmt: skip
+    same.levels, same.render_levels, other.levels, other.render_levels = 1, 1, 1, 2
     path = parts.save(tmp_path / "room.blend")
     code, stdout, _ = run(
         capsys, "view", path, "-o", tmp_path / "out", "--refine", 1, "--frames", "3,5", "--resolution", "16x12",
@@ -190,7 +193,7 @@ def test_what_a_view_leaves_out_is_named(capsys, tmp_path):
     assert code == 0 and document["draw_s"] > 0.0
     assert [(one["name"], one["frame"]) for one in document["reports"]] == [("view_0003", 3), ("view_0005", 5)]
     warnings = "\n".join(document["reports"][0]["warnings"])
-    assert "depth of field" in warnings
+    assert "depth of field" in warnings and "levels of subdivision of Other\n" in f"{warnings}\n"
     assert {path.name for path in (tmp_path / "out").glob("view_*")} == {
         f"view_000{frame}.{suffix}" for frame in (3, 5) for suffix in ("exr", "png")
     }
@@ -210,6 +213,9 @@ def test_a_machine_without_graphics_is_told_in_one_line(tmp_path, own_blender):
 def drawn_by_samples():
     """Means of 1, 2, ... points of a view at rest, the same points drawn alone, and what follows a change."""
     camera = set_up_scene()
+    for mesh in bpy.data.meshes:  # horizons of smooth ones change from point to point
+        mesh.shade_flat()
+    bpy.context.view_layer.update()
     depsgraph = bpy.context.evaluated_depsgraph_get()
     mirror, canvas, points = SceneMirror(), Canvas(*SIZE), filter_points("BLACKMAN_HARRIS", 1.5, 3)
     mirror.sync(depsgraph)

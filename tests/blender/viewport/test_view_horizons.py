@@ -6,6 +6,7 @@ from functools import partial
 import bpy
 import gpu
 import numpy as np
+import pytest
 import random_surfaces
 import scene_parts as parts
 from graphics_card import Canvas, edits_with_graphics, with_graphics
@@ -41,25 +42,25 @@ def chances_in_one_leaf(position, normal, lights):
     return chances_of(own_bounds(position, normal, lights, light_rows(lights)))
 
 
-def shares(samples, lights):
+def shares(samples, lights, threshold=0.5):
     """Shares (P,) of the lobes that end at the smooth horizon; a mask (P,) of samples for which neither rounding can
-    turn the choice nor no light is between the horizons."""
+    turn the choice at the `threshold` nor no light is between the horizons."""
     of_lobes = lobe_chances(samples, np.arange(len(samples)), False)
     by_lobe, by_light = horizon_excess(samples, lights, of_lobes, partial(chances_in_one_leaf, lights=lights), True)
     # Of what is between the horizons where they cross, one part may cancel the other.
     is_sum = np.abs(by_lobe + by_light) >= TIE * (np.abs(by_lobe) + np.abs(by_light))
     share = smooth_share(by_lobe, by_light)
-    return share, is_sum & (np.abs(share - 0.5) >= TIE), by_lobe + by_light != 1.0
+    return share, is_sum & (np.abs(share - threshold) >= TIE), by_lobe + by_light != 1.0
 
 
-def ended(samples, lights):
-    """The samples as the viewport ends them: at the horizon of the larger part."""
-    is_smooth = shares(samples, lights)[0] >= 0.5
+def ended(samples, lights, threshold=0.5):
+    """The samples as the viewport ends them: at the smooth horizon if its share is at least the `threshold`."""
+    is_smooth = shares(samples, lights)[0] >= threshold
     normal = np.where(is_smooth[:, None], samples.smooth_normal, samples.geometric_normal)
     return replace(samples, geometric_normal=normal)
 
 
-def chosen(kind, count=4):
+def chosen(kind, count, threshold):
     """What the card chose (P, 3) among random samples under `count` lights of `kind`, with samples and lights."""
     random = np.random.default_rng([len(kind), *map(ord, kind)])
     samples = random_surfaces.samples("tilted", WIDTH * HEIGHT, random)
@@ -68,20 +69,21 @@ def chosen(kind, count=4):
     samples = replace(samples, geometric_normal=random_surfaces.unit(random_surfaces.rounded(bent)))
     lights = tuple(random_surfaces.light(kind, number, random) for number in range(count))
     horizons = HorizonPass()
-    texture = horizons.draw(upload_samples(samples, WIDTH), upload_lights(lights), (*EYE, 1.0))
+    texture = horizons.draw(upload_samples(samples, WIDTH), upload_lights(lights), (*EYE, 1.0), threshold)
     found = read(texture)[:, :3]
     horizons.free()
     return found, samples, lights
 
 
-def test_the_card_chooses_the_horizon_that_numpy_chooses():
+@pytest.mark.parametrize("threshold", [0.5, 0.2, 0.9])
+def test_the_card_chooses_the_horizon_that_numpy_chooses(threshold):
     # The last ones are more than a draw call takes.
     kinds = {"near": 4, "horizon": 4, "huge": 4, "disk": 4, "polygon": 4, "tiny": 4, "plain": 110}
-    results = with_graphics(lambda: [chosen(kind, count) for kind, count in kinds.items()])
+    results = with_graphics(lambda: [chosen(kind, count, threshold) for kind, count in kinds.items()])
     turned = 0
     for kind, (found, samples, lights) in zip(kinds, results, strict=True):
-        expected = ended(samples, lights).geometric_normal
-        _, is_certain, has_light = shares(samples, lights)
+        expected = ended(samples, lights, threshold).geometric_normal
+        _, is_certain, has_light = shares(samples, lights, threshold)
         sure = is_certain & has_light
         wrong = np.abs(found - expected).max(axis=1) > 1e-6
         assert not wrong[sure].any(), kind

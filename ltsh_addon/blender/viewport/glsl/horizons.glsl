@@ -3,7 +3,8 @@
    There are three steps. BOUNDS: bounds of the light that the lights send to the pixel. EXCESS: the light that only one
    of both horizons lets through, by the directions that Cycles chooses by lobes and by lights. CHOICE: the normal of
    the horizon. The first two add up over draw calls, so there may be many lights. Where `cycles.horizons` splits a
-   sample in two, the pixel takes the horizon of the larger part. */
+   sample in two, a picture takes the horizon of one part: of the larger one at the threshold 1/2, and over pictures
+   with thresholds between 0 and 1 of each as often as its share. */
 
 #ifndef LTSH_CHOICE
 /* A light as seen from a point; its corners are center + s * half_u + t * half_v. */
@@ -322,8 +323,8 @@ void main()
     vec4 smooth_normal = texelFetch(smooth_normals, texel, 0);
     vec4 true_normal = texelFetch(geometric_normals, texel, 0);
     vec2 excess = texelFetch(excesses, texel, 0).xy;
-    /* Smooth if the lights' choice has at least half of the excess, or if there is none. */
-    bool is_smooth = excess.x + excess.y == 0.0 || excess.y / (excess.x + excess.y) >= 0.5;
+    /* Smooth if the lights' choice has so much of the excess, or if there is none. */
+    bool is_smooth = excess.x + excess.y == 0.0 || excess.y / (excess.x + excess.y) >= threshold;
     color = is_smooth ? smooth_normal : true_normal;
 }
 #endif

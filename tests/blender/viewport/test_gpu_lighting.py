@@ -404,7 +404,7 @@ def test_a_thousand_lights_add_up():
 
     def draw():
         samples, lights, lighting = lit("ltsh2", 17, lights=1100)
-        assert len(lighting._shares) > 1
+        assert len(lighting._ranges(None)) > 1
         return samples, lights, drawn(lighting, samples, Canvas(WIDTH, HEIGHT), "specular")
 
     samples, lights, found = with_graphics(draw)

@@ -260,9 +260,10 @@ class _Lit:
 
     def has_same_shares(self, new: _Lit, left_out: frozenset[int]) -> bool:
         """True if the shares are the same, but for those of the lights `left_out`."""
+        if len(self.sources) != len(new.sources):
+            return False
         kept = [number for number in range(len(self.sources)) if number not in left_out]
-        same = all(a is b for number in kept for a, b in zip(self.sources[number], new.sources[number], strict=True))
-        return len(self.sources) == len(new.sources) and same
+        return all(a is b for number in kept for a, b in zip(self.sources[number], new.sources[number], strict=True))
 
 
 def _is_same_light(a: AreaLight, b: AreaLight) -> bool:
@@ -445,7 +446,7 @@ class ViewRenderer:
             self._light(layer, wanted, targets, seen)
             return
         shares = layer.shares
-        sources = () if shares is None else shares.sources or ((shares,),) * (len(lights) + 1)
+        sources = () if shares is None else shares.sources or ((shares, None),) * (len(lights) + 1)
         before, self._lit = self._lit, _Lit(state, lights, sources)
         if self._held is None or not self._held.fits(self._lit):
             moving, self._held = None if before is None else before.changes(self._lit), None

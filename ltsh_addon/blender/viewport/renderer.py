@@ -7,12 +7,11 @@ the picture is their mean.
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 
 import gpu
 import numpy as np
 
-from ...scene import AreaLight
 from ...shading.header import definitions
 from ..extract.origin import new_origin
 from ..materials.values import Value
@@ -256,7 +255,7 @@ class _Lit:
         if not _same(new.state, self.state) or len(new.lights) != count or count > MOST_COMPARED:
             return None
         pairs = zip(self.lights, new.lights, strict=True)
-        return frozenset(number for number, (a, b) in enumerate(pairs) if not _is_same_light(a, b))
+        return frozenset(number for number, (a, b) in enumerate(pairs) if not is_equal(a, b))
 
     def has_same_shares(self, new: _Lit, left_out: frozenset[int]) -> bool:
         """True if the shares are the same, but for those of the lights `left_out`."""
@@ -266,10 +265,14 @@ class _Lit:
         return all(a is b for number in kept for a, b in zip(self.sources[number], new.sources[number], strict=True))
 
 
-def _is_same_light(a: AreaLight, b: AreaLight) -> bool:
-    names = (item.name for item in fields(AreaLight) if item.name != "detail")
-    values = ((getattr(a, name), getattr(b, name)) for name in names)
-    return a is b or all(x is y or np.array_equal(x, y) for x, y in values)
+def is_equal(a, b) -> bool:
+    """True for lights that look the same, and for their parts: arrays, cones, patterns, words and numbers."""
+    if a is b or type(a) is not type(b):
+        return a is b
+    if not is_dataclass(a):
+        return np.array_equal(a, b)
+    names = (item.name for item in fields(a) if item.name != "detail")
+    return all(is_equal(getattr(a, name), getattr(b, name)) for name in names)
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ import bpy
 import numpy as np
 import programs
 import pytest
+import random_surfaces
 import scene_parts as parts
 from fake_scene import run
 from graphics_card import Canvas, edits_with_graphics, with_graphics
@@ -28,11 +29,11 @@ from ltsh_addon.blender.render_settings import filter_points
 from ltsh_addon.blender.viewport import shadows
 from ltsh_addon.blender.viewport.lighting import LightingPass
 from ltsh_addon.blender.viewport.mirror import SceneMirror
-from ltsh_addon.blender.viewport.renderer import CENTERS, ShownPicture, ViewRenderer
+from ltsh_addon.blender.viewport.renderer import CENTERS, ShownPicture, ViewRenderer, is_equal
 from ltsh_addon.blender.viewport.shadows import LiveShadows, ShadowRays, too_many
 from ltsh_addon.blender.viewport.still import view_of_camera
 from ltsh_addon.blender.viewport.textures import read_texture
-from ltsh_addon.scene import Cancelled
+from ltsh_addon.scene import Cancelled, Pattern
 
 ROOT = Path(__file__).resolve().parents[3]
 SIZE = (72, 48)
@@ -406,6 +407,23 @@ def test_while_one_light_changes_the_others_are_not_drawn_again(has_shadows):
         np.testing.assert_allclose(kept, whole, rtol=1e-4, atol=1e-6)
     steps = [relative(first[2], second[2]) for first, second in zip(found, found[1:], strict=False)]
     assert min(steps) > 1e-3, "each change is seen"
+
+
+@pytest.mark.parametrize("kind", ["plain", "disk", "polygon", "ball", "spot", "spot disk", "bulb", "sun"])
+def test_lights_that_are_read_again_are_equal_until_they_change(kind):
+    def read():
+        light = random_surfaces.light(kind, 0, np.random.default_rng(1))
+        pattern = Pattern(np.eye(3), np.ones((2, 3))) if light.is_facing else None
+        return replace(light, pattern=pattern)
+
+    light = read()
+    assert is_equal(light, read())
+    changes = [{"center": light.center + 1e-3}, {"radiance": 2.0 * light.radiance}, {"name": "Other"}]
+    if light.cone is not None:
+        changes.append({"cone": replace(light.cone, cosine=0.5 * light.cone.cosine)})
+    if light.pattern is not None:
+        changes.append({"pattern": Pattern(np.eye(3), np.full((2, 3), 0.5))})
+    assert not any(is_equal(light, replace(read(), **change)) for change in changes)
 
 
 def late_pictures():

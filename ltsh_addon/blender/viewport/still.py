@@ -139,16 +139,16 @@ def _not_shown(scene, camera) -> list[str]:
         "the render region": scene.render.use_border,
     }
     found = [f"{name} is not shown in views" for name, is_asked in asked.items() if is_asked]
-    finer = sorted(ob.name for ob in _layer(scene).objects if not ob.hide_render and _is_finer_in_renders(ob))
-    if finer:
-        found.append(f"views and renders have other modifiers or levels of subdivision of {listed(finer, 4, ', ')}")
+    others = sorted(ob.name for ob in _layer(scene).objects if not ob.hide_render and _differs_in_renders(ob))
+    if others:
+        found.append(f"views and renders have other modifiers or levels of subdivision of {listed(others, 4, ', ')}")
     used = [layer.name for layer in scene.view_layers if layer.use]
     if len(used) > 1:
         found.append(f"scene {scene.name!r}: only view layer {used[0]!r} of {len(used)} is shown")
     return found
 
 
-def _is_finer_in_renders(ob) -> bool:
+def _differs_in_renders(ob) -> bool:
     """True if a modifier of the object gives renders another mesh than views."""
     return any(
         modifier.show_viewport != modifier.show_render

@@ -46,7 +46,8 @@ def shares(samples, lights, threshold=0.5):
     """Shares (P,) of the lobes that end at the smooth horizon; a mask (P,) of samples for which neither rounding can
     turn the choice at the `threshold` nor no light is between the horizons."""
     of_lobes = lobe_chances(samples, np.arange(len(samples)), False)
-    by_lobe, by_light = horizon_excess(samples, lights, of_lobes, partial(chances_in_one_leaf, lights=lights), True)
+    choose = partial(chances_in_one_leaf, lights=lights)
+    by_lobe, by_light = horizon_excess(samples, lights, of_lobes, choose, is_quick=True)
     # Of what is between the horizons where they cross, one part may cancel the other.
     is_sum = np.abs(by_lobe + by_light) >= TIE * (np.abs(by_lobe) + np.abs(by_light))
     share = smooth_share(by_lobe, by_light)

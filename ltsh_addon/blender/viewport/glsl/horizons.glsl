@@ -1,17 +1,16 @@
 /* Chooses the horizon that ends the specular lobe of a pixel, as `cycles.horizons` does for samples.
 
    There are three steps. BOUNDS: bounds of the light that the lights send to the pixel. EXCESS: the light that only one
-   of both horizons lets through, by the directions that Cycles chooses by lobes and by lights. CHOICE: the normal of
-   the horizon. The first two add up over draw calls, so there may be many lights. Where `cycles.horizons` splits a
+   of both horizons lets through, by the directions that Cycles chooses by lobes and by lights, those of `is_quick`:
+   each angle around the smooth normal has one height. CHOICE: the normal of the horizon. The first two add up over draw calls, so there may be many lights. Where `cycles.horizons` splits a
    sample in two, a picture takes the horizon of one part: of the larger one at the threshold 1/2, and over pictures
    with thresholds between 0 and 1 of each as often as its share. */
 
 #ifndef LTSH_CHOICE
 /* A light as seen from a point; its corners are center + s * half_u + t * half_v. */
 struct seen_light {
-    vec3 offset; vec3 half_u; vec3 half_v; vec3 direction; int first; int count; float area; float radiance; float radius;
-    float end;
-    bool faces; bool is_round; bool is_disk;
+    vec3 offset; vec3 half_u; vec3 half_v; vec3 direction; int first; int count; float area; float radiance;
+    float radius; float end; bool faces; bool is_round; bool is_disk;
 };
 
 seen_light light_from(int number, vec3 position, vec3 normal)
@@ -33,10 +32,10 @@ seen_light light_from(int number, vec3 position, vec3 normal)
     light.count = half_u.w > 0.0 ? int(half_u.w) : LTSH_ROUND_CORNERS;
     light.first = half_u.w > 0.0 ? int(center.w) : LTSH_ROUND_FIRST;
     light.radiance = radiance.x + radiance.y + radiance.z;
-    vec4 bounds_of_light = ltsh_light_texel(header + 5);
+    vec4 traits = ltsh_light_texel(header + 5);
     float squares = dot(light.half_u, light.half_u) + dot(light.half_v, light.half_v);
-    light.radius = bounds_of_light.w * sqrt(squares + 2.0 * abs(dot(light.half_u, light.half_v)));
-    float tangent = bounds_of_light.x;
+    light.radius = traits.w * sqrt(squares + 2.0 * abs(dot(light.half_u, light.half_v)));
+    float tangent = traits.x;
     light.end = tangent > 0.0 ? inversesqrt(1.0 + tangent * tangent) : 0.0;
     light.faces = dot(light.offset, light.direction) < 0.0;
     return light;
@@ -198,7 +197,8 @@ float direction_at(float angle)
     return (turns + 0.5 + 0.5 * turn) * float(LTSH_AROUND) - 0.5;
 }
 
-/* The first of the directions that may meet the light, by their angle around the smooth normal, and their count. */
+/* The first of the directions that may meet the light, by their angle around the smooth normal, and their count. A
+   hundredth of a step more, because angles are rounded. */
 ivec2 directions_around(seen_light light, vec3 along, vec3 across)
 {
     vec2 flat_offset = vec2(dot(light.offset, along), dot(light.offset, across));

@@ -10,8 +10,8 @@ from functools import cached_property
 import numpy as np
 from scipy.special import erf
 
-from ltsh_addon.shading import brdf, spherical_harmonics
-from ltsh_addon.shading.lookup_table import basis_integrals, basis_values, bent
+from ltsh_addon.lobes import brdf, spherical_harmonics
+from ltsh_addon.lobes.lookup_table import basis_integrals, basis_values, bent
 
 
 @dataclass(frozen=True)

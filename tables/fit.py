@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ltsh_addon.files import replacing
-from ltsh_addon.shading.lookup_table import FORMAT_VERSION, roughness_nodes, theta_nodes, warp_entries
+from ltsh_addon.lobes.lookup_table import FORMAT_VERSION, roughness_nodes, theta_nodes, warp_entries
 
 from . import projection, refine, walk
 from .families import GGX, Brdf, Family

@@ -19,9 +19,10 @@ from pathlib import Path
 import numpy as np
 
 from ltsh_addon.files import write_bytes
-from ltsh_addon.shading import brdf, evaluate_lobe
-from ltsh_addon.shading.edge_integrals import ridge_matrix
-from ltsh_addon.shading.lookup_table import LookupTable
+from ltsh_addon.lobes import brdf
+from ltsh_addon.lobes.edge_integrals import ridge_matrix
+from ltsh_addon.lobes.lookup_table import LookupTable
+from ltsh_addon.shading import evaluate_lobe
 
 from .families import GGX, family_named
 from .projection import FLAT, Points, project, relative_error, warped_basis

@@ -9,7 +9,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.colors import LogNorm
 
-from ltsh_addon.shading import SHIPPED_TABLES, brdf, evaluate_lobe, load_table
+from ltsh_addon.lobes import brdf
+from ltsh_addon.shading import SHIPPED_TABLES, evaluate_lobe, load_table
 
 from . import optimum, validate
 

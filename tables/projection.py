@@ -14,8 +14,8 @@ from functools import cache
 
 import numpy as np
 
-from ltsh_addon.shading import brdf
-from ltsh_addon.shading.lookup_table import theta_at
+from ltsh_addon.lobes import brdf
+from ltsh_addon.lobes.lookup_table import theta_at
 
 COSINES = np.linspace(0.0, 1.0, 257)
 FLAT = np.ones((1, len(COSINES)))

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ltsh_addon.shading.lookup_table import warp_entries
+from ltsh_addon.lobes.lookup_table import warp_entries
 
 from .projection import FLAT, Points, batches, warped_basis
 

@@ -12,9 +12,10 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
+from ltsh_addon.lobes import brdf
+from ltsh_addon.lobes.lookup_table import LookupTable
 from ltsh_addon.scene import AreaLight, SurfaceSamples
-from ltsh_addon.shading import brdf, evaluate_lobe, header, shade
-from ltsh_addon.shading.lookup_table import LookupTable
+from ltsh_addon.shading import evaluate_lobe, header, shade
 
 from .families import gauss_legendre
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ltsh_addon.shading.lookup_table import WARP_REGULARIZATION
+from ltsh_addon.lobes.lookup_table import WARP_REGULARIZATION
 
 from .projection import FLAT, Points, project
 

@@ -19,7 +19,7 @@ TESTS = Path(__file__).parent
 # Files that need no bpy, of what may depend on the versions of Python and numpy: `make test` runs them on both.
 SMOKE = {
     "cli/test_cli_arguments.py", "imaging/test_exr.py", "packaging/test_environment.py", "pipeline/test_compare.py",
-    "pipeline/test_jobs.py", "shading/test_single_precision.py", "test_scene.py",
+    "pipeline/test_jobs.py", "shading/test_single_precision.py", "scene/test_scene.py",
 }  # fmt: skip
 
 

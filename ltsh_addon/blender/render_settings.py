@@ -11,7 +11,7 @@ import numpy as np
 
 from ..files import check_room_after
 from ..scene import Border, SceneError, listed
-from ..shading.parallel import cores
+from ..workers.pool import cores
 from .evaluated import SURFACE_TYPES
 
 DEFAULTS = {

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from .. import shading
-from ..shading.brdf import dielectric_reflectance, schlick_curve
+from ..lobes.brdf import dielectric_reflectance, schlick_curve
 
 GLASS_NODES = 16
 NORMALS_PER_AXIS = 24

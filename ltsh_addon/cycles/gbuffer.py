@@ -13,8 +13,8 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
+from ..emitters.light_polygons import has_lobe
 from ..scene import FARTHEST, SCALAR_FIELDS, Film, SurfaceSamples, is_constant
-from ..shading.light_polygons import has_lobe
 from .horizons import unit
 from .lobes import AOV_PREFIX, HIT_AOVS, KEPT_AOV, Hits, lobe_aov, lobe_names, read_aov, read_layer, samples_of_lobes
 

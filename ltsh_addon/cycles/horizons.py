@@ -7,9 +7,9 @@ from functools import partial
 
 import numpy as np
 
+from ..emitters.light_tree import stand_ins
+from ..lobes import brdf, polygon
 from ..scene import FACING_SHAPES, AreaLight, SurfaceSamples
-from ..shading import brdf, polygon
-from ..shading.light_tree import stand_ins
 from .light_tree import light_chances, light_rows
 
 SPECULAR_FIELDS = ("specular_f0", "specular_f90", "specular_dip", "dielectric")

@@ -11,8 +11,8 @@ from functools import lru_cache, reduce
 
 import numpy as np
 
+from ..emitters.facing import cone_angle
 from ..scene import AreaLight
-from ..shading.facing import cone_angle
 
 # LIGHTS_OF_LEAF: most lights of a leaf in Cycles. BUCKETS: along each axis Cycles tries to cut a cluster between these.
 LIGHTS_OF_LEAF = 8

@@ -7,9 +7,9 @@ from functools import cached_property
 
 import numpy as np
 
+from ..lobes import diffuse as rough_diffuse
+from ..lobes.brdf import is_clipped
 from ..scene import SurfaceSamples
-from ..shading import diffuse as rough_diffuse
-from ..shading.brdf import is_clipped
 from . import closures
 from .closures import sheen_albedo, sheen_lobe
 from .horizons import SPECULAR_FIELDS, bump_alpha2, unit, valid_specular_normal

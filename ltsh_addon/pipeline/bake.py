@@ -21,8 +21,8 @@ from ..cycles.texels import NOT_BAKED, BakeMaterial, BakeView, TexelMesh, texel_
 from ..files import temporary_folder
 from ..reading import NUMBER, Malformed, check, file_name
 from ..scene import PASSES, REFERENCE, Cancelled, Film, Progress, SurfaceSamples, lights_of, listed
-from ..shading.parallel import cores
 from ..visibility import Occluders, ShadowSampling
+from ..workers.pool import cores
 from . import lighting, picture
 from .bake_files import ErrorPictures, ErrorSums, Planes
 from .options import BAKE_PASSES, MARGIN_TYPES, TEXTURE_SIDES, BakeOptions, child_job

@@ -14,19 +14,7 @@ from ..imaging import write_json, write_overview
 from ..reading import NUMBER, Malformed, read_json
 from ..scene import Progress, SceneError, error_line
 from . import bake, picture, render, view
-from .tasks import (
-    FOLDER,
-    FORMAT,
-    JOB,
-    TASK_RECORD,
-    Job,
-    Records,
-    Task,
-    read_document,
-    shard_of,
-    tasks_of,
-    write_record,
-)
+from .tasks import FOLDER, FORMAT, JOB, TASK_RECORD, Job, Records, Task, read_document, shard_of, tasks_of, write_record
 
 OVERWRITE, RESUME, SKIP = "overwrite", "resume", "skip"
 

@@ -17,9 +17,9 @@ import numpy as np
 
 from ..files import replacing
 from ..imaging.exr import write_channels
+from ..lobes.lookup_table import MIN_ALPHA, WARP_REGULARIZATION, LookupTable, basis_integrals
 from ..scene import VERSION
 from ..shading import header, load_table
-from ..shading.lookup_table import MIN_ALPHA, WARP_REGULARIZATION, LookupTable, basis_integrals
 
 _WARP_NAMES = ("A", "B", "C", "tilt")
 

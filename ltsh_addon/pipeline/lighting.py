@@ -21,6 +21,7 @@ import numpy as np
 
 from .. import shading, visibility
 from ..cycles.gbuffer import finer
+from ..emitters.light_tree import FEWEST
 from ..files import replacing, temporary_folder
 from ..scene import (
     REFERENCE,
@@ -34,7 +35,6 @@ from ..scene import (
     light_records,
     lights_of,
 )
-from ..shading.light_tree import FEWEST
 
 FILM_ARRAYS = ("first", "count", "spread", "whole")  # the optional arrays of a film
 # The two files of `keep_picture`: the samples with all that shading needs, and the occluders.

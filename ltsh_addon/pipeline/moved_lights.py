@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 
 from ..cycles.gbuffer import SHADOW_LOOSENESS, one_shading, with_one_shadow
+from ..emitters.light_polygons import has_lobe
 from ..files import temporary_folder
 from ..scene import AreaLight, Cancelled, Film, SurfaceSamples
-from ..shading.light_polygons import has_lobe
 from ..visibility import BLOCK_SAMPLES, Company, Occluders, Setting, task_of_lights
 from . import picture
 from .lighting import KEPT_SUFFIX, OCCLUDERS_SUFFIX, KeptPicture, rays_of_samples

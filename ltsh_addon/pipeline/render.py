@@ -32,8 +32,8 @@ from ..files import save_array, temporary_folder, write_bytes
 from ..imaging.denoise import NoDenoiser, open_denoiser
 from ..imaging.exr import write_channels
 from ..scene import PASSES, Cancelled, Progress, listed
-from ..shading.parallel import cores
 from ..visibility import ShadowSampling
+from ..workers.pool import cores
 from . import lighting, picture
 from .options import EDGE_POINTS, SHADOW_RAYS, PictureOptions, RenderOptions, child_job
 

@@ -11,10 +11,10 @@ Letters: P samples, L lights, V polygon corners, K coefficients, F Fresnel curve
 functions have space as the last axis, kernels work on (3, V, P).
 """
 
+from ..lobes.lobe_integrals import clamped_form_factor, evaluate_lobe, integrate_polygon
+from ..lobes.lookup_table import LookupTable, TableError, load_table
 from ..scene import PASSES, REFERENCE, SHIPPED_TABLES
 from .integrator import OwnTechnique, Shading, is_own, shade
-from .lobes import clamped_form_factor, evaluate_lobe, integrate_polygon
-from .lookup_table import LookupTable, TableError, load_table
 
 __all__ = [
     "PASSES",

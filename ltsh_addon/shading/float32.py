@@ -14,23 +14,23 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from . import float64, light_cone, moments32, small_lights
-from .facing import FacingDisk, Lobe, mean_emission
-from .light_polygons import (
-    MOSTLY_WHOLE,
-    integrate_visible,
+from ..emitters import light_profile, small_lights
+from ..emitters.facing import FacingDisk, Lobe, mean_emission
+from ..emitters.light_polygons import (
     interpolated,
     light_levels,
     local_corners,
     may_reach,
     off_plane,
 )
-from .light_tree import FEWEST, LightTree, add_far_lights
-from .lobes import FLOAT64_CHUNK, LEAST_SHARE, NARROWEST
-from .lookup_table import MIN_ALPHA
-from .polygon import convex_pieces, dot
-from .sky_map import SkyMap
-from .tails import SeenLight, TailLimits
+from ..emitters.light_tree import FEWEST, LightTree, add_far_lights
+from ..emitters.sky_map import SkyMap
+from ..emitters.tails import SeenLight, TailLimits
+from ..lobes import moments32
+from ..lobes.lobe_integrals import FLOAT64_CHUNK, LEAST_SHARE, NARROWEST
+from ..lobes.lookup_table import MIN_ALPHA
+from ..lobes.polygon import MOSTLY_WHOLE, convex_pieces, dot, integrate_visible
+from . import float64
 
 # If a block has more different indices of refraction, the dielectric's weights are summed up per sample.
 SEPARATE_IORS = 8
@@ -285,7 +285,7 @@ class _Lighting:
         if not lobes.only_tails:
             if not light.is_profiled:
                 rest = self._add_small(lobes, light, position, (columns, allowed), sums[group])
-            elif light_cone.ConeRegions.suit(light):
+            elif light_profile.ConeRegions.suit(light):
                 rest = self._add_points(lobes, light, position, (columns, allowed), sums[group])
             if rest is not None and len(rest) == 0:
                 return
@@ -453,8 +453,8 @@ class _Lighting:
         for piece in moments32.pieces(len(columns), SMALL_CHUNK):
             part = columns[piece]
             offset = (light.center[:, None] - position[:, part]).astype(np.float32)
-            view = light_cone.LightView.of(light, offset, partial(_along_rows, lobes.rows[:, :, part]))
-            regions = light_cone.ConeRegions(light, view, lobes.clip_rows)
+            view = light_profile.LightView.of(light, offset, partial(_along_rows, lobes.rows[:, :, part]))
+            regions = light_profile.ConeRegions(light, view, lobes.clip_rows)
             for count, kind, index in regions.rules():
                 if count == 0:
                     left.append(part[index])
@@ -775,9 +775,9 @@ class ProfiledIntegral:
 
     def __init__(self, light, effort, offset, axes, integrate, count):
         self.effort, self.integrate, self.count = effort, integrate, count
-        self.profile = light_cone.Profile.of(light)
-        self.view = light_cone.LightView.of(light, offset, partial(_along_rows, axes))
-        plane = light_cone.plane_axes(light).astype(np.float32)[:, :, None]
+        self.profile = light_profile.Profile.of(light)
+        self.view = light_profile.LightView.of(light, offset, partial(_along_rows, axes))
+        plane = light_profile.plane_axes(light).astype(np.float32)[:, :, None]
         self.rows = np.concatenate([axes, np.broadcast_to(plane, (2, 3, axes.shape[2]))])
 
     def __call__(self, corners, index):
@@ -788,7 +788,7 @@ class ProfiledIntegral:
         for start in range(0, len(index), step):
             part = slice(start, start + step)
             flat, view = corners[-2:, :, part], self.view.take(index[part])
-            layers = light_cone.layers(view, flat, self.profile, self.effort)
+            layers = light_profile.layers(view, flat, self.profile, self.effort)
             for number, (near, weights, polygons) in enumerate(layers):
                 # Small disks count little, so the rounding of their edges is lost in the sum.
                 smallest = 0.0 if number < self.effort.layers - 1 else moments32.SMALLEST_SAFE

@@ -10,9 +10,12 @@ from itertools import chain
 
 import numpy as np
 
-from ..scene import REFERENCE
-from . import diffuse, facing, light_cone
-from .brdf import (
+from ..emitters import facing, light_profile
+from ..emitters.facing import FacingDisk
+from ..emitters.light_polygons import Framed, PatchTree, has_lobe, light_view, seen_parts, to_local
+from ..emitters.tails import SeenLight, TailLimits
+from ..lobes import diffuse
+from ..lobes.brdf import (
     HalfVectors,
     clipped_metals,
     dielectric_reflectance,
@@ -20,15 +23,20 @@ from .brdf import (
     ggx_brdf_cosine,
     half_angle_cosine,
 )
-from .edge_integrals import vector_irradiance
-from .facing import FacingDisk
-from .light_polygons import Framed, PatchTree, has_lobe, light_view, seen_parts, to_local
-from .lobes import FLOAT64_CHUNK, LEAST_SHARE, form_factor, integrals_on_sphere, polygon_integrals, tilted
-from .lookup_table import MIN_ALPHA, Lobe, LookupTable
-from .polygon import dot
+from ..lobes.edge_integrals import vector_irradiance
+from ..lobes.lobe_integrals import (
+    FLOAT64_CHUNK,
+    LEAST_SHARE,
+    form_factor,
+    integrals_on_sphere,
+    polygon_integrals,
+    tilted,
+)
+from ..lobes.lookup_table import MIN_ALPHA, Lobe, LookupTable
+from ..lobes.polygon import dot
+from ..lobes.spherical_harmonics import coefficient_index
+from ..scene import REFERENCE
 from .reference import anisotropic_integrals, reference_integrals
-from .spherical_harmonics import coefficient_index
-from .tails import SeenLight, TailLimits
 
 # Where a Fresnel curve with a step is looked up: at these shares of the way from a light's center to its corners.
 POINTS_TO_CORNERS = (0.2, 0.5, 0.8)
@@ -195,7 +203,7 @@ def _profiled(light, view, part, integral, count):
     integral(polygons, index) is the integral without the profile."""
     index, polygon, effort = part
     result = np.zeros((count, len(index)))
-    for near, weights, corners in light_cone.layers(view, polygon[3:], light_cone.Profile.of(light), effort):
+    for near, weights, corners in light_profile.layers(view, polygon[3:], light_profile.Profile.of(light), effort):
         result[:, near] += weights * integral(corners[3:], index[near])
     return result
 

@@ -19,10 +19,12 @@ from pathlib import Path
 
 import numpy as np
 
-from . import edge_integrals, lookup_table, tails, wgsl
-from .lobes import LEAST_SHARE
-from .lookup_table import LookupTable, TableError
-from .spherical_harmonics import coefficient_index, normalization
+from ..emitters import tails
+from ..lobes import edge_integrals, lookup_table
+from ..lobes.lobe_integrals import LEAST_SHARE
+from ..lobes.lookup_table import LookupTable, TableError
+from ..lobes.spherical_harmonics import coefficient_index, normalization
+from . import wgsl
 
 # Raise this when a function of core.h changes: headers of different versions then refuse to be included together.
 CORE_VERSION = 7

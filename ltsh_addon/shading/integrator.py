@@ -13,11 +13,14 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from ..emitters import light_profile
+from ..emitters.light_polygons import fitting_patches
+from ..lobes import moments32
+from ..lobes.lobe_integrals import FLOAT64_CHUNK
+from ..lobes.lookup_table import LookupTable, load_table
 from ..scene import PASSES, REFERENCE, AreaLight, Cancelled, SurfaceSamples
-from . import float32, float64, light_cone, moments32, parallel
-from .light_polygons import fitting_patches
-from .lobes import FLOAT64_CHUNK
-from .lookup_table import LookupTable, load_table
+from ..workers import pool
+from . import float32, float64
 
 # Least and greatest number of samples of a block, one or two chunks. One process takes a block at a time, and calls of
 # `progress` come between blocks. Towards the end blocks get shorter, so that all processes end at about the same time.
@@ -160,7 +163,7 @@ def _corners_integrated(light, is_reference):
     """Estimated number of corners in the integrals over a light."""
     count = len(light.polygon()) * min(len(light.patches), PATCHES)
     if light.is_profiled:
-        effort = light_cone.EFFORTS[1]
+        effort = light_profile.EFFORTS[1]
         count *= (2 * effort.chords + 1) * (1 if is_reference else effort.layers)
     return count
 
@@ -236,7 +239,7 @@ def shade(
     count = len(samples)
     result = _Result(task, count, np.dtype(dtype))
     blocks = _blocks(count, *(REFERENCE_BLOCK_LIMITS if task.is_reference else BLOCK_LIMITS))
-    parallel.run(task, samples, blocks, workers, result, progress)
+    pool.run(task, samples, blocks, workers, result, progress)
     return Shading(task.groups, result.radiance.get("specular"), result.radiance.get("diffuse"), result.error)
 
 
@@ -293,7 +296,7 @@ class _Result:
             self.error[block] = error
         self._leftovers[block.start] = leftovers
 
-    def pairs(self) -> list[parallel.Pairs]:
+    def pairs(self) -> list[pool.Pairs]:
         """What all blocks left, in batches. Neither the batches nor their order depend on which block was done first.
         Each batch contains whole blocks."""
         found = []
@@ -305,9 +308,9 @@ class _Result:
                     batch = []
                 batch += [(members + start, number) for members, number in leftovers[name]]
             found.append((name, batch))
-        return [parallel.Pairs(name, *map(np.concatenate, zip(*batch, strict=True))) for name, batch in found if batch]
+        return [pool.Pairs(name, *map(np.concatenate, zip(*batch, strict=True))) for name, batch in found if batch]
 
-    def keep_pairs(self, pairs: parallel.Pairs, radiance: np.ndarray) -> None:
+    def keep_pairs(self, pairs: pool.Pairs, radiance: np.ndarray) -> None:
         """Add what `Task.shade_pairs` returned."""
         lights = self._task.lights_of_pairs(pairs.name)
         group = np.array([self._task.groups.index(light.group) for light in lights])
@@ -335,8 +338,8 @@ def _check_passes(passes) -> None:
 def _parts(light) -> tuple[AreaLight, ...]:
     """The parts of a light that get an integral each: the patches of a small distant light; otherwise the light itself.
     Sheared lights with a profile are returned `upright`."""
-    if light.is_profiled and not light.detail and light_cone.has_shear(light):
-        return (light_cone.upright(light),)
+    if light.is_profiled and not light.detail and light_profile.has_shear(light):
+        return (light_profile.upright(light),)
     is_spot = float64.has_patches(light) and np.linalg.norm(light.half_u) < SPOT * np.linalg.norm(light.center)
     return tuple(replace(patch, group=light.group) for patch in light.patches) if is_spot else (light,)
 

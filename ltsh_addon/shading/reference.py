@@ -18,14 +18,15 @@ from functools import partial
 
 import numpy as np
 
+from ..emitters import light_profile
+from ..emitters.facing import FacingDisk, emission
+from ..emitters.light_polygons import in_front, light_view, to_local, visible_parts
+from ..lobes import brdf
+from ..lobes.brdf import HalfBoundary, HalfVectors
+from ..lobes.edge_integrals import arc_factors
+from ..lobes.lookup_table import MIN_ALPHA, WARP_REGULARIZATION, Lobe
+from ..lobes.polygon import convex_pieces, dot, one_plus_cosine, project_to_sphere, split_at_horizon
 from ..scene import AreaLight
-from . import brdf, light_cone
-from .brdf import HalfBoundary, HalfVectors
-from .edge_integrals import arc_factors
-from .facing import FacingDisk, emission
-from .light_polygons import in_front, light_view, to_local, visible_parts
-from .lookup_table import MIN_ALPHA, WARP_REGULARIZATION, Lobe
-from .polygon import convex_pieces, dot, one_plus_cosine, project_to_sphere, split_at_horizon
 
 _ELLIPSE_PIECES = 8
 # Evaluations per batch, few enough for the arrays of one batch to stay in the cache.
@@ -184,7 +185,7 @@ class Cone:
 
     axis: np.ndarray  # (3, P) from the points straight to the lights' planes
     distance: np.ndarray  # (P,) from the points to the planes
-    profile: light_cone.Profile
+    profile: light_profile.Profile
     at_foot: np.ndarray  # (P,) True if the light is best integrated around `axis`, where the factor has its tip
 
     def take(self, index) -> Cone:
@@ -427,7 +428,7 @@ def _integrals(framed, lobes, light, corners, candidates):
     else:
         pieces = convex_pieces(corners) if light.shape == "POLYGON" else [corners]
         batches = (batch for piece in pieces for batch in _polygons(framed, light, piece, candidates))
-    profile = light_cone.Profile.of(light) if light.has_falloff else None
+    profile = light_profile.Profile.of(light) if light.has_falloff else None
     for index, outline, cone in batches:
         if light.is_facing and not light.is_even:
             cone = FacingEmission(light, frame[:, :, index], (light.center - samples.position[index]).T)
@@ -502,16 +503,16 @@ def _ellipse_extent(normal, ellipse):
 def _cone_parts(framed, cosine, light, corners, candidates):
     """As `_polygons`, but with the cone: the part of a light in the cone of each point. It is cut in two if both the
     foot, where the factor has its tip, and the peak of the lobe lie in it."""
-    profile = light_cone.Profile.of(light)
+    profile = light_profile.Profile.of(light)
     tangent = profile.tangent
     for index, polygon in visible_parts(framed, light, corners, candidates, framed.samples.geometric_normal):
         warp = limit_warp(cosine[index], framed.samples.roughness[index] ** 2)
         view = light_view(framed, light, index, warp.to_original_domain)
-        near = np.nonzero(light_cone.DiskParts(polygon[3:]).least < tangent * view.distance)[0]
+        near = np.nonzero(light_profile.DiskParts(polygon[3:]).least < tangent * view.distance)[0]
         if len(near) == 0:
             continue
         index, view = index[near], view.take(near)
-        part = light_cone.DiskParts(polygon[3:, :, near])
+        part = light_profile.DiskParts(polygon[3:, :, near])
         reach = tangent * view.distance
         flat = part.inside(reach, _CONE_CHORDS)
         axis = view.foot[3:] / view.distance

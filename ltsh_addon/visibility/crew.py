@@ -1,6 +1,6 @@
 """Blocks of samples on all cores: this process and child processes that trace rays take them from one list.
 
-Embree is called with Python's lock held, so threads would not help. Children are started as in `shading.parallel`, and
+Embree is called with Python's lock held, so threads would not help. Children are started as in `workers.pool`, and
 each opens its own tracer. What happens in a block does not depend on who takes it.
 The children of a `Company` stay: each keeps some of the blocks, which one light after another lights. A `Mate` stays
 too: it takes blocks as the children of `run` do, and keeps them from one picture to the next.
@@ -15,7 +15,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..scene import AreaLight, Cancelled, Film, Progress, SurfaceSamples
-from ..shading import LookupTable, parallel, shade, worker
+from ..shading import LookupTable, shade
+from ..workers import pool, worker
 from .occluders import Occluders
 from .rays import open_tracer
 
@@ -48,11 +49,11 @@ def run(task, tracer, blocks: Sequence, workers: int | None, progress: Progress 
     `workers` is the total number of processes; None: as many as there are cores. `progress` is called from this thread;
     if it returns False, Cancelled is raised. No child is left when this ends.
     """
-    wanted = min(parallel.cores() if workers is None else workers, len(blocks)) - 1
-    if parallel.interpreter() is None or getattr(tracer, "library", None) is None:
+    wanted = min(pool.cores() if workers is None else workers, len(blocks)) - 1
+    if pool.interpreter() is None or getattr(tracer, "library", None) is None:
         wanted = 0
     queue = _Queue(len(blocks))
-    with parallel.helpers(queue) as children:
+    with pool.helpers(queue) as children:
         # Pack it in this thread, before tracing adds cached values to the task.
         errand = worker.packed(Errand(task, tracer.occluders, tracer.library)) if wanted > 0 else b""
         for _ in range(wanted):
@@ -69,7 +70,7 @@ def run(task, tracer, blocks: Sequence, workers: int | None, progress: Progress 
                 yielded += 1
 
 
-class _Queue(parallel.Queue):
+class _Queue(pool.Queue):
     """The numbers of the blocks that are left, and the results that children found."""
 
     def __init__(self, count: int):
@@ -85,12 +86,12 @@ class _Queue(parallel.Queue):
         """The results since the last call. With `wait`, waits a while for a result or for work to do."""
         with self._changed:
             if wait and not self._found and not self._left:
-                self._changed.wait(parallel.PATIENCE_SECONDS)
+                self._changed.wait(pool.PATIENCE_SECONDS)
             found, self._found = self._found, []
             return found
 
 
-class _Tracing(parallel.Helper):
+class _Tracing(pool.Helper):
     """A child that finds shares for blocks."""
 
     side = "visibility.crew.ChildSide"
@@ -146,8 +147,8 @@ class Mate:
 
     def __init__(self, tracer):
         self._tracer, self._own = tracer, KeptBlocks(None, tracer)
-        self._child: parallel.Keeper | None = None
-        self._is_possible = parallel.cores() > 1 and parallel.interpreter() is not None and tracer.library is not None
+        self._child: pool.Keeper | None = None
+        self._is_possible = pool.cores() > 1 and pool.interpreter() is not None and tracer.library is not None
         self._is_up, self._run = False, 0
         self._sent: dict[tuple, dict[int, bool]] = {}
         self.key: tuple | None = None
@@ -156,7 +157,7 @@ class Mate:
         """As the function `run`, for blocks of `key`. `is_worth` says whether a process is worth its start."""
         if is_worth and self._child is None and self._is_possible:
             errand = Errand(None, self._tracer.occluders, self._tracer.library)
-            self._child, self._is_up = parallel.Keeper("visibility.crew.KeptBlocks", worker.packed(errand)), False
+            self._child, self._is_up = pool.Keeper("visibility.crew.KeptBlocks", worker.packed(errand)), False
         self._run += 1
         left, asked, missing = deque(range(len(blocks))), deque(), set(range(len(blocks)))
         while missing:
@@ -190,7 +191,7 @@ class Mate:
         """The answers of the process for this run. With `wait`, waits a little for one."""
         found = []
         while self._child is not None:
-            answer = self._child.poll(parallel.PATIENCE_SECONDS if wait and self._is_up and not found else 0.0)
+            answer = self._child.poll(pool.PATIENCE_SECONDS if wait and self._is_up and not found else 0.0)
             if answer is None:
                 break
             self._is_up = True
@@ -266,17 +267,15 @@ class Company:
 
     def __init__(self, setting: Setting, tracer):
         occluders, library = (None, None) if tracer is None else (tracer.occluders, tracer.library)
-        count = min(parallel.cores(), len(setting.blocks))
-        cannot_help = parallel.interpreter() is None or (tracer is not None and library is None)
+        count = min(pool.cores(), len(setting.blocks))
+        cannot_help = pool.interpreter() is None or (tracer is not None and library is None)
         if cannot_help or sum(len(block[0]) for block in setting.blocks.values()) < SAMPLES_WORTH_A_CHILD:
             count = 1
         # This process knows all blocks. After its own, it does those that others have not begun.
         self._own, self._count, self._run = LitBlocks((setting, occluders, library), tracer), count, 0
         parts = [{n: block for n, block in setting.blocks.items() if n % count == own} for own in range(1, count)]
         self._children = [
-            parallel.Keeper(
-                "visibility.crew.LitBlocks", worker.packed((replace(setting, blocks=part), occluders, library))
-            )
+            pool.Keeper("visibility.crew.LitBlocks", worker.packed((replace(setting, blocks=part), occluders, library)))
             for part in parts
         ]
 
@@ -300,7 +299,7 @@ class Company:
                 found = [] if message is None else [self._own.shade(message)]
                 for child in self._children:
                     is_idle = message is None and not found
-                    found += child.answers(parallel.PATIENCE_SECONDS if is_idle else 0.0)
+                    found += child.answers(pool.PATIENCE_SECONDS if is_idle else 0.0)
                 for run, number, radiance in found:
                     if run == self._run and number in missing:
                         missing.remove(number)

@@ -24,10 +24,11 @@ import numpy as np
 
 from ..cycles.horizons import SMALLEST_ALPHA, lobe_chances
 from ..cycles.light_tree import light_chances, light_rows
+from ..emitters import light_profile, light_tree
+from ..lobes import brdf
+from ..lobes.lookup_table import WARP_REGULARIZATION
+from ..lobes.polygon import convex_pieces
 from ..scene import AreaLight, SurfaceSamples
-from ..shading import brdf, light_cone, light_tree
-from ..shading.lookup_table import WARP_REGULARIZATION
-from ..shading.polygon import convex_pieces
 
 # Bits of a coordinate of the sequence, as many as single precision holds.
 BITS = 23
@@ -121,7 +122,7 @@ class Emitter:
     def __init__(self, light: AreaLight):
         self.light, self.chosen_as = light, (light,)
         self.outline = light.polygon(_ROUND_CORNERS) - light.center
-        self.profile = light_cone.Profile.of(light) if light.is_profiled else None
+        self.profile = light_profile.Profile.of(light) if light.is_profiled else None
         self.corners = self._own_corners()
         self.center, self.axes = _parallelogram(light) if self.corners is None else (None, None)
         self._picture = self._edge = None

@@ -18,11 +18,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..emitters.facing import FacingDisk, emission, ray_length
+from ..emitters.light_polygons import LEAST_COSINE, LOBE_WIDTH, has_lobe, may_reach, off_plane
+from ..lobes.brdf import dielectric_reflectance, schlick_curve, stretch
+from ..lobes.diffuse import diffuse_factor
 from ..scene import FARTHEST, PASSES, AreaLight, Film, Progress, SurfaceSamples, round_outline
-from ..shading.brdf import dielectric_reflectance, schlick_curve, stretch
-from ..shading.diffuse import diffuse_factor
-from ..shading.facing import FacingDisk, emission, ray_length
-from ..shading.light_polygons import LEAST_COSINE, LOBE_WIDTH, has_lobe, may_reach, off_plane
 from . import crew
 from .directions import (
     Choices,

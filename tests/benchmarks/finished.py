@@ -23,7 +23,7 @@ from ltsh_addon.blender.process.blender_process import denoiser_libraries, kept_
 from ltsh_addon.cycles.lobes import read_layer  # noqa: E402
 from ltsh_addon.imaging.denoise import open_denoiser  # noqa: E402
 from ltsh_addon.pipeline import RenderOptions, render  # noqa: E402
-from ltsh_addon.shading.parallel import cores  # noqa: E402
+from ltsh_addon.workers.pool import cores  # noqa: E402
 
 # Without compiled modules on disk, every Blender would compile those that it imports; an installed one has them.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)

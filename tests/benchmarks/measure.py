@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ltsh_addon.shading import moments32
+from ltsh_addon.lobes import moments32
 
 
 def ratios(cases, base, rounds=5):

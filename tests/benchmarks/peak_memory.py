@@ -9,7 +9,7 @@ import measure  # noqa: E402
 from bench_scenes import floor_scene  # noqa: E402
 
 from ltsh_addon import shading  # noqa: E402
-from ltsh_addon.shading import parallel  # noqa: E402
+from ltsh_addon.workers import pool  # noqa: E402
 
 
 def print_peak(count):
@@ -19,13 +19,13 @@ def print_peak(count):
     before = measure.resident("self")
     # What making the samples took for a while must not count.
     Path("/proc/self/clear_refs").write_text("5")
-    children, start = [], parallel.subprocess.Popen
+    children, start = [], pool.subprocess.Popen
 
     def popen(*arguments, **options):
         children.append(start(*arguments, **options))
         return children[-1]
 
-    parallel.subprocess.Popen = popen
+    pool.subprocess.Popen = popen
     peaks = {}
 
     def look(_):

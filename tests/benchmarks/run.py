@@ -26,8 +26,10 @@ from textbook_ltc import TextbookLtc  # noqa: E402
 from zonal_harmonics import ZonalHarmonics  # noqa: E402
 
 from ltsh_addon import shading  # noqa: E402
-from ltsh_addon.shading import edge_integrals, light_polygons, moments32, parallel  # noqa: E402
-from ltsh_addon.shading.polygon import project_to_sphere, split_at_horizon  # noqa: E402
+from ltsh_addon.emitters import light_polygons  # noqa: E402
+from ltsh_addon.lobes import edge_integrals, moments32  # noqa: E402
+from ltsh_addon.lobes.polygon import project_to_sphere, split_at_horizon  # noqa: E402
+from ltsh_addon.workers import pool  # noqa: E402
 
 TABLES = {name: shading.load_table(name) for name in shading.SHIPPED_TABLES}
 CHUNK = 12288
@@ -361,7 +363,7 @@ def main():
     sys.stdout.reconfigure(line_buffering=True)
     start = time.perf_counter()
     print(f"Python {sys.version.split()[0]}, numpy {np.__version__}, {os.cpu_count()} cores, "
-          f"load {os.getloadavg()[0]:.1f}, children run on {parallel.interpreter()}")  # fmt: skip
+          f"load {os.getloadavg()[0]:.1f}, children run on {pool.interpreter()}")  # fmt: skip
     for name in options.sections or SECTIONS:
         if not (name in ("cycles", "finished", "shadows", "animation", "viewport") and options.no_cycles):
             SECTIONS[name](options)

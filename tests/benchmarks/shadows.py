@@ -32,7 +32,7 @@ from ltsh_addon.imaging.font import draw_text  # noqa: E402
 from ltsh_addon.pipeline import lighting  # noqa: E402
 from ltsh_addon.pipeline.options import PictureOptions  # noqa: E402
 from ltsh_addon.scene import PASSES  # noqa: E402
-from ltsh_addon.shading.parallel import CORES_VARIABLE, cores  # noqa: E402
+from ltsh_addon.workers.pool import CORES_VARIABLE, cores  # noqa: E402
 
 NAMES = ("contact", "soft", "highlight", "window", "leaves", "demo")
 # Of the error without the noise of Cycles and our own.

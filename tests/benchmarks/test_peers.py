@@ -7,8 +7,8 @@ from textbook_ltc import TextbookLtc
 from zonal_harmonics import ZonalHarmonics
 
 from ltsh_addon import shading
-from ltsh_addon.shading import edge_integrals
-from ltsh_addon.shading.polygon import project_to_sphere
+from ltsh_addon.lobes import edge_integrals
+from ltsh_addon.lobes.polygon import project_to_sphere
 
 
 @pytest.mark.parametrize("degree", [2, 4])

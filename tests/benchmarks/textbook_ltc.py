@@ -8,8 +8,8 @@ degenerate polygons, and no Fresnel factor.
 
 import numpy as np
 
-from ltsh_addon.shading.lookup_table import MIN_ALPHA, warp_entries
-from ltsh_addon.shading.polygon import split_at_horizon
+from ltsh_addon.lobes.lookup_table import MIN_ALPHA, warp_entries
+from ltsh_addon.lobes.polygon import split_at_horizon
 
 CHUNK = 12288
 

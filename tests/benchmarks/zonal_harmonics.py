@@ -12,7 +12,7 @@ and integration by parts the recursions D_l = D_{l-2} + (2 l - 1) B_{l-1}, l B_l
 
 import numpy as np
 
-from ltsh_addon.shading import spherical_harmonics
+from ltsh_addon.lobes import spherical_harmonics
 
 
 def lobe_directions(degree):

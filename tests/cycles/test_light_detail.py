@@ -8,8 +8,8 @@ import random_surfaces
 
 from ltsh_addon import shading
 from ltsh_addon.cycles.patches import cut_into_patches, split_light
+from ltsh_addon.emitters.light_polygons import fitting_patches
 from ltsh_addon.scene import AreaLight
-from ltsh_addon.shading.light_polygons import fitting_patches
 
 PLACES = {
     "rectangle": {"half_u": (0.8, 0, 0), "half_v": (0, -0.6, 0)},

@@ -25,8 +25,8 @@ from ltsh_addon.pipeline.mixer import (
 )
 from ltsh_addon.pipeline.moved_lights import Draft, MovedLights
 from ltsh_addon.scene import Cancelled, Film, SurfaceSamples
-from ltsh_addon.shading import parallel
 from ltsh_addon.visibility import crew
+from ltsh_addon.workers import pool
 
 # float32 sums of three lights in another order, and what EXR files hold of them.
 ROUNDING = 1e-5
@@ -239,7 +239,7 @@ def test_processes_that_stay_shade_moved_lights_alike_also_when_one_is_gone(caps
     monkeypatch.setattr(moved_lights, "BLOCK_SAMPLES", 7)
     alone = MovedLights.load(out / "shade.samples.npz")
     monkeypatch.setattr(crew, "SAMPLES_WORTH_A_CHILD", 0)
-    monkeypatch.setattr(parallel, "cores", lambda: 3)
+    monkeypatch.setattr(pool, "cores", lambda: 3)
     light = kept_in(out).extraction.lights[0]
     lights = [light.moved(np.array([0.1 * step, 0.0, 0.0])) for step in range(3)]
     expected = [alone.picture(one) for one in lights]

@@ -16,8 +16,8 @@ from fake_scene import run
 
 from ltsh_addon import shading
 from ltsh_addon.imaging import read_channels
+from ltsh_addon.lobes import lookup_table
 from ltsh_addon.pipeline import export
-from ltsh_addon.shading import lookup_table
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCUMENT = ROOT / "tables" / "EXPORT.md"

@@ -7,7 +7,7 @@ import pytest
 from surface_scenes import area_light, single_sample
 
 from ltsh_addon import shading
-from ltsh_addon.shading import diffuse
+from ltsh_addon.lobes import diffuse
 
 
 def gauss(count):

@@ -9,7 +9,7 @@ from surface_scenes import area_light, random_samples, single_sample, unit
 from test_single_precision import assert_close
 
 from ltsh_addon import shading
-from ltsh_addon.shading import brdf
+from ltsh_addon.lobes import brdf
 
 # Overhead, and low beyond the point: at grazing angles the terms differ most.
 LOW = {"center": (-1.6, 0.1, 0.35), "half_u": (0, 0.5, 0), "half_v": (0, 0, 0.25), "radiance": (1.0, 1.0, 1.0)}

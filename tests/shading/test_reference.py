@@ -10,7 +10,7 @@ import textbook
 from surface_scenes import area_light, single_sample
 
 from ltsh_addon import shading
-from ltsh_addon.shading import brdf
+from ltsh_addon.lobes import brdf
 from ltsh_addon.shading.reference import EXACT, EllipseBoundary, PolygonBoundary, lobe_integrals
 
 GAUSS = np.polynomial.legendre.leggauss(160)

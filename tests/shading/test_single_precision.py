@@ -8,9 +8,10 @@ from surface_scenes import area_light, four_lights, random_samples, unit
 from test_lobe_robustness import oriented
 
 from ltsh_addon import shading
-from ltsh_addon.shading import edge_integrals, float32, integrator, moments32
-from ltsh_addon.shading import small_lights as points
-from ltsh_addon.shading.polygon import project_to_sphere
+from ltsh_addon.emitters import small_lights as points
+from ltsh_addon.lobes import edge_integrals, moments32
+from ltsh_addon.lobes.polygon import project_to_sphere
+from ltsh_addon.shading import float32, integrator
 
 # What `shade` promises for radiance 1.
 PROMISED = 2e-5

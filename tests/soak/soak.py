@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "helpers"), str(ROOT / "tests" / "shading")]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "helpers"), str(ROOT / "tests" / "lobes")]
 
 import polar_quadrature  # noqa: E402
 import test_lobe_robustness as hostile  # noqa: E402
 
 from ltsh_addon import shading  # noqa: E402
-from ltsh_addon.shading import spherical_harmonics  # noqa: E402
+from ltsh_addon.lobes import spherical_harmonics  # noqa: E402
 
 TABLES = {name: shading.load_table(name) for name in shading.SHIPPED_TABLES}
 BATCH = 50_000

@@ -5,8 +5,9 @@ import zipfile
 import numpy as np
 import pytest
 
-from ltsh_addon.shading import brdf, load_table, spherical_harmonics
-from ltsh_addon.shading.lookup_table import roughness_nodes, theta_nodes
+from ltsh_addon.lobes import brdf, spherical_harmonics
+from ltsh_addon.lobes.lookup_table import roughness_nodes, theta_nodes
+from ltsh_addon.shading import load_table
 from tables import fit, refine, walk
 from tables.families import BECKMANN, GGX, family_named, polar_samples
 from tables.projection import FLAT, Cells, Points, project, relative_error, warped_basis

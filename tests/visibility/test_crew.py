@@ -9,8 +9,8 @@ from test_ratio import floor, panel
 
 from ltsh_addon.blender.process.blender_process import embree_libraries
 from ltsh_addon.scene import PASSES, Cancelled
-from ltsh_addon.shading import parallel, worker
 from ltsh_addon.visibility import OccluderMesh, Occluders, crew, open_tracer, ratio
+from ltsh_addon.workers import pool, worker
 
 
 @pytest.fixture
@@ -18,7 +18,7 @@ def scene(monkeypatch):
     """A ball above the floor in blocks of 200 samples, and the processes that were started."""
     monkeypatch.setattr(ratio, "BLOCK_SAMPLES", 200)
     monkeypatch.setattr(ratio, "SECONDS_WORTH_A_CHILD", -1.0)
-    started, popen = [], parallel.subprocess.Popen
+    started, popen = [], pool.subprocess.Popen
 
     def counted(arguments, **options):
         process = popen(arguments, **options)
@@ -26,7 +26,7 @@ def scene(monkeypatch):
             started.append(process)
         return process
 
-    monkeypatch.setattr(parallel.subprocess, "Popen", counted)
+    monkeypatch.setattr(pool.subprocess, "Popen", counted)
     vertices, triangles = sphere(12)
     mesh = OccluderMesh(0.5 * vertices + [0.0, 1.0, 0.7], triangles)
     with open_tracer(Occluders((mesh,), [0], [np.eye(3, 4)]), list(embree_libraries())) as tracer:
@@ -59,9 +59,9 @@ def test_any_number_of_processes_gives_the_same_bytes(scene, monkeypatch):
 def test_a_mate_gives_the_same_bytes_and_is_sent_samples_once(scene, monkeypatch):
     shares, started, tracer = scene
     alone = shares(workers=1)
-    monkeypatch.setattr(parallel, "cores", lambda: 2)
-    asked, put = [], parallel.Keeper.put
-    monkeypatch.setattr(parallel.Keeper, "put", lambda self, question: (asked.append(question), put(self, question)))
+    monkeypatch.setattr(pool, "cores", lambda: 2)
+    asked, put = [], pool.Keeper.put
+    monkeypatch.setattr(pool.Keeper, "put", lambda self, question: (asked.append(question), put(self, question)))
     mate = crew.Mate(tracer)
     try:
         for number, key in enumerate((("first", 0), ("first", 0), ("second", 0), None, ("second", 1))):
@@ -92,7 +92,7 @@ def test_a_mate_gives_the_same_bytes_and_is_sent_samples_once(scene, monkeypatch
 def test_what_a_child_does_not_do_is_done_here(scene, monkeypatch, caplog):
     shares, started, _ = scene
     alone = shares(workers=1)
-    monkeypatch.setattr(parallel, "interpreter", lambda: "/bin/false")
+    monkeypatch.setattr(pool, "interpreter", lambda: "/bin/false")
     with caplog.at_level(logging.WARNING):
         found = shares(workers=2)
     assert len(started) == 1 and "worker process ended early" in caplog.text

@@ -14,6 +14,7 @@ import numpy as np
 
 from ...cycles import gbuffer, lobes
 from ...cycles.horizons import end_at_horizons_of_cycles
+from ...emitters.light_polygons import has_lobe, lights_that_reach_nothing
 from ...files import replacing_by_copy, temporary_folder
 from ...imaging.color import identified
 from ...imaging.exr import read_channels
@@ -30,7 +31,6 @@ from ...scene import (
     lights_of,
     listed,
 )
-from ...shading.light_polygons import has_lobe, lights_that_reach_nothing
 from ...visibility import Occluders
 from .blender_process import run_child
 

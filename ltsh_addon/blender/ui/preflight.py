@@ -21,11 +21,7 @@ from bpy.props import StringProperty
 from ...scene import error_line
 from ..extract.apply import shows_texture
 from ..extract.bake import ObjectError, check_object
-from ..lights.area import (
-    LightInventory,
-    reason_to_leave_out,
-    unseen_light,
-)
+from ..lights.area import LightInventory, reason_to_leave_out, unseen_light
 from ..lights.area import (
     note_unsupported as note_unsupported_light,
 )

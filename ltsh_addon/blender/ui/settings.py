@@ -22,7 +22,7 @@ from bpy.props import (
 )
 
 from ...scene import CYCLES, REFERENCE, TECHNIQUES
-from ...shading.parallel import CORES_VARIABLE
+from ...workers.pool import CORES_VARIABLE
 from .comparison import changed, mixed
 
 # The name of the add-on: "bl_ext.user_default.ltsh" in Blender, "ltsh_addon" when imported from elsewhere.

@@ -14,18 +14,10 @@ import numpy as np
 from mathutils import Matrix
 
 from ...cycles import horizons
+from ...lobes.lookup_table import LookupTable
 from ...scene import PASSES, AreaLight
 from ...shading import load_table
-from ...shading.lookup_table import LookupTable
-from .shaders import (
-    BOUNDS,
-    CHOICE,
-    EXCESS,
-    HORIZON_SAMPLERS,
-    Features,
-    horizon_shader,
-    lighting_shader,
-)
+from .shaders import BOUNDS, CHOICE, EXCESS, HORIZON_SAMPLERS, Features, horizon_shader, lighting_shader
 from .textures import (
     SAMPLERS,
     SHARE_SAMPLERS,

@@ -16,8 +16,13 @@ import numpy as np
 from gpu_extras.batch import batch_for_shader
 
 from ...cycles import horizons
-from ...shading import facing, light_cone, moments32
-from ...shading.diffuse import ARC_NODES, albedo_slope, mean_slope_above
+from ...emitters import facing, light_profile
+from ...emitters.light_polygons import FOCUSED_ROUND_CORNERS, ROUND_CORNERS
+from ...emitters.tails import NEAR_RADII
+from ...lobes import moments32
+from ...lobes.diffuse import ARC_NODES, albedo_slope, mean_slope_above
+from ...lobes.lobe_integrals import LEAST_SHARE
+from ...lobes.lookup_table import MIN_ALPHA, LookupTable
 from ...shading.float64 import LEAST_ROUGHNESS
 from ...shading.header import (
     bend_literals,
@@ -31,10 +36,6 @@ from ...shading.header import (
     source_text,
     table_sizes,
 )
-from ...shading.light_polygons import FOCUSED_ROUND_CORNERS, ROUND_CORNERS
-from ...shading.lobes import LEAST_SHARE
-from ...shading.lookup_table import MIN_ALPHA, LookupTable
-from ...shading.tails import NEAR_RADII
 from . import sky, textures
 
 # Limits of the half diagonal of a light, as the lobe sees it, for cheaper ways of integration.
@@ -181,7 +182,7 @@ def _lighting_source(table, features) -> str:
 
 
 def _lighting_constants(table) -> dict:
-    plain, beyond, sharp, sharpest = light_cone.EFFORTS
+    plain, beyond, sharp, sharpest = light_profile.EFFORTS
     if {beyond.layers, sharp.layers, sharpest.layers} != {beyond.layers}:
         raise ValueError("the efforts of light_cone have changed: all but the first had equally many layers")
     sizes = table_sizes(table)
@@ -220,12 +221,12 @@ def _lighting_constants(table) -> dict:
         "CHORDS": plain.chords,
         "SHARP_CHORDS": sharp.chords,
         "SHARPEST_CHORDS": sharpest.chords,
-        "WIDE_LOBE": float_literal(light_cone.WIDE_LOBE),
-        "SHARP_LOBE": float_literal(light_cone.SHARP_LOBE),
-        "WELL_INSIDE": float_literal(light_cone.WELL_INSIDE),
-        "LEAST_WIDTH": float_literal(light_cone.WIDTH_RANGE[0]),
-        "MOST_WIDTH": float_literal(light_cone.WIDTH_RANGE[1]),
-        "ROUND_MARGIN": light_cone.ROUND_MARGIN,
+        "WIDE_LOBE": float_literal(light_profile.WIDE_LOBE),
+        "SHARP_LOBE": float_literal(light_profile.SHARP_LOBE),
+        "WELL_INSIDE": float_literal(light_profile.WELL_INSIDE),
+        "LEAST_WIDTH": float_literal(light_profile.WIDTH_RANGE[0]),
+        "MOST_WIDTH": float_literal(light_profile.WIDTH_RANGE[1]),
+        "ROUND_MARGIN": light_profile.ROUND_MARGIN,
         "FEW_CORNERS": few_corners,
         "MANY_CORNERS": many_corners,
         "FEW_CORNERS_FIRST": textures.circle_first(few_corners),

@@ -10,12 +10,13 @@ import numpy as np
 
 from ...cycles import closures, horizons
 from ...cycles.lobes import LEAST_VELVET, LOBE_KINDS
+from ...emitters import light_profile
+from ...emitters.facing import LEAST_SHRINKING, NEAR_DISK
+from ...emitters.light_polygons import ROUND_CORNERS, ROUND_LIMITS
+from ...lobes import moments32
+from ...lobes.lookup_table import LookupTable
 from ...scene import AreaLight, SurfaceSamples
-from ...shading import light_cone, moments32
-from ...shading.facing import LEAST_SHRINKING, NEAR_DISK
 from ...shading.header import float_literal
-from ...shading.light_polygons import ROUND_CORNERS, ROUND_LIMITS
-from ...shading.lookup_table import LookupTable
 from ..materials.looks import COAT, IMAGE_SLOTS, REFRACTION, Look
 from ..materials.values import EXTENSIONS, Value
 
@@ -190,11 +191,11 @@ def _circle(count):
 _FEW_SIZES = {8: 0.15, 16: 1.0}
 _CIRCLES = (*_FEW_SIZES, *ROUND_CORNERS)
 _SIZES = (*_FEW_SIZES.values(), *(0.25 * limit * limit for limit in ROUND_LIMITS), np.inf)
-_NODES = tuple(sorted({effort.layers for effort in light_cone.EFFORTS}))
+_NODES = tuple(sorted({effort.layers for effort in light_profile.EFFORTS}))
 _SHARED = [
     _QUAD,
     *(_circle(count) for count in _CIRCLES),
-    *(np.stack(light_cone.gauss_legendre(count), axis=1) for count in _NODES),
+    *(np.stack(light_profile.gauss_legendre(count), axis=1) for count in _NODES),
 ]
 _FIRST = np.concatenate([[0], np.cumsum([len(part) for part in _SHARED])])[:-1].tolist()
 QUAD_FIRST, _CIRCLE_FIRST = _FIRST[0], _FIRST[1 : 1 + len(_CIRCLES)]
@@ -309,7 +310,7 @@ def _header(light, first, count, half_v, first_receiver):
     flags += PROFILE * light.is_profiled + CAP * _is_cap(light)
     flags += PLACED * (light.shape == "BALL" and light.pattern is not None and not light.pattern.by_ray)
     receivers = -1 if light.receivers is None else len(light.receivers)
-    profile = light_cone.Profile.of(light)
+    profile = light_profile.Profile.of(light)
     tangent, share = (profile.tangent, profile.share) if light.is_profiled else (0.0, np.inf)
     reach = np.sqrt(max((light.half_u**2).sum(), (light.half_v**2).sum()))
     return np.array([

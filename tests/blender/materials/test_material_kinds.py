@@ -11,9 +11,9 @@ from scene_parts import bsdf_material
 
 from ltsh_addon.cycles import gbuffer
 from ltsh_addon.imaging import unbiased_relative_error
+from ltsh_addon.lobes.brdf import dielectric_reflectance
 from ltsh_addon.pipeline import PictureOptions, compare_scene
 from ltsh_addon.shading import shade
-from ltsh_addon.shading.brdf import dielectric_reflectance
 
 COLOR, TINT = (0.8, 0.5, 0.2, 1.0), (0.3, 0.6, 0.9, 1.0)
 GLOSSY, METALLIC, GLASS = "ShaderNodeBsdfAnisotropic", "ShaderNodeBsdfMetallic", "ShaderNodeBsdfGlass"

@@ -12,8 +12,8 @@ import pytest
 import ltsh_addon
 from ltsh_addon.blender.ui import preflight, settings
 from ltsh_addon.blender.ui.settings import Preferences, preferences
-from ltsh_addon.shading import parallel
-from ltsh_addon.shading.parallel import CORES_VARIABLE
+from ltsh_addon.workers import pool
+from ltsh_addon.workers.pool import CORES_VARIABLE
 
 
 def context_with(**chosen):
@@ -59,11 +59,11 @@ def test_the_folder_of_an_extension_is_the_one_that_updates_keep(monkeypatch):
 
 def test_the_limit_of_cores_reaches_this_process_and_its_children_until_disabled(enabled, monkeypatch):
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: range(8), raising=False)
-    assert parallel.cores() == 6
+    assert pool.cores() == 6
     settings.apply(context_with(cores=3))
-    assert (parallel.cores(), os.environ[CORES_VARIABLE]) == (3, "3")
+    assert (pool.cores(), os.environ[CORES_VARIABLE]) == (3, "3")
     settings.apply(context_with(cores=100))
-    assert parallel.cores() == 8
+    assert pool.cores() == 8
     ltsh_addon.unregister()
     assert os.environ[CORES_VARIABLE] == "6"
 
@@ -71,13 +71,13 @@ def test_the_limit_of_cores_reaches_this_process_and_its_children_until_disabled
 @pytest.mark.parametrize("value", ["0", "", "-2", "many", "1e3"])
 def test_a_limit_of_cores_that_makes_no_sense_is_none(monkeypatch, value):
     monkeypatch.delenv(CORES_VARIABLE, raising=False)
-    unlimited = parallel.cores()
+    unlimited = pool.cores()
     monkeypatch.setenv(CORES_VARIABLE, value)
-    assert parallel.cores() == unlimited >= 1
+    assert pool.cores() == unlimited >= 1
 
 
 def test_the_log_level_decides_what_is_told(enabled, capsys):
-    logger = logging.getLogger("ltsh_addon.shading.parallel")
+    logger = logging.getLogger("ltsh_addon.workers.pool")
     (handler,) = logging.getLogger("ltsh_addon").handlers
     handler.setStream(sys.stderr)
     for level, told in (("WARNING", False), ("INFO", True), ("ERROR", False)):

@@ -16,14 +16,11 @@ from functools import cached_property
 
 import numpy as np
 
+from ..lobes.polygon import convex_pieces, dot, split_at_horizon
 from ..scene import AreaLight, SurfaceSamples, round_outline
-from . import facing, light_cone
+from . import facing, light_profile
 from .facing import FacingDisk
-from .polygon import convex_pieces, dot, split_at_horizon
 
-# If at least this share of the points sees all of a light, the light is computed as if all points did: that is cheaper
-# than gathering them.
-MOSTLY_WHOLE = 0.6
 # Corners of the polygon for a round light up to each of ROUND_LIMITS and beyond. These limit the radius of the light in
 # units of the lobe's width where it meets the light. The polygon is within 0.1 % of the ellipse.
 ROUND_CORNERS = (32, 64, 128, 256)
@@ -65,7 +62,7 @@ def light_levels(light, corners, position, width):
     in double precision, so that both paths make the same decisions.
     """
     if light.is_profiled:
-        for effort, chosen in light_cone.efforts(light, position, width):
+        for effort, chosen in light_profile.efforts(light, position, width):
             if light.is_round:
                 corners = light.polygon(FOCUSED_ROUND_CORNERS[effort.chords > 2])
                 effort = replace(effort, chords=2)
@@ -138,47 +135,6 @@ def _along(rows, vector, out, scratch):
     return out
 
 
-def integrate_visible(corners: np.ndarray, facing: np.ndarray, clip_rows, count: int, integrate):
-    """Integrals (count, P) over the visible parts of polygons (C, V, P), and the mask (P,) of points that need float64.
-
-    A point that is `facing` (P,) its polygon sees the part where all coordinates `clip_rows` are positive.
-    `integrate(polygons (C, W, Q), index)` returns (count, Q) and a mask (Q,) for the points `index` (None: all).
-    """
-    whole = facing.copy()
-    partly = facing
-    for row in clip_rows:
-        whole &= np.minimum.reduce(corners[row], axis=0) > 0.0
-    seen_whole = np.count_nonzero(whole)
-    points = len(facing)
-    if seen_whole == points:
-        return integrate(corners, None)
-    for row in clip_rows:
-        partly = partly & (np.maximum.reduce(corners[row], axis=0) > 0.0)
-    cut = np.nonzero(partly & ~whole)[0]
-    values, needs_float64 = np.zeros((count, points), np.float32), np.zeros(points, bool)
-    if seen_whole > MOSTLY_WHOLE * points:
-        found, mask = integrate(corners, None)
-        np.multiply(found, whole, out=values)
-        np.logical_and(mask, whole, out=needs_float64)
-    elif seen_whole:
-        index = np.nonzero(whole)[0]
-        values[:, index], needs_float64[index] = integrate(np.take(corners, index, axis=2), index)
-    if len(cut):
-        for index, polygons in _clipped(np.take(corners, cut, axis=2), clip_rows):
-            values[:, cut[index]], needs_float64[cut[index]] = integrate(polygons, cut[index])
-    return values, needs_float64
-
-
-def _clipped(corners, clip_rows):
-    """Yield (index, polygons): the parts of polygons (C, V, P) where all coordinates `clip_rows` are positive."""
-    if not clip_rows:
-        yield np.arange(corners.shape[2]), corners
-        return
-    for outer, part in split_at_horizon(corners, clip_rows[0]):
-        for inner, polygons in _clipped(part, clip_rows[1:]):
-            yield outer[inner], polygons
-
-
 def local_frames(normal, view):
     """Local frames (3, 3, P): rows tangent, bitangent, normal; the view has y = 0 and x >= 0."""
     # Differences of close vectors are exact. A single-precision normal is not quite a unit vector.
@@ -221,7 +177,7 @@ def may_reach(light, position) -> np.ndarray:
     """Mask (Q,): False for points (3, Q) that no part of a light with a spread or a cone shines on."""
     if light.is_facing:
         return facing.may_reach(light, light.center[:, None] - position)
-    return light_cone.may_reach(light, position)
+    return light_profile.may_reach(light, position)
 
 
 # FEW_SAMPLES: about how many samples are tried first. MOST_PAIRS: how many pairs of a sample and a light are tried.
@@ -311,7 +267,7 @@ def visible_parts(framed: Framed, light, corners, candidates, second_normal=None
         offset = (corners - light.origins(samples.position[index])).transpose(2, 0, 1)
     local = to_local(frame[:, :, index], offset)
     if light.is_profiled:
-        local = np.concatenate([local, to_local(light_cone.plane_axes(light), offset)])
+        local = np.concatenate([local, to_local(light_profile.plane_axes(light), offset)])
     parts = [(slice(None), local)]
     if second_normal is not None:
         height = (offset * second_normal[index].T[:, None, :]).sum(axis=0)
@@ -332,7 +288,7 @@ def seen_parts(framed: Framed, light, corners, candidates, width, second_normal=
             yield index, polygon, effort
 
 
-def light_view(framed: Framed, light, index, to_lobe) -> light_cone.LightView:
+def light_view(framed: Framed, light, index, to_lobe) -> light_profile.LightView:
     """The view of a profiled light from the points `index`. The first three coordinates are those of the lobe, from
     to_lobe(local vectors (3, Q)); the others are local."""
     axes = framed.frame[:, :, index]
@@ -342,7 +298,7 @@ def light_view(framed: Framed, light, index, to_lobe) -> light_cone.LightView:
         local = to_local(axes, np.broadcast_to(vector[:, None], offset.shape))
         return np.concatenate([to_lobe(local), local])
 
-    return light_cone.LightView.of(light, offset, along)
+    return light_profile.LightView.of(light, offset, along)
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import textbook
 
-from ltsh_addon.shading import brdf
+from ltsh_addon.lobes import brdf
 
 COSINES = np.array([1e-3, 0.05, 0.3, 0.7, 0.99, 1.0])
 ALPHAS = np.array([1e-3, 0.02, 0.1, 0.36, 1.0])

@@ -11,10 +11,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .brdf import dielectric_reflectance, schlick_curve
-from .light_cone import Profile
-from .lookup_table import MIN_ALPHA
-from .polygon import dot
+from ..lobes.brdf import dielectric_reflectance, schlick_curve
+from ..lobes.lookup_table import MIN_ALPHA
+from ..lobes.polygon import dot
+from .light_profile import Profile
 
 # Radius of the sphere that the mirrored view ray must miss, in units of the radius of the sphere around the light.
 NEAR_RADII = 2.0

@@ -14,9 +14,9 @@ from functools import cache
 
 import numpy as np
 
-from .light_cone import gauss_legendre
+from ..lobes.polygon import dot
 from .light_polygons import PatchTree, kept
-from .polygon import dot
+from .light_profile import gauss_legendre
 
 # Greatest and least number of texels along each side of a side of a map.
 MOST_TEXELS, FEWEST_TEXELS = 256, 2

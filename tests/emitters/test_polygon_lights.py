@@ -10,7 +10,7 @@ from test_single_precision import all_kinds_of_samples
 from test_single_precision import assert_close as assert_promise
 
 from ltsh_addon import shading
-from ltsh_addon.shading.polygon import convex_pieces
+from ltsh_addon.lobes.polygon import convex_pieces
 
 TECHNIQUES = (*shading.SHIPPED_TABLES, shading.REFERENCE)
 techniques = pytest.mark.parametrize("technique", TECHNIQUES)

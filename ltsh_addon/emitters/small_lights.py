@@ -13,11 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..lobes.lobe_integrals import LEAST_SHARE
+from ..lobes.lookup_table import bent_cosines
+from ..lobes.polygon import dot
+from ..lobes.spherical_harmonics import degree_of
 from .light_polygons import LEAST_COSINE, LOBE_WIDTH
-from .lobes import LEAST_SHARE
-from .lookup_table import bent_cosines
-from .polygon import dot
-from .spherical_harmonics import degree_of
 
 # Greatest radius of a small light in units of the length over which the integrand changes.
 LARGEST = 0.05

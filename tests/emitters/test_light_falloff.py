@@ -7,8 +7,9 @@ import pytest
 import quadrature
 from random_surfaces import unit
 
+from ltsh_addon.emitters import tails
 from ltsh_addon.scene import AreaLight, SurfaceSamples
-from ltsh_addon.shading import shade, tails
+from ltsh_addon.shading import shade
 
 COUNT = 16  # small lights along each side
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import sph_harm_y
 
-from ltsh_addon.shading import spherical_harmonics
+from ltsh_addon.lobes import spherical_harmonics
 
 DEGREE = 8
 PAIRS = [(degree, order) for degree in range(DEGREE + 1) for order in range(degree + 1)]

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .brdf import ggx_distribution, masking
-from .polygon import dot
+from ..lobes.brdf import ggx_distribution, masking
+from ..lobes.polygon import dot
 
 # Distance, in units of a ball's radius, of the disk that stands for the half space seen from within.
 NEAR_DISK = 1e-3

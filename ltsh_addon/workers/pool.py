@@ -26,9 +26,10 @@ from queue import Empty, SimpleQueue
 
 import numpy as np
 
+from ..lobes import moments32
+from ..lobes.lobe_integrals import FLOAT64_CHUNK
 from ..scene import SCALAR_FIELDS, Cancelled, SurfaceSamples
-from . import moments32, worker
-from .lobes import FLOAT64_CHUNK
+from . import worker
 
 # A child takes about 0.2 s to start, so shorter tasks are done in this process alone.
 SECONDS_WORTH_A_CHILD = 0.5
@@ -466,7 +467,7 @@ class Helper(Child):
 class _Shader(Helper):
     """A child that shades blocks and pairs of `samples`."""
 
-    side = "shading.parallel.ChildSide"
+    side = "workers.pool.ChildSide"
 
     def __init__(self, task: bytes, side: ParentSide, queue):
         self._side = side

@@ -22,9 +22,9 @@ from functools import cached_property
 
 import numpy as np
 
+from ..lobes.polygon import dot
 from ..scene import AreaLight
 from . import small_lights
-from .polygon import dot
 from .tails import NEAR_RADII
 
 # A group with fewer lights is shaded light by light.

@@ -21,7 +21,7 @@ from functools import cache
 
 import numpy as np
 
-from .lobes import form_factor
+from .lobe_integrals import form_factor
 from .polygon import project_to_sphere, split_at_horizon
 
 # Nodes of an arc, or of each of its parts if it is cut at the kink of t, z = cos(theta_o).

@@ -6,8 +6,8 @@ import numpy as np
 import polygon_quadrature
 import pytest
 
-from ltsh_addon.shading import edge_integrals, spherical_harmonics
-from ltsh_addon.shading.polygon import clip_to_horizon, one_plus_cosine
+from ltsh_addon.lobes import edge_integrals, spherical_harmonics
+from ltsh_addon.lobes.polygon import clip_to_horizon, one_plus_cosine
 
 # In double precision: coefficients of psi sum to 58 in absolute value, psi is at least 1/3, so each of the two
 # roundings, of the coefficients and of the sum, may cost 58 * 3 * 1.1e-16. Which of them it does differs by processor.

@@ -11,7 +11,7 @@ from surface_scenes import area_light, four_lights, random_samples, single_sampl
 from test_single_precision import PROMISED, all_kinds_of_samples
 
 from ltsh_addon import shading
-from ltsh_addon.shading import light_cone
+from ltsh_addon.emitters import light_profile
 
 # Of a result, or of a hundredth of the largest one: what the spread of the closed forms may be off, and the reference.
 CLOSED, QUADRATURE = 3e-3, 1e-3
@@ -112,13 +112,13 @@ def test_few_points_of_a_light_are_as_good_as_many(place, degrees, monkeypatch):
     samples = random_samples(150, seed=8, lowest_roughness=0.15)
     options = {**PLACES[place], "spread": np.radians(degrees), "radiance": (1, 1, 1)}
     lights = [area_light(center=(x, 0.4, 1.5), **options) for x in (0, 1)]
-    assert all(light_cone.ConeRegions.suit(light) for light in lights)
+    assert all(light_profile.ConeRegions.suit(light) for light in lights)
     few = shading.shade(samples, lights, "ltsh4", workers=1)
 
     def all_dense(regions):
-        yield 60, light_cone.GRADED, np.nonzero((regions.high > regions.low) & (regions.highest > regions.lowest))[0]
+        yield 60, light_profile.GRADED, np.nonzero((regions.high > regions.low) & (regions.highest > regions.lowest))[0]
 
-    monkeypatch.setattr(light_cone.ConeRegions, "rules", all_dense)
+    monkeypatch.setattr(light_profile.ConeRegions, "rules", all_dense)
     many = shading.shade(samples, lights, "ltsh4", workers=1)
     for part in shading.PASSES:
         found, expected = getattr(few, part)[0, :, 0], getattr(many, part)[0, :, 0]
@@ -139,7 +139,7 @@ def test_points_of_long_and_sheared_lights_are_where_those_are(place):
     inside = s * s + t * t < 1.0 if light.is_round else np.ones(len(s), bool)
     points = light.center + s[inside, None] * light.half_u + t[inside, None] * light.half_v
     area = np.linalg.norm(light.area_vector) / len(points)
-    tangent, share = light_cone.cone(light.spread)
+    tangent, share = light_profile.cone(light.spread)
     expected = np.empty(60)
     for row, (position, normal) in enumerate(zip(samples.position, samples.diffuse_normal, strict=True)):
         offset = points - position
@@ -180,7 +180,7 @@ def test_single_precision_keeps_its_promise(name, degrees):
     samples = replace(samples, smooth_normal=samples.diffuse_normal)
     single = shading.shade(samples, lights, name, workers=1)
     double = shading.shade(samples, lights, name, workers=1, dtype=np.float64)
-    limit = PROMISED * light_cone.peak_factor(np.radians(degrees))
+    limit = PROMISED * light_profile.peak_factor(np.radians(degrees))
     for part in shading.PASSES:
         found, expected = getattr(single, part), getattr(double, part)
         assert np.isfinite(found).all() and (found >= 0.0).all() and expected.max() > 0.0
@@ -241,7 +241,7 @@ def test_hostile_places_give_finite_radiance(technique, degrees):
             samples = repeated(sample, np.array(places, dtype=float))
             radiance = shading.shade(samples, [light], technique, workers=1).combined
             assert np.isfinite(radiance).all() and (radiance >= 0.0).all()
-            assert radiance.max() < 3.0 * light_cone.peak_factor(light.spread)
+            assert radiance.max() < 3.0 * light_profile.peak_factor(light.spread)
             # The last one is outside of every cone but the widest.
             assert degrees == 170.0 or not radiance[-1].any()
 
@@ -293,8 +293,8 @@ def test_a_sheared_ellipse_is_the_ellipse_that_it_is():
     u, v, turn = np.array([0.5, 0.1, 0.0]), np.array([0.05, -0.4, 0.0]), 0.6
     sheared = replace(area_light(shape="ELLIPSE", half_u=u, half_v=v, center=(0, 0, 2.0)), spread=np.radians(70.0))
     other = {"half_u": np.cos(turn) * u + np.sin(turn) * v, "half_v": np.cos(turn) * v - np.sin(turn) * u}
-    upright = light_cone.upright(sheared)
-    assert abs(upright.half_u @ upright.half_v) < 1e-12 and light_cone.ConeRegions.suit(upright)
+    upright = light_profile.upright(sheared)
+    assert abs(upright.half_u @ upright.half_v) < 1e-12 and light_profile.ConeRegions.suit(upright)
     assert np.allclose(upright.area_vector, sheared.area_vector)
     samples = random_samples(60, seed=8)
     one, two = (

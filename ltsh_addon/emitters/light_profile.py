@@ -22,8 +22,8 @@ from functools import cache
 
 import numpy as np
 
+from ..lobes.polygon import dot
 from ..scene import AREA_LIGHT_SHAPES
-from .polygon import dot
 
 # Half angle in rad up to which Cycles takes the series of tan h - h.
 _SERIES = 0.05

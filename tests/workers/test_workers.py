@@ -14,7 +14,8 @@ from surface_scenes import area_light, four_lights, random_samples
 
 from ltsh_addon import shading
 from ltsh_addon.scene import Cancelled
-from ltsh_addon.shading import float32, integrator, parallel
+from ltsh_addon.shading import float32, integrator
+from ltsh_addon.workers import pool
 
 ROOT = Path(__file__).resolve().parents[2]
 TECHNIQUES = (*shading.SHIPPED_TABLES, shading.REFERENCE)
@@ -24,7 +25,7 @@ DTYPES = [np.float32, np.float64, np.float32, np.float32, np.float64]
 @pytest.fixture(autouse=True)
 def short_tasks_for_children(monkeypatch):
     """Children start for any task; blocks are small."""
-    monkeypatch.setattr(parallel, "SECONDS_WORTH_A_CHILD", 0.0)
+    monkeypatch.setattr(pool, "SECONDS_WORTH_A_CHILD", 0.0)
     for name in ("BLOCK_LIMITS", "REFERENCE_BLOCK_LIMITS"):
         monkeypatch.setattr(integrator, name, (17, 17))
 
@@ -39,20 +40,20 @@ def started(monkeypatch):
         found.append(original(*arguments, **options))
         return found[-1]
 
-    monkeypatch.setattr(parallel.subprocess, "Popen", popen)
+    monkeypatch.setattr(pool.subprocess, "Popen", popen)
     return found
 
 
 @pytest.fixture
 def children_only(monkeypatch, started):
     """This process takes no block as long as a child that was started lives."""
-    original = parallel._Queue.next
+    original = pool._Queue.next
 
     def patient(self):
         here = threading.current_thread() is threading.main_thread()
         return None if here and any(process.poll() is None for process in started) else original(self)
 
-    monkeypatch.setattr(parallel._Queue, "next", patient)
+    monkeypatch.setattr(pool._Queue, "next", patient)
 
 
 def all_ended(processes):
@@ -187,11 +188,11 @@ def test_without_an_interpreter_this_process_does_it_all(python, monkeypatch, ca
 @pytest.mark.parametrize(("path", "found"), [("/a/python3.13", True), ("/b/blender", False), ("", False)])
 def test_only_a_python_runs_children(path, found, monkeypatch):
     monkeypatch.setattr(sys, "executable", path)
-    assert parallel.interpreter() == (path if found else None)
+    assert pool.interpreter() == (path if found else None)
 
 
 def test_few_samples_stay_in_this_process(monkeypatch, started):
-    monkeypatch.setattr(parallel, "SECONDS_WORTH_A_CHILD", 0.5)
+    monkeypatch.setattr(pool, "SECONDS_WORTH_A_CHILD", 0.5)
     shading.shade(random_samples(1000), four_lights(), "ltsh4", workers=8)
     assert not started
 
@@ -202,14 +203,14 @@ sys.path[:0] = [{root!r}, {tests!r}]
 from surface_scenes import area_light, four_lights, random_samples
 from ltsh_addon import shading
 from ltsh_addon.shading import float32, integrator, parallel
-parallel.SECONDS_WORTH_A_CHILD = 0.0
+pool.SECONDS_WORTH_A_CHILD = 0.0
 integrator.REFERENCE_BLOCK_LIMITS = (8, 8)
-original = parallel.subprocess.Popen
+original = pool.subprocess.Popen
 def popen(*arguments, **options):
     process = original(*arguments, **options)
     print(process.pid, flush=True)
     return process
-parallel.subprocess.Popen = popen
+pool.subprocess.Popen = popen
 shading.shade(random_samples(100000), four_lights(), "reference", workers=2)
 """
 
@@ -237,19 +238,19 @@ for name in ("bl_ext", "bl_ext.user_default", "bl_ext.user_default.ltsh"):
 sys.modules["bl_ext.user_default.ltsh"].__path__ = [{root!r}]
 sys.path[:] = [entry for entry in sys.path if entry not in ("", {root!r})]
 package = "bl_ext.user_default.ltsh.ltsh_addon."
-shading, scene, parallel, integrator = (
-    importlib.import_module(package + name) for name in ("shading", "scene", "shading.parallel", "shading.integrator")
+shading, scene, pool, integrator = (
+    importlib.import_module(package + name) for name in ("shading", "scene", "workers.pool", "shading.integrator")
 )
 import numpy as np
-parallel.SECONDS_WORTH_A_CHILD = 0.0
+pool.SECONDS_WORTH_A_CHILD = 0.0
 integrator.BLOCK_LIMITS = (8, 8)
 by_children = []
-done = parallel._Queue.done
+done = pool._Queue.done
 def counted(self, *arguments):
     import threading
     by_children.append(threading.current_thread() is not threading.main_thread())
     done(self, *arguments)
-parallel._Queue.done = counted
+pool._Queue.done = counted
 up, white = np.tile([0.0, 0.0, 1.0], (64, 1)), np.ones((64, 3))
 position = np.random.default_rng(1).uniform(-1.0, 1.0, (64, 3)) * [1.0, 1.0, 0.0]
 samples = scene.SurfaceSamples(position, up, up, up, np.full(64, 0.4), white, white, np.zeros(64), np.ones(64), white)

@@ -2,7 +2,7 @@
 
 Messages are pickles, each after its length. The first message has the search path and names the class that does the
 work. The second is the task. Each later one goes to the class's `shade`, for example that of
-`shading.parallel.ChildSide`. The answer is the result, or the text of an error.
+`workers.pool.ChildSide`. The answer is the result, or the text of an error.
 """
 
 from __future__ import annotations

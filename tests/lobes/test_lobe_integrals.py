@@ -7,9 +7,9 @@ import textbook
 from polygon_quadrature import above_horizon
 
 from ltsh_addon import shading
-from ltsh_addon.shading import spherical_harmonics
-from ltsh_addon.shading.lobes import polygon_integrals
-from ltsh_addon.shading.lookup_table import Lobe
+from ltsh_addon.lobes import spherical_harmonics
+from ltsh_addon.lobes.lobe_integrals import polygon_integrals
+from ltsh_addon.lobes.lookup_table import Lobe
 
 TABLES = {name: shading.load_table(name) for name in shading.SHIPPED_TABLES}
 # At grazing angles and low roughness the warp stretches polygons up to 1e5 times: 1e5 * eps * some edges

@@ -11,11 +11,11 @@ from functools import partial
 import numpy as np
 
 from . import edge_integrals, moments32
-from .light_polygons import integrate_visible
 from .lookup_table import Lobe, LookupTable, bent
 from .polygon import (
     dot,
     edge_sums,
+    integrate_visible,
     one_plus_cosine,
     project_to_sphere,
     solid_angle,

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ltsh_addon import shading
-from ltsh_addon.shading import lookup_table
+from ltsh_addon.lobes import lookup_table
 
 TABLES = {name: shading.load_table(name) for name in shading.SHIPPED_TABLES}
 table_names = pytest.mark.parametrize("name", shading.SHIPPED_TABLES)

@@ -5,11 +5,7 @@ import polygon_quadrature
 import pytest
 import textbook
 
-from ltsh_addon.shading.polygon import (
-    clip_to_horizon,
-    project_to_sphere,
-    solid_angle,
-)
+from ltsh_addon.lobes.polygon import clip_to_horizon, project_to_sphere, solid_angle
 
 ARROW = np.array([[-1.0, -1.0, 0.0], [1.0, 0.0, 0.0], [-1.0, 1.0, 0.0], [-0.4, 0.0, 0.0]])
 COMB = np.array(

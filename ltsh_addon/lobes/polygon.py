@@ -17,6 +17,9 @@ PATTERN_CORNERS = 8
 DARK, WHOLE, SINGLE_RUN, SEVERAL_RUNS = range(4)
 # Turns below this share of the squared size of the polygon count as straight.
 STRAIGHT = 1e-12
+# If at least this share of the points sees all of a light, the light is computed as if all points did: that is cheaper
+# than gathering them.
+MOSTLY_WHOLE = 0.6
 
 
 def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -131,6 +134,47 @@ def split_at_horizon(vertices: np.ndarray, axis: int = 2):
 def _kinds_of_many_corners(heights):
     above = heights > 0.0
     return np.where(above.all(axis=0), WHOLE, np.where(above.any(axis=0), SEVERAL_RUNS, DARK))
+
+
+def integrate_visible(corners: np.ndarray, facing: np.ndarray, clip_rows, count: int, integrate):
+    """Integrals (count, P) over the visible parts of polygons (C, V, P), and the mask (P,) of points that need float64.
+
+    A point that is `facing` (P,) its polygon sees the part where all coordinates `clip_rows` are positive.
+    `integrate(polygons (C, W, Q), index)` returns (count, Q) and a mask (Q,) for the points `index` (None: all).
+    """
+    whole = facing.copy()
+    partly = facing
+    for row in clip_rows:
+        whole &= np.minimum.reduce(corners[row], axis=0) > 0.0
+    seen_whole = np.count_nonzero(whole)
+    points = len(facing)
+    if seen_whole == points:
+        return integrate(corners, None)
+    for row in clip_rows:
+        partly = partly & (np.maximum.reduce(corners[row], axis=0) > 0.0)
+    cut = np.nonzero(partly & ~whole)[0]
+    values, needs_float64 = np.zeros((count, points), np.float32), np.zeros(points, bool)
+    if seen_whole > MOSTLY_WHOLE * points:
+        found, mask = integrate(corners, None)
+        np.multiply(found, whole, out=values)
+        np.logical_and(mask, whole, out=needs_float64)
+    elif seen_whole:
+        index = np.nonzero(whole)[0]
+        values[:, index], needs_float64[index] = integrate(np.take(corners, index, axis=2), index)
+    if len(cut):
+        for index, polygons in _clipped(np.take(corners, cut, axis=2), clip_rows):
+            values[:, cut[index]], needs_float64[cut[index]] = integrate(polygons, cut[index])
+    return values, needs_float64
+
+
+def _clipped(corners, clip_rows):
+    """Yield (index, polygons): the parts of polygons (C, V, P) where all coordinates `clip_rows` are positive."""
+    if not clip_rows:
+        yield np.arange(corners.shape[2]), corners
+        return
+    for outer, part in split_at_horizon(corners, clip_rows[0]):
+        for inner, polygons in _clipped(part, clip_rows[1:]):
+            yield outer[inner], polygons
 
 
 def split_long_edges(vertices: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ import pytest
 import random_surfaces
 from surface_scenes import area_light
 
-from ltsh_addon.shading.light_polygons import lights_that_reach_nothing
+from ltsh_addon.emitters.light_polygons import lights_that_reach_nothing
 
 
 def is_seen(light, samples, random, count=400):

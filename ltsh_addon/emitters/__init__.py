@@ -1,0 +1,1 @@
+"""How each kind of light becomes polygons, points or factors that lobes are integrated with."""

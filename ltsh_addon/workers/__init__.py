@@ -1,0 +1,1 @@
+"""Child processes that share the work of this one."""

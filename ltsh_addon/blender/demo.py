@@ -10,6 +10,7 @@ from mathutils import Matrix, Vector
 
 from . import demo_meshes
 from .demo_meshes import BALL_ROUGHNESS, Part, everything
+from .process.blend_file import DemoJob
 from .saving import save_copy
 
 RESOLUTION = (480, 270)
@@ -210,3 +211,10 @@ def build(path: Path) -> None:
         _add_light(settings)
     _set_up_view()
     save_copy(Path(path), check_existing=False)
+
+
+def build_demo(job: DemoJob, folder: Path, progress) -> dict:
+    """Do the `job`; returns an empty manifest."""
+    progress("build scene", 0.0)
+    build(Path(job.path))
+    return {}

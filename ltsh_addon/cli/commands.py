@@ -150,11 +150,11 @@ def _run_scenes(arguments, bar, open_file) -> int:
 
 
 def _demo(arguments, bar, open_file) -> int:
-    from ..blender.process import client
+    from ..blender.process.blend_file import build_demo
 
     job = job_of(arguments, (arguments.output / "demo.blend",))
     prepare(job.options)
-    client.build_demo(job.scenes[0], progress=bar)
+    build_demo(job.scenes[0], progress=bar)
     document, code = do_job(job, arguments, bar)
     if job.options.shadows == "on":
         alone = replace(job.options, shadows="off", output=arguments.output / UNSHADOWED)

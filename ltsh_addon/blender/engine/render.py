@@ -23,7 +23,7 @@ from ...pipeline.render import finish
 from ...scene import PASSES, SHIPPED_TABLES, TECHNIQUES, Cancelled, Progress, SceneError, error_line
 from ...shading import TableError
 from ..materials.looks import world_radiance
-from ..process import client
+from ..process.pixels import PixelJob, extract_pixels
 from ..render_settings import pass_names as names_in_files
 from ..render_settings import picture_size
 from ..saving import save_working_copy
@@ -290,7 +290,7 @@ def final_picture(
     """
     if job.cycles_samples:
         return _complete_picture(job, scene_file, progress, show)
-    options = client.ExtractOptions(
+    options = PixelJob(
         scene=scene_file,
         sub_samples=job.sub_samples,
         frame=job.frame,
@@ -300,21 +300,21 @@ def final_picture(
         indices=job.indices,
         shadows=job.shadows,
     )
-    extraction = client.extract(options, progress=progress)
-    emission = extraction.exposure * extraction.emission
+    extraction = extract_pixels(options, progress=progress)
+    emission = extraction.picture.exposure * extraction.cycles.emission
     shown = PASSES if job.shown == "combined" else (job.shown,)
     rest = extraction.rest
     if job.shown != "combined":
-        rest[..., :3] = extraction.exposure * extraction.background[..., :3]
-    passes, warnings = {EMISSION: inside_border(emission, extraction.border)}, extraction.warnings
+        rest[..., :3] = extraction.picture.exposure * extraction.cycles.background[..., :3]
+    passes, warnings = {EMISSION: inside_border(emission, extraction.picture.border)}, extraction.warnings
     if job.data_passes:
         passes |= data_passes(extraction, job.to_camera)
-    indices = extraction.indices.items()
-    passes |= {name: inside_border(plane[..., None], extraction.border) for name, plane in indices}
+    indices = extraction.cycles.indices.items()
+    passes |= {name: inside_border(plane[..., None], extraction.picture.border) for name, plane in indices}
 
     def picture() -> FinalPicture:
         """The picture so far."""
-        combined = inside_border(rest, extraction.border).copy()
+        combined = inside_border(rest, extraction.picture.border).copy()
         for part in shown:
             combined[..., :3] += passes.get(f"LTSH {PASS_LABELS[part]}", 0.0)
         return FinalPicture(combined, dict(passes), warnings, extraction.problems)
@@ -357,7 +357,7 @@ def data_passes(extraction, to_camera: np.ndarray | None) -> dict[str, np.ndarra
         depth = np.full(film.width * film.height, BEHIND)
         depth[pixel] = -(samples.position[first] @ to_camera[2, :3] + to_camera[2, 3])
         found[DEPTH] = depth.reshape(film.height, film.width, 1)
-    return {name: inside_border(image, extraction.border) for name, image in found.items()}
+    return {name: inside_border(image, extraction.picture.border) for name, image in found.items()}
 
 
 def _direct_light(job: FinalJob, comparison) -> FinalPicture:
@@ -366,10 +366,10 @@ def _direct_light(job: FinalJob, comparison) -> FinalPicture:
     images = {f"LTSH {PASS_LABELS[part]}": image for (_, part), image in comparison.images.items()}
     coverage = extraction.film.coverage()
     combined = _over_background(
-        sum(images.values(), np.zeros((*coverage.shape, 3))), coverage, job.background, extraction.exposure
+        sum(images.values(), np.zeros((*coverage.shape, 3))), coverage, job.background, extraction.picture.exposure
     )
-    passes = {name: inside_border(image, extraction.border) for name, image in images.items()}
-    return FinalPicture(inside_border(combined, extraction.border), passes, ())
+    passes = {name: inside_border(image, extraction.picture.border) for name, image in images.items()}
+    return FinalPicture(inside_border(combined, extraction.picture.border), passes, ())
 
 
 def _complete_picture(job: FinalJob, scene_file: Path, progress: Progress, show) -> FinalPicture:
@@ -385,7 +385,7 @@ def _complete_picture(job: FinalJob, scene_file: Path, progress: Progress, show)
     )
     where = {"scene_name": job.scene, "view_layer": job.view_layer}
     made = finish(options, progress, **where, shaded=lambda comparison: show(_direct_light(job, comparison)))
-    border = made.comparison.extraction.border
+    border = made.comparison.extraction.picture.border
     zero = np.zeros_like(made.combined[..., :3])
     passes = {f"LTSH {label}": made.ours.get(f"{job.technique}.{part}", zero) for part, label in PASS_LABELS.items()}
     for name, channels in job.cycles_passes:
@@ -418,7 +418,7 @@ def _image(extraction, technique: str, part: str, shadows, progress: Progress) -
         (shadows,),
         progress=lambda fraction: progress(TECHNIQUES[technique].title, fraction),
     )
-    return inside_border(extraction.film.image(extraction.exposure * lit.combined), extraction.border)
+    return inside_border(extraction.film.image(extraction.picture.exposure * lit.combined), extraction.picture.border)
 
 
 def _over_background(color: np.ndarray, coverage: np.ndarray, background, exposure: float) -> np.ndarray:

@@ -29,6 +29,14 @@ def open_rays(occluders: Occluders, folder: Path, warn: Callable[[str], None]) -
         return Tracer(occluders, BlenderCaster(occluders, folder))
 
 
+@dataclass(frozen=True)
+class RaysJob:
+    """Find the first hits of the rays in the job's folder on the occluders that block, or on those that do not."""
+
+    occluders: str
+    is_clear: bool
+
+
 class BlenderCaster:
     """Casts rays as `visibility.rays.EmbreeCaster` does, in a second Blender."""
 
@@ -57,8 +65,7 @@ class BlenderCaster:
         """First hits of rays (origins, directions, near, far, masks) on blocking surfaces; `is_clear`: on others."""
         for name, values in zip(RAYS, rays, strict=True):
             save_array(self._folder / f"{name}.npy", values)
-        job = {"task": "rays", "occluders": str(self._occluders), "is_clear": is_clear}
-        self._process.do(job, self._folder, None)
+        self._process.do(RaysJob(str(self._occluders), is_clear), self._folder, None)
         return Hits(*(np.load(self._folder / f"{field.name}.npy") for field in fields(Hits)))
 
 
@@ -84,15 +91,15 @@ class _Tree:
 _trees: dict[str, tuple[list[_Tree], list[_Tree]]] = {}  # of the last file of occluders, by its path
 
 
-def cast(job: dict, folder: Path) -> dict:
+def cast(job: RaysJob, folder: Path, progress) -> dict:
     """Write the first hits of the rays in `folder`; returns an empty manifest."""
-    path = job["occluders"]
+    path = job.occluders
     if path not in _trees:
         _trees.clear()
         occluders = Occluders.load(path)
         _trees[path] = tuple(_grown(occluders, index) for index in occluders.split())
     rays = (np.load(folder / f"{name}.npy") for name in RAYS)
-    for name, values in _closest(_trees[path][job["is_clear"]], *rays).items():
+    for name, values in _closest(_trees[path][job.is_clear], *rays).items():
         save_array(folder / f"{name}.npy", values)
     return {}
 

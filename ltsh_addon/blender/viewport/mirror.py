@@ -30,16 +30,16 @@ from ..evaluated import (
     owner_of,
     visibility,
 )
-from ..lights.area import area_light, note_unsupported, reason_to_leave_out, unseen_light
+from ..lights.area import area_light, node_light, note_unsupported, reason_to_leave_out
 from ..lights.emission import emission_of, factors_of, nodes_as_text, open_studio
 from ..lights.linking import Receivers
 from ..lights.meshes import collect_mesh_lights, constant_mesh_lights
-from ..lights.textures import MOST_LOOKS, SeenNodes, ShownTextures, UnseenLight, seen_factor, with_pattern
+from ..lights.textures import MOST_LOOKS, NodeEmission, NodeLight, ShownTextures, node_emission, with_pattern
 from ..lights.world import light_of_world
 from ..materials.graph import source_of, surface_of, tree_in_use
 from ..materials.looks import Look, look_of, world_radiance
 from ..materials.values import product, value_at
-from ..process import client
+from ..process.view import NodeLightFile, render_node_lights
 from .meshes import MeshBatches, mesh_batches
 from .sky import REST_SECONDS, ShownSky, constant_sky, written
 from .textures import look_values, uniform_buffer
@@ -52,10 +52,10 @@ MOST_LIGHTS = 2048
 NOT_RESOLVED = "its nodes are not resolved, it shines as without them"
 NOT_YET = "it shines as without its nodes until Cycles has looked at them"
 # Patterns: a function that returns how Cycles sees the nodes of evaluated light data, or why that is not known.
-Patterns = Callable[[bpy.types.Light, UnseenLight], SeenNodes | str]
+Patterns = Callable[[bpy.types.Light, NodeLight], NodeEmission | str]
 
 
-def no_patterns(data, source: UnseenLight) -> str:
+def no_patterns(data, source: NodeLight) -> str:
     """The `Patterns` of views that resolve no nodes."""
     return NOT_RESOLVED
 
@@ -126,14 +126,14 @@ def _mesh_lights(depsgraph, receivers: Receivers, notes: list[str]) -> list[Area
     return constant_mesh_lights(found, _emission, eye, notes.append)
 
 
-def patterns_of(scene, depsgraph) -> dict[tuple, SeenNodes]:
-    """How Cycles sees the nodes of lights that views cannot read themselves, by the `key` of the `UnseenLight`.
+def patterns_of(scene, depsgraph) -> dict[tuple, NodeEmission]:
+    """How Cycles sees the nodes of lights that views cannot read themselves, by the `key` of the `NodeLight`.
 
     `scene` is left as it was.
     """
-    wanted: dict[tuple, UnseenLight] = {}
+    wanted: dict[tuple, NodeLight] = {}
 
-    def note(data, source: UnseenLight) -> str:
+    def note(data, source: NodeLight) -> str:
         if len(wanted) < MOST_LOOKS:
             wanted[source.key] = source
         return NOT_YET
@@ -148,7 +148,7 @@ def patterns_of(scene, depsgraph) -> dict[tuple, SeenNodes]:
     if not wanted:
         return {}
     with open_studio(scene) as studio:
-        return {key: seen_factor(source, studio) for key, source in wanted.items()}
+        return {key: node_emission(source, studio) for key, source in wanted.items()}
 
 
 @dataclass
@@ -156,7 +156,7 @@ class _Look:
     """A second Blender that looks at lights."""
 
     states: dict[tuple, tuple]  # states by key of the lights without results so far
-    found: list[tuple[tuple, SeenNodes]] = field(default_factory=list)  # new results, with the keys of their lights
+    found: list[tuple[tuple, NodeEmission]] = field(default_factory=list)  # new results, with the keys of their lights
     error: str = ""
     is_stopped: bool = False
     thread: threading.Thread | None = None
@@ -166,17 +166,17 @@ class LiveLamps:
     """The nodes of lights as Cycles sees them, for all windows.
 
     A second Blender looks at new and changed lights while the views go on. Lights are identified by the `key` of
-    `UnseenLight`.
+    `NodeLight`.
     """
 
     def __init__(self):
-        self._known: dict[tuple, tuple[tuple, SeenNodes | str]] = {}  # state of a light's nodes, and the result
+        self._known: dict[tuple, tuple[tuple, NodeEmission | str]] = {}  # state of a light's nodes, and the result
         self._wanted: dict[tuple, tuple] = {}  # states of lights to look at
-        self._sources: dict[tuple, UnseenLight] = {}  # the lights of these states
+        self._sources: dict[tuple, NodeLight] = {}  # the lights of these states
         self._changed, self._images = 0.0, 0  # time of the last change; counts changes of images
         self._look: _Look | None = None
 
-    def pattern(self, data, source: UnseenLight) -> SeenNodes | str:
+    def pattern(self, data, source: NodeLight) -> NodeEmission | str:
         """The last result for a light, or a note that there is none yet. Requests a new look if the light changed."""
         key, state = source.key, self._state(data, source)
         known, found = self._known.get(key, ((), NOT_YET))
@@ -187,7 +187,7 @@ class LiveLamps:
             self._wanted[key], self._sources[key], self._changed = state, source, time.monotonic()
         return found
 
-    def _state(self, data, source: UnseenLight) -> tuple:
+    def _state(self, data, source: NodeLight) -> tuple:
         text = nodes_as_text(data)
         names = {"AREA": ("shape", "size", "size_y"), "SUN": ("angle",)}.get(data.type, ("use_soft_falloff",))
         if data.type in ("POINT", "SPOT") and (source.is_mixed or not source.by_ray):
@@ -251,7 +251,7 @@ class LiveLamps:
             folder = stack.enter_context(temporary_folder())
             places = written(folder / "lamps.blend", lights)
             lamps = [
-                client.UnseenLamp(str(place), light.name, source.matrix.tolist(), source.flags, vars(source.facts))
+                NodeLightFile(str(place), light.name, source.matrix.tolist(), source.flags, vars(source.facts))
                 for place, light, source in zip(places, lights, sources, strict=True)
             ]
         except (OSError, RuntimeError) as error:
@@ -260,13 +260,13 @@ class LiveLamps:
             return True
 
         def take(number: int, factor: np.ndarray, lost: float) -> bool:
-            look.found.append((keys[number], SeenNodes(factor, lost)))
+            look.found.append((keys[number], NodeEmission(factor, lost)))
             return not look.is_stopped
 
         def work() -> None:
             try:
                 with stack:
-                    client.look_at_lamps(lamps, frame, folder, take)
+                    render_node_lights(lamps, frame, folder, take)
             except Cancelled:
                 pass
             except Exception as error:
@@ -305,7 +305,7 @@ def _with_nodes(light: AreaLight, instance, looked: tuple, notes: list[str]) -> 
             return patches
     warnings: list[str] = []
     matrix = np.array(instance.matrix_world, dtype=np.float64)
-    unseen = unseen_light(ob, matrix, SimpleNamespace(warn=warnings.append), instance)
+    unseen = node_light(ob, matrix, SimpleNamespace(warn=warnings.append), instance)
     found = patterns(data, unseen)
     if isinstance(found, str):
         notes.append(f"{light.name}: {found}")

@@ -19,7 +19,7 @@ from ...cycles.environment import CUBE, SkyPicture, sky_lights
 from ...files import temporary_folder
 from ...scene import AreaLight, error_line
 from ..lights.world import light_of_world
-from ..process import client
+from ..process.view import WorldJob, render_world
 
 # Texels of a side of maps. SIZE, LEAST_SIZE: the largest and the smallest map of the light. IRRADIANCE_SIZE: the map of
 # the irradiance. IRRADIANCE_SOURCE: the map of the light from which the irradiance is computed.
@@ -251,7 +251,7 @@ class LiveWorld:
         def work() -> None:
             try:
                 with stack:
-                    found = client.look_at_world(path, name, frame, folder, lambda *_: not stopped.is_set())
+                    found = render_world(WorldJob(path, name, frame), folder, lambda *_: not stopped.is_set())
                 light = [SkyPicture(*axes, one) for axes, one in zip(CUBE, found.light, strict=False)]
                 self._outcome = varied_sky(like, light, found.lights, found.background), found.warnings
             except Exception as error:

@@ -18,10 +18,19 @@ from .. import render_settings
 from ..extract.occluders import collect_occluders
 from ..extract.pixels import no_light, open_scene
 from ..lights.emission import ObjectFacts, open_studio
-from ..lights.textures import UnseenLight, seen_factor
+from ..lights.textures import NodeLight, node_emission
 from ..lights.world import background_pictures, blocks_nothing, light_of_world, light_pictures
 from ..materials.looks import world_radiance
-from ..process.client import GRAPHICS, LAMPS, VIEW_PASSES, VIEW_PNG
+from ..process.view import (
+    GRAPHICS,
+    NODE_LIGHTS,
+    VIEW_PASSES,
+    VIEW_PNG,
+    NodeLightFile,
+    NodeLightJob,
+    ViewJob,
+    WorldJob,
+)
 from ..render_settings import cycles_setting
 from .mirror import NOT_RESOLVED, SceneMirror, patterns_of
 from .renderer import CENTERS, ShownPicture, ViewRenderer
@@ -37,15 +46,15 @@ FEWEST_RAYS = 32
 _renderer: list[ViewRenderer] = []
 
 
-def draw_view(job: dict, folder: Path, progress) -> dict:
-    """Do the `job` (see `client.ViewJob`) and write arrays and a PNG into `folder`; returns the manifest."""
+def draw_view(job: ViewJob, folder: Path, progress) -> dict:
+    """Do the `job` and write arrays and a PNG into `folder`; returns the manifest."""
     started, warnings = time.monotonic(), []
     progress("open scene", 0.0)
-    open_scene(Path(job["scene"]), warnings, job["scripts"])
+    open_scene(Path(job.scene), warnings, job.scripts)
     scene = bpy.context.scene
-    render_settings.go_to_frame(scene, job["frame"])
-    camera = render_settings.choose_camera(scene, job["camera"])
-    size = render_settings.set_resolution(scene, job["width"], job["height"])
+    render_settings.go_to_frame(scene, job.frame)
+    camera = render_settings.choose_camera(scene, job.camera)
+    size = render_settings.set_resolution(scene, job.width, job.height)
     warnings += _not_shown(scene, camera)
     sky = _sky(scene, warnings)
     with bpy.context.temp_override(scene=scene, view_layer=_layer(scene)):
@@ -163,10 +172,10 @@ def _sky(scene, warnings: list[str]) -> ShownSky | None:
     world = _layer(scene).world_override or scene.world
     if world_radiance(world)[1]:
         return None
-    return varied_sky(light_of_world(world), *look_at_world(scene, world, warnings.append))
+    return varied_sky(light_of_world(world), *rendered_world(scene, world, warnings.append))
 
 
-def look_at_world(scene, world, warn: Callable) -> tuple[list[SkyPicture], list[AreaLight], np.ndarray]:
+def rendered_world(scene, world, warn: Callable) -> tuple[list[SkyPicture], list[AreaLight], np.ndarray]:
     """The `world` as Cycles renders it: pictures of its light ([] where it is dark), the small bright lights in it, and
     its background (N, N, 3). `scene` is left as it was."""
     like, light, lights = light_of_world(world), [], []
@@ -175,38 +184,38 @@ def look_at_world(scene, world, warn: Callable) -> tuple[list[SkyPicture], list[
     return [coarse(picture) for picture in light], lights, background_of(background_pictures(scene, world, warn))
 
 
-def show_world(job: dict, folder: Path) -> dict:
-    """Do the `job` (see `client.look_at_world`): writes pictures into `folder`, returns lights and warnings."""
+def render_world(job: WorldJob, folder: Path, progress) -> dict:
+    """Do the `job`: writes pictures into `folder`, returns lights and warnings."""
     warnings: list[str] = []
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
-    with bpy.data.libraries.load(job["path"]) as (_, wanted):
-        wanted.worlds = [job["world"]]
+    with bpy.data.libraries.load(job.path) as (_, wanted):
+        wanted.worlds = [job.world]
     (scene.world,) = wanted.worlds
-    scene.frame_set(job["frame"])
-    light, lights, background = look_at_world(scene, scene.world, warnings.append)
+    scene.frame_set(job.frame)
+    light, lights, background = rendered_world(scene, scene.world, warnings.append)
     save_array(folder / "light.npy", np.array([picture.radiance for picture in light], np.float32))
     save_array(folder / "background.npy", background.astype(np.float32))
     return {"lights": [one.record() for one in lights], "warnings": warnings}
 
 
-def show_lamps(job: dict, folder: Path, progress: Callable) -> dict:
-    """Do the `job` (see `client.look_at_lamps`): writes the factors of each light's nodes into `folder`."""
+def render_node_lights(job: NodeLightJob, folder: Path, progress: Callable) -> dict:
+    """Do the `job`: writes the factors of each light's nodes into `folder`."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    scene, count = bpy.context.scene, len(job["lamps"])
-    scene.frame_set(job["frame"])
-    for number, lamp in enumerate(job["lamps"]):
-        with bpy.data.libraries.load(lamp["path"]) as (there, wanted):
-            if lamp["name"] not in there.lights:
-                raise SceneError(f"{lamp['path']}: has no light {lamp['name']!r}")
-            wanted.lights = [lamp["name"]]
-        facts = ObjectFacts(**lamp["facts"])
-        source = UnseenLight(wanted.lights[0], np.array(lamp["matrix"]), facts=facts, **lamp["flags"])
+    scene, files = bpy.context.scene, [NodeLightFile(**fields) for fields in job.lights]
+    scene.frame_set(job.frame)
+    for number, file in enumerate(files):
+        with bpy.data.libraries.load(file.path) as (there, wanted):
+            if file.name not in there.lights:
+                raise SceneError(f"{file.path}: has no light {file.name!r}")
+            wanted.lights = [file.name]
+        facts = ObjectFacts(**file.facts)
+        source = NodeLight(wanted.lights[0], np.array(file.matrix), facts=facts, **file.flags)
         with open_studio(scene) as studio:
-            found = seen_factor(source, studio)
-        save_array(folder / f"{number}.npy", found.factor.astype(np.float32))
-        save_array(folder / f"{number}_lost.npy", np.array(found.lost))
-        progress(LAMPS, (number + 1) / count)
+            emission = node_emission(source, studio)
+        save_array(folder / f"{number}.npy", emission.factor.astype(np.float32))
+        save_array(folder / f"{number}_lost.npy", np.array(emission.lost))
+        progress(NODE_LIGHTS, (number + 1) / len(files))
     return {}
 
 
@@ -214,7 +223,7 @@ def _layer(scene):
     return next((layer for layer in scene.view_layers if layer.use), scene.view_layers[0])
 
 
-def _draw(job: dict, seen: tuple, size: tuple[int, int], progress) -> dict:
+def _draw(job: ViewJob, seen: tuple, size: tuple[int, int], progress) -> dict:
     """Pictures (H, W, 4), row 0 on top, of all techniques and passes, and the facts of the manifest about them."""
     progress("draw", 0.0)
     scene, camera, sky, patterns = seen
@@ -225,20 +234,20 @@ def _draw(job: dict, seen: tuple, size: tuple[int, int], progress) -> dict:
     if not mirror.lights and not mirror.sky.sides:
         raise no_light(scene, mirror.notes)
     notes, shadows = list(mirror.notes), None
-    if job["shadows"] == "on":
+    if job.shadows == "on":
         problem = too_many(len(mirror.lights), size)
         override = depsgraph.view_layer_eval.material_override
-        rays = max(min(FEWEST_RAYS, job["shadow_rays"]), job["shadow_rays"] // job["refine"])
+        rays = max(min(FEWEST_RAYS, job.shadow_rays), job.shadow_rays // job.refine)
         if problem:
             notes.append(problem)
         else:
             occluders = blocks_nothing(collect_occluders(depsgraph, override, notes.append), scene.world)
             shadows = ShadowRays(occluders, rays)
     canvas = _Canvas(mirror, view_of_camera(camera.evaluated_get(depsgraph), depsgraph, size), size)
-    points = render_settings.sub_pixel_offsets(scene, job["refine"])
-    first, *others = ((technique, name) for technique in job["techniques"] for name in VIEW_PASSES)
+    points = render_settings.sub_pixel_offsets(scene, job.refine)
+    first, *others = ((technique, name) for technique in job.techniques for name in VIEW_PASSES)
     try:
-        seconds = [canvas.seconds_of_redraws(_shown(scene, technique)) for technique in job["techniques"]]
+        seconds = [canvas.seconds_of_redraws(_shown(scene, technique)) for technique in job.techniques]
         shown = replace(_shown(scene, first[0]), also=tuple(others))
         pictures = canvas.draw(shown, points, shadows, lambda share: progress("draw", share))
     except ValueError as error:  # a table that the card does not take

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from ltsh_addon.blender import demo as demo_module
-from ltsh_addon.blender.process import blender_process, client
+from ltsh_addon.blender.process import blender_process
+from ltsh_addon.blender.process.blend_file import build_demo
 from ltsh_addon.blender.saving import check_whole
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -17,7 +18,7 @@ SPECULAR_NODES = {"BSDF_PRINCIPLED", "BSDF_GLOSSY"}
 @pytest.fixture(scope="module")
 def demo_file(tmp_path_factory):
     path = tmp_path_factory.mktemp("demo") / "demo.blend"
-    client.build_demo(path)
+    build_demo(path)
     return path
 
 
@@ -121,5 +122,5 @@ def test_a_build_that_cannot_be_saved_leaves_the_old_file(tmp_path):
     folder = tmp_path / "demo.blend"
     folder.mkdir()
     with pytest.raises((OSError, blender_process.SceneError)):
-        client.build_demo(folder)
+        build_demo(folder)
     assert [path.name for path in tmp_path.iterdir()] == ["demo.blend"]

@@ -6,7 +6,8 @@ import pytest
 import scene_parts
 
 from ltsh_addon import cli
-from ltsh_addon.blender.process import blender_process, client
+from ltsh_addon.blender.process import blender_process
+from ltsh_addon.blender.process.blend_file import build_demo
 from ltsh_addon.pipeline import PictureOptions, compare_scene, shade_scene
 from ltsh_addon.scene import Cancelled
 
@@ -83,7 +84,7 @@ OPERATIONS = {
     "cancelled before it writes": (lambda path: compare_scene(options(path), stop_at("write")), Cancelled),
     "an exception in the middle": (lambda path: compare_scene(options(path), fail_at("Cycles A")), RuntimeError),
     "an unknown camera": (lambda path: shade_scene(options(path, camera="Nobody")), blender_process.SceneError),
-    "building the example": (lambda path: client.build_demo(path.with_name("demo.blend")), None),
+    "building the example": (lambda path: build_demo(path.with_name("demo.blend")), None),
 }
 
 

@@ -13,7 +13,7 @@ from graphics_card import Canvas, edits_with_graphics, with_graphics
 from random_surfaces import EYE
 
 from ltsh_addon import shading
-from ltsh_addon.blender.process import client
+from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels
 from ltsh_addon.blender.viewport.lighting import HorizonPass
 from ltsh_addon.blender.viewport.mirror import SceneMirror
 from ltsh_addon.blender.viewport.renderer import ShownPicture, ViewRenderer
@@ -169,7 +169,7 @@ def test_lobes_of_a_coarse_smooth_mesh_end_where_those_of_numpy_do(tmp_path):
     # The samples of the viewport are those that Cycles takes of the saved file, but for edges of faces.
     path = tmp_path / "sphere.blend"
     bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
-    found = client.extract(client.ExtractOptions(scene=path))
+    found = extract_pixels(PixelJob(scene=path))
     row, column = np.divmod(found.film.pixel, SIZE[0])
     place = np.full(SIZE[0] * SIZE[1], -1)
     place[pixel] = np.arange(len(pixel))

@@ -323,7 +323,6 @@ def final_picture(
     shadows = None
     if extraction.occluders is not None:
         shadows = trace_shadows(extraction, PASSES, job.shadow_rays, progress)
-        warnings += shadows.warnings
     for technique in dict.fromkeys(job.shaded_as().values()):
         for number, part in enumerate(PASSES):
             image = _image(extraction, technique, part, shadows, _part(progress, number / len(PASSES), 1 / len(PASSES)))

@@ -268,7 +268,8 @@ class Company:
     def __init__(self, setting: Setting, tracer):
         occluders, library = (None, None) if tracer is None else (tracer.occluders, tracer.library)
         count = min(pool.cores(), len(setting.blocks))
-        if pool.interpreter() is None or sum(len(block[0]) for block in setting.blocks.values()) < SAMPLES_WORTH_A_CHILD:
+        samples = sum(len(block[0]) for block in setting.blocks.values())
+        if pool.interpreter() is None or samples < SAMPLES_WORTH_A_CHILD:
             count = 1
         # This process knows all blocks. After its own, it does those that others have not begun.
         self._own, self._count, self._run = LitBlocks((setting, occluders, library), tracer), count, 0

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...pipeline.lighting import KeptPicture, shade_lights, trace_shadows
+from ...pipeline.lighting import RelightData, shade_lights, trace_shadows
 from ...pipeline.mixer import LightPictures, light_pictures
 from ...pipeline.options import RenderOptions
 from ...pipeline.render import finish
@@ -82,7 +82,7 @@ class FinalPicture:
     warnings: tuple[str, ...]
     problems: tuple[str, ...] = ()
     lights: LightPictures | None = None  # for the light mixer
-    kept: KeptPicture | None = None  # the samples, for lights that move
+    relight_data: RelightData | None = None  # the samples, for lights that move
 
 
 def final_picture(
@@ -128,7 +128,6 @@ def final_picture(
     shadows = None
     if extraction.occluders is not None:
         shadows = trace_shadows(extraction, PASSES, job.shadow_rays, progress)
-        warnings += shadows.warnings
     for technique in dict.fromkeys(job.shaded_as().values()):
         for number, part in enumerate(PASSES):
             image = _image(extraction, technique, part, shadows, _part(progress, number / len(PASSES), 1 / len(PASSES)))
@@ -137,11 +136,11 @@ def final_picture(
             show(picture())
     if not job.keeps_lights:
         return picture()
-    kept = KeptPicture(extraction, shadows, _kept_options(job, shown), False, {"": rest})
-    return replace(picture(), lights=light_pictures(kept, progress), kept=kept)
+    relight_data = RelightData(extraction, shadows, _relight_options(job, shown), False, {"": rest})
+    return replace(picture(), lights=light_pictures(relight_data, progress), relight_data=relight_data)
 
 
-def _kept_options(job: FinalJob, passes) -> dict:
+def _relight_options(job: FinalJob, passes) -> dict:
     return {"techniques": (job.technique,), "passes": passes, "shadow_rays": job.shadow_rays}
 
 
@@ -200,12 +199,16 @@ def _complete_picture(job: FinalJob, scene_file: Path, progress: Progress, show)
         if planes and set(letters) <= set(planes):
             passes[name] = np.stack([planes[letter] for letter in letters], axis=-1)
     passes = {name: inside_border(image, border) for name, image in passes.items()}
-    lights, kept, ours = None, None, made.comparison
+    lights, relight_data, ours = None, None, made.comparison
     if job.keeps_lights:
-        kept = KeptPicture(ours.extraction, ours.shadows, _kept_options(job, PASSES), False, **made.kept)
-        lights = light_pictures(kept, progress)
+        relight_data = RelightData(
+            ours.extraction, ours.shadows, _relight_options(job, PASSES), False, **made.relight_data
+        )
+        lights = light_pictures(relight_data, progress)
     warnings = tuple(made.report["warnings"])
-    return FinalPicture(inside_border(made.combined, border), passes, warnings, lights=lights, kept=kept)
+    return FinalPicture(
+        inside_border(made.combined, border), passes, warnings, lights=lights, relight_data=relight_data
+    )
 
 
 def _part(progress: Progress, start: float, share: float) -> Progress:

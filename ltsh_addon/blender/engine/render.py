@@ -121,7 +121,7 @@ class LTSH_RenderEngine(bpy.types.RenderEngine):
             self.report({"WARNING"}, warning)
         self._show(picture, job.view_layer)
         if picture.lights is not None:
-            comparison.mix_render(job.scene, picture.lights, picture.kept)
+            comparison.mix_render(job.scene, picture.lights, picture.relight_data)
 
     def _show(self, picture: FinalPicture, view_layer: str) -> None:
         """Give Blender the picture; the last one stays."""

@@ -69,8 +69,6 @@ def _perform(job: dict, folder: Path, progress) -> dict:
         progress("build scene", 0.0)
         _module("blender.demo").build(Path(job["path"]))
         return {}
-    if job["task"] == "rays":
-        return _module("blender.process.blender_rays").cast(job, folder)
     if job["task"] == "bake":
         return _module("blender.extract.bake").extract_bake(job, folder, progress)
     if job["task"] == "facts":

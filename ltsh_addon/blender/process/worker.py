@@ -50,10 +50,9 @@ JOBS = {
     "BakeFactsJob": ("bake", "extract.bake", "scene_facts"),
     "ApplyJob": ("bake", "extract.apply", "apply_bake"),
     "ViewJob": ("view", "viewport.still", "draw_view"),
-    "WorldJob": ("view", "viewport.still", "render_world"),
-    "NodeLightJob": ("view", "viewport.still", "render_node_lights"),
+    "WorldJob": ("view", "viewport.live_cycles", "render_world"),
+    "NodeLightJob": ("view", "viewport.live_cycles", "render_node_lights"),
     "DemoJob": ("blend_file", "demo", "build_demo"),
-    "RaysJob": ("blender_rays", "process.blender_rays", "cast"),
 }
 
 

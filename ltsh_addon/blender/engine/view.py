@@ -22,8 +22,8 @@ from ..extract.occluders import collect_occluders
 from ..lights.world import blocks_nothing
 from ..render_settings import cycles_setting, sub_pixel_offsets
 from ..ui import results
-from ..ui.comparison import PLATE, covered, draw_rectangle
 from ..ui.job import output_folder
+from ..ui.overlay import PLATE, covered, draw_rectangle
 from ..ui.preview import ENGINE
 from ..viewport.mirror import LiveLamps, SceneMirror
 from ..viewport.renderer import ShownPicture, ViewRenderer

@@ -166,9 +166,9 @@ def _draw_lines(font: int, notes: list[tuple[str, tuple]], quiet: str, region, s
     widths = [width_of(line) for line, _ in lines]
     _quiet_lines.pop(pointer, None)
     if last:
-        left = right - max(widths[-len(last) :]) - 0.5 * size
+        x = right - max(widths[-len(last) :]) - 0.5 * size
         top = bottom + (LINE * (len(last) - 1) + 1.05) * size
-        _quiet_lines[pointer] = left, bottom - 0.35 * size, right, top
+        _quiet_lines[pointer] = x, bottom - 0.35 * size, right, top
     for number, ((line, color), width) in enumerate(zip(reversed(lines), reversed(widths), strict=True)):
         _write(font, line, right - width, bottom + number * LINE * size, size, color)
 
@@ -176,10 +176,10 @@ def _draw_lines(font: int, notes: list[tuple[str, tuple]], quiet: str, region, s
 def _draw_captions(font: int, captions: Captions, region, sides: dict[str, int], scale: float) -> None:
     line = CAPTION_SIZE * scale
     top = region.height - sides["TOP"] - MARGIN * scale - line
-    place = captions.split * region.width
+    x = captions.split * region.width
     width, _ = blf.dimensions(font, captions.left)
-    _write(font, captions.left, place - width - MARGIN * scale, top, line, CAPTION_COLOR)
-    _write(font, captions.right, place + MARGIN * scale, top, line, CAPTION_COLOR)
+    _write(font, captions.left, x - width - MARGIN * scale, top, line, CAPTION_COLOR)
+    _write(font, captions.right, x + MARGIN * scale, top, line, CAPTION_COLOR)
     if not captions.middle:
         return
     words = (
@@ -188,10 +188,10 @@ def _draw_captions(font: int, captions: Captions, region, sides: dict[str, int],
         (f"blue: darker by {captions.scale:.3g}", DARKER_COLOR),
     )
     gap = 1.5 * line
-    place = 0.5 * (region.width - sum(blf.dimensions(font, text)[0] + gap for text, _ in words) + gap)
+    x = 0.5 * (region.width - sum(blf.dimensions(font, text)[0] + gap for text, _ in words) + gap)
     for text, color in words:
-        _write(font, text, place, top, line, color)
-        place += blf.dimensions(font, text)[0] + gap
+        _write(font, text, x, top, line, color)
+        x += blf.dimensions(font, text)[0] + gap
 
 
 def _write(font: int, text: str, x: float, y: float, size: float, color) -> None:

@@ -73,10 +73,10 @@ class EngineView:
 
     def take_world(self) -> bool:
         """Show what has been found out about the world; False: there is nothing new."""
-        found = self._world.step(bpy.context.scene.frame_current)
-        if found is None:
+        outcome = self._world.step(bpy.context.scene.frame_current)
+        if outcome is None:
             return False
-        sky, notes = found
+        sky, notes = outcome
         self.mirror.take_sky(self.mirror.sky if sky is None else sky, *notes)
         return True
 
@@ -144,8 +144,8 @@ class EngineView:
         """What is to be said about shadows."""
         if self._renderer is None or self._renderer.shadows is None:
             return []
-        found = [too_many(len(self.mirror.lights), size), self._shadows.problem, *self._shadow_notes]
-        return [note for note in found if note]
+        notes = [too_many(len(self.mirror.lights), size), self._shadows.problem, *self._shadow_notes]
+        return [note for note in notes if note]
 
     def _beside_cycles(self, context, depsgraph, view: ViewCamera, mode: str):
         """The mode that is possible, the texture of the Cycles picture, and what there is to say about it."""

@@ -73,8 +73,8 @@ class HorizonPass:
             try:
                 shader.bind()
                 for name in HORIZON_SAMPLERS[step]:
-                    own = self._textures.get(name) or (lights.texture if name == "lights" else None)
-                    shader.uniform_sampler(name, own or getattr(gbuffer, SAMPLERS[name]))
+                    texture = self._textures.get(name) or (lights.texture if name == "lights" else None)
+                    shader.uniform_sampler(name, texture or getattr(gbuffer, SAMPLERS[name]))
                 for name, value in constants.items():
                     shader.uniform_float(name, value)
                 for first, end in light_shares:
@@ -175,7 +175,7 @@ class LightingPass:
             # Draw the rough diffuse lobe by itself: both lobes together may read too many textures.
             none = {"diffuse": False, "bumped": False, "turned": False, "sheen": False, "rough": False, "velvet": False}
             alone = replace(features, specular=False, geometric=False, bent=False)
-            parts = [*(replace(part, **none) for part in parts), alone]
+            parts = [*(replace(shader_features, **none) for shader_features in parts), alone]
         with nullcontext() if target is None else target.bind():
             previous = gpu.state.viewport_get(), gpu.state.blend_get(), gpu.state.depth_test_get()
             gpu.state.viewport_set(x, y, width, height)
@@ -201,7 +201,7 @@ class LightingPass:
             for first, end in shares(self._loops[run[0] : run[-1] + 1])
         ]
 
-    def _draw(self, features: Features, gbuffer: GBufferTextures, view, place: tuple[int, int], ranges) -> None:
+    def _draw(self, features: Features, gbuffer: GBufferTextures, view, corner: tuple[int, int], ranges) -> None:
         if features not in self._shaders:
             self._shaders[features] = lighting_shader(self.table, features)
         shader, batch = self._shaders[features]
@@ -215,14 +215,14 @@ class LightingPass:
         if features.shadowed:
             shader.uniform_float("grid", Matrix(gbuffer.shares.projection.tolist()))
         for first, end in ranges:
-            shader.uniform_int("place", (*place, first, end))
+            shader.uniform_int("place", (*corner, first, end))
             batch.draw(shader)
             gpu.state.blend_set("ADDITIVE")
 
     def _texture(self, name, gbuffer):
-        own = {"lights": self._lights, "table": self._table, "dielectrics": self._dielectrics, "sky": self._sky}
-        if name in own:
-            return own[name]
+        uploaded = {"lights": self._lights, "table": self._table, "dielectrics": self._dielectrics, "sky": self._sky}
+        if name in uploaded:
+            return uploaded[name]
         if name in SHARE_SAMPLERS:
             return getattr(gbuffer.shares, SHARE_SAMPLERS[name])
         return getattr(gbuffer, SAMPLERS[name])

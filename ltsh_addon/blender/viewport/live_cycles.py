@@ -29,7 +29,7 @@ class _Look:
     """A second Blender that looks at lights."""
 
     states: dict[tuple, tuple]  # states by key of the lights without results so far
-    found: list[tuple[tuple, SeenNodes]] = field(default_factory=list)  # new results, with the keys of their lights
+    results: list[tuple[tuple, SeenNodes]] = field(default_factory=list)  # new results, with the keys of their lights
     error: str = ""
     is_stopped: bool = False
     thread: threading.Thread | None = None
@@ -52,13 +52,13 @@ class LiveNodeLights:
     def pattern(self, data, source: UnseenLight) -> SeenNodes | str:
         """The last result for a light, or a note that there is none yet. Requests a new look if the light changed."""
         key, state = source.key, self._state(data, source)
-        known, found = self._known.get(key, ((), NOT_YET))
+        known, result = self._known.get(key, ((), NOT_YET))
         on_its_way = self._wanted.get(key) or (self._look.states.get(key) if self._look is not None else None)
         if known == state:
             self._wanted.pop(key, None)
         elif on_its_way != state:
             self._wanted[key], self._sources[key], self._changed = state, source, time.monotonic()
-        return found
+        return result
 
     def _state(self, data, source: UnseenLight) -> tuple:
         text = nodes_as_text(data)
@@ -92,10 +92,10 @@ class LiveNodeLights:
         if look is None:
             return bool(self._wanted) and time.monotonic() - self._changed > REST_SECONDS and self._begin(frame)
         has_ended = not look.thread.is_alive()
-        news = bool(look.found)
-        while look.found:
-            key, found = look.found.pop(0)
-            self._known[key] = look.states.pop(key), found
+        news = bool(look.results)
+        while look.results:
+            key, result = look.results.pop(0)
+            self._known[key] = look.states.pop(key), result
         if has_ended:
             self._look = None
             for key, state in look.states.items():
@@ -124,8 +124,8 @@ class LiveNodeLights:
             folder = stack.enter_context(temporary_folder())
             places = written(folder / "lamps.blend", lights)
             lamps = [
-                client.UnseenLamp(str(place), light.name, source.matrix.tolist(), source.flags, vars(source.facts))
-                for place, light, source in zip(places, lights, sources, strict=True)
+                client.UnseenLamp(str(path), light.name, source.matrix.tolist(), source.flags, vars(source.facts))
+                for path, light, source in zip(places, lights, sources, strict=True)
             ]
         except (OSError, RuntimeError) as error:
             stack.close()
@@ -133,7 +133,7 @@ class LiveNodeLights:
             return True
 
         def take(number: int, factor: np.ndarray, lost: float) -> bool:
-            look.found.append((keys[number], SeenNodes(factor, lost)))
+            look.results.append((keys[number], SeenNodes(factor, lost)))
             return not look.is_stopped
 
         def work() -> None:
@@ -157,9 +157,9 @@ REST_SECONDS = 0.3
 
 def written(path: Path, blocks: list) -> list[Path]:
     """Write data-blocks into the .blend `path`; returns the .blend to load each from, for linked ones their library."""
-    own = {block for block in blocks if block.library is None}
-    bpy.data.libraries.write(str(path), own, path_remap="ABSOLUTE", fake_user=True)
-    return [path if block in own else Path(bpy.path.abspath(block.library.filepath)) for block in blocks]
+    local = {block for block in blocks if block.library is None}
+    bpy.data.libraries.write(str(path), local, path_remap="ABSOLUTE", fake_user=True)
+    return [path if block in local else Path(bpy.path.abspath(block.library.filepath)) for block in blocks]
 
 
 class LiveWorld:
@@ -221,9 +221,12 @@ class LiveWorld:
         def work() -> None:
             try:
                 with stack:
-                    found = client.look_at_world(path, name, frame, folder, lambda *_: not stopped.is_set())
-                light = [SkyPicture(*axes, one) for axes, one in zip(CUBE, found.light, strict=False)]
-                self._outcome = varied_sky(like, light, found.lights, found.background), found.warnings
+                    world_picture = client.look_at_world(path, name, frame, folder, lambda *_: not stopped.is_set())
+                light = [SkyPicture(*axes, one) for axes, one in zip(CUBE, world_picture.light, strict=False)]
+                self._outcome = (
+                    varied_sky(like, light, world_picture.lights, world_picture.background),
+                    world_picture.warnings,
+                )
             except Exception as error:
                 self._outcome = error
 
@@ -268,8 +271,8 @@ def show_lamps(job: dict, folder: Path, progress: Callable) -> dict:
         facts = ObjectFacts(**lamp["facts"])
         source = UnseenLight(wanted.lights[0], np.array(lamp["matrix"]), facts=facts, **lamp["flags"])
         with open_studio(scene) as studio:
-            found = seen_factor(source, studio)
-        save_array(folder / f"{number}.npy", found.factor.astype(np.float32))
-        save_array(folder / f"{number}_lost.npy", np.array(found.lost))
+            pattern = seen_factor(source, studio)
+        save_array(folder / f"{number}.npy", pattern.factor.astype(np.float32))
+        save_array(folder / f"{number}_lost.npy", np.array(pattern.lost))
         progress(LAMPS, (number + 1) / count)
     return {}

@@ -127,7 +127,7 @@ def _note_object(changes: Changes, block, update) -> None:
 
 def object_notes(depsgraph) -> list[str]:
     """Notes about objects that renders of `depsgraph` show and views do not, kind by kind."""
-    found: dict[str, list[str]] = {}
+    names_by_kind: dict[str, list[str]] = {}
     for ob in depsgraph.objects:
         kind = NOT_SHOWN.get(ob.type)
         if kind is None and ob.type in SURFACE_TYPES and ob.is_shadow_catcher:
@@ -137,8 +137,8 @@ def object_notes(depsgraph) -> list[str]:
         if kind is None and ob.type == "META" and _has_lost_balls(ob, depsgraph):
             kind = "balls smaller than the Resolution Viewport are coarse or missing in views: lower it"
         if kind is not None:
-            found.setdefault(kind, []).append(ob.name)
-    return [f"{listed(names, NAMED)}: {kind}" for kind, names in found.items()]
+            names_by_kind.setdefault(kind, []).append(ob.name)
+    return [f"{listed(names, NAMED)}: {kind}" for kind, names in names_by_kind.items()]
 
 
 def _has_lost_balls(ob, depsgraph) -> bool:
@@ -236,7 +236,7 @@ class SceneMirror:
     def _read_instances(self, depsgraph, changes: Changes, in_view) -> None:
         override = depsgraph.view_layer_eval.material_override
         receivers = Receivers([ob for ob in _originals(depsgraph) if ob.type == "LIGHT"])
-        found, meshes, looks = [], {}, {}
+        instances, meshes, looks = [], {}, {}
         users = Counter()  # instances by evaluated data, those out of view included
         for instance in depsgraph.object_instances:
             ob = instance.object
@@ -268,8 +268,8 @@ class SceneMirror:
             model = instance.matrix_world.copy()
             side = -1.0 if model.determinant() < 0.0 else 1.0
             center = np.array(model) @ [*mesh.middle, 1.0]
-            found.append((data, (mesh, model, shown, receiver, side, center)))
-        self.instances = [ShownInstance(*values, is_only_user=users[data] == 1) for data, values in found]
+            instances.append((data, (mesh, model, shown, receiver, side, center)))
+        self.instances = [ShownInstance(*values, is_only_user=users[data] == 1) for data, values in instances]
         self._meshes, self._looks = meshes, looks
         self._object_notes = tuple(object_notes(depsgraph))
 
@@ -314,8 +314,8 @@ def _receiver(instance, receivers: Receivers, view_layer) -> int:
     if owner.holdout_get(view_layer=view_layer):
         return HOLDOUT
     numbers = receivers.numbers
-    own = numbers.get(instance.object.original.name_full, 0)
-    return numbers.get(owner.name_full, own) if instance.is_instance else own
+    of_object = numbers.get(instance.object.original.name_full, 0)
+    return numbers.get(owner.name_full, of_object) if instance.is_instance else of_object
 
 
 def _originals(depsgraph) -> list:

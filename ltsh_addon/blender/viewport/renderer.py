@@ -264,12 +264,12 @@ class ViewRenderer:
         whole = replace(gbuffer, smooth_normal=layer.smooth_normal)
         return shadows.shares(whole, view, self._lights.lights, sides, self.samples)
 
-    def _light_surfaces(self, wanted, targets: list[SampleSum], seen: tuple, state: tuple | None) -> None:
+    def _light_surfaces(self, wanted, targets: list[SampleSum], scene: tuple, state: tuple | None) -> None:
         """Light the surfaces as `_light` does; with a `state` (see `_draw_sample`) perhaps only by what has changed."""
         layer, lights = self._surfaces, self._lights.lights
         self._is_split = False
         if state is None or self.samples > 0 or (self.shadows is not None and self.shadows.traces_lobes):
-            self._light(layer, wanted, targets, seen)
+            self._light(layer, wanted, targets, scene)
             return
         shares = layer.shares
         sources = () if shares is None else shares.sources or ((shares, None),) * (len(lights) + 1)
@@ -277,16 +277,16 @@ class ViewRenderer:
         if self._held is None or not self._held.fits(self._lit):
             moving, self._held = None if before is None else before.changes(self._lit), None
             if not moving or len(moving) == len(lights):
-                self._light(layer, wanted, targets, seen)
+                self._light(layer, wanted, targets, scene)
                 return
             held = [SampleSum(layer.size) for _ in wanted]
-            self._light(layer, wanted, held, seen, numbers=frozenset(range(len(lights))) - moving)
+            self._light(layer, wanted, held, scene, numbers=frozenset(range(len(lights))) - moving)
             self._held = StaticLighting(self._lit, moving, held)
         if self._copy is None:
             self._copy = CopyPass()
         for held, target in zip(self._held.targets, targets, strict=True):
             self._copy.draw(held.texture, target.within())
-        self._light(layer, wanted, targets, seen, first="ADDITIVE", numbers=self._held.moving)
+        self._light(layer, wanted, targets, scene, first="ADDITIVE", numbers=self._held.moving)
         self._is_split = True
 
     def _light(
@@ -294,7 +294,7 @@ class ViewRenderer:
         layer: SurfaceLayer,
         wanted: list[tuple[str, str]],
         targets: list[SampleSum],
-        seen: tuple,
+        scene: tuple,
         first: str = "ADDITIVE_PREMULT",
         numbers: Collection[int] | None = None,
     ) -> None:
@@ -302,7 +302,7 @@ class ViewRenderer:
 
         The first lobe is blended by `first`. `seen` are mirror and view. `numbers` are those of the lights, None: all.
         """
-        mirror, view = seen
+        mirror, view = scene
         lightings = [self._lighting_of(technique, mirror) for technique, _ in wanted]
         for lighting in lightings:
             lighting.number = self.samples
@@ -316,8 +316,8 @@ class ViewRenderer:
                 buffer = target.within(gbuffer.mask)
                 lighting.draw(gbuffer, buffer, passes, view=view.homogeneous_eye, blend=blend, numbers=numbers)
 
-    def _add_emission(self, layer: SurfaceLayer, wanted, targets, seen: tuple, with_emission: bool) -> None:
-        mirror, view, size = seen
+    def _add_emission(self, layer: SurfaceLayer, wanted, targets, scene: tuple, with_emission: bool) -> None:
+        mirror, view, size = scene
         for (_, passes), target in zip(wanted, targets, strict=True):
             if with_emission and passes == "combined":
                 layer.add_emission(mirror.instances, view, size, target.within())
@@ -345,8 +345,8 @@ class ViewRenderer:
 
     def free(self) -> None:
         """Free all textures and shaders."""
-        for part in (*self._lighting.values(), self._surfaces, *([self._glass] if self._glass else [])):
-            part.free()
+        for owner in (*self._lighting.values(), self._surfaces, *([self._glass] if self._glass else [])):
+            owner.free()
         self._lighting.clear()
         self._targets.clear()
         self._behind.clear()

@@ -341,10 +341,10 @@ def _diffuse_loops(features) -> Iterator[str]:
         yield "vec3 reflected = form_factor * base.xyz;"
 
     if features.facing:
-        seen = " * ltsh_seen(near, place.z + number).y" if features.shadowed else ""
+        visibility = " * ltsh_seen(near, place.z + number).y" if features.shadowed else ""
         caps = [
             "bool is_cap = (caps >> uint(number) & 1u) != 0u;",
-            f"float form_factor = factor * diffuse_of_cap(matte, light){seen};",
+            f"float form_factor = factor * diffuse_of_cap(matte, light){visibility};",
             "vec3 reflected = form_factor * base.xyz * ltsh_light_texel(header + 4).xyz;",
             "radiance += left != 0u && is_cap ? reflected : vec3(0.0);",
         ]

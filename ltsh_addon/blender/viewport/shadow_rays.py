@@ -83,15 +83,18 @@ class ShadowRays:
         width, height = gbuffer.size
         tracer = self._tracing.around(view.origin)
         film = Film(width, height, pixel)
-        found = visible_shares(samples, (*lights, *sides), tracer, ShadowSampling(rays=self._rays, film=film))
+        traced = visible_shares(samples, (*lights, *sides), tracer, ShadowSampling(rays=self._rays, film=film))
         count = len(lights) + bool(sides)
         values = np.ones((count, height * width, len(PASSES)), np.float32)
         for index, name in enumerate(PASSES):
-            values[:, pixel, index] = found.of_lights(name)[:count]
-            power = (np.square(part[name], dtype=np.float64).sum() for part in (found.radiance, found.deviation))
+            values[:, pixel, index] = traced.of_lights(name)[:count]
+            power = (
+                np.square(values_by_pass[name], dtype=np.float64).sum()
+                for values_by_pass in (traced.radiance, traced.deviation)
+            )
             self._power[name] += list(power)
         self.seconds += time.perf_counter() - start
-        self.traced, self.description = self.traced + found.rays, tracer.description
+        self.traced, self.description = self.traced + traced.rays, tracer.description
         return VisibilityGrid(visibility_texture(values, gbuffer.size), gbuffer.position, view.projection)
 
     def noise(self, samples: int) -> dict[str, float]:

@@ -59,9 +59,9 @@ class PixelGrid:
         positions, first = self.gbuffer_texels["position"], step // 2
         rows, columns = positions.shape[:2]
         stretch = np.eye(4)
-        for axis, (whole, part) in enumerate(((width, columns), (height, rows))):
-            stretch[axis, axis] = whole / (part * step)
-            stretch[axis, 3] = 2.0 / part * ((0.5 * whole - 0.5 - first) / step + 0.5) - 1.0
+        for axis, (whole, count) in enumerate(((width, columns), (height, rows))):
+            stretch[axis, axis] = whole / (count * step)
+            stretch[axis, 3] = 2.0 / count * ((0.5 * whole - 0.5 - first) / step + 0.5) - 1.0
         # The grid of these pixels: positions (H, W, 4), and the projection to its clip space.
         self.grid = positions, stretch @ view.projection
 
@@ -110,18 +110,18 @@ class ShadowRequest:
         raised.
         """
         samples, film = self.points.samples()
-        tracer, found = self.tracing.around(self.origin), {}
+        tracer, results = self.tracing.around(self.origin), {}
         self.tracing.mate.key = (self.state, self.layer) if self.level == 1 else None
         lights = [light for lights in self.lights for light in lights]
         starts = np.cumsum([0, *map(len, self.lights)])[:-1]
-        place_of = dict(zip(starts.tolist(), range(len(starts)), strict=True))
+        index_of = dict(zip(starts.tolist(), range(len(starts)), strict=True))
         groups = shared_numbers(lights, tracer)
         step = BATCH if self.level == 1 else len(groups)
         sampling = ShadowSampling(rays=self.rays, film=film)
         for start in range(0, len(groups), step):
             chosen = [number for group in groups[start : start + step] for number in group]
             try:
-                seen = visible_shares(
+                traced = visible_shares(
                     samples,
                     [lights[number] for number in chosen],
                     tracer,
@@ -130,16 +130,16 @@ class ShadowRequest:
                     progress=progress,
                 )
             except Cancelled:
-                if not found:
+                if not results:
                     raise
                 break
-            by_pass = [seen.of_lights(name) for name in PASSES]
+            by_pass = [traced.of_lights(name) for name in PASSES]
             for row, number in enumerate(chosen):
-                if number in place_of:
+                if number in index_of:
                     values = np.ones((film.height * film.width, len(PASSES)), np.float32)
                     values[film.pixel] = np.stack([shares[row] for shares in by_pass], axis=-1)
-                    found[place_of[number]] = values.reshape(film.height, film.width, len(PASSES))
-        return found
+                    results[index_of[number]] = values.reshape(film.height, film.width, len(PASSES))
+        return results
 
 
 class TracedScene:
@@ -282,7 +282,7 @@ class LiveShadows:
         if request.is_own and not isinstance(outcome, Exception):
             if (request.state, request.keys) == (self._wanted, self._keys):
                 positions, projection = request.points.grid
-                values = np.stack([outcome[place] for place in range(len(request.keys))])
+                values = np.stack([outcome[index] for index in range(len(request.keys))])
                 grid = VisibilityGrid(
                     visibility_texture(values, positions.shape[1::-1]), float_texture(positions), projection
                 )
@@ -296,9 +296,9 @@ class LiveShadows:
             self._state, self._known, self._points, self._latest = request.state, {}, {}, {}
         self._points[request.level == 0] = request.points.grid
         self._known = {key: levels for key, levels in self._known.items() if key in self._keys}
-        for place, values in outcome.items():
-            self._known.setdefault(request.keys[place], {})[request.level] = values
-            self._latest[request.numbers[place]] = {request.level: values}
+        for index, values in outcome.items():
+            self._known.setdefault(request.keys[index], {})[request.level] = values
+            self._latest[request.numbers[index]] = {request.level: values}
         self._origin = request.origin
         self._show()
 
@@ -477,5 +477,5 @@ def _shape_of(light: AreaLight) -> str:
 def _shape_of_sky(sides: Lights) -> str:
     """A key of all that the share of a sky depends on: the relative, not the absolute brightness of its patches."""
     values = np.array([patch.radiance.mean() for side in sides for patch in side.patches])
-    seen = sides[0].affects_diffuse, sides[0].affects_specular, sides[0].name
-    return repr((seen, np.round(values / max(np.abs(values).mean(), 1e-30), 4).tobytes()))
+    traits = sides[0].affects_diffuse, sides[0].affects_specular, sides[0].name
+    return repr((traits, np.round(values / max(np.abs(values).mean(), 1e-30), 4).tobytes()))

@@ -32,8 +32,8 @@ class LightingState:
         """True if the shares are the same, but for those of the lights `left_out`."""
         if len(self.sources) != len(new.sources):
             return False
-        kept = [number for number in range(len(self.sources)) if number not in left_out]
-        return all(a is b for number in kept for a, b in zip(self.sources[number], new.sources[number], strict=True))
+        static = [number for number in range(len(self.sources)) if number not in left_out]
+        return all(a is b for number in static for a, b in zip(self.sources[number], new.sources[number], strict=True))
 
 
 def is_equal(a, b) -> bool:

@@ -138,14 +138,14 @@ def _not_shown(scene, camera) -> list[str]:
         f"depth of field of camera {camera.name!r}": camera.data.dof.use_dof,
         "the render region": scene.render.use_border,
     }
-    found = [f"{name} is not shown in views" for name, is_asked in asked.items() if is_asked]
+    notes = [f"{name} is not shown in views" for name, is_asked in asked.items() if is_asked]
     others = sorted(ob.name for ob in _layer(scene).objects if not ob.hide_render and _differs_in_renders(ob))
     if others:
-        found.append(f"views and renders have other modifiers or levels of subdivision of {listed(others, 4, ', ')}")
+        notes.append(f"views and renders have other modifiers or levels of subdivision of {listed(others, 4, ', ')}")
     used = [layer.name for layer in scene.view_layers if layer.use]
     if len(used) > 1:
-        found.append(f"scene {scene.name!r}: only view layer {used[0]!r} of {len(used)} is shown")
-    return found
+        notes.append(f"scene {scene.name!r}: only view layer {used[0]!r} of {len(used)} is shown")
+    return notes
 
 
 def _differs_in_renders(ob) -> bool:
@@ -170,10 +170,10 @@ def _layer(scene):
     return next((layer for layer in scene.view_layers if layer.use), scene.view_layers[0])
 
 
-def _draw(job: dict, seen: tuple, size: tuple[int, int], progress) -> dict:
+def _draw(job: dict, read: tuple, size: tuple[int, int], progress) -> dict:
     """Pictures (H, W, 4), row 0 on top, of all techniques and passes, and the facts of the manifest about them."""
     progress("draw", 0.0)
-    scene, camera, sky, patterns = seen
+    scene, camera, sky, patterns = read
     with bpy.context.temp_override(scene=scene, view_layer=_layer(scene)):
         depsgraph = bpy.context.evaluated_depsgraph_get()
     mirror = SceneMirror(lambda world: sky, lambda data, source: patterns.get(source.key, NOT_RESOLVED))

@@ -113,8 +113,8 @@ def sheen_table() -> np.ndarray:
     roughness."""
     nodes = np.linspace(0.0, 1.0, closures.SHEEN_NODES)
     cosine, roughness = (axis.ravel() for axis in np.meshgrid(nodes, nodes, indexing="ij"))
-    found = np.concatenate([closures.sheen_lobe(cosine, roughness), closures.velvet_albedo(cosine, roughness)[None]])
-    return found.T.reshape(len(nodes), len(nodes), 4)
+    values = np.concatenate([closures.sheen_lobe(cosine, roughness), closures.velvet_albedo(cosine, roughness)[None]])
+    return values.T.reshape(len(nodes), len(nodes), 4)
 
 
 def blend_table() -> np.ndarray:

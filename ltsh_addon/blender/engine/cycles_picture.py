@@ -14,7 +14,7 @@ from ...imaging.report import index_stamp
 from ...scene import CYCLES
 from ..ui import results
 from ..ui.job import output_folder
-from ..viewport.gbuffer import float_texture
+from ..viewport.drawing import float_texture
 from ..viewport.textures import look_values
 from .overlay import Rectangle
 

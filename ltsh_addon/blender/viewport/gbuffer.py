@@ -10,6 +10,7 @@ import numpy as np
 from ...cycles import closures
 from ...scene import SurfaceSamples
 from .camera import ViewCamera
+from .drawing import float_texture, read_texture
 
 # Fields of `GBufferTextures` by their names in shaders.
 SAMPLERS = {
@@ -27,13 +28,6 @@ SAMPLERS = {
 }
 # Fields of `VisibilityGrid` by their names in shaders.
 SHARE_SAMPLERS = {"shares": "shares", "grid_positions": "positions"}
-
-
-def read_texture(texture: gpu.types.GPUTexture) -> np.ndarray:
-    """The values (H, W, 4) of a texture of floats, row 0 at the bottom."""
-    buffer = texture.read()
-    buffer.dimensions = texture.width * texture.height * 4
-    return np.array(buffer, np.float32).reshape(texture.height, texture.width, 4)
 
 
 @dataclass(frozen=True)
@@ -87,27 +81,6 @@ class GBufferTextures:
     def size(self) -> tuple[int, int]:
         """Width and height in pixels."""
         return self.position.width, self.position.height
-
-
-def empty_texture(size: tuple[int, int]) -> gpu.types.GPUTexture:
-    """RGBA32F texture of zeros; `size` is (width, height)."""
-    texture = gpu.types.GPUTexture(size, format="RGBA32F")
-    texture.clear(format="FLOAT", value=(0.0, 0.0, 0.0, 0.0))
-    return texture
-
-
-def frame_buffer(color: gpu.types.GPUTexture, depth: gpu.types.GPUTexture | None = None) -> gpu.types.GPUFrameBuffer:
-    """A frame buffer of the textures."""
-    return gpu.types.GPUFrameBuffer(color_slots=[color], **({} if depth is None else {"depth_slot": depth}))
-
-
-def float_texture(values: np.ndarray) -> gpu.types.GPUTexture:
-    """RGBA32F texture of values (H, W, 4), or an array texture of values (N, H, W, 4)."""
-    values = np.ascontiguousarray(values, dtype=np.float32)
-    height, width = values.shape[-3:-1]
-    buffer = gpu.types.Buffer("FLOAT", values.size, values.reshape(-1))
-    layers = values.shape[0] if values.ndim == 4 else 0
-    return gpu.types.GPUTexture((width, height), layers=layers, format="RGBA32F", data=buffer)
 
 
 def upload_samples(samples: SurfaceSamples, width: int, pixel: np.ndarray | None = None) -> GBufferTextures:

@@ -15,7 +15,7 @@ from ...lobes import moments32
 from ...lobes.lookup_table import LookupTable
 from ...scene import AreaLight
 from ...shading.header import float_literal
-from .gbuffer import float_texture
+from .drawing import float_texture
 
 HEADER = 7  # texels of a light's header, see `light_texels`
 WIDTH = 256  # texels of a row of the texture of lights

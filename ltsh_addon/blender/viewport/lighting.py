@@ -6,7 +6,6 @@ Lights, tables and integrals are those of `shading.shade`, in float32 throughout
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
-from contextlib import nullcontext
 from dataclasses import replace
 
 import gpu
@@ -17,7 +16,8 @@ from ...cycles import horizons
 from ...lobes.lookup_table import LookupTable
 from ...scene import PASSES, AreaLight
 from ...shading import load_table
-from .gbuffer import SAMPLERS, SHARE_SAMPLERS, GBufferTextures, empty_texture, float_texture, frame_buffer
+from .drawing import WITHIN_MASK, drawing, empty_texture, float_texture, frame_buffer
+from .gbuffer import SAMPLERS, SHARE_SAMPLERS, GBufferTextures
 from .light_texels import UploadedLights, dielectric_texels, shares, table_texels, upload_lights
 from .shaders import BOUNDS, CHOICE, EXCESS, HORIZON_SAMPLERS, Features, horizon_shader, lighting_shader
 
@@ -25,8 +25,6 @@ _RESULTS = {BOUNDS: "light_bounds", EXCESS: "excesses", CHOICE: "horizons"}
 _SHOWN_PASSES = (*PASSES, "combined")
 # From one picture to the next, the points at which lobes sample the world shift by GOLDEN steps and turn by TURN rad.
 GOLDEN, TURN = 0.618034, 2.0
-# The depth test without a mask and with one: pixels are drawn at the depth 1/2.
-WITHIN = ("NONE", "LESS")
 
 
 class HorizonPass:
@@ -53,9 +51,9 @@ class HorizonPass:
         """
         self._resize(gbuffer.size, gbuffer.mask)
         corners = [len(light.corners) if light.shape == "POLYGON" else 1 for light in lights.lights]
-        self._run(BOUNDS, gbuffer, lights, shares([1] * len(corners)), {})
-        self._run(EXCESS, gbuffer, lights, shares([horizons.AROUND * count for count in corners]), {"view": view})
-        self._run(CHOICE, gbuffer, lights, [(0, 0)], {"threshold": threshold})
+        self._run(BOUNDS, gbuffer, lights, shares([1] * len(corners)))
+        self._run(EXCESS, gbuffer, lights, shares([horizons.AROUND * count for count in corners]), view=view)
+        self._run(CHOICE, gbuffer, lights, [(0, 0)], threshold=threshold)
         return self._textures[_RESULTS[CHOICE]]
 
     def _resize(self, size, mask) -> None:
@@ -64,27 +62,14 @@ class HorizonPass:
             self._buffers = {step: frame_buffer(self._textures[name], mask) for step, name in _RESULTS.items()}
             self._size, self._mask = size, mask
 
-    def _run(self, step, gbuffer, lights, light_shares, constants) -> None:
-        shader, batch = self._shaders[step]
-        with self._buffers[step].bind():
-            gpu.state.viewport_set(0, 0, *self._size)
-            gpu.state.blend_set("NONE")
-            gpu.state.depth_test_set(WITHIN[gbuffer.mask is not None])
-            try:
-                shader.bind()
-                for name in HORIZON_SAMPLERS[step]:
-                    texture = self._textures.get(name) or (lights.texture if name == "lights" else None)
-                    shader.uniform_sampler(name, texture or getattr(gbuffer, SAMPLERS[name]))
-                for name, value in constants.items():
-                    shader.uniform_float(name, value)
-                for first, end in light_shares:
-                    if step != CHOICE:
-                        shader.uniform_int("place", (first, end))
-                    batch.draw(shader)
-                    gpu.state.blend_set("ADDITIVE_PREMULT")
-            finally:
-                gpu.state.blend_set("NONE")
-                gpu.state.depth_test_set("NONE")
+    def _run(self, step, gbuffer, lights, ranges, **constants) -> None:
+        shader, uploaded = self._shaders[step], {**self._textures, "lights": lights.texture}
+        textures = {name: uploaded.get(name) or getattr(gbuffer, SAMPLERS[name]) for name in HORIZON_SAMPLERS[step]}
+        with drawing(self._buffers[step], (0, 0, *self._size), depth=WITHIN_MASK[gbuffer.mask is not None]):
+            shader.bind(textures, **constants)
+            for draw_range in ranges:
+                shader.draw(**({} if step == CHOICE else {"draw_range": draw_range}))
+                gpu.state.blend_set("ADDITIVE_PREMULT")
 
 
 class LightingPass:
@@ -176,18 +161,9 @@ class LightingPass:
             none = {"diffuse": False, "bumped": False, "turned": False, "sheen": False, "rough": False, "velvet": False}
             alone = replace(features, specular=False, geometric=False, bent=False)
             parts = [*(replace(shader_features, **none) for shader_features in parts), alone]
-        with nullcontext() if target is None else target.bind():
-            previous = gpu.state.viewport_get(), gpu.state.blend_get(), gpu.state.depth_test_get()
-            gpu.state.viewport_set(x, y, width, height)
-            gpu.state.blend_set(blend)
-            gpu.state.depth_test_set(WITHIN[gbuffer.mask is not None])
-            try:
-                for features in parts:
-                    self._draw(features, gbuffer, view, (x, y), self._ranges(numbers))
-            finally:
-                gpu.state.viewport_set(*previous[0])
-                gpu.state.blend_set(previous[1])
-                gpu.state.depth_test_set(previous[2])
+        with drawing(target, (x, y, width, height), blend, WITHIN_MASK[gbuffer.mask is not None]):
+            for features in parts:
+                self._draw(features, gbuffer, view, (x, y), self._ranges(numbers))
 
     def _ranges(self, numbers: Collection[int] | None) -> list[tuple[int, int]]:
         """The lights (first, end) of each draw call."""
@@ -204,19 +180,18 @@ class LightingPass:
     def _draw(self, features: Features, gbuffer: GBufferTextures, view, corner: tuple[int, int], ranges) -> None:
         if features not in self._shaders:
             self._shaders[features] = lighting_shader(self.table, features)
-        shader, batch = self._shaders[features]
-        shader.bind()
-        for name in features.samplers:
-            shader.uniform_sampler(name, self._texture(name, gbuffer))
-        if "view" in features.constants:
-            shader.uniform_float("view", view)
-        if "jitter" in features.constants:
-            shader.uniform_float("jitter", ((0.5 + self.number * GOLDEN) % 1.0, self.number * TURN))
-        if features.shadowed:
-            shader.uniform_float("grid", Matrix(gbuffer.shares.projection.tolist()))
+        shader, constants = (
+            self._shaders[features],
+            {
+                "view": view,
+                "jitter": ((0.5 + self.number * GOLDEN) % 1.0, self.number * TURN),
+                "grid": Matrix(gbuffer.shares.projection.tolist()) if features.shadowed else None,
+            },
+        )
+        textures = {name: self._texture(name, gbuffer) for name in features.samplers}
+        shader.bind(textures, **{name: constants[name] for name in features.constants if name != "draw_range"})
         for first, end in ranges:
-            shader.uniform_int("place", (*corner, first, end))
-            batch.draw(shader)
+            shader.draw(draw_range=(*corner, first, end))
             gpu.state.blend_set("ADDITIVE")
 
     def _texture(self, name, gbuffer):

@@ -24,10 +24,11 @@ from ..lights.linking import Receivers
 from ..lights.textures import ShownTextures
 from ..lights.world import light_of_world
 from ..materials.looks import Look, look_of, world_radiance
+from .drawing import uniform_buffer
 from .lights import Patterns, no_patterns, view_lights
 from .meshes import MeshBatches, mesh_batches
 from .sky import ShownSky, constant_sky
-from .textures import look_values, uniform_buffer
+from .textures import look_values
 
 # NOT_SHOWN: notes about types of objects that views leave out. NAMED: the most names of objects in such a note.
 NOT_SHOWN = {

@@ -15,7 +15,8 @@ import numpy as np
 from ..extract.origin import new_origin
 from ..materials.values import Value
 from .camera import ViewCamera
-from .gbuffer import GBufferTextures, VisibilityGrid, float_texture, read_texture
+from .drawing import float_texture, read_texture
+from .gbuffer import GBufferTextures, VisibilityGrid
 from .light_texels import UploadedLights, upload_lights
 from .lighting import GOLDEN, HorizonPass, LightingPass
 from .mirror import SceneMirror
@@ -218,7 +219,8 @@ class ViewRenderer:
         glass = self._glass.lobe(0, mirror, view, self._lights).position
         for picture, target, (_, passes) in zip(behind, targets, wanted, strict=True):
             is_seen = passes == "combined" and with_emission
-            self._veil.draw((picture.texture, through, glass, self._background), target.within(), view, is_seen)
+            textures = {"behind": picture.texture, "left": through, "glass": glass, "sky": self._background}
+            self._veil.draw(textures, target.within(), view, is_seen)
         self._light(self._glass, wanted, targets, (mirror, view), "ADDITIVE")
         self._add_emission(self._glass, wanted, targets, (mirror, view, size), with_emission)
         return True

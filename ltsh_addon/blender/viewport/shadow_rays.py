@@ -13,6 +13,7 @@ from ...scene import PASSES, AreaLight, Film
 from ...visibility import Mate, Occluders, ShadowSampling, Tracer, open_tracer, visible_shares
 from ..process.blender_process import embree_libraries
 from .camera import ViewCamera
+from .drawing import float_buffer
 from .gbuffer import GBufferTextures, VisibilityGrid, gbuffer_samples
 
 Lights = Sequence[AreaLight]
@@ -107,8 +108,7 @@ class ShadowRays:
 
 def visibility_texture(values: np.ndarray, size: tuple[int, int]) -> gpu.types.GPUTexture:
     """Array texture of shares (L, H W, 2) on pictures of `size`."""
-    buffer = gpu.types.Buffer("FLOAT", values.size, np.ascontiguousarray(values, np.float32).reshape(-1))
-    return gpu.types.GPUTexture(size, layers=len(values), format="RG16F", data=buffer)
+    return gpu.types.GPUTexture(size, layers=len(values), format="RG16F", data=float_buffer(values))
 
 
 def too_many(lights: int, size: tuple[int, int]) -> str:

@@ -21,7 +21,7 @@ from ..materials.looks import world_radiance
 from ..process.client import GRAPHICS, VIEW_PASSES, VIEW_PNG
 from ..render_settings import cycles_setting
 from .camera import ViewCamera
-from .gbuffer import read_texture
+from .drawing import read_texture
 from .lights import NOT_RESOLVED, patterns_of
 from .live_cycles import look_at_world
 from .mirror import SceneMirror

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gpu
 import numpy as np
 
 from ...cycles import closures, horizons
@@ -36,12 +35,6 @@ DEFINES = {
     "ELEVATION_SHARE": str(horizons.ELEVATION_SHARE),
     "MINIMUM_REFLECTION_ELEVATION": str(horizons.MINIMUM_REFLECTION_ELEVATION),
 }
-
-
-def uniform_buffer(values: np.ndarray) -> gpu.types.GPUUniformBuf:
-    """A uniform buffer of values (N, 4)."""
-    values = np.ascontiguousarray(values, dtype=np.float32)
-    return gpu.types.GPUUniformBuf(gpu.types.Buffer("FLOAT", values.size, values.ravel()))
 
 
 def look_values(look: Look) -> np.ndarray:
@@ -94,13 +87,6 @@ def _slot_values(value: Value) -> np.ndarray:
 def is_encoded(image) -> bool:
     """True for images that Cycles interpolates before it converts them to linear values."""
     return not image.is_float and image.colorspace_settings.name == "sRGB"
-
-
-def float_table(values: np.ndarray) -> gpu.types.GPUTexture:
-    """R32F texture of values (H, W), row 0 first."""
-    values = np.ascontiguousarray(values, dtype=np.float32)
-    buffer = gpu.types.Buffer("FLOAT", values.size, values.ravel())
-    return gpu.types.GPUTexture(values.shape[::-1], format="R32F", data=buffer)
 
 
 def albedo_table() -> np.ndarray:

@@ -27,7 +27,7 @@ from ltsh_addon import imaging
 from ltsh_addon.blender.extract.occluders import collect_occluders
 from ltsh_addon.blender.render_settings import filter_points
 from ltsh_addon.blender.viewport import shadows
-from ltsh_addon.blender.viewport.gbuffer import read_texture
+from ltsh_addon.blender.viewport.drawing import read_texture
 from ltsh_addon.blender.viewport.lighting import LightingPass
 from ltsh_addon.blender.viewport.mirror import SceneMirror
 from ltsh_addon.blender.viewport.pictures import ShownPicture

@@ -41,7 +41,7 @@ class PixelShader:
         for name, kind in constants.items():
             info.push_constant(kind, name)
         for slot, name in enumerate(samplers):
-            info.sampler(slot, "FLOAT_2D_ARRAY" if name in ("table", "shares") else "FLOAT_2D", name)
+            info.sampler(slot, "FLOAT_2D_ARRAY" if name in ("table", "visibility") else "FLOAT_2D", name)
         info.vertex_source(glsl("triangle"))
         info.fragment_source(source)
         self._integers = {name for name, kind in constants.items() if kind in _INTEGERS}

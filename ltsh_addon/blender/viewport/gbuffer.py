@@ -27,14 +27,14 @@ SAMPLERS = {
     "rebounds": "rebound",
 }
 # Fields of `VisibilityGrid` by their names in shaders.
-SHARE_SAMPLERS = {"shares": "shares", "grid_positions": "positions"}
+VISIBILITY_SAMPLERS = {"visibility": "visibility", "grid_positions": "positions"}
 
 
 @dataclass(frozen=True)
 class VisibilityGrid:
-    """The shares of lights that are seen at the points of a picture. Other pictures of the same surfaces may use it."""
+    """The visible fraction of each light at the points of a picture. Other pictures of the same surfaces may use it."""
 
-    shares: gpu.types.GPUTexture  # RG, a layer for each light: the specular and the diffuse share
+    visibility: gpu.types.GPUTexture  # RG, a layer for each light: the specular and the diffuse fraction
     positions: gpu.types.GPUTexture  # of the points, relative to the view's origin; w = 0 where there is no surface
     projection: np.ndarray  # (4, 4) to the clip space that the texels fill
     sources: tuple = ()  # of each layer: a layer whose source is the same object is the same
@@ -58,7 +58,7 @@ class GBufferTextures:
     smooth_normal: gpu.types.GPUTexture | None = None  # w is not read; None: `diffuse_normal`
     tangent: gpu.types.GPUTexture | None = None  # of anisotropic lobes; w = anisotropy; None: 0
     rebound: gpu.types.GPUTexture | None = None  # diffuse_rebound; w = diffuse_roughness; None: 0
-    shares: VisibilityGrid | None = None  # None: every light is seen whole
+    visibility: VisibilityGrid | None = None  # None: every light is seen whole
     mask: gpu.types.GPUTexture | None = None  # depth buffer, 0 where there is no surface; None: all pixels are lit
     has_sheen: bool = False  # there are texels of sheen: base.w = -sheen_a, normal.w = sheen_b
     has_velvet: bool = False  # there are texels of velvet: rebound.w = -sigma, rebound.rgb = albedo
@@ -71,7 +71,7 @@ class GBufferTextures:
             field.name: (texture.width, texture.height)
             for field in fields(self)
             if not field.name.startswith("has_")
-            and field.name != "shares"
+            and field.name != "visibility"
             and (texture := getattr(self, field.name)) is not None
         }
         if len(set(sizes.values())) != 1:

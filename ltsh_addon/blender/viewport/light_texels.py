@@ -249,7 +249,7 @@ def upload_lights(lights: Iterable[AreaLight], sky: gpu.types.GPUTexture | None 
     return UploadedLights(visible, float_texture(light_texels(visible)), sky)
 
 
-def shares(loops: Sequence[int]) -> list[tuple[int, int]]:
+def draw_ranges(loops: Sequence[int]) -> list[tuple[int, int]]:
     """The lights (first, end) of each draw call; `loops` are the iterations of each light. At least one call.
 
     Calls are limited because llvmpipe aborts loops of a pixel after 65535 iterations, and long loops are bad for other

@@ -17,8 +17,8 @@ from ...lobes.lookup_table import LookupTable
 from ...scene import PASSES, AreaLight
 from ...shading import load_table
 from .drawing import WITHIN_MASK, drawing, empty_texture, float_texture, frame_buffer
-from .gbuffer import SAMPLERS, SHARE_SAMPLERS, GBufferTextures
-from .light_texels import UploadedLights, dielectric_texels, shares, table_texels, upload_lights
+from .gbuffer import SAMPLERS, VISIBILITY_SAMPLERS, GBufferTextures
+from .light_texels import UploadedLights, dielectric_texels, draw_ranges, table_texels, upload_lights
 from .shaders import BOUNDS, CHOICE, EXCESS, HORIZON_SAMPLERS, Features, horizon_shader, lighting_shader
 
 _RESULTS = {BOUNDS: "light_bounds", EXCESS: "excesses", CHOICE: "horizons"}
@@ -51,8 +51,8 @@ class HorizonPass:
         """
         self._resize(gbuffer.size, gbuffer.mask)
         corners = [len(light.corners) if light.shape == "POLYGON" else 1 for light in lights.lights]
-        self._run(BOUNDS, gbuffer, lights, shares([1] * len(corners)))
-        self._run(EXCESS, gbuffer, lights, shares([horizons.AROUND * count for count in corners]), view=view)
+        self._run(BOUNDS, gbuffer, lights, draw_ranges([1] * len(corners)))
+        self._run(EXCESS, gbuffer, lights, draw_ranges([horizons.AROUND * count for count in corners]), view=view)
         self._run(CHOICE, gbuffer, lights, [(0, 0)], threshold=threshold)
         return self._textures[_RESULTS[CHOICE]]
 
@@ -143,7 +143,7 @@ class LightingPass:
             bumped=passes != "specular" and gbuffer.smooth_normal is not None,
             focused=self._has_focused,
             turned=passes != "specular" and gbuffer.diffuse_normal is not None,
-            shadowed=gbuffer.shares is not None,
+            shadowed=gbuffer.visibility is not None,
             facing=self._has_facing,
             patterned=self._has_patterns,
             sky=self._sky is not None,
@@ -168,13 +168,13 @@ class LightingPass:
     def _ranges(self, numbers: Collection[int] | None) -> list[tuple[int, int]]:
         """The lights (first, end) of each draw call."""
         if numbers is None:
-            return shares(self._loops)
+            return draw_ranges(self._loops)
         chosen = np.array(sorted(numbers))
         runs = np.split(chosen, np.flatnonzero(np.diff(chosen) > 1) + 1)
         return [
             (int(run[0]) + first, int(run[0]) + end)
             for run in runs
-            for first, end in shares(self._loops[run[0] : run[-1] + 1])
+            for first, end in draw_ranges(self._loops[run[0] : run[-1] + 1])
         ]
 
     def _draw(self, features: Features, gbuffer: GBufferTextures, view, corner: tuple[int, int], ranges) -> None:
@@ -185,7 +185,7 @@ class LightingPass:
             {
                 "view": view,
                 "jitter": ((0.5 + self.number * GOLDEN) % 1.0, self.number * TURN),
-                "grid": Matrix(gbuffer.shares.projection.tolist()) if features.shadowed else None,
+                "grid": Matrix(gbuffer.visibility.projection.tolist()) if features.shadowed else None,
             },
         )
         textures = {name: self._texture(name, gbuffer) for name in features.samplers}
@@ -198,8 +198,8 @@ class LightingPass:
         uploaded = {"lights": self._lights, "table": self._table, "dielectrics": self._dielectrics, "sky": self._sky}
         if name in uploaded:
             return uploaded[name]
-        if name in SHARE_SAMPLERS:
-            return getattr(gbuffer.shares, SHARE_SAMPLERS[name])
+        if name in VISIBILITY_SAMPLERS:
+            return getattr(gbuffer.visibility, VISIBILITY_SAMPLERS[name])
         return getattr(gbuffer, SAMPLERS[name])
 
 

@@ -166,7 +166,7 @@ class SceneMirror:
         self.instances: list[ShownInstance] = []
         self.lights: tuple[AreaLight, ...] = ()  # with the small bright lights of the world
         self.sky = ShownSky()
-        self.own_lights: tuple[AreaLight, ...] = ()  # without those of the world
+        self.lights_without_world: tuple[AreaLight, ...] = ()  # without those of the world
         self._look = look
         self.surfaces_version = 0
         self._meshes: dict[tuple, MeshBatches | None] = {}
@@ -219,8 +219,10 @@ class SceneMirror:
 
     def read_lights(self, depsgraph, in_view: Callable) -> None:
         """Read the lights of the instances that `in_view` accepts."""
-        self.own_lights, self._light_notes = view_lights(depsgraph, in_view, self._light_textures, self._patterns)
-        self.lights = (*self.own_lights, *self.sky.lights)
+        self.lights_without_world, self._light_notes = view_lights(
+            depsgraph, in_view, self._light_textures, self._patterns
+        )
+        self.lights = (*self.lights_without_world, *self.sky.lights)
         self.has_old_lights = False
 
     def _drop_changed(self, changes: Changes) -> None:
@@ -291,7 +293,7 @@ class SceneMirror:
     def take_sky(self, sky: ShownSky, *notes: str) -> None:
         """Show this world from now on; `notes` tell how it differs from Cycles."""
         self.sky, self._world_note = sky, notes
-        self.lights = (*self.own_lights, *sky.lights)
+        self.lights = (*self.lights_without_world, *sky.lights)
 
 
 def _shown_look(material) -> ShownLook:

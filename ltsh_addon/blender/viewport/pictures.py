@@ -70,17 +70,11 @@ def _rays(view: ViewCamera, is_seen: float) -> dict[str, tuple]:
     return {name: (*ray, is_seen) for name, ray in zip(RAYS, view.rays, strict=True)}
 
 
-class CopyPass:
-    """Copies a picture into another one; needs an active GPU context."""
-
-    def __init__(self):
-        self._shader = PixelShader(glsl("copy"), ("picture",), {})
-
-    def draw(self, picture: gpu.types.GPUTexture, target: gpu.types.GPUFrameBuffer) -> None:
-        """Copy `picture` into `target`, which has its size."""
-        with drawing(target, (0, 0, *size_of(picture))):
-            self._shader.bind({"picture": picture})
-            self._shader.draw()
+def copy(shader: PixelShader, picture: gpu.types.GPUTexture, target: gpu.types.GPUFrameBuffer) -> None:
+    """Copy `picture` into `target`, which has its size, by the shader of copy.glsl."""
+    with drawing(target, (0, 0, *size_of(picture))):
+        shader.bind({"picture": picture})
+        shader.draw()
 
 
 class VeilPass:
@@ -105,7 +99,7 @@ class SampleSum:
     """A picture that holds the sum of the samples."""
 
     def __init__(self, size: tuple[int, int]):
-        self.texture, self._buffers = empty_texture(size), {}
+        self.size, self.texture, self._buffers = size, empty_texture(size), {}
 
     def within(self, mask: gpu.types.GPUTexture | None = None) -> gpu.types.GPUFrameBuffer:
         """The frame buffer of the picture, with `mask` as its depth buffer."""

@@ -63,7 +63,7 @@ class Features:
     bumped: bool  # the diffuse lobe has a second horizon
     focused: bool = False  # lights with a spread or a falloff
     turned: bool = False  # the diffuse lobe has a normal of its own
-    shadowed: bool = False  # shares of the lights that are seen
+    shadowed: bool = False  # the visibility of the lights is given
     facing: bool = False  # lights that face every point
     patterned: bool = False  # some of these have a pattern
     sky: bool = False  # the light of the world
@@ -93,7 +93,7 @@ class Features:
         if self.rough:
             names.append("rebounds")
         if self.shadowed:
-            names += ["shares", "grid_positions"]
+            names += ["visibility", "grid_positions"]
         if self.sky:
             names.append("sky")
         return tuple(names)

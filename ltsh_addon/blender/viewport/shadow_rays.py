@@ -17,9 +17,9 @@ from .drawing import float_buffer
 from .gbuffer import GBufferTextures, VisibilityGrid, gbuffer_samples
 
 Lights = Sequence[AreaLight]
-# MOST_BYTES: graphics memory for the shares of all lights. _SHARE_BYTES: of a light and a pixel, two half floats.
+# MOST_BYTES: graphics memory for the visibility of all lights. _LIGHT_BYTES: of a light and a pixel, two half floats.
 MOST_BYTES = 1 << 30
-_SHARE_BYTES = 4
+_LIGHT_BYTES = 4
 
 
 class ViewTracer:
@@ -51,7 +51,7 @@ class ViewTracer:
 
 
 class ShadowRays:
-    """Traces, at once, the shares of lights that the pixels of G-buffers see past `occluders`.
+    """Traces, at once, the visibility of lights from the pixels of G-buffers past `occluders`.
 
     A pixel takes at most `rays` rays per light.
     """
@@ -72,10 +72,10 @@ class ShadowRays:
         # By pass, summed over all calls: squares of the reflected light of pixels, and of its standard deviation.
         self._power = {name: np.zeros(2) for name in PASSES}
 
-    def shares(
+    def visibility(
         self, gbuffer: GBufferTextures, view: ViewCamera, lights: Lights, sides: Lights = (), number: int = 0
     ) -> VisibilityGrid | None:
-        """The shares of `lights`, and last that of the `sides` of a sky if there are any; None without surfaces or
+        """The visibility of `lights`, and last that of the `sides` of a sky if there are any; None without surfaces or
         lights. Positions are relative to the origin of `view`. Raises SceneError."""
         start = time.perf_counter()
         samples, pixel = gbuffer_samples(gbuffer, view)
@@ -107,13 +107,13 @@ class ShadowRays:
 
 
 def visibility_texture(values: np.ndarray, size: tuple[int, int]) -> gpu.types.GPUTexture:
-    """Array texture of shares (L, H W, 2) on pictures of `size`."""
+    """Array texture of visibility (L, H W, 2) on pictures of `size`."""
     return gpu.types.GPUTexture(size, layers=len(values), format="RG16F", data=float_buffer(values))
 
 
 def too_many(lights: int, size: tuple[int, int]) -> str:
-    """Note that the shares of so many lights do not fit into memory; empty where they do."""
-    needed = lights * size[0] * size[1] * _SHARE_BYTES
+    """Note that the visibility of so many lights does not fit into memory; empty where it does."""
+    needed = lights * size[0] * size[1] * _LIGHT_BYTES
     if needed <= MOST_BYTES:
         return ""
     return f"shadows are not drawn: those of {lights} lights need {needed / 2**30:.1f} GiB of graphics memory"

@@ -77,9 +77,7 @@ class SurfacePass:
         having = [instance for instance in instances if any(len(look.lobes) > number for look in instance.looks)]
         return self._gbuffer(number, having, view)
 
-    def add_emission(
-        self, instances: list[ShownInstance], view: ViewCamera, size: tuple[int, int], frame_buffer
-    ) -> None:
+    def add_emission(self, instances: list[ShownInstance], view: ViewCamera, frame_buffer) -> None:
         """Add the emission of the surfaces drawn last to `frame_buffer`."""
         shining = [instance for instance in instances if any(map(_shines, instance.looks))]
         if shining:

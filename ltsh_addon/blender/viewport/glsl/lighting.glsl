@@ -1,5 +1,5 @@
 #ifdef LTSH_SHADOWED
-/* The four texels of the grid of shares around a point, and their weights. Texels of the point's own surface weigh
+/* The four texels of the grid of visibility around a point, and their weights. Texels of the point's own surface weigh
    most. */
 struct ltsh_nearby { ivec2 first; ivec2 last; vec4 weights; };
 
@@ -30,10 +30,10 @@ ltsh_nearby ltsh_grid_at(ltsh_point point)
 /* The specular and the diffuse share of a light that are seen; 1 without texels around the point. */
 vec2 ltsh_seen(ltsh_nearby near, int light)
 {
-    vec2 seen = near.weights.x * texelFetch(shares, ivec3(near.first, light), 0).xy
-              + near.weights.y * texelFetch(shares, ivec3(near.last.x, near.first.y, light), 0).xy
-              + near.weights.z * texelFetch(shares, ivec3(near.first.x, near.last.y, light), 0).xy
-              + near.weights.w * texelFetch(shares, ivec3(near.last, light), 0).xy;
+    vec2 seen = near.weights.x * texelFetch(visibility, ivec3(near.first, light), 0).xy
+              + near.weights.y * texelFetch(visibility, ivec3(near.last.x, near.first.y, light), 0).xy
+              + near.weights.z * texelFetch(visibility, ivec3(near.first.x, near.last.y, light), 0).xy
+              + near.weights.w * texelFetch(visibility, ivec3(near.last, light), 0).xy;
     return dot(near.weights, vec4(1.0)) > 0.0 ? seen : vec2(1.0);
 }
 #endif
@@ -233,7 +233,7 @@ void main()
     if (here && draw_range.z == 0) {
         vec2 open = vec2(1.0);
 #ifdef LTSH_SHADOWED
-        open = ltsh_seen(near, textureSize(shares, 0).z - 1);
+        open = ltsh_seen(near, textureSize(visibility, 0).z - 1);
 #endif
 #ifdef LTSH_SPECULAR
         if (glossy && traits.x > 0.0) {

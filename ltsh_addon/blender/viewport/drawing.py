@@ -48,12 +48,12 @@ class PixelShader:
         self._shader = gpu.shader.create_from_info(info)
         self._batch = batch_for_shader(self._shader, "TRIS", {"corner": _TRIANGLE})
 
-    def bind(self, textures: Mapping[str, gpu.types.GPUTexture], **constants) -> None:
+    def bind(self, textures: Mapping[str, gpu.types.GPUTexture], constants: Mapping | None = None) -> None:
         """Make this the shader that draws, with `textures` by the names of samplers, and push constants."""
         self._shader.bind()
         for name, texture in textures.items():
             self._shader.uniform_sampler(name, texture)
-        self._set(constants)
+        self._set(constants or {})
 
     def draw(self, **constants) -> None:
         """Draw, with new values of these push constants."""

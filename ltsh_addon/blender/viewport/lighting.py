@@ -66,7 +66,7 @@ class HorizonPass:
         shader, uploaded = self._shaders[step], {**self._textures, "lights": lights.texture}
         textures = {name: uploaded.get(name) or getattr(gbuffer, SAMPLERS[name]) for name in HORIZON_SAMPLERS[step]}
         with drawing(self._buffers[step], (0, 0, *self._size), depth=WITHIN_MASK[gbuffer.mask is not None]):
-            shader.bind(textures, **constants)
+            shader.bind(textures, constants)
             for draw_range in ranges:
                 shader.draw(**({} if step == CHOICE else {"draw_range": draw_range}))
                 gpu.state.blend_set("ADDITIVE_PREMULT")
@@ -116,26 +116,23 @@ class LightingPass:
     def draw(
         self,
         gbuffer: GBufferTextures,
-        target: gpu.types.GPUOffScreen | gpu.types.GPUFrameBuffer | None,
+        target: gpu.types.GPUOffScreen | gpu.types.GPUFrameBuffer,
         passes: str = "combined",
         *,
         view: Sequence[float],
-        rect: tuple[int, int, int, int] | None = None,
         blend: str = "NONE",
         numbers: Collection[int] | None = None,
     ) -> None:
         """Write RGB radiance in W m^-2 sr^-1 and alpha 1 where the G-buffer has a surface, 0 elsewhere.
 
-        `passes` is "specular", "diffuse" or "combined"; `view` is that of `HorizonPass.draw`. `target` None draws into
-        the bound frame buffer. Of a G-buffer with a mask only surfaces are written; the mask must be the target's depth
-        buffer. `rect` (x, y, width, height) is the place of the G-buffer in the target; None: (0, 0)
-        and its own size. `blend` is "NONE", "ADDITIVE" to add the radiance (a further lobe of the same surfaces), or
-        "ADDITIVE_PREMULT" to add radiance and alpha. `numbers` are those of the lights to draw, at least one; None:
-        all. The world's light is drawn with light 0.
+        `passes` is "specular", "diffuse" or "combined"; `view` is that of `HorizonPass.draw`. `target` has the size of
+        the G-buffer. Of a G-buffer with a mask only surfaces are written; the mask must be the target's depth buffer.
+        `blend` is "NONE", "ADDITIVE" to add the radiance (a further lobe of the same surfaces), or "ADDITIVE_PREMULT"
+        to add radiance and alpha. `numbers` are those of the lights to draw, at least one; None: all. The world's light
+        is drawn with light 0.
         """
         if passes not in _SHOWN_PASSES:
             raise ValueError(f"lighting pass: passes is {passes!r}, expected one of {', '.join(_SHOWN_PASSES)}")
-        x, y, width, height = rect or (0, 0, *gbuffer.size)
         features = Features(
             specular=passes != "diffuse",
             diffuse=passes != "specular",
@@ -152,18 +149,18 @@ class LightingPass:
             velvet=passes != "specular" and gbuffer.has_velvet,
             bent=passes != "diffuse" and gbuffer.has_bent,
         )
-        parts = [features]
+        shaders = [features]
         if features.specular and gbuffer.tangent is not None:
             # Anisotropic lobes have a shader of their own, which integrates Fresnel's factor with them.
-            parts = [replace(features, brushing=True), replace(features, brushing=True, brushed=True, bent=False)]
+            shaders = [replace(features, brushing=True), replace(features, brushing=True, brushed=True, bent=False)]
         if features.specular and features.rough:
             # Draw the rough diffuse lobe by itself: both lobes together may read too many textures.
             none = {"diffuse": False, "bumped": False, "turned": False, "sheen": False, "rough": False, "velvet": False}
             alone = replace(features, specular=False, geometric=False, bent=False)
-            parts = [*(replace(shader_features, **none) for shader_features in parts), alone]
-        with drawing(target, (x, y, width, height), blend, WITHIN_MASK[gbuffer.mask is not None]):
-            for features in parts:
-                self._draw(features, gbuffer, view, (x, y), self._ranges(numbers))
+            shaders = [*(replace(shader, **none) for shader in shaders), alone]
+        with drawing(target, (0, 0, *gbuffer.size), blend, WITHIN_MASK[gbuffer.mask is not None]):
+            for features in shaders:
+                self._draw(features, gbuffer, view, self._ranges(numbers))
 
     def _ranges(self, numbers: Collection[int] | None) -> list[tuple[int, int]]:
         """The lights (first, end) of each draw call."""
@@ -177,21 +174,19 @@ class LightingPass:
             for first, end in draw_ranges(self._loops[run[0] : run[-1] + 1])
         ]
 
-    def _draw(self, features: Features, gbuffer: GBufferTextures, view, corner: tuple[int, int], ranges) -> None:
+    def _draw(self, features: Features, gbuffer: GBufferTextures, view, ranges) -> None:
         if features not in self._shaders:
             self._shaders[features] = lighting_shader(self.table, features)
-        shader, constants = (
-            self._shaders[features],
-            {
-                "view": view,
-                "jitter": ((0.5 + self.number * GOLDEN) % 1.0, self.number * TURN),
-                "grid": Matrix(gbuffer.visibility.projection.tolist()) if features.shadowed else None,
-            },
-        )
+        shader = self._shaders[features]
+        constants = {
+            "view": view,
+            "jitter": ((0.5 + self.number * GOLDEN) % 1.0, self.number * TURN),
+            "grid": Matrix(gbuffer.visibility.projection.tolist()) if features.shadowed else None,
+        }
         textures = {name: self._texture(name, gbuffer) for name in features.samplers}
-        shader.bind(textures, **{name: constants[name] for name in features.constants if name != "draw_range"})
-        for first, end in ranges:
-            shader.draw(draw_range=(*corner, first, end))
+        shader.bind(textures, {name: constants[name] for name in features.constants if name in constants})
+        for draw_range in ranges:
+            shader.draw(draw_range=draw_range)
             gpu.state.blend_set("ADDITIVE")
 
     def _texture(self, name, gbuffer):

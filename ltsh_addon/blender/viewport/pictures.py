@@ -52,16 +52,17 @@ class PicturePass:
         """
         width, height = size_of(pictures[0])
         is_behind = shown.passes == "combined" and not shown.transparent
+        constants = {
+            "weights": (weights[0], weights[-1]),
+            "mode": MODES.index(shown.mode),
+            "scales": (shown.exposure, shown.difference_scale, shown.split * width, 0.5 * shown.line_width),
+            "opacity": 0.0 if shown.transparent else 1.0,
+            "white": shown.white,
+            **_rays(view, float(is_behind)),
+        }
+        textures = {"first_picture": pictures[0], "second_picture": pictures[-1], "sky": background}
         with drawing(None, (0, 0, width, height)):
-            self._shader.bind(
-                {"first_picture": pictures[0], "second_picture": pictures[-1], "sky": background},
-                weights=(weights[0], weights[-1]),
-                mode=MODES.index(shown.mode),
-                scales=(shown.exposure, shown.difference_scale, shown.split * width, 0.5 * shown.line_width),
-                opacity=0.0 if shown.transparent else 1.0,
-                white=shown.white,
-                **_rays(view, float(is_behind)),
-            )
+            self._shader.bind(textures, constants)
             self._shader.draw()
 
 
@@ -91,7 +92,7 @@ class VeilPass:
         positions; `sky`, the background. Without `is_seen` the background behind glass is black.
         """
         with drawing(target, (0, 0, *size_of(textures["behind"])), "ADDITIVE_PREMULT"):
-            self._shader.bind(textures, is_seen=float(is_seen), **_rays(view, 1.0))
+            self._shader.bind(textures, {"is_seen": float(is_seen), **_rays(view, 1.0)})
             self._shader.draw()
 
 

@@ -102,7 +102,7 @@ class Features:
     def constants(self) -> dict[str, str]:
         """The types of the push constants that the shader reads, by name."""
         needed = {
-            "draw_range": ("IVEC4", True),
+            "draw_range": ("IVEC2", True),
             "view": ("VEC4", self.specular or self.sheen or self.rough),
             "grid": ("MAT4", self.shadowed),
             "jitter": ("VEC2", self.sky and (self.specular or self.rough)),
@@ -228,7 +228,7 @@ def _loop(way: str, body: Iterable[str]) -> Iterator[str]:
     yield f"    left = todo.{way};"
     yield "    do {"
     yield "        number = ltsh_next(left);"
-    yield "        int header = ltsh_header(draw_range.z + number);"
+    yield "        int header = ltsh_header(draw_range.x + number);"
     yield "        ltsh_light light = ltsh_seen_light(header, point);"
     yield from (f"        {line}" for line in body)
     yield "        left &= left - 1u;"
@@ -251,7 +251,7 @@ def _loops(name: str, lobe: str, light: Callable, features: Features) -> Iterato
         factor = "factor"
         yield "float factor = ltsh_factor(number, todo);"
         if features.shadowed:
-            factor += f" * ltsh_seen(near, draw_range.z + number).{'x' if name == 'specular' else 'y'}"
+            factor += f" * ltsh_seen(near, draw_range.x + number).{'x' if name == 'specular' else 'y'}"
         yield f"reflected *= {factor} * ltsh_light_texel(header + 4).xyz;"
         yield "radiance += left != 0u ? reflected : vec3(0.0);"
 
@@ -309,7 +309,7 @@ def _diffuse_loops(features) -> Iterator[str]:
         yield "vec3 reflected = form_factor * base.xyz;"
 
     if features.facing:
-        visibility = " * ltsh_seen(near, draw_range.z + number).y" if features.shadowed else ""
+        visibility = " * ltsh_seen(near, draw_range.x + number).y" if features.shadowed else ""
         caps = [
             "bool is_cap = (caps >> uint(number) & 1u) != 0u;",
             f"float form_factor = factor * diffuse_of_cap(matte, light){visibility};",

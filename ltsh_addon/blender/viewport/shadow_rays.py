@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import gpu
@@ -11,6 +11,8 @@ import numpy as np
 
 from ...scene import PASSES, AreaLight, Film
 from ...visibility import Mate, Occluders, ShadowSampling, Tracer, open_tracer, visible_shares
+from ..extract.occluders import collect_occluders
+from ..lights.world import blocks_nothing
 from ..process.blender_process import embree_libraries
 from .camera import ViewCamera
 from .drawing import float_buffer
@@ -89,11 +91,8 @@ class ShadowRays:
         values = np.ones((count, height * width, len(PASSES)), np.float32)
         for index, name in enumerate(PASSES):
             values[:, pixel, index] = traced.of_lights(name)[:count]
-            power = (
-                np.square(values_by_pass[name], dtype=np.float64).sum()
-                for values_by_pass in (traced.radiance, traced.deviation)
-            )
-            self._power[name] += list(power)
+            for row, of_passes in enumerate((traced.radiance, traced.deviation)):
+                self._power[name][row] += np.square(of_passes[name], dtype=np.float64).sum()
         self.seconds += time.perf_counter() - start
         self.traced, self.description = self.traced + traced.rays, tracer.description
         return VisibilityGrid(visibility_texture(values, gbuffer.size), gbuffer.position, view.projection)
@@ -104,6 +103,12 @@ class ShadowRays:
             name: float(np.sqrt(variance / max(power, 1e-30) / samples))
             for name, (power, variance) in self._power.items()
         }
+
+
+def view_occluders(depsgraph, note: Callable[[str], None]) -> Occluders:
+    """What casts shadows in a view; `note` gets what is approximated."""
+    override = depsgraph.view_layer_eval.material_override
+    return blocks_nothing(collect_occluders(depsgraph, override, note), depsgraph.scene.world)
 
 
 def visibility_texture(values: np.ndarray, size: tuple[int, int]) -> gpu.types.GPUTexture:

@@ -14,9 +14,8 @@ import numpy as np
 from ...files import save_array
 from ...scene import SceneError, error_line, listed
 from .. import render_settings
-from ..extract.occluders import collect_occluders
 from ..extract.pixels import no_light, open_scene
-from ..lights.world import blocks_nothing, light_of_world
+from ..lights.world import light_of_world
 from ..materials.looks import world_radiance
 from ..process.client import GRAPHICS, VIEW_PASSES, VIEW_PNG
 from ..render_settings import cycles_setting
@@ -27,7 +26,7 @@ from .live_cycles import look_at_world
 from .mirror import SceneMirror
 from .pictures import ShownPicture
 from .renderer import CENTERS, ViewRenderer
-from .shadow_rays import ShadowRays, too_many
+from .shadow_rays import ShadowRays, too_many, view_occluders
 from .sky import ShownSky, varied_sky
 
 TIMED = 3  # redraws whose median time is reported
@@ -183,13 +182,11 @@ def _draw(job: dict, read: tuple, size: tuple[int, int], progress) -> dict:
     notes, shadows = list(mirror.notes), None
     if job["shadows"] == "on":
         problem = too_many(len(mirror.lights), size)
-        override = depsgraph.view_layer_eval.material_override
         rays = max(min(FEWEST_RAYS, job["shadow_rays"]), job["shadow_rays"] // job["refine"])
         if problem:
             notes.append(problem)
         else:
-            occluders = blocks_nothing(collect_occluders(depsgraph, override, notes.append), scene.world)
-            shadows = ShadowRays(occluders, rays)
+            shadows = ShadowRays(view_occluders(depsgraph, notes.append), rays)
     canvas = _Canvas(mirror, view_of_camera(camera.evaluated_get(depsgraph), depsgraph, size), size)
     points = render_settings.sub_pixel_offsets(scene, job["refine"])
     first, *others = ((technique, name) for technique in job["techniques"] for name in VIEW_PASSES)

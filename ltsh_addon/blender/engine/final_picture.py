@@ -130,9 +130,17 @@ def final_picture(
         shadows = trace_shadows(extraction, PASSES, job.shadow_rays, progress)
     for technique in dict.fromkeys(job.shaded_as().values()):
         for number, lit_pass in enumerate(PASSES):
-            image = _image(
-                extraction, technique, lit_pass, shadows, _fraction_of(progress, number / len(PASSES), 1 / len(PASSES))
-            )
+            lit = shade_lights(
+                extraction.samples,
+                extraction.lights,
+                technique,
+                (lit_pass,),
+                (shadows,),
+                progress=lambda fraction, first=number, title=TECHNIQUES[technique].title: progress(
+                    title, (first + fraction) / len(PASSES)
+                ),
+            )[0].combined
+            image = inside_border(extraction.film.image(extraction.exposure * lit), extraction.border)
             prefixes = [prefix for prefix, name in job.shaded_as().items() if name == technique]
             passes.update({f"{prefix} {PASS_LABELS[lit_pass]}": image for prefix in prefixes})
             show(picture())
@@ -213,24 +221,6 @@ def _complete_picture(job: FinalJob, scene_file: Path, progress: Progress, show)
     return FinalPicture(
         inside_border(made.combined, border), passes, warnings, lights=lights, relight_data=relight_data
     )
-
-
-def _fraction_of(progress: Progress, start: float, share: float) -> Progress:
-    """A progress callback for a part of a stage: the `share` of it from `start` on."""
-    return lambda stage, fraction: progress(stage, start + share * fraction)
-
-
-def _image(extraction, technique: str, lit_pass: str, shadows, progress: Progress) -> np.ndarray:
-    """Radiance (H, W, 3) of a pass times the film's exposure."""
-    (lit,) = shade_lights(
-        extraction.samples,
-        extraction.lights,
-        technique,
-        (lit_pass,),
-        (shadows,),
-        progress=lambda fraction: progress(TECHNIQUES[technique].title, fraction),
-    )
-    return inside_border(extraction.film.image(extraction.exposure * lit.combined), extraction.border)
 
 
 def _over_background(color: np.ndarray, coverage: np.ndarray, background, exposure: float) -> np.ndarray:

@@ -69,11 +69,3 @@ class SurfaceLayer:
         horizon = horizons.draw(gbuffer, lights, view.homogeneous_eye, self.threshold)
         smooth_normal = gbuffer.smooth_normal if has_bent_lobes(mirror.instances) else None
         return replace(gbuffer, geometric_normal=horizon, smooth_normal=smooth_normal)
-
-    def free(self) -> None:
-        """Free all textures and shaders."""
-        self._surfaces.free()
-        for horizons in (self._horizons, self._lobe_horizons):
-            if horizons is not None:
-                horizons.free()
-        self._gbuffer = self._first_lobe = self.smooth_normal = self._horizons = self._lobe_horizons = None

@@ -37,10 +37,6 @@ class HorizonPass:
         self._shaders = {step: horizon_shader(step) for step in _RESULTS}
         self._size, self._mask, self._textures, self._buffers = None, None, {}, {}
 
-    def free(self) -> None:
-        """Free all textures and shaders."""
-        self._size, self._mask, self._shaders, self._textures, self._buffers = None, None, {}, {}, {}
-
     def draw(
         self, gbuffer: GBufferTextures, lights: UploadedLights, view: Sequence[float], threshold: float = 0.5
     ) -> gpu.types.GPUTexture:
@@ -73,7 +69,7 @@ class HorizonPass:
 
 
 class LightingPass:
-    """One technique, ready to draw. Needs an active GPU context; `free` before that goes."""
+    """One technique, ready to draw. Needs an active GPU context, and must be dropped before that goes."""
 
     def __init__(self, technique: str | LookupTable, iors: Sequence[float] = (1.5, 1.45)):
         """`technique` is "ltc", "ltsh2", "ltsh4", "ltsh4c", the path of a table, or a table of degree up to 4.
@@ -89,11 +85,6 @@ class LightingPass:
         self._sky = None
         self.set_iors(iors)
         self.set_lights(())
-
-    def free(self) -> None:
-        """Free shaders and textures; the pass cannot draw any more."""
-        self._shaders.clear()
-        self._table = self._dielectrics = self._lights = self._sky = None
 
     def set_iors(self, iors: Sequence[float]) -> None:
         """Set the indices of refraction of the faster dielectrics, as in the constructor."""

@@ -292,15 +292,8 @@ class ViewRenderer:
         return read_texture(self._sums[number].texture) / np.float32(self.samples)
 
     def free(self) -> None:
-        """Free all textures and shaders."""
-        for owner in (*self._lighting.values(), self._surfaces, *([self._glass] if self._glass else [])):
-            owner.free()
-        self._lighting.clear()
-        self._sums = self._behind = []
-        self._lights = self._glass = self._veil = self._copy = self._lighting_state = self._static = None
-        self._drawn, self._uploaded = None, (None, None, None)
-        self._sky = self._sky_light = self._background = None
-        self._shown, self.samples = None, 0
+        """Free all textures and shaders: the renderer cannot draw any more."""
+        vars(self).clear()
 
 
 def _cleared(sums: list[SampleSum], frame: Frame, is_new: bool) -> list[SampleSum]:

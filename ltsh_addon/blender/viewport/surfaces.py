@@ -102,11 +102,6 @@ class SurfacePass:
             for number, instances in parts:
                 self._draw_instances(outputs, instances, view, number)
 
-    def free(self) -> None:
-        """Free all textures and shaders."""
-        self._targets, self._tables, self._shaders = {}, {}, {}
-        self._size = self._nothing = self._missing = self._depth = self._through = self._mask_shader = None
-
     def _gbuffer(self, number, instances, view) -> GBufferTextures:
         textures = self._draw_into(SURFACES, instances, view, number)
         if has_normals(instances):

@@ -205,12 +205,6 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
         return found if options.for_finished else ended(found)
 
 
-def build_demo(path: Path, *, progress: Progress | None = None) -> None:
-    """Save the example scene as the .blend `path`, completely or not at all. Raises SceneError, OSError."""
-    with replacing_by_copy(Path(path).absolute()) as unfinished, temporary_folder() as folder:
-        run_child({"task": "demo", "path": str(unfinished)}, folder, progress)
-
-
 def with_points(extraction: Extraction, count: int) -> Extraction:
     """`extraction` with the first `count` points of each pixel of a finished picture.
 

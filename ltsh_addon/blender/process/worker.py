@@ -65,10 +65,6 @@ def _answer(job: dict, folder: Path, progress) -> dict:
 
 
 def _perform(job: dict, folder: Path, progress) -> dict:
-    if job["task"] == "demo":
-        progress("build scene", 0.0)
-        _module("blender.demo").build(Path(job["path"]))
-        return {}
     if job["task"] == "rays":
         return _module("blender.process.blender_rays").cast(job, folder)
     if job["task"] == "bake":

@@ -8,11 +8,9 @@ as large.
 
 from __future__ import annotations
 
-import struct
 import subprocess
 import sys
 import tempfile
-import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -572,21 +570,7 @@ def _image(name: str, values: np.ndarray, *, data: bool, precise: bool = False) 
     image.pixels.foreach_set(pixels.ravel())
     image.update()
     image.pack()
-    if values.ndim == 2:
-        packed = gray_png(np.rint(255.0 * np.reshape(image.pixels[:], pixels.shape)[::-1, :, 0]).astype(np.uint8))
-        image.pack(data=packed, data_len=len(packed))
     return image
-
-
-def gray_png(values: np.ndarray) -> bytes:
-    """PNG file of (H, W) uint8, half as large as the one that Blender packs, which has three equal channels."""
-    above = np.concatenate([np.zeros_like(values[:1]), values[:-1]])
-    lines = np.insert(values - above, 0, 2, axis=1)  # PNG's filter "up"
-    header = struct.pack(">IIBBBBB", values.shape[1], values.shape[0], 8, 0, 0, 0, 0)
-    chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(lines.tobytes(), 9)), (b"IEND", b""))
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
-    )
 
 
 def _new_material(name: str) -> tuple[bpy.types.Material, bpy.types.Node]:

@@ -1,6 +1,7 @@
 """The example scene that is shipped, and the script that made it."""
 
 import importlib
+import sys
 from pathlib import Path
 
 import bpy
@@ -96,7 +97,7 @@ def scene_arrays():
 def test_the_script_makes_the_scene_that_is_shipped(demo, monkeypatch):
     """Textures are the same to within a step of 8 bits, since numpy's sines depend on the machine."""
     shipped = scene_arrays()
-    monkeypatch.syspath_prepend(ROOT / "docs")
+    monkeypatch.setattr(sys, "path", [str(ROOT / "docs"), *sys.path])
     importlib.import_module("demo_scene").build()
     made = scene_arrays()
     assert shipped.keys() == made.keys() and len(shipped) > 100

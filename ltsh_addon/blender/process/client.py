@@ -166,7 +166,7 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
 
         def look(channels: dict[str, np.ndarray]) -> None:
             if options.for_finished:
-                bits.append(gbuffer.kept_by_cycles(channels))
+                bits.append(gbuffer.left_to_cycles(channels))
             if options.rest:
                 rest.add(gbuffer.not_reflected(channels, manifest["passes"], manifest["film_transparent"]))
 

@@ -23,7 +23,7 @@ BLENDER_MODULES = frozenset(
 ROOMS = """
     interruption scene reading files lobes emitters workers shading cycles visibility imaging
     blender.process blender.evaluated blender.render_settings blender.saving blender.materials blender.lights
-    blender.extract blender.demo_meshes blender.demo blender.viewport
+    blender.extract blender.viewport
     pipeline cli panel_job
     blender.ui blender.engine blender.registration
 """.split()

@@ -6,6 +6,7 @@ python tests/benchmarks/finished.py picture        the first picture of the READ
 
 import itertools
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -18,9 +19,9 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT)]
 
 from ltsh_addon import imaging  # noqa: E402
-from ltsh_addon.blender.process.blend_file import build_demo  # noqa: E402
 from ltsh_addon.blender.process.blender_process import denoiser_libraries, shared_blender  # noqa: E402
 from ltsh_addon.blender.process.finished import FinishedJob, render_finished  # noqa: E402
+from ltsh_addon.cli.commands import DEMO_SCENE  # noqa: E402
 from ltsh_addon.cycles.lobes import read_layer  # noqa: E402
 from ltsh_addon.imaging.denoise import open_denoiser  # noqa: E402
 from ltsh_addon.pipeline import RenderOptions, render  # noqa: E402
@@ -37,7 +38,7 @@ OTHER_SEED = 7919  # of the truth, so that no noise is shared
 def build(name: str, path: Path) -> None:
     """The .blend of a scene."""
     if name == "demo":
-        build_demo(path)
+        shutil.copy(DEMO_SCENE, path)
         return
     script = Path(__file__).with_name("finished_scenes.py")
     subprocess.run([sys.executable, str(script), name, str(path)], check=True, stdout=subprocess.DEVNULL)

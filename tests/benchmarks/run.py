@@ -7,7 +7,6 @@ import argparse
 import os
 import subprocess
 import sys
-import tempfile
 import time
 from dataclasses import replace
 from functools import partial
@@ -26,6 +25,7 @@ from textbook_ltc import TextbookLtc  # noqa: E402
 from zonal_harmonics import ZonalHarmonics  # noqa: E402
 
 from ltsh_addon import shading  # noqa: E402
+from ltsh_addon.cli.commands import DEMO_SCENE  # noqa: E402
 from ltsh_addon.emitters import light_polygons  # noqa: E402
 from ltsh_addon.lobes import edge_integrals, moments32  # noqa: E402
 from ltsh_addon.lobes.polygon import project_to_sphere, split_at_horizon  # noqa: E402
@@ -253,15 +253,11 @@ def cpu_seconds():
 
 def cycles(options):
     """Time at equal error: the samples Cycles needs to come as close to the truth as ltsh4, times its time for one."""
-    from ltsh_addon.blender.process.blend_file import build_demo
     from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels
 
     heading("time at equal error on the demo scene, ltsh4 against Cycles (specular)")
     count = 64 if options.quick else 128
-    with tempfile.TemporaryDirectory(prefix="ltsh-bench-") as folder:
-        scene = Path(folder) / "demo.blend"
-        build_demo(scene)
-        extraction = extract_pixels(PixelJob(scene, width=480, height=270, cycles_samples=count))
+    extraction = extract_pixels(PixelJob(DEMO_SCENE, width=480, height=270, cycles_samples=count))
     start = time.perf_counter()
     shaded = shading.shade(extraction.samples, extraction.lights, "ltsh4", passes=["specular"])
     shade_seconds = time.perf_counter() - start

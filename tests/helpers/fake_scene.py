@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ltsh_addon import cli, imaging, shading
-from ltsh_addon.blender.process import blend_file, finished, pixels
+from ltsh_addon.blender.process import finished, pixels
 from ltsh_addon.imaging.color import to_srgb8
 from ltsh_addon.pipeline import PictureOptions
 from ltsh_addon.pipeline.tasks import BatchJob
@@ -88,27 +88,21 @@ def wall(height: float, left: float = -9.0) -> Occluders:
 
 
 class FakeChild:
-    """Stands in for the second Blender; `asked` and `built` tell how `extract_pixels` and `build_demo` were called."""
+    """Stands in for the second Blender; `asked` tells how `extract_pixels` was called."""
 
     def __init__(self, *, groups=("Key", "Fill.001", ""), empty=False, error=None, wall=None, change=None):
         self.groups, self.empty, self.error = groups, empty, error
         self.wall, self.change = wall, change  # an occluder (see `wall`), and what becomes of the lights
         self.asked: list[pixels.PixelJob] = []
-        self.built: list = []
 
     def install(self, monkeypatch) -> FakeChild:
         monkeypatch.setattr(pixels, "extract_pixels", self.extract)
-        monkeypatch.setattr(blend_file, "build_demo", self.build_demo)
         monkeypatch.setattr(finished, "show_finished", self.show_finished)
         return self
 
     def show_finished(self, scene, scene_name, frame, folder, name, *, progress=None):
         picture = np.load(folder / finished.PICTURE)
         imaging.write_png(folder / name, to_srgb8(picture[..., :3]))
-
-    def build_demo(self, path, *, progress=None):
-        self.built.append(path)
-        path.write_bytes(b"BLENDER")
 
     def extract(self, options, *, progress=None):
         self.asked.append(options)

@@ -1,14 +1,13 @@
-"""The .blend files that the second Blender opens or writes: can a file be opened here? Imports no bpy."""
+"""The .blend files that the second Blender opens: can a file be opened here? Imports no bpy."""
 
 from __future__ import annotations
 
 import importlib.metadata
 import re
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
-from ...files import replacing_by_copy, temporary_folder
 from ...reading import check_name
 from ...scene import Progress, SceneError
 from .blender_process import run_job
@@ -78,16 +77,3 @@ def newer(path: Path, saved: Version, here: Version) -> str:
         f"{path}: was saved by Blender {saved}, but this is Blender {here}, which may miss parts of it: use Blender "
         f"{saved}, or save the file with {here}"
     )
-
-
-@dataclass(frozen=True)
-class DemoJob:
-    """Build the example scene and save it as the .blend `path`."""
-
-    path: Path
-
-
-def build_demo(path: Path, *, progress: Progress | None = None) -> None:
-    """Save the example scene as the .blend `path`, completely or not at all. Raises SceneError, OSError."""
-    with replacing_by_copy(Path(path).absolute()) as unfinished, temporary_folder() as folder:
-        run_job(DemoJob(unfinished), folder, progress)

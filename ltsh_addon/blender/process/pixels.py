@@ -234,7 +234,7 @@ class _SampleRenders:
         self._unnamed += gbuffer.surfaces_without_sample(channels)
         self._unshaded += gbuffer.unshaded_hits(channels, len(self._unshaded))
         if self._job.for_finished:
-            self._left_to_cycles.append(gbuffer.kept_by_cycles(channels))
+            self._left_to_cycles.append(gbuffer.left_to_cycles(channels))
         if self._job.rest:
             rest = gbuffer.not_reflected(channels, passes, self._manifest["film_transparent"])
             self._rest = self._rest + rest.astype(np.float64)

@@ -52,7 +52,6 @@ JOBS = {
     "ViewJob": ("view", "viewport.still", "draw_view"),
     "WorldJob": ("view", "viewport.live_cycles", "render_world"),
     "NodeLightJob": ("view", "viewport.live_cycles", "render_node_lights"),
-    "DemoJob": ("blend_file", "demo", "build_demo"),
 }
 
 

@@ -24,6 +24,14 @@ SMOKE = {
     "pipeline/test_jobs.py", "shading/test_single_precision.py", "scene/test_scene.py",
 }  # fmt: skip
 
+# Files in tests/blender of what no version of Blender changes, how processes end and what files they leave: marked
+# `newest`, as are single tests of formulas that stand in one text for all versions.
+NEWEST = {
+    "blender/pipeline/test_bake_disk.py",
+    "blender/pipeline/test_job_runs.py",
+    "blender/pipeline/test_picture_kills.py",
+}
+
 
 def pytest_sessionstart(session):
     """Shells start what runs in the background with Ctrl-C ignored, and children inherit that."""
@@ -38,6 +46,8 @@ def pytest_collection_modifyitems(items):
         path = item.path.relative_to(TESTS).as_posix()
         if path.startswith("blender/"):
             item.add_marker("blender")
+            if path in NEWEST:
+                item.add_marker("newest")
         elif path in SMOKE:
             item.add_marker("smoke")
 

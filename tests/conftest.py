@@ -16,6 +16,10 @@ from hypothesis import settings
 settings.register_profile("ltsh", derandomize=True, deadline=None, database=None)
 settings.load_profile("ltsh")
 
+# Of llvmpipe, which draws where no graphics card is: pictures here are so small that its optimizer takes longer than
+# what it saves.
+os.environ.setdefault("GALLIVM_PERF", "nopt")
+
 EXIT_STATUS = pytest.StashKey[int]()
 TESTS = Path(__file__).parent
 # Files that need no bpy, of what may depend on the versions of Python and numpy: `make test` runs them on both.
@@ -27,6 +31,8 @@ SMOKE = {
 # Files in tests/blender of what no version of Blender changes, how processes end and what files they leave: marked
 # `newest`, as are single tests of formulas that stand in one text for all versions.
 NEWEST = {
+    "blender/process/test_signals.py",
+    "blender/ui/test_job_ends.py",
     "blender/pipeline/test_bake_disk.py",
     "blender/pipeline/test_job_runs.py",
     "blender/pipeline/test_picture_kills.py",

@@ -1,6 +1,5 @@
 """Fixtures of several tests that start Blender."""
 
-import os
 import sys
 import tempfile
 
@@ -10,10 +9,6 @@ import scene_parts as parts
 import ltsh_addon
 from ltsh_addon.blender.process import blender_process
 from ltsh_addon.scene import SceneError
-
-# Of llvmpipe, which draws where no graphics card is: pictures here are so small that its optimizer takes longer than
-# what it saves.
-os.environ.setdefault("GALLIVM_PERF", "nopt")
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -22,8 +22,8 @@ from ltsh_addon.blender.materials import looks
 from ltsh_addon.blender.process import client
 from ltsh_addon.blender.render_settings import pass_names
 from ltsh_addon.blender.ui import results
-from ltsh_addon.blender.ui.comparison import covered
 from ltsh_addon.blender.ui.job import STARTING, Plan
+from ltsh_addon.blender.ui.overlay import covered
 from ltsh_addon.blender.viewport.lights import view_lights
 from ltsh_addon.imaging.exr import read_channels
 from ltsh_addon.pipeline import PictureOptions, RenderOptions, shade_scene

@@ -30,7 +30,7 @@ FAR_AWAY = np.full(3, 1e6)
 MOST_LIGHTS = 2048
 # Reasons why a light has no pattern.
 NOT_RESOLVED = "its nodes are not resolved, it shines as without them"
-NOT_YET = "it shines as without its nodes until Cycles has looked at them"
+NOT_YET = "it shines as without its nodes until Cycles has sources at them"
 # Patterns: a function that returns how Cycles sees the nodes of evaluated light data, or why that is not known.
 Patterns = Callable[[bpy.types.Light, UnseenLight], SeenNodes | str]
 
@@ -81,13 +81,13 @@ def strongest(lights: list[AreaLight], notes: list[str], most: int = MOST_LIGHTS
     if len(lights) <= most:
         return lights
     power = np.array([np.linalg.norm(light.area_vector) * np.abs(light.radiance).sum() for light in lights])
-    kept = np.sort(np.argsort(-power, kind="stable")[:most])
-    left = 1.0 - power[kept].sum() / power.sum()
+    chosen = np.sort(np.argsort(-power, kind="stable")[:most])
+    missing = 1.0 - power[chosen].sum() / power.sum()
     notes.append(
-        f"Of {len(lights)} lights, faces and patches the {most} strongest are shown, {100.0 * left:.1f} % of the power "
-        "is missing"
+        f"Of {len(lights)} lights, faces and patches the {most} strongest are shown, {100.0 * missing:.1f} % of the "
+        "power is missing"
     )
-    return [lights[index] for index in kept]
+    return [lights[index] for index in chosen]
 
 
 def _has_emission(ob) -> bool:
@@ -100,10 +100,10 @@ def _emission(material) -> np.ndarray:
 
 def _mesh_lights(depsgraph, receivers: Receivers, notes: list[str]) -> list[AreaLight]:
     override = depsgraph.view_layer_eval.material_override
-    found = collect_mesh_lights(depsgraph, override, receivers, notes.append, copies=False)
+    mesh_lights = collect_mesh_lights(depsgraph, override, receivers, notes.append, copies=False)
     camera = depsgraph.scene.camera
     eye = FAR_AWAY if camera is None else np.array(camera.matrix_world.translation)
-    return constant_mesh_lights(found, _emission, eye, notes.append)
+    return constant_mesh_lights(mesh_lights, _emission, eye, notes.append)
 
 
 def patterns_of(scene, depsgraph) -> dict[tuple, SeenNodes]:
@@ -118,25 +118,25 @@ def patterns_of(scene, depsgraph) -> dict[tuple, SeenNodes]:
             wanted[source.key] = source
         return NOT_YET
 
-    receivers, looked = Receivers([]), (ShownTextures(), note)
+    receivers, sources = Receivers([]), (ShownTextures(), note)
     for instance in depsgraph.object_instances:
         ob = instance.object
         if ob.type == "LIGHT" and tree_in_use(ob.data) is not None:
             matrix = np.array(instance.matrix_world, dtype=np.float64)
             if not reason_to_leave_out(ob, matrix):
-                _with_nodes(area_light(ob, matrix, EmitterTraits.of(instance), receivers), instance, looked, [])
+                _with_nodes(area_light(ob, matrix, EmitterTraits.of(instance), receivers), instance, sources, [])
     if not wanted:
         return {}
     with open_studio(scene) as studio:
         return {key: seen_factor(source, studio) for key, source in wanted.items()}
 
 
-def _with_nodes(light: AreaLight, instance, looked: tuple, notes: list[str]) -> list[AreaLight]:
+def _with_nodes(light: AreaLight, instance, sources: tuple, notes: list[str]) -> list[AreaLight]:
     """The lights that the node tree of a depsgraph `instance` makes of `light`; [] where it emits nothing.
 
-    `looked` are the textures and patterns of `view_lights`.
+    `sources` are the textures and patterns of `view_lights`.
     """
-    ob, (textures, patterns) = instance.object, looked
+    ob, (textures, patterns) = instance.object, sources
     data = ob.data
     emission = None if tree_in_use(data) is None else emission_of(data)
     if emission is None or emission.plain:
@@ -159,13 +159,13 @@ def _with_nodes(light: AreaLight, instance, looked: tuple, notes: list[str]) -> 
     warnings: list[str] = []
     matrix = np.array(instance.matrix_world, dtype=np.float64)
     unseen = unseen_light(ob, matrix, SimpleNamespace(warn=warnings.append), instance)
-    found = patterns(data, unseen)
-    if isinstance(found, str):
-        notes.append(f"{light.name}: {found}")
+    pattern = patterns(data, unseen)
+    if isinstance(pattern, str):
+        notes.append(f"{light.name}: {pattern}")
         return [replace(light, falloff=0, smooth=0.0)]
     notes += warnings
     if not light.is_distant:
         light = replace(light, falloff=unseen.falloff.power, smooth=unseen.falloff.smooth)
     if light.is_facing or light.is_distant:
-        return with_pattern(light, found, unseen, notes.append)
-    return textures.split_seen(light, found, notes)
+        return with_pattern(light, pattern, unseen, notes.append)
+    return textures.split_seen(light, pattern, notes)

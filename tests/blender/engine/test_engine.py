@@ -571,7 +571,7 @@ def test_a_view_that_is_left_is_freed_at_once_and_what_works_for_it_is_stopped(s
         seen._renderer = SimpleNamespace(shadows=None)
         seen._follow_shadows(depsgraph)
         shadows, stopped = seen._shadows, [one._stop for one in (seen._shadows, seen._shadows.of_glass)]
-        seen._shadows._followed.collect()
+        seen._shadows._traced_scene.collect()
         stopped.append(seen._world._stopped)
         left = [weakref.ref(part) for part in (seen, seen.mirror, shadows, shadows.of_glass)]
         del seen, shadows

@@ -231,6 +231,7 @@ def test_ours_and_the_rest_are_the_whole_in_the_files_of_a_command(out, tmp_path
     assert main([*words, "--resume"]) == 0
 
 
+@pytest.mark.newest
 def test_denoising_takes_the_noise_of_the_rest_and_leaves_its_mean(tmp_path, monkeypatch):
     monkeypatch.setattr(render, "_beside", lambda *images: 1.0)  # at edges the rest holds direct light, too
     floor_and_ball(gray(), 2)
@@ -247,6 +248,7 @@ def test_denoising_takes_the_noise_of_the_rest_and_leaves_its_mean(tmp_path, mon
     assert abs(rest[8, "on"].mean() / true.mean() - 1.0) < 0.05
 
 
+@pytest.mark.newest
 @pytest.mark.parametrize("is_transparent", [False, True])
 def test_edges_of_what_shines_are_smooth_with_few_samples(is_transparent, tmp_path):
     """A glowing ball that also reflects, above a floor without a material, before a sky."""
@@ -273,6 +275,7 @@ def test_edges_of_what_shines_are_smooth_with_few_samples(is_transparent, tmp_pa
     assert abs(ours.mean() / true.mean() - 1.0) < 0.02
 
 
+@pytest.mark.newest
 def test_hard_edges_of_diffuse_light_are_nearer_to_cycles_than_ours_or_its_own(tmp_path, monkeypatch):
     """A ball and its shadow in the sun: points and samples place their edges independently, so the mean of both has
     0.7 of the error where both are alike, and less than either where they are nearly so."""
@@ -305,6 +308,7 @@ def test_hard_edges_of_diffuse_light_are_nearer_to_cycles_than_ours_or_its_own(t
     assert off["both"] < 0.9 * min(off["ours"], off["cycles"]), off
 
 
+@pytest.mark.newest
 def test_half_of_an_edge_is_left_to_cycles_but_not_of_what_is_smooth_or_noisy_there():
     x, y = np.mgrid[:12, :12]
     step, noise = np.where(x + 0.5 * y < 8.0, 1.0, 0.2)[..., None], np.random.default_rng(1).normal(size=(12, 12, 1))
@@ -319,6 +323,7 @@ def test_half_of_an_edge_is_left_to_cycles_but_not_of_what_is_smooth_or_noisy_th
     assert weights["edge"] == 0.5 and weights["slope"] == pytest.approx(1.0) and weights["noisy"] > 0.95, weights
 
 
+@pytest.mark.newest
 def test_noisy_shadows_are_left_to_the_denoiser(tmp_path):
     scene = floor_and_ball(gray(), 1)
     # A slit lets little of a large light through: few of its rays arrive.
@@ -358,6 +363,7 @@ def test_a_kept_finished_picture_is_the_sum_of_its_lights_and_the_rest(out, tmp_
     assert np.linalg.norm(alone - mixed.layers[0]) < 0.02 * np.linalg.norm(alone)
 
 
+@pytest.mark.newest
 def test_edges_go_with_the_light_that_makes_them(out, tmp_path):
     """Of two suns without a light group one is muted: what Cycles has added to its edges goes as well."""
     scene = floor_and_ball(bsdf("BsdfDiffuse"))
@@ -378,6 +384,7 @@ def test_edges_go_with_the_light_that_makes_them(out, tmp_path):
     assert off < 0.1, f"{100.0 * off:.1f} %"
 
 
+@pytest.mark.newest
 def test_bounced_light_follows_the_lights_of_its_light_group(out, tmp_path):
     """Of a finished picture lit anew, in the mixer and in its passes: as a render of the changed scene has it."""
     scene = floor_and_ball(gray(), 3)
@@ -420,6 +427,7 @@ def test_bounced_light_follows_the_lights_of_its_light_group(out, tmp_path):
     assert apart < 2.0 * noise + 0.005 < 0.3 * unfollowed
 
 
+@pytest.mark.newest
 def test_budgets_buy_points_by_what_they_cost():
     pixels = 240 * 135
     points = [pixels_module.affordable_points(seconds, pixels, 4) for seconds in (1.0, 4.0, 8.0, 32.0)]
@@ -431,11 +439,13 @@ def test_budgets_buy_points_by_what_they_cost():
     assert looked[0] >= looked[1] > looked[2] == 0
 
 
+@pytest.mark.newest
 def test_a_budget_excludes_samples(tmp_path, capsys):
     assert main(["render", "room.blend", "-o", str(tmp_path), "--budget", "3", "--cycles-samples", "4"]) == 2
     assert "not both" in capsys.readouterr().err
 
 
+@pytest.mark.newest
 def test_a_budget_chooses_points_rays_and_samples(tmp_path):
     floor_and_ball(gray(), 1)
     path = parts.save(tmp_path / "room.blend")
@@ -457,6 +467,7 @@ def test_a_budget_chooses_points_rays_and_samples(tmp_path):
     assert 0.0 < least <= took
 
 
+@pytest.mark.newest
 @pytest.mark.parametrize(
     ("each", "power", "looked", "points"),
     [
@@ -502,6 +513,7 @@ def test_direct_light_gets_no_more_points_than_a_part_of_it_says_there_is_time_f
     assert how.affordable(look, seconds, looked) == (0, TOO_THIN)
 
 
+@pytest.mark.newest
 def test_highlights_thinner_than_pixels_are_told_from_those_that_points_show(tmp_path):
     """Two points of each pixel on a smooth and on a crumpled floor, of facets of a third of a pixel."""
     thin = {}
@@ -579,6 +591,7 @@ def test_the_first_points_of_a_pixel_are_those_of_a_picture_with_fewer(tmp_path)
     np.testing.assert_allclose(first.film.coverage(), whole.film.coverage(), atol=1e-12)
 
 
+@pytest.mark.newest
 def test_what_cycles_keeps_does_not_fade_at_its_border(tmp_path):
     """Around a ball whose diffuse light is Cycles' own, pixels show as much of the floor as those beside them."""
     floor_and_ball(gray(Subsurface_Weight=0.01, Subsurface_Scale=0.01))
@@ -606,6 +619,7 @@ def test_a_picture_without_any_light_says_that_it_is_black(tmp_path):
     assert any("no light at all" in line and "'Camera'" in line for line in report["warnings"])
 
 
+@pytest.mark.newest
 def test_few_points_leave_to_cycles_what_its_samples_tell_better():
     """Highlights thinner than a pixel, and a slope, by four points of each pixel beside samples of known variance."""
     size, points = 48, 4

@@ -11,11 +11,11 @@ import random_surfaces
 import scene_parts as parts
 from graphics_card import Canvas, edits_with_graphics, with_graphics
 from random_surfaces import EYE
+from uploaded_samples import upload_samples
 
 from ltsh_addon import shading
 from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels
 from ltsh_addon.blender.viewport.camera import ViewCamera
-from ltsh_addon.blender.viewport.gbuffer import upload_samples
 from ltsh_addon.blender.viewport.light_texels import upload_lights
 from ltsh_addon.blender.viewport.lighting import HorizonPass
 from ltsh_addon.blender.viewport.mirror import SceneMirror

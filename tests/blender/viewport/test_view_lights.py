@@ -226,6 +226,7 @@ def test_windows_get_the_patterns_of_lights_from_a_second_blender(tmp_path):
     assert "Library" in notes and "lamps.blend" in notes and not lamps.is_busy
 
 
+@pytest.mark.newest
 def test_a_light_that_changes_meanwhile_is_looked_at_again_and_nobody_waits_in_vain(temporary_root):
     parts.empty_scene()
     tree = add_bulb("Striped", "POINT", stripes)[1]

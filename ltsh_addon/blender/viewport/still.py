@@ -16,7 +16,7 @@ from ...scene import SceneError, error_line, listed
 from .. import render_settings
 from ..extract.pixels import no_light, open_scene
 from ..lights.world import light_of_world
-from ..materials.looks import world_radiance
+from ..materials.preview_material import world_radiance
 from ..process.view import GRAPHICS, VIEW_PASSES, VIEW_PNG, ViewJob
 from ..render_settings import cycles_setting
 from .camera import ViewCamera

@@ -37,8 +37,8 @@ from ..scene import (
 )
 
 FILM_ARRAYS = ("first", "count", "spread", "whole")  # the optional arrays of a film
-# The two files of `keep_picture`: the samples with all that shading needs, and the occluders.
-KEPT_SUFFIX, OCCLUDERS_SUFFIX = ".samples.npz", ".occluders.npz"
+# The two files of `write_relight_data`: the samples with all that shading needs, and the occluders.
+RELIGHT_SUFFIX, OCCLUDERS_SUFFIX = ".samples.npz", ".occluders.npz"
 # MOST_PAIRS: how many pairs of a sample and a light have their radiance in memory at a time.
 MOST_PAIRS = 1 << 25
 # FEWEST_RAYS: a sample gets at least so many of the rays of its pixel, or all of them if they are fewer. The first
@@ -245,8 +245,8 @@ def group_names(groups: Sequence[str]) -> list[str]:
 
 
 @dataclass(frozen=True)
-class KeptPicture:
-    """A picture kept by `keep_picture`: all that shading needs, without Blender and without rays.
+class RelightData:
+    """A picture kept by `write_relight_data`: all that shading needs, without Blender and without rays.
 
     whole picture = sum over passes of `shown` x image of the samples, + sum of `rest`; all include the exposure.
     """
@@ -274,8 +274,8 @@ class KeptPicture:
         return taken if moved or name not in self.edges else taken * self.edges[name][..., None]
 
     @classmethod
-    def load(cls, path: Path) -> KeptPicture:
-        """Raises OSError, and ValueError where the file is not what `keep_picture` writes."""
+    def load(cls, path: Path) -> RelightData:
+        """Raises OSError, and ValueError where the file is not what `write_relight_data` writes."""
         try:
             with Path(path).open("rb") as file, np.load(file) as data:
                 arrays = {name: data[name] for name in data.files}
@@ -286,7 +286,7 @@ class KeptPicture:
             raise ValueError(f"{path}: {problem}; run the picture again") from error
 
     @classmethod
-    def _of(cls, document, arrays) -> KeptPicture:
+    def _of(cls, document, arrays) -> RelightData:
         from ..blender.process.client import UNCHANGED, Extraction
 
         found = document["extraction"]
@@ -329,14 +329,14 @@ def _compact(values: np.ndarray) -> np.ndarray:
 
 
 NOT_REFLECTED = ("emission", "background")  # optional arrays of an Extraction
-FINISHED = ("rest", "taken", "edges")  # fields of a KeptPicture that only finished pictures have
-KEPT_OPTIONS = ("techniques", "passes", "sub_samples", "reference_samples", "shadows", "shadow_rays")
+FINISHED = ("rest", "taken", "edges")  # fields of a RelightData that only finished pictures have
+RELIGHT_OPTIONS = ("techniques", "passes", "sub_samples", "reference_samples", "shadows", "shadow_rays")
 
 
-def keep_picture(extraction, shadows: Shadows | None, options, path: Path, **finished) -> list[Path]:
-    """Write the .npz that `KeptPicture.load` reads, atomically, and the occluders beside it; returns the paths.
+def write_relight_data(extraction, shadows: Shadows | None, options, path: Path, **finished) -> list[Path]:
+    """Write the .npz that `RelightData.load` reads, atomically, and the occluders beside it; returns the paths.
 
-    `finished` are the fields `rest`, `taken` and `edges` of the KeptPicture of a finished picture. Raises OSError.
+    `finished` are the fields `rest`, `taken` and `edges` of the RelightData of a finished picture. Raises OSError.
     """
     from ..blender.process.client import UNCHANGED
 
@@ -353,7 +353,7 @@ def keep_picture(extraction, shadows: Shadows | None, options, path: Path, **fin
             "color_space": {"name": space.name, "to_rec709": space.to_rec709.tolist()},
         },
         "shadows": None if shadows is None else {**shadows.report(), "numbers": shadows.numbers},
-        "options": {"scene": str(options.scene), **{name: getattr(options, name) for name in KEPT_OPTIONS}},
+        "options": {"scene": str(options.scene), **{name: getattr(options, name) for name in RELIGHT_OPTIONS}},
         "had_cycles": extraction.reference is not None,
         **{kind: list(finished.get(kind, ())) for kind in FINISHED},
     }
@@ -377,6 +377,6 @@ def keep_picture(extraction, shadows: Shadows | None, options, path: Path, **fin
                 np.lib.format.write_array(file, np.asarray(values), allow_pickle=False)
     if extraction.occluders is None:
         return [path]
-    occluders = path.with_name(path.name.removesuffix(KEPT_SUFFIX) + OCCLUDERS_SUFFIX)
+    occluders = path.with_name(path.name.removesuffix(RELIGHT_SUFFIX) + OCCLUDERS_SUFFIX)
     extraction.occluders.save(occluders)
     return [path, occluders]

@@ -23,8 +23,8 @@ from ..files import temporary_folder
 from ..scene import AreaLight, Cancelled, Film, SurfaceSamples
 from ..visibility import BLOCK_SAMPLES, Company, Occluders, Setting, task_of_lights
 from . import picture
-from .lighting import KEPT_SUFFIX, OCCLUDERS_SUFFIX, KeptPicture, rays_of_samples
-from .mixer import Row, bounced_light
+from .lighting import OCCLUDERS_SUFFIX, RELIGHT_SUFFIX, RelightData, rays_of_samples
+from .mixer import MixerRow, bounced_light
 
 # BLOCKS: enough that all processes end at about the same time. FEWEST_OF_BLOCK: the overhead of smaller blocks exceeds
 # the cost of their samples.
@@ -119,7 +119,7 @@ class MovedLights:
     Threads may share an object: a new request cancels the one in progress, which raises Cancelled.
     """
 
-    def __init__(self, read: Callable[[], tuple[KeptPicture, Occluders | None]]):
+    def __init__(self, read: Callable[[], tuple[RelightData, Occluders | None]]):
         """`read` is called at the first picture; its exceptions are raised there."""
         self._read, self._kept, self._occluders = read, None, None
         self._company, self._ending = None, ExitStack()
@@ -135,9 +135,9 @@ class MovedLights:
         """
 
         def read():
-            kept, occluders = KeptPicture.load(path), None
+            kept, occluders = RelightData.load(path), None
             if kept.shadows is not None:
-                occluders = Occluders.load(path.with_name(path.name.removesuffix(KEPT_SUFFIX) + OCCLUDERS_SUFFIX))
+                occluders = Occluders.load(path.with_name(path.name.removesuffix(RELIGHT_SUFFIX) + OCCLUDERS_SUFFIX))
             return kept, occluders
 
         return cls(read)
@@ -153,7 +153,7 @@ class MovedLights:
         with suppress(Exception), closing(pictures):
             next(pictures)
 
-    def picture(self, light: AreaLight, row: Row | None = None) -> np.ndarray:
+    def picture(self, light: AreaLight, row: MixerRow | None = None) -> np.ndarray:
         """The picture (H, W, 3) of one light, plus the unchanged bounced light of its `row`. Raises SceneError."""
         turn = self._next_turn()
         with self._lock:
@@ -163,7 +163,7 @@ class MovedLights:
                 pass
             return self._image(values, row)
 
-    def pictures(self, light: AreaLight, row: Row | None = None) -> Iterator[tuple[np.ndarray, float]]:
+    def pictures(self, light: AreaLight, row: MixerRow | None = None) -> Iterator[tuple[np.ndarray, float]]:
         """Yield the result of `picture`, first as a draft and at last complete, and the fraction that is done."""
         self._is_ready = True
         return self._pictures(light, row, self._next_turn())
@@ -222,7 +222,7 @@ class MovedLights:
                 values[name][self._own[number]] = found
             yield
 
-    def _image(self, values, row: Row | None) -> np.ndarray:
+    def _image(self, values, row: MixerRow | None) -> np.ndarray:
         kept = self._kept
         image = np.zeros((kept.extraction.film.height, kept.extraction.film.width, 3), np.float32)
         for name, radiance in values.items():

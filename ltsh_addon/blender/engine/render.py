@@ -16,7 +16,7 @@ import bpy
 import numpy as np
 from bpy.app.handlers import persistent
 
-from ...pipeline.lighting import KeptPicture, shade_lights, trace_shadows
+from ...pipeline.lighting import RelightData, shade_lights, trace_shadows
 from ...pipeline.mixer import LightPictures, light_pictures
 from ...pipeline.options import RenderOptions
 from ...pipeline.render import finish
@@ -137,7 +137,7 @@ class LTSH_RenderEngine(bpy.types.RenderEngine):
             self.report({"WARNING"}, warning)
         self._show(picture, job.view_layer)
         if picture.lights is not None:
-            comparison.mix_render(job.scene, picture.lights, picture.kept)
+            comparison.mix_render(job.scene, picture.lights, picture.relight_data)
 
     def _show(self, picture: FinalPicture, view_layer: str) -> None:
         """Give Blender the picture; the last one stays."""
@@ -277,7 +277,7 @@ class FinalPicture:
     warnings: tuple[str, ...]
     problems: tuple[str, ...] = ()
     lights: LightPictures | None = None  # for the light mixer
-    kept: KeptPicture | None = None  # the samples, for lights that move
+    relight_data: RelightData | None = None  # the samples, for lights that move
 
 
 def final_picture(
@@ -332,8 +332,8 @@ def final_picture(
             show(picture())
     if not job.keeps_lights:
         return picture()
-    kept = KeptPicture(extraction, shadows, _kept_options(job, shown), False, {"": rest})
-    return replace(picture(), lights=light_pictures(kept, progress), kept=kept)
+    relight_data = RelightData(extraction, shadows, _kept_options(job, shown), False, {"": rest})
+    return replace(picture(), lights=light_pictures(relight_data, progress), relight_data=relight_data)
 
 
 def _kept_options(job: FinalJob, passes) -> dict:
@@ -395,12 +395,16 @@ def _complete_picture(job: FinalJob, scene_file: Path, progress: Progress, show)
         if planes and set(letters) <= set(planes):
             passes[name] = np.stack([planes[letter] for letter in letters], axis=-1)
     passes = {name: inside_border(image, border) for name, image in passes.items()}
-    lights, kept, ours = None, None, made.comparison
+    lights, relight_data, ours = None, None, made.comparison
     if job.keeps_lights:
-        kept = KeptPicture(ours.extraction, ours.shadows, _kept_options(job, PASSES), False, **made.kept)
-        lights = light_pictures(kept, progress)
+        relight_data = RelightData(
+            ours.extraction, ours.shadows, _kept_options(job, PASSES), False, **made.relight_data
+        )
+        lights = light_pictures(relight_data, progress)
     warnings = tuple(made.report["warnings"])
-    return FinalPicture(inside_border(made.combined, border), passes, warnings, lights=lights, kept=kept)
+    return FinalPicture(
+        inside_border(made.combined, border), passes, warnings, lights=lights, relight_data=relight_data
+    )
 
 
 def _part(progress: Progress, start: float, share: float) -> Progress:

@@ -12,7 +12,6 @@ import zipfile
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ import numpy as np
 from .. import shading, visibility
 from ..cycles.gbuffer import finer
 from ..emitters.light_tree import FEWEST
-from ..files import replacing, temporary_folder
+from ..files import replacing
 from ..scene import (
     REFERENCE,
     AreaLight,
@@ -56,7 +55,6 @@ class Shadows:
     rays: int
     tracer: str  # name of the ray tracer
     seconds: float = 0.0
-    warnings: tuple[str, ...] = ()
     # By pass, estimates (H, W) of the radiance on the film and of its variance; empty without a film.
     light: dict[str, np.ndarray] = field(default_factory=dict)
     variance: dict[str, np.ndarray] = field(default_factory=dict)
@@ -105,21 +103,17 @@ class ShadowTracer:
     """
 
     def __init__(self, occluders: visibility.Occluders, lights: Sequence[AreaLight], origin: np.ndarray):
-        self.warnings: list[str] = []
         self._occluders, self._origin = occluders, origin
-        self._lights, self._ending = [light.moved(-origin) for light in lights], ExitStack()
+        self._lights = [light.moved(-origin) for light in lights]
 
     def __enter__(self):
-        from ..blender.process.blender_rays import open_rays
+        from ..blender.process.blender_process import embree_libraries
 
-        with ExitStack() as stack:
-            folder = stack.enter_context(temporary_folder())
-            self._tracer = stack.enter_context(open_rays(self._occluders, folder, self.warnings.append))
-            self._ending = stack.pop_all()
+        self._tracer = visibility.open_tracer(self._occluders, embree_libraries())
         return self
 
     def __exit__(self, *error):
-        return self._ending.__exit__(*error)
+        self._tracer.close()
 
     def finer(self, samples: SurfaceSamples, film: Film, points, pixels: np.ndarray):
         """`gbuffer.finer` with this tracer's rays, for samples in world space."""
@@ -145,7 +139,7 @@ class ShadowTracer:
         shares = {name: getattr(found, name) for name in passes}
         noise = {name: found.noise(name, film) for name in passes}
         seconds, tracer = time.perf_counter() - start, self._tracer.description
-        made = Shadows(shares, found.numbers, noise, found.rays, tracer, seconds, tuple(self.warnings))
+        made = Shadows(shares, found.numbers, noise, found.rays, tracer, seconds)
         if film is None:
             return made
         light = {name: film.image(found.radiance[name]) for name in passes}

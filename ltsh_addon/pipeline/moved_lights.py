@@ -19,9 +19,8 @@ import numpy as np
 
 from ..cycles.gbuffer import SHADOW_LOOSENESS, one_shading, with_one_shadow
 from ..emitters.light_polygons import has_lobe
-from ..files import temporary_folder
 from ..scene import AreaLight, Cancelled, Film, SurfaceSamples
-from ..visibility import BLOCK_SAMPLES, Company, Occluders, Setting, task_of_lights
+from ..visibility import BLOCK_SAMPLES, Company, Occluders, Setting, open_tracer, task_of_lights
 from . import picture
 from .lighting import OCCLUDERS_SUFFIX, RELIGHT_SUFFIX, RelightData, rays_of_samples
 from .mixer import MixerRow, bounced_light
@@ -237,7 +236,7 @@ class MovedLights:
             self._ending.close()
 
     def _start(self) -> None:
-        from ..blender.process.blender_rays import open_rays
+        from ..blender.process.blender_process import embree_libraries
 
         if self._kept is None:
             self._kept, self._occluders = self._read()
@@ -266,8 +265,7 @@ class MovedLights:
         with ExitStack() as stack:
             self._tracer = None
             if self._occluders is not None:
-                folder = stack.enter_context(temporary_folder())
-                self._tracer = stack.enter_context(open_rays(self._occluders, folder, lambda warning: None))
+                self._tracer = stack.enter_context(open_tracer(self._occluders, embree_libraries()))
                 self._typical = task_of_lights(starting, lights, self._tracer, passes, DRAFT_RAYS).typical
             self._company = Company(Setting(blocks, table, passes), self._tracer)
             stack.callback(self._company.close)

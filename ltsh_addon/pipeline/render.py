@@ -714,8 +714,6 @@ def _report(comparison: picture.Comparison, cycles, ours: dict[str, _DirectPass]
     kept = comparison.extraction.left_to_cycles
     everything = [*cycles.everything, *kept.everything]
     warnings = [*cycles.warnings, *kept.warnings, *problems]
-    if comparison.shadows is not None:
-        warnings += comparison.shadows.warnings
     if everything:
         why = listed(everything, NAMED, "; ")
         warnings.append(f"all direct light is Cycles' own and denoised, because LTSH does not shade: {why}")

@@ -223,7 +223,7 @@ def conductor_reflectance(cosine, index: np.ndarray, extinction: np.ndarray, exa
 
 
 def conductor_fit(index: np.ndarray, extinction: np.ndarray, exact: bool):
-    """(f0, f90, f82_factor, dielectric), each (Q, 3): the least-squares fit of a conductor's reflectance. Its dielectric
+    """(f0, f90, f82_factor, dielectric) (Q, 3): the least-squares fit of a conductor's reflectance. Its dielectric
     curve is that of CONDUCTOR_FIT_IOR."""
     values = conductor_reflectance(FIT_COSINES[:, None, None], index, extinction, exact)
     constant, schlick, f82_factor, dielectric = np.einsum("kc,cqx->kqx", _fit_matrix(), values)

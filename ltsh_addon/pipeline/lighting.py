@@ -160,26 +160,34 @@ def shade_lights(
     passes: Sequence[str],
     seen: Sequence[Shadows | None] = (None,),
     *,
+    rows: Sequence[int] | None = None,
     workers: int | None = None,
     progress: Callable[[float], bool | None] | None = None,
 ) -> list[shading.Shading]:
     """Radiance of `samples` (P) under `lights` (L): one Shading for each entry of `seen`.
 
-    An entry is the shadows of the samples, or None for no shadows. All shadows must group the lights alike.
+    An entry is the shadows of the samples, or None for no shadows. All shadows must join the same lights, and only
+    lights of one row. `rows` (L,) are as for `shade`; by default each of the `light_groups` has a row.
 
     Lights that share their rays are shaded together and then multiplied by their share, so that a sample that sees
     them whole gets the same bits as without shadows. Exception: many lights without any shadows go to `shade` at once,
     which then merges those that a sample cannot tell apart.
     """
+    if rows is None:
+        groups = light_groups(lights)
+        rows = [groups.index(light.group) for light in lights]
     if lights and all(shares is None for shares in seen):
-        if max(Counter(light.group for light in lights).values()) >= FEWEST:
-            found = shading.shade(samples, lights, table, passes=tuple(passes), workers=workers, progress=progress)
-            return [found] * len(seen)
-    groups = tuple(dict.fromkeys(light.group for light in lights)) or ("",)
-    shape = len(groups), len(samples), 3
+        if max(Counter(rows).values()) >= FEWEST:
+            options = {"passes": tuple(passes), "workers": workers, "progress": progress, "rows": rows}
+            return [shading.shade(samples, lights, table, **options)] * len(seen)
+    shape = 1 + max(rows, default=0), len(samples), 3
     sums = [{name: np.zeros(shape, np.float32) for name in passes} for _ in seen]
     numbers = next((shadows.numbers for shadows in seen if shadows is not None), None)
-    numbers = visibility.shared_numbers(lights) if numbers is None else numbers
+    if numbers is None:
+        # Lights of several rows cannot be shaded together.
+        alike = visibility.shared_numbers(lights)
+        alike = [[own] if len({rows[n] for n in own}) == 1 else [(n,) for n in own] for own in alike]
+        numbers = sorted(itertools.chain.from_iterable(alike))
     error, most = None, max(1, MOST_PAIRS // max(1, len(samples)))
     for first in range(0, len(numbers), most):
         part = numbers[first : first + most]
@@ -188,19 +196,26 @@ def shade_lights(
         def report(fraction, start=start, share=share):
             return None if progress is None else progress(start + fraction * share)
 
-        own = [lights[light].altered(group=str(number)) for number, one in enumerate(part) for light in one]
-        found = shading.shade(samples, own, table, passes=tuple(passes), workers=workers, progress=report)
+        own = [(lights[light], number) for number, one in enumerate(part) for light in one]
+        own, own_rows = zip(*own, strict=True)
+        options = {"passes": tuple(passes), "workers": workers, "progress": report, "rows": own_rows}
+        found = shading.shade(samples, own, table, **options)
         if found.quadrature_error is not None:
             error = found.quadrature_error if error is None else error + found.quadrature_error
         for number, one in enumerate(part):
-            group = groups.index(lights[one[0]].group)
+            row = rows[one[0]]
             for name in passes:
                 radiance = getattr(found, name)[number]
                 for whole, shadows in zip(sums, seen, strict=True):
                     is_all = shadows is None
                     share = 1.0 if is_all else shadows.shares[name][first + number][:, None]
-                    whole[name][group] += radiance if is_all else share * radiance
-    return [shading.Shading(groups, whole.get("specular"), whole.get("diffuse"), error) for whole in sums]
+                    whole[name][row] += radiance if is_all else share * radiance
+    return [shading.Shading(whole.get("specular"), whole.get("diffuse"), error) for whole in sums]
+
+
+def light_groups(lights: Iterable[AreaLight]) -> tuple[str, ...]:
+    """The names of the light groups of `lights` in the order of their first lights, "" for none; at least one name."""
+    return tuple(dict.fromkeys(light.group for light in lights)) or ("",)
 
 
 def layer_names(names: Iterable[str]) -> list[str]:

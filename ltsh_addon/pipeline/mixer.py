@@ -173,15 +173,14 @@ def _layers(kept: RelightData, table, members: list[list[int]], report) -> np.nd
     extraction = kept.extraction
     numbers = sorted(number for own in members for number in own)
     row_of = {number: row for row, own in enumerate(members) for number in own}
-    lights = [replace(extraction.lights[number], group=str(row_of[number])) for number in numbers]
+    lights, of_lights = [extraction.lights[number] for number in numbers], [row_of[number] for number in numbers]
     shadows = None if kept.shadows is None else kept.shadows.of_lights(numbers)
     passes = kept.options["passes"]
-    (lit,) = shade_lights(extraction.samples, lights, table, passes, (shadows,), progress=report)
+    (lit,) = shade_lights(extraction.samples, lights, table, passes, (shadows,), rows=of_lights, progress=report)
     layers = np.zeros((len(members), extraction.film.height, extraction.film.width, 3), np.float32)
     for name in passes:
-        for group, values in zip(lit.groups, getattr(lit, name), strict=True):
-            image = extraction.film.image(extraction.picture.exposure * values)
-            layers[int(group)] += kept.shown(name) * image
+        for layer, values in zip(layers, getattr(lit, name), strict=True):
+            layer += kept.shown(name) * extraction.film.image(extraction.picture.exposure * values)
     return layers
 
 

@@ -224,7 +224,7 @@ def _shown(comparison: Comparison, folder: Path, progress) -> bytes:
 class TechniqueResult:
     """Radiance of one technique on all samples, or on a subset (Q,) of them."""
 
-    shading: shading.Shading  # radiance (G, Q, 3) per pass
+    shading: shading.Shading  # radiance (G, Q, 3) per pass, a row a light group
     seconds: dict[str, float]  # per pass
     subset: np.ndarray | None  # (Q,) sorted indices of the samples that were evaluated, None for all
     unshadowed: shading.Shading | None = None  # the same without shadows, where `shading` has shadows
@@ -270,10 +270,9 @@ def _evaluate(name, table, extraction, shadows, options, progress) -> TechniqueR
 
 def _joined(shaded: dict[str, shading.Shading]) -> shading.Shading:
     """Several Shadings of one pass each as one Shading."""
-    first = next(iter(shaded.values()))
     passes = {name: getattr(part, name) for name, part in shaded.items()}
     error = shaded["specular"].quadrature_error if "specular" in shaded else None
-    return shading.Shading(first.groups, passes.get("specular"), passes.get("diffuse"), error)
+    return shading.Shading(passes.get("specular"), passes.get("diffuse"), error)
 
 
 def _samples_of_random_pixels(film: Film, limit: int) -> np.ndarray:
@@ -493,7 +492,7 @@ class Comparison:
         for (name, pass_name), image in self.images.items():
             layers[f"{name}.{pass_name}"] = image
             result = self.results[name]
-            groups = result.shading.groups
+            groups = lighting.light_groups(self.extraction.lights)
             if len(groups) > 1:
                 for group, values in zip(lighting.group_names(groups), self._radiance(result, pass_name), strict=True):
                     layers[f"{name}.{pass_name}@{group}"] = self._image(result, values)

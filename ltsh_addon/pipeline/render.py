@@ -559,7 +559,8 @@ def _taken(comparison: picture.Comparison, cycles, is_denoised: bool) -> dict[st
             share = np.where(is_taken, certain * weight, 0.0)
             values = comparison.extraction.picture.exposure * getattr(result.shading, name)
             own = map(comparison.film.image, values) if len(values) > 1 else (image,)
-            groups = {group: _share_of(share, one) for group, one in zip(result.shading.groups, own, strict=True)}
+            names = lighting.light_groups(comparison.extraction.lights)
+            groups = {group: _share_of(share, one) for group, one in zip(names, own, strict=True)}
             image = _share_of(share, image)
         found[name] = _DirectPass(image, groups, is_taken, certain, light, color, weight)
     return found

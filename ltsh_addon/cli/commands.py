@@ -16,8 +16,8 @@ from pathlib import Path
 
 from ..pipeline.baseline import Baseline
 from ..pipeline.batch import Merged, merge, run_tasks
+from ..pipeline.evaluation import prepare
 from ..pipeline.options import BakeOptions, PictureOptions, RenderOptions, ViewOptions, options_from, table
-from ..pipeline.picture import prepare
 from ..pipeline.tasks import BatchJob
 from ..scene import SHIPPED_TABLES, SceneError, error_line
 from ..shading import TableError
@@ -472,16 +472,17 @@ def do_job(job: BatchJob, arguments, bar, baseline: Baseline | None = None) -> t
 
     done = run_tasks(job, shard=shard, existing=arguments.existing, progress=bar, tell=tell)
     if shard[1] == 1:
-        if done.kept:
-            bar.remark(f"{done.kept} of {done.tasks} tasks were there already")
+        if done.finished_before:
+            bar.remark(f"{done.finished_before} of {done.tasks} tasks were there already")
         return merge_job(job.options.output, arguments, bar, baseline)
     bar.finish()
     text = f"{shard[0]}/{shard[1]}"
-    kept = f" ({done.kept} were there already)" if done.kept else ""
+    before = f" ({done.finished_before} were there already)" if done.finished_before else ""
     tasks = "1 task" if done.tasks == 1 else f"{done.tasks} tasks"
     _complain(bar, "problem", done.problems)
-    _print(f"shard {text}: {tasks} done{kept}; when all are: merge {job.options.output}", arguments, bar)
-    return {"shard": text, **vars(done)}, 1 if done.problems else 0
+    _print(f"shard {text}: {tasks} done{before}; when all are: merge {job.options.output}", arguments, bar)
+    facts = {"tasks": done.tasks, "done": done.done, "kept": done.finished_before, "problems": done.problems}
+    return {"shard": text, **facts}, 1 if done.problems else 0
 
 
 def merge_job(output: Path, arguments, bar, baseline: Baseline | None = None) -> tuple[dict, int]:
@@ -532,9 +533,10 @@ def _warnings(merged) -> list[str]:
 def _summary(merged: Merged, output) -> str:
     from ..pipeline import bake, picture, render, view
 
-    tables = {"bake": bake, "view": view, "render": render}.get(merged.command, picture)
+    wording = {"bake": bake, "view": view, "render": render}.get(merged.command, picture)
+    brief = render.brief if merged.command == "view" else wording.brief
     if merged.single and "reports" not in merged.report:
-        lines = tables.summary(merged.report, merged.seconds)
+        lines = wording.summary(merged.report, merged.seconds)
     else:
-        lines = [line for report in merged.report["reports"] for line in tables.brief(report)]
+        lines = [line for report in merged.report["reports"] for line in brief(report)]
     return "\n".join([*(line.rstrip() for line in lines), f"written to {output}"])

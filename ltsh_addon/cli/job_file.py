@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..pipeline import picture
+from ..pipeline.evaluation import load_tables
 from ..pipeline.tasks import BatchJob
 from ..reading import Malformed, read_toml
 from ..scene import SceneError, shortened
@@ -120,7 +120,7 @@ class _JobFileReader:
             job = self.job_of(arguments, scenes)
             for scene in scenes:
                 check_readable(scene)
-            picture.load_tables(arguments.techniques)
+            load_tables(arguments.techniques)
             return FileJob(job, arguments)
         except Misuse as error:
             self._complain(where, str(error))

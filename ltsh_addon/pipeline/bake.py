@@ -1,37 +1,25 @@
-"""Bakes: shades the texels of objects, block by block, into the files of `bake_files`."""
+"""Bakes: the objects of a scene, their files and report; `bake_object` shades the texels of each."""
 
 from __future__ import annotations
 
-import functools
-import itertools
-import math
 import shutil
 import time
-from collections import deque
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
-from dataclasses import replace
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import numpy as np
 
-from .. import imaging
-from ..cycles import uv
-from ..cycles.texels import NOT_BAKED, BakeMaterial, BakeView, TexelMesh, texel_samples
 from ..files import temporary_folder
 from ..reading import NUMBER, Malformed, check, file_name
-from ..scene import PASSES, REFERENCE, Cancelled, Film, Progress, SurfaceSamples, lights_of, listed
-from ..visibility import Occluders, ShadowSampling
-from ..workers.pool import cores
-from . import lighting, picture
-from .bake_files import ErrorPictures, ErrorSums, Planes
+from ..scene import PASSES, Progress, lights_of, listed
+from ..visibility import Occluders
+from . import lighting
+from .bake_object import ObjectBaker, applied_layer, bakes_centers_alone, block_rows, shaded_passes
+from .comparison import percent
+from .evaluation import check_named, prepare
 from .options import BAKE_PASSES, MARGIN_TYPES, TEXTURE_SIDES, BakeOptions, child_job
-from .picture import TaskResult, percent
-from .tasks import Records, contents_digest, file_stems, options_digest
+from .tasks import Records, TaskResult, contents_digest, file_stems, options_digest, versions, write_reports
 
-# BLOCK_TEXELS: texels that a thread shades at a time. The allocator reuses arrays of this size; larger ones would be
-# new memory each time.
-BLOCK_TEXELS = 1 << 18
 # NOTED_SHARE_OUTSIDE: a larger share of the UV map outside of the texture is reported. Less may come from texels along
 # the border, which count by their centers.
 NOTED_SHARE_OUTSIDE = 0.01
@@ -44,15 +32,12 @@ def bake_scene(options: BakeOptions, progress: Progress | None = None) -> dict:
     "problems"; the others are baked all the same. Only timing.json depends on the machine's speed. Raises SceneError,
     TableError, OSError, Cancelled, ValueError.
     """
-    made = bake_objects(options, progress)
-    document = made.report
-    if options.apply and document["objects"]:
-        document["applied"] = apply_textures(
-            options.scene, options.output, document["objects"], applied_layer(options), progress
-        )
-    imaging.write_json(options.output / "report.json", document)
-    imaging.write_json(options.output / "timing.json", {"seconds": made.seconds})
-    return {**document, "seconds": made.seconds}
+    result = bake_objects(options, progress)
+    report = result.report
+    if options.apply and report["objects"]:
+        layer = applied_layer(options)
+        report["applied"] = apply_textures(options.scene, options.output, report["objects"], layer, progress)
+    return write_reports(result, options.output)
 
 
 def bake_objects(
@@ -72,23 +57,23 @@ def bake_objects(
     start = time.perf_counter()
     _check(options)
     client.check_readable(options.scene)
-    picture.check_named(options.techniques, "a bake that is resumed")
-    tables = picture.prepare(options)
+    check_named(options.techniques, "a bake that is resumed")
+    tables = prepare(options)
     finished = TileRecords(options)
     with temporary_folder() as folder:
         manifest = client.extract_bake(_job(options, finished.finished, tile, following), folder, progress=progress)
         names = [record["name"] for record in manifest["objects"]]
-        found = file_stems(names) if options.name is None else [options.name]
+        stems = file_stems(names) if options.name is None else [options.name]
         records, files, seconds = [], [], {"blender": manifest["seconds"]}
         with _shadow_tracer(options, manifest, folder) as tracer:
-            for record, stem in zip(manifest["objects"], found, strict=True):
+            for record, stem in zip(manifest["objects"], stems, strict=True):
                 if record["problem"] is None:
                     (options.output / stem).parent.mkdir(parents=True, exist_ok=True)
                     baker = ObjectBaker(options, tables, manifest, record, folder / record["folder"], tracer)
-                    made = baker.bake(stem, [] if tile is None else [tile], finished, progress)
-                    records.append(made.report)
-                    files += made.files
-                    seconds |= made.seconds
+                    baked = baker.bake(stem, [] if tile is None else [tile], finished, progress)
+                    records.append(baked.report)
+                    files += baked.files
+                    seconds |= baked.seconds
                     shutil.rmtree(folder / record["folder"])
     document = _report(options, manifest, records)
     seconds["total"] = time.perf_counter() - start
@@ -133,315 +118,6 @@ def _job(options, finished, tile=None, following=()):
     )
 
 
-def block_rows(options) -> int:
-    """Rows of texels that are baked at a time."""
-    width, height = options.size
-    return max(1, min(height, BLOCK_TEXELS // width))
-
-
-def shaded_passes(options) -> set[str]:
-    """The passes of `shading.shade` from which the wanted passes follow; `diffuse_light` is shaded apart."""
-    wanted = set(options.passes)
-    if "combined" in wanted:
-        wanted |= {"specular", "diffuse"}
-    return wanted & {"specular", "diffuse"}
-
-
-class ObjectBaker:
-    """Bakes the tiles of one object, the `record` of the `manifest`, in blocks of rows from the bottom."""
-
-    def __init__(self, options, tables, manifest, record, folder, tracer=None):
-        self.options, self.tables, self.manifest, self.record, self.folder = options, tables, manifest, record, folder
-        self.lights, self.tracer = lights_of(manifest["lights"]), tracer
-        self.mesh = replace(TexelMesh.load(folder / "mesh.npz"), receiver=record["receiver"])
-        uv_maps = {name: folder / file for name, file in record["uv_maps"].items()}
-        self.materials = [BakeMaterial.of(material, folder.parent, uv_maps) for material in record["materials"]]
-        self.view = BakeView(**manifest["view"])
-        self.groups = tuple(dict.fromkeys(light.group for light in self.lights)) or ("",)
-        self.tiles, self.area = uv.tiles_of(self.mesh.uv)
-        self.compared = tuple(name for name in options.passes if name in shaded_passes(options) | {"combined"})
-        if not options.error:
-            self.compared = ()
-
-    def bake(self, stem: str, tiles: list[int], records: TileRecords, progress) -> TaskResult:
-        """Write the files of `tiles` (empty: all tiles), except those that `records` has as finished.
-
-        The report of the result is the object's entry in the whole report.
-        """
-        name, files, seconds = self.record["name"], [], {}
-        result = {"name": name, "uv": self.record["uv"], "outside": 0.0, "tiles": {}}
-        for tile in tiles or self.tiles:
-            file = f"{stem}{self._suffix(tile)}.exr"
-            start = time.perf_counter()
-            record = records.take(name, tile, file)
-            if record is None:
-                found, written = self._tile(tile, stem, progress)
-                record = records.write(name, tile, stem, written, found)
-            seconds[file] = time.perf_counter() - start
-            files += record["files"]
-            found = record["report"]
-            result["tiles"][str(tile)] = {"file": file, **found}
-            if self.area > 0.0:
-                baked = found["covered_times"] / math.prod(self.options.size)
-                result["outside"] = max(0.0, 1.0 - baked / self.area)
-        return TaskResult(result, seconds, tuple(files))
-
-    def _suffix(self, tile) -> str:
-        return "" if len(self.tiles) == 1 else f".{tile}"
-
-    def _tile(self, tile, stem, progress):
-        """Write the files of one tile; returns its record and the names of the files."""
-        options, file = self.options, f"{stem}{self._suffix(tile)}.exr"
-        path = options.output / file
-        errors, written = ErrorSums(), [file]
-        with self._planes(tile) as planes:
-            record = self._shade(tile, planes, errors, progress)
-            pictures = None
-            if self.compared:
-                pictures = ErrorPictures(*options.size, path, list(self.tables), list(self.compared))
-                named = [str(PurePosixPath(file).with_name(name)) for name in pictures.names]
-                record |= {"pictures": named, "errors": errors.report()}
-                written += named
-            texture = None
-            if options.apply:
-                record["texture"] = f"{stem}.{applied_layer(options)}{self._suffix(tile)}.exr"
-                texture = options.output / record["texture"], _applied_parts(options)
-                written.append(record["texture"])
-            planes.write(path, options.margin, self._metadata(tile), pictures, texture)
-        return record, written
-
-    def _planes(self, tile) -> Planes:
-        options, seams = self.options, None
-        if options.margin_type == "adjacent" and options.margin > 0:
-            seams = uv.UvSeams.of(self.mesh.uv, self.mesh.vertices, *options.size, _place(tile))
-        return Planes(self.folder / f"planes_{tile}", self.channels(), *options.size, seams)
-
-    def _shade(self, tile, planes, errors, progress) -> dict:
-        """Shade a tile block by block into `planes`; returns its counts of texels for the record."""
-        options, covered, covers, overlaps, unshaded, unbaked, lit = self.options, 0, 0, 0, 0, 0, False
-        is_unshaded = np.array([bool(reason) for reason in self.record["unshaded"]])
-        rows, height = block_rows(options), options.size[1]
-        points, spread = options.sub_samples, TilePoints(self, tile, self._threads())
-
-        def shaded(task):
-            return *task, self._block(spread, *task)
-
-        firsts, sums = range(0, height, rows), {}
-        tasks = ((first, point) for first in firsts for point in range(points))
-        for number, (first, point, found) in enumerate(_in_order(shaded, tasks, self._threads())):
-            sums = {name: sums[name] + values for name, values in found.items()} if point else found
-            if point == points - 1:
-                texels = spread.texels(first)
-                layers = {name: values / points for name, values in sums.items()}
-                halves = self._add_cycles(layers, tile, first, texels)
-                covered += len(texels.index)
-                covers += texels.covers
-                overlaps += texels.overlaps
-                unbaked += texels.unbaked
-                unshaded += int(is_unshaded[self.mesh.material[texels.triangle]].sum())
-                lit = lit or any(layers[f"{name}.{part}"].any() for name in self.tables for part in options.passes)
-                planes.put(first, min(rows, height - first), texels, _channels(layers))
-                for pass_name, (a, b) in halves.items():
-                    errors.add_halves(pass_name, a, b)
-                    for name in self.tables:
-                        errors.add(name, pass_name, layers[f"{name}.{pass_name}"], a, b)
-            share = (number + 1) / (len(firsts) * points)
-            if progress is not None and progress(f"shade {self.record['name']}", share) is False:
-                raise Cancelled("the bake was stopped")
-        found = {"texels": covered, "covered_times": covers, "overlapping_texels": overlaps}
-        return {**found, "unshaded_texels": unshaded, "unbaked_texels": unbaked, "is_lit": lit}
-
-    def _threads(self) -> int:
-        """Blocks to shade at a time: one with the reference, whose shading of a block takes all cores itself."""
-        return 1 if REFERENCE in self.tables.values() else cores()
-
-    def channels(self) -> list[str]:
-        """Names of the channels of the EXR, without the coverage."""
-        layers = [f"{name}.{pass_name}" for name in self.tables for pass_name in self.options.passes]
-        if len(self.groups) > 1:
-            layers += [f"{layer}@{group}" for layer in layers for group in lighting.group_names(self.groups)]
-        for pass_name in self.compared:
-            layers += [f"{image}.{pass_name}" for image in ("cycles", "cycles_A", "cycles_B")]
-            layers += [f"error_{name}.{pass_name}" for name in self.tables]
-        return [f"{layer}.{letter}" for layer in layers for letter in "RGB"]
-
-    def _block(self, spread, first, point) -> dict[str, np.ndarray]:
-        """Layers (Q, 3) of the Q texels of a block, shaded at one point of each texel."""
-        texels, maps, weights = spread.at(first, point)
-
-        def read_map(number):
-            return maps[number].reshape(-1, 3)[texels.index]
-
-        samples, texel = texel_samples(self.mesh, self.materials, texels, read_map, self.view, self.lights)
-        layers, shadows = {}, None
-        if self.tracer is not None:
-            options = self.options
-            passes = shaded_passes(options)
-            if "diffuse_light" in options.passes:
-                passes = passes | {"diffuse"}
-            rays = lighting.rays_of_point(options.shadow_rays, options.sub_samples)
-            workers = 1 if self._threads() > 1 else None
-            rows = min(block_rows(options), options.size[1] - first)
-            film = Film(options.size[0], rows, texels.index[texel])
-            sampling = ShadowSampling(sorted(passes), rays, film, is_baked=True)
-            shadows = self.tracer.trace(samples, sampling, workers=workers)
-        for name, table in self.tables.items():
-            for pass_name, radiance in self._passes(samples, texel, len(texels.index), table, shadows).items():
-                layers[f"{name}.{pass_name}"] = radiance.sum(axis=0)
-                if len(self.groups) > 1:
-                    for group, part in zip(lighting.group_names(self.groups), radiance, strict=True):
-                        layers[f"{name}.{pass_name}@{group}"] = part
-        return layers if weights is None else {name: values * weights[:, None] for name, values in layers.items()}
-
-    def _add_cycles(self, layers, tile, first, texels) -> dict[str, np.ndarray]:
-        """Add Cycles' bake and the signed errors to the `layers` (Q, 3); returns the halves of `_halves`."""
-        halves = self._halves(tile, first, texels)
-        for pass_name, (a, b) in halves.items():
-            mean = 0.5 * (a + b)
-            layers |= {f"cycles.{pass_name}": mean, f"cycles_A.{pass_name}": a, f"cycles_B.{pass_name}": b}
-            layers |= {f"error_{name}.{pass_name}": layers[f"{name}.{pass_name}"] - mean for name in self.tables}
-        return halves
-
-    def _halves(self, tile, first, texels) -> dict[str, np.ndarray]:
-        """Cycles' bake of the texels by pass: two independent halves (2, Q, 3)."""
-        halves = {}
-        for pass_name in shaded_passes(self.options) if self.compared else ():
-            baked = np.load(self.folder / f"cycles_{pass_name}_{tile}_{first}.npy")
-            halves[pass_name] = baked.reshape(2, -1, 3)[:, texels.index]
-        if "combined" in self.compared:
-            halves["combined"] = halves["specular"] + halves["diffuse"]
-        return {name: halves[name] for name in self.compared}
-
-    def _passes(self, samples: SurfaceSamples, texel, count, table, shadows) -> dict[str, np.ndarray]:
-        """Radiance (G, Q, 3) of the wanted passes of `count` texels."""
-        found = {}
-        wanted = tuple(sorted(shaded_passes(self.options), reverse=True))
-        workers = 1 if self._threads() > 1 else None
-        if wanted:
-            shaded = lighting.shade_lights(samples, self.lights, table, wanted, (shadows,), workers=workers)[0]
-            found = {name: _summed(getattr(shaded, name), texel, count) for name in wanted}
-        if "diffuse_light" in self.options.passes:
-            first = np.flatnonzero(np.concatenate([[True], texel[1:] != texel[:-1]])) if len(texel) else texel
-            white = replace(samples.take(first), diffuse_albedo=np.ones((len(first), 3)))
-            seen = None if shadows is None else shadows.take(first)
-            lit = lighting.shade_lights(white, self.lights, table, ("diffuse",), (seen,), workers=workers)[0]
-            found["diffuse_light"] = _summed(lit.diffuse, texel[first], count)
-        if "combined" in self.options.passes:
-            found["combined"] = found["specular"] + found["diffuse"]
-        return {name: found[name] for name in self.options.passes}
-
-    def _metadata(self, tile) -> dict[str, str]:
-        options, view = self.options, self.view
-        vector = ", ".join(f"{value:g}" for value in view.vector)
-        seen = {"above": "above the surface", "point": f"position {vector}", "direction": f"from direction {vector}"}
-        return {
-            "ltsh:scene": Path(options.scene).name,
-            "ltsh:object": self.record["name"],
-            "ltsh:uv": self.record["uv"],
-            "ltsh:tile": str(tile),
-            "ltsh:sub_samples": str(options.sub_samples),
-            "ltsh:frame": str(self.manifest["frame"]),
-            "ltsh:view": seen[view.kind] + (", bent as in Cycles' bake" if view.bent else ""),
-            "ltsh:camera": self.manifest["camera"],
-            "ltsh:color_space": self.manifest["color_space"]["name"] or "Linear Rec.709",
-            "ltsh:version": picture.versions(self.manifest["blender_version"])["ltsh"],
-        }
-
-
-class TilePoints:
-    """The points of the texels of a tile: those of `UvTriangles.spread`, or those at which maps were baked."""
-
-    def __init__(self, baker: ObjectBaker, tile: int, threads: int):
-        options = baker.options
-        self._options, self._folder, self._tile, self._mapped = options, baker.folder, tile, baker.record["maps"]
-        self._width = baker.manifest["sampled_texels"]
-        self._triangles = uv.UvTriangles.in_tile(baker.mesh.uv, *options.size, _place(tile))
-        self._at_centers = bakes_centers_alone(options, baker.record)
-        # The points of a block are shaded one after another, so few blocks need to be cached.
-        kept = functools.lru_cache(maxsize=2 + threads // options.sub_samples)
-        self.texels, self._weights_of = kept(self._covered), kept(self._fitted_weights)
-
-    def at(self, first: int, point: int):
-        """One point of the Q texels of the block from row `first` on.
-
-        Returns the texels at this point, the maps there (N, rows, W, 3; None without maps), and the weights (Q,) of
-        the point, 1 on average (None: all points count alike).
-        """
-        texels = self.texels(first)
-        if not self._mapped:
-            return self._triangles.spread(texels, point, self._options.sub_samples, self._width), None, None
-        maps = np.load(self._file(first, point))
-        if self._options.sub_samples == 1:
-            return texels, maps, None
-        places = self._places(texels, maps, first, point)
-        return self._triangles.at(texels, places), maps, self._weights_of(first).at(places)
-
-    def _covered(self, first):
-        rows = min(block_rows(self._options), self._options.size[1] - first)
-        texels = self._triangles.texels(first, rows, self._options.conservative and not self._at_centers)
-        if not self._at_centers:
-            return texels
-        of_pass = f"cycles_{sorted(shaded_passes(self._options))[0]}_{self._tile}_{first}.npy"
-        baked = np.load(self._file(first, 0) if self._mapped else self._folder / of_pass, mmap_mode="r")
-        return texels.baked(baked[0].reshape(-1, 3)[texels.index, 0] != np.float32(NOT_BAKED))
-
-    def _file(self, first, point):
-        return self._folder / f"maps_{self._tile}_{first}_{point}.npy"
-
-    def _places(self, texels, maps, first, point):
-        """Places (Q, 2) in the texture, in texels, at which the maps of a point were baked."""
-        if point == 0:
-            return self._triangles.places(texels)
-        rows, width = maps.shape[1:3]
-        return maps[-1].reshape(-1, 3)[texels.index, :2] * (width, rows) + (0, first)
-
-    def _fitted_weights(self, first):
-        texels, points = self.texels(first), range(self._options.sub_samples)
-        maps = ((np.load(self._file(first, point), mmap_mode="r"), point) for point in points)
-        places = (self._places(texels, of_point, first, point) for of_point, point in maps)
-        return uv.PointWeights.of(self._triangles, texels, places, self._width)
-
-
-def bakes_centers_alone(options: BakeOptions, record: dict) -> bool:
-    """True where an object needs Cycles' own bake, which has only texels whose centers are covered."""
-    return record["maps"] or options.error
-
-
-def _place(tile: int) -> tuple[int, int]:
-    """Column and row of a UDIM tile."""
-    return (tile - 1001) % 10, (tile - 1001) // 10
-
-
-def _in_order(function, items, threads: int):
-    """Yield function(item) in the order of `items`, computed by `threads` threads."""
-    with ThreadPoolExecutor(threads) as pool:
-        waiting, items = deque(), iter(items)
-        try:
-            for item in itertools.islice(items, threads):
-                waiting.append(pool.submit(function, item))
-            while waiting:
-                found = waiting.popleft().result()
-                for item in itertools.islice(items, 1):
-                    waiting.append(pool.submit(function, item))
-                yield found
-        finally:
-            for future in waiting:
-                future.cancel()
-
-
-def _channels(layers) -> dict[str, np.ndarray]:
-    """Channel values (Q,) by name, from layers (Q, 3)."""
-    return {f"{name}.{letter}": pixels[:, n] for name, pixels in layers.items() for n, letter in enumerate("RGB")}
-
-
-def _summed(radiance, texel, count):
-    """Radiance (G, count, 3) of texels: the sums over their samples (G, S, 3)."""
-    if len(texel) == count:
-        return radiance
-    first = np.flatnonzero(np.concatenate([[True], texel[1:] != texel[:-1]])) if len(texel) else texel
-    return np.add.reduceat(radiance, first, axis=1)
-
-
 class TileRecords:
     """Records of finished tiles: reads those of the same job (with `resume`) and writes new ones.
 
@@ -463,20 +139,6 @@ class TileRecords:
     def write(self, name: str, tile: int, stem: str, files, report: dict) -> dict:
         """Write the record of a finished tile; returns it."""
         return self._records.write(f"{stem}.{tile}", self._key, {"object": name, "tile": tile}, files, report=report)
-
-
-def applied_layer(options) -> str:
-    """The layer that `apply` shows: the first technique's combined light, or its first pass where only one is baked."""
-    parts = _applied_parts(options)
-    return parts[0] if len(parts) == 1 else f"{parts[0].rpartition('.')[0]}.combined"
-
-
-def _applied_parts(options) -> list[str]:
-    """The layers whose sum `apply` shows."""
-    names = [name for name in PASSES if name in options.passes]
-    if "combined" in options.passes or len(names) < len(PASSES):
-        names = ["combined"] if "combined" in options.passes else options.passes[:1]
-    return [f"{next(iter(picture.technique_names(options.techniques)))}.{name}" for name in names]
 
 
 def apply_textures(scene: Path, output: Path, records: list[dict], layer: str, progress=None) -> str:
@@ -539,7 +201,7 @@ def _report(options, manifest, records) -> dict:
         "objects": records,
         "problems": problems,
         "warnings": warnings,
-        "versions": picture.versions(manifest["blender_version"]),
+        "versions": versions(manifest["blender_version"]),
     }
 
 
@@ -564,10 +226,10 @@ _TILE = {
 _TILE_RECORD = {"task": {"object": str, "tile": int}, "report": _TILE}
 
 
-def _tiles(value, place) -> None:
-    check(value, {str: {**_TILE, "file": file_name}}, place)
+def _tiles(value, name) -> None:
+    check(value, {str: {**_TILE, "file": file_name}}, name)
     if wrong := [number for number in value if not number.isdecimal()]:
-        raise Malformed(f"{place} has {wrong[0]!r}, expected the number of a tile")
+        raise Malformed(f"{name} has {wrong[0]!r}, expected the number of a tile")
 
 
 # What `merge` and a summary need in a report (see `reading.check`).
@@ -580,19 +242,19 @@ REPORT = {
 
 def summary(report: dict, seconds: dict) -> list[str]:
     """Lines of text about the bake of one scene, camera and frame: a line per file, and the errors if there are any."""
-    found = []
+    lines = []
     for record in report["objects"]:
         for tile in record["tiles"].values():
             took = seconds.get(tile["file"])
             seconds_text = f"{took:>8.2f} s" if isinstance(took, NUMBER) else ""
-            found.append(f"{tile['file']:<40}{tile['texels']:>10} texels{seconds_text}")
+            lines.append(f"{tile['file']:<40}{tile['texels']:>10} texels{seconds_text}")
             for pass_name, figures in tile.get("errors", {}).items():
                 for name, error in figures["techniques"].items():
                     in_noise = (error.get("unbiased_squared_error") or 0.0) < 0.0
                     beside = "in noise" if in_noise else percent(error.get("unbiased_error"))
                     noise = f"(noise {percent(figures.get('noise'))})"
-                    found.append(f"  {name + '.' + pass_name:<30}{beside:>10} beside Cycles {noise}")
-    return found
+                    lines.append(f"  {name + '.' + pass_name:<30}{beside:>10} beside Cycles {noise}")
+    return lines
 
 
 def brief(report: dict) -> list[str]:

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..reading import Malformed, check, read_json
-from .picture import REPORT, percent
+from .comparison import percent
+from .picture import REPORT
 
 # Facts that two comparisons must share for their errors to be comparable.
 _SAME = ("resolution", "sub_samples", "cycles_samples", "surface_samples", "reference")

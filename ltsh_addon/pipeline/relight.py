@@ -1,4 +1,4 @@
-"""`relight`: kept pictures with changed powers and colors of their lights, without tracing a ray."""
+"""`relight`: finished or shaded pictures with changed powers and colors of their lights, without tracing a ray."""
 
 from __future__ import annotations
 
@@ -10,9 +10,12 @@ import numpy as np
 
 from .. import imaging
 from ..scene import AreaLight, Progress, SurfaceSamples, listed
-from . import picture
-from .lighting import RELIGHT_SUFFIX, RelightData, shade_lights
+from .comparison import Comparison
+from .evaluation import evaluated, prepare
+from .layers import COMBINED, REST, layer_name, parse_layer_name
+from .lighting import shade_lights
 from .options import PictureOptions
+from .relight_data import RELIGHT_SUFFIX, RelightData
 
 NO_CYCLES = "Cycles' picture and the errors beside it are left out: they show the lights as they were"
 SAME_REST = "bounced light{}, and all else that Cycles has rendered, is as the lights were; there is no PNG"
@@ -22,7 +25,7 @@ GRAIN = (
     "the picture anew to be rid of it"
 )
 SAME_GLOW = "what glows, lights in sight and the background are seen as the lights were; there is no PNG"
-KEPT_WEIGHTS = (
+SAME_WEIGHTS = (
     "{} of {} samples, between the horizons of their face and of its smooth normal, weigh both as the lights were; "
     "render the picture again for the last digits there"
 )
@@ -52,82 +55,82 @@ def relight(
     *,
     solo: Sequence[str] = (),
 ) -> dict:
-    """Write the pictures whose samples are kept in `folder` into `output`, with changed lights.
+    """Write the pictures whose samples are in `folder` into `output`, with changed lights.
 
     Where there are `solo` lights, all others are dark. Files and layers keep their names; those of Cycles are left
     out. Returns the report of the only picture, else {"reports": [...]}. Raises ValueError for an unknown light or
-    where nothing was kept, OSError, TableError.
+    where there is no picture, OSError, TableError.
     """
     folder, output = Path(folder), Path(output)
     files = sorted(folder.rglob(f"*{RELIGHT_SUFFIX}"))
     if not files:
         fix = "run shade, compare or render with --keep-visibility"
         raise ValueError(f"{folder}: no picture kept its samples there; {fix}")
-    reports = [_relit(path, path.relative_to(folder), (changes, solo), output, progress) for path in files]
+    reports = []
+    for path in files:
+        data = RelightData.load(path)
+        name = path.relative_to(folder).as_posix().removesuffix(RELIGHT_SUFFIX)
+        changed = [*changes, *others_muted(data.extraction.lights, solo)]
+        reports.append(_relit(data, changed, PictureOptions(output=output, name=name, **data.options), progress))
     report = reports[0] if len(reports) == 1 else {"reports": reports}
     imaging.write_json(output / "report.json", report)
     return report
 
 
-def _relit(path: Path, place: Path, wanted, output: Path, progress) -> dict:
-    """Write the picture whose samples are in `path`, at the same `place` below `output`; returns its report."""
-    kept = RelightData.load(path)
-    changes = [*wanted[0], *others_muted(kept.extraction.lights, wanted[1])]
-    lights = changed_lights(kept.extraction.lights, changes)
-    if kept.shadows is not None:
-        _check_shared(kept, lights)
-    name = place.as_posix().removesuffix(RELIGHT_SUFFIX)
-    options = PictureOptions(output=output, name=name, **kept.options)
-    tables = picture.prepare(options)
-    warnings = kept.extraction.warnings + ((SAME_GLOW,) if kept.extraction.rest is not None else ())
-    warnings += (NO_CYCLES,) if kept.had_cycles else ()
-    if split := _split_at_horizons(kept.extraction.samples):
-        warnings += (KEPT_WEIGHTS.format(split, len(kept.extraction.samples)),)
-    extraction = replace(kept.extraction, lights=lights, warnings=warnings)
-    results = picture.evaluated(tables, extraction, kept.shadows, options, progress)
-    comparison = picture.Comparison(options, extraction, results, kept.shadows)
-    if kept.rest:
-        groups = [repr(group) for group in kept.rest if group]
+def _relit(data: RelightData, changes: Sequence[LightChange], options: PictureOptions, progress) -> dict:
+    """Write the picture of `data` with `changes` of its lights; returns its report."""
+    extraction = data.extraction
+    lights = changed_lights(extraction.lights, changes)
+    if data.shadows is not None:
+        _check_shared(data, lights)
+    tables = prepare(options)
+    warnings = extraction.warnings + ((SAME_GLOW,) if extraction.rest is not None else ())
+    warnings += (NO_CYCLES,) if data.had_cycles else ()
+    if split := _split_at_horizons(extraction.samples):
+        warnings += (SAME_WEIGHTS.format(split, len(extraction.samples)),)
+    extraction = replace(extraction, lights=lights, warnings=warnings)
+    results = evaluated(tables, extraction, data.shadows, options, progress)
+    comparison = Comparison(options, extraction, results, data.shadows)
+    if data.rest:
+        groups = [repr(group) for group in data.rest if group]
         warnings += (SAME_REST.format(BUT_GROUPS.format(listed(groups)) if groups else ""),)
-        warnings += (GRAIN,) if kept.extraction.has_lens else ()
-        name = kept.technique
-        rest = _changed_rest(kept, lights, tables[name], results[name].shading, progress)
+        warnings += (GRAIN,) if extraction.has_lens else ()
+        rest = _changed_rest(data, lights, tables[data.technique], results[data.technique].shading, progress)
         extraction = replace(extraction, warnings=warnings)
-        comparison = _Finished(options, extraction, results, kept.shadows, kept, rest)
+        comparison = _FinishedComparison(options, extraction, results, data.shadows, data, rest)
     changed = [{"light": change.name, **{key: value for key, value in asdict(change).items() if key != "name"}}
                for change in changes]  # fmt: skip
     report = {**comparison.report(), "relit": changed}
-    return {"files": comparison.write(output, report, False, progress), **report}
+    return {"files": comparison.write(options.output, report, False, progress), **report}
 
 
 @dataclass(frozen=True)
-class _Finished(picture.Comparison):
-    """A finished picture: our passes, and Cycles' `rest` (H, W, 4)."""
+class _FinishedComparison(Comparison):
+    """A finished picture: LTSH's passes, and Cycles' `rest` (H, W, 4)."""
 
-    kept: RelightData | None = None
+    data: RelightData | None = None
     rest: np.ndarray | None = None
 
     def layers(self) -> dict[str, np.ndarray | imaging.Layer]:
-        found = {}
+        planes = {}
         for name, pixels in super().layers().items():
-            technique, _, part = name.partition(".")
-            pass_name = part.partition("@")[0]
+            technique, pass_name, _ = parse_layer_name(name)
             if technique in self.results and pass_name in self.options.passes:
-                found[name] = pixels * self.kept.shown(pass_name)
+                planes[name] = pixels * self.data.shown(pass_name)
         combined = self.rest.copy()
         for pass_name in self.options.passes:
-            combined[..., :3] += found[f"{self.kept.technique}.{pass_name}"]
-        return {"combined": combined, **found, "rest": self.rest}
+            combined[..., :3] += planes[layer_name(self.data.technique, pass_name)]
+        return {COMBINED: combined, **planes, REST: self.rest}
 
 
-def _changed_rest(kept: RelightData, lights: Sequence[AreaLight], table, shaded, progress) -> np.ndarray:
+def _changed_rest(data: RelightData, lights: Sequence[AreaLight], table, shaded, progress) -> np.ndarray:
     """Cycles' rest (H, W, 4) under the changed `lights`: the bounced light of a group scales with its direct light.
 
     `shaded` is the direct light of the changed lights by `table`.
     """
-    rest, before = kept.rest[""].copy(), None
-    for group, bounced in kept.rest.items():
-        pairs = [pair for pair in zip(kept.extraction.lights, lights, strict=True) if pair[0].group == group]
+    rest, before = data.rest[""].copy(), None
+    for group, bounced in data.rest.items():
+        pairs = [pair for pair in zip(data.extraction.lights, lights, strict=True) if pair[0].group == group]
         if group == "" or not pairs:
             rest[..., :3] += 0.0 if group == "" else bounced[..., :3]
             continue
@@ -136,19 +139,19 @@ def _changed_rest(kept: RelightData, lights: Sequence[AreaLight], table, shaded,
         if np.ptp(factors, axis=0).any():
             if before is None:
                 report = None if progress is None else (lambda fraction: progress("lights", fraction))
-                own = kept.extraction.samples, kept.extraction.lights, table, kept.options["passes"]
-                (before,) = shade_lights(*own, (kept.shadows,), progress=report)
-            now, then = (_light_of_group(kept, one, group) for one in (shaded, before))
+                unchanged = data.extraction.samples, data.extraction.lights, table, data.options["passes"]
+                (before,) = shade_lights(*unchanged, (data.shadows,), progress=report)
+            now, then = (_light_of_group(data, one, group) for one in (shaded, before))
             factor = np.divide(now, then, out=factor, where=then > 0.0)
         rest[..., :3] += factor * bounced[..., :3]
     return rest
 
 
-def _light_of_group(kept: RelightData, shaded, group: str) -> np.ndarray:
+def _light_of_group(data: RelightData, shaded, group: str) -> np.ndarray:
     """Direct light (3,) of a light group, summed over the picture."""
-    number, film = shaded.groups.index(group), kept.extraction.film
-    images = {name: film.image(getattr(shaded, name)[number]) for name in kept.options["passes"]}
-    return sum((kept.shown(name) * image).sum(axis=(0, 1)) for name, image in images.items())
+    number, film = shaded.groups.index(group), data.extraction.film
+    images = {name: film.image(getattr(shaded, name)[number]) for name in data.options["passes"]}
+    return sum((data.shown(name) * image).sum(axis=(0, 1)) for name, image in images.items())
 
 
 def others_muted(lights: Sequence[AreaLight], solo: Sequence[str]) -> list[LightChange]:
@@ -176,56 +179,54 @@ def _split_at_horizons(samples: SurfaceSamples) -> int:
     return int((same[0] & same[1] & same[2] & ~same[3]).sum())
 
 
-def _check_shared(kept: RelightData, lights: Sequence[AreaLight]) -> None:
+def _check_shared(data: RelightData, lights: Sequence[AreaLight]) -> None:
     """Raise ValueError where lights that share their shadow rays are changed differently."""
-    before = kept.extraction.lights
-    for own in kept.shadows.numbers:
-        first = own[0]
-        for number in own[1:] if not before[first].is_distant else ():
+    before = data.extraction.lights
+    for first, *others in data.shadows.numbers:
+        for number in others if not before[first].is_distant else ():
             expected = before[number].radiance.sum() * lights[first].radiance
             if not np.allclose(lights[number].radiance * before[first].radiance.sum(), expected, rtol=1e-2):
                 names = " and ".join(repr(before[each].name) for each in (first, number))
                 raise ValueError(
-                    f"lights {names} are two of {len(own)} that share their shadow rays, expected the same change for "
-                    "all of them: change them in Blender and run the picture again, or give them light groups first"
+                    f"lights {names} are two of {1 + len(others)} that share their shadow rays, expected the same "
+                    "change for all of them: change them in Blender and run the picture again, or give them light groups first"
                 )
 
 
 def changed_lights(lights: Sequence[AreaLight], changes: Sequence[LightChange]) -> tuple[AreaLight, ...]:
     """`lights` with all `changes`. Raises ValueError for an unknown light."""
     names = list(dict.fromkeys(light.name for light in lights))
-    found = list(lights)
+    changed = list(lights)
     for change in changes:
         _check_known(change.name, names)
-        own = [light for light in lights if light.name == change.name]
-        factor = change.factor * _tint(own, change)
-        found = [_scaled(light, factor) if light.name == change.name else light for light in found]
-    return tuple(found)
+        factor = change.factor * _tint([light for light in lights if light.name == change.name], change)
+        changed = [_scaled(light, factor) if light.name == change.name else light for light in changed]
+    return tuple(changed)
 
 
-def _tint(own: list[AreaLight], change: LightChange) -> np.ndarray:
-    """Factor (3,) of the radiance that gives the lights `own` the color of `change`. Raises ValueError."""
+def _tint(lights: list[AreaLight], change: LightChange) -> np.ndarray:
+    """Factor (3,) of the radiance that gives the `lights` the color of `change`. Raises ValueError."""
     if change.color is None:
         return np.ones(3)
-    color = own_color(own)
+    color = color_of(lights)
     missing = [channel for channel, value in zip(("red", "green", "blue"), color, strict=True) if value == 0.0]
     if missing and any(change.color[("red", "green", "blue").index(channel)] for channel in missing):
         raise ValueError(f"light {change.name!r} has no {' and no '.join(missing)}: render it anew to give it some")
     return tint(color, change.color)
 
 
-def own_color(lights: Sequence[AreaLight]) -> np.ndarray:
+def color_of(lights: Sequence[AreaLight]) -> np.ndarray:
     """The color (3,) of the mean radiance of `lights`, its brightest channel 1; white where they are dark."""
     weights = [np.linalg.norm(light.area_vector) for light in lights]
     mean = np.average([light.radiance for light in lights], axis=0, weights=weights)
     return mean / np.max(np.abs(mean)) if mean.any() else np.ones(3)
 
 
-def tint(own: np.ndarray, color: Sequence[float]) -> np.ndarray:
-    """Factor (3,) from the color `own` to `color`; 0 in channels where `own` is 0."""
-    return np.divide(color, own, out=np.zeros(3), where=np.asarray(own) != 0.0)
+def tint(before: np.ndarray, color: Sequence[float]) -> np.ndarray:
+    """Factor (3,) from the color `before` to `color`; 0 in channels where `before` is 0."""
+    return np.divide(color, before, out=np.zeros(3), where=np.asarray(before) != 0.0)
 
 
 def _scaled(light: AreaLight, factor: np.ndarray) -> AreaLight:
-    detail = tuple(_scaled(part, factor) for part in light.detail)
+    detail = tuple(_scaled(patch, factor) for patch in light.detail)
     return replace(light, radiance=light.radiance * factor, detail=detail)

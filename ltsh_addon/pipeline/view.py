@@ -11,15 +11,17 @@ import numpy as np
 from .. import imaging
 from ..files import temporary_folder, write_bytes
 from ..imaging.color import identified
-from ..scene import SHIPPED_TABLES, VERSION, Cancelled, Progress
-from . import picture
+from ..scene import SHIPPED_TABLES, Progress
+from .evaluation import prepare
+from .layers import COVERAGE, layer_name, metadata
 from .options import ViewOptions, child_job
+from .tasks import TaskResult, check_before_writing, versions
 
 # Names of times in a report, and in the seconds of a task.
 TIMES = {"draw_s": "draw", "refined_s": "refined"}
 
 
-def draw_view(options: ViewOptions, progress: Progress | None = None) -> picture.TaskResult:
+def draw_view(options: ViewOptions, progress: Progress | None = None) -> TaskResult:
     """Draw a scene as the viewport does and write its EXR and PNG.
 
     The seconds have "draw": the median of a redraw with the first technique, without rays; "shadows": all rays; and
@@ -28,37 +30,33 @@ def draw_view(options: ViewOptions, progress: Progress | None = None) -> picture
     from ..blender.process import client
 
     start = time.perf_counter()
-    tables = picture.prepare(options)
+    tables = prepare(options)
     width, height = options.resolution or (None, None)
     given = tuple(name if name in SHIPPED_TABLES else str(Path(name).absolute()) for name in options.techniques)
     job = child_job(client.ViewJob, options, width=width, height=height, techniques=given)
     with temporary_folder() as folder:
         manifest = client.draw_view(job, folder, progress=progress)
         pictures = {
-            name: {part: np.load(folder / f"{number}_{part}.npy") for part in client.VIEW_PASSES}
+            name: {pass_name: np.load(folder / f"{number}_{pass_name}.npy") for pass_name in client.VIEW_PASSES}
             for number, name in enumerate(tables)
         }
         shown = (folder / client.VIEW_PNG).read_bytes()
-    if progress is not None and progress("write", 0.0) is False:
-        raise Cancelled("stopped before the files were written")
+    check_before_writing(progress)
     coverage = next(iter(pictures.values()))["diffuse"][..., 3]
     report = _report(options, tables, manifest, coverage)
     name = options.name or "view"
-    layers = {f"{technique}.{part}": image[..., :3] for technique, found in pictures.items()
-              for part, image in found.items()}  # fmt: skip
-    layers["coverage.hit"] = imaging.Layer(coverage, "V")
+    layers = {
+        layer_name(technique, pass_name): image[..., :3]
+        for technique, images in pictures.items()
+        for pass_name, image in images.items()
+    }
+    layers[COVERAGE] = imaging.Layer(coverage, "V")
     path = options.output / f"{name}.exr"
     path.parent.mkdir(parents=True, exist_ok=True)
     color_space = identified(manifest["color_space"]["to_rec709"], manifest["color_space"]["name"])
-    metadata = {
-        "ltsh:scene": Path(options.scene).name,
-        "ltsh:frame": str(manifest["frame"]),
-        "ltsh:camera": manifest["camera"],
-        "ltsh:version": VERSION,
-        "ltsh:exposure": repr(manifest["exposure"]),
-        "ltsh:color_space": color_space.name,
-    }
-    imaging.write_layers(path, layers, metadata, imaging.chromaticities(color_space), manifest["pixel_aspect"])
+    facts = manifest["frame"], manifest["camera"], color_space.name
+    described = metadata(options.scene, *facts, exposure=repr(manifest["exposure"]))
+    imaging.write_layers(path, layers, described, imaging.chromaticities(color_space), manifest["pixel_aspect"])
     write_bytes(path.with_suffix(".png"), shown)
     redraws = {name: statistics.median(times) for name, times in zip(tables, manifest["redraws"], strict=True)}
     draw, shadows = next(iter(redraws.values())), (manifest["shadows"] or {"seconds": 0.0})["seconds"]
@@ -70,11 +68,12 @@ def draw_view(options: ViewOptions, progress: Progress | None = None) -> picture
         "techniques": {name: {"redraw": median} for name, median in redraws.items()},
         "total": time.perf_counter() - start,
     }
-    return picture.TaskResult(report, seconds, (f"{name}.exr", f"{name}.png"))
+    return TaskResult(report, seconds, (f"{name}.exr", f"{name}.png"))
 
 
 def _report(options: ViewOptions, tables, manifest: dict, coverage: np.ndarray) -> dict:
     """The report of a view: the entries of a picture's report that a view has, and "graphics"."""
+    shadows = manifest["shadows"]
     return {
         "scene": str(options.scene),
         "camera": manifest["camera"],
@@ -88,22 +87,17 @@ def _report(options: ViewOptions, tables, manifest: dict, coverage: np.ndarray) 
         "surface_samples": int(np.count_nonzero(coverage)),
         "cycles_samples": 0,
         "lights": manifest["lights"],
-        "versions": picture.versions(manifest["blender_version"]),
+        "versions": versions(manifest["blender_version"]),
         "graphics": manifest["graphics"],
         "tables": dict(zip(tables, options.techniques, strict=True)),
         "reference": None,
-        "shadows": _shadow_facts(manifest["shadows"]),
+        "shadows": shadows and {name: shadows[name] for name in ("rays", "noise", "tracer")},
         "passes": {
             name: {"techniques": {table: {} for table in tables}} for name in ("combined", "specular", "diffuse")
         },
         "problems": [],
         "warnings": manifest["warnings"],
     }
-
-
-def _shadow_facts(found: dict | None) -> dict | None:
-    """The entry of the report about shadows."""
-    return None if found is None else {name: found[name] for name in ("rays", "noise", "tracer")}
 
 
 def with_times(report: dict, seconds: dict) -> dict:
@@ -128,8 +122,3 @@ def summary(report: dict, seconds: dict) -> list[str]:
         else ""
     )
     return [f"{report['resolution'][0]}x{report['resolution'][1]} on {report['graphics']}{took}"]
-
-
-def brief(report: dict) -> list[str]:
-    """One line about a view of several."""
-    return [f"{report['name']:<32} frame {report['frame']}, camera {report['camera']}"]

@@ -16,9 +16,10 @@ import bpy
 import numpy as np
 from bpy.app.handlers import persistent
 
-from ...pipeline.lighting import RelightData, shade_lights, trace_shadows
+from ...pipeline.lighting import shade_lights, trace_shadows
 from ...pipeline.mixer import LightPictures, light_pictures
 from ...pipeline.options import RenderOptions
+from ...pipeline.relight_data import RelightData
 from ...pipeline.render import finish
 from ...scene import PASSES, SHIPPED_TABLES, TECHNIQUES, Cancelled, Progress, SceneError, error_line
 from ...shading import TableError

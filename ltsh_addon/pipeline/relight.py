@@ -189,8 +189,8 @@ def _check_shared(data: RelightData, lights: Sequence[AreaLight]) -> None:
                 names = " and ".join(repr(before[each].name) for each in (first, number))
                 raise ValueError(
                     f"lights {names} are two of {1 + len(others)} that share their shadow rays, expected the same "
-                    "change for all of them: change them in Blender and run the picture again, or give them light groups "
-                    "first"
+                    "change for all of them: change them in Blender and run the picture again, or give them light "
+                    "groups first"
                 )
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from ..pipeline.baseline import Baseline
 from ..pipeline.batch import Merged, merge, run_tasks
-from ..pipeline.evaluation import prepare
+from ..pipeline.lighting import prepare
 from ..pipeline.options import BakeOptions, PictureOptions, RenderOptions, ViewOptions, options_from, table
 from ..pipeline.tasks import BatchJob
 from ..scene import SHIPPED_TABLES, SceneError, error_line
@@ -290,7 +290,7 @@ def _steps(text: str) -> float:
 def _color(text: str) -> tuple[float, ...]:
     """Three numbers."""
     try:
-        values = tuple(float(part) for part in text.split(","))
+        values = tuple(float(number) for number in text.split(","))
     except ValueError:
         values = ()
     if len(values) != 3 or not all(0.0 <= value < 1e12 for value in values):
@@ -364,13 +364,13 @@ def _run_jobs(arguments, bar, open_file) -> int:
 
 def job_parsers() -> dict[str, argparse.ArgumentParser]:
     """Parsers of the commands that a job file may have."""
-    found = {}
+    parsers = {}
     adders = {"shade": add_shade, "compare": add_compare, "bake": add_bake, "view": add_view, "render": add_render}
     for name, add_arguments in adders.items():
-        found[name] = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-        add_arguments(found[name])
-        found[name].set_defaults(command=name)
-    return found
+        parsers[name] = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+        add_arguments(parsers[name])
+        parsers[name].set_defaults(command=name)
+    return parsers
 
 
 def _for_each(jobs: list[FileJob], do, arguments, bar) -> int:

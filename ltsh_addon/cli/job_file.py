@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..pipeline.evaluation import load_tables
+from ..pipeline.lighting import load_tables
 from ..pipeline.tasks import BatchJob
 from ..reading import Malformed, read_toml
 from ..scene import SceneError, shortened
@@ -193,8 +193,8 @@ class _JobFileReader:
     def _complain(self, where: str, text: str, of_the_world: bool = False) -> None:
         """Note a mistake; `where` is "job 2", "defaults", or "" for the file as a whole."""
         self.of_the_world &= of_the_world
-        place = f"{self.path}, {where}" if where else str(self.path)
-        self.mistakes.append(f"{place}: {shortened(' '.join(text.split()), 500)}")
+        subject = f"{self.path}, {where}" if where else str(self.path)
+        self.mistakes.append(f"{subject}: {shortened(' '.join(text.split()), 500)}")
 
 
 def _options(parser) -> dict[str, argparse.Action]:

@@ -16,7 +16,7 @@ from ..visibility import Occluders
 from . import lighting
 from .bake_object import ObjectBaker, applied_layer, bakes_centers_alone, block_rows, shaded_passes
 from .comparison import percent
-from .evaluation import check_named, prepare
+from .lighting import check_named, prepare
 from .options import BAKE_PASSES, MARGIN_TYPES, TEXTURE_SIDES, BakeOptions, child_job
 from .tasks import Records, TaskResult, contents_digest, file_stems, options_digest, versions, write_reports
 

@@ -121,9 +121,9 @@ class Planes:
         shows with weights (Q, 4). `source` are the nearest covered texels of `target`."""
         height, width = self.shape
         points, near = (np.stack([index % width, index // width], axis=-1) for index in (target, source))
-        which, place, island = self._seams.reflected(points + 0.5, near)
-        corner = np.floor(place - 0.5)
-        share = place - 0.5 - corner
+        which, position, island = self._seams.reflected(points + 0.5, near)
+        corner = np.floor(position - 0.5)
+        share = position - 0.5 - corner
         index, weights = np.empty((len(which), 4), np.int64), np.empty((len(which), 4), np.float32)
         for number, (x, y) in enumerate(((0, 0), (1, 0), (0, 1), (1, 1))):
             column, row = corner[:, 0] + x, corner[:, 1] + y
@@ -134,8 +134,8 @@ class Planes:
         # Drop texels of other islands, and those that no face covers.
         weights[self._at(_OWNER, index, np.int32) != 1 + island[:, None]] = 0.0
         total = weights.sum(axis=1)
-        found = np.flatnonzero(total > 1e-3)
-        return which[found], index[found], weights[found] / total[found, None]
+        shown = np.flatnonzero(total > 1e-3)
+        return which[shown], index[shown], weights[shown] / total[shown, None]
 
 
 class ErrorSums:
@@ -159,7 +159,7 @@ class ErrorSums:
 
     def report(self) -> dict:
         """Per pass: the noise of Cycles, and for each technique its bias and its error without that noise."""
-        found = {}
+        report = {}
         for pass_name, (norm, difference, total, light) in self._halves.items():
             techniques = {}
             for (name, of_pass), (product, shaded) in self._products.items():
@@ -171,8 +171,8 @@ class ErrorSums:
                         "bias": shaded / light - 1.0 if light > 0.0 else None,
                     }
             noise = math.sqrt(difference / total) if total > 0.0 else None
-            found[pass_name] = {"noise": noise, "techniques": techniques}
-        return found
+            report[pass_name] = {"noise": noise, "techniques": techniques}
+        return report
 
 
 class ErrorPictures:
@@ -229,11 +229,11 @@ def nearest_covered(coverage: np.ndarray, margin: int) -> tuple[np.ndarray, np.n
         row = rows + step
         inside = (row >= 0) & (row < height)
         row = np.clip(row, 0, height - 1)
-        found = column[row, columns]
-        distance = (found - columns).astype(np.int64) ** 2 + step * step
-        better = inside & (found >= 0) & (distance < best)
+        nearest = column[row, columns]
+        distance = (nearest - columns).astype(np.int64) ** 2 + step * step
+        better = inside & (nearest >= 0) & (distance < best)
         best[better] = distance[better]
-        source[better] = row[better] * width + found[better]
+        source[better] = row[better] * width + nearest[better]
     reached = source >= 0
     return (rows * width + columns)[reached], source[reached]
 
@@ -243,17 +243,17 @@ def _nearest_in_row(coverage, margin):
     height, width = coverage.shape
     columns = np.arange(width, dtype=np.int32)
     far = np.int32(width + 2 * margin + 2)
-    left = np.maximum.accumulate(np.where(coverage, columns, -far), axis=1)
-    right = np.minimum.accumulate(np.where(coverage, columns, 2 * far)[:, ::-1], axis=1)[:, ::-1]
-    to_left, to_right = columns - left, right - columns
-    nearest = np.where(to_left <= to_right, left, right)
+    before = np.maximum.accumulate(np.where(coverage, columns, -far), axis=1)
+    after = np.minimum.accumulate(np.where(coverage, columns, 2 * far)[:, ::-1], axis=1)[:, ::-1]
+    to_left, to_right = columns - before, after - columns
+    nearest = np.where(to_left <= to_right, before, after)
     return np.where(np.minimum(to_left, to_right) <= margin, nearest, -1).astype(np.int32)
 
 
-def _within_reach(found, margin):
-    """Mask (H, W) of the texels that have a true value of `found` (H, W) at most `margin` rows above or below."""
-    height = len(found)
-    counts = np.zeros((height + 1, found.shape[1]), dtype=np.int32)
-    np.cumsum(found, axis=0, out=counts[1:])
+def _within_reach(mask, margin):
+    """Mask (H, W) of the texels that have a true value of `mask` (H, W) at most `margin` rows above or below."""
+    height = len(mask)
+    counts = np.zeros((height + 1, mask.shape[1]), dtype=np.int32)
+    np.cumsum(mask, axis=0, out=counts[1:])
     rows = np.arange(height)
     return counts[np.minimum(rows + margin + 1, height)] > counts[np.maximum(rows - margin, 0)]

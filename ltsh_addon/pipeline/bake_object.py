@@ -20,8 +20,8 @@ from ..visibility import ShadowSampling
 from ..workers.pool import cores
 from . import layers, lighting
 from .bake_files import ErrorPictures, ErrorSums, Planes
-from .evaluation import technique_names
 from .layers import COMBINED, layer_name, parse_layer_name
+from .lighting import technique_names
 from .options import BakeOptions
 from .tasks import TaskResult
 

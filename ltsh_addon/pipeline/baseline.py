@@ -61,25 +61,25 @@ class Baseline:
         lines = []
         for key, now in _pictures(report).items():
             scene, camera, frame = key
-            place = f"{scene}, camera {camera!r}, frame {frame}"
+            picture = f"{scene}, camera {camera!r}, frame {frame}"
             before = self.pictures.get(key)
             if before is None:
-                raise ValueError(f"baseline {self.path}: has no picture of {place}; make a baseline of the same job")
+                raise ValueError(f"baseline {self.path}: has no picture of {picture}; make a baseline of the same job")
             for name in _SAME:
                 if not _is_same(name, before[name], now[name]):
                     raise ValueError(
-                        f"baseline {self.path}: {name} is {before[name]} for {place}, but {now[name]} now; "
+                        f"baseline {self.path}: {name} is {before[name]} for {picture}, but {now[name]} now; "
                         "use the same options, or make a new baseline"
                     )
             earlier = dict(_errors(before))
             for what, error in _errors(now):
                 if what not in earlier:
-                    raise ValueError(f"baseline {self.path}: has no {what} for {place}; make a new baseline")
+                    raise ValueError(f"baseline {self.path}: has no {what} for {picture}; make a new baseline")
                 if error is None or earlier[what] is None:
                     continue  # nothing was lit: there is no error
                 if not tolerance.allows(earlier[what], error):
                     lines.append(
-                        f"{place}: {what}: error {percent(error)}, baseline {percent(earlier[what])}, "
+                        f"{picture}: {what}: error {percent(error)}, baseline {percent(earlier[what])}, "
                         f"tolerance {tolerance}"
                     )
         return lines

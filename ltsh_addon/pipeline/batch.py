@@ -14,7 +14,7 @@ from ..imaging import write_json, write_overview
 from ..reading import NUMBER, Malformed, read_json
 from ..scene import Progress, SceneError, error_line
 from . import bake, picture, render, view
-from .evaluation import prepare
+from .lighting import prepare
 from .tasks import (
     FOLDER,
     FORMAT,

@@ -14,8 +14,8 @@ import numpy as np
 from .. import imaging, shading
 from ..scene import CYCLES, PASSES, REFERENCE, Film, SurfaceSamples
 from . import layers, lighting
-from .evaluation import REFERENCE_SEED, TechniqueResult, described, technique_names, title
 from .layers import COMBINED, layer_name
+from .lighting import REFERENCE_SEED, TechniqueResult, described, technique_names, title
 from .options import PictureOptions
 from .tasks import check_before_writing, versions
 

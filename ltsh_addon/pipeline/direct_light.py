@@ -14,8 +14,7 @@ from ..visibility import ShadowSampling
 from . import plan
 from .comparison import Comparison
 from .compositing import clean_share, light_curvature, point_statistics, radiance_of_samples
-from .evaluation import evaluated, load_tables
-from .lighting import Shadows, ShadowTracer, rays_of_samples
+from .lighting import Shadows, ShadowTracer, evaluated, load_tables, rays_of_samples
 from .options import EDGE_POINTS, SHADOW_RAYS, PictureOptions, RenderOptions, child_job
 
 # SQUARE: the squares of a probe, in pixels on a side.
@@ -38,10 +37,10 @@ def shade_direct_light(
     tables = load_tables(options.techniques)
     width, height = options.resolution or (None, None)
     first, most = plan.first_and_most_points(options)
-    own = child_job(PictureOptions, options, passes=PASSES, sub_samples=most, shadows="on", cycles_samples=2)
+    picture = child_job(PictureOptions, options, passes=PASSES, sub_samples=most, shadows="on", cycles_samples=2)
     job = child_job(
         client.ExtractOptions,
-        own,
+        picture,
         **scene_and_layer,
         width=width,
         height=height,
@@ -55,16 +54,16 @@ def shade_direct_light(
     extraction = client.extract(job, progress=progress)
     clock.end("extraction", extraction.processor_seconds)
     if not extraction.lights or extraction.left_to_cycles.everything:
-        return Comparison(own, extraction, {}, None)
+        return Comparison(picture, extraction, {}, None)
     with ShadowTracer(extraction.occluders, extraction.lights, extraction.origin) as tracer:
-        shader = DirectLightShader(own, options.budget, tables, tracer)
+        shader = DirectLightShader(picture, options.budget, tables, tracer)
         opening = extraction.processor_seconds - extraction.direct_seconds
         chosen = shader.planned(extraction, seconds_left(extraction), clock.seconds() - opening)
         clock.end("choice")
         if chosen.reason:
             cycles = extraction.left_to_cycles
             cycles = replace(cycles, everything=(*cycles.everything, chosen.reason))
-            return Comparison(own, replace(extraction, left_to_cycles=cycles), {}, None)
+            return Comparison(picture, replace(extraction, left_to_cycles=cycles), {}, None)
         points = chosen.points_per_pixel
         if points > extraction.film.sub_samples:
             extraction = client.extract(replace(job, sub_samples=points, seconds=None), progress=progress)

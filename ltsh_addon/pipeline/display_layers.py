@@ -15,7 +15,7 @@ from ..scene import BAKE_PASSES, CYCLES, REFERENCE, TECHNIQUES, Progress
 from .comparison import against_cycles
 from .layers import COMBINED, COVERAGE, CYCLES_LAYERS, ERROR, UNSHADOWED, layer_name, parse_layer_name
 from .mixer import MIXER_FILE, light_pictures
-from .relight_data import RELIGHT_SUFFIX, RelightData
+from .relight import RELIGHT_SUFFIX, RelightData
 
 FOLDER = "images"
 LABELS = {CYCLES: "Cycles", **{name: technique.label for name, technique in TECHNIQUES.items()}}

@@ -15,10 +15,8 @@ import numpy as np
 
 from ..files import replacing
 from ..scene import AreaLight, Progress, error_line, listed
-from .evaluation import load_tables
-from .lighting import Shadows, shade_lights
-from .relight import GRAIN, color_of
-from .relight_data import RelightData
+from .lighting import Shadows, load_tables, shade_lights
+from .relight import GRAIN, RelightData, color_of
 
 MIXER_FILE = "lights.npz"
 # MOST_VALUES: numbers in all pictures of a mixer together; they limit the rows to between FEWEST_ROWS and MOST_ROWS.

@@ -21,10 +21,9 @@ from ..cycles.gbuffer import SHADOW_LOOSENESS, one_shading, with_one_shadow
 from ..emitters.light_polygons import has_lobe
 from ..scene import AreaLight, Cancelled, Film, SurfaceSamples
 from ..visibility import BLOCK_SAMPLES, Company, Occluders, Setting, open_tracer, task_of_lights
-from .evaluation import load_tables
-from .lighting import rays_of_samples
+from .lighting import load_tables, rays_of_samples
 from .mixer import MixerRow, bounced_light
-from .relight_data import OCCLUDERS_SUFFIX, RELIGHT_SUFFIX, RelightData
+from .relight import OCCLUDERS_SUFFIX, RELIGHT_SUFFIX, RelightData
 
 # BLOCKS: enough that all processes end at about the same time. FEWEST_OF_BLOCK: the overhead of smaller blocks exceeds
 # the cost of their samples.

@@ -13,9 +13,9 @@ from ..reading import NUMBER, check, some
 from ..scene import PASSES, Progress
 from . import lighting
 from .comparison import Comparison, most_accurate, percent, unbiased
-from .evaluation import check_named, evaluated, prepare
+from .lighting import check_named, evaluated, prepare
 from .options import PictureOptions, child_job
-from .relight_data import RELIGHT_SUFFIX, write_relight_data
+from .relight import RELIGHT_SUFFIX, write_relight_data
 from .tasks import TaskResult, write_reports
 
 SHOWN = "shown.png"  # temporary
@@ -102,10 +102,10 @@ _ROW = {
 }
 
 
-def _shadows(value, place) -> None:
+def _shadows(value, name) -> None:
     """Check for the document of `Shadows.report`, or null."""
     if value is not None:
-        check(value, {"noise": {str: NUMBER}}, place)
+        check(value, {"noise": {str: NUMBER}}, name)
 
 
 # What `merge`, a baseline and a summary need in a report (see `reading.check`).
@@ -123,9 +123,9 @@ REPORT = {
 }
 
 
-def _seconds(value, place) -> None:
+def _seconds(value, name) -> None:
     """Check for a number, or nested dicts of numbers."""
-    check(value, {str: _seconds} if isinstance(value, dict) else NUMBER, place)
+    check(value, {str: _seconds} if isinstance(value, dict) else NUMBER, name)
 
 
 # The seconds of a picture or a bake (see `reading.check`).

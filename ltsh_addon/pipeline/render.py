@@ -24,7 +24,7 @@ from .comparison import Comparison
 from .direct_light import shade_direct_light
 from .options import RenderOptions, child_job
 from .picture import view_transformed
-from .relight_data import RELIGHT_SUFFIX, write_relight_data
+from .relight import RELIGHT_SUFFIX, write_relight_data
 from .tasks import TaskResult, check_before_writing, write_reports
 
 NAMED = 8  # of what is left to Cycles, in a warning

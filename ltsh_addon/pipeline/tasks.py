@@ -41,10 +41,10 @@ JOB = {
 }
 
 
-def _check_files(files, place) -> None:
-    check(files, {str: {"bytes": int, "sha256": str}}, place)
-    for name in files:
-        file_name(name, place)
+def _check_files(files, name) -> None:
+    check(files, {str: {"bytes": int, "sha256": str}}, name)
+    for file in files:
+        file_name(file, name)
 
 
 _RECORD = {"key": str, "files": _check_files, "problem?": str}

@@ -12,8 +12,8 @@ from .. import imaging
 from ..files import temporary_folder, write_bytes
 from ..imaging.color import identified
 from ..scene import SHIPPED_TABLES, Progress
-from .evaluation import prepare
 from .layers import COVERAGE, layer_name, metadata
+from .lighting import prepare
 from .options import ViewOptions, child_job
 from .tasks import TaskResult, check_before_writing, versions
 

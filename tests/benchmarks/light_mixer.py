@@ -19,7 +19,7 @@ import numpy as np
 
 from ltsh_addon.pipeline.mixer import LightPictures, Mixer, light_pictures
 from ltsh_addon.pipeline.moved_lights import MovedLights
-from ltsh_addon.pipeline.relight_data import RELIGHT_SUFFIX, RelightData
+from ltsh_addon.pipeline.relight import RELIGHT_SUFFIX, RelightData
 
 RESOLUTION = "960x540"
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from ltsh_addon import imaging, scene, shading
-from ltsh_addon.pipeline import PictureOptions, compare_scene, comparison, evaluation, layers, shade_scene
+from ltsh_addon.pipeline import PictureOptions, compare_scene, comparison, layers, lighting, shade_scene
 from ltsh_addon.scene import Cancelled
 
 TABLES = Path(shading.__file__).resolve().parents[2] / "tables"
@@ -288,8 +288,8 @@ def test_a_reference_on_a_subset_is_stated_and_zero_elsewhere(child, tmp_path):
 
 def test_a_reference_of_many_lights_takes_fewer_samples(child, tmp_path, monkeypatch):
     """Their number times that of the lights stays bounded: 100,000 lights would take days."""
-    monkeypatch.setattr(evaluation, "FEWEST_SAMPLES", 1)
-    monkeypatch.setattr(evaluation, "MOST_PAIRS", 20 * len(fake_scene.lights()))
+    monkeypatch.setattr(lighting, "FEWEST_SAMPLES", 1)
+    monkeypatch.setattr(lighting, "MOST_REFERENCE_PAIRS", 20 * len(fake_scene.lights()))
     facts = compare_scene(options(tmp_path))["reference"]
     assert facts["of"] == 35 and 0 < facts["samples"] <= 20
 

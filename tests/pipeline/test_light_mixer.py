@@ -23,7 +23,7 @@ from ltsh_addon.pipeline.mixer import (
     light_pictures,
 )
 from ltsh_addon.pipeline.moved_lights import Draft, MovedLights
-from ltsh_addon.pipeline.relight_data import RelightData, write_relight_data
+from ltsh_addon.pipeline.relight import RelightData, write_relight_data
 from ltsh_addon.scene import Cancelled, Film, SurfaceSamples
 from ltsh_addon.visibility import crew
 from ltsh_addon.workers import pool

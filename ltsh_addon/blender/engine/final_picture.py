@@ -12,7 +12,7 @@ import numpy as np
 from ...pipeline.lighting import shade_lights, trace_shadows
 from ...pipeline.mixer import LightPictures, light_pictures
 from ...pipeline.options import RenderOptions
-from ...pipeline.relight_data import RelightData
+from ...pipeline.relight import RelightData
 from ...pipeline.render import finish
 from ...scene import PASSES, TECHNIQUES, Progress
 from ..process import client

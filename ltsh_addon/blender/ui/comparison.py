@@ -13,7 +13,7 @@ from gpu_extras.batch import batch_for_shader
 
 from ...imaging.color import LUMINANCE_WEIGHTS, color_bar, signed_error_colors
 from ...pipeline.mixer import LightPictures
-from ...pipeline.relight_data import RelightData
+from ...pipeline.relight import RelightData
 from ...scene import error_line
 from . import results
 

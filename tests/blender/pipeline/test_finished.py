@@ -18,12 +18,10 @@ from ltsh_addon.blender.process import client
 from ltsh_addon.cli import main
 from ltsh_addon.cycles.lobes import read_layer
 from ltsh_addon.pipeline import PictureOptions, RenderOptions, compositing, direct_light, plan, render, shade_scene
-from ltsh_addon.pipeline.evaluation import load_tables
-from ltsh_addon.pipeline.lighting import ShadowTracer
+from ltsh_addon.pipeline.lighting import ShadowTracer, load_tables
 from ltsh_addon.pipeline.mixer import light_pictures
 from ltsh_addon.pipeline.moved_lights import MovedLights
-from ltsh_addon.pipeline.relight import LightChange, relight
-from ltsh_addon.pipeline.relight_data import RelightData
+from ltsh_addon.pipeline.relight import LightChange, RelightData, relight
 from ltsh_addon.scene import PASSES, AreaLight, Film
 
 SIZE, BLOCK = 32, 8  # pixels

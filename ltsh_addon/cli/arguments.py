@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from ..pipeline import batch
-from ..pipeline.baseline import Tolerance
 from ..pipeline.options import arguments_of
+from ..pipeline.picture import Tolerance
 
 
 class Misuse(Exception):

@@ -14,10 +14,10 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from ..pipeline.baseline import Baseline
 from ..pipeline.batch import Merged, merge, run_tasks
 from ..pipeline.lighting import prepare
 from ..pipeline.options import BakeOptions, PictureOptions, RenderOptions, ViewOptions, options_from, table
+from ..pipeline.picture import Baseline
 from ..pipeline.tasks import BatchJob
 from ..scene import SHIPPED_TABLES, SceneError, error_line
 from ..shading import TableError

@@ -1,28 +1,51 @@
-"""Bakes: the objects of a scene, their files and report; `bake_object` shades the texels of each."""
+"""Bakes: the texels of objects, shaded block by block into the files of `bake_files`, and the report about them."""
 
 from __future__ import annotations
 
+import functools
+import itertools
+import math
 import shutil
 import time
+from collections import deque
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
-from pathlib import Path
+from dataclasses import replace
+from pathlib import PurePosixPath
 
 import numpy as np
 
+from ..cycles import uv
+from ..cycles.texels import NOT_BAKED, BakeMaterial, BakeView, TexelMesh, texel_samples
 from ..files import temporary_folder
+from ..imaging import exr
+from ..imaging.exr import COMBINED, layer_name
 from ..reading import NUMBER, Malformed, check, file_name
-from ..scene import PASSES, Progress, lights_of, listed
-from ..visibility import Occluders
+from ..scene import PASSES, REFERENCE, Cancelled, Film, Progress, SurfaceSamples, lights_of, listed
+from ..visibility import Occluders, ShadowSampling
+from ..workers.pool import cores
 from . import lighting
-from .bake_object import ObjectBaker, applied_layer, bakes_centers_alone, block_rows, shaded_passes
+from .bake_files import (
+    TILE,
+    ErrorPictures,
+    ErrorSums,
+    Planes,
+    TileRecords,
+    applied_layer,
+    applied_layers,
+    apply_textures,
+)
 from .comparison import percent
 from .lighting import check_named, prepare
 from .options import BAKE_PASSES, MARGIN_TYPES, TEXTURE_SIDES, BakeOptions, child_job
-from .tasks import Records, TaskResult, contents_digest, file_stems, options_digest, versions, write_reports
+from .tasks import TaskResult, file_stems, versions, write_reports
 
 # NOTED_SHARE_OUTSIDE: a larger share of the UV map outside of the texture is reported. Less may come from texels along
 # the border, which count by their centers.
 NOTED_SHARE_OUTSIDE = 0.01
+# BLOCK_TEXELS: texels that a thread shades at a time. The allocator reuses arrays of this size; larger ones would be
+# new memory each time.
+BLOCK_TEXELS = 1 << 18
 
 
 def bake_scene(options: BakeOptions, progress: Progress | None = None) -> dict:
@@ -118,46 +141,315 @@ def _job(options, finished, tile=None, following=()):
     )
 
 
-class TileRecords:
-    """Records of finished tiles: reads those of the same job (with `resume`) and writes new ones.
-
-    Where the options have a `name`, only records of that name are read.
-    """
-
-    def __init__(self, options: BakeOptions):
-        self._records = Records(options.output, "tiles", _TILE_RECORD)
-        self._key = options_digest("bake", options, contents_digest(options))
-        names = None if options.name is None else [options.name]
-        whole = self._records.all_whole(self._key, names) if options.resume else []
-        self.finished = {(record["task"]["object"], record["task"]["tile"]): record for record in whole}
-
-    def take(self, name: str, tile: int, file: str) -> dict | None:
-        """The record of a finished tile of the object `name` with the `file`, else None."""
-        record = self.finished.get((name, tile))
-        return record if record is not None and file in record["files"] else None
-
-    def write(self, name: str, tile: int, stem: str, files, report: dict) -> dict:
-        """Write the record of a finished tile; returns it."""
-        return self._records.write(f"{stem}.{tile}", self._key, {"object": name, "tile": tile}, files, report=report)
+def block_rows(options) -> int:
+    """Rows of texels that are baked at a time."""
+    width, height = options.size
+    return max(1, min(height, BLOCK_TEXELS // width))
 
 
-def apply_textures(scene: Path, output: Path, records: list[dict], layer: str, progress=None) -> str:
-    """Save a copy of the .blend whose objects show the textures of the report's `records`; returns its file name."""
-    from ..blender.process import client
+def shaded_passes(options) -> set[str]:
+    """The passes of `shading.shade` from which the wanted passes follow; `diffuse_light` is shaded apart."""
+    wanted = set(options.passes)
+    if COMBINED in wanted:
+        wanted |= {"specular", "diffuse"}
+    return wanted & {"specular", "diffuse"}
 
-    textures = []
-    for record in records:
-        if any("texture" not in tile for tile in record["tiles"].values()):
-            raise ValueError(f"object {record['name']!r}: has no texture to show; run the job again with --apply")
-        files = [
-            {"path": str((output / tile["texture"]).absolute()), "tile": int(number)}
-            for number, tile in record["tiles"].items()
-        ]
-        name = f"{record['name']} {layer}"
-        textures.append({"object": record["name"], "uv": record["uv"], "name": name, "files": files})
-    path = output / f"{Path(scene).stem}_baked.blend"
-    client.apply_bake(scene, path, textures, progress=progress)
-    return path.name
+
+class ObjectBaker:
+    """Bakes the tiles of one object, the `record` of the `manifest`, in blocks of rows from the bottom."""
+
+    def __init__(self, options, tables, manifest, record, folder, tracer=None):
+        self.options, self.tables, self.manifest, self.record, self.folder = options, tables, manifest, record, folder
+        self.lights, self.tracer = lights_of(manifest["lights"]), tracer
+        self.mesh = replace(TexelMesh.load(folder / "mesh.npz"), receiver=record["receiver"])
+        uv_maps = {name: folder / file for name, file in record["uv_maps"].items()}
+        self.materials = [BakeMaterial.of(material, folder.parent, uv_maps) for material in record["materials"]]
+        self.view = BakeView(**manifest["view"])
+        self.groups = tuple(dict.fromkeys(light.group for light in self.lights)) or ("",)
+        self.tiles, self.area = uv.tiles_of(self.mesh.uv)
+        known = shaded_passes(options) | {COMBINED} if options.error else ()
+        self.compared = tuple(name for name in options.passes if name in known)
+
+    def bake(self, stem: str, tiles: list[int], records, progress) -> TaskResult:
+        """Write the files of `tiles` (empty: all tiles), except those that the TileRecords `records` have as finished.
+
+        The report of the result is the object's entry in the whole report.
+        """
+        name, files, seconds = self.record["name"], [], {}
+        result = {"name": name, "uv": self.record["uv"], "outside": 0.0, "tiles": {}}
+        for tile in tiles or self.tiles:
+            file = f"{stem}{self._suffix(tile)}.exr"
+            start = time.perf_counter()
+            record = records.take(name, tile, file)
+            if record is None:
+                report, written = self._tile(tile, stem, progress)
+                record = records.write(name, tile, stem, written, report)
+            seconds[file] = time.perf_counter() - start
+            files += record["files"]
+            report = record["report"]
+            result["tiles"][str(tile)] = {"file": file, **report}
+            if self.area > 0.0:
+                baked = report["covered_times"] / math.prod(self.options.size)
+                result["outside"] = max(0.0, 1.0 - baked / self.area)
+        return TaskResult(result, seconds, tuple(files))
+
+    def _suffix(self, tile) -> str:
+        return "" if len(self.tiles) == 1 else f".{tile}"
+
+    def _tile(self, tile, stem, progress):
+        """Write the files of one tile; returns its record and the names of the files."""
+        options, file = self.options, f"{stem}{self._suffix(tile)}.exr"
+        path = options.output / file
+        errors, written = ErrorSums(), [file]
+        with self._planes(tile) as planes:
+            record = self._shade(tile, planes, errors, progress)
+            pictures = None
+            if self.compared:
+                pictures = ErrorPictures(*options.size, path, list(self.tables), list(self.compared))
+                named = [str(PurePosixPath(file).with_name(name)) for name in pictures.names]
+                record |= {"pictures": named, "errors": errors.report()}
+                written += named
+            texture = None
+            if options.apply:
+                record["texture"] = f"{stem}.{applied_layer(options)}{self._suffix(tile)}.exr"
+                texture = options.output / record["texture"], applied_layers(options)
+                written.append(record["texture"])
+            planes.write(path, options.margin, self._metadata(tile), pictures, texture)
+        return record, written
+
+    def _planes(self, tile) -> Planes:
+        options, seams = self.options, None
+        if options.margin_type == "adjacent" and options.margin > 0:
+            seams = uv.UvSeams.of(self.mesh.uv, self.mesh.vertices, *options.size, _column_and_row(tile))
+        return Planes(self.folder / f"planes_{tile}", self.channels(), *options.size, seams)
+
+    def _shade(self, tile, planes, errors, progress) -> dict:
+        """Shade a tile block by block into `planes`; returns its counts of texels for the record."""
+        options, covered, covers, overlaps, unshaded, unbaked, lit = self.options, 0, 0, 0, 0, 0, False
+        is_unshaded = np.array([bool(reason) for reason in self.record["unshaded"]])
+        rows, height = block_rows(options), options.size[1]
+        points, spread = options.sub_samples, TilePoints(self, tile, self._threads())
+
+        def shaded(task):
+            return *task, self._block(spread, *task)
+
+        firsts, sums = range(0, height, rows), {}
+        tasks = ((first, point) for first in firsts for point in range(points))
+        for number, (first, point, block) in enumerate(_in_order(shaded, tasks, self._threads())):
+            sums = {name: sums[name] + values for name, values in block.items()} if point else block
+            if point == points - 1:
+                texels = spread.texels(first)
+                planes_of = {name: values / points for name, values in sums.items()}
+                halves = self._add_cycles(planes_of, tile, first, texels)
+                covered += len(texels.index)
+                covers += texels.covers
+                overlaps += texels.overlaps
+                unbaked += texels.unbaked
+                unshaded += int(is_unshaded[self.mesh.material[texels.triangle]].sum())
+                names = (layer_name(name, pass_name) for name in self.tables for pass_name in options.passes)
+                lit = lit or any(planes_of[name].any() for name in names)
+                planes.put(first, min(rows, height - first), texels, _channels(planes_of))
+                for pass_name, (a, b) in halves.items():
+                    errors.add_halves(pass_name, a, b)
+                    for name in self.tables:
+                        errors.add(name, pass_name, planes_of[layer_name(name, pass_name)], a, b)
+            share = (number + 1) / (len(firsts) * points)
+            if progress is not None and progress(f"shade {self.record['name']}", share) is False:
+                raise Cancelled("the bake was stopped")
+        counts = {"texels": covered, "covered_times": covers, "overlapping_texels": overlaps}
+        return {**counts, "unshaded_texels": unshaded, "unbaked_texels": unbaked, "is_lit": lit}
+
+    def _threads(self) -> int:
+        """Blocks to shade at a time: one with the reference, whose shading of a block takes all cores itself."""
+        return 1 if REFERENCE in self.tables.values() else cores()
+
+    def channels(self) -> list[str]:
+        """Names of the channels of the EXR, without the coverage."""
+        names = [layer_name(name, pass_name) for name in self.tables for pass_name in self.options.passes]
+        names += [of_group for name in names for of_group in exr.by_group(name, self.groups, self.groups)]
+        for pass_name in self.compared:
+            images = [*exr.CYCLES_LAYERS, *(f"{exr.ERROR}{name}" for name in self.tables)]
+            names += [layer_name(image, pass_name) for image in images]
+        return [f"{name}.{letter}" for name in names for letter in "RGB"]
+
+    def _block(self, spread, first, point) -> dict[str, np.ndarray]:
+        """Layers (Q, 3) of the Q texels of a block, shaded at one point of each texel."""
+        texels, maps, weights = spread.at(first, point)
+
+        def read_map(number):
+            return maps[number].reshape(-1, 3)[texels.index]
+
+        samples, texel = texel_samples(self.mesh, self.materials, texels, read_map, self.view, self.lights)
+        images, shadows = {}, None
+        if self.tracer is not None:
+            options = self.options
+            passes = shaded_passes(options)
+            if "diffuse_light" in options.passes:
+                passes = passes | {"diffuse"}
+            rays = lighting.rays_of_point(options.shadow_rays, options.sub_samples)
+            workers = 1 if self._threads() > 1 else None
+            rows = min(block_rows(options), options.size[1] - first)
+            film = Film(options.size[0], rows, texels.index[texel])
+            sampling = ShadowSampling(sorted(passes), rays, film, is_baked=True)
+            shadows = self.tracer.trace(samples, sampling, workers=workers)
+        for name, table in self.tables.items():
+            for pass_name, radiance in self._passes(samples, texel, len(texels.index), table, shadows).items():
+                layer = layer_name(name, pass_name)
+                images |= {layer: radiance.sum(axis=0), **exr.by_group(layer, self.groups, radiance)}
+        return images if weights is None else {name: values * weights[:, None] for name, values in images.items()}
+
+    def _add_cycles(self, images, tile, first, texels) -> dict[str, np.ndarray]:
+        """Add Cycles' bake and the signed errors to the `images` (Q, 3); returns the halves of `_halves`."""
+        halves = self._halves(tile, first, texels)
+        for pass_name, (a, b) in halves.items():
+            mean = 0.5 * (a + b)
+            for name, image in zip(exr.CYCLES_LAYERS, (mean, a, b), strict=True):
+                images[layer_name(name, pass_name)] = image
+            for name in self.tables:
+                images[layer_name(f"{exr.ERROR}{name}", pass_name)] = images[layer_name(name, pass_name)] - mean
+        return halves
+
+    def _halves(self, tile, first, texels) -> dict[str, np.ndarray]:
+        """Cycles' bake of the texels by pass: two independent halves (2, Q, 3)."""
+        halves = {}
+        for pass_name in shaded_passes(self.options) if self.compared else ():
+            baked = np.load(self.folder / f"cycles_{pass_name}_{tile}_{first}.npy")
+            halves[pass_name] = baked.reshape(2, -1, 3)[:, texels.index]
+        if COMBINED in self.compared:
+            halves[COMBINED] = halves["specular"] + halves["diffuse"]
+        return {name: halves[name] for name in self.compared}
+
+    def _passes(self, samples: SurfaceSamples, texel, count, table, shadows) -> dict[str, np.ndarray]:
+        """Radiance (G, Q, 3) of the wanted passes of `count` texels."""
+        radiance = {}
+        wanted = tuple(sorted(shaded_passes(self.options), reverse=True))
+        workers = 1 if self._threads() > 1 else None
+        if wanted:
+            shaded = lighting.shade_lights(samples, self.lights, table, wanted, (shadows,), workers=workers)[0]
+            radiance = {name: _summed(getattr(shaded, name), texel, count) for name in wanted}
+        if "diffuse_light" in self.options.passes:
+            first = _first_samples(texel)
+            white = replace(samples.take(first), diffuse_albedo=np.ones((len(first), 3)))
+            shadows = None if shadows is None else shadows.take(first)
+            (lit,) = lighting.shade_lights(white, self.lights, table, ("diffuse",), (shadows,), workers=workers)
+            radiance["diffuse_light"] = _summed(lit.diffuse, texel[first], count)
+        if COMBINED in self.options.passes:
+            radiance[COMBINED] = radiance["specular"] + radiance["diffuse"]
+        return {name: radiance[name] for name in self.options.passes}
+
+    def _metadata(self, tile) -> dict[str, str]:
+        options, view = self.options, self.view
+        vector = ", ".join(f"{value:g}" for value in view.vector)
+        views = {"above": "above the surface", "point": f"position {vector}", "direction": f"from direction {vector}"}
+        return exr.metadata(
+            options.scene,
+            self.manifest["frame"],
+            self.manifest["camera"],
+            self.manifest["color_space"]["name"] or "Linear Rec.709",
+            object=self.record["name"],
+            uv=self.record["uv"],
+            tile=str(tile),
+            sub_samples=str(options.sub_samples),
+            view=views[view.kind] + (", bent as in Cycles' bake" if view.bent else ""),
+        )
+
+
+class TilePoints:
+    """The points of the texels of a tile: those of `UvTriangles.spread`, or those at which maps were baked."""
+
+    def __init__(self, baker: ObjectBaker, tile: int, threads: int):
+        options = baker.options
+        self._options, self._folder, self._tile, self._mapped = options, baker.folder, tile, baker.record["maps"]
+        self._width = baker.manifest["sampled_texels"]
+        self._triangles = uv.UvTriangles.in_tile(baker.mesh.uv, *options.size, _column_and_row(tile))
+        self._at_centers = bakes_centers_alone(options, baker.record)
+        # The points of a block are shaded one after another, so few blocks need to be cached.
+        cached = functools.lru_cache(maxsize=2 + threads // options.sub_samples)
+        self.texels, self._weights_of = cached(self._covered), cached(self._fitted_weights)
+
+    def at(self, first: int, point: int):
+        """One point of the Q texels of the block from row `first` on.
+
+        Returns the texels at this point, the maps there (N, rows, W, 3; None without maps), and the weights (Q,) of
+        the point, 1 on average (None: all points count alike).
+        """
+        texels = self.texels(first)
+        if not self._mapped:
+            return self._triangles.spread(texels, point, self._options.sub_samples, self._width), None, None
+        maps = np.load(self._file(first, point))
+        if self._options.sub_samples == 1:
+            return texels, maps, None
+        positions = self._positions(texels, maps, first, point)
+        return self._triangles.at(texels, positions), maps, self._weights_of(first).at(positions)
+
+    def _covered(self, first):
+        rows = min(block_rows(self._options), self._options.size[1] - first)
+        texels = self._triangles.texels(first, rows, self._options.conservative and not self._at_centers)
+        if not self._at_centers:
+            return texels
+        of_pass = f"cycles_{sorted(shaded_passes(self._options))[0]}_{self._tile}_{first}.npy"
+        baked = np.load(self._file(first, 0) if self._mapped else self._folder / of_pass, mmap_mode="r")
+        return texels.baked(baked[0].reshape(-1, 3)[texels.index, 0] != np.float32(NOT_BAKED))
+
+    def _file(self, first, point):
+        return self._folder / f"maps_{self._tile}_{first}_{point}.npy"
+
+    def _positions(self, texels, maps, first, point):
+        """Positions (Q, 2) in the texture, in texels, at which the maps of a point were baked."""
+        if point == 0:
+            return self._triangles.places(texels)
+        rows, width = maps.shape[1:3]
+        return maps[-1].reshape(-1, 3)[texels.index, :2] * (width, rows) + (0, first)
+
+    def _fitted_weights(self, first):
+        texels, points = self.texels(first), range(self._options.sub_samples)
+        maps = ((np.load(self._file(first, point), mmap_mode="r"), point) for point in points)
+        positions = (self._positions(texels, of_point, first, point) for of_point, point in maps)
+        return uv.PointWeights.of(self._triangles, texels, positions, self._width)
+
+
+def bakes_centers_alone(options: BakeOptions, record: dict) -> bool:
+    """True where an object needs Cycles' own bake, which has only texels whose centers are covered."""
+    return record["maps"] or options.error
+
+
+def _column_and_row(tile: int) -> tuple[int, int]:
+    """Column and row of a UDIM tile."""
+    return (tile - 1001) % 10, (tile - 1001) // 10
+
+
+def _in_order(function, items, threads: int):
+    """Yield function(item) in the order of `items`, computed by `threads` threads."""
+    with ThreadPoolExecutor(threads) as pool:
+        waiting, items = deque(), iter(items)
+        try:
+            for item in itertools.islice(items, threads):
+                waiting.append(pool.submit(function, item))
+            while waiting:
+                result = waiting.popleft().result()
+                for item in itertools.islice(items, 1):
+                    waiting.append(pool.submit(function, item))
+                yield result
+        finally:
+            for future in waiting:
+                future.cancel()
+
+
+def _channels(images) -> dict[str, np.ndarray]:
+    """Channel values (Q,) by name, from images (Q, 3) of layers."""
+    return {f"{name}.{letter}": pixels[:, n] for name, pixels in images.items() for n, letter in enumerate("RGB")}
+
+
+def _summed(radiance, texel, count):
+    """Radiance (G, count, 3) of texels: the sums over their samples (G, S, 3)."""
+    if len(texel) == count:
+        return radiance
+    return np.add.reduceat(radiance, _first_samples(texel), axis=1)
+
+
+def _first_samples(texel: np.ndarray) -> np.ndarray:
+    """The number of the first sample of each texel, of the sorted texels (S,) of samples."""
+    return np.flatnonzero(np.concatenate([[True], texel[1:] != texel[:-1]])) if len(texel) else texel
 
 
 def _report(options, manifest, records) -> dict:
@@ -216,18 +508,8 @@ def _darkness(record, reasons) -> tuple[list[str], list[str]]:
     return [], [f"{name}: no light reaches it, or it reflects none: its texture is black"] if is_dark else []
 
 
-_ERRORS = {"unbiased_squared_error?": NUMBER | None, "unbiased_error?": NUMBER | None}
-_TILE = {
-    **dict.fromkeys(("texels", "unshaded_texels", "unbaked_texels", "covered_times", "overlapping_texels"), NUMBER),
-    "is_lit": bool,
-    "texture?": file_name,
-    "errors?": {str: {"noise?": NUMBER | None, "techniques": {str: _ERRORS}}},
-}
-_TILE_RECORD = {"task": {"object": str, "tile": int}, "report": _TILE}
-
-
 def _tiles(value, name) -> None:
-    check(value, {str: {**_TILE, "file": file_name}}, name)
+    check(value, {str: {**TILE, "file": file_name}}, name)
     if wrong := [number for number in value if not number.isdecimal()]:
         raise Malformed(f"{name} has {wrong[0]!r}, expected the number of a tile")
 

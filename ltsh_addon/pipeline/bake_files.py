@@ -1,4 +1,4 @@
-"""Files of a bake: planes of texels with margins, and pictures of signed errors."""
+"""Files of a bake: planes of texels with margins, pictures of errors, records of tiles, the .blend that shows them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from .. import imaging
-from ..imaging.exr import writing_rows
+from ..imaging.exr import COMBINED, layer_name, parse_layer_name, writing_rows
+from ..reading import NUMBER, file_name
+from ..scene import PASSES
+from .lighting import technique_names
+from .options import BakeOptions
+from .tasks import Records, contents_digest, options_digest
 
 # WRITTEN_TEXELS: texels that are in memory while a file is written.
 WRITTEN_TEXELS = 1 << 18
@@ -21,6 +26,14 @@ LARGEST_PICTURE = 2048  # the most texels of a side of an error picture
 PICTURE_SCALE = 0.1
 PICTURE_PERCENTILE = 99.0
 EMPTY_COLOR = 0.55
+_ERRORS = {"unbiased_squared_error?": NUMBER | None, "unbiased_error?": NUMBER | None}
+TILE = {
+    **dict.fromkeys(("texels", "unshaded_texels", "unbaked_texels", "covered_times", "overlapping_texels"), NUMBER),
+    "is_lit": bool,
+    "texture?": file_name,
+    "errors?": {str: {"noise?": NUMBER | None, "techniques": {str: _ERRORS}}},
+}
+_TILE_RECORD = {"task": {"object": str, "tile": int}, "report": TILE}
 
 
 class Planes:
@@ -257,3 +270,59 @@ def _within_reach(mask, margin):
     np.cumsum(mask, axis=0, out=counts[1:])
     rows = np.arange(height)
     return counts[np.minimum(rows + margin + 1, height)] > counts[np.maximum(rows - margin, 0)]
+
+
+class TileRecords:
+    """Records of finished tiles: reads those of the same job (with `resume`) and writes new ones.
+
+    Where the options have a `name`, only records of that name are read.
+    """
+
+    def __init__(self, options: BakeOptions):
+        self._records = Records(options.output, "tiles", _TILE_RECORD)
+        self._key = options_digest("bake", options, contents_digest(options))
+        names = None if options.name is None else [options.name]
+        whole = self._records.all_whole(self._key, names) if options.resume else []
+        self.finished = {(record["task"]["object"], record["task"]["tile"]): record for record in whole}
+
+    def take(self, name: str, tile: int, file: str) -> dict | None:
+        """The record of a finished tile of the object `name` with the `file`, else None."""
+        record = self.finished.get((name, tile))
+        return record if record is not None and file in record["files"] else None
+
+    def write(self, name: str, tile: int, stem: str, files, report: dict) -> dict:
+        """Write the record of a finished tile; returns it."""
+        return self._records.write(f"{stem}.{tile}", self._key, {"object": name, "tile": tile}, files, report=report)
+
+
+def applied_layer(options) -> str:
+    """The layer that `apply` shows: the first technique's combined light, or its first pass where only one is baked."""
+    names = applied_layers(options)
+    return names[0] if len(names) == 1 else layer_name(parse_layer_name(names[0])[0], COMBINED)
+
+
+def applied_layers(options) -> list[str]:
+    """The layers whose sum `apply` shows."""
+    passes = [name for name in PASSES if name in options.passes]
+    if COMBINED in options.passes or len(passes) < len(PASSES):
+        passes = [COMBINED] if COMBINED in options.passes else options.passes[:1]
+    return [layer_name(next(iter(technique_names(options.techniques))), pass_name) for pass_name in passes]
+
+
+def apply_textures(scene: Path, output: Path, records: list[dict], layer: str, progress=None) -> str:
+    """Save a copy of the .blend whose objects show the textures of the report's `records`; returns its file name."""
+    from ..blender.process import client
+
+    textures = []
+    for record in records:
+        if any("texture" not in tile for tile in record["tiles"].values()):
+            raise ValueError(f"object {record['name']!r}: has no texture to show; run the job again with --apply")
+        files = [
+            {"path": str((output / tile["texture"]).absolute()), "tile": int(number)}
+            for number, tile in record["tiles"].items()
+        ]
+        name = f"{record['name']} {layer}"
+        textures.append({"object": record["name"], "uv": record["uv"], "name": name, "files": files})
+    path = output / f"{Path(scene).stem}_baked.blend"
+    client.apply_bake(scene, path, textures, progress=progress)
+    return path.name

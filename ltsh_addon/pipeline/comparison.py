@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 
 from .. import imaging, shading
+from ..imaging import exr
+from ..imaging.exr import COMBINED, layer_name
 from ..scene import CYCLES, PASSES, REFERENCE, Film, SurfaceSamples
-from . import layers, lighting
-from .layers import COMBINED, layer_name
+from . import lighting
 from .lighting import REFERENCE_SEED, TechniqueResult, described, technique_names, title
 from .options import PictureOptions
 from .tasks import check_before_writing, versions
@@ -209,7 +210,7 @@ class Comparison:
             more["border"] = str(extraction.border)
         if notice := self._subset_notice():
             more["reference"] = f"{notice}; elsewhere zero"
-        metadata = layers.metadata_of(extraction, self.options.scene, **more)
+        metadata = exr.metadata_of(extraction, self.options.scene, **more)
         planes, sheet = self.layers(), self.sheet() if with_cycles else None
         chromaticities = imaging.chromaticities(extraction.color_space)
         files = [f"{name}.exr", *([f"{name}.png", self.options.page] if with_cycles else [])]
@@ -228,17 +229,17 @@ class Comparison:
         for (name, pass_name), image in self.images.items():
             layer, result = layer_name(name, pass_name), self.results[name]
             images = (self._image(result, values) for values in self._radiance(result, pass_name))
-            planes |= {layer: image, **layers.by_group(layer, result.shading.groups, images)}
+            planes |= {layer: image, **exr.by_group(layer, result.shading.groups, images)}
             if result.unshadowed is not None:
                 values = self._exposed(result.unshadowed, pass_name).sum(axis=0)
-                planes[layer_name(f"{name}{layers.UNSHADOWED}", pass_name)] = self._image(result, values)
+                planes[layer_name(f"{name}{exr.UNSHADOWED}", pass_name)] = self._image(result, values)
         for pass_name, halves in self.cycles.items():
             if pass_name not in self.options.passes:
                 continue
-            for name, pixels in zip(layers.CYCLES_LAYERS, (halves.mean(axis=0), *halves), strict=True):
+            for name, pixels in zip(exr.CYCLES_LAYERS, (halves.mean(axis=0), *halves), strict=True):
                 planes[layer_name(name, pass_name)] = pixels
             for name in self.results:
-                planes[layer_name(f"{layers.ERROR}{name}", pass_name)] = self._error(name, pass_name)
+                planes[layer_name(f"{exr.ERROR}{name}", pass_name)] = self._error(name, pass_name)
         planes |= self._whole_layers() | self._visibility_layers()
         # A surface with several lobes shows the first of them.
         first = slice(None) if self.film.first is None else np.nonzero(self.film.first)[0]
@@ -246,7 +247,7 @@ class Comparison:
         for field, letters in SAMPLE_LAYERS.items():
             values = getattr(self.extraction.samples, field)[first]
             planes[layer_name("samples", field)] = imaging.Layer(film.image(values), letters)
-        planes[layers.COVERAGE] = imaging.Layer(self.film.coverage(), "V")
+        planes[exr.COVERAGE] = imaging.Layer(self.film.coverage(), "V")
         return planes
 
     def _whole_layers(self) -> dict[str, np.ndarray]:
@@ -263,7 +264,7 @@ class Comparison:
             planes[layer_name(name, COMBINED)] = np.where(missing[..., None], 0.0, self.whole(name))
             if cycles is not None:
                 error = sum(self._error(name, pass_name) for pass_name in PASSES)
-                planes[layer_name(f"{layers.ERROR}{name}", COMBINED)] = error
+                planes[layer_name(f"{exr.ERROR}{name}", COMBINED)] = error
         if cycles is not None:
             planes[layer_name(CYCLES, COMBINED)] = self._with_rest(cycles)
         return planes
@@ -281,7 +282,7 @@ class Comparison:
         shadows, planes = self.shadows, {}
         if shadows is None or len(shadows.numbers) > MOST_VISIBILITY_LAYERS:
             return planes
-        names = layers.unique_names(self.extraction.lights[numbers[0]].name for numbers in shadows.numbers)
+        names = exr.unique_names(self.extraction.lights[numbers[0]].name for numbers in shadows.numbers)
         nothing = 1.0 - self.film.coverage()
         first = slice(None) if self.film.first is None else np.nonzero(self.film.first)[0]
         film = self.film.take(first)

@@ -21,10 +21,10 @@ import numpy as np
 from .. import imaging
 from ..cycles.lobes import read_layer
 from ..imaging.denoise import NoDenoiser, open_denoiser
+from ..imaging.exr import by_group, layer_name
 from ..scene import Cancelled
 from ..workers.pool import cores
 from .comparison import Comparison
-from .layers import by_group, layer_name
 from .lighting import Shadows
 
 # DIRECT: for each pass of LTSH, the keys of Cycles' light and color in `pass_names`.

@@ -8,12 +8,20 @@ from pathlib import Path
 import numpy as np
 
 from .. import imaging
-from ..imaging.exr import write_channels
+from ..imaging.exr import (
+    COMBINED,
+    COVERAGE,
+    CYCLES_LAYERS,
+    ERROR,
+    UNSHADOWED,
+    layer_name,
+    parse_layer_name,
+    write_channels,
+)
 from ..imaging.report import FILE, write_index
 from ..imaging.sheet import common_error_scale
 from ..scene import BAKE_PASSES, CYCLES, REFERENCE, TECHNIQUES, Progress
 from .comparison import against_cycles
-from .layers import COMBINED, COVERAGE, CYCLES_LAYERS, ERROR, UNSHADOWED, layer_name, parse_layer_name
 from .mixer import MIXER_FILE, light_pictures
 from .relight import RELIGHT_SUFFIX, RelightData
 

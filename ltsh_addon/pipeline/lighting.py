@@ -18,6 +18,7 @@ from .. import shading, visibility
 from ..cycles.gbuffer import finer
 from ..emitters.light_tree import FEWEST
 from ..files import check_takes_files
+from ..imaging.exr import unique_names
 from ..scene import (
     CYCLES,
     REFERENCE,
@@ -29,7 +30,6 @@ from ..scene import (
     Progress,
     SurfaceSamples,
 )
-from .layers import unique_names
 
 # MOST_PAIRS: how many pairs of a sample and a light have their radiance in memory at a time.
 MOST_PAIRS = 1 << 25

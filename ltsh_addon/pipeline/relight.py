@@ -17,6 +17,7 @@ import numpy as np
 
 from .. import imaging
 from ..files import replacing
+from ..imaging.exr import COMBINED, REST, layer_name, parse_layer_name
 from ..scene import (
     REFERENCE,
     AreaLight,
@@ -31,7 +32,6 @@ from ..scene import (
     listed,
 )
 from .comparison import Comparison
-from .layers import COMBINED, REST, layer_name, parse_layer_name
 from .lighting import Shadows, evaluated, prepare, shade_lights
 from .options import PictureOptions
 

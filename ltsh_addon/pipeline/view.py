@@ -11,8 +11,8 @@ import numpy as np
 from .. import imaging
 from ..files import temporary_folder, write_bytes
 from ..imaging.color import identified
+from ..imaging.exr import COVERAGE, layer_name, metadata
 from ..scene import SHIPPED_TABLES, Progress
-from .layers import COVERAGE, layer_name, metadata
 from .lighting import prepare
 from .options import ViewOptions, child_job
 from .tasks import TaskResult, check_before_writing, versions

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from ltsh_addon import imaging, scene, shading
-from ltsh_addon.pipeline import PictureOptions, compare_scene, comparison, layers, lighting, shade_scene
+from ltsh_addon.imaging.exr import group_names
+from ltsh_addon.pipeline import PictureOptions, compare_scene, comparison, lighting, shade_scene
 from ltsh_addon.scene import Cancelled
 
 TABLES = Path(shading.__file__).resolve().parents[2] / "tables"
@@ -76,7 +77,7 @@ def test_one_pass_alone_is_not_combined(child, tmp_path):
 
 def test_layers_of_groups_have_names_of_their_own_without_dots():
     """Blender and compositors take what stands before a dot for the name of a layer."""
-    found = layers.group_names(["Key.001", "", "Key_001", "ungrouped"])
+    found = group_names(["Key.001", "", "Key_001", "ungrouped"])
     assert found == ["Key_001", "ungrouped_", "Key_001_2", "ungrouped"]
 
 

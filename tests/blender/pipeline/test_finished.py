@@ -17,7 +17,7 @@ from ltsh_addon.blender.extract import pixels as pixels_module
 from ltsh_addon.blender.process import client
 from ltsh_addon.cli import main
 from ltsh_addon.cycles.lobes import read_layer
-from ltsh_addon.pipeline import PictureOptions, RenderOptions, compositing, direct_light, plan, render, shade_scene
+from ltsh_addon.pipeline import PictureOptions, RenderOptions, compositing, plan, render, shade_scene
 from ltsh_addon.pipeline.lighting import ShadowTracer, load_tables
 from ltsh_addon.pipeline.mixer import light_pictures
 from ltsh_addon.pipeline.moved_lights import MovedLights
@@ -478,7 +478,7 @@ def test_highlights_thinner_than_pixels_are_told_from_those_that_points_show(tmp
         found = client.extract(job)
         own = PictureOptions(path, output=tmp_path, sub_samples=2, shadows="on")
         with ShadowTracer(found.occluders, found.lights, found.origin) as tracer:
-            shader = direct_light.DirectLightShader(own, 9.0, load_tables(("ltsh4",)), tracer)
+            shader = render.DirectLightShader(own, 9.0, load_tables(("ltsh4",)), tracer)
             thin[name] = shader.probe(client.with_points(found, 2), 1.0).contrast
     assert thin["smooth"] < 0.5 * plan.THIN_CONTRAST and thin["crumpled"] > 1.5 * plan.THIN_CONTRAST
 
@@ -512,7 +512,7 @@ def test_edges_of_shadows_on_flat_surfaces_are_where_cycles_has_them(lens, tmp_p
     light, color = (read_layer(found.channels, found.names[f"diffuse_{part}"], "RGB") for part in ("light", "color"))
     pictures = []
     for most in (1.0, 0.0):
-        monkeypatch.setattr(direct_light, "MOST_EDGES", most)
+        monkeypatch.setattr(render, "MOST_EDGES", most)
         made = render.finish(RenderOptions(path, output=tmp_path, sub_samples=3, cycles_samples=4)).comparison
         pictures.append((made.images["ltsh4", "diffuse"], made.film.has_more()))
     (fine, is_fine), (coarse, is_coarse) = pictures

@@ -48,4 +48,4 @@ def main(rig):
                 rig.fact(f"{technique}, {surface}, {kind}: worst, of what is allowed", round(float(times.max()), 3))
                 rig.check(bool((times <= 1.0).all()), f"{technique}, {surface}, {kind}: as the integrator has it")
                 yield 0.1
-        drawing.free()
+        del drawing

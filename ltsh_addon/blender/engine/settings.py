@@ -111,11 +111,11 @@ def _is_about_scene(panel) -> bool:
 
 def _below(panel) -> list[type]:
     """All classes derived from `panel`, each once."""
-    found = {}
-    for own in panel.__subclasses__():
-        found[own] = None
-        found.update(dict.fromkeys(_below(own)))
-    return list(found)
+    classes = {}
+    for derived in panel.__subclasses__():
+        classes[derived] = None
+        classes.update(dict.fromkeys(_below(derived)))
+    return list(classes)
 
 
 class _AsCycles:

@@ -10,6 +10,7 @@ import numpy as np
 from ...cycles import closures
 from ...scene import SurfaceSamples
 from .camera import ViewCamera
+from .drawing import float_texture, read_texture
 
 # Fields of `GBufferTextures` by their names in shaders.
 SAMPLERS = {
@@ -26,21 +27,14 @@ SAMPLERS = {
     "rebounds": "rebound",
 }
 # Fields of `VisibilityGrid` by their names in shaders.
-SHARE_SAMPLERS = {"shares": "shares", "grid_positions": "positions"}
-
-
-def read_texture(texture: gpu.types.GPUTexture) -> np.ndarray:
-    """The values (H, W, 4) of a texture of floats, row 0 at the bottom."""
-    buffer = texture.read()
-    buffer.dimensions = texture.width * texture.height * 4
-    return np.array(buffer, np.float32).reshape(texture.height, texture.width, 4)
+VISIBILITY_SAMPLERS = {"visibility": "visibility", "grid_positions": "positions"}
 
 
 @dataclass(frozen=True)
 class VisibilityGrid:
-    """The shares of lights that are seen at the points of a picture. Other pictures of the same surfaces may use it."""
+    """The visible fraction of each light at the points of a picture. Other pictures of the same surfaces may use it."""
 
-    shares: gpu.types.GPUTexture  # RG, a layer for each light: the specular and the diffuse share
+    visibility: gpu.types.GPUTexture  # RG, a layer for each light: the specular and the diffuse fraction
     positions: gpu.types.GPUTexture  # of the points, relative to the view's origin; w = 0 where there is no surface
     projection: np.ndarray  # (4, 4) to the clip space that the texels fill
     sources: tuple = ()  # of each layer: a layer whose source is the same object is the same
@@ -64,7 +58,7 @@ class GBufferTextures:
     smooth_normal: gpu.types.GPUTexture | None = None  # w is not read; None: `diffuse_normal`
     tangent: gpu.types.GPUTexture | None = None  # of anisotropic lobes; w = anisotropy; None: 0
     rebound: gpu.types.GPUTexture | None = None  # diffuse_rebound; w = diffuse_roughness; None: 0
-    shares: VisibilityGrid | None = None  # None: every light is seen whole
+    visibility: VisibilityGrid | None = None  # None: every light is seen whole
     mask: gpu.types.GPUTexture | None = None  # depth buffer, 0 where there is no surface; None: all pixels are lit
     has_sheen: bool = False  # there are texels of sheen: base.w = -sheen_a, normal.w = sheen_b
     has_velvet: bool = False  # there are texels of velvet: rebound.w = -sigma, rebound.rgb = albedo
@@ -77,7 +71,7 @@ class GBufferTextures:
             field.name: (texture.width, texture.height)
             for field in fields(self)
             if not field.name.startswith("has_")
-            and field.name != "shares"
+            and field.name != "visibility"
             and (texture := getattr(self, field.name)) is not None
         }
         if len(set(sizes.values())) != 1:
@@ -87,27 +81,6 @@ class GBufferTextures:
     def size(self) -> tuple[int, int]:
         """Width and height in pixels."""
         return self.position.width, self.position.height
-
-
-def empty_texture(size: tuple[int, int]) -> gpu.types.GPUTexture:
-    """RGBA32F texture of zeros; `size` is (width, height)."""
-    texture = gpu.types.GPUTexture(size, format="RGBA32F")
-    texture.clear(format="FLOAT", value=(0.0, 0.0, 0.0, 0.0))
-    return texture
-
-
-def frame_buffer(color: gpu.types.GPUTexture, depth: gpu.types.GPUTexture | None = None) -> gpu.types.GPUFrameBuffer:
-    """A frame buffer of the textures."""
-    return gpu.types.GPUFrameBuffer(color_slots=[color], **({} if depth is None else {"depth_slot": depth}))
-
-
-def float_texture(values: np.ndarray) -> gpu.types.GPUTexture:
-    """RGBA32F texture of values (H, W, 4), or an array texture of values (N, H, W, 4)."""
-    values = np.ascontiguousarray(values, dtype=np.float32)
-    height, width = values.shape[-3:-1]
-    buffer = gpu.types.Buffer("FLOAT", values.size, values.reshape(-1))
-    layers = values.shape[0] if values.ndim == 4 else 0
-    return gpu.types.GPUTexture((width, height), layers=layers, format="RGBA32F", data=buffer)
 
 
 def upload_samples(samples: SurfaceSamples, width: int, pixel: np.ndarray | None = None) -> GBufferTextures:

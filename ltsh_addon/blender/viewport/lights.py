@@ -81,13 +81,13 @@ def strongest(lights: list[AreaLight], notes: list[str], most: int = MOST_LIGHTS
     if len(lights) <= most:
         return lights
     power = np.array([np.linalg.norm(light.area_vector) * np.abs(light.radiance).sum() for light in lights])
-    kept = np.sort(np.argsort(-power, kind="stable")[:most])
-    left = 1.0 - power[kept].sum() / power.sum()
+    chosen = np.sort(np.argsort(-power, kind="stable")[:most])
+    missing = 1.0 - power[chosen].sum() / power.sum()
     notes.append(
-        f"Of {len(lights)} lights, faces and patches the {most} strongest are shown, {100.0 * left:.1f} % of the power "
-        "is missing"
+        f"Of {len(lights)} lights, faces and patches the {most} strongest are shown, {100.0 * missing:.1f} % of the "
+        "power is missing"
     )
-    return [lights[index] for index in kept]
+    return [lights[index] for index in chosen]
 
 
 def _has_emission(ob) -> bool:
@@ -100,10 +100,10 @@ def _emission(material) -> np.ndarray:
 
 def _mesh_lights(depsgraph, receivers: Receivers, notes: list[str]) -> list[AreaLight]:
     override = depsgraph.view_layer_eval.material_override
-    found = collect_mesh_lights(depsgraph, override, receivers, notes.append, copies=False)
+    mesh_lights = collect_mesh_lights(depsgraph, override, receivers, notes.append, copies=False)
     camera = depsgraph.scene.camera
     eye = FAR_AWAY if camera is None else np.array(camera.matrix_world.translation)
-    return constant_mesh_lights(found, _emission, eye, notes.append)
+    return constant_mesh_lights(mesh_lights, _emission, eye, notes.append)
 
 
 def patterns_of(scene, depsgraph) -> dict[tuple, SeenNodes]:
@@ -159,13 +159,13 @@ def _with_nodes(light: AreaLight, instance, looked: tuple, notes: list[str]) -> 
     warnings: list[str] = []
     matrix = np.array(instance.matrix_world, dtype=np.float64)
     unseen = unseen_light(ob, matrix, SimpleNamespace(warn=warnings.append), instance)
-    found = patterns(data, unseen)
-    if isinstance(found, str):
-        notes.append(f"{light.name}: {found}")
+    pattern = patterns(data, unseen)
+    if isinstance(pattern, str):
+        notes.append(f"{light.name}: {pattern}")
         return [replace(light, falloff=0, smooth=0.0)]
     notes += warnings
     if not light.is_distant:
         light = replace(light, falloff=unseen.falloff.power, smooth=unseen.falloff.smooth)
     if light.is_facing or light.is_distant:
-        return with_pattern(light, found, unseen, notes.append)
-    return textures.split_seen(light, found, notes)
+        return with_pattern(light, pattern, unseen, notes.append)
+    return textures.split_seen(light, pattern, notes)

@@ -10,10 +10,11 @@ from mathutils import Matrix
 from ...shading.header import filled
 from ..materials.looks import IMAGE_SLOTS, is_missing
 from .camera import ViewCamera
-from .gbuffer import GBufferTextures, float_texture
+from .drawing import PixelShader, drawing, float_table, float_texture, glsl, uniform_buffer
+from .gbuffer import GBufferTextures
 from .mirror import ShownInstance, ShownLook
-from .shaders import glsl, pixel_shader, slope_text
-from .textures import DEFINES, LOOK_SIZE, albedo_table, blend_table, float_table, sheen_table, uniform_buffer
+from .shaders import slope_text
+from .textures import DEFINES, LOOK_SIZE, albedo_table, blend_table, sheen_table
 
 # Outputs of the surface shader, in groups that are drawn into at once. A group has at most six textures.
 SURFACES = ("position", "normal", "base", "f0", "f90", "dielectric")
@@ -50,7 +51,7 @@ class SurfacePass:
         self._shaders = {(outputs, False): _shader(outputs) for outputs in (SURFACES, NORMALS, EMISSION)}
         self._tables = {"albedo_table": float_table(albedo_table()), "blend_table": float_table(blend_table())}
         self._tables["sheen_table"] = float_texture(sheen_table())
-        self._mask_shader = pixel_shader(glsl("mask"), ("positions",), {}, is_depth=True)
+        self._mask_shader = PixelShader(glsl("mask"), ("positions",), {}, is_depth=True)
         self._nothing = float_texture(np.zeros((1, 1, 4)))
         self._missing = float_texture(np.array(MISSING_COLOR).reshape(1, 1, 4))
         self._size = self._depth = None
@@ -76,9 +77,7 @@ class SurfacePass:
         having = [instance for instance in instances if any(len(look.lobes) > number for look in instance.looks)]
         return self._gbuffer(number, having, view)
 
-    def add_emission(
-        self, instances: list[ShownInstance], view: ViewCamera, size: tuple[int, int], frame_buffer
-    ) -> None:
+    def add_emission(self, instances: list[ShownInstance], view: ViewCamera, frame_buffer) -> None:
         """Add the emission of the surfaces drawn last to `frame_buffer`."""
         shining = [instance for instance in instances if any(map(_shines, instance.looks))]
         if shining:
@@ -99,20 +98,9 @@ class SurfacePass:
 
     def _add(self, outputs, parts, view: ViewCamera, frame_buffer) -> None:
         """Add `outputs` of the lobes (number, instances) of `parts` to `frame_buffer`, on the surfaces drawn last."""
-        with frame_buffer.bind():
-            gpu.state.viewport_set(0, 0, *self._size)
-            gpu.state.depth_test_set("NONE")
-            gpu.state.blend_set("ADDITIVE_PREMULT")
-            try:
-                for number, instances in parts:
-                    self._draw_instances(outputs, instances, view, number)
-            finally:
-                gpu.state.blend_set("NONE")
-
-    def free(self) -> None:
-        """Free all textures and shaders."""
-        self._targets, self._tables, self._shaders = {}, {}, {}
-        self._size = self._nothing = self._missing = self._depth = self._through = self._mask_shader = None
+        with drawing(frame_buffer, (0, 0, *self._size), "ADDITIVE_PREMULT"):
+            for number, instances in parts:
+                self._draw_instances(outputs, instances, view, number)
 
     def _gbuffer(self, number, instances, view) -> GBufferTextures:
         textures = self._draw_into(SURFACES, instances, view, number)
@@ -137,18 +125,9 @@ class SurfacePass:
             texture = gpu.types.GPUTexture(self._size, format="DEPTH_COMPONENT32F")
             self._targets[MASK, is_further] = texture, gpu.types.GPUFrameBuffer(depth_slot=texture)
         texture, buffer = self._targets[MASK, is_further]
-        shader, batch = self._mask_shader
-        with buffer.bind():
-            gpu.state.viewport_set(0, 0, *self._size)
-            gpu.state.depth_test_set("ALWAYS")
-            gpu.state.depth_mask_set(True)
-            try:
-                shader.bind()
-                shader.uniform_sampler("positions", position)
-                batch.draw(shader)
-            finally:
-                gpu.state.depth_test_set("NONE")
-                gpu.state.depth_mask_set(False)
+        with drawing(buffer, (0, 0, *self._size), depth="ALWAYS", writes_depth=True):
+            self._mask_shader.bind({"positions": position})
+            self._mask_shader.draw()
         return texture
 
     def _target(self, outputs, is_further: bool):
@@ -166,19 +145,12 @@ class SurfacePass:
         textures, buffer = self._target(outputs, is_further)
         if (outputs, is_further) not in self._shaders:
             self._shaders[outputs, is_further] = _shader(outputs, is_further)
-        with buffer.bind():
-            gpu.state.viewport_set(0, 0, *self._size)
+        depth = "NONE" if is_further else "LESS_EQUAL"
+        with drawing(buffer, (0, 0, *self._size), depth=depth, writes_depth=not is_further):
             # Only the position tells where there is a surface. The others are cleared because old texels may be NaN.
             buffer.clear(color=(0.0, 0.0, 0.0, 0.0), **({} if is_further or self._is_glass else {"depth": 1.0}))
-            gpu.state.blend_set("NONE")
-            gpu.state.depth_test_set("NONE" if is_further else "LESS_EQUAL")
-            gpu.state.depth_mask_set(not is_further)
             gpu.state.face_culling_set("NONE")
-            try:
-                self._draw_instances(outputs, instances, view, number)
-            finally:
-                gpu.state.depth_test_set("NONE")
-                gpu.state.depth_mask_set(False)
+            self._draw_instances(outputs, instances, view, number)
         return textures
 
     def _draw_instances(self, outputs, instances, view: ViewCamera, number: int) -> None:

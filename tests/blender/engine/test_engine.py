@@ -562,8 +562,7 @@ def test_views_at_rest_are_drawn_again_and_what_moves_is_left_alone():
 def test_a_view_that_is_left_is_freed_at_once_and_what_works_for_it_is_stopped(scene, monkeypatch):
     """Not when Python looks for circles the next time: it has textures, and processes that help."""
     collected = []
-    monkeypatch.setattr(view, "collect_occluders", lambda *arguments: collected.append(True))
-    monkeypatch.setattr(view, "blocks_nothing", lambda occluders, world: occluders)
+    monkeypatch.setattr(view, "view_occluders", lambda *arguments: collected.append(True))
     depsgraph = bpy.context.evaluated_depsgraph_get()
     gc.collect()
     gc.disable()

@@ -74,7 +74,6 @@ def chosen(kind, count, threshold):
     horizons = HorizonPass()
     texture = horizons.draw(upload_samples(samples, WIDTH), upload_lights(lights), (*EYE, 1.0), threshold)
     found = read(texture)[:, :3]
-    horizons.free()
     return found, samples, lights
 
 

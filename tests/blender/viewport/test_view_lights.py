@@ -235,10 +235,10 @@ def test_a_light_that_changes_meanwhile_is_looked_at_again_and_nobody_waits_in_v
     def begun():
         seen(lamps.pattern)
         end = time.monotonic() + 30.0
-        while lamps._look is None and time.monotonic() < end:
+        while lamps._job is None and time.monotonic() < end:
             lamps.step(1)
             time.sleep(0.02)
-        return lamps._look
+        return lamps._job
 
     begun()
     wave.inputs[1].default_value = 0.5

@@ -51,7 +51,7 @@ def normals_at(mesh, points):
     triangles = np.array([triangle.loops[:] for triangle in mesh.loop_triangles])
     place = np.array([mesh.vertices[index].co[:] for index in vertex], np.float32)
     normal, flat = evaluated.interpolated_normals(mesh, vertex)
-    own, its_normal = meshes.own_normals(mesh, flat, triangles, place, normal)
+    own, its_normal = meshes.non_planar_normals(mesh, flat, triangles, place, normal)
     corner_normals = normal[triangles].astype(np.float64)
     corner_normals[own] = its_normal[:, None]
     found = np.full((len(points), 3), np.nan)

@@ -17,11 +17,12 @@ from pathlib import Path
 from ..pipeline.batch import Merged, merge, run_tasks
 from ..pipeline.lighting import prepare
 from ..pipeline.options import BakeOptions, PictureOptions, RenderOptions, ViewOptions, options_from, table
-from ..pipeline.picture import Baseline
+from ..pipeline.picture import Baseline, with_times
 from ..pipeline.tasks import BatchJob
 from ..scene import SHIPPED_TABLES, SceneError, error_line
 from ..shading import TableError
 from .arguments import (
+    FileJob,
     Misuse,
     add_baseline,
     add_batch,
@@ -29,10 +30,10 @@ from .arguments import (
     add_options,
     add_talk,
     from_text,
+    read_jobs,
     scenes_of,
     with_examples,
 )
-from .job_file import FileJob, read_jobs
 from .progress import print_json, print_out
 
 DEMO_RESOLUTION = (480, 270)
@@ -502,9 +503,7 @@ def merge_job(output: Path, arguments, bar, baseline: Baseline | None = None) ->
         _complain(bar, "worse", worse)
     document = merged.report if baseline is None else {**merged.report, "worse": worse}
     if merged.command == "view":
-        from ..pipeline import view
-
-        document = view.with_times(document, merged.seconds)
+        document = with_times(document, merged.seconds)
     return document, 1 if merged.missing or merged.problems or worse else 0
 
 
@@ -531,12 +530,15 @@ def _warnings(merged) -> list[str]:
 
 
 def _summary(merged: Merged, output) -> str:
-    from ..pipeline import bake, picture, render, view
+    from ..pipeline import bake, picture, render
 
-    wording = {"bake": bake, "view": view, "render": render}.get(merged.command, picture)
-    brief = render.brief if merged.command == "view" else wording.brief
+    summary, brief = {
+        "bake": (bake.summary, bake.brief),
+        "view": (picture.view_summary, render.brief),
+        "render": (render.summary, render.brief),
+    }.get(merged.command, (picture.summary, picture.brief))
     if merged.single and "reports" not in merged.report:
-        lines = wording.summary(merged.report, merged.seconds)
+        lines = summary(merged.report, merged.seconds)
     else:
         lines = [line for report in merged.report["reports"] for line in brief(report)]
     return "\n".join([*(line.rstrip() for line in lines), f"written to {output}"])

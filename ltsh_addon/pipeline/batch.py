@@ -13,7 +13,7 @@ from ..files import no_empty_folder, temporary_folder
 from ..imaging import write_json, write_overview
 from ..reading import NUMBER, Malformed, read_json
 from ..scene import Progress, SceneError, error_line
-from . import bake, picture, render, view
+from . import bake, picture, render
 from .lighting import prepare
 from .tasks import (
     FOLDER,
@@ -130,7 +130,7 @@ def _perform(job: BatchJob, task: BatchTask, following: tuple, existing: str, pr
     if job.command == "render":
         return render.make_finished(options, progress)
     if job.command == "view":
-        return view.draw_view(options, progress)
+        return picture.draw_view(options, progress)
     return picture.make_picture(options, job.command == "compare", progress)
 
 

@@ -1,10 +1,11 @@
-"""Pictures of techniques, alone or beside Cycles: from a .blend to the files, and the lines about them.
+"""Pictures of techniques: shaded, beside Cycles, or as the viewport draws them; and the lines about them.
 
 A baseline is the report of an earlier comparison: what got worse since, and where.
 """
 
 from __future__ import annotations
 
+import statistics
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -13,20 +14,25 @@ from pathlib import Path
 
 import numpy as np
 
+from .. import imaging
 from ..files import save_array, temporary_folder, write_bytes
+from ..imaging.color import identified
+from ..imaging.exr import COVERAGE, layer_name, metadata
 from ..reading import NUMBER, Malformed, check, read_json, some
-from ..scene import PASSES, Progress
+from ..scene import PASSES, SHIPPED_TABLES, Progress
 from . import lighting
 from .comparison import Comparison, most_accurate, percent, unbiased
 from .lighting import check_named, evaluated, prepare
-from .options import PictureOptions, child_job
+from .options import PictureOptions, ViewOptions, child_job
 from .relight import RELIGHT_SUFFIX, write_relight_data
-from .tasks import TaskResult, write_reports
+from .tasks import TaskResult, check_before_writing, versions, write_reports
 
 SHOWN = "shown.png"  # temporary
 # Facts that two comparisons must share for their errors to be comparable.
 _SAME = ("resolution", "sub_samples", "cycles_samples", "surface_samples", "reference")
 _CLASSES = ("metals", "dielectrics")
+# Names of times in a report, and in the seconds of a task.
+TIMES = {"draw_s": "draw", "refined_s": "refined"}
 
 
 def shade_scene(options: PictureOptions, progress: Progress | None = None) -> dict:
@@ -101,6 +107,109 @@ def view_transformed(pixels: np.ndarray, options, folder: Path, progress) -> byt
     save_array(folder / client.PICTURE, pixels.astype(np.float32))
     client.show_finished(Path(options.scene), (None, options.frame), folder, SHOWN, progress=progress)
     return (folder / SHOWN).read_bytes()
+
+
+def draw_view(options: ViewOptions, progress: Progress | None = None) -> TaskResult:
+    """Draw a scene as the viewport does and write its EXR and PNG.
+
+    The seconds have "draw": the median of a redraw with the first technique, without rays; "shadows": all rays; and
+    "refined": all `refine` redraws and the rays. Raises SceneError, TableError, OSError, Cancelled.
+    """
+    from ..blender.process import client
+
+    start = time.perf_counter()
+    tables = prepare(options)
+    width, height = options.resolution or (None, None)
+    given = tuple(name if name in SHIPPED_TABLES else str(Path(name).absolute()) for name in options.techniques)
+    job = child_job(client.ViewJob, options, width=width, height=height, techniques=given)
+    with temporary_folder() as folder:
+        manifest = client.draw_view(job, folder, progress=progress)
+        pictures = {
+            name: {pass_name: np.load(folder / f"{number}_{pass_name}.npy") for pass_name in client.VIEW_PASSES}
+            for number, name in enumerate(tables)
+        }
+        shown = (folder / client.VIEW_PNG).read_bytes()
+    check_before_writing(progress)
+    coverage = next(iter(pictures.values()))["diffuse"][..., 3]
+    report = _view_report(options, tables, manifest, coverage)
+    name = options.name or "view"
+    layers = {
+        layer_name(technique, pass_name): image[..., :3]
+        for technique, images in pictures.items()
+        for pass_name, image in images.items()
+    }
+    layers[COVERAGE] = imaging.Layer(coverage, "V")
+    path = options.output / f"{name}.exr"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    color_space = identified(manifest["color_space"]["to_rec709"], manifest["color_space"]["name"])
+    facts = manifest["frame"], manifest["camera"], color_space.name
+    described = metadata(options.scene, *facts, exposure=repr(manifest["exposure"]))
+    imaging.write_layers(path, layers, described, imaging.chromaticities(color_space), manifest["pixel_aspect"])
+    write_bytes(path.with_suffix(".png"), shown)
+    redraws = {name: statistics.median(times) for name, times in zip(tables, manifest["redraws"], strict=True)}
+    draw, shadows = next(iter(redraws.values())), (manifest["shadows"] or {"seconds": 0.0})["seconds"]
+    seconds = {
+        "blender": manifest["seconds"],
+        "draw": draw,
+        "shadows": shadows,
+        "refined": draw * options.refine + shadows,
+        "techniques": {name: {"redraw": median} for name, median in redraws.items()},
+        "total": time.perf_counter() - start,
+    }
+    return TaskResult(report, seconds, (f"{name}.exr", f"{name}.png"))
+
+
+def _view_report(options: ViewOptions, tables, manifest: dict, coverage: np.ndarray) -> dict:
+    """The report of a view: the entries of a picture's report that a view has, and "graphics"."""
+    shadows = manifest["shadows"]
+    return {
+        "scene": str(options.scene),
+        "camera": manifest["camera"],
+        "frame": manifest["frame"],
+        "resolution": [manifest["width"], manifest["height"]],
+        "pixel_aspect": manifest["pixel_aspect"],
+        "pixel_filter": manifest["pixel_filter"] if options.refine > 1 else "pixel centers",
+        "exposure": manifest["exposure"],
+        "color_space": manifest["color_space"]["name"],
+        "sub_samples": options.refine,
+        "surface_samples": int(np.count_nonzero(coverage)),
+        "cycles_samples": 0,
+        "lights": manifest["lights"],
+        "versions": versions(manifest["blender_version"]),
+        "graphics": manifest["graphics"],
+        "tables": dict(zip(tables, options.techniques, strict=True)),
+        "reference": None,
+        "shadows": shadows and {name: shadows[name] for name in ("rays", "noise", "tracer")},
+        "passes": {
+            name: {"techniques": {table: {} for table in tables}} for name in ("combined", "specular", "diffuse")
+        },
+        "problems": [],
+        "warnings": manifest["warnings"],
+    }
+
+
+def with_times(report: dict, seconds: dict) -> dict:
+    """The report of one view or of several, with "draw_s" and "refined_s" of each; `seconds` are those of `merge`."""
+    if "reports" not in report:
+        return {**report, **_times(seconds)}
+    reports = [{**one, **_times(seconds.get(one["name"], {}))} for one in report["reports"]]
+    drawn = [one["draw_s"] for one in reports if "draw_s" in one]
+    return {**report, "reports": reports, **({"draw_s": statistics.median(drawn)} if drawn else {})}
+
+
+def _times(seconds: dict) -> dict:
+    return {name: seconds[key] for name, key in TIMES.items() if key in seconds}
+
+
+def view_summary(report: dict, seconds: dict) -> list[str]:
+    """One line about a view."""
+    times = _times(seconds)
+    took = (
+        f": a redraw {times['draw_s']:.3f} s, all of {report['sub_samples']} {times['refined_s']:.2f} s"
+        if times
+        else ""
+    )
+    return [f"{report['resolution'][0]}x{report['resolution'][1]} on {report['graphics']}{took}"]
 
 
 _ERRORS = {"relative_l2?": NUMBER | None}

@@ -54,8 +54,8 @@ def flat_polygons(vertices: np.ndarray, triangles: np.ndarray, labels: np.ndarra
     labels, triangle_corners = labels.tolist(), vertices[triangles]
     pairs = starts[ends - starts == 2]
     corners, pair_normals, are_quads = _quads(vertices, triangles[order[pairs]], triangles[order[pairs + 1]])
-    for start, own, normal in zip(pairs[are_quads].tolist(), corners[are_quads], pair_normals[are_quads], strict=True):
-        polygons[start] = FlatPolygon(own, normal, labels[order[start]])
+    for start, quad, normal in zip(pairs[are_quads].tolist(), corners[are_quads], pair_normals[are_quads], strict=True):
+        polygons[start] = FlatPolygon(quad, normal, labels[order[start]])
     for start, end in zip(starts.tolist(), ends.tolist(), strict=True):
         if start in polygons:
             continue
@@ -64,9 +64,9 @@ def flat_polygons(vertices: np.ndarray, triangles: np.ndarray, labels: np.ndarra
         if outline is not None:
             polygons[start] = FlatPolygon(outline, _normal(outline), labels[members[0]])
             continue
-        for place, index in enumerate(members.tolist(), start):
-            polygons[place] = FlatPolygon(triangle_corners[index], normals[index], labels[index])
-    return [polygons[place] for place in sorted(polygons)]
+        for rank, index in enumerate(members.tolist(), start):
+            polygons[rank] = FlatPolygon(triangle_corners[index], normals[index], labels[index])
+    return [polygons[rank] for rank in sorted(polygons)]
 
 
 def _quads(vertices, first, second) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -75,8 +75,8 @@ def _quads(vertices, first, second) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     matches = (first[:, :, None] == np.roll(second, -1, axis=1)[:, None]) & (
         np.roll(first, -1, axis=1)[:, :, None] == second[:, None]
     )
-    rows, place = np.arange(len(first)), matches.reshape(-1, 9).argmax(axis=1)
-    edge, other = place // 3, place % 3
+    rows, match = np.arange(len(first)), matches.reshape(-1, 9).argmax(axis=1)
+    edge, other = match // 3, match % 3
     index = [first[rows, (edge + step) % 3] for step in (1, 2, 0)] + [second[rows, (other + 2) % 3]]
     corners = vertices[np.stack(index, axis=1)]
     offset = corners - corners.mean(axis=1, keepdims=True)
@@ -240,8 +240,8 @@ def _is_hollow(vertices, triangles, closed: bool) -> bool:
     normals, first = normals[solid] / lengths[solid, None], first[solid] - used_center
     outward = outward_side(vertices, triangles) if closed else 1
     for start in range(0, len(first), 256):
-        part = slice(start, start + 256)
-        height = (used - used_center) @ normals[part].T - np.sum(first[part] * normals[part], axis=-1)
+        chunk = slice(start, start + 256)
+        height = (used - used_center) @ normals[chunk].T - np.sum(first[chunk] * normals[chunk], axis=-1)
         height *= outward
         if height.max(initial=0.0) > FLATNESS * extent or (not closed and height.min() < -FLATNESS * extent):
             return True

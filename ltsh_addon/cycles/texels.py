@@ -11,7 +11,7 @@ from ..scene import AreaLight, SurfaceSamples
 from .gbuffer import HITS_PER_BLOCK
 from .horizons import end_at_horizons_of_cycles, unit
 from .images import GRAY, ImageTexture
-from .lobes import LOBE_AOVS, Hits, samples_of_lobes
+from .lobes import LOBE_AOVS, SurfaceHits, samples_of_lobes
 from .uv import Texels
 
 # Value of texels that Cycles' bake left out, in its maps and its radiance.
@@ -126,7 +126,7 @@ def texel_samples(
         smooth_normal = unit(_interpolated(mesh.normals, triangle, weights))
         true_normal = true_normals[triangle]
         number = mesh.material[triangle]
-        hits = Hits(
+        hits = SurfaceHits(
             position=position,
             view=view.towards(position, smooth_normal, true_normal),
             smooth_normal=smooth_normal,
@@ -162,15 +162,15 @@ def _lobes(materials, number, maps, triangle, weights) -> list[dict[str, np.ndar
     def varying(which, value, kind):
         at = texels[which]
         if "map" in value:
-            found = maps[value["map"]][at]
-            return found if kind == "COLOR" else found[:, value["channel"]]
+            baked = maps[value["map"]][at]
+            return baked if kind == "COLOR" else baked[:, value["channel"]]
         key = which, value["texture"]
         if key not in colors:
             colors[key] = materials[which].colors(value["texture"], triangle[at], weights[at])
-        part = value["part"]
-        if part == "gray":
+        component = value["part"]
+        if component == "gray":
             return colors[key] @ GRAY
-        return colors[key] if part == "color" else colors[key][:, int(part)]
+        return colors[key] if component == "color" else colors[key][:, int(component)]
 
     slots = []
     for slot in range(max((len(material.lobes) for material in materials), default=0)):

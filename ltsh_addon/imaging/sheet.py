@@ -44,9 +44,9 @@ def comparison_sheet(
     """
     label, image = reference
     for tile in techniques:
-        for part in (tile.image, tile.error):
-            if part.shape != image.shape:
-                raise ValueError(f"tile {tile.label!r} has shape {part.shape}, expected {image.shape} as {label!r}")
+        for pixels in (tile.image, tile.error):
+            if pixels.shape != image.shape:
+                raise ValueError(f"tile {tile.label!r} has shape {pixels.shape}, expected {image.shape} as {label!r}")
     exposure = exposure_factor(image)
     scale = common_error_scale([tile.error for tile in techniques], image)
     first = to_srgb8(exposure * _resized(image))
@@ -94,7 +94,7 @@ def common_error_scale(errors, image) -> float:
     Without errors it is the largest value of the `image`, at least 1.
     """
     values = [np.abs(luminance(error[np.isfinite(error).all(axis=-1)])) for error in errors]
-    values = np.concatenate([part[part > 0.0] for part in values]) if values else np.empty(0)
+    values = np.concatenate([magnitudes[magnitudes > 0.0] for magnitudes in values]) if values else np.empty(0)
     if not values.size:
         return max(float(np.nanmax(np.where(np.isfinite(image), image, 0.0), initial=0.0)), 1.0)
     value = float(np.percentile(values, _SCALE_PERCENTILE))

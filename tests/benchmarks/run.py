@@ -7,7 +7,6 @@ import argparse
 import os
 import subprocess
 import sys
-import tempfile
 import time
 from dataclasses import replace
 from functools import partial
@@ -26,6 +25,7 @@ from textbook_ltc import TextbookLtc  # noqa: E402
 from zonal_harmonics import ZonalHarmonics  # noqa: E402
 
 from ltsh_addon import shading  # noqa: E402
+from ltsh_addon.cli.commands import DEMO_SCENE  # noqa: E402
 from ltsh_addon.emitters import light_polygons  # noqa: E402
 from ltsh_addon.lobes import edge_integrals, moments32  # noqa: E402
 from ltsh_addon.lobes.polygon import project_to_sphere, split_at_horizon  # noqa: E402
@@ -257,10 +257,7 @@ def cycles(options):
 
     heading("time at equal error on the demo scene, ltsh4 against Cycles (specular)")
     count = 64 if options.quick else 128
-    with tempfile.TemporaryDirectory(prefix="ltsh-bench-") as folder:
-        scene = Path(folder) / "demo.blend"
-        client.build_demo(scene)
-        extraction = client.extract(client.ExtractOptions(scene, width=480, height=270, cycles_samples=count))
+    extraction = client.extract(client.ExtractOptions(DEMO_SCENE, width=480, height=270, cycles_samples=count))
     start = time.perf_counter()
     shaded = shading.shade(extraction.samples, extraction.lights, "ltsh4", passes=["specular"])
     shade_seconds = time.perf_counter() - start

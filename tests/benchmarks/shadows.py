@@ -10,6 +10,7 @@ import argparse
 import json
 import math
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -28,6 +29,7 @@ import measure  # noqa: E402
 from ltsh_addon import imaging, shading, visibility  # noqa: E402
 from ltsh_addon.blender.process import client  # noqa: E402
 from ltsh_addon.blender.process.blender_process import embree_libraries  # noqa: E402
+from ltsh_addon.cli.commands import DEMO_SCENE  # noqa: E402
 from ltsh_addon.imaging.font import draw_text  # noqa: E402
 from ltsh_addon.pipeline import lighting  # noqa: E402
 from ltsh_addon.pipeline.options import PictureOptions  # noqa: E402
@@ -484,7 +486,7 @@ def scene_file(name, folder) -> Path:
     """The file of a scene, built by a process of its own."""
     path = folder / f"{name}.blend"
     if name == "demo":
-        client.build_demo(path)
+        shutil.copy(DEMO_SCENE, path)
     else:
         run([sys.executable, Path(__file__).with_name("shadow_scenes.py"), name, path])
     return path

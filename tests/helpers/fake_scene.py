@@ -88,27 +88,21 @@ def wall(height: float, left: float = -9.0) -> Occluders:
 
 
 class FakeChild:
-    """Stands in for functions of `client`; `asked` and `built` tell how `extract` and `build_demo` were called."""
+    """Stands in for functions of `client`; `asked` tells how `extract` was called."""
 
     def __init__(self, *, groups=("Key", "Fill.001", ""), empty=False, error=None, wall=None, change=None):
         self.groups, self.empty, self.error = groups, empty, error
         self.wall, self.change = wall, change  # an occluder (see `wall`), and what becomes of the lights
         self.asked: list[client.ExtractOptions] = []
-        self.built: list = []
 
     def install(self, monkeypatch) -> FakeChild:
         monkeypatch.setattr(client, "extract", self.extract)
-        monkeypatch.setattr(client, "build_demo", self.build_demo)
         monkeypatch.setattr(client, "show_finished", self.show_finished)
         return self
 
     def show_finished(self, scene, where, folder, name, *, progress=None):
         pixels = np.load(folder / client.PICTURE)
         imaging.write_png(folder / name, to_srgb8(pixels[..., :3]))
-
-    def build_demo(self, path, *, progress=None):
-        self.built.append(path)
-        path.write_bytes(b"BLENDER")
 
     def extract(self, options, *, progress=None):
         self.asked.append(options)

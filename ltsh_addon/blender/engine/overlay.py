@@ -11,7 +11,7 @@ import gpu
 from gpu_extras.batch import batch_for_shader
 
 from ...scene import CYCLES, TECHNIQUES
-from ..ui.comparison import PLATE, covered, draw_rectangle
+from ..ui.overlay import PLATE, covered, draw_rectangle
 from ..ui.preview import ENGINE
 
 MOST_NOTES = 4

@@ -24,7 +24,7 @@ from ..ui import comparison
 from ..ui.job import (
     Plan,
     progress_text,
-    seen,
+    session_times,
     stage_title,
 )
 from ..ui.preview import ENGINE
@@ -111,10 +111,10 @@ class LTSH_RenderEngine(bpy.types.RenderEngine):
             while not pictures.empty():
                 self._show(pictures.get(), job.view_layer)
 
-        plan = Plan(job.steps(), seen=seen)
+        plan = Plan(job.steps(), measured=session_times)
         progress = self._progress(plan, show_new)
         picture = stoppable(lambda report: final_picture(job, scene_file, report, pictures.put), progress)
-        plan.end(seen)
+        plan.end(session_times)
         for problem in picture.problems:
             self.report({"ERROR"}, f"LTSH: {problem}")
         for warning in picture.warnings:

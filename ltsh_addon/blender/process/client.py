@@ -166,7 +166,7 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
 
         def look(channels: dict[str, np.ndarray]) -> None:
             if options.for_finished:
-                bits.append(gbuffer.kept_by_cycles(channels))
+                bits.append(gbuffer.left_to_cycles(channels))
             if options.rest:
                 rest.add(gbuffer.not_reflected(channels, manifest["passes"], manifest["film_transparent"]))
 
@@ -203,12 +203,6 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
             weights=np.array(manifest["weights"]) if manifest["weights"] else None,
         )
         return found if options.for_finished else ended(found)
-
-
-def build_demo(path: Path, *, progress: Progress | None = None) -> None:
-    """Save the example scene as the .blend `path`, completely or not at all. Raises SceneError, OSError."""
-    with replacing_by_copy(Path(path).absolute()) as unfinished, temporary_folder() as folder:
-        run_child({"task": "demo", "path": str(unfinished)}, folder, progress)
 
 
 def with_points(extraction: Extraction, count: int) -> Extraction:

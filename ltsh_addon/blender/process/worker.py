@@ -65,10 +65,6 @@ def _answer(job: dict, folder: Path, progress) -> dict:
 
 
 def _perform(job: dict, folder: Path, progress) -> dict:
-    if job["task"] == "demo":
-        progress("build scene", 0.0)
-        _module("blender.demo").build(Path(job["path"]))
-        return {}
     if job["task"] == "bake":
         return _module("blender.extract.bake").extract_bake(job, folder, progress)
     if job["task"] == "facts":

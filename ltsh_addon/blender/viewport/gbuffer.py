@@ -7,10 +7,9 @@ from dataclasses import dataclass, fields
 import gpu
 import numpy as np
 
-from ...cycles import closures
 from ...scene import SurfaceSamples
 from .camera import ViewCamera
-from .drawing import float_texture, read_texture
+from .drawing import read_texture
 
 # Fields of `GBufferTextures` by their names in shaders.
 SAMPLERS = {
@@ -83,54 +82,6 @@ class GBufferTextures:
         return self.position.width, self.position.height
 
 
-def upload_samples(samples: SurfaceSamples, width: int, pixel: np.ndarray | None = None) -> GBufferTextures:
-    """Textures, `width` texels wide, of `samples` (P) at the texels `pixel` (P,), counted from the lower left.
-
-    Without `pixel` the samples are stored in order.
-    """
-    pixel = np.arange(len(samples)) if pixel is None else np.asarray(pixel)
-    height = -(-(int(pixel.max(initial=0)) + 1) // width)
-
-    def texture(vectors, scalars):
-        values = np.zeros((height * width, 4), np.float32)
-        values[pixel, :3] = vectors
-        values[pixel, 3] = scalars
-        return float_texture(values.reshape(height, width, 4))
-
-    dip = samples.specular_dip
-    bumped = (samples.smooth_normal != samples.diffuse_normal).any()
-    turned = bumped or (samples.diffuse_normal != samples.normal).any()
-    fuzzy, velvet = samples.sheen_a > 0.0, samples.sheen_a < 0.0
-    return GBufferTextures(
-        has_sheen=bool(fuzzy.any()),
-        has_bent=bool(((samples.ior < 1.0) & samples.dielectric.any(axis=1)).any()),
-        position=texture(samples.position, 1.0 + samples.receiver),
-        normal=texture(samples.normal, np.where(fuzzy, samples.sheen_b, samples.roughness)),
-        base=texture(samples.diffuse_albedo, np.where(fuzzy, -samples.sheen_a, samples.ior)),
-        f0=texture(samples.specular_f0, dip[:, 0]),
-        f90=texture(samples.specular_f90, dip[:, 1]),
-        dielectric=texture(samples.dielectric, dip[:, 2]),
-        geometric_normal=texture(samples.geometric_normal, 0.0)
-        if (samples.geometric_normal != samples.normal).any()
-        else None,
-        diffuse_normal=texture(samples.diffuse_normal, samples.bump_alpha2) if turned else None,
-        smooth_normal=texture(samples.smooth_normal, 0.0) if bumped else None,
-        tangent=texture(samples.tangent, samples.anisotropy) if samples.anisotropy.any() else None,
-        rebound=texture(
-            np.where(velvet[:, None], _albedo_of_velvet(samples)[:, None], samples.diffuse_rebound),
-            np.where(velvet, samples.sheen_a, samples.diffuse_roughness),
-        )
-        if velvet.any() or samples.diffuse_roughness.any()
-        else None,
-        has_velvet=bool(velvet.any()),
-    )
-
-
-def _albedo_of_velvet(samples) -> np.ndarray:
-    cosine = (samples.diffuse_normal * samples.view).sum(axis=1)
-    return closures.velvet_albedo(cosine, np.maximum(-samples.sheen_a, 0.0))
-
-
 def every_texel(texture: gpu.types.GPUTexture, step: int) -> np.ndarray:
     """Every `step`-th texel (H, W, 4) in either direction."""
     return np.ascontiguousarray(read_texture(texture)[step // 2 :: step, step // 2 :: step])
@@ -138,12 +89,12 @@ def every_texel(texture: gpu.types.GPUTexture, step: int) -> np.ndarray:
 
 def gbuffer_texels(gbuffer: GBufferTextures, step: int = 1) -> dict[str, np.ndarray]:
     """Every `step`-th texel of a G-buffer, (H, W, 4) by name of the texture."""
-    textures = {name: getattr(gbuffer, name) for name in (*_ALWAYS, *_PERHAPS)}
+    textures = {name: getattr(gbuffer, name) for name in (*_REQUIRED, *_OPTIONAL)}
     return {name: every_texel(texture, step) for name, texture in textures.items() if texture is not None}
 
 
-_ALWAYS = ("position", "normal", "base", "f0", "f90", "dielectric")
-_PERHAPS = ("diffuse_normal", "smooth_normal", "geometric_normal", "tangent", "rebound")
+_REQUIRED = ("position", "normal", "base", "f0", "f90", "dielectric")
+_OPTIONAL = ("diffuse_normal", "smooth_normal", "geometric_normal", "tangent", "rebound")
 
 
 def gbuffer_samples(gbuffer: GBufferTextures, view: ViewCamera) -> tuple[SurfaceSamples, np.ndarray]:
@@ -155,8 +106,8 @@ def gbuffer_samples(gbuffer: GBufferTextures, view: ViewCamera) -> tuple[Surface
 def samples_of_texels(texels: dict[str, np.ndarray], view: ViewCamera) -> tuple[SurfaceSamples, np.ndarray]:
     pixel = np.flatnonzero(texels["position"][:, :, 3] > 0.0)
     values = {name: rows.reshape(-1, 4)[pixel].astype(np.float64) for name, rows in texels.items()}
-    position, normal, base, f0, f90, dielectric = (values[name] for name in _ALWAYS)
-    further = {name: values.get(name) for name in _PERHAPS}
+    position, normal, base, f0, f90, dielectric = (values[name] for name in _REQUIRED)
+    further = {name: values.get(name) for name in _OPTIONAL}
     bent, fuzzy = further["diffuse_normal"], base[:, 3] < 0.0
     tangent, rebound = further["tangent"], further["rebound"]
     return SurfaceSamples(

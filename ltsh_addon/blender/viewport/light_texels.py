@@ -19,11 +19,12 @@ from .drawing import float_texture
 
 HEADER = 7  # texels of a light's header, see `light_texels`
 WIDTH = 256  # texels of a row of the texture of lights
-# Flags of a light.
-DIFFUSE, SPECULAR, ROUND, DISTANT, FACING, BALL, CONE = 1, 2, 4, 8, 16, 32, 64
-# UNEVEN: not equally bright all over. PROFILE: with a spread or a falloff. CAP: seen as a cap of the sphere.
-# PLACED: with a pattern by the place on the light.
-UNEVEN, PROFILE, CAP, PLACED = 128, 256, 512, 1024
+# Flags of a light, from the lowest bit on. UNEVEN: not equally bright all over. PROFILE: with a spread or a falloff.
+# CAP: seen as a cap of the sphere. PLACED: with a pattern by the position on the light.
+FLAGS = (
+    *("DIFFUSE", "SPECULAR", "ROUND", "DISTANT", "FACING", "BALL", "CONE"),
+    *("UNEVEN", "PROFILE", "CAP", "PLACED"),
+)
 _QUAD = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
 
@@ -62,17 +63,7 @@ def constants() -> dict[str, int | str]:
         "LIGHT_HEADER": HEADER,
         "FIRST_LIGHT": FIRST_LIGHT,
         "LIGHT_WIDTH": WIDTH,
-        "DIFFUSE_FLAG": DIFFUSE,
-        "SPECULAR_FLAG": SPECULAR,
-        "ROUND_FLAG": ROUND,
-        "DISTANT_FLAG": DISTANT,
-        "FACING_FLAG": FACING,
-        "BALL_FLAG": BALL,
-        "CONE_FLAG": CONE,
-        "UNEVEN_FLAG": UNEVEN,
-        "PROFILE_FLAG": PROFILE,
-        "CAP_FLAG": CAP,
-        "PLACED_FLAG": PLACED,
+        **{f"{name}_FLAG": 1 << bit for bit, name in enumerate(FLAGS)},
         "NEAR_DISK": float_literal(NEAR_DISK),
         "LEAST_SHRINKING": float_literal(LEAST_SHRINKING),
     }
@@ -154,11 +145,21 @@ def _outline(light, next_texel):
 
 
 def _header(light, first, count, half_v, first_receiver):
-    flags = DIFFUSE * light.affects_diffuse + SPECULAR * light.affects_specular + ROUND * light.is_round
-    flags += DISTANT * light.is_distant + FACING * light.is_facing + BALL * (light.shape == "BALL")
-    flags += CONE * (light.cone is not None) + UNEVEN * (not light.is_even) * light.is_facing
-    flags += PROFILE * light.is_profiled + CAP * _is_cap(light)
-    flags += PLACED * (light.shape == "BALL" and light.pattern is not None and not light.pattern.by_ray)
+    is_ball = light.shape == "BALL"
+    traits = {
+        "DIFFUSE": light.affects_diffuse,
+        "SPECULAR": light.affects_specular,
+        "ROUND": light.is_round,
+        "DISTANT": light.is_distant,
+        "FACING": light.is_facing,
+        "BALL": is_ball,
+        "CONE": light.cone is not None,
+        "UNEVEN": light.is_facing and not light.is_even,
+        "PROFILE": light.is_profiled,
+        "CAP": _is_cap(light),
+        "PLACED": is_ball and light.pattern is not None and not light.pattern.by_ray,
+    }
+    flags = sum(1 << bit for bit, name in enumerate(FLAGS) if traits[name])
     receivers = -1 if light.receivers is None else len(light.receivers)
     profile = light_profile.Profile.of(light)
     tangent, share = (profile.tangent, profile.share) if light.is_profiled else (0.0, np.inf)

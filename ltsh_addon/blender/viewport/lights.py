@@ -30,7 +30,7 @@ FAR_AWAY = np.full(3, 1e6)
 MOST_LIGHTS = 2048
 # Reasons why a light has no pattern.
 NOT_RESOLVED = "its nodes are not resolved, it shines as without them"
-NOT_YET = "it shines as without its nodes until Cycles has looked at them"
+NOT_YET = "it shines as without its nodes until Cycles has sources at them"
 # Patterns: a function that returns how Cycles sees the nodes of evaluated light data, or why that is not known.
 Patterns = Callable[[bpy.types.Light, UnseenLight], SeenNodes | str]
 
@@ -118,25 +118,25 @@ def patterns_of(scene, depsgraph) -> dict[tuple, SeenNodes]:
             wanted[source.key] = source
         return NOT_YET
 
-    receivers, looked = Receivers([]), (ShownTextures(), note)
+    receivers, sources = Receivers([]), (ShownTextures(), note)
     for instance in depsgraph.object_instances:
         ob = instance.object
         if ob.type == "LIGHT" and tree_in_use(ob.data) is not None:
             matrix = np.array(instance.matrix_world, dtype=np.float64)
             if not reason_to_leave_out(ob, matrix):
-                _with_nodes(area_light(ob, matrix, EmitterTraits.of(instance), receivers), instance, looked, [])
+                _with_nodes(area_light(ob, matrix, EmitterTraits.of(instance), receivers), instance, sources, [])
     if not wanted:
         return {}
     with open_studio(scene) as studio:
         return {key: seen_factor(source, studio) for key, source in wanted.items()}
 
 
-def _with_nodes(light: AreaLight, instance, looked: tuple, notes: list[str]) -> list[AreaLight]:
+def _with_nodes(light: AreaLight, instance, sources: tuple, notes: list[str]) -> list[AreaLight]:
     """The lights that the node tree of a depsgraph `instance` makes of `light`; [] where it emits nothing.
 
-    `looked` are the textures and patterns of `view_lights`.
+    `sources` are the textures and patterns of `view_lights`.
     """
-    ob, (textures, patterns) = instance.object, looked
+    ob, (textures, patterns) = instance.object, sources
     data = ob.data
     emission = None if tree_in_use(data) is None else emission_of(data)
     if emission is None or emission.plain:

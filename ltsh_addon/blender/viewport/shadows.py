@@ -92,7 +92,7 @@ class ShadowRequest:
     layer: int  # 1: glass, 0: the surfaces behind
 
     @property
-    def is_own(self) -> bool:
+    def is_for_group(self) -> bool:
         """True for a group of further points."""
         return self.level == len(LEVELS)
 
@@ -178,15 +178,18 @@ class LiveShadows:
 
     def __init__(self, behind: LiveShadows | None = None):
         self._behind, self._glass = behind, None
-        self._followed = TracedScene() if behind is None else behind._followed
+        self._traced_scene = TracedScene() if behind is None else behind._traced_scene
         self._version, self._problem = 0, ""
         self._waits = False  # the picture whose shadows were asked for last must wait for the thread
-        self._own: tuple[int, VisibilityGrid | None] = (0, None)  # number and visibility of a group of further points
+        self._group_grid: tuple[int, VisibilityGrid | None] = (
+            0,
+            None,
+        )  # number and visibility of a group of further points
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
         self._request: ShadowRequest | None = None  # the current one of the thread, or its last
         self._outcomes: deque[tuple[ShadowRequest, dict[int, np.ndarray] | Exception]] = deque()
-        self._is_left = False
+        self._is_abandoned = False
         # The lights, with those of a sky as one, their keys, and the arguments that they come from.
         self._lights, self._keys, self._given = (), (), None
         self._wanted: tuple = ()  # state of scene and view that is to be shown
@@ -229,10 +232,10 @@ class LiveShadows:
 
     def follow(self, scene: tuple, collect: Callable[[], Occluders]) -> None:
         """To be called before a picture is drawn. `scene` changes with its occluders; `collect()` returns them."""
-        if scene != self._followed.scene:
+        if scene != self._traced_scene.scene:
             for one in self._both:
                 one._problem = ""
-        self._followed.scene, self._followed.collect = scene, collect
+        self._traced_scene.scene, self._traced_scene.collect = scene, collect
 
     @property
     def is_busy(self) -> bool:
@@ -247,17 +250,17 @@ class LiveShadows:
     def stop(self) -> None:
         """Make the thread and its helping process end soon, and free the textures and the glass at once."""
         for one in self._both:
-            one._is_left = True
+            one._is_abandoned = True
             one._stop.set()
             one._grid = one._blank = None
-            one._own = (0, None)
+            one._group_grid = (0, None)
         self.rest()
         self._glass = None
 
     def rest(self) -> None:
         """End the helping process unless the thread works. It is started again when it pays."""
         if all(one._thread is None or not one._thread.is_alive() for one in self._both):
-            self._followed.close()
+            self._traced_scene.close()
 
     def take_news(self) -> None:
         """Take over the results of the thread. If `version` changes, pictures must be drawn anew."""
@@ -272,16 +275,16 @@ class LiveShadows:
                 one._version += 1
 
     def _take(self, request: ShadowRequest, outcome: dict[int, np.ndarray] | Exception) -> None:
-        if request.is_own and not isinstance(outcome, Exception):
+        if request.is_for_group and not isinstance(outcome, Exception):
             if (request.state, request.keys) == (self._wanted, self._keys):
                 positions, projection = request.points.grid
                 values = np.stack([outcome[index] for index in range(len(request.keys))])
                 grid = VisibilityGrid(
                     visibility_texture(values, positions.shape[1::-1]), float_texture(positions), projection
                 )
-                self._own = request.group, grid
+                self._group_grid = request.group, grid
             return
-        self._version += not (request.is_own and isinstance(outcome, Cancelled))
+        self._version += not (request.is_for_group and isinstance(outcome, Cancelled))
         if isinstance(outcome, Exception):
             self._problem = "" if isinstance(outcome, Cancelled) else f"shadows: {error_line(outcome)}"
             return
@@ -310,8 +313,8 @@ class LiveShadows:
                 self._latest = {}
                 self._show()
         if number == 0:
-            self._wanted = (self._followed.scene, view.projection.tobytes(), view.origin.tobytes(), gbuffer.size)
-            self._own = (0, None)
+            self._wanted = (self._traced_scene.scene, view.projection.tobytes(), view.origin.tobytes(), gbuffer.size)
+            self._group_grid = (0, None)
         for one in self._both:
             one._waits = False
         level = self._next_level()
@@ -323,10 +326,10 @@ class LiveShadows:
         elif self._thread is not None and self._is_outdated:
             self._stop.set()
         if number > 0 and not self._is_off:
-            if number // GROUP == self._own[0] and self._own[1] is not None:
-                return self._own[1]
+            if number // GROUP == self._group_grid[0] and self._group_grid[1] is not None:
+                return self._group_grid[1]
             if level is None and number >= FIRST_POINTS and self._is_free:
-                self._begin_own(number // GROUP, gbuffer, view)
+                self._begin_group(number // GROUP, gbuffer, view)
             self._waits = self._thread is not None
         fits = len(self._layers) == len(self._keys) and np.array_equal(self._origin, view.origin)
         if fits or self._is_off:
@@ -369,10 +372,10 @@ class LiveShadows:
             if self._thread is None and self._glass is not None and self._glass._request.level > 0:
                 self._glass._stop.set()
             return False
-        return self._followed.may_collect() and (number == 0 or level == 0)
+        return self._traced_scene.may_collect() and (number == 0 or level == 0)
 
     def _begin(self, level: int, gbuffer: GBufferTextures, view: ViewCamera) -> None:
-        self._followed.collect_now()
+        self._traced_scene.collect_now()
         requests = [self._request_of(level, gbuffer, view)]
         if level == 0 and self._pixels.get(False, (None,))[0] == self._wanted:
             requests.append(self._request_of(1, gbuffer, view))
@@ -391,7 +394,7 @@ class LiveShadows:
         numbers = tuple(n for n, key in enumerate(self._keys) if max(known.get(key, (-1,))) < level)
         return self._request_for(numbers, points, rays, view, level)
 
-    def _begin_own(self, group: int, gbuffer: GBufferTextures, view: ViewCamera) -> None:
+    def _begin_group(self, group: int, gbuffer: GBufferTextures, view: ViewCamera) -> None:
         points = PixelGrid(1, gbuffer, view)
         request = self._request_for(tuple(range(len(self._keys))), points, GROUP_RAYS, view, len(LEVELS))
         self._start([replace(request, group=group)])
@@ -407,7 +410,7 @@ class LiveShadows:
             lights=tuple(self._lights[n] for n in numbers),
             points=points,
             rays=rays,
-            tracing=self._followed.tracing,
+            tracing=self._traced_scene.tracing,
             origin=view.origin.copy(),
             layer=int(self._behind is not None),
         )
@@ -415,7 +418,7 @@ class LiveShadows:
     def _start(self, requests: list[ShadowRequest]) -> None:
         """Start the thread, which traces one request after another."""
         self._stop.clear()
-        self._request, self._is_left = requests[0], False
+        self._request, self._is_abandoned = requests[0], False
         self._thread = threading.Thread(target=self._trace, args=(requests,), name="LTSH shadows", daemon=True)
         self._thread.start()
 
@@ -433,7 +436,7 @@ class LiveShadows:
             self._outcomes.append((request, outcome))
             if isinstance(outcome, Exception):
                 break
-        if self._is_left:
+        if self._is_abandoned:
             requests[0].tracing.close()
 
     def _show(self) -> None:

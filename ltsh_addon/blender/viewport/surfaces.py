@@ -43,7 +43,7 @@ class SurfacePass:
         self._through: tuple | None = None
         if before is not None:
             self._shaders, self._tables = before._shaders, before._tables
-            self._nothing, self._missing = before._nothing, before._missing
+            self._black_image, self._missing_image = before._black_image, before._missing_image
             self._mask_shader = before._mask_shader
             self._size = self._depth = None
             self._targets: dict = {}
@@ -52,8 +52,8 @@ class SurfacePass:
         self._tables = {"albedo_table": float_table(albedo_table()), "blend_table": float_table(blend_table())}
         self._tables["sheen_table"] = float_texture(sheen_table())
         self._mask_shader = PixelShader(glsl("mask"), ("positions",), {}, is_depth=True)
-        self._nothing = float_texture(np.zeros((1, 1, 4)))
-        self._missing = float_texture(np.array(MISSING_COLOR).reshape(1, 1, 4))
+        self._black_image = float_texture(np.zeros((1, 1, 4)))
+        self._missing_image = float_texture(np.array(MISSING_COLOR).reshape(1, 1, 4))
         self._size = self._depth = None
         self._targets: dict = {}
 
@@ -106,12 +106,13 @@ class SurfacePass:
         textures = self._draw_into(SURFACES, instances, view, number)
         if has_normals(instances):
             textures = textures | self._draw_into(NORMALS, instances, view, number)
-        if any(_is_brushed(look, number) for instance in instances for look in instance.looks):
+        every = [look for instance in instances for look in instance.looks]
+        drawn = [lobe.look for look in every for lobe in look.lobes[number : number + 1]]
+        if any(lobe.brush is not None for lobe in drawn):
             textures = textures | self._draw_into(TANGENTS, instances, view, number)
-        if any(_is_rough(look, number) for instance in instances for look in instance.looks):
+        if any(lobe.is_rough or lobe.kind == "velvet" for lobe in drawn):
             textures = textures | self._draw_into(REBOUNDS, instances, view, number)
-        shown = (look for instance in instances for look in instance.looks if self._draws(look))
-        lobes = [lobe.look for look in shown for lobe in look.lobes[number:]]
+        lobes = [lobe.look for look in every if self._draws(look) for lobe in look.lobes[number:]]
         marks = {
             "has_sheen": any(look.kind == "sheen" for look in lobes),
             "has_velvet": any(look.kind == "velvet" for look in lobes),
@@ -187,11 +188,11 @@ class SurfacePass:
     def _bind_images(self, shader, shown: ShownLook, slots: tuple[str, ...]) -> None:
         if shown.textures is None:
             shown.textures = {
-                name: self._missing if is_missing(use.image) else gpu.texture.from_image(use.image)
+                name: self._missing_image if is_missing(use.image) else gpu.texture.from_image(use.image)
                 for name, use in shown.look.images.items()
             }
         for name in slots:
-            shader.uniform_sampler(f"{name}_image", shown.textures.get(name, self._nothing))
+            shader.uniform_sampler(f"{name}_image", shown.textures.get(name, self._black_image))
 
 
 def _shines(shown: ShownLook) -> bool:
@@ -206,16 +207,6 @@ def has_normals(instances: list[ShownInstance]) -> bool:
 def has_bent_lobes(instances: list[ShownInstance]) -> bool:
     """True if any diffuse lobe does not end at the horizon of its own normal."""
     return any(_bends(lobe) for instance in instances for look in instance.looks for lobe in look.lobes)
-
-
-def _is_brushed(shown: ShownLook, number: int) -> bool:
-    """True if the lobe `number` is anisotropic."""
-    return any(lobe.look.brush is not None for lobe in shown.lobes[number : number + 1])
-
-
-def _is_rough(shown: ShownLook, number: int) -> bool:
-    """True if the diffuse part of the lobe `number` is rough, or velvet."""
-    return any(lobe.look.is_rough or lobe.look.kind == "velvet" for lobe in shown.lobes[number : number + 1])
 
 
 def _bends(shown: ShownLook) -> bool:

@@ -22,8 +22,8 @@ from ltsh_addon.blender.materials import looks
 from ltsh_addon.blender.process import client
 from ltsh_addon.blender.render_settings import pass_names
 from ltsh_addon.blender.ui import results
-from ltsh_addon.blender.ui.comparison import covered
 from ltsh_addon.blender.ui.job import STARTING, Plan
+from ltsh_addon.blender.ui.overlay import covered
 from ltsh_addon.blender.viewport.lights import view_lights
 from ltsh_addon.imaging.exr import read_channels
 from ltsh_addon.pipeline import PictureOptions, RenderOptions, shade_scene
@@ -571,7 +571,7 @@ def test_a_view_that_is_left_is_freed_at_once_and_what_works_for_it_is_stopped(s
         seen._renderer = SimpleNamespace(shadows=None)
         seen._follow_shadows(depsgraph)
         shadows, stopped = seen._shadows, [one._stop for one in (seen._shadows, seen._shadows.of_glass)]
-        seen._shadows._followed.collect()
+        seen._shadows._traced_scene.collect()
         stopped.append(seen._world._stopped)
         left = [weakref.ref(part) for part in (seen, seen.mirror, shadows, shadows.of_glass)]
         del seen, shadows

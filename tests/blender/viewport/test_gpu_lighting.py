@@ -7,9 +7,9 @@ import pytest
 import random_surfaces
 from graphics_card import Canvas, with_graphics
 from random_surfaces import EYE, rounded, unit
+from uploaded_samples import upload_samples
 
 from ltsh_addon import shading
-from ltsh_addon.blender.viewport.gbuffer import upload_samples
 from ltsh_addon.blender.viewport.lighting import LightingPass
 from ltsh_addon.scene import Pattern
 

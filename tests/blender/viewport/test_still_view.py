@@ -326,7 +326,7 @@ def live_pictures():
         partial = stopped_shares(scene)
         scene.drawn(scene.live)
         scene.live.follow((1,), lambda: 1 / 0)
-        scene.live._followed.before = (1,)
+        scene.live._traced_scene.before = (1,)
         scene.live.take_news()
         scene.live.visibility(scene.renderer._surfaces._gbuffer, scene.view, scene.renderer._lights.lights, 0)
         return plain, exact, first, levels, rest, recolored, after_move, partial, scene.live.problem
@@ -560,7 +560,7 @@ def test_shadows_of_a_view_at_rest_get_new_rays_as_its_points_do():
 
 def test_what_helps_to_trace_ends_at_rest_but_not_at_work():
     live, closed, going = LiveShadows(), [], threading.Event()
-    live._followed.tracing = SimpleNamespace(close=lambda: closed.append(True))
+    live._traced_scene.tracing = SimpleNamespace(close=lambda: closed.append(True))
     live.of_glass._thread = threading.Thread(target=going.wait)
     live.of_glass._thread.start()
     try:

@@ -91,7 +91,7 @@ vec2 cosines_of_sums(vec2 first, float second, float sign)
     return first * second - sign * sqrt(max(1.0 - first * first, 0.0) * max(1.0 - second * second, 0.0));
 }
 
-/* The upper and the lower bound of the light that a light sends to the pixel, as `light_tree.light_bounds`, and whether
+/* The upper and the lower bound of the light that a light sends to the pixel, as `light_tree.light_bounds_at`, and whether
    it sends any. */
 vec3 bounds(seen_light light, vec3 smooth_normal)
 {
@@ -269,7 +269,7 @@ void main()
     vec3 third = vec3(1.0 / 3.0);
     vec4 means = vec4(dot(texelFetch(f0s, texel, 0).xyz, third), dot(texelFetch(f90s, texel, 0).xyz, third),
         dot(texelFetch(dielectric_weights, texel, 0).xyz, third), max(base.w, 1.0));
-    /* As `horizons.lobe_chances` of a single sample. */
+    /* As `horizons.lobe_selection_pmf` of a single sample. */
     vec2 chances = vec2(reflectance(means, clamp(dot(bent.xyz, towards_eye), 0.0, 1.0)), dot(base.xyz, third));
     chances /= max(chances.x + chances.y, 1e-12);
     int count = has_two_horizons(texel) ? draw_range.y - draw_range.x : 0;

@@ -99,11 +99,8 @@ def sheen_lobe(cosine: np.ndarray, roughness: np.ndarray) -> np.ndarray:
     multiple-scattering sheen using linearly transformed cosines"). Albedo and lobe agree with Cycles 4.5 and 5.2 to
     1e-4.
     """
-    tables = _sheen_tables()
-    x, y = np.clip(cosine, 0.0, 1.0), np.clip(roughness, SMALLEST_ROUGHNESS, 1.0)
-    lobe = np.zeros((3, len(x)))
-    for index, weight in corners(x, y):
-        lobe += weight * tables[:, index]
+    roughness = np.maximum(roughness, SMALLEST_ROUGHNESS)
+    lobe = np.stack([_interpolate(table, cosine, roughness) for table in _sheen_tables()])
     lobe[0] = np.maximum(lobe[0], 0.0)
     return lobe
 
@@ -119,31 +116,18 @@ def velvet_albedo(cosine: np.ndarray, roughness: np.ndarray) -> np.ndarray:
     It agrees with Cycles to 1 % from a roughness of 0.3 on, and to 5 % at 0.1. Ashikhmin, Premoze and Shirley 2000, "A
     microfacet-based BRDF generator", section 4.3, without Fresnel.
     """
-    table, albedo = _velvet_table(), 0.0
-    for index, weight in corners(np.clip(cosine, 0.0, 1.0), np.clip(roughness, 0.0, 1.0)):
-        albedo = albedo + weight * table[index]
-    return albedo
-
-
-def corners(x: np.ndarray, y: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Bilinear interpolation at points of the unit square: numbers (P,) of four nodes in the table and weights (P,)."""
-    x, y = (SHEEN_NODES - 1) * x, (SHEEN_NODES - 1) * y
-    column, row = (np.minimum(value.astype(int), SHEEN_NODES - 2) for value in (x, y))
-    return [
-        ((column + i) * SHEEN_NODES + row + j, np.abs(1 - i - (x - column)) * np.abs(1 - j - (y - row)))
-        for i in (0, 1)
-        for j in (0, 1)
-    ]
+    return _interpolate(_velvet_table(), cosine, roughness)
 
 
 @cache
 def _sheen_tables() -> np.ndarray:
-    return np.load(PATH).astype(np.float64).reshape(3, -1)
+    """Albedo, a and b of sheen (3, N, N) by cosine and roughness."""
+    return np.load(PATH).astype(np.float64).reshape(3, SHEEN_NODES, SHEEN_NODES)
 
 
 @cache
 def _velvet_table() -> np.ndarray:
-    """Albedos of velvet at the nodes (cosine, roughness) of `corners`, by the midpoint rule over light directions."""
+    """Albedos of velvet (N, N) by cosine and roughness, by the midpoint rule over light directions."""
     steps = np.linspace(0.0, 1.0, SHEEN_NODES)
     view, sigma = np.meshgrid(np.maximum(steps, 0.5 / SHEEN_NODES), np.maximum(steps, 0.01), indexing="ij")
     view, sigma = view.reshape(-1, 1), sigma.reshape(-1, 1)
@@ -156,7 +140,7 @@ def _velvet_table() -> np.ndarray:
     masked = np.minimum(1.0, ratio * np.minimum(view, light))
     density = np.exp(-normal2 / ((1.0 - normal2) * sigma**2)) / (np.pi * (sigma * (1.0 - normal2)) ** 2)
     area = np.sin(theta) * np.pi**2 / VELVET_STEPS**2  # both halves of the circle
-    return (density * masked / (4.0 * view) * area).sum(axis=-1)
+    return (density * masked / (4.0 * view) * area).sum(axis=-1).reshape(SHEEN_NODES, SHEEN_NODES)
 
 
 VELVET_STEPS = 48

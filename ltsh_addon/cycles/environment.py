@@ -72,20 +72,20 @@ class Spot:
     least: float  # mean of the three colors
 
 
-def luminance(radiance: np.ndarray) -> np.ndarray:
+def mean_magnitude(radiance: np.ndarray) -> np.ndarray:
     """Mean absolute value (...) of colors (..., 3)."""
     return np.abs(radiance).mean(axis=-1)
 
 
 def above(radiance: np.ndarray, least: float) -> np.ndarray:
-    """The part of colors (..., 3) above the luminance `least`."""
-    brightness = luminance(radiance)
+    """The part of colors (..., 3) of a mean magnitude above `least`."""
+    brightness = mean_magnitude(radiance)
     return radiance * np.maximum(1.0 - least / np.maximum(brightness, 1e-30), 0.0)[..., None]
 
 
 def bright_spots(pictures: list[SkyPicture]) -> list[Spot]:
     """The spots in the pictures of a cube; the first has the most light."""
-    values = np.concatenate([luminance(picture.radiance).ravel() for picture in pictures])
+    values = np.concatenate([mean_magnitude(picture.radiance).ravel() for picture in pictures])
     angles = np.concatenate([picture.solid_angles().ravel() for picture in pictures])
     power = values * angles
     least, total = SPOT_BRIGHTNESS * power.sum() / angles.sum(), power.sum()
@@ -137,7 +137,7 @@ def spot_light(like: AreaLight, picture: SkyPicture, spot: Spot) -> list[AreaLig
     """The spot that a close `picture` shows, as lights with the name and traits of `like`: a disk if it looks like one,
     otherwise patches; [] if the picture shows no spot."""
     radiance, angles = above(picture.radiance, spot.least), picture.solid_angles()
-    values = luminance(radiance)
+    values = mean_magnitude(radiance)
     power = (values * angles).sum()
     if power <= 0.0:
         return []
@@ -151,7 +151,7 @@ def spot_light(like: AreaLight, picture: SkyPicture, spot: Spot) -> list[AreaLig
     radius = np.arccos(1.0 - solid_angle / (2.0 * np.pi))
     inside = np.linalg.norm(offsets - center, axis=-1) < 2.0 * np.sin(0.5 * radius)
     light = (radiance * angles[..., None]).sum(axis=(0, 1)) / solid_angle
-    missed = (np.abs(values - inside * luminance(light)) * angles).sum()
+    missed = (np.abs(values - inside * mean_magnitude(light)) * angles).sum()
     if missed > DISK_ERROR * power:
         return sky_lights(like, [replace(picture, radiance=radiance)], SPOT_PATCHES)[0]
     _, right, up = spot_frame(replace(spot, direction=center, radius=radius))
@@ -162,7 +162,7 @@ def sky_lights(like: AreaLight, pictures: list[SkyPicture], most: int = MOST_PAT
     """A distant light with a `detail` for each picture that is not dark, with the name and traits of `like`; and the
     mean absolute difference between the smallest patches and the pictures, relative to the mean radiance."""
     trees = [_SkyQuadtree.of(picture) for picture in pictures]
-    total = sum((luminance(picture.radiance) * picture.solid_angles()).sum() for picture in pictures)
+    total = sum((mean_magnitude(picture.radiance) * picture.solid_angles()).sum() for picture in pictures)
     limit, error = _limit(trees, ERROR * total, most)
     lights = [_light(like, picture, tree, limit, (0, 0, 0)) for picture, tree in zip(pictures, trees, strict=True)]
     bright = [light for light in lights if light.detail or np.any(light.radiance != 0.0)]

@@ -284,16 +284,16 @@ class _Shapes:
     @classmethod
     def of(cls, lights, number, share) -> _Shapes:
         """The lights of these numbers, which are of one kind; the `share` (L,) of each shines."""
-        own = [lights[n] for n in number]
-        center, corners = (np.array([light.center for light in own]), np.array([light.polygon() for light in own]))
+        alike = [lights[n] for n in number]
+        center, corners = (np.array([light.center for light in alike]), np.array([light.polygon() for light in alike]))
         radius = np.linalg.norm(corners - center[:, None], axis=2).max(axis=1)
-        if own[0].is_facing:
-            radius = np.array([light.radius for light in own])
-        axes = np.array([[*_plane_axes(light), -light.direction] for light in own])
-        brightness = np.array([np.abs(light.radiance).sum() for light in own])
-        scales = np.linalg.pinv(np.array([[light.half_u, light.half_v] for light in own]).swapaxes(1, 2))
-        rest = radius, axes, scales, share, _is_side(own[0])
-        return cls(number, own[0].shape, own[0].is_distant, brightness, center, corners, *rest)
+        if alike[0].is_facing:
+            radius = np.array([light.radius for light in alike])
+        axes = np.array([[*_plane_axes(light), -light.direction] for light in alike])
+        brightness = np.array([np.abs(light.radiance).sum() for light in alike])
+        scales = np.linalg.pinv(np.array([[light.half_u, light.half_v] for light in alike]).swapaxes(1, 2))
+        rest = radius, axes, scales, share, _is_side(alike[0])
+        return cls(number, alike[0].shape, alike[0].is_distant, brightness, center, corners, *rest)
 
     @property
     def is_facing(self) -> bool:

@@ -46,7 +46,7 @@ def flat_polygons(vertices: np.ndarray, triangles: np.ndarray, labels: np.ndarra
     solid = area > 1e-12 * max(area.max(initial=0.0), 1e-300)
     triangles, labels, normals = triangles[solid], labels[solid], crossed[solid] / area[solid, None]
     neighbors = _coplanar_neighbors(vertices, triangles, labels, normals)
-    groups = _connected(len(triangles), neighbors)
+    groups = connected(len(triangles), neighbors)
     order = np.argsort(groups, kind="stable")
     starts = np.flatnonzero(np.diff(groups[order], prepend=-1))
     ends = np.append(starts[1:], len(order))[: len(starts)]
@@ -114,19 +114,18 @@ def _coplanar_neighbors(vertices, triangles, labels, normals) -> np.ndarray:
     return np.stack([first[fits], second[fits]], axis=-1)
 
 
-def _connected(count: int, pairs: np.ndarray) -> np.ndarray:
+def connected(count: int, pairs: np.ndarray) -> np.ndarray:
     """The smallest index (count,) to which `pairs` (M, 2) connect each item."""
-    group = np.arange(count)
-    while len(pairs):
-        least = np.minimum(group[pairs[:, 0]], group[pairs[:, 1]])
-        before = group.copy()
-        for side in (0, 1):
-            np.minimum.at(group, group[pairs[:, side]], least)
-            np.minimum.at(group, pairs[:, side], least)
-        group = group[group]
-        if np.array_equal(group, before):
-            break
-    return group
+    label, (first, second) = np.arange(count), pairs.T
+    while True:
+        a, b = label[first], label[second]
+        if np.array_equal(a, b):
+            return label
+        smaller = np.minimum(a, b)
+        np.minimum.at(label, a, smaller)
+        np.minimum.at(label, b, smaller)
+        while not np.array_equal(label, label[label]):
+            label = label[label]
 
 
 def _outline(vertices, triangles) -> np.ndarray | None:
@@ -224,7 +223,7 @@ def _islands(triangles: np.ndarray) -> np.ndarray:
     order = np.argsort(edge.ravel(), kind="stable")
     owner, sorted_edge = order // 3, edge.ravel()[order]
     same = sorted_edge[1:] == sorted_edge[:-1]
-    return _connected(len(triangles), np.stack([owner[1:][same], owner[:-1][same]], axis=-1))
+    return connected(len(triangles), np.stack([owner[1:][same], owner[:-1][same]], axis=-1))
 
 
 def _is_hollow(vertices, triangles, closed: bool) -> bool:

@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from .planar_polygons import connected
+
 # Blender's bake shifts its sampling points by this much, in texels, so that centers exactly on an edge belong to one
 # side. The same shift here gives the same texels.
 NUDGE = (0.001, 0.002)
@@ -432,7 +434,7 @@ class UvSeams:
         ends, others = _ends(uv, edge), _ends(uv, partner)
         others = np.where(same[:, :1, None], others, others[:, ::-1])
         together = (np.abs(ends - others) <= SAME_UV).all(axis=(1, 2))
-        islands = _connected(len(uv), edge[together] // 3, partner[together] // 3)
+        islands = connected(len(uv), np.stack([edge[together], partner[together]], axis=1) // 3)
         corners = (uv - np.asarray(tile)) * (width, height)
         third, other_third = _third(corners, edge), _third(corners, partner)
         ends, others = ((pair - np.asarray(tile)) * (width, height) for pair in (ends, others))
@@ -508,20 +510,6 @@ def _towards(ends, corner):
     length = np.linalg.norm(side, axis=1)
     scale = np.divide(turn, length, out=np.full(len(side), np.nan), where=(length > 0.0) & (turn != 0.0))
     return np.stack([-side[:, 1], side[:, 0]], axis=-1) * scale[:, None]
-
-
-def _connected(count, first, second):
-    """The smallest number (count,) to which the pairs first (N,), second (N,) connect each item."""
-    label = np.arange(count)
-    while True:
-        a, b = label[first], label[second]
-        if np.array_equal(a, b):
-            return label
-        smaller = np.minimum(a, b)
-        np.minimum.at(label, a, smaller)
-        np.minimum.at(label, b, smaller)
-        while not np.array_equal(label, label[label]):
-            label = label[label]
 
 
 def _cells(edges, width, height):

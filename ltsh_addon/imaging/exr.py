@@ -78,8 +78,9 @@ def by_group(name: str, groups: Sequence[str], values: Iterable) -> dict:
 
 def metadata_of(extraction, scene: Path, **more: str) -> dict[str, str]:
     """`metadata` of a picture of an `Extraction`, which has its `exposure`."""
-    facts = extraction.frame, extraction.camera, extraction.color_space.name
-    return metadata(scene, *facts, exposure=repr(extraction.exposure), **more)
+    facts = extraction.picture
+    names = facts.frame, facts.camera, facts.color_space.name
+    return metadata(scene, *names, exposure=repr(facts.exposure), **more)
 
 
 def metadata(scene: Path, frame: int, camera: str, color_space: str, **more: str) -> dict[str, str]:

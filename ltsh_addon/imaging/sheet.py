@@ -56,12 +56,12 @@ def comparison_sheet(
     captions = [_wrapped(tile.caption, width) for tile in techniques]
     lines = max(map(len, captions), default=0)
     sheet = _Sheet(title, width, height, count=1 + len(techniques), lines=(len(legend), lines))
-    sheet.place(0, label, first, None, ())
+    sheet.draw_tile(0, label, first, None, ())
     sheet.legend(legend, scale)
     for index, (tile, caption) in enumerate(zip(techniques, captions, strict=True), start=1):
         picture = _with_gray(to_srgb8(exposure * _known(tile.image, tile.missing)), tile.missing)
         error = _to_8bit(signed_error_colors(_known(tile.error, tile.missing), scale))
-        sheet.place(index, tile.label, picture, _with_gray(error, tile.missing), caption)
+        sheet.draw_tile(index, tile.label, picture, _with_gray(error, tile.missing), caption)
     return sheet.pixels
 
 
@@ -158,7 +158,7 @@ class _Sheet:
         row, column = divmod(index, self.columns)
         return _MARGIN + column * (self.width + _GUTTER), self.top + sum(self.heights[:row])
 
-    def place(self, index: int, label: str, picture: np.ndarray, error: np.ndarray | None, caption) -> None:
+    def draw_tile(self, index: int, label: str, picture: np.ndarray, error: np.ndarray | None, caption) -> None:
         """Draw label, picture, error and caption into cell `index`."""
         x, y = self._corner(index)
         draw_text(self.pixels, (x, y), shorten(label, self.width, _LABEL, bold=True), _INK, _LABEL, bold=True)

@@ -72,19 +72,20 @@ def bake_objects(
 ) -> TaskResult:
     """Bake the objects and write their files, but no report.json; `tile` is the only UDIM tile to bake, None: all.
 
-    Within `kept_blender` the scene stays open for the next call with the same options, for the objects named here and
+    Within `shared_blender` the scene stays open for the next call with the same options, for the objects named here and
     those announced as `following`. Raises as `bake_scene` does.
     """
-    from ..blender.process import client
+    from ..blender.process.bake import extract_bake
+    from ..blender.process.blend_file import check_readable
 
     start = time.perf_counter()
     _check(options)
-    client.check_readable(options.scene)
+    check_readable(options.scene)
     check_named(options.techniques, "a bake that is resumed")
     tables = prepare(options)
     finished = TileRecords(options)
     with temporary_folder() as folder:
-        manifest = client.extract_bake(_job(options, finished.finished, tile, following), folder, progress=progress)
+        manifest = extract_bake(_job(options, finished.finished, tile, following), folder, progress=progress)
         names = [record["name"] for record in manifest["objects"]]
         stems = file_stems(names) if options.name is None else [options.name]
         records, files, seconds = [], [], {"blender": manifest["seconds"]}
@@ -125,10 +126,10 @@ def _check(options: BakeOptions) -> None:
 
 
 def _job(options, finished, tile=None, following=()):
-    from ..blender.process import client
+    from ..blender.process.bake import BakeJob
 
     return child_job(
-        client.BakeJob,
+        BakeJob,
         options,
         width=options.size[0],
         height=options.size[1],

@@ -311,7 +311,7 @@ def applied_layers(options) -> list[str]:
 
 def apply_textures(scene: Path, output: Path, records: list[dict], layer: str, progress=None) -> str:
     """Save a copy of the .blend whose objects show the textures of the report's `records`; returns its file name."""
-    from ..blender.process import client
+    from ..blender.process.bake import BakedTextures, apply_bake
 
     textures = []
     for record in records:
@@ -322,7 +322,7 @@ def apply_textures(scene: Path, output: Path, records: list[dict], layer: str, p
             for number, tile in record["tiles"].items()
         ]
         name = f"{record['name']} {layer}"
-        textures.append({"object": record["name"], "uv": record["uv"], "name": name, "files": files})
+        textures.append(BakedTextures(record["name"], record["uv"], name, files))
     path = output / f"{Path(scene).stem}_baked.blend"
-    client.apply_bake(scene, path, textures, progress=progress)
+    apply_bake(scene, path, textures, progress=progress)
     return path.name

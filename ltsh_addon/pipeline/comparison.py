@@ -53,7 +53,7 @@ class Comparison:
     """The results of one scene, ready to be measured and written."""
 
     options: PictureOptions
-    extraction: Any  # blender.process.client.Extraction, which the core does not import
+    extraction: Any  # blender.process.pixels.Extraction, which the core does not import
     results: dict[str, TechniqueResult]
     shadows: lighting.Shadows | None = None
 
@@ -73,12 +73,12 @@ class Comparison:
     @property
     def cycles(self) -> dict[str, np.ndarray]:
         """The two halves (2, H, W, 3) of Cycles' picture per pass; empty without a Cycles reference."""
-        return self.extraction.reference or {}
+        return self.extraction.cycles.reference or {}
 
     @cached_property
     def rest(self) -> np.ndarray | None:
         """The picture (H, W, 4) without reflected light: emission, lights in sight, background; None if unknown."""
-        return None if self.extraction.background is None else self.extraction.rest
+        return None if self.extraction.cycles.background is None else self.extraction.rest
 
     def whole(self, name: str) -> np.ndarray:
         """The whole picture (H, W, 4) of a technique: the sum of its passes, plus `rest` where that is known."""
@@ -104,7 +104,7 @@ class Comparison:
         return self._exposed(result.shading, pass_name)
 
     def _exposed(self, shaded: shading.Shading, pass_name) -> np.ndarray:
-        return self.extraction.exposure * getattr(shaded, pass_name)
+        return self.extraction.picture.exposure * getattr(shaded, pass_name)
 
     def _image(self, result, values) -> np.ndarray:
         return self._film_of(result).image(values)
@@ -120,7 +120,10 @@ class Comparison:
 
     def seconds(self) -> dict:
         """The seconds of the extraction, the shadows and the techniques."""
-        seconds = {**self.extraction.seconds, "techniques": {name: one.seconds for name, one in self.results.items()}}
+        seconds = {
+            **self.extraction.times.stages,
+            "techniques": {name: one.seconds for name, one in self.results.items()},
+        }
         return seconds if self.shadows is None else {**seconds, "shadows": self.shadows.seconds}
 
     # Figures:
@@ -130,19 +133,19 @@ class Comparison:
         extraction, options = self.extraction, self.options
         return {
             "scene": str(options.scene),
-            "camera": extraction.camera,
-            "frame": extraction.frame,
+            "camera": extraction.picture.camera,
+            "frame": extraction.picture.frame,
             "resolution": [self.film.width, self.film.height],
-            "border": None if extraction.border is None else vars(extraction.border),
-            "pixel_aspect": extraction.pixel_aspect,
-            "pixel_filter": extraction.pixel_filter if self.film.sub_samples > 1 else "pixel centers",
-            "exposure": extraction.exposure,
-            "color_space": extraction.color_space.name,
+            "border": None if extraction.picture.border is None else vars(extraction.picture.border),
+            "pixel_aspect": extraction.picture.pixel_aspect,
+            "pixel_filter": extraction.picture.pixel_filter if self.film.sub_samples > 1 else "pixel centers",
+            "exposure": extraction.picture.exposure,
+            "color_space": extraction.picture.color_space.name,
             "sub_samples": self.film.sub_samples,
             "surface_samples": len(extraction.samples) if self.film.first is None else int(self.film.first.sum()),
             "cycles_samples": options.cycles_samples if self.cycles else 0,
             "lights": _light_reports(extraction.lights),
-            "versions": versions(extraction.blender_version),
+            "versions": versions(extraction.picture.blender_version),
             "tables": {name: described(given) for name, given in technique_names(options.techniques).items()},
             "reference": self._reference_facts(),
             "shadows": None if self.shadows is None else self.shadows.report(),
@@ -183,7 +186,7 @@ class Comparison:
         result = self.results[name]
         report = {}
         if self.cycles:
-            image, rec709 = self.images[name, pass_name], self.extraction.color_space.rec709
+            image, rec709 = self.images[name, pass_name], self.extraction.picture.color_space.rec709
             report["against_cycles"] = against_cycles(image, self.cycles[pass_name], self._mask(result), rec709)
         reference = self.results.get(REFERENCE)
         if reference is not None and name != REFERENCE:
@@ -206,16 +209,16 @@ class Comparison:
         """Write all files into the folder `output`; returns their names. All contents are computed first."""
         check_before_writing(progress)
         name, extraction, more = self.options.name or ("compare" if with_cycles else "shade"), self.extraction, {}
-        if extraction.border is not None:
-            more["border"] = str(extraction.border)
+        if extraction.picture.border is not None:
+            more["border"] = str(extraction.picture.border)
         if notice := self._subset_notice():
             more["reference"] = f"{notice}; elsewhere zero"
         metadata = exr.metadata_of(extraction, self.options.scene, **more)
         planes, sheet = self.layers(), self.sheet() if with_cycles else None
-        chromaticities = imaging.chromaticities(extraction.color_space)
+        chromaticities = imaging.chromaticities(extraction.picture.color_space)
         files = [f"{name}.exr", *([f"{name}.png", self.options.page] if with_cycles else [])]
         (output / files[0]).parent.mkdir(parents=True, exist_ok=True)
-        imaging.write_layers(output / files[0], planes, metadata, chromaticities, extraction.pixel_aspect)
+        imaging.write_layers(output / files[0], planes, metadata, chromaticities, extraction.picture.pixel_aspect)
         if with_cycles:
             imaging.write_png(output / files[1], sheet)
             imaging.write_html(output, self.options.page, files[1], files[0], document)
@@ -301,7 +304,7 @@ class Comparison:
     def _sheet_of(self, passes: tuple[str, ...]) -> np.ndarray:
         """The sheet of the sum of `passes`."""
         halves = sum(self.cycles[name] for name in passes)
-        mean, rec709 = halves.mean(axis=0), self.extraction.color_space.rec709
+        mean, rec709 = halves.mean(axis=0), self.extraction.picture.color_space.rec709
         hit, tiles = self.film.coverage() > 0.0, []
         # The picture of all passes also shows the background and lights in sight. Its errors are those of the light.
         behind = 0.0 if self.rest is None or len(passes) == 1 else self.rest[..., :3]

@@ -99,7 +99,7 @@ def direct_passes(comparison: Comparison, cycles, is_denoised: bool) -> dict[str
     technique, result = next(iter(comparison.results.items()), (None, None))
     is_shaded = result is not None and not (cycles.everything or extraction.left_to_cycles.everything)
     # With depth of field LTSH's light is denoised too, so its noise does not matter.
-    leaves_noise = is_denoised and not extraction.has_lens
+    leaves_noise = is_denoised and not extraction.picture.has_lens
     for name, keys in DIRECT.items():
         light, color = (read_layer(cycles.channels, cycles.names[key], "RGB") for key in keys)
         if not is_shaded:
@@ -118,7 +118,7 @@ def direct_passes(comparison: Comparison, cycles, is_denoised: bool) -> dict[str
                 weight = weight_at_edges(clean[..., None] * image, of_cycles)
                 weight = np.where(film.has_more(), 1.0, weight)
         share = np.where(is_replaced, clean * weight, 0.0)
-        values = extraction.exposure * getattr(result.shading, name)
+        values = extraction.picture.exposure * getattr(result.shading, name)
         of_groups = map(film.image, values) if len(values) > 1 else (image,)
         groups = {group: _share_of(share, one) for group, one in zip(result.shading.groups, of_groups, strict=True)}
         passes[name] = DirectPass(_share_of(share, image), groups, is_replaced, clean, light, color, weight)
@@ -185,7 +185,7 @@ def point_statistics(film, radiance: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 def radiance_of_samples(extraction, result, name: str) -> np.ndarray:
     """The exposed radiance (P,) of a pass: the sum over light groups, the mean over color channels."""
-    return extraction.exposure * getattr(result.shading, name).sum(axis=0).mean(axis=-1)
+    return extraction.picture.exposure * getattr(result.shading, name).sum(axis=0).mean(axis=-1)
 
 
 def box_mean(image: np.ndarray, radius: int = NOISE_RADIUS) -> np.ndarray:
@@ -205,7 +205,7 @@ def denoised_rest(cycles, passes: dict[str, DirectPass], extraction, denoise: st
 
     if progress is not None and progress("denoise", 0.0) is False:
         raise Cancelled("stopped before the picture was denoised")
-    rest, is_noisy = read_layer(cycles.channels, "Combined", "RGBA").astype(np.float64), extraction.has_lens
+    rest, is_noisy = read_layer(cycles.channels, "Combined", "RGBA").astype(np.float64), extraction.picture.has_lens
     shining, diffuse = _shining(cycles, extraction), passes["diffuse"]
     # Once without and once with Cycles' direct diffuse light, of which edges need a share.
     replaced = np.stack([passes["specular"].is_replaced, diffuse.is_replaced, shining.is_replaced], axis=-1)
@@ -249,13 +249,13 @@ def most_denoisings(extraction) -> int:
 def _shining(cycles, extraction) -> DirectPass:
     """What shines in sight, on the pixels where it can stay out of the denoiser: not behind surfaces that light passes,
     where it is noisy."""
-    names = {key: cycles.names[key] for key in cycles.shining}
+    names = {key: cycles.names[key] for key in cycles.smooth_emission}
     noisy = sum((read_layer(cycles.channels, name, "RGB") for name in names.values()), np.zeros((1, 1, 3)))
     left_to_cycles = extraction.left_to_cycles
     is_hidden = np.logical_and.reduce([*left_to_cycles.by_pass.values()])
-    if not names or extraction.has_lens or cycles.everything or left_to_cycles.everything:
+    if not names or extraction.picture.has_lens or cycles.everything or left_to_cycles.everything:
         is_hidden = np.ones_like(is_hidden)
-    image = sum(cycles.shining.values(), np.zeros_like(noisy))
+    image = sum(cycles.smooth_emission.values(), np.zeros_like(noisy))
     image = np.where(is_hidden[..., None], 0.0, image)
     return DirectPass(image, {}, ~is_hidden, np.ones(is_hidden.shape), noisy, np.ones(3))
 

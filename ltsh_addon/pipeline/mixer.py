@@ -106,7 +106,7 @@ def light_pictures(data: RelightData, progress: Progress | None = None) -> Light
         if group and values.any() and all(row.group != group for row in rows):
             rows.append(MixerRow(f"Light group {group}", (), note=NOT_SHADED))
             layers = np.concatenate([layers, values[None, ..., :3].astype(np.float32)])
-    notes = [GRAIN] * bool(data.rest and extraction.has_lens)
+    notes = [GRAIN] * bool(data.rest and extraction.picture.has_lens)
     for group in filter(None, data.rest):
         names = [repr(row.name) for row in rows if row.group == group]
         notes += [SHARED_OUT.format(group, listed(names))] if len(names) > 1 else []
@@ -115,7 +115,12 @@ def light_pictures(data: RelightData, progress: Progress | None = None) -> Light
         rows.append(MixerRow(REST, (), note=NOT_OF_LIGHTS))
         layers = np.concatenate([layers, rest[None, ..., :3].astype(np.float32)])
     alpha = np.ones(shape, np.float32) if rest is None or rest.shape[-1] < 4 else rest[..., 3].astype(np.float32)
-    facts = {"camera": extraction.camera, "frame": extraction.frame, "technique": technique, "notes": notes}
+    facts = {
+        "camera": extraction.picture.camera,
+        "frame": extraction.picture.frame,
+        "technique": technique,
+        "notes": notes,
+    }
     return LightPictures(tuple(rows), layers, alpha, facts)
 
 
@@ -172,7 +177,7 @@ def _layers(data: RelightData, table, members: list[list[int]], report) -> np.nd
     layers = np.zeros((len(members), extraction.film.height, extraction.film.width, 3), np.float32)
     for name in passes:
         for group, values in zip(lit.groups, getattr(lit, name), strict=True):
-            image = extraction.film.image(extraction.exposure * values)
+            image = extraction.film.image(extraction.picture.exposure * values)
             layers[int(group)] += data.shown(name) * image
     return layers
 

@@ -53,7 +53,7 @@ def make_picture(options: PictureOptions, with_cycles: bool, progress: Progress 
 
     Raises as `shade_scene` does.
     """
-    from ..blender.process.blender_process import kept_blender
+    from ..blender.process.blender_process import shared_blender
 
     if with_cycles and options.cycles_samples < 2:
         raise ValueError(f"cycles_samples is {options.cycles_samples}, expected at least 2: one for each half")
@@ -66,7 +66,7 @@ def make_picture(options: PictureOptions, with_cycles: bool, progress: Progress 
         if not with_cycles:
             # One Blender for both: it extracts the samples and makes the PNG of the picture.
             folder = stack.enter_context(temporary_folder())
-            stack.enter_context(kept_blender(folder))
+            stack.enter_context(shared_blender(folder))
         extraction = _extracted(options, with_cycles, progress)
         shadows = None
         if extraction.occluders is not None:
@@ -91,21 +91,21 @@ def make_picture(options: PictureOptions, with_cycles: bool, progress: Progress 
 
 def _extracted(options: PictureOptions, with_cycles: bool, progress):
     """The `Extraction` of a scene: samples and lights, with Cycles' picture where asked for."""
-    from ..blender.process import client
+    from ..blender.process.pixels import PixelJob, extract_pixels
 
     width, height = options.resolution or (None, None)
     samples = options.cycles_samples if with_cycles else 0
     rest = set(PASSES) <= set(options.passes)
-    job = child_job(client.ExtractOptions, options, width=width, height=height, cycles_samples=samples, rest=rest)
-    return client.extract(job, progress=progress)
+    job = child_job(PixelJob, options, width=width, height=height, cycles_samples=samples, rest=rest)
+    return extract_pixels(job, progress=progress)
 
 
 def view_transformed(pixels: np.ndarray, options, folder: Path, progress) -> bytes:
     """PNG bytes of `pixels` (H, W, 4) through the view transform of the scene; `folder` is temporary."""
-    from ..blender.process import client
+    from ..blender.process.finished import PICTURE, show_finished
 
-    save_array(folder / client.PICTURE, pixels.astype(np.float32))
-    client.show_finished(Path(options.scene), (None, options.frame), folder, SHOWN, progress=progress)
+    save_array(folder / PICTURE, pixels.astype(np.float32))
+    show_finished(Path(options.scene), None, options.frame, folder, SHOWN, progress=progress)
     return (folder / SHOWN).read_bytes()
 
 
@@ -115,20 +115,20 @@ def draw_view(options: ViewOptions, progress: Progress | None = None) -> TaskRes
     The seconds have "draw": the median of a redraw with the first technique, without rays; "shadows": all rays; and
     "refined": all `refine` redraws and the rays. Raises SceneError, TableError, OSError, Cancelled.
     """
-    from ..blender.process import client
+    from ..blender.process import view
 
     start = time.perf_counter()
     tables = prepare(options)
     width, height = options.resolution or (None, None)
     given = tuple(name if name in SHIPPED_TABLES else str(Path(name).absolute()) for name in options.techniques)
-    job = child_job(client.ViewJob, options, width=width, height=height, techniques=given)
+    job = child_job(view.ViewJob, options, width=width, height=height, techniques=given)
     with temporary_folder() as folder:
-        manifest = client.draw_view(job, folder, progress=progress)
+        manifest = view.draw_view(job, folder, progress=progress)
         pictures = {
-            name: {pass_name: np.load(folder / f"{number}_{pass_name}.npy") for pass_name in client.VIEW_PASSES}
+            name: {pass_name: np.load(folder / f"{number}_{pass_name}.npy") for pass_name in view.VIEW_PASSES}
             for number, name in enumerate(tables)
         }
-        shown = (folder / client.VIEW_PNG).read_bytes()
+        shown = (folder / view.VIEW_PNG).read_bytes()
     check_before_writing(progress)
     coverage = next(iter(pictures.values()))["diffuse"][..., 3]
     report = _view_report(options, tables, manifest, coverage)

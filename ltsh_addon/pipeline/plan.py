@@ -34,7 +34,6 @@ DIRECT_SHARE, MORE_SHARE = 0.5, 0.2
 # THIN_CONTRAST: from this `Probe.contrast` on, highlights are thinner than pixels, and time is better spent on samples
 # of Cycles. In five scenes the contrast is at most 0.18, on the example scene 0.9, and 0.4 with 1280 x 720 pixels.
 THIN_CONTRAST = 0.35
-TOO_THIN = "highlights are thinner than pixels almost everywhere, of which Cycles tells more in the time of the budget"
 
 
 @dataclass(frozen=True)
@@ -84,7 +83,7 @@ def first_and_most_points(options: RenderOptions) -> tuple[int, int]:
 
 def direct_light_plan(scene: SceneMeasurements) -> DirectLightPlan:
     """The points per pixel that the remaining budget allows, or why Cycles does better with that time."""
-    from ..blender.process.client import too_small
+    from ..blender.process.pixels import TOO_THIN, too_small
 
     if scene.seconds_left is None or scene.samples == 0:
         return DirectLightPlan(scene.points)

@@ -21,8 +21,6 @@ from ..imaging.exr import COMBINED, REST, layer_name, parse_layer_name
 from ..scene import (
     REFERENCE,
     AreaLight,
-    Border,
-    ColorSpace,
     Film,
     Progress,
     SurfaceSamples,
@@ -39,7 +37,7 @@ from .options import PictureOptions
 RELIGHT_SUFFIX, OCCLUDERS_SUFFIX = ".samples.npz", ".occluders.npz"
 RELIGHT_OPTIONS = ("techniques", "passes", "sub_samples", "reference_samples", "shadows", "shadow_rays")
 FILM_ARRAYS = ("first", "count", "spread", "whole")  # the optional arrays of a film
-NOT_REFLECTED = ("emission", "background")  # optional arrays of an Extraction
+NOT_REFLECTED = ("emission", "background")  # optional arrays of `Extraction.cycles`
 FINISHED = ("rest", "taken", "edges")  # fields of a RelightData that only finished pictures have
 # Warnings:
 NO_CYCLES = "Cycles' picture and the errors beside it are left out: they show the lights as they were"
@@ -63,7 +61,7 @@ class RelightData:
     whole picture = sum over passes of `shown` x image of the samples, + sum of `rest`; all include the exposure.
     """
 
-    extraction: Any  # blender.process.client.Extraction, without reference and occluders
+    extraction: Any  # blender.process.pixels.Extraction, without reference and occluders
     shadows: Shadows | None
     options: dict  # fields of PictureOptions
     had_cycles: bool
@@ -99,24 +97,22 @@ class RelightData:
 
     @classmethod
     def _of(cls, document, arrays) -> RelightData:
-        from ..blender.process.client import UNCHANGED, Extraction
+        from ..blender.process.pixels import CyclesPasses, Extraction, ExtractionTimes, PictureFacts
 
         facts = document["extraction"]
-        border, space = facts["border"], facts["color_space"]
         samples = {item.name: _compact(arrays[f"samples.{item.name}"]) for item in fields(SurfaceSamples)}
         of_film = {name: arrays.get(f"film.{name}") for name in FILM_ARRAYS}
         extraction = Extraction(
-            **{name: facts[name] for name in UNCHANGED},
             lights=lights_of(facts["lights"]),
             samples=SurfaceSamples(**samples),
             film=Film(pixel=arrays["film.pixel"], **of_film, **facts["film"]),
+            picture=PictureFacts.of(facts),
+            cycles=CyclesPasses(**{name: arrays.get(f"picture.{name}") for name in NOT_REFLECTED}),
+            times=ExtractionTimes(facts["seconds"]),
             warnings=tuple(facts["warnings"]),
             problems=tuple(facts["problems"]),
-            reference=None,
             origin=np.array(facts["origin"]),
-            border=None if border is None else Border(**border),
-            color_space=ColorSpace(space["name"], np.array(space["to_rec709"])),
-            **{name: arrays.get(f"picture.{name}") for name in NOT_REFLECTED},
+            light_settings=facts["light_settings"],
         )
         shadows = document["shadows"]
         if shadows is not None:
@@ -140,23 +136,21 @@ def write_relight_data(extraction, shadows: Shadows | None, options, path: Path,
 
     `finished` are the fields `rest`, `taken` and `edges` of the RelightData of a finished picture. Raises OSError.
     """
-    from ..blender.process.client import UNCHANGED
-
-    film, space = extraction.film, extraction.color_space
+    film = extraction.film
     document = {
         "extraction": {
-            **{name: getattr(extraction, name) for name in UNCHANGED},
+            **extraction.picture.record(),
+            "seconds": extraction.times.stages,
+            "light_settings": extraction.light_settings,
             "lights": light_records(extraction.lights),
             "film": {"width": film.width, "height": film.height, "sub_samples": film.sub_samples},
             "warnings": extraction.warnings,
             "problems": extraction.problems,
             "origin": np.asarray(extraction.origin).tolist(),
-            "border": None if extraction.border is None else vars(extraction.border),
-            "color_space": {"name": space.name, "to_rec709": space.to_rec709.tolist()},
         },
         "shadows": None if shadows is None else {**shadows.report(), "numbers": shadows.numbers},
         "options": {"scene": str(options.scene), **{name: getattr(options, name) for name in RELIGHT_OPTIONS}},
-        "had_cycles": extraction.reference is not None,
+        "had_cycles": extraction.cycles.reference is not None,
         **{kind: list(finished.get(kind, ())) for kind in FINISHED},
     }
     arrays = {f"samples.{item.name}": getattr(extraction.samples, item.name) for item in fields(SurfaceSamples)}
@@ -164,7 +158,7 @@ def write_relight_data(extraction, shadows: Shadows | None, options, path: Path,
     arrays |= {f"film.{name}": getattr(film, name) for name in FILM_ARRAYS if getattr(film, name) is not None}
     if shadows is not None:
         arrays |= {f"shares.{name}": values for name, values in shadows.shares.items()}
-    images = {name: getattr(extraction, name) for name in NOT_REFLECTED}
+    images = {name: getattr(extraction.cycles, name) for name in NOT_REFLECTED}
     arrays |= {f"picture.{name}": image.astype(np.float32) for name, image in images.items() if image is not None}
     for kind, images in finished.items():
         arrays |= {f"{kind}.{name}": np.asarray(image, np.float32) for name, image in images.items()}
@@ -247,7 +241,7 @@ def _relit(data: RelightData, changes: Sequence[LightChange], options: PictureOp
     if data.rest:
         groups = [repr(group) for group in data.rest if group]
         warnings += (SAME_REST.format(BUT_GROUPS.format(listed(groups)) if groups else ""),)
-        warnings += (GRAIN,) if extraction.has_lens else ()
+        warnings += (GRAIN,) if extraction.picture.has_lens else ()
         rest = _changed_rest(data, lights, tables[data.technique], results[data.technique].shading, progress)
         extraction = replace(extraction, warnings=warnings)
         comparison = _FinishedComparison(options, extraction, results, data.shadows, data, rest)

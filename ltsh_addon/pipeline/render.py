@@ -50,7 +50,7 @@ class Finished:
     seconds: dict[str, Any]
     relight_data: dict[str, dict[str, np.ndarray]]  # `rest`, `taken` and `edges` of a RelightData
     comparison: Comparison
-    cycles: Any  # blender.process.client.CyclesPicture
+    cycles: Any  # blender.process.finished.CyclesPicture
 
 
 def render_scene(options: RenderOptions, progress: Progress | None = None) -> dict:
@@ -63,9 +63,9 @@ def render_scene(options: RenderOptions, progress: Progress | None = None) -> di
 
 def make_finished(options: RenderOptions, progress: Progress | None = None) -> TaskResult:
     """Finish one picture and write its files but report.json. Raises as `render_scene` does."""
-    from ..blender.process.blender_process import kept_blender
+    from ..blender.process.blender_process import shared_blender
 
-    with temporary_folder() as folder, kept_blender(folder):
+    with temporary_folder() as folder, shared_blender(folder):
         picture = finish(options, progress)
         png = view_transformed(picture.combined, options, folder, progress)
     check_before_writing(progress)
@@ -76,8 +76,8 @@ def make_finished(options: RenderOptions, progress: Progress | None = None) -> T
     for layer, pixels in {exr.COMBINED: picture.combined, **picture.ours, exr.REST: picture.rest}.items():
         planes |= imaging.Layer(pixels).planes(layer)
     metadata = exr.metadata_of(extraction, options.scene)
-    chromaticities = imaging.chromaticities(extraction.color_space)
-    write_channels(path, planes | picture.channels, metadata, chromaticities, extraction.pixel_aspect)
+    chromaticities = imaging.chromaticities(extraction.picture.color_space)
+    write_channels(path, planes | picture.channels, metadata, chromaticities, extraction.picture.pixel_aspect)
     write_bytes(path.with_suffix(".png"), png)
     files = [f"{name}.exr", f"{name}.png"]
     if options.keep_visibility:
@@ -100,8 +100,8 @@ def finish(
 
     `shaded` is called with the direct light before Cycles begins.
     """
-    from ..blender.process import client
-    from ..blender.process.blender_process import kept_blender
+    from ..blender.process.blender_process import shared_blender
+    from ..blender.process.finished import FinishedJob, render_finished
 
     start, clock = time.perf_counter(), _ProcessorClock()
     scene_and_layer = {"scene_name": scene_name, "view_layer": view_layer}
@@ -110,15 +110,15 @@ def finish(
         pixels, denoisings = extraction.film.width * extraction.film.height, compositing.most_denoisings(extraction)
         return plan.seconds_before_denoising(options.budget, clock.seconds(), pixels, denoisings)
 
-    with temporary_folder() as folder, kept_blender(folder):
+    with temporary_folder() as folder, shared_blender(folder):
         comparison = shade_direct_light(options, scene_and_layer, clock, seconds_left, progress)
         extraction = comparison.extraction
         shaded(comparison)
         width, height = options.resolution or (None, None)
-        edges = not (extraction.has_lens or extraction.left_to_cycles.everything)
+        edges = not (extraction.picture.has_lens or extraction.left_to_cycles.everything)
         size = {"width": width, "height": height, "seconds": seconds_left(extraction), "edges": edges}
-        job = child_job(client.FinishedJob, options, **scene_and_layer, **size)
-        cycles = client.render_finished(job, folder, progress=progress)
+        job = child_job(FinishedJob, options, **scene_and_layer, **size)
+        cycles = render_finished(job, folder, progress=progress)
         clock.end("cycles", cycles.processor_seconds)
         passes = compositing.direct_passes(comparison, cycles, options.denoise == "on")
         rest = compositing.denoised_rest(cycles, passes, extraction, options.denoise, progress)
@@ -134,7 +134,7 @@ def finish(
                 "or let the world shine"
             )
         # The least is to start Blender, open the file, render the first samples of Cycles, and denoise.
-        opening = extraction.processor_seconds - extraction.direct_seconds
+        opening = extraction.times.processor - extraction.times.direct
         least = opening + cycles.least_seconds + clock.stages["denoise"]
         report["warnings"] += plan.over_budget(options.budget, clock.seconds(), least)
         seconds = {
@@ -156,14 +156,14 @@ def shade_direct_light(
     `scene_and_layer` are fields of the child's job. `clock` is told the ends of stages; `seconds_left(extraction)` are
     those of the budget.
     """
-    from ..blender.process import client
+    from ..blender.process.pixels import PixelJob, ended_at_horizons, extract_pixels, with_points
 
     tables = load_tables(options.techniques)
     width, height = options.resolution or (None, None)
     first, most = plan.first_and_most_points(options)
     picture = child_job(PictureOptions, options, passes=PASSES, sub_samples=most, shadows="on", cycles_samples=2)
     job = child_job(
-        client.ExtractOptions,
+        PixelJob,
         picture,
         **scene_and_layer,
         width=width,
@@ -175,13 +175,13 @@ def shade_direct_light(
         for_finished=True,
         edge_points=EDGE_POINTS,
     )
-    extraction = client.extract(job, progress=progress)
-    clock.end("extraction", extraction.processor_seconds)
+    extraction = extract_pixels(job, progress=progress)
+    clock.end("extraction", extraction.times.processor)
     if not extraction.lights or extraction.left_to_cycles.everything:
         return Comparison(picture, extraction, {}, None)
     with ShadowTracer(extraction.occluders, extraction.lights, extraction.origin) as tracer:
         shader = DirectLightShader(picture, options.budget, tables, tracer)
-        opening = extraction.processor_seconds - extraction.direct_seconds
+        opening = extraction.times.processor - extraction.times.direct
         chosen = shader.planned(extraction, seconds_left(extraction), clock.seconds() - opening)
         clock.end("choice")
         if chosen.reason:
@@ -190,15 +190,15 @@ def shade_direct_light(
             return Comparison(picture, replace(extraction, left_to_cycles=cycles), {}, None)
         points = chosen.points_per_pixel
         if points > extraction.film.sub_samples:
-            extraction = client.extract(replace(job, sub_samples=points, seconds=None), progress=progress)
-            clock.end("extraction", extraction.processor_seconds)
-        extraction = client.ended(client.with_points(extraction, points))
+            extraction = extract_pixels(replace(job, sub_samples=points, seconds=None), progress=progress)
+            clock.end("extraction", extraction.times.processor)
+        extraction = ended_at_horizons(with_points(extraction, points))
         clock.end("extraction")
         shadows = shader.shadows(extraction, progress)
         clock.end("shadows")
         comparison = shader.shaded(extraction, shadows, progress)
         clock.end("shading")
-        if extraction.finer is not None:
+        if extraction.points.finer is not None:
             direct_seconds = clock.stages["shadows"] + clock.stages["shading"]
             more = plan.edge_samples(seconds_left(extraction), direct_seconds)
             comparison = shader.with_edge_points(comparison, more, progress)
@@ -218,7 +218,7 @@ class DirectLightShader:
     def shadows(self, extraction, progress=None) -> Shadows:
         """The visibility of the lights from the samples. Points of a pixel with about the same view share rays."""
         samples, film, index = extraction.samples, extraction.film, slice(None)
-        if not extraction.has_lens:
+        if not extraction.picture.has_lens:
             samples, film, index = with_one_shadow(samples, film)
         # Lights of one name, such as the sides of a sky, have common rays.
         pairs = film.coverage().sum() * len({light.name for light in extraction.lights})
@@ -232,21 +232,21 @@ class DirectLightShader:
 
     def planned(self, extraction, seconds_left: float | None, sampling_seconds: float) -> plan.DirectLightPlan:
         """The plan by samples of the first points of each pixel, which took `sampling_seconds`, and by probes."""
-        from ..blender.process import client
+        from ..blender.process.pixels import EDGE_SECONDS, with_points
 
         film = extraction.film
-        merged = client.with_points(extraction, film.sub_samples)
+        merged = with_points(extraction, film.sub_samples)
         measured = plan.SceneMeasurements(
             budget=self.budget,
             seconds_left=seconds_left,
             sampling_seconds=sampling_seconds,
             # Cycles will read the scene in half the time that was needed here, and render what shines in sight.
-            cycles_seconds=0.5 * extraction.direct_seconds + client.EDGE_SECONDS * film.width * film.height / 1e6,
+            cycles_seconds=0.5 * extraction.times.direct + EDGE_SECONDS * film.width * film.height / 1e6,
             points=film.sub_samples,
             most_points=self.options.sub_samples,
-            samples_of_one_point=np.count_nonzero(extraction.point == 0),
+            samples_of_one_point=np.count_nonzero(extraction.points.number == 0),
             samples=len(merged.samples),
-            has_lens=extraction.has_lens,
+            has_lens=extraction.picture.has_lens,
         )
         while (chosen := plan.direct_light_plan(measured)).probe_share > 0.0:
             probe = self.probe(merged, chosen.probe_share)
@@ -255,7 +255,7 @@ class DirectLightShader:
 
     def probe(self, extraction, share: float) -> plan.Probe:
         """Shades a few random squares of the picture that have a `share` of its samples."""
-        from ..blender.process import client
+        from ..blender.process.pixels import ended_at_horizons
 
         film, start = extraction.film, time.process_time()
         row, column = np.divmod(film.pixel, film.width)
@@ -264,7 +264,7 @@ class DirectLightShader:
         count = np.cumsum(np.bincount(square, minlength=len(order))[order])
         chosen = np.isin(square, order[: 1 + np.searchsorted(count, share * len(square))])
         squares = replace(extraction, samples=extraction.samples.take(chosen), film=film.take(chosen))
-        squares = client.ended(squares)
+        squares = ended_at_horizons(squares)
         comparison = self.shaded(squares, self.shadows(squares))
         (technique, result), *_ = comparison.results.items()
         variance, _ = compositing.point_statistics(
@@ -299,7 +299,7 @@ class DirectLightShader:
         if not is_finer.any():
             return comparison
         pixels = {"pixel": pixel[is_finer], "number": points[is_finer]}
-        samples, fine_film, replaced = self.tracer.finer(extraction.samples, film, extraction.finer, pixels)
+        samples, fine_film, replaced = self.tracer.finer(extraction.samples, film, extraction.points.finer, pixels)
         if len(samples) == 0:
             return comparison
         fine = replace(extraction, samples=samples, film=fine_film)

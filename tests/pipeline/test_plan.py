@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ltsh_addon.blender.process.client import too_small
+from ltsh_addon.blender.process.pixels import TOO_THIN, too_small
 from ltsh_addon.pipeline import plan
 from ltsh_addon.pipeline.options import EDGE_POINTS, RenderOptions
 
@@ -60,7 +60,7 @@ def test_direct_light_gets_no_more_points_than_probes_say_there_is_time_for(each
     fewer = planned(scene, seconds_of, contrast=0.1, clean_share=share).points_per_pixel
     assert fewer <= (number if each < 1e-4 else 0)
     # With thin highlights Cycles does better with the time.
-    assert planned(scene, seconds_of, contrast=2.0) == plan.DirectLightPlan(0, plan.TOO_THIN)
+    assert planned(scene, seconds_of, contrast=2.0) == plan.DirectLightPlan(0, TOO_THIN)
 
 
 def test_without_a_budget_or_without_surfaces_all_points_are_shaded():

@@ -105,6 +105,7 @@ def test_a_view_is_the_picture_of_shade(capsys, tmp_path, count, most):
     bpy.data.images.remove(shown)
 
 
+@pytest.mark.newest
 def test_shadows_of_a_view_are_those_of_shade(capsys, tmp_path):
     with_graphics(lambda: None)
     set_up_scene()

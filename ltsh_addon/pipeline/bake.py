@@ -166,7 +166,7 @@ class ObjectBaker:
         uv_maps = {name: folder / file for name, file in record["uv_maps"].items()}
         self.materials = [BakeMaterial.of(material, folder.parent, uv_maps) for material in record["materials"]]
         self.view = BakeView(**manifest["view"])
-        self.groups = tuple(dict.fromkeys(light.group for light in self.lights)) or ("",)
+        self.groups = lighting.light_groups(self.lights)
         self.tiles, self.area = uv.tiles_of(self.mesh.uv)
         known = shaded_passes(options) | {COMBINED} if options.error else ()
         self.compared = tuple(name for name in options.passes if name in known)

@@ -228,11 +228,11 @@ class Comparison:
 
     def layers(self) -> dict[str, np.ndarray | imaging.Layer]:
         """All layers of the EXR by name."""
-        planes = {}
+        planes, groups = {}, lighting.light_groups(self.extraction.lights)
         for (name, pass_name), image in self.images.items():
             layer, result = layer_name(name, pass_name), self.results[name]
             images = (self._image(result, values) for values in self._radiance(result, pass_name))
-            planes |= {layer: image, **exr.by_group(layer, result.shading.groups, images)}
+            planes |= {layer: image, **exr.by_group(layer, groups, images)}
             if result.unshadowed is not None:
                 values = self._exposed(result.unshadowed, pass_name).sum(axis=0)
                 planes[layer_name(f"{name}{exr.UNSHADOWED}", pass_name)] = self._image(result, values)

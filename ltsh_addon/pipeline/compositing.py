@@ -25,7 +25,7 @@ from ..imaging.exr import by_group, layer_name
 from ..scene import Cancelled
 from ..workers.pool import cores
 from .comparison import Comparison
-from .lighting import Shadows
+from .lighting import Shadows, light_groups
 
 # DIRECT: for each pass of LTSH, the keys of Cycles' light and color in `pass_names`.
 DIRECT = {"specular": ("specular_light", "specular_color"), "diffuse": ("diffuse_light", "diffuse_color")}
@@ -120,7 +120,8 @@ def direct_passes(comparison: Comparison, cycles, is_denoised: bool) -> dict[str
         share = np.where(is_replaced, clean * weight, 0.0)
         values = extraction.picture.exposure * getattr(result.shading, name)
         of_groups = map(film.image, values) if len(values) > 1 else (image,)
-        groups = {group: _share_of(share, one) for group, one in zip(result.shading.groups, of_groups, strict=True)}
+        groups = zip(light_groups(extraction.lights), of_groups, strict=True)
+        groups = {group: _share_of(share, one) for group, one in groups}
         passes[name] = DirectPass(_share_of(share, image), groups, is_replaced, clean, light, color, weight)
     return passes
 

@@ -5,9 +5,10 @@ radiance = closed form x visibility of the light. The visibility is the same for
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -158,48 +159,63 @@ def shade_lights(
     passes: Sequence[str],
     shadowing: Sequence[Shadows | None] = (None,),
     *,
+    rows: Sequence[int] | None = None,
     workers: int | None = None,
     progress: Callable[[float], bool | None] | None = None,
 ) -> list[shading.Shading]:
     """Radiance of `samples` (P) under `lights` (L): one Shading for each entry of `shadowing`.
 
-    An entry is the shadows of the samples, or None for no shadows. All shadows must group the lights alike.
+    An entry is the shadows of the samples, or None for no shadows. All shadows must join the same lights, and only
+    lights of one row. `rows` (L,) are as for `shade`; by default each of the `light_groups` has a row.
 
     Lights that share their rays are shaded together and then multiplied by their share, so that a sample that sees
     them whole gets the same bits as without shadows. Exception: many lights without any shadows go to `shade` at once,
     which then merges those that a sample cannot tell apart.
     """
+    if rows is None:
+        groups = light_groups(lights)
+        rows = [groups.index(light.group) for light in lights]
+    options = {"passes": tuple(passes), "workers": workers}
     if lights and all(shadows is None for shadows in shadowing):
-        if max(Counter(light.group for light in lights).values()) >= FEWEST:
-            shaded = shading.shade(samples, lights, table, passes=tuple(passes), workers=workers, progress=progress)
+        if max(Counter(rows).values()) >= FEWEST:
+            shaded = shading.shade(samples, lights, table, rows=rows, progress=progress, **options)
             return [shaded] * len(shadowing)
-    groups = tuple(dict.fromkeys(light.group for light in lights)) or ("",)
-    shape = len(groups), len(samples), 3
+    shape = 1 + max(rows, default=0), len(samples), 3
     sums = [{name: np.zeros(shape, np.float32) for name in passes} for _ in shadowing]
-    numbers = next((shadows.numbers for shadows in shadowing if shadows is not None), None)
-    numbers = visibility.shared_numbers(lights) if numbers is None else numbers
+    joined = next((shadows.numbers for shadows in shadowing if shadows is not None), None)
+    if joined is None:
+        # Lights of several rows cannot be shaded together.
+        alike = visibility.shared_numbers(lights)
+        alike = [[one] if len({rows[n] for n in one}) == 1 else [(n,) for n in one] for one in alike]
+        joined = sorted(itertools.chain.from_iterable(alike))
     error, most = None, max(1, MOST_PAIRS // max(1, len(samples)))
-    for first in range(0, len(numbers), most):
-        rows = numbers[first : first + most]
-        start, share = first / len(numbers), len(rows) / len(numbers)
+    for first in range(0, len(joined), most):
+        block = joined[first : first + most]
+        start, share = first / len(joined), len(block) / len(joined)
 
         def report(fraction, start=start, share=share):
             return None if progress is None else progress(start + fraction * share)
 
-        by_row = [lights[light].altered(group=str(row)) for row, one in enumerate(rows) for light in one]
-        shaded = shading.shade(samples, by_row, table, passes=tuple(passes), workers=workers, progress=report)
+        of_block = [lights[number] for numbers in block for number in numbers]
+        row_of = [row for row, numbers in enumerate(block) for _ in numbers]
+        shaded = shading.shade(samples, of_block, table, rows=row_of, progress=report, **options)
         if shaded.quadrature_error is not None:
             error = shaded.quadrature_error if error is None else error + shaded.quadrature_error
-        for row, one in enumerate(rows):
-            group = groups.index(lights[one[0]].group)
+        for number, lights_of_row in enumerate(block):
+            row = rows[lights_of_row[0]]
             for name in passes:
-                radiance = getattr(shaded, name)[row]
+                radiance = getattr(shaded, name)[number]
                 for total, shadows in zip(sums, shadowing, strict=True):
                     if shadows is None:
-                        total[name][group] += radiance
+                        total[name][row] += radiance
                     else:
-                        total[name][group] += shadows.shares[name][first + row][:, None] * radiance
-    return [shading.Shading(groups, total.get("specular"), total.get("diffuse"), error) for total in sums]
+                        total[name][row] += shadows.shares[name][first + number][:, None] * radiance
+    return [shading.Shading(total.get("specular"), total.get("diffuse"), error) for total in sums]
+
+
+def light_groups(lights: Iterable[AreaLight]) -> tuple[str, ...]:
+    """The names of the light groups of `lights` in the order of their first lights, "" for none; at least one name."""
+    return tuple(dict.fromkeys(light.group for light in lights)) or ("",)
 
 
 # A shader is the name of the reference, a table, or a technique that a script has given.
@@ -270,7 +286,7 @@ def title(name: str) -> str:
 class TechniqueResult:
     """Radiance of one technique on all samples, or on a subset (Q,) of them."""
 
-    shading: shading.Shading  # radiance (G, Q, 3) per pass
+    shading: shading.Shading  # radiance (G, Q, 3) per pass, a row a light group
     seconds: dict[str, float]  # per pass
     subset: np.ndarray | None  # (Q,) sorted indices of the samples that were evaluated, None for all
     unshadowed: shading.Shading | None = None  # the same without shadows, where `shading` has shadows
@@ -315,10 +331,9 @@ def _evaluate(name, table, extraction, shadows, options, progress) -> TechniqueR
 
 def _joined(shaded: dict[str, shading.Shading]) -> shading.Shading:
     """Several Shadings of one pass each as one Shading."""
-    first = next(iter(shaded.values()))
     passes = {name: getattr(one, name) for name, one in shaded.items()}
     error = shaded["specular"].quadrature_error if "specular" in shaded else None
-    return shading.Shading(first.groups, passes.get("specular"), passes.get("diffuse"), error)
+    return shading.Shading(passes.get("specular"), passes.get("diffuse"), error)
 
 
 def _samples_of_random_pixels(film: Film, limit: int) -> np.ndarray:

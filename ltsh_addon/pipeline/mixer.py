@@ -170,15 +170,14 @@ def _layers(data: RelightData, table, members: list[list[int]], report) -> np.nd
     extraction = data.extraction
     row_of = {number: row for row, numbers in enumerate(members) for number in numbers}
     numbers = sorted(row_of)
-    lights = [replace(extraction.lights[number], group=str(row_of[number])) for number in numbers]
+    lights, rows = [extraction.lights[number] for number in numbers], [row_of[number] for number in numbers]
     shadows = None if data.shadows is None else data.shadows.of_lights(numbers)
     passes = data.options["passes"]
-    (lit,) = shade_lights(extraction.samples, lights, table, passes, (shadows,), progress=report)
+    (lit,) = shade_lights(extraction.samples, lights, table, passes, (shadows,), rows=rows, progress=report)
     layers = np.zeros((len(members), extraction.film.height, extraction.film.width, 3), np.float32)
     for name in passes:
-        for group, values in zip(lit.groups, getattr(lit, name), strict=True):
-            image = extraction.film.image(extraction.picture.exposure * values)
-            layers[int(group)] += data.shown(name) * image
+        for layer, values in zip(layers, getattr(lit, name), strict=True):
+            layer += data.shown(name) * extraction.film.image(extraction.picture.exposure * values)
     return layers
 
 

@@ -30,7 +30,7 @@ from ..scene import (
     listed,
 )
 from .comparison import Comparison
-from .lighting import Shadows, evaluated, prepare, shade_lights
+from .lighting import Shadows, evaluated, light_groups, prepare, shade_lights
 from .options import PictureOptions
 
 # The two files of `write_relight_data`: the samples with all that shading needs, and the occluders.
@@ -296,7 +296,7 @@ def _changed_rest(data: RelightData, lights: Sequence[AreaLight], table, shaded,
 
 def _light_of_group(data: RelightData, shaded, group: str) -> np.ndarray:
     """Direct light (3,) of a light group, summed over the picture."""
-    number, film = shaded.groups.index(group), data.extraction.film
+    number, film = light_groups(data.extraction.lights).index(group), data.extraction.film
     images = {name: film.image(getattr(shaded, name)[number]) for name in data.options["passes"]}
     return sum((data.shown(name) * image).sum(axis=(0, 1)) for name, image in images.items())
 

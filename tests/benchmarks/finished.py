@@ -19,12 +19,12 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT)]
 
 from ltsh_addon import imaging  # noqa: E402
-from ltsh_addon.blender.process import client  # noqa: E402
-from ltsh_addon.blender.process.blender_process import denoiser_libraries, kept_blender  # noqa: E402
+from ltsh_addon.blender.process.blender_process import denoiser_libraries, shared_blender  # noqa: E402
+from ltsh_addon.blender.process.finished import FinishedJob, render_finished  # noqa: E402
 from ltsh_addon.cli.commands import DEMO_SCENE  # noqa: E402
 from ltsh_addon.cycles.lobes import read_layer  # noqa: E402
 from ltsh_addon.imaging.denoise import open_denoiser  # noqa: E402
-from ltsh_addon.pipeline import RenderOptions, render  # noqa: E402
+from ltsh_addon.pipeline import RenderOptions, compositing, render  # noqa: E402
 from ltsh_addon.workers.pool import cores  # noqa: E402
 
 # Without compiled modules on disk, every Blender would compile those that it imports; an installed one has them.
@@ -48,14 +48,14 @@ def by_cycles(path: Path, folder: Path, *, samples=None, seconds=None, denoise=T
     """What Cycles alone makes (H, W, 3), processor seconds with the start of Blender, samples."""
     own = Path(tempfile.mkdtemp(dir=folder))
     start = time.process_time()
-    with kept_blender(own):
+    with shared_blender(own):
         # As much as starting Blender, opening the file and denoising take.
         left = None if seconds is None else max(seconds - START, 0.1)
-        job = client.FinishedJob(path, None, None, None, None, *SIZE, samples, left, edges=False)
-        made = client.render_finished(job, own)
+        job = FinishedJob(path, None, None, None, None, *SIZE, samples, left, edges=False)
+        made = render_finished(job, own)
     image = read_layer(made.channels, "Combined", "RGB")
     if denoise:
-        albedo, normal = (read_layer(made.guides, *guide) for guide in (render.ALBEDO, render.NORMAL))
+        albedo, normal = (read_layer(made.guides, *guide) for guide in (compositing.ALBEDO, compositing.NORMAL))
         with open_denoiser(denoiser_libraries(), cores()) as denoiser:
             (image,) = denoiser.all_denoised([image], albedo, normal)
     return image, made.processor_seconds + time.process_time() - start, made.samples
@@ -66,7 +66,7 @@ START = 1.4
 
 def ours(path: Path, folder: Path, **options) -> tuple[np.ndarray, dict, dict]:
     """What `ltsh render` makes, its seconds and its report."""
-    with kept_blender(folder):
+    with shared_blender(folder):
         made = render.finish(RenderOptions(path, output=folder, resolution=SIZE, **options))
     return made.combined[..., :3], made.seconds["processor"], made.report
 

@@ -9,12 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from ...pipeline.lighting import RelightData, shade_lights, trace_shadows
+from ...pipeline.lighting import shade_lights, trace_shadows
 from ...pipeline.mixer import LightPictures, light_pictures
 from ...pipeline.options import RenderOptions
+from ...pipeline.relight import RelightData
 from ...pipeline.render import finish
 from ...scene import PASSES, TECHNIQUES, Progress
-from ..process import client
+from ..process.pixels import PixelJob, extract_pixels
 from ..ui.job import (
     START_SECONDS,
     STARTING,
@@ -95,7 +96,7 @@ def final_picture(
     """
     if job.cycles_samples:
         return _complete_picture(job, scene_file, progress, show)
-    options = client.ExtractOptions(
+    options = PixelJob(
         scene=scene_file,
         sub_samples=job.sub_samples,
         frame=job.frame,
@@ -105,21 +106,21 @@ def final_picture(
         indices=job.indices,
         shadows=job.shadows,
     )
-    extraction = client.extract(options, progress=progress)
-    emission = extraction.exposure * extraction.emission
+    extraction = extract_pixels(options, progress=progress)
+    emission = extraction.picture.exposure * extraction.cycles.emission
     shown = PASSES if job.shown == "combined" else (job.shown,)
     rest = extraction.rest
     if job.shown != "combined":
-        rest[..., :3] = extraction.exposure * extraction.background[..., :3]
-    passes, warnings = {EMISSION: inside_border(emission, extraction.border)}, extraction.warnings
+        rest[..., :3] = extraction.picture.exposure * extraction.cycles.background[..., :3]
+    passes, warnings = {EMISSION: inside_border(emission, extraction.picture.border)}, extraction.warnings
     if job.data_passes:
         passes |= data_passes(extraction, job.to_camera)
-    indices = extraction.indices.items()
-    passes |= {name: inside_border(plane[..., None], extraction.border) for name, plane in indices}
+    indices = extraction.cycles.indices.items()
+    passes |= {name: inside_border(plane[..., None], extraction.picture.border) for name, plane in indices}
 
     def picture() -> FinalPicture:
         """The picture so far."""
-        combined = inside_border(rest, extraction.border).copy()
+        combined = inside_border(rest, extraction.picture.border).copy()
         for lit_pass in shown:
             combined[..., :3] += passes.get(f"LTSH {PASS_LABELS[lit_pass]}", 0.0)
         return FinalPicture(combined, dict(passes), warnings, extraction.problems)
@@ -140,7 +141,7 @@ def final_picture(
                     title, (first + fraction) / len(PASSES)
                 ),
             )[0].combined
-            image = inside_border(extraction.film.image(extraction.exposure * lit), extraction.border)
+            image = inside_border(extraction.film.image(extraction.picture.exposure * lit), extraction.picture.border)
             prefixes = [prefix for prefix, name in job.shaded_as().items() if name == technique]
             passes.update({f"{prefix} {PASS_LABELS[lit_pass]}": image for prefix in prefixes})
             show(picture())
@@ -171,7 +172,7 @@ def data_passes(extraction, to_camera: np.ndarray | None) -> dict[str, np.ndarra
         depth = np.full(film.width * film.height, BEHIND)
         depth[pixel] = -(samples.position[first] @ to_camera[2, :3] + to_camera[2, 3])
         passes[DEPTH] = depth.reshape(film.height, film.width, 1)
-    return {name: inside_border(image, extraction.border) for name, image in passes.items()}
+    return {name: inside_border(image, extraction.picture.border) for name, image in passes.items()}
 
 
 def _direct_light(job: FinalJob, comparison) -> FinalPicture:
@@ -180,10 +181,10 @@ def _direct_light(job: FinalJob, comparison) -> FinalPicture:
     images = {f"LTSH {PASS_LABELS[lit_pass]}": image for (_, lit_pass), image in comparison.images.items()}
     coverage = extraction.film.coverage()
     combined = _over_background(
-        sum(images.values(), np.zeros((*coverage.shape, 3))), coverage, job.background, extraction.exposure
+        sum(images.values(), np.zeros((*coverage.shape, 3))), coverage, job.background, extraction.picture.exposure
     )
-    passes = {name: inside_border(image, extraction.border) for name, image in images.items()}
-    return FinalPicture(inside_border(combined, extraction.border), passes, ())
+    passes = {name: inside_border(image, extraction.picture.border) for name, image in images.items()}
+    return FinalPicture(inside_border(combined, extraction.picture.border), passes, ())
 
 
 def _complete_picture(job: FinalJob, scene_file: Path, progress: Progress, show) -> FinalPicture:
@@ -199,7 +200,7 @@ def _complete_picture(job: FinalJob, scene_file: Path, progress: Progress, show)
     )
     where = {"scene_name": job.scene, "view_layer": job.view_layer}
     made = finish(options, progress, **where, shaded=lambda comparison: show(_direct_light(job, comparison)))
-    border = made.comparison.extraction.border
+    border = made.comparison.extraction.picture.border
     zero = np.zeros_like(made.combined[..., :3])
     passes = {
         f"LTSH {label}": made.ours.get(f"{job.technique}.{lit_pass}", zero) for lit_pass, label in PASS_LABELS.items()

@@ -17,6 +17,7 @@ from bpy_extras.io_utils import ExportHelper
 from ...files import replacing
 from ...scene import SceneError, error_line, listed
 from ..extract.apply import restore_materials, show_texture, shows_texture
+from ..process.bake import BakedTextures
 from ..saving import save_working_copy
 from . import comparison, preflight, results
 from .job import Job, Plan, clock, new_folder, output_folder, progress_text, runs_of, session_times, stage_title, steps
@@ -466,7 +467,7 @@ def last_bake(scene):
     return result if result is not None and result.command == "bake" and result.report["objects"] else None
 
 
-def baked_texture(result, record: dict) -> dict:
+def baked_texture(result, record: dict) -> BakedTextures:
     """The texture of an object for `show_texture`: its combined light, or its first pass.
 
     The pictures are copied to files of their own, which stay when the next bake replaces the pictures. Raises OSError.
@@ -482,7 +483,7 @@ def baked_texture(result, record: dict) -> dict:
         with replacing(path) as temporary:
             shutil.copyfile(source, temporary)
         files.append({"path": str(path), "tile": int(number)})
-    return {"name": f"{record['name']} {layer}", "uv": record["uv"], "files": files}
+    return BakedTextures(record["name"], record["uv"], f"{record['name']} {layer}", files)
 
 
 class LTSH_OT_manual(bpy.types.Operator):

@@ -21,7 +21,7 @@ from bpy.props import StringProperty
 from ...scene import error_line
 from ..extract.apply import shows_texture
 from ..extract.bake import ObjectError, check_object
-from ..lights.area import LightInventory, reason_to_leave_out, unseen_light
+from ..lights.area import LightInventory, node_light, reason_to_leave_out
 from ..lights.area import (
     note_unsupported as note_unsupported_light,
 )
@@ -377,7 +377,7 @@ def _light(ob) -> Entry:
     if problem:
         return Entry(ob.name, kind, LEFT_OUT, (problem,))
     inventory = LightInventory()
-    unseen = unseen_light(ob, matrix, inventory)
+    unseen = node_light(ob, matrix, inventory)
     note_unsupported_light(ob, matrix, inventory)
     notes = [note.partition(": ")[2] for note in inventory.warnings]
     if unseen is not None and unseen.varies and ob.data.type == "AREA":

@@ -15,11 +15,11 @@ from ..evaluated import (
     SURFACE_TYPES,
     EmitterTraits,
 )
-from ..lights.area import area_light, note_unsupported, reason_to_leave_out, unseen_light
+from ..lights.area import area_light, node_light, note_unsupported, reason_to_leave_out
 from ..lights.emission import emission_of, factors_of, open_studio
 from ..lights.linking import Receivers
 from ..lights.meshes import collect_mesh_lights, constant_mesh_lights
-from ..lights.textures import MOST_LOOKS, SeenNodes, ShownTextures, UnseenLight, seen_factor, with_pattern
+from ..lights.textures import MOST_LOOKS, NodeEmission, NodeLight, ShownTextures, node_emission, with_pattern
 from ..materials.graph import source_of, surface_of, tree_in_use
 from ..materials.looks import look_of
 from ..materials.values import product, value_at
@@ -32,10 +32,10 @@ MOST_LIGHTS = 2048
 NOT_RESOLVED = "its nodes are not resolved, it shines as without them"
 NOT_YET = "it shines as without its nodes until Cycles has sources at them"
 # Patterns: a function that returns how Cycles sees the nodes of evaluated light data, or why that is not known.
-Patterns = Callable[[bpy.types.Light, UnseenLight], SeenNodes | str]
+Patterns = Callable[[bpy.types.Light, NodeLight], NodeEmission | str]
 
 
-def no_patterns(data, source: UnseenLight) -> str:
+def no_patterns(data, source: NodeLight) -> str:
     """The `Patterns` of views that resolve no nodes."""
     return NOT_RESOLVED
 
@@ -106,14 +106,14 @@ def _mesh_lights(depsgraph, receivers: Receivers, notes: list[str]) -> list[Area
     return constant_mesh_lights(mesh_lights, _emission, eye, notes.append)
 
 
-def patterns_of(scene, depsgraph) -> dict[tuple, SeenNodes]:
-    """How Cycles sees the nodes of lights that views cannot read themselves, by the `key` of the `UnseenLight`.
+def patterns_of(scene, depsgraph) -> dict[tuple, NodeEmission]:
+    """How Cycles sees the nodes of lights that views cannot read themselves, by the `key` of the `NodeLight`.
 
     `scene` is left as it was.
     """
-    wanted: dict[tuple, UnseenLight] = {}
+    wanted: dict[tuple, NodeLight] = {}
 
-    def note(data, source: UnseenLight) -> str:
+    def note(data, source: NodeLight) -> str:
         if len(wanted) < MOST_LOOKS:
             wanted[source.key] = source
         return NOT_YET
@@ -128,7 +128,7 @@ def patterns_of(scene, depsgraph) -> dict[tuple, SeenNodes]:
     if not wanted:
         return {}
     with open_studio(scene) as studio:
-        return {key: seen_factor(source, studio) for key, source in wanted.items()}
+        return {key: node_emission(source, studio) for key, source in wanted.items()}
 
 
 def _with_nodes(light: AreaLight, instance, sources: tuple, notes: list[str]) -> list[AreaLight]:
@@ -158,7 +158,7 @@ def _with_nodes(light: AreaLight, instance, sources: tuple, notes: list[str]) ->
             return patches
     warnings: list[str] = []
     matrix = np.array(instance.matrix_world, dtype=np.float64)
-    unseen = unseen_light(ob, matrix, SimpleNamespace(warn=warnings.append), instance)
+    unseen = node_light(ob, matrix, SimpleNamespace(warn=warnings.append), instance)
     pattern = patterns(data, unseen)
     if isinstance(pattern, str):
         notes.append(f"{light.name}: {pattern}")

@@ -16,10 +16,10 @@ from ...cycles.environment import CUBE, SkyPicture
 from ...files import save_array, temporary_folder
 from ...scene import AreaLight, Cancelled, SceneError, error_line
 from ..lights.emission import ObjectFacts, nodes_as_text, open_studio
-from ..lights.textures import SeenNodes, UnseenLight, seen_factor
+from ..lights.textures import NodeEmission, NodeLight, node_emission
 from ..lights.world import background_pictures, light_of_world, light_pictures
-from ..process import client
-from ..process.client import LAMPS
+from ..process import view
+from ..process.view import NODE_LIGHTS, NodeLightFile, NodeLightJob, WorldJob
 from .lights import NOT_RESOLVED, NOT_YET
 from .sky import ShownSky, background_of, coarse, varied_sky
 
@@ -29,7 +29,7 @@ class _LightsJob:
     """The work of a second Blender that renders the nodes of lights."""
 
     states: dict[tuple, tuple]  # states by key of the lights without results so far
-    results: list[tuple[tuple, SeenNodes]] = field(default_factory=list)  # new results, with the keys of their lights
+    results: list[tuple[tuple, NodeEmission]] = field(default_factory=list)  # with the keys of their lights
     error: str = ""
     is_stopped: bool = False
     thread: threading.Thread | None = None
@@ -39,17 +39,17 @@ class LiveNodeLights:
     """The nodes of lights as Cycles sees them, for all windows.
 
     A second Blender looks at new and changed lights while the views go on. Lights are identified by the `key` of
-    `UnseenLight`.
+    `NodeLight`.
     """
 
     def __init__(self):
-        self._known: dict[tuple, tuple[tuple, SeenNodes | str]] = {}  # state of a light's nodes, and the result
+        self._known: dict[tuple, tuple[tuple, NodeEmission | str]] = {}  # state of a light's nodes, and the result
         self._wanted: dict[tuple, tuple] = {}  # states of lights to look at
-        self._sources: dict[tuple, UnseenLight] = {}  # the lights of these states
+        self._sources: dict[tuple, NodeLight] = {}  # the lights of these states
         self._changed, self._images = 0.0, 0  # time of the last change; counts changes of images
         self._job: _LightsJob | None = None
 
-    def pattern(self, data, source: UnseenLight) -> SeenNodes | str:
+    def pattern(self, data, source: NodeLight) -> NodeEmission | str:
         """The last result for a light, or a note that there is none yet. Requests a new look if the light changed."""
         key, state = source.key, self._state(data, source)
         known, result = self._known.get(key, ((), NOT_YET))
@@ -60,7 +60,7 @@ class LiveNodeLights:
             self._wanted[key], self._sources[key], self._changed = state, source, time.monotonic()
         return result
 
-    def _state(self, data, source: UnseenLight) -> tuple:
+    def _state(self, data, source: NodeLight) -> tuple:
         text = nodes_as_text(data)
         names = {"AREA": ("shape", "size", "size_y"), "SUN": ("angle",)}.get(data.type, ("use_soft_falloff",))
         if data.type in ("POINT", "SPOT") and (source.is_mixed or not source.by_ray):
@@ -120,16 +120,16 @@ class LiveNodeLights:
         lights = [present[key[0]] for key in keys]
 
         def take(number: int, factor: np.ndarray, lost: float) -> bool:
-            job.results.append((keys[number], SeenNodes(factor, lost)))
+            job.results.append((keys[number], NodeEmission(factor, lost)))
             return not job.is_stopped
 
         def work(folder: Path, paths: list[Path]) -> None:
-            lamps = [
-                client.UnseenLamp(str(path), name, source.matrix.tolist(), source.flags, vars(source.facts))
+            files = [
+                NodeLightFile(str(path), name, source.matrix.tolist(), source.flags, vars(source.facts))
                 for path, name, source in zip(paths, names, sources, strict=True)
             ]
             try:
-                client.look_at_lamps(lamps, frame, folder, take)
+                view.render_node_lights(files, frame, folder, take)
             except Cancelled:
                 pass
             except Exception as error:
@@ -222,7 +222,7 @@ class LiveWorld:
 
         def work(folder: Path, paths: list[Path]) -> None:
             try:
-                result = client.look_at_world(paths[0], name, frame, folder, lambda *_: not stopped.is_set())
+                result = view.render_world(WorldJob(paths[0], name, frame), folder, lambda *_: not stopped.is_set())
                 light = [SkyPicture(*axes, one) for axes, one in zip(CUBE, result.light, strict=False)]
                 self._outcome = varied_sky(like, light, result.lights, result.background), result.warnings
             except Exception as error:
@@ -231,7 +231,7 @@ class LiveWorld:
         self._thread = _start("world", [world], work)
 
 
-def look_at_world(scene, world, warn: Callable) -> tuple[list[SkyPicture], list[AreaLight], np.ndarray]:
+def rendered_world(scene, world, warn: Callable) -> tuple[list[SkyPicture], list[AreaLight], np.ndarray]:
     """The `world` as Cycles renders it: pictures of its light ([] where it is dark), the small bright lights in it, and
     its background (N, N, 3). `scene` is left as it was."""
     like, light, lights = light_of_world(world), [], []
@@ -240,36 +240,36 @@ def look_at_world(scene, world, warn: Callable) -> tuple[list[SkyPicture], list[
     return [coarse(picture) for picture in light], lights, background_of(background_pictures(scene, world, warn))
 
 
-def show_world(job: dict, folder: Path) -> dict:
-    """Do the `job` (see `client.look_at_world`): writes pictures into `folder`, returns lights and warnings."""
+def render_world(job: WorldJob, folder: Path, progress) -> dict:
+    """Do the `job`: writes pictures into `folder`, returns lights and warnings."""
     warnings: list[str] = []
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
-    with bpy.data.libraries.load(job["path"]) as (_, wanted):
-        wanted.worlds = [job["world"]]
+    with bpy.data.libraries.load(job.path) as (_, wanted):
+        wanted.worlds = [job.world]
     (scene.world,) = wanted.worlds
-    scene.frame_set(job["frame"])
-    light, lights, background = look_at_world(scene, scene.world, warnings.append)
+    scene.frame_set(job.frame)
+    light, lights, background = rendered_world(scene, scene.world, warnings.append)
     save_array(folder / "light.npy", np.array([picture.radiance for picture in light], np.float32))
     save_array(folder / "background.npy", background.astype(np.float32))
     return {"lights": [one.record() for one in lights], "warnings": warnings}
 
 
-def show_lamps(job: dict, folder: Path, progress: Callable) -> dict:
-    """Do the `job` (see `client.look_at_lamps`): writes the factors of each light's nodes into `folder`."""
+def render_node_lights(job: NodeLightJob, folder: Path, progress: Callable) -> dict:
+    """Do the `job`: writes the factors of each light's nodes into `folder`."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    scene, count = bpy.context.scene, len(job["lamps"])
-    scene.frame_set(job["frame"])
-    for number, lamp in enumerate(job["lamps"]):
-        with bpy.data.libraries.load(lamp["path"]) as (there, wanted):
-            if lamp["name"] not in there.lights:
-                raise SceneError(f"{lamp['path']}: has no light {lamp['name']!r}")
-            wanted.lights = [lamp["name"]]
-        facts = ObjectFacts(**lamp["facts"])
-        source = UnseenLight(wanted.lights[0], np.array(lamp["matrix"]), facts=facts, **lamp["flags"])
+    scene, files = bpy.context.scene, [NodeLightFile(**fields) for fields in job.lights]
+    scene.frame_set(job.frame)
+    for number, file in enumerate(files):
+        with bpy.data.libraries.load(file.path) as (there, wanted):
+            if file.name not in there.lights:
+                raise SceneError(f"{file.path}: has no light {file.name!r}")
+            wanted.lights = [file.name]
+        facts = ObjectFacts(**file.facts)
+        source = NodeLight(wanted.lights[0], np.array(file.matrix), facts=facts, **file.flags)
         with open_studio(scene) as studio:
-            pattern = seen_factor(source, studio)
+            pattern = node_emission(source, studio)
         save_array(folder / f"{number}.npy", pattern.factor.astype(np.float32))
         save_array(folder / f"{number}_lost.npy", np.array(pattern.lost))
-        progress(LAMPS, (number + 1) / count)
+        progress(NODE_LIGHTS, (number + 1) / len(files))
     return {}

@@ -19,7 +19,7 @@ from ltsh_addon.blender.engine import final_picture, redraws, view
 from ltsh_addon.blender.engine import render as render_module
 from ltsh_addon.blender.lights.textures import ShownTextures
 from ltsh_addon.blender.materials import looks
-from ltsh_addon.blender.process import client
+from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels
 from ltsh_addon.blender.render_settings import pass_names
 from ltsh_addon.blender.ui import results
 from ltsh_addon.blender.ui.job import STARTING, Plan
@@ -85,13 +85,13 @@ def extracted(tmp_path, **options):
     """Samples and lights of a copy of the open file."""
     path = tmp_path / "scene.blend"
     bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
-    return client.extract(client.ExtractOptions(scene=path, **options))
+    return extract_pixels(PixelJob(scene=path, **options))
 
 
 def shaded(extraction, technique="ltsh2", passes=shading.PASSES):
     """What shading the samples gives, (H, W, 3)."""
     result = shading.shade(extraction.samples, extraction.lights, technique, passes=passes)
-    return extraction.exposure * extraction.film.image(result.combined)
+    return extraction.picture.exposure * extraction.film.image(result.combined)
 
 
 def test_settings_of_cycles_own_renders_stay_hidden(addon):

@@ -8,7 +8,7 @@ import pytest
 import quadrature
 import scene_parts
 
-from ltsh_addon.blender.process import client
+from ltsh_addon.blender.process.pixels import faceted
 from ltsh_addon.pipeline import PictureOptions, compare_scene
 from ltsh_addon.scene import PASSES
 from ltsh_addon.shading import shade
@@ -179,11 +179,11 @@ def test_reflections_that_show_the_patches_of_a_world_are_named(tmp_path):
     picture("EQUIRECTANGULAR")
     prepared = scene_parts.prepare()
     ((surface, _, _),) = scene_parts.sample(tmp_path, prepared)[0]
-    assert client.faceted(surface, prepared[2].lights) == []
+    assert faceted(surface, prepared[2].lights) == []
     sharp = replace(surface, roughness=np.where(np.arange(len(surface)) % 4 == 0, 0.1, surface.roughness))
-    (line,) = client.faceted(sharp, prepared[2].lights)
+    (line,) = faceted(sharp, prepared[2].lights)
     assert "'World'" in line and "25 % of the samples" in line
-    assert client.faceted(sharp, [light for light in prepared[2].lights if not light.detail]) == []
+    assert faceted(sharp, [light for light in prepared[2].lights if not light.detail]) == []
 
 
 @pytest.mark.parametrize("kind", ["constant", "sky with a sun"])

@@ -14,7 +14,7 @@ from random_surfaces import EYE
 from uploaded_samples import upload_samples
 
 from ltsh_addon import shading
-from ltsh_addon.blender.process import client
+from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels
 from ltsh_addon.blender.viewport.camera import ViewCamera
 from ltsh_addon.blender.viewport.light_texels import upload_lights
 from ltsh_addon.blender.viewport.lighting import HorizonPass
@@ -172,7 +172,7 @@ def test_lobes_of_a_coarse_smooth_mesh_end_where_those_of_numpy_do(tmp_path):
     # The samples of the viewport are those that Cycles takes of the saved file, but for edges of faces.
     path = tmp_path / "sphere.blend"
     bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
-    found = client.extract(client.ExtractOptions(scene=path))
+    found = extract_pixels(PixelJob(scene=path))
     row, column = np.divmod(found.film.pixel, SIZE[0])
     place = np.full(SIZE[0] * SIZE[1], -1)
     place[pixel] = np.arange(len(pixel))

@@ -13,7 +13,7 @@ from view_pictures import SIZE, viewport_picture
 from ltsh_addon import shading
 from ltsh_addon.blender.lights.emission import nodes_as_text
 from ltsh_addon.blender.lights.textures import ShownTextures
-from ltsh_addon.blender.process import client
+from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels
 from ltsh_addon.blender.viewport.lights import NOT_YET, no_patterns, strongest, view_lights
 from ltsh_addon.blender.viewport.live_cycles import LiveNodeLights
 
@@ -373,7 +373,7 @@ def test_lights_of_every_kind_light_the_view_as_numpy_does(tmp_path):
     pictures = with_graphics(lambda: [viewport_picture(camera, name, False) for name in shading.PASSES])
     path = tmp_path / "lights.blend"
     bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
-    found = client.extract(client.ExtractOptions(scene=path))
+    found = extract_pixels(PixelJob(scene=path))
     distance = np.linalg.norm(found.samples.position - np.array(ball.location), axis=1)
     # Away from the edge of the ball and what is hidden behind it, where positions differ by more than a pixel.
     on_ball = np.abs(distance - 0.7) < 0.01

@@ -480,7 +480,7 @@ def test_an_image_that_shines_is_seen_and_lights_nothing():
         try:
             mirror.sync(depsgraph)
             projection = camera.calc_matrix_camera(depsgraph, x=SIZE[0], y=SIZE[1])
-            shown = ShownPicture("ltsh4", "combined", "single", "ltc", 0.5, 1.0, 1.0, False)
+            shown = ShownPicture("ltsh4", "combined")
             view = ViewCamera.of(camera.matrix_world.inverted(), projection, True)
             for _ in range(2):
                 renderer.draw(mirror, view, SIZE, shown, canvas.buffer, np.zeros((2, 2)))
@@ -545,7 +545,7 @@ def test_glass_shows_what_is_behind_tinted_and_the_reflection_before_it(kind):
             )
             pictures = []
             for passes in ("combined", "specular"):
-                shown = ShownPicture("ltsh4", passes, "single", "ltc", 0.5, 1.0, 1.0, False)
+                shown = ShownPicture("ltsh4", passes)
                 for _ in range(2):
                     renderer.draw(mirror, view, SIZE, shown, canvas.buffer, np.zeros((2, 2)))
                 pictures.append(canvas.read()[..., :3])

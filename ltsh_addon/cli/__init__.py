@@ -29,7 +29,6 @@ from .commands import (
     add_render,
     add_run,
     add_shade,
-    add_tables,
     add_view,
 )
 from .job_file import Mistakes
@@ -176,7 +175,6 @@ def _parser(program: str) -> tuple[argparse.ArgumentParser, dict[str, argparse.A
         ("relight", add_relight, "other powers and colors of lights in pictures that are there"),
         ("run", add_run, "do the jobs of a file"),
         ("merge", add_merge, "assemble the report of what shards have done"),
-        ("tables", add_tables, "fit, validate or export the lookup tables"),
     ):
         add(commands.add_parser(name, help=meaning))
     return parser, commands.choices

@@ -12,7 +12,7 @@ from functools import lru_cache, reduce
 import numpy as np
 
 from ..emitters.facing import cone_angle
-from ..scene import AreaLight
+from ..scene import Light
 
 # LIGHTS_OF_LEAF: most lights of a leaf in Cycles. BUCKETS: along each axis Cycles tries to cut a cluster between these.
 LIGHTS_OF_LEAF = 8
@@ -102,7 +102,7 @@ def _cosine_of_sum(first, second, sign):
 
 
 def light_chances(
-    position: np.ndarray, normal: np.ndarray, lights: tuple[AreaLight, ...], rows: np.ndarray | None = None
+    position: np.ndarray, normal: np.ndarray, lights: tuple[Light, ...], rows: np.ndarray | None = None
 ) -> np.ndarray:
     """Probability (L, P) with which each light is chosen for points (P, 3) with smooth normals. Down to the leaves, the
     halves of a cluster are chosen by their upper bounds half of the time, and by their lower bounds the other half.
@@ -146,7 +146,7 @@ def chances_of(bounds: np.ndarray) -> np.ndarray:
     return sum(0.5 * part / np.maximum(part.sum(axis=0), 1e-30) for part in (most, least))
 
 
-def own_bounds(position: np.ndarray, normal: np.ndarray, lights: tuple[AreaLight, ...], rows: np.ndarray) -> np.ndarray:
+def own_bounds(position: np.ndarray, normal: np.ndarray, lights: tuple[Light, ...], rows: np.ndarray) -> np.ndarray:
     """Upper and lower bound (L, 2, P) on what points (P, 3) with normals get from each light. A flat light counts as
     its rectangle. In single precision if there are more than MOST_LIGHTS."""
     kind = np.float32 if len(lights) > MOST_LIGHTS else np.float64
@@ -202,7 +202,7 @@ def _facing_bounds(light, position, normal):
     offset = light.center - position
     distance = np.linalg.norm(offset, axis=1)
     axis = offset / np.maximum(distance, 1e-30)[:, None]
-    if light.shape == "BALL":
+    if light.is_sphere:
         ratio = np.minimum(light.radius / np.maximum(distance, 1e-30), 1.0)
         width = np.where(ratio < 1.0, np.sqrt(1.0 - ratio**2), -1.0)
     else:
@@ -221,7 +221,7 @@ def _facing_bounds(light, position, normal):
     return _bounds(cluster, axis, normal, width, near, far) * (share * share * (3.0 - 2.0 * share))
 
 
-def light_rows(lights: tuple[AreaLight, ...]) -> np.ndarray:
+def light_rows(lights: tuple[Light, ...]) -> np.ndarray:
     """What the tree needs to know of each light, (L, 16)."""
     return np.array([_row(light) for light in lights])
 

@@ -25,10 +25,10 @@ from ..emitters.light_tree import FEWEST
 from ..files import replacing, temporary_folder
 from ..scene import (
     REFERENCE,
-    AreaLight,
     Border,
     ColorSpace,
     Film,
+    Light,
     Progress,
     SurfaceSamples,
     error_line,
@@ -104,7 +104,7 @@ class ShadowTracer:
     Positions of the occluders are relative to `origin` (3,) in m; lights and samples are in world space.
     """
 
-    def __init__(self, occluders: visibility.Occluders, lights: Sequence[AreaLight], origin: np.ndarray):
+    def __init__(self, occluders: visibility.Occluders, lights: Sequence[Light], origin: np.ndarray):
         self.warnings: list[str] = []
         self._occluders, self._origin = occluders, origin
         self._lights, self._ending = [light.moved(-origin) for light in lights], ExitStack()
@@ -163,7 +163,7 @@ def trace_shadows(extraction, passes: Sequence[str], rays: int, progress: Progre
 
 def shade_lights(
     samples: SurfaceSamples,
-    lights: Sequence[AreaLight],
+    lights: Sequence[Light],
     table: str | shading.LookupTable | shading.OwnTechnique,
     passes: Sequence[str],
     seen: Sequence[Shadows | None] = (None,),

@@ -20,7 +20,7 @@ import numpy as np
 from ..cycles.gbuffer import SHADOW_LOOSENESS, one_shading, with_one_shadow
 from ..emitters.light_polygons import has_lobe
 from ..files import temporary_folder
-from ..scene import AreaLight, Cancelled, Film, SurfaceSamples
+from ..scene import Cancelled, Film, Light, SurfaceSamples
 from ..visibility import BLOCK_SAMPLES, Company, Occluders, Setting, task_of_lights
 from . import picture
 from .lighting import KEPT_SUFFIX, OCCLUDERS_SUFFIX, KeptPicture, rays_of_samples
@@ -142,7 +142,7 @@ class MovedLights:
 
         return cls(read)
 
-    def get_ready(self, light: AreaLight) -> None:
+    def get_ready(self, light: Light) -> None:
         """Start, once and in a thread, what the first picture needs; `light` is any light of the picture."""
         if not self._is_ready:
             pictures = self.pictures(light)
@@ -153,7 +153,7 @@ class MovedLights:
         with suppress(Exception), closing(pictures):
             next(pictures)
 
-    def picture(self, light: AreaLight, row: Row | None = None) -> np.ndarray:
+    def picture(self, light: Light, row: Row | None = None) -> np.ndarray:
         """The picture (H, W, 3) of one light, plus the unchanged bounced light of its `row`. Raises SceneError."""
         turn = self._next_turn()
         with self._lock:
@@ -163,7 +163,7 @@ class MovedLights:
                 pass
             return self._image(values, row)
 
-    def pictures(self, light: AreaLight, row: Row | None = None) -> Iterator[tuple[np.ndarray, float]]:
+    def pictures(self, light: Light, row: Row | None = None) -> Iterator[tuple[np.ndarray, float]]:
         """Yield the result of `picture`, first as a draft and at last complete, and the fraction that is done."""
         self._is_ready = True
         return self._pictures(light, row, self._next_turn())
@@ -196,7 +196,7 @@ class MovedLights:
         if turn != self._turn:
             raise Cancelled("the light has moved again, or the picture was stopped")
 
-    def _prepared(self, light: AreaLight, turn: int):
+    def _prepared(self, light: Light, turn: int):
         """The light relative to the origin of the samples, and its shadow task; None without occluders."""
         self._check(turn)
         if self._company is None:

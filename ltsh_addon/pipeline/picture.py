@@ -630,7 +630,7 @@ def _light_reports(lights) -> list[dict]:
             if len(part) > 1:
                 areas = np.array([np.linalg.norm(light.area_vector) for light in part])
                 radiance = areas @ np.array([light.radiance for light in part]) / areas.sum()
-            patches = sum(len(light.patches) for light in part)
+            patches = sum(len(light.leaves) for light in part)
             found.append(dict(zip(("name", "shape", "group"), kind, strict=True)))
             found[-1] |= {"radiance": radiance.tolist(), "patches": patches}
     return found

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from .. import imaging
-from ..scene import AreaLight, Progress, SurfaceSamples, listed
+from ..scene import Light, Progress, SurfaceSamples, listed
 from . import picture
 from .lighting import KEPT_SUFFIX, KeptPicture, shade_lights
 from .options import PictureOptions
@@ -120,7 +120,7 @@ class _Finished(picture.Comparison):
         return {"combined": combined, **found, "rest": self.rest}
 
 
-def _changed_rest(kept: KeptPicture, lights: Sequence[AreaLight], table, shaded, progress) -> np.ndarray:
+def _changed_rest(kept: KeptPicture, lights: Sequence[Light], table, shaded, progress) -> np.ndarray:
     """Cycles' rest (H, W, 4) under the changed `lights`: the bounced light of a group scales with its direct light.
 
     `shaded` is the direct light of the changed lights by `table`.
@@ -151,7 +151,7 @@ def _light_of_group(kept: KeptPicture, shaded, group: str) -> np.ndarray:
     return sum((kept.shown(name) * image).sum(axis=(0, 1)) for name, image in images.items())
 
 
-def others_muted(lights: Sequence[AreaLight], solo: Sequence[str]) -> list[LightChange]:
+def others_muted(lights: Sequence[Light], solo: Sequence[str]) -> list[LightChange]:
     """Changes that mute all lights except those called `solo`; none where `solo` is empty.
 
     Raises ValueError for an unknown light.
@@ -176,7 +176,7 @@ def _split_at_horizons(samples: SurfaceSamples) -> int:
     return int((same[0] & same[1] & same[2] & ~same[3]).sum())
 
 
-def _check_shared(kept: KeptPicture, lights: Sequence[AreaLight]) -> None:
+def _check_shared(kept: KeptPicture, lights: Sequence[Light]) -> None:
     """Raise ValueError where lights that share their shadow rays are changed differently."""
     before = kept.extraction.lights
     for own in kept.shadows.numbers:
@@ -191,7 +191,7 @@ def _check_shared(kept: KeptPicture, lights: Sequence[AreaLight]) -> None:
                 )
 
 
-def changed_lights(lights: Sequence[AreaLight], changes: Sequence[LightChange]) -> tuple[AreaLight, ...]:
+def changed_lights(lights: Sequence[Light], changes: Sequence[LightChange]) -> tuple[Light, ...]:
     """`lights` with all `changes`. Raises ValueError for an unknown light."""
     names = list(dict.fromkeys(light.name for light in lights))
     found = list(lights)
@@ -203,7 +203,7 @@ def changed_lights(lights: Sequence[AreaLight], changes: Sequence[LightChange]) 
     return tuple(found)
 
 
-def _tint(own: list[AreaLight], change: LightChange) -> np.ndarray:
+def _tint(own: list[Light], change: LightChange) -> np.ndarray:
     """Factor (3,) of the radiance that gives the lights `own` the color of `change`. Raises ValueError."""
     if change.color is None:
         return np.ones(3)
@@ -214,7 +214,7 @@ def _tint(own: list[AreaLight], change: LightChange) -> np.ndarray:
     return tint(color, change.color)
 
 
-def own_color(lights: Sequence[AreaLight]) -> np.ndarray:
+def own_color(lights: Sequence[Light]) -> np.ndarray:
     """The color (3,) of the mean radiance of `lights`, its brightest channel 1; white where they are dark."""
     weights = [np.linalg.norm(light.area_vector) for light in lights]
     mean = np.average([light.radiance for light in lights], axis=0, weights=weights)
@@ -226,6 +226,6 @@ def tint(own: np.ndarray, color: Sequence[float]) -> np.ndarray:
     return np.divide(color, own, out=np.zeros(3), where=np.asarray(own) != 0.0)
 
 
-def _scaled(light: AreaLight, factor: np.ndarray) -> AreaLight:
-    detail = tuple(_scaled(part, factor) for part in light.detail)
-    return replace(light, radiance=light.radiance * factor, detail=detail)
+def _scaled(light: Light, factor: np.ndarray) -> Light:
+    children = tuple(_scaled(child, factor) for child in light.children)
+    return replace(light, radiance=light.radiance * factor, children=children)

@@ -18,7 +18,7 @@ from ..emitters.light_polygons import fitting_patches
 from ..lobes import moments32
 from ..lobes.lobe_integrals import FLOAT64_CHUNK
 from ..lobes.lookup_table import LookupTable, load_table
-from ..scene import PASSES, REFERENCE, AreaLight, Cancelled, SurfaceSamples
+from ..scene import PASSES, REFERENCE, Cancelled, Light, SurfaceSamples
 from ..workers import pool
 from . import float32, float64
 
@@ -40,7 +40,7 @@ SPOT = 0.3
 class Task:
     """The lights, table and passes with which to shade every block of samples."""
 
-    lights: tuple[AreaLight, ...]
+    lights: tuple[Light, ...]
     groups: tuple[str, ...]
     table: LookupTable | str  # or REFERENCE
     passes: tuple[str, ...]
@@ -81,14 +81,14 @@ class Task:
         if self._with_patches is not None:
             self._add(samples, self._with_patches, radiance, error, scratch, {})
         for light in self.lights:
-            if light.detail and not float64.has_patches(light):
+            if light.children and not float64.has_patches(light):
                 for name in self.passes:
                     self._add_detailed(samples, light, name, radiance[name], error, scratch)
         return radiance, error, leftovers
 
-    def lights_of_pairs(self, name: str) -> list[AreaLight]:
+    def lights_of_pairs(self, name: str) -> list[Light]:
         """The lights to which the numbers in `shade_pairs` refer."""
-        return [light for light in self.lights if getattr(light, f"affects_{name}") and not light.detail]
+        return [light for light in self.lights if getattr(light, f"affects_{name}") and not light.children]
 
     def shade_pairs(self, samples: SurfaceSamples, name: str, number: np.ndarray) -> np.ndarray:
         """Radiance (N, 3) of one pass of N samples under one light each."""
@@ -102,8 +102,8 @@ class Task:
 
     @cached_property
     def _plain(self) -> dict[str, float32.Lights]:
-        """The lights without a detail, by pass."""
-        return self._by_pass(light for light in self.lights if not light.detail)
+        """The lights without children, by pass."""
+        return self._by_pass(light for light in self.lights if not light.children)
 
     @cached_property
     def _with_patches(self) -> dict[str, float32.Lights] | None:
@@ -126,7 +126,7 @@ class Task:
         return [(light, self.groups.index(light.group), light.polygon()) for light in lights]
 
     def _add_detailed(self, samples, light, name, radiance, error, scratch) -> None:
-        """Add the light of a light with a `detail` to one pass."""
+        """Add the light of a light with children to one pass."""
         for index, patches in fitting_patches(light, samples, name == "specular"):
             own = {name: np.zeros((len(self.groups), len(index), 3), self.dtype)}
             own_error = None if error is None else np.zeros(len(index))
@@ -161,8 +161,8 @@ class Task:
 
 def _corners_integrated(light, is_reference):
     """Estimated number of corners in the integrals over a light."""
-    count = len(light.polygon()) * min(len(light.patches), PATCHES)
-    if light.is_profiled:
+    count = len(light.polygon()) * min(len(light.leaves), PATCHES)
+    if light.has_profile:
         effort = light_profile.EFFORTS[1]
         count *= (2 * effort.chords + 1) * (1 if is_reference else effort.layers)
     return count
@@ -196,10 +196,10 @@ class Shading:
 class OwnTechnique(Protocol):
     """A technique of the user: anything with this method. An attribute `name` replaces the name of its class."""
 
-    def evaluate(self, samples: SurfaceSamples, lights: tuple[AreaLight, ...]) -> Shading:
+    def evaluate(self, samples: SurfaceSamples, lights: tuple[Light, ...]) -> Shading:
         """Radiance of `samples` (P) under all `lights` together; its light groups are added up.
 
-        The lights have no `detail`. The caller takes care of samples that a light's passes or receivers leave out. If
+        The lights have no children. The caller takes care of samples that a light's passes or receivers leave out. If
         the diffuse pass is None, the caller uses the exact one.
         """
         ...
@@ -212,7 +212,7 @@ def is_own(technique: Any) -> bool:
 
 def shade(
     samples: SurfaceSamples,
-    lights: Iterable[AreaLight],
+    lights: Iterable[Light],
     technique: str | Path | LookupTable | OwnTechnique = "ltsh4",
     *,
     passes: Sequence[str] = PASSES,
@@ -250,7 +250,7 @@ def _shade_with(technique, samples, lights, passes, how) -> Shading:
     groups = tuple(dict.fromkeys(light.group for light in lights)) or ("",)
     radiance = {name: np.zeros((len(groups), len(samples), 3), dtype) for name in passes}
     for number, light in enumerate(lights):
-        found = technique.evaluate(samples, light.patches) if light.area_vector.any() else None
+        found = technique.evaluate(samples, light.leaves) if light.area_vector.any() else None
         for name in passes if found is not None else ():
             if not getattr(light, f"affects_{name}"):
                 continue
@@ -335,13 +335,13 @@ def _check_passes(passes) -> None:
         raise ValueError(f"passes are {list(passes)}, expected some of {', '.join(PASSES)}")
 
 
-def _parts(light) -> tuple[AreaLight, ...]:
+def _parts(light) -> tuple[Light, ...]:
     """The parts of a light that get an integral each: the patches of a small distant light; otherwise the light itself.
     Sheared lights with a profile are returned `upright`."""
-    if light.is_profiled and not light.detail and light_profile.has_shear(light):
+    if light.has_profile and not light.children and light_profile.has_shear(light):
         return (light_profile.upright(light),)
     is_spot = float64.has_patches(light) and np.linalg.norm(light.half_u) < SPOT * np.linalg.norm(light.center)
-    return tuple(replace(patch, group=light.group) for patch in light.patches) if is_spot else (light,)
+    return tuple(replace(patch, group=light.group) for patch in light.leaves) if is_spot else (light,)
 
 
 def _task(lights, technique, passes, dtype) -> Task:

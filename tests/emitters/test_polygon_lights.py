@@ -1,7 +1,5 @@
 """Lights of shape POLYGON, convex or not, and their convex pieces."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import quadrature
@@ -11,6 +9,7 @@ from test_single_precision import assert_close as assert_promise
 
 from ltsh_addon import shading
 from ltsh_addon.lobes.polygon import convex_pieces
+from ltsh_addon.scene import PolygonLight
 
 TECHNIQUES = (*shading.SHIPPED_TABLES, shading.REFERENCE)
 techniques = pytest.mark.parametrize("technique", TECHNIQUES)
@@ -63,7 +62,7 @@ def test_a_polygon_of_four_corners_is_the_rectangle(technique):
     samples, box = random_samples(80, seed=1), area_light(radiance=(1, 1, 1))
     corners = box.polygon()
     for order in (corners, corners[::-1], np.roll(corners, 1, axis=0)):
-        polygon = replace(box, shape="POLYGON", corners=order)
+        polygon = PolygonLight.like(box, corners=order)
         assert_same(shaded(samples, [polygon], technique), [shaded(samples, [box], technique)], technique)
 
 

@@ -21,13 +21,14 @@ from ...imaging.exr import read_channels
 from ...reading import check_name
 from ...scene import (
     REC709,
-    AreaLight,
     Border,
     ColorSpace,
     Film,
+    Light,
     Progress,
     SceneError,
     SurfaceSamples,
+    light_of,
     lights_of,
     listed,
 )
@@ -105,7 +106,7 @@ class Extraction:
     - `light_settings` are power, exposure, red, green and blue of light objects in Blender.
     """
 
-    lights: tuple[AreaLight, ...]
+    lights: tuple[Light, ...]
     samples: SurfaceSamples
     film: Film
     warnings: tuple[str, ...]
@@ -299,7 +300,7 @@ def _rendered_pixels(manifest: dict) -> np.ndarray:
     return seen
 
 
-def unlit(samples: SurfaceSamples, lights: tuple[AreaLight, ...], camera: str) -> list[str]:
+def unlit(samples: SurfaceSamples, lights: tuple[Light, ...], camera: str) -> list[str]:
     """The warning about lights that reach nothing that the camera sees; [] if there are none."""
     if not has_lobe(samples).any():
         return [f"nothing that camera {camera!r} sees reflects light: the picture is black"] if len(samples) else []
@@ -309,21 +310,21 @@ def unlit(samples: SurfaceSamples, lights: tuple[AreaLight, ...], camera: str) -
     return [f"nothing that camera {camera!r} sees is lit by {listed(map(repr, unseen))}"] if unseen else []
 
 
-def faceted(samples: SurfaceSamples, lights: tuple[AreaLight, ...]) -> list[str]:
+def faceted(samples: SurfaceSamples, lights: tuple[Light, ...]) -> list[str]:
     """The warning about reflections so sharp that they show the patches of a world; [] if there are none."""
     sharp = shows_patches(samples, lights)
     if not sharp.any():
         return []
-    sky = next(light for light in lights if light.is_distant and light.detail and light.affects_specular)
+    sky = next(light for light in lights if light.is_distant and light.children and light.affects_specular)
     return [
         f"world {sky.name!r}: it is blurred by a degree or more in reflections sharper than roughness "
         f"{SHARP_REFLECTION:g}, which {100.0 * sharp.mean():.2g} % of the samples have, and in facets in reference"
     ]
 
 
-def shows_patches(samples: SurfaceSamples, lights: tuple[AreaLight, ...]) -> np.ndarray:
+def shows_patches(samples: SurfaceSamples, lights: tuple[Light, ...]) -> np.ndarray:
     """Mask (P,) of the samples whose reflections are so sharp that they show the patches of a world."""
-    if not any(light.is_distant and light.detail and light.affects_specular for light in lights):
+    if not any(light.is_distant and light.children and light.affects_specular for light in lights):
         return np.zeros(len(samples), bool)
     return has_lobe(samples)[1] & (samples.roughness < SHARP_REFLECTION)
 
@@ -580,7 +581,7 @@ class SeenWorld:
     """A world as Cycles renders it."""
 
     light: np.ndarray  # (6, N, N, 3), see `cycles.environment.CUBE`; empty if it gives no light
-    lights: tuple[AreaLight, ...]  # its small, bright spots
+    lights: tuple[Light, ...]  # its small, bright spots
     background: np.ndarray  # (M, M, 3), see `viewport.sky`
     warnings: list[str]
 
@@ -589,7 +590,7 @@ def look_at_world(path: Path, world: str, frame: int, folder: Path, progress: Pr
     """The world named `world` in the .blend `path` at a frame; files go to `folder`. Raises as `extract` does."""
     found = run_child({"task": "world", "path": str(path), "world": world, "frame": frame}, folder, progress)
     light, background = (np.load(folder / f"{name}.npy") for name in ("light", "background"))
-    return SeenWorld(light, tuple(AreaLight(**one) for one in found["lights"]), background, found["warnings"])
+    return SeenWorld(light, tuple(light_of(one) for one in found["lights"]), background, found["warnings"])
 
 
 LAMPS = "look at lights"  # a stage; its fraction is the share of the lights that have files

@@ -19,7 +19,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ...files import temporary_folder
-from ...scene import AreaLight, Cancelled, error_line, listed
+from ...scene import Cancelled, Light, error_line, listed
 from ..evaluated import (
     SURFACE_TYPES,
     EmitterTraits,
@@ -62,7 +62,7 @@ def no_patterns(data, source: UnseenLight) -> str:
 
 def view_lights(
     depsgraph, in_view: Callable, textures: ShownTextures, patterns: Patterns = no_patterns
-) -> tuple[tuple[AreaLight, ...], tuple[str, ...]]:
+) -> tuple[tuple[Light, ...], tuple[str, ...]]:
     """The lights among the instances that `in_view` accepts, and notes about what differs from Cycles.
 
     `textures` are those of the last call, for reuse.
@@ -96,7 +96,7 @@ def view_lights(
     return tuple(strongest(lights, notes)), tuple(dict.fromkeys(notes))
 
 
-def strongest(lights: list[AreaLight], notes: list[str], most: int = MOST_LIGHTS) -> list[AreaLight]:
+def strongest(lights: list[Light], notes: list[str], most: int = MOST_LIGHTS) -> list[Light]:
     """The `most` lights with the largest power, in their order; what is missing is told in `notes`."""
     if len(lights) <= most:
         return lights
@@ -118,7 +118,7 @@ def _emission(material) -> np.ndarray:
     return np.zeros(3) if material is None else look_of(material.original).emission
 
 
-def _mesh_lights(depsgraph, receivers: Receivers, notes: list[str]) -> list[AreaLight]:
+def _mesh_lights(depsgraph, receivers: Receivers, notes: list[str]) -> list[Light]:
     override = depsgraph.view_layer_eval.material_override
     found = collect_mesh_lights(depsgraph, override, receivers, notes.append, copies=False)
     camera = depsgraph.scene.camera
@@ -278,7 +278,7 @@ class LiveLamps:
         return False
 
 
-def _with_nodes(light: AreaLight, instance, looked: tuple, notes: list[str]) -> list[AreaLight]:
+def _with_nodes(light: Light, instance, looked: tuple, notes: list[str]) -> list[Light]:
     """The lights that the node tree of a depsgraph `instance` makes of `light`; [] where it emits nothing.
 
     `looked` are the textures and patterns of `view_lights`.
@@ -452,9 +452,9 @@ class SceneMirror:
         """`look(world)` returns the `ShownSky` of a world that is not constant; None while it is not known."""
         self._patterns = patterns
         self.instances: list[ShownInstance] = []
-        self.lights: tuple[AreaLight, ...] = ()  # with the small bright lights of the world
+        self.lights: tuple[Light, ...] = ()  # with the small bright lights of the world
         self.sky = ShownSky()
-        self.own_lights: tuple[AreaLight, ...] = ()  # without those of the world
+        self.own_lights: tuple[Light, ...] = ()  # without those of the world
         self._look = look
         self.surfaces_version = 0
         self._meshes: dict[tuple, MeshBatches | None] = {}

@@ -11,13 +11,13 @@ from dataclasses import dataclass, replace
 import gpu
 import numpy as np
 
-from ...scene import PASSES, AreaLight, Cancelled, Film, SurfaceSamples, error_line
+from ...scene import PASSES, Cancelled, Film, Light, SurfaceSamples, error_line
 from ...visibility import Mate, Occluders, ShadowSampling, Tracer, open_tracer, shared_numbers, visible_shares
 from ..process.blender_process import embree_libraries
 from .surfaces import View
 from .textures import GBufferTextures, ShareGrid, float_texture, read_texture
 
-Lights = Sequence[AreaLight]
+Lights = Sequence[Light]
 # MOST_BYTES: graphics memory for the shares of all lights. _SHARE_BYTES: of a light and a pixel, two half floats.
 MOST_BYTES = 1 << 30
 _SHARE_BYTES = 4
@@ -550,14 +550,14 @@ def coarse_step(size: tuple[int, int]) -> int:
     return max(2, round((size[0] * size[1] / COARSE_POINTS) ** 0.5))
 
 
-def _shape_of(light: AreaLight) -> str:
+def _shape_of(light: Light) -> str:
     """A key of all that the shares of `light` depend on: everything but its brightness."""
     return repr({name: value for name, value in light.record().items() if name not in ("radiance", "detail")})
 
 
 def _shape_of_sky(sides: Lights) -> str:
     """A key of all that the share of a sky depends on: the relative, not the absolute brightness of its patches."""
-    values = np.array([patch.radiance.mean() for side in sides for patch in side.patches])
+    values = np.array([patch.radiance.mean() for side in sides for patch in side.leaves])
     seen = sides[0].affects_diffuse, sides[0].affects_specular, sides[0].name
     return repr((seen, np.round(values / max(np.abs(values).mean(), 1e-30), 4).tobytes()))
 

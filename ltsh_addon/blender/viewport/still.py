@@ -13,7 +13,7 @@ import numpy as np
 
 from ...cycles.environment import SkyPicture
 from ...files import save_array
-from ...scene import AreaLight, SceneError, error_line, listed
+from ...scene import Light, SceneError, error_line, listed
 from .. import render_settings
 from ..extract.occluders import collect_occluders
 from ..extract.pixels import no_light, open_scene
@@ -166,7 +166,7 @@ def _sky(scene, warnings: list[str]) -> ShownSky | None:
     return varied_sky(light_of_world(world), *look_at_world(scene, world, warnings.append))
 
 
-def look_at_world(scene, world, warn: Callable) -> tuple[list[SkyPicture], list[AreaLight], np.ndarray]:
+def look_at_world(scene, world, warn: Callable) -> tuple[list[SkyPicture], list[Light], np.ndarray]:
     """The `world` as Cycles renders it: pictures of its light ([] where it is dark), the small bright lights in it, and
     its background (N, N, 3). `scene` is left as it was."""
     like, light, lights = light_of_world(world), [], []

@@ -9,7 +9,7 @@ import quadrature
 import scene_parts
 
 from ltsh_addon.blender.lights.area import overlapping_pairs
-from ltsh_addon.scene import AreaLight
+from ltsh_addon.scene import QuadLight
 
 
 def two_lights(apart=0.0, **settings):
@@ -54,7 +54,7 @@ def test_lights_that_rays_do_not_hit_are_not_named():
 
 
 def light(name, x=0.0, **settings):
-    plain = AreaLight(name, "RECTANGLE", (x, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, -1.0), np.ones(3))
+    plain = QuadLight(name, (x, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, -1.0), np.ones(3))
     return replace(plain, **settings)
 
 

@@ -4,7 +4,9 @@ import atexit
 import os
 import platform
 import signal
+import subprocess
 import sys
+import threading
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -86,3 +88,44 @@ def room(tmp_path):
     path = tmp_path / "room.blend"
     path.write_bytes(b"BLENDER")
     return path
+
+
+@pytest.fixture
+def short_tasks_for_children(monkeypatch):
+    """Children start for any task; blocks are small."""
+    from ltsh_addon.shading import integrator
+    from ltsh_addon.workers import pool
+
+    monkeypatch.setattr(pool, "SECONDS_WORTH_A_CHILD", 0.0)
+    for name in ("BLOCK_LIMITS", "REFERENCE_BLOCK_LIMITS"):
+        monkeypatch.setattr(integrator, name, (17, 17))
+
+
+@pytest.fixture
+def started(monkeypatch):
+    """The child processes that were started."""
+    from ltsh_addon.workers import pool
+
+    found = []
+    original = subprocess.Popen
+
+    def popen(*arguments, **options):
+        found.append(original(*arguments, **options))
+        return found[-1]
+
+    monkeypatch.setattr(pool.subprocess, "Popen", popen)
+    return found
+
+
+@pytest.fixture
+def children_only(monkeypatch, started):
+    """This process takes no block as long as a child that was started lives."""
+    from ltsh_addon.workers import pool
+
+    original = pool._Queue.next
+
+    def patient(self):
+        here = threading.current_thread() is threading.main_thread()
+        return None if here and any(process.poll() is None for process in started) else original(self)
+
+    monkeypatch.setattr(pool._Queue, "next", patient)

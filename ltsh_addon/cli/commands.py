@@ -18,7 +18,7 @@ from ..pipeline.baseline import Baseline
 from ..pipeline.batch import Merged, merge, run_tasks
 from ..pipeline.options import BakeOptions, PictureOptions, RenderOptions, ViewOptions, options_from, table
 from ..pipeline.picture import prepare
-from ..pipeline.tasks import Job
+from ..pipeline.tasks import BatchJob
 from ..scene import SHIPPED_TABLES, SceneError, error_line
 from ..shading import TableError
 from .arguments import (
@@ -165,7 +165,7 @@ def _demo(arguments, bar, open_file) -> int:
     return _printed(arguments, document, code)
 
 
-def job_of(arguments, scenes: tuple[Path, ...]) -> Job:
+def job_of(arguments, scenes: tuple[Path, ...]) -> BatchJob:
     """The job of the arguments of demo, compare, shade, bake, view or render. Raises Misuse."""
     kinds = {"bake": BakeOptions, "view": ViewOptions, "render": RenderOptions}
     kind = kinds.get(arguments.command, PictureOptions)
@@ -176,7 +176,7 @@ def job_of(arguments, scenes: tuple[Path, ...]) -> Job:
     if command == "render" and arguments.budget is not None and arguments.cycles_samples is not None:
         raise Misuse("--budget chooses the samples of Cycles: give it or --cycles-samples, not both")
     options = options_from(kind, vars(arguments), scene=scenes[0])
-    return Job(command, options, scenes, cameras, frames, arguments.pattern)
+    return BatchJob(command, options, scenes, cameras, frames, arguments.pattern)
 
 
 def _printed(arguments, document: dict, code: int) -> int:
@@ -460,7 +460,7 @@ def _export_tables(arguments, bar, open_file) -> int:
     return 0
 
 
-def do_job(job: Job, arguments, bar, baseline: Baseline | None = None) -> tuple[dict, int]:
+def do_job(job: BatchJob, arguments, bar, baseline: Baseline | None = None) -> tuple[dict, int]:
     """Do the job, or its shard. Returns the document for --json and the exit code, 1 if something is wrong."""
     shard = arguments.shard or (1, 1)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..pipeline import picture
-from ..pipeline.tasks import Job
+from ..pipeline.tasks import BatchJob
 from ..reading import Malformed, read_toml
 from ..scene import SceneError, shortened
 from ..shading import TableError
@@ -23,14 +23,14 @@ _OF_EVERY_JOB = ("command", "scene", "scenes", "output")
 
 MOST_LINES = 50  # of mistakes that are printed about one file
 
-JobOf = Callable[[argparse.Namespace, tuple[Path, ...]], Job]
+JobOf = Callable[[argparse.Namespace, tuple[Path, ...]], BatchJob]
 
 
 @dataclass(frozen=True)
 class FileJob:
     """One job of a file."""
 
-    job: Job
+    job: BatchJob
     arguments: argparse.Namespace  # as parsed from a command line
 
 
@@ -56,7 +56,7 @@ def read_jobs(path: Path, parsers: dict[str, argparse.ArgumentParser], job_of: J
         raise OSError(f"{path}: cannot be read ({error.strerror}), expected a job file (TOML)") from error
     except Malformed as error:
         raise Mistakes([f"{path}: {error}"]) from None
-    reader = _Reader(path, parsers, job_of)
+    reader = _JobFileReader(path, parsers, job_of)
     wanted = reader.read(document)
     if reader.mistakes:
         # Mistakes in the defaults are found again with every job.
@@ -66,7 +66,7 @@ def read_jobs(path: Path, parsers: dict[str, argparse.ArgumentParser], job_of: J
     return wanted
 
 
-class _Reader:
+class _JobFileReader:
     """Reads one file and collects all mistakes, each a line that names the job and the key."""
 
     def __init__(self, path, parsers, job_of):

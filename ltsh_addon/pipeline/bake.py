@@ -90,7 +90,6 @@ def bake_objects(
                     files += made.files
                     seconds |= made.seconds
                     shutil.rmtree(folder / record["folder"])
-            manifest["warnings"] += tracer.warnings if tracer else []
     document = _report(options, manifest, records)
     seconds["total"] = time.perf_counter() - start
     return TaskResult(document, seconds, tuple(files))

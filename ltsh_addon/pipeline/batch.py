@@ -14,7 +14,19 @@ from ..imaging import write_json, write_overview
 from ..reading import NUMBER, Malformed, read_json
 from ..scene import Progress, SceneError, error_line
 from . import bake, picture, render, view
-from .tasks import FOLDER, FORMAT, JOB, TASK_RECORD, Job, Records, Task, read_document, shard_of, tasks_of, write_record
+from .tasks import (
+    FOLDER,
+    FORMAT,
+    JOB,
+    TASK_RECORD,
+    BatchJob,
+    BatchTask,
+    Records,
+    read_document,
+    shard_of,
+    tasks_of,
+    write_record,
+)
 
 OVERWRITE, RESUME, SKIP = "overwrite", "resume", "skip"
 
@@ -41,7 +53,7 @@ class TaskState:
 
 
 def run_tasks(
-    job: Job,
+    job: BatchJob,
     *,
     shard: tuple[int, int] = (1, 1),
     existing: str = OVERWRITE,
@@ -108,7 +120,7 @@ def _is_done(records, task, existing) -> bool:
     return record is not None and "report" in record and not record["report"].get("problems")
 
 
-def _perform(job: Job, task: Task, following: tuple, existing: str, progress) -> picture.TaskResult:
+def _perform(job: BatchJob, task: BatchTask, following: tuple, existing: str, progress) -> picture.TaskResult:
     options = task.options(job)
     if job.command == "bake":
         options = replace(options, resume=existing == RESUME)
@@ -155,7 +167,7 @@ def merge(output: Path, progress=None) -> Merged:
     """
     output = Path(output)
     job = _read_job(output)
-    tasks = [Task(**{item.name: task[item.name] for item in fields(Task)}) for task in job["tasks"]]
+    tasks = [BatchTask(**{item.name: task[item.name] for item in fields(BatchTask)}) for task in job["tasks"]]
     records = _task_records(output, job["command"])
     found = {task.name: records.whole(task.name, None if job["any_key"] else task.key) for task in tasks}
     missing = tuple(task.name for task in tasks if found[task.name] is None)

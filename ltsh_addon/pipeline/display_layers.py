@@ -12,7 +12,7 @@ from ..imaging.exr import write_channels
 from ..imaging.report import FILE, write_index
 from ..imaging.sheet import common_error_scale
 from ..scene import BAKE_PASSES, CYCLES, REFERENCE, TECHNIQUES, Progress
-from .lighting import KEPT_SUFFIX, KeptPicture
+from .lighting import RELIGHT_SUFFIX, RelightData
 from .mixer import MIXER_FILE, light_pictures
 from .picture import UNSHADOWED, against_cycles
 
@@ -49,8 +49,8 @@ def write_lights(folder: Path, arguments: Sequence[str], progress: Progress | No
     samples; else remove an old one."""
     path = folder / MIXER_FILE
     if "--keep-visibility" in arguments:
-        kept = Path(FILES[arguments[0]]).with_suffix(KEPT_SUFFIX)
-        light_pictures(KeptPicture.load(folder.parent / kept), progress).save(path)
+        kept = Path(FILES[arguments[0]]).with_suffix(RELIGHT_SUFFIX)
+        light_pictures(RelightData.load(folder.parent / kept), progress).save(path)
     else:
         path.unlink(missing_ok=True)
 

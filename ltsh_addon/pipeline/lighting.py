@@ -12,7 +12,6 @@ import zipfile
 import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ import numpy as np
 from .. import shading, visibility
 from ..cycles.gbuffer import finer
 from ..emitters.light_tree import FEWEST
-from ..files import replacing, temporary_folder
+from ..files import replacing
 from ..scene import (
     REFERENCE,
     Border,
@@ -37,8 +36,8 @@ from ..scene import (
 )
 
 FILM_ARRAYS = ("first", "count", "spread", "whole")  # the optional arrays of a film
-# The two files of `keep_picture`: the samples with all that shading needs, and the occluders.
-KEPT_SUFFIX, OCCLUDERS_SUFFIX = ".samples.npz", ".occluders.npz"
+# The two files of `write_relight_data`: the samples with all that shading needs, and the occluders.
+RELIGHT_SUFFIX, OCCLUDERS_SUFFIX = ".samples.npz", ".occluders.npz"
 # MOST_PAIRS: how many pairs of a sample and a light have their radiance in memory at a time.
 MOST_PAIRS = 1 << 25
 # FEWEST_RAYS: a sample gets at least so many of the rays of its pixel, or all of them if they are fewer. The first
@@ -56,7 +55,6 @@ class Shadows:
     rays: int
     tracer: str  # name of the ray tracer
     seconds: float = 0.0
-    warnings: tuple[str, ...] = ()
     # By pass, estimates (H, W) of the radiance on the film and of its variance; empty without a film.
     light: dict[str, np.ndarray] = field(default_factory=dict)
     variance: dict[str, np.ndarray] = field(default_factory=dict)
@@ -104,22 +102,18 @@ class ShadowTracer:
     Positions of the occluders are relative to `origin` (3,) in m; lights and samples are in world space.
     """
 
-    def __init__(self, occluders: visibility.Occluders, lights: Sequence[Light], origin: np.ndarray):
-        self.warnings: list[str] = []
+    def __init__(self, occluders: visibility.Occluders, lights: Sequence[AreaLight], origin: np.ndarray):
         self._occluders, self._origin = occluders, origin
-        self._lights, self._ending = [light.moved(-origin) for light in lights], ExitStack()
+        self._lights = [light.moved(-origin) for light in lights]
 
     def __enter__(self):
-        from ..blender.process.blender_rays import open_rays
+        from ..blender.process.blender_process import embree_libraries
 
-        with ExitStack() as stack:
-            folder = stack.enter_context(temporary_folder())
-            self._tracer = stack.enter_context(open_rays(self._occluders, folder, self.warnings.append))
-            self._ending = stack.pop_all()
+        self._tracer = visibility.open_tracer(self._occluders, embree_libraries())
         return self
 
     def __exit__(self, *error):
-        return self._ending.__exit__(*error)
+        self._tracer.close()
 
     def finer(self, samples: SurfaceSamples, film: Film, points, pixels: np.ndarray):
         """`gbuffer.finer` with this tracer's rays, for samples in world space."""
@@ -145,7 +139,7 @@ class ShadowTracer:
         shares = {name: getattr(found, name) for name in passes}
         noise = {name: found.noise(name, film) for name in passes}
         seconds, tracer = time.perf_counter() - start, self._tracer.description
-        made = Shadows(shares, found.numbers, noise, found.rays, tracer, seconds, tuple(self.warnings))
+        made = Shadows(shares, found.numbers, noise, found.rays, tracer, seconds)
         if film is None:
             return made
         light = {name: film.image(found.radiance[name]) for name in passes}
@@ -230,8 +224,8 @@ def group_names(groups: Sequence[str]) -> list[str]:
 
 
 @dataclass(frozen=True)
-class KeptPicture:
-    """A picture kept by `keep_picture`: all that shading needs, without Blender and without rays.
+class RelightData:
+    """A picture kept by `write_relight_data`: all that shading needs, without Blender and without rays.
 
     whole picture = sum over passes of `shown` x image of the samples, + sum of `rest`; all include the exposure.
     """
@@ -259,8 +253,8 @@ class KeptPicture:
         return taken if moved or name not in self.edges else taken * self.edges[name][..., None]
 
     @classmethod
-    def load(cls, path: Path) -> KeptPicture:
-        """Raises OSError, and ValueError where the file is not what `keep_picture` writes."""
+    def load(cls, path: Path) -> RelightData:
+        """Raises OSError, and ValueError where the file is not what `write_relight_data` writes."""
         try:
             with Path(path).open("rb") as file, np.load(file) as data:
                 arrays = {name: data[name] for name in data.files}
@@ -271,7 +265,7 @@ class KeptPicture:
             raise ValueError(f"{path}: {problem}; run the picture again") from error
 
     @classmethod
-    def _of(cls, document, arrays) -> KeptPicture:
+    def _of(cls, document, arrays) -> RelightData:
         from ..blender.process.client import UNCHANGED, Extraction
 
         found = document["extraction"]
@@ -314,14 +308,14 @@ def _compact(values: np.ndarray) -> np.ndarray:
 
 
 NOT_REFLECTED = ("emission", "background")  # optional arrays of an Extraction
-FINISHED = ("rest", "taken", "edges")  # fields of a KeptPicture that only finished pictures have
-KEPT_OPTIONS = ("techniques", "passes", "sub_samples", "reference_samples", "shadows", "shadow_rays")
+FINISHED = ("rest", "taken", "edges")  # fields of a RelightData that only finished pictures have
+RELIGHT_OPTIONS = ("techniques", "passes", "sub_samples", "reference_samples", "shadows", "shadow_rays")
 
 
-def keep_picture(extraction, shadows: Shadows | None, options, path: Path, **finished) -> list[Path]:
-    """Write the .npz that `KeptPicture.load` reads, atomically, and the occluders beside it; returns the paths.
+def write_relight_data(extraction, shadows: Shadows | None, options, path: Path, **finished) -> list[Path]:
+    """Write the .npz that `RelightData.load` reads, atomically, and the occluders beside it; returns the paths.
 
-    `finished` are the fields `rest`, `taken` and `edges` of the KeptPicture of a finished picture. Raises OSError.
+    `finished` are the fields `rest`, `taken` and `edges` of the RelightData of a finished picture. Raises OSError.
     """
     from ..blender.process.client import UNCHANGED
 
@@ -338,7 +332,7 @@ def keep_picture(extraction, shadows: Shadows | None, options, path: Path, **fin
             "color_space": {"name": space.name, "to_rec709": space.to_rec709.tolist()},
         },
         "shadows": None if shadows is None else {**shadows.report(), "numbers": shadows.numbers},
-        "options": {"scene": str(options.scene), **{name: getattr(options, name) for name in KEPT_OPTIONS}},
+        "options": {"scene": str(options.scene), **{name: getattr(options, name) for name in RELIGHT_OPTIONS}},
         "had_cycles": extraction.reference is not None,
         **{kind: list(finished.get(kind, ())) for kind in FINISHED},
     }
@@ -362,6 +356,6 @@ def keep_picture(extraction, shadows: Shadows | None, options, path: Path, **fin
                 np.lib.format.write_array(file, np.asarray(values), allow_pickle=False)
     if extraction.occluders is None:
         return [path]
-    occluders = path.with_name(path.name.removesuffix(KEPT_SUFFIX) + OCCLUDERS_SUFFIX)
+    occluders = path.with_name(path.name.removesuffix(RELIGHT_SUFFIX) + OCCLUDERS_SUFFIX)
     extraction.occluders.save(occluders)
     return [path, occluders]

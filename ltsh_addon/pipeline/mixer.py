@@ -16,7 +16,7 @@ import numpy as np
 from ..files import replacing
 from ..scene import Light, Progress, error_line, listed
 from . import picture
-from .lighting import KeptPicture, Shadows, shade_lights
+from .lighting import RelightData, Shadows, shade_lights
 from .relight import GRAIN, own_color
 
 MIXER_FILE = "lights.npz"
@@ -39,7 +39,7 @@ NOT_SHADED = "Cycles' light of a light group none of whose lights is shaded here
 
 
 @dataclass(frozen=True)
-class Row:
+class MixerRow:
     """A row of the mixer: lights that change together, or the part of the picture that depends on no light."""
 
     name: str
@@ -56,7 +56,7 @@ class Row:
 class LightPictures:
     """A picture as the sum of one layer for each row."""
 
-    rows: tuple[Row, ...]
+    rows: tuple[MixerRow, ...]
     layers: np.ndarray  # (R, H, W, 3) float32, row 0 on top
     alpha: np.ndarray  # (H, W) float32
     facts: dict  # "camera", "frame", "technique", "notes"
@@ -74,7 +74,7 @@ class LightPictures:
             with Path(path).open("rb") as file, np.load(file) as data:
                 facts, layers, alpha = json.loads(str(data["document"])), data["layers"], data["alpha"]
             rows = tuple(
-                Row(**{**row, **{name: tuple(row[name]) for name in ("lights", "color", "share")}})
+                MixerRow(**{**row, **{name: tuple(row[name]) for name in ("lights", "color", "share")}})
                 for row in facts.pop("rows")
             )
             if layers.ndim != 4 or layers.shape != (len(rows), *alpha.shape, 3):
@@ -84,7 +84,7 @@ class LightPictures:
         return cls(rows, layers, alpha, facts)
 
 
-def light_pictures(kept: KeptPicture, progress: Progress | None = None) -> LightPictures:
+def light_pictures(kept: RelightData, progress: Progress | None = None) -> LightPictures:
     """The pictures of the lights of `kept`, shaded by its most accurate table. Raises TableError, Cancelled."""
     extraction, shadows = kept.extraction, kept.shadows
     shape, technique = (extraction.film.height, extraction.film.width), kept.technique
@@ -106,7 +106,7 @@ def light_pictures(kept: KeptPicture, progress: Progress | None = None) -> Light
         layer += bounced_light(kept, row)
     for group, values in kept.rest.items():
         if group and values.any() and all(row.group != group for row in rows):
-            rows.append(Row(f"Light group {group}", (), note=NOT_SHADED))
+            rows.append(MixerRow(f"Light group {group}", (), note=NOT_SHADED))
             layers = np.concatenate([layers, values[None, ..., :3].astype(np.float32)])
     notes = [GRAIN] * bool(kept.rest and kept.extraction.has_lens) + [
         SHARED_OUT.format(group, listed(repr(row.name) for row in own))
@@ -115,7 +115,7 @@ def light_pictures(kept: KeptPicture, progress: Progress | None = None) -> Light
     ]
     rest = kept.rest.get("")
     if rest is not None:
-        rows.append(Row(REST, (), note=NOT_OF_LIGHTS))
+        rows.append(MixerRow(REST, (), note=NOT_OF_LIGHTS))
         layers = np.concatenate([layers, rest[None, ..., :3].astype(np.float32)])
     alpha = np.ones(shape, np.float32) if rest is None or rest.shape[-1] < 4 else rest[..., 3].astype(np.float32)
     facts = {"camera": extraction.camera, "frame": extraction.frame, "technique": technique, "notes": notes}
@@ -150,7 +150,7 @@ def _members(lights: Sequence[Light], shadows: Shadows | None, most: int = MOST_
     return [*(own for row, own in enumerate(rows) if row in strong), weak]
 
 
-def _row(extraction, own: list[int]) -> Row:
+def _row(extraction, own: list[int]) -> MixerRow:
     """The row of the lights with the numbers `own`."""
     lights = [extraction.lights[number] for number in own]
     names, color = tuple(dict.fromkeys(light.name for light in lights)), tuple(own_color(lights).tolist())
@@ -158,12 +158,12 @@ def _row(extraction, own: list[int]) -> Row:
     settings = {name: known[name] for name in names if name in known}
     if len(names) > 1:
         note = WEAKEST if len({tuple(light.radiance) for light in lights}) > 1 else SHARED
-        return Row(f"{names[0]} and {len(names) - 1} more", names, color, settings, note=note)
-    plain = len(lights) == 1 and not lights[0].children and lights[0].pattern is None
-    return Row(names[0], names, color, settings, lights[0].record() if plain else None)
+        return MixerRow(f"{names[0]} and {len(names) - 1} more", names, color, settings, note=note)
+    plain = len(lights) == 1 and not lights[0].detail and lights[0].pattern is None
+    return MixerRow(names[0], names, color, settings, lights[0].record() if plain else None)
 
 
-def _layers(kept: KeptPicture, table, members: list[list[int]], report) -> np.ndarray:
+def _layers(kept: RelightData, table, members: list[list[int]], report) -> np.ndarray:
     """Direct light (R, H, W, 3) of the rows with these `members`, times the exposure."""
     extraction = kept.extraction
     numbers = sorted(number for own in members for number in own)
@@ -180,7 +180,7 @@ def _layers(kept: KeptPicture, table, members: list[list[int]], report) -> np.nd
     return layers
 
 
-def _with_bounces(kept: KeptPicture, rows: list[Row], members, layers) -> list[Row]:
+def _with_bounces(kept: RelightData, rows: list[MixerRow], members, layers) -> list[MixerRow]:
     """The rows with their shares of the bounced light of their groups, in proportion to the direct light `layers`."""
     found = list(rows)
     for group in filter(None, kept.rest):
@@ -193,7 +193,7 @@ def _with_bounces(kept: KeptPicture, rows: list[Row], members, layers) -> list[R
     return found
 
 
-def bounced_light(kept: KeptPicture, row: Row) -> np.ndarray:
+def bounced_light(kept: RelightData, row: MixerRow) -> np.ndarray:
     """The bounced light (H, W, 3) of a row; 0.0 where it has none."""
     return (np.array(row.share) * kept.rest[row.group][..., :3]).astype(np.float32) if row.group else np.float32(0.0)
 
@@ -223,7 +223,7 @@ class Mixer:
         layers, alpha = self._layers[:, ::-1, :, :3], self._background[::-1, :, 3]
         return LightPictures(self.rows, layers, alpha, self.facts)
 
-    def replace(self, number: int, row: Row, layer: np.ndarray) -> None:
+    def replace(self, number: int, row: MixerRow, layer: np.ndarray) -> None:
         """Replace row `number` by `row` with the picture `layer` (H, W, 3), row 0 on top."""
         self.rows = (*self.rows[:number], row, *self.rows[number + 1 :])
         self._layers[number, ..., :3] = layer[::-1]

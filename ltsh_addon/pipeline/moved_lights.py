@@ -19,12 +19,11 @@ import numpy as np
 
 from ..cycles.gbuffer import SHADOW_LOOSENESS, one_shading, with_one_shadow
 from ..emitters.light_polygons import has_lobe
-from ..files import temporary_folder
-from ..scene import Cancelled, Film, Light, SurfaceSamples
-from ..visibility import BLOCK_SAMPLES, Company, Occluders, Setting, task_of_lights
+from ..scene import AreaLight, Cancelled, Film, SurfaceSamples
+from ..visibility import BLOCK_SAMPLES, Company, Occluders, Setting, open_tracer, task_of_lights
 from . import picture
-from .lighting import KEPT_SUFFIX, OCCLUDERS_SUFFIX, KeptPicture, rays_of_samples
-from .mixer import Row, bounced_light
+from .lighting import OCCLUDERS_SUFFIX, RELIGHT_SUFFIX, RelightData, rays_of_samples
+from .mixer import MixerRow, bounced_light
 
 # BLOCKS: enough that all processes end at about the same time. FEWEST_OF_BLOCK: the overhead of smaller blocks exceeds
 # the cost of their samples.
@@ -119,7 +118,7 @@ class MovedLights:
     Threads may share an object: a new request cancels the one in progress, which raises Cancelled.
     """
 
-    def __init__(self, read: Callable[[], tuple[KeptPicture, Occluders | None]]):
+    def __init__(self, read: Callable[[], tuple[RelightData, Occluders | None]]):
         """`read` is called at the first picture; its exceptions are raised there."""
         self._read, self._kept, self._occluders = read, None, None
         self._company, self._ending = None, ExitStack()
@@ -135,9 +134,9 @@ class MovedLights:
         """
 
         def read():
-            kept, occluders = KeptPicture.load(path), None
+            kept, occluders = RelightData.load(path), None
             if kept.shadows is not None:
-                occluders = Occluders.load(path.with_name(path.name.removesuffix(KEPT_SUFFIX) + OCCLUDERS_SUFFIX))
+                occluders = Occluders.load(path.with_name(path.name.removesuffix(RELIGHT_SUFFIX) + OCCLUDERS_SUFFIX))
             return kept, occluders
 
         return cls(read)
@@ -153,7 +152,7 @@ class MovedLights:
         with suppress(Exception), closing(pictures):
             next(pictures)
 
-    def picture(self, light: Light, row: Row | None = None) -> np.ndarray:
+    def picture(self, light: AreaLight, row: MixerRow | None = None) -> np.ndarray:
         """The picture (H, W, 3) of one light, plus the unchanged bounced light of its `row`. Raises SceneError."""
         turn = self._next_turn()
         with self._lock:
@@ -163,7 +162,7 @@ class MovedLights:
                 pass
             return self._image(values, row)
 
-    def pictures(self, light: Light, row: Row | None = None) -> Iterator[tuple[np.ndarray, float]]:
+    def pictures(self, light: AreaLight, row: MixerRow | None = None) -> Iterator[tuple[np.ndarray, float]]:
         """Yield the result of `picture`, first as a draft and at last complete, and the fraction that is done."""
         self._is_ready = True
         return self._pictures(light, row, self._next_turn())
@@ -222,7 +221,7 @@ class MovedLights:
                 values[name][self._own[number]] = found
             yield
 
-    def _image(self, values, row: Row | None) -> np.ndarray:
+    def _image(self, values, row: MixerRow | None) -> np.ndarray:
         kept = self._kept
         image = np.zeros((kept.extraction.film.height, kept.extraction.film.width, 3), np.float32)
         for name, radiance in values.items():
@@ -237,7 +236,7 @@ class MovedLights:
             self._ending.close()
 
     def _start(self) -> None:
-        from ..blender.process.blender_rays import open_rays
+        from ..blender.process.blender_process import embree_libraries
 
         if self._kept is None:
             self._kept, self._occluders = self._read()
@@ -266,8 +265,7 @@ class MovedLights:
         with ExitStack() as stack:
             self._tracer = None
             if self._occluders is not None:
-                folder = stack.enter_context(temporary_folder())
-                self._tracer = stack.enter_context(open_rays(self._occluders, folder, lambda warning: None))
+                self._tracer = stack.enter_context(open_tracer(self._occluders, embree_libraries()))
                 self._typical = task_of_lights(starting, lights, self._tracer, passes, DRAFT_RAYS).typical
             self._company = Company(Setting(blocks, table, passes), self._tracer)
             stack.callback(self._company.close)

@@ -188,8 +188,8 @@ def make_picture(options: PictureOptions, with_cycles: bool, progress: Progress 
         files.append(Path(files[0]).with_suffix(".png").as_posix())
         write_bytes(output / files[-1], shown)
     if options.keep_visibility:
-        path = (output / files[0]).with_suffix(lighting.KEPT_SUFFIX)
-        kept = lighting.keep_picture(extraction, shadows, options, path)
+        path = (output / files[0]).with_suffix(lighting.RELIGHT_SUFFIX)
+        kept = lighting.write_relight_data(extraction, shadows, options, path)
         files += [path.relative_to(output).as_posix() for path in kept]
     techniques = {name: result.seconds for name, result in results.items()}
     seconds = {**extraction.seconds, "techniques": techniques, "total": time.perf_counter() - start}
@@ -221,7 +221,7 @@ def _shown(comparison: Comparison, folder: Path, progress) -> bytes:
 
 
 @dataclass(frozen=True)
-class Result:
+class TechniqueResult:
     """Radiance of one technique on all samples, or on a subset (Q,) of them."""
 
     shading: shading.Shading  # radiance (G, Q, 3) per pass
@@ -229,20 +229,20 @@ class Result:
     subset: np.ndarray | None  # (Q,) sorted indices of the samples that were evaluated, None for all
     unshadowed: shading.Shading | None = None  # the same without shadows, where `shading` has shadows
 
-    def with_more(self, kept: np.ndarray, more: Result) -> Result:
+    def with_more(self, kept: np.ndarray, more: TechniqueResult) -> TechniqueResult:
         """The samples in the mask `kept` (P,), then those of `more`; both results must be without a subset."""
         seconds = {name: value + more.seconds[name] for name, value in self.seconds.items()}
         own = [(self.shading, more.shading), (self.unshadowed, more.unshadowed)]
         shaded = [None if one is None else one.with_more(kept, other) for one, other in own]
-        return Result(shaded[0], seconds, None, shaded[1])
+        return TechniqueResult(shaded[0], seconds, None, shaded[1])
 
 
-def evaluated(tables, extraction, shadows, options, progress) -> dict[str, Result]:
+def evaluated(tables, extraction, shadows, options, progress) -> dict[str, TechniqueResult]:
     """The results of all techniques in `tables` (see `prepare`), by name."""
     return {name: _evaluate(name, table, extraction, shadows, options, progress) for name, table in tables.items()}
 
 
-def _evaluate(name, table, extraction, shadows, options, progress) -> Result:
+def _evaluate(name, table, extraction, shadows, options, progress) -> TechniqueResult:
     """Shade all samples; the reference shades those of randomly chosen pixels where there are too many."""
     samples, subset = extraction.samples, None
     limit = min(options.reference_samples, max(FEWEST_SAMPLES, MOST_PAIRS // max(len(extraction.lights), 1)))
@@ -265,7 +265,7 @@ def _evaluate(name, table, extraction, shadows, options, progress) -> Result:
             of_pass[pass_name] = shaded
         seconds[pass_name] = time.perf_counter() - start
     shaded, *unshadowed = map(_joined, lit)
-    return Result(shaded, seconds, subset, *unshadowed)
+    return TechniqueResult(shaded, seconds, subset, *unshadowed)
 
 
 def _joined(shaded: dict[str, shading.Shading]) -> shading.Shading:
@@ -315,7 +315,7 @@ class Comparison:
 
     options: PictureOptions
     extraction: Any  # blender.process.client.Extraction, which the core does not import
-    results: dict[str, Result]
+    results: dict[str, TechniqueResult]
     shadows: lighting.Shadows | None = None
 
     @property
@@ -404,7 +404,7 @@ class Comparison:
             "shadows": None if self.shadows is None else self.shadows.report(),
             "passes": {name: self._pass_report(name) for name in options.passes},
             "problems": list(extraction.problems),
-            "warnings": [*extraction.warnings, *(self.shadows.warnings if self.shadows else ())],
+            "warnings": list(extraction.warnings),
         }
 
     def _reference_facts(self) -> dict | None:

@@ -11,7 +11,7 @@ import numpy as np
 from .. import imaging
 from ..scene import Light, Progress, SurfaceSamples, listed
 from . import picture
-from .lighting import KEPT_SUFFIX, KeptPicture, shade_lights
+from .lighting import RELIGHT_SUFFIX, RelightData, shade_lights
 from .options import PictureOptions
 
 NO_CYCLES = "Cycles' picture and the errors beside it are left out: they show the lights as they were"
@@ -59,7 +59,7 @@ def relight(
     where nothing was kept, OSError, TableError.
     """
     folder, output = Path(folder), Path(output)
-    files = sorted(folder.rglob(f"*{KEPT_SUFFIX}"))
+    files = sorted(folder.rglob(f"*{RELIGHT_SUFFIX}"))
     if not files:
         fix = "run shade, compare or render with --keep-visibility"
         raise ValueError(f"{folder}: no picture kept its samples there; {fix}")
@@ -71,12 +71,12 @@ def relight(
 
 def _relit(path: Path, place: Path, wanted, output: Path, progress) -> dict:
     """Write the picture whose samples are in `path`, at the same `place` below `output`; returns its report."""
-    kept = KeptPicture.load(path)
+    kept = RelightData.load(path)
     changes = [*wanted[0], *others_muted(kept.extraction.lights, wanted[1])]
     lights = changed_lights(kept.extraction.lights, changes)
     if kept.shadows is not None:
         _check_shared(kept, lights)
-    name = place.as_posix().removesuffix(KEPT_SUFFIX)
+    name = place.as_posix().removesuffix(RELIGHT_SUFFIX)
     options = PictureOptions(output=output, name=name, **kept.options)
     tables = picture.prepare(options)
     warnings = kept.extraction.warnings + ((SAME_GLOW,) if kept.extraction.rest is not None else ())
@@ -104,7 +104,7 @@ def _relit(path: Path, place: Path, wanted, output: Path, progress) -> dict:
 class _Finished(picture.Comparison):
     """A finished picture: our passes, and Cycles' `rest` (H, W, 4)."""
 
-    kept: KeptPicture | None = None
+    kept: RelightData | None = None
     rest: np.ndarray | None = None
 
     def layers(self) -> dict[str, np.ndarray | imaging.Layer]:
@@ -120,7 +120,7 @@ class _Finished(picture.Comparison):
         return {"combined": combined, **found, "rest": self.rest}
 
 
-def _changed_rest(kept: KeptPicture, lights: Sequence[Light], table, shaded, progress) -> np.ndarray:
+def _changed_rest(kept: RelightData, lights: Sequence[AreaLight], table, shaded, progress) -> np.ndarray:
     """Cycles' rest (H, W, 4) under the changed `lights`: the bounced light of a group scales with its direct light.
 
     `shaded` is the direct light of the changed lights by `table`.
@@ -144,7 +144,7 @@ def _changed_rest(kept: KeptPicture, lights: Sequence[Light], table, shaded, pro
     return rest
 
 
-def _light_of_group(kept: KeptPicture, shaded, group: str) -> np.ndarray:
+def _light_of_group(kept: RelightData, shaded, group: str) -> np.ndarray:
     """Direct light (3,) of a light group, summed over the picture."""
     number, film = shaded.groups.index(group), kept.extraction.film
     images = {name: film.image(getattr(shaded, name)[number]) for name in kept.options["passes"]}
@@ -176,7 +176,7 @@ def _split_at_horizons(samples: SurfaceSamples) -> int:
     return int((same[0] & same[1] & same[2] & ~same[3]).sum())
 
 
-def _check_shared(kept: KeptPicture, lights: Sequence[Light]) -> None:
+def _check_shared(kept: RelightData, lights: Sequence[AreaLight]) -> None:
     """Raise ValueError where lights that share their shadow rays are changed differently."""
     before = kept.extraction.lights
     for own in kept.shadows.numbers:

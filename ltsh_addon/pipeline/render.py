@@ -93,7 +93,7 @@ class Finished:
     channels: dict[str, np.ndarray]  # (H, W) of Cycles' passes, with ours in place of its direct light
     report: dict
     seconds: dict[str, Any]
-    kept: dict[str, dict[str, np.ndarray]]  # `rest`, `taken` and `edges` of a KeptPicture
+    relight_data: dict[str, dict[str, np.ndarray]]  # `rest`, `taken` and `edges` of a RelightData
     comparison: picture.Comparison
     cycles: Any  # blender.process.client.CyclesPicture
 
@@ -128,9 +128,9 @@ def make_finished(options: RenderOptions, progress: Progress | None = None) -> p
     write_bytes(path.with_suffix(".png"), shown)
     files = [f"{name}.exr", f"{name}.png"]
     if options.keep_visibility:
-        path, parts = path.with_name(f"{path.stem}{lighting.KEPT_SUFFIX}"), made.comparison
+        path, parts = path.with_name(f"{path.stem}{lighting.RELIGHT_SUFFIX}"), made.comparison
         kept = parts.extraction, parts.shadows, parts.options, path
-        written = lighting.keep_picture(*kept, **made.kept)
+        written = lighting.write_relight_data(*kept, **made.relight_data)
         files += [one.relative_to(options.output).as_posix() for one in written]
     return picture.TaskResult(made.report, made.seconds, tuple(files))
 
@@ -157,7 +157,7 @@ def finish(
         shaded(comparison)
         seconds = _left(options, comparison.extraction, clock)
         width, height = options.resolution or (None, None)
-        edges = not (comparison.extraction.has_lens or comparison.extraction.kept.everything)
+        edges = not (comparison.extraction.has_lens or comparison.extraction.left_to_cycles.everything)
         own = {"width": width, "height": height, "seconds": seconds, "edges": edges}
         job = child_job(client.FinishedJob, options, **where, **own)
         cycles = client.render_finished(job, folder, progress=progress)
@@ -217,9 +217,9 @@ def _too_long(options: RenderOptions, extraction, cycles, clock: _ProcessorClock
 def _denoisings(extraction) -> int:
     """How many pictures `_rest` denoises at most: two for each combination of passes that are ours, and one for each
     light group."""
-    if extraction.kept.everything:
+    if extraction.left_to_cycles.everything:
         return 1
-    ways = np.unique([mask.ravel() for mask in extraction.kept.by_pass.values()], axis=1)
+    ways = np.unique([mask.ravel() for mask in extraction.left_to_cycles.by_pass.values()], axis=1)
     return 2 * ways.shape[1] + len({light.group for light in extraction.lights if light.group})
 
 
@@ -264,7 +264,7 @@ def _ours(options: RenderOptions, where: dict, clock: _ProcessorClock, progress)
     job = child_job(client.ExtractOptions, own, **where, **size)
     extraction = client.extract(job, progress=progress)
     clock.end("extraction", extraction.processor_seconds)
-    if not extraction.lights or extraction.kept.everything:
+    if not extraction.lights or extraction.left_to_cycles.everything:
         return picture.Comparison(own, extraction, {}, None)
     with lighting.ShadowTracer(extraction.occluders, extraction.lights, extraction.origin) as tracer:
         how = _How(options, own, tables, tracer)
@@ -272,8 +272,8 @@ def _ours(options: RenderOptions, where: dict, clock: _ProcessorClock, progress)
         number, reason = how.affordable(extraction, _left(options, extraction, clock), looked)
         clock.end("choice")
         if reason:
-            kept = replace(extraction.kept, everything=(*extraction.kept.everything, reason))
-            return picture.Comparison(own, replace(extraction, kept=kept), {}, None)
+            kept = replace(extraction.left_to_cycles, everything=(*extraction.left_to_cycles.everything, reason))
+            return picture.Comparison(own, replace(extraction, left_to_cycles=kept), {}, None)
         if number > extraction.film.sub_samples:
             extraction = client.extract(replace(job, sub_samples=number, seconds=None), progress=progress)
             clock.end("extraction", extraction.processor_seconds)
@@ -363,7 +363,7 @@ class _How:
         images = picture.Comparison(self.own, part, results, shadows).images
         (technique, result), *_ = results.items()
         variance, _ = _of_points(part.film, _seen(part, result, "specular"))
-        variance = variance[~part.kept.by_pass["specular"]].sum()
+        variance = variance[~part.left_to_cycles.by_pass["specular"]].sum()
         light = {name: images[technique, name].mean(axis=-1) for name in PASSES}
         whole, squared = sum(light.values()).sum(), np.square(sum(light.values())).sum()
         number, took = int(np.count_nonzero(there)), time.process_time() - start
@@ -381,7 +381,7 @@ class _How:
         light = comparison.images[next(iter(comparison.results)), "diffuse"].mean(axis=-1)
         bend = (_bend(light) * _certain(comparison.shadows, "diffuse")).ravel()
         covered = np.minimum(film.coverage(), 1.0).ravel()
-        pixel = np.flatnonzero((bend > 0.0) & ~extraction.kept.by_pass["diffuse"].ravel() & (covered > 0.0))
+        pixel = np.flatnonzero((bend > 0.0) & ~extraction.left_to_cycles.by_pass["diffuse"].ravel() & (covered > 0.0))
         if len(pixel) > MOST_EDGES * len(bend):
             return comparison
         number = _numbers_of_points(bend[pixel], covered[pixel], more * len(film.pixel))
@@ -439,7 +439,7 @@ def _rays(options: RenderOptions, extraction) -> int:
 
 
 @dataclass(frozen=True)
-class _Part:
+class _DirectPass:
     """One pass of ours, and where it takes the place of Cycles' direct light, which is `light` times `color`."""
 
     image: np.ndarray  # (H, W, 3), black elsewhere
@@ -533,9 +533,9 @@ def _beside(ours: np.ndarray, direct: np.ndarray) -> np.ndarray:
     return 1.0 - 0.5 * np.minimum(np.divide(edge, between, out=np.zeros_like(edge), where=between > 0.0), 1.0)
 
 
-def _taken(comparison: picture.Comparison, cycles, is_denoised: bool) -> dict[str, _Part]:
+def _taken(comparison: picture.Comparison, cycles, is_denoised: bool) -> dict[str, _DirectPass]:
     """Ours by pass. Where Cycles' part is denoised, what is too noisy of ours is left to it."""
-    kept, found = comparison.extraction.kept, {}
+    kept, found = comparison.extraction.left_to_cycles, {}
     shape = comparison.film.height, comparison.film.width
     keeps_all = bool(cycles.everything or kept.everything)
     result = next(iter(comparison.results.values()), None)
@@ -561,12 +561,12 @@ def _taken(comparison: picture.Comparison, cycles, is_denoised: bool) -> dict[st
             own = map(comparison.film.image, values) if len(values) > 1 else (image,)
             groups = {group: _share_of(share, one) for group, one in zip(result.shading.groups, own, strict=True)}
             image = _share_of(share, image)
-        found[name] = _Part(image, groups, is_taken, certain, light, color, weight)
+        found[name] = _DirectPass(image, groups, is_taken, certain, light, color, weight)
     return found
 
 
 def _rest(
-    cycles, ours: dict[str, _Part], extraction, denoise: str, progress
+    cycles, ours: dict[str, _DirectPass], extraction, denoise: str, progress
 ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray], str, list[str]]:
     """What is not ours, denoised. Returns
 
@@ -611,21 +611,21 @@ def _rest(
     return rest, left, _shared_out(rest, of_groups, is_clean=bool(name)), name, problems
 
 
-def _shining(cycles, extraction) -> _Part:
+def _shining(cycles, extraction) -> _DirectPass:
     """What shines in sight, on the pixels where it can stay out of the denoiser: not behind surfaces that light passes,
     where it is noisy."""
     names = {key: cycles.names[key] for key in cycles.shining}
     own = sum((read_layer(cycles.channels, name, "RGB") for name in names.values()), np.zeros((1, 1, 3)))
-    kept = extraction.kept
+    kept = extraction.left_to_cycles
     is_hidden = np.logical_and.reduce([*kept.by_pass.values()])
     if not names or extraction.has_lens or cycles.everything or kept.everything:
         is_hidden = np.ones_like(is_hidden)
     image = sum(cycles.shining.values(), np.zeros_like(own))
     image = np.where(is_hidden[..., None], 0.0, image)
-    return _Part(image, {}, ~is_hidden, np.ones(is_hidden.shape), own, np.ones(3))
+    return _DirectPass(image, {}, ~is_hidden, np.ones(is_hidden.shape), own, np.ones(3))
 
 
-def _without_taken(combined: np.ndarray, parts: list[_Part], way: np.ndarray, is_noisy: bool) -> np.ndarray:
+def _without_taken(combined: np.ndarray, parts: list[_DirectPass], way: np.ndarray, is_noisy: bool) -> np.ndarray:
     """Cycles' picture (H, W, 3) without its light of those of the `parts` that `way` names, on all pixels; where
     ours `is_noisy`, with ours in its place."""
     left = combined.copy()
@@ -637,7 +637,7 @@ def _without_taken(combined: np.ndarray, parts: list[_Part], way: np.ndarray, is
     return left
 
 
-def _rest_of_group(cycles, ours: dict[str, _Part], group: str) -> np.ndarray:
+def _rest_of_group(cycles, ours: dict[str, _DirectPass], group: str) -> np.ndarray:
     """The light (H, W, 3) of a light group that is not ours."""
     found = read_layer(cycles.channels, f"{OF_GROUP}{group}", "RGB").astype(np.float64)
     for part in ours.values():
@@ -657,8 +657,8 @@ def _shared_out(rest: np.ndarray, groups: dict[str, np.ndarray], is_clean: bool)
     return {"": left, **groups}
 
 
-def _kept(ours: dict[str, _Part], rests: dict[str, np.ndarray], of_edges: np.ndarray) -> dict:
-    """`rest`, `taken` and `edges` of a KeptPicture. Cycles' part of an edge is kept as a factor of our light, so that
+def _kept(ours: dict[str, _DirectPass], rests: dict[str, np.ndarray], of_edges: np.ndarray) -> dict:
+    """`rest`, `taken` and `edges` of a RelightData. Cycles' part of an edge is kept as a factor of our light, so that
     it changes with the lights as ours does."""
     taken = {name: np.where(part.is_taken, part.certain, 0.0) for name, part in ours.items()}
     part = ours["diffuse"]
@@ -677,7 +677,7 @@ def _kept(ours: dict[str, _Part], rests: dict[str, np.ndarray], of_edges: np.nda
     return {"rest": rest, "taken": taken, "edges": {"diffuse": part.weight * (1.0 + more)}}
 
 
-def _layers(comparison: picture.Comparison, ours: dict[str, _Part]) -> dict[str, np.ndarray]:
+def _layers(comparison: picture.Comparison, ours: dict[str, _DirectPass]) -> dict[str, np.ndarray]:
     """Ours by the names of the layers, and also by light group where there are several."""
     if not comparison.results:
         return {}
@@ -692,7 +692,7 @@ def _layers(comparison: picture.Comparison, ours: dict[str, _Part]) -> dict[str,
     return layers
 
 
-def _replaced(cycles, ours: dict[str, _Part], rests: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+def _replaced(cycles, ours: dict[str, _DirectPass], rests: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Cycles' channels with ours in place of its direct light, without its noisy Combined."""
     channels = {name: plane for name, plane in cycles.channels.items() if not name.startswith("Combined.")}
     for name, (light, _) in DIRECT.items():
@@ -708,13 +708,11 @@ def _replaced(cycles, ours: dict[str, _Part], rests: dict[str, np.ndarray]) -> d
     return channels
 
 
-def _report(comparison: picture.Comparison, cycles, ours: dict[str, _Part], problems: list[str]) -> dict:
+def _report(comparison: picture.Comparison, cycles, ours: dict[str, _DirectPass], problems: list[str]) -> dict:
     """The report of a picture, and under "finished" what is ours and what is Cycles'."""
-    kept = comparison.extraction.kept
+    kept = comparison.extraction.left_to_cycles
     everything = [*cycles.everything, *kept.everything]
     warnings = [*cycles.warnings, *kept.warnings, *problems]
-    if comparison.shadows is not None:
-        warnings += comparison.shadows.warnings
     if everything:
         why = listed(everything, NAMED, "; ")
         warnings.append(f"all direct light is Cycles' own and denoised, because LTSH does not shade: {why}")

@@ -50,7 +50,7 @@ _digests: dict[tuple, str] = {}
 
 
 @dataclass(frozen=True)
-class Job:
+class BatchJob:
     """One command for every combination of scene, camera and frame (and object of a bake)."""
 
     command: str  # "shade", "compare", "bake", "view" or "render"
@@ -75,7 +75,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Task:
+class BatchTask:
     """One picture, one object of a bake, or one of several UDIM tiles of such an object."""
 
     scene: str
@@ -96,7 +96,7 @@ class Task:
         """Scene, camera and frame: the same for all objects of one bake."""
         return self.scene, self.camera, self.frame
 
-    def options(self, job: Job) -> Any:
+    def options(self, job: BatchJob) -> Any:
         """The job's options for this task."""
         options = replace(job.options, scene=Path(self.scene), camera=self.camera, frame=self.frame)
         if self.object is not None:
@@ -110,7 +110,7 @@ class NameClash(ValueError):
     """Several tasks would get the same name, or one gets a name that is too long."""
 
 
-def tasks_of(job: Job, progress=None) -> list[Task]:
+def tasks_of(job: BatchJob, progress=None) -> list[BatchTask]:
     """All tasks of `job`. Opens the files in Blender if tasks or names depend on their contents.
 
     Raises NameClash where two tasks would write the same file, or a name is too long, SceneError, OSError.
@@ -136,7 +136,7 @@ def tasks_of(job: Job, progress=None) -> list[Task]:
     return tasks
 
 
-def shard_of(tasks: list[Task], shard: tuple[int, int]) -> list[Task]:
+def shard_of(tasks: list[BatchTask], shard: tuple[int, int]) -> list[BatchTask]:
     """Every N-th of the tasks, from number I on: shard (I, N), I from 1 to N."""
     number, count = shard
     return tasks[number - 1 :: count]
@@ -155,18 +155,18 @@ def _facts(job, scene, progress) -> list[dict]:
     return client.scene_facts(Path(scene), frames, objects, uv, scripts=scripts, progress=progress)
 
 
-def _tasks(job, unit, fields, facts, contents) -> list[Task]:
+def _tasks(job, unit, fields, facts, contents) -> list[BatchTask]:
     """The tasks of one scene, camera and frame: one picture, or one per object or UDIM tile of a bake."""
     scene, camera, frame = unit
     key = options_digest(job.command, replace(job.options, scene=Path(scene), camera=camera, frame=frame), contents)
     if job.command != "bake":
-        return [Task(str(scene), camera, frame, None, job.pattern.format(**fields), key)]
+        return [BatchTask(str(scene), camera, frame, None, job.pattern.format(**fields), key)]
     tasks, objects = [], list(dict.fromkeys(facts["objects"]))
     for name, stem in zip(objects, file_stems(objects), strict=True):
         stem = job.pattern.format(**fields, object=stem)
         tiles = facts["tiles"].get(name, ())
-        tasks += [Task(str(scene), camera, frame, name, f"{stem}.{tile}", key, tile) for tile in tiles]
-        tasks += [] if tiles else [Task(str(scene), camera, frame, name, stem, key)]
+        tasks += [BatchTask(str(scene), camera, frame, name, f"{stem}.{tile}", key, tile) for tile in tiles]
+        tasks += [] if tiles else [BatchTask(str(scene), camera, frame, name, stem, key)]
     return tasks
 
 

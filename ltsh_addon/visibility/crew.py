@@ -50,7 +50,7 @@ def run(task, tracer, blocks: Sequence, workers: int | None, progress: Progress 
     if it returns False, Cancelled is raised. No child is left when this ends.
     """
     wanted = min(pool.cores() if workers is None else workers, len(blocks)) - 1
-    if pool.interpreter() is None or getattr(tracer, "library", None) is None:
+    if pool.interpreter() is None:
         wanted = 0
     queue = _Queue(len(blocks))
     with pool.helpers(queue) as children:
@@ -148,7 +148,7 @@ class Mate:
     def __init__(self, tracer):
         self._tracer, self._own = tracer, KeptBlocks(None, tracer)
         self._child: pool.Keeper | None = None
-        self._is_possible = pool.cores() > 1 and pool.interpreter() is not None and tracer.library is not None
+        self._is_possible = pool.cores() > 1 and pool.interpreter() is not None
         self._is_up, self._run = False, 0
         self._sent: dict[tuple, dict[int, bool]] = {}
         self.key: tuple | None = None
@@ -268,8 +268,8 @@ class Company:
     def __init__(self, setting: Setting, tracer):
         occluders, library = (None, None) if tracer is None else (tracer.occluders, tracer.library)
         count = min(pool.cores(), len(setting.blocks))
-        cannot_help = pool.interpreter() is None or (tracer is not None and library is None)
-        if cannot_help or sum(len(block[0]) for block in setting.blocks.values()) < SAMPLES_WORTH_A_CHILD:
+        samples = sum(len(block[0]) for block in setting.blocks.values())
+        if pool.interpreter() is None or samples < SAMPLES_WORTH_A_CHILD:
             count = 1
         # This process knows all blocks. After its own, it does those that others have not begun.
         self._own, self._count, self._run = LitBlocks((setting, occluders, library), tracer), count, 0

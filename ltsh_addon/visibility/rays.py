@@ -301,13 +301,12 @@ class EmbreeCaster:
 class Tracer:
     """Rays through `occluders`; see `open_tracer`. Use it as a context manager, or call `close`.
 
-    `caster` is an EmbreeCaster or the like; `description` names it. `library` is a file that other processes can open;
-    None if they cannot.
+    `description` names the library, and `library` is its file.
     """
 
     def __init__(self, occluders: Occluders, caster):
         self.occluders, self.description = occluders, caster.description
-        self.library = getattr(caster, "library", None)
+        self.library = caster.library
         self._caster, self._lock = caster, threading.Lock()
         self._finder = StartFinder(occluders, caster)
 
@@ -421,7 +420,10 @@ def open_tracer(occluders: Occluders, libraries: Iterable[str | os.PathLike] = (
             return Tracer(occluders, EmbreeCaster(occluders, _trusted[library]))
         except _Unfit as error:
             reasons.append(f"{library}: {error}")
-    raise SceneError(f"no library to trace shadow rays with: {listed(reasons, 8, '; ')}")
+    raise SceneError(
+        f"shadows need Embree 4, which Blender brings along, and none can be used: {listed(reasons, 8, '; ')}. Without "
+        "shadows (--shadows off) it is not needed"
+    )
 
 
 def _probe(embree: _Embree) -> None:

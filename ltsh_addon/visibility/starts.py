@@ -18,7 +18,7 @@ NEARBY, LAYERS, CERTAIN = 2.0**-14, 4, 2.0**-3
 
 
 class StartFinder:
-    """Finds the triangles of `occluders` on which samples lie. `caster` is a `rays.EmbreeCaster` or the like."""
+    """Finds the triangles of `occluders` on which samples lie. `caster` is a `rays.EmbreeCaster`."""
 
     def __init__(self, occluders: Occluders, caster):
         self._occluders, self._caster = occluders, caster

@@ -17,7 +17,7 @@ import many_lights
 import measure
 import numpy as np
 
-from ltsh_addon.pipeline.lighting import KEPT_SUFFIX, KeptPicture
+from ltsh_addon.pipeline.lighting import RELIGHT_SUFFIX, RelightData
 from ltsh_addon.pipeline.mixer import LightPictures, Mixer, light_pictures
 from ltsh_addon.pipeline.moved_lights import MovedLights
 
@@ -55,14 +55,14 @@ def main():
     parser.add_argument("--lights", type=int, default=8)
     options = parser.parse_args()
     out = options.folder.resolve() / f"{options.lights}"
-    kept_file = out / f"shade{KEPT_SUFFIX}"
+    kept_file = out / f"shade{RELIGHT_SUFFIX}"
     if not kept_file.exists():
         out.mkdir(parents=True, exist_ok=True)
         many_lights.build_scene(out / "room.blend", options.lights)
         words = ("--keep-visibility", "--resolution", RESOLUTION, "--techniques", "ltsh4")
         print("shade", many_lights.shade(out / "room.blend", out, *words))
     print(f"kept {kept_file.stat().st_size / 2**20:.0f} MiB")
-    kept, *took = timed(lambda: KeptPicture.load(kept_file))
+    kept, *took = timed(lambda: RelightData.load(kept_file))
     print("read what is kept: {:.2f} s, {:.2f} s of processor time".format(*took))
     pictures, *took = timed(lambda: light_pictures(kept))
     print("pictures of {} rows: {:.2f} s, {:.2f} s of processor time".format(len(pictures.rows), *took))

@@ -26,10 +26,10 @@ import numpy as np
 import random_surfaces
 
 from ltsh_addon.blender import demo
+from ltsh_addon.blender.viewport.camera import ViewCamera
 from ltsh_addon.blender.viewport.mirror import SceneMirror
-from ltsh_addon.blender.viewport.renderer import ShownPicture, ViewRenderer
-from ltsh_addon.blender.viewport.surfaces import View
-from ltsh_addon.scene import QuadLight
+from ltsh_addon.blender.viewport.pictures import ShownPicture
+from ltsh_addon.blender.viewport.renderer import ViewRenderer
 
 TECHNIQUES = ("ltc", "ltsh2", "ltsh4", "ltsh4c")
 # In times of ltc.
@@ -51,7 +51,7 @@ class Frames:
         self.mirror.sync(depsgraph)
         camera = scene.camera
         window = camera.calc_matrix_camera(depsgraph, x=size[0], y=size[1])
-        first = View.of(camera.matrix_world.inverted(), window, camera.data.type == "ORTHO")
+        first = ViewCamera.of(camera.matrix_world.inverted(), window, camera.data.type == "ORTHO")
         # A view that has moved: surfaces are drawn again.
         self.views = [first, replace(first, eye=first.eye + 1e-5)]
         self.size, self.renderer, self.moves = size, ViewRenderer(), 0

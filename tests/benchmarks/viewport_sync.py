@@ -20,7 +20,8 @@ import numpy as np
 
 from ltsh_addon.blender.extract.occluders import collect_occluders
 from ltsh_addon.blender.viewport.mirror import SceneMirror
-from ltsh_addon.blender.viewport.renderer import ShownPicture, ViewRenderer
+from ltsh_addon.blender.viewport.pictures import ShownPicture
+from ltsh_addon.blender.viewport.renderer import ViewRenderer
 from ltsh_addon.blender.viewport.shadows import LiveShadows
 from ltsh_addon.blender.viewport.still import view_of_camera
 

@@ -24,7 +24,7 @@ def main(rig):
 
     shading = importlib.import_module(f"{ADDON}.shading")
     lighting = importlib.import_module(f"{ADDON}.blender.viewport.lighting")
-    textures = importlib.import_module(f"{ADDON}.blender.viewport.textures")
+    textures = importlib.import_module(f"{ADDON}.blender.viewport.gbuffer")
     target = gpu.types.GPUTexture((WIDTH, HEIGHT), format="RGBA32F")
     buffer = gpu.types.GPUFrameBuffer(color_slots=[target])
     for technique in TECHNIQUES:

@@ -35,7 +35,7 @@ def engine_started(rig):
 
 def pixel_centers():
     """Views come to rest with their first picture, which sees pixels at their centers."""
-    module("engine.view").REFINEMENTS = 1
+    module("engine.redraws").REFINEMENTS = 1
 
 
 def bare_view(rig):

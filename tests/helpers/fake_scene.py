@@ -8,8 +8,8 @@ from ltsh_addon import cli, imaging, shading
 from ltsh_addon.blender.process import client
 from ltsh_addon.imaging.color import to_srgb8
 from ltsh_addon.pipeline import PictureOptions
-from ltsh_addon.pipeline.tasks import Job
-from ltsh_addon.scene import Cancelled, Film, Light, QuadLight, SurfaceSamples
+from ltsh_addon.pipeline.tasks import BatchJob
+from ltsh_addon.scene import AreaLight, Cancelled, Film, SurfaceSamples
 from ltsh_addon.visibility import OccluderMesh, Occluders
 
 WIDTH, HEIGHT, SUB_SAMPLES = 6, 4, 2
@@ -136,7 +136,7 @@ class FakeChild:
         )
 
 
-def small_job(room, output, command="shade", **changes) -> Job:
+def small_job(room, output, command="shade", **changes) -> BatchJob:
     """A job of one technique and one pass."""
     options = PictureOptions(room, output, techniques=("ltc",), passes=("diffuse",), cycles_samples=4)
-    return Job(command, options, **{"scenes": (room,), **changes})
+    return BatchJob(command, options, **{"scenes": (room,), **changes})

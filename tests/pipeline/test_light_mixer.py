@@ -10,7 +10,7 @@ from fake_scene import run, wall
 
 from ltsh_addon.imaging.exr import read_channels
 from ltsh_addon.pipeline import lighting, moved_lights, relight
-from ltsh_addon.pipeline.lighting import KeptPicture
+from ltsh_addon.pipeline.lighting import RelightData
 from ltsh_addon.pipeline.mixer import (
     NOT_SHADED,
     REST,
@@ -18,7 +18,7 @@ from ltsh_addon.pipeline.mixer import (
     WEAKEST,
     LightPictures,
     Mixer,
-    Row,
+    MixerRow,
     _members,
     _row,
     light_pictures,
@@ -42,7 +42,7 @@ def shade(capsys, monkeypatch, room, output, *arguments, **scene):
 
 
 def kept_in(output):
-    return KeptPicture.load(output / "shade.samples.npz")
+    return RelightData.load(output / "shade.samples.npz")
 
 
 def mixed(mixer, factors):
@@ -83,7 +83,7 @@ def test_shadows_stay_while_all_lights_change_alike(capsys, monkeypatch, room, o
 def random_mixer(rows=5, size=(40, 30)):
     random = np.random.default_rng(7)
     layers = random.random((rows, *size, 3)).astype(np.float32) * 10.0 ** random.integers(-3, 4, (rows, 1, 1, 1))
-    names = [Row(f"Light {number}", (f"Light {number}",)) for number in range(rows)]
+    names = [MixerRow(f"Light {number}", (f"Light {number}",)) for number in range(rows)]
     return Mixer(LightPictures(tuple(names), layers, np.ones(size, np.float32), {})), layers
 
 
@@ -102,7 +102,7 @@ def test_any_order_of_changes_gives_the_same_bits():
 
 def test_pictures_of_lights_are_read_back(tmp_path):
     mixer, _ = random_mixer()
-    mixer.replace(2, Row("Other", ("Other",)), np.full((40, 30, 3), 7.0))
+    mixer.replace(2, MixerRow("Other", ("Other",)), np.full((40, 30, 3), 7.0))
     mixer.pictures.save(tmp_path / "lights.npz")
     found = LightPictures.load(tmp_path / "lights.npz")
     assert found.rows == mixer.rows and np.array_equal(found.layers, mixer.pictures.layers)
@@ -137,8 +137,8 @@ def test_the_rest_of_a_picture_is_a_row_and_bounced_light_follows_its_light_grou
     rest = {"": random.random((*shape, 4)), "Key": random.random((*shape, 3))}
     taken = {"diffuse": random.random(shape)}
     path = out / "render.samples.npz"
-    lighting.keep_picture(kept.extraction, None, replace(options(room, out)), path, rest=rest, taken=taken)
-    pictures = light_pictures(KeptPicture.load(path))
+    lighting.write_relight_data(kept.extraction, None, replace(options(room, out)), path, rest=rest, taken=taken)
+    pictures = light_pictures(RelightData.load(path))
     assert [row.name for row in pictures.rows][-1] == REST and len(pictures.rows) == 4
     np.testing.assert_allclose(pictures.alpha, rest[""][..., 3], rtol=1e-6)
     plain = light_pictures(kept)
@@ -158,12 +158,12 @@ def test_a_finished_picture_lit_anew_keeps_the_rest(capsys, monkeypatch, room, o
     )
     path = out / "finished" / "render.samples.npz"
     path.parent.mkdir()
-    lighting.keep_picture(kept.extraction, None, options(room, out), path, rest={"": rest}, taken=taken)
+    lighting.write_relight_data(kept.extraction, None, options(room, out), path, rest={"": rest}, taken=taken)
     found = run(capsys, "relight", out / "finished", "--light", "Light 1", "--power", "x3", "--json", "--quiet")
     assert found[0] == 0 and relight.SAME_REST.format("") in found[1]
     channels = read_channels(out / "finished" / "relit" / "render.exr")
     assert np.allclose(channels["rest.A"], rest[..., 3]) and np.allclose(channels["combined.A"], rest[..., 3])
-    pictures = light_pictures(KeptPicture.load(path))
+    pictures = light_pictures(RelightData.load(path))
     expected = np.einsum("rhwc,r->hwc", pictures.layers, [1.0, 3.0, 1.0, 1.0])
     combined = np.stack([channels[f"combined.{letter}"] for letter in "RGB"], axis=-1)
     np.testing.assert_allclose(combined, expected, rtol=1e-5, atol=1e-6)
@@ -177,10 +177,10 @@ def test_bounced_light_follows_a_group_also_where_its_lights_change_differently(
     rest = {"": random.random((*shape, 4)), "Key": random.random((*shape, 3)), "Sky": random.random((*shape, 3))}
     taken = {name: np.ones(shape) for name in ("specular", "diffuse")}
     path.parent.mkdir()
-    lighting.keep_picture(
+    lighting.write_relight_data(
         kept.extraction, None, replace(options(room, out), techniques=("ltsh4",)), path, rest=rest, taken=taken
     )
-    pictures = light_pictures(KeptPicture.load(path))
+    pictures = light_pictures(RelightData.load(path))
     names = [row.name for row in pictures.rows]
     assert names == ["Light 0", "Light 1", "Light 2", "Light group Sky", REST]
     assert pictures.rows[3].note == NOT_SHADED

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import quadrature
+from precisions import assert_close
 from surface_scenes import area_light, random_samples, single_sample, unit
-from test_single_precision import assert_close
 
 from ltsh_addon import shading
 from ltsh_addon.lobes import brdf

@@ -467,7 +467,7 @@ def build_bake(output: Path) -> None:
         found = {"name": name, "uv": "UVMap", "outside": 0.0, "tiles": {"1001": tile}}
         report = {"scene": "room.blend", "frame": 1, "size": [64, 64], "view": "camera", "problems": [], "warnings": [],
                   "versions": versions, "objects": [found]}  # fmt: skip
-        task = tasks.Task("room.blend", None, None, name, name, "key")
+        task = tasks.BatchTask("room.blend", None, None, name, name, "key")
         job_tasks.append(vars(task))
         records.write(name, "key", vars(task), [f"{name}.exr"], report=report)
         tasks.write_record(

@@ -4,8 +4,8 @@ import logging
 
 import numpy as np
 import pytest
+from known_tracers import floor, panel
 from occluder_scenes import sphere
-from test_ratio import floor, panel
 
 from ltsh_addon.blender.process.blender_process import embree_libraries
 from ltsh_addon.scene import PASSES, Cancelled

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from kills import is_running
+from kills import all_ended, is_running
+from precisions import techniques_and_types
 from surface_scenes import area_light, four_lights, random_samples
 
 from ltsh_addon import shading
@@ -18,49 +19,10 @@ from ltsh_addon.shading import float32, integrator
 from ltsh_addon.workers import pool
 
 ROOT = Path(__file__).resolve().parents[2]
-TECHNIQUES = (*shading.SHIPPED_TABLES, shading.REFERENCE)
-DTYPES = [np.float32, np.float64, np.float32, np.float32, np.float64]
+pytestmark = pytest.mark.usefixtures("short_tasks_for_children")
 
 
-@pytest.fixture(autouse=True)
-def short_tasks_for_children(monkeypatch):
-    """Children start for any task; blocks are small."""
-    monkeypatch.setattr(pool, "SECONDS_WORTH_A_CHILD", 0.0)
-    for name in ("BLOCK_LIMITS", "REFERENCE_BLOCK_LIMITS"):
-        monkeypatch.setattr(integrator, name, (17, 17))
-
-
-@pytest.fixture
-def started(monkeypatch):
-    """The child processes that were started."""
-    found = []
-    original = subprocess.Popen
-
-    def popen(*arguments, **options):
-        found.append(original(*arguments, **options))
-        return found[-1]
-
-    monkeypatch.setattr(pool.subprocess, "Popen", popen)
-    return found
-
-
-@pytest.fixture
-def children_only(monkeypatch, started):
-    """This process takes no block as long as a child that was started lives."""
-    original = pool._Queue.next
-
-    def patient(self):
-        here = threading.current_thread() is threading.main_thread()
-        return None if here and any(process.poll() is None for process in started) else original(self)
-
-    monkeypatch.setattr(pool._Queue, "next", patient)
-
-
-def all_ended(processes):
-    return all(process.returncode is not None for process in processes)
-
-
-@pytest.mark.parametrize(("technique", "dtype"), list(zip(TECHNIQUES, DTYPES, strict=True)))
+@techniques_and_types
 def test_workers_do_not_change_one_bit(technique, dtype, started, children_only):
     """All blocks come from children, against all blocks from this process."""
     samples = replace(random_samples(90, seed=6), bump_alpha2=np.full(90, 0.1))
@@ -202,7 +164,8 @@ import sys, time
 sys.path[:0] = [{root!r}, {tests!r}]
 from surface_scenes import area_light, four_lights, random_samples
 from ltsh_addon import shading
-from ltsh_addon.shading import float32, integrator, parallel
+from ltsh_addon.shading import integrator
+from ltsh_addon.workers import pool
 pool.SECONDS_WORTH_A_CHILD = 0.0
 integrator.REFERENCE_BLOCK_LIMITS = (8, 8)
 original = pool.subprocess.Popen

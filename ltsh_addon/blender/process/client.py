@@ -60,7 +60,7 @@ class ExtractOptions:
 
 
 @dataclass(frozen=True)
-class KeptByCycles:
+class LeftToCycles:
     """Where a finished picture takes direct light from Cycles, and why."""
 
     by_pass: dict[str, np.ndarray]  # masks (H, W)
@@ -125,7 +125,7 @@ class Extraction:
     indices: dict[str, np.ndarray] = field(default_factory=dict)
     problems: tuple[str, ...] = ()
     occluders: Occluders | None = None
-    kept: KeptByCycles | None = None
+    left_to_cycles: LeftToCycles | None = None
     origin: np.ndarray = field(default_factory=lambda: np.zeros(3))
     light_settings: dict[str, list[float]] = field(default_factory=dict)
     processor_seconds: float = 0.0  # of the child
@@ -177,7 +177,7 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
         if not problems and not options.for_finished:
             warnings += unlit(samples, lights, manifest["camera"])
             warnings += faceted(samples, lights)
-        kept = _kept(manifest, bits, film, shows_patches(samples, lights)) if options.for_finished else None
+        left_to_cycles = _kept(manifest, bits, film, shows_patches(samples, lights)) if options.for_finished else None
         # Back to positions in the file, in double precision.
         samples = replace(samples, position=samples.position + manifest["origin"])
         lights = tuple(light.moved(np.array(manifest["origin"])) for light in lights)
@@ -193,7 +193,7 @@ def extract(options: ExtractOptions, *, progress: Progress | None = None) -> Ext
             emission=rest.value[..., :3] if options.rest else None,
             background=rest.value[..., 3:] if options.rest else None,
             indices=_read_indices(options.indices, manifest, folder),
-            kept=kept,
+            left_to_cycles=left_to_cycles,
             occluders=Occluders.load(folder / manifest["occluders"]) if manifest["occluders"] else None,
             origin=np.array(manifest["origin"]),
             finer=gbuffer.FinerPoints.of(manifest["finer"]) if manifest.get("finer") else None,
@@ -219,11 +219,11 @@ def with_points(extraction: Extraction, count: int) -> Extraction:
     """
     samples, film = extraction.samples, extraction.film
     if count < film.sub_samples:
-        kept = extraction.point < count
-        samples, film = samples.take(kept), replace(film.take(kept), sub_samples=count)
+        is_first = extraction.point < count
+        samples, film = samples.take(is_first), replace(film.take(is_first), sub_samples=count)
         if extraction.weights is not None:
             seen = np.isfinite(film.whole)
-            film = film.unspread().shared(extraction.weights[:count], extraction.point[kept], seen)
+            film = film.unspread().shared(extraction.weights[:count], extraction.point[is_first], seen)
     # With depth of field the points of a pixel may be far from each other.
     if not extraction.has_lens and len(samples):
         samples, film = gbuffer.merged(samples, film)
@@ -237,7 +237,7 @@ def ended(extraction: Extraction) -> Extraction:
     """`extraction` with samples that end at the horizons of Cycles."""
     samples, film = extraction.samples, extraction.film
     hit = np.arange(len(samples)) if film.first is None else np.cumsum(film.first)
-    is_quick = extraction.kept is not None
+    is_quick = extraction.left_to_cycles is not None
     samples, index = end_at_horizons_of_cycles(samples, extraction.lights, hit, is_quick=is_quick)
     first = np.diff(index, prepend=-1) > 0
     if film.first is not None:
@@ -352,7 +352,7 @@ def _read_indices(keys: tuple[str, ...], manifest: dict, folder: Path) -> dict[s
     return {name: lobes.read_layer(channels, name, "X") for name in names}
 
 
-def _kept(manifest: dict, bits: list[np.ndarray], film: Film, is_faceted: np.ndarray) -> KeptByCycles:
+def _kept(manifest: dict, bits: list[np.ndarray], film: Film, is_faceted: np.ndarray) -> LeftToCycles:
     """Where a finished picture leaves direct light to Cycles: where a point of a pixel is not shaded as in Cycles."""
     found = manifest["kept"]
     by_pass = {
@@ -361,7 +361,7 @@ def _kept(manifest: dict, bits: list[np.ndarray], film: Film, is_faceted: np.nda
     }
     by_pass["specular"] |= film.image(is_faceted) > 0.0
     materials = found["materials"] + ["sharp reflections of the world (specular)"] * bool(is_faceted.any())
-    return KeptByCycles(by_pass, *map(tuple, (materials, found["everything"], found["warnings"])))
+    return LeftToCycles(by_pass, *map(tuple, (materials, found["everything"], found["warnings"])))
 
 
 def read_reference(manifest: dict, folder: Path) -> dict[str, np.ndarray] | None:

@@ -69,8 +69,6 @@ def _perform(job: dict, folder: Path, progress) -> dict:
         progress("build scene", 0.0)
         _module("blender.demo").build(Path(job["path"]))
         return {}
-    if job["task"] == "rays":
-        return _module("blender.process.blender_rays").cast(job, folder)
     if job["task"] == "bake":
         return _module("blender.extract.bake").extract_bake(job, folder, progress)
     if job["task"] == "facts":
@@ -82,9 +80,9 @@ def _perform(job: dict, folder: Path, progress) -> dict:
     if job["task"] == "view":
         return _module("blender.viewport.still").draw_view(job, folder, progress)
     if job["task"] == "world":
-        return _module("blender.viewport.still").show_world(job, folder)
+        return _module("blender.viewport.live_cycles").show_world(job, folder)
     if job["task"] == "lamps":
-        return _module("blender.viewport.still").show_lamps(job, folder, progress)
+        return _module("blender.viewport.live_cycles").show_lamps(job, folder, progress)
     if job["task"] == "apply":
         return _module("blender.extract.apply").apply_bake(job, progress)
     return _module("blender.extract.pixels").extract({**job, "since": _told[0]}, folder, progress)

@@ -12,7 +12,7 @@ import numpy as np
 from gpu_extras.batch import batch_for_shader
 
 from ...imaging.color import LUMINANCE_WEIGHTS, color_bar, signed_error_colors
-from ...pipeline.lighting import KeptPicture
+from ...pipeline.lighting import RelightData
 from ...pipeline.mixer import LightPictures
 from ...scene import error_line
 from . import results
@@ -46,7 +46,7 @@ def mixed(item, context) -> None:
     put_in_editor(context, item.id_data)
 
 
-def mix_render(name: str, pictures: LightPictures, kept: KeptPicture) -> None:
+def mix_render(name: str, pictures: LightPictures, kept: RelightData) -> None:
     """Give the mixer the lights of a final render of the scene `name`; called while Blender renders."""
 
     def take() -> None:

@@ -9,8 +9,8 @@ from typing import ClassVar
 import bpy
 import numpy as np
 
-from ...pipeline.mixer import Row
-from ...scene import Cancelled, Light, SceneError, error_line, light_of, listed
+from ...pipeline.mixer import MixerRow
+from ...scene import AreaLight, Cancelled, SceneError, error_line, listed
 from ..evaluated import EmitterTraits
 from ..lights.area import area_light, reason_to_leave_out
 from ..lights.linking import Receivers
@@ -72,7 +72,7 @@ def moved_rows(context, rows) -> dict[int, Light]:
     return found
 
 
-def targets(row: Row, item) -> dict[str, tuple[float, float, tuple[float, ...]]]:
+def targets(row: MixerRow, item) -> dict[str, tuple[float, float, tuple[float, ...]]]:
     """Power, exposure and color with which each light object of a row looks as the mixer shows it."""
     # Channels that the light lacks in the picture stay as they are.
     found, factor = {}, np.where(np.array(row.color) != 0.0, results.tint_of(row, item), 1.0)
@@ -95,7 +95,7 @@ def _stands_elsewhere(ob, kept: dict) -> bool:
     return not near or is_turned
 
 
-def state_of(row: Row, item) -> tuple[str, str]:
+def state_of(row: MixerRow, item) -> tuple[str, str]:
     """An icon, and a sentence if the light in the scene differs from that of the picture."""
     if not row.lights:
         return "INFO", row.note
@@ -117,7 +117,7 @@ class LTSH_UL_mixer(bpy.types.UIList):
     """Lights of a finished picture"""
 
     # Rows by name, found once per draw of the panel, because that looks at files.
-    rows: ClassVar[dict[str, Row]] = {}
+    rows: ClassVar[dict[str, MixerRow]] = {}
 
     def draw_item(self, context, layout, data, item, icon, active_data, active_property, index):
         line, row = layout.row(align=True), LTSH_UL_mixer.rows.get(item.name)

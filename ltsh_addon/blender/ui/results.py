@@ -14,8 +14,8 @@ import numpy as np
 
 from ...imaging.report import index_stamp, read_index
 from ...pipeline.display_layers import FILES
-from ...pipeline.lighting import KEPT_SUFFIX, KeptPicture
-from ...pipeline.mixer import MIXER_FILE, LightPictures, Mixer, Row
+from ...pipeline.lighting import RELIGHT_SUFFIX, RelightData
+from ...pipeline.mixer import MIXER_FILE, LightPictures, Mixer, MixerRow
 from ...pipeline.moved_lights import MovedLights
 from ...pipeline.relight import tint
 from ...scene import Light, SceneError, SurfaceSamples, light_of
@@ -273,11 +273,11 @@ def is_mixer_read(folder: Path) -> bool:
     return _mixer["stamp"] == stamp or _readings[stamp].done()
 
 
-def mix_render(scene, pictures: LightPictures, kept: KeptPicture) -> None:
+def mix_render(scene, pictures: LightPictures, relight_data: RelightData) -> None:
     """Give the mixer of `scene` the lights of a final render, and the samples for lights that move."""
     forget_renders()
-    size = sum(getattr(kept.extraction.samples, item.name).nbytes for item in fields(SurfaceSamples))
-    moved = MovedLights(lambda: (kept, kept.extraction.occluders)) if size <= MOST_BYTES else None
+    size = sum(getattr(relight_data.extraction.samples, item.name).nbytes for item in fields(SurfaceSamples))
+    moved = MovedLights(lambda: (relight_data, relight_data.extraction.occluders)) if size <= MOST_BYTES else None
     _rendered[scene.name] = Mixer(pictures), moved
     _take_rows(scene)
 
@@ -362,7 +362,7 @@ class Update:
             self.error = error
 
 
-def get_ready(scene, row: Row) -> None:
+def get_ready(scene, row: MixerRow) -> None:
     """Start what shading moved lights needs, because the light of `row` has moved or is still moving."""
     with suppress(SceneError):
         _moved_lights(scene).get_ready(light_of(row.light))
@@ -383,7 +383,7 @@ def _moved_lights(scene) -> MovedLights:
         return found
     if _mixer["moved"] is None:
         result = result_of(scene)
-        _mixer["moved"] = MovedLights.load((result.folder.parent / FILES[result.command]).with_suffix(KEPT_SUFFIX))
+        _mixer["moved"] = MovedLights.load((result.folder.parent / FILES[result.command]).with_suffix(RELIGHT_SUFFIX))
     return _mixer["moved"]
 
 
@@ -399,7 +399,7 @@ def mixed_pixels(scene) -> np.ndarray | None:
     return None if mixer is None else mixer.mixed([_factor(scene, row, item) for row, item in mixer_pairs(scene)])
 
 
-def _factor(scene, row: Row, item) -> np.ndarray:
+def _factor(scene, row: MixerRow, item) -> np.ndarray:
     if item is None:
         return np.ones(3)
     if not is_on(scene, item):
@@ -407,7 +407,7 @@ def _factor(scene, row: Row, item) -> np.ndarray:
     return item.power * 2.0**item.exposure * tint_of(row, item)
 
 
-def tint_of(row: Row, item) -> np.ndarray:
+def tint_of(row: MixerRow, item) -> np.ndarray:
     """Factors (3,) that give a row the color of the mixer."""
     # Blender stores colors in single precision.
     same = np.allclose(item.color, row.color, rtol=1e-6, atol=1e-6)
@@ -419,7 +419,7 @@ def is_on(scene, item) -> bool:
     return not item.muted and (item.solo or not any(other.solo for other in scene.ltsh.mixed))
 
 
-def is_neutral(row: Row, item) -> bool:
+def is_neutral(row: MixerRow, item) -> bool:
     """True if power, exposure and color are as rendered."""
     return item.power == 1.0 and item.exposure == 0.0 and bool((tint_of(row, item) == 1.0).all())
 

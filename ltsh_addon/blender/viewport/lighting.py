@@ -17,20 +17,9 @@ from ...cycles import horizons
 from ...lobes.lookup_table import LookupTable
 from ...scene import PASSES, Light, PolygonLight
 from ...shading import load_table
+from .gbuffer import SAMPLERS, SHARE_SAMPLERS, GBufferTextures, empty_texture, float_texture, frame_buffer
+from .light_texels import UploadedLights, dielectric_texels, shares, table_texels, upload_lights
 from .shaders import BOUNDS, CHOICE, EXCESS, HORIZON_SAMPLERS, Features, horizon_shader, lighting_shader
-from .textures import (
-    SAMPLERS,
-    SHARE_SAMPLERS,
-    GBufferTextures,
-    UploadedLights,
-    dielectric_texels,
-    empty_texture,
-    float_texture,
-    frame_buffer,
-    shares,
-    table_texels,
-    upload_lights,
-)
 
 _RESULTS = {BOUNDS: "light_bounds", EXCESS: "excesses", CHOICE: "horizons"}
 _SHOWN_PASSES = (*PASSES, "combined")

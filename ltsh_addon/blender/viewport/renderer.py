@@ -7,60 +7,32 @@ the picture is their mean.
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import replace
 
 import gpu
 import numpy as np
 
-from ...shading.header import definitions
 from ..extract.origin import new_origin
 from ..materials.values import Value
+from .camera import ViewCamera
+from .gbuffer import GBufferTextures, VisibilityGrid, float_texture, read_texture
+from .light_texels import UploadedLights, upload_lights
 from .lighting import GOLDEN, HorizonPass, LightingPass
 from .mirror import SceneMirror
-from .shaders import glsl, pixel_shader
-from .shadows import LiveShadows, ShadowRays
+from .pictures import CopyPass, PicturePass, SampleSum, ShownPicture, VeilPass
+from .shadow_rays import ShadowRays
+from .shadows import LiveShadows
 from .sky import background_texels, sky_texels
-from .surfaces import SurfacePass, View, has_bent_lobes
-from .textures import (
-    GBufferTextures,
-    ShareGrid,
-    UploadedLights,
-    empty_texture,
-    float_texture,
-    frame_buffer,
-    read_texture,
-    upload_lights,
-)
+from .static_lighting import LightingState, StaticLighting, same_state
+from .surfaces import SurfacePass, has_bent_lobes
 
-MODES = ("single", "split", "difference")
 # MOST_IORS: indices of refraction for which the lighting pass is fast. It is exact for all.
 MOST_IORS = 6
-# RAYS: the shader constants with the rays of `View.rays`.
-RAYS = ("ray_x", "ray_y", "ray_center")
 # CENTERS: the points of pixels of a single frame, their centers, in pixels right and up of them.
 CENTERS = np.zeros((1, 2))
 
 
-@dataclass(frozen=True)
-class ShownPicture:
-    """Which parts of the lighting are shown, and how."""
-
-    technique: str
-    passes: str  # combined, specular or diffuse
-    mode: str  # of MODES
-    second_technique: str
-    split: float  # place of the line between 0 and 1
-    difference_scale: float
-    exposure: float
-    transparent: bool
-    line_width: float = 1.0
-    second_picture: gpu.types.GPUTexture | None = None  # replaces the second technique's picture; without emission
-    white: float = 1.0  # brightness that shows no difference, before the scene's own exposure
-    also: tuple[tuple[str, str], ...] = ()  # further techniques and passes to draw, for `read`
-    world: bool = True  # show the light of the world
-
-
-def _origin_of(lights, view: View) -> np.ndarray:
+def _origin_of(lights, view: ViewCamera) -> np.ndarray:
     """An origin near what is seen, because single precision is coarse far from the origin."""
     places = np.array([light.center for light in lights if not light.is_distant])
     if len(places) == 0:
@@ -68,112 +40,26 @@ def _origin_of(lights, view: View) -> np.ndarray:
     return new_origin(places, places.mean(axis=0) if view.is_parallel else view.eye)
 
 
-class PicturePass:
-    """Draws one or two pictures into the bound frame buffer; needs an active GPU context."""
-
-    def __init__(self):
-        constants = {"mode": "INT", "scales": "VEC4", "opacity": "FLOAT", "white": "FLOAT", "weights": "VEC2"}
-        constants |= dict.fromkeys(RAYS, "VEC4")
-        modes = definitions({mode.upper(): number for number, mode in enumerate(MODES)})
-        source = modes + glsl("octahedron") + glsl("picture")
-        self._shader, self._batch = pixel_shader(source, ("first_picture", "second_picture", "sky"), constants)
-
-    def draw(self, pictures, weights, view: View, shown: ShownPicture, background) -> None:
-        """Fill the bound frame buffer, scene-linear, from one or two RGBA textures times their `weights`.
-
-        The weighted alpha is the share of a pixel that shows a surface. `background` is a texture of
-        `sky.background_texels`.
-        """
-        size = pictures[0].width, pictures[0].height
-        gpu.state.viewport_set(0, 0, *size)
-        gpu.state.blend_set("NONE")
-        gpu.state.depth_test_set("NONE")
-        gpu.state.depth_mask_set(False)
-        shader = self._shader
-        shader.bind()
-        shader.uniform_sampler("first_picture", pictures[0])
-        shader.uniform_sampler("second_picture", pictures[-1])
-        shader.uniform_float("weights", (weights[0], weights[-1]))
-        shader.uniform_int("mode", MODES.index(shown.mode))
-        scales = (shown.exposure, shown.difference_scale, shown.split * size[0], 0.5 * shown.line_width)
-        shader.uniform_float("scales", scales)
-        shader.uniform_sampler("sky", background)
-        shader.uniform_float("opacity", 0.0 if shown.transparent else 1.0)
-        is_behind = shown.passes == "combined" and not shown.transparent
-        for name, ray in zip(RAYS, view.rays, strict=True):
-            shader.uniform_float(name, (*ray, float(is_behind)))
-        shader.uniform_float("white", shown.white)
-        self._batch.draw(shader)
-
-
-class CopyPass:
-    """Copies a picture into another one; needs an active GPU context."""
-
-    def __init__(self):
-        self._shader, self._batch = pixel_shader(glsl("copy"), ("picture",), {})
-
-    def draw(self, picture: gpu.types.GPUTexture, target: gpu.types.GPUFrameBuffer) -> None:
-        """Copy `picture` into `target`, which has its size."""
-        with target.bind():
-            gpu.state.viewport_set(0, 0, picture.width, picture.height)
-            gpu.state.blend_set("NONE")
-            gpu.state.depth_test_set("NONE")
-            self._shader.bind()
-            self._shader.uniform_sampler("picture", picture)
-            self._batch.draw(self._shader)
-
-
-class VeilPass:
-    """Draws what is behind glass; needs an active GPU context."""
-
-    def __init__(self):
-        constants = {"is_seen": "FLOAT", **dict.fromkeys(RAYS, "VEC4")}
-        samplers = ("behind", "left", "glass", "sky")
-        self._shader, self._batch = pixel_shader(glsl("octahedron") + glsl("veil"), samplers, constants)
-
-    def draw(self, textures, target, view: View, is_seen: bool) -> None:
-        """Add the picture of the surfaces, over the background, to `target`, dimmed where there is glass.
-
-        `textures` are the picture (RGBA), the share that glass lets through (RGB), the positions of the glass, and the
-        background. Without `is_seen` the background behind glass is black.
-        """
-        shader = self._shader
-        with target.bind():
-            gpu.state.viewport_set(0, 0, textures[0].width, textures[0].height)
-            gpu.state.blend_set("ADDITIVE_PREMULT")
-            gpu.state.depth_test_set("NONE")
-            try:
-                shader.bind()
-                for name, texture in zip(("behind", "left", "glass", "sky"), textures, strict=True):
-                    shader.uniform_sampler(name, texture)
-                shader.uniform_float("is_seen", float(is_seen))
-                for name, ray in zip(RAYS, view.rays, strict=True):
-                    shader.uniform_float(name, (*ray, 1.0))
-                self._batch.draw(shader)
-            finally:
-                gpu.state.blend_set("NONE")
-
-
-class _Layer:
+class SurfaceLayer:
     """The G-buffer of one layer, surfaces or glass, and the horizons that end its lobes."""
 
-    def __init__(self, before: _Layer | None = None):
+    def __init__(self, before: SurfaceLayer | None = None):
         self._surfaces = SurfacePass(None if before is None else before._surfaces)
         self._horizons: HorizonPass | None = None
         self._lobe_horizons: HorizonPass | None = None
         self._gbuffer: GBufferTextures | None = None
         self._lit: GBufferTextures | None = None
         self.smooth_normal: gpu.types.GPUTexture | None = None  # of the lobe that is lit
-        self.shares: ShareGrid | None = None  # shares for all lobes
+        self.shares: VisibilityGrid | None = None  # shares for all lobes
         self.threshold = 0.5  # see `HorizonPass.draw`
         self.through, self.add_emission = self._surfaces.through, self._surfaces.add_emission
 
-    def draw(self, mirror, view: View, size) -> None:
+    def draw(self, mirror, view: ViewCamera, size) -> None:
         """Draw the surfaces."""
         self._lit = None
         self._gbuffer = self._surfaces.draw(mirror.instances, view, size)
 
-    def choose_horizons(self, mirror, view: View, lights: UploadedLights) -> None:
+    def choose_horizons(self, mirror, view: ViewCamera, lights: UploadedLights) -> None:
         """Choose the horizons of specular lobes as Cycles does; diffuse lobes keep a second one only if they need it.
 
         Only bump-mapped and translucent looks need it.
@@ -193,7 +79,7 @@ class _Layer:
         """True if the horizons are chosen."""
         return self._lit is not None
 
-    def lobe(self, number: int, mirror, view: View, lights: UploadedLights) -> GBufferTextures:
+    def lobe(self, number: int, mirror, view: ViewCamera, lights: UploadedLights) -> GBufferTextures:
         """The G-buffer of the lobes `number`, with their horizons; valid until the next call."""
         if number == 0:
             self.smooth_normal = self._gbuffer.smooth_normal
@@ -203,7 +89,7 @@ class _Layer:
             self._lobe_horizons = HorizonPass()
         return self._with_horizons(gbuffer, self._lobe_horizons, mirror, view, lights)
 
-    def _with_horizons(self, gbuffer, horizons, mirror, view: View, lights) -> GBufferTextures:
+    def _with_horizons(self, gbuffer, horizons, mirror, view: ViewCamera, lights) -> GBufferTextures:
         self.smooth_normal = gbuffer.smooth_normal
         if gbuffer.geometric_normal is None:
             return gbuffer
@@ -220,81 +106,12 @@ class _Layer:
         self._gbuffer = self._lit = self.smooth_normal = self._horizons = self._lobe_horizons = None
 
 
-class _Target:
-    """A picture that holds the sum of the samples."""
-
-    def __init__(self, size: tuple[int, int]):
-        self.texture, self._buffers = empty_texture(size), {}
-
-    def within(self, mask: gpu.types.GPUTexture | None = None) -> gpu.types.GPUFrameBuffer:
-        """The frame buffer of the picture, with `mask` as its depth buffer."""
-        if mask not in self._buffers:
-            self._buffers[mask] = frame_buffer(self.texture, mask)
-        return self._buffers[mask]
-
-    def clear(self) -> None:
-        """Begin a new sum."""
-        self.texture.clear(format="FLOAT", value=(0.0, 0.0, 0.0, 0.0))
-
-
-# With more lights, telling which of them have changed takes longer than it saves.
-MOST_COMPARED = 512
-
-
-@dataclass(frozen=True)
-class _Lit:
-    """What a picture was lit with: state of surfaces and view (see `_same`), lights, and sources of their shares."""
-
-    state: tuple
-    lights: tuple
-    sources: tuple
-
-    def changes(self, new: _Lit) -> frozenset[int] | None:
-        """Numbers of the lights that are others in the picture `new`; None where more has changed."""
-        count = len(self.lights)
-        if not _same(new.state, self.state) or len(new.lights) != count or count > MOST_COMPARED:
-            return None
-        pairs = zip(self.lights, new.lights, strict=True)
-        return frozenset(number for number, (a, b) in enumerate(pairs) if not is_equal(a, b))
-
-    def has_same_shares(self, new: _Lit, left_out: frozenset[int]) -> bool:
-        """True if the shares are the same, but for those of the lights `left_out`."""
-        if len(self.sources) != len(new.sources):
-            return False
-        kept = [number for number in range(len(self.sources)) if number not in left_out]
-        return all(a is b for number in kept for a, b in zip(self.sources[number], new.sources[number], strict=True))
-
-
-def is_equal(a, b) -> bool:
-    """True for lights that look the same, and for their parts: arrays, cones, patterns, words and numbers."""
-    if a is b or type(a) is not type(b):
-        return a is b
-    if not is_dataclass(a):
-        return np.array_equal(a, b)
-    names = (item.name for item in fields(a) if item.name != "children")
-    return all(is_equal(getattr(a, name), getattr(b, name)) for name in names)
-
-
-@dataclass(frozen=True)
-class _Held:
-    """The light of all lights but the `moving` ones, kept while these change."""
-
-    lit: _Lit
-    moving: frozenset[int]
-    targets: list[_Target]
-
-    def fits(self, new: _Lit) -> bool:
-        """True if it is a part of the picture `new`."""
-        changes = self.lit.changes(new)
-        return changes is not None and changes <= self.moving and self.lit.has_same_shares(new, self.moving)
-
-
 class ViewRenderer:
     """The GPU's side of one view; needs an active GPU context."""
 
     def __init__(self):
-        self._surfaces = _Layer()
-        self._glass: _Layer | None = None
+        self._surfaces = SurfaceLayer()
+        self._glass: SurfaceLayer | None = None
         self._picture = PicturePass()
         self._veil: VeilPass | None = None
         self._copy: CopyPass | None = None
@@ -304,14 +121,20 @@ class ViewRenderer:
         self._lights: UploadedLights | None = None
         self._drawn, self._uploaded = None, (None, None, None)
         self._still, self.samples = None, 0
-        self._lit: _Lit | None = None
-        self._held: _Held | None = None
+        self._lit: LightingState | None = None
+        self._held: StaticLighting | None = None
         self._is_split = False
         self._sky, self._sky_light, self._background = None, None, None
         self.shadows: ShadowRays | LiveShadows | None = None
 
     def draw(
-        self, mirror: SceneMirror, view: View, size: tuple[int, int], shown: ShownPicture, frame_buffer, points=CENTERS
+        self,
+        mirror: SceneMirror,
+        view: ViewCamera,
+        size: tuple[int, int],
+        shown: ShownPicture,
+        frame_buffer,
+        points=CENTERS,
     ) -> None:
         """Draw the scene into `frame_buffer`, which has `size` pixels.
 
@@ -335,7 +158,7 @@ class ViewRenderer:
             traced = self.shadows.version
         things = mirror, mirror.lights, mirror.sky, self.shadows
         still = things, (mirror.surfaces_version, *_key(view, size), asked, traced)
-        is_same = _same(still, self._still)
+        is_same = same_state(still, self._still)
         if not is_same or self._is_split:
             self.samples = 0
         if self.samples < len(points):
@@ -346,7 +169,7 @@ class ViewRenderer:
             self._still, self.samples = still, self.samples + is_drawn
         self._show([self._targets[number].texture for number in range(pictures)], view, shown, frame_buffer)
 
-    def show(self, number: int, view: View, shown: ShownPicture, frame_buffer) -> None:
+    def show(self, number: int, view: ViewCamera, shown: ShownPicture, frame_buffer) -> None:
         """Draw the picture `number` of those drawn last, as `draw` does; `shown` must have its passes."""
         self._show([self._targets[number].texture], view, shown, frame_buffer)
 
@@ -359,7 +182,7 @@ class ViewRenderer:
             self._picture.draw(pictures, weights, view, shown, self._background)
 
     def _draw_sample(
-        self, mirror, view: View, size, wanted: list[tuple[str, str]], with_emission: bool, world: bool, state
+        self, mirror, view: ViewCamera, size, wanted: list[tuple[str, str]], with_emission: bool, world: bool, state
     ) -> bool:
         """Add one point of every pixel to the targets of `wanted` techniques and passes; the first point replaces them.
 
@@ -400,16 +223,16 @@ class ViewRenderer:
         self._add_emission(self._glass, wanted, targets, (mirror, view, size), with_emission)
         return True
 
-    def _draw_surfaces(self, mirror, view: View, size) -> bool:
+    def _draw_surfaces(self, mirror, view: ViewCamera, size) -> bool:
         """Draw the G-buffers if anything has changed; True if so."""
         drawn = (mirror,), (mirror.surfaces_version, *_key(view, size))
-        if _same(drawn, self._drawn):
+        if same_state(drawn, self._drawn):
             return False
         self._drawn = None
         self._surfaces.draw(mirror, view, size)
         if mirror.has_glass:
             if self._glass is None:
-                self._glass, self._veil = _Layer(self._surfaces), VeilPass()
+                self._glass, self._veil = SurfaceLayer(self._surfaces), VeilPass()
             self._glass.draw(mirror, view, size)
         self._drawn = drawn
         return True
@@ -422,7 +245,7 @@ class ViewRenderer:
         self._sky_light = float_texture(sky_texels(sky)) if sky.sides else None
         self._background = float_texture(background_texels(sky))
 
-    def _upload_lights(self, mirror, view: View, world: bool) -> bool:
+    def _upload_lights(self, mirror, view: ViewCamera, world: bool) -> bool:
         """Upload the lights if they or the origin of the view have changed; True if so."""
         lights = mirror.lights if world else mirror.own_lights
         known, sky, origin = self._uploaded
@@ -434,14 +257,14 @@ class ViewRenderer:
         self._uploaded = lights, wanted, view.origin
         return True
 
-    def _shares(self, layer: _Layer, gbuffer: GBufferTextures, mirror, view: View) -> ShareGrid | None:
+    def _shares(self, layer: SurfaceLayer, gbuffer: GBufferTextures, mirror, view: ViewCamera) -> VisibilityGrid | None:
         """The shares of the lights that the lobe `gbuffer` of a layer sees."""
         shadows = self.shadows.of_glass if layer is self._glass else self.shadows
         sides = () if self._lights.sky is None else mirror.sky.sides
         whole = replace(gbuffer, smooth_normal=layer.smooth_normal)
         return shadows.shares(whole, view, self._lights.lights, sides, self.samples)
 
-    def _light_surfaces(self, wanted, targets: list[_Target], seen: tuple, state: tuple | None) -> None:
+    def _light_surfaces(self, wanted, targets: list[SampleSum], seen: tuple, state: tuple | None) -> None:
         """Light the surfaces as `_light` does; with a `state` (see `_draw_sample`) perhaps only by what has changed."""
         layer, lights = self._surfaces, self._lights.lights
         self._is_split = False
@@ -450,15 +273,15 @@ class ViewRenderer:
             return
         shares = layer.shares
         sources = () if shares is None else shares.sources or ((shares, None),) * (len(lights) + 1)
-        before, self._lit = self._lit, _Lit(state, lights, sources)
+        before, self._lit = self._lit, LightingState(state, lights, sources)
         if self._held is None or not self._held.fits(self._lit):
             moving, self._held = None if before is None else before.changes(self._lit), None
             if not moving or len(moving) == len(lights):
                 self._light(layer, wanted, targets, seen)
                 return
-            held = [_Target(layer.size) for _ in wanted]
+            held = [SampleSum(layer.size) for _ in wanted]
             self._light(layer, wanted, held, seen, numbers=frozenset(range(len(lights))) - moving)
-            self._held = _Held(self._lit, moving, held)
+            self._held = StaticLighting(self._lit, moving, held)
         if self._copy is None:
             self._copy = CopyPass()
         for held, target in zip(self._held.targets, targets, strict=True):
@@ -468,9 +291,9 @@ class ViewRenderer:
 
     def _light(
         self,
-        layer: _Layer,
+        layer: SurfaceLayer,
         wanted: list[tuple[str, str]],
-        targets: list[_Target],
+        targets: list[SampleSum],
         seen: tuple,
         first: str = "ADDITIVE_PREMULT",
         numbers: Collection[int] | None = None,
@@ -493,7 +316,7 @@ class ViewRenderer:
                 buffer = target.within(gbuffer.mask)
                 lighting.draw(gbuffer, buffer, passes, view=view.homogeneous_eye, blend=blend, numbers=numbers)
 
-    def _add_emission(self, layer: _Layer, wanted, targets, seen: tuple, with_emission: bool) -> None:
+    def _add_emission(self, layer: SurfaceLayer, wanted, targets, seen: tuple, with_emission: bool) -> None:
         mirror, view, size = seen
         for (_, passes), target in zip(wanted, targets, strict=True):
             if with_emission and passes == "combined":
@@ -508,12 +331,12 @@ class ViewRenderer:
         return lighting
 
     @staticmethod
-    def _target(targets: list[_Target], number: int, size) -> _Target:
+    def _target(targets: list[SampleSum], number: int, size) -> SampleSum:
         """The picture `number` of `targets`, created if needed."""
         if len(targets) > number and (targets[number].texture.width, targets[number].texture.height) != size:
             targets.clear()
         while len(targets) <= number:
-            targets.append(_Target(size))
+            targets.append(SampleSum(size))
         return targets[number]
 
     def read(self, number: int = 0) -> np.ndarray:
@@ -534,13 +357,8 @@ class ViewRenderer:
         self._lit = self._held = self._copy = None
 
 
-def _key(view: View, size) -> tuple:
+def _key(view: ViewCamera, size) -> tuple:
     return view.projection.tobytes(), view.eye.tobytes(), view.is_parallel, view.origin.tobytes(), size
-
-
-def _same(new, old) -> bool:
-    """True if two states have identical objects of the scene, their first part, and equal values, their second."""
-    return old is not None and new[1] == old[1] and all(a is b for a, b in zip(new[0], old[0], strict=True))
 
 
 def common_iors(mirror: SceneMirror) -> tuple[float, ...]:

@@ -36,7 +36,7 @@ from ...shading.header import (
     source_text,
     table_sizes,
 )
-from . import sky, textures
+from . import light_texels, sky
 
 # Limits of the half diagonal of a light, as the lobe sees it, for cheaper ways of integration.
 # TINY_LIGHT: up to it lights are sampled by triangles. There the errors of that and of the rounding of edges, which
@@ -190,8 +190,8 @@ def _lighting_constants(table) -> dict:
     return {
         **sizes,
         "BLOCKS": -(-sizes["COEFFICIENTS"] // 4),
-        **textures.constants(),
-        "IOR_STEPS": float_literal(textures.IOR_STEPS),
+        **light_texels.constants(),
+        "IOR_STEPS": float_literal(light_texels.IOR_STEPS),
         "ONE_OVER_PI": float_literal(1.0 / np.pi),
         "PI": float_literal(np.pi),
         "LEAST_ROUGHNESS": LEAST_ROUGHNESS,
@@ -199,7 +199,7 @@ def _lighting_constants(table) -> dict:
         "SHORT_ARC": float_literal(2.0 * np.cos(0.5 * SHORT_ARC)),
         "MOST_ARCS": MOST_ARCS,
         "MOST_HALVINGS": MOST_HALVINGS,
-        "QUAD_FIRST": textures.QUAD_FIRST,
+        "QUAD_FIRST": light_texels.QUAD_FIRST,
         "SKY_SIZE": sky.SIZE,
         "SKY_LEVELS": sky.LEVELS,
         "SKY_POINTS": sky.POINTS,
@@ -216,8 +216,8 @@ def _lighting_constants(table) -> dict:
         "PEAK_WEIGHT": float_literal(9.0 * (NODES_ALONG + 1) * facing.PEAK_WEIGHT),
         "FEW_LAYERS": plain.layers,
         "MANY_LAYERS": beyond.layers,
-        "FEW_NODES": textures.NODES_FIRST[plain.layers],
-        "MANY_NODES": textures.NODES_FIRST[beyond.layers],
+        "FEW_NODES": light_texels.NODES_FIRST[plain.layers],
+        "MANY_NODES": light_texels.NODES_FIRST[beyond.layers],
         "CHORDS": plain.chords,
         "SHARP_CHORDS": sharp.chords,
         "SHARPEST_CHORDS": sharpest.chords,
@@ -229,8 +229,8 @@ def _lighting_constants(table) -> dict:
         "ROUND_MARGIN": light_profile.ROUND_MARGIN,
         "FEW_CORNERS": few_corners,
         "MANY_CORNERS": many_corners,
-        "FEW_CORNERS_FIRST": textures.circle_first(few_corners),
-        "MANY_CORNERS_FIRST": textures.circle_first(many_corners),
+        "FEW_CORNERS_FIRST": light_texels.circle_first(few_corners),
+        "MANY_CORNERS_FIRST": light_texels.circle_first(many_corners),
         # Each of three horizons may add a corner.
         "MOST_CORNERS": many_corners + 3,
     }
@@ -238,7 +238,7 @@ def _lighting_constants(table) -> dict:
 
 def _level_lines() -> Iterator[str]:
     """Statements that choose the corners of a round light by its apparent width."""
-    for first, count, limit in reversed(textures.ROUND_LEVELS):
+    for first, count, limit in reversed(light_texels.ROUND_LEVELS):
         condition = "round && whole" if count < ROUND_CORNERS[0] else "round"
         if not np.isinf(limit):
             condition += f" && wide <= {float_literal(limit)}"
@@ -561,9 +561,9 @@ def horizon_shader(step: str):
     """The shader of one step, and its batch."""
     values = {
         step.upper(): 1,
-        **textures.constants(),
-        "QUAD_FIRST": textures.QUAD_FIRST,
-        "ROUND_FIRST": textures.circle_first(HORIZON_CORNERS),
+        **light_texels.constants(),
+        "QUAD_FIRST": light_texels.QUAD_FIRST,
+        "ROUND_FIRST": light_texels.circle_first(HORIZON_CORNERS),
         "ROUND_CORNERS": HORIZON_CORNERS,
         "SMALLEST_ANGLE": float_literal(horizons.SMALLEST_ANGLE),
         "SMALLEST_ALPHA": float_literal(horizons.SMALLEST_ALPHA),

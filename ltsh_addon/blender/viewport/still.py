@@ -11,24 +11,24 @@ import bpy
 import gpu
 import numpy as np
 
-from ...cycles.environment import SkyPicture
 from ...files import save_array
-from ...scene import Light, SceneError, error_line, listed
+from ...scene import SceneError, error_line, listed
 from .. import render_settings
 from ..extract.occluders import collect_occluders
 from ..extract.pixels import no_light, open_scene
-from ..lights.emission import ObjectFacts, open_studio
-from ..lights.textures import UnseenLight, seen_factor
-from ..lights.world import background_pictures, blocks_nothing, light_of_world, light_pictures
+from ..lights.world import blocks_nothing, light_of_world
 from ..materials.looks import world_radiance
-from ..process.client import GRAPHICS, LAMPS, VIEW_PASSES, VIEW_PNG
+from ..process.client import GRAPHICS, VIEW_PASSES, VIEW_PNG
 from ..render_settings import cycles_setting
-from .mirror import NOT_RESOLVED, SceneMirror, patterns_of
-from .renderer import CENTERS, ShownPicture, ViewRenderer
-from .shadows import ShadowRays, too_many
-from .sky import ShownSky, background_of, coarse, varied_sky
-from .surfaces import View
-from .textures import read_texture
+from .camera import ViewCamera
+from .gbuffer import read_texture
+from .lights import NOT_RESOLVED, patterns_of
+from .live_cycles import look_at_world
+from .mirror import SceneMirror
+from .pictures import ShownPicture
+from .renderer import CENTERS, ViewRenderer
+from .shadow_rays import ShadowRays, too_many
+from .sky import ShownSky, varied_sky
 
 TIMED = 3  # redraws whose median time is reported
 # FEWEST_RAYS: a point of a pixel takes at least so many rays per light, however many points share those of the pixel.
@@ -166,50 +166,6 @@ def _sky(scene, warnings: list[str]) -> ShownSky | None:
     return varied_sky(light_of_world(world), *look_at_world(scene, world, warnings.append))
 
 
-def look_at_world(scene, world, warn: Callable) -> tuple[list[SkyPicture], list[Light], np.ndarray]:
-    """The `world` as Cycles renders it: pictures of its light ([] where it is dark), the small bright lights in it, and
-    its background (N, N, 3). `scene` is left as it was."""
-    like, light, lights = light_of_world(world), [], []
-    if like is not None:
-        light, lights = light_pictures(scene, world, like, warn)
-    return [coarse(picture) for picture in light], lights, background_of(background_pictures(scene, world, warn))
-
-
-def show_world(job: dict, folder: Path) -> dict:
-    """Do the `job` (see `client.look_at_world`): writes pictures into `folder`, returns lights and warnings."""
-    warnings: list[str] = []
-    bpy.ops.wm.read_factory_settings(use_empty=True)
-    scene = bpy.context.scene
-    with bpy.data.libraries.load(job["path"]) as (_, wanted):
-        wanted.worlds = [job["world"]]
-    (scene.world,) = wanted.worlds
-    scene.frame_set(job["frame"])
-    light, lights, background = look_at_world(scene, scene.world, warnings.append)
-    save_array(folder / "light.npy", np.array([picture.radiance for picture in light], np.float32))
-    save_array(folder / "background.npy", background.astype(np.float32))
-    return {"lights": [one.record() for one in lights], "warnings": warnings}
-
-
-def show_lamps(job: dict, folder: Path, progress: Callable) -> dict:
-    """Do the `job` (see `client.look_at_lamps`): writes the factors of each light's nodes into `folder`."""
-    bpy.ops.wm.read_factory_settings(use_empty=True)
-    scene, count = bpy.context.scene, len(job["lamps"])
-    scene.frame_set(job["frame"])
-    for number, lamp in enumerate(job["lamps"]):
-        with bpy.data.libraries.load(lamp["path"]) as (there, wanted):
-            if lamp["name"] not in there.lights:
-                raise SceneError(f"{lamp['path']}: has no light {lamp['name']!r}")
-            wanted.lights = [lamp["name"]]
-        facts = ObjectFacts(**lamp["facts"])
-        source = UnseenLight(wanted.lights[0], np.array(lamp["matrix"]), facts=facts, **lamp["flags"])
-        with open_studio(scene) as studio:
-            found = seen_factor(source, studio)
-        save_array(folder / f"{number}.npy", found.factor.astype(np.float32))
-        save_array(folder / f"{number}_lost.npy", np.array(found.lost))
-        progress(LAMPS, (number + 1) / count)
-    return {}
-
-
 def _layer(scene):
     return next((layer for layer in scene.view_layers if layer.use), scene.view_layers[0])
 
@@ -263,12 +219,12 @@ def _facts(shadows: ShadowRays, samples: int) -> dict:
     return {"rays": shadows.traced, "noise": noise, "tracer": shadows.description, "seconds": shadows.seconds}
 
 
-def view_of_camera(camera, depsgraph, size: tuple[int, int]) -> View:
+def view_of_camera(camera, depsgraph, size: tuple[int, int]) -> ViewCamera:
     """The view of the evaluated object `camera` in a picture of `size`."""
     render = depsgraph.scene_eval.render
     aspect = {"scale_x": render.pixel_aspect_x, "scale_y": render.pixel_aspect_y}
     window = camera.calc_matrix_camera(depsgraph, x=size[0], y=size[1], **aspect)
-    return View.of(camera.matrix_world.normalized().inverted(), window, camera.data.type == "ORTHO")
+    return ViewCamera.of(camera.matrix_world.normalized().inverted(), window, camera.data.type == "ORTHO")
 
 
 def _shown(scene, technique: str) -> ShownPicture:
@@ -287,7 +243,7 @@ def _shown(scene, technique: str) -> ShownPicture:
 class _Canvas:
     """A floating-point picture that a view is drawn into; needs an active GPU context."""
 
-    def __init__(self, mirror: SceneMirror, view: View, size: tuple[int, int]):
+    def __init__(self, mirror: SceneMirror, view: ViewCamera, size: tuple[int, int]):
         self._mirror, self._view, self._size = mirror, view, size
         self._renderer = _renderer[0] if _renderer else ViewRenderer()
         self._texture = gpu.types.GPUTexture(size, format="RGBA32F")

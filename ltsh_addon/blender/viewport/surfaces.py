@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import bpy
 import gpu
 import numpy as np
@@ -11,19 +9,11 @@ from mathutils import Matrix
 
 from ...shading.header import filled
 from ..materials.looks import IMAGE_SLOTS, is_missing
+from .camera import ViewCamera
+from .gbuffer import GBufferTextures, float_texture
 from .mirror import ShownInstance, ShownLook
 from .shaders import glsl, pixel_shader, slope_text
-from .textures import (
-    DEFINES,
-    LOOK_SIZE,
-    GBufferTextures,
-    albedo_table,
-    blend_table,
-    float_table,
-    float_texture,
-    sheen_table,
-    uniform_buffer,
-)
+from .textures import DEFINES, LOOK_SIZE, albedo_table, blend_table, float_table, sheen_table, uniform_buffer
 
 # Outputs of the surface shader, in groups that are drawn into at once. A group has at most six textures.
 SURFACES = ("position", "normal", "base", "f0", "f90", "dielectric")
@@ -38,55 +28,6 @@ _AROUND = {"around": "VEC3"}
 # Before Blender 5.0, Cycles did not normalize interpolated normals for normal maps.
 NORMAL_MAPS_BEND_UNIT_NORMALS = bpy.app.version >= (5, 0, 0)
 MISSING_COLOR = (1.0, 0.0, 1.0, 1.0)  # of images that are not found, as in Cycles
-
-
-@dataclass(frozen=True)
-class View:
-    """The camera of a picture. All positions that are drawn are relative to `origin`."""
-
-    projection: np.ndarray  # (4, 4) to clip space
-    eye: np.ndarray  # (3,) position of the eye, or in parallel views the unit direction toward it
-    is_parallel: bool
-    origin: np.ndarray = field(default_factory=lambda: np.zeros(3))  # (3,) in the world
-
-    @classmethod
-    def of(cls, view_matrix: Matrix, window_matrix: Matrix, is_parallel: bool) -> View:
-        """The view of a region with these matrices."""
-        to_view = np.array(view_matrix, np.float64)
-        to_world = np.linalg.inv(to_view)
-        eye = to_world[:3, 2] / np.linalg.norm(to_world[:3, 2]) if is_parallel else to_world[:3, 3]
-        return cls(np.array(window_matrix, np.float64) @ to_view, eye, is_parallel)
-
-    def around(self, origin: np.ndarray) -> View:
-        """The same view of the world, with positions relative to `origin` (3,)."""
-        to_world = np.eye(4)
-        to_world[:3, 3] = origin - self.origin
-        eye = self.eye if self.is_parallel else self.eye - to_world[:3, 3]
-        return View(self.projection @ to_world, eye, self.is_parallel, origin)
-
-    def shifted(self, offset: np.ndarray, size: tuple[int, int]) -> View:
-        """The same view, in which pixels show the point `offset` (2,) pixels right and up of their centers.
-
-        `size` is that of the picture in pixels.
-        """
-        shift = np.eye(4)
-        shift[:2, 3] = -2.0 * np.asarray(offset) / size
-        return View(shift @ self.projection, self.eye, self.is_parallel, self.origin)
-
-    @property
-    def rays(self) -> np.ndarray:
-        """(3, 3): the change of the eye's ray from the center of the picture to its right end, the change to its upper
-        end, and the ray of the center. Rays may have any length."""
-        if self.is_parallel:
-            return np.stack([np.zeros(3), np.zeros(3), -self.eye])
-        back = np.linalg.inv(self.projection)
-        found = (back[:3] - self.eye[:, None] * back[3]).T
-        return np.stack([found[0], found[1], found[2] + found[3]]) / np.linalg.norm(found[2] + found[3])
-
-    @property
-    def homogeneous_eye(self) -> tuple[float, ...]:
-        """The eye's position and 1, or the direction toward it and 0."""
-        return (*self.eye, 0.0 if self.is_parallel else 1.0)
 
 
 class SurfacePass:
@@ -115,7 +56,7 @@ class SurfacePass:
         self._size = self._depth = None
         self._targets: dict = {}
 
-    def draw(self, instances: list[ShownInstance], view: View, size: tuple[int, int]) -> GBufferTextures:
+    def draw(self, instances: list[ShownInstance], view: ViewCamera, size: tuple[int, int]) -> GBufferTextures:
         """The G-buffer of `instances`, `size` (width, height) in pixels; valid until the next call.
 
         It has further normals if any surface is smooth or bent.
@@ -127,7 +68,7 @@ class SurfacePass:
             self._depth, self._targets = self._before._depth, {}
         return self._gbuffer(0, instances, view)
 
-    def draw_lobe(self, number: int, instances: list[ShownInstance], view: View) -> GBufferTextures:
+    def draw_lobe(self, number: int, instances: list[ShownInstance], view: ViewCamera) -> GBufferTextures:
         """The G-buffer of the lobes `number`, from 1 on, of the surfaces drawn last; valid until the next call.
 
         Pixels whose material has fewer lobes have no surface.
@@ -135,13 +76,15 @@ class SurfacePass:
         having = [instance for instance in instances if any(len(look.lobes) > number for look in instance.looks)]
         return self._gbuffer(number, having, view)
 
-    def add_emission(self, instances: list[ShownInstance], view: View, size: tuple[int, int], frame_buffer) -> None:
+    def add_emission(
+        self, instances: list[ShownInstance], view: ViewCamera, size: tuple[int, int], frame_buffer
+    ) -> None:
         """Add the emission of the surfaces drawn last to `frame_buffer`."""
         shining = [instance for instance in instances if any(map(_shines, instance.looks))]
         if shining:
             self._add(EMISSION, [(0, shining)], view, frame_buffer)
 
-    def through(self, instances: list[ShownInstance], view: View) -> gpu.types.GPUTexture:
+    def through(self, instances: list[ShownInstance], view: ViewCamera) -> gpu.types.GPUTexture:
         """The texture (RGB) of the share of light from behind that the surfaces drawn last let through."""
         if (THROUGH, False) not in self._shaders:
             self._shaders[THROUGH, False] = _shader(THROUGH)
@@ -154,7 +97,7 @@ class SurfacePass:
         self._add(THROUGH, [(number, instances) for number in range(most)], view, self._through[1])
         return self._through[0]
 
-    def _add(self, outputs, parts, view: View, frame_buffer) -> None:
+    def _add(self, outputs, parts, view: ViewCamera, frame_buffer) -> None:
         """Add `outputs` of the lobes (number, instances) of `parts` to `frame_buffer`, on the surfaces drawn last."""
         with frame_buffer.bind():
             gpu.state.viewport_set(0, 0, *self._size)
@@ -217,7 +160,7 @@ class SurfacePass:
             self._targets[outputs, is_further] = textures, buffer
         return self._targets[outputs, is_further]
 
-    def _draw_into(self, outputs, instances, view: View, number: int) -> dict:
+    def _draw_into(self, outputs, instances, view: ViewCamera, number: int) -> dict:
         """Draw the lobes `number`; returns the textures by name."""
         is_further = number > 0
         textures, buffer = self._target(outputs, is_further)
@@ -238,7 +181,7 @@ class SurfacePass:
                 gpu.state.depth_mask_set(False)
         return textures
 
-    def _draw_instances(self, outputs, instances, view: View, number: int) -> None:
+    def _draw_instances(self, outputs, instances, view: ViewCamera, number: int) -> None:
         is_emission, is_later = outputs == EMISSION, number > 0 or outputs in _ADDED
         shader = self._shaders[outputs, number > 0 and outputs not in _ADDED]
         shader.bind()

@@ -18,7 +18,7 @@ from ltsh_addon.blender.process import client
 from ltsh_addon.cli import main
 from ltsh_addon.cycles.lobes import read_layer
 from ltsh_addon.pipeline import PictureOptions, RenderOptions, picture, render, shade_scene
-from ltsh_addon.pipeline.lighting import KeptPicture, ShadowTracer
+from ltsh_addon.pipeline.lighting import RelightData, ShadowTracer
 from ltsh_addon.pipeline.mixer import light_pictures
 from ltsh_addon.pipeline.moved_lights import MovedLights
 from ltsh_addon.pipeline.relight import LightChange, relight
@@ -347,7 +347,7 @@ def test_a_kept_finished_picture_is_the_sum_of_its_lights_and_the_rest(out, tmp_
     options = RenderOptions(path, output=out, sub_samples=2, cycles_samples=8, keep_visibility=True)
     assert {"render.samples.npz", "render.occluders.npz"} < set(render.make_finished(options).files)
     combined = imaging.read_layers(out / "render.exr")["combined"]
-    mixed = light_pictures(KeptPicture.load(out / "render.samples.npz"))
+    mixed = light_pictures(RelightData.load(out / "render.samples.npz"))
     assert len(mixed.layers) == 2
     np.testing.assert_allclose(mixed.layers.sum(axis=0), combined[..., :3], rtol=1e-4, atol=1e-5)
     # Its light alone, where it was: rays of its own, as many as of all lights together.
@@ -391,7 +391,7 @@ def test_bounced_light_follows_the_lights_of_its_light_group(out, tmp_path):
     path = parts.save(tmp_path / "room.blend")
     render.make_finished(RenderOptions(path, output=out, keep_visibility=True, **options))
     layers = imaging.read_layers(out / "render.exr")
-    mixed = light_pictures(KeptPicture.load(out / "render.samples.npz"))
+    mixed = light_pictures(RelightData.load(out / "render.samples.npz"))
     assert [row.group for row in mixed.rows] == ["Warm", "Cold", "", ""]
     np.testing.assert_allclose(mixed.layers.sum(axis=0), layers["combined"][..., :3], rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(mixed.layers[0], layers["Combined_Warm"], rtol=1e-4, atol=1e-5)
@@ -583,7 +583,7 @@ def test_what_cycles_keeps_does_not_fade_at_its_border(tmp_path):
     floor_and_ball(gray(Subsurface_Weight=0.01, Subsurface_Scale=0.01))
     path = parts.save(tmp_path / "scene.blend")
     made = render.finish(RenderOptions(path, output=tmp_path, cycles_samples=64, shadow_rays=256))
-    kept = made.kept["taken"]["diffuse"] == 0.0
+    kept = made.relight_data["taken"]["diffuse"] == 0.0
     noisy = read_layer(made.cycles.channels, "Combined", "RGB")
     # The border of what is kept, and what touches it.
     inside = kept.copy()

@@ -17,7 +17,7 @@ from ltsh_addon.blender.process import blender_process, client
 from ltsh_addon.pipeline import BakeOptions, PictureOptions, batch
 from ltsh_addon.pipeline.batch import merge
 from ltsh_addon.pipeline.picture import make_picture
-from ltsh_addon.pipeline.tasks import Job, tasks_of
+from ltsh_addon.pipeline.tasks import BatchJob, tasks_of
 
 ROOT = Path(__file__).resolve().parents[3]
 
@@ -49,7 +49,7 @@ def run(command):
 
 def job(room, output, cycles_samples=4, **changes):
     options = PictureOptions(room, output, techniques=("ltsh4",), cycles_samples=cycles_samples)
-    return Job("compare", options, **{"scenes": (room,), **changes})
+    return BatchJob("compare", options, **{"scenes": (room,), **changes})
 
 
 def test_one_blender_for_all_frames_gives_the_bytes_of_one_for_each(room, tmp_path, monkeypatch, own_blender):
@@ -158,7 +158,7 @@ def test_shards_of_a_bake_merged_are_the_single_run(room, tmp_path):
         options = BakeOptions(
             room, output, size=(64, 64), margin=2, techniques=("ltsh4",), error=True, cycles_samples=2
         )
-        return batch.run_tasks(Job("bake", options, (room,), frames=(1, 5)), progress=progress, **shard)
+        return batch.run_tasks(BatchJob("bake", options, (room,), frames=(1, 5)), progress=progress, **shard)
 
     assert len(bake(tmp_path / "one").problems) == 2
     # Once for the list of objects, and once for all objects of each frame.
@@ -183,7 +183,7 @@ def test_shards_of_a_bake_merged_are_the_single_run(room, tmp_path):
 def test_a_bake_with_apply_is_finished_by_merge(room, tmp_path):
     def bake(output, **shard):
         options = BakeOptions(room, output, objects=("Slab", "Floor"), size=(64, 64), margin=2, apply=True)
-        return batch.run_tasks(Job("bake", options, (room,)), **shard)
+        return batch.run_tasks(BatchJob("bake", options, (room,)), **shard)
 
     for number in (1, 2):
         assert bake(tmp_path / "out", shard=(number, 2)).problems == ()
@@ -206,7 +206,7 @@ def test_memory_does_not_grow_with_the_frames(room, tmp_path, own_blender):
             sizes.append([count * os.sysconf("SC_PAGE_SIZE") / 2**20 for count in pages])
 
     options = PictureOptions(room, tmp_path / "out", techniques=("ltsh4",), passes=("specular",), resolution=(128, 96))
-    batch.run_tasks(Job("shade", options, (room,), frames=tuple(range(1, 26))), tell=tell)
+    batch.run_tasks(BatchJob("shade", options, (room,), frames=tuple(range(1, 26))), tell=tell)
     for column in zip(*sizes, strict=True):
         assert max(column[15:]) - max(column[5:15]) < 5.0, column
 

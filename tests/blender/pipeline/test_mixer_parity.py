@@ -7,7 +7,7 @@ import scene_parts as parts
 
 from ltsh_addon import imaging
 from ltsh_addon.pipeline import PictureOptions, shade_scene
-from ltsh_addon.pipeline.lighting import KeptPicture
+from ltsh_addon.pipeline.lighting import RelightData
 from ltsh_addon.pipeline.mixer import Mixer, light_pictures
 from ltsh_addon.pipeline.relight import tint
 
@@ -52,7 +52,7 @@ def shade(scene, output, shadows):
 @pytest.mark.parametrize("shadows", ["off", "on"])
 def test_a_mixed_picture_is_that_of_a_changed_scene(room, tmp_path, shadows):
     before, _ = shade(room, tmp_path / "before", shadows)
-    mixer = Mixer(light_pictures(KeptPicture.load(tmp_path / "before" / "shade.samples.npz")))
+    mixer = Mixer(light_pictures(RelightData.load(tmp_path / "before" / "shade.samples.npz")))
     assert {row.name for row in mixer.rows} == {"Key", "Spot", "Sun", "Lamp", "World"}
     factors = np.ones((len(mixer.rows), 3))
     np.testing.assert_allclose(mixer.mixed(factors)[::-1, :, :3], before, rtol=ROUNDING, atol=ROUNDING * before.max())

@@ -13,7 +13,7 @@ from recorded_layout import Layout, buttons, drawn, stand_in
 
 from ltsh_addon import imaging
 from ltsh_addon.blender.ui import mixer, results
-from ltsh_addon.pipeline.mixer import REST, LightPictures, Row
+from ltsh_addon.pipeline.mixer import REST, LightPictures, MixerRow
 
 HEIGHT, WIDTH = 6, 10
 NAMES = ("Key", "Fill", "Lamp", REST)
@@ -32,10 +32,10 @@ def pictures(addon, tmp_path, show_results):
     show_results(addon, tmp_path)
     layers = np.random.default_rng(5).random((4, HEIGHT, WIDTH, 3), np.float32)
     rows = [
-        Row(ob.name, (ob.name,), tuple(ob.data.color),
+        MixerRow(ob.name, (ob.name,), tuple(ob.data.color),
             {ob.name: [ob.data.energy, ob.data.exposure, *ob.data.color]}) for ob in (key, fill)
     ]  # fmt: skip
-    rows += [Row("Lamp", ("Lamp",)), Row(REST, ())]
+    rows += [MixerRow("Lamp", ("Lamp",)), MixerRow(REST, ())]
     show(addon, rows, layers)
     return layers
 
@@ -123,7 +123,7 @@ def test_colors_beyond_white_go_into_the_power(scene):
 def test_channels_that_a_light_has_not_got_are_left_alone(scene, pictures):
     """By its nodes the light is red, whatever its color."""
     key = bpy.data.objects["Key"]
-    rows = [replace(results.mixer_pairs(scene)[0][0], color=(1.0, 0.0, 0.0)), Row("Panel", ("Panel",), light={})]
+    rows = [replace(results.mixer_pairs(scene)[0][0], color=(1.0, 0.0, 0.0)), MixerRow("Panel", ("Panel",), light={})]
     show(scene, rows, pictures[:2])
     results.reset_mixer(scene)
     items(scene)["Key"].power, items(scene)["Key"].color = 2.0, (0.5, 1.0, 1.0)

@@ -27,12 +27,15 @@ from ltsh_addon import imaging
 from ltsh_addon.blender.extract.occluders import collect_occluders
 from ltsh_addon.blender.render_settings import filter_points
 from ltsh_addon.blender.viewport import shadows
+from ltsh_addon.blender.viewport.gbuffer import read_texture
 from ltsh_addon.blender.viewport.lighting import LightingPass
 from ltsh_addon.blender.viewport.mirror import SceneMirror
-from ltsh_addon.blender.viewport.renderer import CENTERS, ShownPicture, ViewRenderer, is_equal
-from ltsh_addon.blender.viewport.shadows import LiveShadows, ShadowRays, too_many
+from ltsh_addon.blender.viewport.pictures import ShownPicture
+from ltsh_addon.blender.viewport.renderer import CENTERS, ViewRenderer
+from ltsh_addon.blender.viewport.shadow_rays import ShadowRays, too_many
+from ltsh_addon.blender.viewport.shadows import LiveShadows
+from ltsh_addon.blender.viewport.static_lighting import is_equal
 from ltsh_addon.blender.viewport.still import view_of_camera
-from ltsh_addon.blender.viewport.textures import read_texture
 from ltsh_addon.scene import Cancelled, Pattern
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -14,11 +14,13 @@ from random_surfaces import EYE
 
 from ltsh_addon import shading
 from ltsh_addon.blender.process import client
+from ltsh_addon.blender.viewport.camera import ViewCamera
+from ltsh_addon.blender.viewport.gbuffer import upload_samples
+from ltsh_addon.blender.viewport.light_texels import upload_lights
 from ltsh_addon.blender.viewport.lighting import HorizonPass
 from ltsh_addon.blender.viewport.mirror import SceneMirror
-from ltsh_addon.blender.viewport.renderer import ShownPicture, ViewRenderer
-from ltsh_addon.blender.viewport.surfaces import View
-from ltsh_addon.blender.viewport.textures import upload_lights, upload_samples
+from ltsh_addon.blender.viewport.pictures import ShownPicture
+from ltsh_addon.blender.viewport.renderer import ViewRenderer
 from ltsh_addon.cycles.horizons import SMALLEST_ANGLE, horizon_excess, lobe_chances, smooth_share
 from ltsh_addon.cycles.light_tree import chances_of, light_rows, own_bounds
 from ltsh_addon.scene import SurfaceSamples
@@ -135,7 +137,9 @@ def drawn(camera):
     depsgraph = bpy.context.evaluated_depsgraph_get()
     mirror, renderer, canvas = SceneMirror(), ViewRenderer(), Canvas(*SIZE)
     mirror.sync(depsgraph)
-    view = View.of(camera.matrix_world.inverted(), camera.calc_matrix_camera(depsgraph, x=SIZE[0], y=SIZE[1]), False)
+    view = ViewCamera.of(
+        camera.matrix_world.inverted(), camera.calc_matrix_camera(depsgraph, x=SIZE[0], y=SIZE[1]), False
+    )
     pictures = {}
     try:
         for technique in ("ltc", "ltsh2", "ltsh4", "ltsh4c"):

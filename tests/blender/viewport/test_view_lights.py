@@ -14,11 +14,11 @@ from ltsh_addon import shading
 from ltsh_addon.blender.lights.emission import nodes_as_text
 from ltsh_addon.blender.lights.textures import ShownTextures
 from ltsh_addon.blender.process import client
-from ltsh_addon.blender.viewport import mirror
-from ltsh_addon.blender.viewport.mirror import strongest, view_lights
+from ltsh_addon.blender.viewport.lights import NOT_YET, no_patterns, strongest, view_lights
+from ltsh_addon.blender.viewport.live_cycles import LiveNodeLights
 
 
-def seen(patterns=mirror.no_patterns):
+def seen(patterns=no_patterns):
     """The lights, and all notes as one text."""
     bpy.context.view_layer.update()
     graph = bpy.context.evaluated_depsgraph_get()
@@ -186,9 +186,9 @@ def test_windows_get_the_patterns_of_lights_from_a_second_blender(tmp_path):
     parts.add_camera()
     # The power of a frame is not that of the nodes.
     striped.data.keyframe_insert("energy", frame=1)
-    lamps = mirror.LiveLamps()
+    lamps = LiveNodeLights()
     lights, notes = seen(lamps.pattern)
-    assert [light.pattern for light in lights] == 3 * [None] and notes.count(mirror.NOT_YET) == 3 and lamps.is_busy
+    assert [light.pattern for light in lights] == 3 * [None] and notes.count(NOT_YET) == 3 and lamps.is_busy
     wait_for(lamps)
     lights, notes = seen(lamps.pattern)
     expected = {light.name: light for light in parts.prepare()[2].lights}
@@ -230,7 +230,7 @@ def test_a_light_that_changes_meanwhile_is_looked_at_again_and_nobody_waits_in_v
     parts.empty_scene()
     tree = add_bulb("Striped", "POINT", stripes)[1]
     wave = next(node for node in tree.nodes if node.bl_idname == "ShaderNodeMath")
-    lamps = mirror.LiveLamps()
+    lamps = LiveNodeLights()
 
     def begun():
         seen(lamps.pattern)
@@ -281,7 +281,7 @@ def test_windows_show_what_depends_on_the_place_and_patterns_of_area_lights():
     flat = parts.add_area_light("Flat")
     tree, emission = light_tree(flat)
     tree.links.new(cloud(tree), emission.inputs["Strength"])
-    lamps = mirror.LiveLamps()
+    lamps = LiveNodeLights()
     assert "Flat" in seen(lamps.pattern)[1]
     wait_for(lamps)
 

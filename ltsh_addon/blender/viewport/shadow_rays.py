@@ -1,0 +1,116 @@
+"""The visibility of each light at the pixels of a view, traced as for pictures, with the same occluders."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+
+import gpu
+import numpy as np
+
+from ...scene import PASSES, AreaLight, Film
+from ...visibility import Mate, Occluders, ShadowSampling, Tracer, open_tracer, visible_shares
+from ..process.blender_process import embree_libraries
+from .camera import ViewCamera
+from .gbuffer import GBufferTextures, VisibilityGrid, gbuffer_samples
+
+Lights = Sequence[AreaLight]
+# MOST_BYTES: graphics memory for the shares of all lights. _SHARE_BYTES: of a light and a pixel, two half floats.
+MOST_BYTES = 1 << 30
+_SHARE_BYTES = 4
+
+
+class ViewTracer:
+    """A tracer of occluders, and the process (mate) that helps it.
+
+    Positions are relative to an origin near the view, where single precision is best. The origin changes rarely.
+    """
+
+    def __init__(self, occluders: Occluders):
+        self._occluders = occluders
+        self._tracer: Tracer | None = None
+        self.mate: Mate | None = None
+        self._origin = np.zeros(3)
+
+    def around(self, origin: np.ndarray) -> Tracer:
+        """The tracer with positions relative to `origin` (3,). Raises SceneError where Embree is missing."""
+        if self._tracer is None or not np.array_equal(origin, self._origin):
+            matrices = np.array(self._occluders.matrices, np.float64)
+            matrices[:, :, 3] -= origin
+            self._tracer = open_tracer(replace(self._occluders, matrices=matrices), embree_libraries())
+            self.close()
+            self.mate, self._origin = Mate(self._tracer), np.array(origin)
+        return self._tracer
+
+    def close(self) -> None:
+        """End the process of the mate."""
+        if self.mate is not None:
+            self.mate.close()
+
+
+class ShadowRays:
+    """Traces, at once, the shares of lights that the pixels of G-buffers see past `occluders`.
+
+    A pixel takes at most `rays` rays per light.
+    """
+
+    version, waits, traces_lobes = 0, False, True
+
+    @property
+    def of_glass(self) -> ShadowRays:
+        """The tracer for the glass in front of the surfaces: the same."""
+        return self
+
+    def take_news(self) -> None:
+        """Do nothing: there is never news, because everything is traced at once."""
+
+    def __init__(self, occluders: Occluders, rays: int):
+        self._tracing, self._rays = ViewTracer(occluders), rays
+        self.seconds, self.traced, self.description = 0.0, 0, ""
+        # By pass, summed over all calls: squares of the reflected light of pixels, and of its standard deviation.
+        self._power = {name: np.zeros(2) for name in PASSES}
+
+    def shares(
+        self, gbuffer: GBufferTextures, view: ViewCamera, lights: Lights, sides: Lights = (), number: int = 0
+    ) -> VisibilityGrid | None:
+        """The shares of `lights`, and last that of the `sides` of a sky if there are any; None without surfaces or
+        lights. Positions are relative to the origin of `view`. Raises SceneError."""
+        start = time.perf_counter()
+        samples, pixel = gbuffer_samples(gbuffer, view)
+        if not len(samples) or not (lights or sides):
+            return None
+        width, height = gbuffer.size
+        tracer = self._tracing.around(view.origin)
+        film = Film(width, height, pixel)
+        found = visible_shares(samples, (*lights, *sides), tracer, ShadowSampling(rays=self._rays, film=film))
+        count = len(lights) + bool(sides)
+        values = np.ones((count, height * width, len(PASSES)), np.float32)
+        for index, name in enumerate(PASSES):
+            values[:, pixel, index] = found.of_lights(name)[:count]
+            power = (np.square(part[name], dtype=np.float64).sum() for part in (found.radiance, found.deviation))
+            self._power[name] += list(power)
+        self.seconds += time.perf_counter() - start
+        self.traced, self.description = self.traced + found.rays, tracer.description
+        return VisibilityGrid(visibility_texture(values, gbuffer.size), gbuffer.position, view.projection)
+
+    def noise(self, samples: int) -> dict[str, float]:
+        """Estimated relative L2 error by pass of the shadows in the mean of `samples` pictures."""
+        return {
+            name: float(np.sqrt(variance / max(power, 1e-30) / samples))
+            for name, (power, variance) in self._power.items()
+        }
+
+
+def visibility_texture(values: np.ndarray, size: tuple[int, int]) -> gpu.types.GPUTexture:
+    """Array texture of shares (L, H W, 2) on pictures of `size`."""
+    buffer = gpu.types.Buffer("FLOAT", values.size, np.ascontiguousarray(values, np.float32).reshape(-1))
+    return gpu.types.GPUTexture(size, layers=len(values), format="RG16F", data=buffer)
+
+
+def too_many(lights: int, size: tuple[int, int]) -> str:
+    """Note that the shares of so many lights do not fit into memory; empty where they do."""
+    needed = lights * size[0] * size[1] * _SHARE_BYTES
+    if needed <= MOST_BYTES:
+        return ""
+    return f"shadows are not drawn: those of {lights} lights need {needed / 2**30:.1f} GiB of graphics memory"

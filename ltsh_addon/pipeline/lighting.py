@@ -102,7 +102,7 @@ class ShadowTracer:
     Positions of the occluders are relative to `origin` (3,) in m; lights and samples are in world space.
     """
 
-    def __init__(self, occluders: visibility.Occluders, lights: Sequence[AreaLight], origin: np.ndarray):
+    def __init__(self, occluders: visibility.Occluders, lights: Sequence[Light], origin: np.ndarray):
         self._occluders, self._origin = occluders, origin
         self._lights = [light.moved(-origin) for light in lights]
 

@@ -159,7 +159,7 @@ def _row(extraction, own: list[int]) -> MixerRow:
     if len(names) > 1:
         note = WEAKEST if len({tuple(light.radiance) for light in lights}) > 1 else SHARED
         return MixerRow(f"{names[0]} and {len(names) - 1} more", names, color, settings, note=note)
-    plain = len(lights) == 1 and not lights[0].detail and lights[0].pattern is None
+    plain = len(lights) == 1 and not lights[0].children and lights[0].pattern is None
     return MixerRow(names[0], names, color, settings, lights[0].record() if plain else None)
 
 

@@ -120,7 +120,7 @@ class _Finished(picture.Comparison):
         return {"combined": combined, **found, "rest": self.rest}
 
 
-def _changed_rest(kept: RelightData, lights: Sequence[AreaLight], table, shaded, progress) -> np.ndarray:
+def _changed_rest(kept: RelightData, lights: Sequence[Light], table, shaded, progress) -> np.ndarray:
     """Cycles' rest (H, W, 4) under the changed `lights`: the bounced light of a group scales with its direct light.
 
     `shaded` is the direct light of the changed lights by `table`.
@@ -176,7 +176,7 @@ def _split_at_horizons(samples: SurfaceSamples) -> int:
     return int((same[0] & same[1] & same[2] & ~same[3]).sum())
 
 
-def _check_shared(kept: RelightData, lights: Sequence[AreaLight]) -> None:
+def _check_shared(kept: RelightData, lights: Sequence[Light]) -> None:
     """Raise ValueError where lights that share their shadow rays are changed differently."""
     before = kept.extraction.lights
     for own in kept.shadows.numbers:

@@ -9,7 +9,7 @@ from ltsh_addon.blender.process import client
 from ltsh_addon.imaging.color import to_srgb8
 from ltsh_addon.pipeline import PictureOptions
 from ltsh_addon.pipeline.tasks import BatchJob
-from ltsh_addon.scene import AreaLight, Cancelled, Film, SurfaceSamples
+from ltsh_addon.scene import Cancelled, Film, Light, QuadLight, SurfaceSamples
 from ltsh_addon.visibility import OccluderMesh, Occluders
 
 WIDTH, HEIGHT, SUB_SAMPLES = 6, 4, 2

@@ -9,7 +9,7 @@ import textbook
 from known_tracers import OPEN, WALL, Tracer, floor, panel, past_spheres
 
 from ltsh_addon import shading
-from ltsh_addon.scene import PASSES, Cancelled, Film, SurfaceSamples
+from ltsh_addon.scene import PASSES, Cancelled, Film, SurfaceSamples, light_of
 from ltsh_addon.visibility import ratio
 from ltsh_addon.visibility.directions import Emitter
 

@@ -10,7 +10,7 @@ import bpy
 import numpy as np
 
 from ...pipeline.mixer import MixerRow
-from ...scene import AreaLight, Cancelled, SceneError, error_line, listed
+from ...scene import Cancelled, Light, SceneError, error_line, light_of, listed
 from ..evaluated import EmitterTraits
 from ..lights.area import area_light, reason_to_leave_out
 from ..lights.linking import Receivers

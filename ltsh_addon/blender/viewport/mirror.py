@@ -10,7 +10,7 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
-from ...scene import AreaLight, listed
+from ...scene import Light, listed
 from ..evaluated import (
     SURFACE_TYPES,
     data_pointer,

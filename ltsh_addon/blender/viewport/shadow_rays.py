@@ -9,13 +9,13 @@ from dataclasses import replace
 import gpu
 import numpy as np
 
-from ...scene import PASSES, AreaLight, Film
+from ...scene import PASSES, Film, Light
 from ...visibility import Mate, Occluders, ShadowSampling, Tracer, open_tracer, visible_shares
 from ..process.blender_process import embree_libraries
 from .camera import ViewCamera
 from .gbuffer import GBufferTextures, VisibilityGrid, gbuffer_samples
 
-Lights = Sequence[AreaLight]
+Lights = Sequence[Light]
 # MOST_BYTES: graphics memory for the shares of all lights. _SHARE_BYTES: of a light and a pixel, two half floats.
 MOST_BYTES = 1 << 30
 _SHARE_BYTES = 4

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...scene import PASSES, AreaLight, Cancelled, Film, SurfaceSamples, error_line
+from ...scene import PASSES, Cancelled, Film, Light, SurfaceSamples, error_line
 from ...visibility import Occluders, ShadowSampling, shared_numbers, visible_shares
 from .camera import ViewCamera
 from .gbuffer import (

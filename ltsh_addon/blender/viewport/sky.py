@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ...cycles.environment import CUBE, SkyPicture, sky_lights
-from ...scene import AreaLight
+from ...scene import Light
 
 # Texels of a side of maps. SIZE, LEAST_SIZE: the largest and the smallest map of the light. IRRADIANCE_SIZE: the map of
 # the irradiance. IRRADIANCE_SOURCE: the map of the light from which the irradiance is computed.

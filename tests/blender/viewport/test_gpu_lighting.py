@@ -11,7 +11,7 @@ from random_surfaces import EYE, rounded, unit
 from ltsh_addon import shading
 from ltsh_addon.blender.viewport.gbuffer import upload_samples
 from ltsh_addon.blender.viewport.lighting import LightingPass
-from ltsh_addon.scene import Pattern
+from ltsh_addon.scene import EllipseLight, Pattern
 
 WIDTH, HEIGHT = 32, 16
 TECHNIQUES = ("ltc", "ltsh2", "ltsh4", "ltsh4c")

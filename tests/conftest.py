@@ -16,6 +16,10 @@ from hypothesis import settings
 settings.register_profile("ltsh", derandomize=True, deadline=None, database=None)
 settings.load_profile("ltsh")
 
+# Of llvmpipe, which draws where no graphics card is: pictures here are so small that its optimizer takes longer than
+# what it saves.
+os.environ.setdefault("GALLIVM_PERF", "nopt")
+
 EXIT_STATUS = pytest.StashKey[int]()
 TESTS = Path(__file__).parent
 # Files that need no bpy, of what may depend on the versions of Python and numpy: `make test` runs them on both.
@@ -23,6 +27,16 @@ SMOKE = {
     "cli/test_cli_arguments.py", "imaging/test_exr.py", "packaging/test_environment.py", "pipeline/test_compare.py",
     "pipeline/test_jobs.py", "shading/test_single_precision.py", "scene/test_scene.py",
 }  # fmt: skip
+
+# Files in tests/blender of what no version of Blender changes, how processes end and what files they leave: marked
+# `newest`, as are single tests of formulas that stand in one text for all versions.
+NEWEST = {
+    "blender/process/test_signals.py",
+    "blender/ui/test_job_ends.py",
+    "blender/pipeline/test_bake_disk.py",
+    "blender/pipeline/test_job_runs.py",
+    "blender/pipeline/test_picture_kills.py",
+}
 
 
 def pytest_sessionstart(session):
@@ -38,6 +52,8 @@ def pytest_collection_modifyitems(items):
         path = item.path.relative_to(TESTS).as_posix()
         if path.startswith("blender/"):
             item.add_marker("blender")
+            if path in NEWEST:
+                item.add_marker("newest")
         elif path in SMOKE:
             item.add_marker("smoke")
 

@@ -24,8 +24,7 @@ from ..emitters.light_tree import FEWEST
 from ..files import replacing
 from ..scene import (
     REFERENCE,
-    Border,
-    ColorSpace,
+    AreaLight,
     Film,
     Light,
     Progress,
@@ -162,26 +161,34 @@ def shade_lights(
     passes: Sequence[str],
     seen: Sequence[Shadows | None] = (None,),
     *,
+    rows: Sequence[int] | None = None,
     workers: int | None = None,
     progress: Callable[[float], bool | None] | None = None,
 ) -> list[shading.Shading]:
     """Radiance of `samples` (P) under `lights` (L): one Shading for each entry of `seen`.
 
-    An entry is the shadows of the samples, or None for no shadows. All shadows must group the lights alike.
+    An entry is the shadows of the samples, or None for no shadows. All shadows must join the same lights, and only
+    lights of one row. `rows` (L,) are as for `shade`; by default each of the `light_groups` has a row.
 
     Lights that share their rays are shaded together and then multiplied by their share, so that a sample that sees
     them whole gets the same bits as without shadows. Exception: many lights without any shadows go to `shade` at once,
     which then merges those that a sample cannot tell apart.
     """
+    if rows is None:
+        groups = light_groups(lights)
+        rows = [groups.index(light.group) for light in lights]
     if lights and all(shares is None for shares in seen):
-        if max(Counter(light.group for light in lights).values()) >= FEWEST:
-            found = shading.shade(samples, lights, table, passes=tuple(passes), workers=workers, progress=progress)
-            return [found] * len(seen)
-    groups = tuple(dict.fromkeys(light.group for light in lights)) or ("",)
-    shape = len(groups), len(samples), 3
+        if max(Counter(rows).values()) >= FEWEST:
+            options = {"passes": tuple(passes), "workers": workers, "progress": progress, "rows": rows}
+            return [shading.shade(samples, lights, table, **options)] * len(seen)
+    shape = 1 + max(rows, default=0), len(samples), 3
     sums = [{name: np.zeros(shape, np.float32) for name in passes} for _ in seen]
     numbers = next((shadows.numbers for shadows in seen if shadows is not None), None)
-    numbers = visibility.shared_numbers(lights) if numbers is None else numbers
+    if numbers is None:
+        # Lights of several rows cannot be shaded together.
+        alike = visibility.shared_numbers(lights)
+        alike = [[own] if len({rows[n] for n in own}) == 1 else [(n,) for n in own] for own in alike]
+        numbers = sorted(itertools.chain.from_iterable(alike))
     error, most = None, max(1, MOST_PAIRS // max(1, len(samples)))
     for first in range(0, len(numbers), most):
         part = numbers[first : first + most]
@@ -190,19 +197,26 @@ def shade_lights(
         def report(fraction, start=start, share=share):
             return None if progress is None else progress(start + fraction * share)
 
-        own = [lights[light].altered(group=str(number)) for number, one in enumerate(part) for light in one]
-        found = shading.shade(samples, own, table, passes=tuple(passes), workers=workers, progress=report)
+        own = [(lights[light], number) for number, one in enumerate(part) for light in one]
+        own, own_rows = zip(*own, strict=True)
+        options = {"passes": tuple(passes), "workers": workers, "progress": report, "rows": own_rows}
+        found = shading.shade(samples, own, table, **options)
         if found.quadrature_error is not None:
             error = found.quadrature_error if error is None else error + found.quadrature_error
         for number, one in enumerate(part):
-            group = groups.index(lights[one[0]].group)
+            row = rows[one[0]]
             for name in passes:
                 radiance = getattr(found, name)[number]
                 for whole, shadows in zip(sums, seen, strict=True):
                     is_all = shadows is None
                     share = 1.0 if is_all else shadows.shares[name][first + number][:, None]
-                    whole[name][group] += radiance if is_all else share * radiance
-    return [shading.Shading(groups, whole.get("specular"), whole.get("diffuse"), error) for whole in sums]
+                    whole[name][row] += radiance if is_all else share * radiance
+    return [shading.Shading(whole.get("specular"), whole.get("diffuse"), error) for whole in sums]
+
+
+def light_groups(lights: Iterable[AreaLight]) -> tuple[str, ...]:
+    """The names of the light groups of `lights` in the order of their first lights, "" for none; at least one name."""
+    return tuple(dict.fromkeys(light.group for light in lights)) or ("",)
 
 
 def layer_names(names: Iterable[str]) -> list[str]:
@@ -230,7 +244,7 @@ class RelightData:
     whole picture = sum over passes of `shown` x image of the samples, + sum of `rest`; all include the exposure.
     """
 
-    extraction: Any  # blender.process.client.Extraction, without reference and occluders
+    extraction: Any  # blender.process.pixels.Extraction, without reference and occluders
     shadows: Shadows | None
     options: dict  # fields of PictureOptions
     had_cycles: bool
@@ -266,28 +280,26 @@ class RelightData:
 
     @classmethod
     def _of(cls, document, arrays) -> RelightData:
-        from ..blender.process.client import UNCHANGED, Extraction
+        from ..blender.process.pixels import CyclesPasses, Extraction, ExtractionTimes, PictureFacts
 
-        found = document["extraction"]
-        border, space = found["border"], found["color_space"]
+        record = document["extraction"]
         extraction = Extraction(
-            **{name: found[name] for name in UNCHANGED},
-            lights=lights_of(found["lights"]),
+            lights=lights_of(record["lights"]),
             samples=SurfaceSamples(
                 **{item.name: _compact(arrays[f"samples.{item.name}"]) for item in fields(SurfaceSamples)}
             ),
             film=Film(
                 pixel=arrays["film.pixel"],
                 **{name: arrays.get(f"film.{name}") for name in FILM_ARRAYS},
-                **found["film"],
+                **record["film"],
             ),
-            warnings=tuple(found["warnings"]),
-            problems=tuple(found["problems"]),
-            reference=None,
-            origin=np.array(found["origin"]),
-            border=None if border is None else Border(**border),
-            color_space=ColorSpace(space["name"], np.array(space["to_rec709"])),
-            **{name: arrays.get(f"picture.{name}") for name in NOT_REFLECTED},
+            picture=PictureFacts.of(record),
+            cycles=CyclesPasses(**{name: arrays.get(f"picture.{name}") for name in NOT_REFLECTED}),
+            times=ExtractionTimes(record["seconds"]),
+            warnings=tuple(record["warnings"]),
+            problems=tuple(record["problems"]),
+            origin=np.array(record["origin"]),
+            light_settings=record["light_settings"],
         )
         shadows = document["shadows"]
         if shadows is not None:
@@ -307,7 +319,7 @@ def _compact(values: np.ndarray) -> np.ndarray:
     return values if values.any() else np.broadcast_to(values.dtype.type(0), values.shape)
 
 
-NOT_REFLECTED = ("emission", "background")  # optional arrays of an Extraction
+NOT_REFLECTED = ("emission", "background")  # optional arrays of `Extraction.cycles`
 FINISHED = ("rest", "taken", "edges")  # fields of a RelightData that only finished pictures have
 RELIGHT_OPTIONS = ("techniques", "passes", "sub_samples", "reference_samples", "shadows", "shadow_rays")
 
@@ -317,23 +329,21 @@ def write_relight_data(extraction, shadows: Shadows | None, options, path: Path,
 
     `finished` are the fields `rest`, `taken` and `edges` of the RelightData of a finished picture. Raises OSError.
     """
-    from ..blender.process.client import UNCHANGED
-
-    film, space = extraction.film, extraction.color_space
+    film = extraction.film
     document = {
         "extraction": {
-            **{name: getattr(extraction, name) for name in UNCHANGED},
+            **extraction.picture.record(),
+            "seconds": extraction.times.stages,
+            "light_settings": extraction.light_settings,
             "lights": light_records(extraction.lights),
             "film": {"width": film.width, "height": film.height, "sub_samples": film.sub_samples},
             "warnings": extraction.warnings,
             "problems": extraction.problems,
             "origin": np.asarray(extraction.origin).tolist(),
-            "border": None if extraction.border is None else vars(extraction.border),
-            "color_space": {"name": space.name, "to_rec709": space.to_rec709.tolist()},
         },
         "shadows": None if shadows is None else {**shadows.report(), "numbers": shadows.numbers},
         "options": {"scene": str(options.scene), **{name: getattr(options, name) for name in RELIGHT_OPTIONS}},
-        "had_cycles": extraction.reference is not None,
+        "had_cycles": extraction.cycles.reference is not None,
         **{kind: list(finished.get(kind, ())) for kind in FINISHED},
     }
     arrays = {f"samples.{item.name}": getattr(extraction.samples, item.name) for item in fields(SurfaceSamples)}
@@ -341,7 +351,7 @@ def write_relight_data(extraction, shadows: Shadows | None, options, path: Path,
     arrays |= {f"film.{name}": getattr(film, name) for name in FILM_ARRAYS if getattr(film, name) is not None}
     if shadows is not None:
         arrays |= {f"shares.{name}": values for name, values in shadows.shares.items()}
-    seen = {name: getattr(extraction, name) for name in NOT_REFLECTED}
+    seen = {name: getattr(extraction.cycles, name) for name in NOT_REFLECTED}
     arrays |= {f"picture.{name}": values.astype(np.float32) for name, values in seen.items() if values is not None}
     for kind, parts in finished.items():
         arrays |= {f"{kind}.{name}": np.asarray(values, np.float32) for name, values in parts.items()}

@@ -108,7 +108,7 @@ def light_pictures(kept: RelightData, progress: Progress | None = None) -> Light
         if group and values.any() and all(row.group != group for row in rows):
             rows.append(MixerRow(f"Light group {group}", (), note=NOT_SHADED))
             layers = np.concatenate([layers, values[None, ..., :3].astype(np.float32)])
-    notes = [GRAIN] * bool(kept.rest and kept.extraction.has_lens) + [
+    notes = [GRAIN] * bool(kept.rest and kept.extraction.picture.has_lens) + [
         SHARED_OUT.format(group, listed(repr(row.name) for row in own))
         for group in kept.rest
         if group and len(own := [row for row in rows if row.group == group]) > 1
@@ -118,7 +118,12 @@ def light_pictures(kept: RelightData, progress: Progress | None = None) -> Light
         rows.append(MixerRow(REST, (), note=NOT_OF_LIGHTS))
         layers = np.concatenate([layers, rest[None, ..., :3].astype(np.float32)])
     alpha = np.ones(shape, np.float32) if rest is None or rest.shape[-1] < 4 else rest[..., 3].astype(np.float32)
-    facts = {"camera": extraction.camera, "frame": extraction.frame, "technique": technique, "notes": notes}
+    facts = {
+        "camera": extraction.picture.camera,
+        "frame": extraction.picture.frame,
+        "technique": technique,
+        "notes": notes,
+    }
     return LightPictures(tuple(rows), layers, alpha, facts)
 
 
@@ -168,15 +173,14 @@ def _layers(kept: RelightData, table, members: list[list[int]], report) -> np.nd
     extraction = kept.extraction
     numbers = sorted(number for own in members for number in own)
     row_of = {number: row for row, own in enumerate(members) for number in own}
-    lights = [replace(extraction.lights[number], group=str(row_of[number])) for number in numbers]
+    lights, of_lights = [extraction.lights[number] for number in numbers], [row_of[number] for number in numbers]
     shadows = None if kept.shadows is None else kept.shadows.of_lights(numbers)
     passes = kept.options["passes"]
-    (lit,) = shade_lights(extraction.samples, lights, table, passes, (shadows,), progress=report)
+    (lit,) = shade_lights(extraction.samples, lights, table, passes, (shadows,), rows=of_lights, progress=report)
     layers = np.zeros((len(members), extraction.film.height, extraction.film.width, 3), np.float32)
     for name in passes:
-        for group, values in zip(lit.groups, getattr(lit, name), strict=True):
-            image = extraction.film.image(extraction.exposure * values)
-            layers[int(group)] += kept.shown(name) * image
+        for layer, values in zip(layers, getattr(lit, name), strict=True):
+            layer += kept.shown(name) * extraction.film.image(extraction.picture.exposure * values)
     return layers
 
 

@@ -225,7 +225,9 @@ class MovedLights:
         kept = self._kept
         image = np.zeros((kept.extraction.film.height, kept.extraction.film.width, 3), np.float32)
         for name, radiance in values.items():
-            image += kept.shown(name, moved=True) * kept.extraction.film.image(kept.extraction.exposure * radiance)
+            image += kept.shown(name, moved=True) * kept.extraction.film.image(
+                kept.extraction.picture.exposure * radiance
+            )
         return image if row is None else image + bounced_light(kept, row)
 
     def close(self) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from .. import imaging
 from ..scene import Light, Progress, SurfaceSamples, listed
 from . import picture
-from .lighting import RELIGHT_SUFFIX, RelightData, shade_lights
+from .lighting import RELIGHT_SUFFIX, RelightData, light_groups, shade_lights
 from .options import PictureOptions
 
 NO_CYCLES = "Cycles' picture and the errors beside it are left out: they show the lights as they were"
@@ -89,7 +89,7 @@ def _relit(path: Path, place: Path, wanted, output: Path, progress) -> dict:
     if kept.rest:
         groups = [repr(group) for group in kept.rest if group]
         warnings += (SAME_REST.format(BUT_GROUPS.format(listed(groups)) if groups else ""),)
-        warnings += (GRAIN,) if kept.extraction.has_lens else ()
+        warnings += (GRAIN,) if kept.extraction.picture.has_lens else ()
         name = kept.technique
         rest = _changed_rest(kept, lights, tables[name], results[name].shading, progress)
         extraction = replace(extraction, warnings=warnings)
@@ -146,7 +146,7 @@ def _changed_rest(kept: RelightData, lights: Sequence[Light], table, shaded, pro
 
 def _light_of_group(kept: RelightData, shaded, group: str) -> np.ndarray:
     """Direct light (3,) of a light group, summed over the picture."""
-    number, film = shaded.groups.index(group), kept.extraction.film
+    number, film = light_groups(kept.extraction.lights).index(group), kept.extraction.film
     images = {name: film.image(getattr(shaded, name)[number]) for name in kept.options["passes"]}
     return sum((kept.shown(name) * image).sum(axis=(0, 1)) for name, image in images.items())
 

@@ -160,7 +160,7 @@ class ParentSide:
         for name in self.sent:
             values = getattr(self.samples, name)
             arrays[f"in {name}"] = ((count, *values.shape[1:]), values.dtype)
-        shape = (len(self.task.groups), count, 3)
+        shape = (self.task.row_count, count, 3)
         for name in self.task.passes:
             arrays[f"out {name}"] = (shape, self.task.dtype)
         if self.task.has_error:

@@ -7,7 +7,6 @@ import argparse
 import os
 import subprocess
 import sys
-import tempfile
 import time
 from dataclasses import replace
 from functools import partial
@@ -26,6 +25,7 @@ from textbook_ltc import TextbookLtc  # noqa: E402
 from zonal_harmonics import ZonalHarmonics  # noqa: E402
 
 from ltsh_addon import shading  # noqa: E402
+from ltsh_addon.cli.commands import DEMO_SCENE  # noqa: E402
 from ltsh_addon.emitters import light_polygons  # noqa: E402
 from ltsh_addon.lobes import edge_integrals, moments32  # noqa: E402
 from ltsh_addon.lobes.polygon import project_to_sphere, split_at_horizon  # noqa: E402
@@ -97,9 +97,9 @@ def shade(options):
         cases = {}
         if fresnel == "white":
             cases["textbook LTC"] = partial(TextbookLtc(TABLES["ltc"]).shade, samples, lights)
-            cases["diffuse"] = partial(shading.shade, samples, lights, "ltc", passes=["diffuse"], workers=1)
+            cases["diffuse"] = partial(in_one_row, samples, lights, "ltc", passes=["diffuse"])
         for name, table in TABLES.items():
-            cases[name] = partial(specular, samples, lights, table)
+            cases[name] = partial(in_one_row, samples, lights, table)
         ratio = compared(cases, "ltc", 3 if options.quick else 5, 4 * count)
         if fresnel == "white":
             targets(ratio)
@@ -142,8 +142,9 @@ def many_lights(options):
         row(f"{count} lights", seconds / len(samples) * 1e9, note=f"{seconds:.1f} s, {seconds / base:.1f} x")
 
 
-def specular(samples, lights, table, **options):
-    return shading.shade(samples, lights, table, passes=["specular"], **{"workers": 1, **options})
+def in_one_row(samples, lights, table, **options):
+    options = {"passes": ["specular"], "workers": 1, "rows": [0] * len(lights), **options}
+    return shading.shade(samples, lights, table, **options)
 
 
 def bounds(options):
@@ -184,7 +185,7 @@ def growth(options):
         row(f"{corners} edges", seconds / count * 1e9, note=f"{seconds / count / corners * 1e9:.1f} ns per edge")
     heading(f"growth with lights: ltsh4, F = 1, {count} samples, ns per sample and light")
     for lights in (1, 2, 4, 8, 16, 64):
-        seconds = timed(specular, *floor_scene(count, lights), TABLES["ltsh4"])
+        seconds = timed(in_one_row, *floor_scene(count, lights), TABLES["ltsh4"])
         row(f"{lights} lights", seconds / count / lights * 1e9)
     heading("growth with degree: moments of rectangles, ns per polygon")
     corners = np.ascontiguousarray(random_polygons(CHUNK, "whole")[2].transpose(2, 1, 0))
@@ -197,7 +198,7 @@ def growth(options):
     heading("growth with samples: ltsh4, F = 1, 4 lights, ns per sample and light")
     sizes = [10_000, 100_000, *([] if options.quick else [1_000_000]), *([10_000_000] if options.large else [])]
     for size in sizes:
-        seconds = timed(specular, *floor_scene(size, 4), TABLES["ltsh4"], rounds=3 if size <= 100_000 else 1)
+        seconds = timed(in_one_row, *floor_scene(size, 4), TABLES["ltsh4"], rounds=3 if size <= 100_000 else 1)
         row(f"{size:.0e} samples", seconds / size / 4 * 1e9, note=f"{seconds:.2f} s")
 
 
@@ -232,7 +233,7 @@ def speed_up(name, samples, lights, two_apart):
 
     def run(number):
         before = cpu_seconds()
-        found[number] = specular(samples, lights, TABLES[name], workers=number).specular
+        found[number] = in_one_row(samples, lights, TABLES[name], workers=number).specular
         cpu[number] = cpu_seconds() - before
 
     cases = {"1 process": partial(run, 1), "2 processes": partial(run, 2), "2 apart, all the work each": two_apart}
@@ -254,30 +255,27 @@ def cpu_seconds():
 
 def cycles(options):
     """Time at equal error: the samples Cycles needs to come as close to the truth as ltsh4, times its time for one."""
-    from ltsh_addon.blender.process import client
+    from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels
 
     heading("time at equal error on the demo scene, ltsh4 against Cycles (specular)")
     count = 64 if options.quick else 128
-    with tempfile.TemporaryDirectory(prefix="ltsh-bench-") as folder:
-        scene = Path(folder) / "demo.blend"
-        client.build_demo(scene)
-        extraction = client.extract(client.ExtractOptions(scene, width=480, height=270, cycles_samples=count))
+    extraction = extract_pixels(PixelJob(DEMO_SCENE, width=480, height=270, cycles_samples=count))
     start = time.perf_counter()
     shaded = shading.shade(extraction.samples, extraction.lights, "ltsh4", passes=["specular"])
     shade_seconds = time.perf_counter() - start
     image = extraction.film.image(shaded.combined)
-    a, b = (half.astype(np.float64) for half in extraction.reference["specular"])
+    a, b = (half.astype(np.float64) for half in extraction.cycles.reference["specular"])
     energy = (a * b).sum()
     # Halves with different seeds: their noise cancels in the product, and their difference is nothing else.
     error = ((image - a) * (image - b)).sum() / energy
     noise = 0.25 * ((a - b) ** 2).sum() / energy
     needed = count * noise / max(error, 1e-12)
-    per_sample = extraction.seconds["cycles"] / count
-    ours = extraction.seconds["samples"] + shade_seconds
-    cycles = f"{count} samples in {extraction.seconds['cycles']:.1f} s, noise {noise**0.5:.2%}"
+    per_sample = extraction.times.stages["cycles"] / count
+    ours = extraction.times.stages["samples"] + shade_seconds
+    cycles = f"{count} samples in {extraction.times.stages['cycles']:.1f} s, noise {noise**0.5:.2%}"
     size = f"{len(extraction.samples)} samples, {len(extraction.lights)} lights"
     print(f"  Cycles: {cycles}")
-    print(f"  ltsh4: error {error**0.5:.2%}, sample extraction {extraction.seconds['samples']:.2f} s")
+    print(f"  ltsh4: error {error**0.5:.2%}, sample extraction {extraction.times.stages['samples']:.2f} s")
     print(f"         shading {shade_seconds:.2f} s ({size})")
     factor = f"{needed * per_sample / ours:.1f} x our time (target 20 x)"
     print(f"  Cycles needs {needed:.0f} samples, {needed * per_sample:.1f} s, for that error: {factor},")

@@ -150,7 +150,7 @@ def measure_shadows(scene) -> tuple[float, float, float]:
 
 def _processor(live) -> float:
     """Processor seconds of this process and of the one that traces with it (Linux)."""
-    mate = live._followed.tracing.mate
+    mate = live._traced_scene.tracing.mate
     child = None if mate is None else mate._child
     if child is None:
         return time.process_time()

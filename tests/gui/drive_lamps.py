@@ -96,7 +96,7 @@ def lamp_of_a_file(scene):
 
 def notes(rig):
     """What the view says."""
-    return module("engine.overlay")._texts[rig.region().as_pointer()][1]
+    return module("engine.overlay")._texts[rig.region().as_pointer()].notes
 
 
 def looked_at(rig, name, what, count=1):

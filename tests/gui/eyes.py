@@ -1,5 +1,6 @@
 """What the drivers see: the pixels of the 3D view as the screen has them, in linear colors where that is wanted."""
 
+import dataclasses
 import importlib
 import time
 
@@ -41,8 +42,8 @@ def pixel_centers():
 def bare_view(rig):
     """Nothing but the picture in the 3D view, without the line about what it leaves out too."""
     space, view_module = rig.space, module("engine.view")
-    show, nothing = view_module.show, view_module.QuietLine()
-    view_module.show = lambda region, error, notes, captions, quiet: show(region, error, notes, captions, nothing)
+    show, nothing = view_module.show, module("engine.overlay").QuietLine()
+    view_module.show = lambda region, texts: show(region, dataclasses.replace(texts, quiet=nothing))
     space.overlay.show_overlays = space.show_gizmo = False
     space.show_region_header = space.show_region_tool_header = False
     space.show_region_toolbar = space.show_region_ui = space.show_region_hud = False

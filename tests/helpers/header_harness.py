@@ -293,7 +293,7 @@ def _build(command, source: str, path: Path) -> Path:
     path.write_text(source, encoding="ascii")
     library = path.with_suffix(".so")
     done = subprocess.run(
-        [*command, "-O1", "-shared", "-fPIC", str(path), "-o", str(library), "-lm"],
+        [*command, "-O0", "-shared", "-fPIC", str(path), "-o", str(library), "-lm"],
         capture_output=True, text=True, check=False, timeout=600,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr

@@ -27,6 +27,7 @@ def test_single_precision_keeps_its_promise(name):
     assert double.specular.max() > 0.5 and double.diffuse.max() > 0.1
 
 
+@pytest.mark.newest
 @table_names
 def test_lights_at_hostile_places_keep_the_promise(name):
     """Touching the surface, standing on it, edge-on, crossing the horizon, tiny, huge, far away and at the point."""
@@ -45,6 +46,7 @@ def test_lights_at_hostile_places_keep_the_promise(name):
         assert_close(samples, white_lights([light]), name)
 
 
+@pytest.mark.newest
 @table_names
 def test_narrow_lights_are_exact_to_rounding(name):
     """1 m by 10 um: in single precision their long edges would cancel but for some percent."""
@@ -80,6 +82,7 @@ def small_lights(size, seed):
         yield area_light("Small", shape, center, u, v, direction=direction, corners=corners, radiance=np.ones(3))
 
 
+@pytest.mark.newest
 @pytest.mark.parametrize("size", [0.2, 0.05, 0.01, 1e-3])
 @table_names
 def test_small_lights_keep_the_promise_and_their_share(name, size, monkeypatch):
@@ -145,6 +148,7 @@ def test_many_indices_of_refraction_give_what_single_ones_give(name):
     assert np.abs(apart - together).max() < 2e-6
 
 
+@pytest.mark.newest
 @pytest.mark.parametrize("corners", [3, 4, 5, 12, 32, 64])
 @pytest.mark.parametrize("degree", [1, 2, 3, 4])
 def test_edge_loop_gives_the_moments(degree, corners):

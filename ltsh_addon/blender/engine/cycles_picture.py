@@ -14,7 +14,7 @@ from ...imaging.report import index_stamp
 from ...scene import CYCLES
 from ..ui import results
 from ..ui.job import output_folder
-from ..viewport.gbuffer import float_texture
+from ..viewport.drawing import float_texture
 from ..viewport.textures import look_values
 from .overlay import Rectangle
 
@@ -117,14 +117,14 @@ class ReferenceTexture:
     """The texture of a reference in one view; made again when view or picture change."""
 
     def __init__(self):
-        self._pixels = self._place = self._texture = None
+        self._pixels = self._placement = self._texture = None
 
     def of(self, reference: Reference, size: tuple[int, int]) -> gpu.types.GPUTexture:
         """RGBA of `size` pixels, alpha 0 outside the camera's frame; needs an active GPU context."""
-        place = reference.frame, size
-        if reference.pixels is not self._pixels or place != self._place:
-            self._texture = float_texture(averaged(reference.pixels, *place))
-            self._pixels, self._place = reference.pixels, place
+        placement = reference.frame, size
+        if reference.pixels is not self._pixels or placement != self._placement:
+            self._texture = float_texture(averaged(reference.pixels, *placement))
+            self._pixels, self._placement = reference.pixels, placement
         return self._texture
 
 

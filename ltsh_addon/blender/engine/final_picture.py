@@ -14,7 +14,7 @@ from ...pipeline.mixer import LightPictures, light_pictures
 from ...pipeline.options import RenderOptions
 from ...pipeline.render import finish
 from ...scene import PASSES, TECHNIQUES, Progress
-from ..process import client
+from ..process.pixels import PixelJob, extract_pixels
 from ..ui.job import (
     START_SECONDS,
     STARTING,
@@ -95,7 +95,7 @@ def final_picture(
     """
     if job.cycles_samples:
         return _complete_picture(job, scene_file, progress, show)
-    options = client.ExtractOptions(
+    options = PixelJob(
         scene=scene_file,
         sub_samples=job.sub_samples,
         frame=job.frame,
@@ -105,23 +105,23 @@ def final_picture(
         indices=job.indices,
         shadows=job.shadows,
     )
-    extraction = client.extract(options, progress=progress)
-    emission = extraction.exposure * extraction.emission
+    extraction = extract_pixels(options, progress=progress)
+    emission = extraction.picture.exposure * extraction.cycles.emission
     shown = PASSES if job.shown == "combined" else (job.shown,)
     rest = extraction.rest
     if job.shown != "combined":
-        rest[..., :3] = extraction.exposure * extraction.background[..., :3]
-    passes, warnings = {EMISSION: inside_border(emission, extraction.border)}, extraction.warnings
+        rest[..., :3] = extraction.picture.exposure * extraction.cycles.background[..., :3]
+    passes, warnings = {EMISSION: inside_border(emission, extraction.picture.border)}, extraction.warnings
     if job.data_passes:
         passes |= data_passes(extraction, job.to_camera)
-    indices = extraction.indices.items()
-    passes |= {name: inside_border(plane[..., None], extraction.border) for name, plane in indices}
+    indices = extraction.cycles.indices.items()
+    passes |= {name: inside_border(plane[..., None], extraction.picture.border) for name, plane in indices}
 
     def picture() -> FinalPicture:
         """The picture so far."""
-        combined = inside_border(rest, extraction.border).copy()
-        for part in shown:
-            combined[..., :3] += passes.get(f"LTSH {PASS_LABELS[part]}", 0.0)
+        combined = inside_border(rest, extraction.picture.border).copy()
+        for lit_pass in shown:
+            combined[..., :3] += passes.get(f"LTSH {PASS_LABELS[lit_pass]}", 0.0)
         return FinalPicture(combined, dict(passes), warnings, extraction.problems)
 
     show(picture())
@@ -129,10 +129,20 @@ def final_picture(
     if extraction.occluders is not None:
         shadows = trace_shadows(extraction, PASSES, job.shadow_rays, progress)
     for technique in dict.fromkeys(job.shaded_as().values()):
-        for number, part in enumerate(PASSES):
-            image = _image(extraction, technique, part, shadows, _part(progress, number / len(PASSES), 1 / len(PASSES)))
+        for number, lit_pass in enumerate(PASSES):
+            lit = shade_lights(
+                extraction.samples,
+                extraction.lights,
+                technique,
+                (lit_pass,),
+                (shadows,),
+                progress=lambda fraction, first=number, title=TECHNIQUES[technique].title: progress(
+                    title, (first + fraction) / len(PASSES)
+                ),
+            )[0].combined
+            image = inside_border(extraction.film.image(extraction.picture.exposure * lit), extraction.picture.border)
             prefixes = [prefix for prefix, name in job.shaded_as().items() if name == technique]
-            passes.update({f"{prefix} {PASS_LABELS[part]}": image for prefix in prefixes})
+            passes.update({f"{prefix} {PASS_LABELS[lit_pass]}": image for prefix in prefixes})
             show(picture())
     if not job.keeps_lights:
         return picture()
@@ -156,24 +166,24 @@ def data_passes(extraction, to_camera: np.ndarray | None) -> dict[str, np.ndarra
     pixel, first = np.unique(film.pixel, return_index=True)
     position = np.zeros((film.width * film.height, 3))
     position[pixel] = samples.position[first]
-    found = {NORMAL: normal, POSITION: position.reshape(film.height, film.width, 3)}
+    passes = {NORMAL: normal, POSITION: position.reshape(film.height, film.width, 3)}
     if to_camera is not None:
         depth = np.full(film.width * film.height, BEHIND)
         depth[pixel] = -(samples.position[first] @ to_camera[2, :3] + to_camera[2, 3])
-        found[DEPTH] = depth.reshape(film.height, film.width, 1)
-    return {name: inside_border(image, extraction.border) for name, image in found.items()}
+        passes[DEPTH] = depth.reshape(film.height, film.width, 1)
+    return {name: inside_border(image, extraction.picture.border) for name, image in passes.items()}
 
 
 def _direct_light(job: FinalJob, comparison) -> FinalPicture:
     """The preliminary picture of a complete one before Cycles begins: its direct light."""
     extraction = comparison.extraction
-    images = {f"LTSH {PASS_LABELS[part]}": image for (_, part), image in comparison.images.items()}
+    images = {f"LTSH {PASS_LABELS[lit_pass]}": image for (_, lit_pass), image in comparison.images.items()}
     coverage = extraction.film.coverage()
     combined = _over_background(
-        sum(images.values(), np.zeros((*coverage.shape, 3))), coverage, job.background, extraction.exposure
+        sum(images.values(), np.zeros((*coverage.shape, 3))), coverage, job.background, extraction.picture.exposure
     )
-    passes = {name: inside_border(image, extraction.border) for name, image in images.items()}
-    return FinalPicture(inside_border(combined, extraction.border), passes, ())
+    passes = {name: inside_border(image, extraction.picture.border) for name, image in images.items()}
+    return FinalPicture(inside_border(combined, extraction.picture.border), passes, ())
 
 
 def _complete_picture(job: FinalJob, scene_file: Path, progress: Progress, show) -> FinalPicture:
@@ -189,9 +199,11 @@ def _complete_picture(job: FinalJob, scene_file: Path, progress: Progress, show)
     )
     where = {"scene_name": job.scene, "view_layer": job.view_layer}
     made = finish(options, progress, **where, shaded=lambda comparison: show(_direct_light(job, comparison)))
-    border = made.comparison.extraction.border
+    border = made.comparison.extraction.picture.border
     zero = np.zeros_like(made.combined[..., :3])
-    passes = {f"LTSH {label}": made.ours.get(f"{job.technique}.{part}", zero) for part, label in PASS_LABELS.items()}
+    passes = {
+        f"LTSH {label}": made.ours.get(f"{job.technique}.{lit_pass}", zero) for lit_pass, label in PASS_LABELS.items()
+    }
     for name, channels in job.cycles_passes:
         planes = {key[-1].upper(): plane for key, plane in made.channels.items() if key.rpartition(".")[0] == name}
         # The letter of a single channel varies.
@@ -211,30 +223,12 @@ def _complete_picture(job: FinalJob, scene_file: Path, progress: Progress, show)
     )
 
 
-def _part(progress: Progress, start: float, share: float) -> Progress:
-    """A progress callback for a part of a stage: the `share` of it from `start` on."""
-    return lambda stage, fraction: progress(stage, start + share * fraction)
-
-
-def _image(extraction, technique: str, part: str, shadows, progress: Progress) -> np.ndarray:
-    """Radiance (H, W, 3) of a pass times the film's exposure."""
-    (lit,) = shade_lights(
-        extraction.samples,
-        extraction.lights,
-        technique,
-        (part,),
-        (shadows,),
-        progress=lambda fraction: progress(TECHNIQUES[technique].title, fraction),
-    )
-    return inside_border(extraction.film.image(extraction.exposure * lit.combined), extraction.border)
-
-
 def _over_background(color: np.ndarray, coverage: np.ndarray, background, exposure: float) -> np.ndarray:
     """RGBA (H, W, 4) of `color` over the radiance `background` (3,) behind the surfaces; None: transparent."""
     if background is None:
         return np.concatenate([color, coverage[..., None]], axis=-1)
-    seen = background * (1.0 - coverage)[..., None]
-    return np.concatenate([color + exposure * seen, np.ones((*coverage.shape, 1))], axis=-1)
+    visible = background * (1.0 - coverage)[..., None]
+    return np.concatenate([color + exposure * visible, np.ones((*coverage.shape, 1))], axis=-1)
 
 
 def inside_border(image: np.ndarray, border) -> np.ndarray:

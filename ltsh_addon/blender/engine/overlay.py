@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import blf
 import bpy
@@ -10,7 +11,7 @@ import gpu
 from gpu_extras.batch import batch_for_shader
 
 from ...scene import CYCLES, TECHNIQUES
-from ..ui.comparison import PLATE, covered, draw_rectangle
+from ..ui.overlay import PLATE, covered, draw_rectangle
 from ..ui.preview import ENGINE
 
 MOST_NOTES = 4
@@ -76,18 +77,28 @@ def left_out(mirror, scene) -> QuietLine:
     return QuietLine("; ".join(parts), LIGHTS_PANEL if is_about_lights else MATERIALS_PANEL)
 
 
-# Region -> (error, notes, captions, quiet line), and where the last of these is: left, bottom, right, top.
-_texts: dict[int, tuple[str, list[str], Captions, QuietLine]] = {}
+@dataclass(frozen=True)
+class ViewTexts:
+    """All that a view says."""
+
+    error: str = ""
+    notes: tuple[str, ...] = ()
+    captions: Captions = field(default_factory=Captions)
+    quiet: QuietLine = field(default_factory=QuietLine)
+
+
+# The texts of regions, and where their quiet lines are, by the pointers of regions.
+_texts: dict[int, ViewTexts] = {}
 _quiet_lines: dict[int, Rectangle] = {}
 _draw_handlers = []
 
 
-def show(region, error: str, notes: list[str], captions: Captions, quiet: QuietLine) -> None:
+def show(region, texts: ViewTexts) -> None:
     """What `region` says from now on."""
-    _texts[region.as_pointer()] = (error, list(dict.fromkeys(notes)), captions, quiet)
+    _texts[region.as_pointer()] = texts
 
 
-def lines_of(error: str, notes: list[str]) -> list[tuple[str, tuple]]:
+def lines_of(error: str, notes: Sequence[str]) -> list[tuple[str, tuple]]:
     """Lines of text and their colors, the top one first."""
     lines = [(f"LTSH: {error}", ERROR_COLOR)] if error else []
     lines += [(note, NOTE_COLOR) for note in notes[:MOST_NOTES]]
@@ -136,22 +147,22 @@ def _draw() -> None:
     region = context.region
     if not is_drawn(context):
         return
-    error, notes, captions, quiet = _texts.get(region.as_pointer(), ("", [], Captions(), QuietLine()))
+    texts = _texts.get(region.as_pointer(), ViewTexts())
     scale = context.preferences.system.ui_scale
     sides, font = covered(context.area, region), 0
-    _draw_lines(font, lines_of(error, notes), quiet.text, region, sides, scale)
+    _draw_lines(font, texts, region, sides, scale)
     blf.size(font, CAPTION_SIZE * scale)
-    _draw_captions(font, captions, region, sides, scale)
+    _draw_captions(font, texts.captions, region, sides, scale)
 
 
-def _draw_lines(font: int, notes: list[tuple[str, tuple]], quiet: str, region, sides: dict[str, int], scale: float):
+def _draw_lines(font: int, texts: ViewTexts, region, sides: dict[str, int], scale: float) -> None:
     """The notes and below them the quiet line, at the lower right: Blender's own boxes are at the left and above."""
 
     def width_of(text: str, share: float = 1.0) -> float:
         blf.size(font, share * size)
         return blf.dimensions(font, text)[0]
 
-    pointer = region.as_pointer()
+    pointer, notes, quiet = region.as_pointer(), lines_of(texts.error, texts.notes), texts.quiet.text
     last = [(quiet, POINTED_COLOR if _pointed.get("region") == pointer else QUIET_COLOR)] if quiet else []
     size, margin = TEXT_SIZE * scale, MARGIN * scale
     free = region.width - sides["RIGHT"] - max(sides["LEFT"], sides["FLOAT"])
@@ -166,9 +177,9 @@ def _draw_lines(font: int, notes: list[tuple[str, tuple]], quiet: str, region, s
     widths = [width_of(line) for line, _ in lines]
     _quiet_lines.pop(pointer, None)
     if last:
-        left = right - max(widths[-len(last) :]) - 0.5 * size
+        x = right - max(widths[-len(last) :]) - 0.5 * size
         top = bottom + (LINE * (len(last) - 1) + 1.05) * size
-        _quiet_lines[pointer] = left, bottom - 0.35 * size, right, top
+        _quiet_lines[pointer] = x, bottom - 0.35 * size, right, top
     for number, ((line, color), width) in enumerate(zip(reversed(lines), reversed(widths), strict=True)):
         _write(font, line, right - width, bottom + number * LINE * size, size, color)
 
@@ -176,10 +187,10 @@ def _draw_lines(font: int, notes: list[tuple[str, tuple]], quiet: str, region, s
 def _draw_captions(font: int, captions: Captions, region, sides: dict[str, int], scale: float) -> None:
     line = CAPTION_SIZE * scale
     top = region.height - sides["TOP"] - MARGIN * scale - line
-    place = captions.split * region.width
+    x = captions.split * region.width
     width, _ = blf.dimensions(font, captions.left)
-    _write(font, captions.left, place - width - MARGIN * scale, top, line, CAPTION_COLOR)
-    _write(font, captions.right, place + MARGIN * scale, top, line, CAPTION_COLOR)
+    _write(font, captions.left, x - width - MARGIN * scale, top, line, CAPTION_COLOR)
+    _write(font, captions.right, x + MARGIN * scale, top, line, CAPTION_COLOR)
     if not captions.middle:
         return
     words = (
@@ -188,10 +199,10 @@ def _draw_captions(font: int, captions: Captions, region, sides: dict[str, int],
         (f"blue: darker by {captions.scale:.3g}", DARKER_COLOR),
     )
     gap = 1.5 * line
-    place = 0.5 * (region.width - sum(blf.dimensions(font, text)[0] + gap for text, _ in words) + gap)
+    x = 0.5 * (region.width - sum(blf.dimensions(font, text)[0] + gap for text, _ in words) + gap)
     for text, color in words:
-        _write(font, text, place, top, line, color)
-        place += blf.dimensions(font, text)[0] + gap
+        _write(font, text, x, top, line, color)
+        x += blf.dimensions(font, text)[0] + gap
 
 
 def _write(font: int, text: str, x: float, y: float, size: float, color) -> None:
@@ -237,7 +248,7 @@ class LTSH_GGT_left_out(bpy.types.GizmoGroup):
 
     def draw_prepare(self, context):
         texts = _texts.get(context.region.as_pointer())
-        self.line.target_set_operator("wm.call_panel").name = MATERIALS_PANEL if texts is None else texts[3].panel
+        self.line.target_set_operator("wm.call_panel").name = MATERIALS_PANEL if texts is None else texts.quiet.panel
 
 
 REACH = 8.0  # pixels of an unscaled interface
@@ -245,10 +256,8 @@ HANDLE = 12.0
 
 
 def is_split(context) -> bool:
-    """True if the space of `context` is a 3D view with a split picture."""
-    space = context.space_data
-    shown = space is not None and space.type == "VIEW_3D" and space.shading.type == "RENDERED"
-    return shown and context.engine == ENGINE and context.scene.ltsh_view.mode == "split"
+    """True in 3D views that show a split picture of the engine."""
+    return is_drawn(context) and context.scene.ltsh_view.mode == "split"
 
 
 def _line_place(context) -> float:

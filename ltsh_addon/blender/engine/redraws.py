@@ -53,7 +53,7 @@ def redraw() -> float | None:
     remaining = moments["next"] - time.monotonic()
     if remaining > 0.0:
         return remaining
-    _tag_views()
+    tag_views()
     return None
 
 
@@ -77,7 +77,7 @@ def _watch_shadows() -> float | None:
         # What moves is drawn soon in any case.
         if time.monotonic() - moments["drawn"] < REST_SECONDS:
             return POLL_SECONDS
-        _tag_views()
+        tag_views()
         if bpy.app.timers.is_registered(_end_helpers):
             bpy.app.timers.unregister(_end_helpers)
         _start(_end_helpers, IDLE_SECONDS)
@@ -100,11 +100,12 @@ def _watch_cycles() -> float | None:
         for view in views:
             view.mirror.has_old_lights = True
     if any(news):
-        _tag_views()
+        tag_views()
     return POLL_SECONDS if any(view.waits_for_world for view in views) or (views and node_lights.is_busy) else None
 
 
-def _tag_views() -> None:
+def tag_views() -> None:
+    """Let Blender draw all rendered views again."""
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             if area.type == "VIEW_3D" and area.spaces.active.shading.type == "RENDERED":

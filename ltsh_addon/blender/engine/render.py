@@ -24,7 +24,7 @@ from ..ui import comparison
 from ..ui.job import (
     Plan,
     progress_text,
-    seen,
+    session_times,
     stage_title,
 )
 from ..ui.preview import ENGINE
@@ -111,10 +111,10 @@ class LTSH_RenderEngine(bpy.types.RenderEngine):
             while not pictures.empty():
                 self._show(pictures.get(), job.view_layer)
 
-        plan = Plan(job.steps(), seen=seen)
+        plan = Plan(job.steps(), measured=session_times)
         progress = self._progress(plan, show_new)
         picture = stoppable(lambda report: final_picture(job, scene_file, report, pictures.put), progress)
-        plan.end(seen)
+        plan.end(session_times)
         for problem in picture.problems:
             self.report({"ERROR"}, f"LTSH: {problem}")
         for warning in picture.warnings:
@@ -157,11 +157,11 @@ def _passes_of(scene, layer) -> list[tuple[str, str, str]]:
     """Name, channels and type of all passes except Combined."""
     settings = scene.ltsh_view
     if not settings.complete:
-        own = [(name, "RGB", "COLOR") for name in pass_names(_prefixes(settings))]
-        own += [(name, *kind) for name, kind in DATA_PASSES.items() if getattr(layer, DATA_SETTINGS[name])]
-        return own + [(names_in_files()[key], "X", "VALUE") for key in _indices_of(layer)]
-    own = [(name, "RGB", "COLOR") for name in pass_names(["LTSH"])[: len(PASSES)]]
-    return own + [one for one in _passes_of_cycles(scene, layer) if one[0] != "Combined"]
+        passes = [(name, "RGB", "COLOR") for name in pass_names(_prefixes(settings))]
+        passes += [(name, *kind) for name, kind in DATA_PASSES.items() if getattr(layer, DATA_SETTINGS[name])]
+        return passes + [(names_in_files()[key], "X", "VALUE") for key in _indices_of(layer)]
+    passes = [(name, "RGB", "COLOR") for name in pass_names(["LTSH"])[: len(PASSES)]]
+    return passes + [one for one in _passes_of_cycles(scene, layer) if one[0] != "Combined"]
 
 
 def _indices_of(layer) -> tuple[str, ...]:

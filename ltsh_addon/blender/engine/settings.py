@@ -6,6 +6,7 @@ import bpy
 
 from ...scene import CYCLES, SHIPPED_TABLES, TECHNIQUES
 from ..ui.preview import ENGINE
+from .redraws import tag_views
 
 # Files store these numbers, so they must not change.
 _NUMBERS = {"ltc": 0, "ltsh2": 1, "ltsh4": 2, CYCLES: 3, "ltsh4c": 4}
@@ -35,10 +36,7 @@ SECOND_ITEMS = (
 
 def _redraw(settings, context) -> None:
     """Show a changed setting at once: Blender does not redraw 3D views for properties of add-ons."""
-    for window in context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type == "VIEW_3D":
-                area.tag_redraw()
+    tag_views()
 
 
 class LTSH_ViewSettings(bpy.types.PropertyGroup):
@@ -111,11 +109,11 @@ def _is_about_scene(panel) -> bool:
 
 def _below(panel) -> list[type]:
     """All classes derived from `panel`, each once."""
-    found = {}
-    for own in panel.__subclasses__():
-        found[own] = None
-        found.update(dict.fromkeys(_below(own)))
-    return list(found)
+    classes = {}
+    for derived in panel.__subclasses__():
+        classes[derived] = None
+        classes.update(dict.fromkeys(_below(derived)))
+    return list(classes)
 
 
 class _AsCycles:

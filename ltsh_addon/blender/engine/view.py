@@ -4,25 +4,24 @@ from __future__ import annotations
 
 import logging
 import time
+from dataclasses import replace
 
 import bpy
 import gpu
 
 from ...scene import CYCLES, error_line
 from ..evaluated import visibility
-from ..extract.occluders import collect_occluders
-from ..lights.world import blocks_nothing
 from ..render_settings import cycles_setting, sub_pixel_offsets
 from ..viewport.camera import ViewCamera
 from ..viewport.live_cycles import LiveWorld
 from ..viewport.mirror import SceneMirror
 from ..viewport.pictures import ShownPicture
 from ..viewport.renderer import ViewRenderer
-from ..viewport.shadow_rays import too_many
+from ..viewport.shadow_rays import too_many, view_occluders
 from ..viewport.shadows import LiveShadows
 from . import redraws
 from .cycles_picture import ReferenceTexture, content, is_outdated, reference_of
-from .overlay import Captions, QuietLine, captions_of, left_out, show
+from .overlay import ViewTexts, captions_of, left_out, show
 
 # Width of the line of the split view in pixels of an unscaled interface.
 LINE_WIDTH = 2.0
@@ -43,7 +42,7 @@ class EngineView:
         self._error = ""
         self._content: tuple[tuple, str] | None = None
         self._shadows = LiveShadows()
-        self._shadow_notes: list[str] = []
+        self._occluder_notes: list[str] = []
         redraws.live_shadows.add(self._shadows)
         redraws.open_views.add(self)
 
@@ -73,10 +72,10 @@ class EngineView:
 
     def take_world(self) -> bool:
         """Show what has been found out about the world; False: there is nothing new."""
-        found = self._world.step(bpy.context.scene.frame_current)
-        if found is None:
+        outcome = self._world.step(bpy.context.scene.frame_current)
+        if outcome is None:
             return False
-        sky, notes = found
+        sky, notes = outcome
         self.mirror.take_sky(self.mirror.sky if sky is None else sky, *notes)
         return True
 
@@ -87,65 +86,68 @@ class EngineView:
 
     def draw(self, context, depsgraph) -> None:
         """Draw into the region of `context`, and ask to be drawn again while the picture can be refined."""
-        start = time.monotonic()
-        frame_buffer = gpu.state.active_framebuffer_get()
-        region = context.region
+        start, target = time.monotonic(), gpu.state.active_framebuffer_get()
         if not _has_drawn[0]:
             _has_drawn[0] = True
-            with frame_buffer.bind():
-                frame_buffer.clear(color=EMPTY_COLOR)
-            show(region, "", [COMPILING], Captions(), QuietLine())
+            _clear(target)
+            show(context.region, ViewTexts(notes=(COMPILING,)))
             redraws.redraw_at(start)
             return
-        error, notes, captions = self._error, [], Captions()
+        texts = ViewTexts(self._error)
         try:
-            if self._renderer is None:
-                self._renderer = ViewRenderer()
-            if self.mirror.has_old_lights:
-                self.mirror.read_lights(depsgraph, visibility(depsgraph, context.space_data))
-            region_data = context.region_data
-            view = ViewCamera.of(region_data.view_matrix, region_data.window_matrix, not region_data.is_perspective)
-            settings, size = depsgraph.scene.ltsh_view, (region.width, region.height)
-            mode, reference = settings.mode, None
-            if mode != "single" and settings.second_technique == CYCLES:
-                mode, reference, notes = self._beside_cycles(context, depsgraph, view, mode)
-            shown = _shown(depsgraph.scene, mode, reference, context.preferences.system.ui_scale)
-            self._follow_shadows(depsgraph)
-            points = sub_pixel_offsets(depsgraph.scene, redraws.REFINEMENTS)
-            self._renderer.draw(self.mirror, view, size, shown, frame_buffer, points)
-            captions = captions_of(settings, mode)
-        except Exception as problem:
-            error = self._note(problem)
-            with frame_buffer.bind():
-                frame_buffer.clear(color=EMPTY_COLOR)
-        if not error and not self.mirror.lights and not self.mirror.sky.sides:
-            notes = [NO_LIGHTS, *notes]
-        lines = [*notes, *self.mirror.notes, *self._notes_of_shadows(size)]
-        show(region, error, lines, captions, left_out(self.mirror, depsgraph.scene))
-        is_waiting = self._renderer is not None and self._renderer.shadows is not None and self._shadows.waits
-        if not error and self._renderer.samples < redraws.REFINEMENTS and not is_waiting:
+            texts = self._draw_picture(context, depsgraph, target)
+        except Exception as error:
+            texts = ViewTexts(self._note(error))
+            _clear(target)
+        notes = [*texts.notes, *self.mirror.notes, *self._shadow_notes(context.region)]
+        if not texts.error and not self.mirror.lights and not self.mirror.sky.sides:
+            notes.insert(0, NO_LIGHTS)
+        quiet = left_out(self.mirror, depsgraph.scene)
+        show(context.region, replace(texts, notes=tuple(dict.fromkeys(notes)), quiet=quiet))
+        is_waiting = self._draws_shadows and self._shadows.waits
+        if not texts.error and self._renderer.samples < redraws.REFINEMENTS and not is_waiting:
             redraws.redraw_later(start, self._renderer.samples)
         redraws.moments["drawn"] = time.monotonic()
         redraws.watch()
 
+    def _draw_picture(self, context, depsgraph, target) -> ViewTexts:
+        """Draw the picture into the frame buffer `target`; returns what there is to say about it."""
+        if self._renderer is None:
+            self._renderer = ViewRenderer()
+        if self.mirror.has_old_lights:
+            self.mirror.read_lights(depsgraph, visibility(depsgraph, context.space_data))
+        scene, region, region_data = depsgraph.scene, context.region, context.region_data
+        camera = ViewCamera.of(region_data.view_matrix, region_data.window_matrix, not region_data.is_perspective)
+        mode, reference, notes = scene.ltsh_view.mode, None, ()
+        if mode != "single" and scene.ltsh_view.second_technique == CYCLES:
+            mode, reference, notes = self._beside_cycles(context, depsgraph, camera, mode)
+        shown = _shown(scene, mode, reference, context.preferences.system.ui_scale)
+        self._follow_shadows(depsgraph)
+        points = sub_pixel_offsets(scene, redraws.REFINEMENTS)
+        self._renderer.draw(self.mirror, camera, (region.width, region.height), shown, target, points)
+        return ViewTexts(self._error, tuple(notes), captions_of(scene.ltsh_view, mode))
+
+    @property
+    def _draws_shadows(self) -> bool:
+        return self._renderer is not None and self._renderer.shadows is not None
+
     def _follow_shadows(self, depsgraph) -> None:
         """Let the renderer draw shadows, if the scene has them."""
         self._renderer.shadows = self._shadows if depsgraph.scene.ltsh.shadows else None
-        notes = self._shadow_notes
+        notes = self._occluder_notes
 
         def collect():
             notes.clear()
-            override = depsgraph.view_layer_eval.material_override
-            return blocks_nothing(collect_occluders(depsgraph, override, notes.append), depsgraph.scene.world)
+            return view_occluders(depsgraph, notes.append)
 
         self._shadows.follow((id(self.mirror), self.mirror.surfaces_version), collect)
 
-    def _notes_of_shadows(self, size) -> list[str]:
+    def _shadow_notes(self, region) -> list[str]:
         """What is to be said about shadows."""
-        if self._renderer is None or self._renderer.shadows is None:
+        if not self._draws_shadows:
             return []
-        found = [too_many(len(self.mirror.lights), size), self._shadows.problem, *self._shadow_notes]
-        return [note for note in found if note]
+        problem = too_many(len(self.mirror.lights), (region.width, region.height))
+        return [note for note in (problem, self._shadows.problem, *self._occluder_notes) if note]
 
     def _beside_cycles(self, context, depsgraph, view: ViewCamera, mode: str):
         """The mode that is possible, the texture of the Cycles picture, and what there is to say about it."""
@@ -198,3 +200,8 @@ def _shown(scene, mode: str, reference, ui_scale: float) -> ShownPicture:
 
 # The first view of a session says that shaders are compiled, which holds up the window, before they are.
 _has_drawn = [bpy.app.background]
+
+
+def _clear(target: gpu.types.GPUFrameBuffer) -> None:
+    with target.bind():
+        target.clear(color=EMPTY_COLOR)

@@ -48,8 +48,8 @@ class ViewCamera:
         if self.is_parallel:
             return np.stack([np.zeros(3), np.zeros(3), -self.eye])
         back = np.linalg.inv(self.projection)
-        found = (back[:3] - self.eye[:, None] * back[3]).T
-        return np.stack([found[0], found[1], found[2] + found[3]]) / np.linalg.norm(found[2] + found[3])
+        corners = (back[:3] - self.eye[:, None] * back[3]).T
+        return np.stack([corners[0], corners[1], corners[2] + corners[3]]) / np.linalg.norm(corners[2] + corners[3])
 
     @property
     def homogeneous_eye(self) -> tuple[float, ...]:

@@ -7,9 +7,9 @@ from dataclasses import dataclass, fields
 import gpu
 import numpy as np
 
-from ...cycles import closures
 from ...scene import SurfaceSamples
 from .camera import ViewCamera
+from .drawing import read_texture
 
 # Fields of `GBufferTextures` by their names in shaders.
 SAMPLERS = {
@@ -26,21 +26,14 @@ SAMPLERS = {
     "rebounds": "rebound",
 }
 # Fields of `VisibilityGrid` by their names in shaders.
-SHARE_SAMPLERS = {"shares": "shares", "grid_positions": "positions"}
-
-
-def read_texture(texture: gpu.types.GPUTexture) -> np.ndarray:
-    """The values (H, W, 4) of a texture of floats, row 0 at the bottom."""
-    buffer = texture.read()
-    buffer.dimensions = texture.width * texture.height * 4
-    return np.array(buffer, np.float32).reshape(texture.height, texture.width, 4)
+VISIBILITY_SAMPLERS = {"visibility": "visibility", "grid_positions": "positions"}
 
 
 @dataclass(frozen=True)
 class VisibilityGrid:
-    """The shares of lights that are seen at the points of a picture. Other pictures of the same surfaces may use it."""
+    """The visible fraction of each light at the points of a picture. Other pictures of the same surfaces may use it."""
 
-    shares: gpu.types.GPUTexture  # RG, a layer for each light: the specular and the diffuse share
+    visibility: gpu.types.GPUTexture  # RG, a layer for each light: the specular and the diffuse fraction
     positions: gpu.types.GPUTexture  # of the points, relative to the view's origin; w = 0 where there is no surface
     projection: np.ndarray  # (4, 4) to the clip space that the texels fill
     sources: tuple = ()  # of each layer: a layer whose source is the same object is the same
@@ -64,7 +57,7 @@ class GBufferTextures:
     smooth_normal: gpu.types.GPUTexture | None = None  # w is not read; None: `diffuse_normal`
     tangent: gpu.types.GPUTexture | None = None  # of anisotropic lobes; w = anisotropy; None: 0
     rebound: gpu.types.GPUTexture | None = None  # diffuse_rebound; w = diffuse_roughness; None: 0
-    shares: VisibilityGrid | None = None  # None: every light is seen whole
+    visibility: VisibilityGrid | None = None  # None: every light is seen whole
     mask: gpu.types.GPUTexture | None = None  # depth buffer, 0 where there is no surface; None: all pixels are lit
     has_sheen: bool = False  # there are texels of sheen: base.w = -sheen_a, normal.w = sheen_b
     has_velvet: bool = False  # there are texels of velvet: rebound.w = -sigma, rebound.rgb = albedo
@@ -77,7 +70,7 @@ class GBufferTextures:
             field.name: (texture.width, texture.height)
             for field in fields(self)
             if not field.name.startswith("has_")
-            and field.name != "shares"
+            and field.name != "visibility"
             and (texture := getattr(self, field.name)) is not None
         }
         if len(set(sizes.values())) != 1:
@@ -89,75 +82,6 @@ class GBufferTextures:
         return self.position.width, self.position.height
 
 
-def empty_texture(size: tuple[int, int]) -> gpu.types.GPUTexture:
-    """RGBA32F texture of zeros; `size` is (width, height)."""
-    texture = gpu.types.GPUTexture(size, format="RGBA32F")
-    texture.clear(format="FLOAT", value=(0.0, 0.0, 0.0, 0.0))
-    return texture
-
-
-def frame_buffer(color: gpu.types.GPUTexture, depth: gpu.types.GPUTexture | None = None) -> gpu.types.GPUFrameBuffer:
-    """A frame buffer of the textures."""
-    return gpu.types.GPUFrameBuffer(color_slots=[color], **({} if depth is None else {"depth_slot": depth}))
-
-
-def float_texture(values: np.ndarray) -> gpu.types.GPUTexture:
-    """RGBA32F texture of values (H, W, 4), or an array texture of values (N, H, W, 4)."""
-    values = np.ascontiguousarray(values, dtype=np.float32)
-    height, width = values.shape[-3:-1]
-    buffer = gpu.types.Buffer("FLOAT", values.size, values.reshape(-1))
-    layers = values.shape[0] if values.ndim == 4 else 0
-    return gpu.types.GPUTexture((width, height), layers=layers, format="RGBA32F", data=buffer)
-
-
-def upload_samples(samples: SurfaceSamples, width: int, pixel: np.ndarray | None = None) -> GBufferTextures:
-    """Textures, `width` texels wide, of `samples` (P) at the texels `pixel` (P,), counted from the lower left.
-
-    Without `pixel` the samples are stored in order.
-    """
-    pixel = np.arange(len(samples)) if pixel is None else np.asarray(pixel)
-    height = -(-(int(pixel.max(initial=0)) + 1) // width)
-
-    def texture(vectors, scalars):
-        values = np.zeros((height * width, 4), np.float32)
-        values[pixel, :3] = vectors
-        values[pixel, 3] = scalars
-        return float_texture(values.reshape(height, width, 4))
-
-    dip = samples.specular_dip
-    bumped = (samples.smooth_normal != samples.diffuse_normal).any()
-    turned = bumped or (samples.diffuse_normal != samples.normal).any()
-    fuzzy, velvet = samples.sheen_a > 0.0, samples.sheen_a < 0.0
-    return GBufferTextures(
-        has_sheen=bool(fuzzy.any()),
-        has_bent=bool(((samples.ior < 1.0) & samples.dielectric.any(axis=1)).any()),
-        position=texture(samples.position, 1.0 + samples.receiver),
-        normal=texture(samples.normal, np.where(fuzzy, samples.sheen_b, samples.roughness)),
-        base=texture(samples.diffuse_albedo, np.where(fuzzy, -samples.sheen_a, samples.ior)),
-        f0=texture(samples.specular_f0, dip[:, 0]),
-        f90=texture(samples.specular_f90, dip[:, 1]),
-        dielectric=texture(samples.dielectric, dip[:, 2]),
-        geometric_normal=texture(samples.geometric_normal, 0.0)
-        if (samples.geometric_normal != samples.normal).any()
-        else None,
-        diffuse_normal=texture(samples.diffuse_normal, samples.bump_alpha2) if turned else None,
-        smooth_normal=texture(samples.smooth_normal, 0.0) if bumped else None,
-        tangent=texture(samples.tangent, samples.anisotropy) if samples.anisotropy.any() else None,
-        rebound=texture(
-            np.where(velvet[:, None], _albedo_of_velvet(samples)[:, None], samples.diffuse_rebound),
-            np.where(velvet, samples.sheen_a, samples.diffuse_roughness),
-        )
-        if velvet.any() or samples.diffuse_roughness.any()
-        else None,
-        has_velvet=bool(velvet.any()),
-    )
-
-
-def _albedo_of_velvet(samples) -> np.ndarray:
-    cosine = (samples.diffuse_normal * samples.view).sum(axis=1)
-    return closures.velvet_albedo(cosine, np.maximum(-samples.sheen_a, 0.0))
-
-
 def every_texel(texture: gpu.types.GPUTexture, step: int) -> np.ndarray:
     """Every `step`-th texel (H, W, 4) in either direction."""
     return np.ascontiguousarray(read_texture(texture)[step // 2 :: step, step // 2 :: step])
@@ -165,12 +89,12 @@ def every_texel(texture: gpu.types.GPUTexture, step: int) -> np.ndarray:
 
 def gbuffer_texels(gbuffer: GBufferTextures, step: int = 1) -> dict[str, np.ndarray]:
     """Every `step`-th texel of a G-buffer, (H, W, 4) by name of the texture."""
-    textures = {name: getattr(gbuffer, name) for name in (*_ALWAYS, *_PERHAPS)}
+    textures = {name: getattr(gbuffer, name) for name in (*_REQUIRED, *_OPTIONAL)}
     return {name: every_texel(texture, step) for name, texture in textures.items() if texture is not None}
 
 
-_ALWAYS = ("position", "normal", "base", "f0", "f90", "dielectric")
-_PERHAPS = ("diffuse_normal", "smooth_normal", "geometric_normal", "tangent", "rebound")
+_REQUIRED = ("position", "normal", "base", "f0", "f90", "dielectric")
+_OPTIONAL = ("diffuse_normal", "smooth_normal", "geometric_normal", "tangent", "rebound")
 
 
 def gbuffer_samples(gbuffer: GBufferTextures, view: ViewCamera) -> tuple[SurfaceSamples, np.ndarray]:
@@ -182,8 +106,8 @@ def gbuffer_samples(gbuffer: GBufferTextures, view: ViewCamera) -> tuple[Surface
 def samples_of_texels(texels: dict[str, np.ndarray], view: ViewCamera) -> tuple[SurfaceSamples, np.ndarray]:
     pixel = np.flatnonzero(texels["position"][:, :, 3] > 0.0)
     values = {name: rows.reshape(-1, 4)[pixel].astype(np.float64) for name, rows in texels.items()}
-    position, normal, base, f0, f90, dielectric = (values[name] for name in _ALWAYS)
-    further = {name: values.get(name) for name in _PERHAPS}
+    position, normal, base, f0, f90, dielectric = (values[name] for name in _REQUIRED)
+    further = {name: values.get(name) for name in _OPTIONAL}
     bent, fuzzy = further["diffuse_normal"], base[:, 3] < 0.0
     tangent, rebound = further["tangent"], further["rebound"]
     return SurfaceSamples(

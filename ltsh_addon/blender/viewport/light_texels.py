@@ -15,15 +15,16 @@ from ...lobes import moments32
 from ...lobes.lookup_table import LookupTable
 from ...scene import Light, PolygonLight
 from ...shading.header import float_literal
-from .gbuffer import float_texture
+from .drawing import float_texture
 
 HEADER = 7  # texels of a light's header, see `light_texels`
 WIDTH = 256  # texels of a row of the texture of lights
-# Flags of a light.
-DIFFUSE, SPECULAR, ROUND, DISTANT, FACING, BALL, CONE = 1, 2, 4, 8, 16, 32, 64
-# UNEVEN: not equally bright all over. PROFILE: with a spread or a falloff. CAP: seen as a cap of the sphere.
-# PLACED: with a pattern by the place on the light.
-UNEVEN, PROFILE, CAP, PLACED = 128, 256, 512, 1024
+# Flags of a light, from the lowest bit on. UNEVEN: not equally bright all over. PROFILE: with a spread or a falloff.
+# CAP: seen as a cap of the sphere. PLACED: with a pattern by the position on the light.
+FLAGS = (
+    *("DIFFUSE", "SPECULAR", "ROUND", "DISTANT", "FACING", "BALL", "CONE"),
+    *("UNEVEN", "PROFILE", "CAP", "PLACED"),
+)
 _QUAD = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
 
@@ -47,11 +48,11 @@ _SHARED = [
     *(_circle(count) for count in _CIRCLES),
     *(np.stack(light_profile.gauss_legendre(count), axis=1) for count in _NODES),
 ]
-_FIRST = np.concatenate([[0], np.cumsum([len(part) for part in _SHARED])])[:-1].tolist()
+_FIRST = np.concatenate([[0], np.cumsum([len(texels) for texels in _SHARED])])[:-1].tolist()
 QUAD_FIRST, _CIRCLE_FIRST = _FIRST[0], _FIRST[1 : 1 + len(_CIRCLES)]
 # Texel of the first node of a quadrature, by its number of nodes.
 NODES_FIRST = dict(zip(_NODES, _FIRST[1 + len(_CIRCLES) :], strict=True))
-FIRST_LIGHT = sum(len(part) for part in _SHARED)
+FIRST_LIGHT = sum(len(texels) for texels in _SHARED)
 # Texel of the first corner, number of corners, and the largest apparent width for which they are used.
 ROUND_LEVELS = tuple(zip(_CIRCLE_FIRST, _CIRCLES, _SIZES, strict=True))
 
@@ -62,17 +63,7 @@ def constants() -> dict[str, int | str]:
         "LIGHT_HEADER": HEADER,
         "FIRST_LIGHT": FIRST_LIGHT,
         "LIGHT_WIDTH": WIDTH,
-        "DIFFUSE_FLAG": DIFFUSE,
-        "SPECULAR_FLAG": SPECULAR,
-        "ROUND_FLAG": ROUND,
-        "DISTANT_FLAG": DISTANT,
-        "FACING_FLAG": FACING,
-        "BALL_FLAG": BALL,
-        "CONE_FLAG": CONE,
-        "UNEVEN_FLAG": UNEVEN,
-        "PROFILE_FLAG": PROFILE,
-        "CAP_FLAG": CAP,
-        "PLACED_FLAG": PLACED,
+        **{f"{name}_FLAG": 1 << bit for bit, name in enumerate(FLAGS)},
         "NEAR_DISK": float_literal(NEAR_DISK),
         "LEAST_SHRINKING": float_literal(LEAST_SHRINKING),
     }
@@ -105,17 +96,17 @@ def light_texels(lights: Iterable[Light]) -> np.ndarray:
     """
     lights = list(lights)
     headers, lists = [], []
-    place = FIRST_LIGHT + HEADER * len(lights)
+    next_texel = FIRST_LIGHT + HEADER * len(lights)
     for light in lights:
-        first, count, half_v, corners = _outline(light, place)
+        first, count, half_v, corners = _outline(light, next_texel)
         receivers = np.zeros((0, 1)) if light.receivers is None else np.array(light.receivers, float)[:, None]
-        headers.append(_header(light, first, count, half_v, place + len(corners)))
+        headers.append(_header(light, first, count, half_v, next_texel + len(corners)))
         pattern = _pattern_texels(light.pattern)
-        headers[-1][6, 3] = place + len(corners) + len(receivers) if len(pattern) else 0.0
-        for part in (corners, receivers, pattern):
-            lists.append(np.pad(part, ((0, 0), (0, 4 - part.shape[1]))))
-            place += len(part)
-    shared = [np.pad(part, ((0, 0), (0, 2))) for part in _SHARED]
+        headers[-1][6, 3] = next_texel + len(corners) + len(receivers) if len(pattern) else 0.0
+        for rows in (corners, receivers, pattern):
+            lists.append(np.pad(rows, ((0, 0), (0, 4 - rows.shape[1]))))
+            next_texel += len(rows)
+    shared = [np.pad(rows, ((0, 0), (0, 2))) for rows in _SHARED]
     texels = np.concatenate([*shared, *headers, *lists])
     rows = -(-len(texels) // WIDTH)
     return np.pad(texels, ((0, rows * WIDTH - len(texels)), (0, 0))).reshape(rows, WIDTH, 4).astype(np.float32)
@@ -134,7 +125,7 @@ def visible_lights(lights: Iterable[Light]) -> list[Light]:
     return [light for light in lights if light.area_vector.any()]
 
 
-def _outline(light, place):
+def _outline(light, next_texel):
     """First texel and number of corners, half_v, and the light's own corners (V, 2).
 
     half_v has the sign with which corners run counterclockwise as seen from the lit side.
@@ -143,22 +134,32 @@ def _outline(light, place):
     if isinstance(light, PolygonLight):
         axes = np.stack([light.half_u, half_v], axis=1)
         corners = np.linalg.lstsq(axes, (light.polygon() - light.center).T, rcond=None)[0].T
-        return place, len(corners), half_v, corners
+        return next_texel, len(corners), half_v, corners
     if np.dot(light.area_vector, light.direction) < 0.0:
         half_v = -half_v
-    own = np.zeros((0, 2))
+    none = np.zeros((0, 2))
     if light.cone is not None:
         values = [[light.cone.cosine], [light.cone.sharpness], [0.0]]
-        return place, 0, half_v, np.concatenate([light.cone.axes, values], axis=1)
-    return (0, 0, half_v, own) if light.is_round else (QUAD_FIRST, 4, half_v, own)
+        return next_texel, 0, half_v, np.concatenate([light.cone.axes, values], axis=1)
+    return (0, 0, half_v, none) if light.is_round else (QUAD_FIRST, 4, half_v, none)
 
 
 def _header(light, first, count, half_v, first_receiver):
-    flags = DIFFUSE * light.affects_diffuse + SPECULAR * light.affects_specular + ROUND * light.is_round
-    flags += DISTANT * light.is_distant + FACING * light.is_facing + BALL * (light.is_facing and light.is_sphere)
-    flags += CONE * (light.cone is not None) + UNEVEN * (light.is_facing and not light.is_uniform)
-    flags += PROFILE * light.has_profile + CAP * _is_cap(light)
-    flags += PLACED * (light.pattern is not None and light.is_sphere and not light.pattern.by_ray)
+    is_ball = light.shape == "BALL"
+    traits = {
+        "DIFFUSE": light.affects_diffuse,
+        "SPECULAR": light.affects_specular,
+        "ROUND": light.is_round,
+        "DISTANT": light.is_distant,
+        "FACING": light.is_facing,
+        "BALL": is_ball,
+        "CONE": light.cone is not None,
+        "UNEVEN": light.is_facing and not light.is_even,
+        "PROFILE": light.is_profiled,
+        "CAP": _is_cap(light),
+        "PLACED": is_ball and light.pattern is not None and not light.pattern.by_ray,
+    }
+    flags = sum(1 << bit for bit, name in enumerate(FLAGS) if traits[name])
     receivers = -1 if light.receivers is None else len(light.receivers)
     profile = light_profile.Profile.of(light)
     tangent, share = (profile.tangent, profile.share) if light.has_profile else (0.0, np.inf)
@@ -208,7 +209,7 @@ def table_texels(table: LookupTable, iors: tuple[float, ...] = ()) -> np.ndarray
     vectors = (*range(len(ridges.weights)), *(("dielectric", float(ior)) for ior in iors))
     channels = ridges.channels(vectors)
     parts = [channels[:parameters], *np.split(channels[parameters:], len(vectors))]
-    padded = np.concatenate([np.pad(part, ((0, -len(part) % 4), (0, 0))) for part in parts])
+    padded = np.concatenate([np.pad(layers, ((0, -len(layers) % 4), (0, 0))) for layers in parts])
     return padded.reshape(-1, 4, rows, columns).transpose(0, 2, 3, 1)
 
 
@@ -249,7 +250,7 @@ def upload_lights(lights: Iterable[Light], sky: gpu.types.GPUTexture | None = No
     return UploadedLights(visible, float_texture(light_texels(visible)), sky)
 
 
-def shares(loops: Sequence[int]) -> list[tuple[int, int]]:
+def draw_ranges(loops: Sequence[int]) -> list[tuple[int, int]]:
     """The lights (first, end) of each draw call; `loops` are the iterations of each light. At least one call.
 
     Calls are limited because llvmpipe aborts loops of a pixel after 65535 iterations, and long loops are bad for other

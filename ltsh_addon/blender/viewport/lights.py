@@ -15,11 +15,11 @@ from ..evaluated import (
     SURFACE_TYPES,
     EmitterTraits,
 )
-from ..lights.area import area_light, note_unsupported, reason_to_leave_out, unseen_light
+from ..lights.area import area_light, node_light, note_unsupported, reason_to_leave_out
 from ..lights.emission import emission_of, factors_of, open_studio
 from ..lights.linking import Receivers
 from ..lights.meshes import collect_mesh_lights, constant_mesh_lights
-from ..lights.textures import MOST_LOOKS, SeenNodes, ShownTextures, UnseenLight, seen_factor, with_pattern
+from ..lights.textures import MOST_LOOKS, NodeEmission, NodeLight, ShownTextures, node_emission, with_pattern
 from ..materials.graph import source_of, surface_of, tree_in_use
 from ..materials.looks import look_of
 from ..materials.values import product, value_at
@@ -30,12 +30,12 @@ FAR_AWAY = np.full(3, 1e6)
 MOST_LIGHTS = 2048
 # Reasons why a light has no pattern.
 NOT_RESOLVED = "its nodes are not resolved, it shines as without them"
-NOT_YET = "it shines as without its nodes until Cycles has looked at them"
+NOT_YET = "it shines as without its nodes until Cycles has sources at them"
 # Patterns: a function that returns how Cycles sees the nodes of evaluated light data, or why that is not known.
-Patterns = Callable[[bpy.types.Light, UnseenLight], SeenNodes | str]
+Patterns = Callable[[bpy.types.Light, NodeLight], NodeEmission | str]
 
 
-def no_patterns(data, source: UnseenLight) -> str:
+def no_patterns(data, source: NodeLight) -> str:
     """The `Patterns` of views that resolve no nodes."""
     return NOT_RESOLVED
 
@@ -81,13 +81,13 @@ def strongest(lights: list[Light], notes: list[str], most: int = MOST_LIGHTS) ->
     if len(lights) <= most:
         return lights
     power = np.array([np.linalg.norm(light.area_vector) * np.abs(light.radiance).sum() for light in lights])
-    kept = np.sort(np.argsort(-power, kind="stable")[:most])
-    left = 1.0 - power[kept].sum() / power.sum()
+    chosen = np.sort(np.argsort(-power, kind="stable")[:most])
+    missing = 1.0 - power[chosen].sum() / power.sum()
     notes.append(
-        f"Of {len(lights)} lights, faces and patches the {most} strongest are shown, {100.0 * left:.1f} % of the power "
-        "is missing"
+        f"Of {len(lights)} lights, faces and patches the {most} strongest are shown, {100.0 * missing:.1f} % of the "
+        "power is missing"
     )
-    return [lights[index] for index in kept]
+    return [lights[index] for index in chosen]
 
 
 def _has_emission(ob) -> bool:
@@ -100,43 +100,43 @@ def _emission(material) -> np.ndarray:
 
 def _mesh_lights(depsgraph, receivers: Receivers, notes: list[str]) -> list[Light]:
     override = depsgraph.view_layer_eval.material_override
-    found = collect_mesh_lights(depsgraph, override, receivers, notes.append, copies=False)
+    mesh_lights = collect_mesh_lights(depsgraph, override, receivers, notes.append, copies=False)
     camera = depsgraph.scene.camera
     eye = FAR_AWAY if camera is None else np.array(camera.matrix_world.translation)
-    return constant_mesh_lights(found, _emission, eye, notes.append)
+    return constant_mesh_lights(mesh_lights, _emission, eye, notes.append)
 
 
-def patterns_of(scene, depsgraph) -> dict[tuple, SeenNodes]:
-    """How Cycles sees the nodes of lights that views cannot read themselves, by the `key` of the `UnseenLight`.
+def patterns_of(scene, depsgraph) -> dict[tuple, NodeEmission]:
+    """How Cycles sees the nodes of lights that views cannot read themselves, by the `key` of the `NodeLight`.
 
     `scene` is left as it was.
     """
-    wanted: dict[tuple, UnseenLight] = {}
+    wanted: dict[tuple, NodeLight] = {}
 
-    def note(data, source: UnseenLight) -> str:
+    def note(data, source: NodeLight) -> str:
         if len(wanted) < MOST_LOOKS:
             wanted[source.key] = source
         return NOT_YET
 
-    receivers, looked = Receivers([]), (ShownTextures(), note)
+    receivers, sources = Receivers([]), (ShownTextures(), note)
     for instance in depsgraph.object_instances:
         ob = instance.object
         if ob.type == "LIGHT" and tree_in_use(ob.data) is not None:
             matrix = np.array(instance.matrix_world, dtype=np.float64)
             if not reason_to_leave_out(ob, matrix):
-                _with_nodes(area_light(ob, matrix, EmitterTraits.of(instance), receivers), instance, looked, [])
+                _with_nodes(area_light(ob, matrix, EmitterTraits.of(instance), receivers), instance, sources, [])
     if not wanted:
         return {}
     with open_studio(scene) as studio:
-        return {key: seen_factor(source, studio) for key, source in wanted.items()}
+        return {key: node_emission(source, studio) for key, source in wanted.items()}
 
 
-def _with_nodes(light: Light, instance, looked: tuple, notes: list[str]) -> list[Light]:
+def _with_nodes(light: AreaLight, instance, sources: tuple, notes: list[str]) -> list[AreaLight]:
     """The lights that the node tree of a depsgraph `instance` makes of `light`; [] where it emits nothing.
 
-    `looked` are the textures and patterns of `view_lights`.
+    `sources` are the textures and patterns of `view_lights`.
     """
-    ob, (textures, patterns) = instance.object, looked
+    ob, (textures, patterns) = instance.object, sources
     data = ob.data
     emission = None if tree_in_use(data) is None else emission_of(data)
     if emission is None or emission.plain:
@@ -158,14 +158,14 @@ def _with_nodes(light: Light, instance, looked: tuple, notes: list[str]) -> list
             return patches
     warnings: list[str] = []
     matrix = np.array(instance.matrix_world, dtype=np.float64)
-    unseen = unseen_light(ob, matrix, SimpleNamespace(warn=warnings.append), instance)
-    found = patterns(data, unseen)
-    if isinstance(found, str):
-        notes.append(f"{light.name}: {found}")
+    unseen = node_light(ob, matrix, SimpleNamespace(warn=warnings.append), instance)
+    pattern = patterns(data, unseen)
+    if isinstance(pattern, str):
+        notes.append(f"{light.name}: {pattern}")
         return [replace(light, falloff=0, smooth=0.0)]
     notes += warnings
     if not light.is_distant:
         light = replace(light, falloff=unseen.falloff.power, smooth=unseen.falloff.smooth)
     if light.is_facing or light.is_distant:
-        return with_pattern(light, found, unseen, notes.append)
-    return textures.split_seen(light, found, notes)
+        return with_pattern(light, pattern, unseen, notes.append)
+    return textures.split_seen(light, pattern, notes)

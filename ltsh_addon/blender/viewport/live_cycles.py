@@ -16,20 +16,20 @@ from ...cycles.environment import CUBE, SkyPicture
 from ...files import save_array, temporary_folder
 from ...scene import Cancelled, Light, SceneError, error_line
 from ..lights.emission import ObjectFacts, nodes_as_text, open_studio
-from ..lights.textures import SeenNodes, UnseenLight, seen_factor
+from ..lights.textures import NodeEmission, NodeLight, node_emission
 from ..lights.world import background_pictures, light_of_world, light_pictures
-from ..process import client
-from ..process.client import LAMPS
+from ..process import view
+from ..process.view import NODE_LIGHTS, NodeLightFile, NodeLightJob, WorldJob
 from .lights import NOT_RESOLVED, NOT_YET
 from .sky import ShownSky, background_of, coarse, varied_sky
 
 
 @dataclass
-class _Look:
-    """A second Blender that looks at lights."""
+class _LightsJob:
+    """The work of a second Blender that renders the nodes of lights."""
 
     states: dict[tuple, tuple]  # states by key of the lights without results so far
-    found: list[tuple[tuple, SeenNodes]] = field(default_factory=list)  # new results, with the keys of their lights
+    results: list[tuple[tuple, NodeEmission]] = field(default_factory=list)  # with the keys of their lights
     error: str = ""
     is_stopped: bool = False
     thread: threading.Thread | None = None
@@ -39,28 +39,28 @@ class LiveNodeLights:
     """The nodes of lights as Cycles sees them, for all windows.
 
     A second Blender looks at new and changed lights while the views go on. Lights are identified by the `key` of
-    `UnseenLight`.
+    `NodeLight`.
     """
 
     def __init__(self):
-        self._known: dict[tuple, tuple[tuple, SeenNodes | str]] = {}  # state of a light's nodes, and the result
+        self._known: dict[tuple, tuple[tuple, NodeEmission | str]] = {}  # state of a light's nodes, and the result
         self._wanted: dict[tuple, tuple] = {}  # states of lights to look at
-        self._sources: dict[tuple, UnseenLight] = {}  # the lights of these states
+        self._sources: dict[tuple, NodeLight] = {}  # the lights of these states
         self._changed, self._images = 0.0, 0  # time of the last change; counts changes of images
-        self._look: _Look | None = None
+        self._job: _LightsJob | None = None
 
-    def pattern(self, data, source: UnseenLight) -> SeenNodes | str:
+    def pattern(self, data, source: NodeLight) -> NodeEmission | str:
         """The last result for a light, or a note that there is none yet. Requests a new look if the light changed."""
         key, state = source.key, self._state(data, source)
-        known, found = self._known.get(key, ((), NOT_YET))
-        on_its_way = self._wanted.get(key) or (self._look.states.get(key) if self._look is not None else None)
+        known, result = self._known.get(key, ((), NOT_YET))
+        on_its_way = self._wanted.get(key) or (self._job.states.get(key) if self._job is not None else None)
         if known == state:
             self._wanted.pop(key, None)
         elif on_its_way != state:
             self._wanted[key], self._sources[key], self._changed = state, source, time.monotonic()
-        return found
+        return result
 
-    def _state(self, data, source: UnseenLight) -> tuple:
+    def _state(self, data, source: NodeLight) -> tuple:
         text = nodes_as_text(data)
         names = {"AREA": ("shape", "size", "size_y"), "SUN": ("angle",)}.get(data.type, ("use_soft_falloff",))
         if data.type in ("POINT", "SPOT") and (source.is_mixed or not source.by_ray):
@@ -78,76 +78,70 @@ class LiveNodeLights:
     @property
     def is_busy(self) -> bool:
         """True while results are to come."""
-        return bool(self._wanted) or self._look is not None
+        return bool(self._wanted) or self._job is not None
 
     def stop(self) -> None:
         """Drop all requests: nobody waits for results any more."""
         self._wanted.clear()
-        if self._look is not None:
-            self._look.is_stopped, self._look = True, None
+        if self._job is not None:
+            self._job.is_stopped, self._job = True, None
 
     def step(self, frame: int) -> bool:
         """Do the next step, in the main thread; True if there is news."""
-        look = self._look
-        if look is None:
+        job = self._job
+        if job is None:
             return bool(self._wanted) and time.monotonic() - self._changed > REST_SECONDS and self._begin(frame)
-        has_ended = not look.thread.is_alive()
-        news = bool(look.found)
-        while look.found:
-            key, found = look.found.pop(0)
-            self._known[key] = look.states.pop(key), found
+        has_ended = not job.thread.is_alive()
+        news = bool(job.results)
+        while job.results:
+            key, result = job.results.pop(0)
+            self._known[key] = job.states.pop(key), result
         if has_ended:
-            self._look = None
-            for key, state in look.states.items():
-                if look.error:
-                    self._known[key] = state, look.error
+            self._job = None
+            for key, state in job.states.items():
+                if job.error:
+                    self._known[key] = state, job.error
                 else:
                     self._wanted.setdefault(key, state)
-            news |= bool(look.error)
+            news |= bool(job.error)
         # Stop if a light has changed again since.
-        look.is_stopped |= any(key in look.states for key in self._wanted)
+        job.is_stopped |= any(key in job.states for key in self._wanted)
         return news
 
     def _begin(self, frame: int) -> bool:
         """Start a second Blender; True if that failed, which is news."""
         present = {light.session_uid: light for light in bpy.data.lights}
         self._known = {key: known for key, known in self._known.items() if key[0] in present}
-        look = _Look({key: state for key, state in self._wanted.items() if key[0] in present})
+        job = _LightsJob({key: state for key, state in self._wanted.items() if key[0] in present})
         self._wanted.clear()
-        if not look.states:
+        if not job.states:
             return False
-        stack = ExitStack()
-        keys = list(look.states)
-        sources = [self._sources[key] for key in keys]
+        keys = list(job.states)
         lights = [present[key[0]] for key in keys]
-        try:
-            folder = stack.enter_context(temporary_folder())
-            places = written(folder / "lamps.blend", lights)
-            lamps = [
-                client.UnseenLamp(str(place), light.name, source.matrix.tolist(), source.flags, vars(source.facts))
-                for place, light, source in zip(places, lights, sources, strict=True)
-            ]
-        except (OSError, RuntimeError) as error:
-            stack.close()
-            self._known.update({key: (look.states[key], f"{NOT_RESOLVED}: {error_line(error)}") for key in keys})
-            return True
 
         def take(number: int, factor: np.ndarray, lost: float) -> bool:
-            look.found.append((keys[number], SeenNodes(factor, lost)))
-            return not look.is_stopped
+            job.results.append((keys[number], NodeEmission(factor, lost)))
+            return not job.is_stopped
 
-        def work() -> None:
+        def work(folder: Path, paths: list[Path]) -> None:
+            files = [
+                NodeLightFile(str(path), name, source.matrix.tolist(), source.flags, vars(source.facts))
+                for path, name, source in zip(paths, names, sources, strict=True)
+            ]
             try:
-                with stack:
-                    client.look_at_lamps(lamps, frame, folder, take)
+                view.render_node_lights(files, frame, folder, take)
             except Cancelled:
                 pass
             except Exception as error:
-                look.error = f"{NOT_RESOLVED}: {error_line(error)}"
+                job.error = f"{NOT_RESOLVED}: {error_line(error)}"
 
-        look.thread = threading.Thread(target=work, name="LTSH lamps", daemon=True)
-        self._look = look
-        look.thread.start()
+        names, sources = [light.name for light in lights], [self._sources[key] for key in keys]
+        try:
+            job.thread = _start("lamps", lights, work)
+        except (OSError, RuntimeError) as error:
+            self._known.update({key: (job.states[key], f"{NOT_RESOLVED}: {error_line(error)}") for key in keys})
+            return True
+        self._job = job
         return False
 
 
@@ -155,11 +149,26 @@ class LiveNodeLights:
 REST_SECONDS = 0.3
 
 
-def written(path: Path, blocks: list) -> list[Path]:
-    """Write data-blocks into the .blend `path`; returns the .blend to load each from, for linked ones their library."""
-    own = {block for block in blocks if block.library is None}
-    bpy.data.libraries.write(str(path), own, path_remap="ABSOLUTE", fake_user=True)
-    return [path if block in own else Path(bpy.path.abspath(block.library.filepath)) for block in blocks]
+def _start(name: str, blocks: list, work: Callable[[Path, list[Path]], None]) -> threading.Thread:
+    """A thread that runs `work(folder, paths)` with a temporary folder, and the .blend to load each of `blocks` from.
+
+    Linked data-blocks are in their library. Raises OSError and RuntimeError where the others cannot be written.
+    """
+    stack = ExitStack()
+    with stack:
+        folder = stack.enter_context(temporary_folder())
+        path, local = folder / f"{name}.blend", {block for block in blocks if block.library is None}
+        bpy.data.libraries.write(str(path), local, path_remap="ABSOLUTE", fake_user=True)
+        paths = [path if block in local else Path(bpy.path.abspath(block.library.filepath)) for block in blocks]
+        stack = stack.pop_all()
+
+    def run() -> None:
+        with stack:
+            work(folder, paths)
+
+    thread = threading.Thread(target=run, name=f"LTSH {name}", daemon=True)
+    thread.start()
+    return thread
 
 
 class LiveWorld:
@@ -209,29 +218,20 @@ class LiveWorld:
         world = next((one for one in bpy.data.worlds if one.name_full == self._of), None)
         if world is None:
             return
-        stack = ExitStack()
-        folder = stack.enter_context(temporary_folder())
         name, like, stopped = world.name, light_of_world(world), self._stopped
-        try:
-            path = written(folder / "world.blend", [world])[0]
-        except BaseException:
-            stack.close()
-            raise
 
-        def work() -> None:
+        def work(folder: Path, paths: list[Path]) -> None:
             try:
-                with stack:
-                    found = client.look_at_world(path, name, frame, folder, lambda *_: not stopped.is_set())
-                light = [SkyPicture(*axes, one) for axes, one in zip(CUBE, found.light, strict=False)]
-                self._outcome = varied_sky(like, light, found.lights, found.background), found.warnings
+                result = view.render_world(WorldJob(paths[0], name, frame), folder, lambda *_: not stopped.is_set())
+                light = [SkyPicture(*axes, one) for axes, one in zip(CUBE, result.light, strict=False)]
+                self._outcome = varied_sky(like, light, result.lights, result.background), result.warnings
             except Exception as error:
                 self._outcome = error
 
-        self._thread = threading.Thread(target=work, name="LTSH world", daemon=True)
-        self._thread.start()
+        self._thread = _start("world", [world], work)
 
 
-def look_at_world(scene, world, warn: Callable) -> tuple[list[SkyPicture], list[Light], np.ndarray]:
+def rendered_world(scene, world, warn: Callable) -> tuple[list[SkyPicture], list[AreaLight], np.ndarray]:
     """The `world` as Cycles renders it: pictures of its light ([] where it is dark), the small bright lights in it, and
     its background (N, N, 3). `scene` is left as it was."""
     like, light, lights = light_of_world(world), [], []
@@ -240,36 +240,36 @@ def look_at_world(scene, world, warn: Callable) -> tuple[list[SkyPicture], list[
     return [coarse(picture) for picture in light], lights, background_of(background_pictures(scene, world, warn))
 
 
-def show_world(job: dict, folder: Path) -> dict:
-    """Do the `job` (see `client.look_at_world`): writes pictures into `folder`, returns lights and warnings."""
+def render_world(job: WorldJob, folder: Path, progress) -> dict:
+    """Do the `job`: writes pictures into `folder`, returns lights and warnings."""
     warnings: list[str] = []
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
-    with bpy.data.libraries.load(job["path"]) as (_, wanted):
-        wanted.worlds = [job["world"]]
+    with bpy.data.libraries.load(job.path) as (_, wanted):
+        wanted.worlds = [job.world]
     (scene.world,) = wanted.worlds
-    scene.frame_set(job["frame"])
-    light, lights, background = look_at_world(scene, scene.world, warnings.append)
+    scene.frame_set(job.frame)
+    light, lights, background = rendered_world(scene, scene.world, warnings.append)
     save_array(folder / "light.npy", np.array([picture.radiance for picture in light], np.float32))
     save_array(folder / "background.npy", background.astype(np.float32))
     return {"lights": [one.record() for one in lights], "warnings": warnings}
 
 
-def show_lamps(job: dict, folder: Path, progress: Callable) -> dict:
-    """Do the `job` (see `client.look_at_lamps`): writes the factors of each light's nodes into `folder`."""
+def render_node_lights(job: NodeLightJob, folder: Path, progress: Callable) -> dict:
+    """Do the `job`: writes the factors of each light's nodes into `folder`."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    scene, count = bpy.context.scene, len(job["lamps"])
-    scene.frame_set(job["frame"])
-    for number, lamp in enumerate(job["lamps"]):
-        with bpy.data.libraries.load(lamp["path"]) as (there, wanted):
-            if lamp["name"] not in there.lights:
-                raise SceneError(f"{lamp['path']}: has no light {lamp['name']!r}")
-            wanted.lights = [lamp["name"]]
-        facts = ObjectFacts(**lamp["facts"])
-        source = UnseenLight(wanted.lights[0], np.array(lamp["matrix"]), facts=facts, **lamp["flags"])
+    scene, files = bpy.context.scene, [NodeLightFile(**fields) for fields in job.lights]
+    scene.frame_set(job.frame)
+    for number, file in enumerate(files):
+        with bpy.data.libraries.load(file.path) as (there, wanted):
+            if file.name not in there.lights:
+                raise SceneError(f"{file.path}: has no light {file.name!r}")
+            wanted.lights = [file.name]
+        facts = ObjectFacts(**file.facts)
+        source = NodeLight(wanted.lights[0], np.array(file.matrix), facts=facts, **file.flags)
         with open_studio(scene) as studio:
-            found = seen_factor(source, studio)
-        save_array(folder / f"{number}.npy", found.factor.astype(np.float32))
-        save_array(folder / f"{number}_lost.npy", np.array(found.lost))
-        progress(LAMPS, (number + 1) / count)
+            pattern = node_emission(source, studio)
+        save_array(folder / f"{number}.npy", pattern.factor.astype(np.float32))
+        save_array(folder / f"{number}_lost.npy", np.array(pattern.lost))
+        progress(NODE_LIGHTS, (number + 1) / len(files))
     return {}

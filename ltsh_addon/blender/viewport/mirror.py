@@ -24,10 +24,11 @@ from ..lights.linking import Receivers
 from ..lights.textures import ShownTextures
 from ..lights.world import light_of_world
 from ..materials.looks import Look, look_of, world_radiance
+from .drawing import uniform_buffer
 from .lights import Patterns, no_patterns, view_lights
 from .meshes import MeshBatches, mesh_batches
 from .sky import ShownSky, constant_sky
-from .textures import look_values, uniform_buffer
+from .textures import look_values
 
 # NOT_SHOWN: notes about types of objects that views leave out. NAMED: the most names of objects in such a note.
 NOT_SHOWN = {
@@ -127,7 +128,7 @@ def _note_object(changes: Changes, block, update) -> None:
 
 def object_notes(depsgraph) -> list[str]:
     """Notes about objects that renders of `depsgraph` show and views do not, kind by kind."""
-    found: dict[str, list[str]] = {}
+    names_by_kind: dict[str, list[str]] = {}
     for ob in depsgraph.objects:
         kind = NOT_SHOWN.get(ob.type)
         if kind is None and ob.type in SURFACE_TYPES and ob.is_shadow_catcher:
@@ -137,8 +138,8 @@ def object_notes(depsgraph) -> list[str]:
         if kind is None and ob.type == "META" and _has_lost_balls(ob, depsgraph):
             kind = "balls smaller than the Resolution Viewport are coarse or missing in views: lower it"
         if kind is not None:
-            found.setdefault(kind, []).append(ob.name)
-    return [f"{listed(names, NAMED)}: {kind}" for kind, names in found.items()]
+            names_by_kind.setdefault(kind, []).append(ob.name)
+    return [f"{listed(names, NAMED)}: {kind}" for kind, names in names_by_kind.items()]
 
 
 def _has_lost_balls(ob, depsgraph) -> bool:
@@ -165,7 +166,7 @@ class SceneMirror:
         self.instances: list[ShownInstance] = []
         self.lights: tuple[Light, ...] = ()  # with the small bright lights of the world
         self.sky = ShownSky()
-        self.own_lights: tuple[Light, ...] = ()  # without those of the world
+        self.lights_without_world: tuple[AreaLight, ...] = ()  # without those of the world
         self._look = look
         self.surfaces_version = 0
         self._meshes: dict[tuple, MeshBatches | None] = {}
@@ -218,8 +219,10 @@ class SceneMirror:
 
     def read_lights(self, depsgraph, in_view: Callable) -> None:
         """Read the lights of the instances that `in_view` accepts."""
-        self.own_lights, self._light_notes = view_lights(depsgraph, in_view, self._light_textures, self._patterns)
-        self.lights = (*self.own_lights, *self.sky.lights)
+        self.lights_without_world, self._light_notes = view_lights(
+            depsgraph, in_view, self._light_textures, self._patterns
+        )
+        self.lights = (*self.lights_without_world, *self.sky.lights)
         self.has_old_lights = False
 
     def _drop_changed(self, changes: Changes) -> None:
@@ -236,7 +239,7 @@ class SceneMirror:
     def _read_instances(self, depsgraph, changes: Changes, in_view) -> None:
         override = depsgraph.view_layer_eval.material_override
         receivers = Receivers([ob for ob in _originals(depsgraph) if ob.type == "LIGHT"])
-        found, meshes, looks = [], {}, {}
+        instances, meshes, looks = [], {}, {}
         users = Counter()  # instances by evaluated data, those out of view included
         for instance in depsgraph.object_instances:
             ob = instance.object
@@ -268,8 +271,8 @@ class SceneMirror:
             model = instance.matrix_world.copy()
             side = -1.0 if model.determinant() < 0.0 else 1.0
             center = np.array(model) @ [*mesh.middle, 1.0]
-            found.append((data, (mesh, model, shown, receiver, side, center)))
-        self.instances = [ShownInstance(*values, is_only_user=users[data] == 1) for data, values in found]
+            instances.append((data, (mesh, model, shown, receiver, side, center)))
+        self.instances = [ShownInstance(*values, is_only_user=users[data] == 1) for data, values in instances]
         self._meshes, self._looks = meshes, looks
         self._object_notes = tuple(object_notes(depsgraph))
 
@@ -290,7 +293,7 @@ class SceneMirror:
     def take_sky(self, sky: ShownSky, *notes: str) -> None:
         """Show this world from now on; `notes` tell how it differs from Cycles."""
         self.sky, self._world_note = sky, notes
-        self.lights = (*self.own_lights, *sky.lights)
+        self.lights = (*self.lights_without_world, *sky.lights)
 
 
 def _shown_look(material) -> ShownLook:
@@ -314,8 +317,8 @@ def _receiver(instance, receivers: Receivers, view_layer) -> int:
     if owner.holdout_get(view_layer=view_layer):
         return HOLDOUT
     numbers = receivers.numbers
-    own = numbers.get(instance.object.original.name_full, 0)
-    return numbers.get(owner.name_full, own) if instance.is_instance else own
+    of_object = numbers.get(instance.object.original.name_full, 0)
+    return numbers.get(owner.name_full, of_object) if instance.is_instance else of_object
 
 
 def _originals(depsgraph) -> list:

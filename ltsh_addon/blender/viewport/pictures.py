@@ -8,8 +8,7 @@ import gpu
 
 from ...shading.header import definitions
 from .camera import ViewCamera
-from .gbuffer import empty_texture, frame_buffer
-from .shaders import glsl, pixel_shader
+from .drawing import PixelShader, drawing, empty_texture, frame_buffer, glsl, size_of
 
 MODES = ("single", "split", "difference")
 # RAYS: the shader constants with the rays of `ViewCamera.rays`.
@@ -43,7 +42,7 @@ class PicturePass:
         constants |= dict.fromkeys(RAYS, "VEC4")
         modes = definitions({mode.upper(): number for number, mode in enumerate(MODES)})
         source = modes + glsl("octahedron") + glsl("picture")
-        self._shader, self._batch = pixel_shader(source, ("first_picture", "second_picture", "sky"), constants)
+        self._shader = PixelShader(source, ("first_picture", "second_picture", "sky"), constants)
 
     def draw(self, pictures, weights, view: ViewCamera, shown: ShownPicture, background) -> None:
         """Fill the bound frame buffer, scene-linear, from one or two RGBA textures times their `weights`.
@@ -51,43 +50,32 @@ class PicturePass:
         The weighted alpha is the share of a pixel that shows a surface. `background` is a texture of
         `sky.background_texels`.
         """
-        size = pictures[0].width, pictures[0].height
-        gpu.state.viewport_set(0, 0, *size)
-        gpu.state.blend_set("NONE")
-        gpu.state.depth_test_set("NONE")
-        gpu.state.depth_mask_set(False)
-        shader = self._shader
-        shader.bind()
-        shader.uniform_sampler("first_picture", pictures[0])
-        shader.uniform_sampler("second_picture", pictures[-1])
-        shader.uniform_float("weights", (weights[0], weights[-1]))
-        shader.uniform_int("mode", MODES.index(shown.mode))
-        scales = (shown.exposure, shown.difference_scale, shown.split * size[0], 0.5 * shown.line_width)
-        shader.uniform_float("scales", scales)
-        shader.uniform_sampler("sky", background)
-        shader.uniform_float("opacity", 0.0 if shown.transparent else 1.0)
+        width, height = size_of(pictures[0])
         is_behind = shown.passes == "combined" and not shown.transparent
-        for name, ray in zip(RAYS, view.rays, strict=True):
-            shader.uniform_float(name, (*ray, float(is_behind)))
-        shader.uniform_float("white", shown.white)
-        self._batch.draw(shader)
+        constants = {
+            "weights": (weights[0], weights[-1]),
+            "mode": MODES.index(shown.mode),
+            "scales": (shown.exposure, shown.difference_scale, shown.split * width, 0.5 * shown.line_width),
+            "opacity": 0.0 if shown.transparent else 1.0,
+            "white": shown.white,
+            **_rays(view, float(is_behind)),
+        }
+        textures = {"first_picture": pictures[0], "second_picture": pictures[-1], "sky": background}
+        with drawing(None, (0, 0, width, height)):
+            self._shader.bind(textures, constants)
+            self._shader.draw()
 
 
-class CopyPass:
-    """Copies a picture into another one; needs an active GPU context."""
+def _rays(view: ViewCamera, is_seen: float) -> dict[str, tuple]:
+    """Values of the constants RAYS; with `is_seen` 0 the background is black."""
+    return {name: (*ray, is_seen) for name, ray in zip(RAYS, view.rays, strict=True)}
 
-    def __init__(self):
-        self._shader, self._batch = pixel_shader(glsl("copy"), ("picture",), {})
 
-    def draw(self, picture: gpu.types.GPUTexture, target: gpu.types.GPUFrameBuffer) -> None:
-        """Copy `picture` into `target`, which has its size."""
-        with target.bind():
-            gpu.state.viewport_set(0, 0, picture.width, picture.height)
-            gpu.state.blend_set("NONE")
-            gpu.state.depth_test_set("NONE")
-            self._shader.bind()
-            self._shader.uniform_sampler("picture", picture)
-            self._batch.draw(self._shader)
+def copy(shader: PixelShader, picture: gpu.types.GPUTexture, target: gpu.types.GPUFrameBuffer) -> None:
+    """Copy `picture` into `target`, which has its size, by the shader of copy.glsl."""
+    with drawing(target, (0, 0, *size_of(picture))):
+        shader.bind({"picture": picture})
+        shader.draw()
 
 
 class VeilPass:
@@ -95,37 +83,24 @@ class VeilPass:
 
     def __init__(self):
         constants = {"is_seen": "FLOAT", **dict.fromkeys(RAYS, "VEC4")}
-        samplers = ("behind", "left", "glass", "sky")
-        self._shader, self._batch = pixel_shader(glsl("octahedron") + glsl("veil"), samplers, constants)
+        self._shader = PixelShader(glsl("octahedron") + glsl("veil"), ("behind", "left", "glass", "sky"), constants)
 
-    def draw(self, textures, target, view: ViewCamera, is_seen: bool) -> None:
+    def draw(self, textures: dict[str, gpu.types.GPUTexture], target, view: ViewCamera, is_seen: bool) -> None:
         """Add the picture of the surfaces, over the background, to `target`, dimmed where there is glass.
 
-        `textures` are the picture (RGBA), the share that glass lets through (RGB), the positions of the glass, and the
-        background. Without `is_seen` the background behind glass is black.
+        `textures` are `behind`, the picture (RGBA); `left`, the share that glass lets through (RGB); `glass`, its
+        positions; `sky`, the background. Without `is_seen` the background behind glass is black.
         """
-        shader = self._shader
-        with target.bind():
-            gpu.state.viewport_set(0, 0, textures[0].width, textures[0].height)
-            gpu.state.blend_set("ADDITIVE_PREMULT")
-            gpu.state.depth_test_set("NONE")
-            try:
-                shader.bind()
-                for name, texture in zip(("behind", "left", "glass", "sky"), textures, strict=True):
-                    shader.uniform_sampler(name, texture)
-                shader.uniform_float("is_seen", float(is_seen))
-                for name, ray in zip(RAYS, view.rays, strict=True):
-                    shader.uniform_float(name, (*ray, 1.0))
-                self._batch.draw(shader)
-            finally:
-                gpu.state.blend_set("NONE")
+        with drawing(target, (0, 0, *size_of(textures["behind"])), "ADDITIVE_PREMULT"):
+            self._shader.bind(textures, {"is_seen": float(is_seen), **_rays(view, 1.0)})
+            self._shader.draw()
 
 
 class SampleSum:
     """A picture that holds the sum of the samples."""
 
     def __init__(self, size: tuple[int, int]):
-        self.texture, self._buffers = empty_texture(size), {}
+        self.size, self.texture, self._buffers = size, empty_texture(size), {}
 
     def within(self, mask: gpu.types.GPUTexture | None = None) -> gpu.types.GPUFrameBuffer:
         """The frame buffer of the picture, with `mask` as its depth buffer."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import gpu
@@ -11,14 +11,17 @@ import numpy as np
 
 from ...scene import PASSES, Film, Light
 from ...visibility import Mate, Occluders, ShadowSampling, Tracer, open_tracer, visible_shares
+from ..extract.occluders import collect_occluders
+from ..lights.world import blocks_nothing
 from ..process.blender_process import embree_libraries
 from .camera import ViewCamera
+from .drawing import float_buffer
 from .gbuffer import GBufferTextures, VisibilityGrid, gbuffer_samples
 
-Lights = Sequence[Light]
-# MOST_BYTES: graphics memory for the shares of all lights. _SHARE_BYTES: of a light and a pixel, two half floats.
+Lights = Sequence[AreaLight]
+# MOST_BYTES: graphics memory for the visibility of all lights. _LIGHT_BYTES: of a light and a pixel, two half floats.
 MOST_BYTES = 1 << 30
-_SHARE_BYTES = 4
+_LIGHT_BYTES = 4
 
 
 class ViewTracer:
@@ -50,7 +53,7 @@ class ViewTracer:
 
 
 class ShadowRays:
-    """Traces, at once, the shares of lights that the pixels of G-buffers see past `occluders`.
+    """Traces, at once, the visibility of lights from the pixels of G-buffers past `occluders`.
 
     A pixel takes at most `rays` rays per light.
     """
@@ -71,10 +74,10 @@ class ShadowRays:
         # By pass, summed over all calls: squares of the reflected light of pixels, and of its standard deviation.
         self._power = {name: np.zeros(2) for name in PASSES}
 
-    def shares(
+    def visibility(
         self, gbuffer: GBufferTextures, view: ViewCamera, lights: Lights, sides: Lights = (), number: int = 0
     ) -> VisibilityGrid | None:
-        """The shares of `lights`, and last that of the `sides` of a sky if there are any; None without surfaces or
+        """The visibility of `lights`, and last that of the `sides` of a sky if there are any; None without surfaces or
         lights. Positions are relative to the origin of `view`. Raises SceneError."""
         start = time.perf_counter()
         samples, pixel = gbuffer_samples(gbuffer, view)
@@ -83,15 +86,15 @@ class ShadowRays:
         width, height = gbuffer.size
         tracer = self._tracing.around(view.origin)
         film = Film(width, height, pixel)
-        found = visible_shares(samples, (*lights, *sides), tracer, ShadowSampling(rays=self._rays, film=film))
+        traced = visible_shares(samples, (*lights, *sides), tracer, ShadowSampling(rays=self._rays, film=film))
         count = len(lights) + bool(sides)
         values = np.ones((count, height * width, len(PASSES)), np.float32)
         for index, name in enumerate(PASSES):
-            values[:, pixel, index] = found.of_lights(name)[:count]
-            power = (np.square(part[name], dtype=np.float64).sum() for part in (found.radiance, found.deviation))
-            self._power[name] += list(power)
+            values[:, pixel, index] = traced.of_lights(name)[:count]
+            for row, of_passes in enumerate((traced.radiance, traced.deviation)):
+                self._power[name][row] += np.square(of_passes[name], dtype=np.float64).sum()
         self.seconds += time.perf_counter() - start
-        self.traced, self.description = self.traced + found.rays, tracer.description
+        self.traced, self.description = self.traced + traced.rays, tracer.description
         return VisibilityGrid(visibility_texture(values, gbuffer.size), gbuffer.position, view.projection)
 
     def noise(self, samples: int) -> dict[str, float]:
@@ -102,15 +105,20 @@ class ShadowRays:
         }
 
 
+def view_occluders(depsgraph, note: Callable[[str], None]) -> Occluders:
+    """What casts shadows in a view; `note` gets what is approximated."""
+    override = depsgraph.view_layer_eval.material_override
+    return blocks_nothing(collect_occluders(depsgraph, override, note), depsgraph.scene.world)
+
+
 def visibility_texture(values: np.ndarray, size: tuple[int, int]) -> gpu.types.GPUTexture:
-    """Array texture of shares (L, H W, 2) on pictures of `size`."""
-    buffer = gpu.types.Buffer("FLOAT", values.size, np.ascontiguousarray(values, np.float32).reshape(-1))
-    return gpu.types.GPUTexture(size, layers=len(values), format="RG16F", data=buffer)
+    """Array texture of visibility (L, H W, 2) on pictures of `size`."""
+    return gpu.types.GPUTexture(size, layers=len(values), format="RG16F", data=float_buffer(values))
 
 
 def too_many(lights: int, size: tuple[int, int]) -> str:
-    """Note that the shares of so many lights do not fit into memory; empty where they do."""
-    needed = lights * size[0] * size[1] * _SHARE_BYTES
+    """Note that the visibility of so many lights does not fit into memory; empty where it does."""
+    needed = lights * size[0] * size[1] * _LIGHT_BYTES
     if needed <= MOST_BYTES:
         return ""
     return f"shadows are not drawn: those of {lights} lights need {needed / 2**30:.1f} GiB of graphics memory"

@@ -13,15 +13,8 @@ import numpy as np
 from ...scene import PASSES, Cancelled, Film, Light, SurfaceSamples, error_line
 from ...visibility import Occluders, ShadowSampling, shared_numbers, visible_shares
 from .camera import ViewCamera
-from .gbuffer import (
-    GBufferTextures,
-    VisibilityGrid,
-    every_texel,
-    float_texture,
-    gbuffer_texels,
-    samples_of_texels,
-    unit_xyz,
-)
+from .drawing import float_texture
+from .gbuffer import GBufferTextures, VisibilityGrid, every_texel, gbuffer_texels, samples_of_texels, unit_xyz
 from .shadow_rays import Lights, ViewTracer, too_many, visibility_texture
 
 
@@ -36,12 +29,12 @@ def _blank() -> VisibilityGrid:
 # a light and a point. None: the distance that gives COARSE_POINTS points.
 LEVELS = ((None, 8), (1, 32))
 COARSE_POINTS = 8000
-# FIRST_POINTS: sub-pixel points that a view at rest draws with the shares of its first picture, so that edges become
-# smooth soon. The later points come in groups of GROUP, each group with new shares of GROUP_RAYS rays.
+# FIRST_POINTS: sub-pixel points that a view at rest draws with the shadows of its first picture, so that edges become
+# smooth soon. The later points come in groups of GROUP, each group with new shadows of GROUP_RAYS rays.
 FIRST_POINTS, GROUP, GROUP_RAYS = 8, 4, 64
 # QUICK_SECONDS: occluders that take longer to collect are only collected once no object moves any more.
 QUICK_SECONDS = 0.03
-# BATCH: emitters that are traced together. The shares of finished batches are kept when the rest is stopped.
+# BATCH: emitters that are traced together. Stopped work keeps finished batches.
 BATCH = 4
 # PAUSE_SECONDS: finer shadows follow the coarse ones of a light if it has stayed still for so long.
 PAUSE_SECONDS = 0.15
@@ -59,9 +52,9 @@ class PixelGrid:
         positions, first = self.gbuffer_texels["position"], step // 2
         rows, columns = positions.shape[:2]
         stretch = np.eye(4)
-        for axis, (whole, part) in enumerate(((width, columns), (height, rows))):
-            stretch[axis, axis] = whole / (part * step)
-            stretch[axis, 3] = 2.0 / part * ((0.5 * whole - 0.5 - first) / step + 0.5) - 1.0
+        for axis, (whole, count) in enumerate(((width, columns), (height, rows))):
+            stretch[axis, axis] = whole / (count * step)
+            stretch[axis, 3] = 2.0 / count * ((0.5 * whole - 0.5 - first) / step + 0.5) - 1.0
         # The grid of these pixels: positions (H, W, 4), and the projection to its clip space.
         self.grid = positions, stretch @ view.projection
 
@@ -84,7 +77,7 @@ class PixelGrid:
 
 @dataclass(frozen=True)
 class ShadowRequest:
-    """Work for the thread: the shares of some lights at points of a picture. The sides of a sky are one light."""
+    """Work for the thread: the visibility of some lights at points of a picture. The sides of a sky are one light."""
 
     state: tuple  # of scene and view, see `LiveShadows._wanted`
     level: int  # number in LEVELS; len(LEVELS): for a group of further points
@@ -99,29 +92,29 @@ class ShadowRequest:
     layer: int  # 1: glass, 0: the surfaces behind
 
     @property
-    def is_own(self) -> bool:
+    def is_for_group(self) -> bool:
         """True for a group of further points."""
         return self.level == len(LEVELS)
 
-    def shares(self, progress: Callable) -> dict[int, np.ndarray]:
+    def visibility(self, progress: Callable) -> dict[int, np.ndarray]:
         """Shares (H, W, 2), row 0 at the bottom, by the index of a light in `keys`.
 
         If `progress` stops the work, the result has only the lights that are finished; without any, Cancelled is
         raised.
         """
         samples, film = self.points.samples()
-        tracer, found = self.tracing.around(self.origin), {}
+        tracer, results = self.tracing.around(self.origin), {}
         self.tracing.mate.key = (self.state, self.layer) if self.level == 1 else None
         lights = [light for lights in self.lights for light in lights]
         starts = np.cumsum([0, *map(len, self.lights)])[:-1]
-        place_of = dict(zip(starts.tolist(), range(len(starts)), strict=True))
+        index_of = dict(zip(starts.tolist(), range(len(starts)), strict=True))
         groups = shared_numbers(lights, tracer)
         step = BATCH if self.level == 1 else len(groups)
         sampling = ShadowSampling(rays=self.rays, film=film)
         for start in range(0, len(groups), step):
             chosen = [number for group in groups[start : start + step] for number in group]
             try:
-                seen = visible_shares(
+                traced = visible_shares(
                     samples,
                     [lights[number] for number in chosen],
                     tracer,
@@ -130,16 +123,16 @@ class ShadowRequest:
                     progress=progress,
                 )
             except Cancelled:
-                if not found:
+                if not results:
                     raise
                 break
-            by_pass = [seen.of_lights(name) for name in PASSES]
+            by_pass = [traced.of_lights(name) for name in PASSES]
             for row, number in enumerate(chosen):
-                if number in place_of:
+                if number in index_of:
                     values = np.ones((film.height * film.width, len(PASSES)), np.float32)
-                    values[film.pixel] = np.stack([shares[row] for shares in by_pass], axis=-1)
-                    found[place_of[number]] = values.reshape(film.height, film.width, len(PASSES))
-        return found
+                    values[film.pixel] = np.stack([of_pass[row] for of_pass in by_pass], axis=-1)
+                    results[index_of[number]] = values.reshape(film.height, film.width, len(PASSES))
+        return results
 
 
 class TracedScene:
@@ -175,9 +168,9 @@ class TracedScene:
 class LiveShadows:
     """Shadows while an artist works: a thread traces them, coarse at first, finer while nothing changes.
 
-    Until new shares are there, the old ones are shown on the same surfaces. A recolored light keeps its shares; only
+    Until new shadows are there, the old ones are shown on the same surfaces. A recolored light keeps its shadows; only
     those of further points of a view at rest are traced again. The glass in front of the surfaces has an object of its
-    own, `of_glass`: only `shares` is called there, all else is asked and told here. Only one of the two traces at a
+    own, `of_glass`: only `visibility` is called there, all else is asked and told here. Only one of the two traces at a
     time.
     """
 
@@ -185,24 +178,27 @@ class LiveShadows:
 
     def __init__(self, behind: LiveShadows | None = None):
         self._behind, self._glass = behind, None
-        self._followed = TracedScene() if behind is None else behind._followed
+        self._traced_scene = TracedScene() if behind is None else behind._traced_scene
         self._version, self._problem = 0, ""
-        self._waits = False  # the picture whose shares were asked for last must wait for the thread
-        self._own: tuple[int, VisibilityGrid | None] = (0, None)  # number and shares of a group of further points
+        self._waits = False  # the picture whose shadows were asked for last must wait for the thread
+        self._group_grid: tuple[int, VisibilityGrid | None] = (
+            0,
+            None,
+        )  # number and visibility of a group of further points
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
         self._request: ShadowRequest | None = None  # the current one of the thread, or its last
         self._outcomes: deque[tuple[ShadowRequest, dict[int, np.ndarray] | Exception]] = deque()
-        self._is_left = False
+        self._is_abandoned = False
         # The lights, with those of a sky as one, their keys, and the arguments that they come from.
         self._lights, self._keys, self._given = (), (), None
         self._wanted: tuple = ()  # state of scene and view that is to be shown
         self._pixels: dict[bool, tuple[tuple, PixelGrid]] = {}  # state and points, by whether they are coarse
         self._state: tuple = ()  # state that was traced last; the next two belong to it
-        self._known: dict[tuple, dict[int, np.ndarray]] = {}  # shares (H, W, 2), by the key of a light and level
+        self._known: dict[tuple, dict[int, np.ndarray]] = {}  # visibility (H, W, 2), by the key of a light and level
         self._points: dict[bool, tuple[np.ndarray, np.ndarray]] = {}  # grids of points, by whether they are coarse
-        self._latest: dict[int, dict[int, np.ndarray]] = {}  # latest shares by the number of a light and level
-        self._layers = np.ones((0, 0, 0, 2), np.float32)  # shares in `_grid`
+        self._latest: dict[int, dict[int, np.ndarray]] = {}  # latest visibility by the number of a light and level
+        self._layers = np.ones((0, 0, 0, 2), np.float32)  # visibility in `_grid`
         self._sources: list[np.ndarray | None] = []  # what each was made from
         self._grid: VisibilityGrid | None = None
         self._blank: VisibilityGrid | None = None
@@ -231,15 +227,15 @@ class LiveShadows:
 
     @property
     def waits(self) -> bool:
-        """True if the picture whose shares were asked for last cannot be drawn yet."""
+        """True if the picture whose shadows were asked for last cannot be drawn yet."""
         return any(one._waits for one in self._both)
 
     def follow(self, scene: tuple, collect: Callable[[], Occluders]) -> None:
         """To be called before a picture is drawn. `scene` changes with its occluders; `collect()` returns them."""
-        if scene != self._followed.scene:
+        if scene != self._traced_scene.scene:
             for one in self._both:
                 one._problem = ""
-        self._followed.scene, self._followed.collect = scene, collect
+        self._traced_scene.scene, self._traced_scene.collect = scene, collect
 
     @property
     def is_busy(self) -> bool:
@@ -254,17 +250,17 @@ class LiveShadows:
     def stop(self) -> None:
         """Make the thread and its helping process end soon, and free the textures and the glass at once."""
         for one in self._both:
-            one._is_left = True
+            one._is_abandoned = True
             one._stop.set()
             one._grid = one._blank = None
-            one._own = (0, None)
+            one._group_grid = (0, None)
         self.rest()
         self._glass = None
 
     def rest(self) -> None:
         """End the helping process unless the thread works. It is started again when it pays."""
         if all(one._thread is None or not one._thread.is_alive() for one in self._both):
-            self._followed.close()
+            self._traced_scene.close()
 
     def take_news(self) -> None:
         """Take over the results of the thread. If `version` changes, pictures must be drawn anew."""
@@ -279,16 +275,16 @@ class LiveShadows:
                 one._version += 1
 
     def _take(self, request: ShadowRequest, outcome: dict[int, np.ndarray] | Exception) -> None:
-        if request.is_own and not isinstance(outcome, Exception):
+        if request.is_for_group and not isinstance(outcome, Exception):
             if (request.state, request.keys) == (self._wanted, self._keys):
                 positions, projection = request.points.grid
-                values = np.stack([outcome[place] for place in range(len(request.keys))])
+                values = np.stack([outcome[index] for index in range(len(request.keys))])
                 grid = VisibilityGrid(
                     visibility_texture(values, positions.shape[1::-1]), float_texture(positions), projection
                 )
-                self._own = request.group, grid
+                self._group_grid = request.group, grid
             return
-        self._version += not (request.is_own and isinstance(outcome, Cancelled))
+        self._version += not (request.is_for_group and isinstance(outcome, Cancelled))
         if isinstance(outcome, Exception):
             self._problem = "" if isinstance(outcome, Cancelled) else f"shadows: {error_line(outcome)}"
             return
@@ -296,16 +292,16 @@ class LiveShadows:
             self._state, self._known, self._points, self._latest = request.state, {}, {}, {}
         self._points[request.level == 0] = request.points.grid
         self._known = {key: levels for key, levels in self._known.items() if key in self._keys}
-        for place, values in outcome.items():
-            self._known.setdefault(request.keys[place], {})[request.level] = values
-            self._latest[request.numbers[place]] = {request.level: values}
+        for index, values in outcome.items():
+            self._known.setdefault(request.keys[index], {})[request.level] = values
+            self._latest[request.numbers[index]] = {request.level: values}
         self._origin = request.origin
         self._show()
 
-    def shares(
+    def visibility(
         self, gbuffer: GBufferTextures, view: ViewCamera, lights: Lights, sides: Lights = (), number: int = 0
     ) -> VisibilityGrid | None:
-        """The shares known so far, as `ShadowRays.shares` returns them; `number` counts the pictures of a view at rest.
+        """What is known so far, as `ShadowRays.visibility` returns it; `number` counts the pictures of a view at rest.
 
         Before any are known, a grid without points: with it the shader with shadows is compiled from the start.
         """
@@ -317,8 +313,8 @@ class LiveShadows:
                 self._latest = {}
                 self._show()
         if number == 0:
-            self._wanted = (self._followed.scene, view.projection.tobytes(), view.origin.tobytes(), gbuffer.size)
-            self._own = (0, None)
+            self._wanted = (self._traced_scene.scene, view.projection.tobytes(), view.origin.tobytes(), gbuffer.size)
+            self._group_grid = (0, None)
         for one in self._both:
             one._waits = False
         level = self._next_level()
@@ -330,10 +326,10 @@ class LiveShadows:
         elif self._thread is not None and self._is_outdated:
             self._stop.set()
         if number > 0 and not self._is_off:
-            if number // GROUP == self._own[0] and self._own[1] is not None:
-                return self._own[1]
+            if number // GROUP == self._group_grid[0] and self._group_grid[1] is not None:
+                return self._group_grid[1]
             if level is None and number >= FIRST_POINTS and self._is_free:
-                self._begin_own(number // GROUP, gbuffer, view)
+                self._begin_group(number // GROUP, gbuffer, view)
             self._waits = self._thread is not None
         fits = len(self._layers) == len(self._keys) and np.array_equal(self._origin, view.origin)
         if fits or self._is_off:
@@ -376,10 +372,10 @@ class LiveShadows:
             if self._thread is None and self._glass is not None and self._glass._request.level > 0:
                 self._glass._stop.set()
             return False
-        return self._followed.may_collect() and (number == 0 or level == 0)
+        return self._traced_scene.may_collect() and (number == 0 or level == 0)
 
     def _begin(self, level: int, gbuffer: GBufferTextures, view: ViewCamera) -> None:
-        self._followed.collect_now()
+        self._traced_scene.collect_now()
         requests = [self._request_of(level, gbuffer, view)]
         if level == 0 and self._pixels.get(False, (None,))[0] == self._wanted:
             requests.append(self._request_of(1, gbuffer, view))
@@ -398,7 +394,7 @@ class LiveShadows:
         numbers = tuple(n for n, key in enumerate(self._keys) if max(known.get(key, (-1,))) < level)
         return self._request_for(numbers, points, rays, view, level)
 
-    def _begin_own(self, group: int, gbuffer: GBufferTextures, view: ViewCamera) -> None:
+    def _begin_group(self, group: int, gbuffer: GBufferTextures, view: ViewCamera) -> None:
         points = PixelGrid(1, gbuffer, view)
         request = self._request_for(tuple(range(len(self._keys))), points, GROUP_RAYS, view, len(LEVELS))
         self._start([replace(request, group=group)])
@@ -414,7 +410,7 @@ class LiveShadows:
             lights=tuple(self._lights[n] for n in numbers),
             points=points,
             rays=rays,
-            tracing=self._followed.tracing,
+            tracing=self._traced_scene.tracing,
             origin=view.origin.copy(),
             layer=int(self._behind is not None),
         )
@@ -422,7 +418,7 @@ class LiveShadows:
     def _start(self, requests: list[ShadowRequest]) -> None:
         """Start the thread, which traces one request after another."""
         self._stop.clear()
-        self._request, self._is_left = requests[0], False
+        self._request, self._is_abandoned = requests[0], False
         self._thread = threading.Thread(target=self._trace, args=(requests,), name="LTSH shadows", daemon=True)
         self._thread.start()
 
@@ -433,18 +429,18 @@ class LiveShadows:
                 break
             self._request = request
             try:
-                outcome = request.shares(lambda stage, fraction: not self._stop.is_set())
+                outcome = request.visibility(lambda stage, fraction: not self._stop.is_set())
             except Exception as error:
                 # Its traceback would make a reference cycle, which keeps the samples of the picture alive.
                 outcome = error.with_traceback(None)
             self._outcomes.append((request, outcome))
             if isinstance(outcome, Exception):
                 break
-        if self._is_left:
+        if self._is_abandoned:
             requests[0].tracing.close()
 
     def _show(self) -> None:
-        """Make the grid of all known shares. A light without any keeps the latest shares of the light of its number."""
+        """Make the grid of all known visibility. A light without any keeps the latest of the light of its number."""
         known = [self._known.get(key) or self._latest.get(number, {}) for number, key in enumerate(self._keys)]
         if not any(known):
             return
@@ -469,13 +465,13 @@ def coarse_step(size: tuple[int, int]) -> int:
     return max(2, round((size[0] * size[1] / COARSE_POINTS) ** 0.5))
 
 
-def _shape_of(light: Light) -> str:
-    """A key of all that the shares of `light` depend on: everything but its brightness."""
+def _shape_of(light: AreaLight) -> str:
+    """A key of all that the visibility of `light` depends on: everything but its brightness."""
     return repr({name: value for name, value in light.record().items() if name not in ("radiance", "detail")})
 
 
 def _shape_of_sky(sides: Lights) -> str:
-    """A key of all that the share of a sky depends on: the relative, not the absolute brightness of its patches."""
-    values = np.array([patch.radiance.mean() for side in sides for patch in side.leaves])
-    seen = sides[0].affects_diffuse, sides[0].affects_specular, sides[0].name
-    return repr((seen, np.round(values / max(np.abs(values).mean(), 1e-30), 4).tobytes()))
+    """A key of all that the visibility of a sky depends on: the relative, not absolute brightness of its patches."""
+    values = np.array([patch.radiance.mean() for side in sides for patch in side.patches])
+    traits = sides[0].affects_diffuse, sides[0].affects_specular, sides[0].name
+    return repr((traits, np.round(values / max(np.abs(values).mean(), 1e-30), 4).tobytes()))

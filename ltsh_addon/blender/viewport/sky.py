@@ -72,14 +72,14 @@ def _summed(values: np.ndarray) -> np.ndarray:
 
 def directions(size: int) -> np.ndarray:
     """Unit directions (N, N, 3) of the texels of a map with N = `size` texels along each side, row 0 at v = -1."""
-    place = (np.arange(size) + 0.5) * (2.0 / size) - 1.0
-    u, v = np.meshgrid(place, place)
+    coordinate = (np.arange(size) + 0.5) * (2.0 / size) - 1.0
+    u, v = np.meshgrid(coordinate, coordinate)
     height = 1.0 - np.abs(u) - np.abs(v)
     below = height < 0.0
     x = np.where(below, (1.0 - np.abs(v)) * np.where(u < 0.0, -1.0, 1.0), u)
     y = np.where(below, (1.0 - np.abs(u)) * np.where(v < 0.0, -1.0, 1.0), v)
-    found = np.stack([x, y, height], axis=-1)
-    return found / np.linalg.norm(found, axis=-1, keepdims=True)
+    toward = np.stack([x, y, height], axis=-1)
+    return toward / np.linalg.norm(toward, axis=-1, keepdims=True)
 
 
 def solid_angles(size: int) -> np.ndarray:
@@ -90,26 +90,28 @@ def solid_angles(size: int) -> np.ndarray:
 def unfolded(pictures: list[SkyPicture], size: int) -> np.ndarray:
     """The map (size, size, 3) interpolated from the six pictures of a cube."""
     toward = directions(size).reshape(-1, 3)
-    found = np.zeros((len(toward), 3))
+    radiance = np.zeros((len(toward), 3))
     side = np.argmax(np.stack([toward @ picture.ahead for picture in pictures]), axis=0)
     for number, picture in enumerate(pictures):
-        own = np.flatnonzero(side == number)
-        along = toward[own] @ picture.ahead
+        texels = np.flatnonzero(side == number)
+        along = toward[texels] @ picture.ahead
         count = len(picture.radiance)
         column, row = (
-            np.clip((sign * (toward[own] @ axis) / (axis @ axis) / along + 1.0) * 0.5 * count - 0.5, 0.0, count - 1.0)
+            np.clip(
+                (sign * (toward[texels] @ axis) / (axis @ axis) / along + 1.0) * 0.5 * count - 0.5, 0.0, count - 1.0
+            )
             for sign, axis in ((1.0, picture.right), (-1.0, picture.up))
         )
-        found[own] = _interpolated(picture.radiance, row, column)
-    return found.reshape(size, size, 3)
+        radiance[texels] = _interpolated(picture.radiance, row, column)
+    return radiance.reshape(size, size, 3)
 
 
 def _interpolated(values: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
-    top, left = row.astype(int), column.astype(int)
-    down, right = np.minimum(top + 1, len(values) - 1), np.minimum(left + 1, values.shape[1] - 1)
-    y, x = (row - top)[:, None], (column - left)[:, None]
-    above = (1.0 - x) * values[top, left] + x * values[top, right]
-    below = (1.0 - x) * values[down, left] + x * values[down, right]
+    top, west = row.astype(int), column.astype(int)
+    down, east = np.minimum(top + 1, len(values) - 1), np.minimum(west + 1, values.shape[1] - 1)
+    y, x = (row - top)[:, None], (column - west)[:, None]
+    above = (1.0 - x) * values[top, west] + x * values[top, east]
+    below = (1.0 - x) * values[down, west] + x * values[down, east]
     return (1.0 - y) * above + y * below
 
 

@@ -28,12 +28,12 @@ class LightingState:
         pairs = zip(self.lights, new.lights, strict=True)
         return frozenset(number for number, (a, b) in enumerate(pairs) if not is_equal(a, b))
 
-    def has_same_shares(self, new: LightingState, left_out: frozenset[int]) -> bool:
-        """True if the shares are the same, but for those of the lights `left_out`."""
+    def has_same_visibility(self, new: LightingState, changed: frozenset[int]) -> bool:
+        """True if the visibility is the same, but for that of the lights `changed`."""
         if len(self.sources) != len(new.sources):
             return False
-        kept = [number for number in range(len(self.sources)) if number not in left_out]
-        return all(a is b for number in kept for a, b in zip(self.sources[number], new.sources[number], strict=True))
+        static = [number for number in range(len(self.sources)) if number not in changed]
+        return all(a is b for number in static for a, b in zip(self.sources[number], new.sources[number], strict=True))
 
 
 def is_equal(a, b) -> bool:
@@ -52,12 +52,12 @@ class StaticLighting:
 
     lit: LightingState
     moving: frozenset[int]
-    targets: list[SampleSum]
+    pictures: list[SampleSum]
 
     def fits(self, new: LightingState) -> bool:
         """True if it is a part of the picture `new`."""
         changes = self.lit.changes(new)
-        return changes is not None and changes <= self.moving and self.lit.has_same_shares(new, self.moving)
+        return changes is not None and changes <= self.moving and self.lit.has_same_visibility(new, self.moving)
 
 
 def same_state(new, old) -> bool:

@@ -14,20 +14,19 @@ import numpy as np
 from ...files import save_array
 from ...scene import SceneError, error_line, listed
 from .. import render_settings
-from ..extract.occluders import collect_occluders
 from ..extract.pixels import no_light, open_scene
-from ..lights.world import blocks_nothing, light_of_world
+from ..lights.world import light_of_world
 from ..materials.looks import world_radiance
-from ..process.client import GRAPHICS, VIEW_PASSES, VIEW_PNG
+from ..process.view import GRAPHICS, VIEW_PASSES, VIEW_PNG, ViewJob
 from ..render_settings import cycles_setting
 from .camera import ViewCamera
-from .gbuffer import read_texture
+from .drawing import read_texture
 from .lights import NOT_RESOLVED, patterns_of
-from .live_cycles import look_at_world
+from .live_cycles import rendered_world
 from .mirror import SceneMirror
 from .pictures import ShownPicture
 from .renderer import CENTERS, ViewRenderer
-from .shadow_rays import ShadowRays, too_many
+from .shadow_rays import ShadowRays, too_many, view_occluders
 from .sky import ShownSky, varied_sky
 
 TIMED = 3  # redraws whose median time is reported
@@ -37,15 +36,15 @@ FEWEST_RAYS = 32
 _renderer: list[ViewRenderer] = []
 
 
-def draw_view(job: dict, folder: Path, progress) -> dict:
-    """Do the `job` (see `client.ViewJob`) and write arrays and a PNG into `folder`; returns the manifest."""
+def draw_view(job: ViewJob, folder: Path, progress) -> dict:
+    """Do the `job` and write arrays and a PNG into `folder`; returns the manifest."""
     started, warnings = time.monotonic(), []
     progress("open scene", 0.0)
-    open_scene(Path(job["scene"]), warnings, job["scripts"])
+    open_scene(Path(job.scene), warnings, job.scripts)
     scene = bpy.context.scene
-    render_settings.go_to_frame(scene, job["frame"])
-    camera = render_settings.choose_camera(scene, job["camera"])
-    size = render_settings.set_resolution(scene, job["width"], job["height"])
+    render_settings.go_to_frame(scene, job.frame)
+    camera = render_settings.choose_camera(scene, job.camera)
+    size = render_settings.set_resolution(scene, job.width, job.height)
     warnings += _not_shown(scene, camera)
     sky = _sky(scene, warnings)
     with bpy.context.temp_override(scene=scene, view_layer=_layer(scene)):
@@ -138,14 +137,14 @@ def _not_shown(scene, camera) -> list[str]:
         f"depth of field of camera {camera.name!r}": camera.data.dof.use_dof,
         "the render region": scene.render.use_border,
     }
-    found = [f"{name} is not shown in views" for name, is_asked in asked.items() if is_asked]
+    notes = [f"{name} is not shown in views" for name, is_asked in asked.items() if is_asked]
     others = sorted(ob.name for ob in _layer(scene).objects if not ob.hide_render and _differs_in_renders(ob))
     if others:
-        found.append(f"views and renders have other modifiers or levels of subdivision of {listed(others, 4, ', ')}")
+        notes.append(f"views and renders have other modifiers or levels of subdivision of {listed(others, 4, ', ')}")
     used = [layer.name for layer in scene.view_layers if layer.use]
     if len(used) > 1:
-        found.append(f"scene {scene.name!r}: only view layer {used[0]!r} of {len(used)} is shown")
-    return found
+        notes.append(f"scene {scene.name!r}: only view layer {used[0]!r} of {len(used)} is shown")
+    return notes
 
 
 def _differs_in_renders(ob) -> bool:
@@ -163,17 +162,17 @@ def _sky(scene, warnings: list[str]) -> ShownSky | None:
     world = _layer(scene).world_override or scene.world
     if world_radiance(world)[1]:
         return None
-    return varied_sky(light_of_world(world), *look_at_world(scene, world, warnings.append))
+    return varied_sky(light_of_world(world), *rendered_world(scene, world, warnings.append))
 
 
 def _layer(scene):
     return next((layer for layer in scene.view_layers if layer.use), scene.view_layers[0])
 
 
-def _draw(job: dict, seen: tuple, size: tuple[int, int], progress) -> dict:
+def _draw(job: ViewJob, read: tuple, size: tuple[int, int], progress) -> dict:
     """Pictures (H, W, 4), row 0 on top, of all techniques and passes, and the facts of the manifest about them."""
     progress("draw", 0.0)
-    scene, camera, sky, patterns = seen
+    scene, camera, sky, patterns = read
     with bpy.context.temp_override(scene=scene, view_layer=_layer(scene)):
         depsgraph = bpy.context.evaluated_depsgraph_get()
     mirror = SceneMirror(lambda world: sky, lambda data, source: patterns.get(source.key, NOT_RESOLVED))
@@ -181,20 +180,18 @@ def _draw(job: dict, seen: tuple, size: tuple[int, int], progress) -> dict:
     if not mirror.lights and not mirror.sky.sides:
         raise no_light(scene, mirror.notes)
     notes, shadows = list(mirror.notes), None
-    if job["shadows"] == "on":
+    if job.shadows == "on":
         problem = too_many(len(mirror.lights), size)
-        override = depsgraph.view_layer_eval.material_override
-        rays = max(min(FEWEST_RAYS, job["shadow_rays"]), job["shadow_rays"] // job["refine"])
+        rays = max(min(FEWEST_RAYS, job.shadow_rays), job.shadow_rays // job.refine)
         if problem:
             notes.append(problem)
         else:
-            occluders = blocks_nothing(collect_occluders(depsgraph, override, notes.append), scene.world)
-            shadows = ShadowRays(occluders, rays)
+            shadows = ShadowRays(view_occluders(depsgraph, notes.append), rays)
     canvas = _Canvas(mirror, view_of_camera(camera.evaluated_get(depsgraph), depsgraph, size), size)
-    points = render_settings.sub_pixel_offsets(scene, job["refine"])
-    first, *others = ((technique, name) for technique in job["techniques"] for name in VIEW_PASSES)
+    points = render_settings.sub_pixel_offsets(scene, job.refine)
+    first, *others = ((technique, name) for technique in job.techniques for name in VIEW_PASSES)
     try:
-        seconds = [canvas.seconds_of_redraws(_shown(scene, technique)) for technique in job["techniques"]]
+        seconds = [canvas.seconds_of_redraws(_shown(scene, technique)) for technique in job.techniques]
         shown = replace(_shown(scene, first[0]), also=tuple(others))
         pictures = canvas.draw(shown, points, shadows, lambda share: progress("draw", share))
     except ValueError as error:  # a table that the card does not take

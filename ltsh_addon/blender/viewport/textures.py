@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gpu
 import numpy as np
 
 from ...cycles import closures, horizons
@@ -36,12 +35,6 @@ DEFINES = {
     "ELEVATION_SHARE": str(horizons.ELEVATION_SHARE),
     "MINIMUM_REFLECTION_ELEVATION": str(horizons.MINIMUM_REFLECTION_ELEVATION),
 }
-
-
-def uniform_buffer(values: np.ndarray) -> gpu.types.GPUUniformBuf:
-    """A uniform buffer of values (N, 4)."""
-    values = np.ascontiguousarray(values, dtype=np.float32)
-    return gpu.types.GPUUniformBuf(gpu.types.Buffer("FLOAT", values.size, values.ravel()))
 
 
 def look_values(look: Look) -> np.ndarray:
@@ -96,13 +89,6 @@ def is_encoded(image) -> bool:
     return not image.is_float and image.colorspace_settings.name == "sRGB"
 
 
-def float_table(values: np.ndarray) -> gpu.types.GPUTexture:
-    """R32F texture of values (H, W), row 0 first."""
-    values = np.ascontiguousarray(values, dtype=np.float32)
-    buffer = gpu.types.Buffer("FLOAT", values.size, values.ravel())
-    return gpu.types.GPUTexture(values.shape[::-1], format="R32F", data=buffer)
-
-
 def albedo_table() -> np.ndarray:
     """(33, 32): directional albedo of GGX by roughness and cosine; the last row is its average by roughness."""
     return np.vstack(closures.albedo_tables())
@@ -113,8 +99,8 @@ def sheen_table() -> np.ndarray:
     roughness."""
     nodes = np.linspace(0.0, 1.0, closures.SHEEN_NODES)
     cosine, roughness = (axis.ravel() for axis in np.meshgrid(nodes, nodes, indexing="ij"))
-    found = np.concatenate([closures.sheen_lobe(cosine, roughness), closures.velvet_albedo(cosine, roughness)[None]])
-    return found.T.reshape(len(nodes), len(nodes), 4)
+    values = np.concatenate([closures.sheen_lobe(cosine, roughness), closures.velvet_albedo(cosine, roughness)[None]])
+    return values.T.reshape(len(nodes), len(nodes), 4)
 
 
 def blend_table() -> np.ndarray:

@@ -19,11 +19,11 @@ from ltsh_addon.blender.engine import final_picture, redraws, view
 from ltsh_addon.blender.engine import render as render_module
 from ltsh_addon.blender.lights.textures import ShownTextures
 from ltsh_addon.blender.materials import looks
-from ltsh_addon.blender.process import client
+from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels
 from ltsh_addon.blender.render_settings import pass_names
 from ltsh_addon.blender.ui import results
-from ltsh_addon.blender.ui.comparison import covered
 from ltsh_addon.blender.ui.job import STARTING, Plan
+from ltsh_addon.blender.ui.overlay import covered
 from ltsh_addon.blender.viewport.lights import view_lights
 from ltsh_addon.imaging.exr import read_channels
 from ltsh_addon.pipeline import PictureOptions, RenderOptions, shade_scene
@@ -85,13 +85,13 @@ def extracted(tmp_path, **options):
     """Samples and lights of a copy of the open file."""
     path = tmp_path / "scene.blend"
     bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
-    return client.extract(client.ExtractOptions(scene=path, **options))
+    return extract_pixels(PixelJob(scene=path, **options))
 
 
 def shaded(extraction, technique="ltsh2", passes=shading.PASSES):
     """What shading the samples gives, (H, W, 3)."""
     result = shading.shade(extraction.samples, extraction.lights, technique, passes=passes)
-    return extraction.exposure * extraction.film.image(result.combined)
+    return extraction.picture.exposure * extraction.film.image(result.combined)
 
 
 def test_settings_of_cycles_own_renders_stay_hidden(addon):
@@ -562,8 +562,7 @@ def test_views_at_rest_are_drawn_again_and_what_moves_is_left_alone():
 def test_a_view_that_is_left_is_freed_at_once_and_what_works_for_it_is_stopped(scene, monkeypatch):
     """Not when Python looks for circles the next time: it has textures, and processes that help."""
     collected = []
-    monkeypatch.setattr(view, "collect_occluders", lambda *arguments: collected.append(True))
-    monkeypatch.setattr(view, "blocks_nothing", lambda occluders, world: occluders)
+    monkeypatch.setattr(view, "view_occluders", lambda *arguments: collected.append(True))
     depsgraph = bpy.context.evaluated_depsgraph_get()
     gc.collect()
     gc.disable()
@@ -572,7 +571,7 @@ def test_a_view_that_is_left_is_freed_at_once_and_what_works_for_it_is_stopped(s
         seen._renderer = SimpleNamespace(shadows=None)
         seen._follow_shadows(depsgraph)
         shadows, stopped = seen._shadows, [one._stop for one in (seen._shadows, seen._shadows.of_glass)]
-        seen._shadows._followed.collect()
+        seen._shadows._traced_scene.collect()
         stopped.append(seen._world._stopped)
         left = [weakref.ref(part) for part in (seen, seen.mirror, shadows, shadows.of_glass)]
         del seen, shadows

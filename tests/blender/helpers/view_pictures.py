@@ -8,7 +8,7 @@ import scene_parts as parts
 from graphics_card import Canvas, with_graphics
 
 from ltsh_addon import shading
-from ltsh_addon.blender.process import client
+from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels
 from ltsh_addon.blender.viewport.camera import ViewCamera
 from ltsh_addon.blender.viewport.mirror import SceneMirror
 from ltsh_addon.blender.viewport.pictures import ShownPicture
@@ -62,7 +62,7 @@ def sampled_pictures(path, passes, rows):
     """Pictures (H, W, 3) by pass of the samples that Cycles took, and the number of the square (H, W) that each pixel
     sees, or -1."""
     bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
-    found = client.extract(client.ExtractOptions(scene=path))
+    found = extract_pixels(PixelJob(scene=path))
     shaded = shading.shade(found.samples, found.lights, "ltsh4", passes=passes, workers=1)
     square = np.full(SIZE[0] * SIZE[1], -1)
     column, row = (np.floor(found.samples.position[:, axis] + 0.5 * count).astype(int)

@@ -13,7 +13,7 @@ from view_pictures import SIZE, viewport_picture
 from ltsh_addon import shading
 from ltsh_addon.blender.lights.emission import nodes_as_text
 from ltsh_addon.blender.lights.textures import ShownTextures
-from ltsh_addon.blender.process import client
+from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels
 from ltsh_addon.blender.viewport.lights import NOT_YET, no_patterns, strongest, view_lights
 from ltsh_addon.blender.viewport.live_cycles import LiveNodeLights
 
@@ -226,6 +226,7 @@ def test_windows_get_the_patterns_of_lights_from_a_second_blender(tmp_path):
     assert "Library" in notes and "lamps.blend" in notes and not lamps.is_busy
 
 
+@pytest.mark.newest
 def test_a_light_that_changes_meanwhile_is_looked_at_again_and_nobody_waits_in_vain(temporary_root):
     parts.empty_scene()
     tree = add_bulb("Striped", "POINT", stripes)[1]
@@ -235,10 +236,10 @@ def test_a_light_that_changes_meanwhile_is_looked_at_again_and_nobody_waits_in_v
     def begun():
         seen(lamps.pattern)
         end = time.monotonic() + 30.0
-        while lamps._look is None and time.monotonic() < end:
+        while lamps._job is None and time.monotonic() < end:
             lamps.step(1)
             time.sleep(0.02)
-        return lamps._look
+        return lamps._job
 
     begun()
     wave.inputs[1].default_value = 0.5
@@ -371,7 +372,7 @@ def test_lights_of_every_kind_light_the_view_as_numpy_does(tmp_path):
     pictures = with_graphics(lambda: [viewport_picture(camera, name, False) for name in shading.PASSES])
     path = tmp_path / "lights.blend"
     bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
-    found = client.extract(client.ExtractOptions(scene=path))
+    found = extract_pixels(PixelJob(scene=path))
     distance = np.linalg.norm(found.samples.position - np.array(ball.location), axis=1)
     # Away from the edge of the ball and what is hidden behind it, where positions differ by more than a pixel.
     on_ball = np.abs(distance - 0.7) < 0.01

@@ -68,7 +68,7 @@ def set_up_scene(add_world):
     [
         (add_constant, "on", 0.05, 2.0 * SEEN),
         (add_constant, "off", 0.012, 2.0 * SEEN),
-        (add_gradient, "off", 0.02, SEEN),
+        pytest.param(add_gradient, "off", 0.02, SEEN, marks=pytest.mark.newest),
     ],
 )
 def test_a_view_is_lit_by_the_world_as_pictures_are(capsys, tmp_path, add_world, shadows, most, seen):

@@ -165,7 +165,7 @@ def sky_lights(like: Light, pictures: list[SkyPicture], most: int = MOST_PATCHES
     total = sum((mean_magnitude(picture.radiance) * picture.solid_angles()).sum() for picture in pictures)
     limit, error = _limit(trees, ERROR * total, most)
     lights = [_light(like, picture, tree, limit, (0, 0, 0)) for picture, tree in zip(pictures, trees, strict=True)]
-    bright = [light for light in lights if light.detail or np.any(light.radiance != 0.0)]
+    bright = [light for light in lights if light.children or np.any(light.radiance != 0.0)]
     return bright, error / total if total > 0.0 else 0.0
 
 
@@ -234,7 +234,7 @@ def _limit(trees, wanted: float, most: int) -> tuple[float, float]:
     return limit, _leaves(trees, limit)[1]
 
 
-def _light(like: AreaLight, picture: SkyPicture, tree: _SkyQuadtree, limit: float, square) -> AreaLight:
+def _light(like: Light, picture: SkyPicture, tree: _SkyQuadtree, limit: float, square) -> Light:
     """The square `square` (level, row, column) of a picture as a light; its parts are the detail."""
     level, row, column = square
     size = 2.0**-level
@@ -247,7 +247,7 @@ def _light(like: AreaLight, picture: SkyPicture, tree: _SkyQuadtree, limit: floa
         half_v=size * picture.up,
         direction=-picture.ahead / np.linalg.norm(picture.ahead),
         radiance=tree.means[level][row, column],
-        detail=tuple(_light(like, picture, tree, limit, smaller) for smaller in parts) if len(parts) > 1 else (),
+        children=tuple(_light(like, picture, tree, limit, smaller) for smaller in parts) if len(parts) > 1 else (),
     )
 
 

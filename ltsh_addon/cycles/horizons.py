@@ -9,7 +9,7 @@ import numpy as np
 
 from ..emitters.light_tree import stand_ins
 from ..lobes import brdf, polygon
-from ..scene import FACING_SHAPES, AreaLight, SurfaceSamples
+from ..scene import Light, PolygonLight, SurfaceSamples
 from .light_tree import light_selection_pmf, light_tree_rows
 
 SPECULAR_FIELDS = ("specular_f0", "specular_f90", "specular_dip", "dielectric")
@@ -292,12 +292,7 @@ class _Shapes:
         brightness = np.array([np.abs(light.radiance).sum() for light in alike])
         scales = np.linalg.pinv(np.array([[light.half_u, light.half_v] for light in alike]).swapaxes(1, 2))
         rest = radius, axes, scales, share, _is_side(alike[0])
-        return cls(number, alike[0].shape, alike[0].is_distant, brightness, center, corners, *rest)
-
-    @property
-    def is_facing(self) -> bool:
-        """True for lights that face every point."""
-        return self.kind in FACING_SHAPES
+        return cls(number, alike[0], brightness, center, corners, *rest)
 
     def crossings(self, samples) -> tuple[np.ndarray, np.ndarray]:
         """Pairs of a light and a sample whose horizons differ on the light: part of it is above one of them, and part
@@ -335,7 +330,7 @@ class _Shapes:
         chunks = [(np.zeros(0, int), np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(0))]
         for start in range(0, len(light), PAIRS):
             row, point = light[start : start + PAIRS], sample[start : start + PAIRS]
-            offset = self.center[row] - (0.0 if self.is_distant else position[point])
+            offset = self.center[row] - (0.0 if self.like.is_distant else position[point])
             pair, ray = directions.near(point, offset, self.radius[row])
             towards = directions.towards[point[pair], ray]
             is_hit = self._meets(row, offset, pair, towards)

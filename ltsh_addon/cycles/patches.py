@@ -154,8 +154,8 @@ def split_light(light: Light, patches: Patches) -> list[Light]:
     if patches.whole is None:
         return []
     outline = _outline(light)
-    detail = [light_of_patch for patch in patches.whole.parts for light_of_patch in _lights_of(light, outline, patch)]
-    return [replace(light, radiance=patches.whole.radiance, detail=tuple(detail))]
+    children = [child for patch in patches.whole.parts for child in _lights_of(light, outline, patch)]
+    return [replace(light, radiance=patches.whole.radiance, children=tuple(children))]
 
 
 def _lights_of(light: Light, outline: np.ndarray, patch: Patch) -> list[Light]:
@@ -163,8 +163,8 @@ def _lights_of(light: Light, outline: np.ndarray, patch: Patch) -> list[Light]:
     whole = _light_of_cell(replace(light, radiance=patch.radiance), outline, patch.cell)
     if not patch.parts:
         return whole
-    detail = tuple(smaller for inner in patch.parts for smaller in _lights_of(light, outline, inner))
-    return [replace(whole[0], detail=detail)] if len(whole) == 1 else list(detail)
+    children = tuple(child for inner in patch.parts for child in _lights_of(light, outline, inner))
+    return [replace(whole[0], children=children)] if len(whole) == 1 else list(children)
 
 
 def _light_of_cell(light: Light, outline: np.ndarray, cell) -> list[Light]:
@@ -196,12 +196,10 @@ def _halves(cell) -> list[tuple]:
     return [(x0, x1, y0, middle), (x0, x1, middle, y1)]
 
 
-def _rectangle(light: AreaLight, cell) -> AreaLight:
+def _rectangle(light: Light, cell) -> Light:
     x0, x1, y0, y1 = cell
-    return replace(
+    return QuadLight.like(
         light,
-        shape="RECTANGLE",
-        corners=None,
         center=light.center + 0.5 * (x0 + x1) * light.half_u + 0.5 * (y0 + y1) * light.half_v,
         half_u=0.5 * (x1 - x0) * light.half_u,
         half_v=0.5 * (y1 - y0) * light.half_v,

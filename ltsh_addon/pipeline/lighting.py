@@ -24,7 +24,6 @@ from ..emitters.light_tree import FEWEST
 from ..files import replacing
 from ..scene import (
     REFERENCE,
-    AreaLight,
     Film,
     Light,
     Progress,
@@ -214,7 +213,7 @@ def shade_lights(
     return [shading.Shading(whole.get("specular"), whole.get("diffuse"), error) for whole in sums]
 
 
-def light_groups(lights: Iterable[AreaLight]) -> tuple[str, ...]:
+def light_groups(lights: Iterable[Light]) -> tuple[str, ...]:
     """The names of the light groups of `lights` in the order of their first lights, "" for none; at least one name."""
     return tuple(dict.fromkeys(light.group for light in lights)) or ("",)
 

@@ -216,7 +216,7 @@ class Lights(list):
         """Trees of many lights, and the positions here of their lights."""
         kinds: dict[tuple, list[int]] = {}
         for number, (light, row, _) in enumerate(self):
-            is_plain = not (light.is_profiled or light.is_distant or light.is_facing or light.cone is not None)
+            is_plain = not (light.has_profile or light.is_distant or light.is_facing or light.cone is not None)
             if is_plain and (light.radiance >= 0.0).all():
                 kinds.setdefault((row, light.receivers), []).append(number)
         many = [numbers for numbers in kinds.values() if len(numbers) >= FEWEST]
@@ -283,7 +283,7 @@ class _Lighting:
             allowed = near if allowed is None else allowed & near
         rest = columns
         if not lobes.only_tails:
-            if not light.is_profiled:
+            if not light.has_profile:
                 rest = self._add_small(lobes, light, position, (columns, allowed), sums[row])
             elif light_profile.ConeRegions.suit(light):
                 rest = self._add_points(lobes, light, position, (columns, allowed), sums[row])

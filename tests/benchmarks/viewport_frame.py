@@ -29,6 +29,7 @@ from ltsh_addon.blender.viewport.mirror import SceneMirror
 from ltsh_addon.blender.viewport.pictures import ShownPicture
 from ltsh_addon.blender.viewport.renderer import ViewRenderer
 from ltsh_addon.cli.commands import DEMO_SCENE
+from ltsh_addon.scene import QuadLight
 
 TECHNIQUES = ("ltc", "ltsh2", "ltsh4", "ltsh4c")
 # In times of ltc.

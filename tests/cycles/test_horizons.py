@@ -10,7 +10,7 @@ from ltsh_addon.cycles.environment import CUBE
 from ltsh_addon.cycles.gbuffer import coarse_meshes
 from ltsh_addon.cycles.horizons import end_at_horizons_of_cycles
 from ltsh_addon.cycles.light_tree import light_bounds_at, light_selection_pmf, light_tree_rows
-from ltsh_addon.scene import AreaLight, SurfaceSamples
+from ltsh_addon.scene import EllipseLight, PointLight, PolygonLight, QuadLight, SkyLight, SurfaceSamples
 
 
 def samples_near_the_horizon(roughness, view=(-0.96, 0.0, 0.28), count=4):

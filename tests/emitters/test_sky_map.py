@@ -96,8 +96,8 @@ def test_a_small_distant_light_with_children_is_all_of_its_patches():
         for s, t in offsets
     )  # fmt: skip
     samples = random_samples(60, seed=4)
-    found = shade(samples, [replace(whole, radiance=(1.0, 1.0, 2.0), detail=detail)], workers=1)
-    expected = shade(samples, detail, workers=1, rows=[0] * len(detail))
+    found = shade(samples, [replace(whole, radiance=(1.0, 1.0, 2.0), children=children)], workers=1)
+    expected = shade(samples, children, workers=1, rows=[0] * len(children))
     assert np.array_equal(found.combined, expected.combined) and found.combined.any()
 
 

@@ -59,9 +59,9 @@ def test_pairs_that_blocks_leave_to_double_precision_are_shaded_together(started
     centers = np.append(generator.uniform(-0.5, 0.5, (4, 2)), np.full((4, 1), 1.5), axis=1)
     lights = [area_light(center=center, **narrow) for center in centers]
     lights[1] = replace(lights[1], receivers=(1,))
-    lights[2] = replace(lights[2], shape="DISK")
+    lights[2] = EllipseLight.like(lights[2])
     # A polygon, for of a rectangle with a falloff single precision takes points.
-    lights[3] = replace(lights[3], shape="POLYGON", corners=lights[3].polygon(), falloff=1)
+    lights[3] = PolygonLight.like(lights[3], corners=lights[3].polygon(), falloff=1)
     rows, asked = (0, 1, 0, 0), []
     original = integrator.Task.shade_pairs
 

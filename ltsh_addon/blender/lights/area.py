@@ -222,7 +222,7 @@ def _note_instancer(instance, inventory: LightInventory) -> None:
         inventory.instancers[instancer.original.name_full] = instancer
 
 
-def rendered_lights(scene, inventory: LightInventory) -> list[AreaLight]:
+def rendered_lights(scene, inventory: LightInventory) -> list[Light]:
     """The lights of `inventory`, with the emission of node trees and materials as Cycles renders it.
 
     Objects that must let light through in the reference, and their materials, get the custom property SIDE_PROPERTY.

@@ -57,7 +57,7 @@ class NodeLight:
         return np.eye(3) if self.is_placed else np.linalg.inv(linear / np.linalg.norm(linear, axis=0))
 
 
-def with_node_emission(lights: list[AreaLight], unseen: dict[int, NodeLight], studio: Studio, warn) -> list:
+def with_node_emission(lights: list[Light], unseen: dict[int, NodeLight], studio: Studio, warn) -> list:
     """`lights` with the rendered emission of those at the positions in `unseen`; dark ones of these are left out."""
     result, seen = [], {}
     for position, light in enumerate(lights):
@@ -246,7 +246,7 @@ def _unfolded(views: list[np.ndarray], within: bool) -> np.ndarray:
     return result
 
 
-def with_pattern(light: AreaLight, found: NodeEmission, source: NodeLight, warn) -> list[AreaLight]:
+def with_pattern(light: Light, found: NodeEmission, source: NodeLight, warn) -> list[Light]:
     """A point, spot or sun times the factor `found` of its nodes: one light, or [] if it is dark."""
     factor = found.factor
     weights = np.sin((np.arange(factor.shape[0]) + 0.5) * (np.pi / factor.shape[0]))[:, None, None]
@@ -314,7 +314,7 @@ class ShownTextures:
         patches = self._patches_of(light, factor)
         return None if patches is None else _shown_patches(light, patches, notes)
 
-    def split_seen(self, light: AreaLight, found: NodeEmission, notes: list[str]) -> list[AreaLight]:
+    def split_seen(self, light: Light, found: NodeEmission, notes: list[str]) -> list[Light]:
         """As `split`, for the factor `found` of the nodes of the light."""
         key = id(found), light.is_round
         if key not in self._seen:

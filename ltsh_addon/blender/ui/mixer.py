@@ -28,7 +28,7 @@ _updating: dict = {"update": None}
 def plain_lights(depsgraph) -> dict[str, Light]:
     """The current lights of the scene without their node trees, by name. Only objects that are exactly one light."""
     receivers = Receivers([instance.object.original for instance in depsgraph.object_instances])
-    by_name: dict[str, list[AreaLight]] = {}
+    by_name: dict[str, list[Light]] = {}
     for instance in depsgraph.object_instances:
         ob = instance.object
         if ob.type == "LIGHT" and instance.show_self:
@@ -39,7 +39,7 @@ def plain_lights(depsgraph) -> dict[str, Light]:
     return {name: lights[0] for name, lights in by_name.items() if len(lights) == 1}
 
 
-def has_moved(before: AreaLight, now: AreaLight) -> bool:
+def has_moved(before: Light, now: Light) -> bool:
     """True where a light has another place, direction, size or shape."""
     size = np.abs(before.center).max() + before.radius
     near = all(
@@ -50,7 +50,7 @@ def has_moved(before: AreaLight, now: AreaLight) -> bool:
     return not (near and np.allclose(*cones, rtol=UNMOVED) and abs(before.spread - now.spread) < UNMOVED)
 
 
-def light_where_it_is(former: AreaLight, now: AreaLight, normalized: bool) -> AreaLight:
+def light_where_it_is(former: Light, now: Light, normalized: bool) -> Light:
     """The light at its place `now`, with the power, linking and light group of `former`.
 
     Where its power is `normalized`, the radiance is scaled with the area.
@@ -66,7 +66,7 @@ def moved_rows(context, rows) -> dict[int, Light]:
     moved, lights = {}, plain_lights(context.evaluated_depsgraph_get())
     for number, row in enumerate(rows):
         if row.light is not None and row.name in lights:
-            before, now = AreaLight(**row.light), lights[row.name]
+            before, now = light_of(row.light), lights[row.name]
             if has_moved(before, now):
                 moved[number] = light_where_it_is(before, now, bpy.data.objects[row.name].data.normalize)
     return moved

@@ -145,7 +145,7 @@ def _outline(light, next_texel):
 
 
 def _header(light, first, count, half_v, first_receiver):
-    is_ball = light.shape == "BALL"
+    is_ball = light.is_facing and light.is_sphere
     traits = {
         "DIFFUSE": light.affects_diffuse,
         "SPECULAR": light.affects_specular,
@@ -154,8 +154,8 @@ def _header(light, first, count, half_v, first_receiver):
         "FACING": light.is_facing,
         "BALL": is_ball,
         "CONE": light.cone is not None,
-        "UNEVEN": light.is_facing and not light.is_even,
-        "PROFILE": light.is_profiled,
+        "UNEVEN": light.is_facing and not light.is_uniform,
+        "PROFILE": light.has_profile,
         "CAP": _is_cap(light),
         "PLACED": is_ball and light.pattern is not None and not light.pattern.by_ray,
     }

@@ -46,7 +46,7 @@ class HorizonPass:
         for parallel views the unit direction toward it and 0.
         """
         self._resize(gbuffer.size, gbuffer.mask)
-        corners = [len(light.corners) if light.shape == "POLYGON" else 1 for light in lights.lights]
+        corners = [len(light.corners) if isinstance(light, PolygonLight) else 1 for light in lights.lights]
         self._run(BOUNDS, gbuffer, lights, draw_ranges([1] * len(corners)))
         self._run(EXCESS, gbuffer, lights, draw_ranges([horizons.AROUND * count for count in corners]), view=view)
         self._run(CHOICE, gbuffer, lights, [(0, 0)], threshold=threshold)

@@ -131,7 +131,7 @@ def patterns_of(scene, depsgraph) -> dict[tuple, NodeEmission]:
         return {key: node_emission(source, studio) for key, source in wanted.items()}
 
 
-def _with_nodes(light: AreaLight, instance, sources: tuple, notes: list[str]) -> list[AreaLight]:
+def _with_nodes(light: Light, instance, sources: tuple, notes: list[str]) -> list[Light]:
     """The lights that the node tree of a depsgraph `instance` makes of `light`; [] where it emits nothing.
 
     `sources` are the textures and patterns of `view_lights`.

@@ -231,7 +231,7 @@ class LiveWorld:
         self._thread = _start("world", [world], work)
 
 
-def rendered_world(scene, world, warn: Callable) -> tuple[list[SkyPicture], list[AreaLight], np.ndarray]:
+def rendered_world(scene, world, warn: Callable) -> tuple[list[SkyPicture], list[Light], np.ndarray]:
     """The `world` as Cycles renders it: pictures of its light ([] where it is dark), the small bright lights in it, and
     its background (N, N, 3). `scene` is left as it was."""
     like, light, lights = light_of_world(world), [], []

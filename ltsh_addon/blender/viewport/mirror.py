@@ -166,7 +166,7 @@ class SceneMirror:
         self.instances: list[ShownInstance] = []
         self.lights: tuple[Light, ...] = ()  # with the small bright lights of the world
         self.sky = ShownSky()
-        self.lights_without_world: tuple[AreaLight, ...] = ()  # without those of the world
+        self.lights_without_world: tuple[Light, ...] = ()  # without those of the world
         self._look = look
         self.surfaces_version = 0
         self._meshes: dict[tuple, MeshBatches | None] = {}

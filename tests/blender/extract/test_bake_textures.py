@@ -96,7 +96,7 @@ def samples_by_object(path, folder, look_up):
     options = BakeOptions(scene=path, output=folder, size=(SIZE, SIZE), view="above")
     job = replace(bake._job(options, {}), look_up_images=look_up)
     manifest = extract_bake(job, folder)
-    lights = tuple(AreaLight(**record) for record in manifest["lights"])
+    lights = tuple(light_of(record) for record in manifest["lights"])
     found = {}
     for record in manifest["objects"]:
         assert record["problem"] is None

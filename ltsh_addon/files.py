@@ -120,13 +120,13 @@ def check_takes_files(folder: str | os.PathLike) -> None:
 def no_empty_folder(folder: str | os.PathLike) -> Iterator[None]:
     """Context in which `folder` may be created; if the block raises, the new folder is deleted if it is empty."""
     path = Path(folder).absolute()
-    missing = [part for part in (path, *path.parents) if not os.path.exists(part)]
+    missing = [parent for parent in (path, *path.parents) if not os.path.exists(parent)]
     try:
         yield
     except BaseException:
         with suppress(OSError):
-            for part in missing:
-                part.rmdir()
+            for parent in missing:
+                parent.rmdir()
         raise
 
 
@@ -252,12 +252,12 @@ def _take(lock: int) -> None:
 def _delete_leftovers(folder: Path, prefix: str, suffix: str, flags: int) -> None:
     """Delete what dead processes of this machine left, with what programs added to the names: `prefix...suffix*`."""
     pattern = re.compile(f"({re.escape(prefix)}{MACHINE}-[0-9a-f]{{8}}{re.escape(suffix)}).*")
-    found: dict[Path, list[Path]] = {}
+    leftovers: dict[Path, list[Path]] = {}
     with suppress(OSError), os.scandir(folder) as entries:
         for entry in entries:
             if match := pattern.fullmatch(entry.name):
-                found.setdefault(Path(folder, match[1]), []).append(Path(entry.path))
-    for path, names in found.items():
+                leftovers.setdefault(Path(folder, match[1]), []).append(Path(entry.path))
+    for path, names in leftovers.items():
         lock = None
         # Files stay that are in use, belong to another user, or are on a file system without locks.
         with suppress(OSError):

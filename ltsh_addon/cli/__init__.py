@@ -19,7 +19,7 @@ from ..pipeline.tasks import NameClash
 from ..reading import is_text
 from ..scene import VERSION, Cancelled, SceneError, error_line
 from ..shading import TableError
-from .arguments import Misuse
+from .arguments import Mistakes, Misuse
 from .commands import (
     add_bake,
     add_compare,
@@ -32,7 +32,6 @@ from .commands import (
     add_tables,
     add_view,
 )
-from .job_file import Mistakes
 from .progress import ProgressBar, RunLog, print_json, print_out
 
 EXAMPLES = """examples:

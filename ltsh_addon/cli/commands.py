@@ -15,14 +15,15 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..files import write_bytes
-from ..pipeline.baseline import Baseline
 from ..pipeline.batch import Merged, merge, run_tasks
+from ..pipeline.lighting import prepare
 from ..pipeline.options import BakeOptions, PictureOptions, RenderOptions, ViewOptions, options_from, table
-from ..pipeline.picture import prepare
+from ..pipeline.picture import Baseline, with_times
 from ..pipeline.tasks import BatchJob
 from ..scene import SHIPPED_TABLES, SceneError, error_line
 from ..shading import TableError
 from .arguments import (
+    FileJob,
     Misuse,
     add_baseline,
     add_batch,
@@ -30,10 +31,10 @@ from .arguments import (
     add_options,
     add_talk,
     from_text,
+    read_jobs,
     scenes_of,
     with_examples,
 )
-from .job_file import FileJob, read_jobs
 from .progress import print_json, print_out
 
 DEMO_SCENE = Path(__file__).parents[1] / "blender" / "demo.blend"  # docs/demo_scene.py made it
@@ -290,7 +291,7 @@ def _steps(text: str) -> float:
 def _color(text: str) -> tuple[float, ...]:
     """Three numbers."""
     try:
-        values = tuple(float(part) for part in text.split(","))
+        values = tuple(float(number) for number in text.split(","))
     except ValueError:
         values = ()
     if len(values) != 3 or not all(0.0 <= value < 1e12 for value in values):
@@ -364,13 +365,13 @@ def _run_jobs(arguments, bar, open_file) -> int:
 
 def job_parsers() -> dict[str, argparse.ArgumentParser]:
     """Parsers of the commands that a job file may have."""
-    found = {}
+    parsers = {}
     adders = {"shade": add_shade, "compare": add_compare, "bake": add_bake, "view": add_view, "render": add_render}
     for name, add_arguments in adders.items():
-        found[name] = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-        add_arguments(found[name])
-        found[name].set_defaults(command=name)
-    return found
+        parsers[name] = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+        add_arguments(parsers[name])
+        parsers[name].set_defaults(command=name)
+    return parsers
 
 
 def _for_each(jobs: list[FileJob], do, arguments, bar) -> int:
@@ -472,16 +473,17 @@ def do_job(job: BatchJob, arguments, bar, baseline: Baseline | None = None) -> t
 
     done = run_tasks(job, shard=shard, existing=arguments.existing, progress=bar, tell=tell)
     if shard[1] == 1:
-        if done.kept:
-            bar.remark(f"{done.kept} of {done.tasks} tasks were there already")
+        if done.finished_before:
+            bar.remark(f"{done.finished_before} of {done.tasks} tasks were there already")
         return merge_job(job.options.output, arguments, bar, baseline)
     bar.finish()
     text = f"{shard[0]}/{shard[1]}"
-    kept = f" ({done.kept} were there already)" if done.kept else ""
+    before = f" ({done.finished_before} were there already)" if done.finished_before else ""
     tasks = "1 task" if done.tasks == 1 else f"{done.tasks} tasks"
     _complain(bar, "problem", done.problems)
-    _print(f"shard {text}: {tasks} done{kept}; when all are: merge {job.options.output}", arguments, bar)
-    return {"shard": text, **vars(done)}, 1 if done.problems else 0
+    _print(f"shard {text}: {tasks} done{before}; when all are: merge {job.options.output}", arguments, bar)
+    facts = {"tasks": done.tasks, "done": done.done, "kept": done.finished_before, "problems": done.problems}
+    return {"shard": text, **facts}, 1 if done.problems else 0
 
 
 def merge_job(output: Path, arguments, bar, baseline: Baseline | None = None) -> tuple[dict, int]:
@@ -501,9 +503,7 @@ def merge_job(output: Path, arguments, bar, baseline: Baseline | None = None) ->
         _complain(bar, "worse", worse)
     document = merged.report if baseline is None else {**merged.report, "worse": worse}
     if merged.command == "view":
-        from ..pipeline import view
-
-        document = view.with_times(document, merged.seconds)
+        document = with_times(document, merged.seconds)
     return document, 1 if merged.missing or merged.problems or worse else 0
 
 
@@ -530,11 +530,15 @@ def _warnings(merged) -> list[str]:
 
 
 def _summary(merged: Merged, output) -> str:
-    from ..pipeline import bake, picture, render, view
+    from ..pipeline import bake, picture, render
 
-    tables = {"bake": bake, "view": view, "render": render}.get(merged.command, picture)
+    summary, brief = {
+        "bake": (bake.summary, bake.brief),
+        "view": (picture.view_summary, render.brief),
+        "render": (render.summary, render.brief),
+    }.get(merged.command, (picture.summary, picture.brief))
     if merged.single and "reports" not in merged.report:
-        lines = tables.summary(merged.report, merged.seconds)
+        lines = summary(merged.report, merged.seconds)
     else:
-        lines = [line for report in merged.report["reports"] for line in tables.brief(report)]
+        lines = [line for report in merged.report["reports"] for line in brief(report)]
     return "\n".join([*(line.rstrip() for line in lines), f"written to {output}"])

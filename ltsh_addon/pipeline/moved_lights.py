@@ -21,9 +21,9 @@ from ..cycles.gbuffer import SHADOW_LOOSENESS, one_shading, with_one_shadow
 from ..emitters.light_polygons import has_lobe
 from ..scene import Cancelled, Film, Light, SurfaceSamples
 from ..visibility import BLOCK_SAMPLES, Company, Occluders, Setting, open_tracer, task_of_lights
-from . import picture
-from .lighting import OCCLUDERS_SUFFIX, RELIGHT_SUFFIX, RelightData, rays_of_samples
+from .lighting import load_tables, rays_of_samples
 from .mixer import MixerRow, bounced_light
+from .relight import OCCLUDERS_SUFFIX, RELIGHT_SUFFIX, RelightData
 
 # BLOCKS: enough that all processes end at about the same time. FEWEST_OF_BLOCK: the overhead of smaller blocks exceeds
 # the cost of their samples.
@@ -259,7 +259,7 @@ class MovedLights:
         self._drafted, self._whole = range(len(drafted)), range(len(drafted), len(drafted) + len(whole))
         self._own = [own for own, _ in (*drafted, *whole)]
         blocks = dict(enumerate(block for _, block in (*drafted, *whole)))
-        (table,) = picture.load_tables((kept.technique,)).values()
+        (table,) = load_tables((kept.technique,)).values()
         passes, lights = (
             tuple(kept.options["passes"]),
             [one.moved(-kept.extraction.origin) for one in kept.extraction.lights],

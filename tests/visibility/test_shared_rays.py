@@ -11,7 +11,8 @@ from random_surfaces import unit
 
 from ltsh_addon import shading
 from ltsh_addon.pipeline import lighting, relight
-from ltsh_addon.scene import PASSES, PolygonLight, light_of
+from ltsh_addon.pipeline.relight import RelightData
+from ltsh_addon.scene import PASSES, AreaLight
 from ltsh_addon.visibility import directions, ratio, shared_numbers
 from ltsh_addon.visibility.directions import Choices, Cluster
 
@@ -133,7 +134,7 @@ def test_lamps_that_nothing_hides_shade_as_without_shadows_bit_by_bit():
 def test_lights_that_share_rays_are_relit_together():
     lights = [replace(light, name=f"Lamp {number}") for number, light in enumerate(ceiling(70))]
     shadows = lighting.Shadows({}, shared_numbers(lights), {}, 0, "")
-    kept = lighting.RelightData(SimpleNamespace(lights=lights), shadows, {}, False)
+    kept = RelightData(SimpleNamespace(lights=lights), shadows, {}, False)
     relight._check_shared(kept, [replace(light, radiance=[2.0, 3.0, 4.0] * light.radiance) for light in lights])
     with pytest.raises(ValueError, match="'Lamp 0' and 'Lamp 3' are two of 70 that share their shadow rays"):
         relight._check_shared(kept, [*lights[:3], replace(lights[3], radiance=np.zeros(3)), *lights[4:]])

@@ -458,6 +458,7 @@ def test_a_render_is_what_the_mixer_changes_until_results_are_shown(scene, monke
     assert results.mixer_of(scene) is None
 
 
+@pytest.mark.newest
 @pytest.mark.parametrize("complete", [False, True])
 def test_a_light_that_moved_since_a_render_is_shaded_where_it_is(scene, monkeypatch, complete):
     """As a render of the moved light; the others, and what is bounced, stay."""

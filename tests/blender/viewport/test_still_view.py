@@ -70,7 +70,7 @@ def relative(picture, expected):
     return np.linalg.norm(picture - expected) / np.linalg.norm(expected)
 
 
-@pytest.mark.parametrize(("count", "most"), [(1, 0.01), (16, 0.02)])
+@pytest.mark.parametrize(("count", "most"), [pytest.param(1, 0.01, marks=pytest.mark.newest), (16, 0.02)])
 def test_a_view_is_the_picture_of_shade(capsys, tmp_path, count, most):
     with_graphics(lambda: None)
     set_up_scene()

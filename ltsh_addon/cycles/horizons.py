@@ -222,7 +222,7 @@ def _excess(samples, shapes, chances, choose, is_quick):
     return by_lobe, by_light
 
 
-def _with_stand_ins(lights) -> tuple[tuple[AreaLight, ...], np.ndarray]:
+def _with_stand_ins(lights) -> tuple[tuple[Light, ...], np.ndarray]:
     """Lights (L) and the share (L,) of each that shines. At most MOST_LIGHTS stand-ins replace many flat lights."""
     others, kinds = [], {}
     for light in lights:

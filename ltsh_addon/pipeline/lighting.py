@@ -25,7 +25,6 @@ from ..scene import (
     REFERENCE,
     SHIPPED_TABLES,
     TECHNIQUES,
-    AreaLight,
     Cancelled,
     Film,
     Light,

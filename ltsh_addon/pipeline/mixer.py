@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from ..files import replacing
-from ..scene import AreaLight, Progress, error_line, listed
+from ..scene import Light, Progress, error_line, listed
 from .lighting import Shadows, load_tables, shade_lights
 from .relight import GRAIN, RelightData, color_of
 

@@ -14,7 +14,7 @@ import pytest
 from ltsh_addon import imaging, scene, shading
 from ltsh_addon.imaging.exr import group_names
 from ltsh_addon.pipeline import PictureOptions, compare_scene, comparison, lighting, shade_scene
-from ltsh_addon.scene import Cancelled
+from ltsh_addon.scene import Cancelled, PolygonLight
 
 TABLES = Path(shading.__file__).resolve().parents[2] / "tables"
 TECHNIQUES = ("ltc", "ltsh4", "reference")

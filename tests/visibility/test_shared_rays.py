@@ -12,7 +12,7 @@ from random_surfaces import unit
 from ltsh_addon import shading
 from ltsh_addon.pipeline import lighting, relight
 from ltsh_addon.pipeline.relight import RelightData
-from ltsh_addon.scene import PASSES, AreaLight
+from ltsh_addon.scene import PASSES, PolygonLight, light_of
 from ltsh_addon.visibility import directions, ratio, shared_numbers
 from ltsh_addon.visibility.directions import Choices, Cluster
 

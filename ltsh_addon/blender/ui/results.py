@@ -17,7 +17,7 @@ from ...pipeline.display_layers import FILES
 from ...pipeline.mixer import MIXER_FILE, LightPictures, Mixer, MixerRow
 from ...pipeline.moved_lights import MovedLights
 from ...pipeline.relight import RELIGHT_SUFFIX, RelightData, tint
-from ...scene import AreaLight, SceneError, SurfaceSamples
+from ...scene import Light, SceneError, SurfaceSamples, light_of
 
 LAYER, SCENE = "ltsh_layer", "ltsh_scene"  # custom properties that mark our images
 PREFIX = "LTSH "

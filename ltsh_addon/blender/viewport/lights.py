@@ -162,7 +162,7 @@ def _with_nodes(light: Light, instance, sources: tuple, notes: list[str]) -> lis
     pattern = patterns(data, unseen)
     if isinstance(pattern, str):
         notes.append(f"{light.name}: {pattern}")
-        return [replace(light, falloff=0, smooth=0.0)]
+        return [light if light.is_distant else replace(light, falloff=0, smooth=0.0)]
     notes += warnings
     if not light.is_distant:
         light = replace(light, falloff=unseen.falloff.power, smooth=unseen.falloff.smooth)

@@ -23,7 +23,7 @@ from ltsh_addon.pipeline.lighting import ShadowTracer, load_tables
 from ltsh_addon.pipeline.mixer import light_pictures
 from ltsh_addon.pipeline.moved_lights import MovedLights
 from ltsh_addon.pipeline.relight import LightChange, RelightData, relight
-from ltsh_addon.scene import PASSES, AreaLight, Film
+from ltsh_addon.scene import PASSES, Film, light_of
 
 SIZE, BLOCK = 32, 8  # pixels
 SAMPLES, TRUE_SAMPLES = 64, 1024

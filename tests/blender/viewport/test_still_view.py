@@ -225,7 +225,7 @@ def drawn_by_samples():
     mirror, canvas, points = SceneMirror(), Canvas(*SIZE), filter_points("BLACKMAN_HARRIS", 1.5, 3)
     mirror.sync(depsgraph)
     view = view_of_camera(camera, depsgraph, SIZE)
-    shown = ShownPicture("ltsh4", "combined", "single", "ltc", 0.5, 1.0, 1.0, False)
+    shown = ShownPicture("ltsh4", "combined")
     still, moved = ViewRenderer(), ViewRenderer()
     try:
         refined, alone, counts = [], [], []
@@ -273,7 +273,7 @@ class LiveView:
         """The picture (H, W, 3)."""
         self.live.follow((0,), self.occluders)
         self.renderer.shadows = shadows
-        shown = ShownPicture("ltsh4", self.passes, "single", "ltc", 0.5, 1.0, 1.0, True)
+        shown = ShownPicture("ltsh4", self.passes, transparent=True)
         self.renderer.draw(self.mirror, self.view, SIZE, shown, self.canvas.buffer, points)
         return self.renderer.read()[..., :3].astype(np.float64)
 

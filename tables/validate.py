@@ -14,7 +14,7 @@ import numpy as np
 
 from ltsh_addon.lobes import brdf
 from ltsh_addon.lobes.lookup_table import LookupTable
-from ltsh_addon.scene import AreaLight, SurfaceSamples
+from ltsh_addon.scene import EllipseLight, SurfaceSamples
 from ltsh_addon.shading import evaluate_lobe, header, shade
 
 from .families import gauss_legendre
@@ -341,7 +341,7 @@ def _disk_lights():
     for number, (center, radius) in enumerate(zip(*_centers_of_disks(), strict=True)):
         across = np.cross(center, [1.0, 0.0, 0.0])
         across *= np.tan(radius) / np.linalg.norm(across)
-        yield AreaLight(str(number), "DISK", center, across, np.cross(center, across), -center, np.ones(3))
+        yield EllipseLight(str(number), center, across, np.cross(center, across), -center, np.ones(3))
 
 
 def _integrals_over_disks(view, tangent, alphas):

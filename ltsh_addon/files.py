@@ -18,13 +18,11 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 
 from .reading import check_name
-from .scene import SurfaceSamples
 
 try:
     import fcntl
@@ -89,22 +87,6 @@ def write_bytes(path: str | os.PathLike, data: bytes) -> None:
     """Write `data` to the file `path`, all or nothing (see `replacing`)."""
     with replacing(path) as temporary:
         temporary.write_bytes(data)
-
-
-def save_samples(samples: SurfaceSamples, path: str | os.PathLike) -> None:
-    """Write a compressed .npz, all or nothing, which `load_samples` reads back bit for bit."""
-    with replacing(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, **{field.name: getattr(samples, field.name) for field in fields(samples)})
-
-
-def load_samples(path: str | os.PathLike) -> SurfaceSamples:
-    """Read what `save_samples` wrote. Raises OSError, ValueError."""
-    names = [field.name for field in fields(SurfaceSamples)]
-    with np.load(path) as data:
-        missing = [name for name in names if name not in data]
-        if missing:
-            raise ValueError(f"{path}: no surface samples, {', '.join(missing)} missing")
-        return SurfaceSamples(**{name: data[name] for name in names})
 
 
 def check_takes_files(folder: str | os.PathLike) -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from ..pipeline import batch
 from ..pipeline.lighting import load_tables
-from ..pipeline.options import arguments_of
+from ..pipeline.options import arguments_of, real_number
 from ..pipeline.picture import Tolerance
 from ..pipeline.tasks import BatchJob
 from ..reading import Malformed, read_toml
@@ -81,19 +81,16 @@ def scenes_of(arguments, open_file: str | None) -> tuple[Path, ...]:
 
 def shard(text: str) -> tuple[int, int]:
     """The shard (I, N) of the text I/N with 1 <= I <= N."""
-    number, separator, count = text.partition("/")
-    if separator and number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count):
-        return int(number), int(count)
+    index, separator, count = text.partition("/")
+    if separator and index.isdecimal() and count.isdecimal() and 1 <= int(index) <= int(count):
+        return int(index), int(count)
     raise ValueError(f"shard is {text!r}, expected I/N with I from 1 to N, such as 1/4 to 4/4")
 
 
 def tolerance(text: str) -> Tolerance:
     """The tolerance of a number, or of a percentage of the baseline's error."""
-    number, relative = text.removesuffix("%"), text.endswith("%")
-    try:
-        value = float(number) / (100.0 if relative else 1.0)
-    except ValueError:
-        value = -1.0
+    relative = text.endswith("%")
+    value = real_number(text.removesuffix("%")) / (100.0 if relative else 1.0)
     if not 0.0 <= value < math.inf:
         raise ValueError(f"tolerance is {text!r}, expected a number such as 0.002, or 10%")
     return Tolerance(value, relative)

@@ -6,21 +6,16 @@ That function takes the arguments, the progress bar and the file that Blender ha
 from __future__ import annotations
 
 import argparse
-import importlib.util
-import math
-import os
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 from ..files import write_bytes
 from ..pipeline.batch import Merged, merge, run_tasks
 from ..pipeline.lighting import prepare
-from ..pipeline.options import BakeOptions, PictureOptions, RenderOptions, ViewOptions, options_from, table
+from ..pipeline.options import BakeOptions, PictureOptions, RenderOptions, ViewOptions, options_from, real_number
 from ..pipeline.picture import Baseline, with_times
 from ..pipeline.tasks import BatchJob
-from ..scene import SHIPPED_TABLES, SceneError, error_line
+from ..scene import SceneError, error_line
 from ..shading import TableError
 from .arguments import (
     FileJob,
@@ -96,53 +91,37 @@ RENDER_EXAMPLES = """examples:
 """
 
 
-def add_demo(parser) -> None:
-    """`ltsh demo`."""
-    size = {"help": "default: {}x{}".format(*DEMO_RESOLUTION), "default": DEMO_RESOLUTION}
-    with_examples(parser, DEMO, DEMO_EXAMPLES)
-    _add_job(parser, PictureOptions, but=("scene",), resolution=size)
-    parser.set_defaults(run=_demo, scenes=[])
+# JOBS: the options of the commands that make a job, their description and examples, and the options they leave out.
+JOBS = {
+    "demo": (PictureOptions, DEMO, DEMO_EXAMPLES, ("scene",)),
+    "compare": (PictureOptions, COMPARE, COMPARE_EXAMPLES, ()),
+    "shade": (PictureOptions, SHADE, SHADE_EXAMPLES, ("cycles_samples",)),
+    "bake": (BakeOptions, BAKE, BAKE_EXAMPLES, ()),
+    "view": (ViewOptions, VIEW, VIEW_EXAMPLES, ()),
+    "render": (RenderOptions, RENDER, RENDER_EXAMPLES, ()),
+}
 
 
-def add_compare(parser) -> None:
-    """`ltsh compare`."""
-    with_examples(parser, COMPARE, COMPARE_EXAMPLES)
-    _add_job(parser, PictureOptions)
-    add_baseline(parser)
-
-
-def add_shade(parser) -> None:
-    """`ltsh shade`."""
-    with_examples(parser, SHADE, SHADE_EXAMPLES)
-    _add_job(parser, PictureOptions, but=("cycles_samples",))
-    parser.set_defaults(cycles_samples=0)
-
-
-def add_bake(parser) -> None:
-    """`ltsh bake`."""
-    with_examples(parser, BAKE, BAKE_EXAMPLES)
-    _add_job(parser, BakeOptions)
-
-
-def add_view(parser) -> None:
-    """`ltsh view`."""
-    with_examples(parser, VIEW, VIEW_EXAMPLES)
-    _add_job(parser, ViewOptions)
-
-
-def add_render(parser) -> None:
-    """`ltsh render`."""
-    with_examples(parser, RENDER, RENDER_EXAMPLES)
-    _add_job(parser, RenderOptions)
-
-
-def _add_job(parser, kind, *, but=(), **changes) -> None:
-    """Add the arguments of the options class `kind`, except `but`, with `changes`, and those about running a job."""
-    add_options(parser, kind, but=(*but, "scripts"), **changes)
+def add_job(parser, command: str, **changes) -> None:
+    """`ltsh demo`, `compare`, `shade`, `bake`, `view` and `render`; `changes` are keywords of arguments by option."""
+    kind, description, examples, left_out = JOBS[command]
+    with_examples(parser, description, examples)
+    add_options(parser, kind, but=(*left_out, "scripts"), **changes)
     add_batch(parser)
     add_option(parser, kind, "scripts")
     add_talk(parser)
     parser.set_defaults(run=_run_scenes)
+    if command == "compare":
+        add_baseline(parser)
+    elif command == "shade":
+        parser.set_defaults(cycles_samples=0)
+
+
+def add_demo(parser) -> None:
+    """`ltsh demo`."""
+    size = {"help": "default: {}x{}".format(*DEMO_RESOLUTION), "default": DEMO_RESOLUTION}
+    add_job(parser, "demo", resolution=size)
+    parser.set_defaults(run=_demo, scenes=[])
 
 
 def _run_scenes(arguments, bar, open_file) -> int:
@@ -168,8 +147,7 @@ def _demo(arguments, bar, open_file) -> int:
 
 def job_of(arguments, scenes: tuple[Path, ...]) -> BatchJob:
     """The job of the arguments of demo, compare, shade, bake, view or render. Raises Misuse."""
-    kinds = {"bake": BakeOptions, "view": ViewOptions, "render": RenderOptions}
-    kind = kinds.get(arguments.command, PictureOptions)
+    kind, *_ = JOBS[arguments.command]
     command = "compare" if arguments.command == "demo" else arguments.command
     cameras, frames = tuple(dict.fromkeys(arguments.cameras or ())), arguments.frames or ()
     if command == "bake" and arguments.apply and (len(cameras) > 1 or len(frames) > 1):
@@ -267,22 +245,15 @@ class _OfLight(argparse.Action):
 
 def _factor(text: str) -> float:
     """x and a number."""
-    number = text.removeprefix("x")
-    try:
-        value = float(number)
-    except ValueError:
-        value = -1.0
-    if number == text or not 0.0 <= value < 1e12:
+    value = real_number(text.removeprefix("x"))
+    if not text.startswith("x") or not 0.0 <= value < 1e12:
         raise ValueError(f"power is {text!r}, expected x and a factor, such as x2 or x.5")
     return value
 
 
 def _steps(text: str) -> float:
     """A number of doublings."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.inf
+    value = real_number(text)
     if not abs(value) <= 32.0:
         raise ValueError(f"exposure is {text!r}, expected a number from -32 to 32, such as +1 or -.5")
     return value
@@ -290,10 +261,7 @@ def _steps(text: str) -> float:
 
 def _color(text: str) -> tuple[float, ...]:
     """Three numbers."""
-    try:
-        values = tuple(float(number) for number in text.split(","))
-    except ValueError:
-        values = ()
+    values = tuple(map(real_number, text.split(",")))
     if len(values) != 3 or not all(0.0 <= value < 1e12 for value in values):
         raise ValueError(f"color is {text!r}, expected red, green and blue such as 1,.8,.6")
     return values
@@ -366,10 +334,9 @@ def _run_jobs(arguments, bar, open_file) -> int:
 def job_parsers() -> dict[str, argparse.ArgumentParser]:
     """Parsers of the commands that a job file may have."""
     parsers = {}
-    adders = {"shade": add_shade, "compare": add_compare, "bake": add_bake, "view": add_view, "render": add_render}
-    for name, add_arguments in adders.items():
+    for name in ("shade", "compare", "bake", "view", "render"):
         parsers[name] = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-        add_arguments(parsers[name])
+        add_job(parsers[name], name)
         parsers[name].set_defaults(command=name)
     return parsers
 
@@ -391,74 +358,6 @@ def _for_each(jobs: list[FileJob], do, arguments, bar) -> int:
         documents.append({"command": wanted.job.command, "output": str(output), **document})
         worst = max(worst, code)
     return _printed(arguments, {"jobs": documents}, worst)
-
-
-TABLES = "Fit, measure and export the lookup tables. All but export need the source checkout and scipy."
-TABLES_EXAMPLES = """examples:
-  %(prog)s export -o out/tables
-  %(prog)s validate ltsh4 --json
-  %(prog)s fit ltsh6 -o out/tables
-"""
-EXPORT = "Write each table as images, as a header for C, C++, GLSL and HLSL, and as WGSL; see docs/engines.md."
-EXPORT_EXAMPLES = """examples:
-  %(prog)s -o out/tables
-  %(prog)s ltsh4 my_table.npz -o out/tables --json
-"""
-SCRIPTS = {
-    "fit": "fit tables to a BRDF, which takes hours",
-    "validate": "errors of tables between their nodes",
-    "optimum": "how good any table of a family could be",
-    "plot": "the figures of tables/README.md",
-}
-
-
-def add_tables(parser) -> None:
-    """`ltsh tables`."""
-    with_examples(parser, TABLES, TABLES_EXAMPLES)
-    actions = parser.add_subparsers(dest="action", required=True)
-    for action, meaning in SCRIPTS.items():
-        # The script parses its own options. No argument starts with this prefix, so all are passed on unchanged.
-        script = actions.add_parser(action, help=meaning, add_help=False, prefix_chars="\0")
-        script.add_argument("arguments", nargs="*")
-        script.set_defaults(run=_run_table_script, quiet=False, log=None)
-    export = actions.add_parser("export", help="for other engines: images, a header for C, C++, GLSL and HLSL, WGSL")
-    with_examples(export, EXPORT, EXPORT_EXAMPLES)
-    export.add_argument("names", nargs="*", type=from_text(table), metavar="TABLE",
-                        help="or a path (.npz); default: all shipped")  # fmt: skip
-    export.add_argument("-o", dest="output", type=Path, required=True, metavar="OUT", help="folder for the files")
-    add_talk(export, "name the files on stdout in one JSON document")
-    export.set_defaults(run=_export_tables)
-
-
-def _run_table_script(arguments, bar, open_file) -> int:
-    root = Path(__file__).resolve().parents[2]
-    if not (root / "tables" / "fit.py").is_file():
-        needed = "the source checkout with tables/fit.py"
-        raise Misuse(f"tables {arguments.action} needs {needed}, which is not here")
-    for library in ("scipy", *(["matplotlib"] if arguments.action == "plot" else [])):
-        if importlib.util.find_spec(library) is None:
-            fix = f"install it with `pip install {library}`"
-            raise Misuse(f"tables {arguments.action} needs {library}, which is not here; {fix}")
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(root), os.environ.get("PYTHONPATH", "")])}
-    command = [sys.executable, "-m", "tables", arguments.action, *arguments.arguments]
-    return subprocess.run(command, env=environment, check=False).returncode
-
-
-def _export_tables(arguments, bar, open_file) -> int:
-    from ..pipeline.export import export_prefixes, export_tables
-
-    try:
-        prefixes = export_prefixes(arguments.names or SHIPPED_TABLES)
-    except ValueError as error:
-        raise Misuse(str(error)) from error
-    files = export_tables(prefixes, arguments.output, bar)
-    bar.finish()
-    paths = {name: [str(path) for path in written] for name, written in files.items()}
-    if arguments.json:
-        print_json({"tables": paths})
-    else:
-        print_out("\n".join(path for written in paths.values() for path in written))
-    return 0
 
 
 def do_job(job: BatchJob, arguments, bar, baseline: Baseline | None = None) -> tuple[dict, int]:

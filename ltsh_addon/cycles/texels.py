@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..scene import AreaLight, SurfaceSamples
+from ..scene import Light, SurfaceSamples
 from .gbuffer import HITS_PER_BLOCK
 from .horizons import end_at_horizons_of_cycles, unit
 from .images import GRAY, ImageTexture
@@ -144,7 +144,7 @@ def texel_samples(
     texels: Texels,
     read_map,
     view: BakeView,
-    lights: tuple[AreaLight, ...],
+    lights: tuple[Light, ...],
 ) -> tuple[SurfaceSamples, np.ndarray]:
     """Samples (S) of texels (Q), and the texel (S,) of each, 0 to Q - 1. The samples of a texel are consecutive.
 

@@ -6,6 +6,7 @@ the second Blender takes the fields that it shares. Records of finished tasks ho
 
 from __future__ import annotations
 
+import math
 import re
 import string
 from collections.abc import Callable
@@ -41,6 +42,14 @@ _FRAMES = re.compile(r"(-?\d+)(?:-(-?\d+)(?::(\d+))?)?", re.ASCII)
 # From text to values. Each function raises ValueError that says what was found and what was expected.
 
 
+def real_number(text: str) -> float:
+    """The number that a text is; NaN, which no limit allows, where it is none."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
 def techniques(text: str) -> tuple[str, ...]:
     """Names of techniques, or paths of tables, separated by commas."""
     names = _names(text)
@@ -74,10 +83,7 @@ def one_table(text: str) -> tuple[str, ...]:
 
 def seconds(text: str) -> float:
     """Seconds of a budget."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
+    value = real_number(text)
     if not 0.0 < value < 1e9:
         raise ValueError(f"budget is {text!r}, expected seconds of processor time, more than 0")
     return value
@@ -157,19 +163,20 @@ def positive(text: str) -> int:
     raise ValueError(f"{text!r} was given, expected a whole number above 0")
 
 
-def refinements(text: str) -> int:
-    """Number of pictures whose mean is a view."""
-    if text.isdecimal() and 1 <= int(text) <= MOST_REFINEMENTS:
-        return int(text)
-    raise ValueError(f"refine is {text!r}, expected a whole number from 1 to {MOST_REFINEMENTS}")
+def whole_number(what: str, least: int, most: int) -> Callable[[str], int]:
+    """The parser of whole numbers from `least` to `most`; errors begin with `what`, such as "margin is"."""
+
+    def parse(text: str) -> int:
+        if text.isdecimal() and least <= int(text) <= most:
+            return int(text)
+        raise ValueError(f"{what} {text!r}, expected a whole number from {least} to {most}")
+
+    return parse
 
 
-def shadow_rays(text: str) -> int:
-    """Number of rays per light and point."""
-    fewest, most = SHADOW_RAYS
-    if text.isdecimal() and fewest <= int(text) <= most:
-        return int(text)
-    raise ValueError(f"shadow rays are {text!r}, expected a whole number from {fewest} to {most}")
+refinements = whole_number("refine is", 1, MOST_REFINEMENTS)  # number of pictures whose mean is a view
+shadow_rays = whole_number("shadow rays are", *SHADOW_RAYS)  # number of rays per light and point
+margin = whole_number("margin is", 0, MOST_MARGIN)  # width of the margin around islands in texels
 
 
 def cycles_samples(text: str) -> int:
@@ -182,21 +189,11 @@ def cycles_samples(text: str) -> int:
     return value
 
 
-def margin(text: str) -> int:
-    """Width of the margin around islands in texels."""
-    if text.isdecimal() and int(text) <= MOST_MARGIN:
-        return int(text)
-    raise ValueError(f"margin is {text!r}, expected a whole number from 0 to {MOST_MARGIN}")
-
-
 def view(text: str) -> tuple[float, ...] | str:
     """camera, above or a position."""
     if text in ("camera", "above"):
         return text
-    try:
-        position = tuple(float(number) for number in text.split(","))
-    except ValueError:
-        position = ()
+    position = tuple(map(real_number, text.split(",")))
     if len(position) == 3 and all(abs(value) < 1e12 for value in position):
         return position
     raise ValueError(f"view is {text!r}, expected camera, above or a position such as 0,-4,1.5")

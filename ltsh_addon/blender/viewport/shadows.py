@@ -12,7 +12,8 @@ import gpu
 import numpy as np
 
 from ...scene import PASSES, AreaLight, Cancelled, Film, SurfaceSamples, error_line
-from ...visibility import Mate, Occluders, ShadowSampling, Tracer, open_tracer, shared_numbers, visible_shares
+from ...visibility import Occluders, ShadowSampling, Starts, Tracer, open_tracer, ray_origins, shared_numbers, visible_shares
+from ...workers.pool import WorkerPool, cores
 from ..process.blender_process import embree_libraries
 from .surfaces import View
 from .textures import GBufferTextures, ShareGrid, float_texture, read_texture
@@ -24,7 +25,7 @@ _SHARE_BYTES = 4
 
 
 class _Tracing:
-    """A tracer of occluders, and the process (mate) that helps it.
+    """A tracer of occluders, and the pool of this process and a worker that trace with it.
 
     Positions are relative to an origin near the view, where single precision is best. The origin changes rarely.
     """
@@ -32,7 +33,7 @@ class _Tracing:
     def __init__(self, occluders: Occluders):
         self._occluders = occluders
         self._tracer: Tracer | None = None
-        self.mate: Mate | None = None
+        self.pool: WorkerPool | None = None
         self._origin = np.zeros(3)
 
     def around(self, origin: np.ndarray) -> Tracer:
@@ -42,13 +43,13 @@ class _Tracing:
             matrices[:, :, 3] -= origin
             self._tracer = open_tracer(replace(self._occluders, matrices=matrices), embree_libraries())
             self.close()
-            self.mate, self._origin = Mate(self._tracer), np.array(origin)
+            self.pool, self._origin = WorkerPool(self._tracer, min(cores(), 2)), np.array(origin)
         return self._tracer
 
     def close(self) -> None:
-        """End the process of the mate."""
-        if self.mate is not None:
-            self.mate.close()
+        """End the worker."""
+        if self.pool is not None:
+            self.pool.close()
 
 
 class ShadowRays:
@@ -139,6 +140,7 @@ class _Points:
     def __init__(self, step: int, gbuffer: GBufferTextures, view: View):
         self._step, self._view, (width, height) = step, view, gbuffer.size
         self._texels, self._samples, self._normal = _texels(gbuffer, step), None, None
+        self._starts: Starts | None = None
         positions, first = self._texels["position"], step // 2
         rows, columns = positions.shape[:2]
         stretch = np.eye(4)
@@ -152,6 +154,12 @@ class _Points:
         """Read again what depends on the lights: the normals of the horizons."""
         if gbuffer.geometric_normal is not None:
             self._normal = _every(gbuffer.geometric_normal, self._step)
+
+    def starts(self, pool: WorkerPool) -> Starts:
+        """Where rays from the samples start."""
+        if self._starts is None:
+            self._starts = ray_origins(self.samples()[0], pool)
+        return self._starts
 
     def samples(self) -> tuple[SurfaceSamples, Film]:
         """The samples and their film."""
@@ -179,7 +187,6 @@ class _Request:
     rays: int
     tracing: _Tracing
     origin: np.ndarray
-    layer: int  # 1: glass, 0: the surfaces behind
 
     @property
     def is_own(self) -> bool:
@@ -194,7 +201,7 @@ class _Request:
         """
         samples, film = self.points.samples()
         tracer, found = self.tracing.around(self.origin), {}
-        self.tracing.mate.key = (self.state, self.layer) if self.level == 1 else None
+        starts = self.points.starts(self.tracing.pool) if self.level == 1 else None
         lights = [light for lights in self.lights for light in lights]
         starts = np.cumsum([0, *map(len, self.lights)])[:-1]
         place_of = dict(zip(starts.tolist(), range(len(starts)), strict=True))
@@ -209,7 +216,8 @@ class _Request:
                     [lights[number] for number in chosen],
                     tracer,
                     sampling,
-                    workers=self.tracing.mate,
+                    workers=self.tracing.pool,
+                    starts=starts,
                     progress=progress,
                 )
             except Cancelled:
@@ -497,7 +505,6 @@ class LiveShadows:
             rays=rays,
             tracing=self._followed.tracing,
             origin=view.origin.copy(),
-            layer=int(self._behind is not None),
         )
 
     def _start(self, requests: list[_Request]) -> None:

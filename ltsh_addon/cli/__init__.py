@@ -167,7 +167,7 @@ def _parser(program: str) -> tuple[argparse.ArgumentParser, dict[str, argparse.A
     parser.add_argument("--version", action="version", version=f"%(prog)s {VERSION}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, add, meaning in (
-        ("demo", add_demo, "build the example scene and run compare on it"),
+        ("demo", add_demo, "write the example scene and run compare on it"),
         ("compare", add_compare, "techniques beside Cycles: EXR, sheet, report"),
         ("shade", add_shade, "shade per pixel of the camera"),
         ("bake", add_bake, "bake lighting and errors into the texels of UV maps"),

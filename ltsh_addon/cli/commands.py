@@ -14,6 +14,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+from ..files import write_bytes
 from ..pipeline.baseline import Baseline
 from ..pipeline.batch import Merged, merge, run_tasks
 from ..pipeline.options import BakeOptions, PictureOptions, RenderOptions, ViewOptions, options_from, table
@@ -35,9 +36,10 @@ from .arguments import (
 from .job_file import FileJob, read_jobs
 from .progress import print_json, print_out
 
+DEMO_SCENE = Path(__file__).parents[1] / "blender" / "demo.blend"  # docs/demo_scene.py made it
 DEMO_RESOLUTION = (480, 270)
 UNSHADOWED = "unshadowed"
-DEMO = """Build the example scene, OUT/demo.blend, and do with it what compare does; then the
+DEMO = """Write the example scene, OUT/demo.blend, and do with it what compare does; then the
 same without shadows, in OUT/unshadowed, which compares the lobes alone."""
 COMPARE = """Shade what the camera sees with several techniques, render the same direct light
 with Cycles, and measure how far apart they are. OUT gets compare.exr (all layers
@@ -150,11 +152,9 @@ def _run_scenes(arguments, bar, open_file) -> int:
 
 
 def _demo(arguments, bar, open_file) -> int:
-    from ..blender.process import client
-
     job = job_of(arguments, (arguments.output / "demo.blend",))
     prepare(job.options)
-    client.build_demo(job.scenes[0], progress=bar)
+    write_bytes(job.scenes[0], DEMO_SCENE.read_bytes())
     document, code = do_job(job, arguments, bar)
     if job.options.shadows == "on":
         alone = replace(job.options, shadows="off", output=arguments.output / UNSHADOWED)

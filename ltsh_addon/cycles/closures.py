@@ -71,18 +71,18 @@ def _albedo(normals, cosine, alpha, ior):
     refracted = np.sqrt(np.maximum(1.0 - (1.0 - towards**2) / ior**2, 0.0))
     up = 2.0 * towards * normals[..., 2] - cosine
     down = (refracted - towards / ior) * normals[..., 2] + cosine / ior
-    reflected, transmitted = (_seen(height, cosine, alpha) for height in (up, down))
+    reflected, transmitted = (_smith_visibility(height, cosine, alpha) for height in (up, down))
     return (fresnel * reflected + (1.0 - fresnel) * transmitted).mean(axis=0)
 
 
-def _seen(height, cosine, alpha):
+def _smith_visibility(height, cosine, alpha):
     """Share of the light towards directions with cosine `height` that height-correlated Smith masking lets through, if
     the normal is visible; 0 below the horizon."""
-    entering, leaving = (_masked(value, alpha) for value in (cosine, np.maximum(height, 1e-9)))
+    entering, leaving = (_smith_lambda(value, alpha) for value in (cosine, np.maximum(height, 1e-9)))
     return np.where(height > 0.0, (1.0 + entering) / (1.0 + entering + leaving), 0.0)
 
 
-def _masked(cosine, alpha):
+def _smith_lambda(cosine, alpha):
     return 0.5 * (np.sqrt(1.0 + alpha**2 * (1.0 / cosine**2 - 1.0)) - 1.0)
 
 
@@ -99,13 +99,10 @@ def sheen_lobe(cosine: np.ndarray, roughness: np.ndarray) -> np.ndarray:
     multiple-scattering sheen using linearly transformed cosines"). Albedo and lobe agree with Cycles 4.5 and 5.2 to
     1e-4.
     """
-    tables = _sheen_tables()
-    x, y = np.clip(cosine, 0.0, 1.0), np.clip(roughness, SMALLEST_ROUGHNESS, 1.0)
-    found = np.zeros((3, len(x)))
-    for index, weight in corners(x, y):
-        found += weight * tables[:, index]
-    found[0] = np.maximum(found[0], 0.0)
-    return found
+    roughness = np.maximum(roughness, SMALLEST_ROUGHNESS)
+    lobe = np.stack([_interpolate(table, cosine, roughness) for table in _sheen_tables()])
+    lobe[0] = np.maximum(lobe[0], 0.0)
+    return lobe
 
 
 def sheen_albedo(cosine: np.ndarray, roughness: np.ndarray) -> np.ndarray:
@@ -119,36 +116,23 @@ def velvet_albedo(cosine: np.ndarray, roughness: np.ndarray) -> np.ndarray:
     It agrees with Cycles to 1 % from a roughness of 0.3 on, and to 5 % at 0.1. Ashikhmin, Premoze and Shirley 2000, "A
     microfacet-based BRDF generator", section 4.3, without Fresnel.
     """
-    table, found = _velvet_table(), 0.0
-    for index, weight in corners(np.clip(cosine, 0.0, 1.0), np.clip(roughness, 0.0, 1.0)):
-        found = found + weight * table[index]
-    return found
-
-
-def corners(x: np.ndarray, y: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Bilinear interpolation at points of the unit square: numbers (P,) of four nodes in the table and weights (P,)."""
-    x, y = (SHEEN_NODES - 1) * x, (SHEEN_NODES - 1) * y
-    column, row = (np.minimum(value.astype(int), SHEEN_NODES - 2) for value in (x, y))
-    return [
-        ((column + i) * SHEEN_NODES + row + j, np.abs(1 - i - (x - column)) * np.abs(1 - j - (y - row)))
-        for i in (0, 1)
-        for j in (0, 1)
-    ]
+    return _interpolate(_velvet_table(), cosine, roughness)
 
 
 @cache
 def _sheen_tables() -> np.ndarray:
-    return np.load(PATH).astype(np.float64).reshape(3, -1)
+    """Albedo, a and b of sheen (3, N, N) by cosine and roughness."""
+    return np.load(PATH).astype(np.float64).reshape(3, SHEEN_NODES, SHEEN_NODES)
 
 
 @cache
 def _velvet_table() -> np.ndarray:
-    """Albedos of velvet at the nodes (cosine, roughness) of `corners`, by the midpoint rule over light directions."""
+    """Albedos of velvet (N, N) by cosine and roughness, by the midpoint rule over light directions."""
     steps = np.linspace(0.0, 1.0, SHEEN_NODES)
     view, sigma = np.meshgrid(np.maximum(steps, 0.5 / SHEEN_NODES), np.maximum(steps, 0.01), indexing="ij")
     view, sigma = view.reshape(-1, 1), sigma.reshape(-1, 1)
     angle = (np.arange(VELVET_STEPS) + 0.5) / VELVET_STEPS
-    theta, phi = (part.ravel() for part in np.meshgrid(0.5 * np.pi * angle, np.pi * angle))
+    theta, phi = (angles.ravel() for angles in np.meshgrid(0.5 * np.pi * angle, np.pi * angle))
     light, across = np.cos(theta), np.sin(theta) * np.cos(phi)
     half2 = 0.5 * (1.0 + view * light + np.sqrt(1.0 - view**2) * across)  # squared cosine of view and half vector
     normal2 = np.clip((view + light) ** 2 / (4.0 * half2), 0.0, 1.0 - 1e-9)  # squared cosine of normal and half vector
@@ -156,7 +140,7 @@ def _velvet_table() -> np.ndarray:
     masked = np.minimum(1.0, ratio * np.minimum(view, light))
     density = np.exp(-normal2 / ((1.0 - normal2) * sigma**2)) / (np.pi * (sigma * (1.0 - normal2)) ** 2)
     area = np.sin(theta) * np.pi**2 / VELVET_STEPS**2  # both halves of the circle
-    return (density * masked / (4.0 * view) * area).sum(axis=-1)
+    return (density * masked / (4.0 * view) * area).sum(axis=-1).reshape(SHEEN_NODES, SHEEN_NODES)
 
 
 VELVET_STEPS = 48
@@ -179,7 +163,7 @@ def specular_level_applied(ior: np.ndarray, level: np.ndarray) -> tuple[np.ndarr
     return np.where(level == 0.5, ior, np.where(ior < 1.0, 1.0 / scaled, scaled)), f0
 
 
-def f82_dip(f0: np.ndarray, tint: np.ndarray) -> np.ndarray:
+def f82_term(f0: np.ndarray, tint: np.ndarray) -> np.ndarray:
     """Factor (Q, 3) of -c (1 - c)^6 in the reflectance of a metal, which is Schlick's times `tint` at c = 1 / 7 (Kutz,
     Hasan and Edmondson 2021, "Novel aspects of the Adobe Standard Material", the F82-tint model)."""
     schlick = f0 + (1.0 - f0) * (6.0 / 7.0) ** 5

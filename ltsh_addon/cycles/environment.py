@@ -53,8 +53,8 @@ class SkyPicture:
     def offsets(self) -> np.ndarray:
         """Directions (N, N, 3) of the pixels' centers, not unit."""
         count = len(self.radiance)
-        place = (np.arange(count) + 0.5) * (2.0 / count) - 1.0
-        return self.ahead + place[None, :, None] * self.right - place[:, None, None] * self.up
+        coordinate = (np.arange(count) + 0.5) * (2.0 / count) - 1.0
+        return self.ahead + coordinate[None, :, None] * self.right - coordinate[:, None, None] * self.up
 
     def solid_angles(self) -> np.ndarray:
         """Solid angles (N, N) of the pixels in sr."""
@@ -72,20 +72,20 @@ class Spot:
     least: float  # mean of the three colors
 
 
-def luminance(radiance: np.ndarray) -> np.ndarray:
+def mean_magnitude(radiance: np.ndarray) -> np.ndarray:
     """Mean absolute value (...) of colors (..., 3)."""
     return np.abs(radiance).mean(axis=-1)
 
 
 def above(radiance: np.ndarray, least: float) -> np.ndarray:
-    """The part of colors (..., 3) above the luminance `least`."""
-    own = luminance(radiance)
-    return radiance * np.maximum(1.0 - least / np.maximum(own, 1e-30), 0.0)[..., None]
+    """The part of colors (..., 3) of a mean magnitude above `least`."""
+    brightness = mean_magnitude(radiance)
+    return radiance * np.maximum(1.0 - least / np.maximum(brightness, 1e-30), 0.0)[..., None]
 
 
 def bright_spots(pictures: list[SkyPicture]) -> list[Spot]:
     """The spots in the pictures of a cube; the first has the most light."""
-    values = np.concatenate([luminance(picture.radiance).ravel() for picture in pictures])
+    values = np.concatenate([mean_magnitude(picture.radiance).ravel() for picture in pictures])
     angles = np.concatenate([picture.solid_angles().ravel() for picture in pictures])
     power = values * angles
     least, total = SPOT_BRIGHTNESS * power.sum() / angles.sum(), power.sum()
@@ -95,8 +95,8 @@ def bright_spots(pictures: list[SkyPicture]) -> list[Spot]:
     offsets = np.concatenate([picture.offsets().reshape(-1, 3) for picture in pictures])[index]
     offsets /= np.linalg.norm(offsets, axis=1, keepdims=True)
     power, pixel = power[index], np.sqrt(angles.max())
-    found = []
-    while len(power) and len(found) < MOST_SPOTS:
+    spots = []
+    while len(power) and len(spots) < MOST_SPOTS:
         center = offsets[np.argmax(power)]
         for _ in range(3):
             near = np.linalg.norm(offsets - center, axis=1) < SPOT_RADIUS
@@ -106,9 +106,9 @@ def bright_spots(pictures: list[SkyPicture]) -> list[Spot]:
         if not near.any() or power[near].sum() < SPOT_SHARE * total:
             break
         radius = np.linalg.norm(offsets[near] - center, axis=1).max() + 1.5 * pixel
-        found.append(Spot(center, float(radius), float(least)))
+        spots.append(Spot(center, float(radius), float(least)))
         offsets, power = offsets[~near], power[~near]
-    return found
+    return spots
 
 
 def spot_frame(spot: Spot) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -137,7 +137,7 @@ def spot_light(like: AreaLight, picture: SkyPicture, spot: Spot) -> list[AreaLig
     """The spot that a close `picture` shows, as lights with the name and traits of `like`: a disk if it looks like one,
     otherwise patches; [] if the picture shows no spot."""
     radiance, angles = above(picture.radiance, spot.least), picture.solid_angles()
-    values = luminance(radiance)
+    values = mean_magnitude(radiance)
     power = (values * angles).sum()
     if power <= 0.0:
         return []
@@ -151,7 +151,7 @@ def spot_light(like: AreaLight, picture: SkyPicture, spot: Spot) -> list[AreaLig
     radius = np.arccos(1.0 - solid_angle / (2.0 * np.pi))
     inside = np.linalg.norm(offsets - center, axis=-1) < 2.0 * np.sin(0.5 * radius)
     light = (radiance * angles[..., None]).sum(axis=(0, 1)) / solid_angle
-    missed = (np.abs(values - inside * luminance(light)) * angles).sum()
+    missed = (np.abs(values - inside * mean_magnitude(light)) * angles).sum()
     if missed > DISK_ERROR * power:
         return sky_lights(like, [replace(picture, radiance=radiance)], SPOT_PATCHES)[0]
     _, right, up = spot_frame(replace(spot, direction=center, radius=radius))
@@ -161,23 +161,23 @@ def spot_light(like: AreaLight, picture: SkyPicture, spot: Spot) -> list[AreaLig
 def sky_lights(like: AreaLight, pictures: list[SkyPicture], most: int = MOST_PATCHES) -> tuple[list[AreaLight], float]:
     """A distant light with a `detail` for each picture that is not dark, with the name and traits of `like`; and the
     mean absolute difference between the smallest patches and the pictures, relative to the mean radiance."""
-    trees = [_Tree.of(picture) for picture in pictures]
-    total = sum((luminance(picture.radiance) * picture.solid_angles()).sum() for picture in pictures)
+    trees = [_SkyQuadtree.of(picture) for picture in pictures]
+    total = sum((mean_magnitude(picture.radiance) * picture.solid_angles()).sum() for picture in pictures)
     limit, error = _limit(trees, ERROR * total, most)
     lights = [_light(like, picture, tree, limit, (0, 0, 0)) for picture, tree in zip(pictures, trees, strict=True)]
-    found = [light for light in lights if light.detail or np.any(light.radiance != 0.0)]
-    return found, error / total if total > 0.0 else 0.0
+    bright = [light for light in lights if light.detail or np.any(light.radiance != 0.0)]
+    return bright, error / total if total > 0.0 else 0.0
 
 
 @dataclass(frozen=True)
-class _Tree:
+class _SkyQuadtree:
     """Squares of a picture by level: level k has 2^k along each side."""
 
     means: list[np.ndarray]  # (2^k, 2^k, 3) radiance
     errors: list[np.ndarray]  # (2^k, 2^k) about the mean absolute difference from the mean, times solid angle
 
     @classmethod
-    def of(cls, picture: SkyPicture) -> _Tree:
+    def of(cls, picture: SkyPicture) -> _SkyQuadtree:
         """For a picture whose side is a power of two pixels."""
         weight = picture.solid_angles()
         light, squares = picture.radiance * weight[..., None], np.square(picture.radiance).mean(axis=-1) * weight
@@ -206,11 +206,11 @@ def _leaves(trees, limit: float) -> tuple[int, float]:
     count, error = 0, 0.0
     for tree in trees:
         exists = np.ones((1, 1), bool)
-        for level, own in enumerate(tree.errors):
-            cut = exists & (own > limit) if level + 1 < len(tree.errors) else np.zeros_like(exists)
+        for level, errors in enumerate(tree.errors):
+            cut = exists & (errors > limit) if level + 1 < len(tree.errors) else np.zeros_like(exists)
             leaf = exists & ~cut
             count += np.count_nonzero(leaf)
-            error += own[leaf].sum()
+            error += errors[leaf].sum()
             if not cut.any():
                 break
             exists = np.repeat(np.repeat(cut, 2, axis=0), 2, axis=1)
@@ -234,12 +234,12 @@ def _limit(trees, wanted: float, most: int) -> tuple[float, float]:
     return limit, _leaves(trees, limit)[1]
 
 
-def _light(like: AreaLight, picture: SkyPicture, tree: _Tree, limit: float, place) -> AreaLight:
-    """The square `place` (level, row, column) of a picture as a light; its parts are the detail."""
-    level, row, column = place
+def _light(like: AreaLight, picture: SkyPicture, tree: _SkyQuadtree, limit: float, square) -> AreaLight:
+    """The square `square` (level, row, column) of a picture as a light; its parts are the detail."""
+    level, row, column = square
     size = 2.0**-level
     across, upward = (2 * column + 1) * size - 1.0, 1.0 - (2 * row + 1) * size
-    parts = _parts(tree, limit, place)
+    parts = _leaves_below(tree, limit, square)
     return replace(
         like,
         center=picture.ahead + across * picture.right + upward * picture.up,
@@ -247,19 +247,19 @@ def _light(like: AreaLight, picture: SkyPicture, tree: _Tree, limit: float, plac
         half_v=size * picture.up,
         direction=-picture.ahead / np.linalg.norm(picture.ahead),
         radiance=tree.means[level][row, column],
-        detail=tuple(_light(like, picture, tree, limit, part) for part in parts) if len(parts) > 1 else (),
+        detail=tuple(_light(like, picture, tree, limit, smaller) for smaller in parts) if len(parts) > 1 else (),
     )
 
 
-def _parts(tree: _Tree, limit: float, place) -> list:
-    found = [place]
+def _leaves_below(tree: _SkyQuadtree, limit: float, square) -> list:
+    squares = [square]
     for _ in range(LEVELS):
         cut = []
-        for level, row, column in found:
+        for level, row, column in squares:
             is_last = level + 1 == len(tree.errors)
-            if is_last or level >= place[0] + LEVELS or tree.errors[level][row, column] <= limit:
+            if is_last or level >= square[0] + LEVELS or tree.errors[level][row, column] <= limit:
                 cut.append((level, row, column))
                 continue
             cut += [(level + 1, 2 * row + i, 2 * column + j) for i in (0, 1) for j in (0, 1)]
-        found = cut
-    return found
+        squares = cut
+    return squares

@@ -16,7 +16,17 @@ import numpy as np
 from ..emitters.light_polygons import has_lobe
 from ..scene import FARTHEST, SCALAR_FIELDS, Film, SurfaceSamples, is_constant
 from .horizons import unit
-from .lobes import AOV_PREFIX, HIT_AOVS, KEPT_AOV, Hits, lobe_aov, lobe_names, read_aov, read_layer, samples_of_lobes
+from .lobes import (
+    AOV_PREFIX,
+    HIT_AOVS,
+    KEPT_AOV,
+    SurfaceHits,
+    lobe_aov,
+    lobe_names,
+    read_aov,
+    read_layer,
+    samples_of_lobes,
+)
 
 # Few enough for the arrays of one block to stay in the cache.
 HITS_PER_BLOCK = 65536
@@ -66,8 +76,8 @@ def surface_samples(channels: dict[str, np.ndarray], diffuse_color: str) -> tupl
     return SurfaceSamples.joined(pieces), pixel[np.concatenate(index)], len(pixel) - len(usable)
 
 
-def _hits_of(values: dict[str, np.ndarray]) -> Hits:
-    return Hits(
+def _hits_of(values: dict[str, np.ndarray]) -> SurfaceHits:
+    return SurfaceHits(
         position=values["position"],
         view=unit(values["incoming"]),
         smooth_normal=unit(values["smooth_normal"]),
@@ -119,15 +129,15 @@ def unshaded_hits(channels: dict[str, np.ndarray], count: int) -> np.ndarray:
     return np.bincount(number[number > 0] - 1, minlength=count)
 
 
-def kept_by_cycles(channels: dict[str, np.ndarray]) -> np.ndarray:
+def left_to_cycles(channels: dict[str, np.ndarray]) -> np.ndarray:
     """Sum (H, W) of KEPT_BITS: the passes that are left to Cycles, because we do not shade the surface as it does."""
     hit = read_aov(channels, "hit")
-    kept = read_aov(channels, KEPT_AOV) if any(f"{AOV_PREFIX}{KEPT_AOV}." in key for key in channels) else 0.0 * hit
-    kept = np.minimum(np.rint(kept), 3).astype(int)
+    passes = read_aov(channels, KEPT_AOV) if any(f"{AOV_PREFIX}{KEPT_AOV}." in key for key in channels) else 0.0 * hit
+    passes = np.minimum(np.rint(passes), 3).astype(int)
     # The pixel shows several surfaces, or one that wrote nothing.
-    kept[(hit != 0.0) & (np.abs(hit - 1.0) > 1e-6)] = 3
-    kept[_shows_surface(channels) & (hit == 0.0)] = 3
-    return kept
+    passes[(hit != 0.0) & (np.abs(hit - 1.0) > 1e-6)] = 3
+    passes[_shows_surface(channels) & (hit == 0.0)] = 3
+    return passes
 
 
 def join(renders: list[tuple[SurfaceSamples, np.ndarray]], width: int, height: int) -> tuple[SurfaceSamples, Film]:
@@ -138,7 +148,7 @@ def join(renders: list[tuple[SurfaceSamples, np.ndarray]], width: int, height: i
         return nothing, Film(width, height, np.zeros(0, int))
     pixel = np.concatenate([pixel for _, pixel in renders])
     # A render has one hit per pixel, whose samples are consecutive.
-    of_hit = [np.concatenate([np.ones(len(own[:1]), bool), own[1:] != own[:-1]]) for _, own in renders]
+    of_hit = [np.concatenate([np.ones(len(pixels[:1]), bool), pixels[1:] != pixels[:-1]]) for _, pixels in renders]
     of_hit = np.concatenate(of_hit)
     first = None if of_hit.all() else of_hit
     return SurfaceSamples.joined([samples for samples, _ in renders]), Film(width, height, pixel, len(renders), first)
@@ -161,33 +171,34 @@ def merged(samples: SurfaceSamples, film: Film) -> tuple[SurfaceSamples, Film]:
     center of the pixel if that shows the surface; so is the edge of a shadow in the pixel. On the example scene with 8
     points, half of the samples remain; without shadows, specular light is 1 % off and diffuse light 0.5 %.
     """
-    kept, place = _groups(samples, film, 1.0)
-    found, own = samples.take(kept), _together(film, kept, place)
-    means = {name: _means(getattr(samples, name), place, own.count) for name in COLORS}
-    return replace(found, **means), own
+    leaders, group = _groups(samples, film, 1.0)
+    first, merged_film = samples.take(leaders), _together(film, leaders, group)
+    means = {name: _means(getattr(samples, name), group, merged_film.count) for name in COLORS}
+    return replace(first, **means), merged_film
 
 
 def with_one_shadow(samples: SurfaceSamples, film: Film) -> tuple[SurfaceSamples, Film, np.ndarray]:
     """Fewer samples (Q), their film, and for each of `samples` the number (P,) of the one that stands for it. One
     sample stands for those of a pixel that see about the same part of each light."""
-    kept, place = _groups(samples, film, SHADOW_LOOSENESS)
-    return samples.take(kept), _together(film, kept, place), place
+    leaders, group = _groups(samples, film, SHADOW_LOOSENESS)
+    return samples.take(leaders), _together(film, leaders, group), group
 
 
-def _together(film: Film, kept: np.ndarray, place: np.ndarray) -> Film:
-    """The film of the samples `kept` (Q,). Each of them stands for the samples (P,) whose `place` is its number."""
-    count = np.bincount(place, weights=film.count, minlength=len(kept))
+def _together(film: Film, leaders: np.ndarray, group: np.ndarray) -> Film:
+    """The film of the samples `leaders` (Q,). Each stands for the samples (P,) whose `group` is its number."""
+    count = np.bincount(group, weights=film.count, minlength=len(leaders))
     count = count if film.count is not None and film.count.dtype.kind == "f" else count.astype(int)
-    own = replace(film.take(kept), count=count)
+    merged_film = replace(film.take(leaders), count=count)
     if film.spread is None:
-        return own
-    columns = film.spread.reshape(len(place), -1).T
-    sums = [np.bincount(place, weights=column, minlength=len(kept)) for column in columns]
-    return replace(own, spread=np.stack(sums, axis=1).astype(np.float32).reshape(own.spread.shape))
+        return merged_film
+    columns = film.spread.reshape(len(group), -1).T
+    sums = [np.bincount(group, weights=column, minlength=len(leaders)) for column in columns]
+    return replace(merged_film, spread=np.stack(sums, axis=1).astype(np.float32).reshape(merged_film.spread.shape))
 
 
 def _groups(samples: SurfaceSamples, film: Film, looseness: float) -> tuple[np.ndarray, np.ndarray]:
-    """The samples (Q,) that stand for others of their pixel, and for each sample the place (P,) of its own in them."""
+    """The samples (Q,) that stand for others of their pixel, and for each sample (P,) the number of the one that
+    stands for it."""
     starts = np.arange(len(samples)) if film.first is None else np.flatnonzero(film.first)
     lengths = np.diff(starts, append=len(samples))
     pixel, target = film.pixel[starts], np.arange(len(starts))
@@ -210,8 +221,8 @@ def _groups(samples: SurfaceSamples, film: Film, looseness: float) -> tuple[np.n
     # Go from hits to their samples.
     lobe = np.arange(len(samples)) - np.repeat(starts, lengths)
     of_sample = np.repeat(starts[target], lengths) + lobe
-    kept = np.flatnonzero(of_sample == np.arange(len(samples)))
-    return kept, np.searchsorted(kept, of_sample)
+    leading = np.flatnonzero(of_sample == np.arange(len(samples)))
+    return leading, np.searchsorted(leading, of_sample)
 
 
 def one_shading(samples: SurfaceSamples, shines: np.ndarray, one, other, looseness: float) -> np.ndarray:
@@ -237,9 +248,9 @@ def one_shading(samples: SurfaceSamples, shines: np.ndarray, one, other, loosene
     return same & (off <= OFF_PLANE * np.linalg.norm(apart, axis=1) + 1e-6)
 
 
-def _means(values: np.ndarray, place: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Means (Q, 3) of the rows of `values` (P, 3) with the same `place` (P,)."""
-    sums = [np.bincount(place, weights=column, minlength=len(count)) for column in values.T]
+def _means(values: np.ndarray, group: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """Means (Q, 3) of the rows of `values` (P, 3) with the same `group` (P,)."""
+    sums = [np.bincount(group, weights=column, minlength=len(count)) for column in values.T]
     return np.stack(sums, axis=1) / count[:, None]
 
 
@@ -269,9 +280,9 @@ class FinerPoints:
     def rays(self, pixel: np.ndarray, offsets: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Origins and unit directions (Q, 3) of rays through `offsets` (Q, 2) of pixels (Q,), and the width (Q,) of a
         pixel at a distance of 1 m."""
-        place = np.stack([np.ones(len(pixel)), pixel % width + 0.5, pixel // width + 0.5], axis=1)
-        place[:, 1:] += offsets * [1.0, -1.0]
-        origin, direction = place @ self.starts, place @ self.directions
+        raster = np.stack([np.ones(len(pixel)), pixel % width + 0.5, pixel // width + 0.5], axis=1)
+        raster[:, 1:] += offsets * [1.0, -1.0]
+        origin, direction = raster @ self.starts, raster @ self.directions
         length = np.linalg.norm(direction, axis=1, keepdims=True)
         return origin, direction / length, np.linalg.norm(self.directions[1]) / length[:, 0]
 
@@ -284,7 +295,7 @@ def finer(
     Each `pixel` (E,) gets the first `number` (E,) of `points`, unless it is unknown what one of them shows.
     `met(origins, directions)` is that of `visibility.rays.Tracer.first_met`.
     """
-    known, (pixels, number) = _Hits.of(samples, film), (pixels["pixel"], pixels["number"])
+    known, (pixels, number) = _PixelHits.of(samples, film), (pixels["pixel"], pixels["number"])
     center, direction, width = points.rays(pixels, np.zeros((len(pixels), 2)), film.width)
     distance, is_behind = met(center, direction)
     is_there = np.isfinite(distance) & ~is_behind
@@ -297,31 +308,34 @@ def finer(
     origin, direction, _ = points.rays(pixel, points.offsets[point], film.width)
     distance, is_behind = met(origin, direction)
     is_there = np.isfinite(distance) & ~is_behind
-    place = _along(origin, direction, distance)
-    hit = known.nearest(place, pixel, is_there)[0]
+    position = _along(origin, direction, distance)
+    hit = known.nearest(position, pixel, is_there)[0]
     for down, right in itertools.product((-1, 0, 1), repeat=2):
         column = pixel % film.width + right
         others = is_there & (hit < 0) & (column >= 0) & (column < film.width)
-        around = known.nearest(place, pixel + down * film.width + right, others)[0]
+        around = known.nearest(position, pixel + down * film.width + right, others)[0]
         hit = np.where(hit < 0, around, hit)
     is_fine = np.bincount(row, is_behind | (is_there & (hit < 0)), len(pixels)) == 0.0
     chosen = np.flatnonzero(is_fine[row] & (hit >= 0))
     lengths = known.lengths[hit[chosen]]
     of_point, first = np.repeat(chosen, lengths), np.repeat(np.cumsum(lengths) - lengths, lengths)
     index = np.repeat(known.starts[hit[chosen]], lengths) + np.arange(len(of_point)) - first
-    own = row[of_point]
-    values = {"pixel": pixel[of_point], "count": film.sub_samples / number[own]}
+    row_of_sample = row[of_point]
+    values = {"pixel": pixel[of_point], "count": film.sub_samples / number[row_of_sample]}
     values["first"] = None if film.first is None else film.first[index]
     if film.spread is not None:
         # The points of a pixel together weigh the same, however many there are.
         whole, columns = film.sub_samples * points.weights.mean(axis=0), points.weights.reshape(len(points.weights), -1)
         sums = np.stack([np.bincount(row, column[point], len(pixels)) for column in columns.T], axis=1)
         scale = np.divide(whole.ravel(), sums, out=np.zeros(sums.shape), where=sums > 0.0)
-        spread = np.where(sums > 0.0, 0.0, whole.ravel() / number[:, None])[own] + scale[own] * columns[point[of_point]]
+        spread = (
+            np.where(sums > 0.0, 0.0, whole.ravel() / number[:, None])[row_of_sample]
+            + scale[row_of_sample] * columns[point[of_point]]
+        )
         values["spread"] = spread.reshape(-1, *whole.shape).astype(np.float32)
         values["whole"] = film.whole + film.sums_around(pixels[is_fine], whole - points.sums)
-    found = replace(samples.take(index), position=place[of_point], view=-direction[of_point])
-    return found, replace(film, **values), np.isin(film.pixel, pixels[is_fine])
+    fine = replace(samples.take(index), position=position[of_point], view=-direction[of_point])
+    return fine, replace(film, **values), np.isin(film.pixel, pixels[is_fine])
 
 
 def _along(origin, direction, distance):
@@ -329,7 +343,7 @@ def _along(origin, direction, distance):
 
 
 @dataclass(frozen=True)
-class _Hits:
+class _PixelHits:
     """The hits (H) of samples (P), and which hits each pixel has."""
 
     samples: SurfaceSamples
@@ -337,11 +351,11 @@ class _Hits:
     lengths: np.ndarray  # (H,) the number of samples of each hit
     is_flat: np.ndarray  # (P,) True for samples whose normals agree, so that they hold for points around, too
     order: np.ndarray  # (H,) the hits sorted by pixel
-    first: np.ndarray  # (W * H,) place in `order` of the first hit of each pixel
+    first: np.ndarray  # (W * H,) position in `order` of the first hit of each pixel
     number: np.ndarray  # (W * H,) of hits of each pixel
 
     @classmethod
-    def of(cls, samples: SurfaceSamples, film: Film) -> _Hits:
+    def of(cls, samples: SurfaceSamples, film: Film) -> _PixelHits:
         """The hits of `samples` on `film`."""
         starts = np.arange(len(samples)) if film.first is None else np.flatnonzero(film.first)
         number = np.bincount(film.pixel[starts], minlength=film.width * film.height)
@@ -351,16 +365,16 @@ class _Hits:
         lengths = np.diff(starts, append=len(samples))
         return cls(samples, starts, lengths, is_flat, order, np.cumsum(number) - number, number)
 
-    def nearest(self, place: np.ndarray, pixel: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """For points `place` (Q, 3): the nearest hit (Q,) of `pixel` (Q,) on the same flat surface, and its distance
-        (Q,) in m. It is -1 if there is none, and where `mask` is False."""
+    def nearest(self, position: np.ndarray, pixel: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """For points at `position` (Q, 3): the nearest hit (Q,) of `pixel` (Q,) on the same flat surface, and its
+        distance (Q,) in m. It is -1 if there is none, and where `mask` is False."""
         hit, apart, least = np.full(len(pixel), -1), np.full(len(pixel), np.inf), np.full(len(pixel), np.inf)
         rows = np.flatnonzero(mask & (pixel >= 0) & (pixel < len(self.number)))
         for step in range(int(self.number[pixel[rows]].max(initial=0))):
             rows = rows[self.number[pixel[rows]] > step]
             other = self.order[self.first[pixel[rows]] + step]
             sample = self.starts[other]
-            between = place[rows] - self.samples.position[sample]
+            between = position[rows] - self.samples.position[sample]
             length = np.linalg.norm(between, axis=1)
             off = np.abs((between * self.samples.geometric_normal[sample]).sum(axis=1))
             score = ACROSS * off + length

@@ -10,7 +10,7 @@ import numpy as np
 from ..emitters.light_tree import stand_ins
 from ..lobes import brdf, polygon
 from ..scene import FACING_SHAPES, AreaLight, SurfaceSamples
-from .light_tree import light_chances, light_rows
+from .light_tree import light_selection_pmf, light_tree_rows
 
 SPECULAR_FIELDS = ("specular_f0", "specular_f90", "specular_dip", "dielectric")
 # Cycles keeps mirrored views at least this high (as a sine) above the true surface.
@@ -105,25 +105,25 @@ def end_at_horizons_of_cycles(
     differ = np.flatnonzero(reflects & apart)
     if len(differ) == 0 or not lights:
         return samples, index
-    chances = lobe_chances(samples, index if hit is None else hit, is_baked)
+    chances = lobe_selection_pmf(samples, index if hit is None else hit, is_baked)
     excess = horizon_excess(samples.take(differ), lights, chances[:, differ], is_quick=is_quick)
-    share, by_smooth = smooth_share(*excess), np.zeros(len(samples))
+    share, by_smooth = smooth_horizon_share(*excess), np.zeros(len(samples))
     by_smooth[differ] = _with_few_splits(share, sum(excess)) if is_quick else share
     by_smooth = np.where(by_smooth < SMALLEST_SHARE, 0.0, np.where(by_smooth > 1.0 - SMALLEST_SHARE, 1.0, by_smooth))
     split = np.flatnonzero((by_smooth > 0.0) & (by_smooth < 1.0))
     index = np.concatenate([index, split])
     ends_smooth = np.concatenate([by_smooth == 1.0, np.ones(len(split), dtype=bool)])
-    share = np.concatenate([np.where(by_smooth == 1.0, 1.0, 1.0 - by_smooth), by_smooth[split]])[:, None]
+    weight = np.concatenate([np.where(by_smooth == 1.0, 1.0, 1.0 - by_smooth), by_smooth[split]])[:, None]
     diffuse = np.concatenate([np.ones(len(samples)), np.zeros(len(split))])[:, None]
     order = np.argsort(index, kind="stable")
-    index, ends_smooth, share, diffuse = index[order], ends_smooth[order], share[order], diffuse[order]
+    index, ends_smooth, weight, diffuse = index[order], ends_smooth[order], weight[order], diffuse[order]
     ended = samples.take(index)
-    specular = {name: getattr(ended, name) * share for name in SPECULAR_FIELDS}
+    specular = {name: getattr(ended, name) * weight for name in SPECULAR_FIELDS}
     normal = np.where(ends_smooth[:, None], ended.smooth_normal, ended.geometric_normal)
     return replace(ended, geometric_normal=normal, diffuse_albedo=ended.diffuse_albedo * diffuse, **specular), index
 
 
-def smooth_share(by_lobe: np.ndarray, by_light: np.ndarray) -> np.ndarray:
+def smooth_horizon_share(by_lobe: np.ndarray, by_light: np.ndarray) -> np.ndarray:
     """Share (P,) of a lobe that ends at the smooth horizon; the rest ends at the mesh's. Takes `horizon_excess`."""
     both = by_lobe + by_light
     # Where no direction meets a light, all lights are far from the highlight: the light's choice decides.
@@ -131,18 +131,18 @@ def smooth_share(by_lobe: np.ndarray, by_light: np.ndarray) -> np.ndarray:
 
 
 def _with_few_splits(share: np.ndarray, excess: np.ndarray) -> np.ndarray:
-    """The shares (P,) of `smooth_share`, rounded to 0 or 1 for the samples where splitting matters least. Together they
-    account for UNSPLIT of the change that splitting every sample would make."""
+    """The shares (P,) of `smooth_horizon_share`, rounded to 0 or 1 for the samples where splitting matters least.
+    Together these account for UNSPLIT of the change that splitting every sample would make."""
     changed = np.minimum(share, 1.0 - share) * excess
     order = np.argsort(changed)
     sums = np.cumsum(changed[order])
     whole = order[sums <= UNSPLIT * sums[-1]]
-    found = share.copy()
-    found[whole] = np.rint(share[whole])
-    return found
+    rounded = share.copy()
+    rounded[whole] = np.rint(share[whole])
+    return rounded
 
 
-def lobe_chances(samples: SurfaceSamples, hit: np.ndarray, is_baked: bool) -> np.ndarray:
+def lobe_selection_pmf(samples: SurfaceSamples, hit: np.ndarray, is_baked: bool) -> np.ndarray:
     """Probabilities (2, P) with which Cycles chooses directions by the specular and by the diffuse lobe of each sample:
     approximately its albedo relative to the sum over all samples with the same `hit` (P,)."""
     specular = _reflectance(samples, np.clip((samples.normal * samples.view).sum(axis=1), 0.0, 1.0))
@@ -167,20 +167,21 @@ def horizon_excess(
     """The light (P,) that only one of the horizons lets through, split by who chose its direction: a lobe or the light.
     The smooth horizon is wrong about the first part, the mesh's horizon about the second.
 
-    `chances` (2, P) come from `lobe_chances`. `choose` returns the chances of the lights; by default it is
-    `light_tree.light_chances`. Where the horizons make no difference, the first part is 1 and the second 0. `is_quick`
-    looks at a third of the directions; on the example scene the shares are then 0.4 % off, weighted by the light.
+    `chances` (2, P) come from `lobe_selection_pmf`. `choose` returns the probabilities of the lights; by default it
+    is `light_tree.light_selection_pmf`. Where the horizons make no difference, the first part is 1 and the second 0.
+    `is_quick` looks at a third of the directions; on the example scene the shares are then 0.4 % off, weighted by the
+    light.
     """
     lights, shares = _few(lights)
     shapes = [_Shapes.of(lights, numbers, shares[numbers]) for numbers in _alike(lights)]
     if choose is None:
-        choose = partial(light_chances, lights=lights, rows=light_rows(lights))
+        choose = partial(light_selection_pmf, lights=lights, rows=light_tree_rows(lights))
     step = min(max(MOST_PAIRS // len(lights), 1), BLOCK)
-    found = np.empty((2, len(samples)))
+    excess = np.empty((2, len(samples)))
     for start in range(0, len(samples), step):
         block = slice(start, start + step)
-        found[:, block] = _excess(samples.take(block), shapes, chances[:, block], choose, is_quick)
-    return found[0], found[1]
+        excess[:, block] = _excess(samples.take(block), shapes, chances[:, block], choose, is_quick)
+    return excess[0], excess[1]
 
 
 def _excess(samples, shapes, chances, choose, is_quick):
@@ -195,9 +196,9 @@ def _excess(samples, shapes, chances, choose, is_quick):
     samples, chances = samples.take(index), chances[:, index]
     directions = _Directions.of(samples, is_quick)
     # A few directions suffice for a light as large as a side of the sky.
-    for own, is_side in ((directions, False), (directions if is_quick else directions.few(), True)):
+    for rays, is_side in ((directions, False), (directions if is_quick else directions.few(), True)):
         hits = [
-            shape.hits(number, np.searchsorted(index, sample), samples.position, own)
+            shape.hits(number, np.searchsorted(index, sample), samples.position, rays)
             for shape, (number, sample) in zip(shapes, crossings, strict=True)
             if shape.is_side == is_side and len(number)
         ]
@@ -205,17 +206,17 @@ def _excess(samples, shapes, chances, choose, is_quick):
             continue
         number, row, ray, brightness, solid_angle = (np.concatenate(values) for values in zip(*hits, strict=True))
         met, row = _numbered(row, len(index))
-        some, towards = samples.take(met), own.towards[met]
+        some, towards = samples.take(met), rays.towards[met]
         chance = choose(some.position, some.smooth_normal)
         lobe = _lobe_density(some, towards)
         half = np.sqrt(np.maximum(0.5 + 0.5 * np.einsum("pni,pi->pn", towards, some.view), 0.0))
-        reflected = lobe * _seen_by_light(some, towards) * _reflectance(some, half) * own.width[met]
+        reflected = lobe * _seen_by_light(some, towards) * _reflectance(some, half) * rays.width[met]
         diffuse = np.maximum(np.einsum("pni,pi->pn", towards, some.diffuse_normal), 0.0) / np.pi
         chosen2 = np.square(chances[0, met, None] * lobe + chances[1, met, None] * diffuse)
-        place = row * towards.shape[1] + ray
-        excess = brightness * reflected.ravel()[place]
+        pair = row * towards.shape[1] + ray
+        excess = brightness * reflected.ravel()[pair]
         light2 = np.square(chance[number, row].astype(float) / np.maximum(solid_angle, 1e-12))
-        weight = light2 / np.maximum(light2 + chosen2.ravel()[place], 1e-30)
+        weight = light2 / np.maximum(light2 + chosen2.ravel()[pair], 1e-30)
         by_light[index[met]] += np.bincount(row, excess * weight, len(met))
         by_lobe[index[met]] += np.bincount(row, excess * (1.0 - weight), len(met))
     return by_lobe, by_light
@@ -230,17 +231,17 @@ def _few(lights) -> tuple[tuple[AreaLight, ...], np.ndarray]:
         elif light.area_vector.any():
             kinds.setdefault(light.spread, []).append(light)
     shares = [np.ones(len(others))]
-    for own in kinds.values():
-        share = np.ones(len(own))
-        if len(own) > MOST_LIGHTS:
-            own, share = stand_ins(own, MOST_LIGHTS)
-        others += own
+    for group in kinds.values():
+        share = np.ones(len(group))
+        if len(group) > MOST_LIGHTS:
+            group, share = stand_ins(group, MOST_LIGHTS)
+        others += group
         shares.append(share)
     return tuple(others), np.concatenate(shares)
 
 
 def _numbered(values, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """The distinct `values`, sorted, which are below `count`; and the place of each value among them."""
+    """The distinct `values`, sorted, which are below `count`; and the index of each value among them."""
     there = np.zeros(count, bool)
     there[values] = True
     return np.flatnonzero(there), (np.cumsum(there) - 1)[values]
@@ -283,16 +284,16 @@ class _Shapes:
     @classmethod
     def of(cls, lights, number, share) -> _Shapes:
         """The lights of these numbers, which are of one kind; the `share` (L,) of each shines."""
-        own = [lights[n] for n in number]
-        center, corners = (np.array([light.center for light in own]), np.array([light.polygon() for light in own]))
+        alike = [lights[n] for n in number]
+        center, corners = (np.array([light.center for light in alike]), np.array([light.polygon() for light in alike]))
         radius = np.linalg.norm(corners - center[:, None], axis=2).max(axis=1)
-        if own[0].is_facing:
-            radius = np.array([light.radius for light in own])
-        axes = np.array([[*_plane_axes(light), -light.direction] for light in own])
-        brightness = np.array([np.abs(light.radiance).sum() for light in own])
-        scales = np.linalg.pinv(np.array([[light.half_u, light.half_v] for light in own]).swapaxes(1, 2))
-        rest = radius, axes, scales, share, _is_side(own[0])
-        return cls(number, own[0].shape, own[0].is_distant, brightness, center, corners, *rest)
+        if alike[0].is_facing:
+            radius = np.array([light.radius for light in alike])
+        axes = np.array([[*_plane_axes(light), -light.direction] for light in alike])
+        brightness = np.array([np.abs(light.radiance).sum() for light in alike])
+        scales = np.linalg.pinv(np.array([[light.half_u, light.half_v] for light in alike]).swapaxes(1, 2))
+        rest = radius, axes, scales, share, _is_side(alike[0])
+        return cls(number, alike[0].shape, alike[0].is_distant, brightness, center, corners, *rest)
 
     @property
     def is_facing(self) -> bool:
@@ -305,7 +306,7 @@ class _Shapes:
         position = 0.0 * samples.position if self.is_distant else samples.position
         normals = samples.smooth_normal, samples.geometric_normal
         starts = [(normal * position).sum(axis=1) for normal in normals]
-        found, step = [np.zeros((2, 0), int)], max(PAIRS // len(position), 1)
+        pairs, step = [np.zeros((2, 0), int)], max(PAIRS // len(position), 1)
         for start in range(0, len(self.center), step):
             center, radius = self.center[start : start + step], self.radius[start : start + step, None]
             smooth, true = (center @ normal.T - at for normal, at in zip(normals, starts, strict=True))
@@ -324,26 +325,26 @@ class _Shapes:
                     some |= above.any(axis=1)
                     every &= above.all(axis=1)
                 light, sample = light[some & ~every], sample[some & ~every]
-            found.append(np.stack([light, sample]))
-        return tuple(np.concatenate(found, axis=1))
+            pairs.append(np.stack([light, sample]))
+        return tuple(np.concatenate(pairs, axis=1))
 
     def hits(self, light, sample, position, directions) -> tuple[np.ndarray, ...]:
         """One entry for each direction that meets its light, from the pairs (R,) `light` and `sample` of `crossings`:
         number of the light, sample, number of the direction, brightness and solid angle in sr of the whole light."""
         if self.is_side:
             return self._side_hits(np.unique(sample), directions)
-        found = [(np.zeros(0, int), np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(0))]
+        chunks = [(np.zeros(0, int), np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(0))]
         for start in range(0, len(light), PAIRS):
-            own, point = light[start : start + PAIRS], sample[start : start + PAIRS]
-            offset = self.center[own] - (0.0 if self.is_distant else position[point])
-            pair, ray = directions.near(point, offset, self.radius[own])
+            row, point = light[start : start + PAIRS], sample[start : start + PAIRS]
+            offset = self.center[row] - (0.0 if self.is_distant else position[point])
+            pair, ray = directions.near(point, offset, self.radius[row])
             towards = directions.towards[point[pair], ray]
-            is_hit = self._meets(own, offset, pair, towards)
+            is_hit = self._meets(row, offset, pair, towards)
             pair, ray = pair[is_hit], ray[is_hit]
             met, of_met = np.unique(pair, return_inverse=True)
-            angle = (self.share[own[met]] * self._solid_angle(own[met], offset[met]))[of_met]
-            found.append((self.number[own[pair]], point[pair], ray, self.brightness[own[pair]], angle))
-        return tuple(np.concatenate(values) for values in zip(*found, strict=True))
+            angle = (self.share[row[met]] * self._solid_angle(row[met], offset[met]))[of_met]
+            chunks.append((self.number[row[pair]], point[pair], ray, self.brightness[row[pair]], angle))
+        return tuple(np.concatenate(values) for values in zip(*chunks, strict=True))
 
     def _side_hits(self, sample, directions) -> tuple[np.ndarray, ...]:
         """As `hits`, for all directions of the samples (R,): each meets the side along its largest component."""
@@ -351,14 +352,14 @@ class _Shapes:
         size = np.abs(towards)
         longest = np.where(size[..., 0] >= np.maximum(size[..., 1], size[..., 2]), 0, 1 + (size[..., 2] > size[..., 1]))
         ahead = np.take_along_axis(towards, longest[..., None], axis=2)[..., 0] > 0.0
-        place, side = np.full(6, -1), self.axes[:, 2]
+        side_of_face, side = np.full(6, -1), self.axes[:, 2]
         axis = np.abs(side).argmax(axis=1)
-        place[2 * axis + (side[np.arange(len(axis)), axis] < 0.0)] = np.arange(len(axis))
-        met = place[2 * longest + ~ahead]
+        side_of_face[2 * axis + (side[np.arange(len(axis)), axis] < 0.0)] = np.arange(len(axis))
+        met = side_of_face[2 * longest + ~ahead]
         row, ray = np.nonzero(met >= 0)
-        own = met[row, ray]
+        met_side = met[row, ray]
         angle = self._solid_angle(np.arange(len(self.number)), self.center)
-        return self.number[own], sample[row], ray, self.brightness[own], angle[own]
+        return self.number[met_side], sample[row], ray, self.brightness[met_side], angle[met_side]
 
     def _cosine(self, light, distance) -> np.ndarray:
         """Cosine (R,) of the angular radius of lights that face every point."""
@@ -450,15 +451,15 @@ class _Directions:
         span = np.pi * CONCENTRATION * np.cosh(CONCENTRATION * step) / np.sinh(CONCENTRATION) * 2.0 / AROUND
         around = np.cos(angle)[:, None] * flat[:, None] + np.sin(angle)[:, None] * across[:, None]
         # Elevation of the mesh's horizon over the smooth one at these angles.
-        rise = -np.arctan2(
+        gap = -np.arctan2(
             np.einsum("pni,pi->pn", around, samples.geometric_normal),
             np.einsum("pi,pi->p", samples.smooth_normal, samples.geometric_normal)[:, None],
         )
         heights = np.resize(HEIGHTS, AROUND)[None] if is_quick else np.array(HEIGHTS)[:, None]
-        elevation = rise[:, None] * heights
+        elevation = gap[:, None] * heights
         towards = np.cos(elevation)[..., None] * around[:, None]
         towards += np.sin(elevation)[..., None] * samples.smooth_normal[:, None, None]
-        width = rise[:, None] * span * np.cos(elevation) / len(heights)
+        width = gap[:, None] * span * np.cos(elevation) / len(heights)
         count = len(samples)
         return cls(towards.reshape(count, -1, 3), width.reshape(count, -1), np.stack([flat, across], axis=1), angle)
 
@@ -479,6 +480,6 @@ class _Directions:
         first = np.searchsorted(turns, middle - reach)
         count = np.minimum(np.searchsorted(turns, middle + reach) - first, AROUND)
         pair = np.repeat(np.arange(len(sample)), count)
-        place = np.arange(len(pair)) + np.repeat(first - np.cumsum(count) + count, count)
+        step = np.arange(len(pair)) + np.repeat(first - np.cumsum(count) + count, count)
         heights = np.arange(0, self.towards.shape[1], AROUND)
-        return np.repeat(pair, len(heights)), ((place % AROUND)[:, None] + heights).ravel()
+        return np.repeat(pair, len(heights)), ((step % AROUND)[:, None] + heights).ravel()

@@ -29,32 +29,32 @@ class ImageTexture:
     def colors(self, uv: np.ndarray) -> np.ndarray:
         """Linear colors (Q, 3) at uv (Q, 2)."""
         height, width = self.pixels.shape[:2]
-        found = interpolated(np.asarray(uv, dtype=np.float64), (width, height), self.interpolation, self._at)
-        return _decoded(found) if self.srgb else found
+        values = interpolated(np.asarray(uv, dtype=np.float64), (width, height), self.interpolation, self._at)
+        return _decoded(values) if self.srgb else values
 
     def _at(self, x, y):
         """Values (Q, 3) of pixels at integers x, y (Q,), which may lie outside the image."""
         height, width = self.pixels.shape[:2]
         columns, rows = (within(index, size, self.extension) for index, size in ((x, width), (y, height)))
-        found = self.pixels[rows, columns].astype(np.float64)
+        values = self.pixels[rows, columns].astype(np.float64)
         if self.pixels.dtype == np.uint8:
-            found /= 255.0
+            values /= 255.0
         if self.extension == "CLIP":
-            found[(x != columns) | (y != rows)] = 0.0
-        return found
+            values[(x != columns) | (y != rows)] = 0.0
+        return values
 
 
 def interpolated(uv: np.ndarray, size: tuple[int, int], interpolation: str, pixel: Callable) -> np.ndarray:
     """Values at uv (Q, 2) of an image of `size` (width, height). `pixel(x, y)` returns the values of pixels, which may
     lie outside the image."""
-    place = uv * np.array(size, uv.dtype)
+    position = uv * np.array(size, uv.dtype)
     if interpolation == "Closest":
-        return pixel(*np.floor(place).astype(np.int64).T)
-    corner = np.floor(place - 0.5)
+        return pixel(*np.floor(position).astype(np.int64).T)
+    corner = np.floor(position - 0.5)
     x, y = corner.astype(np.int64).T
     corners = [pixel(x, y), pixel(x + 1, y), pixel(x, y + 1), pixel(x + 1, y + 1)]
-    tx, ty = ((place - 0.5 - corner)[:, axis].reshape(-1, *[1] * (corners[0].ndim - 1)) for axis in (0, 1))
-    below, above = ((1.0 - tx) * left + tx * right for left, right in (corners[:2], corners[2:]))
+    tx, ty = ((position - 0.5 - corner)[:, axis].reshape(-1, *[1] * (corners[0].ndim - 1)) for axis in (0, 1))
+    below, above = ((1.0 - tx) * low + tx * high for low, high in (corners[:2], corners[2:]))
     return (1.0 - ty) * below + ty * above
 
 

@@ -1,7 +1,11 @@
 """How likely Cycles chooses a light for a point: the probabilities of its light tree (Conty Estevez and Kulla 2018,
 "Importance Sampling of Many Lights with Adaptive Tree Splitting", doi:10.1145/3233305).
 
-These do not change what a render converges to, except for directions between two horizons, see `horizons`.
+These do not change what a render converges to, except for directions between two horizons: `horizons` decides by them
+where lobes end, and `visibility.directions` how much of their light a shadow ray along such a direction stands for.
+Bumped and coarse smooth meshes under several lights need them: with the bounds of each light alone, as if all lights
+were one leaf, specular light on spheres under 4 and 14 lights is 1.6 to 2.6 % off (relative L2), up to 0.5 % in total.
+On the example scene it is 0.01 % off.
 """
 
 from __future__ import annotations
@@ -14,8 +18,8 @@ import numpy as np
 from ..emitters.facing import cone_angle
 from ..scene import AreaLight
 
-# LIGHTS_OF_LEAF: most lights of a leaf in Cycles. BUCKETS: along each axis Cycles tries to cut a cluster between these.
-LIGHTS_OF_LEAF = 8
+# MOST_LIGHTS_OF_LEAF: as in Cycles. BUCKETS: along each axis Cycles tries to cut a node between these.
+MOST_LIGHTS_OF_LEAF = 8
 BUCKETS = 12
 # If there are more lights, all count as one leaf: none of them matters much.
 MOST_LIGHTS = 64
@@ -24,9 +28,9 @@ PAIRS = 2**14
 
 
 @dataclass(frozen=True)
-class Cluster:
-    """Lights in a box. Their directions are within the angle `spread` of `axis`, and each shines as far as the angle
-    `reach` from its own direction."""
+class LightTreeNode:
+    """A node of the light tree: lights in a box. Their directions are within the angle `spread` of `axis`, and each
+    shines as far as the angle `reach` from its own direction."""
 
     lights: tuple[int, ...]
     low: np.ndarray  # (3,) m
@@ -35,10 +39,10 @@ class Cluster:
     spread: float  # rad
     reach: float  # rad
     power: float
-    halves: tuple[Cluster, Cluster] | None = None
+    halves: tuple[LightTreeNode, LightTreeNode] | None = None
 
-    def joined(self, other: Cluster) -> Cluster:
-        """Both clusters as one."""
+    def joined(self, other: LightTreeNode) -> LightTreeNode:
+        """Both nodes as one."""
         wide, narrow = (other, self) if other.spread > self.spread else (self, other)
         cosine = float(np.clip(wide.axis @ narrow.axis, -1.0, 1.0))
         apart, axis, spread = np.arccos(cosine), wide.axis, wide.spread
@@ -51,7 +55,7 @@ class Cluster:
                 axis = np.cos(turn) * axis + np.sin(turn) * across / length
         low, high = np.minimum(self.low, other.low), np.maximum(self.high, other.high)
         lights, reach = self.lights + other.lights, max(self.reach, other.reach)
-        return Cluster(lights, low, high, axis, spread, reach, self.power + other.power)
+        return LightTreeNode(lights, low, high, axis, spread, reach, self.power + other.power)
 
     def cost(self) -> float:
         """Power, times the area of the box, times the measure of directions (eq. 2)."""
@@ -75,24 +79,24 @@ class Cluster:
         return _bounds(self, offset, normal, width, distance, distance) * is_above
 
 
-def _bounds(cluster, offset, normal, width, near, far):
-    """Bounds (2, P) for a cluster that lies within a cone around the offset; `width` (P,) is the cosine of its
+def _bounds(node, offset, normal, width, near, far):
+    """Bounds (2, P) for a node that lies within a cone around the offset; `width` (P,) is the cosine of its
     angle."""
     axis = offset / np.maximum(np.linalg.norm(offset, axis=1), 1e-30)[:, None]
-    here, there = (axis * normal).sum(axis=1), -(axis @ cluster.axis)
+    here, there = (axis * normal).sum(axis=1), -(axis @ node.axis)
     most_here = np.where(here >= width, 1.0, _cosine_of_sum(here, width, -1.0))
     least_here = np.maximum(_cosine_of_sum(here, width, 1.0), 0.0)
     closest = np.where(there >= width, 1.0, _cosine_of_sum(there, width, -1.0))
-    is_inside = closest >= np.cos(cluster.spread)
-    most_there = np.where(is_inside, 1.0, _cosine_of_sum(closest, np.cos(cluster.spread), -1.0))
-    end = cluster.spread + cluster.reach
+    is_inside = closest >= np.cos(node.spread)
+    most_there = np.where(is_inside, 1.0, _cosine_of_sum(closest, np.cos(node.spread), -1.0))
+    end = node.spread + node.reach
     is_seen = (most_here >= 0.0) & (is_inside | (end > np.pi) | (closest > np.cos(end)))
     farthest = _cosine_of_sum(there, width, 1.0)
-    rest = cluster.reach - cluster.spread
+    rest = node.reach - node.spread
     is_whole = is_seen & (rest >= 0.0) & (there >= 0.0) & (width >= 0.0) & (farthest >= np.cos(rest))
-    least_there = _cosine_of_sum(farthest, np.cos(cluster.spread), 1.0)
-    most = cluster.power * np.abs(most_here * most_there) / np.maximum(near, 1e-30) ** 2
-    least = cluster.power * np.abs(least_here * least_there) / np.maximum(far, 1e-30) ** 2
+    least_there = _cosine_of_sum(farthest, np.cos(node.spread), 1.0)
+    most = node.power * np.abs(most_here * most_there) / np.maximum(near, 1e-30) ** 2
+    least = node.power * np.abs(least_here * least_there) / np.maximum(far, 1e-30) ** 2
     return np.stack([np.where(is_seen, most, 0.0), np.where(is_whole, least, 0.0)])
 
 
@@ -101,73 +105,79 @@ def _cosine_of_sum(first, second, sign):
     return first * second - sign * np.sqrt(np.maximum(1.0 - first**2, 0.0) * np.maximum(1.0 - second**2, 0.0))
 
 
-def light_chances(
+def light_selection_pmf(
     position: np.ndarray, normal: np.ndarray, lights: tuple[AreaLight, ...], rows: np.ndarray | None = None
 ) -> np.ndarray:
     """Probability (L, P) with which each light is chosen for points (P, 3) with smooth normals. Down to the leaves, the
-    halves of a cluster are chosen by their upper bounds half of the time, and by their lower bounds the other half.
-    `rows` are the `light_rows` of the lights."""
-    rows = light_rows(lights) if rows is None else rows
-    own = own_bounds(position, normal, lights, rows)
+    halves of a node are chosen by their upper bounds half of the time, and by their lower bounds the other half.
+    `rows` are the `light_tree_rows` of the lights."""
+    rows = light_tree_rows(lights) if rows is None else rows
+    bounds = light_bounds_at(position, normal, lights, rows)
     if len(lights) > MOST_LIGHTS:
-        return chances_of(own)
+        return selection_pmf(bounds)
     distant = np.array([light.is_distant for light in lights], dtype=bool)
     if distant.all():
-        return chances_of(own)
+        return selection_pmf(bounds)
     if distant.any():
         # The distant lights and the tree of the others are the two halves of the whole.
-        near, chances = np.flatnonzero(~distant), np.zeros((len(lights), len(position)))
-        shares = chances_of(np.stack([own[near].sum(axis=0), own[distant].sum(axis=0)]))
-        chances[near] = shares[0] * light_chances(
+        near, pmf = np.flatnonzero(~distant), np.zeros((len(lights), len(position)))
+        shares = selection_pmf(np.stack([bounds[near].sum(axis=0), bounds[distant].sum(axis=0)]))
+        pmf[near] = shares[0] * light_selection_pmf(
             position, normal, tuple(lights[number] for number in near), rows[near]
         )
-        chances[distant] = shares[1] * chances_of(own[distant])
-        return chances
-    chances = np.zeros((len(lights), len(position)))
-    clusters = [(_tree(rows.tobytes(), len(lights)), np.ones(len(position)))]
-    while clusters:
-        cluster, chance = clusters.pop()
-        if cluster.halves is None:
-            chances[list(cluster.lights)] = chance * chances_of(own[list(cluster.lights)])
+        pmf[distant] = shares[1] * selection_pmf(bounds[distant])
+        return pmf
+    pmf = np.zeros((len(lights), len(position)))
+    nodes = [(_tree(rows.tobytes(), len(lights)), np.ones(len(position)))]
+    while nodes:
+        node, probability = nodes.pop()
+        if node.halves is None:
+            pmf[list(node.lights)] = probability * selection_pmf(bounds[list(node.lights)])
             continue
-        halves = cluster.halves
-        bounds = [own[half.lights[0]] if len(half.lights) == 1 else half.bounds(position, normal) for half in halves]
-        clusters.extend(
-            (half, chance * share) for half, share in zip(halves, chances_of(np.stack(bounds)), strict=True)
+        halves = node.halves
+        half_bounds = [
+            bounds[half.lights[0]] if len(half.lights) == 1 else half.bounds(position, normal) for half in halves
+        ]
+        nodes.extend(
+            (half, probability * share)
+            for half, share in zip(halves, selection_pmf(np.stack(half_bounds)), strict=True)
         )
-    return chances
+    return pmf
 
 
-def chances_of(bounds: np.ndarray) -> np.ndarray:
+def selection_pmf(bounds: np.ndarray) -> np.ndarray:
     """Probabilities (N, P) of alternatives, given upper and lower bounds (N, 2, P) on their light."""
     most, least = bounds[:, 0], bounds[:, 1]
     # If all lower bounds are 0, all alternatives with an upper bound above 0 are equally likely.
     least = np.where(least.sum(axis=0) > 0.0, least, most > 0.0)
-    return sum(0.5 * part / np.maximum(part.sum(axis=0), 1e-30) for part in (most, least))
+    return sum(0.5 * bound / np.maximum(bound.sum(axis=0), 1e-30) for bound in (most, least))
 
 
-def own_bounds(position: np.ndarray, normal: np.ndarray, lights: tuple[AreaLight, ...], rows: np.ndarray) -> np.ndarray:
+def light_bounds_at(
+    position: np.ndarray, normal: np.ndarray, lights: tuple[AreaLight, ...], rows: np.ndarray
+) -> np.ndarray:
     """Upper and lower bound (L, 2, P) on what points (P, 3) with normals get from each light. A flat light counts as
     its rectangle. In single precision if there are more than MOST_LIGHTS."""
     kind = np.float32 if len(lights) > MOST_LIGHTS else np.float64
-    own = np.empty((len(lights), 2, len(position)), kind)
+    bounds = np.empty((len(lights), 2, len(position)), kind)
     distant, facing = (np.array([getattr(light, name) for light in lights]) for name in ("is_distant", "is_facing"))
     for number in np.flatnonzero(facing):
-        own[number] = _facing_bounds(lights[number], position, normal)
+        bounds[number] = _facing_bounds(lights[number], position, normal)
     # Subtract large coordinates in double precision.
     middle = position.mean(axis=0) if len(position) else np.zeros(3)
     step = max(PAIRS // max(len(position), 1), 1)
     for flat, points, origin in ((~distant, position - middle, middle), (distant, 0.0 * position, 0.0)):
         numbers = np.flatnonzero(flat & ~facing)
         for start in range(0, len(numbers), step):
-            part = numbers[start : start + step]
-            shifted = np.concatenate([rows[part, :3] - origin, rows[part, 3:]], axis=1)
-            own[part] = _flat_bounds(shifted.astype(kind), points.astype(kind).T, normal.astype(kind).T)
-    return own
+            chunk = numbers[start : start + step]
+            shifted = np.concatenate([rows[chunk, :3] - origin, rows[chunk, 3:]], axis=1)
+            bounds[chunk] = _flat_bounds(shifted.astype(kind), points.astype(kind).T, normal.astype(kind).T)
+    return bounds
 
 
 def _flat_bounds(rows, position, normal):
-    """As `own_bounds`, (N, 2, P), for flat lights given by `light_rows` (N, 16) and points (3, P) with normals."""
+    """As `light_bounds_at`, (N, 2, P), for flat lights given by `light_tree_rows` (N, 16) and points (3, P) with
+    normals."""
     center, half_u, half_v, direction = (rows[:, start : start + 3].T[..., None] for start in (0, 3, 6, 9))
     reach, power = np.maximum(np.cos(rows[:, 12, None]), 0.0), rows[:, 13, None]
     x, y, z = center - position[:, None]
@@ -198,7 +208,7 @@ def _flat_bounds(rows, position, normal):
 
 
 def _facing_bounds(light, position, normal):
-    """As `own_bounds`, (2, P), for one point or spot light."""
+    """As `light_bounds_at`, (2, P), for one point or spot light."""
     offset = light.center - position
     distance = np.linalg.norm(offset, axis=1)
     axis = offset / np.maximum(distance, 1e-30)[:, None]
@@ -210,18 +220,18 @@ def _facing_bounds(light, position, normal):
     inside = width < 0.0
     near = np.where(inside, light.radius / np.sqrt(2.0), distance)
     far = np.where(inside, near, distance / np.maximum(width, 1e-30))
-    cluster = _cluster_of(np.array(_row(light)), 0)
+    node = _leaf(np.array(_row(light)), 0)
     if light.cone is None:
         here = (axis * normal).sum(axis=1)
         most = np.where(here >= width, 1.0, np.maximum(_cosine_of_sum(here, width, -1.0), 0.0))
         least = np.maximum(_cosine_of_sum(here, width, 1.0), 0.0) * np.maximum(width, 0.0)
-        return cluster.power * np.stack([most / np.maximum(near, 1e-30) ** 2, least / np.maximum(far, 1e-30) ** 2])
-    between = np.arccos(np.clip(-(axis @ cluster.axis), -1.0, 1.0)) - np.arccos(np.clip(width, -1.0, 1.0))
-    share = np.clip((np.cos(np.maximum(between, 0.0)) - np.cos(cluster.reach)) * light.cone.sharpness, 0.0, 1.0)
-    return _bounds(cluster, axis, normal, width, near, far) * (share * share * (3.0 - 2.0 * share))
+        return node.power * np.stack([most / np.maximum(near, 1e-30) ** 2, least / np.maximum(far, 1e-30) ** 2])
+    between = np.arccos(np.clip(-(axis @ node.axis), -1.0, 1.0)) - np.arccos(np.clip(width, -1.0, 1.0))
+    share = np.clip((np.cos(np.maximum(between, 0.0)) - np.cos(node.reach)) * light.cone.sharpness, 0.0, 1.0)
+    return _bounds(node, axis, normal, width, near, far) * (share * share * (3.0 - 2.0 * share))
 
 
-def light_rows(lights: tuple[AreaLight, ...]) -> np.ndarray:
+def light_tree_rows(lights: tuple[AreaLight, ...]) -> np.ndarray:
     """What the tree needs to know of each light, (L, 16)."""
     return np.array([_row(light) for light in lights])
 
@@ -234,51 +244,47 @@ def _row(light) -> list[float]:
     return [*light.center, *light.half_u, *light.half_v, *light.direction, reach, power, spread, size]
 
 
-def _cluster_of(row, number: int) -> Cluster:
+def _leaf(row, number: int) -> LightTreeNode:
     center, half_u, half_v, direction = row[:12].reshape(4, 3)
     reach = np.abs(half_u) + np.abs(half_v)
     reach = np.maximum(reach, row[15])
-    return Cluster((number,), center - reach, center + reach, direction, row[14], row[12], row[13])
+    return LightTreeNode((number,), center - reach, center + reach, direction, row[14], row[12], row[13])
 
 
 @lru_cache(maxsize=4)
-def _tree(rows: bytes, count: int) -> Cluster:
-    """The tree of `count` lights, given the bytes of their `light_rows`."""
+def _tree(rows: bytes, count: int) -> LightTreeNode:
+    """The tree of `count` lights, given the bytes of their `light_tree_rows`."""
     rows = np.frombuffer(rows).reshape(count, -1)
-    return _grown([_cluster_of(row, number) for number, row in enumerate(rows)], rows[:, :3])
+    return _grown([_leaf(row, number) for number, row in enumerate(rows)], rows[:, :3])
 
 
-def _all(clusters) -> Cluster:
-    """All clusters as one. Those without power do not widen it."""
-    lights = tuple(number for cluster in clusters for number in cluster.lights)
-    return replace(
-        reduce(Cluster.joined, [cluster for cluster in clusters if cluster.power] or clusters[:1]), lights=lights
-    )
+def _all(nodes) -> LightTreeNode:
+    """All nodes as one. Those without power do not widen it."""
+    lights = tuple(number for node in nodes for number in node.lights)
+    return replace(reduce(LightTreeNode.joined, [node for node in nodes if node.power] or nodes[:1]), lights=lights)
 
 
-def _grown(clusters: list[Cluster], centers: np.ndarray) -> Cluster:
-    """The tree over `clusters` of one light each, cut where it costs least; `centers` (L, 3) are those of all
+def _grown(nodes: list[LightTreeNode], centers: np.ndarray) -> LightTreeNode:
+    """The tree over `nodes` of one light each, cut where it costs least; `centers` (L, 3) are those of all
     lights."""
-    whole = _all(clusters)
-    if len(clusters) < 2:
+    whole = _all(nodes)
+    if len(nodes) < 2:
         return whole
-    places = centers[[cluster.lights[0] for cluster in clusters]]
+    places = centers[[node.lights[0] for node in nodes]]
     extent = places.max(axis=0) - places.min(axis=0)
     least, cut = whole.cost(), None
     for axis in np.flatnonzero(extent > 0.0):
         along = (places[:, axis] - places[:, axis].min()) / extent[axis]
         bucket = np.clip((BUCKETS * along).astype(int), 0, BUCKETS - 1)
         for end in range(1, BUCKETS):
-            parts = [
-                [c for c, b in zip(clusters, bucket, strict=True) if (b < end) == first] for first in (True, False)
-            ]
+            parts = [[c for c, b in zip(nodes, bucket, strict=True) if (b < end) == first] for first in (True, False)]
             if all(parts):
-                cost = extent.max() / extent[axis] * sum(_all(part).cost() for part in parts)
+                cost = extent.max() / extent[axis] * sum(_all(side).cost() for side in parts)
                 least, cut = (cost, (axis, len(parts[0]))) if cost < least else (least, cut)
-    if cut is None and len(clusters) <= LIGHTS_OF_LEAF:
+    if cut is None and len(nodes) <= MOST_LIGHTS_OF_LEAF:
         return whole
-    order, middle = np.arange(len(clusters)), len(clusters) // 2
+    order, middle = np.arange(len(nodes)), len(nodes) // 2
     if cut is not None:
         order, middle = np.argsort(places[:, cut[0]], kind="stable"), cut[1]
-    halves = [[clusters[number] for number in part] for part in (order[:middle], order[middle:])]
+    halves = [[nodes[number] for number in side] for side in (order[:middle], order[middle:])]
     return replace(whole, halves=tuple(_grown(half, centers) for half in halves))

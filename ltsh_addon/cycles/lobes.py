@@ -91,12 +91,12 @@ def read_layer(channels: dict[str, np.ndarray], name: str, components: str) -> n
     planes = []
     for component in components:
         suffix = f".{name}.{component}"
-        found = [key for key in channels if key.endswith(suffix) or key == suffix[1:]]
-        if len(found) != 1:
+        keys = [key for key in channels if key.endswith(suffix) or key == suffix[1:]]
+        if len(keys) != 1:
             raise ValueError(
-                f"render result: {len(found)} channels named {suffix[1:]!r}, expected one; found {sorted(channels)}"
+                f"render result: {len(keys)} channels named {suffix[1:]!r}, expected one; found {sorted(channels)}"
             )
-        planes.append(channels[found[0]])
+        planes.append(channels[keys[0]])
     return planes[0] if len(planes) == 1 else np.stack(planes, axis=-1)
 
 
@@ -118,7 +118,7 @@ SMALLEST_WEIGHT = 1e-5
 
 
 @dataclass(frozen=True)
-class Hits:
+class SurfaceHits:
     """What all lobes of a hit share, for P hits."""
 
     position: np.ndarray  # (P, 3)
@@ -129,10 +129,10 @@ class Hits:
     receiver: np.ndarray  # (P,) integers
     diffuse_albedo: np.ndarray | None  # (P, 3) sum over all lobes; None: estimated lobe by lobe
 
-    def take(self, index) -> Hits:
+    def take(self, index) -> SurfaceHits:
         """The hits at `index`."""
         values = {item.name: getattr(self, item.name) for item in fields(self)}
-        return Hits(**{name: None if value is None else value[index] for name, value in values.items()})
+        return SurfaceHits(**{name: None if value is None else value[index] for name, value in values.items()})
 
 
 # The kinds of lobes that may be anisotropic.
@@ -151,7 +151,7 @@ def aspect_of(kind: str, anisotropy):
 class LobeSlot:
     """The hits (Q,) that have a lobe in one slot, and its quantities there."""
 
-    def __init__(self, hits: Hits, lobe, index, weight):
+    def __init__(self, hits: SurfaceHits, lobe, index, weight):
         self.lobe, self.index, self.weight = lobe, index, weight
         self.hits = hits.take(index)
         self.kind = np.rint(lobe["kind"][index]).astype(int)
@@ -265,7 +265,7 @@ SHAPE = {
 
 
 @dataclass
-class _Part:
+class _LobeSamples:
     """Samples of one kind at the hits `index` (Q,). Fields that are left out are zero, or those of the hit."""
 
     index: np.ndarray
@@ -285,42 +285,42 @@ class _Part:
         self.behind = np.zeros(count, dtype=bool) if self.behind is None else self.behind
 
 
-def samples_of_lobes(hits: Hits, lobes: list[dict[str, np.ndarray]]) -> tuple[SurfaceSamples, np.ndarray]:
+def samples_of_lobes(hits: SurfaceHits, lobes: list[dict[str, np.ndarray]]) -> tuple[SurfaceSamples, np.ndarray]:
     """Samples (S), and the hit (S,) of each: one for each lobe with a weight, at least one per hit, consecutive.
 
     `lobes` has the quantities of LOBE_AOVS that were written, (P,) or (P, 3), for each slot.
     """
     slots = [slot for slot in (_slot_of(hits, lobe) for lobe in lobes) if slot is not None]
-    parts_of_slots = [_parts_of(slot) for slot in slots]
-    parts = [part for own in parts_of_slots for part in own]
-    hits = _with_velvet(hits, slots, parts_of_slots)
-    for slot, own in zip(slots, parts_of_slots, strict=True):
+    batches_of_slots = [_samples_of_slot(slot) for slot in slots]
+    batches = [batch for of_slot in batches_of_slots for batch in of_slot]
+    hits = _with_velvet(hits, slots, batches_of_slots)
+    for slot, of_slot in zip(slots, batches_of_slots, strict=True):
         if slot.has("sheen_weight"):
-            _put_under_sheen(hits, slot, own, parts)
+            _put_under_sheen(hits, slot, of_slot, batches)
     bare = np.ones(len(hits.position), dtype=bool)
-    for part in parts:
-        bare[part.index] = False
-    return _joined(hits, [*parts, _bare_part(hits, np.nonzero(bare)[0])])
+    for batch in batches:
+        bare[batch.index] = False
+    return _joined(hits, [*batches, _bare_samples(hits, np.nonzero(bare)[0])])
 
 
-def _joined(hits: Hits, parts: list[_Part]) -> tuple[SurfaceSamples, np.ndarray]:
+def _joined(hits: SurfaceHits, batches: list[_LobeSamples]) -> tuple[SurfaceSamples, np.ndarray]:
     """The samples of all parts, and the hit of each, in the order of the hits."""
-    index = np.concatenate([part.index for part in parts])
+    index = np.concatenate([batch.index for batch in batches])
     order = np.argsort(index, kind="stable")
     joined = {
-        name: np.concatenate([getattr(part, name) for part in parts])[order]
+        name: np.concatenate([getattr(batch, name) for batch in batches])[order]
         for name in ("normal", "diffuse_normal", "roughness", "ior", "diffuse", "behind")
     }
-    specular = np.concatenate([part.specular for part in parts], axis=1)[:, order]
+    specular = np.concatenate([batch.specular for batch in batches], axis=1)[:, order]
     index, behind = index[order], joined["behind"]
     at_hit = hits.take(index)
     smooth_normal = np.where(behind[:, None], -at_hit.smooth_normal, at_hit.smooth_normal)
     shape = {}
     for name, count in SHAPE.items():
-        if any(name in part.shape for part in parts):
+        if any(name in batch.shape for batch in batches):
             width = (3,) if count == 3 else ()
-            own = [part.shape.get(name, np.zeros((len(part.index), *width))) for part in parts]
-            shape[name] = np.concatenate(own)[order]
+            values = [batch.shape.get(name, np.zeros((len(batch.index), *width))) for batch in batches]
+            shape[name] = np.concatenate(values)[order]
     samples = SurfaceSamples(
         position=at_hit.position,
         view=at_hit.view,
@@ -353,29 +353,29 @@ def _split(albedo: np.ndarray, estimate: np.ndarray, index: np.ndarray) -> np.nd
     return share * albedo[index]
 
 
-def _bare_part(hits, index) -> _Part:
+def _bare_samples(hits, index) -> _LobeSamples:
     """Samples at hits on surfaces without a lobe."""
     normal = hits.smooth_normal[index]
     ones = np.ones(len(index))
-    return _Part(index, normal, normal, ones, ones)
+    return _LobeSamples(index, normal, normal, ones, ones)
 
 
-def _slot_of(hits: Hits, lobe: dict[str, np.ndarray]) -> LobeSlot | None:
+def _slot_of(hits: SurfaceHits, lobe: dict[str, np.ndarray]) -> LobeSlot | None:
     """The hits that have a lobe in one slot; None if there are none."""
     weight = lobe["weight"] if "weight" in lobe else np.ones(len(hits.position))
     index = np.nonzero((np.rint(lobe["kind"]) > 0) & (weight > SMALLEST_WEIGHT))[0]
     return LobeSlot(hits, lobe, index, weight[index]) if len(index) else None
 
 
-def _parts_of(slot: LobeSlot) -> list[_Part]:
+def _samples_of_slot(slot: LobeSlot) -> list[_LobeSamples]:
     """The parts of one slot. Its base comes first."""
-    coat, under = _coat_part(slot)
-    transmitted = _transmission_part(slot, under)
-    base = _base_part(slot, under)
-    return [part for part in (base, coat, transmitted, _dark_metal(slot, under, base)) if part is not None]
+    coat, under = _coat_samples(slot)
+    transmitted = _transmission_samples(slot, under)
+    base = _base_samples(slot, under)
+    return [batch for batch in (base, coat, transmitted, _dark_metal(slot, under, base)) if batch is not None]
 
 
-def _dark_metal(slot: LobeSlot, under: np.ndarray, base: _Part) -> _Part | None:
+def _dark_metal(slot: LobeSlot, under: np.ndarray, base: _LobeSamples) -> _LobeSamples | None:
     """The metal of a slot as a part of its own, None if there is none. It is taken out of `base` where Cycles clips its
     reflectance at 0 and where it is mixed with a dielectric."""
     if not slot.metallic.any() or not (slot.value("tint") < 1.0).any():
@@ -387,22 +387,25 @@ def _dark_metal(slot: LobeSlot, under: np.ndarray, base: _Part) -> _Part | None:
     base.specular[:, at] -= terms[:, at]
     normal = slot.specular_normal[at]
     shape = {name: values[at] for name, values in slot.stretch().items()}
-    return _Part(slot.index[at], normal, normal, slot.gloss[at], np.ones(len(at)), terms[:, at], shape=shape)
+    return _LobeSamples(slot.index[at], normal, normal, slot.gloss[at], np.ones(len(at)), terms[:, at], shape=shape)
 
 
-def _with_velvet(hits: Hits, slots: list[LobeSlot], parts_of_slots: list[list[_Part]]) -> Hits:
+def _with_velvet(hits: SurfaceHits, slots: list[LobeSlot], batches_of_slots: list[list[_LobeSamples]]) -> SurfaceHits:
     """The hits with a diffuse albedo that includes velvet, which Cycles counts as specular."""
     if hits.diffuse_albedo is None or not any(slot.of("velvet").any() for slot in slots):
         return hits
     albedo = hits.diffuse_albedo.copy()
-    for slot, (base, *_) in zip(slots, parts_of_slots, strict=True):
+    for slot, (base, *_) in zip(slots, batches_of_slots, strict=True):
         albedo[slot.index] += np.where(slot.of("velvet"), base.diffuse, 0.0)
     return replace(hits, diffuse_albedo=albedo)
 
 
-def _put_under_sheen(hits: Hits, slot: LobeSlot, own: list[_Part], parts: list[_Part]) -> None:
-    """Take what the slot's sheen reflects away from its `own` parts, and add a part that reflects it to `parts`."""
-    base = own[0]
+def _put_under_sheen(
+    hits: SurfaceHits, slot: LobeSlot, of_slot: list[_LobeSamples], batches: list[_LobeSamples]
+) -> None:
+    """Take what the slot's sheen reflects away from its samples `of_slot`, and add samples that reflect it to
+    `batches`."""
+    base = of_slot[0]
     shine = np.maximum(slot.value("sheen_weight"), 0.0)[:, None] * np.maximum(slot.value("sheen_tint"), 0.0)
     shine = np.where(slot.of("principled"), shine, 0.0)
     most = shine.max(axis=1, keepdims=True)
@@ -410,17 +413,17 @@ def _put_under_sheen(hits: Hits, slot: LobeSlot, own: list[_Part], parts: list[_
     albedo, a, b = sheen_lobe(slot.cosine(normal), slot.value("sheen_roughness"))
     albedo = albedo[:, None]
     if hits.diffuse_albedo is not None:
-        albedo = _albedo_of_sheen(hits, slot, shine, base, parts)
-    left = np.ones((len(hits.position), 1))
-    left[base.index] = np.clip(1.0 - most * albedo, 0.0, 1.0)
-    for part in own:
-        part.specular *= left[part.index]
-        part.diffuse *= left[part.index]
+        albedo = _albedo_of_sheen(hits, slot, shine, base, batches)
+    remaining = np.ones((len(hits.position), 1))
+    remaining[base.index] = np.clip(1.0 - most * albedo, 0.0, 1.0)
+    for batch in of_slot:
+        batch.specular *= remaining[batch.index]
+        batch.diffuse *= remaining[batch.index]
     shine = slot.weight[:, None] * shine * albedo
     at = np.nonzero(shine.any(axis=1))[0]
     shape = {"sheen_a": _tilted(a[at]), "sheen_b": b[at]}
     ones = np.ones(len(at))
-    parts.append(_Part(slot.index[at], normal[at], normal[at], ones, ones, diffuse=shine[at], shape=shape))
+    batches.append(_LobeSamples(slot.index[at], normal[at], normal[at], ones, ones, diffuse=shine[at], shape=shape))
 
 
 def _tilted(a: np.ndarray) -> np.ndarray:
@@ -428,18 +431,18 @@ def _tilted(a: np.ndarray) -> np.ndarray:
     return np.where(np.abs(a) < 1e-5, 1e-5, a)
 
 
-def _albedo_of_sheen(hits, slot, shine, base, parts) -> np.ndarray:
+def _albedo_of_sheen(hits, slot, shine, base, batches) -> np.ndarray:
     """Albedo R (Q, 1) of the sheen. It follows from the diffuse albedo of the hit, which is linear in R.
 
-    Without the sheen, the diffuse albedo would be the sum that all `parts` expect. With it, the slot's own diffuse part
-    D becomes w s R + (1 - max(s) R) D, where s (`shine`) is the weight times the tint of the sheen, and w is the weight
-    of the slot.
+    Without the sheen, the diffuse albedo would be the sum that all `batches` expect. With it, the slot's own diffuse
+    part D becomes w s R + (1 - max(s) R) D, where s (`shine`) is the weight times the tint of the sheen, and w is the
+    weight of the slot.
     """
     expected = np.zeros_like(hits.diffuse_albedo)
-    for part in parts:
+    for batch in batches:
         # Cycles does not count velvet as diffuse.
-        is_velvet = np.broadcast_to(np.asarray(part.shape.get("sheen_a", 0.0)) < 0.0, len(part.index))
-        expected[part.index] += np.where(is_velvet[:, None], 0.0, part.diffuse)
+        is_velvet = np.broadcast_to(np.asarray(batch.shape.get("sheen_a", 0.0)) < 0.0, len(batch.index))
+        expected[batch.index] += np.where(is_velvet[:, None], 0.0, batch.diffuse)
     change = slot.weight[:, None] * shine - shine.max(axis=1, keepdims=True) * base.diffuse
     missing = (hits.diffuse_albedo - expected)[base.index]
     square = (change * change).sum(axis=1)
@@ -447,7 +450,7 @@ def _albedo_of_sheen(hits, slot, shine, base, parts) -> np.ndarray:
     return np.clip(albedo, 0.0, 1.0)[:, None]
 
 
-def _coat_part(slot: LobeSlot):
+def _coat_samples(slot: LobeSlot):
     """The coat (None if there is none), and the share (Q, 3) of the lobe's weight that is left under it."""
     under = np.repeat(slot.weight[:, None], 3, axis=1)
     if not slot.has("coat_weight"):
@@ -462,20 +465,20 @@ def _coat_part(slot: LobeSlot):
     boost = closures.multiple_scattering(mean, albedo, average)
     f0 = np.repeat(closures.f0_of_ior(ior)[:, None], 3, axis=1)
     reflected = boost * albedo[:, None] * closures.dielectric_albedo(f0, ior, roughness, cosine)
-    left = np.clip(1.0 - weight[:, None] * np.where(ior[:, None] > 1.0, reflected, 0.0), 0.0, 1.0)
+    remaining = np.clip(1.0 - weight[:, None] * np.where(ior[:, None] > 1.0, reflected, 0.0), 0.0, 1.0)
     # The light crosses the coat along the refracted ray.
     depth = 1.0 / np.sqrt(1.0 - (1.0 - cosine**2) / ior**2).clip(1e-6)
     tint = np.maximum(slot.value("coat_tint"), 0.0) ** depth[:, None]
-    left = left * (1.0 + weight[:, None] * (tint - 1.0))
+    remaining = remaining * (1.0 + weight[:, None] * (tint - 1.0))
     coated = np.nonzero((weight > SMALLEST_WEIGHT) & (slot.kind == LOBE_KINDS["principled"]))[0]
     specular = np.zeros((4, len(coated), 3))
     specular[3] = (boost * (weight * slot.weight)[:, None])[coated]
-    part = _Part(slot.index[coated], normal[coated], normal[coated], roughness[coated], ior[coated], specular)
-    under[coated] *= left[coated]
-    return part, under
+    coat = _LobeSamples(slot.index[coated], normal[coated], normal[coated], roughness[coated], ior[coated], specular)
+    under[coated] *= remaining[coated]
+    return coat, under
 
 
-def _transmission_part(slot: LobeSlot, under: np.ndarray):
+def _transmission_samples(slot: LobeSlot, under: np.ndarray):
     """What the transmission of a Principled BSDF reflects; None if there is none."""
     if not slot.has("transmission"):
         return None
@@ -483,7 +486,9 @@ def _transmission_part(slot: LobeSlot, under: np.ndarray):
     at = np.nonzero(weight > SMALLEST_WEIGHT)[0]
     specular, ior = _glass_terms(slot, np.maximum(slot.value("tint"), 0.0), np.sqrt(np.minimum(slot.color, 1.0)))
     specular = (specular * (weight[:, None] * under))[:, at]
-    return _Part(slot.index[at], slot.specular_normal[at], slot.normal[at], slot.roughness[at], ior[at], specular)
+    return _LobeSamples(
+        slot.index[at], slot.specular_normal[at], slot.normal[at], slot.roughness[at], ior[at], specular
+    )
 
 
 def _glass_terms(slot: LobeSlot, tint: np.ndarray, through: np.ndarray):
@@ -500,7 +505,7 @@ def _glass_terms(slot: LobeSlot, tint: np.ndarray, through: np.ndarray):
     return np.stack(closures.dielectric_terms(f0, ior)) * factor, ior
 
 
-def _base_part(slot: LobeSlot, under: np.ndarray) -> _Part:
+def _base_samples(slot: LobeSlot, under: np.ndarray) -> _LobeSamples:
     """The part of everything but coat and transmission."""
     specular = _metal_terms(slot)
     diffuse = np.where(slot.of("diffuse") | slot.of("translucent") | slot.of("velvet"), slot.color, 0.0)
@@ -517,13 +522,13 @@ def _base_part(slot: LobeSlot, under: np.ndarray) -> _Part:
         specular += np.where(slot.of("glass"), terms * slot.color, 0.0)
         ior = np.where(slot.of("glass")[:, 0], own_ior, ior)
     if slot.of("principled").any():
-        terms, own_ior, left = _dielectric_terms(slot)
+        terms, own_ior, remaining = _dielectric_terms(slot)
         below = np.where(slot.of("principled"), ((1.0 - slot.metallic) * (1.0 - slot.transmission))[:, None], 0.0)
         specular += terms * below
-        diffuse = diffuse + slot.color * below * left
+        diffuse = diffuse + slot.color * below * remaining
         ior = np.where(slot.of("principled")[:, 0], own_ior, ior)
     behind = slot.of("translucent")
-    return _Part(
+    return _LobeSamples(
         slot.index,
         slot.specular_normal,
         # Cycles also bends the normals of translucent lobes.
@@ -558,7 +563,7 @@ def _metal_terms(slot: LobeSlot) -> np.ndarray:
     terms = np.zeros((4, len(slot.index), 3))
     if slot.metallic.any():
         f0, tint = np.minimum(slot.color, 1.0), np.clip(slot.value("tint"), 0.0, 1.0)
-        dip = closures.f82_dip(f0, tint)
+        dip = closures.f82_term(f0, tint)
         factor = slot.metallic[:, None] * slot.scattered(closures.metal_average(f0, dip))
         terms[:3] += factor * np.stack([f0, np.ones_like(f0), dip])
     if slot.of("glossy").any():
@@ -583,5 +588,5 @@ def _dielectric_terms(slot: LobeSlot):
     albedo = closures.dielectric_albedo(f0, ior, slot.gloss, cosine)
     scattered = (slot.value("multiple_scattering") > 0.5)[:, None]
     albedo = albedo * np.where(scattered, factor * slot.albedos[0][:, None], 1.0)
-    left = np.clip(1.0 - albedo.max(axis=-1, keepdims=True), 0.0, 1.0)
-    return np.stack(closures.dielectric_terms(f0, ior)) * factor, ior, left
+    remaining = np.clip(1.0 - albedo.max(axis=-1, keepdims=True), 0.0, 1.0)
+    return np.stack(closures.dielectric_terms(f0, ior)) * factor, ior, remaining

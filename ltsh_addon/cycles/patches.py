@@ -41,8 +41,8 @@ class Patch:
         """The uncut patches in this one."""
         if not self.parts:
             yield self
-        for part in self.parts:
-            yield from part.smallest()
+        for patch in self.parts:
+            yield from patch.smallest()
 
 
 @dataclass(frozen=True)
@@ -70,31 +70,31 @@ def cut_into_patches(image: np.ndarray, covered: np.ndarray, most: int = GRID * 
     # A heap of (-error, tie breaker, cell). Cells that are too small to cut are removed and counted in `done`.
     open_cells, done, halves_of = [(-error, next(number), whole)], 0, {}
     while open_cells and error > ERROR * total and len(open_cells) + done < most:
-        own, _, cell = heapq.heappop(open_cells)
+        negative_error, _, cell = heapq.heappop(open_cells)
         halves = pixels.best_halves(cell)
         if halves is None:
             done += 1
             continue
-        error += own
+        error += negative_error
         halves_of[cell] = halves
         for half in halves:
-            part = pixels.error(half)
-            error += part
-            heapq.heappush(open_cells, (-part, next(number), half))
+            half_error = pixels.error(half)
+            error += half_error
+            heapq.heappush(open_cells, (-half_error, next(number), half))
     share = max(error, 0.0) / total if total > 0.0 else 0.0
     return Patches(_patch(whole, halves_of, pixels), float(share))
 
 
 def _patch(cell, halves_of: dict, pixels: _Pixels) -> Patch | None:
-    parts, radiance = [cell] if cell in halves_of else [], pixels.mean(cell)
+    cells, radiance = [cell] if cell in halves_of else [], pixels.mean(cell)
     for _ in range(CUTS):
-        parts = [half for part in parts for half in halves_of.get(part, (part,))]
-    found = tuple(patch for patch in (_patch(part, halves_of, pixels) for part in parts) if patch is not None)
-    if not found and not np.any(radiance != 0.0):
+        cells = [half for inner in cells for half in halves_of.get(inner, (inner,))]
+    children = tuple(patch for patch in (_patch(inner, halves_of, pixels) for inner in cells) if patch is not None)
+    if not children and not np.any(radiance != 0.0):
         return None
     height, width = pixels.covered.shape
     sides = (cell[2] / width, cell[3] / width, 1.0 - cell[1] / height, 1.0 - cell[0] / height)
-    return Patch(tuple(2.0 * side - 1.0 for side in sides), radiance, found)
+    return Patch(tuple(2.0 * side - 1.0 for side in sides), radiance, children)
 
 
 class _Pixels:
@@ -109,8 +109,8 @@ class _Pixels:
 
     def _sum(self, cell) -> np.ndarray:
         """Sums (7,) over covered pixels of the colors, of their squares, and of 1."""
-        top, bottom, left, right = cell
-        return self._sums[bottom, right] - self._sums[top, right] - self._sums[bottom, left] + self._sums[top, left]
+        y0, y1, x0, x1 = cell
+        return self._sums[y1, x1] - self._sums[y0, x1] - self._sums[y1, x0] + self._sums[y0, x0]
 
     def mean(self, cell) -> np.ndarray:
         """Mean color (3,); 0 if no pixel is covered."""
@@ -135,14 +135,14 @@ class _Pixels:
 
         A cut never increases the squares. It may increase the absolute differences, which decide when to stop.
         """
-        top, bottom, left, right = cell
+        y0, y1, x0, x1 = cell
         choices = []
-        if bottom - top >= 2 * self._least[0]:
-            middle = (top + bottom) // 2
-            choices.append(((top, middle, left, right), (middle, bottom, left, right)))
-        if right - left >= 2 * self._least[1]:
-            middle = (left + right) // 2
-            choices.append(((top, bottom, left, middle), (top, bottom, middle, right)))
+        if y1 - y0 >= 2 * self._least[0]:
+            middle = (y0 + y1) // 2
+            choices.append(((y0, middle, x0, x1), (middle, y1, x0, x1)))
+        if x1 - x0 >= 2 * self._least[1]:
+            middle = (x0 + x1) // 2
+            choices.append(((y0, y1, x0, middle), (y0, y1, middle, x1)))
         return min(choices, key=lambda halves: sum(self._squares(half) for half in halves), default=None)
 
 
@@ -154,7 +154,7 @@ def split_light(light: AreaLight, patches: Patches) -> list[AreaLight]:
     if patches.whole is None:
         return []
     outline = _outline(light)
-    detail = [part for patch in patches.whole.parts for part in _lights_of(light, outline, patch)]
+    detail = [light_of_patch for patch in patches.whole.parts for light_of_patch in _lights_of(light, outline, patch)]
     return [replace(light, radiance=patches.whole.radiance, detail=tuple(detail))]
 
 
@@ -163,7 +163,7 @@ def _lights_of(light: AreaLight, outline: np.ndarray, patch: Patch) -> list[Area
     whole = _light_of_cell(replace(light, radiance=patch.radiance), outline, patch.cell)
     if not patch.parts:
         return whole
-    detail = tuple(part for inner in patch.parts for part in _lights_of(light, outline, inner))
+    detail = tuple(smaller for inner in patch.parts for smaller in _lights_of(light, outline, inner))
     return [replace(whole[0], detail=detail)] if len(whole) == 1 else list(detail)
 
 
@@ -181,30 +181,30 @@ def _light_of_cell(light: AreaLight, outline: np.ndarray, cell) -> list[AreaLigh
         return [replace(whole, shape="POLYGON", corners=_in_space(light, inside))]
     # Polygons cannot have a spread, so small rectangles with the same power stand for the edge.
     if max(cell[1] - cell[0], cell[3] - cell[2]) > FOCUSED_EDGE:
-        return [part for half in _halves(cell) for part in _light_of_cell(light, outline, half)]
+        return [piece for half in _halves(cell) for piece in _light_of_cell(light, outline, half)]
     bounds = np.stack([inside.min(axis=0), inside.max(axis=0)], axis=-1).ravel()
     full = (bounds[1] - bounds[0]) * (bounds[3] - bounds[2])
     return [_rectangle(replace(light, radiance=light.radiance * share * size / full), bounds)]
 
 
 def _halves(cell) -> list[tuple]:
-    left, right, bottom, top = cell
-    if right - left >= top - bottom:
-        middle = 0.5 * (left + right)
-        return [(left, middle, bottom, top), (middle, right, bottom, top)]
-    middle = 0.5 * (bottom + top)
-    return [(left, right, bottom, middle), (left, right, middle, top)]
+    x0, x1, y0, y1 = cell
+    if x1 - x0 >= y1 - y0:
+        middle = 0.5 * (x0 + x1)
+        return [(x0, middle, y0, y1), (middle, x1, y0, y1)]
+    middle = 0.5 * (y0 + y1)
+    return [(x0, x1, y0, middle), (x0, x1, middle, y1)]
 
 
 def _rectangle(light: AreaLight, cell) -> AreaLight:
-    left, right, bottom, top = cell
+    x0, x1, y0, y1 = cell
     return replace(
         light,
         shape="RECTANGLE",
         corners=None,
-        center=light.center + 0.5 * (left + right) * light.half_u + 0.5 * (bottom + top) * light.half_v,
-        half_u=0.5 * (right - left) * light.half_u,
-        half_v=0.5 * (top - bottom) * light.half_v,
+        center=light.center + 0.5 * (x0 + x1) * light.half_u + 0.5 * (y0 + y1) * light.half_v,
+        half_u=0.5 * (x1 - x0) * light.half_u,
+        half_v=0.5 * (y1 - y0) * light.half_v,
     )
 
 
@@ -232,8 +232,8 @@ def clip_to_cell(outline: np.ndarray, cell) -> np.ndarray:
 
     If a concave polygon falls into several parts, edges that run there and back connect them.
     """
-    left, right, bottom, top = cell
-    for axis, sign, bound in ((0, 1.0, left), (0, -1.0, right), (1, 1.0, bottom), (1, -1.0, top)):
+    x0, x1, y0, y1 = cell
+    for axis, sign, bound in ((0, 1.0, x0), (0, -1.0, x1), (1, 1.0, y0), (1, -1.0, y1)):
         if len(outline) == 0:
             break
         height = sign * (outline[:, axis] - bound)

@@ -46,7 +46,7 @@ def flat_polygons(vertices: np.ndarray, triangles: np.ndarray, labels: np.ndarra
     solid = area > 1e-12 * max(area.max(initial=0.0), 1e-300)
     triangles, labels, normals = triangles[solid], labels[solid], crossed[solid] / area[solid, None]
     neighbors = _coplanar_neighbors(vertices, triangles, labels, normals)
-    groups = _connected(len(triangles), neighbors)
+    groups = connected(len(triangles), neighbors)
     order = np.argsort(groups, kind="stable")
     starts = np.flatnonzero(np.diff(groups[order], prepend=-1))
     ends = np.append(starts[1:], len(order))[: len(starts)]
@@ -54,8 +54,8 @@ def flat_polygons(vertices: np.ndarray, triangles: np.ndarray, labels: np.ndarra
     labels, triangle_corners = labels.tolist(), vertices[triangles]
     pairs = starts[ends - starts == 2]
     corners, pair_normals, are_quads = _quads(vertices, triangles[order[pairs]], triangles[order[pairs + 1]])
-    for start, own, normal in zip(pairs[are_quads].tolist(), corners[are_quads], pair_normals[are_quads], strict=True):
-        polygons[start] = FlatPolygon(own, normal, labels[order[start]])
+    for start, quad, normal in zip(pairs[are_quads].tolist(), corners[are_quads], pair_normals[are_quads], strict=True):
+        polygons[start] = FlatPolygon(quad, normal, labels[order[start]])
     for start, end in zip(starts.tolist(), ends.tolist(), strict=True):
         if start in polygons:
             continue
@@ -64,9 +64,9 @@ def flat_polygons(vertices: np.ndarray, triangles: np.ndarray, labels: np.ndarra
         if outline is not None:
             polygons[start] = FlatPolygon(outline, _normal(outline), labels[members[0]])
             continue
-        for place, index in enumerate(members.tolist(), start):
-            polygons[place] = FlatPolygon(triangle_corners[index], normals[index], labels[index])
-    return [polygons[place] for place in sorted(polygons)]
+        for rank, index in enumerate(members.tolist(), start):
+            polygons[rank] = FlatPolygon(triangle_corners[index], normals[index], labels[index])
+    return [polygons[rank] for rank in sorted(polygons)]
 
 
 def _quads(vertices, first, second) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -75,8 +75,8 @@ def _quads(vertices, first, second) -> tuple[np.ndarray, np.ndarray, np.ndarray]
     matches = (first[:, :, None] == np.roll(second, -1, axis=1)[:, None]) & (
         np.roll(first, -1, axis=1)[:, :, None] == second[:, None]
     )
-    rows, place = np.arange(len(first)), matches.reshape(-1, 9).argmax(axis=1)
-    edge, other = place // 3, place % 3
+    rows, match = np.arange(len(first)), matches.reshape(-1, 9).argmax(axis=1)
+    edge, other = match // 3, match % 3
     index = [first[rows, (edge + step) % 3] for step in (1, 2, 0)] + [second[rows, (other + 2) % 3]]
     corners = vertices[np.stack(index, axis=1)]
     offset = corners - corners.mean(axis=1, keepdims=True)
@@ -114,19 +114,18 @@ def _coplanar_neighbors(vertices, triangles, labels, normals) -> np.ndarray:
     return np.stack([first[fits], second[fits]], axis=-1)
 
 
-def _connected(count: int, pairs: np.ndarray) -> np.ndarray:
+def connected(count: int, pairs: np.ndarray) -> np.ndarray:
     """The smallest index (count,) to which `pairs` (M, 2) connect each item."""
-    group = np.arange(count)
-    while len(pairs):
-        least = np.minimum(group[pairs[:, 0]], group[pairs[:, 1]])
-        before = group.copy()
-        for side in (0, 1):
-            np.minimum.at(group, group[pairs[:, side]], least)
-            np.minimum.at(group, pairs[:, side], least)
-        group = group[group]
-        if np.array_equal(group, before):
-            break
-    return group
+    label, (first, second) = np.arange(count), pairs.T
+    while True:
+        a, b = label[first], label[second]
+        if np.array_equal(a, b):
+            return label
+        smaller = np.minimum(a, b)
+        np.minimum.at(label, a, smaller)
+        np.minimum.at(label, b, smaller)
+        while not np.array_equal(label, label[label]):
+            label = label[label]
 
 
 def _outline(vertices, triangles) -> np.ndarray | None:
@@ -224,7 +223,7 @@ def _islands(triangles: np.ndarray) -> np.ndarray:
     order = np.argsort(edge.ravel(), kind="stable")
     owner, sorted_edge = order // 3, edge.ravel()[order]
     same = sorted_edge[1:] == sorted_edge[:-1]
-    return _connected(len(triangles), np.stack([owner[1:][same], owner[:-1][same]], axis=-1))
+    return connected(len(triangles), np.stack([owner[1:][same], owner[:-1][same]], axis=-1))
 
 
 def _is_hollow(vertices, triangles, closed: bool) -> bool:
@@ -240,8 +239,8 @@ def _is_hollow(vertices, triangles, closed: bool) -> bool:
     normals, first = normals[solid] / lengths[solid, None], first[solid] - used_center
     outward = outward_side(vertices, triangles) if closed else 1
     for start in range(0, len(first), 256):
-        part = slice(start, start + 256)
-        height = (used - used_center) @ normals[part].T - np.sum(first[part] * normals[part], axis=-1)
+        chunk = slice(start, start + 256)
+        height = (used - used_center) @ normals[chunk].T - np.sum(first[chunk] * normals[chunk], axis=-1)
         height *= outward
         if height.max(initial=0.0) > FLATNESS * extent or (not closed and height.min() < -FLATNESS * extent):
             return True

@@ -11,7 +11,7 @@ from ..scene import AreaLight, SurfaceSamples
 from .gbuffer import HITS_PER_BLOCK
 from .horizons import end_at_horizons_of_cycles, unit
 from .images import GRAY, ImageTexture
-from .lobes import LOBE_AOVS, Hits, samples_of_lobes
+from .lobes import LOBE_AOVS, SurfaceHits, samples_of_lobes
 from .uv import Texels
 
 # Value of texels that Cycles' bake left out, in its maps and its radiance.
@@ -79,12 +79,34 @@ class BakeView:
 
 
 @dataclass(frozen=True)
+class MapValue:
+    """A quantity that varies over the surface, in a baked map."""
+
+    map: int  # number of the map
+    channel: int = 0  # of a quantity that is no color
+
+
+@dataclass(frozen=True)
+class TextureValue:
+    """A quantity that varies over the surface, in an image."""
+
+    texture: int  # number in `BakeMaterial.textures`
+    component: str  # "color", "gray", or the number of a channel
+
+
+def _value_of(record):
+    """The value of a JSON record: a MapValue, a TextureValue, a number or a color."""
+    if not isinstance(record, dict):
+        return record
+    return MapValue(**record) if "map" in record else TextureValue(record["texture"], record["part"])
+
+
+@dataclass(frozen=True)
 class BakeMaterial:
-    """The lobes of one material, each with values for `lobes.LOBE_AOVS`. A value that varies names its baked map, or
-    one of the `textures`, and which part of its color it is. Any other value is a number or a color."""
+    """The lobes of one material, each with values for `lobes.LOBE_AOVS`."""
 
     corrected: bool
-    lobes: tuple[dict, ...]
+    lobes: tuple[dict[str, MapValue | TextureValue | float | list], ...]
     textures: tuple[tuple[ImageTexture, np.ndarray], ...] = ()  # each with its UV map (T, 3, 2)
 
     @classmethod
@@ -95,7 +117,8 @@ class BakeMaterial:
             pixels = np.load(images / texture["file"], mmap_mode="r")
             read_as = {name: texture[name] for name in ("extension", "interpolation", "srgb")}
             textures.append((ImageTexture(pixels, **read_as), np.load(uv_maps[texture["uv"]])))
-        return cls(record["corrected"], tuple(record["lobes"]), tuple(textures))
+        lobes = tuple({name: _value_of(value) for name, value in lobe.items()} for lobe in record["lobes"])
+        return cls(record["corrected"], lobes, tuple(textures))
 
     def colors(self, number: int, triangle: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Colors (Q, 3) of texture `number` at points of triangles (Q,), given by barycentric weights (Q, 3)."""
@@ -126,7 +149,7 @@ def texel_samples(
         smooth_normal = unit(_interpolated(mesh.normals, triangle, weights))
         true_normal = true_normals[triangle]
         number = mesh.material[triangle]
-        hits = Hits(
+        hits = SurfaceHits(
             position=position,
             view=view.towards(position, smooth_normal, true_normal),
             smooth_normal=smooth_normal,
@@ -146,7 +169,7 @@ def texel_samples(
 def _maps_read(materials) -> set[int]:
     """Numbers of the maps that some material reads."""
     values = (value for material in materials for lobe in material.lobes for value in lobe.values())
-    return {value["map"] for value in values if isinstance(value, dict) and "map" in value}
+    return {value.map for value in values if isinstance(value, MapValue)}
 
 
 def _interpolated(values, triangle, weights):
@@ -161,16 +184,15 @@ def _lobes(materials, number, maps, triangle, weights) -> list[dict[str, np.ndar
 
     def varying(which, value, kind):
         at = texels[which]
-        if "map" in value:
-            found = maps[value["map"]][at]
-            return found if kind == "COLOR" else found[:, value["channel"]]
-        key = which, value["texture"]
+        if isinstance(value, MapValue):
+            baked = maps[value.map][at]
+            return baked if kind == "COLOR" else baked[:, value.channel]
+        key = which, value.texture
         if key not in colors:
-            colors[key] = materials[which].colors(value["texture"], triangle[at], weights[at])
-        part = value["part"]
-        if part == "gray":
+            colors[key] = materials[which].colors(value.texture, triangle[at], weights[at])
+        if value.component == "gray":
             return colors[key] @ GRAY
-        return colors[key] if part == "color" else colors[key][:, int(part)]
+        return colors[key] if value.component == "color" else colors[key][:, int(value.component)]
 
     slots = []
     for slot in range(max((len(material.lobes) for material in materials), default=0)):
@@ -184,7 +206,7 @@ def _lobes(materials, number, maps, triangle, weights) -> list[dict[str, np.ndar
                 if len(material.lobes) <= slot or name not in material.lobes[slot]:
                     continue
                 value = material.lobes[slot][name]
-                if isinstance(value, dict):
+                if isinstance(value, MapValue | TextureValue):
                     value = varying(which, value, kind)
                 elif kind == "COLOR":
                     value = np.asarray(value)[:3]

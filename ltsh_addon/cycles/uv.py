@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from .planar_polygons import connected
+
 # Blender's bake shifts its sampling points by this much, in texels, so that centers exactly on an edge belong to one
 # side. The same shift here gives the same texels.
 NUDGE = (0.001, 0.002)
@@ -38,8 +40,8 @@ class Texels:
     def baked(self, is_baked: np.ndarray) -> Texels:
         """The texels that Cycles baked, given by the mask `is_baked` (Q,)."""
         unbaked = int(np.count_nonzero(~is_baked))
-        kept = self.index[is_baked], self.triangle[is_baked], self.barycentric[is_baked]
-        return Texels(*kept, self.covers, self.overlaps, unbaked)
+        remaining = self.index[is_baked], self.triangle[is_baked], self.barycentric[is_baked]
+        return Texels(*remaining, self.covers, self.overlaps, unbaked)
 
 
 @dataclass(frozen=True)
@@ -79,10 +81,10 @@ class UvTriangles:
             triangle, index = _expand(*spans, self.width, first_row)
             free = ~covered[index]
             owner[index[free]] = triangle[free]
-        found = np.flatnonzero(owner >= 0)
-        triangle = owner[found]
-        center = np.stack([found % self.width + 0.5, found // self.width + first_row + 0.5], axis=-1)
-        return Texels(found, triangle, barycentric_of_nearest(self.corners[triangle], center), covers, overlaps)
+        texel = np.flatnonzero(owner >= 0)
+        triangle = owner[texel]
+        center = np.stack([texel % self.width + 0.5, texel // self.width + first_row + 0.5], axis=-1)
+        return Texels(texel, triangle, barycentric_of_nearest(self.corners[triangle], center), covers, overlaps)
 
     def spread(self, texels: Texels, number: int, count: int, width: float) -> Texels:
         """`texels` at point `number` of `count`. With more points, their mean tends to that of Cycles' bake.
@@ -177,9 +179,9 @@ def _covered_point(corners, half, u, v):
     area = areas[around][rows, which]
     share = np.divide(share - (sums[rows, which] - area), area, out=np.zeros(len(rows)), where=area > 0.0)
     ends = ends[around][rows, which]
-    found = np.zeros((len(corners), 2))
-    found[around] = np.sqrt(v) * (ends[:, 0] + np.clip(share, 0.0, 1.0)[:, None] * (ends[:, 1] - ends[:, 0]))
-    return found
+    points = np.zeros((len(corners), 2))
+    points[around] = np.sqrt(v) * (ends[:, 0] + np.clip(share, 0.0, 1.0)[:, None] * (ends[:, 1] - ends[:, 0]))
+    return points
 
 
 def _borders(corners, half):
@@ -226,15 +228,15 @@ def _center_spans(corners, first_row, row_count, size):
     triangle, step = repeated(last - first + 1)
     row = first[triangle] + step
     offset = np.cumsum(np.maximum(last - first + 1, 0)) - np.maximum(last - first + 1, 0)
-    left, right = np.full(len(row), np.inf), np.full(len(row), -np.inf)
+    low_x, high_x = np.full(len(row), np.inf), np.full(len(row), -np.inf)
     for side in sides:
         of, number = repeated(side.last - side.first + 1)
         position = offset[of] + (side.first - first)[of] + number
         x = side.x[side.start[of] + number]
-        left[position], right[position] = np.minimum(left[position], x), np.maximum(right[position], x)
-    crossed = np.flatnonzero(np.isfinite(left))
-    left, right = left[crossed], right[crossed]
-    return triangle[crossed], row[crossed], np.floor(left) + 1.0, np.minimum(np.floor(right), width - 1.0)
+        low_x[position], high_x[position] = np.minimum(low_x[position], x), np.maximum(high_x[position], x)
+    crossed = np.flatnonzero(np.isfinite(low_x))
+    low_x, high_x = low_x[crossed], high_x[crossed]
+    return triangle[crossed], row[crossed], np.floor(low_x) + 1.0, np.minimum(np.floor(high_x), width - 1.0)
 
 
 @dataclass(frozen=True)
@@ -254,29 +256,29 @@ def _side_rows(start, end, first_row, row_count, height):
     first = np.maximum(np.ceil(low[:, 1]), first_row)
     last = np.minimum(top, first_row + row_count - 1.0)
     with np.errstate(invalid="ignore"):
-        seen = np.flatnonzero(np.isfinite(low).all(axis=1) & np.isfinite(high).all(axis=1) & (first <= last))
+        meeting = np.flatnonzero(np.isfinite(low).all(axis=1) & np.isfinite(high).all(axis=1) & (first <= last))
     # Sides with the most rows come first, so that those still being followed are always the first ones.
-    seen = seen[np.argsort(first[seen] - top[seen], kind="stable")]
-    low, high, top = low[seen], high[seen], top[seen].astype(np.float32)
+    meeting = meeting[np.argsort(first[meeting] - top[meeting], kind="stable")]
+    low, high, top = low[meeting], high[meeting], top[meeting].astype(np.float32)
     rise = high[:, 1] - low[:, 1]
     flat = rise <= np.finfo(np.float32).eps
     slope = np.divide(low[:, 0] - high[:, 0], rise, out=np.zeros_like(rise), where=~flat)
     x = np.where(flat, np.minimum(low[:, 0], high[:, 0]), slope * (low[:, 1] - top) + low[:, 0])
     rows = np.zeros(len(start) + 1, np.int64)
-    rows[seen + 1] = last[seen] - first[seen] + 1.0
-    place = np.cumsum(rows)
-    values = np.empty(place[-1], np.float32)
-    steps, skipped = top - first[seen], top - last[seen]
-    target = place[seen + 1] - 1 + skipped.astype(np.int64)
-    active = len(seen)
+    rows[meeting + 1] = last[meeting] - first[meeting] + 1.0
+    end_of_side = np.cumsum(rows)
+    values = np.empty(end_of_side[-1], np.float32)
+    steps, skipped = top - first[meeting], top - last[meeting]
+    target = end_of_side[meeting + 1] - 1 + skipped.astype(np.int64)
+    active = len(meeting)
     for step in range(int(steps[0]) + 1 if active else 0):
         active = np.searchsorted(-steps[:active], -step, side="right")
         within = np.flatnonzero(skipped[:active] <= step)
         values[target[within] - step] = x[within]
         x[:active] += slope[:active]
     rows_of = np.full((2, len(start)), [[_NO_ROW], [-_NO_ROW]], dtype=np.int64)
-    rows_of[:, seen] = first[seen], last[seen]
-    return _Side(*rows_of, place[:-1], values)
+    rows_of[:, meeting] = first[meeting], last[meeting]
+    return _Side(*rows_of, end_of_side[:-1], values)
 
 
 def _touching_spans(corners, first_row, row_count, width):
@@ -294,9 +296,9 @@ def _touching_spans(corners, first_row, row_count, width):
     for border in (row, row + 1.0):
         ends += _chain_ends(low, middle, high, np.clip(border, low[:, 1], high[:, 1]))
     ends.append(np.where(inside, middle[:, 0], ends[0]))
-    left, right = np.min(ends, axis=0), np.max(ends, axis=0)
-    last_x = np.maximum(np.ceil(right) - 1.0, np.floor(left))
-    return solid[triangle], row, np.floor(left), np.minimum(last_x, width - 1.0)
+    low_x, high_x = np.min(ends, axis=0), np.max(ends, axis=0)
+    last_x = np.maximum(np.ceil(high_x) - 1.0, np.floor(low_x))
+    return solid[triangle], row, np.floor(low_x), np.minimum(last_x, width - 1.0)
 
 
 def _by_height(corners):
@@ -308,9 +310,9 @@ def _by_height(corners):
 def _rows_of(first, last, first_row, row_count):
     """(triangle, row) for every row from `first` (T,) to `last` (T,) within the block."""
     with np.errstate(invalid="ignore"):
-        seen = np.isfinite(first) & np.isfinite(last)
-    first = np.maximum(np.where(seen, first, 0.0), first_row)
-    last = np.minimum(np.where(seen, last, -1.0), first_row + row_count - 1.0)
+        finite = np.isfinite(first) & np.isfinite(last)
+    first = np.maximum(np.where(finite, first, 0.0), first_row)
+    last = np.minimum(np.where(finite, last, -1.0), first_row + row_count - 1.0)
     triangle, step = repeated(last - first + 1.0)
     return triangle, first[triangle] + step
 
@@ -368,9 +370,9 @@ def _nearest_on_sides(corners, points):
         share = ((points - start) * side).sum(axis=1)
         share = np.clip(np.divide(share, length2, out=np.zeros_like(share), where=length2 > 0.0), 0.0, 1.0)
         gap = points - start - share[:, None] * side
-        found = (gap * gap).sum(axis=1)
-        nearer = np.flatnonzero(found < distance)
-        distance[nearer] = found[nearer]
+        distance2 = (gap * gap).sum(axis=1)
+        nearer = np.flatnonzero(distance2 < distance)
+        distance[nearer] = distance2[nearer]
         best[nearer] = 0.0
         best[nearer, first], best[nearer, second] = 1.0 - share[nearer], share[nearer]
     return best
@@ -432,10 +434,10 @@ class UvSeams:
         ends, others = _ends(uv, edge), _ends(uv, partner)
         others = np.where(same[:, :1, None], others, others[:, ::-1])
         together = (np.abs(ends - others) <= SAME_UV).all(axis=(1, 2))
-        islands = _connected(len(uv), edge[together] // 3, partner[together] // 3)
+        islands = connected(len(uv), np.stack([edge[together], partner[together]], axis=1) // 3)
         corners = (uv - np.asarray(tile)) * (width, height)
         third, other_third = _third(corners, edge), _third(corners, partner)
-        ends, others = ((part - np.asarray(tile)) * (width, height) for part in (ends, others))
+        ends, others = ((pair - np.asarray(tile)) * (width, height) for pair in (ends, others))
         with np.errstate(invalid="ignore"):
             inward, other_inward = _towards(ends, third), _towards(others, other_third)
             cut = ~together & np.isfinite(inward).all(axis=1) & np.isfinite(other_inward).all(axis=1)
@@ -449,11 +451,11 @@ class UvSeams:
         """Where the surface goes on beyond a seam. Points (P, 2) in texels lie outside all triangles; `near` (P, 2) is
         the covered texel closest to each. Returns the numbers (Q,) of the points that face an edge, the places (Q, 2)
         beyond it, and the islands (Q,) there."""
-        found = [
+        chunks = [
             self._reflected(points[first : first + POINTS_PER_BLOCK], near[first : first + POINTS_PER_BLOCK], first)
             for first in range(0, max(len(points), 1), POINTS_PER_BLOCK)
         ]
-        return tuple(np.concatenate(parts) for parts in zip(*found, strict=True))
+        return tuple(np.concatenate(parts) for parts in zip(*chunks, strict=True))
 
     def _reflected(self, points, near, first):
         point, edge = self._candidates(near)
@@ -508,20 +510,6 @@ def _towards(ends, corner):
     length = np.linalg.norm(side, axis=1)
     scale = np.divide(turn, length, out=np.full(len(side), np.nan), where=(length > 0.0) & (turn != 0.0))
     return np.stack([-side[:, 1], side[:, 0]], axis=-1) * scale[:, None]
-
-
-def _connected(count, first, second):
-    """The smallest number (count,) to which the pairs first (N,), second (N,) connect each item."""
-    label = np.arange(count)
-    while True:
-        a, b = label[first], label[second]
-        if np.array_equal(a, b):
-            return label
-        smaller = np.minimum(a, b)
-        np.minimum.at(label, a, smaller)
-        np.minimum.at(label, b, smaller)
-        while not np.array_equal(label, label[label]):
-            label = label[label]
 
 
 def _cells(edges, width, height):

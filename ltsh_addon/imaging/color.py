@@ -159,15 +159,8 @@ def encode_png(image: np.ndarray) -> bytes:
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)  # 8 bits, RGB, deflate, adaptive, not interlaced
     pixels = zlib.compress(_filtered(image).tobytes(), 6)
     perceptual = b"\0"
-    return b"".join(
-        [
-            _SIGNATURE,
-            _chunk(b"IHDR", header),
-            _chunk(b"sRGB", perceptual),
-            _chunk(b"IDAT", pixels),
-            _chunk(b"IEND", b""),
-        ]
-    )
+    chunks = ((b"IHDR", header), (b"sRGB", perceptual), (b"IDAT", pixels), (b"IEND", b""))
+    return _SIGNATURE + b"".join(_chunk(kind, data) for kind, data in chunks)
 
 
 def _chunk(kind: bytes, data: bytes) -> bytes:

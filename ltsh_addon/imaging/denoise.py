@@ -45,9 +45,9 @@ class Denoiser:
 
     def __init__(self, library: str, threads: int):
         try:
-            found = ctypes.CDLL(library)
+            loaded = ctypes.CDLL(library)
             for name, (result, *arguments) in _FUNCTIONS.items():
-                function = getattr(found, name)
+                function = getattr(loaded, name)
                 function.restype, function.argtypes = result, arguments
                 setattr(self, "_" + name.removeprefix("oidn"), function)
         except (OSError, AttributeError) as error:
@@ -83,8 +83,8 @@ class Denoiser:
         made = self._NewFilter(self._device, b"RT")
         try:
             for name, image in {**images, "output": result}.items():
-                place = _FLOAT3, width, height, 0, 0, 0
-                self._SetSharedFilterImage(made, name.encode(), image.ctypes.data, *place)
+                layout = _FLOAT3, width, height, 0, 0, 0
+                self._SetSharedFilterImage(made, name.encode(), image.ctypes.data, *layout)
             for name, value in settings.items():
                 self._SetFilterBool(made, name.encode(), value)
             self._CommitFilter(made)

@@ -208,11 +208,11 @@ def read_channels(path: str | os.PathLike) -> dict[str, np.ndarray]:
     if len(parts) != expected or not parts:
         reason = complaint.getvalue().strip().rpartition(" - ")[2] or f"{len(parts)} of {expected} parts readable"
         raise ValueError(f"{path}: is damaged or incomplete ({reason}); render or write it again")
-    for part in parts:
-        for name, channel in part.channels.items():
+    for exr_part in parts:
+        for name, channel in exr_part.channels.items():
             if channel.pixels is None:
                 raise ValueError(f"{path}: is damaged, channel {name!r} has no pixels; render or write it again")
-            prefix = f"{part.name()}." if len(parts) > 1 and "." not in name and part.name() else ""
+            prefix = f"{exr_part.name()}." if len(parts) > 1 and "." not in name and exr_part.name() else ""
             channels[prefix + name] = channel.pixels
     return channels
 

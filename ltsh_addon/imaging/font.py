@@ -185,7 +185,9 @@ def _drawable(text: str) -> str:
     characters = []
     for character in str(text):
         if character not in STROKES:
-            base = "".join(part for part in unicodedata.normalize("NFKD", character) if not unicodedata.combining(part))
+            base = "".join(
+                letter for letter in unicodedata.normalize("NFKD", character) if not unicodedata.combining(letter)
+            )
             character = base if len(base) == 1 else character
         characters.append(" " if character.isspace() else character)
     return "".join(characters)
@@ -228,12 +230,12 @@ def _coverage(segments: np.ndarray, shape: tuple[int, int], stroke_width: float)
 
 
 def _blend(image: np.ndarray, x: int, y: int, coverage: np.ndarray, color) -> None:
-    top, left = max(0, -y), max(0, -x)
-    bottom, right = min(coverage.shape[0], image.shape[0] - y), min(coverage.shape[1], image.shape[1] - x)
-    if top >= bottom or left >= right:
+    first_y, first_x = max(0, -y), max(0, -x)
+    end_y, end_x = min(coverage.shape[0], image.shape[0] - y), min(coverage.shape[1], image.shape[1] - x)
+    if first_y >= end_y or first_x >= end_x:
         return
-    target = image[y + top : y + bottom, x + left : x + right]
-    share = coverage[top:bottom, left:right, None]
+    target = image[y + first_y : y + end_y, x + first_x : x + end_x]
+    share = coverage[first_y:end_y, first_x:end_x, None]
     target[:] = np.rint(target * (1.0 - share) + np.asarray(color, dtype=np.float64) * share).astype(np.uint8)
 
 

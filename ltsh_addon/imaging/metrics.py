@@ -260,7 +260,7 @@ def _convolved_rows(image: np.ndarray, kernel: np.ndarray) -> np.ndarray:
     weights = kernel.astype(image.dtype)
     for start in range(0, image.shape[1], _COLUMNS):  # so few that the sums stay in the cache
         columns = slice(start, start + _COLUMNS)
-        part = np.empty_like(result[:, columns])
+        scratch = np.empty_like(result[:, columns])
         for offset, weight in enumerate(weights):
-            result[:, columns] += np.multiply(padded[offset : offset + len(image), columns], weight, out=part)
+            result[:, columns] += np.multiply(padded[offset : offset + len(image), columns], weight, out=scratch)
     return result

@@ -147,7 +147,7 @@ def _pass_table(name: str, figures: Mapping) -> str:
     head = "".join(f"<th>{_text(label)}</th>" for _, _, label in _COLUMNS)
     rows = [
         f"<tr><td>{_text(technique)}</td>"
-        + "".join(f"<td>{_percent(row.get(part, {}).get(key))}</td>" for part, key, _ in _COLUMNS)
+        + "".join(f"<td>{_percent(row.get(section, {}).get(key))}</td>" for section, key, _ in _COLUMNS)
         + "</tr>"
         for technique, row in figures["techniques"].items()
     ]
@@ -181,12 +181,12 @@ _GROUP = {
 }
 
 
-def _check_group(group, place) -> None:
-    check(group, _GROUP, place)
+def _check_group(group, location) -> None:
+    check(group, _GROUP, location)
     rows = [name for figures in group.get("figures", {}).values() for name in figures["techniques"]]
     for names, known in (((*group["names"], *rows), "labels"), (group["passes"], "scales")):
         if missing := [name for name in names if name not in group[known]]:
-            raise Malformed(f"{place}.{known} has no {shortened(missing[0], 60)!r}")
+            raise Malformed(f"{location}.{known} has no {shortened(missing[0], 60)!r}")
 
 
 _REPORT = {"warnings?": [str], "problems?": [str]}

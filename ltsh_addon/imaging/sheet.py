@@ -44,9 +44,9 @@ def comparison_sheet(
     """
     label, image = reference
     for tile in techniques:
-        for part in (tile.image, tile.error):
-            if part.shape != image.shape:
-                raise ValueError(f"tile {tile.label!r} has shape {part.shape}, expected {image.shape} as {label!r}")
+        for pixels in (tile.image, tile.error):
+            if pixels.shape != image.shape:
+                raise ValueError(f"tile {tile.label!r} has shape {pixels.shape}, expected {image.shape} as {label!r}")
     exposure = exposure_factor(image)
     scale = common_error_scale([tile.error for tile in techniques], image)
     first = to_srgb8(exposure * _resized(image))
@@ -56,12 +56,12 @@ def comparison_sheet(
     captions = [_wrapped(tile.caption, width) for tile in techniques]
     lines = max(map(len, captions), default=0)
     sheet = _Sheet(title, width, height, count=1 + len(techniques), lines=(len(legend), lines))
-    sheet.place(0, label, first, None, ())
+    sheet.draw_tile(0, label, first, None, ())
     sheet.legend(legend, scale)
     for index, (tile, caption) in enumerate(zip(techniques, captions, strict=True), start=1):
         picture = _with_gray(to_srgb8(exposure * _known(tile.image, tile.missing)), tile.missing)
         error = _to_8bit(signed_error_colors(_known(tile.error, tile.missing), scale))
-        sheet.place(index, tile.label, picture, _with_gray(error, tile.missing), caption)
+        sheet.draw_tile(index, tile.label, picture, _with_gray(error, tile.missing), caption)
     return sheet.pixels
 
 
@@ -94,7 +94,7 @@ def common_error_scale(errors, image) -> float:
     Without errors it is the largest value of the `image`, at least 1.
     """
     values = [np.abs(luminance(error[np.isfinite(error).all(axis=-1)])) for error in errors]
-    values = np.concatenate([part[part > 0.0] for part in values]) if values else np.empty(0)
+    values = np.concatenate([magnitudes[magnitudes > 0.0] for magnitudes in values]) if values else np.empty(0)
     if not values.size:
         return max(float(np.nanmax(np.where(np.isfinite(image), image, 0.0), initial=0.0)), 1.0)
     value = float(np.percentile(values, _SCALE_PERCENTILE))
@@ -158,7 +158,7 @@ class _Sheet:
         row, column = divmod(index, self.columns)
         return _MARGIN + column * (self.width + _GUTTER), self.top + sum(self.heights[:row])
 
-    def place(self, index: int, label: str, picture: np.ndarray, error: np.ndarray | None, caption) -> None:
+    def draw_tile(self, index: int, label: str, picture: np.ndarray, error: np.ndarray | None, caption) -> None:
         """Draw label, picture, error and caption into cell `index`."""
         x, y = self._corner(index)
         draw_text(self.pixels, (x, y), shorten(label, self.width, _LABEL, bold=True), _INK, _LABEL, bold=True)

@@ -64,19 +64,20 @@ def bake_objects(
 ) -> TaskResult:
     """Bake the objects and write their files, but no report.json; `tile` is the only UDIM tile to bake, None: all.
 
-    Within `kept_blender` the scene stays open for the next call with the same options, for the objects named here and
+    Within `shared_blender` the scene stays open for the next call with the same options, for the objects named here and
     those announced as `following`. Raises as `bake_scene` does.
     """
-    from ..blender.process import client
+    from ..blender.process.bake import extract_bake
+    from ..blender.process.blend_file import check_readable
 
     start = time.perf_counter()
     _check(options)
-    client.check_readable(options.scene)
+    check_readable(options.scene)
     picture.check_named(options.techniques, "a bake that is resumed")
     tables = picture.prepare(options)
     finished = TileRecords(options)
     with temporary_folder() as folder:
-        manifest = client.extract_bake(_job(options, finished.finished, tile, following), folder, progress=progress)
+        manifest = extract_bake(_job(options, finished.finished, tile, following), folder, progress=progress)
         names = [record["name"] for record in manifest["objects"]]
         found = file_stems(names) if options.name is None else [options.name]
         records, files, seconds = [], [], {"blender": manifest["seconds"]}
@@ -117,10 +118,10 @@ def _check(options: BakeOptions) -> None:
 
 
 def _job(options, finished, tile=None, following=()):
-    from ..blender.process import client
+    from ..blender.process.bake import BakeJob
 
     return child_job(
-        client.BakeJob,
+        BakeJob,
         options,
         width=options.size[0],
         height=options.size[1],
@@ -481,7 +482,7 @@ def _applied_parts(options) -> list[str]:
 
 def apply_textures(scene: Path, output: Path, records: list[dict], layer: str, progress=None) -> str:
     """Save a copy of the .blend whose objects show the textures of the report's `records`; returns its file name."""
-    from ..blender.process import client
+    from ..blender.process.bake import BakedTextures, apply_bake
 
     textures = []
     for record in records:
@@ -492,9 +493,9 @@ def apply_textures(scene: Path, output: Path, records: list[dict], layer: str, p
             for number, tile in record["tiles"].items()
         ]
         name = f"{record['name']} {layer}"
-        textures.append({"object": record["name"], "uv": record["uv"], "name": name, "files": files})
+        textures.append(BakedTextures(record["name"], record["uv"], name, files))
     path = output / f"{Path(scene).stem}_baked.blend"
-    client.apply_bake(scene, path, textures, progress=progress)
+    apply_bake(scene, path, textures, progress=progress)
     return path.name
 
 

@@ -67,10 +67,10 @@ def run_tasks(
     cannot be written, becomes a problem and the others go on; if it is the only task, SceneError or OSError is raised.
     Raises TableError, ValueError and Cancelled at once, and OSError where not even a record can be written.
     """
-    from ..blender.process.blender_process import kept_blender
+    from ..blender.process.blender_process import shared_blender
 
     output = job.options.output
-    with no_empty_folder(output), temporary_folder() as folder, kept_blender(folder):
+    with no_empty_folder(output), temporary_folder() as folder, shared_blender(folder):
         picture.prepare(job.options)
         tasks = tasks_of(job, progress)
         mine = shard_of(tasks, shard)

@@ -25,8 +25,6 @@ from ..files import replacing
 from ..scene import (
     REFERENCE,
     AreaLight,
-    Border,
-    ColorSpace,
     Film,
     Progress,
     SurfaceSamples,
@@ -230,7 +228,7 @@ class RelightData:
     whole picture = sum over passes of `shown` x image of the samples, + sum of `rest`; all include the exposure.
     """
 
-    extraction: Any  # blender.process.client.Extraction, without reference and occluders
+    extraction: Any  # blender.process.pixels.Extraction, without reference and occluders
     shadows: Shadows | None
     options: dict  # fields of PictureOptions
     had_cycles: bool
@@ -266,28 +264,26 @@ class RelightData:
 
     @classmethod
     def _of(cls, document, arrays) -> RelightData:
-        from ..blender.process.client import UNCHANGED, Extraction
+        from ..blender.process.pixels import CyclesPasses, Extraction, ExtractionTimes, PictureFacts
 
-        found = document["extraction"]
-        border, space = found["border"], found["color_space"]
+        record = document["extraction"]
         extraction = Extraction(
-            **{name: found[name] for name in UNCHANGED},
-            lights=lights_of(found["lights"]),
+            lights=lights_of(record["lights"]),
             samples=SurfaceSamples(
                 **{item.name: _compact(arrays[f"samples.{item.name}"]) for item in fields(SurfaceSamples)}
             ),
             film=Film(
                 pixel=arrays["film.pixel"],
                 **{name: arrays.get(f"film.{name}") for name in FILM_ARRAYS},
-                **found["film"],
+                **record["film"],
             ),
-            warnings=tuple(found["warnings"]),
-            problems=tuple(found["problems"]),
-            reference=None,
-            origin=np.array(found["origin"]),
-            border=None if border is None else Border(**border),
-            color_space=ColorSpace(space["name"], np.array(space["to_rec709"])),
-            **{name: arrays.get(f"picture.{name}") for name in NOT_REFLECTED},
+            picture=PictureFacts.of(record),
+            cycles=CyclesPasses(**{name: arrays.get(f"picture.{name}") for name in NOT_REFLECTED}),
+            times=ExtractionTimes(record["seconds"]),
+            warnings=tuple(record["warnings"]),
+            problems=tuple(record["problems"]),
+            origin=np.array(record["origin"]),
+            light_settings=record["light_settings"],
         )
         shadows = document["shadows"]
         if shadows is not None:
@@ -307,7 +303,7 @@ def _compact(values: np.ndarray) -> np.ndarray:
     return values if values.any() else np.broadcast_to(values.dtype.type(0), values.shape)
 
 
-NOT_REFLECTED = ("emission", "background")  # optional arrays of an Extraction
+NOT_REFLECTED = ("emission", "background")  # optional arrays of `Extraction.cycles`
 FINISHED = ("rest", "taken", "edges")  # fields of a RelightData that only finished pictures have
 RELIGHT_OPTIONS = ("techniques", "passes", "sub_samples", "reference_samples", "shadows", "shadow_rays")
 
@@ -317,23 +313,21 @@ def write_relight_data(extraction, shadows: Shadows | None, options, path: Path,
 
     `finished` are the fields `rest`, `taken` and `edges` of the RelightData of a finished picture. Raises OSError.
     """
-    from ..blender.process.client import UNCHANGED
-
-    film, space = extraction.film, extraction.color_space
+    film = extraction.film
     document = {
         "extraction": {
-            **{name: getattr(extraction, name) for name in UNCHANGED},
+            **extraction.picture.record(),
+            "seconds": extraction.times.stages,
+            "light_settings": extraction.light_settings,
             "lights": light_records(extraction.lights),
             "film": {"width": film.width, "height": film.height, "sub_samples": film.sub_samples},
             "warnings": extraction.warnings,
             "problems": extraction.problems,
             "origin": np.asarray(extraction.origin).tolist(),
-            "border": None if extraction.border is None else vars(extraction.border),
-            "color_space": {"name": space.name, "to_rec709": space.to_rec709.tolist()},
         },
         "shadows": None if shadows is None else {**shadows.report(), "numbers": shadows.numbers},
         "options": {"scene": str(options.scene), **{name: getattr(options, name) for name in RELIGHT_OPTIONS}},
-        "had_cycles": extraction.reference is not None,
+        "had_cycles": extraction.cycles.reference is not None,
         **{kind: list(finished.get(kind, ())) for kind in FINISHED},
     }
     arrays = {f"samples.{item.name}": getattr(extraction.samples, item.name) for item in fields(SurfaceSamples)}
@@ -341,7 +335,7 @@ def write_relight_data(extraction, shadows: Shadows | None, options, path: Path,
     arrays |= {f"film.{name}": getattr(film, name) for name in FILM_ARRAYS if getattr(film, name) is not None}
     if shadows is not None:
         arrays |= {f"shares.{name}": values for name, values in shadows.shares.items()}
-    seen = {name: getattr(extraction, name) for name in NOT_REFLECTED}
+    seen = {name: getattr(extraction.cycles, name) for name in NOT_REFLECTED}
     arrays |= {f"picture.{name}": values.astype(np.float32) for name, values in seen.items() if values is not None}
     for kind, parts in finished.items():
         arrays |= {f"{kind}.{name}": np.asarray(values, np.float32) for name, values in parts.items()}

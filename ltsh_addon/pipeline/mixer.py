@@ -108,7 +108,7 @@ def light_pictures(kept: RelightData, progress: Progress | None = None) -> Light
         if group and values.any() and all(row.group != group for row in rows):
             rows.append(MixerRow(f"Light group {group}", (), note=NOT_SHADED))
             layers = np.concatenate([layers, values[None, ..., :3].astype(np.float32)])
-    notes = [GRAIN] * bool(kept.rest and kept.extraction.has_lens) + [
+    notes = [GRAIN] * bool(kept.rest and kept.extraction.picture.has_lens) + [
         SHARED_OUT.format(group, listed(repr(row.name) for row in own))
         for group in kept.rest
         if group and len(own := [row for row in rows if row.group == group]) > 1
@@ -118,7 +118,12 @@ def light_pictures(kept: RelightData, progress: Progress | None = None) -> Light
         rows.append(MixerRow(REST, (), note=NOT_OF_LIGHTS))
         layers = np.concatenate([layers, rest[None, ..., :3].astype(np.float32)])
     alpha = np.ones(shape, np.float32) if rest is None or rest.shape[-1] < 4 else rest[..., 3].astype(np.float32)
-    facts = {"camera": extraction.camera, "frame": extraction.frame, "technique": technique, "notes": notes}
+    facts = {
+        "camera": extraction.picture.camera,
+        "frame": extraction.picture.frame,
+        "technique": technique,
+        "notes": notes,
+    }
     return LightPictures(tuple(rows), layers, alpha, facts)
 
 
@@ -175,7 +180,7 @@ def _layers(kept: RelightData, table, members: list[list[int]], report) -> np.nd
     layers = np.zeros((len(members), extraction.film.height, extraction.film.width, 3), np.float32)
     for name in passes:
         for group, values in zip(lit.groups, getattr(lit, name), strict=True):
-            image = extraction.film.image(extraction.exposure * values)
+            image = extraction.film.image(extraction.picture.exposure * values)
             layers[int(group)] += kept.shown(name) * image
     return layers
 

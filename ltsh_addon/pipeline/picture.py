@@ -161,7 +161,7 @@ def make_picture(options: PictureOptions, with_cycles: bool, progress: Progress 
 
     Raises as `shade_scene` does.
     """
-    from ..blender.process.blender_process import kept_blender
+    from ..blender.process.blender_process import shared_blender
 
     if with_cycles and options.cycles_samples < 2:
         raise ValueError(f"cycles_samples is {options.cycles_samples}, expected at least 2: one for each half")
@@ -174,7 +174,7 @@ def make_picture(options: PictureOptions, with_cycles: bool, progress: Progress 
         if not with_cycles:
             # One Blender for both: it extracts the samples and makes the PNG of the picture.
             folder = stack.enter_context(temporary_folder())
-            stack.enter_context(kept_blender(folder))
+            stack.enter_context(shared_blender(folder))
         extraction = _extracted(options, with_cycles, progress)
         shadows = None
         if extraction.occluders is not None:
@@ -192,7 +192,7 @@ def make_picture(options: PictureOptions, with_cycles: bool, progress: Progress 
         kept = lighting.write_relight_data(extraction, shadows, options, path)
         files += [path.relative_to(output).as_posix() for path in kept]
     techniques = {name: result.seconds for name, result in results.items()}
-    seconds = {**extraction.seconds, "techniques": techniques, "total": time.perf_counter() - start}
+    seconds = {**extraction.times.stages, "techniques": techniques, "total": time.perf_counter() - start}
     if shadows is not None:
         seconds["shadows"] = shadows.seconds
     return TaskResult(report, seconds, tuple(files))
@@ -200,23 +200,23 @@ def make_picture(options: PictureOptions, with_cycles: bool, progress: Progress 
 
 def _extracted(options: PictureOptions, with_cycles: bool, progress):
     """The `Extraction` of a scene: samples and lights, with Cycles' picture where asked for."""
-    from ..blender.process import client
+    from ..blender.process.pixels import PixelJob, extract_pixels
 
     width, height = options.resolution or (None, None)
     samples = options.cycles_samples if with_cycles else 0
     rest = set(PASSES) <= set(options.passes)
-    job = child_job(client.ExtractOptions, options, width=width, height=height, cycles_samples=samples, rest=rest)
-    return client.extract(job, progress=progress)
+    job = child_job(PixelJob, options, width=width, height=height, cycles_samples=samples, rest=rest)
+    return extract_pixels(job, progress=progress)
 
 
 def _shown(comparison: Comparison, folder: Path, progress) -> bytes:
     """PNG bytes of the most accurate picture, through the view transform of its scene; `folder` is temporary."""
-    from ..blender.process import client
+    from ..blender.process.finished import PICTURE, show_finished
 
     options = comparison.options
     pixels = comparison.whole(most_accurate(comparison.results))
-    save_array(folder / client.PICTURE, pixels.astype(np.float32))
-    client.show_finished(Path(options.scene), (None, options.frame), folder, SHOWN, progress=progress)
+    save_array(folder / PICTURE, pixels.astype(np.float32))
+    show_finished(Path(options.scene), None, options.frame, folder, SHOWN, progress=progress)
     return (folder / SHOWN).read_bytes()
 
 
@@ -314,7 +314,7 @@ class Comparison:
     """The results of one scene, ready to be measured and written."""
 
     options: PictureOptions
-    extraction: Any  # blender.process.client.Extraction, which the core does not import
+    extraction: Any  # blender.process.pixels.Extraction, which the core does not import
     results: dict[str, TechniqueResult]
     shadows: lighting.Shadows | None = None
 
@@ -334,12 +334,12 @@ class Comparison:
     @property
     def cycles(self) -> dict[str, np.ndarray]:
         """The two halves (2, H, W, 3) of Cycles' picture per pass; empty without a Cycles reference."""
-        return self.extraction.reference or {}
+        return self.extraction.cycles.reference or {}
 
     @cached_property
     def rest(self) -> np.ndarray | None:
         """The picture (H, W, 4) without reflected light: emission, lights in sight, background; None if unknown."""
-        return None if self.extraction.background is None else self.extraction.rest
+        return None if self.extraction.cycles.background is None else self.extraction.rest
 
     def whole(self, name: str) -> np.ndarray:
         """The whole picture (H, W, 4) of a technique: the sum of its passes, plus `rest` where that is known."""
@@ -365,7 +365,7 @@ class Comparison:
         return self._exposed(result.shading, pass_name)
 
     def _exposed(self, shaded: shading.Shading, pass_name) -> np.ndarray:
-        return self.extraction.exposure * getattr(shaded, pass_name)
+        return self.extraction.picture.exposure * getattr(shaded, pass_name)
 
     def _image(self, result, values) -> np.ndarray:
         return self._film_of(result).image(values)
@@ -386,19 +386,19 @@ class Comparison:
         extraction, options = self.extraction, self.options
         return {
             "scene": str(options.scene),
-            "camera": extraction.camera,
-            "frame": extraction.frame,
+            "camera": extraction.picture.camera,
+            "frame": extraction.picture.frame,
             "resolution": [self.film.width, self.film.height],
-            "border": None if extraction.border is None else vars(extraction.border),
-            "pixel_aspect": extraction.pixel_aspect,
-            "pixel_filter": extraction.pixel_filter if self.film.sub_samples > 1 else "pixel centers",
-            "exposure": extraction.exposure,
-            "color_space": extraction.color_space.name,
+            "border": None if extraction.picture.border is None else vars(extraction.picture.border),
+            "pixel_aspect": extraction.picture.pixel_aspect,
+            "pixel_filter": extraction.picture.pixel_filter if self.film.sub_samples > 1 else "pixel centers",
+            "exposure": extraction.picture.exposure,
+            "color_space": extraction.picture.color_space.name,
             "sub_samples": self.film.sub_samples,
             "surface_samples": len(extraction.samples) if self.film.first is None else int(self.film.first.sum()),
             "cycles_samples": options.cycles_samples if self.cycles else 0,
             "lights": _light_reports(extraction.lights),
-            "versions": versions(extraction.blender_version),
+            "versions": versions(extraction.picture.blender_version),
             "tables": {name: _described(given) for name, given in technique_names(options.techniques).items()},
             "reference": self._reference_facts(),
             "shadows": None if self.shadows is None else self.shadows.report(),
@@ -439,7 +439,7 @@ class Comparison:
         result = self.results[name]
         report = {}
         if self.cycles:
-            image, rec709 = self.images[name, pass_name], self.extraction.color_space.rec709
+            image, rec709 = self.images[name, pass_name], self.extraction.picture.color_space.rec709
             report["against_cycles"] = against_cycles(image, self.cycles[pass_name], self._mask(result), rec709)
         reference = self.results.get(REFERENCE)
         if reference is not None and name != REFERENCE:
@@ -465,21 +465,21 @@ class Comparison:
         name = self.options.name or ("compare" if with_cycles else "shade")
         metadata = {
             "ltsh:scene": Path(self.options.scene).name,
-            "ltsh:frame": str(self.extraction.frame),
-            "ltsh:camera": self.extraction.camera,
+            "ltsh:frame": str(self.extraction.picture.frame),
+            "ltsh:camera": self.extraction.picture.camera,
             "ltsh:version": document["versions"]["ltsh"],
-            "ltsh:exposure": repr(self.extraction.exposure),
-            "ltsh:color_space": self.extraction.color_space.name,
+            "ltsh:exposure": repr(self.extraction.picture.exposure),
+            "ltsh:color_space": self.extraction.picture.color_space.name,
         }
-        if self.extraction.border is not None:
-            metadata["ltsh:border"] = str(self.extraction.border)
+        if self.extraction.picture.border is not None:
+            metadata["ltsh:border"] = str(self.extraction.picture.border)
         if notice := self._subset_notice():
             metadata["ltsh:reference"] = f"{notice}; elsewhere zero"
         layers, sheet = self.layers(), self.sheet() if with_cycles else None
-        chromaticities = imaging.chromaticities(self.extraction.color_space)
+        chromaticities = imaging.chromaticities(self.extraction.picture.color_space)
         files = [f"{name}.exr", *([f"{name}.png", self.options.page] if with_cycles else [])]
         (output / files[0]).parent.mkdir(parents=True, exist_ok=True)
-        imaging.write_layers(output / files[0], layers, metadata, chromaticities, self.extraction.pixel_aspect)
+        imaging.write_layers(output / files[0], layers, metadata, chromaticities, self.extraction.picture.pixel_aspect)
         if with_cycles:
             imaging.write_png(output / files[1], sheet)
             imaging.write_html(output, self.options.page, files[1], files[0], document)
@@ -569,7 +569,7 @@ class Comparison:
     def _sheet_of(self, passes: tuple[str, ...]) -> np.ndarray:
         """The sheet of the sum of `passes`."""
         halves = sum(self.cycles[name] for name in passes)
-        mean, rec709 = halves.mean(axis=0), self.extraction.color_space.rec709
+        mean, rec709 = halves.mean(axis=0), self.extraction.picture.color_space.rec709
         hit, tiles = self.film.coverage() > 0.0, []
         # The picture of all passes also shows the background and lights in sight. Its errors are those of the light.
         behind = 0.0 if self.rest is None or len(passes) == 1 else self.rest[..., :3]

@@ -89,7 +89,7 @@ def _relit(path: Path, place: Path, wanted, output: Path, progress) -> dict:
     if kept.rest:
         groups = [repr(group) for group in kept.rest if group]
         warnings += (SAME_REST.format(BUT_GROUPS.format(listed(groups)) if groups else ""),)
-        warnings += (GRAIN,) if kept.extraction.has_lens else ()
+        warnings += (GRAIN,) if kept.extraction.picture.has_lens else ()
         name = kept.technique
         rest = _changed_rest(kept, lights, tables[name], results[name].shading, progress)
         extraction = replace(extraction, warnings=warnings)

@@ -95,7 +95,7 @@ class Finished:
     seconds: dict[str, Any]
     relight_data: dict[str, dict[str, np.ndarray]]  # `rest`, `taken` and `edges` of a RelightData
     comparison: picture.Comparison
-    cycles: Any  # blender.process.client.CyclesPicture
+    cycles: Any  # blender.process.finished.CyclesPicture
 
 
 def render_scene(options: RenderOptions, progress: Progress | None = None) -> dict:
@@ -111,13 +111,13 @@ def render_scene(options: RenderOptions, progress: Progress | None = None) -> di
 
 def make_finished(options: RenderOptions, progress: Progress | None = None) -> picture.TaskResult:
     """Finish one picture and write its files but report.json. Raises as `render_scene` does."""
-    from ..blender.process import client
-    from ..blender.process.blender_process import kept_blender
+    from ..blender.process.blender_process import shared_blender
+    from ..blender.process.finished import PICTURE, show_finished
 
-    with temporary_folder() as folder, kept_blender(folder):
+    with temporary_folder() as folder, shared_blender(folder):
         made = finish(options, progress)
-        save_array(folder / client.PICTURE, made.combined.astype(np.float32))
-        client.show_finished(Path(options.scene), (None, options.frame), folder, picture.SHOWN, progress=progress)
+        save_array(folder / PICTURE, made.combined.astype(np.float32))
+        show_finished(Path(options.scene), None, options.frame, folder, picture.SHOWN, progress=progress)
         shown = (folder / picture.SHOWN).read_bytes()
     if progress is not None and progress("write", 0.0) is False:
         raise Cancelled("stopped before the files were written")
@@ -147,20 +147,20 @@ def finish(
 
     `shaded` is called with the direct light before Cycles begins.
     """
-    from ..blender.process import client
-    from ..blender.process.blender_process import kept_blender
+    from ..blender.process.blender_process import shared_blender
+    from ..blender.process.finished import FinishedJob, render_finished
 
     start, clock = time.perf_counter(), _ProcessorClock()
     where = {"scene_name": scene_name, "view_layer": view_layer}
-    with temporary_folder() as folder, kept_blender(folder):
+    with temporary_folder() as folder, shared_blender(folder):
         comparison = _ours(options, where, clock, progress)
         shaded(comparison)
         seconds = _left(options, comparison.extraction, clock)
         width, height = options.resolution or (None, None)
-        edges = not (comparison.extraction.has_lens or comparison.extraction.left_to_cycles.everything)
+        edges = not (comparison.extraction.picture.has_lens or comparison.extraction.left_to_cycles.everything)
         own = {"width": width, "height": height, "seconds": seconds, "edges": edges}
-        job = child_job(client.FinishedJob, options, **where, **own)
-        cycles = client.render_finished(job, folder, progress=progress)
+        job = child_job(FinishedJob, options, **where, **own)
+        cycles = render_finished(job, folder, progress=progress)
         clock.end("cycles", cycles.processor_seconds)
         ours = _taken(comparison, cycles, options.denoise == "on")
         rest, of_edges, rests, denoiser, problems = _rest(
@@ -179,7 +179,7 @@ def finish(
             )
         report["warnings"] += _too_long(options, comparison.extraction, cycles, clock)
         seconds = {
-            **comparison.extraction.seconds,
+            **comparison.extraction.times.stages,
             "techniques": {name: result.seconds for name, result in comparison.results.items()},
             "processor": {**clock.stages, "total": clock.seconds()},
             "total": time.perf_counter() - start,
@@ -206,7 +206,7 @@ def _too_long(options: RenderOptions, extraction, cycles, clock: _ProcessorClock
     if options.budget is None or took <= MOST_OVER * options.budget:
         return []
     # The least is to start Blender, open the file, render the first samples of Cycles, and denoise.
-    least = extraction.processor_seconds - extraction.direct_seconds + cycles.least_seconds + clock.stages["denoise"]
+    least = extraction.times.processor - extraction.times.direct + cycles.least_seconds + clock.stages["denoise"]
     if least > options.budget:
         found = f"takes at least {least:.1f} s of processor time, however few samples, and took {took:.1f} s"
     else:
@@ -250,7 +250,7 @@ class _ProcessorClock:
 
 def _ours(options: RenderOptions, where: dict, clock: _ProcessorClock, progress) -> picture.Comparison:
     """The direct light by the technique, with shadows; without results where all of it is left to Cycles."""
-    from ..blender.process import client
+    from ..blender.process.pixels import PixelJob, ended_at_horizons, extract_pixels, with_points
 
     tables = picture.load_tables(options.techniques)
     width, height = options.resolution or (None, None)
@@ -261,30 +261,30 @@ def _ours(options: RenderOptions, where: dict, clock: _ProcessorClock, progress)
     size = {"width": width, "height": height, "seconds": options.budget, "sub_samples": first}
     size |= {"reserve": LAST_SECONDS / 1e6}
     size |= {"cycles_samples": 0, "for_finished": True, "edge_points": EDGE_POINTS}
-    job = child_job(client.ExtractOptions, own, **where, **size)
-    extraction = client.extract(job, progress=progress)
-    clock.end("extraction", extraction.processor_seconds)
+    job = child_job(PixelJob, own, **where, **size)
+    extraction = extract_pixels(job, progress=progress)
+    clock.end("extraction", extraction.times.processor)
     if not extraction.lights or extraction.left_to_cycles.everything:
         return picture.Comparison(own, extraction, {}, None)
     with lighting.ShadowTracer(extraction.occluders, extraction.lights, extraction.origin) as tracer:
         how = _How(options, own, tables, tracer)
-        looked = clock.seconds() - (extraction.processor_seconds - extraction.direct_seconds)
+        looked = clock.seconds() - (extraction.times.processor - extraction.times.direct)
         number, reason = how.affordable(extraction, _left(options, extraction, clock), looked)
         clock.end("choice")
         if reason:
             kept = replace(extraction.left_to_cycles, everything=(*extraction.left_to_cycles.everything, reason))
             return picture.Comparison(own, replace(extraction, left_to_cycles=kept), {}, None)
         if number > extraction.film.sub_samples:
-            extraction = client.extract(replace(job, sub_samples=number, seconds=None), progress=progress)
-            clock.end("extraction", extraction.processor_seconds)
-        extraction = client.ended(client.with_points(extraction, number))
+            extraction = extract_pixels(replace(job, sub_samples=number, seconds=None), progress=progress)
+            clock.end("extraction", extraction.times.processor)
+        extraction = ended_at_horizons(with_points(extraction, number))
         clock.end("extraction")
         shadows = how.shadows(extraction, progress)
         clock.end("shadows")
         results = picture.evaluated(tables, extraction, shadows, own, progress)
         clock.end("shading")
         comparison = picture.Comparison(own, extraction, results, shadows)
-        if extraction.finer is not None:
+        if extraction.points.finer is not None:
             left, took = _left(options, extraction, clock), clock.stages["shadows"] + clock.stages["shading"]
             more = MOST_FINER if left is None else min(FINER_SHARE * left / took, MOST_FINER)
             comparison = how.with_fine_edges(comparison, more, progress)
@@ -304,7 +304,7 @@ class _How:
     def shadows(self, extraction, progress=None) -> lighting.Shadows:
         """The shares of the lights that the samples see. Points of a pixel that see about the same have common rays."""
         samples, film, place = extraction.samples, extraction.film, slice(None)
-        if not extraction.has_lens:
+        if not extraction.picture.has_lens:
             samples, film, place = with_one_shadow(samples, film)
         rays = lighting.rays_of_samples(_rays(self.options, replace(extraction, samples=samples, film=film)), film)
         return self.tracer.trace(samples, ShadowSampling(PASSES, rays, film), progress=progress).take(place)
@@ -315,20 +315,20 @@ class _How:
 
         `look` has the first points, for which it took `looked` seconds.
         """
-        from ..blender.process import client
+        from ..blender.process.pixels import EDGE_SECONDS, TOO_THIN, too_small, with_points
 
         points, most = look.film.sub_samples, self.own.sub_samples
-        whole = client.with_points(look, points)
+        whole = with_points(look, points)
         if seconds is None or len(whole.samples) == 0:
             return points, ""
-        reason = client.too_small(self.options.budget)
+        reason = too_small(self.options.budget)
         # Cycles will look at the scene half as long as was done here, and render what shines in sight.
-        seconds -= 0.5 * look.direct_seconds + client.EDGE_SECONDS * look.film.width * look.film.height / 1e6
+        seconds -= 0.5 * look.times.direct + EDGE_SECONDS * look.film.width * look.film.height / 1e6
         if seconds <= 0.0:
             return 0, reason
-        one = np.count_nonzero(look.point == 0)
+        one = np.count_nonzero(look.points.number == 0)
         # All points of a pixel but the first make about equally many samples.
-        counts = np.arange(1, max(points, most) + 1) if not look.has_lens else np.array([points])
+        counts = np.arange(1, max(points, most) + 1) if not look.picture.has_lens else np.array([points])
         samples = one + (counts - 1) * (len(whole.samples) - one) / max(points - 1, 1)
         again = np.where(counts > points, looked * (1.0 + counts / points), 0.0)
         allowed = np.where(counts > points, MORE_SHARE, DIRECT_SHARE) * seconds - again
@@ -340,7 +340,7 @@ class _How:
         fits = counts[took * (samples / number) ** power <= share * allowed]
         if len(fits) == 0:
             return 0, reason
-        return (0, client.TOO_THIN) if thin > THIN else (int(fits[-1]), "")
+        return (0, TOO_THIN) if thin > THIN else (int(fits[-1]), "")
 
     def _probe(self, extraction, share: float) -> tuple[int, float, float, float]:
         """Shades a few squares of the picture that have a `share` of its samples. Returns
@@ -349,7 +349,7 @@ class _How:
         - by how much specular light differs among the points of a pixel, relative to the light (root mean squares),
         - the share of the light that is not too noisy.
         """
-        from ..blender.process import client
+        from ..blender.process.pixels import ended_at_horizons
 
         film, start = extraction.film, time.process_time()
         row, column = np.divmod(film.pixel, film.width)
@@ -357,7 +357,7 @@ class _How:
         chosen = np.random.default_rng(round(1.0 / share)).permutation(film.width * film.height)
         count = np.cumsum(np.bincount(square, minlength=len(chosen))[chosen])
         there = np.isin(square, chosen[: 1 + np.searchsorted(count, share * len(square))])
-        part = client.ended(replace(extraction, samples=extraction.samples.take(there), film=film.take(there)))
+        part = ended_at_horizons(replace(extraction, samples=extraction.samples.take(there), film=film.take(there)))
         shadows = self.shadows(part)
         results = picture.evaluated(self.tables, part, shadows, self.own, None)
         images = picture.Comparison(self.own, part, results, shadows).images
@@ -389,7 +389,7 @@ class _How:
         if not chosen.any():
             return comparison
         pixels = {"pixel": pixel[chosen], "number": number[chosen]}
-        samples, own, replaced = self.tracer.finer(extraction.samples, film, extraction.finer, pixels)
+        samples, own, replaced = self.tracer.finer(extraction.samples, film, extraction.points.finer, pixels)
         if len(samples) == 0:
             return comparison
         fine = replace(extraction, samples=samples, film=own)
@@ -511,7 +511,7 @@ def _of_points(film, radiance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _seen(extraction, result, name: str) -> np.ndarray:
     """The exposed radiance (P,) of a pass: the sum over light groups, the mean over color channels."""
-    return extraction.exposure * getattr(result.shading, name).sum(axis=0).mean(axis=-1)
+    return extraction.picture.exposure * getattr(result.shading, name).sum(axis=0).mean(axis=-1)
 
 
 def _around(image: np.ndarray, around: int = AROUND) -> np.ndarray:
@@ -546,18 +546,18 @@ def _taken(comparison: picture.Comparison, cycles, is_denoised: bool) -> dict[st
         if result is not None and not keeps_all:
             is_taken = ~kept.by_pass[name]
             # With depth of field ours is denoised too, so its noise does not matter.
-            if is_denoised and not comparison.extraction.has_lens:
+            if is_denoised and not comparison.extraction.picture.has_lens:
                 certain = _certain(comparison.shadows, name)
             image = comparison.images[next(iter(comparison.results)), name]
-            if is_denoised and not comparison.extraction.has_lens and name == "specular":
+            if is_denoised and not comparison.extraction.picture.has_lens and name == "specular":
                 radiance = _seen(comparison.extraction, result, name)
                 certain = certain * _beside_points(comparison.film, radiance, (light * color).mean(axis=-1))
-            elif is_denoised and not comparison.extraction.has_lens:
+            elif is_denoised and not comparison.extraction.picture.has_lens:
                 of_cycles = _share_of(certain, light.astype(np.float64) * color)
                 weight = _beside(certain[..., None] * image, of_cycles)
                 weight = np.where(comparison.film.has_more(), 1.0, weight)
             share = np.where(is_taken, certain * weight, 0.0)
-            values = comparison.extraction.exposure * getattr(result.shading, name)
+            values = comparison.extraction.picture.exposure * getattr(result.shading, name)
             own = map(comparison.film.image, values) if len(values) > 1 else (image,)
             groups = {group: _share_of(share, one) for group, one in zip(result.shading.groups, own, strict=True)}
             image = _share_of(share, image)
@@ -579,7 +579,7 @@ def _rest(
 
     if progress is not None and progress("denoise", 0.0) is False:
         raise Cancelled("stopped before the picture was denoised")
-    rest, is_noisy = read_layer(cycles.channels, "Combined", "RGBA").astype(np.float64), extraction.has_lens
+    rest, is_noisy = read_layer(cycles.channels, "Combined", "RGBA").astype(np.float64), extraction.picture.has_lens
     shining = _shining(cycles, extraction)
     # Once without and once with Cycles' direct diffuse light, of which edges need a part.
     taken = np.stack([ours["specular"].is_taken, ours["diffuse"].is_taken, shining.is_taken], axis=-1)
@@ -614,13 +614,13 @@ def _rest(
 def _shining(cycles, extraction) -> _DirectPass:
     """What shines in sight, on the pixels where it can stay out of the denoiser: not behind surfaces that light passes,
     where it is noisy."""
-    names = {key: cycles.names[key] for key in cycles.shining}
+    names = {key: cycles.names[key] for key in cycles.smooth_emission}
     own = sum((read_layer(cycles.channels, name, "RGB") for name in names.values()), np.zeros((1, 1, 3)))
     kept = extraction.left_to_cycles
     is_hidden = np.logical_and.reduce([*kept.by_pass.values()])
-    if not names or extraction.has_lens or cycles.everything or kept.everything:
+    if not names or extraction.picture.has_lens or cycles.everything or kept.everything:
         is_hidden = np.ones_like(is_hidden)
-    image = sum(cycles.shining.values(), np.zeros_like(own))
+    image = sum(cycles.smooth_emission.values(), np.zeros_like(own))
     image = np.where(is_hidden[..., None], 0.0, image)
     return _DirectPass(image, {}, ~is_hidden, np.ones(is_hidden.shape), own, np.ones(3))
 
@@ -739,17 +739,19 @@ def _write_exr(path: Path, made: Finished, options: RenderOptions) -> None:
     extraction = made.comparison.extraction
     metadata = {
         "ltsh:scene": Path(options.scene).name,
-        "ltsh:frame": str(extraction.frame),
-        "ltsh:camera": extraction.camera,
+        "ltsh:frame": str(extraction.picture.frame),
+        "ltsh:camera": extraction.picture.camera,
         "ltsh:version": made.report["versions"]["ltsh"],
-        "ltsh:exposure": repr(extraction.exposure),
-        "ltsh:color_space": extraction.color_space.name,
+        "ltsh:exposure": repr(extraction.picture.exposure),
+        "ltsh:color_space": extraction.picture.color_space.name,
     }
     planes = {}
     for name, pixels in {picture.COMBINED: made.combined, **made.ours, REST: made.rest}.items():
         planes |= imaging.Layer(pixels).planes(name)
     planes |= made.channels
-    write_channels(path, planes, metadata, imaging.chromaticities(extraction.color_space), extraction.pixel_aspect)
+    write_channels(
+        path, planes, metadata, imaging.chromaticities(extraction.picture.color_space), extraction.picture.pixel_aspect
+    )
 
 
 def summary(report: dict, seconds: dict) -> list[str]:

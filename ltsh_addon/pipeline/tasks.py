@@ -115,7 +115,7 @@ def tasks_of(job: BatchJob, progress=None) -> list[BatchTask]:
 
     Raises NameClash where two tasks would write the same file, or a name is too long, SceneError, OSError.
     """
-    from ..blender.process.client import check_readable
+    from ..blender.process.blend_file import check_readable
 
     for scene in job.scenes:
         check_readable(Path(scene))
@@ -144,7 +144,7 @@ def shard_of(tasks: list[BatchTask], shard: tuple[int, int]) -> list[BatchTask]:
 
 def _facts(job, scene, progress) -> list[dict]:
     """Facts of the file per frame: camera, frame, objects and tiles. Empty dicts where none are needed."""
-    from ..blender.process import client
+    from ..blender.process.bake import scene_facts
 
     fields = fields_of(job.pattern)
     unknown = ("camera" in fields and not job.cameras) or ("frame" in fields and not job.frames)
@@ -152,7 +152,7 @@ def _facts(job, scene, progress) -> list[dict]:
         return [{}] * max(len(job.frames), 1)
     objects, uv = (job.options.objects, job.options.uv) if job.command == "bake" else (None, None)
     frames, scripts = job.frames or (None,), job.options.scripts
-    return client.scene_facts(Path(scene), frames, objects, uv, scripts=scripts, progress=progress)
+    return scene_facts(Path(scene), frames, objects, uv, scripts=scripts, progress=progress)
 
 
 def _tasks(job, unit, fields, facts, contents) -> list[BatchTask]:

@@ -25,20 +25,20 @@ def draw_view(options: ViewOptions, progress: Progress | None = None) -> picture
     The seconds have "draw": the median of a redraw with the first technique, without rays; "shadows": all rays; and
     "refined": all `refine` redraws and the rays. Raises SceneError, TableError, OSError, Cancelled.
     """
-    from ..blender.process import client
+    from ..blender.process.view import VIEW_PASSES, VIEW_PNG, ViewJob, draw_view
 
     start = time.perf_counter()
     tables = picture.prepare(options)
     width, height = options.resolution or (None, None)
     given = tuple(name if name in SHIPPED_TABLES else str(Path(name).absolute()) for name in options.techniques)
-    job = child_job(client.ViewJob, options, width=width, height=height, techniques=given)
+    job = child_job(ViewJob, options, width=width, height=height, techniques=given)
     with temporary_folder() as folder:
-        manifest = client.draw_view(job, folder, progress=progress)
+        manifest = draw_view(job, folder, progress=progress)
         pictures = {
-            name: {part: np.load(folder / f"{number}_{part}.npy") for part in client.VIEW_PASSES}
+            name: {part: np.load(folder / f"{number}_{part}.npy") for part in VIEW_PASSES}
             for number, name in enumerate(tables)
         }
-        shown = (folder / client.VIEW_PNG).read_bytes()
+        shown = (folder / VIEW_PNG).read_bytes()
     if progress is not None and progress("write", 0.0) is False:
         raise Cancelled("stopped before the files were written")
     coverage = next(iter(pictures.values()))["diffuse"][..., 3]

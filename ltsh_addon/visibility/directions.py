@@ -22,8 +22,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..cycles.horizons import SMALLEST_ALPHA, lobe_chances
-from ..cycles.light_tree import light_chances, light_rows
+from ..cycles.horizons import SMALLEST_ALPHA, lobe_selection_pmf
+from ..cycles.light_tree import light_selection_pmf, light_tree_rows
 from ..emitters import light_profile, light_tree
 from ..lobes import brdf
 from ..lobes.lookup_table import WARP_REGULARIZATION
@@ -740,9 +740,9 @@ class Choices:
         self._hit = np.concatenate([np.zeros(min(len(samples), 1), int), np.cumsum(moved)])
         self._count = np.bincount(self._hit)
         self._first = np.cumsum(self._count) - self._count
-        self._lobes = lobe_chances(samples, self._hit, is_baked=False)
+        self._lobes = lobe_selection_pmf(samples, self._hit, is_baked=False)
         self._chances = np.full((len(self._lights), len(samples)), np.nan, np.float32)
-        self._rows = light_rows(self._lights)
+        self._rows = light_tree_rows(self._lights)
 
     def by_surface(self, name: str, number: int, index, directions, solid_angle) -> np.ndarray:
         """Share (R,) of the light of light `number` that a pass gets because the surface chose the unit directions
@@ -757,7 +757,7 @@ class Choices:
         unknown = np.unique(index[np.isnan(self._chances[number, index])])
         if len(unknown):
             position, normal = self._samples.position[unknown], self._samples.smooth_normal[unknown]
-            self._chances[:, unknown] = light_chances(position, normal, self._lights, self._rows)
+            self._chances[:, unknown] = light_selection_pmf(position, normal, self._lights, self._rows)
         return self._chances[number, index]
 
     def _density(self, name, index, directions):

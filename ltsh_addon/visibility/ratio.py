@@ -23,7 +23,7 @@ from ..emitters.facing import FacingDisk, emission, ray_length
 from ..emitters.light_polygons import LEAST_COSINE, LOBE_WIDTH, has_lobe, may_reach, off_plane
 from ..lobes.brdf import dielectric_reflectance, schlick_curve, stretch
 from ..lobes.diffuse import diffuse_factor
-from ..scene import FARTHEST, PASSES, AreaLight, Film, Progress, SurfaceSamples, round_outline
+from ..scene import FARTHEST, PASSES, AreaLight, Cancelled, Film, Progress, SurfaceSamples, round_outline
 from ..workers.pool import WorkerPool
 from .directions import (
     Choices,

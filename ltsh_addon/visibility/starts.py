@@ -129,8 +129,8 @@ class Starts:
     @classmethod
     def empty(cls, count: int) -> Starts:
         """Room for those of `count` samples, see `put`."""
-        vectors = (np.zeros((count, 3), np.float32) for _ in range(3))
-        return cls(*vectors, np.zeros(count, np.float32), np.zeros((2, count, 3), np.float32), np.zeros(count, np.float32))
+        vectors, numbers = np.zeros((5, count, 3), np.float32), np.zeros((2, count), np.float32)
+        return cls(*vectors[:3], numbers[0], vectors[3:], numbers[1])
 
     def put(self, block: slice, values: Starts) -> None:
         """Set those of the samples of a block."""

@@ -95,13 +95,15 @@ class WorkerPool:
             self._run = run
             self.changed.notify_all()
         try:
-            while run.done < count:
+            done = 0
+            while done < count:
                 number = run.next()
                 if number is None:
                     run.wait(PATIENCE_SECONDS)
                 else:
                     run.finish(number, task.do(job(number), self._context))
-                yield run.done
+                done = run.done
+                yield done
         finally:
             run.stop()
 

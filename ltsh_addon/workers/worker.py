@@ -18,6 +18,7 @@ import tempfile
 import traceback
 import uuid
 from pathlib import Path
+from pickle import Pickler
 
 PACKAGE_FOLDER = Path(__file__).resolve().parents[1]
 # Name of the package in this process: its folder's name, except in the parent, where Blender may use another name.
@@ -77,17 +78,11 @@ class SharedMemory:
             self._file.close()
 
 
-class _Pickler(pickle.Pickler):
-    """Puts aside large arrays. Of an array that repeats one value, that value is sent; equal views are sent once."""
+class _Pickler(Pickler):
+    """Sends the value alone of an array that repeats one value, and equal views once."""
 
-    def __init__(self, file, buffers: list | None):
-        def goes_along(buffer) -> bool:
-            if buffer.raw().nbytes < SMALLEST:
-                return True
-            buffers.append(buffer.raw())
-            return False
-
-        super().__init__(file, pickle.HIGHEST_PROTOCOL, buffer_callback=None if buffers is None else goes_along)
+    def __init__(self, file, buffer_callback):
+        super().__init__(file, pickle.HIGHEST_PROTOCOL, buffer_callback=buffer_callback)
         self._views: dict[tuple, object] = {}
 
     def reducer_override(self, value):
@@ -103,8 +98,14 @@ class _Pickler(pickle.Pickler):
 
 def packed(message, buffers: list | None = None) -> bytes:
     """A pickle of a message. Large arrays are appended to `buffers` if there is such a list."""
+
+    def is_small(buffer) -> bool:
+        if buffer.raw().nbytes >= SMALLEST:
+            buffers.append(buffer.raw())
+        return buffer.raw().nbytes < SMALLEST
+
     stream = io.BytesIO()
-    _Pickler(stream, buffers).dump(message)
+    _Pickler(stream, None if buffers is None else is_small).dump(message)
     return stream.getvalue()
 
 

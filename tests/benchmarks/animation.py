@@ -27,7 +27,7 @@ import finished  # noqa: E402
 import measure  # noqa: E402
 
 from ltsh_addon import imaging  # noqa: E402
-from ltsh_addon.blender.process.blender_process import kept_blender  # noqa: E402
+from ltsh_addon.blender.process.blender_process import shared_blender  # noqa: E402
 
 # Of either process, from the second quarter of the time to the last; a picture per frame would be 240 MiB and more.
 MOST_GROWTH = 16.0
@@ -112,7 +112,7 @@ def _flicker_of_ours(folder: Path) -> float:
 
 def _flicker_of_cycles(scene: Path, folder: Path, seconds: float) -> float:
     """Of as many samples as the seconds of a frame of ours allow, the start of Blender and denoising left out."""
-    with kept_blender(folder):
+    with shared_blender(folder):
         seeds = [finished.seeded(scene, number + 1) for number in range(CYCLES_FRAMES)]
         return _deviation(finished.by_cycles(seed, folder, seconds=seconds + finished.START)[0] for seed in seeds)
 

@@ -6,6 +6,7 @@ python tests/benchmarks/finished.py picture        the first picture of the READ
 
 import itertools
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -18,8 +19,9 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT)]
 
 from ltsh_addon import imaging  # noqa: E402
-from ltsh_addon.blender.process import client  # noqa: E402
-from ltsh_addon.blender.process.blender_process import denoiser_libraries, kept_blender  # noqa: E402
+from ltsh_addon.blender.process.blender_process import denoiser_libraries, shared_blender  # noqa: E402
+from ltsh_addon.blender.process.finished import FinishedJob, render_finished  # noqa: E402
+from ltsh_addon.cli.commands import DEMO_SCENE  # noqa: E402
 from ltsh_addon.cycles.lobes import read_layer  # noqa: E402
 from ltsh_addon.imaging.denoise import open_denoiser  # noqa: E402
 from ltsh_addon.pipeline import RenderOptions, render  # noqa: E402
@@ -36,7 +38,7 @@ OTHER_SEED = 7919  # of the truth, so that no noise is shared
 def build(name: str, path: Path) -> None:
     """The .blend of a scene."""
     if name == "demo":
-        client.build_demo(path)
+        shutil.copy(DEMO_SCENE, path)
         return
     script = Path(__file__).with_name("finished_scenes.py")
     subprocess.run([sys.executable, str(script), name, str(path)], check=True, stdout=subprocess.DEVNULL)
@@ -46,11 +48,11 @@ def by_cycles(path: Path, folder: Path, *, samples=None, seconds=None, denoise=T
     """What Cycles alone makes (H, W, 3), processor seconds with the start of Blender, samples."""
     own = Path(tempfile.mkdtemp(dir=folder))
     start = time.process_time()
-    with kept_blender(own):
+    with shared_blender(own):
         # As much as starting Blender, opening the file and denoising take.
         left = None if seconds is None else max(seconds - START, 0.1)
-        job = client.FinishedJob(path, None, None, None, None, *SIZE, samples, left, edges=False)
-        made = client.render_finished(job, own)
+        job = FinishedJob(path, None, None, None, None, *SIZE, samples, left, edges=False)
+        made = render_finished(job, own)
     image = read_layer(made.channels, "Combined", "RGB")
     if denoise:
         albedo, normal = (read_layer(made.guides, *guide) for guide in (render.ALBEDO, render.NORMAL))
@@ -64,7 +66,7 @@ START = 1.4
 
 def ours(path: Path, folder: Path, **options) -> tuple[np.ndarray, dict, dict]:
     """What `ltsh render` makes, its seconds and its report."""
-    with kept_blender(folder):
+    with shared_blender(folder):
         made = render.finish(RenderOptions(path, output=folder, resolution=SIZE, **options))
     return made.combined[..., :3], made.seconds["processor"], made.report
 

@@ -7,7 +7,6 @@ import argparse
 import os
 import subprocess
 import sys
-import tempfile
 import time
 from dataclasses import replace
 from functools import partial
@@ -26,6 +25,7 @@ from textbook_ltc import TextbookLtc  # noqa: E402
 from zonal_harmonics import ZonalHarmonics  # noqa: E402
 
 from ltsh_addon import shading  # noqa: E402
+from ltsh_addon.cli.commands import DEMO_SCENE  # noqa: E402
 from ltsh_addon.emitters import light_polygons  # noqa: E402
 from ltsh_addon.lobes import edge_integrals, moments32  # noqa: E402
 from ltsh_addon.lobes.polygon import project_to_sphere, split_at_horizon  # noqa: E402
@@ -253,30 +253,27 @@ def cpu_seconds():
 
 def cycles(options):
     """Time at equal error: the samples Cycles needs to come as close to the truth as ltsh4, times its time for one."""
-    from ltsh_addon.blender.process import client
+    from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels
 
     heading("time at equal error on the demo scene, ltsh4 against Cycles (specular)")
     count = 64 if options.quick else 128
-    with tempfile.TemporaryDirectory(prefix="ltsh-bench-") as folder:
-        scene = Path(folder) / "demo.blend"
-        client.build_demo(scene)
-        extraction = client.extract(client.ExtractOptions(scene, width=480, height=270, cycles_samples=count))
+    extraction = extract_pixels(PixelJob(DEMO_SCENE, width=480, height=270, cycles_samples=count))
     start = time.perf_counter()
     shaded = shading.shade(extraction.samples, extraction.lights, "ltsh4", passes=["specular"])
     shade_seconds = time.perf_counter() - start
     image = extraction.film.image(shaded.combined)
-    a, b = (half.astype(np.float64) for half in extraction.reference["specular"])
+    a, b = (half.astype(np.float64) for half in extraction.cycles.reference["specular"])
     energy = (a * b).sum()
     # Halves with different seeds: their noise cancels in the product, and their difference is nothing else.
     error = ((image - a) * (image - b)).sum() / energy
     noise = 0.25 * ((a - b) ** 2).sum() / energy
     needed = count * noise / max(error, 1e-12)
-    per_sample = extraction.seconds["cycles"] / count
-    ours = extraction.seconds["samples"] + shade_seconds
-    cycles = f"{count} samples in {extraction.seconds['cycles']:.1f} s, noise {noise**0.5:.2%}"
+    per_sample = extraction.times.stages["cycles"] / count
+    ours = extraction.times.stages["samples"] + shade_seconds
+    cycles = f"{count} samples in {extraction.times.stages['cycles']:.1f} s, noise {noise**0.5:.2%}"
     size = f"{len(extraction.samples)} samples, {len(extraction.lights)} lights"
     print(f"  Cycles: {cycles}")
-    print(f"  ltsh4: error {error**0.5:.2%}, sample extraction {extraction.seconds['samples']:.2f} s")
+    print(f"  ltsh4: error {error**0.5:.2%}, sample extraction {extraction.times.stages['samples']:.2f} s")
     print(f"         shading {shade_seconds:.2f} s ({size})")
     factor = f"{needed * per_sample / ours:.1f} x our time (target 20 x)"
     print(f"  Cycles needs {needed:.0f} samples, {needed * per_sample:.1f} s, for that error: {factor},")

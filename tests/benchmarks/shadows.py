@@ -10,6 +10,7 @@ import argparse
 import json
 import math
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -26,8 +27,9 @@ sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
 import measure  # noqa: E402
 
 from ltsh_addon import imaging, shading, visibility  # noqa: E402
-from ltsh_addon.blender.process import client  # noqa: E402
 from ltsh_addon.blender.process.blender_process import embree_libraries  # noqa: E402
+from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels  # noqa: E402
+from ltsh_addon.cli.commands import DEMO_SCENE  # noqa: E402
 from ltsh_addon.imaging.font import draw_text  # noqa: E402
 from ltsh_addon.pipeline import lighting  # noqa: E402
 from ltsh_addon.pipeline.options import PictureOptions  # noqa: E402
@@ -189,11 +191,9 @@ class Measured:
     def __init__(self, path, settings):
         self.settings = settings
         width, height = settings.size
-        options = client.ExtractOptions(
-            path, width=width, height=height, cycles_samples=settings.cycles_samples, shadows="on"
-        )
-        self.extraction = client.extract(options)
-        self.halves = self.extraction.reference
+        options = PixelJob(path, width=width, height=height, cycles_samples=settings.cycles_samples, shadows="on")
+        self.extraction = extract_pixels(options)
+        self.halves = self.extraction.cycles.reference
         self.mask = self.extraction.film.coverage() > 0.0
 
     @cached_property
@@ -250,7 +250,7 @@ class Measured:
         values = (np.broadcast_to(shares, getattr(radiance, name).shape[:2])[..., None] * getattr(radiance, name)).sum(
             0
         )
-        return self.extraction.exposure * self.extraction.film.image(values).astype(np.float64)
+        return self.extraction.picture.exposure * self.extraction.film.image(values).astype(np.float64)
 
     def error(self, image, other=None, name=None) -> Error:
         """Of images of a pass, or of their sum."""
@@ -484,7 +484,7 @@ def scene_file(name, folder) -> Path:
     """The file of a scene, built by a process of its own."""
     path = folder / f"{name}.blend"
     if name == "demo":
-        client.build_demo(path)
+        shutil.copy(DEMO_SCENE, path)
     else:
         run([sys.executable, Path(__file__).with_name("shadow_scenes.py"), name, path])
     return path

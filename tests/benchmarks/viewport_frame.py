@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import statistics
 import sys
-import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -25,10 +24,11 @@ import gpu
 import numpy as np
 import random_surfaces
 
-from ltsh_addon.blender import demo
+from ltsh_addon.blender.viewport.camera import ViewCamera
 from ltsh_addon.blender.viewport.mirror import SceneMirror
-from ltsh_addon.blender.viewport.renderer import ShownPicture, ViewRenderer
-from ltsh_addon.blender.viewport.surfaces import View
+from ltsh_addon.blender.viewport.pictures import ShownPicture
+from ltsh_addon.blender.viewport.renderer import ViewRenderer
+from ltsh_addon.cli.commands import DEMO_SCENE
 
 TECHNIQUES = ("ltc", "ltsh2", "ltsh4", "ltsh4c")
 # In times of ltc.
@@ -42,15 +42,14 @@ class Frames:
     """The example scene, ready to be drawn in `size` pixels."""
 
     def __init__(self, size):
-        with tempfile.TemporaryDirectory() as folder:
-            demo.build(Path(folder) / "demo.blend")
+        bpy.ops.wm.open_mainfile(filepath=str(DEMO_SCENE), load_ui=False)
         scene = bpy.context.scene
         depsgraph = bpy.context.evaluated_depsgraph_get()
         self.mirror = SceneMirror()
         self.mirror.sync(depsgraph)
         camera = scene.camera
         window = camera.calc_matrix_camera(depsgraph, x=size[0], y=size[1])
-        first = View.of(camera.matrix_world.inverted(), window, camera.data.type == "ORTHO")
+        first = ViewCamera.of(camera.matrix_world.inverted(), window, camera.data.type == "ORTHO")
         # A view that has moved: surfaces are drawn again.
         self.views = [first, replace(first, eye=first.eye + 1e-5)]
         self.size, self.renderer, self.moves = size, ViewRenderer(), 0

@@ -12,13 +12,13 @@ from ltsh_addon.scene import SceneError
 
 
 @pytest.fixture(scope="session", autouse=True)
-def kept_blender(tmp_path_factory):
+def shared_blender(tmp_path_factory):
     """One second Blender does the jobs of all tests but those that take `own_blender`.
 
     It goes on after a scene that it could not do, which saves its start.
     """
-    with blender_process.kept_blender(tmp_path_factory.mktemp("blender")):
-        process = blender_process._kept.get()
+    with blender_process.shared_blender(tmp_path_factory.mktemp("blender")):
+        process = blender_process._shared.get()
         end, process.end = process.end, lambda: isinstance(sys.exc_info()[1], SceneError) or end()
         yield
         process.end = end
@@ -27,10 +27,10 @@ def kept_blender(tmp_path_factory):
 @pytest.fixture
 def own_blender():
     """Jobs start a Blender of their own, as for users; no other one runs meanwhile."""
-    blender_process._kept.get().end()
-    token = blender_process._kept.set(None)
+    blender_process._shared.get().end()
+    token = blender_process._shared.set(None)
     yield
-    blender_process._kept.reset(token)
+    blender_process._shared.reset(token)
 
 
 @pytest.fixture

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from ltsh_addon import cli, imaging
-from ltsh_addon.blender.process import client
+from ltsh_addon.blender.process.blend_file import running
 from ltsh_addon.cli import progress
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -95,7 +95,7 @@ def newer_scene(header=b"BLENDER17-01v0999"):
     return data(header + NUMBERS.bytes(9999))
 
 
-NEWER = "was saved by Blender 9.99, but this is Blender {}[.]{}".format(*client.running())
+NEWER = "was saved by Blender 9.99, but this is Blender {}[.]{}".format(*running())
 SHADE_A = ["shade", "a.blend", "-o", "out"]
 
 # id: how to make which file (None: none is needed), the arguments, the exit code, what the line must say

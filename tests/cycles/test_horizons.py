@@ -9,7 +9,7 @@ from ltsh_addon.cycles import horizons
 from ltsh_addon.cycles.environment import CUBE
 from ltsh_addon.cycles.gbuffer import coarse_meshes
 from ltsh_addon.cycles.horizons import end_at_horizons_of_cycles
-from ltsh_addon.cycles.light_tree import light_chances, light_rows, own_bounds
+from ltsh_addon.cycles.light_tree import light_bounds_at, light_selection_pmf, light_tree_rows
 from ltsh_addon.scene import AreaLight, SurfaceSamples
 
 
@@ -69,7 +69,9 @@ def test_a_bake_leaves_more_to_the_lobe_than_a_picture():
     samples = replace(samples_near_the_horizon(0.3, (-0.99, 0.0, 0.14)), diffuse_albedo=np.full((4, 3), 1.0))
     lights, hit = (light_at(2.0, 0.6),), np.arange(4)
     shares = [
-        horizons.smooth_share(*horizons.horizon_excess(samples, lights, horizons.lobe_chances(samples, hit, baked)))
+        horizons.smooth_horizon_share(
+            *horizons.horizon_excess(samples, lights, horizons.lobe_selection_pmf(samples, hit, baked))
+        )
         for baked in (True, False)
     ]
     assert (shares[0] + 0.05 < shares[1]).all()
@@ -88,7 +90,7 @@ def test_chances_of_two_lights_are_those_of_their_irradiance_where_they_are_far_
         placed = {"center": toward * distance, "half_u": half * side, "half_v": half * np.cross(toward, side)}
         lights.append(replace(light, **placed, direction=-toward))
     expected = np.array([(number + 1) ** 2 * z / distance**2 for number, (*_, z, distance) in enumerate(places)])
-    found = light_chances(samples.position, samples.smooth_normal, tuple(lights))
+    found = light_selection_pmf(samples.position, samples.smooth_normal, tuple(lights))
     # The lights reach 0.34 degrees, of which the cosines' slopes make up to 1 %.
     assert np.allclose(found[:, 0], expected / expected.sum(), rtol=0.01)
 
@@ -99,7 +101,7 @@ def test_chances_of_lights_add_up(count, loses):
     generator = np.random.default_rng(count)
     normal = horizons.unit(generator.normal(size=(50, 3)))
     lights = tuple(replace(light_at(2.0, 0.2), center=generator.normal(size=3) + (4.0, 0.0, 0.0)) for _ in range(count))
-    sums = light_chances(np.zeros((50, 3)), normal, lights).sum(axis=0)
+    sums = light_selection_pmf(np.zeros((50, 3)), normal, lights).sum(axis=0)
     assert sums.max() < 1.0 + 1e-5 and (sums > 0.0).mean() > 0.4
     assert (sums[sums > 0.0].min() > 1.0 - 1e-5) != loses
 
@@ -183,7 +185,7 @@ def test_rectangles_stand_for_thousands_of_lights(monkeypatch):
     """They leave as much to the smooth horizon, but for 5 % of the light between the horizons, which is little."""
     generator = np.random.default_rng(3)
     samples, lights = samples_around(generator, 100), lights_around(generator, 1500)
-    chances = horizons.lobe_chances(samples, np.arange(100), False)
+    chances = horizons.lobe_selection_pmf(samples, np.arange(100), False)
     found, sizes = [], []
     excess = horizons._excess
     monkeypatch.setattr(
@@ -194,25 +196,25 @@ def test_rectangles_stand_for_thousands_of_lights(monkeypatch):
         found.append(np.array(horizons.horizon_excess(samples, lights, chances)))
     assert sizes[0] == 512 and sizes[-1] == 1500
     weight = found[1].sum(axis=0)
-    few, all_of_them = (horizons.smooth_share(*own) for own in found)
+    few, all_of_them = (horizons.smooth_horizon_share(*own) for own in found)
     assert (weight * np.abs(few - all_of_them)).sum() < 0.05 * weight.sum() and np.ptp(all_of_them) > 0.9
 
 
 def test_a_few_directions_tell_where_lobes_end_under_a_sky(monkeypatch):
     samples, lights = samples_around(np.random.default_rng(7), 300), sides_of_the_sky()
-    chances = horizons.lobe_chances(samples, np.arange(300), is_baked=False)
-    few = horizons.smooth_share(*horizons.horizon_excess(samples, lights, chances))
+    chances = horizons.lobe_selection_pmf(samples, np.arange(300), is_baked=False)
+    few = horizons.smooth_horizon_share(*horizons.horizon_excess(samples, lights, chances))
     monkeypatch.setattr(horizons._Directions, "few", lambda directions: directions)
-    apart = few - horizons.smooth_share(*horizons.horizon_excess(samples, lights, chances))
+    apart = few - horizons.smooth_horizon_share(*horizons.horizon_excess(samples, lights, chances))
     # Of what comes from between the horizons, itself a few percent of the light.
     assert np.sqrt(np.square(apart).mean()) < 0.05 and abs(apart.mean()) < 0.01
 
 
 def test_quick_horizons_are_about_those_of_all_directions_and_split_less():
     samples, lights = samples_around(np.random.default_rng(11), 500), lights_around(np.random.default_rng(12), 200)
-    chances = horizons.lobe_chances(samples, np.arange(500), is_baked=False)
+    chances = horizons.lobe_selection_pmf(samples, np.arange(500), is_baked=False)
     excess = np.array([horizons.horizon_excess(samples, lights, chances, is_quick=quick) for quick in (False, True)])
-    share, quick = (horizons.smooth_share(*own) for own in excess)
+    share, quick = (horizons.smooth_horizon_share(*own) for own in excess)
     light = np.where(excess[0, 1] > 0.0, excess[0].sum(axis=0), 0.0)
     assert (light * np.abs(share - quick)).sum() < 0.05 * light.sum() and np.ptp(share) > 0.9
     whole, _ = end_at_horizons_of_cycles(samples, lights)
@@ -233,10 +235,10 @@ def test_bounds_of_thousands_of_lights_are_those_of_a_few():
     samples, lights = samples_around(generator, 30), lights_around(generator, 1000)
     far = np.array([3e3, -2e3, 1e3])
     position, lights = samples.position + far, tuple(light.moved(far) for light in lights)
-    rows = light_rows(lights)
-    found = own_bounds(position, samples.smooth_normal, lights, rows)
+    rows = light_tree_rows(lights)
+    found = light_bounds_at(position, samples.smooth_normal, lights, rows)
     few = [slice(start, start + 50) for start in range(0, 1000, 50)]
-    expected = [own_bounds(position, samples.smooth_normal, lights[part], rows[part]) for part in few]
+    expected = [light_bounds_at(position, samples.smooth_normal, lights[part], rows[part]) for part in few]
     expected = np.concatenate(expected)
     assert found.dtype == np.float32 and expected.dtype == np.float64
     assert (expected[:, 0] >= expected[:, 1] * (1.0 - 1e-12)).all() and (expected[:, 1] > 0.0).any()

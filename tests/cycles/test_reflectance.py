@@ -6,7 +6,7 @@ import quadrature
 
 from ltsh_addon.cycles import closures, lobes
 from ltsh_addon.cycles.closures import glass_albedos
-from ltsh_addon.cycles.lobes import LOBE_KINDS, Hits
+from ltsh_addon.cycles.lobes import LOBE_KINDS, SurfaceHits
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(64)
 COSINES, COSINE_WEIGHTS = 0.5 * (NODES + 1.0), 0.5 * WEIGHTS
@@ -59,7 +59,7 @@ def transmitted_share(cosine, alpha, ior):
 
 
 def test_a_tinted_metal_has_its_tint_where_the_model_says():
-    dip = closures.f82_dip(COLOR, TINT)
+    dip = closures.f82_term(COLOR, TINT)
     cosine = 1.0 / 7.0
     schlick = COLOR + (1.0 - COLOR) * (1.0 - cosine) ** 5
     assert np.allclose(schlick - dip * cosine * (1.0 - cosine) ** 6, schlick * TINT, rtol=1e-12)
@@ -183,7 +183,7 @@ def test_glass_scatters_what_it_reflects_and_refracts(inside):
 def test_the_diffuse_albedo_of_a_hit_is_split_and_kept():
     up = np.tile([0.0, 0.0, 1.0], (3, 1))
     albedo = np.array([[0.6, 0.3, 0.1], [0.2, 0.2, 0.2], [0.5, 0.0, 0.1]])
-    hits = Hits(np.zeros((3, 3)), up, up, up, np.ones(3, bool), np.zeros(3, int), albedo)
+    hits = SurfaceHits(np.zeros((3, 3)), up, up, up, np.ones(3, bool), np.zeros(3, int), albedo)
     slots = [
         {"kind": np.full(3, LOBE_KINDS["diffuse"]), "color": np.full((3, 3), 0.5), "weight": np.array([0.2, 0.2, 0.0])},
         {"kind": np.full(3, LOBE_KINDS["glossy"]), "color": np.ones((3, 3)), "roughness": np.full(3, 0.3)},

@@ -7,16 +7,14 @@ import numpy as np
 import pytest
 import quadrature
 import surface_scenes
-from surface_scenes import area_light, four_lights, random_samples, single_sample, unit
-from test_single_precision import PROMISED, all_kinds_of_samples
+from precisions import PROMISED, techniques
+from surface_scenes import all_kinds_of_samples, area_light, four_lights, random_samples, single_sample, unit
 
 from ltsh_addon import shading
 from ltsh_addon.emitters import light_profile
 
 # Of a result, or of a hundredth of the largest one: what the spread of the closed forms may be off, and the reference.
 CLOSED, QUADRATURE = 3e-3, 1e-3
-TECHNIQUES = (*shading.SHIPPED_TABLES, shading.REFERENCE)
-techniques = pytest.mark.parametrize("technique", TECHNIQUES)
 
 
 def focused_lights(degrees):

@@ -4,15 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import test_workers
+from kills import all_ended
 from surface_scenes import area_light, random_samples, unit
-from test_workers import children_only, started  # noqa: F401
 
 from ltsh_addon import shading
 from ltsh_addon.emitters import light_tree
 from ltsh_addon.emitters.light_tree import LightTree
 from ltsh_addon.shading import float32, integrator
-from ltsh_addon.workers import pool
 
 # What the lights of a tree may be off together; degree 4 is itself off by ten times as much.
 OFF = 3e-3
@@ -236,12 +234,12 @@ def test_groups_receivers_and_black_lights_are_kept_apart():
     assert only[samples.receiver == 1].any() and not only[samples.receiver != 1].any()
 
 
-def test_workers_do_not_change_one_bit(started, children_only, monkeypatch):  # noqa: F811
-    monkeypatch.setattr(pool, "SECONDS_WORTH_A_CHILD", 0.0)
+def test_workers_do_not_change_one_bit(started, children_only, monkeypatch):
+    monkeypatch.setattr(integrator, "SECONDS_WORTH_A_WORKER", 0.0)
     monkeypatch.setattr(integrator, "BLOCK_LIMITS", (100, 100))
     samples, lights = floor_samples(300, 0.02), many_lights(80)
     one, two = (shading.shade(samples, lights, "ltsh4", workers=count) for count in (1, 2))
-    assert len(started) == 1 and test_workers.all_ended(started)
+    assert len(started) == 1 and all_ended(started)
     assert np.array_equal(one.specular, two.specular) and np.array_equal(one.diffuse, two.diffuse)
 
 

@@ -11,7 +11,7 @@ from surface_scenes import area_light, unit
 from ltsh_addon import shading
 from ltsh_addon.scene import SurfaceSamples
 
-PIXELS, DISTANCE, RINGS = 32, 6.0, 10
+PIXELS, DISTANCE, RINGS = 24, 6.0, 10
 # In units of the sphere's mean radiance; found is 0.1
 BRIGHTEST = 0.15
 # Of the largest radiance of a ring. Found is 0.0014: inside the highlight, where ltc has 0.0008.

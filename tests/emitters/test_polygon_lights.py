@@ -5,36 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import quadrature
-from surface_scenes import area_light, random_samples, single_sample, unit
-from test_single_precision import all_kinds_of_samples
-from test_single_precision import assert_close as assert_promise
+from precisions import TECHNIQUES, techniques
+from precisions import assert_close as assert_promise
+from surface_scenes import STAR, all_kinds_of_samples, area_light, polygon_light, random_samples, single_sample
 
 from ltsh_addon import shading
 from ltsh_addon.lobes.polygon import convex_pieces
 
-TECHNIQUES = (*shading.SHIPPED_TABLES, shading.REFERENCE)
-techniques = pytest.mark.parametrize("technique", TECHNIQUES)
 # An L, clockwise and counterclockwise arms, and a star, in the plane z = 0
 ELL = np.array([[-1, -1], [1, -1], [1, -0.2], [-0.3, -0.2], [-0.3, 1], [-1, 1]], dtype=float)
 ELL_PARTS = (((0.0, -0.6), (1.0, 0.4)), ((-0.65, 0.4), (0.35, 0.6)))  # centers and half sizes of its two rectangles
-STAR = np.array([[np.cos(n * np.pi / 7), np.sin(n * np.pi / 7)] for n in range(14)]) * np.where(
-    np.arange(14) % 2 == 0, 1.0, 0.35
-).reshape(-1, 1)
 REPEATED = np.array(
     [[-1, -1], [-1, -1], [0, -1], [1, -1], [1, -0.2], [1, -0.2], [1, -0.2], [-0.3, -0.2], [-0.3, 0.5], [-0.3, 1]]
     + [[-1, 1]]
 )
-
-
-def polygon_light(flat, center=(0.2, -0.1, 2.0), **options):
-    """A light with corners (V, 2) that shines down, or toward `direction`."""
-    flat = np.asarray(flat, dtype=float)
-    direction = unit(np.asarray(options.pop("direction", (0.1, 0.2, -1.0)), dtype=float))
-    first = unit(np.cross(direction, (0.0, 1.0, 0.0)))
-    second = np.cross(direction, first)
-    corners = np.asarray(center) + flat[:, :1] * first + flat[:, 1:] * second
-    options = {"half_u": first, "half_v": second, "radiance": (1, 1, 1), **options}
-    return area_light(shape="POLYGON", center=center, direction=direction, corners=corners, **options)
 
 
 def rectangle(light, center, half):

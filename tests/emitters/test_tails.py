@@ -10,30 +10,6 @@ from surface_scenes import area_light, single_sample, unit
 from ltsh_addon import shading
 
 
-def bounds(view, roughness, light):
-    """(least, greatest) integral for F = 1 at the origin, normal z; None for lights without limits."""
-    signs = ((0, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
-    points = [light.center + s * light.half_u + t * light.half_v for s, t in signs]
-    distance, radius = np.linalg.norm(light.center), max(np.linalg.norm(p - light.center) for p in points)
-    mirrored = np.array([-view[0], -view[1], view[2]])
-    angle = np.arccos(np.clip(mirrored @ light.center / distance, -1.0, 1.0))
-    if distance <= 2.0 * radius or angle <= np.arcsin(2.0 * radius / distance):
-        return None
-    area = 4.0 * np.linalg.norm(np.cross(light.half_u, light.half_v))
-    values = []
-    for point in points:
-        length = np.linalg.norm(point)
-        brdf = textbook.ggx_brdf(view, point / length, roughness**2) if point[2] > 0.0 else 0.0
-        values.append(brdf * max(point[2], 0.0) * area * abs(light.direction @ point) / length**4)
-    return min(values), max(values)
-
-
-def limited(value, view, roughness, light):
-    """`value` between the bounds, if there are any."""
-    limits = bounds(view, roughness, light)
-    return value if limits is None else min(max(value, limits[0]), limits[1])
-
-
 def random_case(generator):
     """(view, roughness, light) of a light that shines on the origin."""
     mu, roughness = generator.uniform(0.02, 1.0), generator.uniform(0.1, 1.0)
@@ -59,7 +35,7 @@ def cases(count):
     generator = np.random.default_rng(5)
     while count:
         view, roughness, light = random_case(generator)
-        limits = bounds(view, roughness, light)
+        limits = textbook.tail_bounds(view, roughness, light)
         if limits is not None:
             count -= 1
             yield view, roughness, light, limits
@@ -149,7 +125,7 @@ def test_a_profiled_polygon_in_several_pieces_is_limited_as_a_whole():
         dart = replace(light, shape="POLYGON", corners=corners, falloff=2)
         # Its share of the area of the rectangle
         share = np.linalg.norm(dart.area_vector) / np.linalg.norm(light.area_vector)
-        low, high = profile_range(dart) * bounds(view, roughness, light) * share
+        low, high = profile_range(dart) * textbook.tail_bounds(view, roughness, light) * share
         found = shaded(single_sample(view=view, roughness=roughness, **WHITE), dart, "ltsh2")
         assert low - 1e-4 * high - 1e-9 <= found <= 1.0001 * high + 1e-9, (view, roughness, light)
 

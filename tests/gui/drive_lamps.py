@@ -96,12 +96,12 @@ def lamp_of_a_file(scene):
 
 def notes(rig):
     """What the view says."""
-    return module("engine.view")._texts[rig.region().as_pointer()][1]
+    return module("engine.overlay")._texts[rig.region().as_pointer()].notes
 
 
 def looked_at(rig, name, what, count=1):
     """Wait until Cycles has looked at so many lamps; what the view shows then."""
-    lamps, start = module("engine.view")._lamps, time.monotonic()
+    lamps, start = module("engine.redraws").node_lights, time.monotonic()
     yield from until(lambda: lamps.is_busy)
     yield 0.1
     said = [note for note in notes(rig) if "Lamp" in note]
@@ -123,7 +123,7 @@ def edited_and_undone(rig, lamp, node, seen):
     """Another strength of the beam, by its node, and back by the keyboard; what is moved is not looked at again."""
     select(rig, lamp)
     operate(rig, bpy.ops.ed.undo_push, message="Before")
-    lamps = module("engine.view")._lamps
+    lamps = module("engine.redraws").node_lights
     lamp.location.x += 0.4
     yield from eyes.differs(rig, "lamps_3_moved.png", seen, "a lamp that is moved shines elsewhere")
     rig.check(not lamps.is_busy, "and nobody looks at it again")

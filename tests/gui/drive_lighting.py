@@ -21,10 +21,10 @@ def main(rig):
     for name in ("", ".scene"):
         sys.modules[f"ltsh_addon{name}"] = importlib.import_module(f"{ADDON}{name}")
     import random_surfaces
+    import uploaded_samples
 
     shading = importlib.import_module(f"{ADDON}.shading")
     lighting = importlib.import_module(f"{ADDON}.blender.viewport.lighting")
-    textures = importlib.import_module(f"{ADDON}.blender.viewport.textures")
     target = gpu.types.GPUTexture((WIDTH, HEIGHT), format="RGBA32F")
     buffer = gpu.types.GPUFrameBuffer(color_slots=[target])
     for technique in TECHNIQUES:
@@ -37,7 +37,7 @@ def main(rig):
                 samples = random_surfaces.samples(surface, WIDTH * HEIGHT, random)
                 lights = [random_surfaces.light(kind, number, random) for number in range(3)]
                 drawing.set_lights(lights)
-                gbuffer = textures.upload_samples(samples, WIDTH)
+                gbuffer = uploaded_samples.upload_samples(samples, WIDTH)
                 drawing.draw(gbuffer, buffer, "combined", view=(*random_surfaces.EYE, 1.0))
                 values = target.read()
                 values.dimensions = WIDTH * HEIGHT * 4
@@ -48,4 +48,4 @@ def main(rig):
                 rig.fact(f"{technique}, {surface}, {kind}: worst, of what is allowed", round(float(times.max()), 3))
                 rig.check(bool((times <= 1.0).all()), f"{technique}, {surface}, {kind}: as the integrator has it")
                 yield 0.1
-        drawing.free()
+        del drawing

@@ -91,9 +91,9 @@ def two_windows(rig):
 
 def quiet_line_is_clear(rig, where):
     """What the view leaves out stands beside Blender's own regions."""
-    view, region = module("engine.view"), rig.region()
+    view, region = module("engine.overlay"), rig.region()
     sides = view.covered(rig.area("VIEW_3D"), region)
-    place = view._places.get(region.as_pointer())
+    place = view._quiet_lines.get(region.as_pointer())
     rig.fact(f"quiet line {where}: left and right, px", place and (round(place[0]), round(place[2])))
     left, right = max(sides["LEFT"], sides["FLOAT"]), region.width - sides["RIGHT"]
     rig.fact(f"room for it {where}, px", (left, right))

@@ -23,7 +23,7 @@ def main(rig):
     operate(rig, bpy.ops.ltsh.preview)
     select(rig, bpy.data.objects["Sunset"])
     # The frame of the camera beside the sidebar, at rest soon: few further points leave time for fine shadows.
-    module("engine.view").REFINEMENTS = 6
+    module("engine.redraws").REFINEMENTS = 6
     view = rig.space.region_3d
     view.view_camera_zoom, view.view_camera_offset = 2.0, (0.14, 0.0)
     yield REST_SECONDS

@@ -31,16 +31,16 @@ def main(rig):
 
 def first_shadows(rig):
     """With as many points as artists have."""
-    engine = hands.module("engine.view")
+    engine = hands.module("engine.redraws")
     bpy.context.scene.render.engine = "LTSH"
     start = time.monotonic()
     rig.space.shading.type = "RENDERED"
     yield from hands.until(lambda: drawn(engine), 300)
     rig.fact("first picture, s", round(time.monotonic() - start, 1))
-    yield from hands.until(lambda: any(shown._shadows._grid for shown in engine._views), 300)
+    yield from hands.until(lambda: any(shown._shadows._grid for shown in engine.open_views), 300)
     rig.fact("first shadows, s", round(time.monotonic() - start, 1))
-    rig.check(any(shown._shadows._grid for shown in engine._views), "shadows come")
-    yield from hands.until(lambda: any(fine(shown._shadows._known) for shown in engine._views), 300)
+    rig.check(any(shown._shadows._grid for shown in engine.open_views), "shadows come")
+    yield from hands.until(lambda: any(fine(shown._shadows._known) for shown in engine.open_views), 300)
     rig.fact("fine shadows, s", round(time.monotonic() - start, 1))
     yield 1
     rig.shot("1_shadows.png")
@@ -52,17 +52,17 @@ def fine(known):
 
 
 def drawn(engine):
-    return any(shown._renderer is not None and shown._renderer.samples for shown in engine._views)
+    return any(shown._renderer is not None and shown._renderer.samples for shown in engine.open_views)
 
 
 def switched(rig):
-    engine = hands.module("engine.view")
+    engine = hands.module("engine.redraws")
     gc.disable()
     sizes, left, helpers = [], [], []
     for _ in range(SWITCHES):
         rig.space.shading.type = "SOLID"
         yield 0.5
-        left.append(len(engine._views))
+        left.append(len(engine.open_views))
         sizes.append(resident())
         helpers.append(children())
         rig.space.shading.type = "RENDERED"
@@ -78,28 +78,28 @@ def switched(rig):
 
 def closed(rig):
     """A second 3D view is made and closed."""
-    engine = hands.module("engine.view")
+    engine = hands.module("engine.redraws")
     known = set(rig.window.screen.areas)
     hands.operate(rig, bpy.ops.screen.area_split, direction="VERTICAL", factor=0.5)
     for area in rig.window.screen.areas:
         if area.type == "VIEW_3D":
             area.spaces.active.shading.type = "RENDERED"
-    yield from hands.until(lambda: len(engine._views) == 2, 60)
-    rig.check(len(engine._views) == 2, f"two areas have a view each: {len(engine._views)}")
+    yield from hands.until(lambda: len(engine.open_views) == 2, 60)
+    rig.check(len(engine.open_views) == 2, f"two areas have a view each: {len(engine.open_views)}")
     yield 2
     rig.shot("2_two_views.png")
     area = next(area for area in rig.window.screen.areas if area not in known)
     with bpy.context.temp_override(window=rig.window, area=area):
         bpy.ops.screen.area_close()
-    yield from hands.until(lambda: len(engine._views) == 1, 10)
-    rig.check(len(engine._views) == 1, f"that of a closed area is gone: {len(engine._views)}")
+    yield from hands.until(lambda: len(engine.open_views) == 1, 10)
+    rig.check(len(engine.open_views) == 1, f"that of a closed area is gone: {len(engine.open_views)}")
 
 
 def another_file(rig):
-    engine = hands.module("engine.view")
+    engine = hands.module("engine.redraws")
     path = str(Path(bpy.data.filepath).with_name("other.blend"))
     rig.space.shading.type = "RENDERED"
-    before = [weakref.ref(view) for view in engine._views]
+    before = [weakref.ref(view) for view in engine.open_views]
     bpy.ops.wm.save_as_mainfile(filepath=path, copy=True)
     bpy.ops.wm.open_mainfile(filepath=path)
     yield 1

@@ -1,5 +1,6 @@
 """What the drivers see: the pixels of the 3D view as the screen has them, in linear colors where that is wanted."""
 
+import dataclasses
 import importlib
 import time
 
@@ -35,14 +36,14 @@ def engine_started(rig):
 
 def pixel_centers():
     """Views come to rest with their first picture, which sees pixels at their centers."""
-    module("engine.view").REFINEMENTS = 1
+    module("engine.redraws").REFINEMENTS = 1
 
 
 def bare_view(rig):
     """Nothing but the picture in the 3D view, without the line about what it leaves out too."""
     space, view_module = rig.space, module("engine.view")
-    show, nothing = view_module.show, view_module.QuietLine()
-    view_module.show = lambda region, error, notes, captions, quiet: show(region, error, notes, captions, nothing)
+    show, nothing = view_module.show, module("engine.overlay").QuietLine()
+    view_module.show = lambda region, texts: show(region, dataclasses.replace(texts, quiet=nothing))
     space.overlay.show_overlays = space.show_gizmo = False
     space.show_region_header = space.show_region_tool_header = False
     space.show_region_toolbar = space.show_region_ui = space.show_region_hud = False

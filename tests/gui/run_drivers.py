@@ -36,7 +36,7 @@ def main() -> int:
     arguments.out.mkdir(parents=True, exist_ok=True)
     archive = built_zip()
     fixed = ["--blend", str(demo_scene(arguments.out))]
-    for name in ("helpers/random_surfaces.py", "blender/helpers/blender_state.py"):
+    for name in ("helpers/random_surfaces.py", "helpers/uploaded_samples.py", "blender/helpers/blender_state.py"):
         fixed += ["--file", str(HERE.parent / name)]
     for helper in sorted(set(HERE.glob("*.py")) - set(HERE.glob("drive_*.py")) - {Path(__file__).resolve()}):
         fixed += ["--file", str(helper)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ltsh_addon import cli, imaging, shading
-from ltsh_addon.blender.process import client
+from ltsh_addon.blender.process import finished, pixels
 from ltsh_addon.imaging.color import to_srgb8
 from ltsh_addon.pipeline import PictureOptions
 from ltsh_addon.pipeline.tasks import BatchJob
@@ -88,27 +88,21 @@ def wall(height: float, left: float = -9.0) -> Occluders:
 
 
 class FakeChild:
-    """Stands in for functions of `client`; `asked` and `built` tell how `extract` and `build_demo` were called."""
+    """Stands in for the second Blender; `asked` tells how `extract_pixels` was called."""
 
     def __init__(self, *, groups=("Key", "Fill.001", ""), empty=False, error=None, wall=None, change=None):
         self.groups, self.empty, self.error = groups, empty, error
         self.wall, self.change = wall, change  # an occluder (see `wall`), and what becomes of the lights
-        self.asked: list[client.ExtractOptions] = []
-        self.built: list = []
+        self.asked: list[pixels.PixelJob] = []
 
     def install(self, monkeypatch) -> FakeChild:
-        monkeypatch.setattr(client, "extract", self.extract)
-        monkeypatch.setattr(client, "build_demo", self.build_demo)
-        monkeypatch.setattr(client, "show_finished", self.show_finished)
+        monkeypatch.setattr(pixels, "extract_pixels", self.extract)
+        monkeypatch.setattr(finished, "show_finished", self.show_finished)
         return self
 
-    def show_finished(self, scene, where, folder, name, *, progress=None):
-        pixels = np.load(folder / client.PICTURE)
-        imaging.write_png(folder / name, to_srgb8(pixels[..., :3]))
-
-    def build_demo(self, path, *, progress=None):
-        self.built.append(path)
-        path.write_bytes(b"BLENDER")
+    def show_finished(self, scene, scene_name, frame, folder, name, *, progress=None):
+        picture = np.load(folder / finished.PICTURE)
+        imaging.write_png(folder / name, to_srgb8(picture[..., :3]))
 
     def extract(self, options, *, progress=None):
         self.asked.append(options)
@@ -120,19 +114,23 @@ class FakeChild:
         for stage in ("samples", "Cycles A", "Cycles B"):
             if progress is not None and progress(stage, 1.0) is False:
                 raise Cancelled(f"cancelled at {stage}")
-        return client.Extraction(
+        picture = pixels.PictureFacts(
+            options.frame if options.frame is not None else 7, options.camera or "Camera", "5.2.3"
+        )
+        cycles = pixels.CyclesPasses(
+            halves(points, some_lights, some_film) if options.cycles_samples else None,
+            np.full((HEIGHT, WIDTH, 3), EMISSION) if options.rest else None,
+            np.full((HEIGHT, WIDTH, 4), BACKGROUND) if options.rest else None,
+        )
+        return pixels.Extraction(
             lights=some_lights,
             samples=points,
             film=some_film,
             warnings=("camera 'Camera' sees no surface that can be shaded",) if self.empty else (WARNING,),
-            reference=halves(points, some_lights, some_film) if options.cycles_samples else None,
-            blender_version="5.2.3",
-            frame=options.frame if options.frame is not None else 7,
-            camera=options.camera or "Camera",
-            seconds={"start": 0.1, "samples": 0.2, "cycles": 0.3},
+            picture=picture,
+            cycles=cycles,
+            times=pixels.ExtractionTimes({"start": 0.1, "samples": 0.2, "cycles": 0.3}),
             occluders=self.wall if options.shadows == "on" else None,
-            emission=np.full((HEIGHT, WIDTH, 3), EMISSION) if options.rest else None,
-            background=np.full((HEIGHT, WIDTH, 4), BACKGROUND) if options.rest else None,
         )
 
 

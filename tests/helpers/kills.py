@@ -106,6 +106,10 @@ def is_writing(output: Path) -> bool:
     return any(output.rglob(".*.tmp"))
 
 
+def all_ended(processes):
+    return all(process.returncode is not None for process in processes)
+
+
 def is_running(pid):
     """True for processes that are there and not zombies, which only wait to be reaped by whoever inherits them."""
     try:

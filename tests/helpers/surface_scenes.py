@@ -90,3 +90,40 @@ def moved(samples, lights, rotation=None, shift=(0.0, 0.0, 0.0)):
 
 def random_rotation(seed):
     return np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
+
+
+STAR = np.array([[np.cos(n * np.pi / 7), np.sin(n * np.pi / 7)] for n in range(14)]) * np.where(
+    np.arange(14) % 2 == 0, 1.0, 0.35
+).reshape(-1, 1)
+
+
+def polygon_light(flat, center=(0.2, -0.1, 2.0), **options):
+    """A light with corners (V, 2) that shines down, or toward `direction`."""
+    flat = np.asarray(flat, dtype=float)
+    direction = unit(np.asarray(options.pop("direction", (0.1, 0.2, -1.0)), dtype=float))
+    first = unit(np.cross(direction, (0.0, 1.0, 0.0)))
+    second = np.cross(direction, first)
+    corners = np.asarray(center) + flat[:, :1] * first + flat[:, 1:] * second
+    options = {"half_u": first, "half_v": second, "radiance": (1, 1, 1), **options}
+    return area_light(shape="POLYGON", center=center, direction=direction, corners=corners, **options)
+
+
+def all_kinds_of_samples(count, seed):
+    """Every Fresnel kind, all roughness, bump maps, geometric normals that differ, in one set."""
+    samples = random_samples(count, seed, lowest_roughness=0.0)
+    generator = np.random.default_rng(seed + 1)
+    kind = np.arange(count) % 4
+    metal = np.where(kind[:, None] < 3, 1.0, 0.0) * np.ones(3)
+    f0 = np.where(kind[:, None] == 0, metal, 0.5 * metal)
+    bent = unit(samples.normal + 0.2 * generator.normal(size=(count, 3)))
+    flat = (generator.random(count) < 0.5)[:, None]
+    return replace(
+        samples,
+        specular_f0=f0,
+        specular_f90=metal,
+        dielectric=np.where(kind >= 2, 0.7, 0.0),
+        geometric_normal=np.where(flat, samples.normal, bent),
+        smooth_normal=np.where(flat, samples.diffuse_normal, bent),
+        bump_alpha2=0.3 * generator.random(count),
+        diffuse_albedo=generator.random((count, 3)),
+    )

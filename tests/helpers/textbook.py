@@ -15,12 +15,17 @@ def smith_lambda(cosine, alpha):
     return 0.5 * (np.sqrt(1.0 + alpha**2 * tangent_squared) - 1.0)
 
 
+def ggx_of_cosines(cosine_h, cosine_i, cosine_o, alpha):
+    """D G2 / (4 cos_i cos_o) with the height-correlated G2 = 1 / (1 + Lambda_o + Lambda_i), Heitz 2014, eq. 99."""
+    masking = 1.0 / (1.0 + smith_lambda(cosine_o, alpha) + smith_lambda(cosine_i, alpha))
+    return ggx_distribution(cosine_h, alpha) * masking / (4.0 * cosine_i * cosine_o)
+
+
 def ggx_brdf(view, light, alpha):
-    """D G2 / (4 cos_o cos_i) with the height-correlated G2 = 1 / (1 + Lambda_o + Lambda_i), Heitz 2014, eq. 99."""
+    """The same of unit vectors (..., 3), normal z."""
     half = view + light
     half = half / np.linalg.norm(half, axis=-1, keepdims=True)
-    masking = 1.0 / (1.0 + smith_lambda(view[..., 2], alpha) + smith_lambda(light[..., 2], alpha))
-    return ggx_distribution(half[..., 2], alpha) * masking / (4.0 * view[..., 2] * light[..., 2])
+    return ggx_of_cosines(half[..., 2], light[..., 2], view[..., 2], alpha)
 
 
 def fresnel_amplitudes(cosine, ior):
@@ -74,3 +79,27 @@ def view_direction(cos_theta_o):
 def mirror_direction(cos_theta_o):
     """The mirror image of `view_direction`."""
     return view_direction(cos_theta_o) * np.array([-1.0, 1.0, 1.0])
+
+
+def tail_bounds(view, roughness, light):
+    """(least, greatest) integral for F = 1 at the origin, normal z; None for lights without limits."""
+    signs = ((0, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
+    points = [light.center + s * light.half_u + t * light.half_v for s, t in signs]
+    distance, radius = np.linalg.norm(light.center), max(np.linalg.norm(p - light.center) for p in points)
+    mirrored = np.array([-view[0], -view[1], view[2]])
+    angle = np.arccos(np.clip(mirrored @ light.center / distance, -1.0, 1.0))
+    if distance <= 2.0 * radius or angle <= np.arcsin(2.0 * radius / distance):
+        return None
+    area = 4.0 * np.linalg.norm(np.cross(light.half_u, light.half_v))
+    values = []
+    for point in points:
+        length = np.linalg.norm(point)
+        brdf = ggx_brdf(view, point / length, roughness**2) if point[2] > 0.0 else 0.0
+        values.append(brdf * max(point[2], 0.0) * area * abs(light.direction @ point) / length**4)
+    return min(values), max(values)
+
+
+def within_tail_bounds(value, view, roughness, light):
+    """`value` between the bounds, if there are any."""
+    limits = tail_bounds(view, roughness, light)
+    return value if limits is None else min(max(value, limits[0]), limits[1])

@@ -1,9 +1,9 @@
 """Lobes and their integrals over polygons agree with each other, for every shipped table."""
 
 import numpy as np
-import polygon_quadrature
 import pytest
 import textbook
+from lobe_cases import TABLES, lobe_quadrature, random_rectangles, table_names
 from polygon_quadrature import above_horizon
 
 from ltsh_addon import shading
@@ -11,49 +11,14 @@ from ltsh_addon.lobes import spherical_harmonics
 from ltsh_addon.lobes.lobe_integrals import polygon_integrals
 from ltsh_addon.lobes.lookup_table import Lobe
 
-TABLES = {name: shading.load_table(name) for name in shading.SHIPPED_TABLES}
 # At grazing angles and low roughness the warp stretches polygons up to 1e5 times: 1e5 * eps * some edges
 ROUNDING = 1e-9
-table_names = pytest.mark.parametrize("name", shading.SHIPPED_TABLES)
-
-
-def random_rectangles(generator, count, crossing):
-    """Rectangles (P, 4, 3) above the horizon, or crossing it."""
-    found = []
-    signs = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-    while len(found) < count:
-        center = generator.normal(size=3) + np.array([-0.5, 0.0, 0.5])
-        u = generator.normal(size=3)
-        v = np.cross(u, generator.normal(size=3))
-        rectangle = center + signs[:, :1] * u + signs[:, 1:] * v
-        above = (rectangle[:, 2] > 0.0).sum()
-        if (0 < above < 4) if crossing else above == 4:
-            found.append(rectangle)
-    return np.array(found)
 
 
 def random_cases(seed, count=200, crossing=False, lowest=0.0):
     generator = np.random.default_rng(seed)
     cosine, roughness = generator.random(count), lowest + (1.0 - lowest) * generator.random(count)
     return cosine, roughness, random_rectangles(generator, count, crossing)
-
-
-def lobe_quadrature(table, cosine, roughness, polygon, tolerance=1e-8):
-    """Signed integral of `evaluate_lobe` over one polygon above the horizon, and an error bound.
-
-    The clamped cosine of "ltc" has a kink, of which two orders of a rule may both miss a piece: a finer start and an
-    allowance for that.
-    """
-    smooth = table.family == "ltsh"
-
-    def lobe(directions):
-        flat = directions.reshape(1, -1, 3)
-        values = shading.evaluate_lobe(table, np.array([cosine]), np.array([roughness]), flat)
-        return values.reshape(directions.shape[:-1])
-
-    apex = textbook.mirror_direction(max(cosine, 0.05))
-    value, bound = polygon_quadrature.adaptive_integral(polygon, lobe, apex, tolerance, 2 if smooth else 4)
-    return value, bound + (1e-9 if smooth else 3e-7)
 
 
 @table_names

@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
+from markdown_text import FENCE, anchors_of, links_of
 
 ROOT = Path(__file__).resolve().parents[2]
 SKIPPED = {"out", "build"}
@@ -13,23 +14,9 @@ DOCUMENTS = sorted(
     for path in ROOT.rglob("*.md")
     if not any(part.startswith(".") or part in SKIPPED for part in path.relative_to(ROOT).parts)
 )
-LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
-FENCE = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 SPAN = re.compile(r"`([^`\n]+)`")
 # `folder/file.py`, `folder/`, `file.py:name`
 NAMED = re.compile(r"([\w./-]+(?:\.(?:py|md|sh|js|toml)|/))(?::(\w+))?")
-
-
-def links_of(text: str) -> list[str]:
-    """Targets of links and pictures that are not on the web."""
-    found = LINK.findall(FENCE.sub("", text))
-    return [target for target in found if not target.startswith(("https://", "http://"))]
-
-
-def anchors_of(text: str) -> set[str]:
-    """Names by which links reach the headings."""
-    headings = re.findall(r"^#+ (.*)$", FENCE.sub("", text), re.MULTILINE)
-    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
 
 
 def read(path: Path) -> str:

@@ -11,8 +11,8 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from test_documents import links_of
-from test_symbolic_wheel import fake_library, fake_wheel
+from fake_wheels import fake_library, fake_wheel
+from markdown_text import links_of
 
 from requirements import build_extension
 from requirements.build_extension import PLATFORMS, PYTHONS, BuildError, run_tool, with_wheels

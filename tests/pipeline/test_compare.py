@@ -345,15 +345,15 @@ def test_shade_writes_its_layers_and_report_and_nothing_else(child, tmp_path):
 
 
 def own_technique():
-    """The class that docs/reference.md shows."""
-    text = (TABLES.parent / "docs" / "reference.md").read_text(encoding="utf-8")
+    """The class that docs/python.md shows."""
+    text = (TABLES.parent / "docs" / "python.md").read_text(encoding="utf-8")
     code = next(block for block in re.findall(r"^```python\n(.*?)^```", text, re.M | re.S) if "class Center" in block)
     names: dict = {}
     exec(code, names)
     return names["Center"]()
 
 
-def test_the_technique_that_the_reference_shows_takes_part_in_a_comparison(child, tmp_path):
+def test_the_technique_that_the_documents_show_takes_part_in_a_comparison(child, tmp_path):
     technique = own_technique()
     report = compare_scene(options(tmp_path, techniques=("ltsh4", technique)))
     assert list(report["tables"]) == ["ltsh4", "center"] and report["tables"]["center"].endswith(".Center")
@@ -366,7 +366,7 @@ def test_the_technique_that_the_reference_shows_takes_part_in_a_comparison(child
     assert {"center.specular@Key", "error_center.specular"} <= set(layers)
 
 
-def test_the_technique_that_the_reference_shows_is_right_for_small_lights():
+def test_the_technique_that_the_documents_show_is_right_for_small_lights():
     """The integral over a light of the side h is lobe x solid angle, but for terms of h^2."""
     samples, light = fake_scene.samples(40), fake_scene.lights()[0]
     ones = np.ones((40, 3))

@@ -124,9 +124,9 @@ def test_a_scene_that_fails_is_named_and_the_others_are_done(capsys, monkeypatch
             raise SceneError("room.blend: no light\nat this frame")
         return extract(options, progress=progress)
 
-    from ltsh_addon.blender.process import client
+    from ltsh_addon.blender.process import pixels
 
-    monkeypatch.setattr(client, "extract", fail_at_two)
+    monkeypatch.setattr(pixels, "extract_pixels", fail_at_two)
     arguments = ["shade", room, "--frames", "1-3", *SMALL]
     code, _, stderr = run(capsys, *arguments, "-o", tmp_path / "one")
     assert code == 1 and "failed: shade_0002: room.blend: no light at this frame" in stderr.splitlines()
@@ -135,7 +135,7 @@ def test_a_scene_that_fails_is_named_and_the_others_are_done(capsys, monkeypatch
     codes = [run(capsys, *arguments, "-o", tmp_path / "two", "--shard", shard)[0] for shard in ("1/2", "2/2")]
     assert codes == [0, 1] and run(capsys, "merge", tmp_path / "two")[0] == 1
     assert contents(tmp_path / "one") == contents(tmp_path / "two")
-    monkeypatch.setattr(client, "extract", extract)
+    monkeypatch.setattr(pixels, "extract_pixels", extract)
     code, _, stderr = run(capsys, *arguments[:-1], "-o", tmp_path / "one", "--resume")
     assert (code, [options.frame for options in fake.asked[-1:]]) == (0, [2]) and "failed" not in stderr
     assert "2 of 3 tasks were there already\n" in stderr

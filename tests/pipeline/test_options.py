@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from ltsh_addon.blender.process import client
+from ltsh_addon.blender.process.pixels import PixelJob
 from ltsh_addon.cli import commands, job_file
 from ltsh_addon.pipeline import BakeOptions, PictureOptions
 from ltsh_addon.pipeline.options import arguments_of, child_job, command_line, what_matters
@@ -66,8 +66,8 @@ def test_a_digest_holds_what_results_depend_on(command, kind, values):
 
 def test_the_second_blender_gets_the_options_that_it_knows():
     options = PictureOptions(SCENE, OUT, camera="Side", frame=3, **PICTURE)
-    job = child_job(client.ExtractOptions, options, width=1, cycles_samples=0)
+    job = child_job(PixelJob, options, width=1, cycles_samples=0)
     assert (job.scene, job.camera, job.frame, job.sub_samples, job.scripts) == (SCENE, "Side", 3, 4, True)
     assert (job.width, job.cycles_samples) == (1, 0)
-    shared = {item.name for item in fields(PictureOptions)} & {item.name for item in fields(client.ExtractOptions)}
+    shared = {item.name for item in fields(PictureOptions)} & {item.name for item in fields(PixelJob)}
     assert shared == {"scene", "camera", "frame", "sub_samples", "cycles_samples", "scripts", "shadows"}

@@ -154,7 +154,7 @@ def test_weights_that_hang_on_the_former_lights_are_named(capsys, monkeypatch, r
         return replace(found, samples=replace(samples, geometric_normal=normal), film=film)
 
     fake.install(monkeypatch)
-    monkeypatch.setattr(fake_scene.client, "extract", split)
+    monkeypatch.setattr(fake_scene.pixels, "extract_pixels", split)
     assert run(capsys, "shade", room, "-o", out, *ARGUMENTS, "--keep-visibility")[0] == 0
     _, stdout, _ = run(capsys, "relight", out, "--light", "Light 2", "--power", "x2", "--json", "--quiet")
     assert any(line.startswith("3 of ") and "weigh both" in line for line in json.loads(stdout)["warnings"])

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import quadrature
+from precisions import assert_close
 from surface_scenes import area_light, random_samples, single_sample, unit
-from test_single_precision import assert_close
 
 from ltsh_addon import shading
 from ltsh_addon.lobes import brdf
@@ -16,7 +16,7 @@ LOW = {"center": (-1.6, 0.1, 0.35), "half_u": (0, 0.5, 0), "half_v": (0, 0, 0.25
 LIGHT = {"center": (-0.6, 0.1, 1.6), "half_u": (0.5, 0, 0), "half_v": (0, -0.4, 0), "radiance": (1.0, 2.0, 0.5)}
 
 
-def f82_dip(f0, tint):
+def f82_term(f0, tint):
     """The factor of c (1 - c)^6 of Blender's F82 tint, by which the reflectance at c = 1/7 is `tint` times Schlick's
     (Kutz, Hasan and Edmondson 2021, eq. 5)."""
     schlick = f0 + (1.0 - f0) * (6.0 / 7.0) ** 5
@@ -25,7 +25,7 @@ def f82_dip(f0, tint):
 
 def gold(tint=(0.2, 0.5, 0.9)):
     f0 = np.array([0.95, 0.7, 0.3])
-    return {"specular_f0": f0, "specular_f90": (1, 1, 1), "specular_dip": f82_dip(f0, np.array(tint))}
+    return {"specular_f0": f0, "specular_f90": (1, 1, 1), "specular_dip": f82_term(f0, np.array(tint))}
 
 
 SURFACES = {
@@ -37,7 +37,7 @@ SURFACES = {
     },
     "black edge": {
         "specular_f0": (0.1, 0.3, 0.6), "specular_f90": (1, 1, 1),
-        "specular_dip": f82_dip(np.array([0.1, 0.3, 0.6]), np.zeros(3)),
+        "specular_dip": f82_term(np.array([0.1, 0.3, 0.6]), np.zeros(3)),
     },
     "IOR below 1": {"dielectric": (1.0, 0.5, 0.2), "ior": 0.7},
     "all": {**gold(), "dielectric": (0.1, 0.5, 0.9), "ior": 2.0},
@@ -107,7 +107,7 @@ def random_metals(count, seed, tint):
     samples = random_samples(count, seed, lowest_roughness=0.0)
     generator = np.random.default_rng(seed + 50)
     f0 = generator.random((count, 3))
-    dip = f82_dip(f0, tint + (1.0 - tint) * generator.random((count, 3)))
+    dip = f82_term(f0, tint + (1.0 - tint) * generator.random((count, 3)))
     dielectric = np.where(np.arange(count)[:, None] % 3 == 0, generator.random((count, 3)), 0.0)
     return replace(samples, specular_f0=f0, specular_f90=np.ones((count, 3)), specular_dip=dip, dielectric=dielectric)
 
@@ -138,7 +138,7 @@ def test_terms_that_cancel_leave_nothing_below_zero(technique, dtype):
 def test_metals_that_fall_below_black_are_found_among_all_and_others_are_not():
     generator = np.random.default_rng(3)
     f0 = generator.uniform(0.0, 1.0, (20_000, 3)) ** 3
-    dip = f82_dip(f0, generator.uniform(0.0, 1.2, f0.shape))
+    dip = f82_term(f0, generator.uniform(0.0, 1.2, f0.shape))
     cosine = np.linspace(0.0, 1.0, 501)[:, None, None]
     least = (f0 + (1.0 - f0) * (1.0 - cosine) ** 5 - dip * cosine * (1.0 - cosine) ** 6).min(axis=(0, 2))
     found = brdf.is_clipped(f0, np.ones_like(f0), dip)

@@ -3,8 +3,9 @@
 import header_harness
 import numpy as np
 import pytest
+from header_harness import points, random_polygons
+from lobe_cases import lobe_quadrature
 from polygon_quadrature import above_horizon
-from test_lobe_integrals import lobe_quadrature
 
 from ltsh_addon import shading
 from ltsh_addon.lobes.polygon import clip_to_horizon, edge_sums, project_to_sphere, split_at_horizon
@@ -32,32 +33,6 @@ def compiled(request, name, folder, tables):
         pytest.skip("needs a C++ compiler")
     data = np.concatenate(list(data_blocks(table).values()))
     return table, header_harness.compiled_glsl_branch(folder / f"{name}.h", folder, name, data)
-
-
-def points(count: int, seed: int, lowest_roughness=0.0):
-    """cos_theta_o and roughness, float32, some of them at the ends of the range."""
-    generator = np.random.default_rng(seed)
-    cosine, roughness = generator.random(count), lowest_roughness + (1.0 - lowest_roughness) * generator.random(count)
-    cosine[:4], roughness[4:8] = (0.0, 1.0, 1e-3, 1.0 - 1e-6), (1.0, lowest_roughness, 1.0, lowest_roughness)
-    return cosine.astype(np.float32), roughness.astype(np.float32)
-
-
-def random_polygons(count: int, corners: int, seed: int) -> np.ndarray:
-    """Planar convex polygons (count, corners, 3) of any winding, float32, about half of them cut by the horizon.
-
-    Their planes keep a distance from the origin: else clipping makes edges that are half circles up to rounding, and no
-    float32 formula knows their direction.
-    """
-    generator = np.random.default_rng(seed)
-    tries = 4 * count
-    center = generator.normal(size=(tries, 1, 3))
-    center[..., 2] = generator.uniform(-0.3, 1.2, (tries, 1))
-    angle = np.sort(generator.random((tries, corners)) * 2.0 * np.pi, axis=1)[..., None]
-    first, second = generator.normal(size=(2, tries, 1, 3))
-    normal = np.cross(first, second)[:, 0]
-    distance = np.abs((normal * center[:, 0]).sum(axis=1)) / np.linalg.norm(normal, axis=1)
-    polygons = center + np.cos(angle) * first + np.sin(angle) * second
-    return polygons[distance > 0.2][:count].astype(np.float32)
 
 
 def test_the_numbers_come_back_bit_for_bit(folder, tables, name):

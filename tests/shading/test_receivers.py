@@ -4,15 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import test_workers
-from surface_scenes import area_light, four_lights, random_samples
-from test_polygon_lights import STAR, polygon_light
-from test_workers import DTYPES, children_only, short_tasks_for_children, started  # noqa: F401 (fixtures)
+from kills import all_ended
+from precisions import techniques, techniques_and_types
+from surface_scenes import STAR, area_light, four_lights, polygon_light, random_samples
 
 from ltsh_addon import shading
 
-TECHNIQUES = (*shading.SHIPPED_TABLES, shading.REFERENCE)
-techniques = pytest.mark.parametrize("technique", TECHNIQUES)
+pytestmark = pytest.mark.usefixtures("short_tasks_for_children")
 
 
 def numbered_samples(count, seed=0):
@@ -29,7 +27,7 @@ def every_light():
     return [*lights, area_light(spread=0.2, group="Fill")]
 
 
-@pytest.mark.parametrize(("technique", "dtype"), list(zip(TECHNIQUES, DTYPES, strict=True)))
+@techniques_and_types
 def test_only_receivers_are_lit(technique, dtype):
     samples = numbered_samples(24, seed=1)
     lights = every_light()
@@ -60,7 +58,7 @@ def test_a_partition_of_the_receivers_adds_up(technique):
     ("technique", "part", "dtype"),
     [("ltsh4", "specular", np.float32), ("ltc", "diffuse", np.float64), (shading.REFERENCE, "specular", np.float64)],
 )
-def test_workers_do_not_change_one_bit(technique, part, dtype, started, children_only):  # noqa: F811
+def test_workers_do_not_change_one_bit(technique, part, dtype, started, children_only):
     """The numbers travel with either pass; spread and corners with the lights."""
     samples = numbered_samples(60, seed=3)
     lights = [replace(light, receivers=(n, 7)) for n, light in enumerate(every_light())]
@@ -68,5 +66,5 @@ def test_workers_do_not_change_one_bit(technique, part, dtype, started, children
         getattr(shading.shade(samples, lights, technique, passes=[part], workers=count, dtype=dtype), part)
         for count in (1, 2)
     )
-    assert len(started) == 1 and test_workers.all_ended(started)
+    assert len(started) == 1 and all_ended(started)
     assert one.any() and np.array_equal(one, two)

@@ -9,8 +9,8 @@ from functools import partial
 import numpy as np
 import pytest
 import surface_scenes
-import test_tails
 import textbook
+from precisions import techniques
 from surface_scenes import area_light, four_lights, random_samples, single_sample, unit
 
 from ltsh_addon import shading
@@ -18,8 +18,6 @@ from ltsh_addon.scene import Cancelled
 from ltsh_addon.shading import integrator
 
 shade = partial(shading.shade, dtype=np.float64)
-TECHNIQUES = (*shading.SHIPPED_TABLES, shading.REFERENCE)
-techniques = pytest.mark.parametrize("technique", TECHNIQUES)
 # Sums of a few dozen terms of size 10 in double precision, amplified by sharp lobes
 ROUNDING = 1e-9
 # The quadrature stops at 1e-4 of the value: what changes its nodes changes its value by so much.
@@ -137,7 +135,7 @@ def test_specular_light_is_the_clamped_integral_of_the_lobe(technique):
         found = shade(sample, [light], table, passes=["specular"], workers=1).specular[0, 0, 0]
         expected = max(signed[n], least[n])
         if technique != "ltc":
-            expected = test_tails.limited(expected, sample.view[0], roughness[n], light)
+            expected = textbook.within_tail_bounds(expected, sample.view[0], roughness[n], light)
         assert found == pytest.approx(expected, abs=1e-12)
         assert clamped[n] == pytest.approx(max(signed[n], 0.0), abs=1e-12)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import header_harness
 import numpy as np
 import pytest
-from test_header_functions import points, random_polygons
+from header_harness import points, random_polygons
 
 from ltsh_addon import shading
 from ltsh_addon.shading import wgsl

@@ -4,8 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from surface_scenes import area_light, four_lights, random_samples, unit
-from test_lobe_robustness import oriented
+from hostile_polygons import oriented
+from lobe_cases import table_names
+from precisions import assert_close
+from surface_scenes import all_kinds_of_samples, area_light, four_lights, random_samples, unit
 
 from ltsh_addon import shading
 from ltsh_addon.emitters import small_lights as points
@@ -13,47 +15,9 @@ from ltsh_addon.lobes import edge_integrals, moments32
 from ltsh_addon.lobes.polygon import project_to_sphere
 from ltsh_addon.shading import float32, integrator
 
-# What `shade` promises for radiance 1.
-PROMISED = 2e-5
-table_names = pytest.mark.parametrize("name", shading.SHIPPED_TABLES)
-
 
 def white_lights(lights):
     return [replace(light, radiance=np.ones(3)) for light in lights]
-
-
-def all_kinds_of_samples(count, seed):
-    """Every Fresnel kind, all roughness, bump maps, geometric normals that differ, in one set."""
-    samples = random_samples(count, seed, lowest_roughness=0.0)
-    generator = np.random.default_rng(seed + 1)
-    kind = np.arange(count) % 4
-    metal = np.where(kind[:, None] < 3, 1.0, 0.0) * np.ones(3)
-    f0 = np.where(kind[:, None] == 0, metal, 0.5 * metal)
-    bent = unit(samples.normal + 0.2 * generator.normal(size=(count, 3)))
-    flat = (generator.random(count) < 0.5)[:, None]
-    return replace(
-        samples,
-        specular_f0=f0,
-        specular_f90=metal,
-        dielectric=np.where(kind >= 2, 0.7, 0.0),
-        geometric_normal=np.where(flat, samples.normal, bent),
-        smooth_normal=np.where(flat, samples.diffuse_normal, bent),
-        bump_alpha2=0.3 * generator.random(count),
-        diffuse_albedo=generator.random((count, 3)),
-    )
-
-
-def assert_close(samples, lights, name):
-    single = shading.shade(samples, lights, name, workers=1)
-    double = shading.shade(samples, lights, name, workers=1, dtype=np.float64)
-    for part in shading.PASSES:
-        found, expected = getattr(single, part), getattr(double, part)
-        assert found.dtype == np.float32 and expected.dtype == np.float64
-        assert np.isfinite(found).all() and (found >= 0.0).all()
-        error = np.abs(found - expected).max(axis=(0, 2))
-        worst = error.argmax()
-        assert error[worst] < PROMISED, (part, samples.take(slice(worst, worst + 1)))
-    return double
 
 
 @table_names
@@ -62,6 +26,7 @@ def test_single_precision_keeps_its_promise(name):
     assert double.specular.max() > 0.5 and double.diffuse.max() > 0.1
 
 
+@pytest.mark.newest
 @table_names
 def test_lights_at_hostile_places_keep_the_promise(name):
     """Touching the surface, standing on it, edge-on, crossing the horizon, tiny, huge, far away and at the point."""
@@ -80,6 +45,7 @@ def test_lights_at_hostile_places_keep_the_promise(name):
         assert_close(samples, white_lights([light]), name)
 
 
+@pytest.mark.newest
 @table_names
 def test_narrow_lights_are_exact_to_rounding(name):
     """1 m by 10 um: in single precision their long edges would cancel but for some percent."""
@@ -115,6 +81,7 @@ def small_lights(size, seed):
         yield area_light("Small", shape, center, u, v, direction=direction, corners=corners, radiance=np.ones(3))
 
 
+@pytest.mark.newest
 @pytest.mark.parametrize("size", [0.2, 0.05, 0.01, 1e-3])
 @table_names
 def test_small_lights_keep_the_promise_and_their_share(name, size, monkeypatch):
@@ -180,6 +147,7 @@ def test_many_indices_of_refraction_give_what_single_ones_give(name):
     assert np.abs(apart - together).max() < 2e-6
 
 
+@pytest.mark.newest
 @pytest.mark.parametrize("corners", [3, 4, 5, 12, 32, 64])
 @pytest.mark.parametrize("degree", [1, 2, 3, 4])
 def test_edge_loop_gives_the_moments(degree, corners):

@@ -35,8 +35,9 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "helpers")]
 import fake_scene  # noqa: E402
 
 from ltsh_addon import cli, imaging  # noqa: E402
-from ltsh_addon.blender.process import client  # noqa: E402
+from ltsh_addon.blender.process import bake, blend_file  # noqa: E402
 from ltsh_addon.pipeline import batch, tasks  # noqa: E402
+from ltsh_addon.scene import SceneError  # noqa: E402
 
 SECONDS = 10.0
 # Of a message: lines, and letters of one.
@@ -488,10 +489,10 @@ def stand_in() -> None:
     fake_scene.FakeChild().install(Patch)
 
     def cannot(*arguments, **options):
-        raise client.SceneError("this second Blender is none")
+        raise SceneError("this second Blender is none")
 
-    client.run_child = cannot
-    client.scene_facts = lambda scene, frames, objects, uv=None, **options: [
+    blend_file.run_job = bake.run_job = cannot
+    bake.scene_facts = lambda scene, frames, objects, uv=None, **options: [
         {"frame": 1, "camera": "Camera", "objects": ["Floor"], "tiles": {}} for _ in frames
     ]
 

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "helpers"), str(ROOT / "tests" / "lobes")]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "helpers")]
 
+import hostile_polygons as hostile  # noqa: E402
 import polar_quadrature  # noqa: E402
-import test_lobe_robustness as hostile  # noqa: E402
 
 from ltsh_addon import shading  # noqa: E402
 from ltsh_addon.lobes import spherical_harmonics  # noqa: E402

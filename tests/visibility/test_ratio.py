@@ -5,12 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 import random_surfaces
+import textbook
+from known_tracers import OPEN, WALL, Tracer, floor, panel, past_spheres
 
 from ltsh_addon import shading
-from ltsh_addon.scene import PASSES, AreaLight, Cancelled, Film, SurfaceSamples
+from ltsh_addon.scene import PASSES, Cancelled, Film, SurfaceSamples
 from ltsh_addon.visibility import ratio
 from ltsh_addon.visibility.directions import Emitter
-from ltsh_addon.visibility.occluders import ChosenBy
 
 KINDS = [*((surface, "plain") for surface in random_surfaces.SURFACES)] + [
     ("plain", light)
@@ -18,80 +19,6 @@ KINDS = [*((surface, "plain") for surface in random_surfaces.SURFACES)] + [
 ]
 KINDS += [(surface, light) for surface in random_surfaces.SHAPED for light in ("plain", "horizon", "polygon", "spread")]
 KINDS += [("brushed", light) for light in ("plain", "horizon", "ball")]
-
-
-class Tracer:
-    """Rays with a function of origins, directions (R, 3) and distances (R,) for the light that they let through."""
-
-    def __init__(self, passed=lambda origins, directions, distances: np.ones(len(origins))):
-        self.passed, self.rays = passed, 0
-
-    library = None
-
-    def mask_of(self, name):
-        return 0xFFFFFFFF
-
-    surface_mask_of = mask_of
-
-    def chosen_by(self, name):
-        return ChosenBy(surface=False)
-
-    def starts(self, samples):
-        self.position = samples.position
-        return self
-
-    def aimed(self, index, directions, distances, at_surface=False):
-        origins = np.broadcast_to(self.position[index].T[:, None], directions.shape)
-        return origins.astype(np.float32), directions, distances
-
-    def transmittance(self, origins, directions, distances, masks):
-        self.rays += len(origins)
-        assert np.allclose(np.linalg.norm(directions, axis=1), 1.0, atol=1e-5)
-        return self.passed(origins, directions, distances).astype(np.float32)
-
-
-OPEN, WALL = Tracer(), Tracer(lambda origins, directions, distances: np.zeros(len(origins)))
-
-
-def past_spheres(*spheres):
-    """A tracer for opaque spheres (center, radius)."""
-
-    def passed(origins, directions, distances):
-        free = np.ones(len(origins), bool)
-        for center, radius in spheres:
-            offset = origins - np.asarray(center)
-            along = (offset * directions).sum(axis=1)
-            root = along**2 - (offset**2).sum(axis=1) + radius**2
-            near = -along - np.sqrt(np.maximum(root, 0.0))
-            free &= (root <= 0.0) | (near <= 0.0) | (near >= distances)
-        return free
-
-    return Tracer(passed)
-
-
-def floor(side, roughness=0.3):
-    """side^2 samples of the floor from -2 to 2 m, with a diffuse and a specular lobe, and their film."""
-    y, x = (np.mgrid[0:side, 0:side].reshape(2, -1) + 0.5) / side * 4.0 - 2.0
-    position = np.stack([x, y, np.zeros_like(x)], axis=1)
-    view = random_surfaces.unit(np.array([0.0, -6.0, 3.0]) - position)
-    count = len(position)
-    gray = np.full((count, 3), 0.5)
-    up = np.broadcast_to(np.array([0.0, 0.0, 1.0]), (count, 3))
-    samples = SurfaceSamples(
-        position, view, up, up, np.full(count, roughness), gray, gray, np.zeros(count), np.full(count, 1.5), gray
-    )
-    return samples, Film(side, side, np.arange(count))
-
-
-def panel(**changes):
-    """A light of 2 x 1.4 m that stands at the end of the floor."""
-    direction = np.array([0.0, -np.cos(0.3), -np.sin(0.3)])
-    half_u = np.array([1.0, 0.0, 0.0])
-    values = {
-        "name": "Panel", "shape": "RECTANGLE", "center": np.array([0.0, 3.0, 1.5]), "half_u": half_u,
-        "half_v": 0.7 * np.cross(direction, half_u), "direction": direction, "radiance": np.ones(3),
-    }  # fmt: skip
-    return AreaLight(**{**values, **changes})
 
 
 @pytest.mark.parametrize(("surface", "kind"), KINDS)
@@ -152,7 +79,7 @@ def brute_force(samples, light, passed, side):
         normal, view = one.normal[0], one.view[0]
         half = random_surfaces.unit(towards + view)
         alpha, cosine, cosine_o = one.roughness[0] ** 2, np.maximum(towards @ normal, 1e-9), view @ normal
-        lobe = textbook_ggx(half @ normal, cosine, cosine_o, alpha) * cosine
+        lobe = textbook.ggx_of_cosines(half @ normal, cosine, cosine_o, alpha) * cosine
         f0, f90 = one.specular_f0.mean(), one.specular_f90.mean()
         lobe *= f0 + (f90 - f0) * (1.0 - (half * view).sum(axis=1)) ** 5
         lobe *= (towards @ normal > 0.0) & (towards @ one.geometric_normal[0] > 0.0)
@@ -164,14 +91,6 @@ def brute_force(samples, light, passed, side):
             whole = (values * measure).sum()
             shares[name].append((values * measure * seen).sum() / whole if whole > 0.0 else 1.0)
     return {name: np.array(values) for name, values in shares.items()}
-
-
-def textbook_ggx(cosine_h, cosine_i, cosine_o, alpha):
-    """The BRDF with F = 1 in sr^-1 (Walter et al. 2007, eq. 33; Heitz 2014, eq. 99)."""
-    tangents = [1.0 / cosine**2 - 1.0 for cosine in (cosine_h, cosine_i, cosine_o)]
-    distribution = alpha**2 / (np.pi * cosine_h**4 * (alpha**2 + tangents[0]) ** 2)
-    masking = 1.0 / (1.0 + sum(0.5 * (np.sqrt(1.0 + alpha**2 * tangent) - 1.0) for tangent in tangents[1:]))
-    return distribution * masking / (4.0 * cosine_i * cosine_o)
 
 
 def with_all_rays(samples, light, tracer):

@@ -5,8 +5,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import textbook
+from known_tracers import OPEN, WALL, floor, past_spheres
 from random_surfaces import unit
-from test_ratio import OPEN, WALL, floor, past_spheres, textbook_ggx
 
 from ltsh_addon import shading
 from ltsh_addon.pipeline import lighting, relight
@@ -78,7 +79,7 @@ def test_rays_bring_the_light_of_all_lamps(roughness):
         power = light.radiance.mean() * area * light_cosine / distance**2
         expected["diffuse"] += (power * np.maximum(toward[..., 2], 0.0)).sum(axis=1) * 0.5 / np.pi
         half = unit(toward + samples.view[:, None])
-        lobe = textbook_ggx(half[..., 2], toward[..., 2], samples.view[:, None, 2], roughness**2)
+        lobe = textbook.ggx_of_cosines(half[..., 2], toward[..., 2], samples.view[:, None, 2], roughness**2)
         expected["specular"] += (power * np.maximum(toward[..., 2], 0.0) * lobe).sum(axis=1) * 0.5
     for name in PASSES:
         found = pairs.unshadowed(name)

@@ -1,13 +1,12 @@
-"""Settings of the view and final renders, the panels of Cycles that our engine shares, and the line of a split view."""
+"""Settings of the view and final renders, and the panels of Cycles that our engine shares."""
 
 from __future__ import annotations
 
 import bpy
-import gpu
-from gpu_extras.batch import batch_for_shader
 
 from ...scene import CYCLES, SHIPPED_TABLES, TECHNIQUES
 from ..ui.preview import ENGINE
+from .redraws import tag_views
 
 # Files store these numbers, so they must not change.
 _NUMBERS = {"ltc": 0, "ltsh2": 1, "ltsh4": 2, CYCLES: 3, "ltsh4c": 4}
@@ -37,10 +36,7 @@ SECOND_ITEMS = (
 
 def _redraw(settings, context) -> None:
     """Show a changed setting at once: Blender does not redraw 3D views for properties of add-ons."""
-    for window in context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type == "VIEW_3D":
-                area.tag_redraw()
+    tag_views()
 
 
 class LTSH_ViewSettings(bpy.types.PropertyGroup):
@@ -113,11 +109,11 @@ def _is_about_scene(panel) -> bool:
 
 def _below(panel) -> list[type]:
     """All classes derived from `panel`, each once."""
-    found = {}
-    for own in panel.__subclasses__():
-        found[own] = None
-        found.update(dict.fromkeys(_below(own)))
-    return list(found)
+    classes = {}
+    for derived in panel.__subclasses__():
+        classes[derived] = None
+        classes.update(dict.fromkeys(_below(derived)))
+    return list(classes)
 
 
 class _AsCycles:
@@ -169,85 +165,9 @@ def _unshare_panels() -> None:
                 setattr(panel, name, value)
 
 
-REACH = 8.0  # pixels of an unscaled interface
-HANDLE = 12.0
-
-
-def is_split(context) -> bool:
-    """True if the space of `context` is a 3D view with a split picture."""
-    space = context.space_data
-    shown = space is not None and space.type == "VIEW_3D" and space.shading.type == "RENDERED"
-    return shown and context.engine == ENGINE and context.scene.ltsh_view.mode == "split"
-
-
-def _line_place(context) -> float:
-    return context.scene.ltsh_view.split_position * context.region.width
-
-
-class LTSH_GT_split(bpy.types.Gizmo):
-    """A vertical line that moves sideways."""
-
-    bl_idname = "LTSH_GT_split"
-
-    def test_select(self, context, location):
-        reach = REACH * context.preferences.system.ui_scale
-        return 0 if abs(location[0] - _line_place(context)) <= reach else -1
-
-    def draw(self, context):
-        """Draw the handle, an arrow to either side; the line is part of the picture."""
-        size = HANDLE * context.preferences.system.ui_scale * (1.25 if self.is_highlight else 1.0)
-        x, y = _line_place(context), 0.5 * context.region.height
-        shader = gpu.shader.from_builtin("UNIFORM_COLOR")
-        gpu.state.blend_set("ALPHA")
-        shader.bind()
-        for grown, color in ((0.3 * size, (0.0, 0.0, 0.0, 0.6)), (0.0, (0.95, 0.95, 0.95, 1.0))):
-            shader.uniform_float("color", color)
-            corners = []
-            for side in (-1.0, 1.0):
-                inner, tip = x + side * (0.4 * size - 0.5 * grown), x + side * (1.2 * size + grown)
-                corners += [(inner, y + 0.8 * size + grown), (inner, y - 0.8 * size - grown), (tip, y)]
-            batch_for_shader(shader, "TRIS", {"pos": [(*corner, 0.0) for corner in corners]}).draw(shader)
-        gpu.state.blend_set("NONE")
-
-    def invoke(self, context, event):
-        self.start = context.scene.ltsh_view.split_position
-        return {"RUNNING_MODAL"}
-
-    def modal(self, context, event, tweak):
-        width = max(context.region.width, 1)
-        context.scene.ltsh_view.split_position = min(max(event.mouse_region_x / width, 0.0), 1.0)
-        return {"RUNNING_MODAL"}
-
-    def exit(self, context, cancel):
-        if cancel:
-            context.scene.ltsh_view.split_position = self.start
-
-
-class LTSH_GGT_split(bpy.types.GizmoGroup):
-    """The line in every 3D view that is split."""
-
-    bl_idname = "LTSH_GGT_split"
-    bl_label = "LTSH split view"
-    bl_space_type = "VIEW_3D"
-    bl_region_type = "WINDOW"
-    bl_options = {"PERSISTENT", "SHOW_MODAL_ALL"}
-
-    @classmethod
-    def poll(cls, context):
-        return is_split(context)
-
-    def setup(self, context):
-        self.line = self.gizmos.new(LTSH_GT_split.bl_idname)
-        self.line.use_draw_modal = True
-
-
-CLASSES = (LTSH_ViewSettings, LTSH_GT_split, LTSH_GGT_split)
-_add_classes, _remove_classes = bpy.utils.register_classes_factory(CLASSES)
-
-
 def register() -> None:
-    """Add the settings and the gizmo, and show the shared panels."""
-    _add_classes()
+    """Add the settings, and show the shared panels."""
+    bpy.utils.register_class(LTSH_ViewSettings)
     bpy.types.Scene.ltsh_view = bpy.props.PointerProperty(type=LTSH_ViewSettings)
     _share_panels()
 
@@ -256,4 +176,4 @@ def unregister() -> None:
     """Remove what `register` added."""
     _unshare_panels()
     del bpy.types.Scene.ltsh_view
-    _remove_classes()
+    bpy.utils.unregister_class(LTSH_ViewSettings)

@@ -8,6 +8,7 @@ import bpy
 
 from ...scene import SceneError
 from ..materials.graph import cut, ensure_nodes, material_output
+from ..process.bake import ApplyJob, BakedTextures
 from ..saving import save_copy
 from .pixels import open_scene
 
@@ -17,29 +18,27 @@ GROUP_PREFIX = "LTSH Bake"
 FORMER, FORMER_LINK = "ltsh_former_material", "ltsh_former_link"
 
 
-def apply_bake(job: dict, progress) -> dict:
-    """Do the `job` (see `client.apply_bake`): let the baked objects of the scene show their textures, and save it.
-
-    The file is saved as `job["path"]`. Returns the manifest.
-    """
+def apply_bake(job: ApplyJob, folder: Path, progress) -> dict:
+    """Do the `job`: let the baked objects of the scene show their textures, and save it. Returns the manifest."""
     warnings = []
     progress("open scene", 0.0)
-    open_scene(Path(job["scene"]), warnings)
-    path = Path(job["path"])
-    for entry in job["textures"]:
-        ob = bpy.data.objects.get(entry["object"])
+    open_scene(Path(job.scene), warnings)
+    path = Path(job.path)
+    for fields in job.textures:
+        entry = BakedTextures(**fields)
+        ob = bpy.data.objects.get(entry.object)
         if ob is None:
-            raise SceneError(f"object {entry['object']!r} is gone from {job['scene']}")
+            raise SceneError(f"object {entry.object!r} is gone from {job.scene}")
         show_texture(ob, entry)
     bpy.context.preferences.filepaths.save_version = 0  # no backup of our own empty file there
     save_copy(path, relative_remap=True)
     return {"warnings": warnings}
 
 
-def show_texture(ob, entry: dict) -> None:
-    """Give `ob` copies of its materials that show the texture of `entry` (see `client.apply_bake`)."""
+def show_texture(ob, entry: BakedTextures) -> None:
+    """Give `ob` copies of its materials that show its baked textures."""
     restore_materials(ob)
-    _show(ob, _group(ob.name, _image(entry), entry["uv"]))
+    _show(ob, _group(ob.name, _image(entry), entry.uv))
 
 
 def shows_texture(ob) -> bool:
@@ -49,28 +48,28 @@ def shows_texture(ob) -> bool:
 
 def restore_materials(ob) -> bool:
     """Give `ob` back the materials that it had before `show_texture`; False if it shows no texture."""
-    found = False
+    was_shown = False
     for slot in ob.material_slots:
         shown = slot.material
         if shown is None or FORMER_LINK not in shown:
             continue
-        found, former, link = True, shown.get(FORMER), shown[FORMER_LINK]
+        was_shown, former, link = True, shown.get(FORMER), shown[FORMER_LINK]
         slot.material = former if isinstance(former, bpy.types.Material) else None
         if link == "DATA":
             slot.link = "DATA"
         if shown.users == 0:
             bpy.data.materials.remove(shown)
-    return found
+    return was_shown
 
 
 def _image(entry):
     """The texture as an image datablock, in linear colors."""
-    first = entry["files"][0]
+    first = entry.files[0]
     image = bpy.data.images.load(first["path"], check_existing=False)
-    image.name = entry["name"]
-    if len(entry["files"]) > 1:
+    image.name = entry.name
+    if len(entry.files) > 1:
         image.source = "TILED"
-        for file in entry["files"][1:]:
+        for file in entry.files[1:]:
             image.tiles.new(tile_number=file["tile"])
         image.filepath = first["path"].replace(f".{first['tile']}.", ".<UDIM>.")
     try:

@@ -29,6 +29,7 @@ from ..materials.aovs import (
 )
 from ..materials.graph import ensure_nodes
 from ..materials.maps import UV_MAP, MaterialPlan, SavedImages
+from ..process.bake import BakeFactsJob, BakeJob
 from ..render_settings import working_space
 from . import pixels
 from .occluders import collect_occluders
@@ -282,7 +283,7 @@ def view_of(wanted, camera, bent: bool) -> BakeView:
 
 
 # Keys of a job that may change while the same file stays open.
-_OF_ONE_JOB = ("objects", "following", "tile", "finished", "look_up_images", "temporary")
+_OF_ONE_JOB = ("objects", "following", "tile", "finished", "look_up_images")
 
 
 @dataclass(frozen=True)
@@ -332,14 +333,14 @@ class BakeScene:
 _kept: dict[str, tuple] = {}
 
 
-def opened_scene(job: dict, progress) -> BakeScene:
-    """The opened file of `job` (see `client.BakeJob`); one that is open is used again if nothing has changed."""
-    status = Path(job["scene"]).stat()
-    key = {name: value for name, value in job.items() if name not in _OF_ONE_JOB}
+def opened_scene(job: BakeJob, progress) -> BakeScene:
+    """The opened file of `job`; one that is open is used again if nothing has changed."""
+    status = Path(job.scene).stat()
+    key = {name: value for name, value in vars(job).items() if name not in _OF_ONE_JOB}
     key = repr(sorted(key.items())), status.st_mtime_ns, status.st_size, pixels.files_opened()
     if _kept.get("key") == key:
         kept = _kept["scene"]
-        if not isinstance(job["objects"], str) and set(job["objects"]) <= set(kept.names):
+        if not isinstance(job.objects, str) and set(job.objects) <= set(kept.names):
             return kept
     close()
     progress("open scene", 0.0)
@@ -356,16 +357,16 @@ def close() -> None:
         kept.folder.cleanup()
 
 
-def _open(job: dict) -> BakeScene:
+def _open(job: BakeJob) -> BakeScene:
     warnings: list[str] = []
-    pixels.open_scene(Path(job["scene"]), warnings, job["scripts"])
+    pixels.open_scene(Path(job.scene), warnings, job.scripts)
     scene = bpy.context.scene
-    render_settings.go_to_frame(scene, job["frame"])
+    render_settings.go_to_frame(scene, job.frame)
     camera = _camera(scene, job)
     view_layer = render_settings.choose_view_layer(scene, warnings)
-    names = job["objects"]
+    names = job.objects
     if not isinstance(names, str):
-        names = list(dict.fromkeys([*names, *job["following"]]))
+        names = list(dict.fromkeys([*names, *job.following]))
     objects = chosen_objects(scene, view_layer, names)
     render_settings.neutralize(scene, view_layer, camera, warnings)
     world = take_world(scene, view_layer, warnings)
@@ -375,11 +376,11 @@ def _open(job: dict) -> BakeScene:
         warnings.append(f"material override {override!r} is switched off: objects are baked with their own")
         view_layer.material_override = None
     origin = move_to_origin(scene, middle_of(objects[0]), warnings)
-    seen_from = job["view"] if isinstance(job["view"], str) else tuple(np.subtract(job["view"], origin).tolist())
+    seen_from = job.view if isinstance(job.view, str) else tuple(np.subtract(job.view, origin).tolist())
     folder = tempfile.TemporaryDirectory(prefix="ltsh-meshes-", ignore_cleanup_errors=True)
-    has_shadows = job["shadows"] == "on"
-    _apply_modifiers(scene, objects, job["uv"])
-    inventory, meshes, problems, bare = _inspect(scene, objects, job["uv"], Path(folder.name), origin, has_shadows)
+    has_shadows = job.shadows == "on"
+    _apply_modifiers(scene, objects, job.uv)
+    inventory, meshes, problems, bare = _inspect(scene, objects, job.uv, Path(folder.name), origin, has_shadows)
     give_default_material(bare)
     lobes = _lobes([ob for ob in objects if ob.name in meshes], inventory.emitting_materials)
     for material in bpy.data.materials:
@@ -392,9 +393,9 @@ def _open(job: dict) -> BakeScene:
     if not lights:
         raise pixels.no_light(scene, inventory.warnings)
     render_settings.leave_out_objects(scene, inventory.left_out, warnings)
-    if job["cycles_samples"]:
+    if job.cycles_samples:
         scene.world = inventory.world
-    view = view_of(seen_from, camera, bent=job["cycles_samples"] > 0)
+    view = view_of(seen_from, camera, bent=job.cycles_samples > 0)
     if view.kind == "point":
         view = replace(view, vector=tuple(np.add(view.vector, origin).tolist()))
     _look_from(scene, camera, seen_from)
@@ -403,7 +404,7 @@ def _open(job: dict) -> BakeScene:
             let_shadow_rays_through(found.made_opaque)
     else:
         remove_occlusion(scene)
-    name, names = camera.name if job["view"] == "camera" else "", [ob.name for ob in objects]
+    name, names = camera.name if job.view == "camera" else "", [ob.name for ob in objects]
     if has_shadows:
         inventory.occluders.save(Path(folder.name) / OCCLUDERS)
     return BakeScene(scene, name, view, lights, origin, warnings, names, meshes, problems, lobes, folder)
@@ -411,8 +412,8 @@ def _open(job: dict) -> BakeScene:
 
 def _camera(scene, job):
     """The camera of the view, or a new one, which a render needs in any case."""
-    if job["view"] == "camera":
-        return render_settings.choose_camera(scene, job["camera"])
+    if job.view == "camera":
+        return render_settings.choose_camera(scene, job.camera)
     camera = bpy.data.objects.new("ltsh bake", bpy.data.cameras.new("ltsh bake"))
     scene.collection.objects.link(camera)
     scene.camera = camera
@@ -543,13 +544,13 @@ def _lobes(objects, emitting) -> dict[str, MaterialLobes]:
     return found
 
 
-def extract_bake(job: dict, folder: Path, progress) -> dict:
-    """Do the `job` (see `client.extract_bake`) and write .npz and .npy files into `folder`; returns the manifest."""
+def extract_bake(job: BakeJob, folder: Path, progress) -> dict:
+    """Do the `job` and write .npz and .npy files into `folder`; returns the manifest."""
     started = time.monotonic()
     opened = opened_scene(job, progress)
-    names = opened.names if isinstance(job["objects"], str) else job["objects"]
-    images = SavedImages(folder) if job["look_up_images"] else None
-    if job["shadows"] == "on":
+    names = opened.names if isinstance(job.objects, str) else job.objects
+    images = SavedImages(folder) if job.look_up_images else None
+    if job.shadows == "on":
         shutil.copyfile(Path(opened.folder.name) / OCCLUDERS, folder / OCCLUDERS)
     records = []
     for number, name in enumerate(names):
@@ -565,7 +566,7 @@ def extract_bake(job: dict, folder: Path, progress) -> dict:
         "frame": opened.scene.frame_current,
         "lights": light_records(opened.lights),
         "origin": opened.origin.tolist(),
-        "occluders": OCCLUDERS if job["shadows"] == "on" else None,
+        "occluders": OCCLUDERS if job.shadows == "on" else None,
         "color_space": working_space(),
         "warnings": opened.warnings,
         "sampled_texels": SAMPLED_TEXELS,
@@ -591,29 +592,29 @@ def _object(opened, name, images, job, folder, progress) -> dict:
     for uv_name, file in record["uv_maps"].items():
         save_array(folder / file, read.uv_map(uv_name))
     record["maps"] = any(plan.count for plan in distinct)
-    if record["maps"] or job["cycles_samples"]:
+    if record["maps"] or job.cycles_samples:
         _bake(opened, ob, distinct, job, folder, progress)
     return record
 
 
 def _bake(opened, ob, plans, job, folder, progress) -> None:
     """Write the maps and Cycles' bake of an object, for the wanted tiles that are not finished."""
-    read, points = opened.meshes[ob.name], job["sub_samples"] if any(plan.count for plan in plans) else 0
+    read, points = opened.meshes[ob.name], job.sub_samples if any(plan.count for plan in plans) else 0
     bake = ObjectBake(opened.scene, ob, read.uv_name, plans)
     try:
         with np.load(read.mesh) as data:
-            blocks = blocks_of(data["uv"], job["width"], job["height"], job["block_rows"])
-        finished = {tile for name, tile in job["finished"] if name == ob.name}
+            blocks = blocks_of(data["uv"], job.width, job.height, job.block_rows)
+        finished = {tile for name, tile in job.finished if name == ob.name}
         blocks = [Block(*values) for values in blocks if values[0] not in finished]
-        if job["tile"] is not None:
-            blocks = [block for block in blocks if block.tile == job["tile"]]
+        if job.tile is not None:
+            blocks = [block for block in blocks if block.tile == job.tile]
         for number, block in enumerate(blocks):
             progress(f"bake {ob.name}", number / len(blocks))
             for point in range(points):
                 save_array(folder / f"maps_{block.name}_{point}.npy", bake.maps(block, point, points))
-            if job["cycles_samples"]:
-                for kind in job["passes"]:
-                    halves = bake.radiance(block, kind, max(1, job["cycles_samples"] // 2))
+            if job.cycles_samples:
+                for kind in job.passes:
+                    halves = bake.radiance(block, kind, max(1, job.cycles_samples // 2))
                     save_array(folder / f"cycles_{kind}_{block.name}.npy", halves)
     finally:
         bake.close()
@@ -628,20 +629,20 @@ def blocks_of(uv, width: int, height: int, block_rows: int) -> list[tuple[int, i
     ]
 
 
-def scene_facts(job: dict, progress) -> dict:
-    """Do the `job` (see `client.scene_facts`): returns a manifest of what there is to bake in each frame."""
+def scene_facts(job: BakeFactsJob, folder: Path, progress) -> dict:
+    """Do the `job`: returns a manifest of what there is to bake in each frame."""
     progress("open scene", 0.0)
-    pixels.open_scene(Path(job["scene"]), [], job["scripts"])
+    pixels.open_scene(Path(job.scene), [], job.scripts)
     scene, facts, tiles = bpy.context.scene, [], {}
     view_layer = render_settings.choose_view_layer(scene, [])
     own = scene.frame_current
-    for frame in job["frames"]:
+    for frame in job.frames:
         render_settings.go_to_frame(scene, own if frame is None else frame)
-        chosen = [] if job["objects"] is None else chosen_objects(scene, view_layer, job["objects"])
+        chosen = [] if job.objects is None else chosen_objects(scene, view_layer, job.objects)
         name = scene.camera.name if scene.camera is not None else None
         for ob in chosen:
             if ob.name not in tiles:
-                tiles[ob.name] = tiles_without_modifiers(ob, job["uv"])
+                tiles[ob.name] = tiles_without_modifiers(ob, job.uv)
         found = {"frame": scene.frame_current, "camera": name, "objects": [ob.name for ob in chosen]}
         facts.append({**found, "tiles": {ob.name: tiles[ob.name] for ob in chosen if len(tiles[ob.name]) > 1}})
     return {"facts": facts}

@@ -14,7 +14,8 @@ from ..evaluated import SURFACE_TYPES
 from ..materials.aovs import give_default_material, objects_without_material
 from ..materials.bsdfs import emits, is_emission
 from ..materials.graph import cut, ensure_nodes, is_seen_through, material_output, shaders_behind, tree_in_use
-from ..process.client import EDGE_SECONDS
+from ..process.finished import FinishedJob, ShowJob
+from ..process.pixels import EDGE_SECONDS
 from ..render_settings import enable_passes, render_exr
 from .pixels import REST_PASSES, open_scene, scene_named
 
@@ -39,25 +40,25 @@ EDGES, EDGE_SAMPLES, EDGE_LIMIT = "edges.exr", (16, 512), 0.003
 REFLECTING = ("Color", "Base Color", "Metallic", "Specular IOR Level", "Transmission Weight", "Subsurface Weight")
 
 
-def render_finished(job: dict, folder: Path, progress) -> dict:
-    """Do the `job` (see `client.FinishedJob`) and write EXRs into `folder`. Returns the manifest."""
-    warnings, started, seconds = [], time.process_time(), job["seconds"]
+def render_finished(job: FinishedJob, folder: Path, progress) -> dict:
+    """Do the `job` and write EXRs into `folder`. Returns the manifest."""
+    warnings, started, seconds = [], time.process_time(), job.seconds
     progress("open scene", 0.0)
-    open_scene(Path(job["scene"]), warnings, job["scripts"])
-    scene = scene_named(job["scene_name"])
-    render_settings.go_to_frame(scene, job["frame"])
-    camera = render_settings.choose_camera(scene, job["camera"])
-    layer = render_settings.only_view_layer(scene, warnings, job["view_layer"], "rendered")
-    width, height = render_settings.set_resolution(scene, job["width"], job["height"])
+    open_scene(Path(job.scene), warnings, job.scripts)
+    scene = scene_named(job.scene_name)
+    render_settings.go_to_frame(scene, job.frame)
+    camera = render_settings.choose_camera(scene, job.camera)
+    layer = render_settings.only_view_layer(scene, warnings, job.view_layer, "rendered")
+    width, height = render_settings.set_resolution(scene, job.width, job.height)
     render_settings.render_border(scene)  # an error where it is less than a pixel
-    everything = _kept_by_cycles(scene, layer)
+    everything = _reasons_for_cycles(scene, layer)
     dropped = () if layer.cycles.denoising_store_passes else NOT_WRITTEN
     _prepare(scene, layer, warnings)
-    has_edges, end = job["edges"] and not (everything or camera.data.dof.use_dof), None
+    has_edges, end = job.edges and not (everything or camera.data.dof.use_dof), None
     if seconds is not None:
         reserve = EDGE_SECONDS * width * height / 1e6 if has_edges else 0.0
         end = started + SPENT * max(seconds - reserve, 0.0)
-    files, least = _render_chunks(scene, layer, folder, job["cycles_samples"], end, progress)
+    files, least = _render_chunks(scene, layer, folder, job.cycles_samples, end, progress)
     has_edges = has_edges and (end is None or time.process_time() < started + seconds)
     if has_edges:
         _render_edges(scene, layer, folder, progress)
@@ -76,18 +77,18 @@ def render_finished(job: dict, folder: Path, progress) -> dict:
     }
 
 
-def show_finished(job: dict, folder: Path, progress) -> dict:
-    """Write a PNG of pixels (H, W, 4) through the view transform of the scene."""
+def show_finished(job: ShowJob, folder: Path, progress) -> dict:
+    """Do the `job`; returns an empty manifest."""
     progress("write", 0.0)
-    if Path(bpy.data.filepath) != Path(job["scene"]):
-        open_scene(Path(job["scene"]), [], False)
-    scene = scene_named(job["scene_name"])
-    render_settings.go_to_frame(scene, job["frame"])
-    render_settings.save_png(scene, np.load(job["pixels"]), folder / job["name"])
+    if Path(bpy.data.filepath) != Path(job.scene):
+        open_scene(Path(job.scene), [], False)
+    scene = scene_named(job.scene_name)
+    render_settings.go_to_frame(scene, job.frame)
+    render_settings.save_png(scene, np.load(job.pixels), folder / job.name)
     return {}
 
 
-def _kept_by_cycles(scene, layer) -> list[str]:
+def _reasons_for_cycles(scene, layer) -> list[str]:
     """Why all direct light of the picture is left to Cycles."""
     world = layer.world_override or scene.world
     outputs = [] if world is None or tree_in_use(world) is None else tree_in_use(world).nodes

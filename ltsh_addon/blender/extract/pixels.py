@@ -12,7 +12,7 @@ import numpy as np
 from ...scene import SceneError, error_line, light_records, listed
 from .. import render_settings
 from ..evaluated import SURFACE_TYPES, rendered_surfaces, with_render_depsgraph
-from ..lights.area import LightInventory, collect_lights, seen_lights
+from ..lights.area import LightInventory, collect_lights, rendered_lights
 from ..lights.meshes import SIDE_PROPERTY, let_light_through
 from ..lights.world import blocks_nothing, take_world, world_behind, world_lights
 from ..materials.aovs import (
@@ -24,7 +24,9 @@ from ..materials.aovs import (
     objects_without_material,
     remove_aovs,
 )
-from ..process import client
+from ..process.blend_file import newer
+from ..process.blender_process import job_start
+from ..process.pixels import EDGE_SECONDS, PixelJob, too_small
 from ..render_settings import (
     camera_rays,
     enable_passes,
@@ -202,7 +204,7 @@ def open_scene(path: Path, warnings: list[str], scripts: bool = False) -> None:
         ) from None
     saved, here = tuple(bpy.data.version)[:2], bpy.app.version[:2]
     if saved > here:
-        raise SceneError(client.newer(path, saved, here))
+        raise SceneError(newer(path, saved, here))
     if bpy.app.autoexec_fail:
         warnings.append(f"scripts in {path.name} do not run: {bpy.app.autoexec_fail_message}")
     warnings.extend(missing_files())
@@ -241,8 +243,10 @@ def prepare_scene(
     inventory.origin = origin
     default = give_default_material(bare)
     materials += [default] if default else []
-    kept = inventory.kept if for_finished else None
-    of_materials = inject_aovs(materials, inventory.emitting_materials, inventory.unshaded, inventory.made_opaque, kept)
+    left_to_cycles = inventory.left_to_cycles if for_finished else None
+    of_materials = inject_aovs(
+        materials, inventory.emitting_materials, inventory.unshaded, inventory.made_opaque, left_to_cycles
+    )
     inventory.receivers.mark()
     inventory.behind = world
     add_world(inventory, scene, world)
@@ -257,7 +261,7 @@ def prepare_scene(
 def add_world(inventory: LightInventory, scene, world) -> None:
     """Complete `inventory` with the emission of its lights and the light of `world`, the former world of `scene`."""
     of_world = world_lights(scene, world, inventory.warn)
-    inventory.lights = seen_lights(scene, inventory) + of_world
+    inventory.lights = rendered_lights(scene, inventory) + of_world
     inventory.world = world if of_world else None
     if inventory.occluders is not None:
         inventory.occluders = blocks_nothing(inventory.occluders, inventory.world)
@@ -272,30 +276,30 @@ def no_light(scene, reasons: list[str]) -> SceneError:
     return SceneError(f"scene {scene.name!r}: no light that renders, {text}; add a light")
 
 
-def extract(job: dict, folder: Path, progress) -> dict:
-    """Do the `job` (see `client.extract`) and write its files into `folder`; returns the manifest.
+def extract_pixels(job: PixelJob, folder: Path, progress) -> dict:
+    """Do the `job` and write its files into `folder`; returns the manifest.
 
-    The budget of the job counts from the processor time `since` on.
+    The budget of the job counts from `job_start` on.
     """
     started, warnings, seconds = time.monotonic(), [], {}
     progress("open scene", 0.0)
-    open_scene(Path(job["scene"]), warnings, job["scripts"])
+    open_scene(Path(job.scene), warnings, job.scripts)
     opened = time.process_time()
-    scene = scene_named(job["scene_name"])
-    render_settings.go_to_frame(scene, job["frame"])
-    camera = render_settings.choose_camera(scene, job["camera"])
-    view_layer = render_settings.choose_view_layer(scene, warnings, job["view_layer"])
-    picture, for_finished = _picture(scene, job), job["for_finished"]
+    scene = scene_named(job.scene_name)
+    render_settings.go_to_frame(scene, job.frame)
+    camera = render_settings.choose_camera(scene, job.camera)
+    view_layer = render_settings.choose_view_layer(scene, warnings, job.view_layer)
+    picture, for_finished = _picture(scene, job), job.for_finished
     # The points of a pixel give the depth of field. With a reference there is none: its lens points would differ.
     lens, fewest = camera.data.dof, FINISHED_LENS if for_finished else 2
-    has_lens = lens.use_dof and job["sub_samples"] >= fewest and not job["cycles_samples"]
+    has_lens = lens.use_dof and job.sub_samples >= fewest and not job.cycles_samples
     is_sharp = lens.use_dof = lens.use_dof and not has_lens
     end, pixels = None, picture["width"] * picture["height"]
-    if job["seconds"] is not None:
-        end = job["since"] + job["seconds"] - (job["reserve"] + 1e-6 * client.EDGE_SECONDS) * pixels
+    if job.seconds is not None:
+        end = job_start() + job.seconds - (job.reserve + 1e-6 * EDGE_SECONDS) * pixels
     inventory, count = LightInventory(), 0
     if end is None or affordable_points(end - opened, pixels, 1):  # otherwise a look at the scene would be wasted
-        with_occluders, count = job["shadows"] == "on", job["sub_samples"]
+        with_occluders, count = job.shadows == "on", job.sub_samples
         inventory = prepare_scene(
             scene, view_layer, camera, warnings, with_occluders=with_occluders, for_finished=for_finished
         )
@@ -304,9 +308,9 @@ def extract(job: dict, folder: Path, progress) -> dict:
             count = min(affordable_points(end - now, pixels, len(inventory.lights), now - opened), count)
     if is_sharp and for_finished:
         points = f"with fewer than {FINISHED_LENS} points per pixel (--aa)"
-        inventory.kept.everything.append(f"depth of field of camera {camera.name!r} {points}")
+        inventory.left_to_cycles.everything.append(f"depth of field of camera {camera.name!r} {points}")
     if count == 0:
-        inventory.kept.everything.append(client.too_small(job["seconds"]))
+        inventory.left_to_cycles.everything.append(too_small(job.seconds))
     has_shadows = inventory.occluders is not None
     if has_shadows:
         inventory.occluders.save(folder / OCCLUDERS)
@@ -317,20 +321,20 @@ def extract(job: dict, folder: Path, progress) -> dict:
     offsets, weights = sub_pixel_offsets(scene, count), None
     if for_finished:
         # If all direct light is left to Cycles, no samples are needed.
-        count = 0 if inventory.kept.everything else count
+        count = 0 if inventory.left_to_cycles.everything else count
         offsets, weights = sub_pixel_offsets(scene, count, shared_points)
-    finer = _finer(scene, job["edge_points"]) if for_finished and has_shadows and count and not has_lens else None
-    with world_behind(scene, inventory.behind if job["rest"] and not picture["film_transparent"] else None):
-        passes = (*(REST_PASSES if job["rest"] else ()), *job["indices"])
+    finer = _finer(scene, job.edge_points) if for_finished and has_shadows and count and not has_lens else None
+    with world_behind(scene, inventory.behind if job.rest and not picture["film_transparent"] else None):
+        passes = (*(REST_PASSES if job.rest else ()), *job.indices)
         # Lights that the camera sees are part of the rest.
-        with nullcontext() if job["rest"] else without_lights(scene):
+        with nullcontext() if job.rest else without_lights(scene):
             samples = render_pixel_samples(scene, view_layer, folder, offsets, progress, passes)
     seconds["samples"] = time.monotonic() - started
 
     started, reference = time.monotonic(), None
-    if job["cycles_samples"] > 0:
+    if job.cycles_samples > 0:
         _prepare_reference(scene, inventory)
-        reference = render_reference(scene, view_layer, folder, job["cycles_samples"], job["sub_samples"], progress)
+        reference = render_reference(scene, view_layer, folder, job.cycles_samples, job.sub_samples, progress)
     seconds["cycles"] = time.monotonic() - started
     # A later task may save this picture as a PNG with the file's own settings.
     scene.render.film_transparent = picture["film_transparent"]
@@ -345,7 +349,7 @@ def extract(job: dict, folder: Path, progress) -> dict:
         "occluders": OCCLUDERS if has_shadows else None,
         "warnings": warnings,
         "unshaded": inventory.unshaded,
-        "kept": {**vars(inventory.kept), "warnings": inventory.warnings} if for_finished else None,
+        "left_to_cycles": {**vars(inventory.left_to_cycles), "warnings": inventory.warnings} if for_finished else None,
         "samples": samples,
         "has_lens": has_lens,
         "weights": None if weights is None else weights[: len(samples)].tolist(),
@@ -394,9 +398,9 @@ def scene_named(name: str | None):
     return bpy.data.scenes[name]
 
 
-def _picture(scene, job: dict) -> dict:
+def _picture(scene, job: PixelJob) -> dict:
     """Set the size of the picture; returns its entries of the manifest."""
-    width, height = render_settings.set_resolution(scene, job["width"], job["height"])
+    width, height = render_settings.set_resolution(scene, job.width, job.height)
     border = render_settings.render_border(scene)
     cropped = border is not None and border.cropped
     return {

@@ -21,13 +21,13 @@ import numpy as np
 
 from ...scene import AREA_LIGHT_SHAPES, FARTHEST, AreaLight, SpotCone, listed
 from ..evaluated import EmitterTraits, RenderedSurface, surface_instancer
-from ..materials.aovs import KeptByCycles
+from ..materials.aovs import CyclesReasons
 from ..materials.graph import tree_in_use
 from ..render_settings import cycles_setting
 from .emission import Falloff, ObjectFacts, emission_of, open_studio, what_is_lost
 from .linking import Receivers
 from .meshes import SIDE_PROPERTY, MeshLight, collect_mesh_lights, mark_transparent, mesh_area_lights
-from .textures import UnseenLight, look_at_area_lights
+from .textures import NodeLight, with_node_emission
 
 # SHEAR_COSINE: a transform is sheared if the cosine between two of its axes is larger.
 SHEAR_COSINE = 1e-4
@@ -49,7 +49,7 @@ class LightInventory:
     lights: list[AreaLight] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     left_out: set[str] = field(default_factory=set)  # full names of the objects to leave out of the reference
-    unseen: dict[int, UnseenLight] = field(default_factory=dict)  # by position in `lights`
+    node_lights: dict[int, NodeLight] = field(default_factory=dict)  # by position in `lights`
     receivers: Receivers = field(default_factory=lambda: Receivers([]))
     meshes: list[MeshLight] = field(default_factory=list)
     instancers: dict[str, RenderedSurface] = field(default_factory=dict)  # by full name
@@ -60,7 +60,7 @@ class LightInventory:
     occluders: Any = None  # visibility.Occluders, if shadows are wanted
     made_opaque: list[tuple] = field(default_factory=list)  # see `inject_aovs`
     settings: dict[str, list[float]] = field(default_factory=dict)  # see `Extraction.light_settings`
-    kept: KeptByCycles = field(default_factory=KeptByCycles)  # what finished pictures leave to Cycles
+    left_to_cycles: CyclesReasons = field(default_factory=CyclesReasons)  # what finished pictures leave to Cycles
 
     def __post_init__(self):
         self._noted = set(self.warnings)
@@ -80,7 +80,7 @@ class LightInventory:
 def collect_lights(depsgraph, override=None) -> LightInventory:
     """All lights in a render of `depsgraph`, instances included; the material `override` replaces all others.
 
-    What `unseen` and `meshes` of the inventory emit is known only after `seen_lights` has rendered them.
+    What `node_lights` and `meshes` of the inventory emit is known only after `rendered_lights` has rendered them.
     """
     receivers = Receivers([instance.object.original for instance in depsgraph.object_instances])
     inventory = LightInventory(receivers=receivers)
@@ -95,32 +95,32 @@ def collect_lights(depsgraph, override=None) -> LightInventory:
             inventory.left_out.add(ob.original.name_full)
             inventory.warn(f"light {ob.original.name!r}: {problem}; left out of the Cycles reference as well")
             if not cycles_setting(ob.data, "is_portal"):
-                inventory.kept.everything.append(f"light {ob.original.name!r}, {problem}")
+                inventory.left_to_cycles.everything.append(f"light {ob.original.name!r}, {problem}")
             continue
         light = area_light(ob, matrix, EmitterTraits.of(instance), receivers)
         if np.any(light.radiance != 0.0):
-            placed.append((ob.original.name_full, light, unseen_light(ob, matrix, inventory, instance)))
+            placed.append((ob.original.name_full, light, node_light(ob, matrix, inventory, instance)))
             inventory.settings[light.name] = [ob.data.energy, ob.data.exposure, *ob.data.color]
             if cycles_setting(ob.data, "use_multiple_importance_sampling") and ob.data.type == "AREA":
                 hit.append(light)
             note_unsupported(ob, matrix, inventory)
             if _is_sheared(ob, matrix):
-                inventory.kept.everything.append(f"light {ob.original.name!r}, whose transform is sheared")
+                inventory.left_to_cycles.everything.append(f"light {ob.original.name!r}, whose transform is sheared")
             if light.affects_diffuse != light.affects_specular:
                 inventory.warn(half_hidden(light))
             _note_instancer(instance, inventory)
     # If one instance is unusable, all instances of the object are left out: the reference can only drop the object.
-    for name, light, unseen in placed:
+    for name, light, source in placed:
         if name not in inventory.left_out:
-            if unseen is not None:
-                inventory.unseen[len(inventory.lights)] = unseen
+            if source is not None:
+                inventory.node_lights[len(inventory.lights)] = source
             inventory.lights.append(light)
     _note_overlaps(hit, inventory)
     lost: list[str] = []
     inventory.meshes = collect_mesh_lights(depsgraph, override, receivers, lost.append)
     for reason in lost:
         inventory.warn(reason)
-    inventory.kept.everything += lost
+    inventory.left_to_cycles.everything += lost
     for mesh in inventory.meshes:
         if mesh.light.affects_diffuse != mesh.light.affects_specular:
             inventory.warn(half_hidden(mesh.light))
@@ -221,7 +221,7 @@ def _note_instancer(instance, inventory: LightInventory) -> None:
         inventory.instancers[instancer.original.name_full] = instancer
 
 
-def seen_lights(scene, inventory: LightInventory) -> list[AreaLight]:
+def rendered_lights(scene, inventory: LightInventory) -> list[AreaLight]:
     """The lights of `inventory`, with the emission of node trees and materials as Cycles renders it.
 
     Objects that must let light through in the reference, and their materials, get the custom property SIDE_PROPERTY.
@@ -231,14 +231,14 @@ def seen_lights(scene, inventory: LightInventory) -> list[AreaLight]:
             del block[SIDE_PROPERTY]
     for instancer in inventory.instancers.values():
         mark_transparent(instancer.original, 0, [slot.material for slot in instancer.material_slots])
-    if not inventory.unseen and not inventory.meshes:
+    if not inventory.node_lights and not inventory.meshes:
         return inventory.lights
     eye = np.array(scene.camera.matrix_world, dtype=np.float64)[:3, 3]
     with open_studio(scene) as studio:
-        lights = look_at_area_lights(inventory.lights, inventory.unseen, studio, inventory.warn)
+        lights = with_node_emission(inventory.lights, inventory.node_lights, studio, inventory.warn)
         of_meshes = mesh_area_lights(inventory.meshes, studio, eye, inventory.warn)
     dark = [mesh.ob.name for mesh in inventory.meshes if mesh.is_dropped]
-    inventory.kept.everything += [f"object {name!r}, which emits from too many faces" for name in dark]
+    inventory.left_to_cycles.everything += [f"object {name!r}, which emits from too many faces" for name in dark]
     return lights + of_meshes
 
 
@@ -316,7 +316,7 @@ def _radiance(light, half_u: np.ndarray, half_v: np.ndarray) -> np.ndarray:
     return value
 
 
-def unseen_light(ob, matrix: np.ndarray, inventory: LightInventory, instance=None) -> UnseenLight | None:
+def node_light(ob, matrix: np.ndarray, inventory: LightInventory, instance=None) -> NodeLight | None:
     """How to render the light `ob` for its node tree; None if it has none, or only one white Emission node.
 
     That node is the default tree since 5.0.
@@ -344,7 +344,7 @@ def unseen_light(ob, matrix: np.ndarray, inventory: LightInventory, instance=Non
                 f"light {ob.original.name!r}: its emission depends on the direction ({nodes}), shaded as seen head-on"
             )
         is_placed = light.type == "SUN" or emission.is_placed
-        return UnseenLight(light.original, matrix, emission.varies, is_placed=is_placed, **shared)
+        return NodeLight(light.original, matrix, emission.varies, is_placed=is_placed, **shared)
     is_ball = not light.use_soft_falloff and light.shadow_soft_size > 0.0
     # In Cycles the UV coordinates of a spot depend on the direction. A disk that turns to each point shines along its
     # normal, so its emission depends on the direction, too.
@@ -352,7 +352,7 @@ def unseen_light(ob, matrix: np.ndarray, inventory: LightInventory, instance=Non
     within = bool(emission.directional) or by_spot
     axes = matrix[:3, :3]
     is_placed = emission.is_placed or by_spot or np.abs(axes.T @ axes - np.eye(3)).max() > SHEAR_COSINE
-    return UnseenLight(
+    return NodeLight(
         light.original, matrix, emission.varies, is_placed=emission.varies and is_placed,
         by_ray=within or not is_ball, within=within, by_spot=by_spot, is_mixed=emission.by_place, **shared,
     )  # fmt: skip

@@ -19,7 +19,7 @@ MOST_LOOKS = 100
 
 
 @dataclass(frozen=True)
-class UnseenLight:
+class NodeLight:
     """A light whose node tree affects its radiance, which must be rendered to be known."""
 
     data: object  # the original light data block
@@ -57,7 +57,7 @@ class UnseenLight:
         return np.eye(3) if self.is_placed else np.linalg.inv(linear / np.linalg.norm(linear, axis=0))
 
 
-def look_at_area_lights(lights: list[AreaLight], unseen: dict[int, UnseenLight], studio: Studio, warn) -> list:
+def with_node_emission(lights: list[AreaLight], unseen: dict[int, NodeLight], studio: Studio, warn) -> list:
     """`lights` with the rendered emission of those at the positions in `unseen`; dark ones of these are left out."""
     result, seen = [], {}
     for position, light in enumerate(lights):
@@ -67,7 +67,7 @@ def look_at_area_lights(lights: list[AreaLight], unseen: dict[int, UnseenLight],
         source = unseen[position]
         own = seen.setdefault(source.data.name_full, [])
         if not own or (source.is_placed and len(own) < MOST_LOOKS):
-            own.append(seen_factor(source, studio))
+            own.append(node_emission(source, studio))
             found = own[-1]
         else:
             found = own[0]
@@ -83,7 +83,7 @@ def look_at_area_lights(lights: list[AreaLight], unseen: dict[int, UnseenLight],
 
 
 @dataclass(frozen=True)
-class SeenNodes:
+class NodeEmission:
     """The factor by which the node tree of a light multiplies its radiance."""
 
     # (H, W, 3), or (1, 1, 3) where it is constant and for suns. Area lights: columns run along half_u, row 0 is at
@@ -93,12 +93,12 @@ class SeenNodes:
     lost: float = 0.0
 
 
-def seen_factor(source: UnseenLight, studio: Studio) -> SeenNodes:
+def node_emission(source: NodeLight, studio: Studio) -> NodeEmission:
     """The factor of the nodes of a light, rendered by Cycles."""
     return {"AREA": _area_factor, "SUN": _sun_factor}.get(source.data.type, _point_factor)(source, studio)
 
 
-def _area_factor(source: UnseenLight, studio: Studio) -> SeenNodes:
+def _area_factor(source: NodeLight, studio: Studio) -> NodeEmission:
     data, place = source.data, source.place
     size_v = data.size if data.shape in ("SQUARE", "DISK") else data.size_y
     half_u, half_v = 0.5 * data.size * place[:3, 0], 0.5 * size_v * place[:3, 1]
@@ -107,7 +107,7 @@ def _area_factor(source: UnseenLight, studio: Studio) -> SeenNodes:
         image, _ = studio.look(place[:3, 3], half_u, half_v, direction, PIXELS if source.varies else 8)
     if np.dot(np.cross(half_u, half_v), direction) < 0.0:
         image = image[::-1]
-    return SeenNodes(image / (_WHITE["energy"] / np.pi))
+    return NodeEmission(image / (_WHITE["energy"] / np.pi))
 
 
 # PATTERN_ROWS: rows of the map of directions of a point or spot light. VIEW_PIXELS: along each side of the six views
@@ -116,13 +116,13 @@ PATTERN_ROWS, VIEW_PIXELS = 64, 192
 # The least radius of a point or spot light in a render. SMALL_RADIUS: in m. SMALL_SHARE: of its largest coordinate.
 SMALL_RADIUS, SMALL_SHARE = 1e-3, 1e-4
 # Relative errors above which there is a warning. PATTERN_COLORS: where a pattern has one color for all directions.
-# MOST_LOST: of `SeenNodes.lost`.
+# MOST_LOST: of `NodeEmission.lost`.
 PATTERN_COLORS = MOST_LOST = 0.05
 # SUN_PIXELS: along each side of the picture of a sun. LEAST_SUN, WIDEST_SUN: limits of the angle in rad of that sun.
 SUN_PIXELS, LEAST_SUN, WIDEST_SUN = 32, 1e-3, 2.9
 
 
-def _sun_factor(source: UnseenLight, studio: Studio) -> SeenNodes:
+def _sun_factor(source: NodeLight, studio: Studio) -> NodeEmission:
     """The mean factor over the disk of a sun."""
     angle = min(max(source.data.angle, LEAST_SUN), WIDEST_SUN)
     toward = source.matrix[:3, 2] / np.linalg.norm(source.matrix[:3, 2])
@@ -133,7 +133,7 @@ def _sun_factor(source: UnseenLight, studio: Studio) -> SeenNodes:
     step = (np.arange(SUN_PIXELS) + 0.5) * (2.0 / SUN_PIXELS) - 1.0
     inside = image[np.hypot(*np.meshgrid(step, step)) < 1.0 - 2.0 / SUN_PIXELS] / _WHITE["energy"]
     mean = inside.mean(axis=0)
-    return SeenNodes(mean.reshape(1, 1, 3), _apart(inside, mean))
+    return NodeEmission(mean.reshape(1, 1, 3), _apart(inside, mean))
 
 
 def _apart(values: np.ndarray, expected: np.ndarray) -> float:
@@ -141,7 +141,7 @@ def _apart(values: np.ndarray, expected: np.ndarray) -> float:
     return float(np.abs(values - expected).mean() / max(np.abs(expected).mean(), 1e-30))
 
 
-def _point_factor(source: UnseenLight, studio: Studio) -> SeenNodes:
+def _point_factor(source: NodeLight, studio: Studio) -> NodeEmission:
     data, center = source.data, source.place[:3, 3]
     small = max(SMALL_RADIUS, SMALL_SHARE * np.abs(center).max())
     radius = max(data.shadow_soft_size, small)
@@ -156,18 +156,18 @@ def _point_factor(source: UnseenLight, studio: Studio) -> SeenNodes:
 
     within = source.within
     if not source.by_ray:
-        return SeenNodes(_unfolded(views(False, radius), False))
+        return NodeEmission(_unfolded(views(False, radius), False))
     seen = views(within, small)
     factor = _unfolded(seen, within)
     if not source.varies:
-        return SeenNodes(factor.mean(axis=(0, 1), keepdims=True))
+        return NodeEmission(factor.mean(axis=(0, 1), keepdims=True))
     if not source.is_mixed or radius == small:
-        return SeenNodes(factor)
+        return NodeEmission(factor)
     if data.use_soft_falloff or source.by_spot:
         # Differences of opposite sign on opposite sides cancel in the mean over a disk.
         beside = _unfolded(views(within, radius), within) - factor
         across = np.roll(beside[::-1], PATTERN_ROWS, axis=1)
-        return SeenNodes(factor, _apart(factor + 0.5 * (beside + across), factor))
+        return NodeEmission(factor, _apart(factor + 0.5 * (beside + across), factor))
     # Points see a ball as a whole disk: scale the factor from the mean in the middle of that to the mean over it.
     step = (np.arange(VIEW_PIXELS) + 0.5) * (2.0 / VIEW_PIXELS) - 1.0
     disk = np.hypot(*np.meshgrid(step, step)) < 1.0 - 2.0 / VIEW_PIXELS
@@ -175,7 +175,7 @@ def _point_factor(source: UnseenLight, studio: Studio) -> SeenNodes:
     half = VIEW_PIXELS // 2
     middle = np.array([image[half - 1 : half + 1, half - 1 : half + 1].mean(axis=(0, 1)) for image in seen])[:, None]
     scale = whole.mean() / max(middle.mean(), 1e-30)
-    return SeenNodes(factor * scale, _apart(middle * scale, whole))
+    return NodeEmission(factor * scale, _apart(middle * scale, whole))
 
 
 _AXES = np.eye(3)
@@ -183,7 +183,7 @@ _WHITE = {"color": (1.0, 1.0, 1.0), "energy": 100.0, "exposure": 0.0, "normalize
 
 
 @contextmanager
-def _standing(source: UnseenLight, studio: Studio, settings: dict, kind: str = ""):
+def _standing(source: NodeLight, studio: Studio, settings: dict, kind: str = ""):
     """Within this context a white copy of the light stands at its place, without falloff and with these `settings`.
 
     A `kind` replaces the type of the light.
@@ -246,7 +246,7 @@ def _unfolded(views: list[np.ndarray], within: bool) -> np.ndarray:
     return result
 
 
-def with_pattern(light: AreaLight, found: SeenNodes, source: UnseenLight, warn) -> list[AreaLight]:
+def with_pattern(light: AreaLight, found: NodeEmission, source: NodeLight, warn) -> list[AreaLight]:
     """A point, spot or sun times the factor `found` of its nodes: one light, or [] if it is dark."""
     factor = found.factor
     weights = np.sin((np.arange(factor.shape[0]) + 0.5) * (np.pi / factor.shape[0]))[:, None, None]
@@ -300,7 +300,7 @@ class ShownTextures:
 
     def __init__(self):
         self._patches: dict[tuple, Patches | None] = {}
-        self._seen: dict[tuple, tuple[SeenNodes, Patches]] = {}
+        self._seen: dict[tuple, tuple[NodeEmission, Patches]] = {}
 
     def clear(self) -> None:
         """Forget the patches of images, so that the images are read again."""
@@ -314,7 +314,7 @@ class ShownTextures:
         patches = self._patches_of(light, factor)
         return None if patches is None else _shown_patches(light, patches, notes)
 
-    def split_seen(self, light: AreaLight, found: SeenNodes, notes: list[str]) -> list[AreaLight]:
+    def split_seen(self, light: AreaLight, found: NodeEmission, notes: list[str]) -> list[AreaLight]:
         """As `split`, for the factor `found` of the nodes of the light."""
         key = id(found), light.is_round
         if key not in self._seen:

@@ -70,7 +70,7 @@ class MaterialLobes:
 
 
 @dataclass
-class KeptByCycles:
+class CyclesReasons:
     """What finished pictures leave to Cycles, and why."""
 
     materials: list[str] = field(default_factory=list)  # materials, and their passes, with direct light by Cycles
@@ -282,7 +282,7 @@ def inject_aovs(
     emitters: frozenset[str] = frozenset(),
     unshaded: list[str] | None = None,
     made_opaque: list[tuple] | None = None,
-    kept: KeptByCycles | None = None,
+    kept: CyclesReasons | None = None,
 ) -> list[str]:
     """Make every material write its lobes into AOVs; returns warnings.
 

@@ -1,1 +1,1 @@
-"""The second Blender: `client` asks, `worker` answers, `blender_process` is the process between them."""
+"""The second Blender: `worker` does the jobs that the other files declare and ask for."""

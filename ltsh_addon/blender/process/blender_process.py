@@ -8,6 +8,7 @@ for error texts. The end of stdin tells the child that the parent is gone.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import importlib.util
 import json
 import os
@@ -122,7 +123,7 @@ def child_command(job: Path, script: Path = WORKER) -> list[str]:
 
 
 # Where Blender and pip's bpy keep libraries on Linux, Windows and macOS, relative to the binary or the module.
-LIBRARY_PLACES = ("lib/lib{}*", "blender.shared/{}*.dll", "{}*.dll", "../Resources/lib/lib{}*")
+LIBRARY_PATTERNS = ("lib/lib{}*", "blender.shared/{}*.dll", "{}*.dll", "../Resources/lib/lib{}*")
 
 
 def embree_libraries() -> list[Path]:
@@ -131,18 +132,18 @@ def embree_libraries() -> list[Path]:
 
 
 def denoiser_libraries() -> list[Path]:
-    """As `embree_libraries`, for Open Image Denoise 2. The library to call is first: it sorts before its parts."""
+    """As `embree_libraries`, for Open Image Denoise 2. The first is the library to call: it sorts before all others."""
     return _brought_along("OpenImageDenoise")
 
 
 def _brought_along(name: str) -> list[Path]:
     bpy = sys.modules.get("bpy")
-    own = bpy.app.binary_path if bpy is not None else ""
-    if not own:
+    program = bpy.app.binary_path if bpy is not None else ""
+    if not program:
         spec = importlib.util.find_spec("bpy")
-        own = spec.origin if spec is not None and spec.origin else ""
-    folder, patterns = Path(own).parent, (place.format(name) for place in LIBRARY_PLACES)
-    return [path for pattern in patterns for path in sorted(folder.glob(pattern))] if own else []
+        program = spec.origin if spec is not None and spec.origin else ""
+    folder, patterns = Path(program).parent, (pattern.format(name) for pattern in LIBRARY_PATTERNS)
+    return [path for pattern in patterns for path in sorted(folder.glob(pattern))] if program else []
 
 
 def start(command: list[str], folder: Path, *, background: bool = False) -> subprocess.Popen:
@@ -185,11 +186,11 @@ class BlenderProcess:
         self.temporary = [folder]  # folders that it deletes if this process is gone; it writes to the first
         self._child: subprocess.Popen | None = None
 
-    def do(self, job: dict, folder: Path, progress: Progress | None) -> dict:
-        """Do `job` in `folder` and report its progress; returns the manifest. An error ends this Blender."""
+    def do(self, job, folder: Path, progress: Progress | None) -> dict:
+        """Do `job`, see `run_job`, in `folder` and report its progress. An error ends this Blender."""
         job_path = folder / "job.json"
-        temporary = [str(path) for path in (*self.temporary, folder)]
-        job_path.write_text(json.dumps({**job, "temporary": temporary}), encoding="utf-8")
+        record = {"job": type(job).__name__, "fields": dataclasses.asdict(job), "temporary": self.temporary}
+        job_path.write_text(json.dumps(record, default=str), encoding="utf-8")
         try:
             self._hand_over(job_path)
             self._follow(progress)
@@ -232,38 +233,52 @@ class BlenderProcess:
         child.stdout.close()
 
 
-_kept: ContextVar[BlenderProcess | None] = ContextVar("kept Blender", default=None)
+_shared: ContextVar[BlenderProcess | None] = ContextVar("shared Blender", default=None)
 
 
 @contextlib.contextmanager
-def kept_blender(folder: Path):
+def shared_blender(folder: Path):
     """Within this context one Blender does all jobs of this thread; `folder` is its temporary folder.
 
-    This saves starting more of them. Within another `kept_blender` its Blender does the jobs.
+    This saves starting more of them. Within another `shared_blender` its Blender does the jobs.
     """
-    if (kept := _kept.get()) is not None:
-        kept.temporary.append(folder)
+    if (outer := _shared.get()) is not None:
+        outer.temporary.append(folder)
         try:
             yield
         finally:
-            kept.temporary.remove(folder)
+            outer.temporary.remove(folder)
         return
     process = BlenderProcess(folder)
-    token = _kept.set(process)
+    token = _shared.set(process)
     try:
         yield
     finally:
-        _kept.reset(token)
+        _shared.reset(token)
         process.end()
 
 
-def run_child(job: dict, folder: Path, progress: Progress | None) -> dict:
-    """Do `job` in `folder`, in the kept Blender or in a new one; returns its manifest.
+def run_job(job, folder: Path, progress: Progress | None) -> dict:
+    """Do `job` in `folder`, in the shared Blender or in a new one; returns its manifest.
 
-    Raises SceneError with a message of one line, and Cancelled if `progress(stage, fraction)` returned False.
+    A job is an instance of a dataclass that `worker.JOBS` names, with fields of paths and JSON. Raises SceneError with
+    a message of one line, and Cancelled if `progress(stage, fraction)` returned False.
     """
-    kept = _kept.get()
-    if kept is not None:
-        return kept.do(job, folder, progress)
-    with kept_blender(folder):
-        return run_child(job, folder, progress)
+    with shared_blender(folder):
+        return _shared.get().do(job, folder, progress)
+
+
+# In a child:
+
+_job_start = [0.0]
+
+
+def job_start() -> float:
+    """The processor time at which the last job ended; 0 for the first job, which includes the start of Blender."""
+    return _job_start[0]
+
+
+def end_job() -> float:
+    """The processor seconds since `job_start`; the next job starts now."""
+    before, _job_start[0] = _job_start[0], time.process_time()
+    return _job_start[0] - before

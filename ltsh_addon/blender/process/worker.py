@@ -10,7 +10,6 @@ import json
 import os
 import queue
 import sys
-import time
 import traceback
 from pathlib import Path
 
@@ -24,7 +23,7 @@ def _module(name: str):
 
 def main() -> None:
     """Do jobs until the parent ends this process or is gone."""
-    # Python puts the folder of a script first, where `client` and others would be found as top-level modules.
+    # Python puts the folder of a script first, where `pixels` and others would be found as top-level modules.
     sys.path[:] = [str(PACKAGE_FOLDER.parent)] + [entry for entry in sys.path if entry != str(Path(__file__).parent)]
     process = _module("blender.process.blender_process")
     jobs: queue.SimpleQueue = queue.SimpleQueue()
@@ -36,23 +35,34 @@ def main() -> None:
 
     path = Path(sys.argv[-1])
     while True:
-        job = json.loads(path.read_text(encoding="utf-8"))
-        temporary[:] = map(Path, job["temporary"])
-        process.tell(_answer(job, path.parent, progress))
+        record = json.loads(path.read_text(encoding="utf-8"))
+        temporary[:] = map(Path, record["temporary"])
+        process.tell(_answer(record, path.parent, progress))
         path = Path(jobs.get())
 
 
-_told = [0.0]
+# Job -> the module in `blender.process` with its class; the module in `blender` and the function in it that does it.
+JOBS = {
+    "PixelJob": ("pixels", "extract.pixels", "extract_pixels"),
+    "FinishedJob": ("finished", "extract.finished", "render_finished"),
+    "ShowJob": ("finished", "extract.finished", "show_finished"),
+    "BakeJob": ("bake", "extract.bake", "extract_bake"),
+    "BakeFactsJob": ("bake", "extract.bake", "scene_facts"),
+    "ApplyJob": ("bake", "extract.apply", "apply_bake"),
+    "ViewJob": ("view", "viewport.still", "draw_view"),
+    "WorldJob": ("view", "viewport.live_cycles", "render_world"),
+    "NodeLightJob": ("view", "viewport.live_cycles", "render_node_lights"),
+}
 
 
-def _answer(job: dict, folder: Path, progress) -> dict:
-    """Do `job` and write its manifest; returns the message for the parent: done, or an error."""
+def _answer(record: dict, folder: Path, progress) -> dict:
+    """Do the job of `record` and write its manifest; returns the message for the parent: done, or an error."""
     files = _module("files")
     try:
-        manifest = _perform(job, folder, progress)
-        # Counted since the last manifest; the first one includes the start of Blender.
-        manifest["processor_seconds"] = time.process_time() - _told[0]
-        _told[0] = time.process_time()
+        job_module, module, function = JOBS[record["job"]]
+        job = getattr(_module(f"blender.process.{job_module}"), record["job"])(**record["fields"])
+        manifest = getattr(_module(f"blender.{module}"), function)(job, folder, progress)
+        manifest["processor_seconds"] = _module("blender.process.blender_process").end_job()
         (folder / "manifest.json").write_text(json.dumps(manifest), encoding="utf-8")
         return {"done": True}
     except _module("scene").SceneError as error:
@@ -62,30 +72,6 @@ def _answer(job: dict, folder: Path, progress) -> dict:
             return {"error": files.no_room(folder, error)}
         traceback.print_exc()
         return {"error": f"Blender failed with {type(error).__name__}: {error}"}
-
-
-def _perform(job: dict, folder: Path, progress) -> dict:
-    if job["task"] == "demo":
-        progress("build scene", 0.0)
-        _module("blender.demo").build(Path(job["path"]))
-        return {}
-    if job["task"] == "bake":
-        return _module("blender.extract.bake").extract_bake(job, folder, progress)
-    if job["task"] == "facts":
-        return _module("blender.extract.bake").scene_facts(job, progress)
-    if job["task"] == "finished":
-        return _module("blender.extract.finished").render_finished(job, folder, progress)
-    if job["task"] == "show":
-        return _module("blender.extract.finished").show_finished(job, folder, progress)
-    if job["task"] == "view":
-        return _module("blender.viewport.still").draw_view(job, folder, progress)
-    if job["task"] == "world":
-        return _module("blender.viewport.still").show_world(job, folder)
-    if job["task"] == "lamps":
-        return _module("blender.viewport.still").show_lamps(job, folder, progress)
-    if job["task"] == "apply":
-        return _module("blender.extract.apply").apply_bake(job, progress)
-    return _module("blender.extract.pixels").extract({**job, "since": _told[0]}, folder, progress)
 
 
 if __name__ == "__main__":

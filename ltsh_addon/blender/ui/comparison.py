@@ -5,17 +5,15 @@ from __future__ import annotations
 import contextlib
 import logging
 
-import blf
 import bpy
-import gpu
 import numpy as np
-from gpu_extras.batch import batch_for_shader
 
 from ...imaging.color import LUMINANCE_WEIGHTS, color_bar, signed_error_colors
 from ...pipeline.lighting import RelightData
 from ...pipeline.mixer import LightPictures
 from ...scene import error_line
 from . import results
+from .overlay import LINE, PAPER, ROW, draw_gradient, draw_label, draw_rectangle, draw_text, label_places, text_width
 
 NAME = "LTSH Comparison"
 SETTLE_SECONDS = 1.0
@@ -23,7 +21,7 @@ PANEL_REGIONS = {"VIEW_3D": "UI", "IMAGE_EDITOR": "UI", "PROPERTIES": "WINDOW"}
 GRIP_PIXELS = 12.0
 HANDLE_PIXELS = 9.0
 _LOOKUP_SIZE = 1024
-_state = {"lookup": None, "settling": set(), "kept": False, "dragged": None, "probing": False, "drawing": None}
+_state = {"lookup": None, "settling": set(), "saves_pixels": False, "dragged": None, "probing": False, "drawing": None}
 
 
 def changed(settings, context) -> None:
@@ -46,13 +44,13 @@ def mixed(item, context) -> None:
     put_in_editor(context, item.id_data)
 
 
-def mix_render(name: str, pictures: LightPictures, kept: RelightData) -> None:
+def mix_render(name: str, pictures: LightPictures, relight_data: RelightData) -> None:
     """Give the mixer the lights of a final render of the scene `name`; called while Blender renders."""
 
     def take() -> None:
         scene = bpy.data.scenes.get(name)
         if scene is not None:
-            results.mix_render(scene, pictures, kept)
+            results.mix_render(scene, pictures, relight_data)
             redraw_image_editors()
             redraw_panels()
 
@@ -286,19 +284,19 @@ def _areas() -> list:
 
 
 @contextlib.contextmanager
-def kept_as_it_is():
+def saving_images_as_they_are():
     """Context in which saving leaves the images as they are, for copies of the file that no artist opens."""
-    _state["kept"] = True
+    _state["saves_pixels"] = True
     try:
         yield
     finally:
-        _state["kept"] = False
+        _state["saves_pixels"] = False
 
 
 @bpy.app.handlers.persistent
 def _shrink(*_):
     """Before saving, remove pixels that can be made again from the file."""
-    for scene in bpy.data.scenes if not _state["kept"] else ():
+    for scene in bpy.data.scenes if not _state["saves_pixels"] else ():
         for image in results.our_images(scene):
             if is_viewer(image) and results.result_of(scene) is not None:
                 _store(image, np.zeros((4, 4, 4), dtype=np.float32), image.use_view_as_render)
@@ -308,7 +306,7 @@ def _shrink(*_):
 @bpy.app.handlers.persistent
 def _restore(*_):
     """After saving and loading, make the pixels again."""
-    if _state["kept"]:
+    if _state["saves_pixels"]:
         return
     for scene in bpy.data.scenes:
         if any(is_viewer(image) for image in results.our_images(scene)):
@@ -363,85 +361,6 @@ class LTSH_OT_probe(bpy.types.Operator):
         context.window.cursor_modal_restore()
         self._area.tag_redraw()
         return outcome
-
-
-# Text and shapes drawn over an image, in pixels of the region at the interface's scale.
-FONT = 0
-TEXT_SIZE, ROW = 11.0, 26.0  # ROW: from label to label
-# Colors that are readable on any picture in any theme. The plate is nearly opaque: Blender blends linear colors, so a
-# more transparent one would be pale on a white picture.
-INK, PLATE = (1.0, 1.0, 1.0, 1.0), (0.0, 0.0, 0.0, 0.97)
-PAPER, LINE = (0.0, 0.0, 0.0, 0.6), (1.0, 1.0, 1.0, 0.9)
-
-
-def draw_rectangle(left: float, bottom: float, right: float, top: float, color) -> None:
-    """Draw a filled rectangle."""
-    corners = [(left, bottom), (right, bottom), (right, top), (left, top)]
-    shader = gpu.shader.from_builtin("UNIFORM_COLOR")
-    batch = batch_for_shader(shader, "TRIS", {"pos": corners}, indices=[(0, 1, 2), (0, 2, 3)])
-    gpu.state.blend_set("ALPHA")
-    shader.uniform_float("color", color)
-    batch.draw(shader)
-    gpu.state.blend_set("NONE")
-
-
-def covered(area, region) -> dict[str, int]:
-    """Pixels of `region` that other regions of its area lie over, by their side; FLOAT: at the left, too."""
-    sides = {"LEFT": 0, "RIGHT": 0, "BOTTOM": 0, "TOP": 0, "FLOAT": 0}
-    x, y, width, height = region.x, region.y, region.width, region.height
-    for part in area.regions:
-        is_over = part.x < x + width and x < part.x + part.width and part.y < y + height and y < part.y + part.height
-        if part.type == "WINDOW" or not is_over or min(part.width, part.height) <= 1:
-            continue
-        reach = {"LEFT": part.x + part.width - x, "RIGHT": x + width - part.x, "BOTTOM": part.y + part.height - y,
-                 "TOP": y + height - part.y, "FLOAT": part.x + part.width - x}  # fmt: skip
-        if part.alignment in sides:
-            sides[part.alignment] = max(sides[part.alignment], reach[part.alignment])
-    return sides
-
-
-def draw_gradient(left: float, bottom: float, right: float, top: float, colors) -> None:
-    """Draw colors (N, 3), display values, from left to right."""
-    count = len(colors)
-    steps = [left + (right - left) * index / (count - 1) for index in range(count)]
-    positions = [(x, y) for x in steps for y in (bottom, top)]
-    values = [(*map(float, color), 1.0) for color in colors for _ in range(2)]
-    shader = gpu.shader.from_builtin("SMOOTH_COLOR")
-    batch_for_shader(shader, "TRI_STRIP", {"pos": positions, "color": values}).draw(shader)
-
-
-def text_width(text: str, scale: float) -> float:
-    """Width of `text` in pixels."""
-    blf.size(FONT, TEXT_SIZE * scale)
-    return blf.dimensions(FONT, text)[0]
-
-
-def draw_text(x: float, y: float, text: str, scale: float, color=INK) -> None:
-    """Draw `text`, with the left end of its base line at (x, y)."""
-    blf.size(FONT, TEXT_SIZE * scale)
-    blf.color(FONT, *color)
-    blf.position(FONT, x, y, 0.0)
-    blf.draw(FONT, text)
-
-
-def label_places(corners, area, region, scale: float, rows: int) -> tuple[float, float, float, float]:
-    """Where labels of a picture begin and end from left to right, and the lower ends of the first of `rows` below it
-    and of the one above it: beside what is seen of it, on it where there is no room. `corners` of the picture are left,
-    bottom, right and top in pixels of `region`."""
-    left, bottom, right, top = corners
-    sides, gap = covered(area, region), 6.0 * scale
-    start, end = max(left, sides["LEFT"] + gap), min(right, region.width - sides["RIGHT"] - gap)
-    below = max(bottom - ROW * scale, sides["BOTTOM"] + gap + (rows - 1) * ROW * scale)
-    return start, end, below, min(top + gap, region.height - sides["TOP"] - ROW * scale)
-
-
-def draw_label(x: float, y: float, text: str, scale: float, align: float = 0.0) -> None:
-    """Draw `text` on a dark plate whose lower left (`align` 0) or lower right (1) corner is at (x, y)."""
-    pad, height = 6.0 * scale, 20.0 * scale
-    width = text_width(text, scale) + 2.0 * pad
-    left = x - align * width
-    draw_rectangle(left, y, left + width, y + height, PLATE)
-    draw_text(left + pad, y + 6.0 * scale, text, scale)
 
 
 def values_at(scene, result, choice, point) -> tuple[tuple[int, int], list[tuple[str, tuple[float, ...]]]]:

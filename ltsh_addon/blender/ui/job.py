@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import json
 import math
-import queue
 import shutil
 import subprocess
 import tempfile
@@ -15,6 +14,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from queue import Empty, SimpleQueue
 
 import bpy
 from bpy.app.translations import pgettext_iface as translated
@@ -161,10 +161,10 @@ class Step:
 
 def steps(runs: list[Run]) -> list[Step]:
     """The stages of a job, in order."""
-    found = [Step(STARTING, START_SECONDS)]
+    stages = [Step(STARTING, START_SECONDS)]
     for run in runs:
-        found += _bake(run.options) if run.command == "bake" else _picture(run.options, run.command == "compare")
-    return found
+        stages += _bake(run.options) if run.command == "bake" else _picture(run.options, run.command == "compare")
+    return stages
 
 
 def _picture(options: PictureOptions, with_cycles: bool) -> list[Step]:
@@ -211,11 +211,11 @@ def _bake(options: BakeOptions) -> list[Step]:
     texels = 1e-6 * math.prod(options.size)
     samples = options.cycles_samples * len(options.passes) if options.error else options.sub_samples
     shading = sum(_shading(name, texels) for name in options.techniques) * options.sub_samples
-    found = [Step("open scene", OPEN_SECONDS)]
+    stages = [Step("open scene", OPEN_SECONDS)]
     for name in options.objects:
-        found.append(Step(f"bake {name}", RENDER_SECONDS + SAMPLE_SECONDS * texels * samples))
-        found.append(Step(f"shade {name}", shading + FILE_SECONDS * texels))
-    return [*found, Step("images", FILE_SECONDS * texels * len(options.objects))]
+        stages.append(Step(f"bake {name}", RENDER_SECONDS + SAMPLE_SECONDS * texels * samples))
+        stages.append(Step(f"shade {name}", shading + FILE_SECONDS * texels))
+    return [*stages, Step("images", FILE_SECONDS * texels * len(options.objects))]
 
 
 def _shading(technique: str, points: float) -> float:
@@ -223,8 +223,8 @@ def _shading(technique: str, points: float) -> float:
 
 
 # Seconds and costs of the stages of jobs that have ended in this session, by kind of stage.
-Seen = dict[str, tuple[float, float]]
-seen: Seen = {}
+StageTimes = dict[str, tuple[float, float]]
+session_times: StageTimes = {}
 
 
 def _kind(stage: str) -> str:
@@ -233,27 +233,29 @@ def _kind(stage: str) -> str:
     return first if first in ("bake", "shade", "Cycles") else stage
 
 
-def paces(seen: Seen) -> dict[str, float]:
+def paces(measured: StageTimes) -> dict[str, float]:
     """Seconds per cost by kind of stage, and by "" for all others."""
     # Short stages say little about long ones.
-    found = {kind: (seconds + LITTLE_SECONDS) / (cost + LITTLE_SECONDS) for kind, (seconds, cost) in seen.items()}
-    seconds, cost = (sum(values) for values in zip(*seen.values(), strict=True)) if seen else (0.0, 0.0)
-    return {**found, "": (seconds + PRIOR_SECONDS) / (cost + PRIOR_SECONDS)}
+    by_kind = {kind: (seconds + LITTLE_SECONDS) / (cost + LITTLE_SECONDS) for kind, (seconds, cost) in measured.items()}
+    seconds, cost = (sum(values) for values in zip(*measured.values(), strict=True)) if measured else (0.0, 0.0)
+    return {**by_kind, "": (seconds + PRIOR_SECONDS) / (cost + PRIOR_SECONDS)}
 
 
 class Plan:
-    """Follows a job through its `steps` and estimates the time left, with the paces of the jobs `seen` before.
+    """Follows a job through its `steps` and estimates the time left, with the paces of the jobs `measured` before.
 
     The first step begins at once. Some steps may never be reported.
     """
 
-    def __init__(self, steps: Sequence[Step], now: Callable[[], float] = time.monotonic, seen: Seen | None = None):
-        pace, self._asked, self._before = paces(seen or {}), tuple(steps), dict(seen or {})
+    def __init__(
+        self, steps: Sequence[Step], now: Callable[[], float] = time.monotonic, measured: StageTimes | None = None
+    ):
+        pace, self._asked, self._before = paces(measured or {}), tuple(steps), dict(measured or {})
         self._steps = tuple(replace(step, cost=step.cost * pace.get(_kind(step.stage), pace[""])) for step in steps)
         self._now = now
         self._at, self._share = 0, 0.0
         self._measured: dict[str, float] = {}
-        self._seen: Seen = {}
+        self._stage_times: StageTimes = {}
         self._done_cost = self._done_seconds = 0.0
         self._started = self._stage_started = self._reported = now()
         self._fraction = 0.0
@@ -282,17 +284,17 @@ class Plan:
         step, seconds = self._steps[self._at], self._reported - self._stage_started
         self._measured[step.stage] = seconds
         kind, cost = _kind(step.stage), self._asked[self._at].cost
-        before = self._seen.get(kind, (0.0, 0.0))
-        self._seen[kind] = before[0] + seconds, before[1] + cost
+        before = self._stage_times.get(kind, (0.0, 0.0))
+        self._stage_times[kind] = before[0] + seconds, before[1] + cost
         self._done_cost += step.cost
         self._done_seconds += seconds
 
-    def end(self, seen: Seen) -> None:
-        """Note that the job has succeeded, and add the times of its stages to `seen`."""
+    def end(self, measured: StageTimes) -> None:
+        """Note that the job has succeeded, and add the times of its stages to `measured`."""
         self._reported = self._now()
         if self._at == self.count - 1:
             self._end_step()
-        seen.update(self._seen)
+        measured.update(self._stage_times)
 
     def share(self) -> float:
         """The share of the whole job that is done, in [0, `MOST`]; it never falls."""
@@ -303,42 +305,44 @@ class Plan:
 
     def seconds_left(self) -> float:
         """Estimated seconds until the end of the job."""
-        return sum(self._parts_left())
+        return sum(self._known_and_guessed())
 
     @property
     def is_sure(self) -> bool:
         """True if enough of the time left rests on measurements."""
-        known, guessed = self._parts_left()
+        known, guessed = self._known_and_guessed()
         return known >= KNOWN_SHARE * (known + guessed)
 
-    def _parts_left(self) -> tuple[float, float]:
+    def _known_and_guessed(self) -> tuple[float, float]:
         """Seconds left that rest on measurements, and those that are guessed by costs."""
         measured = self._measured_costs()
-        kind = _kind(self._steps[self._at].stage)
-        parts = {True: 0.0, False: 0.0}
-        parts[self._is_followed or kind in measured or kind in self._before] += self._rest_of_step(measured)
+        step = self._steps[self._at]
+        seconds = {True: 0.0, False: 0.0}
+        seconds[self._is_followed or self._is_known(step, measured)] += self._rest_of_step(measured)
         for step in self._steps[self._at + 1 :]:
-            kind = _kind(step.stage)
-            parts[kind in measured or kind in self._before] += self._expected(step, measured)
-        return parts[True], parts[False]
+            seconds[self._is_known(step, measured)] += self._expected(step, measured)
+        return seconds[True], seconds[False]
 
-    def _expected(self, step: Step, measured: dict[str, tuple[float, float]]) -> float:
+    def _is_known(self, step: Step, measured: StageTimes) -> bool:
+        return _kind(step.stage) in measured or _kind(step.stage) in self._before
+
+    def _expected(self, step: Step, measured: StageTimes) -> float:
         """Expected seconds of a step: as the same stage took, else by its cost and the pace of its kind, or of all."""
         seconds, cost = measured.get(_kind(step.stage), (0.0, 0.0))
         pace = seconds / cost if seconds > 0.0 and cost > 0.0 else self._pace()
         return self._measured.get(step.stage, step.cost * pace)
 
-    def _measured_costs(self) -> dict[str, tuple[float, float]]:
+    def _measured_costs(self) -> StageTimes:
         """Measured seconds and costs by kind, with an estimate for the step that runs if it tells enough."""
-        found: dict[str, tuple[float, float]] = {}
+        costs: StageTimes = {}
         for step in self._steps[: self._at + 1]:
             seconds = self._measured.get(step.stage)
             if step is self._steps[self._at]:
                 seconds = (self._reported - self._stage_started) / self._fraction if self._is_followed else None
             if seconds is not None:
-                before = found.get(_kind(step.stage), (0.0, 0.0))
-                found[_kind(step.stage)] = before[0] + seconds, before[1] + step.cost
-        return found
+                before = costs.get(_kind(step.stage), (0.0, 0.0))
+                costs[_kind(step.stage)] = before[0] + seconds, before[1] + step.cost
+        return costs
 
     @property
     def _is_followed(self) -> bool:
@@ -351,7 +355,7 @@ class Plan:
         so_far = seconds + self._now() - self._stage_started
         return max(seconds / cost, so_far / (cost + self._steps[self._at].cost))
 
-    def _rest_of_step(self, measured: dict[str, tuple[float, float]]) -> float:
+    def _rest_of_step(self, measured: StageTimes) -> float:
         """Seconds left of the step that runs; between reports they decay exponentially and never reach 0."""
         if self._is_followed:
             done = self._reported - self._stage_started
@@ -387,7 +391,7 @@ class Job:
         job = self.folder / "job.json"
         document = {"runs": runs, "path": _library_folders(), "temporary": str(self.folder)}
         job.write_text(json.dumps(document), encoding="utf-8")
-        self._messages: queue.SimpleQueue = queue.SimpleQueue()
+        self._messages: SimpleQueue = SimpleQueue()
         command = blender_process.child_command(job, SCRIPT)
         self._process = blender_process.start(command, self.folder, background=background)
         threading.Thread(target=self._listen, name="ltsh-job", daemon=True).start()
@@ -409,7 +413,7 @@ class Job:
         while not self.finished:
             try:
                 message = self._messages.get_nowait()
-            except queue.Empty:
+            except Empty:
                 break
             changed = True
             self._take(message)
@@ -426,7 +430,7 @@ class Job:
         elif "end" in message:
             self.finished = True
             if not self.error:
-                self.plan.end(seen)
+                self.plan.end(session_times)
             self.remove_folder()
 
     def wait(self, seconds: float = 0.05) -> None:
@@ -495,10 +499,10 @@ def stage_title(stage: str) -> str:
 
 def progress_text(plan: Plan, seconds: float) -> str:
     """Percent and time left of a job that began `seconds` ago."""
-    text, left, is_sure = f"{100.0 * plan.share():.0f} %", plan.seconds_left(), plan.is_sure
+    text, remaining, is_sure = f"{100.0 * plan.share():.0f} %", plan.seconds_left(), plan.is_sure
     if seconds < (SURE_SECONDS if is_sure else ROUGH_SECONDS):
         return text
-    shown = clock(left) if is_sure else f"{translated('about')} {clock(rounded(left))}"
+    shown = clock(remaining) if is_sure else f"{translated('about')} {clock(rounded(remaining))}"
     return f"{text}, {shown} {translated('left')}"
 
 

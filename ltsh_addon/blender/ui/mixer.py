@@ -28,70 +28,70 @@ _updating: dict = {"update": None}
 def plain_lights(depsgraph) -> dict[str, AreaLight]:
     """The current lights of the scene without their node trees, by name. Only objects that are exactly one light."""
     receivers = Receivers([instance.object.original for instance in depsgraph.object_instances])
-    found: dict[str, list[AreaLight]] = {}
+    by_name: dict[str, list[AreaLight]] = {}
     for instance in depsgraph.object_instances:
         ob = instance.object
         if ob.type == "LIGHT" and instance.show_self:
             matrix = np.array(instance.matrix_world, dtype=np.float64)
             if not reason_to_leave_out(ob, matrix):
                 light = area_light(ob, matrix, EmitterTraits.of(instance), receivers)
-                found.setdefault(light.name, []).append(light)
-    return {name: lights[0] for name, lights in found.items() if len(lights) == 1}
+                by_name.setdefault(light.name, []).append(light)
+    return {name: lights[0] for name, lights in by_name.items() if len(lights) == 1}
 
 
-def has_moved(kept: AreaLight, now: AreaLight) -> bool:
+def has_moved(before: AreaLight, now: AreaLight) -> bool:
     """True where a light has another place, direction, size or shape."""
-    size = np.abs(kept.center).max() + kept.radius
+    size = np.abs(before.center).max() + before.radius
     near = all(
-        np.allclose(getattr(kept, name), getattr(now, name), rtol=0.0, atol=UNMOVED * most)
+        np.allclose(getattr(before, name), getattr(now, name), rtol=0.0, atol=UNMOVED * most)
         for name, most in (("center", size), ("half_u", size), ("half_v", size), ("direction", 1.0))
     )
-    cones = [(np.inf, np.inf) if one.cone is None else (one.cone.cosine, one.cone.sharpness) for one in (kept, now)]
-    return not (near and np.allclose(*cones, rtol=UNMOVED) and abs(kept.spread - now.spread) < UNMOVED)
+    cones = [(np.inf, np.inf) if one.cone is None else (one.cone.cosine, one.cone.sharpness) for one in (before, now)]
+    return not (near and np.allclose(*cones, rtol=UNMOVED) and abs(before.spread - now.spread) < UNMOVED)
 
 
-def light_where_it_is(kept: AreaLight, now: AreaLight, normalized: bool) -> AreaLight:
-    """The light at its place `now`, with the power, linking and light group of `kept`.
+def light_where_it_is(former: AreaLight, now: AreaLight, normalized: bool) -> AreaLight:
+    """The light at its place `now`, with the power, linking and light group of `former`.
 
     Where its power is `normalized`, the radiance is scaled with the area.
     """
-    before, area = (np.linalg.norm(light.area_vector) for light in (kept, now))
+    former_area, area = (np.linalg.norm(light.area_vector) for light in (former, now))
     names = "group", "receivers", "affects_diffuse", "affects_specular", "falloff", "smooth"
-    own = {name: getattr(kept, name) for name in names}
-    return replace(now, radiance=kept.radiance * (before / area if normalized else 1.0), **own)
+    settings = {name: getattr(former, name) for name in names}
+    return replace(now, radiance=former.radiance * (former_area / area if normalized else 1.0), **settings)
 
 
 def moved_rows(context, rows) -> dict[int, AreaLight]:
     """The moved lights at their new places, by the numbers of their rows."""
-    found, lights = {}, plain_lights(context.evaluated_depsgraph_get())
+    moved, lights = {}, plain_lights(context.evaluated_depsgraph_get())
     for number, row in enumerate(rows):
         if row.light is not None and row.name in lights:
-            kept, now = AreaLight(**row.light), lights[row.name]
-            if has_moved(kept, now):
-                found[number] = light_where_it_is(kept, now, bpy.data.objects[row.name].data.normalize)
-    return found
+            before, now = AreaLight(**row.light), lights[row.name]
+            if has_moved(before, now):
+                moved[number] = light_where_it_is(before, now, bpy.data.objects[row.name].data.normalize)
+    return moved
 
 
 def targets(row: MixerRow, item) -> dict[str, tuple[float, float, tuple[float, ...]]]:
     """Power, exposure and color with which each light object of a row looks as the mixer shows it."""
     # Channels that the light lacks in the picture stay as they are.
-    found, factor = {}, np.where(np.array(row.color) != 0.0, results.tint_of(row, item), 1.0)
+    values, factor = {}, np.where(np.array(row.color) != 0.0, results.tint_of(row, item), 1.0)
     for name, (power, exposure, *color) in row.settings.items():
         mixed = factor * color
         # Blender's color fields show values up to 1, so brighter colors go into the power.
         bright = max(1.0, mixed.max()) if not np.allclose(factor, 1.0) else 1.0
-        found[name] = power * item.power * bright, exposure + item.exposure, tuple((mixed / bright).tolist())
-    return found
+        values[name] = power * item.power * bright, exposure + item.exposure, tuple((mixed / bright).tolist())
+    return values
 
 
-def _stands_elsewhere(ob, kept: dict) -> bool:
+def _stands_elsewhere(ob, before: dict) -> bool:
     """True if a light object has moved or turned since its light was kept. A fast check, without the depsgraph."""
     if ob is None or ob.type != "LIGHT":
         return False
     matrix = np.array(ob.matrix_world)
-    near = kept["is_distant"] or np.allclose(matrix[:3, 3], kept["center"], rtol=1e-4, atol=1e-4)
+    near = before["is_distant"] or np.allclose(matrix[:3, 3], before["center"], rtol=1e-4, atol=1e-4)
     axis = -matrix[:3, 2] / max(np.linalg.norm(matrix[:3, 2]), 1e-30)
-    is_turned = ob.data.type != "POINT" and not np.allclose(axis, kept["direction"], atol=1e-4)
+    is_turned = ob.data.type != "POINT" and not np.allclose(axis, before["direction"], atol=1e-4)
     return not near or is_turned
 
 
@@ -183,12 +183,12 @@ def _draw_update(layout) -> None:
 def notes(scene) -> list[str]:
     """Notes about the mix as a whole."""
     facts = results.mixer_of(scene).facts
-    found, camera = list(facts["notes"]), scene.camera
+    texts, camera = list(facts["notes"]), scene.camera
     if facts["frame"] != scene.frame_current:
-        found.append(f"The picture is of frame {facts['frame']}, the scene is at frame {scene.frame_current}")
+        texts.append(f"The picture is of frame {facts['frame']}, the scene is at frame {scene.frame_current}")
     if camera is None or facts["camera"] != camera.name:
-        found.append(f"The picture is of camera {facts['camera']}")
-    return found
+        texts.append(f"The picture is of camera {facts['camera']}")
+    return texts
 
 
 class LTSH_PT_IMAGE_mixer(_Mixer, bpy.types.Panel):

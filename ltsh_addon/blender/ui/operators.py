@@ -17,14 +17,15 @@ from bpy_extras.io_utils import ExportHelper
 from ...files import replacing
 from ...scene import SceneError, error_line, listed
 from ..extract.apply import restore_materials, show_texture, shows_texture
+from ..process.bake import BakedTextures
 from ..saving import save_working_copy
 from . import comparison, preflight, results
-from .job import Job, Plan, clock, new_folder, output_folder, progress_text, runs_of, seen, stage_title, steps
+from .job import Job, Plan, clock, new_folder, output_folder, progress_text, runs_of, session_times, stage_title, steps
 
 
 def save_scene_copy(path: Path) -> None:
     """Save the open file, unsaved changes included, as `path`. Raises RuntimeError."""
-    with comparison.kept_as_it_is():
+    with comparison.saving_images_as_they_are():
         save_working_copy(path)
 
 
@@ -118,7 +119,9 @@ class _JobOperator:
         folder = new_folder()
         copy = folder / (Path(bpy.data.filepath).name or "untitled.blend")
         runs = runs_of(context, self.command, copy)
-        job = Job(self.bl_label, Plan(steps(runs), seen=seen), folder, self.command, context.scene.session_uid)
+        job = Job(
+            self.bl_label, Plan(steps(runs), measured=session_times), folder, self.command, context.scene.session_uid
+        )
         job.output = runs[-1].options.output
         try:
             save_scene_copy(copy)
@@ -185,13 +188,13 @@ class _JobOperator:
         if job.error:
             self.report({"ERROR"}, job.error)
         elif job.cancelled:
-            kept = self._kept()
-            self.report({"WARNING"}, f"{job.title} was cancelled; {kept}")
+            remains = self._what_remains()
+            self.report({"WARNING"}, f"{job.title} was cancelled; {remains}")
         else:
             self._report_success()
         return {"FINISHED"} if job.shown else {"CANCELLED"}
 
-    def _kept(self) -> str:
+    def _what_remains(self) -> str:
         scene, job = self._scene(), self._job
         result = results.result_of(scene) if scene is not None and job.shown else None
         if result is None:
@@ -464,7 +467,7 @@ def last_bake(scene):
     return result if result is not None and result.command == "bake" and result.report["objects"] else None
 
 
-def baked_texture(result, record: dict) -> dict:
+def baked_texture(result, record: dict) -> BakedTextures:
     """The texture of an object for `show_texture`: its combined light, or its first pass.
 
     The pictures are copied to files of their own, which stay when the next bake replaces the pictures. Raises OSError.
@@ -480,7 +483,7 @@ def baked_texture(result, record: dict) -> dict:
         with replacing(path) as temporary:
             shutil.copyfile(source, temporary)
         files.append({"path": str(path), "tile": int(number)})
-    return {"name": f"{record['name']} {layer}", "uv": record["uv"], "files": files}
+    return BakedTextures(record["name"], record["uv"], f"{record['name']} {layer}", files)
 
 
 class LTSH_OT_manual(bpy.types.Operator):

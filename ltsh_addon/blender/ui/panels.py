@@ -36,12 +36,12 @@ def draw_text(layout, context, text: str, icon: str = "NONE", reserved: float = 
 
 def draw_problems(layout, context, command: str) -> bool:
     """Draw the problems of `command`, each with its fix; True if none of them blocks it."""
-    found = preflight.problems(context, command)
-    if found:
+    problems = preflight.problems(context, command)
+    if problems:
         box = layout.box()
-        for problem in found:
+        for problem in problems:
             _draw_problem(box, context, problem)
-    return not any(problem.blocks for problem in found)
+    return not any(problem.blocks for problem in problems)
 
 
 def _draw_problem(layout, context, problem) -> None:
@@ -126,14 +126,14 @@ def draw_button(layout, operator: str, icon: str, ready: bool, scale: float = 1.
 
 def in_both_places(panel: type, name: str, parent: str = "") -> tuple[type, type]:
     """The mixin `panel` as a class for the 3D viewport's sidebar and one for the render properties."""
-    places = {
+    editors = {
         "VIEW3D": {"bl_space_type": "VIEW_3D", "bl_region_type": "UI", "bl_category": "LTSH"},
         "RENDER": {"bl_space_type": "PROPERTIES", "bl_region_type": "WINDOW", "bl_context": "render"},
     }
     classes = []
-    for place, values in places.items():
-        identifier = f"LTSH_PT_{place}_{name}"
-        family = {"bl_parent_id": f"LTSH_PT_{place}_{parent}"} if parent else {}
+    for editor, values in editors.items():
+        identifier = f"LTSH_PT_{editor}_{name}"
+        family = {"bl_parent_id": f"LTSH_PT_{editor}_{parent}"} if parent else {}
         # Blender reads the docstring of a panel's own class.
         members = {**values, **family, "bl_idname": identifier, "__doc__": panel.__doc__}
         classes.append(type(identifier, (panel, bpy.types.Panel), members))
@@ -337,11 +337,11 @@ class LTSH_UL_lights(bpy.types.UIList):
         objects, wanted = getattr(data, name), self.filter_name.lower()
         shown = [ob.type == "LIGHT" and (wanted in ob.name.lower()) != self.use_filter_invert for ob in objects]
         order = bpy.types.UI_UL_list.sort_items_by_name(objects) if self.use_filter_sort_alpha else []
-        return [self.bitflag_filter_item * own for own in shown], order
+        return [self.bitflag_filter_item * is_shown for is_shown in shown], order
 
     def draw_item(self, context, layout, data, item, icon, active_data, active_property, index=0, flag=0):
         """Name, power, color, solo and mute of a light."""
-        own, light = item.ltsh_light, item.data
+        settings, light = item.ltsh_light, item.data
         row = layout.row(align=True)
         name = row.row()
         name.active, name.ui_units_x = not item.hide_render, NAME_UNITS
@@ -352,8 +352,8 @@ class LTSH_UL_lights(bpy.types.UIList):
             field = row.row()
             field.ui_units_x = units
             field.prop(light, key, text="")
-        row.prop(own, "solo", text="", icon="SOLO_ON" if own.solo else "SOLO_OFF", emboss=False)
-        row.prop(own, "mute", text="", icon="HIDE_ON" if own.mute else "HIDE_OFF", emboss=False)
+        row.prop(settings, "solo", text="", icon="SOLO_ON" if settings.solo else "SOLO_OFF", emboss=False)
+        row.prop(settings, "mute", text="", icon="HIDE_ON" if settings.mute else "HIDE_OFF", emboss=False)
 
 
 def _light_icon(context, ob) -> str:

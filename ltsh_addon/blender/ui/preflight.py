@@ -21,7 +21,7 @@ from bpy.props import StringProperty
 from ...scene import error_line
 from ..extract.apply import shows_texture
 from ..extract.bake import ObjectError, check_object
-from ..lights.area import LightInventory, reason_to_leave_out, unseen_light
+from ..lights.area import LightInventory, node_light, reason_to_leave_out
 from ..lights.area import (
     note_unsupported as note_unsupported_light,
 )
@@ -71,19 +71,19 @@ def problems(context, command: str) -> list[Problem]:
     """The problems that block "shade", "compare" or "bake", and notes."""
     scene, settings = context.scene, context.scene.ltsh
     missing = missing_libraries()
-    found = [Problem(missing)] if missing else []
+    result = [Problem(missing)] if missing else []
     if command == "compare" and not settings.techniques:
-        found.append(Problem("No technique is chosen: choose at least one to compare"))
+        result.append(Problem("No technique is chosen: choose at least one to compare"))
     if command == "bake" and not settings.bake_passes:
-        found.append(Problem("No pass is chosen: choose at least one"))
+        result.append(Problem("No pass is chosen: choose at least one"))
     needs_camera = command != "bake" or settings.bake_view == "camera"
-    found += _camera(scene) if needs_camera else []
-    found += _lights(scene)
+    result += _camera(scene) if needs_camera else []
+    result += _lights(scene)
     if command == "bake":
-        found += bake_objects(context)[1]
+        result += bake_objects(context)[1]
     elif min(picture_of(scene)) < 4:
-        found.append(Problem("The picture is smaller than 4 pixels: raise the resolution"))
-    return found + _files(settings)
+        result.append(Problem("The picture is smaller than 4 pixels: raise the resolution"))
+    return result + _files(settings)
 
 
 def blocking(context, command: str) -> str:
@@ -104,7 +104,7 @@ def bake_objects(context) -> tuple[list, list[Problem]]:
     if not selected:
         return [], [Problem("No mesh is selected: select the objects to bake")]
     baked = [ob for ob in selected if shows_texture(ob) and not ob.hide_render]
-    usable, found = [], [_textures_shown(baked)] if baked else []
+    usable, problems = [], [_textures_shown(baked)] if baked else []
     for ob in selected:
         if ob in baked:
             continue
@@ -112,10 +112,10 @@ def bake_objects(context) -> tuple[list, list[Problem]]:
         if problem is None:
             usable.append(ob)
         else:
-            found.append(problem)
+            problems.append(problem)
     if usable:
-        found = [Problem(p.text, False, p.fix, p.fix_label, p.fix_values) for p in found]
-    return usable, found
+        problems = [Problem(p.text, False, p.fix, p.fix_label, p.fix_values) for p in problems]
+    return usable, problems
 
 
 def _textures_shown(baked) -> Problem:
@@ -175,13 +175,13 @@ def _lights(scene) -> list[Problem]:
 
 def materials_of(scene) -> list:
     """Materials of the objects of `scene` that render, each once, sorted by name."""
-    found = {}
+    by_name = {}
     for ob in scene.objects:
         if not ob.hide_render and ob.type not in ("LIGHT", "CAMERA"):
             for slot in ob.material_slots:
                 if slot.material is not None:
-                    found[slot.material.name_full] = slot.material
-    return [found[name] for name in sorted(found)]
+                    by_name[slot.material.name_full] = slot.material
+    return [by_name[name] for name in sorted(by_name)]
 
 
 def glows(material) -> bool:
@@ -190,17 +190,17 @@ def glows(material) -> bool:
 
 
 def _files(settings) -> list[Problem]:
-    found = []
+    problems = []
     if not bpy.data.filepath:
         text = "The file is not saved: results go to the output folder of the preferences"
-        found.append(Problem(text, False, "wm.save_mainfile", "Save"))
+        problems.append(Problem(text, False, "wm.save_mainfile", "Save"))
     elif (reason := _not_writable(settings.output_folder)) != "":
-        found.append(Problem(reason))
+        problems.append(Problem(reason))
     for image in bpy.data.images:
         if image.is_dirty and image.users > image.use_fake_user and "ltsh_layer" not in image:
             text = f"Image {image.name!r} has changes that are not saved, and do not count"
-            found.append(Problem(text, False, "ltsh.pack_image", "Pack", {"image_name": image.name}))
-    return found
+            problems.append(Problem(text, False, "ltsh.pack_image", "Pack", {"image_name": image.name}))
+    return problems
 
 
 def _not_writable(folder: str) -> str:
@@ -377,7 +377,7 @@ def _light(ob) -> Entry:
     if problem:
         return Entry(ob.name, kind, LEFT_OUT, (problem,))
     inventory = LightInventory()
-    unseen = unseen_light(ob, matrix, inventory)
+    unseen = node_light(ob, matrix, inventory)
     note_unsupported_light(ob, matrix, inventory)
     notes = [note.partition(": ")[2] for note in inventory.warnings]
     if unseen is not None and unseen.varies and ob.data.type == "AREA":

@@ -65,13 +65,13 @@ def _shading_before(scene) -> list:
 
     Views whose shading was changed by hand since then stay as they are.
     """
-    found = []
+    restored = []
     for space in (space for screen in bpy.data.screens for area in screen.areas for space in area.spaces):
         owner, former = _lent_views.get(space.as_pointer(), (None, ""))
         if owner == scene.session_uid and space.type == "VIEW_3D" and space.shading.type == "RENDERED":
             space.shading.type = former
-            found.append(space)
-    return found
+            restored.append(space)
+    return restored
 
 
 def _give_back_views(scene) -> None:

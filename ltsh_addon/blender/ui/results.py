@@ -316,23 +316,23 @@ class Update:
     def _work(self) -> None:
         error = None
         try:
-            for place, (number, light) in enumerate(self.moved.items()):
+            for position, (number, light) in enumerate(self.moved.items()):
                 with closing(self._source.pictures(light, self._before[number][0])) as pictures:
                     for layer, share in pictures:
-                        self._made.put((number, layer, (place + share) / len(self.moved)))
-        except Exception as found:
-            error = found
+                        self._made.put((number, layer, (position + share) / len(self.moved)))
+        except Exception as raised:
+            error = raised
         self._made.put((None, error, 1.0))
 
     def take(self) -> bool:
         """Put new pictures into the mixer, and at the end into its file; True if there were any, or all are done."""
         newest = {}
         while not self.is_finished and not self._made.empty():
-            number, found, self.done = self._made.get()
+            number, content, self.done = self._made.get()
             if number is None:
-                self.is_finished, self.error = True, found
+                self.is_finished, self.error = True, content
             else:
-                newest[number] = found
+                newest[number] = content
         for number, layer in newest.items():
             row = replace(self._before[number][0], light=self.moved[number].record())
             self.mixer.replace(number, row, layer)
@@ -377,10 +377,10 @@ def _end_later() -> None:
 
 def _moved_lights(scene) -> MovedLights:
     if scene.name in _rendered:
-        found = _rendered[scene.name][1]
-        if found is None:
+        moved = _rendered[scene.name][1]
+        if moved is None:
             raise SceneError("this final render has too many samples to keep them all: render again with fewer points")
-        return found
+        return moved
     if _mixer["moved"] is None:
         result = result_of(scene)
         _mixer["moved"] = MovedLights.load((result.folder.parent / FILES[result.command]).with_suffix(RELIGHT_SUFFIX))

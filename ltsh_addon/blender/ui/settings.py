@@ -227,7 +227,7 @@ def _hide(ob, hidden: int) -> None:
             setattr(ob, name, value)
 
 
-def _follow_solo(own, context) -> None:
+def _follow_solo(settings, context) -> None:
     """Hide all lights except those on solo; without any, restore all lights."""
     lights = lights_of(context.scene)
     solo = any(ob.ltsh_light.solo for ob in lights)
@@ -247,16 +247,16 @@ def _release(ob) -> None:
         ob.ltsh_light.held = NOT_HELD
 
 
-def _is_muted(own) -> bool:
-    return bool((_hidden(own.id_data) if own.held == NOT_HELD else own.held) & 2)
+def _is_muted(settings) -> bool:
+    return bool((_hidden(settings.id_data) if settings.held == NOT_HELD else settings.held) & 2)
 
 
-def _set_muted(own, muted: bool) -> None:
-    if own.held != NOT_HELD and any(ob.ltsh_light.solo for ob in lights_of(bpy.context.scene)):
-        own.held = 3 if muted else 0
+def _set_muted(settings, muted: bool) -> None:
+    if settings.held != NOT_HELD and any(ob.ltsh_light.solo for ob in lights_of(bpy.context.scene)):
+        settings.held = 3 if muted else 0
     else:
-        own.held = NOT_HELD
-        _hide(own.id_data, 3 if muted else 0)
+        settings.held = NOT_HELD
+        _hide(settings.id_data, 3 if muted else 0)
 
 
 class LTSH_PG_light(bpy.types.PropertyGroup):

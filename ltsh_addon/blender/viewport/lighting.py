@@ -6,7 +6,6 @@ Lights, tables and integrals are those of `shading.shade`, in float32 throughout
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
-from contextlib import nullcontext
 from dataclasses import replace
 
 import gpu
@@ -17,27 +16,15 @@ from ...cycles import horizons
 from ...lobes.lookup_table import LookupTable
 from ...scene import PASSES, AreaLight
 from ...shading import load_table
+from .drawing import WITHIN_MASK, drawing, empty_texture, float_texture, frame_buffer
+from .gbuffer import SAMPLERS, VISIBILITY_SAMPLERS, GBufferTextures
+from .light_texels import UploadedLights, dielectric_texels, draw_ranges, table_texels, upload_lights
 from .shaders import BOUNDS, CHOICE, EXCESS, HORIZON_SAMPLERS, Features, horizon_shader, lighting_shader
-from .textures import (
-    SAMPLERS,
-    SHARE_SAMPLERS,
-    GBufferTextures,
-    UploadedLights,
-    dielectric_texels,
-    empty_texture,
-    float_texture,
-    frame_buffer,
-    shares,
-    table_texels,
-    upload_lights,
-)
 
 _RESULTS = {BOUNDS: "light_bounds", EXCESS: "excesses", CHOICE: "horizons"}
 _SHOWN_PASSES = (*PASSES, "combined")
 # From one picture to the next, the points at which lobes sample the world shift by GOLDEN steps and turn by TURN rad.
 GOLDEN, TURN = 0.618034, 2.0
-# The depth test without a mask and with one: pixels are drawn at the depth 1/2.
-WITHIN = ("NONE", "LESS")
 
 
 class HorizonPass:
@@ -50,10 +37,6 @@ class HorizonPass:
         self._shaders = {step: horizon_shader(step) for step in _RESULTS}
         self._size, self._mask, self._textures, self._buffers = None, None, {}, {}
 
-    def free(self) -> None:
-        """Free all textures and shaders."""
-        self._size, self._mask, self._shaders, self._textures, self._buffers = None, None, {}, {}, {}
-
     def draw(
         self, gbuffer: GBufferTextures, lights: UploadedLights, view: Sequence[float], threshold: float = 0.5
     ) -> gpu.types.GPUTexture:
@@ -64,9 +47,9 @@ class HorizonPass:
         """
         self._resize(gbuffer.size, gbuffer.mask)
         corners = [len(light.corners) if light.shape == "POLYGON" else 1 for light in lights.lights]
-        self._run(BOUNDS, gbuffer, lights, shares([1] * len(corners)), {})
-        self._run(EXCESS, gbuffer, lights, shares([horizons.AROUND * count for count in corners]), {"view": view})
-        self._run(CHOICE, gbuffer, lights, [(0, 0)], {"threshold": threshold})
+        self._run(BOUNDS, gbuffer, lights, draw_ranges([1] * len(corners)))
+        self._run(EXCESS, gbuffer, lights, draw_ranges([horizons.AROUND * count for count in corners]), view=view)
+        self._run(CHOICE, gbuffer, lights, [(0, 0)], threshold=threshold)
         return self._textures[_RESULTS[CHOICE]]
 
     def _resize(self, size, mask) -> None:
@@ -75,31 +58,18 @@ class HorizonPass:
             self._buffers = {step: frame_buffer(self._textures[name], mask) for step, name in _RESULTS.items()}
             self._size, self._mask = size, mask
 
-    def _run(self, step, gbuffer, lights, light_shares, constants) -> None:
-        shader, batch = self._shaders[step]
-        with self._buffers[step].bind():
-            gpu.state.viewport_set(0, 0, *self._size)
-            gpu.state.blend_set("NONE")
-            gpu.state.depth_test_set(WITHIN[gbuffer.mask is not None])
-            try:
-                shader.bind()
-                for name in HORIZON_SAMPLERS[step]:
-                    own = self._textures.get(name) or (lights.texture if name == "lights" else None)
-                    shader.uniform_sampler(name, own or getattr(gbuffer, SAMPLERS[name]))
-                for name, value in constants.items():
-                    shader.uniform_float(name, value)
-                for first, end in light_shares:
-                    if step != CHOICE:
-                        shader.uniform_int("place", (first, end))
-                    batch.draw(shader)
-                    gpu.state.blend_set("ADDITIVE_PREMULT")
-            finally:
-                gpu.state.blend_set("NONE")
-                gpu.state.depth_test_set("NONE")
+    def _run(self, step, gbuffer, lights, ranges, **constants) -> None:
+        shader, uploaded = self._shaders[step], {**self._textures, "lights": lights.texture}
+        textures = {name: uploaded.get(name) or getattr(gbuffer, SAMPLERS[name]) for name in HORIZON_SAMPLERS[step]}
+        with drawing(self._buffers[step], (0, 0, *self._size), depth=WITHIN_MASK[gbuffer.mask is not None]):
+            shader.bind(textures, constants)
+            for draw_range in ranges:
+                shader.draw(**({} if step == CHOICE else {"draw_range": draw_range}))
+                gpu.state.blend_set("ADDITIVE_PREMULT")
 
 
 class LightingPass:
-    """One technique, ready to draw. Needs an active GPU context; `free` before that goes."""
+    """One technique, ready to draw. Needs an active GPU context, and must be dropped before that goes."""
 
     def __init__(self, technique: str | LookupTable, iors: Sequence[float] = (1.5, 1.45)):
         """`technique` is "ltc", "ltsh2", "ltsh4", "ltsh4c", the path of a table, or a table of degree up to 4.
@@ -115,11 +85,6 @@ class LightingPass:
         self._sky = None
         self.set_iors(iors)
         self.set_lights(())
-
-    def free(self) -> None:
-        """Free shaders and textures; the pass cannot draw any more."""
-        self._shaders.clear()
-        self._table = self._dielectrics = self._lights = self._sky = None
 
     def set_iors(self, iors: Sequence[float]) -> None:
         """Set the indices of refraction of the faster dielectrics, as in the constructor."""
@@ -142,26 +107,23 @@ class LightingPass:
     def draw(
         self,
         gbuffer: GBufferTextures,
-        target: gpu.types.GPUOffScreen | gpu.types.GPUFrameBuffer | None,
+        target: gpu.types.GPUOffScreen | gpu.types.GPUFrameBuffer,
         passes: str = "combined",
         *,
         view: Sequence[float],
-        rect: tuple[int, int, int, int] | None = None,
         blend: str = "NONE",
         numbers: Collection[int] | None = None,
     ) -> None:
         """Write RGB radiance in W m^-2 sr^-1 and alpha 1 where the G-buffer has a surface, 0 elsewhere.
 
-        `passes` is "specular", "diffuse" or "combined"; `view` is that of `HorizonPass.draw`. `target` None draws into
-        the bound frame buffer. Of a G-buffer with a mask only surfaces are written; the mask must be the target's depth
-        buffer. `rect` (x, y, width, height) is the place of the G-buffer in the target; None: (0, 0)
-        and its own size. `blend` is "NONE", "ADDITIVE" to add the radiance (a further lobe of the same surfaces), or
-        "ADDITIVE_PREMULT" to add radiance and alpha. `numbers` are those of the lights to draw, at least one; None:
-        all. The world's light is drawn with light 0.
+        `passes` is "specular", "diffuse" or "combined"; `view` is that of `HorizonPass.draw`. `target` has the size of
+        the G-buffer. Of a G-buffer with a mask only surfaces are written; the mask must be the target's depth buffer.
+        `blend` is "NONE", "ADDITIVE" to add the radiance (a further lobe of the same surfaces), or "ADDITIVE_PREMULT"
+        to add radiance and alpha. `numbers` are those of the lights to draw, at least one; None: all. The world's light
+        is drawn with light 0.
         """
         if passes not in _SHOWN_PASSES:
             raise ValueError(f"lighting pass: passes is {passes!r}, expected one of {', '.join(_SHOWN_PASSES)}")
-        x, y, width, height = rect or (0, 0, *gbuffer.size)
         features = Features(
             specular=passes != "diffuse",
             diffuse=passes != "specular",
@@ -169,7 +131,7 @@ class LightingPass:
             bumped=passes != "specular" and gbuffer.smooth_normal is not None,
             focused=self._has_focused,
             turned=passes != "specular" and gbuffer.diffuse_normal is not None,
-            shadowed=gbuffer.shares is not None,
+            shadowed=gbuffer.visibility is not None,
             facing=self._has_facing,
             patterned=self._has_patterns,
             sky=self._sky is not None,
@@ -178,64 +140,52 @@ class LightingPass:
             velvet=passes != "specular" and gbuffer.has_velvet,
             bent=passes != "diffuse" and gbuffer.has_bent,
         )
-        parts = [features]
+        shaders = [features]
         if features.specular and gbuffer.tangent is not None:
             # Anisotropic lobes have a shader of their own, which integrates Fresnel's factor with them.
-            parts = [replace(features, brushing=True), replace(features, brushing=True, brushed=True, bent=False)]
+            shaders = [replace(features, brushing=True), replace(features, brushing=True, brushed=True, bent=False)]
         if features.specular and features.rough:
             # Draw the rough diffuse lobe by itself: both lobes together may read too many textures.
             none = {"diffuse": False, "bumped": False, "turned": False, "sheen": False, "rough": False, "velvet": False}
             alone = replace(features, specular=False, geometric=False, bent=False)
-            parts = [*(replace(part, **none) for part in parts), alone]
-        with nullcontext() if target is None else target.bind():
-            previous = gpu.state.viewport_get(), gpu.state.blend_get(), gpu.state.depth_test_get()
-            gpu.state.viewport_set(x, y, width, height)
-            gpu.state.blend_set(blend)
-            gpu.state.depth_test_set(WITHIN[gbuffer.mask is not None])
-            try:
-                for features in parts:
-                    self._draw(features, gbuffer, view, (x, y), self._ranges(numbers))
-            finally:
-                gpu.state.viewport_set(*previous[0])
-                gpu.state.blend_set(previous[1])
-                gpu.state.depth_test_set(previous[2])
+            shaders = [*(replace(shader, **none) for shader in shaders), alone]
+        with drawing(target, (0, 0, *gbuffer.size), blend, WITHIN_MASK[gbuffer.mask is not None]):
+            for features in shaders:
+                self._draw(features, gbuffer, view, self._ranges(numbers))
 
     def _ranges(self, numbers: Collection[int] | None) -> list[tuple[int, int]]:
         """The lights (first, end) of each draw call."""
         if numbers is None:
-            return shares(self._loops)
+            return draw_ranges(self._loops)
         chosen = np.array(sorted(numbers))
         runs = np.split(chosen, np.flatnonzero(np.diff(chosen) > 1) + 1)
         return [
             (int(run[0]) + first, int(run[0]) + end)
             for run in runs
-            for first, end in shares(self._loops[run[0] : run[-1] + 1])
+            for first, end in draw_ranges(self._loops[run[0] : run[-1] + 1])
         ]
 
-    def _draw(self, features: Features, gbuffer: GBufferTextures, view, place: tuple[int, int], ranges) -> None:
+    def _draw(self, features: Features, gbuffer: GBufferTextures, view, ranges) -> None:
         if features not in self._shaders:
             self._shaders[features] = lighting_shader(self.table, features)
-        shader, batch = self._shaders[features]
-        shader.bind()
-        for name in features.samplers:
-            shader.uniform_sampler(name, self._texture(name, gbuffer))
-        if "view" in features.constants:
-            shader.uniform_float("view", view)
-        if "jitter" in features.constants:
-            shader.uniform_float("jitter", ((0.5 + self.number * GOLDEN) % 1.0, self.number * TURN))
-        if features.shadowed:
-            shader.uniform_float("grid", Matrix(gbuffer.shares.projection.tolist()))
-        for first, end in ranges:
-            shader.uniform_int("place", (*place, first, end))
-            batch.draw(shader)
+        shader = self._shaders[features]
+        constants = {
+            "view": view,
+            "jitter": ((0.5 + self.number * GOLDEN) % 1.0, self.number * TURN),
+            "grid": Matrix(gbuffer.visibility.projection.tolist()) if features.shadowed else None,
+        }
+        textures = {name: self._texture(name, gbuffer) for name in features.samplers}
+        shader.bind(textures, {name: constants[name] for name in features.constants if name in constants})
+        for draw_range in ranges:
+            shader.draw(draw_range=draw_range)
             gpu.state.blend_set("ADDITIVE")
 
     def _texture(self, name, gbuffer):
-        own = {"lights": self._lights, "table": self._table, "dielectrics": self._dielectrics, "sky": self._sky}
-        if name in own:
-            return own[name]
-        if name in SHARE_SAMPLERS:
-            return getattr(gbuffer.shares, SHARE_SAMPLERS[name])
+        uploaded = {"lights": self._lights, "table": self._table, "dielectrics": self._dielectrics, "sky": self._sky}
+        if name in uploaded:
+            return uploaded[name]
+        if name in VISIBILITY_SAMPLERS:
+            return getattr(gbuffer.visibility, VISIBILITY_SAMPLERS[name])
         return getattr(gbuffer, SAMPLERS[name])
 
 

@@ -14,11 +14,11 @@ from ..evaluated import interpolated_normals, read_values
 _SAME = 1e-5
 
 
-def own_normals(mesh, flat: np.ndarray, triangles: np.ndarray, place: np.ndarray, normal: np.ndarray):
+def non_planar_normals(mesh, flat: np.ndarray, triangles: np.ndarray, position: np.ndarray, normal: np.ndarray):
     """Triangles (K,) that need corners of their own, and their normals (K, 3): triangles of non-planar flat faces.
 
-    `flat` (F,) is the mask of flat faces. `triangles` (T, 3) are numbers of corners, which have the positions `place`
-    and the normals `normal`, (C, 3).
+    `flat` (F,) is the mask of flat faces. `triangles` (T, 3) are numbers of corners with the positions `position` and
+    the normals `normal`, both (C, 3).
     """
     candidates = np.arange(len(triangles))
     if not flat.all():
@@ -26,19 +26,19 @@ def own_normals(mesh, flat: np.ndarray, triangles: np.ndarray, place: np.ndarray
         candidates = np.nonzero(flat[face])[0]
     corners = triangles.take(candidates, axis=0)
     # `take` is several times as fast as an index.
-    first, second, third = (place.take(corners[:, number], axis=0) for number in range(3))
-    own = unit(np.cross(second - first, third - first))
+    first, second, third = (position.take(corners[:, number], axis=0) for number in range(3))
+    face_normal = unit(np.cross(second - first, third - first))
     differs = np.zeros(len(candidates), bool)
     # All corners of a face have its normal where all faces are flat.
     for number in range(1 if flat.all() else 3):
-        difference = np.abs(normal.take(corners[:, number], axis=0) - own)
+        difference = np.abs(normal.take(corners[:, number], axis=0) - face_normal)
         for axis in range(3):
             differs |= difference[:, axis] > _SAME
-    differs &= own.any(axis=1)
-    return candidates[differs], own[differs]
+    differs &= face_normal.any(axis=1)
+    return candidates[differs], face_normal[differs]
 
 
-def corner_tangents(place, normal, uv, triangles) -> np.ndarray:
+def corner_tangents(position, normal, uv, triangles) -> np.ndarray:
     """Tangents (C, 4) of corners by MikkTSpace (Mikkelsen 2008), which Cycles uses; w is the sign of the bitangent.
 
     Corners have positions (C, 3), unit normals (C, 3) and UV coordinates (C, 2). Tangents are in the frame of the
@@ -48,17 +48,17 @@ def corner_tangents(place, normal, uv, triangles) -> np.ndarray:
     triangles, each projected onto the plane of the normal and weighted by its angle.
     """
     corner, area = triangles.ravel(), _uv_area(uv, triangles)
-    of_triangle = unit(_towards_u(place, uv, triangles) * np.sign(area)[:, None])
+    of_triangle = unit(_towards_u(position, uv, triangles) * np.sign(area)[:, None])
     upward = normal[corner].astype(np.float64)
-    flat = unit(_projected(of_triangle.repeat(3, axis=0), upward)) * _angles(place, triangles, upward)[:, None]
+    flat = unit(_projected(of_triangle.repeat(3, axis=0), upward)) * _angles(position, triangles, upward)[:, None]
     used = (area != 0.0).repeat(3)
-    group = _groups(place, normal, uv, corner, area)
+    group = _groups(position, normal, uv, corner, area)
     flat[~used] = 0.0
     total = np.stack([np.bincount(group, flat[:, axis]) for axis in range(3)], axis=-1)
-    found = np.tile(np.array([1.0, 0.0, 0.0, -1.0], np.float32), (len(place), 1))
-    found[corner[used], :3] = unit(total)[group[used]]
-    found[corner[used], 3] = np.sign(area).repeat(3)[used]
-    return found
+    tangents = np.tile(np.array([1.0, 0.0, 0.0, -1.0], np.float32), (len(position), 1))
+    tangents[corner[used], :3] = unit(total)[group[used]]
+    tangents[corner[used], 3] = np.sign(area).repeat(3)[used]
+    return tangents
 
 
 def _uv_area(uv, triangles):
@@ -67,9 +67,9 @@ def _uv_area(uv, triangles):
     return first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
 
 
-def _towards_u(place, uv, triangles):
+def _towards_u(position, uv, triangles):
     """The directions (T, 3) in which u grows, for positive areas."""
-    (first, second), (uv_first, uv_second) = _edges(place, triangles), _edges(uv, triangles)
+    (first, second), (uv_first, uv_second) = _edges(position, triangles), _edges(uv, triangles)
     return first * uv_second[:, 1:] - second * uv_first[:, 1:]
 
 
@@ -78,17 +78,17 @@ def _edges(values, triangles):
     return values[triangles[:, 1]] - start, values[triangles[:, 2]] - start
 
 
-def _angles(place, triangles, upward):
+def _angles(position, triangles, upward):
     """Angles (3 T,) at the corners of the triangles, seen along the normals `upward` (3 T, 3)."""
-    points = place[triangles].astype(np.float64)
+    points = position[triangles].astype(np.float64)
     ahead, back = (unit(_projected((np.roll(points, way, axis=1) - points).reshape(-1, 3), upward)) for way in (-1, 1))
     return np.arccos(np.clip((ahead * back).sum(axis=1), -1.0, 1.0))
 
 
-def _groups(place, normal, uv, corner, area):
+def _groups(position, normal, uv, corner, area):
     """Numbers (3 T,) of the groups of corners that share a tangent."""
     # Adding 0 turns negative zeros into zeros, as the rows are compared bytewise.
-    rows = np.concatenate([place, normal, uv], axis=1, dtype=np.float32)[corner] + np.float32(0.0)
+    rows = np.concatenate([position, normal, uv], axis=1, dtype=np.float32)[corner] + np.float32(0.0)
     rows = np.concatenate([rows, np.sign(area).astype(np.float32).repeat(3)[:, None]], axis=1)
     as_one = np.ascontiguousarray(rows).view(np.dtype((np.void, rows.shape[1] * rows.itemsize))).ravel()
     return np.unique(as_one, return_inverse=True)[1].ravel()
@@ -138,8 +138,8 @@ class MeshBatches:
         """Add the tangents for normal maps on `uv_map`; `ob` is an evaluated object with this mesh."""
         if uv_map in self._tangents or uv_map not in self.uv:
             return
-        found = _arrays(ob)
-        tangents = corner_tangents(found.place, found.normal, found.uv[uv_map], found.triangles)
+        arrays = _arrays(ob)
+        tangents = corner_tangents(arrays.position, arrays.normal, arrays.uv[uv_map], arrays.triangles)
         self._tangents[uv_map] = _vertex_buffer({"tangent": tangents})
         self._batches.clear()
 
@@ -169,7 +169,7 @@ class _Arrays:
     triangles: np.ndarray  # (T, 3) of corners
     slots: np.ndarray  # (T,)
     vertex: np.ndarray  # (C,)
-    place: np.ndarray  # (C, 3)
+    position: np.ndarray  # (C, 3)
     normal: np.ndarray  # (C, 3)
     uv: dict[str, np.ndarray]
     middle: np.ndarray  # (3,)
@@ -178,10 +178,10 @@ class _Arrays:
 
 def mesh_batches(ob) -> MeshBatches | None:
     """The mesh of the evaluated object `ob` on the graphics card; None where it has no faces."""
-    found = _arrays(ob)
-    if found is None:
+    arrays = _arrays(ob)
+    if arrays is None:
         return None
-    triangles, slots = found.triangles, found.slots
+    triangles, slots = arrays.triangles, arrays.slots
     used = tuple(int(slot) for slot in np.flatnonzero(np.bincount(slots)))
     indices = {
         slot: gpu.types.GPUIndexBuf(
@@ -189,8 +189,10 @@ def mesh_batches(ob) -> MeshBatches | None:
         )
         for slot in used
     }
-    buffer = _vertex_buffer({"position": found.place, "normal": found.normal})
-    return MeshBatches(used, len(triangles), indices, buffer, len(found.place), found.uv, found.middle, found.is_smooth)
+    buffer = _vertex_buffer({"position": arrays.position, "normal": arrays.normal})
+    return MeshBatches(
+        used, len(triangles), indices, buffer, len(arrays.position), arrays.uv, arrays.middle, arrays.is_smooth
+    )
 
 
 def _arrays(ob) -> _Arrays | None:
@@ -207,32 +209,32 @@ def _arrays(ob) -> _Arrays | None:
         slots = _slots(mesh, count, max(len(ob.material_slots), 1))
         # Reading attributes is a copy of memory; `mesh.loops` and `mesh.vertices` would be read one by one.
         vertex = read_values(mesh.attributes[".corner_vert"].data, "value", (len(mesh.loops),), np.int32)
-        place = read_values(mesh.attributes["position"].data, "vector", (len(mesh.vertices), 3), np.float32)
-        middle = 0.5 * (place.min(axis=0) + place.max(axis=0)).astype(np.float64)
-        place, uv = place.take(vertex, axis=0), _uv_maps(mesh, len(vertex))
+        position = read_values(mesh.attributes["position"].data, "vector", (len(mesh.vertices), 3), np.float32)
+        middle = 0.5 * (position.min(axis=0) + position.max(axis=0)).astype(np.float64)
+        position, uv = position.take(vertex, axis=0), _uv_maps(mesh, len(vertex))
         normal, flat = interpolated_normals(mesh, vertex)
         if flat.any():
-            chosen, own = own_normals(mesh, flat, triangles, place, normal)
+            chosen, face_normals = non_planar_normals(mesh, flat, triangles, position, normal)
             corners = triangles[chosen].ravel()
             triangles[chosen] = len(vertex) + np.arange(len(corners)).reshape(-1, 3)
-            normal = np.concatenate([normal, own.repeat(3, axis=0)])
+            normal = np.concatenate([normal, face_normals.repeat(3, axis=0)])
             vertex = np.concatenate([vertex, vertex[corners]])
-            place = np.concatenate([place, place.take(corners, axis=0)])
+            position = np.concatenate([position, position.take(corners, axis=0)])
             uv = {name: np.concatenate([values, values.take(corners, axis=0)]) for name, values in uv.items()}
     finally:
         ob.to_mesh_clear()
-    return _Arrays(triangles, slots, vertex, place, normal, uv, middle, not flat.all())
+    return _Arrays(triangles, slots, vertex, position, normal, uv, middle, not flat.all())
 
 
 def texture_space(ob, vertex: np.ndarray) -> np.ndarray:
     """Generated coordinates minus 0.5, (C, 3), of the vertices `vertex` (C,) of the evaluated object `ob`."""
     mesh = ob.to_mesh()
     try:
-        place = read_values(mesh.vertices, "undeformed_co", (len(mesh.vertices), 3), np.float32)
+        position = read_values(mesh.vertices, "undeformed_co", (len(mesh.vertices), 3), np.float32)
         middle, size = np.array(mesh.texspace_location), np.array(mesh.texspace_size)
     finally:
         ob.to_mesh_clear()
-    return ((place - middle) * np.divide(0.5, size, out=np.ones(3), where=size != 0.0)).astype(np.float32)[vertex]
+    return ((position - middle) * np.divide(0.5, size, out=np.ones(3), where=size != 0.0)).astype(np.float32)[vertex]
 
 
 def _slots(mesh, count: int, slots: int) -> np.ndarray:

@@ -1,28 +1,18 @@
-"""The viewport's copy of a scene: after a change only what it touches is read again.
-
-First its lights: area lights and flat emissive meshes, with nodes as far as they can be resolved. Then all the rest.
-"""
+"""The viewport's copy of a scene: after a change only what it touches is read again."""
 
 from __future__ import annotations
 
-import functools
-import threading
-import time
 from collections import Counter
 from collections.abc import Callable
-from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
-from types import SimpleNamespace
+from dataclasses import dataclass, field
 
 import bpy
 import numpy as np
 from mathutils import Matrix
 
-from ...files import temporary_folder
-from ...scene import AreaLight, Cancelled, error_line, listed
+from ...scene import AreaLight, listed
 from ..evaluated import (
     SURFACE_TYPES,
-    EmitterTraits,
     data_pointer,
     is_seen_by_cameras,
     is_surface,
@@ -30,293 +20,15 @@ from ..evaluated import (
     owner_of,
     visibility,
 )
-from ..lights.area import area_light, note_unsupported, reason_to_leave_out, unseen_light
-from ..lights.emission import emission_of, factors_of, nodes_as_text, open_studio
 from ..lights.linking import Receivers
-from ..lights.meshes import collect_mesh_lights, constant_mesh_lights
-from ..lights.textures import MOST_LOOKS, SeenNodes, ShownTextures, UnseenLight, seen_factor, with_pattern
+from ..lights.textures import ShownTextures
 from ..lights.world import light_of_world
-from ..materials.graph import source_of, surface_of, tree_in_use
 from ..materials.looks import Look, look_of, world_radiance
-from ..materials.values import product, value_at
-from ..process import client
+from .drawing import uniform_buffer
+from .lights import Patterns, no_patterns, view_lights
 from .meshes import MeshBatches, mesh_batches
-from .sky import REST_SECONDS, ShownSky, constant_sky, written
-from .textures import look_values, uniform_buffer
-
-# FAR_AWAY: the eye where there is no camera, outside of all closed emissive meshes.
-FAR_AWAY = np.full(3, 1e6)
-# MOST_LIGHTS: patches and faces included. The time of a frame grows with their number.
-MOST_LIGHTS = 2048
-# Reasons why a light has no pattern.
-NOT_RESOLVED = "its nodes are not resolved, it shines as without them"
-NOT_YET = "it shines as without its nodes until Cycles has looked at them"
-# Patterns: a function that returns how Cycles sees the nodes of evaluated light data, or why that is not known.
-Patterns = Callable[[bpy.types.Light, UnseenLight], SeenNodes | str]
-
-
-def no_patterns(data, source: UnseenLight) -> str:
-    """The `Patterns` of views that resolve no nodes."""
-    return NOT_RESOLVED
-
-
-def view_lights(
-    depsgraph, in_view: Callable, textures: ShownTextures, patterns: Patterns = no_patterns
-) -> tuple[tuple[AreaLight, ...], tuple[str, ...]]:
-    """The lights among the instances that `in_view` accepts, and notes about what differs from Cycles.
-
-    `textures` are those of the last call, for reuse.
-    """
-    notes: list[str] = []
-    receivers = Receivers([ob.original for ob in depsgraph.objects])
-    lights, emits = [], False
-    for instance in depsgraph.object_instances:
-        ob = instance.object
-        if not instance.show_self or not in_view(instance):
-            continue
-        emits = emits or (ob.type in SURFACE_TYPES and _has_emission(ob))
-        if ob.type != "LIGHT":
-            continue
-        matrix = np.array(instance.matrix_world, dtype=np.float64)
-        problem = reason_to_leave_out(ob, matrix)
-        if problem:
-            notes.append(f"{ob.original.name}: {problem}")
-            continue
-        plain = area_light(ob, matrix, EmitterTraits.of(instance), receivers)
-        shown = [
-            light
-            for light in _with_nodes(plain, instance, (textures, patterns), notes)
-            if np.any(light.radiance != 0.0)
-        ]
-        if shown:
-            lights.extend(shown)
-            note_unsupported(ob, matrix, SimpleNamespace(warn=notes.append))
-    if emits:
-        lights.extend(_mesh_lights(depsgraph, receivers, notes))
-    return tuple(strongest(lights, notes)), tuple(dict.fromkeys(notes))
-
-
-def strongest(lights: list[AreaLight], notes: list[str], most: int = MOST_LIGHTS) -> list[AreaLight]:
-    """The `most` lights with the largest power, in their order; what is missing is told in `notes`."""
-    if len(lights) <= most:
-        return lights
-    power = np.array([np.linalg.norm(light.area_vector) * np.abs(light.radiance).sum() for light in lights])
-    kept = np.sort(np.argsort(-power, kind="stable")[:most])
-    left = 1.0 - power[kept].sum() / power.sum()
-    notes.append(
-        f"Of {len(lights)} lights, faces and patches the {most} strongest are shown, {100.0 * left:.1f} % of the power "
-        "is missing"
-    )
-    return [lights[index] for index in kept]
-
-
-def _has_emission(ob) -> bool:
-    return any(slot.material is not None and np.any(_emission(slot.material)) for slot in ob.material_slots)
-
-
-def _emission(material) -> np.ndarray:
-    return np.zeros(3) if material is None else look_of(material.original).emission
-
-
-def _mesh_lights(depsgraph, receivers: Receivers, notes: list[str]) -> list[AreaLight]:
-    override = depsgraph.view_layer_eval.material_override
-    found = collect_mesh_lights(depsgraph, override, receivers, notes.append, copies=False)
-    camera = depsgraph.scene.camera
-    eye = FAR_AWAY if camera is None else np.array(camera.matrix_world.translation)
-    return constant_mesh_lights(found, _emission, eye, notes.append)
-
-
-def patterns_of(scene, depsgraph) -> dict[tuple, SeenNodes]:
-    """How Cycles sees the nodes of lights that views cannot read themselves, by the `key` of the `UnseenLight`.
-
-    `scene` is left as it was.
-    """
-    wanted: dict[tuple, UnseenLight] = {}
-
-    def note(data, source: UnseenLight) -> str:
-        if len(wanted) < MOST_LOOKS:
-            wanted[source.key] = source
-        return NOT_YET
-
-    receivers, looked = Receivers([]), (ShownTextures(), note)
-    for instance in depsgraph.object_instances:
-        ob = instance.object
-        if ob.type == "LIGHT" and tree_in_use(ob.data) is not None:
-            matrix = np.array(instance.matrix_world, dtype=np.float64)
-            if not reason_to_leave_out(ob, matrix):
-                _with_nodes(area_light(ob, matrix, EmitterTraits.of(instance), receivers), instance, looked, [])
-    if not wanted:
-        return {}
-    with open_studio(scene) as studio:
-        return {key: seen_factor(source, studio) for key, source in wanted.items()}
-
-
-@dataclass
-class _Look:
-    """A second Blender that looks at lights."""
-
-    states: dict[tuple, tuple]  # states by key of the lights without results so far
-    found: list[tuple[tuple, SeenNodes]] = field(default_factory=list)  # new results, with the keys of their lights
-    error: str = ""
-    is_stopped: bool = False
-    thread: threading.Thread | None = None
-
-
-class LiveLamps:
-    """The nodes of lights as Cycles sees them, for all windows.
-
-    A second Blender looks at new and changed lights while the views go on. Lights are identified by the `key` of
-    `UnseenLight`.
-    """
-
-    def __init__(self):
-        self._known: dict[tuple, tuple[tuple, SeenNodes | str]] = {}  # state of a light's nodes, and the result
-        self._wanted: dict[tuple, tuple] = {}  # states of lights to look at
-        self._sources: dict[tuple, UnseenLight] = {}  # the lights of these states
-        self._changed, self._images = 0.0, 0  # time of the last change; counts changes of images
-        self._look: _Look | None = None
-
-    def pattern(self, data, source: UnseenLight) -> SeenNodes | str:
-        """The last result for a light, or a note that there is none yet. Requests a new look if the light changed."""
-        key, state = source.key, self._state(data, source)
-        known, found = self._known.get(key, ((), NOT_YET))
-        on_its_way = self._wanted.get(key) or (self._look.states.get(key) if self._look is not None else None)
-        if known == state:
-            self._wanted.pop(key, None)
-        elif on_its_way != state:
-            self._wanted[key], self._sources[key], self._changed = state, source, time.monotonic()
-        return found
-
-    def _state(self, data, source: UnseenLight) -> tuple:
-        text = nodes_as_text(data)
-        names = {"AREA": ("shape", "size", "size_y"), "SUN": ("angle",)}.get(data.type, ("use_soft_falloff",))
-        if data.type in ("POINT", "SPOT") and (source.is_mixed or not source.by_ray):
-            names = (*names, "shadow_soft_size")
-        if source.by_spot:
-            names = (*names, "spot_size")
-        where = (source.matrix.tobytes(), source.facts) if source.is_placed else ()
-        images = self._images if "image: " in text else 0
-        return data.type, *(getattr(data, name) for name in names), *source.flags.values(), where, text, images
-
-    def note_images(self) -> None:
-        """Images have changed: look at lights with images again."""
-        self._images += 1
-
-    @property
-    def is_busy(self) -> bool:
-        """True while results are to come."""
-        return bool(self._wanted) or self._look is not None
-
-    def stop(self) -> None:
-        """Drop all requests: nobody waits for results any more."""
-        self._wanted.clear()
-        if self._look is not None:
-            self._look.is_stopped, self._look = True, None
-
-    def step(self, frame: int) -> bool:
-        """Do the next step, in the main thread; True if there is news."""
-        look = self._look
-        if look is None:
-            return bool(self._wanted) and time.monotonic() - self._changed > REST_SECONDS and self._begin(frame)
-        has_ended = not look.thread.is_alive()
-        news = bool(look.found)
-        while look.found:
-            key, found = look.found.pop(0)
-            self._known[key] = look.states.pop(key), found
-        if has_ended:
-            self._look = None
-            for key, state in look.states.items():
-                if look.error:
-                    self._known[key] = state, look.error
-                else:
-                    self._wanted.setdefault(key, state)
-            news |= bool(look.error)
-        # Stop if a light has changed again since.
-        look.is_stopped |= any(key in look.states for key in self._wanted)
-        return news
-
-    def _begin(self, frame: int) -> bool:
-        """Start a second Blender; True if that failed, which is news."""
-        present = {light.session_uid: light for light in bpy.data.lights}
-        self._known = {key: known for key, known in self._known.items() if key[0] in present}
-        look = _Look({key: state for key, state in self._wanted.items() if key[0] in present})
-        self._wanted.clear()
-        if not look.states:
-            return False
-        stack = ExitStack()
-        keys = list(look.states)
-        sources = [self._sources[key] for key in keys]
-        lights = [present[key[0]] for key in keys]
-        try:
-            folder = stack.enter_context(temporary_folder())
-            places = written(folder / "lamps.blend", lights)
-            lamps = [
-                client.UnseenLamp(str(place), light.name, source.matrix.tolist(), source.flags, vars(source.facts))
-                for place, light, source in zip(places, lights, sources, strict=True)
-            ]
-        except (OSError, RuntimeError) as error:
-            stack.close()
-            self._known.update({key: (look.states[key], f"{NOT_RESOLVED}: {error_line(error)}") for key in keys})
-            return True
-
-        def take(number: int, factor: np.ndarray, lost: float) -> bool:
-            look.found.append((keys[number], SeenNodes(factor, lost)))
-            return not look.is_stopped
-
-        def work() -> None:
-            try:
-                with stack:
-                    client.look_at_lamps(lamps, frame, folder, take)
-            except Cancelled:
-                pass
-            except Exception as error:
-                look.error = f"{NOT_RESOLVED}: {error_line(error)}"
-
-        look.thread = threading.Thread(target=work, name="LTSH lamps", daemon=True)
-        self._look = look
-        look.thread.start()
-        return False
-
-
-def _with_nodes(light: AreaLight, instance, looked: tuple, notes: list[str]) -> list[AreaLight]:
-    """The lights that the node tree of a depsgraph `instance` makes of `light`; [] where it emits nothing.
-
-    `looked` are the textures and patterns of `view_lights`.
-    """
-    ob, (textures, patterns) = instance.object, looked
-    data = ob.data
-    emission = None if tree_in_use(data) is None else emission_of(data)
-    if emission is None or emission.plain:
-        return [light]
-    surface = surface_of(data)
-    source = source_of(surface) if surface is not None else None
-    if source is None or source.node is None:
-        return []
-    if source.node.bl_idname == "ShaderNodeEmission" and emission.falloff is not None:
-        if not light.is_distant:
-            light = replace(light, falloff=emission.falloff.power, smooth=emission.falloff.smooth)
-        entries, _ = factors_of(source)
-        factor = functools.reduce(product, [value_at(*entry) for entry in entries])
-        if factor is not None and factor.is_constant:
-            return [replace(light, radiance=light.radiance * factor.offset)]
-        is_area = not (light.is_facing or light.is_distant)
-        patches = textures.split(light, factor, notes) if factor is not None and is_area else None
-        if patches is not None:
-            return patches
-    warnings: list[str] = []
-    matrix = np.array(instance.matrix_world, dtype=np.float64)
-    unseen = unseen_light(ob, matrix, SimpleNamespace(warn=warnings.append), instance)
-    found = patterns(data, unseen)
-    if isinstance(found, str):
-        notes.append(f"{light.name}: {found}")
-        return [replace(light, falloff=0, smooth=0.0)]
-    notes += warnings
-    if not light.is_distant:
-        light = replace(light, falloff=unseen.falloff.power, smooth=unseen.falloff.smooth)
-    if light.is_facing or light.is_distant:
-        return with_pattern(light, found, unseen, notes.append)
-    return textures.split_seen(light, found, notes)
-
+from .sky import ShownSky, constant_sky
+from .textures import look_values
 
 # NOT_SHOWN: notes about types of objects that views leave out. NAMED: the most names of objects in such a note.
 NOT_SHOWN = {
@@ -416,7 +128,7 @@ def _note_object(changes: Changes, block, update) -> None:
 
 def object_notes(depsgraph) -> list[str]:
     """Notes about objects that renders of `depsgraph` show and views do not, kind by kind."""
-    found: dict[str, list[str]] = {}
+    names_by_kind: dict[str, list[str]] = {}
     for ob in depsgraph.objects:
         kind = NOT_SHOWN.get(ob.type)
         if kind is None and ob.type in SURFACE_TYPES and ob.is_shadow_catcher:
@@ -426,8 +138,8 @@ def object_notes(depsgraph) -> list[str]:
         if kind is None and ob.type == "META" and _has_lost_balls(ob, depsgraph):
             kind = "balls smaller than the Resolution Viewport are coarse or missing in views: lower it"
         if kind is not None:
-            found.setdefault(kind, []).append(ob.name)
-    return [f"{listed(names, NAMED)}: {kind}" for kind, names in found.items()]
+            names_by_kind.setdefault(kind, []).append(ob.name)
+    return [f"{listed(names, NAMED)}: {kind}" for kind, names in names_by_kind.items()]
 
 
 def _has_lost_balls(ob, depsgraph) -> bool:
@@ -454,7 +166,7 @@ class SceneMirror:
         self.instances: list[ShownInstance] = []
         self.lights: tuple[AreaLight, ...] = ()  # with the small bright lights of the world
         self.sky = ShownSky()
-        self.own_lights: tuple[AreaLight, ...] = ()  # without those of the world
+        self.lights_without_world: tuple[AreaLight, ...] = ()  # without those of the world
         self._look = look
         self.surfaces_version = 0
         self._meshes: dict[tuple, MeshBatches | None] = {}
@@ -507,8 +219,10 @@ class SceneMirror:
 
     def read_lights(self, depsgraph, in_view: Callable) -> None:
         """Read the lights of the instances that `in_view` accepts."""
-        self.own_lights, self._light_notes = view_lights(depsgraph, in_view, self._light_textures, self._patterns)
-        self.lights = (*self.own_lights, *self.sky.lights)
+        self.lights_without_world, self._light_notes = view_lights(
+            depsgraph, in_view, self._light_textures, self._patterns
+        )
+        self.lights = (*self.lights_without_world, *self.sky.lights)
         self.has_old_lights = False
 
     def _drop_changed(self, changes: Changes) -> None:
@@ -525,7 +239,7 @@ class SceneMirror:
     def _read_instances(self, depsgraph, changes: Changes, in_view) -> None:
         override = depsgraph.view_layer_eval.material_override
         receivers = Receivers([ob for ob in _originals(depsgraph) if ob.type == "LIGHT"])
-        found, meshes, looks = [], {}, {}
+        instances, meshes, looks = [], {}, {}
         users = Counter()  # instances by evaluated data, those out of view included
         for instance in depsgraph.object_instances:
             ob = instance.object
@@ -557,8 +271,8 @@ class SceneMirror:
             model = instance.matrix_world.copy()
             side = -1.0 if model.determinant() < 0.0 else 1.0
             center = np.array(model) @ [*mesh.middle, 1.0]
-            found.append((data, (mesh, model, shown, receiver, side, center)))
-        self.instances = [ShownInstance(*values, is_only_user=users[data] == 1) for data, values in found]
+            instances.append((data, (mesh, model, shown, receiver, side, center)))
+        self.instances = [ShownInstance(*values, is_only_user=users[data] == 1) for data, values in instances]
         self._meshes, self._looks = meshes, looks
         self._object_notes = tuple(object_notes(depsgraph))
 
@@ -579,7 +293,7 @@ class SceneMirror:
     def take_sky(self, sky: ShownSky, *notes: str) -> None:
         """Show this world from now on; `notes` tell how it differs from Cycles."""
         self.sky, self._world_note = sky, notes
-        self.lights = (*self.own_lights, *sky.lights)
+        self.lights = (*self.lights_without_world, *sky.lights)
 
 
 def _shown_look(material) -> ShownLook:
@@ -603,8 +317,8 @@ def _receiver(instance, receivers: Receivers, view_layer) -> int:
     if owner.holdout_get(view_layer=view_layer):
         return HOLDOUT
     numbers = receivers.numbers
-    own = numbers.get(instance.object.original.name_full, 0)
-    return numbers.get(owner.name_full, own) if instance.is_instance else own
+    of_object = numbers.get(instance.object.original.name_full, 0)
+    return numbers.get(owner.name_full, of_object) if instance.is_instance else of_object
 
 
 def _originals(depsgraph) -> list:

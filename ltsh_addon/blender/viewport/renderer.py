@@ -7,313 +7,97 @@ the picture is their mean.
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, replace
 
-import gpu
 import numpy as np
 
-from ...shading.header import definitions
 from ..extract.origin import new_origin
 from ..materials.values import Value
-from .lighting import GOLDEN, HorizonPass, LightingPass
+from .camera import ViewCamera
+from .drawing import PixelShader, float_texture, glsl, read_texture
+from .gbuffer import GBufferTextures, VisibilityGrid
+from .layers import SurfaceLayer
+from .light_texels import UploadedLights, upload_lights
+from .lighting import GOLDEN, LightingPass
 from .mirror import SceneMirror
-from .shaders import glsl, pixel_shader
-from .shadows import LiveShadows, ShadowRays
+from .pictures import PicturePass, SampleSum, ShownPicture, VeilPass, copy
+from .shadow_rays import ShadowRays
+from .shadows import LiveShadows
 from .sky import background_texels, sky_texels
-from .surfaces import SurfacePass, View, has_bent_lobes
-from .textures import (
-    GBufferTextures,
-    ShareGrid,
-    UploadedLights,
-    empty_texture,
-    float_texture,
-    frame_buffer,
-    read_texture,
-    upload_lights,
-)
+from .static_lighting import LightingState, StaticLighting, same_state
 
-MODES = ("single", "split", "difference")
 # MOST_IORS: indices of refraction for which the lighting pass is fast. It is exact for all.
 MOST_IORS = 6
-# RAYS: the shader constants with the rays of `View.rays`.
-RAYS = ("ray_x", "ray_y", "ray_center")
 # CENTERS: the points of pixels of a single frame, their centers, in pixels right and up of them.
 CENTERS = np.zeros((1, 2))
 
 
 @dataclass(frozen=True)
-class ShownPicture:
-    """Which parts of the lighting are shown, and how."""
+class Frame:
+    """What a frame draws."""
 
-    technique: str
-    passes: str  # combined, specular or diffuse
-    mode: str  # of MODES
-    second_technique: str
-    split: float  # place of the line between 0 and 1
-    difference_scale: float
-    exposure: float
-    transparent: bool
-    line_width: float = 1.0
-    second_picture: gpu.types.GPUTexture | None = None  # replaces the second technique's picture; without emission
-    white: float = 1.0  # brightness that shows no difference, before the scene's own exposure
-    also: tuple[tuple[str, str], ...] = ()  # further techniques and passes to draw, for `read`
-    world: bool = True  # show the light of the world
+    mirror: SceneMirror
+    view: ViewCamera
+    size: tuple[int, int]
+    pictures: tuple[tuple[str, str], ...]  # technique and passes of each
+    with_emission: bool  # of surfaces and background, in combined pictures
+    world: bool  # with the light of the world
+
+    @classmethod
+    def of(cls, mirror: SceneMirror, view: ViewCamera, size: tuple[int, int], shown: ShownPicture) -> Frame:
+        """The frame that has the picture `shown`, with positions relative to an origin near what the view sees."""
+        pictures = [(shown.technique, shown.passes)]
+        if shown.mode != "single" and shown.second_picture is None:
+            pictures.append((shown.second_technique, shown.passes))
+        view = view.around(_origin_of(mirror.lights, view))
+        return cls(mirror, view, size, (*pictures, *shown.also), shown.second_picture is None, shown.world)
+
+    @property
+    def surfaces(self) -> tuple[tuple, tuple]:
+        """The state that the G-buffers depend on, see `same_state`."""
+        view = self.view
+        key = view.projection.tobytes(), view.eye.tobytes(), view.is_parallel, view.origin.tobytes(), self.size
+        return (self.mirror,), (self.mirror.surfaces_version, *key)
+
+    @property
+    def content(self) -> tuple:
+        """Which pictures there are, and of what."""
+        return self.pictures, self.with_emission, self.world
 
 
-def _origin_of(lights, view: View) -> np.ndarray:
+def _origin_of(lights, view: ViewCamera) -> np.ndarray:
     """An origin near what is seen, because single precision is coarse far from the origin."""
-    places = np.array([light.center for light in lights if not light.is_distant])
-    if len(places) == 0:
+    centers = np.array([light.center for light in lights if not light.is_distant])
+    if len(centers) == 0:
         return np.zeros(3)
-    return new_origin(places, places.mean(axis=0) if view.is_parallel else view.eye)
-
-
-class PicturePass:
-    """Draws one or two pictures into the bound frame buffer; needs an active GPU context."""
-
-    def __init__(self):
-        constants = {"mode": "INT", "scales": "VEC4", "opacity": "FLOAT", "white": "FLOAT", "weights": "VEC2"}
-        constants |= dict.fromkeys(RAYS, "VEC4")
-        modes = definitions({mode.upper(): number for number, mode in enumerate(MODES)})
-        source = modes + glsl("octahedron") + glsl("picture")
-        self._shader, self._batch = pixel_shader(source, ("first_picture", "second_picture", "sky"), constants)
-
-    def draw(self, pictures, weights, view: View, shown: ShownPicture, background) -> None:
-        """Fill the bound frame buffer, scene-linear, from one or two RGBA textures times their `weights`.
-
-        The weighted alpha is the share of a pixel that shows a surface. `background` is a texture of
-        `sky.background_texels`.
-        """
-        size = pictures[0].width, pictures[0].height
-        gpu.state.viewport_set(0, 0, *size)
-        gpu.state.blend_set("NONE")
-        gpu.state.depth_test_set("NONE")
-        gpu.state.depth_mask_set(False)
-        shader = self._shader
-        shader.bind()
-        shader.uniform_sampler("first_picture", pictures[0])
-        shader.uniform_sampler("second_picture", pictures[-1])
-        shader.uniform_float("weights", (weights[0], weights[-1]))
-        shader.uniform_int("mode", MODES.index(shown.mode))
-        scales = (shown.exposure, shown.difference_scale, shown.split * size[0], 0.5 * shown.line_width)
-        shader.uniform_float("scales", scales)
-        shader.uniform_sampler("sky", background)
-        shader.uniform_float("opacity", 0.0 if shown.transparent else 1.0)
-        is_behind = shown.passes == "combined" and not shown.transparent
-        for name, ray in zip(RAYS, view.rays, strict=True):
-            shader.uniform_float(name, (*ray, float(is_behind)))
-        shader.uniform_float("white", shown.white)
-        self._batch.draw(shader)
-
-
-class CopyPass:
-    """Copies a picture into another one; needs an active GPU context."""
-
-    def __init__(self):
-        self._shader, self._batch = pixel_shader(glsl("copy"), ("picture",), {})
-
-    def draw(self, picture: gpu.types.GPUTexture, target: gpu.types.GPUFrameBuffer) -> None:
-        """Copy `picture` into `target`, which has its size."""
-        with target.bind():
-            gpu.state.viewport_set(0, 0, picture.width, picture.height)
-            gpu.state.blend_set("NONE")
-            gpu.state.depth_test_set("NONE")
-            self._shader.bind()
-            self._shader.uniform_sampler("picture", picture)
-            self._batch.draw(self._shader)
-
-
-class VeilPass:
-    """Draws what is behind glass; needs an active GPU context."""
-
-    def __init__(self):
-        constants = {"is_seen": "FLOAT", **dict.fromkeys(RAYS, "VEC4")}
-        samplers = ("behind", "left", "glass", "sky")
-        self._shader, self._batch = pixel_shader(glsl("octahedron") + glsl("veil"), samplers, constants)
-
-    def draw(self, textures, target, view: View, is_seen: bool) -> None:
-        """Add the picture of the surfaces, over the background, to `target`, dimmed where there is glass.
-
-        `textures` are the picture (RGBA), the share that glass lets through (RGB), the positions of the glass, and the
-        background. Without `is_seen` the background behind glass is black.
-        """
-        shader = self._shader
-        with target.bind():
-            gpu.state.viewport_set(0, 0, textures[0].width, textures[0].height)
-            gpu.state.blend_set("ADDITIVE_PREMULT")
-            gpu.state.depth_test_set("NONE")
-            try:
-                shader.bind()
-                for name, texture in zip(("behind", "left", "glass", "sky"), textures, strict=True):
-                    shader.uniform_sampler(name, texture)
-                shader.uniform_float("is_seen", float(is_seen))
-                for name, ray in zip(RAYS, view.rays, strict=True):
-                    shader.uniform_float(name, (*ray, 1.0))
-                self._batch.draw(shader)
-            finally:
-                gpu.state.blend_set("NONE")
-
-
-class _Layer:
-    """The G-buffer of one layer, surfaces or glass, and the horizons that end its lobes."""
-
-    def __init__(self, before: _Layer | None = None):
-        self._surfaces = SurfacePass(None if before is None else before._surfaces)
-        self._horizons: HorizonPass | None = None
-        self._lobe_horizons: HorizonPass | None = None
-        self._gbuffer: GBufferTextures | None = None
-        self._lit: GBufferTextures | None = None
-        self.smooth_normal: gpu.types.GPUTexture | None = None  # of the lobe that is lit
-        self.shares: ShareGrid | None = None  # shares for all lobes
-        self.threshold = 0.5  # see `HorizonPass.draw`
-        self.through, self.add_emission = self._surfaces.through, self._surfaces.add_emission
-
-    def draw(self, mirror, view: View, size) -> None:
-        """Draw the surfaces."""
-        self._lit = None
-        self._gbuffer = self._surfaces.draw(mirror.instances, view, size)
-
-    def choose_horizons(self, mirror, view: View, lights: UploadedLights) -> None:
-        """Choose the horizons of specular lobes as Cycles does; diffuse lobes keep a second one only if they need it.
-
-        Only bump-mapped and translucent looks need it.
-        """
-        self._lit = None
-        if self._horizons is None and self._gbuffer.geometric_normal is not None:
-            self._horizons = HorizonPass()
-        self._lit = self._with_horizons(self._gbuffer, self._horizons, mirror, view, lights)
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Width and height in pixels."""
-        return self._gbuffer.size
-
-    @property
-    def is_ready(self) -> bool:
-        """True if the horizons are chosen."""
-        return self._lit is not None
-
-    def lobe(self, number: int, mirror, view: View, lights: UploadedLights) -> GBufferTextures:
-        """The G-buffer of the lobes `number`, with their horizons; valid until the next call."""
-        if number == 0:
-            self.smooth_normal = self._gbuffer.smooth_normal
-            return self._lit
-        gbuffer = self._surfaces.draw_lobe(number, mirror.instances, view)
-        if self._lobe_horizons is None and gbuffer.geometric_normal is not None:
-            self._lobe_horizons = HorizonPass()
-        return self._with_horizons(gbuffer, self._lobe_horizons, mirror, view, lights)
-
-    def _with_horizons(self, gbuffer, horizons, mirror, view: View, lights) -> GBufferTextures:
-        self.smooth_normal = gbuffer.smooth_normal
-        if gbuffer.geometric_normal is None:
-            return gbuffer
-        horizon = horizons.draw(gbuffer, lights, view.homogeneous_eye, self.threshold)
-        smooth_normal = gbuffer.smooth_normal if has_bent_lobes(mirror.instances) else None
-        return replace(gbuffer, geometric_normal=horizon, smooth_normal=smooth_normal)
-
-    def free(self) -> None:
-        """Free all textures and shaders."""
-        self._surfaces.free()
-        for horizons in (self._horizons, self._lobe_horizons):
-            if horizons is not None:
-                horizons.free()
-        self._gbuffer = self._lit = self.smooth_normal = self._horizons = self._lobe_horizons = None
-
-
-class _Target:
-    """A picture that holds the sum of the samples."""
-
-    def __init__(self, size: tuple[int, int]):
-        self.texture, self._buffers = empty_texture(size), {}
-
-    def within(self, mask: gpu.types.GPUTexture | None = None) -> gpu.types.GPUFrameBuffer:
-        """The frame buffer of the picture, with `mask` as its depth buffer."""
-        if mask not in self._buffers:
-            self._buffers[mask] = frame_buffer(self.texture, mask)
-        return self._buffers[mask]
-
-    def clear(self) -> None:
-        """Begin a new sum."""
-        self.texture.clear(format="FLOAT", value=(0.0, 0.0, 0.0, 0.0))
-
-
-# With more lights, telling which of them have changed takes longer than it saves.
-MOST_COMPARED = 512
-
-
-@dataclass(frozen=True)
-class _Lit:
-    """What a picture was lit with: state of surfaces and view (see `_same`), lights, and sources of their shares."""
-
-    state: tuple
-    lights: tuple
-    sources: tuple
-
-    def changes(self, new: _Lit) -> frozenset[int] | None:
-        """Numbers of the lights that are others in the picture `new`; None where more has changed."""
-        count = len(self.lights)
-        if not _same(new.state, self.state) or len(new.lights) != count or count > MOST_COMPARED:
-            return None
-        pairs = zip(self.lights, new.lights, strict=True)
-        return frozenset(number for number, (a, b) in enumerate(pairs) if not is_equal(a, b))
-
-    def has_same_shares(self, new: _Lit, left_out: frozenset[int]) -> bool:
-        """True if the shares are the same, but for those of the lights `left_out`."""
-        if len(self.sources) != len(new.sources):
-            return False
-        kept = [number for number in range(len(self.sources)) if number not in left_out]
-        return all(a is b for number in kept for a, b in zip(self.sources[number], new.sources[number], strict=True))
-
-
-def is_equal(a, b) -> bool:
-    """True for lights that look the same, and for their parts: arrays, cones, patterns, words and numbers."""
-    if a is b or type(a) is not type(b):
-        return a is b
-    if not is_dataclass(a):
-        return np.array_equal(a, b)
-    names = (item.name for item in fields(a) if item.name != "detail")
-    return all(is_equal(getattr(a, name), getattr(b, name)) for name in names)
-
-
-@dataclass(frozen=True)
-class _Held:
-    """The light of all lights but the `moving` ones, kept while these change."""
-
-    lit: _Lit
-    moving: frozenset[int]
-    targets: list[_Target]
-
-    def fits(self, new: _Lit) -> bool:
-        """True if it is a part of the picture `new`."""
-        changes = self.lit.changes(new)
-        return changes is not None and changes <= self.moving and self.lit.has_same_shares(new, self.moving)
+    return new_origin(centers, centers.mean(axis=0) if view.is_parallel else view.eye)
 
 
 class ViewRenderer:
     """The GPU's side of one view; needs an active GPU context."""
 
     def __init__(self):
-        self._surfaces = _Layer()
-        self._glass: _Layer | None = None
+        self._surfaces = SurfaceLayer()
+        self._glass: SurfaceLayer | None = None
         self._picture = PicturePass()
         self._veil: VeilPass | None = None
-        self._copy: CopyPass | None = None
+        self._copy: PixelShader | None = None
         self._lighting: dict[str, LightingPass] = {}
-        self._targets: list = []
-        self._behind: list = []  # what is lit behind glass
+        self._sums: list[SampleSum] = []  # of the pictures
+        self._behind: list[SampleSum] = []  # what is lit behind glass
         self._lights: UploadedLights | None = None
         self._drawn, self._uploaded = None, (None, None, None)
-        self._still, self.samples = None, 0
-        self._lit: _Lit | None = None
-        self._held: _Held | None = None
-        self._is_split = False
+        self._shown, self.samples = None, 0  # the state of the pictures, and the number of their points
+        self._lighting_state: LightingState | None = None
+        self._static: StaticLighting | None = None
+        self._is_split = False  # the pictures have static lighting
         self._sky, self._sky_light, self._background = None, None, None
         self.shadows: ShadowRays | LiveShadows | None = None
 
     def draw(
-        self, mirror: SceneMirror, view: View, size: tuple[int, int], shown: ShownPicture, frame_buffer, points=CENTERS
+        self, mirror: SceneMirror, view: ViewCamera, size: tuple[int, int], shown: ShownPicture, target, points=CENTERS
     ) -> None:
-        """Draw the scene into `frame_buffer`, which has `size` pixels.
+        """Draw the scene into the frame buffer `target`, which has `size` pixels.
 
         The first call shows pixels at the first of `points` (N, 2), in pixels right and up of their centers. While
         nothing changes, every further call adds the next point. The picture is their mean; `samples` is their number.
@@ -321,97 +105,96 @@ class ViewRenderer:
         Where only some lights have changed, the others are not drawn again: their light keeps the horizons that were
         chosen before. The next call without a change begins anew with all lights.
         """
-        view = view.around(_origin_of(mirror.lights, view))
-        wanted = [(shown.technique, shown.passes)]
-        if shown.mode != "single" and shown.second_picture is None:
-            wanted.append((shown.second_technique, shown.passes))
-        pictures = len(wanted)
-        wanted += shown.also
-        asked = wanted, shown.second_picture is None, shown.world
+        frame = Frame.of(mirror, view, size, shown)
         self._upload_sky(mirror)
-        traced = None
+        version = None
         if self.shadows is not None:
             self.shadows.take_news()
-            traced = self.shadows.version
-        things = mirror, mirror.lights, mirror.sky, self.shadows
-        still = things, (mirror.surfaces_version, *_key(view, size), asked, traced)
-        is_same = _same(still, self._still)
+            version = self.shadows.version
+        state = (mirror, mirror.lights, mirror.sky, self.shadows), (*frame.surfaces[1], frame.content, version)
+        is_same = same_state(state, self._shown)
         if not is_same or self._is_split:
             self.samples = 0
         if self.samples < len(points):
-            self._still = None  # until the sample is complete
-            state = (mirror, mirror.sky, self.shadows), (mirror.surfaces_version, *_key(view, size), asked)
-            shifted = view.shifted(points[self.samples], size)
-            is_drawn = self._draw_sample(mirror, shifted, size, *asked, None if is_same else state)
-            self._still, self.samples = still, self.samples + is_drawn
-        self._show([self._targets[number].texture for number in range(pictures)], view, shown, frame_buffer)
+            self._shown = None  # until the sample is complete
+            lit_by = None
+            if not is_same:
+                lit_by = (mirror, mirror.sky, self.shadows), (*frame.surfaces[1], frame.content)
+            sample = replace(frame, view=frame.view.shifted(points[self.samples], size))
+            is_drawn = self._draw_sample(sample, lit_by)
+            self._shown, self.samples = state, self.samples + is_drawn
+        count = len(frame.pictures) - len(shown.also)
+        self._show([each.texture for each in self._sums[:count]], frame.view, shown, target)
 
-    def show(self, number: int, view: View, shown: ShownPicture, frame_buffer) -> None:
+    def show(self, number: int, view: ViewCamera, shown: ShownPicture, target) -> None:
         """Draw the picture `number` of those drawn last, as `draw` does; `shown` must have its passes."""
-        self._show([self._targets[number].texture], view, shown, frame_buffer)
+        self._show([self._sums[number].texture], view, shown, target)
 
-    def _show(self, pictures, view, shown, frame_buffer) -> None:
+    def _show(self, pictures, view, shown, target) -> None:
         weights = [1.0 / self.samples] * len(pictures)
         if shown.mode != "single" and shown.second_picture is not None:
             pictures, weights = [*pictures, shown.second_picture], [*weights, 1.0]
         # The sample has bound other buffers, and Blender's own binding is unknown to Python.
-        with frame_buffer.bind():
+        with target.bind():
             self._picture.draw(pictures, weights, view, shown, self._background)
 
-    def _draw_sample(
-        self, mirror, view: View, size, wanted: list[tuple[str, str]], with_emission: bool, world: bool, state
-    ) -> bool:
-        """Add one point of every pixel to the targets of `wanted` techniques and passes; the first point replaces them.
+    def _draw_sample(self, frame: Frame, state: tuple | None) -> bool:
+        """Add one point of every pixel to the pictures; the first point replaces them.
 
         The first point may keep the light of lights that have not changed, in the same `state`; None: it may not.
         Returns False where nothing was drawn because its shadows are not ready.
         """
-        surfaces_changed = self._draw_surfaces(mirror, view, size)
-        lights_changed = self._upload_lights(mirror, view, world)
-        layers = [self._surfaces, self._glass] if mirror.has_glass else [self._surfaces]
-        for layer in layers:
-            layer.threshold = (0.5 + self.samples * GOLDEN) % 1.0
-            if surfaces_changed or lights_changed or not layer.is_ready:
-                layer.choose_horizons(mirror, view, self._lights)
-            layer.shares = None
-            if self.shadows is not None and not self.shadows.traces_lobes:
-                layer.shares = self._shares(layer, layer.lobe(0, mirror, view, self._lights), mirror, view)
-                if self.shadows.waits:
-                    return False
-        targets = [self._target(self._targets, number, size) for number in range(len(wanted))]
-        if self.samples == 0:
-            for target in targets:
-                target.clear()
-        if not mirror.has_glass:
-            self._light_surfaces(wanted, targets, (mirror, view), state)
-            self._add_emission(self._surfaces, wanted, targets, (mirror, view, size), with_emission)
+        layers = self._draw_surfaces(frame)
+        if not self._trace(layers, frame):
+            return False
+        self._sums = _cleared(self._sums, frame, self.samples == 0)
+        if len(layers) == 1:
+            self._light_surfaces(frame, self._sums, state)
+            self._add_emission(self._surfaces, frame, self._sums)
             return True
-        behind = [self._target(self._behind, number, size) for number in range(len(wanted))]
-        for target in behind:
-            target.clear()
-        self._light_surfaces(wanted, behind, (mirror, view), state)
-        self._add_emission(self._surfaces, wanted, behind, (mirror, view, size), with_emission)
-        through = self._glass.through(mirror.instances, view)
-        glass = self._glass.lobe(0, mirror, view, self._lights).position
-        for picture, target, (_, passes) in zip(behind, targets, wanted, strict=True):
-            is_seen = passes == "combined" and with_emission
-            self._veil.draw((picture.texture, through, glass, self._background), target.within(), view, is_seen)
-        self._light(self._glass, wanted, targets, (mirror, view), "ADDITIVE")
-        self._add_emission(self._glass, wanted, targets, (mirror, view, size), with_emission)
+        self._behind = _cleared(self._behind, frame, True)
+        self._light_surfaces(frame, self._behind, state)
+        self._add_emission(self._surfaces, frame, self._behind)
+        textures = {
+            "left": self._glass.through(frame.mirror.instances, frame.view),
+            "glass": self._glass.lobe(0, frame.mirror, frame.view, self._lights).position,
+            "sky": self._background,
+        }
+        for picture, target, (_, passes) in zip(self._behind, self._sums, frame.pictures, strict=True):
+            is_seen = passes == "combined" and frame.with_emission
+            self._veil.draw({"behind": picture.texture, **textures}, target.within(), frame.view, is_seen)
+        self._light(self._glass, frame, self._sums, "ADDITIVE")
+        self._add_emission(self._glass, frame, self._sums)
         return True
 
-    def _draw_surfaces(self, mirror, view: View, size) -> bool:
-        """Draw the G-buffers if anything has changed; True if so."""
-        drawn = (mirror,), (mirror.surfaces_version, *_key(view, size))
-        if _same(drawn, self._drawn):
-            return False
-        self._drawn = None
-        self._surfaces.draw(mirror, view, size)
-        if mirror.has_glass:
-            if self._glass is None:
-                self._glass, self._veil = _Layer(self._surfaces), VeilPass()
-            self._glass.draw(mirror, view, size)
-        self._drawn = drawn
+    def _draw_surfaces(self, frame: Frame) -> list[SurfaceLayer]:
+        """The layers, surfaces and glass, with G-buffers and horizons; drawn again if anything has changed."""
+        has_glass, is_drawn = frame.mirror.has_glass, same_state(frame.surfaces, self._drawn)
+        if not is_drawn:
+            self._drawn = None
+            self._surfaces.draw(frame.mirror, frame.view, frame.size)
+            if has_glass:
+                if self._glass is None:
+                    self._glass, self._veil = SurfaceLayer(self._surfaces), VeilPass()
+                self._glass.draw(frame.mirror, frame.view, frame.size)
+            self._drawn = frame.surfaces
+        is_lit = not self._upload_lights(frame)
+        layers = [self._surfaces, self._glass] if has_glass else [self._surfaces]
+        for layer in layers:
+            layer.threshold = (0.5 + self.samples * GOLDEN) % 1.0
+            if not (is_drawn and is_lit and layer.is_ready):
+                layer.choose_horizons(frame.mirror, frame.view, self._lights)
+        return layers
+
+    def _trace(self, layers: list[SurfaceLayer], frame: Frame) -> bool:
+        """Give the layers the visibility of the lights that all their lobes use; False if it is not ready."""
+        for layer in layers:
+            layer.visibility = None
+            if self.shadows is not None and not self.shadows.traces_lobes:
+                first = layer.lobe(0, frame.mirror, frame.view, self._lights)
+                layer.visibility = self._visibility(layer, first, frame)
+                if self.shadows.waits:
+                    return False
         return True
 
     def _upload_sky(self, mirror) -> None:
@@ -422,82 +205,79 @@ class ViewRenderer:
         self._sky_light = float_texture(sky_texels(sky)) if sky.sides else None
         self._background = float_texture(background_texels(sky))
 
-    def _upload_lights(self, mirror, view: View, world: bool) -> bool:
+    def _upload_lights(self, frame: Frame) -> bool:
         """Upload the lights if they or the origin of the view have changed; True if so."""
-        lights = mirror.lights if world else mirror.own_lights
-        known, sky, origin = self._uploaded
-        wanted = self._sky_light if world else None
-        if known is lights and sky is wanted and np.array_equal(origin, view.origin):
+        lights = frame.mirror.lights if frame.world else frame.mirror.lights_without_world
+        sky, origin = self._sky_light if frame.world else None, frame.view.origin
+        known, known_sky, known_origin = self._uploaded
+        if known is lights and known_sky is sky and np.array_equal(known_origin, origin):
             return False
-        is_moved = view.origin.any()
-        self._lights = upload_lights([light.moved(-view.origin) for light in lights] if is_moved else lights, wanted)
-        self._uploaded = lights, wanted, view.origin
+        self._lights = upload_lights([light.moved(-origin) for light in lights] if origin.any() else lights, sky)
+        self._uploaded = lights, sky, origin
         return True
 
-    def _shares(self, layer: _Layer, gbuffer: GBufferTextures, mirror, view: View) -> ShareGrid | None:
-        """The shares of the lights that the lobe `gbuffer` of a layer sees."""
+    def _visibility(self, layer: SurfaceLayer, gbuffer: GBufferTextures, frame: Frame) -> VisibilityGrid | None:
+        """The visibility of the lights from the lobe `gbuffer` of a layer."""
         shadows = self.shadows.of_glass if layer is self._glass else self.shadows
-        sides = () if self._lights.sky is None else mirror.sky.sides
-        whole = replace(gbuffer, smooth_normal=layer.smooth_normal)
-        return shadows.shares(whole, view, self._lights.lights, sides, self.samples)
+        sides = () if self._lights.sky is None else frame.mirror.sky.sides
+        gbuffer = replace(gbuffer, smooth_normal=layer.smooth_normal)
+        return shadows.visibility(gbuffer, frame.view, self._lights.lights, sides, self.samples)
 
-    def _light_surfaces(self, wanted, targets: list[_Target], seen: tuple, state: tuple | None) -> None:
+    def _light_surfaces(self, frame: Frame, targets: list[SampleSum], state: tuple | None) -> None:
         """Light the surfaces as `_light` does; with a `state` (see `_draw_sample`) perhaps only by what has changed."""
         layer, lights = self._surfaces, self._lights.lights
         self._is_split = False
         if state is None or self.samples > 0 or (self.shadows is not None and self.shadows.traces_lobes):
-            self._light(layer, wanted, targets, seen)
+            self._light(layer, frame, targets)
             return
-        shares = layer.shares
-        sources = () if shares is None else shares.sources or ((shares, None),) * (len(lights) + 1)
-        before, self._lit = self._lit, _Lit(state, lights, sources)
-        if self._held is None or not self._held.fits(self._lit):
-            moving, self._held = None if before is None else before.changes(self._lit), None
+        grid = layer.visibility
+        sources = () if grid is None else grid.sources or ((grid, None),) * (len(lights) + 1)
+        before, self._lighting_state = self._lighting_state, LightingState(state, lights, sources)
+        if self._static is None or not self._static.fits(self._lighting_state):
+            moving, self._static = None if before is None else before.changes(self._lighting_state), None
             if not moving or len(moving) == len(lights):
-                self._light(layer, wanted, targets, seen)
+                self._light(layer, frame, targets)
                 return
-            held = [_Target(layer.size) for _ in wanted]
-            self._light(layer, wanted, held, seen, numbers=frozenset(range(len(lights))) - moving)
-            self._held = _Held(self._lit, moving, held)
+            static = [SampleSum(layer.size) for _ in frame.pictures]
+            self._light(layer, frame, static, numbers=frozenset(range(len(lights))) - moving)
+            self._static = StaticLighting(self._lighting_state, moving, static)
         if self._copy is None:
-            self._copy = CopyPass()
-        for held, target in zip(self._held.targets, targets, strict=True):
-            self._copy.draw(held.texture, target.within())
-        self._light(layer, wanted, targets, seen, first="ADDITIVE", numbers=self._held.moving)
+            self._copy = PixelShader(glsl("copy"), ("picture",), {})
+        for static, target in zip(self._static.pictures, targets, strict=True):
+            copy(self._copy, static.texture, target.within())
+        self._light(layer, frame, targets, "ADDITIVE", self._static.moving)
         self._is_split = True
 
     def _light(
         self,
-        layer: _Layer,
-        wanted: list[tuple[str, str]],
-        targets: list[_Target],
-        seen: tuple,
+        layer: SurfaceLayer,
+        frame: Frame,
+        targets: list[SampleSum],
         first: str = "ADDITIVE_PREMULT",
         numbers: Collection[int] | None = None,
     ) -> None:
-        """Add the light of all lobes of a layer to the `targets` of `wanted` techniques and passes.
+        """Add the light of all lobes of a layer to `targets`, one a picture of the frame.
 
-        The first lobe is blended by `first`. `seen` are mirror and view. `numbers` are those of the lights, None: all.
+        The first lobe is blended by `first`. `numbers` are those of the lights, None: all.
         """
-        mirror, view = seen
-        lightings = [self._lighting_of(technique, mirror) for technique, _ in wanted]
+        lightings = [self._lighting_of(technique, frame.mirror) for technique, _ in frame.pictures]
         for lighting in lightings:
             lighting.number = self.samples
         traces = self.shadows is not None and self.shadows.traces_lobes
-        for number in range(max(mirror.most_lobes, 1)):
-            gbuffer = layer.lobe(number, mirror, view, self._lights)
-            shares = self._shares(layer, gbuffer, mirror, view) if traces else layer.shares
-            gbuffer = replace(gbuffer, shares=shares)
-            blend = first if number == 0 else "ADDITIVE"
-            for lighting, target, (_, passes) in zip(lightings, targets, wanted, strict=True):
+        for number in range(max(frame.mirror.most_lobes, 1)):
+            gbuffer = layer.lobe(number, frame.mirror, frame.view, self._lights)
+            visibility = self._visibility(layer, gbuffer, frame) if traces else layer.visibility
+            gbuffer = replace(gbuffer, visibility=visibility)
+            blend, view = first if number == 0 else "ADDITIVE", frame.view.homogeneous_eye
+            for lighting, target, (_, passes) in zip(lightings, targets, frame.pictures, strict=True):
                 buffer = target.within(gbuffer.mask)
-                lighting.draw(gbuffer, buffer, passes, view=view.homogeneous_eye, blend=blend, numbers=numbers)
+                lighting.draw(gbuffer, buffer, passes, view=view, blend=blend, numbers=numbers)
 
-    def _add_emission(self, layer: _Layer, wanted, targets, seen: tuple, with_emission: bool) -> None:
-        mirror, view, size = seen
-        for (_, passes), target in zip(wanted, targets, strict=True):
-            if with_emission and passes == "combined":
-                layer.add_emission(mirror.instances, view, size, target.within())
+    @staticmethod
+    def _add_emission(layer: SurfaceLayer, frame: Frame, targets: list[SampleSum]) -> None:
+        for (_, passes), target in zip(frame.pictures, targets, strict=True):
+            if frame.with_emission and passes == "combined":
+                layer.add_emission(frame.mirror.instances, frame.view, target.within())
 
     def _lighting_of(self, technique: str, mirror) -> LightingPass:
         if technique not in self._lighting:
@@ -507,40 +287,22 @@ class ViewRenderer:
         lighting.set_lights(self._lights)
         return lighting
 
-    @staticmethod
-    def _target(targets: list[_Target], number: int, size) -> _Target:
-        """The picture `number` of `targets`, created if needed."""
-        if len(targets) > number and (targets[number].texture.width, targets[number].texture.height) != size:
-            targets.clear()
-        while len(targets) <= number:
-            targets.append(_Target(size))
-        return targets[number]
-
     def read(self, number: int = 0) -> np.ndarray:
-        """The last picture (H, W, 4) of target `number`: the techniques, then those of `also`; row 0 at the bottom."""
-        return read_texture(self._targets[number].texture) / np.float32(self.samples)
+        """The last picture `number` (H, W, 4): the techniques, then those of `also`; row 0 at the bottom."""
+        return read_texture(self._sums[number].texture) / np.float32(self.samples)
 
     def free(self) -> None:
-        """Free all textures and shaders."""
-        for part in (*self._lighting.values(), self._surfaces, *([self._glass] if self._glass else [])):
-            part.free()
-        self._lighting.clear()
-        self._targets.clear()
-        self._behind.clear()
-        self._lights = self._glass = self._veil = None
-        self._drawn, self._uploaded = None, (None, None, None)
-        self._sky = self._sky_light = self._background = None
-        self._still, self.samples = None, 0
-        self._lit = self._held = self._copy = None
+        """Free all textures and shaders: the renderer cannot draw any more."""
+        vars(self).clear()
 
 
-def _key(view: View, size) -> tuple:
-    return view.projection.tobytes(), view.eye.tobytes(), view.is_parallel, view.origin.tobytes(), size
-
-
-def _same(new, old) -> bool:
-    """True if two states have identical objects of the scene, their first part, and equal values, their second."""
-    return old is not None and new[1] == old[1] and all(a is b for a, b in zip(new[0], old[0], strict=True))
+def _cleared(sums: list[SampleSum], frame: Frame, is_new: bool) -> list[SampleSum]:
+    """The sums for the pictures of a frame, reused if they have its size; cleared if `is_new`."""
+    sums = [each for each in sums if each.size == frame.size]
+    sums += [SampleSum(frame.size) for _ in range(len(frame.pictures) - len(sums))]
+    for each in sums if is_new else ():
+        each.clear()
+    return sums[: len(frame.pictures)]
 
 
 def common_iors(mirror: SceneMirror) -> tuple[float, ...]:

@@ -6,14 +6,11 @@ compiled for become macros LTSH_... Python generates only lines that repeat per 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass
 from itertools import combinations
-from pathlib import Path
 
-import gpu
 import numpy as np
-from gpu_extras.batch import batch_for_shader
 
 from ...cycles import horizons
 from ...emitters import facing, light_profile
@@ -33,10 +30,10 @@ from ...shading.header import (
     filled,
     float_literal,
     moment_lines,
-    source_text,
     table_sizes,
 )
-from . import sky, textures
+from . import light_texels, sky
+from .drawing import PixelShader, glsl
 
 # Limits of the half diagonal of a light, as the lobe sees it, for cheaper ways of integration.
 # TINY_LIGHT: up to it lights are sampled by triangles. There the errors of that and of the rounding of edges, which
@@ -53,36 +50,7 @@ LEAST_ALPHA, SHORT_ARC, MOST_ARCS, MOST_HALVINGS = 1e-4, 1.2, 16, 6
 SLOPE_DEGREE = 8
 # NODES_ALONG: quadrature nodes along a disk on which the cone of a spot ends, see `shading.facing`.
 NODES_ALONG = 20
-_TRIANGLE = ((-1.0, -1.0), (3.0, -1.0), (-1.0, 3.0))
 _AXES = "xyz"
-
-
-def glsl(name: str) -> str:
-    """The text of `glsl/name`.glsl."""
-    return source_text(Path(__file__).with_name("glsl") / f"{name}.glsl")
-
-
-def pixel_shader(source: str, samplers: Iterable[str], constants: Mapping[str, str], is_depth: bool = False):
-    """A shader that runs `source` for every pixel of the viewport, and the batch that draws it.
-
-    `samplers` are the names of its textures, `constants` the types of its push constants by name. Name only those that
-    the source uses: the compiler removes others, and setting them is an error. The source writes `color`, or with
-    `is_depth` gl_FragDepth.
-    """
-    info = gpu.types.GPUShaderCreateInfo()
-    info.vertex_in(0, "VEC2", "corner")
-    if is_depth:
-        info.depth_write("ANY")
-    else:
-        info.fragment_out(0, "VEC4", "color")
-    for name, kind in constants.items():
-        info.push_constant(kind, name)
-    for slot, name in enumerate(samplers):
-        info.sampler(slot, "FLOAT_2D_ARRAY" if name in ("table", "shares") else "FLOAT_2D", name)
-    info.vertex_source(glsl("triangle"))
-    info.fragment_source(source)
-    shader = gpu.shader.create_from_info(info)
-    return shader, batch_for_shader(shader, "TRIS", {"corner": _TRIANGLE})
 
 
 @dataclass(frozen=True)
@@ -95,7 +63,7 @@ class Features:
     bumped: bool  # the diffuse lobe has a second horizon
     focused: bool = False  # lights with a spread or a falloff
     turned: bool = False  # the diffuse lobe has a normal of its own
-    shadowed: bool = False  # shares of the lights that are seen
+    shadowed: bool = False  # the visibility of the lights is given
     facing: bool = False  # lights that face every point
     patterned: bool = False  # some of these have a pattern
     sky: bool = False  # the light of the world
@@ -125,7 +93,7 @@ class Features:
         if self.rough:
             names.append("rebounds")
         if self.shadowed:
-            names += ["shares", "grid_positions"]
+            names += ["visibility", "grid_positions"]
         if self.sky:
             names.append("sky")
         return tuple(names)
@@ -134,7 +102,7 @@ class Features:
     def constants(self) -> dict[str, str]:
         """The types of the push constants that the shader reads, by name."""
         needed = {
-            "place": ("IVEC4", True),
+            "draw_range": ("IVEC2", True),
             "view": ("VEC4", self.specular or self.sheen or self.rough),
             "grid": ("MAT4", self.shadowed),
             "jitter": ("VEC2", self.sky and (self.specular or self.rough)),
@@ -142,9 +110,9 @@ class Features:
         return {name: kind for name, (kind, is_read) in needed.items() if is_read}
 
 
-def lighting_shader(table: LookupTable, features: Features):
-    """The lighting shader for `table` of degree 1 to 4, and its batch."""
-    return pixel_shader(_lighting_source(table, features), features.samplers, features.constants)
+def lighting_shader(table: LookupTable, features: Features) -> PixelShader:
+    """The lighting shader for `table` of degree 1 to 4."""
+    return PixelShader(_lighting_source(table, features), features.samplers, features.constants)
 
 
 def _lighting_source(table, features) -> str:
@@ -190,8 +158,8 @@ def _lighting_constants(table) -> dict:
     return {
         **sizes,
         "BLOCKS": -(-sizes["COEFFICIENTS"] // 4),
-        **textures.constants(),
-        "IOR_STEPS": float_literal(textures.IOR_STEPS),
+        **light_texels.constants(),
+        "IOR_STEPS": float_literal(light_texels.IOR_STEPS),
         "ONE_OVER_PI": float_literal(1.0 / np.pi),
         "PI": float_literal(np.pi),
         "LEAST_ROUGHNESS": LEAST_ROUGHNESS,
@@ -199,7 +167,7 @@ def _lighting_constants(table) -> dict:
         "SHORT_ARC": float_literal(2.0 * np.cos(0.5 * SHORT_ARC)),
         "MOST_ARCS": MOST_ARCS,
         "MOST_HALVINGS": MOST_HALVINGS,
-        "QUAD_FIRST": textures.QUAD_FIRST,
+        "QUAD_FIRST": light_texels.QUAD_FIRST,
         "SKY_SIZE": sky.SIZE,
         "SKY_LEVELS": sky.LEVELS,
         "SKY_POINTS": sky.POINTS,
@@ -216,8 +184,8 @@ def _lighting_constants(table) -> dict:
         "PEAK_WEIGHT": float_literal(9.0 * (NODES_ALONG + 1) * facing.PEAK_WEIGHT),
         "FEW_LAYERS": plain.layers,
         "MANY_LAYERS": beyond.layers,
-        "FEW_NODES": textures.NODES_FIRST[plain.layers],
-        "MANY_NODES": textures.NODES_FIRST[beyond.layers],
+        "FEW_NODES": light_texels.NODES_FIRST[plain.layers],
+        "MANY_NODES": light_texels.NODES_FIRST[beyond.layers],
         "CHORDS": plain.chords,
         "SHARP_CHORDS": sharp.chords,
         "SHARPEST_CHORDS": sharpest.chords,
@@ -229,8 +197,8 @@ def _lighting_constants(table) -> dict:
         "ROUND_MARGIN": light_profile.ROUND_MARGIN,
         "FEW_CORNERS": few_corners,
         "MANY_CORNERS": many_corners,
-        "FEW_CORNERS_FIRST": textures.circle_first(few_corners),
-        "MANY_CORNERS_FIRST": textures.circle_first(many_corners),
+        "FEW_CORNERS_FIRST": light_texels.circle_first(few_corners),
+        "MANY_CORNERS_FIRST": light_texels.circle_first(many_corners),
         # Each of three horizons may add a corner.
         "MOST_CORNERS": many_corners + 3,
     }
@@ -238,7 +206,7 @@ def _lighting_constants(table) -> dict:
 
 def _level_lines() -> Iterator[str]:
     """Statements that choose the corners of a round light by its apparent width."""
-    for first, count, limit in reversed(textures.ROUND_LEVELS):
+    for first, count, limit in reversed(light_texels.ROUND_LEVELS):
         condition = "round && whole" if count < ROUND_CORNERS[0] else "round"
         if not np.isinf(limit):
             condition += f" && wide <= {float_literal(limit)}"
@@ -260,7 +228,7 @@ def _loop(way: str, body: Iterable[str]) -> Iterator[str]:
     yield f"    left = todo.{way};"
     yield "    do {"
     yield "        number = ltsh_next(left);"
-    yield "        int header = ltsh_header(place.z + number);"
+    yield "        int header = ltsh_header(draw_range.x + number);"
     yield "        ltsh_light light = ltsh_seen_light(header, point);"
     yield from (f"        {line}" for line in body)
     yield "        left &= left - 1u;"
@@ -283,7 +251,7 @@ def _loops(name: str, lobe: str, light: Callable, features: Features) -> Iterato
         factor = "factor"
         yield "float factor = ltsh_factor(number, todo);"
         if features.shadowed:
-            factor += f" * ltsh_seen(near, place.z + number).{'x' if name == 'specular' else 'y'}"
+            factor += f" * ltsh_seen(near, draw_range.x + number).{'x' if name == 'specular' else 'y'}"
         yield f"reflected *= {factor} * ltsh_light_texel(header + 4).xyz;"
         yield "radiance += left != 0u ? reflected : vec3(0.0);"
 
@@ -341,10 +309,10 @@ def _diffuse_loops(features) -> Iterator[str]:
         yield "vec3 reflected = form_factor * base.xyz;"
 
     if features.facing:
-        seen = " * ltsh_seen(near, place.z + number).y" if features.shadowed else ""
+        visibility = " * ltsh_seen(near, draw_range.x + number).y" if features.shadowed else ""
         caps = [
             "bool is_cap = (caps >> uint(number) & 1u) != 0u;",
-            f"float form_factor = factor * diffuse_of_cap(matte, light){seen};",
+            f"float form_factor = factor * diffuse_of_cap(matte, light){visibility};",
             "vec3 reflected = form_factor * base.xyz * ltsh_light_texel(header + 4).xyz;",
             "radiance += left != 0u && is_cap ? reflected : vec3(0.0);",
         ]
@@ -550,20 +518,20 @@ HORIZON_SAMPLERS = {
     CHOICE: ("smooth_normals", "geometric_normals", "excesses"),
 }
 _HORIZON_CONSTANTS = {
-    BOUNDS: {"place": "IVEC2"},
-    EXCESS: {"place": "IVEC2", "view": "VEC4"},
+    BOUNDS: {"draw_range": "IVEC2"},
+    EXCESS: {"draw_range": "IVEC2", "view": "VEC4"},
     CHOICE: {"threshold": "FLOAT"},
 }
 HORIZON_CORNERS = 32  # of round lights, as in `AreaLight.polygon`
 
 
-def horizon_shader(step: str):
-    """The shader of one step, and its batch."""
+def horizon_shader(step: str) -> PixelShader:
+    """The shader of one step."""
     values = {
         step.upper(): 1,
-        **textures.constants(),
-        "QUAD_FIRST": textures.QUAD_FIRST,
-        "ROUND_FIRST": textures.circle_first(HORIZON_CORNERS),
+        **light_texels.constants(),
+        "QUAD_FIRST": light_texels.QUAD_FIRST,
+        "ROUND_FIRST": light_texels.circle_first(HORIZON_CORNERS),
         "ROUND_CORNERS": HORIZON_CORNERS,
         "SMALLEST_ANGLE": float_literal(horizons.SMALLEST_ANGLE),
         "SMALLEST_ALPHA": float_literal(horizons.SMALLEST_ALPHA),
@@ -576,6 +544,6 @@ def horizon_shader(step: str):
         "PI": float_literal(np.pi),
     }
     lights = "" if step == CHOICE else glsl("light_texels")
-    return pixel_shader(
+    return PixelShader(
         definitions(values) + lights + glsl("horizons"), HORIZON_SAMPLERS[step], _HORIZON_CONSTANTS[step]
     )

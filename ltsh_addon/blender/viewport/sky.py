@@ -6,28 +6,18 @@ the inner square, which is turned by 45 degrees.
 
 from __future__ import annotations
 
-import threading
-import time
-from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
-import bpy
 import numpy as np
 
 from ...cycles.environment import CUBE, SkyPicture, sky_lights
-from ...files import temporary_folder
-from ...scene import AreaLight, error_line
-from ..lights.world import light_of_world
-from ..process import client
+from ...scene import AreaLight
 
 # Texels of a side of maps. SIZE, LEAST_SIZE: the largest and the smallest map of the light. IRRADIANCE_SIZE: the map of
 # the irradiance. IRRADIANCE_SOURCE: the map of the light from which the irradiance is computed.
 SIZE, LEAST_SIZE, IRRADIANCE_SIZE, IRRADIANCE_SOURCE = 256, 4, 32, 64
 LEVELS = (SIZE // LEAST_SIZE).bit_length()
 POINTS = 16  # directions in which a lobe samples the map
-# REST_SECONDS: how long worlds and lights must stay unchanged before Cycles looks at them.
-REST_SECONDS = 0.3
 MOST_PATCHES = 1536  # of all sides together, for shadows
 # CUBE_SIZE: pixels of a side of the cube's pictures, enough for the light. BACKGROUND_SIZE: of the largest background.
 CUBE_SIZE, BACKGROUND_SIZE = 128, 2048
@@ -82,14 +72,14 @@ def _summed(values: np.ndarray) -> np.ndarray:
 
 def directions(size: int) -> np.ndarray:
     """Unit directions (N, N, 3) of the texels of a map with N = `size` texels along each side, row 0 at v = -1."""
-    place = (np.arange(size) + 0.5) * (2.0 / size) - 1.0
-    u, v = np.meshgrid(place, place)
+    coordinate = (np.arange(size) + 0.5) * (2.0 / size) - 1.0
+    u, v = np.meshgrid(coordinate, coordinate)
     height = 1.0 - np.abs(u) - np.abs(v)
     below = height < 0.0
     x = np.where(below, (1.0 - np.abs(v)) * np.where(u < 0.0, -1.0, 1.0), u)
     y = np.where(below, (1.0 - np.abs(u)) * np.where(v < 0.0, -1.0, 1.0), v)
-    found = np.stack([x, y, height], axis=-1)
-    return found / np.linalg.norm(found, axis=-1, keepdims=True)
+    toward = np.stack([x, y, height], axis=-1)
+    return toward / np.linalg.norm(toward, axis=-1, keepdims=True)
 
 
 def solid_angles(size: int) -> np.ndarray:
@@ -100,26 +90,28 @@ def solid_angles(size: int) -> np.ndarray:
 def unfolded(pictures: list[SkyPicture], size: int) -> np.ndarray:
     """The map (size, size, 3) interpolated from the six pictures of a cube."""
     toward = directions(size).reshape(-1, 3)
-    found = np.zeros((len(toward), 3))
+    radiance = np.zeros((len(toward), 3))
     side = np.argmax(np.stack([toward @ picture.ahead for picture in pictures]), axis=0)
     for number, picture in enumerate(pictures):
-        own = np.flatnonzero(side == number)
-        along = toward[own] @ picture.ahead
+        texels = np.flatnonzero(side == number)
+        along = toward[texels] @ picture.ahead
         count = len(picture.radiance)
         column, row = (
-            np.clip((sign * (toward[own] @ axis) / (axis @ axis) / along + 1.0) * 0.5 * count - 0.5, 0.0, count - 1.0)
+            np.clip(
+                (sign * (toward[texels] @ axis) / (axis @ axis) / along + 1.0) * 0.5 * count - 0.5, 0.0, count - 1.0
+            )
             for sign, axis in ((1.0, picture.right), (-1.0, picture.up))
         )
-        found[own] = _interpolated(picture.radiance, row, column)
-    return found.reshape(size, size, 3)
+        radiance[texels] = _interpolated(picture.radiance, row, column)
+    return radiance.reshape(size, size, 3)
 
 
 def _interpolated(values: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
-    top, left = row.astype(int), column.astype(int)
-    down, right = np.minimum(top + 1, len(values) - 1), np.minimum(left + 1, values.shape[1] - 1)
-    y, x = (row - top)[:, None], (column - left)[:, None]
-    above = (1.0 - x) * values[top, left] + x * values[top, right]
-    below = (1.0 - x) * values[down, left] + x * values[down, right]
+    top, west = row.astype(int), column.astype(int)
+    down, east = np.minimum(top + 1, len(values) - 1), np.minimum(west + 1, values.shape[1] - 1)
+    y, x = (row - top)[:, None], (column - west)[:, None]
+    above = (1.0 - x) * values[top, west] + x * values[top, east]
+    below = (1.0 - x) * values[down, west] + x * values[down, east]
     return (1.0 - y) * above + y * below
 
 
@@ -183,79 +175,3 @@ def background_texels(sky: ShownSky) -> np.ndarray:
     """Texels (N + 2, N + 2, 4) of the background, with a border."""
     wide = with_border(sky.background)
     return np.concatenate([wide, np.ones((*wide.shape[:2], 1))], axis=-1)
-
-
-def written(path: Path, blocks: list) -> list[Path]:
-    """Write data-blocks into the .blend `path`; returns the .blend to load each from, for linked ones their library."""
-    own = {block for block in blocks if block.library is None}
-    bpy.data.libraries.write(str(path), own, path_remap="ABSOLUTE", fake_user=True)
-    return [path if block in own else Path(bpy.path.abspath(block.library.filepath)) for block in blocks]
-
-
-class LiveWorld:
-    """The world as Cycles sees it, for a window: a second Blender renders it while the view goes on."""
-
-    def __init__(self):
-        self._wanted, self._changed = "", 0.0
-        self._of, self._sky = "", None  # the world that was looked at last, and what was found
-        self._thread: threading.Thread | None = None
-        self._outcome: tuple[ShownSky, list[str]] | Exception | None = None
-        self._stopped = threading.Event()
-
-    def stop(self) -> None:
-        """Cancel the work: nobody waits for it any more."""
-        self._wanted = ""
-        self._stopped.set()
-
-    def look(self, world) -> ShownSky | None:
-        """Request a look at a new or changed `world`. Returns its last result; None where there is none."""
-        self._wanted, self._changed = world.name_full, time.monotonic()
-        return self._sky if self._of == self._wanted else None
-
-    @property
-    def is_busy(self) -> bool:
-        """True while a result is to come."""
-        return bool(self._wanted) or self._thread is not None
-
-    def step(self, frame: int) -> tuple[ShownSky | None, list[str]] | None:
-        """Do the next step, in the main thread. Returns the sky that was found and notes about it; None: no news."""
-        if self._thread is not None:
-            return None if self._thread.is_alive() else self._take()
-        if self._wanted and time.monotonic() - self._changed > REST_SECONDS:
-            self._begin(frame)
-        return None
-
-    def _take(self):
-        self._thread, outcome = None, self._outcome
-        if isinstance(outcome, Exception):
-            return None, [f"{self._of}: {error_line(outcome)}"]
-        if self._wanted == self._of:  # it has changed again
-            return None
-        self._sky = outcome[0]
-        return outcome
-
-    def _begin(self, frame: int) -> None:
-        self._of, self._wanted = self._wanted, ""
-        world = next((one for one in bpy.data.worlds if one.name_full == self._of), None)
-        if world is None:
-            return
-        stack = ExitStack()
-        folder = stack.enter_context(temporary_folder())
-        name, like, stopped = world.name, light_of_world(world), self._stopped
-        try:
-            path = written(folder / "world.blend", [world])[0]
-        except BaseException:
-            stack.close()
-            raise
-
-        def work() -> None:
-            try:
-                with stack:
-                    found = client.look_at_world(path, name, frame, folder, lambda *_: not stopped.is_set())
-                light = [SkyPicture(*axes, one) for axes, one in zip(CUBE, found.light, strict=False)]
-                self._outcome = varied_sky(like, light, found.lights, found.background), found.warnings
-            except Exception as error:
-                self._outcome = error
-
-        self._thread = threading.Thread(target=work, name="LTSH world", daemon=True)
-        self._thread.start()

@@ -11,24 +11,23 @@ import bpy
 import gpu
 import numpy as np
 
-from ...cycles.environment import SkyPicture
 from ...files import save_array
-from ...scene import AreaLight, SceneError, error_line, listed
+from ...scene import SceneError, error_line, listed
 from .. import render_settings
-from ..extract.occluders import collect_occluders
 from ..extract.pixels import no_light, open_scene
-from ..lights.emission import ObjectFacts, open_studio
-from ..lights.textures import UnseenLight, seen_factor
-from ..lights.world import background_pictures, blocks_nothing, light_of_world, light_pictures
+from ..lights.world import light_of_world
 from ..materials.looks import world_radiance
-from ..process.client import GRAPHICS, LAMPS, VIEW_PASSES, VIEW_PNG
+from ..process.view import GRAPHICS, VIEW_PASSES, VIEW_PNG, ViewJob
 from ..render_settings import cycles_setting
-from .mirror import NOT_RESOLVED, SceneMirror, patterns_of
-from .renderer import CENTERS, ShownPicture, ViewRenderer
-from .shadows import ShadowRays, too_many
-from .sky import ShownSky, background_of, coarse, varied_sky
-from .surfaces import View
-from .textures import read_texture
+from .camera import ViewCamera
+from .drawing import read_texture
+from .lights import NOT_RESOLVED, patterns_of
+from .live_cycles import rendered_world
+from .mirror import SceneMirror
+from .pictures import ShownPicture
+from .renderer import CENTERS, ViewRenderer
+from .shadow_rays import ShadowRays, too_many, view_occluders
+from .sky import ShownSky, varied_sky
 
 TIMED = 3  # redraws whose median time is reported
 # FEWEST_RAYS: a point of a pixel takes at least so many rays per light, however many points share those of the pixel.
@@ -37,15 +36,15 @@ FEWEST_RAYS = 32
 _renderer: list[ViewRenderer] = []
 
 
-def draw_view(job: dict, folder: Path, progress) -> dict:
-    """Do the `job` (see `client.ViewJob`) and write arrays and a PNG into `folder`; returns the manifest."""
+def draw_view(job: ViewJob, folder: Path, progress) -> dict:
+    """Do the `job` and write arrays and a PNG into `folder`; returns the manifest."""
     started, warnings = time.monotonic(), []
     progress("open scene", 0.0)
-    open_scene(Path(job["scene"]), warnings, job["scripts"])
+    open_scene(Path(job.scene), warnings, job.scripts)
     scene = bpy.context.scene
-    render_settings.go_to_frame(scene, job["frame"])
-    camera = render_settings.choose_camera(scene, job["camera"])
-    size = render_settings.set_resolution(scene, job["width"], job["height"])
+    render_settings.go_to_frame(scene, job.frame)
+    camera = render_settings.choose_camera(scene, job.camera)
+    size = render_settings.set_resolution(scene, job.width, job.height)
     warnings += _not_shown(scene, camera)
     sky = _sky(scene, warnings)
     with bpy.context.temp_override(scene=scene, view_layer=_layer(scene)):
@@ -138,14 +137,14 @@ def _not_shown(scene, camera) -> list[str]:
         f"depth of field of camera {camera.name!r}": camera.data.dof.use_dof,
         "the render region": scene.render.use_border,
     }
-    found = [f"{name} is not shown in views" for name, is_asked in asked.items() if is_asked]
+    notes = [f"{name} is not shown in views" for name, is_asked in asked.items() if is_asked]
     others = sorted(ob.name for ob in _layer(scene).objects if not ob.hide_render and _differs_in_renders(ob))
     if others:
-        found.append(f"views and renders have other modifiers or levels of subdivision of {listed(others, 4, ', ')}")
+        notes.append(f"views and renders have other modifiers or levels of subdivision of {listed(others, 4, ', ')}")
     used = [layer.name for layer in scene.view_layers if layer.use]
     if len(used) > 1:
-        found.append(f"scene {scene.name!r}: only view layer {used[0]!r} of {len(used)} is shown")
-    return found
+        notes.append(f"scene {scene.name!r}: only view layer {used[0]!r} of {len(used)} is shown")
+    return notes
 
 
 def _differs_in_renders(ob) -> bool:
@@ -163,61 +162,17 @@ def _sky(scene, warnings: list[str]) -> ShownSky | None:
     world = _layer(scene).world_override or scene.world
     if world_radiance(world)[1]:
         return None
-    return varied_sky(light_of_world(world), *look_at_world(scene, world, warnings.append))
-
-
-def look_at_world(scene, world, warn: Callable) -> tuple[list[SkyPicture], list[AreaLight], np.ndarray]:
-    """The `world` as Cycles renders it: pictures of its light ([] where it is dark), the small bright lights in it, and
-    its background (N, N, 3). `scene` is left as it was."""
-    like, light, lights = light_of_world(world), [], []
-    if like is not None:
-        light, lights = light_pictures(scene, world, like, warn)
-    return [coarse(picture) for picture in light], lights, background_of(background_pictures(scene, world, warn))
-
-
-def show_world(job: dict, folder: Path) -> dict:
-    """Do the `job` (see `client.look_at_world`): writes pictures into `folder`, returns lights and warnings."""
-    warnings: list[str] = []
-    bpy.ops.wm.read_factory_settings(use_empty=True)
-    scene = bpy.context.scene
-    with bpy.data.libraries.load(job["path"]) as (_, wanted):
-        wanted.worlds = [job["world"]]
-    (scene.world,) = wanted.worlds
-    scene.frame_set(job["frame"])
-    light, lights, background = look_at_world(scene, scene.world, warnings.append)
-    save_array(folder / "light.npy", np.array([picture.radiance for picture in light], np.float32))
-    save_array(folder / "background.npy", background.astype(np.float32))
-    return {"lights": [one.record() for one in lights], "warnings": warnings}
-
-
-def show_lamps(job: dict, folder: Path, progress: Callable) -> dict:
-    """Do the `job` (see `client.look_at_lamps`): writes the factors of each light's nodes into `folder`."""
-    bpy.ops.wm.read_factory_settings(use_empty=True)
-    scene, count = bpy.context.scene, len(job["lamps"])
-    scene.frame_set(job["frame"])
-    for number, lamp in enumerate(job["lamps"]):
-        with bpy.data.libraries.load(lamp["path"]) as (there, wanted):
-            if lamp["name"] not in there.lights:
-                raise SceneError(f"{lamp['path']}: has no light {lamp['name']!r}")
-            wanted.lights = [lamp["name"]]
-        facts = ObjectFacts(**lamp["facts"])
-        source = UnseenLight(wanted.lights[0], np.array(lamp["matrix"]), facts=facts, **lamp["flags"])
-        with open_studio(scene) as studio:
-            found = seen_factor(source, studio)
-        save_array(folder / f"{number}.npy", found.factor.astype(np.float32))
-        save_array(folder / f"{number}_lost.npy", np.array(found.lost))
-        progress(LAMPS, (number + 1) / count)
-    return {}
+    return varied_sky(light_of_world(world), *rendered_world(scene, world, warnings.append))
 
 
 def _layer(scene):
     return next((layer for layer in scene.view_layers if layer.use), scene.view_layers[0])
 
 
-def _draw(job: dict, seen: tuple, size: tuple[int, int], progress) -> dict:
+def _draw(job: ViewJob, read: tuple, size: tuple[int, int], progress) -> dict:
     """Pictures (H, W, 4), row 0 on top, of all techniques and passes, and the facts of the manifest about them."""
     progress("draw", 0.0)
-    scene, camera, sky, patterns = seen
+    scene, camera, sky, patterns = read
     with bpy.context.temp_override(scene=scene, view_layer=_layer(scene)):
         depsgraph = bpy.context.evaluated_depsgraph_get()
     mirror = SceneMirror(lambda world: sky, lambda data, source: patterns.get(source.key, NOT_RESOLVED))
@@ -225,20 +180,18 @@ def _draw(job: dict, seen: tuple, size: tuple[int, int], progress) -> dict:
     if not mirror.lights and not mirror.sky.sides:
         raise no_light(scene, mirror.notes)
     notes, shadows = list(mirror.notes), None
-    if job["shadows"] == "on":
+    if job.shadows == "on":
         problem = too_many(len(mirror.lights), size)
-        override = depsgraph.view_layer_eval.material_override
-        rays = max(min(FEWEST_RAYS, job["shadow_rays"]), job["shadow_rays"] // job["refine"])
+        rays = max(min(FEWEST_RAYS, job.shadow_rays), job.shadow_rays // job.refine)
         if problem:
             notes.append(problem)
         else:
-            occluders = blocks_nothing(collect_occluders(depsgraph, override, notes.append), scene.world)
-            shadows = ShadowRays(occluders, rays)
+            shadows = ShadowRays(view_occluders(depsgraph, notes.append), rays)
     canvas = _Canvas(mirror, view_of_camera(camera.evaluated_get(depsgraph), depsgraph, size), size)
-    points = render_settings.sub_pixel_offsets(scene, job["refine"])
-    first, *others = ((technique, name) for technique in job["techniques"] for name in VIEW_PASSES)
+    points = render_settings.sub_pixel_offsets(scene, job.refine)
+    first, *others = ((technique, name) for technique in job.techniques for name in VIEW_PASSES)
     try:
-        seconds = [canvas.seconds_of_redraws(_shown(scene, technique)) for technique in job["techniques"]]
+        seconds = [canvas.seconds_of_redraws(_shown(scene, technique)) for technique in job.techniques]
         shown = replace(_shown(scene, first[0]), also=tuple(others))
         pictures = canvas.draw(shown, points, shadows, lambda share: progress("draw", share))
     except ValueError as error:  # a table that the card does not take
@@ -263,12 +216,12 @@ def _facts(shadows: ShadowRays, samples: int) -> dict:
     return {"rays": shadows.traced, "noise": noise, "tracer": shadows.description, "seconds": shadows.seconds}
 
 
-def view_of_camera(camera, depsgraph, size: tuple[int, int]) -> View:
+def view_of_camera(camera, depsgraph, size: tuple[int, int]) -> ViewCamera:
     """The view of the evaluated object `camera` in a picture of `size`."""
     render = depsgraph.scene_eval.render
     aspect = {"scale_x": render.pixel_aspect_x, "scale_y": render.pixel_aspect_y}
     window = camera.calc_matrix_camera(depsgraph, x=size[0], y=size[1], **aspect)
-    return View.of(camera.matrix_world.normalized().inverted(), window, camera.data.type == "ORTHO")
+    return ViewCamera.of(camera.matrix_world.normalized().inverted(), window, camera.data.type == "ORTHO")
 
 
 def _shown(scene, technique: str) -> ShownPicture:
@@ -287,7 +240,7 @@ def _shown(scene, technique: str) -> ShownPicture:
 class _Canvas:
     """A floating-point picture that a view is drawn into; needs an active GPU context."""
 
-    def __init__(self, mirror: SceneMirror, view: View, size: tuple[int, int]):
+    def __init__(self, mirror: SceneMirror, view: ViewCamera, size: tuple[int, int]):
         self._mirror, self._view, self._size = mirror, view, size
         self._renderer = _renderer[0] if _renderer else ViewRenderer()
         self._texture = gpu.types.GPUTexture(size, format="RGBA32F")

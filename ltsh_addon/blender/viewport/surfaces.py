@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import bpy
 import gpu
 import numpy as np
@@ -11,19 +9,12 @@ from mathutils import Matrix
 
 from ...shading.header import filled
 from ..materials.looks import IMAGE_SLOTS, is_missing
+from .camera import ViewCamera
+from .drawing import PixelShader, drawing, float_table, float_texture, glsl, uniform_buffer
+from .gbuffer import GBufferTextures
 from .mirror import ShownInstance, ShownLook
-from .shaders import glsl, pixel_shader, slope_text
-from .textures import (
-    DEFINES,
-    LOOK_SIZE,
-    GBufferTextures,
-    albedo_table,
-    blend_table,
-    float_table,
-    float_texture,
-    sheen_table,
-    uniform_buffer,
-)
+from .shaders import slope_text
+from .textures import DEFINES, LOOK_SIZE, albedo_table, blend_table, sheen_table
 
 # Outputs of the surface shader, in groups that are drawn into at once. A group has at most six textures.
 SURFACES = ("position", "normal", "base", "f0", "f90", "dielectric")
@@ -40,55 +31,6 @@ NORMAL_MAPS_BEND_UNIT_NORMALS = bpy.app.version >= (5, 0, 0)
 MISSING_COLOR = (1.0, 0.0, 1.0, 1.0)  # of images that are not found, as in Cycles
 
 
-@dataclass(frozen=True)
-class View:
-    """The camera of a picture. All positions that are drawn are relative to `origin`."""
-
-    projection: np.ndarray  # (4, 4) to clip space
-    eye: np.ndarray  # (3,) position of the eye, or in parallel views the unit direction toward it
-    is_parallel: bool
-    origin: np.ndarray = field(default_factory=lambda: np.zeros(3))  # (3,) in the world
-
-    @classmethod
-    def of(cls, view_matrix: Matrix, window_matrix: Matrix, is_parallel: bool) -> View:
-        """The view of a region with these matrices."""
-        to_view = np.array(view_matrix, np.float64)
-        to_world = np.linalg.inv(to_view)
-        eye = to_world[:3, 2] / np.linalg.norm(to_world[:3, 2]) if is_parallel else to_world[:3, 3]
-        return cls(np.array(window_matrix, np.float64) @ to_view, eye, is_parallel)
-
-    def around(self, origin: np.ndarray) -> View:
-        """The same view of the world, with positions relative to `origin` (3,)."""
-        to_world = np.eye(4)
-        to_world[:3, 3] = origin - self.origin
-        eye = self.eye if self.is_parallel else self.eye - to_world[:3, 3]
-        return View(self.projection @ to_world, eye, self.is_parallel, origin)
-
-    def shifted(self, offset: np.ndarray, size: tuple[int, int]) -> View:
-        """The same view, in which pixels show the point `offset` (2,) pixels right and up of their centers.
-
-        `size` is that of the picture in pixels.
-        """
-        shift = np.eye(4)
-        shift[:2, 3] = -2.0 * np.asarray(offset) / size
-        return View(shift @ self.projection, self.eye, self.is_parallel, self.origin)
-
-    @property
-    def rays(self) -> np.ndarray:
-        """(3, 3): the change of the eye's ray from the center of the picture to its right end, the change to its upper
-        end, and the ray of the center. Rays may have any length."""
-        if self.is_parallel:
-            return np.stack([np.zeros(3), np.zeros(3), -self.eye])
-        back = np.linalg.inv(self.projection)
-        found = (back[:3] - self.eye[:, None] * back[3]).T
-        return np.stack([found[0], found[1], found[2] + found[3]]) / np.linalg.norm(found[2] + found[3])
-
-    @property
-    def homogeneous_eye(self) -> tuple[float, ...]:
-        """The eye's position and 1, or the direction toward it and 0."""
-        return (*self.eye, 0.0 if self.is_parallel else 1.0)
-
-
 class SurfacePass:
     """Shaders and textures of one view's G-buffer; needs an active GPU context.
 
@@ -101,7 +43,7 @@ class SurfacePass:
         self._through: tuple | None = None
         if before is not None:
             self._shaders, self._tables = before._shaders, before._tables
-            self._nothing, self._missing = before._nothing, before._missing
+            self._black_image, self._missing_image = before._black_image, before._missing_image
             self._mask_shader = before._mask_shader
             self._size = self._depth = None
             self._targets: dict = {}
@@ -109,13 +51,13 @@ class SurfacePass:
         self._shaders = {(outputs, False): _shader(outputs) for outputs in (SURFACES, NORMALS, EMISSION)}
         self._tables = {"albedo_table": float_table(albedo_table()), "blend_table": float_table(blend_table())}
         self._tables["sheen_table"] = float_texture(sheen_table())
-        self._mask_shader = pixel_shader(glsl("mask"), ("positions",), {}, is_depth=True)
-        self._nothing = float_texture(np.zeros((1, 1, 4)))
-        self._missing = float_texture(np.array(MISSING_COLOR).reshape(1, 1, 4))
+        self._mask_shader = PixelShader(glsl("mask"), ("positions",), {}, is_depth=True)
+        self._black_image = float_texture(np.zeros((1, 1, 4)))
+        self._missing_image = float_texture(np.array(MISSING_COLOR).reshape(1, 1, 4))
         self._size = self._depth = None
         self._targets: dict = {}
 
-    def draw(self, instances: list[ShownInstance], view: View, size: tuple[int, int]) -> GBufferTextures:
+    def draw(self, instances: list[ShownInstance], view: ViewCamera, size: tuple[int, int]) -> GBufferTextures:
         """The G-buffer of `instances`, `size` (width, height) in pixels; valid until the next call.
 
         It has further normals if any surface is smooth or bent.
@@ -127,7 +69,7 @@ class SurfacePass:
             self._depth, self._targets = self._before._depth, {}
         return self._gbuffer(0, instances, view)
 
-    def draw_lobe(self, number: int, instances: list[ShownInstance], view: View) -> GBufferTextures:
+    def draw_lobe(self, number: int, instances: list[ShownInstance], view: ViewCamera) -> GBufferTextures:
         """The G-buffer of the lobes `number`, from 1 on, of the surfaces drawn last; valid until the next call.
 
         Pixels whose material has fewer lobes have no surface.
@@ -135,13 +77,13 @@ class SurfacePass:
         having = [instance for instance in instances if any(len(look.lobes) > number for look in instance.looks)]
         return self._gbuffer(number, having, view)
 
-    def add_emission(self, instances: list[ShownInstance], view: View, size: tuple[int, int], frame_buffer) -> None:
+    def add_emission(self, instances: list[ShownInstance], view: ViewCamera, frame_buffer) -> None:
         """Add the emission of the surfaces drawn last to `frame_buffer`."""
         shining = [instance for instance in instances if any(map(_shines, instance.looks))]
         if shining:
             self._add(EMISSION, [(0, shining)], view, frame_buffer)
 
-    def through(self, instances: list[ShownInstance], view: View) -> gpu.types.GPUTexture:
+    def through(self, instances: list[ShownInstance], view: ViewCamera) -> gpu.types.GPUTexture:
         """The texture (RGB) of the share of light from behind that the surfaces drawn last let through."""
         if (THROUGH, False) not in self._shaders:
             self._shaders[THROUGH, False] = _shader(THROUGH)
@@ -154,33 +96,23 @@ class SurfacePass:
         self._add(THROUGH, [(number, instances) for number in range(most)], view, self._through[1])
         return self._through[0]
 
-    def _add(self, outputs, parts, view: View, frame_buffer) -> None:
+    def _add(self, outputs, parts, view: ViewCamera, frame_buffer) -> None:
         """Add `outputs` of the lobes (number, instances) of `parts` to `frame_buffer`, on the surfaces drawn last."""
-        with frame_buffer.bind():
-            gpu.state.viewport_set(0, 0, *self._size)
-            gpu.state.depth_test_set("NONE")
-            gpu.state.blend_set("ADDITIVE_PREMULT")
-            try:
-                for number, instances in parts:
-                    self._draw_instances(outputs, instances, view, number)
-            finally:
-                gpu.state.blend_set("NONE")
-
-    def free(self) -> None:
-        """Free all textures and shaders."""
-        self._targets, self._tables, self._shaders = {}, {}, {}
-        self._size = self._nothing = self._missing = self._depth = self._through = self._mask_shader = None
+        with drawing(frame_buffer, (0, 0, *self._size), "ADDITIVE_PREMULT"):
+            for number, instances in parts:
+                self._draw_instances(outputs, instances, view, number)
 
     def _gbuffer(self, number, instances, view) -> GBufferTextures:
         textures = self._draw_into(SURFACES, instances, view, number)
         if has_normals(instances):
             textures = textures | self._draw_into(NORMALS, instances, view, number)
-        if any(_is_brushed(look, number) for instance in instances for look in instance.looks):
+        every = [look for instance in instances for look in instance.looks]
+        drawn = [lobe.look for look in every for lobe in look.lobes[number : number + 1]]
+        if any(lobe.brush is not None for lobe in drawn):
             textures = textures | self._draw_into(TANGENTS, instances, view, number)
-        if any(_is_rough(look, number) for instance in instances for look in instance.looks):
+        if any(lobe.is_rough or lobe.kind == "velvet" for lobe in drawn):
             textures = textures | self._draw_into(REBOUNDS, instances, view, number)
-        shown = (look for instance in instances for look in instance.looks if self._draws(look))
-        lobes = [lobe.look for look in shown for lobe in look.lobes[number:]]
+        lobes = [lobe.look for look in every if self._draws(look) for lobe in look.lobes[number:]]
         marks = {
             "has_sheen": any(look.kind == "sheen" for look in lobes),
             "has_velvet": any(look.kind == "velvet" for look in lobes),
@@ -194,18 +126,9 @@ class SurfacePass:
             texture = gpu.types.GPUTexture(self._size, format="DEPTH_COMPONENT32F")
             self._targets[MASK, is_further] = texture, gpu.types.GPUFrameBuffer(depth_slot=texture)
         texture, buffer = self._targets[MASK, is_further]
-        shader, batch = self._mask_shader
-        with buffer.bind():
-            gpu.state.viewport_set(0, 0, *self._size)
-            gpu.state.depth_test_set("ALWAYS")
-            gpu.state.depth_mask_set(True)
-            try:
-                shader.bind()
-                shader.uniform_sampler("positions", position)
-                batch.draw(shader)
-            finally:
-                gpu.state.depth_test_set("NONE")
-                gpu.state.depth_mask_set(False)
+        with drawing(buffer, (0, 0, *self._size), depth="ALWAYS", writes_depth=True):
+            self._mask_shader.bind({"positions": position})
+            self._mask_shader.draw()
         return texture
 
     def _target(self, outputs, is_further: bool):
@@ -217,28 +140,21 @@ class SurfacePass:
             self._targets[outputs, is_further] = textures, buffer
         return self._targets[outputs, is_further]
 
-    def _draw_into(self, outputs, instances, view: View, number: int) -> dict:
+    def _draw_into(self, outputs, instances, view: ViewCamera, number: int) -> dict:
         """Draw the lobes `number`; returns the textures by name."""
         is_further = number > 0
         textures, buffer = self._target(outputs, is_further)
         if (outputs, is_further) not in self._shaders:
             self._shaders[outputs, is_further] = _shader(outputs, is_further)
-        with buffer.bind():
-            gpu.state.viewport_set(0, 0, *self._size)
+        depth = "NONE" if is_further else "LESS_EQUAL"
+        with drawing(buffer, (0, 0, *self._size), depth=depth, writes_depth=not is_further):
             # Only the position tells where there is a surface. The others are cleared because old texels may be NaN.
             buffer.clear(color=(0.0, 0.0, 0.0, 0.0), **({} if is_further or self._is_glass else {"depth": 1.0}))
-            gpu.state.blend_set("NONE")
-            gpu.state.depth_test_set("NONE" if is_further else "LESS_EQUAL")
-            gpu.state.depth_mask_set(not is_further)
             gpu.state.face_culling_set("NONE")
-            try:
-                self._draw_instances(outputs, instances, view, number)
-            finally:
-                gpu.state.depth_test_set("NONE")
-                gpu.state.depth_mask_set(False)
+            self._draw_instances(outputs, instances, view, number)
         return textures
 
-    def _draw_instances(self, outputs, instances, view: View, number: int) -> None:
+    def _draw_instances(self, outputs, instances, view: ViewCamera, number: int) -> None:
         is_emission, is_later = outputs == EMISSION, number > 0 or outputs in _ADDED
         shader = self._shaders[outputs, number > 0 and outputs not in _ADDED]
         shader.bind()
@@ -272,11 +188,11 @@ class SurfacePass:
     def _bind_images(self, shader, shown: ShownLook, slots: tuple[str, ...]) -> None:
         if shown.textures is None:
             shown.textures = {
-                name: self._missing if is_missing(use.image) else gpu.texture.from_image(use.image)
+                name: self._missing_image if is_missing(use.image) else gpu.texture.from_image(use.image)
                 for name, use in shown.look.images.items()
             }
         for name in slots:
-            shader.uniform_sampler(f"{name}_image", shown.textures.get(name, self._nothing))
+            shader.uniform_sampler(f"{name}_image", shown.textures.get(name, self._black_image))
 
 
 def _shines(shown: ShownLook) -> bool:
@@ -291,16 +207,6 @@ def has_normals(instances: list[ShownInstance]) -> bool:
 def has_bent_lobes(instances: list[ShownInstance]) -> bool:
     """True if any diffuse lobe does not end at the horizon of its own normal."""
     return any(_bends(lobe) for instance in instances for look in instance.looks for lobe in look.lobes)
-
-
-def _is_brushed(shown: ShownLook, number: int) -> bool:
-    """True if the lobe `number` is anisotropic."""
-    return any(lobe.look.brush is not None for lobe in shown.lobes[number : number + 1])
-
-
-def _is_rough(shown: ShownLook, number: int) -> bool:
-    """True if the diffuse part of the lobe `number` is rough, or velvet."""
-    return any(lobe.look.is_rough or lobe.look.kind == "velvet" for lobe in shown.lobes[number : number + 1])
 
 
 def _bends(shown: ShownLook) -> bool:

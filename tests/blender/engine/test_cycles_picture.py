@@ -9,7 +9,14 @@ import scene_parts as parts
 from bpy_extras.object_utils import world_to_camera_view
 from mathutils import Vector
 
-from ltsh_addon.blender.engine.view import Reference, averaged, camera_frame, content, is_outdated, reference_of
+from ltsh_addon.blender.engine.cycles_picture import (
+    Reference,
+    averaged,
+    camera_frame,
+    content,
+    is_outdated,
+    reference_of,
+)
 from ltsh_addon.imaging.exr import write_channels
 from ltsh_addon.imaging.report import write_index
 from ltsh_addon.scene import AreaLight

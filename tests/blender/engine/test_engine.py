@@ -15,15 +15,16 @@ from job_window import image_pixels
 
 import ltsh_addon
 from ltsh_addon import shading
+from ltsh_addon.blender.engine import final_picture, redraws, view
 from ltsh_addon.blender.engine import render as render_module
-from ltsh_addon.blender.engine import view
 from ltsh_addon.blender.lights.textures import ShownTextures
 from ltsh_addon.blender.materials import looks
-from ltsh_addon.blender.process import client
+from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels
 from ltsh_addon.blender.render_settings import pass_names
 from ltsh_addon.blender.ui import results
 from ltsh_addon.blender.ui.job import STARTING, Plan
-from ltsh_addon.blender.viewport.mirror import view_lights
+from ltsh_addon.blender.ui.overlay import covered
+from ltsh_addon.blender.viewport.lights import view_lights
 from ltsh_addon.imaging.exr import read_channels
 from ltsh_addon.pipeline import PictureOptions, RenderOptions, shade_scene
 from ltsh_addon.pipeline.render import finish
@@ -84,13 +85,13 @@ def extracted(tmp_path, **options):
     """Samples and lights of a copy of the open file."""
     path = tmp_path / "scene.blend"
     bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
-    return client.extract(client.ExtractOptions(scene=path, **options))
+    return extract_pixels(PixelJob(scene=path, **options))
 
 
 def shaded(extraction, technique="ltsh2", passes=shading.PASSES):
     """What shading the samples gives, (H, W, 3)."""
     result = shading.shade(extraction.samples, extraction.lights, technique, passes=passes)
-    return extraction.exposure * extraction.film.image(result.combined)
+    return extraction.picture.exposure * extraction.film.image(result.combined)
 
 
 def test_settings_of_cycles_own_renders_stay_hidden(addon):
@@ -295,7 +296,7 @@ def test_a_stopped_render_is_no_error_and_leaves_nothing(scene, tmp_path, monkey
 
 
 def final_job(scene, **options):
-    return render_module.FinalJob(scene.name, "ViewLayer", None, 2, "ltsh2", "combined", **options)
+    return final_picture.FinalJob(scene.name, "ViewLayer", None, 2, "ltsh2", "combined", **options)
 
 
 def test_progress_follows_the_plan_to_its_end_and_can_stop(scene, tmp_path):
@@ -308,20 +309,20 @@ def test_progress_follows_the_plan_to_its_end_and_can_stop(scene, tmp_path):
         plan.report(stage, fraction)
         shares.append(plan.share())
 
-    render_module.final_picture(job, path, progress)
+    final_picture.final_picture(job, path, progress)
     assert [STARTING, *stages] == [step.stage for step in job.steps()]
     for fractions in stages.values():
         assert fractions == sorted(fractions) and 0.0 <= fractions[0] <= fractions[-1] <= 1.0
     assert shares == sorted(shares) and plan.number == plan.count
     with pytest.raises(Cancelled):
-        render_module.final_picture(job, path, lambda stage, fraction: stage != "LTSH N=4")
+        final_picture.final_picture(job, path, lambda stage, fraction: stage != "LTSH N=4")
 
 
 def test_the_picture_is_shown_as_its_passes_come(scene, tmp_path):
     parts.add_world(Color=(0.1, 0.2, 0.3, 1.0))
     path, shown = parts.save(tmp_path / "scene.blend"), []
     job = final_job(scene)
-    whole = render_module.final_picture(job, path, lambda stage, fraction: True, shown.append)
+    whole = final_picture.final_picture(job, path, lambda stage, fraction: True, shown.append)
     assert [len(picture.passes) for picture in shown] == [1, 2, 3]
     for earlier, name in zip(shown, ("LTSH Specular", "LTSH Diffuse"), strict=False):
         assert name not in earlier.passes
@@ -341,8 +342,8 @@ def test_a_world_that_varies_is_seen_behind_the_surfaces(scene, tmp_path):
                        (plain.outputs[0], mix.inputs[2]), (mix.outputs[0], output.inputs["Surface"])):  # fmt: skip
         tree.links.new(start, end)
     path = parts.save(tmp_path / "scene.blend")
-    picture = render_module.final_picture(final_job(scene), path, lambda *now: True)
-    lit = picture.passes["LTSH Specular"] + picture.passes["LTSH Diffuse"] + picture.passes[render_module.EMISSION]
+    picture = final_picture.final_picture(final_job(scene), path, lambda *now: True)
+    lit = picture.passes["LTSH Specular"] + picture.passes["LTSH Diffuse"] + picture.passes[final_picture.EMISSION]
     behind = picture.combined[..., :3] - lit
     share = behind[..., 1] / seen[1]
     assert share.min() > -1e-4 and share.max() == pytest.approx(1.0, abs=1e-3) and share.mean() < 0.9
@@ -353,7 +354,7 @@ def test_a_world_that_varies_is_seen_behind_the_surfaces(scene, tmp_path):
     scene.render.border_min_x, scene.render.border_max_x = 0.0, 0.5
     path = parts.save(tmp_path / "region.blend")
     job = final_job(scene, keeps_lights=True)
-    region = render_module.final_picture(job, path, lambda *now: True)
+    region = final_picture.final_picture(job, path, lambda *now: True)
     width = region.combined.shape[1]
     assert 0 < width < picture.combined.shape[1]
     np.testing.assert_allclose(region.combined, picture.combined[:, :width], atol=2e-3)
@@ -368,7 +369,7 @@ def test_a_complete_picture_shows_its_direct_light_before_cycles_begins(scene, t
         assert "Cycles" not in stages
         shown.append(picture)
 
-    whole = render_module.final_picture(job, path, lambda stage, fraction: stages.append(stage), show)
+    whole = final_picture.final_picture(job, path, lambda stage, fraction: stages.append(stage), show)
     assert "Cycles" in stages
     (early,) = shown
     for name in ("LTSH Specular", "LTSH Diffuse"):
@@ -433,8 +434,8 @@ def test_depth_normal_position_and_indices_are_those_of_cycles(scene, tmp_path):
 def test_a_final_picture_is_the_sum_of_its_lights_and_the_rest(scene, tmp_path, settings):
     """What the light mixer gets of it."""
     values = {"shown": "combined", "keeps_lights": True, **settings}
-    job = render_module.FinalJob(scene.name, "ViewLayer", None, 2, "ltsh4", **values)
-    found = render_module.final_picture(job, parts.save(tmp_path / "scene.blend"), lambda stage, fraction: True)
+    job = final_picture.FinalJob(scene.name, "ViewLayer", None, 2, "ltsh4", **values)
+    found = final_picture.final_picture(job, parts.save(tmp_path / "scene.blend"), lambda stage, fraction: True)
     layers, combined = found.lights.layers, found.combined
     np.testing.assert_allclose(layers.sum(axis=0), combined[..., :3], rtol=1e-4, atol=1e-5 * combined.max())
     np.testing.assert_allclose(found.lights.alpha, combined[..., 3], atol=1e-6)
@@ -540,30 +541,28 @@ def test_without_cycles_add_on_there_is_a_viewport_and_a_final_render(tmp_path):
 def test_views_at_rest_are_drawn_again_and_what_moves_is_left_alone():
     def left(took, samples):
         """Seconds until views are drawn again, after one that `took` as long."""
-        view._redraw_later(time.monotonic() - took, samples)
-        return view._redraw()
+        redraws.redraw_later(time.monotonic() - took, samples)
+        return redraws.redraw()
 
-    view.register()
     try:
         # A quick picture is refined once nothing has changed for a while; every change begins that anew.
-        assert view.REST_SECONDS - 0.1 < left(0.01, 1) <= view.REST_SECONDS
-        assert bpy.app.timers.is_registered(view._redraw)
-        assert 0.5 < left(0.4, 1) <= 0.8 and left(30.0, 1) <= view.LONGEST_REST
-        view._next.update(at=0.0, drawn=time.monotonic() - 10.0)
+        assert redraws.REST_SECONDS - 0.1 < left(0.01, 1) <= redraws.REST_SECONDS
+        assert bpy.app.timers.is_registered(redraws.redraw)
+        assert 0.5 < left(0.4, 1) <= 0.8 and left(30.0, 1) <= redraws.LONGEST_REST
+        redraws.moments.update(next=0.0, refined=time.monotonic() - 10.0)
         # Then slow ones leave the window as much time as they take, and quick ones follow each other.
         assert 0.2 < left(0.4, 2)
-        view._next.update(at=time.monotonic() + 10.0, drawn=0.0)
+        redraws.moments.update(next=time.monotonic() + 10.0, refined=0.0)
         assert left(0.001, 2) is None
     finally:
-        view.unregister()
-    assert not bpy.app.timers.is_registered(view._redraw)
+        redraws.stop()
+    assert not bpy.app.timers.is_registered(redraws.redraw)
 
 
 def test_a_view_that_is_left_is_freed_at_once_and_what_works_for_it_is_stopped(scene, monkeypatch):
     """Not when Python looks for circles the next time: it has textures, and processes that help."""
     collected = []
-    monkeypatch.setattr(view, "collect_occluders", lambda *arguments: collected.append(True))
-    monkeypatch.setattr(view, "blocks_nothing", lambda occluders, world: occluders)
+    monkeypatch.setattr(view, "view_occluders", lambda *arguments: collected.append(True))
     depsgraph = bpy.context.evaluated_depsgraph_get()
     gc.collect()
     gc.disable()
@@ -572,7 +571,7 @@ def test_a_view_that_is_left_is_freed_at_once_and_what_works_for_it_is_stopped(s
         seen._renderer = SimpleNamespace(shadows=None)
         seen._follow_shadows(depsgraph)
         shadows, stopped = seen._shadows, [one._stop for one in (seen._shadows, seen._shadows.of_glass)]
-        seen._shadows._followed.collect()
+        seen._shadows._traced_scene.collect()
         stopped.append(seen._world._stopped)
         left = [weakref.ref(part) for part in (seen, seen.mirror, shadows, shadows.of_glass)]
         del seen, shadows
@@ -594,10 +593,10 @@ def test_lines_keep_clear_of_all_regions_whatever_their_side():
     overlapping = (part("HEADER", "BOTTOM", 100, 50, 800, 52), part("TOOL_HEADER", "TOP", 100, 598, 800, 52),
                    part("TOOLS", "RIGHT", 810, 102, 90, 496), part("HUD", "FLOAT", 120, 110, 300, 200),
                    part("UI", "LEFT", 100, 102, 1, 496))  # fmt: skip
-    found = view.covered(SimpleNamespace(regions=(window, *overlapping)), window)
+    found = covered(SimpleNamespace(regions=(window, *overlapping)), window)
     assert found == {"LEFT": 0, "RIGHT": 90, "BOTTOM": 52, "TOP": 52, "FLOAT": 320}
     beside = part("HEADER", "TOP", 100, 650, 800, 52), part("TOOLS", "LEFT", 10, 50, 90, 600)
-    assert not any(view.covered(SimpleNamespace(regions=(window, *beside)), window).values())
+    assert not any(covered(SimpleNamespace(regions=(window, *beside)), window).values())
 
 
 def test_material_preview_stays_that_of_eevee():

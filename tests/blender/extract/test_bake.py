@@ -68,9 +68,11 @@ def test_diffuse_light_is_the_irradiance_over_pi_and_leaves_colors_out(tmp_path)
     passes = ("diffuse", "diffuse_light", "combined", "specular")
     _, files = baked(save(tmp_path), tmp_path / "out", passes=passes, view="above")
     layers = files["Plane.exr"]
-    expected = quadrature.radiance(plane_samples(ABOVE, albedo=1.0), [KEY], quadrature.lambert)
+    samples = plane_samples(ABOVE, albedo=1.0)
+    some = np.random.default_rng(0).choice(len(samples), 300, replace=False)
+    expected = quadrature.radiance(samples.take(some), [KEY], quadrature.lambert)
     light = layers["ltsh4.diffuse_light"].reshape(-1, 3)
-    assert np.abs(light - expected).max() < 1e-3 * expected.max()
+    assert np.abs(light[some] - expected).max() < 1e-3 * expected.max()
     color = np.float32([0.8, 0.2, 0.5])
     assert np.abs(layers["ltsh4.diffuse"] - layers["ltsh4.diffuse_light"] * color).max() < 1e-5 * light.max()
     assert np.array_equal(layers["ltsh4.combined"], layers["ltsh4.diffuse"] + layers["ltsh4.specular"])
@@ -259,7 +261,7 @@ def test_points_spread_over_texels_give_the_mean_that_cycles_bakes(tmp_path, kin
         mesh = monkey(waves()).data
         for loop in (loop for face in mesh.polygons if face.center.x > 0.0 for loop in face.loop_indices):
             mesh.uv_layers.active.uv[loop].vector.x += 1.0
-    options = {"techniques": ("reference",), "error": True, "cycles_samples": 256, "sub_samples": 16}
+    options = {"techniques": ("ltsh4",), "error": True, "cycles_samples": 256, "sub_samples": 16}
     report, _ = baked(save(tmp_path), tmp_path / "out", **options)
     tiles = report["objects"][0]["tiles"]
     assert list(tiles) == (["1001"] if kind == "plain" else ["1001", "1002"])

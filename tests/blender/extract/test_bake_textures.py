@@ -8,7 +8,7 @@ import pytest
 from bake_scenes import SIZE, save, start
 from scene_parts import add_plane, principled
 
-from ltsh_addon.blender.process import client
+from ltsh_addon.blender.process.bake import extract_bake
 from ltsh_addon.cycles import texels as texels_module
 from ltsh_addon.cycles.images import ImageTexture
 from ltsh_addon.cycles.uv import UvTriangles
@@ -95,7 +95,7 @@ def samples_by_object(path, folder, look_up):
     folder.mkdir()
     options = BakeOptions(scene=path, output=folder, size=(SIZE, SIZE), view="above")
     job = replace(bake._job(options, {}), look_up_images=look_up)
-    manifest = client.extract_bake(job, folder)
+    manifest = extract_bake(job, folder)
     lights = tuple(AreaLight(**record) for record in manifest["lights"])
     found = {}
     for record in manifest["objects"]:

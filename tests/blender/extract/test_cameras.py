@@ -7,7 +7,7 @@ import scene_parts
 
 from ltsh_addon import imaging
 from ltsh_addon.blender import render_settings
-from ltsh_addon.blender.process.client import ExtractOptions, extract
+from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels
 from ltsh_addon.blender.render_settings import enable_passes, render_exr
 from ltsh_addon.pipeline import PictureOptions, shade_scene
 from ltsh_addon.scene import SceneError
@@ -92,7 +92,7 @@ def test_the_picture_is_that_of_a_plain_render(tmp_path, case):
     CASES[case](scene, scene.camera.data)
     path = saved(tmp_path)
     expected = plain_positions(tmp_path, scene)
-    found = extract(ExtractOptions(path))
+    found = extract_pixels(PixelJob(path))
     assert found.warnings == () and positions(found).shape == expected.shape
     # The first sample of a plain render is at the center as ours is, up to 1e-3 of a pixel by Cycles' table, which the
     # slope of the surface can magnify a few times; a pixel is 0.1 m and more.
@@ -125,14 +125,14 @@ def test_a_region_is_recorded_and_has_the_size_of_a_plain_render(tmp_path):
 def test_a_region_holds_for_anti_aliasing_and_for_the_reference(tmp_path):
     scene = room()
     set_border(scene, crop=True)
-    whole = ExtractOptions(saved(tmp_path), sub_samples=4, cycles_samples=512)
-    cropped = extract(whole)
+    whole = PixelJob(saved(tmp_path), sub_samples=4, cycles_samples=512)
+    cropped = extract_pixels(whole)
     scene.render.use_border = False
     saved(tmp_path)
-    full = extract(whole)
+    full = extract_pixels(whole)
     assert np.abs(positions(full)[6:13, 8:21] - positions(cropped)).max() < 1e-4
-    for name, image in full.reference.items():
-        part, ours = image.mean(axis=0)[6:13, 8:21], cropped.reference[name].mean(axis=0)
+    for name, image in full.cycles.reference.items():
+        part, ours = image.mean(axis=0)[6:13, 8:21], cropped.cycles.reference[name].mean(axis=0)
         assert ours.shape == (7, 13, 3)
         # Another sequence of 512 samples per pixel: their noise.
         assert np.linalg.norm(part - ours) < 0.02 * np.linalg.norm(part)
@@ -141,9 +141,9 @@ def test_a_region_holds_for_anti_aliasing_and_for_the_reference(tmp_path):
 def test_an_animated_lens_shows_the_same_sub_samples_as_one_that_stands_still(tmp_path):
     scene = room()
     animate(scene)
-    moving = extract(ExtractOptions(saved(tmp_path), sub_samples=3))
+    moving = extract_pixels(PixelJob(saved(tmp_path), sub_samples=3))
     scene.camera.data.animation_data_clear()
-    still = extract(ExtractOptions(saved(tmp_path), sub_samples=3))
+    still = extract_pixels(PixelJob(saved(tmp_path), sub_samples=3))
     assert np.array_equal(moving.film.pixel, still.film.pixel)
     assert np.abs(moving.samples.position - still.samples.position).max() < 1e-4
     thirds = np.split(moving.samples.position, 3)
@@ -178,11 +178,11 @@ def test_cameras_with_other_projections_are_refused(tmp_path, kind, words):
     odd.data.type = kind
     path = saved(tmp_path)
     with pytest.raises(SceneError, match=f"camera 'Odd' is {words}.* expected a perspective or orthographic one"):
-        extract(ExtractOptions(path))
-    assert len(extract(ExtractOptions(path, camera=plain.name)).samples) > 0
+        extract_pixels(PixelJob(path))
+    assert len(extract_pixels(PixelJob(path, camera=plain.name)).samples) > 0
     scene.camera = bpy.data.objects["Key"]
     with pytest.raises(SceneError, match="'Key' is a LIGHT object"):
-        extract(ExtractOptions(saved(tmp_path)))
+        extract_pixels(PixelJob(saved(tmp_path)))
 
 
 def test_markers_choose_the_camera_of_the_frame_and_a_named_one_wins(tmp_path):
@@ -196,31 +196,34 @@ def test_markers_choose_the_camera_of_the_frame_and_a_named_one_wins(tmp_path):
         scene.frame_set(frame)
         expected = plain_positions(tmp_path, scene)
         assert scene.camera.name == name
-        found = extract(ExtractOptions(path, frame=frame))
-        assert found.camera == name and np.abs(positions(found) - expected).max() < 0.01
-    named = extract(ExtractOptions(path, frame=10, camera="Camera"))
+        found = extract_pixels(PixelJob(path, frame=frame))
+        assert found.picture.camera == name and np.abs(positions(found) - expected).max() < 0.01
+    named = extract_pixels(PixelJob(path, frame=10, camera="Camera"))
     for marker in scene.timeline_markers:
         marker.camera = None
     scene.camera = first
-    assert named.camera == "Camera" and np.median(np.abs(positions(named) - plain_positions(tmp_path, scene))) < 2e-4
+    assert (
+        named.picture.camera == "Camera"
+        and np.median(np.abs(positions(named) - plain_positions(tmp_path, scene))) < 2e-4
+    )
 
 
 def test_pictures_of_no_pixels_are_refused_in_one_line(tmp_path):
     scene = room()
     set_border(scene, crop=False, left=0.5, right=0.51)
     with pytest.raises(SceneError, match="^.*its render region is 0x7 of 26x15 pixels.*$"):
-        extract(ExtractOptions(saved(tmp_path)))
+        extract_pixels(PixelJob(saved(tmp_path)))
     scene.render.use_border, scene.render.resolution_percentage = False, 2
     with pytest.raises(SceneError, match="^.*2 % of 26x15 pixels is less than one pixel.*$"):
-        extract(ExtractOptions(saved(tmp_path)))
+        extract_pixels(PixelJob(saved(tmp_path)))
 
 
 def test_a_given_size_replaces_the_percentage(tmp_path):
     scene = room()
     scene.render.resolution_percentage = 50
     path = saved(tmp_path)
-    assert extract(ExtractOptions(path)).film.width == 13
-    found = extract(ExtractOptions(path, width=52))
+    assert extract_pixels(PixelJob(path)).film.width == 13
+    found = extract_pixels(PixelJob(path, width=52))
     assert (found.film.width, found.film.height) == (52, round(52 * 7 / 13))
 
 
@@ -228,6 +231,6 @@ def test_stereo_pictures_become_one_from_the_middle(tmp_path):
     scene = room()
     expected = plain_positions(tmp_path, scene)
     scene.render.use_multiview = True
-    found = extract(ExtractOptions(saved(tmp_path)))
+    found = extract_pixels(PixelJob(saved(tmp_path)))
     assert any("stereoscopy" in line for line in found.warnings)
     assert np.median(np.abs(positions(found) - expected)) < 2e-4

@@ -10,7 +10,7 @@ from bake_scenes import baked, save
 from lit_plane import add_instancer, assert_agrees, into_collection
 
 from ltsh_addon.blender.extract import origin
-from ltsh_addon.blender.process import client
+from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels
 from ltsh_addon.cycles import gbuffer
 
 # Where positions are 1/128 m apart: those of the scenes below are multiples of that, so that both places are the same.
@@ -192,7 +192,7 @@ def test_a_lamp_is_not_too_close_to_itself(tmp_path):
     material, _ = scene_parts.bsdf_material("ShaderNodeEmission", "Glow")
     scene_parts.add_sphere(material, 1.0, "Lamp", segments=128, location=(0.0, -0.5, 0.5))
     path = scene_parts.save(tmp_path / "lamp.blend")
-    extraction = client.extract(client.ExtractOptions(scene=path))
+    extraction = extract_pixels(PixelJob(scene=path))
     assert len(extraction.lights) > 20 and not [line for line in extraction.warnings if "rounded" in line]
 
 
@@ -200,7 +200,7 @@ def test_pictures_and_bakes_have_the_places_of_the_file(tmp_path):
     build()
     move()
     path = save(tmp_path)
-    found = client.extract(client.ExtractOptions(scene=path))
+    found = extract_pixels(PixelJob(scene=path))
     (light,) = found.lights
     assert np.abs(light.center - PLACE - (0.25, 0.5, 1.5)).max() < 1e-6
     assert np.abs(found.samples.position[:, 2] - PLACE[2]).max() < 1e-5

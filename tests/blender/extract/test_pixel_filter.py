@@ -8,7 +8,7 @@ from film_scenes import SIZE, compared, diffuse, plain_diffuse
 from scene_parts import add_plane
 
 from ltsh_addon.blender import render_settings
-from ltsh_addon.blender.process.client import ExtractOptions, extract
+from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels
 from ltsh_addon.scene import Film
 
 FILTERS = [("BOX", 4.0), ("GAUSSIAN", 1.0), ("BLACKMAN_HARRIS", 1.5), ("BLACKMAN_HARRIS", 3.0)]
@@ -68,7 +68,7 @@ def test_edges_are_those_of_a_plain_render(tmp_path, kind, width):
     for name in (kind, "other"):
         if name == "other":
             scene.cycles.pixel_filter_type, scene.cycles.filter_width = "GAUSSIAN", 3.0
-        found = extract(ExtractOptions(path, sub_samples=count))
+        found = extract_pixels(PixelJob(path, sub_samples=count))
         white = found.film.image(found.samples.diffuse_albedo)[..., 0]
         _, plain = plain_diffuse(tmp_path, scene, samples=1024)
         errors[name] = np.abs(white - plain[..., 0])

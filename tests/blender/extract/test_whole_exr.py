@@ -8,7 +8,7 @@ import pytest
 import scene_parts
 
 from ltsh_addon.blender import render_settings
-from ltsh_addon.blender.process import client
+from ltsh_addon.blender.process.pixels import rendered_channels
 from ltsh_addon.files import temporary_folder
 from ltsh_addon.imaging.exr import read_channels
 
@@ -45,7 +45,7 @@ def test_a_picture_that_is_not_whole_says_where_room_is_missing(tmp_path, monkey
     with pytest.raises(OSError) as error, temporary_folder() as folder:
         parts(folder / "a.exr")
         (folder / "a.exr").write_bytes((folder / "a.exr").read_bytes()[:-1])
-        client._rendered(folder / "a.exr")
+        rendered_channels(folder / "a.exr")
     assert str(error.value) == (
         f"{tmp_path}: no room for temporary files (a picture was not written whole); "
         "make room, or let TMPDIR name another folder"

@@ -11,7 +11,7 @@ from ltsh_addon.blender import render_settings
 from ltsh_addon.blender.evaluated import with_render_depsgraph
 from ltsh_addon.blender.extract import pixels
 from ltsh_addon.blender.extract.occluders import collect_occluders
-from ltsh_addon.blender.process import client
+from ltsh_addon.blender.process.pixels import read_reference
 from ltsh_addon.cycles import gbuffer
 from ltsh_addon.imaging.exr import read_channels
 
@@ -260,7 +260,7 @@ def reference(folder: Path, prepared, cycles_samples, sub_samples=1):
         "height": scene.render.resolution_y,
         "exposure": 1.0,
     }
-    return client.read_reference(manifest, folder)
+    return read_reference(manifest, folder)
 
 
 def group_with_principled(name="Group"):

@@ -103,13 +103,27 @@ def table_of(cosine: np.ndarray, roughness: np.ndarray, values: np.ndarray) -> n
 def _fitted(cosine, roughness, values) -> np.ndarray:
     count = closures.SHEEN_NODES**2
     square, right = np.zeros((count, count)), np.zeros((count, len(values)))
-    found = closures.corners(cosine.astype(np.float64), roughness.astype(np.float64))
-    for index, weight in found:
+    corners = _corners(cosine.astype(np.float64), roughness.astype(np.float64))
+    for index, weight in corners:
         np.add.at(right, index, weight[:, None] * values.T)
-        for other, other_weight in found:
+        for other, other_weight in corners:
             np.add.at(square, (index, other), weight * other_weight)
     table = np.linalg.lstsq(square, right, rcond=1e-12)[0]
     return table.T.reshape(-1, closures.SHEEN_NODES, closures.SHEEN_NODES).astype(np.float32)
+
+
+def _corners(x: np.ndarray, y: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Bilinear interpolation at points of the unit square: numbers (P,) of four nodes in the table and weights (P,)."""
+    last = closures.SHEEN_NODES - 1
+    column, row = (np.minimum((last * value).astype(int), last - 1) for value in (x, y))
+    return [
+        (
+            (column + i) * closures.SHEEN_NODES + row + j,
+            np.abs(1 - i - (last * x - column)) * np.abs(1 - j - (last * y - row)),
+        )
+        for i in (0, 1)
+        for j in (0, 1)
+    ]
 
 
 def _add_surface() -> None:

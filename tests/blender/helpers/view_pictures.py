@@ -8,10 +8,11 @@ import scene_parts as parts
 from graphics_card import Canvas, with_graphics
 
 from ltsh_addon import shading
-from ltsh_addon.blender.process import client
+from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels
+from ltsh_addon.blender.viewport.camera import ViewCamera
 from ltsh_addon.blender.viewport.mirror import SceneMirror
-from ltsh_addon.blender.viewport.renderer import ShownPicture, ViewRenderer
-from ltsh_addon.blender.viewport.surfaces import View
+from ltsh_addon.blender.viewport.pictures import ShownPicture
+from ltsh_addon.blender.viewport.renderer import ViewRenderer
 
 SIZE = (96, 72)
 COLUMNS = 4
@@ -26,7 +27,7 @@ def viewport_picture(camera, shown, is_parallel):
     mirror, renderer, canvas = SceneMirror(), ViewRenderer(), Canvas(*SIZE)
     try:
         mirror.sync(depsgraph)
-        view = View.of(camera.matrix_world.inverted(), projection, is_parallel)
+        view = ViewCamera.of(camera.matrix_world.inverted(), projection, is_parallel)
         settings = ShownPicture("ltsh4", shown, "single", "ltc", 0.5, 1.0, 1.0, True)
         renderer.draw(mirror, view, SIZE, settings, canvas.buffer)
         return renderer.read()[::-1, :, :3].astype(np.float64), mirror.notes
@@ -61,7 +62,7 @@ def sampled_pictures(path, passes, rows):
     """Pictures (H, W, 3) by pass of the samples that Cycles took, and the number of the square (H, W) that each pixel
     sees, or -1."""
     bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
-    found = client.extract(client.ExtractOptions(scene=path))
+    found = extract_pixels(PixelJob(scene=path))
     shaded = shading.shade(found.samples, found.lights, "ltsh4", passes=passes, workers=1)
     square = np.full(SIZE[0] * SIZE[1], -1)
     column, row = (np.floor(found.samples.position[:, axis] + 0.5 * count).astype(int)

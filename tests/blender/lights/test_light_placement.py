@@ -8,7 +8,7 @@ import pytest
 import scene_parts
 from lit_plane import add_instancer, add_lamp_plane, assert_agrees, instance_on_points, into_collection, start
 
-from ltsh_addon.blender.process.client import ExtractOptions, extract
+from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels
 
 
 @pytest.mark.parametrize("add", [scene_parts.add_area_light, add_lamp_plane], ids=["area light", "mesh light"])
@@ -99,7 +99,7 @@ def test_animated_and_driven_lights_are_those_of_the_frame(tmp_path):
     light.data.driver_add("size").driver.expression = "frame / 4"
     scene_parts.add_camera()
     path = scene_parts.save(tmp_path / "animated.blend")
-    first, middle = (extract(ExtractOptions(path, frame=frame)).lights[0] for frame in (1, 6))
+    first, middle = (extract_pixels(PixelJob(path, frame=frame)).lights[0] for frame in (1, 6))
     assert first.center[2] == pytest.approx(1.0) and middle.center[2] == pytest.approx(1.5)
     assert np.linalg.norm(middle.half_u) == pytest.approx(0.75)
     area = 4.0 * np.linalg.norm(middle.half_u) * np.linalg.norm(middle.half_v)

@@ -101,8 +101,8 @@ def test_a_light_without_emission_is_none(tmp_path):
 
 @pytest.mark.parametrize("is_placed", [False, True], ids=["on the light", "in the world"])
 def test_instances_have_a_look_of_their_own_where_they_need_one(tmp_path, monkeypatch, is_placed):
-    looks, look = [], textures.seen_factor
-    monkeypatch.setattr(textures, "seen_factor", lambda *values: looks.append(values) or look(*values))
+    looks, look = [], textures.node_emission
+    monkeypatch.setattr(textures, "node_emission", lambda *values: looks.append(values) or look(*values))
     start()
     light = add_picture_light()
     if is_placed:

@@ -8,7 +8,7 @@ import pytest
 import quadrature
 import scene_parts
 
-from ltsh_addon.blender.process import client
+from ltsh_addon.blender.process.pixels import faceted
 from ltsh_addon.pipeline import PictureOptions, compare_scene
 from ltsh_addon.scene import PASSES
 from ltsh_addon.shading import shade
@@ -23,13 +23,17 @@ def start(width=24, height=16):
     return scene
 
 
+def coarse_map(world):
+    """Cycles' own map of bright places takes longer than the picture."""
+    world.cycles.sampling_method, world.cycles.sample_map_resolution = "MANUAL", 512
+
+
 def errors(folder, technique, samples=512):
     """By pass the error beyond Cycles' noise and the bias of unshadowed light, and the prepared scene."""
     prepared = scene_parts.prepare()
     ((surface, pixel, _),) = scene_parts.sample(folder, prepared)[0]
-    # Cycles' map of bright places takes longer than the picture.
-    bpy.context.scene.world = world = prepared[2].world
-    world.cycles.sampling_method, world.cycles.sample_map_resolution = "MANUAL", 512
+    bpy.context.scene.world = prepared[2].world
+    coarse_map(bpy.context.scene.world)
     images = scene_parts.reference(folder, prepared, samples)
     found = {}
     shading = shade(surface, prepared[2].lights, technique, workers=1)
@@ -130,6 +134,7 @@ def test_a_world_lights_as_in_cycles(tmp_path, kind):
         assert distance < most and abs(bias) < most, (name, found)
 
 
+@pytest.mark.newest
 def test_the_reference_quadrature_knows_worlds(tmp_path):
     start(12, 8)
     picture("EQUIRECTANGULAR")
@@ -174,11 +179,11 @@ def test_reflections_that_show_the_patches_of_a_world_are_named(tmp_path):
     picture("EQUIRECTANGULAR")
     prepared = scene_parts.prepare()
     ((surface, _, _),) = scene_parts.sample(tmp_path, prepared)[0]
-    assert client.faceted(surface, prepared[2].lights) == []
+    assert faceted(surface, prepared[2].lights) == []
     sharp = replace(surface, roughness=np.where(np.arange(len(surface)) % 4 == 0, 0.1, surface.roughness))
-    (line,) = client.faceted(sharp, prepared[2].lights)
+    (line,) = faceted(sharp, prepared[2].lights)
     assert "'World'" in line and "25 % of the samples" in line
-    assert client.faceted(sharp, [light for light in prepared[2].lights if not light.detail]) == []
+    assert faceted(sharp, [light for light in prepared[2].lights if not light.detail]) == []
 
 
 @pytest.mark.parametrize("kind", ["constant", "sky with a sun"])
@@ -186,6 +191,7 @@ def test_what_blocks_a_world_blocks_it_as_in_cycles(tmp_path, kind):
     """Beyond the noise of both sides, of which 256 rays a light and pixel leave some 2 %."""
     start(24, 16)
     WORLDS[kind]()
+    coarse_map(bpy.context.scene.world)
     path = scene_parts.save(tmp_path / "scene.blend")
     report = compare_scene(
         PictureOptions(scene=path, output=tmp_path / "out", techniques=("ltsh4",), cycles_samples=512)

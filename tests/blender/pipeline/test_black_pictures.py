@@ -8,7 +8,7 @@ import scene_parts
 from fake_scene import run
 
 from ltsh_addon import imaging
-from ltsh_addon.blender.engine.render import FinalJob, final_picture
+from ltsh_addon.blender.engine.final_picture import FinalJob, final_picture
 
 OPTIONS = {
     "shade": ["--techniques", "ltc"],

@@ -14,7 +14,8 @@ from material_scenes import Build
 from ltsh_addon import imaging
 from ltsh_addon.blender import render_settings
 from ltsh_addon.blender.extract import pixels as pixels_module
-from ltsh_addon.blender.process import client
+from ltsh_addon.blender.process.finished import FinishedJob, render_finished
+from ltsh_addon.blender.process.pixels import EDGE_SECONDS, TOO_THIN, PixelJob, extract_pixels, with_points
 from ltsh_addon.cli import main
 from ltsh_addon.cycles.lobes import read_layer
 from ltsh_addon.pipeline import PictureOptions, RenderOptions, picture, render, shade_scene
@@ -161,9 +162,9 @@ def test_a_finished_picture_is_what_cycles_renders(name, tmp_path):
     options = RenderOptions(path, output=tmp_path, sub_samples=POINTS, cycles_samples=SAMPLES, denoise="off")
     made = render.finish(options)
     bpy.context.scene.cycles.seed = 2
-    job = client.FinishedJob(parts.save(tmp_path / "true.blend"), *(None,) * 6, TRUE_SAMPLES, None)
+    job = FinishedJob(parts.save(tmp_path / "true.blend"), *(None,) * 6, TRUE_SAMPLES, None)
     (tmp_path / "true").mkdir()
-    true = read_layer(client.render_finished(job, tmp_path / "true").channels, "Combined", "RGBA")
+    true = read_layer(render_finished(job, tmp_path / "true").channels, "Combined", "RGBA")
 
     for pass_name, share in zip(PASSES, shares, strict=True):
         found = made.report["finished"]["share_of_ours"][pass_name]
@@ -230,6 +231,7 @@ def test_ours_and_the_rest_are_the_whole_in_the_files_of_a_command(out, tmp_path
     assert main([*words, "--resume"]) == 0
 
 
+@pytest.mark.newest
 def test_denoising_takes_the_noise_of_the_rest_and_leaves_its_mean(tmp_path, monkeypatch):
     monkeypatch.setattr(render, "_beside", lambda *images: 1.0)  # at edges the rest holds direct light, too
     floor_and_ball(gray(), 2)
@@ -246,6 +248,7 @@ def test_denoising_takes_the_noise_of_the_rest_and_leaves_its_mean(tmp_path, mon
     assert abs(rest[8, "on"].mean() / true.mean() - 1.0) < 0.05
 
 
+@pytest.mark.newest
 @pytest.mark.parametrize("is_transparent", [False, True])
 def test_edges_of_what_shines_are_smooth_with_few_samples(is_transparent, tmp_path):
     """A glowing ball that also reflects, above a floor without a material, before a sky."""
@@ -257,9 +260,9 @@ def test_edges_of_what_shines_are_smooth_with_few_samples(is_transparent, tmp_pa
     path = parts.save(tmp_path / "scene.blend")
     made = render.finish(RenderOptions(path, output=tmp_path, sub_samples=2, cycles_samples=8))
     scene.cycles.seed = 1
-    job = client.FinishedJob(parts.save(tmp_path / "true.blend"), *(None,) * 6, TRUE_SAMPLES, None)
+    job = FinishedJob(parts.save(tmp_path / "true.blend"), *(None,) * 6, TRUE_SAMPLES, None)
     (tmp_path / "true").mkdir()
-    true = read_layer(client.render_finished(job, tmp_path / "true").channels, "Combined", "RGB")
+    true = read_layer(render_finished(job, tmp_path / "true").channels, "Combined", "RGB")
     light = made.cycles.names["emission"]
     share = read_layer(made.cycles.channels, light, "RGB")[..., 0] / 20.0
     edge = (share > 0.1) & (share < 0.9)
@@ -272,6 +275,7 @@ def test_edges_of_what_shines_are_smooth_with_few_samples(is_transparent, tmp_pa
     assert abs(ours.mean() / true.mean() - 1.0) < 0.02
 
 
+@pytest.mark.newest
 def test_hard_edges_of_diffuse_light_are_nearer_to_cycles_than_ours_or_its_own(tmp_path, monkeypatch):
     """A ball and its shadow in the sun: points and samples place their edges independently, so the mean of both has
     0.7 of the error where both are alike, and less than either where they are nearly so."""
@@ -282,9 +286,9 @@ def test_hard_edges_of_diffuse_light_are_nearer_to_cycles_than_ours_or_its_own(t
     parts.link(bpy.data.objects.new("Sun", sun), rotation=(0.6, 0.5, 0.0))
     path = parts.save(tmp_path / "scene.blend")
     scene.cycles.seed = 1
-    job = client.FinishedJob(parts.save(tmp_path / "true.blend"), *(None,) * 6, TRUE_SAMPLES, None)
+    job = FinishedJob(parts.save(tmp_path / "true.blend"), *(None,) * 6, TRUE_SAMPLES, None)
     (tmp_path / "true").mkdir()
-    true = read_layer(client.render_finished(job, tmp_path / "true").channels, "Combined", "RGB")
+    true = read_layer(render_finished(job, tmp_path / "true").channels, "Combined", "RGB")
     off = {}
     for name, weight in {"both": render._beside, "ours": lambda *images: np.ones((SIZE, SIZE)),
                          "cycles": lambda *images: np.zeros((SIZE, SIZE))}.items():  # fmt: skip
@@ -304,6 +308,7 @@ def test_hard_edges_of_diffuse_light_are_nearer_to_cycles_than_ours_or_its_own(t
     assert off["both"] < 0.9 * min(off["ours"], off["cycles"]), off
 
 
+@pytest.mark.newest
 def test_half_of_an_edge_is_left_to_cycles_but_not_of_what_is_smooth_or_noisy_there():
     x, y = np.mgrid[:12, :12]
     step, noise = np.where(x + 0.5 * y < 8.0, 1.0, 0.2)[..., None], np.random.default_rng(1).normal(size=(12, 12, 1))
@@ -318,6 +323,7 @@ def test_half_of_an_edge_is_left_to_cycles_but_not_of_what_is_smooth_or_noisy_th
     assert weights["edge"] == 0.5 and weights["slope"] == pytest.approx(1.0) and weights["noisy"] > 0.95, weights
 
 
+@pytest.mark.newest
 def test_noisy_shadows_are_left_to_the_denoiser(tmp_path):
     scene = floor_and_ball(gray(), 1)
     # A slit lets little of a large light through: few of its rays arrive.
@@ -357,6 +363,7 @@ def test_a_kept_finished_picture_is_the_sum_of_its_lights_and_the_rest(out, tmp_
     assert np.linalg.norm(alone - mixed.layers[0]) < 0.02 * np.linalg.norm(alone)
 
 
+@pytest.mark.newest
 def test_edges_go_with_the_light_that_makes_them(out, tmp_path):
     """Of two suns without a light group one is muted: what Cycles has added to its edges goes as well."""
     scene = floor_and_ball(bsdf("BsdfDiffuse"))
@@ -377,6 +384,7 @@ def test_edges_go_with_the_light_that_makes_them(out, tmp_path):
     assert off < 0.1, f"{100.0 * off:.1f} %"
 
 
+@pytest.mark.newest
 def test_bounced_light_follows_the_lights_of_its_light_group(out, tmp_path):
     """Of a finished picture lit anew, in the mixer and in its passes: as a render of the changed scene has it."""
     scene = floor_and_ball(gray(), 3)
@@ -419,6 +427,7 @@ def test_bounced_light_follows_the_lights_of_its_light_group(out, tmp_path):
     assert apart < 2.0 * noise + 0.005 < 0.3 * unfollowed
 
 
+@pytest.mark.newest
 def test_budgets_buy_points_by_what_they_cost():
     pixels = 240 * 135
     points = [pixels_module.affordable_points(seconds, pixels, 4) for seconds in (1.0, 4.0, 8.0, 32.0)]
@@ -430,11 +439,13 @@ def test_budgets_buy_points_by_what_they_cost():
     assert looked[0] >= looked[1] > looked[2] == 0
 
 
+@pytest.mark.newest
 def test_a_budget_excludes_samples(tmp_path, capsys):
     assert main(["render", "room.blend", "-o", str(tmp_path), "--budget", "3", "--cycles-samples", "4"]) == 2
     assert "not both" in capsys.readouterr().err
 
 
+@pytest.mark.newest
 def test_a_budget_chooses_points_rays_and_samples(tmp_path):
     floor_and_ball(gray(), 1)
     path = parts.save(tmp_path / "room.blend")
@@ -456,6 +467,7 @@ def test_a_budget_chooses_points_rays_and_samples(tmp_path):
     assert 0.0 < least <= took
 
 
+@pytest.mark.newest
 @pytest.mark.parametrize(
     ("each", "power", "looked", "points"),
     [
@@ -471,8 +483,8 @@ def test_direct_light_gets_no_more_points_than_a_part_of_it_says_there_is_time_f
     tmp_path, monkeypatch, each, power, looked, points
 ):
     floor_and_ball(gray(), 1)
-    options = client.ExtractOptions(parts.save(tmp_path / "room.blend"), sub_samples=2, for_finished=True, shadows="on")
-    look, thin, certain = client.extract(options), 0.1, 1.0
+    options = PixelJob(parts.save(tmp_path / "room.blend"), sub_samples=2, for_finished=True, shadows="on")
+    look, thin, certain = extract_pixels(options), 0.1, 1.0
 
     def seconds_of(self, part, share):
         count = max(round(share * len(part.samples)), 1)
@@ -482,15 +494,15 @@ def test_direct_light_gets_no_more_points_than_a_part_of_it_says_there_is_time_f
     most = PictureOptions(options.scene, output=tmp_path, sub_samples=5)
     how = render._How(RenderOptions(options.scene, output=tmp_path, budget=9.0), most, {}, None)
     # Beside Cycles' look at the scene and what shines in sight.
-    of_edges = 1e-6 * client.EDGE_SECONDS * look.film.width * look.film.height
-    seconds = 3.0 + 0.5 * look.direct_seconds + of_edges
+    of_edges = 1e-6 * EDGE_SECONDS * look.film.width * look.film.height
+    seconds = 3.0 + 0.5 * look.times.direct + of_edges
     number, reason = how.affordable(look, seconds, looked)
     assert number in (points if isinstance(points, range) else [points])
     assert bool(reason) == (number == 0)
     if number == 0:
         assert "too small" in reason
         return
-    samples = len(client.with_points(client.extract(replace(options, sub_samples=number)), number).samples)
+    samples = len(with_points(extract_pixels(replace(options, sub_samples=number)), number).samples)
     # Each further point makes no more samples than the second one.
     assert each * samples**power <= (render.MORE_SHARE if number > 2 else render.DIRECT_SHARE) * 3.0
     assert how.affordable(look, 0.0, looked)[0] == 0 and how.affordable(look, None, looked) == (2, "")
@@ -498,9 +510,10 @@ def test_direct_light_gets_no_more_points_than_a_part_of_it_says_there_is_time_f
     certain = 0.01 if each > 1e-4 else 0.5
     assert how.affordable(look, seconds, looked)[0] <= (number if each < 1e-4 else 0)
     thin, certain = 2.0, 1.0
-    assert how.affordable(look, seconds, looked) == (0, client.TOO_THIN)
+    assert how.affordable(look, seconds, looked) == (0, TOO_THIN)
 
 
+@pytest.mark.newest
 def test_highlights_thinner_than_pixels_are_told_from_those_that_points_show(tmp_path):
     """Two points of each pixel on a smooth and on a crumpled floor, of facets of a third of a pixel."""
     thin = {}
@@ -517,20 +530,20 @@ def test_highlights_thinner_than_pixels_are_told_from_those_that_points_show(tmp
         parts.add_camera((0.0, 0.0, 4.0), (0.0, 0.0, 0.0))
         parts.add_area_light(location=(0.5, 0.0, 3.0), size=0.2)
         path = parts.save(tmp_path / f"{name}.blend")
-        job = client.ExtractOptions(path, sub_samples=2, for_finished=True, shadows="on")
-        found = client.extract(job)
+        job = PixelJob(path, sub_samples=2, for_finished=True, shadows="on")
+        found = extract_pixels(job)
         own = PictureOptions(path, output=tmp_path, sub_samples=2, shadows="on")
         options = RenderOptions(path, output=tmp_path, budget=9.0)
         with ShadowTracer(found.occluders, found.lights, found.origin) as tracer:
             how = render._How(options, own, picture.load_tables(options.techniques), tracer)
-            _, _, thin[name], _ = how._probe(client.with_points(found, 2), 1.0)
+            _, _, thin[name], _ = how._probe(with_points(found, 2), 1.0)
     assert thin["smooth"] < 0.5 * render.THIN and thin["crumpled"] > 1.5 * render.THIN
 
 
 def test_the_files_of_a_budget_share_no_noise(tmp_path):
     floor_and_ball(gray(), 1)
-    job = client.FinishedJob(parts.save(tmp_path / "room.blend"), *(None,) * 7, 1.0, edges=False)
-    samples = client.render_finished(job, tmp_path).samples
+    job = FinishedJob(parts.save(tmp_path / "room.blend"), *(None,) * 7, 1.0, edges=False)
+    samples = render_finished(job, tmp_path).samples
     files = [imaging.read_layers(path) for path in sorted(tmp_path.glob("cycles_*.exr"))]
     noise = [layers["ViewLayer.Combined"] - layers["ViewLayer.Combined"].mean() for layers in files]
     assert len(noise) >= 2 and samples > 10
@@ -550,9 +563,9 @@ def test_edges_of_shadows_on_flat_surfaces_are_where_cycles_has_them(lens, tmp_p
     settings.border_min_x, settings.border_max_y = 0.2, 0.9
     parts.add_area_light(location=(0.8, -1.0, 3.0), size=0.05)
     path = parts.save(tmp_path / "room.blend")
-    job = client.FinishedJob(path, *(None,) * 6, 256, None)
+    job = FinishedJob(path, *(None,) * 6, 256, None)
     (tmp_path / "true").mkdir()
-    found = client.render_finished(job, tmp_path / "true")
+    found = render_finished(job, tmp_path / "true")
     light, color = (read_layer(found.channels, found.names[f"diffuse_{part}"], "RGB") for part in ("light", "color"))
     pictures = []
     for most in (1.0, 0.0):
@@ -568,8 +581,8 @@ def test_edges_of_shadows_on_flat_surfaces_are_where_cycles_has_them(lens, tmp_p
 def test_the_first_points_of_a_pixel_are_those_of_a_picture_with_fewer(tmp_path):
     floor_and_ball(gray(), 1)
     path = parts.save(tmp_path / "room.blend")
-    many, few = (client.extract(client.ExtractOptions(path, sub_samples=count, for_finished=True)) for count in (6, 3))
-    first, whole = client.with_points(many, 3), client.with_points(few, 3)
+    many, few = (extract_pixels(PixelJob(path, sub_samples=count, for_finished=True)) for count in (6, 3))
+    first, whole = with_points(many, 3), with_points(few, 3)
     assert len(many.samples) > len(few.samples) > len(first.samples) > 0
     np.testing.assert_array_equal(first.film.pixel, whole.film.pixel)
     np.testing.assert_allclose(first.samples.position, whole.samples.position, atol=1e-6)
@@ -578,6 +591,7 @@ def test_the_first_points_of_a_pixel_are_those_of_a_picture_with_fewer(tmp_path)
     np.testing.assert_allclose(first.film.coverage(), whole.film.coverage(), atol=1e-12)
 
 
+@pytest.mark.newest
 def test_what_cycles_keeps_does_not_fade_at_its_border(tmp_path):
     """Around a ball whose diffuse light is Cycles' own, pixels show as much of the floor as those beside them."""
     floor_and_ball(gray(Subsurface_Weight=0.01, Subsurface_Scale=0.01))
@@ -605,6 +619,7 @@ def test_a_picture_without_any_light_says_that_it_is_black(tmp_path):
     assert any("no light at all" in line and "'Camera'" in line for line in report["warnings"])
 
 
+@pytest.mark.newest
 def test_few_points_leave_to_cycles_what_its_samples_tell_better():
     """Highlights thinner than a pixel, and a slope, by four points of each pixel beside samples of known variance."""
     size, points = 48, 4

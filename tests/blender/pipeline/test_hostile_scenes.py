@@ -15,7 +15,7 @@ from fake_scene import run
 
 from ltsh_addon import cli, imaging
 from ltsh_addon.blender.extract import pixels
-from ltsh_addon.blender.process import client
+from ltsh_addon.blender.process.blend_file import saved_with
 from ltsh_addon.scene import SceneError
 
 # `make soak` takes 10,000.
@@ -123,11 +123,11 @@ def test_a_newer_file_is_refused_also_where_its_header_cannot_be_read_before(tmp
     path = tmp_path / "scene.blend"
     bpy.ops.wm.save_as_mainfile(filepath=str(path), compress=False)
     data = path.read_bytes()
-    version = client.saved_with(data)
+    version = saved_with(data)
     digits = b"0999" if data[7:9].isdigit() else b"999"
     end = 17 if data[7:9].isdigit() else 12
     path.write_bytes(data[: end - len(digits)] + digits + data[end:])
-    assert version == bpy.app.version[:2] and client.saved_with(path.read_bytes()) == (9, 99)
+    assert version == bpy.app.version[:2] and saved_with(path.read_bytes()) == (9, 99)
     expected = f"scene.blend: was saved by Blender 9.99, but this is Blender {version[0]}.{version[1]}, "
     with pytest.raises(SceneError, match=expected):
         pixels.open_scene(path, [])

@@ -6,7 +6,7 @@ import pytest
 import scene_parts
 
 from ltsh_addon import cli
-from ltsh_addon.blender.process import blender_process, client
+from ltsh_addon.blender.process import blender_process
 from ltsh_addon.pipeline import PictureOptions, compare_scene, shade_scene
 from ltsh_addon.scene import Cancelled
 
@@ -83,7 +83,6 @@ OPERATIONS = {
     "cancelled before it writes": (lambda path: compare_scene(options(path), stop_at("write")), Cancelled),
     "an exception in the middle": (lambda path: compare_scene(options(path), fail_at("Cycles A")), RuntimeError),
     "an unknown camera": (lambda path: shade_scene(options(path, camera="Nobody")), blender_process.SceneError),
-    "building the example": (lambda path: client.build_demo(path.with_name("demo.blend")), None),
 }
 
 
@@ -100,7 +99,7 @@ def test_the_session_and_the_file_stay_as_they_are(tmp_path, capsys, name):
     capsys.readouterr()
     assert datablock_hash.session_state() == before
     assert (path.read_bytes(), path.stat().st_mtime_ns) == (content, time)
-    assert {entry.name for entry in tmp_path.iterdir()} <= {path.name, "out", "demo.blend"}
+    assert {entry.name for entry in tmp_path.iterdir()} <= {path.name, "out"}
 
 
 def test_unsaved_changes_stay_in_the_session_and_out_of_the_result(tmp_path):

@@ -73,9 +73,10 @@ def test_a_full_disk_is_one_line_and_no_half_file(child, room, small_disk, capsy
 @pytest.mark.parametrize("kept", [True, False])
 def test_a_folder_that_vanishes_meanwhile(child, room, tmp_path, capsys, monkeypatch, kept):
     """It is made again where it may be, else named: something else has its name now."""
-    from ltsh_addon.blender.process import client
+    from ltsh_addon.blender.process import pixels
+    from ltsh_addon.blender.process.pixels import extract_pixels
 
-    extract, out = client.extract, tmp_path / "out"
+    extract, out = extract_pixels, tmp_path / "out"
 
     def vanishing(*arguments, **options):
         found = extract(*arguments, **options)
@@ -84,7 +85,7 @@ def test_a_folder_that_vanishes_meanwhile(child, room, tmp_path, capsys, monkeyp
             out.write_text("mine")
         return found
 
-    monkeypatch.setattr(client, "extract", vanishing)
+    monkeypatch.setattr(pixels, "extract_pixels", vanishing)
     code = cli.main(["compare", str(room), "-o", str(out), "--quiet", "--techniques", "ltc"])
     said = capsys.readouterr().err
     if kept:

@@ -12,7 +12,7 @@ import pytest
 import scene_parts
 from kills import children, is_running
 
-from ltsh_addon.blender.process.client import ExtractOptions, extract
+from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels
 from ltsh_addon.scene import Cancelled
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -42,19 +42,27 @@ def test_everything_comes_back_and_the_file_stays_as_it_was(tmp_path, temporary_
         assert 0.0 <= fraction <= 1.0
         stages.append(stage)
 
-    found = extract(ExtractOptions(path, cycles_samples=64), progress=progress)
+    found = extract_pixels(PixelJob(path, cycles_samples=64), progress=progress)
     assert list(dict.fromkeys(stages)) == ["open scene", "samples", "Cycles A", "Cycles B"]
     assert (found.film.width, found.film.height, found.film.sub_samples) == (40, 20, 1)
     assert [light.name for light in found.lights] == ["Key"] and found.warnings == ()
     assert len(found.samples) == 800 and np.allclose(found.samples.roughness, 0.4)
-    assert set(found.reference) == {"specular", "diffuse"} and set(found.seconds) == {"start", "samples", "cycles"}
-    for image in found.reference.values():
+    assert set(found.cycles.reference) == {"specular", "diffuse"} and set(found.times.stages) == {
+        "start",
+        "samples",
+        "cycles",
+    }
+    for image in found.cycles.reference.values():
         assert image.shape == (2, 20, 40, 3) and image.dtype == np.float32
-    specular = found.reference["specular"]
+    specular = found.cycles.reference["specular"]
     # Row 0 on top: the light stands at y > 0, seen from above.
     assert specular[:, :10].sum() > specular[:, 10:].sum() > 0.0
     assert 0.0 < np.abs(specular[0] - specular[1]).sum() < 0.2 * specular.sum()
-    assert (found.frame, found.camera, found.blender_version) == (1, "Camera", bpy.app.version_string)
+    assert (found.picture.frame, found.picture.camera, found.picture.blender_version) == (
+        1,
+        "Camera",
+        bpy.app.version_string,
+    )
     assert hashlib.sha256(path.read_bytes()).hexdigest() == before and len(bpy.data.objects) == loaded
     assert sorted(entry.name for entry in tmp_path.glob("*.blend*")) == [path.name]
     assert list(temporary_root.glob("ltsh-*")) == []
@@ -62,9 +70,9 @@ def test_everything_comes_back_and_the_file_stays_as_it_was(tmp_path, temporary_
 
 def test_camera_frame_size_and_sub_samples_can_be_chosen(tmp_path):
     path = saved_scene(tmp_path / "scene.blend")
-    found = extract(ExtractOptions(path, width=16, height=12, sub_samples=3, frame=10, camera="Second"))
+    found = extract_pixels(PixelJob(path, width=16, height=12, sub_samples=3, frame=10, camera="Second"))
     assert (found.film.width, found.film.height, found.film.sub_samples) == (16, 12, 3)
-    assert (found.frame, found.camera, found.reference) == (10, "Second", None)
+    assert (found.picture.frame, found.picture.camera, found.cycles.reference) == (10, "Second", None)
     assert len(found.samples) == 3 * 16 * 12 and found.film.coverage().min() == 1.0
     # At frame 10 the second camera is 4 m above the origin.
     view = found.samples.position + found.samples.view * (4.0 / found.samples.view[:, 2:])
@@ -73,7 +81,7 @@ def test_camera_frame_size_and_sub_samples_can_be_chosen(tmp_path):
 
 def test_counts_that_make_no_sense_are_refused_at_once(tmp_path):
     with pytest.raises(ValueError, match="sub_samples is 0"):
-        extract(ExtractOptions(tmp_path / "any.blend", sub_samples=0))
+        extract_pixels(PixelJob(tmp_path / "any.blend", sub_samples=0))
 
 
 def test_cancelling_ends_the_child(tmp_path, temporary_root):
@@ -84,7 +92,7 @@ def test_cancelling_ends_the_child(tmp_path, temporary_root):
         return stage != "Cycles A"
 
     with pytest.raises(Cancelled, match="Cycles A"):
-        extract(ExtractOptions(path, cycles_samples=100000), progress=progress)
+        extract_pixels(PixelJob(path, cycles_samples=100000), progress=progress)
     assert running and not any(is_running(child) for child in running)
     assert list(temporary_root.glob("ltsh-*")) == []
 

@@ -11,10 +11,10 @@ import scene_parts as parts
 from job_window import image_pixels
 
 from ltsh_addon import imaging
-from ltsh_addon.blender.engine import view
+from ltsh_addon.blender.engine import overlay
 from ltsh_addon.blender.ui import comparison, operators, results
 from ltsh_addon.blender.ui import settings as settings_module
-from ltsh_addon.blender.ui.comparison import INK, PLATE
+from ltsh_addon.blender.ui.overlay import INK, PLATE, label_places
 from ltsh_addon.imaging.color import signed_error_colors
 
 HEIGHT, WIDTH = 6, 10
@@ -221,7 +221,7 @@ def test_labels_of_a_picture_stay_where_they_are_seen(corners, places):
     area = SimpleNamespace(
         regions=(window, part("UI", "RIGHT", 610, 20, 200, 600), part("HEADER", "TOP", 10, 580, 800, 40))
     )
-    assert comparison.label_places(corners, area, window, 2.0, 2 if corners[0] < 0.0 else 1) == places
+    assert label_places(corners, area, window, 2.0, 2 if corners[0] < 0.0 else 1) == places
 
 
 def test_results_open_in_an_image_editor_that_is_free(scene):
@@ -300,7 +300,7 @@ def luminance(color):
     return np.dot(linear, (0.2126, 0.7152, 0.0722))
 
 
-@pytest.mark.parametrize("color", [INK, view.CAPTION_COLOR, view.BRIGHTER_COLOR, view.DARKER_COLOR])
+@pytest.mark.parametrize("color", [INK, overlay.CAPTION_COLOR, overlay.BRIGHTER_COLOR, overlay.DARKER_COLOR])
 def test_captions_stand_out_from_their_plates(color):
     """On white pictures, which are the worst; WCAG 2.2, criterion 1.4.3, https://www.w3.org/TR/WCAG22/."""
     behind = PLATE[3] * luminance(PLATE) + (1.0 - PLATE[3])

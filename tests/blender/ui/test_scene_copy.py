@@ -50,7 +50,7 @@ def test_the_preferences_stay_where_the_copy_cannot_be_saved(preferences, tmp_pa
     with pytest.raises(RuntimeError):
         operators.save_scene_copy(tmp_path / "missing" / "copy.blend")
     assert preferences.filepaths.file_preview_type == "CAMERA" and preferences.is_dirty == unsaved
-    assert not comparison._state["kept"]
+    assert not comparison._state["saves_pixels"]
 
 
 def test_pictures_of_results_are_not_made_again(preferences, seen, tmp_path, monkeypatch):

@@ -9,7 +9,7 @@ import gpu
 import pytest
 
 from ltsh_addon import shading
-from ltsh_addon.blender.viewport import lighting, renderer, shaders, surfaces, textures
+from ltsh_addon.blender.viewport import drawing, lighting, pictures, shaders, surfaces, textures
 
 # Vulkan asks for 128 bytes of push constants and 16384 of a uniform buffer, Metal has 16 samplers per stage, and all
 # can draw into 8 textures; Blender's OpenGL path has 31 locations of attributes and varyings.
@@ -42,7 +42,7 @@ def recorded(monkeypatch):
     monkeypatch.setattr(gpu.types, "GPUShaderCreateInfo", lambda: made.append(Recorder()) or made[-1])
     monkeypatch.setattr(gpu.types, "GPUStageInterfaceInfo", Recorder)
     monkeypatch.setattr(gpu.shader, "create_from_info", lambda info: info)
-    monkeypatch.setattr(shaders, "batch_for_shader", lambda *arguments: None)
+    monkeypatch.setattr(drawing, "batch_for_shader", lambda *arguments: None)
 
     def run(function):
         made.clear()
@@ -84,7 +84,7 @@ def test_surfaces_and_pictures_keep_to_the_limits(recorded):
     for outputs in (surfaces.SURFACES, surfaces.NORMALS, surfaces.REBOUNDS, surfaces.EMISSION):
         [info] = recorded(lambda outputs=outputs: surfaces._shader(outputs))
         check(info)
-    for info in (*recorded(renderer.PicturePass), *recorded(lighting.HorizonPass)):
+    for info in (*recorded(pictures.PicturePass), *recorded(lighting.HorizonPass)):
         check(info)
     # All values are vec4 or matrices of them, which std140 lays out as arrays of floats are in Python.
     assert 16 * textures.LOOK_SIZE <= BLOCK_BYTES

@@ -27,12 +27,15 @@ from ltsh_addon import imaging
 from ltsh_addon.blender.extract.occluders import collect_occluders
 from ltsh_addon.blender.render_settings import filter_points
 from ltsh_addon.blender.viewport import shadows
+from ltsh_addon.blender.viewport.drawing import read_texture
 from ltsh_addon.blender.viewport.lighting import LightingPass
 from ltsh_addon.blender.viewport.mirror import SceneMirror
-from ltsh_addon.blender.viewport.renderer import CENTERS, ShownPicture, ViewRenderer, is_equal
-from ltsh_addon.blender.viewport.shadows import LiveShadows, ShadowRays, too_many
+from ltsh_addon.blender.viewport.pictures import ShownPicture
+from ltsh_addon.blender.viewport.renderer import CENTERS, ViewRenderer
+from ltsh_addon.blender.viewport.shadow_rays import ShadowRays, too_many
+from ltsh_addon.blender.viewport.shadows import LiveShadows
+from ltsh_addon.blender.viewport.static_lighting import is_equal
 from ltsh_addon.blender.viewport.still import view_of_camera
-from ltsh_addon.blender.viewport.textures import read_texture
 from ltsh_addon.scene import Cancelled, Pattern
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -102,6 +105,7 @@ def test_a_view_is_the_picture_of_shade(capsys, tmp_path, count, most):
     bpy.data.images.remove(shown)
 
 
+@pytest.mark.newest
 def test_shadows_of_a_view_are_those_of_shade(capsys, tmp_path):
     with_graphics(lambda: None)
     set_up_scene()
@@ -162,7 +166,7 @@ def test_shadows_that_are_stopped_leave_nothing_of_their_picture():
     """At once, not when Python looks for circles the next time: samples of a window take hundreds of MiB."""
 
     class Picture:
-        def shares(self, progress):
+        def visibility(self, progress):
             raise Cancelled("stopped")
 
     gc.collect()
@@ -298,7 +302,7 @@ def stopped_shares(scene):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(shadows, "BATCH", 1)
             try:
-                places.append(set(request.shares(go_on)))
+                places.append(set(request.visibility(go_on)))
             except Cancelled:
                 places.append(None)
     return places
@@ -323,9 +327,9 @@ def live_pictures():
         partial = stopped_shares(scene)
         scene.drawn(scene.live)
         scene.live.follow((1,), lambda: 1 / 0)
-        scene.live._followed.before = (1,)
+        scene.live._traced_scene.before = (1,)
         scene.live.take_news()
-        scene.live.shares(scene.renderer._surfaces._gbuffer, scene.view, scene.renderer._lights.lights, 0)
+        scene.live.visibility(scene.renderer._surfaces._gbuffer, scene.view, scene.renderer._lights.lights, 0)
         return plain, exact, first, levels, rest, recolored, after_move, partial, scene.live.problem
     finally:
         scene.live.stop()
@@ -557,7 +561,7 @@ def test_shadows_of_a_view_at_rest_get_new_rays_as_its_points_do():
 
 def test_what_helps_to_trace_ends_at_rest_but_not_at_work():
     live, closed, going = LiveShadows(), [], threading.Event()
-    live._followed.tracing = SimpleNamespace(close=lambda: closed.append(True))
+    live._traced_scene.tracing = SimpleNamespace(close=lambda: closed.append(True))
     live.of_glass._thread = threading.Thread(target=going.wait)
     live.of_glass._thread.start()
     try:

@@ -11,16 +11,18 @@ import random_surfaces
 import scene_parts as parts
 from graphics_card import Canvas, edits_with_graphics, with_graphics
 from random_surfaces import EYE
+from uploaded_samples import upload_samples
 
 from ltsh_addon import shading
-from ltsh_addon.blender.process import client
+from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels
+from ltsh_addon.blender.viewport.camera import ViewCamera
+from ltsh_addon.blender.viewport.light_texels import upload_lights
 from ltsh_addon.blender.viewport.lighting import HorizonPass
 from ltsh_addon.blender.viewport.mirror import SceneMirror
-from ltsh_addon.blender.viewport.renderer import ShownPicture, ViewRenderer
-from ltsh_addon.blender.viewport.surfaces import View
-from ltsh_addon.blender.viewport.textures import upload_lights, upload_samples
-from ltsh_addon.cycles.horizons import SMALLEST_ANGLE, horizon_excess, lobe_chances, smooth_share
-from ltsh_addon.cycles.light_tree import chances_of, light_rows, own_bounds
+from ltsh_addon.blender.viewport.pictures import ShownPicture
+from ltsh_addon.blender.viewport.renderer import ViewRenderer
+from ltsh_addon.cycles.horizons import SMALLEST_ANGLE, horizon_excess, lobe_selection_pmf, smooth_horizon_share
+from ltsh_addon.cycles.light_tree import light_bounds_at, light_tree_rows, selection_pmf
 from ltsh_addon.scene import SurfaceSamples
 
 WIDTH, HEIGHT = 32, 16
@@ -39,18 +41,18 @@ def read(texture):
 
 def chances_in_one_leaf(position, normal, lights):
     """Those of lights, which the card takes for one leaf of the tree."""
-    return chances_of(own_bounds(position, normal, lights, light_rows(lights)))
+    return selection_pmf(light_bounds_at(position, normal, lights, light_tree_rows(lights)))
 
 
 def shares(samples, lights, threshold=0.5):
     """Shares (P,) of the lobes that end at the smooth horizon; a mask (P,) of samples for which neither rounding can
     turn the choice at the `threshold` nor no light is between the horizons."""
-    of_lobes = lobe_chances(samples, np.arange(len(samples)), False)
+    of_lobes = lobe_selection_pmf(samples, np.arange(len(samples)), False)
     choose = partial(chances_in_one_leaf, lights=lights)
     by_lobe, by_light = horizon_excess(samples, lights, of_lobes, choose, is_quick=True)
     # Of what is between the horizons where they cross, one part may cancel the other.
     is_sum = np.abs(by_lobe + by_light) >= TIE * (np.abs(by_lobe) + np.abs(by_light))
-    share = smooth_share(by_lobe, by_light)
+    share = smooth_horizon_share(by_lobe, by_light)
     return share, is_sum & (np.abs(share - threshold) >= TIE), by_lobe + by_light != 1.0
 
 
@@ -72,7 +74,6 @@ def chosen(kind, count, threshold):
     horizons = HorizonPass()
     texture = horizons.draw(upload_samples(samples, WIDTH), upload_lights(lights), (*EYE, 1.0), threshold)
     found = read(texture)[:, :3]
-    horizons.free()
     return found, samples, lights
 
 
@@ -135,7 +136,9 @@ def drawn(camera):
     depsgraph = bpy.context.evaluated_depsgraph_get()
     mirror, renderer, canvas = SceneMirror(), ViewRenderer(), Canvas(*SIZE)
     mirror.sync(depsgraph)
-    view = View.of(camera.matrix_world.inverted(), camera.calc_matrix_camera(depsgraph, x=SIZE[0], y=SIZE[1]), False)
+    view = ViewCamera.of(
+        camera.matrix_world.inverted(), camera.calc_matrix_camera(depsgraph, x=SIZE[0], y=SIZE[1]), False
+    )
     pictures = {}
     try:
         for technique in ("ltc", "ltsh2", "ltsh4", "ltsh4c"):
@@ -169,7 +172,7 @@ def test_lobes_of_a_coarse_smooth_mesh_end_where_those_of_numpy_do(tmp_path):
     # The samples of the viewport are those that Cycles takes of the saved file, but for edges of faces.
     path = tmp_path / "sphere.blend"
     bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
-    found = client.extract(client.ExtractOptions(scene=path))
+    found = extract_pixels(PixelJob(scene=path))
     row, column = np.divmod(found.film.pixel, SIZE[0])
     place = np.full(SIZE[0] * SIZE[1], -1)
     place[pixel] = np.arange(len(pixel))

@@ -13,12 +13,12 @@ from view_pictures import SIZE, viewport_picture
 from ltsh_addon import shading
 from ltsh_addon.blender.lights.emission import nodes_as_text
 from ltsh_addon.blender.lights.textures import ShownTextures
-from ltsh_addon.blender.process import client
-from ltsh_addon.blender.viewport import mirror
-from ltsh_addon.blender.viewport.mirror import strongest, view_lights
+from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels
+from ltsh_addon.blender.viewport.lights import NOT_YET, no_patterns, strongest, view_lights
+from ltsh_addon.blender.viewport.live_cycles import LiveNodeLights
 
 
-def seen(patterns=mirror.no_patterns):
+def seen(patterns=no_patterns):
     """The lights, and all notes as one text."""
     bpy.context.view_layer.update()
     graph = bpy.context.evaluated_depsgraph_get()
@@ -186,9 +186,9 @@ def test_windows_get_the_patterns_of_lights_from_a_second_blender(tmp_path):
     parts.add_camera()
     # The power of a frame is not that of the nodes.
     striped.data.keyframe_insert("energy", frame=1)
-    lamps = mirror.LiveLamps()
+    lamps = LiveNodeLights()
     lights, notes = seen(lamps.pattern)
-    assert [light.pattern for light in lights] == 3 * [None] and notes.count(mirror.NOT_YET) == 3 and lamps.is_busy
+    assert [light.pattern for light in lights] == 3 * [None] and notes.count(NOT_YET) == 3 and lamps.is_busy
     wait_for(lamps)
     lights, notes = seen(lamps.pattern)
     expected = {light.name: light for light in parts.prepare()[2].lights}
@@ -226,19 +226,20 @@ def test_windows_get_the_patterns_of_lights_from_a_second_blender(tmp_path):
     assert "Library" in notes and "lamps.blend" in notes and not lamps.is_busy
 
 
+@pytest.mark.newest
 def test_a_light_that_changes_meanwhile_is_looked_at_again_and_nobody_waits_in_vain(temporary_root):
     parts.empty_scene()
     tree = add_bulb("Striped", "POINT", stripes)[1]
     wave = next(node for node in tree.nodes if node.bl_idname == "ShaderNodeMath")
-    lamps = mirror.LiveLamps()
+    lamps = LiveNodeLights()
 
     def begun():
         seen(lamps.pattern)
         end = time.monotonic() + 30.0
-        while lamps._look is None and time.monotonic() < end:
+        while lamps._job is None and time.monotonic() < end:
             lamps.step(1)
             time.sleep(0.02)
-        return lamps._look
+        return lamps._job
 
     begun()
     wave.inputs[1].default_value = 0.5
@@ -281,7 +282,7 @@ def test_windows_show_what_depends_on_the_place_and_patterns_of_area_lights():
     flat = parts.add_area_light("Flat")
     tree, emission = light_tree(flat)
     tree.links.new(cloud(tree), emission.inputs["Strength"])
-    lamps = mirror.LiveLamps()
+    lamps = LiveNodeLights()
     assert "Flat" in seen(lamps.pattern)[1]
     wait_for(lamps)
 
@@ -371,7 +372,7 @@ def test_lights_of_every_kind_light_the_view_as_numpy_does(tmp_path):
     pictures = with_graphics(lambda: [viewport_picture(camera, name, False) for name in shading.PASSES])
     path = tmp_path / "lights.blend"
     bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
-    found = client.extract(client.ExtractOptions(scene=path))
+    found = extract_pixels(PixelJob(scene=path))
     distance = np.linalg.norm(found.samples.position - np.array(ball.location), axis=1)
     # Away from the edge of the ball and what is hidden behind it, where positions differ by more than a pixel.
     on_ball = np.abs(distance - 0.7) < 0.01

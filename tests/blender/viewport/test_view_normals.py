@@ -8,7 +8,7 @@ from graphics_card import edits_with_graphics, with_graphics
 from view_pictures import COLUMNS, SIZE, away_from_edges, normal_map, sampled_pictures, times_too_far, viewport_picture
 
 from ltsh_addon.blender import evaluated
-from ltsh_addon.blender.process import client
+from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels
 from ltsh_addon.blender.viewport import meshes
 
 # Heights of two quads side by side, neither of them plane.
@@ -51,7 +51,7 @@ def normals_at(mesh, points):
     triangles = np.array([triangle.loops[:] for triangle in mesh.loop_triangles])
     place = np.array([mesh.vertices[index].co[:] for index in vertex], np.float32)
     normal, flat = evaluated.interpolated_normals(mesh, vertex)
-    own, its_normal = meshes.own_normals(mesh, flat, triangles, place, normal)
+    own, its_normal = meshes.non_planar_normals(mesh, flat, triangles, place, normal)
     corner_normals = normal[triangles].astype(np.float64)
     corner_normals[own] = its_normal[:, None]
     found = np.full((len(points), 3), np.nan)
@@ -72,7 +72,7 @@ def test_normals_are_those_that_cycles_interpolates(tmp_path):
     camera.location.x = 0.5 * (len(KINDS) - 1)
     path = tmp_path / "normals.blend"
     bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
-    samples = client.extract(client.ExtractOptions(scene=path)).samples
+    samples = extract_pixels(PixelJob(scene=path)).samples
     column = np.round(samples.position[:, 0]).astype(int)
     for x, ob in enumerate(objects):
         here = (column == x) & (np.abs(samples.position[:, 0] - x) < 0.47) & (np.abs(samples.position[:, 1]) < 0.47)

@@ -11,6 +11,7 @@ from graphics_card import with_graphics
 
 from ltsh_addon import imaging
 from ltsh_addon.blender.viewport import sky
+from ltsh_addon.blender.viewport.live_cycles import LiveWorld
 from ltsh_addon.cycles.environment import CUBE, SkyPicture
 
 SIZE = (64, 48)
@@ -67,7 +68,7 @@ def set_up_scene(add_world):
     [
         (add_constant, "on", 0.05, 2.0 * SEEN),
         (add_constant, "off", 0.012, 2.0 * SEEN),
-        (add_gradient, "off", 0.02, SEEN),
+        pytest.param(add_gradient, "off", 0.02, SEEN, marks=pytest.mark.newest),
     ],
 )
 def test_a_view_is_lit_by_the_world_as_pictures_are(capsys, tmp_path, add_world, shadows, most, seen):
@@ -100,7 +101,7 @@ def test_windows_get_the_world_from_a_second_blender(tmp_path, is_linked):
         with bpy.data.libraries.load(str(tmp_path / "library.blend"), link=True, relative=True) as (_, wanted):
             wanted.worlds = [name]
         (world,) = wanted.worlds
-    live = sky.LiveWorld()
+    live = LiveWorld()
     assert live.look(world) is None and live.is_busy
     end, found = time.monotonic() + 60.0, None
     while found is None and time.monotonic() < end:

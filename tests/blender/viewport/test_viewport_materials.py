@@ -20,15 +20,24 @@ from view_pictures import (
 )
 
 from ltsh_addon import shading
-from ltsh_addon.blender.engine import view
+from ltsh_addon.blender.engine.overlay import (
+    LIGHTS_PANEL,
+    MATERIALS_PANEL,
+    SHARES,
+    QuietLine,
+    left_out,
+    share_of_size,
+    wrapped,
+)
 from ltsh_addon.blender.lights.world import light_of_world
 from ltsh_addon.blender.materials import looks
 from ltsh_addon.blender.materials.looks import look_of
 from ltsh_addon.blender.ui import panels
+from ltsh_addon.blender.viewport.camera import ViewCamera
 from ltsh_addon.blender.viewport.mirror import SceneMirror, ShownLook
-from ltsh_addon.blender.viewport.renderer import ShownPicture, ViewRenderer
+from ltsh_addon.blender.viewport.pictures import ShownPicture
+from ltsh_addon.blender.viewport.renderer import ViewRenderer
 from ltsh_addon.blender.viewport.sky import constant_sky
-from ltsh_addon.blender.viewport.surfaces import View
 
 RED, GOLD, AMBER = (0.6, 0.25, 0.1, 1.0), (0.9, 0.7, 0.3, 1.0), (0.9, 0.6, 0.3, 1.0)
 TINT = (0.2, 0.4, 0.6, 1.0)
@@ -364,27 +373,34 @@ def test_one_line_says_what_a_view_leaves_out(glass, shadows, world, text):
     shown = look_of(made("Pane", "BsdfGlass" if glass else "BsdfDiffuse", {})())
     mirror._looks = {"Pane": ShownLook(shown, None)}
     scene = SimpleNamespace(ltsh=SimpleNamespace(shadows=shadows), ltsh_view=SimpleNamespace(world=world))
-    assert view.left_out(mirror, scene) == view.QuietLine(text, view.MATERIALS)
+    assert left_out(mirror, scene) == QuietLine(text, MATERIALS_PANEL)
     # Where nothing but lights is approximated, a click shows the lights.
     mirror._light_notes = ("Lamp: its nodes are not resolved",)
-    assert view.left_out(mirror, scene).panel == view.LIGHTS
+    assert left_out(mirror, scene).panel == LIGHTS_PANEL
     mirror._looks["Pane"] = ShownLook(replace(shown, notes=("Pane: odd",)), None)
-    assert view.left_out(mirror, scene).panel == view.MATERIALS
-    assert {view.LIGHTS, view.MATERIALS} <= {panel.bl_idname for panel in panels.CLASSES if hasattr(panel, "bl_idname")}
+    assert left_out(mirror, scene).panel == MATERIALS_PANEL
+    assert {LIGHTS_PANEL, MATERIALS_PANEL} <= {
+        panel.bl_idname for panel in panels.CLASSES if hasattr(panel, "bl_idname")
+    }
 
 
 def test_long_lines_of_the_view_are_broken():
     text = "Marble: Base Color is not resolved, because a texture of noise feeds it"
-    lines = view.wrapped([(text, "red"), ("short", "blue")], 200.0, lambda part: 6.0 * len(part))
+    lines = wrapped([(text, "red"), ("short", "blue")], 200.0, lambda part: 6.0 * len(part))
     assert lines[-1] == ("short", "blue") and len(lines) > 2
     assert all(6.0 * len(part) <= 200.0 for part, _ in lines)
     assert " ".join(part.strip() for part, color in lines if color == "red") == text
     # Between a toolbar and a sidebar of twice the scale there may be room for a word alone, or not even for that.
     narrow = [("No bounces", "red")]
-    assert view.wrapped(narrow, 110.0, lambda part: 15.0 * len(part)) == [("No", "red"), ("bounces", "red")]
-    assert [part for part, _ in view.wrapped(narrow, 50.0, lambda part: 15.0 * len(part))] == ["No", "bou", "nce", "s"]
+    assert wrapped(narrow, 110.0, lambda part: 15.0 * len(part)) == [("No", "red"), ("bounces", "red")]
+    assert [part for part, _ in wrapped(narrow, 50.0, lambda part: 15.0 * len(part))] == [
+        "No",
+        "bou",
+        "nce",
+        "s",
+    ]
     # What counts is how wide the letters are.
-    wide = view.wrapped([("ill ill ill WWW WWW WWW", "red")], 60.0, lambda part: sum(3 + 9 * (c == "W") for c in part))
+    wide = wrapped([("ill ill ill WWW WWW WWW", "red")], 60.0, lambda part: sum(3 + 9 * (c == "W") for c in part))
     assert [part for part, _ in wide] == ["ill ill ill", "WWW", "WWW", "WWW"]
 
 
@@ -395,10 +411,10 @@ def test_text_of_views_narrower_than_a_word_is_smaller(width, share):
     def width_of(text, share):
         return 15.0 * share * len(text)
 
-    assert view.share_of_size(lines[:1], width, 24.0, width_of) == share
-    if share > view.SHARES[-1]:
+    assert share_of_size(lines[:1], width, 24.0, width_of) == share
+    if share > SHARES[-1]:
         free = width - 2.0 * share * 24.0
-        parts = view.wrapped(lines, free, lambda text: width_of(text, share))
+        parts = wrapped(lines, free, lambda text: width_of(text, share))
         assert "bounces" in {part.split()[-1] for part, _ in parts}
         assert all(width_of(part, share) <= free for part, _ in parts)
 
@@ -465,7 +481,7 @@ def test_an_image_that_shines_is_seen_and_lights_nothing():
             mirror.sync(depsgraph)
             projection = camera.calc_matrix_camera(depsgraph, x=SIZE[0], y=SIZE[1])
             shown = ShownPicture("ltsh4", "combined", "single", "ltc", 0.5, 1.0, 1.0, False)
-            view = View.of(camera.matrix_world.inverted(), projection, True)
+            view = ViewCamera.of(camera.matrix_world.inverted(), projection, True)
             for _ in range(2):
                 renderer.draw(mirror, view, SIZE, shown, canvas.buffer, np.zeros((2, 2)))
             return canvas.read()[..., :3], mirror.lights, mirror.notes
@@ -524,7 +540,7 @@ def test_glass_shows_what_is_behind_tinted_and_the_reflection_before_it(kind):
         mirror, renderer, canvas = SceneMirror(), ViewRenderer(), Canvas(*SIZE)
         try:
             mirror.sync(depsgraph)
-            view = View.of(
+            view = ViewCamera.of(
                 camera.matrix_world.inverted(), camera.calc_matrix_camera(depsgraph, x=SIZE[0], y=SIZE[1]), True
             )
             pictures = []

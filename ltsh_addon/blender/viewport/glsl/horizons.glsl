@@ -91,7 +91,7 @@ vec2 cosines_of_sums(vec2 first, float second, float sign)
     return first * second - sign * sqrt(max(1.0 - first * first, 0.0) * max(1.0 - second * second, 0.0));
 }
 
-/* The upper and the lower bound of the light that a light sends to the pixel, as `light_tree.light_bounds`, and whether
+/* The upper and the lower bound of the light that a light sends to the pixel, as `light_tree.light_bounds_at`, and whether
    it sends any. */
 vec3 bounds(seen_light light, vec3 smooth_normal)
 {
@@ -122,10 +122,10 @@ void main()
 {
     ivec2 texel = ivec2(gl_FragCoord.xy);
     vec3 position = texelFetch(positions, texel, 0).xyz;
-    int end = has_two_horizons(texel) ? place.y : 0;
+    int end = has_two_horizons(texel) ? draw_range.y : 0;
     vec3 smooth_normal = texelFetch(smooth_normals, texel, 0).xyz;
     vec3 total = vec3(0.0);
-    for (int i = place.x; i < end; ++i) {
+    for (int i = draw_range.x; i < end; ++i) {
         seen_light light = light_from(i, position, smooth_normal);
         total += bounds(light, smooth_normal);
     }
@@ -269,21 +269,21 @@ void main()
     vec3 third = vec3(1.0 / 3.0);
     vec4 means = vec4(dot(texelFetch(f0s, texel, 0).xyz, third), dot(texelFetch(f90s, texel, 0).xyz, third),
         dot(texelFetch(dielectric_weights, texel, 0).xyz, third), max(base.w, 1.0));
-    /* As `horizons.lobe_chances` of a single sample. */
+    /* As `horizons.lobe_selection_pmf` of a single sample. */
     vec2 chances = vec2(reflectance(means, clamp(dot(bent.xyz, towards_eye), 0.0, 1.0)), dot(base.xyz, third));
     chances /= max(chances.x + chances.y, 1e-12);
-    int count = has_two_horizons(texel) ? place.y - place.x : 0;
+    int count = has_two_horizons(texel) ? draw_range.y - draw_range.x : 0;
     /* A bit for each light that matters. Software renderers execute both sides of a branch for every light, so the
        lights that matter have a loop of their own. */
     uint left = 0u;
     int number = 0;
     do {
-        seen_light light = light_from(place.x + number, position, smooth_normal);
+        seen_light light = light_from(draw_range.x + number, position, smooth_normal);
         left |= number < count && crosses(light, smooth_normal, true_normal) ? 1u << uint(number) : 0u;
     } while (++number < count);
     vec2 excess = vec2(0.0);
     do {
-        seen_light light = light_from(place.x + (left != 0u ? findLSB(left) : 0), position, smooth_normal);
+        seen_light light = light_from(draw_range.x + (left != 0u ? findLSB(left) : 0), position, smooth_normal);
         vec3 own = bounds(light, smooth_normal);
         float by_least = all_bounds.y > 0.0 ? own.y / all_bounds.y : own.z / max(all_bounds.z, 1.0);
         float density = 0.5 * (own.x / max(all_bounds.x, 1e-30) + by_least) / max(solid_angle(light), 1e-12);

@@ -1,5 +1,5 @@
 #ifdef LTSH_SHADOWED
-/* The four texels of the grid of shares around a point, and their weights. Texels of the point's own surface weigh
+/* The four texels of the grid of visibility around a point, and their weights. Texels of the point's own surface weigh
    most. */
 struct ltsh_nearby { ivec2 first; ivec2 last; vec4 weights; };
 
@@ -30,10 +30,10 @@ ltsh_nearby ltsh_grid_at(ltsh_point point)
 /* The specular and the diffuse share of a light that are seen; 1 without texels around the point. */
 vec2 ltsh_seen(ltsh_nearby near, int light)
 {
-    vec2 seen = near.weights.x * texelFetch(shares, ivec3(near.first, light), 0).xy
-              + near.weights.y * texelFetch(shares, ivec3(near.last.x, near.first.y, light), 0).xy
-              + near.weights.z * texelFetch(shares, ivec3(near.first.x, near.last.y, light), 0).xy
-              + near.weights.w * texelFetch(shares, ivec3(near.last, light), 0).xy;
+    vec2 seen = near.weights.x * texelFetch(visibility, ivec3(near.first, light), 0).xy
+              + near.weights.y * texelFetch(visibility, ivec3(near.last.x, near.first.y, light), 0).xy
+              + near.weights.z * texelFetch(visibility, ivec3(near.first.x, near.last.y, light), 0).xy
+              + near.weights.w * texelFetch(visibility, ivec3(near.last, light), 0).xy;
     return dot(near.weights, vec4(1.0)) > 0.0 ? seen : vec2(1.0);
 }
 #endif
@@ -109,7 +109,7 @@ vec4 ltsh_limited(vec4 values, ltsh_point point, ltsh_light light, int header, v
 
 void main()
 {
-    ivec2 texel = ivec2(gl_FragCoord.xy) - place.xy;
+    ivec2 texel = ivec2(gl_FragCoord.xy);
     vec4 position = texelFetch(positions, texel, 0);
     vec4 normal = texelFetch(normals, texel, 0);
     vec4 base = texelFetch(bases, texel, 0);
@@ -161,14 +161,14 @@ void main()
 #ifdef LTSH_SHADOWED
     ltsh_nearby near = ltsh_grid_at(point);
 #endif
-    int count = here ? place.w - place.z : 0;
+    int count = here ? draw_range.y - draw_range.x : 0;
     ltsh_todo nothing = ltsh_todo(0u, 0u, 0u, 0u, 0u, 0u);
 #ifdef LTSH_SPECULAR
     {
     ltsh_todo todo = nothing;
     int number = 0;
     do {
-        int header = ltsh_header(place.z + number);
+        int header = ltsh_header(draw_range.x + number);
         ltsh_light light = ltsh_seen_light(header, point);
         bool shines = number < count && glossy && (light.flags & LTSH_SPECULAR_FLAG) != 0;
         shines = shines && ltsh_receives(header, light, point);
@@ -190,7 +190,7 @@ void main()
         factor = ltsh_emission_at_center(header, point, light);
 #endif
 #ifdef LTSH_SHADOWED
-        factor *= ltsh_seen(near, place.z + number).x;
+        factor *= ltsh_seen(near, draw_range.x + number).x;
 #endif
         vec3 reflected = factor * ltsh_reflected(point, values) * ltsh_light_texel(header + 4).xyz;
         radiance += is_point ? reflected : vec3(0.0);
@@ -205,7 +205,7 @@ void main()
     uint caps = 0u;
     int number = 0;
     do {
-        int header = ltsh_header(place.z + number);
+        int header = ltsh_header(draw_range.x + number);
         ltsh_light light = ltsh_seen_light(header, point);
         bool lights_up = number < count && (light.flags & LTSH_DIFFUSE_FLAG) != 0;
         lights_up = lights_up && ltsh_receives(header, light, point);
@@ -217,7 +217,7 @@ void main()
         todo = ltsh_todo_with(todo, number, used && !(is_cap && is_even), light, sight.whole, sight.size);
         float form_factor = diffuse_of_cap(matte, light);
 #ifdef LTSH_SHADOWED
-        form_factor *= ltsh_seen(near, place.z + number).y;
+        form_factor *= ltsh_seen(near, draw_range.x + number).y;
 #endif
         vec3 reflected = form_factor * base.xyz * ltsh_light_texel(header + 4).xyz;
         radiance += is_cap && is_even ? reflected : vec3(0.0);
@@ -230,10 +230,10 @@ void main()
     /* The world's light is added in the draw call of the first lights. */
     vec4 mean = texelFetch(sky, ivec2(0, 0), 0);
     vec4 traits = texelFetch(sky, ivec2(1, 0), 0);
-    if (here && place.z == 0) {
+    if (here && draw_range.x == 0) {
         vec2 open = vec2(1.0);
 #ifdef LTSH_SHADOWED
-        open = ltsh_seen(near, textureSize(shares, 0).z - 1);
+        open = ltsh_seen(near, textureSize(visibility, 0).z - 1);
 #endif
 #ifdef LTSH_SPECULAR
         if (glossy && traits.x > 0.0) {

@@ -293,8 +293,34 @@ def _build(command, source: str, path: Path) -> Path:
     path.write_text(source, encoding="ascii")
     library = path.with_suffix(".so")
     done = subprocess.run(
-        [*command, "-O1", "-shared", "-fPIC", str(path), "-o", str(library), "-lm"],
+        [*command, "-O0", "-shared", "-fPIC", str(path), "-o", str(library), "-lm"],
         capture_output=True, text=True, check=False, timeout=600,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return library
+
+
+def points(count: int, seed: int, lowest_roughness=0.0):
+    """cos_theta_o and roughness, float32, some of them at the ends of the range."""
+    generator = np.random.default_rng(seed)
+    cosine, roughness = generator.random(count), lowest_roughness + (1.0 - lowest_roughness) * generator.random(count)
+    cosine[:4], roughness[4:8] = (0.0, 1.0, 1e-3, 1.0 - 1e-6), (1.0, lowest_roughness, 1.0, lowest_roughness)
+    return cosine.astype(np.float32), roughness.astype(np.float32)
+
+
+def random_polygons(count: int, corners: int, seed: int) -> np.ndarray:
+    """Planar convex polygons (count, corners, 3) of any winding, float32, about half of them cut by the horizon.
+
+    Their planes keep a distance from the origin: else clipping makes edges that are half circles up to rounding, and no
+    float32 formula knows their direction.
+    """
+    generator = np.random.default_rng(seed)
+    tries = 4 * count
+    center = generator.normal(size=(tries, 1, 3))
+    center[..., 2] = generator.uniform(-0.3, 1.2, (tries, 1))
+    angle = np.sort(generator.random((tries, corners)) * 2.0 * np.pi, axis=1)[..., None]
+    first, second = generator.normal(size=(2, tries, 1, 3))
+    normal = np.cross(first, second)[:, 0]
+    distance = np.abs((normal * center[:, 0]).sum(axis=1)) / np.linalg.norm(normal, axis=1)
+    polygons = center + np.cos(angle) * first + np.sin(angle) * second
+    return polygons[distance > 0.2][:count].astype(np.float32)

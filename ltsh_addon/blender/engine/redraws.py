@@ -1,0 +1,122 @@
+"""When views are drawn again: while they are refined, and when shadows, worlds or lights have new results."""
+
+from __future__ import annotations
+
+import time
+import weakref
+
+import bpy
+
+from ..viewport.live_cycles import LiveNodeLights
+
+# Points of a pixel of which a view at rest is the mean.
+REFINEMENTS = 64
+# For so long nothing may change before a view is refined; and drawing that takes longer makes pauses.
+REST_SECONDS, LONGEST_REST = 0.25, 1.0
+QUICK_SECONDS = 0.03
+POLL_SECONDS = 0.05
+# After so long without new shadows the processes end that help to trace them.
+IDLE_SECONDS = 60.0
+# All views, their shadows, and what they know of lights with nodes.
+open_views: weakref.WeakSet = weakref.WeakSet()
+live_shadows: weakref.WeakSet = weakref.WeakSet()
+node_lights = LiveNodeLights()
+# Moments as `time.monotonic` has them: the next redraw of views at rest, the end of their last one, and the end of the
+# last drawing of any view.
+moments = {"next": 0.0, "refined": 0.0, "drawn": 0.0}
+
+
+def redraw_later(start: float, samples: int) -> None:
+    """Let all views be drawn again that can be refined. The drawing began at `start`; where it took long, the window
+    answers as long before the next one, and a view must have come to rest first."""
+    now = time.monotonic()
+    took = now - start
+    if samples > 1:
+        # What the card did after the call is in the time by which this one came late.
+        took = max(took, start - max(moments["next"], moments["refined"]))
+        wait = took if took > QUICK_SECONDS else 0.0
+    else:
+        # The first one of all compiles shaders.
+        wait = min(max(REST_SECONDS, 2.0 * took), LONGEST_REST)
+    moments["refined"] = now
+    redraw_at(now + wait)
+
+
+def redraw_at(moment: float) -> None:
+    """Let all views be drawn again at the `moment`."""
+    moments["next"] = moment
+    _start(redraw, max(moment - time.monotonic(), 0.0))
+
+
+def redraw() -> float | None:
+    """The timer of `redraw_at`: the seconds until it must be called again."""
+    remaining = moments["next"] - time.monotonic()
+    if remaining > 0.0:
+        return remaining
+    tag_views()
+    return None
+
+
+def watch() -> None:
+    """Draw views again when results come in that are on their way now."""
+    if any(shadows.is_busy for shadows in live_shadows):
+        _start(_watch_shadows, POLL_SECONDS)
+    if node_lights.is_busy or any(view.waits_for_world for view in open_views):
+        _start(_watch_cycles, POLL_SECONDS)
+
+
+def _start(timer, seconds: float) -> None:
+    """Call the function `timer` after `seconds`, unless it is going to be called already."""
+    if not bpy.app.timers.is_registered(timer):
+        bpy.app.timers.register(timer, first_interval=seconds)
+
+
+def _watch_shadows() -> float | None:
+    """Draw the views again for which there are new shadows; look again while any are on their way."""
+    if any(shadows.has_news for shadows in live_shadows):
+        # What moves is drawn soon in any case.
+        if time.monotonic() - moments["drawn"] < REST_SECONDS:
+            return POLL_SECONDS
+        tag_views()
+        if bpy.app.timers.is_registered(_end_helpers):
+            bpy.app.timers.unregister(_end_helpers)
+        _start(_end_helpers, IDLE_SECONDS)
+        return None
+    return POLL_SECONDS if any(shadows.is_busy for shadows in live_shadows) else None
+
+
+def _end_helpers() -> None:
+    """End the processes that help to trace shadows."""
+    for shadows in list(live_shadows):
+        shadows.rest()
+
+
+def _watch_cycles() -> float | None:
+    """Show worlds and lights in the views when Cycles has rendered them; look again while any is on its way."""
+    views = list(open_views)
+    news = [view.take_world() for view in views]
+    if views and node_lights.step(bpy.context.scene.frame_current):
+        news.append(True)
+        for view in views:
+            view.mirror.has_old_lights = True
+    if any(news):
+        tag_views()
+    return POLL_SECONDS if any(view.waits_for_world for view in views) or (views and node_lights.is_busy) else None
+
+
+def tag_views() -> None:
+    """Let Blender draw all rendered views again."""
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type == "VIEW_3D" and area.spaces.active.shading.type == "RENDERED":
+                area.tag_redraw()
+
+
+def stop() -> None:
+    """End all timers, and all work for views."""
+    for timer in (redraw, _watch_shadows, _end_helpers, _watch_cycles):
+        if bpy.app.timers.is_registered(timer):
+            bpy.app.timers.unregister(timer)
+    for shadows in live_shadows:
+        shadows.stop()
+    node_lights.stop()

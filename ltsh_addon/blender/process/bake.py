@@ -1,0 +1,99 @@
+"""The jobs of a bake: what there is to bake, its texels, and objects that show textures. Imports no bpy."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from ...files import replacing_by_copy, temporary_folder
+from ...scene import Progress
+from .blend_file import run_scene_job
+from .blender_process import run_job
+
+
+@dataclass(frozen=True)
+class BakeJob:
+    """What to extract from which file for a bake; None means as in the file."""
+
+    scene: Path
+    objects: tuple[str, ...] | str  # names, "selected" or "all"
+    uv: str | None
+    width: int
+    height: int
+    block_rows: int
+    view: tuple[float, float, float] | str  # a position, "camera" or "above"
+    camera: str | None
+    frame: int | None
+    cycles_samples: int
+    passes: tuple[str, ...]  # of Cycles
+    finished: tuple[tuple[str, int], ...] = ()  # (object, tile) that need no maps
+    look_up_images: bool = True  # False: everything that varies is a map
+    following: tuple[str, ...] = ()  # objects of the same file that later jobs need
+    scripts: bool = False  # run the scripts in the file
+    tile: int | None = None  # the only UDIM tile to extract; None: all
+    sub_samples: int = 1  # points of a texel that need maps
+    shadows: str = "off"  # see `pixels.PixelJob`
+
+
+def extract_bake(job: BakeJob, folder: Path, *, progress: Progress | None = None) -> dict:
+    """Write meshes, materials, maps and Cycles' bake of a .blend as files into `folder`; returns the manifest.
+
+    Raises as `pixels.extract_pixels` does.
+    """
+    return run_scene_job(job, folder, progress)
+
+
+@dataclass(frozen=True)
+class BakedTextures:
+    """The baked textures of one object."""
+
+    object: str
+    uv: str  # the UV map on which they lie
+    name: str  # of the image in Blender
+    files: list[dict]  # {"path", "tile"} each
+
+
+@dataclass(frozen=True)
+class ApplyJob:
+    """Save a copy of `scene` as `path`, in which objects show `textures`."""
+
+    scene: Path
+    path: Path
+    textures: list[dict]  # fields of `BakedTextures`
+
+
+def apply_bake(
+    scene: Path, path: Path, textures: list[BakedTextures], *, progress: Progress | None = None
+) -> list[str]:
+    """Save a copy of `scene` as the .blend `path`, in which objects show baked textures; returns warnings.
+
+    The copy appears complete or not at all. Raises as `pixels.extract_pixels` does.
+    """
+    with replacing_by_copy(Path(path).absolute()) as unfinished, temporary_folder() as folder:
+        job = ApplyJob(Path(scene).absolute(), unfinished, [asdict(entry) for entry in textures])
+        return run_job(job, folder, progress)["warnings"]
+
+
+@dataclass(frozen=True)
+class BakeFactsJob:
+    """See `scene_facts`."""
+
+    scene: Path
+    frames: list[int | None]
+    objects: tuple[str, ...] | str | None
+    uv: str | None
+    scripts: bool
+
+
+def scene_facts(
+    scene: Path, frames, objects, uv=None, *, scripts: bool = False, progress: Progress | None = None
+) -> list[dict]:
+    """What there is to bake in each of `frames` (None: the file's own).
+
+    Each entry has "frame", "camera" (name or None), "objects" (names of objects to bake) and "tiles" (the UDIM tiles
+    by object, for objects with several). `objects` are names, "selected", "all", or None for none. `uv` is a UV map;
+    None: the active ones. `scripts`: run those in the file. Raises as `pixels.extract_pixels` does.
+    """
+    job = BakeFactsJob(scene, list(frames), objects, uv, scripts)
+    with temporary_folder() as folder:
+        return run_scene_job(job, folder, progress)["facts"]

@@ -1,0 +1,124 @@
+"""The job of a finished picture: the unchanged scene as Cycles renders it, and its PNG. Imports no bpy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ...cycles.lobes import read_layer
+from ...scene import Progress
+from .blend_file import run_scene_job
+from .blender_process import run_job
+from .pixels import rendered_channels
+
+PICTURE = "picture.npy"
+
+
+@dataclass(frozen=True)
+class FinishedJob:
+    """What Cycles should render of an unchanged scene; None means as in the file."""
+
+    scene: Path
+    frame: int | None
+    camera: str | None
+    scene_name: str | None
+    view_layer: str | None
+    width: int | None
+    height: int | None
+    cycles_samples: int | None
+    seconds: float | None  # processor time, in place of samples
+    scripts: bool = False  # run the scripts in the file
+    edges: bool = True  # also render what emits in sight separately, with smooth edges
+
+
+@dataclass(frozen=True)
+class CyclesPicture:
+    """What Cycles rendered, row 0 on top."""
+
+    channels: dict[str, np.ndarray]  # (H, W) each, by name without that of the view layer
+    guides: dict[str, np.ndarray]  # the channels for the denoiser
+    names: dict[str, str]  # of passes, as in `pass_names`
+    samples: int
+    smooth_emission: dict[str, np.ndarray]  # (H, W, 3) what emits in sight, with smooth edges, by the key of its pass
+    everything: tuple[str, ...]  # reasons why all direct light is left to Cycles
+    warnings: tuple[str, ...]
+    camera: str
+    frame: int
+    processor_seconds: float
+    least_seconds: float  # how many of them every picture of the scene takes
+
+
+def render_finished(job: FinishedJob, folder: Path, *, progress: Progress | None = None) -> CyclesPicture:
+    """The unchanged scene as Cycles renders it. Raises as `pixels.extract_pixels` does."""
+    manifest = run_scene_job(job, folder, progress)
+    channels = _mean_of_chunks(manifest, folder)
+    samples = sum(count for _, count in manifest["files"])
+    dropped = tuple(f"{name}." for name in manifest["dropped"])
+    return CyclesPicture(
+        channels={name: plane for name, plane in channels.items() if not name.startswith(dropped)},
+        guides={name: plane for name, plane in channels.items() if name.startswith("Denoising ")},
+        names=manifest["passes"],
+        samples=samples,
+        smooth_emission=_smooth_emission(manifest, folder, channels, samples),
+        everything=tuple(manifest["everything"]),
+        warnings=tuple(manifest["warnings"]),
+        **{name: manifest[name] for name in ("camera", "frame", "processor_seconds", "least_seconds")},
+    )
+
+
+def _smooth_emission(manifest: dict, folder: Path, channels: dict[str, np.ndarray], samples: int) -> dict:
+    """`CyclesPicture.smooth_emission`: means over the samples of the whole scene and of EDGES; {} without EDGES."""
+    if manifest["edges"] is None:
+        return {}
+    name, most = manifest["edges"]
+    edges = _without_layer(rendered_channels(folder / name), manifest["layer"])
+    count = most * edges["Debug Sample Count.X"][..., None]
+    names = {key: manifest["passes"][key] for key in ("emission", "background")}
+    if manifest["film_transparent"]:
+        del names["background"]
+    return {
+        key: (count * read_layer(edges, name, "RGB") + samples * read_layer(channels, name, "RGB")) / (count + samples)
+        for key, name in names.items()
+    }
+
+
+def _mean_of_chunks(manifest: dict, folder: Path) -> dict[str, np.ndarray]:
+    """The channels: those of light are means over all chunks, all others come from the largest chunk."""
+    files = sorted(manifest["files"], key=lambda item: -item[1])
+    total, channels = sum(count for _, count in files), {}
+    for name, count in files:
+        chunk = _without_layer(rendered_channels(folder / name), manifest["layer"])
+        if not channels:
+            channels = chunk
+            light = [key for key in chunk if key[-2:] in (".R", ".G", ".B", ".A") or key.startswith("Denoising ")]
+            if len(files) > 1:
+                channels |= {key: count / total * chunk[key] for key in light}
+        else:
+            for key in light:
+                channels[key] += count / total * chunk[key]
+    return channels
+
+
+def _without_layer(channels: dict[str, np.ndarray], layer: str) -> dict[str, np.ndarray]:
+    """`channels` by their names without that of the view `layer`."""
+    return {key.removeprefix(f"{layer}."): plane for key, plane in channels.items()}
+
+
+@dataclass(frozen=True)
+class ShowJob:
+    """Write the array `pixels` (H, W, 4) as the PNG `name`, through the view transform of a scene."""
+
+    scene: Path
+    scene_name: str | None  # None: the file's own
+    frame: int | None
+    pixels: Path
+    name: str
+
+
+def show_finished(
+    scene: Path, scene_name: str | None, frame: int | None, folder: Path, name: str, *, progress: Progress | None = None
+) -> None:
+    """Write `PICTURE` (H, W, 4) in `folder` as the PNG `name` beside it; see `ShowJob`."""
+    run_job(ShowJob(Path(scene).absolute(), scene_name, frame, folder / PICTURE, name), folder, progress)

@@ -1,0 +1,275 @@
+"""Worlds and lights with nodes as Cycles sees them: a second Blender looks at them while views go on."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from ...cycles.environment import CUBE, SkyPicture
+from ...files import save_array, temporary_folder
+from ...scene import AreaLight, Cancelled, SceneError, error_line
+from ..lights.emission import ObjectFacts, nodes_as_text, open_studio
+from ..lights.textures import NodeEmission, NodeLight, node_emission
+from ..lights.world import background_pictures, light_of_world, light_pictures
+from ..process import view
+from ..process.view import NODE_LIGHTS, NodeLightFile, NodeLightJob, WorldJob
+from .lights import NOT_RESOLVED, NOT_YET
+from .sky import ShownSky, background_of, coarse, varied_sky
+
+
+@dataclass
+class _LightsJob:
+    """The work of a second Blender that renders the nodes of lights."""
+
+    states: dict[tuple, tuple]  # states by key of the lights without results so far
+    results: list[tuple[tuple, NodeEmission]] = field(default_factory=list)  # with the keys of their lights
+    error: str = ""
+    is_stopped: bool = False
+    thread: threading.Thread | None = None
+
+
+class LiveNodeLights:
+    """The nodes of lights as Cycles sees them, for all windows.
+
+    A second Blender looks at new and changed lights while the views go on. Lights are identified by the `key` of
+    `NodeLight`.
+    """
+
+    def __init__(self):
+        self._known: dict[tuple, tuple[tuple, NodeEmission | str]] = {}  # state of a light's nodes, and the result
+        self._wanted: dict[tuple, tuple] = {}  # states of lights to look at
+        self._sources: dict[tuple, NodeLight] = {}  # the lights of these states
+        self._changed, self._images = 0.0, 0  # time of the last change; counts changes of images
+        self._job: _LightsJob | None = None
+
+    def pattern(self, data, source: NodeLight) -> NodeEmission | str:
+        """The last result for a light, or a note that there is none yet. Requests a new look if the light changed."""
+        key, state = source.key, self._state(data, source)
+        known, result = self._known.get(key, ((), NOT_YET))
+        on_its_way = self._wanted.get(key) or (self._job.states.get(key) if self._job is not None else None)
+        if known == state:
+            self._wanted.pop(key, None)
+        elif on_its_way != state:
+            self._wanted[key], self._sources[key], self._changed = state, source, time.monotonic()
+        return result
+
+    def _state(self, data, source: NodeLight) -> tuple:
+        text = nodes_as_text(data)
+        names = {"AREA": ("shape", "size", "size_y"), "SUN": ("angle",)}.get(data.type, ("use_soft_falloff",))
+        if data.type in ("POINT", "SPOT") and (source.is_mixed or not source.by_ray):
+            names = (*names, "shadow_soft_size")
+        if source.by_spot:
+            names = (*names, "spot_size")
+        where = (source.matrix.tobytes(), source.facts) if source.is_placed else ()
+        images = self._images if "image: " in text else 0
+        return data.type, *(getattr(data, name) for name in names), *source.flags.values(), where, text, images
+
+    def note_images(self) -> None:
+        """Images have changed: look at lights with images again."""
+        self._images += 1
+
+    @property
+    def is_busy(self) -> bool:
+        """True while results are to come."""
+        return bool(self._wanted) or self._job is not None
+
+    def stop(self) -> None:
+        """Drop all requests: nobody waits for results any more."""
+        self._wanted.clear()
+        if self._job is not None:
+            self._job.is_stopped, self._job = True, None
+
+    def step(self, frame: int) -> bool:
+        """Do the next step, in the main thread; True if there is news."""
+        job = self._job
+        if job is None:
+            return bool(self._wanted) and time.monotonic() - self._changed > REST_SECONDS and self._begin(frame)
+        has_ended = not job.thread.is_alive()
+        news = bool(job.results)
+        while job.results:
+            key, result = job.results.pop(0)
+            self._known[key] = job.states.pop(key), result
+        if has_ended:
+            self._job = None
+            for key, state in job.states.items():
+                if job.error:
+                    self._known[key] = state, job.error
+                else:
+                    self._wanted.setdefault(key, state)
+            news |= bool(job.error)
+        # Stop if a light has changed again since.
+        job.is_stopped |= any(key in job.states for key in self._wanted)
+        return news
+
+    def _begin(self, frame: int) -> bool:
+        """Start a second Blender; True if that failed, which is news."""
+        present = {light.session_uid: light for light in bpy.data.lights}
+        self._known = {key: known for key, known in self._known.items() if key[0] in present}
+        job = _LightsJob({key: state for key, state in self._wanted.items() if key[0] in present})
+        self._wanted.clear()
+        if not job.states:
+            return False
+        keys = list(job.states)
+        lights = [present[key[0]] for key in keys]
+
+        def take(number: int, factor: np.ndarray, lost: float) -> bool:
+            job.results.append((keys[number], NodeEmission(factor, lost)))
+            return not job.is_stopped
+
+        def work(folder: Path, paths: list[Path]) -> None:
+            files = [
+                NodeLightFile(str(path), name, source.matrix.tolist(), source.flags, vars(source.facts))
+                for path, name, source in zip(paths, names, sources, strict=True)
+            ]
+            try:
+                view.render_node_lights(files, frame, folder, take)
+            except Cancelled:
+                pass
+            except Exception as error:
+                job.error = f"{NOT_RESOLVED}: {error_line(error)}"
+
+        names, sources = [light.name for light in lights], [self._sources[key] for key in keys]
+        try:
+            job.thread = _start("lamps", lights, work)
+        except (OSError, RuntimeError) as error:
+            self._known.update({key: (job.states[key], f"{NOT_RESOLVED}: {error_line(error)}") for key in keys})
+            return True
+        self._job = job
+        return False
+
+
+# REST_SECONDS: how long worlds and lights must stay unchanged before Cycles looks at them.
+REST_SECONDS = 0.3
+
+
+def _start(name: str, blocks: list, work: Callable[[Path, list[Path]], None]) -> threading.Thread:
+    """A thread that runs `work(folder, paths)` with a temporary folder, and the .blend to load each of `blocks` from.
+
+    Linked data-blocks are in their library. Raises OSError and RuntimeError where the others cannot be written.
+    """
+    stack = ExitStack()
+    with stack:
+        folder = stack.enter_context(temporary_folder())
+        path, local = folder / f"{name}.blend", {block for block in blocks if block.library is None}
+        bpy.data.libraries.write(str(path), local, path_remap="ABSOLUTE", fake_user=True)
+        paths = [path if block in local else Path(bpy.path.abspath(block.library.filepath)) for block in blocks]
+        stack = stack.pop_all()
+
+    def run() -> None:
+        with stack:
+            work(folder, paths)
+
+    thread = threading.Thread(target=run, name=f"LTSH {name}", daemon=True)
+    thread.start()
+    return thread
+
+
+class LiveWorld:
+    """The world as Cycles sees it, for a window: a second Blender renders it while the view goes on."""
+
+    def __init__(self):
+        self._wanted, self._changed = "", 0.0
+        self._of, self._sky = "", None  # the world that was looked at last, and what was found
+        self._thread: threading.Thread | None = None
+        self._outcome: tuple[ShownSky, list[str]] | Exception | None = None
+        self._stopped = threading.Event()
+
+    def stop(self) -> None:
+        """Cancel the work: nobody waits for it any more."""
+        self._wanted = ""
+        self._stopped.set()
+
+    def look(self, world) -> ShownSky | None:
+        """Request a look at a new or changed `world`. Returns its last result; None where there is none."""
+        self._wanted, self._changed = world.name_full, time.monotonic()
+        return self._sky if self._of == self._wanted else None
+
+    @property
+    def is_busy(self) -> bool:
+        """True while a result is to come."""
+        return bool(self._wanted) or self._thread is not None
+
+    def step(self, frame: int) -> tuple[ShownSky | None, list[str]] | None:
+        """Do the next step, in the main thread. Returns the sky that was found and notes about it; None: no news."""
+        if self._thread is not None:
+            return None if self._thread.is_alive() else self._take()
+        if self._wanted and time.monotonic() - self._changed > REST_SECONDS:
+            self._begin(frame)
+        return None
+
+    def _take(self):
+        self._thread, outcome = None, self._outcome
+        if isinstance(outcome, Exception):
+            return None, [f"{self._of}: {error_line(outcome)}"]
+        if self._wanted == self._of:  # it has changed again
+            return None
+        self._sky = outcome[0]
+        return outcome
+
+    def _begin(self, frame: int) -> None:
+        self._of, self._wanted = self._wanted, ""
+        world = next((one for one in bpy.data.worlds if one.name_full == self._of), None)
+        if world is None:
+            return
+        name, like, stopped = world.name, light_of_world(world), self._stopped
+
+        def work(folder: Path, paths: list[Path]) -> None:
+            try:
+                result = view.render_world(WorldJob(paths[0], name, frame), folder, lambda *_: not stopped.is_set())
+                light = [SkyPicture(*axes, one) for axes, one in zip(CUBE, result.light, strict=False)]
+                self._outcome = varied_sky(like, light, result.lights, result.background), result.warnings
+            except Exception as error:
+                self._outcome = error
+
+        self._thread = _start("world", [world], work)
+
+
+def rendered_world(scene, world, warn: Callable) -> tuple[list[SkyPicture], list[AreaLight], np.ndarray]:
+    """The `world` as Cycles renders it: pictures of its light ([] where it is dark), the small bright lights in it, and
+    its background (N, N, 3). `scene` is left as it was."""
+    like, light, lights = light_of_world(world), [], []
+    if like is not None:
+        light, lights = light_pictures(scene, world, like, warn)
+    return [coarse(picture) for picture in light], lights, background_of(background_pictures(scene, world, warn))
+
+
+def render_world(job: WorldJob, folder: Path, progress) -> dict:
+    """Do the `job`: writes pictures into `folder`, returns lights and warnings."""
+    warnings: list[str] = []
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    scene = bpy.context.scene
+    with bpy.data.libraries.load(job.path) as (_, wanted):
+        wanted.worlds = [job.world]
+    (scene.world,) = wanted.worlds
+    scene.frame_set(job.frame)
+    light, lights, background = rendered_world(scene, scene.world, warnings.append)
+    save_array(folder / "light.npy", np.array([picture.radiance for picture in light], np.float32))
+    save_array(folder / "background.npy", background.astype(np.float32))
+    return {"lights": [one.record() for one in lights], "warnings": warnings}
+
+
+def render_node_lights(job: NodeLightJob, folder: Path, progress: Callable) -> dict:
+    """Do the `job`: writes the factors of each light's nodes into `folder`."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    scene, files = bpy.context.scene, [NodeLightFile(**fields) for fields in job.lights]
+    scene.frame_set(job.frame)
+    for number, file in enumerate(files):
+        with bpy.data.libraries.load(file.path) as (there, wanted):
+            if file.name not in there.lights:
+                raise SceneError(f"{file.path}: has no light {file.name!r}")
+            wanted.lights = [file.name]
+        facts = ObjectFacts(**file.facts)
+        source = NodeLight(wanted.lights[0], np.array(file.matrix), facts=facts, **file.flags)
+        with open_studio(scene) as studio:
+            pattern = node_emission(source, studio)
+        save_array(folder / f"{number}.npy", pattern.factor.astype(np.float32))
+        save_array(folder / f"{number}_lost.npy", np.array(pattern.lost))
+        progress(NODE_LIGHTS, (number + 1) / len(files))
+    return {}

@@ -1,0 +1,113 @@
+"""The pictures of a view: sums of samples, and the passes that show, copy and join them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gpu
+
+from ...shading.header import definitions
+from .camera import ViewCamera
+from .drawing import PixelShader, drawing, empty_texture, frame_buffer, glsl, size_of
+
+MODES = ("single", "split", "difference")
+# RAYS: the shader constants with the rays of `ViewCamera.rays`.
+RAYS = ("ray_x", "ray_y", "ray_center")
+
+
+@dataclass(frozen=True)
+class ShownPicture:
+    """Which parts of the lighting are shown, and how."""
+
+    technique: str
+    passes: str  # combined, specular or diffuse
+    mode: str  # of MODES
+    second_technique: str
+    split: float  # place of the line between 0 and 1
+    difference_scale: float
+    exposure: float
+    transparent: bool
+    line_width: float = 1.0
+    second_picture: gpu.types.GPUTexture | None = None  # replaces the second technique's picture; without emission
+    white: float = 1.0  # brightness that shows no difference, before the scene's own exposure
+    also: tuple[tuple[str, str], ...] = ()  # further techniques and passes to draw, for `read`
+    world: bool = True  # show the light of the world
+
+
+class PicturePass:
+    """Draws one or two pictures into the bound frame buffer; needs an active GPU context."""
+
+    def __init__(self):
+        constants = {"mode": "INT", "scales": "VEC4", "opacity": "FLOAT", "white": "FLOAT", "weights": "VEC2"}
+        constants |= dict.fromkeys(RAYS, "VEC4")
+        modes = definitions({mode.upper(): number for number, mode in enumerate(MODES)})
+        source = modes + glsl("octahedron") + glsl("picture")
+        self._shader = PixelShader(source, ("first_picture", "second_picture", "sky"), constants)
+
+    def draw(self, pictures, weights, view: ViewCamera, shown: ShownPicture, background) -> None:
+        """Fill the bound frame buffer, scene-linear, from one or two RGBA textures times their `weights`.
+
+        The weighted alpha is the share of a pixel that shows a surface. `background` is a texture of
+        `sky.background_texels`.
+        """
+        width, height = size_of(pictures[0])
+        is_behind = shown.passes == "combined" and not shown.transparent
+        constants = {
+            "weights": (weights[0], weights[-1]),
+            "mode": MODES.index(shown.mode),
+            "scales": (shown.exposure, shown.difference_scale, shown.split * width, 0.5 * shown.line_width),
+            "opacity": 0.0 if shown.transparent else 1.0,
+            "white": shown.white,
+            **_rays(view, float(is_behind)),
+        }
+        textures = {"first_picture": pictures[0], "second_picture": pictures[-1], "sky": background}
+        with drawing(None, (0, 0, width, height)):
+            self._shader.bind(textures, constants)
+            self._shader.draw()
+
+
+def _rays(view: ViewCamera, is_seen: float) -> dict[str, tuple]:
+    """Values of the constants RAYS; with `is_seen` 0 the background is black."""
+    return {name: (*ray, is_seen) for name, ray in zip(RAYS, view.rays, strict=True)}
+
+
+def copy(shader: PixelShader, picture: gpu.types.GPUTexture, target: gpu.types.GPUFrameBuffer) -> None:
+    """Copy `picture` into `target`, which has its size, by the shader of copy.glsl."""
+    with drawing(target, (0, 0, *size_of(picture))):
+        shader.bind({"picture": picture})
+        shader.draw()
+
+
+class VeilPass:
+    """Draws what is behind glass; needs an active GPU context."""
+
+    def __init__(self):
+        constants = {"is_seen": "FLOAT", **dict.fromkeys(RAYS, "VEC4")}
+        self._shader = PixelShader(glsl("octahedron") + glsl("veil"), ("behind", "left", "glass", "sky"), constants)
+
+    def draw(self, textures: dict[str, gpu.types.GPUTexture], target, view: ViewCamera, is_seen: bool) -> None:
+        """Add the picture of the surfaces, over the background, to `target`, dimmed where there is glass.
+
+        `textures` are `behind`, the picture (RGBA); `left`, the share that glass lets through (RGB); `glass`, its
+        positions; `sky`, the background. Without `is_seen` the background behind glass is black.
+        """
+        with drawing(target, (0, 0, *size_of(textures["behind"])), "ADDITIVE_PREMULT"):
+            self._shader.bind(textures, {"is_seen": float(is_seen), **_rays(view, 1.0)})
+            self._shader.draw()
+
+
+class SampleSum:
+    """A picture that holds the sum of the samples."""
+
+    def __init__(self, size: tuple[int, int]):
+        self.size, self.texture, self._buffers = size, empty_texture(size), {}
+
+    def within(self, mask: gpu.types.GPUTexture | None = None) -> gpu.types.GPUFrameBuffer:
+        """The frame buffer of the picture, with `mask` as its depth buffer."""
+        if mask not in self._buffers:
+            self._buffers[mask] = frame_buffer(self.texture, mask)
+        return self._buffers[mask]
+
+    def clear(self) -> None:
+        """Begin a new sum."""
+        self.texture.clear(format="FLOAT", value=(0.0, 0.0, 0.0, 0.0))

@@ -1,0 +1,125 @@
+"""The visibility of each light at the pixels of a view, traced as for pictures, with the same occluders."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import gpu
+import numpy as np
+
+from ...scene import PASSES, AreaLight, Film
+from ...visibility import Occluders, ShadowSampling, Tracer, open_tracer, visible_shares
+from ...workers.pool import WorkerPool, cores
+from ..extract.occluders import collect_occluders
+from ..lights.world import blocks_nothing
+from ..process.blender_process import embree_libraries
+from .camera import ViewCamera
+from .drawing import float_buffer
+from .gbuffer import GBufferTextures, VisibilityGrid, gbuffer_samples
+
+Lights = Sequence[AreaLight]
+# MOST_BYTES: graphics memory for the visibility of all lights. _LIGHT_BYTES: of a light and a pixel, two half floats.
+MOST_BYTES = 1 << 30
+_LIGHT_BYTES = 4
+
+
+class ViewTracer:
+    """A tracer of occluders, and the pool of this process and a worker that trace with it.
+
+    Positions are relative to an origin near the view, where single precision is best. The origin changes rarely.
+    """
+
+    def __init__(self, occluders: Occluders):
+        self._occluders = occluders
+        self._tracer: Tracer | None = None
+        self.pool: WorkerPool | None = None
+        self._origin = np.zeros(3)
+
+    def around(self, origin: np.ndarray) -> Tracer:
+        """The tracer with positions relative to `origin` (3,). Raises SceneError where Embree is missing."""
+        if self._tracer is None or not np.array_equal(origin, self._origin):
+            matrices = np.array(self._occluders.matrices, np.float64)
+            matrices[:, :, 3] -= origin
+            self._tracer = open_tracer(replace(self._occluders, matrices=matrices), embree_libraries())
+            self.close()
+            self.pool, self._origin = WorkerPool(self._tracer, min(cores(), 2)), np.array(origin)
+        return self._tracer
+
+    def close(self) -> None:
+        """End the worker."""
+        if self.pool is not None:
+            self.pool.close()
+
+
+class ShadowRays:
+    """Traces, at once, the visibility of lights from the pixels of G-buffers past `occluders`.
+
+    A pixel takes at most `rays` rays per light.
+    """
+
+    version, waits, traces_lobes = 0, False, True
+
+    @property
+    def of_glass(self) -> ShadowRays:
+        """The tracer for the glass in front of the surfaces: the same."""
+        return self
+
+    def take_news(self) -> None:
+        """Do nothing: there is never news, because everything is traced at once."""
+
+    def __init__(self, occluders: Occluders, rays: int):
+        self._tracing, self._rays = ViewTracer(occluders), rays
+        self.seconds, self.traced, self.description = 0.0, 0, ""
+        # By pass, summed over all calls: squares of the reflected light of pixels, and of its standard deviation.
+        self._power = {name: np.zeros(2) for name in PASSES}
+
+    def visibility(
+        self, gbuffer: GBufferTextures, view: ViewCamera, lights: Lights, sides: Lights = (), number: int = 0
+    ) -> VisibilityGrid | None:
+        """The visibility of `lights`, and last that of the `sides` of a sky if there are any; None without surfaces or
+        lights. Positions are relative to the origin of `view`. Raises SceneError."""
+        start = time.perf_counter()
+        samples, pixel = gbuffer_samples(gbuffer, view)
+        if not len(samples) or not (lights or sides):
+            return None
+        width, height = gbuffer.size
+        tracer = self._tracing.around(view.origin)
+        film = Film(width, height, pixel)
+        traced = visible_shares(samples, (*lights, *sides), tracer, ShadowSampling(rays=self._rays, film=film))
+        count = len(lights) + bool(sides)
+        values = np.ones((count, height * width, len(PASSES)), np.float32)
+        for index, name in enumerate(PASSES):
+            values[:, pixel, index] = traced.of_lights(name)[:count]
+            for row, of_passes in enumerate((traced.radiance, traced.deviation)):
+                self._power[name][row] += np.square(of_passes[name], dtype=np.float64).sum()
+        self.seconds += time.perf_counter() - start
+        self.traced, self.description = self.traced + traced.rays, tracer.description
+        return VisibilityGrid(visibility_texture(values, gbuffer.size), gbuffer.position, view.projection)
+
+    def noise(self, samples: int) -> dict[str, float]:
+        """Estimated relative L2 error by pass of the shadows in the mean of `samples` pictures."""
+        return {
+            name: float(np.sqrt(variance / max(power, 1e-30) / samples))
+            for name, (power, variance) in self._power.items()
+        }
+
+
+def view_occluders(depsgraph, note: Callable[[str], None]) -> Occluders:
+    """What casts shadows in a view; `note` gets what is approximated."""
+    override = depsgraph.view_layer_eval.material_override
+    return blocks_nothing(collect_occluders(depsgraph, override, note), depsgraph.scene.world)
+
+
+def visibility_texture(values: np.ndarray, size: tuple[int, int]) -> gpu.types.GPUTexture:
+    """Array texture of visibility (L, H W, 2) on pictures of `size`."""
+    return gpu.types.GPUTexture(size, layers=len(values), format="RG16F", data=float_buffer(values))
+
+
+def too_many(lights: int, size: tuple[int, int]) -> str:
+    """Note that the visibility of so many lights does not fit into memory; empty where it does."""
+    needed = lights * size[0] * size[1] * _LIGHT_BYTES
+    if needed <= MOST_BYTES:
+        return ""
+    return f"shadows are not drawn: those of {lights} lights need {needed / 2**30:.1f} GiB of graphics memory"

@@ -18,13 +18,11 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 
 from .reading import check_name
-from .scene import SurfaceSamples
 
 try:
     import fcntl
@@ -91,22 +89,6 @@ def write_bytes(path: str | os.PathLike, data: bytes) -> None:
         temporary.write_bytes(data)
 
 
-def save_samples(samples: SurfaceSamples, path: str | os.PathLike) -> None:
-    """Write a compressed .npz, all or nothing, which `load_samples` reads back bit for bit."""
-    with replacing(path) as temporary, temporary.open("wb") as file:
-        np.savez_compressed(file, **{field.name: getattr(samples, field.name) for field in fields(samples)})
-
-
-def load_samples(path: str | os.PathLike) -> SurfaceSamples:
-    """Read what `save_samples` wrote. Raises OSError, ValueError."""
-    names = [field.name for field in fields(SurfaceSamples)]
-    with np.load(path) as data:
-        missing = [name for name in names if name not in data]
-        if missing:
-            raise ValueError(f"{path}: no surface samples, {', '.join(missing)} missing")
-        return SurfaceSamples(**{name: data[name] for name in names})
-
-
 def check_takes_files(folder: str | os.PathLike) -> None:
     """Create the folder if needed, then create and delete an empty file in it. Raises OSError."""
     check_name(folder)
@@ -120,13 +102,13 @@ def check_takes_files(folder: str | os.PathLike) -> None:
 def no_empty_folder(folder: str | os.PathLike) -> Iterator[None]:
     """Context in which `folder` may be created; if the block raises, the new folder is deleted if it is empty."""
     path = Path(folder).absolute()
-    missing = [part for part in (path, *path.parents) if not os.path.exists(part)]
+    missing = [parent for parent in (path, *path.parents) if not os.path.exists(parent)]
     try:
         yield
     except BaseException:
         with suppress(OSError):
-            for part in missing:
-                part.rmdir()
+            for parent in missing:
+                parent.rmdir()
         raise
 
 
@@ -252,12 +234,12 @@ def _take(lock: int) -> None:
 def _delete_leftovers(folder: Path, prefix: str, suffix: str, flags: int) -> None:
     """Delete what dead processes of this machine left, with what programs added to the names: `prefix...suffix*`."""
     pattern = re.compile(f"({re.escape(prefix)}{MACHINE}-[0-9a-f]{{8}}{re.escape(suffix)}).*")
-    found: dict[Path, list[Path]] = {}
+    leftovers: dict[Path, list[Path]] = {}
     with suppress(OSError), os.scandir(folder) as entries:
         for entry in entries:
             if match := pattern.fullmatch(entry.name):
-                found.setdefault(Path(folder, match[1]), []).append(Path(entry.path))
-    for path, names in found.items():
+                leftovers.setdefault(Path(folder, match[1]), []).append(Path(entry.path))
+    for path, names in leftovers.items():
         lock = None
         # Files stay that are in use, belong to another user, or are on a file system without locks.
         with suppress(OSError):

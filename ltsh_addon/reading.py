@@ -110,62 +110,62 @@ def read_arrays(path: str | os.PathLike, names: Iterable[str]) -> dict[str, np.n
 # The shape of a document:
 
 
-def check(value: Any, shape: Any, place: str = "") -> None:
-    """Raise Malformed, naming the place, if `value` does not have the `shape`, which is one of
+def check(value: Any, shape: Any, entry: str = "") -> None:
+    """Raise Malformed, naming the entry, if `value` does not have the `shape`, which is one of
 
     - a type or several (`int | None`): a value of this type; True is not an int,
     - [shape]: a list of values of this shape,
     - {"key": shape, "other?": shape, str: shape}: a table with "key" and optionally "other"; all other values have the
       shape of `str`, or any shape without it,
     - a tuple: one of its values,
-    - a function check(value, place), which raises Malformed itself.
+    - a function check(value, entry), which raises Malformed itself.
     """
     if isinstance(shape, dict):
-        _expect(value, dict, place)
+        _expect(value, dict, entry)
         missing = [key for key in shape if key is not str and not key.endswith("?") and key not in value]
         if missing:
-            raise Malformed(f"{place or 'the document'} has no {_shown(missing[0])}")
+            raise Malformed(f"{entry or 'the document'} has no {_shown(missing[0])}")
         for key, item in value.items():
             inner = shape.get(key, shape.get(f"{key}?", shape.get(str)))
             if inner is not None:
                 name = shortened(key, 60)
-                check(item, inner, f"{place}.{name}" if place else name)
+                check(item, inner, f"{entry}.{name}" if entry else name)
     elif isinstance(shape, list):
-        _expect(value, list, place)
+        _expect(value, list, entry)
         for number, item in enumerate(value):
-            check(item, shape[0], f"{place}[{number}]")
+            check(item, shape[0], f"{entry}[{number}]")
     elif isinstance(shape, tuple):
         if value not in shape:
-            raise Malformed(f"{place} is {_shown(value)}, expected {' or '.join(map(repr, shape))}")
+            raise Malformed(f"{entry} is {_shown(value)}, expected {' or '.join(map(repr, shape))}")
     elif isinstance(shape, type | UnionType):
-        _expect(value, shape, place)
+        _expect(value, shape, entry)
     else:
-        shape(value, place)
+        shape(value, entry)
 
 
 def some(shape: Any) -> Callable[[Any, str], None]:
     """The shape of a non-empty list or table of this `shape`."""
 
-    def check_some(value, place):
-        check(value, shape, place)
+    def check_some(value, entry):
+        check(value, shape, entry)
         if not value:
-            raise Malformed(f"{place} is empty")
+            raise Malformed(f"{entry} is empty")
 
     return check_some
 
 
-def file_name(value: Any, place: str) -> None:
+def file_name(value: Any, entry: str) -> None:
     """The shape of the name of a file below a folder, without `..`."""
-    _expect(value, str, place)
+    _expect(value, str, entry)
     path = PurePosixPath(value)
     if not path.parts or path.is_absolute() or ".." in path.parts or "\0" in value:
-        raise Malformed(f"{place} is {_shown(value)}, expected a name below the folder")
+        raise Malformed(f"{entry} is {_shown(value)}, expected a name below the folder")
 
 
-def _expect(value, kind, place) -> None:
+def _expect(value, kind, entry) -> None:
     if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
         expected = _NAMES.get(kind) or " or ".join(_NAMES[one] for one in kind.__args__)
-        raise Malformed(f"{place or 'the document'} is {_shown(value)}, expected {expected}")
+        raise Malformed(f"{entry or 'the document'} is {_shown(value)}, expected {expected}")
 
 
 def _shown(value) -> str:
@@ -215,8 +215,8 @@ def _check_contents(document) -> None:
     level = [[document]]
     for _ in range(MOST_LEVELS + 1):
         below = []
-        for part in level:
-            for item in part.values() if isinstance(part, dict) else part:
+        for parent in level:
+            for item in parent.values() if isinstance(parent, dict) else parent:
                 if isinstance(item, dict | list):
                     below.append(item)
                 elif isinstance(item, int) and not INTEGERS[0] <= item <= INTEGERS[1]:
@@ -250,8 +250,8 @@ def _array(archive, entry) -> np.ndarray:
         shape, fortran, dtype = header(file)
         if dtype.hasobject:
             raise Malformed(f"{name} holds Python objects, expected numbers")
-        count, left = math.prod(shape), entry.file_size - file.tell()
-        if min(shape, default=0) < 0 or count * dtype.itemsize != left:
-            raise Malformed(f"{name} has shape {shape} of {dtype}, but {left} bytes")
+        count, size = math.prod(shape), entry.file_size - file.tell()
+        if min(shape, default=0) < 0 or count * dtype.itemsize != size:
+            raise Malformed(f"{name} has shape {shape} of {dtype}, but {size} bytes")
         array = np.frombuffer(file.read(), dtype, count)
     return array.reshape(shape, order="F" if fortran else "C")

@@ -340,8 +340,7 @@ def _disk_lights():
     for number, (center, radius) in enumerate(zip(*_centers_of_disks(), strict=True)):
         across = np.cross(center, [1.0, 0.0, 0.0])
         across *= np.tan(radius) / np.linalg.norm(across)
-        own = {"group": str(number)}
-        yield AreaLight(str(number), "DISK", center, across, np.cross(center, across), -center, np.ones(3), **own)
+        yield AreaLight(str(number), "DISK", center, across, np.cross(center, across), -center, np.ones(3))
 
 
 def _integrals_over_disks(view, tangent, alphas):

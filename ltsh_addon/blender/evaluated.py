@@ -155,15 +155,15 @@ def surface_instancer(instance) -> RenderedSurface | None:
 
 def rendered_surfaces(depsgraph) -> list[RenderedSurface]:
     """Objects with a surface, instances included, each once."""
-    found = {}
+    surfaces = {}
     for instance in depsgraph.object_instances:
         ob = instance.object
         # Hair has the materials of its emitter, which may itself be hidden.
         if ob.type in SURFACE_TYPES and (instance.show_self or instance.show_particles):
             key = (ob.original.name_full, ob.data.name_full if ob.data else "")
-            if key not in found:
-                found[key] = RenderedSurface.of(ob)
-    return list(found.values())
+            if key not in surfaces:
+                surfaces[key] = RenderedSurface.of(ob)
+    return list(surfaces.values())
 
 
 def is_surface(instance) -> bool:

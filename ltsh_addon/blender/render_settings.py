@@ -129,18 +129,19 @@ def render_border(scene) -> Border | None:
     def cut(share, size):
         return int(np.float32(share) * np.float32(size))
 
-    left, right = cut(render.border_min_x, width), cut(render.border_max_x, width)
-    bottom, top = cut(render.border_min_y, height), cut(render.border_max_y, height)
-    if right <= left or top <= bottom:
+    first_column, end_column = cut(render.border_min_x, width), cut(render.border_max_x, width)
+    first_row, end_row = cut(render.border_min_y, height), cut(render.border_max_y, height)
+    columns, rows = max(end_column - first_column, 0), max(end_row - first_row, 0)
+    if not columns or not rows:
         raise SceneError(
-            f"scene {scene.name!r}: its render region is {max(right - left, 0)}x{max(top - bottom, 0)} of "
+            f"scene {scene.name!r}: its render region is {columns}x{rows} of "
             f"{width}x{height} pixels, expected at least one; make it larger or switch it off"
         )
     return Border(
-        left=left,
-        top=height - top,
-        width=right - left,
-        height=top - bottom,
+        left=first_column,
+        top=height - end_row,
+        width=columns,
+        height=rows,
         full_width=width,
         full_height=height,
         cropped=render.use_crop_to_border,
@@ -409,19 +410,19 @@ def without_lights(scene):
 
 def steps_after_rendering(scene) -> list[str]:
     """Warnings about steps after rendering that the scene asks for and that are switched off."""
-    render, found = scene.render, []
+    render, steps = scene.render, []
     if render.use_freestyle:
-        found.append("Freestyle")
+        steps.append("Freestyle")
     if bpy.app.version >= (5, 0, 0):
         tree = scene.compositing_node_group
     else:
         tree = scene.node_tree if scene.use_nodes else None
     if render.use_compositing and tree is not None:
-        found.append(f"compositing by {tree.name!r}")
+        steps.append(f"compositing by {tree.name!r}")
     editor = scene.sequence_editor
     if render.use_sequencer and editor is not None and len(editor.strips):
-        found.append("the video sequencer")
-    return [f"scene {scene.name!r}: {step} is switched off, the passes are as rendered" for step in found]
+        steps.append("the video sequencer")
+    return [f"scene {scene.name!r}: {step} is switched off, the passes are as rendered" for step in steps]
 
 
 GREASE_PENCIL = ("GREASEPENCIL", "GPENCIL")

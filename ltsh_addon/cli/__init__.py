@@ -19,20 +19,15 @@ from ..pipeline.tasks import NameClash
 from ..reading import is_text
 from ..scene import VERSION, Cancelled, SceneError, error_line
 from ..shading import TableError
-from .arguments import Misuse
+from .arguments import Mistakes, Misuse
 from .commands import (
-    add_bake,
-    add_compare,
     add_demo,
+    add_job,
     add_merge,
     add_relight,
-    add_render,
     add_run,
-    add_shade,
     add_tables,
-    add_view,
 )
-from .job_file import Mistakes
 from .progress import ProgressBar, RunLog, print_json, print_out
 
 EXAMPLES = """examples:
@@ -168,15 +163,15 @@ def _parser(program: str) -> tuple[argparse.ArgumentParser, dict[str, argparse.A
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for name, add, meaning in (
         ("demo", add_demo, "write the example scene and run compare on it"),
-        ("compare", add_compare, "techniques beside Cycles: EXR, sheet, report"),
-        ("shade", add_shade, "shade per pixel of the camera"),
-        ("bake", add_bake, "bake lighting and errors into the texels of UV maps"),
-        ("view", add_view, "the viewport's own picture, without a window"),
-        ("render", add_render, "the finished picture: direct light by LTSH, the rest by Cycles, denoised"),
+        ("compare", add_job, "techniques beside Cycles: EXR, sheet, report"),
+        ("shade", add_job, "shade per pixel of the camera"),
+        ("bake", add_job, "bake lighting and errors into the texels of UV maps"),
+        ("view", add_job, "the viewport's own picture, without a window"),
+        ("render", add_job, "the finished picture: direct light by LTSH, the rest by Cycles, denoised"),
         ("relight", add_relight, "other powers and colors of lights in pictures that are there"),
         ("run", add_run, "do the jobs of a file"),
         ("merge", add_merge, "assemble the report of what shards have done"),
         ("tables", add_tables, "fit, validate or export the lookup tables"),
     ):
-        add(commands.add_parser(name, help=meaning))
+        add(commands.add_parser(name, help=meaning), *([name] if add is add_job else []))
     return parser, commands.choices

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
-import math
 import os
 import subprocess
 import sys
@@ -15,14 +14,15 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..files import write_bytes
-from ..pipeline.baseline import Baseline
 from ..pipeline.batch import Merged, merge, run_tasks
-from ..pipeline.options import BakeOptions, PictureOptions, RenderOptions, ViewOptions, options_from, table
-from ..pipeline.picture import prepare
+from ..pipeline.lighting import prepare
+from ..pipeline.options import BakeOptions, PictureOptions, RenderOptions, ViewOptions, options_from, real_number, table
+from ..pipeline.picture import Baseline, with_times
 from ..pipeline.tasks import BatchJob
 from ..scene import SHIPPED_TABLES, SceneError, error_line
 from ..shading import TableError
 from .arguments import (
+    FileJob,
     Misuse,
     add_baseline,
     add_batch,
@@ -30,10 +30,10 @@ from .arguments import (
     add_options,
     add_talk,
     from_text,
+    read_jobs,
     scenes_of,
     with_examples,
 )
-from .job_file import FileJob, read_jobs
 from .progress import print_json, print_out
 
 DEMO_SCENE = Path(__file__).parents[1] / "blender" / "demo.blend"  # docs/demo_scene.py made it
@@ -95,53 +95,37 @@ RENDER_EXAMPLES = """examples:
 """
 
 
-def add_demo(parser) -> None:
-    """`ltsh demo`."""
-    size = {"help": "default: {}x{}".format(*DEMO_RESOLUTION), "default": DEMO_RESOLUTION}
-    with_examples(parser, DEMO, DEMO_EXAMPLES)
-    _add_job(parser, PictureOptions, but=("scene",), resolution=size)
-    parser.set_defaults(run=_demo, scenes=[])
+# JOBS: the options of the commands that make a job, their description and examples, and the options they leave out.
+JOBS = {
+    "demo": (PictureOptions, DEMO, DEMO_EXAMPLES, ("scene",)),
+    "compare": (PictureOptions, COMPARE, COMPARE_EXAMPLES, ()),
+    "shade": (PictureOptions, SHADE, SHADE_EXAMPLES, ("cycles_samples",)),
+    "bake": (BakeOptions, BAKE, BAKE_EXAMPLES, ()),
+    "view": (ViewOptions, VIEW, VIEW_EXAMPLES, ()),
+    "render": (RenderOptions, RENDER, RENDER_EXAMPLES, ()),
+}
 
 
-def add_compare(parser) -> None:
-    """`ltsh compare`."""
-    with_examples(parser, COMPARE, COMPARE_EXAMPLES)
-    _add_job(parser, PictureOptions)
-    add_baseline(parser)
-
-
-def add_shade(parser) -> None:
-    """`ltsh shade`."""
-    with_examples(parser, SHADE, SHADE_EXAMPLES)
-    _add_job(parser, PictureOptions, but=("cycles_samples",))
-    parser.set_defaults(cycles_samples=0)
-
-
-def add_bake(parser) -> None:
-    """`ltsh bake`."""
-    with_examples(parser, BAKE, BAKE_EXAMPLES)
-    _add_job(parser, BakeOptions)
-
-
-def add_view(parser) -> None:
-    """`ltsh view`."""
-    with_examples(parser, VIEW, VIEW_EXAMPLES)
-    _add_job(parser, ViewOptions)
-
-
-def add_render(parser) -> None:
-    """`ltsh render`."""
-    with_examples(parser, RENDER, RENDER_EXAMPLES)
-    _add_job(parser, RenderOptions)
-
-
-def _add_job(parser, kind, *, but=(), **changes) -> None:
-    """Add the arguments of the options class `kind`, except `but`, with `changes`, and those about running a job."""
-    add_options(parser, kind, but=(*but, "scripts"), **changes)
+def add_job(parser, command: str, **changes) -> None:
+    """`ltsh demo`, `compare`, `shade`, `bake`, `view` and `render`; `changes` are keywords of arguments by option."""
+    kind, description, examples, left_out = JOBS[command]
+    with_examples(parser, description, examples)
+    add_options(parser, kind, but=(*left_out, "scripts"), **changes)
     add_batch(parser)
     add_option(parser, kind, "scripts")
     add_talk(parser)
     parser.set_defaults(run=_run_scenes)
+    if command == "compare":
+        add_baseline(parser)
+    elif command == "shade":
+        parser.set_defaults(cycles_samples=0)
+
+
+def add_demo(parser) -> None:
+    """`ltsh demo`."""
+    size = {"help": "default: {}x{}".format(*DEMO_RESOLUTION), "default": DEMO_RESOLUTION}
+    add_job(parser, "demo", resolution=size)
+    parser.set_defaults(run=_demo, scenes=[])
 
 
 def _run_scenes(arguments, bar, open_file) -> int:
@@ -167,8 +151,7 @@ def _demo(arguments, bar, open_file) -> int:
 
 def job_of(arguments, scenes: tuple[Path, ...]) -> BatchJob:
     """The job of the arguments of demo, compare, shade, bake, view or render. Raises Misuse."""
-    kinds = {"bake": BakeOptions, "view": ViewOptions, "render": RenderOptions}
-    kind = kinds.get(arguments.command, PictureOptions)
+    kind, *_ = JOBS[arguments.command]
     command = "compare" if arguments.command == "demo" else arguments.command
     cameras, frames = tuple(dict.fromkeys(arguments.cameras or ())), arguments.frames or ()
     if command == "bake" and arguments.apply and (len(cameras) > 1 or len(frames) > 1):
@@ -266,22 +249,15 @@ class _OfLight(argparse.Action):
 
 def _factor(text: str) -> float:
     """x and a number."""
-    number = text.removeprefix("x")
-    try:
-        value = float(number)
-    except ValueError:
-        value = -1.0
-    if number == text or not 0.0 <= value < 1e12:
+    value = real_number(text.removeprefix("x"))
+    if not text.startswith("x") or not 0.0 <= value < 1e12:
         raise ValueError(f"power is {text!r}, expected x and a factor, such as x2 or x.5")
     return value
 
 
 def _steps(text: str) -> float:
     """A number of doublings."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.inf
+    value = real_number(text)
     if not abs(value) <= 32.0:
         raise ValueError(f"exposure is {text!r}, expected a number from -32 to 32, such as +1 or -.5")
     return value
@@ -289,10 +265,7 @@ def _steps(text: str) -> float:
 
 def _color(text: str) -> tuple[float, ...]:
     """Three numbers."""
-    try:
-        values = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        values = ()
+    values = tuple(map(real_number, text.split(",")))
     if len(values) != 3 or not all(0.0 <= value < 1e12 for value in values):
         raise ValueError(f"color is {text!r}, expected red, green and blue such as 1,.8,.6")
     return values
@@ -364,13 +337,12 @@ def _run_jobs(arguments, bar, open_file) -> int:
 
 def job_parsers() -> dict[str, argparse.ArgumentParser]:
     """Parsers of the commands that a job file may have."""
-    found = {}
-    adders = {"shade": add_shade, "compare": add_compare, "bake": add_bake, "view": add_view, "render": add_render}
-    for name, add_arguments in adders.items():
-        found[name] = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-        add_arguments(found[name])
-        found[name].set_defaults(command=name)
-    return found
+    parsers = {}
+    for name in ("shade", "compare", "bake", "view", "render"):
+        parsers[name] = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+        add_job(parsers[name], name)
+        parsers[name].set_defaults(command=name)
+    return parsers
 
 
 def _for_each(jobs: list[FileJob], do, arguments, bar) -> int:
@@ -472,16 +444,17 @@ def do_job(job: BatchJob, arguments, bar, baseline: Baseline | None = None) -> t
 
     done = run_tasks(job, shard=shard, existing=arguments.existing, progress=bar, tell=tell)
     if shard[1] == 1:
-        if done.kept:
-            bar.remark(f"{done.kept} of {done.tasks} tasks were there already")
+        if done.finished_before:
+            bar.remark(f"{done.finished_before} of {done.tasks} tasks were there already")
         return merge_job(job.options.output, arguments, bar, baseline)
     bar.finish()
     text = f"{shard[0]}/{shard[1]}"
-    kept = f" ({done.kept} were there already)" if done.kept else ""
+    before = f" ({done.finished_before} were there already)" if done.finished_before else ""
     tasks = "1 task" if done.tasks == 1 else f"{done.tasks} tasks"
     _complain(bar, "problem", done.problems)
-    _print(f"shard {text}: {tasks} done{kept}; when all are: merge {job.options.output}", arguments, bar)
-    return {"shard": text, **vars(done)}, 1 if done.problems else 0
+    _print(f"shard {text}: {tasks} done{before}; when all are: merge {job.options.output}", arguments, bar)
+    facts = {"tasks": done.tasks, "done": done.done, "kept": done.finished_before, "problems": done.problems}
+    return {"shard": text, **facts}, 1 if done.problems else 0
 
 
 def merge_job(output: Path, arguments, bar, baseline: Baseline | None = None) -> tuple[dict, int]:
@@ -501,9 +474,7 @@ def merge_job(output: Path, arguments, bar, baseline: Baseline | None = None) ->
         _complain(bar, "worse", worse)
     document = merged.report if baseline is None else {**merged.report, "worse": worse}
     if merged.command == "view":
-        from ..pipeline import view
-
-        document = view.with_times(document, merged.seconds)
+        document = with_times(document, merged.seconds)
     return document, 1 if merged.missing or merged.problems or worse else 0
 
 
@@ -530,11 +501,15 @@ def _warnings(merged) -> list[str]:
 
 
 def _summary(merged: Merged, output) -> str:
-    from ..pipeline import bake, picture, render, view
+    from ..pipeline import bake, picture, render
 
-    tables = {"bake": bake, "view": view, "render": render}.get(merged.command, picture)
+    summary, brief = {
+        "bake": (bake.summary, bake.brief),
+        "view": (picture.view_summary, render.brief),
+        "render": (render.summary, render.brief),
+    }.get(merged.command, (picture.summary, picture.brief))
     if merged.single and "reports" not in merged.report:
-        lines = tables.summary(merged.report, merged.seconds)
+        lines = summary(merged.report, merged.seconds)
     else:
-        lines = [line for report in merged.report["reports"] for line in tables.brief(report)]
+        lines = [line for report in merged.report["reports"] for line in brief(report)]
     return "\n".join([*(line.rstrip() for line in lines), f"written to {output}"])

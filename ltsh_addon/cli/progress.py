@@ -123,8 +123,8 @@ class ProgressBar:
         if self._terminal:
             self._draw(f"{self._task} of {self._tasks} {name}", share, now)
         else:
-            left = "" if self._task == self._tasks else self._remaining(share, now)
-            self._say(f"{self._task} of {self._tasks}: {name} in {seconds:.1f} s {left}".rstrip())
+            remaining = "" if self._task == self._tasks else self._remaining(share, now)
+            self._say(f"{self._task} of {self._tasks}: {name} in {seconds:.1f} s {remaining}".rstrip())
         if self._task == self._tasks:
             self.finish()
             self._tasks = 1

@@ -170,9 +170,9 @@ def f82_term(f0: np.ndarray, tint: np.ndarray) -> np.ndarray:
     return schlick * (1.0 - tint) * 7.0 / (6.0 / 7.0) ** 6
 
 
-def metal_average(f0: np.ndarray, dip: np.ndarray) -> np.ndarray:
+def metal_average(f0: np.ndarray, f82_factor: np.ndarray) -> np.ndarray:
     """Integral (Q, 3) of 2 c F(c) for an F82 metal."""
-    return f0 + (1.0 - f0) / 21.0 - dip / 126.0
+    return f0 + (1.0 - f0) / 21.0 - f82_factor / 126.0
 
 
 def dielectric_average(ior: np.ndarray) -> np.ndarray:
@@ -223,11 +223,11 @@ def conductor_reflectance(cosine, index: np.ndarray, extinction: np.ndarray, exa
 
 
 def conductor_fit(index: np.ndarray, extinction: np.ndarray, exact: bool):
-    """(f0, f90, dip, dielectric), each (Q, 3): the least-squares fit of a conductor's reflectance. Its dielectric curve
-    is that of CONDUCTOR_FIT_IOR."""
+    """(f0, f90, f82_factor, dielectric) (Q, 3): the least-squares fit of a conductor's reflectance. Its dielectric
+    curve is that of CONDUCTOR_FIT_IOR."""
     values = conductor_reflectance(FIT_COSINES[:, None, None], index, extinction, exact)
-    constant, schlick, dip, dielectric = np.einsum("kc,cqx->kqx", _fit_matrix(), values)
-    return constant, constant + schlick, -dip, dielectric
+    constant, schlick, f82_factor, dielectric = np.einsum("kc,cqx->kqx", _fit_matrix(), values)
+    return constant, constant + schlick, -f82_factor, dielectric
 
 
 def conductor_average(index: np.ndarray, extinction: np.ndarray, exact: bool) -> np.ndarray:
@@ -239,7 +239,7 @@ def conductor_average(index: np.ndarray, extinction: np.ndarray, exact: bool) ->
 
 
 def dielectric_terms(f0: np.ndarray, ior: np.ndarray):
-    """(f0, f90, dip, dielectric) (Q, 3) of a dielectric whose reflectance runs from `f0` (Q, 3) to 1.
+    """(f0, f90, f82_factor, dielectric) (Q, 3) of a dielectric whose reflectance runs from `f0` (Q, 3) to 1.
 
     Cycles has F = mix(f0, 1, (F_d - f_d) / (1 - f_d)), where f_d is F_d at normal incidence; this is linear in F_d.
     """

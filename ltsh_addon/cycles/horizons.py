@@ -172,8 +172,8 @@ def horizon_excess(
     `is_quick` looks at a third of the directions; on the example scene the shares are then 0.4 % off, weighted by the
     light.
     """
-    lights, shares = _few(lights)
-    shapes = [_Shapes.of(lights, numbers, shares[numbers]) for numbers in _alike(lights)]
+    lights, shares = _with_stand_ins(lights)
+    shapes = [_LightsOfKind.of(lights, numbers, shares[numbers]) for numbers in _kinds_of_lights(lights)]
     if choose is None:
         choose = partial(light_selection_pmf, lights=lights, rows=light_tree_rows(lights))
     step = min(max(MOST_PAIRS // len(lights), 1), BLOCK)
@@ -194,7 +194,7 @@ def _excess(samples, shapes, chances, choose, is_quick):
         return by_lobe, by_light
     by_lobe[index] = 0.0
     samples, chances = samples.take(index), chances[:, index]
-    directions = _Directions.of(samples, is_quick)
+    directions = _HorizonDirections.of(samples, is_quick)
     # A few directions suffice for a light as large as a side of the sky.
     for rays, is_side in ((directions, False), (directions if is_quick else directions.few(), True)):
         hits = [
@@ -210,7 +210,7 @@ def _excess(samples, shapes, chances, choose, is_quick):
         chance = choose(some.position, some.smooth_normal)
         lobe = _lobe_density(some, towards)
         half = np.sqrt(np.maximum(0.5 + 0.5 * np.einsum("pni,pi->pn", towards, some.view), 0.0))
-        reflected = lobe * _seen_by_light(some, towards) * _reflectance(some, half) * rays.width[met]
+        reflected = lobe * _visible_microfacets(some, towards) * _reflectance(some, half) * rays.width[met]
         diffuse = np.maximum(np.einsum("pni,pi->pn", towards, some.diffuse_normal), 0.0) / np.pi
         chosen2 = np.square(chances[0, met, None] * lobe + chances[1, met, None] * diffuse)
         pair = row * towards.shape[1] + ray
@@ -222,7 +222,7 @@ def _excess(samples, shapes, chances, choose, is_quick):
     return by_lobe, by_light
 
 
-def _few(lights) -> tuple[tuple[AreaLight, ...], np.ndarray]:
+def _with_stand_ins(lights) -> tuple[tuple[AreaLight, ...], np.ndarray]:
     """Lights (L) and the share (L,) of each that shines. At most MOST_LIGHTS stand-ins replace many flat lights."""
     others, kinds = [], {}
     for light in lights:
@@ -247,7 +247,7 @@ def _numbered(values, count: int) -> tuple[np.ndarray, np.ndarray]:
     return np.flatnonzero(there), (np.cumsum(there) - 1)[values]
 
 
-def _alike(lights) -> list[np.ndarray]:
+def _kinds_of_lights(lights) -> list[np.ndarray]:
     """Groups of the numbers of lights that have the same kind of outline and are equally near, distant or facing."""
     kinds = {}
     for number, light in enumerate(lights):
@@ -266,7 +266,7 @@ def _is_side(light) -> bool:
 
 
 @dataclass(frozen=True)
-class _Shapes:
+class _LightsOfKind:
     """Lights of one kind, as arrays for tests of which directions meet them."""
 
     number: np.ndarray  # (L,)
@@ -282,7 +282,7 @@ class _Shapes:
     is_side: bool  # True for sides of the cube around the world; a direction meets exactly one
 
     @classmethod
-    def of(cls, lights, number, share) -> _Shapes:
+    def of(cls, lights, number, share) -> _LightsOfKind:
         """The lights of these numbers, which are of one kind; the `share` (L,) of each shines."""
         alike = [lights[n] for n in number]
         center, corners = (np.array([light.center for light in alike]), np.array([light.polygon() for light in alike]))
@@ -419,7 +419,7 @@ def _lobe_density(samples, towards) -> np.ndarray:
     return brdf.visible_normal_density(cosine, horizontal, vertical, alpha2)
 
 
-def _seen_by_light(samples, towards) -> np.ndarray:
+def _visible_microfacets(samples, towards) -> np.ndarray:
     """Share (P, N) of the microfacets visible from the eye that are also visible from directions `towards` (P, N, 3);
     0 below the horizon of the lobe."""
     alpha2 = np.square(np.maximum(samples.roughness**2, SMALLEST_ALPHA))[:, None]
@@ -430,7 +430,7 @@ def _seen_by_light(samples, towards) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class _Directions:
+class _HorizonDirections:
     """Unit directions (P, N, 3) between the horizons, AROUND of them for each of HEIGHTS or in total, and the solid
     angle (P, N) in sr of each; it is negative where the mesh's horizon is the lower one."""
 
@@ -440,7 +440,7 @@ class _Directions:
     angle: np.ndarray  # (AROUND,) from the first of these to the second
 
     @classmethod
-    def of(cls, samples, is_quick: bool = False) -> _Directions:
+    def of(cls, samples, is_quick: bool = False) -> _HorizonDirections:
         """The directions of `samples`. With `is_quick`, each angle around the normal has only one of HEIGHTS."""
         mirrored = 2.0 * (samples.normal * samples.view).sum(axis=1, keepdims=True) * samples.normal - samples.view
         flat = mirrored - (mirrored * samples.smooth_normal).sum(axis=1, keepdims=True) * samples.smooth_normal
@@ -463,11 +463,13 @@ class _Directions:
         count = len(samples)
         return cls(towards.reshape(count, -1, 3), width.reshape(count, -1), np.stack([flat, across], axis=1), angle)
 
-    def few(self) -> _Directions:
+    def few(self) -> _HorizonDirections:
         """A third of the directions, each with the solid angle of three, at alternating heights and without angles."""
         around = np.arange(AROUND)
         chosen = (around % len(HEIGHTS)) * AROUND + around
-        return _Directions(self.towards[:, chosen], len(HEIGHTS) * self.width[:, chosen], self.flat, self.angle[:0])
+        return _HorizonDirections(
+            self.towards[:, chosen], len(HEIGHTS) * self.width[:, chosen], self.flat, self.angle[:0]
+        )
 
     def near(self, sample, offset, radius) -> tuple[np.ndarray, np.ndarray]:
         """Numbers (K,) of pairs, and of the directions of each pair that may meet its ball. The balls have the `radius`

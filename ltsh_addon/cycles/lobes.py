@@ -273,7 +273,7 @@ class _LobeSamples:
     diffuse_normal: np.ndarray
     roughness: np.ndarray
     ior: np.ndarray
-    specular: np.ndarray = field(default=None)  # (4, Q, 3): f0, f90, dip, dielectric
+    specular: np.ndarray = field(default=None)  # (4, Q, 3): f0, f90, f82_factor, dielectric
     diffuse: np.ndarray = field(default=None)  # (Q, 3) estimated diffuse albedo
     behind: np.ndarray = field(default=None)  # (Q,) bool: the diffuse lobe is on the other side of the surface
     shape: dict[str, np.ndarray] = field(default_factory=dict)  # the fields of SHAPE that are not 0
@@ -563,9 +563,9 @@ def _metal_terms(slot: LobeSlot) -> np.ndarray:
     terms = np.zeros((4, len(slot.index), 3))
     if slot.metallic.any():
         f0, tint = np.minimum(slot.color, 1.0), np.clip(slot.value("tint"), 0.0, 1.0)
-        dip = closures.f82_term(f0, tint)
-        factor = slot.metallic[:, None] * slot.scattered(closures.metal_average(f0, dip))
-        terms[:3] += factor * np.stack([f0, np.ones_like(f0), dip])
+        f82_factor = closures.f82_term(f0, tint)
+        factor = slot.metallic[:, None] * slot.scattered(closures.metal_average(f0, f82_factor))
+        terms[:3] += factor * np.stack([f0, np.ones_like(f0), f82_factor])
     if slot.of("glossy").any():
         terms[:2] += np.where(slot.of("glossy"), slot.color * slot.scattered(slot.color), 0.0)
     return terms

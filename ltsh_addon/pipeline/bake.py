@@ -1,4 +1,4 @@
-"""Bakes: shades the texels of objects, block by block, into the files of `bake_files`."""
+"""Bakes: the texels of objects, shaded block by block into the files of `bake_files`, and the report about them."""
 
 from __future__ import annotations
 
@@ -11,30 +11,41 @@ from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
 from dataclasses import replace
-from pathlib import Path, PurePosixPath
+from pathlib import PurePosixPath
 
 import numpy as np
 
-from .. import imaging
 from ..cycles import uv
 from ..cycles.texels import NOT_BAKED, BakeMaterial, BakeView, TexelMesh, texel_samples
 from ..files import temporary_folder
+from ..imaging import exr
+from ..imaging.exr import COMBINED, layer_name
 from ..reading import NUMBER, Malformed, check, file_name
 from ..scene import PASSES, REFERENCE, Cancelled, Film, Progress, SurfaceSamples, lights_of, listed
 from ..visibility import Occluders, ShadowSampling
 from ..workers.pool import cores
-from . import lighting, picture
-from .bake_files import ErrorPictures, ErrorSums, Planes
+from . import lighting
+from .bake_files import (
+    TILE,
+    ErrorPictures,
+    ErrorSums,
+    Planes,
+    TileRecords,
+    applied_layer,
+    applied_layers,
+    apply_textures,
+)
+from .comparison import percent
+from .lighting import check_named, prepare
 from .options import BAKE_PASSES, MARGIN_TYPES, TEXTURE_SIDES, BakeOptions, child_job
-from .picture import TaskResult, percent
-from .tasks import Records, contents_digest, file_stems, options_digest
+from .tasks import TaskResult, file_stems, versions, write_reports
 
-# BLOCK_TEXELS: texels that a thread shades at a time. The allocator reuses arrays of this size; larger ones would be
-# new memory each time.
-BLOCK_TEXELS = 1 << 18
 # NOTED_SHARE_OUTSIDE: a larger share of the UV map outside of the texture is reported. Less may come from texels along
 # the border, which count by their centers.
 NOTED_SHARE_OUTSIDE = 0.01
+# BLOCK_TEXELS: texels that a thread shades at a time. The allocator reuses arrays of this size; larger ones would be
+# new memory each time.
+BLOCK_TEXELS = 1 << 18
 
 
 def bake_scene(options: BakeOptions, progress: Progress | None = None) -> dict:
@@ -44,15 +55,12 @@ def bake_scene(options: BakeOptions, progress: Progress | None = None) -> dict:
     "problems"; the others are baked all the same. Only timing.json depends on the machine's speed. Raises SceneError,
     TableError, OSError, Cancelled, ValueError.
     """
-    made = bake_objects(options, progress)
-    document = made.report
-    if options.apply and document["objects"]:
-        document["applied"] = apply_textures(
-            options.scene, options.output, document["objects"], applied_layer(options), progress
-        )
-    imaging.write_json(options.output / "report.json", document)
-    imaging.write_json(options.output / "timing.json", {"seconds": made.seconds})
-    return {**document, "seconds": made.seconds}
+    result = bake_objects(options, progress)
+    report = result.report
+    if options.apply and report["objects"]:
+        layer = applied_layer(options)
+        report["applied"] = apply_textures(options.scene, options.output, report["objects"], layer, progress)
+    return write_reports(result, options.output)
 
 
 def bake_objects(
@@ -73,23 +81,23 @@ def bake_objects(
     start = time.perf_counter()
     _check(options)
     check_readable(options.scene)
-    picture.check_named(options.techniques, "a bake that is resumed")
-    tables = picture.prepare(options)
+    check_named(options.techniques, "a bake that is resumed")
+    tables = prepare(options)
     finished = TileRecords(options)
     with temporary_folder() as folder:
         manifest = extract_bake(_job(options, finished.finished, tile, following), folder, progress=progress)
         names = [record["name"] for record in manifest["objects"]]
-        found = file_stems(names) if options.name is None else [options.name]
+        stems = file_stems(names) if options.name is None else [options.name]
         records, files, seconds = [], [], {"blender": manifest["seconds"]}
         with _shadow_tracer(options, manifest, folder) as tracer:
-            for record, stem in zip(manifest["objects"], found, strict=True):
+            for record, stem in zip(manifest["objects"], stems, strict=True):
                 if record["problem"] is None:
                     (options.output / stem).parent.mkdir(parents=True, exist_ok=True)
                     baker = ObjectBaker(options, tables, manifest, record, folder / record["folder"], tracer)
-                    made = baker.bake(stem, [] if tile is None else [tile], finished, progress)
-                    records.append(made.report)
-                    files += made.files
-                    seconds |= made.seconds
+                    baked = baker.bake(stem, [] if tile is None else [tile], finished, progress)
+                    records.append(baked.report)
+                    files += baked.files
+                    seconds |= baked.seconds
                     shutil.rmtree(folder / record["folder"])
     document = _report(options, manifest, records)
     seconds["total"] = time.perf_counter() - start
@@ -143,7 +151,7 @@ def block_rows(options) -> int:
 def shaded_passes(options) -> set[str]:
     """The passes of `shading.shade` from which the wanted passes follow; `diffuse_light` is shaded apart."""
     wanted = set(options.passes)
-    if "combined" in wanted:
+    if COMBINED in wanted:
         wanted |= {"specular", "diffuse"}
     return wanted & {"specular", "diffuse"}
 
@@ -158,14 +166,13 @@ class ObjectBaker:
         uv_maps = {name: folder / file for name, file in record["uv_maps"].items()}
         self.materials = [BakeMaterial.of(material, folder.parent, uv_maps) for material in record["materials"]]
         self.view = BakeView(**manifest["view"])
-        self.groups = tuple(dict.fromkeys(light.group for light in self.lights)) or ("",)
+        self.groups = lighting.light_groups(self.lights)
         self.tiles, self.area = uv.tiles_of(self.mesh.uv)
-        self.compared = tuple(name for name in options.passes if name in shaded_passes(options) | {"combined"})
-        if not options.error:
-            self.compared = ()
+        known = shaded_passes(options) | {COMBINED} if options.error else ()
+        self.compared = tuple(name for name in options.passes if name in known)
 
-    def bake(self, stem: str, tiles: list[int], records: TileRecords, progress) -> TaskResult:
-        """Write the files of `tiles` (empty: all tiles), except those that `records` has as finished.
+    def bake(self, stem: str, tiles: list[int], records, progress) -> TaskResult:
+        """Write the files of `tiles` (empty: all tiles), except those that the TileRecords `records` have as finished.
 
         The report of the result is the object's entry in the whole report.
         """
@@ -176,14 +183,14 @@ class ObjectBaker:
             start = time.perf_counter()
             record = records.take(name, tile, file)
             if record is None:
-                found, written = self._tile(tile, stem, progress)
-                record = records.write(name, tile, stem, written, found)
+                report, written = self._tile(tile, stem, progress)
+                record = records.write(name, tile, stem, written, report)
             seconds[file] = time.perf_counter() - start
             files += record["files"]
-            found = record["report"]
-            result["tiles"][str(tile)] = {"file": file, **found}
+            report = record["report"]
+            result["tiles"][str(tile)] = {"file": file, **report}
             if self.area > 0.0:
-                baked = found["covered_times"] / math.prod(self.options.size)
+                baked = report["covered_times"] / math.prod(self.options.size)
                 result["outside"] = max(0.0, 1.0 - baked / self.area)
         return TaskResult(result, seconds, tuple(files))
 
@@ -206,7 +213,7 @@ class ObjectBaker:
             texture = None
             if options.apply:
                 record["texture"] = f"{stem}.{applied_layer(options)}{self._suffix(tile)}.exr"
-                texture = options.output / record["texture"], _applied_parts(options)
+                texture = options.output / record["texture"], applied_layers(options)
                 written.append(record["texture"])
             planes.write(path, options.margin, self._metadata(tile), pictures, texture)
         return record, written
@@ -214,7 +221,7 @@ class ObjectBaker:
     def _planes(self, tile) -> Planes:
         options, seams = self.options, None
         if options.margin_type == "adjacent" and options.margin > 0:
-            seams = uv.UvSeams.of(self.mesh.uv, self.mesh.vertices, *options.size, _place(tile))
+            seams = uv.UvSeams.of(self.mesh.uv, self.mesh.vertices, *options.size, _column_and_row(tile))
         return Planes(self.folder / f"planes_{tile}", self.channels(), *options.size, seams)
 
     def _shade(self, tile, planes, errors, progress) -> dict:
@@ -229,28 +236,29 @@ class ObjectBaker:
 
         firsts, sums = range(0, height, rows), {}
         tasks = ((first, point) for first in firsts for point in range(points))
-        for number, (first, point, found) in enumerate(_in_order(shaded, tasks, self._threads())):
-            sums = {name: sums[name] + values for name, values in found.items()} if point else found
+        for number, (first, point, block) in enumerate(_in_order(shaded, tasks, self._threads())):
+            sums = {name: sums[name] + values for name, values in block.items()} if point else block
             if point == points - 1:
                 texels = spread.texels(first)
-                layers = {name: values / points for name, values in sums.items()}
-                halves = self._add_cycles(layers, tile, first, texels)
+                planes_of = {name: values / points for name, values in sums.items()}
+                halves = self._add_cycles(planes_of, tile, first, texels)
                 covered += len(texels.index)
                 covers += texels.covers
                 overlaps += texels.overlaps
                 unbaked += texels.unbaked
                 unshaded += int(is_unshaded[self.mesh.material[texels.triangle]].sum())
-                lit = lit or any(layers[f"{name}.{part}"].any() for name in self.tables for part in options.passes)
-                planes.put(first, min(rows, height - first), texels, _channels(layers))
+                names = (layer_name(name, pass_name) for name in self.tables for pass_name in options.passes)
+                lit = lit or any(planes_of[name].any() for name in names)
+                planes.put(first, min(rows, height - first), texels, _channels(planes_of))
                 for pass_name, (a, b) in halves.items():
                     errors.add_halves(pass_name, a, b)
                     for name in self.tables:
-                        errors.add(name, pass_name, layers[f"{name}.{pass_name}"], a, b)
+                        errors.add(name, pass_name, planes_of[layer_name(name, pass_name)], a, b)
             share = (number + 1) / (len(firsts) * points)
             if progress is not None and progress(f"shade {self.record['name']}", share) is False:
                 raise Cancelled("the bake was stopped")
-        found = {"texels": covered, "covered_times": covers, "overlapping_texels": overlaps}
-        return {**found, "unshaded_texels": unshaded, "unbaked_texels": unbaked, "is_lit": lit}
+        counts = {"texels": covered, "covered_times": covers, "overlapping_texels": overlaps}
+        return {**counts, "unshaded_texels": unshaded, "unbaked_texels": unbaked, "is_lit": lit}
 
     def _threads(self) -> int:
         """Blocks to shade at a time: one with the reference, whose shading of a block takes all cores itself."""
@@ -258,13 +266,12 @@ class ObjectBaker:
 
     def channels(self) -> list[str]:
         """Names of the channels of the EXR, without the coverage."""
-        layers = [f"{name}.{pass_name}" for name in self.tables for pass_name in self.options.passes]
-        if len(self.groups) > 1:
-            layers += [f"{layer}@{group}" for layer in layers for group in lighting.group_names(self.groups)]
+        names = [layer_name(name, pass_name) for name in self.tables for pass_name in self.options.passes]
+        names += [of_group for name in names for of_group in exr.by_group(name, self.groups, self.groups)]
         for pass_name in self.compared:
-            layers += [f"{image}.{pass_name}" for image in ("cycles", "cycles_A", "cycles_B")]
-            layers += [f"error_{name}.{pass_name}" for name in self.tables]
-        return [f"{layer}.{letter}" for layer in layers for letter in "RGB"]
+            images = [*exr.CYCLES_LAYERS, *(f"{exr.ERROR}{name}" for name in self.tables)]
+            names += [layer_name(image, pass_name) for image in images]
+        return [f"{name}.{letter}" for name in names for letter in "RGB"]
 
     def _block(self, spread, first, point) -> dict[str, np.ndarray]:
         """Layers (Q, 3) of the Q texels of a block, shaded at one point of each texel."""
@@ -274,7 +281,7 @@ class ObjectBaker:
             return maps[number].reshape(-1, 3)[texels.index]
 
         samples, texel = texel_samples(self.mesh, self.materials, texels, read_map, self.view, self.lights)
-        layers, shadows = {}, None
+        images, shadows = {}, None
         if self.tracer is not None:
             options = self.options
             passes = shaded_passes(options)
@@ -288,19 +295,19 @@ class ObjectBaker:
             shadows = self.tracer.trace(samples, sampling, workers=workers)
         for name, table in self.tables.items():
             for pass_name, radiance in self._passes(samples, texel, len(texels.index), table, shadows).items():
-                layers[f"{name}.{pass_name}"] = radiance.sum(axis=0)
-                if len(self.groups) > 1:
-                    for group, part in zip(lighting.group_names(self.groups), radiance, strict=True):
-                        layers[f"{name}.{pass_name}@{group}"] = part
-        return layers if weights is None else {name: values * weights[:, None] for name, values in layers.items()}
+                layer = layer_name(name, pass_name)
+                images |= {layer: radiance.sum(axis=0), **exr.by_group(layer, self.groups, radiance)}
+        return images if weights is None else {name: values * weights[:, None] for name, values in images.items()}
 
-    def _add_cycles(self, layers, tile, first, texels) -> dict[str, np.ndarray]:
-        """Add Cycles' bake and the signed errors to the `layers` (Q, 3); returns the halves of `_halves`."""
+    def _add_cycles(self, images, tile, first, texels) -> dict[str, np.ndarray]:
+        """Add Cycles' bake and the signed errors to the `images` (Q, 3); returns the halves of `_halves`."""
         halves = self._halves(tile, first, texels)
         for pass_name, (a, b) in halves.items():
             mean = 0.5 * (a + b)
-            layers |= {f"cycles.{pass_name}": mean, f"cycles_A.{pass_name}": a, f"cycles_B.{pass_name}": b}
-            layers |= {f"error_{name}.{pass_name}": layers[f"{name}.{pass_name}"] - mean for name in self.tables}
+            for name, image in zip(exr.CYCLES_LAYERS, (mean, a, b), strict=True):
+                images[layer_name(name, pass_name)] = image
+            for name in self.tables:
+                images[layer_name(f"{exr.ERROR}{name}", pass_name)] = images[layer_name(name, pass_name)] - mean
         return halves
 
     def _halves(self, tile, first, texels) -> dict[str, np.ndarray]:
@@ -309,44 +316,43 @@ class ObjectBaker:
         for pass_name in shaded_passes(self.options) if self.compared else ():
             baked = np.load(self.folder / f"cycles_{pass_name}_{tile}_{first}.npy")
             halves[pass_name] = baked.reshape(2, -1, 3)[:, texels.index]
-        if "combined" in self.compared:
-            halves["combined"] = halves["specular"] + halves["diffuse"]
+        if COMBINED in self.compared:
+            halves[COMBINED] = halves["specular"] + halves["diffuse"]
         return {name: halves[name] for name in self.compared}
 
     def _passes(self, samples: SurfaceSamples, texel, count, table, shadows) -> dict[str, np.ndarray]:
         """Radiance (G, Q, 3) of the wanted passes of `count` texels."""
-        found = {}
+        radiance = {}
         wanted = tuple(sorted(shaded_passes(self.options), reverse=True))
         workers = 1 if self._threads() > 1 else None
         if wanted:
             shaded = lighting.shade_lights(samples, self.lights, table, wanted, (shadows,), workers=workers)[0]
-            found = {name: _summed(getattr(shaded, name), texel, count) for name in wanted}
+            radiance = {name: _summed(getattr(shaded, name), texel, count) for name in wanted}
         if "diffuse_light" in self.options.passes:
-            first = np.flatnonzero(np.concatenate([[True], texel[1:] != texel[:-1]])) if len(texel) else texel
+            first = _first_samples(texel)
             white = replace(samples.take(first), diffuse_albedo=np.ones((len(first), 3)))
-            seen = None if shadows is None else shadows.take(first)
-            lit = lighting.shade_lights(white, self.lights, table, ("diffuse",), (seen,), workers=workers)[0]
-            found["diffuse_light"] = _summed(lit.diffuse, texel[first], count)
-        if "combined" in self.options.passes:
-            found["combined"] = found["specular"] + found["diffuse"]
-        return {name: found[name] for name in self.options.passes}
+            shadows = None if shadows is None else shadows.take(first)
+            (lit,) = lighting.shade_lights(white, self.lights, table, ("diffuse",), (shadows,), workers=workers)
+            radiance["diffuse_light"] = _summed(lit.diffuse, texel[first], count)
+        if COMBINED in self.options.passes:
+            radiance[COMBINED] = radiance["specular"] + radiance["diffuse"]
+        return {name: radiance[name] for name in self.options.passes}
 
     def _metadata(self, tile) -> dict[str, str]:
         options, view = self.options, self.view
         vector = ", ".join(f"{value:g}" for value in view.vector)
-        seen = {"above": "above the surface", "point": f"position {vector}", "direction": f"from direction {vector}"}
-        return {
-            "ltsh:scene": Path(options.scene).name,
-            "ltsh:object": self.record["name"],
-            "ltsh:uv": self.record["uv"],
-            "ltsh:tile": str(tile),
-            "ltsh:sub_samples": str(options.sub_samples),
-            "ltsh:frame": str(self.manifest["frame"]),
-            "ltsh:view": seen[view.kind] + (", bent as in Cycles' bake" if view.bent else ""),
-            "ltsh:camera": self.manifest["camera"],
-            "ltsh:color_space": self.manifest["color_space"]["name"] or "Linear Rec.709",
-            "ltsh:version": picture.versions(self.manifest["blender_version"])["ltsh"],
-        }
+        views = {"above": "above the surface", "point": f"position {vector}", "direction": f"from direction {vector}"}
+        return exr.metadata(
+            options.scene,
+            self.manifest["frame"],
+            self.manifest["camera"],
+            self.manifest["color_space"]["name"] or "Linear Rec.709",
+            object=self.record["name"],
+            uv=self.record["uv"],
+            tile=str(tile),
+            sub_samples=str(options.sub_samples),
+            view=views[view.kind] + (", bent as in Cycles' bake" if view.bent else ""),
+        )
 
 
 class TilePoints:
@@ -356,11 +362,11 @@ class TilePoints:
         options = baker.options
         self._options, self._folder, self._tile, self._mapped = options, baker.folder, tile, baker.record["maps"]
         self._width = baker.manifest["sampled_texels"]
-        self._triangles = uv.UvTriangles.in_tile(baker.mesh.uv, *options.size, _place(tile))
+        self._triangles = uv.UvTriangles.in_tile(baker.mesh.uv, *options.size, _column_and_row(tile))
         self._at_centers = bakes_centers_alone(options, baker.record)
         # The points of a block are shaded one after another, so few blocks need to be cached.
-        kept = functools.lru_cache(maxsize=2 + threads // options.sub_samples)
-        self.texels, self._weights_of = kept(self._covered), kept(self._fitted_weights)
+        cached = functools.lru_cache(maxsize=2 + threads // options.sub_samples)
+        self.texels, self._weights_of = cached(self._covered), cached(self._fitted_weights)
 
     def at(self, first: int, point: int):
         """One point of the Q texels of the block from row `first` on.
@@ -374,8 +380,8 @@ class TilePoints:
         maps = np.load(self._file(first, point))
         if self._options.sub_samples == 1:
             return texels, maps, None
-        places = self._places(texels, maps, first, point)
-        return self._triangles.at(texels, places), maps, self._weights_of(first).at(places)
+        positions = self._positions(texels, maps, first, point)
+        return self._triangles.at(texels, positions), maps, self._weights_of(first).at(positions)
 
     def _covered(self, first):
         rows = min(block_rows(self._options), self._options.size[1] - first)
@@ -389,8 +395,8 @@ class TilePoints:
     def _file(self, first, point):
         return self._folder / f"maps_{self._tile}_{first}_{point}.npy"
 
-    def _places(self, texels, maps, first, point):
-        """Places (Q, 2) in the texture, in texels, at which the maps of a point were baked."""
+    def _positions(self, texels, maps, first, point):
+        """Positions (Q, 2) in the texture, in texels, at which the maps of a point were baked."""
         if point == 0:
             return self._triangles.places(texels)
         rows, width = maps.shape[1:3]
@@ -399,8 +405,8 @@ class TilePoints:
     def _fitted_weights(self, first):
         texels, points = self.texels(first), range(self._options.sub_samples)
         maps = ((np.load(self._file(first, point), mmap_mode="r"), point) for point in points)
-        places = (self._places(texels, of_point, first, point) for of_point, point in maps)
-        return uv.PointWeights.of(self._triangles, texels, places, self._width)
+        positions = (self._positions(texels, of_point, first, point) for of_point, point in maps)
+        return uv.PointWeights.of(self._triangles, texels, positions, self._width)
 
 
 def bakes_centers_alone(options: BakeOptions, record: dict) -> bool:
@@ -408,7 +414,7 @@ def bakes_centers_alone(options: BakeOptions, record: dict) -> bool:
     return record["maps"] or options.error
 
 
-def _place(tile: int) -> tuple[int, int]:
+def _column_and_row(tile: int) -> tuple[int, int]:
     """Column and row of a UDIM tile."""
     return (tile - 1001) % 10, (tile - 1001) // 10
 
@@ -421,82 +427,30 @@ def _in_order(function, items, threads: int):
             for item in itertools.islice(items, threads):
                 waiting.append(pool.submit(function, item))
             while waiting:
-                found = waiting.popleft().result()
+                result = waiting.popleft().result()
                 for item in itertools.islice(items, 1):
                     waiting.append(pool.submit(function, item))
-                yield found
+                yield result
         finally:
             for future in waiting:
                 future.cancel()
 
 
-def _channels(layers) -> dict[str, np.ndarray]:
-    """Channel values (Q,) by name, from layers (Q, 3)."""
-    return {f"{name}.{letter}": pixels[:, n] for name, pixels in layers.items() for n, letter in enumerate("RGB")}
+def _channels(images) -> dict[str, np.ndarray]:
+    """Channel values (Q,) by name, from images (Q, 3) of layers."""
+    return {f"{name}.{letter}": pixels[:, n] for name, pixels in images.items() for n, letter in enumerate("RGB")}
 
 
 def _summed(radiance, texel, count):
     """Radiance (G, count, 3) of texels: the sums over their samples (G, S, 3)."""
     if len(texel) == count:
         return radiance
-    first = np.flatnonzero(np.concatenate([[True], texel[1:] != texel[:-1]])) if len(texel) else texel
-    return np.add.reduceat(radiance, first, axis=1)
+    return np.add.reduceat(radiance, _first_samples(texel), axis=1)
 
 
-class TileRecords:
-    """Records of finished tiles: reads those of the same job (with `resume`) and writes new ones.
-
-    Where the options have a `name`, only records of that name are read.
-    """
-
-    def __init__(self, options: BakeOptions):
-        self._records = Records(options.output, "tiles", _TILE_RECORD)
-        self._key = options_digest("bake", options, contents_digest(options))
-        names = None if options.name is None else [options.name]
-        whole = self._records.all_whole(self._key, names) if options.resume else []
-        self.finished = {(record["task"]["object"], record["task"]["tile"]): record for record in whole}
-
-    def take(self, name: str, tile: int, file: str) -> dict | None:
-        """The record of a finished tile of the object `name` with the `file`, else None."""
-        record = self.finished.get((name, tile))
-        return record if record is not None and file in record["files"] else None
-
-    def write(self, name: str, tile: int, stem: str, files, report: dict) -> dict:
-        """Write the record of a finished tile; returns it."""
-        return self._records.write(f"{stem}.{tile}", self._key, {"object": name, "tile": tile}, files, report=report)
-
-
-def applied_layer(options) -> str:
-    """The layer that `apply` shows: the first technique's combined light, or its first pass where only one is baked."""
-    parts = _applied_parts(options)
-    return parts[0] if len(parts) == 1 else f"{parts[0].rpartition('.')[0]}.combined"
-
-
-def _applied_parts(options) -> list[str]:
-    """The layers whose sum `apply` shows."""
-    names = [name for name in PASSES if name in options.passes]
-    if "combined" in options.passes or len(names) < len(PASSES):
-        names = ["combined"] if "combined" in options.passes else options.passes[:1]
-    return [f"{next(iter(picture.technique_names(options.techniques)))}.{name}" for name in names]
-
-
-def apply_textures(scene: Path, output: Path, records: list[dict], layer: str, progress=None) -> str:
-    """Save a copy of the .blend whose objects show the textures of the report's `records`; returns its file name."""
-    from ..blender.process.bake import BakedTextures, apply_bake
-
-    textures = []
-    for record in records:
-        if any("texture" not in tile for tile in record["tiles"].values()):
-            raise ValueError(f"object {record['name']!r}: has no texture to show; run the job again with --apply")
-        files = [
-            {"path": str((output / tile["texture"]).absolute()), "tile": int(number)}
-            for number, tile in record["tiles"].items()
-        ]
-        name = f"{record['name']} {layer}"
-        textures.append(BakedTextures(record["name"], record["uv"], name, files))
-    path = output / f"{Path(scene).stem}_baked.blend"
-    apply_bake(scene, path, textures, progress=progress)
-    return path.name
+def _first_samples(texel: np.ndarray) -> np.ndarray:
+    """The number of the first sample of each texel, of the sorted texels (S,) of samples."""
+    return np.flatnonzero(np.concatenate([[True], texel[1:] != texel[:-1]])) if len(texel) else texel
 
 
 def _report(options, manifest, records) -> dict:
@@ -540,7 +494,7 @@ def _report(options, manifest, records) -> dict:
         "objects": records,
         "problems": problems,
         "warnings": warnings,
-        "versions": picture.versions(manifest["blender_version"]),
+        "versions": versions(manifest["blender_version"]),
     }
 
 
@@ -555,20 +509,10 @@ def _darkness(record, reasons) -> tuple[list[str], list[str]]:
     return [], [f"{name}: no light reaches it, or it reflects none: its texture is black"] if is_dark else []
 
 
-_ERRORS = {"unbiased_squared_error?": NUMBER | None, "unbiased_error?": NUMBER | None}
-_TILE = {
-    **dict.fromkeys(("texels", "unshaded_texels", "unbaked_texels", "covered_times", "overlapping_texels"), NUMBER),
-    "is_lit": bool,
-    "texture?": file_name,
-    "errors?": {str: {"noise?": NUMBER | None, "techniques": {str: _ERRORS}}},
-}
-_TILE_RECORD = {"task": {"object": str, "tile": int}, "report": _TILE}
-
-
-def _tiles(value, place) -> None:
-    check(value, {str: {**_TILE, "file": file_name}}, place)
+def _tiles(value, name) -> None:
+    check(value, {str: {**TILE, "file": file_name}}, name)
     if wrong := [number for number in value if not number.isdecimal()]:
-        raise Malformed(f"{place} has {wrong[0]!r}, expected the number of a tile")
+        raise Malformed(f"{name} has {wrong[0]!r}, expected the number of a tile")
 
 
 # What `merge` and a summary need in a report (see `reading.check`).
@@ -581,19 +525,19 @@ REPORT = {
 
 def summary(report: dict, seconds: dict) -> list[str]:
     """Lines of text about the bake of one scene, camera and frame: a line per file, and the errors if there are any."""
-    found = []
+    lines = []
     for record in report["objects"]:
         for tile in record["tiles"].values():
             took = seconds.get(tile["file"])
             seconds_text = f"{took:>8.2f} s" if isinstance(took, NUMBER) else ""
-            found.append(f"{tile['file']:<40}{tile['texels']:>10} texels{seconds_text}")
+            lines.append(f"{tile['file']:<40}{tile['texels']:>10} texels{seconds_text}")
             for pass_name, figures in tile.get("errors", {}).items():
                 for name, error in figures["techniques"].items():
                     in_noise = (error.get("unbiased_squared_error") or 0.0) < 0.0
                     beside = "in noise" if in_noise else percent(error.get("unbiased_error"))
                     noise = f"(noise {percent(figures.get('noise'))})"
-                    found.append(f"  {name + '.' + pass_name:<30}{beside:>10} beside Cycles {noise}")
-    return found
+                    lines.append(f"  {name + '.' + pass_name:<30}{beside:>10} beside Cycles {noise}")
+    return lines
 
 
 def brief(report: dict) -> list[str]:

@@ -1,4 +1,4 @@
-"""Files of a bake: planes of texels with margins, and pictures of signed errors."""
+"""Files of a bake: planes of texels with margins, pictures of errors, records of tiles, the .blend that shows them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from .. import imaging
-from ..imaging.exr import writing_rows
+from ..imaging.exr import COMBINED, layer_name, parse_layer_name, writing_rows
+from ..reading import NUMBER, file_name
+from ..scene import PASSES
+from .lighting import technique_names
+from .options import BakeOptions
+from .tasks import Records, contents_digest, options_digest
 
 # WRITTEN_TEXELS: texels that are in memory while a file is written.
 WRITTEN_TEXELS = 1 << 18
@@ -21,6 +26,14 @@ LARGEST_PICTURE = 2048  # the most texels of a side of an error picture
 PICTURE_SCALE = 0.1
 PICTURE_PERCENTILE = 99.0
 EMPTY_COLOR = 0.55
+_ERRORS = {"unbiased_squared_error?": NUMBER | None, "unbiased_error?": NUMBER | None}
+TILE = {
+    **dict.fromkeys(("texels", "unshaded_texels", "unbaked_texels", "covered_times", "overlapping_texels"), NUMBER),
+    "is_lit": bool,
+    "texture?": file_name,
+    "errors?": {str: {"noise?": NUMBER | None, "techniques": {str: _ERRORS}}},
+}
+_TILE_RECORD = {"task": {"object": str, "tile": int}, "report": TILE}
 
 
 class Planes:
@@ -121,9 +134,9 @@ class Planes:
         shows with weights (Q, 4). `source` are the nearest covered texels of `target`."""
         height, width = self.shape
         points, near = (np.stack([index % width, index // width], axis=-1) for index in (target, source))
-        which, place, island = self._seams.reflected(points + 0.5, near)
-        corner = np.floor(place - 0.5)
-        share = place - 0.5 - corner
+        which, position, island = self._seams.reflected(points + 0.5, near)
+        corner = np.floor(position - 0.5)
+        share = position - 0.5 - corner
         index, weights = np.empty((len(which), 4), np.int64), np.empty((len(which), 4), np.float32)
         for number, (x, y) in enumerate(((0, 0), (1, 0), (0, 1), (1, 1))):
             column, row = corner[:, 0] + x, corner[:, 1] + y
@@ -134,8 +147,8 @@ class Planes:
         # Drop texels of other islands, and those that no face covers.
         weights[self._at(_OWNER, index, np.int32) != 1 + island[:, None]] = 0.0
         total = weights.sum(axis=1)
-        found = np.flatnonzero(total > 1e-3)
-        return which[found], index[found], weights[found] / total[found, None]
+        shown = np.flatnonzero(total > 1e-3)
+        return which[shown], index[shown], weights[shown] / total[shown, None]
 
 
 class ErrorSums:
@@ -159,7 +172,7 @@ class ErrorSums:
 
     def report(self) -> dict:
         """Per pass: the noise of Cycles, and for each technique its bias and its error without that noise."""
-        found = {}
+        report = {}
         for pass_name, (norm, difference, total, light) in self._halves.items():
             techniques = {}
             for (name, of_pass), (product, shaded) in self._products.items():
@@ -171,8 +184,8 @@ class ErrorSums:
                         "bias": shaded / light - 1.0 if light > 0.0 else None,
                     }
             noise = math.sqrt(difference / total) if total > 0.0 else None
-            found[pass_name] = {"noise": noise, "techniques": techniques}
-        return found
+            report[pass_name] = {"noise": noise, "techniques": techniques}
+        return report
 
 
 class ErrorPictures:
@@ -229,11 +242,11 @@ def nearest_covered(coverage: np.ndarray, margin: int) -> tuple[np.ndarray, np.n
         row = rows + step
         inside = (row >= 0) & (row < height)
         row = np.clip(row, 0, height - 1)
-        found = column[row, columns]
-        distance = (found - columns).astype(np.int64) ** 2 + step * step
-        better = inside & (found >= 0) & (distance < best)
+        nearest = column[row, columns]
+        distance = (nearest - columns).astype(np.int64) ** 2 + step * step
+        better = inside & (nearest >= 0) & (distance < best)
         best[better] = distance[better]
-        source[better] = row[better] * width + found[better]
+        source[better] = row[better] * width + nearest[better]
     reached = source >= 0
     return (rows * width + columns)[reached], source[reached]
 
@@ -243,17 +256,73 @@ def _nearest_in_row(coverage, margin):
     height, width = coverage.shape
     columns = np.arange(width, dtype=np.int32)
     far = np.int32(width + 2 * margin + 2)
-    left = np.maximum.accumulate(np.where(coverage, columns, -far), axis=1)
-    right = np.minimum.accumulate(np.where(coverage, columns, 2 * far)[:, ::-1], axis=1)[:, ::-1]
-    to_left, to_right = columns - left, right - columns
-    nearest = np.where(to_left <= to_right, left, right)
+    before = np.maximum.accumulate(np.where(coverage, columns, -far), axis=1)
+    after = np.minimum.accumulate(np.where(coverage, columns, 2 * far)[:, ::-1], axis=1)[:, ::-1]
+    to_left, to_right = columns - before, after - columns
+    nearest = np.where(to_left <= to_right, before, after)
     return np.where(np.minimum(to_left, to_right) <= margin, nearest, -1).astype(np.int32)
 
 
-def _within_reach(found, margin):
-    """Mask (H, W) of the texels that have a true value of `found` (H, W) at most `margin` rows above or below."""
-    height = len(found)
-    counts = np.zeros((height + 1, found.shape[1]), dtype=np.int32)
-    np.cumsum(found, axis=0, out=counts[1:])
+def _within_reach(mask, margin):
+    """Mask (H, W) of the texels that have a true value of `mask` (H, W) at most `margin` rows above or below."""
+    height = len(mask)
+    counts = np.zeros((height + 1, mask.shape[1]), dtype=np.int32)
+    np.cumsum(mask, axis=0, out=counts[1:])
     rows = np.arange(height)
     return counts[np.minimum(rows + margin + 1, height)] > counts[np.maximum(rows - margin, 0)]
+
+
+class TileRecords:
+    """Records of finished tiles: reads those of the same job (with `resume`) and writes new ones.
+
+    Where the options have a `name`, only records of that name are read.
+    """
+
+    def __init__(self, options: BakeOptions):
+        self._records = Records(options.output, "tiles", _TILE_RECORD)
+        self._key = options_digest("bake", options, contents_digest(options))
+        names = None if options.name is None else [options.name]
+        whole = self._records.all_whole(self._key, names) if options.resume else []
+        self.finished = {(record["task"]["object"], record["task"]["tile"]): record for record in whole}
+
+    def take(self, name: str, tile: int, file: str) -> dict | None:
+        """The record of a finished tile of the object `name` with the `file`, else None."""
+        record = self.finished.get((name, tile))
+        return record if record is not None and file in record["files"] else None
+
+    def write(self, name: str, tile: int, stem: str, files, report: dict) -> dict:
+        """Write the record of a finished tile; returns it."""
+        return self._records.write(f"{stem}.{tile}", self._key, {"object": name, "tile": tile}, files, report=report)
+
+
+def applied_layer(options) -> str:
+    """The layer that `apply` shows: the first technique's combined light, or its first pass where only one is baked."""
+    names = applied_layers(options)
+    return names[0] if len(names) == 1 else layer_name(parse_layer_name(names[0])[0], COMBINED)
+
+
+def applied_layers(options) -> list[str]:
+    """The layers whose sum `apply` shows."""
+    passes = [name for name in PASSES if name in options.passes]
+    if COMBINED in options.passes or len(passes) < len(PASSES):
+        passes = [COMBINED] if COMBINED in options.passes else options.passes[:1]
+    return [layer_name(next(iter(technique_names(options.techniques))), pass_name) for pass_name in passes]
+
+
+def apply_textures(scene: Path, output: Path, records: list[dict], layer: str, progress=None) -> str:
+    """Save a copy of the .blend whose objects show the textures of the report's `records`; returns its file name."""
+    from ..blender.process.bake import BakedTextures, apply_bake
+
+    textures = []
+    for record in records:
+        if any("texture" not in tile for tile in record["tiles"].values()):
+            raise ValueError(f"object {record['name']!r}: has no texture to show; run the job again with --apply")
+        files = [
+            {"path": str((output / tile["texture"]).absolute()), "tile": int(number)}
+            for number, tile in record["tiles"].items()
+        ]
+        name = f"{record['name']} {layer}"
+        textures.append(BakedTextures(record["name"], record["uv"], name, files))
+    path = output / f"{Path(scene).stem}_baked.blend"
+    apply_bake(scene, path, textures, progress=progress)
+    return path.name

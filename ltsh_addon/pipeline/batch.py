@@ -13,7 +13,8 @@ from ..files import no_empty_folder, temporary_folder
 from ..imaging import write_json, write_overview
 from ..reading import NUMBER, Malformed, read_json
 from ..scene import Progress, SceneError, error_line
-from . import bake, picture, render, view
+from . import bake, picture, render
+from .lighting import prepare
 from .tasks import (
     FOLDER,
     FORMAT,
@@ -22,6 +23,7 @@ from .tasks import (
     BatchJob,
     BatchTask,
     Records,
+    TaskResult,
     read_document,
     shard_of,
     tasks_of,
@@ -37,7 +39,7 @@ class RunResult:
 
     tasks: int  # all
     done: int  # attempted now
-    kept: int  # finished before
+    finished_before: int  # by an earlier run
     problems: tuple[str, ...]
 
 
@@ -71,7 +73,7 @@ def run_tasks(
 
     output = job.options.output
     with no_empty_folder(output), temporary_folder() as folder, shared_blender(folder):
-        picture.prepare(job.options)
+        prepare(job.options)
         tasks = tasks_of(job, progress)
         mine = shard_of(tasks, shard)
         records = _task_records(output, job.command)
@@ -84,17 +86,17 @@ def run_tasks(
             if tell is not None:
                 tell(TaskState(number, len(wanted), task.name))
             following = tuple(other.object for other in wanted[number:] if other.unit == task.unit)
-            found, seconds, files = _attempt(job, task, following, existing, progress, alone=len(tasks) == 1)
+            outcome, seconds, files = _attempt(job, task, following, existing, progress, alone=len(tasks) == 1)
             try:
                 # Only once: the document holds all tasks, perhaps thousands.
                 if not told:
                     _write_job(job, tasks, existing)
                     told = True
                 write_record(_timing_path(output, task), seconds)
-                records.write(task.name, task.key, asdict(task), files, **found)
+                records.write(task.name, task.key, asdict(task), files, **outcome)
             except OSError as error:
-                raise OSError(found.get("problem", str(error))) from error
-            wrong = [found["problem"]] if "problem" in found else found["report"].get("problems", [])
+                raise OSError(outcome.get("problem", str(error))) from error
+            wrong = [outcome["problem"]] if "problem" in outcome else outcome["report"].get("problems", [])
             problems += wrong
             if tell is not None:
                 tell(TaskState(number, len(wanted), task.name, seconds["total"], "; ".join(wrong) or None))
@@ -120,7 +122,7 @@ def _is_done(records, task, existing) -> bool:
     return record is not None and "report" in record and not record["report"].get("problems")
 
 
-def _perform(job: BatchJob, task: BatchTask, following: tuple, existing: str, progress) -> picture.TaskResult:
+def _perform(job: BatchJob, task: BatchTask, following: tuple, existing: str, progress) -> TaskResult:
     options = task.options(job)
     if job.command == "bake":
         options = replace(options, resume=existing == RESUME)
@@ -128,7 +130,7 @@ def _perform(job: BatchJob, task: BatchTask, following: tuple, existing: str, pr
     if job.command == "render":
         return render.make_finished(options, progress)
     if job.command == "view":
-        return view.draw_view(options, progress)
+        return picture.draw_view(options, progress)
     return picture.make_picture(options, job.command == "compare", progress)
 
 
@@ -169,14 +171,12 @@ def merge(output: Path, progress=None) -> Merged:
     job = _read_job(output)
     tasks = [BatchTask(**{item.name: task[item.name] for item in fields(BatchTask)}) for task in job["tasks"]]
     records = _task_records(output, job["command"])
-    found = {task.name: records.whole(task.name, None if job["any_key"] else task.key) for task in tasks}
-    missing = tuple(task.name for task in tasks if found[task.name] is None)
+    finished = {task.name: records.whole(task.name, None if job["any_key"] else task.key) for task in tasks}
+    missing = tuple(task.name for task in tasks if finished[task.name] is None)
     if len(missing) == len(tasks):
         raise ValueError(f"{output}: no task of its job is done, expected {', '.join(missing[:5])}; run it first")
-    units = [
-        _unit(job, output, list(members), found, progress) for _, members in groupby(tasks, key=lambda task: task.unit)
-    ]
-    units = [unit for unit in units if unit is not None]
+    by_unit = (list(members) for _, members in groupby(tasks, key=lambda task: task.unit))
+    units = [unit for members in by_unit if (unit := _unit(job, output, members, finished, progress)) is not None]
     # The problems of a bake name its objects already.
     is_plain = job["single"] or job["command"] == "bake"
     problems = [
@@ -184,9 +184,9 @@ def merge(output: Path, progress=None) -> Merged:
         for name, report in units
         for problem in report.get("problems", ())
     ]
-    problems += [record["problem"] for record in found.values() if record and "problem" in record]
-    problems += _different_versions(found)
-    seconds = {task.name: _read_seconds(output, task) for task in tasks if found[task.name] is not None}
+    problems += [record["problem"] for record in finished.values() if record and "problem" in record]
+    problems += _different_versions(finished)
+    seconds = {task.name: _read_seconds(output, task) for task in tasks if finished[task.name] is not None}
     if job["single"] and units:
         report, seconds = units[0][1], _sum_of(seconds.values())
     else:
@@ -221,9 +221,9 @@ def _task_records(output, command) -> Records:
     return Records(output, "tasks", {**TASK_RECORD, "report?": report})
 
 
-def _unit(job, output, tasks, found, progress) -> tuple[str, dict] | None:
+def _unit(job, output, tasks, finished, progress) -> tuple[str, dict] | None:
     """Name and report of one picture, or of all objects of one bake; None where none of its tasks is done."""
-    records = [found[task.name] for task in tasks if found[task.name] and "report" in found[task.name]]
+    records = [record for task in tasks if (record := finished[task.name]) and "report" in record]
     if not records:
         return None
     files = sorted(file for record in records for file in record["files"])
@@ -232,15 +232,15 @@ def _unit(job, output, tasks, found, progress) -> tuple[str, dict] | None:
         return tasks[0].name, reports[0] if job["single"] else {"files": files, **reports[0]}
     report = {
         **reports[0],
-        "objects": _objects(item for part in reports for item in part["objects"]),
-        "problems": list(dict.fromkeys(line for part in reports for line in part["problems"])),
-        "warnings": list(dict.fromkeys(line for part in reports for line in part["warnings"])),
+        "objects": _objects(item for one in reports for item in one["objects"]),
+        "problems": list(dict.fromkeys(line for one in reports for line in one["problems"])),
+        "warnings": list(dict.fromkeys(line for one in reports for line in one["warnings"])),
     }
     if job["applied_layer"] and report["objects"]:
         report["applied"] = bake.apply_textures(
             Path(tasks[0].scene), output, report["objects"], job["applied_layer"], progress
         )
-    name = " ".join(str(part) for part in (Path(tasks[0].scene).stem, *tasks[0].unit[1:]) if part is not None)
+    name = " ".join(str(word) for word in (Path(tasks[0].scene).stem, *tasks[0].unit[1:]) if word is not None)
     return name, report if job["single"] else {"files": files, **report}
 
 
@@ -253,10 +253,10 @@ def _objects(items) -> list[dict]:
     return list(objects.values())
 
 
-def _different_versions(found) -> list[str]:
+def _different_versions(records) -> list[str]:
     """The problem where shards ran on different versions, whose results must not be mixed; empty if they agree."""
     names = {}
-    for name, record in found.items():
+    for name, record in records.items():
         if record and "report" in record:
             names.setdefault(json.dumps(record["report"]["versions"], sort_keys=True), name)
     if len(names) < 2:
@@ -279,8 +279,8 @@ def _read_seconds(output, task) -> dict:
 def _sum_of(seconds) -> dict:
     """The sums of the seconds of several tasks, name by name."""
     total: dict = {}
-    for part in seconds:
-        for name, value in part.items():
+    for one in seconds:
+        for name, value in one.items():
             before = total.get(name)
             if isinstance(value, dict):
                 total[name] = _sum_of([before if isinstance(before, dict) else {}, value])

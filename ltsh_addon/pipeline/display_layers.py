@@ -8,17 +8,24 @@ from pathlib import Path
 import numpy as np
 
 from .. import imaging
-from ..imaging.exr import write_channels
+from ..imaging.exr import (
+    COMBINED,
+    COVERAGE,
+    CYCLES_LAYERS,
+    ERROR,
+    UNSHADOWED,
+    layer_name,
+    parse_layer_name,
+    write_channels,
+)
 from ..imaging.report import FILE, write_index
 from ..imaging.sheet import common_error_scale
 from ..scene import BAKE_PASSES, CYCLES, REFERENCE, TECHNIQUES, Progress
-from .lighting import RELIGHT_SUFFIX, RelightData
+from .comparison import against_cycles
 from .mixer import MIXER_FILE, light_pictures
-from .picture import UNSHADOWED, against_cycles
+from .relight import RELIGHT_SUFFIX, RelightData
 
 FOLDER = "images"
-ERROR = "error_"
-COMBINED = "combined"
 LABELS = {CYCLES: "Cycles", **{name: technique.label for name, technique in TECHNIQUES.items()}}
 FILES = {"shade": "shade.exr", "compare": "compare.exr"}
 
@@ -45,33 +52,33 @@ def write(command: str, output: Path, report: dict, partial: str = "") -> Path:
 
 
 def write_lights(folder: Path, arguments: Sequence[str], progress: Progress | None = None) -> None:
-    """Write the file of the light mixer into the `folder` of `write`, if the command with these `arguments` kept its
-    samples; else remove an old one."""
+    """Write the file of the light mixer into the `folder` of `write`, if the command with these `arguments` wrote
+    relight data; else remove an old one."""
     path = folder / MIXER_FILE
     if "--keep-visibility" in arguments:
-        kept = Path(FILES[arguments[0]]).with_suffix(RELIGHT_SUFFIX)
-        light_pictures(RelightData.load(folder.parent / kept), progress).save(path)
+        samples = Path(FILES[arguments[0]]).with_suffix(RELIGHT_SUFFIX)
+        light_pictures(RelightData.load(folder.parent / samples), progress).save(path)
     else:
         path.unlink(missing_ok=True)
 
 
 def _group(path: Path, folder: Path, prefix: str, report: dict) -> dict:
     """Write the pictures of one EXR, with `prefix` before their file names; returns their entry of the index."""
-    layers = {name: pixels for name, pixels in imaging.read_layers(path).items() if "@" not in name}
+    layers = {name: pixels for name, pixels in imaging.read_layers(path).items() if not parse_layer_name(name)[2]}
     # The files show emission and background, too. Figures and scales are those of the reflected light.
     shown = {name: layers.pop(name)[..., :3] for name in _whole_pictures(layers)}
-    names = [name for name in _techniques(layers) if not name.startswith(("cycles_", ERROR))]
+    names = [name for name in _techniques(layers) if not name.startswith((*CYCLES_LAYERS[1:], ERROR))]
     names = [name for name in names if not name.endswith(UNSHADOWED)]
-    passes = [name for name in BAKE_PASSES if f"{names[0]}.{name}" in layers]
+    passes = [name for name in BAKE_PASSES if layer_name(names[0], name) in layers]
     _add_combined(layers, names, passes)
     written = {}
     for name in names:
         for pass_name in passes:
-            for layer in (f"{name}.{pass_name}", f"{ERROR}{name}.{pass_name}"):
+            for layer in (layer_name(name, pass_name), layer_name(ERROR + name, pass_name)):
                 if layer in layers:
                     written[layer] = f"{prefix}{layer}.exr"
                     write_channels(folder / written[layer], _unnamed(shown.get(layer, layers[layer])))
-    height, width = layers[f"{names[0]}.{passes[0]}"].shape[:2]
+    height, width = layers[layer_name(names[0], passes[0])].shape[:2]
     return {
         "size": [width, height],
         "names": names,
@@ -86,14 +93,15 @@ def _group(path: Path, folder: Path, prefix: str, report: dict) -> dict:
 
 def _whole_pictures(layers) -> list[str]:
     """Names of the layers of whole pictures: the combined ones with alpha."""
-    return [name for name, pixels in layers.items() if name.endswith(f".{COMBINED}") and pixels.shape[-1] == 4]
+    combined = [name for name in layers if parse_layer_name(name)[1] == COMBINED]
+    return [name for name in combined if layers[name].shape[-1] == 4]
 
 
 def _techniques(layers) -> list[str]:
     """Names of the layers of radiance: techniques in their usual order, then the user's tables, Cycles last."""
-    found = {name.rpartition(".")[0] for name in layers if name.rpartition(".")[2] in BAKE_PASSES}
-    others = sorted(found - {*TECHNIQUES, CYCLES})
-    return [name for name in (*TECHNIQUES, *others, CYCLES) if name in found]
+    names = {technique for technique, pass_name, _ in map(parse_layer_name, layers) if pass_name in BAKE_PASSES}
+    others = sorted(names - {*TECHNIQUES, CYCLES})
+    return [name for name in (*TECHNIQUES, *others, CYCLES) if name in names]
 
 
 def _add_combined(layers, names, passes) -> None:
@@ -102,8 +110,9 @@ def _add_combined(layers, names, passes) -> None:
         return
     for name in names:
         for layer in (name, ERROR + name, f"{name}_A", f"{name}_B"):
-            if f"{layer}.specular" in layers:
-                layers[f"{layer}.{COMBINED}"] = layers[f"{layer}.specular"] + layers[f"{layer}.diffuse"]
+            specular, diffuse = (layer_name(layer, pass_name) for pass_name in ("specular", "diffuse"))
+            if specular in layers:
+                layers[layer_name(layer, COMBINED)] = layers[specular] + layers[diffuse]
     passes.append(COMBINED)
 
 
@@ -114,10 +123,10 @@ def _unnamed(pixels: np.ndarray) -> dict:
 
 def _scale(layers, names, pass_name) -> float:
     """The radiance of an error at the ends of its color scale."""
-    picture = layers[f"{names[-1]}.{pass_name}"]
-    errors = [layers[layer] for name in names if (layer := f"{ERROR}{name}.{pass_name}") in layers]
+    picture = layers[layer_name(names[-1], pass_name)]
+    errors = [layers[layer] for name in names if (layer := layer_name(ERROR + name, pass_name)) in layers]
     if not errors:
-        errors = [layers[f"{name}.{pass_name}"] - picture for name in names[:-1]]
+        errors = [layers[layer_name(name, pass_name)] - picture for name in names[:-1]]
     return common_error_scale(errors, picture)
 
 
@@ -135,12 +144,12 @@ def _figures(layers, names, passes, report) -> dict:
 
 
 def _measured(layers, names, pass_name) -> dict:
-    halves = np.stack([layers[f"cycles_{half}.{pass_name}"] for half in "AB"])
-    hit, rows = layers["coverage.hit"] > 0.0, {}
+    halves = np.stack([layers[layer_name(half, pass_name)] for half in CYCLES_LAYERS[1:]])
+    hit, rows = layers[COVERAGE] > 0.0, {}
     for name in names:
         if name != CYCLES:
-            picture = layers[f"{name}.{pass_name}"]
-            # The reference may cover a part of the pixels only; the others are black.
+            picture = layers[layer_name(name, pass_name)]
+            # The reference may cover some of the pixels only; the others are black.
             mask = hit & picture.any(axis=-1) if name == REFERENCE else hit
             rows[name] = against_cycles(picture, halves, mask)
     return {"noise": imaging.reference_noise(*halves, hit), "techniques": rows}
@@ -148,7 +157,7 @@ def _measured(layers, names, pass_name) -> dict:
 
 def _remove_others(folder: Path, groups: dict) -> None:
     """Remove pictures of an earlier run, which would be mistaken for those of this one."""
-    kept = {FILE} | {name for group in groups.values() for name in group["files"].values()}
+    names = {FILE} | {name for group in groups.values() for name in group["files"].values()}
     for path in folder.iterdir():
-        if path.name not in kept and path.suffix == ".exr":
+        if path.name not in names and path.suffix == ".exr":
             path.unlink()

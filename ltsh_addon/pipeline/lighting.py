@@ -1,46 +1,46 @@
-"""Radiance of samples under lights and occluders, for pictures and bakes; and the file of a kept picture.
+"""Radiance of samples by techniques, under lights and occluders, for pictures and bakes.
 
-radiance = closed form x the share of the light that the sample sees. The shares are the same for every technique.
+radiance = closed form x visibility of the light. The visibility is the same for every technique.
 """
 
 from __future__ import annotations
 
 import itertools
-import json
 import time
-import zipfile
-import zlib
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from .. import shading, visibility
 from ..cycles.gbuffer import finer
 from ..emitters.light_tree import FEWEST
-from ..files import replacing
+from ..files import check_takes_files
+from ..imaging.exr import unique_names
 from ..scene import (
+    CYCLES,
     REFERENCE,
+    SHIPPED_TABLES,
+    TECHNIQUES,
     AreaLight,
+    Cancelled,
     Film,
     Progress,
     SurfaceSamples,
-    error_line,
-    light_records,
-    lights_of,
 )
 
-FILM_ARRAYS = ("first", "count", "spread", "whole")  # the optional arrays of a film
-# The two files of `write_relight_data`: the samples with all that shading needs, and the occluders.
-RELIGHT_SUFFIX, OCCLUDERS_SUFFIX = ".samples.npz", ".occluders.npz"
 # MOST_PAIRS: how many pairs of a sample and a light have their radiance in memory at a time.
 MOST_PAIRS = 1 << 25
 # FEWEST_RAYS: a sample gets at least so many of the rays of its pixel, or all of them if they are fewer. The first
 # eight only tell whether more are needed.
 FEWEST_RAYS = 32
+REFERENCE_SEED = 20160725
+# Limits of the reference: MOST_REFERENCE_PAIRS pairs of a sample and a light, some 30 us each, but always
+# FEWEST_SAMPLES samples.
+MOST_REFERENCE_PAIRS, FEWEST_SAMPLES = 3_000_000, 32
 
 
 @dataclass(frozen=True)
@@ -61,9 +61,9 @@ class Shadows:
         """The shadows of the samples at `index` (Q,)."""
         return replace(self, shares={name: values[:, index] for name, values in self.shares.items()})
 
-    def with_more(self, kept: np.ndarray, more: Shadows) -> Shadows:
-        """The shadows of the samples in the mask `kept` (P,), then those of `more`; `light` and `variance` stay."""
-        shares = {name: np.concatenate([one[:, kept], more.shares[name]], 1) for name, one in self.shares.items()}
+    def with_more(self, mask: np.ndarray, more: Shadows) -> Shadows:
+        """The shadows of the samples in `mask` (P,), then those of `more`; `light` and `variance` stay."""
+        shares = {name: np.concatenate([one[:, mask], more.shares[name]], 1) for name, one in self.shares.items()}
         return replace(self, shares=shares, rays=self.rays + more.rays, seconds=self.seconds + more.seconds)
 
     def of_lights(self, numbers: Sequence[int]) -> Shadows:
@@ -71,10 +71,10 @@ class Shadows:
 
         Of lights that share their rays, `numbers` must hold all or none.
         """
-        place = {number: index for index, number in enumerate(numbers)}
-        rows = [row for row, own in enumerate(self.numbers) if own[0] in place]
-        shares = {name: values[rows] for name, values in self.shares.items()}
-        return replace(self, shares=shares, numbers=tuple(tuple(place[n] for n in self.numbers[row]) for row in rows))
+        index_of = {number: index for index, number in enumerate(numbers)}
+        rows = [row for row, (first, *_) in enumerate(self.numbers) if first in index_of]
+        renumbered = tuple(tuple(index_of[number] for number in self.numbers[row]) for row in rows)
+        return replace(self, shares={name: one[rows] for name, one in self.shares.items()}, numbers=renumbered)
 
     def report(self) -> dict:
         """The entry of report.json."""
@@ -116,8 +116,8 @@ class ShadowTracer:
     def finer(self, samples: SurfaceSamples, film: Film, points, pixels: np.ndarray):
         """`gbuffer.finer` with this tracer's rays, for samples in world space."""
         samples = replace(samples, position=samples.position - self._origin)
-        found, film, replaced = finer(samples, film, points, pixels, self._tracer.first_met)
-        return replace(found, position=found.position + self._origin), film, replaced
+        samples, film, replaced = finer(samples, film, points, pixels, self._tracer.first_met)
+        return replace(samples, position=samples.position + self._origin), film, replaced
 
     def trace(
         self,
@@ -130,19 +130,18 @@ class ShadowTracer:
         """The shadows of `samples` under all lights; see `visibility.visible_shares` for the other arguments."""
         start = time.perf_counter()
         samples = replace(samples, position=samples.position - self._origin)
-        found = visibility.visible_shares(
+        estimate = visibility.visible_shares(
             samples, self._lights, self._tracer, sampling, workers=workers, progress=progress
         )
         passes, film = sampling.passes, sampling.film
-        shares = {name: getattr(found, name) for name in passes}
-        noise = {name: found.noise(name, film) for name in passes}
+        shares = {name: getattr(estimate, name) for name in passes}
+        noise = {name: estimate.noise(name, film) for name in passes}
         seconds, tracer = time.perf_counter() - start, self._tracer.description
-        made = Shadows(shares, found.numbers, noise, found.rays, tracer, seconds)
-        if film is None:
-            return made
-        light = {name: film.image(found.radiance[name]) for name in passes}
-        variance = {name: film.variance(np.square(found.deviation[name])) for name in passes}
-        return replace(made, light=light, variance=variance)
+        light, variance = {}, {}
+        if film is not None:
+            light = {name: film.image(estimate.radiance[name]) for name in passes}
+            variance = {name: film.variance(np.square(estimate.deviation[name])) for name in passes}
+        return Shadows(shares, estimate.numbers, noise, estimate.rays, tracer, seconds, light, variance)
 
 
 def trace_shadows(extraction, passes: Sequence[str], rays: int, progress: Progress | None) -> Shadows:
@@ -158,198 +157,190 @@ def shade_lights(
     lights: Sequence[AreaLight],
     table: str | shading.LookupTable | shading.OwnTechnique,
     passes: Sequence[str],
-    seen: Sequence[Shadows | None] = (None,),
+    shadowing: Sequence[Shadows | None] = (None,),
     *,
+    rows: Sequence[int] | None = None,
     workers: int | None = None,
     progress: Callable[[float], bool | None] | None = None,
 ) -> list[shading.Shading]:
-    """Radiance of `samples` (P) under `lights` (L): one Shading for each entry of `seen`.
+    """Radiance of `samples` (P) under `lights` (L): one Shading for each entry of `shadowing`.
 
-    An entry is the shadows of the samples, or None for no shadows. All shadows must group the lights alike.
+    An entry is the shadows of the samples, or None for no shadows. All shadows must join the same lights, and only
+    lights of one row. `rows` (L,) are as for `shade`; by default each of the `light_groups` has a row.
 
     Lights that share their rays are shaded together and then multiplied by their share, so that a sample that sees
     them whole gets the same bits as without shadows. Exception: many lights without any shadows go to `shade` at once,
     which then merges those that a sample cannot tell apart.
     """
-    if lights and all(shares is None for shares in seen):
-        if max(Counter(light.group for light in lights).values()) >= FEWEST:
-            found = shading.shade(samples, lights, table, passes=tuple(passes), workers=workers, progress=progress)
-            return [found] * len(seen)
-    groups = tuple(dict.fromkeys(light.group for light in lights)) or ("",)
-    shape = len(groups), len(samples), 3
-    sums = [{name: np.zeros(shape, np.float32) for name in passes} for _ in seen]
-    numbers = next((shadows.numbers for shadows in seen if shadows is not None), None)
-    numbers = visibility.shared_numbers(lights) if numbers is None else numbers
+    if rows is None:
+        groups = light_groups(lights)
+        rows = [groups.index(light.group) for light in lights]
+    options = {"passes": tuple(passes), "workers": workers}
+    if lights and all(shadows is None for shadows in shadowing):
+        if max(Counter(rows).values()) >= FEWEST:
+            shaded = shading.shade(samples, lights, table, rows=rows, progress=progress, **options)
+            return [shaded] * len(shadowing)
+    shape = 1 + max(rows, default=0), len(samples), 3
+    sums = [{name: np.zeros(shape, np.float32) for name in passes} for _ in shadowing]
+    joined = next((shadows.numbers for shadows in shadowing if shadows is not None), None)
+    if joined is None:
+        # Lights of several rows cannot be shaded together.
+        alike = visibility.shared_numbers(lights)
+        alike = [[one] if len({rows[n] for n in one}) == 1 else [(n,) for n in one] for one in alike]
+        joined = sorted(itertools.chain.from_iterable(alike))
     error, most = None, max(1, MOST_PAIRS // max(1, len(samples)))
-    for first in range(0, len(numbers), most):
-        part = numbers[first : first + most]
-        start, share = first / len(numbers), len(part) / len(numbers)
+    for first in range(0, len(joined), most):
+        block = joined[first : first + most]
+        start, share = first / len(joined), len(block) / len(joined)
 
         def report(fraction, start=start, share=share):
             return None if progress is None else progress(start + fraction * share)
 
-        own = [lights[light].altered(group=str(number)) for number, one in enumerate(part) for light in one]
-        found = shading.shade(samples, own, table, passes=tuple(passes), workers=workers, progress=report)
-        if found.quadrature_error is not None:
-            error = found.quadrature_error if error is None else error + found.quadrature_error
-        for number, one in enumerate(part):
-            group = groups.index(lights[one[0]].group)
+        of_block = [lights[number] for numbers in block for number in numbers]
+        row_of = [row for row, numbers in enumerate(block) for _ in numbers]
+        shaded = shading.shade(samples, of_block, table, rows=row_of, progress=report, **options)
+        if shaded.quadrature_error is not None:
+            error = shaded.quadrature_error if error is None else error + shaded.quadrature_error
+        for number, lights_of_row in enumerate(block):
+            row = rows[lights_of_row[0]]
             for name in passes:
-                radiance = getattr(found, name)[number]
-                for whole, shadows in zip(sums, seen, strict=True):
-                    is_all = shadows is None
-                    share = 1.0 if is_all else shadows.shares[name][first + number][:, None]
-                    whole[name][group] += radiance if is_all else share * radiance
-    return [shading.Shading(groups, whole.get("specular"), whole.get("diffuse"), error) for whole in sums]
+                radiance = getattr(shaded, name)[number]
+                for total, shadows in zip(sums, shadowing, strict=True):
+                    if shadows is None:
+                        total[name][row] += radiance
+                    else:
+                        total[name][row] += shadows.shares[name][first + number][:, None] * radiance
+    return [shading.Shading(total.get("specular"), total.get("diffuse"), error) for total in sums]
 
 
-def layer_names(names: Iterable[str]) -> list[str]:
-    """`names` made unique for layers, with _ for the dots that separate the parts of a layer's name."""
-    found: list[str] = []
-    for name in names:
-        plain = name.replace(".", "_")
-        others = (f"{plain}_{number}" for number in itertools.count(2))
-        found.append(next(other for other in itertools.chain([plain], others) if other not in found))
-    return found
+def light_groups(lights: Iterable[AreaLight]) -> tuple[str, ...]:
+    """The names of the light groups of `lights` in the order of their first lights, "" for none; at least one name."""
+    return tuple(dict.fromkeys(light.group for light in lights)) or ("",)
 
 
-def group_names(groups: Sequence[str]) -> list[str]:
-    """Layer names of light groups. The empty group becomes "ungrouped", or a longer name that is free."""
-    ungrouped = "ungrouped"
-    while ungrouped in groups:
-        ungrouped += "_"
-    return layer_names(group or ungrouped for group in groups)
+# A shader is the name of the reference, a table, or a technique that a script has given.
+Shader = str | shading.LookupTable | shading.OwnTechnique
+
+
+def prepare(options) -> dict[str, Shader]:
+    """The shaders by the names of their techniques in results. Also checks that the output folder takes files.
+
+    Call it before anything that takes long. Raises TableError, OSError.
+    """
+    tables = load_tables(options.techniques)
+    try:
+        check_takes_files(Path(options.output))
+    except OSError as error:
+        problem = f"cannot be written ({error.strerror}); choose another folder"
+        raise OSError(f"output folder {options.output}: {problem}") from error
+    return tables
+
+
+def load_tables(techniques: Sequence[str | shading.OwnTechnique]) -> dict[str, Shader]:
+    """The shaders by the names of their techniques in results. Raises TableError."""
+    return {name: _table(given) for name, given in technique_names(techniques).items()}
+
+
+def _table(given) -> Shader:
+    if shading.is_own(given) or given == REFERENCE:
+        return given
+    # Shipped tables are cached: a job of many frames loads them for each. A user's table may change meanwhile.
+    return _shipped_table(given) if given in SHIPPED_TABLES else shading.load_table(given)
+
+
+_shipped_table = cache(shading.load_table)
+
+
+def technique_names(techniques: Sequence[str | shading.OwnTechnique]) -> dict[str, str | shading.OwnTechnique]:
+    """The given techniques by their names in results; the name of a user's table is the stem of its path."""
+    names = {}
+    for given in techniques:
+        is_own = shading.is_own(given)
+        name = str(getattr(given, "name", type(given).__name__)) if is_own else Path(given).stem
+        if is_own or given not in TECHNIQUES:
+            name = unique_names([*dict.fromkeys((*TECHNIQUES, CYCLES, *names)), name])[-1]
+        names[name] = given
+    return names
+
+
+def check_named(techniques: Sequence, what: str) -> None:
+    """Raise ValueError where a technique is a user's own, which `what` could not call later."""
+    if unnamed := [described(given) for given in techniques if shading.is_own(given)]:
+        raise ValueError(
+            f"technique {unnamed[0]}: {what} cannot call it later, expected {', '.join(TECHNIQUES)} or the path of a "
+            "table (.npz); leave it out"
+        )
+
+
+def described(given) -> str:
+    """How report.json names a technique: its name, the path of its table, or the class of a user's own."""
+    return f"{type(given).__module__}.{type(given).__qualname__}" if shading.is_own(given) else str(given)
+
+
+def title(name: str) -> str:
+    """The title of a technique on sheets and in progress; for a user's table its name."""
+    return TECHNIQUES[name].title if name in TECHNIQUES else name
 
 
 @dataclass(frozen=True)
-class RelightData:
-    """A picture kept by `write_relight_data`: all that shading needs, without Blender and without rays.
+class TechniqueResult:
+    """Radiance of one technique on all samples, or on a subset (Q,) of them."""
 
-    whole picture = sum over passes of `shown` x image of the samples, + sum of `rest`; all include the exposure.
-    """
+    shading: shading.Shading  # radiance (G, Q, 3) per pass, a row a light group
+    seconds: dict[str, float]  # per pass
+    subset: np.ndarray | None  # (Q,) sorted indices of the samples that were evaluated, None for all
+    unshadowed: shading.Shading | None = None  # the same without shadows, where `shading` has shadows
 
-    extraction: Any  # blender.process.pixels.Extraction, without reference and occluders
-    shadows: Shadows | None
-    options: dict  # fields of PictureOptions
-    had_cycles: bool
-    # By light group: its bounced light (H, W, 3). By "": what depends on no light group (H, W, 3 or 4 with alpha).
-    rest: dict[str, np.ndarray] = field(default_factory=dict)
-    # By pass (H, W): the share of the pass that is ours and not Cycles'; left out: 1.
-    taken: dict[str, np.ndarray] = field(default_factory=dict)
-    # By pass (H, W): a factor of hard edges of light, valid only while the lights stay where they were; left out: 1.
-    edges: dict[str, np.ndarray] = field(default_factory=dict)
-
-    @property
-    def technique(self) -> str:
-        """The last technique of the picture except the reference: by convention the most accurate."""
-        names = [name for name in self.options["techniques"] if name != REFERENCE]
-        return names[-1] if names else "ltsh4"
-
-    def shown(self, name: str, *, moved: bool = False) -> np.ndarray | float:
-        """Factor (H, W, 1) of the image of a pass of the samples; without `edges` for `moved` lights."""
-        taken = self.taken[name][..., None] if name in self.taken else 1.0
-        return taken if moved or name not in self.edges else taken * self.edges[name][..., None]
-
-    @classmethod
-    def load(cls, path: Path) -> RelightData:
-        """Raises OSError, and ValueError where the file is not what `write_relight_data` writes."""
-        try:
-            with Path(path).open("rb") as file, np.load(file) as data:
-                arrays = {name: data[name] for name in data.files}
-            document = json.loads(str(arrays.pop("document")))
-            return cls._of(document, arrays)
-        except (ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile, zlib.error) as error:
-            problem = f"is no file of --keep-visibility, or not whole ({error_line(error)})"
-            raise ValueError(f"{path}: {problem}; run the picture again") from error
-
-    @classmethod
-    def _of(cls, document, arrays) -> RelightData:
-        from ..blender.process.pixels import CyclesPasses, Extraction, ExtractionTimes, PictureFacts
-
-        record = document["extraction"]
-        extraction = Extraction(
-            lights=lights_of(record["lights"]),
-            samples=SurfaceSamples(
-                **{item.name: _compact(arrays[f"samples.{item.name}"]) for item in fields(SurfaceSamples)}
-            ),
-            film=Film(
-                pixel=arrays["film.pixel"],
-                **{name: arrays.get(f"film.{name}") for name in FILM_ARRAYS},
-                **record["film"],
-            ),
-            picture=PictureFacts.of(record),
-            cycles=CyclesPasses(**{name: arrays.get(f"picture.{name}") for name in NOT_REFLECTED}),
-            times=ExtractionTimes(record["seconds"]),
-            warnings=tuple(record["warnings"]),
-            problems=tuple(record["problems"]),
-            origin=np.array(record["origin"]),
-            light_settings=record["light_settings"],
-        )
-        shadows = document["shadows"]
-        if shadows is not None:
-            shares = {name: arrays[f"shares.{name}"] for name in shadows["noise"]}
-            numbers = tuple(map(tuple, shadows["numbers"]))
-            shadows = Shadows(shares, numbers, shadows["noise"], shadows["rays"], shadows["tracer"])
-        options = document["options"]
-        options = {name: tuple(value) if isinstance(value, list) else value for name, value in options.items()}
-        options["scene"] = Path(options["scene"])
-        rest = {name: arrays[f"rest.{name}"] for name in document["rest"]}
-        taken, edges = ({name: arrays[f"{kind}.{name}"] for name in document[kind]} for kind in ("taken", "edges"))
-        return cls(extraction, shadows, options, document["had_cycles"], rest, taken, edges)
+    def with_more(self, mask: np.ndarray, more: TechniqueResult) -> TechniqueResult:
+        """The samples in `mask` (P,), then those of `more`; both results must be without a subset."""
+        seconds = {name: value + more.seconds[name] for name, value in self.seconds.items()}
+        unshadowed = None if self.unshadowed is None else self.unshadowed.with_more(mask, more.unshadowed)
+        return TechniqueResult(self.shading.with_more(mask, more.shading), seconds, None, unshadowed)
 
 
-def _compact(values: np.ndarray) -> np.ndarray:
-    """`values`; a broadcast zero where all are zero."""
-    return values if values.any() else np.broadcast_to(values.dtype.type(0), values.shape)
+def evaluated(tables, extraction, shadows, options, progress) -> dict[str, TechniqueResult]:
+    """The results of all techniques in `tables` (see `prepare`), by name."""
+    return {name: _evaluate(name, table, extraction, shadows, options, progress) for name, table in tables.items()}
 
 
-NOT_REFLECTED = ("emission", "background")  # optional arrays of `Extraction.cycles`
-FINISHED = ("rest", "taken", "edges")  # fields of a RelightData that only finished pictures have
-RELIGHT_OPTIONS = ("techniques", "passes", "sub_samples", "reference_samples", "shadows", "shadow_rays")
+def _evaluate(name, table, extraction, shadows, options, progress) -> TechniqueResult:
+    """Shade all samples; the reference shades those of randomly chosen pixels where there are too many."""
+    samples, subset = extraction.samples, None
+    limit = min(options.reference_samples, max(FEWEST_SAMPLES, MOST_REFERENCE_PAIRS // max(len(extraction.lights), 1)))
+    if name == REFERENCE and len(samples) > limit:
+        subset = _samples_of_random_pixels(extraction.film, limit)
+        samples = samples.take(subset)
+    wanted = (None,) if shadows is None else (shadows if subset is None else shadows.take(subset), None)
+    lit, seconds = [{} for _ in wanted], {}
+    for index, pass_name in enumerate(options.passes):
+
+        def report(fraction, done=index):
+            whole = (done + fraction) / len(options.passes)
+            return None if progress is None else progress(title(name), whole)
+
+        if report(0.0) is False:
+            raise Cancelled(f"stopped before {name} shaded the {pass_name} pass")
+        start = time.perf_counter()
+        shadings = shade_lights(samples, extraction.lights, table, (pass_name,), wanted, progress=report)
+        for of_pass, shaded in zip(lit, shadings, strict=True):
+            of_pass[pass_name] = shaded
+        seconds[pass_name] = time.perf_counter() - start
+    shaded, *unshadowed = map(_joined, lit)
+    return TechniqueResult(shaded, seconds, subset, *unshadowed)
 
 
-def write_relight_data(extraction, shadows: Shadows | None, options, path: Path, **finished) -> list[Path]:
-    """Write the .npz that `RelightData.load` reads, atomically, and the occluders beside it; returns the paths.
+def _joined(shaded: dict[str, shading.Shading]) -> shading.Shading:
+    """Several Shadings of one pass each as one Shading."""
+    passes = {name: getattr(one, name) for name, one in shaded.items()}
+    error = shaded["specular"].quadrature_error if "specular" in shaded else None
+    return shading.Shading(passes.get("specular"), passes.get("diffuse"), error)
 
-    `finished` are the fields `rest`, `taken` and `edges` of the RelightData of a finished picture. Raises OSError.
-    """
-    film = extraction.film
-    document = {
-        "extraction": {
-            **extraction.picture.record(),
-            "seconds": extraction.times.stages,
-            "light_settings": extraction.light_settings,
-            "lights": light_records(extraction.lights),
-            "film": {"width": film.width, "height": film.height, "sub_samples": film.sub_samples},
-            "warnings": extraction.warnings,
-            "problems": extraction.problems,
-            "origin": np.asarray(extraction.origin).tolist(),
-        },
-        "shadows": None if shadows is None else {**shadows.report(), "numbers": shadows.numbers},
-        "options": {"scene": str(options.scene), **{name: getattr(options, name) for name in RELIGHT_OPTIONS}},
-        "had_cycles": extraction.cycles.reference is not None,
-        **{kind: list(finished.get(kind, ())) for kind in FINISHED},
-    }
-    arrays = {f"samples.{item.name}": getattr(extraction.samples, item.name) for item in fields(SurfaceSamples)}
-    arrays["film.pixel"] = film.pixel
-    arrays |= {f"film.{name}": getattr(film, name) for name in FILM_ARRAYS if getattr(film, name) is not None}
-    if shadows is not None:
-        arrays |= {f"shares.{name}": values for name, values in shadows.shares.items()}
-    seen = {name: getattr(extraction.cycles, name) for name in NOT_REFLECTED}
-    arrays |= {f"picture.{name}": values.astype(np.float32) for name, values in seen.items() if values is not None}
-    for kind, parts in finished.items():
-        arrays |= {f"{kind}.{name}": np.asarray(values, np.float32) for name, values in parts.items()}
-    arrays["document"] = np.array(json.dumps(document))
-    # np.savez_compressed would take twice as long, for files 5 % smaller.
-    with (
-        replacing(path) as temporary,
-        zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
-    ):
-        for name, values in arrays.items():
-            with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
-                np.lib.format.write_array(file, np.asarray(values), allow_pickle=False)
-    if extraction.occluders is None:
-        return [path]
-    occluders = path.with_name(path.name.removesuffix(RELIGHT_SUFFIX) + OCCLUDERS_SUFFIX)
-    extraction.occluders.save(occluders)
-    return [path, occluders]
+
+def _samples_of_random_pixels(film: Film, limit: int) -> np.ndarray:
+    """Sorted indices of at most `limit` samples: all samples of pixels that a seeded generator chooses."""
+    generator = np.random.default_rng(REFERENCE_SEED)
+    order = generator.permutation(film.width * film.height)
+    count = np.bincount(film.pixel, minlength=len(order))[order]
+    chosen = np.zeros(len(order), dtype=bool)
+    chosen[order[np.cumsum(count) <= limit]] = True
+    return np.nonzero(chosen[film.pixel])[0]

@@ -15,9 +15,8 @@ import numpy as np
 
 from ..files import replacing
 from ..scene import AreaLight, Progress, error_line, listed
-from . import picture
-from .lighting import RelightData, Shadows, shade_lights
-from .relight import GRAIN, own_color
+from .lighting import Shadows, load_tables, shade_lights
+from .relight import GRAIN, RelightData, color_of
 
 MIXER_FILE = "lights.npz"
 # MOST_VALUES: numbers in all pictures of a mixer together; they limit the rows to between FEWEST_ROWS and MOST_ROWS.
@@ -40,7 +39,7 @@ NOT_SHADED = "Cycles' light of a light group none of whose lights is shaded here
 
 @dataclass(frozen=True)
 class MixerRow:
-    """A row of the mixer: lights that change together, or the part of the picture that depends on no light."""
+    """A row of the mixer: lights that change together, or what of the picture depends on no light."""
 
     name: str
     lights: tuple[str, ...]  # names; empty: depends on no light
@@ -84,36 +83,34 @@ class LightPictures:
         return cls(rows, layers, alpha, facts)
 
 
-def light_pictures(kept: RelightData, progress: Progress | None = None) -> LightPictures:
-    """The pictures of the lights of `kept`, shaded by its most accurate table. Raises TableError, Cancelled."""
-    extraction, shadows = kept.extraction, kept.shadows
-    shape, technique = (extraction.film.height, extraction.film.width), kept.technique
+def light_pictures(data: RelightData, progress: Progress | None = None) -> LightPictures:
+    """The pictures of the lights of `data`, shaded by its most accurate table. Raises TableError, Cancelled."""
+    extraction, shadows = data.extraction, data.shadows
+    shape, technique = (extraction.film.height, extraction.film.width), data.technique
     most = min(max(MOST_VALUES // (4 * shape[0] * shape[1]), FEWEST_ROWS), MOST_ROWS)
     members = _members(extraction.lights, shadows, most)
     layers = np.zeros((len(members), *shape, 3), np.float32)
-    (table,) = picture.load_tables((technique,)).values()
+    (table,) = load_tables((technique,)).values()
     most = max(1, MOST_PAIRS // max(1, len(extraction.samples)))
     for first in range(0, len(members), most):
-        part = members[first : first + most]
-        share = first / len(members), len(part) / len(members)
+        some = members[first : first + most]
 
-        def report(fraction, share=share):
-            return None if progress is None else progress("lights", share[0] + fraction * share[1])
+        def report(fraction, first=first, some=some):
+            return None if progress is None else progress("lights", (first + fraction * len(some)) / len(members))
 
-        layers[first : first + most] = _layers(kept, table, part, report)
-    rows = _with_bounces(kept, [_row(extraction, own) for own in members], members, layers)
+        layers[first : first + most] = _layers(data, table, some, report)
+    rows = _with_bounces(data, [_row(extraction, numbers) for numbers in members], members, layers)
     for row, layer in zip(rows, layers, strict=True):
-        layer += bounced_light(kept, row)
-    for group, values in kept.rest.items():
+        layer += bounced_light(data, row)
+    for group, values in data.rest.items():
         if group and values.any() and all(row.group != group for row in rows):
             rows.append(MixerRow(f"Light group {group}", (), note=NOT_SHADED))
             layers = np.concatenate([layers, values[None, ..., :3].astype(np.float32)])
-    notes = [GRAIN] * bool(kept.rest and kept.extraction.picture.has_lens) + [
-        SHARED_OUT.format(group, listed(repr(row.name) for row in own))
-        for group in kept.rest
-        if group and len(own := [row for row in rows if row.group == group]) > 1
-    ]
-    rest = kept.rest.get("")
+    notes = [GRAIN] * bool(data.rest and extraction.picture.has_lens)
+    for group in filter(None, data.rest):
+        names = [repr(row.name) for row in rows if row.group == group]
+        notes += [SHARED_OUT.format(group, listed(names))] if len(names) > 1 else []
+    rest = data.rest.get("")
     if rest is not None:
         rows.append(MixerRow(REST, (), note=NOT_OF_LIGHTS))
         layers = np.concatenate([layers, rest[None, ..., :3].astype(np.float32)])
@@ -140,25 +137,25 @@ def _members(lights: Sequence[AreaLight], shadows: Shadows | None, most: int = M
             name = root[name]
         return name
 
-    for own in shadows.numbers if shadows is not None else ():
-        for number in own[1:]:
-            root[first(lights[number].name)] = first(lights[own[0]].name)
+    for sharing in shadows.numbers if shadows is not None else ():
+        for number in sharing[1:]:
+            root[first(lights[number].name)] = first(lights[sharing[0]].name)
     members: dict[str, list[int]] = {}
     for number, light in enumerate(lights):
         members.setdefault(first(light.name), []).append(number)
     rows = list(members.values())
     if len(rows) <= most:
         return rows
-    power = [sum(np.linalg.norm(lights[n].area_vector) * lights[n].radiance.sum() for n in own) for own in rows]
-    strong = set(np.argsort(power)[::-1][: most - 1].tolist())
-    weak = [number for row, own in enumerate(rows) if row not in strong for number in own]
-    return [*(own for row, own in enumerate(rows) if row in strong), weak]
+    power = [sum(np.linalg.norm(lights[n].area_vector) * lights[n].radiance.sum() for n in row) for row in rows]
+    strong = sorted(np.argsort(power)[::-1][: most - 1].tolist())
+    weak = [number for row, numbers in enumerate(rows) if row not in strong for number in numbers]
+    return [*(rows[row] for row in strong), weak]
 
 
-def _row(extraction, own: list[int]) -> MixerRow:
-    """The row of the lights with the numbers `own`."""
-    lights = [extraction.lights[number] for number in own]
-    names, color = tuple(dict.fromkeys(light.name for light in lights)), tuple(own_color(lights).tolist())
+def _row(extraction, numbers: list[int]) -> MixerRow:
+    """The row of the lights with these `numbers`."""
+    lights = [extraction.lights[number] for number in numbers]
+    names, color = tuple(dict.fromkeys(light.name for light in lights)), tuple(color_of(lights).tolist())
     known = extraction.light_settings
     settings = {name: known[name] for name in names if name in known}
     if len(names) > 1:
@@ -168,46 +165,45 @@ def _row(extraction, own: list[int]) -> MixerRow:
     return MixerRow(names[0], names, color, settings, lights[0].record() if plain else None)
 
 
-def _layers(kept: RelightData, table, members: list[list[int]], report) -> np.ndarray:
+def _layers(data: RelightData, table, members: list[list[int]], report) -> np.ndarray:
     """Direct light (R, H, W, 3) of the rows with these `members`, times the exposure."""
-    extraction = kept.extraction
-    numbers = sorted(number for own in members for number in own)
-    row_of = {number: row for row, own in enumerate(members) for number in own}
-    lights = [replace(extraction.lights[number], group=str(row_of[number])) for number in numbers]
-    shadows = None if kept.shadows is None else kept.shadows.of_lights(numbers)
-    passes = kept.options["passes"]
-    (lit,) = shade_lights(extraction.samples, lights, table, passes, (shadows,), progress=report)
+    extraction = data.extraction
+    row_of = {number: row for row, numbers in enumerate(members) for number in numbers}
+    numbers = sorted(row_of)
+    lights, rows = [extraction.lights[number] for number in numbers], [row_of[number] for number in numbers]
+    shadows = None if data.shadows is None else data.shadows.of_lights(numbers)
+    passes = data.options["passes"]
+    (lit,) = shade_lights(extraction.samples, lights, table, passes, (shadows,), rows=rows, progress=report)
     layers = np.zeros((len(members), extraction.film.height, extraction.film.width, 3), np.float32)
     for name in passes:
-        for group, values in zip(lit.groups, getattr(lit, name), strict=True):
-            image = extraction.film.image(extraction.picture.exposure * values)
-            layers[int(group)] += kept.shown(name) * image
+        for layer, values in zip(layers, getattr(lit, name), strict=True):
+            layer += data.shown(name) * extraction.film.image(extraction.picture.exposure * values)
     return layers
 
 
-def _with_bounces(kept: RelightData, rows: list[MixerRow], members, layers) -> list[MixerRow]:
+def _with_bounces(data: RelightData, rows: list[MixerRow], members, layers) -> list[MixerRow]:
     """The rows with their shares of the bounced light of their groups, in proportion to the direct light `layers`."""
-    found = list(rows)
-    for group in filter(None, kept.rest):
-        own = [row for row, (first, *_) in enumerate(members) if kept.extraction.lights[first].group == group]
-        weights = layers[own].sum(axis=(1, 2), dtype=np.float64)
-        whole = weights.sum(axis=0)
-        for row, weight in zip(own, weights, strict=True):
-            share = np.divide(weight, whole, out=np.full(3, 1.0 / len(own)), where=whole > 0.0)
-            found[row] = replace(rows[row], group=group, share=tuple(share.tolist()))
-    return found
+    rows = list(rows)
+    for group in filter(None, data.rest):
+        of_group = [row for row, (first, *_) in enumerate(members) if data.extraction.lights[first].group == group]
+        weights = layers[of_group].sum(axis=(1, 2), dtype=np.float64)
+        total = weights.sum(axis=0)
+        for row, weight in zip(of_group, weights, strict=True):
+            share = np.divide(weight, total, out=np.full(3, 1.0 / len(of_group)), where=total > 0.0)
+            rows[row] = replace(rows[row], group=group, share=tuple(share.tolist()))
+    return rows
 
 
-def bounced_light(kept: RelightData, row: MixerRow) -> np.ndarray:
+def bounced_light(data: RelightData, row: MixerRow) -> np.ndarray:
     """The bounced light (H, W, 3) of a row; 0.0 where it has none."""
-    return (np.array(row.share) * kept.rest[row.group][..., :3]).astype(np.float32) if row.group else np.float32(0.0)
+    return (np.array(row.share) * data.rest[row.group][..., :3]).astype(np.float32) if row.group else np.float32(0.0)
 
 
 class Mixer:
     """The weighted sum of the pictures of lights.
 
     A change of one row costs one multiplication and one addition per pixel and channel, because the sum of the others
-    is kept.
+    is cached.
     """
 
     def __init__(self, pictures: LightPictures):

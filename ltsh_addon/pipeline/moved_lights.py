@@ -33,9 +33,9 @@ from ..visibility import (
     task_of_lights,
 )
 from ..workers.pool import WorkerPool
-from . import picture
-from .lighting import OCCLUDERS_SUFFIX, RELIGHT_SUFFIX, RelightData, rays_of_samples
+from .lighting import load_tables, rays_of_samples
 from .mixer import MixerRow, bounced_light
+from .relight import OCCLUDERS_SUFFIX, RELIGHT_SUFFIX, RelightData
 
 # BLOCKS: enough that all processes end at about the same time. FEWEST_OF_BLOCK: the overhead of smaller blocks exceeds
 # the cost of their samples.
@@ -308,7 +308,7 @@ class MovedLights:
         if film.count is not None:
             shadowed, film, shadow = with_one_shadow(samples, film)
         self._passes = tuple(kept.options["passes"])
-        (self._table,) = picture.load_tables((kept.technique,)).values()
+        (self._table,) = load_tables((kept.technique,)).values()
         with ExitStack() as stack:
             self._tracer = origins = None
             if self._occluders is not None:

@@ -6,6 +6,7 @@ the second Blender takes the fields that it shares. Records of finished tasks ho
 
 from __future__ import annotations
 
+import math
 import re
 import string
 from collections.abc import Callable
@@ -41,9 +42,17 @@ _FRAMES = re.compile(r"(-?\d+)(?:-(-?\d+)(?::(\d+))?)?", re.ASCII)
 # From text to values. Each function raises ValueError that says what was found and what was expected.
 
 
+def real_number(text: str) -> float:
+    """The number that a text is; NaN, which no limit allows, where it is none."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
 def techniques(text: str) -> tuple[str, ...]:
     """Names of techniques, or paths of tables, separated by commas."""
-    names = _parts(text)
+    names = _names(text)
     unknown = [name for name in names if name not in TECHNIQUES and not name.endswith(".npz")]
     if unknown or not names:
         raise ValueError(
@@ -64,7 +73,7 @@ def table(text: str) -> str:
 
 def tables(text: str) -> tuple[str, ...]:
     """Shipped tables or paths, separated by commas."""
-    return tuple(table(name) for name in _parts(text) or ("",))
+    return tuple(table(name) for name in _names(text) or ("",))
 
 
 def one_table(text: str) -> tuple[str, ...]:
@@ -74,10 +83,7 @@ def one_table(text: str) -> tuple[str, ...]:
 
 def seconds(text: str) -> float:
     """Seconds of a budget."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
+    value = real_number(text)
     if not 0.0 < value < 1e9:
         raise ValueError(f"budget is {text!r}, expected seconds of processor time, more than 0")
     return value
@@ -94,14 +100,14 @@ def bake_passes(text: str) -> tuple[str, ...]:
 
 
 def _passes(text, known):
-    names = _parts(text)
+    names = _names(text)
     if not names or not set(names) <= set(known):
         raise ValueError(f"passes are {text!r}, expected some of {', '.join(known)}")
     return names
 
 
-def _parts(text) -> tuple[str, ...]:
-    return tuple(dict.fromkeys(part for part in text.split(",") if part))
+def _names(text) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(name for name in text.split(",") if name))
 
 
 def resolution(text: str) -> tuple[int, int]:
@@ -133,21 +139,21 @@ def _sides(text, limits) -> tuple[int, ...]:
 
 def frames(text: str) -> tuple[int, ...]:
     """Frame numbers: single ones and ranges FIRST-LAST or FIRST-LAST:STEP, separated by commas; each once."""
-    found: dict[int, None] = {}
-    for part in text.split(","):
-        match = _FRAMES.fullmatch(part.strip())
+    numbers: dict[int, None] = {}
+    for item in text.split(","):
+        match = _FRAMES.fullmatch(item.strip())
         first, last, step = (None if group is None else int(group) for group in match.groups()) if match else [None] * 3
         if first is None or max(abs(first), abs(last or 0)) > LAST_FRAME:
             raise ValueError(
-                f"frame is {part!r}, expected a whole number from -{LAST_FRAME} to {LAST_FRAME}, or a range such as "
+                f"frame is {item!r}, expected a whole number from -{LAST_FRAME} to {LAST_FRAME}, or a range such as "
                 "1-240 or 1-240:2"
             )
         if last is not None and (last < first or step == 0):
-            raise ValueError(f"frames are {part!r}, expected FIRST-LAST:STEP, upwards, STEP above 0")
-        if len(found) + ((first if last is None else last) - first) // (step or 1) >= MOST_FRAMES:
+            raise ValueError(f"frames are {item!r}, expected FIRST-LAST:STEP, upwards, STEP above 0")
+        if len(numbers) + ((first if last is None else last) - first) // (step or 1) >= MOST_FRAMES:
             raise ValueError(f"frames are {text[:80]!r}, expected at most {MOST_FRAMES} of them")
-        found.update(dict.fromkeys(range(first, (first if last is None else last) + 1, step or 1)))
-    return tuple(found)
+        numbers.update(dict.fromkeys(range(first, (first if last is None else last) + 1, step or 1)))
+    return tuple(numbers)
 
 
 def positive(text: str) -> int:
@@ -157,19 +163,20 @@ def positive(text: str) -> int:
     raise ValueError(f"{text!r} was given, expected a whole number above 0")
 
 
-def refinements(text: str) -> int:
-    """Number of pictures whose mean is a view."""
-    if text.isdecimal() and 1 <= int(text) <= MOST_REFINEMENTS:
-        return int(text)
-    raise ValueError(f"refine is {text!r}, expected a whole number from 1 to {MOST_REFINEMENTS}")
+def whole_number(what: str, least: int, most: int) -> Callable[[str], int]:
+    """The parser of whole numbers from `least` to `most`; errors begin with `what`, such as "margin is"."""
+
+    def parse(text: str) -> int:
+        if text.isdecimal() and least <= int(text) <= most:
+            return int(text)
+        raise ValueError(f"{what} {text!r}, expected a whole number from {least} to {most}")
+
+    return parse
 
 
-def shadow_rays(text: str) -> int:
-    """Number of rays per light and point."""
-    fewest, most = SHADOW_RAYS
-    if text.isdecimal() and fewest <= int(text) <= most:
-        return int(text)
-    raise ValueError(f"shadow rays are {text!r}, expected a whole number from {fewest} to {most}")
+refinements = whole_number("refine is", 1, MOST_REFINEMENTS)  # number of pictures whose mean is a view
+shadow_rays = whole_number("shadow rays are", *SHADOW_RAYS)  # number of rays per light and point
+margin = whole_number("margin is", 0, MOST_MARGIN)  # width of the margin around islands in texels
 
 
 def cycles_samples(text: str) -> int:
@@ -182,21 +189,11 @@ def cycles_samples(text: str) -> int:
     return value
 
 
-def margin(text: str) -> int:
-    """Width of the margin around islands in texels."""
-    if text.isdecimal() and int(text) <= MOST_MARGIN:
-        return int(text)
-    raise ValueError(f"margin is {text!r}, expected a whole number from 0 to {MOST_MARGIN}")
-
-
 def view(text: str) -> tuple[float, ...] | str:
     """camera, above or a position."""
     if text in ("camera", "above"):
         return text
-    try:
-        position = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        position = ()
+    position = tuple(map(real_number, text.split(",")))
     if len(position) == 3 and all(abs(value) < 1e12 for value in position):
         return position
     raise ValueError(f"view is {text!r}, expected camera, above or a position such as 0,-4,1.5")
@@ -234,8 +231,8 @@ def _name(pattern: str, known: tuple[str, ...]) -> str:
     except (KeyError, IndexError, ValueError) as error:
         text = str(error)
         raise ValueError(text if text.startswith("name ") else f"name {pattern!r}: {text}; {expected}") from None
-    for part in example.split("/"):
-        if not part.strip(" ") or part.startswith(".") or part.endswith((".", " ")):
+    for name in example.split("/"):
+        if not name.strip(" ") or name.startswith(".") or name.endswith((".", " ")):
             raise ValueError(
                 f"name {pattern!r} gives {example!r}, expected names below the output folder that do not begin or end "
                 "with a dot: folders are separated by single /"
@@ -484,9 +481,9 @@ def arguments_of(kind: type) -> dict[str, tuple[Any, tuple[Argument, ...]]]:
 
 def options_from(kind: type, values: dict[str, Any], **settings) -> Any:
     """Options of the class `kind` with `values` of a parsed command line (None: the default) and `settings`."""
-    found = {item.name: values[item.name] for item in fields(kind) if values.get(item.name) is not None}
-    found = {name: tuple(dict.fromkeys(value)) if isinstance(value, list) else value for name, value in found.items()}
-    return kind(**{**found, **settings})
+    given = {item.name: values[item.name] for item in fields(kind) if values.get(item.name) is not None}
+    given = {name: tuple(dict.fromkeys(value)) if isinstance(value, list) else value for name, value in given.items()}
+    return kind(**{**given, **settings})
 
 
 def command_line(options: Any) -> list[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import platform
 import string
 from collections import Counter
 from collections.abc import Iterable
@@ -13,14 +14,16 @@ from glob import escape
 from pathlib import Path, PurePath
 from typing import Any
 
+import numpy as np
+
 from ..imaging import write_json
 from ..reading import Malformed, check, file_name, read_json, some
-from ..scene import VERSION, shortened
+from ..scene import VERSION, Cancelled, Progress, shortened
 from .options import what_matters
 
 FOLDER = ".ltsh"
 FORMAT = 1
-# Limits in bytes: of a stem from a name in the scene, and of a part of a path. File systems allow 255, suffixes
+# Limits in bytes: of a stem from a name in the scene, and of a name in a path. File systems allow 255, suffixes
 # included.
 LONGEST_STEM, LONGEST_NAME = 100, 200
 # Shapes that documents must have (see `reading.check`).
@@ -38,10 +41,10 @@ JOB = {
 }
 
 
-def _check_files(files, place) -> None:
-    check(files, {str: {"bytes": int, "sha256": str}}, place)
-    for name in files:
-        file_name(name, place)
+def _check_files(files, name) -> None:
+    check(files, {str: {"bytes": int, "sha256": str}}, name)
+    for file in files:
+        file_name(file, name)
 
 
 _RECORD = {"key": str, "files": _check_files, "problem?": str}
@@ -63,15 +66,19 @@ class BatchJob:
     @property
     def single(self) -> bool:
         """True where the job is one picture, or one bake of some objects."""
-        return len(self.scenes) * max(len(self.cameras), 1) * max(len(self.frames), 1) == 1
+        return len(self.scenes) == 1 and not self.varying
+
+    @property
+    def varying(self) -> list[str]:
+        """The fields of names of which the job has several."""
+        values = {"scene": self.scenes, "camera": self.cameras, "frame": self.frames}
+        return [name for name, several in values.items() if len(several) > 1]
 
     @property
     def pattern(self) -> str:
         """The pattern of the names of files."""
-        counts = {"scene": self.scenes, "camera": self.cameras, "frame": self.frames}
-        varying = [name for name, values in counts.items() if len(values) > 1]
         first = "{object}" if self.command == "bake" else self.command
-        return self.name or default_pattern(first, varying)
+        return self.name or default_pattern(first, self.varying)
 
 
 @dataclass(frozen=True)
@@ -106,6 +113,41 @@ class BatchTask:
         return replace(options, name=self.name, page="report.html" if job.single else f"{self.name}.html")
 
 
+@dataclass(frozen=True)
+class TaskResult:
+    """The result of a task: its report, the seconds it took, and the names of its files below the output folder."""
+
+    report: dict
+    seconds: dict
+    files: tuple[str, ...]
+
+
+def write_reports(result: TaskResult, output: Path) -> dict:
+    """Write report.json and timing.json of the only task into `output`; returns the report, with times as "seconds"."""
+    write_json(Path(output) / "report.json", result.report)
+    write_json(Path(output) / "timing.json", {"seconds": result.seconds})
+    return {**result.report, "seconds": result.seconds}
+
+
+def check_before_writing(progress: Progress | None) -> None:
+    """Report that files are about to be written. Raises Cancelled."""
+    if progress is not None and progress("write", 0.0) is False:
+        raise Cancelled("stopped before the files were written")
+
+
+def versions(blender_version: str) -> dict[str, str]:
+    """Versions that a result depends on."""
+    import OpenEXR
+
+    return {
+        "ltsh": VERSION,
+        "blender": blender_version,
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "OpenEXR": getattr(OpenEXR, "__version__", "unknown"),
+    }
+
+
 class NameClash(ValueError):
     """Several tasks would get the same name, or one gets a name that is too long."""
 
@@ -125,13 +167,13 @@ def tasks_of(job: BatchJob, progress=None) -> list[BatchTask]:
         facts = _facts(job, scene, progress)
         contents = contents_digest(replace(job.options, scene=Path(scene)))
         for camera, camera_stem in zip(job.cameras or (None,), camera_stems, strict=True):
-            for frame, found in zip(job.frames or (None,), facts, strict=True):
+            for frame, of_frame in zip(job.frames or (None,), facts, strict=True):
                 fields = {
                     "scene": stem,
-                    "camera": camera_stem or file_stems([found.get("camera") or "camera"])[0],
-                    "frame": found.get("frame", 0) if frame is None else frame,
+                    "camera": camera_stem or file_stems([of_frame.get("camera") or "camera"])[0],
+                    "frame": of_frame.get("frame", 0) if frame is None else frame,
                 }
-                tasks += _tasks(job, (scene, camera, frame), fields, found, contents)
+                tasks += _tasks(job, (scene, camera, frame), fields, of_frame, contents)
     _check_names(job, tasks)
     return tasks
 
@@ -173,14 +215,12 @@ def _tasks(job, unit, fields, facts, contents) -> list[BatchTask]:
 def _check_names(job, tasks) -> None:
     counts = Counter(task.name.casefold() for task in tasks)
     for task in tasks:
-        if too_long := [part for part in task.name.split("/") if len(os.fsencode(part)) > LONGEST_NAME]:
-            found = f"{shortened(too_long[0], 60)!r}, {len(os.fsencode(too_long[0]))} bytes long"
-            raise NameClash(f"name {job.pattern!r} gives {found}, expected at most {LONGEST_NAME}: use a shorter one")
+        if too_long := [name for name in task.name.split("/") if len(os.fsencode(name)) > LONGEST_NAME]:
+            name = f"{shortened(too_long[0], 60)!r}, {len(os.fsencode(too_long[0]))} bytes long"
+            raise NameClash(f"name {job.pattern!r} gives {name}, expected at most {LONGEST_NAME}: use a shorter one")
         if counts[task.name.casefold()] > 1:
-            counts = {"scene": job.scenes, "camera": job.cameras, "frame": job.frames}
-            missing = [name for name, values in counts.items() if len(values) > 1]
-            missing += ["object"] if job.command == "bake" else []
-            missing = [f"{{{name}}}" for name in missing if name not in fields_of(job.pattern)]
+            varying = [*job.varying, *(["object"] if job.command == "bake" else [])]
+            missing = [f"{{{name}}}" for name in varying if name not in fields_of(job.pattern)]
             hint = f"; add {' or '.join(missing)}" if missing else ""
             raise NameClash(f"name {job.pattern!r} gives several tasks the same name {task.name!r}{hint}")
 
@@ -207,8 +247,8 @@ def fields_of(pattern: str) -> set[str]:
 
 def default_pattern(first: str, varying: Iterable[str]) -> str:
     """The pattern `first`, followed by the `varying` fields: compare, or compare_{frame:04d}."""
-    parts = {"scene": "{scene}", "camera": "{camera}", "frame": "{frame:04d}"}
-    return "_".join([first, *(text for name, text in parts.items() if name in set(varying))])
+    texts = {"scene": "{scene}", "camera": "{camera}", "frame": "{frame:04d}"}
+    return "_".join([first, *(text for name, text in texts.items() if name in set(varying))])
 
 
 class Records:
@@ -218,16 +258,16 @@ class Records:
         self.output, self._folder = Path(output), Path(output) / FOLDER / kind
         self._shape = {**_RECORD, **shape}
 
-    def write(self, name: str, key: str, task: dict, files: Iterable[str], **found) -> dict:
+    def write(self, name: str, key: str, task: dict, files: Iterable[str], **outcome) -> dict:
         """Write the record `name` of a task that has finished, and return it.
 
-        `files` are the names of its files below the output folder, `found` its "report" or "problem".
+        `files` are the names of its files below the output folder, `outcome` its "report" or "problem".
         """
         digests = {}
         for file in sorted(files):
             path = self.output / file
             digests[file] = {"bytes": path.stat().st_size, "sha256": file_digest(path)}
-        record = {"format": FORMAT, "key": key, "task": task, "files": digests, **found}
+        record = {"format": FORMAT, "key": key, "task": task, "files": digests, **outcome}
         write_record(self._path(name), record)
         # Returned as it will be read: JSON may change the types of values.
         return json.loads(self._path(name).read_text(encoding="utf-8"))
@@ -258,8 +298,8 @@ class Records:
             paths = sorted(self._folder.rglob("*.json"))
         else:
             # Names may contain wildcards.
-            found = (self._path(stem).parent.glob(f"{escape(PurePath(stem).name)}.*.json") for stem in stems)
-            paths = sorted(path for group in found for path in group)
+            groups = (self._path(stem).parent.glob(f"{escape(PurePath(stem).name)}.*.json") for stem in stems)
+            paths = sorted(path for group in groups for path in group)
         records = map(self._read, paths)
         return [record for record in records if record and record["key"] == key and self.has_files(record)]
 
@@ -291,8 +331,8 @@ def read_document(path: Path, shape: dict) -> dict:
 
 def options_digest(command: str, options, contents: str) -> str:
     """Digest of all that the results of a task depend on: version, command, options that matter, `contents`."""
-    found = [VERSION, command, what_matters(options), contents]
-    return hashlib.sha256(json.dumps(found, sort_keys=True, default=str).encode()).hexdigest()
+    matters = [VERSION, command, what_matters(options), contents]
+    return hashlib.sha256(json.dumps(matters, sort_keys=True, default=str).encode()).hexdigest()
 
 
 def contents_digest(options) -> str:

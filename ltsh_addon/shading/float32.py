@@ -48,7 +48,7 @@ NARROW_SPREAD = 0.35
 
 
 def shade_diffuse(samples, lights, radiance, scratch, leftovers=None):
-    """Add to `radiance` (G, P, 3) what the diffuse lobes of `samples` reflect of `lights`, (light, group, corners).
+    """Add to `radiance` (R, P, 3) what the diffuse lobes of `samples` reflect of `lights`, (light, row, corners).
 
     A list `leftovers` receives the pairs that are left to `shade_pairs`, if they are fewer than FLOAT64_CHUNK: (samples
     (N,), lights (N,)), where a light's number is its position among those that affect diffuse lobes.
@@ -183,7 +183,7 @@ class AlikeLights:
 
     @classmethod
     def of(cls, lights, numbers) -> AlikeLights:
-        """Those of `lights`, (light, group, corners), with these `numbers` (L,)."""
+        """Those of `lights`, (light, row, corners), with these `numbers` (L,)."""
         own = [lights[number][0] for number in numbers]
         centroid, area, _, diagonal = small_lights.all_of(own)
         center = np.array([light.center for light in own])
@@ -201,7 +201,7 @@ class AlikeLights:
 
 
 class Lights(list):
-    """Lights (light, group, corners) that affect one pass. Trees of many lights are built once."""
+    """Lights (light, row, corners) that affect one pass. Trees of many lights are built once."""
 
     @classmethod
     def of(cls, lights, name) -> Lights:
@@ -214,10 +214,10 @@ class Lights(list):
     def trees(self) -> list[tuple[LightTree, list[int]]]:
         """Trees of many lights, and the positions here of their lights."""
         kinds: dict[tuple, list[int]] = {}
-        for number, (light, group, _) in enumerate(self):
+        for number, (light, row, _) in enumerate(self):
             is_plain = not (light.is_profiled or light.is_distant or light.is_facing or light.cone is not None)
             if is_plain and (light.radiance >= 0.0).all():
-                kinds.setdefault((group, light.receivers), []).append(number)
+                kinds.setdefault((row, light.receivers), []).append(number)
         many = [numbers for numbers in kinds.values() if len(numbers) >= FEWEST]
         return [(LightTree.of([self[number][0] for number in numbers]), numbers) for numbers in many]
 
@@ -237,16 +237,16 @@ class Lights(list):
 
     @cached_property
     def skies(self) -> list[tuple[SkyMap, object, int]]:
-        """Maps of the distant lights with a detail, each with one of its lights and their group."""
+        """Maps of the distant lights with a detail, each with one of its lights and their row."""
         kinds: dict[tuple, list] = {}
-        for light, group, _ in self:
+        for light, row, _ in self:
             if float64.has_patches(light):
-                kinds.setdefault((group, light.receivers), []).append(light)
-        return [(SkyMap.of(lights), lights[0], group) for (group, _), lights in kinds.items()]
+                kinds.setdefault((row, light.receivers), []).append(light)
+        return [(SkyMap.of(lights), lights[0], row) for (row, _), lights in kinds.items()]
 
 
 class _Lighting:
-    """Adds the light of `lights` at `samples` to `radiance` (G, P, 3). shade_in_float64(samples, lights, radiance)
+    """Adds the light of `lights` at `samples` to `radiance` (R, P, 3). shade_in_float64(samples, lights, radiance)
     shades points that need double precision."""
 
     def __init__(self, samples, lights, radiance, scratch, shade_in_float64):
@@ -259,24 +259,23 @@ class _Lighting:
         """Add the light that `lobes` reflect."""
         index, colors = lobes.index, lobes.colors
         position = np.ascontiguousarray(self.samples.position[index].T)
-        groups = {group for _, group, _ in self.lights}
-        sums = {group: np.zeros((len(colors), 3, len(index)), np.float32) for group in groups}
+        sums = {row: np.zeros((len(colors), 3, len(index)), np.float32) for row in {row for _, row, _ in self.lights}}
         self._add_skies(lobes, sums)
         left = self._add_far(lobes, position, sums)
         for number in sorted([*self.lights.alone, *left]):
             if not float64.has_patches(self.lights[number][0]):
                 self._add_light(lobes, number, position, left.get(number), sums)
         signed = (colors < 0.0).any()
-        for group, total in sums.items():
+        for row, total in sums.items():
             reflected = (colors * total).sum(axis=0)
-            if signed and all((light.radiance >= 0.0).all() for light, its, _ in self.lights if its == group):
+            if signed and all((light.radiance >= 0.0).all() for light, its, _ in self.lights if its == row):
                 # Terms that cancel in the Fresnel factor may leave a rest below zero.
                 np.maximum(reflected, np.float32(0.0), out=reflected)
-            self.radiance[group, index] += reflected.T
+            self.radiance[row, index] += reflected.T
 
     def _add_light(self, lobes, number, position, columns, sums) -> None:
-        """Add one light to the `sums` (F, 3, Q) by group, at the `columns` (Q',), None for all."""
-        (light, group, corners), index = self.lights[number], lobes.index
+        """Add one light to the `sums` (F, 3, Q) by row, at the `columns` (Q',), None for all."""
+        (light, row, corners), index = self.lights[number], lobes.index
         allowed = light.receives(self.samples.receiver, index)
         if light.is_focused or light.cone is not None:
             near = may_reach(light, position)
@@ -284,9 +283,9 @@ class _Lighting:
         rest = columns
         if not lobes.only_tails:
             if not light.is_profiled:
-                rest = self._add_small(lobes, light, position, (columns, allowed), sums[group])
+                rest = self._add_small(lobes, light, position, (columns, allowed), sums[row])
             elif light_profile.ConeRegions.suit(light):
-                rest = self._add_points(lobes, light, position, (columns, allowed), sums[group])
+                rest = self._add_points(lobes, light, position, (columns, allowed), sums[row])
             if rest is not None and len(rest) == 0:
                 return
         is_hard = light.spread < NARROW_SPREAD or _is_narrow(light, corners) or _is_in_pieces(light, corners)
@@ -295,7 +294,7 @@ class _Lighting:
             self.needs_float64[number].append(index if chosen is None else index[chosen])
             return
         for batch in _batches(light, corners, position, lobes.width, rest):
-            redo = self._add_polygons(lobes, light, position, batch, allowed, sums[group])
+            redo = self._add_polygons(lobes, light, position, batch, allowed, sums[row])
             if redo.any():
                 self.needs_float64[number].append(index[batch[0]][redo])
 
@@ -332,27 +331,27 @@ class _Lighting:
         return redo
 
     def _add_skies(self, lobes, sums) -> None:
-        """Add the light of skies to the `sums` (F, 3, Q) by group."""
-        for sky, light, group in self.lights.skies:
+        """Add the light of skies to the `sums` (F, 3, Q) by row."""
+        for sky, light, row in self.lights.skies:
             allowed = light.receives(self.samples.receiver, lobes.index)
             chosen = np.arange(len(lobes.index)) if allowed is None else np.nonzero(allowed)[0]
             if lobes.sharpest is None and len(lobes.clip_rows) == 1:
                 normals = self.samples.diffuse_normal[lobes.index[chosen]]
-                sums[group][0][:, chosen] += interpolated(sky.reflected, normals)
+                sums[row][0][:, chosen] += interpolated(sky.reflected, normals)
             else:
-                sky.add(lobes, chosen, sums[group])
+                sky.add(lobes, chosen, sums[row])
 
     def _add_far(self, lobes, position, sums) -> dict[int, np.ndarray]:
-        """Add the light of trees to the `sums` (F, 3, Q) by group. Returns the columns (Q',) that are left to do, by
+        """Add the light of trees to the `sums` (F, 3, Q) by row. Returns the columns (Q',) that are left to do, by
         number of the light."""
         left = {}
         for tree, numbers in self.lights.trees:
-            light, group, _ = self.lights[numbers[0]]
+            light, row, _ = self.lights[numbers[0]]
             allowed = light.receives(self.samples.receiver, lobes.index)
             chosen = np.arange(len(lobes.index)) if allowed is None else np.nonzero(allowed)[0]
             if not len(chosen):
                 continue
-            columns, own = add_far_lights(tree, lobes, position, chosen, sums[group])
+            columns, own = add_far_lights(tree, lobes, position, chosen, sums[row])
             pairs = columns, np.array(numbers)[own]
             if lobes.only_tails:
                 self.pairs_in_float64.append((lobes.index[columns], pairs[1]))
@@ -362,7 +361,7 @@ class _Lighting:
                 place = alike.place[pairs[1]]
                 chosen = place >= 0
                 rest &= ~chosen
-                self._add_near(lobes, position, (columns[chosen], place[chosen], alike), sums[group])
+                self._add_near(lobes, position, (columns[chosen], place[chosen], alike), sums[row])
             columns, number = (own[rest] for own in pairs)
             for light in np.unique(number):
                 left[int(light)] = np.sort(columns[number == light])
@@ -514,10 +513,10 @@ class _Lighting:
         if leftovers is not None and len(members) < FLOAT64_CHUNK:
             leftovers.append((members.astype(np.int32), number.astype(np.int32)))
             return
-        group = np.array([group for _, group, _ in self.lights])
+        row = np.array([row for _, row, _ in self.lights])
         for pairs, found in shade_pairs(self.samples, members, number, self.lights, self.shade_in_float64):
             # A sample may occur with several lights.
-            np.add.at(self.radiance, (group[number[pairs]], members[pairs]), found.astype(np.float32))
+            np.add.at(self.radiance, (row[number[pairs]], members[pairs]), found.astype(np.float32))
 
 
 def shade_pairs(samples, members, number, lights, shade_in_float64):
@@ -545,7 +544,7 @@ def shade_pairs(samples, members, number, lights, shade_in_float64):
 
 
 def _light_of_each(items, number):
-    """One (light, group, corners) that stands for several with equally many corners, so that sample i sees the light
+    """One (light, row, corners) that stands for several with equally many corners, so that sample i sees the light
     `number[i]`."""
     fields = {
         name: np.stack([getattr(light, name) for light, _, _ in items])[number]

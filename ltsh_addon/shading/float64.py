@@ -108,7 +108,7 @@ def _of(vector, index):
 
 
 def shade_diffuse(samples, lights, radiance):
-    """Add to `radiance` (G, P, 3) what the diffuse lobes of `samples` reflect of `lights`, (light, group, corners)."""
+    """Add to `radiance` (R, P, 3) what the diffuse lobes of `samples` reflect of `lights`, (light, row, corners)."""
     framed = Framed.of(samples, samples.diffuse_normal)
     lit = np.nonzero(samples.diffuse_albedo.any(axis=1))[0]
     kinds = list(_diffuse_kinds(framed, lit))
@@ -118,17 +118,17 @@ def shade_diffuse(samples, lights, radiance):
     def shade_own(part, own, target, _):
         shade_diffuse(part, own, target)
 
-    for light, group, corners in lights:
+    for light, row, corners in lights:
         if not light.affects_diffuse:
             continue
         if has_patches(light):
             tree, normals = PatchTree.of(light), (samples.diffuse_normal, samples.smooth_normal)
             index = _receiving(samples, light, lit[is_plain])
             reflected = tree.form_factors(samples.diffuse_normal[index]).T * samples.diffuse_albedo[index]
-            radiance[group, index] += reflected
+            radiance[row, index] += reflected
             index = _receiving(samples, light, lit[~is_plain])
             for columns, patches in tree.pairs(samples, normals, index, False):
-                shade_patches(samples, index[columns], patches, tree, radiance[group], shade_own)
+                shade_patches(samples, index[columns], patches, tree, radiance[row], shade_own)
             continue
         for candidates, second_normal, count, integral in kinds:
             for part in seen_parts(framed, light, corners, candidates, 1.0, second_normal):
@@ -145,7 +145,7 @@ def shade_diffuse(samples, lights, radiance):
                 if count > 1:
                     rebound = irradiance[1][:, None] * samples.diffuse_rebound[index]
                     reflected += rebound * samples.diffuse_albedo[index]
-                radiance[group, index] += reflected * _of(light.radiance, index)
+                radiance[row, index] += reflected * _of(light.radiance, index)
 
 
 def _diffuse_kinds(framed, lit):
@@ -239,14 +239,14 @@ def shade_specular(samples, lights, table, radiance, error=None):
         if error is not None:
             np.add.at(error, index, estimates)
 
-    for light, group, corners in lights:
+    for light, row, corners in lights:
         if not light.affects_specular:
             continue
         if has_patches(light):
             tree, normals = PatchTree.of(light), (samples.normal, samples.geometric_normal)
             index = _receiving(samples, light, lit)
             for columns, patches in tree.pairs(samples, normals, index, True):
-                shade_patches(samples, index[columns], patches, tree, radiance[group], shade_own)
+                shade_patches(samples, index[columns], patches, tree, radiance[row], shade_own)
             continue
         if table == REFERENCE:
             parts = reference_integrals(framed, cosine, light, corners, lit, error)
@@ -271,7 +271,7 @@ def shade_specular(samples, lights, table, radiance, error=None):
             if (chosen := bent[index]).any():
                 mean = _bent_reflectance(framed, light, corners, index[chosen])
                 reflected[chosen] = plain[chosen] * mean
-            radiance[group, index] += np.maximum(reflected, 0.0) * _of(light.radiance, index)
+            radiance[row, index] += np.maximum(reflected, 0.0) * _of(light.radiance, index)
 
 
 def _finished(parts, table, samples, light):

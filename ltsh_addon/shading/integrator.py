@@ -1,4 +1,4 @@
-"""`shade`: takes samples and lights, returns radiance per light group, block by block.
+"""`shade`: takes samples and lights, returns radiance in rows of lights, block by block.
 
 A `Task` shades each block. It is the same in this process and in worker processes.
 """
@@ -45,6 +45,8 @@ _FIELDS_OF_ONE_PASS = {
         "anisotropy", "tangent",
     ),
 }  # fmt: skip
+# Up to so many lights, each has a row of the result unless the caller says otherwise.
+MOST_SINGLE_ROWS = 64
 # Estimate of the most patches of a light that a sample takes.
 PATCHES = 60
 # Distant lights with a smaller half side, in units of their distance, are too small for a `SkyMap`.
@@ -55,8 +57,9 @@ SPOT = 0.3
 class Task:
     """The lights, table and passes with which to shade every block of samples."""
 
-    lights: tuple[AreaLight, ...]
-    groups: tuple[str, ...]
+    lights: tuple[AreaLight, ...]  # L
+    rows: tuple[int, ...]  # (L,) the row of the result to which each light is added
+    row_count: int  # R
     table: LookupTable | str  # or REFERENCE
     passes: tuple[str, ...]
     single: bool
@@ -95,29 +98,33 @@ class Task:
         return moments32.Scratch()
 
     def shade(self, samples: SurfaceSamples) -> tuple[dict[str, np.ndarray], np.ndarray | None, dict]:
-        """Radiance (G, B, 3) by pass of a block of B samples; the error (B,) of the reference, else None; and, by pass,
+        """Radiance (R, B, 3) by pass of a block of B samples; the error (B,) of the reference, else None; and, by pass,
         a list of what is left to `shade_pairs`: samples (N,) and numbers (N,) of lights."""
-        radiance = {name: np.zeros((len(self.groups), len(samples), 3), self.dtype) for name in self.passes}
+        radiance = {name: np.zeros((self.row_count, len(samples), 3), self.dtype) for name in self.passes}
         error = np.zeros(len(samples)) if self.has_error else None
         leftovers: dict[str, list] = {name: [] for name in self.passes}
         self._add(samples, self._plain, radiance, error, leftovers)
         if self._with_patches is not None:
             self._add(samples, self._with_patches, radiance, error, {})
-        for light in self.lights:
+        for light, row in self._rows_of_lights:
             if light.detail and not float64.has_patches(light):
                 for name in self.passes:
-                    self._add_detailed(samples, light, name, radiance[name], error)
+                    self._add_detailed(samples, light, name, radiance[name][row : row + 1], error)
         return radiance, error, leftovers
 
-    def lights_of_pairs(self, name: str) -> list[AreaLight]:
-        """The lights to which the numbers in `shade_pairs` refer."""
-        return [light for light in self.lights if getattr(light, f"affects_{name}") and not light.detail]
+    @property
+    def _rows_of_lights(self):
+        return zip(self.lights, self.rows, strict=True)
+
+    def lights_of_pairs(self, name: str) -> list[tuple[AreaLight, int]]:
+        """The lights, each with its row, to which the numbers in `shade_pairs` refer."""
+        return [one for one in self._rows_of_lights if getattr(one[0], f"affects_{name}") and not one[0].detail]
 
     def shade_pairs(self, samples: SurfaceSamples, name: str, number: np.ndarray) -> np.ndarray:
         """Radiance (N, 3) of one pass of N samples under one light each."""
         in_float64 = float64.shade_diffuse if name == "diffuse" else float32.specular_in_float64(self.table)
         lights, (used, number) = self.lights_of_pairs(name), np.unique(number, return_inverse=True)
-        lights = self._prepared(lights[one] for one in used)
+        lights = _prepared(lights[one] for one in used)
         result, every = np.zeros((len(samples), 3), self.dtype), np.arange(len(samples))
         for pairs, found in float32.shade_pairs(samples, every, number, lights, in_float64):
             result[pairs] = found
@@ -126,11 +133,11 @@ class Task:
     @cached_property
     def _plain(self) -> dict[str, float32.Lights]:
         """The lights without a detail, by pass."""
-        return self._by_pass(light for light in self.lights if not light.detail)
+        return self._by_pass(one for one in self._rows_of_lights if not one[0].detail)
 
     @cached_property
     def _with_patches(self) -> dict[str, float32.Lights] | None:
-        lights = [light for light in self.lights if float64.has_patches(light)]
+        lights = [one for one in self._rows_of_lights if float64.has_patches(one[0])]
         return self._by_pass(lights) if lights else None
 
     def prepare(self) -> None:
@@ -140,22 +147,17 @@ class Task:
                 _ = lights.skies
 
     def _by_pass(self, lights):
-        lights = self._prepared(lights)
+        lights = _prepared(lights)
         found = {name: float32.Lights.of(lights, name) for name in self.passes}
         # If all lights affect both passes, these share their trees.
         return found if len({len(own) for own in found.values()}) > 1 else dict.fromkeys(found, found[self.passes[0]])
 
-    def _prepared(self, lights):
-        return [(light, self.groups.index(light.group), light.polygon()) for light in lights]
-
     def _add_detailed(self, samples, light, name, radiance, error) -> None:
-        """Add the light of a light with a `detail` to one pass."""
+        """Add the light of a light with a `detail` to its row (1, B, 3) of one pass."""
         for index, patches in fitting_patches(light, samples, name == "specular"):
-            own = {name: np.zeros((len(self.groups), len(index), 3), self.dtype)}
+            own = {name: np.zeros((1, len(index), 3), self.dtype)}
             own_error = None if error is None else np.zeros(len(index))
-            # The patches count for the group of the whole light, whatever their own is.
-            group = self.groups.index(light.group)
-            prepared = float32.Lights((patch, group, patch.polygon()) for patch in patches)
+            prepared = float32.Lights(_prepared((patch, 0) for patch in patches))
             self._add(samples.take(index), {name: prepared}, own, own_error, {})
             radiance[:, index] += own[name]
             if error is not None:
@@ -183,6 +185,11 @@ class Task:
                 float64.shade_specular(part, prepared["specular"], self.table, views["specular"], estimates)
 
 
+def _prepared(lights):
+    """(light, row, corners) of lights with their rows."""
+    return [(light, row, light.polygon()) for light, row in lights]
+
+
 def _corners_integrated(light, is_reference):
     """Estimated number of corners in the integrals over a light."""
     count = len(light.polygon()) * min(len(light.patches), PATCHES)
@@ -194,34 +201,33 @@ def _corners_integrated(light, is_reference):
 
 @dataclass(frozen=True)
 class Shading:
-    """Reflected radiance in W m^-2 sr^-1 per light group. A pass that was not asked for is None."""
+    """Reflected radiance in W m^-2 sr^-1, in rows of lights. A pass that was not asked for is None."""
 
-    groups: tuple[str, ...]
-    specular: np.ndarray | None  # (G, P, 3)
-    diffuse: np.ndarray | None  # (G, P, 3)
+    specular: np.ndarray | None = None  # (R, P, 3)
+    diffuse: np.ndarray | None = None  # (R, P, 3)
     quadrature_error: np.ndarray | None = None  # (P,) estimate for F = 1 and unit radiance; "reference" only
 
     @property
     def combined(self) -> np.ndarray:
-        """Sum (P, 3) over the passes and light groups."""
+        """Sum (P, 3) over the passes and rows."""
         return sum(part.sum(axis=0) for part in (self.specular, self.diffuse) if part is not None)
 
     def with_more(self, kept: np.ndarray, more: Shading) -> Shading:
-        """The samples for which the mask `kept` (P,) is True, then those of `more`, with the same groups and passes."""
+        """The samples for which the mask `kept` (P,) is True, then those of `more`, with the same rows and passes."""
 
         def joined(name, axis):
             one, other = getattr(self, name), getattr(more, name)
             return None if one is None else np.concatenate([np.compress(kept, one, axis), other], axis)
 
         axes = {"specular": 1, "diffuse": 1, "quadrature_error": 0}
-        return Shading(self.groups, **{name: joined(name, axis) for name, axis in axes.items()})
+        return Shading(**{name: joined(name, axis) for name, axis in axes.items()})
 
 
 class OwnTechnique(Protocol):
     """A technique of the user: anything with this method. An attribute `name` replaces the name of its class."""
 
     def evaluate(self, samples: SurfaceSamples, lights: tuple[AreaLight, ...]) -> Shading:
-        """Radiance of `samples` (P) under all `lights` together; its light groups are added up.
+        """Radiance of `samples` (P) under all `lights` together; its rows are added up.
 
         The lights have no `detail`. The caller takes care of samples that a light's passes or receivers leave out. If
         the diffuse pass is None, the caller uses the exact one.
@@ -243,8 +249,12 @@ def shade(
     workers: int | None = None,
     progress: Callable[[float], bool | None] | None = None,
     dtype=np.float32,
+    rows: Sequence[int] | None = None,
 ) -> Shading:
-    """Direct, unoccluded reflected radiance of `samples` (P) under `lights`.
+    """Direct, unoccluded reflected radiance of `samples` (P) under `lights` (L).
+
+    `rows` (L,) are integers from 0 on: the row of the result to which each light is added. By default each of up to 64
+    lights has a row; more are added to one. Many lights of one row may be merged where a sample cannot tell them apart.
 
     `technique` is "reference" (quadrature of the true BRDF), a shipped table, a table's path, a LookupTable or an
     OwnTechnique. Diffuse light is exact for polygons in all techniques except the last. `workers` processes (default:
@@ -257,8 +267,8 @@ def shade(
     whose error in single precision is 4e-4 of their light, and always "reference" and degrees above 4.
     """
     if is_own(technique):
-        return _shade_with(technique, samples, tuple(lights), tuple(passes), (workers, progress, dtype))
-    task = _task(tuple(lights), technique, passes, dtype)
+        return _shade_with(technique, samples, tuple(lights), tuple(passes), (workers, progress, dtype, rows))
+    task = _task(tuple(lights), technique, passes, dtype, rows)
     task.prepare()
     blocks = _blocks(len(samples), *(REFERENCE_BLOCK_LIMITS if task.is_reference else BLOCK_LIMITS))
     result = _Result(task, blocks, len(samples), np.dtype(dtype))
@@ -273,16 +283,16 @@ def shade(
         for _ in pool.run(task, len(pairs), lambda number: pairs[number].job(read), result.store_pairs, False):
             if progress is not None and progress(1.0) is False:
                 raise Cancelled("shading was stopped")
-    return Shading(task.groups, result.radiance.get("specular"), result.radiance.get("diffuse"), result.error)
+    return Shading(result.radiance.get("specular"), result.radiance.get("diffuse"), result.error)
 
 
 def _shade_with(technique, samples, lights, passes, how) -> Shading:
     """The result of an OwnTechnique, computed light by light."""
     _check_passes(passes)
-    workers, progress, dtype = how
-    groups = tuple(dict.fromkeys(light.group for light in lights)) or ("",)
-    radiance = {name: np.zeros((len(groups), len(samples), 3), dtype) for name in passes}
-    for number, light in enumerate(lights):
+    workers, progress, dtype, rows = how
+    rows = _rows(rows, len(lights))
+    radiance = {name: np.zeros((1 + max(rows, default=0), len(samples), 3), dtype) for name in passes}
+    for number, (light, row) in enumerate(zip(lights, rows, strict=True)):
         found = technique.evaluate(samples, light.patches) if light.area_vector.any() else None
         for name in passes if found is not None else ():
             if not getattr(light, f"affects_{name}"):
@@ -292,14 +302,14 @@ def _shade_with(technique, samples, lights, passes, how) -> Shading:
                 own = shade(samples, [light], passes=(name,), workers=workers, dtype=dtype).diffuse
             received = light.receives(samples.receiver)
             own = np.asarray(own).sum(axis=0)
-            radiance[name][groups.index(light.group)] += own if received is None else own * received[:, None]
+            radiance[name][row] += own if received is None else own * received[:, None]
         if progress is not None and progress((number + 1) / len(lights)) is False:
             raise Cancelled("shading was stopped")
-    return Shading(groups, radiance.get("specular"), radiance.get("diffuse"))
+    return Shading(radiance.get("specular"), radiance.get("diffuse"))
 
 
 def _own_pass(technique, found, name, count) -> np.ndarray | None:
-    """A pass (G, P, 3) of what an OwnTechnique returned. Raises ValueError if it is not usable."""
+    """A pass (R, P, 3) of what an OwnTechnique returned. Raises ValueError if it is not usable."""
     subject = f"technique {type(technique).__name__}: evaluate"
     if not isinstance(found, Shading):
         raise ValueError(f"{subject} returned {type(found).__name__}, expected a ltsh_addon.shading.Shading")
@@ -308,7 +318,7 @@ def _own_pass(technique, found, name, count) -> np.ndarray | None:
         return None
     shape = np.shape(values)
     if len(shape) != 3 or shape[1:] != (count, 3):
-        raise ValueError(f"{subject} returned {name} of shape {shape}, expected (groups, {count}, 3)")
+        raise ValueError(f"{subject} returned {name} of shape {shape}, expected (rows, {count}, 3)")
     return values
 
 
@@ -338,7 +348,7 @@ class _Result:
 
     def __init__(self, task: Task, blocks: list[slice], count: int, dtype: np.dtype):
         self._task, self._blocks = task, blocks
-        self.radiance = {name: np.zeros((len(task.groups), count, 3), dtype) for name in task.passes}
+        self.radiance = {name: np.zeros((task.row_count, count, 3), dtype) for name in task.passes}
         self.error = np.zeros(count) if task.has_error else None
         self._leftovers: list[dict[str, list]] = [{} for _ in blocks]
         self._pairs: list[LightSamplePairs] = []
@@ -369,10 +379,10 @@ class _Result:
 
     def store_pairs(self, number: int, radiance: np.ndarray) -> None:
         """Add what `Task.shade_pairs` returned."""
-        pairs, lights = self._pairs[number], self._task.lights_of_pairs(self._pairs[number].name)
-        group = np.array([self._task.groups.index(light.group) for light in lights])
+        pairs = self._pairs[number]
+        row = np.array([row for _, row in self._task.lights_of_pairs(pairs.name)])
         # A sample may occur with several lights.
-        np.add.at(self.radiance[pairs.name], (group[pairs.number], pairs.index), radiance)
+        np.add.at(self.radiance[pairs.name], (row[pairs.number], pairs.index), radiance)
 
 
 def _blocks(count: int, least: int, most: int) -> list[slice]:
@@ -398,10 +408,22 @@ def _parts(light) -> tuple[AreaLight, ...]:
     if light.is_profiled and not light.detail and light_profile.has_shear(light):
         return (light_profile.upright(light),)
     is_spot = float64.has_patches(light) and np.linalg.norm(light.half_u) < SPOT * np.linalg.norm(light.center)
-    return tuple(replace(patch, group=light.group) for patch in light.patches) if is_spot else (light,)
+    return light.patches if is_spot else (light,)
 
 
-def _task(lights, technique, passes, dtype) -> Task:
+def _rows(rows, count: int) -> list[int]:
+    """The rows of `count` lights; see `shade`. Raises ValueError."""
+    if rows is None:
+        return list(range(count)) if count <= MOST_SINGLE_ROWS else [0] * count
+    rows = np.asarray(rows)
+    if rows.shape != (count,) or (count and (rows.dtype.kind not in "iu" or rows.min() < 0)):
+        raise ValueError(
+            f"rows are {rows.dtype} of shape {rows.shape}, expected {count} integers from 0 on, one a light"
+        )
+    return rows.tolist()
+
+
+def _task(lights, technique, passes, dtype, rows) -> Task:
     _check_passes(passes)
     if np.dtype(dtype) not in (np.float32, np.float64):
         raise ValueError(f"dtype is {np.dtype(dtype)}, expected float32 or float64")
@@ -411,7 +433,10 @@ def _task(lights, technique, passes, dtype) -> Task:
     if not isinstance(table, str) and table.family == "ltsh":
         # Workers get this matrix with the table, because LAPACK need not give the same last bits in every process.
         _ = table.ridge_weights
-    groups = tuple(dict.fromkeys(light.group for light in lights)) or ("",)
-    lights = tuple(part for light in lights if light.area_vector.any() for part in _parts(light))
+    rows = _rows(rows, len(lights))
+    pairs = [pair for pair in zip(lights, rows, strict=True) if pair[0].area_vector.any()]
+    pairs = [(one, row) for light, row in pairs for one in _parts(light)]
+    count = 1 + max(rows, default=0)
+    lights, rows = (tuple(values) for values in zip(*pairs, strict=True)) if pairs else ((), ())
     fast = not isinstance(table, str) and table.degree <= moments32.MAX_DEGREE
-    return Task(lights, groups, table, tuple(passes), fast and np.dtype(dtype) == np.float32)
+    return Task(lights, rows, count, table, tuple(passes), fast and np.dtype(dtype) == np.float32)

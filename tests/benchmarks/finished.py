@@ -24,7 +24,7 @@ from ltsh_addon.blender.process.finished import FinishedJob, render_finished  # 
 from ltsh_addon.cli.commands import DEMO_SCENE  # noqa: E402
 from ltsh_addon.cycles.lobes import read_layer  # noqa: E402
 from ltsh_addon.imaging.denoise import open_denoiser  # noqa: E402
-from ltsh_addon.pipeline import RenderOptions, render  # noqa: E402
+from ltsh_addon.pipeline import RenderOptions, compositing, render  # noqa: E402
 from ltsh_addon.workers.pool import cores  # noqa: E402
 
 # Without compiled modules on disk, every Blender would compile those that it imports; an installed one has them.
@@ -55,7 +55,7 @@ def by_cycles(path: Path, folder: Path, *, samples=None, seconds=None, denoise=T
         made = render_finished(job, own)
     image = read_layer(made.channels, "Combined", "RGB")
     if denoise:
-        albedo, normal = (read_layer(made.guides, *guide) for guide in (render.ALBEDO, render.NORMAL))
+        albedo, normal = (read_layer(made.guides, *guide) for guide in (compositing.ALBEDO, compositing.NORMAL))
         with open_denoiser(denoiser_libraries(), cores()) as denoiser:
             (image,) = denoiser.all_denoised([image], albedo, normal)
     return image, made.processor_seconds + time.process_time() - start, made.samples

@@ -3,9 +3,6 @@
 python tests/benchmarks/finished_scenes.py NAME FILE.blend
 """
 
-import argparse
-from pathlib import Path
-
 import bpy
 import shadow_scenes as shared  # it finds the next one
 from shadow_scenes import scene_parts
@@ -108,16 +105,12 @@ def window():
 SCENES = {scene.__name__: scene for scene in (artist, studio, lamp, closed, window)}
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("name", choices=SCENES)
-    parser.add_argument("path", type=Path)
-    options = parser.parse_args()
+def build(name, path):
     scene = scene_parts.empty_scene(*SIZE)
     scene.render.engine = "CYCLES"
-    SCENES[options.name]()
-    scene_parts.save(options.path)
+    SCENES[name]()
+    scene_parts.save(path)
 
 
 if __name__ == "__main__":
-    main()
+    shared.main(__doc__.splitlines()[0], SCENES, build)

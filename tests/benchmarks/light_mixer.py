@@ -17,9 +17,9 @@ import many_lights
 import measure
 import numpy as np
 
-from ltsh_addon.pipeline.lighting import RELIGHT_SUFFIX, RelightData
 from ltsh_addon.pipeline.mixer import LightPictures, Mixer, light_pictures
 from ltsh_addon.pipeline.moved_lights import MovedLights
+from ltsh_addon.pipeline.relight import RELIGHT_SUFFIX, RelightData
 
 RESOLUTION = "960x540"
 

@@ -96,9 +96,9 @@ def shade(options):
         cases = {}
         if fresnel == "white":
             cases["textbook LTC"] = partial(TextbookLtc(TABLES["ltc"]).shade, samples, lights)
-            cases["diffuse"] = partial(shading.shade, samples, lights, "ltc", passes=["diffuse"], workers=1)
+            cases["diffuse"] = partial(in_one_row, samples, lights, "ltc", passes=["diffuse"])
         for name, table in TABLES.items():
-            cases[name] = partial(specular, samples, lights, table)
+            cases[name] = partial(in_one_row, samples, lights, table)
         ratio = compared(cases, "ltc", 3 if options.quick else 5, 4 * count)
         if fresnel == "white":
             targets(ratio)
@@ -141,8 +141,9 @@ def many_lights(options):
         row(f"{count} lights", seconds / len(samples) * 1e9, note=f"{seconds:.1f} s, {seconds / base:.1f} x")
 
 
-def specular(samples, lights, table, **options):
-    return shading.shade(samples, lights, table, passes=["specular"], **{"workers": 1, **options})
+def in_one_row(samples, lights, table, **options):
+    options = {"passes": ["specular"], "workers": 1, "rows": [0] * len(lights), **options}
+    return shading.shade(samples, lights, table, **options)
 
 
 def bounds(options):
@@ -183,7 +184,7 @@ def growth(options):
         row(f"{corners} edges", seconds / count * 1e9, note=f"{seconds / count / corners * 1e9:.1f} ns per edge")
     heading(f"growth with lights: ltsh4, F = 1, {count} samples, ns per sample and light")
     for lights in (1, 2, 4, 8, 16, 64):
-        seconds = timed(specular, *floor_scene(count, lights), TABLES["ltsh4"])
+        seconds = timed(in_one_row, *floor_scene(count, lights), TABLES["ltsh4"])
         row(f"{lights} lights", seconds / count / lights * 1e9)
     heading("growth with degree: moments of rectangles, ns per polygon")
     corners = np.ascontiguousarray(random_polygons(CHUNK, "whole")[2].transpose(2, 1, 0))
@@ -196,7 +197,7 @@ def growth(options):
     heading("growth with samples: ltsh4, F = 1, 4 lights, ns per sample and light")
     sizes = [10_000, 100_000, *([] if options.quick else [1_000_000]), *([10_000_000] if options.large else [])]
     for size in sizes:
-        seconds = timed(specular, *floor_scene(size, 4), TABLES["ltsh4"], rounds=3 if size <= 100_000 else 1)
+        seconds = timed(in_one_row, *floor_scene(size, 4), TABLES["ltsh4"], rounds=3 if size <= 100_000 else 1)
         row(f"{size:.0e} samples", seconds / size / 4 * 1e9, note=f"{seconds:.2f} s")
 
 
@@ -231,7 +232,7 @@ def speed_up(name, samples, lights, two_apart):
 
     def run(number):
         before = cpu_seconds()
-        found[number] = specular(samples, lights, TABLES[name], workers=number).specular
+        found[number] = in_one_row(samples, lights, TABLES[name], workers=number).specular
         cpu[number] = cpu_seconds() - before
 
     cases = {"1 process": partial(run, 1), "2 processes": partial(run, 2), "2 apart, all the work each": two_apart}

@@ -204,13 +204,14 @@ def _box(name, low, high, material):
     return ob
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("name", choices=SCENES)
+def main(description: str, names, build) -> None:
+    """Build the scene that the command line names."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("name", choices=names)
     parser.add_argument("path", type=Path)
     options = parser.parse_args()
     build(options.name, options.path)
 
 
 if __name__ == "__main__":
-    main()
+    main(__doc__.splitlines()[0], SCENES, build)

@@ -233,8 +233,8 @@ class Measured:
 
     def _by_light(self, technique, passes):
         """Radiance (L, P, 3) of every light, all of it seen."""
-        lights = [replace(light, group=str(number)) for number, light in enumerate(self.extraction.lights)]
-        return shading.shade(self.extraction.samples, lights, technique, passes=passes)
+        lights = self.extraction.lights
+        return shading.shade(self.extraction.samples, lights, technique, passes=passes, rows=range(len(lights)))
 
     def _of_lights(self, shadows, name):
         """Shares (L, P) of a pass."""

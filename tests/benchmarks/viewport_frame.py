@@ -58,7 +58,7 @@ class Frames:
 
     def seconds(self, technique, passes="combined", moving=True):
         """Time of one frame, to the end of what the card does for it."""
-        shown = ShownPicture(technique, passes, "single", technique, 0.5, 1.0, 1.0, False)
+        shown = ShownPicture(technique, passes)
         self.moves += moving
         # Lights that are new, if equal: what has not changed is not drawn again.
         self.mirror.lights = tuple(list(self.mirror.lights))

@@ -122,7 +122,7 @@ def measure_shadows(scene) -> tuple[float, float, float]:
     view, renderer.shadows = view_of_camera(camera.evaluated_get(depsgraph), depsgraph, SIZE), live
     texture = gpu.types.GPUTexture(SIZE, format="RGBA32F")
     buffer = gpu.types.GPUFrameBuffer(color_slots=[texture])
-    shown = ShownPicture("ltsh4", "combined", "single", "ltc", 0.5, 1.0, 1.0, True)
+    shown = ShownPicture("ltsh4", "combined", transparent=True)
 
     def draw():
         live.follow((0,), lambda: collect_occluders(depsgraph, None, lambda text: None))

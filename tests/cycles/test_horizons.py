@@ -153,9 +153,9 @@ def test_directions_between_the_horizons_meet_the_lights_that_stand_there(kind):
         lights = tuple(replace(light, shape="BALL" if kind == "ball" else "FACING_DISK") for light in lights)
     if kind == "sky":
         lights = sides_of_the_sky()[:5]
-    shape = horizons._Shapes.of(lights, np.arange(len(lights)), np.ones(len(lights)))
+    shape = horizons._LightsOfKind.of(lights, np.arange(len(lights)), np.ones(len(lights)))
     assert shape.is_side == (kind == "sky")
-    directions = horizons._Directions.of(samples)
+    directions = horizons._HorizonDirections.of(samples)
     number, sample, ray, brightness, _ = shape.hits(*shape.crossings(samples), samples.position, directions)
     assert np.array_equal(brightness, np.array([light.radiance.sum() for light in lights])[number])
     found = set(zip(number.tolist(), sample.tolist(), ray.tolist(), strict=True))
@@ -204,7 +204,7 @@ def test_a_few_directions_tell_where_lobes_end_under_a_sky(monkeypatch):
     samples, lights = samples_around(np.random.default_rng(7), 300), sides_of_the_sky()
     chances = horizons.lobe_selection_pmf(samples, np.arange(300), is_baked=False)
     few = horizons.smooth_horizon_share(*horizons.horizon_excess(samples, lights, chances))
-    monkeypatch.setattr(horizons._Directions, "few", lambda directions: directions)
+    monkeypatch.setattr(horizons._HorizonDirections, "few", lambda directions: directions)
     apart = few - horizons.smooth_horizon_share(*horizons.horizon_excess(samples, lights, chances))
     # Of what comes from between the horizons, itself a few percent of the light.
     assert np.sqrt(np.square(apart).mean()) < 0.05 and abs(apart.mean()) < 0.01

@@ -40,9 +40,9 @@ def of_small_lights(samples, whole, technique):
     """Specular and diffuse radiance (P, 3) by COUNT x COUNT lights without a falloff, weighted by their distances."""
     centers, _ = quadrature.patches_of(whole, COUNT)
     plain = replace(whole, falloff=0, smooth=0.0, half_u=whole.half_u / COUNT, half_v=whole.half_v / COUNT)
-    parts = [replace(plain, center=center, group=str(number)) for number, center in enumerate(centers)]
-    found = shade(samples, parts, technique, workers=1, dtype=np.float64)
-    squared = np.square(samples.position - centers[:, None]).sum(axis=-1)  # (G, P)
+    parts = [replace(plain, center=center) for center in centers]
+    found = shade(samples, parts, technique, workers=1, dtype=np.float64, rows=range(len(parts)))
+    squared = np.square(samples.position - centers[:, None]).sum(axis=-1)  # (R, P)
     factor = squared ** (0.5 * whole.falloff) * squared / (whole.smooth + squared)
     return [np.einsum("gp,gpc->pc", factor, values) for values in (found.specular, found.diffuse)]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from surface_scenes import unit
 
 from ltsh_addon.scene import AreaLight, SpotCone, SurfaceSamples
 
@@ -13,10 +14,6 @@ LIGHTS = ("plain", "near", "horizon", "tiny", "tiny disk", "huge", "disk", "poly
 PROFILED_LIGHTS = ("spread", "narrow", "spread disk", "linear", "constant disk", "smooth")
 FACING_LIGHTS = ("ball", "facing disk", "spot", "spot disk", "bulb", "sun")
 GROUPS = 4
-
-
-def unit(vectors):
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 def rounded(values):

@@ -8,7 +8,7 @@ import pytest
 from ltsh_addon import cli
 from ltsh_addon.cli import arguments as arguments_module
 from ltsh_addon.pipeline import PictureOptions, compare_scene, shade_scene
-from ltsh_addon.pipeline.baseline import Baseline, Tolerance
+from ltsh_addon.pipeline.picture import Baseline, Tolerance
 
 
 @pytest.fixture

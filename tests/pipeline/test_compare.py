@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from ltsh_addon import imaging, scene, shading
-from ltsh_addon.pipeline import PictureOptions, compare_scene, lighting, picture, shade_scene
+from ltsh_addon.imaging.exr import group_names
+from ltsh_addon.pipeline import PictureOptions, compare_scene, comparison, lighting, shade_scene
 from ltsh_addon.scene import Cancelled
 
 TABLES = Path(shading.__file__).resolve().parents[2] / "tables"
@@ -76,7 +77,7 @@ def test_one_pass_alone_is_not_combined(child, tmp_path):
 
 def test_layers_of_groups_have_names_of_their_own_without_dots():
     """Blender and compositors take what stands before a dot for the name of a layer."""
-    found = lighting.group_names(["Key.001", "", "Key_001", "ungrouped"])
+    found = group_names(["Key.001", "", "Key_001", "ungrouped"])
     assert found == ["Key_001", "ungrouped_", "Key_001_2", "ungrouped"]
 
 
@@ -218,11 +219,11 @@ def test_the_report_names_a_lamp_of_many_faces_once():
     whole = fake_scene.lights()[0]
     lamp = replace(whole, name="Lamp", shape="POLYGON", corners=whole.polygon(), group="Lamps")
     dark = replace(lamp, radiance=np.zeros(3))
-    found = picture._light_reports([whole, lamp, dark, lamp, replace(lamp, name="Other")])
+    found = comparison._light_reports([whole, lamp, dark, lamp, replace(lamp, name="Other")])
     assert [(one["name"], one["patches"]) for one in found] == [(whole.name, 1), ("Lamp", 3), ("Other", 1)]
     assert np.allclose(found[1]["radiance"], lamp.radiance * 2.0 / 3.0)
     # Two lights of one name that are no faces are two.
-    assert len(picture._light_reports([whole, whole])) == 2
+    assert len(comparison._light_reports([whole, whole])) == 2
 
 
 def test_figures_against_cycles_are_those_of_the_known_noise(child, tmp_path):
@@ -258,7 +259,7 @@ def test_material_classes_part_metals_from_dielectrics():
         specular_f90=np.array([[1.0, 1, 1], [0, 0, 0], [0.4, 0.4, 0.4], [0.6, 0.6, 0.6], [0, 0, 0]]),
         dielectric=np.array([0.0, 1.0, 0.6, 0.4, 0.0]),
     )
-    classes = picture.material_classes(samples)
+    classes = comparison.material_classes(samples)
     assert classes["metals"].tolist() == [True, False, False, True, False]
     assert classes["dielectrics"].tolist() == [False, True, True, False, False]
 
@@ -288,8 +289,8 @@ def test_a_reference_on_a_subset_is_stated_and_zero_elsewhere(child, tmp_path):
 
 def test_a_reference_of_many_lights_takes_fewer_samples(child, tmp_path, monkeypatch):
     """Their number times that of the lights stays bounded: 100,000 lights would take days."""
-    monkeypatch.setattr(picture, "FEWEST_SAMPLES", 1)
-    monkeypatch.setattr(picture, "MOST_PAIRS", 20 * len(fake_scene.lights()))
+    monkeypatch.setattr(lighting, "FEWEST_SAMPLES", 1)
+    monkeypatch.setattr(lighting, "MOST_REFERENCE_PAIRS", 20 * len(fake_scene.lights()))
     facts = compare_scene(options(tmp_path))["reference"]
     assert facts["of"] == 35 and 0 < facts["samples"] <= 20
 
@@ -390,8 +391,8 @@ def test_light_linking_and_the_passes_of_a_light_hold_for_techniques_of_ones_own
     [
         (np.zeros(3), "returned ndarray, expected a ltsh_addon.shading.Shading"),
         (
-            shading.Shading(("",), np.zeros((5, 3)), None),
-            r"returned specular of shape \(5, 3\), expected \(groups, 5, 3",
+            shading.Shading(np.zeros((5, 3))),
+            r"returned specular of shape \(5, 3\), expected \(rows, 5, 3",
         ),
     ],
 )

@@ -82,16 +82,18 @@ def test_resuming_keeps_what_the_same_job_has_done(child, room, tmp_path):
     wanted = job(room, tmp_path / "out", frames=(1, 2, 3))
     assert batch.run_tasks(wanted).done == 3
     before = contents(tmp_path / "out")
-    assert batch.run_tasks(wanted, existing=batch.RESUME).kept == 3 and len(child.asked) == 3
+    assert batch.run_tasks(wanted, existing=batch.RESUME).finished_before == 3 and len(child.asked) == 3
     (tmp_path / "out" / "shade_0002.exr").unlink()
     done = batch.run_tasks(wanted, existing=batch.RESUME)
-    assert (done.done, done.kept, child.asked[-1].frame) == (1, 2, 2) and contents(tmp_path / "out") == before
+    assert (done.done, done.finished_before, child.asked[-1].frame) == (1, 2, 2) and contents(
+        tmp_path / "out"
+    ) == before
     # More frames of the same job keep what is there; other options do not.
-    assert batch.run_tasks(replace(wanted, frames=(3, 4)), existing=batch.RESUME).kept == 1
+    assert batch.run_tasks(replace(wanted, frames=(3, 4)), existing=batch.RESUME).finished_before == 1
     changed = replace(wanted, options=replace(wanted.options, passes=("specular",)))
-    assert batch.run_tasks(changed, existing=batch.RESUME).kept == 0
-    assert batch.run_tasks(wanted, existing=batch.SKIP).kept == 3 and merge(tmp_path / "out").missing == ()
-    assert batch.run_tasks(wanted).kept == 0
+    assert batch.run_tasks(changed, existing=batch.RESUME).finished_before == 0
+    assert batch.run_tasks(wanted, existing=batch.SKIP).finished_before == 3 and merge(tmp_path / "out").missing == ()
+    assert batch.run_tasks(wanted).finished_before == 0
 
 
 @pytest.mark.parametrize("damage", ["cut", "changed", "report", "key", "files", "{", '{"format": 99}', ""])
@@ -109,7 +111,7 @@ def test_what_is_not_whole_is_done_again(child, room, tmp_path, damage):
     else:
         record.write_text(damage)
     done = batch.run_tasks(wanted, existing=batch.SKIP if damage == "cut" else batch.RESUME)
-    assert (done.done, done.kept) == (1, 1)
+    assert (done.done, done.finished_before) == (1, 1)
     after = contents(tmp_path / "out")
     after.pop(".ltsh/job.json"), before.pop(".ltsh/job.json")
     assert after == before
@@ -156,5 +158,5 @@ def test_two_jobs_in_one_folder_leave_each_others_files(child, room, tmp_path):
     batch.run_tasks(second)
     after = contents(tmp_path / "out")
     assert all(after[name] == data for name, data in before.items() if name != ".ltsh/job.json")
-    assert batch.run_tasks(first, existing=batch.RESUME).kept == 2
-    assert batch.run_tasks(second, existing=batch.RESUME).kept == 2
+    assert batch.run_tasks(first, existing=batch.RESUME).finished_before == 2
+    assert batch.run_tasks(second, existing=batch.RESUME).finished_before == 2

@@ -10,7 +10,6 @@ from fake_scene import run, wall
 
 from ltsh_addon.imaging.exr import read_channels
 from ltsh_addon.pipeline import lighting, moved_lights, relight
-from ltsh_addon.pipeline.lighting import RelightData
 from ltsh_addon.pipeline.mixer import (
     NOT_SHADED,
     REST,
@@ -24,6 +23,7 @@ from ltsh_addon.pipeline.mixer import (
     light_pictures,
 )
 from ltsh_addon.pipeline.moved_lights import Draft, MovedLights
+from ltsh_addon.pipeline.relight import RelightData, write_relight_data
 from ltsh_addon.scene import Cancelled, Film, SurfaceSamples
 from ltsh_addon.workers import pool
 
@@ -136,7 +136,7 @@ def test_the_rest_of_a_picture_is_a_row_and_bounced_light_follows_its_light_grou
     rest = {"": random.random((*shape, 4)), "Key": random.random((*shape, 3))}
     taken = {"diffuse": random.random(shape)}
     path = out / "render.samples.npz"
-    lighting.write_relight_data(kept.extraction, None, replace(options(room, out)), path, rest=rest, taken=taken)
+    write_relight_data(kept.extraction, None, replace(options(room, out)), path, rest=rest, taken=taken)
     pictures = light_pictures(RelightData.load(path))
     assert [row.name for row in pictures.rows][-1] == REST and len(pictures.rows) == 4
     np.testing.assert_allclose(pictures.alpha, rest[""][..., 3], rtol=1e-6)
@@ -157,7 +157,7 @@ def test_a_finished_picture_lit_anew_keeps_the_rest(capsys, monkeypatch, room, o
     )
     path = out / "finished" / "render.samples.npz"
     path.parent.mkdir()
-    lighting.write_relight_data(kept.extraction, None, options(room, out), path, rest={"": rest}, taken=taken)
+    write_relight_data(kept.extraction, None, options(room, out), path, rest={"": rest}, taken=taken)
     found = run(capsys, "relight", out / "finished", "--light", "Light 1", "--power", "x3", "--json", "--quiet")
     assert found[0] == 0 and relight.SAME_REST.format("") in found[1]
     channels = read_channels(out / "finished" / "relit" / "render.exr")
@@ -176,7 +176,7 @@ def test_bounced_light_follows_a_group_also_where_its_lights_change_differently(
     rest = {"": random.random((*shape, 4)), "Key": random.random((*shape, 3)), "Sky": random.random((*shape, 3))}
     taken = {name: np.ones(shape) for name in ("specular", "diffuse")}
     path.parent.mkdir()
-    lighting.write_relight_data(
+    write_relight_data(
         kept.extraction, None, replace(options(room, out), techniques=("ltsh4",)), path, rest=rest, taken=taken
     )
     pictures = light_pictures(RelightData.load(path))

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from ltsh_addon.blender.process.pixels import PixelJob
-from ltsh_addon.cli import commands, job_file
+from ltsh_addon.cli import arguments, commands
 from ltsh_addon.pipeline import BakeOptions, PictureOptions
 from ltsh_addon.pipeline.options import arguments_of, child_job, command_line, what_matters
 
@@ -51,7 +51,7 @@ def test_job_files_have_the_options_of_the_command_line(command, kind, values):
     declared = {flag.lstrip("-") for _, arguments in arguments_of(kind).values() for item in arguments
                 for flag in item.flags} - {"scenes", "o", "enable-autoexec"}  # fmt: skip
     baseline = {"baseline", "tolerance"} if command == "compare" else set()
-    assert set(job_file._options(commands.job_parsers()[command])) == declared | baseline
+    assert set(arguments._options(commands.job_parsers()[command])) == declared | baseline
 
 
 @KINDS

@@ -48,8 +48,9 @@ def test_many_lights_without_shadows_are_shaded_all_at_once(count, is_one_call):
     samples, four = random_samples(40, seed=1), four_lights()
     lights = [replace(four[n % 4].moved(np.array([0.2 * n, 0.0, 1.0])), group=f"{n % 2}") for n in range(2 * count)]
     (found,) = lighting.shade_lights(samples, lights, "ltsh4", ("diffuse",), workers=1)
-    expected = shading.shade(samples, lights, "ltsh4", passes=("diffuse",), workers=1)
-    assert found.groups == expected.groups and np.allclose(found.diffuse, expected.diffuse, rtol=1e-2, atol=1e-4)
+    rows = [n % 2 for n in range(2 * count)]
+    expected = shading.shade(samples, lights, "ltsh4", passes=("diffuse",), workers=1, rows=rows)
+    assert np.allclose(found.diffuse, expected.diffuse, rtol=1e-2, atol=1e-4)
     numbers = visibility.shared_numbers(lights)
     seen = lighting.Shadows({"diffuse": np.ones((len(numbers), len(samples)))}, numbers, {}, 0, "")
     shadowed, unshadowed = lighting.shade_lights(samples, lights, "ltsh4", ("diffuse",), (seen, None), workers=1)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from surface_scenes import area_light, random_samples
 
-from ltsh_addon.files import load_samples, save_samples
 from ltsh_addon.scene import AREA_LIGHT_SHAPES, AreaLight, Film, SurfaceSamples, light_records, lights_of
 
 shapes = pytest.mark.parametrize("shape", AREA_LIGHT_SHAPES)
@@ -96,27 +95,6 @@ def test_optional_fields_default_to_a_surface_without_bumps():
     assert np.array_equal(made.geometric_normal, samples.normal)
     assert np.array_equal(made.smooth_normal, samples.diffuse_normal)
     assert np.array_equal(made.bump_alpha2, np.zeros(5))
-
-
-@pytest.mark.parametrize("count", [0, 7])
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_samples_are_saved_and_loaded_bit_for_bit(tmp_path, count, dtype):
-    samples = random_samples(7)
-    samples = SurfaceSamples(**{field.name: getattr(samples, field.name).astype(dtype) for field in fields(samples)})
-    samples = samples.take(slice(0, count))
-    path = tmp_path / "samples.npz"
-    save_samples(samples, path)
-    loaded = load_samples(path)
-    assert len(loaded) == count
-    for field in fields(samples):
-        written, read = getattr(samples, field.name), getattr(loaded, field.name)
-        assert written.dtype == read.dtype and written.tobytes() == read.tobytes(), field.name
-
-
-def test_files_without_samples_are_refused(tmp_path):
-    np.savez(tmp_path / "other.npz", position=np.zeros((2, 3)))
-    with pytest.raises(ValueError, match="other.npz: no surface samples, view, normal, .* missing"):
-        load_samples(tmp_path / "other.npz")
 
 
 def test_samples_are_taken_by_index_mask_and_slice():

@@ -1,4 +1,4 @@
-"""`shade`: symmetries, light groups, one-sided lights, blocks, cancelling, and what is refused.
+"""`shade`: symmetries, rows of lights, one-sided lights, blocks, cancelling, and what is refused.
 
 In double precision, where symmetries hold to rounding; `test_single_precision` compares the other path with this one.
 """
@@ -40,8 +40,7 @@ def small_blocks(monkeypatch, size):
 @techniques
 def test_light_adds_up(technique):
     samples, lights = random_samples(150, seed=1), four_lights()
-    together = shade(samples, lights, technique, workers=1)
-    assert together.groups == ("Key", "Fill", "")
+    together = shade(samples, lights, technique, workers=1, rows=(0, 1, 0, 2))
     assert together.specular.shape == together.diffuse.shape == (3, 150, 3)
     apart = [shade(samples, [light], technique, workers=1) for light in lights]
     assert np.abs(sum(part.combined for part in apart) - together.combined).max() < 1e-12
@@ -187,9 +186,9 @@ def test_progress_can_cancel_at_its_first_call(monkeypatch):
 def test_no_samples_and_no_lights_are_fine(technique):
     none = random_samples(4).take(slice(0, 0))
     shaded = shade(none, four_lights(), technique)
-    assert shaded.specular.shape == (3, 0, 3) and shaded.combined.shape == (0, 3)
+    assert shaded.specular.shape == (4, 0, 3) and shaded.combined.shape == (0, 3)
     dark = shade(random_samples(4), [], technique)
-    assert dark.groups == ("",)
+    assert dark.specular.shape == (1, 4, 3)
     assert np.array_equal(dark.combined, np.zeros((4, 3)))
 
 
@@ -202,6 +201,21 @@ def test_passes_that_were_not_asked_for_are_absent():
 def test_unknown_passes_are_refused(passes):
     with pytest.raises(ValueError, match="expected some of specular, diffuse"):
         shade(random_samples(4), four_lights(), passes=passes)
+
+
+@pytest.mark.parametrize("technique", ["ltc", shading.REFERENCE])
+def test_up_to_64_lights_have_a_row_each_and_more_have_one(technique):
+    samples, lights = random_samples(4), 17 * four_lights()
+    few, many = (shade(samples, lights[:count], technique, passes=["diffuse"]).diffuse for count in (64, 65))
+    assert few.shape == (64, 4, 3) and many.shape == (1, 4, 3)
+    again = shade(samples, lights[:65], technique, passes=["diffuse"], rows=[2] * 64 + [0]).diffuse
+    assert np.allclose(again[2], few.sum(axis=0)) and np.allclose(again.sum(axis=0), many[0]) and not again[1].any()
+
+
+@pytest.mark.parametrize("rows", [(0, 1, 2), (0, 1, 2, -1), (0.0, 1.0, 2.0, 3.0), 0])
+def test_rows_that_do_not_fit_the_lights_are_refused(rows):
+    with pytest.raises(ValueError, match="expected 4 integers from 0 on, one a light"):
+        shade(random_samples(4), four_lights(), rows=rows)
 
 
 @pytest.mark.parametrize("technique", ["ltsh5", "", "Reference", "no/such.npz"])

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from textbook import lhuilier
 
 from ltsh_addon.visibility import directions
 
@@ -40,19 +41,6 @@ def seen_quads(kind, count, rng):
     elif kind == "hair":
         half_u = 1e-3 * half_u
     return np.stack([center + s * half_u + t * half_v for s, t in ((-1, -1), (1, -1), (1, 1), (-1, 1))], axis=1)
-
-
-def lhuilier(a, b, c):
-    """Areas (Q,) of spherical triangles with corners (Q, 3), by L'Huilier's theorem."""
-    sides = [
-        2.0 * np.arctan2(np.linalg.norm(p - q, axis=-1), np.linalg.norm(p + q, axis=-1))
-        for p, q in ((b, c), (c, a), (a, b))
-    ]
-    half = 0.5 * sum(sides)
-    product = np.tan(0.5 * half)
-    for side in sides:
-        product = product * np.tan(0.5 * (half - side))
-    return 4.0 * np.arctan(np.sqrt(np.maximum(product, 0.0)))
 
 
 @pytest.mark.parametrize("kind", ("plain", "tiny", "hair", "over all of the sky"))

@@ -50,19 +50,19 @@ def test_workers_use_the_matrix_of_this_process(dtype, started, children_only):
 
 
 def test_pairs_that_blocks_leave_to_double_precision_are_shaded_together(started, children_only, monkeypatch):
-    """Lights of 1 m by 10 um, of two groups, several kinds, and one not for all; some lobes are sharp. Against double
+    """Lights of 1 m by 10 um, in two rows, of several kinds, and one not for all; some lobes are sharp. Against double
     precision for all, against children, and against blocks that leave little."""
     generator = np.random.default_rng(5)
     samples = random_samples(300, seed=11, lowest_roughness=0.02)
     samples = replace(samples, receiver=np.arange(300) % 2, bump_alpha2=np.full(300, 0.1))
-    narrow = {"half_u": (0.5, 0, 0), "half_v": (0, -5e-6, 0), "group": "Narrow"}
+    narrow = {"half_u": (0.5, 0, 0), "half_v": (0, -5e-6, 0)}
     centers = np.append(generator.uniform(-0.5, 0.5, (4, 2)), np.full((4, 1), 1.5), axis=1)
     lights = [area_light(center=center, **narrow) for center in centers]
-    lights[1] = replace(lights[1], receivers=(1,), group="Key")
+    lights[1] = replace(lights[1], receivers=(1,))
     lights[2] = replace(lights[2], shape="DISK")
     # A polygon, for of a rectangle with a falloff single precision takes points.
     lights[3] = replace(lights[3], shape="POLYGON", corners=lights[3].polygon(), falloff=1)
-    asked = []
+    rows, asked = (0, 1, 0, 0), []
     original = integrator.Task.shade_pairs
 
     def counted(self, samples, name, number):
@@ -70,12 +70,12 @@ def test_pairs_that_blocks_leave_to_double_precision_are_shaded_together(started
         return original(self, samples, name, number)
 
     monkeypatch.setattr(integrator.Task, "shade_pairs", counted)
-    one = shading.shade(samples, lights, "ltsh4", workers=1)
+    one = shading.shade(samples, lights, "ltsh4", workers=1, rows=rows)
     assert [name for name, _ in asked] == list(shading.PASSES) and all(count > 100 for _, count in asked)
-    three = shading.shade(samples, lights, "ltsh4", workers=3)
+    three = shading.shade(samples, lights, "ltsh4", workers=3, rows=rows)
     monkeypatch.setattr(float32, "FLOAT64_CHUNK", 5)
-    at_once = shading.shade(samples, lights, "ltsh4", workers=1)
-    double = shading.shade(samples, lights, "ltsh4", workers=1, dtype=np.float64)
+    at_once = shading.shade(samples, lights, "ltsh4", workers=1, rows=rows)
+    double = shading.shade(samples, lights, "ltsh4", workers=1, dtype=np.float64, rows=rows)
     assert sum(count for _, count in asked[2:]) < 20 and len(started) == 2
     for name in shading.PASSES:
         found, expected = getattr(one, name), getattr(double, name)

@@ -9,9 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ...pipeline.lighting import RelightData, shade_lights, trace_shadows
+from ...pipeline.lighting import shade_lights, trace_shadows
 from ...pipeline.mixer import LightPictures, light_pictures
 from ...pipeline.options import RenderOptions
+from ...pipeline.relight import RelightData
 from ...pipeline.render import finish
 from ...scene import PASSES, TECHNIQUES, Progress
 from ..process.pixels import PixelJob, extract_pixels

@@ -16,7 +16,7 @@ from bpy.app.handlers import persistent
 
 from ...scene import PASSES, SHIPPED_TABLES, TECHNIQUES, Cancelled, Progress, SceneError, error_line
 from ...shading import TableError
-from ..materials.looks import world_radiance
+from ..materials.preview_material import world_radiance
 from ..render_settings import pass_names as names_in_files
 from ..render_settings import picture_size
 from ..saving import save_working_copy

@@ -153,7 +153,7 @@ def _read(ob, mesh, matrix, uv_name):
     world_normals = normals[loops].astype(np.float64) @ np.linalg.inv(linear)
     world_normals /= np.maximum(np.linalg.norm(world_normals, axis=-1, keepdims=True), 1e-30)
     slots = max(len(ob.material_slots), 1)
-    found = TexelMesh(
+    texel_mesh = TexelMesh(
         corners=(positions[vertices].astype(np.float64) @ linear.T + matrix[:3, 3]).reshape(count, 3, 3),
         normals=world_normals.reshape(count, 3, 3),
         uv=uv,
@@ -170,7 +170,7 @@ def _read(ob, mesh, matrix, uv_name):
             "between 0 and 1, or whole faces in UDIM tiles: move it"
         )
     rendered = next((other.name for other in mesh.uv_layers if other.active_render), layer.name)
-    return found, layer.name, {**maps, "": maps[rendered]}
+    return texel_mesh, layer.name, {**maps, "": maps[rendered]}
 
 
 def _uv_of(layer, count):
@@ -211,7 +211,7 @@ class ObjectBake:
         Cycles samples these points; point 0 is the center of the texel. Map n shows map n of every material at once.
         For the other points one more map follows: their places (u, v, 0), where the block is the unit square.
         """
-        found, cycles = [], self.scene.cycles
+        maps, cycles = [], self.scene.cycles
         # With a fixed seed the bytes do not depend on what was baked before.
         cycles.seed, cycles.samples, cycles.use_sample_subset = 0, points, True
         cycles.sample_offset, cycles.sample_subset_length = point, 1
@@ -221,10 +221,10 @@ class ObjectBake:
                 for plan in self.plans:
                     plan.show(number)
                 with render_settings.without_scripts(self.scene):
-                    found.append(self._bake(block, "EMIT", set()))
+                    maps.append(self._bake(block, "EMIT", set()))
         finally:
             cycles.use_sample_subset = False
-        return np.array(found)
+        return np.array(maps)
 
     def radiance(self, block: Block, kind: str, samples: int) -> np.ndarray:
         """Cycles' direct light (2, rows, W, 3), colors included: two halves with different seeds."""
@@ -330,7 +330,7 @@ class BakeScene:
         return [made[slot.material.name_full] for slot in ob.material_slots], list(dict.fromkeys(warnings))
 
 
-_kept: dict[str, tuple] = {}
+_cached: dict[str, tuple] = {}
 
 
 def opened_scene(job: BakeJob, progress) -> BakeScene:
@@ -338,23 +338,23 @@ def opened_scene(job: BakeJob, progress) -> BakeScene:
     status = Path(job.scene).stat()
     key = {name: value for name, value in vars(job).items() if name not in _OF_ONE_JOB}
     key = repr(sorted(key.items())), status.st_mtime_ns, status.st_size, pixels.files_opened()
-    if _kept.get("key") == key:
-        kept = _kept["scene"]
-        if not isinstance(job.objects, str) and set(job.objects) <= set(kept.names):
-            return kept
+    if _cached.get("key") == key:
+        cached = _cached["scene"]
+        if not isinstance(job.objects, str) and set(job.objects) <= set(cached.names):
+            return cached
     close()
     progress("open scene", 0.0)
-    found = _open(job)
-    _kept.update(key=(*key[:-1], pixels.files_opened()), scene=found)
-    return found
+    scene = _open(job)
+    _cached.update(key=(*key[:-1], pixels.files_opened()), scene=scene)
+    return scene
 
 
 def close() -> None:
     """Forget the open file."""
-    kept = _kept.pop("scene", None)
-    _kept.clear()
-    if kept is not None:
-        kept.folder.cleanup()
+    cached = _cached.pop("scene", None)
+    _cached.clear()
+    if cached is not None:
+        cached.folder.cleanup()
 
 
 def _open(job: BakeJob) -> BakeScene:
@@ -400,8 +400,8 @@ def _open(job: BakeJob) -> BakeScene:
         view = replace(view, vector=tuple(np.add(view.vector, origin).tolist()))
     _look_from(scene, camera, seen_from)
     if has_shadows:
-        for found in lobes.values():
-            let_shadow_rays_through(found.made_opaque)
+        for material_lobes in lobes.values():
+            let_shadow_rays_through(material_lobes.made_opaque)
     else:
         remove_occlusion(scene)
     name, names = camera.name if job.view == "camera" else "", [ob.name for ob in objects]
@@ -487,8 +487,10 @@ def _bakes_from_own_mesh(ob, depsgraph, uv_name, probe: str) -> bool:
         layer = layers.get(uv_name) if uv_name else layers.active
         if layer is None or not probe:
             return layer is None or layer.name in ob.data.uv_layers
-        found, count = layers.get(probe), len(mesh.loops)
-        return found is not None and np.allclose(_uv_of(found, count), _probed(_uv_of(layer, count)), atol=1e-4)
+        probe_layer, count = layers.get(probe), len(mesh.loops)
+        return probe_layer is not None and np.allclose(
+            _uv_of(probe_layer, count), _probed(_uv_of(layer, count)), atol=1e-4
+        )
     finally:
         evaluated.to_mesh_clear()
 
@@ -512,10 +514,10 @@ def _inspect(scene, objects, uv_name, folder, origin, with_occluders):
         for number, ob in enumerate(objects):
             try:
                 check_object(ob)
-                found = read_mesh(ob, depsgraph, uv_name, origin)
+                mesh = read_mesh(ob, depsgraph, uv_name, origin)
                 if ob.name_full not in rendered:
                     raise ObjectError(f"object {ob.name!r} is not rendered: its collection is excluded or hidden")
-                meshes[ob.name] = _saved(*found, folder, number)
+                meshes[ob.name] = _saved(*mesh, folder, number)
             except ObjectError as error:
                 problems[ob.name] = str(error)
         bare = objects_without_material([rendered[ob.name_full] for ob in objects if ob.name in meshes])
@@ -536,12 +538,12 @@ def _saved(mesh, uv_name, uv_maps, folder, number) -> ReadMesh:
 
 def _lobes(objects, emitting) -> dict[str, MaterialLobes]:
     """The lobes of the materials of `objects`, by full name of the material."""
-    found = {}
+    lobes = {}
     for material in (slot.material for ob in objects for slot in ob.material_slots):
-        if material.name_full not in found:
+        if material.name_full not in lobes:
             ensure_nodes(material)
-            found[material.name_full] = lobes_of(material, material.name_full in emitting)
-    return found
+            lobes[material.name_full] = lobes_of(material, material.name_full in emitting)
+    return lobes
 
 
 def extract_bake(job: BakeJob, folder: Path, progress) -> dict:
@@ -635,14 +637,14 @@ def scene_facts(job: BakeFactsJob, folder: Path, progress) -> dict:
     pixels.open_scene(Path(job.scene), [], job.scripts)
     scene, facts, tiles = bpy.context.scene, [], {}
     view_layer = render_settings.choose_view_layer(scene, [])
-    own = scene.frame_current
+    saved_frame = scene.frame_current
     for frame in job.frames:
-        render_settings.go_to_frame(scene, own if frame is None else frame)
+        render_settings.go_to_frame(scene, saved_frame if frame is None else frame)
         chosen = [] if job.objects is None else chosen_objects(scene, view_layer, job.objects)
         name = scene.camera.name if scene.camera is not None else None
         for ob in chosen:
             if ob.name not in tiles:
                 tiles[ob.name] = tiles_without_modifiers(ob, job.uv)
-        found = {"frame": scene.frame_current, "camera": name, "objects": [ob.name for ob in chosen]}
-        facts.append({**found, "tiles": {ob.name: tiles[ob.name] for ob in chosen if len(tiles[ob.name]) > 1}})
+        record = {"frame": scene.frame_current, "camera": name, "objects": [ob.name for ob in chosen]}
+        facts.append({**record, "tiles": {ob.name: tiles[ob.name] for ob in chosen if len(tiles[ob.name]) > 1}})
     return {"facts": facts}

@@ -28,7 +28,7 @@ FIRST, CHUNK_SECONDS, MOST_CHUNKS = 16, 6.0, 6
 PROBE, MOST_FILES, SPENT, FILE_SECONDS = 2, 4, 0.97, 3.0
 # PASSES: what a finished picture takes its parts from, and artists put together. GUIDES: what the denoiser needs.
 LIGHT_PASSES = tuple(
-    f"{kind}_{part}" for kind in ("diffuse", "glossy", "transmission") for part in ("direct", "indirect", "color")
+    f"{kind}_{factor}" for kind in ("diffuse", "glossy", "transmission") for factor in ("direct", "indirect", "color")
 )
 PASSES = (*LIGHT_PASSES, "emit", "environment")
 GUIDES = ("Denoising Albedo", "Denoising Normal")
@@ -93,16 +93,16 @@ def _reasons_for_cycles(scene, layer) -> list[str]:
     world = layer.world_override or scene.world
     outputs = [] if world is None or tree_in_use(world) is None else tree_in_use(world).nodes
     rendered = [ob for ob in scene.objects if not ob.hide_render]
-    found = {
+    reasons = {
         "motion blur": scene.render.use_motion_blur,
         "the volume of the world": any(
             node.bl_idname == "ShaderNodeOutputWorld" and node.inputs["Volume"].is_linked for node in outputs
         ),
     }
     for ob in rendered:
-        found[f"volume {ob.name!r}"] = ob.type == "VOLUME"
-        found[f"shadow catcher {ob.name!r}"] = ob.type in SURFACE_TYPES and ob.is_shadow_catcher
-    return [reason for reason, is_there in found.items() if is_there]
+        reasons[f"volume {ob.name!r}"] = ob.type == "VOLUME"
+        reasons[f"shadow catcher {ob.name!r}"] = ob.type in SURFACE_TYPES and ob.is_shadow_catcher
+    return [reason for reason, is_there in reasons.items() if is_there]
 
 
 def _prepare(scene, layer, warnings: list[str]) -> None:
@@ -162,8 +162,8 @@ def _render_chunks(scene, layer, folder: Path, samples, end, progress) -> tuple[
         if end is not None:
             # The first file takes longer, since Cycles looks at the scene, so only the second one tells what a sample
             # takes.
-            left = int((end - time.process_time() - of_file) / each)
-            chunk = left if len(files) > 1 else min(left, 4 * PROBE)
+            affordable = int((end - time.process_time() - of_file) / each)
+            chunk = affordable if len(files) > 1 else min(affordable, 4 * PROBE)
             if chunk < 1 + done // 10 or len(files) == MOST_FILES:
                 break
         else:

@@ -135,9 +135,9 @@ class _Collector:
 
     def _look_for_twins(self, number, matrix, ob):
         """Add a note if an equal mesh is already in the same place."""
-        mesh, own = self._meshes[number], (number, ob.original.name)
-        first = self._there.setdefault((len(mesh.vertices), len(mesh.triangles), matrix.tobytes()), own)
-        if first is not own and _is_same(mesh, self._meshes[first[0]]):
+        mesh, mesh_and_name = self._meshes[number], (number, ob.original.name)
+        first = self._there.setdefault((len(mesh.vertices), len(mesh.triangles), matrix.tobytes()), mesh_and_name)
+        if first is not mesh_and_name and _is_same(mesh, self._meshes[first[0]]):
             self._note(f"in the same place as {first[1]!r}: Cycles is black there, here both are lit", ob)
 
     # Surfaces:
@@ -312,11 +312,11 @@ def _share_at(socket, groups: tuple = ()) -> Value | Curved | None:
         return combined(constant(1.0), limited(curved_at(node.inputs["Alpha"], groups)), 1.0, -1.0)
     if node.bl_idname not in (MIX, ADD):
         return constant(0.0)
-    parts = [_share_at(socket, groups) for socket in node.inputs if socket.type == "SHADER"]
+    inputs = [_share_at(socket, groups) for socket in node.inputs if socket.type == "SHADER"]
     if node.bl_idname == ADD:
-        return combined(*parts, 1.0, 1.0)
-    if all(_is_constant(part) and not part.offset.any() for part in parts):
-        return parts[0]  # whatever the factor is
+        return combined(*inputs, 1.0, 1.0)
+    if all(_is_constant(value) and not value.offset.any() for value in inputs):
+        return inputs[0]  # whatever the factor is
     factor = _factor_at(node.inputs[0], groups)
     if factor is None:
         return None
@@ -324,13 +324,13 @@ def _share_at(socket, groups: tuple = ()) -> Value | Curved | None:
         share = float(factor.offset[0])
         # The other shader does not contribute and may be unknown.
         if share in (0.0, 1.0):
-            return parts[int(share)]
-        return combined(*parts, 1.0 - share, share)
-    first, second = parts
+            return inputs[int(share)]
+        return combined(*inputs, 1.0 - share, share)
+    first, second = inputs
     if not (_is_constant(first) and _is_constant(second)):
         return None
     if isinstance(factor, Curved):
-        begin, end = (float(part.offset.mean()) for part in parts)
+        begin, end = (float(value.offset.mean()) for value in inputs)
         return factor.mapped(end - begin, begin)
     return combined(first, product(factor, constant(second.offset - first.offset)), 1.0, 1.0)
 
@@ -415,8 +415,8 @@ def _split(ob, clear: list, image_of) -> list[OccluderMesh]:
                 return np.zeros((count, 3, 2), np.float32)
             return read_values(layer.uv, "vector", (len(mesh.loops), 2), np.float32)[loops]
 
-        found = []
-        blocking = np.array([part is None for part in clear])
+        meshes = []
+        blocking = np.array([transparency is None for transparency in clear])
         for slot in [None, *(np.flatnonzero(~blocking))]:
             here = blocking[slots] if slot is None else slots == slot
             if not here.any():
@@ -426,18 +426,18 @@ def _split(ob, clear: list, image_of) -> list[OccluderMesh]:
                 transparency = clear[slot].transparency(lambda name, here=here: uv_of(name)[here], image_of)
                 if transparency.share == 1.0 and transparency.image is None:
                     continue
-            found.append(_part(vertices, triangles, normals, here, transparency))
-        return found
+            meshes.append(_part(vertices, triangles, normals, here, transparency))
+        return meshes
     finally:
         ob.to_mesh_clear()
 
 
 def _doubled(meshes: list[OccluderMesh]) -> float:
     """The share of the triangles that coincide with others and face the same way."""
-    parts = [mesh.vertices[mesh.triangles].astype(np.float64) for mesh in meshes]
-    if not parts:
+    triangles = [mesh.vertices[mesh.triangles].astype(np.float64) for mesh in meshes]
+    if not triangles:
         return 0.0
-    corners = np.concatenate(parts)
+    corners = np.concatenate(triangles)
     # A sum of single precision numbers is exact in double precision, so the order of the corners does not matter.
     x, y, z = corners.sum(axis=1).T
     key = x + math.pi * y + math.e * z
@@ -446,8 +446,8 @@ def _doubled(meshes: list[OccluderMesh]) -> float:
     same = key[one] == key[other]
     first, second = (np.sort(corners[index[same]].view("f8,f8,f8"), axis=1) for index in (one, other))
     sides = (corners[index[same], 1:] - corners[index[same], :1] for index in (one, other))
-    own, its = (np.cross(side[:, 0], side[:, 1]) for side in sides)
-    doubled = (first == second).all(axis=(1, 2)) & ((own * its).sum(axis=1) > 0.0)
+    normal, other_normal = (np.cross(side[:, 0], side[:, 1]) for side in sides)
+    doubled = (first == second).all(axis=(1, 2)) & ((normal * other_normal).sum(axis=1) > 0.0)
     touched = np.zeros(len(corners), bool)
     touched[one[same][doubled]] = touched[other[same][doubled]] = True
     return float(touched.mean()) if len(touched) else 0.0

@@ -29,14 +29,14 @@ def move_to_origin(scene, eye: np.ndarray, warnings: list[str]) -> np.ndarray:
     nowhere = np.zeros(3)
     if not any(np.abs(_corners(ob)).max() > FAR for ob in scene.objects):
         return nowhere
-    places = with_render_depsgraph(scene, _places)
-    lights = [place[:3, 3] for (_, kind), place in places if kind == "LIGHT"] or [eye]
+    matrices = with_render_depsgraph(scene, _places)
+    lights = [matrix[:3, 3] for (_, kind), matrix in matrices if kind == "LIGHT"] or [eye]
     origin = new_origin(np.array(lights), eye)
     if not origin.any():
         return nowhere
     apart = float(np.spacing(np.float32(np.abs(origin).max())))
     where = f"what is seen, or its nearest light, is {np.linalg.norm(origin):.3g} m from the origin"
-    lost = _moved(scene, origin, places)
+    lost = _moved(scene, origin, matrices)
     if lost:
         warnings.append(
             f"{where}: positions there are {1000.0 * apart:.2g} mm apart, which changes light from 1 m away by some "
@@ -79,15 +79,15 @@ def middle_of(ob) -> np.ndarray:
 
 def _places(depsgraph) -> list[tuple]:
     """((name, type), matrix (4, 4)) of the camera and of all that is rendered except suns, in a fixed order."""
-    found = []
+    matrices = []
     for instance in depsgraph.object_instances:
         ob = instance.object
         if ob.type in ("LIGHT", *SURFACE_TYPES) and (ob.type != "LIGHT" or ob.data.type != "SUN"):
-            found.append(((ob.original.name, ob.type), np.array(instance.matrix_world, dtype=np.float64)))
+            matrices.append(((ob.original.name, ob.type), np.array(instance.matrix_world, dtype=np.float64)))
     camera = depsgraph.scene_eval.camera
     if camera is not None:
-        found.append(((camera.original.name, "CAMERA"), np.array(camera.matrix_world, dtype=np.float64)))
-    return found
+        matrices.append(((camera.original.name, "CAMERA"), np.array(camera.matrix_world, dtype=np.float64)))
+    return matrices
 
 
 def _moved(scene, origin: np.ndarray, places) -> list[str]:
@@ -111,10 +111,10 @@ def _moved(scene, origin: np.ndarray, places) -> list[str]:
     if not lost:
         _keep_texture_space(origin)
         return []
-    for ob, own in before.items():
-        ob.delta_location = own
-    for collection, own in offsets.items():
-        collection.instance_offset = own
+    for ob, local in before.items():
+        ob.delta_location = local
+    for collection, local in offsets.items():
+        collection.instance_offset = local
     bpy.context.view_layer.update()
     return lost
 

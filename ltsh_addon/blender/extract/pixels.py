@@ -86,15 +86,15 @@ START_SECONDS, LOOKS, POINT_SECONDS, LIGHT_SHARE = 0.5, 3, 6e-6, 0.125
 POINTS_SHARE, DIRECT_SHARE, MOST_LIGHTS = 0.25, 0.5, 100
 
 
-def affordable_points(left: float, pixels: int, lights: int, looked: float = 0.0) -> int:
+def affordable_points(seconds: float, pixels: int, lights: int, looked: float = 0.0) -> int:
     """How many points of each pixel processor seconds that are `left` allow; 0: too few would remain for Cycles.
 
     Each further look at the scene is expected to take as long as the first, `looked` seconds.
     """
     each = POINT_SECONDS * pixels * (1.0 + LIGHT_SHARE * min(lights, MOST_LIGHTS))
-    if DIRECT_SHARE * left < START_SECONDS + LOOKS * looked + each:
+    if DIRECT_SHARE * seconds < START_SECONDS + LOOKS * looked + each:
         return 0
-    return max(int(POINTS_SHARE * (left - LOOKS * looked) / each), 1)
+    return max(int(POINTS_SHARE * (seconds - LOOKS * looked) / each), 1)
 
 
 # REST_PASSES: passes of Cycles with the parts of the picture that are not reflected light.
@@ -269,8 +269,8 @@ def add_world(inventory: LightInventory, scene, world) -> None:
 
 def no_light(scene, reasons: list[str]) -> SceneError:
     """The error for a scene in which no light can be shaded; it names the first of the `reasons`."""
-    found = [f"{ob.name!r} ({ob.data.type})" for ob in scene.objects if ob.type == "LIGHT"]
-    text = f"found lights {listed(found, NAMED)}" if found else "found no lights at all"
+    lights = [f"{ob.name!r} ({ob.data.type})" for ob in scene.objects if ob.type == "LIGHT"]
+    text = f"found lights {listed(lights, NAMED)}" if lights else "found no lights at all"
     if reasons:
         text += f" ({listed((line.partition('; left out')[0] for line in reasons), NAMED, '; ')})"
     return SceneError(f"scene {scene.name!r}: no light that renders, {text}; add a light")

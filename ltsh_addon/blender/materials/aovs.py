@@ -20,8 +20,8 @@ from .graph import (
     CLEAR,
     MIX,
     Factor,
-    Leaf,
     SurfaceShaders,
+    WeightedShader,
     carry_into_group,
     carry_out_of_group,
     computed,
@@ -56,7 +56,7 @@ RECEIVER_PROPERTY = "ltsh_receiver"
 class MaterialLobes:
     """The lobes of one material: the leaves that have one, the values of each, and the differences from Cycles."""
 
-    leaves: tuple[Leaf, ...]
+    leaves: tuple[WeightedShader, ...]
     values: tuple[dict, ...]  # per leaf those of `bsdfs.lobe_values`, and the weight unless that is 1
     warnings: tuple[str, ...]
     is_transparent: bool = False  # rays pass through it and meet the next surface
@@ -64,7 +64,7 @@ class MaterialLobes:
     # Of each input that was changed: its socket, the socket or number that was there, and the number that makes the
     # surface opaque.
     made_opaque: tuple[tuple, ...] = ()
-    kept: frozenset[str] = NEITHER  # passes in which direct light is not as in Cycles
+    left_to_cycles: frozenset[str] = NEITHER  # passes in which direct light is not as in Cycles
     has_volume: bool = False
     is_displaced: bool = False  # its faces are displaced, but their shadows are not
 
@@ -80,11 +80,11 @@ class CyclesReasons:
         """Add what the `lobes` of `material` leave to Cycles."""
         if lobes.has_volume:
             self.everything.append(f"the volume of material {material.name!r}")
-        if lobes.kept:
+        if lobes.left_to_cycles:
             reasons = ["its displacement is not in shadows"] * lobes.is_displaced
             reasons += [line.partition(": ")[2] for line in lobes.warnings]
             why = listed(reasons or [lobes.unshaded], 2, "; ")
-            self.materials.append(f"material {material.name!r} ({' and '.join(sorted(lobes.kept))}: {why})")
+            self.materials.append(f"material {material.name!r} ({' and '.join(sorted(lobes.left_to_cycles))}: {why})")
 
 
 def lobes_of(material, emitter: bool) -> MaterialLobes:
@@ -96,16 +96,16 @@ def lobes_of(material, emitter: bool) -> MaterialLobes:
     notes = notes_of_material(output, shaders, emitter)
     warnings = tuple(dict.fromkeys(f"material {material.name!r}: {note}" for note in notes))
     is_displaced = material.displacement_method != "BUMP" and live_link(output.inputs["Displacement"]) is not None
-    kept = BOTH if is_displaced else _kept_by_cycles(output, shaders)
+    left_to_cycles = BOTH if is_displaced else _passes_left_to_cycles(output, shaders)
     has_volume = live_link(output.inputs["Volume"]) is not None
     made_opaque = []
-    for found in shaders.cuts:
-        if found.node.bl_idname == MIX:
-            is_last = found.other == [socket for socket in found.node.inputs if socket.type == "SHADER"][-1]
-            made_opaque.append(_fixed(found.node.inputs[0], float(is_last)))
+    for cut_node in shaders.cuts:
+        if cut_node.node.bl_idname == MIX:
+            is_last = cut_node.other == [socket for socket in cut_node.node.inputs if socket.type == "SHADER"][-1]
+            made_opaque.append(_fixed(cut_node.node.inputs[0], float(is_last)))
         else:
-            made_opaque.append((found.clear, live_link(found.clear).from_socket, 1.0))
-            cut(found.clear)
+            made_opaque.append((cut_node.clear, live_link(cut_node.clear).from_socket, 1.0))
+            cut(cut_node.clear)
     is_clear = is_seen_through(output, shaders)
     cut(output.inputs["Volume"])
     if is_clear:
@@ -117,7 +117,9 @@ def lobes_of(material, emitter: bool) -> MaterialLobes:
         _show(surface, "ShaderNodeBsdfDiffuse", 0.0)
     if is_clear or (shaders.leaves and all(leaf.is_transparent for leaf in shaders.leaves)):
         unshaded = f"material {material.name!r} is transparent"
-        return MaterialLobes((), (), warnings, True, unshaded, tuple(made_opaque), kept, has_volume, is_displaced)
+        return MaterialLobes(
+            (), (), warnings, True, unshaded, tuple(made_opaque), left_to_cycles, has_volume, is_displaced
+        )
     for leaf in shaders.leaves:
         if has_alpha(leaf.node):
             made_opaque.append(_fixed(leaf.node.inputs["Alpha"], 1.0))
@@ -131,11 +133,11 @@ def lobes_of(material, emitter: bool) -> MaterialLobes:
     unshaded = ""
     if unknown and not leaves:
         unshaded = f"material {material.name!r} has no shader that is supported, found {listed(map(repr, unknown))}"
-    told = warnings, False, unshaded, tuple(made_opaque), kept, has_volume, is_displaced
+    told = warnings, False, unshaded, tuple(made_opaque), left_to_cycles, has_volume, is_displaced
     return MaterialLobes(tuple(leaves), values, *told)
 
 
-def _kept_by_cycles(output, shaders: SurfaceShaders) -> frozenset[str]:
+def _passes_left_to_cycles(output, shaders: SurfaceShaders) -> frozenset[str]:
     """The passes in which direct light on a material is not as in Cycles."""
     leaves = shaders.leaves
     if all(leaf.is_transparent for leaf in leaves):
@@ -195,8 +197,8 @@ def notes_of_material(output, shaders: SurfaceShaders, emitter: bool = False) ->
     elif not leaves:
         notes.append("it has no surface shader and is black, as in Cycles")
     notes += [f"node {node.name!r} {NOTED_NODES[node.bl_idname]}" for node in _noted_nodes(output.id_data)]
-    for found in shaders.cuts:
-        notes.append(f"transparency of node {found.node.name!r} is cut, the surface is shaded and rendered opaque")
+    for cut_node in shaders.cuts:
+        notes.append(f"transparency of node {cut_node.node.name!r} is cut, the surface is shaded and rendered opaque")
     if all(leaf.is_transparent for leaf in leaves):
         return notes + _tinted(leaves)
     if not emitter and any(is_emission(leaf.node) or emits(leaf.node) for leaf in leaves):
@@ -217,7 +219,7 @@ def _tinted(leaves) -> list[str]:
     return [f"node {node.name!r} is shaded as clear; its color is {LEFT_OUT}" for node in nodes]
 
 
-def shaded_leaves(shaders: SurfaceShaders) -> tuple[list[Leaf], list[Leaf]]:
+def shaded_leaves(shaders: SurfaceShaders) -> tuple[list[WeightedShader], list[WeightedShader]]:
     """The leaves with a lobe: the MAX_LOBES with the largest upper bounds on their weights, and the others."""
     leaves = [leaf for leaf in shaders.leaves if bsdf_of(leaf.node) is not None]
     order = sorted(range(len(leaves)), key=lambda index: -leaves[index].bound)
@@ -226,13 +228,13 @@ def shaded_leaves(shaders: SurfaceShaders) -> tuple[list[Leaf], list[Leaf]]:
 
 def _noted_nodes(tree) -> list:
     """Nodes in `tree` and its groups that are in NOTED_NODES and feed something."""
-    found = []
+    noted = []
     for node in tree.nodes:
         if is_group(node) and node.node_tree is not None:
-            found += _noted_nodes(node.node_tree)
+            noted += _noted_nodes(node.node_tree)
         elif node.bl_idname in NOTED_NODES and not node.mute:
-            found += [node] * any(socket.is_linked and socket.type != "SHADER" for socket in node.outputs)
-    return found
+            noted += [node] * any(socket.is_linked and socket.type != "SHADER" for socket in node.outputs)
+    return noted
 
 
 def _own_tree(group):
@@ -249,7 +251,7 @@ class _Weights:
         self._known: dict = {}
         self._shares: dict = {}
 
-    def of(self, leaf: Leaf):
+    def of(self, leaf: WeightedShader):
         """The weight of the lobes of `leaf`: a number, or a socket of its tree."""
         return functools.reduce(total, (self._product(term, leaf.groups) for term in leaf.lobe_terms))
 
@@ -282,17 +284,17 @@ def inject_aovs(
     emitters: frozenset[str] = frozenset(),
     unshaded: list[str] | None = None,
     made_opaque: list[tuple] | None = None,
-    kept: CyclesReasons | None = None,
+    reasons: CyclesReasons | None = None,
 ) -> list[str]:
     """Make every material write its lobes into AOVs; returns warnings.
 
     Only materials with a full name in `emitters` give light. A material that is not shaded at all writes -n as the
     kind of its first lobe, and the n-th entry of `unshaded` is the reason. `made_opaque` gets the entries that
-    `let_shadow_rays_through` takes, and `kept` gets what a finished picture leaves to Cycles.
+    `let_shadow_rays_through` takes, and `reasons` gets what a finished picture leaves to Cycles.
     """
     unshaded = [] if unshaded is None else unshaded
     made_opaque = [] if made_opaque is None else made_opaque
-    found, warnings = [], []
+    opaque, warnings = [], []
     for material in materials:
         ensure_nodes(material)
         emitter = material.name_full in emitters
@@ -301,19 +303,19 @@ def inject_aovs(
         lobes = lobes_of(material, emitter)
         warnings += lobes.warnings
         made_opaque += lobes.made_opaque
-        if kept is not None:
-            kept.note(material, lobes)
-            if lobes.kept:
-                _write_aov(material.node_tree, KEPT_AOV, sum(KEPT_BITS[name] for name in lobes.kept))
+        if reasons is not None:
+            reasons.note(material, lobes)
+            if lobes.left_to_cycles:
+                _write_aov(material.node_tree, KEPT_AOV, sum(KEPT_BITS[name] for name in lobes.left_to_cycles))
         if not lobes.is_transparent:
-            found.append(lobes)
+            opaque.append(lobes)
             _write_hit(material)
             if lobes.unshaded:
                 unshaded.append(lobes.unshaded)
                 _write_aov(material.node_tree, lobe_aov("kind", 0), -len(unshaded))
     # All materials must write the same AOVs for a slot.
-    for slot in range(max((len(lobes.leaves) for lobes in found), default=0)):
-        users = [lobes for lobes in found if len(lobes.leaves) > slot]
+    for slot in range(max((len(lobes.leaves) for lobes in opaque), default=0)):
+        users = [lobes for lobes in opaque if len(lobes.leaves) > slot]
         names = sorted({name for lobes in users for name in lobes.values[slot]})
         for lobes, name in itertools.product(users, names):
             neutral = LOBE_AOVS[name][1]
@@ -381,22 +383,22 @@ def materials_in_use(surfaces: list, override=None) -> list:
     """Original materials of the evaluated objects `surfaces`, each once; only `override` if it is given."""
     if override is not None:
         return [override.original]
-    found = {}
+    materials = {}
     for ob in surfaces:
         for slot in ob.material_slots:
             if slot.material is not None:
-                found[slot.material.original.name_full] = slot.material.original
-    return list(found.values())
+                materials[slot.material.original.name_full] = slot.material.original
+    return list(materials.values())
 
 
 def objects_without_material(surfaces: list) -> list:
     """Original objects of `surfaces` with no material slot or an empty one."""
-    found = {}
+    objects = {}
     for ob in surfaces:
         slots = ob.material_slots
         if len(slots) == 0 or any(slot.material is None for slot in slots):
-            found[ob.original.name_full] = ob.original
-    return list(found.values())
+            objects[ob.original.name_full] = ob.original
+    return list(objects.values())
 
 
 def give_default_material(objects: list):

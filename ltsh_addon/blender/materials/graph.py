@@ -1,7 +1,7 @@
 """Node trees: the walk from a surface to its BSDF nodes, the sources of sockets, and edits of trees.
 
-All readers of materials share this walk, which changes nothing: AOVs and bakes (`aovs`), the viewport (`looks`), the
-emission of lights, and the overview in the panels.
+All readers of materials share this walk, which changes nothing: AOVs and bakes (`aovs`), the viewport
+(`preview_material`), the emission of lights, and the overview in the panels.
 """
 
 from __future__ import annotations
@@ -60,9 +60,9 @@ def is_constant(value, expected) -> bool:
     """True if `value` (of `value_of`) is the constant `expected`: a number, or the first components of a tuple."""
     if is_socket(value):
         return False
-    found = value if isinstance(value, tuple) else (value,)
+    numbers = value if isinstance(value, tuple) else (value,)
     wanted = expected if isinstance(expected, tuple) else (expected,)
-    return all(abs(a - b) < 1e-6 for a, b in zip(found, wanted, strict=False))
+    return all(abs(a - b) < 1e-6 for a, b in zip(numbers, wanted, strict=False))
 
 
 def material_output(tree):
@@ -160,10 +160,10 @@ def source_behind(output, groups: tuple = (), tree_of: Callable = NODE_TREE) -> 
             groups = groups[:-1]
     else:
         return Source(output, node, groups)
-    found = None if entry is None else source_of(entry, groups, tree_of)
-    if found is None or node.bl_idname == "NodeReroute":
-        return found
-    return replace(found, passed=(*found.passed, entry.type, output.type))
+    source = None if entry is None else source_of(entry, groups, tree_of)
+    if source is None or node.bl_idname == "NodeReroute":
+        return source
+    return replace(source, passed=(*source.passed, entry.type, output.type))
 
 
 def constant_of(socket, groups: tuple = (), tree_of: Callable = NODE_TREE) -> float | None:
@@ -202,7 +202,7 @@ class Factor:
 
 
 @dataclass(frozen=True)
-class Leaf:
+class WeightedShader:
     """A shader node that is neither mix nor sum. Its weight is the sum over `terms` of the product of their factors."""
 
     source: Source
@@ -251,19 +251,19 @@ class Cut:
 class SurfaceShaders:
     """The shader nodes behind a socket, in the order of the links, and the transparency that is cut."""
 
-    leaves: list[Leaf] = field(default_factory=list)
+    leaves: list[WeightedShader] = field(default_factory=list)
     cuts: list[Cut] = field(default_factory=list)
     is_transparent: bool = False  # all of it is transparency
 
     def _add(self, other: SurfaceShaders, *factors: Factor) -> None:
-        places = {(leaf.node, leaf.groups): place for place, leaf in enumerate(self.leaves)}
+        positions = {(leaf.node, leaf.groups): position for position, leaf in enumerate(self.leaves)}
         for leaf in other.leaves:
             terms = tuple((*factors, *term) for term in leaf.terms)
-            place = places.get((leaf.node, leaf.groups))
-            if place is None:
-                self.leaves.append(Leaf(leaf.source, terms))
+            position = positions.get((leaf.node, leaf.groups))
+            if position is None:
+                self.leaves.append(WeightedShader(leaf.source, terms))
             else:
-                self.leaves[place] = Leaf(leaf.source, self.leaves[place].terms + terms)
+                self.leaves[position] = WeightedShader(leaf.source, self.leaves[position].terms + terms)
         self.cuts += [cut for cut in other.cuts if cut not in self.cuts]
 
 
@@ -279,7 +279,7 @@ def shaders_behind(socket, groups: tuple = (), tree_of: Callable = NODE_TREE) ->
         return SurfaceShaders()
     node, groups = source.node, source.groups
     if node.bl_idname not in (MIX, ADD):
-        leaf = Leaf(source, ((),))
+        leaf = WeightedShader(source, ((),))
         return SurfaceShaders([leaf], is_transparent=leaf.is_transparent)
     sockets = [socket for socket in node.inputs if socket.type == "SHADER"]
     if node.bl_idname == MIX:
@@ -291,19 +291,19 @@ def shaders_behind(socket, groups: tuple = (), tree_of: Callable = NODE_TREE) ->
         sockets = [socket for socket in sockets if live_link(socket) is not None]
         if len(sockets) == 1:
             return shaders_behind(sockets[0], groups, tree_of)
-    parts = [shaders_behind(socket, groups, tree_of) for socket in sockets]
-    clear = [part.is_transparent for part in parts]
-    found = SurfaceShaders(is_transparent=bool(parts) and all(clear))
+    inputs = [shaders_behind(socket, groups, tree_of) for socket in sockets]
+    clear = [shaders.is_transparent for shaders in inputs]
+    joined = SurfaceShaders(is_transparent=bool(inputs) and all(clear))
     if any(clear) and not all(clear):
         first, second = sockets if clear[0] else reversed(sockets)
         if live_link(second) is not None:
-            found.cuts.append(Cut(node, first, second))
-    is_cut = bool(found.cuts)
-    for index, part in enumerate(parts):
+            joined.cuts.append(Cut(node, first, second))
+    is_cut = bool(joined.cuts)
+    for index, shaders in enumerate(inputs):
         factors = (Factor(node, groups, index == 0, is_cut),) if node.bl_idname == MIX else ()
-        if not (is_cut and part.is_transparent):
-            found._add(part, *factors)
-    return found
+        if not (is_cut and shaders.is_transparent):
+            joined._add(shaders, *factors)
+    return joined
 
 
 def is_seen_through(output, shaders: SurfaceShaders) -> bool:

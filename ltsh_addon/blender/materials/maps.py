@@ -45,26 +45,26 @@ class SavedImages:
 
 
 def plain_texture(output, groups, kind: str):
-    """(image texture node, how it is read, its part) if the `output` of a node shows a texture unchanged, else None.
+    """(image texture node, how it is read, its channel) if the `output` of a node shows a texture unchanged, else None.
 
     `groups` are those around the node (see `graph.Source`), `kind` is the type of the socket that shows it. How it is
-    read is a dictionary for `cycles.texels.BakeMaterial`. The part is "color", or a channel "0", "1" or "2".
+    read is a dictionary for `cycles.texels.BakeMaterial`. The channel is "color", "0", "1" or "2".
     """
-    found, part = source_behind(output, groups), "color"
-    if found is not None and not found.arrives_whole(kind):
+    source, channel = source_behind(output, groups), "color"
+    if source is not None and not source.arrives_whole(kind):
         return None
-    if _is_node(found, "ShaderNodeSeparateColor") and found.node.mode == "RGB":
-        part = str(list(found.node.outputs).index(found.socket))
-        found = found.input(0)
-        if found is not None and not found.arrives_whole("RGBA"):
+    if _is_node(source, "ShaderNodeSeparateColor") and source.node.mode == "RGB":
+        channel = str(list(source.node.outputs).index(source.socket))
+        source = source.input(0)
+        if source is not None and not source.arrives_whole("RGBA"):
             return None
-    if not _is_node(found, "ShaderNodeTexImage") or found.socket.name != "Color" or found.node.image is None:
+    if not _is_node(source, "ShaderNodeTexImage") or source.socket.name != "Color" or source.node.image is None:
         return None
-    node = found.node
-    uv, srgb = _uv_map(found), _known_encoding(node.image)
+    node = source.node
+    uv, srgb = _uv_map(source), _known_encoding(node.image)
     if uv is None or srgb is None or not _is_plain(node):
         return None
-    return node, {"uv": uv, "extension": node.extension, "interpolation": node.interpolation, "srgb": srgb}, part
+    return node, {"uv": uv, "extension": node.extension, "interpolation": node.interpolation, "srgb": srgb}, channel
 
 
 def _is_node(source, kind: str) -> bool:
@@ -73,17 +73,17 @@ def _is_node(source, kind: str) -> bool:
 
 def _uv_map(texture) -> str | None:
     """Name of the UV map at which an image texture is read, "" for the default one; None for other coordinates."""
-    found = texture.input("Vector")
-    if found is None or not found.arrives_whole("VECTOR"):
+    vector = texture.input("Vector")
+    if vector is None or not vector.arrives_whole("VECTOR"):
         return None
-    if found.node is None:
+    if vector.node is None:
         # The texture's own unlinked input means the default UV map; the unlinked input of a group is a constant.
-        return "" if found.socket == texture.node.inputs["Vector"] else None
-    if getattr(found.node, "from_instancer", False):
+        return "" if vector.socket == texture.node.inputs["Vector"] else None
+    if getattr(vector.node, "from_instancer", False):
         return None
-    if _is_node(found, "ShaderNodeUVMap"):
-        return found.node.uv_map
-    return "" if _is_node(found, "ShaderNodeTexCoord") and found.socket.name == "UV" else None
+    if _is_node(vector, "ShaderNodeUVMap"):
+        return vector.node.uv_map
+    return "" if _is_node(vector, "ShaderNodeTexCoord") and vector.socket.name == "UV" else None
 
 
 def _is_plain(node) -> bool:
@@ -174,19 +174,20 @@ class MaterialPlan:
     def _looked_up(self, name, socket, groups):
         """The record of a socket that shows an image unchanged, or None."""
         is_color = LOBE_AOVS[name][0] == "COLOR"
-        found = plain_texture(socket, groups, "RGBA" if is_color else "VALUE")
-        if found is None or found[1]["uv"] not in self._uv_names:
+        texture = plain_texture(socket, groups, "RGBA" if is_color else "VALUE")
+        if texture is None or texture[1]["uv"] not in self._uv_names:
             return None
-        node, place, part = found
-        if is_color and part != "color":
+        node, reading, channel = texture
+        if is_color and channel != "color":
             return None
         file = self._images.file_of(node.image)
         if file is None:
             return None
-        record = {"file": file, **place}
+        record = {"file": file, **reading}
         if record not in self.textures:
             self.textures.append(record)
-        return {"texture": self.textures.index(record), "part": "gray" if part == "color" and not is_color else part}
+        channel = "gray" if channel == "color" and not is_color else channel
+        return {"texture": self.textures.index(record), "part": channel}
 
     def prepare(self, uv_name: str) -> None:
         """Add the nodes that `show` and `target` need; `uv_name` is the UV map that UV_MAP shows."""

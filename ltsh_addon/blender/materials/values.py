@@ -161,19 +161,19 @@ def product(first, second) -> Value | Curved | None:
 
 def value_at(socket, groups: tuple = ()) -> Value | None:
     """The value at the input `socket` inside `groups`, converted to a number for a number socket; None: unknown."""
-    found = _found_at(socket, groups)
-    return found if isinstance(found, Value) else None
+    value = _any_value_at(socket, groups)
+    return value if isinstance(value, Value) else None
 
 
 def curved_at(socket, groups: tuple = ()) -> Value | Curved | None:
     """As `value_at` for a number socket, but also through limits, a threshold or a color ramp, which apply after the
     image is interpolated."""
-    found, source = _found_at(socket, groups), source_of(socket, groups)
+    value, source = _any_value_at(socket, groups), source_of(socket, groups)
     is_ramp = source is not None and source.node is not None and source.node.bl_idname == "ShaderNodeValToRGB"
-    return _curved_ramp(source) if found is None and is_ramp and set(source.passed) <= {"VALUE"} else found
+    return _curved_ramp(source) if value is None and is_ramp and set(source.passed) <= {"VALUE"} else value
 
 
-def _found_at(socket, groups: tuple) -> Value | Curved | None:
+def _any_value_at(socket, groups: tuple) -> Value | Curved | None:
     source = source_of(socket, groups)
     if source is None:
         return None
@@ -215,18 +215,18 @@ def _curved_ramp(source: Source) -> Curved | None:
     value, ramp = input_value(source, 0), source.node.color_ramp
     if value is None:
         return None
-    places = np.arange(RAMP_STEPS + 1, dtype=np.float32) / np.float32(RAMP_STEPS)
-    colors = np.array([ramp.evaluate(float(place)) for place in places])
+    positions = np.arange(RAMP_STEPS + 1, dtype=np.float32) / np.float32(RAMP_STEPS)
+    colors = np.array([ramp.evaluate(float(position)) for position in positions])
     numbers = colors[:, 3] if source.socket.name == "Alpha" else colors[:, :3] @ GRAY
     steps = np.diff(numbers)
     if not ((steps >= 0.0).all() or (steps <= 0.0).all()):
         return None
     if ramp.interpolation == "CONSTANT":
         # Between two entries Cycles takes the lower one.
-        below = np.nextafter(places[1:], np.float32(0.0))
-        places = np.append(places[0], np.stack([below, places[1:]], axis=1))
+        below = np.nextafter(positions[1:], np.float32(0.0))
+        positions = np.append(positions[0], np.stack([below, positions[1:]], axis=1))
         numbers = np.append(numbers[0], np.stack([numbers[:-1], numbers[1:]], axis=1))
-    return Curved(value, tuple(places.tolist()), tuple(numbers.tolist()))
+    return Curved(value, tuple(positions.tolist()), tuple(numbers.tolist()))
 
 
 def _own_value(source: Source) -> Value:
@@ -239,10 +239,10 @@ def _image(source: Source) -> Value | None:
         return None
     if node.interpolation not in INTERPOLATIONS or node.extension not in EXTENSIONS or not has_plain_mapping(node):
         return None
-    place = coordinates(source.input("Vector"))
-    if place is None:
+    uv_and_mapping = coordinates(source.input("Vector"))
+    if uv_and_mapping is None:
         return None
-    uv_map, mapping = place
+    uv_map, mapping = uv_and_mapping
     is_straight = node.image.alpha_mode == "STRAIGHT" and not node.image.colorspace_settings.is_data
     by_alpha = is_straight and not node.outputs["Alpha"].is_linked
     use = ImageUse(node.image, uv_map, mapping, node.interpolation == "Closest", node.extension, by_alpha)
@@ -294,10 +294,10 @@ def _mapping(kind: str, location, rotation, scale, inner):
     """The affine map (2, 3) `inner` followed by that of a Mapping node that stays in the plane."""
     cosine, sine = math.cos(rotation[2]), math.sin(rotation[2])
     turned = [[cosine * scale[0], -sine * scale[1]], [sine * scale[0], cosine * scale[1]]]
-    own = np.vstack([np.column_stack([turned, location[:2]]), [0.0, 0.0, 1.0]])
+    mapping = np.vstack([np.column_stack([turned, location[:2]]), [0.0, 0.0, 1.0]])
     if kind == "TEXTURE":
-        own = np.linalg.pinv(own)
-    whole = own @ np.vstack([inner, [0.0, 0.0, 1.0]])
+        mapping = np.linalg.pinv(mapping)
+    whole = mapping @ np.vstack([inner, [0.0, 0.0, 1.0]])
     return tuple(tuple(float(number) for number in row) for row in whole[:2])
 
 
@@ -314,8 +314,8 @@ def _separate(source: Source) -> Value | None:
 def _combine(source: Source) -> Value | None:
     if getattr(source.node, "mode", "RGB") != "RGB":
         return None
-    parts = constant_inputs(source, 0, 1, 2)
-    return None if parts is None else constant([part[0] for part in parts])
+    components = constant_inputs(source, 0, 1, 2)
+    return None if components is None else constant([component[0] for component in components])
 
 
 def _to_number(source: Source) -> Value | None:
@@ -385,7 +385,7 @@ def _mix(source: Source) -> Value | Curved | None:
     node = source.node
     is_number = node.bl_idname == "ShaderNodeMix" and node.data_type == "FLOAT"
     if is_number:
-        first, second = (curved_at(node.inputs[place], source.groups) for place in (2, 3))
+        first, second = (curved_at(node.inputs[number], source.groups) for number in (2, 3))
     elif node.bl_idname == "ShaderNodeMixRGB":
         first, second = input_value(source, 1), input_value(source, 2)
     elif node.data_type == "RGBA":
@@ -437,12 +437,12 @@ def _ramp(source: Source) -> Value | None:
     factor, ramp = constant_inputs(source, 0), source.node.color_ramp
     if factor is None:
         return None
-    place = min(max(float(factor[0][0]), 0.0), 1.0)
-    color = np.array(ramp.evaluate(place))
+    position = min(max(float(factor[0][0]), 0.0), 1.0)
+    color = np.array(ramp.evaluate(position))
     if bpy.app.version < (5, 0, 0):
         # Later versions do not take constants from the table.
-        entry = int(RAMP_STEPS * place)
-        share = 0.0 if ramp.interpolation == "CONSTANT" else RAMP_STEPS * place - entry
+        entry = int(RAMP_STEPS * position)
+        share = 0.0 if ramp.interpolation == "CONSTANT" else RAMP_STEPS * position - entry
         color, after = (np.array(ramp.evaluate(min(number / RAMP_STEPS, 1.0))) for number in (entry, entry + 1))
         color = (1.0 - share) * color + share * after
     return constant(color[3]) if source.socket.name == "Alpha" else constant(color)

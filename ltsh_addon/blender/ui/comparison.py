@@ -9,8 +9,8 @@ import bpy
 import numpy as np
 
 from ...imaging.color import LUMINANCE_WEIGHTS, color_bar, signed_error_colors
-from ...pipeline.lighting import RelightData
 from ...pipeline.mixer import LightPictures
+from ...pipeline.relight import RelightData
 from ...scene import error_line
 from . import results
 from .overlay import LINE, PAPER, ROW, draw_gradient, draw_label, draw_rectangle, draw_text, label_places, text_width

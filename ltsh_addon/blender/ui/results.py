@@ -14,10 +14,9 @@ import numpy as np
 
 from ...imaging.report import index_stamp, read_index
 from ...pipeline.display_layers import FILES
-from ...pipeline.lighting import RELIGHT_SUFFIX, RelightData
 from ...pipeline.mixer import MIXER_FILE, LightPictures, Mixer, MixerRow
 from ...pipeline.moved_lights import MovedLights
-from ...pipeline.relight import tint
+from ...pipeline.relight import RELIGHT_SUFFIX, RelightData, tint
 from ...scene import AreaLight, SceneError, SurfaceSamples
 
 LAYER, SCENE = "ltsh_layer", "ltsh_scene"  # custom properties that mark our images

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import replace
 
 import gpu
@@ -18,8 +19,7 @@ class SurfaceLayer:
 
     def __init__(self, before: SurfaceLayer | None = None):
         self._surfaces = SurfacePass(None if before is None else before._surfaces)
-        self._horizons: HorizonPass | None = None
-        self._lobe_horizons: HorizonPass | None = None
+        self._horizons = defaultdict(HorizonPass)  # of the first lobes (False), which stay, and of further ones (True)
         self._gbuffer: GBufferTextures | None = None
         self._first_lobe: GBufferTextures | None = None
         self.smooth_normal: gpu.types.GPUTexture | None = None  # of the lobe that is lit
@@ -38,9 +38,7 @@ class SurfaceLayer:
         Only bump-mapped and translucent looks need it.
         """
         self._first_lobe = None
-        if self._horizons is None and self._gbuffer.geometric_normal is not None:
-            self._horizons = HorizonPass()
-        self._first_lobe = self._with_horizons(self._gbuffer, self._horizons, mirror, view, lights)
+        self._first_lobe = self._with_horizons(self._gbuffer, False, mirror, view, lights)
 
     @property
     def size(self) -> tuple[int, int]:
@@ -58,14 +56,12 @@ class SurfaceLayer:
             self.smooth_normal = self._gbuffer.smooth_normal
             return self._first_lobe
         gbuffer = self._surfaces.draw_lobe(number, mirror.instances, view)
-        if self._lobe_horizons is None and gbuffer.geometric_normal is not None:
-            self._lobe_horizons = HorizonPass()
-        return self._with_horizons(gbuffer, self._lobe_horizons, mirror, view, lights)
+        return self._with_horizons(gbuffer, True, mirror, view, lights)
 
-    def _with_horizons(self, gbuffer, horizons, mirror, view: ViewCamera, lights) -> GBufferTextures:
+    def _with_horizons(self, gbuffer, is_further: bool, mirror, view: ViewCamera, lights) -> GBufferTextures:
         self.smooth_normal = gbuffer.smooth_normal
         if gbuffer.geometric_normal is None:
             return gbuffer
-        horizon = horizons.draw(gbuffer, lights, view.homogeneous_eye, self.threshold)
+        horizon = self._horizons[is_further].draw(gbuffer, lights, view.homogeneous_eye, self.threshold)
         smooth_normal = gbuffer.smooth_normal if has_bent_lobes(mirror.instances) else None
         return replace(gbuffer, geometric_normal=horizon, smooth_normal=smooth_normal)

@@ -21,7 +21,7 @@ from ..lights.linking import Receivers
 from ..lights.meshes import collect_mesh_lights, constant_mesh_lights
 from ..lights.textures import MOST_LOOKS, NodeEmission, NodeLight, ShownTextures, node_emission, with_pattern
 from ..materials.graph import source_of, surface_of, tree_in_use
-from ..materials.looks import look_of
+from ..materials.preview_material import preview_of
 from ..materials.values import product, value_at
 
 # FAR_AWAY: the eye where there is no camera, outside of all closed emissive meshes.
@@ -95,7 +95,7 @@ def _has_emission(ob) -> bool:
 
 
 def _emission(material) -> np.ndarray:
-    return np.zeros(3) if material is None else look_of(material.original).emission
+    return np.zeros(3) if material is None else preview_of(material.original).emission
 
 
 def _mesh_lights(depsgraph, receivers: Receivers, notes: list[str]) -> list[AreaLight]:

@@ -23,7 +23,7 @@ from ..evaluated import (
 from ..lights.linking import Receivers
 from ..lights.textures import ShownTextures
 from ..lights.world import light_of_world
-from ..materials.looks import Look, look_of, world_radiance
+from ..materials.preview_material import PreviewMaterial, preview_of, world_radiance
 from .drawing import uniform_buffer
 from .lights import Patterns, no_patterns, view_lights
 from .meshes import MeshBatches, mesh_batches
@@ -45,7 +45,7 @@ HOLDOUT = -1
 class ShownLook:
     """A look on the graphics card."""
 
-    look: Look
+    look: PreviewMaterial
     uniforms: object  # its uniform buffer
     textures: dict | None = None  # by slot; made at the first draw
     further: tuple[ShownLook, ...] = ()  # the other lobes
@@ -297,7 +297,7 @@ class SceneMirror:
 
 
 def _shown_look(material) -> ShownLook:
-    look = look_of(None if material is None else material.original)
+    look = preview_of(None if material is None else material.original)
     further = tuple(ShownLook(lobe, uniform_buffer(look_values(lobe))) for lobe in look.further)
     return ShownLook(look, uniform_buffer(look_values(look)), further=further)
 

@@ -21,12 +21,12 @@ class ShownPicture:
 
     technique: str
     passes: str  # combined, specular or diffuse
-    mode: str  # of MODES
-    second_technique: str
-    split: float  # place of the line between 0 and 1
-    difference_scale: float
-    exposure: float
-    transparent: bool
+    mode: str = "single"  # of MODES
+    second_technique: str = ""
+    split: float = 0.5  # position of the line between 0 and 1
+    difference_scale: float = 1.0
+    exposure: float = 1.0
+    transparent: bool = False
     line_width: float = 1.0
     second_picture: gpu.types.GPUTexture | None = None  # replaces the second technique's picture; without emission
     white: float = 1.0  # brightness that shows no difference, before the scene's own exposure

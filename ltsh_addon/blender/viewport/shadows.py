@@ -403,16 +403,17 @@ class LiveShadows:
         return self._request_for(numbers, points, rays, view, level)
 
     def _begin_group(self, group: int, gbuffer: GBufferTextures, view: ViewCamera) -> None:
-        points = PixelGrid(1, gbuffer, view)
-        request = self._request_for(tuple(range(len(self._keys))), points, GROUP_RAYS, view, len(LEVELS))
-        self._start([replace(request, group=group)])
+        numbers, points = tuple(range(len(self._keys))), PixelGrid(1, gbuffer, view)
+        self._start([self._request_for(numbers, points, GROUP_RAYS, view, group=group)])
 
-    def _request_for(self, numbers: tuple, points: PixelGrid, rays: int, view: ViewCamera, level: int) -> ShadowRequest:
+    def _request_for(
+        self, numbers: tuple, points: PixelGrid, rays: int, view: ViewCamera, level: int = len(LEVELS), group: int = 0
+    ) -> ShadowRequest:
         """The request for the lights with these `numbers`."""
         return ShadowRequest(
             state=self._wanted,
             level=level,
-            group=0,
+            group=group,
             numbers=numbers,
             keys=tuple(self._keys[n] for n in numbers),
             lights=tuple(self._lights[n] for n in numbers),

@@ -16,7 +16,7 @@ from ...scene import SceneError, error_line, listed
 from .. import render_settings
 from ..extract.pixels import no_light, open_scene
 from ..lights.world import light_of_world
-from ..materials.looks import world_radiance
+from ..materials.preview_material import world_radiance
 from ..process.view import GRAPHICS, VIEW_PASSES, VIEW_PNG, ViewJob
 from ..render_settings import cycles_setting
 from .camera import ViewCamera
@@ -50,14 +50,13 @@ def draw_view(job: ViewJob, folder: Path, progress) -> dict:
     with bpy.context.temp_override(scene=scene, view_layer=_layer(scene)):
         patterns = patterns_of(scene, bpy.context.evaluated_depsgraph_get())
     progress(GRAPHICS, 0.0)
-    drawn = with_graphics(lambda: _draw(job, (scene, camera, sky, patterns), size, progress))
-    for number, pixels in enumerate(drawn["pictures"]):
+    pictures, notes, facts = with_graphics(lambda: _draw(job, (scene, camera, sky, patterns), size, progress))
+    for number, pixels in enumerate(pictures):
         technique, index = divmod(number, len(VIEW_PASSES))
         save_array(folder / f"{technique}_{VIEW_PASSES[index]}.npy", pixels)
-    render_settings.save_png(scene, drawn["pictures"][0], folder / VIEW_PNG)
+    render_settings.save_png(scene, pictures[0], folder / VIEW_PNG)
     return {
         "blender_version": bpy.app.version_string,
-        "graphics": drawn["graphics"],
         "frame": scene.frame_current,
         "camera": camera.name,
         "width": size[0],
@@ -66,10 +65,8 @@ def draw_view(job: ViewJob, folder: Path, progress) -> dict:
         "pixel_filter": render_settings.filter_name(scene),
         "exposure": cycles_setting(scene, "film_exposure"),
         "color_space": render_settings.working_space(),
-        "lights": drawn["lights"],
-        "warnings": [*warnings, *drawn["notes"]],
-        "redraws": drawn["seconds"],
-        "shadows": drawn["shadows"],
+        "warnings": [*warnings, *notes],
+        **facts,
         "seconds": time.monotonic() - started,
     }
 
@@ -169,8 +166,8 @@ def _layer(scene):
     return next((layer for layer in scene.view_layers if layer.use), scene.view_layers[0])
 
 
-def _draw(job: ViewJob, read: tuple, size: tuple[int, int], progress) -> dict:
-    """Pictures (H, W, 4), row 0 on top, of all techniques and passes, and the facts of the manifest about them."""
+def _draw(job: ViewJob, read: tuple, size: tuple[int, int], progress) -> tuple[list[np.ndarray], list[str], dict]:
+    """Pictures (H, W, 4), row 0 on top, of all techniques and passes, notes, and facts for the manifest."""
     progress("draw", 0.0)
     scene, camera, sky, patterns = read
     with bpy.context.temp_override(scene=scene, view_layer=_layer(scene)):
@@ -200,20 +197,21 @@ def _draw(job: ViewJob, read: tuple, size: tuple[int, int], progress) -> dict:
         raise SceneError(f"{error}; --shadows off draws the view without") from error
     finally:
         canvas.free()
-    return {
-        "pictures": pictures,
-        "seconds": seconds,
-        "shadows": None if shadows is None else _facts(shadows, len(points)),
-        "lights": sorted({light.name for light in (*mirror.lights, *mirror.sky.sides)}),
-        "notes": notes,
-        "graphics": f"{gpu.platform.renderer_get()}, {gpu.platform.backend_type_get()}",
-    }
-
-
-def _facts(shadows: ShadowRays, samples: int) -> dict:
-    """The facts of `pipeline.lighting.Shadows.report`, and the seconds."""
-    noise = shadows.noise(samples)
-    return {"rays": shadows.traced, "noise": noise, "tracer": shadows.description, "seconds": shadows.seconds}
+    traced = None
+    if shadows is not None:
+        # The facts of `pipeline.lighting.Shadows.report`, and the seconds.
+        traced = {"rays": shadows.traced, "noise": shadows.noise(len(points)), "tracer": shadows.description}
+        traced["seconds"] = shadows.seconds
+    return (
+        pictures,
+        notes,
+        {
+            "graphics": f"{gpu.platform.renderer_get()}, {gpu.platform.backend_type_get()}",
+            "lights": sorted({light.name for light in (*mirror.lights, *mirror.sky.sides)}),
+            "redraws": seconds,
+            "shadows": traced,
+        },
+    )
 
 
 def view_of_camera(camera, depsgraph, size: tuple[int, int]) -> ViewCamera:
@@ -225,16 +223,8 @@ def view_of_camera(camera, depsgraph, size: tuple[int, int]) -> ViewCamera:
 
 
 def _shown(scene, technique: str) -> ShownPicture:
-    return ShownPicture(
-        technique=technique,
-        passes="combined",
-        mode="single",
-        second_technique=technique,
-        split=0.5,
-        difference_scale=1.0,
-        exposure=cycles_setting(scene, "film_exposure"),
-        transparent=scene.render.film_transparent,
-    )
+    exposure, transparent = cycles_setting(scene, "film_exposure"), scene.render.film_transparent
+    return ShownPicture(technique, "combined", exposure=exposure, transparent=transparent)
 
 
 class _Canvas:

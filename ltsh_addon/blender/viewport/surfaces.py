@@ -8,7 +8,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ...shading.header import filled
-from ..materials.looks import IMAGE_SLOTS, is_missing
+from ..materials.preview_material import IMAGE_SLOTS, is_missing
 from .camera import ViewCamera
 from .drawing import PixelShader, drawing, float_table, float_texture, glsl, uniform_buffer
 from .gbuffer import GBufferTextures

@@ -6,7 +6,7 @@ import numpy as np
 
 from ...cycles import closures, horizons
 from ...cycles.lobes import LEAST_VELVET, LOBE_KINDS
-from ..materials.looks import COAT, IMAGE_SLOTS, REFRACTION, Look
+from ..materials.preview_material import COAT, IMAGE_SLOTS, REFRACTION, PreviewMaterial
 from ..materials.values import EXTENSIONS, Value
 
 # The layout of a look's uniform buffer in units of vec4: start and size of the slots, start of the terms of conductors,
@@ -37,7 +37,7 @@ DEFINES = {
 }
 
 
-def look_values(look: Look) -> np.ndarray:
+def look_values(look: PreviewMaterial) -> np.ndarray:
     """The uniform buffer (LOOK_SIZE, 4) of a look."""
     data = np.zeros((LOOK_SIZE, 4))
     flags = (look.normal is not None) + 2 * look.corrected

@@ -18,7 +18,7 @@ from ltsh_addon import shading
 from ltsh_addon.blender.engine import final_picture, redraws, view
 from ltsh_addon.blender.engine import render as render_module
 from ltsh_addon.blender.lights.textures import ShownTextures
-from ltsh_addon.blender.materials import looks
+from ltsh_addon.blender.materials import preview_material
 from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels
 from ltsh_addon.blender.render_settings import pass_names
 from ltsh_addon.blender.ui import results
@@ -458,6 +458,7 @@ def test_a_render_is_what_the_mixer_changes_until_results_are_shown(scene, monke
     assert results.mixer_of(scene) is None
 
 
+@pytest.mark.newest
 @pytest.mark.parametrize("complete", [False, True])
 def test_a_light_that_moved_since_a_render_is_shaded_where_it_is(scene, monkeypatch, complete):
     """As a render of the moved light; the others, and what is bounced, stay."""
@@ -530,7 +531,7 @@ def test_without_cycles_add_on_there_is_a_viewport_and_a_final_render(tmp_path):
         plane, _ = lit_scene()
         lights, notes = view_lights(bpy.context.evaluated_depsgraph_get(), lambda instance: True, ShownTextures())
         assert len(lights) == 1 and not notes
-        assert looks.look_of(plane.active_material).corrected
+        assert preview_material.preview_of(plane.active_material).corrected
         assert view._shown(scene, "single", None, 1.0).exposure == 1.0
         assert render(scene, tmp_path / "final.exr").max() > 0.01
     finally:

@@ -10,7 +10,7 @@ import pytest
 import scene_parts
 from material_scenes import Build
 
-from ltsh_addon.blender.materials.looks import look_of
+from ltsh_addon.blender.materials.preview_material import preview_of
 
 SIZE = (24, 16)
 
@@ -66,7 +66,7 @@ def test_what_does_nothing_is_seen_through(tmp_path, kind):
         made.link(made.shader("VolumePrincipled"), made.output.inputs["Volume"])
     else:
         made.show(make(made))
-    assert look_of(made.material).is_clear
+    assert preview_of(made.material).is_clear
     for layer in range(20):
         scene_parts.add_plane(made.material, size=8.0, location=(0.0, 0.0, 2.0 + 0.1 * layer))
     through, pixel_behind, found, reference = sampled(tmp_path)

@@ -28,7 +28,7 @@ def viewport_picture(camera, shown, is_parallel):
     try:
         mirror.sync(depsgraph)
         view = ViewCamera.of(camera.matrix_world.inverted(), projection, is_parallel)
-        settings = ShownPicture("ltsh4", shown, "single", "ltc", 0.5, 1.0, 1.0, True)
+        settings = ShownPicture("ltsh4", shown, transparent=True)
         renderer.draw(mirror, view, SIZE, settings, canvas.buffer)
         return renderer.read()[::-1, :, :3].astype(np.float64), mirror.notes
     finally:

@@ -12,7 +12,7 @@ from material_scenes import Build
 
 from ltsh_addon.blender.lights.emission import emission_of
 from ltsh_addon.blender.materials.aovs import inject_aovs
-from ltsh_addon.blender.materials.looks import COAT, look_of
+from ltsh_addon.blender.materials.preview_material import COAT, preview_of
 from ltsh_addon.blender.ui import preflight
 from ltsh_addon.cycles.lobes import LOBE_KINDS, MAX_LOBES, SMALLEST_WEIGHT
 
@@ -101,7 +101,7 @@ def lobes_of_aovs(material):
 def lobes_of_look(material):
     """Those of the viewport; a node that is not shaded has its viewport color, which is no lobe of it."""
     lobes = []
-    for lobe in look_of(material).lobes:
+    for lobe in preview_of(material).lobes:
         if lobe.kind != COAT and not lobe.is_stand_in:
             roughness = lobe.values["roughness"].offset[0] if "roughness" in lobe.values else 0.0
             lobes.append((lobe.kind, lobe.weight, lobe.value("color").offset[0], roughness))
@@ -302,7 +302,7 @@ def test_lights_and_the_viewport_see_the_same_emission_in_groups(kind):
     found = emission_of(build.material)
     assert found.emits and not (found.plain or found.varies or found.directional)
     # Transparency takes half of what shines and nothing of what is lit.
-    np.testing.assert_allclose(look_of(build.material).emission, np.array([1.0, 0.5, 0.5]) * 0.125, rtol=1e-6)
+    np.testing.assert_allclose(preview_of(build.material).emission, np.array([1.0, 0.5, 0.5]) * 0.125, rtol=1e-6)
 
 
 def test_no_reader_but_aovs_changes_a_material():
@@ -314,7 +314,7 @@ def test_no_reader_but_aovs_changes_a_material():
         return [[(node.name, len(node.inputs), len(node.outputs)) for node in tree.nodes] for tree in trees]
 
     before, count = state(), len(bpy.data.node_groups)
-    look_of(build.material)
+    preview_of(build.material)
     preflight._material(build.material)
     emission_of(build.material)
     assert state() == before and len(bpy.data.node_groups) == count
@@ -329,5 +329,5 @@ def test_views_name_what_they_do_not_show_of_a_material():
             tree.links.new(tree.nodes.new(kind).outputs[0], output.inputs[name])
         else:
             node.inputs[name].default_value = value
-        (note,) = look_of(material).notes
+        (note,) = preview_of(material).notes
         assert note.startswith(f"{name}: ") and name.lower() in note and "not shown" in note

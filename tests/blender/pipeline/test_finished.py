@@ -15,14 +15,14 @@ from ltsh_addon import imaging
 from ltsh_addon.blender import render_settings
 from ltsh_addon.blender.extract import pixels as pixels_module
 from ltsh_addon.blender.process.finished import FinishedJob, render_finished
-from ltsh_addon.blender.process.pixels import EDGE_SECONDS, TOO_THIN, PixelJob, extract_pixels, with_points
+from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels, with_points
 from ltsh_addon.cli import main
 from ltsh_addon.cycles.lobes import read_layer
-from ltsh_addon.pipeline import PictureOptions, RenderOptions, picture, render, shade_scene
-from ltsh_addon.pipeline.lighting import RelightData, ShadowTracer
+from ltsh_addon.pipeline import PictureOptions, RenderOptions, compositing, plan, render, shade_scene
+from ltsh_addon.pipeline.lighting import ShadowTracer, load_tables
 from ltsh_addon.pipeline.mixer import light_pictures
 from ltsh_addon.pipeline.moved_lights import MovedLights
-from ltsh_addon.pipeline.relight import LightChange, relight
+from ltsh_addon.pipeline.relight import LightChange, RelightData, relight
 from ltsh_addon.scene import PASSES, AreaLight, Film
 
 SIZE, BLOCK = 32, 8  # pixels
@@ -233,7 +233,9 @@ def test_ours_and_the_rest_are_the_whole_in_the_files_of_a_command(out, tmp_path
 
 @pytest.mark.newest
 def test_denoising_takes_the_noise_of_the_rest_and_leaves_its_mean(tmp_path, monkeypatch):
-    monkeypatch.setattr(render, "_beside", lambda *images: 1.0)  # at edges the rest holds direct light, too
+    monkeypatch.setattr(
+        compositing, "weight_at_edges", lambda *images: 1.0
+    )  # at edges the rest holds direct light, too
     floor_and_ball(gray(), 2)
     path = parts.save(tmp_path / "room.blend")
     rest = {
@@ -290,9 +292,9 @@ def test_hard_edges_of_diffuse_light_are_nearer_to_cycles_than_ours_or_its_own(t
     (tmp_path / "true").mkdir()
     true = read_layer(render_finished(job, tmp_path / "true").channels, "Combined", "RGB")
     off = {}
-    for name, weight in {"both": render._beside, "ours": lambda *images: np.ones((SIZE, SIZE)),
+    for name, weight in {"both": compositing.weight_at_edges, "ours": lambda *images: np.ones((SIZE, SIZE)),
                          "cycles": lambda *images: np.zeros((SIZE, SIZE))}.items():  # fmt: skip
-        monkeypatch.setattr(render, "_beside", weight)
+        monkeypatch.setattr(compositing, "weight_at_edges", weight)
         made = render.finish(RenderOptions(path, output=tmp_path, sub_samples=5, cycles_samples=8))
         off[name] = np.linalg.norm(made.combined[..., :3] - true)
         names = (made.cycles.names[key] for key in ("diffuse_light", "diffuse_color"))
@@ -314,12 +316,12 @@ def test_half_of_an_edge_is_left_to_cycles_but_not_of_what_is_smooth_or_noisy_th
     step, noise = np.where(x + 0.5 * y < 8.0, 1.0, 0.2)[..., None], np.random.default_rng(1).normal(size=(12, 12, 1))
     edge = np.s_[5:8, 3]
     weights = {
-        "edge": render._beside(step, step)[edge].max(),
-        "slope": render._beside(step * 0.0 + 0.1 * x[..., None], step)[2:-2, 2:-2].min(),
-        "noisy": render._beside(step, step + 3.0 * noise)[edge].min(),
+        "edge": compositing.weight_at_edges(step, step)[edge].max(),
+        "slope": compositing.weight_at_edges(step * 0.0 + 0.1 * x[..., None], step)[2:-2, 2:-2].min(),
+        "noisy": compositing.weight_at_edges(step, step + 3.0 * noise)[edge].min(),
     }
     assert weights["edge"] == 1.0  # nothing is between both
-    weights["edge"] = render._beside(step, step + 0.02 * noise)[edge].max()
+    weights["edge"] = compositing.weight_at_edges(step, step + 0.02 * noise)[edge].max()
     assert weights["edge"] == 0.5 and weights["slope"] == pytest.approx(1.0) and weights["noisy"] > 0.95, weights
 
 
@@ -468,52 +470,6 @@ def test_a_budget_chooses_points_rays_and_samples(tmp_path):
 
 
 @pytest.mark.newest
-@pytest.mark.parametrize(
-    ("each", "power", "looked", "points"),
-    [
-        (1e-5, 1.0, 0.1, 5),  # seconds of a sample: all of them
-        (1e-5, 1.0, 9.0, 2),  # no time for a second look
-        (1e-5, 1.0, 0.22, range(3, 5)),
-        (0.009, 0.7, 0.1, range(1, 5)),
-        (0.03, 1.0, 0.1, 0),
-        (1.0, 0.5, 0.1, 0),
-    ],
-)
-def test_direct_light_gets_no_more_points_than_a_part_of_it_says_there_is_time_for(
-    tmp_path, monkeypatch, each, power, looked, points
-):
-    floor_and_ball(gray(), 1)
-    options = PixelJob(parts.save(tmp_path / "room.blend"), sub_samples=2, for_finished=True, shadows="on")
-    look, thin, certain = extract_pixels(options), 0.1, 1.0
-
-    def seconds_of(self, part, share):
-        count = max(round(share * len(part.samples)), 1)
-        return count, each * count**power, thin, certain
-
-    monkeypatch.setattr(render._How, "_probe", seconds_of)
-    most = PictureOptions(options.scene, output=tmp_path, sub_samples=5)
-    how = render._How(RenderOptions(options.scene, output=tmp_path, budget=9.0), most, {}, None)
-    # Beside Cycles' look at the scene and what shines in sight.
-    of_edges = 1e-6 * EDGE_SECONDS * look.film.width * look.film.height
-    seconds = 3.0 + 0.5 * look.times.direct + of_edges
-    number, reason = how.affordable(look, seconds, looked)
-    assert number in (points if isinstance(points, range) else [points])
-    assert bool(reason) == (number == 0)
-    if number == 0:
-        assert "too small" in reason
-        return
-    samples = len(with_points(extract_pixels(replace(options, sub_samples=number)), number).samples)
-    # Each further point makes no more samples than the second one.
-    assert each * samples**power <= (render.MORE_SHARE if number > 2 else render.DIRECT_SHARE) * 3.0
-    assert how.affordable(look, 0.0, looked)[0] == 0 and how.affordable(look, None, looked) == (2, "")
-    # What is left to Cycles for its noise is worth no time, and with thin highlights Cycles does better with it.
-    certain = 0.01 if each > 1e-4 else 0.5
-    assert how.affordable(look, seconds, looked)[0] <= (number if each < 1e-4 else 0)
-    thin, certain = 2.0, 1.0
-    assert how.affordable(look, seconds, looked) == (0, TOO_THIN)
-
-
-@pytest.mark.newest
 def test_highlights_thinner_than_pixels_are_told_from_those_that_points_show(tmp_path):
     """Two points of each pixel on a smooth and on a crumpled floor, of facets of a third of a pixel."""
     thin = {}
@@ -533,11 +489,10 @@ def test_highlights_thinner_than_pixels_are_told_from_those_that_points_show(tmp
         job = PixelJob(path, sub_samples=2, for_finished=True, shadows="on")
         found = extract_pixels(job)
         own = PictureOptions(path, output=tmp_path, sub_samples=2, shadows="on")
-        options = RenderOptions(path, output=tmp_path, budget=9.0)
         with ShadowTracer(found.occluders, found.lights, found.origin) as tracer:
-            how = render._How(options, own, picture.load_tables(options.techniques), tracer)
-            _, _, thin[name], _ = how._probe(with_points(found, 2), 1.0)
-    assert thin["smooth"] < 0.5 * render.THIN and thin["crumpled"] > 1.5 * render.THIN
+            shader = render.DirectLightShader(own, 9.0, load_tables(("ltsh4",)), tracer)
+            thin[name] = shader.probe(with_points(found, 2), 1.0).contrast
+    assert thin["smooth"] < 0.5 * plan.THIN_CONTRAST and thin["crumpled"] > 1.5 * plan.THIN_CONTRAST
 
 
 def test_the_files_of_a_budget_share_no_noise(tmp_path):
@@ -628,7 +583,7 @@ def test_few_points_leave_to_cycles_what_its_samples_tell_better():
     noise = random.normal(size=(size, size))
     thin, variance = 10.0 * (random.random(len(film.pixel)) < 0.1), 100.0 * 0.1 * 0.9
     weight = {
-        samples: render._beside_points(film, thin, 1.0 + np.sqrt(variance / samples) * noise).mean()
+        samples: compositing.weight_of_points(film, thin, 1.0 + np.sqrt(variance / samples) * noise).mean()
         for samples in (1, 4, 64)
     }
     # By chance the points of 81 pixels differ less than they should.
@@ -637,11 +592,14 @@ def test_few_points_leave_to_cycles_what_its_samples_tell_better():
     kind = "BLACKMAN_HARRIS", 1.5
     shared = film.shared(render_settings.shared_points(*kind, points)[1], np.tile(range(points), size**2), noise < 9.0)
     own, fewer = (np.square(one.image(thin)[1:-1, 1:-1] - 1.0).mean() for one in (shared, film))
-    assert fewer / own == pytest.approx(render.SHARED, rel=0.1)
+    assert fewer / own == pytest.approx(compositing.SHARED_POINTS, rel=0.1)
     for samples in (4, 16):
         direct = 1.0 + np.sqrt(variance / samples) * noise
-        assert render._beside_points(shared, thin, direct).mean() > render._beside_points(film, thin, direct).mean()
+        assert (
+            compositing.weight_of_points(shared, thin, direct).mean()
+            > compositing.weight_of_points(film, thin, direct).mean()
+        )
     # Each point at the middle of a quarter of its pixel: their mean is the mean of the slope.
     corner = np.tile([0.25, 0.75, 0.25, 0.75], size * size)
     slope = film.pixel % size + corner
-    assert render._beside_points(film, slope, film.image(slope) + 0.05 * noise).min() > 0.95
+    assert compositing.weight_of_points(film, slope, film.image(slope) + 0.05 * noise).min() > 0.95

@@ -7,9 +7,8 @@ import scene_parts as parts
 
 from ltsh_addon import imaging
 from ltsh_addon.pipeline import PictureOptions, shade_scene
-from ltsh_addon.pipeline.lighting import RelightData
 from ltsh_addon.pipeline.mixer import Mixer, light_pictures
-from ltsh_addon.pipeline.relight import tint
+from ltsh_addon.pipeline.relight import RelightData, tint
 
 SIZE = 48, 32
 # Of single precision: in sums of five lights, and in files.

@@ -218,6 +218,7 @@ def picture_of(scene):
     return layers["ltsh4.specular"] + layers["ltsh4.diffuse"]
 
 
+@pytest.mark.newest
 def test_a_moved_light_is_shaded_where_it_is_and_the_others_stay(shaded):
     scene, fill = shaded
     before = picture_of(scene)
@@ -267,6 +268,7 @@ def go_on(monkeypatch):
     return event
 
 
+@pytest.mark.newest
 def test_a_moved_light_comes_as_a_draft_is_followed_and_taken_back(shaded, go_on):
     scene, fill = shaded
     scene.ltsh.mode = "MIX"

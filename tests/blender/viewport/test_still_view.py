@@ -70,7 +70,7 @@ def relative(picture, expected):
     return np.linalg.norm(picture - expected) / np.linalg.norm(expected)
 
 
-@pytest.mark.parametrize(("count", "most"), [(1, 0.01), (16, 0.02)])
+@pytest.mark.parametrize(("count", "most"), [pytest.param(1, 0.01, marks=pytest.mark.newest), (16, 0.02)])
 def test_a_view_is_the_picture_of_shade(capsys, tmp_path, count, most):
     with_graphics(lambda: None)
     set_up_scene()
@@ -225,7 +225,7 @@ def drawn_by_samples():
     mirror, canvas, points = SceneMirror(), Canvas(*SIZE), filter_points("BLACKMAN_HARRIS", 1.5, 3)
     mirror.sync(depsgraph)
     view = view_of_camera(camera, depsgraph, SIZE)
-    shown = ShownPicture("ltsh4", "combined", "single", "ltc", 0.5, 1.0, 1.0, False)
+    shown = ShownPicture("ltsh4", "combined")
     still, moved = ViewRenderer(), ViewRenderer()
     try:
         refined, alone, counts = [], [], []
@@ -273,7 +273,7 @@ class LiveView:
         """The picture (H, W, 3)."""
         self.live.follow((0,), self.occluders)
         self.renderer.shadows = shadows
-        shown = ShownPicture("ltsh4", self.passes, "single", "ltc", 0.5, 1.0, 1.0, True)
+        shown = ShownPicture("ltsh4", self.passes, transparent=True)
         self.renderer.draw(self.mirror, self.view, SIZE, shown, self.canvas.buffer, points)
         return self.renderer.read()[..., :3].astype(np.float64)
 

@@ -143,7 +143,7 @@ def drawn(camera):
     try:
         for technique in ("ltc", "ltsh2", "ltsh4", "ltsh4c"):
             for name in shading.PASSES:
-                shown = ShownPicture(technique, name, "single", "ltc", 0.5, 1.0, 1.0, True)
+                shown = ShownPicture(technique, name, transparent=True)
                 renderer.draw(mirror, view, SIZE, shown, canvas.buffer)
                 pictures[technique, name] = renderer.read().reshape(-1, 4)[:, :3].astype(np.float64)
         samples, pixel = samples_in(renderer._surfaces._gbuffer, view.eye)

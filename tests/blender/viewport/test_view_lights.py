@@ -171,6 +171,7 @@ def wait_for(lamps):
     assert news and not lamps.is_busy
 
 
+@pytest.mark.newest
 def test_windows_get_the_patterns_of_lights_from_a_second_blender(tmp_path):
     parts.empty_scene()
     (tmp_path / "beam.ies").write_text(BEAM)

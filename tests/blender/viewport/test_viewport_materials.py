@@ -30,8 +30,8 @@ from ltsh_addon.blender.engine.overlay import (
     wrapped,
 )
 from ltsh_addon.blender.lights.world import light_of_world
-from ltsh_addon.blender.materials import looks
-from ltsh_addon.blender.materials.looks import look_of
+from ltsh_addon.blender.materials import preview_material
+from ltsh_addon.blender.materials.preview_material import preview_of
 from ltsh_addon.blender.ui import panels
 from ltsh_addon.blender.viewport.camera import ViewCamera
 from ltsh_addon.blender.viewport.mirror import SceneMirror, ShownLook
@@ -299,10 +299,10 @@ def test_tangents_run_around_the_axes_of_turned_and_stretched_objects(tmp_path, 
 
 
 ONION = ("BsdfDiffuse", {})
-for number in range(looks.MOST_LOBES + 1):
+for number in range(preview_material.MOST_LOBES + 1):
     ONION = ("AddShader", {0: ONION, 1: gloss(0.1 * (number + 1))})
 NOT_BRUSHED = "its anisotropy is not resolved, it is shown without"
-TOO_MANY = f"of its {looks.MOST_LOBES + 2} lobes only {looks.MOST_LOBES} are shown"
+TOO_MANY = f"of its {preview_material.MOST_LOBES + 2} lobes only {preview_material.MOST_LOBES} are shown"
 
 
 @pytest.mark.parametrize(
@@ -311,7 +311,7 @@ TOO_MANY = f"of its {looks.MOST_LOBES + 2} lobes only {looks.MOST_LOBES} are sho
         (mixed(0.7), {"glossy": 0.7, "diffuse": 0.3}, []),
         (mixed(("TexNoise.Color", {})), {"glossy": 0.5, "diffuse": 0.5}, ["factor of 'Mix Shader' is not resolved"]),
         (("MixShader", {0: 0.2, 1: CLEAR, 2: CHALK}), {"diffuse": 1.0}, ["transparency is not shown"]),
-        (ONION, {"glossy": looks.MOST_LOBES - 1, "diffuse": 1}, [TOO_MANY]),
+        (ONION, {"glossy": preview_material.MOST_LOBES - 1, "diffuse": 1}, [TOO_MANY]),
         (("BsdfAnisotropic", {"Anisotropy": ("TexNoise", {})}), {"glossy": 1.0}, [NOT_BRUSHED]),
         (("BsdfAnisotropic", {"Anisotropy": 0.5, "Tangent": ("TexNoise", {})}), {"glossy": 1.0}, [NOT_BRUSHED]),
     ],
@@ -319,7 +319,7 @@ TOO_MANY = f"of its {looks.MOST_LOBES + 2} lobes only {looks.MOST_LOBES} are sho
 )
 def test_lobes_have_their_shares_and_what_is_not_shown_is_named(shader, lobes, notes):
     parts.empty_scene()
-    look = look_of(made("Material", *shader)())
+    look = preview_of(made("Material", *shader)())
     found = dict.fromkeys(lobes, 0.0)
     for lobe in look.lobes:
         found[lobe.kind] += lobe.weight
@@ -329,7 +329,7 @@ def test_lobes_have_their_shares_and_what_is_not_shown_is_named(shader, lobes, n
 @pytest.mark.parametrize(("emitter", "strength"), [("Emission", "Strength"), ("BsdfPrincipled", "Emission Strength")])
 def test_what_a_transparent_share_takes_from_emission_and_not_from_lobes(emitter, strength):
     parts.empty_scene()
-    look = look_of(made("Lamp shade", "MixShader", {0: 0.25, 1: CLEAR, 2: (emitter, {strength: 2.0})})())
+    look = preview_of(made("Lamp shade", "MixShader", {0: 0.25, 1: CLEAR, 2: (emitter, {strength: 2.0})})())
     np.testing.assert_allclose(look.emission, 0.5, rtol=1e-6)
     assert look.weight == 1.0
 
@@ -337,7 +337,7 @@ def test_what_a_transparent_share_takes_from_emission_and_not_from_lobes(emitter
 def test_what_is_not_resolved_has_the_viewport_color_or_its_default_and_is_named():
     parts.empty_scene()
     unresolved = {"Base Color": ("TexNoise.Color", {}), "Coat Roughness": ("TexNoise", {}), "Coat Normal": ("Bump", {})}
-    look = look_of(made("Marble", "BsdfPrincipled", {"Roughness": 0.25, "Coat Weight": 0.5, **unresolved})())
+    look = preview_of(made("Marble", "BsdfPrincipled", {"Roughness": 0.25, "Coat Weight": 0.5, **unresolved})())
     np.testing.assert_allclose(look.value("color").offset, TINT[:3], rtol=1e-6)
     np.testing.assert_allclose(look.value("roughness").offset, 0.25, rtol=1e-6)
     np.testing.assert_allclose(look.coat.roughness, 0.03, rtol=1e-6)
@@ -346,7 +346,7 @@ def test_what_is_not_resolved_has_the_viewport_color_or_its_default_and_is_named
 
 def test_materials_of_other_kinds_are_shown_in_their_viewport_color():
     parts.empty_scene()
-    look = look_of(made("Odd", "BsdfHair", {})())
+    look = preview_of(made("Odd", "BsdfHair", {})())
     np.testing.assert_allclose(look.value("color").offset, TINT[:3], rtol=1e-6)
     assert any(note.startswith("Odd: ") and "Hair" in note for note in look.notes)
 
@@ -354,9 +354,9 @@ def test_materials_of_other_kinds_are_shown_in_their_viewport_color():
 def test_an_image_that_is_turned_out_of_its_plane_is_not_resolved():
     parts.empty_scene()
     material = clipped_and_mapped()
-    assert look_of(material).notes == ()
+    assert preview_of(material).notes == ()
     material.node_tree.nodes["Mapping"].inputs["Rotation"].default_value = (0.5, 0.0, 0.0)
-    assert look_of(material).notes == (f"{material.name}: Base Color is not resolved",)
+    assert preview_of(material).notes == (f"{material.name}: Base Color is not resolved",)
 
 
 @pytest.mark.parametrize(
@@ -370,7 +370,7 @@ def test_an_image_that_is_turned_out_of_its_plane_is_not_resolved():
 def test_one_line_says_what_a_view_leaves_out(glass, shadows, world, text):
     mirror = SceneMirror()
     mirror.take_sky(constant_sky(light_of_world(parts.add_world()[0]), np.ones(3), np.ones(3)))
-    shown = look_of(made("Pane", "BsdfGlass" if glass else "BsdfDiffuse", {})())
+    shown = preview_of(made("Pane", "BsdfGlass" if glass else "BsdfDiffuse", {})())
     mirror._looks = {"Pane": ShownLook(shown, None)}
     scene = SimpleNamespace(ltsh=SimpleNamespace(shadows=shadows), ltsh_view=SimpleNamespace(world=world))
     assert left_out(mirror, scene) == QuietLine(text, MATERIALS_PANEL)
@@ -480,7 +480,7 @@ def test_an_image_that_shines_is_seen_and_lights_nothing():
         try:
             mirror.sync(depsgraph)
             projection = camera.calc_matrix_camera(depsgraph, x=SIZE[0], y=SIZE[1])
-            shown = ShownPicture("ltsh4", "combined", "single", "ltc", 0.5, 1.0, 1.0, False)
+            shown = ShownPicture("ltsh4", "combined")
             view = ViewCamera.of(camera.matrix_world.inverted(), projection, True)
             for _ in range(2):
                 renderer.draw(mirror, view, SIZE, shown, canvas.buffer, np.zeros((2, 2)))
@@ -509,7 +509,7 @@ def test_nothing_of_the_file_is_changed():
 
     before = content()
     for material in materials:
-        look_of(material)
+        preview_of(material)
     assert content() == before
 
 
@@ -545,7 +545,7 @@ def test_glass_shows_what_is_behind_tinted_and_the_reflection_before_it(kind):
             )
             pictures = []
             for passes in ("combined", "specular"):
-                shown = ShownPicture("ltsh4", passes, "single", "ltc", 0.5, 1.0, 1.0, False)
+                shown = ShownPicture("ltsh4", passes)
                 for _ in range(2):
                     renderer.draw(mirror, view, SIZE, shown, canvas.buffer, np.zeros((2, 2)))
                 pictures.append(canvas.read()[..., :3])

@@ -226,7 +226,7 @@ float lobe_density(vec3 towards, vec3 towards_eye, vec3 normal, float roughness)
     return alpha2 / (LTSH_PI * steep * steep) * masking / (4.0 * cosine);
 }
 
-/* As `horizons._seen_by_light`. */
+/* As `horizons._visible_microfacets`. */
 float seen_by_light(vec3 towards, vec3 towards_eye, vec3 normal, float roughness)
 {
     float alpha = max(roughness * roughness, LTSH_SMALLEST_ALPHA);

@@ -12,9 +12,9 @@ from ..render_settings import cycles_setting
 from .bsdfs import REFRACTION_NODE, Bsdf, bsdf_of, emission_sockets, has_alpha, is_emission
 from .graph import (
     Factor,
-    Leaf,
     Source,
     SurfaceShaders,
+    WeightedShader,
     is_seen_through,
     live_link,
     shaders_behind,
@@ -26,7 +26,7 @@ from .values import ImageUse, Value, constant, constant_inputs, input_value, val
 
 # Quantities that may come from an image; all others are constants.
 IMAGE_SLOTS = ("color", "roughness", "metallic", "ior", "normal", "weight")
-# NEUTRAL: the value of each quantity of a `Look` that is left out.
+# NEUTRAL: the value of each quantity of a `PreviewMaterial` that is left out.
 NEUTRAL = {"color": 0.8, "roughness": 1.0, "metallic": 0.0, "ior": 1.5, "specular_level": 0.5, "tint": 1.0,
            "transmission": 0.0, "weight": 1.0, "diffuse_roughness": 0.0}  # fmt: skip
 # ROUGH_KINDS: kinds whose diffuse part may be rough.
@@ -82,7 +82,7 @@ class Brush:
 
 
 @dataclass(frozen=True)
-class Look:
+class PreviewMaterial:
     """One lobe of a material in the viewport. The first lobe also holds the other lobes, emission and notes."""
 
     kind: str  # of `cycles.lobes.LOBE_KINDS`, COAT or REFRACTION
@@ -100,12 +100,12 @@ class Look:
     emission: np.ndarray = field(default_factory=lambda: np.zeros(3))
     glow: float = 0.0  # strength of a material that only emits, by the image of its color
     notes: tuple[str, ...] = ()
-    further: tuple[Look, ...] = ()  # lobes that are added to this one
+    further: tuple[PreviewMaterial, ...] = ()  # lobes that are added to this one
     is_clear: bool = False  # nothing is drawn
     is_stand_in: bool = False  # it stands for a node that is not shaded
 
     @property
-    def lobes(self) -> tuple[Look, ...]:
+    def lobes(self) -> tuple[PreviewMaterial, ...]:
         """This lobe and the further ones."""
         return (self, *self.further)
 
@@ -134,8 +134,8 @@ class Look:
     @property
     def images(self) -> dict[str, ImageUse]:
         """Its images, by slot of IMAGE_SLOTS."""
-        found = {name: value.image for name, value in self.values.items() if name in IMAGE_SLOTS and value.image}
-        return {**found, "normal": self.normal.image} if self.normal is not None else found
+        images = {name: value.image for name, value in self.values.items() if name in IMAGE_SLOTS and value.image}
+        return {**images, "normal": self.normal.image} if self.normal is not None else images
 
     @property
     def uv_map(self) -> str:
@@ -153,16 +153,16 @@ def is_missing(image) -> bool:
     return not all(image.size)
 
 
-def plain_look(color) -> Look:
+def plain_preview(color) -> PreviewMaterial:
     """A diffuse surface."""
-    return Look("diffuse", {"color": constant(color)})
+    return PreviewMaterial("diffuse", {"color": constant(color)})
 
 
-def default_look() -> Look:
-    """The look of a surface without material in Cycles: gray, from 5.0 on with the defaults of a Principled BSDF."""
+def default_preview() -> PreviewMaterial:
+    """The preview of a surface without material in Cycles: gray, from 5.0 on with the defaults of a Principled BSDF."""
     if bpy.app.version < (5, 0, 0):
-        return plain_look(0.8)
-    return Look("principled", {"color": constant(0.8), "roughness": constant(0.5)})
+        return plain_preview(0.8)
+    return PreviewMaterial("principled", {"color": constant(0.8), "roughness": constant(0.5)})
 
 
 # Quantity of `cycles.lobes.LOBE_AOVS` -> viewport setting of the material that replaces an unknown value.
@@ -173,24 +173,24 @@ VIEW_FACTORS = ("ShaderNodeFresnel", "ShaderNodeLayerWeight")
 MOST_LOBES = 8
 
 
-def look_of(material) -> Look:
+def preview_of(material) -> PreviewMaterial:
     """How the viewport shades `material`."""
     if material is None:
-        return default_look()
+        return default_preview()
     if bpy.app.version < (5, 0, 0) and not material.use_nodes:
-        return plain_look(material.diffuse_color)
+        return plain_preview(material.diffuse_color)
     surface = surface_of(material)
     if surface is None:
-        return plain_look(0.0)
+        return plain_preview(0.0)
     shaders = shaders_behind(surface)
-    look = _Reader(material, shaders).look()
+    look = _PreviewReader(material, shaders).look()
     lost = [name.lower() for name in ("Volume", "Displacement") if live_link(surface.node.inputs[name]) is not None]
     notes = (*look.notes, *(f"{material.name}: its {name} is not shown" for name in lost))
     return replace(look, notes=notes, is_clear=is_seen_through(surface.node, shaders))
 
 
 @dataclass(frozen=True)
-class Share:
+class LobeWeight:
     """The share of a node in a material: a constant, perhaps times an image, perhaps times a function of the view."""
 
     constant: float = 1.0
@@ -205,18 +205,18 @@ class Share:
 
     @property
     def values(self) -> dict[str, Value]:
-        """Its image as the quantity "weight" of a `Look`; {} without one."""
+        """Its image as the quantity "weight" of a `PreviewMaterial`; {} without one."""
         return {} if self.image is None else {"weight": self.image}
 
-    def times(self, factor: Value | ViewFactor | None) -> Share | None:
+    def times(self, factor: Value | ViewFactor | None) -> LobeWeight | None:
         """This share times `factor`; None if the product cannot be expressed."""
         if isinstance(factor, ViewFactor) and self.curve is None:
             return replace(self, curve=factor, shining=0.5 * self.shining)
         if not isinstance(factor, Value):
             return None
         if factor.is_constant:
-            part = float(np.clip(factor.offset[0], 0.0, 1.0))
-            return replace(self, constant=self.constant * part, shining=self.shining * part)
+            weight = float(np.clip(factor.offset[0], 0.0, 1.0))
+            return replace(self, constant=self.constant * weight, shining=self.shining * weight)
         return replace(self, image=factor, shining=0.5 * self.shining) if self.image is None else None
 
 
@@ -244,15 +244,15 @@ def _view_factor(source: Source | None) -> ViewFactor | None:
     return ViewFactor.of(kind, float(parameter[0][0]), is_blend)
 
 
-class _Reader:
-    """Makes the look of a material from its leaves."""
+class _PreviewReader:
+    """Makes the preview of a material from its leaves."""
 
     def __init__(self, material, shaders: SurfaceShaders):
         self.material, self.notes = material, []
-        found = [(leaf, share) for leaf in shaders.leaves if not leaf.is_transparent for share in self._shares(leaf)]
+        pairs = [(leaf, share) for leaf in shaders.leaves if not leaf.is_transparent for share in self._shares(leaf)]
         guesses, self.notes = self.notes, []
-        self.emitters = [(leaf.source, share) for leaf, share in found if is_emission(leaf.node)]
-        self.leaves = [(leaf.source, share) for leaf, share in found if not is_emission(leaf.node)]
+        self.emitters = [(leaf.source, share) for leaf, share in pairs if is_emission(leaf.node)]
+        self.leaves = [(leaf.source, share) for leaf, share in pairs if not is_emission(leaf.node)]
         if (self.leaves or self.emitters) and (shaders.cuts or any(leaf.is_transparent for leaf in shaders.leaves)):
             self.note("transparency is not shown")
         if any(has_alpha(leaf.node) for leaf in shaders.leaves):
@@ -263,14 +263,14 @@ class _Reader:
         """Note a difference between the material and what the viewport shows."""
         self.notes.append(f"{self.material.name}: {message}")
 
-    def _shares(self, leaf: Leaf) -> list[Share]:
+    def _shares(self, leaf: WeightedShader) -> list[LobeWeight]:
         """The shares of `leaf` that are not 0: one per term, but terms that differ only in their constants are added.
 
         Unknown factors count as one half.
         """
         shares = []
         for term in leaf.terms:
-            share = Share()
+            share = LobeWeight()
             for factor in term:
                 share = self._with_factor(share, factor)
             same = next((other for other in shares if other.image is share.image and other.curve == share.curve), None)
@@ -281,34 +281,34 @@ class _Reader:
             shares.append(share)
         return [share for share in shares if share.estimate > 0.0]
 
-    def _with_factor(self, share: Share, factor: Factor) -> Share:
+    def _with_factor(self, share: LobeWeight, factor: Factor) -> LobeWeight:
         whole = share.times(_value_of_factor(factor))
         if whole is None:
             self.note(f"factor of {factor.node.name!r} is not resolved")
             whole = share.times(constant(0.5))
         return replace(share, shining=whole.shining) if factor.beside_transparency else whole
 
-    def look(self) -> Look:
-        """The look: the lobe with the largest estimated share, with the others in `further`."""
+    def look(self) -> PreviewMaterial:
+        """The preview: the lobe with the largest estimated share, with the others in `further`."""
         glow = self._glow()
         if glow is not None:
             return glow
         emission = np.zeros(3)
         for source, share in self.emitters:
             emission = emission + self._shining(share, self._emission(source))
-        lobes: list[Look] = []
+        lobes: list[PreviewMaterial] = []
         for source, share in sorted(self.leaves, key=lambda pair: -pair[1].estimate):
             emission = emission + self._shining(share, self._emission(source))
             lobes += self._lobes_of(source, share)
         if not lobes:
-            lobes = [plain_look(0.0)]
+            lobes = [plain_preview(0.0)]
         if len(lobes) > MOST_LOBES:
             self.note(f"of its {len(lobes)} lobes only {MOST_LOBES} are shown")
         first, *further = lobes[:MOST_LOBES]
         return replace(first, emission=emission, notes=tuple(dict.fromkeys(self.notes)), further=tuple(further))
 
-    def _glow(self) -> Look | None:
-        """The look of a material that only emits an image, like a baked texture; None for other materials."""
+    def _glow(self) -> PreviewMaterial | None:
+        """The preview of a material that only emits an image, like a baked texture; None for other materials."""
         if self.leaves or len(self.emitters) != 1:
             return None
         source, share = self.emitters[0]
@@ -319,23 +319,29 @@ class _Reader:
             return None
         self.note("its emission varies: it is seen, and lights nothing")
         glow = share.shining * float(strength.offset[0])
-        return Look("diffuse", {"color": color}, weight=0.0, glow=glow, notes=tuple(dict.fromkeys(self.notes)))
+        return PreviewMaterial(
+            "diffuse", {"color": color}, weight=0.0, glow=glow, notes=tuple(dict.fromkeys(self.notes))
+        )
 
-    def _shining(self, share: Share, emission: np.ndarray) -> np.ndarray:
+    def _shining(self, share: LobeWeight, emission: np.ndarray) -> np.ndarray:
         if emission.any() and (share.image is not None or share.curve is not None):
             self.note("its emission varies: half of it is shown")
         return share.shining * emission
 
-    def _lobes_of(self, source: Source, share: Share) -> list[Look]:
+    def _lobes_of(self, source: Source, share: LobeWeight) -> list[PreviewMaterial]:
         """The lobes of one BSDF node."""
         bsdf = bsdf_of(source.node)
         if source.node.bl_idname == REFRACTION_NODE:
             values = self._on_one_uv_map({"color": self._value(source, "color", "Color"), **share.values})
-            return [Look(REFRACTION, values, weight=share.constant, view_factor=share.curve, is_stand_in=True)]
+            return [
+                PreviewMaterial(REFRACTION, values, weight=share.constant, view_factor=share.curve, is_stand_in=True)
+            ]
         if bsdf is None:
             self.note(f"{source.node.bl_label} is not shown, its viewport color is")
             values = {"color": constant(self.material.diffuse_color), **share.values}
-            return [Look("diffuse", values, weight=share.constant, view_factor=share.curve, is_stand_in=True)]
+            return [
+                PreviewMaterial("diffuse", values, weight=share.constant, view_factor=share.curve, is_stand_in=True)
+            ]
         look = self._lobe(source, bsdf, share)
         fuzz = self._sheen(source, look) if look.kind == "principled" else []
         coat = self._coat(source, look) if look.kind == "principled" else None
@@ -350,7 +356,7 @@ class _Reader:
         shine = replace(look, kind=COAT, values=values, scattered=True, brush=None)
         return [look, shine if coat.follows_normal else replace(shine, normal=None), *fuzz]
 
-    def _lobe(self, source: Source, bsdf: Bsdf, share: Share) -> Look:
+    def _lobe(self, source: Source, bsdf: Bsdf, share: LobeWeight) -> PreviewMaterial:
         node, names = source.node, bsdf.sockets
         values = {name: self._value(source, name, names[name]) for name in NEUTRAL if name in names}
         values = self._on_one_uv_map({**values, **share.values})
@@ -359,13 +365,15 @@ class _Reader:
             self.note(f"distribution {node.distribution} is shown as GGX")
         normal, strength = self._normal(source, values)
         corrected = cycles_setting(self.material, "use_bump_map_correction")
-        look = Look(bsdf.kind, values, normal, strength, bsdf.is_scattered, corrected, share.constant, share.curve)
+        look = PreviewMaterial(
+            bsdf.kind, values, normal, strength, bsdf.is_scattered, corrected, share.constant, share.curve
+        )
         look = replace(look, brush=self._brush(source, bsdf, look))
         for name in dict.fromkeys(use.image.name for use in look.images.values() if is_missing(use.image)):
             self.note(f"image {name!r} is missing, it is pink")
         return look
 
-    def _brush(self, source: Source, bsdf: Bsdf, look: Look) -> Brush | None:
+    def _brush(self, source: Source, bsdf: Bsdf, look: PreviewMaterial) -> Brush | None:
         """The `Brush` of the lobe `look` of the node at `source`; None if it is isotropic."""
         if "anisotropy" not in bsdf.sockets or bsdf.kind not in BRUSHED_KINDS:
             return None
@@ -381,7 +389,7 @@ class _Reader:
             return None
         return Brush(aspect, float(rotation[0][0]), direction, uv_map)
 
-    def _sheen(self, source: Source, look: Look) -> list[Look]:
+    def _sheen(self, source: Source, look: PreviewMaterial) -> list[PreviewMaterial]:
         """The sheen lobe of a Principled BSDF; [] without sheen."""
         weight, roughness, tint = (
             np.maximum(self._value(source, "", f"Sheen {name}").offset, 0.0) for name in ("Weight", "Roughness", "Tint")
@@ -393,7 +401,7 @@ class _Reader:
         values["weight"] = look.value("weight")
         return [replace(look, kind="sheen", values=values, scattered=False, brush=None)]
 
-    def _coat(self, source: Source, look: Look) -> Coat | None:
+    def _coat(self, source: Source, look: PreviewMaterial) -> Coat | None:
         """The coat of a Principled BSDF, or None."""
         weight = float(self._value(source, "", "Coat Weight").offset[0])
         if weight <= SMALLEST_WEIGHT:
@@ -402,8 +410,8 @@ class _Reader:
         roughness, ior, tint = (self._value(source, "", name).offset for name in sockets)
         normal, follows = source.input("Coat Normal"), False
         if normal is not None and normal.node is not None:
-            own = source.input("Normal")
-            follows = look.normal is not None and (own.node, own.groups) == (normal.node, normal.groups)
+            lobe_normal = source.input("Normal")
+            follows = look.normal is not None and (lobe_normal.node, lobe_normal.groups) == (normal.node, normal.groups)
             if not follows:
                 self.note("Coat Normal is not resolved")
         roughness, ior = float(np.clip(roughness[0], 0.0, 1.0)), max(float(ior[0]), 1.0)
@@ -450,10 +458,10 @@ class _Reader:
         return color, float(strength[0][0])
 
     def _emission(self, source: Source) -> np.ndarray:
-        parts = [value_at(socket, source.groups) for socket in emission_sockets(source.node)]
-        if all(part is not None and part.is_constant for part in parts):
-            return np.prod([part.offset for part in parts], axis=0) if parts else np.zeros(3)
-        color, strength = parts
+        values = [value_at(socket, source.groups) for socket in emission_sockets(source.node)]
+        if all(value is not None and value.is_constant for value in values):
+            return np.prod([value.offset for value in values], axis=0) if values else np.zeros(3)
+        color, strength = values
         if strength is None or not strength.is_constant or np.any(strength.offset):
             self.note("its emission varies and is not shown")
         return np.zeros(3)

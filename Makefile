@@ -94,7 +94,7 @@ soak:
 	"$$python" tests/soak/soak.py $(SOAK_OPTIONS)
 
 tables:
-	@python=$$($(SETUP) python newest) && "$$python" -m ltsh_addon tables fit
+	@python=$$($(SETUP) python newest) && "$$python" -m tables fit
 
 lock:
 	@$(SETUP) lock $(LOCK_OPTIONS)

@@ -9,7 +9,7 @@ These are the rooms of the package. A room imports only itself and rooms above i
 `engine` and `registration` come last.
 
     interruption  Ctrl-C and SIGTERM as exceptions
-    scene         the shared vocabulary: AreaLight, SurfaceSamples, Film, errors, names of techniques and passes
+    scene         the shared vocabulary: lights, SurfaceSamples, Film, errors, names of techniques and passes
     reading       how files of others are read: what they may hold, what they must have
     files         how files are written, and how leftovers of dead processes are deleted
     shading       the paper: lookup table, polygons, integrals, `shade`, reference quadrature (numpy only)

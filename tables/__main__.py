@@ -1,4 +1,7 @@
-"""`python -m tables fit|validate|optimum|plot ...`, which `ltsh tables` runs from the source checkout."""
+"""`python -m tables fit|validate|optimum|plot|export ...`: makes, measures and exports the lookup tables.
+
+Needs scipy, and `plot` matplotlib, which the add-on does not need.
+"""
 
 from __future__ import annotations
 
@@ -13,9 +16,10 @@ from pathlib import Path
 
 import numpy as np
 
+from ltsh_addon.pipeline.options import table
 from ltsh_addon.shading import SHIPPED_TABLES, TableError, load_table
 
-from . import families, fit, optimum, validate
+from . import export, families, fit, optimum, validate
 from .families import BRDFS
 
 FOLDER = Path(__file__).resolve().parent
@@ -26,16 +30,16 @@ def main(arguments: list[str]) -> int:
     try:
         return options.run(options)
     except (TableError, OSError) as error:
-        print(f"ltsh tables: {error}", file=sys.stderr)
+        print(f"tables: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
-        print("ltsh tables: interrupted; the same command goes on from here", file=sys.stderr)
+        print("tables: interrupted; the same command goes on from here", file=sys.stderr)
         return 130
 
 
 def _parser():
-    parser = argparse.ArgumentParser(prog="ltsh tables")
-    actions = parser.add_subparsers(dest="action", required=True, metavar="fit|validate|optimum|plot")
+    parser = argparse.ArgumentParser(prog="python -m tables")
+    actions = parser.add_subparsers(dest="action", required=True, metavar="fit|validate|optimum|plot|export")
     default = f"default: {', '.join(SHIPPED_TABLES)}"
     fitting = actions.add_parser("fit", help="fit tables; goes on where a fit of the same settings was stopped")
     names = f"ltc, ltsh1 to ltsh8, or these with a c; {default}"
@@ -69,6 +73,13 @@ def _parser():
     plotting = actions.add_parser("plot", help="draw the figures of tables/README.md")
     plotting.add_argument("-o", dest="output", type=Path, default=FOLDER.parent / "docs", metavar="OUT")
     plotting.set_defaults(run=_plot)
+    exporting = actions.add_parser("export", help="for other engines: images, a header for C, C++, GLSL and HLSL, WGSL")
+    exporting.add_argument(
+        "names", nargs="*", type=_table, metavar="TABLE", help="or a path (.npz); default: all shipped"
+    )
+    exporting.add_argument("-o", dest="output", type=Path, required=True, metavar="OUT", help="folder for the files")
+    exporting.add_argument("--json", action="store_true", help="name the files on stdout in one JSON document")
+    exporting.set_defaults(run=_export)
     return parser
 
 
@@ -78,6 +89,13 @@ def _name(text):
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from error
     return text
+
+
+def _table(text):
+    try:
+        return table(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def _fitted_name(text):
@@ -254,7 +272,7 @@ def _grazing(options) -> int:
     """Print shaded errors and L2 errors of a table, and those of the lobe solved at the point itself."""
     names = [name for name in options.names or ["ltsh4"] if name in SHIPPED_TABLES and name != "ltc"]
     if not names:
-        print("ltsh tables: --grazing needs a shipped table of spherical harmonics: ltsh2 or ltsh4", file=sys.stderr)
+        print("tables: --grazing needs a shipped table of spherical harmonics: ltsh2 or ltsh4", file=sys.stderr)
         return 2
     for name in names:
         found = optimum.grazing_errors(load_table(name), min(options.count, len(optimum.ROUGHNESS)))
@@ -278,6 +296,18 @@ def _plot(options) -> int:
     options.output.mkdir(parents=True, exist_ok=True)
     for path in plots.draw_all(options.output, lambda text: print(text, file=sys.stderr, flush=True)):
         print(path)
+    return 0
+
+
+def _export(options) -> int:
+    try:
+        prefixes = export.export_prefixes(options.names or SHIPPED_TABLES)
+    except ValueError as error:
+        print(f"tables: {error}", file=sys.stderr)
+        return 2
+    files = export.export_tables(prefixes, options.output)
+    paths = {name: [str(path) for path in written] for name, written in files.items()}
+    print(json.dumps({"tables": paths}, indent=2) if options.json else "\n".join(sum(paths.values(), [])))
     return 0
 
 

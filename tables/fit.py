@@ -44,7 +44,7 @@ def write_table(path: Path, fitted) -> None:
         "settings": settings(family, fitted.model, len(fitted.node_errors)),
         "node_error_mean": float(fitted.node_errors.mean()),
         "node_error_median": float(np.median(fitted.node_errors)),
-        "command": f"python -m ltsh_addon tables fit {family.name}{_options(fitted)}",
+        "command": f"python -m tables fit {family.name}{_options(fitted)}",
     }
     if family.bend is not None:
         metadata["bend"] = family.bend

@@ -1,4 +1,4 @@
-"""Draws the figures of tables/README.md: `python -m ltsh_addon tables plot` (needs matplotlib)."""
+"""Draws the figures of tables/README.md: `python -m tables plot` (needs matplotlib)."""
 
 from __future__ import annotations
 

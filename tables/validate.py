@@ -1,4 +1,4 @@
-"""Measures a lookup table between its nodes, where a renderer uses it: `python -m ltsh_addon tables validate`.
+"""Measures a lookup table between its nodes, where a renderer uses it: `python -m tables validate`.
 
 The quadrature shares nothing with the fit. The balance heuristic (Veach 1997) combines two sets of points: visible
 normals of GGX (Dupuy and Benyoub 2023, "Sampling Visible GGX Normals with Spherical Caps"), and points that are dense
@@ -14,7 +14,7 @@ import numpy as np
 
 from ltsh_addon.lobes import brdf
 from ltsh_addon.lobes.lookup_table import LookupTable
-from ltsh_addon.scene import AreaLight, SurfaceSamples
+from ltsh_addon.scene import EllipseLight, SurfaceSamples
 from ltsh_addon.shading import evaluate_lobe, header, shade
 
 from .families import gauss_legendre
@@ -303,7 +303,8 @@ def validate_anisotropic(count: int = 3, anisotropies=ANISOTROPIES) -> dict[str,
             exact = np.stack([_integrals_over_disks(*point) for point in points])
             figures = {}
             for name, technique in (("technique", "ltsh4"), ("reference", "reference")):
-                shaded = shade(samples, _disk_lights(), technique, passes=("specular",), workers=1)
+                lights = list(_disk_lights())
+                shaded = shade(samples, lights, technique, passes=("specular",), workers=1, rows=np.arange(len(lights)))
                 errors = np.linalg.norm(shaded.specular[:, :, 0].T - exact, axis=1)
                 figures[name] = float(np.linalg.norm(errors) / np.linalg.norm(exact))
                 figures[f"{name}_maximum"] = float((errors / np.linalg.norm(exact, axis=1)).max())
@@ -340,7 +341,7 @@ def _disk_lights():
     for number, (center, radius) in enumerate(zip(*_centers_of_disks(), strict=True)):
         across = np.cross(center, [1.0, 0.0, 0.0])
         across *= np.tan(radius) / np.linalg.norm(across)
-        yield AreaLight(str(number), "DISK", center, across, np.cross(center, across), -center, np.ones(3))
+        yield EllipseLight(str(number), center, across, np.cross(center, across), -center, np.ones(3))
 
 
 def _integrals_over_disks(view, tangent, alphas):

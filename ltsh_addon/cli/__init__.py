@@ -26,7 +26,6 @@ from .commands import (
     add_merge,
     add_relight,
     add_run,
-    add_tables,
 )
 from .progress import ProgressBar, RunLog, print_json, print_out
 
@@ -171,7 +170,6 @@ def _parser(program: str) -> tuple[argparse.ArgumentParser, dict[str, argparse.A
         ("relight", add_relight, "other powers and colors of lights in pictures that are there"),
         ("run", add_run, "do the jobs of a file"),
         ("merge", add_merge, "assemble the report of what shards have done"),
-        ("tables", add_tables, "fit, validate or export the lookup tables"),
     ):
         add(commands.add_parser(name, help=meaning), *([name] if add is add_job else []))
     return parser, commands.choices

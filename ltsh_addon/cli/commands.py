@@ -6,20 +6,16 @@ That function takes the arguments, the progress bar and the file that Blender ha
 from __future__ import annotations
 
 import argparse
-import importlib.util
-import os
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 from ..files import write_bytes
 from ..pipeline.batch import Merged, merge, run_tasks
 from ..pipeline.lighting import prepare
-from ..pipeline.options import BakeOptions, PictureOptions, RenderOptions, ViewOptions, options_from, real_number, table
+from ..pipeline.options import BakeOptions, PictureOptions, RenderOptions, ViewOptions, options_from, real_number
 from ..pipeline.picture import Baseline, with_times
 from ..pipeline.tasks import BatchJob
-from ..scene import SHIPPED_TABLES, SceneError, error_line
+from ..scene import SceneError, error_line
 from ..shading import TableError
 from .arguments import (
     FileJob,
@@ -362,74 +358,6 @@ def _for_each(jobs: list[FileJob], do, arguments, bar) -> int:
         documents.append({"command": wanted.job.command, "output": str(output), **document})
         worst = max(worst, code)
     return _printed(arguments, {"jobs": documents}, worst)
-
-
-TABLES = "Fit, measure and export the lookup tables. All but export need the source checkout and scipy."
-TABLES_EXAMPLES = """examples:
-  %(prog)s export -o out/tables
-  %(prog)s validate ltsh4 --json
-  %(prog)s fit ltsh6 -o out/tables
-"""
-EXPORT = "Write each table as images, as a header for C, C++, GLSL and HLSL, and as WGSL; see docs/engines.md."
-EXPORT_EXAMPLES = """examples:
-  %(prog)s -o out/tables
-  %(prog)s ltsh4 my_table.npz -o out/tables --json
-"""
-SCRIPTS = {
-    "fit": "fit tables to a BRDF, which takes hours",
-    "validate": "errors of tables between their nodes",
-    "optimum": "how good any table of a family could be",
-    "plot": "the figures of tables/README.md",
-}
-
-
-def add_tables(parser) -> None:
-    """`ltsh tables`."""
-    with_examples(parser, TABLES, TABLES_EXAMPLES)
-    actions = parser.add_subparsers(dest="action", required=True)
-    for action, meaning in SCRIPTS.items():
-        # The script parses its own options. No argument starts with this prefix, so all are passed on unchanged.
-        script = actions.add_parser(action, help=meaning, add_help=False, prefix_chars="\0")
-        script.add_argument("arguments", nargs="*")
-        script.set_defaults(run=_run_table_script, quiet=False, log=None)
-    export = actions.add_parser("export", help="for other engines: images, a header for C, C++, GLSL and HLSL, WGSL")
-    with_examples(export, EXPORT, EXPORT_EXAMPLES)
-    export.add_argument("names", nargs="*", type=from_text(table), metavar="TABLE",
-                        help="or a path (.npz); default: all shipped")  # fmt: skip
-    export.add_argument("-o", dest="output", type=Path, required=True, metavar="OUT", help="folder for the files")
-    add_talk(export, "name the files on stdout in one JSON document")
-    export.set_defaults(run=_export_tables)
-
-
-def _run_table_script(arguments, bar, open_file) -> int:
-    root = Path(__file__).resolve().parents[2]
-    if not (root / "tables" / "fit.py").is_file():
-        needed = "the source checkout with tables/fit.py"
-        raise Misuse(f"tables {arguments.action} needs {needed}, which is not here")
-    for library in ("scipy", *(["matplotlib"] if arguments.action == "plot" else [])):
-        if importlib.util.find_spec(library) is None:
-            fix = f"install it with `pip install {library}`"
-            raise Misuse(f"tables {arguments.action} needs {library}, which is not here; {fix}")
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(root), os.environ.get("PYTHONPATH", "")])}
-    command = [sys.executable, "-m", "tables", arguments.action, *arguments.arguments]
-    return subprocess.run(command, env=environment, check=False).returncode
-
-
-def _export_tables(arguments, bar, open_file) -> int:
-    from ..pipeline.export import export_prefixes, export_tables
-
-    try:
-        prefixes = export_prefixes(arguments.names or SHIPPED_TABLES)
-    except ValueError as error:
-        raise Misuse(str(error)) from error
-    files = export_tables(prefixes, arguments.output, bar)
-    bar.finish()
-    paths = {name: [str(path) for path in written] for name, written in files.items()}
-    if arguments.json:
-        print_json({"tables": paths})
-    else:
-        print_out("\n".join(path for written in paths.values() for path in written))
-    return 0
 
 
 def do_job(job: BatchJob, arguments, bar, baseline: Baseline | None = None) -> tuple[dict, int]:

@@ -1,7 +1,7 @@
 """Light from all directions, given by square pictures, as distant lights. Needs no bpy.
 
-Six pictures make up the cube around a sample. Each becomes a distant rectangle with its mean radiance. The `detail` of
-the rectangle is a tree of parts, each with its own mean; parts like their whole are not cut further. Something as small
+Six pictures make up the cube around a sample. Each becomes a `SkyLight` with its mean radiance. Its `children`
+are a tree of parts, each with its own mean; parts like their whole are not cut further. Something as small
 and bright as the sun becomes a light of its own, and the pictures keep the rest.
 """
 
@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..scene import AreaLight
+from ..scene import Light, SunLight
 
 # Axes (ahead, right, up) of the pictures of a cube; right and up are half a side long.
 CUBE = tuple(
@@ -133,7 +133,7 @@ def without_spots(picture: SkyPicture, spots: list[Spot]) -> SkyPicture:
     return replace(picture, radiance=radiance)
 
 
-def spot_light(like: AreaLight, picture: SkyPicture, spot: Spot) -> list[AreaLight]:
+def spot_light(like: Light, picture: SkyPicture, spot: Spot) -> list[Light]:
     """The spot that a close `picture` shows, as lights with the name and traits of `like`: a disk if it looks like one,
     otherwise patches; [] if the picture shows no spot."""
     radiance, angles = above(picture.radiance, spot.least), picture.solid_angles()
@@ -155,17 +155,17 @@ def spot_light(like: AreaLight, picture: SkyPicture, spot: Spot) -> list[AreaLig
     if missed > DISK_ERROR * power:
         return sky_lights(like, [replace(picture, radiance=radiance)], SPOT_PATCHES)[0]
     _, right, up = spot_frame(replace(spot, direction=center, radius=radius))
-    return [replace(like, shape="DISK", center=center, half_u=right, half_v=up, direction=-center, radiance=light)]
+    return [SunLight.like(like, center=center, half_u=right, half_v=up, direction=-center, radiance=light)]
 
 
-def sky_lights(like: AreaLight, pictures: list[SkyPicture], most: int = MOST_PATCHES) -> tuple[list[AreaLight], float]:
-    """A distant light with a `detail` for each picture that is not dark, with the name and traits of `like`; and the
+def sky_lights(like: Light, pictures: list[SkyPicture], most: int = MOST_PATCHES) -> tuple[list[Light], float]:
+    """A distant light with `children` for each picture that is not dark, with the name and traits of `like`; and the
     mean absolute difference between the smallest patches and the pictures, relative to the mean radiance."""
     trees = [_SkyQuadtree.of(picture) for picture in pictures]
     total = sum((mean_magnitude(picture.radiance) * picture.solid_angles()).sum() for picture in pictures)
     limit, error = _limit(trees, ERROR * total, most)
     lights = [_light(like, picture, tree, limit, (0, 0, 0)) for picture, tree in zip(pictures, trees, strict=True)]
-    bright = [light for light in lights if light.detail or np.any(light.radiance != 0.0)]
+    bright = [light for light in lights if light.children or np.any(light.radiance != 0.0)]
     return bright, error / total if total > 0.0 else 0.0
 
 
@@ -234,7 +234,7 @@ def _limit(trees, wanted: float, most: int) -> tuple[float, float]:
     return limit, _leaves(trees, limit)[1]
 
 
-def _light(like: AreaLight, picture: SkyPicture, tree: _SkyQuadtree, limit: float, square) -> AreaLight:
+def _light(like: Light, picture: SkyPicture, tree: _SkyQuadtree, limit: float, square) -> Light:
     """The square `square` (level, row, column) of a picture as a light; its parts are the detail."""
     level, row, column = square
     size = 2.0**-level
@@ -247,7 +247,7 @@ def _light(like: AreaLight, picture: SkyPicture, tree: _SkyQuadtree, limit: floa
         half_v=size * picture.up,
         direction=-picture.ahead / np.linalg.norm(picture.ahead),
         radiance=tree.means[level][row, column],
-        detail=tuple(_light(like, picture, tree, limit, smaller) for smaller in parts) if len(parts) > 1 else (),
+        children=tuple(_light(like, picture, tree, limit, smaller) for smaller in parts) if len(parts) > 1 else (),
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..emitters.light_tree import stand_ins
 from ..lobes import brdf, polygon
-from ..scene import FACING_SHAPES, AreaLight, SurfaceSamples
+from ..scene import Light, PolygonLight, SurfaceSamples
 from .light_tree import light_selection_pmf, light_tree_rows
 
 SPECULAR_FIELDS = ("specular_f0", "specular_f90", "specular_dip", "dielectric")
@@ -83,7 +83,7 @@ MOST_PAIRS, PAIRS = 2**21, 2**14
 
 def end_at_horizons_of_cycles(
     samples: SurfaceSamples,
-    lights: tuple[AreaLight, ...],
+    lights: tuple[Light, ...],
     hit: np.ndarray | None = None,
     is_baked: bool = False,
     is_quick: bool = False,
@@ -162,7 +162,7 @@ def _reflectance(samples, cosine) -> np.ndarray:
 
 
 def horizon_excess(
-    samples: SurfaceSamples, lights: tuple[AreaLight, ...], chances: np.ndarray, choose=None, is_quick: bool = False
+    samples: SurfaceSamples, lights: tuple[Light, ...], chances: np.ndarray, choose=None, is_quick: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
     """The light (P,) that only one of the horizons lets through, split by who chose its direction: a lobe or the light.
     The smooth horizon is wrong about the first part, the mesh's horizon about the second.
@@ -222,7 +222,7 @@ def _excess(samples, shapes, chances, choose, is_quick):
     return by_lobe, by_light
 
 
-def _with_stand_ins(lights) -> tuple[tuple[AreaLight, ...], np.ndarray]:
+def _with_stand_ins(lights) -> tuple[tuple[Light, ...], np.ndarray]:
     """Lights (L) and the share (L,) of each that shines. At most MOST_LIGHTS stand-ins replace many flat lights."""
     others, kinds = [], {}
     for light in lights:
@@ -252,7 +252,7 @@ def _kinds_of_lights(lights) -> list[np.ndarray]:
     kinds = {}
     for number, light in enumerate(lights):
         outline = light.shape if light.is_facing else 0 if light.is_round else len(light.polygon())
-        kind = light.is_distant, light.shape == "POLYGON", outline, _is_side(light)
+        kind = light.is_distant, isinstance(light, PolygonLight), outline, _is_side(light)
         kinds.setdefault(kind, []).append(number)
     return [np.array(numbers) for numbers in kinds.values()]
 
@@ -270,8 +270,7 @@ class _LightsOfKind:
     """Lights of one kind, as arrays for tests of which directions meet them."""
 
     number: np.ndarray  # (L,)
-    kind: str  # "BALL", "FACING_DISK" or the shape of the first flat light
-    is_distant: bool
+    like: Light  # one of them
     brightness: np.ndarray  # (L,)
     center: np.ndarray  # (L, 3)
     corners: np.ndarray  # (L, V, 3)
@@ -293,17 +292,12 @@ class _LightsOfKind:
         brightness = np.array([np.abs(light.radiance).sum() for light in alike])
         scales = np.linalg.pinv(np.array([[light.half_u, light.half_v] for light in alike]).swapaxes(1, 2))
         rest = radius, axes, scales, share, _is_side(alike[0])
-        return cls(number, alike[0].shape, alike[0].is_distant, brightness, center, corners, *rest)
-
-    @property
-    def is_facing(self) -> bool:
-        """True for lights that face every point."""
-        return self.kind in FACING_SHAPES
+        return cls(number, alike[0], brightness, center, corners, *rest)
 
     def crossings(self, samples) -> tuple[np.ndarray, np.ndarray]:
         """Pairs of a light and a sample whose horizons differ on the light: part of it is above one of them, and part
         of it below one. Both are numbers, the light's among these."""
-        position = 0.0 * samples.position if self.is_distant else samples.position
+        position = 0.0 * samples.position if self.like.is_distant else samples.position
         normals = samples.smooth_normal, samples.geometric_normal
         starts = [(normal * position).sum(axis=1) for normal in normals]
         pairs, step = [np.zeros((2, 0), int)], max(PAIRS // len(position), 1)
@@ -311,14 +305,14 @@ class _LightsOfKind:
             center, radius = self.center[start : start + step], self.radius[start : start + step, None]
             smooth, true = (center @ normal.T - at for normal, at in zip(normals, starts, strict=True))
             # A little more, because the sums are rounded.
-            reach = radius if self.is_facing else radius + 1e-9 * (np.abs(smooth) + np.abs(true))
+            reach = radius if self.like.is_facing else radius + 1e-9 * (np.abs(smooth) + np.abs(true))
             between = (np.minimum(smooth, true) <= reach) & (np.maximum(smooth, true) > -reach)
-            if not self.is_facing:
+            if not self.like.is_facing:
                 back = self.axes[start : start + step, 2]
                 between &= (center * back).sum(axis=1)[:, None] > back @ position.T
             light, sample = np.nonzero(between)
             light += start
-            if not self.is_facing:
+            if not self.like.is_facing:
                 some, every = np.zeros(len(light), bool), np.ones(len(light), bool)
                 for normal, at in zip(normals, starts, strict=True):
                     above = np.einsum("rvi,ri->rv", self.corners[light], normal[sample]) > at[sample, None]
@@ -336,7 +330,7 @@ class _LightsOfKind:
         chunks = [(np.zeros(0, int), np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(0))]
         for start in range(0, len(light), PAIRS):
             row, point = light[start : start + PAIRS], sample[start : start + PAIRS]
-            offset = self.center[row] - (0.0 if self.is_distant else position[point])
+            offset = self.center[row] - (0.0 if self.like.is_distant else position[point])
             pair, ray = directions.near(point, offset, self.radius[row])
             towards = directions.towards[point[pair], ray]
             is_hit = self._meets(row, offset, pair, towards)
@@ -364,25 +358,25 @@ class _LightsOfKind:
     def _cosine(self, light, distance) -> np.ndarray:
         """Cosine (R,) of the angular radius of lights that face every point."""
         ratio = np.minimum(self.radius[light] / np.maximum(distance, 1e-30), 1.0)
-        return np.sqrt(1.0 - ratio**2) if self.kind == "BALL" else 1.0 / np.sqrt(1.0 + ratio**2)
+        return np.sqrt(1.0 - ratio**2) if self.like.is_sphere else 1.0 / np.sqrt(1.0 + ratio**2)
 
     def _meets(self, light, offset, pair, towards) -> np.ndarray:
         """Mask (K,) of the rays that meet their light. The ray k goes along `towards` (K, 3) from the pair `pair[k]`
         (of R), whose light has its center at `offset` (R, 3)."""
-        if self.is_facing:
+        if self.like.is_facing:
             distance = np.linalg.norm(offset, axis=1)
             along = (towards * offset[pair]).sum(axis=1)
             return along > (self._cosine(light, distance) * distance)[pair]
         steepness = np.einsum("ki,ki->k", self.axes[light, 2][pair], towards)
         height = np.einsum("ri,ri->r", self.axes[light, 2], offset)
         distance = height[pair] / np.where(steepness > 0.0, steepness, 1e-30)
-        plane = (self.axes[:, :2] if self.kind == "POLYGON" else self.scales)[light]
+        plane = (self.axes[:, :2] if isinstance(self.like, PolygonLight) else self.scales)[light]
         x0, y0 = np.einsum("rai,ri->ar", plane, offset)
         x, y = np.einsum("kai,ki->ak", plane[pair], towards) * distance
         x, y = x - x0[pair], y - y0[pair]
-        if self.kind in ("DISK", "ELLIPSE"):
+        if self.like.is_round:
             return (x * x + y * y < 1.0) & (steepness > 0.0)
-        if self.kind != "POLYGON":
+        if not isinstance(self.like, PolygonLight):
             return (np.maximum(np.abs(x), np.abs(y)) < 1.0) & (steepness > 0.0)
         outline = np.einsum("rvi,rai->var", self.corners[light] - self.center[light, None], plane)
         inside = np.zeros(len(x), bool)
@@ -394,7 +388,7 @@ class _LightsOfKind:
 
     def _solid_angle(self, light, offset) -> np.ndarray:
         """Solid angle (R,) in sr of lights whose center is at `offset` (R, 3); 0 as seen from behind."""
-        if self.is_facing:
+        if self.like.is_facing:
             return 2.0 * np.pi * (1.0 - self._cosine(light, np.linalg.norm(offset, axis=1)))
         corners = self.corners[light] - self.center[light, None] + offset[:, None]
         corners = np.einsum("rai,rvi->avr", self.axes[light], corners)

@@ -16,7 +16,7 @@ from functools import lru_cache, reduce
 import numpy as np
 
 from ..emitters.facing import cone_angle
-from ..scene import AreaLight
+from ..scene import Light
 
 # MOST_LIGHTS_OF_LEAF: as in Cycles. BUCKETS: along each axis Cycles tries to cut a node between these.
 MOST_LIGHTS_OF_LEAF = 8
@@ -106,7 +106,7 @@ def _cosine_of_sum(first, second, sign):
 
 
 def light_selection_pmf(
-    position: np.ndarray, normal: np.ndarray, lights: tuple[AreaLight, ...], rows: np.ndarray | None = None
+    position: np.ndarray, normal: np.ndarray, lights: tuple[Light, ...], rows: np.ndarray | None = None
 ) -> np.ndarray:
     """Probability (L, P) with which each light is chosen for points (P, 3) with smooth normals. Down to the leaves, the
     halves of a node are chosen by their upper bounds half of the time, and by their lower bounds the other half.
@@ -154,7 +154,7 @@ def selection_pmf(bounds: np.ndarray) -> np.ndarray:
 
 
 def light_bounds_at(
-    position: np.ndarray, normal: np.ndarray, lights: tuple[AreaLight, ...], rows: np.ndarray
+    position: np.ndarray, normal: np.ndarray, lights: tuple[Light, ...], rows: np.ndarray
 ) -> np.ndarray:
     """Upper and lower bound (L, 2, P) on what points (P, 3) with normals get from each light. A flat light counts as
     its rectangle. In single precision if there are more than MOST_LIGHTS."""
@@ -212,7 +212,7 @@ def _facing_bounds(light, position, normal):
     offset = light.center - position
     distance = np.linalg.norm(offset, axis=1)
     axis = offset / np.maximum(distance, 1e-30)[:, None]
-    if light.shape == "BALL":
+    if light.is_sphere:
         ratio = np.minimum(light.radius / np.maximum(distance, 1e-30), 1.0)
         width = np.where(ratio < 1.0, np.sqrt(1.0 - ratio**2), -1.0)
     else:
@@ -231,7 +231,7 @@ def _facing_bounds(light, position, normal):
     return _bounds(node, axis, normal, width, near, far) * (share * share * (3.0 - 2.0 * share))
 
 
-def light_tree_rows(lights: tuple[AreaLight, ...]) -> np.ndarray:
+def light_tree_rows(lights: tuple[Light, ...]) -> np.ndarray:
     """What the tree needs to know of each light, (L, 16)."""
     return np.array([_row(light) for light in lights])
 

@@ -19,7 +19,7 @@ MAX_LOBES = 8
 # Name of the quantity -> type of the AOV.
 HIT_AOVS = {
     "hit": "VALUE",  # 1 where a surface was hit
-    "receiver": "VALUE",  # `AreaLight.receivers`
+    "receiver": "VALUE",  # `Light.receivers`
     "correct_normal": "VALUE",  # 1 where Cycles bends specular normals (use_bump_map_correction)
     "position": "COLOR",
     "incoming": "COLOR",  # towards the camera

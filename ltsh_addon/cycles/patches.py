@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..scene import AreaLight
+from ..scene import Light, PolygonLight, QuadLight
 
 # Mean absolute error at which cutting stops, as a share of the mean radiance.
 ERROR = 0.02
@@ -146,39 +146,39 @@ class _Pixels:
         return min(choices, key=lambda halves: sum(self._squares(half) for half in halves), default=None)
 
 
-def split_light(light: AreaLight, patches: Patches) -> list[AreaLight]:
-    """`light` with its mean radiance and a tree of its patches as `detail`; [] if it is dark.
+def split_light(light: Light, patches: Patches) -> list[Light]:
+    """`light` with its mean radiance and a tree of its patches as `children`; [] if it is dark.
 
     Cells are along its half_u and half_v. Those wholly inside the light become rectangles, others polygons.
     """
     if patches.whole is None:
         return []
     outline = _outline(light)
-    detail = [light_of_patch for patch in patches.whole.parts for light_of_patch in _lights_of(light, outline, patch)]
-    return [replace(light, radiance=patches.whole.radiance, detail=tuple(detail))]
+    children = [child for patch in patches.whole.parts for child in _lights_of(light, outline, patch)]
+    return [replace(light, radiance=patches.whole.radiance, children=tuple(children))]
 
 
-def _lights_of(light: AreaLight, outline: np.ndarray, patch: Patch) -> list[AreaLight]:
-    """One light for `patch` with its parts as detail; only the parts if the patch has no simple shape."""
+def _lights_of(light: Light, outline: np.ndarray, patch: Patch) -> list[Light]:
+    """One light for `patch` with its parts as children; only the parts if the patch has no simple shape."""
     whole = _light_of_cell(replace(light, radiance=patch.radiance), outline, patch.cell)
     if not patch.parts:
         return whole
-    detail = tuple(smaller for inner in patch.parts for smaller in _lights_of(light, outline, inner))
-    return [replace(whole[0], detail=detail)] if len(whole) == 1 else list(detail)
+    children = tuple(child for inner in patch.parts for child in _lights_of(light, outline, inner))
+    return [replace(whole[0], children=children)] if len(whole) == 1 else list(children)
 
 
-def _light_of_cell(light: AreaLight, outline: np.ndarray, cell) -> list[AreaLight]:
+def _light_of_cell(light: Light, outline: np.ndarray, cell) -> list[Light]:
     """The part of `light` in `cell`. `outline` (V, 2) is that of a light that is no rectangle."""
     size = (cell[1] - cell[0]) * (cell[3] - cell[2])
-    inside = outline if light.shape in ("SQUARE", "RECTANGLE") else clip_to_cell(outline, cell)
+    inside = outline if isinstance(light, QuadLight) else clip_to_cell(outline, cell)
     share = polygon_area(inside) / size
-    if light.shape in ("SQUARE", "RECTANGLE") or share >= 1.0 - 1e-6:
+    if isinstance(light, QuadLight) or share >= 1.0 - 1e-6:
         return [_rectangle(light, cell)]
     if share <= 1e-9:
         return []
-    if not light.is_profiled:
+    if not light.has_profile:
         whole = _rectangle(light, cell)
-        return [replace(whole, shape="POLYGON", corners=_in_space(light, inside))]
+        return [PolygonLight.like(whole, corners=_in_space(light, inside))]
     # Polygons cannot have a spread, so small rectangles with the same power stand for the edge.
     if max(cell[1] - cell[0], cell[3] - cell[2]) > FOCUSED_EDGE:
         return [piece for half in _halves(cell) for piece in _light_of_cell(light, outline, half)]
@@ -196,21 +196,19 @@ def _halves(cell) -> list[tuple]:
     return [(x0, x1, y0, middle), (x0, x1, middle, y1)]
 
 
-def _rectangle(light: AreaLight, cell) -> AreaLight:
+def _rectangle(light: Light, cell) -> Light:
     x0, x1, y0, y1 = cell
-    return replace(
+    return QuadLight.like(
         light,
-        shape="RECTANGLE",
-        corners=None,
         center=light.center + 0.5 * (x0 + x1) * light.half_u + 0.5 * (y0 + y1) * light.half_v,
         half_u=0.5 * (x1 - x0) * light.half_u,
         half_v=0.5 * (y1 - y0) * light.half_v,
     )
 
 
-def _outline(light: AreaLight) -> np.ndarray:
+def _outline(light: Light) -> np.ndarray:
     """Corners (V, 2) of `light` in units of half_u and half_v."""
-    if light.shape == "POLYGON":
+    if isinstance(light, PolygonLight):
         offset = light.corners - light.center
         axes = np.stack([light.half_u, light.half_v], axis=-1)
         outline = np.linalg.lstsq(axes, offset.T, rcond=None)[0].T
@@ -221,7 +219,7 @@ def _outline(light: AreaLight) -> np.ndarray:
     return np.sqrt(step / np.sin(step)) * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
 
-def _in_space(light: AreaLight, outline: np.ndarray) -> np.ndarray:
+def _in_space(light: Light, outline: np.ndarray) -> np.ndarray:
     corners = light.center + outline[:, :1] * light.half_u + outline[:, 1:] * light.half_v
     mirrored = np.dot(np.cross(light.half_u, light.half_v), light.direction) < 0.0
     return corners[::-1] if mirrored else corners

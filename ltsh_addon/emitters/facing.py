@@ -46,7 +46,7 @@ _RULES = [_disk_rule(*orders) for orders in ORDERS]
 
 @dataclass(frozen=True)
 class FacingDisk:
-    """The disks that Q points see. Corners and half axes have the order of `AreaLight.polygon`."""
+    """The disks that Q points see. Corners and half axes have the order of `Light.polygon`."""
 
     offset: np.ndarray  # (3, Q) from the points to the centers
     half_u: np.ndarray  # (3, Q)
@@ -60,7 +60,7 @@ class FacingDisk:
         """For points from which the center of `light` is at `offset` (3, Q). Their lobes have the `normal` (3, Q)."""
         radius = offset.dtype.type(np.sqrt((light.half_u**2).sum()))
         squared = dot(offset, offset)
-        if light.shape == "BALL":
+        if light.is_sphere:
             inside = squared <= radius * radius
             shrinking = 1.0 - radius * radius / np.where(inside, radius * radius + 1.0, squared)
             shrinking = np.maximum(shrinking, offset.dtype.type(LEAST_SHRINKING))
@@ -153,7 +153,7 @@ def ray_length(light, offset: np.ndarray, directions: np.ndarray) -> np.ndarray:
     squared = dot(offset, offset)
     # Directions that miss the light have no distance; give them one that can be squared.
     least = 1e-9 * np.sqrt(squared) + np.finfo(offset.dtype).tiny
-    if light.shape != "BALL":
+    if not light.is_sphere:
         return squared / np.maximum(along, least)
     rest = light.radius**2 - squared
     root = np.sqrt(np.maximum(rest + along * along, 0.0))
@@ -166,7 +166,7 @@ def emission(light, offset: np.ndarray, directions: np.ndarray) -> np.ndarray | 
     factor = 1.0
     if light.cone is not None:
         factor = cone_factor(light, directions)
-        if light.shape == "BALL":
+        if light.is_sphere:
             factor = np.where(dot(offset, offset) <= light.radius**2, 1.0, factor)
     if light.has_falloff:
         squared = np.square(ray_length(light, offset, directions))
@@ -178,7 +178,7 @@ def emission(light, offset: np.ndarray, directions: np.ndarray) -> np.ndarray | 
 
 def _normals(light, offset, directions):
     """Normals (3, ...) of the places on the light that unit `directions` (3, ...) meet."""
-    if light.shape != "BALL" or light.pattern.by_ray:
+    if not light.is_sphere or light.pattern.by_ray:
         return -directions
     distance = np.sqrt(np.maximum(dot(offset, offset), np.finfo(offset.dtype).tiny))
     axis = offset / distance
@@ -215,7 +215,7 @@ def mean_emission(light, offset: np.ndarray, disk: FacingDisk, lobe: Lobe) -> np
     Where the factor changes over the disk, this is its mean over points of the disk, weighted by the values of the
     lobe.
     """
-    if light.is_even:
+    if light.is_uniform:
         return 1.0
 
     def factors(places, part):

@@ -1,7 +1,7 @@
 """Area lights as samples see them: corners, parts above the horizon, and patches as fine as a lobe needs.
 
 This file starts with what both precisions share. The corners and parts of lights in single and in double precision
-follow. Last come the patches of lights with a detail, textures near and far. Each sample gets the coarsest patches that
+follow. Last come the patches of lights with children, textures near and far. Each sample gets the coarsest patches that
 its lobe cannot resolve; together they are all of the light above its horizons. A patch has the mean radiance of its
 parts. The error of the mean is second order in the size of the patch, in units of the length over which the rest of the
 integrand changes. For diffuse lobes that length is the distance. For specular lobes it is the width of the lobe, or the
@@ -17,7 +17,7 @@ from functools import cached_property
 import numpy as np
 
 from ..lobes.polygon import convex_pieces, dot, split_at_horizon
-from ..scene import AreaLight, SurfaceSamples, round_outline
+from ..scene import Light, PolygonLight, SurfaceSamples, round_outline
 from . import facing, light_profile
 from .facing import FacingDisk
 
@@ -61,12 +61,12 @@ def light_levels(light, corners, position, width):
     The lobes are `width` (Q,) or a number of radians wide, at points with x, y, z in `position` (3, Q). All arrays are
     in double precision, so that both paths make the same decisions.
     """
-    if light.is_profiled:
+    if light.has_profile:
         for effort, chosen in light_profile.efforts(light, position, width):
             if light.is_round:
                 corners = light.polygon(FOCUSED_ROUND_CORNERS[effort.chords > 2])
                 effort = replace(effort, chords=2)
-            for piece in convex_pieces(corners) if light.shape == "POLYGON" else [corners]:
+            for piece in convex_pieces(corners) if isinstance(light, PolygonLight) else [corners]:
                 yield piece, effort, chosen
     elif light.is_round:
         for outline, chosen in round_levels(light, position, width):
@@ -78,7 +78,7 @@ def light_levels(light, corners, position, width):
 def round_levels(light, position, width):
     """Yield (corners (V, 3), chosen (Q',) of the points, None for all) for a round light. Points have x, y, z in
     `position` (3, Q); their lobes are `width` (Q,) or a number of radians wide. All arrays are in double precision."""
-    position = light.origins(position)
+    position = light.viewpoint(position)
     offset = [position[axis] - light.center[axis] for axis in range(3)]
     reach = np.sqrt(max((light.half_u**2).sum(), (light.half_v**2).sum()))
     beyond = np.sqrt(sum(component * component for component in offset)) - reach
@@ -111,7 +111,7 @@ def local_corners(light, corners: np.ndarray, offset: np.ndarray, rows: np.ndarr
             out += np.multiply(v, t, out=product)
             np.add(center, out, out=result[:, number])
         return result
-    if corners.ndim == 3 or light.is_round or light.shape == "POLYGON":
+    if corners.ndim == 3 or light.is_round or isinstance(light, PolygonLight):
         corners = corners if corners.ndim == 3 else (corners - light.center).astype(np.float32)
         for number, corner in enumerate(corners):
             out = _along(rows, corner, scratch("axis", (coordinates, points)), scratch)
@@ -159,9 +159,9 @@ def in_front(samples, light, candidates):
     position = samples.position[candidates]
     ahead = np.ones(len(candidates), bool)
     if not light.is_facing:
-        origins = light.origins(position)
+        origins = light.viewpoint(position)
         ahead = ((origins - center) * direction).sum(axis=1) > off_plane(center.T, np.abs(origins).sum(axis=1))
-    if light.is_facing or light.is_focused:
+    if light.is_facing or light.has_spread:
         ahead &= may_reach(light, position.T)
     allowed = light.receives(samples.receiver, candidates)
     return candidates[ahead if allowed is None else ahead & allowed]
@@ -191,7 +191,7 @@ def has_lobe(samples: SurfaceSamples) -> np.ndarray:
     return np.stack([samples.diffuse_albedo.any(axis=1), np.logical_or.reduce([term.any(axis=1) for term in terms])])
 
 
-def lights_that_reach_nothing(samples: SurfaceSamples, lights: tuple[AreaLight, ...]) -> list[str]:
+def lights_that_reach_nothing(samples: SurfaceSamples, lights: tuple[Light, ...]) -> list[str]:
     """Names of the `lights` of which no part is in front of a sample and above the horizons of one of its lobes.
 
     Lights of one name are one light. After MOST_PAIRS pairs, all other lights count as seen.
@@ -204,7 +204,7 @@ def lights_that_reach_nothing(samples: SurfaceSamples, lights: tuple[AreaLight, 
             if light.name in reached:
                 continue
             # How far the box around the samples extends in front of the light.
-            ahead = ((light.origins(ends) - light.center) * light.direction).max(axis=0).sum()
+            ahead = ((light.viewpoint(ends) - light.center) * light.direction).max(axis=0).sum()
             if light.is_facing or ahead > 0.0:
                 pairs += len(part)
                 if pairs > MOST_PAIRS or _reaches(light, part, lobes):
@@ -212,7 +212,7 @@ def lights_that_reach_nothing(samples: SurfaceSamples, lights: tuple[AreaLight, 
     return [name for name in dict.fromkeys(light.name for light in lights) if name not in reached]
 
 
-def _reaches(light: AreaLight, samples: SurfaceSamples, lobes: np.ndarray) -> bool:
+def _reaches(light: Light, samples: SurfaceSamples, lobes: np.ndarray) -> bool:
     """True if a corner of the light is above both horizons of one of the `lobes` (2, P)."""
     diffuse = lobes[0] & light.affects_diffuse, (samples.diffuse_normal, samples.smooth_normal)
     specular = lobes[1] & light.affects_specular, (samples.normal, samples.geometric_normal)
@@ -221,7 +221,7 @@ def _reaches(light: AreaLight, samples: SurfaceSamples, lobes: np.ndarray) -> bo
         candidates = np.flatnonzero(lobe)
         for start in range(0, len(candidates), CHUNK):
             index = in_front(samples, light, candidates[start : start + CHUNK])
-            offset = corners - light.origins(samples.position[index])
+            offset = corners - light.viewpoint(samples.position[index])
             heights = [(offset * normal[index]).sum(axis=-1).max(axis=0) for normal in horizons]
             if light.is_facing:
                 offset = light.center - samples.position[index]
@@ -264,9 +264,9 @@ def visible_parts(framed: Framed, light, corners, candidates, second_normal=None
         offset = disk.corners(round_outline(len(corners)))
     else:
         corners = corners[:, None, :] if corners.ndim == 2 else corners[:, index]
-        offset = (corners - light.origins(samples.position[index])).transpose(2, 0, 1)
+        offset = (corners - light.viewpoint(samples.position[index])).transpose(2, 0, 1)
     local = to_local(frame[:, :, index], offset)
-    if light.is_profiled:
+    if light.has_profile:
         local = np.concatenate([local, to_local(light_profile.plane_axes(light), offset)])
     parts = [(slice(None), local)]
     if second_normal is not None:
@@ -292,7 +292,7 @@ def light_view(framed: Framed, light, index, to_lobe) -> light_profile.LightView
     """The view of a profiled light from the points `index`. The first three coordinates are those of the lobe, from
     to_lobe(local vectors (3, Q)); the others are local."""
     axes = framed.frame[:, :, index]
-    offset = (light.center - light.origins(framed.samples.position[index])).T
+    offset = (light.center - light.viewpoint(framed.samples.position[index])).T
 
     def along(vector):
         local = to_local(axes, np.broadcast_to(vector[:, None], offset.shape))
@@ -303,10 +303,10 @@ def light_view(framed: Framed, light, index, to_lobe) -> light_profile.LightView
 
 @dataclass(frozen=True)
 class PatchTree:
-    """The N patches of a light with a detail; the first is the whole light. Those of distant lights are rectangles in
+    """The N patches of a light with children; the first is the whole light. Those of distant lights are rectangles in
     single precision."""
 
-    lights: tuple[AreaLight, ...]  # (N,)
+    lights: tuple[Light, ...]  # (N,)
     center: np.ndarray  # (3, N)
     half_u: np.ndarray  # (3, N)
     half_v: np.ndarray  # (3, N)
@@ -319,8 +319,8 @@ class PatchTree:
     count: np.ndarray  # (N,) number of parts
 
     @classmethod
-    def of(cls, light: AreaLight) -> PatchTree:
-        """The patches of a light with a detail, built once."""
+    def of(cls, light: Light) -> PatchTree:
+        """The patches of a light with children, built once."""
         return kept("_patch_tree", [light], cls._made)
 
     @classmethod
@@ -329,8 +329,8 @@ class PatchTree:
         patches = [light]
         for patch in patches:  # the list grows meanwhile
             first.append(len(patches))
-            patches += patch.detail
-        count, first = np.array([len(patch.detail) for patch in patches]), np.array(first)
+            patches += patch.children
+        count, first = np.array([len(patch.children) for patch in patches]), np.array(first)
         center, half_u, half_v, radiance = (
             np.array([getattr(patch, name) for patch in patches]).T
             for name in ("center", "half_u", "half_v", "radiance")
@@ -420,12 +420,12 @@ class PatchTree:
         """Yield (columns (Q,) of `index`, patches (Q,)): the coarsest patches that the lobes of the samples `index`
         (M,) cannot resolve. Distant patches below any of the `horizons`, normals (P, 3), are left out."""
         light = self.lights[0]
-        narrowest = np.tan(0.5 * light.spread) if light.is_focused else 1.0
+        narrowest = np.tan(0.5 * light.spread) if light.has_spread else 1.0
         for start in range(0, len(index), PATCH_CHUNK):
             part = index[start : start + PATCH_CHUNK]
             normals = [np.ascontiguousarray(normal[part].T, np.float32) for normal in horizons]
             peak = _Peaks(samples, part) if is_specular else None
-            origin = np.ascontiguousarray(light.origins(samples.position[part]).T)
+            origin = np.ascontiguousarray(light.viewpoint(samples.position[part]).T)
             column, patch = np.arange(len(part)), np.zeros(len(part), np.intp)
             while len(column):
                 toward = (self.center[:, patch] - origin[:, column]).astype(np.float32)
@@ -448,7 +448,7 @@ class PatchTree:
                 column, patch = np.repeat(column, count), np.repeat(self.first[patch], count) + number
 
 
-def fitting_patches(light: AreaLight, samples: SurfaceSamples, specular: bool) -> Iterator[tuple]:
+def fitting_patches(light: Light, samples: SurfaceSamples, specular: bool) -> Iterator[tuple]:
     """Yield (index (Q,), lights): the coarsest patches of a near `light` that the lobes of the samples `index` cannot
     resolve. Each sample gets the whole light."""
     if len(samples) == 0:
@@ -498,8 +498,8 @@ def _largest_sizes(area, radiance, first, count, is_distant) -> np.ndarray:
 
 def kept(name, lights, made):
     """The result of made(lights). It is kept with the parts of the first light, which its copies share."""
-    key = [light.detail[0] for light in lights], [(*light.center, *light.radiance) for light in lights]
-    kept = vars(lights[0].detail[0])
+    key = [light.children[0] for light in lights], [(*light.center, *light.radiance) for light in lights]
+    kept = vars(lights[0].children[0])
     old = kept.get(name)
     is_same = old is not None and old[0][1] == key[1] and all(map(lambda one, two: one is two, old[0][0], key[0]))
     if not is_same:

@@ -4,7 +4,7 @@ There are two methods. In double precision, `layers` integrates over parts of th
 `ConeRegions` sums over points of the light wherever few of them suffice, at a tenth to a hundredth of the cost.
 
 Let d be the distance of the shading point from the light's plane, and r the distance in that plane from the foot of
-the point. The factors of `AreaLight` are a profile p(r). The profile of a spread is (R - r)+ / (d (tan h - h)), where
+the point. The factors of a `FlatLight` are a profile p(r). The profile of a spread is (R - r)+ / (d (tan h - h)), where
 R = d tan h and h is half the spread. The profile of a falloff is a function of t = sqrt(d^2 + r^2). Integration by
 parts turns any lobe integral over the light into one over disks around the foot,
 
@@ -23,7 +23,7 @@ from functools import cache
 import numpy as np
 
 from ..lobes.polygon import dot
-from ..scene import AREA_LIGHT_SHAPES
+from ..scene import EllipseLight, QuadLight
 
 # Half angle in rad up to which Cycles takes the series of tan h - h.
 _SERIES = 0.05
@@ -62,7 +62,7 @@ class Profile:
     @classmethod
     def of(cls, light) -> Profile:
         """The profile of `light`."""
-        tangent, share = cone(light.spread) if light.is_focused else (_WIDE_OPEN, _WIDE_OPEN)
+        tangent, share = cone(light.spread) if light.has_spread else (_WIDE_OPEN, _WIDE_OPEN)
         return cls(tangent, share, light.falloff, light.smooth)
 
     def at(self, radius, distance):
@@ -419,7 +419,7 @@ class ConeRegions:
     def suit(light) -> bool:
         """Whether the light is a parallelogram or an ellipse as returned by `upright`, and not distant."""
         is_upright = not (light.is_round and has_shear(light))
-        return is_upright and not light.is_distant and light.shape in AREA_LIGHT_SHAPES
+        return is_upright and isinstance(light, (QuadLight, EllipseLight))
 
     def _turns(self, dtype):
         """Unit vectors (2, P) along s. They follow the longer side of a long light. For other round lights they point

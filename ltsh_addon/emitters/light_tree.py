@@ -17,13 +17,13 @@ near nodes. (Walter et al. 2005, "Lightcuts", with tiles instead of points, doi:
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
 
 from ..lobes.polygon import dot
-from ..scene import AreaLight
+from ..scene import Light, QuadLight
 from . import small_lights
 from .tails import NEAR_RADII
 
@@ -89,7 +89,7 @@ class LightTree:
 
     @classmethod
     def of(cls, lights) -> LightTree:
-        """The tree of AreaLights whose radiance is positive."""
+        """The tree of lights whose radiance is positive."""
         center, area, covariance, diagonal = small_lights.all_of(lights)
         radiance = np.array([light.radiance for light in lights])
         brightness, size = radiance.mean(axis=1), np.linalg.norm(area, axis=1)
@@ -154,8 +154,8 @@ class _Sums:
         return found
 
 
-def stand_ins(lights, most: int) -> tuple[list[AreaLight], np.ndarray]:
-    """Rectangles that stand for many flat AreaLights with an area, and the share (N,) of each that shines. Each stands
+def stand_ins(lights, most: int) -> tuple[list[Light], np.ndarray]:
+    """Rectangles that stand for many flat lights with an area, and the share (N,) of each that shines. Each stands
     for neighbors that face alike. There are N = `most`, a power of two and at most as many as there are lights."""
     center, area, covariance, _ = small_lights.all_of(lights)
     size = np.linalg.norm(area, axis=1)
@@ -181,7 +181,7 @@ def stand_ins(lights, most: int) -> tuple[list[AreaLight], np.ndarray]:
     rows = zip(middle + origin, half_u[:, None] * axes[:, :, 2], half_v[:, None] * axes[:, :, 1], axis, strict=True)
     share = whole / (4.0 * half_u * half_v)
     radiance *= share[:, None]
-    like = replace(lights[0], shape="RECTANGLE", corners=None)
+    like = QuadLight.like(lights[0])
     names = ("center", "half_u", "half_v", "direction")
     found = [
         like.altered(**dict(zip(names, row, strict=True)), radiance=own)

@@ -1,4 +1,4 @@
-"""The sky, that is distant lights with a detail, as a map of all directions, for single precision.
+"""The sky, that is `SkyLight`s with children, as a map of all directions, for single precision.
 
 A lobe is integrated over a fixed number of directions that cover it evenly, whatever its width; each gets the mean of
 the map around it (Krivanek and Colbert 2008, "Real-time Shading with Filtered Importance Sampling",
@@ -47,7 +47,7 @@ class SkyMap:
 
     @classmethod
     def of(cls, lights) -> SkyMap:
-        """The map of distant AreaLights with a detail, made once."""
+        """The map of `SkyLight`s with children, made once."""
         return kept("_sky_map", lights, cls._made)
 
     @classmethod

@@ -37,7 +37,7 @@ class SmallLight:
 
     @classmethod
     def of(cls, light) -> SmallLight:
-        """For an AreaLight."""
+        """For an Light."""
         area = light.area_vector * np.copysign(1.0, light.area_vector @ light.direction)
         u, v = light.half_u, light.half_v
         diagonal = max(((u + v) ** 2).sum(), ((u - v) ** 2).sum())

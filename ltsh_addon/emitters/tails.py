@@ -36,11 +36,11 @@ class SeenLight:
 
     @classmethod
     def of(cls, light, offset, toward) -> SeenLight:
-        """For an AreaLight or a `float64.LightOfEachSample`, in the precision of `offset`."""
+        """For an Light or a `float64.LightOfEachSample`, in the precision of `offset`."""
         vectors = np.stack([light.half_u + light.half_v, light.half_u - light.half_v, light.area_vector])
         vectors = vectors[..., None] if vectors.ndim == 2 else vectors.transpose(0, 2, 1)
         squares = (vectors * vectors).sum(axis=1).astype(offset.dtype)
-        profile = Profile.of(light) if light.is_profiled else None
+        profile = Profile.of(light) if light.has_profile else None
         return cls(offset, toward, vectors[:2].astype(offset.dtype), squares[:2], np.sqrt(squares[2]), profile)
 
     @classmethod

@@ -237,7 +237,7 @@ def load_table(name_or_path: str | Path) -> LookupTable:
     """A shipped table ("ltc", "ltsh2", "ltsh4" or "ltsh4c"), or the one in a .npz file. Raises TableError."""
     path = Path(name_or_path)
     if str(name_or_path) in SHIPPED_TABLES:
-        path = Path(__file__).resolve().parents[2] / "tables" / f"{name_or_path}.npz"
+        path = _tables_folder() / f"{name_or_path}.npz"
     if not path.is_file():
         raise TableError(f"lookup table {name_or_path}: no such file or table; shipped are {', '.join(SHIPPED_TABLES)}")
     try:
@@ -253,6 +253,13 @@ def load_table(name_or_path: str | Path) -> LookupTable:
     if "bend" in metadata:
         known["bend"] = tuple(float(entry) for entry in metadata["bend"])
     return LookupTable(name=metadata.get("name", path.stem), metadata=metadata, **known, **arrays)
+
+
+def _tables_folder() -> Path:
+    """The folder of the shipped tables: inside an installed Python package, else beside it, as in checkout and zip."""
+    package = Path(__file__).resolve().parents[1]
+    inside = package / "tables"
+    return inside if inside.is_dir() else package.with_name("tables")
 
 
 def _check_metadata(metadata) -> None:

@@ -365,7 +365,7 @@ def _light_reports(lights) -> list[dict]:
             if len(faces) > 1:
                 areas = np.array([np.linalg.norm(light.area_vector) for light in faces])
                 radiance = areas @ np.array([light.radiance for light in faces]) / areas.sum()
-            patches = sum(len(light.patches) for light in faces)
+            patches = sum(len(light.leaves) for light in faces)
             entry = dict(zip(("name", "shape", "group"), kind, strict=True))
             entries.append({**entry, "radiance": radiance.tolist(), "patches": patches})
     return entries

@@ -25,9 +25,9 @@ from ..scene import (
     REFERENCE,
     SHIPPED_TABLES,
     TECHNIQUES,
-    AreaLight,
     Cancelled,
     Film,
+    Light,
     Progress,
     SurfaceSamples,
 )
@@ -100,7 +100,7 @@ class ShadowTracer:
     Positions of the occluders are relative to `origin` (3,) in m; lights and samples are in world space.
     """
 
-    def __init__(self, occluders: visibility.Occluders, lights: Sequence[AreaLight], origin: np.ndarray):
+    def __init__(self, occluders: visibility.Occluders, lights: Sequence[Light], origin: np.ndarray):
         self._occluders, self._origin = occluders, origin
         self._lights = [light.moved(-origin) for light in lights]
 
@@ -154,7 +154,7 @@ def trace_shadows(extraction, passes: Sequence[str], rays: int, progress: Progre
 
 def shade_lights(
     samples: SurfaceSamples,
-    lights: Sequence[AreaLight],
+    lights: Sequence[Light],
     table: str | shading.LookupTable | shading.OwnTechnique,
     passes: Sequence[str],
     shadowing: Sequence[Shadows | None] = (None,),
@@ -213,7 +213,7 @@ def shade_lights(
     return [shading.Shading(total.get("specular"), total.get("diffuse"), error) for total in sums]
 
 
-def light_groups(lights: Iterable[AreaLight]) -> tuple[str, ...]:
+def light_groups(lights: Iterable[Light]) -> tuple[str, ...]:
     """The names of the light groups of `lights` in the order of their first lights, "" for none; at least one name."""
     return tuple(dict.fromkeys(light.group for light in lights)) or ("",)
 

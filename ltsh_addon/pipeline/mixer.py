@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from ..files import replacing
-from ..scene import AreaLight, Progress, error_line, listed
+from ..scene import Light, Progress, error_line, listed
 from .lighting import Shadows, load_tables, shade_lights
 from .relight import GRAIN, RelightData, color_of
 
@@ -45,7 +45,7 @@ class MixerRow:
     lights: tuple[str, ...]  # names; empty: depends on no light
     color: tuple[float, float, float] = (1.0, 1.0, 1.0)  # of their light, the brightest channel 1
     settings: dict[str, list[float]] = field(default_factory=dict)  # by name, of lights that are light objects
-    light: dict | None = None  # record of the only light, without detail and pattern; None: others
+    light: dict | None = None  # record of the only light, without children and pattern; None: others
     note: str = ""
     group: str = ""  # light group of whose bounced light the row has a share
     share: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of this bounced light, per channel
@@ -124,7 +124,7 @@ def light_pictures(data: RelightData, progress: Progress | None = None) -> Light
     return LightPictures(tuple(rows), layers, alpha, facts)
 
 
-def _members(lights: Sequence[AreaLight], shadows: Shadows | None, most: int = MOST_ROWS) -> list[list[int]]:
+def _members(lights: Sequence[Light], shadows: Shadows | None, most: int = MOST_ROWS) -> list[list[int]]:
     """Numbers of the lights of each of at most `most` rows.
 
     Lights of one name share a row, and so do lights that share their rays. The weakest rows are merged where needed.
@@ -161,7 +161,7 @@ def _row(extraction, numbers: list[int]) -> MixerRow:
     if len(names) > 1:
         note = WEAKEST if len({tuple(light.radiance) for light in lights}) > 1 else SHARED
         return MixerRow(f"{names[0]} and {len(names) - 1} more", names, color, settings, note=note)
-    plain = len(lights) == 1 and not lights[0].detail and lights[0].pattern is None
+    plain = len(lights) == 1 and not lights[0].children and lights[0].pattern is None
     return MixerRow(names[0], names, color, settings, lights[0].record() if plain else None)
 
 

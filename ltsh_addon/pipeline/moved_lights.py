@@ -19,7 +19,7 @@ import numpy as np
 
 from ..cycles.gbuffer import SHADOW_LOOSENESS, one_shading, with_one_shadow
 from ..emitters.light_polygons import has_lobe
-from ..scene import AreaLight, Cancelled, Film, SurfaceSamples
+from ..scene import Cancelled, Film, Light, SurfaceSamples
 from ..visibility import BLOCK_SAMPLES, Company, Occluders, Setting, open_tracer, task_of_lights
 from .lighting import load_tables, rays_of_samples
 from .mixer import MixerRow, bounced_light
@@ -141,7 +141,7 @@ class MovedLights:
 
         return cls(read)
 
-    def get_ready(self, light: AreaLight) -> None:
+    def get_ready(self, light: Light) -> None:
         """Start, once and in a thread, what the first picture needs; `light` is any light of the picture."""
         if not self._is_ready:
             pictures = self.pictures(light)
@@ -152,7 +152,7 @@ class MovedLights:
         with suppress(Exception), closing(pictures):
             next(pictures)
 
-    def picture(self, light: AreaLight, row: MixerRow | None = None) -> np.ndarray:
+    def picture(self, light: Light, row: MixerRow | None = None) -> np.ndarray:
         """The picture (H, W, 3) of one light, plus the unchanged bounced light of its `row`. Raises SceneError."""
         turn = self._next_turn()
         with self._lock:
@@ -162,7 +162,7 @@ class MovedLights:
                 pass
             return self._image(values, row)
 
-    def pictures(self, light: AreaLight, row: MixerRow | None = None) -> Iterator[tuple[np.ndarray, float]]:
+    def pictures(self, light: Light, row: MixerRow | None = None) -> Iterator[tuple[np.ndarray, float]]:
         """Yield the result of `picture`, first as a draft and at last complete, and the fraction that is done."""
         self._is_ready = True
         return self._pictures(light, row, self._next_turn())
@@ -195,7 +195,7 @@ class MovedLights:
         if turn != self._turn:
             raise Cancelled("the light has moved again, or the picture was stopped")
 
-    def _prepared(self, light: AreaLight, turn: int):
+    def _prepared(self, light: Light, turn: int):
         """The light relative to the origin of the samples, and its shadow task; None without occluders."""
         self._check(turn)
         if self._company is None:

@@ -20,8 +20,8 @@ from ..files import replacing
 from ..imaging.exr import COMBINED, REST, layer_name, parse_layer_name
 from ..scene import (
     REFERENCE,
-    AreaLight,
     Film,
+    Light,
     Progress,
     SurfaceSamples,
     error_line,
@@ -270,7 +270,7 @@ class _FinishedComparison(Comparison):
         return {COMBINED: combined, **planes, REST: self.rest}
 
 
-def _changed_rest(data: RelightData, lights: Sequence[AreaLight], table, shaded, progress) -> np.ndarray:
+def _changed_rest(data: RelightData, lights: Sequence[Light], table, shaded, progress) -> np.ndarray:
     """Cycles' rest (H, W, 4) under the changed `lights`: the bounced light of a group scales with its direct light.
 
     `shaded` is the direct light of the changed lights by `table`.
@@ -301,7 +301,7 @@ def _light_of_group(data: RelightData, shaded, group: str) -> np.ndarray:
     return sum((data.shown(name) * image).sum(axis=(0, 1)) for name, image in images.items())
 
 
-def others_muted(lights: Sequence[AreaLight], solo: Sequence[str]) -> list[LightChange]:
+def others_muted(lights: Sequence[Light], solo: Sequence[str]) -> list[LightChange]:
     """Changes that mute all lights except those called `solo`; none where `solo` is empty.
 
     Raises ValueError for an unknown light.
@@ -326,7 +326,7 @@ def _split_at_horizons(samples: SurfaceSamples) -> int:
     return int((same[0] & same[1] & same[2] & ~same[3]).sum())
 
 
-def _check_shared(data: RelightData, lights: Sequence[AreaLight]) -> None:
+def _check_shared(data: RelightData, lights: Sequence[Light]) -> None:
     """Raise ValueError where lights that share their shadow rays are changed differently."""
     before = data.extraction.lights
     for first, *others in data.shadows.numbers:
@@ -341,7 +341,7 @@ def _check_shared(data: RelightData, lights: Sequence[AreaLight]) -> None:
                 )
 
 
-def changed_lights(lights: Sequence[AreaLight], changes: Sequence[LightChange]) -> tuple[AreaLight, ...]:
+def changed_lights(lights: Sequence[Light], changes: Sequence[LightChange]) -> tuple[Light, ...]:
     """`lights` with all `changes`. Raises ValueError for an unknown light."""
     names = list(dict.fromkeys(light.name for light in lights))
     changed = list(lights)
@@ -352,7 +352,7 @@ def changed_lights(lights: Sequence[AreaLight], changes: Sequence[LightChange]) 
     return tuple(changed)
 
 
-def _tint(lights: list[AreaLight], change: LightChange) -> np.ndarray:
+def _tint(lights: list[Light], change: LightChange) -> np.ndarray:
     """Factor (3,) of the radiance that gives the `lights` the color of `change`. Raises ValueError."""
     if change.color is None:
         return np.ones(3)
@@ -363,7 +363,7 @@ def _tint(lights: list[AreaLight], change: LightChange) -> np.ndarray:
     return tint(color, change.color)
 
 
-def color_of(lights: Sequence[AreaLight]) -> np.ndarray:
+def color_of(lights: Sequence[Light]) -> np.ndarray:
     """The color (3,) of the mean radiance of `lights`, its brightest channel 1; white where they are dark."""
     weights = [np.linalg.norm(light.area_vector) for light in lights]
     mean = np.average([light.radiance for light in lights], axis=0, weights=weights)
@@ -375,6 +375,6 @@ def tint(before: np.ndarray, color: Sequence[float]) -> np.ndarray:
     return np.divide(color, before, out=np.zeros(3), where=np.asarray(before) != 0.0)
 
 
-def _scaled(light: AreaLight, factor: np.ndarray) -> AreaLight:
-    detail = tuple(_scaled(patch, factor) for patch in light.detail)
-    return replace(light, radiance=light.radiance * factor, detail=detail)
+def _scaled(light: Light, factor: np.ndarray) -> Light:
+    children = {"children": tuple(_scaled(child, factor) for child in light.children)} if light.children else {}
+    return replace(light, radiance=light.radiance * factor, **children)

@@ -1,26 +1,29 @@
-"""Lights, kind by kind."""
+"""Lights: a class for each kind.
+
+| class | what it is |
+|---|---|
+| `QuadLight`, `EllipseLight` | flat, one-sided lights: Blender's area lights |
+| `PolygonLight` | a flat, one-sided light: a polygon of a glowing mesh |
+| `PointLight` | a sphere, or a disk that faces every point: Blender's point lights |
+| `SpotLight` | a `PointLight` with a cone: Blender's spot lights |
+| `SunLight`, `SkyLight` | distant lights: a disk (the sun), and a rectangle of the sky or world |
+
+A textured light, and a side of the sky, is a tree: its `children` are finer lights, each of one radiance.
+"""
 
 from __future__ import annotations
 
 import base64
 import itertools
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
-from functools import cached_property
+from dataclasses import dataclass, field, fields
+from functools import cache, cached_property
+from typing import ClassVar
 
 import numpy as np
 
 # FARTHEST: the largest distance or size in m. Squares of much larger numbers overflow single precision.
 FARTHEST = 1e15
-
-
-AREA_LIGHT_SHAPES = ("SQUARE", "RECTANGLE", "DISK", "ELLIPSE")  # shapes of Blender's area lights
-
-
-FACING_SHAPES = ("BALL", "FACING_DISK")  # shapes of Blender's point and spot lights
-
-
-LIGHT_SHAPES = (*AREA_LIGHT_SHAPES, *FACING_SHAPES, "POLYGON")
 
 
 @dataclass(frozen=True)
@@ -60,29 +63,18 @@ class Pattern:
 
 
 @dataclass(frozen=True)
-class AreaLight:
-    """A one-sided, uniformly emitting, flat area light, or one that looks flat from every point.
+class Light:
+    """What all lights have.
 
-    Surface: ``center + s * half_u + t * half_v`` with |s|, |t| <= 1 for SQUARE and RECTANGLE, and s^2 + t^2 <= 1 for
-    DISK and ELLIPSE. A POLYGON is the area inside `corners`, in the plane of center, half_u and half_v; the half axes
-    tell its extent.
-
-    Spread: a `spread` below pi focuses the light as in Cycles. The radiance is multiplied by
-    max(0, (tan h - tan theta) / (tan h - h)), h = spread / 2, theta the angle from `direction` at the light.
-
-    Falloff: at the distance t the radiance is multiplied by t^`falloff` t^2 / (`smooth` + t^2), as by Blender's Light
-    Falloff node: 0 is quadratic, 1 linear, 2 constant.
-
-    Facing lights: a BALL has the radius |half_u| = |half_v|. A FACING_DISK is a disk with that radius which turns its
-    front to every point. Directions of the half axes and `direction` mean nothing for these two. They may have a
-    `cone` and a `pattern`, but no spread.
-
-    Distant lights: a light that `is_distant` is infinitely far away. Its center, half_u, half_v and corners are
-    directions toward it, of any length, the same for every point.
+    Surface: ``center + s * half_u + t * half_v``, with |s|, |t| <= 1, or s^2 + t^2 <= 1 for kinds that are `is_round`.
     """
 
+    SHAPES: ClassVar[tuple[str, ...]] = ()  # the shapes of this kind
+    is_round: ClassVar[bool] = False  # the outline is an ellipse
+    is_facing: ClassVar[bool] = False  # it looks the same from every side (`emitters/facing.py`)
+    is_distant: ClassVar[bool] = False  # it is infinitely far away
+
     name: str
-    shape: str  # one of LIGHT_SHAPES
     center: np.ndarray  # (3,) m
     half_u: np.ndarray  # (3,) m
     half_v: np.ndarray  # (3,) m
@@ -91,119 +83,82 @@ class AreaLight:
     group: str = ""
     affects_diffuse: bool = True
     affects_specular: bool = True
-    corners: np.ndarray | None = None  # (V, 3) m, a simple polygon, either way around; POLYGON only
-    spread: float = np.pi  # rad, full angle of the cone into which the light shines
     receivers: tuple[int, ...] | None = None  # values of SurfaceSamples.receiver that it lights, None: all
-    detail: tuple[AreaLight, ...] = ()  # finer lights that together are this one
-    falloff: int = 0  # power of the distance in m
-    smooth: float = 0.0  # m^2
-    is_distant: bool = False
-    cone: SpotCone | None = None
-    pattern: Pattern | None = None  # for a FACING_DISK always by the direction in which the light travels
+    shape: str = ""  # one of SHAPES
+
+    # Neutral values of fields that not all kinds have. They come last, because kinds that have them inherit the order.
+    spread: ClassVar[float] = np.pi
+    falloff: ClassVar[int] = 0
+    smooth: ClassVar[float] = 0.0
+    children: ClassVar[tuple[Light, ...]] = ()
+    corners: ClassVar[np.ndarray | None] = None
+    cone: ClassVar[SpotCone | None] = None
+    pattern: ClassVar[Pattern | None] = None
 
     def __post_init__(self):
-        if self.shape not in LIGHT_SHAPES:
-            raise ValueError(f"light {self.name!r}: shape is {self.shape!r}, expected one of {', '.join(LIGHT_SHAPES)}")
-        for name in ("center", "half_u", "half_v", "direction", "radiance"):
+        if self.shape not in self.SHAPES:
+            expected = ", ".join(self.SHAPES)
+            raise ValueError(f"light {self.name!r}: shape is {self.shape!r}, expected one of {expected}")
+        for name in _VECTORS:
             value = np.asarray(getattr(self, name), dtype=np.float64)
             if value.shape != (3,) or not np.isfinite(value).all():
                 raise ValueError(f"light {self.name!r}: {name} is {value!r}, expected three finite numbers")
             object.__setattr__(self, name, value)
-        if (self.shape == "POLYGON") != (self.corners is not None):
-            found = "left out" if self.corners is None else "given"
-            raise ValueError(
-                f"light {self.name!r}: shape {self.shape} and corners {found}, "
-                "expected corners for POLYGON and for no other shape"
-            )
-        if self.corners is not None:
-            corners = np.asarray(self.corners, dtype=np.float64)
-            if corners.ndim != 2 or corners.shape[1] != 3 or len(corners) < 3 or not np.isfinite(corners).all():
-                raise ValueError(f"light {self.name!r}: corners {corners!r}, expected (V, 3) finite numbers, V >= 3")
-            object.__setattr__(self, "corners", corners)
-        if not 0.0 < self.spread <= np.pi + 1e-6:
-            raise ValueError(f"light {self.name!r}: spread is {self.spread!r} rad, expected more than 0 and at most pi")
-        if self.shape in ("POLYGON", *FACING_SHAPES) and self.is_focused:
-            raise ValueError(f"light {self.name!r}: spread is {self.spread!r} rad, expected pi for shape {self.shape}")
-        if isinstance(self.cone, dict):
-            object.__setattr__(self, "cone", SpotCone(**self.cone))
-        if isinstance(self.pattern, dict):
-            object.__setattr__(self, "pattern", Pattern(**self.pattern))
-        if not self.is_facing and (self.cone is not None or self.pattern is not None):
-            raise ValueError(f"light {self.name!r}: {self.shape} has a cone or pattern, expected {FACING_SHAPES}")
-        if self.is_facing and (self.is_distant or self.detail):
-            raise ValueError(f"light {self.name!r}: shape {self.shape} is expected nearby, and without detail")
+        if self.receivers is not None:
+            object.__setattr__(self, "receivers", tuple(int(number) for number in self.receivers))
         if self.falloff not in (0, 1, 2) or not 0.0 <= self.smooth < np.inf:
             raise ValueError(
                 f"light {self.name!r}: falloff is {self.falloff!r} and smooth is {self.smooth!r}, expected 0, 1 or 2 "
                 "and a finite number that is not negative"
             )
-        if self.is_distant and self.is_profiled:
-            raise ValueError(f"light {self.name!r}: it is distant, expected neither spread nor falloff")
-        if self.receivers is not None:
-            object.__setattr__(self, "receivers", tuple(int(number) for number in self.receivers))
-        detail = tuple(part if isinstance(part, AreaLight) else AreaLight(**part) for part in self.detail)
-        object.__setattr__(self, "detail", detail)
+        if type(self.children) is not tuple:
+            object.__setattr__(self, "children", tuple(self.children))
 
-    @property
-    def patches(self) -> tuple[AreaLight, ...]:
-        """The finest lights that together are this one: the leaves of `detail`, or this light where it has none."""
-        return tuple(patch for part in self.detail for patch in part.patches) if self.detail else (self,)
+    @classmethod
+    def like(cls, light: Light, **changes) -> Light:
+        """A light of this kind: the fields `changes`, and all others that `light` has too."""
+        names = [name for name in _field_names(cls) if name in _field_names(type(light)) and name != "shape"]
+        return cls(**{**{name: getattr(light, name) for name in names}, **changes})
 
-    def moved(self, offset: np.ndarray) -> AreaLight:
-        """The same light moved by `offset` (3,) in m; distant lights stay as they are."""
-        if self.is_distant or not np.any(offset):
-            return self
-        corners = None if self.corners is None else self.corners + offset
-        detail = tuple(part.moved(offset) for part in self.detail)
-        return self.altered(center=self.center + offset, corners=corners, detail=detail)
-
-    def altered(self, **changes) -> AreaLight:
+    def altered(self, **changes) -> Light:
         """A copy with the fields `changes`, unchecked: `dataclasses.replace` takes too long for 100,000 lights."""
-        light = object.__new__(AreaLight)
-        light.__dict__.update({name: self.__dict__[name] for name in _LIGHT_FIELDS}, **changes)
+        light = object.__new__(type(self))
+        light.__dict__.update({name: self.__dict__[name] for name in _field_names(type(self))}, **changes)
         return light
 
-    def origins(self, position: np.ndarray) -> np.ndarray:
+    def moved(self, offset: np.ndarray) -> Light:
+        """The same light moved by `offset` (3,) in m; distant lights stay as they are."""
+        return self.altered(center=self.center + offset) if np.any(offset) else self
+
+    def viewpoint(self, position: np.ndarray) -> np.ndarray:
         """What to subtract from the light's vectors at `position` (..., 3): that position; zero for distant lights."""
-        return np.zeros_like(position) if self.is_distant else position
+        return position
 
     def record(self) -> dict:
-        """This light as a JSON-able dict; AreaLight(**record) restores it."""
-        values = {item.name: getattr(self, item.name) for item in fields(self)}
-        record = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in values.items()}
+        """This light as a JSON-able dict; `light_of` restores it."""
+        values = {key: getattr(self, name) for key, name in _RECORD.items()}
+        record = {key: value.tolist() if isinstance(value, np.ndarray) else value for key, value in values.items()}
         if self.cone is not None:
             record["cone"] = {**vars(self.cone), "axes": self.cone.axes.tolist()}
         if self.pattern is not None:
-            own = self.pattern
-            record["pattern"] = {**vars(own), "axes": own.axes.tolist(), "values": own.values.tolist()}
-        return {**record, "detail": [part.record() for part in self.detail]}
+            arrays = {name: getattr(self.pattern, name).tolist() for name in ("axes", "values")}
+            record["pattern"] = {**vars(self.pattern), **arrays}
+        return {**record, "detail": [child.record() for child in self.children]}
+
+    @property
+    def leaves(self) -> tuple[Light, ...]:
+        """The finest lights that together are this one: this light itself where it has no children."""
+        return tuple(leaf for child in self.children for leaf in child.leaves) if self.children else (self,)
 
     @property
     def radius(self) -> float:
         """Radius in m of a sphere around the center that holds the whole light."""
-        if self.is_facing:
-            return float(np.linalg.norm(self.half_u))
         if self.is_round:
             return float(np.hypot(np.linalg.norm(self.half_u), np.linalg.norm(self.half_v)))
         return float(np.linalg.norm(self.polygon() - self.center, axis=1).max())
 
     @property
-    def is_round(self) -> bool:
-        """True for lights with the outline of an ellipse."""
-        return self.shape in ("DISK", "ELLIPSE", *FACING_SHAPES)
-
-    @property
-    def is_facing(self) -> bool:
-        """True for BALL and FACING_DISK, which face every point (see `shading.facing`)."""
-        return self.shape in FACING_SHAPES
-
-    @property
-    def is_even(self) -> bool:
-        """True where all of a facing light is equally bright: no cone, pattern or falloff."""
-        return self.cone is None and self.pattern is None and not self.has_falloff
-
-    @property
-    def is_focused(self) -> bool:
+    def has_spread(self) -> bool:
         """True where the spread matters. Closer to pi its factor is 1, except along the light's plane."""
         return self.spread < np.pi - 1e-5
 
@@ -213,9 +168,9 @@ class AreaLight:
         return self.falloff != 0 or self.smooth > 0.0
 
     @property
-    def is_profiled(self) -> bool:
-        """True for flat lights with a spread or falloff: a point sees some places of them brighter than others."""
-        return (self.is_focused or self.has_falloff) and not self.is_facing
+    def has_profile(self) -> bool:
+        """True for flat lights with a spread or falloff, whose brightness varies (`emitters/light_profile.py`)."""
+        return (self.has_spread or self.has_falloff) and not self.is_facing
 
     def receives(self, receiver: np.ndarray, index=slice(None)) -> np.ndarray | None:
         """Mask (Q,) of the samples at `index` that the light may light, by their `receiver` (P,); None: all."""
@@ -223,12 +178,8 @@ class AreaLight:
 
     @cached_property
     def area_vector(self) -> np.ndarray:
-        """Normal (3,), as long as the area in m^2; `corners`, or half_u to half_v, run counterclockwise around it."""
+        """Normal (3,), as long as the area in m^2; half_u to half_v, or `corners`, run counterclockwise around it."""
         # np.cross of two vectors takes twenty times as long, and there may be 100,000 lights.
-        if self.corners is not None:
-            x, y, z = (self.corners - self.corners[0]).T
-            a, b, c = (np.concatenate([values[1:], values[:1]]) for values in (x, y, z))
-            return 0.5 * np.array([y @ c - z @ b, z @ a - x @ c, x @ b - y @ a])
         (x, y, z), (a, b, c) = self.half_u.tolist(), self.half_v.tolist()
         return (np.pi if self.is_round else 4.0) * np.array([y * c - z * b, z * a - x * c, x * b - y * a])
 
@@ -237,67 +188,261 @@ class AreaLight:
 
         A disk or ellipse becomes an affine image of a regular polygon of `round_vertices` corners, with its own area.
         """
-        corners = self.corners
-        if corners is None:
-            s, t = self._outline(round_vertices)
-            corners = self.center + s[:, None] * self.half_u + t[:, None] * self.half_v
+        corners = self._outline(round_vertices)
         return corners[::-1] if np.dot(self.area_vector, self.direction) < 0.0 else corners
 
     def _outline(self, round_vertices):
-        """Corners s, t (2, V) in units of half_u and half_v."""
-        if self.is_round:
-            return round_outline(round_vertices)
-        return np.array([[-1.0, 1.0, 1.0, -1.0], [-1.0, -1.0, 1.0, 1.0]])
+        """Corners (V, 3), either way around."""
+        s, t = round_outline(round_vertices) if self.is_round else _SQUARE
+        return self.center + s[:, None] * self.half_u + t[:, None] * self.half_v
 
 
-_LIGHT_FIELDS = tuple(item.name for item in fields(AreaLight))
+@dataclass(frozen=True)
+class FlatLight(Light):
+    """A flat light that emits to one side.
 
+    Spread: a `spread` below pi focuses the light as in Cycles. The radiance is multiplied by
+    max(0, (tan h - tan theta) / (tan h - h)), h = spread / 2, theta the angle from `direction` at the light.
+
+    Falloff: at the distance t the radiance is multiplied by t^`falloff` t^2 / (`smooth` + t^2), as by Blender's Light
+    Falloff node: 0 is quadratic, 1 linear, 2 constant.
+    """
+
+    spread: float = np.pi  # rad, full angle of the cone into which the light shines
+    falloff: int = 0  # power of the distance in m
+    smooth: float = 0.0  # m^2
+    children: tuple[Light, ...] = ()  # finer lights that together are this one
+
+    def __post_init__(self):
+        super().__post_init__()
+        if not 0.0 < self.spread <= np.pi + 1e-6:
+            raise ValueError(f"light {self.name!r}: spread is {self.spread!r} rad, expected more than 0 and at most pi")
+
+    def moved(self, offset: np.ndarray) -> Light:
+        """As `Light.moved`, with its children."""
+        light = super().moved(offset)
+        return light.altered(children=tuple(child.moved(offset) for child in self.children)) if self.children else light
+
+
+@dataclass(frozen=True)
+class QuadLight(FlatLight):
+    """A parallelogram with the half sides half_u and half_v: Blender's squares and rectangles."""
+
+    SHAPES: ClassVar = ("SQUARE", "RECTANGLE")
+    shape: str = "RECTANGLE"
+
+
+@dataclass(frozen=True)
+class EllipseLight(FlatLight):
+    """An ellipse with the conjugate half axes half_u and half_v: Blender's disks and ellipses."""
+
+    SHAPES: ClassVar = ("DISK", "ELLIPSE")
+    is_round: ClassVar = True
+    shape: str = "ELLIPSE"
+
+
+@dataclass(frozen=True)
+class PolygonLight(FlatLight):
+    """The area inside `corners`, in the plane of center, half_u and half_v; the half axes tell its extent. It has no
+    spread. A glowing mesh is one such light for each of its polygons."""
+
+    SHAPES: ClassVar = ("POLYGON",)
+    shape: str = "POLYGON"
+    corners: np.ndarray = field(kw_only=True)  # (V, 3) m, a simple polygon, either way around
+
+    def __post_init__(self):
+        super().__post_init__()
+        corners = np.asarray(self.corners, dtype=np.float64)
+        if corners.ndim != 2 or corners.shape[1] != 3 or len(corners) < 3 or not np.isfinite(corners).all():
+            raise ValueError(f"light {self.name!r}: corners {corners!r}, expected (V, 3) finite numbers, V >= 3")
+        object.__setattr__(self, "corners", corners)
+        if self.has_spread:
+            raise ValueError(f"light {self.name!r}: spread is {self.spread!r} rad, expected pi for shape {self.shape}")
+
+    def moved(self, offset: np.ndarray) -> Light:
+        """As `Light.moved`, with its corners."""
+        return super().moved(offset).altered(corners=self.corners + offset) if np.any(offset) else self
+
+    @cached_property
+    def area_vector(self) -> np.ndarray:
+        """As `Light.area_vector`."""
+        x, y, z = (self.corners - self.corners[0]).T
+        a, b, c = (np.concatenate([values[1:], values[:1]]) for values in (x, y, z))
+        return 0.5 * np.array([y @ c - z @ b, z @ a - x @ c, x @ b - y @ a])
+
+    def _outline(self, round_vertices):
+        return self.corners
+
+
+@dataclass(frozen=True)
+class PointLight(Light):
+    """A light that faces every point: a sphere (BALL) of the radius |half_u| = |half_v|, or a disk with that radius
+    which turns its front to every point (FACING_DISK: Blender's Soft Falloff).
+
+    Directions of the half axes and `direction` mean nothing. The falloff is that of a `FlatLight`.
+    """
+
+    SHAPES: ClassVar = ("BALL", "FACING_DISK")
+    is_round: ClassVar = True
+    is_facing: ClassVar = True
+    shape: str = "BALL"
+    falloff: int = 0  # power of the distance in m
+    smooth: float = 0.0  # m^2
+    pattern: Pattern | None = None  # for a FACING_DISK always by the direction in which the light travels
+
+    def __post_init__(self):
+        super().__post_init__()
+        if isinstance(self.pattern, dict):
+            object.__setattr__(self, "pattern", Pattern(**self.pattern))
+
+    @property
+    def is_sphere(self) -> bool:
+        """True for a BALL, False for a FACING_DISK."""
+        return self.shape == "BALL"
+
+    @property
+    def is_uniform(self) -> bool:
+        """True where all of the light is equally bright: no cone, pattern or falloff."""
+        return self.cone is None and self.pattern is None and not self.has_falloff
+
+    @property
+    def radius(self) -> float:
+        """As `Light.radius`."""
+        return float(np.linalg.norm(self.half_u))
+
+
+@dataclass(frozen=True)
+class SpotLight(PointLight):
+    """A `PointLight` that shines into a `cone`."""
+
+    cone: SpotCone = field(kw_only=True)
+
+    def __post_init__(self):
+        super().__post_init__()
+        if isinstance(self.cone, dict):
+            object.__setattr__(self, "cone", SpotCone(**self.cone))
+
+
+@dataclass(frozen=True)
+class DistantLight(Light):
+    """A light that is infinitely far away. Its center, half_u and half_v are directions toward it, of any length, the
+    same for every point."""
+
+    is_distant: ClassVar = True
+
+    def moved(self, offset: np.ndarray) -> Light:
+        """This light: it is as far from everywhere."""
+        return self
+
+    def viewpoint(self, position: np.ndarray) -> np.ndarray:
+        """As `Light.viewpoint`."""
+        return np.zeros_like(position)
+
+
+@dataclass(frozen=True)
+class SunLight(DistantLight):
+    """A distant disk: a sun, or a small, bright spot of the world."""
+
+    SHAPES: ClassVar = ("DISK",)
+    is_round: ClassVar = True
+    shape: str = "DISK"
+
+
+@dataclass(frozen=True)
+class SkyLight(DistantLight):
+    """A rectangle of the sky or world: one side of a cube around everything, or one of the `children` of that."""
+
+    SHAPES: ClassVar = ("RECTANGLE",)
+    shape: str = "RECTANGLE"
+    children: tuple[Light, ...] = ()  # finer lights that together are this one
+
+
+_KINDS = (QuadLight, EllipseLight, PolygonLight, PointLight, SunLight, SkyLight)
+
+_SQUARE = np.array([[-1.0, 1.0, 1.0, -1.0], [-1.0, -1.0, 1.0, 1.0]])  # corners s, t (2, 4)
 
 _VECTORS = ("center", "half_u", "half_v", "direction", "radiance")
 
+_KEYS = (
+    *("name", "shape", *_VECTORS, "group", "affects_diffuse", "affects_specular", "corners", "spread", "receivers"),
+    *("detail", "falloff", "smooth", "is_distant", "cone", "pattern"),
+)
+# _RECORD: the keys of a light's record, each with the attribute that it holds.
+_RECORD = {key: "children" if key == "detail" else key for key in _KEYS}
 
 # _FEW_ALIKE: up to so many consecutive lights that differ only in vectors and corners have a record each; more share
 # one record.
 _FEW_ALIKE = 16
 
 
-def light_records(lights: Iterable[AreaLight]) -> list[dict]:
+@cache
+def _field_names(kind: type[Light]) -> tuple[str, ...]:
+    return tuple(item.name for item in fields(kind))
+
+
+def light_of(record: dict) -> Light:
+    """The light of a record of `Light.record`. Its kind follows from "shape", "is_distant" and "cone"; keys may be left
+    out, for defaults. Raises ValueError or TypeError for a malformed record."""
+    values = dict(record)
+    shape, is_distant = values.get("shape"), bool(values.pop("is_distant", False))
+    kind = next((kind for kind in _KINDS if kind.is_distant == is_distant and shape in kind.SHAPES), None)
+    if kind is None:
+        shapes = [shape for kind in _KINDS if kind.is_distant == is_distant for shape in kind.SHAPES]
+        where = "distant" if is_distant else "near"
+        raise ValueError(
+            f"light {values.get('name')!r}: shape is {shape!r}, expected one of {', '.join(shapes)} for a {where} light"
+        )
+    kind = SpotLight if kind is PointLight and values.get("cone") is not None else kind
+    values["children"] = tuple(light_of(child) for child in values.pop("detail", ()))
+    for name in set(values) & set(_RECORD.values()) - set(_field_names(kind)):
+        if np.any(values.pop(name) != getattr(kind, name)):
+            raise ValueError(f"light {values.get('name')!r}: it has {name}, expected none for a {kind.__name__}")
+    return kind(**values)
+
+
+def light_records(lights: Iterable[Light]) -> list[dict]:
     """`lights` as JSON-able records, which `lights_of` reads."""
-    found = []
-    for own in (list(alike) for _, alike in itertools.groupby(lights, _kind)):
-        if len(own) <= _FEW_ALIKE or own[0].detail or own[0].cone is not None or own[0].pattern is not None:
-            found += [light.record() for light in own]
+    records = []
+    for alike in (list(group) for _, group in itertools.groupby(lights, _what_alike_lights_share)):
+        first = alike[0]
+        if len(alike) <= _FEW_ALIKE:
+            records += [light.record() for light in alike]
             continue
-        vectors = [np.array([getattr(light, name) for light in own]) for name in _VECTORS]
-        if own[0].corners is not None:
-            vectors.append(np.array([light.corners for light in own]).reshape(len(own), -1))
+        vectors = [np.array([getattr(light, name) for light in alike]) for name in _VECTORS]
+        if first.corners is not None:
+            vectors.append(np.array([light.corners for light in alike]).reshape(len(alike), -1))
         values = np.concatenate(vectors, axis=1).astype("<f8")
-        found.append({"like": own[0].record(), "vectors": base64.b64encode(values.tobytes()).decode()})
-    return found
+        records.append({"like": first.record(), "vectors": base64.b64encode(values.tobytes()).decode()})
+    return records
 
 
-def _kind(light) -> tuple:
-    rest = (light.__dict__[name] for name in _LIGHT_FIELDS if name not in (*_VECTORS, "corners", "detail"))
-    return *rest, len(light.detail), 0 if light.corners is None else len(light.corners)
+def _what_alike_lights_share(light) -> tuple:
+    if light.children or light.cone is not None or light.pattern is not None:
+        return (id(light),)
+    names = (name for name in _field_names(type(light)) if name not in (*_VECTORS, "corners"))
+    corner_count = 0 if light.corners is None else len(light.corners)
+    return type(light), corner_count, *(light.__dict__[name] for name in names)
 
 
-def lights_of(records: Iterable[dict]) -> tuple[AreaLight, ...]:
+def lights_of(records: Iterable[dict]) -> tuple[Light, ...]:
     """The lights of records of `light_records`. Raises ValueError or TypeError for malformed records."""
-    found = []
+    lights = []
     for record in records:
         if "like" not in record:
-            found.append(AreaLight(**record))
+            lights.append(light_of(record))
             continue
-        like = AreaLight(**record["like"])
-        corners = () if like.corners is None else like.corners.shape
+        like = light_of(record["like"])
+        shape = () if like.corners is None else like.corners.shape
         values = np.frombuffer(base64.b64decode(record["vectors"], validate=True), "<f8")
-        values = values.reshape(-1, 3 * (len(_VECTORS) + (corners[0] if corners else 0)))
+        values = values.reshape(-1, 3 * (len(_VECTORS) + (shape[0] if shape else 0)))
         if not np.isfinite(values).all():
             raise ValueError(f"light {like.name!r}: vectors that are not finite, expected finite numbers")
         for row in values:
-            own = {name: row[3 * place : 3 * place + 3] for place, name in enumerate(_VECTORS)}
-            found.append(like.altered(**own, corners=row[3 * len(_VECTORS) :].reshape(corners) if corners else None))
-    return tuple(found)
+            arrays = {name: row[3 * number : 3 * number + 3] for number, name in enumerate(_VECTORS)}
+            if shape:
+                arrays["corners"] = row[3 * len(_VECTORS) :].reshape(shape)
+            lights.append(like.altered(**arrays))
+    return tuple(lights)
 
 
 def round_outline(count: int) -> np.ndarray:

@@ -51,7 +51,7 @@ class SurfaceSamples:
     diffuse_rebound: np.ndarray | None = None  # (P, 3) multiple scattering of such a surface; default: 0
     sheen_a: np.ndarray | None = None  # (P,) 0: no sheen; below 0: -sigma of velvet; default: 0
     sheen_b: np.ndarray | None = None  # (P,); default: 0
-    receiver: np.ndarray | None = None  # (P,) integers that `AreaLight.receivers` names; default: 0
+    receiver: np.ndarray | None = None  # (P,) integers that `Light.receivers` names; default: 0
     anisotropy: np.ndarray | None = None  # (P,) in (-1, 1); default: 0
     tangent: np.ndarray | None = None  # (P, 3); its part along `normal` does not matter; default: 0
 

@@ -30,6 +30,7 @@ from ..lobes import moments32
 from ..lobes.lobe_integrals import FLOAT64_CHUNK, LEAST_SHARE, NARROWEST
 from ..lobes.lookup_table import MIN_ALPHA
 from ..lobes.polygon import MOSTLY_WHOLE, convex_pieces, dot, integrate_visible
+from ..scene import PolygonLight
 from . import float64
 
 # If a block has more different indices of refraction, the dielectric's weights are summed up per sample.
@@ -170,7 +171,7 @@ class AlikeLights:
     """L lights with equally many corners: vectors (3, L) and numbers (L,), all but `centers` in single precision."""
 
     centers: np.ndarray  # (2, 3, L) center and centroid
-    corners: np.ndarray  # (V, 3, L) of `AreaLight.polygon`, relative to the center
+    corners: np.ndarray  # (V, 3, L) of `Light.polygon`, relative to the center
     half_u: np.ndarray
     half_v: np.ndarray
     direction: np.ndarray
@@ -215,7 +216,7 @@ class Lights(list):
         """Trees of many lights, and the positions here of their lights."""
         kinds: dict[tuple, list[int]] = {}
         for number, (light, row, _) in enumerate(self):
-            is_plain = not (light.is_profiled or light.is_distant or light.is_facing or light.cone is not None)
+            is_plain = not (light.has_profile or light.is_distant or light.is_facing or light.cone is not None)
             if is_plain and (light.radiance >= 0.0).all():
                 kinds.setdefault((row, light.receivers), []).append(number)
         many = [numbers for numbers in kinds.values() if len(numbers) >= FEWEST]
@@ -277,12 +278,12 @@ class _Lighting:
         """Add one light to the `sums` (F, 3, Q) by row, at the `columns` (Q',), None for all."""
         (light, row, corners), index = self.lights[number], lobes.index
         allowed = light.receives(self.samples.receiver, index)
-        if light.is_focused or light.cone is not None:
+        if light.has_spread or light.cone is not None:
             near = may_reach(light, position)
             allowed = near if allowed is None else allowed & near
         rest = columns
         if not lobes.only_tails:
-            if not light.is_profiled:
+            if not light.has_profile:
                 rest = self._add_small(lobes, light, position, (columns, allowed), sums[row])
             elif light_profile.ConeRegions.suit(light):
                 rest = self._add_points(lobes, light, position, (columns, allowed), sums[row])
@@ -302,7 +303,7 @@ class _Lighting:
         """Add the light, seen as polygons, to `total` (F, 3, Q) for a batch of `_batches`. Returns the mask of the
         columns that need double precision; they get nothing."""
         part, outline, effort = batch
-        offset = (light.center[:, None] - light.origins(position[:, part])).astype(np.float32)
+        offset = (light.center[:, None] - light.viewpoint(position[:, part])).astype(np.float32)
         seen, factor = light, 1.0
         if light.is_facing:
             seen, factor = self._seen(light, lobes.index[part], position[:, part])
@@ -315,7 +316,7 @@ class _Lighting:
         if allowed is not None:
             facing &= allowed[part]
         axes, integrate = lobes.rows[:, :, part], partial(lobes.integrate, part)
-        if light.is_profiled:
+        if light.has_profile:
             integrate = ProfiledIntegral(light, effort, offset, axes, integrate, len(lobes.colors))
             axes = integrate.rows
         polygons = local_corners(seen, outline, offset, axes, self.scratch)
@@ -411,7 +412,7 @@ class _Lighting:
         seen, left = small_lights.SmallLight.of(light), []
         count = position.shape[1] if columns is None else len(columns)
         area_vector = seen.area_vector.astype(np.float32)
-        origins = light.origins(position)
+        origins = light.viewpoint(position)
         for piece in moments32.pieces(count, SMALL_CHUNK):
             part = piece if columns is None else columns[piece]
             offset = (seen.center[:, None] - origins[:, part]).astype(np.float32)
@@ -527,7 +528,7 @@ def shade_pairs(samples, members, number, lights, shade_in_float64):
     """
     batches: dict[tuple, list[int]] = {}
     for position, (light, _, corners) in enumerate(lights):
-        own = (1, position) if light.is_profiled or light.is_round else (0, (len(corners), light.is_distant))
+        own = (1, position) if light.has_profile or light.is_round else (0, (len(corners), light.is_distant))
         batches.setdefault(own, []).append(position)
     for (alone, _), chosen in sorted(batches.items()):
         among = np.full(len(lights), -1)
@@ -570,7 +571,7 @@ def _is_narrow(light, corners) -> bool:
 
 def _is_in_pieces(light, corners) -> bool:
     """True for lights that `light_levels` cuts into pieces. Double precision must then shade all of the pieces."""
-    return light.is_profiled and light.shape == "POLYGON" and len(convex_pieces(corners)) > 1
+    return light.has_profile and isinstance(light, PolygonLight) and len(convex_pieces(corners)) > 1
 
 
 def _chosen(part, index):
@@ -719,7 +720,7 @@ def _selected(values, part, index):
 
 class FormFactor:
     """Form factors (1, Q) of polygons whose corners run counterclockwise as seen from the point
-    (`AreaLight.polygon`)."""
+    (`Light.polygon`)."""
 
     def __init__(self, scratch):
         self.scratch = scratch

@@ -35,7 +35,7 @@ from ..lobes.lobe_integrals import (
 from ..lobes.lookup_table import MIN_ALPHA, Lobe, LookupTable
 from ..lobes.polygon import dot
 from ..lobes.spherical_harmonics import coefficient_index
-from ..scene import REFERENCE
+from ..scene import REFERENCE, PolygonLight
 from .reference import anisotropic_integrals, reference_integrals
 
 # Where a Fresnel curve with a step is looked up: at these shares of the way from a light's center to its corners.
@@ -48,7 +48,7 @@ _COSINE = 2.0 / np.sqrt(3.0 * np.pi)
 
 @dataclass(frozen=True)
 class LightOfEachSample:
-    """One light per sample, used instead of one AreaLight for all. Its corners are (V, P, 3)."""
+    """One light per sample, used instead of one `Light` for all. Its corners are (V, P, 3)."""
 
     center: np.ndarray  # (P, 3)
     direction: np.ndarray  # (P, 3)
@@ -58,22 +58,21 @@ class LightOfEachSample:
     area_vector: np.ndarray  # (P, 3)
     affects_diffuse: bool = True
     affects_specular: bool = True
-    is_focused: bool = False
-    is_profiled: bool = False
+    has_spread: bool = False
+    has_profile: bool = False
     is_round: bool = False
     is_distant: bool = False
     is_facing: bool = False
-    shape: str = "RECTANGLE"
     has_falloff: bool = False
-    detail: tuple = ()
+    children: tuple = ()
 
     def take(self, index) -> LightOfEachSample:
         """The lights of the samples `index`."""
         names = ("center", "direction", "radiance", "half_u", "half_v", "area_vector")
         return replace(self, **{name: getattr(self, name)[index] for name in names})
 
-    def origins(self, position: np.ndarray) -> np.ndarray:
-        """As `AreaLight.origins`."""
+    def viewpoint(self, position: np.ndarray) -> np.ndarray:
+        """As `Light.viewpoint`."""
         return np.zeros_like(position) if self.is_distant else position
 
     def receives(self, receiver, index):
@@ -82,8 +81,8 @@ class LightOfEachSample:
 
 
 def has_patches(light) -> bool:
-    """True for a distant light with a detail. The paths of both precisions choose its patches themselves."""
-    return light.is_distant and len(light.detail) > 0
+    """True for a distant light with children. The paths of both precisions choose its patches themselves."""
+    return light.is_distant and len(light.children) > 0
 
 
 def shade_patches(samples, members, patches, tree: PatchTree, radiance, shade) -> None:
@@ -133,7 +132,7 @@ def shade_diffuse(samples, lights, radiance):
         for candidates, second_normal, count, integral in kinds:
             for part in seen_parts(framed, light, corners, candidates, 1.0, second_normal):
                 index, polygon, _ = part
-                if light.is_profiled:
+                if light.has_profile:
                     view = light_view(framed, light, index, lambda vectors: vectors)
                     irradiance = _profiled(light, view, part, integral, count)
                 else:
@@ -255,7 +254,7 @@ def shade_specular(samples, lights, table, radiance, error=None):
             width = lobe_width(samples, plain)
             visible = seen_parts(framed, light, corners, plain, width, samples.geometric_normal)
             parts = ((part[0], _table_integrals(table, lobe, framed, light, part)) for part in visible)
-            if light.is_profiled and light.shape == "POLYGON":
+            if light.has_profile and isinstance(light, PolygonLight):
                 parts = _joined(parts, len(samples))
             parts = _finished(parts, table, samples, light)
             if len(anisotropic):
@@ -303,7 +302,7 @@ def _bent_reflectance(framed, light, corners, at):
         for corner in corners for fraction in POINTS_TO_CORNERS
     ]  # fmt: skip
     samples, axes, direction = framed.samples.take(at), framed.frame[:, :, at], _of(light.direction, at)
-    origin, is_clipped = light.origins(samples.position), clipped_metals(samples)[:, None]
+    origin, is_clipped = light.viewpoint(samples.position), clipped_metals(samples)[:, None]
     cosine = np.clip((samples.normal * samples.view).sum(axis=1), 0.0, 1.0)
     alpha, total, lobe = np.maximum(samples.roughness**2, MIN_ALPHA), 0.0, 1e-30
     for place in places:
@@ -334,7 +333,7 @@ def _limit(integrals, samples, index, light):
     """Apply `TailLimits` to integrals (4, Q) over the light, as seen from the samples `index`."""
     own = light if light.center.ndim == 1 else light.take(index)
     axes = samples.normal[index].T, samples.view[index].T
-    offset = (own.center - own.origins(samples.position[index])).T
+    offset = (own.center - own.viewpoint(samples.position[index])).T
     if light.is_facing:
         seen = SeenLight.of_disk(FacingDisk.of(light, offset, axes[0]))
     else:
@@ -356,7 +355,7 @@ def _fresnel_lobe(table: LookupTable, cosine, samples) -> Lobe:
 
 def _table_integrals(table, lobe, framed, light, part):
     """Integrals (4, Q), never negative, over a `part` from `seen_parts`. Its corners run counterclockwise as seen from
-    the point (`AreaLight.polygon`)."""
+    the point (`Light.polygon`)."""
 
     # Coefficients of z / pi, the clamped cosine of mass 1.
     cosine = np.zeros((1, lobe.coefficients.shape[1], 1))
@@ -370,7 +369,7 @@ def _table_integrals(table, lobe, framed, light, part):
         return np.stack(values)
 
     index, polygon, _ = part
-    if not light.is_profiled:
+    if not light.has_profile:
         return integral(polygon, index)
     own = lobe.take(index)
 

@@ -18,7 +18,7 @@ from ..emitters.light_polygons import fitting_patches
 from ..lobes import moments32
 from ..lobes.lobe_integrals import FLOAT64_CHUNK
 from ..lobes.lookup_table import LookupTable, load_table
-from ..scene import PASSES, REFERENCE, AreaLight, Cancelled, SurfaceSamples
+from ..scene import PASSES, REFERENCE, Cancelled, Light, SurfaceSamples
 from ..workers import pool
 from . import float32, float64
 
@@ -42,7 +42,7 @@ SPOT = 0.3
 class Task:
     """The lights, table and passes with which to shade every block of samples."""
 
-    lights: tuple[AreaLight, ...]  # L
+    lights: tuple[Light, ...]  # L
     rows: tuple[int, ...]  # (L,) the row of the result to which each light is added
     row_count: int  # R
     table: LookupTable | str  # or REFERENCE
@@ -84,7 +84,7 @@ class Task:
         if self._with_patches is not None:
             self._add(samples, self._with_patches, radiance, error, scratch, {})
         for light, row in self._rows_of_lights:
-            if light.detail and not float64.has_patches(light):
+            if light.children and not float64.has_patches(light):
                 for name in self.passes:
                     self._add_detailed(samples, light, name, radiance[name][row : row + 1], error, scratch)
         return radiance, error, leftovers
@@ -93,9 +93,9 @@ class Task:
     def _rows_of_lights(self):
         return zip(self.lights, self.rows, strict=True)
 
-    def lights_of_pairs(self, name: str) -> list[tuple[AreaLight, int]]:
+    def lights_of_pairs(self, name: str) -> list[tuple[Light, int]]:
         """The lights, each with its row, to which the numbers in `shade_pairs` refer."""
-        return [one for one in self._rows_of_lights if getattr(one[0], f"affects_{name}") and not one[0].detail]
+        return [one for one in self._rows_of_lights if getattr(one[0], f"affects_{name}") and not one[0].children]
 
     def shade_pairs(self, samples: SurfaceSamples, name: str, number: np.ndarray) -> np.ndarray:
         """Radiance (N, 3) of one pass of N samples under one light each."""
@@ -110,7 +110,7 @@ class Task:
     @cached_property
     def _plain(self) -> dict[str, float32.Lights]:
         """The lights without a detail, by pass."""
-        return self._by_pass(one for one in self._rows_of_lights if not one[0].detail)
+        return self._by_pass(one for one in self._rows_of_lights if not one[0].children)
 
     @cached_property
     def _with_patches(self) -> dict[str, float32.Lights] | None:
@@ -168,8 +168,8 @@ def _prepared(lights):
 
 def _corners_integrated(light, is_reference):
     """Estimated number of corners in the integrals over a light."""
-    count = len(light.polygon()) * min(len(light.patches), PATCHES)
-    if light.is_profiled:
+    count = len(light.polygon()) * min(len(light.leaves), PATCHES)
+    if light.has_profile:
         effort = light_profile.EFFORTS[1]
         count *= (2 * effort.chords + 1) * (1 if is_reference else effort.layers)
     return count
@@ -202,10 +202,10 @@ class Shading:
 class OwnTechnique(Protocol):
     """A technique of the user: anything with this method. An attribute `name` replaces the name of its class."""
 
-    def evaluate(self, samples: SurfaceSamples, lights: tuple[AreaLight, ...]) -> Shading:
+    def evaluate(self, samples: SurfaceSamples, lights: tuple[Light, ...]) -> Shading:
         """Radiance of `samples` (P) under all `lights` together; its rows are added up.
 
-        The lights have no `detail`. The caller takes care of samples that a light's passes or receivers leave out. If
+        The lights have no children. The caller takes care of samples that a light's passes or receivers leave out. If
         the diffuse pass is None, the caller uses the exact one.
         """
         ...
@@ -218,7 +218,7 @@ def is_own(technique: Any) -> bool:
 
 def shade(
     samples: SurfaceSamples,
-    lights: Iterable[AreaLight],
+    lights: Iterable[Light],
     technique: str | Path | LookupTable | OwnTechnique = "ltsh4",
     *,
     passes: Sequence[str] = PASSES,
@@ -260,7 +260,7 @@ def _shade_with(technique, samples, lights, passes, how) -> Shading:
     rows = _rows(rows, len(lights))
     radiance = {name: np.zeros((1 + max(rows, default=0), len(samples), 3), dtype) for name in passes}
     for number, (light, row) in enumerate(zip(lights, rows, strict=True)):
-        found = technique.evaluate(samples, light.patches) if light.area_vector.any() else None
+        found = technique.evaluate(samples, light.leaves) if light.area_vector.any() else None
         for name in passes if found is not None else ():
             if not getattr(light, f"affects_{name}"):
                 continue
@@ -344,13 +344,13 @@ def _check_passes(passes) -> None:
         raise ValueError(f"passes are {list(passes)}, expected some of {', '.join(PASSES)}")
 
 
-def _parts(light) -> tuple[AreaLight, ...]:
+def _parts(light) -> tuple[Light, ...]:
     """The parts of a light that get an integral each: the patches of a small distant light; otherwise the light itself.
     Sheared lights with a profile are returned `upright`."""
-    if light.is_profiled and not light.detail and light_profile.has_shear(light):
+    if light.has_profile and not light.children and light_profile.has_shear(light):
         return (light_profile.upright(light),)
     is_spot = float64.has_patches(light) and np.linalg.norm(light.half_u) < SPOT * np.linalg.norm(light.center)
-    return light.patches if is_spot else (light,)
+    return light.leaves if is_spot else (light,)
 
 
 def _rows(rows, count: int) -> list[int]:

@@ -26,7 +26,7 @@ from ..lobes.brdf import HalfBoundary, HalfVectors
 from ..lobes.edge_integrals import arc_factors
 from ..lobes.lookup_table import MIN_ALPHA, WARP_REGULARIZATION, Lobe
 from ..lobes.polygon import convex_pieces, dot, one_plus_cosine, project_to_sphere, split_at_horizon
-from ..scene import AreaLight
+from ..scene import Light, PolygonLight
 
 _ELLIPSE_PIECES = 8
 # Evaluations per batch, few enough for the arrays of one batch to stay in the cache.
@@ -154,7 +154,7 @@ class EllipseBoundary:
 class FacingEmission:
     """As `Cone`, for lights that face every point, in local frames. `offset` goes from the points to their centers."""
 
-    light: AreaLight
+    light: Light
     frame: np.ndarray  # (3, 3, P)
     offset: np.ndarray  # (3, P) in the world
 
@@ -421,16 +421,16 @@ def _integrals(framed, lobes, light, corners, candidates):
     clipped = brdf.clipped_metals(samples)
     if light.is_round:
         corners = light.polygon(QUICK_CORNERS if quick else EXACT.round_corners)
-    if light.is_focused:
+    if light.has_spread:
         batches = _cone_parts(framed, cosine, light, corners, candidates)
     elif light.is_round and halves is None:
         batches = _ellipses(framed, light, corners, candidates)
     else:
-        pieces = convex_pieces(corners) if light.shape == "POLYGON" else [corners]
+        pieces = convex_pieces(corners) if isinstance(light, PolygonLight) else [corners]
         batches = (batch for piece in pieces for batch in _polygons(framed, light, piece, candidates))
     profile = light_profile.Profile.of(light) if light.has_falloff else None
     for index, outline, cone in batches:
-        if light.is_facing and not light.is_even:
+        if light.is_facing and not light.is_uniform:
             cone = FacingEmission(light, frame[:, :, index], (light.center - samples.position[index]).T)
         elif cone is None and light.has_falloff:
             cone = _whole_cone(framed, light, index, profile)
@@ -478,7 +478,7 @@ def _uncut_ellipses(framed, light, candidates):
     axes of the ellipse in local frames."""
     samples, frame = framed.samples, framed.frame
     index = in_front(samples, light, candidates)
-    offset = (light.center - light.origins(samples.position[index])).T
+    offset = (light.center - light.viewpoint(samples.position[index])).T
     half_u, half_v = light.half_u[:, None], light.half_v[:, None]
     if light.is_facing:
         disk = FacingDisk.of(light, offset, frame[2][:, index])

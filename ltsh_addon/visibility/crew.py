@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..scene import AreaLight, Cancelled, Film, Progress, SurfaceSamples
+from ..scene import Cancelled, Film, Light, Progress, SurfaceSamples
 from ..shading import LookupTable, shade
 from ..workers import pool, worker
 from .occluders import Occluders
@@ -244,7 +244,7 @@ class LitBlocks:
         run, number, light, task = message
         return run, number, self._lit(number, light, task)
 
-    def _lit(self, number: int, light: AreaLight, task) -> dict[str, np.ndarray]:
+    def _lit(self, number: int, light: Light, task) -> dict[str, np.ndarray]:
         own, (samples, starting, film, place) = self._setting, self._setting.blocks[number]
         radiance = {name: np.zeros((len(samples), 3), np.float32) for name in own.passes}
         shares = dict.fromkeys(own.passes, np.float32(1.0))
@@ -279,7 +279,7 @@ class Company:
             for part in parts
         ]
 
-    def lit(self, light: AreaLight, task, numbers: Sequence[int]) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
+    def lit(self, light: Light, task, numbers: Sequence[int]) -> Iterator[tuple[int, dict[str, np.ndarray]]]:
         """Yield what the blocks `numbers` reflect of a light, see `LitBlocks`, roughly in that order.
 
         If the caller stops early, only work that has begun is left behind.

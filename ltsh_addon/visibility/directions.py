@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from ..emitters import light_profile, light_tree
 from ..lobes import brdf
 from ..lobes.lookup_table import WARP_REGULARIZATION
 from ..lobes.polygon import convex_pieces
-from ..scene import AreaLight, SurfaceSamples
+from ..scene import FlatLight, Light, PointLight, PolygonLight, QuadLight, SkyLight, SurfaceSamples
 
 # Bits of a coordinate of the sequence, as many as single precision holds.
 BITS = 23
@@ -119,22 +119,22 @@ class Emitter:
     its last corner. Otherwise it is the parallelogram center + s axes[0] + t axes[1], |s|, |t| <= 1, around the light.
     """
 
-    def __init__(self, light: AreaLight):
+    def __init__(self, light: Light):
         self.light, self.chosen_as = light, (light,)
         self.outline = light.polygon(_ROUND_CORNERS) - light.center
-        self.profile = light_profile.Profile.of(light) if light.is_profiled else None
+        self.profile = light_profile.Profile.of(light) if light.has_profile else None
         self.corners = self._own_corners()
         self.center, self.axes = _parallelogram(light) if self.corners is None else (None, None)
         self._picture = self._edge = None
-        if self.corners is None and light.detail:
+        if self.corners is None and light.children:
             self._picture = picture_of(light, self._places)
-        elif self.corners is None and light.shape == "POLYGON":
+        elif self.corners is None and isinstance(light, PolygonLight):
             self._edge = self._places(light.corners - light.center).astype(np.float32)
 
     def _own_corners(self) -> np.ndarray | None:
         """Corners (4, 3), relative to the center, of an untextured convex polygon of three or four corners; else None.
         A triangle repeats its last corner."""
-        if self.light.shape != "POLYGON" or self.light.detail:
+        if not isinstance(self.light, PolygonLight) or self.light.children:
             return None
         pieces = convex_pieces(self.outline)
         return pieces[0][[0, 1, 2, -1]] if len(pieces) == 1 and len(pieces[0]) <= 4 else None
@@ -157,7 +157,7 @@ class Emitter:
     def _ranges(self, middle, height):
         """Ranges of s and t over which the quadrilateral extends: no farther than the cone of a spread reaches."""
         squares = (self.axes * self.axes).sum(axis=1)
-        if not self.light.is_focused or abs(self.axes[0] @ self.axes[1]) > 1e-6 * squares.max():
+        if not self.light.has_spread or abs(self.axes[0] @ self.axes[1]) > 1e-6 * squares.max():
             return ((-_ONE, _ONE), (-_ONE, _ONE))
         ranges = []
         for axis, squared in zip(self.axes, squares, strict=True):
@@ -185,10 +185,10 @@ class Emitter:
         return own if factor is None else factor * own
 
 
-def _parallelogram(light: AreaLight):
+def _parallelogram(light: Light):
     """Center, relative to that of the light, and half axes (2, 3) of a parallelogram around the light. Around a polygon
     it is the smallest rectangle along one of the edges."""
-    if light.shape != "POLYGON":
+    if not isinstance(light, PolygonLight):
         return np.zeros(3), np.stack([light.half_u, light.half_v])
     outline, best = light.corners - light.center, (np.inf, np.zeros(3), np.zeros((2, 3)))
     for edge in np.roll(outline, -1, axis=0) - outline:
@@ -221,7 +221,7 @@ def picture_of(light, places_of):
     grid = (np.arange(_PICTURE) + 0.5) * (2.0 / _PICTURE) - 1.0
     picture = np.zeros((_PICTURE, _PICTURE), np.float32)
     mean = max(np.abs(light.radiance).mean(), 1e-30)
-    for patch in light.patches:
+    for patch in light.leaves:
         outline = places_of(patch.polygon() - light.center)
         columns, rows = (slice(*np.searchsorted(grid, (axis.min(), axis.max()))) for axis in outline.T)
         part = picture[rows, columns]
@@ -229,7 +229,7 @@ def picture_of(light, places_of):
     return picture
 
 
-def shared_numbers(lights: Sequence[AreaLight], tracer=None) -> tuple[tuple[int, ...], ...]:
+def shared_numbers(lights: Sequence[Light], tracer=None) -> tuple[tuple[int, ...], ...]:
     """Which of the `lights` share their rays, and so the share of them that is visible, as tuples of numbers.
 
     The sides of a sky do. So do plain lights that have the same color, group and pass and are blocked by the same
@@ -254,16 +254,16 @@ def _kind(light, number, masks) -> tuple:
     """A key that is equal for lights that share their rays."""
     if _is_side(light):
         return "sky", light.name
-    is_even = light.is_even and not (light.is_distant or light.is_facing or light.is_profiled or light.detail)
+    is_plain = isinstance(light, FlatLight) and not (light.has_profile or light.children)
     brightest = light.radiance.max()
-    if not is_even or light.radiance.min() < 0.0 or brightest == 0.0 or not light.area_vector.any():
+    if not is_plain or light.radiance.min() < 0.0 or brightest == 0.0 or not light.area_vector.any():
         return "one", number
     color = tuple(np.round(light.radiance / brightest, COLOR_DIGITS).tolist())
     return "many", light.group, light.receivers, light.affects_diffuse, light.affects_specular, color, masks
 
 
 def emitters_of(
-    lights: Sequence[AreaLight], tracer=None
+    lights: Sequence[Light], tracer=None
 ) -> tuple[tuple[Emitter | Cluster, ...], tuple[tuple[int, ...], ...]]:
     """The emitters, and for each the numbers of the `lights` it stands for."""
     numbers, emitters = shared_numbers(lights, tracer), []
@@ -274,9 +274,9 @@ def emitters_of(
     return tuple(emitters), numbers
 
 
-def _is_side(light: AreaLight) -> bool:
+def _is_side(light: Light) -> bool:
     """True for a side of the sky, a cube around all samples."""
-    if not light.is_distant or light.shape != "RECTANGLE":
+    if not isinstance(light, SkyLight):
         return False
     axes = np.stack([light.center, light.half_u, light.half_v])
     return bool(np.array_equal(np.abs(axes).sum(axis=0), np.ones(3)) and np.allclose(axes @ axes.T, np.eye(3)))
@@ -285,7 +285,7 @@ def _is_side(light: AreaLight) -> bool:
 class Sky(Emitter):
     """The sides of a cube as one emitter. Its `light` has their mean radiance; its shape is a mere placeholder."""
 
-    def __init__(self, sides: Sequence[AreaLight]):
+    def __init__(self, sides: Sequence[Light]):
         self.ahead = np.repeat(np.eye(3, dtype=np.float32), 2, axis=0)
         self.ahead[1::2] *= -1.0
         self.right, self.up = np.roll(self.ahead, 1, axis=1), np.roll(self.ahead, 2, axis=1)
@@ -304,9 +304,8 @@ class Sky(Emitter):
         self.values = (values / max(np.abs(radiance).mean(), 1e-30)).astype(np.float32).ravel()
         like = sides[0]
         super().__init__(
-            AreaLight(
-                like.name,
-                "RECTANGLE",
+            SkyLight(
+                name=like.name,
                 center=np.array([0.0, 0.0, NEXT_TO]),
                 half_u=np.array([1.0, 0.0, 0.0]),
                 half_v=np.array([0.0, 1.0, 0.0]),
@@ -315,7 +314,6 @@ class Sky(Emitter):
                 affects_diffuse=like.affects_diffuse,
                 affects_specular=like.affects_specular,
                 receivers=like.receivers,
-                is_distant=True,
             )
         )
         self.chosen_as = tuple(sides)
@@ -389,9 +387,9 @@ def _by_cosine(x, y, normal):
     return found
 
 
-def _cells_of(side: AreaLight) -> np.ndarray:
+def _cells_of(side: Light) -> np.ndarray:
     """Brightness (CELLS, CELLS) in units of the mean; rows along half_v, columns along half_u."""
-    if not side.detail:
+    if not side.children:
         return np.ones((CELLS, CELLS))
     axes = np.linalg.pinv(np.stack([side.half_u, side.half_v]))
     picture = picture_of(side, lambda offset: offset @ axes)
@@ -409,7 +407,7 @@ class Cluster:
     power, and reaches as far as they do.
     """
 
-    def __init__(self, lights: Sequence[AreaLight]):
+    def __init__(self, lights: Sequence[Light]):
         pieces = [(piece, light) for light in lights for piece in _quads_of(light)]
         corners = np.array([piece for piece, _ in pieces])
         owners = [light for _, light in pieces]
@@ -422,9 +420,8 @@ class Cluster:
         center, radius = 0.5 * (low + high), max(0.5 * float(np.linalg.norm(high - low)), 1e-6)
         power = (radiance * area[:, None]).sum(axis=0)
         axes, like = radius * np.sqrt(0.5) * np.eye(3), lights[0]
-        self.light = AreaLight(
-            like.name,
-            "RECTANGLE",
+        self.light = QuadLight(
+            name=like.name,
             center=center,
             half_u=axes[0],
             half_v=axes[1],
@@ -435,7 +432,7 @@ class Cluster:
             receivers=like.receivers,
         )
         ball = {"half_u": radius * np.eye(3)[0], "half_v": radius * np.eye(3)[1]}
-        self.chosen_as = (replace(self.light, shape="BALL", radiance=power / (4.0 * np.pi * radius**2), **ball),)
+        self.chosen_as = (PointLight.like(self.light, radiance=power / (4.0 * np.pi * radius**2), **ball),)
         corners = corners - center
         values = radiance.mean(axis=1)
         self.brightness = (values / max(self.light.radiance.mean(), 1e-30)).astype(np.float32)
@@ -539,10 +536,10 @@ def _levels(children):
         levels.append((last, last + more))
 
 
-def _quads_of(light: AreaLight) -> list[np.ndarray]:
+def _quads_of(light: Light) -> list[np.ndarray]:
     """Convex quadrilaterals (4, 3) that make up a light; triangles repeat their last corner. A round light gives the
     parallelogram around it."""
-    if light.shape != "POLYGON":
+    if not isinstance(light, PolygonLight):
         u, v = light.half_u, light.half_v
         return [light.center + np.stack([-u - v, u - v, u + v, v - u])]
     if len(light.corners) == 3:
@@ -728,7 +725,7 @@ class Choices:
     if the light casts no shadow. Rays that the surface chose start at the surface, and are always blocked.
     """
 
-    def __init__(self, samples: SurfaceSamples, lights: Sequence[AreaLight], is_baked: bool):
+    def __init__(self, samples: SurfaceSamples, lights: Sequence[Light], is_baked: bool):
         self._samples, self._lights, self._is_baked = samples, tuple(lights), is_baked
         self._first = None
 

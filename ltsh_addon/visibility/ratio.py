@@ -22,7 +22,7 @@ from ..emitters.facing import FacingDisk, emission, ray_length
 from ..emitters.light_polygons import LEAST_COSINE, LOBE_WIDTH, has_lobe, may_reach, off_plane
 from ..lobes.brdf import dielectric_reflectance, schlick_curve, stretch
 from ..lobes.diffuse import diffuse_factor
-from ..scene import FARTHEST, PASSES, AreaLight, Film, Progress, SurfaceSamples, round_outline
+from ..scene import FARTHEST, PASSES, Film, Light, PolygonLight, Progress, SurfaceSamples, round_outline
 from . import crew
 from .directions import (
     Choices,
@@ -136,7 +136,7 @@ class ShadowSampling:
 
 def visible_shares(
     samples: SurfaceSamples,
-    lights: Sequence[AreaLight],
+    lights: Sequence[Light],
     tracer,
     sampling: ShadowSampling = ShadowSampling(),
     *,
@@ -228,7 +228,7 @@ def typical_radiance(samples: SurfaceSamples, task: ShadowTask, tracer) -> tuple
 
 
 def task_of_lights(
-    samples: SurfaceSamples, lights: Sequence[AreaLight], tracer, passes: Sequence[str], rays: int
+    samples: SurfaceSamples, lights: Sequence[Light], tracer, passes: Sequence[str], rays: int
 ) -> ShadowTask:
     """The task that finds the shares of `lights` with at most `rays` per pair, as `visible_shares` does."""
     (emitters, _), passes = emitters_of(lights, tracer), tuple(passes)
@@ -336,16 +336,16 @@ class Pairs:
         self.mask = np.uint32(surface.tracer.mask_of(light.name))
         self.surface_mask = np.uint32(surface.tracer.surface_mask_of(light.name))
         # The faces of a mesh light block rays to the mesh itself.
-        self.at_surface = isinstance(emitter, Cluster) or light.shape == "POLYGON"
+        self.at_surface = isinstance(emitter, Cluster) or isinstance(light, PolygonLight)
         self.chosen_by, self.number, self.choices = surface.tracer.chosen_by(light.name), number, choices
-        origins = light.origins(surface.position)
+        origins = light.viewpoint(surface.position)
         offset = (light.center[:, None] - origins).astype(np.float32)
         ahead = np.ones(offset.shape[1], bool)
         if not light.is_facing and not isinstance(emitter, Cluster):
             ahead = dot(light.direction.astype(np.float32), offset) < -off_plane(
                 light.center, np.abs(origins).sum(axis=0)
             )
-        if light.is_focused or light.is_facing:
+        if light.has_spread or light.is_facing:
             ahead &= may_reach(light, surface.position)
         if light.receivers is not None:
             ahead &= light.receives(surface.receiver)
@@ -418,7 +418,7 @@ class Pairs:
         surface, index = self.surface, self.index[members]
         if isinstance(self.emitter, Cluster):
             return View(surface, index, self.emitter, (name,)).corner_heights(surface.horizons(name))
-        center = self.light.center[:, None] - self.light.origins(surface.position[:, index])
+        center = self.light.center[:, None] - self.light.viewpoint(surface.position[:, index])
         if self.light.is_facing:
             normal = surface.horizons(name)[0][:, index]
             offset = FacingDisk.of(self.light, center.astype(np.float32), normal).corners(OUTLINE)
@@ -604,7 +604,7 @@ class View:
     def __init__(self, surface: Surface, index: np.ndarray, emitter: Emitter | Cluster, lobes: tuple[str, ...]):
         self.index, self.emitter, self.lobes = index, emitter, lobes
         light = emitter.light
-        offset = light.center[:, None] - light.origins(np.take(surface.position, index, axis=1))
+        offset = light.center[:, None] - light.viewpoint(np.take(surface.position, index, axis=1))
         self.height = (-dot(light.direction, offset)).astype(np.float32)
         self.offset = offset.astype(np.float32)
         self.disk, is_quad = None, not isinstance(emitter, Cluster)

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ltsh_addon.scene import AreaLight, SurfaceSamples
+from ltsh_addon.scene import QuadLight, SurfaceSamples
 
 
 def unit(vectors):
@@ -71,7 +71,7 @@ def _lamp(number, generator):
     direction = unit(np.array([0.0, 0.0, 0.2]) - center)
     half_u = 0.5 * unit(np.cross(direction, [0.0, 0.0, 1.0]))
     half_v = 0.7 * np.cross(direction, unit(half_u))
-    lamp = AreaLight("Lamp", "RECTANGLE", center, half_u, half_v, direction, np.array([5.0, 4.0, 3.0]))
+    lamp = QuadLight("Lamp", center, half_u, half_v, direction, np.array([5.0, 4.0, 3.0]))
     return lamp if np.dot(np.cross(half_u, half_v), direction) > 0 else replace(lamp, half_v=-half_v)
 
 
@@ -107,5 +107,5 @@ def ceiling(count, seed=1):
         direction = unit(np.array([0.0, 0.0, -1.0]) + 0.3 * generator.normal(size=3))
         half_u = generator.uniform(0.25, 0.5) * unit(np.cross(direction, [0.0, 1.0, 0.0]))
         half_v, color = np.cross(direction, half_u), generator.uniform(5.0, 10.0, 3)
-        lights.append(AreaLight("Lamp", "RECTANGLE", place, half_u, half_v, direction, color))
+        lights.append(QuadLight("Lamp", place, half_u, half_v, direction, color))
     return lights

@@ -29,6 +29,7 @@ from ltsh_addon.cli.commands import DEMO_SCENE  # noqa: E402
 from ltsh_addon.emitters import light_polygons  # noqa: E402
 from ltsh_addon.lobes import edge_integrals, moments32  # noqa: E402
 from ltsh_addon.lobes.polygon import project_to_sphere, split_at_horizon  # noqa: E402
+from ltsh_addon.scene import EllipseLight, PolygonLight  # noqa: E402
 from ltsh_addon.workers import pool  # noqa: E402
 
 TABLES = {name: shading.load_table(name) for name in shading.SHIPPED_TABLES}
@@ -110,14 +111,14 @@ def light_kinds(options):
     heading(f"kinds of lights: ltsh4, F = 1, {count} samples, 4 lights, one process: ns per sample and light")
     samples, lights = floor_scene(count, 4)
     samples = replace(samples, receiver=np.arange(count) % 2)
-    hexagon = [replace(light, shape="POLYGON", corners=replace(light, shape="DISK").polygon(6)) for light in lights]
+    hexagon = [PolygonLight.like(light, corners=EllipseLight.like(light).polygon(6)) for light in lights]
     kinds = {
         "rectangle": lights,
         "rectangle, half of the samples": [replace(light, receivers=(1,)) for light in lights],
         "hexagon": hexagon,
-        "ellipse": [replace(light, shape="ELLIPSE") for light in lights],
+        "ellipse": [EllipseLight.like(light) for light in lights],
         "rectangle, spread 90 degrees": [replace(light, spread=0.5 * np.pi) for light in lights],
-        "ellipse, spread 90 degrees": [replace(light, shape="ELLIPSE", spread=0.5 * np.pi) for light in lights],
+        "ellipse, spread 90 degrees": [EllipseLight.like(light, spread=0.5 * np.pi) for light in lights],
         "rectangle, spread 15 degrees": [replace(light, spread=np.pi / 12) for light in lights],
     }
     for part in ("specular", "diffuse"):

@@ -29,6 +29,7 @@ from ltsh_addon.blender.viewport.mirror import SceneMirror
 from ltsh_addon.blender.viewport.pictures import ShownPicture
 from ltsh_addon.blender.viewport.renderer import ViewRenderer
 from ltsh_addon.cli.commands import DEMO_SCENE
+from ltsh_addon.scene import QuadLight
 
 TECHNIQUES = ("ltc", "ltsh2", "ltsh4", "ltsh4c")
 # In times of ltc.
@@ -107,7 +108,7 @@ def many_lights(frames, rounds):
     generator = np.random.default_rng(3)
     many = [random_surfaces.light(KINDS[number % len(KINDS)], number, generator) for number in range(MANY)]
     lights = {"many": [light if light.is_distant else light.moved(np.array([0.0, 0.0, 2.0])) for light in many]}
-    lights["four"] = [replace(light, shape="RECTANGLE", spread=np.pi, detail=()) for light in frames.mirror.lights[:4]]
+    lights["four"] = [QuadLight.like(light, spread=np.pi, children=()) for light in frames.mirror.lights[:4]]
     seconds = {}
     for name, own in lights.items():
         frames.mirror.lights = tuple(own)

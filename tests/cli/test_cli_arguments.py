@@ -50,10 +50,8 @@ def test_wrong_values_are_misuse(capsys, child, room, out, arguments, complaint)
         (["demo"], "-o"),
         (["compare", "room.blend", "-o", "out", "--cycles-samples", "1"], "expected at least 2"),
         (["compare", "room.blend", "-o", "out", "--cycles-samples", "0"], "'0' was given"),
-        (["tables"], "action"),
-        (["tables", "burn"], "'burn'"),
         ("shad room.blend -o out".split(), "ltsh: command 'shad' is unknown (expected one of demo, compare, "
-         "shade, bake, view, render, relight, run, merge, tables); see ltsh --help"),
+         "shade, bake, view, render, relight, run, merge); see ltsh --help"),
         ("shade room.blend -o out --techniqes ltc".split(), "ltsh shade: option --techniqes is unknown here; see ltsh "
          "shade --help"),
         ("shade room.blend -o out --techniqes=ltc".split(), "option --techniqes is unknown here"),
@@ -62,7 +60,6 @@ def test_wrong_values_are_misuse(capsys, child, room, out, arguments, complaint)
         ("shade room.blend -o out hall.blend".split(),
          "'hall.blend' is not expected here (name all files one after another); see"),
         ("demo room.blend -o out".split(), "ltsh demo: 'room.blend' is not expected here; see ltsh demo --help"),
-        ("tables export -o out --jsn".split(), "option --jsn is unknown here"),
     ],
 )  # fmt: skip
 def test_wrong_calls_are_misuse(capsys, child, tmp_path, monkeypatch, arguments, complaint):
@@ -97,7 +94,7 @@ def test_left_out_options_mean_as_in_the_file(capsys, child, room, out):
     assert (asked.width, asked.height, asked.sub_samples, asked.frame, asked.camera) == (None, None, 1, None, None)
 
 
-@pytest.mark.parametrize("command", "demo compare shade bake render run merge tables".split() + ["tables export"])
+@pytest.mark.parametrize("command", "demo compare shade bake render run merge".split())
 def test_help_says_what_a_command_does_with_its_options_defaults_and_examples(capsys, command):
     code, stdout, stderr = run(capsys, *command.split(), "--help")
     description = stdout.split("\n\n")[1]
@@ -114,7 +111,7 @@ def test_help_says_what_a_command_does_with_its_options_defaults_and_examples(ca
 def test_the_main_help_names_the_commands_and_the_program_as_it_was_called(capsys, out):
     program = "blender --command ltsh"
     code, stdout, _ = run(capsys, "--help", program=program)
-    assert code == 0 and all(f"\n    {command} " in stdout for command in ("demo", "compare", "shade", "tables"))
+    assert code == 0 and all(f"\n    {command} " in stdout for command in ("demo", "compare", "shade", "bake"))
     assert f"{program} demo -o out/demo" in stdout
     assert run(capsys, "shade", "-o", out, program=program)[2].startswith(f"{program}: ")
     assert run(capsys, "--version")[:2] == (0, f"ltsh {VERSION}\n")

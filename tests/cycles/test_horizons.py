@@ -10,7 +10,7 @@ from ltsh_addon.cycles.environment import CUBE
 from ltsh_addon.cycles.gbuffer import coarse_meshes
 from ltsh_addon.cycles.horizons import end_at_horizons_of_cycles
 from ltsh_addon.cycles.light_tree import light_bounds_at, light_selection_pmf, light_tree_rows
-from ltsh_addon.scene import AreaLight, SurfaceSamples
+from ltsh_addon.scene import EllipseLight, PointLight, PolygonLight, QuadLight, SkyLight, SurfaceSamples
 
 
 def samples_near_the_horizon(roughness, view=(-0.96, 0.0, 0.28), count=4):
@@ -34,7 +34,7 @@ def samples_near_the_horizon(roughness, view=(-0.96, 0.0, 0.28), count=4):
 def light_at(distance, half):
     """A square light on the x axis that faces the origin, its center on the horizon."""
     axes = {"half_u": (0.0, half, 0.0), "half_v": (0.0, 0.0, half), "direction": (-1.0, 0.0, 0.0)}
-    return AreaLight("Light", "SQUARE", (distance, 0.0, 0.0), radiance=(1.0, 1.0, 1.0), **axes)
+    return QuadLight("Light", (distance, 0.0, 0.0), radiance=(1.0, 1.0, 1.0), **axes)
 
 
 @pytest.mark.parametrize(
@@ -129,7 +129,7 @@ def samples_around(generator, count):
 
 def sides_of_the_sky(brightness=range(1, 7)):
     """The cube that the light of a world makes."""
-    like = replace(light_at(1.0, 1.0), is_distant=True)
+    like = SkyLight.like(light_at(1.0, 1.0))
     return tuple(
         replace(like, center=ahead, half_u=right, half_v=up, direction=-ahead, radiance=(b, b, b))
         for (ahead, right, up), b in zip(CUBE, brightness, strict=True)
@@ -142,15 +142,15 @@ def test_directions_between_the_horizons_meet_the_lights_that_stand_there(kind):
     generator = np.random.default_rng(3)
     samples, lights = samples_around(generator, 12), lights_around(generator, 200)
     if kind == "distant":
-        lights = tuple(replace(light, is_distant=True) for light in lights)
+        lights = tuple(SkyLight.like(light) for light in lights)
     if kind == "sheared":
-        lights = tuple(replace(light, shape="RECTANGLE", half_v=light.half_v + 0.5 * light.half_u) for light in lights)
+        lights = tuple(QuadLight.like(light, half_v=light.half_v + 0.5 * light.half_u) for light in lights)
     if kind == "ellipse":
-        lights = tuple(replace(light, shape="ELLIPSE", half_v=0.5 * light.half_v) for light in lights)
+        lights = tuple(EllipseLight.like(light, half_v=0.5 * light.half_v) for light in lights)
     if kind == "polygon":
-        lights = tuple(replace(light, shape="POLYGON", corners=light.polygon()) for light in lights)
+        lights = tuple(PolygonLight.like(light, corners=light.polygon()) for light in lights)
     if kind in ("ball", "disk"):
-        lights = tuple(replace(light, shape="BALL" if kind == "ball" else "FACING_DISK") for light in lights)
+        lights = tuple(PointLight.like(light, shape="BALL" if kind == "ball" else "FACING_DISK") for light in lights)
     if kind == "sky":
         lights = sides_of_the_sky()[:5]
     shape = horizons._LightsOfKind.of(lights, np.arange(len(lights)), np.ones(len(lights)))
@@ -161,7 +161,7 @@ def test_directions_between_the_horizons_meet_the_lights_that_stand_there(kind):
     found = set(zip(number.tolist(), sample.tolist(), ray.tolist(), strict=True))
     expected = set()
     for index, light in enumerate(lights):
-        offset = (light.center - light.origins(samples.position))[:, None]
+        offset = (light.center - light.viewpoint(samples.position))[:, None]
         towards = directions.towards
         if light.is_facing:
             # How far from the ball's center, or from that of the disk that is turned to the point, rays pass.

@@ -1,4 +1,4 @@
-"""Lights with a detail: each sample takes all of the light once, in patches as small as it needs."""
+"""Lights with children: each sample takes all of the light once, in patches as small as it needs."""
 
 from dataclasses import replace
 
@@ -9,7 +9,7 @@ import random_surfaces
 from ltsh_addon import shading
 from ltsh_addon.cycles.patches import cut_into_patches, split_light
 from ltsh_addon.emitters.light_polygons import fitting_patches
-from ltsh_addon.scene import AreaLight
+from ltsh_addon.scene import light_of
 
 PLACES = {
     "rectangle": {"half_u": (0.8, 0, 0), "half_v": (0, -0.6, 0)},
@@ -27,12 +27,13 @@ def textured_light(place="rectangle", most=128):
     x, y = np.meshgrid(*(np.linspace(-1.0, 1.0, 64),) * 2)
     covered = np.hypot(x, y) < 1.0 if place == "ellipse" else np.ones((64, 64), bool)
     placed = {
+        "name": "Lamp",
         "shape": "RECTANGLE",
         "center": (0.0, 0.0, 2.0),
         "direction": (0.0, 0.0, -1.0),
         "radiance": (5.0, 3.0, 1.0),
     }
-    (light,) = split_light(AreaLight("Lamp", **{**placed, **PLACES[place]}), cut_into_patches(image, covered, most))
+    (light,) = split_light(light_of(placed | PLACES[place]), cut_into_patches(image, covered, most))
     return light
 
 
@@ -55,24 +56,24 @@ def test_every_sample_gets_the_whole_light_once(place, specular):
     # The pixels of an ellipse cover its edge only roughly.
     expected = np.linalg.norm(light.area_vector) * light.radiance
     assert np.allclose(power, expected, rtol=1e-9 if place != "ellipse" else 0.02)
-    assert count.max() <= len(light.patches) and count.mean() < len(light.patches)
+    assert count.max() <= len(light.leaves) and count.mean() < len(light.leaves)
 
 
 def test_patches_that_fit_give_the_light_of_the_smallest_ones():
     light, samples = textured_light(), metals(150)
-    expected = shading.shade(samples, light.patches, workers=1)
+    expected = shading.shade(samples, light.leaves, workers=1)
     found = shading.shade(samples, [light], workers=1)
     for name in shading.PASSES:
         exact, coarse = getattr(expected, name), getattr(found, name)
         # Of the whole light as one patch it is 5 % and more.
         assert np.linalg.norm(coarse - exact) < 3e-3 * np.linalg.norm(exact), name
-        plain = getattr(shading.shade(samples, [replace(light, detail=())], passes=(name,), workers=1), name)
+        plain = getattr(shading.shade(samples, [replace(light, children=())], passes=(name,), workers=1), name)
         assert np.linalg.norm(plain - exact) > 0.04 * np.linalg.norm(exact), name
 
 
 def test_the_reference_takes_the_same_patches():
     light, samples = textured_light(most=16), metals(6)
-    expected = shading.shade(samples, light.patches, shading.REFERENCE, workers=1).specular.sum(axis=0)
+    expected = shading.shade(samples, light.leaves, shading.REFERENCE, workers=1).specular.sum(axis=0)
     found = shading.shade(samples, [light], shading.REFERENCE, workers=1)
     assert np.linalg.norm(found.specular - expected) < 3e-3 * np.linalg.norm(expected)
     assert found.quadrature_error.shape == (6,) and found.quadrature_error.max() > 0.0

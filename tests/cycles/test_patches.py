@@ -13,7 +13,7 @@ from ltsh_addon.cycles.patches import (
     signed_area,
     split_light,
 )
-from ltsh_addon.scene import AreaLight
+from ltsh_addon.scene import light_of
 
 PLACED = {
     "center": [1.0, 2.0, 3.0],
@@ -118,16 +118,23 @@ def area_of(light):
 @pytest.mark.parametrize("direction", [-1.0, 1.0])
 @pytest.mark.parametrize(("shape", "spread"), [("RECTANGLE", np.pi), ("ELLIPSE", np.pi), ("ELLIPSE", 1.0)])
 def test_the_parts_of_a_light_have_its_power(shape, spread, direction):
-    light = AreaLight("L", shape, **{**PLACED, "direction": [0, 0, direction]}, radiance=[1.0, 1.0, 1.0], spread=spread)
+    changes = {
+        "name": "L",
+        "shape": shape,
+        "direction": [0, 0, direction],
+        "radiance": [1.0, 1.0, 1.0],
+        "spread": spread,
+    }
+    light = light_of(PLACED | changes)
     image = np.random.default_rng(7).random((64, 64, 3))
     area = 4.0 * 0.6 * 0.4 * (np.pi / 4.0 if shape == "ELLIPSE" else 1.0)
     # The mean of the image inside the ellipse is not known better than by its pixels.
     for picture, most, mean, tolerance in ((np.ones((64, 64, 3)), 1, 1.0, 1e-9), (image, 100, 0.5, 0.03)):
         (whole,) = split_light(light, cut_into_patches(picture, everywhere(picture), most=most))
-        powers = [area_of(part) * part.radiance for part in whole.patches]
+        powers = [area_of(part) * part.radiance for part in whole.leaves]
         # Counterclockwise around the direction: all areas are positive.
         assert min(power.min() for power in powers) > 0.0
         assert np.allclose(sum(powers), area * mean, rtol=tolerance)
-        assert {part.spread for part in whole.patches} == {spread}
+        assert {part.spread for part in whole.leaves} == {spread}
         if spread < np.pi and most > 1:
-            assert {part.shape for part in whole.patches} == {"RECTANGLE"}
+            assert {part.shape for part in whole.leaves} == {"RECTANGLE"}

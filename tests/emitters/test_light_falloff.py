@@ -8,7 +8,7 @@ import quadrature
 from random_surfaces import unit
 
 from ltsh_addon.emitters import tails
-from ltsh_addon.scene import AreaLight, SurfaceSamples
+from ltsh_addon.scene import SurfaceSamples, light_of
 from ltsh_addon.shading import shade
 
 COUNT = 16  # small lights along each side
@@ -30,10 +30,8 @@ def light(height, **settings):
     """A tilted rectangle of 2 x 1.2 m over the plane, changed by `settings`."""
     u, toward = np.array([0.98, 0.0, 0.199]), np.array([0.199, 0.0, -0.98])
     center, radiance = np.array([0.2, 0.3, height]), np.array([1.0, 2.0, 3.0])
-    plain = AreaLight(
-        "Light", "RECTANGLE", center, u, np.array([0.0, 0.6, 0.0]), toward / np.linalg.norm(toward), radiance
-    )
-    return replace(plain, **settings)
+    values = {"name": "Light", "shape": "RECTANGLE", "center": center, "half_u": u, "half_v": np.array([0.0, 0.6, 0.0])}
+    return light_of({**values, "direction": toward / np.linalg.norm(toward), "radiance": radiance, **settings})
 
 
 def of_small_lights(samples, whole, technique):

@@ -10,6 +10,7 @@ from surface_scenes import area_light, random_samples, unit
 from ltsh_addon import shading
 from ltsh_addon.emitters import light_tree
 from ltsh_addon.emitters.light_tree import LightTree
+from ltsh_addon.scene import EllipseLight, PolygonLight, QuadLight
 from ltsh_addon.shading import float32, integrator
 from ltsh_addon.workers import pool
 
@@ -144,15 +145,13 @@ def test_few_samples_between_many_lights_get_the_light_of_each(name, monkeypatch
 @pytest.mark.parametrize("shape", ["RECTANGLE", "TRIANGLE", "HEXAGON", "narrow", "DISK"])
 def test_lights_shaded_together_are_those_of_each(shape, monkeypatch):
     """Of leaves that no tile takes as points, whatever their shape."""
-    lights = [replace(light, shape="DISK") for light in lowered(many_lights(80), 1.7)]
+    lights = [EllipseLight.like(light) for light in lowered(many_lights(80), 1.7)]
     if shape in ("TRIANGLE", "HEXAGON"):
-        lights = [replace(one, shape="POLYGON", corners=one.polygon(3 if shape[0] == "T" else 6)) for one in lights]
+        lights = [PolygonLight.like(one, corners=one.polygon(3 if shape[0] == "T" else 6)) for one in lights]
     elif shape != "DISK":
         # The light of a narrow one is left to double precision.
         thin = 1e-5 if shape == "narrow" else 1.0
-        lights = [
-            replace(one, shape="RECTANGLE", half_v=thin * one.half_v, radiance=one.radiance / thin) for one in lights
-        ]
+        lights = [QuadLight.like(one, half_v=thin * one.half_v, radiance=one.radiance / thin) for one in lights]
     monkeypatch.setattr(light_tree, "LEAF_SIZE", 0.0)
     samples = floor_samples(300, 0.3)
     smooth = unit(np.array([0.0, 0.0, 1.0]) + 0.1 * np.random.default_rng(5).normal(size=(300, 3)))

@@ -1,7 +1,5 @@
 """Lights of shape POLYGON, convex or not, and their convex pieces."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import quadrature
@@ -11,6 +9,7 @@ from surface_scenes import STAR, all_kinds_of_samples, area_light, polygon_light
 
 from ltsh_addon import shading
 from ltsh_addon.lobes.polygon import convex_pieces
+from ltsh_addon.scene import PolygonLight
 
 # An L, clockwise and counterclockwise arms, and a star, in the plane z = 0
 ELL = np.array([[-1, -1], [1, -1], [1, -0.2], [-0.3, -0.2], [-0.3, 1], [-1, 1]], dtype=float)
@@ -47,7 +46,7 @@ def test_a_polygon_of_four_corners_is_the_rectangle(technique):
     samples, box = random_samples(80, seed=1), area_light(radiance=(1, 1, 1))
     corners = box.polygon()
     for order in (corners, corners[::-1], np.roll(corners, 1, axis=0)):
-        polygon = replace(box, shape="POLYGON", corners=order)
+        polygon = PolygonLight.like(box, corners=order)
         assert_same(shaded(samples, [polygon], technique), [shaded(samples, [box], technique)], technique)
 
 

@@ -1,13 +1,11 @@
 """Round lights are polygons with as many corners as it takes: their error against finer polygons and exact ellipses."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from surface_scenes import area_light, single_sample, unit
 
 from ltsh_addon import shading
-from ltsh_addon.scene import SurfaceSamples
+from ltsh_addon.scene import PolygonLight, SurfaceSamples
 
 # Of the root mean square, and of a single value no less than a hundredth of the largest.
 TYPICAL, WORST = 1e-3, 0.05
@@ -50,7 +48,7 @@ def test_round_lights_are_round(shape, distance, roughness, grazing):
     """Both lobes and precisions, against a polygon of 768 corners, which is within 1e-6."""
     light = light_of(shape)
     samples = samples_under(light, distance, roughness, grazing)
-    fine = replace(light, shape="POLYGON", corners=light.polygon(768))
+    fine = PolygonLight.like(light, corners=light.polygon(768))
     expected = shading.shade(samples, [fine], "ltsh4", dtype=np.float64, workers=1)
     for dtype in (np.float32, np.float64):
         found = shading.shade(samples, [light], "ltsh4", dtype=dtype, workers=1)
@@ -64,7 +62,7 @@ def test_fine_polygons_are_the_ellipses_of_the_reference(roughness, distance):
     """That 768 corners are enough is no assumption: the reference integrates the ellipse itself, to 1e-4."""
     light = light_of("ELLIPSE")
     samples = samples_under(light, distance, roughness, False, count=12)
-    fine = replace(light, shape="POLYGON", corners=light.polygon(192))
+    fine = PolygonLight.like(light, corners=light.polygon(192))
     found, expected = (
         shading.shade(samples, [one], shading.REFERENCE, passes=["specular"]).specular for one in (fine, light)
     )

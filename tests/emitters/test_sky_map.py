@@ -1,4 +1,4 @@
-"""Distant lights with a detail: patches chosen by the lobes give what the smallest ones do."""
+"""The sky: patches chosen by the lobes give what the smallest ones do."""
 
 from dataclasses import replace
 
@@ -7,10 +7,10 @@ import pytest
 from surface_scenes import random_samples, single_sample
 
 from ltsh_addon.cycles.environment import CUBE, SkyPicture, bright_spots, sky_lights, spot_frame, without_spots
-from ltsh_addon.scene import AreaLight
+from ltsh_addon.scene import SkyLight
 from ltsh_addon.shading import shade
 
-LIKE = AreaLight("Sky", "RECTANGLE", [0, 0, 1], [1, 0, 0], [0, 1, 0], [0, 0, -1], np.ones(3), is_distant=True)
+LIKE = SkyLight("Sky", [0, 0, 1], [1, 0, 0], [0, 1, 0], [0, 0, -1], np.ones(3))
 
 
 def pictures(count=32, seed=1):
@@ -34,7 +34,7 @@ def test_patches_chosen_by_lobes_give_what_the_smallest_do(technique, dtype):
     samples = random_samples(60, seed=2, lowest_roughness=0.25)
     lights, error = sky_lights(LIKE, pictures())
     assert len(lights) == 6 and error < 0.03
-    leaves = [leaf for light in lights for leaf in light.patches]
+    leaves = [leaf for light in lights for leaf in light.leaves]
     found = shade(samples, lights, technique, dtype=dtype, workers=1)
     expected = shade(samples, leaves, technique, dtype=dtype, workers=1)
     for name, most in (("specular", 0.01), ("diffuse", 2e-3)):
@@ -47,7 +47,7 @@ def test_mirrors_reflect_a_sky():
     samples = random_samples(60, seed=2)
     samples = replace(samples, roughness=np.zeros(len(samples)))
     lights, _ = sky_lights(LIKE, pictures())
-    leaves = [leaf for light in lights for leaf in light.patches]
+    leaves = [leaf for light in lights for leaf in light.leaves]
     found, expected = (
         shade(samples, given, "ltsh4", passes=("specular",), workers=1).specular.sum(axis=0)
         for given in (lights, leaves)
@@ -85,19 +85,19 @@ def test_sharp_reflections_show_a_smooth_sky_without_facets():
     assert bend < 0.3 * facets, (bend, facets)
 
 
-def test_a_small_distant_light_with_a_detail_is_all_of_its_patches():
+def test_a_small_distant_light_with_children_is_all_of_its_patches():
     """Such as a bright window in an image, of which a map would give a lobe too much or too little."""
     place = {"center": [0.1, 0.2, 1.0], "half_u": [0.05, 0, 0], "half_v": [0, 0.05, 0]}
     offsets = [(s, t) for s in (-0.5, 0.5) for t in (-0.5, 0.5)]
     whole = replace(LIKE, **place)
-    detail = tuple(
+    children = tuple(
         replace(whole, center=whole.center + s * whole.half_u + t * whole.half_v, half_u=0.5 * whole.half_u,
                 half_v=0.5 * whole.half_v, radiance=(1.0 + s, 1.0 - t, 2.0))
         for s, t in offsets
     )  # fmt: skip
     samples = random_samples(60, seed=4)
-    found = shade(samples, [replace(whole, radiance=(1.0, 1.0, 2.0), detail=detail)], workers=1)
-    expected = shade(samples, detail, workers=1, rows=[0] * len(detail))
+    found = shade(samples, [replace(whole, radiance=(1.0, 1.0, 2.0), children=children)], workers=1)
+    expected = shade(samples, children, workers=1, rows=[0] * len(children))
     assert np.array_equal(found.combined, expected.combined) and found.combined.any()
 
 
@@ -105,7 +105,7 @@ def test_a_constant_sky_is_one_patch_a_side_and_reflects_the_albedo():
     """From above a plane half of the sky is seen: the diffuse reflection is the albedo."""
     constant = [SkyPicture(*axes, np.ones((8, 8, 3))) for axes in CUBE]
     lights, error = sky_lights(LIKE, constant)
-    assert len(lights) == 6 and error < 1e-6 and not any(light.detail for light in lights)
+    assert len(lights) == 6 and error < 1e-6 and not any(light.children for light in lights)
     samples = random_samples(100, seed=3)
     flat = (samples.diffuse_normal == samples.smooth_normal).all(axis=1)
     diffuse = shade(samples, lights, "ltc", passes=("diffuse",), workers=1).diffuse.sum(axis=0)

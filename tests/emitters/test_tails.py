@@ -8,6 +8,7 @@ import textbook
 from surface_scenes import area_light, single_sample, unit
 
 from ltsh_addon import shading
+from ltsh_addon.scene import PolygonLight
 
 
 def random_case(generator):
@@ -122,7 +123,7 @@ def test_a_profiled_polygon_in_several_pieces_is_limited_as_a_whole():
     for view, roughness, light, _ in cases(25):
         u, v = light.half_u, light.half_v
         corners = light.center + np.stack([-u - v, u - v, u + v, 0.3 * u - 0.3 * v])
-        dart = replace(light, shape="POLYGON", corners=corners, falloff=2)
+        dart = PolygonLight.like(light, corners=corners, falloff=2)
         # Its share of the area of the rectangle
         share = np.linalg.norm(dart.area_vector) / np.linalg.norm(light.area_vector)
         low, high = profile_range(dart) * textbook.tail_bounds(view, roughness, light) * share

@@ -9,7 +9,7 @@ from ltsh_addon.blender.process import finished, pixels
 from ltsh_addon.imaging.color import to_srgb8
 from ltsh_addon.pipeline import PictureOptions
 from ltsh_addon.pipeline.tasks import BatchJob
-from ltsh_addon.scene import AreaLight, Cancelled, Film, SurfaceSamples
+from ltsh_addon.scene import Cancelled, Film, Light, QuadLight, SurfaceSamples
 from ltsh_addon.visibility import OccluderMesh, Occluders
 
 WIDTH, HEIGHT, SUB_SAMPLES = 6, 4, 2
@@ -53,10 +53,10 @@ def samples(count: int, seed: int = 4) -> SurfaceSamples:
     )
 
 
-def lights(groups=("Key", "Fill.001", "")) -> tuple[AreaLight, ...]:
+def lights(groups=("Key", "Fill.001", "")) -> tuple[Light, ...]:
     """One square light over the plane per group."""
     return tuple(
-        AreaLight(
+        QuadLight(
             name=f"Light {index}",
             shape="SQUARE",
             center=(0.7 * index - 0.7, 0.2 * index, 1.5),

@@ -15,7 +15,7 @@ from ltsh_addon import shading
 from ltsh_addon.lobes.edge_integrals import MAX_DEGREE
 from ltsh_addon.lobes.lookup_table import LookupTable
 from ltsh_addon.lobes.spherical_harmonics import coefficient_count
-from ltsh_addon.pipeline import export as export_module
+from tables import export as export_module
 
 C_COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 CXX_COMPILER = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")

@@ -3,7 +3,7 @@
 import numpy as np
 import random_surfaces
 
-from ltsh_addon.scene import AreaLight, Film, SurfaceSamples
+from ltsh_addon.scene import Film, SurfaceSamples, light_of
 from ltsh_addon.visibility.occluders import ChosenBy
 
 
@@ -78,4 +78,4 @@ def panel(**changes):
         "name": "Panel", "shape": "RECTANGLE", "center": np.array([0.0, 3.0, 1.5]), "half_u": half_u,
         "half_v": 0.7 * np.cross(direction, half_u), "direction": direction, "radiance": np.ones(3),
     }  # fmt: skip
-    return AreaLight(**{**values, **changes})
+    return light_of(values | changes)

@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from ltsh_addon.scene import PolygonLight
+
 
 def patches_of(light, count=64) -> tuple[np.ndarray, np.ndarray]:
     """Points (S, 3) on the light and the area (S,) in m^2 that each stands for, negative where a fan of triangles over
     a concave polygon counts what is outside once more and takes it off again."""
-    if light.shape == "POLYGON":
+    if isinstance(light, PolygonLight):
         first, *others = light.corners
         fans = [_triangle_patches(light, first, *pair, count) for pair in zip(others, others[1:], strict=False)]
         return tuple(np.concatenate(parts) for parts in zip(*fans, strict=True))

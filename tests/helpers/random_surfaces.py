@@ -5,7 +5,17 @@ from __future__ import annotations
 import numpy as np
 from surface_scenes import unit
 
-from ltsh_addon.scene import AreaLight, SpotCone, SurfaceSamples
+from ltsh_addon.scene import (
+    EllipseLight,
+    Light,
+    PointLight,
+    PolygonLight,
+    QuadLight,
+    SpotCone,
+    SpotLight,
+    SunLight,
+    SurfaceSamples,
+)
 
 EYE = np.array([0.25, -4.0, 2.0])
 SURFACES = ("plain", "sharp", "grazing", "head-on", "tilted")
@@ -93,7 +103,7 @@ def _fresnel(random, count):
     }
 
 
-def light(kind: str, number: int, random: np.random.Generator) -> AreaLight:
+def light(kind: str, number: int, random: np.random.Generator) -> Light:
     """A light within a few meters of the origin that shines towards it, with about the power of any other."""
     if kind in FACING_LIGHTS:
         return _facing(kind, number, random)
@@ -119,15 +129,15 @@ def light(kind: str, number: int, random: np.random.Generator) -> AreaLight:
         direction = -direction
     shape = "POLYGON" if kind == "polygon" else "ELLIPSE" if "disk" in kind else "RECTANGLE"
     area = 4.0 * np.linalg.norm(half_u) * np.linalg.norm(half_v)
-    return AreaLight(
+    kinds = {"RECTANGLE": QuadLight, "ELLIPSE": EllipseLight, "POLYGON": PolygonLight}
+    return kinds[shape](
         name=f"{kind} {number}",
-        shape=shape,
         center=rounded(center),
         half_u=half_u,
         half_v=half_v,
         direction=direction,
         radiance=rounded(random.uniform(0.5, 1.0, 3) / area),
-        corners=_star(random, rounded(center), half_u, half_v) if shape == "POLYGON" else None,
+        **({"corners": _star(random, rounded(center), half_u, half_v)} if shape == "POLYGON" else {}),
         spread=spread,
         receivers=tuple(random.choice(GROUPS, 2, replace=False)) if kind == "linked" else None,
         falloff={"linear": 1, "constant disk": 2}.get(kind, 0),
@@ -140,29 +150,28 @@ def _facing(kind, number, random):
     if kind == "sun":
         toward, half = unit(np.array([*random.uniform(-1.0, 1.0, 2), 0.5])), random.uniform(0.01, 0.5)
         first = np.sin(half) * unit(np.cross(toward, random.normal(size=3)))
-        return AreaLight(
+        return SunLight(
             name=f"{kind} {number}",
-            shape="DISK",
             center=rounded(np.cos(half) * toward),
             half_u=rounded(first),
             half_v=rounded(np.cross(first, toward)),
             direction=-toward,
             radiance=rounded(random.uniform(0.5, 1.0, 3) / (np.pi * np.sin(half) ** 2)),
-            is_distant=True,
         )
     center, radius = (
         np.array([*random.uniform(-2.0, 2.0, 2), random.uniform(0.8, 2.5)]),
         10.0 ** random.uniform(-2.0, -0.2),
     )
-    toward, cone = unit(center), None
+    toward, light_class, cone = unit(center), PointLight, {}
     if "spot" in kind:
         u = unit(np.cross(toward, random.normal(size=3)))
         axes = np.stack([u, random.uniform(0.6, 1.6) * np.cross(toward, u), toward])
         cosine = np.cos(random.uniform(0.3, 1.2))
-        cone = SpotCone(axes, cosine, 1.0 / (random.uniform(0.05, 1.0) * (1.0 - cosine)))
+        light_class = SpotLight
+        cone = {"cone": SpotCone(axes, cosine, 1.0 / (random.uniform(0.05, 1.0) * (1.0 - cosine)))}
     if kind == "bulb":
         radius = 1e-6
-    return AreaLight(
+    return light_class(
         name=f"{kind} {number}",
         shape="FACING_DISK" if "disk" in kind else "BALL",
         center=rounded(center),
@@ -170,7 +179,7 @@ def _facing(kind, number, random):
         half_v=rounded([0.0, radius, 0.0]),
         direction=-toward,
         radiance=rounded(random.uniform(0.5, 1.0, 3) / radius**2),
-        cone=cone,
+        **cone,
     )
 
 

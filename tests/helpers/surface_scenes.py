@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ltsh_addon.scene import AreaLight, SurfaceSamples
+from ltsh_addon.scene import SurfaceSamples, light_of
 
 
 def unit(vectors):
@@ -37,7 +37,8 @@ def area_light(name="Lamp", shape="RECTANGLE", center=(0, 0, 3), half_u=(1, 0, 0
     """An area light that shines along cross(half_u, half_v), by default down."""
     if "direction" not in options:
         options["direction"] = unit(np.cross(np.asarray(half_u, dtype=float), np.asarray(half_v, dtype=float)))
-    return AreaLight(name, shape, center, half_u, half_v, **{"radiance": (5.0, 3.0, 1.0), **options})
+    values = {"name": name, "shape": shape, "center": center, "half_u": half_u, "half_v": half_v}
+    return light_of({**values, "radiance": (5.0, 3.0, 1.0), **options})
 
 
 def four_lights():

@@ -14,7 +14,7 @@ import pytest
 from ltsh_addon import imaging, scene, shading
 from ltsh_addon.imaging.exr import group_names
 from ltsh_addon.pipeline import PictureOptions, compare_scene, comparison, lighting, shade_scene
-from ltsh_addon.scene import Cancelled
+from ltsh_addon.scene import Cancelled, PolygonLight
 
 TABLES = Path(shading.__file__).resolve().parents[2] / "tables"
 TECHNIQUES = ("ltc", "ltsh4", "reference")
@@ -217,7 +217,7 @@ def test_the_report_has_its_schema_and_is_the_file(child, tmp_path):
 
 def test_the_report_names_a_lamp_of_many_faces_once():
     whole = fake_scene.lights()[0]
-    lamp = replace(whole, name="Lamp", shape="POLYGON", corners=whole.polygon(), group="Lamps")
+    lamp = PolygonLight.like(whole, name="Lamp", corners=whole.polygon(), group="Lamps")
     dark = replace(lamp, radiance=np.zeros(3))
     found = comparison._light_reports([whole, lamp, dark, lamp, replace(lamp, name="Other")])
     assert [(one["name"], one["patches"]) for one in found] == [(whole.name, 1), ("Lamp", 3), ("Other", 1)]

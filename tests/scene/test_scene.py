@@ -7,9 +7,17 @@ import numpy as np
 import pytest
 from surface_scenes import area_light, random_samples
 
-from ltsh_addon.scene import AREA_LIGHT_SHAPES, AreaLight, Film, SurfaceSamples, light_records, lights_of
+from ltsh_addon.scene import (
+    EllipseLight,
+    Film,
+    PolygonLight,
+    QuadLight,
+    SurfaceSamples,
+    light_records,
+    lights_of,
+)
 
-shapes = pytest.mark.parametrize("shape", AREA_LIGHT_SHAPES)
+shapes = pytest.mark.parametrize("shape", (*QuadLight.SHAPES, *EllipseLight.SHAPES))
 
 
 def vector_area(polygon):
@@ -53,13 +61,11 @@ def test_lights_survive_their_records_many_alike_in_one():
     """In their order, bit for bit; those that differ in more than their vectors are kept apart."""
     generator = np.random.default_rng(1)
     fans = [
-        AreaLight(
-            "Lamp", "POLYGON", *generator.normal(size=(5, 3)), group="A", corners=generator.normal(size=(count, 3))
-        )
+        PolygonLight("Lamp", *generator.normal(size=(5, 3)), group="A", corners=generator.normal(size=(count, 3)))
         for count in np.repeat([4, 3, 4], 40)
     ]
     lights = [*fans, *(area_light(center=place) for place in generator.normal(size=(30, 3))), area_light(spread=1.0)]
-    lights.append(replace(area_light(), detail=(area_light(),)))
+    lights.append(replace(area_light(), children=(area_light(),)))
     records = json.loads(json.dumps(light_records(lights)))
     assert len(records) == 6
     for light, other in zip(lights, lights_of(records), strict=True):

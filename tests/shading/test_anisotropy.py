@@ -7,13 +7,13 @@ import pytest
 import quadrature
 import random_surfaces
 
-from ltsh_addon.scene import AreaLight
+from ltsh_addon.scene import QuadLight
 from ltsh_addon.shading import shade
 
 COUNT = 60
 HALF_U, HALF_V = np.array([1.5, 0.2, 0.1]), np.array([-0.15, -0.6, 1.0])
-LIGHT = AreaLight(
-    "Key", "RECTANGLE", [0.3, 2.5, 2.2], HALF_U, HALF_V, random_surfaces.unit(np.cross(HALF_U, HALF_V)), [2.0, 1.5, 1.0]
+LIGHT = QuadLight(
+    "Key", [0.3, 2.5, 2.2], HALF_U, HALF_V, random_surfaces.unit(np.cross(HALF_U, HALF_V)), [2.0, 1.5, 1.0]
 )
 
 

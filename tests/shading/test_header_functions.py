@@ -9,7 +9,7 @@ from polygon_quadrature import above_horizon
 
 from ltsh_addon import shading
 from ltsh_addon.lobes.polygon import clip_to_horizon, edge_sums, project_to_sphere, split_at_horizon
-from ltsh_addon.scene import AreaLight, SurfaceSamples
+from ltsh_addon.scene import QuadLight, SurfaceSamples
 from ltsh_addon.shading.header import data_blocks
 
 pytestmark = pytest.mark.skipif(header_harness.C_COMPILER is None, reason="needs a C compiler")
@@ -140,7 +140,7 @@ def test_what_shading_takes_of_an_integral_agrees(compiled):
         center = np.array(center)
         half_u = size * np.cross(center, [0.0, 0.0, 1.0]) / np.linalg.norm(center[:2])
         half_v = 0.5 * size * np.cross(half_u, center) / np.linalg.norm(np.cross(half_u, center))
-        light = AreaLight("", "RECTANGLE", center, half_u, half_v, -center / np.linalg.norm(center), np.ones(3))
+        light = QuadLight("", center, half_u, half_v, -center / np.linalg.norm(center), np.ones(3))
         vertices = np.broadcast_to(light.polygon(), (len(cosine), 4, 3)).astype(np.float32)
         found = header.call("shaded", cosine, roughness, ior, 4, vertices, shape=(2,))
         signed = header.call("integral", cosine, roughness, 0, 4, vertices)

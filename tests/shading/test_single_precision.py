@@ -13,6 +13,7 @@ from ltsh_addon import shading
 from ltsh_addon.emitters import small_lights as points
 from ltsh_addon.lobes import edge_integrals, moments32
 from ltsh_addon.lobes.polygon import project_to_sphere
+from ltsh_addon.scene import PolygonLight
 from ltsh_addon.shading import float32, integrator
 
 
@@ -56,7 +57,7 @@ def test_narrow_lights_are_exact_to_rounding(name):
         area_light(**narrow),
         area_light(**narrow, shape="ELLIPSE"),
         area_light(**narrow, spread=1.0),
-        replace(area_light(**narrow), shape="POLYGON", corners=triangle),
+        PolygonLight.like(area_light(**narrow), corners=triangle),
     ]
     for light in white_lights(lights):
         single = shading.shade(samples, [light], name, workers=1)
@@ -64,7 +65,7 @@ def test_narrow_lights_are_exact_to_rounding(name):
         for part in shading.PASSES:
             found, expected = getattr(single, part), getattr(double, part)
             # Of the light with a spread single precision takes points, double precision layers.
-            limit = 0.003 if light.is_focused else 2e-7
+            limit = 0.003 if light.has_spread else 2e-7
             assert np.abs(found - expected).max() < limit * expected.max() and expected.max() > 0.0
 
 

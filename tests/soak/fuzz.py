@@ -202,9 +202,7 @@ def option_values(generator, folder):
 
 
 def loose_words(generator, folder):
-    known = (
-        "shade compare bake run merge tables export demo room.blend -o new --json --resume --overwrite --quiet --log "
-    )
+    known = "shade compare bake run merge demo room.blend -o new --json --resume --overwrite --quiet --log "
     known = [*known.split(), "--help", "--version", "job.toml", "single", "--name"]
     count = generator.integers(0, 7)
     words = [choose(generator, known if generator.random() < 0.7 else WORDS) for _ in range(count)]
@@ -244,8 +242,6 @@ def tables(generator, folder):
         replace_file(generator, path)
     else:
         write_table(generator, path, content)
-    if generator.random() < 0.2:
-        return Case(["tables", "export", "t.npz", "-o", "new", "--quiet"], (DONE, WORLD))
     return Case(
         ["shade", "room.blend", "-o", "new", "--quiet", "--passes", "diffuse", "--techniques=t.npz"], (DONE, WORLD)
     )
@@ -371,9 +367,9 @@ def results(generator, folder):
 
 def streams(generator, folder):
     """Streams that are full, closed or gone; the exit code is 1 where what was asked for could not be printed."""
-    command = choose(generator, [["merge", "single"], ["merge", "frames", "--json"], [*SHADE, "-o", "new"], ["--help"],
-                                 [*SHADE, "-o", "new", "--json"], ["run", "job.toml", "--json"], ["--version"],
-                                 ["tables", "export", "ltc", "-o", "new"]])  # fmt: skip
+    commands = [["merge", "single"], ["merge", "frames", "--json"], [*SHADE, "-o", "new"], ["--help"]]
+    commands += [[*SHADE, "-o", "new", "--json"], ["run", "job.toml", "--json"], ["--version"]]
+    command = choose(generator, commands)
     kind = choose(generator, ["full", "pipe", "closed", "error", "log", "folder"])
     if kind in ("log", "folder") and not command[0].startswith("-"):
         return Case([*command, "--log", "/dev/full" if kind == "log" else "images"], (WORLD,))
@@ -415,9 +411,7 @@ def limits(generator, folder):
 
 def signals(generator, folder):
     """Ctrl-C and SIGTERM at any moment of a real process; before our first line runs, Python says what it likes."""
-    command = choose(
-        generator, [["shade", "none.blend", "-o", "new"], ["tables", "export", "ltc", "-o", "new"], ["--help"]]
-    )
+    command = choose(generator, [["shade", "none.blend", "-o", "new"], ["--help"]])
     number = choose(generator, [signal.SIGINT, signal.SIGTERM])
     return Case(command, (DONE, WORLD, -number, 128 + number), signal_after=(number, generator.uniform(0.0, 0.7)))
 

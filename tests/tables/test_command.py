@@ -16,7 +16,7 @@ from tables import __main__
 ROOT = Path(__file__).resolve().parents[2]
 
 WRONG = [
-    ([], "required: fit|validate|optimum|plot"),
+    ([], "required: fit|validate|optimum|plot|export"),
     (["polish"], "invalid choice: 'polish'"),
     (["fit", "ltsh9"], "table 'ltsh9' is unknown, expected ltc"),
     (["fit", "ltsh2+ltc"], "a sum of two lobes cannot be fitted"),
@@ -33,7 +33,7 @@ def test_bad_arguments_end_with_2(arguments, message, capsys):
         __main__.main(arguments)
     assert caught.value.code == 2
     streams = capsys.readouterr()
-    assert streams.out == "" and message in streams.err and "usage: ltsh tables" in streams.err
+    assert streams.out == "" and message in streams.err and "usage: python -m tables" in streams.err
 
 
 def run(*arguments, **options):

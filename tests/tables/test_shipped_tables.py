@@ -74,7 +74,7 @@ def test_the_readme_names_the_bytes(name):
 @pytest.mark.parametrize("name", SHIPPED_TABLES)
 def test_the_metadata_says_how_the_table_was_made(name):
     table = TABLES[name]
-    assert table.metadata["command"] == f"python -m ltsh_addon tables fit {name}"
+    assert table.metadata["command"] == f"python -m tables fit {name}"
     assert table.metadata["settings"] == settings(family_named(name), GGX, len(table.warp))
     assert len(table.metadata["fresnel_curve_names"]) == len(table.fresnel_curves)
 

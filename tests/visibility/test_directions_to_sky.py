@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from ltsh_addon.cycles.environment import CUBE, SkyPicture, sky_lights
-from ltsh_addon.scene import AreaLight
+from ltsh_addon.scene import SkyLight
 from ltsh_addon.visibility.directions import Sky, emitters_of, unit_points
 
-LIKE = AreaLight("Sky", "RECTANGLE", [0, 0, 1], [1, 0, 0], [0, 1, 0], [0, 0, -1], np.ones(3), is_distant=True)
+LIKE = SkyLight("Sky", [0, 0, 1], [1, 0, 0], [0, 1, 0], [0, 0, -1], np.ones(3))
 NORMALS = np.array([[0.0, 0.6, -0.8], [0.0, 0.8, 0.0], [1.0, 0.0, 0.6]], np.float32)  # (3, Q)
 
 
@@ -23,7 +23,7 @@ def pictures():
 
 def test_the_sides_of_a_sky_have_one_emitter():
     lights, _ = sky_lights(LIKE, pictures())
-    lamp = AreaLight("Sky", "RECTANGLE", [0, 0, 1], [0.1, 0, 0], [0, 0.1, 0], [0, 0, -1], np.ones(3), is_distant=True)
+    lamp = SkyLight("Sky", [0, 0, 1], [0.1, 0, 0], [0, 0.1, 0], [0, 0, -1], np.ones(3))
     emitters, numbers = emitters_of([lamp, *lights])
     assert numbers == ((0,), (1, 2, 3, 4, 5)) and isinstance(emitters[1], Sky)
 

@@ -9,7 +9,7 @@ import textbook
 from known_tracers import OPEN, WALL, Tracer, floor, panel, past_spheres
 
 from ltsh_addon import shading
-from ltsh_addon.scene import PASSES, Cancelled, Film, SurfaceSamples
+from ltsh_addon.scene import PASSES, Cancelled, Film, SurfaceSamples, light_of
 from ltsh_addon.visibility import ratio
 from ltsh_addon.visibility.directions import Emitter
 
@@ -137,7 +137,7 @@ def test_a_textured_light_counts_by_its_radiance():
                             radiance=np.full(3, bright))
         for side, bright in ((-1.0, 1.0), (1.0, 3.0))
     ]  # fmt: skip
-    light = dataclasses.replace(whole, detail=tuple(halves))
+    light = dataclasses.replace(whole, children=tuple(halves))
     samples, _ = floor(8)
     expected = shading.shade(samples, [light], "reference", dtype=np.float64, workers=1)
     parts = [shading.shade(samples, [half], "reference", dtype=np.float64, workers=1) for half in halves]
@@ -341,7 +341,7 @@ def test_rays_to_distant_lights_have_no_end():
     here = dataclasses.replace(samples, position=np.zeros_like(samples.position))
     near = Tracer(lambda origins, directions, distances: directions[:, 0] > 0.0)
     expected = ratio.visible_shares(
-        here, [dataclasses.replace(light, is_distant=False)], near, ratio.ShadowSampling(rays=256)
+        here, [light_of(light.record() | {"is_distant": False})], near, ratio.ShadowSampling(rays=256)
     )
     assert found.mixed.all()
     for name in PASSES:

@@ -8,7 +8,7 @@ from occluder_scenes import answers, random_occluders, random_rays, samples_on, 
 
 from ltsh_addon.blender.process.blender_process import embree_libraries
 from ltsh_addon.cycles.images import EXTENSIONS, INTERPOLATIONS
-from ltsh_addon.scene import PASSES, AreaLight, SceneError
+from ltsh_addon.scene import PASSES, PolygonLight, SceneError
 from ltsh_addon.visibility import (
     OccluderMesh,
     Occluders,
@@ -427,8 +427,7 @@ def glowing_faces(mesh):
             place = (corners - corners[0]) @ axes.T
             middle, half = 0.5 * (place.min(axis=0) + place.max(axis=0)), 0.5 * np.ptp(place, axis=0)
             lights.append(
-                AreaLight(
-                    "Lamp", "POLYGON", center=corners[0] + middle @ axes, half_u=half[0] * axes[0],
+                PolygonLight("Lamp", center=corners[0] + middle @ axes, half_u=half[0] * axes[0],
                     half_v=half[1] * axes[1], direction=normal, radiance=np.ones(3), corners=corners,
                 )
             )  # fmt: skip

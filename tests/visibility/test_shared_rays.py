@@ -12,7 +12,7 @@ from random_surfaces import unit
 from ltsh_addon import shading
 from ltsh_addon.pipeline import lighting, relight
 from ltsh_addon.pipeline.relight import RelightData
-from ltsh_addon.scene import PASSES, AreaLight
+from ltsh_addon.scene import PASSES, PolygonLight, light_of
 from ltsh_addon.visibility import directions, ratio, shared_numbers
 from ltsh_addon.visibility.directions import Choices, Cluster
 
@@ -35,7 +35,7 @@ def ceiling(count=100, color=(1.0, 0.5, 0.25), **changes):
         radiance = generator.uniform(1.0, 4.0) * np.array(color)
         values = {"name": "Lamp", "shape": shape, "center": center, "half_u": half_u, "half_v": half_v}
         values |= {"direction": direction, "radiance": radiance, "corners": corners}
-        lights.append(AreaLight(**values | changes))
+        lights.append(light_of(values | changes))
     return lights
 
 
@@ -61,7 +61,7 @@ def test_lights_of_one_color_group_and_kind_share_their_rays():
 def test_rays_bring_the_light_of_all_lamps(roughness):
     """The weights of 1024 rays beside midpoints of all lamps: at 2 m cells of 2 cm, errors of 1e-4."""
     samples, _ = floor(5, roughness)
-    lights = [light for light in ceiling(99) if light.shape != "POLYGON"]
+    lights = [light for light in ceiling(99) if not isinstance(light, PolygonLight)]
     cluster = Cluster(lights)
     surface = ratio.Surface(samples, PASSES, OPEN.starts(samples) and OPEN)
     pairs = ratio.Pairs(surface, cluster, 0, Choices(samples, cluster.chosen_as, False))

@@ -14,7 +14,7 @@ from precisions import techniques_and_types
 from surface_scenes import area_light, four_lights, random_samples
 
 from ltsh_addon import shading
-from ltsh_addon.scene import Cancelled
+from ltsh_addon.scene import Cancelled, EllipseLight, PolygonLight
 from ltsh_addon.shading import float32, integrator
 from ltsh_addon.workers import pool
 
@@ -59,9 +59,9 @@ def test_pairs_that_blocks_leave_to_double_precision_are_shaded_together(started
     centers = np.append(generator.uniform(-0.5, 0.5, (4, 2)), np.full((4, 1), 1.5), axis=1)
     lights = [area_light(center=center, **narrow) for center in centers]
     lights[1] = replace(lights[1], receivers=(1,))
-    lights[2] = replace(lights[2], shape="DISK")
+    lights[2] = EllipseLight.like(lights[2])
     # A polygon, for of a rectangle with a falloff single precision takes points.
-    lights[3] = replace(lights[3], shape="POLYGON", corners=lights[3].polygon(), falloff=1)
+    lights[3] = PolygonLight.like(lights[3], corners=lights[3].polygon(), falloff=1)
     rows, asked = (0, 1, 0, 0), []
     original = integrator.Task.shade_pairs
 
@@ -217,7 +217,7 @@ pool._Queue.done = counted
 up, white = np.tile([0.0, 0.0, 1.0], (64, 1)), np.ones((64, 3))
 position = np.random.default_rng(1).uniform(-1.0, 1.0, (64, 3)) * [1.0, 1.0, 0.0]
 samples = scene.SurfaceSamples(position, up, up, up, np.full(64, 0.4), white, white, np.zeros(64), np.ones(64), white)
-light = scene.AreaLight("Lamp", "RECTANGLE", (0, 0, 2), (1, 0, 0), (0, -1, 0), (0, 0, -1), (1, 1, 1))
+light = scene.QuadLight("Lamp", (0, 0, 2), (1, 0, 0), (0, -1, 0), (0, 0, -1), (1, 1, 1))
 import time
 def leave_some(fraction):
     limit = time.monotonic() + 60.0

@@ -1,4 +1,4 @@
-"""Lights of an evaluated scene as `AreaLight` (runs in the child).
+"""Lights of an evaluated scene (runs in the child).
 
 They are as in Cycles 4.5 and 5.2, measured to 2e-5. The strength is S = color * temperature color * energy *
 2^exposure. The radiance L follows from it:
@@ -19,7 +19,7 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ...scene import AREA_LIGHT_SHAPES, FARTHEST, AreaLight, SpotCone, listed
+from ...scene import FARTHEST, EllipseLight, Light, PointLight, QuadLight, SpotCone, SpotLight, SunLight, listed
 from ..evaluated import EmitterTraits, RenderedSurface, surface_instancer
 from ..materials.aovs import CyclesReasons
 from ..materials.graph import tree_in_use
@@ -46,7 +46,7 @@ SHARPEST = 1e9
 class LightInventory:
     """The lights of a scene that can be shaded, and warnings about those that cannot."""
 
-    lights: list[AreaLight] = field(default_factory=list)
+    lights: list[Light] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     left_out: set[str] = field(default_factory=set)  # full names of the objects to leave out of the reference
     node_lights: dict[int, NodeLight] = field(default_factory=dict)  # by position in `lights`
@@ -132,13 +132,14 @@ def collect_lights(depsgraph, override=None) -> LightInventory:
 NAMED_PAIRS = 3
 # MOST_PAIRS: the search ends after this many pairs.
 MOST_PAIRS = 1000
+_AREA_LIGHTS = {shape: kind for kind in (QuadLight, EllipseLight) for shape in kind.SHAPES}
 # TRIED: points along each side of a light that are tested for an overlap.
 TRIED = 16
 # CHUNK: how many lights are compared with all others at once.
 CHUNK = 256
 
 
-def overlapping_pairs(lights: list[AreaLight]) -> list[tuple[AreaLight, AreaLight, float]]:
+def overlapping_pairs(lights: list[Light]) -> list[tuple[Light, Light, float]]:
     """Pairs of overlapping lights, each with the share of the smaller light that lies in the other; at most MOST_PAIRS.
 
     Both lights lie in one plane, up to single precision, shine to the same side and light a common object.
@@ -174,12 +175,12 @@ def overlapping_pairs(lights: list[AreaLight]) -> list[tuple[AreaLight, AreaLigh
     return found
 
 
-def _never_meet(first: AreaLight, second: AreaLight) -> bool:
+def _never_meet(first: Light, second: Light) -> bool:
     """True if no object receives light from both."""
     return None not in (first.receivers, second.receivers) and not set(first.receivers) & set(second.receivers)
 
 
-def _overlap(first: AreaLight, second: AreaLight) -> float:
+def _overlap(first: Light, second: Light) -> float:
     """The share of the smaller of two lights in one plane that lies in the other."""
     small, large = sorted((first, second), key=lambda light: np.linalg.norm(light.area_vector))
     steps = (np.arange(TRIED) + 0.5) / TRIED * 2.0 - 1.0
@@ -191,7 +192,7 @@ def _overlap(first: AreaLight, second: AreaLight) -> float:
     return float(np.mean(size < 1.0))
 
 
-def _note_overlaps(lights: list[AreaLight], inventory: LightInventory) -> None:
+def _note_overlaps(lights: list[Light], inventory: LightInventory) -> None:
     """Warn of overlapping lights: Cycles takes one of two hits at the same distance, and so loses light."""
     pairs = overlapping_pairs(lights)
     if not pairs:
@@ -206,7 +207,7 @@ def _note_overlaps(lights: list[AreaLight], inventory: LightInventory) -> None:
     )
 
 
-def half_hidden(light: AreaLight) -> str:
+def half_hidden(light: Light) -> str:
     """The warning about a light that is hidden from diffuse or from glossy rays, but not from both."""
     kind = "glossy" if light.affects_diffuse else "diffuse"
     return (
@@ -221,7 +222,7 @@ def _note_instancer(instance, inventory: LightInventory) -> None:
         inventory.instancers[instancer.original.name_full] = instancer
 
 
-def rendered_lights(scene, inventory: LightInventory) -> list[AreaLight]:
+def rendered_lights(scene, inventory: LightInventory) -> list[Light]:
     """The lights of `inventory`, with the emission of node trees and materials as Cycles renders it.
 
     Objects that must let light through in the reference, and their materials, get the custom property SIDE_PROPERTY.
@@ -252,7 +253,7 @@ def reason_to_leave_out(ob, matrix: np.ndarray) -> str:
     lengths = np.linalg.norm(matrix[:3, :3], axis=0)
     if light.type != "AREA":
         return _reason_to_leave_out_point(light, matrix, lengths)
-    if light.shape not in AREA_LIGHT_SHAPES:
+    if light.shape not in _AREA_LIGHTS:
         return f"shape {light.shape} is not supported"
     if cycles_setting(light, "is_portal"):
         return "it is a light portal, which only guides the sampling of the world"
@@ -281,8 +282,8 @@ def _sizes(light) -> tuple[float, float]:
     return light.size, light.size if light.shape in ("SQUARE", "DISK") else light.size_y
 
 
-def area_light(ob, matrix: np.ndarray, traits: EmitterTraits, receivers: Receivers) -> AreaLight:
-    """The `AreaLight` of the evaluated light `ob` at `matrix` (4, 4), without regard to its node tree."""
+def area_light(ob, matrix: np.ndarray, traits: EmitterTraits, receivers: Receivers) -> Light:
+    """The `Light` of the evaluated light `ob` at `matrix` (4, 4), without regard to its node tree."""
     light = ob.data
     shared = {
         "group": traits.group,
@@ -294,7 +295,7 @@ def area_light(ob, matrix: np.ndarray, traits: EmitterTraits, receivers: Receive
         return point_light(ob, matrix, **shared)
     size_u, size_v = _sizes(light)
     half_u, half_v = 0.5 * size_u * matrix[:3, 0], 0.5 * size_v * matrix[:3, 1]
-    return AreaLight(
+    return _AREA_LIGHTS[light.shape](
         name=ob.original.name,
         shape=light.shape,
         center=matrix[:3, 3],
@@ -380,8 +381,8 @@ def _is_sheared(ob, matrix: np.ndarray) -> bool:
     return np.abs(axes.T @ axes - np.eye(3)).max() > SHEAR_COSINE
 
 
-def point_light(ob, matrix: np.ndarray, **traits) -> AreaLight:
-    """The `AreaLight` of the evaluated point, spot or sun light `ob` at `matrix` (4, 4); `traits` are fields of it."""
+def point_light(ob, matrix: np.ndarray, **traits) -> Light:
+    """The `Light` of the evaluated point, spot or sun light `ob` at `matrix` (4, 4); `traits` are fields of it."""
     light, axis = ob.data, -matrix[:3, 2] / max(np.linalg.norm(matrix[:3, 2]), 1e-30)
     if light.type == "SUN":
         return _sun(light, ob.original.name, axis, traits)
@@ -392,15 +393,17 @@ def point_light(ob, matrix: np.ndarray, **traits) -> AreaLight:
     if light.normalize:
         scale /= 4.0 * math.pi * radius**2 if radius > LEAST_RADIUS else 4.0
     radius = max(radius, LEAST_RADIUS)
-    return AreaLight(
+    is_spot = light.type == "SPOT"
+    kind, cone = (SpotLight, {"cone": _cone(light, matrix)}) if is_spot else (PointLight, {})
+    return kind(
         name=ob.original.name,
         shape="FACING_DISK" if light.use_soft_falloff else "BALL",
         center=matrix[:3, 3],
         half_u=np.array([radius, 0.0, 0.0]),
         half_v=np.array([0.0, radius, 0.0]),
-        direction=axis if light.type == "SPOT" else np.array([0.0, 0.0, -1.0]),
+        direction=axis if is_spot else np.array([0.0, 0.0, -1.0]),
         radiance=strength(light) * scale,
-        cone=_cone(light, matrix) if light.type == "SPOT" else None,
+        **cone,
         **traits,
     )
 
@@ -419,7 +422,7 @@ def _cone(light, matrix) -> SpotCone:
     return SpotCone(np.linalg.inv(matrix[:3, :3]), cosine, min(1.0 / max(blend, 1e-30), SHARPEST))
 
 
-def _sun(light, name, axis, traits) -> AreaLight:
+def _sun(light, name, axis, traits) -> Light:
     half = 0.5 * light.angle
     value = strength(light)
     if half <= LEAST_ANGLE:
@@ -430,14 +433,12 @@ def _sun(light, name, axis, traits) -> AreaLight:
     half = min(half, WIDEST_SUN)
     first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     first *= math.sin(half) / np.linalg.norm(first)
-    return AreaLight(
+    return SunLight(
         name=name,
-        shape="DISK",
         center=-math.cos(half) * axis,
         half_u=first,
         half_v=np.cross(axis, first),
         direction=axis,
         radiance=value,
-        is_distant=True,
         **traits,
     )

@@ -64,13 +64,13 @@ POWERS = {"Quadratic": 0, "Linear": 1, "Constant": 2}  # output of the Light Fal
 
 @dataclass(frozen=True)
 class Falloff:
-    """How the distance scales a light: the fields `falloff` and `smooth` of an `AreaLight`."""
+    """How the distance scales a light: the fields `falloff` and `smooth` of a `FlatLight`."""
 
     power: int = 0
     smooth: float = 0.0
 
     def times(self, other: Falloff) -> Falloff | None:
-        """The product of both falloffs; None where an `AreaLight` cannot express it."""
+        """The product of both falloffs; None where a light cannot express it."""
         power = self.power + other.power
         return None if power > 2 or (self.smooth and other.smooth) else Falloff(power, self.smooth + other.smooth)
 

@@ -116,7 +116,7 @@ class Receivers:
         }
 
     def of(self, ob) -> tuple[int, ...] | None:
-        """`AreaLight.receivers` of the original object `ob`."""
+        """`Light.receivers` of the original object `ob`."""
         collection = receiver_collection(ob)
         return None if collection is None else self._reached[collection.name_full]
 

@@ -11,7 +11,7 @@ import numpy as np
 from ...cycles import planar_polygons
 from ...cycles.patches import ERROR, GRID, cut_into_patches, split_light
 from ...cycles.planar_polygons import FlatPolygon
-from ...scene import AreaLight
+from ...scene import Light, PolygonLight, QuadLight
 from ..evaluated import SURFACE_TYPES, EmitterTraits, RenderedSurface, is_rendered, read_values, surface_instancer
 from ..materials.graph import computed, ensure_nodes, live_link, material_output
 from .emission import (
@@ -45,7 +45,7 @@ class MeshLight:
     """An object whose materials may emit; how much is not known yet."""
 
     ob: object  # original
-    light: AreaLight  # a stand-in with all values that its polygons share
+    light: Light  # a stand-in with all values that its polygons share
     materials: list  # original material or None per slot
     emission: list[Emission]  # per slot
     placements: list[Placement] = field(default_factory=list)
@@ -62,7 +62,7 @@ class MeshLight:
         pairs = zip(self.materials, self.emission, strict=True)
         return [material.name_full for material, emission in pairs if emission.emits]
 
-    def light_of(self, slot: int) -> AreaLight:
+    def light_of(self, slot: int) -> Light:
         """The stand-in light with the falloff of the material in `slot`."""
         falloff = self.emission[slot].falloff or Falloff()
         return replace(self.light, falloff=falloff.power, smooth=falloff.smooth)
@@ -106,9 +106,8 @@ def _mesh_light(ob, traits: EmitterTraits, override, receivers: Receivers, known
     if not any(part.emits for part in emission) or not (traits.diffuse or traits.glossy):
         return None
     nothing = np.zeros(3)
-    light = AreaLight(
+    light = QuadLight(
         name=ob.original.name,
-        shape="RECTANGLE",
         center=nothing,
         half_u=nothing,
         half_v=nothing,
@@ -195,7 +194,7 @@ def _undisplaced(found: list[MeshLight]):
             material.displacement_method = method
 
 
-def mesh_area_lights(found: list[MeshLight], studio: Studio, eye: np.ndarray, warn) -> list[AreaLight]:
+def mesh_area_lights(found: list[MeshLight], studio: Studio, eye: np.ndarray, warn) -> list[Light]:
     """The area lights that stand for the objects `found`; the camera is at `eye` (3,).
 
     A closed mesh emits from the side where the camera is. Objects that shine get the custom property SIDE_PROPERTY.
@@ -206,7 +205,7 @@ def mesh_area_lights(found: list[MeshLight], studio: Studio, eye: np.ndarray, wa
         return _lights_of_all(found, studio, eye, warn)
 
 
-def _lights_of_all(found: list[MeshLight], studio: Studio, eye: np.ndarray, warn) -> list[AreaLight]:
+def _lights_of_all(found: list[MeshLight], studio: Studio, eye: np.ndarray, warn) -> list[Light]:
     lights, known = [], {}
     for mesh_light in found:
         radiance = [
@@ -231,7 +230,7 @@ def _lights_of_all(found: list[MeshLight], studio: Studio, eye: np.ndarray, warn
     return lights
 
 
-def constant_mesh_lights(found: list[MeshLight], radiance_of, eye: np.ndarray, warn) -> list[AreaLight]:
+def constant_mesh_lights(found: list[MeshLight], radiance_of, eye: np.ndarray, warn) -> list[Light]:
     """The area lights of the objects `found`, without falloff, for known radiances `radiance_of(material)` (3,)."""
     lights = []
     for mesh_light in found:
@@ -301,9 +300,9 @@ def _sides(side: int) -> tuple[int, ...]:
     return (1, -1) if side == 0 else (side,)
 
 
-def _constant_lights(mesh_light: MeshLight, parts, radiance, side: int) -> list[AreaLight]:
+def _constant_lights(mesh_light: MeshLight, parts, radiance, side: int) -> list[Light]:
     polygons = [polygon for _, own in parts for polygon in own]
-    lights: dict[tuple, AreaLight] = {}
+    lights: dict[tuple, Light] = {}
     kinds: dict[tuple, list[int]] = {}
     for number, polygon in enumerate(polygons):
         kinds.setdefault((polygon.label, len(polygon.corners)), []).append(number)
@@ -316,13 +315,13 @@ def _constant_lights(mesh_light: MeshLight, parts, radiance, side: int) -> list[
     return [lights[key] for key in sorted(lights)]
 
 
-def polygon_light(stand_in: AreaLight, polygon: FlatPolygon, way: int, radiance: np.ndarray) -> AreaLight:
+def polygon_light(stand_in: Light, polygon: FlatPolygon, way: int, radiance: np.ndarray) -> Light:
     """`stand_in` with the shape of `polygon`, half_u along its longest edge, emitting along `way` (1 or -1) times its
     normal."""
     return polygon_lights(stand_in, [polygon], way, radiance)[0]
 
 
-def polygon_lights(stand_in: AreaLight, polygons: list[FlatPolygon], way: int, radiance) -> list[AreaLight]:
+def polygon_lights(stand_in: Light, polygons: list[FlatPolygon], way: int, radiance) -> list[Light]:
     """As `polygon_light`, for `polygons` with equally many corners."""
     corners = np.array([polygon.corners for polygon in polygons])[:, :: 1 if way > 0 else -1]
     direction = way * np.array([polygon.normal for polygon in polygons])
@@ -335,8 +334,8 @@ def polygon_lights(stand_in: AreaLight, polygons: list[FlatPolygon], way: int, r
     low, high = place.min(axis=1), place.max(axis=1)
     (middle_u, middle_v), (half_u, half_v) = (0.5 * (low + high)).T[..., None], (0.5 * (high - low)).T[..., None]
     center = corners[:, 0] + middle_u * u + middle_v * v
-    first = replace(
-        stand_in, shape="POLYGON", center=center[0], half_u=u[0], half_v=v[0], direction=direction[0],
+    first = PolygonLight.like(
+        stand_in, center=center[0], half_u=u[0], half_v=v[0], direction=direction[0],
         radiance=radiance, corners=corners[0],
     )  # fmt: skip
     rows = zip(center, half_u * u, half_v * v, direction, corners, strict=True)
@@ -366,7 +365,7 @@ def _shown(studio: Studio, mesh, matrix: np.ndarray, facts: ObjectFacts):
         yield
 
 
-def _textured_lights(mesh_light: MeshLight, parts, side: int, studio: Studio, warn) -> list[AreaLight]:
+def _textured_lights(mesh_light: MeshLight, parts, side: int, studio: Studio, warn) -> list[Light]:
     """Lights of the polygons whose material emits differently from place to place."""
     textured = [
         (placement, [polygon for polygon in polygons if mesh_light.emission[polygon.label].varies])
@@ -389,7 +388,7 @@ def _textured_lights(mesh_light: MeshLight, parts, side: int, studio: Studio, wa
                     lights.extend(split_light(light, patches))
                     errors.append(patches.error)
     if max(errors) > ERROR:
-        patches = sum(len(light.patches) for light in lights)
+        patches = sum(len(light.leaves) for light in lights)
         warn(
             f"object {mesh_light.ob.name!r}: its texture is shaded as {patches} patches of constant radiance, "
             f"which differ from it by {100.0 * max(errors):.0f} % on average"
@@ -405,7 +404,7 @@ def _dressed(mesh_light: MeshLight, placement: Placement):
     return mesh
 
 
-def _look_at_polygon(studio: Studio, light: AreaLight, pixels: int) -> tuple[np.ndarray, np.ndarray]:
+def _look_at_polygon(studio: Studio, light: Light, pixels: int) -> tuple[np.ndarray, np.ndarray]:
     """Radiance (H, W, 3) of the rectangle around `light`, and the mask (H, W) of the pixels inside its outline."""
     image, seen = studio.look(light.center, light.half_u, light.half_v, light.direction, pixels)
     rows, columns = seen.shape
@@ -428,7 +427,7 @@ def _contains(outline: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return inside
 
 
-def _mean_lights(mesh_light: MeshLight, textured, side: int, studio: Studio, warn) -> list[AreaLight]:
+def _mean_lights(mesh_light: MeshLight, textured, side: int, studio: Studio, warn) -> list[Light]:
     """One light per polygon, with the mean radiance of the largest polygons of its material and side."""
     sums: dict[tuple[int, int], np.ndarray] = {}
     lights = []

@@ -10,7 +10,7 @@ import numpy as np
 
 from ...cycles.images import ImageTexture
 from ...cycles.patches import ERROR, Patches, cut_into_patches, split_light
-from ...scene import AreaLight, Pattern
+from ...scene import Light, Pattern
 from ..materials.values import Value, is_srgb, opaque_pixels
 from .emission import PIXELS, Falloff, ObjectFacts, Studio, falloff_left_out, seen_by_surfaces
 
@@ -57,7 +57,7 @@ class NodeLight:
         return np.eye(3) if self.is_placed else np.linalg.inv(linear / np.linalg.norm(linear, axis=0))
 
 
-def with_node_emission(lights: list[AreaLight], unseen: dict[int, NodeLight], studio: Studio, warn) -> list:
+def with_node_emission(lights: list[Light], unseen: dict[int, NodeLight], studio: Studio, warn) -> list:
     """`lights` with the rendered emission of those at the positions in `unseen`; dark ones of these are left out."""
     result, seen = [], {}
     for position, light in enumerate(lights):
@@ -246,7 +246,7 @@ def _unfolded(views: list[np.ndarray], within: bool) -> np.ndarray:
     return result
 
 
-def with_pattern(light: AreaLight, found: NodeEmission, source: NodeLight, warn) -> list[AreaLight]:
+def with_pattern(light: Light, found: NodeEmission, source: NodeLight, warn) -> list[Light]:
     """A point, spot or sun times the factor `found` of its nodes: one light, or [] if it is dark."""
     factor = found.factor
     weights = np.sin((np.arange(factor.shape[0]) + 0.5) * (np.pi / factor.shape[0]))[:, None, None]
@@ -266,7 +266,7 @@ def with_pattern(light: AreaLight, found: NodeEmission, source: NodeLight, warn)
     return [replace(light, pattern=Pattern(source.axes, values, source.by_ray))]
 
 
-def _covered(light: AreaLight, rows: int, columns: int) -> np.ndarray:
+def _covered(light: Light, rows: int, columns: int) -> np.ndarray:
     """The mask (rows, columns) of pixels on the light; pixels on the edge of a round one are left out, being partly
     dark."""
     if not light.is_round:
@@ -275,7 +275,7 @@ def _covered(light: AreaLight, rows: int, columns: int) -> np.ndarray:
     return np.hypot(2.0 * x - 1.0, 2.0 * y - 1.0) < 1.0 - 1.5 / min(rows, columns)
 
 
-def _with_factor(light: AreaLight, factor: np.ndarray, warn) -> list[AreaLight]:
+def _with_factor(light: Light, factor: np.ndarray, warn) -> list[Light]:
     patches = cut_into_patches(factor * light.radiance, _covered(light, *factor.shape[:2]))
     if patches.error > ERROR:
         warn(
@@ -306,7 +306,7 @@ class ShownTextures:
         """Forget the patches of images, so that the images are read again."""
         self._patches.clear()
 
-    def split(self, light: AreaLight, factor: Value, notes: list[str]) -> list[AreaLight] | None:
+    def split(self, light: Light, factor: Value, notes: list[str]) -> list[Light] | None:
         """`light` times the image `factor` as patches; None where only Cycles knows the colors of the image.
 
         Coarse patches are reported in `notes`.
@@ -314,7 +314,7 @@ class ShownTextures:
         patches = self._patches_of(light, factor)
         return None if patches is None else _shown_patches(light, patches, notes)
 
-    def split_seen(self, light: AreaLight, found: NodeEmission, notes: list[str]) -> list[AreaLight]:
+    def split_seen(self, light: Light, found: NodeEmission, notes: list[str]) -> list[Light]:
         """As `split`, for the factor `found` of the nodes of the light."""
         key = id(found), light.is_round
         if key not in self._seen:
@@ -326,7 +326,7 @@ class ShownTextures:
             self._seen[key] = found, patches
         return _shown_patches(light, self._seen[key][1], notes)
 
-    def _patches_of(self, light: AreaLight, factor: Value) -> Patches | None:
+    def _patches_of(self, light: Light, factor: Value) -> Patches | None:
         use = factor.image
         key = (use.image.session_uid, use.mapping, use.closest, use.extension, light.is_round,
                factor.matrix.tobytes(), factor.offset.tobytes())  # fmt: skip
@@ -336,13 +336,13 @@ class ShownTextures:
         return self._patches[key]
 
 
-def _shown_patches(light: AreaLight, patches: Patches, notes: list[str]) -> list[AreaLight]:
+def _shown_patches(light: Light, patches: Patches, notes: list[str]) -> list[Light]:
     if patches.error > ERROR:
         notes.append(
             f"{light.name}: its texture is shown as {len(patches.smallest)} patches, "
             f"{100.0 * patches.error:.0f} % off on average"
         )
-    shown = (patch for whole in split_light(light, patches) for patch in whole.patches)
+    shown = (patch for whole in split_light(light, patches) for patch in whole.leaves)
     return [replace(patch, radiance=patch.radiance * light.radiance) for patch in shown]
 
 

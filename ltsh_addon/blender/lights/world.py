@@ -11,7 +11,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ...cycles.environment import CUBE, SkyPicture, bright_spots, sky_lights, spot_frame, spot_light, without_spots
-from ...scene import AreaLight, listed
+from ...scene import Light, SkyLight, listed
 from ..materials.graph import is_group, is_socket, source_of, surface_of, tree_in_use, value_of
 from .emission import CONSTANT_NODES, LIGHT_PATH, OF_CAMERA, open_studio, trees_of
 
@@ -76,16 +76,15 @@ def blocks_nothing(occluders, world):
     return replace(occluders, light_masks={**occluders.light_masks, world.name: 0})
 
 
-def light_of_world(world) -> AreaLight | None:
+def light_of_world(world) -> Light | None:
     """A distant light on one side of a cube with the name and traits of `world`; None if the world gives no light."""
     if not may_shine(world):
         return None
     sees = world.cycles_visibility
     if not (sees.diffuse or sees.glossy):
         return None
-    return AreaLight(
+    return SkyLight(
         name=world.name,
-        shape="RECTANGLE",
         center=np.array([0.0, 0.0, 1.0]),
         half_u=np.array([1.0, 0.0, 0.0]),
         half_v=np.array([0.0, 1.0, 0.0]),
@@ -94,11 +93,10 @@ def light_of_world(world) -> AreaLight | None:
         group=world.lightgroup,
         affects_diffuse=sees.diffuse,
         affects_specular=sees.glossy,
-        is_distant=True,
     )
 
 
-def world_lights(scene, world, warn) -> list[AreaLight]:
+def world_lights(scene, world, warn) -> list[Light]:
     """The light of the `world` of `scene` as distant lights that have its name; [] if it is dark."""
     like = light_of_world(world)
     if like is None:
@@ -106,7 +104,7 @@ def world_lights(scene, world, warn) -> list[AreaLight]:
     pictures, lights = light_pictures(scene, world, like, warn)
     found, error = sky_lights(like, pictures)
     if error > COARSE:
-        count = sum(len(light.patches) for light in found)
+        count = sum(len(light.leaves) for light in found)
         warn(
             f"world {world.name!r}: it is shaded as {count} patches of constant radiance, which differ from it by "
             f"{100.0 * error:.0f} % on average"
@@ -114,7 +112,7 @@ def world_lights(scene, world, warn) -> list[AreaLight]:
     return found + lights
 
 
-def light_pictures(scene, world, like: AreaLight, warn) -> tuple[list[SkyPicture], list[AreaLight]]:
+def light_pictures(scene, world, like: Light, warn) -> tuple[list[SkyPicture], list[Light]]:
     """Six pictures (a cube) of `world` as surfaces see it, without small, bright spots, and lights like `like` for
     these."""
     with _observatory(scene, world, warn) as look:

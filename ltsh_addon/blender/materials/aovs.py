@@ -48,7 +48,7 @@ NOTED_NODES = {
     SCRIPT: "is Open Shading Language, which is not read: what it feeds keeps the value of its own socket",
 }
 LEFT_OUT = "left out of the Cycles reference as well"
-# RECEIVER_PROPERTY: custom property of objects, a value of `AreaLight.receivers` that tells which lights reach them.
+# RECEIVER_PROPERTY: custom property of objects, a value of `Light.receivers` that tells which lights reach them.
 RECEIVER_PROPERTY = "ltsh_receiver"
 
 

@@ -14,7 +14,7 @@ from ...emitters.light_polygons import has_lobe, lights_that_reach_nothing
 from ...files import temporary_folder
 from ...imaging.color import identified
 from ...imaging.exr import read_channels
-from ...scene import REC709, AreaLight, Border, ColorSpace, Film, Progress, SurfaceSamples, lights_of, listed
+from ...scene import REC709, Border, ColorSpace, Film, Light, Progress, SurfaceSamples, lights_of, listed
 from ...visibility import Occluders
 from .blend_file import run_scene_job
 
@@ -141,7 +141,7 @@ class PixelPoints:
 class Extraction:
     """The lights and samples of a picture, and what Cycles rendered of it."""
 
-    lights: tuple[AreaLight, ...]
+    lights: tuple[Light, ...]
     samples: SurfaceSamples
     film: Film
     picture: PictureFacts
@@ -345,7 +345,7 @@ def ended_at_horizons(extraction: Extraction) -> Extraction:
     return replace(extraction, samples=samples, film=replace(film.take(index), first=None if first.all() else first))
 
 
-def unlit(samples: SurfaceSamples, lights: tuple[AreaLight, ...], camera: str) -> list[str]:
+def unlit(samples: SurfaceSamples, lights: tuple[Light, ...], camera: str) -> list[str]:
     """The warning about lights that reach nothing that the camera sees; [] if there are none."""
     if not has_lobe(samples).any():
         return [f"nothing that camera {camera!r} sees reflects light: the picture is black"] if len(samples) else []
@@ -355,21 +355,21 @@ def unlit(samples: SurfaceSamples, lights: tuple[AreaLight, ...], camera: str) -
     return [f"nothing that camera {camera!r} sees is lit by {listed(map(repr, unseen))}"] if unseen else []
 
 
-def faceted(samples: SurfaceSamples, lights: tuple[AreaLight, ...]) -> list[str]:
+def faceted(samples: SurfaceSamples, lights: tuple[Light, ...]) -> list[str]:
     """The warning about reflections so sharp that they show the patches of a world; [] if there are none."""
     sharp = shows_patches(samples, lights)
     if not sharp.any():
         return []
-    sky = next(light for light in lights if light.is_distant and light.detail and light.affects_specular)
+    sky = next(light for light in lights if light.is_distant and light.children and light.affects_specular)
     return [
         f"world {sky.name!r}: it is blurred by a degree or more in reflections sharper than roughness "
         f"{SHARP_REFLECTION:g}, which {100.0 * sharp.mean():.2g} % of the samples have, and in facets in reference"
     ]
 
 
-def shows_patches(samples: SurfaceSamples, lights: tuple[AreaLight, ...]) -> np.ndarray:
+def shows_patches(samples: SurfaceSamples, lights: tuple[Light, ...]) -> np.ndarray:
     """Mask (P,) of the samples whose reflections are so sharp that they show the patches of a world."""
-    if not any(light.is_distant and light.detail and light.affects_specular for light in lights):
+    if not any(light.is_distant and light.children and light.affects_specular for light in lights):
         return np.zeros(len(samples), bool)
     return has_lobe(samples)[1] & (samples.roughness < SHARP_REFLECTION)
 

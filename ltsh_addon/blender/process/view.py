@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...scene import AreaLight, Progress, SceneError
+from ...scene import Light, Progress, SceneError, light_of
 from .blend_file import run_scene_job
 from .blender_process import run_job
 
@@ -76,7 +76,7 @@ class WorldPicture:
     """A world as Cycles renders it."""
 
     light: np.ndarray  # (6, N, N, 3), see `cycles.environment.CUBE`; empty if it gives no light
-    lights: tuple[AreaLight, ...]  # its small, bright spots
+    lights: tuple[Light, ...]  # its small, bright spots
     background: np.ndarray  # (M, M, 3), see `viewport.sky`
     warnings: list[str]
 
@@ -85,7 +85,7 @@ def render_world(job: WorldJob, folder: Path, progress: Progress | None = None) 
     """The world of `job`; files go to `folder`. Raises as `pixels.extract_pixels` does."""
     manifest = run_job(job, folder, progress)
     light, background = (np.load(folder / f"{name}.npy") for name in ("light", "background"))
-    lights = tuple(AreaLight(**record) for record in manifest["lights"])
+    lights = tuple(light_of(record) for record in manifest["lights"])
     return WorldPicture(light, lights, background, manifest["warnings"])
 
 

@@ -10,7 +10,7 @@ import bpy
 import numpy as np
 
 from ...pipeline.mixer import MixerRow
-from ...scene import AreaLight, Cancelled, SceneError, error_line, listed
+from ...scene import Cancelled, Light, SceneError, error_line, light_of, listed
 from ..evaluated import EmitterTraits
 from ..lights.area import area_light, reason_to_leave_out
 from ..lights.linking import Receivers
@@ -25,10 +25,10 @@ TIMER_SECONDS = 0.1
 _updating: dict = {"update": None}
 
 
-def plain_lights(depsgraph) -> dict[str, AreaLight]:
+def plain_lights(depsgraph) -> dict[str, Light]:
     """The current lights of the scene without their node trees, by name. Only objects that are exactly one light."""
     receivers = Receivers([instance.object.original for instance in depsgraph.object_instances])
-    by_name: dict[str, list[AreaLight]] = {}
+    by_name: dict[str, list[Light]] = {}
     for instance in depsgraph.object_instances:
         ob = instance.object
         if ob.type == "LIGHT" and instance.show_self:
@@ -39,7 +39,7 @@ def plain_lights(depsgraph) -> dict[str, AreaLight]:
     return {name: lights[0] for name, lights in by_name.items() if len(lights) == 1}
 
 
-def has_moved(before: AreaLight, now: AreaLight) -> bool:
+def has_moved(before: Light, now: Light) -> bool:
     """True where a light has another place, direction, size or shape."""
     size = np.abs(before.center).max() + before.radius
     near = all(
@@ -50,7 +50,7 @@ def has_moved(before: AreaLight, now: AreaLight) -> bool:
     return not (near and np.allclose(*cones, rtol=UNMOVED) and abs(before.spread - now.spread) < UNMOVED)
 
 
-def light_where_it_is(former: AreaLight, now: AreaLight, normalized: bool) -> AreaLight:
+def light_where_it_is(former: Light, now: Light, normalized: bool) -> Light:
     """The light at its place `now`, with the power, linking and light group of `former`.
 
     Where its power is `normalized`, the radiance is scaled with the area.
@@ -61,12 +61,12 @@ def light_where_it_is(former: AreaLight, now: AreaLight, normalized: bool) -> Ar
     return replace(now, radiance=former.radiance * (former_area / area if normalized else 1.0), **settings)
 
 
-def moved_rows(context, rows) -> dict[int, AreaLight]:
+def moved_rows(context, rows) -> dict[int, Light]:
     """The moved lights at their new places, by the numbers of their rows."""
     moved, lights = {}, plain_lights(context.evaluated_depsgraph_get())
     for number, row in enumerate(rows):
         if row.light is not None and row.name in lights:
-            before, now = AreaLight(**row.light), lights[row.name]
+            before, now = light_of(row.light), lights[row.name]
             if has_moved(before, now):
                 moved[number] = light_where_it_is(before, now, bpy.data.objects[row.name].data.normalize)
     return moved

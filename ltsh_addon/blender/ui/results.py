@@ -17,7 +17,7 @@ from ...pipeline.display_layers import FILES
 from ...pipeline.mixer import MIXER_FILE, LightPictures, Mixer, MixerRow
 from ...pipeline.moved_lights import MovedLights
 from ...pipeline.relight import RELIGHT_SUFFIX, RelightData, tint
-from ...scene import AreaLight, SceneError, SurfaceSamples
+from ...scene import Light, SceneError, SurfaceSamples, light_of
 
 LAYER, SCENE = "ltsh_layer", "ltsh_scene"  # custom properties that mark our images
 PREFIX = "LTSH "
@@ -303,7 +303,7 @@ class Update:
     SceneError.
     """
 
-    def __init__(self, scene, moved: dict[int, AreaLight]):
+    def __init__(self, scene, moved: dict[int, Light]):
         self.mixer, self.moved, self.done = mixer_of(scene), moved, 0.0
         self.is_finished, self.error = False, None
         self._path = None if scene.name in _rendered else result_of(scene).folder / MIXER_FILE
@@ -364,7 +364,7 @@ class Update:
 def get_ready(scene, row: MixerRow) -> None:
     """Start what shading moved lights needs, because the light of `row` has moved or is still moving."""
     with suppress(SceneError):
-        _moved_lights(scene).get_ready(AreaLight(**row.light))
+        _moved_lights(scene).get_ready(light_of(row.light))
         _end_later()
 
 

@@ -13,7 +13,7 @@ from ...emitters.facing import LEAST_SHRINKING, NEAR_DISK
 from ...emitters.light_polygons import ROUND_CORNERS, ROUND_LIMITS
 from ...lobes import moments32
 from ...lobes.lookup_table import LookupTable
-from ...scene import AreaLight
+from ...scene import Light, PolygonLight
 from ...shading.header import float_literal
 from .drawing import float_texture
 
@@ -29,7 +29,7 @@ _QUAD = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
 
 def _circle(count):
-    """Corners (count, 2) of a regular polygon with the area of the unit circle, as in `AreaLight.polygon`."""
+    """Corners (count, 2) of a regular polygon with the area of the unit circle, as in `Light.polygon`."""
     step = 2.0 * np.pi / count
     angle = step * np.arange(count)
     return np.sqrt(step / np.sin(step)) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -74,7 +74,7 @@ def circle_first(count: int) -> int:
     return _CIRCLE_FIRST[_CIRCLES.index(count)]
 
 
-def light_texels(lights: Iterable[AreaLight]) -> np.ndarray:
+def light_texels(lights: Iterable[Light]) -> np.ndarray:
     """Texels (H, `WIDTH`, 4) of `lights` in float32. Lights must have an area, see `visible_lights`.
 
     The order is: corners s, t that lights share; nodes and weights of quadratures over cones; `HEADER` texels per
@@ -120,7 +120,7 @@ def _pattern_texels(pattern) -> np.ndarray:
     return np.concatenate([np.concatenate([pattern.axes, traits], axis=1), values])
 
 
-def visible_lights(lights: Iterable[AreaLight]) -> list[AreaLight]:
+def visible_lights(lights: Iterable[Light]) -> list[Light]:
     """The lights that have an area."""
     return [light for light in lights if light.area_vector.any()]
 
@@ -131,7 +131,7 @@ def _outline(light, next_texel):
     half_v has the sign with which corners run counterclockwise as seen from the lit side.
     """
     half_v = light.half_v
-    if light.shape == "POLYGON":
+    if isinstance(light, PolygonLight):
         axes = np.stack([light.half_u, half_v], axis=1)
         corners = np.linalg.lstsq(axes, (light.polygon() - light.center).T, rcond=None)[0].T
         return next_texel, len(corners), half_v, corners
@@ -145,7 +145,7 @@ def _outline(light, next_texel):
 
 
 def _header(light, first, count, half_v, first_receiver):
-    is_ball = light.shape == "BALL"
+    is_ball = light.is_facing and light.is_sphere
     traits = {
         "DIFFUSE": light.affects_diffuse,
         "SPECULAR": light.affects_specular,
@@ -154,15 +154,15 @@ def _header(light, first, count, half_v, first_receiver):
         "FACING": light.is_facing,
         "BALL": is_ball,
         "CONE": light.cone is not None,
-        "UNEVEN": light.is_facing and not light.is_even,
-        "PROFILE": light.is_profiled,
+        "UNEVEN": light.is_facing and not light.is_uniform,
+        "PROFILE": light.has_profile,
         "CAP": _is_cap(light),
         "PLACED": is_ball and light.pattern is not None and not light.pattern.by_ray,
     }
     flags = sum(1 << bit for bit, name in enumerate(FLAGS) if traits[name])
     receivers = -1 if light.receivers is None else len(light.receivers)
     profile = light_profile.Profile.of(light)
-    tangent, share = (profile.tangent, profile.share) if light.is_profiled else (0.0, np.inf)
+    tangent, share = (profile.tangent, profile.share) if light.has_profile else (0.0, np.inf)
     reach = np.sqrt(max((light.half_u**2).sum(), (light.half_v**2).sum()))
     return np.array([
         [*light.center, first],
@@ -187,7 +187,7 @@ def _is_cap(light) -> bool:
 
 
 def _bound(light):
-    if light.shape != "POLYGON":
+    if not isinstance(light, PolygonLight):
         return 1.01
     axes = np.stack([light.half_u, light.half_v], axis=1)
     return 1.01 * np.abs(np.linalg.lstsq(axes, (light.corners - light.center).T, rcond=None)[0]).max()
@@ -239,12 +239,12 @@ MOST_LOOPS, MOST_LIGHTS = 40000, 32  # limits of a draw call
 class UploadedLights:
     """Lights that have an area, their texture, and the texture of the world's light, if there is any."""
 
-    lights: tuple[AreaLight, ...]
+    lights: tuple[Light, ...]
     texture: gpu.types.GPUTexture
     sky: gpu.types.GPUTexture | None = None
 
 
-def upload_lights(lights: Iterable[AreaLight], sky: gpu.types.GPUTexture | None = None) -> UploadedLights:
+def upload_lights(lights: Iterable[Light], sky: gpu.types.GPUTexture | None = None) -> UploadedLights:
     """`lights` on the card, beside the texture `sky`; needs an active GPU context."""
     visible = tuple(visible_lights(lights))
     return UploadedLights(visible, float_texture(light_texels(visible)), sky)

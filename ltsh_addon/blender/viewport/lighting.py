@@ -14,7 +14,7 @@ from mathutils import Matrix
 
 from ...cycles import horizons
 from ...lobes.lookup_table import LookupTable
-from ...scene import PASSES, AreaLight
+from ...scene import PASSES, Light, PolygonLight
 from ...shading import load_table
 from .drawing import WITHIN_MASK, drawing, empty_texture, float_texture, frame_buffer
 from .gbuffer import SAMPLERS, VISIBILITY_SAMPLERS, GBufferTextures
@@ -46,7 +46,7 @@ class HorizonPass:
         for parallel views the unit direction toward it and 0.
         """
         self._resize(gbuffer.size, gbuffer.mask)
-        corners = [len(light.corners) if light.shape == "POLYGON" else 1 for light in lights.lights]
+        corners = [len(light.corners) if isinstance(light, PolygonLight) else 1 for light in lights.lights]
         self._run(BOUNDS, gbuffer, lights, draw_ranges([1] * len(corners)))
         self._run(EXCESS, gbuffer, lights, draw_ranges([horizons.AROUND * count for count in corners]), view=view)
         self._run(CHOICE, gbuffer, lights, [(0, 0)], threshold=threshold)
@@ -95,12 +95,12 @@ class LightingPass:
         self._table = float_texture(table_texels(self.table, iors))
         self._dielectrics = float_texture(dielectric_texels(self.table, iors))
 
-    def set_lights(self, lights: Iterable[AreaLight] | UploadedLights) -> None:
+    def set_lights(self, lights: Iterable[Light] | UploadedLights) -> None:
         """Set the lights. Light groups are added up."""
         uploaded = lights if isinstance(lights, UploadedLights) else upload_lights(lights)
         self._lights, self._sky = uploaded.texture, uploaded.sky
         self._loops = [_loops(light) for light in uploaded.lights]
-        self._has_focused = any(light.is_profiled for light in uploaded.lights)
+        self._has_focused = any(light.has_profile for light in uploaded.lights)
         self._has_facing = any(light.is_facing for light in uploaded.lights)
         self._has_patterns = any(light.pattern is not None for light in uploaded.lights)
 
@@ -189,8 +189,8 @@ class LightingPass:
         return getattr(gbuffer, SAMPLERS[name])
 
 
-def _loops(light: AreaLight) -> int:
+def _loops(light: Light) -> int:
     """Approximate upper limit of the iterations of the loops over a light's corners."""
-    if light.is_profiled:
+    if light.has_profile:
         return 16000 if light.is_round else 2000
     return 1200 if light.is_round else 10 * len(light.polygon())

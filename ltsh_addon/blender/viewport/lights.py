@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import bpy
 import numpy as np
 
-from ...scene import AreaLight
+from ...scene import Light
 from ..evaluated import (
     SURFACE_TYPES,
     EmitterTraits,
@@ -42,7 +42,7 @@ def no_patterns(data, source: NodeLight) -> str:
 
 def view_lights(
     depsgraph, in_view: Callable, textures: ShownTextures, patterns: Patterns = no_patterns
-) -> tuple[tuple[AreaLight, ...], tuple[str, ...]]:
+) -> tuple[tuple[Light, ...], tuple[str, ...]]:
     """The lights among the instances that `in_view` accepts, and notes about what differs from Cycles.
 
     `textures` are those of the last call, for reuse.
@@ -76,7 +76,7 @@ def view_lights(
     return tuple(strongest(lights, notes)), tuple(dict.fromkeys(notes))
 
 
-def strongest(lights: list[AreaLight], notes: list[str], most: int = MOST_LIGHTS) -> list[AreaLight]:
+def strongest(lights: list[Light], notes: list[str], most: int = MOST_LIGHTS) -> list[Light]:
     """The `most` lights with the largest power, in their order; what is missing is told in `notes`."""
     if len(lights) <= most:
         return lights
@@ -98,7 +98,7 @@ def _emission(material) -> np.ndarray:
     return np.zeros(3) if material is None else preview_of(material.original).emission
 
 
-def _mesh_lights(depsgraph, receivers: Receivers, notes: list[str]) -> list[AreaLight]:
+def _mesh_lights(depsgraph, receivers: Receivers, notes: list[str]) -> list[Light]:
     override = depsgraph.view_layer_eval.material_override
     mesh_lights = collect_mesh_lights(depsgraph, override, receivers, notes.append, copies=False)
     camera = depsgraph.scene.camera
@@ -131,7 +131,7 @@ def patterns_of(scene, depsgraph) -> dict[tuple, NodeEmission]:
         return {key: node_emission(source, studio) for key, source in wanted.items()}
 
 
-def _with_nodes(light: AreaLight, instance, sources: tuple, notes: list[str]) -> list[AreaLight]:
+def _with_nodes(light: Light, instance, sources: tuple, notes: list[str]) -> list[Light]:
     """The lights that the node tree of a depsgraph `instance` makes of `light`; [] where it emits nothing.
 
     `sources` are the textures and patterns of `view_lights`.
@@ -162,7 +162,7 @@ def _with_nodes(light: AreaLight, instance, sources: tuple, notes: list[str]) ->
     pattern = patterns(data, unseen)
     if isinstance(pattern, str):
         notes.append(f"{light.name}: {pattern}")
-        return [replace(light, falloff=0, smooth=0.0)]
+        return [light if light.is_distant else replace(light, falloff=0, smooth=0.0)]
     notes += warnings
     if not light.is_distant:
         light = replace(light, falloff=unseen.falloff.power, smooth=unseen.falloff.smooth)

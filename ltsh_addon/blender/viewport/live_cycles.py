@@ -14,7 +14,7 @@ import numpy as np
 
 from ...cycles.environment import CUBE, SkyPicture
 from ...files import save_array, temporary_folder
-from ...scene import AreaLight, Cancelled, SceneError, error_line
+from ...scene import Cancelled, Light, SceneError, error_line
 from ..lights.emission import ObjectFacts, nodes_as_text, open_studio
 from ..lights.textures import NodeEmission, NodeLight, node_emission
 from ..lights.world import background_pictures, light_of_world, light_pictures
@@ -231,7 +231,7 @@ class LiveWorld:
         self._thread = _start("world", [world], work)
 
 
-def rendered_world(scene, world, warn: Callable) -> tuple[list[SkyPicture], list[AreaLight], np.ndarray]:
+def rendered_world(scene, world, warn: Callable) -> tuple[list[SkyPicture], list[Light], np.ndarray]:
     """The `world` as Cycles renders it: pictures of its light ([] where it is dark), the small bright lights in it, and
     its background (N, N, 3). `scene` is left as it was."""
     like, light, lights = light_of_world(world), [], []

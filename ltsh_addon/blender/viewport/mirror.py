@@ -10,7 +10,7 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
-from ...scene import AreaLight, listed
+from ...scene import Light, listed
 from ..evaluated import (
     SURFACE_TYPES,
     data_pointer,
@@ -164,9 +164,9 @@ class SceneMirror:
         """`look(world)` returns the `ShownSky` of a world that is not constant; None while it is not known."""
         self._patterns = patterns
         self.instances: list[ShownInstance] = []
-        self.lights: tuple[AreaLight, ...] = ()  # with the small bright lights of the world
+        self.lights: tuple[Light, ...] = ()  # with the small bright lights of the world
         self.sky = ShownSky()
-        self.lights_without_world: tuple[AreaLight, ...] = ()  # without those of the world
+        self.lights_without_world: tuple[Light, ...] = ()  # without those of the world
         self._look = look
         self.surfaces_version = 0
         self._meshes: dict[tuple, MeshBatches | None] = {}

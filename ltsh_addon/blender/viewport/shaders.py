@@ -522,7 +522,7 @@ _HORIZON_CONSTANTS = {
     EXCESS: {"draw_range": "IVEC2", "view": "VEC4"},
     CHOICE: {"threshold": "FLOAT"},
 }
-HORIZON_CORNERS = 32  # of round lights, as in `AreaLight.polygon`
+HORIZON_CORNERS = 32  # of round lights, as in `Light.polygon`
 
 
 def horizon_shader(step: str) -> PixelShader:

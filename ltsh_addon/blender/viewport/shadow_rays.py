@@ -9,7 +9,7 @@ from dataclasses import replace
 import gpu
 import numpy as np
 
-from ...scene import PASSES, AreaLight, Film
+from ...scene import PASSES, Film, Light
 from ...visibility import Mate, Occluders, ShadowSampling, Tracer, open_tracer, visible_shares
 from ..extract.occluders import collect_occluders
 from ..lights.world import blocks_nothing
@@ -18,7 +18,7 @@ from .camera import ViewCamera
 from .drawing import float_buffer
 from .gbuffer import GBufferTextures, VisibilityGrid, gbuffer_samples
 
-Lights = Sequence[AreaLight]
+Lights = Sequence[Light]
 # MOST_BYTES: graphics memory for the visibility of all lights. _LIGHT_BYTES: of a light and a pixel, two half floats.
 MOST_BYTES = 1 << 30
 _LIGHT_BYTES = 4

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...scene import PASSES, AreaLight, Cancelled, Film, SurfaceSamples, error_line
+from ...scene import PASSES, Cancelled, Film, Light, SurfaceSamples, error_line
 from ...visibility import Occluders, ShadowSampling, shared_numbers, visible_shares
 from .camera import ViewCamera
 from .drawing import float_texture
@@ -466,13 +466,13 @@ def coarse_step(size: tuple[int, int]) -> int:
     return max(2, round((size[0] * size[1] / COARSE_POINTS) ** 0.5))
 
 
-def _shape_of(light: AreaLight) -> str:
+def _shape_of(light: Light) -> str:
     """A key of all that the visibility of `light` depends on: everything but its brightness."""
     return repr({name: value for name, value in light.record().items() if name not in ("radiance", "detail")})
 
 
 def _shape_of_sky(sides: Lights) -> str:
     """A key of all that the visibility of a sky depends on: the relative, not absolute brightness of its patches."""
-    values = np.array([patch.radiance.mean() for side in sides for patch in side.patches])
+    values = np.array([patch.radiance.mean() for side in sides for patch in side.leaves])
     traits = sides[0].affects_diffuse, sides[0].affects_specular, sides[0].name
     return repr((traits, np.round(values / max(np.abs(values).mean(), 1e-30), 4).tobytes()))

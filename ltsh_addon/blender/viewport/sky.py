@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from ...cycles.environment import CUBE, SkyPicture, sky_lights
-from ...scene import AreaLight
+from ...scene import Light
 
 # Texels of a side of maps. SIZE, LEAST_SIZE: the largest and the smallest map of the light. IRRADIANCE_SIZE: the map of
 # the irradiance. IRRADIANCE_SOURCE: the map of the light from which the irradiance is computed.
@@ -27,14 +27,14 @@ CUBE_SIZE, BACKGROUND_SIZE = 128, 2048
 class ShownSky:
     """A world as a view shows it."""
 
-    sides: tuple[AreaLight, ...] = ()  # of a cube around all points, for shadows; empty for a dark world
-    lights: tuple[AreaLight, ...] = ()  # the small bright lights in it
+    sides: tuple[Light, ...] = ()  # of a cube around all points, for shadows; empty for a dark world
+    lights: tuple[Light, ...] = ()  # the small bright lights in it
     # (N, N, 3) map of the light without these lights; N = 1: constant.
     light: np.ndarray = field(default_factory=lambda: np.zeros((1, 1, 3)))
     background: np.ndarray = field(default_factory=lambda: np.zeros((1, 1, 3)))  # (N, N, 3) map as cameras see it
 
 
-def constant_sky(like: AreaLight | None, radiance: np.ndarray, background: np.ndarray) -> ShownSky:
+def constant_sky(like: Light | None, radiance: np.ndarray, background: np.ndarray) -> ShownSky:
     """A world that is the same in all directions. `like` has the name and traits of its light; None: it is dark."""
     picture = np.array(radiance, np.float64).reshape(1, 1, 3)
     sides = [] if like is None else sky_lights(like, [SkyPicture(*axes, picture) for axes in CUBE])[0]
@@ -42,7 +42,7 @@ def constant_sky(like: AreaLight | None, radiance: np.ndarray, background: np.nd
     return ShownSky(tuple(sides), (), picture if sides else np.zeros((1, 1, 3)), shown)
 
 
-def varied_sky(like: AreaLight | None, light, lights, background: np.ndarray) -> ShownSky:
+def varied_sky(like: Light | None, light, lights, background: np.ndarray) -> ShownSky:
     """A world from a cube of coarse pictures of its `light`, the small bright `lights` that these leave out, and the
     map `background` (N, N, 3)."""
     sides = () if like is None else tuple(sky_lights(like, light, MOST_PATCHES)[0])

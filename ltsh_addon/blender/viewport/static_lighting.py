@@ -42,7 +42,7 @@ def is_equal(a, b) -> bool:
         return a is b
     if not is_dataclass(a):
         return np.array_equal(a, b)
-    names = (item.name for item in fields(a) if item.name != "detail")
+    names = (item.name for item in fields(a) if item.name != "children")
     return all(is_equal(getattr(a, name), getattr(b, name)) for name in names)
 
 

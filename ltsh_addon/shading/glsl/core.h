@@ -468,5 +468,5 @@ LTSH_FUNCTION ltsh_limits ltsh_tail_limits(
 }
 
 #elif LTSH_SHARED != @VERSION@
-#error headers of different versions of ltsh tables export are included together
+#error headers of different versions of python -m tables export are included together
 #endif

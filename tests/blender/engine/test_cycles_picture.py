@@ -19,7 +19,7 @@ from ltsh_addon.blender.engine.cycles_picture import (
 )
 from ltsh_addon.imaging.exr import write_channels
 from ltsh_addon.imaging.report import write_index
-from ltsh_addon.scene import AreaLight
+from ltsh_addon.scene import QuadLight
 
 SIZE = parts.SIZE
 PIXELS = np.random.default_rng(3).random((SIZE[1], SIZE[0], 3)).astype(np.float32)
@@ -106,7 +106,7 @@ def lit_by(*lights):
 
 def lamp(x=0.0):
     sides = {"half_u": (0.5, 0.0, 0.0), "half_v": (0.0, 0.5, 0.0), "direction": (0.0, 0.0, -1.0)}
-    return AreaLight("Lamp", "SQUARE", center=(x, 0.0, 1.0), radiance=np.ones(3), **sides)
+    return QuadLight("Lamp", center=(x, 0.0, 1.0), radiance=np.ones(3), **sides)
 
 
 def test_a_change_of_the_scene_makes_the_picture_outdated_until_it_is_undone(tmp_path):

@@ -16,7 +16,7 @@ from ltsh_addon import imaging
 from ltsh_addon.blender import render_settings
 from ltsh_addon.cycles import lobes
 from ltsh_addon.pipeline import bake
-from ltsh_addon.scene import AreaLight, SurfaceSamples
+from ltsh_addon.scene import QuadLight, SurfaceSamples
 
 
 def plane_samples(view, f0=0.0, f90=0.0, albedo=0.0):
@@ -32,8 +32,7 @@ def plane_samples(view, f0=0.0, f90=0.0, albedo=0.0):
     return SurfaceSamples(position, vectors, up, up, 0.4 * one[:, 0], color, one * f90, 0.0 * one, ior, one * albedo)
 
 
-KEY = AreaLight(
-    "Key", "RECTANGLE", (0.3, 0.2, 1.5), (0.6, 0.0, 0.0), (0.0, 0.35, 0.0), (0.0, 0.0, -1.0),
+KEY = QuadLight("Key", (0.3, 0.2, 1.5), (0.6, 0.0, 0.0), (0.0, 0.35, 0.0), (0.0, 0.0, -1.0),
     np.full(3, 100.0 / (1.2 * 0.7) / math.pi),
 )  # fmt: skip
 

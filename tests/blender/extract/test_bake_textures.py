@@ -13,7 +13,7 @@ from ltsh_addon.cycles import texels as texels_module
 from ltsh_addon.cycles.images import ImageTexture
 from ltsh_addon.cycles.uv import UvTriangles
 from ltsh_addon.pipeline import BakeOptions, bake
-from ltsh_addon.scene import AreaLight
+from ltsh_addon.scene import light_of
 
 # Cycles bakes 0.001 and 0.002 of a texel beside the center, where these textures change by 0.3 per texel at most.
 NUDGED = 2e-3
@@ -96,7 +96,7 @@ def samples_by_object(path, folder, look_up):
     options = BakeOptions(scene=path, output=folder, size=(SIZE, SIZE), view="above")
     job = replace(bake._job(options, {}), look_up_images=look_up)
     manifest = extract_bake(job, folder)
-    lights = tuple(AreaLight(**record) for record in manifest["lights"])
+    lights = tuple(light_of(record) for record in manifest["lights"])
     found = {}
     for record in manifest["objects"]:
         assert record["problem"] is None

@@ -12,6 +12,7 @@ from lit_plane import add_instancer, assert_agrees, into_collection
 from ltsh_addon.blender.extract import origin
 from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels
 from ltsh_addon.cycles import gbuffer
+from ltsh_addon.scene import QuadLight
 
 # Where positions are 1/128 m apart: those of the scenes below are multiples of that, so that both places are the same.
 PLACE = np.array([100000.0, -70000.0, 40.0])
@@ -179,7 +180,7 @@ def test_positions_that_stay_far_are_named_with_their_effect():
     far[0] = position[0]
     assert gbuffer.rounded_positions(far, [light]) == []
     # 6 m beside a square of 8 m, in its plane: no closer by its radius than 4.3 m, which is enough.
-    square = replace(light, shape="RECTANGLE", half_u=(4.0, 0.0, 0.0), half_v=(0.0, 4.0, 0.0))
+    square = QuadLight.like(light, half_u=(4.0, 0.0, 0.0), half_v=(0.0, 4.0, 0.0))
     assert gbuffer.rounded_positions(position + [10.0, 0.0, -1.0], [square]) == []
     # A surface that shines does not light itself.
     square = replace(square, direction=(0.0, 0.0, -1.0))

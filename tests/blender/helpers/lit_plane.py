@@ -30,7 +30,7 @@ def compare(folder, samples=256, count=16):
     assert unusable == 0 and len(surface) > 0
     images = scene_parts.reference(folder, prepared, samples)
     errors = {}
-    lights = [patch for light in prepared[2].lights for patch in light.patches]
+    lights = [patch for light in prepared[2].lights for patch in light.leaves]
     for lobe, brdf in BRDFS.items():
         halves = images[lobe].reshape(2, -1, 3)[:, pixel].astype(np.float64)
         expected = quadrature.radiance(surface, lights, brdf, count=count)

@@ -25,7 +25,7 @@ def test_a_light_is_as_bright_as_in_cycles(tmp_path, name):
     tree.links.new(add_falloff(tree, name, 0.7), emission.inputs["Strength"])
     _, _, inventory, warnings = assert_agrees(tmp_path)
     (light,) = inventory.lights
-    assert warnings == [] and (light.falloff, light.smooth) == FALLOFFS[name] and not light.detail
+    assert warnings == [] and (light.falloff, light.smooth) == FALLOFFS[name] and not light.children
 
 
 def test_a_picture_on_a_focused_light_keeps_its_falloff(tmp_path):
@@ -43,7 +43,7 @@ def test_a_picture_on_a_focused_light_keeps_its_falloff(tmp_path):
     holder.node_tree = group
     tree.links.new(holder.outputs[0], emission.inputs["Strength"])
     _, _, inventory, warnings = assert_agrees(tmp_path, samples=1024, count=6, tolerance=4e-3)
-    assert warnings == [] and {light.falloff for light in inventory.lights[0].patches} == {1}
+    assert warnings == [] and {light.falloff for light in inventory.lights[0].leaves} == {1}
 
 
 def test_a_glowing_mesh_has_a_falloff_of_its_material(tmp_path):

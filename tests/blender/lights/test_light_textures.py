@@ -38,8 +38,8 @@ def test_an_image_on_a_light_is_that_of_cycles(tmp_path, name):
     # Cycles does not look for bright parts of a texture: its noise is twice that of a plain light.
     _, _, inventory, warnings = assert_agrees(tmp_path, samples=2048, count=8)
     (light,) = inventory.lights
-    assert len(light.patches) > 16 and warnings == []
-    assert {patch.spread for patch in light.patches} == {light.spread}
+    assert len(light.leaves) > 16 and warnings == []
+    assert {patch.spread for patch in light.leaves} == {light.spread}
 
 
 def test_patches_keep_the_power_of_the_light():
@@ -47,8 +47,8 @@ def test_patches_keep_the_power_of_the_light():
     add_picture_light()
     lights = scene_parts.prepare()[2].lights
     (whole,) = lights
-    areas = [4.0 * np.linalg.norm(np.cross(light.half_u, light.half_v)) for light in whole.patches]
-    power = sum(area * light.radiance for area, light in zip(areas, whole.patches, strict=True))
+    areas = [4.0 * np.linalg.norm(np.cross(light.half_u, light.half_v)) for light in whole.leaves]
+    power = sum(area * light.radiance for area, light in zip(areas, whole.leaves, strict=True))
     assert np.allclose(power, sum(areas) * whole.radiance, rtol=1e-9)
     plain = 100.0 / math.pi  # watts over pi, of a light that is white all over
     assert np.allclose(power, plain * picture().mean(axis=(0, 1)), rtol=1e-4)
@@ -62,8 +62,8 @@ def test_a_smooth_texture_needs_patches_along_one_side_only(tmp_path):
     tree.links.new(ramp.outputs["Fac"], emission.inputs["Strength"])
     _, _, inventory, warnings = assert_agrees(tmp_path)
     (light,) = inventory.lights
-    assert warnings == [] and 16 <= len(light.patches) <= 32
-    assert np.allclose([np.linalg.norm(patch.half_v) for patch in light.patches], 0.35)
+    assert warnings == [] and 16 <= len(light.leaves) <= 32
+    assert np.allclose([np.linalg.norm(patch.half_v) for patch in light.leaves], 0.35)
 
 
 def test_constant_nodes_keep_the_light_whole(tmp_path):
@@ -126,7 +126,7 @@ def test_a_texture_too_fine_is_named_with_its_error():
     pixels = np.random.default_rng(8).random((256, 256, 3))
     tree.links.new(add_image(tree, pixels).outputs["Color"], emission.inputs["Color"])
     _, _, inventory, warnings = scene_parts.prepare()
-    assert len(inventory.lights[0].patches) == 64 * 64
+    assert len(inventory.lights[0].leaves) == 64 * 64
     # The mean distance of a number in [0, 1] from its mean is a quarter, half of the mean, here less by what the
     # 16 pixels of each patch have in common.
     assert any("'Fine'" in line and "4096 patches" in line and " 4" in line for line in warnings), warnings

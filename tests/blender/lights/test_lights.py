@@ -9,7 +9,7 @@ import pytest
 import quadrature
 import scene_parts
 
-from ltsh_addon.scene import AreaLight, SurfaceSamples
+from ltsh_addon.scene import EllipseLight, PolygonLight, SurfaceSamples, light_of
 
 LAMBERT = "ShaderNodeBsdfDiffuse"
 CASES = {
@@ -104,12 +104,12 @@ def test_light_records_survive_json():
     corners = np.random.default_rng(4).normal(size=(5, 3))
     placed = {"center": [0.1, 0.2, 1.0 / 3.0], "half_u": [0.5, 0, 0], "half_v": [0, 0.25, 0], "direction": [0, 0, -1.0]}
     more = {"group": "Keys", "affects_diffuse": False, "corners": corners, "receivers": (0, 3)}
-    light = AreaLight("L\u00e4mpchen", "POLYGON", **placed, radiance=[1e-9, 2.0, 3e9], **more)
-    found = AreaLight(**json.loads(json.dumps(light.record())))
+    light = PolygonLight("L\u00e4mpchen", **placed, radiance=[1e-9, 2.0, 3e9], **more)
+    found = light_of(json.loads(json.dumps(light.record())))
     for name, value in vars(light).items():
         assert np.array_equal(getattr(found, name), value) and type(getattr(found, name)) is type(value), name
-    plain = AreaLight("L", "DISK", **placed, radiance=[1.0, 1.0, 1.0], spread=1.0 / 7.0)
-    found = AreaLight(**json.loads(json.dumps(plain.record())))
+    plain = EllipseLight("L", **placed, radiance=[1.0, 1.0, 1.0], spread=1.0 / 7.0)
+    found = light_of(json.loads(json.dumps(plain.record())))
     assert found.corners is None and found.receivers is None and found.spread == 1.0 / 7.0
 
 
@@ -131,6 +131,6 @@ def test_the_oracle_reproduces_the_form_factor_of_a_parallel_disk():
     up, one = np.array([[0.0, 0.0, 1.0]]), np.ones(1)
     zero = np.zeros((1, 3))
     point = SurfaceSamples(zero, up, up, up, one, zero, zero, one, one, np.pi * np.ones((1, 3)))
-    disk = AreaLight("d", "DISK", [0, 0, 2.0], [0.5, 0, 0], [0, 0.5, 0], [0, 0, -1.0], [1.0, 1.0, 1.0])
+    disk = EllipseLight("d", [0, 0, 2.0], [0.5, 0, 0], [0, 0.5, 0], [0, 0, -1.0], [1.0, 1.0, 1.0])
     found = quadrature.radiance(point, [disk], quadrature.lambert)[0, 0]
     assert found == pytest.approx(math.pi * 0.25 / 4.25, rel=1e-4)

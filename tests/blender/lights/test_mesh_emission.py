@@ -65,7 +65,7 @@ def test_a_textured_screen_becomes_patches(tmp_path):
     add_lamp_plane(material)
     _, _, inventory, warnings = assert_agrees(tmp_path, samples=1024, count=8)
     assert warnings == [] and len(inventory.lights) == 2
-    assert 32 <= sum(len(light.patches) for light in inventory.lights) <= 64
+    assert 32 <= sum(len(light.leaves) for light in inventory.lights) <= 64
     total = sum(
         4.0 * np.linalg.norm(np.cross(light.half_u, light.half_v)) * light.radiance for light in inventory.lights
     )

@@ -9,7 +9,7 @@ import quadrature
 import scene_parts
 
 from ltsh_addon.blender.lights.area import overlapping_pairs
-from ltsh_addon.scene import AreaLight
+from ltsh_addon.scene import EllipseLight, QuadLight
 
 
 def two_lights(apart=0.0, **settings):
@@ -54,7 +54,7 @@ def test_lights_that_rays_do_not_hit_are_not_named():
 
 
 def light(name, x=0.0, **settings):
-    plain = AreaLight(name, "RECTANGLE", (x, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, -1.0), np.ones(3))
+    plain = QuadLight(name, (x, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, -1.0), np.ones(3))
     return replace(plain, **settings)
 
 
@@ -69,7 +69,7 @@ def test_overlaps_are_those_of_the_shapes():
     assert share(whole, light("B", 0.3, half_u=(0.1, 0.0, 0.0))) == 1.0
     # The corners of a rectangle are outside of the ellipse in it.
     corner = light("B", center=(0.95, 0.45, 1.0), half_u=(0.05, 0.0, 0.0), half_v=(0.0, 0.05, 0.0))
-    assert share(whole, corner) == 1.0 and share(light("A", shape="ELLIPSE"), corner) == 0.0
+    assert share(whole, corner) == 1.0 and share(EllipseLight.like(light("A")), corner) == 0.0
     assert share(whole, light("B", direction=(0.0, 0.0, 1.0))) == 0.0
     assert share(light("A", receivers=(1,)), light("B", receivers=(2,))) == 0.0
     assert share(light("A", receivers=(1,)), light("B", receivers=(1, 2))) == 1.0

@@ -183,7 +183,7 @@ def test_reflections_that_show_the_patches_of_a_world_are_named(tmp_path):
     sharp = replace(surface, roughness=np.where(np.arange(len(surface)) % 4 == 0, 0.1, surface.roughness))
     (line,) = faceted(sharp, prepared[2].lights)
     assert "'World'" in line and "25 % of the samples" in line
-    assert faceted(sharp, [light for light in prepared[2].lights if not light.detail]) == []
+    assert faceted(sharp, [light for light in prepared[2].lights if not light.children]) == []
 
 
 @pytest.mark.parametrize("kind", ["constant", "sky with a sun"])

@@ -23,7 +23,7 @@ from ltsh_addon.pipeline.lighting import ShadowTracer, load_tables
 from ltsh_addon.pipeline.mixer import light_pictures
 from ltsh_addon.pipeline.moved_lights import MovedLights
 from ltsh_addon.pipeline.relight import LightChange, RelightData, relight
-from ltsh_addon.scene import PASSES, AreaLight, Film
+from ltsh_addon.scene import PASSES, Film, light_of
 
 SIZE, BLOCK = 32, 8  # pixels
 SAMPLES, TRUE_SAMPLES = 64, 1024
@@ -360,7 +360,7 @@ def test_a_kept_finished_picture_is_the_sum_of_its_lights_and_the_rest(out, tmp_
     np.testing.assert_allclose(mixed.layers.sum(axis=0), combined[..., :3], rtol=1e-4, atol=1e-5)
     # Its light alone, where it was: rays of its own, as many as of all lights together.
     lights = MovedLights.load(out / "render.samples.npz")
-    alone = lights.picture(AreaLight(**mixed.rows[0].light))
+    alone = lights.picture(light_of(mixed.rows[0].light))
     lights.close()
     assert np.linalg.norm(alone - mixed.layers[0]) < 0.02 * np.linalg.norm(alone)
 

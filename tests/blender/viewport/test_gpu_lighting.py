@@ -11,7 +11,7 @@ from uploaded_samples import upload_samples
 
 from ltsh_addon import shading
 from ltsh_addon.blender.viewport.lighting import LightingPass
-from ltsh_addon.scene import Pattern
+from ltsh_addon.scene import EllipseLight, Pattern
 
 WIDTH, HEIGHT = 32, 16
 TECHNIQUES = ("ltc", "ltsh2", "ltsh4", "ltsh4c")
@@ -85,7 +85,7 @@ def test_radiance_is_that_of_the_integrator(surface, kinds, techniques):
                         distance = np.linalg.norm(found - shaded.combined) / np.linalg.norm(shaded.combined)
                         assert distance < CONES, f"{kind}, {technique}, {name}: {distance:.4f}"
                         continue
-                    relative = RELATIVE_OF_PROFILES if lights[0].is_profiled else RELATIVE
+                    relative = RELATIVE_OF_PROFILES if lights[0].has_profile else RELATIVE
                     relative = RELATIVE_OF_CAPS if kind in random_surfaces.FACING_LIGHTS else relative
                     times = excess(found, shaded.combined, relative)
                     brightest[name] = max(brightest[name], float(shaded.combined.max()))
@@ -366,7 +366,7 @@ def test_no_input_gives_anything_but_finite_light():
         lights = [random_surfaces.light(kind, 0, random) for kind in random_surfaces.LIGHTS]
         flat = replace(lights[0], center=np.zeros(3), half_u=np.eye(3)[0], half_v=np.eye(3)[1], direction=-np.eye(3)[2])
         small, far = (replace(flat, half_u=size * flat.half_u, half_v=size * flat.half_v) for size in (1e-12, 1e12))
-        lights += [flat, small, far, replace(flat, shape="DISK")]
+        lights += [flat, small, far, EllipseLight.like(flat)]
         corner = np.indices((3, 3, 3)).reshape(3, -1).T - 1.0
         position = rounded(samples.position)
         position[: len(corner)] = corner

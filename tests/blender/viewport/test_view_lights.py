@@ -94,7 +94,7 @@ def test_an_image_on_a_light_becomes_patches_of_its_power(shape):
     parts.add_camera()
     lights, notes = seen()
     (textured,) = parts.prepare()[2].lights
-    expected = textured.patches
+    expected = textured.leaves
 
     def power(many):
         return sum(np.linalg.norm(one.area_vector) * one.radiance for one in many)
@@ -295,7 +295,7 @@ def test_windows_show_what_depends_on_the_place_and_patterns_of_area_lights():
         by_name = {name: [light for light in lights if light.name == name] for name in expected}
         assert len(by_name["Flat"]) > 8 and len(by_name["Bulb"]) == 1
         power, place = power_and_place(by_name["Flat"])
-        theirs = power_and_place(expected["Flat"].patches)
+        theirs = power_and_place(expected["Flat"].leaves)
         np.testing.assert_allclose(power, theirs[0], rtol=1e-3)
         # 1.2 x 0.7 m.
         np.testing.assert_allclose(place, theirs[1], atol=2e-3)

@@ -1,4 +1,4 @@
-"""Lookup tables for other engines: the files of `ltsh tables export` (tables/EXPORT.md).
+"""Lookup tables for other engines: the files of `python -m tables export` (tables/EXPORT.md).
 
 The EXR has every stored quantity as a channel over the grid of the table. The header (.h) has all numbers and the
 functions that shade with them, the .wgsl these functions, the .dds the numbers as textures.
@@ -15,11 +15,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ..files import replacing
-from ..imaging.exr import write_channels
-from ..lobes.lookup_table import MIN_ALPHA, WARP_REGULARIZATION, LookupTable, basis_integrals
-from ..scene import VERSION
-from ..shading import header, load_table
+from ltsh_addon.files import replacing
+from ltsh_addon.imaging.exr import write_channels
+from ltsh_addon.lobes.lookup_table import MIN_ALPHA, WARP_REGULARIZATION, LookupTable, basis_integrals
+from ltsh_addon.scene import VERSION
+from ltsh_addon.shading import header, load_table
 
 _WARP_NAMES = ("A", "B", "C", "tilt")
 
@@ -122,7 +122,7 @@ def _attributes(table) -> dict[str, str]:
         "table": table.name,
         "family": table.family,
         "degree": table.degree,
-        "made_by": f"ltsh tables export {VERSION}",
+        "made_by": f"python -m tables export, LTSH {VERSION}",
         "rows": "top to bottom: roughness, uniform from 0 to 1; alpha = roughness^2 of GGX",
         "columns": "left to right: theta_o, uniform in 1 - sqrt(1 - theta_o / 90 deg) from 0 to 1",
         "frame": "z is the shading normal, the view direction is (sin theta_o, 0, cos theta_o)",
@@ -164,7 +164,7 @@ def _about(table, name) -> str:
     curves = "\n".join(f"    {number}: {text}" for number, text in enumerate(_curve_names(table)))
     return f"""\
 {name}: {table.metadata.get("brdf", "a fitted BRDF")}, as linearly transformed lobes ({table.family}).
-Made by `ltsh tables export` {VERSION}. C99, C++, GLSL 3.30 and HLSL, or WGSL.
+Made by `python -m tables export` of LTSH {VERSION}. C99, C++, GLSL 3.30 and HLSL, or WGSL.
 Frame: z is the shading normal, the view direction is (sin theta_o, 0, cos theta_o). roughness^2 = alpha of GGX.
 Fresnel curves of c, the cosine of the half angle; a reflectance that is a sum of them needs the same sum of integrals:
 {curves}

@@ -1,23 +1,20 @@
-"""`ltsh tables export`: the EXR against the table, the file handling, the command line."""
+"""`python -m tables export`: the EXR against the table, the file handling, the command line."""
 
 import errno
 import json
 import os
 import re
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import OpenEXR
 import pytest
-from fake_scene import run
 
 from ltsh_addon import shading
 from ltsh_addon.imaging import read_channels
 from ltsh_addon.lobes import lookup_table
-from ltsh_addon.pipeline import export
+from tables import __main__, export
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCUMENT = ROOT / "tables" / "EXPORT.md"
@@ -27,6 +24,15 @@ def files_of(name: str, family: str = "") -> list[str]:
     """What is written of a table, in order."""
     textures = [f"{name}_{number}.dds" for number in (1, 2)] if "ltc" in (name, family) else []
     return [*(f"{name}.{ending}" for ending in ("exr", "h", "wgsl", "dds")), *textures]
+
+
+def run(capsys, *arguments):
+    """Exit code, stdout and stderr of `python -m tables export`."""
+    try:
+        code = __main__.main(["export", *map(str, arguments)])
+    except SystemExit as end:
+        code = end.code
+    return code, *capsys.readouterr()
 
 
 @pytest.fixture(scope="module")
@@ -112,7 +118,7 @@ def test_names_in_headers_are_identifiers(name, expected):
 
 
 def test_all_shipped_tables_are_the_default(capsys, out):
-    code, stdout, stderr = run(capsys, "tables", "export", "-o", out, "--quiet")
+    code, stdout, stderr = run(capsys, "-o", out)
     names = [file for name in shading.SHIPPED_TABLES for file in files_of(name)]
     assert (code, stderr) == (0, "") and stdout.splitlines() == [str(out / name) for name in names]
     assert sorted(path.name for path in out.iterdir()) == sorted(names)
@@ -121,7 +127,7 @@ def test_all_shipped_tables_are_the_default(capsys, out):
 def test_json_is_one_document_that_names_the_files(capsys, out, tmp_path):
     path = tmp_path / "My table.npz"
     shutil.copy(ROOT / "tables" / "ltc.npz", path)
-    code, stdout, stderr = run(capsys, "tables", "export", "ltc", path, "ltc", "-o", out / "deep", "--json", "--quiet")
+    code, stdout, stderr = run(capsys, "ltc", path, "ltc", "-o", out / "deep", "--json")
     files = json.loads(stdout)["tables"]
     assert (code, stderr) == (0, "") and list(files) == ["ltc", str(path)]
     expected = {*files_of("ltc"), *files_of("My table", "ltc")}
@@ -141,7 +147,7 @@ def test_json_is_one_document_that_names_the_files(capsys, out, tmp_path):
     ],
 )
 def test_wrong_arguments_are_misuse(capsys, out, arguments, complaint):
-    code, stdout, stderr = run(capsys, "tables", "export", *(out if word == "OUT" else word for word in arguments))
+    code, stdout, stderr = run(capsys, *(out if word == "OUT" else word for word in arguments))
     assert (code, stdout) == (2, "") and complaint in stderr.splitlines()[-1] and not out.exists()
 
 
@@ -153,8 +159,8 @@ def _assert_failure(result, complaint):
 def test_a_broken_table_fails_before_anything_is_written(capsys, out, tmp_path):
     path = tmp_path / "broken.npz"
     path.write_bytes(b"")
-    _assert_failure(run(capsys, "tables", "export", "ltc", path, "-o", out, "--quiet"), f"lookup table {path}")
-    _assert_failure(run(capsys, "tables", "export", tmp_path / "no.npz", "-o", out, "--quiet"), "no such file")
+    _assert_failure(run(capsys, "ltc", path, "-o", out), f"lookup table {path}")
+    _assert_failure(run(capsys, tmp_path / "no.npz", "-o", out), "no such file")
     assert not out.exists()
 
 
@@ -170,7 +176,7 @@ def test_nothing_is_left_behind_when_writing_fails(capsys, out, monkeypatch, own
         raise failure
 
     monkeypatch.setattr(owner, attribute, fail)
-    result = run(capsys, "tables", "export", "ltc", "-o", out, "--quiet")
+    result = run(capsys, "ltc", "-o", out)
     _assert_failure(result, f"{out / named}: cannot be written")
     assert result[2].count("cannot be written") == 1 and list(out.iterdir()) == []
 
@@ -181,7 +187,7 @@ def test_a_failure_keeps_what_was_there(capsys, out, name):
     other = "ltc.wgsl"
     (out / name).mkdir(parents=True)
     (out / other).write_bytes(b"old")
-    _assert_failure(run(capsys, "tables", "export", "ltc", "-o", out, "--quiet"), "a folder has that name")
+    _assert_failure(run(capsys, "ltc", "-o", out), "a folder has that name")
     assert (out / other).read_bytes() == b"old" and len(list(out.iterdir())) == 2
 
 
@@ -195,38 +201,3 @@ def test_every_file_says_its_license(exported):
         with OpenEXR.File(str(exported / f"{name}.exr"), header_only=True) as file:
             assert json.loads(file.header()["ltsh:conventions"])["license"] == "CC0-1.0"
     assert "CC0 1.0 Universal" in (ROOT / "tables" / "LICENSE").read_text(encoding="utf-8")
-
-
-@pytest.fixture(scope="module")
-def installed(tmp_path_factory):
-    """The add-on as Blender installs it: under another name, with the tables but not their scripts."""
-    folder = tmp_path_factory.mktemp("installed")
-    add_on = folder / "bl_ext" / "user_default" / "ltsh"
-    shutil.copytree(ROOT / "ltsh_addon", add_on / "ltsh_addon", ignore=shutil.ignore_patterns("__pycache__"))
-    (add_on / "tables").mkdir()
-    for path in (ROOT / "tables").glob("*.npz"):
-        shutil.copy(path, add_on / "tables")
-    return folder
-
-
-def _run_without_scipy(folder, package, *arguments):
-    code = f"import sys; sys.modules['scipy'] = None; from {package} import cli; sys.exit(cli.main(sys.argv[1:]))"
-    command = [sys.executable, "-W", "error", "-c", code, *map(str, arguments)]
-    return subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=600, check=False)
-
-
-def test_the_installed_add_on_exports_without_scipy(installed, exported, out):
-    package = "bl_ext.user_default.ltsh.ltsh_addon"
-    done = _run_without_scipy(installed, package, "tables", "export", "ltsh2", "-o", out, "--quiet")
-    assert (done.returncode, done.stderr) == (0, "")
-    for name in files_of("ltsh2"):
-        assert (out / name).read_bytes() == (exported / name).read_bytes()
-
-
-@pytest.mark.parametrize("action", ["fit", "validate"])
-def test_fit_and_validate_say_what_they_lack(installed, action):
-    done = _run_without_scipy(installed, "bl_ext.user_default.ltsh.ltsh_addon", "tables", action)
-    assert (done.returncode, done.stdout) == (2, "") and "needs the source checkout" in done.stderr
-    done = _run_without_scipy(ROOT, "ltsh_addon", "tables", action)
-    assert (done.returncode, done.stdout) == (2, "") and "needs scipy" in done.stderr
-    assert len(done.stderr.splitlines()) == 1

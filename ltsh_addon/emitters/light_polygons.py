@@ -56,7 +56,7 @@ LEAST_COSINE = 0.1
 
 
 def light_levels(light, corners, position, width):
-    """Yield (corners (V, 3), `DiskLayers` of lights with a profile, chosen (Q',) of the points, None for all), as their lobes need.
+    """Yield (corners (V, 3), `DiskLayers` or None, chosen (Q',) of the points, None for all), as their lobes need.
 
     The lobes are `width` (Q,) or a number of radians wide, at points with x, y, z in `position` (3, Q). All arrays are
     in double precision, so that both paths make the same decisions.

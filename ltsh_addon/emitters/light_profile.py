@@ -142,8 +142,8 @@ WIDE_LOBE, SHARP_LOBE = 0.09, 0.01
 
 def disk_layers(light, position, width):
     """Yield (disks, chosen (Q',)) for points with x, y, z in `position` (3, Q): `chosen` are the numbers of the points
-    that need these `DiskLayers` for a profile error of about 0.3 %. Their lobes are `width` (Q,) or a number of radians wide.
-    All arrays are in double precision."""
+    that need these `DiskLayers` for a profile error of about 0.3 %. Their lobes are `width` (Q,) or a number of radians
+    wide. All arrays are in double precision."""
     extent, reach, beside = _place_in_cone(light, position)
     length = reach - beside
     if light.has_falloff:

@@ -98,7 +98,18 @@ def _value_of(record):
     """The value of a JSON record: a MapValue, a TextureValue, a number or a color."""
     if not isinstance(record, dict):
         return record
-    return MapValue(**record) if "map" in record else TextureValue(record["texture"], record["part"])
+    return MapValue(**record) if "map" in record else TextureValue(**record)
+
+
+@dataclass(frozen=True)
+class TextureFile:
+    """An image that a material shows unchanged, and how it is read; see `ImageTexture`."""
+
+    uv: str  # the UV map, "" for the one that renders
+    extension: str
+    interpolation: str
+    srgb: bool
+    file: str = ""  # name of the .npy with its pixels
 
 
 @dataclass(frozen=True)
@@ -113,10 +124,11 @@ class BakeMaterial:
     def of(cls, record: dict, images: Path, uv_maps: dict[str, Path]) -> BakeMaterial:
         """From a JSON record, the folder of `images`, and the files of UV maps by name."""
         textures = []
-        for texture in record["textures"]:
-            pixels = np.load(images / texture["file"], mmap_mode="r")
-            read_as = {name: texture[name] for name in ("extension", "interpolation", "srgb")}
-            textures.append((ImageTexture(pixels, **read_as), np.load(uv_maps[texture["uv"]])))
+        for entry in record["textures"]:
+            texture = TextureFile(**entry)
+            pixels = np.load(images / texture.file, mmap_mode="r")
+            image = ImageTexture(pixels, texture.extension, texture.interpolation, texture.srgb)
+            textures.append((image, np.load(uv_maps[texture.uv])))
         lobes = tuple({name: _value_of(value) for name, value in lobe.items()} for lobe in record["lobes"])
         return cls(record["corrected"], lobes, tuple(textures))
 

@@ -11,12 +11,12 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ...cycles.texels import NOT_BAKED, BakeView, TexelMesh
+from ...cycles.texels import NOT_BAKED, BakeView
 from ...cycles.uv import tiles_of
 from ...files import save_array
-from ...scene import FARTHEST, SceneError, error_line, light_records, listed
+from ...scene import error_line, light_records
 from .. import render_settings
-from ..evaluated import normals_at_corners, read_values, rendered_surfaces, with_render_depsgraph
+from ..evaluated import rendered_surfaces, with_render_depsgraph
 from ..lights.area import collect_lights
 from ..lights.world import take_world
 from ..materials.aovs import (
@@ -32,18 +32,25 @@ from ..materials.maps import UV_MAP, MaterialPlan, SavedImages
 from ..process.bake import BakeFactsJob, BakeJob
 from ..render_settings import working_space
 from . import pixels
+from .bake_meshes import (
+    UV_LAYER,
+    MeshFiles,
+    ObjectError,
+    apply_modifiers,
+    check_object,
+    chosen_objects,
+    read_mesh,
+    save_mesh,
+    tiles_without_modifiers,
+    uv_of,
+)
 from .occluders import collect_occluders
 from .origin import middle_of, move_to_origin
 from .pixels import OCCLUDERS, SEEDS, remove_occlusion
 
-UV_LAYER = "ltsh_texels"
 # SAMPLED_TEXELS: width of the part of a texel over which Cycles' bake spreads its samples; the whole texel since 5.2.
 SAMPLED_TEXELS = 1.0 if bpy.app.version >= (5, 2, 0) else 0.5
 CYCLES_TYPES = {"specular": "GLOSSY", "diffuse": "DIFFUSE"}
-
-
-class ObjectError(Exception):
-    """An object cannot be baked; the message is one line and names it."""
 
 
 @dataclass(frozen=True)
@@ -65,116 +72,6 @@ class Block:
         column, row = (self.tile - 1001) % 10, (self.tile - 1001) // 10
         v = (uv[:, 1] - row) * (self.height / self.rows) - self.first_row / self.rows
         return np.stack([uv[:, 0] - column, v], axis=-1)
-
-
-def chosen_objects(scene, view_layer, wanted) -> list:
-    """Objects to bake: "all" meshes that render, the "selected" ones, or those named. Raises SceneError."""
-    if isinstance(wanted, str):
-        objects = [
-            ob for ob in view_layer.objects
-            if ob.type == "MESH" and not ob.hide_render and (wanted == "all" or ob.select_get())
-        ]  # fmt: skip
-        if not objects:
-            raise SceneError(
-                f"scene {scene.name!r}: no mesh that renders"
-                + (" is selected; select one in the file or name it" if wanted == "selected" else ", nothing to bake")
-            )
-        return objects
-    missing = [name for name in wanted if name not in view_layer.objects]
-    if missing:
-        names = listed(repr(ob.name) for ob in view_layer.objects if ob.type == "MESH")
-        raise SceneError(f"object {missing[0]!r} is not in scene {scene.name!r}; meshes there: {names}")
-    return [view_layer.objects[name] for name in wanted]
-
-
-def check_object(ob) -> None:
-    """Raise ObjectError if the object cannot be baked, as far as that is known without evaluating it."""
-    if ob.type != "MESH":
-        raise ObjectError(f"object {ob.name!r} is a {ob.type}, expected a mesh: convert it to one")
-    if ob.library is not None or ob.data.library is not None:
-        library = (ob.library or ob.data.library).filepath
-        raise ObjectError(f"object {ob.name!r} is linked from {library}: bake it there, or make it local")
-    if ob.hide_render:
-        raise ObjectError(f"object {ob.name!r} is hidden in renders: show it")
-
-
-def tiles_without_modifiers(ob, uv_name: str | None) -> list[int]:
-    """The UDIM tiles of a mesh object; [] if they are unknown without evaluating it."""
-    if ob.type != "MESH" or ob.modifiers or len(ob.data.loops) == 0:
-        return []
-    layer = ob.data.uv_layers.get(uv_name) if uv_name else ob.data.uv_layers.active
-    if layer is None:
-        return []
-    uv = _uv_of(layer, len(ob.data.loops))
-    if (np.floor(uv.min(axis=0)) == 0.0).all() and (uv.max(axis=0) <= 1.0).all():
-        return [1001]
-    ob.data.calc_loop_triangles()
-    triangles = read_values(ob.data.loop_triangles, "loops", (3 * len(ob.data.loop_triangles),), np.int32)
-    return tiles_of(uv[triangles].reshape(-1, 3, 2))[0]
-
-
-def read_mesh(
-    ob, depsgraph, uv_name: str | None, origin=(0.0, 0.0, 0.0)
-) -> tuple[TexelMesh, str, dict[str, np.ndarray]]:
-    """The evaluated mesh of `ob`, the name of the UV map to bake, and all UV maps (T, 3, 2) by name.
-
-    "" names the UV map that renders. `origin` (3,) in m is added to the positions. Raises ObjectError.
-    """
-    evaluated = ob.evaluated_get(depsgraph)
-    mesh = evaluated.to_mesh(preserve_all_data_layers=True, depsgraph=depsgraph)
-    try:
-        matrix = np.array(evaluated.matrix_world, dtype=np.float64)
-        matrix[:3, 3] += origin
-        return _read(ob, mesh, matrix, uv_name)
-    finally:
-        evaluated.to_mesh_clear()
-
-
-def _read(ob, mesh, matrix, uv_name):
-    mesh.calc_loop_triangles()
-    count = len(mesh.loop_triangles)
-    if count == 0:
-        raise ObjectError(f"object {ob.name!r} has no faces, nothing to bake")
-    layer = mesh.uv_layers.get(uv_name) if uv_name else mesh.uv_layers.active
-    if layer is None:
-        names = ", ".join(repr(other.name) for other in mesh.uv_layers) or "none"
-        wanted = f"no UV map {uv_name!r}" if uv_name else "no UV map"
-        raise ObjectError(f"object {ob.name!r} has {wanted}, found {names}: unwrap it, or choose another UV map")
-    loops, vertices = (read_values(mesh.loop_triangles, name, (3 * count,), np.int32) for name in ("loops", "vertices"))
-    positions = read_values(mesh.vertices, "co", (len(mesh.vertices), 3), np.float32)
-    normals = normals_at_corners(mesh)
-    maps = {other.name: _uv_of(other, len(mesh.loops))[loops].reshape(count, 3, 2) for other in mesh.uv_layers}
-    uv = maps[layer.name]
-    linear = matrix[:3, :3]
-    if not np.isfinite(matrix).all() or abs(np.linalg.det(linear)) < 1e-30:
-        raise ObjectError(f"object {ob.name!r}: its transform has no inverse, expected a scale other than 0")
-    if max(np.abs(matrix).max(), np.abs(positions[vertices]).max()) > FARTHEST:
-        raise ObjectError(f"object {ob.name!r} is farther away, or larger, than {FARTHEST:g} m: move it, or scale it")
-    world_normals = normals[loops].astype(np.float64) @ np.linalg.inv(linear)
-    world_normals /= np.maximum(np.linalg.norm(world_normals, axis=-1, keepdims=True), 1e-30)
-    slots = max(len(ob.material_slots), 1)
-    texel_mesh = TexelMesh(
-        corners=(positions[vertices].astype(np.float64) @ linear.T + matrix[:3, 3]).reshape(count, 3, 3),
-        normals=world_normals.reshape(count, 3, 3),
-        uv=uv,
-        material=np.minimum(read_values(mesh.loop_triangles, "material_index", (count,), np.int32), slots - 1),
-        vertices=vertices.reshape(count, 3),
-        mirrored=bool(np.linalg.det(linear) < 0.0),
-    )
-    a, b, c = np.moveaxis(uv.astype(np.float64), 1, 0)
-    if not np.any((b - a)[:, 0] * (c - a)[:, 1] != (b - a)[:, 1] * (c - a)[:, 0]):
-        raise ObjectError(f"object {ob.name!r}: all faces of UV map {layer.name!r} have no area: unwrap it")
-    if not tiles_of(uv)[0]:
-        raise ObjectError(
-            f"object {ob.name!r}: all of UV map {layer.name!r} lies outside of the texture, expected some of it "
-            "between 0 and 1, or whole faces in UDIM tiles: move it"
-        )
-    rendered = next((other.name for other in mesh.uv_layers if other.active_render), layer.name)
-    return texel_mesh, layer.name, {**maps, "": maps[rendered]}
-
-
-def _uv_of(layer, count):
-    return read_values(layer.uv, "vector", (count, 2), np.float32)
 
 
 class ObjectBake:
@@ -264,7 +161,7 @@ class ObjectBake:
     def _place(self, block):
         layers = self.ob.data.uv_layers
         count = len(self.ob.data.loops)
-        uv = _uv_of(layers[self.uv_name], count).astype(np.float64)
+        uv = uv_of(layers[self.uv_name], count).astype(np.float64)
         layers[self.layer_name].uv.foreach_set("vector", block.placed(uv).astype(np.float32).ravel())
         self.ob.data.update()
 
@@ -286,21 +183,6 @@ def view_of(wanted, camera, bent: bool) -> BakeView:
 _OF_ONE_JOB = ("objects", "following", "tile", "finished", "look_up_images")
 
 
-@dataclass(frozen=True)
-class ReadMesh:
-    """The mesh and the UV maps of an object, saved in files."""
-
-    mesh: Path  # for `TexelMesh.load`
-    uv_name: str
-    uv_names: tuple[str, ...]  # "" for the one that renders
-    uv_maps: Path  # .npz of arrays (T, 3, 2), named by the position in `uv_names`
-
-    def uv_map(self, name: str) -> np.ndarray:
-        """The UV map `name` (T, 3, 2)."""
-        with np.load(self.uv_maps) as data:
-            return data[str(self.uv_names.index(name))]
-
-
 @dataclass
 class BakeScene:
     """The open file. Each object that was named when it was opened is in either `meshes` or `problems`."""
@@ -312,7 +194,7 @@ class BakeScene:
     origin: np.ndarray  # (3,) m, the place in the file of the occluders' origin
     warnings: list[str]
     names: list[str]
-    meshes: dict[str, ReadMesh]
+    meshes: dict[str, MeshFiles]
     problems: dict[str, str]
     lobes: dict[str, MaterialLobes]  # by full name of the material
     folder: tempfile.TemporaryDirectory = field(repr=False)
@@ -379,7 +261,7 @@ def _open(job: BakeJob) -> BakeScene:
     seen_from = job.view if isinstance(job.view, str) else tuple(np.subtract(job.view, origin).tolist())
     folder = tempfile.TemporaryDirectory(prefix="ltsh-meshes-", ignore_cleanup_errors=True)
     has_shadows = job.shadows == "on"
-    _apply_modifiers(scene, objects, job.uv)
+    apply_modifiers(scene, objects, job.uv)
     inventory, meshes, problems, bare = _inspect(scene, objects, job.uv, Path(folder.name), origin, has_shadows)
     give_default_material(bare)
     lobes = _lobes([ob for ob in objects if ob.name in meshes], inventory.emitting_materials)
@@ -428,82 +310,6 @@ def _look_from(scene, camera, wanted) -> None:
     bpy.context.view_layer.update()
 
 
-def _apply_modifiers(scene, objects, uv_name: str | None) -> None:
-    """Replace the meshes of objects by evaluated ones where modifiers change the UV map or the materials.
-
-    Booleans, arrays with caps and geometry nodes can do so; Cycles' bake reads both from the object's own mesh.
-    """
-    probed = {}
-    for ob in objects:
-        if ob.type == "MESH" and ob.library is None and ob.data.library is None and len(ob.modifiers):
-            layer = ob.data.uv_layers.get(uv_name) if uv_name else ob.data.uv_layers.active
-            probed[ob] = "" if layer is None else _probe(ob.data, layer)
-    if not probed:
-        return
-
-    def visit(depsgraph):
-        instancers = {item.parent.original for item in depsgraph.object_instances if item.is_instance and item.parent}
-        return {
-            ob: _evaluated_copy(ob, depsgraph)
-            for ob, probe in probed.items()
-            if ob not in instancers and not _bakes_from_own_mesh(ob, depsgraph, uv_name, probe)
-        }
-
-    made = with_render_depsgraph(scene, visit)
-    for ob, probe in probed.items():
-        if probe:
-            ob.data.uv_layers.remove(ob.data.uv_layers[probe])
-    for ob, mesh in made.items():
-        ob.data = mesh
-        for modifier in [modifier for modifier in ob.modifiers if modifier.type != "PARTICLE_SYSTEM"]:
-            ob.modifiers.remove(modifier)
-
-
-def _probe(mesh, layer) -> str:
-    """The name of a new UV map of `mesh`, a copy of `layer` moved as `Block.placed` does; "" if there is no room."""
-    name, active = layer.name, mesh.uv_layers.active_index
-    probe = mesh.uv_layers.new(name=UV_LAYER, do_init=False)
-    if probe is None:
-        return ""
-    mesh.uv_layers.active_index = active
-    probe.uv.foreach_set("vector", _probed(_uv_of(mesh.uv_layers[name], len(mesh.loops))).ravel())
-    return probe.name
-
-
-def _probed(uv: np.ndarray) -> np.ndarray:
-    return (uv * (1.0, 4.0) - (0.0, 1.0)).astype(np.float32)
-
-
-def _bakes_from_own_mesh(ob, depsgraph, uv_name, probe: str) -> bool:
-    """True if the object's own mesh has the UV map and the materials with which it is rendered."""
-    evaluated = ob.evaluated_get(depsgraph)
-    if [slot.material and slot.material.original for slot in evaluated.material_slots] != [
-        slot.material for slot in ob.material_slots
-    ]:
-        return False
-    mesh = evaluated.to_mesh(preserve_all_data_layers=True, depsgraph=depsgraph)
-    try:
-        layers = mesh.uv_layers
-        layer = layers.get(uv_name) if uv_name else layers.active
-        if layer is None or not probe:
-            return layer is None or layer.name in ob.data.uv_layers
-        probe_layer, count = layers.get(probe), len(mesh.loops)
-        return probe_layer is not None and np.allclose(
-            _uv_of(probe_layer, count), _probed(_uv_of(layer, count)), atol=1e-4
-        )
-    finally:
-        evaluated.to_mesh_clear()
-
-
-def _evaluated_copy(ob, depsgraph):
-    """A new mesh with the result of the modifiers of `ob`; its generated coordinates are unchanged."""
-    evaluated = ob.evaluated_get(depsgraph)
-    mesh = bpy.data.meshes.new_from_object(evaluated, preserve_all_data_layers=True, depsgraph=depsgraph)
-    mesh.use_auto_texspace = False
-    mesh.texspace_location, mesh.texspace_size = ob.data.texspace_location, ob.data.texspace_size
-    return mesh
-
-
 def _inspect(scene, objects, uv_name, folder, origin, with_occluders):
     """The lights, meshes by object name, problems of the other objects by name, and objects without material."""
 
@@ -517,7 +323,7 @@ def _inspect(scene, objects, uv_name, folder, origin, with_occluders):
                 mesh = read_mesh(ob, depsgraph, uv_name, origin)
                 if ob.name_full not in rendered:
                     raise ObjectError(f"object {ob.name!r} is not rendered: its collection is excluded or hidden")
-                meshes[ob.name] = _saved(*mesh, folder, number)
+                meshes[ob.name] = save_mesh(*mesh, folder, number)
             except ObjectError as error:
                 problems[ob.name] = str(error)
         bare = objects_without_material([rendered[ob.name_full] for ob in objects if ob.name in meshes])
@@ -527,13 +333,6 @@ def _inspect(scene, objects, uv_name, folder, origin, with_occluders):
         return inventory, meshes, problems, bare
 
     return with_render_depsgraph(scene, visit)
-
-
-def _saved(mesh, uv_name, uv_maps, folder, number) -> ReadMesh:
-    path, maps = folder / f"mesh_{number}.npz", folder / f"uv_{number}.npz"
-    mesh.save(path)
-    np.savez(maps, **{str(position): values for position, values in enumerate(uv_maps.values())})
-    return ReadMesh(path, uv_name, tuple(uv_maps), maps)
 
 
 def _lobes(objects, emitting) -> dict[str, MaterialLobes]:
@@ -589,7 +388,7 @@ def _object(opened, name, images, job, folder, progress) -> dict:
     record = {"folder": folder.name, "uv": read.uv_name, "materials": [plan.record() for plan in plans]}
     record["unshaded"] = [opened.lobes[slot.material.name_full].unshaded for slot in ob.material_slots]
     record |= {"warnings": warnings, "receiver": int(ob.get(RECEIVER_PROPERTY, 0))}
-    used = sorted({texture["uv"] for plan in plans for texture in plan.textures})
+    used = sorted({texture.uv for plan in plans for texture in plan.textures})
     record["uv_maps"] = {name: f"uv_{number}.npy" for number, name in enumerate(used)}
     for uv_name, file in record["uv_maps"].items():
         save_array(folder / file, read.uv_map(uv_name))

@@ -5,6 +5,7 @@ For a bake the material emits the values of a map. A color or normal takes a map
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import bpy
@@ -12,6 +13,7 @@ import numpy as np
 
 from ...cycles.images import EXTENSIONS, INTERPOLATIONS
 from ...cycles.lobes import LOBE_AOVS
+from ...cycles.texels import MapValue, TextureFile, TextureValue
 from ...files import save_array
 from ..render_settings import working_space
 from .graph import carry_out_of_group, computed, cut, is_socket, live_link, material_output, source_behind, value_of
@@ -44,17 +46,17 @@ class SavedImages:
         return name
 
 
-def plain_texture(output, groups, kind: str):
-    """(image texture node, how it is read, its channel) if the `output` of a node shows a texture unchanged, else None.
+def plain_texture(output, groups, kind: str) -> tuple[bpy.types.Image, TextureFile, str] | None:
+    """The image, how it is read, and its component if the `output` of a node shows a texture unchanged, else None.
 
-    `groups` are those around the node (see `graph.Source`), `kind` is the type of the socket that shows it. How it is
-    read is a dictionary for `cycles.texels.BakeMaterial`. The channel is "color", "0", "1" or "2".
+    `groups` are those around the node (see `graph.Source`), `kind` is the type of the socket that shows it. The
+    component is "color", or the number of a channel.
     """
-    source, channel = source_behind(output, groups), "color"
+    source, component = source_behind(output, groups), "color"
     if source is not None and not source.arrives_whole(kind):
         return None
     if _is_node(source, "ShaderNodeSeparateColor") and source.node.mode == "RGB":
-        channel = str(list(source.node.outputs).index(source.socket))
+        component = str(list(source.node.outputs).index(source.socket))
         source = source.input(0)
         if source is not None and not source.arrives_whole("RGBA"):
             return None
@@ -64,7 +66,7 @@ def plain_texture(output, groups, kind: str):
     uv, srgb = _uv_map(source), _known_encoding(node.image)
     if uv is None or srgb is None or not _is_plain(node):
         return None
-    return node, {"uv": uv, "extension": node.extension, "interpolation": node.interpolation, "srgb": srgb}, channel
+    return node.image, TextureFile(uv, node.extension, node.interpolation, srgb), component
 
 
 def _is_node(source, kind: str) -> bool:
@@ -128,7 +130,7 @@ class MaterialPlan:
 
     def __init__(self, material, lobes: tuple[dict, ...], paths: tuple, images: SavedImages | None, uv_names=()):
         self.material, self.tree = material, material.node_tree
-        self.textures: list[dict] = []  # as `cycles.texels.BakeMaterial` reads them
+        self.textures: list[TextureFile] = []
         self._images, self._uv_names = images, {"", *uv_names}
         # The sockets of each map in the tree of the material: one color, or up to three numbers.
         self._maps: list[list] = []
@@ -150,7 +152,11 @@ class MaterialPlan:
     def record(self) -> dict:
         """The record of the material for `cycles.texels.BakeMaterial.of`."""
         corrected = bool(self.material.cycles.use_bump_map_correction)
-        return {"corrected": corrected, "lobes": list(self.lobes), "textures": self.textures}
+        lobes = [
+            {name: vars(value) if isinstance(value, MapValue | TextureValue) else value for name, value in lobe.items()}
+            for lobe in self.lobes
+        ]
+        return {"corrected": corrected, "lobes": lobes, "textures": [vars(texture) for texture in self.textures]}
 
     def _recorded(self, name, value, groups):
         if not is_socket(value):
@@ -164,30 +170,31 @@ class MaterialPlan:
         if LOBE_AOVS[name][0] == "COLOR":
             self._colors.add(len(self._maps))
             self._maps.append([socket])
-            return {"map": len(self._maps) - 1}
+            return MapValue(len(self._maps) - 1)
         if self._numbers is None or len(self._maps[self._numbers]) == 3:
             self._maps.append([])
             self._numbers = len(self._maps) - 1
         self._maps[self._numbers].append(socket)
-        return {"map": self._numbers, "channel": len(self._maps[self._numbers]) - 1}
+        return MapValue(self._numbers, len(self._maps[self._numbers]) - 1)
 
     def _looked_up(self, name, socket, groups):
-        """The record of a socket that shows an image unchanged, or None."""
+        """The `TextureValue` of a socket that shows an image unchanged, or None."""
         is_color = LOBE_AOVS[name][0] == "COLOR"
-        texture = plain_texture(socket, groups, "RGBA" if is_color else "VALUE")
-        if texture is None or texture[1]["uv"] not in self._uv_names:
+        shown = plain_texture(socket, groups, "RGBA" if is_color else "VALUE")
+        if shown is None or shown[1].uv not in self._uv_names:
             return None
-        node, reading, channel = texture
-        if is_color and channel != "color":
+        image, texture, component = shown
+        if is_color and component != "color":
             return None
-        file = self._images.file_of(node.image)
+        file = self._images.file_of(image)
         if file is None:
             return None
-        record = {"file": file, **reading}
-        if record not in self.textures:
-            self.textures.append(record)
-        channel = "gray" if channel == "color" and not is_color else channel
-        return {"texture": self.textures.index(record), "part": channel}
+        texture = replace(texture, file=file)
+        if texture not in self.textures:
+            self.textures.append(texture)
+        return TextureValue(
+            self.textures.index(texture), "gray" if component == "color" and not is_color else component
+        )
 
     def prepare(self, uv_name: str) -> None:
         """Add the nodes that `show` and `target` need; `uv_name` is the UV map that UV_MAP shows."""

@@ -20,7 +20,7 @@ from bpy.props import StringProperty
 
 from ...scene import error_line
 from ..extract.apply import shows_texture
-from ..extract.bake import ObjectError, check_object
+from ..extract.bake_meshes import ObjectError, check_object
 from ..lights.area import LightInventory, node_light, reason_to_leave_out
 from ..lights.area import (
     note_unsupported as note_unsupported_light,

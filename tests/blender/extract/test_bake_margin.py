@@ -10,7 +10,7 @@ from mathutils import Vector
 from scene_parts import add_plane, principled
 
 from ltsh_addon import imaging
-from ltsh_addon.blender.extract import bake
+from ltsh_addon.blender.extract.bake_meshes import read_mesh
 from ltsh_addon.cycles.uv import UvSeams, UvTriangles
 from ltsh_addon.pipeline.bake_files import Planes
 
@@ -118,7 +118,7 @@ def test_covered_texels_are_those_that_cycles_bakes(make, size):
     scene_parts.empty_scene()
     make()
     ob = bpy.context.object
-    mesh, _, _ = bake.read_mesh(ob, bpy.context.evaluated_depsgraph_get(), None)
+    mesh, _, _ = read_mesh(ob, bpy.context.evaluated_depsgraph_get(), None)
     layer = ob.data.uv_layers.active.uv
     for tile in range(2 if make is two_tiles else 1):
         _, baked_texels = blender_bake(ob, 0, size)
@@ -140,7 +140,7 @@ def test_margins_agree_with_blenders_own(tmp_path, kind, share):
     getattr(bpy.ops.mesh, f"primitive_{kind}_add")()
     ob = bpy.context.object
     (plain, _), (wide, _) = blender_bake(ob, 0), blender_bake(ob, MARGIN)
-    mesh, _, _ = bake.read_mesh(ob, bpy.context.evaluated_depsgraph_get(), None)
+    mesh, _, _ = read_mesh(ob, bpy.context.evaluated_depsgraph_get(), None)
 
     def colors(texels):
         return plain.reshape(-1, 3)[texels.index]

@@ -14,8 +14,7 @@ from ...visibility import Mate, Occluders, ShadowSampling, Tracer, open_tracer, 
 from ..extract.occluders import collect_occluders
 from ..lights.world import blocks_nothing
 from ..process.blender_process import embree_libraries
-from .camera import ViewCamera
-from .drawing import float_buffer
+from .drawing import ViewCamera, float_buffer
 from .gbuffer import GBufferTextures, VisibilityGrid, gbuffer_samples
 
 Lights = Sequence[Light]

@@ -110,9 +110,8 @@ def room(tmp_path):
 def short_tasks_for_children(monkeypatch):
     """Children start for any task; blocks are small."""
     from ltsh_addon.shading import integrator
-    from ltsh_addon.workers import pool
 
-    monkeypatch.setattr(pool, "SECONDS_WORTH_A_CHILD", 0.0)
+    monkeypatch.setattr(integrator, "SECONDS_WORTH_A_WORKER", 0.0)
     for name in ("BLOCK_LIMITS", "REFERENCE_BLOCK_LIMITS"):
         monkeypatch.setattr(integrator, name, (17, 17))
 
@@ -138,10 +137,10 @@ def children_only(monkeypatch, started):
     """This process takes no block as long as a child that was started lives."""
     from ltsh_addon.workers import pool
 
-    original = pool._Queue.next
+    original = pool._Run.next
 
     def patient(self):
         here = threading.current_thread() is threading.main_thread()
         return None if here and any(process.poll() is None for process in started) else original(self)
 
-    monkeypatch.setattr(pool._Queue, "next", patient)
+    monkeypatch.setattr(pool._Run, "next", patient)

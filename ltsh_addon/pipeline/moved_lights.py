@@ -19,8 +19,20 @@ import numpy as np
 
 from ..cycles.gbuffer import SHADOW_LOOSENESS, one_shading, with_one_shadow
 from ..emitters.light_polygons import has_lobe
+from ..lobes.lookup_table import LookupTable
 from ..scene import Cancelled, Film, Light, SurfaceSamples
-from ..visibility import BLOCK_SAMPLES, Company, Occluders, Setting, open_tracer, task_of_lights
+from ..shading import shade
+from ..visibility import (
+    BLOCK_SAMPLES,
+    Occluders,
+    ShadowTask,
+    Starts,
+    Tracer,
+    open_tracer,
+    ray_origins,
+    task_of_lights,
+)
+from ..workers.pool import WorkerPool
 from .lighting import load_tables, rays_of_samples
 from .mixer import MixerRow, bounced_light
 from .relight import OCCLUDERS_SUFFIX, RELIGHT_SUFFIX, RelightData
@@ -28,6 +40,8 @@ from .relight import OCCLUDERS_SUFFIX, RELIGHT_SUFFIX, RelightData
 # BLOCKS: enough that all processes end at about the same time. FEWEST_OF_BLOCK: the overhead of smaller blocks exceeds
 # the cost of their samples.
 BLOCKS, FEWEST_OF_BLOCK = 16, 1 << 11
+# With fewer samples, starting a worker takes longer than its help saves.
+SAMPLES_WORTH_A_WORKER = 1 << 13
 # STEP: distance of the pixels of a draft. DRAFT_RAYS: the most rays of one of its samples.
 STEP, DRAFT_RAYS = 2, 32
 # MOST_LIKE: a similar sample is looked for among so many of a grid pixel. LEAST_WEIGHT: a sample is interpolated if the
@@ -97,32 +111,69 @@ def _coarse(film: Film) -> Film:
     return replace(film, width=width, height=height, pixel=y // STEP * width + x // STEP)
 
 
-def _blocks(samples: SurfaceSamples, starting: SurfaceSamples, film: Film, place: np.ndarray) -> Iterator[tuple]:
-    """Yield the indices of the `samples` of a block, and the block as `Setting` has it.
+@dataclass(frozen=True)
+class LitSamples:
+    """P samples to shade, and the Q samples from which their shadow rays start, in blocks."""
 
-    Shadow rays start from the samples `starting` (Q); `place` (P,) is the number of the one whose shares each of the
-    `samples` takes.
-    """
-    order = np.argsort(place, kind="stable")
-    size = min(BLOCK_SAMPLES, max(len(starting) // BLOCKS, FEWEST_OF_BLOCK))
-    for first in range(0, max(len(starting), 1), size):
-        begin, end = np.searchsorted(place[order], (first, first + size))
-        own, part = order[begin:end], slice(first, first + size)
-        yield own, (samples.take(own), starting.take(part), film.take(part), place[own] - first)
+    samples: SurfaceSamples  # (P)
+    shadowed: SurfaceSamples  # (Q)
+    film: Film  # (Q)
+    shadow: np.ndarray  # (P,) for each of `samples`, the number of the one of `shadowed` whose visibility it takes
+    ray_origins: Starts | None  # (Q)
+    blocks: list[tuple[np.ndarray | slice, slice]]  # of each block, the indices of `samples` and of `shadowed`
+
+    @classmethod
+    def of(cls, samples, shadowed, film, shadow, ray_origins) -> LitSamples:
+        """With blocks of about equal size."""
+        order = np.argsort(shadow, kind="stable")
+        size, blocks = min(BLOCK_SAMPLES, max(len(shadowed) // BLOCKS, FEWEST_OF_BLOCK)), []
+        for first in range(0, max(len(shadowed), 1), size):
+            begin, end = np.searchsorted(shadow[order], (first, first + size))
+            block = slice(first, min(first + size, len(shadowed)))
+            blocks.append((block if samples is shadowed else order[begin:end], block))
+        return cls(samples, shadowed, film, shadow, ray_origins, blocks)
+
+    def job(self, number: int) -> tuple:
+        """The block that `MovedLightTask.do` shades."""
+        (index, block), origins = self.blocks[number], self.ray_origins
+        visibility_job = self.shadowed.take(block), self.film.take(block), origins and origins.take(block)
+        return self.samples.take(index), self.shadow[index] - block.start, visibility_job
+
+
+@dataclass(frozen=True)
+class MovedLightTask:
+    """Shades blocks of samples under one light."""
+
+    light: Light
+    shadows: ShadowTask | None  # None: nothing stands in the way
+    table: LookupTable
+    passes: tuple[str, ...]
+
+    def do(self, job: tuple, tracer: Tracer | None) -> dict[str, np.ndarray]:
+        """The radiance (B, 3) by pass of a block."""
+        samples, shadow, visibility_job = job
+        visibility = dict.fromkeys(self.passes, np.float32(1.0))
+        if self.shadows is not None:
+            traced = self.shadows.do(visibility_job, tracer)
+            visibility = {name: getattr(traced, name)[0][shadow, None] for name in self.passes}
+        if not any(values.any() for values in visibility.values()):
+            return {name: np.zeros((len(samples), 3), np.float32) for name in self.passes}
+        lit = shade(samples, [self.light], self.table, passes=self.passes, workers=1)
+        return {name: visibility[name] * getattr(lit, name)[0] for name in self.passes}
 
 
 class MovedLights:
     """Pictures of single lights of a kept picture at new places, by rays of the light alone.
 
-    The first picture starts processes that hold the samples, so that later pictures take less; `close` ends them.
+    The first picture starts workers, so that later pictures take less; `close` ends them.
     Threads may share an object: a new request cancels the one in progress, which raises Cancelled.
     """
 
     def __init__(self, read: Callable[[], tuple[RelightData, Occluders | None]]):
         """`read` is called at the first picture; its exceptions are raised there."""
         self._read, self._kept, self._occluders = read, None, None
-        self._company, self._ending = None, ExitStack()
-        # Without `close`, the processes end with this object or with Python.
+        self._pool, self._ending = None, ExitStack()
+        # Without `close`, the workers end with this object or with Python.
         weakref.finalize(self, self._ending.close)
         self._lock, self._is_ready, self._turn = threading.Lock(), False, 0
 
@@ -156,11 +207,11 @@ class MovedLights:
         """The picture (H, W, 3) of one light, plus the unchanged bounced light of its `row`. Raises SceneError."""
         turn = self._next_turn()
         with self._lock:
-            light, task = self._prepared(light, turn)
-            values = self._nothing()
-            for _ in self._blocks_lit(light, task, self._whole, values, turn):
+            task = self._prepared(light, turn)
+            radiance = self._black(self._whole)
+            for _ in self._lit(task, self._whole, range(len(self._whole.blocks)), radiance, turn):
                 pass
-            return self._image(values, row)
+            return self._image(radiance, row)
 
     def pictures(self, light: Light, row: MixerRow | None = None) -> Iterator[tuple[np.ndarray, float]]:
         """Yield the result of `picture`, first as a draft and at last complete, and the fraction that is done."""
@@ -169,18 +220,19 @@ class MovedLights:
 
     def _pictures(self, light, row, turn):
         with self._lock:
-            light, task = self._prepared(light, turn)
-            values, quick = self._nothing(), task and replace(task, rays=min(task.rays, DRAFT_RAYS))
-            for _ in self._blocks_lit(light, quick, self._drafted, values, turn):
+            task, draft = self._prepared(light, turn), self._black(self._drafted)
+            quick, blocks = task, self._whole.blocks
+            if task.shadows is not None:
+                quick = replace(task, shadows=replace(task.shadows, rays=min(task.shadows.rays, DRAFT_RAYS)))
+            for _ in self._lit(quick, self._drafted, range(len(self._drafted.blocks)), draft, turn):
                 pass
-            for name, radiance in values.items():
-                values[name] = self._draft.all_samples(name, radiance[self._draft.index])
-            yield self._image(values, row), 0.0
-            light_of = {n: sum(values[name][self._own[n]].sum() for name in values) for n in self._whole}
-            shown, first = time.monotonic(), sorted(self._whole, key=light_of.__getitem__, reverse=True)
-            for done, _ in enumerate(self._blocks_lit(light, task, first, values, turn), 1):
-                if done == len(first) or time.monotonic() - shown > SECONDS:
-                    yield self._image(values, row), done / len(first)
+            radiance = {name: self._draft.all_samples(name, values) for name, values in draft.items()}
+            yield self._image(radiance, row), 0.0
+            light_of = [sum(values[index].sum() for values in radiance.values()) for index, _ in blocks]
+            shown, order = time.monotonic(), sorted(range(len(blocks)), key=light_of.__getitem__, reverse=True)
+            for done in self._lit(task, self._whole, order, radiance, turn):
+                if done == len(order) or time.monotonic() - shown > SECONDS:
+                    yield self._image(radiance, row), done / len(order)
                     shown = time.monotonic()
 
     def stop(self) -> None:
@@ -195,31 +247,35 @@ class MovedLights:
         if turn != self._turn:
             raise Cancelled("the light has moved again, or the picture was stopped")
 
-    def _prepared(self, light: Light, turn: int):
-        """The light relative to the origin of the samples, and its shadow task; None without occluders."""
+    def _prepared(self, light: Light, turn: int) -> MovedLightTask:
+        """The task for a light in world space."""
         self._check(turn)
-        if self._company is None:
+        if self._pool is None:
             self._start()
         kept = self._kept
         light = light.moved(-kept.extraction.origin)
         if self._tracer is None:
-            return light, None
+            return MovedLightTask(light, None, self._table, self._passes)
         rays = rays_of_samples(kept.options["shadow_rays"], kept.extraction.film)
-        task = task_of_lights(self._starting, (light,), self._tracer, kept.options["passes"], rays)
+        shadows = task_of_lights(self._whole.shadowed, (light,), self._tracer, self._passes, rays)
         # The light gets as many rays as it would get in a new picture, beside the other lights.
-        typical = {name: max(value, self._typical[name]) for name, value in task.typical.items()}
-        return light, replace(task, typical=typical)
+        typical = {name: max(value, self._typical[name]) for name, value in shadows.typical.items()}
+        return MovedLightTask(light, replace(shadows, typical=typical), self._table, self._passes)
 
-    def _nothing(self) -> dict[str, np.ndarray]:
-        return {name: np.zeros((self._count, 3), np.float32) for name in self._kept.options["passes"]}
+    def _black(self, lit: LitSamples) -> dict[str, np.ndarray]:
+        return {name: np.zeros((len(lit.samples), 3), np.float32) for name in self._passes}
 
-    def _blocks_lit(self, light, task, numbers: Sequence[int], values, turn: int) -> Iterator[None]:
-        """Put the radiance of the blocks `numbers` into `values`, (P, 3) by pass; yields after each block."""
-        for number, radiance in self._company.lit(light, task, numbers):
+    def _lit(self, task: MovedLightTask, lit: LitSamples, order: Sequence[int], radiance, turn: int) -> Iterator[int]:
+        """Put what the blocks of `lit` reflect into `radiance`, (P, 3) by pass; yields how many are done."""
+
+        def store(number, by_pass):
+            for name, values in by_pass.items():
+                radiance[name][lit.blocks[order[number]][0]] = values
+
+        is_worth = len(self._whole.samples) >= SAMPLES_WORTH_A_WORKER
+        for done in self._pool.run(task, len(order), lambda number: lit.job(order[number]), store, is_worth):
             self._check(turn)
-            for name, found in radiance.items():
-                values[name][self._own[number]] = found
-            yield
+            yield done
 
     def _image(self, values, row: MixerRow | None) -> np.ndarray:
         kept = self._kept
@@ -234,7 +290,7 @@ class MovedLights:
         """End the processes; the next picture starts new ones."""
         self.stop()
         with self._lock:
-            self._company, self._is_ready = None, False
+            self._pool, self._is_ready = None, False
             self._ending.close()
 
     def _start(self) -> None:
@@ -245,30 +301,26 @@ class MovedLights:
         kept, film = self._kept, self._kept.extraction.film
         samples = kept.extraction.samples
         samples = replace(samples, position=samples.position - kept.extraction.origin)
-        starting, place = samples, np.arange(len(samples))
+        shadowed, shadow = samples, np.arange(len(samples))
         # Rays use the film only to know which samples are neighbors.
         film = film.unspread()
         self._draft = draft = Draft.of(samples, film)
         if film.count is not None:
-            starting, film, place = with_one_shadow(samples, film)
-        self._starting, self._count = starting, len(samples)
-        parts, place_of_draft = np.unique(place[draft.index], return_inverse=True)
-        quick = samples.take(draft.index), starting.take(parts), _coarse(film.take(parts)), place_of_draft
-        drafted = [(draft.index[own], block) for own, block in _blocks(*quick)]
-        whole = list(_blocks(samples, starting, film, place))
-        self._drafted, self._whole = range(len(drafted)), range(len(drafted), len(drafted) + len(whole))
-        self._own = [own for own, _ in (*drafted, *whole)]
-        blocks = dict(enumerate(block for _, block in (*drafted, *whole)))
-        (table,) = load_tables((kept.technique,)).values()
-        passes, lights = (
-            tuple(kept.options["passes"]),
-            [one.moved(-kept.extraction.origin) for one in kept.extraction.lights],
-        )
+            shadowed, film, shadow = with_one_shadow(samples, film)
+        self._passes = tuple(kept.options["passes"])
+        (self._table,) = load_tables((kept.technique,)).values()
         with ExitStack() as stack:
-            self._tracer = None
+            self._tracer = origins = None
             if self._occluders is not None:
                 self._tracer = stack.enter_context(open_tracer(self._occluders, embree_libraries()))
-                self._typical = task_of_lights(starting, lights, self._tracer, passes, DRAFT_RAYS).typical
-            self._company = Company(Setting(blocks, table, passes), self._tracer)
-            stack.callback(self._company.close)
+            pool = stack.enter_context(WorkerPool(self._tracer))
+            if self._tracer is not None:
+                lights = [light.moved(-kept.extraction.origin) for light in kept.extraction.lights]
+                self._typical = task_of_lights(shadowed, lights, self._tracer, self._passes, DRAFT_RAYS).typical
+                origins = ray_origins(shadowed, pool)
+            self._whole = LitSamples.of(samples, shadowed, film, shadow, origins)
+            index, shadow = np.unique(shadow[draft.index], return_inverse=True)
+            quick = samples.take(draft.index), shadowed.take(index), _coarse(film.take(index))
+            self._drafted = LitSamples.of(*quick, shadow, origins and origins.take(index))
+            self._pool = pool
             self._ending.callback(stack.pop_all().close)

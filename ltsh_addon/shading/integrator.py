@@ -6,7 +6,7 @@ A `Task` shades each block. It is the same in this process and in worker process
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
@@ -19,7 +19,7 @@ from ..lobes import moments32
 from ..lobes.lobe_integrals import FLOAT64_CHUNK
 from ..lobes.lookup_table import LookupTable, load_table
 from ..scene import PASSES, REFERENCE, Cancelled, Light, SurfaceSamples
-from ..workers import pool
+from ..workers.pool import WorkerPool
 from . import float32, float64
 
 # Least and greatest number of samples of a block, one or two chunks. One process takes a block at a time, and calls of
@@ -30,6 +30,21 @@ REFERENCE_BLOCK_LIMITS = (256, 2048)
 # from long ones. _SINGLE_COST: in single precision for degree 0. _COST_PER_DEGREE: what each degree adds to that.
 _SINGLE_COST, _COST_PER_DEGREE = (20.0, 15.0), (10.0, 7.0)
 _DOUBLE_COST, _REFERENCE_COST = (100.0, 120.0), (20_000.0, 1000.0)
+# A worker takes about 0.2 s to start, so shorter tasks are done in this process alone.
+SECONDS_WORTH_A_WORKER = 0.5
+# An anisotropic sample takes about as long as this many isotropic ones.
+ANISOTROPIC_COST = 6
+# Fields of SurfaceSamples that only one pass reads.
+_FIELDS_OF_ONE_PASS = {
+    "diffuse": (
+        "diffuse_normal", "smooth_normal", "bump_alpha2", "diffuse_albedo", "diffuse_roughness", "diffuse_rebound",
+        "sheen_a", "sheen_b",
+    ),
+    "specular": (
+        "normal", "geometric_normal", "roughness", "specular_f0", "specular_f90", "specular_dip", "dielectric", "ior",
+        "anisotropy", "tangent",
+    ),
+}  # fmt: skip
 # Up to so many lights, each has a row of the result unless the caller says otherwise.
 MOST_SINGLE_ROWS = 64
 # Estimate of the most patches of a light that a sample takes.
@@ -74,19 +89,27 @@ class Task:
         corners = sum(_corners_integrated(light, self.is_reference) for light in self.lights)
         return 1e-9 * count * len(self.passes) * (per_light * len(self.lights) + per_corner * corners)
 
-    def shade(self, samples: SurfaceSamples, scratch) -> tuple[dict[str, np.ndarray], np.ndarray | None, dict]:
+    def do(self, job: SurfaceSamples | tuple[SurfaceSamples, str, np.ndarray], context=None):
+        """What `shade` returns for a block of samples, or `shade_pairs` for its arguments."""
+        return self.shade_pairs(*job) if isinstance(job, tuple) else self.shade(job)
+
+    @cached_property
+    def _scratch(self) -> moments32.Scratch:
+        return moments32.Scratch()
+
+    def shade(self, samples: SurfaceSamples) -> tuple[dict[str, np.ndarray], np.ndarray | None, dict]:
         """Radiance (R, B, 3) by pass of a block of B samples; the error (B,) of the reference, else None; and, by pass,
         a list of what is left to `shade_pairs`: samples (N,) and numbers (N,) of lights."""
         radiance = {name: np.zeros((self.row_count, len(samples), 3), self.dtype) for name in self.passes}
         error = np.zeros(len(samples)) if self.has_error else None
         leftovers: dict[str, list] = {name: [] for name in self.passes}
-        self._add(samples, self._plain, radiance, error, scratch, leftovers)
+        self._add(samples, self._plain, radiance, error, leftovers)
         if self._with_patches is not None:
-            self._add(samples, self._with_patches, radiance, error, scratch, {})
+            self._add(samples, self._with_patches, radiance, error, {})
         for light, row in self._rows_of_lights:
             if light.children and not float64.has_patches(light):
                 for name in self.passes:
-                    self._add_detailed(samples, light, name, radiance[name][row : row + 1], error, scratch)
+                    self._add_detailed(samples, light, name, radiance[name][row : row + 1], error)
         return radiance, error, leftovers
 
     @property
@@ -129,20 +152,21 @@ class Task:
         # If all lights affect both passes, these share their trees.
         return found if len({len(own) for own in found.values()}) > 1 else dict.fromkeys(found, found[self.passes[0]])
 
-    def _add_detailed(self, samples, light, name, radiance, error, scratch) -> None:
+    def _add_detailed(self, samples, light, name, radiance, error) -> None:
         """Add the light of a light with a `detail` to its row (1, B, 3) of one pass."""
         for index, patches in fitting_patches(light, samples, name == "specular"):
             own = {name: np.zeros((1, len(index), 3), self.dtype)}
             own_error = None if error is None else np.zeros(len(index))
             prepared = float32.Lights(_prepared((patch, 0) for patch in patches))
-            self._add(samples.take(index), {name: prepared}, own, own_error, scratch, {})
+            self._add(samples.take(index), {name: prepared}, own, own_error, {})
             radiance[:, index] += own[name]
             if error is not None:
                 error[index] += own_error
 
-    def _add(self, samples, prepared, radiance, error, scratch, leftovers) -> None:
+    def _add(self, samples, prepared, radiance, error, leftovers) -> None:
         """Add the light of the `prepared` lights by pass to `radiance`, except for pairs put into `leftovers`."""
         if self.single:
+            scratch = self._scratch
             if "diffuse" in radiance:
                 left = leftovers.get("diffuse")
                 float32.shade_diffuse(samples, prepared["diffuse"], radiance["diffuse"], scratch, left)
@@ -170,7 +194,7 @@ def _corners_integrated(light, is_reference):
     """Estimated number of corners in the integrals over a light."""
     count = len(light.polygon()) * min(len(light.leaves), PATCHES)
     if light.has_profile:
-        effort = light_profile.EFFORTS[1]
+        effort = light_profile.DISK_LAYERS[1]
         count *= (2 * effort.chords + 1) * (1 if is_reference else effort.layers)
     return count
 
@@ -238,18 +262,27 @@ def shade(
     False to stop: Cancelled is raised. Also raises TableError and ValueError.
 
     With `dtype` float32, radiance is float32 and within 2e-5 of that with float64, per unit of the lights' radiance;
-    for lights with a spread, of their radiance straight ahead. Spreads are accurate to 0.3 % (see `light_cone`). Points
-    for which single precision does not suffice are computed in double. So are lights a thousand times as long as wide,
-    whose error in single precision is 4e-4 of their light, and always "reference" and degrees above 4.
+    for lights with a spread, of their radiance straight ahead. Spreads are accurate to 0.3 % (see `light_profile`).
+    Points for which single precision does not suffice are computed in double. So are lights a thousand times as long as
+    wide, whose error in single precision is 4e-4 of their light, and always "reference" and degrees above 4.
     """
     if is_own(technique):
         return _shade_with(technique, samples, tuple(lights), tuple(passes), (workers, progress, dtype, rows))
     task = _task(tuple(lights), technique, passes, dtype, rows)
     task.prepare()
-    count = len(samples)
-    result = _Result(task, count, np.dtype(dtype))
-    blocks = _blocks(count, *(REFERENCE_BLOCK_LIMITS if task.is_reference else BLOCK_LIMITS))
-    pool.run(task, samples, blocks, workers, result, progress)
+    blocks = _blocks(len(samples), *(REFERENCE_BLOCK_LIMITS if task.is_reference else BLOCK_LIMITS))
+    result = _Result(task, blocks, len(samples), np.dtype(dtype))
+    seconds = task.seconds(len(samples) + ANISOTROPIC_COST * np.count_nonzero(samples.anisotropy))
+    read = _fields_read(samples, task)
+    with WorkerPool(processes=workers) as pool:
+        is_worth = seconds >= SECONDS_WORTH_A_WORKER
+        for done in pool.run(task, len(blocks), lambda number: read.take(blocks[number]), result.store, is_worth):
+            if progress is not None and progress(done / len(blocks)) is False:
+                raise Cancelled("shading was stopped")
+        pairs = result.pairs()
+        for _ in pool.run(task, len(pairs), lambda number: pairs[number].job(read), result.store_pairs, False):
+            if progress is not None and progress(1.0) is False:
+                raise Cancelled("shading was stopped")
     return Shading(result.radiance.get("specular"), result.radiance.get("diffuse"), result.error)
 
 
@@ -289,39 +322,64 @@ def _own_pass(technique, found, name, count) -> np.ndarray | None:
     return values
 
 
-class _Result:
-    """Collects blocks, and what they leave for the end."""
+def _fields_read(samples: SurfaceSamples, task: Task) -> SurfaceSamples:
+    """The samples with zeros, which are not sent to workers, in the fields that the task does not read."""
+    unread = {field for name in set(PASSES) - set(task.passes) for field in _FIELDS_OF_ONE_PASS[name]}
+    if all(light.receivers is None for light in task.lights):
+        unread.add("receiver")
+    return replace(samples, **{name: np.broadcast_to(0, getattr(samples, name).shape) for name in unread})
 
-    def __init__(self, task: Task, count: int, dtype: np.dtype):
-        self._task = task
+
+@dataclass(frozen=True)
+class LightSamplePairs:
+    """Samples, each to be shaded under one light in one pass; fewer than two FLOAT64_CHUNK of them."""
+
+    name: str  # of the pass
+    index: np.ndarray  # (N,) of the samples; some occur several times
+    number: np.ndarray  # (N,) of the lights
+
+    def job(self, samples: SurfaceSamples) -> tuple[SurfaceSamples, str, np.ndarray]:
+        """The arguments of `Task.shade_pairs`."""
+        return samples.take(self.index), self.name, self.number
+
+
+class _Result:
+    """Collects what `blocks` reflect, and the pairs that they leave for the end."""
+
+    def __init__(self, task: Task, blocks: list[slice], count: int, dtype: np.dtype):
+        self._task, self._blocks = task, blocks
         self.radiance = {name: np.zeros((task.row_count, count, 3), dtype) for name in task.passes}
         self.error = np.zeros(count) if task.has_error else None
-        self._leftovers: dict[int, dict] = {}  # by start of the block
+        self._leftovers: list[dict[str, list]] = [{} for _ in blocks]
+        self._pairs: list[LightSamplePairs] = []
 
-    def keep(self, block: slice, radiance, error, leftovers) -> None:
-        """Keep what `Task.shade` returned."""
+    def store(self, number: int, shaded: tuple) -> None:
+        """Store what `Task.shade` returned for a block."""
+        (radiance, error, leftovers), block = shaded, self._blocks[number]
         for name, values in radiance.items():
             self.radiance[name][:, block] = values
         if self.error is not None:
             self.error[block] = error
-        self._leftovers[block.start] = leftovers
+        self._leftovers[number] = {
+            name: [(members + block.start, light.copy()) for members, light in pairs]
+            for name, pairs in leftovers.items()
+        }
 
-    def pairs(self) -> list[pool.Pairs]:
+    def pairs(self) -> list[LightSamplePairs]:
         """What all blocks left, in batches. Neither the batches nor their order depend on which block was done first.
         Each batch contains whole blocks."""
-        found = []
         for name in self._task.passes:
             batch: list[tuple] = []
-            for start, leftovers in sorted(self._leftovers.items()):
-                if sum(len(members) for members, _ in batch) >= FLOAT64_CHUNK:
-                    found.append((name, batch))
+            for leftovers in [*self._leftovers, None]:
+                if batch and (leftovers is None or sum(len(members) for members, _ in batch) >= FLOAT64_CHUNK):
+                    self._pairs.append(LightSamplePairs(name, *map(np.concatenate, zip(*batch, strict=True))))
                     batch = []
-                batch += [(members + start, number) for members, number in leftovers[name]]
-            found.append((name, batch))
-        return [pool.Pairs(name, *map(np.concatenate, zip(*batch, strict=True))) for name, batch in found if batch]
+                batch += [] if leftovers is None else leftovers[name]
+        return self._pairs
 
-    def keep_pairs(self, pairs: pool.Pairs, radiance: np.ndarray) -> None:
+    def store_pairs(self, number: int, radiance: np.ndarray) -> None:
         """Add what `Task.shade_pairs` returned."""
+        pairs = self._pairs[number]
         row = np.array([row for _, row in self._task.lights_of_pairs(pairs.name)])
         # A sample may occur with several lights.
         np.add.at(self.radiance[pairs.name], (row[pairs.number], pairs.index), radiance)

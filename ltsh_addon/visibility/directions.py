@@ -444,7 +444,7 @@ class Cluster:
     def _build(self, corners, normal, power):
         """Set the arrays of the nodes, with the root first."""
         low, high = corners.min(axis=1), corners.max(axis=1)
-        order, start, end, self.children = light_tree.ranges(0.5 * (low + high), normal)
+        order, start, end, self.children = light_tree.node_ranges(0.5 * (low + high), normal)
         alone = end - start == 1
         own = order[start]
         self.leaf = np.where(alone, own, -1)
@@ -459,7 +459,7 @@ class Cluster:
         self.center = np.ascontiguousarray(0.5 * (low + high).T, dtype=np.float32)
         self.radius = (0.5 * np.linalg.norm(high - low, axis=1)).astype(np.float32)
         self.axis = np.ascontiguousarray(axis.T, dtype=np.float32)
-        self.cone = light_tree.cones(axis, normal[order], start, end).astype(np.float32)
+        self.cone = light_tree.normal_spreads(axis, normal[order], start, end).astype(np.float32)
         self.power = (sums / sums[0]).astype(np.float32)
 
     def pick(self, x: np.ndarray, lobes: Sequence[ClusterLobe], own: np.ndarray):

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,8 +23,8 @@ from ..emitters.facing import FacingDisk, emission, ray_length
 from ..emitters.light_polygons import LEAST_COSINE, LOBE_WIDTH, has_lobe, may_reach, off_plane
 from ..lobes.brdf import dielectric_reflectance, schlick_curve, stretch
 from ..lobes.diffuse import diffuse_factor
-from ..scene import FARTHEST, PASSES, Film, Light, PolygonLight, Progress, SurfaceSamples, round_outline
-from . import crew
+from ..scene import FARTHEST, PASSES, Cancelled, Film, Light, PolygonLight, Progress, SurfaceSamples, round_outline
+from ..workers.pool import WorkerPool
 from .directions import (
     Choices,
     Cluster,
@@ -47,8 +48,9 @@ MOST_RAYS = 1024
 BLOCK_RAYS = 1 << 15
 # Samples that one process takes at a time.
 BLOCK_SAMPLES = 1 << 14
-# Processor seconds for the probes of all pairs from which on a helping process is worth its start.
-SECONDS_WORTH_A_CHILD = 1.0
+# Processor seconds for the probes of all pairs, and number of samples whose rays' origins are looked for, from which on
+# workers are worth their start.
+SECONDS_WORTH_A_WORKER, SAMPLES_WORTH_A_WORKER = 1.0, 1 << 17
 # How many of PROBES rays are spread evenly over the light; the specular lobe chooses the others. Rows: pairs with both
 # lobes, with a diffuse lobe only, with a specular lobe only. Columns: both lobes count alike (always so for the
 # probes), the specular lobe counts more, the diffuse lobe counts more.
@@ -140,13 +142,15 @@ def visible_shares(
     tracer,
     sampling: ShadowSampling = ShadowSampling(),
     *,
-    workers: int | crew.Mate | None = None,
+    workers: int | WorkerPool | None = None,
+    starts: Starts | None = None,
     progress: Progress | None = None,
 ) -> Visibility:
     """The shares of `lights` that P samples see. `tracer` comes from `visibility.open_tracer`.
 
-    `workers` is a number of processes (None: all cores) or a Mate of the tracer; the result is the same bit for bit.
-    If there are few samples, this process does them alone. `progress` may return False to stop: Cancelled is raised.
+    `workers` is a number of processes (None: all cores) or a WorkerPool of the tracer; the result is the same bit for
+    bit. If there are few samples, this process does them alone. `starts` are the `ray_origins` of the samples if they
+    are known. `progress` may return False to stop: Cancelled is raised.
     """
     (emitters, numbers), passes = emitters_of(lights, tracer), tuple(sampling.passes)
     film = None if sampling.film is None else sampling.film.unspread()
@@ -159,22 +163,53 @@ def visible_shares(
     shape = len(emitters), len(samples)
     shares = {name: np.ones(shape, np.float32) for name in passes}
     radiance, deviation = ({name: np.zeros(shape[1], np.float32) for name in passes} for _ in range(2))
-    mixed, traced = np.zeros(shape, bool), 0
-    blocks = [slice(start, min(start + BLOCK_SAMPLES, shape[1])) for start in range(0, shape[1], BLOCK_SAMPLES)]
-    parts = (tuple(None if one is None else one.take(block) for one in (samples, film)) for block in blocks)
-    is_worth = seconds > SECONDS_WORTH_A_CHILD
-    if isinstance(workers, crew.Mate):
-        found_parts = workers.run(task, list(parts), is_worth, progress)
-    else:
-        found_parts = crew.run(task, tracer, list(parts), workers if is_worth else 1, progress)
-    for number, found in found_parts:
+    blocks, mixed = _blocks(shape[1]), np.zeros(shape, bool)
+    traced = np.zeros(len(blocks), np.int64)
+
+    def job(number):
+        return tuple(None if one is None else one.take(blocks[number]) for one in (samples, film, starts))
+
+    def store(number, found):
         block = blocks[number]
         for name in passes:
             shares[name][:, block] = getattr(found, name)
             radiance[name][block], deviation[name][block] = found.radiance[name], found.deviation[name]
-        mixed[:, block] = found.mixed
-        traced += found.rays
-    return Visibility(shares.get("specular"), shares.get("diffuse"), radiance, deviation, traced, mixed, numbers)
+        mixed[:, block], traced[number] = found.mixed, found.rays
+
+    with ExitStack() as stack:
+        pool = workers if isinstance(workers, WorkerPool) else stack.enter_context(WorkerPool(tracer, workers))
+        for done in pool.run(task, len(blocks), job, store, seconds > SECONDS_WORTH_A_WORKER):
+            if progress is not None and progress("shadows", done / len(blocks)) is False:
+                raise Cancelled("shadows were stopped")
+    result = Visibility(shares.get("specular"), shares.get("diffuse"), radiance, deviation, int(traced.sum()), mixed)
+    return replace(result, numbers=numbers)
+
+
+def ray_origins(samples: SurfaceSamples, pool: WorkerPool) -> Starts:
+    """Where rays from P samples start, found by the processes of `pool`, whose context is a tracer."""
+    blocks, starts = _blocks(len(samples)), Starts.empty(len(samples))
+    for _ in pool.run(
+        OriginTask(),
+        len(blocks),
+        lambda number: samples.take(blocks[number]),
+        lambda number, found: starts.put(blocks[number], found),
+        len(samples) >= SAMPLES_WORTH_A_WORKER,
+    ):
+        pass
+    return starts
+
+
+def _blocks(count: int) -> list[slice]:
+    return [slice(start, min(start + BLOCK_SAMPLES, count)) for start in range(0, count, BLOCK_SAMPLES)]
+
+
+@dataclass(frozen=True)
+class OriginTask:
+    """The task of `ray_origins`."""
+
+    def do(self, samples: SurfaceSamples, tracer) -> Starts:
+        """Where rays from the samples of a block start."""
+        return tracer.starts(samples)
 
 
 @dataclass(frozen=True)
@@ -186,6 +221,11 @@ class ShadowTask:
     rays: int
     typical: dict[str, float]
     is_baked: bool
+
+    def do(self, job: tuple[SurfaceSamples, Film | None, Starts | None], tracer) -> Visibility:
+        """The shares of a block of samples; without what its rays start from, that is found too."""
+        samples, film, starts = job
+        return self.shares(samples, film, tracer, starts)
 
     def shares(self, samples: SurfaceSamples, film: Film | None, tracer, starts: Starts | None = None) -> Visibility:
         """The shares of a block, found in this thread. `starts` is `tracer.starts(samples)` if it is known already."""

@@ -310,6 +310,10 @@ class Tracer:
         self._caster, self._lock = caster, threading.Lock()
         self._finder = StartFinder(occluders, caster)
 
+    def __reduce__(self):
+        # A worker process opens a tracer of its own.
+        return open_tracer, (self.occluders, (self.library,))
+
     def __enter__(self) -> Tracer:
         return self
 

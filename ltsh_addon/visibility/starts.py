@@ -126,6 +126,18 @@ class Starts:
     lift: np.ndarray  # (2, P, 3) m, to where a smooth surface would be: for light from outside, and from inside
     terminator: np.ndarray  # (P,) as Occluders.terminators; 0 on flat triangles
 
+    @classmethod
+    def empty(cls, count: int) -> Starts:
+        """Room for those of `count` samples, see `put`."""
+        vectors, numbers = np.zeros((5, count, 3), np.float32), np.zeros((2, count), np.float32)
+        return cls(*vectors[:3], numbers[0], vectors[3:], numbers[1])
+
+    def put(self, block: slice, values: Starts) -> None:
+        """Set those of the samples of a block."""
+        for field in fields(self):
+            rows = getattr(self, field.name)
+            (rows[:, block] if field.name == "lift" else rows[block])[:] = getattr(values, field.name)
+
     def take(self, index) -> Starts:
         """The starts of the samples at `index`: integers (Q,) or a slice."""
         own = {field.name: getattr(self, field.name) for field in fields(self)}

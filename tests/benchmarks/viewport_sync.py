@@ -150,12 +150,11 @@ def measure_shadows(scene) -> tuple[float, float, float]:
 
 def _processor(live) -> float:
     """Processor seconds of this process and of the one that traces with it (Linux)."""
-    mate = live._traced_scene.tracing.mate
-    child = None if mate is None else mate._child
-    if child is None:
-        return time.process_time()
-    fields = Path(f"/proc/{child._process.pid}/stat").read_text().rpartition(")")[2].split()
-    return time.process_time() + (int(fields[11]) + int(fields[12])) / 100.0
+    seconds, pool = time.process_time(), live._traced_scene.tracing.pool
+    for worker in [] if pool is None else pool._workers:
+        fields = Path(f"/proc/{worker._process.pid}/stat").read_text().rpartition(")")[2].split()
+        seconds += (int(fields[11]) + int(fields[12])) / 100.0
+    return seconds
 
 
 def _memory() -> float:

@@ -12,7 +12,6 @@ from ltsh_addon.emitters import light_tree
 from ltsh_addon.emitters.light_tree import LightTree
 from ltsh_addon.scene import EllipseLight, PolygonLight, QuadLight
 from ltsh_addon.shading import float32, integrator
-from ltsh_addon.workers import pool
 
 # What the lights of a tree may be off together; degree 4 is itself off by ten times as much.
 OFF = 3e-3
@@ -238,7 +237,7 @@ def test_rows_receivers_and_black_lights_are_kept_apart():
 
 
 def test_workers_do_not_change_one_bit(started, children_only, monkeypatch):
-    monkeypatch.setattr(pool, "SECONDS_WORTH_A_CHILD", 0.0)
+    monkeypatch.setattr(integrator, "SECONDS_WORTH_A_WORKER", 0.0)
     monkeypatch.setattr(integrator, "BLOCK_LIMITS", (100, 100))
     samples, lights = floor_samples(300, 0.02), many_lights(80)
     one, two = (shading.shade(samples, lights, "ltsh4", workers=count) for count in (1, 2))

@@ -25,7 +25,6 @@ from ltsh_addon.pipeline.mixer import (
 from ltsh_addon.pipeline.moved_lights import Draft, MovedLights
 from ltsh_addon.pipeline.relight import RelightData, write_relight_data
 from ltsh_addon.scene import Cancelled, Film, SurfaceSamples
-from ltsh_addon.visibility import crew
 from ltsh_addon.workers import pool
 
 # float32 sums of three lights in another order, and what EXR files hold of them.
@@ -238,7 +237,7 @@ def test_processes_that_stay_shade_moved_lights_alike_also_when_one_is_gone(caps
     shade(capsys, monkeypatch, room, out, wall=wall(0.7, left=0.0))
     monkeypatch.setattr(moved_lights, "BLOCK_SAMPLES", 7)
     alone = MovedLights.load(out / "shade.samples.npz")
-    monkeypatch.setattr(crew, "SAMPLES_WORTH_A_CHILD", 0)
+    monkeypatch.setattr(moved_lights, "SAMPLES_WORTH_A_WORKER", 0)
     monkeypatch.setattr(pool, "cores", lambda: 3)
     light = kept_in(out).extraction.lights[0]
     lights = [light.moved(np.array([0.1 * step, 0.0, 0.0])) for step in range(3)]
@@ -246,7 +245,7 @@ def test_processes_that_stay_shade_moved_lights_alike_also_when_one_is_gone(caps
     together = MovedLights.load(out / "shade.samples.npz")
     try:
         np.testing.assert_array_equal(together.picture(lights[0]), expected[0])
-        children = together._company._children
+        children = list(together._pool._workers)
         assert len(children) == 2 and all(child._process.poll() is None for child in children)
         children[1]._process.kill()
         np.testing.assert_array_equal(together.picture(lights[1]), expected[1])
@@ -256,8 +255,8 @@ def test_processes_that_stay_shade_moved_lights_alike_also_when_one_is_gone(caps
     # Made ready in a thread, while the light still moves.
     together.get_ready(light)
     np.testing.assert_array_equal(together.picture(lights[2]), expected[2])
-    (child, _), company = together._company._children, together._company
-    del together, company
+    (child, _), stays = together._pool._workers, together._pool
+    del together, stays
     gc.collect()
     assert child._process.poll() is not None
     with pytest.raises(OSError, match="nothing"):

@@ -154,7 +154,7 @@ def test_only_a_python_runs_children(path, found, monkeypatch):
 
 
 def test_few_samples_stay_in_this_process(monkeypatch, started):
-    monkeypatch.setattr(pool, "SECONDS_WORTH_A_CHILD", 0.5)
+    monkeypatch.setattr(integrator, "SECONDS_WORTH_A_WORKER", 0.5)
     shading.shade(random_samples(1000), four_lights(), "ltsh4", workers=8)
     assert not started
 
@@ -166,7 +166,7 @@ from surface_scenes import area_light, four_lights, random_samples
 from ltsh_addon import shading
 from ltsh_addon.shading import integrator
 from ltsh_addon.workers import pool
-pool.SECONDS_WORTH_A_CHILD = 0.0
+integrator.SECONDS_WORTH_A_WORKER = 0.0
 integrator.REFERENCE_BLOCK_LIMITS = (8, 8)
 original = pool.subprocess.Popen
 def popen(*arguments, **options):
@@ -205,15 +205,15 @@ shading, scene, pool, integrator = (
     importlib.import_module(package + name) for name in ("shading", "scene", "workers.pool", "shading.integrator")
 )
 import numpy as np
-pool.SECONDS_WORTH_A_CHILD = 0.0
+integrator.SECONDS_WORTH_A_WORKER = 0.0
 integrator.BLOCK_LIMITS = (8, 8)
 by_children = []
-done = pool._Queue.done
+finish = pool._Run.finish
 def counted(self, *arguments):
     import threading
     by_children.append(threading.current_thread() is not threading.main_thread())
-    done(self, *arguments)
-pool._Queue.done = counted
+    finish(self, *arguments)
+pool._Run.finish = counted
 up, white = np.tile([0.0, 0.0, 1.0], (64, 1)), np.ones((64, 3))
 position = np.random.default_rng(1).uniform(-1.0, 1.0, (64, 3)) * [1.0, 1.0, 0.0]
 samples = scene.SurfaceSamples(position, up, up, up, np.full(64, 0.4), white, white, np.zeros(64), np.ones(64), white)
@@ -226,27 +226,18 @@ def leave_some(fraction):
 one = shading.shade(samples, [light], "ltsh4", workers=1).combined
 by_children.clear()
 two = shading.shade(samples, [light], "ltsh4", workers=2, progress=leave_some).combined
-visibility, ratio, crew, processes = (importlib.import_module(package + name) for name in (
-    "visibility", "visibility.ratio", "visibility.crew", "blender.process.blender_process"))
+visibility, ratio, processes = (importlib.import_module(package + name) for name in (
+    "visibility", "visibility.ratio", "blender.process.blender_process"))
 mesh = visibility.OccluderMesh(np.array([(0, -9, 1), (9, -9, 1), (9, 9, 1)]), np.array([(0, 1, 2)]))
 occluders = visibility.Occluders((mesh,), np.zeros(1, int), np.eye(4)[None, :3])
-ratio.SECONDS_WORTH_A_CHILD, ratio.BLOCK_SAMPLES, traced = -1.0, 8, []
-queued = crew._Queue.done
-def counted(self, *arguments):
-    import threading
-    traced.append(threading.current_thread() is not threading.main_thread())
-    queued(self, *arguments)
-crew._Queue.done = counted
-limit = time.monotonic() + 60.0
-def leave_some(stage, fraction):
-    while not any(traced) and time.monotonic() < limit:
-        time.sleep(0.01)
+ratio.SECONDS_WORTH_A_WORKER, ratio.BLOCK_SAMPLES, shaded_by_children = -1.0, 8, any(by_children)
 with visibility.open_tracer(occluders, processes.embree_libraries()) as tracer:
     single = ratio.visible_shares(samples, [light], tracer, workers=1).diffuse
-    traced.clear()
-    double = ratio.visible_shares(samples, [light], tracer, workers=2, progress=leave_some).diffuse
+    by_children.clear()
+    leave = lambda stage, fraction: leave_some(fraction)
+    double = ratio.visible_shares(samples, [light], tracer, workers=2, progress=leave).diffuse
 same = np.array_equal(one, two) and np.array_equal(single, double)
-print(same, any(by_children) and any(traced), "ltsh_addon" in sys.modules)
+print(same, shaded_by_children and any(by_children), "ltsh_addon" in sys.modules)
 """
 
 

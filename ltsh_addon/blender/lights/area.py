@@ -153,26 +153,26 @@ def overlapping_pairs(lights: list[Light]) -> list[tuple[Light, Light, float]]:
     )
     reach = np.sqrt((half_u**2 + half_v**2).sum(axis=1))
     rounding = 4.0 * np.spacing((np.abs(center).max(axis=1) + reach).astype(np.float32))
-    found = []
+    pairs = []
     for start in range(0, len(lights), CHUNK):
-        part = slice(start, start + CHUNK)
+        chunk = slice(start, start + CHUNK)
         # Lights before `start` have already been compared with these.
-        end = np.searchsorted(center[:, axis], center[part, axis].max() + reach[part].max() + reach.max(), "right")
+        end = np.searchsorted(center[:, axis], center[chunk, axis].max() + reach[chunk].max() + reach.max(), "right")
         other = slice(start, end)
-        offset = center[None, other] - center[part, None]
-        near = (offset**2).sum(axis=-1) < (reach[part, None] + reach[other]) ** 2
-        near &= np.abs((offset * direction[part, None]).sum(axis=-1)) <= np.maximum(
-            rounding[part, None], rounding[other]
+        offset = center[None, other] - center[chunk, None]
+        near = (offset**2).sum(axis=-1) < (reach[chunk, None] + reach[other]) ** 2
+        near &= np.abs((offset * direction[chunk, None]).sum(axis=-1)) <= np.maximum(
+            rounding[chunk, None], rounding[other]
         )
-        near &= direction[part] @ direction[other].T > 1.0 - 1e-6
+        near &= direction[chunk] @ direction[other].T > 1.0 - 1e-6
         for first, second in zip(*np.nonzero(np.triu(near, 1)), strict=True):
-            pair = lights[start + first], lights[start + second]
-            share = 0.0 if _never_meet(*pair) else _overlap(*pair)
+            lights_of_pair = lights[start + first], lights[start + second]
+            share = 0.0 if _never_meet(*lights_of_pair) else _overlap(*lights_of_pair)
             if share > 0.0:
-                found.append((*pair, share))
-            if len(found) == MOST_PAIRS:
-                return found
-    return found
+                pairs.append((*lights_of_pair, share))
+            if len(pairs) == MOST_PAIRS:
+                return pairs
+    return pairs
 
 
 def _never_meet(first: Light, second: Light) -> bool:

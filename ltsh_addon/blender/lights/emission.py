@@ -93,22 +93,22 @@ class Emission:
 
 def emission_of(data) -> Emission:
     """What the nodes of a material or light emit."""
-    found, seen, surface = Emission(), set(), surface_of(data)
+    emission, visited, surface = Emission(), set(), surface_of(data)
     leaves = [] if surface is None else shaders_behind(surface).leaves
-    found.plain = len(leaves) == 1 and leaves[0].terms == ((),) and _is_neutral(leaves[0].node)
+    emission.plain = len(leaves) == 1 and leaves[0].terms == ((),) and _is_neutral(leaves[0].node)
     for leaf in leaves:
         if not emits(leaf.node):
             continue
-        found.emits = True
+        emission.emits = True
         alpha = (leaf.node.inputs["Alpha"],) if "Alpha" in leaf.node.inputs else ()
         for value in (*emission_sockets(leaf.node), *alpha):
-            _note_value(source_of(value, leaf.groups), found, seen)
+            _note_value(source_of(value, leaf.groups), emission, visited)
         for factor in {factor for term in leaf.terms for factor in term}:
-            _note_value(factor.source, found, seen)
+            _note_value(factor.source, emission, visited)
     falloffs = {_falloff_of(leaf) for leaf in leaves if emits(leaf.node)}
     if falloffs:
-        found.falloff = falloffs.pop() if len(falloffs) == 1 else None
-    return found
+        emission.falloff = falloffs.pop() if len(falloffs) == 1 else None
+    return emission
 
 
 def _falloff_of(leaf) -> Falloff | None:
@@ -118,8 +118,8 @@ def _falloff_of(leaf) -> Falloff | None:
         others.append(source_of(leaf.node.inputs["Alpha"], leaf.groups))
     if any(_has_falloff(source) for source in others):
         return None
-    found = factors_of(leaf.source)
-    return None if found is None else found[1]
+    factors = factors_of(leaf.source)
+    return None if factors is None else factors[1]
 
 
 def factors_of(source: Source) -> tuple[list[tuple], Falloff] | None:
@@ -129,13 +129,13 @@ def factors_of(source: Source) -> tuple[list[tuple], Falloff] | None:
     return _joined(both)
 
 
-def _joined(parts) -> tuple[list[tuple], Falloff] | None:
-    if any(part is None for part in parts):
+def _joined(products) -> tuple[list[tuple], Falloff] | None:
+    if any(one is None for one in products):
         return None
     falloff = Falloff()
-    for _, other in parts:
+    for _, other in products:
         falloff = None if falloff is None else falloff.times(other)
-    return None if falloff is None else ([entry for entries, _ in parts for entry in entries], falloff)
+    return None if falloff is None else ([entry for entries, _ in products for entry in entries], falloff)
 
 
 def _factors(socket, groups) -> tuple[list[tuple], Falloff] | None:
@@ -152,8 +152,8 @@ def _factors(socket, groups) -> tuple[list[tuple], Falloff] | None:
     smooth = value_at(node.inputs["Smooth"], groups)
     if smooth is None or not smooth.is_constant or source.socket.name not in POWERS:
         return None
-    own = [], Falloff(POWERS[source.socket.name], max(float(smooth.offset[0]), 0.0))
-    return _joined([own, _factors(node.inputs["Strength"], groups)])
+    node_falloff = [], Falloff(POWERS[source.socket.name], max(float(smooth.offset[0]), 0.0))
+    return _joined([node_falloff, _factors(node.inputs["Strength"], groups)])
 
 
 def _multiplied(node, as_number: bool):
@@ -179,22 +179,22 @@ def _multiplied(node, as_number: bool):
 
 def _has_falloff(source: Source | None) -> bool:
     """True if a Light Falloff node is among the nodes behind `source`."""
-    seen, found = set(), [source]
-    while found:
-        source = found.pop()
-        if source is None or source.node is None or (source.node, source.groups) in seen:
+    visited, waiting = set(), [source]
+    while waiting:
+        source = waiting.pop()
+        if source is None or source.node is None or (source.node, source.groups) in visited:
             continue
         if source.node.bl_idname == LIGHT_FALLOFF:
             return True
-        seen.add((source.node, source.groups))
-        found += [source_of(entry, source.groups) for entry in source.node.inputs]
+        visited.add((source.node, source.groups))
+        waiting += [source_of(entry, source.groups) for entry in source.node.inputs]
     return False
 
 
 @contextmanager
 def falloff_left_out(blocks):
     """Within this context the Light Falloff nodes of materials and lights give their Strength at any distance."""
-    moved, smooths = [], []
+    links, smooths = [], []
     try:
         for tree in trees_of(blocks):
             for node in tree.nodes:
@@ -205,13 +205,13 @@ def falloff_left_out(blocks):
                 for link in list(smooth.links):
                     tree.links.remove(link)
                 smooth.default_value = 0.0
-                own = [(output, link.to_socket) for output in node.outputs for link in output.links]
-                moved += own
-                for _, target in own:
+                ends = [(output, link.to_socket) for output in node.outputs for link in output.links]
+                links += ends
+                for _, target in ends:
                     tree.links.new(node.outputs["Quadratic"], target)
         yield
     finally:
-        for start, end in moved:
+        for start, end in links:
             start.id_data.links.new(start, end)
         for smooth, value, starts in smooths:
             smooth.default_value = value
@@ -221,13 +221,13 @@ def falloff_left_out(blocks):
 
 def trees_of(blocks) -> list:
     """The node trees of materials, lights and worlds, and of the groups in them."""
-    found, waiting = [], [tree_in_use(block) for block in blocks if block is not None]
+    trees, waiting = [], [tree_in_use(block) for block in blocks if block is not None]
     while waiting:
         tree = waiting.pop()
-        if tree is not None and tree not in found:
-            found.append(tree)
+        if tree is not None and tree not in trees:
+            trees.append(tree)
             waiting += [node.node_tree for node in tree.nodes if is_group(node)]
-    return found
+    return trees
 
 
 # PARTS: types of the settings inside a node, beside its sockets. UNSEEN: properties of nodes that change no value.
@@ -244,15 +244,15 @@ UNSEEN = (
 
 def nodes_as_text(data) -> str:
     """The node trees of a material or light as text, which differs wherever their values may differ."""
-    found = []
+    lines = []
     for tree in trees_of([data]):
         for node in tree.nodes:
             sockets = [_value(getattr(socket, "default_value", None)) for socket in (*node.inputs, *node.outputs)]
-            found.append(f"{node.name!r}{sockets}{_values(node, UNSEEN)}")
+            lines.append(f"{node.name!r}{sockets}{_values(node, UNSEEN)}")
         for link in tree.links:
             ends = link.from_node.name, link.from_socket.identifier, link.to_node.name, link.to_socket.identifier
-            found.append(f"{ends}{link.is_muted}")
-    return "\n".join(found)
+            lines.append(f"{ends}{link.is_muted}")
+    return "\n".join(lines)
 
 
 def _values(block, unseen: tuple = ("rna_type",)) -> list:
@@ -284,29 +284,31 @@ def _is_neutral(node) -> bool:
     return strength == 1.0 and not is_socket(color) and color[:3] == (1.0, 1.0, 1.0)
 
 
-def _note_value(source: Source | None, found: Emission, seen: set) -> None:
-    """Note in `found` what the value of `source` depends on."""
+def _note_value(source: Source | None, emission: Emission, visited: set) -> None:
+    """Note in `emission` what the value of `source` depends on."""
     if source is None or source.node is None:
         return
     key = source.node, source.socket.identifier, source.groups
-    if key in seen:
+    if key in visited:
         return
-    seen.add(key)
+    visited.add(key)
     node, kind, output = source.node, source.node.bl_idname, source.socket.name
     vector = node.inputs.get("Vector") if kind.startswith("ShaderNodeTex") else None
     is_free = vector is not None and vector.enabled and not vector.is_linked
     if _is_among(source, DIRECTIONAL) and (kind != IES or is_free):
-        found.directional.add(node.bl_label)
+        emission.directional.add(node.bl_label)
     if _is_among(source, OF_CAMERA):
-        found.of_camera.add(node.bl_label)
+        emission.of_camera.add(node.bl_label)
     if kind == LIGHT_PATH and output != CAMERA_RAY:
-        found.of_path.add(output)
-    found.is_placed |= _is_among(source, PLACED) or (output == "Object" and getattr(node, "object", None) is not None)
-    found.by_place |= _is_among(source, BY_PLACE) or (is_free and kind != IES)
-    found.by_uv |= _is_among(source, BY_UV) or (is_free and kind == "ShaderNodeTexImage")
-    found.varies |= kind not in CONSTANT_NODES
+        emission.of_path.add(output)
+    emission.is_placed |= _is_among(source, PLACED) or (
+        output == "Object" and getattr(node, "object", None) is not None
+    )
+    emission.by_place |= _is_among(source, BY_PLACE) or (is_free and kind != IES)
+    emission.by_uv |= _is_among(source, BY_UV) or (is_free and kind == "ShaderNodeTexImage")
+    emission.varies |= kind not in CONSTANT_NODES
     for entry in node.inputs:
-        _note_value(source_of(entry, source.groups), found, seen)
+        _note_value(source_of(entry, source.groups), emission, visited)
 
 
 def _is_among(source: Source, kinds: dict[str, tuple]) -> bool:
@@ -319,20 +321,20 @@ def what_is_lost(emission: Emission, is_light: bool) -> list[str]:
 
     They leave out a dependence on the direction.
     """
-    found = []
+    warnings = []
     if emission.of_camera:
         nodes = ", ".join(sorted(emission.of_camera))
-        found.append(f"its emission depends on the camera ({nodes}), shaded as from a camera right before it")
+        warnings.append(f"its emission depends on the camera ({nodes}), shaded as from a camera right before it")
     # Cycles evaluates the nodes of lights without a ray type ("Is ..."), those of materials with several ray types.
     paths = sorted(name for name in emission.of_path if not (is_light and name.startswith("Is ")))
     if paths:
-        found.append(
+        warnings.append(
             f"its emission depends on {listed(paths, 3)} of a Light Path node, of which Cycles takes a mixture that "
             "hangs on how it samples, shaded as seen by a camera right before it"
         )
     if emission.falloff is None:
-        found.append(NO_FACTOR)
-    return found
+        warnings.append(NO_FACTOR)
+    return warnings
 
 
 @dataclass(frozen=True)
@@ -377,17 +379,17 @@ def seen_by_surfaces(blocks, random: float):
                 name, value = values[node.bl_idname]
                 targets = [link.to_socket for link in node.outputs[name].links]
                 if targets:
-                    own = tree.nodes.new("ShaderNodeValue")
-                    own.outputs[0].default_value = value
-                    moved.append((tree, own, node.outputs[name], targets))
+                    value_node = tree.nodes.new("ShaderNodeValue")
+                    value_node.outputs[0].default_value = value
+                    moved.append((tree, value_node, node.outputs[name], targets))
                     for target in targets:
-                        tree.links.new(own.outputs[0], target)
+                        tree.links.new(value_node.outputs[0], target)
         yield
     finally:
-        for tree, own, output, targets in moved:
+        for tree, value_node, output, targets in moved:
             for target in targets:
                 tree.links.new(output, target)
-            tree.nodes.remove(own)
+            tree.nodes.remove(value_node)
 
 
 # PIXELS: along each side of a picture.

@@ -36,7 +36,9 @@ def linked_objects(collection) -> LinkedObjects:
         states.update(dict.fromkeys((ob.name_full for ob in child.all_objects), item.light_linking.link_state))
     for item, ob in zip(collection.collection_objects, collection.objects, strict=True):
         states[ob.name_full] = item.light_linking.link_state
-    names = {state: {name for name, own in states.items() if own == state} for state in ("INCLUDE", "EXCLUDE")}
+    names = {
+        state: {name for name, its_state in states.items() if its_state == state} for state in ("INCLUDE", "EXCLUDE")
+    }
     return LinkedObjects(frozenset(names["INCLUDE"]), frozenset(names["EXCLUDE"]))
 
 

@@ -73,7 +73,7 @@ def collect_mesh_lights(depsgraph, override, receivers: Receivers, warn, copies:
 
     `copies`: copy the meshes of objects with textures into new data blocks, which rendering the textures needs.
     """
-    found: dict[tuple, MeshLight | None] = {}
+    mesh_lights: dict[tuple, MeshLight | None] = {}
     known: dict[str, Emission] = {}
     for instance in depsgraph.object_instances:
         ob = instance.object
@@ -82,28 +82,28 @@ def collect_mesh_lights(depsgraph, override, receivers: Receivers, warn, copies:
         traits = EmitterTraits.of(instance)
         slots = tuple(slot.material.name_full if slot.material else "" for slot in ob.material_slots)
         key = (ob.original.name_full, ob.data.name_full if ob.data else "", slots, traits)
-        if key not in found:
-            found[key] = _mesh_light(ob, traits, override, receivers, known)
-            if found[key] is not None and ob.type in ("CURVES", "POINTCLOUD"):
+        if key not in mesh_lights:
+            mesh_lights[key] = _mesh_light(ob, traits, override, receivers, known)
+            if mesh_lights[key] is not None and ob.type in ("CURVES", "POINTCLOUD"):
                 warn(f"object {ob.original.name!r}: the emission of {ob.type.lower()} is not shaded, it lights nothing")
-                found[key] = None
-        if found[key] is not None:
+                mesh_lights[key] = None
+        if mesh_lights[key] is not None:
             matrix = np.array(instance.matrix_world, dtype=np.float64)
-            placement = _placement(ob, matrix, found[key], depsgraph if copies else None)
+            placement = _placement(ob, matrix, mesh_lights[key], depsgraph if copies else None)
             if placement is not None:
                 placement.facts = ObjectFacts.of(ob, instance)
-                found[key].placements.append(placement)
+                mesh_lights[key].placements.append(placement)
                 instancer = surface_instancer(instance)
                 if instancer is not None:
-                    found[key].instancers[instancer.original.name_full] = instancer
-    return [light for light in found.values() if light is not None and light.placements]
+                    mesh_lights[key].instancers[instancer.original.name_full] = instancer
+    return [light for light in mesh_lights.values() if light is not None and light.placements]
 
 
 def _mesh_light(ob, traits: EmitterTraits, override, receivers: Receivers, known: dict) -> MeshLight | None:
     slots = [override] * max(1, len(ob.material_slots)) if override else [slot.material for slot in ob.material_slots]
     materials = [None if material is None else material.original for material in slots]
     emission = [_emission_of(material, known) for material in materials]
-    if not any(part.emits for part in emission) or not (traits.diffuse or traits.glossy):
+    if not any(one.emits for one in emission) or not (traits.diffuse or traits.glossy):
         return None
     nothing = np.zeros(3)
     light = QuadLight(
@@ -177,11 +177,11 @@ FEW_POLYGONS = 16
 
 
 @contextmanager
-def _undisplaced(found: list[MeshLight]):
+def _undisplaced(mesh_lights: list[MeshLight]):
     """Within this context no material displaces faces, which could move them out of the camera's sight."""
     methods = {
         material.name_full: (material, material.displacement_method)
-        for mesh_light in found
+        for mesh_light in mesh_lights
         for material in mesh_light.materials
         if material is not None
     }
@@ -194,27 +194,27 @@ def _undisplaced(found: list[MeshLight]):
             material.displacement_method = method
 
 
-def mesh_area_lights(found: list[MeshLight], studio: Studio, eye: np.ndarray, warn) -> list[Light]:
-    """The area lights that stand for the objects `found`; the camera is at `eye` (3,).
+def mesh_area_lights(mesh_lights: list[MeshLight], studio: Studio, eye: np.ndarray, warn) -> list[Light]:
+    """The area lights that stand for the objects `mesh_lights`; the camera is at `eye` (3,).
 
     A closed mesh emits from the side where the camera is. Objects that shine get the custom property SIDE_PROPERTY.
     """
-    for mesh_light in found:
+    for mesh_light in mesh_lights:
         _note_what_is_lost(mesh_light, warn)
-    with _undisplaced(found), falloff_left_out(material for light in found for material in light.materials):
-        return _lights_of_all(found, studio, eye, warn)
+    with _undisplaced(mesh_lights), falloff_left_out(material for light in mesh_lights for material in light.materials):
+        return _lights_of_all(mesh_lights, studio, eye, warn)
 
 
-def _lights_of_all(found: list[MeshLight], studio: Studio, eye: np.ndarray, warn) -> list[Light]:
+def _lights_of_all(mesh_lights: list[MeshLight], studio: Studio, eye: np.ndarray, warn) -> list[Light]:
     lights, known = [], {}
-    for mesh_light in found:
+    for mesh_light in mesh_lights:
         radiance = [
             _material_radiance(studio, material, known) if emission.emits and not emission.varies else np.zeros((2, 3))
             for material, emission in zip(mesh_light.materials, mesh_light.emission, strict=True)
         ]
         side = _emitting_side(mesh_light, eye, warn)
-        parts = _polygons(mesh_light, radiance)
-        count = sum(len(polygons) for _, polygons in parts) * (2 if side == 0 else 1)
+        placed_polygons = _polygons(mesh_light, radiance)
+        count = sum(len(polygons) for _, polygons in placed_polygons) * (2 if side == 0 else 1)
         if count > MOST_POLYGONS:
             warn(
                 f"object {mesh_light.ob.name!r}: it emits from {count} flat faces, more than {MOST_POLYGONS}; it "
@@ -222,27 +222,27 @@ def _lights_of_all(found: list[MeshLight], studio: Studio, eye: np.ndarray, warn
             )
             mesh_light.is_dropped = True
             continue
-        own = _constant_lights(mesh_light, parts, radiance, side)
-        own += _textured_lights(mesh_light, parts, side, studio, warn)
-        if own:
+        of_object = _constant_lights(mesh_light, placed_polygons, radiance, side)
+        of_object += _textured_lights(mesh_light, placed_polygons, side, studio, warn)
+        if of_object:
             mark_transparent(mesh_light.ob, side, mesh_light.materials)
-            lights.extend(own)
+            lights.extend(of_object)
     return lights
 
 
-def constant_mesh_lights(found: list[MeshLight], radiance_of, eye: np.ndarray, warn) -> list[Light]:
-    """The area lights of the objects `found`, without falloff, for known radiances `radiance_of(material)` (3,)."""
+def constant_mesh_lights(mesh_lights: list[MeshLight], radiance_of, eye: np.ndarray, warn) -> list[Light]:
+    """The area lights of `mesh_lights`, without falloff, for known radiances `radiance_of(material)` (3,)."""
     lights = []
-    for mesh_light in found:
+    for mesh_light in mesh_lights:
         radiance = [np.tile(radiance_of(material), (2, 1)) for material in mesh_light.materials]
         side = _emitting_side(mesh_light, eye, warn)
-        own = _constant_lights(mesh_light, _polygons(mesh_light, radiance), radiance, side)
-        own = [replace(light, falloff=0, smooth=0.0) for light in own]
-        if len(own) > MOST_SHOWN:
-            count = f"{len(own)} flat faces, more than the {MOST_SHOWN} that the viewport takes"
+        of_mesh = _constant_lights(mesh_light, _polygons(mesh_light, radiance), radiance, side)
+        of_mesh = [replace(light, falloff=0, smooth=0.0) for light in of_mesh]
+        if len(of_mesh) > MOST_SHOWN:
+            count = f"{len(of_mesh)} flat faces, more than the {MOST_SHOWN} that the viewport takes"
             warn(f"object {mesh_light.ob.name!r}: it emits from {count}; pictures, bakes and F12 shade it")
         else:
-            lights.extend(own)
+            lights.extend(of_mesh)
     return lights
 
 
@@ -282,14 +282,14 @@ def _emitting_side(mesh_light: MeshLight, eye: np.ndarray, warn) -> int:
 def _polygons(mesh_light: MeshLight, radiance) -> list[tuple[Placement, list[FlatPolygon]]]:
     """Each placement with its emitting polygons, labeled by material slot."""
     shines = np.array([emission.varies or bool(np.any(value)) for emission, value in _slots(mesh_light, radiance)])
-    parts = []
+    placed_polygons = []
     for placement in mesh_light.placements:
         chosen = shines[placement.slots]
         polygons = planar_polygons.flat_polygons(
             placement.vertices, placement.triangles[chosen], placement.slots[chosen]
         )
-        parts.append((placement, polygons))
-    return parts
+        placed_polygons.append((placement, polygons))
+    return placed_polygons
 
 
 def _slots(mesh_light: MeshLight, radiance):
@@ -300,8 +300,8 @@ def _sides(side: int) -> tuple[int, ...]:
     return (1, -1) if side == 0 else (side,)
 
 
-def _constant_lights(mesh_light: MeshLight, parts, radiance, side: int) -> list[Light]:
-    polygons = [polygon for _, own in parts for polygon in own]
+def _constant_lights(mesh_light: MeshLight, placed_polygons, radiance, side: int) -> list[Light]:
+    polygons = [polygon for _, of_placement in placed_polygons for polygon in of_placement]
     lights: dict[tuple, Light] = {}
     kinds: dict[tuple, list[int]] = {}
     for number, polygon in enumerate(polygons):
@@ -310,8 +310,10 @@ def _constant_lights(mesh_light: MeshLight, parts, radiance, side: int) -> list[
         for order, way in enumerate(_sides(side)):
             value = radiance[label][0 if way > 0 else 1]
             if np.any(value):
-                own = polygon_lights(mesh_light.light_of(label), [polygons[number] for number in numbers], way, value)
-                lights.update(zip(((number, order) for number in numbers), own, strict=True))
+                same_kind = polygon_lights(
+                    mesh_light.light_of(label), [polygons[number] for number in numbers], way, value
+                )
+                lights.update(zip(((number, order) for number in numbers), same_kind, strict=True))
     return [lights[key] for key in sorted(lights)]
 
 
@@ -330,8 +332,8 @@ def polygon_lights(stand_in: Light, polygons: list[FlatPolygon], way: int, radia
     u = u - (u * direction).sum(axis=1, keepdims=True) * direction
     u /= np.linalg.norm(u, axis=1, keepdims=True)
     v = np.cross(direction, u)
-    place = np.einsum("nvi,nai->nva", corners - corners[:, :1], np.stack([u, v], axis=1))
-    low, high = place.min(axis=1), place.max(axis=1)
+    in_plane = np.einsum("nvi,nai->nva", corners - corners[:, :1], np.stack([u, v], axis=1))
+    low, high = in_plane.min(axis=1), in_plane.max(axis=1)
     (middle_u, middle_v), (half_u, half_v) = (0.5 * (low + high)).T[..., None], (0.5 * (high - low)).T[..., None]
     center = corners[:, 0] + middle_u * u + middle_v * v
     first = PolygonLight.like(
@@ -365,11 +367,11 @@ def _shown(studio: Studio, mesh, matrix: np.ndarray, facts: ObjectFacts):
         yield
 
 
-def _textured_lights(mesh_light: MeshLight, parts, side: int, studio: Studio, warn) -> list[Light]:
+def _textured_lights(mesh_light: MeshLight, placed_polygons, side: int, studio: Studio, warn) -> list[Light]:
     """Lights of the polygons whose material emits differently from place to place."""
     textured = [
         (placement, [polygon for polygon in polygons if mesh_light.emission[polygon.label].varies])
-        for placement, polygons in parts
+        for placement, polygons in placed_polygons
     ]
     count = sum(len(polygons) for _, polygons in textured)
     if count == 0:
@@ -406,16 +408,16 @@ def _dressed(mesh_light: MeshLight, placement: Placement):
 
 def _look_at_polygon(studio: Studio, light: Light, pixels: int) -> tuple[np.ndarray, np.ndarray]:
     """Radiance (H, W, 3) of the rectangle around `light`, and the mask (H, W) of the pixels inside its outline."""
-    image, seen = studio.look(light.center, light.half_u, light.half_v, light.direction, pixels)
-    rows, columns = seen.shape
+    image, covered = studio.look(light.center, light.half_u, light.half_v, light.direction, pixels)
+    rows, columns = covered.shape
     x, y = np.meshgrid((np.arange(columns) + 0.5) / columns * 2.0 - 1.0, 1.0 - (np.arange(rows) + 0.5) / rows * 2.0)
     offset = light.corners - light.center
     outline = np.stack(
         [offset @ half / np.dot(half, half) for half in (light.half_u, light.half_v)],
         axis=-1,
     )
-    inside = seen & _contains(outline, x, y)
-    return image, inside if inside.any() else seen
+    inside = covered & _contains(outline, x, y)
+    return image, inside if inside.any() else covered
 
 
 def _contains(outline: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
@@ -462,9 +464,9 @@ def let_light_through(scene) -> None:
     materials = {material.name_full: material for material in bpy.data.materials if SIDE_PROPERTY in material}
     for ob in bpy.data.objects:
         if SIDE_PROPERTY in ob:
-            found = [slot.material for slot in ob.material_slots]
-            found += [layer.material_override for layer in scene.view_layers]
-            materials.update((material.name_full, material) for material in found if material is not None)
+            of_object = [slot.material for slot in ob.material_slots]
+            of_object += [layer.material_override for layer in scene.view_layers]
+            materials.update((material.name_full, material) for material in of_object if material is not None)
     if materials:
         scene.cycles.transparent_max_bounces = MOST_TRANSPARENT_FACES
     for material in materials.values():

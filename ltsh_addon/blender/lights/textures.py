@@ -46,7 +46,7 @@ class NodeLight:
         return self.data.session_uid, *(self.instance if self.is_placed else ())
 
     @property
-    def place(self) -> np.ndarray:
+    def render_matrix(self) -> np.ndarray:
         """The matrix (4, 4) at which it is rendered."""
         return self.matrix if self.is_placed else np.eye(4)
 
@@ -59,26 +59,26 @@ class NodeLight:
 
 def with_node_emission(lights: list[Light], unseen: dict[int, NodeLight], studio: Studio, warn) -> list:
     """`lights` with the rendered emission of those at the positions in `unseen`; dark ones of these are left out."""
-    result, seen = [], {}
+    result, emissions = [], {}
     for position, light in enumerate(lights):
         if position not in unseen:
             result.append(light)
             continue
         source = unseen[position]
-        own = seen.setdefault(source.data.name_full, [])
-        if not own or (source.is_placed and len(own) < MOST_LOOKS):
-            own.append(node_emission(source, studio))
-            found = own[-1]
+        of_data = emissions.setdefault(source.data.name_full, [])
+        if not of_data or (source.is_placed and len(of_data) < MOST_LOOKS):
+            of_data.append(node_emission(source, studio))
+            emission = of_data[-1]
         else:
-            found = own[0]
+            emission = of_data[0]
             if source.is_placed:
                 warn(f"light {light.name!r}: of over {MOST_LOOKS} instances the others get the nodes of the first")
         if not light.is_distant:
             light = replace(light, falloff=source.falloff.power, smooth=source.falloff.smooth)
         if light.is_facing or light.is_distant:
-            result.extend(with_pattern(light, found, source, warn))
+            result.extend(with_pattern(light, emission, source, warn))
         else:
-            result.extend(_with_factor(light, found.factor, warn))
+            result.extend(_with_factor(light, emission.factor, warn))
     return result
 
 
@@ -99,12 +99,12 @@ def node_emission(source: NodeLight, studio: Studio) -> NodeEmission:
 
 
 def _area_factor(source: NodeLight, studio: Studio) -> NodeEmission:
-    data, place = source.data, source.place
+    data, matrix = source.data, source.render_matrix
     size_v = data.size if data.shape in ("SQUARE", "DISK") else data.size_y
-    half_u, half_v = 0.5 * data.size * place[:3, 0], 0.5 * size_v * place[:3, 1]
-    direction = -place[:3, 2] / np.linalg.norm(place[:3, 2])
+    half_u, half_v = 0.5 * data.size * matrix[:3, 0], 0.5 * size_v * matrix[:3, 1]
+    direction = -matrix[:3, 2] / np.linalg.norm(matrix[:3, 2])
     with _standing(source, studio, {"spread": np.pi}):
-        image, _ = studio.look(place[:3, 3], half_u, half_v, direction, PIXELS if source.varies else 8)
+        image, _ = studio.look(matrix[:3, 3], half_u, half_v, direction, PIXELS if source.varies else 8)
     if np.dot(np.cross(half_u, half_v), direction) < 0.0:
         image = image[::-1]
     return NodeEmission(image / (_WHITE["energy"] / np.pi))
@@ -142,7 +142,7 @@ def _apart(values: np.ndarray, expected: np.ndarray) -> float:
 
 
 def _point_factor(source: NodeLight, studio: Studio) -> NodeEmission:
-    data, center = source.data, source.place[:3, 3]
+    data, center = source.data, source.render_matrix[:3, 3]
     small = max(SMALL_RADIUS, SMALL_SHARE * np.abs(center).max())
     radius = max(data.shadow_soft_size, small)
 
@@ -151,14 +151,14 @@ def _point_factor(source: NodeLight, studio: Studio) -> NodeEmission:
         kind = "SPOT" if data.type == "SPOT" and source.by_spot else "POINT"
         settings = {"shadow_soft_size": radius, "use_soft_falloff": False}
         with _standing(source, studio, settings, kind):
-            found = [_side(studio, center, number, radius, within) for number in range(6)]
-        return [image / (_WHITE["energy"] / np.pi) for image in found]
+            images = [_side(studio, center, number, radius, within) for number in range(6)]
+        return [image / (_WHITE["energy"] / np.pi) for image in images]
 
     within = source.within
     if not source.by_ray:
         return NodeEmission(_unfolded(views(False, radius), False))
-    seen = views(within, small)
-    factor = _unfolded(seen, within)
+    sides = views(within, small)
+    factor = _unfolded(sides, within)
     if not source.varies:
         return NodeEmission(factor.mean(axis=(0, 1), keepdims=True))
     if not source.is_mixed or radius == small:
@@ -173,7 +173,7 @@ def _point_factor(source: NodeLight, studio: Studio) -> NodeEmission:
     disk = np.hypot(*np.meshgrid(step, step)) < 1.0 - 2.0 / VIEW_PIXELS
     whole = np.array([image[disk] for image in views(False, radius)])
     half = VIEW_PIXELS // 2
-    middle = np.array([image[half - 1 : half + 1, half - 1 : half + 1].mean(axis=(0, 1)) for image in seen])[:, None]
+    middle = np.array([image[half - 1 : half + 1, half - 1 : half + 1].mean(axis=(0, 1)) for image in sides])[:, None]
     scale = whole.mean() / max(middle.mean(), 1e-30)
     return NodeEmission(factor * scale, _apart(middle * scale, whole))
 
@@ -202,7 +202,7 @@ def _standing(source: NodeLight, studio: Studio, settings: dict, kind: str = "")
         ob = bpy.data.objects.new("Look at a light", data)
         ob.visible_camera = True
         with falloff_left_out([data]), seen_by_surfaces([data], source.facts.random):
-            with studio.show(ob, source.place, source.facts):
+            with studio.show(ob, source.render_matrix, source.facts):
                 yield
     finally:
         bpy.data.lights.remove(data)
@@ -219,8 +219,8 @@ def _side(studio: Studio, center, number: int, radius: float, within: bool) -> n
     if not within:
         return studio.look(center, radius * right, radius * np.cross(out, right), out, VIEW_PIXELS, 1.0)[0]
     # Rays from the exact center of a spot do not hit it.
-    place = center + 0.02 * radius * out
-    return studio.look_around(place, (-out, right), 0.5 * np.pi, 2.0 * radius, VIEW_PIXELS)
+    eye = center + 0.02 * radius * out
+    return studio.look_around(eye, (-out, right), 0.5 * np.pi, 2.0 * radius, VIEW_PIXELS)
 
 
 def _unfolded(views: list[np.ndarray], within: bool) -> np.ndarray:
@@ -246,17 +246,17 @@ def _unfolded(views: list[np.ndarray], within: bool) -> np.ndarray:
     return result
 
 
-def with_pattern(light: Light, found: NodeEmission, source: NodeLight, warn) -> list[Light]:
-    """A point, spot or sun times the factor `found` of its nodes: one light, or [] if it is dark."""
-    factor = found.factor
+def with_pattern(light: Light, emission: NodeEmission, source: NodeLight, warn) -> list[Light]:
+    """A point, spot or sun times the factor of its nodes: one light, or [] if it is dark."""
+    factor = emission.factor
     weights = np.sin((np.arange(factor.shape[0]) + 0.5) * (np.pi / factor.shape[0]))[:, None, None]
     mean = (factor * weights).sum(axis=(0, 1)) / (weights.sum() * factor.shape[1])
     if not mean.any():
         return []
     light = replace(light, radiance=light.radiance * mean)
-    if found.lost > MOST_LOST:
+    if emission.lost > MOST_LOST:
         what = "over the sun, shaded as its mean" if light.is_distant else "over the light, shaded as in its middle"
-        warn(f"light {light.name!r}: its emission varies {what}, up to {100.0 * found.lost:.0f} % off on average")
+        warn(f"light {light.name!r}: its emission varies {what}, up to {100.0 * emission.lost:.0f} % off on average")
     if factor.shape[0] == 1:
         return [light]
     values = factor.mean(axis=-1) / mean.mean()
@@ -314,16 +314,16 @@ class ShownTextures:
         patches = self._patches_of(light, factor)
         return None if patches is None else _shown_patches(light, patches, notes)
 
-    def split_seen(self, light: Light, found: NodeEmission, notes: list[str]) -> list[Light]:
-        """As `split`, for the factor `found` of the nodes of the light."""
-        key = id(found), light.is_round
+    def split_seen(self, light: Light, emission: NodeEmission, notes: list[str]) -> list[Light]:
+        """As `split`, for the factor of the nodes of the light."""
+        key = id(emission), light.is_round
         if key not in self._seen:
             if len(self._seen) >= MOST_SEEN:
                 self._seen.clear()
-            rows, columns = found.factor.shape[:2]
-            patches = cut_into_patches(found.factor, _covered(light, rows, columns), MOST_PATCHES)
-            # `found` is kept alive, so that no other object gets its id().
-            self._seen[key] = found, patches
+            rows, columns = emission.factor.shape[:2]
+            patches = cut_into_patches(emission.factor, _covered(light, rows, columns), MOST_PATCHES)
+            # `emission` is kept alive, so that no other object gets its id().
+            self._seen[key] = emission, patches
         return _shown_patches(light, self._seen[key][1], notes)
 
     def _patches_of(self, light: Light, factor: Value) -> Patches | None:
@@ -358,8 +358,8 @@ def _texture(use) -> ImageTexture | None:
 
 def _cut(texture: ImageTexture, factor: Value, is_round: bool) -> Patches:
     count = POINTS * SUB
-    place = (np.arange(count) + 0.5) / count
-    u, v = np.meshgrid(place, 1.0 - place)
+    step = (np.arange(count) + 0.5) / count
+    u, v = np.meshgrid(step, 1.0 - step)
     mapping = np.array(factor.image.mapping)
     uv = np.stack([u, v, np.ones_like(u)], axis=-1).reshape(-1, 3) @ mapping.T
     colors = factor.offset + texture.colors(uv) @ factor.matrix[:, :3].T + factor.matrix[:, 3]

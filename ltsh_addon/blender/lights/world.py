@@ -102,14 +102,14 @@ def world_lights(scene, world, warn) -> list[Light]:
     if like is None:
         return []
     pictures, lights = light_pictures(scene, world, like, warn)
-    found, error = sky_lights(like, pictures)
+    sky, error = sky_lights(like, pictures)
     if error > COARSE:
-        count = sum(len(light.leaves) for light in found)
+        count = sum(len(light.leaves) for light in sky)
         warn(
             f"world {world.name!r}: it is shaded as {count} patches of constant radiance, which differ from it by "
             f"{100.0 * error:.0f} % on average"
         )
-    return found + lights
+    return sky + lights
 
 
 def light_pictures(scene, world, like: Light, warn) -> tuple[list[SkyPicture], list[Light]]:
@@ -171,17 +171,17 @@ def _observatory(scene, world, warn, by_cameras: bool = False):
 
     It shows the world as surfaces see it, or with `by_cameras` as cameras do.
     """
-    own = world.copy()
+    copied = world.copy()
     groups = []
     try:
-        _store(own.cycles, "sampling_method", NOT_SAMPLED)
+        _store(copied.cycles, "sampling_method", NOT_SAMPLED)
         if not by_cameras:
-            _store(own.cycles_visibility, "camera", True)
-        if tree_in_use(own) is not None and not by_cameras:
-            groups = _own_groups(own.node_tree)
-            _as_surfaces_see(own, world.name, warn)
+            _store(copied.cycles_visibility, "camera", True)
+        if tree_in_use(copied) is not None and not by_cameras:
+            groups = _own_groups(copied.node_tree)
+            _as_surfaces_see(copied, world.name, warn)
         with open_studio(scene) as studio:
-            studio.scene.world = own
+            studio.scene.world = copied
             studio.scene.render.film_transparent = False
             lens = studio.camera.data
             lens.type, lens.clip_start, lens.clip_end = "PERSP", 0.1, 1.0
@@ -202,10 +202,10 @@ def _observatory(scene, world, warn, by_cameras: bool = False):
                     radiance[odd] = 0.0
                 return SkyPicture(ahead, right, up, radiance)
 
-            _note_cameras(own, world.name, warn)
+            _note_cameras(copied, world.name, warn)
             yield look
     finally:
-        bpy.data.worlds.remove(own)
+        bpy.data.worlds.remove(copied)
         for group in groups:
             bpy.data.node_groups.remove(group)
 
@@ -232,15 +232,15 @@ def _own_groups(tree) -> list:
 
 def _note_cameras(world, name: str, warn) -> None:
     """Warn of nodes whose values depend on the camera."""
-    found = set()
+    labels = set()
     for node in _nodes(world):
         outputs = OF_CAMERA.get(node.bl_idname)
         if outputs is not None:
             used = {output.name for output in node.outputs if output.is_linked}
-            found |= {f"{node.bl_label}: {output}" for output in used if not outputs or output in outputs}
-    if found:
+            labels |= {f"{node.bl_label}: {output}" for output in used if not outputs or output in outputs}
+    if labels:
         warn(
-            f"world {name!r}: it depends on the camera ({listed(sorted(found))}); its light and its background are "
+            f"world {name!r}: it depends on the camera ({listed(sorted(labels))}); its light and its background are "
             "those of six cameras, one for each side of a cube"
         )
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import json
 import math
-import queue
 import shutil
 import subprocess
 import tempfile
@@ -15,6 +14,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from queue import Empty, SimpleQueue
 
 import bpy
 from bpy.app.translations import pgettext_iface as translated
@@ -391,7 +391,7 @@ class Job:
         job = self.folder / "job.json"
         document = {"runs": runs, "path": _library_folders(), "temporary": str(self.folder)}
         job.write_text(json.dumps(document), encoding="utf-8")
-        self._messages: queue.SimpleQueue = queue.SimpleQueue()
+        self._messages: SimpleQueue = SimpleQueue()
         command = blender_process.child_command(job, SCRIPT)
         self._process = blender_process.start(command, self.folder, background=background)
         threading.Thread(target=self._listen, name="ltsh-job", daemon=True).start()
@@ -413,7 +413,7 @@ class Job:
         while not self.finished:
             try:
                 message = self._messages.get_nowait()
-            except queue.Empty:
+            except Empty:
                 break
             changed = True
             self._take(message)

@@ -10,7 +10,8 @@ import gpu
 import numpy as np
 
 from ...scene import PASSES, Film, Light
-from ...visibility import Mate, Occluders, ShadowSampling, Tracer, open_tracer, visible_shares
+from ...visibility import Occluders, ShadowSampling, Tracer, open_tracer, visible_shares
+from ...workers.pool import WorkerPool, cores
 from ..extract.occluders import collect_occluders
 from ..lights.world import blocks_nothing
 from ..process.blender_process import embree_libraries
@@ -24,7 +25,7 @@ _LIGHT_BYTES = 4
 
 
 class ViewTracer:
-    """A tracer of occluders, and the process (mate) that helps it.
+    """A tracer of occluders, and the pool of this process and a worker that trace with it.
 
     Positions are relative to an origin near the view, where single precision is best. The origin changes rarely.
     """
@@ -32,7 +33,7 @@ class ViewTracer:
     def __init__(self, occluders: Occluders):
         self._occluders = occluders
         self._tracer: Tracer | None = None
-        self.mate: Mate | None = None
+        self.pool: WorkerPool | None = None
         self._origin = np.zeros(3)
 
     def around(self, origin: np.ndarray) -> Tracer:
@@ -42,13 +43,13 @@ class ViewTracer:
             matrices[:, :, 3] -= origin
             self._tracer = open_tracer(replace(self._occluders, matrices=matrices), embree_libraries())
             self.close()
-            self.mate, self._origin = Mate(self._tracer), np.array(origin)
+            self.pool, self._origin = WorkerPool(self._tracer, min(cores(), 2)), np.array(origin)
         return self._tracer
 
     def close(self) -> None:
-        """End the process of the mate."""
-        if self.mate is not None:
-            self.mate.close()
+        """End the worker."""
+        if self.pool is not None:
+            self.pool.close()
 
 
 class ShadowRays:

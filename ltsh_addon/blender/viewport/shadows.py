@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...scene import PASSES, Cancelled, Film, Light, SurfaceSamples, error_line
-from ...visibility import Occluders, ShadowSampling, shared_numbers, visible_shares
+from ...visibility import Occluders, ShadowSampling, Starts, ray_origins, shared_numbers, visible_shares
+from ...workers.pool import WorkerPool
 from .drawing import ViewCamera, float_texture
 from .gbuffer import GBufferTextures, VisibilityGrid, every_texel, gbuffer_texels, samples_of_texels, unit_xyz
 from .shadow_rays import Lights, ViewTracer, too_many, visibility_texture
@@ -48,6 +49,7 @@ class PixelGrid:
     def __init__(self, step: int, gbuffer: GBufferTextures, view: ViewCamera):
         self._step, self._view, (width, height) = step, view, gbuffer.size
         self.gbuffer_texels, self._samples, self._normal = gbuffer_texels(gbuffer, step), None, None
+        self._ray_origins: Starts | None = None
         positions, first = self.gbuffer_texels["position"], step // 2
         rows, columns = positions.shape[:2]
         stretch = np.eye(4)
@@ -61,6 +63,12 @@ class PixelGrid:
         """Read again what depends on the lights: the normals of the horizons."""
         if gbuffer.geometric_normal is not None:
             self._normal = every_texel(gbuffer.geometric_normal, self._step)
+
+    def ray_origins(self, pool: WorkerPool) -> Starts:
+        """Where rays from the samples start. They stay when only lights change."""
+        if self._ray_origins is None:
+            self._ray_origins = ray_origins(self.samples()[0], pool)
+        return self._ray_origins
 
     def samples(self) -> tuple[SurfaceSamples, Film]:
         """The samples and their film."""
@@ -88,7 +96,6 @@ class ShadowRequest:
     rays: int
     tracing: ViewTracer
     origin: np.ndarray
-    layer: int  # 1: glass, 0: the surfaces behind
 
     @property
     def is_for_group(self) -> bool:
@@ -103,7 +110,7 @@ class ShadowRequest:
         """
         samples, film = self.points.samples()
         tracer, results = self.tracing.around(self.origin), {}
-        self.tracing.mate.key = (self.state, self.layer) if self.level == 1 else None
+        ray_starts = self.points.ray_origins(self.tracing.pool) if self.level == 1 else None
         lights = [light for lights in self.lights for light in lights]
         starts = np.cumsum([0, *map(len, self.lights)])[:-1]
         index_of = dict(zip(starts.tolist(), range(len(starts)), strict=True))
@@ -118,7 +125,8 @@ class ShadowRequest:
                     [lights[number] for number in chosen],
                     tracer,
                     sampling,
-                    workers=self.tracing.mate,
+                    workers=self.tracing.pool,
+                    starts=ray_starts,
                     progress=progress,
                 )
             except Cancelled:
@@ -412,7 +420,6 @@ class LiveShadows:
             rays=rays,
             tracing=self._traced_scene.tracing,
             origin=view.origin.copy(),
-            layer=int(self._behind is not None),
         )
 
     def _start(self, requests: list[ShadowRequest]) -> None:

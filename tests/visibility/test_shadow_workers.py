@@ -9,7 +9,7 @@ from occluder_scenes import sphere
 
 from ltsh_addon.blender.process.blender_process import embree_libraries
 from ltsh_addon.scene import PASSES, Cancelled
-from ltsh_addon.visibility import OccluderMesh, Occluders, crew, open_tracer, ratio
+from ltsh_addon.visibility import OccluderMesh, Occluders, open_tracer, ratio
 from ltsh_addon.workers import pool, worker
 
 
@@ -17,7 +17,7 @@ from ltsh_addon.workers import pool, worker
 def scene(monkeypatch):
     """A ball above the floor in blocks of 200 samples, and the processes that were started."""
     monkeypatch.setattr(ratio, "BLOCK_SAMPLES", 200)
-    monkeypatch.setattr(ratio, "SECONDS_WORTH_A_CHILD", -1.0)
+    monkeypatch.setattr(ratio, "SECONDS_WORTH_A_WORKER", -1.0)
     started, popen = [], pool.subprocess.Popen
 
     def counted(arguments, **options):
@@ -43,9 +43,8 @@ def test_any_number_of_processes_gives_the_same_bytes(scene, monkeypatch):
     alone = shares(workers=1)
     assert not started and 0.1 < alone.mixed.mean() < 0.9
     # This process leaves most to the children.
-    done = crew._Queue.done
-    by = []
-    monkeypatch.setattr(crew._Queue, "done", lambda self, number, found: (by.append(number), done(self, number, found)))
+    by, finish = [], pool._Run.finish
+    monkeypatch.setattr(pool._Run, "finish", lambda *arguments: (by.append(arguments[1]), finish(*arguments)))
     for workers in (2, 3):
         found = shares(workers=workers)
         for name in PASSES:
@@ -56,36 +55,25 @@ def test_any_number_of_processes_gives_the_same_bytes(scene, monkeypatch):
     assert sorted(by) == sorted(2 * list(range(8)))
 
 
-def test_a_mate_gives_the_same_bytes_and_is_sent_samples_once(scene, monkeypatch):
+def test_a_pool_that_stays_gives_the_same_bytes(scene):
     shares, started, tracer = scene
     alone = shares(workers=1)
-    monkeypatch.setattr(pool, "cores", lambda: 2)
-    asked, put = [], pool.Keeper.put
-    monkeypatch.setattr(pool.Keeper, "put", lambda self, question: (asked.append(question), put(self, question)))
-    mate = crew.Mate(tracer)
-    try:
-        for number, key in enumerate((("first", 0), ("first", 0), ("second", 0), None, ("second", 1))):
+    with pool.WorkerPool(tracer, 2) as both:
+        for number in range(3):
             if number == 2:
-                # What was asked last is not waited for, and is not taken for an answer later on.
+                # What has begun is not waited for, and is not taken for a result later on.
                 with pytest.raises(Cancelled):
-                    shares(workers=mate, progress=lambda stage, share: share < 0.5)
-            mate.key, _ = key, asked.clear()
-            found = shares(workers=mate)
-            while mate._child is not None and not mate._is_up:  # the first time this process may do it all
-                mate._answers(wait=True)
+                    shares(workers=both, progress=lambda stage, share: share < 0.5)
+            # Where rays start may be known, from the same processes.
+            starts = None if number == 0 else ratio.ray_origins(floor(40)[0], both)
+            found = shares(workers=both, starts=starts)
             for name in PASSES:
                 np.testing.assert_array_equal(getattr(found, name), getattr(alone, name))
             assert found.rays == alone.rays
-            blocks = [question[3] for question in asked if question[4] is not None]
-            assert asked and len(blocks) == len(set(blocks))
-            if number == 1:
-                assert len(blocks) < len(asked), "some are known"
         assert len(started) == 1 and started[0].poll() is None
         started[0].kill()
         started[0].wait()
-        np.testing.assert_array_equal(shares(workers=mate).diffuse, alone.diffuse)
-    finally:
-        mate.close()
+        np.testing.assert_array_equal(shares(workers=both).diffuse, alone.diffuse)
     assert len(started) == 1
 
 

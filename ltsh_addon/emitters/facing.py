@@ -208,7 +208,7 @@ def pattern_values(pattern, normals: np.ndarray) -> np.ndarray:
     return (above * (1.0 - down) + below * down).astype(normals.dtype)
 
 
-def mean_emission(light, offset: np.ndarray, disk: FacingDisk, lobe: Lobe) -> np.ndarray | float:
+def mean_emission(light, offset: np.ndarray, disk: FacingDisk, lobe: AnalyticLobe) -> np.ndarray | float:
     """Mean factor (Q,) of the light's radiance for the lobes; 1.0 if it is 1 everywhere. The light's center is at
     `offset` (3, Q).
 
@@ -262,18 +262,18 @@ def factors_at(light, offset, places):
 
 
 @dataclass(frozen=True)
-class Lobe:
+class AnalyticLobe:
     """Lobes of Q samples: diffuse, or GGX if there are a view and alpha."""
 
     normal: np.ndarray  # (3, Q)
     view: np.ndarray | None = None  # (3, Q)
     alpha: np.ndarray | None = None  # (Q,)
 
-    def take(self, part) -> Lobe:
+    def take(self, part) -> AnalyticLobe:
         """The lobes of the samples `part`."""
         if self.view is None:
-            return Lobe(self.normal[:, part])
-        return Lobe(self.normal[:, part], self.view[:, part], self.alpha[part])
+            return AnalyticLobe(self.normal[:, part])
+        return AnalyticLobe(self.normal[:, part], self.view[:, part], self.alpha[part])
 
     def values(self, directions: np.ndarray) -> np.ndarray:
         """BRDF times cosine (S, Q) of white lobes, for unit directions (3, S, Q)."""

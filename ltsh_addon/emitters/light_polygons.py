@@ -56,18 +56,18 @@ LEAST_COSINE = 0.1
 
 
 def light_levels(light, corners, position, width):
-    """Yield (corners (V, 3), effort for the cone, chosen (Q',) of the points, None for all), as their lobes need.
+    """Yield (corners (V, 3), `DiskLayers` or None, chosen (Q',) of the points, None for all), as their lobes need.
 
     The lobes are `width` (Q,) or a number of radians wide, at points with x, y, z in `position` (3, Q). All arrays are
     in double precision, so that both paths make the same decisions.
     """
     if light.has_profile:
-        for effort, chosen in light_profile.efforts(light, position, width):
+        for disks, chosen in light_profile.disk_layers(light, position, width):
             if light.is_round:
-                corners = light.polygon(FOCUSED_ROUND_CORNERS[effort.chords > 2])
-                effort = replace(effort, chords=2)
+                corners = light.polygon(FOCUSED_ROUND_CORNERS[disks.chords > 2])
+                disks = replace(disks, chords=2)
             for piece in convex_pieces(corners) if isinstance(light, PolygonLight) else [corners]:
-                yield piece, effort, chosen
+                yield piece, disks, chosen
     elif light.is_round:
         for outline, chosen in round_levels(light, position, width):
             yield outline, None, chosen
@@ -232,14 +232,14 @@ def _reaches(light: Light, samples: SurfaceSamples, lobes: np.ndarray) -> bool:
 
 
 @dataclass(frozen=True)
-class Framed:
+class LocalFrames:
     """Samples (P) and their local frames (3, 3, P): rows tangent, bitangent, normal."""
 
     samples: SurfaceSamples
     frame: np.ndarray
 
     @classmethod
-    def of(cls, samples: SurfaceSamples, normal: np.ndarray) -> Framed:
+    def of(cls, samples: SurfaceSamples, normal: np.ndarray) -> LocalFrames:
         """Frames around the normals (P, 3) of one of the lobes."""
         return cls(samples, local_frames(normal, samples.view))
 
@@ -249,7 +249,7 @@ def to_local(axes, vectors):
     return np.stack([sum(row[k] * vectors[k] for k in range(3)) for row in axes])
 
 
-def visible_parts(framed: Framed, light, corners, candidates, second_normal=None):
+def visible_polygons(framed: LocalFrames, light, corners, candidates, second_normal=None):
     """Yield (index, polygons (3, W, Q) in local frames) for the points of `candidates` that the light shines on.
 
     Polygons are clipped at the horizon of `second_normal` (P, 3), if there is one, and at the shading horizon. Those of
@@ -279,16 +279,16 @@ def visible_parts(framed: Framed, light, corners, candidates, second_normal=None
             yield index[outer][inner], clipped
 
 
-def seen_parts(framed: Framed, light, corners, candidates, width, second_normal=None):
-    """As `visible_parts`, but (index, polygons, effort), at the level that lobes of `width` (Q,) or a number need."""
+def visible_polygons_by_level(framed: LocalFrames, light, corners, candidates, width, second_normal=None):
+    """As `visible_polygons`, but (index, polygons, disks): at the level that lobes of `width` (Q,) or a number need."""
     position = framed.samples.position[candidates].T
-    for outline, effort, chosen in light_levels(light, corners, position, width):
+    for outline, disks, chosen in light_levels(light, corners, position, width):
         of_level = candidates if chosen is None else candidates[chosen]
-        for index, polygon in visible_parts(framed, light, outline, of_level, second_normal):
-            yield index, polygon, effort
+        for index, polygon in visible_polygons(framed, light, outline, of_level, second_normal):
+            yield index, polygon, disks
 
 
-def light_view(framed: Framed, light, index, to_lobe) -> light_profile.LightView:
+def light_view(framed: LocalFrames, light, index, to_lobe) -> light_profile.LightView:
     """The view of a profiled light from the points `index`. The first three coordinates are those of the lobe, from
     to_lobe(local vectors (3, Q)); the others are local."""
     axes = framed.frame[:, :, index]
@@ -321,7 +321,7 @@ class PatchTree:
     @classmethod
     def of(cls, light: Light) -> PatchTree:
         """The patches of a light with children, built once."""
-        return kept("_patch_tree", [light], cls._made)
+        return cached_on_children("_patch_tree", [light], cls._made)
 
     @classmethod
     def _made(cls, lights) -> PatchTree:
@@ -496,7 +496,7 @@ def _largest_sizes(area, radiance, first, count, is_distant) -> np.ndarray:
     return np.where(count == 0, np.inf, largest).astype(np.float32)
 
 
-def kept(name, lights, made):
+def cached_on_children(name, lights, made):
     """The result of made(lights). It is kept with the parts of the first light, which its copies share."""
     key = [light.children[0] for light in lights], [(*light.center, *light.radiance) for light in lights]
     kept = vars(lights[0].children[0])

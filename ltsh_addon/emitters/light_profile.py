@@ -1,7 +1,7 @@
 """Lights with a spread or a falloff: integrals over the light times a profile.
 
 There are two methods. In double precision, `layers` integrates over parts of the light. In single precision,
-`ConeRegions` sums over points of the light wherever few of them suffice, at a tenth to a hundredth of the cost.
+`ProfileRegions` sums over points of the light wherever few of them suffice, at a tenth to a hundredth of the cost.
 
 Let d be the distance of the shading point from the light's plane, and r the distance in that plane from the foot of
 the point. The factors of a `FlatLight` are a profile p(r). The profile of a spread is (R - r)+ / (d (tan h - h)), where
@@ -33,7 +33,7 @@ WIDTH_RANGE = (1e-4, 1e3)
 ROUND_MARGIN = 1.02
 
 
-def cone(spread: float) -> tuple[float, float]:
+def spread_tangent(spread: float) -> tuple[float, float]:
     """tan h, and tan h - h, the divisor of the factor, where h is half the `spread` in rad."""
     half = 0.5 * spread
     tangent = float(np.tan(half))
@@ -62,7 +62,7 @@ class Profile:
     @classmethod
     def of(cls, light) -> Profile:
         """The profile of `light`."""
-        tangent, share = cone(light.spread) if light.has_spread else (_WIDE_OPEN, _WIDE_OPEN)
+        tangent, share = spread_tangent(light.spread) if light.has_spread else (_WIDE_OPEN, _WIDE_OPEN)
         return cls(tangent, share, light.falloff, light.smooth)
 
     def at(self, radius, distance):
@@ -96,7 +96,7 @@ class Profile:
 
 def peak_factor(spread: float) -> float:
     """The factor straight ahead of the light, its largest value."""
-    tangent, share = cone(spread)
+    tangent, share = spread_tangent(spread)
     return tangent / share
 
 
@@ -113,7 +113,7 @@ def has_shear(light) -> bool:
 
 
 def upright(light):
-    """The same light in the form that `ConeRegions` needs. The half axes of an ellipse become its principal axes, at
+    """The same light in the form that `ProfileRegions` needs. The half axes of an ellipse become its principal axes, at
     right angles even if a transform sheared the light; half_u of a parallelogram becomes the shorter side."""
     u, v = light.half_u, light.half_v
     if not light.is_round:
@@ -124,8 +124,8 @@ def upright(light):
 
 
 @dataclass(frozen=True)
-class Effort:
-    """Number of layers per cone, and of chords per arc of a layer; at least 2 chords."""
+class DiskLayers:
+    """Number of disks around the foot over which integrals run, and of chords per arc of a disk; at least 2 chords."""
 
     layers: int
     chords: int
@@ -133,17 +133,17 @@ class Effort:
 
 # From the cheapest to the most accurate. The profile hardly varies over a light that is well inside the cone or far
 # away. Sharp lobes see the difference between chords and a circle.
-EFFORTS = (Effort(5, 2), Effort(8, 2), Effort(8, 4), Effort(8, 12))
+DISK_LAYERS = (DiskLayers(5, 2), DiskLayers(8, 2), DiskLayers(8, 4), DiskLayers(8, 12))
 # Largest extent of a light well inside the cone, as a share of its distance from the cone's edge or from the point.
 WELL_INSIDE = 0.25
 # Widths in rad from which on a lobe is wide, and below which it is sharp.
 WIDE_LOBE, SHARP_LOBE = 0.09, 0.01
 
 
-def efforts(light, position, width):
-    """Yield (effort, chosen (Q',)) for points with x, y, z in `position` (3, Q): `chosen` are the numbers of the points
-    that need `effort` for a profile error of about 0.3 %. Their lobes are `width` (Q,) or a number of radians wide.
-    All arrays are in double precision."""
+def disk_layers(light, position, width):
+    """Yield (disks, chosen (Q',)) for points with x, y, z in `position` (3, Q): `chosen` are the numbers of the points
+    that need these `DiskLayers` for a profile error of about 0.3 %. Their lobes are `width` (Q,) or a number of radians
+    wide. All arrays are in double precision."""
     extent, reach, beside = _place_in_cone(light, position)
     length = reach - beside
     if light.has_falloff:
@@ -152,7 +152,7 @@ def efforts(light, position, width):
     number = np.where(width >= WIDE_LOBE, np.where(inside, 0, 1), np.where(inside, 0, 2))
     number = np.where(width < SHARP_LOBE, 3, number)
     for chosen in np.unique(number):
-        yield EFFORTS[chosen], np.nonzero(number == chosen)[0]
+        yield DISK_LAYERS[chosen], np.nonzero(number == chosen)[0]
 
 
 def may_reach(light, position) -> np.ndarray:
@@ -231,29 +231,29 @@ class LightView:
         return np.where(seen, distance, 0.0), np.where(seen, width, np.inf)
 
 
-def layers(view: LightView, flat: np.ndarray, profile: Profile, effort: Effort):
+def layers(view: LightView, flat: np.ndarray, profile: Profile, disks: DiskLayers):
     """Yield (index (Q,), weights (Q,), corners (C, W, Q)) from the innermost polygon to the outermost. The lobe
     integrals over these polygons, times the weights, add up to the integral over the convex part `flat` (2, V, P) of
     the light times its profile.
     """
-    part = DiskParts(flat)
+    part = PolygonInDisks(flat)
     reach = profile.tangent * view.distance
     index = np.nonzero(part.least < reach)[0]
     if len(index) == 0:
         return
     if len(index) < flat.shape[2]:
-        part, view, reach = DiskParts(flat[:, :, index]), view.take(index), reach[index]
-    nodes, weights = _graded_nodes(part.least, np.minimum(part.largest, reach), *view.lobe_range(), effort.layers)
+        part, view, reach = PolygonInDisks(flat[:, :, index]), view.take(index), reach[index]
+    nodes, weights = _graded_nodes(part.least, np.minimum(part.largest, reach), *view.lobe_range(), disks.layers)
     for radius, weight in zip(nodes, weights, strict=True):
         weight = weight * profile.descent(radius, view.distance)
-        yield index, weight, view.corners(part.inside(radius, effort.chords))
+        yield index, weight, view.corners(part.inside(radius, disks.chords))
     whole = np.nonzero(part.largest < reach)[0]
     if len(whole):
         weight = profile.at(part.largest[whole], view.distance[whole])
         yield index[whole], weight, view.take(whole).corners(part.flat[:, :, whole])
 
 
-class DiskParts:
+class PolygonInDisks:
     """Convex polygons (2, V, P) in a light's plane, and their parts in disks around the origin, the foot of a point."""
 
     def __init__(self, flat: np.ndarray):
@@ -387,7 +387,7 @@ LONG = 2.0
 RADII = np.array([3, 4, 5])
 
 
-class ConeRegions:
+class ProfileRegions:
     """The region of a light that each point sees: the part in its cone and above its horizons, where the profile is
     not 0.
 

@@ -90,11 +90,11 @@ class LightTree:
     @classmethod
     def of(cls, lights) -> LightTree:
         """The tree of lights whose radiance is positive."""
-        center, area, covariance, diagonal = small_lights.all_of(lights)
+        center, area, covariance, diagonal = small_lights.moments_of(lights)
         radiance = np.array([light.radiance for light in lights])
         brightness, size = radiance.mean(axis=1), np.linalg.norm(area, axis=1)
         power, normal = brightness * size, area / size[:, None]
-        order, start, end, children = ranges(center, normal)
+        order, start, end, children = node_ranges(center, normal)
         sums = _Sums(order, start, end)
         total = sums(power)
         origin = center.mean(axis=0)
@@ -115,7 +115,7 @@ class LightTree:
         # Cosines are taken as uniform over sqrt(3) standard deviations of the directions on either side of the mean.
         turned = np.maximum(1.0 - (length[:, 0] / total) ** 2, 0.0) * (end - start > 1)
         swing = (total * np.maximum(np.sqrt(1.5 * turned), TURNED)).astype(np.float32)
-        cone = cones(axis, normal[order], start, end)
+        cone = normal_spreads(axis, normal[order], start, end)
         number = np.where(end - start == 1, order[start], -1)
         diagonal = (sums(power * diagonal) / total).astype(np.float32)
         reach = np.sqrt(3.0 * variances.sum(axis=1))
@@ -157,10 +157,10 @@ class _Sums:
 def stand_ins(lights, most: int) -> tuple[list[Light], np.ndarray]:
     """Rectangles that stand for many flat lights with an area, and the share (N,) of each that shines. Each stands
     for neighbors that face alike. There are N = `most`, a power of two and at most as many as there are lights."""
-    center, area, covariance, _ = small_lights.all_of(lights)
+    center, area, covariance, _ = small_lights.moments_of(lights)
     size = np.linalg.norm(area, axis=1)
     normal = area / size[:, None]
-    order, start, end, _ = ranges(center, normal, most)
+    order, start, end, _ = node_ranges(center, normal, most)
     sums = _Sums(order, start[-most:], end[-most:])
     whole = sums(size)
     radiance = sums(size[:, None] * np.array([light.radiance for light in lights])) / whole[:, None]
@@ -190,7 +190,7 @@ def stand_ins(lights, most: int) -> tuple[list[Light], np.ndarray]:
     return found, share
 
 
-def ranges(center, normal, most=np.inf):
+def node_ranges(center, normal, most=np.inf):
     """The order (L,) of the lights, the starts and the ends (N,) of the nodes in that order, and the children (N, 2) of
     the nodes. Each level halves the nodes above it where their lights differ most. The last level is the first that has
     `most` nodes."""
@@ -223,7 +223,7 @@ def ranges(center, normal, most=np.inf):
         ends.append(np.stack([middle, end], axis=1).ravel())
 
 
-def cones(axis, normals, start, end):
+def normal_spreads(axis, normals, start, end):
     """The largest angles (N,) in rad between the axes (N, 3) and the normals (L, 3) `start` to `end` of each node."""
     least, largest = np.ones(len(axis)), 1 << 16
     size = end - start
@@ -366,7 +366,7 @@ def _heights(ranges, offset, axis, cone):
 
 
 @dataclass(frozen=True)
-class _Between:
+class NodeDistances:
     """Where nodes are as seen from tiles, for K pairs; lengths in m."""
 
     offset: np.ndarray  # (K, 3) from center to center
@@ -378,7 +378,7 @@ class _Between:
     parallax: np.ndarray  # rad: how much directions from points of the tile to points of the node may differ
 
     @classmethod
-    def of(cls, tree: LightTree, tiles: Tiles, tile, node) -> _Between:
+    def of(cls, tree: LightTree, tiles: Tiles, tile, node) -> NodeDistances:
         """For the numbers (K,) of tiles and nodes."""
         offset = (tree.center[node] - tiles.center[tile]).astype(np.float32)
         half, reach, radius = tiles.half[tile], tree.reach[node], tiles.radius[tile]
@@ -419,7 +419,7 @@ class _Pairs:
     @classmethod
     def of(cls, tree: LightTree, tiles: Tiles, tile, node) -> _Pairs:
         """For the numbers (K,) of tiles and nodes."""
-        between = _Between.of(tree, tiles, tile, node)
+        between = NodeDistances.of(tree, tiles, tile, node)
         size, seen = between.reach / between.nearest, between.radius / between.nearest
         # Where a horizon or its own plane crosses a light, the cosine is at most this.
         rim = np.minimum(2.0 * size, 1.0)
@@ -491,7 +491,7 @@ class _Pairs:
         return cls(*(np.concatenate([getattr(part, own.name) for part in parts]) for own in fields(cls)))
 
 
-def _shining(tree: LightTree, node, between: _Between, rim):
+def _shining(tree: LightTree, node, between: NodeDistances, rim):
     """For K pairs: an upper bound on the light; the share of all light, and of this light, that may be wrong because a
     sample may be in the plane of a light; and whether the nodes face away."""
     angle, cone = _angles(-between.offset, between.distance, tree.axis[node]), tree.cone[node]
@@ -566,8 +566,8 @@ def add_far_lights(tree: LightTree, lobes, position, chosen, total) -> tuple[np.
 
 
 @dataclass(frozen=True)
-class _Fan:
-    """Like `small_lights.Rays`, arrays (Q, K) from Q samples of a tile to K points."""
+class PointDirections:
+    """Like `small_lights.RaysToCenters`, arrays (Q, K) from Q samples of a tile to K points."""
 
     ends: np.ndarray  # (4, K): offsets of the points from the middle of the tile, then 1
     place: np.ndarray  # (4, Q): offsets of the samples, then 1
@@ -608,7 +608,7 @@ class _Points:
         self.from_plane[:3], self.from_plane[3] = vector.T, -(vector * points).sum(axis=1)
         self.swing, self.diagonal = tree.swing[node], tree.diagonal[node]
 
-    def fan(self, part, place) -> _Fan:
+    def fan(self, part, place) -> PointDirections:
         """Rays from `place` (4, Q) to the points `part`, a slice."""
         ends, size = self.ends[:, part], dot(place, place)
         # Matrix products lose digits of the squares if points are near compared with the size of the tile.
@@ -624,7 +624,7 @@ class _Points:
             flux = _mean_above_zero(flux, self.swing[part] * distance)
         else:
             np.maximum(flux, np.float32(0.0), out=flux)
-        return _Fan(ends, place, squares, distance, flux, self.diagonal[part])
+        return PointDirections(ends, place, squares, distance, flux, self.diagonal[part])
 
 
 def _light_of(tree, lobes, position, tile) -> np.ndarray:

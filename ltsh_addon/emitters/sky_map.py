@@ -15,7 +15,7 @@ from functools import cache
 import numpy as np
 
 from ..lobes.polygon import dot
-from .light_polygons import PatchTree, kept
+from .light_polygons import PatchTree, cached_on_children
 from .light_profile import gauss_legendre
 
 # Greatest and least number of texels along each side of a side of a map.
@@ -48,7 +48,7 @@ class SkyMap:
     @classmethod
     def of(cls, lights) -> SkyMap:
         """The map of `SkyLight`s with children, made once."""
-        return kept("_sky_map", lights, cls._made)
+        return cached_on_children("_sky_map", lights, cls._made)
 
     @classmethod
     def _made(cls, lights) -> SkyMap:

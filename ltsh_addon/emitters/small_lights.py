@@ -50,7 +50,7 @@ class SmallLight:
         return cls(center, float(np.linalg.norm(light.corners - center, axis=1).max()), area, diagonal, covariance)
 
 
-def all_of(lights) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def moments_of(lights) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Centers (L, 3), area vectors (L, 3), covariances (L, 3, 3) and diagonals (L,), as in `SmallLight`."""
     center, u, v, direction = (
         np.array([getattr(light, name) for light in lights]) for name in ("center", "half_u", "half_v", "direction")
@@ -83,7 +83,7 @@ def _moments(corners, area):
 
 
 @dataclass(frozen=True)
-class Rays:
+class RaysToCenters:
     """Rays (...) from samples to the centers of small lights."""
 
     offset: np.ndarray  # (3, ...) m
@@ -94,7 +94,7 @@ class Rays:
     slack: np.ndarray | None = None  # (...): relative change of a specular lobe over the light
 
     @classmethod
-    def along(cls, offset, area_vector, diagonal) -> Rays:
+    def along(cls, offset, area_vector, diagonal) -> RaysToCenters:
         """Rays to lights with `area_vector` (3, ...) whose centers are at `offset` from the samples."""
         squares = dot(offset, offset)
         flux = np.maximum(-dot(area_vector, offset), np.float32(0.0))
@@ -104,11 +104,11 @@ class Rays:
         """Dot products (...) of the offsets with vectors (3, Q)."""
         return dot(vectors, self.offset)
 
-    def take(self, index) -> Rays:
+    def take(self, index) -> RaysToCenters:
         """The rays `index` (Q,) of the last axis."""
         chosen = (values[..., index] for values in (self.offset, self.squares, self.distance, self.flux))
         diagonal = self.diagonal[index] if np.ndim(self.diagonal) else self.diagonal
-        return Rays(*chosen, diagonal, None if self.slack is None else self.slack[index])
+        return RaysToCenters(*chosen, diagonal, None if self.slack is None else self.slack[index])
 
 
 class SharpestLobes:
@@ -119,7 +119,7 @@ class SharpestLobes:
         self.mirrored = np.float32(2.0) * cosine * normal - view
         self.width = (LOBE_WIDTH * width * np.maximum(np.abs(cosine), LEAST_COSINE)).astype(np.float32)
 
-    def lengths(self, part, rays: Rays, size) -> np.ndarray:
+    def lengths(self, part, rays: RaysToCenters, size) -> np.ndarray:
         """The least angle (...) in rad, at most 1, over which the lobes `part` change within lights of a radius of
         `size` rad."""
         toward = dot(self.mirrored[:, part], rays.offset)
@@ -129,14 +129,14 @@ class SharpestLobes:
         return np.minimum(np.maximum(chord, np.float32(0.0)) + self.width[part], np.float32(1.0))
 
 
-def seen_sizes(lobes, part, rays: Rays, radius) -> np.ndarray:
+def relative_sizes(lobes, part, rays: RaysToCenters, radius) -> np.ndarray:
     """Radii (...) of lights of `radius` m, in units of the length over which the lobes `part` change."""
     size = np.float32(radius) / rays.distance
     return size if lobes.sharpest is None else size / lobes.sharpest.lengths(part, rays, size)
 
 
-def small_and_lit(lobes, part, rays: Rays, radius, size) -> tuple[np.ndarray, np.ndarray]:
-    """Masks (...) of the lights that are small, given `size` from `seen_sizes`, and of those that also light the
+def small_and_lit(lobes, part, rays: RaysToCenters, radius, size) -> tuple[np.ndarray, np.ndarray]:
+    """Masks (...) of the lights that are small, given `size` from `relative_sizes`, and of those that also light the
     samples.
 
     Lights that cross a horizon are not small.
@@ -156,7 +156,7 @@ class CosineAtPoint:
     def __init__(self, rows):
         self.normal = rows[2]
 
-    def __call__(self, part, rays: Rays):
+    def __call__(self, part, rays: RaysToCenters):
         values = rays.heights(self.normal[:, part])
         np.maximum(values, np.float32(0.0), out=values)
         values *= rays.flux
@@ -193,7 +193,7 @@ class ShadowedCosineAtPoint:
     def __init__(self, rows, bump_alpha2):
         self.plain, self.smooth, self.bump_alpha2 = CosineAtPoint(rows), rows[3], bump_alpha2
 
-    def __call__(self, part, rays: Rays):
+    def __call__(self, part, rays: RaysToCenters):
         along = rays.heights(self.smooth[:, part])
         return self.plain(part, rays) * self._shadowing(part, along, rays.squares)
 
@@ -229,7 +229,7 @@ class LobeAtPoint:
         ]))  # fmt: skip
         self.terms = weights if self.is_cosine else polynomial_terms(weights)
 
-    def __call__(self, part, rays: Rays):
+    def __call__(self, part, rays: RaysToCenters):
         x, y, z = (rays.heights(row[:, part]) for row in self.rows[:3])
         inverse = np.float32(1.0) / np.sqrt(x * x + y * y + z * z)
         angle = inverse * inverse * inverse

@@ -24,7 +24,7 @@ _TINY = 1e-12
 
 
 @dataclass(frozen=True)
-class SeenLight:
+class LightFromPoints:
     """Lights as Q points see them: one light for all points, or one for each. "..." stands for Q or 1."""
 
     offset: np.ndarray  # (3, Q) of the light's center from the points
@@ -35,7 +35,7 @@ class SeenLight:
     profile: Profile | None
 
     @classmethod
-    def of(cls, light, offset, toward) -> SeenLight:
+    def of(cls, light, offset, toward) -> LightFromPoints:
         """For an Light or a `float64.LightOfEachSample`, in the precision of `offset`."""
         vectors = np.stack([light.half_u + light.half_v, light.half_u - light.half_v, light.area_vector])
         vectors = vectors[..., None] if vectors.ndim == 2 else vectors.transpose(0, 2, 1)
@@ -44,14 +44,14 @@ class SeenLight:
         return cls(offset, toward, vectors[:2].astype(offset.dtype), squares[:2], np.sqrt(squares[2]), profile)
 
     @classmethod
-    def of_plain(cls, halves, area, offset, toward) -> SeenLight:
+    def of_plain(cls, halves, area, offset, toward) -> LightFromPoints:
         """For lights without a profile, given by two half axes (3, Q) and area vectors (3, Q)."""
         u, v = halves
         diagonals = np.stack([u + v, u - v])
         return cls(offset, toward, diagonals, (diagonals * diagonals).sum(axis=1), np.sqrt(dot(area, area)), None)
 
     @classmethod
-    def of_disk(cls, disk) -> SeenLight:
+    def of_disk(cls, disk) -> LightFromPoints:
         """For a FacingDisk."""
         u, v = disk.half_u, disk.half_v
         square = disk.radius * disk.radius
@@ -100,7 +100,7 @@ class TailLimits:
         *values, ior = (value if value is None else value[..., part] for value in values)
         return TailLimits(*values, self.schlick, ior)
 
-    def apply(self, integrals, part, light: SeenLight, scratch) -> None:
+    def apply(self, integrals, part, light: LightFromPoints, scratch) -> None:
         """Limit integrals (F, Q') over the light as the samples `part` see it, in place.
 
         In the tail, the first integral (for F = 1) is brought between two bounds: the least and the greatest integrand
@@ -115,7 +115,7 @@ class TailLimits:
 
     def apply_at_centers(self, integrals, part, rays) -> None:
         """As `apply`, for integrals (F, ...) over lights so small that their center stands for all of them. The centers
-        are the ends of `rays`, `small_lights.Rays`."""
+        are the ends of `rays`, `small_lights.RaysToCenters`."""
         lobes = self.take(part)
         tail, value, cosine = lobes.true_and_tail(rays)
         margin = rays.slack * value

@@ -15,7 +15,7 @@ from functools import cached_property, partial
 import numpy as np
 
 from ..emitters import light_profile, small_lights
-from ..emitters.facing import FacingDisk, Lobe, mean_emission
+from ..emitters.facing import AnalyticLobe, FacingDisk, mean_emission
 from ..emitters.light_polygons import (
     interpolated,
     light_levels,
@@ -25,7 +25,7 @@ from ..emitters.light_polygons import (
 )
 from ..emitters.light_tree import FEWEST, LightTree, add_far_lights
 from ..emitters.sky_map import SkyMap
-from ..emitters.tails import SeenLight, TailLimits
+from ..emitters.tails import LightFromPoints, TailLimits
 from ..lobes import moments32
 from ..lobes.lobe_integrals import FLOAT64_CHUNK, LEAST_SHARE, NARROWEST
 from ..lobes.lookup_table import MIN_ALPHA
@@ -144,7 +144,7 @@ class Lobes:
     rows: np.ndarray  # (C, 3, Q) axes of the coordinates that `integrate` takes
     clip_rows: tuple[int, ...]  # numbers of the coordinates that are positive above a horizon
     integrate: Callable  # integrate(columns, corners, index, smallest) -> integrals (F, Q') and mask of what to redo
-    at_point: Callable  # integrals (F, Q') over small lights by columns and `small_lights.Rays`
+    at_point: Callable  # integrals (F, Q') over small lights by columns and `small_lights.RaysToCenters`
     colors: np.ndarray  # (F, 3, Q) reflectances by which the integrals are multiplied
     width: np.ndarray | float  # rad, as for `light_levels`
     limits: TailLimits | None = None
@@ -186,7 +186,7 @@ class AlikeLights:
     def of(cls, lights, numbers) -> AlikeLights:
         """Those of `lights`, (light, row, corners), with these `numbers` (L,)."""
         own = [lights[number][0] for number in numbers]
-        centroid, area, _, diagonal = small_lights.all_of(own)
+        centroid, area, _, diagonal = small_lights.moments_of(own)
         center = np.array([light.center for light in own])
         corners = np.array([lights[number][2] for number in numbers])
         radius = np.sqrt(np.square(corners - centroid[:, None]).sum(axis=2).max(axis=1))
@@ -285,7 +285,7 @@ class _Lighting:
         if not lobes.only_tails:
             if not light.has_profile:
                 rest = self._add_small(lobes, light, position, (columns, allowed), sums[row])
-            elif light_profile.ConeRegions.suit(light):
+            elif light_profile.ProfileRegions.suit(light):
                 rest = self._add_points(lobes, light, position, (columns, allowed), sums[row])
             if rest is not None and len(rest) == 0:
                 return
@@ -322,7 +322,7 @@ class _Lighting:
         polygons = local_corners(seen, outline, offset, axes, self.scratch)
         found, redo = integrate_visible(polygons, facing, lobes.clip_rows, len(lobes.colors), integrate)
         if lobes.limits is not None:
-            own = SeenLight.of_disk(seen) if light.is_facing else SeenLight.of(light, offset, toward)
+            own = LightFromPoints.of_disk(seen) if light.is_facing else LightFromPoints.of(light, offset, toward)
             lobes.limits.apply(found, part, own, self.scratch)
         if light.is_facing:
             found *= factor
@@ -376,8 +376,8 @@ class _Lighting:
             part, own = columns[piece], number[piece]
             offset = (lights.centers[1][:, own] - position[:, part]).astype(np.float32)
             radius = lights.radius[own]
-            rays = small_lights.Rays.along(offset, lights.area_vector[:, own], lights.diagonal[own])
-            size = small_lights.seen_sizes(lobes, part, rays, radius)
+            rays = small_lights.RaysToCenters.along(offset, lights.area_vector[:, own], lights.diagonal[own])
+            size = small_lights.relative_sizes(lobes, part, rays, radius)
             rays = replace(rays, slack=np.float32(small_lights.VARIATION) * size)
             small, lit = small_lights.small_and_lit(lobes, part, rays, radius, size)
             left.append(piece.start + np.nonzero(~small)[0])
@@ -398,7 +398,7 @@ class _Lighting:
             found, redo = integrate_visible(polygons, facing, lobes.clip_rows, len(total), integrate)
             if lobes.limits is not None:
                 halves = lights.half_u[:, own], lights.half_v[:, own]
-                seen = SeenLight.of_plain(halves, lights.area_vector[:, own], offset, toward)
+                seen = LightFromPoints.of_plain(halves, lights.area_vector[:, own], offset, toward)
                 lobes.limits.apply(found, part, seen, self.scratch)
             if redo.any():
                 found[:, redo] = 0.0
@@ -416,10 +416,10 @@ class _Lighting:
         for piece in moments32.pieces(count, SMALL_CHUNK):
             part = piece if columns is None else columns[piece]
             offset = (seen.center[:, None] - origins[:, part]).astype(np.float32)
-            rays = small_lights.Rays.along(offset, area_vector, np.float32(seen.diagonal))
+            rays = small_lights.RaysToCenters.along(offset, area_vector, np.float32(seen.diagonal))
             if light.is_facing:
                 rays = replace(rays, flux=np.float32(np.linalg.norm(light.area_vector)) * rays.distance)
-            size = small_lights.seen_sizes(lobes, part, rays, seen.radius)
+            size = small_lights.relative_sizes(lobes, part, rays, seen.radius)
             rays = replace(rays, slack=np.float32(small_lights.VARIATION) * size)
             small, lit = small_lights.small_and_lit(lobes, part, rays, seen.radius, size)
             if not small.all():
@@ -454,7 +454,7 @@ class _Lighting:
             part = columns[piece]
             offset = (light.center[:, None] - position[:, part]).astype(np.float32)
             view = light_profile.LightView.of(light, offset, partial(_along_rows, lobes.rows[:, :, part]))
-            regions = light_profile.ConeRegions(light, view, lobes.clip_rows)
+            regions = light_profile.ProfileRegions(light, view, lobes.clip_rows)
             for count, kind, index in regions.rules():
                 if count == 0:
                     left.append(part[index])
@@ -466,7 +466,7 @@ class _Lighting:
                     found *= view.distance[chosen]
                     if lobes.limits is not None:
                         seen = offset[:, chosen]
-                        seen = SeenLight.of(light, seen, dot(seen, light.direction.astype(np.float32)))
+                        seen = LightFromPoints.of(light, seen, dot(seen, light.direction.astype(np.float32)))
                         lobes.limits.apply(found, part[chosen], seen, self.scratch)
                     for channel in range(3):
                         total[:, channel, part[chosen]] += found * np.float32(light.radiance[channel])
@@ -478,13 +478,13 @@ class _Lighting:
         disk = FacingDisk.of(light, offset, lobe.normal)
         return disk, mean_emission(light, offset, disk, lobe)
 
-    def _lobe(self, index) -> Lobe:
+    def _lobe(self, index) -> AnalyticLobe:
         """The lobes of the samples `index`, without their colors."""
         samples = self.samples
         if self.shade_in_float64 is float64.shade_diffuse:
-            return Lobe(_columns(samples.diffuse_normal, index))
+            return AnalyticLobe(_columns(samples.diffuse_normal, index))
         alpha = np.maximum(samples.roughness[index].astype(np.float32) ** 2, np.float32(MIN_ALPHA))
-        return Lobe(_columns(samples.normal, index), _columns(samples.view, index), alpha)
+        return AnalyticLobe(_columns(samples.normal, index), _columns(samples.view, index), alpha)
 
     def add_in_float64(self, members) -> None:
         """Add the light of all lights at the samples `members` (Q,)."""

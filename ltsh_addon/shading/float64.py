@@ -12,8 +12,8 @@ import numpy as np
 
 from ..emitters import facing, light_profile
 from ..emitters.facing import FacingDisk
-from ..emitters.light_polygons import Framed, PatchTree, has_lobe, light_view, seen_parts, to_local
-from ..emitters.tails import SeenLight, TailLimits
+from ..emitters.light_polygons import LocalFrames, PatchTree, has_lobe, light_view, to_local, visible_polygons_by_level
+from ..emitters.tails import LightFromPoints, TailLimits
 from ..lobes import diffuse
 from ..lobes.brdf import (
     HalfVectors,
@@ -108,7 +108,7 @@ def _of(vector, index):
 
 def shade_diffuse(samples, lights, radiance):
     """Add to `radiance` (R, P, 3) what the diffuse lobes of `samples` reflect of `lights`, (light, row, corners)."""
-    framed = Framed.of(samples, samples.diffuse_normal)
+    framed = LocalFrames.of(samples, samples.diffuse_normal)
     lit = np.nonzero(samples.diffuse_albedo.any(axis=1))[0]
     kinds = list(_diffuse_kinds(framed, lit))
     is_plain = (samples.diffuse_normal[lit] == samples.smooth_normal[lit]).all(axis=1)
@@ -130,7 +130,7 @@ def shade_diffuse(samples, lights, radiance):
                 shade_patches(samples, index[columns], patches, tree, radiance[row], shade_own)
             continue
         for candidates, second_normal, count, integral in kinds:
-            for part in seen_parts(framed, light, corners, candidates, 1.0, second_normal):
+            for part in visible_polygons_by_level(framed, light, corners, candidates, 1.0, second_normal):
                 index, polygon, _ = part
                 if light.has_profile:
                     view = light_view(framed, light, index, lambda vectors: vectors)
@@ -138,7 +138,7 @@ def shade_diffuse(samples, lights, radiance):
                 else:
                     irradiance = integral(polygon, index)
                 if light.is_facing:
-                    own = facing.Lobe(framed.frame[2][:, index])
+                    own = facing.AnalyticLobe(framed.frame[2][:, index])
                     irradiance = irradiance * _mean_emission(light, samples, index, own)
                 reflected = irradiance[0][:, None] * samples.diffuse_albedo[index]
                 if count > 1:
@@ -198,8 +198,8 @@ def lobe_width(samples, index) -> np.ndarray:
 
 
 def _profiled(light, view, part, integral, count):
-    """Integrals (count, Q) over polygons (5, W, Q) times the profile of the light. `part` is from `seen_parts`;
-    integral(polygons, index) is the integral without the profile."""
+    """Integrals (count, Q) over polygons (5, W, Q) times the profile of the light. `part` is from
+    `visible_polygons_by_level`; integral(polygons, index) is the integral without the profile."""
     index, polygon, effort = part
     result = np.zeros((count, len(index)))
     for near, weights, corners in light_profile.layers(view, polygon[3:], light_profile.Profile.of(light), effort):
@@ -221,7 +221,7 @@ def shade_specular(samples, lights, table, radiance, error=None):
     """As `shade_diffuse`, for the specular lobes. If `table` is REFERENCE, its error estimates are added to `error`
     (P,)."""
     cosine = (samples.normal * samples.view).sum(axis=1)
-    framed = Framed.of(samples, samples.normal)
+    framed = LocalFrames.of(samples, samples.normal)
     lit = np.nonzero((cosine > 0.0) & has_lobe(samples)[1])[0]
     cosine = np.clip(cosine, 0.0, 1.0)
     lobe, bent = None, np.zeros(len(samples), bool)
@@ -252,7 +252,7 @@ def shade_specular(samples, lights, table, radiance, error=None):
         else:
             plain = lit[~is_anisotropic]
             width = lobe_width(samples, plain)
-            visible = seen_parts(framed, light, corners, plain, width, samples.geometric_normal)
+            visible = visible_polygons_by_level(framed, light, corners, plain, width, samples.geometric_normal)
             parts = ((part[0], _table_integrals(table, lobe, framed, light, part)) for part in visible)
             if light.has_profile and isinstance(light, PolygonLight):
                 parts = _joined(parts, len(samples))
@@ -280,7 +280,7 @@ def _finished(parts, table, samples, light):
             _limit(integrals, samples, index, light)
         if light.is_facing:
             alpha = np.maximum(samples.roughness[index].astype(np.float64) ** 2, MIN_ALPHA)
-            own = facing.Lobe(samples.normal[index].T, samples.view[index].T, alpha)
+            own = facing.AnalyticLobe(samples.normal[index].T, samples.view[index].T, alpha)
             integrals *= _mean_emission(light, samples, index, own)
         yield index, integrals
 
@@ -335,9 +335,9 @@ def _limit(integrals, samples, index, light):
     axes = samples.normal[index].T, samples.view[index].T
     offset = (own.center - own.viewpoint(samples.position[index])).T
     if light.is_facing:
-        seen = SeenLight.of_disk(FacingDisk.of(light, offset, axes[0]))
+        seen = LightFromPoints.of_disk(FacingDisk.of(light, offset, axes[0]))
     else:
-        seen = SeenLight.of(own, offset, dot(offset, own.direction.T))
+        seen = LightFromPoints.of(own, offset, dot(offset, own.direction.T))
     limits = TailLimits.of(axes, samples.roughness[index], samples.geometric_normal[index].T, True, samples.ior[index])
     limits.apply(integrals, slice(None), seen, lambda name, shape: np.empty(shape))
 
@@ -354,8 +354,8 @@ def _fresnel_lobe(table: LookupTable, cosine, samples) -> Lobe:
 
 
 def _table_integrals(table, lobe, framed, light, part):
-    """Integrals (4, Q), never negative, over a `part` from `seen_parts`. Its corners run counterclockwise as seen from
-    the point (`Light.polygon`)."""
+    """Integrals (4, Q), never negative, over a `part` from `visible_polygons_by_level`. Its corners run
+    counterclockwise as seen from the point (`Light.polygon`)."""
 
     # Coefficients of z / pi, the clamped cosine of mass 1.
     cosine = np.zeros((1, lobe.coefficients.shape[1], 1))

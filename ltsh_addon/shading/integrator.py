@@ -194,7 +194,7 @@ def _corners_integrated(light, is_reference):
     """Estimated number of corners in the integrals over a light."""
     count = len(light.polygon()) * min(len(light.leaves), PATCHES)
     if light.has_profile:
-        effort = light_profile.EFFORTS[1]
+        effort = light_profile.DISK_LAYERS[1]
         count *= (2 * effort.chords + 1) * (1 if is_reference else effort.layers)
     return count
 
@@ -262,9 +262,9 @@ def shade(
     False to stop: Cancelled is raised. Also raises TableError and ValueError.
 
     With `dtype` float32, radiance is float32 and within 2e-5 of that with float64, per unit of the lights' radiance;
-    for lights with a spread, of their radiance straight ahead. Spreads are accurate to 0.3 % (see `light_cone`). Points
-    for which single precision does not suffice are computed in double. So are lights a thousand times as long as wide,
-    whose error in single precision is 4e-4 of their light, and always "reference" and degrees above 4.
+    for lights with a spread, of their radiance straight ahead. Spreads are accurate to 0.3 % (see `light_profile`).
+    Points for which single precision does not suffice are computed in double. So are lights a thousand times as long as
+    wide, whose error in single precision is 4e-4 of their light, and always "reference" and degrees above 4.
     """
     if is_own(technique):
         return _shade_with(technique, samples, tuple(lights), tuple(passes), (workers, progress, dtype, rows))

@@ -20,7 +20,7 @@ import numpy as np
 
 from ..emitters import light_profile
 from ..emitters.facing import FacingDisk, emission
-from ..emitters.light_polygons import in_front, light_view, to_local, visible_parts
+from ..emitters.light_polygons import in_front, light_view, to_local, visible_polygons
 from ..lobes import brdf
 from ..lobes.brdf import HalfBoundary, HalfVectors
 from ..lobes.edge_integrals import arc_factors
@@ -460,7 +460,7 @@ def _whole_cone(framed, light, index, profile) -> Cone:
 
 def _polygons(framed, light, corners, candidates):
     """Yield (index, polygons (3, V, Q) in local frames, None)."""
-    for index, polygon in visible_parts(framed, light, corners, candidates, framed.samples.geometric_normal):
+    for index, polygon in visible_polygons(framed, light, corners, candidates, framed.samples.geometric_normal):
         yield index, polygon[:3], None
 
 
@@ -505,14 +505,14 @@ def _cone_parts(framed, cosine, light, corners, candidates):
     foot, where the factor has its tip, and the peak of the lobe lie in it."""
     profile = light_profile.Profile.of(light)
     tangent = profile.tangent
-    for index, polygon in visible_parts(framed, light, corners, candidates, framed.samples.geometric_normal):
+    for index, polygon in visible_polygons(framed, light, corners, candidates, framed.samples.geometric_normal):
         warp = limit_warp(cosine[index], framed.samples.roughness[index] ** 2)
         view = light_view(framed, light, index, warp.to_original_domain)
-        near = np.nonzero(light_profile.DiskParts(polygon[3:]).least < tangent * view.distance)[0]
+        near = np.nonzero(light_profile.PolygonInDisks(polygon[3:]).least < tangent * view.distance)[0]
         if len(near) == 0:
             continue
         index, view = index[near], view.take(near)
-        part = light_profile.DiskParts(polygon[3:, :, near])
+        part = light_profile.PolygonInDisks(polygon[3:, :, near])
         reach = tangent * view.distance
         flat = part.inside(reach, _CONE_CHORDS)
         axis = view.foot[3:] / view.distance

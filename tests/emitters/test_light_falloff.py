@@ -51,8 +51,9 @@ FALLOFFS = {"linear": (1, 0.0), "constant": (2, 0.0), "smooth": (0, 2.0), "smoot
 @pytest.mark.parametrize("name", FALLOFFS)
 @pytest.mark.parametrize(("height", "roughness"), [(1.5, 0.3), (0.8, 0.6), (4.0, 0.2)])
 def test_a_falloff_is_that_of_many_small_lights(monkeypatch, name, height, roughness):
-    """`light_cone` promises 0.3 %; the small lights, an eighth of a meter wide, are off by their size over the distance
-    squared, over 24: less than 1e-3. The limits in the tails, which each light has as a whole, do not add up."""
+    """`light_profile` promises 0.3 %; the small lights, an eighth of a meter wide, are off by their size over the
+    distance squared, over 24: less than 1e-3. The limits in the tails, which each light has as a whole, do not add
+    up."""
     monkeypatch.setattr(tails, "NEAR_RADII", np.inf)
     falloff, smooth = FALLOFFS[name]
     samples, whole = surface(roughness), light(height, falloff=falloff, smooth=smooth)

@@ -110,13 +110,13 @@ def test_few_points_of_a_light_are_as_good_as_many(place, degrees, monkeypatch):
     samples = random_samples(150, seed=8, lowest_roughness=0.15)
     options = {**PLACES[place], "spread": np.radians(degrees), "radiance": (1, 1, 1)}
     lights = [area_light(center=(x, 0.4, 1.5), **options) for x in (0, 1)]
-    assert all(light_profile.ConeRegions.suit(light) for light in lights)
+    assert all(light_profile.ProfileRegions.suit(light) for light in lights)
     few = shading.shade(samples, lights, "ltsh4", workers=1)
 
     def all_dense(regions):
         yield 60, light_profile.GRADED, np.nonzero((regions.high > regions.low) & (regions.highest > regions.lowest))[0]
 
-    monkeypatch.setattr(light_profile.ConeRegions, "rules", all_dense)
+    monkeypatch.setattr(light_profile.ProfileRegions, "rules", all_dense)
     many = shading.shade(samples, lights, "ltsh4", workers=1)
     for part in shading.PASSES:
         found, expected = getattr(few, part)[0, :, 0], getattr(many, part)[0, :, 0]
@@ -137,7 +137,7 @@ def test_points_of_long_and_sheared_lights_are_where_those_are(place):
     inside = s * s + t * t < 1.0 if light.is_round else np.ones(len(s), bool)
     points = light.center + s[inside, None] * light.half_u + t[inside, None] * light.half_v
     area = np.linalg.norm(light.area_vector) / len(points)
-    tangent, share = light_profile.cone(light.spread)
+    tangent, share = light_profile.spread_tangent(light.spread)
     expected = np.empty(60)
     for row, (position, normal) in enumerate(zip(samples.position, samples.diffuse_normal, strict=True)):
         offset = points - position
@@ -292,7 +292,7 @@ def test_a_sheared_ellipse_is_the_ellipse_that_it_is():
     sheared = replace(area_light(shape="ELLIPSE", half_u=u, half_v=v, center=(0, 0, 2.0)), spread=np.radians(70.0))
     other = {"half_u": np.cos(turn) * u + np.sin(turn) * v, "half_v": np.cos(turn) * v - np.sin(turn) * u}
     upright = light_profile.upright(sheared)
-    assert abs(upright.half_u @ upright.half_v) < 1e-12 and light_profile.ConeRegions.suit(upright)
+    assert abs(upright.half_u @ upright.half_v) < 1e-12 and light_profile.ProfileRegions.suit(upright)
     assert np.allclose(upright.area_vector, sheared.area_vector)
     samples = random_samples(60, seed=8)
     one, two = (

@@ -42,7 +42,7 @@ def _circle(count):
 _FEW_SIZES = {8: 0.15, 16: 1.0}
 _CIRCLES = (*_FEW_SIZES, *ROUND_CORNERS)
 _SIZES = (*_FEW_SIZES.values(), *(0.25 * limit * limit for limit in ROUND_LIMITS), np.inf)
-_NODES = tuple(sorted({effort.layers for effort in light_profile.EFFORTS}))
+_NODES = tuple(sorted({effort.layers for effort in light_profile.DISK_LAYERS}))
 _SHARED = [
     _QUAD,
     *(_circle(count) for count in _CIRCLES),

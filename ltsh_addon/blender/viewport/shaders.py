@@ -150,9 +150,9 @@ def _lighting_source(table, features) -> str:
 
 
 def _lighting_constants(table) -> dict:
-    plain, beyond, sharp, sharpest = light_profile.EFFORTS
+    plain, beyond, sharp, sharpest = light_profile.DISK_LAYERS
     if {beyond.layers, sharp.layers, sharpest.layers} != {beyond.layers}:
-        raise ValueError("the efforts of light_cone have changed: all but the first had equally many layers")
+        raise ValueError("DISK_LAYERS of light_profile have changed: all but the first had equally many layers")
     sizes = table_sizes(table)
     few_corners, many_corners = FOCUSED_ROUND_CORNERS
     return {

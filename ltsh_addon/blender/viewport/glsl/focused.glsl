@@ -1,4 +1,4 @@
-/* The integral of a lobe over a light with a spread or a falloff, as in `shading.light_cone`, node by node.
+/* The integral of a lobe over a light with a spread or a falloff, as in `light_profile`, node by node.
 
    The part of the light above all horizons is kept as a list of corners, since every disk around the foot of the point
    cuts it anew. Edges outside of a disk are moved along radii to its circle, and arcs become chords. */

@@ -1,4 +1,4 @@
-/* Parts of lights in their planes, cut by disks: `DiskParts` of `shading.light_cone`. */
+/* Parts of lights in their planes, cut by disks: `PolygonInDisks` of `light_profile`. */
 
 /* A part of a light, in coordinates of its plane with the foot of the point as the origin: number of corners, least and
    largest distance from the foot, whether it contains the foot, and the direction toward its nearest point. The corners
@@ -21,7 +21,7 @@ float ltsh_falloff(vec2 falloff, float squared)
     return power * (falloff.y > 0.0 ? squared / (squared + falloff.y) : 1.0);
 }
 
-/* The profile of a light at a radius, as in `shading.light_cone`; `ltsh_descent` is its negative derivative. */
+/* The profile of a light at a radius, as in `light_profile`; `ltsh_descent` is its negative derivative. */
 float ltsh_profile(vec4 cone, vec2 falloff, float radius, float distance)
 {
     return max((cone.x - radius / distance) * cone.y, 0.0) * ltsh_falloff(falloff, distance * distance + radius * radius);

@@ -392,7 +392,7 @@ def _shining(tree: LightTree, node, between: NodeDistances, rim):
 
 
 def _refined(tree, tiles, is_fine) -> TileNodePairs:
-    """The coarsest `TileNodePairs` of all tiles for which is_fine(pairs) holds or which are leaves, without dark ones."""
+    """The coarsest pairs of all tiles for which is_fine(pairs) holds or which are leaves, without dark ones."""
     fine, tile, node = [], np.arange(len(tiles.columns)), np.zeros(len(tiles.columns), int)
     while len(node) or not fine:
         pairs = TileNodePairs.of(tree, tiles, tile, node)
@@ -516,8 +516,8 @@ class NodePoints:
 
 
 def _light_of(tree, lobes, position, tile) -> np.ndarray:
-    """The light (F, 3, Q) of nodes. `tile` is the columns (Q,), at x, y, z in `position` (3, Q), and the `TileNodePairs` with
-    the nodes."""
+    """The light (F, 3, Q) of nodes. `tile` is the columns (Q,), at x, y, z in `position` (3, Q), and the pairs with the
+    nodes."""
     columns, pairs = tile
     middle = position.mean(axis=1)
     origins = np.ones((4, len(columns)), np.float32)

@@ -72,7 +72,7 @@ class Draft:
         shape = 4, len(samples)
         like, weights = np.zeros(shape, np.int32), np.zeros(shape, np.float32)
         for corner, (right, below) in enumerate(itertools.product((0, 1), repeat=2)):
-            column, row = (STEP * (place // STEP + step) for place, step in ((x, right), (y, below)))
+            column, row = (STEP * (coordinate // STEP + step) for coordinate, step in ((x, right), (y, below)))
             weight = (1.0 - np.abs(column - x) / STEP) * (1.0 - np.abs(row - y) / STEP)
             there = ~is_own & (weight > 0.0) & (column < film.width) & (row < film.height)
             pixel = np.where(there, row * film.width + column, 0)
@@ -98,10 +98,10 @@ class Draft:
         """Radiance (P, 3) of all samples in the pass `name`, from the `radiance` (Q, 3) of the draft's."""
         color = self.colors[name]
         light = np.divide(radiance, color[self.index], out=np.zeros_like(radiance), where=color[self.index] > 0.0)
-        found = np.zeros_like(color)
+        interpolated = np.zeros_like(color)
         for source, weight in zip(self.sources, self.weights, strict=True):
-            found += weight[:, None] * light[source]
-        return found * color
+            interpolated += weight[:, None] * light[source]
+        return interpolated * color
 
 
 def _coarse(film: Film) -> Film:
@@ -171,7 +171,7 @@ class MovedLights:
 
     def __init__(self, read: Callable[[], tuple[RelightData, Occluders | None]]):
         """`read` is called at the first picture; its exceptions are raised there."""
-        self._read, self._kept, self._occluders = read, None, None
+        self._read, self._relight_data, self._occluders = read, None, None
         self._pool, self._ending = None, ExitStack()
         # Without `close`, the workers end with this object or with Python.
         weakref.finalize(self, self._ending.close)
@@ -185,10 +185,10 @@ class MovedLights:
         """
 
         def read():
-            kept, occluders = RelightData.load(path), None
-            if kept.shadows is not None:
+            relight_data, occluders = RelightData.load(path), None
+            if relight_data.shadows is not None:
                 occluders = Occluders.load(path.with_name(path.name.removesuffix(RELIGHT_SUFFIX) + OCCLUDERS_SUFFIX))
-            return kept, occluders
+            return relight_data, occluders
 
         return cls(read)
 
@@ -252,11 +252,11 @@ class MovedLights:
         self._check(turn)
         if self._pool is None:
             self._start()
-        kept = self._kept
-        light = light.moved(-kept.extraction.origin)
+        relight_data = self._relight_data
+        light = light.moved(-relight_data.extraction.origin)
         if self._tracer is None:
             return MovedLightTask(light, None, self._table, self._passes)
-        rays = rays_of_samples(kept.options["shadow_rays"], kept.extraction.film)
+        rays = rays_of_samples(relight_data.options["shadow_rays"], relight_data.extraction.film)
         shadows = task_of_lights(self._whole.shadowed, (light,), self._tracer, self._passes, rays)
         # The light gets as many rays as it would get in a new picture, beside the other lights.
         typical = {name: max(value, self._typical[name]) for name, value in shadows.typical.items()}
@@ -278,13 +278,13 @@ class MovedLights:
             yield done
 
     def _image(self, values, row: MixerRow | None) -> np.ndarray:
-        kept = self._kept
-        image = np.zeros((kept.extraction.film.height, kept.extraction.film.width, 3), np.float32)
+        relight_data = self._relight_data
+        image = np.zeros((relight_data.extraction.film.height, relight_data.extraction.film.width, 3), np.float32)
         for name, radiance in values.items():
-            image += kept.shown(name, moved=True) * kept.extraction.film.image(
-                kept.extraction.picture.exposure * radiance
+            image += relight_data.shown(name, moved=True) * relight_data.extraction.film.image(
+                relight_data.extraction.picture.exposure * radiance
             )
-        return image if row is None else image + bounced_light(kept, row)
+        return image if row is None else image + bounced_light(relight_data, row)
 
     def close(self) -> None:
         """End the processes; the next picture starts new ones."""
@@ -296,26 +296,26 @@ class MovedLights:
     def _start(self) -> None:
         from ..blender.process.blender_process import embree_libraries
 
-        if self._kept is None:
-            self._kept, self._occluders = self._read()
-        kept, film = self._kept, self._kept.extraction.film
-        samples = kept.extraction.samples
-        samples = replace(samples, position=samples.position - kept.extraction.origin)
+        if self._relight_data is None:
+            self._relight_data, self._occluders = self._read()
+        relight_data, film = self._relight_data, self._relight_data.extraction.film
+        samples = relight_data.extraction.samples
+        samples = replace(samples, position=samples.position - relight_data.extraction.origin)
         shadowed, shadow = samples, np.arange(len(samples))
         # Rays use the film only to know which samples are neighbors.
         film = film.unspread()
         self._draft = draft = Draft.of(samples, film)
         if film.count is not None:
             shadowed, film, shadow = with_one_shadow(samples, film)
-        self._passes = tuple(kept.options["passes"])
-        (self._table,) = load_tables((kept.technique,)).values()
+        self._passes = tuple(relight_data.options["passes"])
+        (self._table,) = load_tables((relight_data.technique,)).values()
         with ExitStack() as stack:
             self._tracer = origins = None
             if self._occluders is not None:
                 self._tracer = stack.enter_context(open_tracer(self._occluders, embree_libraries()))
             pool = stack.enter_context(WorkerPool(self._tracer))
             if self._tracer is not None:
-                lights = [light.moved(-kept.extraction.origin) for light in kept.extraction.lights]
+                lights = [light.moved(-relight_data.extraction.origin) for light in relight_data.extraction.lights]
                 self._typical = task_of_lights(shadowed, lights, self._tracer, self._passes, DRAFT_RAYS).typical
                 origins = ray_origins(shadowed, pool)
             self._whole = LitSamples.of(samples, shadowed, film, shadow, origins)

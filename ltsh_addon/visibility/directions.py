@@ -89,14 +89,14 @@ _POINTS = [sequence(MOST_POINTS, seed) for seed in (1, 2)]
 def unit_points(seeds: np.ndarray, stream: int, first: int, last: int) -> list[np.ndarray]:
     """Numbers x, y (S, Q) in (0, 1): the points `first` to `last` of the sequence `stream`, 0 or 1, scrambled by the
     seeds (Q,)."""
-    found = []
+    coordinates = []
     for axis, points in enumerate(_POINTS[stream][:, first:last]):
-        own = mixed_bits(seeds + np.uint32((2 * stream + axis) * 0x9E3779B1 & 0xFFFFFFFF)) >> np.uint32(32 - BITS)
-        numbers = (points[:, None] ^ own).astype(np.float32)
+        scrambled = mixed_bits(seeds + np.uint32((2 * stream + axis) * 0x9E3779B1 & 0xFFFFFFFF)) >> np.uint32(32 - BITS)
+        numbers = (points[:, None] ^ scrambled).astype(np.float32)
         numbers += np.float32(0.5)
         numbers *= np.float32(2.0**-BITS)
-        found.append(numbers)
-    return found
+        coordinates.append(numbers)
+    return coordinates
 
 
 def seeds_of(position: np.ndarray) -> np.ndarray:
@@ -179,10 +179,10 @@ class Emitter:
         start = offset + self.center.astype(np.float32)[:, None]
         s, t = (dot(towards, axis) * distance - dot(start, axis) for axis in along)
         if self._picture is not None:
-            own = self._picture[_cells(t), _cells(s)]
+            pattern = self._picture[_cells(t), _cells(s)]
         else:
-            own = _inside(self._edge, s, t) if self._edge is not None else s * s + t * t <= _ONE
-        return own if factor is None else factor * own
+            pattern = _inside(self._edge, s, t) if self._edge is not None else s * s + t * t <= _ONE
+        return pattern if factor is None else factor * pattern
 
 
 def _parallelogram(light: Light):
@@ -196,8 +196,8 @@ def _parallelogram(light: Light):
             axes = np.stack([edge, np.cross(light.direction, edge)]) / np.linalg.norm(edge)
             flat = outline @ axes.T
             low, high = flat.min(axis=0), flat.max(axis=0)
-            found = np.prod(high - low), 0.5 * (low + high) @ axes, 0.5 * (high - low)[:, None] * axes
-            best = min(best, found, key=lambda each: each[0])
+            candidate = np.prod(high - low), 0.5 * (low + high) @ axes, 0.5 * (high - low)[:, None] * axes
+            best = min(best, candidate, key=lambda each: each[0])
     return best[1:]
 
 
@@ -210,9 +210,9 @@ def _inside(outline, s, t):
     return inside
 
 
-def _cells(place):
+def _cells(coordinate):
     """Rows or columns of a light's picture at coordinates from -1 to 1."""
-    return np.clip((0.5 * _PICTURE) * (place + _ONE), 0, _PICTURE - 1).astype(np.intp)
+    return np.clip((0.5 * _PICTURE) * (coordinate + _ONE), 0, _PICTURE - 1).astype(np.intp)
 
 
 def picture_of(light, places_of):
@@ -224,8 +224,8 @@ def picture_of(light, places_of):
     for patch in light.leaves:
         outline = places_of(patch.polygon() - light.center)
         columns, rows = (slice(*np.searchsorted(grid, (axis.min(), axis.max()))) for axis in outline.T)
-        part = picture[rows, columns]
-        part[_inside(outline, *np.meshgrid(grid[columns], grid[rows]))] = np.abs(patch.radiance).mean() / mean
+        cells = picture[rows, columns]
+        cells[_inside(outline, *np.meshgrid(grid[columns], grid[rows]))] = np.abs(patch.radiance).mean() / mean
     return picture
 
 
@@ -243,11 +243,11 @@ def shared_numbers(lights: Sequence[Light], tracer=None) -> tuple[tuple[int, ...
             ways = (tracer.mask_of, tracer.surface_mask_of, tracer.chosen_by)
             masks[light.name] = tuple(way(light.name) for way in ways)
         shared.setdefault(_kind(light, number, masks.get(light.name)), []).append(number)
-    found = []
-    for kind, own in shared.items():
-        is_one = kind[0] == "sky" or len(own) >= light_tree.FEWEST
-        found.extend([tuple(own)] if is_one else [(number,) for number in own])
-    return tuple(sorted(found))
+    groups = []
+    for kind, numbers in shared.items():
+        is_one = kind[0] == "sky" or len(numbers) >= light_tree.FEWEST
+        groups.extend([tuple(numbers)] if is_one else [(number,) for number in numbers])
+    return tuple(sorted(groups))
 
 
 def _kind(light, number, masks) -> tuple:
@@ -267,10 +267,10 @@ def emitters_of(
 ) -> tuple[tuple[Emitter | Cluster, ...], tuple[tuple[int, ...], ...]]:
     """The emitters, and for each the numbers of the `lights` it stands for."""
     numbers, emitters = shared_numbers(lights, tracer), []
-    for own in numbers:
-        members = [lights[number] for number in own]
+    for group in numbers:
+        members = [lights[number] for number in group]
         is_sky = _is_side(members[0])
-        emitters.append(Sky(members) if is_sky else Cluster(members) if len(own) > 1 else Emitter(members[0]))
+        emitters.append(Sky(members) if is_sky else Cluster(members) if len(group) > 1 else Emitter(members[0]))
     return tuple(emitters), numbers
 
 
@@ -296,8 +296,8 @@ class Sky(Emitter):
             self.right[slot], self.up[slot] = side.half_u, side.half_v
             values[slot] = np.abs(side.radiance).mean() * _cells_of(side)
             radiance += side.radiance / 6.0
-        place = (np.arange(CELLS) + 0.5) * (2.0 / CELLS) - 1.0
-        angles = (4.0 / CELLS**2) * (1.0 + place[:, None] ** 2 + place**2) ** -1.5
+        middles = (np.arange(CELLS) + 0.5) * (2.0 / CELLS) - 1.0
+        angles = (4.0 / CELLS**2) * (1.0 + middles[:, None] ** 2 + middles**2) ** -1.5
         power = (values * angles).ravel()
         self.chances = (power / power.sum()).astype(np.float32)
         self.ends = np.cumsum(power / power.sum()).astype(np.float32)
@@ -328,26 +328,26 @@ class Sky(Emitter):
     def _by_picture(self, x, y, normal):
         cell = np.minimum(np.searchsorted(self.ends, x.ravel()).reshape(x.shape), len(self.ends) - 1)
         share = (x - (self.ends[cell] - self.chances[cell])) / np.maximum(self.chances[cell], np.float32(1e-30))
-        slot, place = np.divmod(cell, CELLS * CELLS)
-        row, column = np.divmod(place, CELLS)
+        slot, cell_of_side = np.divmod(cell, CELLS * CELLS)
+        row, column = np.divmod(cell_of_side, CELLS)
         step = np.float32(2.0 / CELLS)
         s = (column.astype(np.float32) + np.clip(share, _ZERO, _ONE)) * step - _ONE
         t = (row.astype(np.float32) + y) * step - _ONE
-        found = np.stack([self.ahead[slot, k] + s * self.right[slot, k] + t * self.up[slot, k] for k in range(3)])
-        found /= np.sqrt(dot(found, found))
-        below = np.minimum(dot(found, normal[:, None]), _ZERO)
+        directions = np.stack([self.ahead[slot, k] + s * self.right[slot, k] + t * self.up[slot, k] for k in range(3)])
+        directions /= np.sqrt(dot(directions, directions))
+        below = np.minimum(dot(directions, normal[:, None]), _ZERO)
         below *= np.float32(-2.0)
-        found += below * normal[:, None]
-        return found
+        directions += below * normal[:, None]
+        return directions
 
     def density(self, directions: np.ndarray, normal: np.ndarray) -> np.ndarray:
         """Probability density (S, Q) per sr of unit directions (3, S, Q) above the horizon of `normal`."""
         height = dot(directions, normal[:, None])
         mirrored = directions - np.float32(2.0) * height * normal[:, None]
-        found = self._plain_density(directions) + self._plain_density(mirrored)
-        found += np.maximum(height, _ZERO) * np.float32(1.0 / np.pi)
-        found *= np.float32(0.5)
-        return found
+        density = self._plain_density(directions) + self._plain_density(mirrored)
+        density += np.maximum(height, _ZERO) * np.float32(1.0 / np.pi)
+        density *= np.float32(0.5)
+        return density
 
     def _plain_density(self, directions):
         cell, along = self._cells(directions)
@@ -382,9 +382,9 @@ def _by_cosine(x, y, normal):
     tangent = np.stack([_ONE + sign * normal[0] * normal[0] * a, sign * b, -sign * normal[0]])[:, None]
     bitangent = np.stack([b, sign + normal[1] * normal[1] * a, -normal[1]])[:, None]
     radius, angle = np.sqrt(x), np.float32(2.0 * np.pi) * y
-    found = radius * np.cos(angle) * tangent + radius * np.sin(angle) * bitangent
-    found += np.sqrt(_ONE - x) * normal[:, None]
-    return found
+    directions = radius * np.cos(angle) * tangent + radius * np.sin(angle) * bitangent
+    directions += np.sqrt(_ONE - x) * normal[:, None]
+    return directions
 
 
 def _cells_of(side: Light) -> np.ndarray:
@@ -446,11 +446,11 @@ class Cluster:
         low, high = corners.min(axis=1), corners.max(axis=1)
         order, start, end, self.children = light_tree.node_ranges(0.5 * (low + high), normal)
         alone = end - start == 1
-        own = order[start]
-        self.leaf = np.where(alone, own, -1)
-        low, high, sums, vector = low[own], high[own], power[own], power[own, None] * normal[own]
-        for first, last in reversed(_levels(self.children)):
-            inner = first + np.flatnonzero(self.children[first:last, 0] >= 0)
+        first = order[start]
+        self.leaf = np.where(alone, first, -1)
+        low, high, sums, vector = low[first], high[first], power[first], power[first, None] * normal[first]
+        for begin, last in reversed(_levels(self.children)):
+            inner = begin + np.flatnonzero(self.children[begin:last, 0] >= 0)
             one, other = self.children[inner].T
             low[inner], high[inner] = np.minimum(low[one], low[other]), np.maximum(high[one], high[other])
             sums[inner], vector[inner] = sums[one] + sums[other], vector[one] + vector[other]
@@ -462,7 +462,7 @@ class Cluster:
         self.cone = light_tree.normal_spreads(axis, normal[order], start, end).astype(np.float32)
         self.power = (sums / sums[0]).astype(np.float32)
 
-    def pick(self, x: np.ndarray, lobes: Sequence[ClusterLobe], own: np.ndarray):
+    def pick(self, x: np.ndarray, lobes: Sequence[ClusterLobe], lobe_of_ray: np.ndarray):
         """The leaves (R,) that rays take, the probability (R,) of each by lobe, and the numbers x (R,) in [0, 1),
         rescaled for reuse. Ray r chooses by the lobe `own[r]`."""
         node, chances = np.zeros(len(x), np.intp), np.ones((len(lobes), len(x)), np.float32)
@@ -474,7 +474,7 @@ class Cluster:
             bounds = (self._bounds(one, lobes, inner), self._bounds(other, lobes, inner))
             both = bounds[0] + bounds[1]
             share = np.divide(bounds[0], both, out=np.zeros_like(both), where=both > 0.0)
-            mine = share[own[inner], np.arange(len(inner))]
+            mine = share[lobe_of_ray[inner], np.arange(len(inner))]
             is_first = x[inner] < mine
             size = np.where(is_first, mine, _ONE - mine)
             rest = (x[inner] - np.where(is_first, _ZERO, mine)) / np.maximum(size, _TINY)
@@ -544,11 +544,11 @@ def _quads_of(light: Light) -> list[np.ndarray]:
         return [light.center + np.stack([-u - v, u - v, u + v, v - u])]
     if len(light.corners) == 3:
         return [light.corners[[0, 1, 2, 2]]]
-    found = []
+    quads = []
     for piece in convex_pieces(light.corners):
         for first in range(1, len(piece) - 1, 2):
-            found.append(piece[[0, first, first + 1, min(first + 2, len(piece) - 1)]])
-    return found
+            quads.append(piece[[0, first, first + 1, min(first + 2, len(piece) - 1)]])
+    return quads
 
 
 class SphericalQuads:
@@ -575,16 +575,16 @@ class SphericalQuads:
         self.is_seen = self.solid_angle > _LEAST_SOLID_ANGLE
         np.maximum(self.solid_angle, _LEAST_SOLID_ANGLE, out=self.solid_angle)
 
-    def part(self, rows: slice) -> SphericalQuads:
+    def take_rows(self, rows: slice) -> SphericalQuads:
         """The quadrilaterals of these `rows`, if they are (3, 4, S, Q): each sample sees several."""
-        found = copy.copy(self)
+        quads = copy.copy(self)
         for name in ("apex", "both"):
-            setattr(found, name, getattr(self, name)[:, rows])
-        found.near = [near[:, rows] for near in self.near]
-        found.terms = [tuple(term[rows] for term in terms) for terms in self.terms]
+            setattr(quads, name, getattr(self, name)[:, rows])
+        quads.near = [near[:, rows] for near in self.near]
+        quads.terms = [tuple(term[rows] for term in terms) for terms in self.terms]
         for name in ("gap", "first", "solid_angle", "is_seen"):
-            setattr(found, name, getattr(self, name)[rows])
-        return found
+            setattr(quads, name, getattr(self, name)[rows])
+        return quads
 
     def directions(self, x: np.ndarray, y: np.ndarray, out: np.ndarray) -> np.ndarray:
         """Unit vectors `out` (3, S, Q) for numbers x, y (S, Q) in [0, 1), which are overwritten."""
@@ -762,8 +762,8 @@ class Choices:
         hit, density = self._hit[index], np.zeros(len(index))
         for number in range(self._count[hit].max(initial=0)):
             here = np.flatnonzero(self._count[hit] > number)
-            own = self._first[hit[here]] + number
-            specular, diffuse = self._lobes[:, own]
+            sample = self._first[hit[here]] + number
+            specular, diffuse = self._lobes[:, sample]
             # A bake of one pass chooses by the lobes of that pass alone.
             if self._is_baked:
                 whole = np.maximum(self._sum_of_hit(name, hit[here]), 1e-12)
@@ -771,20 +771,20 @@ class Choices:
                     specular / whole if name == "specular" else 0.0 * specular,
                     diffuse / whole if name == "diffuse" else 0.0 * diffuse,
                 )
-            density[here] += specular * self._lobe_density(own, directions[here])
-            cosine = np.einsum("rk,rk->r", directions[here], self._samples.diffuse_normal[own])
+            density[here] += specular * self._lobe_density(sample, directions[here])
+            cosine = np.einsum("rk,rk->r", directions[here], self._samples.diffuse_normal[sample])
             density[here] += diffuse * np.maximum(cosine, 0.0) / np.pi
         return density
 
     def _sum_of_hit(self, name, hit):
         return np.bincount(self._hit, weights=self._lobes[int(name == "diffuse")])[hit]
 
-    def _lobe_density(self, own, directions):
+    def _lobe_density(self, index, directions):
         samples = self._samples
-        normal, view = samples.normal[own], samples.view[own]
+        normal, view = samples.normal[index], samples.view[index]
         half = directions + view
         vertical = np.square(np.maximum(np.einsum("rk,rk->r", half, normal), 0.0))
         horizontal = np.maximum(np.square(half).sum(axis=1) - vertical, 0.0)
-        alpha2 = np.square(np.maximum(samples.roughness[own] ** 2, SMALLEST_ALPHA))
+        alpha2 = np.square(np.maximum(samples.roughness[index] ** 2, SMALLEST_ALPHA))
         cosine = np.maximum(np.einsum("rk,rk->r", normal, view), 1e-3)
         return brdf.visible_normal_density(cosine, horizontal, vertical, alpha2)

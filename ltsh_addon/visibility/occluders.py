@@ -64,8 +64,8 @@ class Transparency:
 
     def shares_of(self, values) -> np.ndarray:
         """Shares (...) for values (...) of the image."""
-        found = values if self.curve is None else np.interp(values, *self.curve)
-        return (self.share * np.clip(found, 0.0, 1.0)).astype(np.float32)
+        values_of_curve = values if self.curve is None else np.interp(values, *self.curve)
+        return (self.share * np.clip(values_of_curve, 0.0, 1.0)).astype(np.float32)
 
     def _image_at(self, uv):
         height, width = self.image.shape
@@ -75,10 +75,10 @@ class Transparency:
         """Values of pixels, which may lie outside the image."""
         height, width = self.image.shape
         columns, rows = within(x, width, self.extension), within(y, height, self.extension)
-        found = self.image[rows, columns]
+        values = self.image[rows, columns]
         if self.extension == "CLIP":
-            found = np.where((x == columns) & (y == rows), found, self.outside)
-        return found
+            values = np.where((x == columns) & (y == rows), values, self.outside)
+        return values
 
 
 @dataclass(frozen=True)
@@ -243,8 +243,8 @@ class Occluders:
             more = (arrays.get(f"{name}{number}") for name in ("normals", "thickness"))
             meshes.append(OccluderMesh(*shape, clear, *more))
         instances = {name: arrays[name] for name in ("mesh", "matrices", "masks", "terminators")}
-        own = {name: head[name] for name in _SETTINGS}
-        return cls(tuple(meshes), **instances, **own)
+        settings = {name: head[name] for name in _SETTINGS}
+        return cls(tuple(meshes), **instances, **settings)
 
 
 _OF_CLEAR = "share", "extension", "interpolation", "outside", "curve"
@@ -309,27 +309,28 @@ def _cut_out(mesh, most, drops_clear):
     kinds = [_Counts.of(values <= 0.0, clear, outside <= 0.0)]
     if drops_clear:
         kinds.append(_Counts.of(values >= 1.0, clear, outside >= 1.0))
-    overlap, left = _overlaps(mesh), Parts(np.arange(len(mesh.triangles)), np.tile(_WHOLE, (len(mesh.triangles), 1, 1)))
+    overlap, count = _overlaps(mesh), len(mesh.triangles)
+    remaining = Parts(np.arange(count), np.tile(_WHOLE, (count, 1, 1)))
     blocking, mixed, count = [], [], 0
     for level in range(_LEVELS + 1):
-        grown = left.corners
+        grown = remaining.corners
         if level:
-            middle = left.corners.mean(axis=1, keepdims=True)
-            grown = grown + (2.0**level * overlap[left.triangle, None, None]) * (grown - middle)
-        place = _placed(clear.uv[left.triangle].astype(np.float64), grown) * clear.image.shape[::-1]
-        low, high = place.min(axis=1), place.max(axis=1)
+            middle = remaining.corners.mean(axis=1, keepdims=True)
+            grown = grown + (2.0**level * overlap[remaining.triangle, None, None]) * (grown - middle)
+        pixel = _placed(clear.uv[remaining.triangle].astype(np.float64), grown) * clear.image.shape[::-1]
+        low, high = pixel.min(axis=1), pixel.max(axis=1)
         is_one = [kind.all_within(low, high) for kind in kinds]
-        blocking.append(Parts(left.triangle, grown).take(is_one[0]))
+        blocking.append(Parts(remaining.triangle, grown).take(is_one[0]))
         rest = ~np.logical_or.reduce(is_one)
         count += int(is_one[0].sum())
         is_last = level == _LEVELS or count + 4 * int(rest.sum()) > most
-        fine = rest & (is_last | ((high - low).max(axis=1) < _FINEST) | ~(overlap[left.triangle] <= _WIDEST))
-        mixed.append(Parts(left.triangle, grown).take(fine))
+        fine = rest & (is_last | ((high - low).max(axis=1) < _FINEST) | ~(overlap[remaining.triangle] <= _WIDEST))
+        mixed.append(Parts(remaining.triangle, grown).take(fine))
         count += int(fine.sum())
-        left = left.take(rest & ~fine).quarters()
+        remaining = remaining.take(rest & ~fine).quarters()
     return tuple(
-        Parts(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("triangle", "corners")))
-        for parts in (blocking, mixed)
+        Parts(*(np.concatenate([getattr(piece, name) for piece in pieces]) for name in ("triangle", "corners")))
+        for pieces in (blocking, mixed)
     )
 
 
@@ -383,10 +384,10 @@ class _Counts:
         if not self.repeats:
             size = width, height
             first, last = np.clip(first + 1, 0, np.subtract(size, 1)), np.clip(last + 1, 1, size)
-        found = 0
+        count = 0
         for y, sign in ((last[:, 1], 1), (first[:, 1], -1)):
-            found = found + sign * (self._below(last[:, 0], y) - self._below(first[:, 0], y))
-        return found == (last - first).prod(axis=1)
+            count = count + sign * (self._below(last[:, 0], y) - self._below(first[:, 0], y))
+        return count == (last - first).prod(axis=1)
 
     def _below(self, x, y):
         """Number (T,) of pixels of the kind to the left of columns x (T,) and below rows y (T,)."""

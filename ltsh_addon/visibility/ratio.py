@@ -103,11 +103,11 @@ class Visibility:
 
     def of_lights(self, name: str) -> np.ndarray:
         """The shares (L, P) of pass `name` by light."""
-        shares = getattr(self, name)
-        found = np.empty((sum(map(len, self.numbers)), shares.shape[1]), np.float32)
-        for own, share in zip(self.numbers, shares, strict=True):
-            found[list(own)] = share
-        return found
+        by_emitter = getattr(self, name)
+        by_light = np.empty((sum(map(len, self.numbers)), by_emitter.shape[1]), np.float32)
+        for numbers, visibility in zip(self.numbers, by_emitter, strict=True):
+            by_light[list(numbers)] = visibility
+        return by_light
 
     def noise(self, name: str, film: Film | None = None) -> float:
         """Relative L2 error of a pass, estimated from the two halves of the rays, over the samples, or over the pixels
@@ -169,12 +169,12 @@ def visible_shares(
     def job(number):
         return tuple(None if one is None else one.take(blocks[number]) for one in (samples, film, starts))
 
-    def store(number, found):
+    def store(number, traced_block):
         block = blocks[number]
         for name in passes:
-            shares[name][:, block] = getattr(found, name)
-            radiance[name][block], deviation[name][block] = found.radiance[name], found.deviation[name]
-        mixed[:, block], traced[number] = found.mixed, found.rays
+            shares[name][:, block] = getattr(traced_block, name)
+            radiance[name][block], deviation[name][block] = traced_block.radiance[name], traced_block.deviation[name]
+        mixed[:, block], traced[number] = traced_block.mixed, traced_block.rays
 
     with ExitStack() as stack:
         pool = workers if isinstance(workers, WorkerPool) else stack.enter_context(WorkerPool(tracer, workers))
@@ -192,7 +192,7 @@ def ray_origins(samples: SurfaceSamples, pool: WorkerPool) -> Starts:
         OriginTask(),
         len(blocks),
         lambda number: samples.take(blocks[number]),
-        lambda number, found: starts.put(blocks[number], found),
+        lambda number, origins: starts.put(blocks[number], origins),
         len(samples) >= SAMPLES_WORTH_A_WORKER,
     ):
         pass
@@ -247,7 +247,7 @@ class ShadowTask:
             index = pairs.index
             mixed[number, index] = pairs.visible & pairs.blocked
             for name in self.passes:
-                share, noise = pairs.found(name)
+                share, noise = pairs.visibility_ratio(name)
                 unshadowed = pairs.unshadowed(name)
                 shares[name][number, index] = share
                 radiance[name][index] += unshadowed * share
@@ -262,8 +262,8 @@ def typical_radiance(samples: SurfaceSamples, task: ShadowTask, tracer) -> tuple
     most = max(min(TYPICAL_SAMPLES, TYPICAL_PAIRS // max(len(task.emitters), 1)), 1)
     chosen = slice(None, None, -(-len(samples) // most) or 1)
     some = samples.take(chosen)
-    found = replace(task, rays=PROBES).shares(some, None, tracer)
-    squares = {name: np.square(found.radiance[name]).mean() if len(some) else 0.0 for name in task.passes}
+    traced = replace(task, rays=PROBES).shares(some, None, tracer)
+    squares = {name: np.square(traced.radiance[name]).mean() if len(some) else 0.0 for name in task.passes}
     return {name: float(np.sqrt(square)) for name, square in squares.items()}, len(some)
 
 
@@ -337,11 +337,11 @@ class Surface:
 
     def _rows(self, vectors):
         # Equal normals share one array, so that identity tells whether they differ.
-        found = np.ascontiguousarray(vectors.T, dtype=np.float32)
-        same = next((known for known in self._known if np.array_equal(known, found)), None)
-        if same is None:
-            self._known.append(found)
-        return found if same is None else same
+        rows = np.ascontiguousarray(vectors.T, dtype=np.float32)
+        equal = next((known for known in self._known if np.array_equal(known, rows)), None)
+        if equal is None:
+            self._known.append(rows)
+        return rows if equal is None else equal
 
     def horizons(self, name: str) -> tuple[np.ndarray, ...]:
         """The normals (3, P) whose horizons bound the lobe of pass `name`: below any of them it is 0."""
@@ -358,7 +358,7 @@ def _different(first, second):
 class _ChosenBySurface:
     """Rays (R,) that meet different things depending on who chooses them: the surface or the light."""
 
-    place: np.ndarray  # in the flattened (S, Q) of all rays
+    flat: np.ndarray  # in the flattened (S, Q) of all rays
     arriving: np.ndarray  # transmittance of the ray that the surface chooses
     index: np.ndarray  # number of the sample
     directions: np.ndarray  # (3, R)
@@ -487,12 +487,12 @@ class Pairs:
             if self.light.is_distant:
                 distance[:] = _FARTHEST
             aimed = self.surface.starts.aimed(self.index[unmet], toward[:, None], distance[None], self.at_surface)
-            found = (
+            visibility = (
                 self._transmittance(self.mask, *(rows[..., 0, :] for rows in aimed)) if self.chosen_by.light else _ONE
             )
             # Next to nothing, so that it does not count in sums over samples.
             self.weights[number][:, unmet] = _TINY
-            self.arriving[number][:, unmet] = found * _TINY
+            self.arriving[number][:, unmet] = visibility * _TINY
 
     def _transmittance(self, mask, origins, directions, distances):
         """Transmittance (R,) of rays with a mask, `origins` and `directions` (3, R) and `distances` (R,)."""
@@ -531,8 +531,8 @@ class Pairs:
         least, most = arriving, arriving
         if others is not None:
             least, most = arriving.copy(), arriving.copy()
-            least.ravel()[others.place] = np.minimum(others.arriving, arriving.ravel()[others.place])
-            most.ravel()[others.place] = np.maximum(others.arriving, arriving.ravel()[others.place])
+            least.ravel()[others.flat] = np.minimum(others.arriving, arriving.ravel()[others.flat])
+            most.ravel()[others.flat] = np.maximum(others.arriving, arriving.ravel()[others.flat])
         self.visible[block] |= most.sum(axis=0) > 0.0
         self.blocked[block] |= least.sum(axis=0) < met.sum(axis=0)
         for name, weight in weights.items():
@@ -541,7 +541,7 @@ class Pairs:
                 passing = arriving.copy()
                 share = self.choices.by_surface(name, self.number, others.index, others.directions, others.solid_angle)
                 share[others.is_alone] = 1.0
-                passing.ravel()[others.place] += share * (others.arriving - arriving.ravel()[others.place])
+                passing.ravel()[others.flat] += share * (others.arriving - arriving.ravel()[others.flat])
             for sums in (self.weights[number], self.arriving[number]):
                 halves = sums[:, block]
                 rays.add_to(halves, weight)
@@ -569,13 +569,13 @@ class Pairs:
         if meet_the_same:
             chosen &= (start != origins).any(axis=0)
         chosen = np.flatnonzero(chosen)
-        found = self._transmittance(self.surface_mask, start[:, chosen], toward[:, chosen], distance[chosen])
-        differ = np.flatnonzero(found != arriving.ravel()[flat[chosen]])
+        visibility = self._transmittance(self.surface_mask, start[:, chosen], toward[:, chosen], distance[chosen])
+        differ = np.flatnonzero(visibility != arriving.ravel()[flat[chosen]])
         if len(differ) == 0:
             return None
-        chosen, found = chosen[differ], found[differ]
+        chosen, visibility = chosen[differ], visibility[differ]
         angle = view.solid_angles(flat[chosen])
-        return _ChosenBySurface(flat[chosen], found, index[chosen], directions[:, chosen], angle, is_alone[chosen])
+        return _ChosenBySurface(flat[chosen], visibility, index[chosen], directions[:, chosen], angle, is_alone[chosen])
 
     def unshadowed(self, name: str) -> np.ndarray:
         """Approximate radiance (Q,) that a pass reflects without shadows; 0 for pairs without that lobe."""
@@ -583,7 +583,7 @@ class Pairs:
         scale = scale * np.float32(np.abs(self.light.radiance).mean() / np.pi) / np.maximum(self.count, 1)
         return self.weights[PASSES.index(name)].sum(axis=0) * scale * self.wanted[name]
 
-    def found(self, name: str):
+    def visibility_ratio(self, name: str):
         """Shares (Q,) of a pass, and their approximate standard deviations (Q,)."""
         weights, arriving = self.weights[PASSES.index(name)], self.arriving[PASSES.index(name)]
         whole = weights.sum(axis=0)
@@ -630,12 +630,12 @@ class Rays:
     def add_to(self, halves, weight):
         """Add weights (S, Q) to the sums (2, Q) of the first and of the second half of all rays."""
         start, stop = self.evenly
-        parts = np.zeros((self.looks, weight.shape[1]), np.float32)
+        batch_sums = np.zeros((self.looks, weight.shape[1]), np.float32)
         for rows in (weight[: stop - start], weight[stop - start :]):
             if len(rows):
-                parts += rows.reshape(self.looks, -1, weight.shape[1]).sum(axis=1)
-        for number, part in enumerate(parts, self.first // PROBES):
-            halves[int(2 * number * PROBES >= self.total)] += part
+                batch_sums += rows.reshape(self.looks, -1, weight.shape[1]).sum(axis=1)
+        for number, batch_sum in enumerate(batch_sums, self.first // PROBES):
+            halves[int(2 * number * PROBES >= self.total)] += batch_sum
 
 
 class View:
@@ -655,8 +655,8 @@ class View:
         elif is_quad:
             corners = emitter.corners_from(self.offset, self.height)
         else:
-            place = np.take(surface.position, index, axis=1)
-            self.least_height = off_plane(light.center + light.radius, np.abs(place).sum(axis=0)).astype(np.float32)
+            position = np.take(surface.position, index, axis=1)
+            self.least_height = off_plane(light.center + light.radius, np.abs(position).sum(axis=0)).astype(np.float32)
         if is_quad:
             self.quads = SphericalQuads(corners)
             self.is_seen, self.solid_angle = self.quads.is_seen, self.quads.solid_angle
@@ -776,7 +776,7 @@ class View:
     def _rays_to_cluster(self, rays: Rays):
         """As `rays`, for a cluster: each ray goes to a leaf of its own."""
         even, sharp = (
-            unit_points(self.seeds, stream, *part) for stream, part in enumerate((rays.evenly, rays.by_lobe))
+            unit_points(self.seeds, stream, *numbers) for stream, numbers in enumerate((rays.evenly, rays.by_lobe))
         )
         evenly, shape = len(even[0]), (len(even[0]) + len(sharp[0]), len(self.index))
         leaf, chances, x = self._leaves(np.concatenate([even[0], sharp[0]]), evenly)
@@ -784,14 +784,14 @@ class View:
         corners = emitter.corners[:, :, leaf] + self.offset[:, None, None]
         quads, directions = SphericalQuads(corners), np.empty((3, *shape), np.float32)
         is_seen, local = quads.is_seen, None
-        quads.part(slice(None, evenly)).directions(x[:evenly], y[:evenly], out=directions[:, :evenly])
+        quads.take_rows(slice(None, evenly)).directions(x[:evenly], y[:evenly], out=directions[:, :evenly])
         self.solid_angle = quads.solid_angle / np.maximum(chances[0], np.float32(1e-12))
         density = np.float32(evenly / shape[0]) * chances[0] / quads.solid_angle
         if evenly < shape[0]:
             local, length = np.empty((3, *shape), np.float32), np.empty(shape, np.float32)
             warped = SphericalQuads(self.warps.warped(self.warps.local(corners)))
             is_seen = is_seen & warped.is_seen
-            warped.part(slice(evenly, None)).directions(x[evenly:], y[evenly:], out=local[:, evenly:])
+            warped.take_rows(slice(evenly, None)).directions(x[evenly:], y[evenly:], out=local[:, evenly:])
             length[evenly:] = self.warps.unwarped(local[:, evenly:])
             self.warps.world(local[:, evenly:], out=directions[:, evenly:])
             self.warps.local(directions[:, :evenly], out=local[:, :evenly])
@@ -808,10 +808,10 @@ class View:
         factor = factor * emitter.brightness[leaf] / np.maximum(density, _TINY)
         return directions, distance, self._weights(directions, local, factor)
 
-    def _inside_round(self, leaf, corners, place):
+    def _inside_round(self, leaf, corners, points):
         """Mask (S, Q): False for places (3, S, Q) outside the ellipse in the parallelogram of a round light."""
         u, v = 0.5 * (corners[:, 1] - corners[:, 0]), 0.5 * (corners[:, 3] - corners[:, 0])
-        offset = place - 0.5 * (corners[:, 0] + corners[:, 2])
+        offset = points - 0.5 * (corners[:, 0] + corners[:, 2])
         uu, uv, vv, us, vs = dot(u, u), dot(u, v), dot(v, v), dot(u, offset), dot(v, offset)
         whole = np.maximum(uu * vv - uv * uv, _TINY)
         s, t = (vv * us - uv * vs) / whole, (uu * vs - uv * us) / whole
@@ -822,7 +822,7 @@ class View:
         x chooses the leaves: the first `evenly` rays by the diffuse lobe if there is one, the others by the specular
         lobe."""
         columns = np.tile(np.arange(len(self.index)), len(x))
-        lobes, own = [], np.zeros(x.shape, np.intp)
+        lobes, lobe_of_ray = [], np.zeros(x.shape, np.intp)
         if "diffuse" in self.lobes:
             lobes.append(ClusterLobe(self.offset[:, columns], self.horizons[0][:, columns]))
         if "specular" in self.lobes:
@@ -831,8 +831,8 @@ class View:
             width = np.maximum(LOBE_WIDTH * self.alpha * np.maximum(self.cosine, LEAST_COSINE), np.float32(1e-4))
             rows = (self.geometric_normal[:, columns], mirrored[:, columns], width[columns].astype(np.float32))
             lobes.append(ClusterLobe(self.offset[:, columns], *rows))
-            own[evenly:] = len(lobes) - 1
-        leaf, chances, rest = self.emitter.pick(x.ravel(), lobes, own.ravel())
+            lobe_of_ray[evenly:] = len(lobes) - 1
+        leaf, chances, rest = self.emitter.pick(x.ravel(), lobes, lobe_of_ray.ravel())
         return leaf.reshape(x.shape), chances.reshape(len(lobes), *x.shape), rest.reshape(x.shape)
 
     def corner_heights(self, horizons):
@@ -854,11 +854,11 @@ class View:
         """Brightness (S, Q) of a light that faces the points, and distances (S, Q) to it, along directions (3, S, Q)
         that meet its plane at `distance`."""
         disk, offset = self.disk, np.broadcast_to(self.offset[:, None], directions.shape)
-        place = directions * distance - disk.offset[:, None]
-        inside = dot(place, place) <= disk.radius * disk.radius
-        own = ray_length(self.emitter.light, offset, directions)
+        from_center = directions * distance - disk.offset[:, None]
+        inside = dot(from_center, from_center) <= disk.radius * disk.radius
+        length = ray_length(self.emitter.light, offset, directions)
         factor = inside * disk.gain * np.asarray(emission(self.emitter.light, offset, directions), np.float32)
-        return factor, np.where(inside, own, distance).astype(np.float32)
+        return factor, np.where(inside, length, distance).astype(np.float32)
 
     def _diffuse(self, directions):
         """Diffuse lobe times cosine (S, Q): a plain cosine for most surfaces, with the shadowing of a bump map where

@@ -217,10 +217,10 @@ class _Scene:
             self._kept.append(data)
         self._attach(scene, geometry, mask)
 
-    def _add_instance(self, part, matrix, mask) -> None:
+    def _add_instance(self, mesh_scene, matrix, mask) -> None:
         embree, values = self._embree, np.ascontiguousarray(matrix, np.float32)
         geometry = embree.NewGeometry(embree.device, _INSTANCES)
-        embree.SetGeometryInstancedScene(geometry, part)
+        embree.SetGeometryInstancedScene(geometry, mesh_scene)
         embree.SetGeometryTransform(geometry, 0, _FLOAT3X4, values.ctypes.data)
         self._attach(self.scene, geometry, mask)
 
@@ -233,12 +233,12 @@ class _Scene:
 
     def hits(self, ray, distance, number, triangle, u, v) -> Hits:
         """Hits by triangles and places on the meshes themselves. `number` (H,) counts the instances of this scene."""
-        own = self._mesh[number] if self._parts else ()
-        for mesh in self._parts.keys() & set(np.unique(own).tolist()):
-            here = np.flatnonzero(own == mesh)
+        mesh_of_hit = self._mesh[number] if self._parts else ()
+        for mesh in self._parts.keys() & set(np.unique(mesh_of_hit).tolist()):
+            here = np.flatnonzero(mesh_of_hit == mesh)
             corners = self._parts[mesh].corners[triangle[here]]
-            shares = np.stack([1.0 - u[here] - v[here], u[here], v[here]])
-            u[here], v[here] = np.einsum("cq,qck->kq", shares, corners)
+            weights = np.stack([1.0 - u[here] - v[here], u[here], v[here]])
+            u[here], v[here] = np.einsum("cq,qck->kq", weights, corners)
             triangle[here] = self._parts[mesh].triangle[triangle[here]]
         return Hits(ray, distance, self.instances[number], triangle, u, v)
 
@@ -261,11 +261,11 @@ class EmbreeCaster:
         self._embree, self._scenes = embree, []
         parts = cut_outs(occluders)
         for number, index in enumerate(occluders.split()):
-            own = {mesh: both[number] for mesh, both in parts.items()}
-            filled = [mesh for mesh, part in own.items() if len(part.triangle)]
-            whole = index[~np.isin(occluders.mesh[index], list(own))]
+            pieces_of_mesh = {mesh: both[number] for mesh, both in parts.items()}
+            filled = [mesh for mesh, pieces in pieces_of_mesh.items() if len(pieces.triangle)]
+            whole = index[~np.isin(occluders.mesh[index], list(pieces_of_mesh))]
             index = np.union1d(whole, np.flatnonzero(np.isin(occluders.mesh, filled)))
-            self._scenes.append(_Scene(embree, occluders, index, own))
+            self._scenes.append(_Scene(embree, occluders, index, pieces_of_mesh))
         self.has = tuple(len(scene.instances) > 0 for scene in self._scenes)
         self._packets = _Packets(embree.width, RAY_ROWS)
         self._hits = _Packets(embree.width, HIT_ROWS)
@@ -291,9 +291,9 @@ class EmbreeCaster:
             packets.set(row, values)
         packets.numbers[:, GEOMETRY : INSTANCE + 1] = NONE
         packets.trace(self._embree.intersect, scene.scene, count)
-        geometry, part = packets.get(GEOMETRY, count, True), packets.get(INSTANCE, count, True)
+        geometry, instance = packets.get(GEOMETRY, count, True), packets.get(INSTANCE, count, True)
         ray = np.flatnonzero(geometry != NONE)
-        number = np.where(part == NONE, geometry, part)[ray]
+        number = np.where(instance == NONE, geometry, instance)[ray]
         distance, u, v = (packets.get(row, count)[ray] for row in (FAR, U, V))
         return scene.hits(ray, distance, number, packets.get(TRIANGLE, count, True)[ray], u, v)
 
@@ -341,9 +341,9 @@ class Tracer:
         with self._lock:
             if self._caster.has[False]:
                 for start in range(0, count, chunk):
-                    part = slice(start, start + chunk)
-                    blocked = self._caster.blocked(origins[part], directions[part], distances[part], masks[part])
-                    shares[part][blocked] = 0.0
+                    rows = slice(start, start + chunk)
+                    blocked = self._caster.blocked(origins[rows], directions[rows], distances[rows], masks[rows])
+                    shares[rows][blocked] = 0.0
             if self._caster.has[True]:
                 self._attenuate(shares, origins, directions, distances, masks)
         return shares
@@ -355,11 +355,11 @@ class Tracer:
         for _ in range(self.occluders.transparent_surfaces + 1):
             met = []
             for start in range(0, len(index), self._caster.chunk):
-                part = index[start : start + self._caster.chunk]
-                origins, directions, distances, masks = (values[part] for values in rays)
-                hits = self._caster.closest(True, origins, directions, near[part], distances, masks)
-                near[part[hits.ray]] = hits.distance * STEP
-                met.append((part[hits.ray], self.occluders.mesh[hits.instance], hits.triangle, hits.u, hits.v))
+                rows = index[start : start + self._caster.chunk]
+                origins, directions, distances, masks = (values[rows] for values in rays)
+                hits = self._caster.closest(True, origins, directions, near[rows], distances, masks)
+                near[rows[hits.ray]] = hits.distance * STEP
+                met.append((rows[hits.ray], self.occluders.mesh[hits.instance], hits.triangle, hits.u, hits.v))
             if not met:
                 return
             index, mesh, *places = map(np.concatenate, zip(*met, strict=True))
@@ -373,18 +373,18 @@ class Tracer:
     def first_met(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Distance (R,) in m along unit `directions` (R, 3) to what blocks rays, inf if nothing does; and mask (R,) of
         the rays with something transparent before that."""
-        found = np.full((2, len(origins)), np.inf, np.float32)
+        nearest = np.full((2, len(origins)), np.inf, np.float32)
         rays = [np.asarray(values, np.float32) for values in (origins, directions)]
         masks, chunk = np.full(len(origins), ALL_RAYS, np.uint32), self._caster.chunk
         with self._lock:
             for is_clear in np.flatnonzero(self._caster.has):
                 for start in range(0, len(origins), chunk):
-                    part = slice(start, start + chunk)
-                    own = [values[part] for values in rays]
-                    near, far = np.zeros(len(own[0]), np.float32), np.full(len(own[0]), np.inf, np.float32)
-                    hits = self._caster.closest(bool(is_clear), *own, near, far, masks[part])
-                    found[is_clear, start + hits.ray] = hits.distance
-        return found[0], found[1] < found[0]
+                    rows = slice(start, start + chunk)
+                    chunk_rays = [values[rows] for values in rays]
+                    near, far = (np.full(len(chunk_rays[0]), end, np.float32) for end in (0.0, np.inf))
+                    hits = self._caster.closest(bool(is_clear), *chunk_rays, near, far, masks[rows])
+                    nearest[is_clear, start + hits.ray] = hits.distance
+        return nearest[0], nearest[1] < nearest[0]
 
     def mask_of(self, light: str) -> int:
         """Mask for `transmittance` of the rays to the light of that name; 0 if nothing is in its way."""
@@ -455,6 +455,6 @@ def _probe(embree: _Embree) -> None:
     )
     origins, directions, distances, masks, answers = map(np.array, zip(*rays, strict=True))
     with Tracer(occluders, EmbreeCaster(occluders, embree)) as tracer:
-        found = tracer.transmittance(origins, directions, distances, masks)
-    if not np.array_equal(found, answers.astype(np.float32)):
+        transmittance = tracer.transmittance(origins, directions, distances, masks)
+    if not np.array_equal(transmittance, answers.astype(np.float32)):
         raise _Unfit(f"version {embree.version}: rays of known answer got others")

@@ -46,25 +46,25 @@ class StartFinder:
         clearance = (CLEARANCE * 8.0 * reach).astype(np.float32)
         lift, terminator = np.zeros((2, count, 3), np.float32), np.zeros(count, np.float32)
         for start in range(0, count, chunk):
-            part = slice(start, start + chunk)
-            found = self._triangles_at(position[part], normal[part], (NEARBY * (1.0 + reach[part])).astype(np.float32))
-            index, shape = start + found.ray, _Shape.of(self._occluders, found, self._is_applied)
+            rows = slice(start, start + chunk)
+            hits = self._triangles_at(position[rows], normal[rows], (NEARBY * (1.0 + reach[rows])).astype(np.float32))
+            index, shape = start + hits.ray, _Shape.of(self._occluders, hits, self._is_applied)
             clearance[index] = CLEARANCE * (reach[index] + shape.size)
-            is_thick = self._thickness[found.instance] > 0.0
+            is_thick = self._thickness[hits.instance] > 0.0
             # Graphics cards interpolate positions less exactly than Cycles; such rays would meet their own surface.
             moved = shape.point - position[index]
             off = (_dot(moved, moved) > (0.5 * clearance[index]) ** 2) & ~is_thick
             position[index[off]] = shape.point[off]
-            for number in np.unique(found.instance[is_thick]):
-                here = found.instance == number
-                clearance[index[here]] += self._thickness_of(number, found.triangle[here])
+            for number in np.unique(hits.instance[is_thick]):
+                here = hits.instance == number
+                clearance[index[here]] += self._thickness_of(number, hits.triangle[here])
             normal[index] = np.where(
                 is_thick[:, None], normal[index], shape.face_normals(normal[index], smooth_normal[index])
             )
             smooth = np.flatnonzero(shape.is_smooth)
             index = index[smooth]
             lift[:, index] = shape.take(smooth).lifts(normal[index])
-            terminator[index] = self._occluders.terminators[found.instance[smooth]] * lift[:, index].any(axis=(0, 2))
+            terminator[index] = self._occluders.terminators[hits.instance[smooth]] * lift[:, index].any(axis=(0, 2))
         return Starts(position, normal, smooth_normal, clearance, lift, terminator)
 
     def _thickness_of(self, instance, triangle) -> np.ndarray:
@@ -75,12 +75,12 @@ class StartFinder:
 
     def _triangles_at(self, position, normal, reach) -> Hits:
         """Hits on the triangles on which samples lie, within `reach` (P,) m or within the triangles' thickness."""
-        found = self._nearest(position, normal, reach)
+        hits = self._nearest(position, normal, reach)
         thickest = np.float32(self._thickness.max(initial=0.0))
         if thickest == 0.0:
-            return found
+            return hits
         rest = np.ones(len(position), bool)
-        rest[found.ray] = False
+        rest[hits.ray] = False
         rest = np.flatnonzero(rest)
         wider = self._nearest(position[rest], normal[rest], np.full(len(rest), thickest))
         within = np.zeros(len(wider.ray), bool)
@@ -88,7 +88,7 @@ class StartFinder:
             here = np.flatnonzero(wider.instance == number)
             within[here] = wider.distance[here] <= self._thickness_of(number, wider.triangle[here])
         wider = Hits(rest[wider.ray], *(getattr(wider, field.name) for field in fields(Hits)[1:]))
-        joined = zip(*((getattr(hits, field.name) for field in fields(Hits)) for hits in (found, wider)), strict=True)
+        joined = zip(*((getattr(each, field.name) for field in fields(Hits)) for each in (hits, wider)), strict=True)
         return Hits(*(np.concatenate([one, other[within]]) for one, other in joined))
 
     def _nearest(self, position, normal, reach) -> Hits:
@@ -104,11 +104,11 @@ class StartFinder:
                 rays = origins[index], -normal[index], near[index], 2.0 * reach[index], everything[index]
                 hits = self._caster.closest(is_clear, *rays)
                 index = index[hits.ray]
-                found = np.abs(hits.distance - reach[index])
-                closer = found < off[index]
+                offset = np.abs(hits.distance - reach[index])
+                closer = offset < off[index]
                 for field in fields(Hits)[2:]:
                     getattr(best, field.name)[index[closer]] = getattr(hits, field.name)[closer]
-                off[index[closer]] = found[closer]
+                off[index[closer]] = offset[closer]
                 near[index] = hits.distance * STEP
                 index = index[off[index] > CERTAIN * reach[index]]
         there = np.isfinite(off)
@@ -140,8 +140,8 @@ class Starts:
 
     def take(self, index) -> Starts:
         """The starts of the samples at `index`: integers (Q,) or a slice."""
-        own = {field.name: getattr(self, field.name) for field in fields(self)}
-        return Starts(**{name: values[:, index] if name == "lift" else values[index] for name, values in own.items()})
+        lift = self.lift[:, index]
+        return Starts(*(lift if each.name == "lift" else getattr(self, each.name)[index] for each in fields(self)))
 
     def origins(self, index: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Origins (R, 3) of rays along unit `directions` (R, 3) from the samples `index` (R,)."""
@@ -155,15 +155,15 @@ class Starts:
         smooth = np.flatnonzero(terminator)
         lift = None
         if len(smooth):
-            part = slice(None) if len(smooth) == len(index) else smooth
-            rays = directions[:, :, part], facing[:, part], terminator[part]
-            lift, own = self._lifts(index[part], *rays)
-            side[:, part] = np.where(own, np.abs(side[:, part]) * own, side[:, part])
-        found = side * normal
-        found += self.position[index].T[:, None]
+            columns = slice(None) if len(smooth) == len(index) else smooth
+            rays = directions[:, :, columns], facing[:, columns], terminator[columns]
+            lift, side_of_triangle = self._lifts(index[columns], *rays)
+            side[:, columns] = np.where(side_of_triangle, np.abs(side[:, columns]) * side_of_triangle, side[:, columns])
+        origins = side * normal
+        origins += self.position[index].T[:, None]
         if lift is not None:
-            found[:, :, part] += lift
-        return found
+            origins[:, :, columns] += lift
+        return origins
 
     def from_surface(
         self, index: np.ndarray, directions: np.ndarray, distances: np.ndarray
@@ -205,8 +205,8 @@ class Starts:
         amount = np.clip(grazing, 0.0, 1.0)
         outside, inside = self.lift[:, index].transpose(0, 2, 1)[:, :, None]
         # As in Cycles, light from behind the sample's own triangle meets it.
-        own = np.where((amount > 0.0) & (facing <= 0.0), flipped, np.float32(0.0))
-        return amount * np.where(is_inside, inside, outside), own
+        side_of_triangle = np.where((amount > 0.0) & (facing <= 0.0), flipped, np.float32(0.0))
+        return amount * np.where(is_inside, inside, outside), side_of_triangle
 
 
 def _toward(directions, distances, moved):
@@ -246,11 +246,12 @@ class _Shape:
         is_smooth, mesh = np.zeros(len(hits.ray), bool), occluders.mesh[hits.instance]
         order = np.argsort(mesh, kind="stable")
         for here in np.split(order, np.flatnonzero(np.diff(mesh[order])) + 1) if len(order) else ():
-            own, triangle = occluders.meshes[mesh[here[0]]], hits.triangle[here]
-            named = own.triangles[triangle]
-            corners[here] = own.vertices[named]
-            if own.normals is not None:
-                normals[here] = own.normals[named] if own.normals.ndim == 2 else own.normals[triangle]
+            object_mesh, triangle = occluders.meshes[mesh[here[0]]], hits.triangle[here]
+            named = object_mesh.triangles[triangle]
+            corners[here] = object_mesh.vertices[named]
+            if object_mesh.normals is not None:
+                at_vertices = object_mesh.normals.ndim == 2
+                normals[here] = object_mesh.normals[named if at_vertices else triangle]
                 is_smooth[here] = True
         matrix, applied = occluders.matrices[hits.instance], is_applied[hits.instance][:, None, None]
         in_world = _turned(corners, matrix)
@@ -283,9 +284,9 @@ class _Shape:
         first, second = np.moveaxis(_turned(self.corners[:, 1:] - self.corners[:, :1], self.to_world), 1, 0)
         normal = _crossed(first, second)
         length = np.linalg.norm(normal, axis=1, keepdims=True)
-        own = np.einsum("qc,qck->qk", self.shares, self.normals)
-        own = _turned(own[:, None], _cofactors(self.to_world))[:, 0]
-        facing = np.where(self.is_smooth, _dot(own, smooth_normal), _dot(normal, geometric_normal))
+        interpolated = np.einsum("qc,qck->qk", self.shares, self.normals)
+        interpolated = _turned(interpolated[:, None], _cofactors(self.to_world))[:, 0]
+        facing = np.where(self.is_smooth, _dot(interpolated, smooth_normal), _dot(normal, geometric_normal))
         normal *= np.where(facing < 0.0, -1.0, 1.0)[:, None]
         return np.divide(normal, length, out=geometric_normal.astype(np.float64), where=length > 0.0)
 
@@ -302,11 +303,11 @@ class _Shape:
         for side in (1.0, -1.0):
             envelope = [
                 np.maximum(
-                    side * _dot(own - point, n)
-                    + np.maximum(np.maximum(side * _dot(one - own, n), side * _dot(other - own, n)), 0.0),
+                    side * _dot(corner - point, n)
+                    + np.maximum(np.maximum(side * _dot(one - corner, n), side * _dot(other - corner, n)), 0.0),
                     0.0,
                 )
-                for own, one, other, n in corners
+                for corner, one, other, n in corners
             ]
             heights.append(side * np.maximum(np.minimum.reduce(envelope), side * parabola))
         normal = _turned(normal[:, None], self.to_world)[:, 0]

@@ -137,19 +137,19 @@ class Channel:
     def send(self, message) -> None:
         """Write one message. Arrays of the latest message received stay as they are."""
         buffers: list[memoryview] = []
-        data, places = packed(message, buffers), []
+        data, spans = packed(message, buffers), []
         for buffer in buffers:
-            start = -(-(places[-1][1] if places else self._end) // _ALIGNMENT) * _ALIGNMENT
-            places.append((start, start + buffer.nbytes))
+            start = -(-(spans[-1][1] if spans else self._end) // _ALIGNMENT) * _ALIGNMENT
+            spans.append((start, start + buffer.nbytes))
         memory = self._memory
-        if places and places[-1][1] > memory.size:
-            memory.enlarge(places[-1][1])
-        for place, buffer in zip(places, buffers, strict=True):
-            memory.view(*place)[:] = buffer
+        if spans and spans[-1][1] > memory.size:
+            memory.enlarge(spans[-1][1])
+        for span, buffer in zip(spans, buffers, strict=True):
+            memory.view(*span)[:] = buffer
         self._end = 0
-        for part in (packed((memory.handle, memory.size, places)), data):
-            self._output.write(_LENGTH.pack(len(part)))
-            self._output.write(part)
+        for block in (packed((memory.handle, memory.size, spans)), data):
+            self._output.write(_LENGTH.pack(len(block)))
+            self._output.write(block)
         self._output.flush()
 
     def receive(self):
@@ -157,10 +157,10 @@ class Channel:
 
         Raises EOFError if the other process is gone.
         """
-        handle, size, places = unpacked(self._read(), "")
+        handle, size, spans = unpacked(self._read(), "")
         self._memory.follow(handle, size)
-        self._end = places[-1][1] if places else 0
-        buffers = [self._memory.view(*place) for place in places]
+        self._end = spans[-1][1] if spans else 0
+        buffers = [self._memory.view(*span) for span in spans]
         return _Unpickler(io.BytesIO(self._read()), self.package, buffers).load()
 
     def _read(self) -> bytes:

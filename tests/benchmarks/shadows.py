@@ -30,7 +30,7 @@ from ltsh_addon import imaging, shading, visibility  # noqa: E402
 from ltsh_addon.blender.process.blender_process import embree_libraries  # noqa: E402
 from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels  # noqa: E402
 from ltsh_addon.cli.commands import DEMO_SCENE  # noqa: E402
-from ltsh_addon.imaging.font import draw_text  # noqa: E402
+from ltsh_addon.imaging.sheet import draw_text  # noqa: E402
 from ltsh_addon.pipeline import lighting  # noqa: E402
 from ltsh_addon.pipeline.options import PictureOptions  # noqa: E402
 from ltsh_addon.scene import PASSES  # noqa: E402

@@ -24,7 +24,7 @@ import gpu
 import numpy as np
 import random_surfaces
 
-from ltsh_addon.blender.viewport.camera import ViewCamera
+from ltsh_addon.blender.viewport.drawing import ViewCamera
 from ltsh_addon.blender.viewport.mirror import SceneMirror
 from ltsh_addon.blender.viewport.pictures import ShownPicture
 from ltsh_addon.blender.viewport.renderer import ViewRenderer

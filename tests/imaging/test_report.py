@@ -7,7 +7,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from ltsh_addon.imaging import Tile, comparison_sheet, font, report, sheet
+from ltsh_addon.imaging import Tile, comparison_sheet, report, sheet
 from ltsh_addon.imaging.color import exposure_factor, to_srgb8
 
 
@@ -126,7 +126,7 @@ def test_every_word_of_the_legend_and_of_captions_stands_on_small_sheets(monkeyp
     draw = sheet.draw_text
 
     def watch(image, corner, text, color, size, **more):
-        (x, y), box = corner, font.text_size(text, size, bold=more.get("bold", False))
+        (x, y), box = corner, sheet.text_size(text, size, bold=more.get("bold", False))
         assert 0 <= x and 0 <= y and x + box[0] <= image.shape[1] + 2 and y + box[1] <= image.shape[0], text
         drawn.append(text)
         return draw(image, corner, text, color, size, **more)
@@ -157,9 +157,9 @@ def test_odd_images_make_a_sheet_and_images_of_different_size_are_refused():
 
 def test_text_stays_in_its_box_and_draws_ink():
     for size in (14.0, 26.0):
-        width, height = font.text_size("Agjy|_{}", size)
+        width, height = sheet.text_size("Agjy|_{}", size)
         image = np.full((height + 40, width + 40, 3), 255, dtype=np.uint8)
-        font.draw_text(image, (20, 20), "Agjy|_{}", (0, 0, 0), size)
+        sheet.draw_text(image, (20, 20), "Agjy|_{}", (0, 0, 0), size)
         rows, columns = np.nonzero(image.min(axis=-1) < 255)
         assert rows.size > 50
         assert rows.min() >= 20 and rows.max() < 20 + height and columns.min() >= 20 and columns.max() < 20 + width
@@ -169,13 +169,13 @@ def test_every_printable_character_looks_different():
     looks = {}
     for character in string.printable[:95].replace(" ", ""):
         image = np.full((40, 40, 3), 255, dtype=np.uint8)
-        font.draw_text(image, (4, 4), character, (0, 0, 0), 28.0)
+        sheet.draw_text(image, (4, 4), character, (0, 0, 0), 28.0)
         looks.setdefault(image.tobytes(), []).append(character)
     assert [group for group in looks.values() if len(group) > 1] == []
 
 
 def test_long_text_is_shortened_and_wrapped_to_fit():
     text = "signed error of a technique with a long explanation " * 3
-    assert font.text_size(font.shorten(text, 200), 14.0)[0] <= 200
-    assert all(font.text_size(line)[0] <= 200 for line in font.wrap(text, 200))
-    assert " ".join(font.wrap(text, 200)) == " ".join(text.split())
+    assert sheet.text_size(sheet.shorten(text, 200), 14.0)[0] <= 200
+    assert all(sheet.text_size(line)[0] <= 200 for line in sheet.wrap(text, 200))
+    assert " ".join(sheet.wrap(text, 200)) == " ".join(text.split())

@@ -109,7 +109,7 @@ def test_shares_are_those_of_a_quadrature_over_the_light(shape, roughness):
     expected = brute_force(samples, light, tracer.passed, 150)
     pairs = with_all_rays(samples, light, tracer)
     for name, limit in (("specular", 0.012), ("diffuse", 0.006)):
-        error = pairs.found(name)[0] - expected[name][pairs.index]
+        error = pairs.visibility_ratio(name)[0] - expected[name][pairs.index]
         # Stratified, 1024 rays are off by about 1024^-0.75 = 0.6 % of one; half as many for a sharp lobe.
         assert np.sqrt(np.square(error).mean()) < limit, name
         assert abs(error.mean()) < 0.25 * limit, name
@@ -125,7 +125,7 @@ def test_bump_mapped_lobes_have_the_shares_of_a_quadrature():
     expected = brute_force(samples, light, tracer.passed, 150)
     pairs = with_all_rays(samples, light, tracer)
     for name in PASSES:
-        error = np.abs(pairs.found(name)[0] - expected[name][pairs.index])[pairs.visible & pairs.blocked]
+        error = np.abs(pairs.visibility_ratio(name)[0] - expected[name][pairs.index])[pairs.visible & pairs.blocked]
         assert len(error) > 30 and np.median(error) < 0.01 and np.quantile(error, 0.9) < 0.04, name
 
 
@@ -148,7 +148,7 @@ def test_a_textured_light_counts_by_its_radiance():
         np.testing.assert_allclose(pairs.unshadowed(name), lit, rtol=0.02, atol=0.01 * lit.max())
         share = getattr(parts[1], name)[0, :, 0] / sum(getattr(part, name)[0, :, 0] for part in parts)
         # The picture of the light has 128 columns.
-        np.testing.assert_allclose(pairs.found(name)[0], share, atol=0.02)
+        np.testing.assert_allclose(pairs.visibility_ratio(name)[0], share, atol=0.02)
 
 
 def test_a_half_plane_leaves_the_form_factor_of_what_it_does_not_hide():
@@ -162,7 +162,7 @@ def test_a_half_plane_leaves_the_form_factor_of_what_it_does_not_hide():
 
     behind = samples.take(samples.position[:, 1] < 1.0)
     pairs = with_all_rays(behind, light, tracer)
-    shares = pairs.found("diffuse")[0]
+    shares = pairs.visibility_ratio("diffuse")[0]
     for number, position in enumerate(behind.position[pairs.index]):
         # The plane through the point and the edge: x (1 - y) + (y - py) px ... of the vertical line x = 0, y = 1.
         edge = np.array([0.0, 1.0, 0.0]) - position
@@ -211,7 +211,7 @@ def test_few_rays_suffice_and_the_told_noise_is_about_the_real_one():
         for name in PASSES:
             error, light = np.zeros(len(samples)), np.zeros(len(samples))
             for number, exact in enumerate(pairs):
-                radiance, share = exact.unshadowed(name), exact.found(name)[0]
+                radiance, share = exact.unshadowed(name), exact.visibility_ratio(name)[0]
                 error[exact.index] += (getattr(found, name)[number, exact.index] - share) * radiance
                 light[exact.index] += share * radiance
             real = np.sqrt(np.square(error).sum() / np.square(light).sum())
@@ -253,7 +253,7 @@ def test_a_wire_that_probes_miss_casts_all_of_its_shadow():
     light = panel()
     found = ratio.visible_shares(samples, [light], wire, ratio.ShadowSampling(rays=64, film=film))
     exact = with_all_rays(samples.take(slice(None, None, 3)), light, wire)
-    expected = 1.0 - exact.found("diffuse")[0]
+    expected = 1.0 - exact.visibility_ratio("diffuse")[0]
     lost = 1.0 - found.diffuse[0, ::3][exact.index]
     in_shadow = expected > 0.002
     assert 0.005 < expected[in_shadow].mean() < 0.1

@@ -12,7 +12,7 @@ import gpu
 from ...scene import CYCLES, error_line
 from ..evaluated import visibility
 from ..render_settings import cycles_setting, sub_pixel_offsets
-from ..viewport.camera import ViewCamera
+from ..viewport.drawing import ViewCamera
 from ..viewport.live_cycles import LiveWorld
 from ..viewport.mirror import SceneMirror
 from ..viewport.pictures import ShownPicture

@@ -8,8 +8,7 @@ import gpu
 import numpy as np
 
 from ...scene import SurfaceSamples
-from .camera import ViewCamera
-from .drawing import read_texture
+from .drawing import ViewCamera, read_texture
 
 # Fields of `GBufferTextures` by their names in shaders.
 SAMPLERS = {

@@ -15,8 +15,7 @@ from ...workers.pool import WorkerPool, cores
 from ..extract.occluders import collect_occluders
 from ..lights.world import blocks_nothing
 from ..process.blender_process import embree_libraries
-from .camera import ViewCamera
-from .drawing import float_buffer
+from .drawing import ViewCamera, float_buffer
 from .gbuffer import GBufferTextures, VisibilityGrid, gbuffer_samples
 
 Lights = Sequence[Light]

@@ -13,8 +13,7 @@ import numpy as np
 from ...scene import PASSES, Cancelled, Film, Light, SurfaceSamples, error_line
 from ...visibility import Occluders, ShadowSampling, Starts, ray_origins, shared_numbers, visible_shares
 from ...workers.pool import WorkerPool
-from .camera import ViewCamera
-from .drawing import float_texture
+from .drawing import ViewCamera, float_texture
 from .gbuffer import GBufferTextures, VisibilityGrid, every_texel, gbuffer_texels, samples_of_texels, unit_xyz
 from .shadow_rays import Lights, ViewTracer, too_many, visibility_texture
 

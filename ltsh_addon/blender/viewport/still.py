@@ -19,8 +19,7 @@ from ..lights.world import light_of_world
 from ..materials.preview_material import world_radiance
 from ..process.view import GRAPHICS, VIEW_PASSES, VIEW_PNG, ViewJob
 from ..render_settings import cycles_setting
-from .camera import ViewCamera
-from .drawing import read_texture
+from .drawing import ViewCamera, read_texture
 from .lights import NOT_RESOLVED, patterns_of
 from .live_cycles import rendered_world
 from .mirror import SceneMirror

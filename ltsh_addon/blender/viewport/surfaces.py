@@ -9,8 +9,7 @@ from mathutils import Matrix
 
 from ...shading.header import filled
 from ..materials.preview_material import IMAGE_SLOTS, is_missing
-from .camera import ViewCamera
-from .drawing import PixelShader, drawing, float_table, float_texture, glsl, uniform_buffer
+from .drawing import PixelShader, ViewCamera, drawing, float_table, float_texture, glsl, uniform_buffer
 from .gbuffer import GBufferTextures
 from .mirror import ShownInstance, ShownLook
 from .shaders import slope_text

@@ -9,7 +9,7 @@ from graphics_card import Canvas, with_graphics
 
 from ltsh_addon import shading
 from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels
-from ltsh_addon.blender.viewport.camera import ViewCamera
+from ltsh_addon.blender.viewport.drawing import ViewCamera
 from ltsh_addon.blender.viewport.mirror import SceneMirror
 from ltsh_addon.blender.viewport.pictures import ShownPicture
 from ltsh_addon.blender.viewport.renderer import ViewRenderer

@@ -30,11 +30,10 @@ from ltsh_addon.blender.viewport import shadows
 from ltsh_addon.blender.viewport.drawing import read_texture
 from ltsh_addon.blender.viewport.lighting import LightingPass
 from ltsh_addon.blender.viewport.mirror import SceneMirror
-from ltsh_addon.blender.viewport.pictures import ShownPicture
+from ltsh_addon.blender.viewport.pictures import ShownPicture, is_equal
 from ltsh_addon.blender.viewport.renderer import CENTERS, ViewRenderer
 from ltsh_addon.blender.viewport.shadow_rays import ShadowRays, too_many
 from ltsh_addon.blender.viewport.shadows import LiveShadows
-from ltsh_addon.blender.viewport.static_lighting import is_equal
 from ltsh_addon.blender.viewport.still import view_of_camera
 from ltsh_addon.scene import Cancelled, Pattern
 

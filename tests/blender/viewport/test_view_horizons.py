@@ -15,7 +15,7 @@ from uploaded_samples import upload_samples
 
 from ltsh_addon import shading
 from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels
-from ltsh_addon.blender.viewport.camera import ViewCamera
+from ltsh_addon.blender.viewport.drawing import ViewCamera
 from ltsh_addon.blender.viewport.light_texels import upload_lights
 from ltsh_addon.blender.viewport.lighting import HorizonPass
 from ltsh_addon.blender.viewport.mirror import SceneMirror

@@ -33,7 +33,7 @@ from ltsh_addon.blender.lights.world import light_of_world
 from ltsh_addon.blender.materials import preview_material
 from ltsh_addon.blender.materials.preview_material import preview_of
 from ltsh_addon.blender.ui import panels
-from ltsh_addon.blender.viewport.camera import ViewCamera
+from ltsh_addon.blender.viewport.drawing import ViewCamera
 from ltsh_addon.blender.viewport.mirror import SceneMirror, ShownLook
 from ltsh_addon.blender.viewport.pictures import ShownPicture
 from ltsh_addon.blender.viewport.renderer import ViewRenderer

@@ -139,7 +139,7 @@ class SkyMap:
         return radiance
 
     def add(self, lobes, chosen: np.ndarray, total: np.ndarray) -> None:
-        """Add what the columns `chosen` (Q',) of `float32.Lobes` reflect of the sky to `total` (F, 3, Q)."""
+        """Add what the columns `chosen` (Q',) of `lobes32.Lobes` reflect of the sky to `total` (F, 3, Q)."""
         nodes, angle = self.nodes
         for start in range(0, len(chosen), MAP_CHUNK):
             columns = chosen[start : start + MAP_CHUNK]

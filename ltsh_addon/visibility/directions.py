@@ -8,7 +8,7 @@ heuristic (Veach and Guibas 1995) combines both.
 
 The sides of a sky surround all samples and count as one light. The specular lobe chooses its directions as above; of
 the other directions, half follow the picture of the sky and half the cosine. Many plain lights of one color also count
-as one light (`Cluster`).
+as one light (`LightCluster`).
 
 Everything is in single precision. Arrays are (S, Q), S directions from each of Q points, or (Q,). Vectors have their
 components first.
@@ -120,7 +120,7 @@ class Emitter:
     """
 
     def __init__(self, light: Light):
-        self.light, self.chosen_as = light, (light,)
+        self.light, self.selected_as = light, (light,)
         self.outline = light.polygon(_ROUND_CORNERS) - light.center
         self.profile = light_profile.Profile.of(light) if light.has_profile else None
         self.corners = self._own_corners()
@@ -264,13 +264,13 @@ def _kind(light, number, masks) -> tuple:
 
 def emitters_of(
     lights: Sequence[Light], tracer=None
-) -> tuple[tuple[Emitter | Cluster, ...], tuple[tuple[int, ...], ...]]:
+) -> tuple[tuple[Emitter | LightCluster, ...], tuple[tuple[int, ...], ...]]:
     """The emitters, and for each the numbers of the `lights` it stands for."""
     numbers, emitters = shared_numbers(lights, tracer), []
     for group in numbers:
         members = [lights[number] for number in group]
         is_sky = _is_side(members[0])
-        emitters.append(Sky(members) if is_sky else Cluster(members) if len(group) > 1 else Emitter(members[0]))
+        emitters.append(Sky(members) if is_sky else LightCluster(members) if len(group) > 1 else Emitter(members[0]))
     return tuple(emitters), numbers
 
 
@@ -299,7 +299,7 @@ class Sky(Emitter):
         middles = (np.arange(CELLS) + 0.5) * (2.0 / CELLS) - 1.0
         angles = (4.0 / CELLS**2) * (1.0 + middles[:, None] ** 2 + middles**2) ** -1.5
         power = (values * angles).ravel()
-        self.chances = (power / power.sum()).astype(np.float32)
+        self.pmf = (power / power.sum()).astype(np.float32)
         self.ends = np.cumsum(power / power.sum()).astype(np.float32)
         self.values = (values / max(np.abs(radiance).mean(), 1e-30)).astype(np.float32).ravel()
         like = sides[0]
@@ -316,7 +316,7 @@ class Sky(Emitter):
                 receivers=like.receivers,
             )
         )
-        self.chosen_as = tuple(sides)
+        self.selected_as = tuple(sides)
 
     def directions(self, x: np.ndarray, y: np.ndarray, normal: np.ndarray) -> np.ndarray:
         """Unit vectors (3, S, Q) for numbers (S, Q) in [0, 1). Half of them follow the brightness of the sky; those
@@ -327,7 +327,7 @@ class Sky(Emitter):
 
     def _by_picture(self, x, y, normal):
         cell = np.minimum(np.searchsorted(self.ends, x.ravel()).reshape(x.shape), len(self.ends) - 1)
-        share = (x - (self.ends[cell] - self.chances[cell])) / np.maximum(self.chances[cell], np.float32(1e-30))
+        share = (x - (self.ends[cell] - self.pmf[cell])) / np.maximum(self.pmf[cell], np.float32(1e-30))
         slot, cell_of_side = np.divmod(cell, CELLS * CELLS)
         row, column = np.divmod(cell_of_side, CELLS)
         step = np.float32(2.0 / CELLS)
@@ -351,7 +351,7 @@ class Sky(Emitter):
 
     def _plain_density(self, directions):
         cell, along = self._cells(directions)
-        return self.chances[cell] * np.float32(CELLS * CELLS / 4.0) / (along * along * along)
+        return self.pmf[cell] * np.float32(CELLS * CELLS / 4.0) / (along * along * along)
 
     def brightness_along(self, directions: np.ndarray) -> np.ndarray:
         """Radiance as factors (S, Q) of its mean, along unit directions (3, S, Q)."""
@@ -397,7 +397,7 @@ def _cells_of(side: Light) -> np.ndarray:
     return picture.reshape(CELLS, step, CELLS, step).mean(axis=(1, 3))
 
 
-class Cluster:
+class LightCluster:
     """Many plain lights of one color as one emitter: each ray goes to one light, chosen by what it may give the sample.
 
     The lights, cut into quadrilaterals, are the leaves of a binary tree. A ray goes down from the root. It takes a half
@@ -432,7 +432,7 @@ class Cluster:
             receivers=like.receivers,
         )
         ball = {"half_u": radius * np.eye(3)[0], "half_v": radius * np.eye(3)[1]}
-        self.chosen_as = (PointLight.like(self.light, radiance=power / (4.0 * np.pi * radius**2), **ball),)
+        self.selected_as = (PointLight.like(self.light, radiance=power / (4.0 * np.pi * radius**2), **ball),)
         corners = corners - center
         values = radiance.mean(axis=1)
         self.brightness = (values / max(self.light.radiance.mean(), 1e-30)).astype(np.float32)
@@ -462,14 +462,14 @@ class Cluster:
         self.cone = light_tree.normal_spreads(axis, normal[order], start, end).astype(np.float32)
         self.power = (sums / sums[0]).astype(np.float32)
 
-    def pick(self, x: np.ndarray, lobes: Sequence[ClusterLobe], lobe_of_ray: np.ndarray):
+    def pick(self, x: np.ndarray, lobes: Sequence[LobeBound], lobe_of_ray: np.ndarray):
         """The leaves (R,) that rays take, the probability (R,) of each by lobe, and the numbers x (R,) in [0, 1),
         rescaled for reuse. Ray r chooses by the lobe `own[r]`."""
-        node, chances = np.zeros(len(x), np.intp), np.ones((len(lobes), len(x)), np.float32)
+        node, pmf = np.zeros(len(x), np.intp), np.ones((len(lobes), len(x)), np.float32)
         while True:
             inner = np.flatnonzero(self.leaf[node] < 0)
             if len(inner) == 0:
-                return self.leaf[node], chances, x
+                return self.leaf[node], pmf, x
             one, other = self.children[node[inner]].T
             bounds = (self._bounds(one, lobes, inner), self._bounds(other, lobes, inner))
             both = bounds[0] + bounds[1]
@@ -479,7 +479,7 @@ class Cluster:
             size = np.where(is_first, mine, _ONE - mine)
             rest = (x[inner] - np.where(is_first, _ZERO, mine)) / np.maximum(size, _TINY)
             x[inner] = np.clip(rest, _ZERO, np.float32(1.0 - 2.0**-24))
-            chances[:, inner] *= np.where(both > 0.0, np.where(is_first, share, _ONE - share), _ZERO)
+            pmf[:, inner] *= np.where(both > 0.0, np.where(is_first, share, _ONE - share), _ZERO)
             node[inner] = np.where(is_first, one, other)
 
     def _bounds(self, node, lobes, rays):
@@ -500,7 +500,7 @@ _SLACK = np.float32(2e-3)
 
 
 @dataclass(frozen=True)
-class ClusterLobe:
+class LobeBound:
     """What bounds the lobe of each ray: vectors (3, R) and values (R,)."""
 
     offset: np.ndarray  # m, from the sample to the center of the cluster
@@ -572,7 +572,7 @@ class SphericalQuads:
             self.terms.append((volume, np.float32(0.5) * dot(both, both), near_both))
             angles.append(2.0 * np.arctan2(volume, self.gap + near_both))
         self.first, self.solid_angle = angles[0], angles[0] + angles[1]
-        self.is_seen = self.solid_angle > _LEAST_SOLID_ANGLE
+        self.has_solid_angle = self.solid_angle > _LEAST_SOLID_ANGLE
         np.maximum(self.solid_angle, _LEAST_SOLID_ANGLE, out=self.solid_angle)
 
     def take_rows(self, rows: slice) -> SphericalQuads:
@@ -582,7 +582,7 @@ class SphericalQuads:
             setattr(quads, name, getattr(self, name)[:, rows])
         quads.near = [near[:, rows] for near in self.near]
         quads.terms = [tuple(term[rows] for term in terms) for terms in self.terms]
-        for name in ("gap", "first", "solid_angle", "is_seen"):
+        for name in ("gap", "first", "solid_angle", "has_solid_angle"):
             setattr(quads, name, getattr(self, name)[rows])
         return quads
 
@@ -718,7 +718,7 @@ def _cross(a, b):
     return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
-class Choices:
+class LightSelection:
     """How likely Cycles chooses directions from samples (P) by `lights` (L) and by the lobes of the surface.
 
     Who chose a ray decides what it meets. Rays that the light chose start above a curved surface, and are not blocked
@@ -738,24 +738,24 @@ class Choices:
         self._count = np.bincount(self._hit)
         self._first = np.cumsum(self._count) - self._count
         self._lobes = lobe_selection_pmf(samples, self._hit, is_baked=False)
-        self._chances = np.full((len(self._lights), len(samples)), np.nan, np.float32)
+        self._light_selection_pmf = np.full((len(self._lights), len(samples)), np.nan, np.float32)
         self._rows = light_tree_rows(self._lights)
 
-    def by_surface(self, name: str, number: int, index, directions, solid_angle) -> np.ndarray:
+    def bsdf_share(self, name: str, number: int, index, directions, solid_angle) -> np.ndarray:
         """Share (R,) of the light of light `number` that a pass gets because the surface chose the unit directions
         (3, R), seen from the samples `index` (R,). The light has the `solid_angle` (R,) in sr."""
         if self._first is None:
             self._prepare()
-        by_light = self._chance(number, index) / np.maximum(solid_angle, 1e-12)
-        by_surface = self._density(name, index, directions.T.astype(np.float64))
-        return (by_surface**2 / np.maximum(by_surface**2 + by_light**2, 1e-30)).astype(np.float32)
+        by_light = self._pmf(number, index) / np.maximum(solid_angle, 1e-12)
+        bsdf_share = self._density(name, index, directions.T.astype(np.float64))
+        return (bsdf_share**2 / np.maximum(bsdf_share**2 + by_light**2, 1e-30)).astype(np.float32)
 
-    def _chance(self, number, index):
-        unknown = np.unique(index[np.isnan(self._chances[number, index])])
+    def _pmf(self, number, index):
+        unknown = np.unique(index[np.isnan(self._light_selection_pmf[number, index])])
         if len(unknown):
             position, normal = self._samples.position[unknown], self._samples.smooth_normal[unknown]
-            self._chances[:, unknown] = light_selection_pmf(position, normal, self._lights, self._rows)
-        return self._chances[number, index]
+            self._light_selection_pmf[:, unknown] = light_selection_pmf(position, normal, self._lights, self._rows)
+        return self._light_selection_pmf[number, index]
 
     def _density(self, name, index, directions):
         """Probability density (R,) per sr with which the lobes of a hit choose the directions (R, 3)."""

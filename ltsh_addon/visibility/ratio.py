@@ -1,4 +1,4 @@
-"""The share of each light that each sample sees: `visible_shares`.
+"""The share of each light that each sample sees: `trace_visibility`.
 
 The ratio estimator (Heitz, Hill and McGuire 2018, "Combining analytic direct illumination and stochastic shadows",
 doi:10.1145/3190834.3190852): shadowed radiance = closed form x sum(w V) / sum(w). V is the transmittance of a ray to
@@ -26,10 +26,10 @@ from ..lobes.diffuse import diffuse_factor
 from ..scene import FARTHEST, PASSES, Cancelled, Film, Light, PolygonLight, Progress, SurfaceSamples, round_outline
 from ..workers.pool import WorkerPool
 from .directions import (
-    Choices,
-    Cluster,
-    ClusterLobe,
     Emitter,
+    LightCluster,
+    LightSelection,
+    LobeBound,
     Sky,
     SphericalQuads,
     Warps,
@@ -39,7 +39,7 @@ from .directions import (
     seeds_of,
     unit_points,
 )
-from .starts import Starts
+from .shadow_terminator import RayOrigins
 
 # Number of rays of the first look at a pair. More rays come in multiples of it.
 PROBES = 8
@@ -54,7 +54,7 @@ SECONDS_WORTH_A_WORKER, SAMPLES_WORTH_A_WORKER = 1.0, 1 << 17
 # How many of PROBES rays are spread evenly over the light; the specular lobe chooses the others. Rows: pairs with both
 # lobes, with a diffuse lobe only, with a specular lobe only. Columns: both lobes count alike (always so for the
 # probes), the specular lobe counts more, the diffuse lobe counts more.
-EVENLY = np.array([[4, 2, 6], [8, 8, 8], [2, 2, 2]])
+LIGHT_SAMPLED = np.array([[4, 2, 6], [8, 8, 8], [2, 2, 2]])
 # A pair gets rays in proportion to this power of its light relative to that of a typical sample. The reason: the square
 # root of the variance of stratified rays falls with their number to the power -0.8.
 WORTH_POWER = 0.75
@@ -136,43 +136,43 @@ class ShadowSampling:
             raise ValueError(f"shadow rays are {self.rays}, expected {PROBES} to {MOST_RAYS}")
 
 
-def visible_shares(
+def trace_visibility(
     samples: SurfaceSamples,
     lights: Sequence[Light],
     tracer,
     sampling: ShadowSampling = ShadowSampling(),
     *,
     workers: int | WorkerPool | None = None,
-    starts: Starts | None = None,
+    ray_origins: RayOrigins | None = None,
     progress: Progress | None = None,
 ) -> Visibility:
     """The shares of `lights` that P samples see. `tracer` comes from `visibility.open_tracer`.
 
     `workers` is a number of processes (None: all cores) or a WorkerPool of the tracer; the result is the same bit for
-    bit. If there are few samples, this process does them alone. `starts` are the `ray_origins` of the samples if they
-    are known. `progress` may return False to stop: Cancelled is raised.
+    bit. If there are few samples, this process does them alone. `ray_origins` come from `trace_ray_origins` if they are
+    known. `progress` may return False to stop: Cancelled is raised.
     """
     (emitters, numbers), passes = emitters_of(lights, tracer), tuple(sampling.passes)
     film = None if sampling.film is None else sampling.film.unspread()
     typical = dict.fromkeys(passes, 1.0)
     task = ShadowTask(emitters, passes, sampling.rays // PROBES * PROBES, typical, sampling.is_baked)
     start = time.thread_time()
-    typical, looked_at = typical_radiance(samples, task, tracer)
-    seconds = (time.thread_time() - start) * len(samples) / max(looked_at, 1)
+    typical, probed = typical_radiance(samples, task, tracer)
+    seconds = (time.thread_time() - start) * len(samples) / max(probed, 1)
     task = replace(task, typical=typical)
     shape = len(emitters), len(samples)
-    shares = {name: np.ones(shape, np.float32) for name in passes}
+    visibility = {name: np.ones(shape, np.float32) for name in passes}
     radiance, deviation = ({name: np.zeros(shape[1], np.float32) for name in passes} for _ in range(2))
     blocks, mixed = _blocks(shape[1]), np.zeros(shape, bool)
     traced = np.zeros(len(blocks), np.int64)
 
     def job(number):
-        return tuple(None if one is None else one.take(blocks[number]) for one in (samples, film, starts))
+        return tuple(None if one is None else one.take(blocks[number]) for one in (samples, film, ray_origins))
 
     def store(number, traced_block):
         block = blocks[number]
         for name in passes:
-            shares[name][:, block] = getattr(traced_block, name)
+            visibility[name][:, block] = getattr(traced_block, name)
             radiance[name][block], deviation[name][block] = traced_block.radiance[name], traced_block.deviation[name]
         mixed[:, block], traced[number] = traced_block.mixed, traced_block.rays
 
@@ -181,22 +181,22 @@ def visible_shares(
         for done in pool.run(task, len(blocks), job, store, seconds > SECONDS_WORTH_A_WORKER):
             if progress is not None and progress("shadows", done / len(blocks)) is False:
                 raise Cancelled("shadows were stopped")
-    result = Visibility(shares.get("specular"), shares.get("diffuse"), radiance, deviation, int(traced.sum()), mixed)
-    return replace(result, numbers=numbers)
+    by_pass = visibility.get("specular"), visibility.get("diffuse")
+    return Visibility(*by_pass, radiance, deviation, int(traced.sum()), mixed, numbers)
 
 
-def ray_origins(samples: SurfaceSamples, pool: WorkerPool) -> Starts:
+def trace_ray_origins(samples: SurfaceSamples, pool: WorkerPool) -> RayOrigins:
     """Where rays from P samples start, found by the processes of `pool`, whose context is a tracer."""
-    blocks, starts = _blocks(len(samples)), Starts.empty(len(samples))
+    blocks, ray_origins = _blocks(len(samples)), RayOrigins.empty(len(samples))
     for _ in pool.run(
         OriginTask(),
         len(blocks),
         lambda number: samples.take(blocks[number]),
-        lambda number, origins: starts.put(blocks[number], origins),
+        lambda number, origins: ray_origins.put(blocks[number], origins),
         len(samples) >= SAMPLES_WORTH_A_WORKER,
     ):
         pass
-    return starts
+    return ray_origins
 
 
 def _blocks(count: int) -> list[slice]:
@@ -207,53 +207,51 @@ def _blocks(count: int) -> list[slice]:
 class OriginTask:
     """The task of `ray_origins`."""
 
-    def do(self, samples: SurfaceSamples, tracer) -> Starts:
+    def do(self, samples: SurfaceSamples, tracer) -> RayOrigins:
         """Where rays from the samples of a block start."""
-        return tracer.starts(samples)
+        return tracer.ray_origins(samples)
 
 
 @dataclass(frozen=True)
 class ShadowTask:
     """The emitters and settings with which to find the shares of every block of samples."""
 
-    emitters: tuple[Emitter | Cluster, ...]
+    emitters: tuple[Emitter | LightCluster, ...]
     passes: tuple[str, ...]
     rays: int
     typical: dict[str, float]
     is_baked: bool
 
-    def do(self, job: tuple[SurfaceSamples, Film | None, Starts | None], tracer) -> Visibility:
-        """The shares of a block of samples; without what its rays start from, that is found too."""
-        samples, film, starts = job
-        return self.shares(samples, film, tracer, starts)
-
-    def shares(self, samples: SurfaceSamples, film: Film | None, tracer, starts: Starts | None = None) -> Visibility:
-        """The shares of a block, found in this thread. `starts` is `tracer.starts(samples)` if it is known already."""
+    def do(self, job: tuple[SurfaceSamples, Film | None, RayOrigins | None], tracer) -> Visibility:
+        """The visibility from a block of samples on a film; the third is `tracer.ray_origins(samples)` if that is known
+        already."""
+        samples, film, ray_origins = job
         shape = len(self.emitters), len(samples)
-        shares = {name: np.ones(shape, np.float32) for name in self.passes}
+        visibility = {name: np.ones(shape, np.float32) for name in self.passes}
         radiance, variance = ({name: np.zeros(shape[1], np.float32) for name in self.passes} for _ in range(2))
         mixed, traced = np.zeros(shape, bool), 0
-        surface, neighbors = Surface(samples, self.passes, tracer, starts), Neighbors.of(film, shape[1])
+        surface, neighbors = SampleRows(samples, self.passes, tracer, ray_origins), PixelNeighbors.of(film, shape[1])
         # What each sample counts for its pixel.
         importance = np.ones(shape[1], np.float32)
         if film is not None and film.count is not None:
             importance = (film.count / film.sub_samples).astype(np.float32)
-        choices, first = Choices(samples, [one for each in self.emitters for one in each.chosen_as], self.is_baked), 0
+        lights = [light for emitter in self.emitters for light in emitter.selected_as]
+        selection, first = LightSelection(samples, lights, self.is_baked), 0
         for number, emitter in enumerate(self.emitters):
-            pairs = Pairs(surface, emitter, first, choices)
-            first += len(emitter.chosen_as)
-            pairs.trace(self.rays, neighbors, self.typical, importance)
-            traced += pairs.traced
-            index = pairs.index
-            mixed[number, index] = pairs.visible & pairs.blocked
+            estimator = RatioEstimator(surface, emitter, first, selection)
+            first += len(emitter.selected_as)
+            estimator.trace(self.rays, neighbors, self.typical, importance)
+            traced += estimator.traced
+            index = estimator.index
+            mixed[number, index] = estimator.visible & estimator.blocked
             for name in self.passes:
-                share, noise = pairs.visibility_ratio(name)
-                unshadowed = pairs.unshadowed(name)
-                shares[name][number, index] = share
-                radiance[name][index] += unshadowed * share
+                ratio, noise = estimator.visibility_ratio(name)
+                unshadowed = estimator.unshadowed(name)
+                visibility[name][number, index] = ratio
+                radiance[name][index] += unshadowed * ratio
                 variance[name][index] += np.square(unshadowed * noise)
         deviation = {name: np.sqrt(values) for name, values in variance.items()}
-        return Visibility(shares.get("specular"), shares.get("diffuse"), radiance, deviation, traced, mixed)
+        return Visibility(visibility.get("specular"), visibility.get("diffuse"), radiance, deviation, traced, mixed)
 
 
 def typical_radiance(samples: SurfaceSamples, task: ShadowTask, tracer) -> tuple[dict[str, float], int]:
@@ -262,22 +260,22 @@ def typical_radiance(samples: SurfaceSamples, task: ShadowTask, tracer) -> tuple
     most = max(min(TYPICAL_SAMPLES, TYPICAL_PAIRS // max(len(task.emitters), 1)), 1)
     chosen = slice(None, None, -(-len(samples) // most) or 1)
     some = samples.take(chosen)
-    traced = replace(task, rays=PROBES).shares(some, None, tracer)
+    traced = replace(task, rays=PROBES).do((some, None, None), tracer)
     squares = {name: np.square(traced.radiance[name]).mean() if len(some) else 0.0 for name in task.passes}
     return {name: float(np.sqrt(square)) for name, square in squares.items()}, len(some)
 
 
-def task_of_lights(
+def shadow_task(
     samples: SurfaceSamples, lights: Sequence[Light], tracer, passes: Sequence[str], rays: int
 ) -> ShadowTask:
-    """The task that finds the shares of `lights` with at most `rays` per pair, as `visible_shares` does."""
+    """The task that finds the shares of `lights` with at most `rays` per pair, as `trace_visibility` does."""
     (emitters, _), passes = emitters_of(lights, tracer), tuple(passes)
     task = ShadowTask(emitters, passes, rays // PROBES * PROBES, dict.fromkeys(passes, 1.0), False)
     return replace(task, typical=typical_radiance(samples, task, tracer)[0])
 
 
 @dataclass(frozen=True)
-class Neighbors:
+class PixelNeighbors:
     """Which samples are close to each other: those in the same pixel and in the eight pixels around it."""
 
     pixel: np.ndarray  # (P,)
@@ -285,7 +283,7 @@ class Neighbors:
     height: int
 
     @classmethod
-    def of(cls, film: Film | None, count: int) -> Neighbors:
+    def of(cls, film: Film | None, count: int) -> PixelNeighbors:
         """The neighbors in `film`; without one, each sample is close to those before and after it."""
         if film is None:
             return cls(np.arange(count), count, 1)
@@ -304,11 +302,11 @@ class Neighbors:
         return (grid[:, 1:-1] | grid[:, :-2] | grid[:, 2:]).ravel()[pixel]
 
 
-class Surface:
+class SampleRows:
     """Samples in single precision with components first: vectors are (3, P)."""
 
-    def __init__(self, samples: SurfaceSamples, passes: Sequence[str], tracer, starts: Starts | None = None):
-        self.tracer, self.starts = tracer, tracer.starts(samples) if starts is None else starts
+    def __init__(self, samples: SurfaceSamples, passes: Sequence[str], tracer, ray_origins: RayOrigins | None = None):
+        self.tracer, self.ray_origins = tracer, tracer.ray_origins(samples) if ray_origins is None else ray_origins
         self.position = np.ascontiguousarray(samples.position.T)
         self.receiver = samples.receiver
         self.seeds = seeds_of(samples.position)
@@ -328,8 +326,8 @@ class Surface:
             self.tangent = self._rows(samples.tangent)
         names = ("specular_f0", "specular_f90", "specular_dip", "dielectric", "diffuse_albedo")
         terms = [getattr(samples, name).mean(axis=1, dtype=np.float32) for name in names]
-        self.f0, f90, self.dip, self.dielectric, self.albedo = terms
-        self.rise = f90 - self.f0
+        self.f0, f90, self.f82_term, self.dielectric, self.albedo = terms
+        self.f90_minus_f0 = f90 - self.f0
         self.ior = samples.ior.astype(np.float32)
         diffuse, specular = has_lobe(samples)
         specular &= dot(self.normal, self.view) > 0.0
@@ -355,33 +353,33 @@ def _different(first, second):
 
 
 @dataclass(frozen=True)
-class _ChosenBySurface:
+class RaysOfSurface:
     """Rays (R,) that meet different things depending on who chooses them: the surface or the light."""
 
     flat: np.ndarray  # in the flattened (S, Q) of all rays
-    arriving: np.ndarray  # transmittance of the ray that the surface chooses
+    visibility: np.ndarray  # transmittance of the ray that the surface chooses
     index: np.ndarray  # number of the sample
     directions: np.ndarray  # (3, R)
     solid_angle: np.ndarray  # of the light, sr
     is_alone: np.ndarray  # True where the light never chooses this direction
 
 
-class Pairs:
+class RatioEstimator:
     """The samples that an emitter may reach, and what their rays have found so far. `number` is the emitter's number in
-    `choices`."""
+    `selection`."""
 
-    def __init__(self, surface: Surface, emitter: Emitter | Cluster, number: int, choices: Choices):
+    def __init__(self, surface: SampleRows, emitter: Emitter | LightCluster, number: int, selection: LightSelection):
         light = emitter.light
         self.surface, self.emitter, self.light = surface, emitter, light
         self.mask = np.uint32(surface.tracer.mask_of(light.name))
         self.surface_mask = np.uint32(surface.tracer.surface_mask_of(light.name))
         # The faces of a mesh light block rays to the mesh itself.
-        self.at_surface = isinstance(emitter, Cluster) or isinstance(light, PolygonLight)
-        self.chosen_by, self.number, self.choices = surface.tracer.chosen_by(light.name), number, choices
+        self.at_surface = isinstance(emitter, LightCluster) or isinstance(light, PolygonLight)
+        self.chosen_by, self.number, self.selection = surface.tracer.chosen_by(light.name), number, selection
         origins = light.viewpoint(surface.position)
         offset = (light.center[:, None] - origins).astype(np.float32)
         ahead = np.ones(offset.shape[1], bool)
-        if not light.is_facing and not isinstance(emitter, Cluster):
+        if not light.is_facing and not isinstance(emitter, LightCluster):
             ahead = dot(light.direction.astype(np.float32), offset) < -off_plane(
                 light.center, np.abs(origins).sum(axis=0)
             )
@@ -400,12 +398,12 @@ class Pairs:
         self.wanted = {name: wanted[self.index] for name, wanted in self.wanted.items()}
         count = len(self.index)
         # Sums of all weights, and of the weights times transmittance, by pass and half of the rays
-        self.weights, self.arriving = np.zeros((2, 2, 2, count), np.float32)
+        self.sum_w, self.sum_wv = np.zeros((2, 2, 2, count), np.float32)
         self.visible, self.blocked = np.zeros(count, bool), np.zeros(count, bool)
         self.count = np.zeros(count, np.int32)
         self.traced = 0
 
-    def trace(self, rays: int, neighbors: Neighbors, typical: dict[str, float], importance: np.ndarray) -> None:
+    def trace(self, rays: int, neighbors: PixelNeighbors, typical: dict[str, float], importance: np.ndarray) -> None:
         """Trace the probes of all pairs, then up to `rays` rays for pairs that need them. How many depends on the light
         and the `importance` (P,) of the sample. `typical` comes from `typical_radiance`."""
         if self.mask == 0 or not self.light.area_vector.any():
@@ -431,7 +429,7 @@ class Pairs:
         worth = {name: self.unshadowed(name) / max(typical.get(name, 0.0), 1e-30) for name in PASSES}
         most = importance * np.maximum(worth["specular"], worth["diffuse"])
         # A sky or a cluster stands for many lights and gets the rays of all of them.
-        share = 1.0 if isinstance(self.emitter, Sky | Cluster) else TYPICAL_SHARE
+        share = 1.0 if isinstance(self.emitter, Sky | LightCluster) else TYPICAL_SHARE
         wanted = rays * share * most**WORTH_POWER
         limit = rays
         if share < 1.0 and rays > PROBES:
@@ -449,15 +447,15 @@ class Pairs:
         """Mask (Q,) of the pairs with a lobe that no ray has met so far."""
         unmet = np.zeros(len(self.index), bool)
         for number, name in enumerate(PASSES):
-            unmet |= self.wanted[name] & (self.weights[number].sum(axis=0) == 0.0)
+            unmet |= self.wanted[name] & (self.sum_w[number].sum(axis=0) == 0.0)
         return unmet
 
     def _corner_heights(self, name, members):
         """Least height (V, M) of the light's corners over the horizons of a lobe, and the offsets (3, V, M) from the
         samples to the corners."""
         surface, index = self.surface, self.index[members]
-        if isinstance(self.emitter, Cluster):
-            return View(surface, index, self.emitter, (name,)).corner_heights(surface.horizons(name))
+        if isinstance(self.emitter, LightCluster):
+            return RaySampler(surface, index, self.emitter, (name,)).corner_heights(surface.horizons(name))
         center = self.light.center[:, None] - self.light.viewpoint(surface.position[:, index])
         if self.light.is_facing:
             normal = surface.horizons(name)[0][:, index]
@@ -470,14 +468,14 @@ class Pairs:
     def _leave_out_unlit(self):
         """Drop lobes for which the whole light is below the horizon."""
         for number, name in enumerate(PASSES):
-            unmet = np.flatnonzero(self.wanted[name] & (self.weights[number].sum(axis=0) == 0.0))
+            unmet = np.flatnonzero(self.wanted[name] & (self.sum_w[number].sum(axis=0) == 0.0))
             self.wanted[name][unmet] = self._corner_heights(name, unmet)[0].max(axis=0) > 0.0
 
     def _aim_at_corners(self):
         """Trace one ray to the highest corner of the light for each lobe that no ray met so far: such a lobe sees only
         a corner of the light."""
         for number, name in enumerate(PASSES):
-            unmet = np.flatnonzero(self.wanted[name] & (self.weights[number].sum(axis=0) == 0.0))
+            unmet = np.flatnonzero(self.wanted[name] & (self.sum_w[number].sum(axis=0) == 0.0))
             if len(unmet) == 0:
                 continue
             heights, offset = self._corner_heights(name, unmet)
@@ -486,13 +484,13 @@ class Pairs:
             toward /= np.maximum(distance, _TINY)
             if self.light.is_distant:
                 distance[:] = _FARTHEST
-            aimed = self.surface.starts.aimed(self.index[unmet], toward[:, None], distance[None], self.at_surface)
+            aimed = self.surface.ray_origins.aimed(self.index[unmet], toward[:, None], distance[None], self.at_surface)
             visibility = (
                 self._transmittance(self.mask, *(rows[..., 0, :] for rows in aimed)) if self.chosen_by.light else _ONE
             )
             # Next to nothing, so that it does not count in sums over samples.
-            self.weights[number][:, unmet] = _TINY
-            self.arriving[number][:, unmet] = visibility * _TINY
+            self.sum_w[number][:, unmet] = _TINY
+            self.sum_wv[number][:, unmet] = visibility * _TINY
 
     def _transmittance(self, mask, origins, directions, distances):
         """Transmittance (R,) of rays with a mask, `origins` and `directions` (3, R) and `distances` (R,)."""
@@ -508,61 +506,62 @@ class Pairs:
             for start in range(0, len(chosen), BLOCK_RAYS // PROBES):
                 block = chosen[start : start + BLOCK_RAYS // PROBES]
                 lobes = tuple(name for name in PASSES if self.wanted[name][block[0]])
-                view = View(self.surface, self.index[block], self.emitter, lobes)
+                sampler = RaySampler(self.surface, self.index[block], self.emitter, lobes)
                 step = BLOCK_RAYS // (PROBES * len(block)) * PROBES
                 for number in range(first, last, step):
-                    rays = Rays(
-                        number, min(number + step, last), max(last, 2 * PROBES), EVENLY[kind, 0], EVENLY[kind, split]
-                    )
-                    self._add_block(block, view, rays)
+                    light_sampled = LIGHT_SAMPLED[kind, 0], LIGHT_SAMPLED[kind, split]
+                    batch = RayBatch(number, min(number + step, last), max(last, 2 * PROBES), *light_sampled)
+                    self._add_block(block, sampler, batch)
         self.count[members] = last
 
-    def _add_block(self, block, view, rays):
-        """Trace some `rays` of the pairs `block` (B,) of a view."""
-        directions, distance, weights = view.rays(rays)
-        arriving, others = np.zeros(distance.shape, np.float32), None
+    def _add_block(self, block, sampler, batch):
+        """Trace some `batch` of the pairs `block` (B,) of a view."""
+        directions, distance, weights = sampler.sample(batch)
+        visibility, others = np.zeros(distance.shape, np.float32), None
         met = np.logical_or.reduce([weight > 0.0 for weight in weights.values()])
         flat = np.flatnonzero(met)
-        aimed = self.surface.starts.aimed(view.index, directions, distance, self.at_surface)
+        aimed = self.surface.ray_origins.aimed(sampler.index, directions, distance, self.at_surface)
         origins, *rest = (_taken(rows, flat) for rows in aimed)
-        arriving.ravel()[flat] = self._transmittance(self.mask, origins, *rest) if self.chosen_by.light else _ONE
+        visibility.ravel()[flat] = self._transmittance(self.mask, origins, *rest) if self.chosen_by.light else _ONE
         if self.chosen_by.surface:
-            others = self._chosen_by_surface(view, (directions, distance), flat, origins, arriving)
-        least, most = arriving, arriving
+            others = self._chosen_by_surface(sampler, (directions, distance), flat, origins, visibility)
+        least, most = visibility, visibility
         if others is not None:
-            least, most = arriving.copy(), arriving.copy()
-            least.ravel()[others.flat] = np.minimum(others.arriving, arriving.ravel()[others.flat])
-            most.ravel()[others.flat] = np.maximum(others.arriving, arriving.ravel()[others.flat])
+            least, most = visibility.copy(), visibility.copy()
+            least.ravel()[others.flat] = np.minimum(others.visibility, visibility.ravel()[others.flat])
+            most.ravel()[others.flat] = np.maximum(others.visibility, visibility.ravel()[others.flat])
         self.visible[block] |= most.sum(axis=0) > 0.0
         self.blocked[block] |= least.sum(axis=0) < met.sum(axis=0)
         for name, weight in weights.items():
-            number, passing = PASSES.index(name), arriving
+            number, passing = PASSES.index(name), visibility
             if others is not None:
-                passing = arriving.copy()
-                share = self.choices.by_surface(name, self.number, others.index, others.directions, others.solid_angle)
+                passing = visibility.copy()
+                rays = others.index, others.directions, others.solid_angle
+                share = self.selection.bsdf_share(name, self.number, *rays)
                 share[others.is_alone] = 1.0
-                passing.ravel()[others.flat] += share * (others.arriving - arriving.ravel()[others.flat])
-            for sums in (self.weights[number], self.arriving[number]):
+                passing.ravel()[others.flat] += share * (others.visibility - visibility.ravel()[others.flat])
+            for sums in (self.sum_w[number], self.sum_wv[number]):
                 halves = sums[:, block]
-                rays.add_to(halves, weight)
+                batch.add_to(halves, weight)
                 sums[:, block] = halves
                 weight *= passing
 
-    def _chosen_by_surface(self, view, rays, flat, origins, arriving):
+    def _chosen_by_surface(self, sampler, rays, flat, origins, light_visibility):
         """The rays at the places `flat` (R,) that the surface would choose and that then meet something else than the
-        light's rays did; None if there are none. The light's rays start at `origins` (3, R) and found `arriving`."""
-        starts = self.surface.starts
+        light's rays did; None if there are none. The light's rays start at `origins` (3, R), with
+        `light_visibility` (S, Q)."""
+        ray_origins = self.surface.ray_origins
         meet_the_same = self.chosen_by.light and self.mask == self.surface_mask
-        if meet_the_same and not starts.terminator[view.index].any():
+        if meet_the_same and not ray_origins.terminator[sampler.index].any():
             return None
         directions, distance = (_taken(rows, flat) for rows in rays)
-        column = flat % arriving.shape[1]
-        index = view.index[column]
-        start, toward, distance = starts.from_surface(index, directions, distance)
+        column = flat % light_visibility.shape[1]
+        index = sampler.index[column]
+        start, toward, distance = ray_origins.from_surface(index, directions, distance)
         # The light chooses directions above the smooth horizon; the surface chooses directions above the mesh's.
         smooth, flat_facing = (
             dot(np.take(normal, index, axis=0).T, directions)
-            for normal in (starts.smooth_normal, starts.geometric_normal)
+            for normal in (ray_origins.smooth_normal, ray_origins.geometric_normal)
         )
         is_alone = (smooth <= 0.0) & (flat_facing > 0.0)
         chosen = (smooth <= 0.0) | (flat_facing > 0.0)
@@ -570,28 +569,28 @@ class Pairs:
             chosen &= (start != origins).any(axis=0)
         chosen = np.flatnonzero(chosen)
         visibility = self._transmittance(self.surface_mask, start[:, chosen], toward[:, chosen], distance[chosen])
-        differ = np.flatnonzero(visibility != arriving.ravel()[flat[chosen]])
+        differ = np.flatnonzero(visibility != light_visibility.ravel()[flat[chosen]])
         if len(differ) == 0:
             return None
         chosen, visibility = chosen[differ], visibility[differ]
-        angle = view.solid_angles(flat[chosen])
-        return _ChosenBySurface(flat[chosen], visibility, index[chosen], directions[:, chosen], angle, is_alone[chosen])
+        angle = sampler.solid_angles(flat[chosen])
+        return RaysOfSurface(flat[chosen], visibility, index[chosen], directions[:, chosen], angle, is_alone[chosen])
 
     def unshadowed(self, name: str) -> np.ndarray:
         """Approximate radiance (Q,) that a pass reflects without shadows; 0 for pairs without that lobe."""
         scale = self.surface.albedo[self.index] if name == "diffuse" else np.float32(0.5)
         scale = scale * np.float32(np.abs(self.light.radiance).mean() / np.pi) / np.maximum(self.count, 1)
-        return self.weights[PASSES.index(name)].sum(axis=0) * scale * self.wanted[name]
+        return self.sum_w[PASSES.index(name)].sum(axis=0) * scale * self.wanted[name]
 
     def visibility_ratio(self, name: str):
         """Shares (Q,) of a pass, and their approximate standard deviations (Q,)."""
-        weights, arriving = self.weights[PASSES.index(name)], self.arriving[PASSES.index(name)]
-        whole = weights.sum(axis=0)
-        share = np.divide(arriving.sum(axis=0), whole, out=np.ones_like(whole), where=whole > 0.0)
-        halves = np.divide(arriving, weights, out=np.stack([share, share]), where=weights > 0.0)
+        sum_w, sum_wv = self.sum_w[PASSES.index(name)], self.sum_wv[PASSES.index(name)]
+        total = sum_w.sum(axis=0)
+        ratio = np.divide(sum_wv.sum(axis=0), total, out=np.ones_like(total), where=total > 0.0)
+        halves = np.divide(sum_wv, sum_w, out=np.stack([ratio, ratio]), where=sum_w > 0.0)
         # Pairs with probes only have no second half of rays: take the deviation of independent rays.
-        usual = np.sqrt(share * (_ONE - share) / np.maximum(self.count, 1).astype(np.float32))
-        return share, np.where((weights > 0.0).all(axis=0), 0.5 * np.abs(halves[0] - halves[1]), usual)
+        usual = np.sqrt(ratio * (_ONE - ratio) / np.maximum(self.count, 1).astype(np.float32))
+        return ratio, np.where((sum_w > 0.0).all(axis=0), 0.5 * np.abs(halves[0] - halves[1]), usual)
 
 
 def _taken(rows, flat):
@@ -600,7 +599,7 @@ def _taken(rows, flat):
 
 
 @dataclass(frozen=True)
-class Rays:
+class RayBatch:
     """The rays `first` to `last` of each pair, in looks of PROBES rays. In each look the lobe chooses some of the rays.
 
     `probes` is how many rays of the first look are chosen evenly, `later` the same for each later look.
@@ -613,41 +612,41 @@ class Rays:
     later: int
 
     @property
-    def looks(self) -> int:
+    def groups(self) -> int:
         """Number of looks of PROBES rays each."""
         return (self.last - self.first) // PROBES
 
     @property
-    def evenly(self) -> tuple[int, int]:
+    def light_points(self) -> tuple[int, int]:
         """First and last number of the points that choose directions evenly over the light."""
         return tuple(self.probes + self.later * (n // PROBES - 1) if n else 0 for n in (self.first, self.last))
 
     @property
-    def by_lobe(self) -> tuple[int, int]:
+    def bsdf_points(self) -> tuple[int, int]:
         """First and last number of the points that choose directions by the lobe."""
-        return tuple(n - even for n, even in zip((self.first, self.last), self.evenly, strict=True))
+        return tuple(n - even for n, even in zip((self.first, self.last), self.light_points, strict=True))
 
     def add_to(self, halves, weight):
         """Add weights (S, Q) to the sums (2, Q) of the first and of the second half of all rays."""
-        start, stop = self.evenly
-        batch_sums = np.zeros((self.looks, weight.shape[1]), np.float32)
+        start, stop = self.light_points
+        batch_sums = np.zeros((self.groups, weight.shape[1]), np.float32)
         for rows in (weight[: stop - start], weight[stop - start :]):
             if len(rows):
-                batch_sums += rows.reshape(self.looks, -1, weight.shape[1]).sum(axis=1)
+                batch_sums += rows.reshape(self.groups, -1, weight.shape[1]).sum(axis=1)
         for number, batch_sum in enumerate(batch_sums, self.first // PROBES):
             halves[int(2 * number * PROBES >= self.total)] += batch_sum
 
 
-class View:
+class RaySampler:
     """A light seen from a block of samples: arrays (Q,) and (3, Q)."""
 
-    def __init__(self, surface: Surface, index: np.ndarray, emitter: Emitter | Cluster, lobes: tuple[str, ...]):
+    def __init__(self, surface: SampleRows, index: np.ndarray, emitter: Emitter | LightCluster, lobes: tuple[str, ...]):
         self.index, self.emitter, self.lobes = index, emitter, lobes
         light = emitter.light
         offset = light.center[:, None] - light.viewpoint(np.take(surface.position, index, axis=1))
         self.height = (-dot(light.direction, offset)).astype(np.float32)
         self.offset = offset.astype(np.float32)
-        self.disk, is_quad = None, not isinstance(emitter, Cluster)
+        self.disk, is_quad = None, not isinstance(emitter, LightCluster)
         if light.is_facing:
             normal = surface.normal if "specular" in lobes else surface.diffuse_normal
             self.disk = FacingDisk.of(light, self.offset, np.take(normal, index, axis=1))
@@ -659,9 +658,9 @@ class View:
             self.least_height = off_plane(light.center + light.radius, np.abs(position).sum(axis=0)).astype(np.float32)
         if is_quad:
             self.quads = SphericalQuads(corners)
-            self.is_seen, self.solid_angle = self.quads.is_seen, self.quads.solid_angle
+            self.has_solid_angle, self.solid_angle = self.quads.has_solid_angle, self.quads.solid_angle
         if isinstance(emitter, Sky):
-            # The solid angle of one side: `Choices` knows the sides one by one.
+            # The solid angle of one side: `LightSelection` knows the sides one by one.
             self.solid_angle = np.full(len(index), 4.0 * np.pi / 6.0, np.float32)
         self.seeds = surface.seeds[index]
         if "diffuse" in lobes:
@@ -685,40 +684,37 @@ class View:
             self.warps = Warps(rows, self.cosine, self.sine, self.alpha)
             if is_quad:
                 self.warped_quads = SphericalQuads(self.warps.warped(self.warps.local(corners)))
-                self.is_seen = self.is_seen & self.warped_quads.is_seen
-            self.f0, self.rise, self.dip = surface.f0[index], surface.rise[index], surface.dip[index]
+                self.has_solid_angle = self.has_solid_angle & self.warped_quads.has_solid_angle
+            self.f0, self.f90_minus_f0 = surface.f0[index], surface.f90_minus_f0[index]
+            self.f82_term = surface.f82_term[index]
             self.dielectric, self.ior = surface.dielectric[index], surface.ior[index]
 
-    def rays(self, rays: Rays):
-        """Unit directions (3, S, Q) of `rays`, distances to the light (S, Q), and weights (S, Q) by lobe."""
+    def sample(self, batch: RayBatch):
+        """Unit directions (3, S, Q) of `batch`, distances to the light (S, Q), and weights (S, Q) by lobe."""
         if isinstance(self.emitter, Sky):
-            return self._rays_to_sky(rays)
-        if isinstance(self.emitter, Cluster):
-            return self._rays_to_cluster(rays)
-        evenly, by_lobe = (last - first for first, last in (rays.evenly, rays.by_lobe))
-        shape = (evenly + by_lobe, len(self.index))
+            return self._sample_sky(batch)
+        if isinstance(self.emitter, LightCluster):
+            return self._sample_cluster(batch)
+        light_count, bsdf_count = (last - first for first, last in (batch.light_points, batch.bsdf_points))
+        shape = (light_count + bsdf_count, len(self.index))
         directions = np.empty((3, *shape), np.float32)
-        if evenly:
-            points = unit_points(self.seeds, 0, *rays.evenly)
-            self.quads.directions(*points, out=directions[:, :evenly])
-        density = np.float32(evenly / shape[0]) / self.quads.solid_angle
-        if by_lobe:
-            local, length = np.empty((3, *shape), np.float32), np.empty(shape, np.float32)
-            points = unit_points(self.seeds, 1, *rays.by_lobe)
-            length[evenly:] = self.warps.unwarped(self.warped_quads.directions(*points, out=local[:, evenly:]))
-            self.warps.world(local[:, evenly:], out=directions[:, evenly:])
-            self.warps.local(directions[:, :evenly], out=local[:, :evenly])
-            length[:evenly] = self.warps.lengths(local[:, :evenly])
-            scale = np.float32(by_lobe / shape[0]) * self.warps.determinant / self.warped_quads.solid_angle
-            scale *= self.is_seen
-            np.clip(length, *_LENGTHS, out=length)
+        if light_count:
+            points = unit_points(self.seeds, 0, *batch.light_points)
+            self.quads.directions(*points, out=directions[:, :light_count])
+        density = np.float32(light_count / shape[0]) / self.quads.solid_angle
+        if bsdf_count:
+            local = np.empty((3, *shape), np.float32)
+            self.warped_quads.directions(*unit_points(self.seeds, 1, *batch.bsdf_points), out=local[:, light_count:])
+            length = self._unwarped(directions, local, light_count)
+            scale = np.float32(bsdf_count / shape[0]) * self.warps.determinant / self.warped_quads.solid_angle
+            scale *= self.has_solid_angle
             density = density + scale / (length * length * length)
         light = self.emitter.light
         falling = dot(directions, -light.direction.astype(np.float32) if self.disk is None else self._axis())
         height = self.height if self.disk is None else self.disk.length
         distance = np.minimum(height / np.maximum(falling, _TINY), _FARTHEST)
         falls = falling > 0.0
-        falls &= self.is_seen
+        falls &= self.has_solid_angle
         factor = falls / density
         if self.disk is None:
             brightness = self.emitter.brightness(directions, distance, self.offset, self.height)
@@ -728,7 +724,17 @@ class View:
             factor *= brightness
         if light.is_distant:
             distance[:] = _FARTHEST
-        return directions, distance, self._weights(directions, local if by_lobe else None, factor)
+        return directions, distance, self._weights(directions, local if bsdf_count else None, factor)
+
+    def _unwarped(self, directions, local, light_count):
+        """Complete the directions (3, S, Q) in the world and in the local frames. The first `light_count` are known in
+        the world, the others in the local frames after the warp. Returns their lengths (S, Q) after the warp."""
+        length = np.empty(directions.shape[1:], np.float32)
+        length[light_count:] = self.warps.unwarped(local[:, light_count:])
+        self.warps.world(local[:, light_count:], out=directions[:, light_count:])
+        self.warps.local(directions[:, :light_count], out=local[:, :light_count])
+        length[:light_count] = self.warps.lengths(local[:, :light_count])
+        return np.clip(length, *_LENGTHS, out=length)
 
     def _weights(self, directions, local, factor):
         weights = {}
@@ -740,29 +746,26 @@ class View:
             weights["diffuse"] *= factor
         return weights
 
-    def _rays_to_sky(self, rays: Rays):
-        """As `rays`, for a sky: by its picture and cosine, and by the cosine after the warp of the lobe."""
-        evenly, by_lobe = (last - first for first, last in (rays.evenly, rays.by_lobe))
-        shape, local = (evenly + by_lobe, len(self.index)), None
+    def _sample_sky(self, batch: RayBatch):
+        """As `sample`, for a sky: by its picture and cosine, and by the cosine after the warp of the lobe."""
+        light_count, bsdf_count = (last - first for first, last in (batch.light_points, batch.bsdf_points))
+        shape, local = (light_count + bsdf_count, len(self.index)), None
         normal = self.horizons[0] if "diffuse" in self.lobes else self.geometric_normal
         directions = np.empty((3, *shape), np.float32)
-        if evenly:
-            directions[:, :evenly] = self.emitter.directions(*unit_points(self.seeds, 0, *rays.evenly), normal)
-        if by_lobe:
-            local, length = np.empty((3, *shape), np.float32), np.empty(shape, np.float32)
-            x, y = unit_points(self.seeds, 1, *rays.by_lobe)
+        if light_count:
+            points = unit_points(self.seeds, 0, *batch.light_points)
+            directions[:, :light_count] = self.emitter.directions(*points, normal)
+        if bsdf_count:
+            local = np.empty((3, *shape), np.float32)
+            x, y = unit_points(self.seeds, 1, *batch.bsdf_points)
             radius, angle = np.sqrt(x), np.float32(2.0 * np.pi) * y
             chosen = (radius * np.cos(angle), radius * np.sin(angle), np.sqrt(_ONE - x))
-            local[:, evenly:] = chosen
-            length[evenly:] = self.warps.unwarped(local[:, evenly:])
-            self.warps.world(local[:, evenly:], out=directions[:, evenly:])
-            self.warps.local(directions[:, :evenly], out=local[:, :evenly])
-            length[:evenly] = self.warps.lengths(local[:, :evenly])
-            np.clip(length, *_LENGTHS, out=length)
-        density = np.float32(evenly / shape[0]) * self.emitter.density(directions, normal)
-        if by_lobe:
+            local[:, light_count:] = chosen
+            length = self._unwarped(directions, local, light_count)
+        density = np.float32(light_count / shape[0]) * self.emitter.density(directions, normal)
+        if bsdf_count:
             cosine = np.maximum(self.warps.zz * local[2] / length, _ZERO)
-            scale = np.float32(by_lobe / shape[0] / np.pi) * self.warps.determinant
+            scale = np.float32(bsdf_count / shape[0] / np.pi) * self.warps.determinant
             density += scale * cosine / (length * length * length)
         factor = self.emitter.brightness_along(directions) / np.maximum(density, _TINY)
         distance = np.full(shape, _FARTHEST, np.float32)
@@ -773,36 +776,35 @@ class View:
         `flat` (R,) of the flattened (S, Q)."""
         return self.solid_angle.ravel()[flat % self.solid_angle.size]
 
-    def _rays_to_cluster(self, rays: Rays):
-        """As `rays`, for a cluster: each ray goes to a leaf of its own."""
+    def _sample_cluster(self, batch: RayBatch):
+        """As `sample`, for a cluster: each ray goes to a leaf of its own."""
         even, sharp = (
-            unit_points(self.seeds, stream, *numbers) for stream, numbers in enumerate((rays.evenly, rays.by_lobe))
+            unit_points(self.seeds, stream, *numbers)
+            for stream, numbers in enumerate((batch.light_points, batch.bsdf_points))
         )
-        evenly, shape = len(even[0]), (len(even[0]) + len(sharp[0]), len(self.index))
-        leaf, chances, x = self._leaves(np.concatenate([even[0], sharp[0]]), evenly)
+        light_count, shape = len(even[0]), (len(even[0]) + len(sharp[0]), len(self.index))
+        leaf, pmf, x = self._leaves(np.concatenate([even[0], sharp[0]]), light_count)
         y, emitter = np.concatenate([even[1], sharp[1]]), self.emitter
         corners = emitter.corners[:, :, leaf] + self.offset[:, None, None]
         quads, directions = SphericalQuads(corners), np.empty((3, *shape), np.float32)
-        is_seen, local = quads.is_seen, None
-        quads.take_rows(slice(None, evenly)).directions(x[:evenly], y[:evenly], out=directions[:, :evenly])
-        self.solid_angle = quads.solid_angle / np.maximum(chances[0], np.float32(1e-12))
-        density = np.float32(evenly / shape[0]) * chances[0] / quads.solid_angle
-        if evenly < shape[0]:
-            local, length = np.empty((3, *shape), np.float32), np.empty(shape, np.float32)
+        has_solid_angle, local = quads.has_solid_angle, None
+        rows = slice(None, light_count)
+        quads.take_rows(rows).directions(x[rows], y[rows], out=directions[:, rows])
+        self.solid_angle = quads.solid_angle / np.maximum(pmf[0], np.float32(1e-12))
+        density = np.float32(light_count / shape[0]) * pmf[0] / quads.solid_angle
+        if light_count < shape[0]:
+            local = np.empty((3, *shape), np.float32)
             warped = SphericalQuads(self.warps.warped(self.warps.local(corners)))
-            is_seen = is_seen & warped.is_seen
-            warped.take_rows(slice(evenly, None)).directions(x[evenly:], y[evenly:], out=local[:, evenly:])
-            length[evenly:] = self.warps.unwarped(local[:, evenly:])
-            self.warps.world(local[:, evenly:], out=directions[:, evenly:])
-            self.warps.local(directions[:, :evenly], out=local[:, :evenly])
-            length[:evenly] = self.warps.lengths(local[:, :evenly])
-            np.clip(length, *_LENGTHS, out=length)
-            scale = np.float32(1.0 - evenly / shape[0]) * chances[-1] * self.warps.determinant / warped.solid_angle
+            has_solid_angle = has_solid_angle & warped.has_solid_angle
+            rows = slice(light_count, None)
+            warped.take_rows(rows).directions(x[rows], y[rows], out=local[:, rows])
+            length = self._unwarped(directions, local, light_count)
+            scale = np.float32(1.0 - light_count / shape[0]) * pmf[-1] * self.warps.determinant / warped.solid_angle
             density = density + scale / (length * length * length)
         normal = emitter.normal[:, leaf]
         falling, height = -dot(directions, normal), np.maximum(-dot(corners[:, 0], normal), _ZERO)
         distance = np.minimum(height / np.maximum(falling, _TINY), _FARTHEST)
-        factor = is_seen & (falling > 0.0) & (height > self.least_height) & (density > 0.0)
+        factor = has_solid_angle & (falling > 0.0) & (height > self.least_height) & (density > 0.0)
         if emitter.is_round is not None:
             factor &= self._inside_round(leaf, corners, directions * np.where(factor, distance, _ZERO))
         factor = factor * emitter.brightness[leaf] / np.maximum(density, _TINY)
@@ -817,31 +819,31 @@ class View:
         s, t = (vv * us - uv * vs) / whole, (uu * vs - uv * us) / whole
         return (s * s + t * t <= _ONE) | ~self.emitter.is_round[leaf]
 
-    def _leaves(self, x, evenly):
+    def _leaves(self, x, light_count):
         """The leaves (S, Q) that rays go to, by lobe their probabilities, and the numbers x (S, Q) rescaled for reuse.
-        x chooses the leaves: the first `evenly` rays by the diffuse lobe if there is one, the others by the specular
-        lobe."""
+        x chooses the leaves: the first `light_count` rays by the diffuse lobe if there is one, the others by the
+        specular lobe."""
         columns = np.tile(np.arange(len(self.index)), len(x))
         lobes, lobe_of_ray = [], np.zeros(x.shape, np.intp)
         if "diffuse" in self.lobes:
-            lobes.append(ClusterLobe(self.offset[:, columns], self.horizons[0][:, columns]))
+            lobes.append(LobeBound(self.offset[:, columns], self.horizons[0][:, columns]))
         if "specular" in self.lobes:
             normal = self.warps.rows[2]
             mirrored = np.float32(2.0) * self.cosine * normal - self.view
             width = np.maximum(LOBE_WIDTH * self.alpha * np.maximum(self.cosine, LEAST_COSINE), np.float32(1e-4))
             rows = (self.geometric_normal[:, columns], mirrored[:, columns], width[columns].astype(np.float32))
-            lobes.append(ClusterLobe(self.offset[:, columns], *rows))
-            lobe_of_ray[evenly:] = len(lobes) - 1
-        leaf, chances, rest = self.emitter.pick(x.ravel(), lobes, lobe_of_ray.ravel())
-        return leaf.reshape(x.shape), chances.reshape(len(lobes), *x.shape), rest.reshape(x.shape)
+            lobes.append(LobeBound(self.offset[:, columns], *rows))
+            lobe_of_ray[light_count:] = len(lobes) - 1
+        leaf, pmf, rest = self.emitter.pick(x.ravel(), lobes, lobe_of_ray.ravel())
+        return leaf.reshape(x.shape), pmf.reshape(len(lobes), *x.shape), rest.reshape(x.shape)
 
     def corner_heights(self, horizons):
         """As `Pairs._corner_heights`, for the corners of the leaves that the probes go to. Leaves that face away have
         height -1."""
         x = unit_points(self.seeds, 0, 0, PROBES)[0]
-        leaf, chances, _ = self._leaves(x, PROBES)
+        leaf, pmf, _ = self._leaves(x, PROBES)
         corners = self.emitter.corners[:, :, leaf] + self.offset[:, None, None]
-        is_lit = (chances[0] > 0.0) & (dot(corners[:, 0], self.emitter.normal[:, leaf]) < -self.least_height)
+        is_lit = (pmf[0] > 0.0) & (dot(corners[:, 0], self.emitter.normal[:, leaf]) < -self.least_height)
         corners, is_lit = corners.reshape(3, 4 * PROBES, len(self.index)), np.tile(is_lit, (4, 1))
         heights = np.minimum.reduce([dot(corners, normal[:, None, self.index]) for normal in horizons])
         return np.where(is_lit, heights, -_ONE), corners
@@ -925,10 +927,10 @@ class View:
         cosine *= np.float32(0.5)
         np.minimum(cosine, _ONE, out=cosine)
         result = schlick_curve(cosine)
-        if self.dip.any():
-            result *= self.rise - self.dip * (cosine * (_ONE - cosine))
+        if self.f82_term.any():
+            result *= self.f90_minus_f0 - self.f82_term * (cosine * (_ONE - cosine))
         else:
-            result *= self.rise
+            result *= self.f90_minus_f0
         result += self.f0
         if self.dielectric.any():
             result += self.dielectric * dielectric_reflectance(cosine, self.ior)

@@ -381,31 +381,32 @@ def script_nodes() -> list:
 
 
 @contextmanager
-def without_scripts(scene):
-    """Within this context Cycles renders without Open Shading Language, as if the nodes that run it were not linked."""
-    before, nodes = scene.cycles.shading_system, script_nodes()
-    scene.cycles.shading_system = False
-    for node in nodes:
-        node.mute = True
+def changed_properties(changes: list[tuple]):
+    """Within this context properties have other values: `changes` are (owner, name, value)."""
+    before = [(owner, name, getattr(owner, name)) for owner, name, _ in changes]
     try:
+        for owner, name, value in changes:
+            setattr(owner, name, value)
         yield
     finally:
-        scene.cycles.shading_system = before
-        for node in nodes:
-            node.mute = False
+        for owner, name, value in before:
+            setattr(owner, name, value)
+
+
+@contextmanager
+def without_scripts(scene):
+    """Within this context Cycles renders without Open Shading Language, as if the nodes that run it were not linked."""
+    nodes = [(node, "mute", True) for node in script_nodes()]
+    with changed_properties([(scene.cycles, "shading_system", False), *nodes]):
+        yield
 
 
 @contextmanager
 def without_lights(scene):
     """Within this context no light object is rendered; their light would take a third of the time of one sample."""
-    lights = [ob for ob in scene.objects if ob.type == "LIGHT" and not ob.hide_render]
-    for ob in lights:
-        ob.hide_render = True
-    try:
+    lights = [ob for ob in scene.objects if ob.type == "LIGHT"]
+    with changed_properties([(ob, "hide_render", True) for ob in lights]):
         yield
-    finally:
-        for ob in lights:
-            ob.hide_render = False
 
 
 def steps_after_rendering(scene) -> list[str]:

@@ -45,7 +45,7 @@ from .bake_meshes import (
     uv_of,
 )
 from .occluders import collect_occluders
-from .origin import middle_of, move_to_origin
+from .origin import box_center, move_to_origin
 from .pixels import OCCLUDERS, SEEDS, remove_occlusion
 
 # SAMPLED_TEXELS: width of the part of a texel over which Cycles' bake spreads its samples; the whole texel since 5.2.
@@ -257,7 +257,7 @@ def _open(job: BakeJob) -> BakeScene:
         override = view_layer.material_override.name
         warnings.append(f"material override {override!r} is switched off: objects are baked with their own")
         view_layer.material_override = None
-    origin = move_to_origin(scene, middle_of(objects[0]), warnings)
+    origin = move_to_origin(scene, box_center(objects[0]), warnings)
     seen_from = job.view if isinstance(job.view, str) else tuple(np.subtract(job.view, origin).tolist())
     folder = tempfile.TemporaryDirectory(prefix="ltsh-meshes-", ignore_cleanup_errors=True)
     has_shadows = job.shadows == "on"

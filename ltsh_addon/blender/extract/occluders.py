@@ -32,8 +32,8 @@ from ..materials.values import (
 )
 from ..render_settings import cycles_setting
 
-# AS_IT_IS: the places of occluders that are not points.
-AS_IT_IS = np.eye(4)[None]
+# ONE_INSTANCE: the matrices of occluders that are not points.
+ONE_INSTANCE = np.eye(4)[None]
 # NAMED: how many names of a kind a warning lists.
 NAMED = 3
 # A light is sampled by rays toward points on the light, and by rays in directions that the surface chooses.
@@ -57,6 +57,16 @@ def collect_occluders(depsgraph, override, warn, left_out=frozenset()) -> Occlud
     return _Collector(depsgraph, override, left_out).collect(warn)
 
 
+@dataclass(frozen=True)
+class _Instances:
+    """Instances of one mesh."""
+
+    mesh: int
+    matrices: np.ndarray  # (N, 3, 4)
+    mask: int
+    terminator: float
+
+
 class _Collector:
     def __init__(self, depsgraph, override, left_out):
         self._depsgraph, self._override, self._left_out = depsgraph, override, left_out
@@ -68,12 +78,12 @@ class _Collector:
         self._most_sets = (SURFACE_SHIFT if self._shift else MOST_BLOCKER_SETS + 1) - 1
         self._blockers = Blockers(list(objects.values()), self._most_sets)
         self._meshes: list[OccluderMesh] = []
-        # Key of evaluated data -> numbers of its meshes, and the places (N, 4, 4) of its points in the object.
-        self._parts: dict[tuple, tuple[list[int], np.ndarray]] = {}
-        self._instances: list[tuple] = []  # (mesh, matrices (N, 3, 4), mask, terminator)
-        # (size, place) of a mesh -> number of the first such mesh, and the name of its object.
-        self._there: dict[tuple, tuple[int, str]] = {}
-        self._materials: dict[str, _Clear | None] = {}
+        # Key of evaluated data -> numbers of its meshes, and the matrices (N, 4, 4) of its points in the object.
+        self._shapes: dict[tuple, tuple[list[int], np.ndarray]] = {}
+        self._instances: list[_Instances] = []
+        # (size, matrix) of a mesh -> number of the first such mesh, and the name of its object.
+        self._first_meshes: dict[tuple, tuple[int, str]] = {}
+        self._materials: dict[str, _ClearMaterial | None] = {}
         self._images: dict[tuple, np.ndarray] = {}
         # Difference from Cycles -> names of the objects that it concerns.
         self._notes: dict[str, dict[str, None]] = {}
@@ -102,11 +112,11 @@ class _Collector:
         return self._joined()
 
     def _joined(self) -> Occluders:
-        counts = [len(matrices) for _, matrices, _, _ in self._instances]
+        matrices = [instances.matrices for instances in self._instances]
         mesh, masks, terminators = (
-            np.repeat([instance[row] for instance in self._instances], counts) for row in (0, 2, 3)
+            np.repeat([getattr(instances, name) for instances in self._instances], list(map(len, matrices)))
+            for name in ("mesh", "mask", "terminator")
         )
-        matrices = [matrices for _, matrices, _, _ in self._instances]
         return Occluders(
             tuple(self._meshes),
             mesh.astype(np.int64),
@@ -122,21 +132,23 @@ class _Collector:
     def _note(self, kind: str, block) -> None:
         self._notes.setdefault(kind, {})[block.original.name if block.original else block.name] = None
 
-    def _place(self, instance, matrix, numbers, places=AS_IT_IS) -> None:
+    def _add_instances(self, instance, matrix, numbers, matrices=ONE_INSTANCE) -> None:
         mask, (by_light, by_surface) = self._blockers.mask_of(instance), _meets(instance)
         if self._shift:
             mask = by_light * mask | (by_surface * mask) << self._shift
         terminator = getattr(instance.object, "shadow_terminator_geometry_offset", TERMINATOR_OFFSET)
-        self._instances += [(number, (matrix @ places)[:, :3], mask, terminator) for number in numbers]
+        self._instances += [_Instances(number, (matrix @ matrices)[:, :3], mask, terminator) for number in numbers]
         # The depsgraph lists metaballs twice.
-        if places is AS_IT_IS and instance.object.type != "META":
+        if matrices is ONE_INSTANCE and instance.object.type != "META":
             for number in numbers:
                 self._look_for_twins(number, matrix, instance.object)
 
     def _look_for_twins(self, number, matrix, ob):
         """Add a note if an equal mesh is already in the same place."""
         mesh, mesh_and_name = self._meshes[number], (number, ob.original.name)
-        first = self._there.setdefault((len(mesh.vertices), len(mesh.triangles), matrix.tobytes()), mesh_and_name)
+        first = self._first_meshes.setdefault(
+            (len(mesh.vertices), len(mesh.triangles), matrix.tobytes()), mesh_and_name
+        )
         if first is not mesh_and_name and _is_same(mesh, self._meshes[first[0]]):
             self._note(f"in the same place as {first[1]!r}: Cycles is black there, here both are lit", ob)
 
@@ -153,13 +165,13 @@ class _Collector:
         if self._simplified(ob):
             self._note("camera or distance culling is on, but it blocks everywhere", ob)
         key = (*_shape_key(ob), tuple(material.name_full if material else "" for material in materials))
-        if key not in self._parts:
+        if key not in self._shapes:
             clear = [self._clear_of(material) for material in materials]
-            places = AS_IT_IS
+            matrices = ONE_INSTANCE
             if ob.type == "CURVES":
                 meshes = _tubes_of_curves(ob, clear[0], self._note)
             elif ob.type == "POINTCLOUD":
-                meshes, places = _balls(ob, clear[0], self._note)
+                meshes, matrices = _balls(ob, clear[0], self._note)
             else:
                 meshes = _split(ob, clear, self._image)
                 share = _doubled(meshes)
@@ -170,8 +182,8 @@ class _Collector:
                     self._note(text, ob)
                 if any(material is not None and _is_displaced(material) for material in materials):
                     self._note("displacement is not in shadows, the surface blocks where it is without", ob)
-            self._parts[key] = self._number(meshes), places
-        self._place(instance, matrix, *self._parts[key])
+            self._shapes[key] = self._number(meshes), matrices
+        self._add_instances(instance, matrix, *self._shapes[key])
 
     def _number(self, meshes) -> list[int]:
         """Keep those `meshes` that have triangles; returns their numbers."""
@@ -185,7 +197,7 @@ class _Collector:
             cycles_setting(scene, name) and cycles_setting(ob, name) for name in names
         )
 
-    def _clear_of(self, material) -> _Clear | None:
+    def _clear_of(self, material) -> _ClearMaterial | None:
         """The light that a material lets through; None if it blocks all."""
         if material is None:
             return None
@@ -200,7 +212,7 @@ class _Collector:
         output = surface.node
         if live_link(surface) is None:
             # A material with only a volume lets light through; another warning tells that volumes are not shaded.
-            return None if live_link(output.inputs["Volume"]) is None else _Clear(constant(1.0))
+            return None if live_link(output.inputs["Volume"]) is None else _ClearMaterial(constant(1.0))
         value, curve = _share_at(surface), None
         if isinstance(value, Curved):
             value, curve = value.value, (value.places, value.numbers)
@@ -212,12 +224,14 @@ class _Collector:
             value = value.mapped(np.full((3, 3), 1.0 / 3.0))
         if value.is_constant:
             share = float(np.clip(value.offset[0], 0.0, 1.0))
-            return _Clear(constant(share)) if share > 0.0 else None
+            return _ClearMaterial(constant(share)) if share > 0.0 else None
         image = self._image(value)
         if image is None:
             self._note("only Cycles knows the colors of its image, it blocks as if it were opaque", material)
             return None
-        return _Clear(value, curve) if np.interp(image, *curve or ((0.0, 1.0), (0.0, 1.0))).max() > 0.0 else None
+        return (
+            _ClearMaterial(value, curve) if np.interp(image, *curve or ((0.0, 1.0), (0.0, 1.0))).max() > 0.0 else None
+        )
 
     def _image(self, value: Value) -> np.ndarray | None:
         """`value` at the pixels (H, W) of its image; None if only Cycles knows the colors."""
@@ -249,8 +263,8 @@ class _Collector:
             slot = min(settings.material, len(ob.material_slots)) - 1
             material = self._override or (ob.material_slots[slot].material if slot >= 0 else None)
             meshes = [_tubes_of_hair(ob, system, count, steps, self._clear_of(material))]
-            # The places of particles are in world space.
-            self._place(instance, np.eye(4), self._number(meshes))
+            # The positions of particles are in world space.
+            self._add_instances(instance, np.eye(4), self._number(meshes))
 
 
 def _meets(instance) -> tuple[bool, bool]:
@@ -274,7 +288,7 @@ def _is_same(mesh, other):
 
 
 @dataclass(frozen=True)
-class _Clear:
+class _ClearMaterial:
     """The share of light that a material lets through."""
 
     value: Value
@@ -426,7 +440,7 @@ def _split(ob, clear: list, image_of) -> list[OccluderMesh]:
                 transparency = clear[slot].transparency(lambda name, here=here: uv_of(name)[here], image_of)
                 if transparency.share == 1.0 and transparency.image is None:
                     continue
-            meshes.append(_part(vertices, triangles, normals, here, transparency))
+            meshes.append(_submesh(vertices, triangles, normals, here, transparency))
         return meshes
     finally:
         ob.to_mesh_clear()
@@ -453,7 +467,7 @@ def _doubled(meshes: list[OccluderMesh]) -> float:
     return float(touched.mean()) if len(touched) else 0.0
 
 
-def _part(vertices, triangles, normals, here, transparency) -> OccluderMesh:
+def _submesh(vertices, triangles, normals, here, transparency) -> OccluderMesh:
     if here.all():
         return OccluderMesh(vertices, triangles, transparency, normals)
     used, named = np.unique(triangles[here], return_inverse=True)
@@ -472,12 +486,12 @@ def _tubes_of_curves(ob, clear, note) -> list[OccluderMesh]:
     if not points:
         return []
     note("hair blocks as tubes of three flat sides", ob)
-    places = read_values(curves.attributes["position"].data, "vector", (points, 3), np.float32)
+    positions = read_values(curves.attributes["position"].data, "vector", (points, 3), np.float32)
     radii = np.full(points, POINT_RADIUS, np.float32)
     if "radius" in curves.attributes:
         radii = read_values(curves.attributes["radius"].data, "value", (points,), np.float32)
     first = read_values(curves.curves, "first_point_index", (len(curves.curves),), np.int32)
-    return [_tubes(places, radii, first, _constant_transparency(clear, ob, note))]
+    return [_tubes(positions, radii, first, _constant_transparency(clear, ob, note))]
 
 
 def _tubes_of_hair(ob, system, count, steps, clear) -> OccluderMesh:
@@ -490,12 +504,12 @@ def _tubes_of_hair(ob, system, count, steps, clear) -> OccluderMesh:
     radius = tip + (root - tip) * (1.0 - along) ** power
     if settings.use_close_tip:
         radius[-1] = 0.0
-    places = np.array(
+    positions = np.array(
         [system.co_hair(object=ob, particle_no=number, step=step) for number in range(count) for step in range(steps)],
         np.float32,
     ).reshape(-1, 3)
     radii = np.tile(radius, count).astype(np.float32)
-    return _tubes(places, radii, np.arange(count) * steps, _constant_transparency(clear))
+    return _tubes(positions, radii, np.arange(count) * steps, _constant_transparency(clear))
 
 
 def _constant_transparency(clear, ob=None, note=None) -> Transparency | None:
@@ -509,15 +523,15 @@ def _constant_transparency(clear, ob=None, note=None) -> Transparency | None:
     return None
 
 
-def _tubes(places, radii, first, transparency) -> OccluderMesh:
-    """Tubes around curves through `places` that begin at the points `first`, with the mean width of round tubes."""
-    points, sides = len(places), TUBE_SIDES
+def _tubes(positions, radii, first, transparency) -> OccluderMesh:
+    """Tubes around curves through `positions` that begin at the points `first`, with the mean width of round tubes."""
+    points, sides = len(positions), TUBE_SIDES
     starts = np.ones(points, bool)
     starts[first] = False
     ends = np.flatnonzero(starts)  # end points of the pieces; each piece begins at the point before
     along = np.zeros((points, 3))
-    along[ends] += places[ends] - places[ends - 1]
-    along[ends - 1] += places[ends] - places[ends - 1]
+    along[ends] += positions[ends] - positions[ends - 1]
+    along[ends - 1] += positions[ends] - positions[ends - 1]
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-30)
     axis = np.eye(3)[np.abs(along).argmin(axis=1)]
     x = np.cross(along, axis)
@@ -527,7 +541,7 @@ def _tubes(places, radii, first, transparency) -> OccluderMesh:
     out = radii.astype(np.float64) * math.pi / (sides * math.sin(math.pi / sides))
     angle = 2.0 * math.pi * np.arange(sides) / sides
     ring = np.cos(angle)[:, None] * x[:, None] + np.sin(angle)[:, None] * y[:, None]
-    vertices = (places[:, None] + out[:, None, None] * ring).reshape(-1, 3)
+    vertices = (positions[:, None] + out[:, None, None] * ring).reshape(-1, 3)
     one, two = np.arange(sides), (np.arange(sides) + 1) % sides
     low, high = (ends - 1)[:, None] * sides, ends[:, None] * sides
     triangles = np.stack([low + one, low + two, high + two, low + one, high + two, high + one], axis=-1)
@@ -537,25 +551,25 @@ def _tubes(places, radii, first, transparency) -> OccluderMesh:
 
 
 def _balls(ob, clear, note) -> tuple[list[OccluderMesh], np.ndarray]:
-    """A list of one ball, and its places (N, 4, 4) in a point cloud."""
+    """A list of one ball, and its matrices (N, 4, 4) in a point cloud."""
     cloud = ob.data
     count = len(cloud.points)
     if count > MOST_PIECES:
         note(f"more than {MOST_PIECES:,} pieces of hair or points, which block nothing", ob)
         count = 0
     if not count:
-        return [], AS_IT_IS
+        return [], ONE_INSTANCE
     note("points block as balls of 80 flat faces", ob)
     radii = np.full(count, POINT_RADIUS, np.float32)
     if "radius" in cloud.attributes:
         radii = read_values(cloud.attributes["radius"].data, "value", (count,), np.float32)
-    places = np.zeros((count, 4, 4))
-    places[:, range(3), range(3)] = radii[:, None]
-    places[:, :3, 3] = read_values(cloud.attributes["position"].data, "vector", (count, 3), np.float32)
-    places[:, 3, 3] = 1.0
+    matrices = np.zeros((count, 4, 4))
+    matrices[:, range(3), range(3)] = radii[:, None]
+    matrices[:, :3, 3] = read_values(cloud.attributes["position"].data, "vector", (count, 3), np.float32)
+    matrices[:, 3, 3] = 1.0
     vertices, triangles = _ball()
     transparency, thickness = _constant_transparency(clear, ob, note), np.full(len(triangles), BALL_THICKNESS)
-    return [OccluderMesh(vertices, triangles, transparency, thickness=thickness)], places
+    return [OccluderMesh(vertices, triangles, transparency, thickness=thickness)], matrices
 
 
 @cache

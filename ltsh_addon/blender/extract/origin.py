@@ -72,7 +72,7 @@ def _corners(ob) -> np.ndarray:
         return corners @ matrix[:3, :3].T + matrix[:3, 3]
 
 
-def middle_of(ob) -> np.ndarray:
+def box_center(ob) -> np.ndarray:
     """The middle (3,) of the box around an object."""
     return _corners(ob).mean(axis=0)
 

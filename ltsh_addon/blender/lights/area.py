@@ -21,10 +21,10 @@ import numpy as np
 
 from ...scene import FARTHEST, EllipseLight, Light, PointLight, QuadLight, SpotCone, SpotLight, SunLight, listed
 from ..evaluated import EmitterTraits, RenderedSurface, surface_instancer
-from ..materials.aovs import CyclesReasons
+from ..materials.aovs import CyclesReasons, OpaqueInput
 from ..materials.graph import tree_in_use
 from ..render_settings import cycles_setting
-from .emission import Falloff, ObjectFacts, emission_of, open_studio, what_is_lost
+from .emission import Falloff, ObjectFacts, emission_of, emission_warnings, open_studio
 from .linking import Receivers
 from .meshes import SIDE_PROPERTY, MeshLight, collect_mesh_lights, mark_transparent, mesh_area_lights
 from .textures import NodeLight, with_node_emission
@@ -58,7 +58,7 @@ class LightInventory:
     world: Any = None  # the world that lights the scene
     behind: Any = None  # the world that is seen behind the surfaces
     occluders: Any = None  # visibility.Occluders, if shadows are wanted
-    made_opaque: list[tuple] = field(default_factory=list)  # see `inject_aovs`
+    made_opaque: list[OpaqueInput] = field(default_factory=list)  # see `inject_aovs`
     settings: dict[str, list[float]] = field(default_factory=dict)  # see `Extraction.light_settings`
     left_to_cycles: CyclesReasons = field(default_factory=CyclesReasons)  # what finished pictures leave to Cycles
 
@@ -331,7 +331,7 @@ def node_light(ob, matrix: np.ndarray, inventory: LightInventory, instance=None)
     if light.type == "SUN":
         # As in Cycles: a sun has no distance.
         emission.falloff = Falloff()
-    for problem in what_is_lost(emission, is_light=True):
+    for problem in emission_warnings(emission, is_light=True):
         inventory.warn(f"light {ob.original.name!r}: {problem}")
     shared = {
         "falloff": emission.falloff or Falloff(),

@@ -192,7 +192,7 @@ def _has_falloff(source: Source | None) -> bool:
 
 
 @contextmanager
-def falloff_left_out(blocks):
+def without_falloff(blocks):
     """Within this context the Light Falloff nodes of materials and lights give their Strength at any distance."""
     links, smooths = [], []
     try:
@@ -316,7 +316,7 @@ def _is_among(source: Source, kinds: dict[str, tuple]) -> bool:
     return outputs is not None and (not outputs or source.socket.name in outputs)
 
 
-def what_is_lost(emission: Emission, is_light: bool) -> list[str]:
+def emission_warnings(emission: Emission, is_light: bool) -> list[str]:
     """Warnings about emission that is not shaded as in Cycles: that of a light (`is_light`) or of a material.
 
     They leave out a dependence on the direction.
@@ -368,7 +368,7 @@ def _random_id(name: str) -> int:
 
 
 @contextmanager
-def seen_by_surfaces(blocks, random: float):
+def without_camera_rays(blocks, random: float):
     """Within this context the nodes of materials and lights get 0 for Is Camera Ray and `random` for Object Info's
     Random."""
     values = {LIGHT_PATH: (CAMERA_RAY, 0.0), "ShaderNodeObjectInfo": ("Random", random)}

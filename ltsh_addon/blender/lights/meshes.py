@@ -14,6 +14,7 @@ from ...cycles.planar_polygons import FlatPolygon
 from ...scene import Light, PolygonLight, QuadLight
 from ..evaluated import SURFACE_TYPES, EmitterTraits, RenderedSurface, is_rendered, read_values, surface_instancer
 from ..materials.graph import computed, ensure_nodes, live_link, material_output
+from ..render_settings import changed_properties
 from .emission import (
     PIXELS,
     Emission,
@@ -21,9 +22,9 @@ from .emission import (
     ObjectFacts,
     Studio,
     emission_of,
-    falloff_left_out,
-    seen_by_surfaces,
-    what_is_lost,
+    emission_warnings,
+    without_camera_rays,
+    without_falloff,
 )
 from .linking import Receivers
 
@@ -166,9 +167,9 @@ SIDE_PROPERTY = "ltsh_emitting_side"
 # Limits on the emitting polygons of one object. MOST_POLYGONS: in pictures and bakes, where 20,000 take about 13 s of
 # processor time. MOST_SHOWN: in the viewport.
 MOST_POLYGONS, MOST_SHOWN = 200_000, 2000
-# MOST_LOOKS: up to this many textured polygons of one object are rendered one by one. Of an object with more, only the
-# STAND_INS largest of each instance are rendered, and all get their mean.
-MOST_LOOKS = 256
+# MOST_RENDERED_POLYGONS: up to this many textured polygons of one object are rendered one by one. Of an object with
+# more, only the STAND_INS largest of each instance are rendered, and all get their mean.
+MOST_RENDERED_POLYGONS = 256
 STAND_INS = 32
 # Fields of lights that differ from polygon to polygon.
 _PLACE = ("center", "half_u", "half_v", "direction", "corners")
@@ -176,22 +177,10 @@ _PLACE = ("center", "half_u", "half_v", "direction", "corners")
 FEW_POLYGONS = 16
 
 
-@contextmanager
 def _undisplaced(mesh_lights: list[MeshLight]):
     """Within this context no material displaces faces, which could move them out of the camera's sight."""
-    methods = {
-        material.name_full: (material, material.displacement_method)
-        for mesh_light in mesh_lights
-        for material in mesh_light.materials
-        if material is not None
-    }
-    try:
-        for material, _ in methods.values():
-            material.displacement_method = "BUMP"
-        yield
-    finally:
-        for material, method in methods.values():
-            material.displacement_method = method
+    materials = {material.name_full: material for light in mesh_lights for material in light.materials if material}
+    return changed_properties([(material, "displacement_method", "BUMP") for material in materials.values()])
 
 
 def mesh_area_lights(mesh_lights: list[MeshLight], studio: Studio, eye: np.ndarray, warn) -> list[Light]:
@@ -200,8 +189,8 @@ def mesh_area_lights(mesh_lights: list[MeshLight], studio: Studio, eye: np.ndarr
     A closed mesh emits from the side where the camera is. Objects that shine get the custom property SIDE_PROPERTY.
     """
     for mesh_light in mesh_lights:
-        _note_what_is_lost(mesh_light, warn)
-    with _undisplaced(mesh_lights), falloff_left_out(material for light in mesh_lights for material in light.materials):
+        _warn_of_emission(mesh_light, warn)
+    with _undisplaced(mesh_lights), without_falloff(material for light in mesh_lights for material in light.materials):
         return _lights_of_all(mesh_lights, studio, eye, warn)
 
 
@@ -254,12 +243,12 @@ def mark_transparent(ob, side: int, materials: list) -> None:
             material[SIDE_PROPERTY] = 0
 
 
-def _note_what_is_lost(mesh_light: MeshLight, warn) -> None:
+def _warn_of_emission(mesh_light: MeshLight, warn) -> None:
     for material, emission in zip(mesh_light.materials, mesh_light.emission, strict=True):
         if emission.emits and emission.directional:
             nodes = ", ".join(sorted(emission.directional))
             warn(f"material {material.name!r}: its emission depends on the direction ({nodes}), shaded as seen head-on")
-        for problem in what_is_lost(emission, is_light=False) if emission.emits else ():
+        for problem in emission_warnings(emission, is_light=False) if emission.emits else ():
             warn(f"material {material.name!r}: {problem}")
         if emission.emits and material.displacement_method != "BUMP" and displaces(material):
             warn(f"material {material.name!r}: it emits from where its faces are without displacement")
@@ -363,7 +352,7 @@ def _shown(studio: Studio, mesh, matrix: np.ndarray, facts: ObjectFacts):
     ob = bpy.data.objects.new("Look at a mesh", mesh)
     # Its light must not fall on itself.
     ob.visible_diffuse = ob.visible_glossy = ob.visible_transmission = ob.visible_shadow = False
-    with seen_by_surfaces(mesh.materials, facts.random), studio.show(ob, matrix, facts):
+    with without_camera_rays(mesh.materials, facts.random), studio.show(ob, matrix, facts):
         yield
 
 
@@ -376,12 +365,12 @@ def _textured_lights(mesh_light: MeshLight, placed_polygons, side: int, studio: 
     count = sum(len(polygons) for _, polygons in textured)
     if count == 0:
         return []
-    if count > MOST_LOOKS:
+    if count > MOST_RENDERED_POLYGONS:
         return _mean_lights(mesh_light, textured, side, studio, warn)
     most = max(1, GRID * GRID // (count * len(_sides(side))))
     lights, errors = [], []
     for placement, polygons in textured:
-        with _shown(studio, _dressed(mesh_light, placement), placement.matrix, placement.facts):
+        with _shown(studio, _with_materials(mesh_light, placement), placement.matrix, placement.facts):
             for polygon in polygons:
                 for way in _sides(side):
                     light = polygon_light(mesh_light.light_of(polygon.label), polygon, way, np.ones(3))
@@ -398,7 +387,7 @@ def _textured_lights(mesh_light: MeshLight, placed_polygons, side: int, studio: 
     return lights
 
 
-def _dressed(mesh_light: MeshLight, placement: Placement):
+def _with_materials(mesh_light: MeshLight, placement: Placement):
     mesh = placement.mesh
     mesh.materials.clear()
     for material in mesh_light.materials:
@@ -435,7 +424,7 @@ def _mean_lights(mesh_light: MeshLight, textured, side: int, studio: Studio, war
     lights = []
     for placement, polygons in textured:
         largest = sorted(polygons, key=lambda polygon: -np.ptp(polygon.corners, axis=0).max())[:STAND_INS]
-        with _shown(studio, _dressed(mesh_light, placement), placement.matrix, placement.facts):
+        with _shown(studio, _with_materials(mesh_light, placement), placement.matrix, placement.facts):
             for polygon in largest:
                 for way in _sides(side):
                     light = polygon_light(mesh_light.light_of(polygon.label), polygon, way, np.ones(3))
@@ -451,7 +440,9 @@ def _mean_lights(mesh_light: MeshLight, textured, side: int, studio: Studio, war
                     lights.append(
                         polygon_light(mesh_light.light_of(polygon.label), polygon, way, np.array(light_sum) / area)
                     )
-    warn(f"object {mesh_light.ob.name!r}: its texture on more than {MOST_LOOKS} faces is shaded as its mean")
+    warn(
+        f"object {mesh_light.ob.name!r}: its texture on more than {MOST_RENDERED_POLYGONS} faces is shaded as its mean"
+    )
     return lights
 
 

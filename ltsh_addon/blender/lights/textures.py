@@ -12,10 +12,10 @@ from ...cycles.images import ImageTexture
 from ...cycles.patches import ERROR, Patches, cut_into_patches, split_light
 from ...scene import Light, Pattern
 from ..materials.values import Value, is_srgb, opaque_pixels
-from .emission import PIXELS, Falloff, ObjectFacts, Studio, falloff_left_out, seen_by_surfaces
+from .emission import PIXELS, Falloff, ObjectFacts, Studio, without_camera_rays, without_falloff
 
-# MOST_LOOKS: how many lights of one data block are rendered where they stand; others get the result of the first.
-MOST_LOOKS = 100
+# MOST_INSTANCES: how many lights of one data block are rendered where they stand; others get the result of the first.
+MOST_INSTANCES = 100
 
 
 @dataclass(frozen=True)
@@ -66,13 +66,13 @@ def with_node_emission(lights: list[Light], unseen: dict[int, NodeLight], studio
             continue
         source = unseen[position]
         of_data = emissions.setdefault(source.data.name_full, [])
-        if not of_data or (source.is_placed and len(of_data) < MOST_LOOKS):
+        if not of_data or (source.is_placed and len(of_data) < MOST_INSTANCES):
             of_data.append(node_emission(source, studio))
             emission = of_data[-1]
         else:
             emission = of_data[0]
             if source.is_placed:
-                warn(f"light {light.name!r}: of over {MOST_LOOKS} instances the others get the nodes of the first")
+                warn(f"light {light.name!r}: of over {MOST_INSTANCES} instances the others get the nodes of the first")
         if not light.is_distant:
             light = replace(light, falloff=source.falloff.power, smooth=source.falloff.smooth)
         if light.is_facing or light.is_distant:
@@ -103,7 +103,7 @@ def _area_factor(source: NodeLight, studio: Studio) -> NodeEmission:
     size_v = data.size if data.shape in ("SQUARE", "DISK") else data.size_y
     half_u, half_v = 0.5 * data.size * matrix[:3, 0], 0.5 * size_v * matrix[:3, 1]
     direction = -matrix[:3, 2] / np.linalg.norm(matrix[:3, 2])
-    with _standing(source, studio, {"spread": np.pi}):
+    with _white_light(source, studio, {"spread": np.pi}):
         image, _ = studio.look(matrix[:3, 3], half_u, half_v, direction, PIXELS if source.varies else 8)
     if np.dot(np.cross(half_u, half_v), direction) < 0.0:
         image = image[::-1]
@@ -128,7 +128,7 @@ def _sun_factor(source: NodeLight, studio: Studio) -> NodeEmission:
     toward = source.matrix[:3, 2] / np.linalg.norm(source.matrix[:3, 2])
     right = np.cross(toward, np.eye(3)[np.argmin(np.abs(toward))])
     axes = toward, right / np.linalg.norm(right)
-    with _standing(source, studio, {"angle": angle}):
+    with _white_light(source, studio, {"angle": angle}):
         image = studio.look_around(np.zeros(3), axes, angle, 1.0, SUN_PIXELS)
     step = (np.arange(SUN_PIXELS) + 0.5) * (2.0 / SUN_PIXELS) - 1.0
     inside = image[np.hypot(*np.meshgrid(step, step)) < 1.0 - 2.0 / SUN_PIXELS] / _WHITE["energy"]
@@ -150,7 +150,7 @@ def _point_factor(source: NodeLight, studio: Studio) -> NodeEmission:
         """The factor (N, N, 3) on each of the six sides of a light of this `radius`, seen from outside or within."""
         kind = "SPOT" if data.type == "SPOT" and source.by_spot else "POINT"
         settings = {"shadow_soft_size": radius, "use_soft_falloff": False}
-        with _standing(source, studio, settings, kind):
+        with _white_light(source, studio, settings, kind):
             images = [_side(studio, center, number, radius, within) for number in range(6)]
         return [image / (_WHITE["energy"] / np.pi) for image in images]
 
@@ -183,7 +183,7 @@ _WHITE = {"color": (1.0, 1.0, 1.0), "energy": 100.0, "exposure": 0.0, "normalize
 
 
 @contextmanager
-def _standing(source: NodeLight, studio: Studio, settings: dict, kind: str = ""):
+def _white_light(source: NodeLight, studio: Studio, settings: dict, kind: str = ""):
     """Within this context a white copy of the light stands at its place, without falloff and with these `settings`.
 
     A `kind` replaces the type of the light.
@@ -201,7 +201,7 @@ def _standing(source: NodeLight, studio: Studio, settings: dict, kind: str = "")
             setattr(data, key, value)
         ob = bpy.data.objects.new("Look at a light", data)
         ob.visible_camera = True
-        with falloff_left_out([data]), seen_by_surfaces([data], source.facts.random):
+        with without_falloff([data]), without_camera_rays([data], source.facts.random):
             with studio.show(ob, source.render_matrix, source.facts):
                 yield
     finally:
@@ -291,8 +291,8 @@ MOST_PATCHES = 64
 POINTS, SUB = 128, 2
 
 
-# MOST_SEEN: how many lights with nodes have their patches kept.
-MOST_SEEN = 256
+# MOST_CACHED: how many lights with nodes have their patches kept.
+MOST_CACHED = 256
 
 
 class ShownTextures:
@@ -314,11 +314,11 @@ class ShownTextures:
         patches = self._patches_of(light, factor)
         return None if patches is None else _shown_patches(light, patches, notes)
 
-    def split_seen(self, light: Light, emission: NodeEmission, notes: list[str]) -> list[Light]:
+    def split_by_nodes(self, light: Light, emission: NodeEmission, notes: list[str]) -> list[Light]:
         """As `split`, for the factor of the nodes of the light."""
         key = id(emission), light.is_round
         if key not in self._seen:
-            if len(self._seen) >= MOST_SEEN:
+            if len(self._seen) >= MOST_CACHED:
                 self._seen.clear()
             rows, columns = emission.factor.shape[:2]
             patches = cut_into_patches(emission.factor, _covered(light, rows, columns), MOST_PATCHES)

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import functools
 import itertools
-from dataclasses import dataclass, field
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import bpy
 
@@ -53,6 +55,15 @@ RECEIVER_PROPERTY = "ltsh_receiver"
 
 
 @dataclass(frozen=True)
+class OpaqueInput:
+    """An input that was changed to make a surface opaque."""
+
+    socket: Any
+    source: Any  # the socket or number that was there
+    level: float  # the number that makes the surface opaque, 0 or 1
+
+
+@dataclass(frozen=True)
 class MaterialLobes:
     """The lobes of one material: the leaves that have one, the values of each, and the differences from Cycles."""
 
@@ -61,9 +72,7 @@ class MaterialLobes:
     warnings: tuple[str, ...]
     is_transparent: bool = False  # rays pass through it and meet the next surface
     unshaded: str = ""  # why it is black where Cycles has light, "" where it is shaded
-    # Of each input that was changed: its socket, the socket or number that was there, and the number that makes the
-    # surface opaque.
-    made_opaque: tuple[tuple, ...] = ()
+    made_opaque: tuple[OpaqueInput, ...] = ()
     left_to_cycles: frozenset[str] = NEITHER  # passes in which direct light is not as in Cycles
     has_volume: bool = False
     is_displaced: bool = False  # its faces are displaced, but their shadows are not
@@ -98,28 +107,27 @@ def lobes_of(material, emitter: bool) -> MaterialLobes:
     is_displaced = material.displacement_method != "BUMP" and live_link(output.inputs["Displacement"]) is not None
     left_to_cycles = BOTH if is_displaced else _passes_left_to_cycles(output, shaders)
     has_volume = live_link(output.inputs["Volume"]) is not None
-    made_opaque = []
+    traits = {"left_to_cycles": left_to_cycles, "has_volume": has_volume, "is_displaced": is_displaced}
+    without_lobe, made_opaque = MaterialLobes((), (), warnings, **traits), []
     for cut_node in shaders.cuts:
         if cut_node.node.bl_idname == MIX:
             is_last = cut_node.other == [socket for socket in cut_node.node.inputs if socket.type == "SHADER"][-1]
             made_opaque.append(_fixed(cut_node.node.inputs[0], float(is_last)))
         else:
-            made_opaque.append((cut_node.clear, live_link(cut_node.clear).from_socket, 1.0))
+            made_opaque.append(OpaqueInput(cut_node.clear, live_link(cut_node.clear).from_socket, 1.0))
             cut(cut_node.clear)
     is_clear = is_seen_through(output, shaders)
     cut(output.inputs["Volume"])
     if is_clear:
         if live_link(surface) is not None:
-            made_opaque.append((surface, live_link(surface).from_socket, 1.0))
+            made_opaque.append(OpaqueInput(surface, live_link(surface).from_socket, 1.0))
         _show(surface, CLEAR, 1.0)
     elif not shaders.leaves:
         # Without a shader Cycles counts AOVs twice; a black BSDF looks the same.
         _show(surface, "ShaderNodeBsdfDiffuse", 0.0)
     if is_clear or (shaders.leaves and all(leaf.is_transparent for leaf in shaders.leaves)):
         unshaded = f"material {material.name!r} is transparent"
-        return MaterialLobes(
-            (), (), warnings, True, unshaded, tuple(made_opaque), left_to_cycles, has_volume, is_displaced
-        )
+        return replace(without_lobe, is_transparent=True, unshaded=unshaded, made_opaque=tuple(made_opaque))
     for leaf in shaders.leaves:
         if has_alpha(leaf.node):
             made_opaque.append(_fixed(leaf.node.inputs["Alpha"], 1.0))
@@ -133,8 +141,7 @@ def lobes_of(material, emitter: bool) -> MaterialLobes:
     unshaded = ""
     if unknown and not leaves:
         unshaded = f"material {material.name!r} has no shader that is supported, found {listed(map(repr, unknown))}"
-    told = warnings, False, unshaded, tuple(made_opaque), left_to_cycles, has_volume, is_displaced
-    return MaterialLobes(tuple(leaves), values, *told)
+    return replace(without_lobe, leaves=tuple(leaves), values=values, unshaded=unshaded, made_opaque=tuple(made_opaque))
 
 
 def _passes_left_to_cycles(output, shaders: SurfaceShaders) -> frozenset[str]:
@@ -147,8 +154,8 @@ def _passes_left_to_cycles(output, shaders: SurfaceShaders) -> frozenset[str]:
     return NEITHER.union(*(passes_of_cycles(leaf.node) for leaf in leaves if not is_emission(leaf.node)))
 
 
-def _fixed(target, level: float) -> tuple:
-    """Fix the number at the input `target` to `level`, 0 or 1; returns its entry of `MaterialLobes.made_opaque`.
+def _fixed(target, level: float) -> OpaqueInput:
+    """Fix the number at the input `target` to `level`, 0 or 1.
 
     Its old source stays linked: Cycles reads an image differently if its alpha feeds nothing.
     """
@@ -159,16 +166,16 @@ def _fixed(target, level: float) -> tuple:
     else:
         cut(target)
         target.default_value = level
-    return target, before, level
+    return OpaqueInput(target, before, level)
 
 
-def let_shadow_rays_through(made_opaque) -> None:
-    """Give materials their transparency back for all but camera rays; see `MaterialLobes.made_opaque`."""
-    for target, before, level in made_opaque:
-        tree = target.id_data
+def let_shadow_rays_through(made_opaque: Iterable[OpaqueInput]) -> None:
+    """Give materials their transparency back for all but camera rays."""
+    for changed in made_opaque:
+        target, before, tree = changed.socket, changed.source, changed.socket.id_data
         is_camera_ray = tree.nodes.new("ShaderNodeLightPath").outputs["Is Camera Ray"]
         if target.type != "SHADER":
-            if level:
+            if changed.level:
                 tree.links.new(computed("MAXIMUM", is_camera_ray, before), target)
             else:
                 tree.links.new(computed("MINIMUM", computed("SUBTRACT", 1.0, is_camera_ray), before), target)
@@ -283,7 +290,7 @@ def inject_aovs(
     materials: list,
     emitters: frozenset[str] = frozenset(),
     unshaded: list[str] | None = None,
-    made_opaque: list[tuple] | None = None,
+    made_opaque: list[OpaqueInput] | None = None,
     reasons: CyclesReasons | None = None,
 ) -> list[str]:
     """Make every material write its lobes into AOVs; returns warnings.

@@ -19,7 +19,14 @@ from ..lights.area import area_light, node_light, note_unsupported, reason_to_le
 from ..lights.emission import emission_of, factors_of, open_studio
 from ..lights.linking import Receivers
 from ..lights.meshes import collect_mesh_lights, constant_mesh_lights
-from ..lights.textures import MOST_LOOKS, NodeEmission, NodeLight, ShownTextures, node_emission, with_pattern
+from ..lights.textures import (
+    MOST_INSTANCES,
+    NodeEmission,
+    NodeLight,
+    ShownTextures,
+    node_emission,
+    with_pattern,
+)
 from ..materials.graph import source_of, surface_of, tree_in_use
 from ..materials.preview_material import preview_of
 from ..materials.values import product, value_at
@@ -114,7 +121,7 @@ def patterns_of(scene, depsgraph) -> dict[tuple, NodeEmission]:
     wanted: dict[tuple, NodeLight] = {}
 
     def note(data, source: NodeLight) -> str:
-        if len(wanted) < MOST_LOOKS:
+        if len(wanted) < MOST_INSTANCES:
             wanted[source.key] = source
         return NOT_YET
 
@@ -168,4 +175,4 @@ def _with_nodes(light: Light, instance, sources: tuple, notes: list[str]) -> lis
         light = replace(light, falloff=unseen.falloff.power, smooth=unseen.falloff.smooth)
     if light.is_facing or light.is_distant:
         return with_pattern(light, pattern, unseen, notes.append)
-    return textures.split_seen(light, pattern, notes)
+    return textures.split_by_nodes(light, pattern, notes)

@@ -116,7 +116,7 @@ def test_instances_have_a_look_of_their_own_where_they_need_one(tmp_path, monkey
     assert len(looks) == (3 if is_placed else 1) and warnings == []
     assert len({round(float(np.linalg.norm(light.half_v)), 4) for light in inventory.lights}) > 1
     if is_placed:
-        monkeypatch.setattr(textures, "MOST_LOOKS", 2)
+        monkeypatch.setattr(textures, "MOST_INSTANCES", 2)
         assert sum("'Light'" in line and "2 instances" in line for line in scene_parts.prepare()[3]) == 1
 
 

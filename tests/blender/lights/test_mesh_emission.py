@@ -74,7 +74,7 @@ def test_a_textured_screen_becomes_patches(tmp_path):
 
 
 def test_a_texture_over_many_faces_is_shaded_as_its_mean(monkeypatch):
-    monkeypatch.setattr(meshes, "MOST_LOOKS", 8)
+    monkeypatch.setattr(meshes, "MOST_RENDERED_POLYGONS", 8)
     start()
     material, node = lamp_material()
     tree = material.node_tree

@@ -6,7 +6,7 @@ they go. `rays` traces them, and `ratio` turns what they meet into the visibilit
 
 from __future__ import annotations
 
-from .directions import shared_numbers
+from .light_cluster import shared_numbers
 from .occluders import Hits, OccluderMesh, Occluders, Transparency
 from .ratio import (
     BLOCK_SAMPLES,

@@ -399,7 +399,7 @@ class Tracer:
         return self.occluders.chosen_by(light)
 
     def ray_origins(self, samples: SurfaceSamples) -> RayOrigins:
-        """Where rays from `samples` start, see `StartFinder.ray_origins`."""
+        """Where rays from `samples` start, see `ShadowTerminator.ray_origins`."""
         with self._lock:
             return self._terminator.ray_origins(samples)
 

@@ -117,7 +117,7 @@ class ShadowTerminator:
 
 @dataclass(frozen=True)
 class RayOrigins:
-    """Where shadow rays of P samples start, see `StartFinder.ray_origins`. `origins` returns the start of each ray."""
+    """Where shadow rays of P samples start, see `ShadowTerminator`. `origins` returns the start of each ray."""
 
     position: np.ndarray  # (P, 3) float32
     geometric_normal: np.ndarray  # (P, 3)

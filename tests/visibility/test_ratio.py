@@ -10,8 +10,10 @@ from known_tracers import OPEN, WALL, Tracer, floor, panel, past_spheres
 
 from ltsh_addon import shading
 from ltsh_addon.scene import PASSES, Cancelled, Film, SurfaceSamples, light_of
-from ltsh_addon.visibility import ratio
-from ltsh_addon.visibility.directions import Emitter
+from ltsh_addon.visibility import estimator, ratio
+from ltsh_addon.visibility.emitter import Emitter
+from ltsh_addon.visibility.light_selection import LightSelection
+from ltsh_addon.visibility.ray_sampler import SampleRows
 
 KINDS = [*((surface, "plain") for surface in random_surfaces.SURFACES)] + [
     ("plain", light)
@@ -95,9 +97,9 @@ def brute_force(samples, light, passed, side):
 
 def with_all_rays(samples, light, tracer):
     """The pairs of a light after as many rays as there can be, for each."""
-    choices = ratio.LightSelection(samples, [light], is_baked=False)
-    pairs = ratio.RatioEstimator(ratio.SampleRows(samples, PASSES, tracer), Emitter(light), 0, choices)
-    pairs._add_rays(np.arange(len(pairs.index)), 0, ratio.MOST_RAYS, 0)
+    selection = LightSelection(samples, [light], is_baked=False)
+    pairs = estimator.RatioEstimator(SampleRows(samples, PASSES, tracer), Emitter(light), 0, selection)
+    pairs._add_rays(np.arange(len(pairs.index)), 0, estimator.MOST_RAYS, 0)
     return pairs
 
 
@@ -237,8 +239,8 @@ def test_a_small_highlight_that_is_half_seen_gets_more_rays_than_all_else(monkey
     lamp = panel(half_u=np.array([0.15, 0.0, 0.0]), half_v=0.15 * panel().half_v)
     bars = past_spheres(*(((x, 1.5, 0.7), 0.0375) for x in (-0.135, -0.045, 0.045, 0.135)))
     images, rays = {}, {}
-    for name, brightest, most in (("truth", 1, 1024), ("before", 1, 32), ("now", ratio.BRIGHTEST, 32)):
-        monkeypatch.setattr(ratio, "BRIGHTEST", brightest)
+    for name, brightest, most in (("truth", 1, 1024), ("before", 1, 32), ("now", estimator.BRIGHTEST, 32)):
+        monkeypatch.setattr(estimator, "BRIGHTEST", brightest)
         found = ratio.trace_visibility(samples, [lamp], bars, ratio.ShadowSampling(rays=most, film=film))
         images[name], rays[name] = found.radiance["specular"], found.rays
     errors = {name: np.linalg.norm(images[name] - images["truth"]) for name in ("before", "now")}

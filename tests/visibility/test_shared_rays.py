@@ -13,8 +13,10 @@ from ltsh_addon import shading
 from ltsh_addon.pipeline import lighting, relight
 from ltsh_addon.pipeline.relight import RelightData
 from ltsh_addon.scene import PASSES, PolygonLight, light_of
-from ltsh_addon.visibility import directions, ratio, shared_numbers
-from ltsh_addon.visibility.directions import LightCluster, LightSelection
+from ltsh_addon.visibility import estimator, light_cluster, ratio, shared_numbers
+from ltsh_addon.visibility.light_cluster import LightCluster
+from ltsh_addon.visibility.light_selection import LightSelection
+from ltsh_addon.visibility.ray_sampler import SampleRows
 
 THREE_SPHERES = past_spheres(((0.0, 0.3, 0.6), 0.35), ((-1.0, -0.5, 0.3), 0.3), ((1.0, 1.2, 1.0), 0.3))
 
@@ -63,9 +65,9 @@ def test_rays_bring_the_light_of_all_lamps(roughness):
     samples, _ = floor(5, roughness)
     lights = [light for light in ceiling(99) if not isinstance(light, PolygonLight)]
     cluster = LightCluster(lights)
-    surface = ratio.SampleRows(samples, PASSES, OPEN.ray_origins(samples) and OPEN)
-    pairs = ratio.RatioEstimator(surface, cluster, 0, LightSelection(samples, cluster.selected_as, False))
-    pairs._add_rays(np.arange(len(pairs.index)), 0, ratio.MOST_RAYS, 0)
+    surface = SampleRows(samples, PASSES, OPEN.ray_origins(samples) and OPEN)
+    pairs = estimator.RatioEstimator(surface, cluster, 0, LightSelection(samples, cluster.selected_as, False))
+    pairs._add_rays(np.arange(len(pairs.index)), 0, estimator.MOST_RAYS, 0)
     expected = {name: np.zeros(len(samples)) for name in PASSES}
     place = (np.arange(10) + 0.5) / 5.0 - 1.0
     s, t = (axis.ravel() for axis in np.meshgrid(place, place))
@@ -103,7 +105,7 @@ def test_shadows_are_those_of_each_lamp_by_itself(roughness, monkeypatch):
     lights = ceiling(80, (1.0, 0.2, 0.1)) + ceiling(70, (0.1, 0.2, 1.0))
     shared = shadows_of(samples, lights, THREE_SPHERES, film, rays=256)
     assert len(shared.numbers) == 2
-    monkeypatch.setattr(directions.light_tree, "FEWEST", len(lights))
+    monkeypatch.setattr(light_cluster.light_tree, "FEWEST", len(lights))
     alone = shadows_of(samples, lights, THREE_SPHERES, film, rays=64)
     assert len(alone.numbers) == 150 and shared.rays < 0.5 * alone.rays
     monkeypatch.undo()

@@ -1,6 +1,7 @@
 """`Emitter`: the quadrilateral at which directions to a light aim, and where the light is bright in it.
 
-Where a round, polygonal or textured light leaves the quadrilateral dark, the direction has the weight 0. `Sky` is the emitter of all sides of a sky.
+Where a round, polygonal or textured light leaves the quadrilateral dark, the direction has the weight 0.
+`Sky` is the emitter of all sides of a sky.
 """
 
 from __future__ import annotations

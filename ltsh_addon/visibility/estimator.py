@@ -41,8 +41,7 @@ ROUNDS = 4
 # Rays end at this share of their distance to the light, just before it.
 END = np.float32(1.0 - 1e-4)
 _ZERO, _ONE, _TINY = np.float32(0.0), np.float32(1.0), np.float32(1e-30)
-# OUTLINE: points of the unit disk to aim at. SQUARE: corners of the square around it. Both are for lights that face the
-# points.
+# Points of the unit disk to aim at, for lights that face the points.
 OUTLINE = 0.99 * round_outline(16)
 _FARTHEST = np.float32(FARTHEST)
 

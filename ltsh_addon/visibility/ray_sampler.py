@@ -52,7 +52,7 @@ class RayBatch:
 
     @property
     def groups(self) -> int:
-        """Number of looks of PROBES rays each."""
+        """Number of groups of PROBES rays each."""
         return (self.last - self.first) // PROBES
 
     @property

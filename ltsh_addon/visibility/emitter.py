@@ -13,7 +13,7 @@ import numpy as np
 from ..emitters import light_profile
 from ..lobes.polygon import convex_pieces
 from ..scene import Light, PolygonLight, SkyLight
-from .spherical_quads import dot
+from .sampling import dot
 
 _ZERO, _ONE, _TINY = np.float32(0.0), np.float32(1.0), np.float32(1e-30)
 # Cells along each side of the picture of a textured light.

@@ -6,18 +6,21 @@ a neighbor in the picture says otherwise. The other pairs get more rays, the mor
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from ..cycles.horizons import SMALLEST_ALPHA, lobe_selection_pmf
+from ..cycles.light_tree import light_selection_pmf, light_tree_rows
 from ..emitters.facing import FacingDisk
 from ..emitters.light_polygons import may_reach, off_plane
-from ..scene import FARTHEST, PASSES, Film, PolygonLight, round_outline
+from ..lobes import brdf
+from ..scene import FARTHEST, PASSES, Film, Light, PolygonLight, SurfaceSamples, round_outline
 from .emitter import Emitter, Sky
 from .light_cluster import LightCluster
-from .light_selection import LightSelection
 from .ray_sampler import PROBES, RayBatch, RaySampler, SampleRows
-from .spherical_quads import dot
+from .sampling import dot
 
 MOST_RAYS = 1024
 # Rays of a block, few enough for its arrays to stay in the cache.
@@ -318,3 +321,75 @@ class RatioEstimator:
 def _taken(rows, flat):
     """Values (3, R) or (R,) at the places `flat` of the flattened last two axes of `rows`, (3, S, Q) or (S, Q)."""
     return np.take(rows.reshape(*rows.shape[:-2], -1), flat, axis=-1)
+
+
+class LightSelection:
+    """How likely Cycles chooses directions from samples (P) by `lights` (L) and by the lobes of the surface.
+
+    Who chose a ray decides what it meets. Rays that the light chose start above a curved surface, and are not blocked
+    if the light casts no shadow. Rays that the surface chose start at the surface, and are always blocked.
+    """
+
+    def __init__(self, samples: SurfaceSamples, lights: Sequence[Light], is_baked: bool):
+        self._samples, self._lights, self._is_baked = samples, tuple(lights), is_baked
+        self._first = None
+
+    def _prepare(self):
+        """Compute the chances on first use; most scenes never need them."""
+        samples = self._samples
+        moved = np.any(samples.position[1:] != samples.position[:-1], axis=1)
+        # The samples of one hit are consecutive.
+        self._hit = np.concatenate([np.zeros(min(len(samples), 1), int), np.cumsum(moved)])
+        self._count = np.bincount(self._hit)
+        self._first = np.cumsum(self._count) - self._count
+        self._lobes = lobe_selection_pmf(samples, self._hit, is_baked=False)
+        self._light_selection_pmf = np.full((len(self._lights), len(samples)), np.nan, np.float32)
+        self._rows = light_tree_rows(self._lights)
+
+    def bsdf_share(self, name: str, number: int, index, directions, solid_angle) -> np.ndarray:
+        """Share (R,) of the light of light `number` that a pass gets because the surface chose the unit directions
+        (3, R), seen from the samples `index` (R,). The light has the `solid_angle` (R,) in sr."""
+        if self._first is None:
+            self._prepare()
+        by_light = self._pmf(number, index) / np.maximum(solid_angle, 1e-12)
+        bsdf_share = self._density(name, index, directions.T.astype(np.float64))
+        return (bsdf_share**2 / np.maximum(bsdf_share**2 + by_light**2, 1e-30)).astype(np.float32)
+
+    def _pmf(self, number, index):
+        unknown = np.unique(index[np.isnan(self._light_selection_pmf[number, index])])
+        if len(unknown):
+            position, normal = self._samples.position[unknown], self._samples.smooth_normal[unknown]
+            self._light_selection_pmf[:, unknown] = light_selection_pmf(position, normal, self._lights, self._rows)
+        return self._light_selection_pmf[number, index]
+
+    def _density(self, name, index, directions):
+        """Probability density (R,) per sr with which the lobes of a hit choose the directions (R, 3)."""
+        hit, density = self._hit[index], np.zeros(len(index))
+        for number in range(self._count[hit].max(initial=0)):
+            here = np.flatnonzero(self._count[hit] > number)
+            sample = self._first[hit[here]] + number
+            specular, diffuse = self._lobes[:, sample]
+            # A bake of one pass chooses by the lobes of that pass alone.
+            if self._is_baked:
+                whole = np.maximum(self._sum_of_hit(name, hit[here]), 1e-12)
+                specular, diffuse = (
+                    specular / whole if name == "specular" else 0.0 * specular,
+                    diffuse / whole if name == "diffuse" else 0.0 * diffuse,
+                )
+            density[here] += specular * self._lobe_density(sample, directions[here])
+            cosine = np.einsum("rk,rk->r", directions[here], self._samples.diffuse_normal[sample])
+            density[here] += diffuse * np.maximum(cosine, 0.0) / np.pi
+        return density
+
+    def _sum_of_hit(self, name, hit):
+        return np.bincount(self._hit, weights=self._lobes[int(name == "diffuse")])[hit]
+
+    def _lobe_density(self, index, directions):
+        samples = self._samples
+        normal, view = samples.normal[index], samples.view[index]
+        half = directions + view
+        vertical = np.square(np.maximum(np.einsum("rk,rk->r", half, normal), 0.0))
+        horizontal = np.maximum(np.square(half).sum(axis=1) - vertical, 0.0)
+        alpha2 = np.square(np.maximum(samples.roughness[index] ** 2, SMALLEST_ALPHA))
+        cosine = np.maximum(np.einsum("rk,rk->r", normal, view), 1e-3)
+        return brdf.visible_normal_density(cosine, horizontal, vertical, alpha2)

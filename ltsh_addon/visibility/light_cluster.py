@@ -11,7 +11,7 @@ from ..emitters import light_tree
 from ..lobes.polygon import convex_pieces
 from ..scene import FlatLight, Light, PointLight, PolygonLight, QuadLight, SkyLight
 from .emitter import Emitter, Sky
-from .spherical_quads import dot
+from .sampling import dot
 
 _ZERO, _ONE, _TINY = np.float32(0.0), np.float32(1.0), np.float32(1e-30)
 

@@ -23,9 +23,8 @@ from ..lobes.diffuse import diffuse_factor
 from ..scene import FARTHEST, SurfaceSamples
 from .emitter import Emitter, Sky
 from .light_cluster import LightCluster, LobeBound
+from .sampling import SphericalQuads, Warps, dot, frames, seeds_of, unit_points
 from .shadow_terminator import RayOrigins
-from .sobol import seeds_of, unit_points
-from .spherical_quads import SphericalQuads, Warps, dot, frames
 
 # Number of probe rays of a pair. More rays come in multiples of it.
 PROBES = 8

@@ -14,7 +14,7 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from ..emitters import light_profile, small_lights
+from ..emitters import light_profile, profile_regions, small_lights
 from ..emitters.facing import AnalyticLobe, FacingDisk, mean_emission
 from ..emitters.light_polygons import (
     interpolated,
@@ -285,7 +285,7 @@ class _Lighting:
         if not lobes.only_tails:
             if not light.has_profile:
                 rest = self._add_small(lobes, light, position, (columns, allowed), sums[row])
-            elif light_profile.ProfileRegions.suit(light):
+            elif profile_regions.ProfileRegions.suit(light):
                 rest = self._add_points(lobes, light, position, (columns, allowed), sums[row])
             if rest is not None and len(rest) == 0:
                 return
@@ -454,7 +454,7 @@ class _Lighting:
             part = columns[piece]
             offset = (light.center[:, None] - position[:, part]).astype(np.float32)
             view = light_profile.LightView.of(light, offset, partial(_along_rows, lobes.rows[:, :, part]))
-            regions = light_profile.ProfileRegions(light, view, lobes.clip_rows)
+            regions = profile_regions.ProfileRegions(light, view, lobes.clip_rows)
             for count, kind, index in regions.rules():
                 if count == 0:
                     left.append(part[index])

@@ -1,4 +1,4 @@
-"""How numbers become directions: the Sobol sequence, quadrilaterals sampled over their solid angle, and the warp of GGX.
+"""Directions of numbers: the Sobol sequence, quadrilaterals sampled over their solid angle, and the warp of GGX.
 
 Everything is in single precision. Arrays are (S, Q), S directions from each of Q points, or (Q,). Vectors have their
 components first.

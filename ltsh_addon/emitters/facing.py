@@ -65,35 +65,35 @@ class FacingDisk:
             shrinking = 1.0 - radius * radius / np.where(inside, radius * radius + 1.0, squared)
             shrinking = np.maximum(shrinking, offset.dtype.type(LEAST_SHRINKING))
             offset = offset * shrinking
-            own = np.where(inside, radius, radius * np.sqrt(shrinking))
+            disk_radius = np.where(inside, radius, radius * np.sqrt(shrinking))
             distance = NEAR_DISK
         else:
             inside = squared <= 0.0
-            own, distance = np.broadcast_to(radius, squared.shape), 1e-6
+            disk_radius, distance = np.broadcast_to(radius, squared.shape), 1e-6
         if inside.any():
             offset = np.where(inside, offset.dtype.type(distance) * radius * normal, offset)
         length = np.sqrt(dot(offset, offset))
         gain = np.ones_like(length)
-        tiny = own < LEAST_SIZE * length
+        tiny = disk_radius < LEAST_SIZE * length
         if tiny.any():
-            gain = np.where(tiny, np.square(own / (LEAST_SIZE * length)), gain)
-            own = np.where(tiny, LEAST_SIZE * length, own)
+            gain = np.where(tiny, np.square(disk_radius / (LEAST_SIZE * length)), gain)
+            disk_radius = np.where(tiny, LEAST_SIZE * length, disk_radius)
         x, y, z = -offset / length
         # A frame around the direction of the light (Duff et al. 2017).
         sign = np.copysign(offset.dtype.type(1.0), z)
         a = -1.0 / (sign + z)
         b = x * y * a
-        half_u = own * np.stack([1.0 + sign * x * x * a, sign * b, -sign * x])
-        half_v = own * np.stack([b, sign + y * y * a, -y])
-        return cls(offset, half_u, half_v, length, own, gain)
+        half_u = disk_radius * np.stack([1.0 + sign * x * x * a, sign * b, -sign * x])
+        half_v = disk_radius * np.stack([b, sign + y * y * a, -y])
+        return cls(offset, half_u, half_v, length, disk_radius, gain)
 
     def _sizes(self):
         return self.length, self.radius, self.gain
 
-    def take(self, part) -> FacingDisk:
-        """The disks of the points `part`."""
-        vectors = (self.offset[:, part], self.half_u[:, part], self.half_v[:, part])
-        return FacingDisk(*vectors, *(values[part] for values in self._sizes()))
+    def take(self, index) -> FacingDisk:
+        """The disks of the points `index`."""
+        vectors = (self.offset[:, index], self.half_u[:, index], self.half_v[:, index])
+        return FacingDisk(*vectors, *(values[index] for values in self._sizes()))
 
     def along(self, cone) -> FacingDisk:
         """The same disks turned so that the factor of `cone` changes most along u; unchanged without a cone."""
@@ -143,8 +143,8 @@ def may_reach(light, offset: np.ndarray) -> np.ndarray:
     axis = np.linalg.solve(light.cone.axes, [0.0, 0.0, 1.0])
     axis /= np.sqrt((axis**2).sum())
     between = np.arccos(np.clip(dot(axis, offset) / distance, -1.0, 1.0))
-    seen = np.arcsin(np.minimum(light.radius / distance, 1.0))
-    return (between < cone_angle(light.cone) + 1.001 * seen + 1e-4) | (distance <= light.radius)
+    angular_radius = np.arcsin(np.minimum(light.radius / distance, 1.0))
+    return (between < cone_angle(light.cone) + 1.001 * angular_radius + 1e-4) | (distance <= light.radius)
 
 
 def ray_length(light, offset: np.ndarray, directions: np.ndarray) -> np.ndarray:
@@ -198,10 +198,10 @@ def pattern_values(pattern, normals: np.ndarray) -> np.ndarray:
     rows, columns = pattern.values.shape
     row = np.arctan2(np.sqrt(x * x + y * y), z) * (rows / np.pi) - 0.5
     column = np.arctan2(y, x) * (0.5 * columns / np.pi) - 0.5
-    first, left = np.floor(row), np.floor(column)
-    down, right = row - first, column - left
-    upper, lower = (np.clip(first + step, 0, rows - 1).astype(np.intp) for step in (0, 1))
-    here, there = ((left + step).astype(np.intp) % columns for step in (0, 1))
+    first_row, first_column = np.floor(row), np.floor(column)
+    down, right = row - first_row, column - first_column
+    upper, lower = (np.clip(first_row + step, 0, rows - 1).astype(np.intp) for step in (0, 1))
+    here, there = ((first_column + step).astype(np.intp) % columns for step in (0, 1))
     values = pattern.values
     above = values[upper, here] * (1.0 - right) + values[upper, there] * right
     below = values[lower, here] * (1.0 - right) + values[lower, there] * right
@@ -218,30 +218,30 @@ def mean_emission(light, offset: np.ndarray, disk: FacingDisk, lobe: AnalyticLob
     if light.is_uniform:
         return 1.0
 
-    def factors(places, part):
-        directions = disk.take(part).along(light.cone).corners(places)
+    def factors(places, points):
+        directions = disk.take(points).along(light.cone).corners(places)
         lengths = np.sqrt(dot(directions, directions))
         directions /= lengths
-        own = np.broadcast_to(offset[:, None, part], directions.shape)
-        return emission(light, own, directions), directions, lengths
+        center_offset = np.broadcast_to(offset[:, None, points], directions.shape)
+        return emission(light, center_offset, directions), directions, lengths
 
     few = factors(_RIM, slice(None))[0]
     least, most = few.min(axis=0), few.max(axis=0)
     # The center stands for half of the disk's area, the points around it for the other half: right for smooth changes.
     result = 0.5 * few[0] + 0.5 * few[1:].mean(axis=0)
     rule = np.where(most - least > CHANGING * most, np.where(least < STEP * most, 1, 0), -1)
-    for part, (places, shares) in _parts(rule):
-        values, directions, lengths = factors(places, part)
-        own = lobe.take(part)
-        weights = own.values(directions) / lengths**3 * shares.astype(lengths.dtype)[:, None]
-        peak = own.peak(disk.take(part))
-        at_peak, toward_peak, length = factors_at(light, offset[:, part], peak)
-        weight = PEAK_WEIGHT * own.values(toward_peak[:, None])[0] / length**3
-        weight *= own.view is not None
+    for points, (places, shares) in _parts(rule):
+        values, directions, lengths = factors(places, points)
+        lobes = lobe.take(points)
+        weights = lobes.values(directions) / lengths**3 * shares.astype(lengths.dtype)[:, None]
+        peak = lobes.peak(disk.take(points))
+        at_peak, toward_peak, length = factors_at(light, offset[:, points], peak)
+        weight = PEAK_WEIGHT * lobes.values(toward_peak[:, None])[0] / length**3
+        weight *= lobes.view is not None
         whole = weights.sum(axis=0) + weight
         lit = whole > 0.0
         mean = ((weights * values).sum(axis=0) + weight * at_peak) / np.where(lit, whole, 1.0)
-        result[part] = np.where(lit, mean, values.mean(axis=0))
+        result[points] = np.where(lit, mean, values.mean(axis=0))
     return result
 
 
@@ -269,11 +269,11 @@ class AnalyticLobe:
     view: np.ndarray | None = None  # (3, Q)
     alpha: np.ndarray | None = None  # (Q,)
 
-    def take(self, part) -> AnalyticLobe:
-        """The lobes of the samples `part`."""
+    def take(self, index) -> AnalyticLobe:
+        """The lobes of the samples `index`."""
         if self.view is None:
-            return AnalyticLobe(self.normal[:, part])
-        return AnalyticLobe(self.normal[:, part], self.view[:, part], self.alpha[part])
+            return AnalyticLobe(self.normal[:, index])
+        return AnalyticLobe(self.normal[:, index], self.view[:, index], self.alpha[index])
 
     def values(self, directions: np.ndarray) -> np.ndarray:
         """BRDF times cosine (S, Q) of white lobes, for unit directions (3, S, Q)."""
@@ -296,8 +296,8 @@ class AnalyticLobe:
         mirrored = 2.0 * dot(self.normal, self.view) * self.normal - self.view
         along = dot(mirrored, disk.offset)
         ahead = along > 1e-3 * disk.length
-        place = mirrored * (disk.length * disk.length / np.where(ahead, along, 1.0)) - disk.offset
+        hit = mirrored * (disk.length * disk.length / np.where(ahead, along, 1.0)) - disk.offset
         squared = disk.radius * disk.radius
-        s, t = (np.where(ahead, dot(place, half) / squared, 0.0) for half in (disk.half_u, disk.half_v))
+        s, t = (np.where(ahead, dot(hit, half) / squared, 0.0) for half in (disk.half_u, disk.half_v))
         beyond = np.maximum(np.sqrt(s * s + t * t), 1.0)
         return disk.offset + s / beyond * disk.half_u + t / beyond * disk.half_v

@@ -197,17 +197,17 @@ def lights_that_reach_nothing(samples: SurfaceSamples, lights: tuple[Light, ...]
     Lights of one name are one light. After MOST_PAIRS pairs, all other lights count as seen.
     """
     reached = set()
-    for part in (samples.take(slice(None, None, max(1, len(samples) // FEW_SAMPLES))), samples):
-        lobes, pairs = has_lobe(part), 0
-        ends = np.stack([part.position.min(axis=0, initial=np.inf), part.position.max(axis=0, initial=-np.inf)])
+    for subset in (samples.take(slice(None, None, max(1, len(samples) // FEW_SAMPLES))), samples):
+        lobes, pairs = has_lobe(subset), 0
+        ends = np.stack([subset.position.min(axis=0, initial=np.inf), subset.position.max(axis=0, initial=-np.inf)])
         for light in lights:
             if light.name in reached:
                 continue
             # How far the box around the samples extends in front of the light.
             ahead = ((light.viewpoint(ends) - light.center) * light.direction).max(axis=0).sum()
             if light.is_facing or ahead > 0.0:
-                pairs += len(part)
-                if pairs > MOST_PAIRS or _reaches(light, part, lobes):
+                pairs += len(subset)
+                if pairs > MOST_PAIRS or _reaches(light, subset, lobes):
                     reached.add(light.name)
     return [name for name in dict.fromkeys(light.name for light in lights) if name not in reached]
 
@@ -268,13 +268,15 @@ def visible_polygons(framed: LocalFrames, light, corners, candidates, second_nor
     local = to_local(frame[:, :, index], offset)
     if light.has_profile:
         local = np.concatenate([local, to_local(light_profile.plane_axes(light), offset)])
-    parts = [(slice(None), local)]
+    clipped_parts = [(slice(None), local)]
     if second_normal is not None:
         height = (offset * second_normal[index].T[:, None, :]).sum(axis=0)
         if not (height > 0.0).all():
             with_height = np.concatenate([local, height[None]])
-            parts = ((part, clipped[:-1]) for part, clipped in split_at_horizon(with_height, axis=len(local)))
-    for outer, polygon in parts:
+            clipped_parts = (
+                (chosen, clipped[:-1]) for chosen, clipped in split_at_horizon(with_height, axis=len(local))
+            )
+    for outer, polygon in clipped_parts:
         for inner, clipped in split_at_horizon(polygon):
             yield index[outer][inner], clipped
 
@@ -383,18 +385,18 @@ class PatchTree:
     @cached_property
     def reflected(self) -> np.ndarray:
         """Radiance (6, GRID, GRID, 3) that white diffuse surfaces reflect, by normals as in `interpolated`."""
-        place = np.linspace(-1.0, 1.0, GRID)
+        coordinate = np.linspace(-1.0, 1.0, GRID)
         normals = np.ones((3, 2, GRID, GRID, 3))
         for axis in range(3):
             normals[axis, 1, ..., axis] = -1.0
-            normals[axis, ..., (axis + 1) % 3] = place[:, None]
-            normals[axis, ..., (axis + 2) % 3] = place
+            normals[axis, ..., (axis + 1) % 3] = coordinate[:, None]
+            normals[axis, ..., (axis + 2) % 3] = coordinate
         normals = (normals / np.linalg.norm(normals, axis=-1, keepdims=True)).reshape(-1, 3).astype(np.float32)
         result = np.zeros((len(normals), 3))
         for toward, light in self._points():
             for start in range(0, toward.shape[1], GRID_POINTS):
-                part = slice(start, start + GRID_POINTS)
-                result += np.maximum(normals @ toward[:, part], np.float32(0.0)) @ light[:, part].T
+                block = slice(start, start + GRID_POINTS)
+                result += np.maximum(normals @ toward[:, block], np.float32(0.0)) @ light[:, block].T
         return result.reshape(6, GRID, GRID, 3)
 
     def _points(self):
@@ -404,8 +406,8 @@ class PatchTree:
         steps = np.ceil(self.half[leaves] / distance / POINT_SIZE).astype(int)
         for count in np.unique(steps):
             patch = leaves[steps == count]
-            place = (np.arange(count) + 0.5) * (2.0 / count) - 1.0
-            s, t = (values.ravel() for values in np.meshgrid(place, place))
+            coordinate = (np.arange(count) + 0.5) * (2.0 / count) - 1.0
+            s, t = (values.ravel() for values in np.meshgrid(coordinate, coordinate))
             center, half_u, half_v = (values[:, patch, None] for values in (self.center, self.half_u, self.half_v))
             points = center + half_u * s + half_v * t
             squares = dot(points, points)
@@ -422,11 +424,11 @@ class PatchTree:
         light = self.lights[0]
         narrowest = np.tan(0.5 * light.spread) if light.has_spread else 1.0
         for start in range(0, len(index), PATCH_CHUNK):
-            part = index[start : start + PATCH_CHUNK]
-            normals = [np.ascontiguousarray(normal[part].T, np.float32) for normal in horizons]
-            peak = _Peaks(samples, part) if is_specular else None
-            origin = np.ascontiguousarray(light.viewpoint(samples.position[part]).T)
-            column, patch = np.arange(len(part)), np.zeros(len(part), np.intp)
+            block = index[start : start + PATCH_CHUNK]
+            normals = [np.ascontiguousarray(normal[block].T, np.float32) for normal in horizons]
+            peak = _Peaks(samples, block) if is_specular else None
+            origin = np.ascontiguousarray(light.viewpoint(samples.position[block]).T)
+            column, patch = np.arange(len(block)), np.zeros(len(block), np.intp)
             while len(column):
                 toward = (self.center[:, patch] - origin[:, column]).astype(np.float32)
                 distance = np.maximum(np.sqrt(dot(toward, toward)), np.float32(1e-30))
@@ -460,9 +462,9 @@ def fitting_patches(light: Light, samples: SurfaceSamples, specular: bool) -> It
     key, owner = np.arange(len(tree.count)), np.repeat(np.arange(len(tree.count)), tree.count)
     key[1:] = np.where(tree.count[1:] == 0, -1 - owner, key[1:])
     order = np.argsort(key[patch], kind="stable")
-    for own in np.split(order, np.flatnonzero(np.diff(key[patch[order]])) + 1):
-        members = np.unique(patch[own])
-        yield index[own[patch[own] == members[0]]], tuple(tree.lights[number] for number in members)
+    for group in np.split(order, np.flatnonzero(np.diff(key[patch[order]])) + 1):
+        members = np.unique(patch[group])
+        yield index[group[patch[group] == members[0]]], tuple(tree.lights[number] for number in members)
 
 
 class _Peaks:
@@ -486,10 +488,10 @@ def _largest_sizes(area, radiance, first, count, is_distant) -> np.ndarray:
     """Largest sizes (N,) of patches by their contrast: the difference between a patch and its parts, relative to the
     whole light."""
     brightness, owner = np.abs(radiance).sum(axis=0), np.repeat(np.arange(len(count)), count)
-    part = np.arange(1, len(count))
-    different = area[part] * np.abs(radiance[:, part] - radiance[:, owner]).sum(axis=0)
+    child = np.arange(1, len(count))
+    different = area[child] * np.abs(radiance[:, child] - radiance[:, owner]).sum(axis=0)
     # The part of a patch that its parts do not cover is dark.
-    dark = np.maximum(area - np.bincount(owner, area[part], len(count)), 0.0) * brightness
+    dark = np.maximum(area - np.bincount(owner, area[child], len(count)), 0.0) * brightness
     contrast = (np.bincount(owner, different, len(count)) + dark) / np.maximum(area * brightness[0], 1e-30)
     product, most = (SKY_PRODUCT, LARGEST_OF_SKY) if is_distant else (PATCH_PRODUCT, LARGEST_PATCH)
     largest = np.minimum(np.sqrt(product / np.maximum(contrast, 1e-9)), most)
@@ -499,12 +501,14 @@ def _largest_sizes(area, radiance, first, count, is_distant) -> np.ndarray:
 def cached_on_children(name, lights, made):
     """The result of made(lights). It is kept with the parts of the first light, which its copies share."""
     key = [light.children[0] for light in lights], [(*light.center, *light.radiance) for light in lights]
-    kept = vars(lights[0].children[0])
-    old = kept.get(name)
-    is_same = old is not None and old[0][1] == key[1] and all(map(lambda one, two: one is two, old[0][0], key[0]))
+    cache = vars(lights[0].children[0])
+    cached = cache.get(name)
+    is_same = (
+        cached is not None and cached[0][1] == key[1] and all(map(lambda one, two: one is two, cached[0][0], key[0]))
+    )
     if not is_same:
-        kept[name] = key, made(lights)
-    return kept[name][1]
+        cache[name] = key, made(lights)
+    return cache[name][1]
 
 
 def interpolated(grid: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -515,12 +519,12 @@ def interpolated(grid: np.ndarray, normals: np.ndarray) -> np.ndarray:
     rows = np.arange(len(normals))
     along = normals[rows, axis]
     face = 2 * axis + (along < 0.0)
-    places = [
+    coordinates = [
         np.clip((normals[rows, (axis + step) % 3] / np.abs(along) + 1.0) * 0.5 * (size - 1), 0.0, size - 1.0)
         for step in (1, 2)
     ]
-    lows = [np.minimum(place.astype(np.intp), size - 2) for place in places]
-    (s, t), (i, j) = [place - low for place, low in zip(places, lows, strict=True)], lows
+    lows = [np.minimum(coordinate.astype(np.intp), size - 2) for coordinate in coordinates]
+    (s, t), (i, j) = [coordinate - low for coordinate, low in zip(coordinates, lows, strict=True)], lows
     near = grid[face, i, j] * (1.0 - t)[:, None] + grid[face, i, j + 1] * t[:, None]
     far = grid[face, i + 1, j] * (1.0 - t)[:, None] + grid[face, i + 1, j + 1] * t[:, None]
     return (near * (1.0 - s)[:, None] + far * s[:, None]).T

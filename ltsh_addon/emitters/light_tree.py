@@ -26,6 +26,7 @@ from ..lobes.polygon import dot
 from ..scene import Light, QuadLight
 from . import small_lights
 from .tails import NEAR_RADII
+from .tiles import TileCubics, Tiles, lengths, neighbor_keys, products, split_columns
 
 # A group with fewer lights is shaded light by light.
 FEWEST = 64
@@ -48,9 +49,6 @@ LEAF_ERROR, FINER_LEAF_ERROR, LEAF_SIZE = 2e-3, 5e-4, 1.0
 # The light of a node is interpolated between ten samples if the error of cubics is at most ERROR. That error is
 # INTERPOLATED times the fourth power of the tile's size as seen from the node.
 INTERPOLATED = 0.3
-# ROUGHEST: how far all that the lobes depend on may differ from such cubics, in units of the lengths over which lobes
-# change. LARGEST_WEIGHTS: limit for the sum of the absolute weights of the ten samples.
-ROUGHEST, LARGEST_WEIGHTS = 1e-3, 8.0
 # Lower limit of divisors: lengths in m, and cosines.
 LEAST = np.float32(1e-12)
 # TILE: most samples of a tile, for diffuse and for specular lobes. PAIRS: pairs of a sample and a point per chunk.
@@ -78,7 +76,9 @@ class LightTree:
     reach: np.ndarray  # (N,) m: sqrt(3) standard deviations of the brightness; for a square, half its diagonal
     axes: np.ndarray  # (3, 3, N) m: principal axes of the brightness (first axis), a standard deviation long
     axis: np.ndarray  # (N, 3) mean direction into which the lights shine
-    cone: np.ndarray  # (N,) rad: largest angle of a light's direction from `axis`; reach, axis and cone are float32
+    normal_spread: (
+        np.ndarray
+    )  # (N,) rad: largest angle of a light's direction from `axis`; reach, axis and normal_spread are float32
     vector: np.ndarray  # (N, 3): mean radiance times area vectors
     swing: np.ndarray  # (N,) mean radiance times area: how much of a vector may belong to lights that face away
     color: np.ndarray  # (3, N) of the light, 1 on average
@@ -95,7 +95,7 @@ class LightTree:
         brightness, size = radiance.mean(axis=1), np.linalg.norm(area, axis=1)
         power, normal = brightness * size, area / size[:, None]
         order, start, end, children = node_ranges(center, normal)
-        sums = _Sums(order, start, end)
+        sums = NodeSums(order, start, end)
         total = sums(power)
         origin = center.mean(axis=0)
         middle = sums(power[:, None] * (center - origin)) / total[:, None]
@@ -115,12 +115,14 @@ class LightTree:
         # Cosines are taken as uniform over sqrt(3) standard deviations of the directions on either side of the mean.
         turned = np.maximum(1.0 - (length[:, 0] / total) ** 2, 0.0) * (end - start > 1)
         swing = (total * np.maximum(np.sqrt(1.5 * turned), TURNED)).astype(np.float32)
-        cone = normal_spreads(axis, normal[order], start, end)
+        normal_spread = normal_spreads(axis, normal[order], start, end)
         number = np.where(end - start == 1, order[start], -1)
         diagonal = (sums(power * diagonal) / total).astype(np.float32)
         reach = np.sqrt(3.0 * variances.sum(axis=1))
-        reach, axis, cone = (values.astype(np.float32) for values in (reach, axis, cone))
-        return cls(middle + origin, reach, axes, axis, cone, vector, swing, color, total, diagonal, children, number)
+        reach, axis, normal_spread = (values.astype(np.float32) for values in (reach, axis, normal_spread))
+        return cls(
+            middle + origin, reach, axes, axis, normal_spread, vector, swing, color, total, diagonal, children, number
+        )
 
     @cached_property
     def is_turned(self) -> np.ndarray:
@@ -130,16 +132,16 @@ class LightTree:
     @cached_property
     def places(self) -> list[np.ndarray]:
         """Points (N W, 3), W for each node; one array for diffuse and one for specular lobes."""
-        number, found = np.arange(len(self.center)), []
+        number, points_by_lobe = np.arange(len(self.center)), []
         for corners in (CORNERS, PAIRS_OF_CORNERS):
             # Nodes take the ways in turn, so that their errors cancel.
             ways = corners[number % len(corners)]
             points = np.stack([(ways * self.axes[:, axis].T[:, None]).sum(axis=2) for axis in range(3)], axis=2)
-            found.append((self.center[:, None] + points).reshape(-1, 3))
-        return found
+            points_by_lobe.append((self.center[:, None] + points).reshape(-1, 3))
+        return points_by_lobe
 
 
-class _Sums:
+class NodeSums:
     """Sums over the lights of nodes. The lights of a node are `order[start:end]`."""
 
     def __init__(self, order, start, end):
@@ -148,10 +150,10 @@ class _Sums:
     def __call__(self, values):
         """Sums (N, ...) of the lights' `values` (L, ...)."""
         running = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values[self.order], axis=0)])
-        found = running[self.end] - running[self.start]
+        sums = running[self.end] - running[self.start]
         alone = self.end - self.start == 1
-        found[alone] = values[self.order[self.start[alone]]]
-        return found
+        sums[alone] = values[self.order[self.start[alone]]]
+        return sums
 
 
 def stand_ins(lights, most: int) -> tuple[list[Light], np.ndarray]:
@@ -161,7 +163,7 @@ def stand_ins(lights, most: int) -> tuple[list[Light], np.ndarray]:
     size = np.linalg.norm(area, axis=1)
     normal = area / size[:, None]
     order, start, end, _ = node_ranges(center, normal, most)
-    sums = _Sums(order, start[-most:], end[-most:])
+    sums = NodeSums(order, start[-most:], end[-most:])
     whole = sums(size)
     radiance = sums(size[:, None] * np.array([light.radiance for light in lights])) / whole[:, None]
     origin = center.mean(axis=0)
@@ -183,11 +185,11 @@ def stand_ins(lights, most: int) -> tuple[list[Light], np.ndarray]:
     radiance *= share[:, None]
     like = QuadLight.like(lights[0])
     names = ("center", "half_u", "half_v", "direction")
-    found = [
-        like.altered(**dict(zip(names, row, strict=True)), radiance=own)
-        for row, own in zip(rows, radiance, strict=True)
+    rectangles = [
+        like.altered(**dict(zip(names, row, strict=True)), radiance=mean)
+        for row, mean in zip(rows, radiance, strict=True)
     ]
-    return found, share
+    return rectangles, share
 
 
 def node_ranges(center, normal, most=np.inf):
@@ -201,9 +203,9 @@ def node_ranges(center, normal, most=np.inf):
     while True:
         start, end = starts[-1], ends[-1]
         inner = np.nonzero(end - start > 1)[0]
-        own = np.full((len(start), 2), -1)
-        own[inner] = first + np.arange(2 * len(inner)).reshape(-1, 2)
-        children.append(own)
+        child = np.full((len(start), 2), -1)
+        child[inner] = first + np.arange(2 * len(inner)).reshape(-1, 2)
+        children.append(child)
         if len(inner) == 0 or len(start) >= most:
             return order, np.concatenate(starts), np.concatenate(ends), np.concatenate(children)
         start, end = start[inner], end[inner]
@@ -237,123 +239,9 @@ def normal_spreads(axis, normals, start, end):
     return np.arccos(np.clip(least, -1.0, 1.0))
 
 
-@dataclass(frozen=True)
-class Tiles:
-    """T tiles of samples, and bounds on the lobes in them."""
-
-    columns: list[np.ndarray]  # of the samples of each tile
-    center: np.ndarray  # (T, 3) m
-    half: np.ndarray  # (T, 3) m: half the box around the samples; this and what follows in single precision
-    radius: np.ndarray  # (T,) m: half the diagonal of the box
-    horizons: list[tuple[np.ndarray, np.ndarray]]  # cones around the normals of each horizon: axes (T, 3), angles (T,)
-    mirrored: tuple[np.ndarray, np.ndarray] | None  # cones around the mirrored views; None for diffuse lobes
-    width: np.ndarray | None  # (T,) rad, of the narrowest specular lobe
-    only_tails: bool  # True: nodes must be in the tails of the lobes, at least `SHARP_TAIL` from their peaks
-
-    @classmethod
-    def of(cls, lobes, position, columns) -> Tiles:
-        """The tiles with these `columns`, of samples with x, y, z in `position` (3, Q)."""
-        every = np.concatenate(columns)
-        first = np.concatenate([[0], np.cumsum([len(own) for own in columns])[:-1]])
-        place = position[:, every]
-        low, high = (end.reduceat(place, first, axis=1).T for end in (np.minimum, np.maximum))
-        horizons = [_cones_of(lobes.rows[row][:, every], first) for row in lobes.clip_rows]
-        mirrored = width = None
-        if lobes.sharpest is not None:
-            mirrored = _cones_of(lobes.sharpest.mirrored[:, every], first)
-            width = np.minimum.reduceat(lobes.sharpest.width[every], first)
-        half = (0.5 * (high - low)).astype(np.float32)
-        return cls(columns, 0.5 * (low + high), half, _lengths(half), horizons, mirrored, width, lobes.only_tails)
-
-
-def _keys(lobes, position, chosen) -> np.ndarray:
-    """Keys (D, Q') by which the columns `chosen` (Q',) are grouped: places, and directions of the lobes."""
-    direction = lobes.rows[lobes.clip_rows[-1]] if lobes.sharpest is None else lobes.sharpest.mirrored
-    place = position[:, chosen]
-    extent = np.ptp(place, axis=1)
-    weight = 4.0 / max(np.sqrt(extent @ extent), 1e-30)
-    keys = np.concatenate([weight * (place - place.mean(axis=1, keepdims=True)), direction[:, chosen]])
-    return keys.astype(np.float32)
-
-
-@dataclass(frozen=True)
-class Cubics:
-    """Ten samples of each of T tiles, and cubics of two coordinates that interpolate to its other samples."""
-
-    anchors: np.ndarray  # (T, 10) places of the ten samples in the tile
-    weights: np.ndarray  # (T, R, 10) for the at most R samples of a tile
-    are_smooth: np.ndarray  # (T,) True if all that the lobes depend on is close to such a cubic
-
-    @classmethod
-    def of(cls, parts, keys, shape) -> Cubics:
-        """For tiles of the samples `parts`. `keys` (D, Q) come from `_keys`; `shape` (S, Q) is what the lobes
-        depend on, in units of the lengths over which they change."""
-        count = max(map(len, parts))
-        index = np.stack([np.resize(part, count) for part in parts])
-        own = np.moveaxis(keys[:, index], 0, -1)
-        own -= own.mean(axis=1, keepdims=True)
-        size = np.maximum(np.abs(own[..., :3]).max(axis=(1, 2)), 1e-30)[:, None]
-        _, axes = np.linalg.eigh(own.transpose(0, 2, 1) @ own)
-        u, v = np.moveaxis(own @ axes[:, :, :-3:-1], -1, 0)
-        u, v = (one / np.maximum(np.abs(one).max(axis=1, keepdims=True), 1e-30) for one in (u, v))
-        one = np.ones_like(u)
-        powers = [one, u, u * u, u * u * u, v, v * u, v * u * u, v * v, v * v * u, v * v * v]
-        values = np.stack(powers, axis=-1)
-        # Choose the samples that determine cubics best, one after another, by a pivoted Cholesky decomposition.
-        tile, left = np.arange(len(parts)), (values * values).sum(axis=2)
-        found, anchors, least = np.zeros_like(values), np.zeros((len(parts), len(powers)), int), np.inf
-        for step in range(len(powers)):
-            place = left.argmax(axis=1)
-            most = left[tile, place]
-            column = values @ values[tile, place][:, :, None] - found @ found[tile, place][:, :, None]
-            found[:, :, step] = column[..., 0] / np.sqrt(np.maximum(most, 1e-30))[:, None]
-            left -= found[:, :, step] ** 2
-            anchors[:, step], least = place, np.minimum(least, most)
-        are_smooth = least > 1e-4
-        chosen = found[tile[:, None], anchors].astype(np.float64)
-        chosen[~are_smooth] = np.eye(len(powers))
-        weights = (found @ np.linalg.inv(chosen)).astype(np.float32)
-        are_smooth &= np.abs(weights).sum(axis=2).max(axis=1) < LARGEST_WEIGHTS
-        shape = np.concatenate([own[..., :3] / size[..., None], np.moveaxis(shape[:, index], 0, -1)], axis=2)
-        off = np.abs(weights @ shape[tile[:, None], anchors] - shape).max(axis=(1, 2))
-        return cls(anchors, weights, are_smooth & (off < ROUGHEST))
-
-
-def _halves(keys, part, most):
-    """Parts of the columns `part` that are neighbors in `keys` (D, Q), at most `most` columns each."""
-    if len(part) <= most:
-        return [part]
-    own = keys[:, part]
-    along = own[np.argmax(np.ptp(own, axis=1))]
-    order = np.argpartition(along, len(part) // 2)
-    half = len(part) // 2
-    return [*_halves(keys, part[order[:half]], most), *_halves(keys, part[order[half:]], most)]
-
-
-def _cones_of(vectors, first):
-    """Axes (T, 3) and angles (T,) of cones around the vectors (3, Q) of each tile. `first` (T,) is its first column."""
-    own = vectors.astype(np.float64)
-    own /= np.maximum(np.sqrt(dot(own, own)), 1e-30)
-    axis = np.add.reduceat(own, first, axis=1)
-    axis /= np.maximum(np.sqrt(dot(axis, axis)), 1e-30)
-    count = np.diff(np.append(first, own.shape[1]))
-    least = np.minimum.reduceat(dot(np.repeat(axis, count, axis=1), own), first)
-    return axis.T.astype(np.float32), np.arccos(np.clip(least, -1.0, 1.0)).astype(np.float32)
-
-
 def _angles(offset, distance, axis):
     """Angles (K,) in rad between vectors `offset` (K, 3), `distance` (K,) long, and the unit vectors `axis` (K, 3)."""
-    return np.arccos(np.clip(_products(offset, axis) / distance, -1.0, 1.0))
-
-
-def _products(one, two):
-    """Dot products (K,) of vectors (K, 3)."""
-    return np.einsum("ki,ki->k", one, two)
-
-
-def _lengths(vectors):
-    """Lengths (K,) of vectors (K, 3)."""
-    return np.sqrt(_products(vectors, vectors))
+    return np.arccos(np.clip(products(offset, axis) / distance, -1.0, 1.0))
 
 
 def _heights(ranges, offset, axis, cone):
@@ -361,8 +249,8 @@ def _heights(ranges, offset, axis, cone):
     they may differ (K,) within `ranges`: the reach (K,) of the node, half the box (K, 3) of the tile, and the largest
     distance (K,) between them. Normals are within `cone` (K,) in rad of the axis."""
     reach, half, farthest = ranges
-    slack = reach + _products(half, np.abs(axis)) + np.sin(np.minimum(cone, 0.5 * np.pi)) * farthest
-    return _products(offset, axis), slack
+    slack = reach + products(half, np.abs(axis)) + np.sin(np.minimum(cone, 0.5 * np.pi)) * farthest
+    return products(offset, axis), slack
 
 
 @dataclass(frozen=True)
@@ -383,7 +271,7 @@ class NodeDistances:
         offset = (tree.center[node] - tiles.center[tile]).astype(np.float32)
         half, reach, radius = tiles.half[tile], tree.reach[node], tiles.radius[tile]
         gap = np.maximum(np.abs(offset) - half, 0.0)
-        distance, nearest = (np.maximum(_lengths(vectors), LEAST) for vectors in (offset, gap))
+        distance, nearest = (np.maximum(lengths(vectors), LEAST) for vectors in (offset, gap))
         extent = radius + reach
         parallax = np.where(extent < distance, np.arcsin(np.minimum(extent / distance, 1.0)), np.float32(np.pi))
         return cls(offset, half, reach, radius, distance, nearest, parallax)
@@ -399,7 +287,7 @@ class NodeDistances:
 
 
 @dataclass
-class _Pairs:
+class TileNodePairs:
     """K pairs of a tile and a node: upper bounds on their light and on its error."""
 
     tile: np.ndarray
@@ -417,10 +305,10 @@ class _Pairs:
     crossed: np.ndarray  # light that is wrong where horizons and planes cross the node
 
     @classmethod
-    def of(cls, tree: LightTree, tiles: Tiles, tile, node) -> _Pairs:
+    def of(cls, tree: LightTree, tiles: Tiles, tile, node) -> TileNodePairs:
         """For the numbers (K,) of tiles and nodes."""
         between = NodeDistances.of(tree, tiles, tile, node)
-        size, seen = between.reach / between.nearest, between.radius / between.nearest
+        size, tile_size = between.reach / between.nearest, between.radius / between.nearest
         # Where a horizon or its own plane crosses a light, the cosine is at most this.
         rim = np.minimum(2.0 * size, 1.0)
         light, plane, crossed, is_dark = _shining(tree, node, between, rim)
@@ -451,10 +339,10 @@ class _Pairs:
                 is_wrong = ~are_in_tail
             light *= (width**2 / (width**2 + away**2)) ** 2
             length = np.minimum(width + away, 1.0)
-            size, seen, turn = size / length, seen / length, turn / length
+            size, tile_size, turn = size / length, tile_size / length, turn / length
         light[is_dark] = 0.0
         mean = light / (1.0 + (between.radius / np.maximum(between.nearest, between.reach)) ** 2)
-        change, are_leaves = np.minimum(seen + turn, 1.0), tree.number[node] >= 0
+        change, are_leaves = np.minimum(tile_size + turn, 1.0), tree.number[node] >= 0
         are = are_leaves, is_dark, are_crossed, is_smooth, are_in_tail, is_wrong
         return cls(tile, node, *are, size, change, light, mean, light * crossed)
 
@@ -481,88 +369,88 @@ class _Pairs:
         for number, start, end in zip(numbers, first, np.append(first, len(pairs.tile))[1:], strict=True):
             yield number, pairs.take(slice(start, end))
 
-    def take(self, index) -> _Pairs:
+    def take(self, index) -> TileNodePairs:
         """The pairs at `index` (Q,)."""
-        return _Pairs(*(getattr(self, own.name)[index] for own in fields(self)))
+        return TileNodePairs(*(getattr(self, item.name)[index] for item in fields(self)))
 
     @classmethod
-    def joined(cls, parts) -> _Pairs:
-        """All pairs of the `parts`."""
-        return cls(*(np.concatenate([getattr(part, own.name) for part in parts]) for own in fields(cls)))
+    def joined(cls, pieces) -> TileNodePairs:
+        """All pairs of the `pieces`."""
+        return cls(*(np.concatenate([getattr(pairs, item.name) for pairs in pieces]) for item in fields(cls)))
 
 
 def _shining(tree: LightTree, node, between: NodeDistances, rim):
     """For K pairs: an upper bound on the light; the share of all light, and of this light, that may be wrong because a
     sample may be in the plane of a light; and whether the nodes face away."""
-    angle, cone = _angles(-between.offset, between.distance, tree.axis[node]), tree.cone[node]
-    shining = np.cos(np.clip(angle - cone - between.parallax, 0.0, 0.5 * np.pi))
+    angle, normal_spread = _angles(-between.offset, between.distance, tree.axis[node]), tree.normal_spread[node]
+    shining = np.cos(np.clip(angle - normal_spread - between.parallax, 0.0, 0.5 * np.pi))
     power = tree.power[node]
     light = power * shining / np.maximum(between.nearest, between.reach) ** 2
-    height, slack = _heights(between.ranges, -between.offset, tree.axis[node], cone)
+    height, slack = _heights(between.ranges, -between.offset, tree.axis[node], normal_spread)
     plane = np.where(height < slack, np.minimum(SWUNG * (tree.swing[node] / power) + CROSSED * rim, 1.0), 0.0)
     return light, plane, np.minimum(plane / np.maximum(shining, LEAST), 1.0), height < -slack
 
 
-def _refined(tree, tiles, is_fine) -> _Pairs:
-    """The coarsest `_Pairs` of all tiles for which is_fine(pairs) holds or which are leaves, without dark ones."""
+def _refined(tree, tiles, is_fine) -> TileNodePairs:
+    """The coarsest pairs of all tiles for which is_fine(pairs) holds or which are leaves, without dark ones."""
     fine, tile, node = [], np.arange(len(tiles.columns)), np.zeros(len(tiles.columns), int)
     while len(node) or not fine:
-        pairs = _Pairs.of(tree, tiles, tile, node)
+        pairs = TileNodePairs.of(tree, tiles, tile, node)
         done = pairs.are_leaves | is_fine(pairs)
         fine.append(pairs.take(done & ~pairs.is_dark))
         open_ones = ~(done | pairs.is_dark)
         tile, node = np.repeat(tile[open_ones], 2), tree.children[node[open_ones]].ravel()
-    return _Pairs.joined(fine)
+    return TileNodePairs.joined(fine)
 
 
 def add_far_lights(tree: LightTree, lobes, position, chosen, total) -> tuple[np.ndarray, np.ndarray]:
     """Add the light of the tree to `total` (F, 3, Q), for the columns `chosen` (Q',) of `lobes`, at x, y, z in
     `position` (3, Q). Returns the pairs (K,) that are left: columns, and numbers of the lights to shade as polygons."""
     is_specular = lobes.sharpest is not None
-    keys = _keys(lobes, position, chosen)
-    parts = _halves(keys, np.arange(len(chosen)), TILE[is_specular])
-    tiles = Tiles.of(lobes, position, [chosen[part] for part in parts])
-    cubics = Cubics.of(parts, keys, lobes.shape[:, chosen])
+    keys = neighbor_keys(lobes, position, chosen)
+    tile_members = split_columns(keys, np.arange(len(chosen)), TILE[is_specular])
+    tiles = Tiles.of(lobes, position, [chosen[members] for members in tile_members])
+    cubics = TileCubics.of(tile_members, keys, lobes.shape[:, chosen])
     coarse = _refined(tree, tiles, lambda pairs: pairs.size < COARSE)
-    light = np.bincount(coarse.tile, coarse.mean, len(parts))
+    light = np.bincount(coarse.tile, coarse.mean, len(tile_members))
     most = ERROR[is_specular] * light
     pairs = _refined(tree, tiles, lambda pairs: pairs.are_fine(most[pairs.tile]))
     pairs.is_smooth &= cubics.are_smooth[pairs.tile] & (
         INTERPOLATED * pairs.change**4 * pairs.light <= most[pairs.tile]
     )
     near = pairs.are_near(LEAF_ERROR * light[pairs.tile])
-    for number, own in pairs.take(~near).by_tile():
+    for number, tile_pairs in pairs.take(~near).by_tile():
         columns = tiles.columns[number]
-        smooth = own.is_smooth
+        smooth = tile_pairs.is_smooth
         if smooth.any():
             few, weights = columns[cubics.anchors[number]], cubics.weights[number, : len(columns)].T
-            total[:, :, columns] += _light_of(tree, lobes, position[:, few], (few, own.take(smooth))) @ weights
-            own = own.take(~smooth)
+            total[:, :, columns] += _light_of(tree, lobes, position[:, few], (few, tile_pairs.take(smooth))) @ weights
+            tile_pairs = tile_pairs.take(~smooth)
         if not smooth.all():
-            total[:, :, columns] += _light_of(tree, lobes, position[:, columns], (columns, own))
-    light = np.bincount(pairs.tile[~near], pairs.mean[~near], len(parts))
-    near, left, tile, node, finer = pairs.take(near), [], [], [], []
-    for number, own in near.by_tile():
-        if len(own.node) <= MANY_LEAVES:
-            left.append((tiles.columns[number], own))
+            total[:, :, columns] += _light_of(tree, lobes, position[:, columns], (columns, tile_pairs))
+    light = np.bincount(pairs.tile[~near], pairs.mean[~near], len(tile_members))
+    near, remaining, tile, node, finer = pairs.take(near), [], [], [], []
+    for number, tile_pairs in near.by_tile():
+        if len(tile_pairs.node) <= MANY_LEAVES:
+            remaining.append((tiles.columns[number], tile_pairs))
             continue
-        for part in _halves(keys, parts[number], FINER_TILE):
-            tile.append(np.full(len(own.node), len(finer)))
-            node.append(own.node)
-            finer.append((chosen[part], light[number]))
+        for members in split_columns(keys, tile_members[number], FINER_TILE):
+            tile.append(np.full(len(tile_pairs.node), len(finer)))
+            node.append(tile_pairs.node)
+            finer.append((chosen[members], light[number]))
     if finer:
         columns, light = zip(*finer, strict=True)
-        pairs = _Pairs.of(tree, Tiles.of(lobes, position, columns), np.concatenate(tile), np.concatenate(node))
+        pairs = TileNodePairs.of(tree, Tiles.of(lobes, position, columns), np.concatenate(tile), np.concatenate(node))
         pairs = pairs.take(~pairs.is_dark)
         light = light + np.bincount(pairs.tile, pairs.mean, len(finer))
         near = pairs.are_near(FINER_LEAF_ERROR * light[pairs.tile])
-        for number, own in pairs.take(~near).by_tile():
-            part = columns[number]
-            total[:, :, part] += _light_of(tree, lobes, position[:, part], (part, own))
-        left += [(columns[number], own) for number, own in pairs.take(near).by_tile()]
-    columns = [np.repeat(part, len(own.node)) for part, own in left]
-    numbers = [np.tile(tree.number[own.node], len(part)) for part, own in left]
-    return tuple(np.concatenate([np.empty(0, np.intp), *own]) for own in (columns, numbers))
+        for number, tile_pairs in pairs.take(~near).by_tile():
+            members = columns[number]
+            total[:, :, members] += _light_of(tree, lobes, position[:, members], (members, tile_pairs))
+        remaining += [(columns[number], tile_pairs) for number, tile_pairs in pairs.take(near).by_tile()]
+    columns = [np.repeat(members, len(tile_pairs.node)) for members, tile_pairs in remaining]
+    numbers = [np.tile(tree.number[tile_pairs.node], len(members)) for members, tile_pairs in remaining]
+    return tuple(np.concatenate([np.empty(0, np.intp), *values]) for values in (columns, numbers))
 
 
 @dataclass(frozen=True)
@@ -570,7 +458,7 @@ class PointDirections:
     """Like `small_lights.RaysToCenters`, arrays (Q, K) from Q samples of a tile to K points."""
 
     ends: np.ndarray  # (4, K): offsets of the points from the middle of the tile, then 1
-    place: np.ndarray  # (4, Q): offsets of the samples, then 1
+    origins: np.ndarray  # (4, Q): offsets of the samples, then 1
     squares: np.ndarray
     distance: np.ndarray
     flux: np.ndarray
@@ -580,13 +468,13 @@ class PointDirections:
     def heights(self, vectors) -> np.ndarray:
         """Products (Q, K) of the rays with `vectors` (3, Q, 1)."""
         vectors = vectors[..., 0]
-        return np.concatenate([vectors, -dot(vectors, self.place)[None]]).T @ self.ends
+        return np.concatenate([vectors, -dot(vectors, self.origins)[None]]).T @ self.ends
 
 
-class _Points:
+class NodePoints:
     """The K points that stand for nodes of a tree in a tile."""
 
-    def __init__(self, tree, pairs: _Pairs, middle, is_specular):
+    def __init__(self, tree, pairs: TileNodePairs, middle, is_specular):
         nodes, single, crossed = pairs.node, pairs.are_points, pairs.are_crossed
         places, turned = tree.places[is_specular], tree.is_turned[nodes]
         # Nodes that take longer come last.
@@ -608,32 +496,32 @@ class _Points:
         self.from_plane[:3], self.from_plane[3] = vector.T, -(vector * points).sum(axis=1)
         self.swing, self.diagonal = tree.swing[node], tree.diagonal[node]
 
-    def fan(self, part, place) -> PointDirections:
-        """Rays from `place` (4, Q) to the points `part`, a slice."""
-        ends, size = self.ends[:, part], dot(place, place)
+    def directions(self, block, origins) -> PointDirections:
+        """Rays from `origins` (4, Q) to the points `block`, a slice."""
+        ends, size = self.ends[:, block], dot(origins, origins)
         # Matrix products lose digits of the squares if points are near compared with the size of the tile.
-        if self.squared[part].min() > 4.0 * size.max():
-            squares = place.T @ self.from_squares[:, part]
+        if self.squared[block].min() > 4.0 * size.max():
+            squares = origins.T @ self.from_squares[:, block]
             squares += size[:, None]
         else:
-            offset = ends[:3, None] - place[:3, :, None]
+            offset = ends[:3, None] - origins[:3, :, None]
             squares = dot(offset, offset)
         distance = np.sqrt(squares)
-        flux = place.T @ self.from_plane[:, part]
-        if self.is_turned[part].any():
-            flux = _mean_above_zero(flux, self.swing[part] * distance)
+        flux = origins.T @ self.from_plane[:, block]
+        if self.is_turned[block].any():
+            flux = _mean_above_zero(flux, self.swing[block] * distance)
         else:
             np.maximum(flux, np.float32(0.0), out=flux)
-        return PointDirections(ends, place, squares, distance, flux, self.diagonal[part])
+        return PointDirections(ends, origins, squares, distance, flux, self.diagonal[block])
 
 
 def _light_of(tree, lobes, position, tile) -> np.ndarray:
-    """The light (F, 3, Q) of nodes. `tile` is the columns (Q,), at x, y, z in `position` (3, Q), and the `_Pairs` with
-    the nodes."""
+    """The light (F, 3, Q) of nodes. `tile` is the columns (Q,), at x, y, z in `position` (3, Q), and the pairs with the
+    nodes."""
     columns, pairs = tile
     middle = position.mean(axis=1)
-    place = np.ones((4, len(columns)), np.float32)
-    place[:3] = position - middle[:, None]
+    origins = np.ones((4, len(columns)), np.float32)
+    origins[:3] = position - middle[:, None]
     clipped = lobes.clip_rows if lobes.sharpest is not None or len(lobes.clip_rows) > 1 else ()
     # Samples are the first axis: their values for many points are then read once.
     columns = columns[:, None]
@@ -642,16 +530,16 @@ def _light_of(tree, lobes, position, tile) -> np.ndarray:
     step = max(PAIRS // len(columns), 1)
     for is_tail in (True, False):
         exact = is_tail and lobes.limits is not None
-        points = _Points(tree, pairs.take(pairs.are_in_tail == is_tail), middle, lobes.sharpest is not None)
+        points = NodePoints(tree, pairs.take(pairs.are_in_tail == is_tail), middle, lobes.sharpest is not None)
         for first in range(0, len(points.squared), step):
-            part = slice(first, first + step)
-            fan = points.fan(part, place)
-            if points.is_crossed[part].any():
+            block = slice(first, first + step)
+            rays = points.directions(block, origins)
+            if points.is_crossed[block].any():
                 for normal in horizons:
-                    fan.flux[fan.heights(normal) <= 0.0] = 0.0
-            values = lobes.limits.at_centers(columns, fan, len(sums)) if exact else lobes.at_point(columns, fan)
-            for own, value in zip(sums, values, strict=True):
-                own += points.colors[:, part] @ value.T
+                    rays.flux[rays.heights(normal) <= 0.0] = 0.0
+            values = lobes.limits.at_centers(columns, rays, len(sums)) if exact else lobes.at_point(columns, rays)
+            for target, value in zip(sums, values, strict=True):
+                target += points.colors[:, block] @ value.T
     return sums
 
 

@@ -58,10 +58,10 @@ class SkyMap:
         directions = _cells(side)
         radiance, angle = np.zeros((3, 6, side, side)), dot(directions, directions) ** -1.5
         for tree, grid in zip(trees, grids, strict=True):
-            s, t, seen = tree.places(directions)
-            row, column = (np.minimum((0.5 * (place[seen] + 1.0) * grid.shape[1]).astype(int), grid.shape[1] - 1)
-                           for place in (t, s))  # fmt: skip
-            radiance[:, seen] += grid[:, row, column]
+            s, t, inside = tree.places(directions)
+            row, column = (np.minimum((0.5 * (coordinate[inside] + 1.0) * grid.shape[1]).astype(int), grid.shape[1] - 1)
+                           for coordinate in (t, s))  # fmt: skip
+            radiance[:, inside] += grid[:, row, column]
         levels = [radiance]
         while True:
             # With the interpolation between texels, the variances are 3/4 and 3/2 of the square of a texel.
@@ -105,13 +105,13 @@ class SkyMap:
         np.clip(level, 0.0, len(self.first) - 1.001, out=level)
         low = level.astype(np.intp)
         level -= low
-        found = self._at(low, face, s, t)
+        radiance = self._at(low, face, s, t)
         low += 1
-        more = self._at(low, face, s, t)
-        more -= found
-        more *= level
-        found += more
-        return found
+        coarser = self._at(low, face, s, t)
+        coarser -= radiance
+        coarser *= level
+        radiance += coarser
+        return radiance
 
     def _at(self, level, face, s, t) -> np.ndarray:
         """Radiance (3, ...) of a level (...) at s, t (...) of a side of the cube."""
@@ -130,37 +130,37 @@ class SkyMap:
         both = s * t
         below, right = t - both, s - both
         here = np.float32(1.0) - s - below
-        found = np.empty((3, *s.shape), np.float32)
-        for out, texels in zip(found, self.texels, strict=True):
+        radiance = np.empty((3, *s.shape), np.float32)
+        for out, texels in zip(radiance, self.texels, strict=True):
             np.multiply(np.take(texels, row), here, out=out)
             out += np.take(texels[1:], row) * right
             out += np.take(texels[self.width :], row) * below
             out += np.take(texels[self.width + 1 :], row) * both
-        return found
+        return radiance
 
     def add(self, lobes, chosen: np.ndarray, total: np.ndarray) -> None:
-        """Add what the columns `chosen` (Q',) of `float32.Lobes` reflect of the sky to `total` (F, 3, Q)."""
+        """Add what the columns `chosen` (Q',) of `lobes32.Lobes` reflect of the sky to `total` (F, 3, Q)."""
         nodes, angle = self.nodes
         for start in range(0, len(chosen), MAP_CHUNK):
-            part = chosen[start : start + MAP_CHUNK]
-            first, second, third = (lobes.rows[row][:, part] for row in range(3))
+            columns = chosen[start : start + MAP_CHUNK]
+            first, second, third = (lobes.rows[row][:, columns] for row in range(3))
             axes = _cross(second, third), _cross(third, first), _cross(first, second)
             determinant = dot(first, axes[0])
             stretch = _stretch(axes)
             directions = [nodes[0] * stretch, nodes[1] / stretch, nodes[2]]
             inverse = np.float32(1.0) / np.sqrt(dot(directions, directions))
-            directions = [place * inverse for place in directions]
-            own = angle * (inverse * inverse * inverse)
+            directions = [coordinate * inverse for coordinate in directions]
+            solid_angle = angle * (inverse * inverse * inverse)
             # The world direction of each node: the inverse of the lobe's axes gives it up to a factor.
-            toward = sum(place * axis[:, None] for place, axis in zip(directions, axes, strict=True))
-            area = own * (determinant * determinant)
-            values = lobes.at_point.at_nodes(part, directions, toward) * own
+            toward = sum(coordinate * axis[:, None] for coordinate, axis in zip(directions, axes, strict=True))
+            area = solid_angle * (determinant * determinant)
+            values = lobes.at_point.at_nodes(columns, directions, toward) * solid_angle
             if len(lobes.clip_rows) > 1:
-                values = values * _share_above(lobes, part, toward, area)
+                values = values * _share_above(lobes, columns, toward, area)
             radiance = self.means(toward, area)
             for value, target in zip(values, total, strict=True):
                 for channel in range(3):
-                    target[channel, part] += (value * radiance[channel]).sum(axis=0)
+                    target[channel, columns] += (value * radiance[channel]).sum(axis=0)
 
 
 def _stretch(axes):
@@ -171,14 +171,14 @@ def _stretch(axes):
     return squares ** np.float32(-0.125)
 
 
-def _share_above(lobes, part, toward, area) -> np.ndarray:
+def _share_above(lobes, columns, toward, area) -> np.ndarray:
     """Share (N, Q) of the `area` around directions (3, N, Q) above the horizons of lobes, except for their own."""
     squares = dot(toward, toward)
     radius = np.sqrt(area / (np.float32(np.pi) * np.sqrt(squares)))
     share = np.float32(1.0)
     for row in lobes.clip_rows:
         if row != 2:
-            height = dot(lobes.rows[row][:, None, part], toward) / (lobes.lengths[row][part] * radius)
+            height = dot(lobes.rows[row][:, None, columns], toward) / (lobes.lengths[row][columns] * radius)
             share = share * np.clip(np.float32(0.5) + np.float32(0.5) * height, np.float32(0.0), np.float32(1.0))
     return share
 
@@ -191,15 +191,15 @@ def _nodes(count: int) -> tuple[np.ndarray, np.ndarray]:
     turn = np.pi * (np.sqrt(5.0) - 1.0) * number
     nodes = np.stack([np.sqrt(1.0 - z * z) * np.cos(turn), np.sqrt(1.0 - z * z) * np.sin(turn), z])
     angle = -2.0 * np.pi * np.diff((1.0 - np.arange(count + 1) / count) ** DENSE)
-    place, weight = gauss_legendre(6)
-    high, around = np.meshgrid(0.5 * (place + 1.0), 0.25 * np.pi * np.arange(8), indexing="ij")
+    abscissa, weight = gauss_legendre(6)
+    high, around = np.meshgrid(0.5 * (abscissa + 1.0), 0.25 * np.pi * np.arange(8), indexing="ij")
     wide = np.sqrt(1.0 - high * high)
     exact = np.stack([wide * np.cos(around), wide * np.sin(around), high]).reshape(3, -1)
     weight = np.repeat(weight, 8) * (np.pi / 8.0)
     powers = [(i, j, k) for i in range(5) for j in range(min(5 - i, 2)) for k in range(5 - i - j)]
     moments, wanted = (
-        np.array([np.prod([vector**power for vector, power in zip(vectors, own, strict=True)], axis=0)
-                  for own in powers]) for vectors in (nodes, exact)
+        np.array([np.prod([vector**power for vector, power in zip(vectors, exponents, strict=True)], axis=0)
+                  for exponents in powers]) for vectors in (nodes, exact)
     )  # fmt: skip
     change = np.linalg.lstsq(moments * angle, wanted @ weight - moments @ angle, rcond=None)[0]
     return nodes[:, :, None].astype(np.float32), (angle * (1.0 + change))[:, None].astype(np.float32)
@@ -212,13 +212,13 @@ def _cross(a, b):
 def _cells(count: int, more: int = 0) -> np.ndarray:
     """Centers (3, 6, n, n) of `count` texels along each side of the sides of a cube, and of `more` texels around
     them."""
-    place = (np.arange(-more, count + more) + 0.5) * (2.0 / count) - 1.0
-    t, s = np.meshgrid(place, place, indexing="ij")
-    found = np.empty((3, 6, *s.shape))
+    coordinate = (np.arange(-more, count + more) + 0.5) * (2.0 / count) - 1.0
+    t, s = np.meshgrid(coordinate, coordinate, indexing="ij")
+    directions = np.empty((3, 6, *s.shape))
     for axis in range(3):
-        found[axis, 2 * axis], found[axis, 2 * axis + 1] = 1.0, -1.0
-        found[(axis + 1) % 3, 2 * axis : 2 * axis + 2], found[(axis + 2) % 3, 2 * axis : 2 * axis + 2] = s, t
-    return found
+        directions[axis, 2 * axis], directions[axis, 2 * axis + 1] = 1.0, -1.0
+        directions[(axis + 1) % 3, 2 * axis : 2 * axis + 2], directions[(axis + 2) % 3, 2 * axis : 2 * axis + 2] = s, t
+    return directions
 
 
 @cache
@@ -227,7 +227,9 @@ def _bordered(count: int) -> np.ndarray:
     directions = _cells(count, 1)
     axis = np.argmax(np.abs(directions), axis=0)
     along, s, t = (np.take_along_axis(directions, ((axis + step) % 3)[None], axis=0)[0] for step in range(3))
-    row, column = (np.clip((0.5 * (place / np.abs(along) + 1.0) * count).astype(int), 0, count - 1) for place in (t, s))
+    row, column = (
+        np.clip((0.5 * (coordinate / np.abs(along) + 1.0) * count).astype(int), 0, count - 1) for coordinate in (t, s)
+    )
     return ((2 * axis + (along < 0.0)) * count + row) * count + column
 
 
@@ -263,14 +265,14 @@ def _grid(tree: PatchTree) -> np.ndarray:
     s, t, _ = tree.places(tree.center[:, leaves])
     level = np.rint(-np.log2(tree.size_on_plane[leaves])).astype(int)
     finest = int(level.max())
-    row, column = ((0.5 * (place + 1.0) * 2.0**level).astype(int) for place in (t, s))
+    row, column = ((0.5 * (coordinate + 1.0) * 2.0**level).astype(int) for coordinate in (t, s))
     means, known = [], []
-    for own in range(finest, -1, -1):
-        if own == finest:
-            mean, cut = np.zeros((3, 2**own, 2**own)), np.zeros((2**own, 2**own))
+    for depth in range(finest, -1, -1):
+        if depth == finest:
+            mean, cut = np.zeros((3, 2**depth, 2**depth)), np.zeros((2**depth, 2**depth))
         else:
             mean, cut = 0.25 * _sums_of_four(means[-1]), _sums_of_four(known[-1])
-        here = level == own
+        here = level == depth
         mean[:, row[here], column[here]], cut[row[here], column[here]] = tree.radiance[:, leaves[here]], 1.0
         means.append(mean)
         known.append(cut)
@@ -283,7 +285,7 @@ def _grid(tree: PatchTree) -> np.ndarray:
 def _doubled(grid):
     """Values (3, 2 n, 2 n) from values (3, n, n). Each gets a slope where its neighbors on both sides agree on one."""
     around = np.pad(grid, ((0, 0), (1, 1), (1, 1)), mode="edge")
-    found = np.empty((3, 2 * grid.shape[1], 2 * grid.shape[2]))
+    fine = np.empty((3, 2 * grid.shape[1], 2 * grid.shape[2]))
     steps = []
     for before, after in ((around[:, :-2, 1:-1], around[:, 2:, 1:-1]), (around[:, 1:-1, :-2], around[:, 1:-1, 2:])):
         one, other = grid - before, after - grid
@@ -291,5 +293,5 @@ def _doubled(grid):
         steps.append(np.where(one * other > 0.0, 0.25 * least, 0.0))
     for i, way in enumerate((-1.0, 1.0)):
         for j, other_way in enumerate((-1.0, 1.0)):
-            found[:, i::2, j::2] = grid + way * steps[0] + other_way * steps[1]
-    return found
+            fine[:, i::2, j::2] = grid + way * steps[0] + other_way * steps[1]
+    return fine

@@ -61,9 +61,9 @@ def moments_of(lights) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     covariance /= np.where(is_round, 4.0, 3.0)[:, None, None]
     counts = np.array([0 if light.corners is None else len(light.corners) for light in lights])
     for count in np.unique(counts[counts > 0]):
-        own = np.flatnonzero(counts == count)
-        corners = np.array([lights[number].corners for number in own])
-        center[own], covariance[own] = _moments(corners, area[own])
+        same = np.flatnonzero(counts == count)
+        corners = np.array([lights[number].corners for number in same])
+        center[same], covariance[same] = _moments(corners, area[same])
     return center, area * np.copysign(1.0, (area * direction).sum(axis=1))[:, None], covariance, diagonal
 
 
@@ -78,7 +78,10 @@ def _moments(corners, area):
     crossed = np.stack([y * c - z * b, z * a - x * c, x * b - y * a], axis=-1)
     shares = (crossed * (0.5 * area)[:, None]).sum(axis=-1) / (area * area).sum(axis=1)[:, None]
     center = (shares[..., None] * (first + second)).sum(axis=1) / 3.0
-    products = sum(np.einsum("lv,lvi,lvj->lij", shares, part, part) for part in (first, second, first + second)) / 12.0
+    products = (
+        sum(np.einsum("lv,lvi,lvj->lij", shares, vectors, vectors) for vectors in (first, second, first + second))
+        / 12.0
+    )
     return corners[:, 0] + center, products - center[:, :, None] * center[:, None]
 
 
@@ -119,23 +122,23 @@ class SharpestLobes:
         self.mirrored = np.float32(2.0) * cosine * normal - view
         self.width = (LOBE_WIDTH * width * np.maximum(np.abs(cosine), LEAST_COSINE)).astype(np.float32)
 
-    def lengths(self, part, rays: RaysToCenters, size) -> np.ndarray:
-        """The least angle (...) in rad, at most 1, over which the lobes `part` change within lights of a radius of
+    def lengths(self, columns, rays: RaysToCenters, size) -> np.ndarray:
+        """The least angle (...) in rad, at most 1, over which the lobes `columns` change within lights of a radius of
         `size` rad."""
-        toward = dot(self.mirrored[:, part], rays.offset)
+        toward = dot(self.mirrored[:, columns], rays.offset)
         toward /= rays.distance
         chord = np.sqrt(np.maximum(np.float32(2.0) - np.float32(2.0) * toward, np.float32(0.0)))
         chord -= size
-        return np.minimum(np.maximum(chord, np.float32(0.0)) + self.width[part], np.float32(1.0))
+        return np.minimum(np.maximum(chord, np.float32(0.0)) + self.width[columns], np.float32(1.0))
 
 
-def relative_sizes(lobes, part, rays: RaysToCenters, radius) -> np.ndarray:
-    """Radii (...) of lights of `radius` m, in units of the length over which the lobes `part` change."""
+def relative_sizes(lobes, columns, rays: RaysToCenters, radius) -> np.ndarray:
+    """Radii (...) of lights of `radius` m, in units of the length over which the lobes `columns` change."""
     size = np.float32(radius) / rays.distance
-    return size if lobes.sharpest is None else size / lobes.sharpest.lengths(part, rays, size)
+    return size if lobes.sharpest is None else size / lobes.sharpest.lengths(columns, rays, size)
 
 
-def small_and_lit(lobes, part, rays: RaysToCenters, radius, size) -> tuple[np.ndarray, np.ndarray]:
+def small_and_lit(lobes, columns, rays: RaysToCenters, radius, size) -> tuple[np.ndarray, np.ndarray]:
     """Masks (...) of the lights that are small, given `size` from `relative_sizes`, and of those that also light the
     samples.
 
@@ -144,8 +147,8 @@ def small_and_lit(lobes, part, rays: RaysToCenters, radius, size) -> tuple[np.nd
     small = size < np.float32(LARGEST)
     lit = rays.flux > 0.0
     for row, length in lobes.lengths.items():
-        height = dot(lobes.rows[row][:, part], rays.offset)
-        small &= np.abs(height) > np.float32(radius) * length[part]
+        height = dot(lobes.rows[row][:, columns], rays.offset)
+        small &= np.abs(height) > np.float32(radius) * length[columns]
         lit &= height > 0.0
     return small, lit & small
 
@@ -156,21 +159,21 @@ class CosineAtPoint:
     def __init__(self, rows):
         self.normal = rows[2]
 
-    def __call__(self, part, rays: RaysToCenters):
-        values = rays.heights(self.normal[:, part])
+    def __call__(self, columns, rays: RaysToCenters):
+        values = rays.heights(self.normal[:, columns])
         np.maximum(values, np.float32(0.0), out=values)
         values *= rays.flux
         values *= np.float32(1.0 / np.pi)
         values /= rays.squares * rays.squares
         return values[None]
 
-    def at_nodes(self, part, nodes, toward):
+    def at_nodes(self, columns, nodes, toward):
         """Values (1, N, ...) of the lobes at unit vectors (3, N, 1) along their axes."""
         return (nodes[2] * np.float32(1.0 / np.pi))[None]
 
-    def integral(self, part, coordinates, weights):
+    def integral(self, columns, coordinates, weights):
         """Sums (1, Q) over points of the lobe divided by the cubed distance, times `weights` that broadcast to (S, T,
-        Q). The points have `coordinates` (C, S, T, Q) along the rows of the lobes `part` (Q,)."""
+        Q). The points have `coordinates` (C, S, T, Q) along the rows of the lobes `columns` (Q,)."""
         return _sum(self.at(coordinates), weights)[None]
 
     @staticmethod
@@ -193,27 +196,27 @@ class ShadowedCosineAtPoint:
     def __init__(self, rows, bump_alpha2):
         self.plain, self.smooth, self.bump_alpha2 = CosineAtPoint(rows), rows[3], bump_alpha2
 
-    def __call__(self, part, rays: RaysToCenters):
-        along = rays.heights(self.smooth[:, part])
-        return self.plain(part, rays) * self._shadowing(part, along, rays.squares)
+    def __call__(self, columns, rays: RaysToCenters):
+        along = rays.heights(self.smooth[:, columns])
+        return self.plain(columns, rays) * self._shadowing(columns, along, rays.squares)
 
-    def at_nodes(self, part, nodes, toward):
+    def at_nodes(self, columns, nodes, toward):
         """As in `CosineAtPoint`. `toward` (3, N, Q) are the world directions of the nodes."""
-        along = dot(self.smooth[:, None, part], toward)
-        return self.plain.at_nodes(part, nodes, toward) * self._shadowing(part, along, dot(toward, toward))
+        along = dot(self.smooth[:, None, columns], toward)
+        return self.plain.at_nodes(columns, nodes, toward) * self._shadowing(columns, along, dot(toward, toward))
 
-    def integral(self, part, coordinates, weights):
+    def integral(self, columns, coordinates, weights):
         """As in `CosineAtPoint`. There is one more coordinate, along the smooth normal."""
         values = self.plain.at(coordinates)
-        values *= self._shadowing(part, coordinates[3], dot(coordinates[:3], coordinates[:3]))
+        values *= self._shadowing(columns, coordinates[3], dot(coordinates[:3], coordinates[:3]))
         return _sum(values, weights)[None]
 
-    def _shadowing(self, part, along, squares):
+    def _shadowing(self, columns, along, squares):
         """Bump shadowing (...), given the height (...) over the plane of the smooth normal and the squared distance
         (...)."""
         along = np.maximum(along, np.float32(1e-15) * np.sqrt(squares))
         tangent2 = np.maximum(squares / (along * along) - np.float32(1.0), np.float32(0.0))
-        shadowing = np.sqrt(np.float32(1.0) + self.bump_alpha2[part] * tangent2)
+        shadowing = np.sqrt(np.float32(1.0) + self.bump_alpha2[columns] * tangent2)
         return np.float32(2.0) / (np.float32(1.0) + shadowing)
 
 
@@ -229,42 +232,42 @@ class LobeAtPoint:
         ]))  # fmt: skip
         self.terms = weights if self.is_cosine else polynomial_terms(weights)
 
-    def __call__(self, part, rays: RaysToCenters):
-        x, y, z = (rays.heights(row[:, part]) for row in self.rows[:3])
+    def __call__(self, columns, rays: RaysToCenters):
+        x, y, z = (rays.heights(row[:, columns]) for row in self.rows[:3])
         inverse = np.float32(1.0) / np.sqrt(x * x + y * y + z * z)
         angle = inverse * inverse * inverse
-        angle *= self.determinant[part] * rays.flux
+        angle *= self.determinant[columns] * rays.flux
         z *= inverse
         cosine = np.maximum(z, np.float32(0.0)) * angle
         cosine *= np.float32(1.0 / np.pi)
         if self.is_cosine:
-            return np.stack([terms[part] * cosine for terms in self.terms[:, 0]])
+            return np.stack([terms[columns] * cosine for terms in self.terms[:, 0]])
         x *= inverse
         leaning = None if self.bend is None else self._leaning(x, y * inverse, z)
         # For points of a light tree, the other integrals follow from the first.
         needed = self.terms[:1] if rays.slack is None else self.terms
-        values = np.stack([self._value(terms[..., part], x, z, leaning) for terms in needed])
+        values = np.stack([self._value(terms[..., columns], x, z, leaning) for terms in needed])
         values *= angle
         np.maximum(values, np.float32(0.0), out=values)
         np.maximum(values[0], np.float32(LEAST_SHARE) * cosine, out=values[0])
         if rays.slack is None:
-            return self.limits.true_in_tails(values[0], part, rays, len(self.terms))
-        self.limits.apply_at_centers(values, part, rays)
+            return self.limits.true_in_tails(values[0], columns, rays, len(self.terms))
+        self.limits.apply_at_centers(values, columns, rays)
         return values
 
-    def at_nodes(self, part, nodes, toward):
+    def at_nodes(self, columns, nodes, toward):
         """As in `CosineAtPoint`, but (F, N, Q), without limits."""
         x, y, z = nodes
         cosine = z * np.float32(1.0 / np.pi)
         if self.is_cosine:
-            return self.terms[:, :, part] * cosine
+            return self.terms[:, :, columns] * cosine
         leaning = None if self.bend is None else self._leaning(x, y, z)
-        values = np.stack([self._value(terms[:, None, part], x, z, leaning) for terms in self.terms])
+        values = np.stack([self._value(terms[:, None, columns], x, z, leaning) for terms in self.terms])
         np.maximum(values, np.float32(0.0), out=values)
         np.maximum(values[0], np.float32(LEAST_SHARE) * cosine, out=values[0])
         return values
 
-    def integral(self, part, coordinates, weights):
+    def integral(self, columns, coordinates, weights):
         """As in `CosineAtPoint`, but (F, Q), without limits."""
         x, y, z = coordinates[:3]
         inverse = x * x
@@ -277,11 +280,11 @@ class LobeAtPoint:
         angle = inverse * inverse
         angle *= inverse
         angle *= weights
-        determinant = self.determinant[part]
+        determinant = self.determinant[columns]
         cosine = _sum(z, angle) * (determinant * np.float32(1.0 / np.pi))
         if self.is_cosine:
-            return self.terms[:, 0, part] * cosine
-        values = np.stack([_sum(self._value(terms[:, part], x, z, leaning), angle) for terms in self.terms])
+            return self.terms[:, 0, columns] * cosine
+        values = np.stack([_sum(self._value(terms[:, columns], x, z, leaning), angle) for terms in self.terms])
         values *= determinant
         np.maximum(values, np.float32(0.0), out=values)
         np.maximum(values[0], np.float32(LEAST_SHARE) * cosine, out=values[0])

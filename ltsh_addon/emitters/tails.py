@@ -94,14 +94,14 @@ class TailLimits:
         ior = None if ior is None else np.maximum(ior, 1.0).astype(normal.dtype)
         return cls(normal, view, dot(normal, view), alpha * alpha, second, schlick, ior)
 
-    def take(self, part) -> TailLimits:
-        """The limits of the samples `part`: integers (Q',) or a slice."""
+    def take(self, columns) -> TailLimits:
+        """The limits of the samples `columns`: integers (Q',) or a slice."""
         values = self.normal, self.view, self.cosine, self.alpha_squared, self.second, self.ior
-        *values, ior = (value if value is None else value[..., part] for value in values)
+        *values, ior = (value if value is None else value[..., columns] for value in values)
         return TailLimits(*values, self.schlick, ior)
 
-    def apply(self, integrals, part, light: LightFromPoints, scratch) -> None:
-        """Limit integrals (F, Q') over the light as the samples `part` see it, in place.
+    def apply(self, integrals, columns, light: LightFromPoints, scratch) -> None:
+        """Limit integrals (F, Q') over the light as the samples `columns` see it, in place.
 
         In the tail, the first integral (for F = 1) is brought between two bounds: the least and the greatest integrand
         over the area, of its values at the center and the corners, times the area, times the least and the greatest
@@ -111,12 +111,12 @@ class TailLimits:
         """
         # Outside the tail nothing is limited, but points may coincide.
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            _LightPoints(self.take(part), light, scratch).limit(integrals)
+            _LightPoints(self.take(columns), light, scratch).limit(integrals)
 
-    def apply_at_centers(self, integrals, part, rays) -> None:
+    def apply_at_centers(self, integrals, columns, rays) -> None:
         """As `apply`, for integrals (F, ...) over lights so small that their center stands for all of them. The centers
         are the ends of `rays`, `small_lights.RaysToCenters`."""
-        lobes = self.take(part)
+        lobes = self.take(columns)
         tail, value, cosine = lobes.true_and_tail(rays)
         margin = rays.slack * value
         value = np.minimum(np.maximum(integrals[0], value - margin), value + margin)
@@ -128,10 +128,10 @@ class TailLimits:
         cosine *= tail
         lobes.limit_others(integrals, cosine)
 
-    def true_in_tails(self, plain, part, rays, count) -> list:
+    def true_in_tails(self, plain, columns, rays, count) -> list:
         """`count` integrals (...) over points. The first is `plain`, replaced by the true value in the tail; the others
         are the first times their Fresnel curves."""
-        lobes = self.take(part)
+        lobes = self.take(columns)
         tail, value, cosine = lobes.true_and_tail(rays)
         np.copyto(plain, value, where=tail)
         return lobes.curves(plain, cosine, count)
@@ -145,9 +145,9 @@ class TailLimits:
         mirrored *= np.abs(mirrored)
         return (mirrored < beyond) & (beyond > 0.0), *self.true_values(heights, views, rays)
 
-    def at_centers(self, part, rays, count) -> list:
+    def at_centers(self, columns, rays, count) -> list:
         """`count` true integrals (...) over small lights that are all in the tail."""
-        lobes = self.take(part)
+        lobes = self.take(columns)
         value, cosine = lobes.true_values(rays.heights(lobes.normal), rays.heights(lobes.view), rays)
         return lobes.curves(value, cosine, count)
 
@@ -188,14 +188,14 @@ class TailLimits:
     def curves(self, value, cosine, count) -> list:
         """`count` arrays: `value` (...), then `value` times the other Fresnel curves of the lobes. `cosine` (...) is
         that of the half angle."""
-        found = [value]
+        integrals = [value]
         if self.schlick:
-            found.append(schlick_curve(cosine) * value)
+            integrals.append(schlick_curve(cosine) * value)
             if count > 2 + (self.ior is not None):
-                found.append(cosine * (np.float32(1.0) - cosine) * found[1])
+                integrals.append(cosine * (np.float32(1.0) - cosine) * integrals[1])
         if self.ior is not None:
-            found.append(dielectric_reflectance(cosine, self.ior) * value)
-        return found
+            integrals.append(dielectric_reflectance(cosine, self.ior) * value)
+        return integrals
 
     def limit_others(self, integrals, cosine) -> None:
         """Limit all but the first of integrals (F, ...) by the first, in place. `cosine` (...) is the least cosine of

@@ -127,10 +127,10 @@ class ShadowTracer:
         workers: int | None = None,
         progress: Progress | None = None,
     ) -> Shadows:
-        """The shadows of `samples` under all lights; see `visibility.visible_shares` for the other arguments."""
+        """The shadows of `samples` under all lights; see `visibility.trace_visibility` for the other arguments."""
         start = time.perf_counter()
         samples = replace(samples, position=samples.position - self._origin)
-        estimate = visibility.visible_shares(
+        estimate = visibility.trace_visibility(
             samples, self._lights, self._tracer, sampling, workers=workers, progress=progress
         )
         passes, film = sampling.passes, sampling.film

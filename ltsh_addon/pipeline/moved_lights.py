@@ -25,12 +25,12 @@ from ..shading import shade
 from ..visibility import (
     BLOCK_SAMPLES,
     Occluders,
+    RayOrigins,
     ShadowTask,
-    Starts,
     Tracer,
     open_tracer,
-    ray_origins,
-    task_of_lights,
+    shadow_task,
+    trace_ray_origins,
 )
 from ..workers.pool import WorkerPool
 from .lighting import load_tables, rays_of_samples
@@ -119,7 +119,7 @@ class LitSamples:
     shadowed: SurfaceSamples  # (Q)
     film: Film  # (Q)
     shadow: np.ndarray  # (P,) for each of `samples`, the number of the one of `shadowed` whose visibility it takes
-    ray_origins: Starts | None  # (Q)
+    ray_origins: RayOrigins | None  # (Q)
     blocks: list[tuple[np.ndarray | slice, slice]]  # of each block, the indices of `samples` and of `shadowed`
 
     @classmethod
@@ -257,7 +257,7 @@ class MovedLights:
         if self._tracer is None:
             return MovedLightTask(light, None, self._table, self._passes)
         rays = rays_of_samples(relight_data.options["shadow_rays"], relight_data.extraction.film)
-        shadows = task_of_lights(self._whole.shadowed, (light,), self._tracer, self._passes, rays)
+        shadows = shadow_task(self._whole.shadowed, (light,), self._tracer, self._passes, rays)
         # The light gets as many rays as it would get in a new picture, beside the other lights.
         typical = {name: max(value, self._typical[name]) for name, value in shadows.typical.items()}
         return MovedLightTask(light, replace(shadows, typical=typical), self._table, self._passes)
@@ -316,8 +316,8 @@ class MovedLights:
             pool = stack.enter_context(WorkerPool(self._tracer))
             if self._tracer is not None:
                 lights = [light.moved(-relight_data.extraction.origin) for light in relight_data.extraction.lights]
-                self._typical = task_of_lights(shadowed, lights, self._tracer, self._passes, DRAFT_RAYS).typical
-                origins = ray_origins(shadowed, pool)
+                self._typical = shadow_task(shadowed, lights, self._tracer, self._passes, DRAFT_RAYS).typical
+                origins = trace_ray_origins(shadowed, pool)
             self._whole = LitSamples.of(samples, shadowed, film, shadow, origins)
             index, shadow = np.unique(shadow[draft.index], return_inverse=True)
             quick = samples.take(draft.index), shadowed.take(index), _coarse(film.take(index))

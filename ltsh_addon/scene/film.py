@@ -28,9 +28,9 @@ class Film:
 
     def take(self, index) -> Film:
         """The film of the samples at `index`: integers (Q,), a boolean mask (P,) or a slice."""
-        own = {name: getattr(self, name) for name in ("first", "count", "spread")}
-        own = {name: None if values is None else values[index] for name, values in own.items()}
-        return replace(self, pixel=self.pixel[index], **own)
+        arrays = {name: getattr(self, name) for name in ("first", "count", "spread")}
+        arrays = {name: None if values is None else values[index] for name, values in arrays.items()}
+        return replace(self, pixel=self.pixel[index], **arrays)
 
     def with_more(self, more: Film) -> Film:
         """A film with the samples of this one and of `more`, which has the same pixels."""
@@ -72,20 +72,20 @@ class Film:
         size, around = weights.shape[1], weights.shape[1] // 2
         shape = self.height + 2 * around, self.width + 2 * around
         sums = np.zeros((columns.shape[1], shape[0] * shape[1]))
-        place = self.pixel // self.width * shape[1] + self.pixel % self.width
+        corner = self.pixel // self.width * shape[1] + self.pixel % self.width
         for row, column in np.ndindex(size, size):
-            weight, target = weights[:, row, column], place + row * shape[1] + column
-            for own, values in zip(sums, columns.T, strict=True):
-                own += np.bincount(target, weights=values * weight, minlength=len(own))
+            weight, target = weights[:, row, column], corner + row * shape[1] + column
+            for total, values in zip(sums, columns.T, strict=True):
+                total += np.bincount(target, weights=values * weight, minlength=len(total))
         inside = slice(around, around + self.height), slice(around, around + self.width)
         return np.moveaxis(sums.reshape(-1, *shape), 0, -1)[inside]
 
-    def shared(self, weights: np.ndarray, sub_sample: np.ndarray, seen: np.ndarray) -> Film:
+    def shared(self, weights: np.ndarray, sub_sample: np.ndarray, rendered: np.ndarray) -> Film:
         """The film whose pixels share their samples. `weights` (N, D, D) are those of the N points of a pixel,
-        `sub_sample` (P,) is the point of each sample, `seen` (H, W) the mask of the rendered pixels."""
-        whole = self.sums_around(np.flatnonzero(seen), weights.sum(axis=0))
+        `sub_sample` (P,) is the point of each sample, `rendered` (H, W) the mask of the rendered pixels."""
+        whole = self.sums_around(np.flatnonzero(rendered), weights.sum(axis=0))
         spread = weights.astype(np.float32)[sub_sample]
-        return replace(self, spread=spread, whole=np.where(seen, whole, np.inf))
+        return replace(self, spread=spread, whole=np.where(rendered, whole, np.inf))
 
     def sums_around(self, pixel: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Sums (H, W) of `weights` (D, D) laid around each `pixel` (Q,)."""

@@ -117,8 +117,8 @@ def _taken(values: np.ndarray, index, count: int) -> np.ndarray:
     return np.broadcast_to(values.flat[0], (count, *values.shape[1:])) if is_constant(values) else values[index]
 
 
-def _one_after_another(parts: list[np.ndarray]) -> np.ndarray:
-    """All rows of the `parts`."""
-    if all(map(is_constant, parts)) and len({part.flat[0] for part in parts}) == 1:
-        return np.broadcast_to(parts[0].flat[0], (sum(map(len, parts)), *parts[0].shape[1:]))
-    return np.concatenate(parts)
+def _one_after_another(pieces: list[np.ndarray]) -> np.ndarray:
+    """All rows of the `pieces`."""
+    if all(map(is_constant, pieces)) and len({piece.flat[0] for piece in pieces}) == 1:
+        return np.broadcast_to(pieces[0].flat[0], (sum(map(len, pieces)), *pieces[0].shape[1:]))
+    return np.concatenate(pieces)

@@ -1,20 +1,19 @@
-"""The fast path of `shade`: float32 frames, lookups and edge sums in chunks that fit the cache.
+"""The fast path of `shade`: lights, lookups and edge sums in float32, in chunks that fit the cache.
 
-The warp of the lobe (and its tilt, for "ltc") is multiplied into the local frame of a sample once for all lights. One
-product then gives a light's corners. `float64` shades what single precision cannot: points so close to a light's plane
-that an edge spans half a circle, tiny lights, and sharp lobes. If a block has few such pairs of a sample and a light,
-they are handed back, because `shade_pairs` shades the pairs of many blocks together.
+`lobes32` has the lobes, whose frames are made once for all lights. `float64` shades what single precision cannot:
+points so close to a light's plane that an edge spans half a circle, tiny lights, and sharp lobes. If a block has few
+such pairs of a sample and a light, they are handed back, because `float64.shade_pairs` shades those of many blocks
+together.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
 
-from ..emitters import light_profile, small_lights
+from ..emitters import light_profile, profile_regions, small_lights
 from ..emitters.facing import AnalyticLobe, FacingDisk, mean_emission
 from ..emitters.light_polygons import (
     interpolated,
@@ -27,19 +26,27 @@ from ..emitters.light_tree import FEWEST, LightTree, add_far_lights
 from ..emitters.sky_map import SkyMap
 from ..emitters.tails import LightFromPoints, TailLimits
 from ..lobes import moments32
-from ..lobes.lobe_integrals import FLOAT64_CHUNK, LEAST_SHARE, NARROWEST
+from ..lobes.lobe_integrals import FLOAT64_CHUNK, NARROWEST
 from ..lobes.lookup_table import MIN_ALPHA
 from ..lobes.polygon import MOSTLY_WHOLE, convex_pieces, dot, integrate_visible
 from ..scene import PolygonLight
 from . import float64
+from .lobes32 import (
+    CHUNK,
+    CORNERS,
+    FormFactor,
+    LobeIntegral,
+    Lobes,
+    ProfiledIntegral,
+    ShadowedFormFactor,
+    along_axes,
+    any_component,
+    as_columns,
+    fresnel_kinds,
+    lobe_axes,
+    normal_frames,
+)
 
-# If a block has more different indices of refraction, the dielectric's weights are summed up per sample.
-SEPARATE_IORS = 8
-# Samples per chunk. It is large because a call of numpy costs as much as some thousand elements. Its rows are not a
-# multiple of a page long, because the cache would hold few of such rows.
-CHUNK = 24592
-# Corners per chunk.
-CORNERS = 4 * CHUNK
 # Samples per chunk for small lights.
 SMALL_CHUNK = 6144
 # Points per chunk for lights with a profile.
@@ -51,28 +58,28 @@ NARROW_SPREAD = 0.35
 def shade_diffuse(samples, lights, radiance, scratch, leftovers=None):
     """Add to `radiance` (R, P, 3) what the diffuse lobes of `samples` reflect of `lights`, (light, row, corners).
 
-    A list `leftovers` receives the pairs that are left to `shade_pairs`, if they are fewer than FLOAT64_CHUNK: (samples
+    A list `leftovers` receives the pairs for `float64.shade_pairs`, if they are fewer than FLOAT64_CHUNK: (samples
     (N,), lights (N,)), where a light's number is its position among those that affect diffuse lobes.
     """
     lights = Lights.of(lights, "diffuse")
-    lit = np.nonzero(_any_component(samples.diffuse_albedo))[0]
+    lit = np.nonzero(any_component(samples.diffuse_albedo))[0]
     bumped = np.zeros(len(lit), bool)
     if samples.diffuse_normal is not samples.smooth_normal:
-        bumped = _any_component(samples.diffuse_normal != samples.smooth_normal)[lit]
+        bumped = any_component(samples.diffuse_normal != samples.smooth_normal)[lit]
     lighting = _Lighting(samples, lights, radiance, scratch, float64.shade_diffuse)
     shaped = ((samples.sheen_a != 0.0) | (samples.diffuse_roughness != 0.0))[lit]
     lighting.add_in_float64(lit[shaped])
     lit, bumped = lit[~shaped], bumped[~shaped]
     for is_bumped, members in ((False, lit[~bumped]), (True, lit[bumped])):
         for index in _chunks(members):
-            rows = _normal_frame(_columns(samples.diffuse_normal, index))
+            rows = normal_frames(as_columns(samples.diffuse_normal, index))
             clip_rows, integrate, at_point = (2,), FormFactor(scratch), small_lights.CosineAtPoint(rows)
             if is_bumped:
-                smooth, bump_alpha2 = _columns(samples.smooth_normal, index), samples.bump_alpha2[index]
+                smooth, bump_alpha2 = as_columns(samples.smooth_normal, index), samples.bump_alpha2[index]
                 rows, clip_rows = np.concatenate([rows, smooth[None]]), (3, 2)
                 integrate = ShadowedFormFactor(rows, bump_alpha2.astype(np.float32), scratch)
                 at_point = small_lights.ShadowedCosineAtPoint(rows, bump_alpha2.astype(np.float32))
-            colors = _columns(samples.diffuse_albedo, index)[None]
+            colors = as_columns(samples.diffuse_albedo, index)[None]
             others = (samples.bump_alpha2[index],) if is_bumped else ()
             lighting.add(Lobes(index, rows, clip_rows, integrate, at_point, colors, 1.0, others=others))
     lighting.finish(leftovers)
@@ -83,7 +90,7 @@ def shade_specular(samples, lights, table, radiance, scratch, leftovers=None):
     lights = Lights.of(lights, "specular")
     ridges = moments32.prepare(table)
     terms = (samples.specular_f90, samples.specular_f0, samples.specular_dip, samples.dielectric)
-    reflective = np.logical_or.reduce([_any_component(term) for term in terms])
+    reflective = np.logical_or.reduce([any_component(term) for term in terms])
     lit = reflective & (dot(samples.normal.T, samples.view.T) > 0.0)
     sharp = lit & ((samples.roughness < moments32.SHARP_ROUGHNESS) | float64.has_bent_fresnel(samples))
     anisotropic = lit & (samples.anisotropy != 0.0)
@@ -108,8 +115,8 @@ def _specular_lobes(samples, index, kind, colors, scratch) -> Lobes:
     """The specular lobes of the samples `index` (Q,) with `colors` (F, 3, Q). `kind` is a table, its `RidgeTable`, and
     the Fresnel terms as `fresnel_kinds` yields them."""
     table, ridges, vectors = kind
-    axes = _columns(samples.normal, index), _columns(samples.view, index)
-    rows, clip_rows, weights = _lobe_rows(samples, index, axes, ridges, vectors, scratch)
+    axes = as_columns(samples.normal, index), as_columns(samples.view, index)
+    rows, clip_rows, weights = lobe_axes(samples, index, axes, ridges, vectors, scratch)
     integrate, width = LobeIntegral(ridges, weights, scratch), float64.lobe_width(samples, index)
     limits = None
     if table.family == "ltsh":
@@ -123,7 +130,7 @@ def _specular_lobes(samples, index, kind, colors, scratch) -> Lobes:
 
 
 def specular_in_float64(table):
-    """The argument `shade_in_float64` of `shade_pairs` for specular lobes of `table`. For diffuse lobes it is
+    """The argument `shade_in_float64` of `float64.shade_pairs` for specular lobes of `table`. For diffuse lobes it is
     `float64.shade_diffuse`."""
 
     def shade(samples, lights, radiance):
@@ -134,36 +141,6 @@ def specular_in_float64(table):
 
 def _chunks(members):
     return (members[part] for part in moments32.pieces(len(members), CHUNK))
-
-
-@dataclass(frozen=True)
-class Lobes:
-    """The lobes of Q samples."""
-
-    index: np.ndarray  # (Q,) of the samples
-    rows: np.ndarray  # (C, 3, Q) axes of the coordinates that `integrate` takes
-    clip_rows: tuple[int, ...]  # numbers of the coordinates that are positive above a horizon
-    integrate: Callable  # integrate(columns, corners, index, smallest) -> integrals (F, Q') and mask of what to redo
-    at_point: Callable  # integrals (F, Q') over small lights by columns and `small_lights.RaysToCenters`
-    colors: np.ndarray  # (F, 3, Q) reflectances by which the integrals are multiplied
-    width: np.ndarray | float  # rad, as for `light_levels`
-    limits: TailLimits | None = None
-    sharpest: small_lights.SharpestLobes | None = None  # only for specular lobes
-    only_tails: bool = False  # True: single precision suffices for lights in the tails of the lobes only
-    others: tuple = ()  # (Q,) arrays of what the lobes depend on besides rows and widths
-
-    @cached_property
-    def shape(self) -> np.ndarray:
-        """What the lobes depend on (S, Q), each divided by the length over which the lobes change with it."""
-        rows = [self.rows[row] / self.lengths[row] for row in self.clip_rows]
-        if self.sharpest is not None:
-            rows += [self.sharpest.mirrored / self.sharpest.width, np.log(self.sharpest.width)[None]]
-        return np.concatenate([*rows, *(other[None].astype(np.float32) for other in self.others)])
-
-    @cached_property
-    def lengths(self) -> dict[int, np.ndarray]:
-        """Lengths (Q,) of the rows that are clipped."""
-        return {row: np.sqrt(dot(self.rows[row], self.rows[row])) for row in self.clip_rows}
 
 
 @dataclass(frozen=True)
@@ -285,7 +262,7 @@ class _Lighting:
         if not lobes.only_tails:
             if not light.has_profile:
                 rest = self._add_small(lobes, light, position, (columns, allowed), sums[row])
-            elif light_profile.ProfileRegions.suit(light):
+            elif profile_regions.ProfileRegions.suit(light):
                 rest = self._add_points(lobes, light, position, (columns, allowed), sums[row])
             if rest is not None and len(rest) == 0:
                 return
@@ -453,8 +430,8 @@ class _Lighting:
         for piece in moments32.pieces(len(columns), SMALL_CHUNK):
             part = columns[piece]
             offset = (light.center[:, None] - position[:, part]).astype(np.float32)
-            view = light_profile.LightView.of(light, offset, partial(_along_rows, lobes.rows[:, :, part]))
-            regions = light_profile.ProfileRegions(light, view, lobes.clip_rows)
+            view = light_profile.LightView.of(light, offset, partial(along_axes, lobes.rows[:, :, part]))
+            regions = profile_regions.ProfileRegions(light, view, lobes.clip_rows)
             for count, kind, index in regions.rules():
                 if count == 0:
                     left.append(part[index])
@@ -482,9 +459,9 @@ class _Lighting:
         """The lobes of the samples `index`, without their colors."""
         samples = self.samples
         if self.shade_in_float64 is float64.shade_diffuse:
-            return AnalyticLobe(_columns(samples.diffuse_normal, index))
+            return AnalyticLobe(as_columns(samples.diffuse_normal, index))
         alpha = np.maximum(samples.roughness[index].astype(np.float32) ** 2, np.float32(MIN_ALPHA))
-        return AnalyticLobe(_columns(samples.normal, index), _columns(samples.view, index), alpha)
+        return AnalyticLobe(as_columns(samples.normal, index), as_columns(samples.view, index), alpha)
 
     def add_in_float64(self, members) -> None:
         """Add the light of all lights at the samples `members` (Q,)."""
@@ -515,45 +492,9 @@ class _Lighting:
             leftovers.append((members.astype(np.int32), number.astype(np.int32)))
             return
         row = np.array([row for _, row, _ in self.lights])
-        for pairs, found in shade_pairs(self.samples, members, number, self.lights, self.shade_in_float64):
+        for pairs, found in float64.shade_pairs(self.samples, members, number, self.lights, self.shade_in_float64):
             # A sample may occur with several lights.
             np.add.at(self.radiance, (row[number[pairs]], members[pairs]), found.astype(np.float32))
-
-
-def shade_pairs(samples, members, number, lights, shade_in_float64):
-    """Yield (pairs (Q,), radiance (Q, 3)) of the samples `members` (N,), each under the one light `number` (N,).
-
-    Lights with equally many corners make one batch. Round lights and lights with a profile are shaded one by one,
-    because their corners depend on the sample.
-    """
-    batches: dict[tuple, list[int]] = {}
-    for position, (light, _, corners) in enumerate(lights):
-        own = (1, position) if light.has_profile or light.is_round else (0, (len(corners), light.is_distant))
-        batches.setdefault(own, []).append(position)
-    for (alone, _), chosen in sorted(batches.items()):
-        among = np.full(len(lights), -1)
-        among[chosen] = np.arange(len(chosen))
-        of_batch = np.nonzero(among[number] >= 0)[0]
-        for start in range(0, len(of_batch), FLOAT64_CHUNK):
-            pairs = of_batch[start : start + FLOAT64_CHUNK]
-            used, own = np.unique(among[number[pairs]], return_inverse=True)
-            items = [lights[chosen[position]] for position in used]
-            own = (items[0][0], 0, items[0][2]) if alone else _light_of_each(items, own)
-            target = np.zeros((1, len(pairs), 3))
-            shade_in_float64(samples.take(members[pairs]), [own], target)
-            yield pairs, target[0]
-
-
-def _light_of_each(items, number):
-    """One (light, row, corners) that stands for several with equally many corners, so that sample i sees the light
-    `number[i]`."""
-    fields = {
-        name: np.stack([getattr(light, name) for light, _, _ in items])[number]
-        for name in ("center", "direction", "radiance", "half_u", "half_v", "area_vector")
-    }
-    corners = np.stack([corners for _, _, corners in items])
-    distant = items[0][0].is_distant
-    return float64.LightOfEachSample(**fields, is_distant=distant), 0, corners[number].transpose(1, 0, 2)
 
 
 def _scatter(found, columns, radiance, total) -> None:
@@ -599,206 +540,3 @@ def _batches(light, corners, position, width, rest=None):
         for start in range(0, count, step):
             part = slice(start, start + step)
             yield part if chosen is None else chosen[part], outline, effort
-
-
-def fresnel_kinds(samples, members):
-    """Yield (vectors, members, colors): the samples `members` grouped by the Fresnel terms that they need.
-
-    `vectors` are those of `RidgeTable`; colors(index) returns the reflectances (F, 3, Q) of the terms.
-    """
-    dipped = _any_component(samples.specular_dip)[members]
-    metal = (_any_component(samples.specular_f90) | _any_component(samples.specular_f0))[members] | dipped
-    flat = ~_any_component(samples.specular_f90 != samples.specular_f0)[members] & ~dipped
-    dielectric = _any_component(samples.dielectric)[members]
-
-    def white(index):
-        return _columns(samples.specular_f0, index)[None]
-
-    def schlick(index):
-        f0 = _columns(samples.specular_f0, index)
-        return np.stack([f0, _columns(samples.specular_f90, index) - f0])
-
-    def f82(index):
-        return np.concatenate([schlick(index), -_columns(samples.specular_dip, index)[None]])
-
-    def coat(index):
-        color = _columns(samples.dielectric, index)
-        return np.stack([np.zeros_like(color), color])
-
-    def metal_and_coat(index, first):
-        return np.concatenate([first(index), _columns(samples.dielectric, index)[None]])
-
-    yield (0,), members[~dielectric & flat], white
-    yield (0, 1), members[~dielectric & ~flat & ~dipped], schlick
-    yield (0, 1, 2), members[~dielectric & dipped], f82
-    for vector, with_ior in _by_ior(samples.ior, members[dielectric & ~metal]):
-        yield (0, vector), with_ior, coat
-    for own, chosen in (((0, 1), metal & ~dipped), ((0, 1, 2), dipped)):
-        first = f82 if 2 in own else schlick
-        for vector, with_ior in _by_ior(samples.ior, members[dielectric & chosen]):
-            yield (*own, vector), with_ior, partial(metal_and_coat, first=first)
-
-
-def _by_ior(ior, members):
-    """Yield (vector, members): the dielectric's weight vector of the samples. There is one per index of refraction if
-    there are few of these."""
-    values = ior[members]
-    if len(members) == 0:
-        return
-    if values.min() == values.max():
-        yield ("dielectric", float(values[0])), members
-        return
-    distinct, number = np.unique(values, return_inverse=True)
-    if len(distinct) > SEPARATE_IORS:
-        yield "dielectric", members
-        return
-    for position, value in enumerate(distinct):
-        yield ("dielectric", float(value)), members[number == position]
-
-
-def _normal_frame(normal):
-    """Frames (3, 3, P) around normals (3, P), with an arbitrary tangent (Duff et al. 2017)."""
-    x, y, z = normal
-    sign = np.copysign(np.float32(1.0), z)
-    a = np.float32(-1.0) / (sign + z)
-    b = x * y * a
-    tangent = np.stack([np.float32(1.0) + sign * x * x * a, sign * b, -sign * x])
-    return np.stack([tangent, np.stack([b, sign + y * y * a, -y]), normal])
-
-
-def _lobe_rows(samples, index, axes, ridges, vectors, scratch):
-    """Axes (C, 3, Q) of the warped local frames, the numbers of the coordinates to clip, and the weights (F, K, Q), for
-    samples with the normals and views `axes`."""
-    normal, view = axes
-    cosine = dot(normal, view)
-    # Differences of close vectors are exact, so nothing of this one runs along the normal.
-    tangent = view - normal
-    tangent -= dot(normal, tangent) * normal
-    sine = np.sqrt(dot(tangent, tangent))
-    straight = np.nonzero(sine < 1e-6)[0]
-    if len(straight):
-        # The lobe is round there, so any tangent serves.
-        tangent[:, straight] = _normal_frame(normal[:, straight])[0]
-    tangent /= np.where(sine < 1e-6, np.float32(1.0), sine)
-    bitangent = np.stack([
-        normal[1] * tangent[2] - normal[2] * tangent[1],
-        normal[2] * tangent[0] - normal[0] * tangent[2],
-        normal[0] * tangent[1] - normal[1] * tangent[0],
-    ])  # fmt: skip
-    roughness = samples.roughness[index].astype(np.float32)
-    angle = np.minimum(cosine, np.float32(1.0)), np.minimum(sine, np.float32(1.0))
-    warp, weights, tilt = ridges.fetch(vectors, *angle, roughness, samples.ior[index], scratch)
-    rows = [warp[0] * tangent + warp[1] * normal, warp[2] * bitangent, warp[3] * normal]
-    clip_rows = (2,)
-    if tilt is not None:
-        sin_tilt, cos_tilt = np.sin(tilt), np.cos(tilt)
-        rows[0], rows[2] = cos_tilt * rows[0] - sin_tilt * rows[2], sin_tilt * rows[0] + cos_tilt * rows[2]
-        rows.append(normal)
-        clip_rows = (3, 2)
-    geometric = samples.geometric_normal[index]
-    if samples.geometric_normal is not samples.normal and (geometric != samples.normal[index]).any():
-        rows.append(np.ascontiguousarray(geometric.T, dtype=np.float32))
-        clip_rows = (len(rows) - 1, *clip_rows)
-    return np.stack(rows), clip_rows, weights
-
-
-def _any_component(vectors):
-    """Mask (P,) of the vectors (P, 3) with an element other than 0; numpy's own reduction of short rows is slow."""
-    return (vectors[:, 0] != 0) | (vectors[:, 1] != 0) | (vectors[:, 2] != 0)
-
-
-def _columns(vectors, index):
-    """Rows `index` of vectors (P, 3) as (3, Q) float32."""
-    return np.ascontiguousarray(vectors[index].T, dtype=np.float32)
-
-
-def _selected(values, part, index):
-    """Values (..., Q) at the columns `index` (None: all) of the slice `part` of columns."""
-    values = values[..., part]
-    return values if index is None else np.take(values, index, axis=-1)
-
-
-class FormFactor:
-    """Form factors (1, Q) of polygons whose corners run counterclockwise as seen from the point
-    (`Light.polygon`)."""
-
-    def __init__(self, scratch):
-        self.scratch = scratch
-
-    def __call__(self, part, corners, index, smallest=moments32.SMALLEST_SAFE):
-        integral, needs_float64 = moments32.cosine_integral(corners, self.scratch, smallest)
-        integral *= np.float32(-1.0 / np.pi)
-        return np.maximum(integral, np.float32(0.0))[None], needs_float64
-
-
-class ShadowedFormFactor:
-    """Form factors (1, Q) times the bump shadowing of `SurfaceSamples` in the mean direction of the polygon."""
-
-    def __init__(self, rows, bump_alpha2, scratch):
-        self.smooth = np.stack([dot(row, rows[3]) for row in rows[:3]])
-        self.bump_alpha2, self.scratch = bump_alpha2, scratch
-
-    def __call__(self, part, corners, index, smallest=moments32.SMALLEST_SAFE):
-        smooth, bump_alpha2 = (_selected(values, part, index) for values in (self.smooth, self.bump_alpha2))
-        integrals, needs_float64 = moments32.vector_irradiance(corners, self.scratch, smallest)
-        direction = np.negative(integrals, out=integrals)
-        along = np.maximum(dot(direction, smooth), np.float32(1e-15))
-        tangent2 = np.maximum(dot(direction, direction) / (along * along) - np.float32(1.0), np.float32(0.0))
-        shadowing = np.float32(2.0) / (np.float32(1.0) + np.sqrt(np.float32(1.0) + bump_alpha2 * tangent2))
-        values = np.maximum(direction[2], np.float32(0.0)) * shadowing * np.float32(1.0 / np.pi)
-        return values[None], needs_float64
-
-
-class LobeIntegral:
-    """Integrals (F, Q) of lobes with F weight vectors over polygons, never negative. Winding is as in `FormFactor`.
-
-    The first integral is the one for F = 1.
-    """
-
-    def __init__(self, ridges, weights, scratch):
-        self.ridges, self.weights, self.scratch = ridges, weights, scratch
-
-    def __call__(self, part, corners, index, smallest=moments32.SMALLEST_SAFE):
-        weights = _selected(self.weights, part, index)
-        values, _, cosine, needs_float64 = self.ridges.integrals(corners, weights, self.scratch, smallest)
-        np.negative(values, out=values)
-        np.maximum(values, np.float32(0.0), out=values)
-        np.maximum(values[0], np.float32(-LEAST_SHARE) * cosine, out=values[0])
-        return values, needs_float64
-
-
-class ProfiledIntegral:
-    """Integrals (F, Q) over polygons times the profile of the light, as sums of integrals over parts of the light.
-
-    The polygons need the coordinates along `rows`: those along `axes` (C, 3, P), then two in the light's plane.
-    """
-
-    def __init__(self, light, effort, offset, axes, integrate, count):
-        self.effort, self.integrate, self.count = effort, integrate, count
-        self.profile = light_profile.Profile.of(light)
-        self.view = light_profile.LightView.of(light, offset, partial(_along_rows, axes))
-        plane = light_profile.plane_axes(light).astype(np.float32)[:, :, None]
-        self.rows = np.concatenate([axes, np.broadcast_to(plane, (2, 3, axes.shape[2]))])
-
-    def __call__(self, corners, index):
-        index = np.arange(corners.shape[2]) if index is None else index
-        values = np.zeros((self.count, len(index)), np.float32)
-        needs_float64 = np.zeros(len(index), bool)
-        step = max(CORNERS // (corners.shape[1] * (2 * self.effort.chords + 1)), 512)
-        for start in range(0, len(index), step):
-            part = slice(start, start + step)
-            flat, view = corners[-2:, :, part], self.view.take(index[part])
-            layers = light_profile.layers(view, flat, self.profile, self.effort)
-            for number, (near, weights, polygons) in enumerate(layers):
-                # Small disks count little, so the rounding of their edges is lost in the sum.
-                smallest = 0.0 if number < self.effort.layers - 1 else moments32.SMALLEST_SAFE
-                found, redo = self.integrate(polygons, index[part][near], smallest=smallest)
-                values[:, start + near] += weights * found
-                needs_float64[start + near] |= redo
-        return values, needs_float64
-
-
-def _along_rows(axes, vector):
-    """Products (C, P) of rows (C, 3, P) with a vector (3,)."""
-    x, y, z = vector.astype(np.float32)
-    return x * axes[:, 0] + y * axes[:, 1] + z * axes[:, 2]

@@ -101,6 +101,42 @@ def shade_patches(samples, members, patches, tree: PatchTree, radiance, shade) -
         np.add.at(radiance, index, target[0])
 
 
+def shade_pairs(samples, members, number, lights, shade_in_float64):
+    """Yield (pairs (Q,), radiance (Q, 3)) of the samples `members` (N,), each under the one light `number` (N,).
+
+    Lights with equally many corners make one batch. Round lights and lights with a profile are shaded one by one,
+    because their corners depend on the sample.
+    """
+    batches: dict[tuple, list[int]] = {}
+    for position, (light, _, corners) in enumerate(lights):
+        own = (1, position) if light.has_profile or light.is_round else (0, (len(corners), light.is_distant))
+        batches.setdefault(own, []).append(position)
+    for (alone, _), chosen in sorted(batches.items()):
+        among = np.full(len(lights), -1)
+        among[chosen] = np.arange(len(chosen))
+        of_batch = np.nonzero(among[number] >= 0)[0]
+        for start in range(0, len(of_batch), FLOAT64_CHUNK):
+            pairs = of_batch[start : start + FLOAT64_CHUNK]
+            used, own = np.unique(among[number[pairs]], return_inverse=True)
+            items = [lights[chosen[position]] for position in used]
+            own = (items[0][0], 0, items[0][2]) if alone else _light_of_each(items, own)
+            target = np.zeros((1, len(pairs), 3))
+            shade_in_float64(samples.take(members[pairs]), [own], target)
+            yield pairs, target[0]
+
+
+def _light_of_each(items, number):
+    """One (light, row, corners) that stands for several with equally many corners, so that sample i sees the light
+    `number[i]`."""
+    fields = {
+        name: np.stack([getattr(light, name) for light, _, _ in items])[number]
+        for name in ("center", "direction", "radiance", "half_u", "half_v", "area_vector")
+    }
+    corners = np.stack([corners for _, _, corners in items])
+    distant = items[0][0].is_distant
+    return LightOfEachSample(**fields, is_distant=distant), 0, corners[number].transpose(1, 0, 2)
+
+
 def _of(vector, index):
     """`vector` if it is (3,), the same for all samples; otherwise its rows for the samples `index`."""
     return vector if vector.ndim == 1 else vector[index]

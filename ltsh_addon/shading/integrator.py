@@ -126,7 +126,7 @@ class Task:
         lights, (used, number) = self.lights_of_pairs(name), np.unique(number, return_inverse=True)
         lights = _prepared(lights[one] for one in used)
         result, every = np.zeros((len(samples), 3), self.dtype), np.arange(len(samples))
-        for pairs, found in float32.shade_pairs(samples, every, number, lights, in_float64):
+        for pairs, found in float64.shade_pairs(samples, every, number, lights, in_float64):
             result[pairs] = found
         return result
 

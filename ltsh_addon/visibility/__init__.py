@@ -1,31 +1,39 @@
 """The share of each light that is visible: occluders, rays through them, and what they leave of each light.
 
-`occluders` holds what stands in the way. `starts` says where rays start, and `directions` chooses where they go. `rays`
-traces them, and `ratio` turns what they meet into shares (`visible_shares`).
+`occluders` holds what stands in the way. `shadow_terminator` says where rays start, and `ray_sampler` chooses where
+they go. `rays` traces them, and `ratio` turns what they meet into the visibility of lights (`trace_visibility`).
 """
 
 from __future__ import annotations
 
-from .directions import shared_numbers
+from .light_cluster import shared_numbers
 from .occluders import Hits, OccluderMesh, Occluders, Transparency
-from .ratio import BLOCK_SAMPLES, ShadowSampling, ShadowTask, Visibility, ray_origins, task_of_lights, visible_shares
+from .ratio import (
+    BLOCK_SAMPLES,
+    ShadowSampling,
+    ShadowTask,
+    Visibility,
+    shadow_task,
+    trace_ray_origins,
+    trace_visibility,
+)
 from .rays import Tracer, open_tracer
-from .starts import Starts
+from .shadow_terminator import RayOrigins
 
 __all__ = [
     "BLOCK_SAMPLES",
     "Hits",
     "OccluderMesh",
     "Occluders",
+    "RayOrigins",
     "ShadowSampling",
     "ShadowTask",
-    "Starts",
     "Tracer",
     "Transparency",
     "Visibility",
     "open_tracer",
-    "ray_origins",
+    "shadow_task",
     "shared_numbers",
-    "task_of_lights",
-    "visible_shares",
+    "trace_ray_origins",
+    "trace_visibility",
 ]

@@ -21,7 +21,7 @@ TRANSPARENT_SURFACES = 8
 # From this number of transparent surfaces on, parts that let all light through are dropped and no longer count.
 UNLIMITED = 1024
 # Most parts of all meshes with an image
-MOST_PARTS = 1 << 17
+MOST_PIECES = 1 << 17
 # A ray continues behind a transparent surface at this multiple of its distance.
 STEP = np.float32(1.0 + 2.0**-21)
 
@@ -54,15 +54,15 @@ class Transparency:
                 f"and one of {', '.join(INTERPOLATIONS)}"
             )
 
-    def shares(self, triangle: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    def transmittance(self, triangle: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
         """Shares (Q,) at the points (1 - u - v) a + u b + v c of triangles (Q,) with corners a, b, c."""
         if self.image is None:
             return np.full(len(triangle), self.share, np.float32)
         a, b, c = np.moveaxis(self.uv[triangle], 1, 0)
         u, v = u[:, None], v[:, None]
-        return self.shares_of(self._image_at((1.0 - u - v) * a + u * b + v * c))
+        return self.transmittance_of(self._image_at((1.0 - u - v) * a + u * b + v * c))
 
-    def shares_of(self, values) -> np.ndarray:
+    def transmittance_of(self, values) -> np.ndarray:
         """Shares (...) for values (...) of the image."""
         values_of_curve = values if self.curve is None else np.interp(values, *self.curve)
         return (self.share * np.clip(values_of_curve, 0.0, 1.0)).astype(np.float32)
@@ -264,7 +264,7 @@ class Hits:
 
 
 @dataclass(frozen=True)
-class Parts:
+class TrianglePieces:
     """T triangles to trace instead of a mesh. Each is a part of a `triangle` (T,) of the mesh; `corners` (T, 3, 2) are
     the weights u, v of its corners there."""
 
@@ -275,18 +275,23 @@ class Parts:
         """Corners (T, 3, 3) in float64."""
         return _placed(mesh.vertices[mesh.triangles[self.triangle]].astype(np.float64), self.corners)
 
-    def take(self, mask: np.ndarray) -> Parts:
+    def take(self, mask: np.ndarray) -> TrianglePieces:
         """The parts for which `mask` (T,) is True."""
-        return Parts(self.triangle[mask], self.corners[mask])
+        return TrianglePieces(self.triangle[mask], self.corners[mask])
 
-    def quarters(self) -> Parts:
+    @classmethod
+    def joined(cls, several: list[TrianglePieces]) -> TrianglePieces:
+        """All pieces of `several`, one after another."""
+        return cls(*(np.concatenate([getattr(each, name) for each in several]) for name in ("triangle", "corners")))
+
+    def quarters(self) -> TrianglePieces:
         """The four parts (4 T) into which the midpoints of its sides cut each."""
         middles = 0.5 * (self.corners + self.corners[:, [1, 2, 0]])
         a, b, c = (np.stack([self.corners[:, k], middles[:, k], middles[:, k - 1]], axis=1) for k in range(3))
-        return Parts(np.tile(self.triangle, 4), np.concatenate([a, b, c, middles]))
+        return TrianglePieces(np.tile(self.triangle, 4), np.concatenate([a, b, c, middles]))
 
 
-def cut_outs(occluders: Occluders) -> dict[int, tuple[Parts, Parts]]:
+def cut_outs(occluders: Occluders) -> dict[int, tuple[TrianglePieces, TrianglePieces]]:
     """For meshes with an image, by number: the parts that block all light, and the parts that may let some through.
 
     With them, few rays have to look at the image. Parts overlap a little, so that no ray slips between parts of
@@ -300,17 +305,17 @@ def cut_outs(occluders: Occluders) -> dict[int, tuple[Parts, Parts]]:
         and mesh.transparency.extension != "MIRROR"
     ]
     drops_clear = occluders.transparent_surfaces >= UNLIMITED
-    return {number: _cut_out(occluders.meshes[number], MOST_PARTS // len(cut), drops_clear) for number in cut}
+    return {number: _cut_out(occluders.meshes[number], MOST_PIECES // len(cut), drops_clear) for number in cut}
 
 
 def _cut_out(mesh, most, drops_clear):
     clear = mesh.transparency
-    values, outside = clear.shares_of(clear.image), clear.shares_of(clear.outside)
-    kinds = [_Counts.of(values <= 0.0, clear, outside <= 0.0)]
+    values, outside = clear.transmittance_of(clear.image), clear.transmittance_of(clear.outside)
+    kinds = [_PixelCounts.of(values <= 0.0, clear, outside <= 0.0)]
     if drops_clear:
-        kinds.append(_Counts.of(values >= 1.0, clear, outside >= 1.0))
+        kinds.append(_PixelCounts.of(values >= 1.0, clear, outside >= 1.0))
     overlap, count = _overlaps(mesh), len(mesh.triangles)
-    remaining = Parts(np.arange(count), np.tile(_WHOLE, (count, 1, 1)))
+    remaining = TrianglePieces(np.arange(count), np.tile(_WHOLE, (count, 1, 1)))
     blocking, mixed, count = [], [], 0
     for level in range(_LEVELS + 1):
         grown = remaining.corners
@@ -320,18 +325,15 @@ def _cut_out(mesh, most, drops_clear):
         pixel = _placed(clear.uv[remaining.triangle].astype(np.float64), grown) * clear.image.shape[::-1]
         low, high = pixel.min(axis=1), pixel.max(axis=1)
         is_one = [kind.all_within(low, high) for kind in kinds]
-        blocking.append(Parts(remaining.triangle, grown).take(is_one[0]))
+        blocking.append(TrianglePieces(remaining.triangle, grown).take(is_one[0]))
         rest = ~np.logical_or.reduce(is_one)
         count += int(is_one[0].sum())
         is_last = level == _LEVELS or count + 4 * int(rest.sum()) > most
         fine = rest & (is_last | ((high - low).max(axis=1) < _FINEST) | ~(overlap[remaining.triangle] <= _WIDEST))
-        mixed.append(Parts(remaining.triangle, grown).take(fine))
+        mixed.append(TrianglePieces(remaining.triangle, grown).take(fine))
         count += int(fine.sum())
         remaining = remaining.take(rest & ~fine).quarters()
-    return tuple(
-        Parts(*(np.concatenate([getattr(piece, name) for piece in pieces]) for name in ("triangle", "corners")))
-        for pieces in (blocking, mixed)
-    )
+    return TrianglePieces.joined(blocking), TrianglePieces.joined(mixed)
 
 
 # _WHOLE: corners of a triangle. _LEVELS: most cuts of a triangle into four. _FINEST: size in pixels at which cutting
@@ -358,7 +360,7 @@ def _placed(corners, places):
 
 
 @dataclass(frozen=True)
-class _Counts:
+class _PixelCounts:
     """How many pixels of an image are of a kind, to the left of and below each pixel."""
 
     sums: np.ndarray  # (H + 1, W + 1)
@@ -366,7 +368,7 @@ class _Counts:
     reach: float  # distance in pixels from its center up to which a pixel counts
 
     @classmethod
-    def of(cls, mask, clear: Transparency, is_outside: bool) -> _Counts:
+    def of(cls, mask, clear: Transparency, is_outside: bool) -> _PixelCounts:
         """For a mask (H, W). If the image does not repeat, a border of one pixel stands for what is beside it."""
         if clear.extension != "REPEAT":
             mode = {"constant_values": is_outside} if clear.extension == "CLIP" else {"mode": "edge"}

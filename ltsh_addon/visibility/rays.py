@@ -18,8 +18,8 @@ from itertools import repeat
 import numpy as np
 
 from ..scene import SceneError, SurfaceSamples, error_line, listed
-from .occluders import ALL_RAYS, STEP, ChosenBy, Hits, OccluderMesh, Occluders, Parts, Transparency, cut_outs
-from .starts import StartFinder, Starts
+from .occluders import ALL_RAYS, STEP, ChosenBy, Hits, OccluderMesh, Occluders, Transparency, TrianglePieces, cut_outs
+from .shadow_terminator import RayOrigins, ShadowTerminator
 
 # Names under which the system may know the library.
 SYSTEM_LIBRARIES = ("libembree4.so.4", "libembree4.4.dylib", "libembree4.dylib", "embree4.dll")
@@ -163,11 +163,11 @@ class _Packets:
 
 
 class _Scene:
-    """The instances `index` of `occluders` as an Embree scene. For meshes in `parts`, by number, only these parts."""
+    """The instances `index` of `occluders` as an Embree scene. For meshes in `pieces`, by number, only these parts."""
 
-    def __init__(self, embree: _Embree, occluders: Occluders, index: np.ndarray, parts: dict[int, Parts]):
-        self._embree, self._kept, self._scenes = embree, [], []
-        self.scene, self.instances, self._parts = None, index, parts
+    def __init__(self, embree: _Embree, occluders: Occluders, index: np.ndarray, pieces: dict[int, TrianglePieces]):
+        self._embree, self._buffers, self._scenes = embree, [], []
+        self.scene, self.instances, self._pieces = None, index, pieces
         self._mesh = occluders.mesh[index]
         uses = np.bincount(self._mesh, minlength=len(occluders.meshes))
         shared: dict[int, int] = {}
@@ -175,9 +175,9 @@ class _Scene:
         try:
             for number in index:
                 mesh, mask = int(occluders.mesh[number]), int(occluders.masks[number])
-                matrix, shape = occluders.matrices[number], (occluders.meshes[mesh], parts.get(mesh))
+                matrix, shape = occluders.matrices[number], (occluders.meshes[mesh], pieces.get(mesh))
                 # Parts keep the digits that they have in the space of their object.
-                if uses[mesh] == 1 and mesh not in parts:
+                if uses[mesh] == 1 and mesh not in pieces:
                     self._add_triangles(self.scene, shape, matrix, mask)
                 else:
                     if mesh not in shared:
@@ -198,10 +198,10 @@ class _Scene:
         return scene
 
     def _add_triangles(self, scene, shape, matrix, mask) -> None:
-        (mesh, parts), embree = shape, self._embree
+        (mesh, pieces), embree = shape, self._embree
         vertices, triangles = mesh.vertices, mesh.triangles
-        if parts is not None:
-            vertices = parts.vertices(mesh).reshape(-1, 3)
+        if pieces is not None:
+            vertices = pieces.vertices(mesh).reshape(-1, 3)
             triangles = np.arange(len(vertices), dtype=np.uint32).reshape(-1, 3)
         if matrix is not None:
             vertices = vertices.astype(np.float64) @ matrix[:, :3].T + matrix[:, 3]
@@ -214,7 +214,7 @@ class _Scene:
             (_INDEX_BUFFER, triangles, _UINT3, len(triangles)),
         ):
             embree.SetSharedGeometryBuffer(geometry, kind, 0, form, data.ctypes.data, 0, 12, count)
-            self._kept.append(data)
+            self._buffers.append(data)
         self._attach(scene, geometry, mask)
 
     def _add_instance(self, mesh_scene, matrix, mask) -> None:
@@ -233,19 +233,19 @@ class _Scene:
 
     def hits(self, ray, distance, number, triangle, u, v) -> Hits:
         """Hits by triangles and places on the meshes themselves. `number` (H,) counts the instances of this scene."""
-        mesh_of_hit = self._mesh[number] if self._parts else ()
-        for mesh in self._parts.keys() & set(np.unique(mesh_of_hit).tolist()):
+        mesh_of_hit = self._mesh[number] if self._pieces else ()
+        for mesh in self._pieces.keys() & set(np.unique(mesh_of_hit).tolist()):
             here = np.flatnonzero(mesh_of_hit == mesh)
-            corners = self._parts[mesh].corners[triangle[here]]
+            corners = self._pieces[mesh].corners[triangle[here]]
             weights = np.stack([1.0 - u[here] - v[here], u[here], v[here]])
             u[here], v[here] = np.einsum("cq,qck->kq", weights, corners)
-            triangle[here] = self._parts[mesh].triangle[triangle[here]]
+            triangle[here] = self._pieces[mesh].triangle[triangle[here]]
         return Hits(ray, distance, self.instances[number], triangle, u, v)
 
     def close(self) -> None:
         while self._scenes:
             self._embree.ReleaseScene(self._scenes.pop(0))
-        self._kept.clear()
+        self._buffers.clear()
 
 
 class EmbreeCaster:
@@ -259,9 +259,9 @@ class EmbreeCaster:
     def __init__(self, occluders: Occluders, embree: _Embree):
         self.description, self.library = f"Embree {embree.version}", embree.path
         self._embree, self._scenes = embree, []
-        parts = cut_outs(occluders)
+        pieces = cut_outs(occluders)
         for number, index in enumerate(occluders.split()):
-            pieces_of_mesh = {mesh: both[number] for mesh, both in parts.items()}
+            pieces_of_mesh = {mesh: both[number] for mesh, both in pieces.items()}
             filled = [mesh for mesh, pieces in pieces_of_mesh.items() if len(pieces.triangle)]
             whole = index[~np.isin(occluders.mesh[index], list(pieces_of_mesh))]
             index = np.union1d(whole, np.flatnonzero(np.isin(occluders.mesh, filled)))
@@ -308,7 +308,7 @@ class Tracer:
         self.occluders, self.description = occluders, caster.description
         self.library = caster.library
         self._caster, self._lock = caster, threading.Lock()
-        self._finder = StartFinder(occluders, caster)
+        self._terminator = ShadowTerminator(occluders, caster)
 
     def __reduce__(self):
         # A worker process opens a tracer of its own.
@@ -337,21 +337,21 @@ class Tracer:
         origins, directions, distances = (np.asarray(values, np.float32) for values in (origins, directions, distances))
         count, chunk = len(origins), self._caster.chunk
         masks = np.broadcast_to(np.uint32(ALL_RAYS), (count,)) if masks is None else np.asarray(masks, np.uint32)
-        shares = np.ones(count, np.float32)
+        transmittance = np.ones(count, np.float32)
         with self._lock:
             if self._caster.has[False]:
                 for start in range(0, count, chunk):
                     rows = slice(start, start + chunk)
                     blocked = self._caster.blocked(origins[rows], directions[rows], distances[rows], masks[rows])
-                    shares[rows][blocked] = 0.0
+                    transmittance[rows][blocked] = 0.0
             if self._caster.has[True]:
-                self._attenuate(shares, origins, directions, distances, masks)
-        return shares
+                self._attenuate(transmittance, origins, directions, distances, masks)
+        return transmittance
 
-    def _attenuate(self, shares, *rays):
-        """Multiply `shares` (R,) by those of the transparent surfaces that the rays meet."""
-        near = np.zeros(len(shares), np.float32)
-        index = np.flatnonzero(shares > 0.0)
+    def _attenuate(self, transmittance, *rays):
+        """Multiply `transmittance` (R,) by those of the transparent surfaces that the rays meet."""
+        near = np.zeros(len(transmittance), np.float32)
+        index = np.flatnonzero(transmittance > 0.0)
         for _ in range(self.occluders.transparent_surfaces + 1):
             met = []
             for start in range(0, len(index), self._caster.chunk):
@@ -366,9 +366,9 @@ class Tracer:
             for number in np.unique(mesh):
                 here = np.flatnonzero(mesh == number)
                 clear = self.occluders.meshes[number].transparency
-                shares[index[here]] *= clear.shares(*(values[here] for values in places))
-            index = index[shares[index] > 0.0]
-        shares[index] = 0.0
+                transmittance[index[here]] *= clear.transmittance(*(values[here] for values in places))
+            index = index[transmittance[index] > 0.0]
+        transmittance[index] = 0.0
 
     def first_met(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Distance (R,) in m along unit `directions` (R, 3) to what blocks rays, inf if nothing does; and mask (R,) of
@@ -398,10 +398,10 @@ class Tracer:
         """Which kinds of rays to the light of that name exist."""
         return self.occluders.chosen_by(light)
 
-    def starts(self, samples: SurfaceSamples) -> Starts:
-        """Where rays from `samples` start, see `StartFinder.starts`."""
+    def ray_origins(self, samples: SurfaceSamples) -> RayOrigins:
+        """Where rays from `samples` start, see `ShadowTerminator.ray_origins`."""
         with self._lock:
-            return self._finder.starts(samples)
+            return self._terminator.ray_origins(samples)
 
 
 # Which library:

@@ -404,7 +404,7 @@ def ray_counts(scene: Measured):
             timed = TimedTracer(tracer._tracer)
             samples = replace(samples, position=samples.position - scene.extraction.origin)
             sampling = visibility.ShadowSampling(rays=rays, film=scene.extraction.film)
-            found = visibility.visible_shares(samples, tracer._lights, timed, sampling, workers=1)
+            found = visibility.trace_visibility(samples, tracer._lights, timed, sampling, workers=1)
             end = time.process_time()
         rows[rays] = end - start, found.rays
         numpy_share = (end - grown) / timed.seconds - 1.0 if timed.seconds else math.nan

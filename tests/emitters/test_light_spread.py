@@ -11,7 +11,7 @@ from precisions import PROMISED, techniques
 from surface_scenes import all_kinds_of_samples, area_light, four_lights, random_samples, single_sample, unit
 
 from ltsh_addon import shading
-from ltsh_addon.emitters import light_profile
+from ltsh_addon.emitters import light_profile, profile_regions
 
 # Of a result, or of a hundredth of the largest one: what the spread of the closed forms may be off, and the reference.
 CLOSED, QUADRATURE = 3e-3, 1e-3
@@ -110,13 +110,14 @@ def test_few_points_of_a_light_are_as_good_as_many(place, degrees, monkeypatch):
     samples = random_samples(150, seed=8, lowest_roughness=0.15)
     options = {**PLACES[place], "spread": np.radians(degrees), "radiance": (1, 1, 1)}
     lights = [area_light(center=(x, 0.4, 1.5), **options) for x in (0, 1)]
-    assert all(light_profile.ProfileRegions.suit(light) for light in lights)
+    assert all(profile_regions.ProfileRegions.suit(light) for light in lights)
     few = shading.shade(samples, lights, "ltsh4", workers=1)
 
     def all_dense(regions):
-        yield 60, light_profile.GRADED, np.nonzero((regions.high > regions.low) & (regions.highest > regions.lowest))[0]
+        lit = np.nonzero((regions.high > regions.low) & (regions.highest > regions.lowest))[0]
+        yield 60, profile_regions.GRADED, lit
 
-    monkeypatch.setattr(light_profile.ProfileRegions, "rules", all_dense)
+    monkeypatch.setattr(profile_regions.ProfileRegions, "rules", all_dense)
     many = shading.shade(samples, lights, "ltsh4", workers=1)
     for part in shading.PASSES:
         found, expected = getattr(few, part)[0, :, 0], getattr(many, part)[0, :, 0]
@@ -292,7 +293,7 @@ def test_a_sheared_ellipse_is_the_ellipse_that_it_is():
     sheared = replace(area_light(shape="ELLIPSE", half_u=u, half_v=v, center=(0, 0, 2.0)), spread=np.radians(70.0))
     other = {"half_u": np.cos(turn) * u + np.sin(turn) * v, "half_v": np.cos(turn) * v - np.sin(turn) * u}
     upright = light_profile.upright(sheared)
-    assert abs(upright.half_u @ upright.half_v) < 1e-12 and light_profile.ProfileRegions.suit(upright)
+    assert abs(upright.half_u @ upright.half_v) < 1e-12 and profile_regions.ProfileRegions.suit(upright)
     assert np.allclose(upright.area_vector, sheared.area_vector)
     samples = random_samples(60, seed=8)
     one, two = (

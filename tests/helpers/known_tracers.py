@@ -23,7 +23,7 @@ class Tracer:
     def chosen_by(self, name):
         return ChosenBy(surface=False)
 
-    def starts(self, samples):
+    def ray_origins(self, samples):
         self.position = samples.position
         return self
 

@@ -51,7 +51,7 @@ def answers(occluders, origins, directions, distances, masks):
             continue
         for ray, triangle in zip(*np.nonzero(surely), strict=True):
             here = np.array([triangle]), u[ray, [triangle]], v[ray, [triangle]]
-            shares[ray] *= clear.shares(*here)[0]
+            shares[ray] *= clear.transmittance(*here)[0]
             met[ray] += 1
     shares[met > occluders.transparent_surfaces] = 0.0
     return shares, is_sure

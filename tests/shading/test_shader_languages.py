@@ -13,7 +13,7 @@ import pytest
 from header_harness import points, random_polygons
 
 from ltsh_addon import shading
-from ltsh_addon.shading import wgsl
+from ltsh_addon.shading import header
 from ltsh_addon.shading.header import data_blocks
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -181,7 +181,7 @@ def test_conditions_loops_and_changed_parameters_are_translated():
 }
 """
     assert (
-        wgsl.translated(text, "f").split()
+        header.translated_to_wgsl(text, "f").split()
         == """fn f(x_given: f32, n: i32) -> f32 {
     var x = x_given;
     for (var i: i32 = 0; i < n; i++) {

@@ -14,7 +14,7 @@ from ltsh_addon.emitters import small_lights as points
 from ltsh_addon.lobes import edge_integrals, moments32
 from ltsh_addon.lobes.polygon import project_to_sphere
 from ltsh_addon.scene import PolygonLight
-from ltsh_addon.shading import float32, integrator
+from ltsh_addon.shading import integrator, lobes32
 
 
 def white_lights(lights):
@@ -144,7 +144,7 @@ def test_many_indices_of_refraction_give_what_single_ones_give(name):
     many = replace(few, ior=few.ior + np.where(np.arange(300) < 150, 0.0, 1e-3 * np.arange(300)))
     apart = shading.shade(few, lights, name, workers=1).specular[:, :150]
     together = shading.shade(many, lights, name, workers=1).specular[:, :150]
-    assert len(np.unique(many.ior)) > float32.SEPARATE_IORS
+    assert len(np.unique(many.ior)) > lobes32.SEPARATE_IORS
     assert np.abs(apart - together).max() < 2e-6
 
 

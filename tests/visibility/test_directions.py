@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from textbook import lhuilier
 
-from ltsh_addon.visibility import directions
+from ltsh_addon.visibility import sampling
 
 
 @pytest.mark.parametrize("power", range(1, 9))
@@ -13,18 +13,18 @@ def test_every_first_power_of_two_of_points_is_stratified(power):
     count = 2**power
     for seed in (1, 2, 3):
         for change in (0, 0x2ABCDE, 0x155555):
-            x, y = directions.sequence(1024, seed)[:, :count] ^ np.uint32(change)
+            x, y = sampling.sequence(1024, seed)[:, :count] ^ np.uint32(change)
             for bits in range(power + 1):
-                cell = (x >> (directions.BITS - bits)) * 2 ** (power - bits) + (y >> (directions.BITS - power + bits))
+                cell = (x >> (sampling.BITS - bits)) * 2 ** (power - bits) + (y >> (sampling.BITS - power + bits))
                 assert len(np.unique(cell)) == count
 
 
 def test_points_of_samples_lie_in_the_unit_interval_and_differ():
     rng = np.random.default_rng(1)
-    seeds = directions.seeds_of(rng.normal(size=(2000, 3)))
+    seeds = sampling.seeds_of(rng.normal(size=(2000, 3)))
     assert len(np.unique(seeds)) > 1995
     for stream in (0, 1):
-        points = np.stack(directions.unit_points(seeds, stream, 0, 64))
+        points = np.stack(sampling.unit_points(seeds, stream, 0, 64))
         assert points.min() > 0.0 and points.max() < 1.0
         # Means of 64 stratified points are within 1 / 64 of the middle; over all samples there is no bias.
         assert np.abs(points.mean(axis=1) - 0.5).max() < 1.0 / 64.0
@@ -46,7 +46,7 @@ def seen_quads(kind, count, rng):
 @pytest.mark.parametrize("kind", ("plain", "tiny", "hair", "over all of the sky"))
 def test_directions_are_spread_evenly_over_the_solid_angle(kind):
     corners = seen_quads(kind, 60, np.random.default_rng(4))
-    quads = directions.SphericalQuads(corners.astype(np.float32))
+    quads = sampling.SphericalQuads(corners.astype(np.float32))
     unit = np.moveaxis(corners / np.linalg.norm(corners, axis=0), 0, -1)
     expected = lhuilier(*unit[:3]) + lhuilier(*unit[[0, 2, 3]])
     # Corners 1e-4 apart have three digits in single precision.
@@ -78,12 +78,12 @@ def test_a_warp_and_its_inverse_are_one_another():
     view *= np.sign((view * normal).sum(axis=0))
     view[:, :50] = normal[:, :50]
     normal, view = normal.astype(np.float32), view.astype(np.float32)
-    cosine, sine, rows = directions.frames(normal, view)
+    cosine, sine, rows = sampling.frames(normal, view)
     np.testing.assert_allclose(
         np.einsum("ikq,jkq->qij", rows, rows), np.broadcast_to(np.eye(3), (200, 3, 3)), atol=1e-6
     )
     np.testing.assert_allclose(sine[None] * rows[0] + cosine[None] * rows[2], view, atol=2e-6)
-    warps = directions.Warps(rows, cosine, sine, rng.uniform(0.01, 1.0, 200).astype(np.float32))
+    warps = sampling.Warps(rows, cosine, sine, rng.uniform(0.01, 1.0, 200).astype(np.float32))
     world = rng.normal(size=(3, 5, 200)).astype(np.float32)
     world /= np.linalg.norm(world, axis=0)
     local = warps.local(world)

@@ -5,7 +5,9 @@ import pytest
 
 from ltsh_addon.cycles.environment import CUBE, SkyPicture, sky_lights
 from ltsh_addon.scene import SkyLight
-from ltsh_addon.visibility.directions import Sky, emitters_of, unit_points
+from ltsh_addon.visibility.emitter import Sky
+from ltsh_addon.visibility.light_cluster import emitters_of
+from ltsh_addon.visibility.sampling import unit_points
 
 LIKE = SkyLight("Sky", [0, 0, 1], [1, 0, 0], [0, 1, 0], [0, 0, -1], np.ones(3))
 NORMALS = np.array([[0.0, 0.6, -0.8], [0.0, 0.8, 0.0], [1.0, 0.0, 0.6]], np.float32)  # (3, Q)

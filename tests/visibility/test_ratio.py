@@ -10,8 +10,10 @@ from known_tracers import OPEN, WALL, Tracer, floor, panel, past_spheres
 
 from ltsh_addon import shading
 from ltsh_addon.scene import PASSES, Cancelled, Film, SurfaceSamples, light_of
-from ltsh_addon.visibility import ratio
-from ltsh_addon.visibility.directions import Emitter
+from ltsh_addon.visibility import estimator, ratio
+from ltsh_addon.visibility.emitter import Emitter
+from ltsh_addon.visibility.estimator import LightSelection
+from ltsh_addon.visibility.ray_sampler import SampleRows
 
 KINDS = [*((surface, "plain") for surface in random_surfaces.SURFACES)] + [
     ("plain", light)
@@ -27,7 +29,7 @@ def test_weights_are_the_light_that_is_reflected(surface, kind):
     random = np.random.default_rng(5)
     samples = random_surfaces.samples(surface, 16, random)
     lights = [random_surfaces.light(kind, number, random) for number in range(3)]
-    found = ratio.visible_shares(samples, lights, OPEN, ratio.ShadowSampling(rays=8))
+    found = ratio.trace_visibility(samples, lights, OPEN, ratio.ShadowSampling(rays=8))
     for name in PASSES:
         assert (getattr(found, name) == 1.0).all()
     for light in lights:
@@ -53,7 +55,7 @@ def test_behind_a_wall_nothing_is_left():
     random = np.random.default_rng(6)
     for surface, kind in KINDS:
         samples, light = random_surfaces.samples(surface, 40, random), random_surfaces.light(kind, 0, random)
-        found = ratio.visible_shares(samples, [light], WALL)
+        found = ratio.trace_visibility(samples, [light], WALL)
         whole = shading.shade(samples, [light], "ltsh4", workers=1)
         for name in PASSES:
             share, radiance = getattr(found, name)[0], getattr(whole, name)[0]
@@ -95,9 +97,9 @@ def brute_force(samples, light, passed, side):
 
 def with_all_rays(samples, light, tracer):
     """The pairs of a light after as many rays as there can be, for each."""
-    choices = ratio.Choices(samples, [light], is_baked=False)
-    pairs = ratio.Pairs(ratio.Surface(samples, PASSES, tracer), Emitter(light), 0, choices)
-    pairs._add_rays(np.arange(len(pairs.index)), 0, ratio.MOST_RAYS, 0)
+    selection = LightSelection(samples, [light], is_baked=False)
+    pairs = estimator.RatioEstimator(SampleRows(samples, PASSES, tracer), Emitter(light), 0, selection)
+    pairs._add_rays(np.arange(len(pairs.index)), 0, estimator.MOST_RAYS, 0)
     return pairs
 
 
@@ -205,7 +207,7 @@ def test_few_rays_suffice_and_the_told_noise_is_about_the_real_one():
     lights = [panel(), panel(name="Low", center=np.array([0.5, 2.0, 0.6]))]
     pairs = [with_all_rays(samples, light, THREE_SPHERES) for light in lights]
     for rays, limit in ((8, 0.12), (32, 0.06), (128, 0.025)):
-        found = ratio.visible_shares(samples, lights, THREE_SPHERES, ratio.ShadowSampling(rays=rays, film=film))
+        found = ratio.trace_visibility(samples, lights, THREE_SPHERES, ratio.ShadowSampling(rays=rays, film=film))
         # Most pairs are settled by the probes, or not worth all rays.
         assert found.rays < max(0.45 * rays, 8.01) * sum(len(exact.index) for exact in pairs)
         for name in PASSES:
@@ -221,9 +223,9 @@ def test_few_rays_suffice_and_the_told_noise_is_about_the_real_one():
 
 def test_samples_that_stand_for_few_points_of_their_pixel_get_fewer_rays():
     samples, film = floor(32)
-    everywhere = ratio.visible_shares(samples, [panel()], THREE_SPHERES, ratio.ShadowSampling(rays=256, film=film))
+    everywhere = ratio.trace_visibility(samples, [panel()], THREE_SPHERES, ratio.ShadowSampling(rays=256, film=film))
     few = dataclasses.replace(film, sub_samples=16, count=np.ones(len(samples), int))
-    found = ratio.visible_shares(samples, [panel()], THREE_SPHERES, ratio.ShadowSampling(rays=256, film=few))
+    found = ratio.trace_visibility(samples, [panel()], THREE_SPHERES, ratio.ShadowSampling(rays=256, film=few))
     probes = 8 * len(samples)
     # A sixteenth of the light is worth an eighth of the rays (`WORTH_POWER`), at least 16 where it is half in shadow.
     assert found.rays - probes < 0.4 * (everywhere.rays - probes)
@@ -237,9 +239,9 @@ def test_a_small_highlight_that_is_half_seen_gets_more_rays_than_all_else(monkey
     lamp = panel(half_u=np.array([0.15, 0.0, 0.0]), half_v=0.15 * panel().half_v)
     bars = past_spheres(*(((x, 1.5, 0.7), 0.0375) for x in (-0.135, -0.045, 0.045, 0.135)))
     images, rays = {}, {}
-    for name, brightest, most in (("truth", 1, 1024), ("before", 1, 32), ("now", ratio.BRIGHTEST, 32)):
-        monkeypatch.setattr(ratio, "BRIGHTEST", brightest)
-        found = ratio.visible_shares(samples, [lamp], bars, ratio.ShadowSampling(rays=most, film=film))
+    for name, brightest, most in (("truth", 1, 1024), ("before", 1, 32), ("now", estimator.BRIGHTEST, 32)):
+        monkeypatch.setattr(estimator, "BRIGHTEST", brightest)
+        found = ratio.trace_visibility(samples, [lamp], bars, ratio.ShadowSampling(rays=most, film=film))
         images[name], rays[name] = found.radiance["specular"], found.rays
     errors = {name: np.linalg.norm(images[name] - images["truth"]) for name in ("before", "now")}
     assert errors["now"] < 0.5 * errors["before"]
@@ -251,7 +253,7 @@ def test_a_wire_that_probes_miss_casts_all_of_its_shadow():
     samples, film = floor(64)
     wire = past_spheres(*(((0.3, 1.0, z), 0.012) for z in np.arange(0.02, 1.5, 0.02)))
     light = panel()
-    found = ratio.visible_shares(samples, [light], wire, ratio.ShadowSampling(rays=64, film=film))
+    found = ratio.trace_visibility(samples, [light], wire, ratio.ShadowSampling(rays=64, film=film))
     exact = with_all_rays(samples.take(slice(None, None, 3)), light, wire)
     expected = 1.0 - exact.visibility_ratio("diffuse")[0]
     lost = 1.0 - found.diffuse[0, ::3][exact.index]
@@ -265,9 +267,9 @@ def test_a_wire_that_probes_miss_casts_all_of_its_shadow():
 def test_a_sample_does_not_depend_on_its_block():
     samples, film = floor(24)
     lights = [panel(), panel(name="Disk", shape="ELLIPSE")]
-    whole = ratio.visible_shares(samples, lights, THREE_SPHERES, ratio.ShadowSampling(rays=8, film=film))
+    whole = ratio.trace_visibility(samples, lights, THREE_SPHERES, ratio.ShadowSampling(rays=8, film=film))
     for part in (slice(100, 339), np.arange(575, -1, -7)):
-        found = ratio.visible_shares(
+        found = ratio.trace_visibility(
             samples.take(part), lights, THREE_SPHERES, ratio.ShadowSampling(rays=8, film=film.take(part))
         )
         for name in PASSES:
@@ -295,7 +297,7 @@ def test_degenerate_input_gives_shares(film_rows):
         panel(shape="POLYGON", corners=light.center + np.outer([0.0, 1.0, 2.0], light.half_u)),
     ]  # fmt: skip
     for tracer in (OPEN, WALL, THREE_SPHERES):
-        found = ratio.visible_shares(samples, lights, tracer, ratio.ShadowSampling(film=film))
+        found = ratio.trace_visibility(samples, lights, tracer, ratio.ShadowSampling(film=film))
         for name in PASSES:
             share = getattr(found, name)
             assert ((share >= 0.0) & (share <= 1.0)).all()
@@ -307,29 +309,29 @@ def test_pairs_without_light_are_not_traced():
     samples, _ = floor(6)
     for light in (panel(receivers=()), panel(receivers=(7,)), panel(affects_diffuse=False, affects_specular=False)):
         tracer = Tracer(WALL.passed)
-        found = ratio.visible_shares(samples, [light], tracer)
+        found = ratio.trace_visibility(samples, [light], tracer)
         assert tracer.rays == found.rays == 0
         assert (found.specular == 1.0).all() and (found.diffuse == 1.0).all()
     unblocked = Tracer(WALL.passed)
     unblocked.mask_of = lambda name: 0
-    assert (ratio.visible_shares(samples, [panel()], unblocked).diffuse == 1.0).all() and unblocked.rays == 0
-    only = ratio.visible_shares(
+    assert (ratio.trace_visibility(samples, [panel()], unblocked).diffuse == 1.0).all() and unblocked.rays == 0
+    only = ratio.trace_visibility(
         samples, [panel(affects_specular=False)], WALL, ratio.ShadowSampling(passes=("diffuse",))
     )
     assert only.specular is None and (only.diffuse == 0.0).all()
-    half = ratio.visible_shares(samples, [panel(affects_specular=False)], WALL)
+    half = ratio.trace_visibility(samples, [panel(affects_specular=False)], WALL)
     assert (half.specular == 1.0).all() and (half.diffuse == 0.0).all()
 
 
 def test_the_number_of_rays_has_limits():
     for rays in (7, 1025):
         with pytest.raises(ValueError, match=f"shadow rays are {rays}, expected 8 to 1024"):
-            ratio.visible_shares(*([floor(2)[0], [panel()]]), OPEN, ratio.ShadowSampling(rays=rays))
+            ratio.trace_visibility(*([floor(2)[0], [panel()]]), OPEN, ratio.ShadowSampling(rays=rays))
 
 
 def test_tracing_can_be_stopped():
     with pytest.raises(Cancelled):
-        ratio.visible_shares(floor(4)[0], [panel()], OPEN, progress=lambda stage, share: False)
+        ratio.trace_visibility(floor(4)[0], [panel()], OPEN, progress=lambda stage, share: False)
 
 
 def test_rays_to_distant_lights_have_no_end():
@@ -337,10 +339,10 @@ def test_rays_to_distant_lights_have_no_end():
     samples, film = floor(12)
     light = panel(is_distant=True)
     half = Tracer(lambda origins, directions, distances: (directions[:, 0] > 0.0) | (distances < 1e9))
-    found = ratio.visible_shares(samples, [light], half, ratio.ShadowSampling(rays=256, film=film))
+    found = ratio.trace_visibility(samples, [light], half, ratio.ShadowSampling(rays=256, film=film))
     here = dataclasses.replace(samples, position=np.zeros_like(samples.position))
     near = Tracer(lambda origins, directions, distances: directions[:, 0] > 0.0)
-    expected = ratio.visible_shares(
+    expected = ratio.trace_visibility(
         here, [light_of(light.record() | {"is_distant": False})], near, ratio.ShadowSampling(rays=256)
     )
     assert found.mixed.all()

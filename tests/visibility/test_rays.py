@@ -16,7 +16,7 @@ from ltsh_addon.visibility import (
     Transparency,
     open_tracer,
     rays,
-    visible_shares,
+    trace_visibility,
 )
 from ltsh_addon.visibility.occluders import cut_outs
 
@@ -163,7 +163,7 @@ def test_parts_block_where_the_image_is_black_and_cover_all_that_is_not_clear():
     mesh = OccluderMesh(np.eye(3), [[0, 1, 2]], image)
     ((blocking, mixed),) = cut_outs(Occluders((mesh,), [0], [np.eye(3, 4)], transparent_surfaces=1024)).values()
     places = rng.dirichlet((1.0, 1.0, 1.0), 20_000)[:, 1:]
-    shares = image.shares(np.zeros(len(places), int), *places.T)
+    shares = image.transmittance(np.zeros(len(places), int), *places.T)
 
     def covers(parts):
         inside = np.zeros(len(places), bool)
@@ -210,7 +210,7 @@ def test_occluders_come_back_from_their_file(tmp_path):
             assert other.transparency is None
             continue
         point = np.arange(len(mesh.triangles)), *rng.uniform(0, 0.5, (2, len(mesh.triangles)))
-        assert np.array_equal(mesh.transparency.shares(*point), other.transparency.shares(*point))
+        assert np.array_equal(mesh.transparency.transmittance(*point), other.transparency.transmittance(*point))
 
 
 def test_an_unfit_library_is_not_trusted(libraries, tmp_path, monkeypatch):
@@ -254,7 +254,7 @@ def directions_around(normals, rng, per_sample):
 
 
 def seen(tracer, samples, index, directions, distance=np.inf):
-    starts = tracer.starts(samples)
+    starts = tracer.ray_origins(samples)
     origins = starts.origins(index, directions)
     return starts, tracer.transmittance(origins, directions, np.full(len(index), distance))
 
@@ -389,7 +389,7 @@ def test_lifted_rays_go_to_the_same_points(libraries):
     mesh = OccluderMesh(vertices, triangles, normals=vertices)
     with open_tracer(Occluders((mesh,), [0], [np.eye(3, 4)]), libraries) as tracer:
         samples = samples_on(mesh, np.eye(3, 4), rng, 50)
-        starts = tracer.starts(samples)
+        starts = tracer.ray_origins(samples)
     index = rng.integers(0, 50, 40)
     directions = rng.normal(size=(3, 7, 40)).astype(np.float32)
     directions /= np.linalg.norm(directions, axis=0)
@@ -410,7 +410,7 @@ def test_a_sample_off_all_triangles_starts_beside_its_surface(libraries):
     mesh = OccluderMesh(*sphere(8))
     with open_tracer(Occluders((mesh,), [0], [np.eye(3, 4)]), libraries) as tracer:
         up = np.array([[0.0, 0, 1]])
-        starts = tracer.starts(surface_samples(np.array([[0.0, 0, 4]]), up, up))
+        starts = tracer.ray_origins(surface_samples(np.array([[0.0, 0, 4]]), up, up))
     assert starts.terminator == 0 and 0 < starts.clearance[0] < 1e-4
     above, below = starts.origins(np.array([0, 0]), np.array([[0, 0, 1], [0, 0, -1]], np.float32))
     assert below[2] < 4.0 < above[2]
@@ -447,7 +447,7 @@ def test_a_convex_lamp_does_not_stand_in_its_own_light(libraries, rows):
     position = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0.0 * radius], axis=1)
     lights = glowing_faces(lamp)
     with open_tracer(Occluders((floor, lamp), [0, 1], [np.eye(3, 4)] * 2), libraries) as tracer:
-        found = visible_shares(surface_samples(position, up, up), lights, tracer, ShadowSampling(rays=64), workers=1)
+        found = trace_visibility(surface_samples(position, up, up), lights, tracer, ShadowSampling(rays=64), workers=1)
     assert len(found.numbers) == (1 if rows == 8 else len(lights))
     # Of faces that are seen nearly edge-on, rounding decides, and they give next to no light.
     offsets = np.array([[light.corners - place for place in position] for light in lights])

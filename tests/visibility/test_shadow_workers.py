@@ -33,7 +33,9 @@ def scene(monkeypatch):
         samples, film = floor(40)
 
         def shares(**options):
-            return ratio.visible_shares(samples, [panel()], tracer, ratio.ShadowSampling(rays=32, film=film), **options)
+            return ratio.trace_visibility(
+                samples, [panel()], tracer, ratio.ShadowSampling(rays=32, film=film), **options
+            )
 
         yield shares, started, tracer
 
@@ -65,8 +67,8 @@ def test_a_pool_that_stays_gives_the_same_bytes(scene):
                 with pytest.raises(Cancelled):
                     shares(workers=both, progress=lambda stage, share: share < 0.5)
             # Where rays start may be known, from the same processes.
-            starts = None if number == 0 else ratio.ray_origins(floor(40)[0], both)
-            found = shares(workers=both, starts=starts)
+            origins = None if number == 0 else ratio.trace_ray_origins(floor(40)[0], both)
+            found = shares(workers=both, ray_origins=origins)
             for name in PASSES:
                 np.testing.assert_array_equal(getattr(found, name), getattr(alone, name))
             assert found.rays == alone.rays

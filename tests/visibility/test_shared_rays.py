@@ -13,8 +13,10 @@ from ltsh_addon import shading
 from ltsh_addon.pipeline import lighting, relight
 from ltsh_addon.pipeline.relight import RelightData
 from ltsh_addon.scene import PASSES, PolygonLight, light_of
-from ltsh_addon.visibility import directions, ratio, shared_numbers
-from ltsh_addon.visibility.directions import Choices, Cluster
+from ltsh_addon.visibility import estimator, light_cluster, ratio, shared_numbers
+from ltsh_addon.visibility.estimator import LightSelection
+from ltsh_addon.visibility.light_cluster import LightCluster
+from ltsh_addon.visibility.ray_sampler import SampleRows
 
 THREE_SPHERES = past_spheres(((0.0, 0.3, 0.6), 0.35), ((-1.0, -0.5, 0.3), 0.3), ((1.0, 1.2, 1.0), 0.3))
 
@@ -40,7 +42,7 @@ def ceiling(count=100, color=(1.0, 0.5, 0.25), **changes):
 
 
 def shadows_of(samples, lights, tracer, film=None, **options):
-    found = ratio.visible_shares(samples, lights, tracer, ratio.ShadowSampling(film=film, **options), workers=1)
+    found = ratio.trace_visibility(samples, lights, tracer, ratio.ShadowSampling(film=film, **options), workers=1)
     shares = {name: getattr(found, name) for name in PASSES}
     return lighting.Shadows(shares, found.numbers, {}, found.rays, "")
 
@@ -62,10 +64,10 @@ def test_rays_bring_the_light_of_all_lamps(roughness):
     """The weights of 1024 rays beside midpoints of all lamps: at 2 m cells of 2 cm, errors of 1e-4."""
     samples, _ = floor(5, roughness)
     lights = [light for light in ceiling(99) if not isinstance(light, PolygonLight)]
-    cluster = Cluster(lights)
-    surface = ratio.Surface(samples, PASSES, OPEN.starts(samples) and OPEN)
-    pairs = ratio.Pairs(surface, cluster, 0, Choices(samples, cluster.chosen_as, False))
-    pairs._add_rays(np.arange(len(pairs.index)), 0, ratio.MOST_RAYS, 0)
+    cluster = LightCluster(lights)
+    surface = SampleRows(samples, PASSES, OPEN.ray_origins(samples) and OPEN)
+    pairs = estimator.RatioEstimator(surface, cluster, 0, LightSelection(samples, cluster.selected_as, False))
+    pairs._add_rays(np.arange(len(pairs.index)), 0, estimator.MOST_RAYS, 0)
     expected = {name: np.zeros(len(samples)) for name in PASSES}
     place = (np.arange(10) + 0.5) / 5.0 - 1.0
     s, t = (axis.ravel() for axis in np.meshgrid(place, place))
@@ -91,7 +93,7 @@ def test_shares_are_0_in_the_dark_and_1_in_the_open():
     samples, film = floor(16)
     for light in (ceiling(99), ceiling(99, affects_specular=False)):
         for tracer, share in ((OPEN, 1.0), (WALL, 0.0)):
-            found = ratio.visible_shares(samples, light, tracer, ratio.ShadowSampling(film=film))
+            found = ratio.trace_visibility(samples, light, tracer, ratio.ShadowSampling(film=film))
             assert found.diffuse.shape == (1, 256) and found.of_lights("diffuse").shape == (99, 256)
             assert (found.diffuse == share).all()
             assert (found.specular == (share if light[0].affects_specular else 1.0)).all()
@@ -103,7 +105,7 @@ def test_shadows_are_those_of_each_lamp_by_itself(roughness, monkeypatch):
     lights = ceiling(80, (1.0, 0.2, 0.1)) + ceiling(70, (0.1, 0.2, 1.0))
     shared = shadows_of(samples, lights, THREE_SPHERES, film, rays=256)
     assert len(shared.numbers) == 2
-    monkeypatch.setattr(directions.light_tree, "FEWEST", len(lights))
+    monkeypatch.setattr(light_cluster.light_tree, "FEWEST", len(lights))
     alone = shadows_of(samples, lights, THREE_SPHERES, film, rays=64)
     assert len(alone.numbers) == 150 and shared.rays < 0.5 * alone.rays
     monkeypatch.undo()

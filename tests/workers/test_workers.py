@@ -232,10 +232,10 @@ mesh = visibility.OccluderMesh(np.array([(0, -9, 1), (9, -9, 1), (9, 9, 1)]), np
 occluders = visibility.Occluders((mesh,), np.zeros(1, int), np.eye(4)[None, :3])
 ratio.SECONDS_WORTH_A_WORKER, ratio.BLOCK_SAMPLES, shaded_by_children = -1.0, 8, any(by_children)
 with visibility.open_tracer(occluders, processes.embree_libraries()) as tracer:
-    single = ratio.visible_shares(samples, [light], tracer, workers=1).diffuse
+    single = ratio.trace_visibility(samples, [light], tracer, workers=1).diffuse
     by_children.clear()
     leave = lambda stage, fraction: leave_some(fraction)
-    double = ratio.visible_shares(samples, [light], tracer, workers=2, progress=leave).diffuse
+    double = ratio.trace_visibility(samples, [light], tracer, workers=2, progress=leave).diffuse
 same = np.array_equal(one, two) and np.array_equal(single, double)
 print(same, shaded_by_children and any(by_children), "ltsh_addon" in sys.modules)
 """

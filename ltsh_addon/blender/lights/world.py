@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import bpy
 import numpy as np
+from mathutils import Matrix
 
 from ...cycles.environment import CUBE, SkyPicture, bright_spots, sky_lights, spot_frame, spot_light, without_spots
 from ...scene import Light, SkyLight, listed
@@ -182,12 +183,19 @@ def _observatory(scene, world, warn, by_cameras: bool = False):
         with open_studio(scene) as studio:
             studio.scene.world = copied
             studio.scene.render.film_transparent = False
+            lens = studio.camera.data
+            lens.type, lens.clip_start, lens.clip_end = "PERSP", 0.1, 1.0
 
             def look(ahead, right, up, pixels, samples):
+                axes = np.eye(4)
+                axes[:3, 0], axes[:3, 1] = right / np.linalg.norm(right), up / np.linalg.norm(up)
+                axes[:3, 2] = -ahead / np.linalg.norm(ahead)
+                studio.camera.matrix_world = Matrix(axes.tolist())
+                lens.angle = 2.0 * math.atan(np.linalg.norm(right) / np.linalg.norm(ahead))
+                render = studio.scene.render
+                render.resolution_x = render.resolution_y = pixels
                 studio.scene.cycles.samples = samples
-                length, half_width = np.linalg.norm(ahead), np.linalg.norm(right)
-                angle = 2.0 * math.atan(half_width / length)
-                radiance = studio.look_around(np.zeros(3), (ahead / length, right / half_width), angle, 1.0, pixels)
+                radiance = studio.picture()[..., :3]
                 odd = ~(np.abs(radiance) < MOST_RADIANCE).all(axis=-1)
                 if odd.any():
                     warn(f"world {world.name!r}: its radiance is not finite, or beyond {MOST_RADIANCE:g}; dark there")

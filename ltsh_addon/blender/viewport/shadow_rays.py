@@ -10,7 +10,7 @@ import gpu
 import numpy as np
 
 from ...scene import PASSES, Film, Light
-from ...visibility import Occluders, ShadowSampling, Tracer, open_tracer, visible_shares
+from ...visibility import Occluders, ShadowSampling, Tracer, open_tracer, trace_visibility
 from ...workers.pool import WorkerPool, cores
 from ..extract.occluders import collect_occluders
 from ..lights.world import blocks_nothing
@@ -86,7 +86,7 @@ class ShadowRays:
         width, height = gbuffer.size
         tracer = self._tracing.around(view.origin)
         film = Film(width, height, pixel)
-        traced = visible_shares(samples, (*lights, *sides), tracer, ShadowSampling(rays=self._rays, film=film))
+        traced = trace_visibility(samples, (*lights, *sides), tracer, ShadowSampling(rays=self._rays, film=film))
         count = len(lights) + bool(sides)
         values = np.ones((count, height * width, len(PASSES)), np.float32)
         for index, name in enumerate(PASSES):

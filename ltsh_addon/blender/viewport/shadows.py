@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ...scene import PASSES, Cancelled, Film, Light, SurfaceSamples, error_line
-from ...visibility import Occluders, ShadowSampling, Starts, ray_origins, shared_numbers, visible_shares
+from ...visibility import Occluders, RayOrigins, ShadowSampling, shared_numbers, trace_ray_origins, trace_visibility
 from ...workers.pool import WorkerPool
 from .drawing import ViewCamera, float_texture
 from .gbuffer import GBufferTextures, VisibilityGrid, every_texel, gbuffer_texels, samples_of_texels, unit_xyz
@@ -49,7 +49,7 @@ class PixelGrid:
     def __init__(self, step: int, gbuffer: GBufferTextures, view: ViewCamera):
         self._step, self._view, (width, height) = step, view, gbuffer.size
         self.gbuffer_texels, self._samples, self._normal = gbuffer_texels(gbuffer, step), None, None
-        self._ray_origins: Starts | None = None
+        self._ray_origins: RayOrigins | None = None
         positions, first = self.gbuffer_texels["position"], step // 2
         rows, columns = positions.shape[:2]
         stretch = np.eye(4)
@@ -64,10 +64,10 @@ class PixelGrid:
         if gbuffer.geometric_normal is not None:
             self._normal = every_texel(gbuffer.geometric_normal, self._step)
 
-    def ray_origins(self, pool: WorkerPool) -> Starts:
+    def ray_origins(self, pool: WorkerPool) -> RayOrigins:
         """Where rays from the samples start. They stay when only lights change."""
         if self._ray_origins is None:
-            self._ray_origins = ray_origins(self.samples()[0], pool)
+            self._ray_origins = trace_ray_origins(self.samples()[0], pool)
         return self._ray_origins
 
     def samples(self) -> tuple[SurfaceSamples, Film]:
@@ -110,7 +110,7 @@ class ShadowRequest:
         """
         samples, film = self.points.samples()
         tracer, results = self.tracing.around(self.origin), {}
-        ray_starts = self.points.ray_origins(self.tracing.pool) if self.level == 1 else None
+        origins = self.points.ray_origins(self.tracing.pool) if self.level == 1 else None
         lights = [light for lights in self.lights for light in lights]
         starts = np.cumsum([0, *map(len, self.lights)])[:-1]
         index_of = dict(zip(starts.tolist(), range(len(starts)), strict=True))
@@ -120,13 +120,13 @@ class ShadowRequest:
         for start in range(0, len(groups), step):
             chosen = [number for group in groups[start : start + step] for number in group]
             try:
-                traced = visible_shares(
+                traced = trace_visibility(
                     samples,
                     [lights[number] for number in chosen],
                     tracer,
                     sampling,
                     workers=self.tracing.pool,
-                    starts=ray_starts,
+                    ray_origins=origins,
                     progress=progress,
                 )
             except Cancelled:

@@ -75,7 +75,7 @@ def both(folder, monkeypatch):
     directions = LIGHT - samples.position
     directions = (directions / np.linalg.norm(directions, axis=1)[:, None]).astype(np.float32)
     with open_tracer(occluders, embree_libraries()) as tracer:
-        starts = tracer.starts(samples)
+        starts = tracer.ray_origins(samples)
         found = shares(tracer, starts.origins(np.arange(len(samples)), directions))
         plain = shares(tracer, samples.position + 1e-4 * samples.geometric_normal)
     assert lit.sum() > 300

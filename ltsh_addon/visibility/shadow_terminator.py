@@ -17,7 +17,7 @@ CLEARANCE = 2.0**-21
 NEARBY, LAYERS, CERTAIN = 2.0**-14, 4, 2.0**-3
 
 
-class StartFinder:
+class ShadowTerminator:
     """Finds the triangles of `occluders` on which samples lie. `caster` is a `rays.EmbreeCaster`."""
 
     def __init__(self, occluders: Occluders, caster):
@@ -29,7 +29,7 @@ class StartFinder:
         for number in np.flatnonzero(np.array(thick, bool)[occluders.mesh]):
             self._thickness[number] = self._thickness_of(number, slice(None)).max()
 
-    def starts(self, samples: SurfaceSamples) -> Starts:
+    def ray_origins(self, samples: SurfaceSamples) -> RayOrigins:
         """Where rays from `samples` start: as in Cycles, on the triangle, which they leave without meeting it.
 
         A smooth surface would hide light that falls on its triangles at a grazing angle. There, rays start on a curved
@@ -48,7 +48,7 @@ class StartFinder:
         for start in range(0, count, chunk):
             rows = slice(start, start + chunk)
             hits = self._triangles_at(position[rows], normal[rows], (NEARBY * (1.0 + reach[rows])).astype(np.float32))
-            index, shape = start + hits.ray, _Shape.of(self._occluders, hits, self._is_applied)
+            index, shape = start + hits.ray, _TrianglePoints.of(self._occluders, hits, self._is_applied)
             clearance[index] = CLEARANCE * (reach[index] + shape.size)
             is_thick = self._thickness[hits.instance] > 0.0
             # Graphics cards interpolate positions less exactly than Cycles; such rays would meet their own surface.
@@ -65,7 +65,7 @@ class StartFinder:
             index = index[smooth]
             lift[:, index] = shape.take(smooth).lifts(normal[index])
             terminator[index] = self._occluders.terminators[hits.instance[smooth]] * lift[:, index].any(axis=(0, 2))
-        return Starts(position, normal, smooth_normal, clearance, lift, terminator)
+        return RayOrigins(position, normal, smooth_normal, clearance, lift, terminator)
 
     def _thickness_of(self, instance, triangle) -> np.ndarray:
         """World-space thickness (Q,) of triangles of an instance that has one, in m."""
@@ -116,8 +116,8 @@ class StartFinder:
 
 
 @dataclass(frozen=True)
-class Starts:
-    """Where shadow rays of P samples start, see `StartFinder.starts`. `origins` returns the start of each ray."""
+class RayOrigins:
+    """Where shadow rays of P samples start, see `ShadowTerminator`. `origins` returns the start of each ray."""
 
     position: np.ndarray  # (P, 3) float32
     geometric_normal: np.ndarray  # (P, 3)
@@ -127,21 +127,21 @@ class Starts:
     terminator: np.ndarray  # (P,) as Occluders.terminators; 0 on flat triangles
 
     @classmethod
-    def empty(cls, count: int) -> Starts:
+    def empty(cls, count: int) -> RayOrigins:
         """Room for those of `count` samples, see `put`."""
         vectors, numbers = np.zeros((5, count, 3), np.float32), np.zeros((2, count), np.float32)
         return cls(*vectors[:3], numbers[0], vectors[3:], numbers[1])
 
-    def put(self, block: slice, values: Starts) -> None:
+    def put(self, block: slice, values: RayOrigins) -> None:
         """Set those of the samples of a block."""
         for field in fields(self):
             rows = getattr(self, field.name)
             (rows[:, block] if field.name == "lift" else rows[block])[:] = getattr(values, field.name)
 
-    def take(self, index) -> Starts:
+    def take(self, index) -> RayOrigins:
         """The starts of the samples at `index`: integers (Q,) or a slice."""
         lift = self.lift[:, index]
-        return Starts(*(lift if each.name == "lift" else getattr(self, each.name)[index] for each in fields(self)))
+        return RayOrigins(*(lift if each.name == "lift" else getattr(self, each.name)[index] for each in fields(self)))
 
     def origins(self, index: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Origins (R, 3) of rays along unit `directions` (R, 3) from the samples `index` (R,)."""
@@ -228,19 +228,19 @@ def _dot(first, second):
 
 
 @dataclass(frozen=True)
-class _Shape:
+class _TrianglePoints:
     """Q points on triangles. Corners and normals are in the space in which Cycles has them."""
 
     corners: np.ndarray  # (Q, 3, 3)
     normals: np.ndarray  # (Q, 3, 3) at the corners, if `is_smooth`
     is_smooth: np.ndarray  # (Q,)
-    shares: np.ndarray  # (Q, 3) weights of the corners
+    weights: np.ndarray  # (Q, 3) weights of the corners
     to_world: np.ndarray  # (Q, 3, 3) takes directions to world space
     point: np.ndarray  # (Q, 3) in world space
     size: np.ndarray  # (Q,) m, extent of the triangle, plus its distance from the origin of the instance if not applied
 
     @classmethod
-    def of(cls, occluders: Occluders, hits: Hits, is_applied: np.ndarray) -> _Shape:
+    def of(cls, occluders: Occluders, hits: Hits, is_applied: np.ndarray) -> _TrianglePoints:
         """For `hits`. Instances for which `is_applied` (I,) is True are in world space."""
         corners, normals = np.zeros((2, len(hits.ray), 3, 3))
         is_smooth, mesh = np.zeros(len(hits.ray), bool), occluders.mesh[hits.instance]
@@ -257,22 +257,22 @@ class _Shape:
         in_world = _turned(corners, matrix)
         size = np.abs(in_world - in_world[:, :1]).max(axis=(1, 2))
         size += np.where(applied[:, 0, 0], 0.0, np.abs(in_world).max(axis=(1, 2)))
-        shares = np.stack([1.0 - hits.u - hits.v, hits.u, hits.v], axis=-1)
+        weights = np.stack([1.0 - hits.u - hits.v, hits.u, hits.v], axis=-1)
         turned = _turned(normals, _cofactors(matrix))
         turned /= np.maximum(np.linalg.norm(turned, axis=-1, keepdims=True), 1e-30)
         return cls(
             np.where(applied, in_world + matrix[:, None, :, 3], corners),
             np.where(applied, turned, normals),
             is_smooth,
-            shares,
+            weights,
             np.where(applied, np.eye(3), matrix[:, :, :3]),
-            np.einsum("qc,qck->qk", shares, in_world) + matrix[:, :, 3],
+            np.einsum("qc,qck->qk", weights, in_world) + matrix[:, :, 3],
             size,
         )
 
-    def take(self, index: np.ndarray) -> _Shape:
+    def take(self, index: np.ndarray) -> _TrianglePoints:
         """The points at `index`."""
-        return _Shape(*(getattr(self, each.name)[index] for each in fields(self)))
+        return _TrianglePoints(*(getattr(self, each.name)[index] for each in fields(self)))
 
     def face_normals(self, geometric_normal: np.ndarray, smooth_normal: np.ndarray) -> np.ndarray:
         """Unit normals (Q, 3) of the triangles in world space. Those of flat triangles point to the side of
@@ -284,7 +284,7 @@ class _Shape:
         first, second = np.moveaxis(_turned(self.corners[:, 1:] - self.corners[:, :1], self.to_world), 1, 0)
         normal = _crossed(first, second)
         length = np.linalg.norm(normal, axis=1, keepdims=True)
-        interpolated = np.einsum("qc,qck->qk", self.shares, self.normals)
+        interpolated = np.einsum("qc,qck->qk", self.weights, self.normals)
         interpolated = _turned(interpolated[:, None], _cofactors(self.to_world))[:, 0]
         facing = np.where(self.is_smooth, _dot(interpolated, smooth_normal), _dot(normal, geometric_normal))
         normal *= np.where(facing < 0.0, -1.0, 1.0)[:, None]
@@ -294,8 +294,8 @@ class _Shape:
         """How far (2, Q, 3) above the points a smooth surface would be, for light from the side of `geometric_normal`
         (Q, 3) and from the other side: Cycles' `shadow_ray_smooth_surface_offset`."""
         (v0, v1, v2), (n0, n1, n2) = np.moveaxis(self.corners, 1, 0), np.moveaxis(self.normals, 1, 0)
-        point, normal = (np.einsum("qc,qck->qk", self.shares, values) for values in (self.corners, self.normals))
-        s, t = self.shares[:, 0], self.shares[:, 1]
+        point, normal = (np.einsum("qc,qck->qk", self.weights, values) for values in (self.corners, self.normals))
+        s, t = self.weights[:, 0], self.weights[:, 1]
         a, b, c = _dot(n2 - n0, v0 - v2), _dot(n2 - n1, v1 - v2), _dot(n1 - n0, v1 - v0)
         parabola = 0.5 * (a * s * (s - 1.0) + (a + b + c) * s * t + b * t * (t - 1.0))
         corners = ((v0, v1, v2, n0), (v1, v0, v2, n1), (v2, v0, v1, n2))

@@ -1,0 +1,148 @@
+"""Hair and points as meshes that block light: tubes and balls with flat faces and the mean width of round ones."""
+
+from __future__ import annotations
+
+import math
+from functools import cache
+
+import numpy as np
+
+from ...visibility.occluders import OccluderMesh, Transparency
+from ..evaluated import read_values
+
+# ONE_INSTANCE: the matrices of occluders that are not points.
+ONE_INSTANCE = np.eye(4)[None]
+# MOST_PIECES: hair or points with more pieces block nothing; such hair would take some 0.7 GiB.
+MOST_PIECES = 1_000_000
+TUBE_SIDES = 3
+# BALL_THICKNESS: the largest distance of a ball of radius 1 from the flat faces that stand for it.
+BALL_THICKNESS = 0.08
+# POINT_RADIUS: in m, as in Cycles, of points without a radius.
+POINT_RADIUS = 0.01
+
+
+def tubes_of_curves(ob, clear, note) -> list[OccluderMesh]:
+    """Tubes along hair curves."""
+    curves = ob.data
+    points = len(curves.points)
+    if points > MOST_PIECES:
+        note(f"more than {MOST_PIECES:,} pieces of hair or points, which block nothing", ob)
+        return []
+    if not points:
+        return []
+    note("hair blocks as tubes of three flat sides", ob)
+    positions = read_values(curves.attributes["position"].data, "vector", (points, 3), np.float32)
+    radii = np.full(points, POINT_RADIUS, np.float32)
+    if "radius" in curves.attributes:
+        radii = read_values(curves.attributes["radius"].data, "value", (points,), np.float32)
+    first = read_values(curves.curves, "first_point_index", (len(curves.curves),), np.int32)
+    return [_tubes(positions, radii, first, _constant_transparency(clear, ob, note))]
+
+
+def tubes_of_hair(ob, system, count, steps, clear) -> OccluderMesh:
+    """Tubes along the hair of a particle system, in world space."""
+    settings = system.settings
+    along = np.linspace(0.0, 1.0, steps)
+    root, tip = 0.5 * settings.radius_scale * settings.root_radius, 0.5 * settings.radius_scale * settings.tip_radius
+    shape = settings.shape
+    power = 1.0 + shape if shape < 0.0 else 1.0 / max(1.0 - shape, 1e-6)
+    radius = tip + (root - tip) * (1.0 - along) ** power
+    if settings.use_close_tip:
+        radius[-1] = 0.0
+    positions = np.array(
+        [system.co_hair(object=ob, particle_no=number, step=step) for number in range(count) for step in range(steps)],
+        np.float32,
+    ).reshape(-1, 3)
+    radii = np.tile(radius, count).astype(np.float32)
+    return _tubes(positions, radii, np.arange(count) * steps, _constant_transparency(clear))
+
+
+def _constant_transparency(clear, ob=None, note=None) -> Transparency | None:
+    """The transparency of hair or points, whose images are not read because they have no UV maps."""
+    if clear is None:
+        return None
+    if clear.value.is_constant:
+        return Transparency(float(clear.value.offset[0]))
+    if note is not None:
+        note("an image on hair or points is not read here, they block as if they were opaque", ob)
+    return None
+
+
+def _tubes(positions, radii, first, transparency) -> OccluderMesh:
+    """Tubes around curves through `positions` that begin at the points `first`, with the mean width of round tubes."""
+    points, sides = len(positions), TUBE_SIDES
+    starts = np.ones(points, bool)
+    starts[first] = False
+    ends = np.flatnonzero(starts)  # end points of the pieces; each piece begins at the point before
+    along = np.zeros((points, 3))
+    along[ends] += positions[ends] - positions[ends - 1]
+    along[ends - 1] += positions[ends] - positions[ends - 1]
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-30)
+    axis = np.eye(3)[np.abs(along).argmin(axis=1)]
+    x = np.cross(along, axis)
+    x /= np.maximum(np.linalg.norm(x, axis=1, keepdims=True), 1e-30)
+    y = np.cross(along, x)
+    # The mean width of a convex outline over all directions is its length over pi.
+    out = radii.astype(np.float64) * math.pi / (sides * math.sin(math.pi / sides))
+    angle = 2.0 * math.pi * np.arange(sides) / sides
+    ring = np.cos(angle)[:, None] * x[:, None] + np.sin(angle)[:, None] * y[:, None]
+    vertices = (positions[:, None] + out[:, None, None] * ring).reshape(-1, 3)
+    one, two = np.arange(sides), (np.arange(sides) + 1) % sides
+    low, high = (ends - 1)[:, None] * sides, ends[:, None] * sides
+    triangles = np.stack([low + one, low + two, high + two, low + one, high + two, high + one], axis=-1)
+    # The shaded surface is a ribbon through the middle or a round tube, and bends where these pieces are straight.
+    thickness = np.repeat(1.3 * np.maximum(out[ends], out[ends - 1]), 2 * sides)
+    return OccluderMesh(vertices, triangles.reshape(-1, 3), transparency, thickness=thickness)
+
+
+def balls(ob, clear, note) -> tuple[list[OccluderMesh], np.ndarray]:
+    """A list of one ball, and its matrices (N, 4, 4) in a point cloud."""
+    cloud = ob.data
+    count = len(cloud.points)
+    if count > MOST_PIECES:
+        note(f"more than {MOST_PIECES:,} pieces of hair or points, which block nothing", ob)
+        count = 0
+    if not count:
+        return [], ONE_INSTANCE
+    note("points block as balls of 80 flat faces", ob)
+    radii = np.full(count, POINT_RADIUS, np.float32)
+    if "radius" in cloud.attributes:
+        radii = read_values(cloud.attributes["radius"].data, "value", (count,), np.float32)
+    matrices = np.zeros((count, 4, 4))
+    matrices[:, range(3), range(3)] = radii[:, None]
+    matrices[:, :3, 3] = read_values(cloud.attributes["position"].data, "vector", (count, 3), np.float32)
+    matrices[:, 3, 3] = 1.0
+    vertices, triangles = _ball()
+    transparency, thickness = _constant_transparency(clear, ob, note), np.full(len(triangles), BALL_THICKNESS)
+    return [OccluderMesh(vertices, triangles, transparency, thickness=thickness)], matrices
+
+
+@cache
+def _ball():
+    """Vertices and triangles of a ball of 80 triangles with the same mean shadow as a sphere of radius 1."""
+    golden = (1.0 + math.sqrt(5.0)) / 2.0
+    corners = [(0.0, a, b * golden) for a in (-1.0, 1.0) for b in (-1.0, 1.0)]
+    corners = np.array([np.roll(corner, turn) for turn in range(3) for corner in corners])
+    apart = np.linalg.norm(corners[:, None] - corners, axis=-1)
+    near = np.abs(apart - 2.0) < 1e-9
+    faces = [
+        (a, b, c) for a in range(12) for b in range(a) for c in range(b) if near[a, b] and near[b, c] and near[a, c]
+    ]
+    vertices, triangles, middles = list(corners), [], {}
+    for face in faces:
+        between = []
+        for a, b in ((0, 1), (1, 2), (2, 0)):
+            pair = tuple(sorted((face[a], face[b])))
+            if pair not in middles:
+                middles[pair] = len(vertices)
+                vertices.append(0.5 * (corners[pair[0]] + corners[pair[1]]))
+            between.append(middles[pair])
+        ab, bc, ca = between
+        triangles += [(face[0], ab, ca), (face[1], bc, ab), (face[2], ca, bc), (ab, bc, ca)]
+    vertices = np.array(vertices)
+    vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)
+    triangles = np.array(triangles)
+    a, b, c = np.moveaxis(vertices[triangles], 1, 0)
+    # The mean shadow of a convex body is a quarter of its surface area.
+    area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+    return vertices * math.sqrt(4.0 * math.pi / area), triangles

@@ -1,0 +1,260 @@
+"""The lobes of samples in single precision: frames, Fresnel terms, and their integrals over polygons.
+
+Arrays of vectors are (3, Q). The warp of a lobe (and its tilt, for "ltc") is multiplied into the frame of its sample,
+so that one product takes the corners of a light into the coordinates in which the lobe is integrated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, partial
+
+import numpy as np
+
+from ..emitters import light_profile, small_lights
+from ..emitters.tails import TailLimits
+from ..lobes import moments32
+from ..lobes.lobe_integrals import LEAST_SHARE
+from ..lobes.polygon import dot
+
+# If a block has more different indices of refraction, the dielectric's weights are summed up per sample.
+SEPARATE_IORS = 8
+# Samples per chunk. It is large because a call of numpy costs as much as some thousand elements. Its rows are not a
+# multiple of a page long, because the cache would hold few of such rows.
+CHUNK = 24592
+# Corners per chunk.
+CORNERS = 4 * CHUNK
+
+
+@dataclass(frozen=True)
+class Lobes:
+    """The lobes of Q samples."""
+
+    index: np.ndarray  # (Q,) of the samples
+    rows: np.ndarray  # (C, 3, Q) axes of the coordinates that `integrate` takes
+    clip_rows: tuple[int, ...]  # numbers of the coordinates that are positive above a horizon
+    integrate: Callable  # integrate(columns, corners, index, smallest) -> integrals (F, Q') and mask of what to redo
+    at_point: Callable  # integrals (F, Q') over small lights by columns and `small_lights.RaysToCenters`
+    colors: np.ndarray  # (F, 3, Q) reflectances by which the integrals are multiplied
+    width: np.ndarray | float  # rad, as for `light_levels`
+    limits: TailLimits | None = None
+    sharpest: small_lights.SharpestLobes | None = None  # only for specular lobes
+    only_tails: bool = False  # True: single precision suffices for lights in the tails of the lobes only
+    others: tuple = ()  # (Q,) arrays of what the lobes depend on besides rows and widths
+
+    @cached_property
+    def shape(self) -> np.ndarray:
+        """What the lobes depend on (S, Q), each divided by the length over which the lobes change with it."""
+        rows = [self.rows[row] / self.lengths[row] for row in self.clip_rows]
+        if self.sharpest is not None:
+            rows += [self.sharpest.mirrored / self.sharpest.width, np.log(self.sharpest.width)[None]]
+        return np.concatenate([*rows, *(other[None].astype(np.float32) for other in self.others)])
+
+    @cached_property
+    def lengths(self) -> dict[int, np.ndarray]:
+        """Lengths (Q,) of the rows that are clipped."""
+        return {row: np.sqrt(dot(self.rows[row], self.rows[row])) for row in self.clip_rows}
+
+
+def fresnel_kinds(samples, members):
+    """Yield (vectors, members, colors): the samples `members` grouped by the Fresnel terms that they need.
+
+    `vectors` are those of `RidgeTable`; colors(index) returns the reflectances (F, 3, Q) of the terms.
+    """
+    dipped = any_component(samples.specular_dip)[members]
+    metal = (any_component(samples.specular_f90) | any_component(samples.specular_f0))[members] | dipped
+    flat = ~any_component(samples.specular_f90 != samples.specular_f0)[members] & ~dipped
+    dielectric = any_component(samples.dielectric)[members]
+
+    def white(index):
+        return as_columns(samples.specular_f0, index)[None]
+
+    def schlick(index):
+        f0 = as_columns(samples.specular_f0, index)
+        return np.stack([f0, as_columns(samples.specular_f90, index) - f0])
+
+    def f82(index):
+        return np.concatenate([schlick(index), -as_columns(samples.specular_dip, index)[None]])
+
+    def coat(index):
+        color = as_columns(samples.dielectric, index)
+        return np.stack([np.zeros_like(color), color])
+
+    def metal_and_coat(index, first):
+        return np.concatenate([first(index), as_columns(samples.dielectric, index)[None]])
+
+    yield (0,), members[~dielectric & flat], white
+    yield (0, 1), members[~dielectric & ~flat & ~dipped], schlick
+    yield (0, 1, 2), members[~dielectric & dipped], f82
+    for vector, with_ior in _by_ior(samples.ior, members[dielectric & ~metal]):
+        yield (0, vector), with_ior, coat
+    for own, chosen in (((0, 1), metal & ~dipped), ((0, 1, 2), dipped)):
+        first = f82 if 2 in own else schlick
+        for vector, with_ior in _by_ior(samples.ior, members[dielectric & chosen]):
+            yield (*own, vector), with_ior, partial(metal_and_coat, first=first)
+
+
+def _by_ior(ior, members):
+    """Yield (vector, members): the dielectric's weight vector of the samples. There is one per index of refraction if
+    there are few of these."""
+    values = ior[members]
+    if len(members) == 0:
+        return
+    if values.min() == values.max():
+        yield ("dielectric", float(values[0])), members
+        return
+    distinct, number = np.unique(values, return_inverse=True)
+    if len(distinct) > SEPARATE_IORS:
+        yield "dielectric", members
+        return
+    for position, value in enumerate(distinct):
+        yield ("dielectric", float(value)), members[number == position]
+
+
+def normal_frames(normal):
+    """Frames (3, 3, P) around normals (3, P), with an arbitrary tangent (Duff et al. 2017)."""
+    x, y, z = normal
+    sign = np.copysign(np.float32(1.0), z)
+    a = np.float32(-1.0) / (sign + z)
+    b = x * y * a
+    tangent = np.stack([np.float32(1.0) + sign * x * x * a, sign * b, -sign * x])
+    return np.stack([tangent, np.stack([b, sign + y * y * a, -y]), normal])
+
+
+def lobe_axes(samples, index, axes, ridges, vectors, scratch):
+    """Axes (C, 3, Q) of the warped local frames, the numbers of the coordinates to clip, and the weights (F, K, Q), for
+    samples with the normals and views `axes`."""
+    normal, view = axes
+    cosine = dot(normal, view)
+    # Differences of close vectors are exact, so nothing of this one runs along the normal.
+    tangent = view - normal
+    tangent -= dot(normal, tangent) * normal
+    sine = np.sqrt(dot(tangent, tangent))
+    straight = np.nonzero(sine < 1e-6)[0]
+    if len(straight):
+        # The lobe is round there, so any tangent serves.
+        tangent[:, straight] = normal_frames(normal[:, straight])[0]
+    tangent /= np.where(sine < 1e-6, np.float32(1.0), sine)
+    bitangent = np.stack([
+        normal[1] * tangent[2] - normal[2] * tangent[1],
+        normal[2] * tangent[0] - normal[0] * tangent[2],
+        normal[0] * tangent[1] - normal[1] * tangent[0],
+    ])  # fmt: skip
+    roughness = samples.roughness[index].astype(np.float32)
+    angle = np.minimum(cosine, np.float32(1.0)), np.minimum(sine, np.float32(1.0))
+    warp, weights, tilt = ridges.fetch(vectors, *angle, roughness, samples.ior[index], scratch)
+    rows = [warp[0] * tangent + warp[1] * normal, warp[2] * bitangent, warp[3] * normal]
+    clip_rows = (2,)
+    if tilt is not None:
+        sin_tilt, cos_tilt = np.sin(tilt), np.cos(tilt)
+        rows[0], rows[2] = cos_tilt * rows[0] - sin_tilt * rows[2], sin_tilt * rows[0] + cos_tilt * rows[2]
+        rows.append(normal)
+        clip_rows = (3, 2)
+    geometric = samples.geometric_normal[index]
+    if samples.geometric_normal is not samples.normal and (geometric != samples.normal[index]).any():
+        rows.append(np.ascontiguousarray(geometric.T, dtype=np.float32))
+        clip_rows = (len(rows) - 1, *clip_rows)
+    return np.stack(rows), clip_rows, weights
+
+
+def any_component(vectors):
+    """Mask (P,) of the vectors (P, 3) with an element other than 0; numpy's own reduction of short rows is slow."""
+    return (vectors[:, 0] != 0) | (vectors[:, 1] != 0) | (vectors[:, 2] != 0)
+
+
+def as_columns(vectors, index):
+    """Rows `index` of vectors (P, 3) as (3, Q) float32."""
+    return np.ascontiguousarray(vectors[index].T, dtype=np.float32)
+
+
+def _selected(values, part, index):
+    """Values (..., Q) at the columns `index` (None: all) of the slice `part` of columns."""
+    values = values[..., part]
+    return values if index is None else np.take(values, index, axis=-1)
+
+
+class FormFactor:
+    """Form factors (1, Q) of polygons whose corners run counterclockwise as seen from the point
+    (`Light.polygon`)."""
+
+    def __init__(self, scratch):
+        self.scratch = scratch
+
+    def __call__(self, part, corners, index, smallest=moments32.SMALLEST_SAFE):
+        integral, needs_float64 = moments32.cosine_integral(corners, self.scratch, smallest)
+        integral *= np.float32(-1.0 / np.pi)
+        return np.maximum(integral, np.float32(0.0))[None], needs_float64
+
+
+class ShadowedFormFactor:
+    """Form factors (1, Q) times the bump shadowing of `SurfaceSamples` in the mean direction of the polygon."""
+
+    def __init__(self, rows, bump_alpha2, scratch):
+        self.smooth = np.stack([dot(row, rows[3]) for row in rows[:3]])
+        self.bump_alpha2, self.scratch = bump_alpha2, scratch
+
+    def __call__(self, part, corners, index, smallest=moments32.SMALLEST_SAFE):
+        smooth, bump_alpha2 = (_selected(values, part, index) for values in (self.smooth, self.bump_alpha2))
+        integrals, needs_float64 = moments32.vector_irradiance(corners, self.scratch, smallest)
+        direction = np.negative(integrals, out=integrals)
+        along = np.maximum(dot(direction, smooth), np.float32(1e-15))
+        tangent2 = np.maximum(dot(direction, direction) / (along * along) - np.float32(1.0), np.float32(0.0))
+        shadowing = np.float32(2.0) / (np.float32(1.0) + np.sqrt(np.float32(1.0) + bump_alpha2 * tangent2))
+        values = np.maximum(direction[2], np.float32(0.0)) * shadowing * np.float32(1.0 / np.pi)
+        return values[None], needs_float64
+
+
+class LobeIntegral:
+    """Integrals (F, Q) of lobes with F weight vectors over polygons, never negative. Winding is as in `FormFactor`.
+
+    The first integral is the one for F = 1.
+    """
+
+    def __init__(self, ridges, weights, scratch):
+        self.ridges, self.weights, self.scratch = ridges, weights, scratch
+
+    def __call__(self, part, corners, index, smallest=moments32.SMALLEST_SAFE):
+        weights = _selected(self.weights, part, index)
+        values, _, cosine, needs_float64 = self.ridges.integrals(corners, weights, self.scratch, smallest)
+        np.negative(values, out=values)
+        np.maximum(values, np.float32(0.0), out=values)
+        np.maximum(values[0], np.float32(-LEAST_SHARE) * cosine, out=values[0])
+        return values, needs_float64
+
+
+class ProfiledIntegral:
+    """Integrals (F, Q) over polygons times the profile of the light, as sums of integrals over parts of the light.
+
+    The polygons need the coordinates along `rows`: those along `axes` (C, 3, P), then two in the light's plane.
+    """
+
+    def __init__(self, light, effort, offset, axes, integrate, count):
+        self.effort, self.integrate, self.count = effort, integrate, count
+        self.profile = light_profile.Profile.of(light)
+        self.view = light_profile.LightView.of(light, offset, partial(along_axes, axes))
+        plane = light_profile.plane_axes(light).astype(np.float32)[:, :, None]
+        self.rows = np.concatenate([axes, np.broadcast_to(plane, (2, 3, axes.shape[2]))])
+
+    def __call__(self, corners, index):
+        index = np.arange(corners.shape[2]) if index is None else index
+        values = np.zeros((self.count, len(index)), np.float32)
+        needs_float64 = np.zeros(len(index), bool)
+        step = max(CORNERS // (corners.shape[1] * (2 * self.effort.chords + 1)), 512)
+        for start in range(0, len(index), step):
+            part = slice(start, start + step)
+            flat, view = corners[-2:, :, part], self.view.take(index[part])
+            layers = light_profile.layers(view, flat, self.profile, self.effort)
+            for number, (near, weights, polygons) in enumerate(layers):
+                # Small disks count little, so the rounding of their edges is lost in the sum.
+                smallest = 0.0 if number < self.effort.layers - 1 else moments32.SMALLEST_SAFE
+                found, redo = self.integrate(polygons, index[part][near], smallest=smallest)
+                values[:, start + near] += weights * found
+                needs_float64[start + near] |= redo
+        return values, needs_float64
+
+
+def along_axes(axes, vector):
+    """Products (C, P) of rows (C, 3, P) with a vector (3,)."""
+    x, y, z = vector.astype(np.float32)
+    return x * axes[:, 0] + y * axes[:, 1] + z * axes[:, 2]

@@ -1,0 +1,395 @@
+"""`RatioEstimator`: the rays from samples to one emitter, and the visibility of the emitter that they tell.
+
+Every pair of a sample and a light gets a few probe rays. If all arrive, or all are blocked, the pair is settled, unless
+a neighbor in the picture says otherwise. The other pairs get more rays, the more light they reflect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..cycles.horizons import SMALLEST_ALPHA, lobe_selection_pmf
+from ..cycles.light_tree import light_selection_pmf, light_tree_rows
+from ..emitters.facing import FacingDisk
+from ..emitters.light_polygons import may_reach, off_plane
+from ..lobes import brdf
+from ..scene import FARTHEST, PASSES, Film, Light, PolygonLight, SurfaceSamples, round_outline
+from .emitter import Emitter, Sky
+from .light_cluster import LightCluster
+from .ray_sampler import PROBES, RayBatch, RaySampler, SampleRows
+from .sampling import dot
+
+MOST_RAYS = 1024
+# Rays of a block, few enough for its arrays to stay in the cache.
+BLOCK_RAYS = 1 << 15
+# How many of PROBES rays are spread evenly over the light; the specular lobe chooses the others. Rows: pairs with both
+# lobes, with a diffuse lobe only, with a specular lobe only. Columns: both lobes count alike (always so for the
+# probes), the specular lobe counts more, the diffuse lobe counts more.
+LIGHT_SAMPLED = np.array([[4, 2, 6], [8, 8, 8], [2, 2, 2]])
+# A pair gets rays in proportion to this power of its light relative to that of a typical sample. The reason: the square
+# root of the variance of stratified rays falls with their number to the power -0.8.
+WORTH_POWER = 0.75
+# Rays of a pair as bright as a typical sample, as a share of the most rays of a pair.
+TYPICAL_SHARE = 0.4
+# Numbers of rays that a pair may get, besides the probes and the most rays.
+LEVELS = (16, 32, 64, 128, 256, 512)
+# The brightest pairs may get this many times the most rays of a pair: where lobes are narrow and lights half visible, a
+# few pixels cause most of the noise of a picture.
+BRIGHTEST = 4
+# Rounds in which neighbors of mixed pairs get more rays. Neighbors that turn out mixed pass this on in the next round.
+ROUNDS = 4
+# Rays end at this share of their distance to the light, just before it.
+END = np.float32(1.0 - 1e-4)
+_ZERO, _ONE, _TINY = np.float32(0.0), np.float32(1.0), np.float32(1e-30)
+# Points of the unit disk to aim at, for lights that face the points.
+OUTLINE = 0.99 * round_outline(16)
+_FARTHEST = np.float32(FARTHEST)
+
+
+@dataclass(frozen=True)
+class PixelNeighbors:
+    """Which samples are close to each other: those in the same pixel and in the eight pixels around it."""
+
+    pixel: np.ndarray  # (P,)
+    width: int
+    height: int
+
+    @classmethod
+    def of(cls, film: Film | None, count: int) -> PixelNeighbors:
+        """The neighbors in `film`; without one, each sample is close to those before and after it."""
+        if film is None:
+            return cls(np.arange(count), count, 1)
+        # The film may hold a part of a picture: count only its rows.
+        top = int(film.pixel.min(initial=film.width * film.height)) // film.width
+        height = int(film.pixel.max(initial=0)) // film.width + 1 - top
+        return cls(film.pixel - top * film.width, film.width, max(height, 0))
+
+    def any_around(self, index: np.ndarray, mask: np.ndarray) -> np.ndarray:
+        """Mask (Q,) of the samples `index` (Q,): is `mask` (Q,) true for at least one of the samples around?"""
+        pixel = self.pixel[index]
+        marked = np.zeros(self.width * self.height, bool)
+        marked[pixel[mask]] = True
+        grid = np.pad(marked.reshape(self.height, self.width), 1)
+        grid = grid[1:-1] | grid[:-2] | grid[2:]
+        return (grid[:, 1:-1] | grid[:, :-2] | grid[:, 2:]).ravel()[pixel]
+
+
+@dataclass(frozen=True)
+class RaysOfSurface:
+    """Rays (R,) that meet different things depending on who chooses them: the surface or the light."""
+
+    flat: np.ndarray  # in the flattened (S, Q) of all rays
+    visibility: np.ndarray  # transmittance of the ray that the surface chooses
+    index: np.ndarray  # number of the sample
+    directions: np.ndarray  # (3, R)
+    solid_angle: np.ndarray  # of the light, sr
+    is_alone: np.ndarray  # True where the light never chooses this direction
+
+
+class RatioEstimator:
+    """The samples that an emitter may reach, and what their rays have found so far. `number` is the emitter's number in
+    `selection`."""
+
+    def __init__(self, surface: SampleRows, emitter: Emitter | LightCluster, number: int, selection: LightSelection):
+        light = emitter.light
+        self.surface, self.emitter, self.light = surface, emitter, light
+        self.mask = np.uint32(surface.tracer.mask_of(light.name))
+        self.surface_mask = np.uint32(surface.tracer.surface_mask_of(light.name))
+        # The faces of a mesh light block rays to the mesh itself.
+        self.at_surface = isinstance(emitter, LightCluster) or isinstance(light, PolygonLight)
+        self.chosen_by, self.number, self.selection = surface.tracer.chosen_by(light.name), number, selection
+        origins = light.viewpoint(surface.position)
+        offset = (light.center[:, None] - origins).astype(np.float32)
+        ahead = np.ones(offset.shape[1], bool)
+        if not light.is_facing and not isinstance(emitter, LightCluster):
+            ahead = dot(light.direction.astype(np.float32), offset) < -off_plane(
+                light.center, np.abs(origins).sum(axis=0)
+            )
+        if light.has_spread or light.is_facing:
+            ahead &= may_reach(light, surface.position)
+        if light.receivers is not None:
+            ahead &= light.receives(surface.receiver)
+        radius, self.wanted, above = np.float32(1.001 * light.radius), {}, {}
+        for name, lobe in surface.lobes.items():
+            self.wanted[name] = lobe & ahead & getattr(light, f"affects_{name}")
+            for normal in surface.horizons(name):
+                if id(normal) not in above:
+                    above[id(normal)] = dot(normal, offset) > -radius
+                self.wanted[name] &= above[id(normal)]
+        self.index = np.flatnonzero(self.wanted["specular"] | self.wanted["diffuse"])
+        self.wanted = {name: wanted[self.index] for name, wanted in self.wanted.items()}
+        count = len(self.index)
+        # Sums of all weights, and of the weights times transmittance, by pass and half of the rays
+        self.sum_w, self.sum_wv = np.zeros((2, 2, 2, count), np.float32)
+        self.visible, self.blocked = np.zeros(count, bool), np.zeros(count, bool)
+        self.count = np.zeros(count, np.int32)
+        self.traced = 0
+
+    def trace(self, rays: int, neighbors: PixelNeighbors, typical: dict[str, float], importance: np.ndarray) -> None:
+        """Trace the probes of all pairs, then up to `rays` rays for pairs that need them. How many depends on the light
+        and the `importance` (P,) of the sample. `typical` comes from `typical_radiance`."""
+        if self.mask == 0 or not self.light.area_vector.any():
+            return
+        self._add_rays(np.arange(len(self.index)), 0, PROBES, 0)
+        self._leave_out_unlit()
+        number, choice = self._plan(rays, typical, importance[self.index])
+        for _ in range(ROUNDS):
+            chosen = neighbors.any_around(self.index, self.visible) & neighbors.any_around(self.index, self.blocked)
+            chosen |= self._unmet()
+            chosen &= self.count < number
+            if not chosen.any():
+                break
+            for last in np.unique(number[chosen]):
+                for split in range(3):
+                    members = np.flatnonzero(chosen & (number == last) & (choice == split))
+                    self._add_rays(members, PROBES, int(last), split)
+        self._aim_at_corners()
+
+    def _plan(self, rays, typical, importance):
+        """Number of rays (Q,) that each pair is worth, and its column (Q,) of EVENLY. Both depend on the unshadowed
+        light that the pair reflects, the number also on its `importance` (Q,)."""
+        worth = {name: self.unshadowed(name) / max(typical.get(name, 0.0), 1e-30) for name in PASSES}
+        most = importance * np.maximum(worth["specular"], worth["diffuse"])
+        # A sky or a cluster stands for many lights and gets the rays of all of them.
+        share = 1.0 if isinstance(self.emitter, Sky | LightCluster) else TYPICAL_SHARE
+        wanted = rays * share * most**WORTH_POWER
+        limit = rays
+        if share < 1.0 and rays > PROBES:
+            limit = min(BRIGHTEST * rays, MOST_RAYS)
+        if isinstance(self.emitter, Sky):
+            # Points lit by the sky alone are dark beside those lit by a sun in it: do not let them go short.
+            wanted = np.maximum(wanted, 0.25 * rays * importance)
+        levels = [level for level in LEVELS if level < limit] + [limit]
+        number = np.take(levels, np.searchsorted(levels, np.minimum(wanted, limit)))
+        choice = np.where(worth["specular"] > 2.0 * worth["diffuse"], 1, 0)
+        choice[worth["diffuse"] > 2.0 * worth["specular"]] = 2
+        return number, choice
+
+    def _unmet(self):
+        """Mask (Q,) of the pairs with a lobe that no ray has met so far."""
+        unmet = np.zeros(len(self.index), bool)
+        for number, name in enumerate(PASSES):
+            unmet |= self.wanted[name] & (self.sum_w[number].sum(axis=0) == 0.0)
+        return unmet
+
+    def _corner_heights(self, name, members):
+        """Least height (V, M) of the light's corners over the horizons of a lobe, and the offsets (3, V, M) from the
+        samples to the corners."""
+        surface, index = self.surface, self.index[members]
+        if isinstance(self.emitter, LightCluster):
+            return RaySampler(surface, index, self.emitter, (name,)).corner_heights(surface.horizons(name))
+        center = self.light.center[:, None] - self.light.viewpoint(surface.position[:, index])
+        if self.light.is_facing:
+            normal = surface.horizons(name)[0][:, index]
+            offset = FacingDisk.of(self.light, center.astype(np.float32), normal).corners(OUTLINE)
+        else:
+            offset = (self.emitter.outline.T[:, :, None] + center[:, None]).astype(np.float32)
+        heights = [dot(offset, normal[:, None, index]) for normal in surface.horizons(name)]
+        return np.minimum.reduce(heights), offset
+
+    def _leave_out_unlit(self):
+        """Drop lobes for which the whole light is below the horizon."""
+        for number, name in enumerate(PASSES):
+            unmet = np.flatnonzero(self.wanted[name] & (self.sum_w[number].sum(axis=0) == 0.0))
+            self.wanted[name][unmet] = self._corner_heights(name, unmet)[0].max(axis=0) > 0.0
+
+    def _aim_at_corners(self):
+        """Trace one ray to the highest corner of the light for each lobe that no ray met so far: such a lobe sees only
+        a corner of the light."""
+        for number, name in enumerate(PASSES):
+            unmet = np.flatnonzero(self.wanted[name] & (self.sum_w[number].sum(axis=0) == 0.0))
+            if len(unmet) == 0:
+                continue
+            heights, offset = self._corner_heights(name, unmet)
+            toward = np.take_along_axis(offset, heights.argmax(axis=0)[None, None], axis=1)[:, 0]
+            distance = np.sqrt(dot(toward, toward))
+            toward /= np.maximum(distance, _TINY)
+            if self.light.is_distant:
+                distance[:] = _FARTHEST
+            aimed = self.surface.ray_origins.aimed(self.index[unmet], toward[:, None], distance[None], self.at_surface)
+            visibility = (
+                self._transmittance(self.mask, *(rows[..., 0, :] for rows in aimed)) if self.chosen_by.light else _ONE
+            )
+            # Next to nothing, so that it does not count in sums over samples.
+            self.sum_w[number][:, unmet] = _TINY
+            self.sum_wv[number][:, unmet] = visibility * _TINY
+
+    def _transmittance(self, mask, origins, directions, distances):
+        """Transmittance (R,) of rays with a mask, `origins` and `directions` (3, R) and `distances` (R,)."""
+        self.traced += len(distances)
+        masks = np.broadcast_to(mask, distances.shape)
+        return self.surface.tracer.transmittance(origins.T, directions.T, distances * END, masks)
+
+    def _add_rays(self, members, first, last, split):
+        """Trace the rays `first` to `last` of the pairs `members` (M,). `split` is a column of EVENLY."""
+        diffuse, specular = (self.wanted[name][members] for name in ("diffuse", "specular"))
+        for kind, chosen in enumerate((diffuse & specular, diffuse & ~specular, ~diffuse & specular)):
+            chosen = members[chosen]
+            for start in range(0, len(chosen), BLOCK_RAYS // PROBES):
+                block = chosen[start : start + BLOCK_RAYS // PROBES]
+                lobes = tuple(name for name in PASSES if self.wanted[name][block[0]])
+                sampler = RaySampler(self.surface, self.index[block], self.emitter, lobes)
+                step = BLOCK_RAYS // (PROBES * len(block)) * PROBES
+                for number in range(first, last, step):
+                    light_sampled = LIGHT_SAMPLED[kind, 0], LIGHT_SAMPLED[kind, split]
+                    batch = RayBatch(number, min(number + step, last), max(last, 2 * PROBES), *light_sampled)
+                    self._add_block(block, sampler, batch)
+        self.count[members] = last
+
+    def _add_block(self, block, sampler, batch):
+        """Trace some `batch` of the pairs `block` (B,) of a view."""
+        directions, distance, weights = sampler.sample(batch)
+        visibility, others = np.zeros(distance.shape, np.float32), None
+        met = np.logical_or.reduce([weight > 0.0 for weight in weights.values()])
+        flat = np.flatnonzero(met)
+        aimed = self.surface.ray_origins.aimed(sampler.index, directions, distance, self.at_surface)
+        origins, *rest = (_taken(rows, flat) for rows in aimed)
+        visibility.ravel()[flat] = self._transmittance(self.mask, origins, *rest) if self.chosen_by.light else _ONE
+        if self.chosen_by.surface:
+            others = self._chosen_by_surface(sampler, (directions, distance), flat, origins, visibility)
+        least, most = visibility, visibility
+        if others is not None:
+            least, most = visibility.copy(), visibility.copy()
+            least.ravel()[others.flat] = np.minimum(others.visibility, visibility.ravel()[others.flat])
+            most.ravel()[others.flat] = np.maximum(others.visibility, visibility.ravel()[others.flat])
+        self.visible[block] |= most.sum(axis=0) > 0.0
+        self.blocked[block] |= least.sum(axis=0) < met.sum(axis=0)
+        for name, weight in weights.items():
+            number, passing = PASSES.index(name), visibility
+            if others is not None:
+                passing = visibility.copy()
+                rays = others.index, others.directions, others.solid_angle
+                share = self.selection.bsdf_share(name, self.number, *rays)
+                share[others.is_alone] = 1.0
+                passing.ravel()[others.flat] += share * (others.visibility - visibility.ravel()[others.flat])
+            for sums in (self.sum_w[number], self.sum_wv[number]):
+                halves = sums[:, block]
+                batch.add_to(halves, weight)
+                sums[:, block] = halves
+                weight *= passing
+
+    def _chosen_by_surface(self, sampler, rays, flat, origins, light_visibility):
+        """The rays at the places `flat` (R,) that the surface would choose and that then meet something else than the
+        light's rays did; None if there are none. The light's rays start at `origins` (3, R), with
+        `light_visibility` (S, Q)."""
+        ray_origins = self.surface.ray_origins
+        meet_the_same = self.chosen_by.light and self.mask == self.surface_mask
+        if meet_the_same and not ray_origins.terminator[sampler.index].any():
+            return None
+        directions, distance = (_taken(rows, flat) for rows in rays)
+        column = flat % light_visibility.shape[1]
+        index = sampler.index[column]
+        start, toward, distance = ray_origins.from_surface(index, directions, distance)
+        # The light chooses directions above the smooth horizon; the surface chooses directions above the mesh's.
+        smooth, flat_facing = (
+            dot(np.take(normal, index, axis=0).T, directions)
+            for normal in (ray_origins.smooth_normal, ray_origins.geometric_normal)
+        )
+        is_alone = (smooth <= 0.0) & (flat_facing > 0.0)
+        chosen = (smooth <= 0.0) | (flat_facing > 0.0)
+        if meet_the_same:
+            chosen &= (start != origins).any(axis=0)
+        chosen = np.flatnonzero(chosen)
+        visibility = self._transmittance(self.surface_mask, start[:, chosen], toward[:, chosen], distance[chosen])
+        differ = np.flatnonzero(visibility != light_visibility.ravel()[flat[chosen]])
+        if len(differ) == 0:
+            return None
+        chosen, visibility = chosen[differ], visibility[differ]
+        angle = sampler.solid_angles(flat[chosen])
+        return RaysOfSurface(flat[chosen], visibility, index[chosen], directions[:, chosen], angle, is_alone[chosen])
+
+    def unshadowed(self, name: str) -> np.ndarray:
+        """Approximate radiance (Q,) that a pass reflects without shadows; 0 for pairs without that lobe."""
+        scale = self.surface.albedo[self.index] if name == "diffuse" else np.float32(0.5)
+        scale = scale * np.float32(np.abs(self.light.radiance).mean() / np.pi) / np.maximum(self.count, 1)
+        return self.sum_w[PASSES.index(name)].sum(axis=0) * scale * self.wanted[name]
+
+    def visibility_ratio(self, name: str):
+        """Shares (Q,) of a pass, and their approximate standard deviations (Q,)."""
+        sum_w, sum_wv = self.sum_w[PASSES.index(name)], self.sum_wv[PASSES.index(name)]
+        total = sum_w.sum(axis=0)
+        ratio = np.divide(sum_wv.sum(axis=0), total, out=np.ones_like(total), where=total > 0.0)
+        halves = np.divide(sum_wv, sum_w, out=np.stack([ratio, ratio]), where=sum_w > 0.0)
+        # Pairs with probes only have no second half of rays: take the deviation of independent rays.
+        usual = np.sqrt(ratio * (_ONE - ratio) / np.maximum(self.count, 1).astype(np.float32))
+        return ratio, np.where((sum_w > 0.0).all(axis=0), 0.5 * np.abs(halves[0] - halves[1]), usual)
+
+
+def _taken(rows, flat):
+    """Values (3, R) or (R,) at the places `flat` of the flattened last two axes of `rows`, (3, S, Q) or (S, Q)."""
+    return np.take(rows.reshape(*rows.shape[:-2], -1), flat, axis=-1)
+
+
+class LightSelection:
+    """How likely Cycles chooses directions from samples (P) by `lights` (L) and by the lobes of the surface.
+
+    Who chose a ray decides what it meets. Rays that the light chose start above a curved surface, and are not blocked
+    if the light casts no shadow. Rays that the surface chose start at the surface, and are always blocked.
+    """
+
+    def __init__(self, samples: SurfaceSamples, lights: Sequence[Light], is_baked: bool):
+        self._samples, self._lights, self._is_baked = samples, tuple(lights), is_baked
+        self._first = None
+
+    def _prepare(self):
+        """Compute the chances on first use; most scenes never need them."""
+        samples = self._samples
+        moved = np.any(samples.position[1:] != samples.position[:-1], axis=1)
+        # The samples of one hit are consecutive.
+        self._hit = np.concatenate([np.zeros(min(len(samples), 1), int), np.cumsum(moved)])
+        self._count = np.bincount(self._hit)
+        self._first = np.cumsum(self._count) - self._count
+        self._lobes = lobe_selection_pmf(samples, self._hit, is_baked=False)
+        self._light_selection_pmf = np.full((len(self._lights), len(samples)), np.nan, np.float32)
+        self._rows = light_tree_rows(self._lights)
+
+    def bsdf_share(self, name: str, number: int, index, directions, solid_angle) -> np.ndarray:
+        """Share (R,) of the light of light `number` that a pass gets because the surface chose the unit directions
+        (3, R), seen from the samples `index` (R,). The light has the `solid_angle` (R,) in sr."""
+        if self._first is None:
+            self._prepare()
+        by_light = self._pmf(number, index) / np.maximum(solid_angle, 1e-12)
+        bsdf_share = self._density(name, index, directions.T.astype(np.float64))
+        return (bsdf_share**2 / np.maximum(bsdf_share**2 + by_light**2, 1e-30)).astype(np.float32)
+
+    def _pmf(self, number, index):
+        unknown = np.unique(index[np.isnan(self._light_selection_pmf[number, index])])
+        if len(unknown):
+            position, normal = self._samples.position[unknown], self._samples.smooth_normal[unknown]
+            self._light_selection_pmf[:, unknown] = light_selection_pmf(position, normal, self._lights, self._rows)
+        return self._light_selection_pmf[number, index]
+
+    def _density(self, name, index, directions):
+        """Probability density (R,) per sr with which the lobes of a hit choose the directions (R, 3)."""
+        hit, density = self._hit[index], np.zeros(len(index))
+        for number in range(self._count[hit].max(initial=0)):
+            here = np.flatnonzero(self._count[hit] > number)
+            sample = self._first[hit[here]] + number
+            specular, diffuse = self._lobes[:, sample]
+            # A bake of one pass chooses by the lobes of that pass alone.
+            if self._is_baked:
+                whole = np.maximum(self._sum_of_hit(name, hit[here]), 1e-12)
+                specular, diffuse = (
+                    specular / whole if name == "specular" else 0.0 * specular,
+                    diffuse / whole if name == "diffuse" else 0.0 * diffuse,
+                )
+            density[here] += specular * self._lobe_density(sample, directions[here])
+            cosine = np.einsum("rk,rk->r", directions[here], self._samples.diffuse_normal[sample])
+            density[here] += diffuse * np.maximum(cosine, 0.0) / np.pi
+        return density
+
+    def _sum_of_hit(self, name, hit):
+        return np.bincount(self._hit, weights=self._lobes[int(name == "diffuse")])[hit]
+
+    def _lobe_density(self, index, directions):
+        samples = self._samples
+        normal, view = samples.normal[index], samples.view[index]
+        half = directions + view
+        vertical = np.square(np.maximum(np.einsum("rk,rk->r", half, normal), 0.0))
+        horizontal = np.maximum(np.square(half).sum(axis=1) - vertical, 0.0)
+        alpha2 = np.square(np.maximum(samples.roughness[index] ** 2, SMALLEST_ALPHA))
+        cosine = np.maximum(np.einsum("rk,rk->r", normal, view), 1e-3)
+        return brdf.visible_normal_density(cosine, horizontal, vertical, alpha2)

@@ -6,6 +6,7 @@ Read from the source, and tried in fresh interpreters.
 import ast
 import subprocess
 import sys
+import tokenize
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,7 +14,14 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "ltsh_addon"
-MOST_FILES = 176
+MOST_FILES = 170
+MOST_LINES = 44_000  # of the package
+MOST_LINES_OF_A_FILE = 600
+# Files that hold one subject and are longer: why.
+LONGER = {}
+# What a value has been through, not what it is.
+VAGUE_NAMES = frozenset("found part own place left kept seen".split())
+MOST_VAGUE_NAMES = 600
 FEWEST_LINES = 50  # of a file that only one other imports
 BLENDER_MODULES = frozenset(
     "aud bl_operators bl_ui blf bmesh bpy bpy_extras cycles gpu gpu_extras idprop imbuf mathutils".split()
@@ -197,6 +205,38 @@ def test_there_are_few_files_and_no_crumbs():
         and len(path.read_text(encoding="utf-8").splitlines()) < FEWEST_LINES
     ]
     assert not crumbs, f"fewer than {FEWEST_LINES} lines, belongs into its importer: {crumbs}"
+
+
+def test_the_package_and_its_files_stay_small():
+    lines = {dotted(path): len(path.read_text(encoding="utf-8").splitlines()) for path in sources(PACKAGE)}
+    total = sum(lines.values())
+    assert total <= MOST_LINES
+    long = {name: count for name, count in lines.items() if count > MOST_LINES_OF_A_FILE and name not in LONGER}
+    assert not long, f"files above {MOST_LINES_OF_A_FILE} lines hold several subjects, or a reason in LONGER: {long}"
+    assert all(lines[name] > MOST_LINES_OF_A_FILE for name in LONGER), "these are short now"
+
+
+def test_every_class_name_stands_once():
+    where = {}
+    for path in sources(PACKAGE):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef):
+                where.setdefault(node.name, []).append(dotted(path))
+    twice = {name: modules for name, modules in where.items() if len(modules) > 1}
+    assert not twice, twice
+
+
+def vague_names(path: Path) -> int:
+    with path.open("rb") as file:
+        tokens = tokenize.tokenize(file.readline)
+        return sum(token.type == tokenize.NAME and token.string in VAGUE_NAMES for token in tokens)
+
+
+def test_names_say_what_a_value_is():
+    counts = {dotted(path): vague_names(path) for path in sources(PACKAGE)}
+    most = sorted(counts, key=counts.get, reverse=True)[:5]
+    total = sum(counts.values())
+    assert total <= MOST_VAGUE_NAMES, {name: counts[name] for name in most}
 
 
 @pytest.mark.parametrize(

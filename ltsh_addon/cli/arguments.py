@@ -219,7 +219,7 @@ class _JobFileReader:
 
     def _checked(self, where, parser, words, scenes) -> FileJob | None:
         """The job, if its options make sense together and its files are there; else None."""
-        from ..blender.process.blend_file import check_readable
+        from ..blender.process.blender_process import check_readable
 
         try:
             arguments = _parse(parser, words)

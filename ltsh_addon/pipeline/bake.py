@@ -76,7 +76,7 @@ def bake_objects(
     those announced as `following`. Raises as `bake_scene` does.
     """
     from ..blender.process.bake import extract_bake
-    from ..blender.process.blend_file import check_readable
+    from ..blender.process.blender_process import check_readable
 
     start = time.perf_counter()
     _check(options)

@@ -157,7 +157,7 @@ def tasks_of(job: BatchJob, progress=None) -> list[BatchTask]:
 
     Raises NameClash where two tasks would write the same file, or a name is too long, SceneError, OSError.
     """
-    from ..blender.process.blend_file import check_readable
+    from ..blender.process.blender_process import check_readable
 
     for scene in job.scenes:
         check_readable(Path(scene))

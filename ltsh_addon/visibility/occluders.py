@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..cycles.images import EXTENSIONS, INTERPOLATIONS, interpolated, within
+from ..cycles.texels import EXTENSIONS, INTERPOLATIONS, interpolated, within
 from ..files import replacing
 
 # Mask of all kinds of rays.

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from ltsh_addon import cli, imaging
-from ltsh_addon.blender.process.blend_file import running
+from ltsh_addon.blender.process.blender_process import running
 from ltsh_addon.cli import progress
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ltsh_addon.blender.viewport.drawing import float_texture
-from ltsh_addon.blender.viewport.gbuffer import GBufferTextures
+from ltsh_addon.blender.viewport.drawing import GBufferTextures, float_texture
 from ltsh_addon.cycles import closures
 from ltsh_addon.scene import SurfaceSamples
 

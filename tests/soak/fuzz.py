@@ -35,7 +35,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "helpers")]
 import fake_scene  # noqa: E402
 
 from ltsh_addon import cli, imaging  # noqa: E402
-from ltsh_addon.blender.process import bake, blend_file  # noqa: E402
+from ltsh_addon.blender.process import bake, blender_process  # noqa: E402
 from ltsh_addon.pipeline import batch, tasks  # noqa: E402
 from ltsh_addon.scene import SceneError  # noqa: E402
 
@@ -485,7 +485,7 @@ def stand_in() -> None:
     def cannot(*arguments, **options):
         raise SceneError("this second Blender is none")
 
-    blend_file.run_job = bake.run_job = cannot
+    blender_process.run_job = bake.run_job = cannot
     bake.scene_facts = lambda scene, frames, objects, uv=None, **options: [
         {"frame": 1, "camera": "Camera", "objects": ["Floor"], "tiles": {}} for _ in frames
     ]

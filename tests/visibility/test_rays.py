@@ -7,7 +7,7 @@ import pytest
 from occluder_scenes import answers, random_occluders, random_rays, samples_on, sphere, surface_samples
 
 from ltsh_addon.blender.process.blender_process import embree_libraries
-from ltsh_addon.cycles.images import EXTENSIONS, INTERPOLATIONS
+from ltsh_addon.cycles.texels import EXTENSIONS, INTERPOLATIONS
 from ltsh_addon.scene import PASSES, PolygonLight, SceneError
 from ltsh_addon.visibility import (
     OccluderMesh,

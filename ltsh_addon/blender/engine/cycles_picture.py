@@ -15,7 +15,7 @@ from ...scene import CYCLES
 from ..ui import results
 from ..ui.job import output_folder
 from ..viewport.drawing import float_texture
-from ..viewport.textures import look_values
+from ..viewport.meshes import look_values
 from .overlay import Rectangle
 
 # Shares by which the shapes of two pictures may differ: sizes are whole pixels.

@@ -24,8 +24,7 @@ from ..materials.aovs import (
     objects_without_material,
     remove_aovs,
 )
-from ..process.blend_file import newer
-from ..process.blender_process import job_start
+from ..process.blender_process import job_start, newer
 from ..process.pixels import EDGE_SECONDS, PixelJob, too_small
 from ..render_settings import (
     camera_rays,

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import bpy
 import numpy as np
 
-from ...cycles.images import ImageTexture
 from ...cycles.patches import ERROR, Patches, cut_into_patches, split_light
+from ...cycles.texels import ImageTexture
 from ...scene import Light, Pattern
 from ..materials.values import Value, is_srgb, opaque_pixels
 from .emission import PIXELS, Falloff, ObjectFacts, Studio, without_camera_rays, without_falloff

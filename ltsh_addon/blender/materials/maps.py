@@ -11,9 +11,8 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ...cycles.images import EXTENSIONS, INTERPOLATIONS
 from ...cycles.lobes import LOBE_AOVS
-from ...cycles.texels import MapValue, TextureFile, TextureValue
+from ...cycles.texels import EXTENSIONS, INTERPOLATIONS, MapValue, TextureFile, TextureValue
 from ...files import save_array
 from ..render_settings import working_space
 from .graph import carry_out_of_group, computed, cut, is_socket, live_link, material_output, source_behind, value_of

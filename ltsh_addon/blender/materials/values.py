@@ -10,7 +10,7 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ...cycles.images import EXTENSIONS, GRAY, INTERPOLATIONS
+from ...cycles.texels import EXTENSIONS, GRAY, INTERPOLATIONS
 from .graph import Source, source_of
 
 # How Blender converts colors and vectors to numbers.

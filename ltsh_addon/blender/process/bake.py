@@ -7,8 +7,7 @@ from pathlib import Path
 
 from ...files import replacing_by_copy, temporary_folder
 from ...scene import Progress
-from .blend_file import run_scene_job
-from .blender_process import run_job
+from .blender_process import run_job, run_scene_job
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,7 @@ import numpy as np
 
 from ...cycles.lobes import read_layer
 from ...scene import Progress
-from .blend_file import run_scene_job
-from .blender_process import run_job
+from .blender_process import run_job, run_scene_job
 from .pixels import rendered_channels
 
 PICTURE = "picture.npy"

@@ -16,7 +16,7 @@ from ...imaging.color import identified
 from ...imaging.exr import read_channels
 from ...scene import REC709, Border, ColorSpace, Film, Light, Progress, SurfaceSamples, lights_of, listed
 from ...visibility import Occluders
-from .blend_file import run_scene_job
+from .blender_process import run_scene_job
 
 # REASONS: how many materials, or other reasons, an error names.
 REASONS = 5

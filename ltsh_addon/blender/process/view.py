@@ -12,8 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from ...scene import Light, Progress, SceneError, light_of
-from .blend_file import run_scene_job
-from .blender_process import run_job
+from .blender_process import run_job, run_scene_job
 
 # VIEW_PASSES: the pictures that are drawn of a view. VIEW_PNG: the file of the first. GRAPHICS: the stage that the
 # child reports before it asks for a graphics card; on a machine without one it may crash there.

@@ -16,8 +16,16 @@ from ...cycles import horizons
 from ...lobes.lookup_table import LookupTable
 from ...scene import PASSES, Light, PolygonLight
 from ...shading import load_table
-from .drawing import WITHIN_MASK, drawing, empty_texture, float_texture, frame_buffer
-from .gbuffer import SAMPLERS, VISIBILITY_SAMPLERS, GBufferTextures
+from .drawing import (
+    SAMPLERS,
+    VISIBILITY_SAMPLERS,
+    WITHIN_MASK,
+    GBufferTextures,
+    drawing,
+    empty_texture,
+    float_texture,
+    frame_buffer,
+)
 from .light_texels import UploadedLights, dielectric_texels, draw_ranges, table_texels, upload_lights
 from .shaders import BOUNDS, CHOICE, EXCESS, HORIZON_SAMPLERS, Features, horizon_shader, lighting_shader
 

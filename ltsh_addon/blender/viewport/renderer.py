@@ -15,8 +15,7 @@ import numpy as np
 
 from ..extract.origin import new_origin
 from ..materials.values import Value
-from .drawing import PixelShader, ViewCamera, float_texture, glsl, read_texture
-from .gbuffer import GBufferTextures, VisibilityGrid
+from .drawing import GBufferTextures, PixelShader, ViewCamera, VisibilityGrid, float_texture, glsl, read_texture
 from .light_texels import UploadedLights, upload_lights
 from .lighting import GOLDEN, HorizonPass, LightingPass
 from .mirror import SceneMirror

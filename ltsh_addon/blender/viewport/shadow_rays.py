@@ -15,8 +15,7 @@ from ...workers.pool import WorkerPool, cores
 from ..extract.occluders import collect_occluders
 from ..lights.world import blocks_nothing
 from ..process.blender_process import embree_libraries
-from .drawing import ViewCamera, float_buffer
-from .gbuffer import GBufferTextures, VisibilityGrid, gbuffer_samples
+from .drawing import GBufferTextures, ViewCamera, VisibilityGrid, float_buffer, gbuffer_samples
 
 Lights = Sequence[Light]
 # MOST_BYTES: graphics memory for the visibility of all lights. _LIGHT_BYTES: of a light and a pixel, two half floats.

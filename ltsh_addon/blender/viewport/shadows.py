@@ -13,8 +13,16 @@ import numpy as np
 from ...scene import PASSES, Cancelled, Film, Light, SurfaceSamples, error_line
 from ...visibility import Occluders, RayOrigins, ShadowSampling, shared_numbers, trace_ray_origins, trace_visibility
 from ...workers.pool import WorkerPool
-from .drawing import ViewCamera, float_texture
-from .gbuffer import GBufferTextures, VisibilityGrid, every_texel, gbuffer_texels, samples_of_texels, unit_xyz
+from .drawing import (
+    GBufferTextures,
+    ViewCamera,
+    VisibilityGrid,
+    every_texel,
+    float_texture,
+    gbuffer_texels,
+    samples_of_texels,
+    unit_xyz,
+)
 from .shadow_rays import Lights, ViewTracer, too_many, visibility_texture
 
 

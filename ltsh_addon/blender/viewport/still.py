@@ -20,9 +20,8 @@ from ..materials.preview_material import world_radiance
 from ..process.view import GRAPHICS, VIEW_PASSES, VIEW_PNG, ViewJob
 from ..render_settings import cycles_setting
 from .drawing import ViewCamera, read_texture
-from .lights import NOT_RESOLVED, patterns_of
 from .live_cycles import rendered_world
-from .mirror import SceneMirror
+from .mirror import NOT_RESOLVED, SceneMirror, patterns_of
 from .pictures import ShownPicture
 from .renderer import CENTERS, ViewRenderer
 from .shadow_rays import ShadowRays, too_many, view_occluders

@@ -9,11 +9,10 @@ from mathutils import Matrix
 
 from ...shading.header import filled
 from ..materials.preview_material import IMAGE_SLOTS, is_missing
-from .drawing import PixelShader, ViewCamera, drawing, float_table, float_texture, glsl, uniform_buffer
-from .gbuffer import GBufferTextures
+from .drawing import GBufferTextures, PixelShader, ViewCamera, drawing, float_table, float_texture, glsl, uniform_buffer
+from .meshes import DEFINES, LOOK_SIZE, albedo_table, blend_table, sheen_table
 from .mirror import ShownInstance, ShownLook
 from .shaders import slope_text
-from .textures import DEFINES, LOOK_SIZE, albedo_table, blend_table, sheen_table
 
 # Outputs of the surface shader, in groups that are drawn into at once. A group has at most six textures.
 SURFACES = ("position", "normal", "base", "f0", "f90", "dielectric")

@@ -24,7 +24,7 @@ from ltsh_addon.blender.render_settings import pass_names
 from ltsh_addon.blender.ui import results
 from ltsh_addon.blender.ui.job import STARTING, Plan
 from ltsh_addon.blender.ui.overlay import covered
-from ltsh_addon.blender.viewport.lights import view_lights
+from ltsh_addon.blender.viewport.mirror import view_lights
 from ltsh_addon.imaging.exr import read_channels
 from ltsh_addon.pipeline import PictureOptions, RenderOptions, shade_scene
 from ltsh_addon.pipeline.render import finish

@@ -10,7 +10,7 @@ from scene_parts import add_plane, principled
 
 from ltsh_addon.blender.process.bake import extract_bake
 from ltsh_addon.cycles import texels as texels_module
-from ltsh_addon.cycles.images import ImageTexture
+from ltsh_addon.cycles.texels import ImageTexture
 from ltsh_addon.cycles.uv import UvTriangles
 from ltsh_addon.pipeline import BakeOptions, bake
 from ltsh_addon.scene import light_of

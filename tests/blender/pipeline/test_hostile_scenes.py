@@ -15,7 +15,7 @@ from fake_scene import run
 
 from ltsh_addon import cli, imaging
 from ltsh_addon.blender.extract import pixels
-from ltsh_addon.blender.process.blend_file import saved_with
+from ltsh_addon.blender.process.blender_process import saved_with
 from ltsh_addon.scene import SceneError
 
 # `make soak` takes 10,000.

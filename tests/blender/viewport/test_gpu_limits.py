@@ -9,7 +9,7 @@ import gpu
 import pytest
 
 from ltsh_addon import shading
-from ltsh_addon.blender.viewport import drawing, lighting, pictures, shaders, surfaces, textures
+from ltsh_addon.blender.viewport import drawing, lighting, meshes, pictures, shaders, surfaces
 
 # Vulkan asks for 128 bytes of push constants and 16384 of a uniform buffer, Metal has 16 samplers per stage, and all
 # can draw into 8 textures; Blender's OpenGL path has 31 locations of attributes and varyings.
@@ -87,4 +87,4 @@ def test_surfaces_and_pictures_keep_to_the_limits(recorded):
     for info in (*recorded(pictures.PicturePass), *recorded(lighting.HorizonPass)):
         check(info)
     # All values are vec4 or matrices of them, which std140 lays out as arrays of floats are in Python.
-    assert 16 * textures.LOOK_SIZE <= BLOCK_BYTES
+    assert 16 * meshes.LOOK_SIZE <= BLOCK_BYTES

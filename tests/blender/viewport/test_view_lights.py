@@ -14,8 +14,8 @@ from ltsh_addon import shading
 from ltsh_addon.blender.lights.emission import nodes_as_text
 from ltsh_addon.blender.lights.textures import ShownTextures
 from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels
-from ltsh_addon.blender.viewport.lights import NOT_YET, no_patterns, strongest, view_lights
 from ltsh_addon.blender.viewport.live_cycles import LiveNodeLights
+from ltsh_addon.blender.viewport.mirror import NOT_YET, no_patterns, strongest, view_lights
 
 
 def seen(patterns=no_patterns):

@@ -1,4 +1,4 @@
-"""Surface samples at texels, from a mesh, its materials and the texels that its triangles cover; and images as Cycles samples them.
+"""Surface samples at texels, from a mesh, its materials and covered texels; and images as Cycles samples them.
 
 Needs no bpy. Measured with 4.5.15 and 5.2.3: 8-bit images in sRGB are decoded after interpolation; with CLIP, the image
 is black outside and blends to black within half a pixel.

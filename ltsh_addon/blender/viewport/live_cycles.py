@@ -20,8 +20,8 @@ from ..lights.textures import NodeEmission, NodeLight, node_emission
 from ..lights.world import background_pictures, light_of_world, light_pictures
 from ..process import view
 from ..process.view import NODE_LIGHTS, NodeLightFile, NodeLightJob, WorldJob
+from .light_texels import ShownSky, background_of, coarse, varied_sky
 from .mirror import NOT_RESOLVED, NOT_YET
-from .sky import ShownSky, background_of, coarse, varied_sky
 
 
 @dataclass

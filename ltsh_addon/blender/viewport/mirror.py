@@ -40,8 +40,8 @@ from ..materials.graph import source_of, surface_of, tree_in_use
 from ..materials.preview_material import PreviewMaterial, preview_of, world_radiance
 from ..materials.values import product, value_at
 from .drawing import uniform_buffer
+from .light_texels import ShownSky, constant_sky
 from .meshes import MeshBatches, look_values, mesh_batches
-from .sky import ShownSky, constant_sky
 
 # FAR_AWAY: the eye where there is no camera, outside of all closed emissive meshes.
 FAR_AWAY = np.full(3, 1e6)

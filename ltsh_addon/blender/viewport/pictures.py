@@ -48,7 +48,7 @@ class PicturePass:
         """Fill the bound frame buffer, scene-linear, from one or two RGBA textures times their `weights`.
 
         The weighted alpha is the share of a pixel that shows a surface. `background` is a texture of
-        `sky.background_texels`.
+        `light_texels.background_texels`.
         """
         width, height = size_of(pictures[0])
         is_behind = shown.passes == "combined" and not shown.transparent

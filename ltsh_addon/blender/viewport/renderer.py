@@ -16,13 +16,12 @@ import numpy as np
 from ..extract.origin import new_origin
 from ..materials.values import Value
 from .drawing import GBufferTextures, PixelShader, ViewCamera, VisibilityGrid, float_texture, glsl, read_texture
-from .light_texels import UploadedLights, upload_lights
+from .light_texels import UploadedLights, background_texels, sky_texels, upload_lights
 from .lighting import GOLDEN, HorizonPass, LightingPass
 from .mirror import SceneMirror
 from .pictures import LightingState, PicturePass, SampleSum, ShownPicture, StaticLighting, VeilPass, copy, same_state
 from .shadow_rays import ShadowRays
 from .shadows import LiveShadows
-from .sky import background_texels, sky_texels
 from .surfaces import SurfacePass, has_bent_lobes
 
 

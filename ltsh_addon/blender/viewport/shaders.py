@@ -32,7 +32,7 @@ from ...shading.header import (
     moment_lines,
     table_sizes,
 )
-from . import light_texels, sky
+from . import light_texels
 from .drawing import PixelShader, glsl
 
 # Limits of the half diagonal of a light, as the lobe sees it, for cheaper ways of integration.
@@ -168,10 +168,10 @@ def _lighting_constants(table) -> dict:
         "MOST_ARCS": MOST_ARCS,
         "MOST_HALVINGS": MOST_HALVINGS,
         "QUAD_FIRST": light_texels.QUAD_FIRST,
-        "SKY_SIZE": sky.SIZE,
-        "SKY_LEVELS": sky.LEVELS,
-        "SKY_POINTS": sky.POINTS,
-        "IRRADIANCE_SIZE": sky.IRRADIANCE_SIZE,
+        "SKY_SIZE": light_texels.SKY_SIZE,
+        "SKY_LEVELS": light_texels.SKY_LEVELS,
+        "SKY_POINTS": light_texels.SKY_POINTS,
+        "IRRADIANCE_SIZE": light_texels.IRRADIANCE_SIZE,
         "LEAST_OF_COSINE": float_literal(LEAST_SHARE * 0.5 / np.pi),
         "TINY": float_literal(TINY_LIGHT**2),
         "SMALL": float_literal(SMALL_LIGHT**2),

@@ -20,12 +20,12 @@ from ..materials.preview_material import world_radiance
 from ..process.view import GRAPHICS, VIEW_PASSES, VIEW_PNG, ViewJob
 from ..render_settings import cycles_setting
 from .drawing import ViewCamera, read_texture
+from .light_texels import ShownSky, varied_sky
 from .live_cycles import rendered_world
 from .mirror import NOT_RESOLVED, SceneMirror, patterns_of
 from .pictures import ShownPicture
 from .renderer import CENTERS, ViewRenderer
 from .shadow_rays import ShadowRays, too_many, view_occluders
-from .sky import ShownSky, varied_sky
 
 TIMED = 3  # redraws whose median time is reported
 # FEWEST_RAYS: a point of a pixel takes at least so many rays per light, however many points share those of the pixel.

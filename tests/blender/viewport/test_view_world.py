@@ -10,7 +10,7 @@ from fake_scene import run
 from graphics_card import with_graphics
 
 from ltsh_addon import imaging
-from ltsh_addon.blender.viewport import sky
+from ltsh_addon.blender.viewport import light_texels as sky
 from ltsh_addon.blender.viewport.live_cycles import LiveWorld
 from ltsh_addon.cycles.environment import CUBE, SkyPicture
 

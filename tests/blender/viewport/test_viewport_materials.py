@@ -34,10 +34,10 @@ from ltsh_addon.blender.materials import preview_material
 from ltsh_addon.blender.materials.preview_material import preview_of
 from ltsh_addon.blender.ui import panels
 from ltsh_addon.blender.viewport.drawing import ViewCamera
+from ltsh_addon.blender.viewport.light_texels import constant_sky
 from ltsh_addon.blender.viewport.mirror import SceneMirror, ShownLook
 from ltsh_addon.blender.viewport.pictures import ShownPicture
 from ltsh_addon.blender.viewport.renderer import ViewRenderer
-from ltsh_addon.blender.viewport.sky import constant_sky
 
 RED, GOLD, AMBER = (0.6, 0.25, 0.1, 1.0), (0.9, 0.7, 0.3, 1.0), (0.9, 0.6, 0.3, 1.0)
 TINT = (0.2, 0.4, 0.6, 1.0)

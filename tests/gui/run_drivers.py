@@ -36,8 +36,9 @@ def main() -> int:
     arguments.out.mkdir(parents=True, exist_ok=True)
     archive = built_zip()
     fixed = ["--blend", str(demo_scene(arguments.out))]
-    for name in ("helpers/random_surfaces.py", "helpers/uploaded_samples.py", "blender/helpers/blender_state.py"):
-        fixed += ["--file", str(HERE.parent / name)]
+    for name in ("random_surfaces", "surface_scenes", "uploaded_samples"):
+        fixed += ["--file", str(HERE.parent / "helpers" / f"{name}.py")]
+    fixed += ["--file", str(HERE.parent / "blender" / "helpers" / "blender_state.py")]
     for helper in sorted(set(HERE.glob("*.py")) - set(HERE.glob("drive_*.py")) - {Path(__file__).resolve()}):
         fixed += ["--file", str(helper)]
     failed = [path.stem for path in drivers if not run(arguments.runner, path, archive, fixed, arguments.out)]

@@ -110,14 +110,14 @@ def clipped_metals(samples):
 
 def is_clipped(f0, f90, dip):
     """Mask (P,) of the F82 metals, each (P, 3), whose reflectance falls below 0 at some angle."""
-    found = np.zeros(len(f0), bool)
+    clipped = np.zeros(len(f0), bool)
     # The dip cannot bring other metals below 0, so their angles need not be tried.
     may_fall = np.minimum(f0, f90) < MOST_OF_DIP * np.maximum(dip, 0.0)
     at = np.nonzero((dip > 0.0).any(axis=-1) & may_fall.any(axis=-1))[0]
     cosines = np.linspace(0.0, 1.0, 33)[:, None, None]
     if len(at):
-        found[at] = f82_reflectance(cosines, f0[at], f90[at], dip[at]).min(axis=(0, 2)) < 0.0
-    return found
+        clipped[at] = f82_reflectance(cosines, f0[at], f90[at], dip[at]).min(axis=(0, 2)) < 0.0
+    return clipped
 
 
 def dielectric_reflectance(cosine, ior):
@@ -125,15 +125,15 @@ def dielectric_reflectance(cosine, ior):
     reflection. Broadcasts."""
     cosine = np.asarray(cosine)
     g = np.sqrt(np.maximum(ior * ior - 1.0 + cosine * cosine, 0.0))
-    total, found = g + cosine, g - cosine
-    plus, minus = cosine * total - 1.0, cosine * found + 1.0
+    total, ratio = g + cosine, g - cosine
+    plus, minus = cosine * total - 1.0, cosine * ratio + 1.0
     # At cosine 0 without refraction (ior 1) the quotient is 0 / 0; its limit along cosine -> 0 is 0.
-    found /= np.maximum(total, 1e-30)
+    ratio /= np.maximum(total, 1e-30)
     plus /= minus
-    found *= found
+    ratio *= ratio
     plus *= plus
     plus += 1.0
-    return 0.5 * found * plus
+    return 0.5 * ratio * plus
 
 
 def stretch(x, y, anisotropy):
@@ -258,10 +258,10 @@ class HalfBoundary:
         end = 2.0 * triple(apex - last, middle - last, last)
         first, middle, last = (vectors.astype(dtype, copy=False) for vectors in (first, middle, last))
         start, across, end = (values.astype(dtype, copy=False) for values in (start, across, end))
-        place = near * near * first[:, None] + 2.0 * near * far * middle[:, None] + far * far * last[:, None]
-        squared = dot(place, place)
+        point = near * near * first[:, None] + 2.0 * near * far * middle[:, None] + far * far * last[:, None]
+        squared = dot(point, point)
         wedge = weights * (near * near * start + near * far * across + far * far * end) / squared
-        return place / np.sqrt(squared), wedge
+        return point / np.sqrt(squared), wedge
 
 
 def _short_arcs(arcs, owner):
@@ -280,10 +280,10 @@ def _short_arcs(arcs, owner):
         size = np.sqrt(dot(halfway, halfway))
         halfway, scale = halfway / size, 0.5 / np.sqrt(size)
         parts = (first, halfway), (scale * (first + middle), scale * (middle + last)), (halfway, last)
-        arcs, owner = [np.concatenate(part, axis=1) for part in parts], np.concatenate([owner, owner])
+        arcs, owner = [np.concatenate(halves, axis=1) for halves in parts], np.concatenate([owner, owner])
     else:
         finished.append([*arcs, owner])
-    return [np.concatenate(part, axis=-1) for part in zip(*finished, strict=True)]
+    return [np.concatenate(halves, axis=-1) for halves in zip(*finished, strict=True)]
 
 
 def triple(a, b, c):

@@ -58,8 +58,8 @@ def velvet_integral(polygon: np.ndarray, cosine: np.ndarray, sigma: np.ndarray) 
     count = VELVET_NODES if corners.shape[1] <= 8 else VELVET_NODES // 2
     nodes, weights = np.polynomial.legendre.leggauss(count)
     nodes, weights = 0.5 * (nodes[:, None] + 1.0), 0.5 * weights[:, None]
-    for place in range(1, corners.shape[1] - 1):
-        first, second, third = corners[:, 0], corners[:, place], corners[:, place + 1]
+    for corner in range(1, corners.shape[1] - 1):
+        first, second, third = corners[:, 0], corners[:, corner], corners[:, corner + 1]
         volume = (first * np.cross(second, third, axis=0)).sum(axis=0)
         for share, weight in zip(nodes[:, 0], weights[:, 0], strict=True):
             # Go toward the second corner, and from there toward the third.
@@ -82,8 +82,8 @@ def albedo_slope(cosine: np.ndarray) -> np.ndarray:
     cosine = np.clip(cosine, 0.0, 1.0)
     sine, angle = np.sqrt(1.0 - cosine * cosine), np.arccos(cosine)
     tangent = sine / np.maximum(cosine, 1e-6)
-    found = sine * (angle - 2.0 / 3.0 - sine * cosine) + 2.0 / 3.0 * tangent * (1.0 - sine**3)
-    return np.where(cosine < 1e-6, np.pi / 2.0 - 2.0 / 3.0 - cosine, found)
+    slope = sine * (angle - 2.0 / 3.0 - sine * cosine) + 2.0 / 3.0 * tangent * (1.0 - sine**3)
+    return np.where(cosine < 1e-6, np.pi / 2.0 - 2.0 / 3.0 - cosine, slope)
 
 
 def rebound(color: np.ndarray, cosine: np.ndarray, roughness: np.ndarray) -> np.ndarray:

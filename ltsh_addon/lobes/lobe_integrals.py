@@ -96,8 +96,8 @@ def _integrate_in_float64(table, cosine, roughness, vertices, signed):
     lobe = table.lookup(cosine, roughness, curves=1)
     result = np.zeros(len(cosine))
     for index, polygon in split_at_horizon(np.ascontiguousarray(vertices.transpose(2, 1, 0))):
-        part = lobe.take(index)
-        integral = polygon_integrals(table, part, polygon, part.coefficients)[0]
+        lobes = lobe.take(index)
+        integral = polygon_integrals(table, lobes, polygon, lobes.coefficients)[0]
         if not signed:
             integral = np.maximum(np.sign(integrals_on_sphere(solid_angle, polygon)) * integral, 0.0)
         result[index] = integral
@@ -182,22 +182,22 @@ def _integrate_in_float32(table, cosine, roughness, vertices, signed):
 
     step = max(_FLOAT32_CORNERS // corners, 512)
     for start in range(0, count, step):
-        part = slice(start, start + step)
-        mu = np.clip(cosine[part], np.float32(0.0), np.float32(1.0))
-        rough = np.clip(roughness[part], np.float32(0.0), np.float32(1.0))
+        chunk = slice(start, start + step)
+        mu = np.clip(cosine[chunk], np.float32(0.0), np.float32(1.0))
+        rough = np.clip(roughness[chunk], np.float32(0.0), np.float32(1.0))
         sine = np.sqrt((np.float32(1.0) - mu) * (np.float32(1.0) + mu))
         warp, weights, tilt = ridges.fetch((0,), mu, sine, rough, None, scratch)
-        polygons, clip_rows = _warped(vertices[part], warp, tilt, scratch)
-        found, redo[part] = integrate_visible(polygons, np.ones(len(mu), bool), clip_rows, 2, integrate)
-        values, orientation = found
-        narrow, turns_back = _narrow_and_turning_back(vertices[part])
-        redo[part] |= narrow
+        polygons, clip_rows = _warped(vertices[chunk], warp, tilt, scratch)
+        integrals, redo[chunk] = integrate_visible(polygons, np.ones(len(mu), bool), clip_rows, 2, integrate)
+        values, orientation = integrals
+        narrow, turns_back = _narrow_and_turning_back(vertices[chunk])
+        redo[chunk] |= narrow
         if not signed:
             if turns_back.any():
-                orientation[turns_back] = _orientations(vertices[part][turns_back])
+                orientation[turns_back] = _orientations(vertices[chunk][turns_back])
             values *= orientation
             np.maximum(values, np.float32(0.0), out=values)
-        result[part] = values
+        result[chunk] = values
     redo |= roughness < moments32.SHARP_ROUGHNESS
     return result, np.nonzero(redo)[0]
 

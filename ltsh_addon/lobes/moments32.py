@@ -363,13 +363,13 @@ def weighted_moments(
     vectors, _, points = weights.shape
     sums = np.empty((vectors, points), np.float32)
     angle, cosine, needs_float64 = np.empty(points, np.float32), np.empty(points, np.float32), np.empty(points, bool)
-    for part in pieces(points, PIECE_CORNERS // corners.shape[1]):
-        found, needs_float64[part] = moments(corners[:, :, part], degree, scratch, smallest, bend)
-        weight = weights[:, :, part]
-        products = np.multiply(weight, found, out=scratch("weighted", weight.shape))
-        np.add.reduce(products, axis=1, out=sums[:, part])
-        angle[part] = found[0]
-        np.multiply(found[2], np.float32(0.5 / np.pi), out=cosine[part])
+    for piece in pieces(points, PIECE_CORNERS // corners.shape[1]):
+        terms, needs_float64[piece] = moments(corners[:, :, piece], degree, scratch, smallest, bend)
+        weight = weights[:, :, piece]
+        products = np.multiply(weight, terms, out=scratch("weighted", weight.shape))
+        np.add.reduce(products, axis=1, out=sums[:, piece])
+        angle[piece] = terms[0]
+        np.multiply(terms[2], np.float32(0.5 / np.pi), out=cosine[piece])
     return sums, angle, cosine, needs_float64
 
 

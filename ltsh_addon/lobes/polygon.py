@@ -123,12 +123,12 @@ def split_at_horizon(vertices: np.ndarray, axis: int = 2):
         index = np.nonzero(kinds == kind)[0]
         if len(index) == 0:
             continue
-        part = vertices if len(index) == len(kinds) else np.take(vertices, index, axis=2)
+        clipped = vertices if len(index) == len(kinds) else np.take(vertices, index, axis=2)
         if kind == SINGLE_RUN:
-            part = clip_single_run(part, patterns[index], axis)
+            clipped = clip_single_run(clipped, patterns[index], axis)
         elif kind == SEVERAL_RUNS:
-            part = clip_to_horizon(part, axis)
-        yield index, part
+            clipped = clip_to_horizon(clipped, axis)
+        yield index, clipped
 
 
 def _kinds_of_many_corners(heights):
@@ -155,8 +155,8 @@ def integrate_visible(corners: np.ndarray, facing: np.ndarray, clip_rows, count:
     cut = np.nonzero(partly & ~whole)[0]
     values, needs_float64 = np.zeros((count, points), np.float32), np.zeros(points, bool)
     if seen_whole > MOSTLY_WHOLE * points:
-        found, mask = integrate(corners, None)
-        np.multiply(found, whole, out=values)
+        integrals, mask = integrate(corners, None)
+        np.multiply(integrals, whole, out=values)
         np.logical_and(mask, whole, out=needs_float64)
     elif seen_whole:
         index = np.nonzero(whole)[0]
@@ -172,8 +172,8 @@ def _clipped(corners, clip_rows):
     if not clip_rows:
         yield np.arange(corners.shape[2]), corners
         return
-    for outer, part in split_at_horizon(corners, clip_rows[0]):
-        for inner, polygons in _clipped(part, clip_rows[1:]):
+    for outer, above in split_at_horizon(corners, clip_rows[0]):
+        for inner, polygons in _clipped(above, clip_rows[1:]):
             yield outer[inner], polygons
 
 
@@ -296,8 +296,8 @@ def _next_ear(ring, flat):
             break
         a, b, c = before[position], points[position], after[position]
         inside = (_turn(a, b, points) >= 0.0) & (_turn(b, c, points) >= 0.0) & (_turn(c, a, points) >= 0.0)
-        own = (points == a).all(axis=1) | (points == b).all(axis=1) | (points == c).all(axis=1)
-        if not (inside & ~own).any():
+        is_corner = (points == a).all(axis=1) | (points == b).all(axis=1) | (points == c).all(axis=1)
+        if not (inside & ~is_corner).any():
             return int(position)
     # The polygon is not simple: the smallest triangle does the least harm.
     return int(np.argmin(np.abs(area)))

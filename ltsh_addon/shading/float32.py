@@ -140,7 +140,7 @@ def specular_in_float64(table):
 
 
 def _chunks(members):
-    return (members[part] for part in moments32.pieces(len(members), CHUNK))
+    return (members[piece] for piece in moments32.pieces(len(members), CHUNK))
 
 
 @dataclass(frozen=True)
@@ -157,25 +157,25 @@ class AlikeLights:
     radius: np.ndarray  # m, around the centroid
     diagonal: np.ndarray  # as in `small_lights.SmallLight`
     numbers: np.ndarray  # among all lights
-    place: np.ndarray  # (N,) place here of each of the N lights; -1 for those not here or too narrow
+    column: np.ndarray  # (N,) column here of each of the N lights; -1 for those not here or too narrow
 
     @classmethod
     def of(cls, lights, numbers) -> AlikeLights:
         """Those of `lights`, (light, row, corners), with these `numbers` (L,)."""
-        own = [lights[number][0] for number in numbers]
-        centroid, area, _, diagonal = small_lights.moments_of(own)
-        center = np.array([light.center for light in own])
+        alike = [lights[number][0] for number in numbers]
+        centroid, area, _, diagonal = small_lights.moments_of(alike)
+        center = np.array([light.center for light in alike])
         corners = np.array([lights[number][2] for number in numbers])
         radius = np.sqrt(np.square(corners - centroid[:, None]).sum(axis=2).max(axis=1))
         names = ("half_u", "half_v", "direction", "radiance")
-        vectors = [np.array([getattr(light, name) for light in own]) for name in names]
+        vectors = [np.array([getattr(light, name) for light in alike]) for name in names]
         longest = np.square(corners - corners[:, :1]).sum(axis=2).max(axis=1)
         is_narrow = np.sqrt(np.square(area).sum(axis=1)) < NARROWEST * longest
-        place = np.full(len(lights), -1)
-        place[numbers] = np.where(is_narrow, -1, np.arange(len(numbers)))
+        column = np.full(len(lights), -1)
+        column[numbers] = np.where(is_narrow, -1, np.arange(len(numbers)))
         corners = (corners - center[:, None]).transpose(1, 2, 0)
         others = (values.T.astype(np.float32, order="C") for values in (*vectors, area, radius, diagonal))
-        return cls(np.stack([center.T, centroid.T]), corners.astype(np.float32, order="C"), *others, numbers, place)
+        return cls(np.stack([center.T, centroid.T]), corners.astype(np.float32, order="C"), *others, numbers, column)
 
 
 class Lights(list):
@@ -239,10 +239,10 @@ class _Lighting:
         position = np.ascontiguousarray(self.samples.position[index].T)
         sums = {row: np.zeros((len(colors), 3, len(index)), np.float32) for row in {row for _, row, _ in self.lights}}
         self._add_skies(lobes, sums)
-        left = self._add_far(lobes, position, sums)
-        for number in sorted([*self.lights.alone, *left]):
+        remaining = self._add_far(lobes, position, sums)
+        for number in sorted([*self.lights.alone, *remaining]):
             if not float64.has_patches(self.lights[number][0]):
-                self._add_light(lobes, number, position, left.get(number), sums)
+                self._add_light(lobes, number, position, remaining.get(number), sums)
         signed = (colors < 0.0).any()
         for row, total in sums.items():
             reflected = (colors * total).sum(axis=0)
@@ -279,33 +279,36 @@ class _Lighting:
     def _add_polygons(self, lobes, light, position, batch, allowed, total) -> np.ndarray:
         """Add the light, seen as polygons, to `total` (F, 3, Q) for a batch of `_batches`. Returns the mask of the
         columns that need double precision; they get nothing."""
-        part, outline, effort = batch
-        offset = (light.center[:, None] - light.viewpoint(position[:, part])).astype(np.float32)
-        seen, factor = light, 1.0
+        columns, outline, effort = batch
+        offset = (light.center[:, None] - light.viewpoint(position[:, columns])).astype(np.float32)
+        outline_light, factor = light, 1.0
         if light.is_facing:
-            seen, factor = self._seen(light, lobes.index[part], position[:, part])
-            factor = factor * seen.gain
-            offset, facing = seen.offset, np.ones(offset.shape[1], bool)
+            outline_light, factor = self._seen(light, lobes.index[columns], position[:, columns])
+            factor = factor * outline_light.gain
+            offset, facing = outline_light.offset, np.ones(offset.shape[1], bool)
         else:
-            extent = np.abs(position[:, part]).sum(axis=0)
+            extent = np.abs(position[:, columns]).sum(axis=0)
             toward = dot(offset, light.direction.astype(np.float32))
             facing = toward < -off_plane(light.center, 0.0 if light.is_distant else extent)
         if allowed is not None:
-            facing &= allowed[part]
-        axes, integrate = lobes.rows[:, :, part], partial(lobes.integrate, part)
+            facing &= allowed[columns]
+        axes, integrate = lobes.rows[:, :, columns], partial(lobes.integrate, columns)
         if light.has_profile:
             integrate = ProfiledIntegral(light, effort, offset, axes, integrate, len(lobes.colors))
             axes = integrate.rows
-        polygons = local_corners(seen, outline, offset, axes, self.scratch)
-        found, redo = integrate_visible(polygons, facing, lobes.clip_rows, len(lobes.colors), integrate)
+        polygons = local_corners(outline_light, outline, offset, axes, self.scratch)
+        integrals, redo = integrate_visible(polygons, facing, lobes.clip_rows, len(lobes.colors), integrate)
         if lobes.limits is not None:
-            own = LightFromPoints.of_disk(seen) if light.is_facing else LightFromPoints.of(light, offset, toward)
-            lobes.limits.apply(found, part, own, self.scratch)
+            if light.is_facing:
+                light_from_points = LightFromPoints.of_disk(outline_light)
+            else:
+                light_from_points = LightFromPoints.of(light, offset, toward)
+            lobes.limits.apply(integrals, columns, light_from_points, self.scratch)
         if light.is_facing:
-            found *= factor
-        found[:, redo] = 0.0
+            integrals *= factor
+        integrals[:, redo] = 0.0
         for channel in range(3):
-            total[:, channel, part] += found * np.float32(light.radiance[channel])
+            total[:, channel, columns] += integrals * np.float32(light.radiance[channel])
         return redo
 
     def _add_skies(self, lobes, sums) -> None:
@@ -322,132 +325,136 @@ class _Lighting:
     def _add_far(self, lobes, position, sums) -> dict[int, np.ndarray]:
         """Add the light of trees to the `sums` (F, 3, Q) by row. Returns the columns (Q',) that are left to do, by
         number of the light."""
-        left = {}
+        remaining = {}
         for tree, numbers in self.lights.trees:
             light, row, _ = self.lights[numbers[0]]
             allowed = light.receives(self.samples.receiver, lobes.index)
             chosen = np.arange(len(lobes.index)) if allowed is None else np.nonzero(allowed)[0]
             if not len(chosen):
                 continue
-            columns, own = add_far_lights(tree, lobes, position, chosen, sums[row])
-            pairs = columns, np.array(numbers)[own]
+            columns, light_number = add_far_lights(tree, lobes, position, chosen, sums[row])
+            pairs = columns, np.array(numbers)[light_number]
             if lobes.only_tails:
                 self.pairs_in_float64.append((lobes.index[columns], pairs[1]))
                 continue
             rest = np.ones(len(columns), bool)
             for alike in self.lights.alike:
-                place = alike.place[pairs[1]]
-                chosen = place >= 0
+                column = alike.column[pairs[1]]
+                chosen = column >= 0
                 rest &= ~chosen
-                self._add_near(lobes, position, (columns[chosen], place[chosen], alike), sums[row])
-            columns, number = (own[rest] for own in pairs)
+                self._add_near(lobes, position, (columns[chosen], column[chosen], alike), sums[row])
+            columns, number = (values[rest] for values in pairs)
             for light in np.unique(number):
-                left[int(light)] = np.sort(columns[number == light])
-        return left
+                remaining[int(light)] = np.sort(columns[number == light])
+        return remaining
 
     def _add_near(self, lobes, position, pairs, total) -> None:
         """Add to `total` (F, 3, Q) the light of `pairs`: columns (K,), numbers (K,) of lights, and the AlikeLights."""
         columns, number, lights = pairs
-        extent, left = np.abs(position).sum(axis=0), [np.empty(0, np.intp)]
+        extent, remaining = np.abs(position).sum(axis=0), [np.empty(0, np.intp)]
         for piece in moments32.pieces(len(columns), SMALL_CHUNK):
-            part, own = columns[piece], number[piece]
-            offset = (lights.centers[1][:, own] - position[:, part]).astype(np.float32)
-            radius = lights.radius[own]
-            rays = small_lights.RaysToCenters.along(offset, lights.area_vector[:, own], lights.diagonal[own])
-            size = small_lights.relative_sizes(lobes, part, rays, radius)
+            batch, light_column = columns[piece], number[piece]
+            offset = (lights.centers[1][:, light_column] - position[:, batch]).astype(np.float32)
+            radius = lights.radius[light_column]
+            area_vector, diagonal = lights.area_vector[:, light_column], lights.diagonal[light_column]
+            rays = small_lights.RaysToCenters.along(offset, area_vector, diagonal)
+            size = small_lights.relative_sizes(lobes, batch, rays, radius)
             rays = replace(rays, slack=np.float32(small_lights.VARIATION) * size)
-            small, lit = small_lights.small_and_lit(lobes, part, rays, radius, size)
-            left.append(piece.start + np.nonzero(~small)[0])
+            small, lit = small_lights.small_and_lit(lobes, batch, rays, radius, size)
+            remaining.append(piece.start + np.nonzero(~small)[0])
             lit = np.nonzero(lit)[0]
             if len(lit):
-                _scatter(lobes.at_point(part[lit], rays.take(lit)), part[lit], lights.radiance[:, own[lit]], total)
-        left = np.concatenate(left)
-        for piece in moments32.pieces(len(left), CORNERS // len(lights.corners)):
-            part, own = columns[left[piece]], number[left[piece]]
-            if not len(part):
+                radiance = lights.radiance[:, light_column[lit]]
+                _scatter(lobes.at_point(batch[lit], rays.take(lit)), batch[lit], radiance, total)
+        remaining = np.concatenate(remaining)
+        for piece in moments32.pieces(len(remaining), CORNERS // len(lights.corners)):
+            batch, light_column = columns[remaining[piece]], number[remaining[piece]]
+            if not len(batch):
                 continue
-            center, direction = lights.centers[0][:, own], lights.direction[:, own]
-            offset = (center - position[:, part]).astype(np.float32)
+            center, direction = lights.centers[0][:, light_column], lights.direction[:, light_column]
+            offset = (center - position[:, batch]).astype(np.float32)
             toward = dot(offset, direction)
-            facing = toward < -off_plane(center, extent[part])
-            axes, integrate = lobes.rows[:, :, part], partial(lobes.integrate, part)
-            polygons = local_corners(None, lights.corners[:, :, own], offset, axes, self.scratch)
-            found, redo = integrate_visible(polygons, facing, lobes.clip_rows, len(total), integrate)
+            facing = toward < -off_plane(center, extent[batch])
+            axes, integrate = lobes.rows[:, :, batch], partial(lobes.integrate, batch)
+            polygons = local_corners(None, lights.corners[:, :, light_column], offset, axes, self.scratch)
+            integrals, redo = integrate_visible(polygons, facing, lobes.clip_rows, len(total), integrate)
             if lobes.limits is not None:
-                halves = lights.half_u[:, own], lights.half_v[:, own]
-                seen = LightFromPoints.of_plain(halves, lights.area_vector[:, own], offset, toward)
-                lobes.limits.apply(found, part, seen, self.scratch)
+                halves = lights.half_u[:, light_column], lights.half_v[:, light_column]
+                light_from_points = LightFromPoints.of_plain(
+                    halves, lights.area_vector[:, light_column], offset, toward
+                )
+                lobes.limits.apply(integrals, batch, light_from_points, self.scratch)
             if redo.any():
-                found[:, redo] = 0.0
-                self.pairs_in_float64.append((lobes.index[part[redo]], lights.numbers[own[redo]]))
-            _scatter(found, part, lights.radiance[:, own], total)
+                integrals[:, redo] = 0.0
+                self.pairs_in_float64.append((lobes.index[batch[redo]], lights.numbers[light_column[redo]]))
+            _scatter(integrals, batch, lights.radiance[:, light_column], total)
 
     def _add_small(self, lobes, light, position, among, total) -> np.ndarray | None:
         """Add the light to `total` (F, 3, Q) where it is small, and return the columns that are left, None for all.
         `among` restricts where: columns (Q',), None for all, and a mask (Q,), None for all."""
         columns, allowed = among
-        seen, left = small_lights.SmallLight.of(light), []
+        small_light, remaining = small_lights.SmallLight.of(light), []
         count = position.shape[1] if columns is None else len(columns)
-        area_vector = seen.area_vector.astype(np.float32)
+        area_vector = small_light.area_vector.astype(np.float32)
         origins = light.viewpoint(position)
         for piece in moments32.pieces(count, SMALL_CHUNK):
-            part = piece if columns is None else columns[piece]
-            offset = (seen.center[:, None] - origins[:, part]).astype(np.float32)
-            rays = small_lights.RaysToCenters.along(offset, area_vector, np.float32(seen.diagonal))
+            batch = piece if columns is None else columns[piece]
+            offset = (small_light.center[:, None] - origins[:, batch]).astype(np.float32)
+            rays = small_lights.RaysToCenters.along(offset, area_vector, np.float32(small_light.diagonal))
             if light.is_facing:
                 rays = replace(rays, flux=np.float32(np.linalg.norm(light.area_vector)) * rays.distance)
-            size = small_lights.relative_sizes(lobes, part, rays, seen.radius)
+            size = small_lights.relative_sizes(lobes, batch, rays, small_light.radius)
             rays = replace(rays, slack=np.float32(small_lights.VARIATION) * size)
-            small, lit = small_lights.small_and_lit(lobes, part, rays, seen.radius, size)
+            small, lit = small_lights.small_and_lit(lobes, batch, rays, small_light.radius, size)
             if not small.all():
-                left.append(_chosen(part, np.nonzero(~small)[0]))
+                remaining.append(_chosen(batch, np.nonzero(~small)[0]))
             if allowed is not None:
-                lit &= allowed[part]
+                lit &= allowed[batch]
             share = np.count_nonzero(lit)
             if share == 0:
                 continue
             if share > MOSTLY_WHOLE * len(lit):
-                found = lobes.at_point(part, rays)
+                integrals = lobes.at_point(batch, rays)
                 if share < len(lit):
-                    found = np.where(lit, found, np.float32(0.0))
+                    integrals = np.where(lit, integrals, np.float32(0.0))
             else:
                 chosen = np.nonzero(lit)[0]
-                part = _chosen(part, chosen)
-                found = lobes.at_point(part, rays.take(chosen))
+                batch = _chosen(batch, chosen)
+                integrals = lobes.at_point(batch, rays.take(chosen))
             if light.is_facing:
-                found = found * self._seen(light, lobes.index[part], position[:, part])[1]
+                integrals = integrals * self._seen(light, lobes.index[batch], position[:, batch])[1]
             for channel in range(3):
-                total[:, channel, part] += found * np.float32(light.radiance[channel])
-        left = np.concatenate(left) if left else np.empty(0, np.intp)
-        return None if columns is None and len(left) == count else left
+                total[:, channel, batch] += integrals * np.float32(light.radiance[channel])
+        remaining = np.concatenate(remaining) if remaining else np.empty(0, np.intp)
+        return None if columns is None and len(remaining) == count else remaining
 
     def _add_points(self, lobes, light, position, among, total) -> np.ndarray:
         """As `_add_small`, for a light with a profile: add it where few points of the light suffice."""
         columns, allowed = among
         columns = np.arange(position.shape[1]) if columns is None else columns
         columns = columns if allowed is None else columns[allowed[columns]]
-        left = [columns[:0]]
+        remaining = [columns[:0]]
         for piece in moments32.pieces(len(columns), SMALL_CHUNK):
-            part = columns[piece]
-            offset = (light.center[:, None] - position[:, part]).astype(np.float32)
-            view = light_profile.LightView.of(light, offset, partial(along_axes, lobes.rows[:, :, part]))
+            batch = columns[piece]
+            offset = (light.center[:, None] - position[:, batch]).astype(np.float32)
+            view = light_profile.LightView.of(light, offset, partial(along_axes, lobes.rows[:, :, batch]))
             regions = profile_regions.ProfileRegions(light, view, lobes.clip_rows)
             for count, kind, index in regions.rules():
                 if count == 0:
-                    left.append(part[index])
+                    remaining.append(batch[index])
                     continue
                 for some in moments32.pieces(len(index), POINT_CHUNK // (count * count)):
                     chosen = index[some]
                     s, t, weights = regions.points(count, kind, chosen)
-                    found = lobes.at_point.integral(part[chosen], regions.coordinates(s, t, chosen), weights)
-                    found *= view.distance[chosen]
+                    integrals = lobes.at_point.integral(batch[chosen], regions.coordinates(s, t, chosen), weights)
+                    integrals *= view.distance[chosen]
                     if lobes.limits is not None:
-                        seen = offset[:, chosen]
-                        seen = LightFromPoints.of(light, seen, dot(seen, light.direction.astype(np.float32)))
-                        lobes.limits.apply(found, part[chosen], seen, self.scratch)
+                        toward = dot(offset[:, chosen], light.direction.astype(np.float32))
+                        light_from_points = LightFromPoints.of(light, offset[:, chosen], toward)
+                        lobes.limits.apply(integrals, batch[chosen], light_from_points, self.scratch)
                     for channel in range(3):
-                        total[:, channel, part[chosen]] += found * np.float32(light.radiance[channel])
-        return np.concatenate(left)
+                        total[:, channel, batch[chosen]] += integrals * np.float32(light.radiance[channel])
+        return np.concatenate(remaining)
 
     def _seen(self, light, index, position) -> tuple[FacingDisk, np.ndarray | float]:
         """The FacingDisk as which the samples `index` see a light from `position` (3, Q), and its `mean_emission`."""
@@ -482,26 +489,26 @@ class _Lighting:
     def finish(self, leftovers) -> None:
         """Add what was left to float64, or put it into the list `leftovers`."""
         counts = [sum(map(len, parts)) for parts in self.needs_float64]
-        pairs = [own for own in self.pairs_in_float64 if len(own[0])]
+        pairs = [pair for pair in self.pairs_in_float64 if len(pair[0])]
         if not any(counts) and not pairs:
             return
-        members = [part for parts in self.needs_float64 for part in parts]
-        members = np.concatenate([*members, *(own for own, _ in pairs)])
-        number = np.concatenate([np.repeat(np.arange(len(counts)), counts), *(own for _, own in pairs)])
+        members = [indices for of_light in self.needs_float64 for indices in of_light]
+        members = np.concatenate([*members, *(indices for indices, _ in pairs)])
+        number = np.concatenate([np.repeat(np.arange(len(counts)), counts), *(numbers for _, numbers in pairs)])
         if leftovers is not None and len(members) < FLOAT64_CHUNK:
             leftovers.append((members.astype(np.int32), number.astype(np.int32)))
             return
         row = np.array([row for _, row, _ in self.lights])
-        for pairs, found in float64.shade_pairs(self.samples, members, number, self.lights, self.shade_in_float64):
+        for pairs, values in float64.shade_pairs(self.samples, members, number, self.lights, self.shade_in_float64):
             # A sample may occur with several lights.
-            np.add.at(self.radiance, (row[number[pairs]], members[pairs]), found.astype(np.float32))
+            np.add.at(self.radiance, (row[number[pairs]], members[pairs]), values.astype(np.float32))
 
 
-def _scatter(found, columns, radiance, total) -> None:
+def _scatter(integrals, columns, radiance, total) -> None:
     """Add integrals (F, K) times radiance (3, K) to `total` (F, 3, Q), at the columns (K,), which may repeat."""
-    for own, values in zip(total, found, strict=True):
+    for sums, values in zip(total, integrals, strict=True):
         for channel in range(3):
-            own[channel] += np.bincount(columns, values * radiance[channel], own.shape[1])
+            sums[channel] += np.bincount(columns, values * radiance[channel], sums.shape[1])
 
 
 def _is_narrow(light, corners) -> bool:
@@ -515,9 +522,9 @@ def _is_in_pieces(light, corners) -> bool:
     return light.has_profile and isinstance(light, PolygonLight) and len(convex_pieces(corners)) > 1
 
 
-def _chosen(part, index):
+def _chosen(columns, index):
     """The columns at `index` (Q,) among the columns `part`, a slice or integers."""
-    return part.start + index if isinstance(part, slice) else part[index]
+    return columns.start + index if isinstance(columns, slice) else columns[index]
 
 
 def _both(allowed, rest):
@@ -538,5 +545,5 @@ def _batches(light, corners, position, width, rest=None):
         count = position.shape[1] if chosen is None else len(chosen)
         step = max(CORNERS // len(outline), 512)
         for start in range(0, count, step):
-            part = slice(start, start + step)
-            yield part if chosen is None else chosen[part], outline, effort
+            batch = slice(start, start + step)
+            yield batch if chosen is None else chosen[batch], outline, effort

@@ -94,10 +94,10 @@ def shade_patches(samples, members, patches, tree: PatchTree, radiance, shade) -
         center, half_u, half_v, light = (values[:, patch].T.astype(np.float64) for values in vectors)
         direction = np.broadcast_to(tree.direction.astype(np.float64), center.shape)
         area = tree.area_vectors(patch).T.astype(np.float64)
-        own = LightOfEachSample(center, direction, light, half_u, half_v, area, is_distant=True)
+        patch_of_each = LightOfEachSample(center, direction, light, half_u, half_v, area, is_distant=True)
         corners = tree.corners(patch).transpose(1, 2, 0).astype(np.float64)
         target = np.zeros((1, len(index), 3))
-        shade(samples.take(index), [(own, 0, corners)], target, index)
+        shade(samples.take(index), [(patch_of_each, 0, corners)], target, index)
         np.add.at(radiance, index, target[0])
 
 
@@ -109,19 +109,19 @@ def shade_pairs(samples, members, number, lights, shade_in_float64):
     """
     batches: dict[tuple, list[int]] = {}
     for position, (light, _, corners) in enumerate(lights):
-        own = (1, position) if light.has_profile or light.is_round else (0, (len(corners), light.is_distant))
-        batches.setdefault(own, []).append(position)
+        kind = (1, position) if light.has_profile or light.is_round else (0, (len(corners), light.is_distant))
+        batches.setdefault(kind, []).append(position)
     for (alone, _), chosen in sorted(batches.items()):
         among = np.full(len(lights), -1)
         among[chosen] = np.arange(len(chosen))
         of_batch = np.nonzero(among[number] >= 0)[0]
         for start in range(0, len(of_batch), FLOAT64_CHUNK):
             pairs = of_batch[start : start + FLOAT64_CHUNK]
-            used, own = np.unique(among[number[pairs]], return_inverse=True)
+            used, item_of_pair = np.unique(among[number[pairs]], return_inverse=True)
             items = [lights[chosen[position]] for position in used]
-            own = (items[0][0], 0, items[0][2]) if alone else _light_of_each(items, own)
+            light = (items[0][0], 0, items[0][2]) if alone else _light_of_each(items, item_of_pair)
             target = np.zeros((1, len(pairs), 3))
-            shade_in_float64(samples.take(members[pairs]), [own], target)
+            shade_in_float64(samples.take(members[pairs]), [light], target)
             yield pairs, target[0]
 
 
@@ -150,8 +150,8 @@ def shade_diffuse(samples, lights, radiance):
     is_plain = (samples.diffuse_normal[lit] == samples.smooth_normal[lit]).all(axis=1)
     is_plain &= (samples.sheen_a[lit] == 0.0) & (samples.diffuse_roughness[lit] == 0.0)
 
-    def shade_own(part, own, target, _):
-        shade_diffuse(part, own, target)
+    def shade_own(chunk, lights, target, _):
+        shade_diffuse(chunk, lights, target)
 
     for light, row, corners in lights:
         if not light.affects_diffuse:
@@ -166,16 +166,16 @@ def shade_diffuse(samples, lights, radiance):
                 shade_patches(samples, index[columns], patches, tree, radiance[row], shade_own)
             continue
         for candidates, second_normal, count, integral in kinds:
-            for part in visible_polygons_by_level(framed, light, corners, candidates, 1.0, second_normal):
-                index, polygon, _ = part
+            for level in visible_polygons_by_level(framed, light, corners, candidates, 1.0, second_normal):
+                index, polygon, _ = level
                 if light.has_profile:
                     view = light_view(framed, light, index, lambda vectors: vectors)
-                    irradiance = _profiled(light, view, part, integral, count)
+                    irradiance = _profiled(light, view, level, integral, count)
                 else:
                     irradiance = integral(polygon, index)
                 if light.is_facing:
-                    own = facing.AnalyticLobe(framed.frame[2][:, index])
-                    irradiance = irradiance * _mean_emission(light, samples, index, own)
+                    lobe = facing.AnalyticLobe(framed.frame[2][:, index])
+                    irradiance = irradiance * _mean_emission(light, samples, index, lobe)
                 reflected = irradiance[0][:, None] * samples.diffuse_albedo[index]
                 if count > 1:
                     rebound = irradiance[1][:, None] * samples.diffuse_rebound[index]
@@ -233,10 +233,10 @@ def lobe_width(samples, index) -> np.ndarray:
     return np.maximum(samples.sharpest_roughness[index].astype(np.float64), LEAST_ROUGHNESS) ** 2
 
 
-def _profiled(light, view, part, integral, count):
+def _profiled(light, view, level, integral, count):
     """Integrals (count, Q) over polygons (5, W, Q) times the profile of the light. `part` is from
     `visible_polygons_by_level`; integral(polygons, index) is the integral without the profile."""
-    index, polygon, effort = part
+    index, polygon, effort = level
     result = np.zeros((count, len(index)))
     for near, weights, corners in light_profile.layers(view, polygon[3:], light_profile.Profile.of(light), effort):
         result[:, near] += weights * integral(corners[3:], index[near])
@@ -268,9 +268,9 @@ def shade_specular(samples, lights, table, radiance, error=None):
         bent = has_bent_fresnel(samples)
         lobe = _fresnel_lobe(table, cosine, samples)
 
-    def shade_own(part, own, target, index):
+    def shade_own(chunk, lights, target, index):
         estimates = None if error is None else np.zeros(len(index))
-        shade_specular(part, own, table, target, estimates)
+        shade_specular(chunk, lights, table, target, estimates)
         if error is not None:
             np.add.at(error, index, estimates)
 
@@ -289,7 +289,7 @@ def shade_specular(samples, lights, table, radiance, error=None):
             plain = lit[~is_anisotropic]
             width = lobe_width(samples, plain)
             visible = visible_polygons_by_level(framed, light, corners, plain, width, samples.geometric_normal)
-            parts = ((part[0], _table_integrals(table, lobe, framed, light, part)) for part in visible)
+            parts = ((level[0], _table_integrals(table, lobe, framed, light, level)) for level in visible)
             if light.has_profile and isinstance(light, PolygonLight):
                 parts = _joined(parts, len(samples))
             parts = _finished(parts, table, samples, light)
@@ -316,8 +316,8 @@ def _finished(parts, table, samples, light):
             _limit(integrals, samples, index, light)
         if light.is_facing:
             alpha = np.maximum(samples.roughness[index].astype(np.float64) ** 2, MIN_ALPHA)
-            own = facing.AnalyticLobe(samples.normal[index].T, samples.view[index].T, alpha)
-            integrals *= _mean_emission(light, samples, index, own)
+            analytic_lobe = facing.AnalyticLobe(samples.normal[index].T, samples.view[index].T, alpha)
+            integrals *= _mean_emission(light, samples, index, analytic_lobe)
         yield index, integrals
 
 
@@ -341,8 +341,8 @@ def _bent_reflectance(framed, light, corners, at):
     origin, is_clipped = light.viewpoint(samples.position), clipped_metals(samples)[:, None]
     cosine = np.clip((samples.normal * samples.view).sum(axis=1), 0.0, 1.0)
     alpha, total, lobe = np.maximum(samples.roughness**2, MIN_ALPHA), 0.0, 1e-30
-    for place in places:
-        offset = np.broadcast_to(place, origin.shape) - origin
+    for point in places:
+        offset = np.broadcast_to(point, origin.shape) - origin
         distance = np.linalg.norm(offset, axis=1)
         local = to_local(axes, (offset / distance[:, None]).T).T[:, None]
         values = ggx_brdf_cosine(cosine, alpha, local)
@@ -367,15 +367,15 @@ def _joined(parts, count):
 
 def _limit(integrals, samples, index, light):
     """Apply `TailLimits` to integrals (4, Q) over the light, as seen from the samples `index`."""
-    own = light if light.center.ndim == 1 else light.take(index)
+    light_of_each = light if light.center.ndim == 1 else light.take(index)
     axes = samples.normal[index].T, samples.view[index].T
-    offset = (own.center - own.viewpoint(samples.position[index])).T
+    offset = (light_of_each.center - light_of_each.viewpoint(samples.position[index])).T
     if light.is_facing:
-        seen = LightFromPoints.of_disk(FacingDisk.of(light, offset, axes[0]))
+        light_from_points = LightFromPoints.of_disk(FacingDisk.of(light, offset, axes[0]))
     else:
-        seen = LightFromPoints.of(own, offset, dot(offset, own.direction.T))
+        light_from_points = LightFromPoints.of(light_of_each, offset, dot(offset, light_of_each.direction.T))
     limits = TailLimits.of(axes, samples.roughness[index], samples.geometric_normal[index].T, True, samples.ior[index])
-    limits.apply(integrals, slice(None), seen, lambda name, shape: np.empty(shape))
+    limits.apply(integrals, slice(None), light_from_points, lambda name, shape: np.empty(shape))
 
 
 def _fresnel_lobe(table: LookupTable, cosine, samples) -> Lobe:
@@ -389,7 +389,7 @@ def _fresnel_lobe(table: LookupTable, cosine, samples) -> Lobe:
     return lobe.with_coefficients(np.stack([*lobe.coefficients[:3], dielectric]))
 
 
-def _table_integrals(table, lobe, framed, light, part):
+def _table_integrals(table, lobe, framed, light, level):
     """Integrals (4, Q), never negative, over a `part` from `visible_polygons_by_level`. Its corners run
     counterclockwise as seen from the point (`Light.polygon`)."""
 
@@ -398,20 +398,20 @@ def _table_integrals(table, lobe, framed, light, part):
     cosine[0, 0 if table.family == "ltc" else coefficient_index(1, 0)] = 1.0 if table.family == "ltc" else _COSINE
 
     def integral(polygon, index):
-        own = lobe.take(index)
-        vectors = np.concatenate([own.coefficients, np.broadcast_to(cosine, own.coefficients[:1].shape)])
-        *values, plain = np.maximum(-polygon_integrals(table, own, polygon, vectors), 0.0)
+        lobes = lobe.take(index)
+        vectors = np.concatenate([lobes.coefficients, np.broadcast_to(cosine, lobes.coefficients[:1].shape)])
+        *values, plain = np.maximum(-polygon_integrals(table, lobes, polygon, vectors), 0.0)
         values[0] = np.maximum(values[0], LEAST_SHARE * plain)
         return np.stack(values)
 
-    index, polygon, _ = part
+    index, polygon, _ = level
     if not light.has_profile:
         return integral(polygon, index)
-    own = lobe.take(index)
+    lobes = lobe.take(index)
 
     def to_lobe(vectors):
-        warped = own.to_original_domain(vectors)
-        return warped if own.tilt is None else tilted(warped, own.tilt)
+        warped = lobes.to_original_domain(vectors)
+        return warped if lobes.tilt is None else tilted(warped, lobes.tilt)
 
     view = light_view(framed, light, index, to_lobe)
-    return _profiled(light, view, part, integral, 4)
+    return _profiled(light, view, level, integral, 4)

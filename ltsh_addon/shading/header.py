@@ -41,7 +41,7 @@ def source_text(path: Path) -> str:
 
 def filled(text: str, values: Mapping[str, object]) -> str:
     """`text` with each name, written @NAME@, replaced by its value. Raises KeyError if a name has no value."""
-    return re.sub(r"@(\w+)@", lambda found: str(values[found[1]]), text)
+    return re.sub(r"@(\w+)@", lambda match: str(values[match[1]]), text)
 
 
 def float_literal(value) -> str:
@@ -114,9 +114,9 @@ def _text(name) -> str:
 
 def _of_family(text, family) -> str:
     """`text` for a family of tables: keeps one of the two parts between the lines `@if ltsh`, `@else` and `@end`."""
-    kept = 1 if family == "ltsh" else 2
+    group = 1 if family == "ltsh" else 2
     return re.sub(
-        r"^@if ltsh\n(.*?)^@else\n(.*?)^@end\n", lambda found: found[kept], text, flags=re.DOTALL | re.MULTILINE
+        r"^@if ltsh\n(.*?)^@else\n(.*?)^@end\n", lambda match: match[group], text, flags=re.DOTALL | re.MULTILINE
     )
 
 
@@ -370,20 +370,20 @@ def translated_to_wgsl(text: str, prefix: str) -> str:
 
 def _preprocessed(text, prefix) -> str:
     """The output of a shader's preprocessor. Macros that are whole numbers become constants."""
-    lines, kept = [], [True]
+    lines, active = [], [True]
     for line in text.splitlines():
         words = line.split(maxsplit=2)
         if not line.startswith("#"):
-            lines += [line] if all(kept) else []
+            lines += [line] if all(active) else []
         elif words[0] in ("#if", "#ifdef", "#ifndef"):
             # Only LTSH_SHADER is defined: this is not C.
-            kept.append(words[1] == "LTSH_SHADER" if words[0] == "#ifdef" else words[1] != "LTSH_SHADER")
-            kept[-1] = kept[-1] and words[0] != "#if"
+            active.append(words[1] == "LTSH_SHADER" if words[0] == "#ifdef" else words[1] != "LTSH_SHADER")
+            active[-1] = active[-1] and words[0] != "#if"
         elif words[0] in ("#else", "#elif"):
-            kept[-1] = False
+            active[-1] = False
         elif words[0] == "#endif":
-            kept.pop()
-        elif words[0] == "#define" and all(kept) and len(words) == 3 and re.fullmatch(r"\d+", words[2]):
+            active.pop()
+        elif words[0] == "#define" and all(active) and len(words) == 3 and re.fullmatch(r"\d+", words[2]):
             lines.append(f"const {words[1]} = {words[2]};")
     return "\n".join(lines).replace(f"{prefix.upper()}_DATA(", f"{prefix}_data(")
 
@@ -431,10 +431,10 @@ class _Translation:
         return token
 
     def _until(self, end: str) -> str:
-        found = [self._take()]
-        while found[-1] != end:
-            found.append(self._take())
-        return "".join(found)
+        taken = [self._take()]
+        while taken[-1] != end:
+            taken.append(self._take())
+        return "".join(taken)
 
     # Declarations:
 
@@ -471,11 +471,11 @@ class _Translation:
         self._word()
         body = self._block()
         copies = []
-        for number, (own, kind) in enumerate(parameters):
-            if re.search(rf"(?<![\w.]){own}[\w.\[\]]* [-+*/]?= ", body):
-                parameters[number] = (f"{own}_given", kind)
-                copies.append(f"\n    var {own} = {own}_given;")
-        listed = ", ".join(f"{own}: {kind}" for own, kind in parameters)
+        for number, (parameter, kind) in enumerate(parameters):
+            if re.search(rf"(?<![\w.]){parameter}[\w.\[\]]* [-+*/]?= ", body):
+                parameters[number] = (f"{parameter}_given", kind)
+                copies.append(f"\n    var {parameter} = {parameter}_given;")
+        listed = ", ".join(f"{parameter}: {kind}" for parameter, kind in parameters)
         returned = "" if result == "void" else f" -> {self._types[result]}"
         start = body.index("{") + 1
         return f"fn {name}({listed}){returned}{body[:start]}{''.join(copies)}{body[start:]}"

@@ -126,8 +126,8 @@ class Task:
         lights, (used, number) = self.lights_of_pairs(name), np.unique(number, return_inverse=True)
         lights = _prepared(lights[one] for one in used)
         result, every = np.zeros((len(samples), 3), self.dtype), np.arange(len(samples))
-        for pairs, found in float64.shade_pairs(samples, every, number, lights, in_float64):
-            result[pairs] = found
+        for pairs, radiance in float64.shade_pairs(samples, every, number, lights, in_float64):
+            result[pairs] = radiance
         return result
 
     @cached_property
@@ -148,18 +148,20 @@ class Task:
 
     def _by_pass(self, lights):
         lights = _prepared(lights)
-        found = {name: float32.Lights.of(lights, name) for name in self.passes}
+        lights_by_pass = {name: float32.Lights.of(lights, name) for name in self.passes}
         # If all lights affect both passes, these share their trees.
-        return found if len({len(own) for own in found.values()}) > 1 else dict.fromkeys(found, found[self.passes[0]])
+        if len({len(pass_lights) for pass_lights in lights_by_pass.values()}) > 1:
+            return lights_by_pass
+        return dict.fromkeys(lights_by_pass, lights_by_pass[self.passes[0]])
 
     def _add_detailed(self, samples, light, name, radiance, error) -> None:
         """Add the light of a light with a `detail` to its row (1, B, 3) of one pass."""
         for index, patches in fitting_patches(light, samples, name == "specular"):
-            own = {name: np.zeros((1, len(index), 3), self.dtype)}
+            patch_radiance = {name: np.zeros((1, len(index), 3), self.dtype)}
             own_error = None if error is None else np.zeros(len(index))
             prepared = float32.Lights(_prepared((patch, 0) for patch in patches))
-            self._add(samples.take(index), {name: prepared}, own, own_error, {})
-            radiance[:, index] += own[name]
+            self._add(samples.take(index), {name: prepared}, patch_radiance, own_error, {})
+            radiance[:, index] += patch_radiance[name]
             if error is not None:
                 error[index] += own_error
 
@@ -168,21 +170,21 @@ class Task:
         if self.single:
             scratch = self._scratch
             if "diffuse" in radiance:
-                left = leftovers.get("diffuse")
-                float32.shade_diffuse(samples, prepared["diffuse"], radiance["diffuse"], scratch, left)
+                pairs = leftovers.get("diffuse")
+                float32.shade_diffuse(samples, prepared["diffuse"], radiance["diffuse"], scratch, pairs)
             if "specular" in radiance:
-                left, lights = leftovers.get("specular"), prepared["specular"]
-                float32.shade_specular(samples, lights, self.table, radiance["specular"], scratch, left)
+                pairs, lights = leftovers.get("specular"), prepared["specular"]
+                float32.shade_specular(samples, lights, self.table, radiance["specular"], scratch, pairs)
             return
         for start in range(0, len(samples), FLOAT64_CHUNK):
             chunk = slice(start, start + FLOAT64_CHUNK)
-            part = samples.take(chunk)
+            batch = samples.take(chunk)
             views = {name: values[:, chunk] for name, values in radiance.items()}
             if "diffuse" in views:
-                float64.shade_diffuse(part, prepared["diffuse"], views["diffuse"])
+                float64.shade_diffuse(batch, prepared["diffuse"], views["diffuse"])
             if "specular" in views:
                 estimates = None if error is None else error[chunk]
-                float64.shade_specular(part, prepared["specular"], self.table, views["specular"], estimates)
+                float64.shade_specular(batch, prepared["specular"], self.table, views["specular"], estimates)
 
 
 def _prepared(lights):
@@ -210,14 +212,14 @@ class Shading:
     @property
     def combined(self) -> np.ndarray:
         """Sum (P, 3) over the passes and rows."""
-        return sum(part.sum(axis=0) for part in (self.specular, self.diffuse) if part is not None)
+        return sum(radiance.sum(axis=0) for radiance in (self.specular, self.diffuse) if radiance is not None)
 
-    def with_more(self, kept: np.ndarray, more: Shading) -> Shading:
+    def with_more(self, mask: np.ndarray, more: Shading) -> Shading:
         """The samples for which the mask `kept` (P,) is True, then those of `more`, with the same rows and passes."""
 
         def joined(name, axis):
             one, other = getattr(self, name), getattr(more, name)
-            return None if one is None else np.concatenate([np.compress(kept, one, axis), other], axis)
+            return None if one is None else np.concatenate([np.compress(mask, one, axis), other], axis)
 
         axes = {"specular": 1, "diffuse": 1, "quadrature_error": 0}
         return Shading(**{name: joined(name, axis) for name, axis in axes.items()})
@@ -293,27 +295,27 @@ def _shade_with(technique, samples, lights, passes, how) -> Shading:
     rows = _rows(rows, len(lights))
     radiance = {name: np.zeros((1 + max(rows, default=0), len(samples), 3), dtype) for name in passes}
     for number, (light, row) in enumerate(zip(lights, rows, strict=True)):
-        found = technique.evaluate(samples, light.leaves) if light.area_vector.any() else None
-        for name in passes if found is not None else ():
+        shaded = technique.evaluate(samples, light.leaves) if light.area_vector.any() else None
+        for name in passes if shaded is not None else ():
             if not getattr(light, f"affects_{name}"):
                 continue
-            own = _own_pass(technique, found, name, len(samples))
-            if own is None:
-                own = shade(samples, [light], passes=(name,), workers=workers, dtype=dtype).diffuse
+            reflected = _own_pass(technique, shaded, name, len(samples))
+            if reflected is None:
+                reflected = shade(samples, [light], passes=(name,), workers=workers, dtype=dtype).diffuse
             received = light.receives(samples.receiver)
-            own = np.asarray(own).sum(axis=0)
-            radiance[name][row] += own if received is None else own * received[:, None]
+            reflected = np.asarray(reflected).sum(axis=0)
+            radiance[name][row] += reflected if received is None else reflected * received[:, None]
         if progress is not None and progress((number + 1) / len(lights)) is False:
             raise Cancelled("shading was stopped")
     return Shading(radiance.get("specular"), radiance.get("diffuse"))
 
 
-def _own_pass(technique, found, name, count) -> np.ndarray | None:
+def _own_pass(technique, shaded, name, count) -> np.ndarray | None:
     """A pass (R, P, 3) of what an OwnTechnique returned. Raises ValueError if it is not usable."""
     subject = f"technique {type(technique).__name__}: evaluate"
-    if not isinstance(found, Shading):
-        raise ValueError(f"{subject} returned {type(found).__name__}, expected a ltsh_addon.shading.Shading")
-    values = getattr(found, name)
+    if not isinstance(shaded, Shading):
+        raise ValueError(f"{subject} returned {type(shaded).__name__}, expected a ltsh_addon.shading.Shading")
+    values = getattr(shaded, name)
     if values is None and name == "diffuse":
         return None
     shape = np.shape(values)

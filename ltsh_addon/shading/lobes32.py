@@ -89,10 +89,10 @@ def fresnel_kinds(samples, members):
     yield (0, 1, 2), members[~dielectric & dipped], f82
     for vector, with_ior in _by_ior(samples.ior, members[dielectric & ~metal]):
         yield (0, vector), with_ior, coat
-    for own, chosen in (((0, 1), metal & ~dipped), ((0, 1, 2), dipped)):
-        first = f82 if 2 in own else schlick
+    for metal_vectors, chosen in (((0, 1), metal & ~dipped), ((0, 1, 2), dipped)):
+        first = f82 if 2 in metal_vectors else schlick
         for vector, with_ior in _by_ior(samples.ior, members[dielectric & chosen]):
-            yield (*own, vector), with_ior, partial(metal_and_coat, first=first)
+            yield (*metal_vectors, vector), with_ior, partial(metal_and_coat, first=first)
 
 
 def _by_ior(ior, members):
@@ -168,9 +168,9 @@ def as_columns(vectors, index):
     return np.ascontiguousarray(vectors[index].T, dtype=np.float32)
 
 
-def _selected(values, part, index):
+def _selected(values, columns, index):
     """Values (..., Q) at the columns `index` (None: all) of the slice `part` of columns."""
-    values = values[..., part]
+    values = values[..., columns]
     return values if index is None else np.take(values, index, axis=-1)
 
 
@@ -181,7 +181,7 @@ class FormFactor:
     def __init__(self, scratch):
         self.scratch = scratch
 
-    def __call__(self, part, corners, index, smallest=moments32.SMALLEST_SAFE):
+    def __call__(self, columns, corners, index, smallest=moments32.SMALLEST_SAFE):
         integral, needs_float64 = moments32.cosine_integral(corners, self.scratch, smallest)
         integral *= np.float32(-1.0 / np.pi)
         return np.maximum(integral, np.float32(0.0))[None], needs_float64
@@ -194,8 +194,8 @@ class ShadowedFormFactor:
         self.smooth = np.stack([dot(row, rows[3]) for row in rows[:3]])
         self.bump_alpha2, self.scratch = bump_alpha2, scratch
 
-    def __call__(self, part, corners, index, smallest=moments32.SMALLEST_SAFE):
-        smooth, bump_alpha2 = (_selected(values, part, index) for values in (self.smooth, self.bump_alpha2))
+    def __call__(self, columns, corners, index, smallest=moments32.SMALLEST_SAFE):
+        smooth, bump_alpha2 = (_selected(values, columns, index) for values in (self.smooth, self.bump_alpha2))
         integrals, needs_float64 = moments32.vector_irradiance(corners, self.scratch, smallest)
         direction = np.negative(integrals, out=integrals)
         along = np.maximum(dot(direction, smooth), np.float32(1e-15))
@@ -214,8 +214,8 @@ class LobeIntegral:
     def __init__(self, ridges, weights, scratch):
         self.ridges, self.weights, self.scratch = ridges, weights, scratch
 
-    def __call__(self, part, corners, index, smallest=moments32.SMALLEST_SAFE):
-        weights = _selected(self.weights, part, index)
+    def __call__(self, columns, corners, index, smallest=moments32.SMALLEST_SAFE):
+        weights = _selected(self.weights, columns, index)
         values, _, cosine, needs_float64 = self.ridges.integrals(corners, weights, self.scratch, smallest)
         np.negative(values, out=values)
         np.maximum(values, np.float32(0.0), out=values)
@@ -242,14 +242,14 @@ class ProfiledIntegral:
         needs_float64 = np.zeros(len(index), bool)
         step = max(CORNERS // (corners.shape[1] * (2 * self.effort.chords + 1)), 512)
         for start in range(0, len(index), step):
-            part = slice(start, start + step)
-            flat, view = corners[-2:, :, part], self.view.take(index[part])
+            chunk = slice(start, start + step)
+            flat, view = corners[-2:, :, chunk], self.view.take(index[chunk])
             layers = light_profile.layers(view, flat, self.profile, self.effort)
             for number, (near, weights, polygons) in enumerate(layers):
                 # Small disks count little, so the rounding of their edges is lost in the sum.
                 smallest = 0.0 if number < self.effort.layers - 1 else moments32.SMALLEST_SAFE
-                found, redo = self.integrate(polygons, index[part][near], smallest=smallest)
-                values[:, start + near] += weights * found
+                integrals, redo = self.integrate(polygons, index[chunk][near], smallest=smallest)
+                values[:, start + near] += weights * integrals
                 needs_float64[start + near] |= redo
         return values, needs_float64
 

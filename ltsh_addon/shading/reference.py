@@ -263,12 +263,12 @@ def half_vector_integrals(halves: HalfVectors, polygon, ior, *, cone=None, metal
         batch = max(_BATCH // (order[0] * order[1]), 1)
         for start in range(0, len(arcs), batch):
             chosen = arcs[start : start + batch]
-            own = owner[chosen]
+            owner_index = owner[chosen]
             rows = _arc_sums(
-                order, (boundary, chosen, toward[:, chosen]), [_taken(part, own, dtype) for part in setting]
+                order, (boundary, chosen, toward[:, chosen]), [_taken(part, owner_index, dtype) for part in setting]
             )
             for row, values in zip(total, rows, strict=True):
-                row += np.bincount(own, values, count)
+                row += np.bincount(owner_index, values, count)
         return total
 
     if quick:
@@ -286,13 +286,15 @@ def half_vector_integrals(halves: HalfVectors, polygon, ior, *, cone=None, metal
     return result, error
 
 
-def _taken(part, index, dtype):
+def _taken(values, index, dtype):
     """The points `index` of `part`: None, an array (P, ...) or an object with `take`. In `dtype`, except for cones."""
-    if isinstance(part, HalfVectors):
-        return part.take(index).astype(dtype)
-    if isinstance(part, list):
-        return [term[index].astype(dtype) for term in part]
-    return part if part is None else part[index].astype(dtype) if isinstance(part, np.ndarray) else part.take(index)
+    if isinstance(values, HalfVectors):
+        return values.take(index).astype(dtype)
+    if isinstance(values, list):
+        return [term[index].astype(dtype) for term in values]
+    if isinstance(values, np.ndarray):
+        return values[index].astype(dtype)
+    return None if values is None else values.take(index)
 
 
 def _arc_sums(order, fan, setting):
@@ -438,8 +440,8 @@ def _integrals(framed, lobes, light, corners, candidates):
         if clipped[index].any():
             metal = [term[index] * clipped[index, None] for term in terms]
         if halves is not None:
-            own = halves.take(index)
-            integrals, estimate = half_vector_integrals(own, outline, ior, cone=cone, metal=metal, quick=quick)
+            half_vectors = halves.take(index)
+            integrals, estimate = half_vector_integrals(half_vectors, outline, ior, cone=cone, metal=metal, quick=quick)
         else:
             make_boundary = (
                 partial(PolygonBoundary.warped, polygon=outline) if isinstance(outline, np.ndarray) else outline
@@ -512,30 +514,30 @@ def _cone_parts(framed, cosine, light, corners, candidates):
         if len(near) == 0:
             continue
         index, view = index[near], view.take(near)
-        part = light_profile.PolygonInDisks(polygon[3:, :, near])
+        in_disks = light_profile.PolygonInDisks(polygon[3:, :, near])
         reach = tangent * view.distance
-        flat = part.inside(reach, _CONE_CHORDS)
+        flat = in_disks.inside(reach, _CONE_CHORDS)
         axis = view.foot[3:] / view.distance
-        for chosen, boundary, at_foot in _around_foot_and_peak(part, reach, flat, view):
+        for chosen, boundary, at_foot in _around_foot_and_peak(in_disks, reach, flat, view):
             cone = Cone(axis[:, chosen], view.distance[chosen], profile, at_foot)
             yield index[chosen], boundary, cone
 
 
-def _around_foot_and_peak(part, reach, flat, view):
+def _around_foot_and_peak(in_disks, reach, flat, view):
     """Yield (chosen (R,), polygons (3, W, R), mask (R,) of those to be integrated around the foot)."""
-    peak, _, seen, _ = view.peak()
-    following = np.roll(part.flat, -1, axis=1)
-    along, offset = following - part.flat, peak[:, None] - part.flat
+    peak, _, peak_visible, _ = view.peak()
+    following = np.roll(in_disks.flat, -1, axis=1)
+    along, offset = following - in_disks.flat, peak[:, None] - in_disks.flat
     side = along[0] * offset[1] - along[1] * offset[0]
-    peak_inside = seen & ((side >= 0.0).all(axis=0) | (side <= 0.0).all(axis=0))
+    peak_inside = peak_visible & ((side >= 0.0).all(axis=0) | (side <= 0.0).all(axis=0))
     squared = peak[0] * peak[0] + peak[1] * peak[1]
     peak_inside &= squared < reach * reach
-    both = part.encloses & peak_inside & (squared > 0.0)
+    both = in_disks.encloses & peak_inside & (squared > 0.0)
     corners = view.corners(flat)[3:]
     toward_peak = flat[0] * peak[0] + flat[1] * peak[1] - 0.5 * squared
     with_height = np.concatenate([corners, np.where(both, toward_peak, 1.0)[None]])
     for chosen, polygons in split_at_horizon(with_height, axis=3):
-        yield chosen, polygons[:3], (part.encloses & ~peak_inside)[chosen]
+        yield chosen, polygons[:3], (in_disks.encloses & ~peak_inside)[chosen]
     cut = np.nonzero(both)[0]
     if len(cut):
         with_height = np.concatenate([corners, -toward_peak[None]])[:, :, cut]

@@ -3,9 +3,9 @@
 This file starts with what both precisions share. The corners and parts of lights in single and in double precision
 follow. Last come the patches of lights with children, textures near and far. Each sample gets the coarsest patches that
 its lobe cannot resolve; together they are all of the light above its horizons. A patch has the mean radiance of its
-children. The error of the mean is second order in the size of the patch, in units of the length over which the rest of the
-integrand changes. For diffuse lobes that length is the distance. For specular lobes it is the width of the lobe, or the
-angle from its peak if that is larger.
+children. The error of the mean is second order in the size of the patch, in units of the length over which the rest of
+the integrand changes. For diffuse lobes that length is the distance. For specular lobes it is the width of the lobe, or
+the angle from its peak if that is larger.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
-"""Lights that face every point: the balls and disks of point and spot lights, and the cones of spots.
+"""Facing lights, which look the same from every side: point lights, and spot lights with their cones.
 
-A ball is seen as the disk in its outline. From within a ball, light comes from everywhere; a disk that almost fills the
-half space over the lobe's normal stands for it.
+A sphere is seen as the disk in its outline. From within a sphere, light comes from everywhere; a disk that almost fills
+the half space over the lobe's normal stands for it. Cones and patterns make some places of a disk brighter than others:
+`mean_emission` weights them by the lobe.
 """
 
 from __future__ import annotations
@@ -13,9 +14,9 @@ import numpy as np
 from ..lobes.brdf import ggx_distribution, masking
 from ..lobes.polygon import dot
 
-# Distance, in units of a ball's radius, of the disk that stands for the half space seen from within.
+# Distance, in units of a sphere's radius, of the disk that stands for the half space seen from within.
 NEAR_DISK = 1e-3
-# Least share of the squared distance by which a point counts as outside a ball.
+# Least share of the squared distance by which a point counts as outside a sphere.
 LEAST_SHRINKING = 1e-6
 # Least radius of a disk in units of its distance: in smaller ones too few digits of double precision tell edges apart.
 LEAST_SIZE = 1e-5
@@ -46,7 +47,7 @@ _RULES = [_disk_rule(*orders) for orders in ORDERS]
 
 @dataclass(frozen=True)
 class FacingDisk:
-    """The disks that Q points see. Corners and half axes have the order of `Light.polygon`."""
+    """The disks as which Q points see a facing light. Corners and half axes have the order of `Light.polygon`."""
 
     offset: np.ndarray  # (3, Q) from the points to the centers
     half_u: np.ndarray  # (3, Q)
@@ -235,7 +236,9 @@ def mean_emission(light, offset: np.ndarray, disk: FacingDisk, lobe: AnalyticLob
         lobes = lobe.take(points)
         weights = lobes.values(directions) / lengths**3 * shares.astype(lengths.dtype)[:, None]
         peak = lobes.peak(disk.take(points))
-        at_peak, toward_peak, length = factors_at(light, offset[:, points], peak)
+        length = np.sqrt(dot(peak, peak))
+        toward_peak = peak / length
+        at_peak = emission(light, offset[:, points], toward_peak)
         weight = PEAK_WEIGHT * lobes.values(toward_peak[:, None])[0] / length**3
         weight *= lobes.view is not None
         whole = weights.sum(axis=0) + weight
@@ -252,13 +255,6 @@ def _parts(rule):
         step = NODES_CHUNK // len(shares)
         for start in range(0, len(chosen), step):
             yield chosen[start : start + step], (places, shares)
-
-
-def factors_at(light, offset, places):
-    """Emission (Q,) of points of the light at `places` (3, Q), and their unit directions (3, Q) and distances (Q,)."""
-    length = np.sqrt(dot(places, places))
-    directions = places / length
-    return emission(light, offset, directions), directions, length
 
 
 @dataclass(frozen=True)

@@ -3,9 +3,9 @@
 This file starts with what both precisions share. The corners and parts of lights in single and in double precision
 follow. Last come the patches of lights with children, textures near and far. Each sample gets the coarsest patches that
 its lobe cannot resolve; together they are all of the light above its horizons. A patch has the mean radiance of its
-parts. The error of the mean is second order in the size of the patch, in units of the length over which the rest of the
-integrand changes. For diffuse lobes that length is the distance. For specular lobes it is the width of the lobe, or the
-angle from its peak if that is larger.
+children. The error of the mean is second order in the size of the patch, in units of the length over which the rest of
+the integrand changes. For diffuse lobes that length is the distance. For specular lobes it is the width of the lobe, or
+the angle from its peak if that is larger.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ ROUNDING, FARTHEST_ROUNDED = 4e-7, 4000.0
 # Measured on random surfaces at a light's size from it, with the contrasts of a photograph: the patches of a sample
 # agree with the smallest ones to 0.2 % (relative L2). With 0.006, a sample takes 150 patches of 1024 on average.
 PATCH_PRODUCT = 0.004
-# Greatest half diagonal of a patch in units of that length, which also holds if the means of its parts are equal.
+# Greatest half diagonal of a patch in units of that length, which also holds if its children are equally bright.
 LARGEST_PATCH = 0.5
 # The same two limits for the sky, which is all around: what patches lose on one side of a lobe they gain on the other.
 # Measured on skies with and without fine detail: 0.15 % and 0.3 % (relative L2) from the smallest patches, with 200
 # patches a lobe.
 SKY_PRODUCT, LARGEST_OF_SKY = 0.1, 0.6
-# Least width of a lobe in rad, so that mirrors find patches without parts.
+# Least width of a lobe in rad, so that mirrors take the smallest patches.
 LEAST_WIDTH = 1e-7
 # The diffuse reflection of a sky is tabulated by normals on a cube. GRID: normals along each side of a face.
 # GRID_POINTS: directions that are added at a time. POINT_SIZE: largest half diagonal in rad of what counts as a single
@@ -316,9 +316,9 @@ class PatchTree:
     direction: np.ndarray  # (3,) unit, toward the samples
     half: np.ndarray  # (N,) half the diagonal
     reach: np.ndarray  # (N,) rad, about the angle from the center to the corners; distant lights only
-    largest: np.ndarray  # (N,) largest size in units of the lobe's length; infinite for patches without parts
-    first: np.ndarray  # (N,) number of the first part
-    count: np.ndarray  # (N,) number of parts
+    largest: np.ndarray  # (N,) largest size in units of the lobe's length; infinite for patches without children
+    first: np.ndarray  # (N,) number of the first child
+    count: np.ndarray  # (N,) number of children
 
     @classmethod
     def of(cls, light: Light) -> PatchTree:
@@ -458,7 +458,7 @@ def fitting_patches(light: Light, samples: SurfaceSamples, specular: bool) -> It
     tree = PatchTree.of(light)
     pairs = tree.pairs(samples, (), np.arange(len(samples)), specular)
     index, patch = (np.concatenate(values) for values in zip(*pairs, strict=True))
-    # Parts that have no parts share a key with the others of their patch, because the same samples take them.
+    # Leaves share a key with the other leaves of their patch, because the same samples take them.
     key, owner = np.arange(len(tree.count)), np.repeat(np.arange(len(tree.count)), tree.count)
     key[1:] = np.where(tree.count[1:] == 0, -1 - owner, key[1:])
     order = np.argsort(key[patch], kind="stable")
@@ -485,12 +485,12 @@ class _Peaks:
 
 
 def _largest_sizes(area, radiance, first, count, is_distant) -> np.ndarray:
-    """Largest sizes (N,) of patches by their contrast: the difference between a patch and its parts, relative to the
+    """Largest sizes (N,) of patches by their contrast: the difference between a patch and its children, relative to the
     whole light."""
     brightness, owner = np.abs(radiance).sum(axis=0), np.repeat(np.arange(len(count)), count)
     child = np.arange(1, len(count))
     different = area[child] * np.abs(radiance[:, child] - radiance[:, owner]).sum(axis=0)
-    # The part of a patch that its parts do not cover is dark.
+    # What the children of a patch do not cover is dark.
     dark = np.maximum(area - np.bincount(owner, area[child], len(count)), 0.0) * brightness
     contrast = (np.bincount(owner, different, len(count)) + dark) / np.maximum(area * brightness[0], 1e-30)
     product, most = (SKY_PRODUCT, LARGEST_OF_SKY) if is_distant else (PATCH_PRODUCT, LARGEST_PATCH)
@@ -499,7 +499,7 @@ def _largest_sizes(area, radiance, first, count, is_distant) -> np.ndarray:
 
 
 def cached_on_children(name, lights, made):
-    """The result of made(lights). It is kept with the parts of the first light, which its copies share."""
+    """The result of made(lights). It is cached on the first child of the first light, which copies of that share."""
     key = [light.children[0] for light in lights], [(*light.center, *light.radiance) for light in lights]
     cache = vars(lights[0].children[0])
     cached = cache.get(name)

@@ -91,12 +91,6 @@ class Profile:
         return factor * (1.0, np.sqrt(squared), squared)[self.falloff]
 
 
-def peak_factor(spread: float) -> float:
-    """The factor straight ahead of the light, its largest value."""
-    tangent, share = spread_tangent(spread)
-    return tangent / share
-
-
 def plane_axes(light) -> np.ndarray:
     """Two orthonormal axes (2, 3) in the plane of the light, the first along half_u."""
     first = light.half_u / np.sqrt((light.half_u**2).sum())

@@ -14,7 +14,7 @@ from functools import cache
 
 import numpy as np
 
-from ..lobes.polygon import dot
+from ..lobes.polygon import cross, dot
 from .light_polygons import PatchTree, cached_on_children
 from .light_profile import gauss_legendre
 
@@ -144,7 +144,7 @@ class SkyMap:
         for start in range(0, len(chosen), MAP_CHUNK):
             columns = chosen[start : start + MAP_CHUNK]
             first, second, third = (lobes.rows[row][:, columns] for row in range(3))
-            axes = _cross(second, third), _cross(third, first), _cross(first, second)
+            axes = cross(second, third), cross(third, first), cross(first, second)
             determinant = dot(first, axes[0])
             stretch = _stretch(axes)
             directions = [nodes[0] * stretch, nodes[1] / stretch, nodes[2]]
@@ -166,7 +166,7 @@ class SkyMap:
 def _stretch(axes):
     """Factor (Q,) by which directions are stretched along the first axis (3, Q) of lobes and shrunk along the second.
     It is the root of the factor that would make the area they cover round in the world."""
-    across = _cross(axes[0], axes[2])
+    across = cross(axes[0], axes[2])
     squares = dot(across, across) / (dot(axes[1], axes[1]) * dot(axes[2], axes[2]))
     return squares ** np.float32(-0.125)
 
@@ -203,10 +203,6 @@ def _nodes(count: int) -> tuple[np.ndarray, np.ndarray]:
     )  # fmt: skip
     change = np.linalg.lstsq(moments * angle, wanted @ weight - moments @ angle, rcond=None)[0]
     return nodes[:, :, None].astype(np.float32), (angle * (1.0 + change))[:, None].astype(np.float32)
-
-
-def _cross(a, b):
-    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
 def _cells(count: int, more: int = 0) -> np.ndarray:

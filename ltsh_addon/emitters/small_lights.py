@@ -15,7 +15,7 @@ import numpy as np
 
 from ..lobes.lobe_integrals import LEAST_SHARE
 from ..lobes.lookup_table import bent_cosines
-from ..lobes.polygon import dot
+from ..lobes.polygon import cross, dot
 from ..lobes.spherical_harmonics import degree_of
 from .light_polygons import LEAST_COSINE, LOBE_WIDTH
 
@@ -33,25 +33,23 @@ class SmallLight:
     radius: float  # m, around the centroid
     area_vector: np.ndarray  # (3,) m^2, toward where it shines
     diagonal: float  # m^2: square of the longer half diagonal of the parallelogram around it
-    covariance: np.ndarray  # (3, 3) m^2, of its points
 
     @classmethod
     def of(cls, light) -> SmallLight:
-        """For an Light."""
+        """For a `Light`."""
         area = light.area_vector * np.copysign(1.0, light.area_vector @ light.direction)
-        u, v = light.half_u, light.half_v
+        u, v, center = light.half_u, light.half_v, light.center
         diagonal = max(((u + v) ** 2).sum(), ((u - v) ** 2).sum())
-        covariance = (np.outer(u, u) + np.outer(v, v)) / (4.0 if light.is_round else 3.0)
-        if light.is_round:
-            return cls(light.center, float(np.sqrt(max(u @ u, v @ v))), area, diagonal, covariance)
-        if light.corners is None:
-            return cls(light.center, float(np.sqrt(diagonal)), area, diagonal, covariance)
-        (center,), (covariance,) = _moments(light.corners[None], light.area_vector[None])
-        return cls(center, float(np.linalg.norm(light.corners - center, axis=1).max()), area, diagonal, covariance)
+        radius = np.sqrt(max(u @ u, v @ v) if light.is_round else diagonal)
+        if light.corners is not None:
+            (center,), _ = _moments(light.corners[None], light.area_vector[None])
+            radius = np.linalg.norm(light.corners - center, axis=1).max()
+        return cls(center, float(radius), area, diagonal)
 
 
 def moments_of(lights) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Centers (L, 3), area vectors (L, 3), covariances (L, 3, 3) and diagonals (L,), as in `SmallLight`."""
+    """Centers (L, 3), area vectors (L, 3), covariances (L, 3, 3) of the points in m^2, and diagonals (L,) of lights, as
+    in `SmallLight`."""
     center, u, v, direction = (
         np.array([getattr(light, name) for light in lights]) for name in ("center", "half_u", "half_v", "direction")
     )
@@ -227,9 +225,7 @@ class LobeAtPoint:
         self.rows, self.limits = rows, limits
         self.is_cosine, self.bend = table.family == "ltc", table.bend
         x, y, z = rows[:3]
-        self.determinant = dot(x, np.stack([
-            y[1] * z[2] - y[2] * z[1], y[2] * z[0] - y[0] * z[2], y[0] * z[1] - y[1] * z[0]
-        ]))  # fmt: skip
+        self.determinant = dot(x, cross(y, z))
         self.terms = weights if self.is_cosine else polynomial_terms(weights)
 
     def __call__(self, columns, rays: RaysToCenters):

@@ -36,7 +36,7 @@ class LightFromPoints:
 
     @classmethod
     def of(cls, light, offset, toward) -> LightFromPoints:
-        """For an Light or a `float64.LightOfEachSample`, in the precision of `offset`."""
+        """For a `Light` or a `float64.LightOfEachSample`, in the precision of `offset`."""
         vectors = np.stack([light.half_u + light.half_v, light.half_u - light.half_v, light.area_vector])
         vectors = vectors[..., None] if vectors.ndim == 2 else vectors.transpose(0, 2, 1)
         squares = (vectors * vectors).sum(axis=1).astype(offset.dtype)

@@ -27,6 +27,11 @@ def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
+def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Cross products (3, ...) of vectors (3, ...)."""
+    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
 def clip_to_horizon(vertices: np.ndarray, axis: int = 2) -> np.ndarray:
     """The parts (C, W, P) of polygons (C, V, P) with C coordinates where coordinate `axis` is positive.
 

@@ -91,6 +91,6 @@ def test_an_own_opencolorio_configuration_is_taken_into_account(tmp_path, monkey
     colored_room("Linear Rec.709")
     path = scene_parts.save(tmp_path / "scene.blend")
     monkeypatch.setenv("OCIO", str(own / "config.ocio"))
-    found = extract_pixels(PixelJob(path)).color_space
+    found = extract_pixels(PixelJob(path)).picture.color_space
     # Since 5.0 the space stands in the file; before, the configuration alone decides.
     assert found.name == ("Linear Rec.709" if CHOOSES_SPACES else space)

@@ -18,8 +18,7 @@ KINDS = ("plain", "horizon", "tiny", "disk", "polygon", "linked", "spread")
 def main(rig):
     yield 1
     rig.fact("graphics", f"{gpu.platform.backend_type_get()}, {gpu.platform.renderer_get()}")
-    viewport = ".blender.viewport"
-    for name in ("", ".scene", ".cycles", ".cycles.closures", f"{viewport}.drawing", f"{viewport}.gbuffer"):
+    for name in ("", ".scene", ".cycles", ".cycles.closures", ".blender.viewport.drawing"):
         sys.modules[f"ltsh_addon{name}"] = importlib.import_module(f"{ADDON}{name}")
     import random_surfaces
     import uploaded_samples

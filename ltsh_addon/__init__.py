@@ -12,8 +12,12 @@ These are the rooms of the package. A room imports only itself and rooms above i
     scene         the shared vocabulary: lights, SurfaceSamples, Film, errors, names of techniques and passes
     reading       how files of others are read: what they may hold, what they must have
     files         how files are written, and how leftovers of dead processes are deleted
-    shading       the paper: lookup table, polygons, integrals, `shade`, reference quadrature (numpy only)
+    lobes         the paper: lookup tables, spherical harmonics, polygons, integrals, BRDFs (numpy only)
+    emitters      how each kind of light becomes polygons, points or factors (numpy only)
+    workers       child processes that share the work
+    shading       `shade`, the reference quadrature, the header for other engines (numpy only)
     cycles        how Cycles shades: BSDF formulas, normals, G-buffers, UV rasters (numpy only)
+    visibility    the visibility of lights: occluders, and rays by Embree (numpy and ctypes)
     imaging       EXR, metrics, color, comparison sheet, report
     blender       .blend to lights and samples, Cycles renders, viewport, panels, render engine (all that knows bpy)
     pipeline      a .blend in, files out: pictures, bakes, tasks

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -24,9 +24,7 @@ from ltsh_addon.shading import header, load_table
 _WARP_NAMES = ("A", "B", "C", "tilt")
 
 
-def export_tables(
-    prefixes: Mapping[str, str], folder: str | os.PathLike, progress: Callable[[str, float], object] | None = None
-) -> dict[str, list[Path]]:
+def export_tables(prefixes: Mapping[str, str], folder: str | os.PathLike) -> dict[str, list[Path]]:
     """Write the tables of `export_prefixes` into `folder`, created if needed; returns the files by table.
 
     All tables are read before anything is written. The files of a table appear all or none. Raises TableError,
@@ -39,10 +37,8 @@ def export_tables(
     except OSError as error:
         raise OSError(f"output folder {folder}: cannot be made ({error.strerror}); choose another folder") from error
     files = {}
-    for number, (given, table) in enumerate(tables.items(), start=1):
+    for given, table in tables.items():
         files[given] = export_table(table, Path(given).stem, prefixes[given], folder)
-        if progress is not None:
-            progress("export", number / len(tables))
     return files
 
 

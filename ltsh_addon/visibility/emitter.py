@@ -11,9 +11,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..emitters import light_profile
-from ..lobes.polygon import convex_pieces
+from ..lobes.polygon import convex_pieces, dot
 from ..scene import Light, PolygonLight, SkyLight
-from .sampling import dot
 
 _ZERO, _ONE, _TINY = np.float32(0.0), np.float32(1.0), np.float32(1e-30)
 # Cells along each side of the picture of a textured light.

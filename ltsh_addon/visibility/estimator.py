@@ -16,11 +16,11 @@ from ..cycles.light_tree import light_selection_pmf, light_tree_rows
 from ..emitters.facing import FacingDisk
 from ..emitters.light_polygons import may_reach, off_plane
 from ..lobes import brdf
+from ..lobes.polygon import dot
 from ..scene import FARTHEST, PASSES, Film, Light, PolygonLight, SurfaceSamples, round_outline
 from .emitter import Emitter, Sky
 from .light_cluster import LightCluster
 from .ray_sampler import PROBES, RayBatch, RaySampler, SampleRows
-from .sampling import dot
 
 MOST_RAYS = 1024
 # Rays of a block, few enough for its arrays to stay in the cache.

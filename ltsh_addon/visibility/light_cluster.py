@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..emitters import light_tree
-from ..lobes.polygon import convex_pieces
+from ..lobes.polygon import convex_pieces, dot
 from ..scene import FlatLight, Light, PointLight, PolygonLight, QuadLight, SkyLight
 from .emitter import Emitter, Sky
-from .sampling import dot
 
 _ZERO, _ONE, _TINY = np.float32(0.0), np.float32(1.0), np.float32(1e-30)
 

@@ -20,10 +20,11 @@ from ..emitters.facing import FacingDisk, emission, ray_length
 from ..emitters.light_polygons import LEAST_COSINE, LOBE_WIDTH, has_lobe, off_plane
 from ..lobes.brdf import dielectric_reflectance, schlick_curve, stretch
 from ..lobes.diffuse import diffuse_factor
+from ..lobes.polygon import dot
 from ..scene import FARTHEST, SurfaceSamples
 from .emitter import Emitter, Sky
 from .light_cluster import LightCluster, LobeBound
-from .sampling import SphericalQuads, Warps, dot, frames, seeds_of, unit_points
+from .sampling import SphericalQuads, Warps, frames, seeds_of, unit_points
 from .shadow_terminator import RayOrigins
 
 # Number of probe rays of a pair. More rays come in multiples of it.
@@ -276,8 +277,9 @@ class RaySampler:
         return leaf.reshape(x.shape), pmf.reshape(len(lobes), *x.shape), rest.reshape(x.shape)
 
     def corner_heights(self, horizons):
-        """As `Pairs._corner_heights`, for the corners of the leaves that the probes go to. Leaves that face away have
-        height -1."""
+        """As `RatioEstimator._corner_heights`, for the corners of the leaves that the probes go to.
+
+        Leaves that face away have height -1."""
         x = unit_points(self.seeds, 0, 0, PROBES)[0]
         leaf, pmf, _ = self._leaves(x, PROBES)
         corners = self.emitter.corners[:, :, leaf] + self.offset[:, None, None]

@@ -11,6 +11,7 @@ import copy
 import numpy as np
 
 from ..lobes.lookup_table import WARP_REGULARIZATION
+from ..lobes.polygon import cross, dot
 
 _ZERO, _ONE, _TINY = np.float32(0.0), np.float32(1.0), np.float32(1e-30)
 # In sr. Quadrilaterals with a smaller solid angle count as invisible.
@@ -32,7 +33,7 @@ class SphericalQuads:
         self.gap = np.float32(0.5) * dot(self.both, self.both)
         self.terms, angles = [], []
         for near in self.near:
-            volume = np.abs(dot(_cross(near - self.apex, chord), self.apex))
+            volume = np.abs(dot(cross(near - self.apex, chord), self.apex))
             near_both = dot(near, self.both)
             both = self.apex + near
             self.terms.append((volume, np.float32(0.5) * dot(both, both), near_both))
@@ -172,16 +173,8 @@ def frames(normal: np.ndarray, view: np.ndarray):
     tangent -= dot(tangent, normal) / squared * normal
     tangent /= np.sqrt(dot(tangent, tangent))
     normal = normal / np.sqrt(squared)
-    rows = np.stack([tangent, _cross(normal, tangent), normal])
+    rows = np.stack([tangent, cross(normal, tangent), normal])
     return np.clip(dot(normal, view), _ZERO, _ONE), sine, rows
-
-
-def dot(a, b):
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _cross(a, b):
-    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
 # Bits of a coordinate of the sequence, as many as single precision holds.

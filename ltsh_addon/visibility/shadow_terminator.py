@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
+from ..lobes.polygon import dot
 from ..scene import SurfaceSamples
 from .occluders import ALL_RAYS, STEP, Hits, Occluders
 
@@ -150,7 +151,7 @@ class RayOrigins:
     def origins_of_rows(self, index: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Origins (3, S, Q) of S rays from each of the samples `index` (Q,), along unit `directions` (3, S, Q)."""
         normal, terminator = self.geometric_normal[index].T[:, None], self.terminator[index]
-        facing = _dot_rows(normal, directions)
+        facing = dot(normal, directions)
         side = np.copysign(self.clearance[index], facing)
         smooth = np.flatnonzero(terminator)
         lift = None
@@ -171,7 +172,7 @@ class RayOrigins:
         """As `aimed`, for one ray per sample, (R,), that starts at the sample itself. Rays that Cycles sends on from a
         surface do so."""
         normal = self.geometric_normal[index].T
-        moved = np.copysign(self.clearance[index], _dot_rows(normal, directions)) * normal
+        moved = np.copysign(self.clearance[index], dot(normal, directions)) * normal
         return moved + self.position[index].T, *_toward(directions, distances, moved)
 
     def aimed(
@@ -187,7 +188,7 @@ class RayOrigins:
         moved = origins - self.position[index].T[:, None]
         if at_surface:
             return origins, *_toward(directions, distances, moved)
-        lifted = np.flatnonzero(_dot_rows(moved, moved) > 4.0 * self.clearance[index] ** 2)
+        lifted = np.flatnonzero(dot(moved, moved) > 4.0 * self.clearance[index] ** 2)
         if len(lifted):
             directions, distances = directions.copy(), distances.copy()
             rows, ends = directions.reshape(3, -1), distances.ravel()
@@ -197,7 +198,7 @@ class RayOrigins:
     def _lifts(self, index, directions, facing, terminator):
         """How far above the sample (3, S, Q) rays of smooth samples start; and on which side of their own triangle (S,
         Q) they start so as not to meet it: above (1), below (-1), or as the direction says (0)."""
-        smooth_facing = _dot_rows(self.smooth_normal[index].T[:, None], directions)
+        smooth_facing = dot(self.smooth_normal[index].T[:, None], directions)
         is_inside = smooth_facing < 0.0
         flipped = np.where(is_inside, np.float32(-1.0), np.float32(1.0))
         facing, smooth_facing = facing * flipped, np.abs(smooth_facing)
@@ -213,13 +214,8 @@ def _toward(directions, distances, moved):
     """Unit directions (3, ...) and distances (...) of rays that start `moved` (3, ...) m away from others, and end
     where these end."""
     toward = directions * distances - moved
-    length = np.sqrt(_dot_rows(toward, toward))
+    length = np.sqrt(dot(toward, toward))
     return toward / np.maximum(length, np.float32(1e-30)), length
-
-
-def _dot_rows(first, second):
-    """Dot products (S, Q) of vectors (3, S, Q)."""
-    return first[0] * second[0] + first[1] * second[1] + first[2] * second[2]
 
 
 def _dot(first, second):

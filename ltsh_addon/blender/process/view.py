@@ -76,7 +76,7 @@ class WorldPicture:
 
     light: np.ndarray  # (6, N, N, 3), see `cycles.environment.CUBE`; empty if it gives no light
     lights: tuple[Light, ...]  # its small, bright spots
-    background: np.ndarray  # (M, M, 3), see `viewport.sky`
+    background: np.ndarray  # (M, M, 3), see `viewport.light_texels`
     warnings: list[str]
 
 

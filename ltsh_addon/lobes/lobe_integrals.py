@@ -38,7 +38,7 @@ LEAST_SHARE = 0.02
 
 
 def evaluate_lobe(table: LookupTable, cos_theta_o, roughness, directions) -> np.ndarray:
-    """The lobe in sr^-1, which approximates BRDF times cosine with F = 1; 0 below the horizon.
+    """The lobe D in sr^-1 (Allmenroeder and Peters 2021), about BRDF times cosine with F = 1; 0 below the horizon.
 
     cos_theta_o and roughness (P,) in [0, 1], unit directions (P, S, 3) in the local frame -> (P, S), float32 if the
     directions are, else float64. Raises ValueError if the shapes do not fit.
@@ -62,6 +62,8 @@ def evaluate_lobe(table: LookupTable, cos_theta_o, roughness, directions) -> np.
 
 def integrate_polygon(table: LookupTable, cos_theta_o, roughness, vertices, *, signed: bool = False) -> np.ndarray:
     """Integral of `evaluate_lobe` over the part of a polygon above the horizon: reflected radiance per radiance.
+
+    Allmenroeder and Peters 2021, eq. 1 and 2.
 
     cos_theta_o (P,), roughness (P,), vertices (P, V, 3) in the local frame in any length unit, either winding -> (P,),
     float32 if the vertices are, else float64. Raises ValueError if the shapes do not fit.

@@ -68,7 +68,7 @@ class Lobe:
     coefficients: np.ndarray  # (F, K, P), one vector per Fresnel curve
 
     def to_original_domain(self, vectors: np.ndarray) -> np.ndarray:
-        """W times `vectors` (3, ..., P)."""
+        """W times `vectors` (3, ..., P): eq. 2 of Allmenroeder and Peters 2021."""
         return np.stack(
             [self.xx * vectors[0] + self.xz * vectors[2], self.yy * vectors[1], self.zz * vectors[2]], axis=0
         )

@@ -34,7 +34,10 @@ def normalization(l: int, m: int) -> float:  # noqa: E741
 
 
 def evaluate(degree: int, directions: np.ndarray) -> np.ndarray:
-    """Values (K, ...) of all basis functions up to `degree` at unit directions (..., 3)."""
+    """Values (K, ...) of all basis functions up to `degree` at unit directions (..., 3).
+
+    Allmenroeder and Peters 2021, section 2, without the odd functions.
+    """
     x, y, z = directions[..., 0], directions[..., 1], directions[..., 2]
     basis = np.empty((coefficient_count(degree), *x.shape), dtype=directions.dtype)
     real, imaginary = np.ones_like(x), np.zeros_like(x)

@@ -174,7 +174,7 @@ def missing_images(depsgraph, world, override=None) -> list[str]:
     missing = [image for image in bpy.data.images if image.users and _is_lost(image)]
     if not missing:
         return []
-    users, objects, blocks = bpy.data.user_map(), set(), {world}
+    user_map, objects, blocks = bpy.data.user_map(), set(), {world}
     for instance in depsgraph.object_instances:
         ob = instance.object
         if ob.type == "LIGHT":
@@ -184,7 +184,7 @@ def missing_images(depsgraph, world, override=None) -> list[str]:
             blocks |= {override} if override else _materials_of_faces(ob)
 
     def shapes(block) -> bool:
-        return any(user in objects or isinstance(user, _SHAPING) and shapes(user) for user in users[block])
+        return any(user in objects or user.id_type in _SHAPING and shapes(user) for user in user_map[block])
 
     shown = {image for block in blocks - {None} for image in images_behind(block)}
     return [
@@ -204,12 +204,12 @@ def _materials_of_faces(ob) -> set:
 
 
 # Data by which images change the shape of objects, or where others stand on them.
-_SHAPING = bpy.types.Texture, bpy.types.GeometryNodeTree, bpy.types.ParticleSettings
+_SHAPING = "TEXTURE", "NODETREE", "PARTICLE"
 
 
 def _is_lost(image) -> bool:
     """True if a file of the image is not there; a sequence is there if its folder has one of its kind."""
-    if image.source not in ("FILE", "MOVIE", "SEQUENCE", "TILED") or len(image.packed_files) or not image.filepath:
+    if image.source not in ("FILE", "MOVIE", "SEQUENCE", "TILED") or image.packed_file or not image.filepath:
         return False
     path = Path(bpy.path.abspath(image.filepath, library=image.library))
     if image.source == "SEQUENCE":

@@ -14,9 +14,9 @@ from ltsh_addon.imaging.exr import read_channels
 pytestmark = pytest.mark.newest
 
 
-def lost(name, ending="png", source="FILE"):
-    image = bpy.data.images.new(name, 4, 4, tiled=source == "TILED")
-    image.source, image.filepath = source, f"//nowhere/{name}.{ending}"
+def lost(name, ending="png", tiled=False):
+    image = bpy.data.images.new(name, 4, 4, tiled=tiled)
+    image.source, image.filepath = "TILED" if tiled else "FILE", f"//nowhere/{name}.{ending}"
     return image
 
 
@@ -104,7 +104,7 @@ def gallery():
     plane("Plain", material("Plain", lost("yes material")), -2.0)
     plane("Group", grouped(lost("yes group")), -1.0)
     plane("Half", mixed("Half", lost("yes half"), 0.5), 0.0)
-    tiles = lost("yes tiles", "<UDIM>.png", "TILED")
+    tiles = lost("yes tiles", "<UDIM>.png", tiled=True)
     in_the_modifiers(plane("Tiles", material("Tiles", tiles), 1.0))
     # Not shown:
     unlinked = plane("None", mixed("None", lost("no weight"), 0.0), 2.0)
@@ -119,11 +119,12 @@ def gallery():
     empty = bpy.data.objects.new("Reference", None)
     empty.empty_display_type, empty.data = "IMAGE", lost("no, reference picture")
     scene.collection.objects.link(empty)
-    scene.camera.data.show_background_images = True
-    scene.camera.data.background_images.new().image = lost("no, behind the camera")
+    background_images = scene.camera.data.background_images
+    background_images.new().image = lost("no, behind the camera")
     stencil = bpy.data.textures.new("Stencil", "IMAGE")
     stencil.image = lost("no, brush")
-    bpy.data.brushes.new("Brush", mode="TEXTURE_PAINT").texture = stencil
+    brushes = bpy.data.brushes
+    brushes.new("Brush", mode="TEXTURE_PAINT").texture = stencil
     other = bpy.data.scenes.new("Other")
     elsewhere = plane("Elsewhere", material("Elsewhere", lost("no, other scene")), 0.0)
     scene.collection.objects.unlink(elsewhere)

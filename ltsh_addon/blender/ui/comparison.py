@@ -21,7 +21,8 @@ PANEL_REGIONS = {"VIEW_3D": "UI", "IMAGE_EDITOR": "UI", "PROPERTIES": "WINDOW"}
 GRIP_PIXELS = 12.0
 HANDLE_PIXELS = 9.0
 _LOOKUP_SIZE = 1024
-_state = {"lookup": None, "settling": set(), "saves_pixels": False, "dragged": None, "probing": False, "drawing": None}
+_state = {"lookup": None, "settling": set(), "saves_pixels": False, "dragged": None, "probing": False, "drawing": None,
+          "paths": []}  # fmt: skip
 
 
 def changed(settings, context) -> None:
@@ -40,6 +41,7 @@ def mixed(item, context) -> None:
     if settings.mode == "MIX":
         changed(settings, context)
     else:
+        settings.mode_before_mix = settings.mode
         settings.mode = "MIX"
     put_in_editor(context, item.id_data)
 
@@ -149,7 +151,6 @@ def viewer_image(scene):
             return image
     image = bpy.data.images.new(NAME, 4, 4, alpha=False, float_buffer=True)
     image[results.LAYER], image[results.SCENE] = "", scene.name
-    image.use_fake_user = True
     return image
 
 
@@ -294,13 +295,27 @@ def saving_images_as_they_are():
 
 
 @bpy.app.handlers.persistent
-def _shrink(*_):
-    """Before saving, remove pixels that can be made again from the file."""
-    for scene in bpy.data.scenes if not _state["saves_pixels"] else ():
+def _shrink(path="", *_):
+    """Before saving as `path`, remove pixels that can be made again from the file, and let paths begin at `path`."""
+    if _state["saves_pixels"]:
+        return
+    _state["paths"] = [
+        (owner, name, bpy.path.abspath(getattr(owner, name)))
+        for owner, name in results.paths_in(bpy.data.scenes)
+        if getattr(owner, name)
+    ]
+    _write_paths(path)
+    for scene in bpy.data.scenes:
         for image in results.our_images(scene):
             if is_viewer(image) and results.result_of(scene) is not None:
                 _store(image, np.zeros((4, 4, 4), dtype=np.float32), image.use_view_as_render)
                 image.pack()
+
+
+def _write_paths(blend: str) -> None:
+    """Write the paths of results relative to the file `blend`."""
+    for owner, name, path in _state["paths"]:
+        setattr(owner, name, results.blender_path(path, blend))
 
 
 @bpy.app.handlers.persistent
@@ -308,8 +323,15 @@ def _restore(*_):
     """After saving and loading, make the pixels again."""
     if _state["saves_pixels"]:
         return
+    _write_paths(bpy.data.filepath)
+    _state["paths"] = []
+    # Files of former versions keep the pictures of layers.
+    for image in bpy.data.images:
+        if results.LAYER in image and image.use_fake_user:
+            image.use_fake_user = False
     for scene in bpy.data.scenes:
-        if any(is_viewer(image) for image in results.our_images(scene)):
+        is_shown = any(is_viewer(image) for image in results.our_images(scene))
+        if is_shown or results.result_of(scene) is not None:
             refresh(scene)
     settle()
 
@@ -505,8 +527,8 @@ def _draw() -> None:
         draw_label(start, below, f"{first} \u2212 {second}", scale)
         limit = error_scale(settings, result.groups[choice.group], choice)
         _draw_legend(start, below - ROW * scale, limit, scale)
-    if result.partial:
-        draw_label(start, above, result.partial, scale)
+    if results.lacks(result):
+        draw_label(start, above, results.lacks(result), scale)
     draw_probe(context, result, choice, (left, bottom, right, top))
 
 
@@ -535,9 +557,10 @@ _add_classes, _remove_classes = bpy.utils.register_classes_factory((LTSH_OT_prob
 
 @bpy.app.handlers.persistent
 def _mix_again(*_):
-    """After undo and redo the mixer may have other values."""
+    """After undo and redo the settings may have other values than the picture that is shown."""
+    images = {area.spaces.active.image for area in _areas() if area.type == "IMAGE_EDITOR"}
     for scene in bpy.data.scenes:
-        if scene.ltsh.mode == "MIX":
+        if scene.ltsh.mode == "MIX" or any(is_viewer(image) and results.belongs(image, scene) for image in images):
             refresh(scene)
 
 

@@ -181,6 +181,12 @@ class LTSH_PG_mixed_light(bpy.types.PropertyGroup):
     settings: FloatVectorProperty(size=5, options={"HIDDEN"})
 
 
+class LTSH_PG_last_result(bpy.types.PropertyGroup):
+    """Where the last results of a command are, by its name."""
+
+    folder: StringProperty(subtype="DIR_PATH", options={"HIDDEN", "PATH_SUPPORTS_BLEND_RELATIVE"})
+
+
 NOT_HELD = -1
 
 
@@ -248,10 +254,13 @@ def _release(ob) -> None:
 
 
 def _is_muted(settings) -> bool:
-    return bool((_hidden(settings.id_data) if settings.held == NOT_HELD else settings.held) & 2)
+    ob = settings.id_data
+    return bool(_hidden(ob) if settings.held == NOT_HELD else settings.held) or ob.hide_get()
 
 
 def _set_muted(settings, muted: bool) -> None:
+    if not muted and settings.id_data.hide_get():
+        settings.id_data.hide_set(False)
     if settings.held != NOT_HELD and any(ob.ltsh_light.solo for ob in lights_of(bpy.context.scene)):
         settings.held = 3 if muted else 0
     else:
@@ -263,7 +272,8 @@ class LTSH_PG_light(bpy.types.PropertyGroup):
     """What the list of lights changes in an object."""
 
     mute: BoolProperty(
-        name="Mute", description="Hide the light in views and renders", get=_is_muted, set=_set_muted
+        name="Mute", description="Hide the light in views and renders; also closed where H hides it",
+        get=_is_muted, set=_set_muted,
     )  # fmt: skip
     solo: BoolProperty(
         name="Solo", description="Hide all lights that are not on solo, in views and renders, until this is off again",
@@ -343,6 +353,7 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
         name="Active Light", description="Click a light to select it", get=_active_index, set=_select,
         options={"HIDDEN"},
     )  # fmt: skip
+    last_results: CollectionProperty(type=LTSH_PG_last_result, options={"HIDDEN"})
     result_folder: StringProperty(
         name="Results", description="Folder of the pictures that are shown",
         subtype="DIR_PATH", options={"HIDDEN", "PATH_SUPPORTS_BLEND_RELATIVE"},
@@ -352,6 +363,7 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
     mode: EnumProperty(
         name="View", description="How the two pictures are shown", items=MODES, default="WIPE", update=changed
     )
+    mode_before_mix: StringProperty(default="WIPE", options={"HIDDEN"})
     groups: CollectionProperty(type=bpy.types.PropertyGroup)
     group: StringProperty(name="Object", description="Which baked texture is shown", update=changed)
     first: EnumProperty(
@@ -409,6 +421,7 @@ CLASSES = (
     LTSH_AddonPreferences,
     LTSH_PG_mixed_light,
     LTSH_PG_light,
+    LTSH_PG_last_result,
     LTSH_PG_scene,
     LTSH_OT_add_preset,
     LTSH_PT_presets,

@@ -63,7 +63,7 @@ def depth_of_rays(made):
 
 
 def power_of_facing(made):
-    return mixed(made, calculated(made, "POWER", node(made, "LayerWeight", "Facing", Blend=0.4), 2.0))
+    return mixed(made, calculated(made, "POWER", node(made, "LayerWeight", "Facing", **{"Blend": 0.4}), 2.0))
 
 
 # What nodes give depends on the ray alone: nothing is baked.
@@ -73,7 +73,7 @@ READ = {
     "depth of rays": (depth_of_rays, "tilted"),
     "Fresnel": (lambda made: mixed(made, fresnel(made)), "tilted"),
     "Fresnel on a ball": (lambda made: mixed(made, fresnel(made)), "ball"),
-    "Layer Weight, Fresnel": (lambda made: mixed(made, node(made, "LayerWeight", "Fresnel", Blend=0.2)), "ball"),
+    "Layer Weight, Fresnel": (lambda made: mixed(made, node(made, "LayerWeight", "Fresnel", **{"Blend": 0.2})), "ball"),
     "a power of Facing": (power_of_facing, "ball"),
     "Backfacing": (behind, "ball"),
 }

@@ -21,8 +21,7 @@ PANEL_REGIONS = {"VIEW_3D": "UI", "IMAGE_EDITOR": "UI", "PROPERTIES": "WINDOW"}
 GRIP_PIXELS = 12.0
 HANDLE_PIXELS = 9.0
 _LOOKUP_SIZE = 1024
-_state = {"lookup": None, "settling": set(), "saves_pixels": False, "dragged": None, "probing": False, "drawing": None,
-          "paths": []}  # fmt: skip
+_state = {"lookup": None, "settling": set(), "paths": [], "saves_pixels": False, "dragged": None, "probing": False}
 
 
 def changed(settings, context) -> None:
@@ -299,11 +298,9 @@ def _shrink(path="", *_):
     """Before saving as `path`, remove pixels that can be made again from the file, and let paths begin at `path`."""
     if _state["saves_pixels"]:
         return
-    _state["paths"] = [
-        (owner, name, bpy.path.abspath(getattr(owner, name)))
-        for owner, name in results.paths_in(bpy.data.scenes)
-        if getattr(owner, name)
-    ]
+    owners = [(scene.ltsh, "result_folder") for scene in bpy.data.scenes]
+    owners += [(last, "folder") for scene in bpy.data.scenes for last in scene.ltsh.last_results]
+    _state["paths"] = [(*owner, bpy.path.abspath(getattr(*owner))) for owner in owners if getattr(*owner)]
     _write_paths(path)
     for scene in bpy.data.scenes:
         for image in results.our_images(scene):
@@ -313,7 +310,7 @@ def _shrink(path="", *_):
 
 
 def _write_paths(blend: str) -> None:
-    """Write the paths of results relative to the file `blend`."""
+    """Let the paths of results begin at the file `blend`."""
     for owner, name, path in _state["paths"]:
         setattr(owner, name, results.blender_path(path, blend))
 
@@ -324,7 +321,7 @@ def _restore(*_):
     if _state["saves_pixels"]:
         return
     _write_paths(bpy.data.filepath)
-    _state["paths"] = []
+    _state["paths"].clear()
     # Files of former versions keep the pictures of layers.
     for image in bpy.data.images:
         if results.LAYER in image and image.use_fake_user:

@@ -71,19 +71,6 @@ def view_of(context):
     return space
 
 
-def _shading_before(scene) -> list:
-    """Restore the shading of the views that show a preview of `scene`, and return them.
-
-    Views whose shading was changed by hand since then stay as they are.
-    """
-    restored = []
-    for space, lent in _views_of(scene):
-        if lent.shows and space.shading.type == "RENDERED":
-            space.shading.type = lent.former
-            restored.append(space)
-    return restored
-
-
 def _views_of(scene) -> list[tuple]:
     """The 3D views that were lent to the preview of `scene`, each with its `_LentView`."""
     spaces = [space for screen in bpy.data.screens for area in screen.areas for space in area.spaces]
@@ -92,19 +79,16 @@ def _views_of(scene) -> list[tuple]:
 
 
 def _let_views_follow(scene) -> None:
-    """Show the preview of `scene` in its views, or restore them, after its engine has changed."""
-    if is_previewing(scene):
-        for space, lent in _views_of(scene):
-            if not lent.shows and space.shading.type == lent.former:
-                space.shading.type, lent.shows = "RENDERED", True
-        return
-    restored = _shading_before(scene)
+    """Show the preview of `scene` in its views, or restore them, after its engine has changed.
+
+    Views whose shading was changed by hand since then stay as they are.
+    """
+    shows = is_previewing(scene)
     for space, lent in _views_of(scene):
-        # A view that was changed by hand meanwhile stays the artist's.
-        if lent.shows and space in restored:
-            lent.shows = False
-        elif lent.shows:
+        if space.shading.type != ("RENDERED" if lent.shows else lent.former):
             del _lent_views[space.as_pointer()]
+        elif shows != lent.shows:
+            space.shading.type, lent.shows = "RENDERED" if shows else lent.former, shows
 
 
 def stop_preview(scene) -> None:
@@ -120,7 +104,6 @@ def stop_preview(scene) -> None:
 
 
 _saved: list[str] = []
-_saved_views: list = []
 
 
 @persistent
@@ -128,24 +111,18 @@ def _before_saving(*_) -> None:
     # A copy for a render of our own keeps the engine: the render has begun.
     if keeps_engine():
         return
-    _saved.clear()
-    _saved_views.clear()
-    for scene in bpy.data.scenes:
-        if is_previewing(scene):
-            _saved.append(scene.name)
-            _saved_views.extend(_shading_before(scene))
-            scene.render.engine = scene.ltsh_view.artist_engine
+    _saved[:] = [scene.name for scene in bpy.data.scenes if is_previewing(scene)]
+    for scene in (bpy.data.scenes[name] for name in _saved):
+        scene.render.engine = scene.ltsh_view.artist_engine
+        _let_views_follow(scene)
 
 
 @persistent
 def _after_saving(*_) -> None:
-    for name in _saved:
-        if name in bpy.data.scenes:
-            bpy.data.scenes[name].render.engine = ENGINE
-    for space in _saved_views:
-        space.shading.type = "RENDERED"
+    for scene in (bpy.data.scenes[name] for name in _saved if name in bpy.data.scenes):
+        scene.render.engine = ENGINE
+        _let_views_follow(scene)
     _saved.clear()
-    _saved_views.clear()
 
 
 @persistent

@@ -73,21 +73,9 @@ def lacks(result: Result) -> str:
 
 
 def folder_of(scene, command: str, current: Path) -> Path:
-    """The folder of the last results of `command`: the remembered one, or `current` if that has none."""
-    last = next((item.folder for item in scene.ltsh.last_results if item.name == command), "")
-    return Path(bpy.path.abspath(last)) if last and result_in(last) is not None else current
-
-
-def _remember(scene, command: str, folder: str) -> None:
-    known = scene.ltsh.last_results
-    item = next((item for item in known if item.name == command), None) or known.add()
-    item.name, item.folder = command, folder
-
-
-def paths_in(scenes) -> list[tuple]:
-    """The paths of results in the settings of `scenes`: owner and name of each property."""
-    owners = [(scene.ltsh, "result_folder") for scene in scenes]
-    return owners + [(item, "folder") for scene in scenes for item in scene.ltsh.last_results]
+    """The folder of the last results of `command`, wherever the file was saved since; `current` if it is gone."""
+    last = scene.ltsh.last_results.get(command)
+    return current if last is None or result_in(last.folder) is None else Path(bpy.path.abspath(last.folder))
 
 
 def result_in(folder: str) -> Result | None:
@@ -128,7 +116,8 @@ def show(scene, folder: Path) -> None:
     if result is None:
         return
     settings = scene.ltsh
-    _remember(scene, result.command, settings.result_folder)
+    last = settings.last_results.get(result.command) or settings.last_results.add()
+    last.name, last.folder = result.command, settings.result_folder
     if before != settings.result_folder or not has_mixer(scene, result):
         leave_mix(settings)
     settings.groups.clear()

@@ -175,41 +175,33 @@ class _WorldLook:
     """A world as Cycles sees it, for all views that show it: a second Blender renders it while the views go on."""
 
     def __init__(self, name: str):
-        self.name, self.users = name, 0
+        self.name, self.users, self.stopped = name, 0, threading.Event()
         # The sky that was found (None after errors) and notes about it; None: it was not looked at yet.
         self.outcome: tuple[ShownSky | None, list[str]] | None = None
         self.sky: ShownSky | None = None  # the last one that was found
-        self._changed: float | None = None  # time of the last request that no work has begun for
+        self.changed: float | None = None  # time of the last request that no work has begun for
         self._thread: threading.Thread | None = None
         self._result: tuple[ShownSky, list[str]] | Exception | None = None
-        self.stopped = threading.Event()
-
-    def request(self) -> None:
-        """Look at the world, which is new or has changed."""
-        self._changed = time.monotonic()
 
     @property
     def is_busy(self) -> bool:
         """True while a result is to come."""
-        return self._changed is not None or self._thread is not None
+        return self.changed is not None or self._thread is not None
 
     def step(self, frame: int) -> None:
         """Do the next step, in the main thread."""
-        if self._thread is not None:
-            if not self._thread.is_alive():
-                self._take()
-        elif self._changed is not None and time.monotonic() - self._changed > REST_SECONDS:
-            self._begin(frame)
-
-    def _take(self) -> None:
-        self._thread, result = None, self._result
-        if isinstance(result, Exception):
-            self.outcome = None, [f"{self.name}: {error_line(result)}"]
-        elif self._changed is None:  # else it has changed again
-            self.outcome, self.sky = result, result[0]
+        if self._thread is None:
+            if self.changed is not None and time.monotonic() - self.changed > REST_SECONDS:
+                self._begin(frame)
+        elif not self._thread.is_alive():
+            self._thread, result = None, self._result
+            if isinstance(result, Exception):
+                self.outcome = None, [f"{self.name}: {error_line(result)}"]
+            elif self.changed is None:  # else it has changed again
+                self.outcome, self.sky = result, result[0]
 
     def _begin(self, frame: int) -> None:
-        self._changed = None
+        self.changed = None
         world = next((one for one in bpy.data.worlds if one.name_full == self.name), None)
         if world is None:
             return
@@ -248,15 +240,14 @@ class LiveWorld:
 
     def look(self, world) -> ShownSky | None:
         """Request a look at a new or changed `world`. Returns its last result; None where there is none."""
-        if self._look is None or self._look.name != world.name_full:
+        is_other = self._look is None or self._look.name != world.name_full
+        if is_other:
             self.stop()
             self._look = _world_looks.setdefault(world.name_full, _WorldLook(world.name_full))
             self._look.users += 1
-            # Other views of this world have asked for it, and know its changes.
-            if self._look.users == 1:
-                self._look.request()
-        else:
-            self._look.request()
+        # Other views of this world have asked for it, and know its changes.
+        if not is_other or self._look.users == 1:
+            self._look.changed = time.monotonic()
         return self._look.sky
 
     @property
@@ -266,13 +257,10 @@ class LiveWorld:
 
     def step(self, frame: int) -> tuple[ShownSky | None, list[str]] | None:
         """Do the next step, in the main thread. Returns the sky that was found and notes about it; None: no news."""
-        if self._look is None:
-            return None
-        self._look.step(frame)
-        if self._look.outcome is self._taken:
-            return None
-        self._taken = self._look.outcome
-        return self._taken
+        if self._look is not None:
+            self._look.step(frame)
+        before, self._taken = self._taken, None if self._look is None else self._look.outcome
+        return None if self._taken is before else self._taken
 
 
 def rendered_world(scene, world, warn: Callable) -> tuple[list[SkyPicture], list[Light], np.ndarray]:

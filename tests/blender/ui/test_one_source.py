@@ -105,7 +105,7 @@ def test_views_of_one_world_look_at_it_once(monkeypatch):
     monkeypatch.setattr(live_cycles._WorldLook, "_begin", lambda look, frame: begun.append(look) or found(look))
 
     def found(look):
-        look._changed, look.outcome, look.sky = None, (sky, ["a note"]), sky
+        look.changed, look.outcome, look.sky = None, (sky, ["a note"]), sky
 
     first, second = live_cycles.LiveWorld(), live_cycles.LiveWorld()
     assert first.look(world) is None and second.look(world) is None

@@ -265,6 +265,7 @@ def _open(job: BakeJob) -> BakeScene:
     inventory, meshes, problems, bare = _inspect(scene, objects, job.uv, Path(folder.name), origin, has_shadows)
     give_default_material(bare)
     lobes = _lobes([ob for ob in objects if ob.name in meshes], inventory.emitting_materials)
+    inventory.made_opaque = [one for of_material in lobes.values() for one in of_material.made_opaque]
     for material in bpy.data.materials:
         if material.name_full not in inventory.emitting_materials:
             material.cycles.emission_sampling = "NONE"
@@ -282,8 +283,7 @@ def _open(job: BakeJob) -> BakeScene:
         view = replace(view, vector=tuple(np.add(view.vector, origin).tolist()))
     _look_from(scene, camera, seen_from)
     if has_shadows:
-        for material_lobes in lobes.values():
-            let_shadow_rays_through(material_lobes.made_opaque)
+        let_shadow_rays_through(inventory.made_opaque)
     else:
         remove_occlusion(scene)
     name, names = camera.name if job.view == "camera" else "", [ob.name for ob in objects]

@@ -21,7 +21,7 @@ import numpy as np
 
 from ...scene import FARTHEST, EllipseLight, Light, PointLight, QuadLight, SpotCone, SpotLight, SunLight, listed
 from ..evaluated import EmitterTraits, RenderedSurface, surface_instancer
-from ..materials.aovs import CyclesReasons, OpaqueInput
+from ..materials.aovs import CyclesReasons, OpaqueInput, with_transparency
 from ..materials.graph import tree_in_use
 from ..render_settings import cycles_setting
 from .emission import Falloff, ObjectFacts, emission_of, emission_warnings, open_studio
@@ -237,7 +237,9 @@ def rendered_lights(scene, inventory: LightInventory) -> list[Light]:
     eye = np.array(scene.camera.matrix_world, dtype=np.float64)[:3, 3]
     with open_studio(scene) as studio:
         lights = with_node_emission(inventory.lights, inventory.node_lights, studio, inventory.warn)
-        of_meshes = mesh_area_lights(inventory.meshes, studio, eye, inventory.warn)
+        # With shadows, Cycles' reference has the transparency of glowing faces, too.
+        with with_transparency(inventory.made_opaque if inventory.occluders is not None else ()):
+            of_meshes = mesh_area_lights(inventory.meshes, studio, eye, inventory.warn)
     dark = [mesh.ob.name for mesh in inventory.meshes if mesh.is_dropped]
     inventory.left_to_cycles.everything += [f"object {name!r}, which emits from too many faces" for name in dark]
     return lights + of_meshes

@@ -13,7 +13,7 @@ from ...cycles.patches import ERROR, GRID, cut_into_patches, split_light
 from ...cycles.planar_polygons import FlatPolygon
 from ...scene import Light, PolygonLight, QuadLight
 from ..evaluated import SURFACE_TYPES, EmitterTraits, RenderedSurface, is_rendered, read_values, surface_instancer
-from ..materials.graph import computed, ensure_nodes, live_link, material_output
+from ..materials.graph import computed, ensure_nodes, fill_with_bsdf, live_link, material_output
 from ..render_settings import changed_properties
 from .emission import (
     PIXELS,
@@ -365,10 +365,21 @@ def _textured_lights(mesh_light: MeshLight, placed_polygons, side: int, studio: 
     count = sum(len(polygons) for _, polygons in textured)
     if count == 0:
         return []
-    if count > MOST_RENDERED_POLYGONS:
-        return _mean_lights(mesh_light, textured, side, studio, warn)
+    make = _mean_lights if count > MOST_RENDERED_POLYGONS else _patch_lights
+    lights = make(mesh_light, textured, side, studio, warn)
+    for label in sorted({polygon.label for _, polygons in textured for polygon in polygons} - set(lights)):
+        warn(
+            f"object {mesh_light.ob.name!r}: material {mesh_light.materials[label].name!r} may emit there, but "
+            "a picture of its faces is black; it lights nothing"
+        )
+    return [light for of_label in lights.values() for light in of_label]
+
+
+def _patch_lights(mesh_light: MeshLight, textured, side: int, studio: Studio, warn) -> dict[int, list[Light]]:
+    """By material slot, the polygons with patches of constant radiance."""
+    count = sum(len(polygons) for _, polygons in textured)
     most = max(1, GRID * GRID // (count * len(_sides(side))))
-    lights, errors = [], []
+    lights, errors = {}, []
     for placement, polygons in textured:
         with _shown(studio, _with_materials(mesh_light, placement), placement.matrix, placement.facts):
             for polygon in polygons:
@@ -376,10 +387,11 @@ def _textured_lights(mesh_light: MeshLight, placed_polygons, side: int, studio: 
                     light = polygon_light(mesh_light.light_of(polygon.label), polygon, way, np.ones(3))
                     image, covered = _look_at_polygon(studio, light, PIXELS if count <= FEW_POLYGONS else PIXELS // 4)
                     patches = cut_into_patches(image, covered, most)
-                    lights.extend(split_light(light, patches))
+                    if patches.whole is not None:
+                        lights.setdefault(polygon.label, []).extend(split_light(light, patches))
                     errors.append(patches.error)
     if max(errors) > ERROR:
-        patches = sum(len(light.leaves) for light in lights)
+        patches = sum(len(light.leaves) for of_label in lights.values() for light in of_label)
         warn(
             f"object {mesh_light.ob.name!r}: its texture is shaded as {patches} patches of constant radiance, "
             f"which differ from it by {100.0 * max(errors):.0f} % on average"
@@ -388,15 +400,27 @@ def _textured_lights(mesh_light: MeshLight, placed_polygons, side: int, studio: 
 
 
 def _with_materials(mesh_light: MeshLight, placement: Placement):
-    mesh = placement.mesh
-    mesh.materials.clear()
-    for material in mesh_light.materials:
-        mesh.materials.append(material)
+    """The mesh of `placement` with its textured materials. All else is transparent: it may lie just before them.
+
+    Each slot is set in its turn: `clear` would give all faces the first material.
+    """
+    mesh, clear = placement.mesh, bpy.data.materials.new("Lets a look through")
+    ensure_nodes(clear)
+    fill_with_bsdf(clear.node_tree, "ShaderNodeBsdfTransparent", (1.0, 1.0, 1.0, 1.0))
+    while len(mesh.materials) > len(mesh_light.materials):
+        mesh.materials.pop()
+    for slot, (material, emission) in enumerate(zip(mesh_light.materials, mesh_light.emission, strict=True)):
+        if slot == len(mesh.materials):
+            mesh.materials.append(None)
+        mesh.materials[slot] = material if emission.varies else clear
     return mesh
 
 
 def _look_at_polygon(studio: Studio, light: Light, pixels: int) -> tuple[np.ndarray, np.ndarray]:
-    """Radiance (H, W, 3) of the rectangle around `light`, and the mask (H, W) of the pixels inside its outline."""
+    """Radiance (H, W, 3) of the rectangle around `light`, and the mask (H, W) of the pixels inside its outline.
+
+    Pixels at the outline count only where most of their rays met the light.
+    """
     image, covered = studio.look(light.center, light.half_u, light.half_v, light.direction, pixels)
     rows, columns = covered.shape
     x, y = np.meshgrid((np.arange(columns) + 0.5) / columns * 2.0 - 1.0, 1.0 - (np.arange(rows) + 0.5) / rows * 2.0)
@@ -405,7 +429,10 @@ def _look_at_polygon(studio: Studio, light: Light, pixels: int) -> tuple[np.ndar
         [offset @ half / np.dot(half, half) for half in (light.half_u, light.half_v)],
         axis=-1,
     )
-    inside = covered & _contains(outline, x, y)
+    inside = _contains(outline, x, y)
+    unmet = inside & ~covered  # at the outline, or transparent there
+    corners = [(x[unmet] + s / columns, y[unmet] + t / rows) for s in (-1.0, 1.0) for t in (-1.0, 1.0)]
+    inside[unmet] = np.all([_contains(outline, *corner) for corner in corners], axis=0)
     return image, inside if inside.any() else covered
 
 
@@ -418,12 +445,14 @@ def _contains(outline: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return inside
 
 
-def _mean_lights(mesh_light: MeshLight, textured, side: int, studio: Studio, warn) -> list[Light]:
-    """One light per polygon, with the mean radiance of the largest polygons of its material and side."""
+def _mean_lights(mesh_light: MeshLight, textured, side: int, studio: Studio, warn) -> dict[int, list[Light]]:
+    """By material slot, one light per polygon, with the mean radiance of the largest polygons of its slot and side."""
     sums: dict[tuple[int, int], np.ndarray] = {}
-    lights = []
+    lights: dict[int, list[Light]] = {}
     for placement, polygons in textured:
-        largest = sorted(polygons, key=lambda polygon: -np.ptp(polygon.corners, axis=0).max())[:STAND_INS]
+        by_size = sorted(polygons, key=lambda polygon: -np.ptp(polygon.corners, axis=0).max())
+        labels = {polygon.label for polygon in polygons}
+        largest = [one for label in labels for one in [one for one in by_size if one.label == label][:STAND_INS]]
         with _shown(studio, _with_materials(mesh_light, placement), placement.matrix, placement.facts):
             for polygon in largest:
                 for way in _sides(side):
@@ -437,9 +466,8 @@ def _mean_lights(mesh_light: MeshLight, textured, side: int, studio: Studio, war
             for way in _sides(side):
                 *light_sum, area = sums.get((polygon.label, way), np.zeros(4))
                 if area > 0.0 and np.any(light_sum):
-                    lights.append(
-                        polygon_light(mesh_light.light_of(polygon.label), polygon, way, np.array(light_sum) / area)
-                    )
+                    light = polygon_light(mesh_light.light_of(polygon.label), polygon, way, np.array(light_sum) / area)
+                    lights.setdefault(polygon.label, []).append(light)
     warn(
         f"object {mesh_light.ob.name!r}: its texture on more than {MOST_RENDERED_POLYGONS} faces is shaded as its mean"
     )

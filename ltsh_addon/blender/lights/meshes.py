@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
@@ -103,7 +104,8 @@ def collect_mesh_lights(depsgraph, override, receivers: Receivers, warn, copies:
 def _mesh_light(ob, traits: EmitterTraits, override, receivers: Receivers, known: dict) -> MeshLight | None:
     slots = [override] * max(1, len(ob.material_slots)) if override else [slot.material for slot in ob.material_slots]
     materials = [None if material is None else material.original for material in slots]
-    emission = [_emission_of(material, known) for material in materials]
+    known |= {one.name_full: emission_of(one) for one in materials if one is not None and one.name_full not in known}
+    emission = [Emission() if material is None else known[material.name_full] for material in materials]
     if not any(one.emits for one in emission) or not (traits.diffuse or traits.glossy):
         return None
     nothing = np.zeros(3)
@@ -120,14 +122,6 @@ def _mesh_light(ob, traits: EmitterTraits, override, receivers: Receivers, known
         receivers=receivers.of(ob.original),
     )
     return MeshLight(ob.original, light, materials, emission)
-
-
-def _emission_of(material, known: dict[str, Emission]) -> Emission:
-    if material is None:
-        return Emission()
-    if material.name_full not in known:
-        known[material.name_full] = emission_of(material)
-    return known[material.name_full]
 
 
 def displaces(material) -> bool:
@@ -177,12 +171,6 @@ _PLACE = ("center", "half_u", "half_v", "direction", "corners")
 FEW_POLYGONS = 16
 
 
-def _undisplaced(mesh_lights: list[MeshLight]):
-    """Within this context no material displaces faces, which could move them out of the camera's sight."""
-    materials = {material.name_full: material for light in mesh_lights for material in light.materials if material}
-    return changed_properties([(material, "displacement_method", "BUMP") for material in materials.values()])
-
-
 def mesh_area_lights(mesh_lights: list[MeshLight], studio: Studio, eye: np.ndarray, warn) -> list[Light]:
     """The area lights that stand for the objects `mesh_lights`; the camera is at `eye` (3,).
 
@@ -190,7 +178,10 @@ def mesh_area_lights(mesh_lights: list[MeshLight], studio: Studio, eye: np.ndarr
     """
     for mesh_light in mesh_lights:
         _warn_of_emission(mesh_light, warn)
-    with _undisplaced(mesh_lights), without_falloff(material for light in mesh_lights for material in light.materials):
+    materials = {material.name_full: material for light in mesh_lights for material in light.materials if material}
+    # Displacement could move faces out of the camera's sight.
+    undisplaced = [(material, "displacement_method", "BUMP") for material in materials.values()]
+    with changed_properties(undisplaced), without_falloff(materials.values()):
         return _lights_of_all(mesh_lights, studio, eye, warn)
 
 
@@ -270,7 +261,8 @@ def _emitting_side(mesh_light: MeshLight, eye: np.ndarray, warn) -> int:
 
 def _polygons(mesh_light: MeshLight, radiance) -> list[tuple[Placement, list[FlatPolygon]]]:
     """Each placement with its emitting polygons, labeled by material slot."""
-    shines = np.array([emission.varies or bool(np.any(value)) for emission, value in _slots(mesh_light, radiance)])
+    slots = zip(mesh_light.emission, radiance, strict=True)
+    shines = np.array([emission.varies or bool(np.any(value)) for emission, value in slots])
     placed_polygons = []
     for placement in mesh_light.placements:
         chosen = shines[placement.slots]
@@ -279,10 +271,6 @@ def _polygons(mesh_light: MeshLight, radiance) -> list[tuple[Placement, list[Fla
         )
         placed_polygons.append((placement, polygons))
     return placed_polygons
-
-
-def _slots(mesh_light: MeshLight, radiance):
-    return zip(mesh_light.emission, radiance, strict=True)
 
 
 def _sides(side: int) -> tuple[int, ...]:
@@ -380,16 +368,12 @@ def _patch_lights(mesh_light: MeshLight, textured, side: int, studio: Studio, wa
     count = sum(len(polygons) for _, polygons in textured)
     most = max(1, GRID * GRID // (count * len(_sides(side))))
     lights, errors = {}, []
-    for placement, polygons in textured:
-        with _shown(studio, _with_materials(mesh_light, placement), placement.matrix, placement.facts):
-            for polygon in polygons:
-                for way in _sides(side):
-                    light = polygon_light(mesh_light.light_of(polygon.label), polygon, way, np.ones(3))
-                    image, covered = _look_at_polygon(studio, light, PIXELS if count <= FEW_POLYGONS else PIXELS // 4)
-                    patches = cut_into_patches(image, covered, most)
-                    if patches.whole is not None:
-                        lights.setdefault(polygon.label, []).extend(split_light(light, patches))
-                    errors.append(patches.error)
+    pixels = PIXELS if count <= FEW_POLYGONS else PIXELS // 4
+    for polygon, _, light, image, covered in _looks(mesh_light, textured, side, studio, pixels):
+        patches = cut_into_patches(image, covered, most)
+        if patches.whole is not None:
+            lights.setdefault(polygon.label, []).extend(split_light(light, patches))
+        errors.append(patches.error)
     if max(errors) > ERROR:
         patches = sum(len(light.leaves) for of_label in lights.values() for light in of_label)
         warn(
@@ -397,6 +381,15 @@ def _patch_lights(mesh_light: MeshLight, textured, side: int, studio: Studio, wa
             f"which differ from it by {100.0 * max(errors):.0f} % on average"
         )
     return lights
+
+
+def _looks(mesh_light: MeshLight, textured, side: int, studio: Studio, pixels: int):
+    """Yield each polygon with the way that it emits, its light of radiance 1, and what `_look_at_polygon` gives."""
+    for placement, polygons in textured:
+        with _shown(studio, _with_materials(mesh_light, placement), placement.matrix, placement.facts):
+            for polygon, way in itertools.product(polygons, _sides(side)):
+                light = polygon_light(mesh_light.light_of(polygon.label), polygon, way, np.ones(3))
+                yield polygon, way, light, *_look_at_polygon(studio, light, pixels)
 
 
 def _with_materials(mesh_light: MeshLight, placement: Placement):
@@ -446,25 +439,20 @@ def _mean_lights(mesh_light: MeshLight, textured, side: int, studio: Studio, war
     """By material slot, one light per polygon, with the mean radiance of the largest polygons of its slot and side."""
     sums: dict[tuple[int, int], np.ndarray] = {}
     lights: dict[int, list[Light]] = {}
+    largest = []
     for placement, polygons in textured:
-        by_size = sorted(polygons, key=lambda polygon: -np.ptp(polygon.corners, axis=0).max())
-        labels = {polygon.label for polygon in polygons}
-        largest = [one for label in labels for one in [one for one in by_size if one.label == label][:STAND_INS]]
-        with _shown(studio, _with_materials(mesh_light, placement), placement.matrix, placement.facts):
-            for polygon in largest:
-                for way in _sides(side):
-                    light = polygon_light(mesh_light.light_of(polygon.label), polygon, way, np.ones(3))
-                    image, covered = _look_at_polygon(studio, light, PIXELS // 16)
-                    area = 4.0 * np.linalg.norm(np.cross(light.half_u, light.half_v)) * covered.mean()
-                    share = np.append(area * image[covered].mean(axis=0), area) if covered.any() else np.zeros(4)
-                    sums[polygon.label, way] = sums.get((polygon.label, way), np.zeros(4)) + share
-    for _, polygons in textured:
-        for polygon in polygons:
-            for way in _sides(side):
-                *light_sum, area = sums.get((polygon.label, way), np.zeros(4))
-                if area > 0.0 and np.any(light_sum):
-                    light = polygon_light(mesh_light.light_of(polygon.label), polygon, way, np.array(light_sum) / area)
-                    lights.setdefault(polygon.label, []).append(light)
+        by_size = sorted(polygons, key=lambda polygon: (polygon.label, -np.ptp(polygon.corners, axis=0).max()))
+        of_labels = itertools.groupby(by_size, key=lambda polygon: polygon.label)
+        largest.append((placement, [one for _, alike in of_labels for one in list(alike)[:STAND_INS]]))
+    for polygon, way, light, image, covered in _looks(mesh_light, largest, side, studio, PIXELS // 16):
+        area = 4.0 * np.linalg.norm(np.cross(light.half_u, light.half_v)) * covered.mean()
+        share = np.append(area * image[covered].mean(axis=0), area) if covered.any() else np.zeros(4)
+        sums[polygon.label, way] = sums.get((polygon.label, way), np.zeros(4)) + share
+    for polygon, way in itertools.product((one for _, polygons in textured for one in polygons), _sides(side)):
+        *light_sum, area = sums.get((polygon.label, way), np.zeros(4))
+        if area > 0.0 and np.any(light_sum):
+            light = polygon_light(mesh_light.light_of(polygon.label), polygon, way, np.array(light_sum) / area)
+            lights.setdefault(polygon.label, []).append(light)
     warn(
         f"object {mesh_light.ob.name!r}: its texture on more than {MOST_RENDERED_POLYGONS} faces is shaded as its mean"
     )

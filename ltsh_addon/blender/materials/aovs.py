@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 import itertools
 from collections.abc import Iterable
-from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -161,8 +160,12 @@ def _fixed(target, level: float) -> OpaqueInput:
     Its old source stays linked: Cycles reads an image differently if its alpha feeds nothing.
     """
     before = value_of(target)
-    fixed = computed("MAXIMUM" if level else "MINIMUM", before, level, clamp=True) if is_socket(before) else level
-    _feed(target, fixed)
+    if is_socket(before):
+        fixed = computed("MAXIMUM" if level else "MINIMUM", before, level, clamp=True)
+        target.id_data.links.new(fixed, target)
+    else:
+        cut(target)
+        target.default_value = level
     return OpaqueInput(target, before, level)
 
 
@@ -184,33 +187,6 @@ def let_shadow_rays_through(made_opaque: Iterable[OpaqueInput]) -> None:
         if now is not None:
             tree.links.new(now.from_socket, node.inputs[2])
         tree.links.new(node.outputs[0], target)
-
-
-@contextmanager
-def with_transparency(made_opaque: Iterable[OpaqueInput]):
-    """Within this context materials have their transparency back, for all rays."""
-    former = []
-    try:
-        for changed in made_opaque:
-            target, link = changed.socket, live_link(changed.socket)
-            former.append((target, link and link.from_socket, getattr(target, "default_value", None)))
-            _feed(target, changed.source)
-        yield
-    finally:
-        for target, source, value in former:
-            _feed(target, source or value)
-            if value is not None:
-                target.default_value = value
-
-
-def _feed(target, source) -> None:
-    """Link the input `target` to a socket, or give it a number."""
-    if is_socket(source):
-        target.id_data.links.new(source, target)
-    else:
-        cut(target)
-        if source is not None:
-            target.default_value = source
 
 
 def _show(surface, node_type: str, level: float) -> None:

@@ -322,20 +322,17 @@ class LTSH_GGT_split(bpy.types.GizmoGroup):
 
 
 CLASSES = (LTSH_GT_left_out, LTSH_GGT_left_out, LTSH_GT_split, LTSH_GGT_split)
-_add_classes, _remove_classes = bpy.utils.register_classes_factory(CLASSES)
 
 
 def register() -> None:
-    """Add the drawing and the handles to all 3D views."""
-    _add_classes()
+    """Add the drawing to all 3D views."""
     if not bpy.app.background:
         _draw_handlers.append(bpy.types.SpaceView3D.draw_handler_add(_draw, (), "WINDOW", "POST_PIXEL"))
 
 
 def unregister() -> None:
-    """Remove them."""
+    """Remove it."""
     while _draw_handlers:
         bpy.types.SpaceView3D.draw_handler_remove(_draw_handlers.pop(), "WINDOW")
-    _remove_classes()
     _texts.clear()
     _quiet_lines.clear()

@@ -165,9 +165,11 @@ def _unshare_panels() -> None:
                 setattr(panel, name, value)
 
 
+CLASSES = (LTSH_ViewSettings,)
+
+
 def register() -> None:
     """Add the settings, and show the shared panels."""
-    bpy.utils.register_class(LTSH_ViewSettings)
     bpy.types.Scene.ltsh_view = bpy.props.PointerProperty(type=LTSH_ViewSettings)
     _share_panels()
 
@@ -176,4 +178,3 @@ def unregister() -> None:
     """Remove what `register` added."""
     _unshare_panels()
     del bpy.types.Scene.ltsh_view
-    bpy.utils.unregister_class(LTSH_ViewSettings)

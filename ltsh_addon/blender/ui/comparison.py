@@ -549,9 +549,6 @@ def _draw_legend(left: float, below: float, limit: float, scale: float) -> None:
     draw_label(bar + width, below, end, scale)
 
 
-_add_classes, _remove_classes = bpy.utils.register_classes_factory((LTSH_OT_probe, LTSH_GT_wipe, LTSH_GGT_wipe))
-
-
 @bpy.app.handlers.persistent
 def _mix_again(*_):
     """After undo and redo the settings may have other values than the picture that is shown."""
@@ -569,6 +566,7 @@ def _forget_file(*_):
     _state.update(dragged=None, probing=False)
 
 
+CLASSES = (LTSH_OT_probe, LTSH_GT_wipe, LTSH_GGT_wipe)
 HANDLERS = (
     ("load_pre", _forget_file),
     ("save_pre", _shrink), ("save_post", _restore), ("load_post", _restore),
@@ -577,21 +575,13 @@ HANDLERS = (
 
 
 def register() -> None:
-    """Add the probe, the line and the handlers."""
-    for name, function in HANDLERS:
-        getattr(bpy.app.handlers, name).append(function)
-    _add_classes()
+    """Add the drawing over pictures."""
     _state["drawing"] = bpy.types.SpaceImageEditor.draw_handler_add(_draw, (), "WINDOW", "POST_PIXEL")
 
 
 def unregister() -> None:
-    """Remove what `register` added."""
+    """Remove it, and end what goes on."""
     bpy.types.SpaceImageEditor.draw_handler_remove(_state["drawing"], "WINDOW")
-    _remove_classes()
     if bpy.app.timers.is_registered(settle):
         bpy.app.timers.unregister(settle)
     results.forget_renders()
-    for name, function in HANDLERS:
-        handlers = getattr(bpy.app.handlers, name)
-        if function in handlers:
-            handlers.remove(function)

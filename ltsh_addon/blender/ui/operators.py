@@ -533,18 +533,13 @@ CLASSES = (
     LTSH_OT_restore_materials,
     LTSH_OT_manual,
 )
-_register, _unregister = bpy.utils.register_classes_factory(CLASSES)
+HANDLERS = (("load_pre", _stop),)
 
 
 def register():
-    _register()
-    bpy.app.handlers.load_pre.append(_stop)
     atexit.register(_end_now)
 
 
 def unregister():
     _end_now()
     atexit.unregister(_end_now)
-    if _stop in bpy.app.handlers.load_pre:
-        bpy.app.handlers.load_pre.remove(_stop)
-    _unregister()

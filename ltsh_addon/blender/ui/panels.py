@@ -580,4 +580,3 @@ CLASSES = (
     *in_both_places(_Materials, "materials", "main"),
     LTSH_PT_IMAGE_results,
 )
-register, unregister = bpy.utils.register_classes_factory(CLASSES)

@@ -22,9 +22,7 @@ from ...scene import error_line
 from ..extract.apply import shows_texture
 from ..extract.bake_meshes import ObjectError, check_object
 from ..lights.area import LightInventory, node_light, reason_to_leave_out
-from ..lights.area import (
-    note_unsupported as note_unsupported_light,
-)
+from ..lights.area import note_unsupported as note_unsupported_light
 from ..lights.emission import emission_of
 from ..lights.world import may_shine
 from ..materials.aovs import notes_of_material
@@ -415,18 +413,7 @@ CLASSES = (
     LTSH_OT_add_uv_map,
     LTSH_OT_pack_image,
 )
-_register_classes, _unregister_classes = bpy.utils.register_classes_factory(CLASSES)
+HANDLERS = tuple((event, _forget) for event in ("depsgraph_update_post", "load_post", "undo_post", "redo_post"))
 
 
-def register():
-    _register_classes()
-    for handlers in (bpy.app.handlers.depsgraph_update_post, bpy.app.handlers.load_post, bpy.app.handlers.undo_post):
-        handlers.append(_forget)
-
-
-def unregister():
-    for handlers in (bpy.app.handlers.depsgraph_update_post, bpy.app.handlers.load_post, bpy.app.handlers.undo_post):
-        if _forget in handlers:
-            handlers.remove(_forget)
-    _known.clear()
-    _unregister_classes()
+register = unregister = _known.clear

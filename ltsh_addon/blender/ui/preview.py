@@ -162,6 +162,7 @@ def _subscribe() -> None:
     )
 
 
+CLASSES = (LTSH_OT_preview,)
 HANDLERS = (
     ("save_pre", _before_saving),
     ("save_post", _after_saving),
@@ -170,24 +171,12 @@ HANDLERS = (
     ("redo_post", _after_undo),
     ("load_post", _after_loading),
 )
-
-
-def register() -> None:
-    """Add the operator and the handlers."""
-    bpy.utils.register_class(LTSH_OT_preview)
-    for name, function in HANDLERS:
-        getattr(bpy.app.handlers, name).append(function)
-    _subscribe()
+register = _subscribe
 
 
 def unregister() -> None:
-    """End all previews; remove operator and handlers."""
+    """End all previews."""
     bpy.msgbus.clear_by_owner(_subscriber)
     for scene in bpy.data.scenes:
         if is_previewing(scene):
             stop_preview(scene)
-    for name, function in HANDLERS:
-        functions = getattr(bpy.app.handlers, name)
-        if function in functions:
-            functions.remove(function)
-    bpy.utils.unregister_class(LTSH_OT_preview)

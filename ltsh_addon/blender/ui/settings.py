@@ -426,14 +426,12 @@ CLASSES = (
     LTSH_OT_add_preset,
     LTSH_PT_presets,
 )
-_add_classes, _remove_classes = bpy.utils.register_classes_factory(CLASSES)
 # The folder in which Blender looks for a folder "presets".
 PRESETS_PARENT = str(Path(__file__).parent)
 
 
 def register() -> None:
-    """Add settings, preferences and presets, and apply the preferences."""
-    _add_classes()
+    """Add settings and presets, and apply the preferences."""
     apply(bpy.context)
     bpy.types.Scene.ltsh = PointerProperty(type=LTSH_PG_scene, name="LTSH")
     bpy.types.Object.ltsh_light = PointerProperty(type=LTSH_PG_light, name="LTSH Light")
@@ -455,4 +453,3 @@ def unregister() -> None:
     logger.setLevel(logging.NOTSET)
     while _variables_before:
         _set_variable(*_variables_before.popitem())
-    _remove_classes()

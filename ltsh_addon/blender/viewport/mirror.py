@@ -27,14 +27,7 @@ from ..lights.area import area_light, node_light, note_unsupported, reason_to_le
 from ..lights.emission import emission_of, factors_of, open_studio
 from ..lights.linking import Receivers
 from ..lights.meshes import collect_mesh_lights, constant_mesh_lights
-from ..lights.textures import (
-    MOST_INSTANCES,
-    NodeEmission,
-    NodeLight,
-    ShownTextures,
-    node_emission,
-    with_pattern,
-)
+from ..lights.textures import MOST_INSTANCES, NodeEmission, NodeLight, ShownTextures, node_emission, with_pattern
 from ..lights.world import light_of_world
 from ..materials.graph import source_of, surface_of, tree_in_use
 from ..materials.preview_material import PreviewMaterial, preview_of, world_radiance

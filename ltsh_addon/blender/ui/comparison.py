@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
+import functools
 import logging
 
 import bpy
@@ -12,6 +12,7 @@ from ...imaging.color import LUMINANCE_WEIGHTS, color_bar, signed_error_colors
 from ...pipeline.mixer import LightPictures
 from ...pipeline.relight import RelightData
 from ...scene import error_line
+from ..saving import is_working_copy
 from . import results
 from .overlay import LINE, PAPER, ROW, draw_gradient, draw_label, draw_rectangle, draw_text, label_places, text_width
 
@@ -21,21 +22,22 @@ PANEL_REGIONS = {"VIEW_3D": "UI", "IMAGE_EDITOR": "UI", "PROPERTIES": "WINDOW"}
 GRIP_PIXELS = 12.0
 HANDLE_PIXELS = 9.0
 _LOOKUP_SIZE = 1024
-_state = {"lookup": None, "settling": set(), "paths": [], "saves_pixels": False, "dragged": None, "probing": False}
+_state = {"settling": set(), "paths": [], "dragged": None, "probing": False}
 
 
-def changed(settings, context) -> None:
-    """Called by Blender when a setting of the view changes."""
+def changed(settings, context=None) -> None:
+    """Called by Blender when a setting of the view changes. The panels say that a picture is gone when the results are
+    shown again."""
     try:
         refresh(settings.id_data)
     except RuntimeError as error:
-        _warn(error)
+        logging.getLogger(__name__).warning("%s", error_line(error))
 
 
 def mixed(item, context) -> None:
     """Called by Blender when a value of the light mixer changes; shows the mix at once."""
     settings = item.id_data.ltsh
-    if results.is_silent():
+    if results.state["is_silent"]:
         return
     if settings.mode == "MIX":
         changed(settings, context)
@@ -52,15 +54,10 @@ def mix_render(name: str, pictures: LightPictures, relight_data: RelightData) ->
         scene = bpy.data.scenes.get(name)
         if scene is not None:
             results.mix_render(scene, pictures, relight_data)
-            redraw_image_editors()
+            redraw_editors("IMAGE_EDITOR")
             redraw_panels()
 
     bpy.app.timers.register(take, first_interval=0.0)
-
-
-def _warn(error: RuntimeError) -> None:
-    """Log that a picture is gone; the panels say so when the results are shown again."""
-    logging.getLogger(__name__).warning("%s", error_line(error))
 
 
 def refresh(scene) -> bool:
@@ -86,7 +83,7 @@ def refresh(scene) -> bool:
 def _show(scene, pixels: np.ndarray, as_render: bool) -> None:
     _store(viewer_image(scene), pixels, as_render)
     _settle_later(scene)
-    redraw_image_editors()
+    redraw_editors("IMAGE_EDITOR")
 
 
 def _chosen_images(scene, result, choice) -> list:
@@ -117,10 +114,7 @@ def drag_split(scene, position: float | None) -> None:
     time.
     """
     _state["dragged"] = None if position is None else min(max(position, 0.0), 1.0)
-    try:
-        refresh(scene)
-    except RuntimeError as error:
-        _warn(error)
+    changed(scene.ltsh)
 
 
 def compose(first: np.ndarray, second: np.ndarray, mode: str, split: float, scale: float) -> np.ndarray:
@@ -178,14 +172,13 @@ def _lookup_index(difference: np.ndarray, scale: float) -> np.ndarray:
     return np.where(finite, index, _LOOKUP_SIZE - 1)
 
 
+@functools.cache
 def _error_lookup() -> np.ndarray:
     """Linear colors (N, 3) that Blender's default display shows as the colors of `signed_error_colors`."""
-    if _state["lookup"] is None:
-        values = np.append(np.linspace(-1.0, 1.0, _LOOKUP_SIZE - 1), np.nan)
-        colors = signed_error_colors(values[None], 1.0)[0]
-        linear = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
-        _state["lookup"] = linear.astype(np.float32)
-    return _state["lookup"]
+    values = np.append(np.linspace(-1.0, 1.0, _LOOKUP_SIZE - 1), np.nan)
+    colors = signed_error_colors(values[None], 1.0)[0]
+    linear = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
+    return linear.astype(np.float32)
 
 
 def _settle_later(scene) -> None:
@@ -263,10 +256,10 @@ def _arrange(window, area, attempt: int | None) -> float | None:
     return None
 
 
-def redraw_image_editors() -> None:
-    """Draw all Image Editors again."""
+def redraw_editors(kind: str) -> None:
+    """Draw all areas of a kind again: Blender does not redraw 3D views for properties of add-ons."""
     for area in _areas():
-        if area.type == "IMAGE_EDITOR":
+        if area.type == kind:
             area.tag_redraw()
 
 
@@ -283,20 +276,10 @@ def _areas() -> list:
     return [area for window in bpy.context.window_manager.windows for area in window.screen.areas]
 
 
-@contextlib.contextmanager
-def saving_images_as_they_are():
-    """Context in which saving leaves the images as they are, for copies of the file that no artist opens."""
-    _state["saves_pixels"] = True
-    try:
-        yield
-    finally:
-        _state["saves_pixels"] = False
-
-
 @bpy.app.handlers.persistent
 def _shrink(path="", *_):
     """Before saving as `path`, remove pixels that can be made again from the file, and let paths begin at `path`."""
-    if _state["saves_pixels"]:
+    if is_working_copy():
         return
     owners = [(scene.ltsh, "result_folder") for scene in bpy.data.scenes]
     owners += [(last, "folder") for scene in bpy.data.scenes for last in scene.ltsh.last_results]
@@ -318,7 +301,7 @@ def _write_paths(blend: str) -> None:
 @bpy.app.handlers.persistent
 def _restore(*_):
     """After saving and loading, make the pixels again."""
-    if _state["saves_pixels"]:
+    if is_working_copy():
         return
     _write_paths(bpy.data.filepath)
     _state["paths"].clear()

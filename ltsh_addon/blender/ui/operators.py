@@ -22,19 +22,12 @@ from ..saving import save_working_copy
 from . import comparison, preflight, results
 from .job import Job, Plan, clock, new_folder, output_folder, progress_text, runs_of, session_times, stage_title, steps
 
-
-def save_scene_copy(path: Path) -> None:
-    """Save the open file, unsaved changes included, as `path`. Raises RuntimeError."""
-    with comparison.saving_images_as_they_are():
-        save_working_copy(path)
-
-
 TIMER_SECONDS, WAITING_SECONDS = 0.1, 0.005
 
 
 def running_job() -> Job | None:
     """The job that runs now, or None."""
-    return results.running["job"]
+    return results.state["job"]
 
 
 class _JobOperator:
@@ -123,13 +116,13 @@ class _JobOperator:
         )
         job.output = runs[-1].options.output
         try:
-            save_scene_copy(copy)
+            save_working_copy(copy)
             job.start([run.to_dict() for run in runs], background=not bpy.app.background)
         except (RuntimeError, OSError, SceneError) as error:
             job.remove_folder()
             self.report({"ERROR"}, error_line(error))
             return False
-        self._job = results.running["job"] = job
+        self._job = results.state["job"] = job
         return True
 
     def _show_progress(self, context) -> None:
@@ -180,7 +173,7 @@ class _JobOperator:
         if self._opened and not job.error:
             self._show_all_results(context)
         if running_job() is job:
-            results.running["job"] = None
+            results.state["job"] = None
         for workspace in bpy.data.workspaces:
             workspace.status_text_set(None)
         comparison.redraw_panels()
@@ -285,14 +278,14 @@ def _stop(*_):
     """Stop the job before another file is opened, since its scene goes."""
     job = running_job()
     if job is not None:
-        results.running["job"] = None
+        results.state["job"] = None
         job.cancel()
 
 
 def _end_now() -> None:
     job = running_job()
     if job is not None:
-        results.running["job"] = None
+        results.state["job"] = None
         job.end_now()
 
 

@@ -54,8 +54,8 @@ class Choice:
     mode: str
 
 
-# The job that runs now, or None (see `operators.running_job`).
-running: dict = {"job": None}
+# The job that runs now, or None (see `operators.running_job`); True while this module sets values of the mixer.
+state: dict = {"job": None, "is_silent": False}
 _read: dict[str, tuple[tuple, Result]] = {}
 _pixels: dict[str, tuple[tuple, np.ndarray]] = {}
 PIXELS_KEPT = 8
@@ -68,7 +68,7 @@ def result_of(scene) -> Result | None:
 
 def lacks(result: Result) -> str:
     """What the pictures lack while the job runs that adds it; "": nothing, or they stay as they are."""
-    job = running["job"]
+    job = state["job"]
     return result.partial if job is not None and result.folder in map(Path, job.results) else ""
 
 
@@ -251,7 +251,7 @@ def leave_mix(settings) -> None:
 # The light mixer:
 
 # The mixer of the picture that was asked for last, and its MovedLights.
-_mixer: dict = {"stamp": None, "mixer": None, "moved": None, "is_silent": False}
+_mixer: dict = {"stamp": None, "mixer": None, "moved": None}
 # Mixers that threads read, by the stamp of their file.
 _readings: dict[tuple, Future] = {}
 # Mixers and MovedLights of final renders by the name of their scene, while nothing else is shown. They are in no file.
@@ -463,7 +463,7 @@ def reset_mixer(scene) -> None:
 
 def _take_rows(scene) -> None:
     """Give each row of the mixer an item. Existing values stay, unless the light was changed in the scene since."""
-    items, _mixer["is_silent"] = scene.ltsh.mixed, True
+    items, state["is_silent"] = scene.ltsh.mixed, True
     for row, item in mixer_pairs(scene):
         settings = next(iter(row.settings.values()), [0.0] * 5)
         if item is None:
@@ -473,12 +473,7 @@ def _take_rows(scene) -> None:
             continue
         item.power, item.exposure, item.color, item.settings = 1.0, 0.0, row.color, settings
         item.muted = item.solo = item.applied = False
-    _mixer["is_silent"] = False
-
-
-def is_silent() -> bool:
-    """True while this module sets values of the mixer."""
-    return _mixer["is_silent"]
+    state["is_silent"] = False
 
 
 def mix_label(scene) -> str:

@@ -23,7 +23,7 @@ from bpy.props import (
 
 from ...scene import CYCLES, REFERENCE, TECHNIQUES
 from ...workers.pool import CORES_VARIABLE
-from .comparison import changed, mixed
+from .comparison import changed, mixed, redraw_editors
 
 # The name of the add-on: "bl_ext.user_default.ltsh" in Blender, "ltsh_addon" when imported from elsewhere.
 ADDON = __package__.rsplit(".", 3)[0]
@@ -149,14 +149,6 @@ MODES = (
     ("ERROR", "Difference", "First minus second: red is too bright, blue too dark, white is equal", "IMAGE_ALPHA", 3),
     ("MIX", "Mix", "The picture with its lights as the Light Mixer has them", "LIGHT", 4),
 )
-
-
-def _redraw_views(settings, context) -> None:
-    """Show a changed setting at once: Blender does not redraw 3D views for properties of add-ons."""
-    for window in context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type == "VIEW_3D":
-                area.tag_redraw()
 
 
 class LTSH_PG_mixed_light(bpy.types.PropertyGroup):
@@ -309,7 +301,7 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
         name="Shadows",
         description="Surfaces stand in each other's light, in the Cycles reference too; without, pictures show how "
         "well a technique shades alone",
-        default=True, update=_redraw_views,
+        default=True, update=lambda self, context: redraw_editors("VIEW_3D"),
     )  # fmt: skip
     shadow_rays: IntProperty(
         name="Shadow Rays",

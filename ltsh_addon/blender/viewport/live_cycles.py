@@ -180,21 +180,16 @@ class _WorldLook:
         self.outcome: tuple[ShownSky | None, list[str]] | None = None
         self.sky: ShownSky | None = None  # the last one that was found
         self.changed: float | None = None  # time of the last request that no work has begun for
-        self._thread: threading.Thread | None = None
+        self.thread: threading.Thread | None = None
         self._result: tuple[ShownSky, list[str]] | Exception | None = None
-
-    @property
-    def is_busy(self) -> bool:
-        """True while a result is to come."""
-        return self.changed is not None or self._thread is not None
 
     def step(self, frame: int) -> None:
         """Do the next step, in the main thread."""
-        if self._thread is None:
+        if self.thread is None:
             if self.changed is not None and time.monotonic() - self.changed > REST_SECONDS:
                 self._begin(frame)
-        elif not self._thread.is_alive():
-            self._thread, result = None, self._result
+        elif not self.thread.is_alive():
+            self.thread, result = None, self._result
             if isinstance(result, Exception):
                 self.outcome = None, [f"{self.name}: {error_line(result)}"]
             elif self.changed is None:  # else it has changed again
@@ -215,7 +210,7 @@ class _WorldLook:
             except Exception as error:
                 self._result = error
 
-        self._thread = _start("world", [world], work)
+        self.thread = _start("world", [world], work)
 
 
 # By the full name of the world.
@@ -253,7 +248,9 @@ class LiveWorld:
     @property
     def is_busy(self) -> bool:
         """True while a result is to come."""
-        return self._look is not None and (self._look.is_busy or self._look.outcome is not self._taken)
+        look = self._look
+        has_work = look is not None and (look.changed is not None or look.thread is not None)
+        return has_work or (look is not None and look.outcome is not self._taken)
 
     def step(self, frame: int) -> tuple[ShownSky | None, list[str]] | None:
         """Do the next step, in the main thread. Returns the sky that was found and notes about it; None: no news."""

@@ -16,7 +16,7 @@ def scene(tmp_path):
     """The add-on and a saved file that can be shaded."""
     with add_on_in_room(tmp_path / "room.blend") as found:
         yield found
-        results.running["job"] = None
+        results.state["job"] = None
 
 
 @pytest.fixture

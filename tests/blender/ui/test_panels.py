@@ -91,9 +91,9 @@ def test_every_panel_draws_in_every_state(scene, tmp_path, add_results, width):
                     drawn(panel, function, width)
 
     draw_all()
-    results.running["job"] = Job("Compare with Cycles", Plan([Step("Cycles A", 1.0)]), tmp_path, "compare", 0)
+    results.state["job"] = Job("Compare with Cycles", Plan([Step("Cycles A", 1.0)]), tmp_path, "compare", 0)
     draw_all()
-    results.running["job"] = None
+    results.state["job"] = None
     for partial in ("Not complete: without Cycles", ""):
         add_results(partial, ("ltc", "ltsh4") if partial else ("ltc", "ltsh4", "cycles"))
         draw_all()
@@ -154,7 +154,7 @@ def test_a_running_job_stands_in_the_place_of_its_buttons_and_nothing_moves(scen
     bpy.data.objects["Floor"].select_set(True)
     before = {one: (heights(one), drawn(one)) for one in (MAIN_3D, panel, other)}
     plan = Plan([Step("samples", 30.0), Step("Cycles A", 100.0)])
-    job = results.running["job"] = Job("Compare with Cycles", plan, tmp_path, command, 0)
+    job = results.state["job"] = Job("Compare with Cycles", plan, tmp_path, command, 0)
     job._take({"stage": "Cycles A", "fraction": 0.25})
     plan._share = 0.25
     shown = drawn(panel)
@@ -290,10 +290,10 @@ def test_numbers_are_those_of_the_report(scene, tmp_path, add_results):
     assert buttons(shown)["ltsh.save_exr"] and "ltsh_warnings" in [item.what for item in shown if item.kind == "panel"]
     # While the job runs that adds Cycles; pictures that a cancelled job left are what they are.
     add_results("Not complete: without Cycles", ("ltc", "ltsh4"))
-    job = results.running["job"] = Job("Compare with Cycles", Plan([Step("Cycles A", 1.0)]), tmp_path, "compare", 0)
+    job = results.state["job"] = Job("Compare with Cycles", Plan([Step("Cycles A", 1.0)]), tmp_path, "compare", 0)
     job.results.append(results.result_of(scene).folder)
     assert "Not complete: without Cycles" in texts(drawn(RESULTS))
-    results.running["job"] = None
+    results.state["job"] = None
     assert "Not complete" not in texts(drawn(RESULTS))
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from ...scene import SceneError, error_line, light_records, listed
 from .. import render_settings
 from ..evaluated import SURFACE_TYPES, owner_of, read_values, rendered_surfaces, with_render_depsgraph
-from ..lights.area import LightInventory, collect_lights, rendered_lights
+from ..lights.area import LightInventory, collect_lights, note_overlaps, rendered_lights
 from ..lights.meshes import SIDE_PROPERTY, let_light_through
 from ..lights.world import blocks_nothing, take_world, world_behind, world_lights
 from ..materials.aovs import (
@@ -313,6 +313,7 @@ def add_world(inventory: LightInventory, scene, world) -> None:
     """Complete `inventory` with the emission of its lights and the light of `world`, the former world of `scene`."""
     of_world = world_lights(scene, world, inventory.warn)
     inventory.lights = rendered_lights(scene, inventory) + of_world
+    note_overlaps(inventory)
     inventory.world = world if of_world else None
     if inventory.occluders is not None:
         inventory.occluders = blocks_nothing(inventory.occluders, inventory.world)

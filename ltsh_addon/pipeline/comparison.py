@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .. import imaging, shading
+from .. import imaging
 from ..imaging import exr
 from ..imaging.exr import COMBINED, layer_name
-from ..scene import CYCLES, PASSES, REFERENCE, Film, SurfaceSamples
+from ..scene import CYCLES, PASSES, REFERENCE, SCALAR_FIELDS, Film, SurfaceSamples
 from . import lighting
 from .lighting import REFERENCE_SEED, TechniqueResult, described, technique_names, title
 from .options import PictureOptions
@@ -23,28 +23,10 @@ from .tasks import check_before_writing, versions
 # MOST_VISIBILITY_LAYERS: with more lights the EXR has no visibility layers.
 MOST_VISIBILITY_LAYERS = 64
 # Layers of the G-buffer: field of SurfaceSamples and its channel letters.
+_COLORS = "specular_f0", "specular_f90", "specular_dip", "dielectric", "diffuse_albedo", "diffuse_rebound"
 SAMPLE_LAYERS = {
-    "position": "XYZ",
-    "view": "XYZ",
-    "normal": "XYZ",
-    "diffuse_normal": "XYZ",
-    "geometric_normal": "XYZ",
-    "smooth_normal": "XYZ",
-    "bump_alpha2": "V",
-    "roughness": "V",
-    "specular_f0": "RGB",
-    "specular_f90": "RGB",
-    "specular_dip": "RGB",
-    "dielectric": "RGB",
-    "ior": "V",
-    "diffuse_albedo": "RGB",
-    "diffuse_roughness": "V",
-    "diffuse_rebound": "RGB",
-    "sheen_a": "V",
-    "sheen_b": "V",
-    "receiver": "V",
-    "anisotropy": "V",
-    "tangent": "XYZ",
+    field.name: "V" if field.name in SCALAR_FIELDS else "RGB" if field.name in _COLORS else "XYZ"
+    for field in fields(SurfaceSamples)
 }
 
 
@@ -100,11 +82,8 @@ class Comparison:
             for pass_name in self.options.passes
         }
 
-    def _radiance(self, result, pass_name) -> np.ndarray:
-        return self._exposed(result.shading, pass_name)
-
-    def _exposed(self, shaded: shading.Shading, pass_name) -> np.ndarray:
-        return self.extraction.picture.exposure * getattr(shaded, pass_name)
+    def _radiance(self, result, pass_name, of: str = "shading") -> np.ndarray:
+        return self.extraction.picture.exposure * getattr(getattr(result, of), pass_name)
 
     def _image(self, result, values) -> np.ndarray:
         return self._film_of(result).image(values)
@@ -234,7 +213,7 @@ class Comparison:
             images = (self._image(result, values) for values in self._radiance(result, pass_name))
             planes |= {layer: image, **exr.by_group(layer, groups, images)}
             if result.unshadowed is not None:
-                values = self._exposed(result.unshadowed, pass_name).sum(axis=0)
+                values = self._radiance(result, pass_name, "unshadowed").sum(axis=0)
                 planes[layer_name(f"{name}{exr.UNSHADOWED}", pass_name)] = self._image(result, values)
         for pass_name, halves in self.cycles.items():
             if pass_name not in self.options.passes:

@@ -220,7 +220,7 @@ def _is_lost(image) -> bool:
     return not all((path.parent / name).is_file() for name in names)
 
 
-def missing_libraries() -> list[str]:
+def lost_libraries() -> list[str]:
     """A warning for each library that is missing."""
     return [
         f"library {library.name!r}: {library.filepath} is missing, and what it held with it"
@@ -255,7 +255,7 @@ def open_scene(path: Path, warnings: list[str], scripts: bool = False) -> None:
         raise SceneError(newer(path, saved, here))
     if bpy.app.autoexec_fail:
         warnings.append(f"scripts in {path.name} do not run: {bpy.app.autoexec_fail_message}")
-    warnings.extend(missing_libraries())
+    warnings.extend(lost_libraries())
 
 
 def _reason(error: RuntimeError, path: Path) -> str:

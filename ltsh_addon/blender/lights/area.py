@@ -19,6 +19,7 @@ from typing import Any
 import bpy
 import numpy as np
 
+from ...cycles.horizons import unit
 from ...cycles.light_tree import light_selection_pmf
 from ...scene import FARTHEST, EllipseLight, Light, PointLight, QuadLight, SpotCone, SpotLight, SunLight, listed
 from ..evaluated import EmitterTraits, RenderedSurface, is_surface, read_values, surface_instancer
@@ -264,28 +265,21 @@ def _lost_diffuse_shares(pair: tuple[Light, Light], inventory: LightInventory) -
 
 def _lit_points(depsgraph) -> tuple[np.ndarray, np.ndarray]:
     """Random points (Q, 3) on the surfaces of a scene, evenly by area, and their normals, in world space."""
-    random, areas, triangles = np.random.default_rng(0), [], []
+    random, chosen, total = np.random.default_rng(0), np.zeros((LIT_POINTS, 3, 3)), 1e-30
     for instance in depsgraph.object_instances:
         mesh = instance.object.data
-        if not is_surface(instance) or not isinstance(mesh, bpy.types.Mesh):
-            continue
-        vertices = read_values(mesh.vertices, "co", (len(mesh.vertices), 3), np.float32)
-        mesh.calc_loop_triangles()
-        corners = read_values(mesh.loop_triangles, "vertices", (len(mesh.loop_triangles), 3), np.int32)
-        matrix = np.array(instance.matrix_world)
-        world = (vertices @ matrix[:3, :3].T + matrix[:3, 3])[corners]
-        area = 0.5 * np.linalg.norm(np.cross(world[:, 1] - world[:, 0], world[:, 2] - world[:, 0]), axis=1)
-        if area.sum() > 0.0:
-            triangles.append(world[random.choice(len(area), LIT_POINTS, p=area / area.sum())])
-            areas.append(area.sum())
-    if not areas:
-        return np.zeros((0, 3)), np.zeros((0, 3))
-    which = random.choice(len(areas), LIT_POINTS, p=np.array(areas) / sum(areas))
-    chosen = np.stack(triangles)[which, np.arange(LIT_POINTS)]
-    weights = random.dirichlet(np.ones(3), LIT_POINTS)
-    normal = np.cross(chosen[:, 1] - chosen[:, 0], chosen[:, 2] - chosen[:, 0])
-    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-30)
-    return (weights[..., None] * chosen).sum(axis=1), normal
+        if is_surface(instance) and isinstance(mesh, bpy.types.Mesh) and len(mesh.polygons):
+            mesh.calc_loop_triangles()
+            corners = read_values(mesh.loop_triangles, "vertices", (len(mesh.loop_triangles), 3), np.int32)
+            vertices = read_values(mesh.vertices, "co", (len(mesh.vertices), 3), np.float32)
+            matrix = np.array(instance.matrix_world)
+            world = (vertices @ matrix[:3, :3].T + matrix[:3, 3])[corners]
+            area = np.cumsum(np.linalg.norm(np.cross(world[:, 1] - world[:, 0], world[:, 2] - world[:, 0]), axis=1))
+            total += area[-1]
+            new = random.random(LIT_POINTS) < area[-1] / total
+            chosen[new] = world[np.searchsorted(area[:-1], area[-1] * random.random(np.count_nonzero(new)))]
+    normal = unit(np.cross(chosen[:, 1] - chosen[:, 0], chosen[:, 2] - chosen[:, 0]))
+    return (random.dirichlet(np.ones(3), LIT_POINTS)[..., None] * chosen).sum(axis=1), normal
 
 
 def half_hidden(light: Light) -> str:

@@ -64,11 +64,7 @@ def bake_scene(options: BakeOptions, progress: Progress | None = None) -> dict:
 
 
 def bake_objects(
-    options: BakeOptions,
-    progress: Progress | None = None,
-    *,
-    tile: int | None = None,
-    following: tuple[str, ...] = (),
+    options: BakeOptions, progress: Progress | None = None, *, tile: int | None = None, following: tuple[str, ...] = ()
 ) -> TaskResult:
     """Bake the objects and write their files, but no report.json; `tile` is the only UDIM tile to bake, None: all.
 

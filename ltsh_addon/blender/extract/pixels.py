@@ -184,7 +184,8 @@ def missing_images(depsgraph, world, override=None) -> list[str]:
             blocks |= {override} if override else _materials_of_faces(ob)
 
     def shapes(block) -> bool:
-        return any(user in objects or user.id_type in _SHAPING and shapes(user) for user in user_map[block])
+        between = "TEXTURE", "NODETREE", "PARTICLE"
+        return any(user in objects or user.id_type in between and shapes(user) for user in user_map[block])
 
     shown = {image for block in blocks - {None} for image in images_behind(block)}
     return [
@@ -203,21 +204,15 @@ def _materials_of_faces(ob) -> set:
     return {materials[number] for number in np.unique(np.clip(index, 0, len(materials) - 1))}
 
 
-# Data by which images change the shape of objects, or where others stand on them.
-_SHAPING = "TEXTURE", "NODETREE", "PARTICLE"
-
-
 def _is_lost(image) -> bool:
     """True if a file of the image is not there; a sequence is there if its folder has one of its kind."""
     if image.source not in ("FILE", "MOVIE", "SEQUENCE", "TILED") or image.packed_file or not image.filepath:
         return False
     path = Path(bpy.path.abspath(image.filepath, library=image.library))
     if image.source == "SEQUENCE":
-        return next(path.parent.glob(f"*{path.suffix}"), None) is None
-    names = [path.name]
-    if image.source == "TILED":
-        names = [path.name.replace("<UDIM>", str(tile.number)) for tile in image.tiles if "<UDIM>" in path.name]
-    return not all((path.parent / name).is_file() for name in names)
+        return not any(path.parent.glob(f"*{path.suffix}"))
+    numbers = [tile.number for tile in image.tiles] if image.source == "TILED" else [1001]
+    return not all(path.with_name(path.name.replace("<UDIM>", str(number))).is_file() for number in numbers)
 
 
 def lost_libraries() -> list[str]:

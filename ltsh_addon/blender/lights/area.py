@@ -218,8 +218,7 @@ def note_overlaps(inventory: LightInventory) -> None:
     names = [f"{first.name!r} and {second.name!r} ({100.0 * share:.0f} %)" for first, second, share in pairs]
     brightness = [[np.abs(light.radiance).sum() for light in pair[:2]] for pair in pairs]
     lost = max(max(pair) / sum(pair) for pair in brightness)
-    strongest = sorted(range(len(pairs)), key=lambda number: -sum(brightness[number]))[:NAMED_PAIRS]
-    mean, most = max(_lost_diffuse_shares(pairs[number][:2], inventory) for number in strongest)
+    mean, most = max(_lost_diffuse_shares(pair[:2], inventory) for pair in pairs[:NAMED_PAIRS])
     inventory.warn(
         f"lights {listed(names, NAMED_PAIRS)}: each pair overlaps in one plane, by that share of the smaller light; "
         f"there Cycles loses about {100.0 * mean:.2g} % of their diffuse light on all surfaces together, at "
@@ -499,11 +498,9 @@ def _cone(light, matrix) -> SpotCone:
 
 def _sun(light, name, axis, traits) -> Light:
     half = 0.5 * light.angle
-    value = strength(light)
-    if half <= LEAST_ANGLE:
-        half = LEAST_ANGLE
-        value = value / (math.pi * math.sin(half) ** 2)
-    elif light.normalize:
+    value, is_point = strength(light), half <= LEAST_ANGLE
+    half = max(half, LEAST_ANGLE)
+    if is_point or light.normalize:
         value = value / (math.pi * math.sin(half) ** 2)
     half = min(half, WIDEST_SUN)
     first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])

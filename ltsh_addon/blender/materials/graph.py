@@ -17,6 +17,7 @@ import bpy
 from ..render_settings import SCRIPT
 
 MIX, ADD = "ShaderNodeMixShader", "ShaderNodeAddShader"
+_MIXES = MIX, "ShaderNodeMix", "ShaderNodeMixRGB"
 CLEAR, HOLDOUT, PRINCIPLED = "ShaderNodeBsdfTransparent", "ShaderNodeHoldout", "ShaderNodeBsdfPrincipled"
 GROUP_SOCKET_NAME = "ltsh"
 
@@ -178,9 +179,7 @@ def images_behind(data) -> set:
         known.add((source.node, source.groups))
         images.add(getattr(source.node, "image", None))
         inputs = [socket for socket in source.node.inputs if socket.enabled]
-        if source.node.bl_idname in (MIX, "ShaderNodeMix", "ShaderNodeMixRGB") and is_constant(
-            value_of(inputs[0]), 0.0
-        ):
+        if source.node.bl_idname in _MIXES and is_constant(value_of(inputs[0]), 0.0):
             inputs = inputs[:2]  # the first of both alone has a weight
         waiting += [(socket, source.groups) for socket in inputs]
     return images - {None}

@@ -100,11 +100,8 @@ class ProgressBar:
 
     def begin_job(self, label: str) -> None:
         """Begin another job: print a line, unless quiet, and log it."""
-        self.finish()
         self._tasks, self._stage = 1, None
-        self.log.line(label)
-        if not self._quiet:
-            self._say(label)
+        self.remark(label)
 
     def begin_task(self, number: int, tasks: int) -> None:
         """Begin task `number` of `tasks`, counted from 1."""

@@ -64,8 +64,7 @@ class Comparison:
 
     def whole(self, name: str) -> np.ndarray:
         """The whole picture (H, W, 4) of a technique: the sum of its passes, plus `rest` where that is known."""
-        light = sum(self.images[name, pass_name] for pass_name in self.options.passes)
-        return self._with_rest(light)
+        return self._with_rest(sum(self.images[name, pass_name] for pass_name in self.options.passes))
 
     def _with_rest(self, light: np.ndarray) -> np.ndarray:
         """The picture (H, W, 4) with this reflected `light` (H, W, 3); alpha is the coverage where `rest` is None."""
@@ -89,9 +88,7 @@ class Comparison:
         return self._film_of(result).image(values)
 
     def _film_of(self, result) -> Film:
-        if result.subset is None:
-            return self.film
-        return self.film.take(result.subset)
+        return self.film if result.subset is None else self.film.take(result.subset)
 
     def _mask(self, result) -> np.ndarray:
         """Mask (H, W) of the pixels whose surfaces the technique has shaded."""

@@ -395,9 +395,8 @@ def tiles_of(uv: np.ndarray) -> tuple[list[int], float]:
     solid = np.isfinite(area) & (area > 0.0)
     uv, area = uv[solid], area[solid]
     tile = np.floor(uv.mean(axis=1))
-    reaches = (uv.max(axis=1) > tile + TILE_TOLERANCE) & (uv.min(axis=1) < tile + 1.0 - TILE_TOLERANCE)
-    if reaches.all(axis=1).any():
-        uv, tile = uv[reaches.all(axis=1)], tile[reaches.all(axis=1)]
+    inside = ((uv.max(axis=1) > tile + TILE_TOLERANCE) & (uv.min(axis=1) < tile + 1.0 - TILE_TOLERANCE)).all(axis=1)
+    uv, tile = (uv[inside], tile[inside]) if inside.any() else (uv, tile)
     column, row = tile.astype(np.int64).T
     origin = np.stack([column, row], axis=-1)[:, None]
     within = np.all((uv >= origin - TILE_TOLERANCE) & (uv <= origin + 1.0 + TILE_TOLERANCE), axis=(1, 2))

@@ -131,8 +131,7 @@ class Comparison:
         }
 
     def _reference_facts(self) -> dict | None:
-        result = self.results.get(REFERENCE)
-        if result is None:
+        if (result := self.results.get(REFERENCE)) is None:
             return None
         count = len(self.extraction.samples) if result.subset is None else len(result.subset)
         error = result.shading.quadrature_error

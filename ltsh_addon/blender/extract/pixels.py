@@ -198,10 +198,10 @@ def missing_images(depsgraph, world, override=None) -> list[str]:
 def _materials_of_faces(ob) -> set:
     """The original materials, or None, of the faces of the evaluated object `ob`; all where it has hair."""
     materials = [slot.material and slot.material.original for slot in ob.material_slots]
-    if not isinstance(ob.data, bpy.types.Mesh) or ob.particle_systems or len(materials) < 2:
-        return set(materials)
-    index = read_values(ob.data.polygons, "material_index", (len(ob.data.polygons),), np.int32)
-    return {materials[number] for number in np.unique(np.clip(index, 0, len(materials) - 1))}
+    if isinstance(ob.data, bpy.types.Mesh) and not ob.particle_systems and len(materials) > 1:
+        index = read_values(ob.data.polygons, "material_index", (len(ob.data.polygons),), np.int32)
+        return {materials[number] for number in np.unique(np.clip(index, 0, len(materials) - 1))}
+    return set(materials)
 
 
 def _is_lost(image) -> bool:
@@ -294,6 +294,8 @@ def prepare_scene(
         materials, inventory.emitting_materials, inventory.unshaded, inventory.made_opaque, left_to_cycles
     )
     inventory.receivers.mark()
+    if with_occluders:  # before a look at the lights, which shows them to such rays
+        let_shadow_rays_through(inventory.made_opaque)
     inventory.behind = world
     add_world(inventory, scene, world)
     if not inventory.lights and not for_finished:
@@ -412,8 +414,6 @@ def _prepare_reference(scene, inventory: LightInventory) -> None:
     """Make Cycles light the scene as the techniques do, with or without shadows."""
     if inventory.occluders is None:
         remove_occlusion(scene)
-    else:
-        let_shadow_rays_through(inventory.made_opaque)
     scene.world = inventory.world
 
 

@@ -110,8 +110,6 @@ def collect_lights(depsgraph, override=None) -> LightInventory:
             note_unsupported(ob, matrix, inventory)
             if _is_sheared(ob, matrix):
                 inventory.left_to_cycles.everything.append(f"light {ob.original.name!r}, whose transform is sheared")
-            if light.affects_diffuse != light.affects_specular:
-                inventory.warn(half_hidden(light))
             _note_instancer(instance, inventory)
     # If one instance is unusable, all instances of the object are left out: the reference can only drop the object.
     for name, light, source in placed:
@@ -127,9 +125,10 @@ def collect_lights(depsgraph, override=None) -> LightInventory:
         inventory.warn(reason)
     inventory.left_to_cycles.everything += lost
     for mesh in inventory.meshes:
-        if mesh.light.affects_diffuse != mesh.light.affects_specular:
-            inventory.warn(half_hidden(mesh.light))
         inventory.instancers.update(mesh.instancers)
+    for light in [*inventory.lights, *(mesh.light for mesh in inventory.meshes)]:
+        if light.affects_diffuse != light.affects_specular:
+            inventory.warn(half_hidden(light))
     return inventory
 
 
@@ -149,14 +148,12 @@ LIT_POINTS, LEAST_LIT = 512, 0.1
 def overlapping_pairs(lights: list[Light]) -> list[tuple[Light, Light, float]]:
     """Pairs of overlapping lights, each with the share of the smaller light that lies in the other; at most MOST_PAIRS.
 
-    Both lights lie in one plane, up to single precision, shine to the same side and light a common object. The light
-    that comes first in `lights` is the first of its pair.
+    Both lights lie in one plane, up to single precision, shine to the same side and light a common object.
     """
     if len(lights) < 2:
         return []
     axis = np.ptp([light.center for light in lights], axis=0).argmax()
-    order = sorted(range(len(lights)), key=lambda number: lights[number].center[axis])
-    lights = [lights[number] for number in order]
+    lights = sorted(lights, key=lambda light: light.center[axis])
     center, direction, half_u, half_v = (
         np.array([getattr(light, name) for light in lights]) for name in ("center", "direction", "half_u", "half_v")
     )
@@ -175,19 +172,15 @@ def overlapping_pairs(lights: list[Light]) -> list[tuple[Light, Light, float]]:
         )
         near &= direction[chunk] @ direction[other].T > 1.0 - 1e-6
         for first, second in zip(*np.nonzero(np.triu(near, 1)), strict=True):
-            pair = sorted((start + first, start + second), key=order.__getitem__)
-            lights_of_pair = lights[pair[0]], lights[pair[1]]
-            share = 0.0 if _never_meet(*lights_of_pair) else _overlap(*lights_of_pair)
+            lights_of_pair = lights[start + first], lights[start + second]
+            receivers = [light.receivers for light in lights_of_pair]
+            never_meet = None not in receivers and not set(receivers[0]) & set(receivers[1])
+            share = 0.0 if never_meet else _overlap(*lights_of_pair)
             if share > 0.0:
                 pairs.append((*lights_of_pair, share))
             if len(pairs) == MOST_PAIRS:
                 return pairs
     return pairs
-
-
-def _never_meet(first: Light, second: Light) -> bool:
-    """True if no object receives light from both."""
-    return None not in (first.receivers, second.receivers) and not set(first.receivers) & set(second.receivers)
 
 
 def _overlap(first: Light, second: Light) -> float:
@@ -234,10 +227,11 @@ def _lost_diffuse_shares(pair: tuple[Light, Light], inventory: LightInventory) -
     Rays that Cycles sends by the BSDF hit the first of both lights alone. So of the second it has only what rays to
     lights count by the power heuristic (Veach and Guibas 1995), as if the other rays had found nothing.
     """
-    first, second = pair
     # Cycles hardly ever chooses a world among lights that are so near.
     lights = tuple(light for light in inventory.lights if not light.is_distant)
-    number = next(number for number, light in enumerate(lights) if light is second)
+    number = max(number for number, light in enumerate(lights) if light is pair[0] or light is pair[1])
+    second = lights[number]
+    first = pair[0] if pair[1] is second else pair[1]
     position, normal = inventory.lit_points
     normal = normal * np.sign(((second.center - position) * normal).sum(axis=1, keepdims=True))  # lit on both sides
     pmf = light_selection_pmf(position, normal, lights)
@@ -407,10 +401,12 @@ def node_light(ob, matrix: np.ndarray, inventory: LightInventory, instance=None)
         emission.falloff = Falloff()
     for problem in emission_warnings(emission, is_light=True):
         inventory.warn(f"light {ob.original.name!r}: {problem}")
+    is_made = instance is not None and instance.is_instance
+    of_parent = (instance.parent.original.name_full, *instance.persistent_id) if is_made else ()
     shared = {
         "falloff": emission.falloff or Falloff(),
         "facts": ObjectFacts.of(ob, instance),
-        "instance": (ob.original.name_full, *_instance_key(instance)),
+        "instance": (ob.original.name_full, *of_parent),
     }
     if light.type in ("AREA", "SUN"):
         if emission.directional and light.type == "AREA":
@@ -431,12 +427,6 @@ def node_light(ob, matrix: np.ndarray, inventory: LightInventory, instance=None)
         light.original, matrix, emission.varies, is_placed=emission.varies and is_placed,
         by_ray=within or not is_ball, within=within, by_spot=by_spot, is_mixed=emission.by_place, **shared,
     )  # fmt: skip
-
-
-def _instance_key(instance) -> tuple:
-    if instance is None or not instance.is_instance:
-        return ()
-    return instance.parent.original.name_full, *instance.persistent_id
 
 
 def note_unsupported(ob, matrix: np.ndarray, inventory: LightInventory) -> None:

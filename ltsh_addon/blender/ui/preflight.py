@@ -132,7 +132,8 @@ def _object_problem(ob, uv_map: str) -> Problem | None:
     try:
         check_object(ob)
     except ObjectError as error:
-        return Problem(_sentence(str(error)))
+        text = str(error)
+        return Problem(text[:1].upper() + text[1:])
     if not ob.data.polygons and not ob.modifiers:
         return Problem(f"Object {ob.name!r} has no faces")
     if uv_map and uv_map not in ob.data.uv_layers and ob.data.uv_layers:
@@ -142,10 +143,6 @@ def _object_problem(ob, uv_map: str) -> Problem | None:
         text = f"Object {ob.name!r} has no UV map"
         return Problem(text, True, "ltsh.add_uv_map", "Unwrap", {"object_name": ob.name})
     return None
-
-
-def _sentence(text: str) -> str:
-    return text[:1].upper() + text[1:]
 
 
 def _camera(scene) -> list[Problem]:

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..files import write_bytes
+from ..imaging import on_screen
 from ..pipeline.batch import Merged, merge, run_tasks
 from ..pipeline.lighting import prepare
 from ..pipeline.options import BakeOptions, PictureOptions, RenderOptions, ViewOptions, options_from, real_number
@@ -216,8 +217,8 @@ def add_relight(parser) -> None:
     parser.add_argument(
         "-o", dest="output", type=Path, metavar="OUT2", help="folder for the results; default: OUT/relit"
     )
-    parser.add_argument("--light", dest="changes", action="append", type=_light, default=[], metavar="NAME",
-                        help="the light to change; may be given several times")  # fmt: skip
+    parser.add_argument("--light", dest="changes", action="append", type=lambda name: {"name": name}, default=[],
+                        metavar="NAME", help="the light to change; may be given several times")  # fmt: skip
     parser.add_argument("--power", action=_OfLight, type=from_text(_factor), metavar="xF", help="such as x2 or x.5")
     parser.add_argument("--exposure", action=_OfLight, type=from_text(_steps), metavar="E", help="such as +1 or -.5")
     parser.add_argument("--color", action=_OfLight, type=from_text(_color), metavar="R,G,B", help="such as 1,.8,.6")
@@ -226,10 +227,6 @@ def add_relight(parser) -> None:
                             help=f"{what}; may be given several times")  # fmt: skip
     add_talk(parser)
     parser.set_defaults(run=_relight)
-
-
-def _light(name: str) -> dict:
-    return {"name": name}
 
 
 class _OfLight(argparse.Action):
@@ -391,7 +388,9 @@ def merge_job(output: Path, arguments, bar, baseline: Baseline | None = None) ->
     bar.finish()
     _complain(bar, "not baked" if merged.command == "bake" else "failed", merged.problems)
     if not arguments.json:
-        _complain(bar, "warning", _warnings(merged))
+        reports = [merged.report] if merged.single else merged.report["reports"]
+        lines = (line for report in reports for line in report.get("warnings", ()))
+        _complain(bar, "warning", on_screen(lines, f"{output}/report.json"))
     _print(_summary(merged, output), arguments, bar)
     _complain(bar, "missing", merged.missing)
     worse = []
@@ -421,11 +420,6 @@ def _print(text, arguments, bar) -> None:
 def _complain(bar, what: str, lines) -> None:
     for line in dict.fromkeys(lines):
         bar.note(f"{what}: {line}")
-
-
-def _warnings(merged) -> list[str]:
-    reports = [merged.report] if merged.single else merged.report["reports"]
-    return list(dict.fromkeys(line for report in reports for line in report.get("warnings", ())))
 
 
 def _summary(merged: Merged, output) -> str:

@@ -18,7 +18,7 @@ import numpy as np
 from ..cycles import uv
 from ..cycles.texels import NOT_BAKED, BakeMaterial, BakeView, TexelMesh, texel_samples
 from ..files import temporary_folder
-from ..imaging import exr
+from ..imaging import exr, grouped
 from ..imaging.exr import COMBINED, layer_name
 from ..reading import NUMBER, Malformed, check, file_name
 from ..scene import PASSES, REFERENCE, Cancelled, Film, Progress, SurfaceSamples, lights_of, listed
@@ -64,11 +64,7 @@ def bake_scene(options: BakeOptions, progress: Progress | None = None) -> dict:
 
 
 def bake_objects(
-    options: BakeOptions,
-    progress: Progress | None = None,
-    *,
-    tile: int | None = None,
-    following: tuple[str, ...] = (),
+    options: BakeOptions, progress: Progress | None = None, *, tile: int | None = None, following: tuple[str, ...] = ()
 ) -> TaskResult:
     """Bake the objects and write their files, but no report.json; `tile` is the only UDIM tile to bake, None: all.
 
@@ -456,7 +452,7 @@ def _first_samples(texel: np.ndarray) -> np.ndarray:
 def _report(options, manifest, records) -> dict:
     problems = [record["problem"] for record in manifest["objects"] if record["problem"]]
     lines = [line for record in manifest["objects"] for line in record["warnings"]]
-    warnings = list(dict.fromkeys([*manifest["warnings"], *lines]))
+    warnings = [*manifest["warnings"], *lines]
     if options.conservative:
         warnings += [
             f"object {record['name']!r}: texels whose centers no face covers are left out, because Cycles bakes none "
@@ -469,22 +465,15 @@ def _report(options, manifest, records) -> dict:
         wrong, note = _darkness(record, reasons[record["name"]])
         problems += wrong
         warnings += note
-        if record["outside"] > NOTED_SHARE_OUTSIDE:
-            share = f"{100 * record['outside']:.3g} %"
-            warnings.append(
-                f"object {record['name']!r}: {share} of UV map {record['uv']!r} lies outside of the texture, not baked"
-            )
+        name = f"object {record['name']!r}"
+        if (share := 100 * record["outside"]) > 100 * NOTED_SHARE_OUTSIDE:
+            warnings.append(f"{name}: {share:.3g} % of UV map {record['uv']!r} lies outside of the texture, not baked")
         for tile in record["tiles"].values():
-            share = tile["overlapping_texels"] / max(tile["texels"], 1)
-            if share > 0.0:
-                share = f"{100 * share:.3g} %"
-                warnings.append(f"object {record['name']!r}: {share} of its texels are covered more than once")
-            if tile["unbaked_texels"]:
-                share = f"{100 * tile['unbaked_texels'] / (tile['texels'] + tile['unbaked_texels']):.3g} %"
-                warnings.append(
-                    f"object {record['name']!r}: {share} of its texels are left out, because Cycles bakes nothing "
-                    "there: apply the modifiers"
-                )
+            if share := 100 * tile["overlapping_texels"] / max(tile["texels"], 1):
+                warnings.append(f"{name}: {share:.3g} % of its texels are covered more than once")
+            if share := 100 * tile["unbaked_texels"] / max(tile["texels"] + tile["unbaked_texels"], 1):
+                why = "because Cycles bakes nothing there: apply the modifiers"
+                warnings.append(f"{name}: {share:.3g} % of its texels are left out, {why}")
     return {
         "scene": str(options.scene),
         "frame": manifest["frame"],
@@ -493,7 +482,7 @@ def _report(options, manifest, records) -> dict:
         "view": manifest["view"],
         "objects": records,
         "problems": problems,
-        "warnings": warnings,
+        "warnings": grouped(warnings),
         "versions": versions(manifest["blender_version"]),
     }
 

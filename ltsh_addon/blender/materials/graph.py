@@ -17,6 +17,7 @@ import bpy
 from ..render_settings import SCRIPT
 
 MIX, ADD = "ShaderNodeMixShader", "ShaderNodeAddShader"
+_MIXES = MIX, "ShaderNodeMix", "ShaderNodeMixRGB"
 CLEAR, HOLDOUT, PRINCIPLED = "ShaderNodeBsdfTransparent", "ShaderNodeHoldout", "ShaderNodeBsdfPrincipled"
 GROUP_SOCKET_NAME = "ltsh"
 
@@ -164,6 +165,24 @@ def source_behind(output, groups: tuple = (), tree_of: Callable = NODE_TREE) -> 
     if source is None or node.bl_idname == "NodeReroute":
         return source
     return replace(source, passed=(*source.passed, entry.type, output.type))
+
+
+def images_behind(data) -> set:
+    """The images whose nodes feed the output of a material, world or light."""
+    output = None if tree_in_use(data) is None else material_output(data.node_tree)
+    waiting = [] if output is None else [(socket, ()) for socket in output.inputs]
+    images, known = set(), set()
+    while waiting:
+        source = source_of(*waiting.pop())
+        if source is None or source.node is None or (source.node, source.groups) in known:
+            continue
+        known.add((source.node, source.groups))
+        images.add(getattr(source.node, "image", None))
+        inputs = [socket for socket in source.node.inputs if socket.enabled]
+        if source.node.bl_idname in _MIXES and is_constant(value_of(inputs[0]), 0.0):
+            inputs = inputs[:2]  # the first of both alone has a weight
+        waiting += [(socket, source.groups) for socket in inputs]
+    return images - {None}
 
 
 def constant_of(socket, groups: tuple = (), tree_of: Callable = NODE_TREE) -> float | None:

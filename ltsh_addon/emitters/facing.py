@@ -197,7 +197,7 @@ def pattern_values(pattern, normals: np.ndarray) -> np.ndarray:
     """Values (...) of a pattern for normals (3, ...), by linear interpolation."""
     x, y, z = (dot(row, normals) for row in pattern.axes.astype(normals.dtype))
     rows, columns = pattern.values.shape
-    row = np.arctan2(np.sqrt(x * x + y * y), z) * (rows / np.pi) - 0.5
+    row = (np.arctan2(np.sqrt(x * x + y * y), z) - pattern.start) * (rows / (np.pi - pattern.start)) - 0.5
     column = np.arctan2(y, x) * (0.5 * columns / np.pi) - 0.5
     first_row, first_column = np.floor(row), np.floor(column)
     down, right = row - first_row, column - first_column

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import base64
 import itertools
+import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass, field, fields
 from functools import cache, cached_property
@@ -46,13 +47,29 @@ class SpotCone:
 class Pattern:
     """Factors of the radiance of a light, by the normal n of the place on a ball, or by the direction n of the light.
 
-    With v = axes n, the polar angle of v from z, 0 to pi, selects the row of `values`; the azimuth of v around z,
+    With v = axes n, the polar angle of v from z, `start` to pi, selects the row of `values`; the azimuth of v around z,
     counted from x, selects the column. Rows and columns are equal steps of these angles.
     """
 
     axes: np.ndarray  # (3, 3), of any length
     values: np.ndarray  # (H, W)
     by_ray: bool = False  # n is the direction in which the light travels, not the normal
+    start: float = 0.0  # rad
+
+    @classmethod
+    def of(cls, record: dict) -> Pattern:
+        """The pattern of a `record`. Raises ValueError or TypeError for a malformed one."""
+        values = dict(record)
+        if "bytes" in values:
+            packed = zlib.decompress(base64.b64decode(values.pop("bytes"), validate=True))
+            values["values"] = np.frombuffer(packed, "<f4").reshape(values.pop("rows"), -1)
+        return cls(**values)
+
+    def record(self) -> dict:
+        """This pattern as a JSON-able dict."""
+        packed = base64.b64encode(zlib.compress(self.values.astype("<f4").tobytes(), 1)).decode()
+        shared = {"axes": self.axes.tolist(), "by_ray": self.by_ray, "start": self.start}
+        return {**shared, "rows": len(self.values), "bytes": packed}
 
     def __post_init__(self):
         axes, values = np.asarray(self.axes, dtype=np.float64), np.asarray(self.values, dtype=np.float32)
@@ -141,8 +158,7 @@ class Light:
         if self.cone is not None:
             record["cone"] = {**vars(self.cone), "axes": self.cone.axes.tolist()}
         if self.pattern is not None:
-            arrays = {name: getattr(self.pattern, name).tolist() for name in ("axes", "values")}
-            record["pattern"] = {**vars(self.pattern), **arrays}
+            record["pattern"] = self.pattern.record()
         return {**record, "detail": [child.record() for child in self.children]}
 
     @property
@@ -293,7 +309,7 @@ class PointLight(Light):
     def __post_init__(self):
         super().__post_init__()
         if isinstance(self.pattern, dict):
-            object.__setattr__(self, "pattern", Pattern(**self.pattern))
+            object.__setattr__(self, "pattern", Pattern.of(self.pattern))
 
     @property
     def is_sphere(self) -> bool:

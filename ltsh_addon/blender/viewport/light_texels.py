@@ -23,7 +23,7 @@ from ...shading.header import float_literal
 from .drawing import float_texture
 
 HEADER = 7  # texels of a light's header, see `light_texels`
-WIDTH = 256  # texels of a row of the texture of lights
+WIDTH = 1024  # texels of a row of the texture of lights
 # Flags of a light, from the lowest bit on. UNEVEN: not equally bright all over. PROFILE: with a spread or a falloff.
 # CAP: seen as a cap of the sphere. PLACED: with a pattern by the position on the light.
 FLAGS = (
@@ -94,7 +94,8 @@ def light_texels(lights: Iterable[Light]) -> np.ndarray:
         5   tan h and 1 / (tan h - h) of the spread, 0 without profile; largest half length; bound
         6   power of the falloff; its smoothing; area; first texel of the pattern, 0: there is none
 
-    A pattern is three texels of its axes, with height, width and `by_ray` as w, then its values, four per texel.
+    A pattern is three texels of its axes, with rows from pole to pole, width and `by_ray` as w, one of its number of
+    rows, then its values, four per texel.
 
     Bound: along any axis no corner is farther from the center than the bound times the sum of the extents of half_u
     and half_v.
@@ -120,9 +121,10 @@ def light_texels(lights: Iterable[Light]) -> np.ndarray:
 def _pattern_texels(pattern) -> np.ndarray:
     if pattern is None:
         return np.zeros((0, 4))
-    traits = np.array([*pattern.values.shape, pattern.by_ray])[:, None]
+    rows, columns = pattern.values.shape
+    traits = np.array([rows * np.pi / (np.pi - pattern.start), columns, pattern.by_ray])[:, None]
     values = np.pad(pattern.values.ravel(), (0, -pattern.values.size % 4)).reshape(-1, 4)
-    return np.concatenate([np.concatenate([pattern.axes, traits], axis=1), values])
+    return np.concatenate([np.concatenate([pattern.axes, traits], axis=1), [[rows, 0.0, 0.0, 0.0]], values])
 
 
 def visible_lights(lights: Iterable[Light]) -> list[Light]:

@@ -20,13 +20,7 @@ from ..reading import is_text
 from ..scene import VERSION, Cancelled, SceneError, error_line
 from ..shading import TableError
 from .arguments import Mistakes, Misuse
-from .commands import (
-    add_demo,
-    add_job,
-    add_merge,
-    add_relight,
-    add_run,
-)
+from .commands import add_demo, add_job, add_merge, add_relight, add_run
 from .progress import ProgressBar, RunLog, print_json, print_out
 
 EXAMPLES = """examples:

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..files import write_bytes
+from ..imaging import on_screen
 from ..pipeline.batch import Merged, merge, run_tasks
 from ..pipeline.lighting import prepare
 from ..pipeline.options import BakeOptions, PictureOptions, RenderOptions, ViewOptions, options_from, real_number
@@ -391,7 +392,9 @@ def merge_job(output: Path, arguments, bar, baseline: Baseline | None = None) ->
     bar.finish()
     _complain(bar, "not baked" if merged.command == "bake" else "failed", merged.problems)
     if not arguments.json:
-        _complain(bar, "warning", _warnings(merged))
+        reports = [merged.report] if merged.single else merged.report["reports"]
+        lines = (line for report in reports for line in report.get("warnings", ()))
+        _complain(bar, "warning", on_screen(lines, f"{output}/report.json"))
     _print(_summary(merged, output), arguments, bar)
     _complain(bar, "missing", merged.missing)
     worse = []
@@ -421,11 +424,6 @@ def _print(text, arguments, bar) -> None:
 def _complain(bar, what: str, lines) -> None:
     for line in dict.fromkeys(lines):
         bar.note(f"{what}: {line}")
-
-
-def _warnings(merged) -> list[str]:
-    reports = [merged.report] if merged.single else merged.report["reports"]
-    return list(dict.fromkeys(line for report in reports for line in report.get("warnings", ())))
 
 
 def _summary(merged: Merged, output) -> str:

@@ -205,12 +205,7 @@ class BakeMaterial:
 
 
 def texel_samples(
-    mesh: TexelMesh,
-    materials: list[BakeMaterial],
-    texels: Texels,
-    read_map,
-    view: BakeView,
-    lights: tuple[Light, ...],
+    mesh: TexelMesh, materials: list[BakeMaterial], texels: Texels, read_map, view: BakeView, lights: tuple[Light, ...]
 ) -> tuple[SurfaceSamples, np.ndarray]:
     """Samples (S) of texels (Q), and the texel (S,) of each, 0 to Q - 1. The samples of a texel are consecutive.
 

@@ -7,13 +7,14 @@ import json
 import math
 import os
 import posixpath
+import re
 import urllib.parse
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from ..files import write_bytes
 from ..reading import NUMBER, Malformed, check, file_name, read_json, some
-from ..scene import shortened
+from ..scene import listed, shortened
 
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 78rem; padding: 0 1rem; color: #222; }
@@ -52,6 +53,50 @@ def _plain(value):
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
+
+
+# What differs between warnings of one kind: names as `repr` quotes them, and numbers.
+_ONE = r"""(?:(?<!\w)(?:'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*")|\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?(?: %)?)"""
+_VARYING, _MEMBER = re.compile(_ONE), re.compile(f"{_ONE}(?: {_ONE})*")
+_MORE = re.compile(r"(.*) \((\d+) more: (.*)\)", re.DOTALL)
+# A warning with a phrase of NOTES is about a setting, or the same in Cycles, and comes last; one with a phrase of
+# ABSENT is about something that is not in the picture, and comes first.
+_NOTES = ("switched off", "as in Cycles", "nor does Cycles", "as rendered", "on the processor", "only view layer")
+_NOTES += ("lights were", "as they were", "is Cycles' own", "only guides", "so the techniques do not")
+_ABSENT = (" black", "not shaded", "lights nothing", "could not be read", "missing", "left out", "not finite")
+MOST_SHOWN, NAMED = 8, 3  # warnings on a screen, and others of its kind that a warning on a screen names
+
+
+def grouped(lines: Iterable[str]) -> list[str]:
+    """Warnings, the most harmful first, those of one kind in one: "object 'A': it glows (2 more: 'B'; 'C')".
+
+    Warnings are of one kind if only names and numbers differ. Harm: first what is absent from the picture, last what
+    is the same in Cycles, in between by the largest percentage in the line.
+    """
+    kinds: dict[str, tuple[str, dict[str, None]]] = {}
+    for line in sorted(dict.fromkeys(lines), key=_harm):
+        head, _, members = _MORE.fullmatch(line).groups() if _MORE.fullmatch(line) else (line, 0, "")
+        first, others = kinds.setdefault(_VARYING.sub("\0", head), (head, {}))
+        known = _VARYING.findall(first)
+        new = " ".join(one for one, its in zip(_VARYING.findall(head), known, strict=True) if one != its)
+        others |= dict.fromkeys(one for one in (new, *_MEMBER.findall(members)) if one and one not in known)
+    return [f"{head} ({len(more)} more: {'; '.join(more)})" if more else head for head, more in kinds.values()]
+
+
+def _harm(line: str) -> tuple[int, float]:
+    rank = 2 if any(map(line.__contains__, _NOTES)) else 0 if any(map(line.__contains__, _ABSENT)) else 1
+    return rank, -max((float(one) for one in re.findall(r"(\d+(?:\.\d+)?) %", line)), default=0.0)
+
+
+def on_screen(warnings: Iterable[str], rest: str = "report.json") -> list[str]:
+    """The first `MOST_SHOWN` of `grouped` warnings with fewer names, and a line about those in the `rest`."""
+    lines = grouped(warnings)
+    shown = [
+        f"{match[1]} ({match[2]} more: {listed(_MEMBER.findall(match[3]), NAMED, '; ')})" if match else line
+        for line in lines[:MOST_SHOWN]
+        for match in [_MORE.fullmatch(line)]
+    ]
+    return shown + ([f"{len(lines) - MOST_SHOWN} more kinds of warnings are in {rest}"] if lines[MOST_SHOWN:] else [])
 
 
 def write_html(folder: str | os.PathLike, page: str, sheet: str, layers: str, report: Mapping) -> None:

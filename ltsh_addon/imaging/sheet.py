@@ -33,11 +33,7 @@ class Tile:
 
 
 def comparison_sheet(
-    title: str,
-    reference: tuple[str, np.ndarray],
-    techniques: Sequence[Tile],
-    *,
-    notes: Sequence[str] = (),
+    title: str, reference: tuple[str, np.ndarray], techniques: Sequence[Tile], *, notes: Sequence[str] = ()
 ) -> np.ndarray:
     """The sheet (H, W, 3), 8-bit sRGB.
 

@@ -18,7 +18,7 @@ import numpy as np
 from ..cycles import uv
 from ..cycles.texels import NOT_BAKED, BakeMaterial, BakeView, TexelMesh, texel_samples
 from ..files import temporary_folder
-from ..imaging import exr
+from ..imaging import exr, grouped
 from ..imaging.exr import COMBINED, layer_name
 from ..reading import NUMBER, Malformed, check, file_name
 from ..scene import PASSES, REFERENCE, Cancelled, Film, Progress, SurfaceSamples, lights_of, listed
@@ -64,11 +64,7 @@ def bake_scene(options: BakeOptions, progress: Progress | None = None) -> dict:
 
 
 def bake_objects(
-    options: BakeOptions,
-    progress: Progress | None = None,
-    *,
-    tile: int | None = None,
-    following: tuple[str, ...] = (),
+    options: BakeOptions, progress: Progress | None = None, *, tile: int | None = None, following: tuple[str, ...] = ()
 ) -> TaskResult:
     """Bake the objects and write their files, but no report.json; `tile` is the only UDIM tile to bake, None: all.
 
@@ -456,7 +452,7 @@ def _first_samples(texel: np.ndarray) -> np.ndarray:
 def _report(options, manifest, records) -> dict:
     problems = [record["problem"] for record in manifest["objects"] if record["problem"]]
     lines = [line for record in manifest["objects"] for line in record["warnings"]]
-    warnings = list(dict.fromkeys([*manifest["warnings"], *lines]))
+    warnings = [*manifest["warnings"], *lines]
     if options.conservative:
         warnings += [
             f"object {record['name']!r}: texels whose centers no face covers are left out, because Cycles bakes none "
@@ -493,7 +489,7 @@ def _report(options, manifest, records) -> dict:
         "view": manifest["view"],
         "objects": records,
         "problems": problems,
-        "warnings": warnings,
+        "warnings": grouped(warnings),
         "versions": versions(manifest["blender_version"]),
     }
 

@@ -10,7 +10,7 @@ from itertools import groupby
 from pathlib import Path
 
 from ..files import no_empty_folder, temporary_folder
-from ..imaging import write_json, write_overview
+from ..imaging import grouped, write_json, write_overview
 from ..reading import NUMBER, Malformed, read_json
 from ..scene import Progress, SceneError, error_line
 from . import bake, picture, render
@@ -234,7 +234,7 @@ def _unit(job, output, tasks, finished, progress) -> tuple[str, dict] | None:
         **reports[0],
         "objects": _objects(item for one in reports for item in one["objects"]),
         "problems": list(dict.fromkeys(line for one in reports for line in one["problems"])),
-        "warnings": list(dict.fromkeys(line for one in reports for line in one["warnings"])),
+        "warnings": grouped(line for one in reports for line in one["warnings"]),
     }
     if job["applied_layer"] and report["objects"]:
         report["applied"] = bake.apply_textures(

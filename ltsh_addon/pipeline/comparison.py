@@ -151,7 +151,7 @@ class Comparison:
             "shadows": None if self.shadows is None else self.shadows.report(),
             "passes": {name: self._pass_report(name) for name in options.passes},
             "problems": list(extraction.problems),
-            "warnings": list(extraction.warnings),
+            "warnings": imaging.grouped(extraction.warnings),
         }
 
     def _reference_facts(self) -> dict | None:

@@ -20,17 +20,7 @@ from ..cycles.gbuffer import finer
 from ..emitters.light_tree import FEWEST
 from ..files import check_takes_files
 from ..imaging.exr import unique_names
-from ..scene import (
-    CYCLES,
-    REFERENCE,
-    SHIPPED_TABLES,
-    TECHNIQUES,
-    Cancelled,
-    Film,
-    Light,
-    Progress,
-    SurfaceSamples,
-)
+from ..scene import CYCLES, REFERENCE, SHIPPED_TABLES, TECHNIQUES, Cancelled, Film, Light, Progress, SurfaceSamples
 
 # MOST_PAIRS: how many pairs of a sample and a light have their radiance in memory at a time.
 MOST_PAIRS = 1 << 25

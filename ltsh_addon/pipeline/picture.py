@@ -184,7 +184,7 @@ def _view_report(options: ViewOptions, tables, manifest: dict, coverage: np.ndar
             name: {"techniques": {table: {} for table in tables}} for name in ("combined", "specular", "diffuse")
         },
         "problems": [],
-        "warnings": manifest["warnings"],
+        "warnings": imaging.grouped(manifest["warnings"]),
     }
 
 

@@ -18,17 +18,7 @@ import numpy as np
 from .. import imaging
 from ..files import replacing
 from ..imaging.exr import COMBINED, REST, layer_name, parse_layer_name
-from ..scene import (
-    REFERENCE,
-    Film,
-    Light,
-    Progress,
-    SurfaceSamples,
-    error_line,
-    light_records,
-    lights_of,
-    listed,
-)
+from ..scene import REFERENCE, Film, Light, Progress, SurfaceSamples, error_line, light_records, lights_of, listed
 from .comparison import Comparison
 from .lighting import Shadows, evaluated, light_groups, prepare, shade_lights
 from .options import PictureOptions

@@ -137,6 +137,7 @@ def finish(
         opening = extraction.times.processor - extraction.times.direct
         least = opening + cycles.least_seconds + clock.stages["denoise"]
         report["warnings"] += plan.over_budget(options.budget, clock.seconds(), least)
+        report["warnings"] = imaging.grouped(report["warnings"])
         seconds = {
             **comparison.seconds(),
             "processor": {**clock.stages, "total": clock.seconds()},
@@ -350,7 +351,7 @@ def _report(comparison: Comparison, cycles, passes: dict, problems: list[str]) -
         "camera": cycles.camera,
         "cycles_samples": cycles.samples,
         "problems": [],
-        "warnings": list(dict.fromkeys(warnings)),
+        "warnings": warnings,
         "finished": {
             "share_of_ours": {name: float(share) for name, share in shares.items()},
             "all_by_cycles": everything,

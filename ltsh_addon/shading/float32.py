@@ -15,13 +15,7 @@ import numpy as np
 
 from ..emitters import light_profile, profile_regions, small_lights
 from ..emitters.facing import AnalyticLobe, FacingDisk, mean_emission
-from ..emitters.light_polygons import (
-    interpolated,
-    light_levels,
-    local_corners,
-    may_reach,
-    off_plane,
-)
+from ..emitters.light_polygons import interpolated, light_levels, local_corners, may_reach, off_plane
 from ..emitters.light_tree import FEWEST, LightTree, add_far_lights
 from ..emitters.sky_map import SkyMap
 from ..emitters.tails import LightFromPoints, TailLimits

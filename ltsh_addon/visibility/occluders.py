@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +32,8 @@ class Transparency:
     """Share of light that a surface lets through: `share`, times the value of `image` at `uv` if there is one.
 
     Colors count by their mean. The image (H, W) holds shares, with row 0 at the bottom. `uv` (T, 3, 2) places the
-    corners of the triangles on it.
+    corners of the triangles on it. With `cosines` (A,), which increase, it holds (A, H, W): by the cosine of the ray
+    back to the shaded point and the normal, negative from behind.
     """
 
     share: float = 1.0
@@ -42,6 +44,7 @@ class Transparency:
     outside: float = 1.0  # value beside the image if `extension` is CLIP
     # Values and shares, both increasing, or the shares decreasing: turns interpolated values of the image into shares.
     curve: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+    cosines: tuple[float, ...] | None = None
 
     def __post_init__(self):
         if not 0.0 <= self.share <= 1.0:
@@ -54,28 +57,37 @@ class Transparency:
                 f"and one of {', '.join(INTERPOLATIONS)}"
             )
 
-    def transmittance(self, triangle: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Shares (Q,) at the points (1 - u - v) a + u b + v c of triangles (Q,) with corners a, b, c."""
+    def transmittance(self, triangle: np.ndarray, u: np.ndarray, v: np.ndarray, cosine=None) -> np.ndarray:
+        """Shares (Q,) at the points (1 - u - v) a + u b + v c of triangles (Q,) with corners a, b, c.
+
+        `cosine` (Q,) is needed only with `cosines`.
+        """
         if self.image is None:
             return np.full(len(triangle), self.share, np.float32)
         a, b, c = np.moveaxis(self.uv[triangle], 1, 0)
         u, v = u[:, None], v[:, None]
-        return self.transmittance_of(self._image_at((1.0 - u - v) * a + u * b + v * c))
+        uv = (1.0 - u - v) * a + u * b + v * c
+        if self.cosines is None:
+            return self.transmittance_of(self._image_at(uv))
+        level = np.interp(cosine, self.cosines, np.arange(len(self.cosines)))
+        below = np.minimum(level.astype(np.int64), len(self.cosines) - 2)
+        first, second = (self._image_at(uv, (number,)) for number in (below, below + 1))
+        return self.transmittance_of(first + (level - below) * (second - first))
 
     def transmittance_of(self, values) -> np.ndarray:
         """Shares (...) for values (...) of the image."""
         values_of_curve = values if self.curve is None else np.interp(values, *self.curve)
         return (self.share * np.clip(values_of_curve, 0.0, 1.0)).astype(np.float32)
 
-    def _image_at(self, uv):
-        height, width = self.image.shape
-        return interpolated(uv, (width, height), self.interpolation, self._pixel)
+    def _image_at(self, uv, level=()):
+        height, width = self.image.shape[-2:]
+        return interpolated(uv, (width, height), self.interpolation, partial(self._pixel, level))
 
-    def _pixel(self, x, y):
+    def _pixel(self, level, x, y):
         """Values of pixels, which may lie outside the image."""
-        height, width = self.image.shape
+        height, width = self.image.shape[-2:]
         columns, rows = within(x, width, self.extension), within(y, height, self.extension)
-        values = self.image[rows, columns]
+        values = self.image[(*level, rows, columns)]
         if self.extension == "CLIP":
             values = np.where((x == columns) & (y == rows), values, self.outside)
         return values
@@ -117,6 +129,20 @@ class OccluderMesh:
         uv = None if self.transparency is None else self.transparency.uv
         if uv is not None and uv.shape != (len(triangles), 3, 2):
             raise ValueError(f"mesh: uv {uv.shape}, expected {len(triangles), 3, 2}")
+
+    def cosines(self, triangle, u, v, directions: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+        """The cosines (Q,) of `Transparency.cosines` for rays that go on in unit `directions` (Q, 3) at points of
+        triangles (Q,), as in `Transparency.transmittance`. `inverse` (Q, 3, 3) are the inverses of their instances'
+        matrices."""
+        corners = self.triangles[triangle]
+        a, b, c = np.moveaxis(self.vertices[corners].astype(np.float64), 1, 0)
+        flat = smooth = np.cross(b - a, c - a)
+        if self.normals is not None:
+            normals = self.normals[corners] if self.normals.ndim == 2 else self.normals[triangle]
+            smooth = np.einsum("kq,qkc->qc", [1.0 - u - v, u, v], normals)
+        toward, side = (np.einsum("qi,qij,qj->q", normal, inverse, -directions) for normal in (smooth, flat))
+        length = np.linalg.norm(np.einsum("qi,qij->qj", smooth, inverse), axis=1)
+        return np.copysign(toward / np.maximum(length, 1e-30), side)
 
 
 @dataclass(frozen=True)
@@ -216,10 +242,7 @@ class Occluders:
                 arrays[f"uv{number}"] = clear.uv
             about.append(record)
         arrays |= {f"image{number}": image for number, image in enumerate(images.values())}
-        head = {
-            "meshes": about,
-            **{name: getattr(self, name) for name in _SETTINGS},
-        }
+        head = {"meshes": about, **{name: getattr(self, name) for name in _SETTINGS}}
         arrays["about"] = np.frombuffer(json.dumps(head).encode(), np.uint8)
         with replacing(path) as temporary, temporary.open("wb") as file:
             np.savez(file, **arrays)
@@ -247,7 +270,7 @@ class Occluders:
         return cls(tuple(meshes), **instances, **settings)
 
 
-_OF_CLEAR = "share", "extension", "interpolation", "outside", "curve"
+_OF_CLEAR = "share", "extension", "interpolation", "outside", "curve", "cosines"
 _SETTINGS = "transparent_surfaces", "light_masks", "lone_choices", "surface_shift"
 
 
@@ -303,6 +326,7 @@ def cut_outs(occluders: Occluders) -> dict[int, tuple[TrianglePieces, TrianglePi
         if mesh.transparency is not None
         and mesh.transparency.image is not None
         and mesh.transparency.extension != "MIRROR"
+        and mesh.transparency.cosines is None
     ]
     drops_clear = occluders.transparent_surfaces >= UNLIMITED
     return {number: _cut_out(occluders.meshes[number], MOST_PIECES // len(cut), drops_clear) for number in cut}

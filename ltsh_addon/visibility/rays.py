@@ -359,14 +359,20 @@ class Tracer:
                 origins, directions, distances, masks = (values[rows] for values in rays)
                 hits = self._caster.closest(True, origins, directions, near[rows], distances, masks)
                 near[rows[hits.ray]] = hits.distance * STEP
-                met.append((rows[hits.ray], self.occluders.mesh[hits.instance], hits.triangle, hits.u, hits.v))
+                met.append((rows[hits.ray], hits.instance, hits.triangle, hits.u, hits.v))
             if not met:
                 return
-            index, mesh, *places = map(np.concatenate, zip(*met, strict=True))
+            index, instance, *places = map(np.concatenate, zip(*met, strict=True))
+            mesh = self.occluders.mesh[instance]
             for number in np.unique(mesh):
                 here = np.flatnonzero(mesh == number)
-                clear = self.occluders.meshes[number].transparency
-                transmittance[index[here]] *= clear.transmittance(*(values[here] for values in places))
+                occluder, place = self.occluders.meshes[number], [values[here] for values in places]
+                cosine = None
+                if occluder.transparency.cosines is not None:
+                    several, which = np.unique(instance[here], return_inverse=True)
+                    inverse = np.linalg.pinv(self.occluders.matrices[several, :, :3])[which]
+                    cosine = occluder.cosines(*place, rays[1][index[here]], inverse)
+                transmittance[index[here]] *= occluder.transparency.transmittance(*place, cosine)
             index = index[transmittance[index] > 0.0]
         transmittance[index] = 0.0
 

@@ -179,3 +179,37 @@ def test_long_text_is_shortened_and_wrapped_to_fit():
     assert sheet.text_size(sheet.shorten(text, 200), 14.0)[0] <= 200
     assert all(sheet.text_size(line)[0] <= 200 for line in sheet.wrap(text, 200))
     assert " ".join(sheet.wrap(text, 200)) == " ".join(text.split())
+
+
+def test_warnings_of_one_kind_are_one_line_with_a_count_and_all_names():
+    own_light = "object {!r}: its faces may stand in their own light, shaded as if they did not"
+    names = [f"P{number}" for number in range(49)] + ["it's", "a; b"]
+    (line,) = report.grouped(own_light.format(name) for name in names)
+    assert line.startswith(own_light.format("P0") + " (50 more: ") and all(repr(name) in line for name in names)
+    (shown,) = report.on_screen([line])
+    assert shown == own_light.format("P0") + " (50 more: 'P1'; 'P2'; 'P3' and 47 more)"
+    assert report.grouped([line]) == [line]
+
+
+def test_groups_of_several_tasks_merge_as_their_lines_would():
+    lines = [f"object 'Leaf {n}': {n + 1}.5 % of its texels are left out" for n in range(7)]
+    (together,) = report.grouped([*lines, "object 'Leaf 3': 4.5 % of its texels are left out"])
+    merged = report.grouped([*report.grouped(lines[4:]), *report.grouped(lines[:5])])
+    assert len(merged) == 1 and "(6 more: " in together and "(6 more: " in merged[0]
+    assert together.startswith(lines[6])  # the worst
+    assert all(f"'Leaf {n}' {n + 1}.5 %" in merged[0] for n in range(6))
+
+
+def test_the_most_harmful_warnings_come_first_and_at_most_eight_are_shown():
+    harmless = [
+        "motion blur is switched off, in the Cycles reference as well",
+        "direct light is Cycles' own: 99 % of it",
+    ]
+    sizes = zip("abcdefg", (3, 41, 0.5, 7, 20, 1, 2), strict=True)
+    sized = [f"light 'A': kind {letter} is {size} % off" for letter, size in sizes]
+    absent = ["object 'B': it emits from too many faces; it lights nothing, in the Cycles reference neither"]
+    lines = report.grouped([*harmless, *sized, *absent])
+    assert lines[0] == absent[0] and lines[-2:] == harmless[::-1]
+    assert [line.split()[-3] for line in lines[1:-2]] == ["41", "20", "7", "3", "2", "1", "0.5"]
+    shown = report.on_screen(lines, "out/report.json")
+    assert shown == [*lines[:8], "2 more kinds of warnings are in out/report.json"]

@@ -16,13 +16,7 @@ from ...pipeline.relight import RelightData
 from ...pipeline.render import finish
 from ...scene import PASSES, TECHNIQUES, Progress
 from ..process.pixels import PixelJob, extract_pixels
-from ..ui.job import (
-    START_SECONDS,
-    STARTING,
-    Step,
-    finished_steps,
-    shading_steps,
-)
+from ..ui.job import START_SECONDS, STARTING, Step, finished_steps, shading_steps
 
 PASS_LABELS = {"specular": "Specular", "diffuse": "Diffuse"}
 # Passes from the samples themselves, by Blender's names: their channels and type, and their settings of the view layer.

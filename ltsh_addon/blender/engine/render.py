@@ -14,6 +14,7 @@ import bpy
 import numpy as np
 from bpy.app.handlers import persistent
 
+from ...imaging import MOST_SHOWN, grouped
 from ...scene import PASSES, SHIPPED_TABLES, TECHNIQUES, Cancelled, Progress, SceneError, error_line
 from ...shading import TableError
 from ..materials.preview_material import world_radiance
@@ -117,8 +118,8 @@ class LTSH_RenderEngine(bpy.types.RenderEngine):
         plan.end(session_times)
         for problem in picture.problems:
             self.report({"ERROR"}, f"LTSH: {problem}")
-        for warning in picture.warnings:
-            self.report({"WARNING"}, warning)
+        for number, warning in enumerate(grouped(picture.warnings)):
+            self.report({"WARNING"} if number < MOST_SHOWN else {"INFO"}, warning)
         self._show(picture, job.view_layer)
         if picture.lights is not None:
             comparison.mix_render(job.scene, picture.lights, picture.relight_data)

@@ -262,7 +262,9 @@ def _open(job: BakeJob) -> BakeScene:
     folder = tempfile.TemporaryDirectory(prefix="ltsh-meshes-", ignore_cleanup_errors=True)
     has_shadows = job.shadows == "on"
     apply_modifiers(scene, objects, job.uv)
-    inventory, meshes, problems, bare = _inspect(scene, objects, job.uv, Path(folder.name), origin, has_shadows)
+    files = Path(folder.name), origin, has_shadows
+    inventory, meshes, problems, bare, lost = _inspect(scene, world, objects, job.uv, files)
+    warnings += lost
     give_default_material(bare)
     lobes = _lobes([ob for ob in objects if ob.name in meshes], inventory.emitting_materials)
     for material in bpy.data.materials:
@@ -310,8 +312,9 @@ def _look_from(scene, camera, wanted) -> None:
     bpy.context.view_layer.update()
 
 
-def _inspect(scene, objects, uv_name, folder, origin, with_occluders):
-    """The lights, meshes by object name, problems of the other objects by name, and objects without material."""
+def _inspect(scene, world, objects, uv_name, files):
+    """The lights, meshes by object name, problems of the other objects by name, objects without material, warnings."""
+    folder, origin, with_occluders = files
 
     def visit(depsgraph):
         meshes, problems = {}, {}
@@ -330,7 +333,7 @@ def _inspect(scene, objects, uv_name, folder, origin, with_occluders):
         inventory = collect_lights(depsgraph)
         if with_occluders:
             inventory.occluders = collect_occluders(depsgraph, None, inventory.warn, inventory.left_out)
-        return inventory, meshes, problems, bare
+        return inventory, meshes, problems, bare, pixels.missing_images(depsgraph, world)
 
     return with_render_depsgraph(scene, visit)
 

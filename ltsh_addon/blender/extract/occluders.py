@@ -1,27 +1,30 @@
 """What blocks light in an evaluated scene (runs in the child).
 
 As in Cycles, every object that is visible to shadow rays blocks them, holdouts and glowing objects included.
-Hair and points become meshes in `hair_and_points`.
+What their shapes are is in `occluder_shapes`.
 """
 
 from __future__ import annotations
 
 import math
+from contextlib import contextmanager
 from dataclasses import dataclass
 
-import bpy
 import numpy as np
 
 from ...scene import FARTHEST, listed
 from ...visibility.occluders import TERMINATOR_OFFSET, OccluderMesh, Occluders, Transparency
-from ..evaluated import SURFACE_TYPES, is_rendered, normals_at_corners, owner_of, read_values
+from ..evaluated import SURFACE_TYPES, is_rendered, owner_of
 from ..lights.linking import MOST_BLOCKER_SETS, OTHER_LIGHTS, Blockers
-from ..materials.graph import ADD, CLEAR, MIX, PRINCIPLED, live_link, source_of, surface_of
+from ..materials import maps
+from ..materials.graph import ADD, CLEAR, MIX, PRINCIPLED, Source, live_link, source_of, surface_of
 from ..materials.values import (
+    READERS,
     Curved,
     Value,
     combined,
     constant,
+    constant_inputs,
     curved_at,
     is_gray,
     is_srgb,
@@ -30,7 +33,7 @@ from ..materials.values import (
     value_at,
 )
 from ..render_settings import cycles_setting
-from .hair_and_points import MOST_PIECES, ONE_INSTANCE, balls, tubes_of_curves, tubes_of_hair
+from . import occluder_shapes as shapes
 
 # NAMED: how many names of a kind a warning lists.
 NAMED = 3
@@ -123,14 +126,14 @@ class _Collector:
     def _note(self, kind: str, block) -> None:
         self._notes.setdefault(kind, {})[block.original.name if block.original else block.name] = None
 
-    def _add_instances(self, instance, matrix, numbers, matrices=ONE_INSTANCE) -> None:
+    def _add_instances(self, instance, matrix, numbers, matrices=shapes.ONE_INSTANCE) -> None:
         mask, (by_light, by_surface) = self._blockers.mask_of(instance), _meets(instance)
         if self._shift:
             mask = by_light * mask | (by_surface * mask) << self._shift
         terminator = getattr(instance.object, "shadow_terminator_geometry_offset", TERMINATOR_OFFSET)
         self._instances += [_Instances(number, (matrix @ matrices)[:, :3], mask, terminator) for number in numbers]
         # The depsgraph lists metaballs twice.
-        if matrices is ONE_INSTANCE and instance.object.type != "META":
+        if matrices is shapes.ONE_INSTANCE and instance.object.type != "META":
             for number in numbers:
                 self._look_for_twins(number, matrix, instance.object)
 
@@ -155,16 +158,16 @@ class _Collector:
             self._note("diffuse and glossy rays do not both meet it: light that surfaces choose counts as glossy", ob)
         if self._simplified(ob):
             self._note("camera or distance culling is on, but it blocks everywhere", ob)
-        key = (*_shape_key(ob), tuple(material.name_full if material else "" for material in materials))
+        key = (*shapes.shape_key(ob), tuple(material.name_full if material else "" for material in materials))
         if key not in self._shapes:
             clear = [self._clear_of(material) for material in materials]
-            matrices = ONE_INSTANCE
+            matrices = shapes.ONE_INSTANCE
             if ob.type == "CURVES":
-                meshes = tubes_of_curves(ob, clear[0], self._note)
+                meshes = shapes.tubes_of_curves(ob, clear[0], self._note)
             elif ob.type == "POINTCLOUD":
-                meshes, matrices = balls(ob, clear[0], self._note)
+                meshes, matrices = shapes.balls(ob, clear[0], self._note)
             else:
-                meshes = _split(ob, clear, self._image)
+                meshes = shapes.split_by_slot(ob, clear, self._image)
                 share = _doubled(meshes)
                 if share > 0.0:
                     text = (
@@ -204,11 +207,15 @@ class _Collector:
         if live_link(surface) is None:
             # A material with only a volume lets light through; another warning tells that volumes are not shaded.
             return None if live_link(output.inputs["Volume"]) is None else _ClearMaterial(constant(1.0))
-        value, curve = _share_at(surface), None
+        with _read_for_shadow_rays():
+            value, curve = _share_at(surface), None
         if isinstance(value, Curved):
             value, curve = value.value, (value.places, value.numbers)
         if value is None:
-            self._note("it is transparent in a way that is not read here, and blocks as if it were opaque", material)
+            shares = _shares_by_cosine(surface)
+            if shares is not None:
+                return _ClearMaterial(shares=shares) if max(shares) > 0.0 else None
+            self._note("only Cycles can tell how transparent it is; here it blocks as if it were opaque", material)
             return None
         if not is_gray(value):
             self._note("colored transparency counts by its mean, shadows are gray", material)
@@ -247,13 +254,13 @@ class _Collector:
                 self._note("hair on instances blocks nothing", ob)
                 continue
             count, steps = len(system.particles) + len(system.child_particles), 2**settings.render_step + 1
-            if count * steps > MOST_PIECES:
-                self._note(f"more than {MOST_PIECES:,} pieces of hair or points, which block nothing", ob)
+            if count * steps > shapes.MOST_PIECES:
+                self._note(f"more than {shapes.MOST_PIECES:,} pieces of hair or points, which block nothing", ob)
                 continue
             self._note("hair blocks as tubes of three flat sides", ob)
             slot = min(settings.material, len(ob.material_slots)) - 1
             material = self._override or (ob.material_slots[slot].material if slot >= 0 else None)
-            meshes = [tubes_of_hair(ob, system, count, steps, self._clear_of(material))]
+            meshes = [shapes.tubes_of_hair(ob, system, count, steps, self._clear_of(material))]
             # The positions of particles are in world space.
             self._add_instances(instance, np.eye(4), self._number(meshes))
 
@@ -280,16 +287,19 @@ def _is_same(mesh, other):
 
 @dataclass(frozen=True)
 class _ClearMaterial:
-    """The share of light that a material lets through."""
+    """The share of light that a material lets through: `value`, or `shares` at `maps.COSINES`."""
 
-    value: Value
+    value: Value | None = None
     curve: tuple | None = None  # see `Transparency.curve`
+    shares: tuple[float, ...] = ()
 
-    def transparency(self, uv_of, image_of) -> Transparency:
-        """The `Transparency` of triangles.
+    def transparency(self, triangles: int, uv_of, image_of) -> Transparency:
+        """The `Transparency` of so many `triangles`.
 
         `uv_of(name)` returns their corners on a UV map, and `image_of(value)` the shares at the pixels of an image.
         """
+        if self.shares:
+            return maps.even_transparency(self.shares, maps.COSINES, triangles)
         if self.value.is_constant:
             return Transparency(float(self.value.offset[0]))
         use = self.value.image
@@ -303,6 +313,45 @@ class _ClearMaterial:
             outside=float(self.value.offset[0]),
             curve=self.curve,
         )
+
+    @property
+    def mean(self) -> float | None:
+        """The share that stands for all; None if places on the surface differ."""
+        if self.shares:
+            return float(np.mean(self.shares))
+        return float(self.value.offset[0]) if self.value.is_constant else None
+
+
+@contextmanager
+def _read_for_shadow_rays(cosine: float | None = None):
+    """Within this context nodes are read as they are for shadow rays; with a `cosine`, for those that meet the surface
+    at that (see `Transparency.cosines`). Without it what depends on that is unknown."""
+
+    def read(source: Source) -> Value | None:
+        number = constant_inputs(source, 0) if source.node.inputs else None
+        number = None if number is None else float(number[0][0])
+        value = maps.shown_to_shadow_ray(source.node, source.socket.name, number, cosine)
+        return None if value is None else constant(value)
+
+    readers = dict.fromkeys((maps.LIGHT_PATH, *maps.DIRECTIONAL), read)
+    READERS.update(readers)
+    try:
+        yield
+    finally:
+        for kind in readers:
+            del READERS[kind]
+
+
+def _shares_by_cosine(surface) -> tuple[float, ...] | None:
+    """The shares at `maps.COSINES` of the shader at the input `surface`; None where not only they decide."""
+    shares = []
+    for cosine in maps.COSINES.tolist():
+        with _read_for_shadow_rays(cosine):
+            value = _share_at(surface)
+        if not _is_constant(value):
+            return None
+        shares.append(min(max(float(value.offset.mean()), 0.0), 1.0))
+    return tuple(shares)
 
 
 def _share_at(socket, groups: tuple = ()) -> Value | Curved | None:
@@ -322,7 +371,7 @@ def _share_at(socket, groups: tuple = ()) -> Value | Curved | None:
         return combined(*inputs, 1.0, 1.0)
     if all(_is_constant(value) and not value.offset.any() for value in inputs):
         return inputs[0]  # whatever the factor is
-    factor = _factor_at(node.inputs[0], groups)
+    factor = limited(curved_at(node.inputs[0], groups))
     if factor is None:
         return None
     if _is_constant(factor):
@@ -342,15 +391,6 @@ def _share_at(socket, groups: tuple = ()) -> Value | Curved | None:
 
 def _is_constant(value: Value | Curved | None) -> bool:
     return isinstance(value, Value) and value.is_constant
-
-
-def _factor_at(socket, groups) -> Value | Curved | None:
-    """The factor of a Mix Shader node for shadow rays, which are of no other type; None: unknown."""
-    source = source_of(socket, groups)
-    if source is not None and source.node is not None and source.node.bl_idname == "ShaderNodeLightPath":
-        name = source.socket.name
-        return constant(float(name == "Is Shadow Ray")) if name.startswith("Is ") else None
-    return limited(curved_at(socket, groups))
 
 
 def _values_of_image(value: Value) -> np.ndarray | None:
@@ -380,63 +420,6 @@ def _is_displaced(material) -> bool:
     return getattr(material, "displacement_method", "BUMP") != "BUMP"
 
 
-def _shape_key(ob) -> tuple:
-    """A key of the evaluated data of an object, valid while the depsgraph does not change."""
-    data = ob.data
-    is_mesh = isinstance(data, bpy.types.Mesh)
-    original = data.original.session_uid if data.original is not None else 0
-    owner = 0 if is_mesh and not ob.modifiers else ob.original.session_uid
-    return owner, original, data.as_pointer(), len(data.vertices) if is_mesh else 0
-
-
-# Shapes:
-
-
-def _split(ob, clear: list, image_of) -> list[OccluderMesh]:
-    """Meshes of `ob`: one of all faces that block, and one per slot of those that let light through."""
-    mesh = ob.to_mesh()
-    if mesh is None:
-        return []
-    try:
-        mesh.calc_loop_triangles()
-        count = len(mesh.loop_triangles)
-        if not count:
-            return []
-        loops, triangles = (
-            read_values(mesh.loop_triangles, name, (count, 3), np.int32) for name in ("loops", "vertices")
-        )
-        slots = np.clip(read_values(mesh.loop_triangles, "material_index", (count,), np.int32), 0, len(clear) - 1)
-        vertices = read_values(mesh.vertices, "co", (len(mesh.vertices), 3), np.float32)
-        normals = None
-        if mesh.normals_domain == "POINT":
-            normals = read_values(mesh.vertex_normals, "vector", (len(vertices), 3), np.float32)
-        elif mesh.normals_domain == "CORNER":
-            normals = normals_at_corners(mesh)[loops]
-
-        def uv_of(name):
-            layers = mesh.uv_layers
-            layer = layers.get(name) if name else next((other for other in layers if other.active_render), None)
-            if layer is None:
-                return np.zeros((count, 3, 2), np.float32)
-            return read_values(layer.uv, "vector", (len(mesh.loops), 2), np.float32)[loops]
-
-        meshes = []
-        blocking = np.array([transparency is None for transparency in clear])
-        for slot in [None, *(np.flatnonzero(~blocking))]:
-            here = blocking[slots] if slot is None else slots == slot
-            if not here.any():
-                continue
-            transparency = None
-            if slot is not None:
-                transparency = clear[slot].transparency(lambda name, here=here: uv_of(name)[here], image_of)
-                if transparency.share == 1.0 and transparency.image is None:
-                    continue
-            meshes.append(_submesh(vertices, triangles, normals, here, transparency))
-        return meshes
-    finally:
-        ob.to_mesh_clear()
-
-
 def _doubled(meshes: list[OccluderMesh]) -> float:
     """The share of the triangles that coincide with others and face the same way."""
     triangles = [mesh.vertices[mesh.triangles].astype(np.float64) for mesh in meshes]
@@ -456,12 +439,3 @@ def _doubled(meshes: list[OccluderMesh]) -> float:
     touched = np.zeros(len(corners), bool)
     touched[one[same][doubled]] = touched[other[same][doubled]] = True
     return float(touched.mean()) if len(touched) else 0.0
-
-
-def _submesh(vertices, triangles, normals, here, transparency) -> OccluderMesh:
-    if here.all():
-        return OccluderMesh(vertices, triangles, transparency, normals)
-    used, named = np.unique(triangles[here], return_inverse=True)
-    if normals is not None:
-        normals = normals[used] if normals.ndim == 2 else normals[here]
-    return OccluderMesh(vertices[used], named.reshape(-1, 3), transparency, normals)

@@ -11,7 +11,7 @@ import numpy as np
 
 from ...scene import SceneError, error_line, light_records, listed
 from .. import render_settings
-from ..evaluated import SURFACE_TYPES, rendered_surfaces, with_render_depsgraph
+from ..evaluated import SURFACE_TYPES, owner_of, read_values, rendered_surfaces, with_render_depsgraph
 from ..lights.area import LightInventory, collect_lights, rendered_lights
 from ..lights.meshes import SIDE_PROPERTY, let_light_through
 from ..lights.world import blocks_nothing, take_world, world_behind, world_lights
@@ -24,6 +24,7 @@ from ..materials.aovs import (
     objects_without_material,
     remove_aovs,
 )
+from ..materials.graph import images_behind
 from ..process.blender_process import job_start, newer
 from ..process.pixels import EDGE_SECONDS, PixelJob, too_small
 from ..render_settings import (
@@ -165,19 +166,67 @@ def _render_half(scene, folder: Path, half: str, offsets, share: int, progress) 
     return files
 
 
-def missing_files() -> list[str]:
-    """A warning for each library and each image file in use that is missing."""
-    warnings = []
-    for library in bpy.data.libraries:
-        path = bpy.path.abspath(library.filepath)
-        if not Path(path).is_file():
-            warnings.append(f"library {library.name!r}: {library.filepath} is missing, and what it held with it")
-    for image in bpy.data.images:
-        if image.source != "FILE" or image.packed_file is not None or not image.users or not image.filepath:
-            continue
-        if not Path(bpy.path.abspath(image.filepath, library=image.library)).is_file():
-            warnings.append(f"image {image.name!r}: {image.filepath} is missing, Cycles shows it in one false color")
-    return warnings
+def missing_images(depsgraph, world, override=None) -> list[str]:
+    """A warning for each missing image that is shown: by a face, a light, the `world`, or what shapes an object.
+
+    The material `override` replaces all others.
+    """
+    missing = [image for image in bpy.data.images if image.users and _is_lost(image)]
+    if not missing:
+        return []
+    user_map, objects, blocks = bpy.data.user_map(), set(), {world}
+    for instance in depsgraph.object_instances:
+        ob = instance.object
+        if ob.type == "LIGHT":
+            blocks.add(ob.original.data)
+        elif ob.type in SURFACE_TYPES and (instance.show_self or instance.show_particles):
+            objects |= {ob.original, owner_of(instance).original}
+            blocks |= {override} if override else _materials_of_faces(ob)
+
+    def shapes(block) -> bool:
+        return any(user in objects or user.id_type in _SHAPING and shapes(user) for user in user_map[block])
+
+    shown = {image for block in blocks - {None} for image in images_behind(block)}
+    return [
+        f"image {image.name!r}: {image.filepath} is missing, Cycles shows it in one false color"
+        for image in missing
+        if image in shown or shapes(image)
+    ]
+
+
+def _materials_of_faces(ob) -> set:
+    """The original materials, or None, of the faces of the evaluated object `ob`; all where it has hair."""
+    materials = [slot.material and slot.material.original for slot in ob.material_slots]
+    if not isinstance(ob.data, bpy.types.Mesh) or ob.particle_systems or len(materials) < 2:
+        return set(materials)
+    index = read_values(ob.data.polygons, "material_index", (len(ob.data.polygons),), np.int32)
+    return {materials[number] for number in np.unique(np.clip(index, 0, len(materials) - 1))}
+
+
+# Data by which images change the shape of objects, or where others stand on them.
+_SHAPING = "TEXTURE", "NODETREE", "PARTICLE"
+
+
+def _is_lost(image) -> bool:
+    """True if a file of the image is not there; a sequence is there if its folder has one of its kind."""
+    if image.source not in ("FILE", "MOVIE", "SEQUENCE", "TILED") or image.packed_file or not image.filepath:
+        return False
+    path = Path(bpy.path.abspath(image.filepath, library=image.library))
+    if image.source == "SEQUENCE":
+        return next(path.parent.glob(f"*{path.suffix}"), None) is None
+    names = [path.name]
+    if image.source == "TILED":
+        names = [path.name.replace("<UDIM>", str(tile.number)) for tile in image.tiles if "<UDIM>" in path.name]
+    return not all((path.parent / name).is_file() for name in names)
+
+
+def missing_libraries() -> list[str]:
+    """A warning for each library that is missing."""
+    return [
+        f"library {library.name!r}: {library.filepath} is missing, and what it held with it"
+        for library in bpy.data.libraries
+        if not Path(bpy.path.abspath(library.filepath)).is_file()
+    ]
 
 
 _files_opened = 0
@@ -206,7 +255,7 @@ def open_scene(path: Path, warnings: list[str], scripts: bool = False) -> None:
         raise SceneError(newer(path, saved, here))
     if bpy.app.autoexec_fail:
         warnings.append(f"scripts in {path.name} do not run: {bpy.app.autoexec_fail_message}")
-    warnings.extend(missing_files())
+    warnings.extend(missing_libraries())
 
 
 def _reason(error: RuntimeError, path: Path) -> str:
@@ -229,6 +278,8 @@ def prepare_scene(
     render_settings.prepare_surfaces(warnings)
     origin = move_to_origin(scene, np.array(camera.matrix_world, dtype=np.float64)[:3, 3], warnings)
 
+    lost: list[str] = []
+
     def visit(depsgraph):
         surfaces = rendered_surfaces(depsgraph)
         override = view_layer.material_override
@@ -236,6 +287,7 @@ def prepare_scene(
         inventory = collect_lights(depsgraph, override)
         if with_occluders:
             inventory.occluders = collect_occluders(depsgraph, override, inventory.warn, inventory.left_out)
+        lost.extend(missing_images(depsgraph, world, override))
         return inventory, materials_in_use(surfaces, override), bare
 
     inventory, materials, bare = with_render_depsgraph(scene, visit)
@@ -249,10 +301,10 @@ def prepare_scene(
     inventory.receivers.mark()
     inventory.behind = world
     add_world(inventory, scene, world)
-    warnings.extend(inventory.warnings)
     if not inventory.lights and not for_finished:
         raise no_light(scene, inventory.warnings)
-    warnings.extend(of_materials)
+    inventory.warnings += lost
+    warnings += inventory.warnings + of_materials
     render_settings.leave_out_objects(scene, inventory.left_out, warnings)
     return inventory
 

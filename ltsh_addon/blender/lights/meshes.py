@@ -401,10 +401,7 @@ def _look_at_polygon(studio: Studio, light: Light, pixels: int) -> tuple[np.ndar
     rows, columns = covered.shape
     x, y = np.meshgrid((np.arange(columns) + 0.5) / columns * 2.0 - 1.0, 1.0 - (np.arange(rows) + 0.5) / rows * 2.0)
     offset = light.corners - light.center
-    outline = np.stack(
-        [offset @ half / np.dot(half, half) for half in (light.half_u, light.half_v)],
-        axis=-1,
-    )
+    outline = np.stack([offset @ half / np.dot(half, half) for half in (light.half_u, light.half_v)], axis=-1)
     inside = covered & _contains(outline, x, y)
     return image, inside if inside.any() else covered
 

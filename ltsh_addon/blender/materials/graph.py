@@ -166,6 +166,33 @@ def source_behind(output, groups: tuple = (), tree_of: Callable = NODE_TREE) -> 
     return replace(source, passed=(*source.passed, entry.type, output.type))
 
 
+def images_behind(data) -> set:
+    """The images whose nodes feed the output of a material, world or light."""
+    output = None if tree_in_use(data) is None else material_output(data.node_tree)
+    waiting = [] if output is None else [(socket, ()) for socket in output.inputs]
+    images, known = set(), set()
+    while waiting:
+        source = source_of(*waiting.pop())
+        if source is None or source.node is None or (source.node, source.groups) in known:
+            continue
+        known.add((source.node, source.groups))
+        images.add(getattr(source.node, "image", None))
+        waiting += [(socket, source.groups) for socket in _inputs_that_count(source.node)]
+    return images - {None}
+
+
+def _inputs_that_count(node) -> list:
+    """The inputs of a node in use, without that of a mix to which a constant factor gives no weight."""
+    inputs = [socket for socket in node.inputs if socket.enabled]
+    if node.bl_idname in (MIX, "ShaderNodeMix", "ShaderNodeMixRGB") and len(inputs) == 3:
+        factor = value_of(inputs[0])
+        if is_constant(factor, 0.0):
+            return inputs[:2]
+        if is_constant(factor, 1.0) and getattr(node, "blend_type", "MIX") == "MIX":
+            return [inputs[0], inputs[2]]
+    return inputs
+
+
 def constant_of(socket, groups: tuple = (), tree_of: Callable = NODE_TREE) -> float | None:
     """The constant at the input `socket` inside `groups`; None if nodes compute it. `tree_of`: see `source_behind`."""
     source = source_of(socket, groups, tree_of)

@@ -14,6 +14,8 @@ import numpy as np
 from ...cycles.lobes import LOBE_AOVS
 from ...cycles.texels import EXTENSIONS, INTERPOLATIONS, MapValue, TextureFile, TextureValue
 from ...files import save_array
+from ...lobes.brdf import dielectric_reflectance
+from ...visibility.occluders import Transparency
 from ..render_settings import working_space
 from .graph import carry_out_of_group, computed, cut, is_socket, live_link, material_output, source_behind, value_of
 from .values import has_plain_mapping, is_srgb, opaque_pixels
@@ -244,3 +246,46 @@ class MaterialPlan:
         self.show(None)
         for node in (self._image_node, self._places, *self._emissions.values()):
             self.tree.nodes.remove(node)
+
+
+# Transparency:
+
+LIGHT_PATH = "ShaderNodeLightPath"
+DIRECTIONAL = FRESNEL, LAYER_WEIGHT, GEOMETRY = "ShaderNodeFresnel", "ShaderNodeLayerWeight", "ShaderNodeNewGeometry"
+# UNKNOWN: outputs of nodes that differ from shadow ray to shadow ray by more than `Transparency.cosines`.
+UNKNOWN = {
+    LIGHT_PATH: ("Ray Length", "Transparent Depth"),
+    GEOMETRY: ("Incoming",),
+    "ShaderNodeTexCoord": ("Reflection", "Window"),
+}
+# COSINES: those of `Transparency.cosines` for shares that do not vary, closest at grazing angles, where Fresnel is
+# steepest.
+_FRONT = np.square(np.linspace(1e-3, 1.0, 129))
+COSINES = np.append(-_FRONT[::-1], _FRONT)
+EVEN = 1e-4  # shares that differ less count as the same
+
+
+def shown_to_shadow_ray(node, output: str, number: float | None, cosine: float | None) -> float | None:
+    """What the `output` of a node is for a shadow ray that meets a surface at `cosine` (see `Transparency.cosines`),
+    where its first input is the constant `number`; None: unknown. Bumps are left out: on average they change little."""
+    kind = node.bl_idname
+    if kind == LIGHT_PATH:
+        return None if output in UNKNOWN[kind] else float(output in ("Is Shadow Ray", "Ray Depth"))
+    if cosine is None or (kind == GEOMETRY and output != "Backfacing") or (kind != GEOMETRY and number is None):
+        return None
+    if kind == GEOMETRY:
+        return float(cosine < 0.0)
+    if output == "Facing":
+        blend = min(max(number, 0.0), 1.0 - 1e-5)
+        return 1.0 - abs(cosine) ** (2.0 * blend if blend < 0.5 else 0.5 / (1.0 - blend))
+    index = max(number, 1e-5) if kind == FRESNEL else 1.0 / max(1.0 - number, 1e-5)
+    return float(dielectric_reflectance(abs(cosine), index if cosine >= 0.0 else 1.0 / index))
+
+
+def even_transparency(shares: np.ndarray, cosines, triangles: int) -> Transparency:
+    """The transparency of so many triangles by their `shares` (A,) at `cosines` (A,); () with a single share."""
+    shares = np.clip(shares, 0.0, 1.0).astype(np.float32)
+    if np.ptp(shares) <= EVEN:
+        return Transparency(float(shares.mean()))
+    uv = np.zeros((triangles, 3, 2), np.float32)
+    return Transparency(1.0, shares[:, None, None], uv, "EXTEND", "Closest", cosines=tuple(cosines))

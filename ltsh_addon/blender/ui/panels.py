@@ -7,6 +7,7 @@ import textwrap
 import bpy
 from bpy.app.translations import pgettext_iface as translated
 
+from ...imaging import on_screen
 from . import comparison, operators, preflight, results
 from .job import clock, output_folder, progress_text, stage_title
 from .operators import COMMANDS
@@ -512,7 +513,7 @@ class _Results:
         header, body = self.layout.panel("ltsh_warnings", default_closed=True)
         header.label(text=f"Warnings ({len(warnings)})", icon="ERROR", translate=False)
         if body is not None:
-            for warning in warnings:
+            for warning in on_screen(warnings):
                 draw_text(body, context, warning, "DOT")
 
 

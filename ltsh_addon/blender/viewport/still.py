@@ -14,7 +14,7 @@ import numpy as np
 from ...files import save_array
 from ...scene import SceneError, error_line, listed
 from .. import render_settings
-from ..extract.pixels import no_light, open_scene
+from ..extract.pixels import missing_images, no_light, open_scene
 from ..lights.world import light_of_world
 from ..materials.preview_material import world_radiance
 from ..process.view import GRAPHICS, VIEW_PASSES, VIEW_PNG, ViewJob
@@ -46,7 +46,9 @@ def draw_view(job: ViewJob, folder: Path, progress) -> dict:
     warnings += _not_shown(scene, camera)
     sky = _sky(scene, warnings)
     with bpy.context.temp_override(scene=scene, view_layer=_layer(scene)):
-        patterns = patterns_of(scene, bpy.context.evaluated_depsgraph_get())
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+        patterns = patterns_of(scene, depsgraph)
+        warnings += missing_images(depsgraph, scene.world, _layer(scene).material_override)
     progress(GRAPHICS, 0.0)
     pictures, notes, facts = with_graphics(lambda: _draw(job, (scene, camera, sky, patterns), size, progress))
     for number, pixels in enumerate(pictures):

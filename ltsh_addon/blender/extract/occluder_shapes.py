@@ -1,14 +1,16 @@
-"""Hair and points as meshes that block light: tubes and balls with flat faces and the mean width of round ones."""
+"""The shapes of what blocks light: meshes by their transparency, and hair and points as meshes: tubes and balls with
+flat faces and the mean width of round ones."""
 
 from __future__ import annotations
 
 import math
 from functools import cache
 
+import bpy
 import numpy as np
 
 from ...visibility.occluders import OccluderMesh, Transparency
-from ..evaluated import read_values
+from ..evaluated import normals_at_corners, read_values
 
 # ONE_INSTANCE: the matrices of occluders that are not points.
 ONE_INSTANCE = np.eye(4)[None]
@@ -58,13 +60,13 @@ def tubes_of_hair(ob, system, count, steps, clear) -> OccluderMesh:
 
 
 def _constant_transparency(clear, ob=None, note=None) -> Transparency | None:
-    """The transparency of hair or points, whose images are not read because they have no UV maps."""
+    """The transparency of hair or points, from place to place of which it is not read."""
     if clear is None:
         return None
-    if clear.value.is_constant:
-        return Transparency(float(clear.value.offset[0]))
+    if clear.mean is not None:
+        return Transparency(clear.mean)
     if note is not None:
-        note("an image on hair or points is not read here, they block as if they were opaque", ob)
+        note("transparency that varies along hair or points is not read here, they block as if they were opaque", ob)
     return None
 
 
@@ -146,3 +148,68 @@ def _ball():
     # The mean shadow of a convex body is a quarter of its surface area.
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
     return vertices * math.sqrt(4.0 * math.pi / area), triangles
+
+
+def shape_key(ob) -> tuple:
+    """A key of the evaluated data of an object, valid while the depsgraph does not change."""
+    data = ob.data
+    is_mesh = isinstance(data, bpy.types.Mesh)
+    original = data.original.session_uid if data.original is not None else 0
+    owner = 0 if is_mesh and not ob.modifiers else ob.original.session_uid
+    return owner, original, data.as_pointer(), len(data.vertices) if is_mesh else 0
+
+
+def split_by_slot(ob, clear: list, image_of) -> list[OccluderMesh]:
+    """Meshes of `ob`: one of all faces that block, and one per slot of those that let light through."""
+    mesh = ob.to_mesh()
+    if mesh is None:
+        return []
+    try:
+        mesh.calc_loop_triangles()
+        count = len(mesh.loop_triangles)
+        if not count:
+            return []
+        loops, triangles = (
+            read_values(mesh.loop_triangles, name, (count, 3), np.int32) for name in ("loops", "vertices")
+        )
+        slots = np.clip(read_values(mesh.loop_triangles, "material_index", (count,), np.int32), 0, len(clear) - 1)
+        vertices = read_values(mesh.vertices, "co", (len(mesh.vertices), 3), np.float32)
+        normals = None
+        if mesh.normals_domain == "POINT":
+            normals = read_values(mesh.vertex_normals, "vector", (len(vertices), 3), np.float32)
+        elif mesh.normals_domain == "CORNER":
+            normals = normals_at_corners(mesh)[loops]
+
+        def uv_of(name):
+            layers = mesh.uv_layers
+            layer = layers.get(name) if name else next((other for other in layers if other.active_render), None)
+            if layer is None:
+                return np.zeros((count, 3, 2), np.float32)
+            return read_values(layer.uv, "vector", (len(mesh.loops), 2), np.float32)[loops]
+
+        meshes = []
+        blocking = np.array([transparency is None for transparency in clear])
+        for slot in [None, *(np.flatnonzero(~blocking))]:
+            here = blocking[slots] if slot is None else slots == slot
+            if not here.any():
+                continue
+            transparency = None
+            if slot is not None:
+                transparency = clear[slot].transparency(
+                    int(here.sum()), lambda name, here=here: uv_of(name)[here], image_of
+                )
+                if transparency.share == 1.0 and transparency.image is None:
+                    continue
+            meshes.append(_submesh(vertices, triangles, normals, here, transparency))
+        return meshes
+    finally:
+        ob.to_mesh_clear()
+
+
+def _submesh(vertices, triangles, normals, here, transparency) -> OccluderMesh:
+    if here.all():
+        return OccluderMesh(vertices, triangles, transparency, normals)
+    used, named = np.unique(triangles[here], return_inverse=True)
+    if normals is not None:
+        normals = normals[used] if normals.ndim == 2 else normals[here]
+    return OccluderMesh(vertices[used], named.reshape(-1, 3), transparency, normals)

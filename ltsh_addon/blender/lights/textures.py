@@ -59,7 +59,7 @@ class NodeLight:
 
     @property
     def frame(self) -> np.ndarray:
-        """The orthonormal axes, rows of (3, 3), of its map of directions where it is rendered: the z axis is its own."""
+        """The orthonormal axes, rows of (3, 3), of its map of directions where it is rendered."""
         axes, sizes = np.linalg.qr(self.render_matrix[:3, [2, 0, 1]])
         z, x = (axes[:, number] * np.copysign(1.0, sizes[number, number]) for number in (0, 1))
         return np.stack([x, np.cross(z, x), z])
@@ -99,7 +99,7 @@ class NodeEmission:
     factor: np.ndarray
     # Relative error of the factor of emission that depends on both direction and place, or that varies over a sun.
     lost: float = 0.0
-    # Of points and spots: the polar angle in rad where the rows begin, and the relative error by the size of their steps.
+    # Of points and spots: the polar angle in rad where the rows begin, and the relative error by the size of steps.
     start: float = 0.0
     blurred: float = 0.0
 
@@ -121,8 +121,8 @@ def _area_factor(source: NodeLight, studio: Studio) -> NodeEmission:
     return NodeEmission(image / (_WHITE["energy"] / np.pi))
 
 
-# PATTERN_ROWS: rows of the map of directions of a point or spot light, if they suffice; at most MOST_ROWS, in maps of up
-# to MOST_TEXELS. VIEW_PIXELS: along each side of the six views that the map is made from, at least.
+# PATTERN_ROWS: rows of the map of directions of a point or spot light, if they suffice; else up to MOST_ROWS, in maps
+# of up to MOST_TEXELS. VIEW_PIXELS: along each side of the six views that the map is made from, at least.
 PATTERN_ROWS, MOST_ROWS, MOST_TEXELS, VIEW_PIXELS = 64, 2048, 1 << 19, 192
 # RESOLVED: relative error of a map that needs no finer steps.
 RESOLVED = 0.01

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import base64
 import itertools
-import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass, field, fields
 from functools import cache, cached_property
@@ -56,23 +55,11 @@ class Pattern:
     by_ray: bool = False  # n is the direction in which the light travels, not the normal
     start: float = 0.0  # rad
 
-    @classmethod
-    def of(cls, record: dict) -> Pattern:
-        """The pattern of a `record`. Raises ValueError or TypeError for a malformed one."""
-        values = dict(record)
-        if "bytes" in values:
-            packed = zlib.decompress(base64.b64decode(values.pop("bytes"), validate=True))
-            values["values"] = np.frombuffer(packed, "<f4").reshape(values.pop("rows"), -1)
-        return cls(**values)
-
-    def record(self) -> dict:
-        """This pattern as a JSON-able dict."""
-        packed = base64.b64encode(zlib.compress(self.values.astype("<f4").tobytes(), 1)).decode()
-        shared = {"axes": self.axes.tolist(), "by_ray": self.by_ray, "start": self.start}
-        return {**shared, "rows": len(self.values), "bytes": packed}
-
     def __post_init__(self):
-        axes, values = np.asarray(self.axes, dtype=np.float64), np.asarray(self.values, dtype=np.float32)
+        axes, values = np.asarray(self.axes, dtype=np.float64), self.values
+        if isinstance(values, list) and len(values) == 2 and isinstance(values[1], str):  # of a record
+            values = np.frombuffer(base64.b64decode(values[1], validate=True), "<f4").reshape(values[0], -1)
+        values = np.asarray(values, dtype=np.float32)
         if axes.shape != (3, 3) or values.ndim != 2 or not np.isfinite(axes).all() or not np.isfinite(values).all():
             raise ValueError(f"pattern: axes {axes!r} and values of shape {values.shape}, expected 3 x 3 and (H, W)")
         object.__setattr__(self, "axes", axes)
@@ -158,7 +145,9 @@ class Light:
         if self.cone is not None:
             record["cone"] = {**vars(self.cone), "axes": self.cone.axes.tolist()}
         if self.pattern is not None:
-            record["pattern"] = self.pattern.record()
+            packed = base64.b64encode(self.pattern.values.astype("<f4").tobytes()).decode()
+            fields_of_pattern = {"axes": self.pattern.axes.tolist(), "values": [len(self.pattern.values), packed]}
+            record["pattern"] = {**vars(self.pattern), **fields_of_pattern}
         return {**record, "detail": [child.record() for child in self.children]}
 
     @property
@@ -309,7 +298,7 @@ class PointLight(Light):
     def __post_init__(self):
         super().__post_init__()
         if isinstance(self.pattern, dict):
-            object.__setattr__(self, "pattern", Pattern.of(self.pattern))
+            object.__setattr__(self, "pattern", Pattern(**self.pattern))
 
     @property
     def is_sphere(self) -> bool:

@@ -195,21 +195,17 @@ def _point_factor(source: NodeLight, studio: Studio) -> NodeEmission:
 def _resolved(source: NodeLight, views) -> NodeEmission:
     """The map of directions, as fine as it must be; `views(pixels, sides)` are its pictures, the first without
     arguments. Fine maps of what a spot emits by the direction end at its cone."""
-    within, data, sides = source.within, source.data, views()
-    start = np.pi - 0.5 * data.spot_size if data.type == "SPOT" and source.by_ray else 0.0
-    if start and source.is_placed:  # the scale of the object changes the angle of the cone
-        cone = SpotCone(np.linalg.inv(source.matrix[:3, :3]), -np.cos(start), 1.0)
-        start = max(np.pi - cone_angle(cone), 0.0)
+    within, sides, start = source.within, views(), 0.0
+    if source.data.type == "SPOT" and source.by_ray:
+        cone = SpotCone(np.linalg.inv(source.matrix[:3, :3]), np.cos(0.5 * source.data.spot_size), 1.0)
+        start = np.pi - cone_angle(cone)
     emission = NodeEmission(_unfolded(sides, within, _map_directions(PATTERN_ROWS)))
     error = _blurred(emission, sides, within, (PATTERN_ROWS, start))
     if error <= RESOLVED:
         return emission
-    rows = PATTERN_ROWS
-    while rows < min(PATTERN_ROWS * error / RESOLVED, MOST_ROWS):
-        finer = _map_directions(2 * rows, start)
-        if finer[..., 0].size > MOST_TEXELS:
-            break
-        rows *= 2
+    rows = int(2.0 ** np.ceil(np.log2(min(PATTERN_ROWS * error / RESOLVED, MOST_ROWS))))
+    while _map_directions(rows, start)[..., 0].size > MOST_TEXELS:
+        rows //= 2
     normal = _map_directions(rows, start)
     sides = views(max(VIEW_PIXELS, rows * 5 // 4), np.unique(_sides_of(normal)).tolist())
     emission = NodeEmission(_unfolded(sides, within, normal), start=np.pi - len(normal) * (np.pi / rows))
@@ -328,18 +324,11 @@ def with_pattern(light: Light, emission: NodeEmission, source: NodeLight, warn) 
             f"light {light.name!r}: its pattern is shaded in steps of {np.degrees(step):.2g} degrees, "
             f"{100.0 * emission.blurred:.0f} % off on average"
         )
-    values = factor.mean(axis=-1) / mean.mean()
-    if _apart(values[..., None] * mean, factor) <= PATTERN_COLORS:
-        return [replace(light, pattern=Pattern(source.axes, values, source.by_ray, emission.start))]
-    return [
-        replace(
-            light,
-            radiance=light.radiance * np.eye(3)[color],
-            pattern=Pattern(source.axes, factor[..., color] / mean[color], source.by_ray, emission.start),
-        )
-        for color in range(3)
-        if mean[color] and light.radiance[color]
-    ]
+    colors = [(np.ones(3), factor.mean(axis=-1) / mean.mean())]
+    if _apart(colors[0][1][..., None] * mean, factor) > PATTERN_COLORS:
+        colors = [(np.eye(3)[n], factor[..., n] / mean[n]) for n in range(3) if mean[n] and light.radiance[n]]
+    patterns = [(color, Pattern(source.axes, values, source.by_ray, emission.start)) for color, values in colors]
+    return [replace(light, radiance=light.radiance * color, pattern=pattern) for color, pattern in patterns]
 
 
 def _covered(light: Light, rows: int, columns: int) -> np.ndarray:
@@ -440,8 +429,5 @@ def _cut(texture: ImageTexture, factor: Value, is_round: bool) -> Patches:
     uv = np.stack([u, v, np.ones_like(u)], axis=-1).reshape(-1, 3) @ mapping.T
     colors = factor.offset + texture.colors(uv) @ factor.matrix[:, :3].T + factor.matrix[:, 3]
     image = colors.reshape(POINTS, SUB, POINTS, SUB, 3).mean(axis=(1, 3))
-    covered = np.ones((POINTS, POINTS), bool)
-    if is_round:
-        x, y = np.meshgrid(*2 * [2.0 * (np.arange(POINTS) + 0.5) / POINTS - 1.0])
-        covered = np.hypot(x, y) < 1.0
-    return cut_into_patches(image, covered, MOST_PATCHES)
+    x, y = np.meshgrid(*2 * [2.0 * (np.arange(POINTS) + 0.5) / POINTS - 1.0])
+    return cut_into_patches(image, (np.hypot(x, y) < 1.0) | (not is_round), MOST_PATCHES)

@@ -18,7 +18,7 @@ from ...emitters.facing import LEAST_SHRINKING, NEAR_DISK
 from ...emitters.light_polygons import ROUND_CORNERS, ROUND_LIMITS
 from ...lobes import moments32
 from ...lobes.lookup_table import LookupTable
-from ...scene import Light, PolygonLight
+from ...scene import Light, PolygonLight, round_outline
 from ...shading.header import float_literal
 from .drawing import float_texture
 
@@ -33,13 +33,6 @@ FLAGS = (
 _QUAD = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 
 
-def _circle(count):
-    """Corners (count, 2) of a regular polygon with the area of the unit circle, as in `Light.polygon`."""
-    step = 2.0 * np.pi / count
-    angle = step * np.arange(count)
-    return np.sqrt(step / np.sin(step)) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-
-
 # _FEW_SIZES: the apparent width up to which round lights that no horizon cuts get 8 or 16 corners. Width is the squared
 # half diagonal over distance after the warp, see integral.glsl. A polygon with the area of a circle has its second
 # moments to 2e-3 with 8 corners, to 1.4e-4 with 16. Note that lobes make lights on their axis twice as large, and that
@@ -50,7 +43,7 @@ _SIZES = (*_FEW_SIZES.values(), *(0.25 * limit * limit for limit in ROUND_LIMITS
 _NODES = tuple(sorted({effort.layers for effort in light_profile.DISK_LAYERS}))
 _SHARED = [
     _QUAD,
-    *(_circle(count) for count in _CIRCLES),
+    *(round_outline(count).T for count in _CIRCLES),
     *(np.stack(light_profile.gauss_legendre(count), axis=1) for count in _NODES),
 ]
 _FIRST = np.concatenate([[0], np.cumsum([len(texels) for texels in _SHARED])])[:-1].tolist()

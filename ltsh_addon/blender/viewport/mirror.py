@@ -27,14 +27,7 @@ from ..lights.area import area_light, node_light, note_unsupported, reason_to_le
 from ..lights.emission import emission_of, factors_of, open_studio
 from ..lights.linking import Receivers
 from ..lights.meshes import collect_mesh_lights, constant_mesh_lights
-from ..lights.textures import (
-    MOST_INSTANCES,
-    NodeEmission,
-    NodeLight,
-    ShownTextures,
-    node_emission,
-    with_pattern,
-)
+from ..lights.textures import MOST_INSTANCES, NodeEmission, NodeLight, ShownTextures, node_emission, with_pattern
 from ..lights.world import light_of_world
 from ..materials.graph import source_of, surface_of, tree_in_use
 from ..materials.preview_material import PreviewMaterial, preview_of, world_radiance
@@ -76,7 +69,7 @@ def view_lights(
         ob = instance.object
         if not instance.show_self or not in_view(instance):
             continue
-        emits = emits or (ob.type in SURFACE_TYPES and _has_emission(ob))
+        emits |= ob.type in SURFACE_TYPES and any(np.any(_emission(slot.material)) for slot in ob.material_slots)
         if ob.type != "LIGHT":
             continue
         matrix = np.array(instance.matrix_world, dtype=np.float64)
@@ -116,10 +109,6 @@ def strongest(lights: Sequence[Light], notes: list[str], most: int = MOST_LIGHTS
         "power is missing"
     )
     return [lights[index] for index in chosen]
-
-
-def _has_emission(ob) -> bool:
-    return any(slot.material is not None and np.any(_emission(slot.material)) for slot in ob.material_slots)
 
 
 def _emission(material) -> np.ndarray:
@@ -408,7 +397,7 @@ class SceneMirror:
 
     def _read_instances(self, depsgraph, changes: Changes, in_view) -> None:
         override = depsgraph.view_layer_eval.material_override
-        receivers = Receivers([ob for ob in _originals(depsgraph) if ob.type == "LIGHT"])
+        receivers = Receivers([ob.original for ob in depsgraph.objects if ob.type == "LIGHT"])
         instances, meshes, looks = [], {}, {}
         users = Counter()  # instances by evaluated data, those out of view included
         for instance in depsgraph.object_instances:
@@ -490,7 +479,3 @@ def _receiver(instance, receivers: Receivers, view_layer) -> int:
     numbers = receivers.numbers
     of_object = numbers.get(instance.object.original.name_full, 0)
     return numbers.get(owner.name_full, of_object) if instance.is_instance else of_object
-
-
-def _originals(depsgraph) -> list:
-    return [ob.original for ob in depsgraph.objects]

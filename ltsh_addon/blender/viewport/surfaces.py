@@ -77,7 +77,7 @@ class SurfacePass:
 
     def add_emission(self, instances: list[ShownInstance], view: ViewCamera, frame_buffer) -> None:
         """Add the emission of the surfaces drawn last to `frame_buffer`."""
-        shining = [instance for instance in instances if any(map(_shines, instance.looks))]
+        shining = [one for one in instances if any(np.any(it.look.emission) or it.look.glow > 0.0 for it in one.looks)]
         if shining:
             self._add(EMISSION, [(0, shining)], view, frame_buffer)
 
@@ -191,10 +191,6 @@ class SurfacePass:
             }
         for name in slots:
             shader.uniform_sampler(f"{name}_image", shown.textures.get(name, self._black_image))
-
-
-def _shines(shown: ShownLook) -> bool:
-    return bool(np.any(shown.look.emission)) or shown.look.glow > 0.0
 
 
 def has_bent_lobes(instances: list[ShownInstance]) -> bool:

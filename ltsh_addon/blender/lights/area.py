@@ -110,7 +110,9 @@ def collect_lights(depsgraph, override=None) -> LightInventory:
             note_unsupported(ob, matrix, inventory)
             if _is_sheared(ob, matrix):
                 inventory.left_to_cycles.everything.append(f"light {ob.original.name!r}, whose transform is sheared")
-            _note_instancer(instance, inventory)
+            instancer = surface_instancer(instance)
+            if instancer is not None:
+                inventory.instancers[instancer.original.name_full] = instancer
     # If one instance is unusable, all instances of the object are left out: the reference can only drop the object.
     for name, light, source in placed:
         if name not in inventory.left_out:
@@ -284,12 +286,6 @@ def half_hidden(light: Light) -> str:
     )
 
 
-def _note_instancer(instance, inventory: LightInventory) -> None:
-    instancer = surface_instancer(instance)
-    if instancer is not None:
-        inventory.instancers[instancer.original.name_full] = instancer
-
-
 def rendered_lights(scene, inventory: LightInventory) -> list[Light]:
     """The lights of `inventory`, with the emission of node trees and materials as Cycles renders it.
 
@@ -458,7 +454,11 @@ def point_light(ob, matrix: np.ndarray, **traits) -> Light:
         scale /= 4.0 * math.pi * radius**2 if radius > LEAST_RADIUS else 4.0
     radius = max(radius, LEAST_RADIUS)
     is_spot = light.type == "SPOT"
-    kind, cone = (SpotLight, {"cone": _cone(light, matrix)}) if is_spot else (PointLight, {})
+    kind, cone = SpotLight if is_spot else PointLight, {}
+    if is_spot:
+        cosine = math.cos(0.5 * light.spot_size)
+        sharpness = min(1.0 / max((1.0 - cosine) * light.spot_blend, 1e-30), SHARPEST)
+        cone["cone"] = SpotCone(np.linalg.inv(matrix[:3, :3]), cosine, sharpness)
     return kind(
         name=ob.original.name,
         shape="FACING_DISK" if light.use_soft_falloff else "BALL",
@@ -478,12 +478,6 @@ def strength(light) -> np.ndarray:
     if light.use_temperature:
         value *= np.array(light.temperature_color, dtype=np.float64)[:3]
     return value
-
-
-def _cone(light, matrix) -> SpotCone:
-    cosine = math.cos(0.5 * light.spot_size)
-    blend = (1.0 - cosine) * light.spot_blend
-    return SpotCone(np.linalg.inv(matrix[:3, :3]), cosine, min(1.0 / max(blend, 1e-30), SHARPEST))
 
 
 def _sun(light, name, axis, traits) -> Light:

@@ -111,7 +111,7 @@ def mixed(rig):
 
 
 def saved(rig):
-    """The results of both commands are there when the file is saved elsewhere, and the file has none of the pictures."""
+    """The results of both commands are there when the file is saved elsewhere; the file has no pictures."""
     operators, scene = hands.module("ui.operators"), bpy.context.scene
     before = {command: operators.last_folder(scene, command).resolve() for command in ("shade", "compare")}
     folder = rig.out / "elsewhere"

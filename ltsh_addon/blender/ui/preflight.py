@@ -170,13 +170,9 @@ def _lights(scene) -> list[Problem]:
 
 def materials_of(scene) -> list:
     """Materials of the objects of `scene` that render, each once, sorted by name."""
-    by_name = {}
-    for ob in scene.objects:
-        if not ob.hide_render and ob.type not in ("LIGHT", "CAMERA"):
-            for slot in ob.material_slots:
-                if slot.material is not None:
-                    by_name[slot.material.name_full] = slot.material
-    return [by_name[name] for name in sorted(by_name)]
+    objects = (ob for ob in scene.objects if not ob.hide_render and ob.type not in ("LIGHT", "CAMERA"))
+    materials = {slot.material for ob in objects for slot in ob.material_slots} - {None}
+    return sorted(materials, key=lambda material: material.name_full)
 
 
 def glows(material) -> bool:

@@ -17,7 +17,7 @@ from ..emitters.facing import FacingDisk
 from ..emitters.light_polygons import may_reach, off_plane
 from ..lobes import brdf
 from ..lobes.polygon import dot
-from ..scene import FARTHEST, PASSES, Film, Light, PolygonLight, SurfaceSamples, round_outline
+from ..scene import FARTHEST, PASSES, Film, FlatLight, Light, PolygonLight, SurfaceSamples, round_outline
 from .emitter import Emitter, Sky
 from .light_cluster import LightCluster
 from .ray_sampler import PROBES, RayBatch, RaySampler, SampleRows
@@ -41,8 +41,11 @@ LEVELS = (16, 32, 64, 128, 256, 512)
 BRIGHTEST = 4
 # Rounds in which neighbors of mixed pairs get more rays. Neighbors that turn out mixed pass this on in the next round.
 ROUNDS = 4
-# Rays end at this share of their distance to the light, just before it.
-END = np.float32(1.0 - 1e-4)
+# Rays end at this share of their distance to the light, just before it; rays to an area light behind which a face is as
+# near as that end STEPS float steps before its plane.
+END, STEPS = np.float32(1.0 - 1e-4), 2.0
+# Points along each side of a light from which near faces are looked for.
+LOOKED_AT = 8
 _ZERO, _ONE, _TINY = np.float32(0.0), np.float32(1.0), np.float32(1e-30)
 # Points of the unit disk to aim at, for lights that face the points.
 OUTLINE = 0.99 * round_outline(16)
@@ -127,6 +130,9 @@ class RatioEstimator:
         self.visible, self.blocked = np.zeros(count, bool), np.zeros(count, bool)
         self.count = np.zeros(count, np.int32)
         self.traced = 0
+        # How far before the plane of the light rays end, in m, but for what follows from their length; 0: at END.
+        self.margin = _ZERO if self.at_surface or not isinstance(light, FlatLight) else self._margin(origins)
+        self.at_surface = self.at_surface or self.margin > 0.0
 
     def trace(self, rays: int, neighbors: PixelNeighbors, typical: dict[str, float], importance: np.ndarray) -> None:
         """Trace the probes of all pairs, then up to `rays` rays for pairs that need them. How many depends on the light
@@ -147,6 +153,20 @@ class RatioEstimator:
                     members = np.flatnonzero(chosen & (number == last) & (choice == split))
                     self._add_rays(members, PROBES, int(last), split)
         self._aim_at_corners()
+
+    def _margin(self, position):
+        """STEPS float steps of the light's coordinates, if a face is so near to it that END is not between them for samples
+        at `position` (3, P); else 0."""
+        light = self.light
+        farthest = np.sqrt(np.square(position[:, self.index] - light.center[:, None]).sum(axis=0).max(initial=0.0))
+        near = 2.0 * (1.0 - END) * farthest
+        s, t = np.meshgrid(*2 * [(np.arange(LOOKED_AT) + 0.5) * (2.0 / LOOKED_AT) - 1.0])
+        points = light.center + s.reshape(-1, 1) * light.half_u + t.reshape(-1, 1) * light.half_v
+        points += near * light.direction
+        rays = np.broadcast_to(-light.direction, points.shape), np.full(len(points), 2.0 * near)
+        if not near or (self.surface.tracer.transmittance(points, *rays) == 1.0).all():
+            return _ZERO
+        return np.float32(STEPS * 2.0**-24 * np.abs(light.polygon()).max())
 
     def _plan(self, rays, typical, importance):
         """Number of rays (Q,) that each pair is worth, and its column (Q,) of EVENLY. Both depend on the unshadowed
@@ -220,8 +240,11 @@ class RatioEstimator:
     def _transmittance(self, mask, origins, directions, distances):
         """Transmittance (R,) of rays with a mask, `origins` and `directions` (3, R) and `distances` (R,)."""
         self.traced += len(distances)
-        masks = np.broadcast_to(mask, distances.shape)
-        return self.surface.tracer.transmittance(origins.T, directions.T, distances * END, masks)
+        masks, ends = np.broadcast_to(mask, distances.shape), distances * END
+        if self.margin:
+            falling = np.maximum(-(self.light.direction.astype(np.float32) @ directions), _TINY)
+            ends = np.maximum(ends, distances * np.float32(1.0 - STEPS * 2.0**-24) - self.margin / falling)
+        return self.surface.tracer.transmittance(origins.T, directions.T, ends, masks)
 
     def _add_rays(self, members, first, last, split):
         """Trace the rays `first` to `last` of the pairs `members` (M,). `split` is a column of EVENLY."""

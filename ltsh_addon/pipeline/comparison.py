@@ -375,10 +375,7 @@ def material_classes(samples: SurfaceSamples) -> dict[str, np.ndarray]:
     """Masks (P,) of the samples whose specular lobe is mostly a metal's, or mostly a dielectric's."""
     metal = samples.specular_f90.max(axis=1, initial=0.0)
     dielectric = samples.dielectric.max(axis=1, initial=0.0)
-    return {
-        "metals": (metal > dielectric) & (metal > 0.0),
-        "dielectrics": (dielectric >= metal) & (dielectric > 0.0),
-    }
+    return {"metals": (metal > dielectric) & (metal > 0.0), "dielectrics": (dielectric >= metal) & (dielectric > 0.0)}
 
 
 def percent(value) -> str:

@@ -22,12 +22,7 @@ from ..render_settings import pass_names as names_in_files
 from ..render_settings import picture_size
 from ..saving import save_working_copy
 from ..ui import comparison
-from ..ui.job import (
-    Plan,
-    progress_text,
-    session_times,
-    stage_title,
-)
+from ..ui.job import Plan, progress_text, session_times, stage_title
 from ..ui.preview import ENGINE
 from . import overlay, redraws
 from .final_picture import DEPTH, NORMAL, POSITION, FinalJob, FinalPicture, final_picture, pass_names

@@ -196,7 +196,7 @@ def split_by_slot(ob, clear: list, image_of) -> list[OccluderMesh]:
             transparency = None
             if slot is not None:
                 transparency = clear[slot].transparency(
-                    int(here.sum()), lambda name, here=here: uv_of(name)[here], image_of
+                    int(slot), int(here.sum()), lambda name, here=here: uv_of(name)[here], image_of
                 )
                 if transparency.share == 1.0 and transparency.image is None:
                     continue

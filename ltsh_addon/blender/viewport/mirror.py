@@ -13,28 +13,12 @@ import numpy as np
 from mathutils import Matrix
 
 from ...scene import Light, listed
-from ..evaluated import (
-    SURFACE_TYPES,
-    EmitterTraits,
-    data_pointer,
-    is_seen_by_cameras,
-    is_surface,
-    mesh_key,
-    owner_of,
-    visibility,
-)
+from .. import evaluated
+from ..lights import textures as textures_module
 from ..lights.area import area_light, node_light, note_unsupported, reason_to_leave_out
 from ..lights.emission import emission_of, factors_of, open_studio
 from ..lights.linking import Receivers
 from ..lights.meshes import collect_mesh_lights, constant_mesh_lights
-from ..lights.textures import (
-    MOST_INSTANCES,
-    NodeEmission,
-    NodeLight,
-    ShownTextures,
-    node_emission,
-    with_pattern,
-)
 from ..lights.world import light_of_world
 from ..materials.graph import source_of, surface_of, tree_in_use
 from ..materials.preview_material import PreviewMaterial, preview_of, world_radiance
@@ -51,16 +35,16 @@ MOST_LIGHTS = 2048
 NOT_RESOLVED = "its nodes are not resolved, it shines as without them"
 NOT_YET = "it shines as without its nodes until Cycles has sources at them"
 # Patterns: a function that returns how Cycles sees the nodes of evaluated light data, or why that is not known.
-Patterns = Callable[[bpy.types.Light, NodeLight], NodeEmission | str]
+Patterns = Callable[[bpy.types.Light, textures_module.NodeLight], textures_module.NodeEmission | str]
 
 
-def no_patterns(data, source: NodeLight) -> str:
+def no_patterns(data, source: textures_module.NodeLight) -> str:
     """The `Patterns` of views that resolve no nodes."""
     return NOT_RESOLVED
 
 
 def view_lights(
-    depsgraph, in_view: Callable, textures: ShownTextures, patterns: Patterns = no_patterns
+    depsgraph, in_view: Callable, textures: textures_module.ShownTextures, patterns: Patterns = no_patterns
 ) -> tuple[tuple[Light, ...], tuple[str, ...]]:
     """The lights among the instances that `in_view` accepts, and notes about what differs from Cycles.
 
@@ -73,7 +57,7 @@ def view_lights(
         ob = instance.object
         if not instance.show_self or not in_view(instance):
             continue
-        emits = emits or (ob.type in SURFACE_TYPES and _has_emission(ob))
+        emits = emits or (ob.type in evaluated.SURFACE_TYPES and _has_emission(ob))
         if ob.type != "LIGHT":
             continue
         matrix = np.array(instance.matrix_world, dtype=np.float64)
@@ -81,7 +65,7 @@ def view_lights(
         if problem:
             notes.append(f"{ob.original.name}: {problem}")
             continue
-        plain = area_light(ob, matrix, EmitterTraits.of(instance), receivers)
+        plain = area_light(ob, matrix, evaluated.EmitterTraits.of(instance), receivers)
         shown = [
             light
             for light in _with_nodes(plain, instance, (textures, patterns), notes)
@@ -125,29 +109,31 @@ def _mesh_lights(depsgraph, receivers: Receivers, notes: list[str]) -> list[Ligh
     return constant_mesh_lights(mesh_lights, _emission, eye, notes.append)
 
 
-def patterns_of(scene, depsgraph) -> dict[tuple, NodeEmission]:
+def patterns_of(scene, depsgraph) -> dict[tuple, textures_module.NodeEmission]:
     """How Cycles sees the nodes of lights that views cannot read themselves, by the `key` of the `NodeLight`.
 
     `scene` is left as it was.
     """
-    wanted: dict[tuple, NodeLight] = {}
+    wanted: dict[tuple, textures_module.NodeLight] = {}
 
-    def note(data, source: NodeLight) -> str:
-        if len(wanted) < MOST_INSTANCES:
+    def note(data, source: textures_module.NodeLight) -> str:
+        if len(wanted) < textures_module.MOST_INSTANCES:
             wanted[source.key] = source
         return NOT_YET
 
-    receivers, sources = Receivers([]), (ShownTextures(), note)
+    receivers, sources = Receivers([]), (textures_module.ShownTextures(), note)
     for instance in depsgraph.object_instances:
         ob = instance.object
         if ob.type == "LIGHT" and tree_in_use(ob.data) is not None:
             matrix = np.array(instance.matrix_world, dtype=np.float64)
             if not reason_to_leave_out(ob, matrix):
-                _with_nodes(area_light(ob, matrix, EmitterTraits.of(instance), receivers), instance, sources, [])
+                _with_nodes(
+                    area_light(ob, matrix, evaluated.EmitterTraits.of(instance), receivers), instance, sources, []
+                )
     if not wanted:
         return {}
     with open_studio(scene) as studio:
-        return {key: node_emission(source, studio) for key, source in wanted.items()}
+        return {key: textures_module.node_emission(source, studio) for key, source in wanted.items()}
 
 
 def _with_nodes(light: Light, instance, sources: tuple, notes: list[str]) -> list[Light]:
@@ -186,7 +172,7 @@ def _with_nodes(light: Light, instance, sources: tuple, notes: list[str]) -> lis
     if not light.is_distant:
         light = replace(light, falloff=unseen.falloff.power, smooth=unseen.falloff.smooth)
     if light.is_facing or light.is_distant:
-        return with_pattern(light, pattern, unseen, notes.append)
+        return textures_module.with_pattern(light, pattern, unseen, notes.append)
     return textures.split_by_nodes(light, pattern, notes)
 
 
@@ -291,7 +277,7 @@ def object_notes(depsgraph) -> list[str]:
     names_by_kind: dict[str, list[str]] = {}
     for ob in depsgraph.objects:
         kind = NOT_SHOWN.get(ob.type)
-        if kind is None and ob.type in SURFACE_TYPES and ob.is_shadow_catcher:
+        if kind is None and ob.type in evaluated.SURFACE_TYPES and ob.is_shadow_catcher:
             kind = "shown as any surface, not as shadow catcher"
         if kind is None and any(system.settings.type == "HAIR" for system in ob.particle_systems):
             kind = NOT_SHOWN["CURVES"]
@@ -333,7 +319,7 @@ class SceneMirror:
         self._looks: dict[str, ShownLook] = {}
         self._object_notes: tuple[str, ...] = ()
         self._light_notes: tuple[str, ...] = ()
-        self._light_textures = ShownTextures()
+        self._light_textures = textures_module.ShownTextures()
         self.has_old_lights = False  # True: there are new results about lights, which are to be read again
         self._world_note: tuple[str, ...] = ()
         self._synced = False
@@ -367,7 +353,7 @@ class SceneMirror:
         """Take over all changes; `space` is the 3D view, for its local view."""
         changes = changes_of(depsgraph, not self._synced)
         self._drop_changed(changes)
-        in_view = visibility(depsgraph, space)
+        in_view = evaluated.visibility(depsgraph, space)
         if changes.surfaces:
             self._read_instances(depsgraph, changes, in_view)
             self.surfaces_version += 1
@@ -403,13 +389,13 @@ class SceneMirror:
         users = Counter()  # instances by evaluated data, those out of view included
         for instance in depsgraph.object_instances:
             ob = instance.object
-            if not is_surface(instance):
+            if not evaluated.is_surface(instance):
                 continue
-            data = data_pointer(ob)
+            data = evaluated.data_pointer(ob)
             users[data] += 1
-            if not is_seen_by_cameras(instance, depsgraph.view_layer) or not in_view(instance):
+            if not evaluated.is_seen_by_cameras(instance, depsgraph.view_layer) or not in_view(instance):
                 continue
-            key = mesh_key(instance)
+            key = evaluated.mesh_key(instance)
             if key not in meshes:
                 known = key in self._meshes and not changes.geometry.intersection(key[:3])
                 meshes[key] = self._meshes[key] if known else mesh_batches(ob)
@@ -473,7 +459,7 @@ def _name(material) -> str:
 
 
 def _receiver(instance, receivers: Receivers, view_layer) -> int:
-    owner = owner_of(instance).original
+    owner = evaluated.owner_of(instance).original
     if owner.holdout_get(view_layer=view_layer):
         return HOLDOUT
     numbers = receivers.numbers

@@ -171,7 +171,7 @@ def _light_of_cell(light: Light, outline: np.ndarray, cell) -> list[Light]:
     """The part of `light` in `cell`. `outline` (V, 2) is that of a light that is no rectangle."""
     size = (cell[1] - cell[0]) * (cell[3] - cell[2])
     inside = outline if isinstance(light, QuadLight) else clip_to_cell(outline, cell)
-    share = polygon_area(inside) / size
+    share = abs(signed_area(inside)) / size
     if isinstance(light, QuadLight) or share >= 1.0 - 1e-6:
         return [_rectangle(light, cell)]
     if share <= 1e-9:
@@ -253,8 +253,3 @@ def signed_area(outline: np.ndarray) -> float:
         return 0.0
     x, y = outline.T
     return 0.5 * float(np.dot(x, np.roll(y, -1)) - np.dot(np.roll(x, -1), y))
-
-
-def polygon_area(outline: np.ndarray) -> float:
-    """Area of a polygon (V, 2)."""
-    return abs(signed_area(outline))

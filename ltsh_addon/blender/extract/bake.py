@@ -250,6 +250,8 @@ def _open(job: BakeJob) -> BakeScene:
     warnings += lost
     aovs.give_default_material(bare)
     lobes = _lobes([ob for ob in objects if ob.name in meshes], inventory.emitting_materials)
+    for material_lobes in lobes.values() if has_shadows else ():
+        aovs.let_shadow_rays_through(material_lobes.made_opaque)
     for material in bpy.data.materials:
         if material.name_full not in inventory.emitting_materials:
             material.cycles.emission_sampling = "NONE"
@@ -266,10 +268,7 @@ def _open(job: BakeJob) -> BakeScene:
     if view.kind == "point":
         view = replace(view, vector=tuple(np.add(view.vector, origin).tolist()))
     _look_from(scene, camera, seen_from)
-    if has_shadows:
-        for material_lobes in lobes.values():
-            aovs.let_shadow_rays_through(material_lobes.made_opaque)
-    else:
+    if not has_shadows:
         remove_occlusion(scene)
     name, names = camera.name if job.view == "camera" else "", [ob.name for ob in objects]
     if has_shadows:

@@ -283,6 +283,8 @@ def prepare_scene(
         materials, inventory.emitting_materials, inventory.unshaded, inventory.made_opaque, left_to_cycles
     )
     inventory.receivers.mark()
+    if with_occluders:  # before a look at the lights, which shows them to such rays
+        aovs.let_shadow_rays_through(inventory.made_opaque)
     inventory.behind = world
     add_world(inventory, scene, world)
     if not inventory.lights and not for_finished:
@@ -400,8 +402,6 @@ def _prepare_reference(scene, inventory: LightInventory) -> None:
     """Make Cycles light the scene as the techniques do, with or without shadows."""
     if inventory.occluders is None:
         remove_occlusion(scene)
-    else:
-        aovs.let_shadow_rays_through(inventory.made_opaque)
     scene.world = inventory.world
 
 

@@ -167,17 +167,14 @@ def overlapping_pairs(lights: list[Light]) -> list[tuple[Light, Light, float]]:
         near &= direction[chunk] @ direction[other].T > 1.0 - 1e-6
         for first, second in zip(*np.nonzero(np.triu(near, 1)), strict=True):
             lights_of_pair = lights[start + first], lights[start + second]
-            share = 0.0 if _never_meet(*lights_of_pair) else _overlap(*lights_of_pair)
+            receivers = [light.receivers for light in lights_of_pair]
+            never_meet = None not in receivers and not set(receivers[0]) & set(receivers[1])
+            share = 0.0 if never_meet else _overlap(*lights_of_pair)
             if share > 0.0:
                 pairs.append((*lights_of_pair, share))
             if len(pairs) == MOST_PAIRS:
                 return pairs
     return pairs
-
-
-def _never_meet(first: Light, second: Light) -> bool:
-    """True if no object receives light from both."""
-    return None not in (first.receivers, second.receivers) and not set(first.receivers) & set(second.receivers)
 
 
 def _overlap(first: Light, second: Light) -> float:
@@ -333,10 +330,12 @@ def node_light(ob, matrix: np.ndarray, inventory: LightInventory, instance=None)
         emission.falloff = Falloff()
     for problem in emission_warnings(emission, is_light=True):
         inventory.warn(f"light {ob.original.name!r}: {problem}")
+    is_made = instance is not None and instance.is_instance
+    of_parent = (instance.parent.original.name_full, *instance.persistent_id) if is_made else ()
     shared = {
         "falloff": emission.falloff or Falloff(),
         "facts": ObjectFacts.of(ob, instance),
-        "instance": (ob.original.name_full, *_instance_key(instance)),
+        "instance": (ob.original.name_full, *of_parent),
     }
     if light.type in ("AREA", "SUN"):
         if emission.directional and light.type == "AREA":
@@ -357,12 +356,6 @@ def node_light(ob, matrix: np.ndarray, inventory: LightInventory, instance=None)
         light.original, matrix, emission.varies, is_placed=emission.varies and is_placed,
         by_ray=within or not is_ball, within=within, by_spot=by_spot, is_mixed=emission.by_place, **shared,
     )  # fmt: skip
-
-
-def _instance_key(instance) -> tuple:
-    if instance is None or not instance.is_instance:
-        return ()
-    return instance.parent.original.name_full, *instance.persistent_id
 
 
 def note_unsupported(ob, matrix: np.ndarray, inventory: LightInventory) -> None:

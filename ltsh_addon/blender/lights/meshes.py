@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 
@@ -13,7 +14,7 @@ from ...cycles.patches import ERROR, GRID, cut_into_patches, split_light
 from ...cycles.planar_polygons import FlatPolygon
 from ...scene import Light, PolygonLight, QuadLight
 from ..evaluated import SURFACE_TYPES, EmitterTraits, RenderedSurface, is_rendered, read_values, surface_instancer
-from ..materials.graph import computed, ensure_nodes, live_link, material_output
+from ..materials.graph import computed, ensure_nodes, fill_with_bsdf, live_link, material_output
 from ..render_settings import changed_properties
 from .emission import (
     PIXELS,
@@ -103,7 +104,8 @@ def collect_mesh_lights(depsgraph, override, receivers: Receivers, warn, copies:
 def _mesh_light(ob, traits: EmitterTraits, override, receivers: Receivers, known: dict) -> MeshLight | None:
     slots = [override] * max(1, len(ob.material_slots)) if override else [slot.material for slot in ob.material_slots]
     materials = [None if material is None else material.original for material in slots]
-    emission = [_emission_of(material, known) for material in materials]
+    known |= {one.name_full: emission_of(one) for one in materials if one is not None and one.name_full not in known}
+    emission = [Emission() if material is None else known[material.name_full] for material in materials]
     if not any(one.emits for one in emission) or not (traits.diffuse or traits.glossy):
         return None
     nothing = np.zeros(3)
@@ -120,14 +122,6 @@ def _mesh_light(ob, traits: EmitterTraits, override, receivers: Receivers, known
         receivers=receivers.of(ob.original),
     )
     return MeshLight(ob.original, light, materials, emission)
-
-
-def _emission_of(material, known: dict[str, Emission]) -> Emission:
-    if material is None:
-        return Emission()
-    if material.name_full not in known:
-        known[material.name_full] = emission_of(material)
-    return known[material.name_full]
 
 
 def displaces(material) -> bool:
@@ -177,12 +171,6 @@ _PLACE = ("center", "half_u", "half_v", "direction", "corners")
 FEW_POLYGONS = 16
 
 
-def _undisplaced(mesh_lights: list[MeshLight]):
-    """Within this context no material displaces faces, which could move them out of the camera's sight."""
-    materials = {material.name_full: material for light in mesh_lights for material in light.materials if material}
-    return changed_properties([(material, "displacement_method", "BUMP") for material in materials.values()])
-
-
 def mesh_area_lights(mesh_lights: list[MeshLight], studio: Studio, eye: np.ndarray, warn) -> list[Light]:
     """The area lights that stand for the objects `mesh_lights`; the camera is at `eye` (3,).
 
@@ -190,7 +178,10 @@ def mesh_area_lights(mesh_lights: list[MeshLight], studio: Studio, eye: np.ndarr
     """
     for mesh_light in mesh_lights:
         _warn_of_emission(mesh_light, warn)
-    with _undisplaced(mesh_lights), without_falloff(material for light in mesh_lights for material in light.materials):
+    materials = {material.name_full: material for light in mesh_lights for material in light.materials if material}
+    # Displacement could move faces out of the camera's sight.
+    undisplaced = [(material, "displacement_method", "BUMP") for material in materials.values()]
+    with changed_properties(undisplaced), without_falloff(materials.values()):
         return _lights_of_all(mesh_lights, studio, eye, warn)
 
 
@@ -270,7 +261,8 @@ def _emitting_side(mesh_light: MeshLight, eye: np.ndarray, warn) -> int:
 
 def _polygons(mesh_light: MeshLight, radiance) -> list[tuple[Placement, list[FlatPolygon]]]:
     """Each placement with its emitting polygons, labeled by material slot."""
-    shines = np.array([emission.varies or bool(np.any(value)) for emission, value in _slots(mesh_light, radiance)])
+    slots = zip(mesh_light.emission, radiance, strict=True)
+    shines = np.array([emission.varies or bool(np.any(value)) for emission, value in slots])
     placed_polygons = []
     for placement in mesh_light.placements:
         chosen = shines[placement.slots]
@@ -279,10 +271,6 @@ def _polygons(mesh_light: MeshLight, radiance) -> list[tuple[Placement, list[Fla
         )
         placed_polygons.append((placement, polygons))
     return placed_polygons
-
-
-def _slots(mesh_light: MeshLight, radiance):
-    return zip(mesh_light.emission, radiance, strict=True)
 
 
 def _sides(side: int) -> tuple[int, ...]:
@@ -365,21 +353,29 @@ def _textured_lights(mesh_light: MeshLight, placed_polygons, side: int, studio: 
     count = sum(len(polygons) for _, polygons in textured)
     if count == 0:
         return []
-    if count > MOST_RENDERED_POLYGONS:
-        return _mean_lights(mesh_light, textured, side, studio, warn)
+    make = _mean_lights if count > MOST_RENDERED_POLYGONS else _patch_lights
+    lights = make(mesh_light, textured, side, studio, warn)
+    for label in sorted({polygon.label for _, polygons in textured for polygon in polygons} - set(lights)):
+        warn(
+            f"object {mesh_light.ob.name!r}: material {mesh_light.materials[label].name!r} may emit there, but "
+            "a picture of its faces is black; it lights nothing"
+        )
+    return [light for of_label in lights.values() for light in of_label]
+
+
+def _patch_lights(mesh_light: MeshLight, textured, side: int, studio: Studio, warn) -> dict[int, list[Light]]:
+    """By material slot, the polygons with patches of constant radiance."""
+    count = sum(len(polygons) for _, polygons in textured)
     most = max(1, GRID * GRID // (count * len(_sides(side))))
-    lights, errors = [], []
-    for placement, polygons in textured:
-        with _shown(studio, _with_materials(mesh_light, placement), placement.matrix, placement.facts):
-            for polygon in polygons:
-                for way in _sides(side):
-                    light = polygon_light(mesh_light.light_of(polygon.label), polygon, way, np.ones(3))
-                    image, covered = _look_at_polygon(studio, light, PIXELS if count <= FEW_POLYGONS else PIXELS // 4)
-                    patches = cut_into_patches(image, covered, most)
-                    lights.extend(split_light(light, patches))
-                    errors.append(patches.error)
+    lights, errors = {}, []
+    pixels = PIXELS if count <= FEW_POLYGONS else PIXELS // 4
+    for polygon, _, light, image, covered in _looks(mesh_light, textured, side, studio, pixels):
+        patches = cut_into_patches(image, covered, most)
+        if patches.whole is not None:
+            lights.setdefault(polygon.label, []).extend(split_light(light, patches))
+        errors.append(patches.error)
     if max(errors) > ERROR:
-        patches = sum(len(light.leaves) for light in lights)
+        patches = sum(len(light.leaves) for of_label in lights.values() for light in of_label)
         warn(
             f"object {mesh_light.ob.name!r}: its texture is shaded as {patches} patches of constant radiance, "
             f"which differ from it by {100.0 * max(errors):.0f} % on average"
@@ -387,22 +383,46 @@ def _textured_lights(mesh_light: MeshLight, placed_polygons, side: int, studio: 
     return lights
 
 
+def _looks(mesh_light: MeshLight, textured, side: int, studio: Studio, pixels: int):
+    """Yield each polygon with the way that it emits, its light of radiance 1, and what `_look_at_polygon` gives."""
+    for placement, polygons in textured:
+        with _shown(studio, _with_materials(mesh_light, placement), placement.matrix, placement.facts):
+            for polygon, way in itertools.product(polygons, _sides(side)):
+                light = polygon_light(mesh_light.light_of(polygon.label), polygon, way, np.ones(3))
+                yield polygon, way, light, *_look_at_polygon(studio, light, pixels)
+
+
 def _with_materials(mesh_light: MeshLight, placement: Placement):
-    mesh = placement.mesh
-    mesh.materials.clear()
-    for material in mesh_light.materials:
-        mesh.materials.append(material)
+    """The mesh of `placement` with its textured materials. All else is transparent: it may lie just before them.
+
+    Each slot is set in its turn: `clear` would give all faces the first material.
+    """
+    mesh, clear = placement.mesh, bpy.data.materials.new("Lets a look through")
+    ensure_nodes(clear)
+    fill_with_bsdf(clear.node_tree, "ShaderNodeBsdfTransparent", (1.0, 1.0, 1.0, 1.0))
+    while len(mesh.materials) > len(mesh_light.materials):
+        mesh.materials.pop()
+    for slot, (material, emission) in enumerate(zip(mesh_light.materials, mesh_light.emission, strict=True)):
+        if slot == len(mesh.materials):
+            mesh.materials.append(None)
+        mesh.materials[slot] = material if emission.varies else clear
     return mesh
 
 
 def _look_at_polygon(studio: Studio, light: Light, pixels: int) -> tuple[np.ndarray, np.ndarray]:
-    """Radiance (H, W, 3) of the rectangle around `light`, and the mask (H, W) of the pixels inside its outline."""
+    """Radiance (H, W, 3) of the rectangle around `light`, and the mask (H, W) of the pixels inside its outline.
+
+    Pixels at the outline count only where most of their rays met the light.
+    """
     image, covered = studio.look(light.center, light.half_u, light.half_v, light.direction, pixels)
     rows, columns = covered.shape
     x, y = np.meshgrid((np.arange(columns) + 0.5) / columns * 2.0 - 1.0, 1.0 - (np.arange(rows) + 0.5) / rows * 2.0)
     offset = light.corners - light.center
     outline = np.stack([offset @ half / np.dot(half, half) for half in (light.half_u, light.half_v)], axis=-1)
-    inside = covered & _contains(outline, x, y)
+    inside = _contains(outline, x, y)
+    unmet = inside & ~covered  # at the outline, or transparent there
+    corners = [(x[unmet] + s / columns, y[unmet] + t / rows) for s in (-1.0, 1.0) for t in (-1.0, 1.0)]
+    inside[unmet] = np.all([_contains(outline, *corner) for corner in corners], axis=0)
     return image, inside if inside.any() else covered
 
 
@@ -415,28 +435,24 @@ def _contains(outline: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
     return inside
 
 
-def _mean_lights(mesh_light: MeshLight, textured, side: int, studio: Studio, warn) -> list[Light]:
-    """One light per polygon, with the mean radiance of the largest polygons of its material and side."""
+def _mean_lights(mesh_light: MeshLight, textured, side: int, studio: Studio, warn) -> dict[int, list[Light]]:
+    """By material slot, one light per polygon, with the mean radiance of the largest polygons of its slot and side."""
     sums: dict[tuple[int, int], np.ndarray] = {}
-    lights = []
+    lights: dict[int, list[Light]] = {}
+    largest = []
     for placement, polygons in textured:
-        largest = sorted(polygons, key=lambda polygon: -np.ptp(polygon.corners, axis=0).max())[:STAND_INS]
-        with _shown(studio, _with_materials(mesh_light, placement), placement.matrix, placement.facts):
-            for polygon in largest:
-                for way in _sides(side):
-                    light = polygon_light(mesh_light.light_of(polygon.label), polygon, way, np.ones(3))
-                    image, covered = _look_at_polygon(studio, light, PIXELS // 16)
-                    area = 4.0 * np.linalg.norm(np.cross(light.half_u, light.half_v)) * covered.mean()
-                    share = np.append(area * image[covered].mean(axis=0), area) if covered.any() else np.zeros(4)
-                    sums[polygon.label, way] = sums.get((polygon.label, way), np.zeros(4)) + share
-    for _, polygons in textured:
-        for polygon in polygons:
-            for way in _sides(side):
-                *light_sum, area = sums.get((polygon.label, way), np.zeros(4))
-                if area > 0.0 and np.any(light_sum):
-                    lights.append(
-                        polygon_light(mesh_light.light_of(polygon.label), polygon, way, np.array(light_sum) / area)
-                    )
+        by_size = sorted(polygons, key=lambda polygon: (polygon.label, -np.ptp(polygon.corners, axis=0).max()))
+        of_labels = itertools.groupby(by_size, key=lambda polygon: polygon.label)
+        largest.append((placement, [one for _, alike in of_labels for one in list(alike)[:STAND_INS]]))
+    for polygon, way, light, image, covered in _looks(mesh_light, largest, side, studio, PIXELS // 16):
+        area = 4.0 * np.linalg.norm(np.cross(light.half_u, light.half_v)) * covered.mean()
+        share = np.append(area * image[covered].mean(axis=0), area) if covered.any() else np.zeros(4)
+        sums[polygon.label, way] = sums.get((polygon.label, way), np.zeros(4)) + share
+    for polygon, way in itertools.product((one for _, polygons in textured for one in polygons), _sides(side)):
+        *light_sum, area = sums.get((polygon.label, way), np.zeros(4))
+        if area > 0.0 and np.any(light_sum):
+            light = polygon_light(mesh_light.light_of(polygon.label), polygon, way, np.array(light_sum) / area)
+            lights.setdefault(polygon.label, []).append(light)
     warn(
         f"object {mesh_light.ob.name!r}: its texture on more than {MOST_RENDERED_POLYGONS} faces is shaded as its mean"
     )

@@ -213,12 +213,12 @@ def metal_room(path: Path) -> Path:
     return save(path)
 
 
-def prepare():
+def prepare(with_occluders=False):
     """The scene's preparation as the child does it; (scene, view layer, light inventory, warnings)."""
     scene, warnings = bpy.context.scene, []
     camera = render_settings.choose_camera(scene, None)
     layer = render_settings.choose_view_layer(scene, warnings)
-    inventory = pixels.prepare_scene(scene, layer, camera, warnings)
+    inventory = pixels.prepare_scene(scene, layer, camera, warnings, with_occluders=with_occluders)
     return scene, layer, inventory, warnings
 
 

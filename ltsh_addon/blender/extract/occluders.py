@@ -52,33 +52,23 @@ class UnreadSurface:
     number: int  # of the mesh in the occluders
 
 
-# MOST_BAKED: of so many surfaces the transparency is baked; others block.
-MOST_BAKED = 100
-
-
 def with_baked_shares(occluders: Occluders, unread: list[UnreadSurface], scene, warn) -> Occluders:
     """`occluders` with what the `unread` surfaces let through. `warn(text)` tells what of that is approximated.
 
     Call this before materials are changed.
     """
     meshes = list(occluders.meshes)
-    for surface in unread[:MOST_BAKED]:
+    for surface in unread:
         with open_studio(scene) as studio:
             if scene.camera is not None:
                 studio.camera.matrix_world = scene.camera.matrix_world
             transparency = maps.baked_transparency(surface, studio)
         meshes[surface.number] = replace(meshes[surface.number], transparency=transparency)
+        bpy.data.meshes.remove(surface.mesh)
     for material in dict.fromkeys(surface.material for surface in unread):
         problem = maps.depends_on_rays(trees_of([material]))
         if problem:
             warn(f"shadows: what material {material.name!r} lets through depends on {problem}")
-    if len(unread) > MOST_BAKED:
-        names = listed((repr(surface.name) for surface in unread[MOST_BAKED:]), NAMED)
-        warn(
-            f"shadows: only Cycles can tell how transparent more than {MOST_BAKED} objects are; opaque are here {names}"
-        )
-    for surface in unread:
-        bpy.data.meshes.remove(surface.mesh)
     return replace(occluders, meshes=tuple(meshes))
 
 
@@ -250,7 +240,7 @@ class _Collector:
         output = surface.node
         if live_link(surface) is None:
             # A material with only a volume lets light through; another warning tells that volumes are not shaded.
-            return None if live_link(output.inputs["Volume"]) is None else _ClearMaterial(values.constant(1.0))
+            return None if live_link(output.inputs["Volume"]) is None else _ClearMaterial(shares=(1.0,))
         with _read_for_shadow_rays():
             value, curve = _share_at(surface), None
         if isinstance(value, values.Curved):
@@ -265,7 +255,7 @@ class _Collector:
             value = value.mapped(np.full((3, 3), 1.0 / 3.0))
         if value.is_constant:
             share = float(np.clip(value.offset[0], 0.0, 1.0))
-            return _ClearMaterial(values.constant(share)) if share > 0.0 else None
+            return _ClearMaterial(shares=(share,)) if share > 0.0 else None
         image = self._image(value)
         if image is None:
             return self._unread_material(material)
@@ -343,7 +333,7 @@ class _UnreadTransparency(Transparency):
 
 @dataclass(frozen=True)
 class _ClearMaterial:
-    """The share of light that a material lets through: `value`, or `shares` at maps.COSINES; neither: Cycles knows."""
+    """The share of light that a material lets through: `value`, or `shares` (one, or at maps.COSINES), or unknown."""
 
     value: values.Value | None = None
     curve: tuple | None = None  # see `Transparency.curve`
@@ -358,8 +348,6 @@ class _ClearMaterial:
             return maps.even_transparency(self.shares, maps.COSINES, triangles)
         if self.value is None:
             return _UnreadTransparency(slot=slot)
-        if self.value.is_constant:
-            return Transparency(float(self.value.offset[0]))
         use = self.value.image
         mapping = np.array(use.mapping, np.float32)
         uv = uv_of(use.uv_map) @ mapping[:, :2].T + mapping[:, 2]
@@ -371,13 +359,6 @@ class _ClearMaterial:
             outside=float(self.value.offset[0]),
             curve=self.curve,
         )
-
-    @property
-    def mean(self) -> float | None:
-        """The share that stands for all; None if places on the surface differ."""
-        if self.shares:
-            return float(np.mean(self.shares))
-        return float(self.value.offset[0]) if self.value is not None and self.value.is_constant else None
 
 
 @contextmanager

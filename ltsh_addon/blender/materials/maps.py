@@ -227,11 +227,7 @@ class MaterialPlan:
 LIGHT_PATH = "ShaderNodeLightPath"
 DIRECTIONAL = FRESNEL, LAYER_WEIGHT, GEOMETRY = "ShaderNodeFresnel", "ShaderNodeLayerWeight", "ShaderNodeNewGeometry"
 # UNKNOWN: outputs of nodes that differ from shadow ray to shadow ray by more than `Transparency.cosines`.
-UNKNOWN = {
-    LIGHT_PATH: ("Ray Length", "Transparent Depth"),
-    GEOMETRY: ("Incoming",),
-    "ShaderNodeTexCoord": ("Reflection", "Window"),
-}
+UNKNOWN = {"Ray Length", "Transparent Depth", "Incoming", "Reflection", "Window"}
 # COSINES: those of `Transparency.cosines` for shares that do not vary, closest at grazing angles, where Fresnel is
 # steepest.
 _FRONT = np.square(np.linspace(1e-3, 1.0, 129))
@@ -246,7 +242,7 @@ def shown_to_shadow_ray(node, output: str, number: float | None, cosine: float |
     where its first input is the constant `number`; None: unknown. Bumps are left out: on average they change little."""
     kind = node.bl_idname
     if kind == LIGHT_PATH:
-        return None if output in UNKNOWN[kind] else float(output in ("Is Shadow Ray", "Ray Depth"))
+        return None if output in UNKNOWN else float(output in ("Is Shadow Ray", "Ray Depth"))
     if cosine is None or (kind == GEOMETRY and output != "Backfacing") or (kind != GEOMETRY and number is None):
         return None
     if kind == GEOMETRY:
@@ -270,7 +266,7 @@ def _by_cosine(output) -> np.ndarray | None:
 def depends_on_rays(trees) -> str:
     """What the nodes of `trees` depend on that differs from ray to ray and is baked as one value, and which; or ""."""
     outputs = [one for tree in trees for node in tree.nodes for one in node.outputs if one.is_linked]
-    names = {output.name for output in outputs if output.name in UNKNOWN.get(output.node.bl_idname, ())}
+    names = {output.name for output in outputs if output.name in UNKNOWN and not graph.is_group(output.node)}
     of_outputs = [(output.name, _by_cosine(output)) for output in outputs]
     spreads = {name: np.abs(one - one.mean()).mean() for name, one in of_outputs if one is not None and np.ptp(one) > 0}
     off = max(spreads.values(), default=0.0)

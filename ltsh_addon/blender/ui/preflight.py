@@ -22,9 +22,7 @@ from ...scene import error_line
 from ..extract.apply import shows_texture
 from ..extract.bake_meshes import ObjectError, check_object
 from ..lights.area import LightInventory, node_light, reason_to_leave_out
-from ..lights.area import (
-    note_unsupported as note_unsupported_light,
-)
+from ..lights.area import note_unsupported as note_unsupported_light
 from ..lights.emission import emission_of
 from ..lights.world import may_shine
 from ..materials.aovs import notes_of_material

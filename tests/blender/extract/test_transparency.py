@@ -6,8 +6,6 @@ import pytest
 import scene_parts
 from shadow_scenes import clear, hidden, pane, seen_by_cycles, seen_by_rays, shown, start, textured
 
-from ltsh_addon.blender.extract import occluders as occluder_module
-
 pytestmark = pytest.mark.newest
 
 
@@ -200,14 +198,3 @@ def test_with_other_nodes_fresnel_counts_by_its_mean_which_is_named():
     # What noise lets through of the mean: where that is 0.5, between 0.5 and 1.
     assert 0.5 < image[image > 0.0].mean() < 0.9
     assert len(warnings) == 1 and "depends on Fac" in warnings[0] and "mean over directions" in warnings[0], warnings
-
-
-def test_more_surfaces_than_are_baked_block_and_are_named(monkeypatch):
-    monkeypatch.setattr(occluder_module, "MOST_BAKED", 1)
-    start()
-    material = shown(BAKED["noise"][0])
-    for number in range(3):
-        pane(material).location.z += 0.1 * number
-    occluders, warnings = scene_parts.baked_occluders()
-    shares = [mesh.transparency.share for mesh in occluders.meshes if mesh.transparency is not None]
-    assert shares == [1.0, 0.0, 0.0] and len(warnings) == 1 and "'Pane.001'" in warnings[0], warnings

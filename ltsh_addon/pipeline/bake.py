@@ -455,22 +455,15 @@ def _report(options, manifest, records) -> dict:
         wrong, note = _darkness(record, reasons[record["name"]])
         problems += wrong
         warnings += note
-        if record["outside"] > NOTED_SHARE_OUTSIDE:
-            share = f"{100 * record['outside']:.3g} %"
-            warnings.append(
-                f"object {record['name']!r}: {share} of UV map {record['uv']!r} lies outside of the texture, not baked"
-            )
+        name = f"object {record['name']!r}"
+        if (share := 100 * record["outside"]) > 100 * NOTED_SHARE_OUTSIDE:
+            warnings.append(f"{name}: {share:.3g} % of UV map {record['uv']!r} lies outside of the texture, not baked")
         for tile in record["tiles"].values():
-            share = tile["overlapping_texels"] / max(tile["texels"], 1)
-            if share > 0.0:
-                share = f"{100 * share:.3g} %"
-                warnings.append(f"object {record['name']!r}: {share} of its texels are covered more than once")
-            if tile["unbaked_texels"]:
-                share = f"{100 * tile['unbaked_texels'] / (tile['texels'] + tile['unbaked_texels']):.3g} %"
-                warnings.append(
-                    f"object {record['name']!r}: {share} of its texels are left out, because Cycles bakes nothing "
-                    "there: apply the modifiers"
-                )
+            if share := 100 * tile["overlapping_texels"] / max(tile["texels"], 1):
+                warnings.append(f"{name}: {share:.3g} % of its texels are covered more than once")
+            if share := 100 * tile["unbaked_texels"] / max(tile["texels"] + tile["unbaked_texels"], 1):
+                why = "because Cycles bakes nothing there: apply the modifiers"
+                warnings.append(f"{name}: {share:.3g} % of its texels are left out, {why}")
     return {
         "scene": str(options.scene),
         "frame": manifest["frame"],

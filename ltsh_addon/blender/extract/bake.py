@@ -137,14 +137,12 @@ class ObjectBake:
     def _image(self, block):
         size = block.width, block.rows
         if size not in self.images:
-            image = bpy.data.images.new("ltsh bake", *size, alpha=True, float_buffer=True, is_data=True)
-            self.images[size] = image
+            self.images[size] = bpy.data.images.new("ltsh bake", *size, alpha=True, float_buffer=True, is_data=True)
         return self.images[size]
 
     def _place(self, block):
         layers = self.ob.data.uv_layers
-        count = len(self.ob.data.loops)
-        uv = bake_meshes.uv_of(layers[self.uv_name], count).astype(np.float64)
+        uv = bake_meshes.uv_of(layers[self.uv_name], len(self.ob.data.loops)).astype(np.float64)
         layers[self.layer_name].uv.foreach_set("vector", block.placed(uv).astype(np.float32).ravel())
         self.ob.data.update()
 
@@ -153,13 +151,12 @@ def view_of(wanted, camera, bent: bool) -> BakeView:
     """The view for `wanted`: "camera", "above" or a position (3,)."""
     if wanted == "above":
         return BakeView("above")
-    if wanted == "camera":
-        matrix = np.array(camera.matrix_world, dtype=np.float64)
-        if camera.data.type == "ORTHO":
-            axis = matrix[:3, 2] / np.linalg.norm(matrix[:3, 2])
-            return BakeView("direction", tuple(axis.tolist()), bent)
-        return BakeView("point", tuple(matrix[:3, 3].tolist()), bent)
-    return BakeView("point", tuple(wanted), bent)
+    if wanted != "camera":
+        return BakeView("point", tuple(wanted), bent)
+    matrix = np.array(camera.matrix_world, dtype=np.float64)
+    if camera.data.type == "ORTHO":
+        return BakeView("direction", tuple((matrix[:3, 2] / np.linalg.norm(matrix[:3, 2])).tolist()), bent)
+    return BakeView("point", tuple(matrix[:3, 3].tolist()), bent)
 
 
 # Keys of a job that may change while the same file stays open.

@@ -12,7 +12,7 @@ import numpy as np
 from ...scene import SceneError, error_line, light_records, listed
 from .. import render_settings
 from ..evaluated import SURFACE_TYPES, owner_of, read_values, rendered_surfaces, with_render_depsgraph
-from ..lights.area import LightInventory, collect_lights, rendered_lights
+from ..lights.area import LightInventory, collect_lights, note_overlaps, rendered_lights
 from ..lights.meshes import SIDE_PROPERTY, let_light_through
 from ..lights.world import blocks_nothing, take_world, world_behind, world_lights
 from ..materials import aovs
@@ -165,7 +165,8 @@ def missing_images(depsgraph, world, override=None) -> list[str]:
             blocks |= {override} if override else _materials_of_faces(ob)
 
     def shapes(block) -> bool:
-        return any(user in objects or user.id_type in _SHAPING and shapes(user) for user in user_map[block])
+        between = "TEXTURE", "NODETREE", "PARTICLE"
+        return any(user in objects or user.id_type in between and shapes(user) for user in user_map[block])
 
     shown = {image for block in blocks - {None} for image in images_behind(block)}
     return [
@@ -178,14 +179,10 @@ def missing_images(depsgraph, world, override=None) -> list[str]:
 def _materials_of_faces(ob) -> set:
     """The original materials, or None, of the faces of the evaluated object `ob`; all where it has hair."""
     materials = [slot.material and slot.material.original for slot in ob.material_slots]
-    if not isinstance(ob.data, bpy.types.Mesh) or ob.particle_systems or len(materials) < 2:
-        return set(materials)
-    index = read_values(ob.data.polygons, "material_index", (len(ob.data.polygons),), np.int32)
-    return {materials[number] for number in np.unique(np.clip(index, 0, len(materials) - 1))}
-
-
-# Data by which images change the shape of objects, or where others stand on them.
-_SHAPING = "TEXTURE", "NODETREE", "PARTICLE"
+    if isinstance(ob.data, bpy.types.Mesh) and not ob.particle_systems and len(materials) > 1:
+        index = read_values(ob.data.polygons, "material_index", (len(ob.data.polygons),), np.int32)
+        return {materials[number] for number in np.unique(np.clip(index, 0, len(materials) - 1))}
+    return set(materials)
 
 
 def _is_lost(image) -> bool:
@@ -194,14 +191,12 @@ def _is_lost(image) -> bool:
         return False
     path = Path(bpy.path.abspath(image.filepath, library=image.library))
     if image.source == "SEQUENCE":
-        return next(path.parent.glob(f"*{path.suffix}"), None) is None
-    names = [path.name]
-    if image.source == "TILED":
-        names = [path.name.replace("<UDIM>", str(tile.number)) for tile in image.tiles if "<UDIM>" in path.name]
-    return not all((path.parent / name).is_file() for name in names)
+        return not any(path.parent.glob(f"*{path.suffix}"))
+    numbers = [tile.number for tile in image.tiles] if image.source == "TILED" else [1001]
+    return not all(path.with_name(path.name.replace("<UDIM>", str(number))).is_file() for number in numbers)
 
 
-def missing_libraries() -> list[str]:
+def lost_libraries() -> list[str]:
     """A warning for each library that is missing."""
     return [
         f"library {library.name!r}: {library.filepath} is missing, and what it held with it"
@@ -236,7 +231,7 @@ def open_scene(path: Path, warnings: list[str], scripts: bool = False) -> None:
         raise SceneError(newer(path, saved, here))
     if bpy.app.autoexec_fail:
         warnings.append(f"scripts in {path.name} do not run: {bpy.app.autoexec_fail_message}")
-    warnings.extend(missing_libraries())
+    warnings.extend(lost_libraries())
 
 
 def _reason(error: RuntimeError, path: Path) -> str:
@@ -299,6 +294,7 @@ def add_world(inventory: LightInventory, scene, world) -> None:
     """Complete `inventory` with the emission of its lights and the light of `world`, the former world of `scene`."""
     of_world = world_lights(scene, world, inventory.warn)
     inventory.lights = rendered_lights(scene, inventory) + of_world
+    note_overlaps(inventory)
     inventory.world = world if of_world else None
     if inventory.occluders is not None:
         inventory.occluders = blocks_nothing(inventory.occluders, inventory.world)

@@ -132,7 +132,8 @@ def _object_problem(ob, uv_map: str) -> Problem | None:
     try:
         check_object(ob)
     except ObjectError as error:
-        return Problem(_sentence(str(error)))
+        text = str(error)
+        return Problem(text[:1].upper() + text[1:])
     if not ob.data.polygons and not ob.modifiers:
         return Problem(f"Object {ob.name!r} has no faces")
     if uv_map and uv_map not in ob.data.uv_layers and ob.data.uv_layers:
@@ -142,10 +143,6 @@ def _object_problem(ob, uv_map: str) -> Problem | None:
         text = f"Object {ob.name!r} has no UV map"
         return Problem(text, True, "ltsh.add_uv_map", "Unwrap", {"object_name": ob.name})
     return None
-
-
-def _sentence(text: str) -> str:
-    return text[:1].upper() + text[1:]
 
 
 def _camera(scene) -> list[Problem]:
@@ -173,13 +170,9 @@ def _lights(scene) -> list[Problem]:
 
 def materials_of(scene) -> list:
     """Materials of the objects of `scene` that render, each once, sorted by name."""
-    by_name = {}
-    for ob in scene.objects:
-        if not ob.hide_render and ob.type not in ("LIGHT", "CAMERA"):
-            for slot in ob.material_slots:
-                if slot.material is not None:
-                    by_name[slot.material.name_full] = slot.material
-    return [by_name[name] for name in sorted(by_name)]
+    objects = (ob for ob in scene.objects if not ob.hide_render and ob.type not in ("LIGHT", "CAMERA"))
+    materials = {slot.material for ob in objects for slot in ob.material_slots} - {None}
+    return sorted(materials, key=lambda material: material.name_full)
 
 
 def glows(material) -> bool:

@@ -65,7 +65,7 @@ class LiveNodeLights:
         names = {"AREA": ("shape", "size", "size_y"), "SUN": ("angle",)}.get(data.type, ("use_soft_falloff",))
         if data.type in ("POINT", "SPOT") and (source.is_mixed or not source.by_ray):
             names = (*names, "shadow_soft_size")
-        if source.by_spot:
+        if source.by_spot or source.by_ray and data.type == "SPOT":
             names = (*names, "spot_size")
         where = (source.matrix.tobytes(), source.facts) if source.is_placed else ()
         images = self._images if "image: " in text else 0
@@ -119,8 +119,8 @@ class LiveNodeLights:
         keys = list(job.states)
         lights = [present[key[0]] for key in keys]
 
-        def take(number: int, factor: np.ndarray, lost: float) -> bool:
-            job.results.append((keys[number], NodeEmission(factor, lost)))
+        def take(number: int, factor: np.ndarray, traits: list[float]) -> bool:
+            job.results.append((keys[number], NodeEmission(factor, *traits)))
             return not job.is_stopped
 
         def work(folder: Path, paths: list[Path]) -> None:
@@ -270,6 +270,6 @@ def render_node_lights(job: NodeLightJob, folder: Path, progress: Callable) -> d
         with open_studio(scene) as studio:
             pattern = node_emission(source, studio)
         save_array(folder / f"{number}.npy", pattern.factor.astype(np.float32))
-        save_array(folder / f"{number}_lost.npy", np.array(pattern.lost))
+        save_array(folder / f"{number}_traits.npy", np.array([pattern.lost, pattern.start, pattern.blurred]))
         progress(NODE_LIGHTS, (number + 1) / len(files))
     return {}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 
@@ -13,12 +13,21 @@ import numpy as np
 from mathutils import Matrix
 
 from ...scene import Light, listed
-from .. import evaluated
-from ..lights import textures as textures_module
+from ..evaluated import (
+    SURFACE_TYPES,
+    EmitterTraits,
+    data_pointer,
+    is_seen_by_cameras,
+    is_surface,
+    mesh_key,
+    owner_of,
+    visibility,
+)
 from ..lights.area import area_light, node_light, note_unsupported, reason_to_leave_out
 from ..lights.emission import emission_of, factors_of, open_studio
 from ..lights.linking import Receivers
 from ..lights.meshes import collect_mesh_lights, constant_mesh_lights
+from ..lights.textures import MOST_INSTANCES, NodeEmission, NodeLight, ShownTextures, node_emission, with_pattern
 from ..lights.world import light_of_world
 from ..materials.graph import source_of, surface_of, tree_in_use
 from ..materials.preview_material import PreviewMaterial, preview_of, world_radiance
@@ -30,21 +39,24 @@ from .meshes import MeshBatches, look_values, mesh_batches
 # FAR_AWAY: the eye where there is no camera, outside of all closed emissive meshes.
 FAR_AWAY = np.full(3, 1e6)
 # MOST_LIGHTS: patches and faces included. The time of a frame grows with their number.
-MOST_LIGHTS = 2048
+# One layer of the texture of visibility is that of the sky's sides; cards take 2048 layers.
+MOST_LIGHTS = 2047
+# MOST_VALUES: of all patterns. They fill a quarter of the largest texture of lights.
+MOST_VALUES = 1 << 24
 # Reasons why a light has no pattern.
 NOT_RESOLVED = "its nodes are not resolved, it shines as without them"
 NOT_YET = "it shines as without its nodes until Cycles has sources at them"
 # Patterns: a function that returns how Cycles sees the nodes of evaluated light data, or why that is not known.
-Patterns = Callable[[bpy.types.Light, textures_module.NodeLight], textures_module.NodeEmission | str]
+Patterns = Callable[[bpy.types.Light, NodeLight], NodeEmission | str]
 
 
-def no_patterns(data, source: textures_module.NodeLight) -> str:
+def no_patterns(data, source: NodeLight) -> str:
     """The `Patterns` of views that resolve no nodes."""
     return NOT_RESOLVED
 
 
 def view_lights(
-    depsgraph, in_view: Callable, textures: textures_module.ShownTextures, patterns: Patterns = no_patterns
+    depsgraph, in_view: Callable, textures: ShownTextures, patterns: Patterns = no_patterns
 ) -> tuple[tuple[Light, ...], tuple[str, ...]]:
     """The lights among the instances that `in_view` accepts, and notes about what differs from Cycles.
 
@@ -57,7 +69,7 @@ def view_lights(
         ob = instance.object
         if not instance.show_self or not in_view(instance):
             continue
-        emits = emits or (ob.type in evaluated.SURFACE_TYPES and _has_emission(ob))
+        emits |= ob.type in SURFACE_TYPES and any(np.any(_emission(slot.material)) for slot in ob.material_slots)
         if ob.type != "LIGHT":
             continue
         matrix = np.array(instance.matrix_world, dtype=np.float64)
@@ -65,7 +77,7 @@ def view_lights(
         if problem:
             notes.append(f"{ob.original.name}: {problem}")
             continue
-        plain = area_light(ob, matrix, evaluated.EmitterTraits.of(instance), receivers)
+        plain = area_light(ob, matrix, EmitterTraits.of(instance), receivers)
         shown = [
             light
             for light in _with_nodes(plain, instance, (textures, patterns), notes)
@@ -76,10 +88,16 @@ def view_lights(
             note_unsupported(ob, matrix, SimpleNamespace(warn=notes.append))
     if emits:
         lights.extend(_mesh_lights(depsgraph, receivers, notes))
-    return tuple(strongest(lights, notes)), tuple(dict.fromkeys(notes))
+    shown, values = list(strongest(lights, notes)), 0
+    for number, light in enumerate(shown):
+        values += 0 if light.pattern is None else light.pattern.values.size
+        if values > MOST_VALUES and light.pattern is not None:
+            notes.append(f"{light.name}: it shines without its pattern, those of the lights before it fill the texture")
+            shown[number] = replace(light, pattern=None)
+    return tuple(shown), tuple(dict.fromkeys(notes))
 
 
-def strongest(lights: list[Light], notes: list[str], most: int = MOST_LIGHTS) -> list[Light]:
+def strongest(lights: Sequence[Light], notes: list[str], most: int = MOST_LIGHTS) -> Sequence[Light]:
     """The `most` lights with the largest power, in their order; what is missing is told in `notes`."""
     if len(lights) <= most:
         return lights
@@ -91,10 +109,6 @@ def strongest(lights: list[Light], notes: list[str], most: int = MOST_LIGHTS) ->
         "power is missing"
     )
     return [lights[index] for index in chosen]
-
-
-def _has_emission(ob) -> bool:
-    return any(slot.material is not None and np.any(_emission(slot.material)) for slot in ob.material_slots)
 
 
 def _emission(material) -> np.ndarray:
@@ -109,31 +123,29 @@ def _mesh_lights(depsgraph, receivers: Receivers, notes: list[str]) -> list[Ligh
     return constant_mesh_lights(mesh_lights, _emission, eye, notes.append)
 
 
-def patterns_of(scene, depsgraph) -> dict[tuple, textures_module.NodeEmission]:
+def patterns_of(scene, depsgraph) -> dict[tuple, NodeEmission]:
     """How Cycles sees the nodes of lights that views cannot read themselves, by the `key` of the `NodeLight`.
 
     `scene` is left as it was.
     """
-    wanted: dict[tuple, textures_module.NodeLight] = {}
+    wanted: dict[tuple, NodeLight] = {}
 
-    def note(data, source: textures_module.NodeLight) -> str:
-        if len(wanted) < textures_module.MOST_INSTANCES:
+    def note(data, source: NodeLight) -> str:
+        if len(wanted) < MOST_INSTANCES:
             wanted[source.key] = source
         return NOT_YET
 
-    receivers, sources = Receivers([]), (textures_module.ShownTextures(), note)
+    receivers, sources = Receivers([]), (ShownTextures(), note)
     for instance in depsgraph.object_instances:
         ob = instance.object
         if ob.type == "LIGHT" and tree_in_use(ob.data) is not None:
             matrix = np.array(instance.matrix_world, dtype=np.float64)
             if not reason_to_leave_out(ob, matrix):
-                _with_nodes(
-                    area_light(ob, matrix, evaluated.EmitterTraits.of(instance), receivers), instance, sources, []
-                )
+                _with_nodes(area_light(ob, matrix, EmitterTraits.of(instance), receivers), instance, sources, [])
     if not wanted:
         return {}
     with open_studio(scene) as studio:
-        return {key: textures_module.node_emission(source, studio) for key, source in wanted.items()}
+        return {key: node_emission(source, studio) for key, source in wanted.items()}
 
 
 def _with_nodes(light: Light, instance, sources: tuple, notes: list[str]) -> list[Light]:
@@ -172,7 +184,7 @@ def _with_nodes(light: Light, instance, sources: tuple, notes: list[str]) -> lis
     if not light.is_distant:
         light = replace(light, falloff=unseen.falloff.power, smooth=unseen.falloff.smooth)
     if light.is_facing or light.is_distant:
-        return textures_module.with_pattern(light, pattern, unseen, notes.append)
+        return with_pattern(light, pattern, unseen, notes.append)
     return textures.split_by_nodes(light, pattern, notes)
 
 
@@ -277,7 +289,7 @@ def object_notes(depsgraph) -> list[str]:
     names_by_kind: dict[str, list[str]] = {}
     for ob in depsgraph.objects:
         kind = NOT_SHOWN.get(ob.type)
-        if kind is None and ob.type in evaluated.SURFACE_TYPES and ob.is_shadow_catcher:
+        if kind is None and ob.type in SURFACE_TYPES and ob.is_shadow_catcher:
             kind = "shown as any surface, not as shadow catcher"
         if kind is None and any(system.settings.type == "HAIR" for system in ob.particle_systems):
             kind = NOT_SHOWN["CURVES"]
@@ -319,15 +331,16 @@ class SceneMirror:
         self._looks: dict[str, ShownLook] = {}
         self._object_notes: tuple[str, ...] = ()
         self._light_notes: tuple[str, ...] = ()
-        self._light_textures = textures_module.ShownTextures()
+        self._light_textures = ShownTextures()
         self.has_old_lights = False  # True: there are new results about lights, which are to be read again
         self._world_note: tuple[str, ...] = ()
+        self._limit_notes: list[str] = []
         self._synced = False
 
     @property
     def notes(self) -> list[str]:
         """Notes about what differs from Cycles, each once."""
-        notes = self.material_notes, self._object_notes, self._light_notes, self._world_note
+        notes = self.material_notes, self._object_notes, self._light_notes, self._world_note, self._limit_notes
         return list(dict.fromkeys(note for kind in notes for note in kind))
 
     @property
@@ -353,7 +366,7 @@ class SceneMirror:
         """Take over all changes; `space` is the 3D view, for its local view."""
         changes = changes_of(depsgraph, not self._synced)
         self._drop_changed(changes)
-        in_view = evaluated.visibility(depsgraph, space)
+        in_view = visibility(depsgraph, space)
         if changes.surfaces:
             self._read_instances(depsgraph, changes, in_view)
             self.surfaces_version += 1
@@ -368,7 +381,7 @@ class SceneMirror:
         self.lights_without_world, self._light_notes = view_lights(
             depsgraph, in_view, self._light_textures, self._patterns
         )
-        self.lights = (*self.lights_without_world, *self.sky.lights)
+        self.take_sky(self.sky, *self._world_note)
         self.has_old_lights = False
 
     def _drop_changed(self, changes: Changes) -> None:
@@ -384,18 +397,18 @@ class SceneMirror:
 
     def _read_instances(self, depsgraph, changes: Changes, in_view) -> None:
         override = depsgraph.view_layer_eval.material_override
-        receivers = Receivers([ob for ob in _originals(depsgraph) if ob.type == "LIGHT"])
+        receivers = Receivers([ob.original for ob in depsgraph.objects if ob.type == "LIGHT"])
         instances, meshes, looks = [], {}, {}
         users = Counter()  # instances by evaluated data, those out of view included
         for instance in depsgraph.object_instances:
             ob = instance.object
-            if not evaluated.is_surface(instance):
+            if not is_surface(instance):
                 continue
-            data = evaluated.data_pointer(ob)
+            data = data_pointer(ob)
             users[data] += 1
-            if not evaluated.is_seen_by_cameras(instance, depsgraph.view_layer) or not in_view(instance):
+            if not is_seen_by_cameras(instance, depsgraph.view_layer) or not in_view(instance):
                 continue
-            key = evaluated.mesh_key(instance)
+            key = mesh_key(instance)
             if key not in meshes:
                 known = key in self._meshes and not changes.geometry.intersection(key[:3])
                 meshes[key] = self._meshes[key] if known else mesh_batches(ob)
@@ -438,8 +451,9 @@ class SceneMirror:
 
     def take_sky(self, sky: ShownSky, *notes: str) -> None:
         """Show this world from now on; `notes` tell how it differs from Cycles."""
-        self.sky, self._world_note = sky, notes
-        self.lights = (*self.lights_without_world, *sky.lights)
+        self.sky, self._world_note, self._limit_notes = sky, notes, []
+        most = MOST_LIGHTS - len(sky.lights)
+        self.lights = (*strongest(self.lights_without_world, self._limit_notes, most), *sky.lights)
 
 
 def _shown_look(material) -> ShownLook:
@@ -459,13 +473,9 @@ def _name(material) -> str:
 
 
 def _receiver(instance, receivers: Receivers, view_layer) -> int:
-    owner = evaluated.owner_of(instance).original
+    owner = owner_of(instance).original
     if owner.holdout_get(view_layer=view_layer):
         return HOLDOUT
     numbers = receivers.numbers
     of_object = numbers.get(instance.object.original.name_full, 0)
     return numbers.get(owner.name_full, of_object) if instance.is_instance else of_object
-
-
-def _originals(depsgraph) -> list:
-    return [ob.original for ob in depsgraph.objects]

@@ -13,7 +13,7 @@ from ..files import no_empty_folder, temporary_folder
 from ..imaging import grouped, write_json, write_overview
 from ..reading import NUMBER, Malformed, read_json
 from ..scene import Progress, SceneError, error_line
-from . import bake, picture, render
+from . import bake, bake_files, picture, render
 from . import tasks as batch_tasks
 from .lighting import prepare
 
@@ -131,7 +131,7 @@ def _write_job(job, tasks, existing) -> None:
         "command": job.command,
         "single": job.single,
         "any_key": existing == SKIP,
-        "applied_layer": bake.applied_layer(job.options) if applied else None,
+        "applied_layer": bake_files.applied_layer(job.options) if applied else None,
         "tasks": [asdict(task) for task in tasks],
     }
     batch_tasks.write_record(Path(job.options.output) / batch_tasks.FOLDER / "job.json", document)
@@ -229,7 +229,7 @@ def _unit(job, output, tasks, finished, progress) -> tuple[str, dict] | None:
         "warnings": grouped(line for one in reports for line in one["warnings"]),
     }
     if job["applied_layer"] and report["objects"]:
-        report["applied"] = bake.apply_textures(
+        report["applied"] = bake_files.apply_textures(
             Path(tasks[0].scene), output, report["objects"], job["applied_layer"], progress
         )
     name = " ".join(str(word) for word in (Path(tasks[0].scene).stem, *tasks[0].unit[1:]) if word is not None)

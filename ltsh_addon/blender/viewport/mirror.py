@@ -41,10 +41,8 @@ FAR_AWAY = np.full(3, 1e6)
 # MOST_LIGHTS: patches and faces included. The time of a frame grows with their number.
 # One layer of the texture of visibility is that of the sky's sides; cards take 2048 layers.
 MOST_LIGHTS = 2047
-# MOST_VALUES: of all patterns. They fill a quarter of the largest texture of lights.
-MOST_VALUES = 1 << 24
-# MOST_TRIANGLES: of objects that light by an image. More are mostly baked ones, whose light is in the images already.
-MOST_TRIANGLES = 64
+MOST_VALUES = 1 << 24  # of all patterns: they fill a quarter of the largest texture of lights
+MOST_TRIANGLES = 64  # of objects that light by an image; more are mostly baked, with their light in the image
 # Reasons why a light has no pattern.
 NOT_RESOLVED = "its nodes are not resolved, it shines as without them"
 NOT_YET = "it shines as without its nodes until Cycles has sources at them"
@@ -82,11 +80,8 @@ def view_lights(
             notes.append(f"{ob.original.name}: {problem}")
             continue
         plain = area_light(ob, matrix, EmitterTraits.of(instance), receivers)
-        shown = [
-            light
-            for light in _with_nodes(plain, instance, (textures, patterns), notes)
-            if np.any(light.radiance != 0.0)
-        ]
+        shown = _with_nodes(plain, instance, (textures, patterns), notes)
+        shown = [light for light in shown if np.any(light.radiance != 0.0)]
         if shown:
             lights.extend(shown)
             note_unsupported(ob, matrix, SimpleNamespace(warn=notes.append))

@@ -216,8 +216,8 @@ def note_overlaps(inventory: LightInventory) -> None:
     mean, most = max(_lost_diffuse_shares(pair[:2], inventory) for pair in pairs[:NAMED_PAIRS])
     inventory.warn(
         f"lights {listed(names, NAMED_PAIRS)}: each pair overlaps in one plane, by that share of the smaller light; "
-        f"there Cycles loses about {100.0 * mean:.2g} % of their diffuse light on all surfaces together, at "
-        f"points {100.0 * most:.2g} %, and up to {100.0 * lost:.0f} % of their light in sharp reflections, the "
+        f"there Cycles loses about {100.0 * mean:.3g} % of their diffuse light on all surfaces together, at "
+        f"points {100.0 * most:.3g} %, and up to {100.0 * lost:.0f} % of their light in sharp reflections, the "
         "techniques lose nothing; move one of each pair forward by 0.1 mm"
     )
 

@@ -232,8 +232,7 @@ def _lost_diffuse_shares(pair: tuple[Light, Light], inventory: LightInventory) -
     # Cycles hardly ever chooses a world among lights that are so near.
     lights = tuple(light for light in inventory.lights if not light.is_distant)
     number = max(number for number, light in enumerate(lights) if light is pair[0] or light is pair[1])
-    second = lights[number]
-    first = pair[0] if pair[1] is second else pair[1]
+    first, second = pair if pair[1] is lights[number] else pair[::-1]
     position, normal = inventory.lit_points
     normal = normal * np.sign(((second.center - position) * normal).sum(axis=1, keepdims=True))  # lit on both sides
     pmf = light_selection_pmf(position, normal, lights)

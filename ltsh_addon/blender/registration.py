@@ -11,11 +11,13 @@ import bpy
 
 from ..cli.progress import reserve_stdout
 
-# PARTS: modules of this package with register() and unregister(); each needs only those before it.
+# Modules of this package: their CLASSES, HANDLERS (pairs of a name and a function), register() and unregister(), as far
+# as they have them. Each needs only those before it.
 PARTS = (
     "ui.settings",
     "engine.settings",
     "engine.render",
+    "engine.overlay",
     "ui.preview",
     "ui.operators",
     "ui.preflight",
@@ -40,11 +42,24 @@ def register(command_line: Callable[..., int]) -> None:
         added.callback(bpy.utils.unregister_cli_command, bpy.utils.register_cli_command("ltsh", run))
         for name in PARTS:
             part = importlib.import_module(f".{name}", __package__)
-            part.register()
-            added.callback(part.unregister)
+            for kind in getattr(part, "CLASSES", ()):
+                bpy.utils.register_class(kind)
+                added.callback(bpy.utils.unregister_class, kind)
+            for event, function in getattr(part, "HANDLERS", ()):
+                getattr(bpy.app.handlers, event).append(function)
+                added.callback(_remove_handler, event, function)
+            if hasattr(part, "register"):
+                part.register()
+                added.callback(part.unregister)
         _registered.push(added.pop_all())
     # Blender 4.5 hangs at exit if an engine is still registered.
     atexit.register(unregister)
+
+
+def _remove_handler(event: str, function: Callable) -> None:
+    handlers = getattr(bpy.app.handlers, event)
+    if function in handlers:
+        handlers.remove(function)
 
 
 def unregister() -> None:

@@ -13,7 +13,7 @@ from ..scene import SceneError, error_line
 # The last bytes of a compressed .blend (Zstandard seekable format 0.1.1, facebook/zstd, contrib/seekable_format).
 SEEK_TABLE_END = bytes.fromhex("b1ea928f")
 
-_state = {"keeps engine": False}
+_state = {"keeps engine": False, "is working copy": False}
 
 
 def save_working_copy(path: Path, *, keep_engine: bool = False) -> None:
@@ -22,11 +22,16 @@ def save_working_copy(path: Path, *, keep_engine: bool = False) -> None:
     Even during a preview a file is saved with the artist's engine; `keep_engine` saves the engine in use.
     """
     with _without_thumbnail():
-        _state["keeps engine"] = keep_engine
+        _state.update({"keeps engine": keep_engine, "is working copy": True})
         try:
             bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True, compress=False, check_existing=False)
         finally:
-            _state["keeps engine"] = False
+            _state.update({"keeps engine": False, "is working copy": False})
+
+
+def is_working_copy() -> bool:
+    """True while a copy is being saved that no artist opens."""
+    return _state["is working copy"]
 
 
 def keeps_engine() -> bool:

@@ -217,8 +217,8 @@ def add_relight(parser) -> None:
     parser.add_argument(
         "-o", dest="output", type=Path, metavar="OUT2", help="folder for the results; default: OUT/relit"
     )
-    parser.add_argument("--light", dest="changes", action="append", type=_light, default=[], metavar="NAME",
-                        help="the light to change; may be given several times")  # fmt: skip
+    parser.add_argument("--light", dest="changes", action="append", type=lambda name: {"name": name}, default=[],
+                        metavar="NAME", help="the light to change; may be given several times")  # fmt: skip
     parser.add_argument("--power", action=_OfLight, type=from_text(_factor), metavar="xF", help="such as x2 or x.5")
     parser.add_argument("--exposure", action=_OfLight, type=from_text(_steps), metavar="E", help="such as +1 or -.5")
     parser.add_argument("--color", action=_OfLight, type=from_text(_color), metavar="R,G,B", help="such as 1,.8,.6")
@@ -227,10 +227,6 @@ def add_relight(parser) -> None:
                             help=f"{what}; may be given several times")  # fmt: skip
     add_talk(parser)
     parser.set_defaults(run=_relight)
-
-
-def _light(name: str) -> dict:
-    return {"name": name}
 
 
 class _OfLight(argparse.Action):

@@ -68,11 +68,8 @@ class ProgressBar:
         self._task, self._tasks = 0, 1
         self._quiet = quiet or stream is None  # print would take None for stdout
         self._terminal = bool(getattr(stream, "isatty", lambda: False)())
-        self._stage = None
-        self._stage_start = 0.0
-        self._fraction = 0.0
-        self._last_shown = 0.0
-        self._line_open = False
+        self._stage, self._line_open = None, False
+        self._stage_start = self._fraction = self._last_shown = 0.0
 
     def __call__(self, stage: str, fraction: float) -> bool:
         """Show the progress of `stage`, a fraction in [0, 1]. Always returns True, since a bar never stops the work."""
@@ -100,11 +97,8 @@ class ProgressBar:
 
     def begin_job(self, label: str) -> None:
         """Begin another job: print a line, unless quiet, and log it."""
-        self.finish()
         self._tasks, self._stage = 1, None
-        self.log.line(label)
-        if not self._quiet:
-            self._say(label)
+        self.remark(label)
 
     def begin_task(self, number: int, tasks: int) -> None:
         """Begin task `number` of `tasks`, counted from 1."""

@@ -159,13 +159,20 @@ def spot_light(like: Light, picture: SkyPicture, spot: Spot) -> list[Light]:
 
 
 def sky_lights(like: Light, pictures: list[SkyPicture], most: int = MOST_PATCHES) -> tuple[list[Light], float]:
-    """A distant light with `children` for each picture that is not dark, with the name and traits of `like`; and the
-    mean absolute difference between the smallest patches and the pictures, relative to the mean radiance."""
+    """A distant light for each picture that is not dark, with the name and traits of `like`; and the mean absolute
+    difference between the smallest patches and the pictures, relative to the mean radiance.
+
+    All lights have `children`, or none if all pictures are constant: a map of the sky should not end at one of them.
+    """
     trees = [_SkyQuadtree.of(picture) for picture in pictures]
     total = sum((mean_magnitude(picture.radiance) * picture.solid_angles()).sum() for picture in pictures)
     limit, error = _limit(trees, ERROR * total, most)
-    lights = [_light(like, picture, tree, limit, (0, 0, 0)) for picture, tree in zip(pictures, trees, strict=True)]
-    bright = [light for light in lights if light.children or np.any(light.radiance != 0.0)]
+    if any(tree.errors[0] > limit for tree in trees):
+        trees = [replace(tree, errors=[np.full((1, 1), np.inf), *tree.errors[1:]]) for tree in trees]
+    bright = [
+        _light(like, picture, tree, limit, (0, 0, 0))
+        for picture, tree in zip(pictures, trees, strict=True) if np.any(picture.radiance)
+    ]  # fmt: skip
     return bright, error / total if total > 0.0 else 0.0
 
 

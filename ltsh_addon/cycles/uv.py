@@ -387,13 +387,17 @@ def tiles_of(uv: np.ndarray) -> tuple[list[int], float]:
     """UDIM tiles (1001 is the unit square, ten to a row) in which triangles uv (T, 3, 2) lie, and an area: 0 if all
     triangles lie within tiles, otherwise the area of all triangles, in tiles.
 
-    If a triangle reaches over a border, the texture repeats or is wrong. Then only the unit square counts.
+    If a triangle reaches over a border, the texture repeats or is wrong. Then only the unit square counts. A triangle
+    on a border has no tile, unless all are: unwraps put slivers a float step beyond.
     """
     uv = np.asarray(uv, dtype=np.float64)
     area = np.abs(cross(uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]))
     solid = np.isfinite(area) & (area > 0.0)
     uv, area = uv[solid], area[solid]
-    column, row = np.moveaxis(np.floor(uv.mean(axis=1)).astype(np.int64), -1, 0)
+    tile = np.floor(uv.mean(axis=1))
+    inside = ((uv.max(axis=1) > tile + TILE_TOLERANCE) & (uv.min(axis=1) < tile + 1.0 - TILE_TOLERANCE)).all(axis=1)
+    uv, tile = (uv[inside], tile[inside]) if inside.any() else (uv, tile)
+    column, row = tile.astype(np.int64).T
     origin = np.stack([column, row], axis=-1)[:, None]
     within = np.all((uv >= origin - TILE_TOLERANCE) & (uv <= origin + 1.0 + TILE_TOLERANCE), axis=(1, 2))
     numbered = (column >= 0) & (column < 10) & (row >= 0)

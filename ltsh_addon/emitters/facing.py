@@ -7,7 +7,7 @@ the half space over the lobe's normal stands for it. Cones and patterns make som
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -88,13 +88,9 @@ class FacingDisk:
         half_v = disk_radius * np.stack([b, sign + y * y * a, -y])
         return cls(offset, half_u, half_v, length, disk_radius, gain)
 
-    def _sizes(self):
-        return self.length, self.radius, self.gain
-
     def take(self, index) -> FacingDisk:
         """The disks of the points `index`."""
-        vectors = (self.offset[:, index], self.half_u[:, index], self.half_v[:, index])
-        return FacingDisk(*vectors, *(values[index] for values in self._sizes()))
+        return FacingDisk(*(values[..., index] for values in vars(self).values()))
 
     def along(self, cone) -> FacingDisk:
         """The same disks turned so that the factor of `cone` changes most along u; unchanged without a cone."""
@@ -106,8 +102,7 @@ class FacingDisk:
         s, t = dot(rise, self.half_u), dot(rise, self.half_v)
         size = np.sqrt(s * s + t * t)
         s, t = (np.where(size > 0.0, value / np.where(size > 0.0, size, 1.0), 1.0) for value in (s, t))
-        half_u = s * self.half_u + t * self.half_v
-        return FacingDisk(self.offset, half_u, s * self.half_v - t * self.half_u, *self._sizes())
+        return replace(self, half_u=s * self.half_u + t * self.half_v, half_v=s * self.half_v - t * self.half_u)
 
     def corners(self, outline: np.ndarray) -> np.ndarray:
         """Offsets (3, V, Q) from the points to places (2, V) of the disks, in units of the half axes."""
@@ -197,7 +192,7 @@ def pattern_values(pattern, normals: np.ndarray) -> np.ndarray:
     """Values (...) of a pattern for normals (3, ...), by linear interpolation."""
     x, y, z = (dot(row, normals) for row in pattern.axes.astype(normals.dtype))
     rows, columns = pattern.values.shape
-    row = np.arctan2(np.sqrt(x * x + y * y), z) * (rows / np.pi) - 0.5
+    row = (np.arctan2(np.sqrt(x * x + y * y), z) - pattern.start) * (rows / (np.pi - pattern.start)) - 0.5
     column = np.arctan2(y, x) * (0.5 * columns / np.pi) - 0.5
     first_row, first_column = np.floor(row), np.floor(column)
     down, right = row - first_row, column - first_column
@@ -267,9 +262,7 @@ class AnalyticLobe:
 
     def take(self, index) -> AnalyticLobe:
         """The lobes of the samples `index`."""
-        if self.view is None:
-            return AnalyticLobe(self.normal[:, index])
-        return AnalyticLobe(self.normal[:, index], self.view[:, index], self.alpha[index])
+        return AnalyticLobe(*(None if values is None else values[..., index] for values in vars(self).values()))
 
     def values(self, directions: np.ndarray) -> np.ndarray:
         """BRDF times cosine (S, Q) of white lobes, for unit directions (3, S, Q)."""

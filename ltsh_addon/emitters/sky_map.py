@@ -21,13 +21,13 @@ from .light_profile import gauss_legendre
 # Greatest and least number of texels along each side of a side of a map.
 MOST_TEXELS, FEWEST_TEXELS = 256, 2
 # DIRECTIONS: how many a lobe takes of a map. DENSE: how much denser they are at its peak; their heights are equal steps
-# to this power. Measured with a window as bright as all the rest: 1.2 % (relative L2) off the smallest patches where
-# the cosine of the view is at least 0.2; 0.5 % without windows.
-DIRECTIONS, DENSE = 224, 0.85
+# to this power. Off as many as one likes (relative L2): 0.1 % under a gradient, 0.4 % with a window six times as bright
+# as all the rest, 1.5 % with one thirty times as bright.
+DIRECTIONS, DENSE = 160, 0.85
 # Standard deviation of the mean around each direction, in units of the side of a square with its solid angle.
-BLUR = 0.6
+BLUR = 0.45
 # Samples per chunk.
-MAP_CHUNK = 96
+MAP_CHUNK = 128
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class SkyMap:
     scale: np.ndarray  # (N,) half the texels along a side
     sharpest: float  # variance of the second level's blur, as an area on a cube of half side 1
     reflected: np.ndarray  # as in PatchTree
-    nodes: tuple[np.ndarray, np.ndarray]  # see `_nodes`; LAPACK need not give the same last bits in every process
+    nodes: tuple[np.ndarray, ...]  # see `_nodes`; LAPACK need not give the same last bits in every process
 
     @classmethod
     def of(cls, lights) -> SkyMap:
@@ -81,6 +81,22 @@ class SkyMap:
             sum(tree.reflected for tree in trees),
             _nodes(DIRECTIONS),
         )
+
+    def _directions(self, rows):
+        """For lobes with the axes `rows` (3, 3, Q): directions along them (3, N, Q), the same in the world up to a
+        factor, their weights (N, Q), and the solid angles around them as in `means`."""
+        nodes, angle, weight = self.nodes
+        first, second, third = rows
+        axes = cross(second, third), cross(third, first), cross(first, second)
+        determinant = dot(first, axes[0])
+        stretch = _stretch(axes)
+        directions = [nodes[0] * stretch, nodes[1] / stretch, nodes[2]]
+        inverse = np.float32(1.0) / np.sqrt(dot(directions, directions))
+        directions = [coordinate * inverse for coordinate in directions]
+        inverse *= inverse * inverse
+        # The inverse of the lobe's axes gives the world direction up to a factor.
+        toward = sum(coordinate * axis[:, None] for coordinate, axis in zip(directions, axes, strict=True))
+        return directions, toward, weight * inverse, (angle * inverse) * (determinant * determinant)
 
     def means(self, toward, area) -> np.ndarray:
         """Mean radiance (3, ...) around directions `toward` (3, ...). `area` (...) is the solid angle in sr over which
@@ -140,21 +156,10 @@ class SkyMap:
 
     def add(self, lobes, chosen: np.ndarray, total: np.ndarray) -> None:
         """Add what the columns `chosen` (Q',) of `lobes32.Lobes` reflect of the sky to `total` (F, 3, Q)."""
-        nodes, angle = self.nodes
         for start in range(0, len(chosen), MAP_CHUNK):
             columns = chosen[start : start + MAP_CHUNK]
-            first, second, third = (lobes.rows[row][:, columns] for row in range(3))
-            axes = cross(second, third), cross(third, first), cross(first, second)
-            determinant = dot(first, axes[0])
-            stretch = _stretch(axes)
-            directions = [nodes[0] * stretch, nodes[1] / stretch, nodes[2]]
-            inverse = np.float32(1.0) / np.sqrt(dot(directions, directions))
-            directions = [coordinate * inverse for coordinate in directions]
-            solid_angle = angle * (inverse * inverse * inverse)
-            # The world direction of each node: the inverse of the lobe's axes gives it up to a factor.
-            toward = sum(coordinate * axis[:, None] for coordinate, axis in zip(directions, axes, strict=True))
-            area = solid_angle * (determinant * determinant)
-            values = lobes.at_point.at_nodes(columns, directions, toward) * solid_angle
+            directions, toward, weight, area = self._directions(lobes.rows[:3, :, columns])
+            values = lobes.at_point.at_nodes(columns, directions, toward, weight)
             if len(lobes.clip_rows) > 1:
                 values = values * _share_above(lobes, columns, toward, area)
             radiance = self.means(toward, area)
@@ -183,9 +188,9 @@ def _share_above(lobes, columns, toward, area) -> np.ndarray:
     return share
 
 
-def _nodes(count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Unit vectors (3, N, 1) above z = 0, a spiral of golden angles, and the solid angles (N, 1) around them. Sums over
-    them are exact for polynomials of degree 4."""
+def _nodes(count: int) -> tuple[np.ndarray, ...]:
+    """Unit vectors (3, N, 1) above z = 0, a spiral of golden angles, the solid angles (N, 1) around them, and weights
+    (N, 1), close to these, with which sums are exact for polynomials of degree 4."""
     number = np.arange(count) + 0.5
     z = (1.0 - number / count) ** DENSE
     turn = np.pi * (np.sqrt(5.0) - 1.0) * number
@@ -202,7 +207,7 @@ def _nodes(count: int) -> tuple[np.ndarray, np.ndarray]:
                   for exponents in powers]) for vectors in (nodes, exact)
     )  # fmt: skip
     change = np.linalg.lstsq(moments * angle, wanted @ weight - moments @ angle, rcond=None)[0]
-    return nodes[:, :, None].astype(np.float32), (angle * (1.0 + change))[:, None].astype(np.float32)
+    return tuple(values[..., None].astype(np.float32) for values in (nodes, angle, angle * (1.0 + change)))
 
 
 def _cells(count: int, more: int = 0) -> np.ndarray:

@@ -58,7 +58,7 @@ def _plain(value):
 # What differs between warnings of one kind: names as `repr` quotes them, and numbers.
 _ONE = r"""(?:(?<!\w)(?:'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*")|\d[\d,]*(?:\.\d+)?(?:e[-+]?\d+)?(?: %)?)"""
 _VARYING, _MEMBER = re.compile(_ONE), re.compile(f"{_ONE}(?: {_ONE})*")
-_MORE = re.compile(r"(.*) \((\d+) more: (.*)\)", re.DOTALL)
+_MORE = re.compile(r"(.*) \((\d+) more: (.*)\)\Z", re.DOTALL)
 # A warning with a phrase of NOTES is about a setting, or the same in Cycles, and comes last; one with a phrase of
 # ABSENT is about something that is not in the picture, and comes first.
 _NOTES = ("switched off", "as in Cycles", "nor does Cycles", "as rendered", "on the processor", "only view layer")
@@ -75,7 +75,7 @@ def grouped(lines: Iterable[str]) -> list[str]:
     """
     kinds: dict[str, tuple[str, dict[str, None]]] = {}
     for line in sorted(dict.fromkeys(lines), key=_harm):
-        head, _, members = _MORE.fullmatch(line).groups() if _MORE.fullmatch(line) else (line, 0, "")
+        head, _, members = _MORE.match(line).groups() if _MORE.match(line) else (line, 0, "")
         first, others = kinds.setdefault(_VARYING.sub("\0", head), (head, {}))
         known = _VARYING.findall(first)
         new = " ".join(one for one, its in zip(_VARYING.findall(head), known, strict=True) if one != its)
@@ -90,13 +90,14 @@ def _harm(line: str) -> tuple[int, float]:
 
 def on_screen(warnings: Iterable[str], rest: str = "report.json") -> list[str]:
     """The first `MOST_SHOWN` of `grouped` warnings with fewer names, and a line about those in the `rest`."""
+
+    def shorter(match) -> str:
+        return f"{match[1]} ({match[2]} more: {listed(_MEMBER.findall(match[3]), NAMED, '; ')})"
+
     lines = grouped(warnings)
-    shown = [
-        f"{match[1]} ({match[2]} more: {listed(_MEMBER.findall(match[3]), NAMED, '; ')})" if match else line
-        for line in lines[:MOST_SHOWN]
-        for match in [_MORE.fullmatch(line)]
-    ]
-    return shown + ([f"{len(lines) - MOST_SHOWN} more kinds of warnings are in {rest}"] if lines[MOST_SHOWN:] else [])
+    more = len(lines) - MOST_SHOWN
+    shown = [_MORE.sub(shorter, line) for line in lines[:MOST_SHOWN]]
+    return [*shown, f"{more} more kinds of warnings are in {rest}"] if more > 0 else shown
 
 
 def write_html(folder: str | os.PathLike, page: str, sheet: str, layers: str, report: Mapping) -> None:

@@ -6,7 +6,8 @@ import re
 import unicodedata
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cache, lru_cache
+from pathlib import Path
 
 import numpy as np
 
@@ -195,126 +196,7 @@ DESCENT = 4.4  # lowest stroke center: g, p, q
 DIGIT_WIDTH = 8.4  # of all digits, so that numbers form columns
 SPACE_WIDTH = 3.0
 
-_BOWL_RIGHT = "M0 5v3.8 10h7.6 5v3.8 0h0 5"
-_BOWL_LEFT = "M7.6 5v3.8 10h0 5v3.8 0h7.6 5"
-_S = "M8.6 11.5C8 13.1 6.4 14 4.6 14h.4 10.5C.4 8.3 2.4 7.8 4.6 7.2C7.2 6.5 9 5.9 9 3.7v4.5 0C2.4 0 .7 .9 0 2.7"
-_P = "M0 0L0 14L4.6 14h8.6 10.2v4.6 6.4L0 6.4"
-
-STROKES = {
-    "A": "M0 0L5 14L10 0M1.7 4.6L8.3 4.6",
-    "B": "M0 7.4L4.8 7.4h8.2 10.7v4.8 14L0 14L0 0L4.9 0h8.9 3.7v4.9 7.4",
-    "C": "M9.5 11.2C8.7 12.9 7.1 14 5.2 14h0 7v5.2 0C7.1 0 8.7 1.1 9.5 2.8",
-    "D": "M0 0L0 14L3.8 14h9.4 7v3.8 0L0 0",
-    "E": "M7.6 14L0 14L0 0L7.6 0M0 7.2L6.6 7.2",
-    "F": "M7.6 14L0 14L0 0M0 6.8L6.6 6.8",
-    "G": "M9.5 11.4C8.7 13 7.1 14 5.2 14h0 7v5.2 0C7.3 0 9 .9 9.8 2L9.8 6.6L5.8 6.6",
-    "H": "M0 0L0 14M9 0L9 14M0 7.2L9 7.2",
-    "I": "M0 0L0 14",
-    "J": "M5.8 14L5.8 4v2.9 0h0 3.2",
-    "K": "M0 0L0 14M8.6 14L0 5.2M3.3 8.6L9.2 0",
-    "L": "M0 14L0 0L7.2 0",
-    "M": "M0 0L0 14L5.6 4.2L11.2 14L11.2 0",
-    "N": "M0 0L0 14L9.2 0L9.2 14",
-    "O": "M5.3 14h0 7v5.3 0h10.6 7v5.3 14",
-    "P": _P,
-    "Q": "M5.3 14h0 7v5.3 0h10.6 7v5.3 14M6.8 3.2L10.4 -.8",
-    "R": _P + "M4.6 6.4L9.2 0",
-    "S": _S,
-    "T": "M0 14L9.2 14M4.6 14L4.6 0",
-    "U": "M0 14L0 4.8v4.6 0h9.2 4.8L9.2 14",
-    "V": "M0 14L4.9 0L9.8 14",
-    "W": "M0 14L3.5 0L7 12L10.5 0L14 14",
-    "X": "M0 0L9 14M0 14L9 0",
-    "Y": "M0 14L4.7 6.6L9.4 14M4.7 6.6L4.7 0",
-    "Z": "M.2 14L8.6 14L0 0L8.8 0",
-    "a": "M.6 7.9C1.1 9.2 2.3 10 3.8 10h7 6.8L7 0M7 5.8L3.2 5.8h0 2.9v3 0C4.9 0 6.4 1 7 2.7",
-    "b": "M0 14L0 0" + _BOWL_RIGHT,
-    "c": "M7.1 7.8C6.5 9.2 5.3 10 3.9 10h0 5v3.9 0C5.3 0 6.5 .8 7.1 2.2",
-    "d": "M7.6 14L7.6 0" + _BOWL_LEFT,
-    "e": "M0 5.2L7.6 5.2v3.9 10h0 5v4 0C5.4 0 6.5 .6 7.2 1.7",
-    "f": "M5.2 13.9C3 14.4 2 13.4 2 11.2L2 0M0 10L4.8 10",
-    "g": "M7.6 10L7.6 -.6v3.7 -4.4C2.2 -4.4 1.1 -3.9 .4 -3" + _BOWL_LEFT,
-    "h": "M0 14L0 0M0 5.6v3.8 10h7 6.4L7 0",
-    "i": "M0 10L0 0M0 13.8L0 13.6",
-    "j": "M2 10L2 -1.8C2 -3.7 1.2 -4.5 -.4 -4.3M2 13.8L2 13.6",
-    "k": "M0 14L0 0M6.6 10L0 3.6M2.5 6L7 0",
-    "l": "M0 14L0 2.4C0 .6 .7 -.1 2.2 0",
-    "m": "M0 10L0 0M0 5.8v3.3 10h5.9 6.6L5.9 0M5.9 5.8v9.2 10h11.8 6.6L11.8 0",
-    "n": "M0 10L0 0M0 5.6v3.8 10h7 6.4L7 0",
-    "o": "M4 10h0 5v4 0h8 5v4 10",
-    "p": "M0 10L0 -4.4" + _BOWL_RIGHT,
-    "q": "M7.6 10L7.6 -4.4" + _BOWL_LEFT,
-    "r": "M0 10L0 0M0 5.4C0 8.4 1.6 10.3 4.4 9.9",
-    "s": "M6.3 8.2C5.9 9.4 4.8 10 3.4 10h.3 7.5C.3 6 1.8 5.6 3.4 5.2C5.1 4.8 6.7 4.2 6.7 2.6v3.4 0C1.8 0 .5 .7 0 1.9",
-    "t": "M2 13L2 2.8C2 .7 3 -.2 4.9 .1M0 10L4.8 10",
-    "u": "M0 10L0 3.8v3.4 0h7 4.4M7 10L7 0",
-    "v": "M0 10L3.7 0L7.4 10",
-    "w": "M0 10L2.9 0L5.8 9L8.7 0L11.6 10",
-    "x": "M0 0L6.8 10M0 10L6.8 0",
-    "y": "M0 10L3.9 .2M7.6 10L3.2 -2.2C2.6 -3.8 1.6 -4.6 .2 -4.3",
-    "z": "M.2 10L6.4 10L0 0L6.6 0",
-    "0": "M4.2 14h0 7v4.2 0h8.4 7v4.2 14",
-    "1": "M1 11.2L4.8 14L4.8 0",
-    "2": "M.4 10.3C.4 12.6 2 14 4.2 14h8 10.3C8 7.7 5 5.6 .2 0L8.4 0",
-    "3": "M.6 11.7C1.2 13.2 2.6 14 4.1 14h7.8 10.7v4.2 7.4L3 7.4M4.2 7.4h8.3 3.7v4.1 0C2.2 0 .7 .9 .1 2.7",
-    "4": "M6.4 0L6.4 14L0 4L8.6 4",
-    "5": "M7.6 14L1.5 14L.9 7.5C1.8 8.4 3 8.9 4.3 8.9h8.4 4.5v4.2 0C2.3 0 .8 .9 .1 2.5",
-    "6": "M7.4 12.4C6.8 13.4 5.8 14 4.6 14h.1 6.4L.1 4.4v4.2 0h8.3 4.4v4.2 8.8h.1 4.4",
-    "7": "M0 14L8.2 14L3 0",
-    "8": "M4.2 7.5h.5 10.8v4.2 14h7.9 10.8v4.2 7.5h0 3.8v4.2 0h8.4 3.8v4.2 7.5",
-    "9": "M1 1.6C1.6 .6 2.6 0 3.8 0h8.3 7.6L8.3 9.6v4.2 14h.1 9.6v4.2 5.2h8.3 9.6",
-    "!": "M0 14L0 4.4M0 .3L0 0",
-    '"': "M0 14L0 10.4M3 14L3 10.4",
-    "#": "M3.4 14L1.4 0M8 14L6 0M.6 9.6L9.4 9.6M0 4.4L8.8 4.4",
-    "$": _S + "M4.5 15.8L4.5 -1.8",
-    "%": "M2.7 14h0 10.8v2.7 7.6h5.4 10.8v2.7 14M10.5 6.4h7.8 3.2v10.5 0h13.2 3.2v10.5 6.4M10.4 14L2.8 0",
-    "&": "M10.2 0L2.2 9C1.4 10 1.2 10.6 1.2 11.4v3.8 14h6.4 11.6C6.4 9.8 5 8.8 3.4 7.8C1.2 6.4 0 5.4 0 3.6v4 0"
-    "C6.8 0 9 2.4 9.6 6",
-    "'": "M0 14L0 10.4",
-    "(": "M3 15.6C-1 10.4 -1 3 3 -2.6",
-    ")": "M0 15.6C4 10.4 4 3 0 -2.6",
-    "*": "M3.2 14L3.2 7.6M.4 12.4L6 9.2M6 12.4L.4 9.2",
-    "+": "M0 6L8 6M4 10L4 2",
-    ",": "M.8 .2L0 -2.6",
-    "-": "M0 5.4L4.4 5.4",
-    ".": "M0 .3L0 0",
-    "/": "M0 -1.6L5.6 15",
-    ":": "M0 .3L0 0M0 9.3L0 9",
-    ";": "M.8 .2L0 -2.6M.8 9.3L.8 9",
-    "<": "M7.6 10.4L0 6L7.6 1.6",
-    "=": "M0 8L8 8M0 4L8 4",
-    ">": "M0 10.4L7.6 6L0 1.6",
-    "?": "M0 11C.4 13 1.9 14 3.7 14h7.2 10.8C7.2 8 3.6 7.9 3.6 4.4M3.6 .3L3.6 0",
-    "@": "M9.6 5.4v6.6 8.8h3.6 5.4v6.6 2h9.6 5.4M9.6 8.8L9.6 4.2C9.6 1.2 13.2 1.4 13.2 5.6v6.8 12h0 5v6.8 -2.6"
-    "C8.4 -2.6 9.8 -2.2 10.8 -1.6",
-    "[": "M2.8 15.6L0 15.6L0 -2.6L2.8 -2.6",
-    "\\": "M0 15L5.6 -1.6",
-    "]": "M0 15.6L2.8 15.6L2.8 -2.6L0 -2.6",
-    "^": "M0 8.6L3.6 14L7.2 8.6",
-    "_": "M0 -2.4L8 -2.4",
-    "`": "M0 14.4L2 11.8",
-    "{": "M3.6 15.6h1.6 13.4L1.6 9v0 6.5h1.6 4L1.6 -.4v3.6 -2.6",
-    "|": "M0 16L0 -3",
-    "}": "M0 15.6h2 13.4L2 9v3.6 6.5h2 4L2 -.4v0 -2.6",
-    "~": "M0 5C1.4 8 3.2 7.4 4.2 6.2C5.2 5 7 4.4 8.4 7.2",
-    "\u2212": "M0 6L8 6",  # minus
-    "\u2013": "M0 5.4L7 5.4",  # en dash
-    "\u2014": "M0 5.4L11 5.4",  # em dash
-    "\u2026": "M0 .3L0 0M4 .3L4 0M8 .3L8 0",  # ellipsis
-}
-
-REPLACEMENT = "M0 0L0 14L7 14L7 0L0 0M0 0L7 14"  # for every character that is not above
-
 _UNITS_PER_EM = 20.0
-# The letters of the sheet: a single-weight sans serif drawn as strokes.
-#
-# Units: capitals are 14 high, small letters 10, the baseline is y = 0, y points up, x = 0 is the center of the leftmost
-# stroke. A glyph is a path of absolute coordinates:
-#
-#     M x y                    lift the pen
-#     L x y                    straight line
-#     h x y, v x y             quarter of a (slightly squarish) ellipse that leaves horizontally or vertically
-#     C x1 y1 x2 y2 x y        cubic Bezier curve
 _STROKE_WIDTH = {False: 1.45, True: 2.35}  # units; regular, bold
 _BEARING = 1.35  # units of air on each side of a glyph, from the stroke's edge
 _CURVE_STEPS = 8
@@ -363,10 +245,17 @@ def wrap(text: str, width: int, size: float = 14.0, *, bold: bool = False) -> li
     return [shorten(line, width, size, bold=bold) for line in lines]
 
 
+@cache
+def _paths() -> dict[str, str]:
+    """Paths of characters, as letters.txt describes them; the one for all others is "replacement"."""
+    lines = Path(__file__).with_name("letters.txt").read_text(encoding="utf-8").split("\n\n", 1)[1].splitlines()
+    return dict(line.split(" ", 1) for line in lines)
+
+
 def _drawable(text: str) -> str:
-    characters = []
+    paths, characters = _paths(), []
     for character in str(text):
-        if character not in STROKES:
+        if character not in paths:
             base = "".join(
                 letter for letter in unicodedata.normalize("NFKD", character) if not unicodedata.combining(letter)
             )
@@ -391,7 +280,7 @@ def _glyph(character: str, size: float, bold: bool) -> tuple[np.ndarray, int]:
     if character == " ":
         advance = max(1, round((SPACE_WIDTH + 2.0 * _BEARING) * unit))
         return np.zeros((ascent + descent, advance)), advance
-    segments = _segments(STROKES.get(character, REPLACEMENT))
+    segments = _segments(_paths().get(character, _paths()["replacement"]))
     digit = character.isdigit() and character.isascii()
     low, high = (0.0, DIGIT_WIDTH) if digit else (segments[..., 0].min(), segments[..., 0].max())
     advance = int(np.ceil((high - low + 2.0 * _BEARING) * unit + stroke_width))

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .. import imaging, shading
+from .. import imaging
 from ..imaging import exr
 from ..imaging.exr import COMBINED, layer_name
-from ..scene import CYCLES, PASSES, REFERENCE, Film, SurfaceSamples
+from ..scene import CYCLES, PASSES, REFERENCE, SCALAR_FIELDS, Film, SurfaceSamples
 from . import lighting
 from .lighting import REFERENCE_SEED, TechniqueResult, described, technique_names, title
 from .options import PictureOptions
@@ -23,28 +23,10 @@ from .tasks import check_before_writing, versions
 # MOST_VISIBILITY_LAYERS: with more lights the EXR has no visibility layers.
 MOST_VISIBILITY_LAYERS = 64
 # Layers of the G-buffer: field of SurfaceSamples and its channel letters.
+_COLORS = "specular_f0", "specular_f90", "specular_dip", "dielectric", "diffuse_albedo", "diffuse_rebound"
 SAMPLE_LAYERS = {
-    "position": "XYZ",
-    "view": "XYZ",
-    "normal": "XYZ",
-    "diffuse_normal": "XYZ",
-    "geometric_normal": "XYZ",
-    "smooth_normal": "XYZ",
-    "bump_alpha2": "V",
-    "roughness": "V",
-    "specular_f0": "RGB",
-    "specular_f90": "RGB",
-    "specular_dip": "RGB",
-    "dielectric": "RGB",
-    "ior": "V",
-    "diffuse_albedo": "RGB",
-    "diffuse_roughness": "V",
-    "diffuse_rebound": "RGB",
-    "sheen_a": "V",
-    "sheen_b": "V",
-    "receiver": "V",
-    "anisotropy": "V",
-    "tangent": "XYZ",
+    field.name: "V" if field.name in SCALAR_FIELDS else "RGB" if field.name in _COLORS else "XYZ"
+    for field in fields(SurfaceSamples)
 }
 
 
@@ -82,8 +64,7 @@ class Comparison:
 
     def whole(self, name: str) -> np.ndarray:
         """The whole picture (H, W, 4) of a technique: the sum of its passes, plus `rest` where that is known."""
-        light = sum(self.images[name, pass_name] for pass_name in self.options.passes)
-        return self._with_rest(light)
+        return self._with_rest(sum(self.images[name, pass_name] for pass_name in self.options.passes))
 
     def _with_rest(self, light: np.ndarray) -> np.ndarray:
         """The picture (H, W, 4) with this reflected `light` (H, W, 3); alpha is the coverage where `rest` is None."""
@@ -100,19 +81,14 @@ class Comparison:
             for pass_name in self.options.passes
         }
 
-    def _radiance(self, result, pass_name) -> np.ndarray:
-        return self._exposed(result.shading, pass_name)
-
-    def _exposed(self, shaded: shading.Shading, pass_name) -> np.ndarray:
-        return self.extraction.picture.exposure * getattr(shaded, pass_name)
+    def _radiance(self, result, pass_name, of: str = "shading") -> np.ndarray:
+        return self.extraction.picture.exposure * getattr(getattr(result, of), pass_name)
 
     def _image(self, result, values) -> np.ndarray:
         return self._film_of(result).image(values)
 
     def _film_of(self, result) -> Film:
-        if result.subset is None:
-            return self.film
-        return self.film.take(result.subset)
+        return self.film if result.subset is None else self.film.take(result.subset)
 
     def _mask(self, result) -> np.ndarray:
         """Mask (H, W) of the pixels whose surfaces the technique has shaded."""
@@ -155,8 +131,7 @@ class Comparison:
         }
 
     def _reference_facts(self) -> dict | None:
-        result = self.results.get(REFERENCE)
-        if result is None:
+        if (result := self.results.get(REFERENCE)) is None:
             return None
         count = len(self.extraction.samples) if result.subset is None else len(result.subset)
         error = result.shading.quadrature_error
@@ -234,7 +209,7 @@ class Comparison:
             images = (self._image(result, values) for values in self._radiance(result, pass_name))
             planes |= {layer: image, **exr.by_group(layer, groups, images)}
             if result.unshadowed is not None:
-                values = self._exposed(result.unshadowed, pass_name).sum(axis=0)
+                values = self._radiance(result, pass_name, "unshadowed").sum(axis=0)
                 planes[layer_name(f"{name}{exr.UNSHADOWED}", pass_name)] = self._image(result, values)
         for pass_name, halves in self.cycles.items():
             if pass_name not in self.options.passes:
@@ -375,10 +350,7 @@ def material_classes(samples: SurfaceSamples) -> dict[str, np.ndarray]:
     """Masks (P,) of the samples whose specular lobe is mostly a metal's, or mostly a dielectric's."""
     metal = samples.specular_f90.max(axis=1, initial=0.0)
     dielectric = samples.dielectric.max(axis=1, initial=0.0)
-    return {
-        "metals": (metal > dielectric) & (metal > 0.0),
-        "dielectrics": (dielectric >= metal) & (dielectric > 0.0),
-    }
+    return {"metals": (metal > dielectric) & (metal > 0.0), "dielectrics": (dielectric >= metal) & (dielectric > 0.0)}
 
 
 def percent(value) -> str:

@@ -204,8 +204,6 @@ def denoised_rest(cycles, passes: dict[str, DirectPass], extraction, denoise: st
     """All that is not LTSH's direct light, denoised if `denoise` is "on"."""
     from ..blender.process.blender_process import denoiser_libraries
 
-    if progress is not None and progress("denoise", 0.0) is False:
-        raise Cancelled("stopped before the picture was denoised")
     rest, is_noisy = read_layer(cycles.channels, "Combined", "RGBA").astype(np.float64), extraction.picture.has_lens
     shining, diffuse = _shining(cycles, extraction), passes["diffuse"]
     # Once without and once with Cycles' direct diffuse light, of which edges need a share.
@@ -223,6 +221,8 @@ def denoised_rest(cycles, passes: dict[str, DirectPass], extraction, denoise: st
         guides = [read_layer(cycles.guides, *guide) for guide in (ALBEDO, NORMAL)]
         try:
             with open_denoiser(denoiser_libraries(), cores()) as denoiser:
+                if progress is not None and progress("denoise", 0.0) is False:
+                    raise Cancelled("stopped before the picture was denoised")
                 pictures, name = denoiser.all_denoised(pictures, *guides), denoiser.name
         except NoDenoiser as error:
             problems = [f"{error}; the picture is not denoised"]

@@ -124,21 +124,17 @@ def draw_view(options: ViewOptions, progress: Progress | None = None) -> TaskRes
     job = child_job(view.ViewJob, options, width=width, height=height, techniques=given)
     with temporary_folder() as folder:
         manifest = view.draw_view(job, folder, progress=progress)
-        pictures = {
-            name: {pass_name: np.load(folder / f"{number}_{pass_name}.npy") for pass_name in view.VIEW_PASSES}
-            for number, name in enumerate(tables)
+        layers = {
+            layer_name(technique, pass_name): np.load(folder / f"{number}_{pass_name}.npy")
+            for number, technique in enumerate(tables)
+            for pass_name in view.VIEW_PASSES
         }
         shown = (folder / view.VIEW_PNG).read_bytes()
     check_before_writing(progress)
-    coverage = next(iter(pictures.values()))["diffuse"][..., 3]
+    coverage = layers[layer_name(next(iter(tables)), "diffuse")][..., 3]
     report = _view_report(options, tables, manifest, coverage)
     name = options.name or "view"
-    layers = {
-        layer_name(technique, pass_name): image[..., :3]
-        for technique, images in pictures.items()
-        for pass_name, image in images.items()
-    }
-    layers[COVERAGE] = imaging.Layer(coverage, "V")
+    layers = {name: image[..., :3] for name, image in layers.items()} | {COVERAGE: imaging.Layer(coverage, "V")}
     path = options.output / f"{name}.exr"
     path.parent.mkdir(parents=True, exist_ok=True)
     color_space = identified(manifest["color_space"]["to_rec709"], manifest["color_space"]["name"])

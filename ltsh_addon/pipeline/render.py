@@ -126,7 +126,7 @@ def finish(
         for one in passes.values():
             combined[..., :3] += one.image
         clock.end("denoise")
-        report = _report(comparison, cycles, passes, rest.problems)
+        report = _report(comparison, cycles, passes, rest)
         report["finished"] |= {"denoiser": rest.denoiser, "budget_s": options.budget}
         if not np.any(combined[..., :3]):
             report["warnings"].append(
@@ -334,17 +334,18 @@ class _ProcessorClock:
         return self._now() - self._start + self._others
 
 
-def _report(comparison: Comparison, cycles, passes: dict, problems: list[str]) -> dict:
+def _report(comparison: Comparison, cycles, passes: dict, rest: compositing.Rest) -> dict:
     """The report of a picture, and under "finished" what is LTSH's and what is Cycles'."""
     left_to_cycles = comparison.extraction.left_to_cycles
     everything = [*cycles.everything, *left_to_cycles.everything]
-    warnings = [*cycles.warnings, *left_to_cycles.warnings, *problems]
+    warnings = [*cycles.warnings, *left_to_cycles.warnings, *rest.problems]
+    theirs = "Cycles' own and denoised" if rest.denoiser else "Cycles' own"
     if everything:
         why = listed(everything, NAMED, "; ")
-        warnings.append(f"all direct light is Cycles' own and denoised, because LTSH does not shade: {why}")
+        warnings.append(f"all direct light is {theirs}, because LTSH does not shade: {why}")
     if left_to_cycles.materials and not everything:
         why = listed(left_to_cycles.materials, NAMED, "; ")
-        warnings.append(f"direct light on some surfaces is Cycles' own and denoised: {why}")
+        warnings.append(f"direct light on some surfaces is {theirs}: {why}")
     shares = {name: np.where(one.is_replaced, one.clean_share, 0.0).mean() for name, one in passes.items()}
     return {
         **comparison.report(),

@@ -46,16 +46,20 @@ class SpotCone:
 class Pattern:
     """Factors of the radiance of a light, by the normal n of the place on a ball, or by the direction n of the light.
 
-    With v = axes n, the polar angle of v from z, 0 to pi, selects the row of `values`; the azimuth of v around z,
+    With v = axes n, the polar angle of v from z, `start` to pi, selects the row of `values`; the azimuth of v around z,
     counted from x, selects the column. Rows and columns are equal steps of these angles.
     """
 
     axes: np.ndarray  # (3, 3), of any length
     values: np.ndarray  # (H, W)
     by_ray: bool = False  # n is the direction in which the light travels, not the normal
+    start: float = 0.0  # rad
 
     def __post_init__(self):
-        axes, values = np.asarray(self.axes, dtype=np.float64), np.asarray(self.values, dtype=np.float32)
+        axes, values = np.asarray(self.axes, dtype=np.float64), self.values
+        if isinstance(values, list) and len(values) == 2 and isinstance(values[1], str):  # of a record
+            values = np.frombuffer(base64.b64decode(values[1], validate=True), "<f4").reshape(values[0], -1)
+        values = np.asarray(values, dtype=np.float32)
         if axes.shape != (3, 3) or values.ndim != 2 or not np.isfinite(axes).all() or not np.isfinite(values).all():
             raise ValueError(f"pattern: axes {axes!r} and values of shape {values.shape}, expected 3 x 3 and (H, W)")
         object.__setattr__(self, "axes", axes)
@@ -141,8 +145,9 @@ class Light:
         if self.cone is not None:
             record["cone"] = {**vars(self.cone), "axes": self.cone.axes.tolist()}
         if self.pattern is not None:
-            arrays = {name: getattr(self.pattern, name).tolist() for name in ("axes", "values")}
-            record["pattern"] = {**vars(self.pattern), **arrays}
+            packed = base64.b64encode(self.pattern.values.astype("<f4").tobytes()).decode()
+            fields_of_pattern = {"axes": self.pattern.axes.tolist(), "values": [len(self.pattern.values), packed]}
+            record["pattern"] = {**vars(self.pattern), **fields_of_pattern}
         return {**record, "detail": [child.record() for child in self.children]}
 
     @property

@@ -147,7 +147,7 @@ class RaySampler:
             length = self._unwarped(directions, local, light_count)
             scale = np.float32(bsdf_count / shape[0]) * self.warps.determinant / self.warped_quads.solid_angle
             scale *= self.has_solid_angle
-            density = density + scale / (length * length * length)
+            density = density + _after_warp(scale, length)
         light = self.emitter.light
         falling = dot(directions, -light.direction.astype(np.float32) if self.disk is None else self._axis())
         height = self.height if self.disk is None else self.disk.length
@@ -205,7 +205,7 @@ class RaySampler:
         if bsdf_count:
             cosine = np.maximum(self.warps.zz * local[2] / length, _ZERO)
             scale = np.float32(bsdf_count / shape[0] / np.pi) * self.warps.determinant
-            density += scale * cosine / (length * length * length)
+            density += _after_warp(scale * cosine, length)
         factor = self.emitter.brightness_along(directions) / np.maximum(density, _TINY)
         distance = np.full(shape, _FARTHEST, np.float32)
         return directions, distance, self._weights(directions, local, factor)
@@ -239,7 +239,7 @@ class RaySampler:
             warped.take_rows(rows).directions(x[rows], y[rows], out=local[:, rows])
             length = self._unwarped(directions, local, light_count)
             scale = np.float32(1.0 - light_count / shape[0]) * pmf[-1] * self.warps.determinant / warped.solid_angle
-            density = density + scale / (length * length * length)
+            density = density + _after_warp(scale, length)
         normal = emitter.normal[:, leaf]
         falling, height = -dot(directions, normal), np.maximum(-dot(corners[:, 0], normal), _ZERO)
         distance = np.minimum(height / np.maximum(falling, _TINY), _FARTHEST)
@@ -375,6 +375,12 @@ class RaySampler:
         if self.dielectric.any():
             result += self.dielectric * dielectric_reflectance(cosine, self.ior)
         return np.maximum(result, _ZERO, out=result)
+
+
+def _after_warp(density, length):
+    """Densities of unit vectors of this `length` after the warp; beyond single precision infinite: no weight."""
+    with np.errstate(over="ignore"):
+        return density / (length * length * length)
 
 
 _MIN_ALPHA = np.float32(1e-5)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ltsh_addon.cycles.uv import LATTICE, NUDGE, PointWeights, Texels, UvTriangles, barycentric_of_nearest
+from ltsh_addon.cycles.uv import LATTICE, NUDGE, PointWeights, Texels, UvTriangles, barycentric_of_nearest, tiles_of
 
 WIDTH, HEIGHT = 61, 47
 
@@ -176,3 +176,29 @@ def test_weights_of_random_points_give_the_mean_of_the_spread_ones():
     assert np.abs(np.mean([weights.at(at) for at in points], axis=0) - 1.0).max() < 1e-12
     # The stiffness leaves some of it.
     assert np.sqrt(np.mean((found - wanted) ** 2)) < 0.1 * np.sqrt(np.mean((plain - wanted) ** 2))
+
+
+@pytest.mark.parametrize("tile", [(0, 0), (1, 0), (9, 0), (0, 1), (3, 2)])
+@pytest.mark.parametrize("steps", [1, 3])
+def test_slivers_a_float_step_beyond_a_border_make_no_tile(tile, steps):
+    """Rounding of unwraps: on every side, in single precision, and at both ends of the row of tiles."""
+    low = np.float32(tile)
+    corners = low + np.float32([[0, 0], [1, 0], [1, 1], [0, 1]])
+    whole = [corners[[0, 1, 2]], corners[[0, 2, 3]]]
+    for axis in (0, 1):
+        for border, beyond in ((low[axis], -np.inf), (low[axis] + np.float32(1.0), np.inf)):
+            sliver = low + np.float32([[0.2, 0.2], [0.5, 0.5], [0.7, 0.7]])
+            sliver[:, axis] = border
+            for _ in range(steps):
+                sliver[1, axis] = np.nextafter(sliver[1, axis], np.float32(beyond))
+            whole.append(sliver)
+    assert tiles_of(np.array(whole)) == ([1001 + tile[0] + 10 * tile[1]], 0.0)
+
+
+def test_tiles_that_hold_a_face_stay_however_small_it_is():
+    small = np.float32([[0.5, 0.5], [0.502, 0.5], [0.5, 0.502]])
+    assert tiles_of(np.array([small, small + np.float32([1.0, 0.0])])) == ([1001, 1002], 0.0)
+    on_the_border = np.float32([[1.0, 0.2], [1.0 + 1e-6, 0.3], [1.0, 0.4]])
+    assert tiles_of(on_the_border[None]) == ([1002], 0.0)
+    across = small + np.float32([0.499, 0.0])
+    assert tiles_of(across[None])[0] == [1001] and tiles_of(across[None])[1] > 0.0

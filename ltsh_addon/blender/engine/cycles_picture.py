@@ -61,8 +61,8 @@ def reference_of(context, scene, passes: str, projection: np.ndarray) -> Referen
 
 def _comparison_of(scene) -> results.Result | None:
     """The results with a Cycles picture: those that are shown, or the last ones of the command."""
-    last = str(output_folder(scene, "compare") / "images")
-    for result in (results.result_of(scene), results.result_in(last)):
+    last = results.folder_of(scene, "compare", output_folder(scene, "compare") / "images")
+    for result in (results.result_of(scene), results.result_in(str(last))):
         if result is not None and "" in result.groups and CYCLES in result.groups[""]["names"]:
             return result
     return None

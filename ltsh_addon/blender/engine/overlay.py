@@ -260,10 +260,6 @@ def is_split(context) -> bool:
     return is_drawn(context) and context.scene.ltsh_view.mode == "split"
 
 
-def _line_place(context) -> float:
-    return context.scene.ltsh_view.split_position * context.region.width
-
-
 class LTSH_GT_split(bpy.types.Gizmo):
     """A vertical line that moves sideways."""
 
@@ -271,12 +267,12 @@ class LTSH_GT_split(bpy.types.Gizmo):
 
     def test_select(self, context, location):
         reach = REACH * context.preferences.system.ui_scale
-        return 0 if abs(location[0] - _line_place(context)) <= reach else -1
+        return 0 if abs(location[0] - context.scene.ltsh_view.split_position * context.region.width) <= reach else -1
 
     def draw(self, context):
         """Draw the handle, an arrow to either side; the line is part of the picture."""
         size = HANDLE * context.preferences.system.ui_scale * (1.25 if self.is_highlight else 1.0)
-        x, y = _line_place(context), 0.5 * context.region.height
+        x, y = context.scene.ltsh_view.split_position * context.region.width, 0.5 * context.region.height
         shader = gpu.shader.from_builtin("UNIFORM_COLOR")
         gpu.state.blend_set("ALPHA")
         shader.bind()
@@ -322,20 +318,17 @@ class LTSH_GGT_split(bpy.types.GizmoGroup):
 
 
 CLASSES = (LTSH_GT_left_out, LTSH_GGT_left_out, LTSH_GT_split, LTSH_GGT_split)
-_add_classes, _remove_classes = bpy.utils.register_classes_factory(CLASSES)
 
 
 def register() -> None:
-    """Add the drawing and the handles to all 3D views."""
-    _add_classes()
+    """Add the drawing to all 3D views."""
     if not bpy.app.background:
         _draw_handlers.append(bpy.types.SpaceView3D.draw_handler_add(_draw, (), "WINDOW", "POST_PIXEL"))
 
 
 def unregister() -> None:
-    """Remove them."""
+    """Remove it."""
     while _draw_handlers:
         bpy.types.SpaceView3D.draw_handler_remove(_draw_handlers.pop(), "WINDOW")
-    _remove_classes()
     _texts.clear()
     _quiet_lines.clear()

@@ -22,14 +22,9 @@ from ..render_settings import pass_names as names_in_files
 from ..render_settings import picture_size
 from ..saving import save_working_copy
 from ..ui import comparison
-from ..ui.job import (
-    Plan,
-    progress_text,
-    session_times,
-    stage_title,
-)
+from ..ui.job import Plan, progress_text, session_times, stage_title
 from ..ui.preview import ENGINE
-from . import overlay, redraws
+from . import redraws
 from .final_picture import DEPTH, NORMAL, POSITION, FinalJob, FinalPicture, final_picture, pass_names
 from .view import EngineView
 
@@ -285,24 +280,12 @@ def saved_copy() -> Path:
     return Path(_copy["folder"].name) / "scene.blend"
 
 
+CLASSES = (LTSH_RenderEngine,)
 HANDLERS = (("render_init", _save_copy), ("render_complete", _delete_copy), ("render_cancel", _delete_copy))
-
-
-def register() -> None:
-    """Add the engine and the handlers of its renders and views."""
-    bpy.utils.register_class(LTSH_RenderEngine)
-    for name, function in HANDLERS:
-        getattr(bpy.app.handlers, name).append(function)
-    overlay.register()
+register = _delete_copy
 
 
 def unregister() -> None:
-    """Remove what `register` added."""
+    """End what goes on for views and renders."""
     redraws.stop()
-    overlay.unregister()
-    for name, function in HANDLERS:
-        functions = getattr(bpy.app.handlers, name)
-        if function in functions:
-            functions.remove(function)
     _delete_copy()
-    bpy.utils.unregister_class(LTSH_RenderEngine)

@@ -23,15 +23,8 @@ MODES = (
     ("split", "Split", "The technique left of a line that can be dragged, the second technique right of it"),
     ("difference", "Difference", "The technique minus the second: red is brighter, blue darker, white equal"),
 )
-SECOND_ITEMS = (
-    *TECHNIQUE_ITEMS,
-    (
-        CYCLES,
-        "Cycles",
-        "The picture that Compare with Cycles has made, where the view is through its camera",
-        _NUMBERS[CYCLES],
-    ),
-)
+BESIDE = "The picture that Compare with Cycles has made, where the view is through its camera"
+SECOND_ITEMS = (*TECHNIQUE_ITEMS, (CYCLES, "Cycles", BESIDE, _NUMBERS[CYCLES]))
 
 
 def _redraw(settings, context) -> None:
@@ -69,14 +62,12 @@ class LTSH_ViewSettings(bpy.types.PropertyGroup):
     complete: bpy.props.BoolProperty(
         name="Complete",
         description="Final renders also have what is not direct light, by Cycles and denoised: bounces, glass, "
-        "subsurface, and all its passes",
-        default=False,
-    )
+        "subsurface, and all its passes", default=False,
+    )  # fmt: skip
     technique_passes: bpy.props.BoolProperty(
-        name="Passes of All Techniques",
+        name="Passes of All Techniques", default=False,
         description="Final renders also have a specular and a diffuse pass of every technique",
-        default=False,
-    )
+    )  # fmt: skip
     artist_engine: bpy.props.StringProperty(
         name="Former Engine", description="The render engine to give back after the preview", options={"HIDDEN"}
     )
@@ -165,9 +156,11 @@ def _unshare_panels() -> None:
                 setattr(panel, name, value)
 
 
+CLASSES = (LTSH_ViewSettings,)
+
+
 def register() -> None:
     """Add the settings, and show the shared panels."""
-    bpy.utils.register_class(LTSH_ViewSettings)
     bpy.types.Scene.ltsh_view = bpy.props.PointerProperty(type=LTSH_ViewSettings)
     _share_panels()
 
@@ -176,4 +169,3 @@ def unregister() -> None:
     """Remove what `register` added."""
     _unshare_panels()
     del bpy.types.Scene.ltsh_view
-    bpy.utils.unregister_class(LTSH_ViewSettings)

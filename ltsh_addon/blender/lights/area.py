@@ -19,8 +19,10 @@ from typing import Any
 import bpy
 import numpy as np
 
+from ...cycles.horizons import unit
+from ...cycles.light_tree import light_selection_pmf
 from ...scene import FARTHEST, EllipseLight, Light, PointLight, QuadLight, SpotCone, SpotLight, SunLight, listed
-from ..evaluated import EmitterTraits, RenderedSurface, surface_instancer
+from ..evaluated import EmitterTraits, RenderedSurface, is_surface, read_values, surface_instancer
 from ..materials.aovs import CyclesReasons, OpaqueInput
 from ..materials.graph import tree_in_use
 from ..render_settings import cycles_setting
@@ -55,6 +57,8 @@ class LightInventory:
     instancers: dict[str, RenderedSurface] = field(default_factory=dict)  # by full name
     origin: np.ndarray = field(default_factory=lambda: np.zeros(3))  # (3,) m; add it for positions in the file
     unshaded: list[str] = field(default_factory=list)  # reasons why materials are not shaded, see `inject_aovs`
+    hit: set[str] = field(default_factory=set)  # names of the lights that random rays hit, if some overlap
+    lit_points: tuple[np.ndarray, np.ndarray] = ()  # points of surfaces and their normals, if some overlap
     world: Any = None  # the world that lights the scene
     behind: Any = None  # the world that is seen behind the surfaces
     occluders: Any = None  # visibility.Occluders, if shadows are wanted
@@ -106,25 +110,27 @@ def collect_lights(depsgraph, override=None) -> LightInventory:
             note_unsupported(ob, matrix, inventory)
             if _is_sheared(ob, matrix):
                 inventory.left_to_cycles.everything.append(f"light {ob.original.name!r}, whose transform is sheared")
-            if light.affects_diffuse != light.affects_specular:
-                inventory.warn(half_hidden(light))
-            _note_instancer(instance, inventory)
+            instancer = surface_instancer(instance)
+            if instancer is not None:
+                inventory.instancers[instancer.original.name_full] = instancer
     # If one instance is unusable, all instances of the object are left out: the reference can only drop the object.
     for name, light, source in placed:
         if name not in inventory.left_out:
             if source is not None:
                 inventory.node_lights[len(inventory.lights)] = source
             inventory.lights.append(light)
-    _note_overlaps(hit, inventory)
+    if overlapping_pairs(hit):
+        inventory.hit, inventory.lit_points = {light.name for light in hit}, _lit_points(depsgraph)
     lost: list[str] = []
     inventory.meshes = collect_mesh_lights(depsgraph, override, receivers, lost.append)
     for reason in lost:
         inventory.warn(reason)
     inventory.left_to_cycles.everything += lost
     for mesh in inventory.meshes:
-        if mesh.light.affects_diffuse != mesh.light.affects_specular:
-            inventory.warn(half_hidden(mesh.light))
         inventory.instancers.update(mesh.instancers)
+    for light in [*inventory.lights, *(mesh.light for mesh in inventory.meshes)]:
+        if light.affects_diffuse != light.affects_specular:
+            inventory.warn(half_hidden(light))
     return inventory
 
 
@@ -137,6 +143,8 @@ _AREA_LIGHTS = {shape: kind for kind in (QuadLight, EllipseLight) for shape in k
 TRIED = 16
 # CHUNK: how many lights are compared with all others at once.
 CHUNK = 256
+# LIT_POINTS: points of surfaces, for a mean over them. LEAST_LIT: see `_lost_diffuse_shares`.
+LIT_POINTS, LEAST_LIT = 512, 0.1
 
 
 def overlapping_pairs(lights: list[Light]) -> list[tuple[Light, Light, float]]:
@@ -180,28 +188,93 @@ def overlapping_pairs(lights: list[Light]) -> list[tuple[Light, Light, float]]:
 def _overlap(first: Light, second: Light) -> float:
     """The share of the smaller of two lights in one plane that lies in the other."""
     small, large = sorted((first, second), key=lambda light: np.linalg.norm(light.area_vector))
+    return float(np.mean(_is_inside(_points_of(small), large)))
+
+
+def _points_of(light: Light) -> np.ndarray:
+    """Points (Q, 3) all over a flat light."""
     steps = (np.arange(TRIED) + 0.5) / TRIED * 2.0 - 1.0
     s, t = (values.ravel() for values in np.meshgrid(steps, steps))
-    inside = np.hypot(s, t) < 1.0 if small.is_round else np.ones(len(s), bool)
-    points = small.center + s[inside, None] * small.half_u + t[inside, None] * small.half_v - large.center
-    u, v = (points @ half / np.dot(half, half) for half in (large.half_u, large.half_v))
-    size = np.hypot(u, v) if large.is_round else np.maximum(np.abs(u), np.abs(v))
-    return float(np.mean(size < 1.0))
+    inside = np.hypot(s, t) < 1.0 if light.is_round else np.ones(len(s), bool)
+    return light.center + s[inside, None] * light.half_u + t[inside, None] * light.half_v
 
 
-def _note_overlaps(lights: list[Light], inventory: LightInventory) -> None:
+def _is_inside(points: np.ndarray, light: Light) -> np.ndarray:
+    """Mask (Q,) of the points in the plane of a flat light that lie in it."""
+    u, v = ((points - light.center) @ half / np.dot(half, half) for half in (light.half_u, light.half_v))
+    return (np.hypot(u, v) if light.is_round else np.maximum(np.abs(u), np.abs(v))) < 1.0
+
+
+def note_overlaps(inventory: LightInventory) -> None:
     """Warn of overlapping lights: Cycles takes one of two hits at the same distance, and so loses light."""
-    pairs = overlapping_pairs(lights)
+    pairs = overlapping_pairs([light for light in inventory.lights if light.name in inventory.hit])
     if not pairs:
         return
     names = [f"{first.name!r} and {second.name!r} ({100.0 * share:.0f} %)" for first, second, share in pairs]
     brightness = [[np.abs(light.radiance).sum() for light in pair[:2]] for pair in pairs]
     lost = max(max(pair) / sum(pair) for pair in brightness)
+    mean, most = max(_lost_diffuse_shares(pair[:2], inventory) for pair in pairs[:NAMED_PAIRS])
     inventory.warn(
         f"lights {listed(names, NAMED_PAIRS)}: each pair overlaps in one plane, by that share of the smaller light; "
-        f"there Cycles loses up to {100.0 * lost:.0f} % of their light in sharp reflections, some 1 % elsewhere, the "
+        f"there Cycles loses about {100.0 * mean:.2g} % of their diffuse light on all surfaces together, at "
+        f"points {100.0 * most:.2g} %, and up to {100.0 * lost:.0f} % of their light in sharp reflections, the "
         "techniques lose nothing; move one of each pair forward by 0.1 mm"
     )
+
+
+def _lost_diffuse_shares(pair: tuple[Light, Light], inventory: LightInventory) -> tuple[float, float]:
+    """The share of the light of an overlapping `pair` on diffuse surfaces that Cycles loses, and the largest at a point
+    that is lit by at least LEAST_LIT of the light of the brightest.
+
+    Rays that Cycles sends by the BSDF hit the first of both lights alone. So of the second it has only what rays to
+    lights count by the power heuristic (Veach and Guibas 1995), as if the other rays had found nothing.
+    """
+    # Cycles hardly ever chooses a world among lights that are so near.
+    lights = tuple(light for light in inventory.lights if not light.is_distant)
+    number = max(number for number, light in enumerate(lights) if light is pair[0] or light is pair[1])
+    second = lights[number]
+    first = pair[0] if pair[1] is second else pair[1]
+    position, normal = inventory.lit_points
+    normal = normal * np.sign(((second.center - position) * normal).sum(axis=1, keepdims=True))  # lit on both sides
+    pmf = light_selection_pmf(position, normal, lights)
+    lost = total = np.full(len(position), 1e-30)
+    for light in (first, second):
+        points = _points_of(light)
+        offset = points - position[:, None]
+        square = (offset**2).sum(axis=-1)
+        offset /= np.sqrt(square)[..., None]
+        solid_angle = np.maximum(-(offset @ light.direction), 0.0) / square
+        solid_angle *= np.linalg.norm(light.area_vector) / len(points)
+        by_bsdf = np.maximum((offset * normal[:, None]).sum(axis=-1), 0.0) / math.pi
+        arriving = np.abs(light.radiance).sum() * by_bsdf * solid_angle
+        total = total + arriving.sum(axis=1)
+        if light is second:
+            # Cycles chooses points of rectangles evenly by solid angle, of ellipses by area.
+            whole = len(points) * solid_angle if light.is_round else solid_angle.sum(axis=1, keepdims=True)
+            by_light = pmf[number, :, None] / np.maximum(whole, 1e-30)
+            weight = by_bsdf**2 / np.maximum(by_bsdf**2 + by_light**2, 1e-30)
+            lost = (arriving * weight)[:, _is_inside(points, first)].sum(axis=1)
+    is_lit = total >= LEAST_LIT * total.max(initial=0.0)
+    return float(lost.sum() / total.sum()), float((lost / total)[is_lit].max(initial=0.0))
+
+
+def _lit_points(depsgraph) -> tuple[np.ndarray, np.ndarray]:
+    """Random points (Q, 3) on the surfaces of a scene, evenly by area, and their normals, in world space."""
+    random, chosen, total = np.random.default_rng(0), np.zeros((LIT_POINTS, 3, 3)), 1e-30
+    for instance in depsgraph.object_instances:
+        mesh = instance.object.data
+        if is_surface(instance) and isinstance(mesh, bpy.types.Mesh) and len(mesh.polygons):
+            mesh.calc_loop_triangles()
+            corners = read_values(mesh.loop_triangles, "vertices", (len(mesh.loop_triangles), 3), np.int32)
+            vertices = read_values(mesh.vertices, "co", (len(mesh.vertices), 3), np.float32)
+            matrix = np.array(instance.matrix_world)
+            world = (vertices @ matrix[:3, :3].T + matrix[:3, 3])[corners]
+            area = np.cumsum(np.linalg.norm(np.cross(world[:, 1] - world[:, 0], world[:, 2] - world[:, 0]), axis=1))
+            total += area[-1]
+            new = random.random(LIT_POINTS) < area[-1] / total
+            chosen[new] = world[np.searchsorted(area[:-1], area[-1] * random.random(np.count_nonzero(new)))]
+    normal = unit(np.cross(chosen[:, 1] - chosen[:, 0], chosen[:, 2] - chosen[:, 0]))
+    return (random.dirichlet(np.ones(3), LIT_POINTS)[..., None] * chosen).sum(axis=1), normal
 
 
 def half_hidden(light: Light) -> str:
@@ -211,12 +284,6 @@ def half_hidden(light: Light) -> str:
         f"light {light.name!r}: it is hidden from {kind} rays; Cycles still lets up to 3 % of it through on surfaces "
         "that are both diffuse and glossy, the techniques let none"
     )
-
-
-def _note_instancer(instance, inventory: LightInventory) -> None:
-    instancer = surface_instancer(instance)
-    if instancer is not None:
-        inventory.instancers[instancer.original.name_full] = instancer
 
 
 def rendered_lights(scene, inventory: LightInventory) -> list[Light]:
@@ -387,7 +454,11 @@ def point_light(ob, matrix: np.ndarray, **traits) -> Light:
         scale /= 4.0 * math.pi * radius**2 if radius > LEAST_RADIUS else 4.0
     radius = max(radius, LEAST_RADIUS)
     is_spot = light.type == "SPOT"
-    kind, cone = (SpotLight, {"cone": _cone(light, matrix)}) if is_spot else (PointLight, {})
+    kind, cone = SpotLight if is_spot else PointLight, {}
+    if is_spot:
+        cosine = math.cos(0.5 * light.spot_size)
+        sharpness = min(1.0 / max((1.0 - cosine) * light.spot_blend, 1e-30), SHARPEST)
+        cone["cone"] = SpotCone(np.linalg.inv(matrix[:3, :3]), cosine, sharpness)
     return kind(
         name=ob.original.name,
         shape="FACING_DISK" if light.use_soft_falloff else "BALL",
@@ -409,19 +480,11 @@ def strength(light) -> np.ndarray:
     return value
 
 
-def _cone(light, matrix) -> SpotCone:
-    cosine = math.cos(0.5 * light.spot_size)
-    blend = (1.0 - cosine) * light.spot_blend
-    return SpotCone(np.linalg.inv(matrix[:3, :3]), cosine, min(1.0 / max(blend, 1e-30), SHARPEST))
-
-
 def _sun(light, name, axis, traits) -> Light:
     half = 0.5 * light.angle
-    value = strength(light)
-    if half <= LEAST_ANGLE:
-        half = LEAST_ANGLE
-        value = value / (math.pi * math.sin(half) ** 2)
-    elif light.normalize:
+    value, is_point = strength(light), half <= LEAST_ANGLE
+    half = max(half, LEAST_ANGLE)
+    if is_point or light.normalize:
         value = value / (math.pi * math.sin(half) ** 2)
     half = min(half, WIDEST_SUN)
     first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])

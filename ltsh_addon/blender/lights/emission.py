@@ -93,18 +93,20 @@ class Emission:
 
 def emission_of(data) -> Emission:
     """What the nodes of a material or light emit."""
-    emission, visited, surface = Emission(), set(), surface_of(data)
+    emission, surface, values = Emission(), surface_of(data), []
     leaves = [] if surface is None else shaders_behind(surface).leaves
-    emission.plain = len(leaves) == 1 and leaves[0].terms == ((),) and _is_neutral(leaves[0].node)
+    if len(leaves) == 1 and leaves[0].terms == ((),) and leaves[0].node.bl_idname == EMISSION:
+        color, strength = (value_of(socket) for socket in emission_sockets(leaves[0].node))
+        emission.plain = strength == 1.0 and not is_socket(color) and color[:3] == (1.0, 1.0, 1.0)
     for leaf in leaves:
         if not emits(leaf.node):
             continue
         emission.emits = True
         alpha = (leaf.node.inputs["Alpha"],) if "Alpha" in leaf.node.inputs else ()
-        for value in (*emission_sockets(leaf.node), *alpha):
-            _note_value(source_of(value, leaf.groups), emission, visited)
-        for factor in {factor for term in leaf.terms for factor in term}:
-            _note_value(factor.source, emission, visited)
+        values += [source_of(value, leaf.groups) for value in (*emission_sockets(leaf.node), *alpha)]
+        values += [factor.source for term in leaf.terms for factor in term]
+    for source in _sources_behind(values):
+        _note_value(source, emission)
     falloffs = {_falloff_of(leaf) for leaf in leaves if emits(leaf.node)}
     if falloffs:
         emission.falloff = falloffs.pop() if len(falloffs) == 1 else None
@@ -179,16 +181,21 @@ def _multiplied(node, as_number: bool):
 
 def _has_falloff(source: Source | None) -> bool:
     """True if a Light Falloff node is among the nodes behind `source`."""
-    visited, waiting = set(), [source]
+    return any(one.node.bl_idname == LIGHT_FALLOFF for one in _sources_behind([source]))
+
+
+def _sources_behind(sources: list) -> list[Source]:
+    """All that the values of `sources` depend on, themselves included, each once."""
+    behind, waiting = {}, list(sources)
     while waiting:
         source = waiting.pop()
-        if source is None or source.node is None or (source.node, source.groups) in visited:
+        if source is None or source.node is None:
             continue
-        if source.node.bl_idname == LIGHT_FALLOFF:
-            return True
-        visited.add((source.node, source.groups))
-        waiting += [source_of(entry, source.groups) for entry in source.node.inputs]
-    return False
+        key = source.node, source.socket.identifier, source.groups
+        if key not in behind:
+            behind[key] = source
+            waiting += [source_of(entry, source.groups) for entry in source.node.inputs]
+    return list(behind.values())
 
 
 @contextmanager
@@ -276,22 +283,8 @@ def _value(value):
     return value
 
 
-def _is_neutral(node) -> bool:
-    """True for an Emission node that multiplies by 1."""
-    if node.bl_idname != EMISSION:
-        return False
-    color, strength = (value_of(socket) for socket in emission_sockets(node))
-    return strength == 1.0 and not is_socket(color) and color[:3] == (1.0, 1.0, 1.0)
-
-
-def _note_value(source: Source | None, emission: Emission, visited: set) -> None:
-    """Note in `emission` what the value of `source` depends on."""
-    if source is None or source.node is None:
-        return
-    key = source.node, source.socket.identifier, source.groups
-    if key in visited:
-        return
-    visited.add(key)
+def _note_value(source: Source, emission: Emission) -> None:
+    """Note in `emission` what the value of `source` depends on by itself."""
     node, kind, output = source.node, source.node.bl_idname, source.socket.name
     vector = node.inputs.get("Vector") if kind.startswith("ShaderNodeTex") else None
     is_free = vector is not None and vector.enabled and not vector.is_linked
@@ -307,8 +300,6 @@ def _note_value(source: Source | None, emission: Emission, visited: set) -> None
     emission.by_place |= _is_among(source, BY_PLACE) or (is_free and kind != IES)
     emission.by_uv |= _is_among(source, BY_UV) or (is_free and kind == "ShaderNodeTexImage")
     emission.varies |= kind not in CONSTANT_NODES
-    for entry in node.inputs:
-        _note_value(source_of(entry, source.groups), emission, visited)
 
 
 def _is_among(source: Source, kinds: dict[str, tuple]) -> bool:

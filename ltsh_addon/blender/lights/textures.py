@@ -10,7 +10,8 @@ import numpy as np
 
 from ...cycles.patches import ERROR, Patches, cut_into_patches, split_light
 from ...cycles.texels import ImageTexture
-from ...scene import Light, Pattern
+from ...emitters.facing import cone_angle, pattern_values
+from ...scene import Light, Pattern, SpotCone
 from ..materials.values import Value, is_srgb, opaque_pixels
 from .emission import PIXELS, Falloff, ObjectFacts, Studio, without_camera_rays, without_falloff
 
@@ -54,7 +55,14 @@ class NodeLight:
     def axes(self) -> np.ndarray:
         """`Pattern.axes` (3, 3) for points and spots."""
         linear = self.matrix[:3, :3]
-        return np.eye(3) if self.is_placed else np.linalg.inv(linear / np.linalg.norm(linear, axis=0))
+        return self.frame if self.is_placed else np.linalg.inv(linear / np.linalg.norm(linear, axis=0))
+
+    @property
+    def frame(self) -> np.ndarray:
+        """The orthonormal axes, rows of (3, 3), of its map of directions where it is rendered."""
+        axes, sizes = np.linalg.qr(self.render_matrix[:3, [2, 0, 1]])
+        z, x = (axes[:, number] * np.copysign(1.0, sizes[number, number]) for number in (0, 1))
+        return np.stack([x, np.cross(z, x), z])
 
 
 def with_node_emission(lights: list[Light], unseen: dict[int, NodeLight], studio: Studio, warn) -> list:
@@ -91,6 +99,9 @@ class NodeEmission:
     factor: np.ndarray
     # Relative error of the factor of emission that depends on both direction and place, or that varies over a sun.
     lost: float = 0.0
+    # Of points and spots: the polar angle in rad where the rows begin, and the relative error by the size of steps.
+    start: float = 0.0
+    blurred: float = 0.0
 
 
 def node_emission(source: NodeLight, studio: Studio) -> NodeEmission:
@@ -110,14 +121,16 @@ def _area_factor(source: NodeLight, studio: Studio) -> NodeEmission:
     return NodeEmission(image / (_WHITE["energy"] / np.pi))
 
 
-# PATTERN_ROWS: rows of the map of directions of a point or spot light. VIEW_PIXELS: along each side of the six views
-# that the map is made from.
-PATTERN_ROWS, VIEW_PIXELS = 64, 192
+# PATTERN_ROWS: rows of the map of directions of a point or spot light, if they suffice; else up to MOST_ROWS, in maps
+# of up to MOST_TEXELS. VIEW_PIXELS: along each side of the six views that the map is made from, at least.
+PATTERN_ROWS, MOST_ROWS, MOST_TEXELS, VIEW_PIXELS = 64, 2048, 1 << 19, 192
+# RESOLVED: relative error of a map that needs no finer steps.
+RESOLVED = 0.01
 # The least radius of a point or spot light in a render. SMALL_RADIUS: in m. SMALL_SHARE: of its largest coordinate.
 SMALL_RADIUS, SMALL_SHARE = 1e-3, 1e-4
-# Relative errors above which there is a warning. PATTERN_COLORS: where a pattern has one color for all directions.
-# MOST_LOST: of `NodeEmission.lost`.
-PATTERN_COLORS = MOST_LOST = 0.05
+# PATTERN_COLORS: relative error above which a pattern has a map for each color. MOST_LOST, MOST_BLURRED: errors of a
+# `NodeEmission` above which there is a warning.
+PATTERN_COLORS, MOST_LOST, MOST_BLURRED = 0.01, 0.05, 0.02
 # SUN_PIXELS: along each side of the picture of a sun. LEAST_SUN, WIDEST_SUN: limits of the angle in rad of that sun.
 SUN_PIXELS, LEAST_SUN, WIDEST_SUN = 32, 1e-3, 2.9
 
@@ -146,36 +159,69 @@ def _point_factor(source: NodeLight, studio: Studio) -> NodeEmission:
     small = max(SMALL_RADIUS, SMALL_SHARE * np.abs(center).max())
     radius = max(data.shadow_soft_size, small)
 
-    def views(within: bool, radius: float) -> list[np.ndarray]:
-        """The factor (N, N, 3) on each of the six sides of a light of this `radius`, seen from outside or within."""
+    def views(within: bool, radius: float, pixels: int = VIEW_PIXELS, sides=range(6)) -> dict[int, np.ndarray]:
+        """The factor (N, N, 3) on `sides` of a light of this `radius`, seen from outside or within, by their number."""
         kind = "SPOT" if data.type == "SPOT" and source.by_spot else "POINT"
         settings = {"shadow_soft_size": radius, "use_soft_falloff": False}
         with _white_light(source, studio, settings, kind):
-            images = [_side(studio, center, number, radius, within) for number in range(6)]
-        return [image / (_WHITE["energy"] / np.pi) for image in images]
+            images = {number: _side(studio, source, number, (radius, within, pixels)) for number in sides}
+        return {number: image / (_WHITE["energy"] / np.pi) for number, image in images.items()}
 
     within = source.within
     if not source.by_ray:
-        return NodeEmission(_unfolded(views(False, radius), False))
+        return _resolved(source, lambda *sampling: views(False, radius, *sampling))
     sides = views(within, small)
-    factor = _unfolded(sides, within)
+    factor = _unfolded(sides, within, _map_directions(PATTERN_ROWS))
     if not source.varies:
         return NodeEmission(factor.mean(axis=(0, 1), keepdims=True))
+    emission = _resolved(source, lambda *sampling: views(within, small, *sampling) if sampling else sides)
     if not source.is_mixed or radius == small:
-        return NodeEmission(factor)
+        return emission
     if data.use_soft_falloff or source.by_spot:
         # Differences of opposite sign on opposite sides cancel in the mean over a disk.
-        beside = _unfolded(views(within, radius), within) - factor
+        beside = _unfolded(views(within, radius), within, _map_directions(PATTERN_ROWS)) - factor
         across = np.roll(beside[::-1], PATTERN_ROWS, axis=1)
-        return NodeEmission(factor, _apart(factor + 0.5 * (beside + across), factor))
+        return replace(emission, lost=_apart(factor + 0.5 * (beside + across), factor))
     # Points see a ball as a whole disk: scale the factor from the mean in the middle of that to the mean over it.
     step = (np.arange(VIEW_PIXELS) + 0.5) * (2.0 / VIEW_PIXELS) - 1.0
     disk = np.hypot(*np.meshgrid(step, step)) < 1.0 - 2.0 / VIEW_PIXELS
-    whole = np.array([image[disk] for image in views(False, radius)])
-    half = VIEW_PIXELS // 2
-    middle = np.array([image[half - 1 : half + 1, half - 1 : half + 1].mean(axis=(0, 1)) for image in sides])[:, None]
+    whole = np.array([image[disk] for image in views(False, radius).values()])
+    half = slice(VIEW_PIXELS // 2 - 1, VIEW_PIXELS // 2 + 1)
+    middle = np.array([image[half, half].mean(axis=(0, 1)) for image in sides.values()])[:, None]
     scale = whole.mean() / max(middle.mean(), 1e-30)
-    return NodeEmission(factor * scale, _apart(middle * scale, whole))
+    return replace(emission, factor=emission.factor * scale, lost=_apart(middle * scale, whole))
+
+
+def _resolved(source: NodeLight, views) -> NodeEmission:
+    """The map of directions, as fine as it must be; `views(pixels, sides)` are its pictures, the first without
+    arguments. Fine maps of what a spot emits by the direction end at its cone."""
+    within, sides, start = source.within, views(), 0.0
+    if source.data.type == "SPOT" and source.by_ray:
+        cone = SpotCone(np.linalg.inv(source.matrix[:3, :3]), np.cos(0.5 * source.data.spot_size), 1.0)
+        start = np.pi - cone_angle(cone)
+    emission = NodeEmission(_unfolded(sides, within, _map_directions(PATTERN_ROWS)))
+    error = _blurred(emission, sides, within, (PATTERN_ROWS, start))
+    if error <= RESOLVED:
+        return emission
+    rows = int(2.0 ** np.ceil(np.log2(min(PATTERN_ROWS * error / RESOLVED, MOST_ROWS))))
+    while _map_directions(rows, start)[..., 0].size > MOST_TEXELS:
+        rows //= 2
+    normal = _map_directions(rows, start)
+    sides = views(max(VIEW_PIXELS, rows * 5 // 4), np.unique(_sides_of(normal)).tolist())
+    emission = NodeEmission(_unfolded(sides, within, normal), start=np.pi - len(normal) * (np.pi / rows))
+    return replace(emission, blurred=_blurred(emission, sides, within, (rows, start)))
+
+
+def _blurred(emission: NodeEmission, sides: dict, within: bool, steps: tuple[int, float]) -> float:
+    """The relative error of a map by the size of its steps: from one of twice the rows, four times if these are few."""
+    rows, start = steps
+    normal = _map_directions(rows * (4 if rows == PATTERN_ROWS else 2), start)
+    # Some of the many rows will do. What is beyond the cone does not count.
+    normal = normal[1 if start else 0 :: 1 if rows == PATTERN_ROWS else 5]
+    weights = np.hypot(normal[..., 0], normal[..., 1])
+    pattern = Pattern(np.eye(3), emission.factor.mean(axis=-1), start=emission.start)
+    coarse = pattern_values(pattern, np.moveaxis(normal, -1, 0))
+    return _apart(coarse * weights, _unfolded(sides, within, normal).mean(axis=-1) * weights)
 
 
 _AXES = np.eye(3)
@@ -213,43 +259,57 @@ def _side_axes(number: int) -> tuple[np.ndarray, np.ndarray]:
     return _AXES[number // 2] * (-1.0) ** number, _AXES[(number // 2 + 1) % 3]
 
 
-def _side(studio: Studio, center, number: int, radius: float, within: bool) -> np.ndarray:
-    """A picture (N, N, 3) of side `number` of a ball from outside; `within`: of the opposite side from the inside."""
-    out, right = _side_axes(number)
+def _side(studio: Studio, source: NodeLight, number: int, look: tuple[float, bool, int]) -> np.ndarray:
+    """A picture (N, N, 3) of side `number` of a ball from outside; within: of the opposite side from the inside.
+
+    `look` are its radius, whether it is seen from within, and N.
+    """
+    radius, within, pixels = look
+    center, (out, right) = source.render_matrix[:3, 3], (axis @ source.frame for axis in _side_axes(number))
     if not within:
-        return studio.look(center, radius * right, radius * np.cross(out, right), out, VIEW_PIXELS, 1.0)[0]
+        return studio.look(center, radius * right, radius * np.cross(out, right), out, pixels, 1.0)[0]
     # Rays from the exact center of a spot do not hit it.
-    eye = center + 0.02 * radius * out
-    return studio.look_around(eye, (-out, right), 0.5 * np.pi, 2.0 * radius, VIEW_PIXELS)
+    eye = center + 0.004 * radius * out
+    return studio.look_around(eye, (-out, right), 0.5 * np.pi, 2.0 * radius, pixels)
 
 
-def _unfolded(views: list[np.ndarray], within: bool) -> np.ndarray:
-    """The map (H, W, 3) of directions, made from pictures of the six sides; `within`: taken from the inside."""
-    rows, columns = PATTERN_ROWS, 2 * PATTERN_ROWS
-    polar = (np.arange(rows) + 0.5)[:, None] * (np.pi / rows)
+def _map_directions(rows: int, start: float = 0.0) -> np.ndarray:
+    """Unit vectors (H, W, 3) of a map of directions with `rows` from pole to pole: its rows from the polar angle
+    `start` on, with as many columns as the longest of them needs."""
+    step = np.pi / rows
+    first = int(start / step)
+    polar = (np.arange(first, rows) + 0.5)[:, None] * step
+    columns = 2 * rows if first < rows // 2 else max(4, int(np.ceil(2 * rows * np.sin(first * step))))
     around = (np.arange(columns) + 0.5) * (2.0 * np.pi / columns)
-    x, y, z = np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar) + 0.0 * around
-    normal = np.stack([x, y, z], axis=-1)
-    result, highest = np.zeros((rows, columns, 3)), np.full((rows, columns), -1.0)
-    for number, image in enumerate(views):
+    return np.stack([np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar) + 0.0 * around], -1)
+
+
+def _sides_of(normal: np.ndarray) -> np.ndarray:
+    """The numbers (...) of the sides of a cube that directions (..., 3) from its center meet."""
+    axis = np.abs(normal).argmax(axis=-1)
+    return 2 * axis + (np.take_along_axis(normal, axis[..., None], -1)[..., 0] < 0.0)
+
+
+def _unfolded(views: dict[int, np.ndarray], within: bool, normal: np.ndarray) -> np.ndarray:
+    """The map (H, W, 3) for directions `normal`, made from pictures of sides; `within`: taken from the inside."""
+    result, side = np.zeros(normal.shape), _sides_of(normal)
+    for number, image in views.items():
         out, right = _side_axes(number)
-        facing = normal @ out
-        better = facing > highest
+        chosen = normal[side == number]
         # From within, light that leaves along the normal is seen by a ray in the opposite direction.
-        up, depth = (np.cross(right, -out), -facing) if within else (np.cross(out, right), np.ones_like(facing))
-        depth = np.where(better & (depth != 0.0), depth, 1.0)
+        up, depth = (np.cross(right, -out), -(chosen @ out)) if within else (np.cross(out, right), 1.0)
         row, column = (
-            np.clip((normal @ axis / depth + 1.0) * 0.5 * VIEW_PIXELS, 0, VIEW_PIXELS - 1).astype(int)
+            np.clip((chosen @ axis / depth + 1.0) * 0.5 * len(image), 0, len(image) - 1).astype(int)
             for axis in (-up, right)
         )
-        result[better], highest[better] = image[row, column][better], facing[better]
+        result[side == number] = image[row, column]
     return result
 
 
 def with_pattern(light: Light, emission: NodeEmission, source: NodeLight, warn) -> list[Light]:
-    """A point, spot or sun times the factor of its nodes: one light, or [] if it is dark."""
-    factor = emission.factor
-    weights = np.sin((np.arange(factor.shape[0]) + 0.5) * (np.pi / factor.shape[0]))[:, None, None]
+    """A point, spot or sun times the factor of its nodes: one light, one for each color, or [] if it is dark."""
+    factor, step = emission.factor, (np.pi - emission.start) / len(emission.factor)
+    weights = np.sin(emission.start + (np.arange(len(factor)) + 0.5) * step)[:, None, None]
     mean = (factor * weights).sum(axis=(0, 1)) / (weights.sum() * factor.shape[1])
     if not mean.any():
         return []
@@ -257,13 +317,18 @@ def with_pattern(light: Light, emission: NodeEmission, source: NodeLight, warn) 
     if emission.lost > MOST_LOST:
         what = "over the sun, shaded as its mean" if light.is_distant else "over the light, shaded as in its middle"
         warn(f"light {light.name!r}: its emission varies {what}, up to {100.0 * emission.lost:.0f} % off on average")
-    if factor.shape[0] == 1:
+    if len(factor) == 1:
         return [light]
-    values = factor.mean(axis=-1) / mean.mean()
-    apart = _apart(values[..., None] * mean, factor)
-    if apart > PATTERN_COLORS:
-        warn(f"light {light.name!r}: the colors of its pattern are shaded as their mean, {100.0 * apart:.0f} % off")
-    return [replace(light, pattern=Pattern(source.axes, values, source.by_ray))]
+    if emission.blurred > MOST_BLURRED:
+        warn(
+            f"light {light.name!r}: its pattern is shaded in steps of {np.degrees(step):.2g} degrees, "
+            f"{100.0 * emission.blurred:.0f} % off on average"
+        )
+    colors = [(np.ones(3), factor.mean(axis=-1) / mean.mean())]
+    if _apart(colors[0][1][..., None] * mean, factor) > PATTERN_COLORS:
+        colors = [(np.eye(3)[n], factor[..., n] / mean[n]) for n in range(3) if mean[n] and light.radiance[n]]
+    patterns = [(color, Pattern(source.axes, values, source.by_ray, emission.start)) for color, values in colors]
+    return [replace(light, radiance=light.radiance * color, pattern=pattern) for color, pattern in patterns]
 
 
 def _covered(light: Light, rows: int, columns: int) -> np.ndarray:
@@ -364,8 +429,5 @@ def _cut(texture: ImageTexture, factor: Value, is_round: bool) -> Patches:
     uv = np.stack([u, v, np.ones_like(u)], axis=-1).reshape(-1, 3) @ mapping.T
     colors = factor.offset + texture.colors(uv) @ factor.matrix[:, :3].T + factor.matrix[:, 3]
     image = colors.reshape(POINTS, SUB, POINTS, SUB, 3).mean(axis=(1, 3))
-    covered = np.ones((POINTS, POINTS), bool)
-    if is_round:
-        x, y = np.meshgrid(*2 * [2.0 * (np.arange(POINTS) + 0.5) / POINTS - 1.0])
-        covered = np.hypot(x, y) < 1.0
-    return cut_into_patches(image, covered, MOST_PATCHES)
+    x, y = np.meshgrid(*2 * [2.0 * (np.arange(POINTS) + 0.5) / POINTS - 1.0])
+    return cut_into_patches(image, (np.hypot(x, y) < 1.0) | (not is_round), MOST_PATCHES)

@@ -17,6 +17,7 @@ import bpy
 from ..render_settings import SCRIPT
 
 MIX, ADD = "ShaderNodeMixShader", "ShaderNodeAddShader"
+_MIXES = MIX, "ShaderNodeMix", "ShaderNodeMixRGB"
 CLEAR, HOLDOUT, PRINCIPLED = "ShaderNodeBsdfTransparent", "ShaderNodeHoldout", "ShaderNodeBsdfPrincipled"
 GROUP_SOCKET_NAME = "ltsh"
 
@@ -177,20 +178,11 @@ def images_behind(data) -> set:
             continue
         known.add((source.node, source.groups))
         images.add(getattr(source.node, "image", None))
-        waiting += [(socket, source.groups) for socket in _inputs_that_count(source.node)]
+        inputs = [socket for socket in source.node.inputs if socket.enabled]
+        if source.node.bl_idname in _MIXES and is_constant(value_of(inputs[0]), 0.0):
+            inputs = inputs[:2]  # the first of both alone has a weight
+        waiting += [(socket, source.groups) for socket in inputs]
     return images - {None}
-
-
-def _inputs_that_count(node) -> list:
-    """The inputs of a node in use, without that of a mix to which a constant factor gives no weight."""
-    inputs = [socket for socket in node.inputs if socket.enabled]
-    if node.bl_idname in (MIX, "ShaderNodeMix", "ShaderNodeMixRGB") and len(inputs) == 3:
-        factor = value_of(inputs[0])
-        if is_constant(factor, 0.0):
-            return inputs[:2]
-        if is_constant(factor, 1.0) and getattr(node, "blend_type", "MIX") == "MIX":
-            return [inputs[0], inputs[2]]
-    return inputs
 
 
 def constant_of(socket, groups: tuple = (), tree_of: Callable = NODE_TREE) -> float | None:

@@ -113,7 +113,7 @@ class NodeLightJob:
 def render_node_lights(lights: list[NodeLightFile], frame: int, folder: Path, take: Callable[..., bool]) -> None:
     """Let Cycles render the nodes of `lights` at a frame, one after another.
 
-    Calls `take(number, factor, lost)` for each, with the values of a `lights.textures.NodeEmission`, until it returns
+    Calls `take(number, factor, traits)` for each, with the values of a `lights.textures.NodeEmission`, until it returns
     False. Files go to `folder`. Raises as `pixels.extract_pixels` does.
     """
 
@@ -121,6 +121,6 @@ def render_node_lights(lights: list[NodeLightFile], frame: int, folder: Path, ta
         number = round(fraction * len(lights)) - 1
         if stage != NODE_LIGHTS:
             return None
-        return take(number, np.load(folder / f"{number}.npy"), np.load(folder / f"{number}_lost.npy").item())
+        return take(number, np.load(folder / f"{number}.npy"), np.load(folder / f"{number}_traits.npy").tolist())
 
     run_job(NodeLightJob([asdict(light) for light in lights], frame), folder, watched)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
+import functools
 import logging
 
 import bpy
@@ -12,6 +12,7 @@ from ...imaging.color import LUMINANCE_WEIGHTS, color_bar, signed_error_colors
 from ...pipeline.mixer import LightPictures
 from ...pipeline.relight import RelightData
 from ...scene import error_line
+from ..saving import is_working_copy
 from . import results
 from .overlay import LINE, PAPER, ROW, draw_gradient, draw_label, draw_rectangle, draw_text, label_places, text_width
 
@@ -21,25 +22,27 @@ PANEL_REGIONS = {"VIEW_3D": "UI", "IMAGE_EDITOR": "UI", "PROPERTIES": "WINDOW"}
 GRIP_PIXELS = 12.0
 HANDLE_PIXELS = 9.0
 _LOOKUP_SIZE = 1024
-_state = {"lookup": None, "settling": set(), "saves_pixels": False, "dragged": None, "probing": False, "drawing": None}
+_state = {"settling": set(), "paths": [], "dragged": None, "probing": False}
 
 
-def changed(settings, context) -> None:
-    """Called by Blender when a setting of the view changes."""
+def changed(settings, context=None) -> None:
+    """Called by Blender when a setting of the view changes. The panels say that a picture is gone when the results are
+    shown again."""
     try:
         refresh(settings.id_data)
     except RuntimeError as error:
-        _warn(error)
+        logging.getLogger(__name__).warning("%s", error_line(error))
 
 
 def mixed(item, context) -> None:
     """Called by Blender when a value of the light mixer changes; shows the mix at once."""
     settings = item.id_data.ltsh
-    if results.is_silent():
+    if results.state["is_silent"]:
         return
     if settings.mode == "MIX":
         changed(settings, context)
     else:
+        settings.mode_before_mix = settings.mode
         settings.mode = "MIX"
     put_in_editor(context, item.id_data)
 
@@ -51,15 +54,10 @@ def mix_render(name: str, pictures: LightPictures, relight_data: RelightData) ->
         scene = bpy.data.scenes.get(name)
         if scene is not None:
             results.mix_render(scene, pictures, relight_data)
-            redraw_image_editors()
+            redraw_editors("IMAGE_EDITOR")
             redraw_panels()
 
     bpy.app.timers.register(take, first_interval=0.0)
-
-
-def _warn(error: RuntimeError) -> None:
-    """Log that a picture is gone; the panels say so when the results are shown again."""
-    logging.getLogger(__name__).warning("%s", error_line(error))
 
 
 def refresh(scene) -> bool:
@@ -85,7 +83,7 @@ def refresh(scene) -> bool:
 def _show(scene, pixels: np.ndarray, as_render: bool) -> None:
     _store(viewer_image(scene), pixels, as_render)
     _settle_later(scene)
-    redraw_image_editors()
+    redraw_editors("IMAGE_EDITOR")
 
 
 def _chosen_images(scene, result, choice) -> list:
@@ -116,10 +114,7 @@ def drag_split(scene, position: float | None) -> None:
     time.
     """
     _state["dragged"] = None if position is None else min(max(position, 0.0), 1.0)
-    try:
-        refresh(scene)
-    except RuntimeError as error:
-        _warn(error)
+    changed(scene.ltsh)
 
 
 def compose(first: np.ndarray, second: np.ndarray, mode: str, split: float, scale: float) -> np.ndarray:
@@ -149,7 +144,6 @@ def viewer_image(scene):
             return image
     image = bpy.data.images.new(NAME, 4, 4, alpha=False, float_buffer=True)
     image[results.LAYER], image[results.SCENE] = "", scene.name
-    image.use_fake_user = True
     return image
 
 
@@ -178,14 +172,13 @@ def _lookup_index(difference: np.ndarray, scale: float) -> np.ndarray:
     return np.where(finite, index, _LOOKUP_SIZE - 1)
 
 
+@functools.cache
 def _error_lookup() -> np.ndarray:
     """Linear colors (N, 3) that Blender's default display shows as the colors of `signed_error_colors`."""
-    if _state["lookup"] is None:
-        values = np.append(np.linspace(-1.0, 1.0, _LOOKUP_SIZE - 1), np.nan)
-        colors = signed_error_colors(values[None], 1.0)[0]
-        linear = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
-        _state["lookup"] = linear.astype(np.float32)
-    return _state["lookup"]
+    values = np.append(np.linspace(-1.0, 1.0, _LOOKUP_SIZE - 1), np.nan)
+    colors = signed_error_colors(values[None], 1.0)[0]
+    linear = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
+    return linear.astype(np.float32)
 
 
 def _settle_later(scene) -> None:
@@ -263,10 +256,10 @@ def _arrange(window, area, attempt: int | None) -> float | None:
     return None
 
 
-def redraw_image_editors() -> None:
-    """Draw all Image Editors again."""
+def redraw_editors(kind: str) -> None:
+    """Draw all areas of a kind again: Blender does not redraw 3D views for properties of add-ons."""
     for area in _areas():
-        if area.type == "IMAGE_EDITOR":
+        if area.type == kind:
             area.tag_redraw()
 
 
@@ -283,33 +276,42 @@ def _areas() -> list:
     return [area for window in bpy.context.window_manager.windows for area in window.screen.areas]
 
 
-@contextlib.contextmanager
-def saving_images_as_they_are():
-    """Context in which saving leaves the images as they are, for copies of the file that no artist opens."""
-    _state["saves_pixels"] = True
-    try:
-        yield
-    finally:
-        _state["saves_pixels"] = False
-
-
 @bpy.app.handlers.persistent
-def _shrink(*_):
-    """Before saving, remove pixels that can be made again from the file."""
-    for scene in bpy.data.scenes if not _state["saves_pixels"] else ():
+def _shrink(path="", *_):
+    """Before saving as `path`, remove pixels that can be made again from the file, and let paths begin at `path`."""
+    if is_working_copy():
+        return
+    owners = [(scene.ltsh, "result_folder") for scene in bpy.data.scenes]
+    owners += [(last, "folder") for scene in bpy.data.scenes for last in scene.ltsh.last_results]
+    _state["paths"] = [(*owner, bpy.path.abspath(getattr(*owner))) for owner in owners if getattr(*owner)]
+    _write_paths(path)
+    for scene in bpy.data.scenes:
         for image in results.our_images(scene):
             if is_viewer(image) and results.result_of(scene) is not None:
                 _store(image, np.zeros((4, 4, 4), dtype=np.float32), image.use_view_as_render)
                 image.pack()
 
 
+def _write_paths(blend: str) -> None:
+    """Let the paths of results begin at the file `blend`."""
+    for owner, name, path in _state["paths"]:
+        setattr(owner, name, results.blender_path(path, blend))
+
+
 @bpy.app.handlers.persistent
 def _restore(*_):
     """After saving and loading, make the pixels again."""
-    if _state["saves_pixels"]:
+    if is_working_copy():
         return
+    _write_paths(bpy.data.filepath)
+    _state["paths"].clear()
+    # Files of former versions keep the pictures of layers.
+    for image in bpy.data.images:
+        if results.LAYER in image and image.use_fake_user:
+            image.use_fake_user = False
     for scene in bpy.data.scenes:
-        if any(is_viewer(image) for image in results.our_images(scene)):
+        is_shown = any(is_viewer(image) for image in results.our_images(scene))
+        if is_shown or results.result_of(scene) is not None:
             refresh(scene)
     settle()
 
@@ -505,8 +507,8 @@ def _draw() -> None:
         draw_label(start, below, f"{first} \u2212 {second}", scale)
         limit = error_scale(settings, result.groups[choice.group], choice)
         _draw_legend(start, below - ROW * scale, limit, scale)
-    if result.partial:
-        draw_label(start, above, result.partial, scale)
+    if results.lacks(result):
+        draw_label(start, above, results.lacks(result), scale)
     draw_probe(context, result, choice, (left, bottom, right, top))
 
 
@@ -530,14 +532,12 @@ def _draw_legend(left: float, below: float, limit: float, scale: float) -> None:
     draw_label(bar + width, below, end, scale)
 
 
-_add_classes, _remove_classes = bpy.utils.register_classes_factory((LTSH_OT_probe, LTSH_GT_wipe, LTSH_GGT_wipe))
-
-
 @bpy.app.handlers.persistent
 def _mix_again(*_):
-    """After undo and redo the mixer may have other values."""
+    """After undo and redo the settings may have other values than the picture that is shown."""
+    images = {area.spaces.active.image for area in _areas() if area.type == "IMAGE_EDITOR"}
     for scene in bpy.data.scenes:
-        if scene.ltsh.mode == "MIX":
+        if scene.ltsh.mode == "MIX" or any(is_viewer(image) and results.belongs(image, scene) for image in images):
             refresh(scene)
 
 
@@ -549,6 +549,7 @@ def _forget_file(*_):
     _state.update(dragged=None, probing=False)
 
 
+CLASSES = (LTSH_OT_probe, LTSH_GT_wipe, LTSH_GGT_wipe)
 HANDLERS = (
     ("load_pre", _forget_file),
     ("save_pre", _shrink), ("save_post", _restore), ("load_post", _restore),
@@ -557,21 +558,13 @@ HANDLERS = (
 
 
 def register() -> None:
-    """Add the probe, the line and the handlers."""
-    for name, function in HANDLERS:
-        getattr(bpy.app.handlers, name).append(function)
-    _add_classes()
+    """Add the drawing over pictures."""
     _state["drawing"] = bpy.types.SpaceImageEditor.draw_handler_add(_draw, (), "WINDOW", "POST_PIXEL")
 
 
 def unregister() -> None:
-    """Remove what `register` added."""
+    """Remove it, and end what goes on."""
     bpy.types.SpaceImageEditor.draw_handler_remove(_state["drawing"], "WINDOW")
-    _remove_classes()
     if bpy.app.timers.is_registered(settle):
         bpy.app.timers.unregister(settle)
     results.forget_renders()
-    for name, function in HANDLERS:
-        handlers = getattr(bpy.app.handlers, name)
-        if function in handlers:
-            handlers.remove(function)

@@ -390,4 +390,3 @@ CLASSES = (
     LTSH_OT_update_moved_lights,
     LTSH_OT_cancel_moved_lights,
 )
-register, unregister = bpy.utils.register_classes_factory(CLASSES)

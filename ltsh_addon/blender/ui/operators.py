@@ -22,20 +22,12 @@ from ..saving import save_working_copy
 from . import comparison, preflight, results
 from .job import Job, Plan, clock, new_folder, output_folder, progress_text, runs_of, session_times, stage_title, steps
 
-
-def save_scene_copy(path: Path) -> None:
-    """Save the open file, unsaved changes included, as `path`. Raises RuntimeError."""
-    with comparison.saving_images_as_they_are():
-        save_working_copy(path)
-
-
 TIMER_SECONDS, WAITING_SECONDS = 0.1, 0.005
-_running: dict = {"job": None}
 
 
 def running_job() -> Job | None:
     """The job that runs now, or None."""
-    return _running["job"]
+    return results.state["job"]
 
 
 class _JobOperator:
@@ -124,13 +116,13 @@ class _JobOperator:
         )
         job.output = runs[-1].options.output
         try:
-            save_scene_copy(copy)
+            save_working_copy(copy)
             job.start([run.to_dict() for run in runs], background=not bpy.app.background)
         except (RuntimeError, OSError, SceneError) as error:
             job.remove_folder()
             self.report({"ERROR"}, error_line(error))
             return False
-        self._job = _running["job"] = job
+        self._job = results.state["job"] = job
         return True
 
     def _show_progress(self, context) -> None:
@@ -181,7 +173,7 @@ class _JobOperator:
         if self._opened and not job.error:
             self._show_all_results(context)
         if running_job() is job:
-            _running["job"] = None
+            results.state["job"] = None
         for workspace in bpy.data.workspaces:
             workspace.status_text_set(None)
         comparison.redraw_panels()
@@ -286,14 +278,14 @@ def _stop(*_):
     """Stop the job before another file is opened, since its scene goes."""
     job = running_job()
     if job is not None:
-        _running["job"] = None
+        results.state["job"] = None
         job.cancel()
 
 
 def _end_now() -> None:
     job = running_job()
     if job is not None:
-        _running["job"] = None
+        results.state["job"] = None
         job.end_now()
 
 
@@ -340,7 +332,7 @@ class LTSH_OT_show_results(bpy.types.Operator):
     command: EnumProperty(name="Command", description="Whose results", items=COMMANDS)
 
     def execute(self, context):
-        folder = output_folder(context.scene, self.command) / "images"
+        folder = last_folder(context.scene, self.command)
         if results.result_in(str(folder)) is None:
             self.report({"ERROR"}, f"{folder} holds no results: run the command first")
             return {"CANCELLED"}
@@ -461,9 +453,14 @@ class LTSH_OT_restore_materials(bpy.types.Operator):
         return {"FINISHED"}
 
 
+def last_folder(scene, command: str) -> Path:
+    """The folder of the last results of `command`, wherever the file and new results are saved since."""
+    return results.folder_of(scene, command, output_folder(scene, command) / "images")
+
+
 def last_bake(scene):
     """The results of the last bake of `scene`; None if there is none."""
-    result = results.result_in(str(output_folder(scene, "bake") / "images"))
+    result = results.result_in(str(last_folder(scene, "bake")))
     return result if result is not None and result.command == "bake" and result.report["objects"] else None
 
 
@@ -529,18 +526,13 @@ CLASSES = (
     LTSH_OT_restore_materials,
     LTSH_OT_manual,
 )
-_register, _unregister = bpy.utils.register_classes_factory(CLASSES)
+HANDLERS = (("load_pre", _stop),)
 
 
 def register():
-    _register()
-    bpy.app.handlers.load_pre.append(_stop)
     atexit.register(_end_now)
 
 
 def unregister():
     _end_now()
     atexit.unregister(_end_now)
-    if _stop in bpy.app.handlers.load_pre:
-        bpy.app.handlers.load_pre.remove(_stop)
-    _unregister()

@@ -13,7 +13,7 @@ from .job import clock, output_folder, progress_text, stage_title
 from .operators import COMMANDS
 from .preflight import APPROXIMATED, EXACT, LEFT_OUT, overview
 from .preview import ENGINE, is_previewing
-from .settings import active_light
+from .settings import active_light, lights_of
 
 # Widths in pixels at interface scale 1.
 LETTER_PIXELS = 6.6  # mean width of a letter of Blender's interface
@@ -256,7 +256,6 @@ class _Final:
     """F12 with our engine."""
 
     bl_label = "Final Render"
-    bl_options = {"DEFAULT_CLOSED"}
 
     @classmethod
     def poll(cls, context):
@@ -396,6 +395,9 @@ class _Lights(_Entries):
 
     def draw(self, context):
         layout, scene = self.layout, context.scene
+        if not lights_of(scene):
+            draw_text(gray(layout), context, "No light in the scene: add one (Shift A)", "INFO")
+            return
         layout.template_list("LTSH_UL_lights", "", scene, "objects", scene.ltsh, "active_light", rows=LIGHT_ROWS)
         ob = active_light(context)
         if ob is None:
@@ -483,14 +485,14 @@ class _Results:
         result = results.result_of(scene)
         for command, title, _ in COMMANDS:
             cell = row.row(align=True)
-            cell.enabled = results.result_in(str(output_folder(scene, command) / "images")) is not None
+            cell.enabled = results.result_in(str(operators.last_folder(scene, command))) is not None
             shown = result is not None and result.command == command
             cell.operator("ltsh.show_results", text=title, depress=shown).command = command
         if result is None:
             draw_text(layout, context, "None yet: shade, compare or bake first", "INFO")
             return
-        if result.partial:
-            draw_text(layout.box(), context, result.partial, "ERROR")
+        if results.lacks(result):
+            draw_text(layout.box(), context, results.lacks(result), "INFO")
         if len(result.groups) > 1:
             layout.prop_search(scene.ltsh, "group", scene.ltsh, "groups", icon="TEXTURE")
         self.draw_choice(context, result)
@@ -536,6 +538,7 @@ class LTSH_PT_IMAGE_results(_Results, bpy.types.Panel):
         for item in settings.bl_rna.properties["mode"].enum_items:
             row = modes.row(align=True)
             row.enabled = len(group["names"]) > 1 or item.identifier in results.OF_ONE_PICTURE
+            row.enabled &= item.identifier != "MIX" or results.has_mixer(context.scene, result)
             row.prop_enum(settings, "mode", item.identifier)
         if choice.mode == "MIX":
             column.prop(context.scene.view_settings, "exposure", text="Exposure of the Scene")
@@ -577,4 +580,3 @@ CLASSES = (
     *in_both_places(_Materials, "materials", "main"),
     LTSH_PT_IMAGE_results,
 )
-register, unregister = bpy.utils.register_classes_factory(CLASSES)

@@ -22,16 +22,15 @@ from ...scene import error_line
 from ..extract.apply import shows_texture
 from ..extract.bake_meshes import ObjectError, check_object
 from ..lights.area import LightInventory, node_light, reason_to_leave_out
-from ..lights.area import (
-    note_unsupported as note_unsupported_light,
-)
+from ..lights.area import note_unsupported as note_unsupported_light
 from ..lights.emission import emission_of
 from ..lights.world import may_shine
 from ..materials.aovs import notes_of_material
 from ..materials.bsdfs import bsdf_of, is_emission
 from ..materials.graph import shaders_behind, surface_of
+from ..materials.preview_material import preview_of
 from ..render_settings import CAMERA_KINDS, CAMERA_TYPES, picture_size
-from .preview import view_of
+from .preview import ENGINE, view_of
 
 EXACT, APPROXIMATED, LEFT_OUT = "exact", "approximated", "left out"
 
@@ -134,7 +133,7 @@ def _object_problem(ob, uv_map: str) -> Problem | None:
     try:
         check_object(ob)
     except ObjectError as error:
-        return Problem(_sentence(str(error)))
+        return Problem(str(error)[:1].upper() + str(error)[1:])
     if not ob.data.polygons and not ob.modifiers:
         return Problem(f"Object {ob.name!r} has no faces")
     if uv_map and uv_map not in ob.data.uv_layers and ob.data.uv_layers:
@@ -144,10 +143,6 @@ def _object_problem(ob, uv_map: str) -> Problem | None:
         text = f"Object {ob.name!r} has no UV map"
         return Problem(text, True, "ltsh.add_uv_map", "Unwrap", {"object_name": ob.name})
     return None
-
-
-def _sentence(text: str) -> str:
-    return text[:1].upper() + text[1:]
 
 
 def _camera(scene) -> list[Problem]:
@@ -175,13 +170,9 @@ def _lights(scene) -> list[Problem]:
 
 def materials_of(scene) -> list:
     """Materials of the objects of `scene` that render, each once, sorted by name."""
-    by_name = {}
-    for ob in scene.objects:
-        if not ob.hide_render and ob.type not in ("LIGHT", "CAMERA"):
-            for slot in ob.material_slots:
-                if slot.material is not None:
-                    by_name[slot.material.name_full] = slot.material
-    return [by_name[name] for name in sorted(by_name)]
+    objects = (ob for ob in scene.objects if not ob.hide_render and ob.type not in ("LIGHT", "CAMERA"))
+    materials = {slot.material for ob in objects for slot in ob.material_slots} - {None}
+    return sorted(materials, key=lambda material: material.name_full)
 
 
 def glows(material) -> bool:
@@ -357,17 +348,18 @@ class Overview:
     materials: tuple[Entry, ...]
 
 
-_known: dict[str, Overview] = {}
+_known: dict[tuple[str, bool], Overview] = {}
 
 
 def overview(scene) -> Overview:
     """Lights and materials of `scene`; read again after any change of the file."""
-    if scene.name not in _known:
-        _known[scene.name] = Overview(
+    in_view = scene.render.engine == ENGINE
+    if (scene.name, in_view) not in _known:
+        _known[scene.name, in_view] = Overview(
             tuple(_light(ob) for ob in scene.objects if ob.type == "LIGHT" and not ob.hide_render),
-            tuple(_material(material) for material in materials_of(scene)),
+            tuple(_material(material, in_view) for material in materials_of(scene)),
         )
-    return _known[scene.name]
+    return _known[scene.name, in_view]
 
 
 def _light(ob) -> Entry:
@@ -385,13 +377,16 @@ def _light(ob) -> Entry:
     return Entry(ob.name, kind, APPROXIMATED if notes else EXACT, tuple(notes))
 
 
-def _material(material) -> Entry:
+def _material(material, in_view: bool) -> Entry:
+    """The entry of a material; with what the view says of it, if the view is ours."""
     surface = surface_of(material)
     if surface is None:
         return Entry(material.name, "", EXACT)
     shaders = shaders_behind(surface)
     # An emissive material is a kind, not a defect: leave out the note that it does not light the scene.
     notes = tuple(dict.fromkeys(notes_of_material(surface.node, shaders, emitter=True)))
+    of_view = preview_of(material).notes if in_view else ()
+    notes += tuple(f"in the view: {note.removeprefix(f'{material.name}: ')}" for note in dict.fromkeys(of_view))
     shown = [bsdf_of(leaf.node) or is_emission(leaf.node) or leaf.is_transparent for leaf in shaders.leaves]
     state = LEFT_OUT if shown and not any(shown) else APPROXIMATED if notes else EXACT
     return Entry(material.name, "emissive" if glows(material) else "", state, notes)
@@ -410,18 +405,7 @@ CLASSES = (
     LTSH_OT_add_uv_map,
     LTSH_OT_pack_image,
 )
-_register_classes, _unregister_classes = bpy.utils.register_classes_factory(CLASSES)
+HANDLERS = tuple((event, _forget) for event in ("depsgraph_update_post", "load_post", "undo_post", "redo_post"))
 
 
-def register():
-    _register_classes()
-    for handlers in (bpy.app.handlers.depsgraph_update_post, bpy.app.handlers.load_post, bpy.app.handlers.undo_post):
-        handlers.append(_forget)
-
-
-def unregister():
-    for handlers in (bpy.app.handlers.depsgraph_update_post, bpy.app.handlers.load_post, bpy.app.handlers.undo_post):
-        if _forget in handlers:
-            handlers.remove(_forget)
-    _known.clear()
-    _unregister_classes()
+register = unregister = _known.clear

@@ -5,6 +5,8 @@ Files are saved with the artist's engine and viewport shading, so that they open
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import bpy
 from bpy.app.handlers import persistent
 
@@ -37,7 +39,7 @@ class LTSH_OT_preview(bpy.types.Operator):
         space = view_of(context)
         if scene.render.engine != ENGINE:
             if space is not None:
-                _lent_views[space.as_pointer()] = (scene.session_uid, space.shading.type)
+                _lent_views[space.as_pointer()] = _LentView(scene.session_uid, space.shading.type)
             scene.ltsh_view.artist_engine = scene.render.engine
             scene.render.engine = ENGINE
         if space is not None:
@@ -45,9 +47,18 @@ class LTSH_OT_preview(bpy.types.Operator):
         return {"FINISHED"}
 
 
-# By the address of a 3D view that shows a preview: its scene, and the shading to restore. Kept only in memory, since
-# undo does not change views, and files are saved without previews.
-_lent_views: dict[int, tuple[int, str]] = {}
+@dataclass
+class _LentView:
+    """A 3D view that shows a preview, or has shown one that undo or redo may bring back."""
+
+    scene: int  # its session_uid
+    former: str  # the shading to restore
+    shows: bool = True  # the preview, now
+
+
+# By the address of the view. Kept only in memory, since undo does not change views, and files are saved without
+# previews.
+_lent_views: dict[int, _LentView] = {}
 
 
 def view_of(context):
@@ -60,36 +71,31 @@ def view_of(context):
     return space
 
 
-def _shading_before(scene) -> list:
-    """Restore the shading of the views that show a preview of `scene`, and return them.
+def _views_of(scene) -> list[tuple]:
+    """The 3D views that were lent to the preview of `scene`, each with its `_LentView`."""
+    spaces = [space for screen in bpy.data.screens for area in screen.areas for space in area.spaces]
+    views = [(space, _lent_views.get(space.as_pointer())) for space in spaces if space.type == "VIEW_3D"]
+    return [(space, lent) for space, lent in views if lent is not None and lent.scene == scene.session_uid]
+
+
+def _let_views_follow(scene) -> None:
+    """Show the preview of `scene` in its views, or restore them, after its engine has changed.
 
     Views whose shading was changed by hand since then stay as they are.
     """
-    restored = []
-    for space in (space for screen in bpy.data.screens for area in screen.areas for space in area.spaces):
-        owner, former = _lent_views.get(space.as_pointer(), (None, ""))
-        if owner == scene.session_uid and space.type == "VIEW_3D" and space.shading.type == "RENDERED":
-            space.shading.type = former
-            restored.append(space)
-    return restored
-
-
-def _give_back_views(scene) -> None:
-    """Restore the views of the preview of `scene`, and forget them."""
-    _shading_before(scene)
-    _forget_views(scene)
-
-
-def _forget_views(scene) -> None:
-    for address in [address for address, (owner, _) in _lent_views.items() if owner == scene.session_uid]:
-        del _lent_views[address]
+    shows = is_previewing(scene)
+    for space, lent in _views_of(scene):
+        if space.shading.type != ("RENDERED" if lent.shows else lent.former):
+            del _lent_views[space.as_pointer()]
+        elif shows != lent.shows:
+            space.shading.type, lent.shows = "RENDERED" if shows else lent.former, shows
 
 
 def stop_preview(scene) -> None:
     """End the preview of `scene`: restore the artist's engine and the shading of views."""
-    _give_back_views(scene)
     wanted = scene.ltsh_view.artist_engine
     scene.ltsh_view.artist_engine = ""
+    _let_views_follow(scene)
     try:
         scene.render.engine = wanted
     except TypeError:
@@ -98,7 +104,6 @@ def stop_preview(scene) -> None:
 
 
 _saved: list[str] = []
-_saved_views: list = []
 
 
 @persistent
@@ -106,32 +111,25 @@ def _before_saving(*_) -> None:
     # A copy for a render of our own keeps the engine: the render has begun.
     if keeps_engine():
         return
-    _saved.clear()
-    _saved_views.clear()
-    for scene in bpy.data.scenes:
-        if is_previewing(scene):
-            _saved.append(scene.name)
-            _saved_views.extend(_shading_before(scene))
-            scene.render.engine = scene.ltsh_view.artist_engine
+    _saved[:] = [scene.name for scene in bpy.data.scenes if is_previewing(scene)]
+    for scene in (bpy.data.scenes[name] for name in _saved):
+        scene.render.engine = scene.ltsh_view.artist_engine
+        _let_views_follow(scene)
 
 
 @persistent
 def _after_saving(*_) -> None:
-    for name in _saved:
-        if name in bpy.data.scenes:
-            bpy.data.scenes[name].render.engine = ENGINE
-    for space in _saved_views:
-        space.shading.type = "RENDERED"
+    for scene in (bpy.data.scenes[name] for name in _saved if name in bpy.data.scenes):
+        scene.render.engine = ENGINE
+        _let_views_follow(scene)
     _saved.clear()
-    _saved_views.clear()
 
 
 @persistent
 def _after_undo(*_) -> None:
-    """Undo may end a preview: it restores the engine, but not the views."""
+    """Undo and redo may end a preview or bring it back: they restore the engine, but not the views."""
     for scene in bpy.data.scenes:
-        if not is_previewing(scene):
-            _give_back_views(scene)
+        _let_views_follow(scene)
 
 
 @persistent
@@ -149,7 +147,8 @@ def _engine_changed() -> None:
     for scene in bpy.data.scenes:
         if scene.render.engine != ENGINE and scene.ltsh_view.artist_engine:
             scene.ltsh_view.artist_engine = ""
-            _forget_views(scene)
+            for space, _ in _views_of(scene):
+                del _lent_views[space.as_pointer()]
 
 
 _subscriber = object()
@@ -163,31 +162,21 @@ def _subscribe() -> None:
     )
 
 
+CLASSES = (LTSH_OT_preview,)
 HANDLERS = (
     ("save_pre", _before_saving),
     ("save_post", _after_saving),
     ("save_post_fail", _after_saving),
     ("undo_post", _after_undo),
+    ("redo_post", _after_undo),
     ("load_post", _after_loading),
 )
-
-
-def register() -> None:
-    """Add the operator and the handlers."""
-    bpy.utils.register_class(LTSH_OT_preview)
-    for name, function in HANDLERS:
-        getattr(bpy.app.handlers, name).append(function)
-    _subscribe()
+register = _subscribe
 
 
 def unregister() -> None:
-    """End all previews; remove operator and handlers."""
+    """End all previews."""
     bpy.msgbus.clear_by_owner(_subscriber)
     for scene in bpy.data.scenes:
         if is_previewing(scene):
             stop_preview(scene)
-    for name, function in HANDLERS:
-        functions = getattr(bpy.app.handlers, name)
-        if function in functions:
-            functions.remove(function)
-    bpy.utils.unregister_class(LTSH_OT_preview)

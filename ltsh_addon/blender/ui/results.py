@@ -30,7 +30,7 @@ class Result:
 
     folder: Path
     command: str  # that made them: shade, compare or bake
-    partial: str  # what is missing; "": nothing
+    partial: str  # what these pictures lack that their job adds later; "": nothing
     report: dict  # of the command
     groups: dict  # groups of pictures: of baked textures by the stem of their files, of the camera's picture by ""
 
@@ -54,6 +54,8 @@ class Choice:
     mode: str
 
 
+# The job that runs now, or None (see `operators.running_job`); True while this module sets values of the mixer.
+state: dict = {"job": None, "is_silent": False}
 _read: dict[str, tuple[tuple, Result]] = {}
 _pixels: dict[str, tuple[tuple, np.ndarray]] = {}
 PIXELS_KEPT = 8
@@ -62,6 +64,18 @@ PIXELS_KEPT = 8
 def result_of(scene) -> Result | None:
     """The results of `scene`; None if there are none or their folder is gone. Files are read once."""
     return result_in(scene.ltsh.result_folder) if scene.ltsh.result_folder else None
+
+
+def lacks(result: Result) -> str:
+    """What the pictures lack while the job runs that adds it; "": nothing, or they stay as they are."""
+    job = state["job"]
+    return result.partial if job is not None and result.folder in map(Path, job.results) else ""
+
+
+def folder_of(scene, command: str, current: Path) -> Path:
+    """The folder of the last results of `command`, wherever the file was saved since; `current` if it is gone."""
+    last = scene.ltsh.last_results.get(command)
+    return current if last is None or result_in(last.folder) is None else Path(bpy.path.abspath(last.folder))
 
 
 def result_in(folder: str) -> Result | None:
@@ -83,30 +97,38 @@ def choice_of(settings, result: Result) -> Choice:
     name, group = result.group(settings.group)
     names, passes = group["names"], group["passes"]
     first = settings.first if settings.first in names else names[0]
-    second = settings.second if settings.second in names else next((n for n in names[::-1] if n != first), first)
+    # A picture is never compared with itself, as long as there is another one.
+    others = [name for name in names if name != first] or [first]
+    second = settings.second if settings.second in others else others[-1]
     pass_name = settings.pass_name if settings.pass_name in passes else passes[-1]
+    mode = settings.mode if settings.mode != "MIX" or has_mixer(settings.id_data, result) else settings.mode_before_mix
     # A picture alone is not compared.
-    mode = settings.mode if len(names) > 1 or settings.mode in OF_ONE_PICTURE else "A"
+    mode = mode if len(names) > 1 or mode in OF_ONE_PICTURE else "A"
     return Choice(name, first, second, pass_name, mode)
 
 
 def show(scene, folder: Path) -> None:
     """Make the pictures in `folder` the results of `scene`, with images for the chosen pass."""
-    scene.ltsh.result_folder = _blender_path(folder)
+    before, scene.ltsh.result_folder = scene.ltsh.result_folder, blender_path(folder)
     _pixels.clear()
     forget_renders()
     result = result_of(scene)
     if result is None:
         return
     settings = scene.ltsh
+    last = settings.last_results.get(result.command) or settings.last_results.add()
+    last.name, last.folder = result.command, settings.result_folder
+    if before != settings.result_folder or not has_mixer(scene, result):
+        leave_mix(settings)
     settings.groups.clear()
     for name in result.groups:
         settings.groups.add().name = name
     choice = choice_of(settings, result)
     # The artist's choice stays if the new results have it, or will have it once they are complete.
     for key in ("group", "first", "second", "pass_name") if not result.partial else ():
-        if getattr(settings, key) != getattr(choice, key) and _offers(settings, key, getattr(choice, key)):
-            settings[key] = _stored(settings, key, getattr(choice, key))
+        is_alone = key == "second" and choice.second == choice.first
+        if getattr(settings, key) != getattr(choice, key) and not is_alone:
+            set_silently(settings, key, getattr(choice, key))
     wanted = {_full(name, layer) for name, group in result.groups.items() for layer in group["files"]}
     for image in [image for image in our_images(scene) if image[LAYER] not in wanted and image[LAYER]]:
         bpy.data.images.remove(image)
@@ -133,10 +155,10 @@ def layer_image(scene, result: Result, group: str, layer: str):
     if image is None:
         image = bpy.data.images.load(str(path), check_existing=False)
         image.name = PREFIX + full
+        # Without users, files do not keep it: it is read again from the results.
         image[LAYER], image[SCENE] = full, scene.name
-        image.use_fake_user = True
     is_error = layer.startswith(ERROR)
-    _set(image, "filepath", _blender_path(path))
+    _set(image, "filepath", blender_path(path))
     _set(image.colorspace_settings, "name", "Non-Color" if is_error else linear_space())
     _set(image, "use_view_as_render", not is_error)
     return image
@@ -202,31 +224,34 @@ def _full(group: str, layer: str) -> str:
     return f"{group} {layer}".strip()
 
 
-def _blender_path(path: Path) -> str:
-    """`path` relative to the .blend if possible, so that both can move together."""
-    if not bpy.data.filepath:
+def blender_path(path, blend: str = "") -> str:
+    """`path` relative to the .blend (the open one, or `blend`) if possible, so that both can move together."""
+    blend = blend or bpy.data.filepath
+    if not blend:
         return str(path)
     try:
-        return bpy.path.relpath(str(path))
+        return bpy.path.relpath(str(path), start=str(Path(blend).parent))
     except ValueError:  # another drive of Windows
         return str(path)
 
 
-def _offers(settings, key: str, value: str) -> bool:
+def set_silently(settings, key: str, value: str) -> None:
+    """Set a property, if it offers `value`, without a call of its update function."""
     items = getattr(settings.bl_rna.properties[key], "enum_items", None)
-    return items is None or value in items
+    if items is None or value in items:
+        settings[key] = value if items is None else items[value].value
 
 
-def _stored(settings, key: str, value: str):
-    """`value` as it is stored in `settings[key]`; setting it there does not call the property's update function."""
-    items = getattr(settings.bl_rna.properties[key], "enum_items", None)
-    return value if items is None else items[value].value
+def leave_mix(settings) -> None:
+    """Show the pictures again as before the light mixer."""
+    if settings.mode == "MIX":
+        set_silently(settings, "mode", settings.mode_before_mix)
 
 
 # The light mixer:
 
 # The mixer of the picture that was asked for last, and its MovedLights.
-_mixer: dict = {"stamp": None, "mixer": None, "moved": None, "is_silent": False}
+_mixer: dict = {"stamp": None, "mixer": None, "moved": None}
 # Mixers that threads read, by the stamp of their file.
 _readings: dict[tuple, Future] = {}
 # Mixers and MovedLights of final renders by the name of their scene, while nothing else is shown. They are in no file.
@@ -234,6 +259,11 @@ _rendered: dict[str, tuple[Mixer, MovedLights | None]] = {}
 # MOST_BYTES: final renders with larger samples do not keep them for moved lights. IDLE_SECONDS: the processes for moved
 # lights end after so long without use.
 MOST_BYTES, IDLE_SECONDS = 1 << 31, 60.0
+
+
+def has_mixer(scene, result: Result) -> bool:
+    """True if `mixer_of` has a mixer, without reading it."""
+    return scene.name in _rendered or (result.folder / MIXER_FILE).exists()
 
 
 def mixer_of(scene) -> Mixer | None:
@@ -278,7 +308,9 @@ def mix_render(scene, pictures: LightPictures, relight_data: RelightData) -> Non
     size = sum(getattr(relight_data.extraction.samples, item.name).nbytes for item in fields(SurfaceSamples))
     moved = MovedLights(lambda: (relight_data, relight_data.extraction.occluders)) if size <= MOST_BYTES else None
     _rendered[scene.name] = Mixer(pictures), moved
-    _take_rows(scene)
+    # The picture shows the lights as they are in the scene.
+    reset_mixer(scene)
+    leave_mix(scene.ltsh)
 
 
 def forget_renders() -> None:
@@ -431,7 +463,7 @@ def reset_mixer(scene) -> None:
 
 def _take_rows(scene) -> None:
     """Give each row of the mixer an item. Existing values stay, unless the light was changed in the scene since."""
-    items, _mixer["is_silent"] = scene.ltsh.mixed, True
+    items, state["is_silent"] = scene.ltsh.mixed, True
     for row, item in mixer_pairs(scene):
         settings = next(iter(row.settings.values()), [0.0] * 5)
         if item is None:
@@ -441,12 +473,7 @@ def _take_rows(scene) -> None:
             continue
         item.power, item.exposure, item.color, item.settings = 1.0, 0.0, row.color, settings
         item.muted = item.solo = item.applied = False
-    _mixer["is_silent"] = False
-
-
-def is_silent() -> bool:
-    """True while this module sets values of the mixer."""
-    return _mixer["is_silent"]
+    state["is_silent"] = False
 
 
 def mix_label(scene) -> str:

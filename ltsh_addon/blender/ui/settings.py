@@ -23,7 +23,7 @@ from bpy.props import (
 
 from ...scene import CYCLES, REFERENCE, TECHNIQUES
 from ...workers.pool import CORES_VARIABLE
-from .comparison import changed, mixed
+from .comparison import changed, mixed, redraw_editors
 
 # The name of the add-on: "bl_ext.user_default.ltsh" in Blender, "ltsh_addon" when imported from elsewhere.
 ADDON = __package__.rsplit(".", 3)[0]
@@ -151,14 +151,6 @@ MODES = (
 )
 
 
-def _redraw_views(settings, context) -> None:
-    """Show a changed setting at once: Blender does not redraw 3D views for properties of add-ons."""
-    for window in context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type == "VIEW_3D":
-                area.tag_redraw()
-
-
 class LTSH_PG_mixed_light(bpy.types.PropertyGroup):
     """What the light mixer makes of a light, by its name."""
 
@@ -179,6 +171,12 @@ class LTSH_PG_mixed_light(bpy.types.PropertyGroup):
     applied: BoolProperty(description="The scene has values of the mixer", options={"HIDDEN"})
     # Settings of the light in Blender when the picture was made; the values above belong to them.
     settings: FloatVectorProperty(size=5, options={"HIDDEN"})
+
+
+class LTSH_PG_last_result(bpy.types.PropertyGroup):
+    """Where the last results of a command are, by its name."""
+
+    folder: StringProperty(subtype="DIR_PATH", options={"HIDDEN", "PATH_SUPPORTS_BLEND_RELATIVE"})
 
 
 NOT_HELD = -1
@@ -248,10 +246,13 @@ def _release(ob) -> None:
 
 
 def _is_muted(settings) -> bool:
-    return bool((_hidden(settings.id_data) if settings.held == NOT_HELD else settings.held) & 2)
+    ob = settings.id_data
+    return bool(_hidden(ob) if settings.held == NOT_HELD else settings.held) or ob.hide_get()
 
 
 def _set_muted(settings, muted: bool) -> None:
+    if not muted and settings.id_data.hide_get():
+        settings.id_data.hide_set(False)
     if settings.held != NOT_HELD and any(ob.ltsh_light.solo for ob in lights_of(bpy.context.scene)):
         settings.held = 3 if muted else 0
     else:
@@ -263,7 +264,8 @@ class LTSH_PG_light(bpy.types.PropertyGroup):
     """What the list of lights changes in an object."""
 
     mute: BoolProperty(
-        name="Mute", description="Hide the light in views and renders", get=_is_muted, set=_set_muted
+        name="Mute", description="Hide the light in views and renders; also closed where H hides it",
+        get=_is_muted, set=_set_muted,
     )  # fmt: skip
     solo: BoolProperty(
         name="Solo", description="Hide all lights that are not on solo, in views and renders, until this is off again",
@@ -299,7 +301,7 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
         name="Shadows",
         description="Surfaces stand in each other's light, in the Cycles reference too; without, pictures show how "
         "well a technique shades alone",
-        default=True, update=_redraw_views,
+        default=True, update=lambda self, context: redraw_editors("VIEW_3D"),
     )  # fmt: skip
     shadow_rays: IntProperty(
         name="Shadow Rays",
@@ -343,6 +345,7 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
         name="Active Light", description="Click a light to select it", get=_active_index, set=_select,
         options={"HIDDEN"},
     )  # fmt: skip
+    last_results: CollectionProperty(type=LTSH_PG_last_result, options={"HIDDEN"})
     result_folder: StringProperty(
         name="Results", description="Folder of the pictures that are shown",
         subtype="DIR_PATH", options={"HIDDEN", "PATH_SUPPORTS_BLEND_RELATIVE"},
@@ -352,6 +355,7 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
     mode: EnumProperty(
         name="View", description="How the two pictures are shown", items=MODES, default="WIPE", update=changed
     )
+    mode_before_mix: StringProperty(default="WIPE", options={"HIDDEN"})
     groups: CollectionProperty(type=bpy.types.PropertyGroup)
     group: StringProperty(name="Object", description="Which baked texture is shown", update=changed)
     first: EnumProperty(
@@ -409,18 +413,17 @@ CLASSES = (
     LTSH_AddonPreferences,
     LTSH_PG_mixed_light,
     LTSH_PG_light,
+    LTSH_PG_last_result,
     LTSH_PG_scene,
     LTSH_OT_add_preset,
     LTSH_PT_presets,
 )
-_add_classes, _remove_classes = bpy.utils.register_classes_factory(CLASSES)
 # The folder in which Blender looks for a folder "presets".
 PRESETS_PARENT = str(Path(__file__).parent)
 
 
 def register() -> None:
-    """Add settings, preferences and presets, and apply the preferences."""
-    _add_classes()
+    """Add settings and presets, and apply the preferences."""
     apply(bpy.context)
     bpy.types.Scene.ltsh = PointerProperty(type=LTSH_PG_scene, name="LTSH")
     bpy.types.Object.ltsh_light = PointerProperty(type=LTSH_PG_light, name="LTSH Light")
@@ -442,4 +445,3 @@ def unregister() -> None:
     logger.setLevel(logging.NOTSET)
     while _variables_before:
         _set_variable(*_variables_before.popitem())
-    _remove_classes()

@@ -18,12 +18,12 @@ from ...emitters.facing import LEAST_SHRINKING, NEAR_DISK
 from ...emitters.light_polygons import ROUND_CORNERS, ROUND_LIMITS
 from ...lobes import moments32
 from ...lobes.lookup_table import LookupTable
-from ...scene import Light, PolygonLight
+from ...scene import Light, PolygonLight, round_outline
 from ...shading.header import float_literal
 from .drawing import float_texture
 
 HEADER = 7  # texels of a light's header, see `light_texels`
-WIDTH = 256  # texels of a row of the texture of lights
+WIDTH = 1024  # texels of a row of the texture of lights
 # Flags of a light, from the lowest bit on. UNEVEN: not equally bright all over. PROFILE: with a spread or a falloff.
 # CAP: seen as a cap of the sphere. PLACED: with a pattern by the position on the light.
 FLAGS = (
@@ -31,13 +31,6 @@ FLAGS = (
     *("UNEVEN", "PROFILE", "CAP", "PLACED"),
 )
 _QUAD = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
-
-
-def _circle(count):
-    """Corners (count, 2) of a regular polygon with the area of the unit circle, as in `Light.polygon`."""
-    step = 2.0 * np.pi / count
-    angle = step * np.arange(count)
-    return np.sqrt(step / np.sin(step)) * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
 # _FEW_SIZES: the apparent width up to which round lights that no horizon cuts get 8 or 16 corners. Width is the squared
@@ -50,7 +43,7 @@ _SIZES = (*_FEW_SIZES.values(), *(0.25 * limit * limit for limit in ROUND_LIMITS
 _NODES = tuple(sorted({effort.layers for effort in light_profile.DISK_LAYERS}))
 _SHARED = [
     _QUAD,
-    *(_circle(count) for count in _CIRCLES),
+    *(round_outline(count).T for count in _CIRCLES),
     *(np.stack(light_profile.gauss_legendre(count), axis=1) for count in _NODES),
 ]
 _FIRST = np.concatenate([[0], np.cumsum([len(texels) for texels in _SHARED])])[:-1].tolist()
@@ -94,7 +87,8 @@ def light_texels(lights: Iterable[Light]) -> np.ndarray:
         5   tan h and 1 / (tan h - h) of the spread, 0 without profile; largest half length; bound
         6   power of the falloff; its smoothing; area; first texel of the pattern, 0: there is none
 
-    A pattern is three texels of its axes, with height, width and `by_ray` as w, then its values, four per texel.
+    A pattern is three texels of its axes, with rows from pole to pole, width and `by_ray` as w, one of its number of
+    rows, then its values, four per texel.
 
     Bound: along any axis no corner is farther from the center than the bound times the sum of the extents of half_u
     and half_v.
@@ -120,9 +114,10 @@ def light_texels(lights: Iterable[Light]) -> np.ndarray:
 def _pattern_texels(pattern) -> np.ndarray:
     if pattern is None:
         return np.zeros((0, 4))
-    traits = np.array([*pattern.values.shape, pattern.by_ray])[:, None]
+    rows, columns = pattern.values.shape
+    traits = np.array([rows * np.pi / (np.pi - pattern.start), columns, pattern.by_ray])[:, None]
     values = np.pad(pattern.values.ravel(), (0, -pattern.values.size % 4)).reshape(-1, 4)
-    return np.concatenate([np.concatenate([pattern.axes, traits], axis=1), values])
+    return np.concatenate([np.concatenate([pattern.axes, traits], axis=1), [[rows, 0.0, 0.0, 0.0]], values])
 
 
 def visible_lights(lights: Iterable[Light]) -> list[Light]:

@@ -53,18 +53,15 @@ class HorizonPass:
         Pixels take the smooth horizon where its share is at least `threshold`. `view` is the camera's place and 1, or
         for parallel views the unit direction toward it and 0.
         """
-        self._resize(gbuffer.size, gbuffer.mask)
+        if gbuffer.size != self._size or gbuffer.mask is not self._mask:
+            self._size, self._mask = gbuffer.size, gbuffer.mask
+            self._textures = {name: empty_texture(self._size) for name in _RESULTS.values()}
+            self._buffers = {step: frame_buffer(self._textures[name], self._mask) for step, name in _RESULTS.items()}
         corners = [len(light.corners) if isinstance(light, PolygonLight) else 1 for light in lights.lights]
         self._run(BOUNDS, gbuffer, lights, draw_ranges([1] * len(corners)))
         self._run(EXCESS, gbuffer, lights, draw_ranges([horizons.AROUND * count for count in corners]), view=view)
         self._run(CHOICE, gbuffer, lights, [(0, 0)], threshold=threshold)
         return self._textures[_RESULTS[CHOICE]]
-
-    def _resize(self, size, mask) -> None:
-        if size != self._size or mask is not self._mask:
-            self._textures = {name: empty_texture(size) for name in _RESULTS.values()}
-            self._buffers = {step: frame_buffer(self._textures[name], mask) for step, name in _RESULTS.items()}
-            self._size, self._mask = size, mask
 
     def _run(self, step, gbuffer, lights, ranges, **constants) -> None:
         shader, uploaded = self._shaders[step], {**self._textures, "lights": lights.texture}

@@ -65,7 +65,7 @@ class LiveNodeLights:
         names = {"AREA": ("shape", "size", "size_y"), "SUN": ("angle",)}.get(data.type, ("use_soft_falloff",))
         if data.type in ("POINT", "SPOT") and (source.is_mixed or not source.by_ray):
             names = (*names, "shadow_soft_size")
-        if source.by_spot:
+        if source.by_spot or source.by_ray and data.type == "SPOT":
             names = (*names, "spot_size")
         where = (source.matrix.tobytes(), source.facts) if source.is_placed else ()
         images = self._images if "image: " in text else 0
@@ -119,8 +119,8 @@ class LiveNodeLights:
         keys = list(job.states)
         lights = [present[key[0]] for key in keys]
 
-        def take(number: int, factor: np.ndarray, lost: float) -> bool:
-            job.results.append((keys[number], NodeEmission(factor, lost)))
+        def take(number: int, factor: np.ndarray, traits: list[float]) -> bool:
+            job.results.append((keys[number], NodeEmission(factor, *traits)))
             return not job.is_stopped
 
         def work(folder: Path, paths: list[Path]) -> None:
@@ -171,64 +171,93 @@ def _start(name: str, blocks: list, work: Callable[[Path, list[Path]], None]) ->
     return thread
 
 
-class LiveWorld:
-    """The world as Cycles sees it, for a window: a second Blender renders it while the view goes on."""
+class _WorldLook:
+    """A world as Cycles sees it, for all views that show it: a second Blender renders it while the views go on."""
 
-    def __init__(self):
-        self._wanted, self._changed = "", 0.0
-        self._of, self._sky = "", None  # the world that was looked at last, and what was found
-        self._thread: threading.Thread | None = None
-        self._outcome: tuple[ShownSky, list[str]] | Exception | None = None
-        self._stopped = threading.Event()
+    def __init__(self, name: str):
+        self.name, self.users, self.stopped = name, 0, threading.Event()
+        # The sky that was found (None after errors) and notes about it; None: it was not looked at yet.
+        self.outcome: tuple[ShownSky | None, list[str]] | None = None
+        self.sky: ShownSky | None = None  # the last one that was found
+        self.changed: float | None = None  # time of the last request that no work has begun for
+        self.thread: threading.Thread | None = None
+        self._result: tuple[ShownSky, list[str]] | Exception | None = None
 
-    def stop(self) -> None:
-        """Cancel the work: nobody waits for it any more."""
-        self._wanted = ""
-        self._stopped.set()
-
-    def look(self, world) -> ShownSky | None:
-        """Request a look at a new or changed `world`. Returns its last result; None where there is none."""
-        self._wanted, self._changed = world.name_full, time.monotonic()
-        return self._sky if self._of == self._wanted else None
-
-    @property
-    def is_busy(self) -> bool:
-        """True while a result is to come."""
-        return bool(self._wanted) or self._thread is not None
-
-    def step(self, frame: int) -> tuple[ShownSky | None, list[str]] | None:
-        """Do the next step, in the main thread. Returns the sky that was found and notes about it; None: no news."""
-        if self._thread is not None:
-            return None if self._thread.is_alive() else self._take()
-        if self._wanted and time.monotonic() - self._changed > REST_SECONDS:
-            self._begin(frame)
-        return None
-
-    def _take(self):
-        self._thread, outcome = None, self._outcome
-        if isinstance(outcome, Exception):
-            return None, [f"{self._of}: {error_line(outcome)}"]
-        if self._wanted == self._of:  # it has changed again
-            return None
-        self._sky = outcome[0]
-        return outcome
+    def step(self, frame: int) -> None:
+        """Do the next step, in the main thread."""
+        if self.thread is None:
+            if self.changed is not None and time.monotonic() - self.changed > REST_SECONDS:
+                self._begin(frame)
+        elif not self.thread.is_alive():
+            self.thread, result = None, self._result
+            if isinstance(result, Exception):
+                self.outcome = None, [f"{self.name}: {error_line(result)}"]
+            elif self.changed is None:  # else it has changed again
+                self.outcome, self.sky = result, result[0]
 
     def _begin(self, frame: int) -> None:
-        self._of, self._wanted = self._wanted, ""
-        world = next((one for one in bpy.data.worlds if one.name_full == self._of), None)
+        self.changed = None
+        world = next((one for one in bpy.data.worlds if one.name_full == self.name), None)
         if world is None:
             return
-        name, like, stopped = world.name, light_of_world(world), self._stopped
+        name, like, stopped = world.name, light_of_world(world), self.stopped
 
         def work(folder: Path, paths: list[Path]) -> None:
             try:
                 result = view.render_world(WorldJob(paths[0], name, frame), folder, lambda *_: not stopped.is_set())
                 light = [SkyPicture(*axes, one) for axes, one in zip(CUBE, result.light, strict=False)]
-                self._outcome = varied_sky(like, light, result.lights, result.background), result.warnings
+                self._result = varied_sky(like, light, result.lights, result.background), result.warnings
             except Exception as error:
-                self._outcome = error
+                self._result = error
 
-        self._thread = _start("world", [world], work)
+        self.thread = _start("world", [world], work)
+
+
+# By the full name of the world.
+_world_looks: dict[str, _WorldLook] = {}
+
+
+class LiveWorld:
+    """The world of a view as Cycles sees it. Views of one world share what Cycles has found out."""
+
+    def __init__(self):
+        self._look: _WorldLook | None = None
+        self._taken: tuple | None = None
+
+    def stop(self) -> None:
+        """Nobody waits for the world any more: cancel the work, if no other view has this world."""
+        look, self._look = self._look, None
+        if look is not None:
+            look.users -= 1
+            if not look.users:
+                look.stopped.set()
+                _world_looks.pop(look.name, None)
+
+    def look(self, world) -> ShownSky | None:
+        """Request a look at a new or changed `world`. Returns its last result; None where there is none."""
+        is_other = self._look is None or self._look.name != world.name_full
+        if is_other:
+            self.stop()
+            self._look = _world_looks.setdefault(world.name_full, _WorldLook(world.name_full))
+            self._look.users += 1
+        # Other views of this world have asked for it, and know its changes.
+        if not is_other or self._look.users == 1:
+            self._look.changed = time.monotonic()
+        return self._look.sky
+
+    @property
+    def is_busy(self) -> bool:
+        """True while a result is to come."""
+        look = self._look
+        has_work = look is not None and (look.changed is not None or look.thread is not None)
+        return has_work or (look is not None and look.outcome is not self._taken)
+
+    def step(self, frame: int) -> tuple[ShownSky | None, list[str]] | None:
+        """Do the next step, in the main thread. Returns the sky that was found and notes about it; None: no news."""
+        if self._look is not None:
+            self._look.step(frame)
+        before, self._taken = self._taken, None if self._look is None else self._look.outcome
+        return None if self._taken is before else self._taken
 
 
 def rendered_world(scene, world, warn: Callable) -> tuple[list[SkyPicture], list[Light], np.ndarray]:
@@ -270,6 +299,6 @@ def render_node_lights(job: NodeLightJob, folder: Path, progress: Callable) -> d
         with open_studio(scene) as studio:
             pattern = node_emission(source, studio)
         save_array(folder / f"{number}.npy", pattern.factor.astype(np.float32))
-        save_array(folder / f"{number}_lost.npy", np.array(pattern.lost))
+        save_array(folder / f"{number}_traits.npy", np.array([pattern.lost, pattern.start, pattern.blurred]))
         progress(NODE_LIGHTS, (number + 1) / len(files))
     return {}

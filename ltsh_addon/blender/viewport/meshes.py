@@ -52,8 +52,10 @@ def corner_tangents(position, normal, uv, triangles) -> np.ndarray:
     Corners with the same position, normal, UV coordinates and orientation in UV share a tangent: the mean over their
     triangles, each projected onto the plane of the normal and weighted by its angle.
     """
-    corner, area = triangles.ravel(), _uv_area(uv, triangles)
-    of_triangle = unit(_towards_u(position, uv, triangles) * np.sign(area)[:, None])
+    (first, second), (uv_first, uv_second) = _edges(position, triangles), _edges(uv, triangles)
+    # Twice the areas in UV, negative where a triangle is mirrored there; then the directions in which u grows.
+    corner, area = triangles.ravel(), uv_first[:, 0] * uv_second[:, 1] - uv_first[:, 1] * uv_second[:, 0]
+    of_triangle = unit((first * uv_second[:, 1:] - second * uv_first[:, 1:]) * np.sign(area)[:, None])
     upward = normal[corner].astype(np.float64)
     flat = unit(_projected(of_triangle.repeat(3, axis=0), upward)) * _angles(position, triangles, upward)[:, None]
     used = (area != 0.0).repeat(3)
@@ -64,18 +66,6 @@ def corner_tangents(position, normal, uv, triangles) -> np.ndarray:
     tangents[corner[used], :3] = unit(total)[group[used]]
     tangents[corner[used], 3] = np.sign(area).repeat(3)[used]
     return tangents
-
-
-def _uv_area(uv, triangles):
-    """Twice the areas (T,) in UV, negative where a triangle is mirrored there."""
-    first, second = _edges(uv, triangles)
-    return first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
-
-
-def _towards_u(position, uv, triangles):
-    """The directions (T, 3) in which u grows, for positive areas."""
-    (first, second), (uv_first, uv_second) = _edges(position, triangles), _edges(uv, triangles)
-    return first * uv_second[:, 1:] - second * uv_first[:, 1:]
 
 
 def _edges(values, triangles):

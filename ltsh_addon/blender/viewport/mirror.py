@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 
@@ -27,14 +27,7 @@ from ..lights.area import area_light, node_light, note_unsupported, reason_to_le
 from ..lights.emission import emission_of, factors_of, open_studio
 from ..lights.linking import Receivers
 from ..lights.meshes import collect_mesh_lights, constant_mesh_lights
-from ..lights.textures import (
-    MOST_INSTANCES,
-    NodeEmission,
-    NodeLight,
-    ShownTextures,
-    node_emission,
-    with_pattern,
-)
+from ..lights.textures import MOST_INSTANCES, NodeEmission, NodeLight, ShownTextures, node_emission, with_pattern
 from ..lights.world import light_of_world
 from ..materials.graph import source_of, surface_of, tree_in_use
 from ..materials.preview_material import PreviewMaterial, preview_of, world_radiance
@@ -46,7 +39,10 @@ from .meshes import MeshBatches, look_values, mesh_batches
 # FAR_AWAY: the eye where there is no camera, outside of all closed emissive meshes.
 FAR_AWAY = np.full(3, 1e6)
 # MOST_LIGHTS: patches and faces included. The time of a frame grows with their number.
-MOST_LIGHTS = 2048
+# One layer of the texture of visibility is that of the sky's sides; cards take 2048 layers.
+MOST_LIGHTS = 2047
+# MOST_VALUES: of all patterns. They fill a quarter of the largest texture of lights.
+MOST_VALUES = 1 << 24
 # Reasons why a light has no pattern.
 NOT_RESOLVED = "its nodes are not resolved, it shines as without them"
 NOT_YET = "it shines as without its nodes until Cycles has sources at them"
@@ -73,7 +69,7 @@ def view_lights(
         ob = instance.object
         if not instance.show_self or not in_view(instance):
             continue
-        emits = emits or (ob.type in SURFACE_TYPES and _has_emission(ob))
+        emits |= ob.type in SURFACE_TYPES and any(np.any(_emission(slot.material)) for slot in ob.material_slots)
         if ob.type != "LIGHT":
             continue
         matrix = np.array(instance.matrix_world, dtype=np.float64)
@@ -92,10 +88,16 @@ def view_lights(
             note_unsupported(ob, matrix, SimpleNamespace(warn=notes.append))
     if emits:
         lights.extend(_mesh_lights(depsgraph, receivers, notes))
-    return tuple(strongest(lights, notes)), tuple(dict.fromkeys(notes))
+    shown, values = list(strongest(lights, notes)), 0
+    for number, light in enumerate(shown):
+        values += 0 if light.pattern is None else light.pattern.values.size
+        if values > MOST_VALUES and light.pattern is not None:
+            notes.append(f"{light.name}: it shines without its pattern, those of the lights before it fill the texture")
+            shown[number] = replace(light, pattern=None)
+    return tuple(shown), tuple(dict.fromkeys(notes))
 
 
-def strongest(lights: list[Light], notes: list[str], most: int = MOST_LIGHTS) -> list[Light]:
+def strongest(lights: Sequence[Light], notes: list[str], most: int = MOST_LIGHTS) -> Sequence[Light]:
     """The `most` lights with the largest power, in their order; what is missing is told in `notes`."""
     if len(lights) <= most:
         return lights
@@ -107,10 +109,6 @@ def strongest(lights: list[Light], notes: list[str], most: int = MOST_LIGHTS) ->
         "power is missing"
     )
     return [lights[index] for index in chosen]
-
-
-def _has_emission(ob) -> bool:
-    return any(slot.material is not None and np.any(_emission(slot.material)) for slot in ob.material_slots)
 
 
 def _emission(material) -> np.ndarray:
@@ -336,12 +334,13 @@ class SceneMirror:
         self._light_textures = ShownTextures()
         self.has_old_lights = False  # True: there are new results about lights, which are to be read again
         self._world_note: tuple[str, ...] = ()
+        self._limit_notes: list[str] = []
         self._synced = False
 
     @property
     def notes(self) -> list[str]:
         """Notes about what differs from Cycles, each once."""
-        notes = self.material_notes, self._object_notes, self._light_notes, self._world_note
+        notes = self.material_notes, self._object_notes, self._light_notes, self._world_note, self._limit_notes
         return list(dict.fromkeys(note for kind in notes for note in kind))
 
     @property
@@ -382,7 +381,7 @@ class SceneMirror:
         self.lights_without_world, self._light_notes = view_lights(
             depsgraph, in_view, self._light_textures, self._patterns
         )
-        self.lights = (*self.lights_without_world, *self.sky.lights)
+        self.take_sky(self.sky, *self._world_note)
         self.has_old_lights = False
 
     def _drop_changed(self, changes: Changes) -> None:
@@ -398,7 +397,7 @@ class SceneMirror:
 
     def _read_instances(self, depsgraph, changes: Changes, in_view) -> None:
         override = depsgraph.view_layer_eval.material_override
-        receivers = Receivers([ob for ob in _originals(depsgraph) if ob.type == "LIGHT"])
+        receivers = Receivers([ob.original for ob in depsgraph.objects if ob.type == "LIGHT"])
         instances, meshes, looks = [], {}, {}
         users = Counter()  # instances by evaluated data, those out of view included
         for instance in depsgraph.object_instances:
@@ -452,8 +451,9 @@ class SceneMirror:
 
     def take_sky(self, sky: ShownSky, *notes: str) -> None:
         """Show this world from now on; `notes` tell how it differs from Cycles."""
-        self.sky, self._world_note = sky, notes
-        self.lights = (*self.lights_without_world, *sky.lights)
+        self.sky, self._world_note, self._limit_notes = sky, notes, []
+        most = MOST_LIGHTS - len(sky.lights)
+        self.lights = (*strongest(self.lights_without_world, self._limit_notes, most), *sky.lights)
 
 
 def _shown_look(material) -> ShownLook:
@@ -479,7 +479,3 @@ def _receiver(instance, receivers: Receivers, view_layer) -> int:
     numbers = receivers.numbers
     of_object = numbers.get(instance.object.original.name_full, 0)
     return numbers.get(owner.name_full, of_object) if instance.is_instance else of_object
-
-
-def _originals(depsgraph) -> list:
-    return [ob.original for ob in depsgraph.objects]

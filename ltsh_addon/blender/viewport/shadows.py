@@ -344,7 +344,8 @@ class LiveShadows:
             if number // GROUP == self._group_grid[0] and self._group_grid[1] is not None:
                 return self._group_grid[1]
             if level is None and number >= FIRST_POINTS and self._is_free:
-                self._begin_group(number // GROUP, gbuffer, view)
+                numbers, points = tuple(range(len(self._keys))), PixelGrid(1, gbuffer, view)
+                self._start([self._request_for(numbers, points, GROUP_RAYS, view, group=number // GROUP)])
             self._waits = self._thread is not None
         fits = len(self._layers) == len(self._keys) and np.array_equal(self._origin, view.origin)
         if fits or self._is_off:
@@ -408,10 +409,6 @@ class LiveShadows:
         known = self._known if self._wanted == self._state else {}
         numbers = tuple(n for n, key in enumerate(self._keys) if max(known.get(key, (-1,))) < level)
         return self._request_for(numbers, points, rays, view, level)
-
-    def _begin_group(self, group: int, gbuffer: GBufferTextures, view: ViewCamera) -> None:
-        numbers, points = tuple(range(len(self._keys))), PixelGrid(1, gbuffer, view)
-        self._start([self._request_for(numbers, points, GROUP_RAYS, view, group=group)])
 
     def _request_for(
         self, numbers: tuple, points: PixelGrid, rays: int, view: ViewCamera, level: int = len(LEVELS), group: int = 0

@@ -77,7 +77,7 @@ class SurfacePass:
 
     def add_emission(self, instances: list[ShownInstance], view: ViewCamera, frame_buffer) -> None:
         """Add the emission of the surfaces drawn last to `frame_buffer`."""
-        shining = [instance for instance in instances if any(map(_shines, instance.looks))]
+        shining = [one for one in instances if any(np.any(it.look.emission) or it.look.glow > 0.0 for it in one.looks)]
         if shining:
             self._add(EMISSION, [(0, shining)], view, frame_buffer)
 
@@ -102,7 +102,7 @@ class SurfacePass:
 
     def _gbuffer(self, number, instances, view) -> GBufferTextures:
         textures = self._draw_into(SURFACES, instances, view, number)
-        if has_normals(instances):
+        if has_bent_lobes(instances) or any(instance.mesh.is_smooth for instance in instances):
             textures = textures | self._draw_into(NORMALS, instances, view, number)
         every = [look for instance in instances for look in instance.looks]
         drawn = [lobe.look for look in every for lobe in look.lobes[number : number + 1]]
@@ -193,23 +193,10 @@ class SurfacePass:
             shader.uniform_sampler(f"{name}_image", shown.textures.get(name, self._black_image))
 
 
-def _shines(shown: ShownLook) -> bool:
-    return bool(np.any(shown.look.emission)) or shown.look.glow > 0.0
-
-
-def has_normals(instances: list[ShownInstance]) -> bool:
-    """True if any diffuse lobe or horizon has a normal of its own."""
-    return has_bent_lobes(instances) or any(instance.mesh.is_smooth for instance in instances)
-
-
 def has_bent_lobes(instances: list[ShownInstance]) -> bool:
     """True if any diffuse lobe does not end at the horizon of its own normal."""
-    return any(_bends(lobe) for instance in instances for look in instance.looks for lobe in look.lobes)
-
-
-def _bends(shown: ShownLook) -> bool:
-    """True if the diffuse lobe has a normal of its own."""
-    return shown.look.normal is not None or shown.look.kind == "translucent"
+    lobes = (lobe.look for instance in instances for look in instance.looks for lobe in look.lobes)
+    return any(lobe.normal is not None or lobe.kind == "translucent" for lobe in lobes)
 
 
 def _shader(outputs, is_further: bool = False):

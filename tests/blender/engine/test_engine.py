@@ -573,7 +573,8 @@ def test_a_view_that_is_left_is_freed_at_once_and_what_works_for_it_is_stopped(s
         seen._follow_shadows(depsgraph)
         shadows, stopped = seen._shadows, [one._stop for one in (seen._shadows, seen._shadows.of_glass)]
         seen._shadows._traced_scene.collect()
-        stopped.append(seen._world._stopped)
+        assert seen._world.look(bpy.data.worlds.new("Any")) is None
+        stopped.append(seen._world._look.stopped)
         left = [weakref.ref(part) for part in (seen, seen.mirror, shadows, shadows.of_glass)]
         del seen, shadows
         assert [one() for one in left] == [None] * 4

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from job_window import add_on_in_room
 
-from ltsh_addon.blender.ui import comparison, operators, results
+from ltsh_addon.blender.ui import comparison, results
 from ltsh_addon.imaging.exr import write_channels
 from ltsh_addon.pipeline import display_layers
 
@@ -16,7 +16,7 @@ def scene(tmp_path):
     """The add-on and a saved file that can be shaded."""
     with add_on_in_room(tmp_path / "room.blend") as found:
         yield found
-        operators._running["job"] = None
+        results.state["job"] = None
 
 
 @pytest.fixture

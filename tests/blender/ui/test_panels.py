@@ -5,7 +5,7 @@ import pytest
 import scene_parts as parts
 from recorded_layout import Layout, buttons, context_of, drawn, stand_in, texts
 
-from ltsh_addon.blender.ui import operators, panels, preflight, results
+from ltsh_addon.blender.ui import panels, preflight, results
 from ltsh_addon.blender.ui.job import Job, Plan, Step
 
 MAIN_3D, MAIN_RENDER, *PARTS = panels.CLASSES[1:-1]
@@ -91,9 +91,9 @@ def test_every_panel_draws_in_every_state(scene, tmp_path, add_results, width):
                     drawn(panel, function, width)
 
     draw_all()
-    operators._running["job"] = Job("Compare with Cycles", Plan([Step("Cycles A", 1.0)]), tmp_path, "compare", 0)
+    results.state["job"] = Job("Compare with Cycles", Plan([Step("Cycles A", 1.0)]), tmp_path, "compare", 0)
     draw_all()
-    operators._running["job"] = None
+    results.state["job"] = None
     for partial in ("Not complete: without Cycles", ""):
         add_results(partial, ("ltc", "ltsh4") if partial else ("ltc", "ltsh4", "cycles"))
         draw_all()
@@ -154,7 +154,7 @@ def test_a_running_job_stands_in_the_place_of_its_buttons_and_nothing_moves(scen
     bpy.data.objects["Floor"].select_set(True)
     before = {one: (heights(one), drawn(one)) for one in (MAIN_3D, panel, other)}
     plan = Plan([Step("samples", 30.0), Step("Cycles A", 100.0)])
-    job = operators._running["job"] = Job("Compare with Cycles", plan, tmp_path, command, 0)
+    job = results.state["job"] = Job("Compare with Cycles", plan, tmp_path, command, 0)
     job._take({"stage": "Cycles A", "fraction": 0.25})
     plan._share = 0.25
     shown = drawn(panel)
@@ -279,7 +279,7 @@ def test_lights_and_materials_are_listed_with_what_is_not_exact(scene):
     assert signs["Floor"] == "CHECKMARK" and signs["Fur"] == "CANCEL"
 
 
-def test_numbers_are_those_of_the_report(scene, add_results):
+def test_numbers_are_those_of_the_report(scene, tmp_path, add_results):
     add_results()
     shown = drawn(RESULTS)
     for number in ("L2 %", "12.34", "-1.51", "0.0321", "Noise of Cycles 2.00 %", "LTSH 4 10.00 %"):
@@ -288,8 +288,13 @@ def test_numbers_are_those_of_the_report(scene, add_results):
     assert "LTSH 4: L2 12.34 %, bias -1.51 %, FLIP 0.0321" in narrow
     assert "Not complete" not in narrow
     assert buttons(shown)["ltsh.save_exr"] and "ltsh_warnings" in [item.what for item in shown if item.kind == "panel"]
+    # While the job runs that adds Cycles; pictures that a cancelled job left are what they are.
     add_results("Not complete: without Cycles", ("ltc", "ltsh4"))
+    job = results.state["job"] = Job("Compare with Cycles", Plan([Step("Cycles A", 1.0)]), tmp_path, "compare", 0)
+    job.results.append(results.result_of(scene).folder)
     assert "Not complete: without Cycles" in texts(drawn(RESULTS))
+    results.state["job"] = None
+    assert "Not complete" not in texts(drawn(RESULTS))
 
 
 def test_the_image_editor_offers_the_pictures_that_are_there(scene, add_results):
@@ -309,6 +314,6 @@ def test_a_picture_alone_is_shown_whole_whatever_the_mode(scene, add_results, mo
     scene.ltsh.mode = mode
     shown = drawn(panels.LTSH_PT_IMAGE_results)
     assert not {"second", "split", "error_scale"} & {item.what for item in shown}
-    # Single and Mix.
-    assert [item.enabled for item in shown if item.what == "mode"] == [True, False, False, False, True]
+    # Single alone: no lights were kept to mix.
+    assert [item.enabled for item in shown if item.what == "mode"] == [True, False, False, False, False]
     assert results.choice_of(scene.ltsh, results.result_of(scene)).mode == "A"

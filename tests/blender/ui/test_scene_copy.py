@@ -4,7 +4,8 @@ import bpy
 import numpy as np
 import pytest
 
-from ltsh_addon.blender.ui import comparison, operators
+from ltsh_addon.blender import saving
+from ltsh_addon.blender.ui import comparison
 
 
 @pytest.fixture
@@ -36,7 +37,7 @@ def seen():
 
 def test_no_thumbnail_is_drawn_and_the_preferences_stay(preferences, seen, tmp_path):
     bpy.context.scene.frame_current = 7
-    operators.save_scene_copy(tmp_path / "copy.blend")
+    saving.save_working_copy(tmp_path / "copy.blend")
     assert [kind for kind, _ in seen] == ["NONE"]
     assert preferences.filepaths.file_preview_type == "CAMERA" and not preferences.is_dirty
     assert bpy.data.filepath == str(tmp_path / "room.blend")
@@ -48,9 +49,9 @@ def test_no_thumbnail_is_drawn_and_the_preferences_stay(preferences, seen, tmp_p
 def test_the_preferences_stay_where_the_copy_cannot_be_saved(preferences, tmp_path, unsaved):
     preferences.is_dirty = unsaved
     with pytest.raises(RuntimeError):
-        operators.save_scene_copy(tmp_path / "missing" / "copy.blend")
+        saving.save_working_copy(tmp_path / "missing" / "copy.blend")
     assert preferences.filepaths.file_preview_type == "CAMERA" and preferences.is_dirty == unsaved
-    assert not comparison._state["saves_pixels"]
+    assert not saving.is_working_copy()
 
 
 def test_pictures_of_results_are_not_made_again(preferences, seen, tmp_path, monkeypatch):
@@ -58,7 +59,7 @@ def test_pictures_of_results_are_not_made_again(preferences, seen, tmp_path, mon
     monkeypatch.setattr(comparison, "refresh", lambda scene: refreshed.append(scene))
     refreshed, image = [], comparison.viewer_image(bpy.context.scene)
     comparison._store(image, np.ones((8, 6, 4), np.float32), True)
-    operators.save_scene_copy(tmp_path / "copy.blend")
+    saving.save_working_copy(tmp_path / "copy.blend")
     assert seen[-1][1][image.name] == (6, 8) == tuple(image.size) and not refreshed
     # A file for people holds none of what can be made again.
     bpy.ops.wm.save_mainfile()

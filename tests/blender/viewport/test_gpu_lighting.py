@@ -105,9 +105,12 @@ def test_patterns_are_those_of_a_quadrature():
     rows, columns = (np.arange(count) + 0.5 for count in (16, 32))
     values = 1.2 + np.cos(0.4 * rows)[:, None] * np.sin(columns * (2.0 * np.pi / 32))
     lights = []
-    for kind, by_ray in (("ball", False), ("ball", True), ("facing disk", False), ("bulb", False)):
+    kinds = (("ball", False, 0.0), ("ball", True, 0.0), ("facing disk", False, 0.0), ("bulb", False, 0.0))
+    for kind, by_ray, start in (*kinds, ("facing disk", True, 1.2)):
         light = random_surfaces.light(kind, len(lights), random)
-        lights.append(replace(light, pattern=Pattern(np.linalg.qr(random.normal(size=(3, 3)))[0], values, by_ray)))
+        lights.append(
+            replace(light, pattern=Pattern(np.linalg.qr(random.normal(size=(3, 3)))[0], values, by_ray, start))
+        )
     pairs = [(light, replace(light, pattern=None)) for light in lights]
 
     def draw():

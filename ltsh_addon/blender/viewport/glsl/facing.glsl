@@ -28,15 +28,17 @@ float ltsh_pattern(int header, int flags, vec3 offset, float radius, vec3 direct
     vec3 normal = across * ((ratio * along - root * sine) / max(sine, 1e-20)) - (root * along + ratio * sine) * axis;
     normal = (flags & LTSH_BALL_FLAG) == 0 || row_z.w > 0.0 ? -direction : normal;
     vec3 local = vec3(dot(row_x.xyz, normal), dot(row_y.xyz, normal), dot(row_z.xyz, normal));
-    ivec2 size = max(ivec2(row_y.w, row_x.w), ivec2(1));
-    vec2 place = vec2(0.5 * atan(local.y, local.x), atan(length(local.xy), local.z)) * vec2(size) / LTSH_PI - 0.5;
+    ivec2 size = max(ivec2(row_y.w, ltsh_light_texel(first + 3).x), ivec2(1));
+    vec2 place = vec2(0.5 * atan(local.y, local.x), atan(length(local.xy), local.z)) / LTSH_PI;
+    /* The rows are the last of `row_x.w` from pole to pole. */
+    place = place * vec2(float(size.x), row_x.w) - vec2(0.5, row_x.w - float(size.y) + 0.5);
     vec2 low = floor(place);
     vec2 share = place - low;
     ivec2 left = ivec2(low) + ivec2(size.x, 0);
     ivec2 columns = ivec2(left.x % size.x, (left.x + 1) % size.x);
     ivec2 rows = size.x * clamp(ivec2(left.y, left.y + 1), ivec2(0), ivec2(size.y - 1));
-    vec2 above = vec2(ltsh_pattern_value(first + 3, rows.x + columns.x), ltsh_pattern_value(first + 3, rows.x + columns.y));
-    vec2 below = vec2(ltsh_pattern_value(first + 3, rows.y + columns.x), ltsh_pattern_value(first + 3, rows.y + columns.y));
+    vec2 above = vec2(ltsh_pattern_value(first + 4, rows.x + columns.x), ltsh_pattern_value(first + 4, rows.x + columns.y));
+    vec2 below = vec2(ltsh_pattern_value(first + 4, rows.y + columns.x), ltsh_pattern_value(first + 4, rows.y + columns.y));
     float value = mix(mix(above.x, above.y, share.x), mix(below.x, below.y, share.x), share.y);
     return first > 0 ? value : 1.0;
 }

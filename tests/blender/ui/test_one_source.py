@@ -1,0 +1,132 @@
+"""What the interface says is what is so: no state has a second copy that undo, saving or other results leave behind."""
+
+import bpy
+import numpy as np
+import pytest
+import scene_parts as parts
+from scene_parts import principled
+
+from ltsh_addon.blender.ui import comparison, panels, preflight, preview, results
+from ltsh_addon.blender.viewport import live_cycles
+
+
+def test_a_picture_is_not_compared_with_itself_after_one_that_was_alone(scene, tmp_path, show_results):
+    show_results(scene, tmp_path, names=("ltsh4c",))
+    show_results(scene, tmp_path, seed=2, names=("ltsh4c", "cycles"))
+    for first, second in (("ltsh4c", "cycles"), ("cycles", "ltsh4c")):
+        scene.ltsh.first = scene.ltsh.second = first
+        choice = results.choice_of(scene.ltsh, results.result_of(scene))
+        assert (choice.first, choice.second) == (first, second)
+
+
+@pytest.mark.parametrize("end", ["undo", "button"])
+def test_redo_and_undo_of_an_end_bring_the_preview_back_into_its_view(scene, end):
+    scene.render.engine = "BLENDER_WORKBENCH"
+    space = preview.view_of(bpy.context)
+    space.shading.type = "WIREFRAME"
+    bpy.ops.ed.undo_push(message="Before")
+    bpy.ops.ltsh.preview()
+    bpy.ops.ed.undo_push(message="Preview")
+    if end == "undo":
+        bpy.ops.ed.undo()
+        assert space.shading.type == "WIREFRAME"
+        bpy.ops.ed.redo()
+    else:
+        bpy.ops.ltsh.preview()
+        bpy.ops.ed.undo_push(message="End")
+        assert space.shading.type == "WIREFRAME"
+        bpy.ops.ed.undo()
+    assert preview.is_previewing(bpy.context.scene) and space.shading.type == "RENDERED"
+    bpy.ops.ltsh.preview()
+    assert space.shading.type == "WIREFRAME"
+
+
+def test_materials_have_the_sign_of_what_the_view_says(scene):
+    material, shader = principled("Rough")
+    noise = material.node_tree.nodes.new("ShaderNodeTexNoise")
+    material.node_tree.links.new(noise.outputs[0], shader.inputs["Roughness"])
+    parts.add_plane(material, name="Rough plane")
+    bpy.context.view_layer.update()
+    scene.render.engine = "BLENDER_WORKBENCH"
+    entry = next(one for one in preflight.overview(scene).materials if one.name == "Rough")
+    assert entry.state == preflight.EXACT
+    scene.render.engine = "LTSH"
+    entry = next(one for one in preflight.overview(scene).materials if one.name == "Rough")
+    assert entry.state == preflight.APPROXIMATED
+    assert "in the view: Roughness is not resolved" in entry.notes
+
+
+def test_the_eye_of_a_light_is_the_one_that_h_closes(scene):
+    light = bpy.data.objects["Light"]
+    light.hide_set(True)
+    assert light.ltsh_light.mute and not light.hide_render
+    light.ltsh_light.mute = False
+    assert not light.hide_get() and not light.ltsh_light.mute
+    light.hide_viewport = True
+    assert light.ltsh_light.mute
+
+
+@pytest.mark.parametrize("elsewhere", ["saved first", "saved as"])
+def test_saving_elsewhere_keeps_all_results(scene, tmp_path, show_results, elsewhere):
+    if elsewhere == "saved first":
+        scene.ltsh.output_folder = ""
+    show_results(scene, tmp_path)
+    other = tmp_path / "other"
+    other.mkdir()
+    bpy.ops.wm.save_as_mainfile(filepath=str(other / "renamed.blend"))
+    scene = bpy.context.scene
+    assert results.result_of(scene) is not None
+    assert panels.operators.last_folder(scene, "compare") == results.result_of(scene).folder
+    bpy.ops.wm.open_mainfile(filepath=str(other / "renamed.blend"))
+    assert results.result_of(bpy.context.scene).folder.resolve() == (tmp_path / "ltsh" / "compare" / "images")
+
+
+def test_files_are_saved_without_pictures(scene, tmp_path, show_results):
+    show_results(scene, tmp_path)
+    assert len(results.our_images(scene)) > 3
+    path = tmp_path / "copy.blend"
+    bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
+    with bpy.data.libraries.load(str(path)) as (there, _):
+        names = [name for name in there.images if name.startswith(results.PREFIX)]
+    assert names == []
+    # They are there after undo, too.
+    for message in ("Before", "Something"):
+        bpy.ops.ed.undo_push(message=message)
+    bpy.ops.ed.undo()
+    comparison.refresh(bpy.context.scene)
+    assert comparison.viewer_image(bpy.context.scene).size[0] > 4
+
+
+def test_views_of_one_world_look_at_it_once(monkeypatch):
+    parts.empty_scene(8, 8)
+    world, begun = parts.add_world()[0], []
+    sky = live_cycles.ShownSky()
+    monkeypatch.setattr(live_cycles, "REST_SECONDS", -1.0)
+    monkeypatch.setattr(live_cycles._WorldLook, "_begin", lambda look, frame: begun.append(look) or found(look))
+
+    def found(look):
+        look.changed, look.outcome, look.sky = None, (sky, ["a note"]), sky
+
+    first, second = live_cycles.LiveWorld(), live_cycles.LiveWorld()
+    assert first.look(world) is None and second.look(world) is None
+    assert first.step(1) == (sky, ["a note"]) == second.step(1) and len(begun) == 1
+    assert not first.is_busy and not second.is_busy and first.step(1) is None
+    late = live_cycles.LiveWorld()
+    assert late.look(world) is sky and late.step(1) == (sky, ["a note"]) and len(begun) == 1
+    # A change is looked at again, for all.
+    first.look(world)
+    assert first.step(1) == second.step(1) == (sky, ["a note"]) and len(begun) == 2
+    for live in (first, second, late):
+        live.stop()
+    assert not live_cycles._world_looks
+
+
+def test_a_final_render_and_other_results_leave_the_mix(scene, tmp_path, show_results):
+    show_results(scene, tmp_path)
+    scene.ltsh.mode_before_mix = "SIDE"
+    scene.ltsh.mode = "MIX"
+    assert results.choice_of(scene.ltsh, results.result_of(scene)).mode == "SIDE"
+    show_results(scene, tmp_path, seed=2)
+    assert scene.ltsh.mode == "SIDE"
+    image = comparison.viewer_image(scene)
+    assert np.array(image.size).tolist() == [20, 6]

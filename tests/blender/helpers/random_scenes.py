@@ -88,7 +88,7 @@ class RandomScene:
 
     def _mixed(self, tree, one, other):
         """Make the surface of a material a mix of two nodes."""
-        mix = parts.add_node(tree, "ShaderNodeMixShader", Fac=self.random.uniform(0.2, 0.8))
+        mix = parts.add_node(tree, "ShaderNodeMixShader", **{"Fac": self.random.uniform(0.2, 0.8)})
         tree.links.new(one.outputs[0], mix.inputs[1])
         tree.links.new(other.outputs[0], mix.inputs[2])
         output = next(node for node in tree.nodes if node.bl_idname == "ShaderNodeOutputMaterial")

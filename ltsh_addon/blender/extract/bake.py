@@ -25,7 +25,7 @@ from ..materials.maps import UV_MAP, MaterialPlan, SavedImages
 from ..process.bake import BakeFactsJob, BakeJob
 from ..render_settings import working_space
 from . import bake_meshes, pixels
-from .occluders import collect_occluders
+from .occluders import collect_occluders, with_baked_shares
 from .origin import box_center, move_to_origin
 from .pixels import OCCLUDERS, SEEDS, remove_occlusion
 
@@ -313,10 +313,14 @@ def _inspect(scene, world, objects, uv_name, files):
         bare = aovs.objects_without_material([rendered[ob.name_full] for ob in objects if ob.name in meshes])
         inventory = collect_lights(depsgraph)
         if with_occluders:
-            inventory.occluders = collect_occluders(depsgraph, None, inventory.warn, inventory.left_out)
+            inventory.occluders = collect_occluders(depsgraph, None, inventory.warn, inventory.left_out, unread)
         return inventory, meshes, problems, bare, pixels.missing_images(depsgraph, world)
 
-    return with_render_depsgraph(scene, visit)
+    unread = []
+    inventory, *others = with_render_depsgraph(scene, visit)
+    if unread:
+        inventory.occluders = with_baked_shares(inventory.occluders, unread, scene, inventory.warn)
+    return inventory, *others
 
 
 def _lobes(objects, emitting) -> dict[str, aovs.MaterialLobes]:

@@ -24,17 +24,7 @@ from ..reading import NUMBER, Malformed, check, file_name
 from ..scene import PASSES, REFERENCE, Cancelled, Film, Progress, SurfaceSamples, lights_of, listed
 from ..visibility import Occluders, ShadowSampling
 from ..workers.pool import cores
-from . import lighting
-from .bake_files import (
-    TILE,
-    ErrorPictures,
-    ErrorSums,
-    Planes,
-    TileRecords,
-    applied_layer,
-    applied_layers,
-    apply_textures,
-)
+from . import bake_files, lighting
 from .comparison import percent
 from .lighting import check_named, prepare
 from .options import BAKE_PASSES, MARGIN_TYPES, TEXTURE_SIDES, BakeOptions, child_job
@@ -58,8 +48,8 @@ def bake_scene(options: BakeOptions, progress: Progress | None = None) -> dict:
     result = bake_objects(options, progress)
     report = result.report
     if options.apply and report["objects"]:
-        layer = applied_layer(options)
-        report["applied"] = apply_textures(options.scene, options.output, report["objects"], layer, progress)
+        layer = bake_files.applied_layer(options)
+        report["applied"] = bake_files.apply_textures(options.scene, options.output, report["objects"], layer, progress)
     return write_reports(result, options.output)
 
 
@@ -79,7 +69,7 @@ def bake_objects(
     check_readable(options.scene)
     check_named(options.techniques, "a bake that is resumed")
     tables = prepare(options)
-    finished = TileRecords(options)
+    finished = bake_files.TileRecords(options)
     with temporary_folder() as folder:
         manifest = extract_bake(_job(options, finished.finished, tile, following), folder, progress=progress)
         names = [record["name"] for record in manifest["objects"]]
@@ -197,28 +187,28 @@ class ObjectBaker:
         """Write the files of one tile; returns its record and the names of the files."""
         options, file = self.options, f"{stem}{self._suffix(tile)}.exr"
         path = options.output / file
-        errors, written = ErrorSums(), [file]
+        errors, written = bake_files.ErrorSums(), [file]
         with self._planes(tile) as planes:
             record = self._shade(tile, planes, errors, progress)
             pictures = None
             if self.compared:
-                pictures = ErrorPictures(*options.size, path, list(self.tables), list(self.compared))
+                pictures = bake_files.ErrorPictures(*options.size, path, list(self.tables), list(self.compared))
                 named = [str(PurePosixPath(file).with_name(name)) for name in pictures.names]
                 record |= {"pictures": named, "errors": errors.report()}
                 written += named
             texture = None
             if options.apply:
-                record["texture"] = f"{stem}.{applied_layer(options)}{self._suffix(tile)}.exr"
-                texture = options.output / record["texture"], applied_layers(options)
+                record["texture"] = f"{stem}.{bake_files.applied_layer(options)}{self._suffix(tile)}.exr"
+                texture = options.output / record["texture"], bake_files.applied_layers(options)
                 written.append(record["texture"])
             planes.write(path, options.margin, self._metadata(tile), pictures, texture)
         return record, written
 
-    def _planes(self, tile) -> Planes:
+    def _planes(self, tile) -> bake_files.Planes:
         options, seams = self.options, None
         if options.margin_type == "adjacent" and options.margin > 0:
             seams = uv.UvSeams.of(self.mesh.uv, self.mesh.vertices, *options.size, _column_and_row(tile))
-        return Planes(self.folder / f"planes_{tile}", self.channels(), *options.size, seams)
+        return bake_files.Planes(self.folder / f"planes_{tile}", self.channels(), *options.size, seams)
 
     def _shade(self, tile, planes, errors, progress) -> dict:
         """Shade a tile block by block into `planes`; returns its counts of texels for the record."""
@@ -499,7 +489,7 @@ def _darkness(record, reasons) -> tuple[list[str], list[str]]:
 
 
 def _tiles(value, name) -> None:
-    check(value, {str: {**TILE, "file": file_name}}, name)
+    check(value, {str: {**bake_files.TILE, "file": file_name}}, name)
     if wrong := [number for number in value if not number.isdecimal()]:
         raise Malformed(f"{name} has {wrong[0]!r}, expected the number of a tile")
 

@@ -13,22 +13,9 @@ from ..files import no_empty_folder, temporary_folder
 from ..imaging import grouped, write_json, write_overview
 from ..reading import NUMBER, Malformed, read_json
 from ..scene import Progress, SceneError, error_line
-from . import bake, picture, render
+from . import bake, bake_files, picture, render
+from . import tasks as batch_tasks
 from .lighting import prepare
-from .tasks import (
-    FOLDER,
-    FORMAT,
-    JOB,
-    TASK_RECORD,
-    BatchJob,
-    BatchTask,
-    Records,
-    TaskResult,
-    read_document,
-    shard_of,
-    tasks_of,
-    write_record,
-)
 
 OVERWRITE, RESUME, SKIP = "overwrite", "resume", "skip"
 
@@ -55,7 +42,7 @@ class TaskState:
 
 
 def run_tasks(
-    job: BatchJob,
+    job: batch_tasks.BatchJob,
     *,
     shard: tuple[int, int] = (1, 1),
     existing: str = OVERWRITE,
@@ -74,8 +61,8 @@ def run_tasks(
     output = job.options.output
     with no_empty_folder(output), temporary_folder() as folder, shared_blender(folder):
         prepare(job.options)
-        tasks = tasks_of(job, progress)
-        mine = shard_of(tasks, shard)
+        tasks = batch_tasks.tasks_of(job, progress)
+        mine = batch_tasks.shard_of(tasks, shard)
         records = _task_records(output, job.command)
         wanted = [task for task in mine if existing == OVERWRITE or not _is_done(records, task, existing)]
         problems = []
@@ -92,7 +79,7 @@ def run_tasks(
                 if not told:
                     _write_job(job, tasks, existing)
                     told = True
-                write_record(_timing_path(output, task), seconds)
+                batch_tasks.write_record(_timing_path(output, task), seconds)
                 records.write(task.name, task.key, asdict(task), files, **outcome)
             except OSError as error:
                 raise OSError(outcome.get("problem", str(error))) from error
@@ -122,7 +109,9 @@ def _is_done(records, task, existing) -> bool:
     return record is not None and "report" in record and not record["report"].get("problems")
 
 
-def _perform(job: BatchJob, task: BatchTask, following: tuple, existing: str, progress) -> TaskResult:
+def _perform(
+    job: batch_tasks.BatchJob, task: batch_tasks.BatchTask, following: tuple, existing: str, progress
+) -> batch_tasks.TaskResult:
     options = task.options(job)
     if job.command == "bake":
         options = replace(options, resume=existing == RESUME)
@@ -138,14 +127,14 @@ def _write_job(job, tasks, existing) -> None:
     """Write job.json, the description of the whole job for `merge`; every shard writes the same."""
     applied = job.command == "bake" and job.options.apply
     document = {
-        "format": FORMAT,
+        "format": batch_tasks.FORMAT,
         "command": job.command,
         "single": job.single,
         "any_key": existing == SKIP,
-        "applied_layer": bake.applied_layer(job.options) if applied else None,
+        "applied_layer": bake_files.applied_layer(job.options) if applied else None,
         "tasks": [asdict(task) for task in tasks],
     }
-    write_record(Path(job.options.output) / FOLDER / "job.json", document)
+    batch_tasks.write_record(Path(job.options.output) / batch_tasks.FOLDER / "job.json", document)
 
 
 @dataclass(frozen=True)
@@ -169,7 +158,10 @@ def merge(output: Path, progress=None) -> Merged:
     """
     output = Path(output)
     job = _read_job(output)
-    tasks = [BatchTask(**{item.name: task[item.name] for item in fields(BatchTask)}) for task in job["tasks"]]
+    tasks = [
+        batch_tasks.BatchTask(**{item.name: task[item.name] for item in fields(batch_tasks.BatchTask)})
+        for task in job["tasks"]
+    ]
     records = _task_records(output, job["command"])
     finished = {task.name: records.whole(task.name, None if job["any_key"] else task.key) for task in tasks}
     missing = tuple(task.name for task in tasks if finished[task.name] is None)
@@ -202,9 +194,9 @@ def merge(output: Path, progress=None) -> Merged:
 
 
 def _read_job(output: Path) -> dict:
-    path = output / FOLDER / "job.json"
+    path = output / batch_tasks.FOLDER / "job.json"
     try:
-        return read_document(path, JOB)
+        return batch_tasks.read_document(path, batch_tasks.JOB)
     except (FileNotFoundError, NotADirectoryError):
         raise ValueError(
             f"{output}: no task has finished there; expected the folder that was given to -o of shade, compare or bake"
@@ -215,10 +207,10 @@ def _read_job(output: Path) -> dict:
         raise ValueError(f"{path}: {error}; run the job again with --resume") from None
 
 
-def _task_records(output, command) -> Records:
+def _task_records(output, command) -> batch_tasks.Records:
     """The records of the tasks: with the report of a bake or, for all other commands, of a picture; or a problem."""
     report = bake.REPORT if command == "bake" else picture.REPORT
-    return Records(output, "tasks", {**TASK_RECORD, "report?": report})
+    return batch_tasks.Records(output, "tasks", {**batch_tasks.TASK_RECORD, "report?": report})
 
 
 def _unit(job, output, tasks, finished, progress) -> tuple[str, dict] | None:
@@ -237,7 +229,7 @@ def _unit(job, output, tasks, finished, progress) -> tuple[str, dict] | None:
         "warnings": grouped(line for one in reports for line in one["warnings"]),
     }
     if job["applied_layer"] and report["objects"]:
-        report["applied"] = bake.apply_textures(
+        report["applied"] = bake_files.apply_textures(
             Path(tasks[0].scene), output, report["objects"], job["applied_layer"], progress
         )
     name = " ".join(str(word) for word in (Path(tasks[0].scene).stem, *tasks[0].unit[1:]) if word is not None)
@@ -266,7 +258,7 @@ def _different_versions(records) -> list[str]:
 
 
 def _timing_path(output, task) -> Path:
-    return Path(output) / FOLDER / "timing" / f"{task.name}.json"
+    return Path(output) / batch_tasks.FOLDER / "timing" / f"{task.name}.json"
 
 
 def _read_seconds(output, task) -> dict:

@@ -8,16 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from .. import imaging
-from ..imaging.exr import (
-    COMBINED,
-    COVERAGE,
-    CYCLES_LAYERS,
-    ERROR,
-    UNSHADOWED,
-    layer_name,
-    parse_layer_name,
-    write_channels,
-)
+from ..imaging import exr
 from ..imaging.report import FILE, write_index
 from ..imaging.sheet import common_error_scale
 from ..scene import BAKE_PASSES, CYCLES, REFERENCE, TECHNIQUES, Progress
@@ -64,21 +55,21 @@ def write_lights(folder: Path, arguments: Sequence[str], progress: Progress | No
 
 def _group(path: Path, folder: Path, prefix: str, report: dict) -> dict:
     """Write the pictures of one EXR, with `prefix` before their file names; returns their entry of the index."""
-    layers = {name: pixels for name, pixels in imaging.read_layers(path).items() if not parse_layer_name(name)[2]}
+    layers = {name: pixels for name, pixels in imaging.read_layers(path).items() if not exr.parse_layer_name(name)[2]}
     # The files show emission and background, too. Figures and scales are those of the reflected light.
     shown = {name: layers.pop(name)[..., :3] for name in _whole_pictures(layers)}
-    names = [name for name in _techniques(layers) if not name.startswith((*CYCLES_LAYERS[1:], ERROR))]
-    names = [name for name in names if not name.endswith(UNSHADOWED)]
-    passes = [name for name in BAKE_PASSES if layer_name(names[0], name) in layers]
+    names = [name for name in _techniques(layers) if not name.startswith((*exr.CYCLES_LAYERS[1:], exr.ERROR))]
+    names = [name for name in names if not name.endswith(exr.UNSHADOWED)]
+    passes = [name for name in BAKE_PASSES if exr.layer_name(names[0], name) in layers]
     _add_combined(layers, names, passes)
     written = {}
     for name in names:
         for pass_name in passes:
-            for layer in (layer_name(name, pass_name), layer_name(ERROR + name, pass_name)):
+            for layer in (exr.layer_name(name, pass_name), exr.layer_name(exr.ERROR + name, pass_name)):
                 if layer in layers:
                     written[layer] = f"{prefix}{layer}.exr"
-                    write_channels(folder / written[layer], _unnamed(shown.get(layer, layers[layer])))
-    height, width = layers[layer_name(names[0], passes[0])].shape[:2]
+                    exr.write_channels(folder / written[layer], _unnamed(shown.get(layer, layers[layer])))
+    height, width = layers[exr.layer_name(names[0], passes[0])].shape[:2]
     return {
         "size": [width, height],
         "names": names,
@@ -93,27 +84,27 @@ def _group(path: Path, folder: Path, prefix: str, report: dict) -> dict:
 
 def _whole_pictures(layers) -> list[str]:
     """Names of the layers of whole pictures: the combined ones with alpha."""
-    combined = [name for name in layers if parse_layer_name(name)[1] == COMBINED]
+    combined = [name for name in layers if exr.parse_layer_name(name)[1] == exr.COMBINED]
     return [name for name in combined if layers[name].shape[-1] == 4]
 
 
 def _techniques(layers) -> list[str]:
     """Names of the layers of radiance: techniques in their usual order, then the user's tables, Cycles last."""
-    names = {technique for technique, pass_name, _ in map(parse_layer_name, layers) if pass_name in BAKE_PASSES}
+    names = {technique for technique, pass_name, _ in map(exr.parse_layer_name, layers) if pass_name in BAKE_PASSES}
     others = sorted(names - {*TECHNIQUES, CYCLES})
     return [name for name in (*TECHNIQUES, *others, CYCLES) if name in names]
 
 
 def _add_combined(layers, names, passes) -> None:
     """Add the sums of specular and diffuse to `layers` and `passes`, where both are there and their sum is not."""
-    if COMBINED in passes or not {"specular", "diffuse"} <= set(passes):
+    if exr.COMBINED in passes or not {"specular", "diffuse"} <= set(passes):
         return
     for name in names:
-        for layer in (name, ERROR + name, f"{name}_A", f"{name}_B"):
-            specular, diffuse = (layer_name(layer, pass_name) for pass_name in ("specular", "diffuse"))
+        for layer in (name, exr.ERROR + name, f"{name}_A", f"{name}_B"):
+            specular, diffuse = (exr.layer_name(layer, pass_name) for pass_name in ("specular", "diffuse"))
             if specular in layers:
-                layers[layer_name(layer, COMBINED)] = layers[specular] + layers[diffuse]
-    passes.append(COMBINED)
+                layers[exr.layer_name(layer, exr.COMBINED)] = layers[specular] + layers[diffuse]
+    passes.append(exr.COMBINED)
 
 
 def _unnamed(pixels: np.ndarray) -> dict:
@@ -123,10 +114,10 @@ def _unnamed(pixels: np.ndarray) -> dict:
 
 def _scale(layers, names, pass_name) -> float:
     """The radiance of an error at the ends of its color scale."""
-    picture = layers[layer_name(names[-1], pass_name)]
-    errors = [layers[layer] for name in names if (layer := layer_name(ERROR + name, pass_name)) in layers]
+    picture = layers[exr.layer_name(names[-1], pass_name)]
+    errors = [layers[layer] for name in names if (layer := exr.layer_name(exr.ERROR + name, pass_name)) in layers]
     if not errors:
-        errors = [layers[layer_name(name, pass_name)] - picture for name in names[:-1]]
+        errors = [layers[exr.layer_name(name, pass_name)] - picture for name in names[:-1]]
     return common_error_scale(errors, picture)
 
 
@@ -144,11 +135,11 @@ def _figures(layers, names, passes, report) -> dict:
 
 
 def _measured(layers, names, pass_name) -> dict:
-    halves = np.stack([layers[layer_name(half, pass_name)] for half in CYCLES_LAYERS[1:]])
-    hit, rows = layers[COVERAGE] > 0.0, {}
+    halves = np.stack([layers[exr.layer_name(half, pass_name)] for half in exr.CYCLES_LAYERS[1:]])
+    hit, rows = layers[exr.COVERAGE] > 0.0, {}
     for name in names:
         if name != CYCLES:
-            picture = layers[layer_name(name, pass_name)]
+            picture = layers[exr.layer_name(name, pass_name)]
             # The reference may cover some of the pixels only; the others are black.
             mask = hit & picture.any(axis=-1) if name == REFERENCE else hit
             rows[name] = against_cycles(picture, halves, mask)

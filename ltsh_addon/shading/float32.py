@@ -24,22 +24,7 @@ from ..lobes.lobe_integrals import FLOAT64_CHUNK, NARROWEST
 from ..lobes.lookup_table import MIN_ALPHA
 from ..lobes.polygon import MOSTLY_WHOLE, convex_pieces, dot, integrate_visible
 from ..scene import PolygonLight
-from . import float64
-from .lobes32 import (
-    CHUNK,
-    CORNERS,
-    FormFactor,
-    LobeIntegral,
-    Lobes,
-    ProfiledIntegral,
-    ShadowedFormFactor,
-    along_axes,
-    any_component,
-    as_columns,
-    fresnel_kinds,
-    lobe_axes,
-    normal_frames,
-)
+from . import float64, lobes32
 
 # Samples per chunk for small lights.
 SMALL_CHUNK = 6144
@@ -56,26 +41,26 @@ def shade_diffuse(samples, lights, radiance, scratch, leftovers=None):
     (N,), lights (N,)), where a light's number is its position among those that affect diffuse lobes.
     """
     lights = Lights.of(lights, "diffuse")
-    lit = np.nonzero(any_component(samples.diffuse_albedo))[0]
+    lit = np.nonzero(lobes32.any_component(samples.diffuse_albedo))[0]
     bumped = np.zeros(len(lit), bool)
     if samples.diffuse_normal is not samples.smooth_normal:
-        bumped = any_component(samples.diffuse_normal != samples.smooth_normal)[lit]
+        bumped = lobes32.any_component(samples.diffuse_normal != samples.smooth_normal)[lit]
     lighting = _Lighting(samples, lights, radiance, scratch, float64.shade_diffuse)
     shaped = ((samples.sheen_a != 0.0) | (samples.diffuse_roughness != 0.0))[lit]
     lighting.add_in_float64(lit[shaped])
     lit, bumped = lit[~shaped], bumped[~shaped]
     for is_bumped, members in ((False, lit[~bumped]), (True, lit[bumped])):
         for index in _chunks(members):
-            rows = normal_frames(as_columns(samples.diffuse_normal, index))
-            clip_rows, integrate, at_point = (2,), FormFactor(scratch), small_lights.CosineAtPoint(rows)
+            rows = lobes32.normal_frames(lobes32.as_columns(samples.diffuse_normal, index))
+            clip_rows, integrate, at_point = (2,), lobes32.FormFactor(scratch), small_lights.CosineAtPoint(rows)
             if is_bumped:
-                smooth, bump_alpha2 = as_columns(samples.smooth_normal, index), samples.bump_alpha2[index]
+                smooth, bump_alpha2 = lobes32.as_columns(samples.smooth_normal, index), samples.bump_alpha2[index]
                 rows, clip_rows = np.concatenate([rows, smooth[None]]), (3, 2)
-                integrate = ShadowedFormFactor(rows, bump_alpha2.astype(np.float32), scratch)
+                integrate = lobes32.ShadowedFormFactor(rows, bump_alpha2.astype(np.float32), scratch)
                 at_point = small_lights.ShadowedCosineAtPoint(rows, bump_alpha2.astype(np.float32))
-            colors = as_columns(samples.diffuse_albedo, index)[None]
+            colors = lobes32.as_columns(samples.diffuse_albedo, index)[None]
             others = (samples.bump_alpha2[index],) if is_bumped else ()
-            lighting.add(Lobes(index, rows, clip_rows, integrate, at_point, colors, 1.0, others=others))
+            lighting.add(lobes32.Lobes(index, rows, clip_rows, integrate, at_point, colors, 1.0, others=others))
     lighting.finish(leftovers)
 
 
@@ -84,7 +69,7 @@ def shade_specular(samples, lights, table, radiance, scratch, leftovers=None):
     lights = Lights.of(lights, "specular")
     ridges = moments32.prepare(table)
     terms = (samples.specular_f90, samples.specular_f0, samples.specular_dip, samples.dielectric)
-    reflective = np.logical_or.reduce([any_component(term) for term in terms])
+    reflective = np.logical_or.reduce([lobes32.any_component(term) for term in terms])
     lit = reflective & (dot(samples.normal.T, samples.view.T) > 0.0)
     sharp = lit & ((samples.roughness < moments32.SHARP_ROUGHNESS) | float64.has_bent_fresnel(samples))
     anisotropic = lit & (samples.anisotropy != 0.0)
@@ -97,7 +82,7 @@ def shade_specular(samples, lights, table, radiance, scratch, leftovers=None):
         far = sharp & ~anisotropic
     sharp = (sharp | anisotropic) & ~far
     for only_tails, chosen in ((False, lit & ~sharp & ~far), (True, far)):
-        for vectors, members, colors_of in fresnel_kinds(samples, np.nonzero(chosen)[0]):
+        for vectors, members, colors_of in lobes32.fresnel_kinds(samples, np.nonzero(chosen)[0]):
             for index in _chunks(members):
                 lobes = _specular_lobes(samples, index, (table, ridges, vectors), colors_of(index), scratch)
                 lighting.add(replace(lobes, only_tails=only_tails))
@@ -105,13 +90,13 @@ def shade_specular(samples, lights, table, radiance, scratch, leftovers=None):
     lighting.finish(leftovers)
 
 
-def _specular_lobes(samples, index, kind, colors, scratch) -> Lobes:
+def _specular_lobes(samples, index, kind, colors, scratch) -> lobes32.Lobes:
     """The specular lobes of the samples `index` (Q,) with `colors` (F, 3, Q). `kind` is a table, its `RidgeTable`, and
     the Fresnel terms as `fresnel_kinds` yields them."""
     table, ridges, vectors = kind
-    axes = as_columns(samples.normal, index), as_columns(samples.view, index)
-    rows, clip_rows, weights = lobe_axes(samples, index, axes, ridges, vectors, scratch)
-    integrate, width = LobeIntegral(ridges, weights, scratch), float64.lobe_width(samples, index)
+    axes = lobes32.as_columns(samples.normal, index), lobes32.as_columns(samples.view, index)
+    rows, clip_rows, weights = lobes32.lobe_axes(samples, index, axes, ridges, vectors, scratch)
+    integrate, width = lobes32.LobeIntegral(ridges, weights, scratch), float64.lobe_width(samples, index)
     limits = None
     if table.family == "ltsh":
         ior = None if isinstance(vectors[-1], int) else samples.ior[index]
@@ -120,7 +105,7 @@ def _specular_lobes(samples, index, kind, colors, scratch) -> Lobes:
     at_point = small_lights.LobeAtPoint(rows, weights, table, limits)
     sharpest = small_lights.SharpestLobes(*axes, width)
     others = samples.roughness[index], samples.ior[index]
-    return Lobes(index, rows, clip_rows, integrate, at_point, colors, width, limits, sharpest, others=others)
+    return lobes32.Lobes(index, rows, clip_rows, integrate, at_point, colors, width, limits, sharpest, others=others)
 
 
 def specular_in_float64(table):
@@ -134,7 +119,7 @@ def specular_in_float64(table):
 
 
 def _chunks(members):
-    return (members[piece] for piece in moments32.pieces(len(members), CHUNK))
+    return (members[piece] for piece in moments32.pieces(len(members), lobes32.CHUNK))
 
 
 @dataclass(frozen=True)
@@ -227,7 +212,7 @@ class _Lighting:
         self.needs_float64 = [[] for _ in lights]  # indices of samples, per light
         self.pairs_in_float64: list[tuple] = []  # the same as pairs (K,) of a sample and a light
 
-    def add(self, lobes: Lobes) -> None:
+    def add(self, lobes: lobes32.Lobes) -> None:
         """Add the light that `lobes` reflect."""
         index, colors = lobes.index, lobes.colors
         position = np.ascontiguousarray(self.samples.position[index].T)
@@ -288,7 +273,7 @@ class _Lighting:
             facing &= allowed[columns]
         axes, integrate = lobes.rows[:, :, columns], partial(lobes.integrate, columns)
         if light.has_profile:
-            integrate = ProfiledIntegral(light, effort, offset, axes, integrate, len(lobes.colors))
+            integrate = lobes32.ProfiledIntegral(light, effort, offset, axes, integrate, len(lobes.colors))
             axes = integrate.rows
         polygons = local_corners(outline_light, outline, offset, axes, self.scratch)
         integrals, redo = integrate_visible(polygons, facing, lobes.clip_rows, len(lobes.colors), integrate)
@@ -361,7 +346,7 @@ class _Lighting:
                 radiance = lights.radiance[:, light_column[lit]]
                 _scatter(lobes.at_point(batch[lit], rays.take(lit)), batch[lit], radiance, total)
         remaining = np.concatenate(remaining)
-        for piece in moments32.pieces(len(remaining), CORNERS // len(lights.corners)):
+        for piece in moments32.pieces(len(remaining), lobes32.CORNERS // len(lights.corners)):
             batch, light_column = columns[remaining[piece]], number[remaining[piece]]
             if not len(batch):
                 continue
@@ -431,7 +416,7 @@ class _Lighting:
         for piece in moments32.pieces(len(columns), SMALL_CHUNK):
             batch = columns[piece]
             offset = (light.center[:, None] - position[:, batch]).astype(np.float32)
-            view = light_profile.LightView.of(light, offset, partial(along_axes, lobes.rows[:, :, batch]))
+            view = light_profile.LightView.of(light, offset, partial(lobes32.along_axes, lobes.rows[:, :, batch]))
             regions = profile_regions.ProfileRegions(light, view, lobes.clip_rows)
             for count, kind, index in regions.rules():
                 if count == 0:
@@ -460,9 +445,9 @@ class _Lighting:
         """The lobes of the samples `index`, without their colors."""
         samples = self.samples
         if self.shade_in_float64 is float64.shade_diffuse:
-            return AnalyticLobe(as_columns(samples.diffuse_normal, index))
+            return AnalyticLobe(lobes32.as_columns(samples.diffuse_normal, index))
         alpha = np.maximum(samples.roughness[index].astype(np.float32) ** 2, np.float32(MIN_ALPHA))
-        return AnalyticLobe(as_columns(samples.normal, index), as_columns(samples.view, index), alpha)
+        return AnalyticLobe(lobes32.as_columns(samples.normal, index), lobes32.as_columns(samples.view, index), alpha)
 
     def add_in_float64(self, members) -> None:
         """Add the light of all lights at the samples `members` (Q,)."""
@@ -537,7 +522,7 @@ def _batches(light, corners, position, width, rest=None):
         if rest is not None:
             chosen = rest if chosen is None else rest[chosen]
         count = position.shape[1] if chosen is None else len(chosen)
-        step = max(CORNERS // len(outline), 512)
+        step = max(lobes32.CORNERS // len(outline), 512)
         for start in range(0, count, step):
             batch = slice(start, start + step)
             yield batch if chosen is None else chosen[batch], outline, effort

@@ -14,24 +14,8 @@ from ..emitters import facing, light_profile
 from ..emitters.facing import FacingDisk
 from ..emitters.light_polygons import LocalFrames, PatchTree, has_lobe, light_view, to_local, visible_polygons_by_level
 from ..emitters.tails import LightFromPoints, TailLimits
-from ..lobes import diffuse
-from ..lobes.brdf import (
-    HalfVectors,
-    clipped_metals,
-    dielectric_reflectance,
-    f82_reflectance,
-    ggx_brdf_cosine,
-    half_angle_cosine,
-)
+from ..lobes import brdf, diffuse, lobe_integrals
 from ..lobes.edge_integrals import vector_irradiance
-from ..lobes.lobe_integrals import (
-    FLOAT64_CHUNK,
-    LEAST_SHARE,
-    form_factor,
-    integrals_on_sphere,
-    polygon_integrals,
-    tilted,
-)
 from ..lobes.lookup_table import MIN_ALPHA, Lobe, LookupTable
 from ..lobes.polygon import dot
 from ..lobes.spherical_harmonics import coefficient_index
@@ -88,8 +72,11 @@ def has_patches(light) -> bool:
 def shade_patches(samples, members, patches, tree: PatchTree, radiance, shade) -> None:
     """Add to `radiance` (P, 3) what the samples `members` (N,) reflect of one patch each. shade(samples, lights,
     radiance, members) does so for one light per sample."""
-    for start in range(0, len(members), FLOAT64_CHUNK):
-        index, patch = members[start : start + FLOAT64_CHUNK], patches[start : start + FLOAT64_CHUNK]
+    for start in range(0, len(members), lobe_integrals.FLOAT64_CHUNK):
+        index, patch = (
+            members[start : start + lobe_integrals.FLOAT64_CHUNK],
+            patches[start : start + lobe_integrals.FLOAT64_CHUNK],
+        )
         vectors = (tree.center, tree.half_u, tree.half_v, tree.radiance)
         center, half_u, half_v, light = (values[:, patch].T.astype(np.float64) for values in vectors)
         direction = np.broadcast_to(tree.direction.astype(np.float64), center.shape)
@@ -115,8 +102,8 @@ def shade_pairs(samples, members, number, lights, shade_in_float64):
         among = np.full(len(lights), -1)
         among[chosen] = np.arange(len(chosen))
         of_batch = np.nonzero(among[number] >= 0)[0]
-        for start in range(0, len(of_batch), FLOAT64_CHUNK):
-            pairs = of_batch[start : start + FLOAT64_CHUNK]
+        for start in range(0, len(of_batch), lobe_integrals.FLOAT64_CHUNK):
+            pairs = of_batch[start : start + lobe_integrals.FLOAT64_CHUNK]
             used, item_of_pair = np.unique(among[number[pairs]], return_inverse=True)
             items = [lights[chosen[position]] for position in used]
             light = (items[0][0], 0, items[0][2]) if alone else _light_of_each(items, item_of_pair)
@@ -190,7 +177,7 @@ def _diffuse_kinds(framed, lit):
     samples = framed.samples
 
     def lambert(polygon, _):
-        return np.abs(form_factor(polygon))[None]
+        return np.abs(lobe_integrals.form_factor(polygon))[None]
 
     def sheen(polygon, index):
         return np.abs(diffuse.sheen_form_factor(polygon, samples.sheen_a[index], samples.sheen_b[index]))[None]
@@ -245,7 +232,7 @@ def _profiled(light, view, level, integral, count):
 
 def _bump_shadowing(framed, index, polygon):
     """The bump shadowing (Q,) of `SurfaceSamples` in the mean direction of the polygon."""
-    samples, direction = framed.samples, -integrals_on_sphere(vector_irradiance, polygon)
+    samples, direction = framed.samples, -lobe_integrals.integrals_on_sphere(vector_irradiance, polygon)
     smooth = to_local(framed.frame[:, :, index], samples.smooth_normal[index].T)
     along = (direction * smooth).sum(axis=0)
     tangent2 = (direction * direction).sum(axis=0) / np.maximum(along, 1e-30) ** 2 - 1.0
@@ -263,7 +250,7 @@ def shade_specular(samples, lights, table, radiance, error=None):
     lobe, bent = None, np.zeros(len(samples), bool)
     is_anisotropic = samples.anisotropy[lit] != 0.0
     anisotropic = lit[is_anisotropic]
-    halves = HalfVectors.of(samples, framed.frame, cosine) if table != REFERENCE and len(anisotropic) else None
+    halves = brdf.HalfVectors.of(samples, framed.frame, cosine) if table != REFERENCE and len(anisotropic) else None
     if table != REFERENCE and len(lit):
         bent = has_bent_fresnel(samples)
         lobe = _fresnel_lobe(table, cosine, samples)
@@ -327,7 +314,7 @@ def has_bent_fresnel(samples) -> np.ndarray:
     below = samples.ior < 1.0
     if below.any():
         below = below & samples.dielectric.any(axis=1)
-    return below | clipped_metals(samples)
+    return below | brdf.clipped_metals(samples)
 
 
 def _bent_reflectance(framed, light, corners, at):
@@ -338,20 +325,20 @@ def _bent_reflectance(framed, light, corners, at):
         for corner in corners for fraction in POINTS_TO_CORNERS
     ]  # fmt: skip
     samples, axes, direction = framed.samples.take(at), framed.frame[:, :, at], _of(light.direction, at)
-    origin, is_clipped = light.viewpoint(samples.position), clipped_metals(samples)[:, None]
+    origin, is_clipped = light.viewpoint(samples.position), brdf.clipped_metals(samples)[:, None]
     cosine = np.clip((samples.normal * samples.view).sum(axis=1), 0.0, 1.0)
     alpha, total, lobe = np.maximum(samples.roughness**2, MIN_ALPHA), 0.0, 1e-30
     for point in places:
         offset = np.broadcast_to(point, origin.shape) - origin
         distance = np.linalg.norm(offset, axis=1)
         local = to_local(axes, (offset / distance[:, None]).T).T[:, None]
-        values = ggx_brdf_cosine(cosine, alpha, local)
+        values = brdf.ggx_brdf_cosine(cosine, alpha, local)
         if not light.is_facing:
             values = values * np.maximum(-(offset * direction).sum(axis=1), 0.0)[:, None] / distance[:, None] ** 3
-        half = half_angle_cosine(cosine, local)
-        metal = f82_reflectance(half, samples.specular_f0, samples.specular_f90, samples.specular_dip)
+        half = brdf.half_angle_cosine(cosine, local)
+        metal = brdf.f82_reflectance(half, samples.specular_f0, samples.specular_f90, samples.specular_dip)
         metal = np.where(is_clipped, np.maximum(metal, 0.0), metal)
-        coat = samples.dielectric * dielectric_reflectance(half, samples.ior[:, None])
+        coat = samples.dielectric * brdf.dielectric_reflectance(half, samples.ior[:, None])
         total, lobe = total + values * (metal + coat), lobe + values
     return total / lobe
 
@@ -400,8 +387,8 @@ def _table_integrals(table, lobe, framed, light, level):
     def integral(polygon, index):
         lobes = lobe.take(index)
         vectors = np.concatenate([lobes.coefficients, np.broadcast_to(cosine, lobes.coefficients[:1].shape)])
-        *values, plain = np.maximum(-polygon_integrals(table, lobes, polygon, vectors), 0.0)
-        values[0] = np.maximum(values[0], LEAST_SHARE * plain)
+        *values, plain = np.maximum(-lobe_integrals.polygon_integrals(table, lobes, polygon, vectors), 0.0)
+        values[0] = np.maximum(values[0], lobe_integrals.LEAST_SHARE * plain)
         return np.stack(values)
 
     index, polygon, _ = level
@@ -411,7 +398,7 @@ def _table_integrals(table, lobe, framed, light, level):
 
     def to_lobe(vectors):
         warped = lobes.to_original_domain(vectors)
-        return warped if lobes.tilt is None else tilted(warped, lobes.tilt)
+        return warped if lobes.tilt is None else lobe_integrals.tilted(warped, lobes.tilt)
 
     view = light_view(framed, light, index, to_lobe)
     return _profiled(light, view, level, integral, 4)

@@ -19,32 +19,13 @@ from .. import render_settings
 from ..evaluated import rendered_surfaces, with_render_depsgraph
 from ..lights.area import collect_lights
 from ..lights.world import take_world
-from ..materials.aovs import (
-    RECEIVER_PROPERTY,
-    MaterialLobes,
-    give_default_material,
-    let_shadow_rays_through,
-    lobes_of,
-    objects_without_material,
-)
+from ..materials import aovs
 from ..materials.graph import ensure_nodes
 from ..materials.maps import UV_MAP, MaterialPlan, SavedImages
 from ..process.bake import BakeFactsJob, BakeJob
 from ..render_settings import working_space
-from . import pixels
-from .bake_meshes import (
-    UV_LAYER,
-    MeshFiles,
-    ObjectError,
-    apply_modifiers,
-    check_object,
-    chosen_objects,
-    read_mesh,
-    save_mesh,
-    tiles_without_modifiers,
-    uv_of,
-)
-from .occluders import collect_occluders
+from . import bake_meshes, pixels
+from .occluders import collect_occluders, with_baked_shares
 from .origin import box_center, move_to_origin
 from .pixels import OCCLUDERS, SEEDS, remove_occlusion
 
@@ -80,14 +61,16 @@ class ObjectBake:
     def __init__(self, scene, ob, uv_name: str, plans: list[MaterialPlan]):
         self.scene, self.ob, self.uv_name, self.plans = scene, ob, uv_name, plans
         if uv_name not in ob.data.uv_layers:
-            raise ObjectError(
+            raise bake_meshes.ObjectError(
                 f"object {ob.name!r}: its UV map {uv_name!r} is made by modifiers that make instances as well, where "
                 "textures cannot be baked: apply the modifiers"
             )
         active = ob.data.uv_layers.active_index
-        layer = ob.data.uv_layers.new(name=UV_LAYER, do_init=False)
+        layer = ob.data.uv_layers.new(name=bake_meshes.UV_LAYER, do_init=False)
         if layer is None:
-            raise ObjectError(f"object {ob.name!r} has eight UV maps, and baking needs one more: remove one")
+            raise bake_meshes.ObjectError(
+                f"object {ob.name!r} has eight UV maps, and baking needs one more: remove one"
+            )
         ob.data.uv_layers.active_index = active
         # Blender appends a number if the name is in use.
         self.layer_name, self.images = layer.name, {}
@@ -159,7 +142,7 @@ class ObjectBake:
 
     def _place(self, block):
         layers = self.ob.data.uv_layers
-        uv = uv_of(layers[self.uv_name], len(self.ob.data.loops)).astype(np.float64)
+        uv = bake_meshes.uv_of(layers[self.uv_name], len(self.ob.data.loops)).astype(np.float64)
         layers[self.layer_name].uv.foreach_set("vector", block.placed(uv).astype(np.float32).ravel())
         self.ob.data.update()
 
@@ -191,9 +174,9 @@ class BakeScene:
     origin: np.ndarray  # (3,) m, the place in the file of the occluders' origin
     warnings: list[str]
     names: list[str]
-    meshes: dict[str, MeshFiles]
+    meshes: dict[str, bake_meshes.MeshFiles]
     problems: dict[str, str]
-    lobes: dict[str, MaterialLobes]  # by full name of the material
+    lobes: dict[str, aovs.MaterialLobes]  # by full name of the material
     folder: tempfile.TemporaryDirectory = field(repr=False)
 
     def plans(self, ob, images) -> tuple[list[MaterialPlan], list[str]]:
@@ -246,7 +229,7 @@ def _open(job: BakeJob) -> BakeScene:
     names = job.objects
     if not isinstance(names, str):
         names = list(dict.fromkeys([*names, *job.following]))
-    objects = chosen_objects(scene, view_layer, names)
+    objects = bake_meshes.chosen_objects(scene, view_layer, names)
     render_settings.neutralize(scene, view_layer, camera, warnings)
     world = take_world(scene, view_layer, warnings)
     render_settings.prepare_surfaces(warnings)
@@ -258,14 +241,14 @@ def _open(job: BakeJob) -> BakeScene:
     seen_from = job.view if isinstance(job.view, str) else tuple(np.subtract(job.view, origin).tolist())
     folder = tempfile.TemporaryDirectory(prefix="ltsh-meshes-", ignore_cleanup_errors=True)
     has_shadows = job.shadows == "on"
-    apply_modifiers(scene, objects, job.uv)
+    bake_meshes.apply_modifiers(scene, objects, job.uv)
     files = Path(folder.name), origin, has_shadows
     inventory, meshes, problems, bare, lost = _inspect(scene, world, objects, job.uv, files)
     warnings += lost
-    give_default_material(bare)
+    aovs.give_default_material(bare)
     lobes = _lobes([ob for ob in objects if ob.name in meshes], inventory.emitting_materials)
     for material_lobes in lobes.values() if has_shadows else ():
-        let_shadow_rays_through(material_lobes.made_opaque)
+        aovs.let_shadow_rays_through(material_lobes.made_opaque)
     for material in bpy.data.materials:
         if material.name_full not in inventory.emitting_materials:
             material.cycles.emission_sampling = "NONE"
@@ -318,29 +301,35 @@ def _inspect(scene, world, objects, uv_name, files):
         rendered = {surface.original.name_full: surface for surface in rendered_surfaces(depsgraph)}
         for number, ob in enumerate(objects):
             try:
-                check_object(ob)
-                mesh = read_mesh(ob, depsgraph, uv_name, origin)
+                bake_meshes.check_object(ob)
+                mesh = bake_meshes.read_mesh(ob, depsgraph, uv_name, origin)
                 if ob.name_full not in rendered:
-                    raise ObjectError(f"object {ob.name!r} is not rendered: its collection is excluded or hidden")
-                meshes[ob.name] = save_mesh(*mesh, folder, number)
-            except ObjectError as error:
+                    raise bake_meshes.ObjectError(
+                        f"object {ob.name!r} is not rendered: its collection is excluded or hidden"
+                    )
+                meshes[ob.name] = bake_meshes.save_mesh(*mesh, folder, number)
+            except bake_meshes.ObjectError as error:
                 problems[ob.name] = str(error)
-        bare = objects_without_material([rendered[ob.name_full] for ob in objects if ob.name in meshes])
+        bare = aovs.objects_without_material([rendered[ob.name_full] for ob in objects if ob.name in meshes])
         inventory = collect_lights(depsgraph)
         if with_occluders:
-            inventory.occluders = collect_occluders(depsgraph, None, inventory.warn, inventory.left_out)
+            inventory.occluders = collect_occluders(depsgraph, None, inventory.warn, inventory.left_out, unread)
         return inventory, meshes, problems, bare, pixels.missing_images(depsgraph, world)
 
-    return with_render_depsgraph(scene, visit)
+    unread = []
+    inventory, *others = with_render_depsgraph(scene, visit)
+    if unread:
+        inventory.occluders = with_baked_shares(inventory.occluders, unread, scene, inventory.warn)
+    return inventory, *others
 
 
-def _lobes(objects, emitting) -> dict[str, MaterialLobes]:
+def _lobes(objects, emitting) -> dict[str, aovs.MaterialLobes]:
     """The lobes of the materials of `objects`, by full name of the material."""
     lobes = {}
     for material in (slot.material for ob in objects for slot in ob.material_slots):
         if material.name_full not in lobes:
             ensure_nodes(material)
-            lobes[material.name_full] = lobes_of(material, material.name_full in emitting)
+            lobes[material.name_full] = aovs.lobes_of(material, material.name_full in emitting)
     return lobes
 
 
@@ -358,7 +347,7 @@ def extract_bake(job: BakeJob, folder: Path, progress) -> dict:
         if record["problem"] is None:
             try:
                 record |= _object(opened, name, images, job, folder / f"object_{number}", progress)
-            except (ObjectError, RuntimeError) as error:
+            except (bake_meshes.ObjectError, RuntimeError) as error:
                 record["problem"] = error_line(error)
         records.append(record)
     return {
@@ -386,7 +375,7 @@ def _object(opened, name, images, job, folder, progress) -> dict:
     distinct = list({id(plan): plan for plan in plans}.values())
     record = {"folder": folder.name, "uv": read.uv_name, "materials": [plan.record() for plan in plans]}
     record["unshaded"] = [opened.lobes[slot.material.name_full].unshaded for slot in ob.material_slots]
-    record |= {"warnings": warnings, "receiver": int(ob.get(RECEIVER_PROPERTY, 0))}
+    record |= {"warnings": warnings, "receiver": int(ob.get(aovs.RECEIVER_PROPERTY, 0))}
     used = sorted({texture.uv for plan in plans for texture in plan.textures})
     record["uv_maps"] = {name: f"uv_{number}.npy" for number, name in enumerate(used)}
     for uv_name, file in record["uv_maps"].items():
@@ -438,11 +427,11 @@ def scene_facts(job: BakeFactsJob, folder: Path, progress) -> dict:
     saved_frame = scene.frame_current
     for frame in job.frames:
         render_settings.go_to_frame(scene, saved_frame if frame is None else frame)
-        chosen = [] if job.objects is None else chosen_objects(scene, view_layer, job.objects)
+        chosen = [] if job.objects is None else bake_meshes.chosen_objects(scene, view_layer, job.objects)
         name = scene.camera.name if scene.camera is not None else None
         for ob in chosen:
             if ob.name not in tiles:
-                tiles[ob.name] = tiles_without_modifiers(ob, job.uv)
+                tiles[ob.name] = bake_meshes.tiles_without_modifiers(ob, job.uv)
         record = {"frame": scene.frame_current, "camera": name, "objects": [ob.name for ob in chosen]}
         facts.append({**record, "tiles": {ob.name: tiles[ob.name] for ob in chosen if len(tiles[ob.name]) > 1}})
     return {"facts": facts}

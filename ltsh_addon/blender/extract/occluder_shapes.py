@@ -63,8 +63,8 @@ def _constant_transparency(clear, ob=None, note=None) -> Transparency | None:
     """The transparency of hair or points, from place to place of which it is not read."""
     if clear is None:
         return None
-    if clear.mean is not None:
-        return Transparency(clear.mean)
+    if clear.shares:
+        return Transparency(float(np.mean(clear.shares)))
     if note is not None:
         note("transparency that varies along hair or points is not read here, they block as if they were opaque", ob)
     return None
@@ -196,7 +196,7 @@ def split_by_slot(ob, clear: list, image_of) -> list[OccluderMesh]:
             transparency = None
             if slot is not None:
                 transparency = clear[slot].transparency(
-                    int(here.sum()), lambda name, here=here: uv_of(name)[here], image_of
+                    int(slot), int(here.sum()), lambda name, here=here: uv_of(name)[here], image_of
                 )
                 if transparency.share == 1.0 and transparency.image is None:
                     continue

@@ -8,30 +8,18 @@ from __future__ import annotations
 
 import math
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import bpy
 import numpy as np
 
 from ...scene import FARTHEST, listed
 from ...visibility.occluders import TERMINATOR_OFFSET, OccluderMesh, Occluders, Transparency
 from ..evaluated import SURFACE_TYPES, is_rendered, owner_of
+from ..lights.emission import ObjectFacts, open_studio, trees_of
 from ..lights.linking import MOST_BLOCKER_SETS, OTHER_LIGHTS, Blockers
-from ..materials import maps
+from ..materials import maps, values
 from ..materials.graph import ADD, CLEAR, MIX, PRINCIPLED, Source, live_link, source_of, surface_of
-from ..materials.values import (
-    READERS,
-    Curved,
-    Value,
-    combined,
-    constant,
-    constant_inputs,
-    curved_at,
-    is_gray,
-    is_srgb,
-    limited,
-    product,
-    value_at,
-)
 from ..render_settings import cycles_setting
 from . import occluder_shapes as shapes
 
@@ -42,13 +30,46 @@ NAMED = 3
 SURFACE_SHIFT = 16
 
 
-def collect_occluders(depsgraph, override, warn, left_out=frozenset()) -> Occluders:
+def collect_occluders(depsgraph, override, warn, left_out=frozenset(), unread: list | None = None) -> Occluders:
     """What blocks shadow rays in a render of `depsgraph`, without the objects with full names in `left_out`.
 
     The material `override` replaces all others. `warn(text)` is called for differences from Cycles. Call this before
-    materials are changed.
+    materials are changed. `unread` gets each `UnreadSurface`; without that list they block, which is warned of.
     """
-    return _Collector(depsgraph, override, left_out).collect(warn)
+    return _Collector(depsgraph, override, left_out, unread).collect(warn)
+
+
+@dataclass(frozen=True)
+class UnreadSurface:
+    """Faces of an object that block until Cycles tells what they let through: a slot of `mesh`, a copy."""
+
+    name: str
+    mesh: object
+    slot: int
+    material: object  # the original
+    matrix: np.ndarray  # (4, 4)
+    facts: ObjectFacts
+    number: int  # of the mesh in the occluders
+
+
+def with_baked_shares(occluders: Occluders, unread: list[UnreadSurface], scene, warn) -> Occluders:
+    """`occluders` with what the `unread` surfaces let through. `warn(text)` tells what of that is approximated.
+
+    Call this before materials are changed.
+    """
+    meshes = list(occluders.meshes)
+    for surface in unread:
+        with open_studio(scene) as studio:
+            if scene.camera is not None:
+                studio.camera.matrix_world = scene.camera.matrix_world
+            transparency = maps.baked_transparency(surface, studio)
+        meshes[surface.number] = replace(meshes[surface.number], transparency=transparency)
+        bpy.data.meshes.remove(surface.mesh)
+    for material in dict.fromkeys(surface.material for surface in unread):
+        problem = maps.depends_on_rays(trees_of([material]))
+        if problem:
+            warn(f"shadows: what material {material.name!r} lets through depends on {problem}")
+    return replace(occluders, meshes=tuple(meshes))
 
 
 @dataclass(frozen=True)
@@ -62,8 +83,8 @@ class _Instances:
 
 
 class _Collector:
-    def __init__(self, depsgraph, override, left_out):
-        self._depsgraph, self._override, self._left_out = depsgraph, override, left_out
+    def __init__(self, depsgraph, override, left_out, unread):
+        self._depsgraph, self._override, self._left_out, self._unread = depsgraph, override, left_out, unread
         objects = {
             instance.object.original.name_full: instance.object.original for instance in depsgraph.object_instances
         }
@@ -177,6 +198,7 @@ class _Collector:
                 if any(material is not None and _is_displaced(material) for material in materials):
                     self._note("displacement is not in shadows, the surface blocks where it is without", ob)
             self._shapes[key] = self._number(meshes), matrices
+            self._remember_unread(instance, matrix, materials, self._shapes[key][0])
         self._add_instances(instance, matrix, *self._shapes[key])
 
     def _number(self, meshes) -> list[int]:
@@ -184,6 +206,18 @@ class _Collector:
         first = len(self._meshes)
         self._meshes += [mesh for mesh in meshes if len(mesh.triangles)]
         return list(range(first, len(self._meshes)))
+
+    def _remember_unread(self, instance, matrix, materials, numbers) -> None:
+        ob = instance.object
+        for number in numbers:
+            slot = getattr(self._meshes[number].transparency, "slot", None)
+            if slot is not None:
+                mesh = bpy.data.meshes.new_from_object(ob, preserve_all_data_layers=True, depsgraph=self._depsgraph)
+                if ob.type == "MESH":
+                    mesh.use_auto_texspace, data = False, ob.original.data
+                    mesh.texspace_location, mesh.texspace_size = data.texspace_location, data.texspace_size
+                surface = ob.original.name, mesh, slot, materials[slot].original, matrix
+                self._unread.append(UnreadSurface(*surface, ObjectFacts.of(ob, instance), number))
 
     def _simplified(self, ob) -> bool:
         scene, names = self._depsgraph.scene, ("use_camera_cull", "use_distance_cull")
@@ -206,32 +240,36 @@ class _Collector:
         output = surface.node
         if live_link(surface) is None:
             # A material with only a volume lets light through; another warning tells that volumes are not shaded.
-            return None if live_link(output.inputs["Volume"]) is None else _ClearMaterial(constant(1.0))
+            return None if live_link(output.inputs["Volume"]) is None else _ClearMaterial(shares=(1.0,))
         with _read_for_shadow_rays():
             value, curve = _share_at(surface), None
-        if isinstance(value, Curved):
+        if isinstance(value, values.Curved):
             value, curve = value.value, (value.places, value.numbers)
         if value is None:
             shares = _shares_by_cosine(surface)
             if shares is not None:
                 return _ClearMaterial(shares=shares) if max(shares) > 0.0 else None
-            self._note("only Cycles can tell how transparent it is; here it blocks as if it were opaque", material)
-            return None
-        if not is_gray(value):
+            return self._unread_material(material)
+        if not values.is_gray(value):
             self._note("colored transparency counts by its mean, shadows are gray", material)
             value = value.mapped(np.full((3, 3), 1.0 / 3.0))
         if value.is_constant:
             share = float(np.clip(value.offset[0], 0.0, 1.0))
-            return _ClearMaterial(constant(share)) if share > 0.0 else None
+            return _ClearMaterial(shares=(share,)) if share > 0.0 else None
         image = self._image(value)
         if image is None:
-            self._note("only Cycles knows the colors of its image, it blocks as if it were opaque", material)
-            return None
+            return self._unread_material(material)
         return (
             _ClearMaterial(value, curve) if np.interp(image, *curve or ((0.0, 1.0), (0.0, 1.0))).max() > 0.0 else None
         )
 
-    def _image(self, value: Value) -> np.ndarray | None:
+    def _unread_material(self, material) -> _ClearMaterial | None:
+        if self._unread is not None:
+            return _ClearMaterial()
+        self._note("only Cycles can tell how transparent it is; here it blocks as if it were opaque", material)
+        return None
+
+    def _image(self, value: values.Value) -> np.ndarray | None:
         """`value` at the pixels (H, W) of its image; None if only Cycles knows the colors."""
         use = value.image
         key = (use.image.session_uid, value.matrix[0].tobytes(), value.offset[0].tobytes())
@@ -286,22 +324,30 @@ def _is_same(mesh, other):
 
 
 @dataclass(frozen=True)
-class _ClearMaterial:
-    """The share of light that a material lets through: `value`, or `shares` at `maps.COSINES`."""
+class _UnreadTransparency(Transparency):
+    """The transparency of faces that block until `with_baked_shares` asks Cycles, and their material slot."""
 
-    value: Value | None = None
+    share: float = 0.0
+    slot: int = 0
+
+
+@dataclass(frozen=True)
+class _ClearMaterial:
+    """The share of light that a material lets through: `value`, or `shares` (one, or at maps.COSINES), or unknown."""
+
+    value: values.Value | None = None
     curve: tuple | None = None  # see `Transparency.curve`
     shares: tuple[float, ...] = ()
 
-    def transparency(self, triangles: int, uv_of, image_of) -> Transparency:
-        """The `Transparency` of so many `triangles`.
+    def transparency(self, slot: int, triangles: int, uv_of, image_of) -> Transparency:
+        """The `Transparency` of so many `triangles` of a `slot`.
 
         `uv_of(name)` returns their corners on a UV map, and `image_of(value)` the shares at the pixels of an image.
         """
         if self.shares:
             return maps.even_transparency(self.shares, maps.COSINES, triangles)
-        if self.value.is_constant:
-            return Transparency(float(self.value.offset[0]))
+        if self.value is None:
+            return _UnreadTransparency(slot=slot)
         use = self.value.image
         mapping = np.array(use.mapping, np.float32)
         uv = uv_of(use.uv_map) @ mapping[:, :2].T + mapping[:, 2]
@@ -314,32 +360,25 @@ class _ClearMaterial:
             curve=self.curve,
         )
 
-    @property
-    def mean(self) -> float | None:
-        """The share that stands for all; None if places on the surface differ."""
-        if self.shares:
-            return float(np.mean(self.shares))
-        return float(self.value.offset[0]) if self.value.is_constant else None
-
 
 @contextmanager
 def _read_for_shadow_rays(cosine: float | None = None):
     """Within this context nodes are read as they are for shadow rays; with a `cosine`, for those that meet the surface
     at that (see `Transparency.cosines`). Without it what depends on that is unknown."""
 
-    def read(source: Source) -> Value | None:
-        number = constant_inputs(source, 0) if source.node.inputs else None
+    def read(source: Source) -> values.Value | None:
+        number = values.constant_inputs(source, 0) if source.node.inputs else None
         number = None if number is None else float(number[0][0])
         value = maps.shown_to_shadow_ray(source.node, source.socket.name, number, cosine)
-        return None if value is None else constant(value)
+        return None if value is None else values.constant(value)
 
     readers = dict.fromkeys((maps.LIGHT_PATH, *maps.DIRECTIONAL), read)
-    READERS.update(readers)
+    values.READERS.update(readers)
     try:
         yield
     finally:
         for kind in readers:
-            del READERS[kind]
+            del values.READERS[kind]
 
 
 def _shares_by_cosine(surface) -> tuple[float, ...] | None:
@@ -354,24 +393,26 @@ def _shares_by_cosine(surface) -> tuple[float, ...] | None:
     return tuple(shares)
 
 
-def _share_at(socket, groups: tuple = ()) -> Value | Curved | None:
+def _share_at(socket, groups: tuple = ()) -> values.Value | values.Curved | None:
     """The share of light that the shader at the input `socket` lets through for shadow rays; None: unknown."""
     source = source_of(socket, groups)
     if source is None or source.node is None:
-        return constant(0.0)
+        return values.constant(0.0)
     node, groups = source.node, source.groups
     if node.bl_idname == CLEAR:
-        return value_at(node.inputs["Color"], groups)
+        return values.value_at(node.inputs["Color"], groups)
     if node.bl_idname == PRINCIPLED:
-        return combined(constant(1.0), limited(curved_at(node.inputs["Alpha"], groups)), 1.0, -1.0)
+        return values.combined(
+            values.constant(1.0), values.limited(values.curved_at(node.inputs["Alpha"], groups)), 1.0, -1.0
+        )
     if node.bl_idname not in (MIX, ADD):
-        return constant(0.0)
+        return values.constant(0.0)
     inputs = [_share_at(socket, groups) for socket in node.inputs if socket.type == "SHADER"]
     if node.bl_idname == ADD:
-        return combined(*inputs, 1.0, 1.0)
+        return values.combined(*inputs, 1.0, 1.0)
     if all(_is_constant(value) and not value.offset.any() for value in inputs):
         return inputs[0]  # whatever the factor is
-    factor = limited(curved_at(node.inputs[0], groups))
+    factor = values.limited(values.curved_at(node.inputs[0], groups))
     if factor is None:
         return None
     if _is_constant(factor):
@@ -379,24 +420,24 @@ def _share_at(socket, groups: tuple = ()) -> Value | Curved | None:
         # The other shader does not contribute and may be unknown.
         if share in (0.0, 1.0):
             return inputs[int(share)]
-        return combined(*inputs, 1.0 - share, share)
+        return values.combined(*inputs, 1.0 - share, share)
     first, second = inputs
     if not (_is_constant(first) and _is_constant(second)):
         return None
-    if isinstance(factor, Curved):
+    if isinstance(factor, values.Curved):
         begin, end = (float(value.offset.mean()) for value in inputs)
         return factor.mapped(end - begin, begin)
-    return combined(first, product(factor, constant(second.offset - first.offset)), 1.0, 1.0)
+    return values.combined(first, values.product(factor, values.constant(second.offset - first.offset)), 1.0, 1.0)
 
 
-def _is_constant(value: Value | Curved | None) -> bool:
-    return isinstance(value, Value) and value.is_constant
+def _is_constant(value: values.Value | values.Curved | None) -> bool:
+    return isinstance(value, values.Value) and value.is_constant
 
 
-def _values_of_image(value: Value) -> np.ndarray | None:
+def _values_of_image(value: values.Value) -> np.ndarray | None:
     image = value.image.image
     colors_count = bool(np.any(value.matrix[:, :3]))
-    srgb = is_srgb(image)
+    srgb = values.is_srgb(image)
     if not all(image.size) or (colors_count and srgb is None):
         return None
     width, height = image.size

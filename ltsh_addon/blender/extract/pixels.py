@@ -15,32 +15,11 @@ from ..evaluated import SURFACE_TYPES, owner_of, read_values, rendered_surfaces,
 from ..lights.area import LightInventory, collect_lights, note_overlaps, rendered_lights
 from ..lights.meshes import SIDE_PROPERTY, let_light_through
 from ..lights.world import blocks_nothing, take_world, world_behind, world_lights
-from ..materials.aovs import (
-    declare_aovs,
-    give_default_material,
-    inject_aovs,
-    let_shadow_rays_through,
-    materials_in_use,
-    objects_without_material,
-    remove_aovs,
-)
+from ..materials import aovs
 from ..materials.graph import images_behind
 from ..process.blender_process import job_start, newer
 from ..process.pixels import EDGE_SECONDS, PixelJob, too_small
-from ..render_settings import (
-    camera_rays,
-    enable_passes,
-    filter_name,
-    pinned_pixel_filter,
-    render_exr,
-    shared_points,
-    shifted_pixels,
-    sub_pixel_offsets,
-    without_lights,
-    without_scripts,
-    working_space,
-)
-from .occluders import collect_occluders
+from .occluders import collect_occluders, with_baked_shares
 from .origin import move_to_origin
 
 # FAST_PIXELS: up to this many samples (about 1 GB of files), files are compressed fast instead of well.
@@ -54,25 +33,25 @@ def render_pixel_samples(
 
     Returns the names of the files in `folder`, one per offset. With depth of field each file has other lens points.
     """
-    declare_aovs(view_layer)
-    enable_passes(view_layer, ("combined", "diffuse_color", "normal", *extra_passes))
+    aovs.declare_aovs(view_layer)
+    render_settings.enable_passes(view_layer, ("combined", "diffuse_color", "normal", *extra_passes))
     scene.cycles.seed, scene.cycles.samples, scene.cycles.use_sample_subset = 0, 1, False
     files, sub_samples, cycles = [], len(offsets), scene.cycles
     if scene.camera.data.dof.use_dof:
         cycles.samples, cycles.use_sample_subset, cycles.sample_subset_length = sub_samples, True, 1
     # RLE is faster to write than ZIP; its files are 2.4 times larger on the example scene.
     codec = "RLE" if sub_samples * scene.render.resolution_x * scene.render.resolution_y <= FAST_PIXELS else "ZIP"
-    with pinned_pixel_filter(scene), without_scripts(scene):
+    with render_settings.pinned_pixel_filter(scene), render_settings.without_scripts(scene):
         for index, offset in enumerate(offsets):
             progress("samples", index / sub_samples)
             files.append(f"samples_{index:04d}.exr")
             cycles.sample_offset = index  # used only with a sample subset
             # Only the camera changes from file to file: Cycles keeps the scene, and the result is the same bit by bit.
             scene.render.use_persistent_data = index < sub_samples - 1
-            with shifted_pixels(scene, offset):
-                render_exr(scene, folder / files[-1], codec)
+            with render_settings.shifted_pixels(scene, offset):
+                render_settings.render_exr(scene, folder / files[-1], codec)
     cycles.use_sample_subset = False
-    remove_aovs(view_layer)
+    aovs.remove_aovs(view_layer)
     return files
 
 
@@ -130,12 +109,14 @@ def render_reference(scene, view_layer, folder: Path, cycles_samples: int, sub_s
     `render_pixel_samples`, so that edges agree: each sub-sample gets an equal share of the samples, at least one. A
     half is rendered in chunks of one sample sequence because Cycles reports progress only about once a minute.
     """
-    enable_passes(view_layer, ("combined", "diffuse_direct", "diffuse_color", "glossy_direct", "glossy_color"))
-    samples, offsets = max(1, cycles_samples // 2), sub_pixel_offsets(scene, sub_samples)
+    render_settings.enable_passes(
+        view_layer, ("combined", "diffuse_direct", "diffuse_color", "glossy_direct", "glossy_color")
+    )
+    samples, offsets = max(1, cycles_samples // 2), render_settings.sub_pixel_offsets(scene, sub_samples)
     share = max(1, samples // sub_samples)
     # Cycles keeps the scene, and its picture of a procedural sky, for all files.
     scene.render.use_persistent_data = True
-    with pinned_pixel_filter(scene):
+    with render_settings.pinned_pixel_filter(scene):
         files = [_render_half(scene, folder, half, offsets, share, progress) for half in SEEDS]
     scene.render.use_persistent_data = False
     return files
@@ -155,8 +136,8 @@ def _render_half(scene, folder: Path, half: str, offsets, share: int, progress) 
         started = time.monotonic()
         cycles.sample_offset, cycles.sample_subset_length = done, min(chunk, samples - done)
         files.append([f"cycles_{half}_{len(files):04d}.exr", cycles.sample_subset_length])
-        with shifted_pixels(scene, offsets[done // share]):
-            render_exr(scene, folder / files[-1][0])
+        with render_settings.shifted_pixels(scene, offsets[done // share]):
+            render_settings.render_exr(scene, folder / files[-1][0])
         done += cycles.sample_subset_length
         if len(offsets) == 1 and len(files) == 1 and done < samples:
             seconds_left = (time.monotonic() - started) * (samples - done) / done
@@ -278,24 +259,27 @@ def prepare_scene(
     def visit(depsgraph):
         surfaces = rendered_surfaces(depsgraph)
         override = view_layer.material_override
-        bare = [] if override else objects_without_material(surfaces)
+        bare = [] if override else aovs.objects_without_material(surfaces)
         inventory = collect_lights(depsgraph, override)
         if with_occluders:
-            inventory.occluders = collect_occluders(depsgraph, override, inventory.warn, inventory.left_out)
+            inventory.occluders = collect_occluders(depsgraph, override, inventory.warn, inventory.left_out, unread)
         lost.extend(missing_images(depsgraph, world, override))
-        return inventory, materials_in_use(surfaces, override), bare
+        return inventory, aovs.materials_in_use(surfaces, override), bare
 
+    unread = []
     inventory, materials, bare = with_render_depsgraph(scene, visit)
+    if unread:
+        inventory.occluders = with_baked_shares(inventory.occluders, unread, scene, inventory.warn)
     inventory.origin = origin
-    default = give_default_material(bare)
+    default = aovs.give_default_material(bare)
     materials += [default] if default else []
     left_to_cycles = inventory.left_to_cycles if for_finished else None
-    of_materials = inject_aovs(
+    of_materials = aovs.inject_aovs(
         materials, inventory.emitting_materials, inventory.unshaded, inventory.made_opaque, left_to_cycles
     )
     inventory.receivers.mark()
     if with_occluders:  # before a look at the lights, which shows them to such rays
-        let_shadow_rays_through(inventory.made_opaque)
+        aovs.let_shadow_rays_through(inventory.made_opaque)
     inventory.behind = world
     add_world(inventory, scene, world)
     if not inventory.lights and not for_finished:
@@ -367,16 +351,16 @@ def extract_pixels(job: PixelJob, folder: Path, progress) -> dict:
 
     started = time.monotonic()
     lens.use_dof = has_lens
-    offsets, weights = sub_pixel_offsets(scene, count), None
+    offsets, weights = render_settings.sub_pixel_offsets(scene, count), None
     if for_finished:
         # If all direct light is left to Cycles, no samples are needed.
         count = 0 if inventory.left_to_cycles.everything else count
-        offsets, weights = sub_pixel_offsets(scene, count, shared_points)
+        offsets, weights = render_settings.sub_pixel_offsets(scene, count, render_settings.shared_points)
     finer = _finer(scene, job.edge_points) if for_finished and has_shadows and count and not has_lens else None
     with world_behind(scene, inventory.behind if job.rest and not picture["film_transparent"] else None):
         passes = (*(REST_PASSES if job.rest else ()), *job.indices)
         # Lights that the camera sees are part of the rest.
-        with nullcontext() if job.rest else without_lights(scene):
+        with nullcontext() if job.rest else render_settings.without_lights(scene):
             samples = render_pixel_samples(scene, view_layer, folder, offsets, progress, passes)
     seconds["samples"] = time.monotonic() - started
 
@@ -421,10 +405,10 @@ def _finer(scene, count: int) -> dict | None:
     """The record of `gbuffer.FinerPoints` for `count` points per pixel; None if the camera's rays are not known."""
 
     def visit(depsgraph):
-        return camera_rays(scene, scene.camera.evaluated_get(depsgraph).matrix_world)
+        return render_settings.camera_rays(scene, scene.camera.evaluated_get(depsgraph).matrix_world)
 
     rays = with_render_depsgraph(scene, visit)
-    offsets, weights = sub_pixel_offsets(scene, count, shared_points)
+    offsets, weights = render_settings.sub_pixel_offsets(scene, count, render_settings.shared_points)
     if rays is None:
         return None
     return {
@@ -455,8 +439,8 @@ def _picture(scene, job: PixelJob) -> dict:
         "height": border.height if cropped else height,
         "border": None if border is None else vars(border),
         "pixel_aspect": scene.render.pixel_aspect_x / scene.render.pixel_aspect_y,
-        "pixel_filter": filter_name(scene),
+        "pixel_filter": render_settings.filter_name(scene),
         "film_transparent": scene.render.film_transparent,
         "exposure": scene.cycles.film_exposure,
-        "color_space": working_space(),
+        "color_space": render_settings.working_space(),
     }

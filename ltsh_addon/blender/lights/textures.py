@@ -376,7 +376,7 @@ class ShownTextures:
 
         Coarse patches are reported in `notes`.
         """
-        patches = self._patches_of(light, factor)
+        patches = self._patches_of(light.is_round, factor)
         return None if patches is None else _shown_patches(light, patches, notes)
 
     def split_by_nodes(self, light: Light, emission: NodeEmission, notes: list[str]) -> list[Light]:
@@ -391,13 +391,18 @@ class ShownTextures:
             self._seen[key] = emission, patches
         return _shown_patches(light, self._seen[key][1], notes)
 
-    def _patches_of(self, light: Light, factor: Value) -> Patches | None:
+    def mean(self, factor: Value) -> np.ndarray:
+        """The mean color (3,) of an image on all of its UV square; 0 where only Cycles knows its colors."""
+        patches = self._patches_of(False, factor)
+        return np.zeros(3) if patches is None or patches.whole is None else patches.whole.radiance
+
+    def _patches_of(self, is_round: bool, factor: Value) -> Patches | None:
         use = factor.image
-        key = (use.image.session_uid, use.mapping, use.closest, use.extension, light.is_round,
+        key = (use.image.session_uid, use.mapping, use.closest, use.extension, is_round,
                factor.matrix.tobytes(), factor.offset.tobytes())  # fmt: skip
         if key not in self._patches:
             texture = _texture(use)
-            self._patches[key] = None if texture is None else _cut(texture, factor, light.is_round)
+            self._patches[key] = None if texture is None else _cut(texture, factor, is_round)
         return self._patches[key]
 
 

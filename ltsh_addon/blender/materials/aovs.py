@@ -17,31 +17,8 @@ import bpy
 from ...cycles.lobes import AOV_PREFIX, HIT_AOVS, KEPT_AOV, KEPT_BITS, LOBE_AOVS, MAX_LOBES, aov_kind, lobe_aov
 from ...scene import listed
 from ..render_settings import SCRIPT
+from . import graph
 from .bsdfs import BOTH, NEITHER, bsdf_of, emits, has_alpha, is_emission, lobe_values, notes_of, passes_of_cycles
-from .graph import (
-    CLEAR,
-    MIX,
-    Factor,
-    SurfaceShaders,
-    WeightedShader,
-    carry_into_group,
-    carry_out_of_group,
-    computed,
-    cut,
-    ensure_nodes,
-    fill_with_bsdf,
-    is_constant,
-    is_group,
-    is_seen_through,
-    is_socket,
-    live_link,
-    material_output,
-    mix_weights,
-    product,
-    shaders_behind,
-    total,
-    value_of,
-)
 
 # Nodes whose values differ from those in the Cycles reference, and the note about each.
 NOTED_NODES = {
@@ -67,7 +44,7 @@ class OpaqueInput:
 class MaterialLobes:
     """The lobes of one material: the leaves that have one, the values of each, and the differences from Cycles."""
 
-    leaves: tuple[WeightedShader, ...]
+    leaves: tuple[graph.WeightedShader, ...]
     values: tuple[dict, ...]  # per leaf those of `bsdfs.lobe_values`, and the weight unless that is 1
     warnings: tuple[str, ...]
     is_transparent: bool = False  # rays pass through it and meet the next surface
@@ -99,29 +76,29 @@ class CyclesReasons:
 def lobes_of(material, emitter: bool) -> MaterialLobes:
     """The lobes of `material`, at most MAX_LOBES; its tree is changed. An `emitter` gets no note about its emission."""
     tree = material.node_tree
-    output = material_output(tree) or tree.nodes.new("ShaderNodeOutputMaterial")
+    output = graph.material_output(tree) or tree.nodes.new("ShaderNodeOutputMaterial")
     surface = output.inputs["Surface"]
-    shaders = shaders_behind(surface, tree_of=functools.cache(_own_tree))
+    shaders = graph.shaders_behind(surface, tree_of=functools.cache(_own_tree))
     notes = notes_of_material(output, shaders, emitter)
     warnings = tuple(dict.fromkeys(f"material {material.name!r}: {note}" for note in notes))
-    is_displaced = material.displacement_method != "BUMP" and live_link(output.inputs["Displacement"]) is not None
+    is_displaced = material.displacement_method != "BUMP" and graph.live_link(output.inputs["Displacement"]) is not None
     left_to_cycles = BOTH if is_displaced else _passes_left_to_cycles(output, shaders)
-    has_volume = live_link(output.inputs["Volume"]) is not None
+    has_volume = graph.live_link(output.inputs["Volume"]) is not None
     traits = {"left_to_cycles": left_to_cycles, "has_volume": has_volume, "is_displaced": is_displaced}
     without_lobe, made_opaque = MaterialLobes((), (), warnings, **traits), []
     for cut_node in shaders.cuts:
-        if cut_node.node.bl_idname == MIX:
+        if cut_node.node.bl_idname == graph.MIX:
             is_last = cut_node.other == [socket for socket in cut_node.node.inputs if socket.type == "SHADER"][-1]
             made_opaque.append(_fixed(cut_node.node.inputs[0], float(is_last)))
         else:
-            made_opaque.append(OpaqueInput(cut_node.clear, live_link(cut_node.clear).from_socket, 1.0))
-            cut(cut_node.clear)
-    is_clear = is_seen_through(output, shaders)
-    cut(output.inputs["Volume"])
+            made_opaque.append(OpaqueInput(cut_node.clear, graph.live_link(cut_node.clear).from_socket, 1.0))
+            graph.cut(cut_node.clear)
+    is_clear = graph.is_seen_through(output, shaders)
+    graph.cut(output.inputs["Volume"])
     if is_clear:
-        if live_link(surface) is not None:
-            made_opaque.append(OpaqueInput(surface, live_link(surface).from_socket, 1.0))
-        _show(surface, CLEAR, 1.0)
+        if graph.live_link(surface) is not None:
+            made_opaque.append(OpaqueInput(surface, graph.live_link(surface).from_socket, 1.0))
+        _show(surface, graph.CLEAR, 1.0)
     elif not shaders.leaves:
         # Without a shader Cycles counts AOVs twice; a black BSDF looks the same.
         _show(surface, "ShaderNodeBsdfDiffuse", 0.0)
@@ -135,7 +112,7 @@ def lobes_of(material, emitter: bool) -> MaterialLobes:
     weight_of = _Weights().of
     # Compute all weights before any value: the group sockets that values come from must stay where they are.
     weights = [weight_of(leaf) for leaf in leaves]
-    shares = [{} if is_constant(weight, 1.0) else {"weight": weight} for weight in weights]
+    shares = [{} if graph.is_constant(weight, 1.0) else {"weight": weight} for weight in weights]
     values = tuple({**lobe_values(leaf.node), **share} for leaf, share in zip(leaves, shares, strict=True))
     unknown = [leaf.node.name for leaf in shaders.leaves if bsdf_of(leaf.node) is None and not is_emission(leaf.node)]
     unshaded = ""
@@ -144,7 +121,7 @@ def lobes_of(material, emitter: bool) -> MaterialLobes:
     return replace(without_lobe, leaves=tuple(leaves), values=values, unshaded=unshaded, made_opaque=tuple(made_opaque))
 
 
-def _passes_left_to_cycles(output, shaders: SurfaceShaders) -> frozenset[str]:
+def _passes_left_to_cycles(output, shaders: graph.SurfaceShaders) -> frozenset[str]:
     """The passes in which direct light on a material is not as in Cycles."""
     leaves = shaders.leaves
     if all(leaf.is_transparent for leaf in leaves):
@@ -159,12 +136,12 @@ def _fixed(target, level: float) -> OpaqueInput:
 
     Its old source stays linked: Cycles reads an image differently if its alpha feeds nothing.
     """
-    before = value_of(target)
-    if is_socket(before):
-        fixed = computed("MAXIMUM" if level else "MINIMUM", before, level, clamp=True)
+    before = graph.value_of(target)
+    if graph.is_socket(before):
+        fixed = graph.computed("MAXIMUM" if level else "MINIMUM", before, level, clamp=True)
         target.id_data.links.new(fixed, target)
     else:
-        cut(target)
+        graph.cut(target)
         target.default_value = level
     return OpaqueInput(target, before, level)
 
@@ -176,11 +153,13 @@ def let_shadow_rays_through(made_opaque: Iterable[OpaqueInput]) -> None:
         is_camera_ray = tree.nodes.new("ShaderNodeLightPath").outputs["Is Camera Ray"]
         if target.type != "SHADER":
             if changed.level:
-                tree.links.new(computed("MAXIMUM", is_camera_ray, before), target)
+                tree.links.new(graph.computed("MAXIMUM", is_camera_ray, before), target)
             else:
-                tree.links.new(computed("MINIMUM", computed("SUBTRACT", 1.0, is_camera_ray), before), target)
+                tree.links.new(
+                    graph.computed("MINIMUM", graph.computed("SUBTRACT", 1.0, is_camera_ray), before), target
+                )
             continue
-        now = live_link(target)
+        now = graph.live_link(target)
         node = tree.nodes.new("ShaderNodeMixShader")
         tree.links.new(is_camera_ray, node.inputs[0])
         tree.links.new(before, node.inputs[1])
@@ -196,10 +175,10 @@ def _show(surface, node_type: str, level: float) -> None:
     surface.id_data.links.new(node.outputs[0], surface)
 
 
-def notes_of_material(output, shaders: SurfaceShaders, emitter: bool = False) -> list[str]:
+def notes_of_material(output, shaders: graph.SurfaceShaders, emitter: bool = False) -> list[str]:
     """Notes about what of a material is not shaded as in Cycles; `emitter`: it is a light. Changes nothing."""
     notes, leaves = [], shaders.leaves
-    if live_link(output.inputs["Volume"]) is not None:
+    if graph.live_link(output.inputs["Volume"]) is not None:
         notes.append(f"its volume is not shaded{'' if leaves else ', it is seen through'}; {LEFT_OUT}")
     elif not leaves:
         notes.append("it has no surface shader and is black, as in Cycles")
@@ -221,12 +200,12 @@ def notes_of_material(output, shaders: SurfaceShaders, emitter: bool = False) ->
 def _tinted(leaves) -> list[str]:
     """Notes about transparency that is not clear."""
     white = 1.0, 1.0, 1.0
-    nodes = [leaf.node for leaf in leaves if leaf.node.bl_idname == CLEAR]
-    nodes = [node for node in nodes if not is_constant(value_of(node.inputs["Color"]), white)]
+    nodes = [leaf.node for leaf in leaves if leaf.node.bl_idname == graph.CLEAR]
+    nodes = [node for node in nodes if not graph.is_constant(graph.value_of(node.inputs["Color"]), white)]
     return [f"node {node.name!r} is shaded as clear; its color is {LEFT_OUT}" for node in nodes]
 
 
-def shaded_leaves(shaders: SurfaceShaders) -> tuple[list[WeightedShader], list[WeightedShader]]:
+def shaded_leaves(shaders: graph.SurfaceShaders) -> tuple[list[graph.WeightedShader], list[graph.WeightedShader]]:
     """The leaves with a lobe: the MAX_LOBES with the largest upper bounds on their weights, and the others."""
     leaves = [leaf for leaf in shaders.leaves if bsdf_of(leaf.node) is not None]
     order = sorted(range(len(leaves)), key=lambda index: -leaves[index].bound)
@@ -237,7 +216,7 @@ def _noted_nodes(tree) -> list:
     """Nodes in `tree` and its groups that are in NOTED_NODES and feed something."""
     noted = []
     for node in tree.nodes:
-        if is_group(node) and node.node_tree is not None:
+        if graph.is_group(node) and node.node_tree is not None:
             noted += _noted_nodes(node.node_tree)
         elif node.bl_idname in NOTED_NODES and not node.mute:
             noted += [node] * any(socket.is_linked and socket.type != "SHADER" for socket in node.outputs)
@@ -258,11 +237,11 @@ class _Weights:
         self._known: dict = {}
         self._shares: dict = {}
 
-    def of(self, leaf: WeightedShader):
+    def of(self, leaf: graph.WeightedShader):
         """The weight of the lobes of `leaf`: a number, or a socket of its tree."""
-        return functools.reduce(total, (self._product(term, leaf.groups) for term in leaf.lobe_terms))
+        return functools.reduce(graph.total, (self._product(term, leaf.groups) for term in leaf.lobe_terms))
 
-    def _product(self, factors: tuple[Factor, ...], groups: tuple):
+    def _product(self, factors: tuple[graph.Factor, ...], groups: tuple):
         """The product of `factors` in the tree that `groups` lead to."""
         key = factors, groups
         if key not in self._known:
@@ -272,17 +251,17 @@ class _Weights:
     def _carried(self, factors, groups):
         last = factors[-1]
         if groups == last.groups:
-            return product(self._product(factors[:-1], groups), self._share(last))
+            return graph.product(self._product(factors[:-1], groups), self._share(last))
         depth = len(groups)
         if last.groups[:depth] == groups:
-            return carry_out_of_group(last.groups[depth], self._product(factors, last.groups[: depth + 1]))
-        return carry_into_group(groups[-1], self._product(factors, groups[:-1]))
+            return graph.carry_out_of_group(last.groups[depth], self._product(factors, last.groups[: depth + 1]))
+        return graph.carry_into_group(groups[-1], self._product(factors, groups[:-1]))
 
-    def _share(self, factor: Factor):
+    def _share(self, factor: graph.Factor):
         if factor.constant is not None:
             return factor.constant
         if factor.node not in self._shares:
-            self._shares[factor.node] = mix_weights(factor.node)
+            self._shares[factor.node] = graph.mix_weights(factor.node)
         return self._shares[factor.node][0 if factor.is_complement else 1]
 
 
@@ -303,7 +282,7 @@ def inject_aovs(
     made_opaque = [] if made_opaque is None else made_opaque
     opaque, warnings = [], []
     for material in materials:
-        ensure_nodes(material)
+        graph.ensure_nodes(material)
         emitter = material.name_full in emitters
         if not emitter:
             material.cycles.emission_sampling = "NONE"
@@ -349,7 +328,7 @@ def _write_hit(material) -> None:
 
 def _bends_normals(tree):
     """A socket of `tree` that is 1, except on hair, where it is 0: Cycles bends no specular normals there."""
-    return computed("SUBTRACT", 1.0, tree.nodes.new("ShaderNodeHairInfo").outputs["Is Strand"])
+    return graph.computed("SUBTRACT", 1.0, tree.nodes.new("ShaderNodeHairInfo").outputs["Is Strand"])
 
 
 def _write_aov(tree, name: str, value) -> None:
@@ -357,7 +336,7 @@ def _write_aov(tree, name: str, value) -> None:
     node = tree.nodes.new("ShaderNodeOutputAOV")
     node.aov_name = AOV_PREFIX + name
     target = node.inputs["Color" if aov_kind(name) == "COLOR" else "Value"]
-    if is_socket(value):
+    if graph.is_socket(value):
         tree.links.new(value, target)
     elif isinstance(value, tuple):
         target.default_value = (*value[:3], 1.0)
@@ -413,10 +392,10 @@ def give_default_material(objects: list):
     if not objects:
         return None
     material = bpy.data.materials.new("Default surface")
-    ensure_nodes(material)
+    graph.ensure_nodes(material)
     # Measured: a gray Diffuse BSDF in 4.5.15, a Principled BSDF with all its defaults in 5.2.3.
     default = "ShaderNodeBsdfDiffuse" if bpy.app.version < (5, 0, 0) else "ShaderNodeBsdfPrincipled"
-    fill_with_bsdf(material.node_tree, default, (0.8, 0.8, 0.8, 1.0))
+    graph.fill_with_bsdf(material.node_tree, default, (0.8, 0.8, 0.8, 1.0))
     for ob in objects:
         if len(ob.material_slots) == 0:
             ob.data.materials.append(material)

@@ -1,10 +1,13 @@
 """The varying values of a material: images that are read directly, and maps that Cycles bakes (in the child).
 
 For a bake the material emits the values of a map. A color or normal takes a map of its own; three numbers share one.
+`baked_transparency` bakes what a surface lets through for shadow rays.
 """
 
 from __future__ import annotations
 
+import math
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,13 +15,15 @@ import bpy
 import numpy as np
 
 from ...cycles.lobes import LOBE_AOVS
-from ...cycles.texels import EXTENSIONS, INTERPOLATIONS, MapValue, TextureFile, TextureValue
+from ...cycles.texels import MapValue, TextureFile, TextureValue
 from ...files import save_array
 from ...lobes.brdf import dielectric_reflectance
 from ...visibility.occluders import Transparency
+from ..evaluated import read_values
 from ..render_settings import working_space
-from .graph import carry_out_of_group, computed, cut, is_socket, live_link, material_output, source_behind, value_of
-from .values import has_plain_mapping, is_srgb, opaque_pixels
+from . import graph
+from .bsdfs import EMISSION
+from .values import IDENTITY, READERS, is_srgb, opaque_pixels
 
 # UV_MAP: number of the map that shows the coordinates of the UV map being baked.
 UV_MAP = -1
@@ -53,49 +58,18 @@ def plain_texture(output, groups, kind: str) -> tuple[bpy.types.Image, TextureFi
     `groups` are those around the node (see `graph.Source`), `kind` is the type of the socket that shows it. The
     component is "color", or the number of a channel.
     """
-    source, component = source_behind(output, groups), "color"
-    if source is not None and not source.arrives_whole(kind):
+    source = graph.source_behind(output, groups)
+    if source is None or source.node is None or not source.arrives_whole(kind):
         return None
-    if _is_node(source, "ShaderNodeSeparateColor") and source.node.mode == "RGB":
-        component = str(list(source.node.outputs).index(source.socket))
-        source = source.input(0)
-        if source is not None and not source.arrives_whole("RGBA"):
-            return None
-    if not _is_node(source, "ShaderNodeTexImage") or source.socket.name != "Color" or source.node.image is None:
+    is_texture = source.node.bl_idname in ("ShaderNodeTexImage", "ShaderNodeSeparateColor")
+    value = READERS[source.node.bl_idname](source) if is_texture else None
+    if value is None or value.is_constant or value.image.mapping != IDENTITY:
         return None
-    node = source.node
-    uv, srgb = _uv_map(source), _known_encoding(node.image)
-    if uv is None or srgb is None or not _is_plain(node):
+    component = "color" if np.array_equal(value.matrix[:, :3], np.eye(3)) else str(value.matrix[0].argmax())
+    use, srgb = value.image, _known_encoding(value.image.image)
+    if srgb is None or component == "3":  # alpha
         return None
-    return node.image, TextureFile(uv, node.extension, node.interpolation, srgb), component
-
-
-def _is_node(source, kind: str) -> bool:
-    return source is not None and source.node is not None and source.node.bl_idname == kind
-
-
-def _uv_map(texture) -> str | None:
-    """Name of the UV map at which an image texture is read, "" for the default one; None for other coordinates."""
-    vector = texture.input("Vector")
-    if vector is None or not vector.arrives_whole("VECTOR"):
-        return None
-    if vector.node is None:
-        # The texture's own unlinked input means the default UV map; the unlinked input of a group is a constant.
-        return "" if vector.socket == texture.node.inputs["Vector"] else None
-    if getattr(vector.node, "from_instancer", False):
-        return None
-    if _is_node(vector, "ShaderNodeUVMap"):
-        return vector.node.uv_map
-    return "" if _is_node(vector, "ShaderNodeTexCoord") and vector.socket.name == "UV" else None
-
-
-def _is_plain(node) -> bool:
-    return (
-        node.projection == "FLAT"
-        and node.extension in EXTENSIONS
-        and node.interpolation in INTERPOLATIONS
-        and has_plain_mapping(node)
-    )
+    return use.image, TextureFile(use.uv_map, use.extension, "Closest" if use.closest else "Linear", srgb), component
 
 
 def _known_encoding(image) -> bool | None:
@@ -118,7 +92,7 @@ def _alphas_in_use(tree, paths):
             if node.bl_idname == "ShaderNodeTexImage" and node.outputs["Alpha"].is_linked:
                 socket = node.outputs["Alpha"]
                 for group in reversed(path):
-                    socket = carry_out_of_group(group, socket)
+                    socket = graph.carry_out_of_group(group, socket)
                 yield socket
 
 
@@ -160,14 +134,14 @@ class MaterialPlan:
         return {"corrected": corrected, "lobes": lobes, "textures": [vars(texture) for texture in self.textures]}
 
     def _recorded(self, name, value, groups):
-        if not is_socket(value):
+        if not graph.is_socket(value):
             return list(value[:3]) if isinstance(value, tuple) else value
         texture = self._looked_up(name, value, groups) if self._images is not None else None
         if texture is not None:
             return texture
         socket = value
         for group in reversed(groups):
-            socket = carry_out_of_group(group, socket)
+            socket = graph.carry_out_of_group(group, socket)
         if LOBE_AOVS[name][0] == "COLOR":
             self._colors.add(len(self._maps))
             self._maps.append([socket])
@@ -199,10 +173,10 @@ class MaterialPlan:
 
     def prepare(self, uv_name: str) -> None:
         """Add the nodes that `show` and `target` need; `uv_name` is the UV map that UV_MAP shows."""
-        self._output = material_output(self.tree)
+        self._output = graph.material_output(self.tree)
         if self._output is None:
             self._output = self.tree.nodes.new("ShaderNodeOutputMaterial")
-        link = live_link(self._output.inputs["Surface"])
+        link = graph.live_link(self._output.inputs["Surface"])
         self._surface = link.from_socket if link else None
         self._emissions = {number: self._emission(number) for number in range(self.count)}
         self._places = self.tree.nodes.new("ShaderNodeUVMap")
@@ -214,7 +188,7 @@ class MaterialPlan:
     def _emission(self, number):
         emission, sockets = self.tree.nodes.new("ShaderNodeEmission"), self._maps[number]
         for alpha in self._alphas:
-            one = computed("MAXIMUM", alpha, value_of(emission.inputs["Strength"]), clamp=True)
+            one = graph.computed("MAXIMUM", alpha, graph.value_of(emission.inputs["Strength"]), clamp=True)
             self.tree.links.new(one, emission.inputs["Strength"])
         if number in self._colors:
             self.tree.links.new(sockets[0], emission.inputs["Color"])
@@ -229,7 +203,7 @@ class MaterialPlan:
     def show(self, number: int | None) -> None:
         """Make the material emit map `number`, black if there is no such map; None restores its surface."""
         surface = self._output.inputs["Surface"]
-        cut(surface)
+        graph.cut(surface)
         if number is None:
             if self._surface is not None:
                 self.tree.links.new(self._surface, surface)
@@ -253,16 +227,14 @@ class MaterialPlan:
 LIGHT_PATH = "ShaderNodeLightPath"
 DIRECTIONAL = FRESNEL, LAYER_WEIGHT, GEOMETRY = "ShaderNodeFresnel", "ShaderNodeLayerWeight", "ShaderNodeNewGeometry"
 # UNKNOWN: outputs of nodes that differ from shadow ray to shadow ray by more than `Transparency.cosines`.
-UNKNOWN = {
-    LIGHT_PATH: ("Ray Length", "Transparent Depth"),
-    GEOMETRY: ("Incoming",),
-    "ShaderNodeTexCoord": ("Reflection", "Window"),
-}
+UNKNOWN = {"Ray Length", "Transparent Depth", "Incoming", "Reflection", "Window"}
 # COSINES: those of `Transparency.cosines` for shares that do not vary, closest at grazing angles, where Fresnel is
 # steepest.
 _FRONT = np.square(np.linspace(1e-3, 1.0, 129))
 COSINES = np.append(-_FRONT[::-1], _FRONT)
 EVEN = 1e-4  # shares that differ less count as the same
+# MOST_TEXELS: of a bake. MOST_SIDE: of a face. GAP: between faces. SAMPLES: of a texel.
+MOST_TEXELS, MOST_SIDE, GAP, SAMPLES = 1 << 18, 512, 2, 4
 
 
 def shown_to_shadow_ray(node, output: str, number: float | None, cosine: float | None) -> float | None:
@@ -270,7 +242,7 @@ def shown_to_shadow_ray(node, output: str, number: float | None, cosine: float |
     where its first input is the constant `number`; None: unknown. Bumps are left out: on average they change little."""
     kind = node.bl_idname
     if kind == LIGHT_PATH:
-        return None if output in UNKNOWN[kind] else float(output in ("Is Shadow Ray", "Ray Depth"))
+        return None if output in UNKNOWN else float(output in ("Is Shadow Ray", "Ray Depth"))
     if cosine is None or (kind == GEOMETRY and output != "Backfacing") or (kind != GEOMETRY and number is None):
         return None
     if kind == GEOMETRY:
@@ -282,6 +254,27 @@ def shown_to_shadow_ray(node, output: str, number: float | None, cosine: float |
     return float(dielectric_reflectance(abs(cosine), index if cosine >= 0.0 else 1.0 / index))
 
 
+def _by_cosine(output) -> np.ndarray | None:
+    """The value of the `output` of a node for shadow rays at COSINES; None: unknown."""
+    number = graph.value_of(output.node.inputs[0]) if output.node.inputs else None
+    if output.node.bl_idname not in (LIGHT_PATH, *DIRECTIONAL) or graph.is_socket(number):
+        return None
+    values = [shown_to_shadow_ray(output.node, output.name, number, cosine) for cosine in COSINES]
+    return None if None in values else np.array(values)
+
+
+def depends_on_rays(trees) -> str:
+    """What the nodes of `trees` depend on that differs from ray to ray and is baked as one value, and which; or ""."""
+    outputs = [one for tree in trees for node in tree.nodes for one in node.outputs if one.is_linked]
+    names = {output.name for output in outputs if output.name in UNKNOWN and not graph.is_group(output.node)}
+    of_outputs = [(output.name, _by_cosine(output)) for output in outputs]
+    spreads = {name: np.abs(one - one.mean()).mean() for name, one in of_outputs if one is not None and np.ptp(one) > 0}
+    off = max(spreads.values(), default=0.0)
+    mean = f"the mean over directions, {100.0 * off:.0f} % off on average" if spreads else "0, or along the normal"
+    names |= set(spreads)
+    return f"{' and '.join(sorted(names))}, of which it is {mean}" if names else ""
+
+
 def even_transparency(shares: np.ndarray, cosines, triangles: int) -> Transparency:
     """The transparency of so many triangles by their `shares` (A,) at `cosines` (A,); () with a single share."""
     shares = np.clip(shares, 0.0, 1.0).astype(np.float32)
@@ -289,3 +282,122 @@ def even_transparency(shares: np.ndarray, cosines, triangles: int) -> Transparen
         return Transparency(float(shares.mean()))
     uv = np.zeros((triangles, 3, 2), np.float32)
     return Transparency(1.0, shares[:, None, None], uv, "EXTEND", "Closest", cosines=tuple(cosines))
+
+
+def baked_transparency(surface, studio) -> Transparency:
+    """What a `surface` (`extract.occluders.UnreadSurface`) lets through for shadow rays, as Cycles bakes it from its
+    mesh, which is changed."""
+    mesh, count = surface.mesh, len(surface.mesh.polygons)
+    slots = read_values(mesh.polygons, "material_index", (count,), np.int32)
+    is_chosen = np.clip(slots, 0, max(len(mesh.materials) - 1, 0)) == surface.slot
+    uv, size = _side_by_side(mesh, np.flatnonzero(is_chosen))
+    layer = mesh.uv_layers.new(name="ltsh_shares", do_init=False) or mesh.uv_layers[-1]
+    layer.uv.foreach_set("vector", uv.ravel())
+    image = bpy.data.images.new("ltsh shares", size, size, alpha=True, float_buffer=True, is_data=True)
+    try:
+        with _emitting_share(surface.material, surface.facts.random, image) as emitter:
+            mesh.materials.append(emitter)
+            for number in range(len(mesh.materials)):
+                mesh.materials[number] = emitter  # the other faces lie outside
+            ob, scene = bpy.data.objects.new("ltsh shares", mesh), studio.scene
+            scene.cycles.samples = SAMPLES
+            context = {"view_layer": scene.view_layers[0], "active_object": ob, "selected_objects": [ob]}
+            with (
+                studio.show(ob, surface.matrix, surface.facts),
+                bpy.context.temp_override(scene=scene, object=ob, **context),
+            ):
+                bpy.ops.object.bake(
+                    type="EMIT", margin=GAP // 2, margin_type="EXTEND", use_clear=False, uv_layer=layer.name,
+                    target="IMAGE_TEXTURES", save_mode="INTERNAL", use_selected_to_active=False,
+                )  # fmt: skip
+        pixels = np.empty(size * size * 4, np.float32)
+        image.pixels.foreach_get(pixels)
+    finally:
+        bpy.data.images.remove(image)
+    mesh.calc_loop_triangles()
+    triangles = len(mesh.loop_triangles)
+    of_faces = is_chosen[read_values(mesh.loop_triangles, "polygon_index", (triangles,), np.int32)]
+    corners = read_values(mesh.loop_triangles, "loops", (triangles, 3), np.int32)[of_faces]
+    shares = np.clip(np.nan_to_num(pixels.reshape(size, size, 4)[..., :3].mean(axis=-1)), 0.0, 1.0)
+    return Transparency(1.0, shares, uv[corners], "EXTEND")
+
+
+def _side_by_side(mesh, faces: np.ndarray) -> tuple[np.ndarray, int]:
+    """UV coordinates (C, 2) of the corners of `mesh` that place the `faces` side by side in a square picture, and the
+    texels along its side. The corners of other faces lie at one place outside."""
+    count, columns = len(mesh.polygons), math.ceil(math.sqrt(len(faces)))
+    side = max(min(MOST_SIDE, math.isqrt(MOST_TEXELS) // columns - GAP), 1)
+    first, corners = (read_values(mesh.polygons, name, (count,), np.int32) for name in ("loop_start", "loop_total"))
+    face, size = np.repeat(np.arange(count), corners), columns * (side + GAP)
+    vertices = read_values(mesh.vertices, "co", (len(mesh.vertices), 3), np.float32).astype(np.float64)
+    corner = vertices[read_values(mesh.loops, "vertex_index", (len(face),), np.int32)]
+    along = corner[first + 1] - corner[first]
+    across = np.cross(read_values(mesh.polygons, "normal", (count, 3), np.float32), along)
+    places = np.stack([(corner * axis[face]).sum(axis=1) for axis in (along, across)], axis=1)
+    places -= np.minimum.reduceat(places, first)[face]
+    places *= (side / np.maximum(np.maximum.reduceat(places, first), 1e-30))[face]
+    cells = np.full((count, 2), np.nan)
+    cells[faces] = np.stack(np.divmod(np.arange(len(faces)), columns), axis=1) * (side + GAP) + 0.5 * GAP
+    return np.nan_to_num((places + cells[face]) / size, nan=-1.0).astype(np.float32), size
+
+
+@contextmanager
+def _emitting_share(material, random: float, image):
+    """Within this context: a copy of `material` that emits what it lets through for shadow rays and bakes to `image`;
+    what depends on their direction has its mean over COSINES. `random` is that of Object Info."""
+    material = material.copy()
+    trees = [material.node_tree]
+    try:
+        material.cycles.emission_sampling = "NONE"
+        for name in ("Volume", "Displacement"):
+            graph.cut(graph.material_output(material.node_tree).inputs[name])
+        for tree in trees:
+            for node in list(tree.nodes):
+                if graph.is_group(node) and node.node_tree is not None:
+                    node.node_tree = node.node_tree.copy()
+                    trees.append(node.node_tree)
+                elif any(socket.type == "SHADER" for socket in node.outputs):
+                    _emit_share(node)
+                for output in [output for output in node.outputs if output.is_linked]:
+                    values = _by_cosine(output)
+                    mean = None if values is None else float(values.mean())
+                    if (node.bl_idname, output.name) == ("ShaderNodeObjectInfo", "Random"):
+                        mean = random
+                    if mean is not None:
+                        value = tree.nodes.new("ShaderNodeValue").outputs[0]
+                        value.default_value = mean
+                        _feed_instead(output, value)
+        nodes = trees[0].nodes
+        nodes.active = nodes.new("ShaderNodeTexImage")
+        nodes.active.image = image
+        yield material
+    finally:
+        bpy.data.materials.remove(material)
+        for tree in trees[1:]:
+            bpy.data.node_groups.remove(tree)
+
+
+def _emit_share(node) -> None:
+    """Let a shader node emit what it lets through instead; mixes and sums of shaders stay."""
+    if any(socket.type == "SHADER" for socket in node.inputs):
+        return
+    tree = node.id_data
+    emission = tree.nodes.new(EMISSION)
+    value, target = 0.0, emission.inputs["Strength"]
+    if node.bl_idname == graph.CLEAR:
+        value, target = graph.value_of(node.inputs["Color"]), emission.inputs["Color"]
+    elif node.bl_idname == graph.PRINCIPLED:
+        alpha = graph.value_of(node.inputs["Alpha"])
+        value = graph.computed("SUBTRACT", 1.0, alpha, clamp=True) if graph.is_socket(alpha) else max(1.0 - alpha, 0.0)
+    if graph.is_socket(value):
+        tree.links.new(value, target)
+    else:
+        target.default_value = value
+    for output in node.outputs:
+        _feed_instead(output, emission.outputs[0])
+
+
+def _feed_instead(output, other) -> None:
+    """Let the output `other` feed what `output` has fed."""
+    for target in [link.to_socket for link in output.links]:
+        output.id_data.links.new(other, target)

@@ -9,19 +9,8 @@ import numpy as np
 
 from ...cycles.lobes import BRUSHED_KINDS, SMALLEST_WEIGHT, aspect_of
 from ..render_settings import cycles_setting
+from . import graph
 from .bsdfs import REFRACTION_NODE, Bsdf, bsdf_of, emission_sockets, has_alpha, is_emission
-from .graph import (
-    Factor,
-    Source,
-    SurfaceShaders,
-    WeightedShader,
-    is_seen_through,
-    live_link,
-    shaders_behind,
-    source_of,
-    surface_of,
-    tree_in_use,
-)
 from .values import ImageUse, Value, constant, constant_inputs, input_value, value_at
 
 # Quantities that may come from an image; all others are constants.
@@ -179,14 +168,16 @@ def preview_of(material) -> PreviewMaterial:
         return default_preview()
     if bpy.app.version < (5, 0, 0) and not material.use_nodes:
         return plain_preview(material.diffuse_color)
-    surface = surface_of(material)
+    surface = graph.surface_of(material)
     if surface is None:
         return plain_preview(0.0)
-    shaders = shaders_behind(surface)
+    shaders = graph.shaders_behind(surface)
     look = _PreviewReader(material, shaders).look()
-    lost = [name.lower() for name in ("Volume", "Displacement") if live_link(surface.node.inputs[name]) is not None]
+    lost = [
+        name.lower() for name in ("Volume", "Displacement") if graph.live_link(surface.node.inputs[name]) is not None
+    ]
     notes = (*look.notes, *(f"{material.name}: its {name} is not shown" for name in lost))
-    return replace(look, notes=notes, is_clear=is_seen_through(surface.node, shaders))
+    return replace(look, notes=notes, is_clear=graph.is_seen_through(surface.node, shaders))
 
 
 @dataclass(frozen=True)
@@ -220,7 +211,7 @@ class LobeWeight:
         return replace(self, image=factor, shining=0.5 * self.shining) if self.image is None else None
 
 
-def _value_of_factor(factor: Factor) -> Value | ViewFactor | None:
+def _value_of_factor(factor: graph.Factor) -> Value | ViewFactor | None:
     """The factor as a value; None: unknown."""
     value = value_at(factor.node.inputs[0], factor.groups)
     if value is None:
@@ -232,7 +223,7 @@ def _value_of_factor(factor: Factor) -> Value | ViewFactor | None:
     return constant(1.0 - np.clip(value.offset, 0.0, 1.0)) if value.is_constant else value.mapped(-np.eye(3), 1.0)
 
 
-def _view_factor(source: Source | None) -> ViewFactor | None:
+def _view_factor(source: graph.Source | None) -> ViewFactor | None:
     """The output of a Fresnel or Layer Weight node with a constant number and the smooth normal; None for others."""
     if source is None or source.node is None or source.node.bl_idname not in VIEW_FACTORS:
         return None
@@ -247,7 +238,7 @@ def _view_factor(source: Source | None) -> ViewFactor | None:
 class _PreviewReader:
     """Makes the preview of a material from its leaves."""
 
-    def __init__(self, material, shaders: SurfaceShaders):
+    def __init__(self, material, shaders: graph.SurfaceShaders):
         self.material, self.notes = material, []
         pairs = [(leaf, share) for leaf in shaders.leaves if not leaf.is_transparent for share in self._shares(leaf)]
         guesses, self.notes = self.notes, []
@@ -263,7 +254,7 @@ class _PreviewReader:
         """Note a difference between the material and what the viewport shows."""
         self.notes.append(f"{self.material.name}: {message}")
 
-    def _shares(self, leaf: WeightedShader) -> list[LobeWeight]:
+    def _shares(self, leaf: graph.WeightedShader) -> list[LobeWeight]:
         """The shares of `leaf` that are not 0: one per term, but terms that differ only in their constants are added.
 
         Unknown factors count as one half.
@@ -281,7 +272,7 @@ class _PreviewReader:
             shares.append(share)
         return [share for share in shares if share.estimate > 0.0]
 
-    def _with_factor(self, share: LobeWeight, factor: Factor) -> LobeWeight:
+    def _with_factor(self, share: LobeWeight, factor: graph.Factor) -> LobeWeight:
         whole = share.times(_value_of_factor(factor))
         if whole is None:
             self.note(f"factor of {factor.node.name!r} is not resolved")
@@ -317,7 +308,7 @@ class _PreviewReader:
             return None
         if share.image is not None or share.curve is not None:
             return None
-        self.note("its emission varies: it is seen, and lights nothing")
+        self.note("its emission varies: it lights as the mean of its image, with over 64 triangles not at all")
         glow = share.shining * float(strength.offset[0])
         return PreviewMaterial(
             "diffuse", {"color": color}, weight=0.0, glow=glow, notes=tuple(dict.fromkeys(self.notes))
@@ -328,7 +319,7 @@ class _PreviewReader:
             self.note("its emission varies: half of it is shown")
         return share.shining * emission
 
-    def _lobes_of(self, source: Source, share: LobeWeight) -> list[PreviewMaterial]:
+    def _lobes_of(self, source: graph.Source, share: LobeWeight) -> list[PreviewMaterial]:
         """The lobes of one BSDF node."""
         bsdf = bsdf_of(source.node)
         if source.node.bl_idname == REFRACTION_NODE:
@@ -356,7 +347,7 @@ class _PreviewReader:
         shine = replace(look, kind=COAT, values=values, scattered=True, brush=None)
         return [look, shine if coat.follows_normal else replace(shine, normal=None), *fuzz]
 
-    def _lobe(self, source: Source, bsdf: Bsdf, share: LobeWeight) -> PreviewMaterial:
+    def _lobe(self, source: graph.Source, bsdf: Bsdf, share: LobeWeight) -> PreviewMaterial:
         node, names = source.node, bsdf.sockets
         values = {name: self._value(source, name, names[name]) for name in NEUTRAL if name in names}
         values = self._on_one_uv_map({**values, **share.values})
@@ -373,7 +364,7 @@ class _PreviewReader:
             self.note(f"image {name!r} is missing, it is pink")
         return look
 
-    def _brush(self, source: Source, bsdf: Bsdf, look: PreviewMaterial) -> Brush | None:
+    def _brush(self, source: graph.Source, bsdf: Bsdf, look: PreviewMaterial) -> Brush | None:
         """The `Brush` of the lobe `look` of the node at `source`; None if it is isotropic."""
         if "anisotropy" not in bsdf.sockets or bsdf.kind not in BRUSHED_KINDS:
             return None
@@ -389,7 +380,7 @@ class _PreviewReader:
             return None
         return Brush(aspect, float(rotation[0][0]), direction, uv_map)
 
-    def _sheen(self, source: Source, look: PreviewMaterial) -> list[PreviewMaterial]:
+    def _sheen(self, source: graph.Source, look: PreviewMaterial) -> list[PreviewMaterial]:
         """The sheen lobe of a Principled BSDF; [] without sheen."""
         weight, roughness, tint = (
             np.maximum(self._value(source, "", f"Sheen {name}").offset, 0.0) for name in ("Weight", "Roughness", "Tint")
@@ -401,7 +392,7 @@ class _PreviewReader:
         values["weight"] = look.value("weight")
         return [replace(look, kind="sheen", values=values, scattered=False, brush=None)]
 
-    def _coat(self, source: Source, look: PreviewMaterial) -> Coat | None:
+    def _coat(self, source: graph.Source, look: PreviewMaterial) -> Coat | None:
         """The coat of a Principled BSDF, or None."""
         weight = float(self._value(source, "", "Coat Weight").offset[0])
         if weight <= SMALLEST_WEIGHT:
@@ -417,7 +408,7 @@ class _PreviewReader:
         roughness, ior = float(np.clip(roughness[0], 0.0, 1.0)), max(float(ior[0]), 1.0)
         return Coat(weight, roughness, ior, np.maximum(tint, 0.0) * np.ones(3), follows)
 
-    def _value(self, source: Source, name: str, socket_name: str) -> Value:
+    def _value(self, source: graph.Source, name: str, socket_name: str) -> Value:
         value = input_value(source, socket_name)
         if value is not None and (value.is_constant or name in IMAGE_SLOTS):
             return value
@@ -439,7 +430,7 @@ class _PreviewReader:
             result[name] = value
         return result
 
-    def _normal(self, source: Source, values: dict[str, Value]) -> tuple[Value | None, float]:
+    def _normal(self, source: graph.Source, values: dict[str, Value]) -> tuple[Value | None, float]:
         """The normal map at the Normal socket, or None, and its strength."""
         normal = source.input("Normal") if "Normal" in source.node.inputs else None
         if normal is None or normal.node is None:
@@ -457,7 +448,7 @@ class _PreviewReader:
             return None, 1.0
         return color, float(strength[0][0])
 
-    def _emission(self, source: Source) -> np.ndarray:
+    def _emission(self, source: graph.Source) -> np.ndarray:
         values = [value_at(socket, source.groups) for socket in emission_sockets(source.node)]
         if all(value is not None and value.is_constant for value in values):
             return np.prod([value.offset for value in values], axis=0) if values else np.zeros(3)
@@ -483,10 +474,10 @@ def world_radiance(world) -> tuple[np.ndarray, bool]:
     """
     if world is None:
         return np.zeros(3), True
-    if tree_in_use(world) is None:
+    if graph.tree_in_use(world) is None:
         return np.array(world.color, np.float64), True
-    surface = surface_of(world)
-    source = source_of(surface) if surface is not None else None
+    surface = graph.surface_of(world)
+    source = graph.source_of(surface) if surface is not None else None
     if source is None or source.node is None:
         return np.zeros(3), True
     if source.node.bl_idname == "ShaderNodeBackground":

@@ -41,8 +41,8 @@ FAR_AWAY = np.full(3, 1e6)
 # MOST_LIGHTS: patches and faces included. The time of a frame grows with their number.
 # One layer of the texture of visibility is that of the sky's sides; cards take 2048 layers.
 MOST_LIGHTS = 2047
-# MOST_VALUES: of all patterns. They fill a quarter of the largest texture of lights.
-MOST_VALUES = 1 << 24
+MOST_VALUES = 1 << 24  # of all patterns: they fill a quarter of the largest texture of lights
+MOST_TRIANGLES = 64  # of objects that light by an image; more are mostly baked, with their light in the image
 # Reasons why a light has no pattern.
 NOT_RESOLVED = "its nodes are not resolved, it shines as without them"
 NOT_YET = "it shines as without its nodes until Cycles has sources at them"
@@ -69,7 +69,9 @@ def view_lights(
         ob = instance.object
         if not instance.show_self or not in_view(instance):
             continue
-        emits |= ob.type in SURFACE_TYPES and any(np.any(_emission(slot.material)) for slot in ob.material_slots)
+        if ob.type in SURFACE_TYPES and not emits:
+            few = textures if len(getattr(ob.data, "polygons", ())) <= MOST_TRIANGLES else None
+            emits = any(np.any(_emission(slot.material, few)) for slot in ob.material_slots)
         if ob.type != "LIGHT":
             continue
         matrix = np.array(instance.matrix_world, dtype=np.float64)
@@ -78,16 +80,13 @@ def view_lights(
             notes.append(f"{ob.original.name}: {problem}")
             continue
         plain = area_light(ob, matrix, EmitterTraits.of(instance), receivers)
-        shown = [
-            light
-            for light in _with_nodes(plain, instance, (textures, patterns), notes)
-            if np.any(light.radiance != 0.0)
-        ]
+        shown = _with_nodes(plain, instance, (textures, patterns), notes)
+        shown = [light for light in shown if np.any(light.radiance != 0.0)]
         if shown:
             lights.extend(shown)
             note_unsupported(ob, matrix, SimpleNamespace(warn=notes.append))
     if emits:
-        lights.extend(_mesh_lights(depsgraph, receivers, notes))
+        lights.extend(_mesh_lights(depsgraph, receivers, textures, notes))
     shown, values = list(strongest(lights, notes)), 0
     for number, light in enumerate(shown):
         values += 0 if light.pattern is None else light.pattern.values.size
@@ -111,16 +110,25 @@ def strongest(lights: Sequence[Light], notes: list[str], most: int = MOST_LIGHTS
     return [lights[index] for index in chosen]
 
 
-def _emission(material) -> np.ndarray:
-    return np.zeros(3) if material is None else preview_of(material.original).emission
+def _emission(material, textures: ShownTextures | None) -> np.ndarray:
+    """The mean emission (3,) of a material; without `textures` that of an image counts as 0."""
+    look = None if material is None else preview_of(material.original)
+    if look is None or not look.glow or textures is None:
+        return np.zeros(3) if look is None else look.emission
+    return look.glow * textures.mean(look.value("color"))
 
 
-def _mesh_lights(depsgraph, receivers: Receivers, notes: list[str]) -> list[Light]:
+def _mesh_lights(depsgraph, receivers: Receivers, textures: ShownTextures, notes: list[str]) -> list[Light]:
     override = depsgraph.view_layer_eval.material_override
     mesh_lights = collect_mesh_lights(depsgraph, override, receivers, notes.append, copies=False)
     camera = depsgraph.scene.camera
     eye = FAR_AWAY if camera is None else np.array(camera.matrix_world.translation)
-    return constant_mesh_lights(mesh_lights, _emission, eye, notes.append)
+    lights = []
+    for mesh_light in mesh_lights:
+        count = sum(len(placement.triangles) for placement in mesh_light.placements)
+        radiance_of = functools.partial(_emission, textures=textures if count <= MOST_TRIANGLES else None)
+        lights += constant_mesh_lights([mesh_light], radiance_of, eye, notes.append)
+    return lights
 
 
 def patterns_of(scene, depsgraph) -> dict[tuple, NodeEmission]:

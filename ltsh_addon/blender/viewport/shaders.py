@@ -20,18 +20,8 @@ from ...lobes import moments32
 from ...lobes.diffuse import ARC_NODES, albedo_slope, mean_slope_above
 from ...lobes.lobe_integrals import LEAST_SHARE
 from ...lobes.lookup_table import MIN_ALPHA, LookupTable
+from ...shading import header
 from ...shading.float64 import LEAST_ROUGHNESS
-from ...shading.header import (
-    bend_literals,
-    bent_factor,
-    bent_moment_lines,
-    core_text,
-    definitions,
-    filled,
-    float_literal,
-    moment_lines,
-    table_sizes,
-)
 from . import light_texels
 from .drawing import PixelShader, glsl
 
@@ -123,8 +113,8 @@ def _lighting_source(table, features) -> str:
     is_cosine = table.family == "ltc" and not features.brushed
     chosen = {"cosine": is_cosine, **asdict(features)}
     defined = {name.upper(): 1 for name, is_chosen in chosen.items() if is_chosen}
-    parts = ["#define LTSH_GLSL 1", core_text(), definitions({**defined, **_lighting_constants(table)})]
-    parts += [glsl("light_texels"), filled(glsl("lights"), {"LEVELS": "\n".join(_level_lines())})]
+    parts = ["#define LTSH_GLSL 1", header.core_text(), header.definitions({**defined, **_lighting_constants(table)})]
+    parts += [glsl("light_texels"), header.filled(glsl("lights"), {"LEVELS": "\n".join(_level_lines())})]
     if features.focused:
         parts.append(glsl("spread"))
     if features.facing:
@@ -146,25 +136,25 @@ def _lighting_source(table, features) -> str:
         loops["SPECULAR_LOOPS"] = "\n".join(_specular_loops(features))
     if features.diffuse:
         loops["DIFFUSE_LOOPS"] = "\n".join(_diffuse_loops(features))
-    return "\n".join([*parts, filled(glsl("lighting"), loops)])
+    return "\n".join([*parts, header.filled(glsl("lighting"), loops)])
 
 
 def _lighting_constants(table) -> dict:
     plain, beyond, sharp, sharpest = light_profile.DISK_LAYERS
     if {beyond.layers, sharp.layers, sharpest.layers} != {beyond.layers}:
         raise ValueError("DISK_LAYERS of light_profile have changed: all but the first had equally many layers")
-    sizes = table_sizes(table)
+    sizes = header.table_sizes(table)
     few_corners, many_corners = FOCUSED_ROUND_CORNERS
     return {
         **sizes,
         "BLOCKS": -(-sizes["COEFFICIENTS"] // 4),
         **light_texels.constants(),
-        "IOR_STEPS": float_literal(light_texels.IOR_STEPS),
-        "ONE_OVER_PI": float_literal(1.0 / np.pi),
-        "PI": float_literal(np.pi),
+        "IOR_STEPS": header.float_literal(light_texels.IOR_STEPS),
+        "ONE_OVER_PI": header.float_literal(1.0 / np.pi),
+        "PI": header.float_literal(np.pi),
         "LEAST_ROUGHNESS": LEAST_ROUGHNESS,
-        "LEAST_ALPHA": float_literal(LEAST_ALPHA),
-        "SHORT_ARC": float_literal(2.0 * np.cos(0.5 * SHORT_ARC)),
+        "LEAST_ALPHA": header.float_literal(LEAST_ALPHA),
+        "SHORT_ARC": header.float_literal(2.0 * np.cos(0.5 * SHORT_ARC)),
         "MOST_ARCS": MOST_ARCS,
         "MOST_HALVINGS": MOST_HALVINGS,
         "QUAD_FIRST": light_texels.QUAD_FIRST,
@@ -172,16 +162,16 @@ def _lighting_constants(table) -> dict:
         "SKY_LEVELS": light_texels.SKY_LEVELS,
         "SKY_POINTS": light_texels.SKY_POINTS,
         "IRRADIANCE_SIZE": light_texels.IRRADIANCE_SIZE,
-        "LEAST_OF_COSINE": float_literal(LEAST_SHARE * 0.5 / np.pi),
-        "TINY": float_literal(TINY_LIGHT**2),
-        "SMALL": float_literal(SMALL_LIGHT**2),
-        "POINT": float_literal(POINT_LIGHT**2),
-        "NEAR_SQUARED": float_literal(NEAR_RADII**2),
-        "MIN_ALPHA": float_literal(MIN_ALPHA),
-        "CHANGING": float_literal(facing.CHANGING),
+        "LEAST_OF_COSINE": header.float_literal(LEAST_SHARE * 0.5 / np.pi),
+        "TINY": header.float_literal(TINY_LIGHT**2),
+        "SMALL": header.float_literal(SMALL_LIGHT**2),
+        "POINT": header.float_literal(POINT_LIGHT**2),
+        "NEAR_SQUARED": header.float_literal(NEAR_RADII**2),
+        "MIN_ALPHA": header.float_literal(MIN_ALPHA),
+        "CHANGING": header.float_literal(facing.CHANGING),
         "NODES_ALONG": NODES_ALONG,
         # The weights of the nodes add up to 9 (NODES_ALONG + 1).
-        "PEAK_WEIGHT": float_literal(9.0 * (NODES_ALONG + 1) * facing.PEAK_WEIGHT),
+        "PEAK_WEIGHT": header.float_literal(9.0 * (NODES_ALONG + 1) * facing.PEAK_WEIGHT),
         "FEW_LAYERS": plain.layers,
         "MANY_LAYERS": beyond.layers,
         "FEW_NODES": light_texels.NODES_FIRST[plain.layers],
@@ -189,11 +179,11 @@ def _lighting_constants(table) -> dict:
         "CHORDS": plain.chords,
         "SHARP_CHORDS": sharp.chords,
         "SHARPEST_CHORDS": sharpest.chords,
-        "WIDE_LOBE": float_literal(light_profile.WIDE_LOBE),
-        "SHARP_LOBE": float_literal(light_profile.SHARP_LOBE),
-        "WELL_INSIDE": float_literal(light_profile.WELL_INSIDE),
-        "LEAST_WIDTH": float_literal(light_profile.WIDTH_RANGE[0]),
-        "MOST_WIDTH": float_literal(light_profile.WIDTH_RANGE[1]),
+        "WIDE_LOBE": header.float_literal(light_profile.WIDE_LOBE),
+        "SHARP_LOBE": header.float_literal(light_profile.SHARP_LOBE),
+        "WELL_INSIDE": header.float_literal(light_profile.WELL_INSIDE),
+        "LEAST_WIDTH": header.float_literal(light_profile.WIDTH_RANGE[0]),
+        "MOST_WIDTH": header.float_literal(light_profile.WIDTH_RANGE[1]),
         "ROUND_MARGIN": light_profile.ROUND_MARGIN,
         "FEW_CORNERS": few_corners,
         "MANY_CORNERS": many_corners,
@@ -209,7 +199,7 @@ def _level_lines() -> Iterator[str]:
     for first, count, limit in reversed(light_texels.ROUND_LEVELS):
         condition = "round && whole" if count < ROUND_CORNERS[0] else "round"
         if not np.isinf(limit):
-            condition += f" && wide <= {float_literal(limit)}"
+            condition += f" && wide <= {header.float_literal(limit)}"
         for name, value in (("first", first), ("count", count)):
             yield f"    light.{name} = {condition} ? {value} : light.{name};"
 
@@ -322,7 +312,7 @@ def _diffuse_loops(features) -> Iterator[str]:
 
 def _specular_text(table, is_cosine, features) -> str:
     count = table.coefficients.shape[3]
-    moments = [f"    {line}" for line in moment_lines(table.degree)]
+    moments = [f"    {line}" for line in header.moment_lines(table.degree)]
     spots = [line.replace("ltsh_edge_moment(edge,", "solid_angle * ltsh_spot_moment(direction,") for line in moments]
     if table.bend is not None:
         moments += _bent_edge_lines(table)
@@ -336,7 +326,7 @@ def _specular_text(table, is_cosine, features) -> str:
     ]
     lines = {"MOMENT_LINES": moments, "SPOT_LINES": spots, "FETCHES": fetches, "TERMS": terms}
     values = {name: "\n".join(texts) for name, texts in lines.items()}
-    values["SUM"] = filled(glsl("cosine_sum" if is_cosine else "moment_sum"), values)
+    values["SUM"] = header.filled(glsl("cosine_sum" if is_cosine else "moment_sum"), values)
     # A tilt turns the horizon around the second axis of the frame, so both horizons meet there.
     seam = "lobe.row_y" if is_cosine else None
     values["INTEGRAL"] = _integral_text("specular", 1 + is_cosine + features.geometric, seam)
@@ -344,7 +334,7 @@ def _specular_text(table, is_cosine, features) -> str:
     if features.focused:
         sum_value = "specular_values(weights, sum)"
         values["FOCUSED"] = _focused_text("specular", "specular_weights weights, ", sum_value, "mat3(1.0)")
-    return filled(glsl("specular"), values)
+    return header.filled(glsl("specular"), values)
 
 
 # Statements that put sizes in units of the lobe's width, by its smaller alpha and by both.
@@ -359,21 +349,21 @@ def _brushed_text(features) -> str:
         values["FOCUSED"] = _focused_text(
             "specular", "specular_weights weights, ", value, frame, "LTSH_TINY / lobe.sharpness"
         )
-    return filled(glsl("brushed"), values)
+    return header.filled(glsl("brushed"), values)
 
 
 def _bent_edge_lines(table):
     """Statements that add the edge from `start` to `end` to the moments of the table's bend."""
-    bent = [f"ltsh_unit(ltsh_bent({end}, {bend_literals(table)}))" for end in ("start", "end")]
+    bent = [f"ltsh_unit(ltsh_bent({end}, {header.bend_literals(table)}))" for end in ("start", "end")]
     yield f"    ltsh_edge leaning = ltsh_edge_between({', '.join(bent)});"
-    yield from (f"    {line}" for line in bent_moment_lines(table))
+    yield from (f"    {line}" for line in header.bent_moment_lines(table))
 
 
 def _bent_spot_lines(table):
     """Statements that add a spot to these moments: 2 pi times the integrals of `lookup_table.bent_cosines`."""
-    yield f"    vec3 bent = ltsh_bent(direction, {bend_literals(table)});"
+    yield f"    vec3 bent = ltsh_bent(direction, {header.bend_literals(table)});"
     yield "    float squares = dot(bent, bent);"
-    yield f"    float share = {bent_factor(table, 2.0 * np.pi)} * solid_angle / (squares * squares);"
+    yield f"    float share = {header.bent_factor(table, 2.0 * np.pi)} * solid_angle / (squares * squares);"
     count = table.coefficients.shape[3]
     for row, axis in ((count - 2, "x"), (count - 1, "z")):
         yield f"    moments.values[{row}] += share * bent.{axis};"
@@ -386,24 +376,24 @@ def _diffuse_text(features) -> str:
         if features.rough:
             sum_value = "vec4(diffuse_rough_factors(lobe, sum), 0.0, 0.0)"
         values["FOCUSED"] = _focused_text("diffuse", "", sum_value, "diffuse_frame(lobe)")
-    return filled(glsl("diffuse"), values)
+    return header.filled(glsl("diffuse"), values)
 
 
 def slope_text() -> str:
     """GLSL of float rough_slope(float cosine)."""
-    return filled(glsl("slope"), {"SLOPE": _root_polynomial(albedo_slope)})
+    return header.filled(glsl("slope"), {"SLOPE": _root_polynomial(albedo_slope)})
 
 
 def _rough_text(features) -> str:
     nodes, weights = (values[ARC_NODES // 2 :] for values in np.polynomial.legendre.leggauss(ARC_NODES))
     constants = {"NODES": ARC_NODES, "PLACES": _vector(nodes), "WEIGHTS": _vector(weights)}
-    text = filled(glsl("rough"), {"MEAN_SLOPE": _root_polynomial(mean_slope_above)})
+    text = header.filled(glsl("rough"), {"MEAN_SLOPE": _root_polynomial(mean_slope_above)})
     velvet = glsl("velvet") if features.velvet else ""
-    return definitions(constants, "LTSH_ARC") + slope_text() + text + velvet
+    return header.definitions(constants, "LTSH_ARC") + slope_text() + text + velvet
 
 
 def _vector(values) -> str:
-    return f"vec{len(values)}({', '.join(map(float_literal, values))})"
+    return f"vec{len(values)}({', '.join(map(header.float_literal, values))})"
 
 
 def _root_polynomial(function) -> str:
@@ -411,7 +401,7 @@ def _root_polynomial(function) -> str:
     domain = [0.01, 1.0]
     fit = np.polynomial.chebyshev.Chebyshev.interpolate(lambda u: function(1.0 - u * u) / u, SLOPE_DEGREE, domain)
     highest = fit.convert(kind=np.polynomial.Polynomial).coef[::-1]
-    return "\n".join(f"    value = value * root + {float_literal(value)};" for value in highest)
+    return "\n".join(f"    value = value * root + {header.float_literal(value)};" for value in highest)
 
 
 def _focused_text(name, arguments, value, frame, tiny="LTSH_TINY") -> str:
@@ -420,7 +410,9 @@ def _focused_text(name, arguments, value, frame, tiny="LTSH_TINY") -> str:
     Expects spread.glsl and what `_integral_text` expects. `value` is the vec4 that a `name`_sum `sum` stands for.
     `frame` is the matrix from vectors of `name`_warped to coordinates in which the lobe lies around e_z.
     """
-    return filled(glsl("focused"), {"name": name, "ARGUMENTS": arguments, "VALUE": value, "FRAME": frame, "TINY": tiny})
+    return header.filled(
+        glsl("focused"), {"name": name, "ARGUMENTS": arguments, "VALUE": value, "FRAME": frame, "TINY": tiny}
+    )
 
 
 def _integral_text(name: str, planes: int, seam: str | None = None, sizes: str = "") -> str:
@@ -441,7 +433,7 @@ def _integral_text(name: str, planes: int, seam: str | None = None, sizes: str =
         "CLOSING": "\n".join(_closing_lines(planes)),
         "PINS": "\n".join(f"    vec4 pin_{k} = vec4(0.0);" for k in range(planes)),
     }
-    return filled(glsl("integral"), values)
+    return header.filled(glsl("integral"), values)
 
 
 def _apex_lines(name, planes, seam):
@@ -533,17 +525,17 @@ def horizon_shader(step: str) -> PixelShader:
         "QUAD_FIRST": light_texels.QUAD_FIRST,
         "ROUND_FIRST": light_texels.circle_first(HORIZON_CORNERS),
         "ROUND_CORNERS": HORIZON_CORNERS,
-        "SMALLEST_ANGLE": float_literal(horizons.SMALLEST_ANGLE),
-        "SMALLEST_ALPHA": float_literal(horizons.SMALLEST_ALPHA),
+        "SMALLEST_ANGLE": header.float_literal(horizons.SMALLEST_ANGLE),
+        "SMALLEST_ALPHA": header.float_literal(horizons.SMALLEST_ALPHA),
         "AROUND": horizons.AROUND,
-        "CONCENTRATION": float_literal(horizons.CONCENTRATION),
-        "SINH": float_literal(float(np.sinh(horizons.CONCENTRATION))),
+        "CONCENTRATION": header.float_literal(horizons.CONCENTRATION),
+        "SINH": header.float_literal(float(np.sinh(horizons.CONCENTRATION))),
         "HEIGHTS": len(horizons.HEIGHTS),
-        "FIRST_HEIGHT": float_literal(horizons.HEIGHTS[0]),
-        "HEIGHT_STEP": float_literal(horizons.HEIGHTS[1] - horizons.HEIGHTS[0]),
-        "PI": float_literal(np.pi),
+        "FIRST_HEIGHT": header.float_literal(horizons.HEIGHTS[0]),
+        "HEIGHT_STEP": header.float_literal(horizons.HEIGHTS[1] - horizons.HEIGHTS[0]),
+        "PI": header.float_literal(np.pi),
     }
     lights = "" if step == CHOICE else glsl("light_texels")
     return PixelShader(
-        definitions(values) + lights + glsl("horizons"), HORIZON_SAMPLERS[step], _HORIZON_CONSTANTS[step]
+        header.definitions(values) + lights + glsl("horizons"), HORIZON_SAMPLERS[step], _HORIZON_CONSTANTS[step]
     )

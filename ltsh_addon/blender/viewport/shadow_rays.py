@@ -104,10 +104,10 @@ class ShadowRays:
         }
 
 
-def view_occluders(depsgraph, note: Callable[[str], None]) -> Occluders:
-    """What casts shadows in a view; `note` gets what is approximated."""
+def view_occluders(depsgraph, note: Callable[[str], None], unread: list | None = None) -> Occluders:
+    """What casts shadows in a view; `note` gets what is approximated. `unread`: see `collect_occluders`."""
     override = depsgraph.view_layer_eval.material_override
-    return blocks_nothing(collect_occluders(depsgraph, override, note), depsgraph.scene.world)
+    return blocks_nothing(collect_occluders(depsgraph, override, note, unread=unread), depsgraph.scene.world)
 
 
 def visibility_texture(values: np.ndarray, size: tuple[int, int]) -> gpu.types.GPUTexture:

@@ -14,6 +14,7 @@ import numpy as np
 from ...files import save_array
 from ...scene import SceneError, error_line, listed
 from .. import render_settings
+from ..extract.occluders import with_baked_shares
 from ..extract.pixels import missing_images, no_light, open_scene
 from ..lights.world import light_of_world
 from ..materials.preview_material import world_radiance
@@ -46,11 +47,15 @@ def draw_view(job: ViewJob, folder: Path, progress) -> dict:
     warnings += _not_shown(scene, camera)
     sky = _sky(scene, warnings)
     with bpy.context.temp_override(scene=scene, view_layer=_layer(scene)):
-        depsgraph = bpy.context.evaluated_depsgraph_get()
+        depsgraph, unread = bpy.context.evaluated_depsgraph_get(), []
         patterns = patterns_of(scene, depsgraph)
+        occluders = view_occluders(depsgraph, warnings.append, unread) if job.shadows == "on" else None
         warnings += missing_images(depsgraph, scene.world, _layer(scene).material_override)
+    if unread:
+        occluders = with_baked_shares(occluders, unread, scene, warnings.append)
     progress(GRAPHICS, 0.0)
-    pictures, notes, facts = with_graphics(lambda: _draw(job, (scene, camera, sky, patterns), size, progress))
+    read = scene, camera, sky, patterns, occluders
+    pictures, notes, facts = with_graphics(lambda: _draw(job, read, size, progress))
     for number, pixels in enumerate(pictures):
         technique, index = divmod(number, len(VIEW_PASSES))
         save_array(folder / f"{technique}_{VIEW_PASSES[index]}.npy", pixels)
@@ -169,7 +174,7 @@ def _layer(scene):
 def _draw(job: ViewJob, read: tuple, size: tuple[int, int], progress) -> tuple[list[np.ndarray], list[str], dict]:
     """Pictures (H, W, 4), row 0 on top, of all techniques and passes, notes, and facts for the manifest."""
     progress("draw", 0.0)
-    scene, camera, sky, patterns = read
+    scene, camera, sky, patterns, occluders = read
     with bpy.context.temp_override(scene=scene, view_layer=_layer(scene)):
         depsgraph = bpy.context.evaluated_depsgraph_get()
     mirror = SceneMirror(lambda world: sky, lambda data, source: patterns.get(source.key, NOT_RESOLVED))
@@ -177,13 +182,13 @@ def _draw(job: ViewJob, read: tuple, size: tuple[int, int], progress) -> tuple[l
     if not mirror.lights and not mirror.sky.sides:
         raise no_light(scene, mirror.notes)
     notes, shadows = list(mirror.notes), None
-    if job.shadows == "on":
+    if occluders is not None:
         problem = too_many(len(mirror.lights), size)
         rays = max(min(FEWEST_RAYS, job.shadow_rays), job.shadow_rays // job.refine)
         if problem:
             notes.append(problem)
         else:
-            shadows = ShadowRays(view_occluders(depsgraph, notes.append), rays)
+            shadows = ShadowRays(occluders, rays)
     canvas = _Canvas(mirror, view_of_camera(camera.evaluated_get(depsgraph), depsgraph, size), size)
     points = render_settings.sub_pixel_offsets(scene, job.refine)
     first, *others = ((technique, name) for technique in job.techniques for name in VIEW_PASSES)

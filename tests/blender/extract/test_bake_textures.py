@@ -142,6 +142,7 @@ def altered(kind, folder):
     tree.links.new(shown.outputs[0], node.inputs["Base Color"])
     if kind == "mapping node":
         mapping = tree.nodes.new("ShaderNodeMapping")
+        mapping.inputs["Scale"].default_value = (2.0, 1.0, 1.0)
         tree.links.new(tree.nodes.new("ShaderNodeTexCoord").outputs["UV"], mapping.inputs[0])
         tree.links.new(mapping.outputs[0], shown.inputs[0])
     elif kind == "cubic":

@@ -378,7 +378,7 @@ def test_more_panes_than_cycles_goes_through_block(tmp_path):
 NAMED = {
     "procedural": "'Pane'",
     "colored": "by its mean",
-    "color under alpha": "only Cycles knows",
+    "color under alpha": "only Cycles can tell",
     "displaced": "displacement",
     "hidden from reflections": "light that surfaces choose counts as glossy",
     "in the same place": "in the same place as 'Pane'",

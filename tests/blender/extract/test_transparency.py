@@ -1,10 +1,10 @@
-"""What surfaces let through by nodes that depend on the ray, against Cycles under a light that is nearly a point."""
+"""What surfaces let through, by any nodes, against the shadows of Cycles under a light that is nearly a point."""
 
 import bpy
 import numpy as np
 import pytest
 import scene_parts
-from shadow_scenes import clear, hidden, pane, seen_by_cycles, seen_by_rays, shown, start
+from shadow_scenes import clear, hidden, pane, seen_by_cycles, seen_by_rays, shown, start, textured
 
 pytestmark = pytest.mark.newest
 
@@ -46,8 +46,42 @@ def light_path(made, output):
     return node(made, "LightPath", output)
 
 
+def by_curves(made):
+    """The alpha of a Principled BSDF from an image through nodes that are not read."""
+    inside, curves = made.shader("BsdfPrincipled"), made.new("ShaderNodeRGBCurve")
+    curves.mapping.curves[3].points[0].location = (0.0, 0.3)
+    made.link(textured(made, "Color", space="sRGB"), curves.inputs["Color"])
+    made.link(curves.outputs[0], inside.node.inputs["Alpha"])
+    return inside
+
+
+def in_group(made):
+    """A mix in a group whose factor comes from outside."""
+    tree = bpy.data.node_groups.new("Inside", "ShaderNodeTree")
+    tree.interface.new_socket("Factor", in_out="INPUT", socket_type="NodeSocketFloat")
+    tree.interface.new_socket("Shader", in_out="OUTPUT", socket_type="NodeSocketShader")
+    inlet, outlet, mix, ends = (
+        tree.nodes.new(kind)
+        for kind in ("NodeGroupInput", "NodeGroupOutput", "ShaderNodeMixShader", "ShaderNodeBsdfTransparent")
+    )
+    for source, target in (
+        (inlet.outputs[0], mix.inputs[0]),
+        (ends.outputs[0], mix.inputs[1]),
+        (mix.outputs[0], outlet.inputs[0]),
+    ):
+        tree.links.new(source, target)
+    group = made.new("ShaderNodeGroup")
+    group.node_tree = tree
+    made.link(noise(made, "UV", 4.0), group.inputs[0])
+    return group.outputs[0]
+
+
 def behind(made):
     return mixed(made, calculated(made, "MULTIPLY", node(made, "NewGeometry", "Backfacing"), 0.7))
+
+
+def random_of_object(made):
+    return mixed(made, calculated(made, "MULTIPLY", node(made, "ObjectInfo", "Random"), 0.8))
 
 
 def behind_math(made):
@@ -77,6 +111,14 @@ READ = {
     "a power of Facing": (power_of_facing, "ball"),
     "Backfacing": (behind, "ball"),
 }
+BAKED = {
+    "noise": (lambda made: mixed(made, noise(made, "UV", 3.0)), "tilted"),
+    "noise in space": (lambda made: mixed(made, noise(made, "Object", 4.0)), "cube"),
+    "generated coordinates": (lambda made: mixed(made, noise(made, "Generated", 4.0)), "mirrored cube"),
+    "curves of an image": (by_curves, "tilted"),
+    "a group": (in_group, "tilted"),
+    "a random number": (random_of_object, "tilted"),
+}
 
 
 def shape(kind, material):
@@ -103,6 +145,11 @@ def off_cycles(folder, occluders):
     return np.abs(transmittance - expected)[is_sure]
 
 
+def names_of_data():
+    kinds = ("materials", "meshes", "images", "scenes", "objects", "node_groups")
+    return {name: set(getattr(bpy.data, name).keys()) - {"Render Result"} for name in kinds}
+
+
 @pytest.mark.parametrize("name", READ)
 def test_what_depends_on_the_ray_alone_is_as_in_cycles(tmp_path, name):
     start()
@@ -113,9 +160,41 @@ def test_what_depends_on_the_ray_alone_is_as_in_cycles(tmp_path, name):
     assert not warnings and (off > 0.004).sum() <= 2 and off.mean() < 5e-4, (off.max(), warnings)
 
 
-def test_what_only_cycles_can_tell_blocks_and_is_named():
+@pytest.mark.parametrize("name", BAKED)
+def test_what_only_cycles_can_tell_is_baked(tmp_path, name):
     start()
-    pane(shown(lambda made: mixed(made, noise(made, "UV", 3.0))))
+    shape(BAKED[name][1], shown(BAKED[name][0]))
+    before = names_of_data()
+    occluders, warnings = scene_parts.baked_occluders()
+    after = names_of_data()
+    off = off_cycles(tmp_path, occluders)
+    # The shares of a texel of some 5 mm differ by less than 0.02.
+    assert not warnings and np.quantile(off, 0.99) < 0.02 and off.mean() < 0.004, (off.max(), warnings)
+    assert before == after
+
+
+def test_in_a_view_what_only_cycles_can_tell_blocks_and_is_named():
+    start()
+    pane(shown(BAKED["noise"][0]))
     occluders, warnings = scene_parts.collected_occluders()
     assert len(warnings) == 1 and "blocks as if it were opaque: 'Pane'" in warnings[0], warnings
     assert seen_by_rays(occluders)[0].min() == 0.0
+
+
+@pytest.mark.parametrize("output", ["Ray Length", "Transparent Depth", "Incoming"])
+def test_what_differs_from_ray_to_ray_is_named(output):
+    start()
+    kind = "NewGeometry" if output == "Incoming" else "LightPath"
+    pane(shown(lambda made: mixed(made, calculated(made, "MULTIPLY", node(made, kind, output), 0.2))))
+    warnings = scene_parts.baked_occluders()[1]
+    assert len(warnings) == 1 and f"material 'Pane' lets through depends on {output}" in warnings[0], warnings
+
+
+def test_with_other_nodes_fresnel_counts_by_its_mean_which_is_named():
+    start()
+    pane(shown(lambda made: made.mix(noise(made, "UV", 4.0), mixed(made, fresnel(made)), clear(made))))
+    occluders, warnings = scene_parts.baked_occluders()
+    image = next(mesh.transparency.image for mesh in occluders.meshes if mesh.transparency is not None)
+    # What noise lets through of the mean: where that is 0.5, between 0.5 and 1.
+    assert 0.5 < image[image > 0.0].mean() < 0.9
+    assert len(warnings) == 1 and "depends on Fac" in warnings[0] and "mean over directions" in warnings[0], warnings

@@ -10,7 +10,7 @@ import numpy as np
 from ltsh_addon.blender import render_settings
 from ltsh_addon.blender.evaluated import with_render_depsgraph
 from ltsh_addon.blender.extract import pixels
-from ltsh_addon.blender.extract.occluders import collect_occluders
+from ltsh_addon.blender.extract.occluders import collect_occluders, with_baked_shares
 from ltsh_addon.blender.process.pixels import read_reference
 from ltsh_addon.cycles import gbuffer
 from ltsh_addon.imaging.exr import read_channels
@@ -222,14 +222,21 @@ def prepare(with_occluders=False):
     return scene, layer, inventory, warnings
 
 
-def collected_occluders():
-    """What blocks light in the open scene, and the warnings about it."""
+def collected_occluders(unread=None):
+    """What blocks light in the open scene, and the warnings about it. `unread`: see `collect_occluders`."""
     warnings, override = [], bpy.context.view_layer.material_override
 
     def visit(depsgraph):
-        return collect_occluders(depsgraph, override, warnings.append)
+        return collect_occluders(depsgraph, override, warnings.append, unread=unread)
 
     return with_render_depsgraph(bpy.context.scene, visit), warnings
+
+
+def baked_occluders():
+    """As `collected_occluders`, and what Cycles bakes of their transparency."""
+    unread = []
+    occluders, warnings = collected_occluders(unread)
+    return with_baked_shares(occluders, unread, bpy.context.scene, warnings.append), warnings
 
 
 def silent(stage, fraction):

@@ -1,6 +1,7 @@
 """Lights of the viewport: every light of a scene is drawn as the numpy side has it, or named."""
 
 import time
+from dataclasses import replace
 
 import bpy
 import numpy as np
@@ -14,8 +15,10 @@ from ltsh_addon import shading
 from ltsh_addon.blender.lights.emission import nodes_as_text
 from ltsh_addon.blender.lights.textures import ShownTextures
 from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels
+from ltsh_addon.blender.viewport import mirror
+from ltsh_addon.blender.viewport.light_texels import ShownSky
 from ltsh_addon.blender.viewport.live_cycles import LiveNodeLights
-from ltsh_addon.blender.viewport.mirror import NOT_YET, no_patterns, strongest, view_lights
+from ltsh_addon.blender.viewport.mirror import MOST_LIGHTS, NOT_YET, no_patterns, strongest, view_lights
 
 
 def seen(patterns=no_patterns):
@@ -420,3 +423,18 @@ def test_a_flat_surface_that_shines_does_not_light_itself():
     for passes in shading.PASSES:
         picture, _ = with_graphics(lambda passes=passes: viewport_picture(camera, passes, False))
         assert not picture.any()
+
+
+@pytest.mark.newest
+def test_lights_and_those_of_the_world_fit_the_layers_of_a_card(monkeypatch):
+    """With the sky's sides they have a layer each, and cards take 2048."""
+    parts.empty_scene()
+    parts.add_area_light("Lamp")
+    (lamp,), _ = seen()
+    assert MOST_LIGHTS < 2048
+    monkeypatch.setattr(mirror, "MOST_LIGHTS", 4)
+    shown = mirror.SceneMirror()
+    shown.lights_without_world = tuple(replace(lamp, radiance=(1.0 + n) * lamp.radiance) for n in range(4))
+    shown.take_sky(ShownSky(lights=(lamp,)))
+    assert len(shown.lights) == 4 and shown.lights[-1] is lamp and shown.lights[0] is shown.lights_without_world[1]
+    assert any("10.0 % of the power is missing" in note for note in shown.notes)

@@ -461,7 +461,7 @@ def test_colors_under_alpha_are_those_of_cycles(is_used, interpolation):
 
 
 @edits_with_graphics
-def test_an_image_that_shines_is_seen_and_lights_nothing():
+def test_an_image_that_shines_is_seen_and_lights_as_its_mean():
     """As a baked texture does; seen from above, by an orthographic camera."""
     parts.empty_scene(*SIZE)
     colors = np.array([[[0.2, 0.4, 0.6, 1.0], [0.8, 0.1, 0.0, 1.0]], [[0.0, 0.5, 0.1, 1.0], [0.3, 0.3, 0.9, 1.0]]])
@@ -495,7 +495,11 @@ def test_an_image_that_shines_is_seen_and_lights_nothing():
         seen = picture[int((0.5 + y / (4.0 * height / width)) * height), int((0.5 + x / 4.0) * width)]
         # Pictures of views are half floats.
         np.testing.assert_allclose(seen, 2.0 * colors[row, column, :3], rtol=2.0**-11, atol=1e-6)
-    assert not lights and list(notes) == ["Baked: its emission varies: it is seen, and lights nothing"]
+    # It lights on both sides, as the mean of its image.
+    assert [light.name for light in lights] == ["Plane", "Plane"]
+    for light in lights:
+        np.testing.assert_allclose(light.radiance, 2.0 * colors[..., :3].mean(axis=(0, 1)), rtol=1e-5)
+    assert len(notes) == 1 and notes[0].startswith("Baked: its emission varies: it lights as the mean of its image")
 
 
 def test_nothing_of_the_file_is_changed():

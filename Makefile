@@ -23,7 +23,7 @@ help:
 	@echo 'make lint    ruff only'
 	@echo 'make extension  the zips that Blender installs, one per platform: build/ltsh-*.zip'
 	@echo 'make bench   what shading costs, beside a textbook LTC, zonal harmonics and Cycles (20 minutes or more)'
-	@echo 'make soak    long tests, commands killed at random moments, 2,000 hostile inputs, 10,000 lights, 240 frames, 1e8 random integrals and 1e5 polygons of each kind (hours)'
+	@echo 'make soak    long tests, commands killed at random moments, 2,000 hostile inputs, 200 random scenes beside Cycles, 10,000 lights, 240 frames, 1e8 random integrals and 1e5 polygons of each kind (hours)'
 	@echo 'make tables  fit the lookup tables in tables/ again (long)'
 	@echo 'make lock    resolve requirements/*.in into the lock files; LOCK_OPTIONS=--upgrade takes newer versions'
 	@echo 'make clean   remove out/, build/ and caches (the environments in .venv stay)'

@@ -426,6 +426,6 @@ def rounded_positions(position: np.ndarray, lights) -> list[str]:
     return [
         f"positions are up to {np.abs(some).max():.3g} m from the origin, where they are rounded to "
         f"{1000.0 * apart.max():.2g} mm, in Cycles too: for half of the samples that is over "
-        f"{100.0 * min(np.median(share), 1.0):.2g} % of the distance from the nearest light, and their light is about "
+        f"{100.0 * min(np.median(share), 1.0):.3g} % of the distance from the nearest light, and their light is about "
         "as uncertain, more in sharp reflections; move the scene to the origin"
     ]

@@ -32,7 +32,7 @@ from .tasks import TaskResult, file_stems, versions, write_reports
 
 # NOTED_SHARE_OUTSIDE: a larger share of the UV map outside of the texture is reported. Less may come from texels along
 # the border, which count by their centers.
-NOTED_SHARE_OUTSIDE = 0.01
+NOTED_SHARE_OUTSIDE, NOTED_SHARE_DOUBLE = 0.01, 0.001
 # BLOCK_TEXELS: texels that a thread shades at a time. The allocator reuses arrays of this size; larger ones would be
 # new memory each time.
 BLOCK_TEXELS = 1 << 18
@@ -459,7 +459,7 @@ def _report(options, manifest, records) -> dict:
         if (share := 100 * record["outside"]) > 100 * NOTED_SHARE_OUTSIDE:
             warnings.append(f"{name}: {share:.3g} % of UV map {record['uv']!r} lies outside of the texture, not baked")
         for tile in record["tiles"].values():
-            if share := 100 * tile["overlapping_texels"] / max(tile["texels"], 1):
+            if (share := 100 * tile["overlapping_texels"] / max(tile["texels"], 1)) > 100 * NOTED_SHARE_DOUBLE:
                 warnings.append(f"{name}: {share:.3g} % of its texels are covered more than once")
             if share := 100 * tile["unbaked_texels"] / max(tile["texels"] + tile["unbaked_texels"], 1):
                 why = "because Cycles bakes nothing there: apply the modifiers"

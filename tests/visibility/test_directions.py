@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from textbook import lhuilier
 
-from ltsh_addon.visibility import sampling
+from ltsh_addon.visibility import ray_sampler, sampling
 
 
 @pytest.mark.parametrize("power", range(1, 9))
@@ -94,3 +94,9 @@ def test_a_warp_and_its_inverse_are_one_another():
     lengths = warps.unwarped(unit)
     np.testing.assert_allclose(lengths, expected, rtol=2e-3)
     np.testing.assert_allclose(warps.world(unit), world, atol=2e-3)
+
+
+def test_densities_beyond_single_precision_are_infinite_without_a_warning():
+    """Warnings are errors in tests. A ray of infinite density weighs nothing."""
+    density = ray_sampler._after_warp(np.float32([1e6, 2.0]), np.float32([1e-11, 0.5]))
+    assert density[0] == np.inf and density[1] == 16.0

@@ -23,8 +23,8 @@ from ..materials.graph import ADD, CLEAR, MIX, PRINCIPLED, Source, live_link, so
 from ..render_settings import cycles_setting
 from . import occluder_shapes as shapes
 
-# NAMED: how many names of a kind a warning lists.
-NAMED = 3
+# NAMED: how many names of a kind a warning lists. LEAST_DOUBLED: share of the area of an object that is named.
+NAMED, LEAST_DOUBLED = 3, 1e-3
 # A light is sampled by rays toward points on the light, and by rays in directions that the surface chooses.
 # SURFACE_SHIFT: the bits of a mask for the latter are this much higher, if some object blocks only one kind of ray.
 SURFACE_SHIFT = 16
@@ -190,11 +190,9 @@ class _Collector:
             else:
                 meshes = shapes.split_by_slot(ob, clear, self._image)
                 share = _doubled(meshes)
-                if share > 0.0:
-                    text = (
-                        f"{100.0 * share:.2g} % of its faces where others are: Cycles is black there, here all are lit"
-                    )
-                    self._note(text, ob)
+                if share > LEAST_DOUBLED:
+                    text = "of its faces where others are: Cycles is black there, here all are lit"
+                    self._note(f"{float(f'{100.0 * share:.2g}'):g} % {text}", ob)
                 if any(material is not None and _is_displaced(material) for material in materials):
                     self._note("displacement is not in shadows, the surface blocks where it is without", ob)
             self._shapes[key] = self._number(meshes), matrices
@@ -462,7 +460,7 @@ def _is_displaced(material) -> bool:
 
 
 def _doubled(meshes: list[OccluderMesh]) -> float:
-    """The share of the triangles that coincide with others and face the same way."""
+    """The share of the area of triangles that coincide with others and face the same way."""
     triangles = [mesh.vertices[mesh.triangles].astype(np.float64) for mesh in meshes]
     if not triangles:
         return 0.0
@@ -477,6 +475,8 @@ def _doubled(meshes: list[OccluderMesh]) -> float:
     sides = (corners[index[same], 1:] - corners[index[same], :1] for index in (one, other))
     normal, other_normal = (np.cross(side[:, 0], side[:, 1]) for side in sides)
     doubled = (first == second).all(axis=(1, 2)) & ((normal * other_normal).sum(axis=1) > 0.0)
-    touched = np.zeros(len(corners), bool)
-    touched[one[same][doubled]] = touched[other[same][doubled]] = True
-    return float(touched.mean()) if len(touched) else 0.0
+    if not doubled.any():
+        return 0.0
+    touched = np.unique([one[same][doubled], other[same][doubled]])
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    return float(area[touched].sum() / area.sum())

@@ -40,8 +40,8 @@ def move_to_origin(scene, eye: np.ndarray, warnings: list[str]) -> np.ndarray:
     if lost:
         warnings.append(
             f"{where}: positions there are {1000.0 * apart:.2g} mm apart, which changes light from 1 m away by some "
-            f"{min(1000.0 * apart, 100.0):.2g} %, in Cycles and in the techniques; the scene could not be moved to the "
-            f"origin, for {listed(map(repr, lost), NAMED)} would not follow: move it there"
+            f"{float(f'{min(1000.0 * apart, 100.0):.2g}'):g} %, in Cycles and in the techniques; the scene could not "
+            f"be moved to the origin, for {listed(map(repr, lost), NAMED)} would not follow: move it there"
         )
         return nowhere
     warnings.append(

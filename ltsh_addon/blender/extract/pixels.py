@@ -153,10 +153,8 @@ def missing_images(depsgraph, world, override=None) -> list[str]:
     The material `override` replaces all others.
     """
     missing = [image for image in bpy.data.images if image.users and _is_lost(image)]
-    if not missing:
-        return []
-    user_map, objects, blocks = bpy.data.user_map(), set(), {world}
-    for instance in depsgraph.object_instances:
+    user_map, objects, blocks = bpy.data.user_map() if missing else {}, set(), {world}
+    for instance in depsgraph.object_instances if missing else ():
         ob = instance.object
         if ob.type == "LIGHT":
             blocks.add(ob.original.data)

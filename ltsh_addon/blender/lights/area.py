@@ -216,8 +216,8 @@ def note_overlaps(inventory: LightInventory) -> None:
     mean, most = max(_lost_diffuse_shares(pair[:2], inventory) for pair in pairs[:NAMED_PAIRS])
     inventory.warn(
         f"lights {listed(names, NAMED_PAIRS)}: each pair overlaps in one plane, by that share of the smaller light; "
-        f"there Cycles loses about {100.0 * mean:.2g} % of their diffuse light on all surfaces together, at "
-        f"points {100.0 * most:.2g} %, and up to {100.0 * lost:.0f} % of their light in sharp reflections, the "
+        f"there Cycles loses about {100.0 * mean:.3g} % of their diffuse light on all surfaces together, at "
+        f"points {100.0 * most:.3g} %, and up to {100.0 * lost:.0f} % of their light in sharp reflections, the "
         "techniques lose nothing; move one of each pair forward by 0.1 mm"
     )
 
@@ -232,8 +232,7 @@ def _lost_diffuse_shares(pair: tuple[Light, Light], inventory: LightInventory) -
     # Cycles hardly ever chooses a world among lights that are so near.
     lights = tuple(light for light in inventory.lights if not light.is_distant)
     number = max(number for number, light in enumerate(lights) if light is pair[0] or light is pair[1])
-    second = lights[number]
-    first = pair[0] if pair[1] is second else pair[1]
+    first, second = pair if pair[1] is lights[number] else pair[::-1]
     position, normal = inventory.lit_points
     normal = normal * np.sign(((second.center - position) * normal).sum(axis=1, keepdims=True))  # lit on both sides
     pmf = light_selection_pmf(position, normal, lights)

@@ -267,15 +267,16 @@ class _SampleRenders:
         if not self._renders:
             return [], []
         materials, camera, warnings = self._manifest["unshaded"], self._manifest["camera"], []
-        if self._unusable:
-            what = "transparent surfaces in front of others, or not finite, or too far away"
-            warnings.append(f"{self._unusable} samples are not shaded: {what}")
-        if self._unnamed:
-            warnings.append(f"{self._unnamed} samples see a surface whose material could not be read: not shaded")
-        of_samples = len(warnings)
-        warnings += gbuffer.coarse_meshes(samples)
         shaded = len(samples) if film.first is None else int(film.first.sum())
         total = shaded + self._unusable + self._unnamed
+        if self._unusable:
+            what = "transparent surfaces in front of others, or not finite, or too far away"
+            warnings.append(f"{100.0 * self._unusable / total:.3g} % of the samples are not shaded: {what}")
+        if self._unnamed:
+            what = "see a surface whose material could not be read: not shaded"
+            warnings.append(f"{100.0 * self._unnamed / total:.3g} % of the samples {what}")
+        of_samples = len(warnings)
+        warnings += gbuffer.coarse_meshes(samples)
         lost = self._unusable + self._unnamed + int(self._unshaded.sum())
         if 2 * lost > total:
             reasons = [materials[number] for number in np.argsort(-self._unshaded, kind="stable")]
@@ -363,7 +364,7 @@ def faceted(samples: SurfaceSamples, lights: tuple[Light, ...]) -> list[str]:
     sky = next(light for light in lights if light.is_distant and light.children and light.affects_specular)
     return [
         f"world {sky.name!r}: it is blurred by a degree or more in reflections sharper than roughness "
-        f"{SHARP_REFLECTION:g}, which {100.0 * sharp.mean():.2g} % of the samples have, and in facets in reference"
+        f"{SHARP_REFLECTION:g}, which {100.0 * sharp.mean():.3g} % of the samples have, and in facets in reference"
     ]
 
 

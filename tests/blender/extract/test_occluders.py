@@ -432,6 +432,20 @@ def test_what_is_not_as_in_cycles_is_named(name):
     assert seen_by_rays(occluders)[0].min() == pytest.approx(share, abs=1e-5)
 
 
+@pytest.mark.newest
+@pytest.mark.parametrize(("doubled", "others", "named"), [(0.01, 2.0, ""), (2.0, 0.01, "100 % of its faces where")])
+def test_doubled_faces_count_by_their_area(doubled, others, named):
+    """A triangle twice among 20 others: of 5e-6 of the area nothing is said, however many faces there are."""
+    start()
+    sizes = np.array([doubled, doubled, *[others] * 20])
+    corners = sizes[:, None, None] * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    corners[2:, :, 2] += np.arange(1.0, 21.0)[:, None]
+    vertices, faces = corners.reshape(-1, 3).tolist(), np.arange(66).reshape(-1, 3).tolist()
+    hidden(scene_parts.add_mesh("Pane", vertices, faces, location=(0.3, 0.2, 1.0)))
+    warnings = scene_parts.collected_occluders()[1]
+    assert len(warnings) == bool(named) and all(named in line for line in warnings), warnings
+
+
 # Hair and points:
 
 

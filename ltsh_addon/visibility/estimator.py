@@ -41,9 +41,9 @@ LEVELS = (16, 32, 64, 128, 256, 512)
 BRIGHTEST = 4
 # Rounds in which neighbors of mixed pairs get more rays. Neighbors that turn out mixed pass this on in the next round.
 ROUNDS = 4
-# Rays end at this share of their distance to the light, just before it; rays to an area light behind which a face is as
-# near as that end STEPS float steps before its plane.
-END, STEPS = np.float32(1.0 - 1e-4), 2.0
+# Rays end at this share of their distance to the light, just before it; but to an area light with a face as near as
+# that, GAP of the coordinates before its plane: a step of single precision.
+END, GAP = np.float32(1.0 - 1e-4), float(np.finfo(np.float32).eps)
 # Points along each side of a light from which near faces are looked for.
 LOOKED_AT = 8
 _ZERO, _ONE, _TINY = np.float32(0.0), np.float32(1.0), np.float32(1e-30)
@@ -131,14 +131,16 @@ class RatioEstimator:
         self.count = np.zeros(count, np.int32)
         self.traced = 0
         # How far before the plane of the light rays end, in m, but for what follows from their length; 0: at END.
-        self.margin = _ZERO if self.at_surface or not isinstance(light, FlatLight) else self._margin(origins)
-        self.at_surface = self.at_surface or self.margin > 0.0
+        self.margin = _ZERO
 
     def trace(self, rays: int, neighbors: PixelNeighbors, typical: dict[str, float], importance: np.ndarray) -> None:
         """Trace the probes of all pairs, then up to `rays` rays for pairs that need them. How many depends on the light
         and the `importance` (P,) of the sample. `typical` comes from `typical_radiance`."""
         if self.mask == 0 or not self.light.area_vector.any():
             return
+        if isinstance(self.light, FlatLight) and not self.at_surface and len(self.index):
+            self.margin = self._margin()
+            self.at_surface = self.margin > 0.0
         self._add_rays(np.arange(len(self.index)), 0, PROBES, 0)
         self._leave_out_unlit()
         number, choice = self._plan(rays, typical, importance[self.index])
@@ -154,19 +156,20 @@ class RatioEstimator:
                     self._add_rays(members, PROBES, int(last), split)
         self._aim_at_corners()
 
-    def _margin(self, position):
-        """STEPS float steps of the light's coordinates, if a face is so near to it that END is not between them for samples
-        at `position` (3, P); else 0."""
+    def _margin(self):
+        """GAP of the light's coordinates along its normal in m, if a face is so near that END may be behind it; else
+        0."""
         light = self.light
-        farthest = np.sqrt(np.square(position[:, self.index] - light.center[:, None]).sum(axis=0).max(initial=0.0))
-        near = 2.0 * (1.0 - END) * farthest
+        offset = self.surface.position[:, self.index] - light.center[:, None]
+        near = 2.0 * (1.0 - END) * np.sqrt(np.square(offset).sum(axis=0).max())
         s, t = np.meshgrid(*2 * [(np.arange(LOOKED_AT) + 0.5) * (2.0 / LOOKED_AT) - 1.0])
         points = light.center + s.reshape(-1, 1) * light.half_u + t.reshape(-1, 1) * light.half_v
         points += near * light.direction
-        rays = np.broadcast_to(-light.direction, points.shape), np.full(len(points), 2.0 * near)
-        if not near or (self.surface.tracer.transmittance(points, *rays) == 1.0).all():
+        rays = points, np.broadcast_to(-light.direction, points.shape), np.full(len(points), 2.0 * near)
+        masks = np.full(len(points), self.mask)
+        if (self.surface.tracer.transmittance(*rays, masks) == 1.0).all():
             return _ZERO
-        return np.float32(STEPS * 2.0**-24 * np.abs(light.polygon()).max())
+        return np.float32(GAP * (np.abs(light.direction) @ np.abs(light.center)) + 1e-12)
 
     def _plan(self, rays, typical, importance):
         """Number of rays (Q,) that each pair is worth, and its column (Q,) of EVENLY. Both depend on the unshadowed
@@ -243,7 +246,7 @@ class RatioEstimator:
         masks, ends = np.broadcast_to(mask, distances.shape), distances * END
         if self.margin:
             falling = np.maximum(-(self.light.direction.astype(np.float32) @ directions), _TINY)
-            ends = np.maximum(ends, distances * np.float32(1.0 - STEPS * 2.0**-24) - self.margin / falling)
+            ends = np.maximum(ends, distances * np.float32(1.0 - GAP) - self.margin / falling)
         return self.surface.tracer.transmittance(origins.T, directions.T, ends, masks)
 
     def _add_rays(self, members, first, last, split):

@@ -355,7 +355,7 @@ class RaySampler:
         ratio *= ratio
         ratio *= alpha2 if self.stretch is None else alpha2 * self.stretch[0]
         ratio *= mu
-        ratio /= slope
+        ratio /= np.maximum(slope, _TINY, out=slope)
         ratio *= self._reflectance(squared)
         if self.has_own_horizon:
             ratio *= dot(directions, self.geometric_normal) > 0.0

@@ -350,3 +350,23 @@ def test_rays_to_distant_lights_have_no_end():
         # Other places, other rays: about 2 % each.
         difference = getattr(found, name) - getattr(expected, name)
         assert np.sqrt(np.square(difference).mean()) < 0.04 and abs(difference.mean()) < 0.01
+
+
+@pytest.mark.parametrize("shape", ["RECTANGLE", "ELLIPSE"])
+@pytest.mark.parametrize("tilt", [0.0, 0.6])
+def test_a_face_just_before_a_light_blocks_it_and_one_just_behind_does_not(shape, tilt):
+    """By the geometry. 4 um are 8 float steps of the coordinates here; the rays' ends keep 2, rounding takes 2."""
+    direction = np.array([0.0, np.sin(tilt), -np.cos(tilt)])
+    half_u = np.array([0.3, 0.0, 0.0])
+    places = {"center": np.array([0.0, 0.0, 3.1]), "half_u": half_u, "half_v": np.cross(direction, half_u)}
+    light = panel(shape=shape, direction=direction, **places)
+    for before in (4e-6, 3e-4, -4e-6):
+
+        def passed(origins, directions, distances, before=before):
+            height = (light.center + before * direction - origins) @ direction
+            return np.where((directions @ direction) * distances < height, 0.0, 1.0)
+
+        found = ratio.trace_visibility(floor(12)[0], [light], Tracer(passed))
+        for name in PASSES:
+            share = getattr(found, name)
+            assert (share == (0.0 if before > 0.0 else 1.0)).all(), (before, name, share.min(), share.max())

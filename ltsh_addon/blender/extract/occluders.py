@@ -14,6 +14,7 @@ import bpy
 import numpy as np
 
 from ...scene import FARTHEST, listed
+from ...visibility.estimator import GAP
 from ...visibility.occluders import TERMINATOR_OFFSET, OccluderMesh, Occluders, Transparency
 from ..evaluated import SURFACE_TYPES, is_rendered, owner_of
 from ..lights.emission import ObjectFacts, open_studio, trees_of
@@ -80,6 +81,7 @@ class _Instances:
     matrices: np.ndarray  # (N, 3, 4)
     mask: int
     terminator: float
+    name: str
 
 
 class _Collector:
@@ -117,6 +119,11 @@ class _Collector:
                 self._add(instance, matrix)
             if instance.show_particles and ob.particle_systems:
                 self._add_hair(instance)
+        if in_planes := self._lights_in_planes():
+            warn(
+                f"shadows: area lights in the plane of a face: {listed(in_planes, NAMED)}: Cycles loses a part of "
+                "their light at random, the techniques lose nothing; move them off by 0.1 mm"
+            )
         for kind, names in self._notes.items():
             warn(f"shadows: {kind}: {listed(map(repr, names), NAMED)}")
         if self._blockers.unnumbered:
@@ -152,11 +159,37 @@ class _Collector:
         if self._shift:
             mask = by_light * mask | (by_surface * mask) << self._shift
         terminator = getattr(instance.object, "shadow_terminator_geometry_offset", TERMINATOR_OFFSET)
-        self._instances += [_Instances(number, (matrix @ matrices)[:, :3], mask, terminator) for number in numbers]
+        matrices_3x4, name = (matrix @ matrices)[:, :3], instance.object.original.name
+        self._instances += [_Instances(number, matrices_3x4, mask, terminator, name) for number in numbers]
         # The depsgraph lists metaballs twice.
         if matrices is shapes.ONE_INSTANCE and instance.object.type != "META":
             for number in numbers:
                 self._look_for_twins(number, matrix, instance.object)
+
+    def _lights_in_planes(self) -> list[str]:
+        """Names of area lights that lie in the plane of a face, up to rounding, each with that of the object."""
+        lights = [
+            (instance.object.original.name, *_points_of_area_light(instance))
+            for instance in self._depsgraph.object_instances
+            if instance.object.type == "LIGHT" and instance.object.data.type == "AREA"
+        ]
+        if not lights or not self._instances:
+            return []
+        matrices = np.concatenate([instances.matrices for instances in self._instances])
+        owner = np.repeat(np.arange(len(self._instances)), [len(one.matrices) for one in self._instances])
+        ends = np.array([(mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)) for mesh in self._meshes], np.float64)
+        low, high = ends[[instances.mesh for instances in self._instances]][owner].swapaxes(0, 1)
+        centers = np.einsum("nij,nj->ni", matrices[:, :, :3], 0.5 * (low + high)) + matrices[:, :, 3]
+        halves = np.einsum("nij,nj->ni", np.abs(matrices[:, :, :3]), 0.5 * (high - low))
+        result = {}
+        for light, points, normal in lights:
+            near = 4.0 * GAP * (np.abs(normal) @ np.abs(points[0]))
+            reach = np.ptp(points, axis=0) / 2.0 + near
+            for number in np.flatnonzero((np.abs(centers - points[0]) <= halves + reach).all(axis=1)):
+                instances = self._instances[owner[number]]
+                if _holds(self._meshes[instances.mesh], matrices[number], points, (normal, near)):
+                    result[f"{light!r} in {instances.name!r}"] = None
+        return list(result)
 
     def _look_for_twins(self, number, matrix, ob):
         """Add a note if an equal mesh is already in the same place."""
@@ -457,6 +490,25 @@ def _is_displaced(material) -> bool:
     if surface is None or live_link(surface.node.inputs["Displacement"]) is None:
         return False
     return getattr(material, "displacement_method", "BUMP") != "BUMP"
+
+
+def _points_of_area_light(instance) -> tuple[np.ndarray, np.ndarray]:
+    """The center and four points near the corners (5, 3) of an area light, and its unit normal (3,)."""
+    light, matrix = instance.object.data, np.array(instance.matrix_world, dtype=np.float64)
+    depth = light.size_y if light.shape in ("RECTANGLE", "ELLIPSE") else light.size
+    places = 0.35 * np.array([[0, 0], [-1, -1], [-1, 1], [1, -1], [1, 1]]) * (light.size, depth)
+    normal = np.cross(matrix[:3, 0], matrix[:3, 1])
+    return places @ matrix[:3, :2].T + matrix[:3, 3], normal / max(np.linalg.norm(normal), 1e-30)
+
+
+def _holds(mesh, matrix, points, plane) -> bool:
+    """True if one of the `points` (N, 3) is in a triangle of their `plane`: its normal, and a tolerance in m."""
+    normal, near = plane
+    vertices = mesh.vertices @ matrix[:, :3].T + matrix[:, 3]
+    is_flat = (np.abs((vertices - points[0]) @ normal) <= near)[mesh.triangles].all(axis=1)
+    offset = vertices[mesh.triangles[is_flat]][:, None] - points[:, None]
+    sides = np.cross(offset, np.roll(offset, -1, axis=2)) @ normal
+    return bool(((sides >= 0.0).all(axis=2) | (sides <= 0.0).all(axis=2)).any())
 
 
 def _doubled(meshes: list[OccluderMesh]) -> float:

@@ -384,6 +384,7 @@ NAMED = {
     "in the same place": "in the same place as 'Pane'",
     "instance in the same place": "in the same place as 'Pane'",
     "doubled": "67 % of its faces where others are",
+    "light in its plane": "in the plane of a face: 'Flush' in 'Pane'",
 }
 
 
@@ -414,6 +415,14 @@ def test_what_is_not_as_in_cycles_is_named(name):
         twin = ob.copy()
         twin.data = ob.data if name.startswith("instance") else ob.data.copy()
         scene_parts.link(twin, ob.location)
+    elif name == "light in its plane":
+        ob = pane(scene_parts.principled("Pane")[0])
+        ob.name = "Pane"
+        for light_name, height in (("Flush", 0.0), ("Below", -1e-4), ("Above", 1e-4)):
+            light = bpy.data.lights.new(light_name, "AREA")
+            light.size = 0.1
+            location = (ob.location.x, ob.location.y, ob.location.z + height)
+            scene_parts.link(bpy.data.objects.new(light_name, light), location)
     elif name == "doubled":
         # Two squares are one; of the triangles above one is the back of the other.
         square, up = [(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)], [(-1, -1, 0.1), (1, -1, 0.1), (0, 1, 0.1)]

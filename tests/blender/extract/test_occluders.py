@@ -448,7 +448,7 @@ def test_doubled_faces_count_by_their_area(doubled, others, named):
     start()
     sizes = np.array([doubled, doubled, *[others] * 20])
     corners = sizes[:, None, None] * np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-    corners[2:, :, 2] += np.arange(1.0, 21.0)[:, None]
+    corners[2:, :, 2] += np.arange(1.0, 21.0)[:, None] + 0.03  # in no plane of a light
     vertices, faces = corners.reshape(-1, 3).tolist(), np.arange(66).reshape(-1, 3).tolist()
     hidden(scene_parts.add_mesh("Pane", vertices, faces, location=(0.3, 0.2, 1.0)))
     warnings = scene_parts.collected_occluders()[1]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scene_parts
 from material_scenes import Build
-from shadow_scenes import (
+from panes import (
     LIGHT,
     add_light,
     assert_as_cycles,

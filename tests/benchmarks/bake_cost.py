@@ -1,15 +1,17 @@
 """What a bake takes: seconds and memory by size, and its time at equal error beside Cycles' bake; needs bpy.
 
-python tests/benchmarks/bake_cost.py [time | memory | cycles]
+python tests/benchmarks/bake_cost.py [time | memory | cycles | shadows]
 
 time: 1024^2 and 4096^2 under four lights, ltsh4, constant materials. memory: the peak by size. cycles: part of `make
 bench`; how long Cycles' bake takes to come as near to the truth as ltsh4, which the quadrature of `reference` tells.
+shadows: processor seconds, with those of Blender, for a floor with shadows under one light and a constant world.
 """
 
 import argparse
 import json
 import math
 import os
+import resource
 import subprocess
 import sys
 import tempfile
@@ -48,6 +50,38 @@ def build_scene(path, textured=False):
         tree.links.new(noise.outputs[0], node.inputs["Roughness"])
     scene_parts.add_plane(material, name="Floor")
     scene_parts.save(path)
+
+
+def build_shadows(path):
+    """A floor of 6 m with boxes and balls on it, under one area light and a constant world."""
+    import bpy
+    import scene_parts
+
+    build_scene(path)
+    for ob in [ob for ob in bpy.data.objects if ob.type == "LIGHT"][1:]:
+        bpy.data.objects.remove(ob)
+    for number in range(5):
+        place = (1.1 * (number % 3) - 1.2, 1.4 * (number // 3) - 0.9, 0.3)
+        add = bpy.ops.mesh.primitive_cube_add if number % 2 else bpy.ops.mesh.primitive_uv_sphere_add
+        add(location=place, scale=(0.3, 0.3, 0.3))
+    scene_parts.add_world(Color=(0.3, 0.35, 0.5, 1.0))
+    scene_parts.save(path)
+
+
+def with_shadows(sizes=(512, 1024)):
+    """Print the processor seconds of `bake` with shadows and without, by size, all processes together."""
+    with tempfile.TemporaryDirectory(prefix="ltsh-bench-") as name:
+        scene = _scene(Path(name), "shadows")
+        for size in sizes:
+            seconds = []
+            for shadows in ("on", "off"):
+                before = resource.getrusage(resource.RUSAGE_CHILDREN)
+                options = "--size", str(size), "--object", "Floor", "--shadows", shadows
+                bake(scene, Path(name) / f"{size}{shadows}", *options)
+                after = resource.getrusage(resource.RUSAGE_CHILDREN)
+                seconds.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+            with_them, without = seconds
+            print(f"  {size:>5}^2: {with_them:.1f} processor s, {without:.1f} without shadows", flush=True)
 
 
 def bake(scene, output, *options):
@@ -165,13 +199,18 @@ def _scene(folder, kind):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("what", choices=("time", "memory", "cycles", "scene"))
+    parser.add_argument("what", choices=("time", "memory", "cycles", "shadows", "scene"))
     parser.add_argument("path", nargs="?", type=Path)
-    parser.add_argument("--kind", default="constant", choices=("constant", "textured"))
+    parser.add_argument("--kind", default="constant", choices=("constant", "textured", "shadows"))
     parser.add_argument("--sizes", default="4096,8192")
     options, more = parser.parse_known_args()
     if options.what == "scene":
-        build_scene(options.path, options.kind == "textured")
+        if options.kind == "shadows":
+            build_shadows(options.path)
+        else:
+            build_scene(options.path, options.kind == "textured")
+    elif options.what == "shadows":
+        with_shadows()
     elif options.what == "time" and not times():
         raise SystemExit("a bake takes too much")
     elif options.what == "cycles" and equal_error() < FACTOR:

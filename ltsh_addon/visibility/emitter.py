@@ -7,12 +7,13 @@ Where a round, polygonal or textured light leaves the quadrilateral dark, the di
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from ..emitters import light_profile
 from ..lobes.polygon import convex_pieces, dot
-from ..scene import Light, PolygonLight, SkyLight
+from ..scene import Light, PolygonLight
 
 _ZERO, _ONE, _TINY = np.float32(0.0), np.float32(1.0), np.float32(1e-30)
 # Cells along each side of the picture of a textured light.
@@ -166,20 +167,9 @@ class Sky(Emitter):
         self.ends = np.cumsum(power / power.sum()).astype(np.float32)
         self.values = (values / max(np.abs(radiance).mean(), 1e-30)).astype(np.float32).ravel()
         self.is_constant = np.ptp(values) <= 1e-6 * values.max()
-        like = sides[0]
-        super().__init__(
-            SkyLight(
-                name=like.name,
-                center=np.array([0.0, 0.0, NEXT_TO]),
-                half_u=np.array([1.0, 0.0, 0.0]),
-                half_v=np.array([0.0, 1.0, 0.0]),
-                direction=np.array([0.0, 0.0, -1.0]),
-                radiance=radiance,
-                affects_diffuse=like.affects_diffuse,
-                affects_specular=like.affects_specular,
-                receivers=like.receivers,
-            )
-        )
+        right, up, away = np.eye(3)
+        shape = {"center": NEXT_TO * away, "half_u": right, "half_v": up, "direction": -away}
+        super().__init__(replace(sides[0], **shape, radiance=radiance, children=()))
         self.selected_as = tuple(sides)
 
     def directions(self, x: np.ndarray, y: np.ndarray, normal: np.ndarray) -> np.ndarray:

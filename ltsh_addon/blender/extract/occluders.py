@@ -6,7 +6,6 @@ What their shapes are is in `occluder_shapes`.
 
 from __future__ import annotations
 
-import math
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
@@ -26,6 +25,10 @@ from . import occluder_shapes as shapes
 
 # NAMED: how many names of a kind a warning lists. LEAST_DOUBLED: share of the area of an object that is named.
 NAMED, LEAST_DOUBLED = 3, 1e-3
+# AREA_POINTS: points of an object tried for faces in one plane. MOST_TESTS: pairs of a point and a triangle by plane.
+# PLANE_STEPS: planes are the same if their unit normals, and heights in units of the largest coordinate, round to it.
+AREA_POINTS, MOST_TESTS, PLANE_STEPS = 2048, 2_000_000, 1e5
+PLANE_KEYS = np.array([1, 3_000_017, 9_000_000_000_023, 27_000_000_000_000_029])
 # A light is sampled by rays toward points on the light, and by rays in directions that the surface chooses.
 # SURFACE_SHIFT: the bits of a mask for the latter are this much higher, if some object blocks only one kind of ray.
 SURFACE_SHIFT = 16
@@ -222,7 +225,7 @@ class _Collector:
                 meshes, matrices = shapes.balls(ob, clear[0], self._note)
             else:
                 meshes = shapes.split_by_slot(ob, clear, self._image)
-                share = _doubled(meshes)
+                share = _overlapped(meshes)
                 if share > LEAST_DOUBLED:
                     text = "of its faces where others are: Cycles is black there, here all are lit"
                     self._note(f"{float(f'{100.0 * share:.2g}'):g} % {text}", ob)
@@ -511,24 +514,39 @@ def _holds(mesh, matrix, points, plane) -> bool:
     return bool(((sides >= 0.0).all(axis=2) | (sides <= 0.0).all(axis=2)).any())
 
 
-def _doubled(meshes: list[OccluderMesh]) -> float:
-    """The share of the area of triangles that coincide with others and face the same way."""
+def _overlapped(meshes: list[OccluderMesh]) -> float:
+    """The share of the area of triangles that lies in others of the same plane which face the same way.
+
+    It is found at AREA_POINTS points, evenly spaced over the area of all triangles.
+    """
     triangles = [mesh.vertices[mesh.triangles].astype(np.float64) for mesh in meshes]
-    if not triangles:
+    corners = np.concatenate([np.zeros((0, 3, 3)), *triangles])
+    sides = corners[:, 1:] - corners[:, :1]
+    normal = np.cross(sides[:, 0], sides[:, 1])
+    area = np.linalg.norm(normal, axis=1)
+    if not 0.0 < area.sum() < np.inf:
         return 0.0
-    corners = np.concatenate(triangles)
-    # A sum of single precision numbers is exact in double precision, so the order of the corners does not matter.
-    x, y, z = corners.sum(axis=1).T
-    key = x + math.pi * y + math.e * z
-    order = np.argsort(key)
-    one, other = order[:-1], order[1:]
-    same = key[one] == key[other]
-    first, second = (np.sort(corners[index[same]].view("f8,f8,f8"), axis=1) for index in (one, other))
-    sides = (corners[index[same], 1:] - corners[index[same], :1] for index in (one, other))
-    normal, other_normal = (np.cross(side[:, 0], side[:, 1]) for side in sides)
-    doubled = (first == second).all(axis=(1, 2)) & ((normal * other_normal).sum(axis=1) > 0.0)
-    if not doubled.any():
-        return 0.0
-    touched = np.unique([one[same][doubled], other[same][doubled]])
-    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    return float(area[touched].sum() / area.sum())
+    normal /= np.maximum(area, 1e-300)[:, None]
+    height = (normal * corners[:, 0]).sum(axis=1) / np.abs(corners).max()
+    plane = np.rint(np.column_stack([normal, height]) * PLANE_STEPS).astype(np.int64)
+    _, group, count = np.unique(plane @ PLANE_KEYS, return_inverse=True, return_counts=True)
+    number = np.arange(AREA_POINTS) + 0.5
+    own = np.searchsorted(np.cumsum(area), number * (area.sum() / AREA_POINTS)).clip(max=len(area) - 1)
+    # A sequence of Roberts 2018 ("The Unreasonable Effectiveness of Quasirandom Sequences"), folded into triangles.
+    place = np.outer(number, (0.7548776662466927, 0.5698402909980532)) % 1.0
+    place = np.where(place.sum(axis=1, keepdims=True) > 1.0, 1.0 - place, place)
+    points = corners[own, 0] + (place[:, :, None] * sides[own]).sum(axis=1)
+    overlapped = 0.0
+    for number in np.unique(group[own]):
+        here, members = np.flatnonzero(group[own] == number), np.flatnonzero(group == number)
+        if len(members) == 1:
+            continue
+        tried = here[:: -(-len(here) * len(members) // MOST_TESTS)]
+        axes = np.argsort(np.abs(normal[members[0]]))[:2]
+        (a, b), (c, d) = (sides[members][:, k, axes].T for k in (0, 1))
+        x, y = (points[tried][:, None, axes] - corners[members, 0][:, axes]).transpose(2, 0, 1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u, v = (x * d - y * c) / (a * d - b * c), (a * y - b * x) / (a * d - b * c)
+        covering = ((u > 1e-6) & (v > 1e-6) & (u + v < 1.0 - 1e-6)).sum(axis=1)
+        overlapped += (covering > 1).mean() * len(here)
+    return overlapped / AREA_POINTS

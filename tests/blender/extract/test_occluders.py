@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scene_parts
 from material_scenes import Build
-from shadow_scenes import (
+from panes import (
     LIGHT,
     add_light,
     assert_as_cycles,
@@ -384,6 +384,7 @@ NAMED = {
     "in the same place": "in the same place as 'Pane'",
     "instance in the same place": "in the same place as 'Pane'",
     "doubled": "67 % of its faces where others are",
+    "overlapped": "50 % of its faces where others are",
     "light in its plane": "in the plane of a face: 'Flush' in 'Pane'",
 }
 
@@ -428,6 +429,10 @@ def test_what_is_not_as_in_cycles_is_named(name):
         square, up = [(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)], [(-1, -1, 0.1), (1, -1, 0.1), (0, 1, 0.1)]
         faces = [(0, 1, 2), (2, 3, 0), (6, 4, 5), (6, 7, 4), (10, 9, 8), (8, 9, 10)]
         hidden(scene_parts.add_mesh("Pane", 2 * square + up, faces, location=(0.3, 0.2, 1.0)))
+    elif name == "overlapped":
+        # Two squares in one plane share half of each, as tiles of an Array modifier do.
+        squares = [(x + left, y, 0) for left in (-1.5, -0.5) for x, y in ((0, -1), (2, -1), (2, 1), (0, 1))]
+        hidden(scene_parts.add_mesh("Pane", squares, [(0, 1, 2, 3), (4, 5, 6, 7)], location=(0.3, 0.2, 1.0)))
     else:
         made = Build("Pane")
         made.show(made.leaf(0.5))

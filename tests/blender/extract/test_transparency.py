@@ -4,7 +4,7 @@ import bpy
 import numpy as np
 import pytest
 import scene_parts
-from shadow_scenes import clear, hidden, pane, seen_by_cycles, seen_by_rays, shown, start, textured
+from panes import clear, hidden, pane, seen_by_cycles, seen_by_rays, shown, start, textured
 
 pytestmark = pytest.mark.newest
 

@@ -7,12 +7,13 @@ Where a round, polygonal or textured light leaves the quadrilateral dark, the di
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from ..emitters import light_profile
 from ..lobes.polygon import convex_pieces, dot
-from ..scene import Light, PolygonLight, SkyLight
+from ..scene import Light, PolygonLight
 
 _ZERO, _ONE, _TINY = np.float32(0.0), np.float32(1.0), np.float32(1e-30)
 # Cells along each side of the picture of a textured light.
@@ -147,92 +148,89 @@ class Sky(Emitter):
     """The sides of a cube as one emitter. Its `light` has their mean radiance; its shape is a mere placeholder."""
 
     def __init__(self, sides: Sequence[Light]):
-        self.ahead = np.repeat(np.eye(3, dtype=np.float32), 2, axis=0)
-        self.ahead[1::2] *= -1.0
-        self.right, self.up = np.roll(self.ahead, 1, axis=1), np.roll(self.ahead, 2, axis=1)
+        ahead = np.repeat(np.eye(3), 2, axis=0)
+        ahead[1::2] *= -1.0
+        axes = np.stack([ahead, np.roll(ahead, 1, axis=1), np.roll(ahead, 2, axis=1)])
         values, radiance = np.zeros((6, CELLS, CELLS)), np.zeros(3)
         for side in sides:
             axis = int(np.argmax(np.abs(side.center)))
             slot = 2 * axis + int(side.center[axis] < 0.0)
-            self.right[slot], self.up[slot] = side.half_u, side.half_v
+            axes[1:, slot] = side.half_u, side.half_v
             values[slot] = np.abs(side.radiance).mean() * _cells_of(side)
             radiance += side.radiance / 6.0
+        # Ahead, right and up (3, 6) of each side: the component that is not 0, and its sign.
+        self.component, self.sign = np.abs(axes).argmax(axis=2), axes.sum(axis=2).astype(np.float32)
         middles = (np.arange(CELLS) + 0.5) * (2.0 / CELLS) - 1.0
         angles = (4.0 / CELLS**2) * (1.0 + middles[:, None] ** 2 + middles**2) ** -1.5
         power = (values * angles).ravel()
         self.pmf = (power / power.sum()).astype(np.float32)
         self.ends = np.cumsum(power / power.sum()).astype(np.float32)
         self.values = (values / max(np.abs(radiance).mean(), 1e-30)).astype(np.float32).ravel()
-        like = sides[0]
-        super().__init__(
-            SkyLight(
-                name=like.name,
-                center=np.array([0.0, 0.0, NEXT_TO]),
-                half_u=np.array([1.0, 0.0, 0.0]),
-                half_v=np.array([0.0, 1.0, 0.0]),
-                direction=np.array([0.0, 0.0, -1.0]),
-                radiance=radiance,
-                affects_diffuse=like.affects_diffuse,
-                affects_specular=like.affects_specular,
-                receivers=like.receivers,
-            )
-        )
+        self.is_constant = np.ptp(values) <= 1e-6 * values.max()
+        right, up, away = np.eye(3)
+        shape = {"center": NEXT_TO * away, "half_u": right, "half_v": up, "direction": -away}
+        super().__init__(replace(sides[0], **shape, radiance=radiance, children=()))
         self.selected_as = tuple(sides)
 
     def directions(self, x: np.ndarray, y: np.ndarray, normal: np.ndarray) -> np.ndarray:
         """Unit vectors (3, S, Q) for numbers (S, Q) in [0, 1). Half of them follow the brightness of the sky; those
-        below the horizon of `normal` (3, Q) are mirrored. The other half follow the cosine."""
+        below the horizon of `normal` (3, Q) are mirrored. The other half follow the cosine, as all do where the sky is
+        constant."""
+        if self.is_constant:
+            return _by_cosine(x, y, normal)
         by_picture = x < np.float32(0.5)
         x = np.where(by_picture, np.float32(2.0) * x, np.float32(2.0) * x - _ONE)
-        return np.where(by_picture, self._by_picture(x, y, normal), _by_cosine(x, y, normal))
+        directions, flat = _by_cosine(x, y, normal), np.flatnonzero(by_picture)
+        chosen = self._by_picture(x.ravel()[flat], y.ravel()[flat], np.take(normal, flat % normal.shape[1], axis=1))
+        directions.reshape(3, -1)[:, flat] = chosen
+        return directions
 
     def _by_picture(self, x, y, normal):
-        cell = np.minimum(np.searchsorted(self.ends, x.ravel()).reshape(x.shape), len(self.ends) - 1)
+        """Unit vectors (3, R) for numbers and normals of their own (R,), (3, R)."""
+        cell = np.minimum(np.searchsorted(self.ends, x), len(self.ends) - 1)
         share = (x - (self.ends[cell] - self.pmf[cell])) / np.maximum(self.pmf[cell], np.float32(1e-30))
         slot, cell_of_side = np.divmod(cell, CELLS * CELLS)
         row, column = np.divmod(cell_of_side, CELLS)
         step = np.float32(2.0 / CELLS)
         s = (column.astype(np.float32) + np.clip(share, _ZERO, _ONE)) * step - _ONE
         t = (row.astype(np.float32) + y) * step - _ONE
-        directions = np.stack([self.ahead[slot, k] + s * self.right[slot, k] + t * self.up[slot, k] for k in range(3)])
+        directions = np.empty((3, len(x)), np.float32)
+        for component, sign, size in zip(self.component, self.sign, (_ONE, s, t), strict=True):
+            directions[component[slot], np.arange(len(x))] = sign[slot] * size
         directions /= np.sqrt(dot(directions, directions))
-        below = np.minimum(dot(directions, normal[:, None]), _ZERO)
+        below = np.minimum(dot(directions, normal), _ZERO)
         below *= np.float32(-2.0)
-        directions += below * normal[:, None]
+        directions += below * normal
         return directions
 
-    def density(self, directions: np.ndarray, normal: np.ndarray) -> np.ndarray:
-        """Probability density (S, Q) per sr of unit directions (3, S, Q) above the horizon of `normal`."""
+    def along(self, directions: np.ndarray, normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Probability density (S, Q) per sr of unit directions (3, S, Q), 0 below the horizon of `normal`, and the
+        radiance as factors (S, Q) of its mean, or 1."""
         height = dot(directions, normal[:, None])
+        if self.is_constant:
+            return np.maximum(height, _ZERO) * np.float32(1.0 / np.pi), _ONE
         mirrored = directions - np.float32(2.0) * height * normal[:, None]
-        density = self._plain_density(directions) + self._plain_density(mirrored)
+        (density, cell), (other, _) = self._by_cells(directions), self._by_cells(mirrored)
+        density += other
         density += np.maximum(height, _ZERO) * np.float32(1.0 / np.pi)
-        density *= np.float32(0.5)
-        return density
+        density *= np.float32(0.5) * (height > _ZERO)
+        return density, self.values[cell]
 
-    def _plain_density(self, directions):
-        cell, along = self._cells(directions)
-        return self.pmf[cell] * np.float32(CELLS * CELLS / 4.0) / (along * along * along)
-
-    def brightness_along(self, directions: np.ndarray) -> np.ndarray:
-        """Radiance as factors (S, Q) of its mean, along unit directions (3, S, Q)."""
-        return self.values[self._cells(directions)[0]]
-
-    def _cells(self, directions):
-        """Numbers (S, Q) of the cells that unit directions (3, S, Q) meet, and the largest components of these."""
+    def _by_cells(self, directions):
+        """Density (S, Q) of unit directions (3, S, Q) by the picture alone, and the numbers (S, Q) of their cells."""
         sizes = np.abs(directions)
-        axis = np.argmax(sizes, axis=0)
-        along = np.take_along_axis(sizes, axis[None], axis=0)[0]
-        slot = 2 * axis + (np.take_along_axis(directions, axis[None], axis=0)[0] < 0.0)
-        column, row = (
-            np.clip(
-                (sum(axes[slot, k] * directions[k] for k in range(3)) / along + _ONE) * np.float32(CELLS / 2.0),
-                0,
-                CELLS - 1,
-            ).astype(np.intp)
-            for axes in (self.right, self.up)
-        )
-        return (slot * CELLS + row) * CELLS + column, along
+        along = np.maximum(np.maximum(sizes[0], sizes[1]), sizes[2])
+        slot = np.where(sizes[0] == along, 0, np.where(sizes[1] == along, 2, 4)).ravel()
+        # Component k of the ray n is at the place k R + n.
+        flat, ray = directions.ravel(), np.arange(along.size)
+        slot += flat[(slot >> 1) * along.size + ray] < _ZERO
+        cell = slot.reshape(along.shape)
+        for component, sign in zip(self.component[:0:-1] * along.size, self.sign[:0:-1], strict=True):
+            coordinate = (sign[slot] * flat[component[slot] + ray]).reshape(along.shape) / along
+            coordinate += _ONE
+            coordinate *= np.float32(CELLS / 2.0)
+            cell = cell * CELLS + np.clip(coordinate, 0, CELLS - 1, out=coordinate).astype(np.intp)
+        return self.pmf[cell] * np.float32(CELLS * CELLS / 4.0) / (along * along * along), cell
 
 
 def _by_cosine(x, y, normal):

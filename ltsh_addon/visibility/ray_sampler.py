@@ -201,12 +201,13 @@ class RaySampler:
             chosen = (radius * np.cos(angle), radius * np.sin(angle), np.sqrt(_ONE - x))
             local[:, light_count:] = chosen
             length = self._unwarped(directions, local, light_count)
-        density = np.float32(light_count / shape[0]) * self.emitter.density(directions, normal)
+        density, brightness = self.emitter.along(directions, normal)
+        density *= np.float32(light_count / shape[0])
         if bsdf_count:
             cosine = np.maximum(self.warps.zz * local[2] / length, _ZERO)
             scale = np.float32(bsdf_count / shape[0] / np.pi) * self.warps.determinant
             density += _after_warp(scale * cosine, length)
-        factor = self.emitter.brightness_along(directions) / np.maximum(density, _TINY)
+        factor = brightness / np.maximum(density, _TINY)
         distance = np.full(shape, _FARTHEST, np.float32)
         return directions, distance, self._weights(directions, local, factor)
 

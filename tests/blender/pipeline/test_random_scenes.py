@@ -1,5 +1,6 @@
 """Random scenes beside Cycles: the technique `reference` is right in every block, or a warning says why not."""
 
+import re
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,6 +19,19 @@ PIXELS = 192
 # An error counts beyond 4 standard errors of a block, which 1 of 16,000 exceeds by chance, and this share of the
 # picture's mean, which leaves room for the rays of both sides and for single precision.
 STANDARD_ERRORS, SHARE = 4.0, 0.005
+# Pixels along the side of the windows that noise is averaged over.
+WINDOW = 5
+# The warnings after which a scene need not agree, as Cycles itself is wrong there, and the words of scenes that may get
+# them. No other warning excuses a scene: what is cut or moved to the origin is so in the render of Cycles as well.
+EXCUSES = {
+    "its transform is sheared, which Cycles itself does not sample correctly": r"area[^,]*\(sheared\)",
+    "Cycles is black there, here both are lit": "^snapped",
+    "shadows: area lights in the plane of a face": "^snapped.* area ",
+}
+# What is wrong without a warning.
+OVERLAP = "faces of unequal meshes overlap in one plane: Cycles is black there, and no warning says so"
+SHEARED_SPOT = "a spot whose transform is sheared is 1 % too dark, and no warning says so"
+WRONG = {7: OVERLAP, 20: SHEARED_SPOT, 113: OVERLAP}
 
 
 @dataclass
@@ -29,6 +43,15 @@ class Finding:
     bias: dict[str, float] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
 
+    @property
+    def is_excused(self) -> bool:
+        """True if a warning says why the scene may differ from Cycles, and the scene has what it is about."""
+        return any(
+            cause in warning and re.search(words, self.words)
+            for cause, words in EXCUSES.items()
+            for warning in self.warnings
+        )
+
     def __str__(self):
         figures = [f"{name} {self.excess[name]:+.4f} bias {self.bias[name]:+.4f}" for name in self.excess]
         return f"{'; '.join(figures)}; {self.words}; warnings: {self.warnings}"
@@ -38,6 +61,18 @@ def block_sums(image):
     """The sums (B,) of blocks of an image (H, W)."""
     height, width = (side // BLOCK for side in image.shape)
     return image.reshape(height, BLOCK, width, BLOCK).sum(axis=(1, 3)).ravel()
+
+
+def noise_variance(first, second):
+    """The variance (H, W) of the mean of two halves of the samples.
+
+    The halves of one pixel may agree by chance, and in a block of few pixels nothing makes up for that. So each pixel
+    has at least the mean variance of the noisy pixels around it.
+    """
+    squared, reach = 0.25 * (first - second) ** 2, WINDOW // 2
+    windows = np.lib.stride_tricks.sliding_window_view(np.pad(squared, reach), (WINDOW, WINDOW))
+    around = windows.sum(axis=(2, 3)) / np.maximum((windows > 0.0).sum(axis=(2, 3)), 1)
+    return np.maximum(squared, around)
 
 
 def examine(seed, folder, techniques=(REFERENCE, "ltsh4c"), cycles_samples=192) -> Finding:
@@ -64,8 +99,8 @@ def examine(seed, folder, techniques=(REFERENCE, "ltsh4c"), cycles_samples=192) 
         if not (mask & (mean != 0.0)).any():
             finding.excess[name] = finding.bias[name] = float(image[mask].any())
             continue
-        # Noise of pixels is independent, so that the differences of a block's pixels give its standard error.
-        deviation = 0.5 * np.sqrt(block_sums(np.where(mask, first - second, 0.0) ** 2))
+        # Noise of pixels is independent.
+        deviation = np.sqrt(block_sums(np.where(mask, noise_variance(first, second), 0.0)))
         error = np.abs(block_sums(np.where(mask, image - mean, 0.0))) - STANDARD_ERRORS * deviation
         error /= np.maximum(block_sums(mask.astype(float)), 1.0)
         finding.excess[name] = float(error.max() / mean[mask].mean())
@@ -73,11 +108,17 @@ def examine(seed, folder, techniques=(REFERENCE, "ltsh4c"), cycles_samples=192) 
     return finding
 
 
+def _param(seed):
+    marks = [pytest.mark.soak] if seed >= QUICK else []
+    if seed in WRONG:
+        xfail = pytest.mark.xfail(raises=AssertionError, reason=WRONG[seed])
+        marks.append(xfail)
+    return pytest.param(seed, marks=marks)
+
+
 @pytest.mark.newest
-@pytest.mark.parametrize(
-    "seed", [*range(QUICK), *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(QUICK, SEEDS))]
-)
+@pytest.mark.parametrize("seed", [*map(_param, range(SEEDS))])
 def test_reference_agrees_with_cycles_in_every_block_of_a_random_scene(seed, tmp_path):
     finding = examine(seed, tmp_path)
     print(f"seed {seed}: {finding}")
-    assert finding.excess[REFERENCE] < SHARE or finding.warnings, f"seed {seed}: {finding}"
+    assert finding.excess[REFERENCE] < SHARE or finding.is_excused, f"seed {seed}: {finding}"

@@ -30,8 +30,10 @@ EXCUSES = {
 }
 # What is wrong without a warning.
 OVERLAP = "faces of unequal meshes overlap in one plane: Cycles is black there, and no warning says so"
-SHEARED_SPOT = "a spot whose transform is sheared is 1 % too dark, and no warning says so"
-WRONG = {7: OVERLAP, 20: SHEARED_SPOT, 113: OVERLAP}
+SHEARED_SPOT = (
+    "`cone_angle` is too small for a spot whose transform is sheared: dark at the rim, and no warning says so"
+)
+WRONG = {7: OVERLAP, 20: SHEARED_SPOT, 87: OVERLAP, 113: OVERLAP}
 
 
 @dataclass

@@ -63,8 +63,8 @@ PICTURES = {
         black_floor,
         0,
         (
-            "warning: material 'Nothing': it has no surface shader",
             "warning: nothing that camera 'Camera' sees reflects",
+            "warning: material 'Nothing': it has no surface shader",
         ),
     ),
 }

@@ -125,10 +125,13 @@ def cone_factor(light, directions: np.ndarray) -> np.ndarray:
 
 
 def cone_angle(cone) -> float:
-    """Half the opening angle in rad of a cone, along its wider axis."""
+    """Half the opening angle in rad of a cone, along its wider axis; an upper bound if its axes are not orthogonal."""
     angle = np.arccos(np.clip(cone.cosine, -1.0, 1.0))
-    sizes = np.sqrt((cone.axes**2).sum(axis=1))
-    return float(np.arctan2(np.sin(angle) * sizes[2], np.cos(angle) * min(sizes[:2])))
+    edge, axis = np.split(np.linalg.inv(cone.axes), [2], axis=1)
+    along = axis.T @ edge / np.linalg.norm(axis)
+    wide = np.linalg.norm(edge - axis / np.linalg.norm(axis) @ along, 2) * np.sin(angle)
+    least = np.linalg.norm(axis) * np.cos(angle) - np.linalg.norm(along) * np.sin(angle)
+    return float(np.arctan2(wide, least)) if least > -1e-9 * wide else np.pi
 
 
 def may_reach(light, offset: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ import quadrature
 from surface_scenes import area_light, random_samples, unit
 
 from ltsh_addon import shading
+from ltsh_addon.emitters.facing import cone_angle
 from ltsh_addon.scene import Pattern, SpotCone, light_of
 
 
@@ -197,3 +198,15 @@ def test_patterns_are_read_by_direction_and_survive_json(by_ray):
 
     expected = oracle(samples, KINDS["ball"], weighted)
     assert np.allclose(found, expected, rtol=5e-3, atol=2e-3 * expected.max())
+
+
+def test_no_light_of_a_sheared_cone_is_outside_of_its_angle():
+    random = np.random.default_rng(0)
+    turns = np.linspace(0.0, 2.0 * np.pi, 500)
+    for half_angle in np.linspace(0.02, 1.57, 50):
+        axes = np.eye(3) + random.uniform(-0.5, 0.5, (3, 3))
+        rim = np.stack([np.cos(turns), np.sin(turns), np.full(500, 1.0 / np.tan(half_angle))])
+        rim, axis = np.linalg.solve(axes, rim), np.linalg.solve(axes, [0.0, 0.0, 1.0])
+        cosine = axis @ rim / np.linalg.norm(axis) / np.linalg.norm(rim, axis=0)
+        # Rounding alone.
+        assert cone_angle(SpotCone(axes, np.cos(half_angle), 1.0)) >= np.arccos(cosine.min()) - 1e-9

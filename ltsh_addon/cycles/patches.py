@@ -21,7 +21,7 @@ ERROR = 0.02
 # Most cells along each side; so there are at most 64 x 64 patches.
 GRID = 64
 # Cuts that lead from a patch to its parts.
-CUTS = 2
+CUTS = 4
 # Corners of the polygon that stands for an ellipse cut into patches. It has the area of the ellipse and is within 2e-3
 # of the radius from it.
 ROUND_CORNERS = 64

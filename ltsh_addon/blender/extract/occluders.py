@@ -537,10 +537,9 @@ def _overlapped(meshes: list[OccluderMesh]) -> float:
     place = np.where(place.sum(axis=1, keepdims=True) > 1.0, 1.0 - place, place)
     points = corners[own, 0] + (place[:, :, None] * sides[own]).sum(axis=1)
     overlapped = 0.0
-    for number in np.unique(group[own]):
-        here, members = np.flatnonzero(group[own] == number), np.flatnonzero(group == number)
-        if len(members) == 1:
-            continue
+    of_point = group[own]
+    for shared in np.unique(of_point[count[of_point] > 1]):
+        here, members = np.flatnonzero(of_point == shared), np.flatnonzero(group == shared)
         tried = here[:: -(-len(here) * len(members) // MOST_TESTS)]
         axes = np.argsort(np.abs(normal[members[0]]))[:2]
         (a, b), (c, d) = (sides[members][:, k, axes].T for k in (0, 1))

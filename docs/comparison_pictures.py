@@ -12,7 +12,6 @@ from pathlib import Path
 
 import matplotlib
 import matplotlib.pyplot as plt
-import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
@@ -24,7 +23,7 @@ from ltsh_addon.imaging.sheet import common_error_scale  # noqa: E402
 matplotlib.use("Agg")
 DEMO, OBJECT = ROOT / "out" / "demo", "floor"
 TECHNIQUES = {"ltc": "LTC", "ltsh2": "LTSH N=2", "ltsh4": "LTSH N=4", "ltsh4c": "LTSH N=4c"}
-DPI, WIDTH = 100, 3.6  # dots per inch; inches of a picture
+WIDTH = 3.6  # inches of a picture
 
 
 def bake(output: Path, size: int, cycles_samples: int) -> dict:
@@ -43,21 +42,18 @@ def draw(title: str, layers: dict, light: str, path: Path) -> None:
     errors = [layers[f"error_{name}.{light}"] for name in labels]
     exposure, scale = imaging.exposure_factor(pictures["Cycles"]), common_error_scale(errors, pictures["Cycles"])
     height, width = pictures["Cycles"].shape[:2]
-    size = WIDTH * len(pictures), 2.0 * WIDTH * height / width + 0.8
-    figure, axes = plt.subplots(2, len(pictures), figsize=size, layout="constrained", squeeze=False)
-    for axis, (label, image) in zip(axes[0], pictures.items(), strict=True):
+    size = WIDTH * len(pictures), 2.0 * WIDTH * height / width + 0.6
+    figure, (above, below) = plt.subplots(2, len(pictures), figsize=size, constrained_layout=True)
+    for axis, (label, image) in zip(above, pictures.items(), strict=True):
         axis.imshow(imaging.to_srgb8(exposure * image))
-        axis.set_title(label)
-    for axis, error in zip(axes[1, 1:], errors, strict=True):
+        axis.set_title(f"{title}: Cycles" if label == "Cycles" else label)
+    below[0].imshow(color_bar(200, 12))
+    below[0].set_title(f"\u2212{scale:g} to +{scale:g}: technique \u2212 Cycles, radiance", fontsize=10)
+    for axis, error in zip(below[1:], errors, strict=True):
         axis.imshow(imaging.signed_error_colors(error, scale))
-    for axis in axes.ravel():
-        axis.set_axis_off()
-    bar = axes[1, 0].inset_axes((0.0, 0.85, 1.0, 0.1))
-    bar.imshow(color_bar(256, 16), extent=(-scale, scale, 0.0, 1.0), aspect="auto")
-    bar.set_yticks([])
-    bar.set_xlabel(f"technique \u2212 Cycles, in radiance\nexposure {np.log2(exposure):+.1f} EV")
-    figure.suptitle(title, fontweight="bold")
-    figure.savefig(path, dpi=DPI)
+    for axis in (*above, *below):
+        axis.axis("off")
+    figure.savefig(path)
 
 
 def main() -> None:
@@ -70,7 +66,7 @@ def main() -> None:
     wanted = options.pictures or ("demo", "bake")
     if "demo" in wanted:
         layers = imaging.read_layers(DEMO / "compare.exr")
-        draw("demo: all direct light beside Cycles", layers, "combined", ROOT / "docs" / "demo.png")
+        draw("All direct light", layers, "combined", ROOT / "docs" / "demo.png")
     if "bake" in wanted:
         layers = bake(ROOT / "out" / "bake_picture", options.size, options.cycles_samples)
         draw("A floor, baked", layers, "specular", ROOT / "docs" / "bake.png")

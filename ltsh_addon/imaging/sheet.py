@@ -57,8 +57,10 @@ def comparison_sheet(reference: np.ndarray, techniques: Sequence[Tile]) -> tuple
 
 
 def _framed(picture: np.ndarray) -> np.ndarray:
-    half = _GUTTER // 2
-    return np.pad(picture, ((half, half), (half, half), (0, 0)), constant_values=_PAPER)
+    height, width, _ = picture.shape
+    framed = np.full((height + _GUTTER, width + _GUTTER, 3), _PAPER, np.uint8)
+    framed[_GUTTER // 2 :, _GUTTER // 2 :][:height, :width] = picture
+    return framed
 
 
 def _known(image: np.ndarray, missing: np.ndarray | None) -> np.ndarray:

@@ -61,7 +61,7 @@ def test_cancelling_keeps_what_is_finished_and_marks_it(never_ends, stop):
     assert operators.running_job() is None and ended(job)
     result = results.result_of(never_ends)
     assert result.partial == job_module.NO_CYCLES
-    assert image_pixels("LTSH ltsh4.combined").max() > 0.0
+    assert image_pixels("LTSH ltsh4c.combined").max() > 0.0
     # The choice is there again when Cycles is.
     assert never_ends.ltsh.second == "cycles"
 

@@ -80,7 +80,7 @@ def test_shading_and_baking_show_what_the_command_line_writes(scene, tmp_path, r
 
 
 def baked(scene, tmp_path):
-    """A bake of the floor as the job leaves it: specular and diffuse of LTSH 4; their sum (H, W, 3)."""
+    """A bake of the floor as the job leaves it: specular and diffuse of LTSH 4c; their sum (H, W, 3)."""
     output = tmp_path / "ltsh" / "bake"
     output.mkdir(parents=True)
     pictures = np.random.default_rng(5).random((2, 6, 10, 3), np.float32)

@@ -282,10 +282,10 @@ def test_lights_and_materials_are_listed_with_what_is_not_exact(scene):
 def test_numbers_are_those_of_the_report(scene, tmp_path, add_results):
     add_results()
     shown = drawn(RESULTS)
-    for number in ("L2 %", "12.34", "-1.51", "0.0321", "Noise of Cycles 2.00 %", "LTSH 4 10.00 %"):
+    for number in ("L2 %", "12.34", "-1.51", "0.0321", "Noise of Cycles 2.00 %", "LTSH 4c 10.00 %"):
         assert number in texts(shown).replace("\u00a0", " "), number
     narrow = texts(drawn(RESULTS, width=220)).replace("\u00a0", " ")
-    assert "LTSH 4: L2 12.34 %, bias -1.51 %, FLIP 0.0321" in narrow
+    assert "LTSH 4c: L2 12.34 %, bias -1.51 %, FLIP 0.0321" in narrow
     assert "Not complete" not in narrow
     assert buttons(shown)["ltsh.save_exr"] and "ltsh_warnings" in [item.what for item in shown if item.kind == "panel"]
     # While the job runs that adds Cycles; pictures that a cancelled job left are what they are.

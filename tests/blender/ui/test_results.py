@@ -112,7 +112,7 @@ def test_the_probe_reads_every_picture_at_the_pixel(scene, pictures):
     result, choice = result_and_choice(scene)
     for point, place in (((0.0, 0.0), (0, 0)), ((1.0, 1.0), (WIDTH - 1, HEIGHT - 1)), ((0.55, 0.2), (5, 1))):
         pixel, rows = comparison.values_at(scene, result, choice, point)
-        assert pixel == place and [label for label, _ in rows] == ["LTC", "LTSH 4", "Cycles"]
+        assert pixel == place and [label for label, _ in rows] == ["LTC", "LTSH 4c", "Cycles"]
         for name, (_, values) in zip(PICTURES, rows, strict=True):
             expected = pictures[f"{name}.combined"][HEIGHT - 1 - place[1], place[0]]
             np.testing.assert_array_equal(np.float32(values), expected)

@@ -112,7 +112,6 @@ class RelightData:
             times=ExtractionTimes(facts["seconds"]),
             warnings=tuple(facts["warnings"]),
             problems=tuple(facts["problems"]),
-            origin=np.array(facts["origin"]),
             light_settings=facts["light_settings"],
         )
         shadows = document["shadows"]
@@ -147,7 +146,6 @@ def write_relight_data(extraction, shadows: Shadows | None, options, path: Path,
             "film": {"width": film.width, "height": film.height, "sub_samples": film.sub_samples},
             "warnings": extraction.warnings,
             "problems": extraction.problems,
-            "origin": np.asarray(extraction.origin).tolist(),
         },
         "shadows": None if shadows is None else {**shadows.report(), "numbers": shadows.numbers},
         "options": {"scene": str(options.scene), **{name: getattr(options, name) for name in RELIGHT_OPTIONS}},

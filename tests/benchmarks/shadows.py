@@ -22,9 +22,10 @@ from pathlib import Path
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
+sys.path[:0] = [str(ROOT), str(Path(__file__).parent), str(ROOT / "tests" / "helpers")]
 
 import measure  # noqa: E402
+from surface_scenes import shifted  # noqa: E402
 
 from ltsh_addon import imaging, shading, visibility  # noqa: E402
 from ltsh_addon.blender.process.blender_process import embree_libraries  # noqa: E402
@@ -219,8 +220,8 @@ class Measured:
         occluders = extraction.occluders
         matrices = occluders.matrices.copy()
         matrices[:, :, 3] += shift
-        lights = [light.moved(shift) for light in extraction.lights]
-        tracer = lighting.ShadowTracer(replace(occluders, matrices=matrices), lights, extraction.origin)
+        lights = [shifted(light, shift) for light in extraction.lights]
+        tracer = lighting.ShadowTracer(replace(occluders, matrices=matrices), lights)
         return tracer, replace(extraction.samples, position=extraction.samples.position + shift)
 
     @cached_property
@@ -402,7 +403,6 @@ def ray_counts(scene: Measured):
         with tracer:
             grown = time.process_time()
             timed = TimedTracer(tracer._tracer)
-            samples = replace(samples, position=samples.position - scene.extraction.origin)
             sampling = visibility.ShadowSampling(rays=rays, film=scene.extraction.film)
             found = visibility.trace_visibility(samples, tracer._lights, timed, sampling, workers=1)
             end = time.process_time()

@@ -490,7 +490,7 @@ def test_highlights_thinner_than_pixels_are_told_from_those_that_points_show(tmp
         job = PixelJob(path, sub_samples=2, for_finished=True, shadows="on")
         found = extract_pixels(job)
         own = PictureOptions(path, output=tmp_path, sub_samples=2, shadows="on")
-        with ShadowTracer(found.occluders, found.lights, found.origin) as tracer:
+        with ShadowTracer(found.occluders, found.lights) as tracer:
             shader = render.DirectLightShader(own, 9.0, load_tables(("ltsh4c",)), tracer)
             thin[name] = shader.probe(with_points(found, 2), 1.0).contrast
     assert thin["smooth"] < 0.5 * plan.THIN_CONTRAST and thin["crumpled"] > 1.5 * plan.THIN_CONTRAST

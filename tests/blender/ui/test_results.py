@@ -1,6 +1,7 @@
 """Results as images: wipe, difference, probe, numbers, multi-layer files, presets, the manual."""
 
 import json
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -251,8 +252,9 @@ def test_presets_of_ours_set_everything_they_name(scene):
     for path in files:
         assert bpy.ops.script.execute_preset(filepath=str(path), menu_idname="LTSH_PT_presets") == {"FINISHED"}
         seen_values.add(tuple(str(getattr(scene.ltsh, name)) for name in settings_module.KEPT))
-        named = [line.split("=")[0].strip() for line in path.read_text().splitlines() if line.startswith("settings.")]
-        assert set(named) <= {f"settings.{name}" for name in settings_module.KEPT}
+        named = re.findall(r'^settings\.(?:property_unset\("(\w+)"\)|(\w+) = )', path.read_text(), re.MULTILINE)
+        assert len(named) == path.read_text().count("settings.")
+        assert {first or second for first, second in named} <= set(settings_module.KEPT)
     assert len(seen_values) == 3
 
 

@@ -2,7 +2,7 @@ import bpy
 
 settings = bpy.context.scene.ltsh
 
-settings.techniques = settings.bl_rna.properties["techniques"].default_flag
+settings.property_unset("techniques")
 settings.resolution_percentage = 50
 settings.anti_aliasing = 1
 settings.cycles_samples = 64

@@ -18,7 +18,18 @@ import numpy as np
 from .. import imaging
 from ..files import replacing
 from ..imaging.exr import COMBINED, REST, layer_name, parse_layer_name
-from ..scene import REFERENCE, Film, Light, Progress, SurfaceSamples, error_line, light_records, lights_of, listed
+from ..scene import (
+    DEFAULT_TECHNIQUE,
+    REFERENCE,
+    Film,
+    Light,
+    Progress,
+    SurfaceSamples,
+    error_line,
+    light_records,
+    lights_of,
+    listed,
+)
 from .comparison import Comparison
 from .lighting import Shadows, evaluated, light_groups, prepare, shade_lights
 from .options import PictureOptions
@@ -66,7 +77,7 @@ class RelightData:
     def technique(self) -> str:
         """The last technique of the picture except the reference: by convention the most accurate."""
         names = [name for name in self.options["techniques"] if name != REFERENCE]
-        return names[-1] if names else "ltsh4"
+        return names[-1] if names else DEFAULT_TECHNIQUE
 
     def shown(self, name: str, *, moved: bool = False) -> np.ndarray | float:
         """Factor (H, W, 1) of the image of a pass of the samples; without `edges` for `moved` lights."""

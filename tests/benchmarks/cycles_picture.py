@@ -1,6 +1,6 @@
 """What Cycles alone makes of a .blend, in a process of its own; needs bpy.
 
-python tests/benchmarks/cycles_picture.py FILE.blend OUT.exr WIDTH HEIGHT SAMPLES [passes]
+python tests/benchmarks/cycles_picture.py FILE.blend OUT.exr WIDTH HEIGHT SAMPLES SEED [passes]
 
 Denoised by Blender with its default settings; with `passes` not denoised, with direct light and the denoiser's guides.
 """
@@ -13,13 +13,14 @@ import bpy
 PASSES = ("combined", "diffuse_direct", "diffuse_color", "glossy_direct", "glossy_color")
 
 
-def main(path: str, out: str, width: str, height: str, samples: str, passes: str = "") -> None:
+def main(path: str, out: str, width: str, height: str, samples: str, seed: str, passes: str = "") -> None:
     bpy.ops.wm.open_mainfile(filepath=path)
     scene, layer = bpy.context.scene, bpy.context.view_layer
     render, cycles = scene.render, scene.cycles
     render.resolution_x, render.resolution_y, render.resolution_percentage = int(width), int(height), 100
     render.threads_mode, render.threads = "FIXED", len(os.sched_getaffinity(0))
     cycles.samples, cycles.use_adaptive_sampling, cycles.use_denoising = int(samples), False, not passes
+    cycles.seed = int(seed)
     if passes:
         layer.cycles.denoising_store_passes = True
         for name in PASSES:

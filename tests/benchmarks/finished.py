@@ -107,13 +107,13 @@ class Scene:
             run(Path(__file__).with_name("finished_scenes.py"), self.name, self.cache, seed)
         return path
 
-    def cycles(self, seed: int, samples: int, *passes: str) -> tuple[dict, float]:
-        """Channels of Cycles alone, and its processor seconds."""
-        blend = self.blend(seed)
+    def cycles(self, seed: int, samples: int, *passes: str, blend: Path | None = None) -> tuple[dict, float]:
+        """Channels of Cycles alone, of this scene or of a file, and its processor seconds."""
+        blend = blend or self.blend(0)
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "cycles.exr"
             script = Path(__file__).with_name("cycles_picture.py")
-            seconds = run(script, blend, path, *self.size, samples, *passes)
+            seconds = run(script, blend, path, *self.size, samples, seed, *passes)
             return read_channels(path), seconds
 
     def find_truth(self) -> None:
@@ -218,13 +218,13 @@ def main(arguments=()) -> None:
         f"{'scene':<19}{'budget':>6}  {'points + samples':<16}{'processor':>9}"
         + "".join(f"{one:>12}" for one in FIGURES)
     )
-    tables = {}
+    tables, budgets = {}, options.budgets
     for name in names:
         scene = Scene(name, options.cache, size, options.true_samples)
         scene.find_truth()
-        for budget in options.budgets:
+        for budget in budgets:
             tables[name, budget] = compare(scene, budget, options.seeds, options.options.split())
-    for budget in options.budgets:
+    for budget in budgets:
         middle = np.median([table for (_, one), table in tables.items() if one == budget], axis=0)
         words = zip(("ratio", "room", "goal"), middle, strict=True)
         print(

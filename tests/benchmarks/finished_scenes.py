@@ -1,4 +1,4 @@
-"""Twelve scenes of unlike kinds for finished pictures, as users of Blender build them; needs bpy.
+"""Twelve scenes of unlike kinds for finished pictures, as users of Blender build them, and a plain one; needs bpy.
 
 python tests/benchmarks/finished_scenes.py NAME FOLDER SEED ...    writes FOLDER/NAME_SEED.blend
 """
@@ -159,7 +159,7 @@ def cloth():
     shader(velvet).inputs["Sheen Tint"].default_value = (0.9, 0.35, 0.45, 1.0)
     grid("Velvet", np.stack([0.85 * u - 0.5, 0.75 * v, fall + ripple + wrinkle], axis=-1), velvet)
     wool = material("Wool", (0.62, 0.55, 0.42), 0.9, Sheen_Weight=0.4)
-    knit = texture(wool.node_tree, "Wave", 18.0, bands_direction="DIAGONAL", Distortion=2.0, Detail=3.0)
+    knit = texture(wool.node_tree, "Wave", 18.0, **{"bands_direction": "DIAGONAL", "Distortion": 2.0})
     bump(drive(wool, "Base Color", knit, (0.42, 0.34, 0.24), (0.66, 0.6, 0.48)), knit, 0.9, 0.02)
     for number, (a, b, r) in enumerate(((0.62, -0.35, 0.2), (0.98, -0.2, 0.17), (0.78, -0.58, 0.13))):
         ball(f"Ball {number}", wool, (a, b, r + 0.02), r, (0.5 * number, 0.3, 0))
@@ -433,7 +433,7 @@ def workshop():
 def food():
     """A breakfast by a window: bread, cheese, tomatoes, an orange, a fried egg and milk, all of which light enters."""
     cloth_ = material("Linen", (0.6, 0.6, 0.58), 0.9, Sheen_Weight=0.3)
-    weave = texture(cloth_.node_tree, "Wave", 22.0, Distortion=1.5)
+    weave = texture(cloth_.node_tree, "Wave", 22.0, **{"Distortion": 1.5})
     bump(cloth_, weave, 0.25, 0.005)
     panel("Table", (-1.5, -1.2, 0), (3, 0, 0), (0, 2.4, 0), cloth_)
     panel("Wall", (-3, 1.2, -1), (6, 0, 0), (0, 0, 3), worn("Wall", (0.35, 0.42, 0.45), 0.8, 2.0, 0.1, 0.1))
@@ -451,7 +451,7 @@ def food():
     for number, (x, y, r) in enumerate(tomatoes):
         z = 0.012 + 0.85 * r if x < 0.3 else 0.85 * r
         ball(f"Tomato {number}", tomato, (x, y, z), (r, r, 0.85 * r), (0.2, 0.15 * number, 0))
-        put("cone", "Stalk", stalk, (x, y, z + 0.9 * r), radius1=0.3 * r, depth=0.2 * r, vertices=5)
+        rod("Stalk", stalk, (x, y, z + 0.9 * r), (0.3 * r, 0.1 * r), vertices=5)
     cheese = soft("Cheese", (0.85, 0.6, 0.18), 0.35, (0.6, 0.4, 0.15), 0.04, depth=0.1)
     corner = [(0, 0), (0.22, -0.06), (0.22, 0.08)]
     wedge = [(x, y, z) for z in (0.0, 0.1) for x, y in corner]
@@ -487,7 +487,7 @@ def hall():
     """A hall of columns with a marble floor under 300 lights: panels, spots at the columns, lamps on the walls."""
     random = np.random.default_rng(3)
     marble = worn("Marble", (0.5, 0.47, 0.42), 0.15, 1.5, 0.06)
-    vein = texture(marble.node_tree, "Noise", 1.2, Detail=8.0, Distortion=2.5)
+    vein = texture(marble.node_tree, "Noise", 1.2, **{"Detail": 8.0, "Distortion": 2.5})
     drive(marble, "Base Color", vein, (0.2, 0.18, 0.17), (0.6, 0.56, 0.5), (0.4, 0.6))
     stone, gold = worn("Stone", (0.5, 0.45, 0.38), 0.6, 4.0, 0.15, 0.1), brushed("Gold", (0.9, 0.65, 0.3), 0.25)
     panel("Floor", (-8, -2, 0), (16, 0, 0), (0, 32, 0), marble)
@@ -526,7 +526,18 @@ def arcade():
     bpy.ops.wm.open_mainfile(filepath=str(DEMO))
 
 
-SCENES = (product, bathroom, cloth, window, street, arcade, car, foliage, glow, workshop, food, hall)
+def studio():
+    """Balls of many roughnesses on a plane under four softboxes; nothing of it is hard. `animation.py` looks at it."""
+    panel("Floor", (-7, -7, 0), (14, 0, 0), (0, 14, 0), material("Floor", (0.4, 0.4, 0.42), 0.35))
+    for number in range(5):
+        surface = material("Ball", (0.8, 0.3 + 0.1 * number, 0.2), 0.15 + 0.12 * number, Metallic=number % 2)
+        ball(f"Ball {number}", surface, (-2.4 + 1.2 * number, 0.2 * number, 0.55), 0.55)
+    for number, place in enumerate(((-4, -3, 3.5), (4, -2, 3), (0, 4, 4), (-1, -4, 5))):
+        softbox(f"Box {number}", 150, (1.6, 1.0), place, (0.0, 0.0, 0.4))
+    camera((0.0, -6.0, 2.0), (0.0, 0.0, 0.8), 35)
+
+
+SCENES = (product, bathroom, cloth, window, street, arcade, car, foliage, glow, workshop, food, hall, studio)
 
 
 def main(name: str, folder: str, *seeds: str) -> None:

@@ -112,7 +112,7 @@ def worn(name, color, roughness, scale=8.0, spread=0.12, depth=0.0, **inputs):
 def wood(name, dark=(0.2, 0.09, 0.035), light=(0.42, 0.23, 0.11), scale=3.0, stretch=(1, 8, 1)):
     """Lacquered wood with grain in its color and its bumps."""
     surface = worn(name, light, 0.35, 6.0)
-    grain = texture(surface.node_tree, "Wave", scale, stretch, Distortion=4.0, Detail=2.0)
+    grain = texture(surface.node_tree, "Wave", scale, stretch, **{"Distortion": 4.0, "Detail": 2.0})
     return bump(drive(surface, "Base Color", grain, dark, light), grain, 0.12)
 
 
@@ -124,15 +124,15 @@ def brushed(name, color=(0.8, 0.78, 0.75), roughness=0.3, **inputs):
 def tiles(name, color, grout, scale, roughness=0.15, width=0.5, height=0.25):
     """Glazed tiles in rough joints."""
     surface = material(name, color, roughness)
-    brick = texture(surface.node_tree, "Brick", scale, coordinates="UV", Mortar_Size=0.012, offset=0.5,
-                    Brick_Width=width, Row_Height=height)  # fmt: skip
+    bricks = {"Mortar_Size": 0.012, "Brick_Width": width, "Row_Height": height}
+    brick = texture(surface.node_tree, "Brick", scale, coordinates="UV", **bricks)
     drive(surface, "Roughness", brick, roughness, 0.8)
     return bump(drive(surface, "Base Color", brick, color, grout), brick, -0.3)
 
 
 def glass(name, roughness=0.0, color=(1, 1, 1)):
     """Clear glass."""
-    return material(name, color, roughness, Transmission_Weight=1.0, IOR=1.45)
+    return material(name, color, roughness, **{"Transmission_Weight": 1.0, "IOR": 1.45})
 
 
 # Meshes:
@@ -189,7 +189,7 @@ def put(kind, name, surface, location, rotation=(0, 0, 0), scale=(1, 1, 1), beve
     ob.name, ob.scale = name, scale
     ob.data.materials.append(surface)
     if bevel:
-        ob.data.transform(mathutils.Matrix.Diagonal((*scale, 1.0)))
+        ob.data.transform(mathutils.Matrix(np.diag((*scale, 1.0))))
         ob.scale = (1, 1, 1)
         rounded = ob.modifiers.new("Bevel", "BEVEL")
         rounded.width, rounded.segments, rounded.limit_method = bevel, 3, "ANGLE"
@@ -203,7 +203,7 @@ def ball(name, surface, location, radius, rotation=(0, 0, 0)):
     """A sphere, or a spheroid with three radii."""
     scale = radius if isinstance(radius, tuple) else (radius,) * 3
     ob = put("uv_sphere", name, surface, location, rotation, radius=1, segments=48, ring_count=24)
-    ob.data.transform(mathutils.Matrix.Diagonal((*scale, 1.0)))
+    ob.data.transform(mathutils.Matrix(np.diag((*scale, 1.0))))
 
 
 def rod(name, surface, location, size, rotation=(0, 0, 0), bevel=0.0, vertices=32):

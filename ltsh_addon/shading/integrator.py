@@ -19,7 +19,7 @@ from ..emitters.light_tree import FEWEST, is_special
 from ..lobes import moments32
 from ..lobes.lobe_integrals import FLOAT64_CHUNK
 from ..lobes.lookup_table import LookupTable, load_table
-from ..scene import PASSES, REFERENCE, Cancelled, Light, SurfaceSamples
+from ..scene import DEFAULT_TECHNIQUE, PASSES, REFERENCE, Cancelled, Light, SurfaceSamples
 from ..workers.pool import WorkerPool
 from . import float32, float64
 
@@ -258,7 +258,7 @@ def is_own(technique: Any) -> bool:
 def shade(
     samples: SurfaceSamples,
     lights: Iterable[Light],
-    technique: str | Path | LookupTable | OwnTechnique = "ltsh4",
+    technique: str | Path | LookupTable | OwnTechnique = DEFAULT_TECHNIQUE,
     *,
     passes: Sequence[str] = PASSES,
     workers: int | None = None,

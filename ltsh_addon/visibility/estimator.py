@@ -398,7 +398,8 @@ class LightSelection:
             specular, diffuse = self._lobes[:, sample]
             # A bake of one pass chooses by the lobes of that pass alone.
             if self._is_baked:
-                whole = np.maximum(self._sum_of_hit(name, hit[here]), 1e-12)
+                sums = np.bincount(self._hit, weights=self._lobes[int(name == "diffuse")])
+                whole = np.maximum(sums[hit[here]], 1e-12)
                 specular, diffuse = (
                     specular / whole if name == "specular" else 0.0 * specular,
                     diffuse / whole if name == "diffuse" else 0.0 * diffuse,
@@ -407,9 +408,6 @@ class LightSelection:
             cosine = np.einsum("rk,rk->r", directions[here], self._samples.diffuse_normal[sample])
             density[here] += diffuse * np.maximum(cosine, 0.0) / np.pi
         return density
-
-    def _sum_of_hit(self, name, hit):
-        return np.bincount(self._hit, weights=self._lobes[int(name == "diffuse")])[hit]
 
     def _lobe_density(self, index, directions):
         samples = self._samples

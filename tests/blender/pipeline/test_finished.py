@@ -611,12 +611,12 @@ def test_few_points_leave_to_cycles_what_its_samples_tell_better():
 @pytest.mark.newest
 def test_borders_of_colors_are_as_smooth_as_in_cycles(tmp_path):
     """A white ball before a checkered floor, by one point a pixel: only the color within pixels is unknown."""
+    scene = floor_and_ball(bsdf("BsdfDiffuse"), 1)
     checks = bsdf("BsdfDiffuse")()
     tree = checks.node_tree
     checker = tree.nodes.new("ShaderNodeTexChecker")
     checker.inputs["Scale"].default_value = 23.0
     tree.links.new(checker.outputs["Color"], tree.nodes["Diffuse BSDF"].inputs["Color"])
-    scene = floor_and_ball(bsdf("BsdfDiffuse"), 1)
     scene.objects["Plane"].data.materials[0] = checks
     path = parts.save(tmp_path / "scene.blend")
     scene.cycles.seed = 1

@@ -314,7 +314,8 @@ def relight_fields(passes: dict[str, DirectPass], rest: Rest) -> dict[str, dict[
     """`rest`, `taken` and `edges` of the RelightData. Cycles' light of an edge becomes a factor of LTSH's, so that it
     changes with the lights as LTSH's does."""
     taken = {
-        name: np.where(one.is_replaced, one.clean_share, 0.0)[..., None] * one.recoloring for name, one in passes.items()
+        name: np.where(one.is_replaced, one.clean_share, 0.0)[..., None] * one.recoloring
+        for name, one in passes.items()
     }
     diffuse, groups = passes["diffuse"], rest.groups
     if np.ndim(diffuse.weight) == 0:

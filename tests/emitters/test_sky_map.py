@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 from surface_scenes import random_samples, single_sample
 
-from ltsh_addon.cycles.environment import CUBE, SkyPicture, bright_spots, fine_detail, sky_lights, spot_frame, without_spots
+from ltsh_addon.cycles.environment import (
+    CUBE,
+    SkyPicture,
+    bright_spots,
+    fine_detail,
+    sky_lights,
+    spot_frame,
+    without_spots,
+)
 from ltsh_addon.scene import SkyLight
 from ltsh_addon.shading import shade
 

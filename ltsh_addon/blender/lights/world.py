@@ -10,7 +10,16 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
-from ...cycles.environment import CUBE, SkyPicture, bright_spots, fine_detail, sky_lights, spot_frame, spot_light, without_spots
+from ...cycles.environment import (
+    CUBE,
+    SkyPicture,
+    bright_spots,
+    fine_detail,
+    sky_lights,
+    spot_frame,
+    spot_light,
+    without_spots,
+)
 from ...scene import Light, SkyLight, listed
 from ..materials.graph import is_group, is_socket, source_of, surface_of, tree_in_use, value_of
 from .emission import CONSTANT_NODES, LIGHT_PATH, OF_CAMERA, open_studio, trees_of
@@ -97,7 +106,7 @@ def light_of_world(world) -> Light | None:
 
 
 def world_lights(scene, world, warn) -> tuple[list[Light], float]:
-    """The light of the `world` of `scene` as distant lights that have its name, [] if it is dark; and its `fine_detail`."""
+    """The light of the `world` of `scene` as distant lights that have its name, [] if it is dark; its `fine_detail`."""
     like = light_of_world(world)
     if like is None:
         return [], 0.0

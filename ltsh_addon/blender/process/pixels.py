@@ -370,7 +370,9 @@ def faceted(samples: SurfaceSamples, lights: tuple[Light, ...], sky_detail: floa
 
 def shows_patches(samples: SurfaceSamples, lights: tuple[Light, ...], sky_detail: float) -> np.ndarray:
     """Mask (P,) of the samples whose reflections are so sharp that they show the patches of a world with detail."""
-    if sky_detail <= SMOOTH_SKY or not any(light.is_distant and light.children and light.affects_specular for light in lights):
+    if sky_detail <= SMOOTH_SKY or not any(
+        light.is_distant and light.children and light.affects_specular for light in lights
+    ):
         return np.zeros(len(samples), bool)
     return has_lobe(samples)[1] & (samples.roughness < SHARP_REFLECTION)
 

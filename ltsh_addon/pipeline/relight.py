@@ -68,7 +68,7 @@ class RelightData:
     had_cycles: bool
     # By light group: its bounced light (H, W, 3). By "": what depends on no light group (H, W, 3 or 4 with alpha).
     rest: dict[str, np.ndarray] = field(default_factory=dict)
-    # By pass (H, W, 3): the share of the pass that is LTSH's and not Cycles', recolored; left out: 1. (H, W) in old files.
+    # By pass (H, W, 3), in old files (H, W): the share that is LTSH's and not Cycles', recolored; left out: 1.
     taken: dict[str, np.ndarray] = field(default_factory=dict)
     # By pass (H, W): a factor of hard edges of light, valid only while the lights stay where they were; left out: 1.
     edges: dict[str, np.ndarray] = field(default_factory=dict)

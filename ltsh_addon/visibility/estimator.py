@@ -21,6 +21,7 @@ from ..lobes.polygon import dot
 from ..scene import FARTHEST, PASSES, Film, FlatLight, Light, PolygonLight, SurfaceSamples, round_outline
 from .emitter import Emitter, Sky
 from .light_cluster import LightCluster
+from .occluders import GAP
 from .ray_sampler import PROBES, RayBatch, RaySampler, SampleRows
 
 MOST_RAYS = 1024
@@ -59,7 +60,7 @@ TILE = np.float32(16.0)
 ACROSS, BEND = [AROUND.index(step) for step in ((0, 2), (2, 0))], np.float32(0.75 / 4.0)
 # Rays end at this share of their distance to the light, just before it; but to an area light with a face as near as
 # that, GAP of the coordinates before its plane: a step of single precision.
-END, GAP = np.float32(1.0 - 1e-4), float(np.finfo(np.float32).eps)
+END = np.float32(1.0 - 1e-4)
 # Points along each side of a light from which near faces are looked for.
 LOOKED_AT = 8
 _ZERO, _ONE, _TINY = np.float32(0.0), np.float32(1.0), np.float32(1e-30)
@@ -541,7 +542,8 @@ class LightSelection:
             specular, diffuse = self._lobes[:, sample]
             # A bake of one pass chooses by the lobes of that pass alone.
             if self._is_baked:
-                whole = np.maximum(self._sum_of_hit(name, hit[here]), 1e-12)
+                sums = np.bincount(self._hit, weights=self._lobes[int(name == "diffuse")])
+                whole = np.maximum(sums[hit[here]], 1e-12)
                 specular, diffuse = (
                     specular / whole if name == "specular" else 0.0 * specular,
                     diffuse / whole if name == "diffuse" else 0.0 * diffuse,
@@ -550,9 +552,6 @@ class LightSelection:
             cosine = np.einsum("rk,rk->r", directions[here], self._samples.diffuse_normal[sample])
             density[here] += diffuse * np.maximum(cosine, 0.0) / np.pi
         return density
-
-    def _sum_of_hit(self, name, hit):
-        return np.bincount(self._hit, weights=self._lobes[int(name == "diffuse")])[hit]
 
     def _lobe_density(self, index, directions):
         samples = self._samples

@@ -276,19 +276,16 @@ class RaySampler:
         """The leaves (S, Q) that rays go to, by lobe their probabilities, and the numbers x (S, Q) rescaled for reuse.
         x chooses the leaves: the first `light_count` rays by the diffuse lobe if there is one, the others by the
         specular lobe."""
-        columns = np.tile(np.arange(len(self.index)), len(x))
-        lobes, lobe_of_ray = [], np.zeros(x.shape, np.intp)
+        lobes, lobe_of_row = [], np.zeros(len(x), np.intp)
         if "diffuse" in self.lobes:
-            lobes.append(LobeBound(self.offset[:, columns], self.horizons[0][:, columns]))
+            lobes.append(LobeBound(self.offset, self.horizons[0]))
         if "specular" in self.lobes:
             normal = self.warps.rows[2]
             mirrored = np.float32(2.0) * self.cosine * normal - self.view
             width = np.maximum(LOBE_WIDTH * self.alpha * np.maximum(self.cosine, LEAST_COSINE), np.float32(1e-4))
-            rows = (self.geometric_normal[:, columns], mirrored[:, columns], width[columns].astype(np.float32))
-            lobes.append(LobeBound(self.offset[:, columns], *rows))
-            lobe_of_ray[light_count:] = len(lobes) - 1
-        leaf, pmf, rest = self.emitter.pick(x.ravel(), lobes, lobe_of_ray.ravel())
-        return leaf.reshape(x.shape), pmf.reshape(len(lobes), *x.shape), rest.reshape(x.shape)
+            lobes.append(LobeBound(self.offset, self.geometric_normal, mirrored, width.astype(np.float32)))
+            lobe_of_row[light_count:] = len(lobes) - 1
+        return self.emitter.pick(x, lobes, lobe_of_row)
 
     def corner_heights(self, horizons):
         """As `RatioEstimator._corner_heights`, for the corners of the leaves that the probes go to.

@@ -256,10 +256,10 @@ def _arrange(window, area, attempt: int | None) -> float | None:
     return None
 
 
-def redraw_editors(kind: str) -> None:
-    """Draw all areas of a kind again: Blender does not redraw 3D views for properties of add-ons."""
+def redraw_editors(*kinds: str) -> None:
+    """Draw all areas of these kinds again: Blender does not redraw 3D views for properties of add-ons."""
     for area in _areas():
-        if area.type == kind:
+        if area.type in kinds:
             area.tag_redraw()
 
 

@@ -14,7 +14,7 @@ STRICT ?=
 .NOTPARALLEL:
 
 help:
-	@echo 'make demo    shade the example scene, compare it with Cycles: out/demo/compare.png, report.json'
+	@echo 'make demo    shade the example scene, compare it with Cycles: out/demo/report.html, report.json'
 	@echo 'make test    ruff, then pytest on Blender 5.2 (Python 3.13) and on Blender 4.5 (Python 3.11)'
 	@echo 'make test-fast  the tests that need no Blender, on one Python'
 	@echo 'make test-blender BLENDER=path  the tests of tests/blender inside that Blender'

@@ -404,10 +404,11 @@ def rounded_positions(position: np.ndarray, lights) -> list[str]:
     """The warning about positions (P, 3) so far from the origin that single precision rounds them noticeably."""
     lights = [light for light in lights if not light.is_distant]
     some = position[:: max(1, len(position) // FEW_SAMPLES, len(position) * len(lights) // MOST_PAIRS)]
+    some = some[np.isfinite(some).all(axis=1)]  # an object may be nowhere
     if len(some) == 0 or not lights:
         return []
     apart = np.spacing(np.abs(some).max(axis=1).astype(np.float32)).astype(np.float64)
-    nearest = np.empty(len(some))
+    nearest, numbers = np.empty(len(some)), np.empty(len(some), int)
     center, half_u, half_v, direction = (
         np.array([getattr(light, name) for light in lights]) for name in ("center", "half_u", "half_v", "direction")
     )
@@ -419,13 +420,17 @@ def rounded_positions(position: np.ndarray, lights) -> list[str]:
         height = np.where(facing, distance, np.abs((offset * direction).sum(axis=1)))
         # A shining surface does not light itself.
         is_own = (distance < 0.0) & (height < 2.0 * apart[row]) & ~facing
-        nearest[row] = np.where(is_own, np.inf, np.maximum(distance, height)).min()
+        distance = np.where(is_own, np.inf, np.maximum(distance, height))
+        numbers[row] = distance.argmin()
+        nearest[row] = distance[numbers[row]]
     share = apart / np.maximum(nearest, 1e-30)
-    if np.mean(share > ROUNDED) <= ROUNDED_SHARE:
+    is_rounded = share > ROUNDED
+    if np.mean(is_rounded) <= ROUNDED_SHARE:
         return []
+    name = lights[np.bincount(numbers[is_rounded]).argmax()].name
     return [
         f"positions are up to {np.abs(some).max():.3g} m from the origin, where they are rounded to "
         f"{1000.0 * apart.max():.2g} mm, in Cycles too: for half of the samples that is over "
-        f"{100.0 * min(np.median(share), 1.0):.3g} % of the distance from the nearest light, and their light is about "
-        "as uncertain, more in sharp reflections; move the scene to the origin"
+        f"{100.0 * min(np.median(share), 1.0):.3g} % of the distance from the nearest light, mostly {name!r}, and "
+        "their light is about as uncertain, more in sharp reflections; move the scene to the origin"
     ]

@@ -28,9 +28,8 @@ ROUND_LIMITS = (8.0, 40.0, 300.0)
 # Corners for a round light with a spread: for efforts with few chords and with many.
 FOCUSED_ROUND_CORNERS = (32, 64)
 # ROUNDING: how far rounding moves points off their plane, in units of their coordinates. A flat surface that shines
-# must not light itself because of this. FARTHEST_ROUNDED: greatest sum of coordinates in m; points of larger scenes
-# were rounded relative to an origin nearby (see `blender.extract.origin`).
-ROUNDING, FARTHEST_ROUNDED = 4e-7, 4000.0
+# must not light itself because of this.
+ROUNDING = 4e-7
 # Greatest product of a patch's contrast (see `_largest_sizes`) and the square of its size in units of that length.
 # Measured on random surfaces at a light's size from it, with the contrasts of a photograph: the patches of a sample
 # agree with the smallest ones to 0.2 % (relative L2). With 0.006, a sample takes 150 patches of 1024 on average.
@@ -170,7 +169,7 @@ def in_front(samples, light, candidates):
 def off_plane(center, extent) -> np.ndarray:
     """Distance (Q,) in m in front of a light from which on points surely see it. The light's center is (3,) or (3, Q);
     `extent` (Q,) is the sum of the absolute coordinates of the points."""
-    return ROUNDING * np.minimum(np.abs(center).sum(axis=0) + extent, FARTHEST_ROUNDED)
+    return ROUNDING * (np.abs(center).sum(axis=0) + extent)
 
 
 def may_reach(light, position) -> np.ndarray:

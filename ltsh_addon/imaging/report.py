@@ -9,7 +9,7 @@ import os
 import posixpath
 import re
 import urllib.parse
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 from ..files import write_bytes
@@ -19,9 +19,10 @@ from ..scene import listed, shortened
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 78rem; padding: 0 1rem; color: #222; }
 h1 { font-size: 1.5rem; margin-bottom: 0.2rem; } h2 { font-size: 1.1rem; margin-top: 2rem; }
-img { max-width: 100%; border: 1px solid #ddd; } p.facts { color: #666; margin-top: 0; }
+img { width: 100%; border: 1px solid #ddd; image-rendering: pixelated; } p.facts { color: #666; margin-top: 0; }
 table { border-collapse: collapse; }
 td, th { padding: 0.25rem 0.8rem; text-align: right; border-bottom: 1px solid #ddd; }
+p.labels { display: flex; margin: 0; } p.labels span { flex: 1; text-align: center; font-weight: 600; }
 td:first-child, th:first-child { text-align: left; } li { margin: 0.2rem 0; }
 """
 _COLUMNS = (
@@ -100,12 +101,15 @@ def on_screen(warnings: Iterable[str], rest: str = "report.json") -> list[str]:
     return [*shown, f"{more} more kinds of warnings are in {rest}"] if more > 0 else shown
 
 
-def write_html(folder: str | os.PathLike, page: str, sheet: str, layers: str, report: Mapping) -> None:
+def write_html(folder: str | os.PathLike, page: str, files: Sequence[str], texts: tuple, report: Mapping) -> None:
     """Write the page `page` of a comparison's `report`, atomically.
 
-    It links the `sheet` (PNG) and the `layers` (EXR). All three are paths below `folder`, which has report.json.
+    It links the `files`, the layers (EXR) and the sheet (PNG). All are paths below `folder`, which has report.json.
+    `texts` are the labels of the sheet's columns and the lines about its rows.
     """
-    sheet, layers, figures = (_link(page, name) for name in (sheet, layers, "report.json"))
+    layers, sheet, figures = (_link(page, name) for name in (*files, "report.json"))
+    labels = "".join(f"<span>{_text(label)}</span>" for label in texts[0])
+    legend = "".join(f"<li>{_text(line)}</li>" for line in texts[1])
     width, height = report["resolution"]
     facts = ", ".join(
         (
@@ -122,7 +126,10 @@ def write_html(folder: str | os.PathLike, page: str, sheet: str, layers: str, re
         f"<h1>{_text(report['scene'])}</h1>",
         f'<p class="facts">{_text(facts)}</p>',
         *(f"<p><strong>{_text(problem)}</strong></p>" for problem in report.get("problems", ())),
-        f'<p><a href="{sheet}"><img src="{sheet}" alt="Cycles and the techniques, with signed errors"></a></p>',
+        f'<p class="labels">{labels}</p>',
+        f'<a href="{sheet}"><img src="{sheet}" alt="Cycles and the techniques, with signed errors"></a>',
+        "<p>Below each row of pictures their errors, technique − Cycles: red is too bright, blue too dark. From the "
+        f"top:</p><ol>{legend}</ol>",
         *(_pass_table(name, figures) for name, figures in report["passes"].items()),
         _warnings(report["warnings"]),
         f'<p>All layers: <a href="{layers}">{layers}</a>. All figures: <a href="{figures}">report.json</a>.</p>',

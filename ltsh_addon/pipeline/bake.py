@@ -95,7 +95,7 @@ def _shadow_tracer(options, manifest, folder):
     if manifest["occluders"] is None:
         return nullcontext()
     occluders = Occluders.load(folder / manifest["occluders"])
-    return lighting.ShadowTracer(occluders, lights_of(manifest["lights"]), np.array(manifest["origin"]))
+    return lighting.ShadowTracer(occluders, lights_of(manifest["lights"]))
 
 
 def _check(options: BakeOptions) -> None:

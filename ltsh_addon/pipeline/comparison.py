@@ -189,14 +189,15 @@ class Comparison:
         if notice := self._subset_notice():
             more["reference"] = f"{notice}; elsewhere zero"
         metadata = exr.metadata_of(extraction, self.options.scene, **more)
-        planes, sheet = self.layers(), self.sheet() if with_cycles else None
+        planes, (sheet, legend) = self.layers(), self.sheet() if with_cycles else (None, [])
         chromaticities = imaging.chromaticities(extraction.picture.color_space)
         files = [f"{name}.exr", *([f"{name}.png", self.options.page] if with_cycles else [])]
         (output / files[0]).parent.mkdir(parents=True, exist_ok=True)
         imaging.write_layers(output / files[0], planes, metadata, chromaticities, extraction.picture.pixel_aspect)
         if with_cycles:
             imaging.write_png(output / files[1], sheet)
-            imaging.write_html(output, self.options.page, files[1], files[0], document)
+            labels = ["Cycles", *map(title, self.results)]
+            imaging.write_html(output, self.options.page, files[:2], (labels, legend), document)
         if progress is not None:
             progress("write", 1.0)
         return files
@@ -270,17 +271,19 @@ class Comparison:
                 planes[layer_name("visibility", pass_name, name)] = image
         return planes
 
-    def sheet(self) -> np.ndarray:
-        """The comparison sheet (H, W, 3), 8 bit: both passes together where both were shaded, then each pass."""
+    def sheet(self) -> tuple[np.ndarray, list[str]]:
+        """The comparison sheet (H, W, 3), 8 bit, and a line about each of its rows: both passes together where both
+        were shaded, then each pass."""
         wanted = [name for name in PASSES if name in self.options.passes]
         rows = [(name,) for name in wanted] if len(wanted) == 1 else [PASSES, *((name,) for name in wanted)]
-        return np.concatenate([self._sheet_of(passes) for passes in rows])
+        sheets, legend = zip(*map(self._sheet_of, rows), strict=True)
+        return np.concatenate(sheets), list(legend)
 
-    def _sheet_of(self, passes: tuple[str, ...]) -> np.ndarray:
-        """The sheet of the sum of `passes`."""
+    def _sheet_of(self, passes: tuple[str, ...]) -> tuple[np.ndarray, str]:
+        """The sheet of the sum of `passes`, and a line about it."""
         halves = sum(self.cycles[name] for name in passes)
         mean, rec709 = halves.mean(axis=0), self.extraction.picture.color_space.rec709
-        hit, tiles = self.film.coverage() > 0.0, []
+        hit, tiles, errors = self.film.coverage() > 0.0, [], []
         # The picture of all passes also shows the background and lights in sight. Its errors are those of the light.
         behind = 0.0 if self.rest is None or len(passes) == 1 else self.rest[..., :3]
         for name, result in self.results.items():
@@ -288,31 +291,18 @@ class Comparison:
             if result.subset is not None:
                 missing = hit & ~self._mask(result)
             error = rec709(sum(self._error(name, one) for one in passes))
-            tiles.append(imaging.Tile(title(name), rec709(image), error, self._caption(name, passes), missing))
-        notes = [
-            f"{self.film.width} x {self.film.height}, {self.options.cycles_samples} Cycles samples",
-            f"noise of the Cycles reference {percent(imaging.reference_noise(*halves, hit))}",
-        ]
-        if self.shadows is not None and len(passes) == 1:
-            notes.append(f"noise of our shadows {percent(self.shadows.noise[passes[0]])}")
-        if notice := self._subset_notice():
-            notes.append(f"{notice}; elsewhere gray")
+            tiles.append(imaging.Tile(title(name), rec709(image), error, missing))
+            image = sum(self.images[name, one] for one in passes)
+            beside = imaging.noisy_error_statistics(image, *halves, self._mask(result)).to_dict()
+            errors.append(f"{title(name)} {unbiased(beside)}")
+        sheet, scales = imaging.comparison_sheet(rec709(mean + behind), tiles)
         light = passes[0] if len(passes) == 1 else COMBINED
-        head = f"{Path(self.options.scene).stem}: {light} radiance beside Cycles"
-        return imaging.comparison_sheet(head, ("Cycles", rec709(mean + behind)), tiles, notes=notes)
-
-    def _caption(self, name: str, passes: tuple[str, ...]) -> list[str]:
-        """Caption lines: the errors of a technique in the sum of `passes`."""
-        result, halves = self.results[name], sum(self.cycles[one] for one in passes)
-        image = sum(self.images[name, one] for one in passes)
-        beside = imaging.noisy_error_statistics(image, *halves, self._mask(result)).to_dict()
-        lines, reference = [f"against Cycles {unbiased(beside)}"], self.results.get(REFERENCE)
-        if reference is not None and name != REFERENCE:
-            index = slice(None) if reference.subset is None else reference.subset
-            values = sum(self._radiance(result, one).sum(axis=0)[index] for one in passes)
-            truth = sum(self._radiance(reference, one).sum(axis=0) for one in passes)
-            lines.append(f"against reference {percent(imaging.error_statistics(values, truth).relative_l2)}")
-        return lines
+        line = f"{light} radiance: errors against Cycles {', '.join(errors)}; {scales}"
+        if self.shadows is not None and len(passes) == 1:
+            line += f"; noise of our shadows {percent(self.shadows.noise[passes[0]])}"
+        if notice := self._subset_notice():
+            line += f"; {notice}, elsewhere gray"
+        return sheet, line
 
 
 def most_accurate(names) -> str:

@@ -85,14 +85,10 @@ def rays_of_samples(rays: int, film: Film) -> int:
 
 
 class ShadowTracer:
-    """Context that finds the shares of `lights` that samples see past `occluders`.
+    """Context that finds the shares of `lights` that samples see past `occluders`."""
 
-    Positions of the occluders are relative to `origin` (3,) in m; lights and samples are in world space.
-    """
-
-    def __init__(self, occluders: visibility.Occluders, lights: Sequence[Light], origin: np.ndarray):
-        self._occluders, self._origin = occluders, origin
-        self._lights = [light.moved(-origin) for light in lights]
+    def __init__(self, occluders: visibility.Occluders, lights: Sequence[Light]):
+        self._occluders, self._lights = occluders, lights
 
     def __enter__(self):
         from ..blender.process.blender_process import embree_libraries
@@ -104,10 +100,8 @@ class ShadowTracer:
         self._tracer.close()
 
     def finer(self, samples: SurfaceSamples, film: Film, points, pixels: np.ndarray):
-        """`gbuffer.finer` with this tracer's rays, for samples in world space."""
-        samples = replace(samples, position=samples.position - self._origin)
-        samples, film, replaced = finer(samples, film, points, pixels, self._tracer.first_met)
-        return replace(samples, position=samples.position + self._origin), film, replaced
+        """`gbuffer.finer` with this tracer's rays."""
+        return finer(samples, film, points, pixels, self._tracer.first_met)
 
     def trace(
         self,
@@ -119,7 +113,6 @@ class ShadowTracer:
     ) -> Shadows:
         """The shadows of `samples` under all lights; see `visibility.trace_visibility` for the other arguments."""
         start = time.perf_counter()
-        samples = replace(samples, position=samples.position - self._origin)
         estimate = visibility.trace_visibility(
             samples, self._lights, self._tracer, sampling, workers=workers, progress=progress
         )
@@ -138,7 +131,7 @@ def trace_shadows(extraction, passes: Sequence[str], rays: int, progress: Progre
     """The shadows of the samples of an `Extraction`; the samples of a pixel share `rays` per light."""
     film = extraction.film
     sampling = visibility.ShadowSampling(passes, rays_of_samples(rays, film), film)
-    with ShadowTracer(extraction.occluders, extraction.lights, extraction.origin) as tracer:
+    with ShadowTracer(extraction.occluders, extraction.lights) as tracer:
         return tracer.trace(extraction.samples, sampling, progress=progress)
 
 

@@ -248,14 +248,13 @@ class MovedLights:
             raise Cancelled("the light has moved again, or the picture was stopped")
 
     def _prepared(self, light: Light, turn: int) -> MovedLightTask:
-        """The task for a light in world space."""
+        """The task for a light."""
         self._check(turn)
         if self._pool is None:
             self._start()
-        relight_data = self._relight_data
-        light = light.moved(-relight_data.extraction.origin)
         if self._tracer is None:
             return MovedLightTask(light, None, self._table, self._passes)
+        relight_data = self._relight_data
         rays = rays_of_samples(relight_data.options["shadow_rays"], relight_data.extraction.film)
         shadows = shadow_task(self._whole.shadowed, (light,), self._tracer, self._passes, rays)
         # The light gets as many rays as it would get in a new picture, beside the other lights.
@@ -299,9 +298,8 @@ class MovedLights:
         if self._relight_data is None:
             self._relight_data, self._occluders = self._read()
         relight_data, film = self._relight_data, self._relight_data.extraction.film
-        samples = relight_data.extraction.samples
-        samples = replace(samples, position=samples.position - relight_data.extraction.origin)
-        shadowed, shadow = samples, np.arange(len(samples))
+        samples = shadowed = relight_data.extraction.samples
+        shadow = np.arange(len(samples))
         # Rays use the film only to know which samples are neighbors.
         film = film.unspread()
         self._draft = draft = Draft.of(samples, film)
@@ -315,7 +313,7 @@ class MovedLights:
                 self._tracer = stack.enter_context(open_tracer(self._occluders, embree_libraries()))
             pool = stack.enter_context(WorkerPool(self._tracer))
             if self._tracer is not None:
-                lights = [light.moved(-relight_data.extraction.origin) for light in relight_data.extraction.lights]
+                lights = relight_data.extraction.lights
                 self._typical = shadow_task(shadowed, lights, self._tracer, self._passes, DRAFT_RAYS).typical
                 origins = trace_ray_origins(shadowed, pool)
             self._whole = LitSamples.of(samples, shadowed, film, shadow, origins)

@@ -18,7 +18,18 @@ import numpy as np
 from .. import imaging
 from ..files import replacing
 from ..imaging.exr import COMBINED, REST, layer_name, parse_layer_name
-from ..scene import REFERENCE, Film, Light, Progress, SurfaceSamples, error_line, light_records, lights_of, listed
+from ..scene import (
+    DEFAULT_TECHNIQUE,
+    REFERENCE,
+    Film,
+    Light,
+    Progress,
+    SurfaceSamples,
+    error_line,
+    light_records,
+    lights_of,
+    listed,
+)
 from .comparison import Comparison
 from .lighting import Shadows, evaluated, light_groups, prepare, shade_lights
 from .options import PictureOptions
@@ -66,7 +77,7 @@ class RelightData:
     def technique(self) -> str:
         """The last technique of the picture except the reference: by convention the most accurate."""
         names = [name for name in self.options["techniques"] if name != REFERENCE]
-        return names[-1] if names else "ltsh4"
+        return names[-1] if names else DEFAULT_TECHNIQUE
 
     def shown(self, name: str, *, moved: bool = False) -> np.ndarray | float:
         """Factor (H, W, 1) of the image of a pass of the samples; without `edges` for `moved` lights."""
@@ -101,7 +112,6 @@ class RelightData:
             times=ExtractionTimes(facts["seconds"]),
             warnings=tuple(facts["warnings"]),
             problems=tuple(facts["problems"]),
-            origin=np.array(facts["origin"]),
             light_settings=facts["light_settings"],
         )
         shadows = document["shadows"]
@@ -136,7 +146,6 @@ def write_relight_data(extraction, shadows: Shadows | None, options, path: Path,
             "film": {"width": film.width, "height": film.height, "sub_samples": film.sub_samples},
             "warnings": extraction.warnings,
             "problems": extraction.problems,
-            "origin": np.asarray(extraction.origin).tolist(),
         },
         "shadows": None if shadows is None else {**shadows.report(), "numbers": shadows.numbers},
         "options": {"scene": str(options.scene), **{name: getattr(options, name) for name in RELIGHT_OPTIONS}},

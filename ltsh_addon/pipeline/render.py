@@ -180,7 +180,7 @@ def shade_direct_light(
     clock.end("extraction", extraction.times.processor)
     if not extraction.lights or extraction.left_to_cycles.everything:
         return Comparison(picture, extraction, {}, None)
-    with ShadowTracer(extraction.occluders, extraction.lights, extraction.origin) as tracer:
+    with ShadowTracer(extraction.occluders, extraction.lights) as tracer:
         shader = DirectLightShader(picture, options.budget, tables, tracer)
         opening = extraction.times.processor - extraction.times.direct
         chosen = shader.planned(extraction, seconds_left(extraction), clock.seconds() - opening)

@@ -130,10 +130,6 @@ class Light:
         light.__dict__.update({name: self.__dict__[name] for name in _field_names(type(self))}, **changes)
         return light
 
-    def moved(self, offset: np.ndarray) -> Light:
-        """The same light moved by `offset` (3,) in m; distant lights stay as they are."""
-        return self.altered(center=self.center + offset) if np.any(offset) else self
-
     def viewpoint(self, position: np.ndarray) -> np.ndarray:
         """What to subtract from the light's vectors at `position` (..., 3): that position; zero for distant lights."""
         return position
@@ -223,11 +219,6 @@ class FlatLight(Light):
         if not 0.0 < self.spread <= np.pi + 1e-6:
             raise ValueError(f"light {self.name!r}: spread is {self.spread!r} rad, expected more than 0 and at most pi")
 
-    def moved(self, offset: np.ndarray) -> Light:
-        """As `Light.moved`, with its children."""
-        light = super().moved(offset)
-        return light.altered(children=tuple(child.moved(offset) for child in self.children)) if self.children else light
-
 
 @dataclass(frozen=True)
 class QuadLight(FlatLight):
@@ -263,10 +254,6 @@ class PolygonLight(FlatLight):
         object.__setattr__(self, "corners", corners)
         if self.has_spread:
             raise ValueError(f"light {self.name!r}: spread is {self.spread!r} rad, expected pi for shape {self.shape}")
-
-    def moved(self, offset: np.ndarray) -> Light:
-        """As `Light.moved`, with its corners."""
-        return super().moved(offset).altered(corners=self.corners + offset) if np.any(offset) else self
 
     @cached_property
     def area_vector(self) -> np.ndarray:
@@ -334,10 +321,6 @@ class DistantLight(Light):
     same for every point."""
 
     is_distant: ClassVar = True
-
-    def moved(self, offset: np.ndarray) -> Light:
-        """This light: it is as far from everywhere."""
-        return self
 
     def viewpoint(self, position: np.ndarray) -> np.ndarray:
         """As `Light.viewpoint`."""

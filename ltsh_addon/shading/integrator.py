@@ -18,7 +18,7 @@ from ..emitters.light_polygons import fitting_patches
 from ..lobes import moments32
 from ..lobes.lobe_integrals import FLOAT64_CHUNK
 from ..lobes.lookup_table import LookupTable, load_table
-from ..scene import PASSES, REFERENCE, Cancelled, Light, SurfaceSamples
+from ..scene import DEFAULT_TECHNIQUE, PASSES, REFERENCE, Cancelled, Light, SurfaceSamples
 from ..workers.pool import WorkerPool
 from . import float32, float64
 
@@ -245,7 +245,7 @@ def is_own(technique: Any) -> bool:
 def shade(
     samples: SurfaceSamples,
     lights: Iterable[Light],
-    technique: str | Path | LookupTable | OwnTechnique = "ltsh4",
+    technique: str | Path | LookupTable | OwnTechnique = DEFAULT_TECHNIQUE,
     *,
     passes: Sequence[str] = PASSES,
     workers: int | None = None,

@@ -20,6 +20,7 @@ from ..lobes.polygon import dot
 from ..scene import FARTHEST, PASSES, Film, FlatLight, Light, PolygonLight, SurfaceSamples, round_outline
 from .emitter import Emitter, Sky
 from .light_cluster import LightCluster
+from .occluders import GAP
 from .ray_sampler import PROBES, RayBatch, RaySampler, SampleRows
 
 MOST_RAYS = 1024
@@ -43,7 +44,7 @@ BRIGHTEST = 4
 ROUNDS = 4
 # Rays end at this share of their distance to the light, just before it; but to an area light with a face as near as
 # that, GAP of the coordinates before its plane: a step of single precision.
-END, GAP = np.float32(1.0 - 1e-4), float(np.finfo(np.float32).eps)
+END = np.float32(1.0 - 1e-4)
 # Points along each side of a light from which near faces are looked for.
 LOOKED_AT = 8
 _ZERO, _ONE, _TINY = np.float32(0.0), np.float32(1.0), np.float32(1e-30)

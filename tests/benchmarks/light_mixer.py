@@ -74,7 +74,8 @@ def main():
         print(f"change {kind}: {median:.1f} ms, at most {longest:.1f}")
     moved = MovedLights.load(kept_file)
     for number, text in enumerate(("the first time", "again", "again")):
-        light = kept.extraction.lights[0].moved(np.array([0.5, 0.2 * number, 0.0]))
+        light = kept.extraction.lights[0]
+        light = light.altered(center=light.center + (0.5, 0.2 * number, 0.0))
         print(f"a moved light, {text}: {shaded(moved, light)}")
     moved.close()
 

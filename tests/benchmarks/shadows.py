@@ -22,15 +22,15 @@ from pathlib import Path
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
+sys.path[:0] = [str(ROOT), str(Path(__file__).parent), str(ROOT / "tests" / "helpers")]
 
 import measure  # noqa: E402
+from surface_scenes import shifted  # noqa: E402
 
 from ltsh_addon import imaging, shading, visibility  # noqa: E402
 from ltsh_addon.blender.process.blender_process import embree_libraries  # noqa: E402
 from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels  # noqa: E402
 from ltsh_addon.cli.commands import DEMO_SCENE  # noqa: E402
-from ltsh_addon.imaging.sheet import draw_text  # noqa: E402
 from ltsh_addon.pipeline import lighting  # noqa: E402
 from ltsh_addon.pipeline.options import PictureOptions  # noqa: E402
 from ltsh_addon.scene import PASSES  # noqa: E402
@@ -219,8 +219,8 @@ class Measured:
         occluders = extraction.occluders
         matrices = occluders.matrices.copy()
         matrices[:, :, 3] += shift
-        lights = [light.moved(shift) for light in extraction.lights]
-        tracer = lighting.ShadowTracer(replace(occluders, matrices=matrices), lights, extraction.origin)
+        lights = [shifted(light, shift) for light in extraction.lights]
+        tracer = lighting.ShadowTracer(replace(occluders, matrices=matrices), lights)
         return tracer, replace(extraction.samples, position=extraction.samples.position + shift)
 
     @cached_property
@@ -402,7 +402,6 @@ def ray_counts(scene: Measured):
         with tracer:
             grown = time.process_time()
             timed = TimedTracer(tracer._tracer)
-            samples = replace(samples, position=samples.position - scene.extraction.origin)
             sampling = visibility.ShadowSampling(rays=rays, film=scene.extraction.film)
             found = visibility.trace_visibility(samples, tracer._lights, timed, sampling, workers=1)
             end = time.process_time()
@@ -448,21 +447,22 @@ def memory_and_cores(path, folder, settings):
 
 
 def error_sheet(name, scene, ours, folder):
-    """Write NAME_errors.png: signed errors of our picture with most rays, by pass."""
+    """Write NAME_errors.png: signed errors of our picture with most rays, the specular pass above the diffuse one."""
     sheets = []
     for part in PASSES:
         mean = scene.halves[part].mean(axis=0)
         tile = imaging.Tile(f"LTSH, {scene.settings.most_rays} rays", ours[part], np.where(
-            scene.mask[..., None], ours[part] - mean, 0.0), [])  # fmt: skip
-        sheets.append(imaging.comparison_sheet(f"{name}: {part}", ("Cycles", mean), [tile]))
+            scene.mask[..., None], ours[part] - mean, 0.0))  # fmt: skip
+        sheets.append(imaging.comparison_sheet(mean, [tile])[0])
     imaging.write_png(folder / f"{name}_errors.png", np.concatenate(sheets))
 
 
-_GAP, _LABEL = 6, 24
+_GAP = 6
 
 
 def side_by_side(rows, path):
     """Write pictures (H, W, 3), lists of {label: linear image}, one below the other, each with one exposure."""
+    print(f"  {path.name}, from the left: {', '.join(rows[0])}")
     columns = []
     for images in rows:
         exposure = imaging.exposure_factor(images["Cycles, converged"])
@@ -470,12 +470,8 @@ def side_by_side(rows, path):
         gap = np.full((len(tiles[0]), _GAP, 3), 255, np.uint8)
         columns.append(np.concatenate([part for tile in tiles for part in (tile, gap)][:-1], axis=1))
     width = columns[0].shape[1]
-    head = np.full((_LABEL, width, 3), 255, np.uint8)
-    step = rows[0]["LTSH"].shape[1] + _GAP
-    for number, label in enumerate(rows[0]):
-        draw_text(head, number * step, 4, label, 14.0)
     gap = np.full((_GAP, width, 3), 255, np.uint8)
-    picture = np.concatenate([head, *(part for row in columns for part in (row, gap))][:-1])
+    picture = np.concatenate([part for row in columns for part in (row, gap)][:-1])
     # Noise fills the file: two bits less of it are not seen.
     imaging.write_png(path, picture | 3)
 

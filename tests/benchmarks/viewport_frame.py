@@ -23,6 +23,7 @@ import bpy
 import gpu
 import numpy as np
 import random_surfaces
+from surface_scenes import shifted
 
 from ltsh_addon.blender.viewport.drawing import ViewCamera
 from ltsh_addon.blender.viewport.mirror import SceneMirror
@@ -107,7 +108,7 @@ def many_lights(frames, rounds):
     """Print what MANY lights of all KINDS cost beside four rectangles."""
     generator = np.random.default_rng(3)
     many = [random_surfaces.light(KINDS[number % len(KINDS)], number, generator) for number in range(MANY)]
-    lights = {"many": [light if light.is_distant else light.moved(np.array([0.0, 0.0, 2.0])) for light in many]}
+    lights = {"many": [shifted(light, (0.0, 0.0, 2.0)) for light in many]}
     lights["four"] = [QuadLight.like(light, spread=np.pi, children=()) for light in frames.mirror.lights[:4]]
     seconds = {}
     for name, own in lights.items():

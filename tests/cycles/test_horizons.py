@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from surface_scenes import shifted
 
 from ltsh_addon.cycles import horizons
 from ltsh_addon.cycles.environment import CUBE
@@ -234,7 +235,7 @@ def test_bounds_of_thousands_of_lights_are_those_of_a_few():
     generator = np.random.default_rng(5)
     samples, lights = samples_around(generator, 30), lights_around(generator, 1000)
     far = np.array([3e3, -2e3, 1e3])
-    position, lights = samples.position + far, tuple(light.moved(far) for light in lights)
+    position, lights = samples.position + far, tuple(shifted(light, far) for light in lights)
     rows = light_tree_rows(lights)
     found = light_bounds_at(position, samples.smooth_normal, lights, rows)
     few = [slice(start, start + 50) for start in range(0, 1000, 50)]

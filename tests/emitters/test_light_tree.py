@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from kills import all_ended
-from surface_scenes import area_light, random_samples, unit
+from surface_scenes import area_light, random_samples, shifted, unit
 
 from ltsh_addon import shading
 from ltsh_addon.emitters import light_tree, tiles
@@ -107,7 +107,7 @@ def test_light_is_interpolated_on_smooth_surfaces(monkeypatch):
 
 
 def lowered(lights, height):
-    return [light.moved(np.array([0.0, 0.0, -height])) for light in lights]
+    return [shifted(light, (0.0, 0.0, -height)) for light in lights]
 
 
 def test_uneven_surfaces_need_few_near_lights_whole(monkeypatch):

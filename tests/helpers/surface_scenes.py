@@ -89,6 +89,16 @@ def moved(samples, lights, rotation=None, shift=(0.0, 0.0, 0.0)):
     return SurfaceSamples(**fields), turned
 
 
+def shifted(light, offset):
+    """`light` moved by `offset` (3,) in m; distant lights stay as they are."""
+    if light.is_distant:
+        return light
+    changes = {"center": light.center + offset, "children": tuple(shifted(child, offset) for child in light.children)}
+    if light.corners is not None:
+        changes["corners"] = light.corners + offset
+    return light.altered(**changes)
+
+
 def random_rotation(seed):
     return np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
 

@@ -7,6 +7,7 @@ import fake_scene
 import numpy as np
 import pytest
 from fake_scene import run, wall
+from surface_scenes import shifted
 
 from ltsh_addon.imaging.exr import read_channels
 from ltsh_addon.pipeline import lighting, moved_lights, relight
@@ -219,7 +220,7 @@ def test_a_moved_light_is_as_in_a_new_picture(capsys, monkeypatch, room, out):
     before = shade(capsys, monkeypatch, room, out / "first", **occluders)
 
     def move(lights):
-        return lights[0].moved(np.array([0.3, -0.2, 0.1])), *lights[1:]
+        return shifted(lights[0], (0.3, -0.2, 0.1)), *lights[1:]
 
     shade(capsys, monkeypatch, room, out / "second", **occluders, change=move)
     kept, expected = kept_in(out / "first"), light_pictures(kept_in(out / "second"))
@@ -240,7 +241,7 @@ def test_processes_that_stay_shade_moved_lights_alike_also_when_one_is_gone(caps
     monkeypatch.setattr(moved_lights, "SAMPLES_WORTH_A_WORKER", 0)
     monkeypatch.setattr(pool, "cores", lambda: 3)
     light = kept_in(out).extraction.lights[0]
-    lights = [light.moved(np.array([0.1 * step, 0.0, 0.0])) for step in range(3)]
+    lights = [shifted(light, (0.1 * step, 0.0, 0.0)) for step in range(3)]
     expected = [alone.picture(one) for one in lights]
     together = MovedLights.load(out / "shade.samples.npz")
     try:

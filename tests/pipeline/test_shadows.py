@@ -7,7 +7,7 @@ import fake_scene
 import numpy as np
 import pytest
 from fake_scene import run, wall
-from surface_scenes import four_lights, random_samples
+from surface_scenes import four_lights, random_samples, shifted
 
 from ltsh_addon import shading, visibility
 from ltsh_addon.imaging.exr import read_channels
@@ -46,7 +46,7 @@ def test_samples_that_see_all_of_their_lights_get_the_same_bits(capsys, monkeypa
 def test_many_lights_without_shadows_are_shaded_all_at_once(count, is_one_call):
     """One by one `shade` could not take those together that a sample cannot tell apart."""
     samples, four = random_samples(40, seed=1), four_lights()
-    lights = [replace(four[n % 4].moved(np.array([0.2 * n, 0.0, 1.0])), group=f"{n % 2}") for n in range(2 * count)]
+    lights = [replace(shifted(four[n % 4], (0.2 * n, 0.0, 1.0)), group=f"{n % 2}") for n in range(2 * count)]
     (found,) = lighting.shade_lights(samples, lights, "ltsh4", ("diffuse",), workers=1)
     rows = [n % 2 for n in range(2 * count)]
     expected = shading.shade(samples, lights, "ltsh4", passes=("diffuse",), workers=1, rows=rows)

@@ -5,12 +5,13 @@ from __future__ import annotations
 import shutil
 import tempfile
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import bpy
 import numpy as np
 
+from ...cycles.gbuffer import rounded_positions
 from ...cycles.texels import NOT_BAKED, BakeView
 from ...cycles.uv import tiles_of
 from ...files import save_array
@@ -26,7 +27,6 @@ from ..process.bake import BakeFactsJob, BakeJob
 from ..render_settings import working_space
 from . import bake_meshes, pixels
 from .occluders import collect_occluders, with_baked_shares
-from .origin import box_center, move_to_origin
 from .pixels import OCCLUDERS, SEEDS, remove_occlusion
 
 # SAMPLED_TEXELS: width of the part of a texel over which Cycles' bake spreads its samples; the whole texel since 5.2.
@@ -171,7 +171,6 @@ class BakeScene:
     camera: str
     view: BakeView
     lights: list
-    origin: np.ndarray  # (3,) m, the place in the file of the occluders' origin
     warnings: list[str]
     names: list[str]
     meshes: dict[str, bake_meshes.MeshFiles]
@@ -237,12 +236,10 @@ def _open(job: BakeJob) -> BakeScene:
         override = view_layer.material_override.name
         warnings.append(f"material override {override!r} is switched off: objects are baked with their own")
         view_layer.material_override = None
-    origin = move_to_origin(scene, box_center(objects[0]), warnings)
-    seen_from = job.view if isinstance(job.view, str) else tuple(np.subtract(job.view, origin).tolist())
     folder = tempfile.TemporaryDirectory(prefix="ltsh-meshes-", ignore_cleanup_errors=True)
     has_shadows = job.shadows == "on"
     bake_meshes.apply_modifiers(scene, objects, job.uv)
-    files = Path(folder.name), origin, has_shadows
+    files = Path(folder.name), has_shadows
     inventory, meshes, problems, bare, lost = _inspect(scene, world, objects, job.uv, files)
     warnings += lost
     aovs.give_default_material(bare)
@@ -254,23 +251,30 @@ def _open(job: BakeJob) -> BakeScene:
             material.cycles.emission_sampling = "NONE"
     inventory.receivers.mark()
     pixels.add_world(inventory, scene, world)
-    lights = [light.moved(origin) for light in inventory.lights]
-    warnings.extend(inventory.warnings)
-    if not lights:
+    warnings += inventory.warnings + rounded_positions(_points_in_boxes(objects), inventory.lights)
+    if not inventory.lights:
         raise pixels.no_light(scene, inventory.warnings)
     render_settings.leave_out_objects(scene, inventory.left_out, warnings)
     if job.cycles_samples:
         scene.world = inventory.world
-    view = view_of(seen_from, camera, bent=job.cycles_samples > 0)
-    if view.kind == "point":
-        view = replace(view, vector=tuple(np.add(view.vector, origin).tolist()))
-    _look_from(scene, camera, seen_from)
+    view = view_of(job.view, camera, bent=job.cycles_samples > 0)
+    _look_from(scene, camera, job.view)
     if not has_shadows:
         remove_occlusion(scene)
     name, names = camera.name if job.view == "camera" else "", [ob.name for ob in objects]
     if has_shadows:
         inventory.occluders.save(Path(folder.name) / OCCLUDERS)
-    return BakeScene(scene, name, view, lights, origin, warnings, names, meshes, problems, lobes, folder)
+    return BakeScene(scene, name, view, inventory.lights, warnings, names, meshes, problems, lobes, folder)
+
+
+def _points_in_boxes(objects) -> np.ndarray:
+    """Points (N, 3) all over the boxes around the objects."""
+    steps, points = np.linspace(0.0, 1.0, 9), []
+    for ob in objects:
+        box, matrix = np.array(ob.bound_box), np.array(ob.matrix_world, dtype=np.float64)
+        axes = box.min(axis=0)[:, None] + np.ptp(box, axis=0)[:, None] * steps
+        points.append(np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3) @ matrix[:3, :3].T + matrix[:3, 3])
+    return np.concatenate(points)
 
 
 def _camera(scene, job):
@@ -293,7 +297,7 @@ def _look_from(scene, camera, wanted) -> None:
 
 def _inspect(scene, world, objects, uv_name, files):
     """The lights, meshes by object name, problems of the other objects by name, objects without material, warnings."""
-    folder, origin, with_occluders = files
+    folder, with_occluders = files
 
     def visit(depsgraph):
         meshes, problems = {}, {}
@@ -302,7 +306,7 @@ def _inspect(scene, world, objects, uv_name, files):
         for number, ob in enumerate(objects):
             try:
                 bake_meshes.check_object(ob)
-                mesh = bake_meshes.read_mesh(ob, depsgraph, uv_name, origin)
+                mesh = bake_meshes.read_mesh(ob, depsgraph, uv_name)
                 if ob.name_full not in rendered:
                     raise bake_meshes.ObjectError(
                         f"object {ob.name!r} is not rendered: its collection is excluded or hidden"
@@ -354,7 +358,6 @@ def extract_bake(job: BakeJob, folder: Path, progress) -> dict:
         "blender_version": bpy.app.version_string,
         "frame": opened.scene.frame_current,
         "lights": light_records(opened.lights),
-        "origin": opened.origin.tolist(),
         "occluders": OCCLUDERS if job.shadows == "on" else None,
         "color_space": working_space(),
         "warnings": opened.warnings,

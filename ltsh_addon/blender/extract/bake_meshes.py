@@ -89,19 +89,15 @@ def save_mesh(mesh: TexelMesh, uv_name: str, uv_maps: dict, folder: Path, number
     return MeshFiles(path, uv_name, tuple(uv_maps), maps)
 
 
-def read_mesh(
-    ob, depsgraph, uv_name: str | None, origin=(0.0, 0.0, 0.0)
-) -> tuple[TexelMesh, str, dict[str, np.ndarray]]:
+def read_mesh(ob, depsgraph, uv_name: str | None) -> tuple[TexelMesh, str, dict[str, np.ndarray]]:
     """The evaluated mesh of `ob`, the name of the UV map to bake, and all UV maps (T, 3, 2) by name.
 
-    "" names the UV map that renders. `origin` (3,) in m is added to the positions. Raises ObjectError.
+    "" names the UV map that renders. Raises ObjectError.
     """
     evaluated = ob.evaluated_get(depsgraph)
     mesh = evaluated.to_mesh(preserve_all_data_layers=True, depsgraph=depsgraph)
     try:
-        matrix = np.array(evaluated.matrix_world, dtype=np.float64)
-        matrix[:3, 3] += origin
-        return _read(ob, mesh, matrix, uv_name)
+        return _read(ob, mesh, np.array(evaluated.matrix_world, dtype=np.float64), uv_name)
     finally:
         evaluated.to_mesh_clear()
 

@@ -20,7 +20,6 @@ from ..materials.graph import images_behind
 from ..process.blender_process import job_start, newer
 from ..process.pixels import EDGE_SECONDS, PixelJob, too_small
 from .occluders import collect_occluders, with_baked_shares
-from .origin import move_to_origin
 
 # FAST_PIXELS: up to this many samples (about 1 GB of files), files are compressed fast instead of well.
 FAST_PIXELS = 10_000_000
@@ -250,7 +249,6 @@ def prepare_scene(
     render_settings.neutralize(scene, view_layer, camera, warnings)
     world = take_world(scene, view_layer, warnings)
     render_settings.prepare_surfaces(warnings)
-    origin = move_to_origin(scene, np.array(camera.matrix_world, dtype=np.float64)[:3, 3], warnings)
 
     lost: list[str] = []
 
@@ -268,7 +266,6 @@ def prepare_scene(
     inventory, materials, bare = with_render_depsgraph(scene, visit)
     if unread:
         inventory.occluders = with_baked_shares(inventory.occluders, unread, scene, inventory.warn)
-    inventory.origin = origin
     default = aovs.give_default_material(bare)
     materials += [default] if default else []
     left_to_cycles = inventory.left_to_cycles if for_finished else None
@@ -376,7 +373,6 @@ def extract_pixels(job: PixelJob, folder: Path, progress) -> dict:
         **picture,
         "lights": light_records(inventory.lights),
         "light_settings": inventory.settings,
-        "origin": inventory.origin.tolist(),
         "occluders": OCCLUDERS if has_shadows else None,
         "warnings": warnings,
         "unshaded": inventory.unshaded,

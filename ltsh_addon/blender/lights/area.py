@@ -55,7 +55,6 @@ class LightInventory:
     receivers: Receivers = field(default_factory=lambda: Receivers([]))
     meshes: list[MeshLight] = field(default_factory=list)
     instancers: dict[str, RenderedSurface] = field(default_factory=dict)  # by full name
-    origin: np.ndarray = field(default_factory=lambda: np.zeros(3))  # (3,) m; add it for positions in the file
     unshaded: list[str] = field(default_factory=list)  # reasons why materials are not shaded, see `inject_aovs`
     hit: set[str] = field(default_factory=set)  # names of the lights that random rays hit, if some overlap
     lit_points: tuple[np.ndarray, np.ndarray] = ()  # points of surfaces and their normals, if some overlap

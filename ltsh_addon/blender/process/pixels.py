@@ -134,7 +134,7 @@ class PixelPoints:
 
     number: np.ndarray | None = None  # (P,) of each sample's point in its pixel
     weights: np.ndarray | None = None  # (N, D, D) of the points, as in `Film.shared`
-    finer: gbuffer.FinerPoints | None = None  # for pixels at edges, relative to the origin of the extraction
+    finer: gbuffer.FinerPoints | None = None  # for pixels at edges
 
 
 @dataclass(frozen=True)
@@ -149,8 +149,7 @@ class Extraction:
     times: ExtractionTimes = field(default_factory=ExtractionTimes)
     warnings: tuple[str, ...] = ()
     problems: tuple[str, ...] = ()  # why most of the picture is not shaded
-    occluders: Occluders | None = None  # positions relative to `origin`; None without shadows
-    origin: np.ndarray = field(default_factory=lambda: np.zeros(3))  # (3,) m
+    occluders: Occluders | None = None  # None without shadows
     light_settings: dict[str, list[float]] = field(default_factory=dict)  # power, exposure, red, green, blue by object
     # Of finished pictures:
     left_to_cycles: LeftToCycles | None = None
@@ -184,7 +183,7 @@ def extract_pixels(job: PixelJob, *, progress: Progress | None = None) -> Extrac
         for name in manifest["samples"]:
             renders.add(rendered_channels(folder / name))
         samples, film = renders.joined()
-        lights, origin = lights_of(manifest["lights"]), np.array(manifest["origin"])
+        lights = lights_of(manifest["lights"])
         warnings, problems = renders.messages(samples, film)
         warnings += gbuffer.rounded_positions(samples.position[has_lobe(samples).any(axis=0)], lights)
         left_to_cycles, points = None, PixelPoints()
@@ -195,9 +194,8 @@ def extract_pixels(job: PixelJob, *, progress: Progress | None = None) -> Extrac
             warnings += unlit(samples, lights, manifest["camera"]) + faceted(samples, lights)
         times = (manifest[name] for name in ("seconds", "processor_seconds", "direct_seconds"))
         extraction = Extraction(
-            # Back to positions in the file, in double precision.
-            lights=tuple(light.moved(origin) for light in lights),
-            samples=replace(samples, position=samples.position + manifest["origin"]),
+            lights=tuple(lights),
+            samples=samples,
             film=film,
             picture=PictureFacts.of(manifest),
             cycles=renders.cycles_passes(folder),
@@ -205,7 +203,6 @@ def extract_pixels(job: PixelJob, *, progress: Progress | None = None) -> Extrac
             warnings=tuple(manifest["warnings"] + warnings),
             problems=tuple(problems),
             occluders=Occluders.load(folder / manifest["occluders"]) if manifest["occluders"] else None,
-            origin=origin,
             light_settings=manifest["light_settings"],
             left_to_cycles=left_to_cycles,
             points=points,

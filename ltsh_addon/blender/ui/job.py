@@ -19,8 +19,8 @@ from queue import Empty, SimpleQueue
 import bpy
 from bpy.app.translations import pgettext_iface as translated
 
-from ...pipeline.options import BakeOptions, PictureOptions, command_line
-from ...scene import REFERENCE, TECHNIQUES
+from ...pipeline.options import BakeOptions, CompareOptions, PictureOptions, command_line
+from ...scene import DEFAULT_TECHNIQUE, REFERENCE, TECHNIQUES
 from ..process import blender_process
 from . import preflight
 from .settings import preferences
@@ -95,7 +95,8 @@ def picture_options(scene, command: str, scene_file: Path) -> PictureOptions:
     """The options of "shade" or "compare" by the settings of `scene`."""
     settings = scene.ltsh
     samples = {"cycles_samples": settings.cycles_samples} if command == "compare" else {}
-    return PictureOptions(
+    kind = CompareOptions if command == "compare" else PictureOptions
+    return kind(
         scene=scene_file,
         output=output_folder(scene, command),
         techniques=chosen(settings, "techniques") if command == "compare" else (scene.ltsh_view.technique,),
@@ -178,7 +179,7 @@ def _picture(options: PictureOptions, with_cycles: bool) -> list[Step]:
         *shading,
         Step("write", FILE_SECONDS * pixels),
         Step("images", FILE_SECONDS * pixels),
-        *([Step("lights", _shading("ltsh4", points))] if options.keep_visibility else []),
+        *([Step("lights", _shading(DEFAULT_TECHNIQUE, points))] if options.keep_visibility else []),
     ]
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 
 import gpu
@@ -138,12 +138,11 @@ def uniform_buffer(values: np.ndarray) -> gpu.types.GPUUniformBuf:
 
 @dataclass(frozen=True)
 class ViewCamera:
-    """The camera of a picture. All positions that are drawn are relative to `origin`."""
+    """The camera of a picture."""
 
     projection: np.ndarray  # (4, 4) to clip space
     eye: np.ndarray  # (3,) position of the eye, or in parallel views the unit direction toward it
     is_parallel: bool
-    origin: np.ndarray = field(default_factory=lambda: np.zeros(3))  # (3,) in the world
 
     @classmethod
     def of(cls, view_matrix: Matrix, window_matrix: Matrix, is_parallel: bool) -> ViewCamera:
@@ -153,13 +152,6 @@ class ViewCamera:
         eye = to_world[:3, 2] / np.linalg.norm(to_world[:3, 2]) if is_parallel else to_world[:3, 3]
         return cls(np.array(window_matrix, np.float64) @ to_view, eye, is_parallel)
 
-    def around(self, origin: np.ndarray) -> ViewCamera:
-        """The same view of the world, with positions relative to `origin` (3,)."""
-        to_world = np.eye(4)
-        to_world[:3, 3] = origin - self.origin
-        eye = self.eye if self.is_parallel else self.eye - to_world[:3, 3]
-        return ViewCamera(self.projection @ to_world, eye, self.is_parallel, origin)
-
     def shifted(self, offset: np.ndarray, size: tuple[int, int]) -> ViewCamera:
         """The same view, in which pixels show the point `offset` (2,) pixels right and up of their centers.
 
@@ -167,7 +159,7 @@ class ViewCamera:
         """
         shift = np.eye(4)
         shift[:2, 3] = -2.0 * np.asarray(offset) / size
-        return ViewCamera(shift @ self.projection, self.eye, self.is_parallel, self.origin)
+        return ViewCamera(shift @ self.projection, self.eye, self.is_parallel)
 
     @property
     def rays(self) -> np.ndarray:
@@ -208,7 +200,7 @@ class VisibilityGrid:
     """The visible fraction of each light at the points of a picture. Other pictures of the same surfaces may use it."""
 
     visibility: gpu.types.GPUTexture  # RG, a layer for each light: the specular and the diffuse fraction
-    positions: gpu.types.GPUTexture  # of the points, relative to the view's origin; w = 0 where there is no surface
+    positions: gpu.types.GPUTexture  # of the points; w = 0 where there is no surface
     projection: np.ndarray  # (4, 4) to the clip space that the texels fill
     sources: tuple = ()  # of each layer: a layer whose source is the same object is the same
 
@@ -272,8 +264,7 @@ _OPTIONAL = ("diffuse_normal", "smooth_normal", "geometric_normal", "tangent", "
 
 
 def gbuffer_samples(gbuffer: GBufferTextures, view: ViewCamera) -> tuple[SurfaceSamples, np.ndarray]:
-    """The samples (P) of a G-buffer, relative to the origin of `view`, and their texels (P,), counted from the lower
-    left."""
+    """The samples (P) of a G-buffer, and their texels (P,), counted from the lower left."""
     return samples_of_texels(gbuffer_texels(gbuffer), view)
 
 

@@ -12,6 +12,7 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
+from ...cycles.gbuffer import rounded_positions
 from ...scene import Light, listed
 from ..evaluated import (
     SURFACE_TYPES,
@@ -38,6 +39,8 @@ from .meshes import MeshBatches, look_values, mesh_batches
 
 # FAR_AWAY: the eye where there is no camera, outside of all closed emissive meshes.
 FAR_AWAY = np.full(3, 1e6)
+# FAR: in m from the origin; up to there positions are at most 0.12 mm apart, which is not looked at.
+FAR = 2000.0
 # MOST_LIGHTS: patches and faces included. The time of a frame grows with their number.
 # One layer of the texture of visibility is that of the sky's sides; cards take 2048 layers.
 MOST_LIGHTS = 2047
@@ -462,6 +465,9 @@ class SceneMirror:
         self.sky, self._world_note, self._limit_notes = sky, notes, []
         most = MOST_LIGHTS - len(sky.lights)
         self.lights = (*strongest(self.lights_without_world, self._limit_notes, most), *sky.lights)
+        points = [shown.center[:3] for shown in self.instances] + [light.center for light in self.lights]
+        points = np.array(points).reshape(-1, 3)
+        self._limit_notes += rounded_positions(points[np.abs(points).max(axis=1) > FAR], self.lights)
 
 
 def _shown_look(material) -> ShownLook:

@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 import gpu
 import numpy as np
 
-from ..extract.origin import new_origin
 from ..materials.values import Value
 from .drawing import GBufferTextures, PixelShader, ViewCamera, VisibilityGrid, float_texture, glsl, read_texture
 from .light_texels import UploadedLights, background_texels, sky_texels, upload_lights
@@ -97,32 +96,23 @@ class Frame:
 
     @classmethod
     def of(cls, mirror: SceneMirror, view: ViewCamera, size: tuple[int, int], shown: ShownPicture) -> Frame:
-        """The frame that has the picture `shown`, with positions relative to an origin near what the view sees."""
+        """The frame that has the picture `shown`."""
         pictures = [(shown.technique, shown.passes)]
         if shown.mode != "single" and shown.second_picture is None:
             pictures.append((shown.second_technique, shown.passes))
-        view = view.around(_origin_of(mirror.lights, view))
         return cls(mirror, view, size, (*pictures, *shown.also), shown.second_picture is None, shown.world)
 
     @property
     def surfaces(self) -> tuple[tuple, tuple]:
         """The state that the G-buffers depend on, see `same_state`."""
         view = self.view
-        key = view.projection.tobytes(), view.eye.tobytes(), view.is_parallel, view.origin.tobytes(), self.size
+        key = view.projection.tobytes(), view.eye.tobytes(), view.is_parallel, self.size
         return (self.mirror,), (self.mirror.surfaces_version, *key)
 
     @property
     def content(self) -> tuple:
         """Which pictures there are, and of what."""
         return self.pictures, self.with_emission, self.world
-
-
-def _origin_of(lights, view: ViewCamera) -> np.ndarray:
-    """An origin near what is seen, because single precision is coarse far from the origin."""
-    centers = np.array([light.center for light in lights if not light.is_distant])
-    if len(centers) == 0:
-        return np.zeros(3)
-    return new_origin(centers, centers.mean(axis=0) if view.is_parallel else view.eye)
 
 
 class ViewRenderer:
@@ -138,7 +128,7 @@ class ViewRenderer:
         self._sums: list[SampleSum] = []  # of the pictures
         self._behind: list[SampleSum] = []  # what is lit behind glass
         self._lights: UploadedLights | None = None
-        self._drawn, self._uploaded = None, (None, None, None)
+        self._drawn, self._uploaded = None, (None, None)
         self._shown, self.samples = None, 0  # the state of the pictures, and the number of their points
         self._lighting_state: LightingState | None = None
         self._static: StaticLighting | None = None
@@ -258,14 +248,12 @@ class ViewRenderer:
         self._background = float_texture(background_texels(sky))
 
     def _upload_lights(self, frame: Frame) -> bool:
-        """Upload the lights if they or the origin of the view have changed; True if so."""
+        """Upload the lights if they have changed; True if so."""
         lights = frame.mirror.lights if frame.world else frame.mirror.lights_without_world
-        sky, origin = self._sky_light if frame.world else None, frame.view.origin
-        known, known_sky, known_origin = self._uploaded
-        if known is lights and known_sky is sky and np.array_equal(known_origin, origin):
+        sky = self._sky_light if frame.world else None
+        if self._uploaded[0] is lights and self._uploaded[1] is sky:
             return False
-        self._lights = upload_lights([light.moved(-origin) for light in lights] if origin.any() else lights, sky)
-        self._uploaded = lights, sky, origin
+        self._lights, self._uploaded = upload_lights(lights, sky), (lights, sky)
         return True
 
     def _visibility(self, layer: SurfaceLayer, gbuffer: GBufferTextures, frame: Frame) -> VisibilityGrid | None:

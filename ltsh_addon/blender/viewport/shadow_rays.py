@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from functools import cached_property
 
 import gpu
 import numpy as np
@@ -24,26 +24,18 @@ _LIGHT_BYTES = 4
 
 
 class ViewTracer:
-    """A tracer of occluders, and the pool of this process and a worker that trace with it.
-
-    Positions are relative to an origin near the view, where single precision is best. The origin changes rarely.
-    """
+    """A tracer of occluders, and the pool of this process and a worker that trace with it."""
 
     def __init__(self, occluders: Occluders):
         self._occluders = occluders
-        self._tracer: Tracer | None = None
         self.pool: WorkerPool | None = None
-        self._origin = np.zeros(3)
 
-    def around(self, origin: np.ndarray) -> Tracer:
-        """The tracer with positions relative to `origin` (3,). Raises SceneError where Embree is missing."""
-        if self._tracer is None or not np.array_equal(origin, self._origin):
-            matrices = np.array(self._occluders.matrices, np.float64)
-            matrices[:, :, 3] -= origin
-            self._tracer = open_tracer(replace(self._occluders, matrices=matrices), embree_libraries())
-            self.close()
-            self.pool, self._origin = WorkerPool(self._tracer, min(cores(), 2)), np.array(origin)
-        return self._tracer
+    @cached_property
+    def tracer(self) -> Tracer:
+        """The tracer. Raises SceneError where Embree is missing."""
+        tracer = open_tracer(self._occluders, embree_libraries())
+        self.pool = WorkerPool(tracer, min(cores(), 2))
+        return tracer
 
     def close(self) -> None:
         """End the worker."""
@@ -77,13 +69,13 @@ class ShadowRays:
         self, gbuffer: GBufferTextures, view: ViewCamera, lights: Lights, sides: Lights = (), number: int = 0
     ) -> VisibilityGrid | None:
         """The visibility of `lights`, and last that of the `sides` of a sky if there are any; None without surfaces or
-        lights. Positions are relative to the origin of `view`. Raises SceneError."""
+        lights. Raises SceneError."""
         start = time.perf_counter()
         samples, pixel = gbuffer_samples(gbuffer, view)
         if not len(samples) or not (lights or sides):
             return None
         width, height = gbuffer.size
-        tracer = self._tracing.around(view.origin)
+        tracer = self._tracing.tracer
         film = Film(width, height, pixel)
         traced = trace_visibility(samples, (*lights, *sides), tracer, ShadowSampling(rays=self._rays, film=film))
         count = len(lights) + bool(sides)

@@ -103,7 +103,6 @@ class ShadowRequest:
     points: PixelGrid
     rays: int
     tracing: ViewTracer
-    origin: np.ndarray
 
     @property
     def is_for_group(self) -> bool:
@@ -117,7 +116,7 @@ class ShadowRequest:
         raised.
         """
         samples, film = self.points.samples()
-        tracer, results = self.tracing.around(self.origin), {}
+        tracer, results = self.tracing.tracer, {}
         origins = self.points.ray_origins(self.tracing.pool) if self.level == 1 else None
         lights = [light for lights in self.lights for light in lights]
         starts = np.cumsum([0, *map(len, self.lights)])[:-1]
@@ -217,7 +216,6 @@ class LiveShadows:
         self._sources: list[np.ndarray | None] = []  # what each was made from
         self._grid: VisibilityGrid | None = None
         self._blank: VisibilityGrid | None = None
-        self._origin = np.zeros(3)
 
     @property
     def of_glass(self) -> LiveShadows:
@@ -310,7 +308,6 @@ class LiveShadows:
         for index, values in outcome.items():
             self._known.setdefault(request.keys[index], {})[request.level] = values
             self._latest[request.numbers[index]] = {request.level: values}
-        self._origin = request.origin
         self._show()
 
     def visibility(
@@ -328,7 +325,7 @@ class LiveShadows:
                 self._latest = {}
                 self._show()
         if number == 0:
-            self._wanted = (self._traced_scene.scene, view.projection.tobytes(), view.origin.tobytes(), gbuffer.size)
+            self._wanted = (self._traced_scene.scene, view.projection.tobytes(), gbuffer.size)
             self._group_grid = (0, None)
         for one in self._both:
             one._waits = False
@@ -345,9 +342,9 @@ class LiveShadows:
                 return self._group_grid[1]
             if level is None and number >= FIRST_POINTS and self._is_free:
                 numbers, points = tuple(range(len(self._keys))), PixelGrid(1, gbuffer, view)
-                self._start([self._request_for(numbers, points, GROUP_RAYS, view, group=number // GROUP)])
+                self._start([self._request_for(numbers, points, GROUP_RAYS, group=number // GROUP)])
             self._waits = self._thread is not None
-        fits = len(self._layers) == len(self._keys) and np.array_equal(self._origin, view.origin)
+        fits = len(self._layers) == len(self._keys)
         if fits or self._is_off:
             return self._grid if fits else None
         if self._blank is None:
@@ -408,10 +405,10 @@ class LiveShadows:
             self._pixels[level == 0] = self._wanted, points
         known = self._known if self._wanted == self._state else {}
         numbers = tuple(n for n, key in enumerate(self._keys) if max(known.get(key, (-1,))) < level)
-        return self._request_for(numbers, points, rays, view, level)
+        return self._request_for(numbers, points, rays, level)
 
     def _request_for(
-        self, numbers: tuple, points: PixelGrid, rays: int, view: ViewCamera, level: int = len(LEVELS), group: int = 0
+        self, numbers: tuple, points: PixelGrid, rays: int, level: int = len(LEVELS), group: int = 0
     ) -> ShadowRequest:
         """The request for the lights with these `numbers`."""
         return ShadowRequest(
@@ -424,7 +421,6 @@ class LiveShadows:
             points=points,
             rays=rays,
             tracing=self._traced_scene.tracing,
-            origin=view.origin.copy(),
         )
 
     def _start(self, requests: list[ShadowRequest]) -> None:

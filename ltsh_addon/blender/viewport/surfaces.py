@@ -5,7 +5,6 @@ from __future__ import annotations
 import bpy
 import gpu
 import numpy as np
-from mathutils import Matrix
 
 from ...shading.header import filled
 from ..materials.preview_material import IMAGE_SLOTS, is_missing
@@ -164,13 +163,12 @@ class SurfacePass:
         shader.uniform_block("view", self._view_values)
         for name, table in self._tables.items() if not is_emission else ():
             shader.uniform_sampler(name, table)
-        to_view = Matrix.Translation(-view.origin)
         # From near to far, so that hidden pixels are not computed.
         for instance in sorted(instances, key=lambda item: np.dot(view.projection[3], item.center)):
             looks = [pair for pair in zip(instance.mesh.slots, instance.looks, strict=True) if self._draws(pair[1])]
             if not looks:
                 continue
-            shader.uniform_float("model", to_view @ instance.model)
+            shader.uniform_float("model", instance.model)
             if not is_emission:
                 marks = instance.mesh.is_smooth, instance.is_only_user
                 shader.uniform_float("placement", (instance.receiver, instance.side, *marks))

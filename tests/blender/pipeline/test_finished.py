@@ -192,11 +192,11 @@ def test_depth_of_field_is_that_of_cycles_where_points_are_few_and_shade_has_it_
     # The denoiser saw the light that is taken away now, grain and all.
     found = relight(out, [LightChange("Light", muted=True)], out / "muted")
     assert any("shows its grain" in line for line in found["warnings"])
-    options = PictureOptions(path, output=out, techniques=("ltsh4",), sub_samples=POINTS)
+    options = PictureOptions(path, output=out, techniques=("ltsh4c",), sub_samples=POINTS)
     assert not any("depth of field" in line for line in shade_scene(options)["warnings"])
     layers = imaging.read_layers(out / "shade.exr")
     for name in PASSES:
-        found, expected = layers[f"ltsh4.{name}"], ours[f"ltsh4.{name}"]
+        found, expected = layers[f"ltsh4c.{name}"], ours[f"ltsh4c.{name}"]
         noise = blocks(np.abs(found - expected)) / BLOCK
         assert (np.abs(blocks(found) - blocks(expected)) < EDGE_ERROR * expected.max() + 4.0 * noise).all()
     # With one point a pixel is seen through the middle of the lens.
@@ -214,13 +214,13 @@ def test_ours_and_the_rest_are_the_whole_in_the_files_of_a_command(out, tmp_path
     assert report["cycles_samples"] == 4
     assert report["finished"]["denoiser"].startswith("Open Image Denoise")
     layers = imaging.read_layers(out / "render.exr")
-    whole = layers["ltsh4.specular"] + layers["ltsh4.diffuse"] + layers["rest"][..., :3]
+    whole = layers["ltsh4c.specular"] + layers["ltsh4c.diffuse"] + layers["rest"][..., :3]
     np.testing.assert_allclose(layers["combined"][..., :3], whole, rtol=1e-6, atol=1e-6)
     direct, color, kinds = ("Dir", "Col", "Diff Gloss") if bpy.app.version < (5, 0, 0) else (
         " Direct", " Color", "Diffuse Glossy")  # fmt: skip
     for kind, name in zip(kinds.split(), ("diffuse", "specular"), strict=True):
         # What the few samples of Cycles have not seen at an edge has no color.
-        seen, own = layers[kind + color] > 0.0, layers[f"ltsh4.{name}"]
+        seen, own = layers[kind + color] > 0.0, layers[f"ltsh4c.{name}"]
         assert seen.mean() > 0.1
         found = layers[kind + direct] * layers[kind + color]
         # Of edges of diffuse light, and of highlights of which two points tell too little, a part is Cycles' own.
@@ -299,11 +299,11 @@ def test_hard_edges_of_diffuse_light_are_nearer_to_cycles_than_ours_or_its_own(t
         off[name] = np.linalg.norm(made.combined[..., :3] - true)
         names = (made.cycles.names[key] for key in ("diffuse_light", "diffuse_color"))
         own, (light, color) = (
-            made.ours["ltsh4.diffuse"],
+            made.ours["ltsh4c.diffuse"],
             (read_layer(made.cycles.channels, key, "RGB") for key in names),
         )
         written = read_layer(made.channels, made.cycles.names["diffuse_light"], "RGB") * color
-        whole = made.comparison.images["ltsh4", "diffuse"]
+        whole = made.comparison.images["ltsh4c", "diffuse"]
         lit = (whole > 0.0) & (color > 0.0)
         left = (1.0 - own[lit] / whole[lit]) * (light * color)[lit]
         np.testing.assert_allclose(written[lit], own[lit] + left, rtol=1e-4, atol=1e-5)
@@ -490,8 +490,8 @@ def test_highlights_thinner_than_pixels_are_told_from_those_that_points_show(tmp
         job = PixelJob(path, sub_samples=2, for_finished=True, shadows="on")
         found = extract_pixels(job)
         own = PictureOptions(path, output=tmp_path, sub_samples=2, shadows="on")
-        with ShadowTracer(found.occluders, found.lights, found.origin) as tracer:
-            shader = render.DirectLightShader(own, 9.0, load_tables(("ltsh4",)), tracer)
+        with ShadowTracer(found.occluders, found.lights) as tracer:
+            shader = render.DirectLightShader(own, 9.0, load_tables(("ltsh4c",)), tracer)
             thin[name] = shader.probe(with_points(found, 2), 1.0).contrast
     assert thin["smooth"] < 0.5 * plan.THIN_CONTRAST and thin["crumpled"] > 1.5 * plan.THIN_CONTRAST
 
@@ -527,7 +527,7 @@ def test_edges_of_shadows_on_flat_surfaces_are_where_cycles_has_them(lens, tmp_p
     for most in (1.0, 0.0):
         monkeypatch.setattr(render, "MOST_EDGES", most)
         made = render.finish(RenderOptions(path, output=tmp_path, sub_samples=3, cycles_samples=4)).comparison
-        pictures.append((made.images["ltsh4", "diffuse"], made.film.has_more()))
+        pictures.append((made.images["ltsh4c", "diffuse"], made.film.has_more()))
     (fine, is_fine), (coarse, is_coarse) = pictures
     assert np.count_nonzero(is_fine) > 60 and not is_coarse.any()
     error, before = (np.linalg.norm((one - light * color)[is_fine]) for one in (fine, coarse))

@@ -13,6 +13,7 @@ import numpy as np
 
 SIZE = "1600x1100"
 SECONDS = 3600
+SETTLE_SECONDS = 4  # panels below one that became shorter move for a moment
 WAIT = 900  # for a job or a picture, on a busy machine
 # From the right and upper end of the sidebar, see `hands`: the first light of the list, the header of Bake, and with it
 # open its button and settings; while a preview is on, the header of Materials and the first setting of Final Render.
@@ -111,6 +112,7 @@ def completed(rig):
     yield from hands.click_button(rig, hands.PREVIEW)
     yield from hands.until(lambda: shading(rig)[1] == "SOLID")
     rig.check(shading(rig)[1] == "SOLID", "a click ends the preview")
+    yield SETTLE_SECONDS
 
 
 def pressed_f12(rig):
@@ -156,7 +158,7 @@ def hidden(rig):
     rig.xdo("click", 1)
     yield from hands.until(lambda: bpy.context.view_layer.objects.active.name == "floor")
     rig.check(bpy.context.view_layer.objects.active.name == "floor", "a click in the view selects the floor")
-    yield 2
+    yield SETTLE_SECONDS
 
 
 def cancelled(rig):
@@ -224,7 +226,7 @@ def baked(rig):
     rig.check(hands.settings().mode == chosen().mode == "WIPE", f"a bake leaves the mix: {chosen().mode}")
     check_wipe(rig)
     yield from hands.click_button(rig, BAKE_HEADER)
-    yield 2
+    yield SETTLE_SECONDS
 
 
 def check_wipe(rig):
@@ -266,7 +268,7 @@ def rendered(rig):
     rig.check(hands.settings().mode == chosen().mode != "MIX", f"F12 leaves the mix: {chosen().mode}")
     rig.shot("13_rendered.png")
     yield from hands.click_button(rig, hands.PREVIEW)
-    yield 2
+    yield SETTLE_SECONDS
 
 
 def compared(rig):
@@ -340,13 +342,12 @@ def two_views(rig):
 
 def dark(rig):
     """Without lights the panel asks for none to be clicked."""
-    yield 2
+    yield SETTLE_SECONDS
     for _ in [ob for ob in bpy.context.scene.objects if ob.type == "LIGHT"]:
         yield from hands.click_button(rig, FIRST_LIGHT)
         yield from hands.over(rig)
         yield from hands.keys(rig, "Delete")
         yield 1
     rig.check(not hands.module("ui.settings").lights_of(bpy.context.scene), "Delete removes the lights of the list")
-    # Panels below one that became shorter move for a moment.
-    yield 3
+    yield SETTLE_SECONDS
     rig.shot("17_no_light.png")

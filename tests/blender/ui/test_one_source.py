@@ -29,8 +29,8 @@ def test_a_picture_is_not_compared_with_itself_after_one_that_was_alone(scene, t
     ],
 )
 def test_the_pressed_buttons_are_those_of_the_pictures_that_are_shown(scene, tmp_path, show_results, names, pressed):
+    scene.ltsh.first, scene.ltsh.second, scene.ltsh.mode = "ltsh4", "cycles", "WIPE"
     show_results(scene, tmp_path, names=names, partial="Not complete: without Cycles")
-    assert (scene.ltsh.first, scene.ltsh.second, scene.ltsh.mode) == ("ltsh4", "cycles", "WIPE")
     shown = recorded_layout.drawn(panels.LTSH_PT_IMAGE_results)
     assert [entry.text for entry in shown if entry.what == "ltsh.choose" and entry.pressed] == pressed
     bpy.ops.ltsh.choose(key="pass_name", value="diffuse")
@@ -150,8 +150,8 @@ def test_views_of_one_world_look_at_it_once(monkeypatch):
 
 def test_a_final_render_and_other_results_leave_the_mix(scene, tmp_path, show_results):
     show_results(scene, tmp_path)
-    scene.ltsh.mode_before_mix = "SIDE"
-    scene.ltsh.mode = "MIX"
+    bpy.ops.ltsh.choose(key="mode", value="SIDE")
+    bpy.ops.ltsh.choose(key="mode", value="MIX")
     assert results.choice_of(scene.ltsh, results.result_of(scene)).mode == "SIDE"
     show_results(scene, tmp_path, seed=2)
     assert scene.ltsh.mode == "SIDE"

@@ -31,7 +31,7 @@ const JOB_TYPE = {
             description: "Such as 12 or 1-240:2,300; empty: the frame that the file was saved at",
         },
         {
-            key: "techniques", label: "Techniques", type: "string", default: "ltsh4",
+            key: "techniques", label: "Techniques", type: "string", default: "ltsh4c",
             description: "Some of ltc, ltsh2, ltsh4, ltsh4c, reference, separated by commas; render takes one, and "
                 + "render and view no reference",
         },

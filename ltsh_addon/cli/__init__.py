@@ -26,7 +26,7 @@ from .progress import ProgressBar, RunLog, print_json, print_out
 EXAMPLES = """examples:
   %(prog)s demo -o out/demo
   %(prog)s compare room.blend -o out/room --resolution 960x540 --cycles-samples 1024
-  %(prog)s shade room.blend -o out/room --techniques ltsh4 --aa 16
+  %(prog)s shade room.blend -o out/room --resolution 960x540 --aa 16
   %(prog)s render room.blend -o out/room --budget 30
   %(prog)s bake room.blend -o out/room --object Floor --size 2048 --error
   %(prog)s compare room.blend -o out/room --frames 1-240 --shard 1/4 --resume

@@ -13,7 +13,16 @@ from ..files import write_bytes
 from ..imaging import on_screen
 from ..pipeline.batch import Merged, merge, run_tasks
 from ..pipeline.lighting import prepare
-from ..pipeline.options import BakeOptions, PictureOptions, RenderOptions, ViewOptions, options_from, real_number
+from ..pipeline.options import (
+    BakeOptions,
+    CompareOptions,
+    DemoOptions,
+    PictureOptions,
+    RenderOptions,
+    ViewOptions,
+    options_from,
+    real_number,
+)
 from ..pipeline.picture import Baseline, with_times
 from ..pipeline.tasks import BatchJob
 from ..scene import SceneError, error_line
@@ -56,7 +65,7 @@ COMPARE_EXAMPLES = """examples:
   %(prog)s room.blend -o out/today --baseline out/yesterday/report.json --tolerance 0.002
 """
 SHADE_EXAMPLES = """examples:
-  %(prog)s room.blend -o out/room --techniques ltsh4 --aa 16
+  %(prog)s room.blend -o out/room --resolution 960x540 --aa 16
   %(prog)s room.blend -o out/room --frames 1-240 --resume
 """
 BAKE = """Shade the texels of UV maps. OUT gets an EXR for each object, with a layer for each
@@ -65,7 +74,7 @@ BAKE_EXAMPLES = """examples:
   %(prog)s room.blend -o out/room
   %(prog)s room.blend -o out/room --object Floor --object Wall --size 2048 --uv Lightmap --view above
   %(prog)s room.blend -o out/room --passes diffuse_light --size 512
-  %(prog)s room.blend -o out/room --object Floor --techniques ltc,ltsh4 --error --cycles-samples 1024
+  %(prog)s room.blend -o out/room --object Floor --techniques ltc,ltsh4c --error --cycles-samples 1024
   %(prog)s room.blend -o out/room --frames 1-240:2 --shard 1/4 --resume
 
 An object that cannot be baked is named at the end, and the exit code is 1; the others are baked all the same.
@@ -94,8 +103,8 @@ RENDER_EXAMPLES = """examples:
 
 # JOBS: the options of the commands that make a job, their description and examples, and the options they leave out.
 JOBS = {
-    "demo": (PictureOptions, DEMO, DEMO_EXAMPLES, ("scene",)),
-    "compare": (PictureOptions, COMPARE, COMPARE_EXAMPLES, ()),
+    "demo": (DemoOptions, DEMO, DEMO_EXAMPLES, ("scene",)),
+    "compare": (CompareOptions, COMPARE, COMPARE_EXAMPLES, ()),
     "shade": (PictureOptions, SHADE, SHADE_EXAMPLES, ("cycles_samples",)),
     "bake": (BakeOptions, BAKE, BAKE_EXAMPLES, ()),
     "view": (ViewOptions, VIEW, VIEW_EXAMPLES, ()),
@@ -286,7 +295,7 @@ RUN_EXAMPLES = """examples:
 
 night.toml:
   [defaults]                       # for all jobs whose command has that option
-  techniques = ["ltc", "ltsh4"]
+  techniques = ["ltc", "ltsh4c"]
 
   [[job]]
   command = "compare"              # or "bake", "shade", "view" or "render"

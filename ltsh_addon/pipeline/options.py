@@ -9,12 +9,12 @@ from __future__ import annotations
 import math
 import re
 import string
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import MISSING, asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from ..scene import BAKE_PASSES, PASSES, SHIPPED_TABLES, TECHNIQUES
+from ..scene import BAKE_PASSES, COMPARED_TECHNIQUES, DEFAULT_TECHNIQUE, PASSES, SHIPPED_TABLES, TECHNIQUES
 
 # Blender's own limits. PICTURE_SIDES: the smallest and largest side of a picture in pixels. LAST_FRAME: of frames.
 PICTURE_SIDES = (4, 65536)
@@ -284,9 +284,10 @@ def _output() -> Any:
     return option("-o", matters=False, dest="output", type=folder, required=True, metavar="OUT", help=meaning)
 
 
-def _techniques(default: tuple[str, ...]) -> Any:
-    meaning = f"{', '.join(TECHNIQUES)} or paths of tables (.npz), separated by commas (default: {','.join(default)})"
-    return option("--techniques", default=default, type=techniques, metavar="T", help=meaning)
+def _techniques(known: Iterable[str] = TECHNIQUES, default=(DEFAULT_TECHNIQUE,), parse: Callable = techniques) -> Any:
+    one = "the path of a table (.npz)" if parse is one_table else "paths of tables (.npz), separated by commas"
+    meaning = f"{', '.join(known)} or {one} (default: {','.join(default)})"
+    return option("--techniques", default=default, type=parse, metavar="T", help=meaning)
 
 
 def _passes_of(known: tuple[str, ...], parse: Callable, default: str) -> Any:
@@ -362,7 +363,7 @@ class PictureOptions(CameraOptions):
     """What to shade and how; None means as in the file."""
 
     # Names, paths of tables, or (only from Python) a `shading.OwnTechnique`.
-    techniques: tuple[Any, ...] = _techniques(tuple(TECHNIQUES))
+    techniques: tuple[Any, ...] = _techniques()
     passes: tuple[str, ...] = _passes_of(PASSES, passes, "both")
     resolution: tuple[int, int] | None = _resolution()
     sub_samples: int = _sub_samples("points per pixel, drawn from its filter; 1: pixel centers")
@@ -376,6 +377,20 @@ class PictureOptions(CameraOptions):
     keep_visibility: bool = flag("--keep-visibility", "also keep what `relight` needs, beside the EXR as two .npz")
     scripts: bool = _scripts()
     page: str = option(default="report.html", matters=False)  # file name of a comparison's HTML page
+
+
+@dataclass(frozen=True)
+class CompareOptions(PictureOptions):
+    """What to put beside Cycles and how; None means as in the file."""
+
+    techniques: tuple[Any, ...] = _techniques(default=COMPARED_TECHNIQUES)
+
+
+@dataclass(frozen=True)
+class DemoOptions(CompareOptions):
+    """How to show all techniques."""
+
+    techniques: tuple[Any, ...] = _techniques(default=tuple(TECHNIQUES))
 
 
 @dataclass(frozen=True)
@@ -410,7 +425,7 @@ class BakeOptions:
         "--view", default="camera", type=view, metavar="V",
         help="camera, above (along the normals) or a position X,Y,Z in m (default: %(default)s)",
     )  # fmt: skip
-    techniques: tuple[str, ...] = _techniques(("ltsh4",))
+    techniques: tuple[str, ...] = _techniques()
     passes: tuple[str, ...] = _passes_of(BAKE_PASSES, bake_passes, ",".join(PASSES))
     frame: int | None = _frame()
     camera: str | None = _camera()
@@ -428,10 +443,7 @@ class BakeOptions:
 class ViewOptions(CameraOptions):
     """What to draw as the viewport does; None means as in the file."""
 
-    techniques: tuple[str, ...] = option(
-        "--techniques", default=("ltsh4",), type=tables, metavar="T",
-        help=f"{', '.join(SHIPPED_TABLES)} or paths of tables (.npz), separated by commas (default: ltsh4)",
-    )  # fmt: skip
+    techniques: tuple[str, ...] = _techniques(SHIPPED_TABLES, parse=tables)
     resolution: tuple[int, int] | None = _resolution()
     refine: int = option(
         "--refine", default=16, type=refinements, metavar="N",
@@ -446,10 +458,7 @@ class ViewOptions(CameraOptions):
 class RenderOptions(CameraOptions):
     """What finished picture to render and how; None means as in the file."""
 
-    techniques: tuple[str, ...] = option(
-        "--techniques", default=("ltsh4",), type=one_table, metavar="T",
-        help=f"of the direct light: {', '.join(SHIPPED_TABLES)} or the path of a table (.npz) (default: ltsh4)",
-    )  # fmt: skip
+    techniques: tuple[str, ...] = _techniques(SHIPPED_TABLES, parse=one_table)
     resolution: tuple[int, int] | None = _resolution()
     sub_samples: int | None = option(
         "--aa", default=None, type=positive, metavar="N",

@@ -18,7 +18,18 @@ import numpy as np
 from .. import imaging
 from ..files import replacing
 from ..imaging.exr import COMBINED, REST, layer_name, parse_layer_name
-from ..scene import REFERENCE, Film, Light, Progress, SurfaceSamples, error_line, light_records, lights_of, listed
+from ..scene import (
+    DEFAULT_TECHNIQUE,
+    REFERENCE,
+    Film,
+    Light,
+    Progress,
+    SurfaceSamples,
+    error_line,
+    light_records,
+    lights_of,
+    listed,
+)
 from .comparison import Comparison
 from .lighting import Shadows, evaluated, light_groups, prepare, shade_lights
 from .options import PictureOptions
@@ -57,7 +68,7 @@ class RelightData:
     had_cycles: bool
     # By light group: its bounced light (H, W, 3). By "": what depends on no light group (H, W, 3 or 4 with alpha).
     rest: dict[str, np.ndarray] = field(default_factory=dict)
-    # By pass (H, W): the share of the pass that is LTSH's and not Cycles'; left out: 1.
+    # By pass (H, W, 3), in old files (H, W): the share that is LTSH's and not Cycles', recolored; left out: 1.
     taken: dict[str, np.ndarray] = field(default_factory=dict)
     # By pass (H, W): a factor of hard edges of light, valid only while the lights stay where they were; left out: 1.
     edges: dict[str, np.ndarray] = field(default_factory=dict)
@@ -66,11 +77,11 @@ class RelightData:
     def technique(self) -> str:
         """The last technique of the picture except the reference: by convention the most accurate."""
         names = [name for name in self.options["techniques"] if name != REFERENCE]
-        return names[-1] if names else "ltsh4"
+        return names[-1] if names else DEFAULT_TECHNIQUE
 
     def shown(self, name: str, *, moved: bool = False) -> np.ndarray | float:
-        """Factor (H, W, 1) of the image of a pass of the samples; without `edges` for `moved` lights."""
-        taken = self.taken[name][..., None] if name in self.taken else 1.0
+        """Factor (H, W, 1 or 3) of the image of a pass of the samples; without `edges` for `moved` lights."""
+        taken = np.atleast_3d(self.taken[name]) if name in self.taken else 1.0
         return taken if moved or name not in self.edges else taken * self.edges[name][..., None]
 
     @classmethod

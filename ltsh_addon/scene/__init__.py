@@ -26,14 +26,26 @@ from .lights import (
     round_outline,
 )
 from .samples import SCALAR_FIELDS, SurfaceSamples, is_constant
-from .techniques import BAKE_PASSES, CYCLES, PASSES, REFERENCE, SHIPPED_TABLES, TECHNIQUES, Technique
+from .techniques import (
+    BAKE_PASSES,
+    COMPARED_TECHNIQUES,
+    CYCLES,
+    DEFAULT_TECHNIQUE,
+    PASSES,
+    REFERENCE,
+    SHIPPED_TABLES,
+    TECHNIQUES,
+    Technique,
+)
 
 __all__ = [
     "BAKE_PASSES",
     "Border",
+    "COMPARED_TECHNIQUES",
     "CYCLES",
     "Cancelled",
     "ColorSpace",
+    "DEFAULT_TECHNIQUE",
     "DistantLight",
     "EllipseLight",
     "FARTHEST",

@@ -44,6 +44,11 @@ TECHNIQUES = {
 SHIPPED_TABLES = tuple(name for name in TECHNIQUES if name != REFERENCE)
 
 
+# What shades where nothing else is chosen, and what comparisons put beside Cycles then.
+DEFAULT_TECHNIQUE = "ltsh4c"
+COMPARED_TECHNIQUES = ("ltc", DEFAULT_TECHNIQUE)
+
+
 CYCLES = "cycles"  # the name of Cycles' pictures beside those of techniques
 
 

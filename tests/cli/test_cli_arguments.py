@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 from fake_scene import run
 
-from ltsh_addon import shading
-from ltsh_addon.scene import VERSION, listed
+from ltsh_addon.scene import COMPARED_TECHNIQUES, DEFAULT_TECHNIQUE, TECHNIQUES, VERSION, listed
 
 
 def assert_misuse(result, complaint):
@@ -104,7 +103,8 @@ def test_help_says_what_a_command_does_with_its_options_defaults_and_examples(ca
         options = "-o --techniques --passes --resolution --aa --frame --camera --json --quiet".split()
         options += [] if command == "shade" else ["--cycles-samples"]
         assert not [option for option in options if option not in stdout]
-        assert ",".join((*shading.SHIPPED_TABLES, "reference")) in stdout
+        chosen = {"demo": TECHNIQUES, "compare": COMPARED_TECHNIQUES, "shade": (DEFAULT_TECHNIQUE,)}[command]
+        assert f"(default: {','.join(chosen)})" in " ".join(stdout.split())
         assert ("480x270" in stdout) == (command == "demo")
 
 

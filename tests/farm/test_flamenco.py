@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from ltsh_addon.cli import commands as cli_commands
+from ltsh_addon.scene import DEFAULT_TECHNIQUE
 
 ROOT = Path(__file__).resolve().parents[2]
 ENGINE = shutil.which("node") or shutil.which("qjs") or shutil.which("nodejs")
@@ -71,7 +72,7 @@ BAKE = {"objects": "Floor; Big Wall;", "size": 256, "error": True, "apply": True
 @pytest.mark.parametrize(
     ("settings", "expected"),
     [
-        ({}, {"techniques": ("ltsh4",), "passes": ("specular", "diffuse"), "objects": "all", "frames": ()}),
+        ({}, {"techniques": (DEFAULT_TECHNIQUE,), "passes": ("specular", "diffuse"), "objects": "all", "frames": ()}),
         (BAKE, {"objects": ("Floor", "Big Wall"), "size": (256, 256), "error": True, "apply": True,
                 "cycles_samples": 64, "frames": (-3,)}),
         ({"passes": "diffuse_light,combined"}, {"passes": ("diffuse_light", "combined"), "error": False}),
@@ -82,7 +83,7 @@ BAKE = {"objects": "Floor; Big Wall;", "size": 256, "error": True, "apply": True
         ({"command": "compare"}, {"cycles_samples": 512}),
         ({"error": True}, {"error": True, "cycles_samples": 256}),
         ({"command": "render", "frames": "1-3"},
-         {"techniques": ("ltsh4",), "frames": (1, 2, 3), "cycles_samples": None, "budget": None}),
+         {"techniques": (DEFAULT_TECHNIQUE,), "frames": (1, 2, 3), "cycles_samples": None, "budget": None}),
         ({"command": "render", "cycles_samples": 64, "arguments": "--denoise off"},
          {"cycles_samples": 64, "budget": None, "denoise": "off"}),
         ({"command": "render", "arguments": "--budget 30"}, {"cycles_samples": None, "budget": 30.0}),

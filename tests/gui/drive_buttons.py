@@ -7,7 +7,7 @@ SIZE = "1280x900"
 SECONDS = 1800
 # Places that shift with what the panel shows.
 ADD_CAMERA, GRAY_COMPARE, BAKE_HEADER, BAKE = (149, 358), (149, 392), (223, 420), (149, 477)
-SHADED = "LTSH ltsh4.combined"
+SHADED = "LTSH ltsh4c.combined"
 
 
 def main(rig):
@@ -80,7 +80,7 @@ def baked(rig):
     yield from hands.wait_for_job(rig, 900)
     # Panels below one that became shorter move for a moment.
     yield 3
-    rig.check(max(hands.image_pixels("LTSH floor ltsh4.combined"), default=0.0) > 0.1, "the baked texture is an image")
+    rig.check(max(hands.image_pixels("LTSH floor ltsh4c.combined"), default=0.0) > 0.1, "the baked texture is an image")
     result = hands.module("ui.results").result_of(bpy.context.scene)
     rig.check(result is not None and result.command == "bake", "the results are those of the bake")
     rig.shot("5_baked.png")

@@ -13,7 +13,7 @@ def main(rig):
     yield from hands.open_panel(rig)
     yield 1.5
     rig.shot("1_panel.png")
-    rig.check(hands.settings().techniques == {"ltc", "ltsh4"}, "LTC and LTSH 4 are chosen at the start")
+    rig.check(hands.settings().techniques == {"ltc", "ltsh4c"}, "LTC and LTSH 4c are chosen at the start")
     hands.settings().cycles_samples = 64
     yield from cancelled(rig)
     yield from finished(rig)
@@ -56,7 +56,7 @@ def finished(rig):
     yield from hands.wait_for_job(rig, 900)
     pulse.stop(rig, "while a comparison runs")
     names = {image.name for image in bpy.data.images}
-    rig.check({"LTSH ltsh4.combined", "LTSH cycles.combined", "LTSH error_ltsh4.combined"} <= names,
+    rig.check({"LTSH ltsh4c.combined", "LTSH cycles.combined", "LTSH error_ltsh4c.combined"} <= names,
               "pictures are images of Blender")  # fmt: skip
     yield from hands.results_opened(rig)
     yield 3

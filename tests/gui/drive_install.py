@@ -61,7 +61,7 @@ def used(rig):
     yield from hands.click_button(rig, hands.SHADE)
     yield from hands.until(lambda: hands.job() is not None)
     yield from hands.wait_for_job(rig, 300)
-    rig.check(len(hands.image_pixels("LTSH ltsh4.combined")) > 0, "shading the camera view shows an image")
+    rig.check(len(hands.image_pixels("LTSH ltsh4c.combined")) > 0, "shading the camera view shows an image")
     yield 3
     yield from hands.click_button(rig, hands.PREVIEW)
     yield 5

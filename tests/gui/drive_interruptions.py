@@ -158,10 +158,10 @@ def during_a_bake(rig, other):
             yield from hands.wait_for_job(rig, 600)
             rig.check(not job.error and job.shown == 1, f"and the bake ends well: {job.error}")
             yield 1
-            rig.check(hands.image_pixels("LTSH floor ltsh4.combined") != (), "with its texture")
+            rig.check(hands.image_pixels("LTSH floor ltsh4c.combined") != (), "with its texture")
             rig.shot("4_baked.png")
             yield from typed(rig, "ctrl+z")
-            rig.check("LTSH floor ltsh4.combined" not in bpy.data.images, "one undo takes it away")
+            rig.check("LTSH floor ltsh4c.combined" not in bpy.data.images, "one undo takes it away")
         else:
             yield from opened(rig, other)
             rig.check(hands.job() is None and job.cancelled, "another file ends it")

@@ -7,7 +7,7 @@ import pytest
 
 from ltsh_addon.blender.process.pixels import PixelJob
 from ltsh_addon.cli import arguments, commands
-from ltsh_addon.pipeline import BakeOptions, PictureOptions
+from ltsh_addon.pipeline import BakeOptions, CompareOptions, PictureOptions
 from ltsh_addon.pipeline.options import arguments_of, child_job, command_line, what_matters
 
 SCENE, OUT = Path("room.blend"), Path("out")
@@ -26,7 +26,7 @@ BAKE = {
 }  # fmt: skip
 OF_A_TASK = {"scene", "output", "frame", "camera", "name"}
 KINDS = pytest.mark.parametrize(
-    ("command", "kind", "values"), [("compare", PictureOptions, PICTURE), ("bake", BakeOptions, BAKE)]
+    ("command", "kind", "values"), [("compare", CompareOptions, PICTURE), ("bake", BakeOptions, BAKE)]
 )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from ...scene import CYCLES, SHIPPED_TABLES, TECHNIQUES
+from ...scene import CYCLES, DEFAULT_TECHNIQUE, SHIPPED_TABLES, TECHNIQUES
 from ..ui.preview import ENGINE
 from .redraws import tag_views
 
@@ -36,7 +36,11 @@ class LTSH_ViewSettings(bpy.types.PropertyGroup):
     """Settings of the viewport and of final renders with the engine LTSH."""
 
     technique: bpy.props.EnumProperty(
-        name="Technique", description="What shades the picture", items=TECHNIQUE_ITEMS, default="ltsh4", update=_redraw
+        name="Technique",
+        description="What shades the picture",
+        items=TECHNIQUE_ITEMS,
+        default=DEFAULT_TECHNIQUE,
+        update=_redraw,
     )
     shown: bpy.props.EnumProperty(
         name="Show", description="Which reflection is seen", items=SHOWN_PASSES, default="combined", update=_redraw

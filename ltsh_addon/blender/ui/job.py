@@ -7,7 +7,6 @@ import json
 import math
 import shutil
 import subprocess
-import tempfile
 import threading
 import time
 from collections import deque
@@ -19,8 +18,8 @@ from queue import Empty, SimpleQueue
 import bpy
 from bpy.app.translations import pgettext_iface as translated
 
-from ...pipeline.options import BakeOptions, PictureOptions, command_line
-from ...scene import REFERENCE, TECHNIQUES
+from ...pipeline.options import BakeOptions, CompareOptions, PictureOptions, command_line
+from ...scene import DEFAULT_TECHNIQUE, REFERENCE, TECHNIQUES
 from ..process import blender_process
 from . import preflight
 from .settings import preferences
@@ -95,7 +94,8 @@ def picture_options(scene, command: str, scene_file: Path) -> PictureOptions:
     """The options of "shade" or "compare" by the settings of `scene`."""
     settings = scene.ltsh
     samples = {"cycles_samples": settings.cycles_samples} if command == "compare" else {}
-    return PictureOptions(
+    kind = CompareOptions if command == "compare" else PictureOptions
+    return kind(
         scene=scene_file,
         output=output_folder(scene, command),
         techniques=chosen(settings, "techniques") if command == "compare" else (scene.ltsh_view.technique,),
@@ -178,7 +178,7 @@ def _picture(options: PictureOptions, with_cycles: bool) -> list[Step]:
         *shading,
         Step("write", FILE_SECONDS * pixels),
         Step("images", FILE_SECONDS * pixels),
-        *([Step("lights", _shading("ltsh4", points))] if options.keep_visibility else []),
+        *([Step("lights", _shading(DEFAULT_TECHNIQUE, points))] if options.keep_visibility else []),
     ]
 
 
@@ -388,8 +388,9 @@ class Job:
 
         Raises SceneError and OSError.
         """
-        job = self.folder / "job.json"
-        document = {"runs": runs, "path": _library_folders(), "temporary": str(self.folder)}
+        job, spec = self.folder / "job.json", importlib.util.find_spec("OpenEXR")
+        libraries = [str(Path(spec.origin).parent)] if spec is not None and spec.origin else []
+        document = {"runs": runs, "path": libraries, "temporary": str(self.folder)}
         job.write_text(json.dumps(document), encoding="utf-8")
         self._messages: SimpleQueue = SimpleQueue()
         command = blender_process.child_command(job, SCRIPT)
@@ -472,17 +473,6 @@ class Job:
     def seconds(self) -> float:
         """Seconds since the start."""
         return time.monotonic() - self.started
-
-
-def new_folder() -> Path:
-    """A temporary folder for a job."""
-    return Path(tempfile.mkdtemp(prefix="ltsh-"))
-
-
-def _library_folders() -> list[str]:
-    """Folders in which the process finds the libraries of the extension."""
-    spec = importlib.util.find_spec("OpenEXR")
-    return [str(Path(spec.origin).parent)] if spec is not None and spec.origin else []
 
 
 def clock(seconds: float) -> str:

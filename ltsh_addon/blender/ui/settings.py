@@ -21,7 +21,7 @@ from bpy.props import (
     StringProperty,
 )
 
-from ...scene import CYCLES, REFERENCE, TECHNIQUES
+from ...scene import COMPARED_TECHNIQUES, CYCLES, DEFAULT_TECHNIQUE, REFERENCE, TECHNIQUES
 from ...workers.pool import CORES_VARIABLE
 from .comparison import changed, mixed, redraw_editors
 
@@ -280,7 +280,7 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
     techniques: EnumProperty(
         name="Compared",
         description="Techniques whose pictures are put beside that of Cycles. Shift-click to choose several",
-        items=TECHNIQUE_ITEMS, options={"ENUM_FLAG"}, default={"ltc", "ltsh4"},
+        items=TECHNIQUE_ITEMS, options={"ENUM_FLAG"}, default=set(COMPARED_TECHNIQUES),
     )  # fmt: skip
     resolution_percentage: IntProperty(
         name="Resolution", description="Percentage of the scene's render resolution",
@@ -360,7 +360,7 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
     group: StringProperty(name="Object", description="Which baked texture is shown", update=changed)
     first: EnumProperty(
         name="A", description="The first picture, left of the line",
-        items=PICTURE_ITEMS, default="ltsh4", update=changed,
+        items=PICTURE_ITEMS, default=DEFAULT_TECHNIQUE, update=changed,
     )  # fmt: skip
     second: EnumProperty(
         name="B", description="The second picture, right of the line",

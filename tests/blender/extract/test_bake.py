@@ -70,18 +70,18 @@ def test_diffuse_light_is_the_irradiance_over_pi_and_leaves_colors_out(tmp_path)
     samples = plane_samples(ABOVE, albedo=1.0)
     some = np.random.default_rng(0).choice(len(samples), 300, replace=False)
     expected = quadrature.radiance(samples.take(some), [KEY], quadrature.lambert)
-    light = layers["ltsh4.diffuse_light"].reshape(-1, 3)
+    light = layers["ltsh4c.diffuse_light"].reshape(-1, 3)
     assert np.abs(light[some] - expected).max() < 1e-3 * expected.max()
     color = np.float32([0.8, 0.2, 0.5])
-    assert np.abs(layers["ltsh4.diffuse"] - layers["ltsh4.diffuse_light"] * color).max() < 1e-5 * light.max()
-    assert np.array_equal(layers["ltsh4.combined"], layers["ltsh4.diffuse"] + layers["ltsh4.specular"])
+    assert np.abs(layers["ltsh4c.diffuse"] - layers["ltsh4c.diffuse_light"] * color).max() < 1e-5 * light.max()
+    assert np.array_equal(layers["ltsh4c.combined"], layers["ltsh4c.diffuse"] + layers["ltsh4c.specular"])
     assert layers["coverage.hit"].min() == 1.0
 
 
 def test_textures_groups_and_mixes_agree_with_the_bake_of_cycles(tmp_path):
     textured_scene()
     report, files = baked(
-        save(tmp_path), tmp_path / "out", techniques=("reference", "ltsh4"), error=True, cycles_samples=256, margin=2
+        save(tmp_path), tmp_path / "out", techniques=("reference", "ltsh4c"), error=True, cycles_samples=256, margin=2
     )
     assert report["problems"] == [] and set(files) == {"Plane.exr", "Sphere.exr"}
     for name, layers in files.items():
@@ -96,14 +96,14 @@ def test_textures_groups_and_mixes_agree_with_the_bake_of_cycles(tmp_path):
             # highlight agrees within the noise. The bump's shadowing of diffuse light is taken at the mean direction.
             assert found.unbiased_relative_error < 0.012, (name, pass_name, found)
             assert abs(found.bias) < 0.004, (name, pass_name, found)
-            for technique in ("reference", "ltsh4"):
+            for technique in ("reference", "ltsh4c"):
                 error = layers[f"error_{technique}.{pass_name}"]
                 expected = layers[f"{technique}.{pass_name}"] - layers[f"cycles.{pass_name}"]
                 scale = np.abs(cycles).max()
                 assert np.abs(error - expected)[covered].max() <= 2e-7 * scale
     errors = report["objects"][0]["tiles"]["1001"]["errors"]["specular"]
-    assert 0.0 < errors["noise"] < 0.1 and set(errors["techniques"]) == {"reference", "ltsh4"}
-    assert {path.name for path in (tmp_path / "out").glob("*.png")} >= {"Plane.error_ltsh4.specular.png"}
+    assert 0.0 < errors["noise"] < 0.1 and set(errors["techniques"]) == {"reference", "ltsh4c"}
+    assert {path.name for path in (tmp_path / "out").glob("*.png")} >= {"Plane.error_ltsh4c.specular.png"}
 
 
 def test_several_materials_and_none_are_baked_on_one_object(tmp_path):
@@ -121,7 +121,7 @@ def test_several_materials_and_none_are_baked_on_one_object(tmp_path):
     ob.data.materials.append(None)
     ob.data.polygons.foreach_set("material_index", [0, 1, 2])
     _, files = baked(save(tmp_path), tmp_path / "out", passes=("diffuse",))
-    image = files["Strips.exr"]["ltsh4.diffuse"][SIZE // 2]
+    image = files["Strips.exr"]["ltsh4c.diffuse"][SIZE // 2]
     red, green, gray = image[SIZE // 6], image[SIZE // 2], image[5 * SIZE // 6]
     assert red[0] > 0.0 == red[1] == red[2] and green[1] > 0.0 == green[0] == green[2]
     assert gray[0] == pytest.approx(gray[1]) and gray[1] == pytest.approx(gray[2]) and gray[0] > 0.0
@@ -169,7 +169,7 @@ def test_the_margin_repeats_the_border_and_conservative_adds_texels(tmp_path):
     _, wide = baked(path, tmp_path / "wide", margin=5)
     _, safe = baked(path, tmp_path / "safe", conservative=True)
     layers, covered = wide["Plane.exr"], plain["Plane.exr"]["coverage.hit"] > 0.0
-    image, before = layers["ltsh4.specular"], plain["Plane.exr"]["ltsh4.specular"]
+    image, before = layers["ltsh4c.specular"], plain["Plane.exr"]["ltsh4c.specular"]
     assert np.array_equal(layers["coverage.hit"] > 0.0, covered) and np.array_equal(image[covered], before[covered])
     rows, columns = np.nonzero(covered)
     top, left, right = rows.min(), columns.min(), columns.max()
@@ -222,8 +222,8 @@ def test_apply_shows_all_light_that_was_baked(tmp_path, passes, shown):
     _, files = baked(save(tmp_path), tmp_path / "out", passes=passes, apply=True, margin=2)
     layers = files.pop("Plane.exr")
     ((name, texture),) = files.items()
-    assert name == f"Plane.ltsh4.{shown[0] if len(shown) == 1 else 'combined'}.exr"
-    assert np.array_equal(texture[""], sum(layers[f"ltsh4.{part}"] for part in shown))
+    assert name == f"Plane.ltsh4c.{shown[0] if len(shown) == 1 else 'combined'}.exr"
+    assert np.array_equal(texture[""], sum(layers[f"ltsh4c.{part}"] for part in shown))
 
 
 def monkey(material):
@@ -260,7 +260,7 @@ def test_points_spread_over_texels_give_the_mean_that_cycles_bakes(tmp_path, kin
         mesh = monkey(waves()).data
         for loop in (loop for face in mesh.polygons if face.center.x > 0.0 for loop in face.loop_indices):
             mesh.uv_layers.active.uv[loop].vector.x += 1.0
-    options = {"techniques": ("ltsh4",), "error": True, "cycles_samples": 256, "sub_samples": 16}
+    options = {"techniques": ("ltsh4c",), "error": True, "cycles_samples": 256, "sub_samples": 16}
     report, _ = baked(save(tmp_path), tmp_path / "out", **options)
     tiles = report["objects"][0]["tiles"]
     assert list(tiles) == (["1001"] if kind == "plain" else ["1001", "1002"])
@@ -282,12 +282,12 @@ def test_apply_saves_a_file_whose_object_shows_the_texture(tmp_path):
     output = tmp_path / "out"
     report, files = baked(path, output, passes=("specular", "combined"), apply=True)
     assert path.read_bytes() == before and report["applied"] == "scene_baked.blend"
-    assert set(files) == {"Plane.exr", "Plane.ltsh4.combined.exr"}
-    combined = files["Plane.exr"]["ltsh4.combined"]
-    assert np.array_equal(files["Plane.ltsh4.combined.exr"][""], combined)
+    assert set(files) == {"Plane.exr", "Plane.ltsh4c.combined.exr"}
+    combined = files["Plane.exr"]["ltsh4c.combined"]
+    assert np.array_equal(files["Plane.ltsh4c.combined.exr"][""], combined)
     bpy.ops.wm.open_mainfile(filepath=str(output / report["applied"]))
     (image,) = [image for image in bpy.data.images if image.name.startswith("Plane")]
-    assert image.filepath == "//Plane.ltsh4.combined.exr"
+    assert image.filepath == "//Plane.ltsh4c.combined.exr"
     assert bpy.data.objects["Plane"].material_slots[0].material.name == "Material (baked Plane)"
     # A light shines on emission in vain: the picture is the texture, texel for pixel.
     scene = bpy.context.scene

@@ -64,7 +64,7 @@ def test_linked_objects_are_named_with_their_library_and_linked_materials_are_ba
         for name in ("Linked", "Linked mesh")
     ]
     layers = files["Linked material.exr"]
-    assert layers["ltsh4.specular"].max() > 0.0 and layers["coverage.hit"].all()
+    assert layers["ltsh4c.specular"].max() > 0.0 and layers["coverage.hit"].all()
 
 
 def test_faces_without_area_on_the_texture_leave_the_others_as_they_are(odd):
@@ -136,7 +136,7 @@ def test_uv_maps_and_materials_that_modifiers_bring_in_are_baked_as_by_cycles(ma
     assert report["problems"] == [] and not [line for line in report["warnings"] if "left out" in line]
     layers = files[f"{ob.name}.exr"]
     covered = layers["coverage.hit"] > 0.0
-    ours, cycles = layers["ltsh4.diffuse"][covered], layers["cycles.diffuse"][covered]
+    ours, cycles = layers["ltsh4c.diffuse"][covered], layers["cycles.diffuse"][covered]
     assert cycles.min() >= 0.0 and cycles.mean() > 0.01
     assert np.linalg.norm(ours - cycles) <= 0.02 * np.linalg.norm(cycles)
 
@@ -157,7 +157,7 @@ def test_light_groups_are_layers_and_each_is_the_light_of_its_own_lights(tmp_pat
         bpy.data.objects.remove(bpy.data.objects[name])
     _, files = baked(save(tmp_path), tmp_path / "alone")
     for pass_name in ("specular", "diffuse"):
-        layer = f"ltsh4.{pass_name}"
+        layer = f"ltsh4c.{pass_name}"
         assert {name for name in layers if name.startswith(f"{layer}@")} == {
             f"{layer}@{group}" for group in ("Key", "Fill", "ungrouped")
         }
@@ -257,7 +257,7 @@ def test_resume_bakes_again_what_belongs_to_another_job(tmp_path):
     path = save(tmp_path)
     _, first = baked(path, tmp_path / "out", view="above", resume=True)
     _, second = baked(path, tmp_path / "out", view="camera", resume=True)
-    assert np.abs(first["Plane.exr"]["ltsh4.specular"] - second["Plane.exr"]["ltsh4.specular"]).max() > 0.0
+    assert np.abs(first["Plane.exr"]["ltsh4c.specular"] - second["Plane.exr"]["ltsh4c.specular"]).max() > 0.0
     (tmp_path / "out" / "Plane.exr").write_bytes(b"no EXR")
     _, third = baked(path, tmp_path / "out", view="camera", resume=True)
-    assert np.array_equal(second["Plane.exr"]["ltsh4.specular"], third["Plane.exr"]["ltsh4.specular"])
+    assert np.array_equal(second["Plane.exr"]["ltsh4c.specular"], third["Plane.exr"]["ltsh4c.specular"])

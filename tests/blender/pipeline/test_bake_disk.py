@@ -91,7 +91,7 @@ def test_a_blend_for_which_the_disk_is_too_small_is_not_left_half_written(scene,
     said = capfd.readouterr().err
     assert said == f"ltsh: {output}: Blender could not save the whole .blend there; is the disk full?\n"
     assert not kills.is_writing(small_disk) and list(small_disk.rglob("*.blend")) == []
-    assert (output / "Small.ltsh4.combined.exr").is_file()
+    assert (output / "Small.ltsh4c.combined.exr").is_file()
 
 
 def test_a_full_disk_for_temporary_files_is_one_line(small_disk, tmp_path, capfd, monkeypatch):
@@ -136,4 +136,4 @@ def test_a_blend_that_cannot_be_saved_is_named(scene, tmp_path, capsys):
     assert cli.main(["bake", str(scene), "-o", str(tmp_path / "out"), *options]) == 1
     expected = f"ltsh: {tmp_path}/out/scene_baked.blend: cannot be written: a folder has that name\n"
     assert capsys.readouterr().err == expected
-    assert (tmp_path / "out" / "Small.ltsh4.combined.exr").is_file() and not kills.is_writing(tmp_path / "out")
+    assert (tmp_path / "out" / "Small.ltsh4c.combined.exr").is_file() and not kills.is_writing(tmp_path / "out")

@@ -49,7 +49,7 @@ def test_an_animation_of_finished_pictures_stands_still_and_goes_on_after_a_kill
 
     trial = kills.Trial(command, tmp_path)
     first, second = (imaging.read_layers(path) for path in sorted((tmp_path / "whole").glob("*.exr")))
-    assert first["rest"].any() and first["ltsh4.diffuse"].any()
+    assert first["rest"].any() and first["ltsh4c.diffuse"].any()
     assert all(np.array_equal(first[name], second[name]) for name in first)
     half = tmp_path / "half"
     assert trial.runs.end_when(command(half, "--resume"), lambda: (half / "render_0001.exr").exists())

@@ -197,8 +197,8 @@ def test_faces_whose_smooth_normals_point_to_their_other_side_are_lit_as_in_cycl
         scene_parts.save(path)
         layers = bake_scenes.baked(path, tmp_path / f"bake {scale:g}", **options)[1]["Face.exr"]
         for part in ("specular", "diffuse"):
-            found, expected = (layers[f"{name}.{part}"].mean() for name in ("ltsh4", "cycles"))
-            # LTSH4's own error; light that started below the face would be lost.
+            found, expected = (layers[f"{name}.{part}"].mean() for name in ("ltsh4c", "cycles"))
+            # LTSH4C's own error; light that started below the face would be lost.
             assert expected > 0.0 and abs(found / expected - 1.0) < 0.03, (part, scale)
 
 
@@ -218,6 +218,6 @@ def test_what_a_curved_surface_chooses_starts_at_its_faces_as_in_cycles_bake(tmp
     options = {"shadows": "on", "shadow_rays": 256, "error": True, "cycles_samples": 256, "objects": ("Face",)}
     layers = bake_scenes.baked(path, tmp_path / "bake", **options)[1]["Face.exr"]
     halves = np.stack([layers[f"cycles_{half}.specular"] for half in "AB"])
-    squared, _ = bias(layers["ltsh4.specular"], halves)
-    # Measured: 2.5 %, mostly LTSH4's own; 42 % where all rays start above the surface.
+    squared, _ = bias(layers["ltsh4c.specular"], halves)
+    # Measured: 2.5 %, mostly LTSH4C's own; 42 % where all rays start above the surface.
     assert squared < 0.04**2

@@ -23,7 +23,7 @@ def scene(tmp_path):
 def show_results():
     """A function that shows random results as `ltsh compare` leaves them; it returns {layer: (H, W, 3)}."""
 
-    def show(scene, folder, seed=1, names=("ltc", "ltsh4", "cycles"), report=EMPTY, partial=""):
+    def show(scene, folder, seed=1, names=("ltc", "ltsh4c", "cycles"), report=EMPTY, partial=""):
         random, passes = np.random.default_rng(seed), tuple(report["passes"]) or ("specular", "diffuse")
         output = folder / "ltsh" / "compare"
         output.mkdir(parents=True, exist_ok=True)

@@ -18,10 +18,10 @@ from ltsh_addon.blender.ui import operators, results
 ROOT = Path(__file__).resolve().parents[3]
 # Runs a job until its first stage, and waits to be killed or cancels it and ends.
 OWNER = """
-import json, threading, time
-from ltsh_addon.blender.ui.job import Job, new_folder
-from ltsh_addon.blender.ui.job import Plan, Step
-job = Job("Job", Plan([Step("Starting", 1.0)]), new_folder(), "compare", 0)
+import json, tempfile, threading, time
+from pathlib import Path
+from ltsh_addon.blender.ui.job import Job, Plan, Step
+job = Job("Job", Plan([Step("Starting", 1.0)]), Path(tempfile.mkdtemp(prefix="ltsh-")), "compare", 0)
 job.start(json.loads({runs!r}), background=False)
 while not job.finished and job.stage == "Starting":
     job.poll()
@@ -57,11 +57,11 @@ def test_cancelling_keeps_what_is_finished_and_marks_it(never_ends, stop):
         assert bpy.ops.ltsh.cancel() == {"FINISHED"}
         hand.send()
     assert hand.outcome == {"FINISHED"} and hand.context.timers == []
-    assert hand.reports == [("WARNING", "Compare with Cycles was cancelled; kept: LTC, LTSH 4")]
+    assert hand.reports == [("WARNING", "Compare with Cycles was cancelled; kept: LTC, LTSH 4c")]
     assert operators.running_job() is None and ended(job)
     result = results.result_of(never_ends)
     assert result.partial == job_module.NO_CYCLES
-    assert image_pixels("LTSH ltsh4.combined").max() > 0.0
+    assert image_pixels("LTSH ltsh4c.combined").max() > 0.0
     # The choice is there again when Cycles is.
     assert never_ends.ltsh.second == "cycles"
 
@@ -82,7 +82,7 @@ def test_a_job_whose_window_is_closed_goes_on_in_another(never_ends):
     assert other.context.status.startswith("Compare with Cycles: ")
     other.send("ESC", "PRESS")
     assert other.outcome == {"FINISHED"} and operators.running_job() is None and ended(job)
-    assert other.reports == [("WARNING", "Compare with Cycles was cancelled; kept: LTC, LTSH 4")]
+    assert other.reports == [("WARNING", "Compare with Cycles was cancelled; kept: LTC, LTSH 4c")]
 
 
 def test_one_job_at_a_time_and_cancelling_one_without_results_says_so(never_ends):

@@ -43,7 +43,7 @@ def pictures(addon, tmp_path, show_results):
 def show(scene, rows, layers):
     """Put pictures of lights beside the results, and show these anew."""
     folder = results.result_of(scene).folder
-    facts = {"camera": "Camera", "frame": 1, "technique": "ltsh4", "notes": []}
+    facts = {"camera": "Camera", "frame": 1, "technique": "ltsh4c", "notes": []}
     LightPictures(tuple(rows), layers, np.ones((HEIGHT, WIDTH), np.float32), facts).save(folder / "lights.npz")
     results._mixer["stamp"] = None
     results.show(scene, folder)
@@ -205,7 +205,7 @@ def shaded(tmp_path):
     from job_window import add_on_in_room
 
     with add_on_in_room(tmp_path / "room.blend") as scene:
-        scene.ltsh.techniques = {"ltsh4"}
+        scene.ltsh.techniques = {"ltsh4c"}
         fill = parts.add_area_light("Fill", location=(-1.0, 0.5, 1.5), size=0.5)
         parts.link(bpy.data.objects.new("Sun", bpy.data.lights.new("Sun", "SUN")), rotation=(0.5, 0.0, 0.0))
         parts.add_sphere(parts.principled("Ball")[0], smooth=False, radius=0.3, location=(0.0, 0.0, 0.6))
@@ -215,7 +215,7 @@ def shaded(tmp_path):
 
 def picture_of(scene):
     layers = imaging.read_layers(results.result_of(scene).folder.parent / "shade.exr")
-    return layers["ltsh4.specular"] + layers["ltsh4.diffuse"]
+    return layers["ltsh4c.specular"] + layers["ltsh4c.diffuse"]
 
 
 @pytest.mark.newest

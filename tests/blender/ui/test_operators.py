@@ -40,16 +40,16 @@ def command_line(*arguments):
 def test_a_comparison_shows_what_the_command_line_writes(scene, tmp_path, reported):
     assert bpy.ops.ltsh.compare() == {"FINISHED"}
     assert [job.STARTING, *reported] == planned("compare")
-    command_line("compare", tmp_path / "room.blend", "-o", tmp_path / "out", "--techniques", "ltc,ltsh4",
+    command_line("compare", tmp_path / "room.blend", "-o", tmp_path / "out", "--techniques", "ltc,ltsh4c",
                  "--cycles-samples", "4")  # fmt: skip
     expected = imaging.read_layers(tmp_path / "out" / "compare.exr")
-    for name in ("ltc", "ltsh4", "cycles", "error_ltsh4"):
+    for name in ("ltc", "ltsh4c", "cycles", "error_ltsh4c"):
         np.testing.assert_array_equal(image_pixels(f"LTSH {name}.combined"), expected[f"{name}.combined"][..., :3])
     scene.ltsh.pass_name = "specular"
-    for name in ("ltsh4", "cycles", "error_ltc"):
+    for name in ("ltsh4c", "cycles", "error_ltc"):
         np.testing.assert_array_equal(image_pixels(f"LTSH {name}.specular"), expected[f"{name}.specular"])
-    assert not expected["ltsh4.specular"].max() == 0.0
-    assert bpy.data.images["LTSH error_ltsh4.combined"].colorspace_settings.name == "Non-Color"
+    assert not expected["ltsh4c.specular"].max() == 0.0
+    assert bpy.data.images["LTSH error_ltsh4c.combined"].colorspace_settings.name == "Non-Color"
     files = [tmp_path / folder / "compare.exr" for folder in ("ltsh/compare", "out")]
     assert files[0].read_bytes() == files[1].read_bytes() and operators.running_job() is None
 
@@ -80,11 +80,11 @@ def test_shading_and_baking_show_what_the_command_line_writes(scene, tmp_path, r
 
 
 def baked(scene, tmp_path):
-    """A bake of the floor as the job leaves it: specular and diffuse of LTSH 4; their sum (H, W, 3)."""
+    """A bake of the floor as the job leaves it: specular and diffuse of LTSH 4c; their sum (H, W, 3)."""
     output = tmp_path / "ltsh" / "bake"
     output.mkdir(parents=True)
     pictures = np.random.default_rng(5).random((2, 6, 10, 3), np.float32)
-    layers = {f"ltsh4.{part}": picture for part, picture in zip(("specular", "diffuse"), pictures, strict=True)}
+    layers = {f"ltsh4c.{part}": picture for part, picture in zip(("specular", "diffuse"), pictures, strict=True)}
     channels = {f"{layer}.{letter}": picture[..., index] for layer, picture in layers.items()
                 for index, letter in enumerate("RGB")}  # fmt: skip
     write_channels(output / "Floor.exr", channels)
@@ -103,7 +103,9 @@ def test_a_bake_is_shown_in_the_scene_and_taken_back(scene, tmp_path):
         (slot,) = floor.material_slots
         (group,) = [node.node_tree for node in slot.material.node_tree.nodes if node.type == "GROUP"]
         (texture,) = [node for node in group.nodes if node.type == "TEX_IMAGE"]
-        assert Path(bpy.path.abspath(texture.image.filepath)) == tmp_path / "ltsh" / "bake" / "Floor.ltsh4.combined.exr"
+        assert (
+            Path(bpy.path.abspath(texture.image.filepath)) == tmp_path / "ltsh" / "bake" / "Floor.ltsh4c.combined.exr"
+        )
         np.testing.assert_array_equal(image_pixels(texture.image.name), expected)
         assert slot.link == "OBJECT" and floor.data.materials[0] == former
         assert len(set(bpy.data.materials) - materials) == 1

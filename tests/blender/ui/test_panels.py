@@ -31,7 +31,7 @@ def classes(base):
 def add_results(scene, tmp_path, show_results):
     """A function that shows results of these pictures."""
 
-    def add(partial="", names=("ltsh4", "cycles")):
+    def add(partial="", names=("ltsh4c", "cycles")):
         row = {"relative_l2": 0.1234, "bias": -0.0151, "flip": 0.0321, "unbiased_squared_error": 0.01}
         rows = {name: {"against_cycles": row} for name in names if name != "cycles"}
         passes = {"specular": {"noise": 0.02, "techniques": rows}}
@@ -95,7 +95,7 @@ def test_every_panel_draws_in_every_state(scene, tmp_path, add_results, width):
     draw_all()
     results.state["job"] = None
     for partial in ("Not complete: without Cycles", ""):
-        add_results(partial, ("ltc", "ltsh4") if partial else ("ltc", "ltsh4", "cycles"))
+        add_results(partial, ("ltc", "ltsh4c") if partial else ("ltc", "ltsh4c", "cycles"))
         draw_all()
     bpy.ops.object.select_all(action="SELECT")
     for mode in ("A", "WIPE", "SIDE", "ERROR"):
@@ -282,14 +282,14 @@ def test_lights_and_materials_are_listed_with_what_is_not_exact(scene):
 def test_numbers_are_those_of_the_report(scene, tmp_path, add_results):
     add_results()
     shown = drawn(RESULTS)
-    for number in ("L2 %", "12.34", "-1.51", "0.0321", "Noise of Cycles 2.00 %", "LTSH 4 10.00 %"):
+    for number in ("L2 %", "12.34", "-1.51", "0.0321", "Noise of Cycles 2.00 %", "LTSH 4c 10.00 %"):
         assert number in texts(shown).replace("\u00a0", " "), number
     narrow = texts(drawn(RESULTS, width=220)).replace("\u00a0", " ")
-    assert "LTSH 4: L2 12.34 %, bias -1.51 %, FLIP 0.0321" in narrow
+    assert "LTSH 4c: L2 12.34 %, bias -1.51 %, FLIP 0.0321" in narrow
     assert "Not complete" not in narrow
     assert buttons(shown)["ltsh.save_exr"] and "ltsh_warnings" in [item.what for item in shown if item.kind == "panel"]
     # While the job runs that adds Cycles; pictures that a cancelled job left are what they are.
-    add_results("Not complete: without Cycles", ("ltc", "ltsh4"))
+    add_results("Not complete: without Cycles", ("ltc", "ltsh4c"))
     job = results.state["job"] = Job("Compare with Cycles", Plan([Step("Cycles A", 1.0)]), tmp_path, "compare", 0)
     job.results.append(results.result_of(scene).folder)
     assert "Not complete: without Cycles" in texts(drawn(RESULTS))
@@ -310,7 +310,7 @@ def test_the_image_editor_offers_the_pictures_that_are_there(scene, add_results)
 
 @pytest.mark.parametrize("mode", ["WIPE", "SIDE", "ERROR", "A"])
 def test_a_picture_alone_is_shown_whole_whatever_the_mode(scene, add_results, mode):
-    add_results(names=("ltsh4",))
+    add_results(names=("ltsh4c",))
     scene.ltsh.mode = mode
     shown = drawn(panels.LTSH_PT_IMAGE_results)
     assert not {"second", "split", "error_scale"} & {item.what for item in shown}

@@ -1,6 +1,7 @@
 """Results as images: wipe, difference, probe, numbers, multi-layer files, presets, the manual."""
 
 import json
+import re
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -16,9 +17,10 @@ from ltsh_addon.blender.ui import comparison, operators, results
 from ltsh_addon.blender.ui import settings as settings_module
 from ltsh_addon.blender.ui.overlay import INK, PLATE, label_places
 from ltsh_addon.imaging.color import signed_error_colors
+from ltsh_addon.scene import COMPARED_TECHNIQUES, DEFAULT_TECHNIQUE
 
 HEIGHT, WIDTH = 6, 10
-PICTURES = ("ltc", "ltsh4", "cycles")
+PICTURES = ("ltc", "ltsh4c", "cycles")
 
 
 def seen():
@@ -41,7 +43,7 @@ def test_left_of_the_line_is_the_first_picture_and_right_the_second(scene, pictu
     """A dragged line is seen before the settings know it."""
     for split, columns in ((0.0, 0), (0.3, 3), (1.0, WIDTH)):
         expected = pictures["cycles.combined"].copy()
-        expected[:, :columns] = pictures["ltsh4.combined"][:, :columns]
+        expected[:, :columns] = pictures["ltsh4c.combined"][:, :columns]
         scene.ltsh.split = split
         np.testing.assert_array_equal(seen(), expected)
         scene.ltsh.split = 0.5
@@ -71,7 +73,7 @@ def test_changing_technique_and_pass_changes_the_picture_at_once(scene, pictures
 
 def test_side_by_side_and_swapped(scene, pictures):
     scene.ltsh.mode = "SIDE"
-    sides = [pictures["ltsh4.combined"], pictures["cycles.combined"]]
+    sides = [pictures["ltsh4c.combined"], pictures["cycles.combined"]]
     np.testing.assert_array_equal(seen(), np.concatenate(sides, axis=1))
     bpy.ops.ltsh.swap()
     np.testing.assert_array_equal(seen(), np.concatenate(sides[::-1], axis=1))
@@ -83,7 +85,7 @@ def test_the_difference_has_the_colors_of_the_sheet(scene, pictures):
     image = bpy.data.images["LTSH Comparison"]
     assert not image.use_view_as_render
     weights = np.array([0.2126, 0.7152, 0.0722])
-    difference = (pictures["ltsh4.combined"] - pictures["cycles.combined"]) @ weights
+    difference = (pictures["ltsh4c.combined"] - pictures["cycles.combined"]) @ weights
     linear = seen().astype(np.float64)
     shown = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)
     # The colors stand in a table of 1023 steps of the whole range.
@@ -111,7 +113,7 @@ def test_the_probe_reads_every_picture_at_the_pixel(scene, pictures):
     result, choice = result_and_choice(scene)
     for point, place in (((0.0, 0.0), (0, 0)), ((1.0, 1.0), (WIDTH - 1, HEIGHT - 1)), ((0.55, 0.2), (5, 1))):
         pixel, rows = comparison.values_at(scene, result, choice, point)
-        assert pixel == place and [label for label, _ in rows] == ["LTC", "LTSH 4", "Cycles"]
+        assert pixel == place and [label for label, _ in rows] == ["LTC", "LTSH 4c", "Cycles"]
         for name, (_, values) in zip(PICTURES, rows, strict=True):
             expected = pictures[f"{name}.combined"][HEIGHT - 1 - place[1], place[0]]
             np.testing.assert_array_equal(np.float32(values), expected)
@@ -148,8 +150,8 @@ def test_another_file_gets_nothing_of_what_was_shown_before(addon, tmp_path, sho
 def test_new_results_replace_the_old_pictures(scene, tmp_path, show_results):
     pictures = show_results(scene, tmp_path, seed=2)
     scene.ltsh.mode = "A"
-    np.testing.assert_array_equal(seen(), pictures["ltsh4.combined"])
-    assert len([image for image in bpy.data.images if image.name.startswith("LTSH ltsh4")]) == 1
+    np.testing.assert_array_equal(seen(), pictures["ltsh4c.combined"])
+    assert len([image for image in bpy.data.images if image.name.startswith("LTSH ltsh4c")]) == 1
 
 
 @pytest.mark.parametrize("damage", ["folder gone", "picture gone", "index broken"])
@@ -179,7 +181,7 @@ def test_two_scenes_have_results_of_their_own(scene, tmp_path, show_results):
     np.testing.assert_array_equal(seen(), first)
     image = comparison.viewer_image(other)
     assert image.name == "LTSH Comparison.001"
-    assert abs(image.pixels[0] - pictures["ltsh4.combined"][-1, 0, 0]) == 0.0
+    assert abs(image.pixels[0] - pictures["ltsh4c.combined"][-1, 0, 0]) == 0.0
 
 
 def test_the_multilayer_file_is_the_one_of_the_command(scene, tmp_path):
@@ -197,9 +199,9 @@ def test_figures_of_passes_that_the_report_lacks_are_measured(scene, tmp_path):
     """The report here has none at all: relative L2 by its definition, from both halves of Cycles."""
     index = json.loads((tmp_path / "ltsh" / "compare" / "images" / "index.json").read_text())
     layers = imaging.read_layers(tmp_path / "ltsh" / "compare" / "compare.exr")
-    row = index["groups"][""]["figures"]["specular"]["techniques"]["ltsh4"]
+    row = index["groups"][""]["figures"]["specular"]["techniques"]["ltsh4c"]
     halves = [layers[f"cycles_{half}.specular"].astype(np.float64) for half in "AB"]
-    technique = layers["ltsh4.specular"]
+    technique = layers["ltsh4c.specular"]
     squared = ((technique - halves[0]) * (technique - halves[1])).sum() / (halves[0] * halves[1]).sum()
     assert row["unbiased_squared_error"] == pytest.approx(squared, rel=1e-6)
     assert 0.0 < row["flip"] < 1.0
@@ -250,9 +252,20 @@ def test_presets_of_ours_set_everything_they_name(scene):
     for path in files:
         assert bpy.ops.script.execute_preset(filepath=str(path), menu_idname="LTSH_PT_presets") == {"FINISHED"}
         seen_values.add(tuple(str(getattr(scene.ltsh, name)) for name in settings_module.KEPT))
-        named = [line.split("=")[0].strip() for line in path.read_text().splitlines() if line.startswith("settings.")]
-        assert set(named) <= {f"settings.{name}" for name in settings_module.KEPT}
+        named = re.findall(r'^settings\.(?:property_unset\("(\w+)"\)|(\w+) = )', path.read_text(), re.MULTILINE)
+        assert len(named) == path.read_text().count("settings.")
+        assert {first or second for first, second in named} <= set(settings_module.KEPT)
     assert len(seen_values) == 3
+
+
+@pytest.mark.newest
+def test_files_keep_the_techniques_that_they_were_saved_with(scene, tmp_path):
+    assert (scene.ltsh.techniques, scene.ltsh.first) == (set(COMPARED_TECHNIQUES), DEFAULT_TECHNIQUE)
+    assert scene.ltsh_view.technique == DEFAULT_TECHNIQUE
+    scene.ltsh.techniques, scene.ltsh_view.technique = {"ltc", "ltsh4"}, "ltsh4"
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "before.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "before.blend"))
+    assert (bpy.context.scene.ltsh.techniques, bpy.context.scene.ltsh_view.technique) == ({"ltc", "ltsh4"}, "ltsh4")
 
 
 def test_a_preset_of_the_artist_brings_the_settings_back(scene, tmp_path, monkeypatch):

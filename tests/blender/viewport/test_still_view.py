@@ -600,8 +600,8 @@ def test_what_a_view_leaves_out_is_named_and_hides_nothing(capsys, tmp_path):
     assert warnings[0] == []
     for part in ("Hair", "Sign", "Cloud: point clouds", "Plane: shown as any surface"):
         assert any(part in line for line in warnings[1]), (part, warnings[1])
-    np.testing.assert_array_equal(layers[0]["ltsh4.combined"], layers[1]["ltsh4.combined"])
-    assert run(capsys, "shade", path, "-o", tmp_path / "shade", "--techniques", "ltsh4", "--quiet")[0] == 0
+    np.testing.assert_array_equal(layers[0]["ltsh4c.combined"], layers[1]["ltsh4c.combined"])
+    assert run(capsys, "shade", path, "-o", tmp_path / "shade", "--techniques", "ltsh4c", "--quiet")[0] == 0
     seen = imaging.read_layers(tmp_path / "shade" / "shade.exr")["coverage.hit"]
     assert np.abs(layers[0]["coverage.hit"] - seen).mean() < 0.01
 
@@ -616,7 +616,7 @@ def test_a_view_after_a_render_with_grease_pencil(capsys, tmp_path):
     for _ in range(2):
         arguments = ("-o", tmp_path / "view", "--refine", 1, "--shadows", "off", "--quiet")
         assert run(capsys, "view", path, *arguments)[::2] == (0, "")
-        found.append(imaging.read_layers(tmp_path / "view" / "view.exr")["ltsh4.combined"])
+        found.append(imaging.read_layers(tmp_path / "view" / "view.exr")["ltsh4c.combined"])
         arguments = ("--resolution", "8x8", "--cycles-samples", 2, "--quiet")
         assert run(capsys, "render", path, "-o", tmp_path / "render", *arguments)[0] == 0
     np.testing.assert_array_equal(*found)

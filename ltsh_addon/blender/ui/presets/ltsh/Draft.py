@@ -2,7 +2,7 @@ import bpy
 
 settings = bpy.context.scene.ltsh
 
-settings.techniques = {"ltc", "ltsh4"}
+settings.property_unset("techniques")
 settings.resolution_percentage = 50
 settings.anti_aliasing = 1
 settings.cycles_samples = 64

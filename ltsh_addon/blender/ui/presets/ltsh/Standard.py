@@ -2,7 +2,7 @@ import bpy
 
 settings = bpy.context.scene.ltsh
 
-settings.techniques = {"ltc", "ltsh4"}
+settings.property_unset("techniques")
 settings.resolution_percentage = 100
 settings.anti_aliasing = 4
 settings.cycles_samples = 256

@@ -172,7 +172,8 @@ class RatioEstimator:
             z = (np.arange(LOOKED_AT**2) + 0.5) * (2.0 / LOOKED_AT**2) - 1.0
             turn = (np.sqrt(1.0 - z * z), np.arange(len(z)) * np.pi * (3.0 - np.sqrt(5.0)))
             normal = np.column_stack([turn[0] * np.cos(turn[1]), turn[0] * np.sin(turn[1]), z])
-            points, margin = light.center + light.radius * normal, GAP * np.abs(light.center).sum() + 1e-12
+            # The directions to a small light are uncertain.
+            points, margin = light.center + light.radius * normal, 0.1 * near + GAP * np.abs(light.center).sum()
             length += light.radius
         else:
             s, t = np.meshgrid(*2 * [(np.arange(LOOKED_AT) + 0.5) * (2.0 / LOOKED_AT) - 1.0])

@@ -140,7 +140,8 @@ class LookupTable:
         parameters, (total, count) = self.warp.shape[2], self.coefficients.shape[2:]
         curves = total if curves is None else curves
         wanted = self._channels[: parameters + curves * count]
-        channels = _interpolate(wanted, self.warp.shape[:2], roughness, _theta_coordinate(cosine))
+        column = 1.0 - np.sqrt(np.maximum(1.0 - np.arccos(cosine) * (2.0 / np.pi), 0.0))
+        channels = _interpolate(wanted, self.warp.shape[:2], roughness, column)
         alpha = np.maximum(roughness * roughness, dtype.type(MIN_ALPHA))
         return Lobe(
             *warp_entries(cosine, alpha, *channels[:3]),
@@ -194,10 +195,6 @@ def warp_entries(cosine, alpha, a, b, c, sine=None):
         sine = np.sqrt(np.maximum(1.0 - cosine * cosine, 0.0))
     squared = cosine * cosine + (WARP_REGULARIZATION * alpha * sine) ** 2
     return a * squared, a * b * np.sqrt(squared) * sine, c, 2.0 * alpha
-
-
-def _theta_coordinate(cosine):
-    return 1.0 - np.sqrt(np.maximum(1.0 - np.arccos(cosine) * (2.0 / np.pi), 0.0))
 
 
 def theta_nodes(count: int) -> np.ndarray:

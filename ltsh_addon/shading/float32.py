@@ -16,7 +16,7 @@ import numpy as np
 from ..emitters import light_profile, profile_regions, small_lights
 from ..emitters.facing import AnalyticLobe, FacingDisk, mean_emission
 from ..emitters.light_polygons import interpolated, light_levels, local_corners, may_reach, off_plane
-from ..emitters.light_tree import FEWEST, LightTree, add_far_lights
+from ..emitters.light_tree import FEWEST, LightTree, add_far_lights, is_special
 from ..emitters.sky_map import SkyMap
 from ..emitters.tails import LightFromPoints, TailLimits
 from ..lobes import moments32
@@ -39,6 +39,8 @@ def shade_diffuse(samples, lights, radiance, scratch, leftovers=None):
 
     A list `leftovers` receives the pairs for `float64.shade_pairs`, if they are fewer than FLOAT64_CHUNK: (samples
     (N,), lights (N,)), where a light's number is its position among those that affect diffuse lobes.
+
+    Returns the numbers (M,) of the samples that are shaded in double precision, without the `leaves` of `lights`.
     """
     lights = Lights.of(lights, "diffuse")
     lit = np.nonzero(lobes32.any_component(samples.diffuse_albedo))[0]
@@ -47,7 +49,8 @@ def shade_diffuse(samples, lights, radiance, scratch, leftovers=None):
         bumped = lobes32.any_component(samples.diffuse_normal != samples.smooth_normal)[lit]
     lighting = _Lighting(samples, lights, radiance, scratch, float64.shade_diffuse)
     shaped = ((samples.sheen_a != 0.0) | (samples.diffuse_roughness != 0.0))[lit]
-    lighting.add_in_float64(lit[shaped])
+    in_float64 = lit[shaped]
+    lighting.add_in_float64(in_float64)
     lit, bumped = lit[~shaped], bumped[~shaped]
     for is_bumped, members in ((False, lit[~bumped]), (True, lit[bumped])):
         for index in _chunks(members):
@@ -62,6 +65,7 @@ def shade_diffuse(samples, lights, radiance, scratch, leftovers=None):
             others = (samples.bump_alpha2[index],) if is_bumped else ()
             lighting.add(lobes32.Lobes(index, rows, clip_rows, integrate, at_point, colors, 1.0, others=others))
     lighting.finish(leftovers)
+    return in_float64
 
 
 def shade_specular(samples, lights, table, radiance, scratch, leftovers=None):
@@ -86,8 +90,10 @@ def shade_specular(samples, lights, table, radiance, scratch, leftovers=None):
             for index in _chunks(members):
                 lobes = _specular_lobes(samples, index, (table, ridges, vectors), colors_of(index), scratch)
                 lighting.add(replace(lobes, only_tails=only_tails))
-    lighting.add_in_float64(np.nonzero(sharp)[0])
+    in_float64 = np.nonzero(sharp)[0]
+    lighting.add_in_float64(in_float64)
     lighting.finish(leftovers)
+    return in_float64
 
 
 def _specular_lobes(samples, index, kind, colors, scratch) -> lobes32.Lobes:
@@ -158,22 +164,29 @@ class AlikeLights:
 
 
 class Lights(list):
-    """Lights (light, row, corners) that affect one pass. Trees of many lights are built once."""
+    """Lights (light, row, corners) that affect one pass. Trees of many lights are built once.
+
+    The last `leaf_count` are leaves of textured lights.
+    """
+
+    leaf_count = 0
 
     @classmethod
-    def of(cls, lights, name) -> Lights:
-        """Those of `lights` that affect the pass `name`. A Lights object is returned as it is."""
-        return (
-            lights if isinstance(lights, Lights) else cls(one for one in lights if getattr(one[0], f"affects_{name}"))
-        )
+    def of(cls, lights, name, leaves=()) -> Lights:
+        """Those of `lights` and `leaves` that affect the pass `name`. A Lights object is returned as it is."""
+        if isinstance(lights, Lights):
+            return lights
+        lights, leaves = ([one for one in many if getattr(one[0], f"affects_{name}")] for many in (lights, leaves))
+        result = cls(lights + leaves)
+        result.leaf_count = len(leaves)
+        return result
 
     @cached_property
     def trees(self) -> list[tuple[LightTree, list[int]]]:
         """Trees of many lights, and the positions here of their lights."""
         kinds: dict[tuple, list[int]] = {}
         for number, (light, row, _) in enumerate(self):
-            is_plain = not (light.has_profile or light.is_distant or light.is_facing or light.cone is not None)
-            if is_plain and (light.radiance >= 0.0).all():
+            if not is_special(light):
                 kinds.setdefault((row, light.receivers), []).append(number)
         many = [numbers for numbers in kinds.values() if len(numbers) >= FEWEST]
         return [(LightTree.of([self[number][0] for number in numbers]), numbers) for numbers in many]
@@ -450,19 +463,20 @@ class _Lighting:
         return AnalyticLobe(lobes32.as_columns(samples.normal, index), lobes32.as_columns(samples.view, index), alpha)
 
     def add_in_float64(self, members) -> None:
-        """Add the light of all lights at the samples `members` (Q,)."""
+        """Add the light of all lights but leaves at the samples `members` (Q,)."""
+        lights = self.lights[: len(self.lights) - self.lights.leaf_count]
         if len(members) == 0:
             return
-        has_patches = any(float64.has_patches(light) for light, _, _ in self.lights)
-        if not has_patches and len(members) * len(self.lights) < FLOAT64_CHUNK:
-            for (light, _, _), needs_float64 in zip(self.lights, self.needs_float64, strict=True):
+        has_patches = any(float64.has_patches(light) for light, _, _ in lights)
+        if not has_patches and len(members) * len(lights) < FLOAT64_CHUNK:
+            for (light, _, _), needs_float64 in zip(lights, self.needs_float64, strict=False):
                 allowed = light.receives(self.samples.receiver, members)
                 needs_float64.append(members if allowed is None else members[allowed])
             return
         for start in range(0, len(members), FLOAT64_CHUNK):
             index = members[start : start + FLOAT64_CHUNK]
             target = np.zeros((len(self.radiance), len(index), 3))
-            self.shade_in_float64(self.samples.take(index), self.lights, target)
+            self.shade_in_float64(self.samples.take(index), lights, target)
             self.radiance[:, index] += target.astype(np.float32)
 
     def finish(self, leftovers) -> None:

@@ -358,8 +358,7 @@ def test_rays_to_distant_lights_have_no_end():
 @pytest.mark.parametrize("tilt", [0.0, 0.6])
 def test_a_face_just_before_a_light_blocks_it_and_one_just_behind_does_not(kind, tilt):
     """By the geometry. 4 um are 8 float steps of the coordinates here; the rays' ends keep 2, rounding takes 2. Faces
-    that glow block their rays too, so that these end farther away; directions to a tiny light are 5e-6
-    uncertain, with rays of 4 m."""
+    that glow block their rays too, so that these end farther away; rays to a point keep 8."""
     direction = np.array([0.0, np.sin(tilt), -np.cos(tilt)])
     half_u = np.array([0.3, 0.0, 0.0]) * (
         1e-6 if kind in ("BALL", "FACING_DISK") else 0.1 if "cluster" in kind else 1.0
@@ -372,7 +371,7 @@ def test_a_face_just_before_a_light_blocks_it_and_one_just_behind_does_not(kind,
     for x in range(-80, 80, 2) if "cluster" in kind else (0.0,):
         outline = {"corners": center + x * half_u + corners} if is_mesh else {}
         lights.append(panel(center=center + x * half_u, **common, **outline))
-    for before in (6e-5 if is_mesh else 1.5e-4 if half_u[0] < 1e-5 else 4e-6, 3e-4, -4e-6):
+    for before in (6e-5 if is_mesh else 1e-5 if half_u[0] < 1e-5 else 4e-6, 3e-4, -4e-6):
 
         def passed(origins, directions, distances, before=before):
             height = (center - origins) @ direction

@@ -134,9 +134,11 @@ def reports(rig):
     area = rig.area("DOPESHEET_EDITOR")
     area.type = "INFO"
     hands.operate(rig, bpy.ops.info.select_all, action="SELECT", kind="INFO")
-    hands.operate(rig, bpy.ops.info.report_copy, kind="INFO")
+    report_copy = bpy.ops.info.report_copy
+    hands.operate(rig, report_copy, kind="INFO")
     area.ui_type = "TIMELINE"
-    return bpy.context.window_manager.clipboard
+    clipboard = bpy.context.window_manager.clipboard
+    return clipboard
 
 
 def hidden(rig):

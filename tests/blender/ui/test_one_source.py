@@ -100,7 +100,8 @@ def test_saving_elsewhere_keeps_all_results(scene, tmp_path, show_results, elsew
 
 
 def test_without_a_light_none_is_to_be_clicked(scene):
-    lights, panel = [ob for ob in scene.objects if ob.type == "LIGHT"], bpy.types.LTSH_PT_VIEW3D_lights
+    lights = [ob for ob in scene.objects if ob.type == "LIGHT"]
+    panel = next(kind for kind in panels.CLASSES if kind.__name__ == "LTSH_PT_VIEW3D_lights")
     assert lights and "Click a light" in recorded_layout.texts(recorded_layout.drawn(panel))
     for light in lights:
         bpy.data.objects.remove(light)

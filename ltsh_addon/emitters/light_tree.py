@@ -69,7 +69,7 @@ CORNERS = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0
 def is_special(light: Light) -> bool:
     """True for a light that no tree takes."""
     is_plain = not (light.has_profile or light.is_distant or light.is_facing or light.cone is not None)
-    return not is_plain or light.radiance.min() < 0.0 or light.radiance.max() == 0.0
+    return not is_plain or min(radiance := light.radiance.tolist()) < 0.0 or max(radiance) == 0.0
 
 
 @dataclass(frozen=True)

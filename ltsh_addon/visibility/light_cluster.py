@@ -275,10 +275,11 @@ def _kind(light, number, masks) -> tuple:
     if _is_side(light):
         return "sky", light.name
     is_plain = isinstance(light, FlatLight) and not (light.has_profile or light.children)
-    brightest = light.radiance.max()
-    if not is_plain or light.radiance.min() < 0.0 or brightest == 0.0 or not light.area_vector.any():
+    radiance = light.radiance.tolist()
+    brightest = max(radiance)
+    if not is_plain or min(radiance) < 0.0 or brightest == 0.0 or not any(light.area_vector.tolist()):
         return "one", number
-    color = tuple(np.round(light.radiance / brightest, COLOR_DIGITS).tolist())
+    color = tuple(round(value / brightest, COLOR_DIGITS) for value in radiance)
     return "many", light.group, light.receivers, light.affects_diffuse, light.affects_specular, color, masks
 
 

@@ -10,14 +10,24 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
-from ...cycles.environment import CUBE, SkyPicture, bright_spots, sky_lights, spot_frame, spot_light, without_spots
+from ...cycles.environment import (
+    CUBE,
+    SMOOTH_SKY,
+    SkyPicture,
+    bright_spots,
+    fine_detail,
+    sky_lights,
+    spot_frame,
+    spot_light,
+    without_spots,
+)
 from ...scene import Light, SkyLight, listed
 from ..materials.graph import is_group, is_socket, source_of, surface_of, tree_in_use, value_of
 from .emission import CONSTANT_NODES, LIGHT_PATH, OF_CAMERA, open_studio, trees_of
 
-# Pixels along each side of a picture of a world. PLAIN: a world of one color. PROCEDURAL: one without images. LEAST,
-# MOST: limits for one with images. SPOT_PIXELS: a close picture of a small, bright spot.
-PLAIN, PROCEDURAL, LEAST, MOST = 8, 256, 256, 1024
+# Pixels along each side of a picture of a world. PLAIN: a world of one color. SMOOTH: one without fine detail.
+# PROCEDURAL: another without images. LEAST, MOST: limits for one with images. SPOT_PIXELS: a small, bright spot.
+PLAIN, SMOOTH, PROCEDURAL, LEAST, MOST = 8, 64, 256, 256, 1024
 SPOT_PIXELS, SAMPLES, SPOT_SAMPLES = 128, 8, 16
 # COARSE: mean relative error of patches above which there is a warning.
 COARSE = 0.05
@@ -96,11 +106,11 @@ def light_of_world(world) -> Light | None:
     )
 
 
-def world_lights(scene, world, warn) -> list[Light]:
-    """The light of the `world` of `scene` as distant lights that have its name; [] if it is dark."""
+def world_lights(scene, world, warn) -> tuple[list[Light], float]:
+    """The light of the `world` of `scene` as distant lights that have its name, [] if it is dark; its `fine_detail`."""
     like = light_of_world(world)
     if like is None:
-        return []
+        return [], 0.0
     pictures, lights = light_pictures(scene, world, like, warn)
     sky, error = sky_lights(like, pictures)
     if error > COARSE:
@@ -109,15 +119,17 @@ def world_lights(scene, world, warn) -> list[Light]:
             f"world {world.name!r}: it is shaded as {count} patches of constant radiance, which differ from it by "
             f"{100.0 * error:.0f} % on average"
         )
-    return sky + lights
+    return sky + lights, fine_detail(pictures)
 
 
 def light_pictures(scene, world, like: Light, warn) -> tuple[list[SkyPicture], list[Light]]:
     """Six pictures (a cube) of `world` as surfaces see it, without small, bright spots, and lights like `like` for
     these."""
     with _observatory(scene, world, warn) as look:
-        pixels = _pixels(world)
-        pictures = [look(*axes, pixels, SAMPLES if pixels < MOST else SAMPLES // 2) for axes in CUBE]
+        for pixels in dict.fromkeys((min(_pixels(world), SMOOTH), _pixels(world))):
+            pictures = [look(*axes, pixels, SAMPLES if pixels < MOST else SAMPLES // 2) for axes in CUBE]
+            if fine_detail(pictures) <= SMOOTH_SKY:
+                break
         spots = bright_spots(pictures)
         lights = []
         for number, spot in enumerate(spots):

@@ -9,7 +9,7 @@ import statistics
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -96,8 +96,7 @@ def _transmitted(tables, extraction, options: PictureOptions, progress) -> Compa
     behind, shadows = extraction.behind, None
     if behind is None:
         return None
-    if extraction.occluders is not None:
-        behind = replace(behind, occluders=extraction.occluders)
+    if behind.occluders is not None:
         shadows = lighting.trace_shadows(behind, options.passes, options.shadow_rays, progress)
     return Comparison(options, behind, evaluated(tables, behind, shadows, options, progress), shadows)
 

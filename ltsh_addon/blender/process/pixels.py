@@ -201,12 +201,6 @@ def extract_pixels(job: PixelJob, *, progress: Progress | None = None) -> Extrac
             points = renders.points()
         elif not problems:
             warnings += unlit(samples, lights, manifest["camera"]) + faceted(samples, lights)
-        behind, glass = None, renders.glass
-        if glass is not None:
-            warnings.append(
-                f"{100.0 * glass.mean():.3g} % of the picture shows glass: {THROUGH_GLASS[bool(manifest['behind'])]}"
-            )
-            behind = _behind(job, manifest, folder, lights)
         times = (manifest[name] for name in ("seconds", "processor_seconds", "direct_seconds"))
         extraction = Extraction(
             lights=tuple(lights),
@@ -219,24 +213,23 @@ def extract_pixels(job: PixelJob, *, progress: Progress | None = None) -> Extrac
             problems=tuple(problems),
             occluders=Occluders.load(folder / manifest["occluders"]) if manifest["occluders"] else None,
             light_settings=manifest["light_settings"],
-            glass=glass,
-            behind=behind,
+            glass=renders.glass,
             left_to_cycles=left_to_cycles,
             points=points,
         )
+        if extraction.glass is not None and manifest["behind"]:
+            extraction = replace(extraction, behind=_behind(job, manifest, folder, extraction))
     return extraction if job.for_finished else ended_at_horizons(extraction)
 
 
-def _behind(job: PixelJob, manifest: dict, folder: Path, lights: list[Light]) -> Extraction | None:
-    """What is seen through glass; None where that was not rendered."""
-    if not manifest["behind"]:
-        return None
+def _behind(job: PixelJob, manifest: dict, folder: Path, extraction: Extraction) -> Extraction:
+    """What is seen through the glass of `extraction`."""
     renders = _SampleRenders(job, {**manifest, "film_transparent": False}, is_behind=True)
     for name in manifest["behind"]:
         renders.add(rendered_channels(folder / BEHIND / name))
     samples, film = renders.joined()
     cycles = CyclesPasses(None, *renders.not_reflected())
-    return ended_at_horizons(Extraction(tuple(lights), samples, film, PictureFacts.of(manifest), cycles))
+    return ended_at_horizons(replace(extraction, samples=samples, film=film, cycles=cycles))
 
 
 class _SampleRenders:
@@ -321,6 +314,9 @@ class _SampleRenders:
             what = "see a surface whose material could not be read: not shaded"
             warnings.append(f"{100.0 * self._unnamed / total:.3g} % of the samples {what}")
         of_samples = len(warnings)
+        if self.glass is not None:
+            shown = THROUGH_GLASS[bool(self._manifest["behind"])]
+            warnings.append(f"{100.0 * self.glass.mean():.3g} % of the picture shows glass: {shown}")
         warnings += gbuffer.coarse_meshes(samples)
         lost = self._unusable + self._unnamed + int(self._unshaded.sum())
         if 2 * lost > total:

@@ -19,7 +19,9 @@ from ltsh_addon.files import replacing
 from ltsh_addon.imaging.exr import write_channels
 from ltsh_addon.lobes.lookup_table import MIN_ALPHA, WARP_REGULARIZATION, LookupTable, basis_integrals
 from ltsh_addon.scene import VERSION
-from ltsh_addon.shading import header, load_table
+from ltsh_addon.shading import load_table
+
+from . import header
 
 _WARP_NAMES = ("A", "B", "C", "tilt")
 

@@ -15,8 +15,9 @@ import numpy as np
 from ltsh_addon.lobes import brdf
 from ltsh_addon.lobes.lookup_table import LookupTable
 from ltsh_addon.scene import EllipseLight, SurfaceSamples
-from ltsh_addon.shading import evaluate_lobe, header, shade
+from ltsh_addon.shading import evaluate_lobe, shade
 
+from . import header
 from .families import gauss_legendre
 
 IOR = (1.1, 1.2, 1.33, 1.5, 1.8, 2.4, 3.0)

@@ -105,11 +105,6 @@ def sheen_lobe(cosine: np.ndarray, roughness: np.ndarray) -> np.ndarray:
     return lobe
 
 
-def sheen_albedo(cosine: np.ndarray, roughness: np.ndarray) -> np.ndarray:
-    """The albedo (P,) of `sheen_lobe`, with its arguments."""
-    return sheen_lobe(cosine, roughness)[0]
-
-
 def velvet_albedo(cosine: np.ndarray, roughness: np.ndarray) -> np.ndarray:
     """Albedo (P,) of velvet, for `cosine` (P,) between view and normal and for `roughness` (P,).
 

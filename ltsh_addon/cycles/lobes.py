@@ -11,7 +11,7 @@ from ..lobes import diffuse as rough_diffuse
 from ..lobes.brdf import is_clipped
 from ..scene import SurfaceSamples
 from . import closures
-from .closures import sheen_albedo, sheen_lobe
+from .closures import sheen_lobe
 from .horizons import SPECULAR_FIELDS, bump_alpha2, unit, valid_specular_normal
 
 AOV_PREFIX = "ltsh_"
@@ -165,7 +165,7 @@ class LobeSlot:
     def alphas(self) -> np.ndarray:
         """Alphas (2, Q) of GGX along the tangent and across it."""
         alpha = self.roughness**2
-        if not self._has_anisotropy():
+        if "anisotropy" not in self.lobe or not (np.abs(self.value("anisotropy")) > 0.0).any():
             return np.stack([alpha, alpha])
         anisotropy, aspect = self.value("anisotropy"), 1.0
         for kind in BRUSHED_KINDS:
@@ -176,9 +176,6 @@ class LobeSlot:
     def gloss(self) -> np.ndarray:
         """Roughness (Q,) of the reflecting lobes, from the geometric mean of both alphas."""
         return np.sqrt(np.sqrt(self.alphas[0] * self.alphas[1]))
-
-    def _has_anisotropy(self):
-        return "anisotropy" in self.lobe and bool((np.abs(self.value("anisotropy")) > 0.0).any())
 
     def stretch(self) -> dict[str, np.ndarray]:
         """Anisotropy and tangent as in `SurfaceSamples`; {} if no lobe is anisotropic."""
@@ -512,7 +509,7 @@ def _base_samples(slot: LobeSlot, under: np.ndarray) -> _LobeSamples:
     specular = _metal_terms(slot)
     diffuse = np.where(slot.of("diffuse") | slot.of("translucent") | slot.of("velvet"), slot.color, 0.0)
     if slot.of("sheen").any():
-        albedo = sheen_albedo(slot.cosine(slot.normal), slot.roughness)[:, None]
+        albedo = sheen_lobe(slot.cosine(slot.normal), slot.roughness)[0][:, None]
         diffuse = np.where(slot.of("sheen"), slot.color * albedo, diffuse)
     shape = _diffuse_shape(slot) | slot.stretch()
     ior = np.full(len(slot.index), closures.CONDUCTOR_FIT_IOR)

@@ -37,7 +37,10 @@ class ImageTexture:
         """Linear colors (Q, 3) at uv (Q, 2)."""
         height, width = self.pixels.shape[:2]
         values = interpolated(np.asarray(uv, dtype=np.float64), (width, height), self.interpolation, self._at)
-        return _decoded(values) if self.srgb else values
+        if not self.srgb:
+            return values
+        # IEC 61966-2-1
+        return np.where(values <= 0.04045, values / 12.92, ((np.maximum(values, 0.0) + 0.055) / 1.055) ** 2.4)
 
     def _at(self, x, y):
         """Values (Q, 3) of pixels at integers x, y (Q,), which may lie outside the image."""
@@ -73,11 +76,6 @@ def within(index: np.ndarray, size: int, extension: str) -> np.ndarray:
         folded = index % (2 * size)
         return np.where(folded < size, folded, 2 * size - 1 - folded)
     return np.clip(index, 0, size - 1)
-
-
-def _decoded(encoded):
-    """Linear values of sRGB values (IEC 61966-2-1)."""
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((np.maximum(encoded, 0.0) + 0.055) / 1.055) ** 2.4)
 
 
 # Value of texels that Cycles' bake left out, in its maps and its radiance.
@@ -213,7 +211,8 @@ def texel_samples(
     """
     true_normals = mesh.true_normals()
     corrected = np.array([material.corrected for material in materials], dtype=bool)
-    maps = {number: read_map(number) for number in _maps_read(materials)}
+    values = (value for material in materials for lobe in material.lobes for value in lobe.values())
+    maps = {number: read_map(number) for number in {value.map for value in values if isinstance(value, MapValue)}}
     pieces, index = [], []
     for start in range(0, max(len(texels.index), 1), HITS_PER_BLOCK):
         block = slice(start, start + HITS_PER_BLOCK)
@@ -237,12 +236,6 @@ def texel_samples(
         pieces.append(samples)
         index.append(texel[of_sample] + start)
     return SurfaceSamples.joined(pieces), np.concatenate(index)
-
-
-def _maps_read(materials) -> set[int]:
-    """Numbers of the maps that some material reads."""
-    values = (value for material in materials for lobe in material.lobes for value in lobe.values())
-    return {value.map for value in values if isinstance(value, MapValue)}
 
 
 def _interpolated(values, triangle, weights):

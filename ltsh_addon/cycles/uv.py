@@ -283,7 +283,8 @@ def _side_rows(start, end, first_row, row_count, height):
 
 def _touching_spans(corners, first_row, row_count, width):
     """(triangle, row, first x, last x) of the runs of unit squares that triangles (T, 3, 2) touch."""
-    low, middle, high = _by_height(corners)
+    order = np.argsort(corners[:, :, 1], axis=1, kind="stable")
+    low, middle, high = np.moveaxis(np.take_along_axis(corners, order[:, :, None], axis=1), 1, 0)
     area = cross(middle - low, high - low)
     solid = np.flatnonzero(np.isfinite(area) & (area != 0.0))
     low, middle, high = low[solid], middle[solid], high[solid]
@@ -299,12 +300,6 @@ def _touching_spans(corners, first_row, row_count, width):
     low_x, high_x = np.min(ends, axis=0), np.max(ends, axis=0)
     last_x = np.maximum(np.ceil(high_x) - 1.0, np.floor(low_x))
     return solid[triangle], row, np.floor(low_x), np.minimum(last_x, width - 1.0)
-
-
-def _by_height(corners):
-    """Corners (T, 3, 2) sorted by y: three arrays (T, 2)."""
-    order = np.argsort(corners[:, :, 1], axis=1, kind="stable")
-    return np.moveaxis(np.take_along_axis(corners, order[:, :, None], axis=1), 1, 0)
 
 
 def _rows_of(first, last, first_row, row_count):

@@ -2,8 +2,8 @@
 
 The lights of a group are the leaves of a binary tree. Neighboring samples form a tile. In every branch, a tile takes
 the coarsest node that is small, or whose error is at most ERROR of the light that the tile gets from the group on
-average. These are far fewer nodes than there are lights. A node becomes one point, two or four, with the mean and the
-variances of its brightness; the normals of its lights count as uniform around their mean.
+average. These are far fewer nodes than there are lights. A node becomes one point or four, with the mean and the
+variances of its brightness and the mean of each color; the normals of its lights count as uniform around their mean.
 
 The error is estimated as the light of the node times the fourth power of its size, in units of the length over which
 the integrand changes (see `small_lights`). Distances and angles are bounded for the whole tile. Where a horizon or the
@@ -36,7 +36,8 @@ FEWEST = 64
 SMALL, LARGEST, ERROR = 0.25, 3.0, (4e-4, 2.5e-4)
 # Size of the nodes from which that light is estimated.
 COARSE = 0.6
-# Smaller nodes are one point, others two or four.
+# Smaller nodes are one point, others four, and so are those of lights of different colors, if their size times how far
+# colors are off the center, in standard deviations, exceeds the square of this.
 POINT = 0.08
 # The error of a node's points, in units of its light times the fourth power of its size.
 FOURTH_ORDER = 1.0
@@ -61,11 +62,14 @@ TURNED = 1e-6
 # the same as a share of the swing of its lights, if some of them may face away.
 CROSSED, SWUNG = 0.1, 0.02
 
-# The points of a node along its axes, (W, P, 3), in W alternative ways. They have the node's variances; for a square
-# they are the Gauss points.
-CORNERS = np.array([[[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]]])
-# For specular lobes two opposite corners of a box are enough. The next node takes another pair.
-PAIRS_OF_CORNERS = np.stack([CORNERS[0], -CORNERS[0]], axis=1)
+# The four points (4, 3) of a node along its axes. They have its variances; for a square they are the Gauss points.
+CORNERS = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0, -1.0, 1.0]])
+
+
+def is_special(light: Light) -> bool:
+    """True for a light that no tree takes."""
+    is_plain = not (light.has_profile or light.is_distant or light.is_facing or light.cone is not None)
+    return not is_plain or light.radiance.min() < 0.0 or light.radiance.max() == 0.0
 
 
 @dataclass(frozen=True)
@@ -74,6 +78,7 @@ class LightTree:
 
     center: np.ndarray  # (N, 3) m, of brightness
     reach: np.ndarray  # (N,) m: sqrt(3) standard deviations of the brightness; for a square, half its diagonal
+    radius: np.ndarray  # (N,) m: no point of the lights is farther from the center
     axes: np.ndarray  # (3, 3, N) m: principal axes of the brightness (first axis), a standard deviation long
     axis: np.ndarray  # (N, 3) mean direction into which the lights shine
     normal_spread: (
@@ -82,6 +87,7 @@ class LightTree:
     vector: np.ndarray  # (N, 3): mean radiance times area vectors
     swing: np.ndarray  # (N,) mean radiance times area: how much of a vector may belong to lights that face away
     color: np.ndarray  # (3, N) of the light, 1 on average
+    tint: np.ndarray  # (3, 3, N): how far the mean of each color is off the center along each axis, in units of `axes`
     power: np.ndarray  # (N,) mean radiance times area
     diagonal: np.ndarray  # (N,) mean of `SmallLight.diagonal`; float32, as are swing and color
     children: np.ndarray  # (N, 2) numbers of nodes
@@ -111,7 +117,14 @@ class LightTree:
         length = np.linalg.norm(axis, axis=1, keepdims=True)
         axis = np.where(length > 1e-9 * total[:, None], axis / np.maximum(length, 1e-300), normal[order[start]])
         vector = sums(brightness[:, None] * area)
-        color = (sums(radiance * size[:, None]).T / total).astype(np.float32)
+        powers = radiance * size[:, None]
+        color = sums(powers).T / total
+        away = sums(powers[:, :, None] * offset[:, None]).transpose(1, 2, 0)
+        away = away / (total * np.maximum(color, 1e-12))[:, None] - middle.T
+        tint = (away[:, None] * axes).sum(axis=2) / np.maximum((axes * axes).sum(axis=1), 1e-300)
+        # No point gets less than nothing of a color.
+        tint *= (color > 1e-12)[:, None] / np.maximum(np.abs(tint).sum(axis=1, keepdims=True), 1.0)
+        color, tint = color.astype(np.float32), tint.astype(np.float32)
         # Cosines are taken as uniform over sqrt(3) standard deviations of the directions on either side of the mean.
         turned = np.maximum(1.0 - (length[:, 0] / total) ** 2, 0.0) * (end - start > 1)
         swing = (total * np.maximum(np.sqrt(1.5 * turned), TURNED)).astype(np.float32)
@@ -119,10 +132,15 @@ class LightTree:
         number = np.where(end - start == 1, order[start], -1)
         diagonal = (sums(power * diagonal) / total).astype(np.float32)
         reach = np.sqrt(3.0 * variances.sum(axis=1))
-        reach, axis, normal_spread = (values.astype(np.float32) for values in (reach, axis, normal_spread))
-        return cls(
-            middle + origin, reach, axes, axis, normal_spread, vector, swing, color, total, diagonal, children, number
+        rim = [np.linalg.norm(light.polygon() - one, axis=1).max() for light, one in zip(lights, center, strict=True)]
+        rim = np.array(rim)
+        radius = over_lights(
+            np.maximum, lambda node, light: lengths(offset[light] - middle[node]) + rim[light], (order, start, end)
         )
+        sizes = (values.astype(np.float32) for values in (reach, np.maximum(radius, reach)))
+        directions = (values.astype(np.float32) for values in (axis, normal_spread))
+        lights_of_node = vector, swing, color, tint, total, diagonal
+        return cls(middle + origin, *sizes, axes, *directions, *lights_of_node, children, number)
 
     @cached_property
     def is_turned(self) -> np.ndarray:
@@ -130,15 +148,16 @@ class LightTree:
         return self.swing > 2.0 * TURNED * self.power
 
     @cached_property
-    def places(self) -> list[np.ndarray]:
-        """Points (N W, 3), W for each node; one array for diffuse and one for specular lobes."""
-        number, points_by_lobe = np.arange(len(self.center)), []
-        for corners in (CORNERS, PAIRS_OF_CORNERS):
-            # Nodes take the ways in turn, so that their errors cancel.
-            ways = corners[number % len(corners)]
-            points = np.stack([(ways * self.axes[:, axis].T[:, None]).sum(axis=2) for axis in range(3)], axis=2)
-            points_by_lobe.append((self.center[:, None] + points).reshape(-1, 3))
-        return points_by_lobe
+    def tinted(self) -> np.ndarray:
+        """The largest distance (N,) of a color from the center, in standard deviations."""
+        return np.sqrt(np.square(self.tint).sum(axis=1)).max(axis=0)
+
+    @cached_property
+    def places(self) -> tuple[np.ndarray, np.ndarray]:
+        """The points (4 N, 3), four for each node, and their colors (3, 4 N)."""
+        points = self.center[:, None] + np.einsum("pk,kxn->npx", CORNERS, self.axes)
+        colors = 0.25 * self.color[..., None] * (1.0 + np.einsum("pk,ckn->cnp", CORNERS, self.tint))
+        return points.reshape(-1, 3), colors.reshape(3, -1).astype(np.float32)
 
 
 class NodeSums:
@@ -227,16 +246,25 @@ def node_ranges(center, normal, most=np.inf):
 
 def normal_spreads(axis, normals, start, end):
     """The largest angles (N,) in rad between the axes (N, 3) and the normals (L, 3) `start` to `end` of each node."""
-    least, largest = np.ones(len(axis)), 1 << 16
+    cosines = over_lights(
+        np.minimum, lambda node, light: products(axis[node], normals[light]), (np.arange(len(normals)), start, end)
+    )
+    return np.arccos(np.clip(cosines, -1.0, 1.0))
+
+
+def over_lights(function, values, ranges):
+    """For each of N nodes, the `function` of the values(nodes (M,), lights (M,)) of its lights, order[start:end]."""
+    order, start, end = ranges
+    result, largest = np.empty(len(start)), 1 << 16
     size = end - start
-    for first in range(0, len(axis), largest):
-        chosen = np.arange(first, min(first + largest, len(axis)))
+    for first in range(0, len(start), largest):
+        chosen = np.arange(first, min(first + largest, len(start)))
         # Go level by level: each level has every light at most once.
         member = np.repeat(chosen, size[chosen])
         offset = np.concatenate([[0], np.cumsum(size[chosen])[:-1]])
         places = np.arange(len(member)) + np.repeat(start[chosen] - offset, size[chosen])
-        least[chosen] = np.minimum.reduceat((axis[member] * normals[places]).sum(axis=1), offset)
-    return np.arccos(np.clip(least, -1.0, 1.0))
+        result[chosen] = function.reduceat(values(member, order[places]), offset)
+    return result
 
 
 def _angles(offset, distance, axis):
@@ -246,7 +274,7 @@ def _angles(offset, distance, axis):
 
 def _heights(ranges, offset, axis, cone):
     """Heights (K,) of nodes at `offset` (K, 3) over planes through tiles with the normals `axis` (K, 3), and how much
-    they may differ (K,) within `ranges`: the reach (K,) of the node, half the box (K, 3) of the tile, and the largest
+    they may differ (K,) within `ranges`: the radius (K,) of the node, half the box (K, 3) of the tile, and the largest
     distance (K,) between them. Normals are within `cone` (K,) in rad of the axis."""
     reach, half, farthest = ranges
     slack = reach + products(half, np.abs(axis)) + np.sin(np.minimum(cone, 0.5 * np.pi)) * farthest
@@ -260,6 +288,7 @@ class NodeDistances:
     offset: np.ndarray  # (K, 3) from center to center
     half: np.ndarray  # (K, 3) half the box of the tile
     reach: np.ndarray  # of the node
+    extent: np.ndarray  # radius of the node
     radius: np.ndarray  # of the tile
     distance: np.ndarray  # between the centers
     nearest: np.ndarray  # from the box to the center of the node
@@ -269,12 +298,12 @@ class NodeDistances:
     def of(cls, tree: LightTree, tiles: Tiles, tile, node) -> NodeDistances:
         """For the numbers (K,) of tiles and nodes."""
         offset = (tree.center[node] - tiles.center[tile]).astype(np.float32)
-        half, reach, radius = tiles.half[tile], tree.reach[node], tiles.radius[tile]
+        half, reach, extent, radius = tiles.half[tile], tree.reach[node], tree.radius[node], tiles.radius[tile]
         gap = np.maximum(np.abs(offset) - half, 0.0)
         distance, nearest = (np.maximum(lengths(vectors), LEAST) for vectors in (offset, gap))
-        extent = radius + reach
-        parallax = np.where(extent < distance, np.arcsin(np.minimum(extent / distance, 1.0)), np.float32(np.pi))
-        return cls(offset, half, reach, radius, distance, nearest, parallax)
+        both = radius + extent
+        parallax = np.where(both < distance, np.arcsin(np.minimum(both / distance, 1.0)), np.float32(np.pi))
+        return cls(offset, half, reach, extent, radius, distance, nearest, parallax)
 
     def away(self, axes, cones):
         """Lower bound (K,) in rad on angles between directions to nodes and cones of directions; negative within."""
@@ -283,7 +312,7 @@ class NodeDistances:
     @property
     def ranges(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The ranges for `_heights`."""
-        return self.reach, self.half, self.distance + (self.radius + self.reach)
+        return self.extent, self.half, self.distance + (self.radius + self.extent)
 
 
 @dataclass
@@ -293,6 +322,7 @@ class TileNodePairs:
     tile: np.ndarray
     node: np.ndarray
     are_leaves: np.ndarray
+    are_points: np.ndarray  # a single point stands for the node
     is_dark: np.ndarray
     are_crossed: np.ndarray  # a horizon may cross the node
     is_smooth: np.ndarray  # light may be interpolated between samples
@@ -343,13 +373,9 @@ class TileNodePairs:
         light[is_dark] = 0.0
         mean = light / (1.0 + (between.radius / np.maximum(between.nearest, between.reach)) ** 2)
         change, are_leaves = np.minimum(tile_size + turn, 1.0), tree.number[node] >= 0
-        are = are_leaves, is_dark, are_crossed, is_smooth, are_in_tail, is_wrong
+        are_points = (size < POINT) & (size * tree.tinted[node] < POINT**2)
+        are = are_leaves, are_points, is_dark, are_crossed, is_smooth, are_in_tail, is_wrong
         return cls(tile, node, *are, size, change, light, mean, light * crossed)
-
-    @property
-    def are_points(self) -> np.ndarray:
-        """Mask (K,) of the nodes that are a single point."""
-        return self.size < POINT
 
     def are_fine(self, most) -> np.ndarray:
         """Mask (K,) of the nodes that may be used: their error is at most `most` (K,), or they are small."""
@@ -474,21 +500,20 @@ class PointDirections:
 class NodePoints:
     """The K points that stand for nodes of a tree in a tile."""
 
-    def __init__(self, tree, pairs: TileNodePairs, middle, is_specular):
+    def __init__(self, tree, pairs: TileNodePairs, middle):
         nodes, single, crossed = pairs.node, pairs.are_points, pairs.are_crossed
-        places, turned = tree.places[is_specular], tree.is_turned[nodes]
+        (places, colors), turned = tree.places, tree.is_turned[nodes]
         # Nodes that take longer come last.
         order = np.argsort(2 * turned + crossed, kind="stable")
-        most = len(places) // len(tree.center)
-        count = np.where(single, 1, most)[order]
+        count = np.where(single, 1, len(CORNERS))[order]
         node = np.repeat(nodes[order], count)
         ends = np.cumsum(count)
-        points = places[most * node + np.arange(len(node)) - np.repeat(ends - count, count)]
+        number = len(CORNERS) * node + np.arange(len(node)) - np.repeat(ends - count, count)
+        points, self.colors = places[number], colors[:, number]
         alone = ends[count == 1] - 1
-        points[alone] = tree.center[node[alone]]
+        points[alone], self.colors[:, alone] = tree.center[node[alone]], tree.color[:, node[alone]]
         points -= middle
         self.is_crossed, self.is_turned = np.repeat(crossed[order], count), np.repeat(turned[order], count)
-        self.colors = tree.color[:, node] / np.repeat(count, count).astype(np.float32)
         self.squared, vector = (points * points).sum(axis=1), tree.vector[node]
         self.ends, self.from_squares, self.from_plane = np.ones((3, 4, len(node)), np.float32)
         self.ends[:3] = points.T
@@ -530,7 +555,7 @@ def _light_of(tree, lobes, position, tile) -> np.ndarray:
     step = max(PAIRS // len(columns), 1)
     for is_tail in (True, False):
         exact = is_tail and lobes.limits is not None
-        points = NodePoints(tree, pairs.take(pairs.are_in_tail == is_tail), middle, lobes.sharpest is not None)
+        points = NodePoints(tree, pairs.take(pairs.are_in_tail == is_tail), middle)
         for first in range(0, len(points.squared), step):
             block = slice(first, first + step)
             rays = points.directions(block, origins)

@@ -148,6 +148,18 @@ class LookupTable:
             coefficients=channels[parameters:].reshape(curves, count, -1),
         )
 
+    @cached_property
+    def _albedos(self) -> np.ndarray:
+        warp, coefficients = (
+            np.moveaxis(values.reshape(-1, *values.shape[2:]), 0, -1) for values in (self.warp, self.coefficients)
+        )
+        return Lobe(*warp[[0, 0, 0, 0]], warp[3] if len(warp) > 3 else None, coefficients).albedo().astype(np.float32)
+
+    def albedos(self, cos_theta_o: np.ndarray, roughness: np.ndarray) -> np.ndarray:
+        """Directional albedos (F, P) in single precision for all Fresnel curves; arguments as for `lookup`."""
+        cosine, roughness = (np.clip(values, 0.0, 1.0).astype(np.float32) for values in (cos_theta_o, roughness))
+        return _interpolate(self._albedos, self.warp.shape[:2], roughness, _theta_coordinate(cosine))
+
     def average_albedos(self, roughness: np.ndarray) -> np.ndarray:
         """`average_albedo` (F, P) at roughness (P,), clamped to [0, 1]."""
         nodes = roughness_nodes(len(self.average_albedo))

@@ -120,7 +120,8 @@ def split_at_horizon(vertices: np.ndarray, axis: int = 2):
     the points that see some of theirs. Whole polygons come first, then clipped ones."""
     corners = vertices.shape[1]
     if corners > PATTERN_CORNERS:
-        patterns, kinds = None, _kinds_of_many_corners(vertices[axis])
+        patterns, above = None, vertices[axis] > 0.0
+        kinds = np.where(above.all(axis=0), WHOLE, np.where(above.any(axis=0), SEVERAL_RUNS, DARK))
     else:
         patterns = horizon_patterns(vertices[axis])
         kinds = _pattern_kinds(corners)[patterns]
@@ -134,11 +135,6 @@ def split_at_horizon(vertices: np.ndarray, axis: int = 2):
         elif kind == SEVERAL_RUNS:
             clipped = clip_to_horizon(clipped, axis)
         yield index, clipped
-
-
-def _kinds_of_many_corners(heights):
-    above = heights > 0.0
-    return np.where(above.all(axis=0), WHOLE, np.where(above.any(axis=0), SEVERAL_RUNS, DARK))
 
 
 def integrate_visible(corners: np.ndarray, facing: np.ndarray, clip_rows, count: int, integrate):

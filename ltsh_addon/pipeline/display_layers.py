@@ -57,7 +57,8 @@ def _group(path: Path, folder: Path, prefix: str, report: dict) -> dict:
     """Write the pictures of one EXR, with `prefix` before their file names; returns their entry of the index."""
     layers = {name: pixels for name, pixels in imaging.read_layers(path).items() if not exr.parse_layer_name(name)[2]}
     # The files show emission and background, too. Figures and scales are those of the reflected light.
-    shown = {name: layers.pop(name)[..., :3] for name in _whole_pictures(layers)}
+    whole = [name for name in layers if exr.parse_layer_name(name)[1] == exr.COMBINED and layers[name].shape[-1] == 4]
+    shown = {name: layers.pop(name)[..., :3] for name in whole}
     names = [name for name in _techniques(layers) if not name.startswith((*exr.CYCLES_LAYERS[1:], exr.ERROR))]
     names = [name for name in names if not name.endswith(exr.UNSHADOWED)]
     passes = [name for name in BAKE_PASSES if exr.layer_name(names[0], name) in layers]
@@ -80,12 +81,6 @@ def _group(path: Path, folder: Path, prefix: str, report: dict) -> dict:
         "figures": _figures(layers, names, passes, report),
         "scales": {pass_name: _scale(layers, names, pass_name) for pass_name in passes},
     }
-
-
-def _whole_pictures(layers) -> list[str]:
-    """Names of the layers of whole pictures: the combined ones with alpha."""
-    combined = [name for name in layers if exr.parse_layer_name(name)[1] == exr.COMBINED]
-    return [name for name in combined if layers[name].shape[-1] == 4]
 
 
 def _techniques(layers) -> list[str]:

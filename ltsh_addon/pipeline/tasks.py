@@ -76,9 +76,10 @@ class BatchJob:
 
     @property
     def pattern(self) -> str:
-        """The pattern of the names of files."""
+        """The pattern of the names of files, by default such as compare, or compare_{frame:04d}."""
         first = "{object}" if self.command == "bake" else self.command
-        return self.name or default_pattern(first, self.varying)
+        texts = {"scene": "{scene}", "camera": "{camera}", "frame": "{frame:04d}"}
+        return self.name or "_".join([first, *(text for name, text in texts.items() if name in self.varying)])
 
 
 @dataclass(frozen=True)
@@ -243,12 +244,6 @@ def file_stems(names: Iterable[str]) -> list[str]:
 def fields_of(pattern: str) -> set[str]:
     """The names of the fields of a pattern."""
     return {name for _, name, _, _ in string.Formatter().parse(pattern) if name}
-
-
-def default_pattern(first: str, varying: Iterable[str]) -> str:
-    """The pattern `first`, followed by the `varying` fields: compare, or compare_{frame:04d}."""
-    texts = {"scene": "{scene}", "camera": "{camera}", "frame": "{frame:04d}"}
-    return "_".join([first, *(text for name, text in texts.items() if name in set(varying))])
 
 
 class Records:

@@ -15,8 +15,8 @@ import numpy as np
 
 from ..emitters import light_profile, profile_regions, small_lights
 from ..emitters.facing import AnalyticLobe, FacingDisk, mean_emission
-from ..emitters.light_polygons import interpolated, light_levels, local_corners, may_reach, off_plane
-from ..emitters.light_tree import FEWEST, LightTree, add_far_lights
+from ..emitters.light_polygons import light_levels, local_corners, may_reach, off_plane
+from ..emitters.light_tree import FEWEST, LightTree, add_far_lights, is_special
 from ..emitters.sky_map import SkyMap
 from ..emitters.tails import LightFromPoints, TailLimits
 from ..lobes import moments32
@@ -39,6 +39,8 @@ def shade_diffuse(samples, lights, radiance, scratch, leftovers=None):
 
     A list `leftovers` receives the pairs for `float64.shade_pairs`, if they are fewer than FLOAT64_CHUNK: (samples
     (N,), lights (N,)), where a light's number is its position among those that affect diffuse lobes.
+
+    Returns the numbers (M,) of the samples that are shaded in double precision, without the `leaves` of `lights`.
     """
     lights = Lights.of(lights, "diffuse")
     lit = np.nonzero(lobes32.any_component(samples.diffuse_albedo))[0]
@@ -47,7 +49,8 @@ def shade_diffuse(samples, lights, radiance, scratch, leftovers=None):
         bumped = lobes32.any_component(samples.diffuse_normal != samples.smooth_normal)[lit]
     lighting = _Lighting(samples, lights, radiance, scratch, float64.shade_diffuse)
     shaped = ((samples.sheen_a != 0.0) | (samples.diffuse_roughness != 0.0))[lit]
-    lighting.add_in_float64(lit[shaped])
+    in_float64 = lit[shaped]
+    lighting.add_in_float64(in_float64)
     lit, bumped = lit[~shaped], bumped[~shaped]
     for is_bumped, members in ((False, lit[~bumped]), (True, lit[bumped])):
         for index in _chunks(members):
@@ -62,6 +65,7 @@ def shade_diffuse(samples, lights, radiance, scratch, leftovers=None):
             others = (samples.bump_alpha2[index],) if is_bumped else ()
             lighting.add(lobes32.Lobes(index, rows, clip_rows, integrate, at_point, colors, 1.0, others=others))
     lighting.finish(leftovers)
+    return in_float64
 
 
 def shade_specular(samples, lights, table, radiance, scratch, leftovers=None):
@@ -76,9 +80,7 @@ def shade_specular(samples, lights, table, radiance, scratch, leftovers=None):
 
     lighting = _Lighting(samples, lights, radiance, scratch, specular_in_float64(table))
     far = sharp & False
-    if lights.skies:
-        far = sharp & ~(anisotropic | float64.has_bent_fresnel(samples))
-    elif lights.trees and table.family == "ltsh":
+    if lights.trees and table.family == "ltsh":
         far = sharp & ~anisotropic
     sharp = (sharp | anisotropic) & ~far
     for only_tails, chosen in ((False, lit & ~sharp & ~far), (True, far)):
@@ -86,8 +88,10 @@ def shade_specular(samples, lights, table, radiance, scratch, leftovers=None):
             for index in _chunks(members):
                 lobes = _specular_lobes(samples, index, (table, ridges, vectors), colors_of(index), scratch)
                 lighting.add(replace(lobes, only_tails=only_tails))
-    lighting.add_in_float64(np.nonzero(sharp)[0])
+    in_float64 = np.nonzero(sharp)[0]
+    lighting.add_in_float64(in_float64)
     lighting.finish(leftovers)
+    return in_float64
 
 
 def _specular_lobes(samples, index, kind, colors, scratch) -> lobes32.Lobes:
@@ -158,22 +162,29 @@ class AlikeLights:
 
 
 class Lights(list):
-    """Lights (light, row, corners) that affect one pass. Trees of many lights are built once."""
+    """Lights (light, row, corners) that affect one pass. Trees of many lights are built once.
+
+    The last `leaf_count` are leaves of textured lights.
+    """
+
+    leaf_count = 0
 
     @classmethod
-    def of(cls, lights, name) -> Lights:
-        """Those of `lights` that affect the pass `name`. A Lights object is returned as it is."""
-        return (
-            lights if isinstance(lights, Lights) else cls(one for one in lights if getattr(one[0], f"affects_{name}"))
-        )
+    def of(cls, lights, name, leaves=()) -> Lights:
+        """Those of `lights` and `leaves` that affect the pass `name`. A Lights object is returned as it is."""
+        if isinstance(lights, Lights):
+            return lights
+        lights, leaves = ([one for one in many if getattr(one[0], f"affects_{name}")] for many in (lights, leaves))
+        result = cls(lights + leaves)
+        result.leaf_count = len(leaves)
+        return result
 
     @cached_property
     def trees(self) -> list[tuple[LightTree, list[int]]]:
         """Trees of many lights, and the positions here of their lights."""
         kinds: dict[tuple, list[int]] = {}
         for number, (light, row, _) in enumerate(self):
-            is_plain = not (light.has_profile or light.is_distant or light.is_facing or light.cone is not None)
-            if is_plain and (light.radiance >= 0.0).all():
+            if not is_special(light):
                 kinds.setdefault((row, light.receivers), []).append(number)
         many = [numbers for numbers in kinds.values() if len(numbers) >= FEWEST]
         return [(LightTree.of([self[number][0] for number in numbers]), numbers) for numbers in many]
@@ -194,12 +205,25 @@ class Lights(list):
 
     @cached_property
     def skies(self) -> list[tuple[SkyMap, object, int]]:
-        """Maps of the distant lights with a detail, each with one of its lights and their row."""
+        """Maps of lights that are all `float64.has_patches`, each with one of its lights and their row."""
         kinds: dict[tuple, list] = {}
         for light, row, _ in self:
-            if float64.has_patches(light):
-                kinds.setdefault((row, light.receivers), []).append(light)
-        return [(SkyMap.of(lights), lights[0], row) for (row, _), lights in kinds.items()]
+            kinds.setdefault((row, light.receivers), []).append(light)
+        maps = [SkyMap.of(lights) for lights in kinds.values()]
+        # With the same directions for all, the parts of a sky in several rows add up.
+        most = np.max([sky.directions for sky in maps], axis=0)
+        maps = [replace(sky, directions=most) for sky in maps]
+        return [(sky, lights[0], row) for sky, ((row, _), lights) in zip(maps, kinds.items(), strict=True)]
+
+
+def shade_skies(samples, lights, table, radiance) -> None:
+    """Add to `radiance`, (R, P, 3) by pass, what `samples` reflect of `Lights.skies`; `lights` has them by pass."""
+    adds = {"diffuse": lobes32.add_diffuse_of_sky, "specular": partial(lobes32.add_specular_of_sky, table=table)}
+    for name, add in adds.items():
+        for sky, light, row in lights[name].skies if name in radiance else ():
+            allowed = light.receives(samples.receiver)
+            index = np.arange(len(samples)) if allowed is None else np.nonzero(allowed)[0]
+            add(sky, samples, index, radiance[name][row])
 
 
 class _Lighting:
@@ -217,11 +241,9 @@ class _Lighting:
         index, colors = lobes.index, lobes.colors
         position = np.ascontiguousarray(self.samples.position[index].T)
         sums = {row: np.zeros((len(colors), 3, len(index)), np.float32) for row in {row for _, row, _ in self.lights}}
-        self._add_skies(lobes, sums)
         remaining = self._add_far(lobes, position, sums)
         for number in sorted([*self.lights.alone, *remaining]):
-            if not float64.has_patches(self.lights[number][0]):
-                self._add_light(lobes, number, position, remaining.get(number), sums)
+            self._add_light(lobes, number, position, remaining.get(number), sums)
         signed = (colors < 0.0).any()
         for row, total in sums.items():
             reflected = (colors * total).sum(axis=0)
@@ -289,17 +311,6 @@ class _Lighting:
         for channel in range(3):
             total[:, channel, columns] += integrals * np.float32(light.radiance[channel])
         return redo
-
-    def _add_skies(self, lobes, sums) -> None:
-        """Add the light of skies to the `sums` (F, 3, Q) by row."""
-        for sky, light, row in self.lights.skies:
-            allowed = light.receives(self.samples.receiver, lobes.index)
-            chosen = np.arange(len(lobes.index)) if allowed is None else np.nonzero(allowed)[0]
-            if lobes.sharpest is None and len(lobes.clip_rows) == 1:
-                normals = self.samples.diffuse_normal[lobes.index[chosen]]
-                sums[row][0][:, chosen] += interpolated(sky.reflected, normals)
-            else:
-                sky.add(lobes, chosen, sums[row])
 
     def _add_far(self, lobes, position, sums) -> dict[int, np.ndarray]:
         """Add the light of trees to the `sums` (F, 3, Q) by row. Returns the columns (Q',) that are left to do, by
@@ -450,19 +461,19 @@ class _Lighting:
         return AnalyticLobe(lobes32.as_columns(samples.normal, index), lobes32.as_columns(samples.view, index), alpha)
 
     def add_in_float64(self, members) -> None:
-        """Add the light of all lights at the samples `members` (Q,)."""
+        """Add the light of all lights but leaves at the samples `members` (Q,)."""
+        lights = self.lights[: len(self.lights) - self.lights.leaf_count]
         if len(members) == 0:
             return
-        has_patches = any(float64.has_patches(light) for light, _, _ in self.lights)
-        if not has_patches and len(members) * len(self.lights) < FLOAT64_CHUNK:
-            for (light, _, _), needs_float64 in zip(self.lights, self.needs_float64, strict=True):
+        if len(members) * len(lights) < FLOAT64_CHUNK:
+            for (light, _, _), needs_float64 in zip(lights, self.needs_float64, strict=False):
                 allowed = light.receives(self.samples.receiver, members)
                 needs_float64.append(members if allowed is None else members[allowed])
             return
         for start in range(0, len(members), FLOAT64_CHUNK):
             index = members[start : start + FLOAT64_CHUNK]
             target = np.zeros((len(self.radiance), len(index), 3))
-            self.shade_in_float64(self.samples.take(index), self.lights, target)
+            self.shade_in_float64(self.samples.take(index), lights, target)
             self.radiance[:, index] += target.astype(np.float32)
 
     def finish(self, leftovers) -> None:

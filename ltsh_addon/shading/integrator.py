@@ -15,6 +15,7 @@ import numpy as np
 
 from ..emitters import light_profile
 from ..emitters.light_polygons import fitting_patches
+from ..emitters.light_tree import FEWEST, is_special
 from ..lobes import moments32
 from ..lobes.lobe_integrals import FLOAT64_CHUNK
 from ..lobes.lookup_table import LookupTable, load_table
@@ -103,13 +104,16 @@ class Task:
         radiance = {name: np.zeros((self.row_count, len(samples), 3), self.dtype) for name in self.passes}
         error = np.zeros(len(samples)) if self.has_error else None
         leftovers: dict[str, list] = {name: [] for name in self.passes}
-        self._add(samples, self._plain, radiance, error, leftovers)
-        if self._with_patches is not None:
+        in_float64 = self._add(samples, self._plain, radiance, error, leftovers)
+        if self._with_patches is not None and self.single:
+            float32.shade_skies(samples, self._with_patches, self.table, radiance)
+        elif self._with_patches is not None:
             self._add(samples, self._with_patches, radiance, error, {})
         for light, row in self._rows_of_lights:
             if light.children and not float64.has_patches(light):
                 for name in self.passes:
-                    self._add_detailed(samples, light, name, radiance[name][row : row + 1], error)
+                    index = in_float64[name] if self._has_tree(light) else np.arange(len(samples))
+                    self._add_detailed((samples, index), light, name, radiance[name][row : row + 1], error)
         return radiance, error, leftovers
 
     @property
@@ -118,7 +122,7 @@ class Task:
 
     def lights_of_pairs(self, name: str) -> list[tuple[Light, int]]:
         """The lights, each with its row, to which the numbers in `shade_pairs` refer."""
-        return [one for one in self._rows_of_lights if getattr(one[0], f"affects_{name}") and not one[0].children]
+        return [one[:2] for one in self._plain[name]]
 
     def shade_pairs(self, samples: SurfaceSamples, name: str, number: np.ndarray) -> np.ndarray:
         """Radiance (N, 3) of one pass of N samples under one light each."""
@@ -132,8 +136,14 @@ class Task:
 
     @cached_property
     def _plain(self) -> dict[str, float32.Lights]:
-        """The lights without a detail, by pass."""
-        return self._by_pass(one for one in self._rows_of_lights if not one[0].children)
+        """The lights without children, then the leaves of those with a tree, by pass."""
+        trees = [(light, row) for light, row in self._rows_of_lights if self._has_tree(light)]
+        leaves = [(leaf, row) for light, row in trees for leaf in light.leaves]
+        return self._by_pass((one for one in self._rows_of_lights if not one[0].children), leaves)
+
+    def _has_tree(self, light) -> bool:
+        """True for a textured light whose leaves are shaded as a tree of many lights."""
+        return self.single and len(light.leaves) >= FEWEST and not any(map(is_special, light.leaves))
 
     @cached_property
     def _with_patches(self) -> dict[str, float32.Lights] | None:
@@ -146,17 +156,19 @@ class Task:
             for lights in (self._with_patches or {}).values():
                 _ = lights.skies
 
-    def _by_pass(self, lights):
-        lights = _prepared(lights)
-        lights_by_pass = {name: float32.Lights.of(lights, name) for name in self.passes}
+    def _by_pass(self, lights, leaves=()):
+        lights, leaves = _prepared(lights), _prepared(leaves)
+        lights_by_pass = {name: float32.Lights.of(lights, name, leaves) for name in self.passes}
         # If all lights affect both passes, these share their trees.
         if len({len(pass_lights) for pass_lights in lights_by_pass.values()}) > 1:
             return lights_by_pass
         return dict.fromkeys(lights_by_pass, lights_by_pass[self.passes[0]])
 
-    def _add_detailed(self, samples, light, name, radiance, error) -> None:
-        """Add the light of a light with a `detail` to its row (1, B, 3) of one pass."""
-        for index, patches in fitting_patches(light, samples, name == "specular"):
+    def _add_detailed(self, among, light, name, radiance, error) -> None:
+        """Add a light with children to its row (1, B, 3) of one pass, for samples and the numbers of some of them."""
+        samples, chosen = among
+        for index, patches in fitting_patches(light, samples.take(chosen), name == "specular"):
+            index = chosen[index]
             patch_radiance = {name: np.zeros((1, len(index), 3), self.dtype)}
             own_error = None if error is None else np.zeros(len(index))
             prepared = float32.Lights(_prepared((patch, 0) for patch in patches))
@@ -165,17 +177,19 @@ class Task:
             if error is not None:
                 error[index] += own_error
 
-    def _add(self, samples, prepared, radiance, error, leftovers) -> None:
-        """Add the light of the `prepared` lights by pass to `radiance`, except for pairs put into `leftovers`."""
+    def _add(self, samples, prepared, radiance, error, leftovers) -> dict[str, np.ndarray]:
+        """Add the light of the `prepared` lights by pass to `radiance`, except for pairs put into `leftovers`. Returns,
+        by pass, the numbers of the samples that took no leaves of textured lights."""
+        in_float64 = {}
         if self.single:
             scratch = self._scratch
             if "diffuse" in radiance:
-                pairs = leftovers.get("diffuse")
-                float32.shade_diffuse(samples, prepared["diffuse"], radiance["diffuse"], scratch, pairs)
+                pairs, lights = leftovers.get("diffuse"), prepared["diffuse"]
+                in_float64["diffuse"] = float32.shade_diffuse(samples, lights, radiance["diffuse"], scratch, pairs)
             if "specular" in radiance:
-                pairs, lights = leftovers.get("specular"), prepared["specular"]
-                float32.shade_specular(samples, lights, self.table, radiance["specular"], scratch, pairs)
-            return
+                pairs, lights, target = leftovers.get("specular"), prepared["specular"], radiance["specular"]
+                in_float64["specular"] = float32.shade_specular(samples, lights, self.table, target, scratch, pairs)
+            return in_float64
         for start in range(0, len(samples), FLOAT64_CHUNK):
             chunk = slice(start, start + FLOAT64_CHUNK)
             batch = samples.take(chunk)
@@ -185,6 +199,7 @@ class Task:
             if "specular" in views:
                 estimates = None if error is None else error[chunk]
                 float64.shade_specular(batch, prepared["specular"], self.table, views["specular"], estimates)
+        return in_float64
 
 
 def _prepared(lights):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -57,6 +58,7 @@ class LightCluster:
         self.corners = np.ascontiguousarray(corners.transpose(2, 1, 0), dtype=np.float32)
         self.normal = np.ascontiguousarray(normal.T, dtype=np.float32)
         self.is_round = is_round if is_round.any() else None
+        self.has_mesh = any(isinstance(light, PolygonLight) for light in lights)
         self._build(corners, normal, values * area)
 
     def _build(self, corners, normal, power):
@@ -79,62 +81,115 @@ class LightCluster:
         self.axis = np.ascontiguousarray(axis.T, dtype=np.float32)
         self.cone = light_tree.normal_spreads(axis, normal[order], start, end).astype(np.float32)
         self.power = (sums / sums[0]).astype(np.float32)
+        self.order, self.start, self.end = order, start, end
+        self.running = np.append(0.0, np.cumsum(power[order]))
+        self.cut = self._cut()
 
-    def pick(self, x: np.ndarray, lobes: Sequence[LobeBound], lobe_of_ray: np.ndarray):
-        """The leaves (R,) that rays take, the probability (R,) of each by lobe, and the numbers x (R,) in [0, 1),
-        rescaled for reuse. Ray r chooses by the lobe `own[r]`."""
-        node, pmf = np.zeros(len(x), np.intp), np.ones((len(lobes), len(x)), np.float32)
-        while True:
-            inner = np.flatnonzero(self.leaf[node] < 0)
-            if len(inner) == 0:
-                return self.leaf[node], pmf, x
-            one, other = self.children[node[inner]].T
-            bounds = (self._bounds(one, lobes, inner), self._bounds(other, lobes, inner))
-            both = bounds[0] + bounds[1]
+    def _cut(self):
+        """Numbers (K,) of the at most CUT nodes that make up the cluster, with few turns and short ways in each."""
+        size = np.where(self.leaf < 0, self.power * (self.radius / self.radius[0] + self.cone), _ZERO)
+        nodes = [(-float(size[0]), 0)]
+        while len(nodes) < CUT and nodes[0][0] < 0.0:
+            halves = self.children[heapq.heappop(nodes)[1]].tolist()
+            for half in halves:
+                heapq.heappush(nodes, (-float(size[half]), half))
+        return np.array(sorted(node for _, node in nodes))
+
+    def pick(self, x: np.ndarray, lobes: Sequence[LobeBound], lobe_of_row: np.ndarray):
+        """The leaves (S, Q) to which S rays from each of Q samples go, the probabilities (L, S, Q) of these by lobe,
+        and the numbers x (S, Q) in [0, 1), rescaled for reuse. Row r of the rays chooses by lobe `lobe_of_row[r]`."""
+        shape, sample, count = x.shape, np.tile(np.arange(x.shape[1]), len(x)), len(self.cut)
+        x, lobe_of_ray, rays = x.ravel(), np.repeat(lobe_of_row, x.shape[1]), np.arange(x.size)
+        bounds = self._bounds((None, self.cut), lobes, (slice(None), None))
+        ends = np.cumsum(bounds, axis=2)
+        whole = np.maximum(ends[:, :, -1:], _TINY)
+        ends, bounds = ends / whole, bounds / whole
+        place = np.empty(x.size, np.intp)
+        for number in np.unique(lobe_of_row):
+            mine = np.flatnonzero(lobe_of_ray == number)
+            steps = (ends[number] + np.arange(shape[1])[:, None]).ravel()
+            place[mine] = np.searchsorted(steps, x[mine] + sample[mine].astype(float), side="right")
+        place = np.clip(place, sample * count, sample * count + (count - 1))
+        bounds, ends = bounds.reshape(len(lobes), -1), ends.reshape(len(lobes), -1)
+        pmf, node = bounds[:, place], self.cut[place - sample * count]
+        mine = pmf[lobe_of_ray, rays]
+        x = _rescaled(x - (ends[lobe_of_ray, place] - mine), mine)
+        offset = self.center[:, node] + lobes[0].offset[:, sample]
+        distance = np.sqrt(np.maximum(dot(offset, offset), _TINY))
+        limit = FAR * distance * np.minimum.reduce([lobe.lengths(offset / distance, sample) for lobe in lobes])
+        rays = np.flatnonzero((self.cone[node] > NARROW) | (self.radius[node] > limit))
+        while len(rays):
+            rays = rays[self.leaf[node[rays]] < 0]
+            halves, columns = self.children[node[rays]], sample[rays]
+            bounds = np.stack([self._bounds((half,), lobes, (columns,)) for half in halves.T])
+            both = bounds.sum(axis=0)
             share = np.divide(bounds[0], both, out=np.zeros_like(both), where=both > 0.0)
-            mine = share[lobe_of_ray[inner], np.arange(len(inner))]
-            is_first = x[inner] < mine
-            size = np.where(is_first, mine, _ONE - mine)
-            rest = (x[inner] - np.where(is_first, _ZERO, mine)) / np.maximum(size, _TINY)
-            x[inner] = np.clip(rest, _ZERO, np.float32(1.0 - 2.0**-24))
-            pmf[:, inner] *= np.where(both > 0.0, np.where(is_first, share, _ONE - share), _ZERO)
-            node[inner] = np.where(is_first, one, other)
+            mine = share[lobe_of_ray[rays], np.arange(len(rays))]
+            is_first = x[rays] < mine
+            x[rays] = _rescaled(x[rays] - np.where(is_first, _ZERO, mine), np.where(is_first, mine, _ONE - mine))
+            pmf[:, rays] *= np.where(both > 0.0, np.where(is_first, share, _ONE - share), _ZERO)
+            node[rays] = np.where(is_first, *halves.T)
+        # Within a node, leaves are chosen by their power alone.
+        start, end = self.start[node], self.end[node]
+        whole = self.running[end] - self.running[start]
+        target = self.running[start] + x * whole
+        leaf = np.clip(np.searchsorted(self.running, target, side="right") - 1, start, end - 1)
+        size = self.running[leaf + 1] - self.running[leaf]
+        x = _rescaled((target - self.running[leaf]).astype(np.float32), size.astype(np.float32))
+        pmf *= (size / np.maximum(whole, 1e-300)).astype(np.float32)
+        return self.order[leaf].reshape(shape), pmf.reshape(len(lobes), *shape), x.reshape(shape)
 
-    def _bounds(self, node, lobes, rays):
-        """By lobe, an approximate upper bound (R,) on the light that the `rays` (R,) get from their nodes."""
-        offset = self.center[:, node] + lobes[0].offset[:, rays]
+    def _bounds(self, nodes, lobes, samples):
+        """By lobe (L, ...), an approximate upper bound on the light that `samples` get from `nodes`, two indices."""
+        offset = self.center[:, *nodes] + lobes[0].offset[:, *samples]
         squares = np.maximum(dot(offset, offset), _TINY)
-        distance, radius = np.sqrt(squares), self.radius[node]
+        distance, radius = np.sqrt(squares), self.radius[nodes]
         spread = np.where(radius < distance, np.arcsin(np.minimum(radius / distance, _ONE)), np.float32(np.pi))
         spread += _SLACK
         offset /= distance
-        light = self.power[node] / np.maximum(squares, radius * radius)
-        light *= _cosine_at_most(-dot(offset, self.axis[:, node]), self.cone[node] + spread)
-        return np.stack([light * lobe.at_most(offset, spread, rays) for lobe in lobes])
+        light = self.power[nodes] / np.maximum(squares, radius * radius)
+        light *= _cosine_at_most(-dot(offset, self.axis[:, *nodes]), self.cone[nodes] + spread)
+        return np.stack([light * lobe.at_most(offset, spread, samples) for lobe in lobes])
 
 
+def _rescaled(x, size):
+    """Numbers x (R,) in [0, size), as numbers in [0, 1)."""
+    return np.clip(x / np.maximum(size, _TINY), _ZERO, np.float32(1.0 - 2.0**-24))
+
+
+# CUT: nodes that all samples bound. In these nodes, rays choose leaves by power alone, if the lights turn by less than
+# NARROW rad and the radius of the node is below FAR of the distance, and of the angle over which the lobe changes.
+CUT, NARROW, FAR = 128, np.float32(0.7), np.float32(0.3)
 # In rad, the error of angles in single precision.
 _SLACK = np.float32(2e-3)
 
 
 @dataclass(frozen=True)
 class LobeBound:
-    """What bounds the lobe of each ray: vectors (3, R) and values (R,)."""
+    """What bounds the lobe of each sample: vectors (3, Q) and values (Q,)."""
 
     offset: np.ndarray  # m, from the sample to the center of the cluster
     normal: np.ndarray
     mirrored: np.ndarray | None = None  # the mirrored view; specular lobes only
     width: np.ndarray | None = None  # in rad
 
-    def at_most(self, directions, spread, rays):
-        """Upper bound (R,) of the lobe within angles `spread` (R,) of `directions` (3, R)."""
-        cosine = _cosine_at_most(dot(directions, self.normal[:, rays]), spread)
+    def at_most(self, directions, spread, samples):
+        """Upper bound (...) of the lobes of the `samples`, an index, within angles `spread` (...) of `directions`
+        (3, ...)."""
+        cosine = _cosine_at_most(dot(directions, self.normal[:, *samples]), spread)
         if self.mirrored is None:
             return cosine
-        toward = np.clip(dot(directions, self.mirrored[:, rays]), -_ONE, _ONE)
+        toward = np.clip(dot(directions, self.mirrored[:, *samples]), -_ONE, _ONE)
         away = np.maximum(np.arccos(toward) - spread, _ZERO)
-        squared = np.square(self.width[rays])
+        squared = np.square(self.width[samples])
         return np.square(squared / (squared + away * away)) * (cosine > 0.0)
+
+    def lengths(self, directions, samples):
+        """The angles (R,) in rad, at most 1, over which the lobes of `samples` (R,) change at `directions` (3, R)."""
+        if self.mirrored is None:
+            return np.ones(len(samples), np.float32)
+        toward = np.clip(dot(directions, self.mirrored[:, samples]), -_ONE, _ONE)
+        return np.minimum(self.width[samples] + np.arccos(toward), _ONE)
 
 
 def _cosine_at_most(cosine, spread):

@@ -25,6 +25,13 @@ UNLIMITED = 1024
 MOST_PIECES = 1 << 17
 # A ray continues behind a transparent surface at this multiple of its distance.
 STEP = np.float32(1.0 + 2.0**-21)
+# GAP: a step of single precision, as a share of the coordinates. What is within 4 of them of a plane is in it.
+GAP = float(np.finfo(np.float32).eps)
+# For overlaps in a plane: how many triangles are looked at, how many of a mesh tell its planes, how many points are
+# tried, and how many pairs of a point and a triangle by plane. PLANE_STEPS: the unit normals of planes, and their
+# heights in units of the largest coordinate, round to as many steps; PLANE_KEYS make a number of that.
+MOST_IN_PLANES, LARGEST, PLANE_POINTS, MOST_TESTS, PLANE_STEPS = 1 << 17, 1024, 2048, 2_000_000, 1e4
+PLANE_KEYS = np.array([1, 3_000_017, 9_000_000_000_023, 27_000_000_000_000_029])
 
 
 @dataclass(frozen=True)
@@ -215,6 +222,56 @@ class Occluders:
         alone = self.lone_choices.get(light)
         return ChosenBy(light=alone != "surface", surface=alone != "light")
 
+    def holding(self, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
+        """Numbers of the instances with a face that holds one of the `points` (N, 3) of a plane of unit `normal`."""
+        near = 4.0 * GAP * (np.abs(normal) @ np.abs(points[0]))
+        ends = [(mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)) for mesh in self.meshes]
+        low, high = np.array(ends, np.float64).reshape(-1, 2, 3)[self.mesh].swapaxes(0, 1)
+        centers = np.einsum("nij,nj->ni", self.matrices[:, :, :3], 0.5 * (low + high)) + self.matrices[:, :, 3]
+        halves = np.einsum("nij,nj->ni", np.abs(self.matrices[:, :, :3]), 0.5 * (high - low))
+        reach = halves + np.ptp(points, axis=0) / 2.0 + near
+        close = np.flatnonzero((np.abs(centers - points.mean(axis=0)) <= reach).all(axis=1))
+        result = []
+        for number in close:
+            offset = self._in_plane(number, points[0], normal, near)[:, None] - points[:, None]
+            sides = np.cross(offset, np.roll(offset, -1, axis=2)) @ normal
+            if ((sides >= 0.0).all(axis=2) | (sides <= 0.0).all(axis=2)).any():
+                result.append(number)
+        return np.array(result, np.int64)
+
+    def _in_plane(self, number, point, normal, near):
+        """Corners (T, 3, 3) of the triangles of an instance that are nearer to a plane than `near`, in m."""
+        mesh, matrix = self.meshes[self.mesh[number]], self.matrices[number]
+        vertices = mesh.vertices @ matrix[:, :3].T + matrix[:, 3]
+        return vertices[mesh.triangles[(np.abs((vertices - point) @ normal) <= near)[mesh.triangles].all(axis=1)]]
+
+    def overlaps(self, owners: np.ndarray) -> dict[tuple[int, int], float]:
+        """By pairs of two of the `owners` (I,) of the instances, which faces of one are in faces of the other: the
+        share of its faces in that plane. An owner below 0 does not count."""
+        chosen = np.flatnonzero(owners >= 0)[: MOST_IN_PLANES // 2]
+        most = min(max(MOST_IN_PLANES // max(len(chosen), 1), 2), LARGEST)
+        largest = {number: _largest(self.meshes[number], most) for number in set(self.mesh[chosen].tolist())}
+        corners = [np.zeros((0, 3, 3)), *(largest[self.mesh[number]] for number in chosen)]
+        count = list(map(len, corners[1:]))
+        corners, number = np.concatenate(corners), np.repeat(chosen, count)
+        corners = np.einsum("tkj,tij->tki", corners, self.matrices[number, :, :3]) + self.matrices[number, None, :, 3]
+        planes = _Planes.of(corners)
+        is_sheet, shared = planes.sheets(owners[number]), planes.shared_by(owners[number])[planes.group]
+        heights = np.rint(planes.height / GAP / 8.0)
+        _, index = np.unique(np.column_stack([planes.group, number, heights])[shared], axis=0, return_index=True)
+        corners, number, normal = corners[shared][index], number[shared][index], planes.normal[shared][index]
+        rest, faces = 32 * MOST_IN_PLANES, []
+        for instance, triangle, direction in zip(number, corners, normal, strict=True):
+            rest -= len(self.meshes[self.mesh[instance]].triangles)
+            near = 4.0 * GAP * np.abs(triangle).max()
+            faces.append(self._in_plane(instance, triangle[0], direction, near) if rest > 0 else triangle[None])
+        corners = np.concatenate([np.zeros((0, 3, 3)), *faces])
+        result = {}
+        points = overlaps_in_planes(corners, np.repeat(owners[number], list(map(len, faces))), is_sheet)
+        for first, other, share in zip(*map(np.ndarray.tolist, points), strict=True):
+            result[first, other] = result.get((first, other), 0.0) + share
+        return result
+
     @property
     def triangle_count(self) -> int:
         """Number of triangles over all instances."""
@@ -272,6 +329,109 @@ class Occluders:
 
 _OF_CLEAR = "share", "extension", "interpolation", "outside", "curve", "cosines"
 _SETTINGS = "transparent_surfaces", "light_masks", "lone_choices", "surface_shift"
+
+
+def overlap_within(meshes: list[OccluderMesh]) -> float:
+    """The share of the area of the triangles of an object that lies in others of the same plane which face alike; at
+    least so much if there are more than MOST_IN_PLANES."""
+    corners = np.concatenate([np.zeros((0, 3, 3)), *(_largest(mesh, MOST_IN_PLANES) for mesh in meshes)])
+    owners, numbers = np.zeros(len(corners), np.int64), np.arange(len(corners))
+    return float(overlaps_in_planes(corners, owners, np.zeros(1, bool), numbers)[2].sum())
+
+
+def _largest(mesh, most):
+    """Corners (T, 3, 3), float64, of the `most` largest triangles of a mesh."""
+    corners = mesh.vertices[mesh.triangles]
+    if len(corners) > most:
+        areas = np.square(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])).sum(axis=1)
+        corners = corners[np.sort(np.argpartition(areas, -most)[-most:])]
+    return corners.astype(np.float64)
+
+
+@dataclass(frozen=True)
+class _Planes:
+    """The planes of T triangles: areas, unit normals, heights in units of the largest coordinate, whether the normals
+    are those of the plane (1) or opposite (-1), and the number of the plane."""
+
+    area: np.ndarray  # (T,)
+    normal: np.ndarray  # (T, 3)
+    height: np.ndarray  # (T,)
+    facing: np.ndarray  # (T,)
+    group: np.ndarray  # (T,)
+
+    @classmethod
+    def of(cls, corners: np.ndarray) -> _Planes:
+        """The planes of triangles (T, 3, 3)."""
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        length = np.linalg.norm(normal, axis=1)
+        normal /= np.maximum(length, 1e-300)[:, None]
+        facing = np.where(normal @ (0.61, 0.553, 0.567) < 0.0, -1.0, 1.0)
+        height = (normal * corners[:, 0]).sum(axis=1) / np.abs(corners).max(initial=1e-300)
+        # The offset keeps round numbers from where numbers round up or down.
+        plane = np.rint(np.column_stack([normal, height]) * (facing * PLANE_STEPS)[:, None] + 0.123)
+        group = np.unique(plane.astype(np.int64) @ PLANE_KEYS, return_inverse=True)[1]
+        return cls(0.5 * length, normal, height, facing, group)
+
+    def shared_by(self, numbers: np.ndarray) -> np.ndarray:
+        """Mask of the planes whose triangles do not all have the same of the `numbers` (T,)."""
+        some = np.zeros(self.group.max(initial=-1) + 1, np.int64)
+        some[self.group] = numbers
+        result = np.zeros(len(some), bool)
+        result[self.group[numbers != some[self.group]]] = True
+        return result
+
+    def sheets(self, owners: np.ndarray) -> np.ndarray:
+        """Mask of the `owners` (T,) whose triangles are in one plane; true for numbers that no triangle has."""
+        some = np.zeros(owners.max(initial=-1) + 1, np.int64)
+        some[owners] = self.group
+        result = np.ones(len(some), bool)
+        result[owners[self.group != some[owners]]] = False
+        return result
+
+
+def overlaps_in_planes(
+    corners: np.ndarray, owners: np.ndarray, is_sheet: np.ndarray, numbers: np.ndarray | None = None
+):
+    """Where triangles `corners` (T, 3, 3) of `owners` (T,) lie in triangles of other `numbers` (T,), by default of
+    other owners: S points, as their owners (S,), those of the others (S,), and the shares (S,) of the areas of their
+    owners for which they stand.
+
+    Both must face the same way, unless both owners are among those that are one flat face, `is_sheet`: where a box
+    stands on another, nothing shows.
+    """
+    numbers, planes = owners if numbers is None else numbers, _Planes.of(corners)
+    normal, facing, group, sides = planes.normal, planes.facing, planes.group, corners[:, 1:] - corners[:, :1]
+    areas = np.bincount(owners, planes.area).clip(min=1e-300)
+    weight = np.cumsum(planes.area * planes.shared_by(numbers)[group] / areas[owners])
+    empty = np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0)
+    if not weight[-1:].sum() > 0.0:
+        return empty
+    number = np.arange(PLANE_POINTS) + 0.5
+    own = np.searchsorted(weight, number * (weight[-1] / PLANE_POINTS)).clip(max=len(group) - 1)
+    # A sequence of Roberts 2018 ("The Unreasonable Effectiveness of Quasirandom Sequences"), folded into triangles.
+    weights = np.outer(number, (0.7548776662466927, 0.5698402909980532)) % 1.0
+    weights = np.where(weights.sum(axis=1, keepdims=True) > 1.0, 1.0 - weights, weights)
+    points = corners[own, 0] + (weights[:, :, None] * sides[own]).sum(axis=1)
+    result = [empty]
+    for shared in np.unique(group[own]):
+        here, members = np.flatnonzero(group[own] == shared), np.flatnonzero(group == shared)
+        tried = here[:: -(-len(here) * len(members) // MOST_TESTS)]
+        axes = np.argsort(np.abs(normal[members[0]]))[:2]
+        (a, b), (c, d) = (sides[members][:, k, axes].T for k in (0, 1))
+        x, y = (points[tried][:, None, axes] - corners[members, 0][:, axes]).transpose(2, 0, 1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            u, v = (x * d - y * c) / (a * d - b * c), (a * y - b * x) / (a * d - b * c)
+        point, member = np.nonzero((u > 1e-6) & (v > 1e-6) & (u + v < 1.0 - 1e-6))
+        point, member = tried[point], members[member]
+        away = np.abs((normal[member] * (points[point] - corners[member, 0])).sum(axis=1))
+        chosen = away <= 4.0 * GAP * np.abs(corners[own[point]]).max(axis=(1, 2))
+        chosen &= numbers[member] != numbers[own[point]]
+        is_flat = is_sheet[owners[member]] & is_sheet[owners[own[point]]]
+        chosen &= is_flat | (facing[member] == facing[own[point]])
+        point, index = np.unique(point[chosen], return_index=True)
+        share = np.full(len(point), weight[-1] / PLANE_POINTS * len(here) / len(tried))
+        result.append((owners[own[point]], owners[member[chosen][index]], share))
+    return tuple(map(np.concatenate, zip(*result, strict=True)))
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ import finished  # noqa: E402
 import measure  # noqa: E402
 
 from ltsh_addon import imaging  # noqa: E402
-from ltsh_addon.blender.process.blender_process import shared_blender  # noqa: E402
+from ltsh_addon.cycles.lobes import read_layer  # noqa: E402
 
 # Of either process, from the second quarter of the time to the last; a picture per frame would be 240 MiB and more.
 MOST_GROWTH = 16.0
@@ -71,17 +71,15 @@ def report(command, frames, scene=None, resolution="64x36") -> str:
     """Print what `frames` frames cost; what is wrong."""
     with tempfile.TemporaryDirectory(prefix="ltsh-animation-") as name:
         folder = Path(name)
-        if scene is None:
-            scene = folder / "scene.blend"
-            finished.build("demo" if command == "shade" else "studio", scene)
-        common = [command, Path(scene).absolute(), *QUALITY[command], "--resolution", resolution]
+        size = tuple(map(int, resolution.split("x")))
+        still = finished.Scene("arcade" if command == "shade" else "studio", folder, size, 0)
+        common = [command, Path(scene or still.blend(0)).absolute(), *QUALITY[command], "--resolution", resolution]
         singles = [run([*common, "-o", folder / f"single_{n}", "--frames", 1], []) for n in range(3)]
         rows: list = []
         whole, processors = run([*common, "-o", folder / "all", "--frames", f"1-{frames}"], rows)
         records = json.loads((folder / "all" / "timing.json").read_text())["seconds"]
         if command == "render":
-            finished.SIZE = tuple(map(int, resolution.split("x")))
-            flicker = _flicker_of_ours(folder / "all"), _flicker_of_cycles(Path(scene), folder, processors / frames)
+            flicker = _flicker_of_ours(folder / "all"), _flicker_of_cycles(still, scene, processors / frames)
     rows, each = np.array(rows), np.array([record["total"] for record in records.values()])
     single, of_single = map(min, zip(*singles, strict=True))
     print(f"  single frame with Blender's start      {single:7.2f} s, {of_single:7.2f} s of processors")
@@ -110,11 +108,12 @@ def _flicker_of_ours(folder: Path) -> float:
     return _deviation(imaging.read_layers(path)["combined"][..., :3] for path in sorted(folder.rglob("*.exr")))
 
 
-def _flicker_of_cycles(scene: Path, folder: Path, seconds: float) -> float:
+def _flicker_of_cycles(still: finished.Scene, scene: Path | None, seconds: float) -> float:
     """Of as many samples as the seconds of a frame of ours allow, the start of Blender and denoising left out."""
-    with shared_blender(folder):
-        seeds = [finished.seeded(scene, number + 1) for number in range(CYCLES_FRAMES)]
-        return _deviation(finished.by_cycles(seed, folder, seconds=seconds + finished.START)[0] for seed in seeds)
+    one, more = (still.cycles(0, samples, blend=scene)[1] for samples in (1, 65))
+    samples = max(round(64.0 * seconds / (more - one)), 1)
+    renders = (still.cycles(number + 1, samples, blend=scene)[0] for number in range(CYCLES_FRAMES))
+    return _deviation(read_layer(channels, "Combined", "RGB") for channels in renders)
 
 
 def _over_time(rows, each) -> bool:

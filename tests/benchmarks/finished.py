@@ -1,16 +1,23 @@
-"""Finished pictures beside Cycles with Open Image Denoise at equal processor time, each against converged Cycles.
+"""Finished pictures beside Cycles and its denoiser at equal processor time of whole processes, by three figures.
 
-python tests/benchmarks/finished.py [SCENE ...]    2, 8 and 30 s, 240 x 135 pixels
-python tests/benchmarks/finished.py picture        the first picture of the README, and Cycles' time at equal error
+python tests/benchmarks/finished.py [--scenes NAME ...] [--budgets S ...] [--seeds N] [--true-samples N]
+
+The figures: relative L2 over all pixels, and without the brightest 0.2 %, both free of the noise of the truth; FLIP.
+The room is what direct light without noise and cost would leave of Cycles' error: the perfect direct light, and
+Combined - direct of as many samples as Cycles has in the time, denoised. The goal is its square root: half of the gain.
+Settings of finished pictures are chosen on TUNED; HELD_OUT are only looked at. Truths and rooms stay in --cache.
 """
 
-import itertools
+import argparse
+import ast
+import hashlib
+import importlib.metadata
+import json
 import os
-import shutil
 import subprocess
 import sys
 import tempfile
-import time
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -19,132 +26,212 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT)]
 
 from ltsh_addon import imaging  # noqa: E402
-from ltsh_addon.blender.process.blender_process import denoiser_libraries, shared_blender  # noqa: E402
-from ltsh_addon.blender.process.finished import FinishedJob, render_finished  # noqa: E402
-from ltsh_addon.cli.commands import DEMO_SCENE  # noqa: E402
+from ltsh_addon.blender.process.blender_process import denoiser_libraries  # noqa: E402
 from ltsh_addon.cycles.lobes import read_layer  # noqa: E402
+from ltsh_addon.imaging.color import luminance  # noqa: E402
 from ltsh_addon.imaging.denoise import open_denoiser  # noqa: E402
-from ltsh_addon.pipeline import RenderOptions, compositing, render  # noqa: E402
+from ltsh_addon.imaging.exr import COMBINED, read_channels  # noqa: E402
+from ltsh_addon.pipeline.compositing import ALBEDO, NORMAL  # noqa: E402
 from ltsh_addon.workers.pool import cores  # noqa: E402
 
-# Without compiled modules on disk, every Blender would compile those that it imports; an installed one has them.
-os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
-# The settings of finished pictures were chosen on all but the last.
-SCENES = ("artist", "studio", "closed", "lamp", "window", "demo")
-SIZE, BUDGETS, TRUE_SAMPLES = (240, 135), (2.0, 8.0, 30.0), 1024
-OTHER_SEED = 7919  # of the truth, so that no noise is shared
+TUNED = ("product", "bathroom", "cloth", "window", "street", "arcade")
+HELD_OUT = ("car", "foliage", "glow", "workshop", "food", "hall")
+TRUE_SEEDS = 7919, 7920  # of the halves of the truth, which share no noise with any picture
+BRIGHTEST = 0.002
+# The names of a pass's light and color in Blender 4.5 and in later ones.
+DIRECT = ((("Diffuse Direct", "DiffDir"), ("Diffuse Color", "DiffCol")),
+          (("Glossy Direct", "GlossDir"), ("Glossy Color", "GlossCol")))  # fmt: skip
+MOST_OFF = 0.06  # of Cycles' time, before it is rendered again
+FIGURES = ("L2", f"L2 -{100 * BRIGHTEST:.1f} %", "FLIP")
 
 
-def build(name: str, path: Path) -> None:
-    """The .blend of a scene."""
-    if name == "demo":
-        shutil.copy(DEMO_SCENE, path)
-        return
-    script = Path(__file__).with_name("finished_scenes.py")
-    subprocess.run([sys.executable, str(script), name, str(path)], check=True, stdout=subprocess.DEVNULL)
+def run(*command) -> float:
+    """Processor seconds of a whole process, with the children that it has waited for."""
+    # Without compiled modules on disk, every Blender would compile those that it imports; an installed one has them.
+    variables = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
+    with tempfile.TemporaryFile() as output:
+        process = subprocess.Popen(
+            [sys.executable, *map(str, command)], cwd=ROOT, env=variables, stdout=output, stderr=output
+        )
+        _, status, usage = os.wait4(process.pid, 0)
+        process.returncode = os.waitstatus_to_exitcode(status)
+        if process.returncode:
+            output.seek(0)
+            raise RuntimeError(f"{command}: {output.read().decode(errors='replace')[-2000:]}")
+    return usage.ru_utime + usage.ru_stime
 
 
-def by_cycles(path: Path, folder: Path, *, samples=None, seconds=None, denoise=True) -> tuple[np.ndarray, float, int]:
-    """What Cycles alone makes (H, W, 3), processor seconds with the start of Blender, samples."""
-    own = Path(tempfile.mkdtemp(dir=folder))
-    start = time.process_time()
-    with shared_blender(own):
-        # As much as starting Blender, opening the file and denoising take.
-        left = None if seconds is None else max(seconds - START, 0.1)
-        job = FinishedJob(path, None, None, None, None, *SIZE, samples, left, edges=False)
-        made = render_finished(job, own)
-    image = read_layer(made.channels, "Combined", "RGB")
-    if denoise:
-        albedo, normal = (read_layer(made.guides, *guide) for guide in (compositing.ALBEDO, compositing.NORMAL))
-        with open_denoiser(denoiser_libraries(), cores()) as denoiser:
-            (image,) = denoiser.all_denoised([image], albedo, normal)
-    return image, made.processor_seconds + time.process_time() - start, made.samples
+def figures(pair, halves) -> np.ndarray:
+    """The three figures of a picture against the truth, known as two `halves` (H, W, 3) that share no noise.
+
+    `pair` is the picture twice; or with the direct light of one half each, which stands for light without noise.
+    """
+    middle = 0.5 * sum(halves)
+    brightness = luminance(middle)
+    is_dim = brightness <= np.quantile(brightness, 1.0 - BRIGHTEST)
+    squares = [image - half for image, half in zip(pair, halves, strict=True)]
+    squares, norms = np.prod(squares, axis=0).sum(axis=-1), np.prod(halves, axis=0).sum(axis=-1)
+    ratios = squares.sum() / norms.sum(), squares[is_dim].sum() / norms[is_dim].sum()
+    return np.array([*np.sqrt(np.maximum(ratios, 0.0)), imaging.mean_flip(middle, 0.5 * sum(pair))])
 
 
-START = 1.4
+@dataclass
+class Scene:
+    """A scene with what is known of it, in a folder that is named after its source."""
+
+    name: str
+    cache: Path
+    size: tuple[int, int]
+    true_samples: int
+    fixed: float = 0.0  # processor seconds of Cycles with one sample
+    each: float = 0.0  # and of each further one
+    halves: list = field(default_factory=list)  # (H, W, 3) truths
+    direct: list = field(default_factory=list)  # (H, W, 3) their direct light
+
+    def __post_init__(self):
+        folder = Path(__file__).parent
+        source = (folder / "finished_scenes.py").read_text()
+        functions = {one.name: one for one in ast.parse(source).body if isinstance(one, ast.FunctionDef)}
+        helpers = [name for name in functions if name.startswith("_")]
+        texts = [ast.unparse(functions[name]) for name in (self.name, *helpers)]
+        texts += [(folder / file).read_text() for file in ("scene_builders.py", "cycles_picture.py")]
+        texts += [importlib.metadata.version("bpy"), str(self.size)]
+        key = hashlib.sha256("".join(texts).encode()).hexdigest()[:12]
+        self.cache = self.cache / f"{self.name}_{key}"
+        self.cache.mkdir(parents=True, exist_ok=True)
+
+    def blend(self, seed: int) -> Path:
+        """The .blend with this seed of Cycles."""
+        path = self.cache / f"{self.name}_{seed}.blend"
+        if not path.exists():
+            run(Path(__file__).with_name("finished_scenes.py"), self.name, self.cache, seed)
+        return path
+
+    def cycles(self, seed: int, samples: int, *passes: str, blend: Path | None = None) -> tuple[dict, float]:
+        """Channels of Cycles alone, of this scene or of a file, and its processor seconds."""
+        blend = blend or self.blend(0)
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "cycles.exr"
+            script = Path(__file__).with_name("cycles_picture.py")
+            seconds = run(script, blend, path, *self.size, samples, seed, *passes)
+            return read_channels(path), seconds
+
+    def find_truth(self) -> None:
+        """The truth and the cost of samples, from the cache or from Cycles."""
+        path = self.cache / f"truth_{self.true_samples}.npz"
+        if not path.exists():
+            count = self.true_samples // 2
+            renders = [self.cycles(seed, count, "passes") for seed in TRUE_SEEDS]
+            fixed = self.cycles(0, 1)[1]
+            each = (sum(seconds for _, seconds in renders) / 2 - fixed) / count
+            halves = [read_layer(channels, "Combined", "RGB") for channels, _ in renders]
+            direct = [direct_light(channels) for channels, _ in renders]
+            np.savez(path, halves=halves, direct=direct, cost=[fixed, each])
+        with np.load(path) as data:
+            self.halves, self.direct = list(data["halves"].astype(float)), list(data["direct"].astype(float))
+            self.fixed, self.each = data["cost"]
+
+    def by_cycles(self, seed: int, seconds: float) -> tuple[np.ndarray, float, int]:
+        """The figures of Cycles and its denoiser with so many processor seconds, its seconds and samples."""
+        for _ in range(3):
+            samples = max(round((seconds - self.fixed) / self.each), 1)
+            channels, took = self.cycles(seed, samples)
+            self.each = max((took - self.fixed) / samples, 1e-3 * took / samples)
+            if samples == 1 or abs(took / seconds - 1.0) < MOST_OFF:
+                break
+        image = read_layer(channels, "Combined", "RGB").astype(float)
+        return figures((image, image), self.halves), took, samples
+
+    def room(self, seed: int, samples: int) -> np.ndarray:
+        """Figures (2, 3) with perfect direct light and of Cycles alone with about so many samples, both denoised."""
+        samples = round(2.0 ** (round(4.0 * np.log2(samples)) / 4.0))  # a few numbers only, which the cache will have
+        path = self.cache / f"room_{self.true_samples}_{samples}_{seed}.json"
+        if not path.exists():
+            channels, _ = self.cycles(seed, samples, "passes")
+            whole = read_layer(channels, "Combined", "RGB").astype(float)
+            guides = [read_layer(channels, *guide) for guide in (ALBEDO, NORMAL)]
+            with open_denoiser(denoiser_libraries(), cores()) as denoiser:
+                rest, whole = denoiser.all_denoised([whole - direct_light(channels), whole], *guides)
+            pairs = [rest + direct for direct in self.direct], [whole, whole]
+            path.write_text(json.dumps([figures(pair, self.halves).tolist() for pair in pairs]))
+        return np.array(json.loads(path.read_text()))
+
+    def ours(self, seed: int, budget: float, more=()) -> tuple[np.ndarray, float, dict]:
+        """The figures of `ltsh render`, its processor seconds and its report."""
+        with tempfile.TemporaryDirectory() as folder:
+            size = "x".join(map(str, self.size))
+            options = ("--resolution", size, "--budget", budget, "--quiet", *more)
+            seconds = run("-m", "ltsh_addon", "render", self.blend(seed), "-o", folder, *options)
+            image = read_layer(read_channels(Path(folder) / "render.exr"), COMBINED, "RGB").astype(float)
+            report = json.loads((Path(folder) / "report.json").read_text())
+        return figures((image, image), self.halves), seconds, report
 
 
-def ours(path: Path, folder: Path, **options) -> tuple[np.ndarray, dict, dict]:
-    """What `ltsh render` makes, its seconds and its report."""
-    with shared_blender(folder):
-        made = render.finish(RenderOptions(path, output=folder, resolution=SIZE, **options))
-    return made.combined[..., :3], made.seconds["processor"], made.report
+def direct_light(channels: dict) -> np.ndarray:
+    """Diffuse and glossy direct light (H, W, 3) of Cycles' passes."""
+
+    def one(names):
+        name = next(name for name in names if any(f"{name}.R" in key for key in channels))
+        return read_layer(channels, name, "RGB").astype(float)
+
+    return sum(one(light) * one(color) for light, color in DIRECT)
 
 
-def seeded(path: Path, seed: int) -> Path:
-    """A copy of the .blend with other random numbers."""
-    copy = path.with_name(f"{path.stem}_{seed}.blend")
-    code = (
-        f"import bpy; bpy.ops.wm.open_mainfile(filepath={str(path)!r}); bpy.context.scene.cycles.seed = {seed}; "
-        f"bpy.ops.wm.save_as_mainfile(filepath={str(copy)!r}, copy=True)"
+def compare(scene: Scene, budget: float, seeds: int, more=()) -> np.ndarray:
+    """Print the lines of a scene and budget; ratio, room and goal (3, 3)."""
+    ours = [scene.ours(seed, budget, more) for seed in range(seeds)]
+    theirs = [scene.by_cycles(seed, seconds) for seed, (_, seconds, _) in enumerate(ours)]
+    rooms = np.median([scene.room(seed, one[2]) for seed, one in enumerate(theirs)], axis=0)
+    report = ours[0][2]
+    kind = "held out" if scene.name in HELD_OUT else "tuned"
+    points = 0 if report["finished"]["all_by_cycles"] else report["sub_samples"]
+    labels = f"LTSH {points} + {report['cycles_samples']}", f"Cycles {theirs[0][2]}"
+    medians = [np.median([one[0] for one in runs], axis=0) for runs in (ours, theirs)]
+    took = [np.median([one[1] for one in runs]) for runs in (ours, theirs)]
+    for row, label in enumerate(labels):
+        start = f"{scene.name:<10}{kind:<9}{budget:>4g} s" if row == 0 else " " * 25
+        first, second, flip = medians[row]
+        print(f"{start}  {label:<16}{took[row]:>7.1f} s{100 * first:>10.2f} %{100 * second:>10.2f} %{flip:>12.4f}")
+    table = np.array([medians[0] / medians[1], rooms[0] / rooms[1], np.sqrt(rooms[0] / rooms[1])])
+    for label, values in zip(("ratio", "room", "goal"), table, strict=True):
+        print(f"{'':<27}{label:<25}" + "".join(f"{value:>12.2f}" for value in values))
+    sys.stdout.flush()
+    return table
+
+
+def main(arguments=()) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", nargs="+", default=TUNED + HELD_OUT, metavar="NAME", help="or: tuned, held-out")
+    parser.add_argument("--budgets", nargs="+", type=float, default=[8.0, 30.0], metavar="S")
+    parser.add_argument("--seeds", type=int, default=3, metavar="N")
+    parser.add_argument("--true-samples", type=int, default=4096, metavar="N")
+    parser.add_argument("--size", default="240x135", metavar="WxH")
+    parser.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "ltsh_truth", metavar="FOLDER")
+    parser.add_argument("--options", default="", help="further options of render, such as '--techniques ltc'")
+    options = parser.parse_args(arguments)
+    names = {"tuned": TUNED, "held-out": HELD_OUT}.get(options.scenes[0], options.scenes)
+    size = tuple(map(int, options.size.split("x")))
+    print(
+        f"finished pictures of {options.size}, load {os.getloadavg()[0]:.1f}, truth of {options.true_samples} samples"
     )
-    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
-    return copy
-
-
-def error(image: np.ndarray, halves: tuple[np.ndarray, np.ndarray]) -> float:
-    """Relative L2 without the noise of the truth, known as two halves that share no noise."""
-    first, second = halves
-    squared = ((image - first) * (image - second)).sum() / (first * second).sum()
-    return float(np.sqrt(max(squared, 0.0)))
-
-
-def errors(image: np.ndarray, halves: tuple[np.ndarray, np.ndarray]) -> str:
-    """The same in words, and FLIP with the noise of the truth."""
-    return f"{100.0 * error(image, halves):7.2f} %{imaging.mean_flip(0.5 * sum(halves), image):9.4f}"
-
-
-def truth(name: str, folder: Path, samples: int) -> tuple[Path, tuple[np.ndarray, np.ndarray]]:
-    """The .blend of a scene, and its converged halves; tells what they took."""
-    path = folder / f"{name}.blend"
-    build(name, path)
-    halves = [
-        by_cycles(seeded(path, OTHER_SEED + half), folder, samples=samples // 2, denoise=False) for half in range(2)
-    ]
-    seconds = sum(half[1] for half in halves)
-    print(f"  {name:<10}{'':>8}  Cycles, {samples} samples, {seconds:.0f} s: the truth", flush=True)
-    return path, tuple(half[0] for half in halves)
-
-
-def beside(name: str, budget: float, path: Path, folder: Path, true, *, is_ours: bool) -> float:
-    """Print what one of both makes in a budget; its error."""
-    if is_ours:
-        image, seconds, report = ours(path, folder, budget=budget)
-        label, took = f"LTSH {report['sub_samples']} + {report['cycles_samples']}", seconds["total"]
-    else:
-        image, took, samples = by_cycles(path, folder, seconds=budget)
-        label = f"Cycles {samples}"
-    print(f"  {name:<10}{budget:>6.0f} s  {label:<18}{took:>8.1f} s{errors(image, true)}", flush=True)
-    return error(image, true)
-
-
-def heading() -> None:
-    print(f"finished pictures of {SIZE[0]} x {SIZE[1]}, load {os.getloadavg()[0]:.1f}")
-    print(f"  {'scene':<10}{'budget':>8}  {'':<18}{'processor':>10}{'rel. L2':>10}{'FLIP':>9}")
-
-
-def main(names=SCENES, true_samples=TRUE_SAMPLES, budgets=BUDGETS) -> None:
-    heading()
-    with tempfile.TemporaryDirectory() as folder:
-        for name in names:
-            path, true = truth(name, Path(folder), true_samples)
-            for budget, is_ours in itertools.product(budgets, (False, True)):
-                beside(name, budget, path, Path(folder), true, is_ours=is_ours)
-
-
-def picture(name="artist", budget=40.0) -> None:
-    """A larger picture, and Cycles with longer and longer budgets until it is as near."""
-    heading()
-    with tempfile.TemporaryDirectory() as folder:
-        path, true = truth(name, Path(folder), TRUE_SAMPLES)
-        found = beside(name, budget, path, Path(folder), true, is_ours=True)
-        while beside(name, budget, path, Path(folder), true, is_ours=False) > found and budget < 1000.0:
-            budget *= np.sqrt(2.0)
+    print(
+        f"{'scene':<19}{'budget':>6}  {'points + samples':<16}{'processor':>9}"
+        + "".join(f"{one:>12}" for one in FIGURES)
+    )
+    tables, budgets = {}, options.budgets
+    for name in names:
+        scene = Scene(name, options.cache, size, options.true_samples)
+        scene.find_truth()
+        for budget in budgets:
+            tables[name, budget] = compare(scene, budget, options.seeds, options.options.split())
+    for budget in budgets:
+        middle = np.median([table for (_, one), table in tables.items() if one == budget], axis=0)
+        words = zip(("ratio", "room", "goal"), middle, strict=True)
+        print(
+            f"median, {budget:g} s: "
+            + "; ".join(f"{label} " + ", ".join(f"{v:.2f}" for v in row) for label, row in words)
+        )
 
 
 if __name__ == "__main__":
-    if sys.argv[1:] == ["picture"]:
-        SIZE = 640, 360
-        picture()
-    else:
-        main(*([sys.argv[1:]] if sys.argv[1:] else []))
+    main(sys.argv[1:])

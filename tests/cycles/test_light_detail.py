@@ -59,16 +59,49 @@ def test_every_sample_gets_the_whole_light_once(place, specular):
     assert count.max() <= len(light.leaves) and count.mean() < len(light.leaves)
 
 
-def test_patches_that_fit_give_the_light_of_the_smallest_ones():
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_patches_that_fit_give_the_light_of_the_smallest_ones(dtype):
+    """Of the table "ltc": a tree of lights gives those of degrees above 0 the true value in their tails."""
     light, samples = textured_light(), metals(150)
-    expected = shading.shade(samples, light.leaves, workers=1)
-    found = shading.shade(samples, [light], workers=1)
+    expected = shading.shade(samples, light.leaves, "ltc", workers=1, dtype=np.float64, rows=[0] * len(light.leaves))
+    found = shading.shade(samples, [light], "ltc", workers=1, dtype=dtype)
     for name in shading.PASSES:
         exact, coarse = getattr(expected, name), getattr(found, name)
         # Of the whole light as one patch it is 5 % and more.
         assert np.linalg.norm(coarse - exact) < 3e-3 * np.linalg.norm(exact), name
-        plain = getattr(shading.shade(samples, [replace(light, children=())], passes=(name,), workers=1), name)
+        plain = getattr(shading.shade(samples, [replace(light, children=())], "ltc", passes=(name,), workers=1), name)
         assert np.linalg.norm(plain - exact) > 0.04 * np.linalg.norm(exact), name
+
+
+def test_dark_patches_shine_where_the_lobe_meets_no_other():
+    """Surfaces 2 cm under a light of two cells, of which one has a hundredth of the other's brightness."""
+    image = np.ones((64, 64, 3))
+    image[:, :32] += 99.0 * (np.arange(64) >= 32)[:, None, None]
+    covered = np.ones((64, 64), bool)
+    (light,) = split_light(replace(textured_light(), children=()), cut_into_patches(image, covered, 128))
+    light = replace(light, children=tuple(one for leaf in light.leaves for one in quarters(leaf, 3)))
+    samples = metals(2000)
+    x, y = np.meshgrid(np.linspace(-0.75, 0.75, 50), np.linspace(-0.55, 0.55, 40))
+    position = np.stack([x.ravel(), y.ravel(), np.full(x.size, 1.98)], axis=1)
+    up = np.tile([0.0, 0.0, 1.0], (len(position), 1))
+    view = np.array([0.0, -3.0, 3.5]) - position
+    view /= np.linalg.norm(view, axis=1, keepdims=True)
+    normals = dict.fromkeys(("normal", "diffuse_normal", "geometric_normal", "smooth_normal"), up)
+    samples = replace(samples, position=position, view=view, roughness=np.full(len(up), 0.12), **normals)
+    found = shading.shade(samples, [light], passes=("specular",), workers=1).specular[0]
+    chosen = np.arange(0, len(up), 19)
+    expected = shading.shade(samples.take(chosen), light.leaves, passes=("specular",), workers=1, dtype=np.float64)
+    expected = expected.specular.sum(axis=0)
+    assert (np.abs(found[chosen] - expected) < 0.01 * expected).all()
+
+
+def quarters(light, levels):
+    """`light` cut into quarters, and these again, `levels` times."""
+    if levels == 0:
+        return [light]
+    half = {"half_u": 0.5 * light.half_u, "half_v": 0.5 * light.half_v}
+    centers = [light.center + s * half["half_u"] + t * half["half_v"] for s in (-1, 1) for t in (-1, 1)]
+    return [one for center in centers for one in quarters(replace(light, center=center, **half), levels - 1)]
 
 
 def test_the_reference_takes_the_same_patches():

@@ -56,6 +56,32 @@ def test_diffuse_light_of_many_is_that_of_each():
     assert relative_error(found, expected) < OFF
 
 
+@pytest.mark.parametrize("name", shading.PASSES)
+def test_each_color_comes_from_where_its_lights_are(name):
+    """A panel of 1 m, red on one side and green on the other, 1 m over a floor of 3 m: .5 % off where the points of a
+    node share one color."""
+    x, y = np.meshgrid(np.linspace(-1.5, 1.5, 40), np.linspace(-1.5, 1.5, 30))
+    position, up = np.stack([x.ravel(), y.ravel(), 0.0 * x.ravel()], axis=1), np.tile([0.0, 0.0, 1.0], (x.size, 1))
+    normals = dict.fromkeys(("normal", "diffuse_normal", "geometric_normal", "smooth_normal"), up)
+    samples = replace(
+        random_samples(1200, 1, 0.5), position=position, view=unit([0.0, -3.0, 2.0] - position), **normals
+    )
+    samples, lights, half = replace(samples, roughness=np.full(x.size, 0.6)), [], np.eye(3) / 32.0
+    for x, y in np.ndindex(16, 16):
+        color, center = (
+            np.array([np.exp(-x / 3.0), np.exp(x / 3.0 - 5.0), 0.0]),
+            np.array([(x - 7.5) / 16.0, (y - 7.5) / 16.0, 1.0]),
+        )
+        lights.append(
+            area_light("Lamp", "RECTANGLE", center, half[0], half[1], direction=-np.eye(3)[2], radiance=color)
+        )
+    found, expected = (
+        getattr(shading.shade(samples, lights, "ltc", passes=[name], workers=1, dtype=dtype), name).sum(axis=0)
+        for dtype in (np.float32, np.float64)
+    )
+    assert relative_error(found, expected) < OFF and not found[:, 2].any()
+
+
 @pytest.mark.parametrize("name, lowest_roughness", [("ltsh4", 0.02), *((name, 0.3) for name in shading.SHIPPED_TABLES)])
 def test_specular_light_of_many_is_closer_to_the_truth_than_that_of_each(name, lowest_roughness):
     """The tails of lobes are true where lights are points. Some lobes are sharper than single precision can tell."""
@@ -285,10 +311,13 @@ def test_nodes_have_the_power_and_the_moments_of_their_lights():
     moments = ((power[:, None] * shift).T @ shift + own) / power.sum()
     axes = tree.axes[:, :, 0]
     assert np.allclose(axes.T @ axes, moments)
-    for corners in (light_tree.CORNERS, light_tree.PAIRS_OF_CORNERS):
-        points = corners @ axes
-        assert np.allclose(points.sum(axis=1), 0.0)
-        # Of pairs, all ways together.
-        points = points.reshape(-1, 3)
-        assert np.allclose(points.T @ points / len(points), moments)
+    points, colors = (values[..., :4] if len(values) == 3 else values[:4] - tree.center[0] for values in tree.places)
+    assert np.allclose(points.mean(axis=0), 0.0) and np.allclose(points.T @ points / 4, moments)
+    # Each color of the points has the power and the center of its color of the lights.
+    powers = radiance * np.linalg.norm(area, axis=1)[:, None]
+    assert np.allclose(colors.sum(axis=1) * power.sum(), powers.sum(axis=0))
+    assert np.allclose(colors @ points / colors.sum(axis=1)[:, None], powers.T @ shift / powers.sum(axis=0)[:, None])
+    assert all(
+        np.linalg.norm(light.polygon() - tree.center[0], axis=1).max() < 1.001 * tree.radius[0] for light in lights
+    )
     assert len(lights) < float32.FEWEST  # so that few lights are shaded one by one

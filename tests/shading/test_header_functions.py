@@ -10,7 +10,7 @@ from polygon_quadrature import above_horizon
 from ltsh_addon import shading
 from ltsh_addon.lobes.polygon import clip_to_horizon, edge_sums, project_to_sphere, split_at_horizon
 from ltsh_addon.scene import QuadLight, SurfaceSamples
-from ltsh_addon.shading.header import data_blocks
+from tables.header import data_blocks
 
 pytestmark = pytest.mark.skipif(header_harness.C_COMPILER is None, reason="needs a C compiler")
 

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from ltsh_addon import shading
-from ltsh_addon.shading import header
-from ltsh_addon.shading.header import data_blocks
-from tables import validate
+from tables import header, validate
+from tables.header import data_blocks
 
 
 def sampled(texture, u, v):

@@ -13,8 +13,8 @@ import pytest
 from header_harness import points, random_polygons
 
 from ltsh_addon import shading
-from ltsh_addon.shading import header
-from ltsh_addon.shading.header import data_blocks
+from tables import header
+from tables.header import data_blocks
 
 ROOT = Path(__file__).resolve().parents[2]
 ENGINES, EXPORT = ROOT / "docs" / "engines.md", ROOT / "tables" / "EXPORT.md"

@@ -153,7 +153,8 @@ def _passes_of(scene, layer) -> list[tuple[str, str, str]]:
     """Name, channels and type of all passes except Combined."""
     settings = scene.ltsh_view
     if not settings.complete:
-        passes = [(name, "RGB", "COLOR") for name in pass_names(_prefixes(settings))]
+        labels = [TECHNIQUES[name].label for name in SHIPPED_TABLES] if settings.technique_passes else []
+        passes = [(name, "RGB", "COLOR") for name in pass_names(["LTSH", *labels])]
         passes += [(name, *kind) for name, kind in DATA_PASSES.items() if getattr(layer, DATA_SETTINGS[name])]
         return passes + [(names_in_files()[key], "X", "VALUE") for key in _indices_of(layer)]
     passes = [(name, "RGB", "COLOR") for name in pass_names(["LTSH"])[: len(PASSES)]]
@@ -173,11 +174,6 @@ def _passes_of_cycles(scene, layer) -> list[tuple[str, str, str]]:
 
     unwritten = ("Noisy ", "Guiding ", "Render Time")
     return [one for one in list_render_passes(scene, layer) if not one[0].startswith(unwritten)]
-
-
-def _prefixes(settings) -> list[str]:
-    others = SHIPPED_TABLES if settings.technique_passes else ()
-    return ["LTSH", *(TECHNIQUES[name].label for name in others)]
 
 
 def _job_of(engine, depsgraph) -> FinalJob:

@@ -13,8 +13,7 @@ import bpy
 import numpy as np
 
 from ...scene import FARTHEST, listed
-from ...visibility.estimator import GAP
-from ...visibility.occluders import TERMINATOR_OFFSET, OccluderMesh, Occluders, Transparency
+from ...visibility.occluders import TERMINATOR_OFFSET, OccluderMesh, Occluders, Transparency, overlap_within
 from ..evaluated import SURFACE_TYPES, is_rendered, owner_of
 from ..lights.emission import ObjectFacts, open_studio, trees_of
 from ..lights.linking import MOST_BLOCKER_SETS, OTHER_LIGHTS, Blockers
@@ -23,12 +22,9 @@ from ..materials.graph import ADD, CLEAR, MIX, PRINCIPLED, Source, live_link, so
 from ..render_settings import cycles_setting
 from . import occluder_shapes as shapes
 
-# NAMED: how many names of a kind a warning lists. LEAST_DOUBLED: share of the area of an object that is named.
+# NAMED: how many names of a kind a warning lists. LEAST_DOUBLED: least share of the area of an object in other faces
+# that is named.
 NAMED, LEAST_DOUBLED = 3, 1e-3
-# AREA_POINTS: points of an object tried for faces in one plane. MOST_TESTS: pairs of a point and a triangle by plane.
-# PLANE_STEPS: planes are the same if their unit normals, and heights in units of the largest coordinate, round to it.
-AREA_POINTS, MOST_TESTS, PLANE_STEPS = 2048, 2_000_000, 1e5
-PLANE_KEYS = np.array([1, 3_000_017, 9_000_000_000_023, 27_000_000_000_000_029])
 # A light is sampled by rays toward points on the light, and by rays in directions that the surface chooses.
 # SURFACE_SHIFT: the bits of a mask for the latter are this much higher, if some object blocks only one kind of ray.
 SURFACE_SHIFT = 16
@@ -85,6 +81,7 @@ class _Instances:
     mask: int
     terminator: float
     name: str
+    owner: int  # the index in `_Collector._names`; -1: its faces are not looked for in planes of others
 
 
 class _Collector:
@@ -101,6 +98,7 @@ class _Collector:
         # Key of evaluated data -> numbers of its meshes, and the matrices (N, 4, 4) of its points in the object.
         self._shapes: dict[tuple, tuple[list[int], np.ndarray]] = {}
         self._instances: list[_Instances] = []
+        self._names: list[str] = []  # of objects, one for each time that instances were added
         # (size, matrix) of a mesh -> number of the first such mesh, and the name of its object.
         self._first_meshes: dict[tuple, tuple[int, str]] = {}
         self._materials: dict[str, _ClearMaterial | None] = {}
@@ -122,11 +120,8 @@ class _Collector:
                 self._add(instance, matrix)
             if instance.show_particles and ob.particle_systems:
                 self._add_hair(instance)
-        if in_planes := self._lights_in_planes():
-            warn(
-                f"shadows: area lights in the plane of a face: {listed(in_planes, NAMED)}: Cycles loses a part of "
-                "their light at random, the techniques lose nothing; move them off by 0.1 mm"
-            )
+        occluders = self._joined()
+        self._warn_of_planes(occluders, warn)
         for kind, names in self._notes.items():
             warn(f"shadows: {kind}: {listed(map(repr, names), NAMED)}")
         if self._blockers.unnumbered:
@@ -134,7 +129,7 @@ class _Collector:
                 f"shadows: all objects block lights {listed(map(repr, self._blockers.unnumbered), NAMED)}: more than "
                 f"{self._most_sets} blocker collections are not told apart"
             )
-        return self._joined()
+        return occluders
 
     def _joined(self) -> Occluders:
         matrices = [instances.matrices for instances in self._instances]
@@ -163,45 +158,51 @@ class _Collector:
             mask = by_light * mask | (by_surface * mask) << self._shift
         terminator = getattr(instance.object, "shadow_terminator_geometry_offset", TERMINATOR_OFFSET)
         matrices_3x4, name = (matrix @ matrices)[:, :3], instance.object.original.name
-        self._instances += [_Instances(number, matrices_3x4, mask, terminator, name) for number in numbers]
-        # The depsgraph lists metaballs twice.
-        if matrices is shapes.ONE_INSTANCE and instance.object.type != "META":
-            for number in numbers:
-                self._look_for_twins(number, matrix, instance.object)
+        # Hair and points are no faces, and the depsgraph lists metaballs twice.
+        has_faces = instance.object.type != "META" and all(self._meshes[number].thickness is None for number in numbers)
+        twins = [has_faces and self._is_twin(number, matrix, instance.object) for number in numbers]
+        owner = len(self._names) if has_faces and not any(twins) else -1
+        self._names.append(name)
+        self._instances += [_Instances(number, matrices_3x4, mask, terminator, name, owner) for number in numbers]
 
-    def _lights_in_planes(self) -> list[str]:
-        """Names of area lights that lie in the plane of a face, up to rounding, each with that of the object."""
-        lights = [
-            (instance.object.original.name, *_points_of_area_light(instance))
-            for instance in self._depsgraph.object_instances
-            if instance.object.type == "LIGHT" and instance.object.data.type == "AREA"
-        ]
-        if not lights or not self._instances:
-            return []
-        matrices = np.concatenate([instances.matrices for instances in self._instances])
-        owner = np.repeat(np.arange(len(self._instances)), [len(one.matrices) for one in self._instances])
-        ends = np.array([(mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)) for mesh in self._meshes], np.float64)
-        low, high = ends[[instances.mesh for instances in self._instances]][owner].swapaxes(0, 1)
-        centers = np.einsum("nij,nj->ni", matrices[:, :, :3], 0.5 * (low + high)) + matrices[:, :, 3]
-        halves = np.einsum("nij,nj->ni", np.abs(matrices[:, :, :3]), 0.5 * (high - low))
-        result = {}
-        for light, points, normal in lights:
-            near = 4.0 * GAP * (np.abs(normal) @ np.abs(points[0]))
-            reach = np.ptp(points, axis=0) / 2.0 + near
-            for number in np.flatnonzero((np.abs(centers - points[0]) <= halves + reach).all(axis=1)):
-                instances = self._instances[owner[number]]
-                if _holds(self._meshes[instances.mesh], matrices[number], points, (normal, near)):
-                    result[f"{light!r} in {instances.name!r}"] = None
-        return list(result)
+    def _warn_of_planes(self, occluders, warn):
+        """Name area lights and faces in the plane of faces of other objects, up to rounding."""
+        count = [len(instances.matrices) for instances in self._instances]
+        instance_of = np.repeat(np.arange(len(self._instances)), count)
+        in_planes = {}
+        for instance in self._depsgraph.object_instances:
+            if instance.object.type == "LIGHT" and instance.object.data.type == "AREA":
+                for number in occluders.holding(*_points_of_area_light(instance)):
+                    name = self._instances[instance_of[number]].name
+                    in_planes[f"{instance.object.original.name!r} in {name!r}"] = None
+        if in_planes:
+            warn(
+                f"shadows: area lights in the plane of a face: {listed(in_planes, NAMED)}: Cycles loses a part of "
+                "their light at random, the techniques lose nothing; move them off by 0.1 mm"
+            )
+        owners = np.array([instances.owner for instances in self._instances], np.int64)[instance_of]
+        pairs = sorted(occluders.overlaps(owners).items(), key=lambda pair: -pair[1])
+        texts = {}
+        for (first, other), share in pairs:
+            names = [self._names[owner] for owner in (first, other)]
+            if share > LEAST_DOUBLED and frozenset(names) not in texts:
+                texts[frozenset(names)] = f"{_percent(share)} of those of {names[0]!r} in {names[1]!r}"
+        if texts:
+            warn(
+                f"shadows: faces in one plane: {listed(texts.values(), NAMED)}: Cycles is black there, here both are "
+                "lit; move one off by 0.1 mm"
+            )
 
-    def _look_for_twins(self, number, matrix, ob):
-        """Add a note if an equal mesh is already in the same place."""
+    def _is_twin(self, number, matrix, ob) -> bool:
+        """Whether an equal mesh is already in the same place, which gets a note."""
         mesh, mesh_and_name = self._meshes[number], (number, ob.original.name)
         first = self._first_meshes.setdefault(
             (len(mesh.vertices), len(mesh.triangles), matrix.tobytes()), mesh_and_name
         )
-        if first is not mesh_and_name and _is_same(mesh, self._meshes[first[0]]):
-            self._note(f"in the same place as {first[1]!r}: Cycles is black there, here both are lit", ob)
+        if first is mesh_and_name or not _is_same(mesh, self._meshes[first[0]]):
+            return False
+        self._note(f"in the same place as {first[1]!r}: Cycles is black there, here both are lit", ob)
+        return True
 
     # Surfaces:
 
@@ -225,10 +226,9 @@ class _Collector:
                 meshes, matrices = shapes.balls(ob, clear[0], self._note)
             else:
                 meshes = shapes.split_by_slot(ob, clear, self._image)
-                share = _overlapped(meshes)
-                if share > LEAST_DOUBLED:
+                if (share := overlap_within(meshes)) > LEAST_DOUBLED:
                     text = "of its faces where others are: Cycles is black there, here all are lit"
-                    self._note(f"{float(f'{100.0 * share:.2g}'):g} % {text}", ob)
+                    self._note(f"{_percent(share)} {text}", ob)
                 if any(material is not None and _is_displaced(material) for material in materials):
                     self._note("displacement is not in shadows, the surface blocks where it is without", ob)
             self._shapes[key] = self._number(meshes), matrices
@@ -346,6 +346,10 @@ def _meets(instance) -> tuple[bool, bool]:
 def _is_met_by_some(instance) -> bool:
     by_light, by_surface = _meets(instance)
     return instance.object.type in SURFACE_TYPES and by_light != by_surface
+
+
+def _percent(share) -> str:
+    return f"{float(f'{100.0 * share:.2g}'):g} %"
 
 
 def _is_same(mesh, other):
@@ -502,50 +506,3 @@ def _points_of_area_light(instance) -> tuple[np.ndarray, np.ndarray]:
     places = 0.35 * np.array([[0, 0], [-1, -1], [-1, 1], [1, -1], [1, 1]]) * (light.size, depth)
     normal = np.cross(matrix[:3, 0], matrix[:3, 1])
     return places @ matrix[:3, :2].T + matrix[:3, 3], normal / max(np.linalg.norm(normal), 1e-30)
-
-
-def _holds(mesh, matrix, points, plane) -> bool:
-    """True if one of the `points` (N, 3) is in a triangle of their `plane`: its normal, and a tolerance in m."""
-    normal, near = plane
-    vertices = mesh.vertices @ matrix[:, :3].T + matrix[:, 3]
-    is_flat = (np.abs((vertices - points[0]) @ normal) <= near)[mesh.triangles].all(axis=1)
-    offset = vertices[mesh.triangles[is_flat]][:, None] - points[:, None]
-    sides = np.cross(offset, np.roll(offset, -1, axis=2)) @ normal
-    return bool(((sides >= 0.0).all(axis=2) | (sides <= 0.0).all(axis=2)).any())
-
-
-def _overlapped(meshes: list[OccluderMesh]) -> float:
-    """The share of the area of triangles that lies in others of the same plane which face the same way.
-
-    It is found at AREA_POINTS points, evenly spaced over the area of all triangles.
-    """
-    triangles = [mesh.vertices[mesh.triangles].astype(np.float64) for mesh in meshes]
-    corners = np.concatenate([np.zeros((0, 3, 3)), *triangles])
-    sides = corners[:, 1:] - corners[:, :1]
-    normal = np.cross(sides[:, 0], sides[:, 1])
-    area = np.linalg.norm(normal, axis=1)
-    if not 0.0 < area.sum() < np.inf:
-        return 0.0
-    normal /= np.maximum(area, 1e-300)[:, None]
-    height = (normal * corners[:, 0]).sum(axis=1) / np.abs(corners).max()
-    plane = np.rint(np.column_stack([normal, height]) * PLANE_STEPS).astype(np.int64)
-    _, group, count = np.unique(plane @ PLANE_KEYS, return_inverse=True, return_counts=True)
-    number = np.arange(AREA_POINTS) + 0.5
-    own = np.searchsorted(np.cumsum(area), number * (area.sum() / AREA_POINTS)).clip(max=len(area) - 1)
-    # A sequence of Roberts 2018 ("The Unreasonable Effectiveness of Quasirandom Sequences"), folded into triangles.
-    place = np.outer(number, (0.7548776662466927, 0.5698402909980532)) % 1.0
-    place = np.where(place.sum(axis=1, keepdims=True) > 1.0, 1.0 - place, place)
-    points = corners[own, 0] + (place[:, :, None] * sides[own]).sum(axis=1)
-    overlapped = 0.0
-    of_point = group[own]
-    for shared in np.unique(of_point[count[of_point] > 1]):
-        here, members = np.flatnonzero(of_point == shared), np.flatnonzero(group == shared)
-        tried = here[:: -(-len(here) * len(members) // MOST_TESTS)]
-        axes = np.argsort(np.abs(normal[members[0]]))[:2]
-        (a, b), (c, d) = (sides[members][:, k, axes].T for k in (0, 1))
-        x, y = (points[tried][:, None, axes] - corners[members, 0][:, axes]).transpose(2, 0, 1)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            u, v = (x * d - y * c) / (a * d - b * c), (a * y - b * x) / (a * d - b * c)
-        covering = ((u > 1e-6) & (v > 1e-6) & (u + v < 1.0 - 1e-6)).sum(axis=1)
-        overlapped += (covering > 1).mean() * len(here)
-    return overlapped / AREA_POINTS

@@ -382,16 +382,15 @@ def _write_hit(material) -> None:
     receiver.attribute_type, receiver.attribute_name = "INSTANCER", RECEIVER_PROPERTY
     _write_aov(tree, "hit", 1.0)
     _write_aov(tree, "receiver", receiver.outputs["Fac"])
-    _write_aov(tree, "correct_normal", _bends_normals(tree) if material.cycles.use_bump_map_correction else 0.0)
+    bends = 0.0
+    if material.cycles.use_bump_map_correction:
+        # 0 on hair: Cycles bends no specular normals there.
+        bends = graph.computed("SUBTRACT", 1.0, tree.nodes.new("ShaderNodeHairInfo").outputs["Is Strand"])
+    _write_aov(tree, "correct_normal", bends)
     _write_aov(tree, "position", geometry.outputs["Position"])
     _write_aov(tree, "incoming", geometry.outputs["Incoming"])
     _write_aov(tree, "smooth_normal", geometry.outputs["Normal"])
     _write_aov(tree, "true_normal", geometry.outputs["True Normal"])
-
-
-def _bends_normals(tree):
-    """A socket of `tree` that is 1, except on hair, where it is 0: Cycles bends no specular normals there."""
-    return graph.computed("SUBTRACT", 1.0, tree.nodes.new("ShaderNodeHairInfo").outputs["Is Strand"])
 
 
 def _write_aov(tree, name: str, value) -> None:

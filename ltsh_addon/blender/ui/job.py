@@ -7,7 +7,6 @@ import json
 import math
 import shutil
 import subprocess
-import tempfile
 import threading
 import time
 from collections import deque
@@ -389,8 +388,9 @@ class Job:
 
         Raises SceneError and OSError.
         """
-        job = self.folder / "job.json"
-        document = {"runs": runs, "path": _library_folders(), "temporary": str(self.folder)}
+        job, spec = self.folder / "job.json", importlib.util.find_spec("OpenEXR")
+        libraries = [str(Path(spec.origin).parent)] if spec is not None and spec.origin else []
+        document = {"runs": runs, "path": libraries, "temporary": str(self.folder)}
         job.write_text(json.dumps(document), encoding="utf-8")
         self._messages: SimpleQueue = SimpleQueue()
         command = blender_process.child_command(job, SCRIPT)
@@ -473,17 +473,6 @@ class Job:
     def seconds(self) -> float:
         """Seconds since the start."""
         return time.monotonic() - self.started
-
-
-def new_folder() -> Path:
-    """A temporary folder for a job."""
-    return Path(tempfile.mkdtemp(prefix="ltsh-"))
-
-
-def _library_folders() -> list[str]:
-    """Folders in which the process finds the libraries of the extension."""
-    spec = importlib.util.find_spec("OpenEXR")
-    return [str(Path(spec.origin).parent)] if spec is not None and spec.origin else []
 
 
 def clock(seconds: float) -> str:

@@ -6,6 +6,7 @@ import atexit
 import logging
 import re
 import shutil
+import tempfile
 import time
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from ..extract.apply import restore_materials, show_texture, shows_texture
 from ..process.bake import BakedTextures
 from ..saving import save_working_copy
 from . import comparison, preflight, results
-from .job import Job, Plan, clock, new_folder, output_folder, progress_text, runs_of, session_times, stage_title, steps
+from .job import Job, Plan, clock, output_folder, progress_text, runs_of, session_times, stage_title, steps
 
 TIMER_SECONDS, WAITING_SECONDS = 0.1, 0.005
 
@@ -108,7 +109,7 @@ class _JobOperator:
         if reason:
             self.report({"ERROR"}, reason)
             return False
-        folder = new_folder()
+        folder = Path(tempfile.mkdtemp(prefix="ltsh-"))
         copy = folder / (Path(bpy.data.filepath).name or "untitled.blend")
         runs = runs_of(context, self.command, copy)
         job = Job(

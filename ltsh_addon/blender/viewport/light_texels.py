@@ -73,7 +73,7 @@ def circle_first(count: int) -> int:
 
 
 def light_texels(lights: Iterable[Light]) -> np.ndarray:
-    """Texels (H, `WIDTH`, 4) of `lights` in float32. Lights must have an area, see `visible_lights`.
+    """Texels (H, `WIDTH`, 4) of `lights` in float32. Lights must have an area.
 
     The order is: corners s, t that lights share; nodes and weights of quadratures over cones; `HEADER` texels per
     light; then the corners, receivers and pattern of each light. A corner is center + s * half_u + t * half_v. A light
@@ -118,11 +118,6 @@ def _pattern_texels(pattern) -> np.ndarray:
     traits = np.array([rows * np.pi / (np.pi - pattern.start), columns, pattern.by_ray])[:, None]
     values = np.pad(pattern.values.ravel(), (0, -pattern.values.size % 4)).reshape(-1, 4)
     return np.concatenate([np.concatenate([pattern.axes, traits], axis=1), [[rows, 0.0, 0.0, 0.0]], values])
-
-
-def visible_lights(lights: Iterable[Light]) -> list[Light]:
-    """The lights that have an area."""
-    return [light for light in lights if light.area_vector.any()]
 
 
 def _outline(light, next_texel):
@@ -246,7 +241,7 @@ class UploadedLights:
 
 def upload_lights(lights: Iterable[Light], sky: gpu.types.GPUTexture | None = None) -> UploadedLights:
     """`lights` on the card, beside the texture `sky`; needs an active GPU context."""
-    visible = tuple(visible_lights(lights))
+    visible = tuple(light for light in lights if light.area_vector.any())
     return UploadedLights(visible, float_texture(light_texels(visible)), sky)
 
 

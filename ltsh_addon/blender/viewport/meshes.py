@@ -318,14 +318,11 @@ def _slot_values(value: Value) -> np.ndarray:
         rows[:3], rows[3, 3] = value.matrix, 1.0
         rows[4:6, :3] = use.mapping
         rows[4, 3] = use.closest
-        encoding = is_encoded(use.image) * (1 + use.by_alpha)
+        # Cycles interpolates such images before it converts them to linear values.
+        is_encoded = not use.image.is_float and use.image.colorspace_settings.name == "sRGB"
+        encoding = is_encoded * (1 + use.by_alpha)
         rows[5, 3] = EXTENSIONS.index(use.extension) + len(EXTENSIONS) * encoding
     return rows
-
-
-def is_encoded(image) -> bool:
-    """True for images that Cycles interpolates before it converts them to linear values."""
-    return not image.is_float and image.colorspace_settings.name == "sRGB"
 
 
 def albedo_table() -> np.ndarray:

@@ -385,6 +385,7 @@ NAMED = {
     "instance in the same place": "in the same place as 'Pane'",
     "doubled": "67 % of its faces where others are",
     "overlapped": "50 % of its faces where others are",
+    "rug in its plane": "100 % of those of 'Pane' in 'Rug'",
     "light in its plane": "in the plane of a face: 'Flush' in 'Pane'",
 }
 
@@ -424,6 +425,10 @@ def test_what_is_not_as_in_cycles_is_named(name):
             light.size = 0.1
             location = (ob.location.x, ob.location.y, ob.location.z + height)
             scene_parts.link(bpy.data.objects.new(light_name, light), location)
+    elif name == "rug in its plane":
+        corners = [(-1, -1, 0), (1, -1, 0), (0, 1, 0)]
+        hidden(scene_parts.add_mesh("Pane", corners, [(0, 1, 2)], location=(0.3, 0.2, 1.0)))
+        pane(scene_parts.principled("Rug")[0]).name = "Rug"
     elif name == "doubled":
         # Two squares are one; of the triangles above one is the back of the other.
         square, up = [(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)], [(-1, -1, 0.1), (1, -1, 0.1), (0, 1, 0.1)]

@@ -29,9 +29,8 @@ EXCUSES = {
     "shadows: area lights in the plane of a face": "^snapped.* area ",
 }
 # What is wrong without a warning.
-OVERLAP = "faces of unequal meshes overlap in one plane: Cycles is black there, and no warning says so"
 RARE = "Cycles samples the rim of the cone of a sheared spot so rarely that two halves do not tell its noise"
-WRONG = {7: OVERLAP, 42: RARE, 87: OVERLAP, 113: OVERLAP}
+WRONG = {42: RARE}
 
 
 @dataclass

@@ -18,10 +18,10 @@ from ltsh_addon.blender.ui import operators, results
 ROOT = Path(__file__).resolve().parents[3]
 # Runs a job until its first stage, and waits to be killed or cancels it and ends.
 OWNER = """
-import json, threading, time
-from ltsh_addon.blender.ui.job import Job, new_folder
-from ltsh_addon.blender.ui.job import Plan, Step
-job = Job("Job", Plan([Step("Starting", 1.0)]), new_folder(), "compare", 0)
+import json, tempfile, threading, time
+from pathlib import Path
+from ltsh_addon.blender.ui.job import Job, Plan, Step
+job = Job("Job", Plan([Step("Starting", 1.0)]), Path(tempfile.mkdtemp(prefix="ltsh-")), "compare", 0)
 job.start(json.loads({runs!r}), background=False)
 while not job.finished and job.stage == "Starting":
     job.poll()

@@ -340,7 +340,7 @@ def cut(socket) -> None:
 
 # FOLDED: what the operations of Math nodes are for numbers alone.
 FOLDED = {
-    "DIVIDE": operator.truediv,
+    "DIVIDE": lambda first, second: first / second,
     "LOGARITHM": math.log,
     "MAXIMUM": max,
     "POWER": lambda base, exponent: max(base, 0.0) ** exponent,

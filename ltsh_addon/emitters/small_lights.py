@@ -50,14 +50,15 @@ class SmallLight:
         return cls(center, float(radius), area, diagonal)
 
 
-def moments_of(lights) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Centers (L, 3), area vectors (L, 3), covariances (L, 3, 3) of the points in m^2, and diagonals (L,) of lights, as
-    in `SmallLight`."""
+def moments_of(lights) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Centers (L, 3), area vectors (L, 3), covariances (L, 3, 3) of the points in m^2, diagonals (L,) and radii (L,) of
+    lights, as in `SmallLight`."""
     center, u, v, direction = (
         np.array([getattr(light, name) for light in lights]) for name in ("center", "half_u", "half_v", "direction")
     )
     area, is_round = np.array([light.area_vector for light in lights]), np.array([light.is_round for light in lights])
     diagonal = np.maximum(np.square(u + v).sum(axis=1), np.square(u - v).sum(axis=1))
+    radius = np.sqrt(np.where(is_round, np.maximum(np.square(u).sum(axis=1), np.square(v).sum(axis=1)), diagonal))
     covariance = u[:, :, None] * u[:, None] + v[:, :, None] * v[:, None]
     covariance /= np.where(is_round, 4.0, 3.0)[:, None, None]
     counts = np.array([0 if light.corners is None else len(light.corners) for light in lights])
@@ -65,7 +66,8 @@ def moments_of(lights) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         same = np.flatnonzero(counts == count)
         corners = np.array([lights[number].corners for number in same])
         center[same], covariance[same] = _moments(corners, area[same])
-    return center, area * np.copysign(1.0, (area * direction).sum(axis=1))[:, None], covariance, diagonal
+        radius[same] = np.sqrt(np.square(corners - center[same, None]).sum(axis=2).max(axis=1))
+    return center, area * np.copysign(1.0, (area * direction).sum(axis=1))[:, None], covariance, diagonal, radius
 
 
 def _moments(corners, area):

@@ -154,10 +154,9 @@ class AlikeLights:
     def of(cls, lights, numbers) -> AlikeLights:
         """Those of `lights`, (light, row, corners), with these `numbers` (L,)."""
         alike = [lights[number][0] for number in numbers]
-        centroid, area, _, diagonal = small_lights.moments_of(alike)
+        centroid, area, _, diagonal, radius = small_lights.moments_of(alike)
         center = np.array([light.center for light in alike])
         corners = np.array([lights[number][2] for number in numbers])
-        radius = np.sqrt(np.square(corners - centroid[:, None]).sum(axis=2).max(axis=1))
         names = ("half_u", "half_v", "direction", "radiance")
         vectors = [np.array([getattr(light, name) for light in alike]) for name in names]
         longest = np.square(corners - corners[:, :1]).sum(axis=2).max(axis=1)

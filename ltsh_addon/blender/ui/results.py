@@ -124,11 +124,8 @@ def show(scene, folder: Path) -> None:
     for name in result.groups:
         settings.groups.add().name = name
     choice = choice_of(settings, result)
-    # The artist's choice stays if the new results have it, or will have it once they are complete.
-    for key in ("group", "first", "second", "pass_name") if not result.partial else ():
-        is_alone = key == "second" and choice.second == choice.first
-        if getattr(settings, key) != getattr(choice, key) and not is_alone:
-            set_silently(settings, key, getattr(choice, key))
+    if settings.group != choice.group:
+        set_silently(settings, "group", choice.group)
     wanted = {_full(name, layer) for name, group in result.groups.items() for layer in group["files"]}
     for image in [image for image in our_images(scene) if image[LAYER] not in wanted and image[LAYER]]:
         bpy.data.images.remove(image)
@@ -331,8 +328,7 @@ def end_processes() -> None:
 class Update:
     """Shades lights of a scene's mixer that have moved, by the numbers of their rows.
 
-    A thread shades them at their new places, first as drafts; `take` puts new pictures into the mixer. Raises
-    SceneError.
+    A thread shades them at their new places; `take` puts new pictures into the mixer. Raises SceneError.
     """
 
     def __init__(self, scene, moved: dict[int, Light]):
@@ -362,7 +358,7 @@ class Update:
             number, content, self.done = self._made.get()
             if number is None:
                 self.is_finished, self.error = True, content
-            else:
+            elif content is not None:
                 newest[number] = content
         for number, layer in newest.items():
             row = replace(self._before[number][0], light=self.moved[number].record())

@@ -23,7 +23,7 @@ from ..pipeline.options import (
     options_from,
     real_number,
 )
-from ..pipeline.picture import Baseline, with_times
+from ..pipeline.picture import Baseline
 from ..pipeline.tasks import BatchJob
 from ..scene import SceneError, error_line
 from ..shading import TableError
@@ -82,8 +82,7 @@ An object that cannot be baked is named at the end, and the exit code is 1; the 
 VIEW = """Draw what the camera sees as the viewport does, in a fraction of the time that shade
 takes. Needs OpenGL or Vulkan, with a graphics card or without. OUT gets view.exr, with
 a layer for each technique, combined and by pass, view.png, which shows the first
-technique through the scene's view transform, and report.json. --json also tells draw_s,
-the median seconds of a redraw, and refined_s, those of N redraws with all shadow rays."""
+technique through the scene's view transform, and report.json."""
 VIEW_EXAMPLES = """examples:
   %(prog)s room.blend -o out/draft --resolution 480x270 --refine 1
   %(prog)s room.blend -o out/playblast --frames 1-240 --resume
@@ -200,7 +199,7 @@ def _merge(arguments, bar, open_file) -> int:
     if arguments.baseline is not None:
         raise Misuse("--baseline belongs into the job file, to the job that it is for")
 
-    def merge(job, settings, baseline):
+    def merge(job, settings, bar, baseline):
         return merge_job(job.options.output, settings, bar, baseline)
 
     return _for_each(read_jobs(arguments.output, job_parsers(), job_of), merge, arguments, bar)
@@ -328,13 +327,10 @@ def add_run(parser) -> None:
 
 
 def _run_jobs(arguments, bar, open_file) -> int:
-    def do(job, settings, baseline):
-        return do_job(job, settings, bar, baseline)
-
     def job_with_scripts(of_job, scenes):
         return job_of(argparse.Namespace(**{**vars(of_job), "scripts": arguments.scripts}), scenes)
 
-    return _for_each(read_jobs(arguments.file, job_parsers(), job_with_scripts), do, arguments, bar)
+    return _for_each(read_jobs(arguments.file, job_parsers(), job_with_scripts), do_job, arguments, bar)
 
 
 def job_parsers() -> dict[str, argparse.ArgumentParser]:
@@ -348,7 +344,8 @@ def job_parsers() -> dict[str, argparse.ArgumentParser]:
 
 
 def _for_each(jobs: list[FileJob], do, arguments, bar) -> int:
-    """Call do(job, settings, baseline) for every job; the others go on if one fails. Returns the worst exit code."""
+    """Call do(job, settings, bar, baseline) for every job; the others go on if one fails; returns the worst exit
+    code."""
     baselines = [baseline_of(wanted.arguments) for wanted in jobs]
     documents, worst = [], 0
     for number, (wanted, baseline) in enumerate(zip(jobs, baselines, strict=True), 1):
@@ -357,7 +354,7 @@ def _for_each(jobs: list[FileJob], do, arguments, bar) -> int:
         label = f"job {number} of {len(jobs)} ({wanted.job.command}, {output})"
         bar.begin_job(label)
         try:
-            document, code = do(wanted.job, settings, baseline)
+            document, code = do(wanted.job, settings, bar, baseline)
         except (SceneError, TableError, OSError, ValueError, ImportError, MemoryError) as error:
             bar.note(f"failed: {label}: {error_line(error)}")
             document, code = {"error": error_line(error)}, 1
@@ -409,8 +406,6 @@ def merge_job(output: Path, arguments, bar, baseline: Baseline | None = None) ->
         worse = baseline.worse(merged.report, arguments.tolerance)
         _complain(bar, "worse", worse)
     document = merged.report if baseline is None else {**merged.report, "worse": worse}
-    if merged.command == "view":
-        document = with_times(document, merged.seconds)
     return document, 1 if merged.missing or merged.problems or worse else 0
 
 

@@ -72,7 +72,7 @@ SMALLEST_ANGLE = 1e-4
 # A sample is split only if both parts have at least this share of the light from between the horizons.
 SMALLEST_SHARE = 5e-3
 # Share of the light that splitting would move and that a quick run leaves where it is.
-UNSPLIT = 0.1
+UNSPLIT = 0.03
 # Samples per block.
 BLOCK = 2048
 # If there are more flat lights of one spread, this many rectangles stand for them, about as fine as the directions.
@@ -288,7 +288,7 @@ class _LightsOfKind:
         radius = np.linalg.norm(corners - center[:, None], axis=2).max(axis=1)
         if alike[0].is_facing:
             radius = np.array([light.radius for light in alike])
-        axes = np.array([[*_plane_axes(light), -light.direction] for light in alike])
+        axes = _plane_axes(corners - center[:, None], np.array([light.direction for light in alike]))
         brightness = np.array([np.abs(light.radiance).sum() for light in alike])
         scales = np.linalg.pinv(np.array([[light.half_u, light.half_v] for light in alike]).swapaxes(1, 2))
         rest = radius, axes, scales, share, _is_side(alike[0])
@@ -396,11 +396,11 @@ class _LightsOfKind:
         return np.where(corners[2].mean(axis=0) > 0.0, whole, 0.0)
 
 
-def _plane_axes(light) -> np.ndarray:
-    """Two orthonormal axes (2, 3) in the plane of the light."""
-    first = light.polygon()[0] - light.center
-    first /= max(np.linalg.norm(first), 1e-30)
-    return np.stack([first, np.cross(light.direction, first)])
+def _plane_axes(corners, direction) -> np.ndarray:
+    """Orthonormal axes (L, 3, 3): two in the planes of lights with `corners` (L, V, 3), from their centers, and a
+    `direction` (L, 3); then the opposite of that."""
+    first = corners[:, 0] / np.maximum(np.linalg.norm(corners[:, 0], axis=1), 1e-30)[:, None]
+    return np.stack([first, np.cross(direction, first), -direction], axis=1)
 
 
 def _lobe_density(samples, towards) -> np.ndarray:

@@ -10,8 +10,6 @@ The dots in shapes (...) stand for lights, samples or both; arrays broadcast ove
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
-from math import comb, gamma
 
 import numpy as np
 
@@ -20,7 +18,10 @@ from ..lobes.lookup_table import bent_cosines
 from ..lobes.polygon import cross, dot
 from ..lobes.spherical_harmonics import degree_of
 from .light_polygons import LEAST_COSINE, LOBE_WIDTH
+from .tails import NEAR_RADII
 
+# Angle in rad from the peak of a sharp lobe beyond which single precision finds its tail to 2e-4.
+SHARP_TAIL = 0.05
 # Greatest radius of a small light in units of the length over which the integrand changes.
 LARGEST = 0.05
 # Relative change of GGX toward the rim of such a light, divided by that size.
@@ -49,14 +50,15 @@ class SmallLight:
         return cls(center, float(radius), area, diagonal)
 
 
-def moments_of(lights) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Centers (L, 3), area vectors (L, 3), covariances (L, 3, 3) of the points in m^2, and diagonals (L,) of lights, as
-    in `SmallLight`."""
+def moments_of(lights) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Centers (L, 3), area vectors (L, 3), covariances (L, 3, 3) of the points in m^2, diagonals (L,) and radii (L,) of
+    lights, as in `SmallLight`."""
     center, u, v, direction = (
         np.array([getattr(light, name) for light in lights]) for name in ("center", "half_u", "half_v", "direction")
     )
     area, is_round = np.array([light.area_vector for light in lights]), np.array([light.is_round for light in lights])
     diagonal = np.maximum(np.square(u + v).sum(axis=1), np.square(u - v).sum(axis=1))
+    radius = np.sqrt(np.where(is_round, np.maximum(np.square(u).sum(axis=1), np.square(v).sum(axis=1)), diagonal))
     covariance = u[:, :, None] * u[:, None] + v[:, :, None] * v[:, None]
     covariance /= np.where(is_round, 4.0, 3.0)[:, None, None]
     counts = np.array([0 if light.corners is None else len(light.corners) for light in lights])
@@ -64,7 +66,8 @@ def moments_of(lights) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         same = np.flatnonzero(counts == count)
         corners = np.array([lights[number].corners for number in same])
         center[same], covariance[same] = _moments(corners, area[same])
-    return center, area * np.copysign(1.0, (area * direction).sum(axis=1))[:, None], covariance, diagonal
+        radius[same] = np.sqrt(np.square(corners - center[same, None]).sum(axis=2).max(axis=1))
+    return center, area * np.copysign(1.0, (area * direction).sum(axis=1))[:, None], covariance, diagonal, radius
 
 
 def _moments(corners, area):
@@ -122,6 +125,14 @@ class SharpestLobes:
         self.mirrored = np.float32(2.0) * cosine * normal - view
         self.width = (LOBE_WIDTH * width * np.maximum(np.abs(cosine), LEAST_COSINE)).astype(np.float32)
 
+    def are_tails(self, light, position) -> np.ndarray:
+        """Mask (Q,) of the lobes at `position` (3, Q) of which a light meets only the tail, where limits hold."""
+        offset = (light.center[:, None] - light.viewpoint(position)).astype(np.float32)
+        distance = np.maximum(np.sqrt(dot(offset, offset)), np.float32(1e-30))
+        reach = np.arcsin(np.minimum(np.float32(NEAR_RADII * SmallLight.of(light).radius) / distance, np.float32(1.0)))
+        away = np.arccos(np.clip(dot(self.mirrored, offset) / distance, -1.0, 1.0))
+        return away > reach + np.float32(SHARP_TAIL)
+
     def lengths(self, columns, rays: RaysToCenters, size) -> np.ndarray:
         """The least angle (...) in rad, at most 1, over which the lobes `columns` change within lights of a radius of
         `size` rad."""
@@ -167,13 +178,6 @@ class CosineAtPoint:
         values /= rays.squares * rays.squares
         return values[None]
 
-    def at_nodes(self, columns, nodes, toward, weights):
-        """Values (1, N, Q) of the lobes at unit vectors (3, N, Q) along their axes, times weights (N, Q), all scaled
-        so that they add up to the integral over the hemisphere."""
-        values = nodes[2] * weights
-        values /= values.sum(axis=0)
-        return values[None]
-
     def integral(self, columns, coordinates, weights):
         """Sums (1, Q) over points of the lobe divided by the cubed distance, times `weights` that broadcast to (S, T,
         Q). The points have `coordinates` (C, S, T, Q) along the rows of the lobes `columns` (Q,)."""
@@ -201,28 +205,22 @@ class ShadowedCosineAtPoint:
 
     def __call__(self, columns, rays: RaysToCenters):
         along = rays.heights(self.smooth[:, columns])
-        return self.plain(columns, rays) * self._shadowing(columns, along, rays.squares)
-
-    def at_nodes(self, columns, nodes, toward, weights):
-        """As in `CosineAtPoint`, without the shadowing in the scale. `toward` (3, N, Q) are the world directions of the
-        nodes."""
-        along = dot(self.smooth[:, None, columns], toward)
-        shadowing = self._shadowing(columns, along, dot(toward, toward))
-        return self.plain.at_nodes(columns, nodes, toward, weights) * shadowing
+        return self.plain(columns, rays) * bump_shadowing(along, rays.squares, self.bump_alpha2[columns])
 
     def integral(self, columns, coordinates, weights):
         """As in `CosineAtPoint`. There is one more coordinate, along the smooth normal."""
         values = self.plain.at(coordinates)
-        values *= self._shadowing(columns, coordinates[3], dot(coordinates[:3], coordinates[:3]))
+        squares = dot(coordinates[:3], coordinates[:3])
+        values *= bump_shadowing(coordinates[3], squares, self.bump_alpha2[columns])
         return _sum(values, weights)[None]
 
-    def _shadowing(self, columns, along, squares):
-        """Bump shadowing (...), given the height (...) over the plane of the smooth normal and the squared distance
-        (...)."""
-        along = np.maximum(along, np.float32(1e-15) * np.sqrt(squares))
-        tangent2 = np.maximum(squares / (along * along) - np.float32(1.0), np.float32(0.0))
-        shadowing = np.sqrt(np.float32(1.0) + self.bump_alpha2[columns] * tangent2)
-        return np.float32(2.0) / (np.float32(1.0) + shadowing)
+
+def bump_shadowing(along, squares, bump_alpha2):
+    """Bump shadowing (...) at heights (...) over the plane of the smooth normal and squared distances (...)."""
+    along = np.maximum(along, np.float32(1e-15) * np.sqrt(squares))
+    tangent2 = np.maximum(squares / (along * along) - np.float32(1.0), np.float32(0.0))
+    shadowing = np.sqrt(np.float32(1.0) + bump_alpha2.astype(np.float32) * tangent2)
+    return np.float32(2.0) / (np.float32(1.0) + shadowing)
 
 
 class LobeAtPoint:
@@ -234,7 +232,6 @@ class LobeAtPoint:
         x, y, z = rows[:3]
         self.determinant = dot(x, cross(y, z))
         self.terms = weights if self.is_cosine else polynomial_terms(weights)
-        self.wholes = hemisphere_integrals_of_terms(self.terms.shape[1], self.bend is not None)
 
     def __call__(self, columns, rays: RaysToCenters):
         x, y, z = (rays.heights(row[:, columns]) for row in self.rows[:3])
@@ -257,26 +254,6 @@ class LobeAtPoint:
         if rays.slack is None:
             return self.limits.true_in_tails(values[0], columns, rays, len(self.terms))
         self.limits.apply_at_centers(values, columns, rays)
-        return values
-
-    def at_nodes(self, columns, nodes, toward, weights):
-        """As in `CosineAtPoint`, but (F, N, Q), without limits. The scale is that of the lobe before it is kept from
-        falling below zero."""
-        x, y, z = nodes
-        cosine = z * weights
-        cosine *= np.float32(1.0 / np.pi)
-        if self.is_cosine:
-            return self.terms[:, :, columns] * (cosine / cosine.sum(axis=0))
-        leaning = None if self.bend is None else self._leaning(x, y, z)
-        terms = self.terms[..., columns]
-        values = np.stack([self._value(curve[:, None], x, z, leaning) for curve in terms])
-        values *= weights
-        exact = sum(term * integral for term, integral in zip(np.moveaxis(terms, 1, 0), self.wholes, strict=True))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            scale = np.fmin(np.fmax(exact / values.sum(axis=1), np.float32(0.5)), np.float32(2.0))
-        np.maximum(values, np.float32(0.0), out=values)
-        np.maximum(values[0], np.float32(LEAST_SHARE) * cosine, out=values[0])
-        values *= scale[:, None]
         return values
 
     def integral(self, columns, coordinates, weights):
@@ -346,19 +323,6 @@ def polynomial_terms(weights: np.ndarray) -> np.ndarray:
         terms[5] -= 3.0 * (w[12] + w[14])
         terms[10:15] = 5.0 * w[10], 20.0 * w[11], 30.0 * w[12], 20.0 * w[13], 5.0 * w[14]
     return np.ascontiguousarray(np.moveaxis(terms, 0, -2))
-
-
-@cache
-def hemisphere_integrals_of_terms(count: int, has_bend: bool) -> np.ndarray:
-    """Integrals (K,) over the hemisphere of the `count` functions whose coefficients are in `polynomial_terms`."""
-    degree = degree_of(count - 2 * has_bend)
-    # x^k z^power: the mean of cos^k around the axis, times a beta function of heights.
-    integrals = [
-        0.0 if k % 2 else np.pi * comb(k, k // 2) / 2.0**k * gamma(0.5 * k + 1.0) * gamma(0.5 * power + 0.5)
-        / gamma(0.5 * (k + power) + 1.5)
-        for n in range(degree + 1) for power in range(n + 1) for k in [n - power]
-    ]  # fmt: skip
-    return np.array(integrals + [0.0, 2.0 * np.pi] * has_bend, np.float32)
 
 
 def polynomial(terms: np.ndarray, x, z) -> np.ndarray:

@@ -18,7 +18,7 @@ from ..emitters.facing import FacingDisk
 from ..emitters.light_polygons import may_reach, off_plane
 from ..lobes import brdf
 from ..lobes.polygon import dot
-from ..scene import FARTHEST, PASSES, Film, FlatLight, Light, PolygonLight, SurfaceSamples, round_outline
+from ..scene import FARTHEST, PASSES, Film, FlatLight, Light, PointLight, PolygonLight, SurfaceSamples, round_outline
 from .emitter import Emitter, Sky
 from .light_cluster import LightCluster
 from .occluders import GAP
@@ -58,10 +58,10 @@ TILE = np.float32(12.0)
 # Numbers of AROUND two pixels away, and what the kernel adds to a picture per second difference of these: half its
 # variance of 1.5 pixels over the squared distance.
 ACROSS, BEND = [AROUND.index(step) for step in ((0, 2), (2, 0))], np.float32(0.75 / 4.0)
-# Rays end at this share of their distance to the light, just before it; but to an area light with a face as near as
-# that, GAP of the coordinates before its plane: a step of single precision.
-END = np.float32(1.0 - 1e-4)
-# Points along each side of a light from which near faces are looked for.
+# Rays end at this share of their distance to the light, just before it; but to a light with a face as near as that, GAP
+# of the coordinates before its surface, a step of single precision, or MESH_STEPS of them before a face that glows.
+END, MESH_STEPS = np.float32(1.0 - 1e-4), 16.0
+# Points along each side of a flat light from which near faces are looked for; as many squared around a point.
 LOOKED_AT = 8
 _ZERO, _ONE, _TINY = np.float32(0.0), np.float32(1.0), np.float32(1e-30)
 # Points of the unit disk to aim at, for lights that face the points.
@@ -206,7 +206,8 @@ class RatioEstimator:
         self.mask = np.uint32(surface.tracer.mask_of(light.name))
         self.surface_mask = np.uint32(surface.tracer.surface_mask_of(light.name))
         # The faces of a mesh light block rays to the mesh itself.
-        self.at_surface = isinstance(emitter, LightCluster) or isinstance(light, PolygonLight)
+        self.is_mesh = emitter.has_mesh if isinstance(emitter, LightCluster) else isinstance(light, PolygonLight)
+        self.at_surface = self.is_mesh or isinstance(emitter, LightCluster)
         self.chosen_by, self.number, self.selection = surface.tracer.chosen_by(light.name), number, selection
         origins = light.viewpoint(surface.position)
         offset = (light.center[:, None] - origins).astype(np.float32)
@@ -235,7 +236,7 @@ class RatioEstimator:
         self.count = np.zeros(count, np.int32)
         self.traced = 0
         # How far before the plane of the light rays end, in m, but for what follows from their length; 0: at END.
-        self.margin = _ZERO
+        self.margin, self.is_tiny = _ZERO, False
         self.is_shared = np.zeros(count, bool)
 
     def trace(self, rays: int, neighbors: PixelNeighbors, typical: dict[str, float], importance: np.ndarray) -> None:
@@ -243,9 +244,9 @@ class RatioEstimator:
         and the `importance` (P,) of the sample. `typical` comes from `typical_radiance`."""
         if self.mask == 0 or not self.light.area_vector.any():
             return
-        if isinstance(self.light, FlatLight) and not self.at_surface and len(self.index):
+        if isinstance(self.light, FlatLight | PointLight) and len(self.index):
             self.margin = self._margin()
-            self.at_surface = self.margin > 0.0
+            self.at_surface |= bool(self.margin)
         shares = isinstance(self.emitter, Sky) and neighbors.order is not None and rays > PROBES
         self._neighbors, order = neighbors, neighbors.order if shares else None
         self._add_rays(np.arange(len(self.index)), 0, PROBES, 0, order)
@@ -296,19 +297,32 @@ class RatioEstimator:
                 self._add_rays(members, PROBES, int(last), split, order)
 
     def _margin(self):
-        """GAP of the light's coordinates along its normal in m, if a face is so near that END may be behind it; else
-        0."""
-        light = self.light
+        """How far before the light's surface rays end, in m, if a face is so near that END may be behind it; else 0."""
+        light, emitter = self.light, self.emitter
         offset = self.surface.position[:, self.index] - light.center[:, None]
-        near = 2.0 * (1.0 - END) * np.sqrt(np.square(offset).sum(axis=0).max())
-        s, t = np.meshgrid(*2 * [(np.arange(LOOKED_AT) + 0.5) * (2.0 / LOOKED_AT) - 1.0])
-        points = light.center + s.reshape(-1, 1) * light.half_u + t.reshape(-1, 1) * light.half_v
-        points += near * light.direction
-        rays = points, np.broadcast_to(-light.direction, points.shape), np.full(len(points), 2.0 * near)
-        masks = np.full(len(points), self.mask)
-        if (self.surface.tracer.transmittance(*rays, masks) == 1.0).all():
-            return _ZERO
-        return np.float32(GAP * (np.abs(light.direction) @ np.abs(light.center)) + 1e-12)
+        near = 2.0 * (1.0 - END) * (np.sqrt(np.square(offset).sum(axis=0).max()) + light.radius * light.is_facing)
+        margin, length = GAP * (np.abs(light.direction) @ np.abs(light.center)) + 1e-12, 2.0 * near
+        if isinstance(emitter, LightCluster):
+            points, normal = light.center + emitter.corners.mean(axis=1).T, emitter.normal.T
+            margin = GAP * (np.abs(light.center).max() + light.radius)
+        elif light.is_facing:
+            # Evenly spread over a sphere: a spiral.
+            z = (np.arange(LOOKED_AT**2) + 0.5) * (2.0 / LOOKED_AT**2) - 1.0
+            turn = (np.sqrt(1.0 - z * z), np.arange(len(z)) * np.pi * (3.0 - np.sqrt(5.0)))
+            normal = np.column_stack([turn[0] * np.cos(turn[1]), turn[0] * np.sin(turn[1]), z])
+            points, length = light.center + light.radius * normal, length + light.radius
+            # The directions to a small light are uncertain; those to its center are not, which then stands for it.
+            self.is_tiny = light.radius < 0.1 * near
+            margin = 4.0 * GAP * (np.abs(light.center).sum() + near / (1.0 - END)) if self.is_tiny else 0.1 * near
+        else:
+            s, t = np.meshgrid(*2 * [(np.arange(LOOKED_AT) + 0.5) * (2.0 / LOOKED_AT) - 1.0])
+            points = light.center + s.reshape(-1, 1) * light.half_u + t.reshape(-1, 1) * light.half_v
+            normal = np.broadcast_to(light.direction, points.shape)
+        if self.is_mesh:
+            margin = MESH_STEPS * GAP * (np.abs(light.center).sum() + light.radius) + 1e-12
+            length = near - margin
+        rays = points + near * normal, -normal, np.full(len(points), length), np.full(len(points), self.mask)
+        return _ZERO if (self.surface.tracer.transmittance(*rays) == 1.0).all() else np.float32(margin)
 
     def _wanted_rays(self, rays, worth, importance):
         """Number of rays (Q,) that each pair is worth, by the unshadowed light that it reflects relative to a typical
@@ -372,19 +386,26 @@ class RatioEstimator:
                 distance[:] = _FARTHEST
             aimed = self.surface.ray_origins.aimed(self.index[unmet], toward[:, None], distance[None], self.at_surface)
             visibility = (
-                self._transmittance(self.mask, *(rows[..., 0, :] for rows in aimed)) if self.chosen_by.light else _ONE
+                self._transmittance(self.mask, _ONE, *(rows[..., 0, :] for rows in aimed))
+                if self.chosen_by.light
+                else _ONE
             )
             # Next to nothing, so that it does not count in sums over samples.
             self.sum_w[number][:, unmet] = _TINY
             self.sum_wv[number][:, unmet] = visibility * _TINY
 
-    def _transmittance(self, mask, origins, directions, distances):
-        """Transmittance (R,) of rays with a mask, `origins` and `directions` (3, R) and `distances` (R,)."""
+    def _transmittance(self, mask, falling, origins, directions, distances):
+        """Transmittance (R,) of rays with a mask, `origins` and `directions` (3, R) and `distances` (R,), which meet
+        the light at angles with the cosines `falling` (R,)."""
         self.traced += len(distances)
+        if self.margin and self.is_tiny:
+            directions = self.light.center[:, None] - origins
+            distances = np.sqrt(dot(directions, directions))
+            directions /= np.maximum(distances, _TINY)
         masks, ends = np.broadcast_to(mask, distances.shape), distances * END
         if self.margin:
-            falling = np.maximum(-(self.light.direction.astype(np.float32) @ directions), _TINY)
-            ends = np.maximum(ends, distances * np.float32(1.0 - GAP) - self.margin / falling)
+            margin = self.margin / np.maximum(falling, _TINY)
+            ends = np.maximum(ends, distances * np.float32(1.0 - GAP) - margin)
         return self.surface.tracer.transmittance(origins.T, directions.T, ends, masks)
 
     def _add_rays(self, members, first, last, split, order=None):
@@ -412,7 +433,11 @@ class RatioEstimator:
         flat = np.flatnonzero(met)
         aimed = self.surface.ray_origins.aimed(sampler.index, directions, distance, self.at_surface)
         origins, *rest = (_taken(rows, flat) for rows in aimed)
-        visibility.ravel()[flat] = self._transmittance(self.mask, origins, *rest) if self.chosen_by.light else _ONE
+        if self.chosen_by.light:
+            falling = sampler.falling.ravel()[flat] if self.margin else _ONE
+            visibility.ravel()[flat] = self._transmittance(self.mask, falling, origins, *rest)
+        else:
+            visibility.ravel()[flat] = _ONE
         if self.chosen_by.surface:
             others = self._chosen_by_surface(sampler, (directions, distance), flat, origins, visibility)
         least, most = visibility, visibility
@@ -458,7 +483,9 @@ class RatioEstimator:
         if meet_the_same:
             chosen &= (start != origins).any(axis=0)
         chosen = np.flatnonzero(chosen)
-        visibility = self._transmittance(self.surface_mask, start[:, chosen], toward[:, chosen], distance[chosen])
+        falling = sampler.falling.ravel()[flat[chosen]] if self.margin else _ONE
+        rays = start[:, chosen], toward[:, chosen], distance[chosen]
+        visibility = self._transmittance(self.surface_mask, falling, *rays)
         differ = np.flatnonzero(visibility != light_visibility.ravel()[flat[chosen]])
         if len(differ) == 0:
             return None

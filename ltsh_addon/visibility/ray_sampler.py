@@ -141,7 +141,8 @@ class RaySampler:
             self.dielectric, self.ior = surface.dielectric[index], surface.ior[index]
 
     def sample(self, batch: RayBatch):
-        """Unit directions (3, S, Q) of `batch`, distances to the light (S, Q), and weights (S, Q) by lobe."""
+        """Unit directions (3, S, Q) of `batch`, distances to the light (S, Q), and weights (S, Q) by lobe; `falling`
+        gets the cosines (S, Q) at a light that is flat."""
         if isinstance(self.emitter, Sky):
             return self._sample_sky(batch)
         if isinstance(self.emitter, LightCluster):
@@ -166,6 +167,7 @@ class RaySampler:
         height = self.height if self.disk is None else self.disk.length
         distance = np.minimum(height / np.maximum(falling, _TINY), _FARTHEST)
         falls = falling > 0.0
+        self.falling = falling if self.disk is None else np.ones_like(falling)
         falls &= self.has_solid_angle
         factor = falls / density
         if self.disk is None:
@@ -257,6 +259,7 @@ class RaySampler:
         normal = emitter.normal[:, leaf]
         falling, height = -dot(directions, normal), np.maximum(-dot(corners[:, 0], normal), _ZERO)
         distance = np.minimum(height / np.maximum(falling, _TINY), _FARTHEST)
+        self.falling = falling
         factor = has_solid_angle & (falling > 0.0) & (height > self.least_height) & (density > 0.0)
         if emitter.is_round is not None:
             factor &= self._inside_round(leaf, corners, directions * np.where(factor, distance, _ZERO))

@@ -124,11 +124,8 @@ def show(scene, folder: Path) -> None:
     for name in result.groups:
         settings.groups.add().name = name
     choice = choice_of(settings, result)
-    # The artist's choice stays if the new results have it, or will have it once they are complete.
-    for key in ("group", "first", "second", "pass_name") if not result.partial else ():
-        is_alone = key == "second" and choice.second == choice.first
-        if getattr(settings, key) != getattr(choice, key) and not is_alone:
-            set_silently(settings, key, getattr(choice, key))
+    # By these names no update function is called.
+    settings["group"] = choice.group
     wanted = {_full(name, layer) for name, group in result.groups.items() for layer in group["files"]}
     for image in [image for image in our_images(scene) if image[LAYER] not in wanted and image[LAYER]]:
         bpy.data.images.remove(image)
@@ -235,17 +232,10 @@ def blender_path(path, blend: str = "") -> str:
         return str(path)
 
 
-def set_silently(settings, key: str, value: str) -> None:
-    """Set a property, if it offers `value`, without a call of its update function."""
-    items = getattr(settings.bl_rna.properties[key], "enum_items", None)
-    if items is None or value in items:
-        settings[key] = value if items is None else items[value].value
-
-
 def leave_mix(settings) -> None:
     """Show the pictures again as before the light mixer."""
     if settings.mode == "MIX":
-        set_silently(settings, "mode", settings.mode_before_mix)
+        settings["mode"] = settings.bl_rna.properties["mode"].enum_items[settings.mode_before_mix].value
 
 
 # The light mixer:
@@ -331,8 +321,7 @@ def end_processes() -> None:
 class Update:
     """Shades lights of a scene's mixer that have moved, by the numbers of their rows.
 
-    A thread shades them at their new places, first as drafts; `take` puts new pictures into the mixer. Raises
-    SceneError.
+    A thread shades them at their new places; `take` puts new pictures into the mixer. Raises SceneError.
     """
 
     def __init__(self, scene, moved: dict[int, Light]):
@@ -362,7 +351,7 @@ class Update:
             number, content, self.done = self._made.get()
             if number is None:
                 self.is_finished, self.error = True, content
-            else:
+            elif content is not None:
                 newest[number] = content
         for number, layer in newest.items():
             row = replace(self._before[number][0], light=self.moved[number].record())

@@ -277,13 +277,13 @@ class RatioEstimator:
     def _trace_alone(self, number, choice, worth):
         """Give up sharing where that changes the light: there, trace up to `number` (Q,) rays anew."""
         alone = ~self.visible
-        for number in (np.minimum(number, ENOUGH_RAYS), number):
+        for last in (np.minimum(number, ENOUGH_RAYS), number):
             alone &= self.is_shared & (self.count > PROBES)
             self.is_shared &= ~alone
             for sums in (self.sum_w, self.sum_wv):
                 sums[:, :, alone] = 0.0
             self._add_rays(np.flatnonzero(alone), 0, PROBES, 0)
-            self._trace_more(alone & (number > PROBES), number, choice, None)
+            self._trace_more(alone & (last > PROBES), last, choice, None)
             alone = np.zeros(len(self.index), bool)
             for name in PASSES:
                 change = self._neighbors.bend(name, self.index, self.visibility_ratio(name)[0])

@@ -41,8 +41,6 @@ COARSE = 0.6
 POINT = 0.08
 # The error of a node's points, in units of its light times the fourth power of its size.
 FOURTH_ORDER = 1.0
-# Angle in rad from the peak of a sharp lobe beyond which single precision finds its tail to 2e-4.
-SHARP_TAIL = 0.05
 # Leaves are shaded as polygons if their error exceeds LEAF_ERROR of the tile's light, or their size LEAF_SIZE. In the
 # finer tiles below the limit is FINER_LEAF_ERROR: these differ in where their lobes point, so that their light may be
 # far below its bound.
@@ -372,7 +370,7 @@ class TileNodePairs:
             near = NEAR_RADII * np.sqrt(tree.diagonal[node])
             are_in_tail = np.sin(np.minimum(away, 0.5 * np.pi)) * between.nearest > near
             if tiles.only_tails:
-                are_in_tail &= away > SHARP_TAIL
+                are_in_tail &= away > small_lights.SHARP_TAIL
                 is_wrong = ~are_in_tail
             light *= (width**2 / (width**2 + away**2)) ** 2
             length = np.minimum(width + away, 1.0)

@@ -18,7 +18,10 @@ from ..lobes.lookup_table import bent_cosines
 from ..lobes.polygon import cross, dot
 from ..lobes.spherical_harmonics import degree_of
 from .light_polygons import LEAST_COSINE, LOBE_WIDTH
+from .tails import NEAR_RADII
 
+# Angle in rad from the peak of a sharp lobe beyond which single precision finds its tail to 2e-4.
+SHARP_TAIL = 0.05
 # Greatest radius of a small light in units of the length over which the integrand changes.
 LARGEST = 0.05
 # Relative change of GGX toward the rim of such a light, divided by that size.
@@ -121,6 +124,14 @@ class SharpestLobes:
         cosine = dot(normal, view)
         self.mirrored = np.float32(2.0) * cosine * normal - view
         self.width = (LOBE_WIDTH * width * np.maximum(np.abs(cosine), LEAST_COSINE)).astype(np.float32)
+
+    def are_tails(self, light, position) -> np.ndarray:
+        """Mask (Q,) of the lobes at `position` (3, Q) of which a light meets only the tail, where limits hold."""
+        offset = (light.center[:, None] - light.viewpoint(position)).astype(np.float32)
+        distance = np.maximum(np.sqrt(dot(offset, offset)), np.float32(1e-30))
+        reach = np.arcsin(np.minimum(np.float32(NEAR_RADII * SmallLight.of(light).radius) / distance, np.float32(1.0)))
+        away = np.arccos(np.clip(dot(self.mirrored, offset) / distance, -1.0, 1.0))
+        return away > reach + np.float32(SHARP_TAIL)
 
     def lengths(self, columns, rays: RaysToCenters, size) -> np.ndarray:
         """The least angle (...) in rad, at most 1, over which the lobes `columns` change within lights of a radius of

@@ -10,6 +10,7 @@ import bpy
 import numpy as np
 
 from ...scene import SceneError, error_line, light_records, listed
+from ...visibility.occluders import UNLIMITED
 from .. import render_settings
 from ..evaluated import SURFACE_TYPES, owner_of, read_values, rendered_surfaces, with_render_depsgraph
 from ..lights.area import LightInventory, collect_lights, note_overlaps, rendered_lights
@@ -264,6 +265,8 @@ def prepare_scene(
 
     unread = []
     inventory, materials, bare = with_render_depsgraph(scene, visit)
+    # Camera rays pass through any number of wholly transparent surfaces, which leave no trace in the passes.
+    scene.cycles.transparent_max_bounces = UNLIMITED
     if unread:
         inventory.occluders = with_baked_shares(inventory.occluders, unread, scene, inventory.warn)
     default = aovs.give_default_material(bare)
@@ -410,6 +413,8 @@ def _prepare_reference(scene, inventory: LightInventory) -> None:
     """Make Cycles light the scene as the techniques do, with or without shadows."""
     if inventory.occluders is None:
         remove_occlusion(scene)
+    else:
+        scene.cycles.transparent_max_bounces = inventory.occluders.transparent_surfaces
     scene.world = inventory.world
 
 

@@ -16,6 +16,7 @@ from ...scene import SceneError, error_line, listed
 from .. import render_settings
 from ..extract.occluders import with_baked_shares
 from ..extract.pixels import missing_images, no_light, open_scene
+from ..lights.area import collect_lights, note_overlaps
 from ..lights.world import light_of_world
 from ..materials.preview_material import world_radiance
 from ..process.view import GRAPHICS, VIEW_PASSES, VIEW_PNG, ViewJob
@@ -50,6 +51,7 @@ def draw_view(job: ViewJob, folder: Path, progress) -> dict:
         patterns = patterns_of(scene, depsgraph)
         occluders = view_occluders(depsgraph, warnings.append, unread) if job.shadows == "on" else None
         warnings += missing_images(depsgraph, scene.world, _layer(scene).material_override)
+        warnings += overlaps_of_lights(depsgraph)
     if unread:
         occluders = with_baked_shares(occluders, unread, scene, warnings.append)
     progress(GRAPHICS, 0.0)
@@ -73,6 +75,17 @@ def draw_view(job: ViewJob, folder: Path, progress) -> dict:
         **facts,
         "seconds": time.monotonic() - started,
     }
+
+
+def overlaps_of_lights(depsgraph) -> list[str]:
+    """Warnings about area lights that overlap in a plane."""
+    lights = [each.object for each in depsgraph.object_instances if each.object.type == "LIGHT"]
+    if sum(light.data.type == "AREA" for light in lights) < 2:
+        return []
+    inventory = collect_lights(depsgraph, depsgraph.view_layer_eval.material_override)
+    inventory.warnings.clear()
+    note_overlaps(inventory)
+    return inventory.warnings
 
 
 def with_graphics(function: Callable):

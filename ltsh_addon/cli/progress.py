@@ -238,6 +238,10 @@ class MessageProgress(ProgressBar):
             self._send({"stage": stage, "fraction": fraction})
         return True
 
+    def expect(self, seconds: dict[str, float]) -> None:
+        """Send the seconds that stages to come will take, by stage."""
+        self._send({"expected": seconds})
+
     def note(self, text: str) -> None:
         """Append the line to `notes`."""
         self.notes.append(text)

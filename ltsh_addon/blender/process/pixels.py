@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -168,9 +169,12 @@ class Extraction:
         return np.concatenate([light, self.cycles.background[..., 3:]], axis=-1)
 
 
-def extract_pixels(job: PixelJob, *, progress: Progress | None = None) -> Extraction:
+def extract_pixels(
+    job: PixelJob, *, progress: Progress | None = None, look: Callable[[Extraction], None] | None = None
+) -> Extraction:
     """The lights, samples and (if asked for) the Cycles reference of a .blend.
 
+    `look` gets the extraction before its lobes end at horizons, which may take long. For finished pictures it stays so.
     Raises SceneError if the scene or file cannot be used, Cancelled if `progress(stage, fraction)` returned False.
     """
     if job.sub_samples < 1 or job.cycles_samples < 0:
@@ -207,7 +211,11 @@ def extract_pixels(job: PixelJob, *, progress: Progress | None = None) -> Extrac
             left_to_cycles=left_to_cycles,
             points=points,
         )
-    return extraction if job.for_finished else ended_at_horizons(extraction)
+    if job.for_finished:
+        return extraction
+    if look is not None:
+        look(extraction)
+    return ended_at_horizons(extraction, progress)
 
 
 class _SampleRenders:
@@ -331,12 +339,13 @@ def with_points(extraction: Extraction, count: int) -> Extraction:
     return replace(extraction, samples=samples, film=film, points=PixelPoints(finer=finer))
 
 
-def ended_at_horizons(extraction: Extraction) -> Extraction:
+def ended_at_horizons(extraction: Extraction, progress: Progress | None = None) -> Extraction:
     """`extraction` with lobes that end at the horizons of Cycles."""
     samples, film = extraction.samples, extraction.film
     hit = np.arange(len(samples)) if film.first is None else np.cumsum(film.first)
     is_quick = extraction.left_to_cycles is not None
-    samples, index = end_at_horizons_of_cycles(samples, extraction.lights, hit, is_quick=is_quick)
+    options = {"is_quick": is_quick, "progress": progress}
+    samples, index = end_at_horizons_of_cycles(samples, extraction.lights, hit, **options)
     first = np.diff(index, prepend=-1) > 0
     if film.first is not None:
         first &= film.first[index]

@@ -37,6 +37,7 @@ NO_CYCLES = "Not complete: without Cycles"
 STAGE_TITLES = {
     "open scene": "Open Scene",
     "samples": "Sample Surfaces",
+    "horizons": "Horizons of Bumps",
     "Cycles A": "Cycles, First Half",
     "Cycles B": "Cycles, Second Half",
     "shadows": "Trace Shadows",
@@ -55,7 +56,7 @@ MOST = 0.99  # the largest share that is shown before the end is reported
 # Costs in seconds on two cores: once, or per million points, or per million points times samples. Plans learn the pace
 # of the machine.
 START_SECONDS, OPEN_SECONDS, RENDER_SECONDS = 1.5, 2.0, 0.5
-SAMPLE_SECONDS, FILE_SECONDS = 16.0, 3.0
+SAMPLE_SECONDS, FILE_SECONDS, HORIZON_SECONDS = 16.0, 3.0, 5.0
 CYCLES_SECONDS = 3.0  # per sample of Cycles, of direct light or of all
 SHADING_SECONDS = {"ltc": 6.5, "ltsh2": 8.0, "ltsh4": 10.0, "ltsh4c": 11.5, REFERENCE: 160.0}
 SHADOW_SECONDS, DENOISE_SECONDS = 30.0, 4.0  # shadows: with USUAL_RAYS rays
@@ -187,6 +188,7 @@ def shading_steps(points: float, sub_samples: int, shadow_rays: int, techniques)
     sampling = [
         Step("open scene", OPEN_SECONDS),
         Step("samples", RENDER_SECONDS * sub_samples + SAMPLE_SECONDS * points),
+        Step("horizons", HORIZON_SECONDS * points),
     ]
     shading = [Step(TECHNIQUES[name].title, _shading(name, points)) for name in techniques]
     # Most rays go to points that see a part of a light; elsewhere a few suffice.
@@ -255,6 +257,7 @@ class Plan:
         self._now = now
         self._at, self._share = 0, 0.0
         self._measured: dict[str, float] = {}
+        self._expected_seconds: dict[str, float] = {}
         self._stage_times: StageTimes = {}
         self._done_cost = self._done_seconds = 0.0
         self._started = self._stage_started = self._reported = now()
@@ -279,6 +282,10 @@ class Plan:
             self._end_step()
             self._at, self._stage_started = at, self._reported
         self._fraction = min(max(fraction, 0.0), 1.0) if self._steps[self._at].stage == stage else 0.0
+
+    def expect(self, seconds: dict[str, float]) -> None:
+        """Note the seconds that stages will take, as somebody has measured who knows what they do."""
+        self._expected_seconds.update(seconds)
 
     def _end_step(self) -> None:
         step, seconds = self._steps[self._at], self._reported - self._stage_started
@@ -324,13 +331,14 @@ class Plan:
         return seconds[True], seconds[False]
 
     def _is_known(self, step: Step, measured: StageTimes) -> bool:
-        return _kind(step.stage) in measured or _kind(step.stage) in self._before
+        kind = _kind(step.stage)
+        return kind in measured or kind in self._before or step.stage in self._expected_seconds
 
     def _expected(self, step: Step, measured: StageTimes) -> float:
         """Expected seconds of a step: as the same stage took, else by its cost and the pace of its kind, or of all."""
         seconds, cost = measured.get(_kind(step.stage), (0.0, 0.0))
         pace = seconds / cost if seconds > 0.0 and cost > 0.0 else self._pace()
-        return self._measured.get(step.stage, step.cost * pace)
+        return self._measured.get(step.stage, self._expected_seconds.get(step.stage, step.cost * pace))
 
     def _measured_costs(self) -> StageTimes:
         """Measured seconds and costs by kind, with an estimate for the step that runs if it tells enough."""
@@ -424,6 +432,8 @@ class Job:
         if "stage" in message:
             self.stage = message["stage"]
             self.plan.report(self.stage, float(message["fraction"]))
+        elif "expected" in message:
+            self.plan.expect(message["expected"])
         elif "result" in message:
             self.results.append(Path(message["result"]))
         elif "error" in message:

@@ -35,6 +35,7 @@ LEVELS = 2
 # A spot is brighter than the mean by SPOT_BRIGHTNESS, has at least the share SPOT_SHARE of the light, and fits into the
 # angle SPOT_RADIUS in rad.
 SPOT_BRIGHTNESS, SPOT_SHARE, SPOT_RADIUS = 100.0, 0.01, 0.06
+DETAIL_ANGLE = 0.1  # rad
 # MOST_SPOTS: most spots of a sky. SPOT_PATCHES: most patches of a spot that is no disk.
 MOST_SPOTS, SPOT_PATCHES = 8, 40
 # A spot becomes a disk of constant radiance if the disk misses at most this share of its light.
@@ -109,6 +110,21 @@ def bright_spots(pictures: list[SkyPicture]) -> list[Spot]:
         spots.append(Spot(center, float(radius), float(least)))
         offsets, power = offsets[~near], power[~near]
     return spots
+
+
+def fine_detail(pictures: list[SkyPicture]) -> float:
+    """The mean absolute difference of pictures from themselves, blurred by squares of DETAIL_ANGLE; relative to their
+    mean. It is near 0 for gradients, however steep."""
+    difference = total = 0.0
+    for picture in pictures:
+        light = mean_magnitude(picture.radiance)
+        half = int(len(light) * DETAIL_ANGLE / np.pi)
+        sums = np.pad(light, ((1, 0), (1, 0))).cumsum(axis=0).cumsum(axis=1)
+        side = 2 * half + 1
+        blurred = (sums[side:, side:] - sums[:-side, side:] - sums[side:, :-side] + sums[:-side, :-side]) / side**2
+        inner = light[half : len(light) - half, half : len(light) - half]
+        difference, total = difference + np.abs(inner - blurred).sum(), total + inner.sum()
+    return difference / total if total > 0.0 else 0.0
 
 
 def spot_frame(spot: Spot) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -154,9 +154,9 @@ def ray_length(light, offset: np.ndarray, directions: np.ndarray) -> np.ndarray:
     least = 1e-9 * np.sqrt(squared) + np.finfo(offset.dtype).tiny
     if not light.is_sphere:
         return squared / np.maximum(along, least)
-    rest = light.radius**2 - squared
-    root = np.sqrt(np.maximum(rest + along * along, 0.0))
+    rest, across = light.radius**2 - squared, offset - along * directions
     # The near side or, from within, the far one, computed without a difference of nearly equal numbers.
+    root = np.sqrt(np.maximum(light.radius**2 - dot(across, across), 0.0))
     return np.where(rest < 0.0, -rest / np.maximum(along + root, least), along + root)
 
 

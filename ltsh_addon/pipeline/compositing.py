@@ -42,7 +42,8 @@ EDGE_ERROR, LEAST_CURVATURE, EDGE_RADIUS = 0.2, 0.1, 1
 # to Cycles than the second number; it begins to do so at the first. SLOPE_VARIANCE: the variance within a pixel,
 # relative to the squared slope from pixel to pixel; it is twice the true one, to be safe. SHARED_POINTS: points that
 # pixels share are worth so many.
-FEW_POINTS, SLOPE_VARIANCE, SHARED_POINTS = (0.5, 0.75), 1.0 / 6.0, 2.25
+FEW_POINTS, SLOPE_VARIANCE, SHARED_POINTS = (0.25, 1.0), 1.0 / 6.0, 2.25
+MOST_RECOLORING = 3.0  # how many times the color of LTSH's points Cycles' color of a pixel counts at most
 MOST_OF_EDGE = 3.0  # Cycles' light of an edge is at most this many times LTSH's
 
 
@@ -57,6 +58,7 @@ class DirectPass:
     light: np.ndarray  # (H, W, 3)
     color: np.ndarray  # (H, W, 3)
     weight: np.ndarray | float = 1.0  # (H, W) of LTSH; the rest of 1 is Cycles' direct light, denoised
+    recoloring: np.ndarray | float = 1.0  # (H, W, 3) of `image`, see `recoloring_of_points`
 
     @property
     def share(self) -> np.ndarray:
@@ -108,6 +110,10 @@ def direct_passes(comparison: Comparison, cycles, is_denoised: bool) -> dict[str
             continue
         image, is_replaced = comparison.images[technique, name], ~extraction.left_to_cycles.by_pass[name]
         clean, weight = np.ones(shape), 1.0
+        recoloring = np.ones(color.shape)
+        if name == "diffuse" and film.sub_samples < cycles.samples and not extraction.picture.has_lens:
+            recoloring = recoloring_of_points(film.image(extraction.samples.diffuse_albedo), color)
+        image = recoloring * image
         if leaves_noise:
             clean = clean_share(comparison.shadows, name)
             if name == "specular":
@@ -119,11 +125,19 @@ def direct_passes(comparison: Comparison, cycles, is_denoised: bool) -> dict[str
                 weight = np.where(film.has_more(), 1.0, weight)
         share = np.where(is_replaced, clean * weight, 0.0)
         values = extraction.picture.exposure * getattr(result.shading, name)
-        of_groups = map(film.image, values) if len(values) > 1 else (image,)
+        of_groups = (recoloring * film.image(one) for one in values) if len(values) > 1 else (image,)
         groups = zip(light_groups(extraction.lights), of_groups, strict=True)
         groups = {group: _share_of(share, one) for group, one in groups}
-        passes[name] = DirectPass(_share_of(share, image), groups, is_replaced, clean, light, color, weight)
+        of_cycles = is_replaced, clean, light, color
+        passes[name] = DirectPass(_share_of(share, image), groups, *of_cycles, weight, recoloring)
     return passes
+
+
+def recoloring_of_points(own_color: np.ndarray, color: np.ndarray) -> np.ndarray:
+    """Factor (H, W, 3) of LTSH's diffuse light: the `color` (H, W, 3) that Cycles' many samples find over that of
+    LTSH's few points, `own_color`. So borders of objects and textures are as smooth as Cycles'."""
+    factor = np.divide(color, own_color, out=np.ones_like(own_color), where=own_color > 1e-6)
+    return np.minimum(factor, MOST_RECOLORING)
 
 
 def clean_share(shadows: Shadows, name: str) -> np.ndarray:
@@ -293,13 +307,35 @@ def _shared_out(rest: np.ndarray, groups: dict[str, np.ndarray], is_clean: bool)
     return {"": remaining, **groups}
 
 
+def noise(cycles, passes: dict[str, DirectPass]) -> list[float]:
+    """Noise before denoising, relative to the light: of Cycles' picture without what LTSH replaces, and of all of it.
+
+    Mean deviations of pixels, known by the difference of two parts of the samples; [] if there is one file of them.
+    """
+    if not cycles.largest:
+        return []
+    files, whole, replaced = (cycles.largest, cycles.channels), [], []
+    for channels in files:
+        whole.append(read_layer(channels, "Combined", "RGB").astype(np.float64))
+        for name, one in passes.items():
+            light, color = (read_layer(channels, cycles.names[key], "RGB") for key in DIRECT[name])
+            replaced.append(_share_of(one.share, light.astype(np.float64) * color))
+    difference, light = whole[0] - whole[1], max(whole[1].sum(), 1e-30)
+    rest = difference - sum(replaced[: len(passes)]) + sum(replaced[len(passes) :])
+    scale = np.sqrt(cycles.samples_of_largest / (cycles.samples - cycles.samples_of_largest))
+    return [float(scale * np.abs(one).sum() / light) for one in (rest, difference)]
+
+
 # What is written:
 
 
 def relight_fields(passes: dict[str, DirectPass], rest: Rest) -> dict[str, dict[str, np.ndarray]]:
     """`rest`, `taken` and `edges` of the RelightData. Cycles' light of an edge becomes a factor of LTSH's, so that it
     changes with the lights as LTSH's does."""
-    taken = {name: np.where(one.is_replaced, one.clean_share, 0.0) for name, one in passes.items()}
+    taken = {
+        name: np.where(one.is_replaced, one.clean_share, 0.0)[..., None] * one.recoloring
+        for name, one in passes.items()
+    }
     diffuse, groups = passes["diffuse"], rest.groups
     if np.ndim(diffuse.weight) == 0:
         return {"rest": groups, "taken": taken, "edges": {}}

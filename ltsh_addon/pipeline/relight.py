@@ -68,7 +68,7 @@ class RelightData:
     had_cycles: bool
     # By light group: its bounced light (H, W, 3). By "": what depends on no light group (H, W, 3 or 4 with alpha).
     rest: dict[str, np.ndarray] = field(default_factory=dict)
-    # By pass (H, W): the share of the pass that is LTSH's and not Cycles'; left out: 1.
+    # By pass (H, W, 3), in old files (H, W): the share that is LTSH's and not Cycles', recolored; left out: 1.
     taken: dict[str, np.ndarray] = field(default_factory=dict)
     # By pass (H, W): a factor of hard edges of light, valid only while the lights stay where they were; left out: 1.
     edges: dict[str, np.ndarray] = field(default_factory=dict)
@@ -80,8 +80,8 @@ class RelightData:
         return names[-1] if names else DEFAULT_TECHNIQUE
 
     def shown(self, name: str, *, moved: bool = False) -> np.ndarray | float:
-        """Factor (H, W, 1) of the image of a pass of the samples; without `edges` for `moved` lights."""
-        taken = self.taken[name][..., None] if name in self.taken else 1.0
+        """Factor (H, W, 1 or 3) of the image of a pass of the samples; without `edges` for `moved` lights."""
+        taken = np.atleast_3d(self.taken[name]) if name in self.taken else 1.0
         return taken if moved or name not in self.edges else taken * self.edges[name][..., None]
 
     @classmethod

@@ -128,6 +128,7 @@ def finish(
         clock.end("denoise")
         report = _report(comparison, cycles, passes, rest)
         report["finished"] |= {"denoiser": rest.denoiser, "budget_s": options.budget}
+        report["finished"]["gain"] = _gain(cycles, passes, combined, clock.stages)
         if not np.any(combined[..., :3]):
             report["warnings"].append(
                 f"camera {cycles.camera!r} sees no light at all, by Cycles neither: the picture is black; add a light, "
@@ -361,6 +362,19 @@ def _report(comparison: Comparison, cycles, passes: dict, rest: compositing.Rest
     }
 
 
+def _gain(cycles, passes: dict, combined: np.ndarray, stages: dict[str, float]) -> dict:
+    """LTSH's share of the light; the noise before denoising, and that of Cycles alone in as many `stages` (s)."""
+    light = sum(one.image.sum() for one in passes.values())
+    gain = {"share_of_light": float(light / max(combined[..., :3].sum(), 1e-30))}
+    for name, value in zip(("noise", "noise_of_cycles"), compositing.noise(cycles, passes), strict=False):
+        gain[name] = value
+    if "noise" in gain:
+        sampling = max(cycles.processor_seconds - cycles.least_seconds, 1e-3)
+        more = (sum(stages.values()) - stages["cycles"] - stages["denoise"]) / sampling
+        gain["noise_of_cycles"] /= float(np.sqrt(1.0 + more))
+    return gain
+
+
 def summary(report: dict, seconds: dict) -> list[str]:
     """Lines about what a picture is made of, and how long it took."""
     finished, (width, height) = report["finished"], report["resolution"]
@@ -370,8 +384,15 @@ def summary(report: dict, seconds: dict) -> list[str]:
     return [
         f"{width}x{height}, {report['sub_samples']} points per pixel, {report['cycles_samples']} samples of Cycles, "
         f"{denoised}{took}",
-        f"direct light by LTSH on: {shares} of the pixels",
+        f"direct light by LTSH on: {shares} of the pixels{_gained(finished['gain'])}",
     ]
+
+
+def _gained(gain: dict) -> str:
+    """What was gained, in words."""
+    noise = [f"{100.0 * gain[name]:.1f} %" for name in ("noise", "noise_of_cycles") if name in gain]
+    words = f"; noise before denoising {noise[0]}, of Cycles alone in this time {noise[1]}" if noise else ""
+    return f", {100.0 * gain['share_of_light']:.0f} % of the light{words}"
 
 
 def brief(report: dict) -> list[str]:

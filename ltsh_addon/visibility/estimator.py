@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from ..emitters.facing import FacingDisk
 from ..emitters.light_polygons import may_reach, off_plane
 from ..lobes import brdf
 from ..lobes.polygon import dot
-from ..scene import FARTHEST, PASSES, Film, FlatLight, Light, PolygonLight, SurfaceSamples, round_outline
+from ..scene import FARTHEST, PASSES, Film, FlatLight, Light, PointLight, PolygonLight, SurfaceSamples, round_outline
 from .emitter import Emitter, Sky
 from .light_cluster import LightCluster
 from .occluders import GAP
@@ -39,13 +40,28 @@ TYPICAL_SHARE = 0.4
 LEVELS = (16, 32, 64, 128, 256, 512)
 # The brightest pairs may get this many times the most rays of a pair: where lobes are narrow and lights half visible, a
 # few pixels cause most of the noise of a picture.
-BRIGHTEST = 4
+BRIGHTEST, BRIGHTEST_OF_SKY = 4, 2
 # Rounds in which neighbors of mixed pairs get more rays. Neighbors that turn out mixed pass this on in the next round.
 ROUNDS = 4
-# Rays end at this share of their distance to the light, just before it; but to an area light with a face as near as
-# that, GAP of the coordinates before its plane: a step of single precision.
-END = np.float32(1.0 - 1e-4)
-# Points along each side of a light from which near faces are looked for.
+# Samples that share the rays to a sky are alike: their normals differ by at most LIKE_NORMAL, they lie in one plane but
+# for a slope of LIKE_NORMAL, and for the specular pass their mirrored views differ by LIKE_LOBE alpha, and the alphas
+# by LIKE_ALPHA of one.
+LIKE_NORMAL, LIKE_LOBE, LIKE_ALPHA = np.float32(0.1), np.float32(0.7), np.float32(0.2)
+# Samples do not share rays where that would change their light by more than this share of the typical one, nor where
+# all their rays are blocked. These are enough rays to tell that all is blocked.
+MOST_BIAS, ENOUGH_RAYS = 0.007, 64
+# Pairs of opposite pixels (y, x) around a pixel that share rays, and their weights in (1, 2, 2, 2, 1) x (1, 2, 2, 2,
+# 1), which counts all places of a square of 4 x 4 pixels alike. TILE: the number of pixels that this is worth.
+AROUND = [(y, x) for y in range(-2, 3) for x in range(-2, 3) if (y, x) > (0, 0)]
+KERNEL, CENTER = np.array([(2 - abs(y) // 2) * (2 - abs(x) // 2) for y, x in AROUND], np.float32), np.float32(4.0)
+TILE = np.float32(16.0)
+# Numbers of AROUND two pixels away, and what the kernel adds to a picture per second difference of these: half its
+# variance of 1.5 pixels over the squared distance.
+ACROSS, BEND = [AROUND.index(step) for step in ((0, 2), (2, 0))], np.float32(0.75 / 4.0)
+# Rays end at this share of their distance to the light, just before it; but to a light with a face as near as that, GAP
+# of the coordinates before its surface, a step of single precision, or MESH_STEPS of them before a face that glows.
+END, MESH_STEPS = np.float32(1.0 - 1e-4), 16.0
+# Points along each side of a flat light from which near faces are looked for; as many squared around a point.
 LOOKED_AT = 8
 _ZERO, _ONE, _TINY = np.float32(0.0), np.float32(1.0), np.float32(1e-30)
 # Points of the unit disk to aim at, for lights that face the points.
@@ -53,23 +69,95 @@ OUTLINE = 0.99 * round_outline(16)
 _FARTHEST = np.float32(FARTHEST)
 
 
-@dataclass(frozen=True)
 class PixelNeighbors:
-    """Which samples are close to each other: those in the same pixel and in the eight pixels around it."""
+    """Which samples are close to each other in a picture: those in the same pixel and in the eight pixels around it.
+    Like ones up to two pixels away may share rays."""
 
-    pixel: np.ndarray  # (P,)
-    width: int
-    height: int
+    def __init__(self, film: Film | None, surface: SampleRows):
+        """The neighbors in `film`; without one, each sample is close to those before and after it, and shares
+        nothing."""
+        count = surface.position.shape[1]
+        self.order, self._surface = None, surface
+        self.pixel, self.width, self.height = np.arange(count), count, 1
+        if film is not None and count:
+            y, x = np.divmod(film.pixel, film.width)
+            self.order = _order_in_squares(y, x)
+            # The film may hold a part of a picture.
+            self._y, self._x = y - y.min(), x - x.min()
+            self.width, self.height = int(self._x.max()) + 1, int(self._y.max()) + 1
+            self.pixel = self._y * self.width + self._x
 
-    @classmethod
-    def of(cls, film: Film | None, count: int) -> PixelNeighbors:
-        """The neighbors in `film`; without one, each sample is close to those before and after it."""
-        if film is None:
-            return cls(np.arange(count), count, 1)
-        # The film may hold a part of a picture: count only its rows.
-        top = int(film.pixel.min(initial=film.width * film.height)) // film.width
-        height = int(film.pixel.max(initial=0)) // film.width + 1 - top
-        return cls(film.pixel - top * film.width, film.width, max(height, 0))
+    @cached_property
+    def _around(self) -> np.ndarray:
+        """The samples (N, 2, P) in the pixels of AROUND, -1 for none. Of the samples of a pixel, the first goes with
+        the first of another, and so on."""
+        by_pixel = np.argsort(self.pixel, kind="stable")
+        rank, pixel = np.empty_like(by_pixel), self.pixel[by_pixel]
+        rank[by_pixel] = np.arange(len(pixel)) - np.searchsorted(pixel, pixel)
+        grid = np.full((self.height + 4, self.width + 4, rank.max() + 1), -1, np.int32)
+        y, x = self._y + 2, self._x + 2
+        grid[y, x, rank] = np.arange(len(rank))
+        return np.stack([[grid[y + sign * dy, x + sign * dx, rank] for sign in (1, -1)] for dy, dx in AROUND])
+
+    @cached_property
+    def _alike(self) -> dict[str, np.ndarray]:
+        """Masks (N, P) by pass: the sample and those of AROUND are alike."""
+        surface, around = self._surface, self._around
+        alike = {name: np.zeros(around[:, 0].shape, bool) for name in PASSES}
+        mirrored = np.float32(2.0) * dot(surface.normal, surface.view) * surface.normal - surface.view
+        alpha = surface.alpha
+        sharp = alpha if surface.tangent is None else alpha * np.maximum(_ONE - np.abs(surface.anisotropy), _ZERO)
+        width = LIKE_LOBE * np.maximum(sharp, np.float32(1e-4))
+        traits = [surface.receiver, *surface.lobes.values()]
+        for number, both in enumerate(around):
+            here = np.flatnonzero((both >= 0).all(axis=0))
+            near = np.ones(len(here), bool)
+            for other in both[:, here]:
+                for normal in (surface.geometric_normal, surface.diffuse_normal):
+                    near &= _apart(normal, here, other) < LIKE_NORMAL**2
+                height = dot(np.take(surface.position, other, 1) - np.take(surface.position, here, 1),
+                             np.take(surface.geometric_normal, here, 1))  # fmt: skip
+                near &= height * height <= LIKE_NORMAL**2 * _apart(surface.position, here, other)
+                near &= np.logical_and.reduce([trait[other] == trait[here] for trait in traits])
+            alike["diffuse"][number, here] = near
+            for other in both[:, here]:
+                near &= _apart(mirrored, here, other) < np.square(width[here])
+                near &= np.abs(alpha[other] - alpha[here]) <= LIKE_ALPHA * alpha[here]
+            alike["specular"][number, here] = near
+        return alike
+
+    def sharing(self, name: str, index: np.ndarray) -> np.ndarray:
+        """With how many samples, from 1 to TILE, the samples `index` (Q,) share their rays in a pass, itself
+        included."""
+        whole = CENTER + 2.0 * KERNEL.sum()
+        return np.maximum(TILE * (CENTER + 2.0 * (KERNEL @ self._alike[name][:, index])) / whole, _ONE)
+
+    def shared(self, name: str, index: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Weighted means (..., Q) of `values` (..., Q) of the samples `index` (Q,) and of like ones around."""
+        sums, total = CENTER * values, np.full(len(index), CENTER)
+        for number, weight in enumerate(KERNEL):
+            here, one, other = self._like_pairs(name, index, number)
+            sums[..., here] += weight * (values[..., one] + values[..., other])
+            total[here] += 2.0 * weight
+        return sums / total
+
+    def bend(self, name: str, index: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """What `shared` has changed (Q,) where its result `values` (Q,) is curved, approximately."""
+        change = np.zeros(len(index), np.float32)
+        for number in ACROSS:
+            here, one, other = self._like_pairs(name, index, number)
+            change[here] += BEND * (values[one] + values[other] - 2.0 * values[here])
+        return change
+
+    def _like_pairs(self, name, index, number):
+        """Of the samples `index` (Q,), the numbers (R,) of those that are like both opposite ones of AROUND; and the
+        numbers (R,) of these."""
+        place = np.full(len(self.pixel), -1, np.int32)
+        place[index] = np.arange(len(index), dtype=np.int32)
+        here = np.flatnonzero(self._alike[name][number, index])
+        one, other = place[self._around[number][:, index[here]]]
+        good = (one >= 0) & (other >= 0)
+        return here[good], one[good], other[good]
 
     def any_around(self, index: np.ndarray, mask: np.ndarray) -> np.ndarray:
         """Mask (Q,) of the samples `index` (Q,): is `mask` (Q,) true for at least one of the samples around?"""
@@ -79,6 +167,21 @@ class PixelNeighbors:
         grid = np.pad(marked.reshape(self.height, self.width), 1)
         grid = grid[1:-1] | grid[:-2] | grid[2:]
         return (grid[:, 1:-1] | grid[:, :-2] | grid[:, 2:]).ravel()[pixel]
+
+
+def _apart(vectors, here, other):
+    """Squared distances (R,) of the vectors (3, P) at the indices `here` and `other` (R,)."""
+    step = np.take(vectors, other, axis=1) - np.take(vectors, here, axis=1)
+    return dot(step, step)
+
+
+def _order_in_squares(y, x):
+    """Numbers (P,) uint32 of pixels square by square, in each of these square by square, and so on. They repeat every
+    512 pixels."""
+    number = np.zeros(len(x), np.uint32)
+    for bit in range(9):
+        number |= (((x >> bit & 1) << 2 * bit) | ((y >> bit & 1) << 2 * bit + 1)).astype(np.uint32)
+    return number
 
 
 @dataclass(frozen=True)
@@ -103,7 +206,8 @@ class RatioEstimator:
         self.mask = np.uint32(surface.tracer.mask_of(light.name))
         self.surface_mask = np.uint32(surface.tracer.surface_mask_of(light.name))
         # The faces of a mesh light block rays to the mesh itself.
-        self.at_surface = isinstance(emitter, LightCluster) or isinstance(light, PolygonLight)
+        self.is_mesh = emitter.has_mesh if isinstance(emitter, LightCluster) else isinstance(light, PolygonLight)
+        self.at_surface = self.is_mesh or isinstance(emitter, LightCluster)
         self.chosen_by, self.number, self.selection = surface.tracer.chosen_by(light.name), number, selection
         origins = light.viewpoint(surface.position)
         offset = (light.center[:, None] - origins).astype(np.float32)
@@ -132,65 +236,112 @@ class RatioEstimator:
         self.count = np.zeros(count, np.int32)
         self.traced = 0
         # How far before the plane of the light rays end, in m, but for what follows from their length; 0: at END.
-        self.margin = _ZERO
+        self.margin, self.is_tiny = _ZERO, False
+        self.is_shared = np.zeros(count, bool)
 
     def trace(self, rays: int, neighbors: PixelNeighbors, typical: dict[str, float], importance: np.ndarray) -> None:
         """Trace the probes of all pairs, then up to `rays` rays for pairs that need them. How many depends on the light
         and the `importance` (P,) of the sample. `typical` comes from `typical_radiance`."""
         if self.mask == 0 or not self.light.area_vector.any():
             return
-        if isinstance(self.light, FlatLight) and not self.at_surface and len(self.index):
+        if isinstance(self.light, FlatLight | PointLight) and len(self.index):
             self.margin = self._margin()
-            self.at_surface = self.margin > 0.0
-        self._add_rays(np.arange(len(self.index)), 0, PROBES, 0)
+            self.at_surface |= bool(self.margin)
+        shares = isinstance(self.emitter, Sky) and neighbors.order is not None and rays > PROBES
+        self._neighbors, order = neighbors, neighbors.order if shares else None
+        self._add_rays(np.arange(len(self.index)), 0, PROBES, 0, order)
         self._leave_out_unlit()
-        number, choice = self._plan(rays, typical, importance[self.index])
+        importance = importance[self.index]
+        worth = {name: importance * self.unshadowed(name) / max(typical.get(name, 0.0), 1e-30) for name in PASSES}
+        choice = np.where(worth["specular"] > 2.0 * worth["diffuse"], 1, 0)
+        choice[worth["diffuse"] > 2.0 * worth["specular"]] = 2
+        by_pass = [self._wanted_rays(rays, worth[name], importance) for name in PASSES]
+        alone = self._level(rays, np.maximum(*by_pass))
+        number = alone
+        if shares:
+            sharing = [neighbors.sharing(name, self.index) for name in PASSES]
+            each = [np.where(self.wanted[name], by_pass[k] / sharing[k], 0.0) for k, name in enumerate(PASSES)]
+            number = self._level(rays, np.maximum(*each))
+            self.is_shared = alone > PROBES
         for _ in range(ROUNDS):
             chosen = neighbors.any_around(self.index, self.visible) & neighbors.any_around(self.index, self.blocked)
             chosen |= self._unmet()
             chosen &= self.count < number
             if not chosen.any():
                 break
-            for last in np.unique(number[chosen]):
-                for split in range(3):
-                    members = np.flatnonzero(chosen & (number == last) & (choice == split))
-                    self._add_rays(members, PROBES, int(last), split)
+            self._trace_more(chosen, number, choice, order)
+        if shares:
+            self._trace_alone(alone, choice, worth)
         self._aim_at_corners()
 
-    def _margin(self):
-        """GAP of the light's coordinates along its normal in m, if a face is so near that END may be behind it; else
-        0."""
-        light = self.light
-        offset = self.surface.position[:, self.index] - light.center[:, None]
-        near = 2.0 * (1.0 - END) * np.sqrt(np.square(offset).sum(axis=0).max())
-        s, t = np.meshgrid(*2 * [(np.arange(LOOKED_AT) + 0.5) * (2.0 / LOOKED_AT) - 1.0])
-        points = light.center + s.reshape(-1, 1) * light.half_u + t.reshape(-1, 1) * light.half_v
-        points += near * light.direction
-        rays = points, np.broadcast_to(-light.direction, points.shape), np.full(len(points), 2.0 * near)
-        masks = np.full(len(points), self.mask)
-        if (self.surface.tracer.transmittance(*rays, masks) == 1.0).all():
-            return _ZERO
-        return np.float32(GAP * (np.abs(light.direction) @ np.abs(light.center)) + 1e-12)
+    def _trace_alone(self, number, choice, worth):
+        """Give up sharing where that changes the light: there, trace `number` (Q,) rays anew."""
+        bends = np.zeros(len(self.index), bool)
+        for name in PASSES:
+            change = self._neighbors.bend(name, self.index, self.visibility_ratio(name)[0])
+            bends |= np.abs(change) * worth[name] ** WORTH_POWER > MOST_BIAS
+        dark = ~self.visible & ~bends
+        number = np.where(dark, np.minimum(number, ENOUGH_RAYS), number)
+        alone = self.is_shared & (self.count > PROBES) & (bends | dark)
+        self.is_shared &= ~alone
+        for sums in (self.sum_w, self.sum_wv):
+            sums[:, :, alone] = 0.0
+        self._add_rays(np.flatnonzero(alone), 0, PROBES, 0)
+        self._trace_more(alone & (number > PROBES), number, choice, None)
 
-    def _plan(self, rays, typical, importance):
-        """Number of rays (Q,) that each pair is worth, and its column (Q,) of EVENLY. Both depend on the unshadowed
-        light that the pair reflects, the number also on its `importance` (Q,)."""
-        worth = {name: self.unshadowed(name) / max(typical.get(name, 0.0), 1e-30) for name in PASSES}
-        most = importance * np.maximum(worth["specular"], worth["diffuse"])
+    def _trace_more(self, chosen, number, choice, order):
+        """Trace rays of the `chosen` pairs up to the `number`, split by `choice`; each (Q,)."""
+        for last in np.unique(number[chosen]):
+            for split in range(3):
+                members = np.flatnonzero(chosen & (number == last) & (choice == split))
+                self._add_rays(members, PROBES, int(last), split, order)
+
+    def _margin(self):
+        """How far before the light's surface rays end, in m, if a face is so near that END may be behind it; else 0."""
+        light, emitter = self.light, self.emitter
+        offset = self.surface.position[:, self.index] - light.center[:, None]
+        near = 2.0 * (1.0 - END) * (np.sqrt(np.square(offset).sum(axis=0).max()) + light.radius * light.is_facing)
+        margin, length = GAP * (np.abs(light.direction) @ np.abs(light.center)) + 1e-12, 2.0 * near
+        if isinstance(emitter, LightCluster):
+            points, normal = light.center + emitter.corners.mean(axis=1).T, emitter.normal.T
+            margin = GAP * (np.abs(light.center).max() + light.radius)
+        elif light.is_facing:
+            # Evenly spread over a sphere: a spiral.
+            z = (np.arange(LOOKED_AT**2) + 0.5) * (2.0 / LOOKED_AT**2) - 1.0
+            turn = (np.sqrt(1.0 - z * z), np.arange(len(z)) * np.pi * (3.0 - np.sqrt(5.0)))
+            normal = np.column_stack([turn[0] * np.cos(turn[1]), turn[0] * np.sin(turn[1]), z])
+            points, length = light.center + light.radius * normal, length + light.radius
+            # The directions to a small light are uncertain; those to its center are not, which then stands for it.
+            self.is_tiny = light.radius < 0.1 * near
+            margin = 4.0 * GAP * (np.abs(light.center).sum() + near / (1.0 - END)) if self.is_tiny else 0.1 * near
+        else:
+            s, t = np.meshgrid(*2 * [(np.arange(LOOKED_AT) + 0.5) * (2.0 / LOOKED_AT) - 1.0])
+            points = light.center + s.reshape(-1, 1) * light.half_u + t.reshape(-1, 1) * light.half_v
+            normal = np.broadcast_to(light.direction, points.shape)
+        if self.is_mesh:
+            margin = MESH_STEPS * GAP * (np.abs(light.center).sum() + light.radius) + 1e-12
+            length = near - 2.0 * margin
+        rays = points + near * normal, -normal, np.full(len(points), length), np.full(len(points), self.mask)
+        return _ZERO if (self.surface.tracer.transmittance(*rays) == 1.0).all() else np.float32(margin)
+
+    def _wanted_rays(self, rays, worth, importance):
+        """Number of rays (Q,) that each pair is worth, by the unshadowed light that it reflects relative to a typical
+        sample, times the `importance` (Q,)."""
         # A sky or a cluster stands for many lights and gets the rays of all of them.
         share = 1.0 if isinstance(self.emitter, Sky | LightCluster) else TYPICAL_SHARE
-        wanted = rays * share * most**WORTH_POWER
-        limit = rays
-        if share < 1.0 and rays > PROBES:
-            limit = min(BRIGHTEST * rays, MOST_RAYS)
+        wanted = rays * share * worth**WORTH_POWER
         if isinstance(self.emitter, Sky):
             # Points lit by the sky alone are dark beside those lit by a sun in it: do not let them go short.
             wanted = np.maximum(wanted, 0.25 * rays * importance)
+        return wanted
+
+    def _level(self, rays, wanted):
+        """The number of rays (Q,) to trace where so many are `wanted`."""
+        limit = rays
+        if not isinstance(self.emitter, LightCluster) and rays > PROBES:
+            limit = min((BRIGHTEST_OF_SKY if isinstance(self.emitter, Sky) else BRIGHTEST) * rays, MOST_RAYS)
         levels = [level for level in LEVELS if level < limit] + [limit]
-        number = np.take(levels, np.searchsorted(levels, np.minimum(wanted, limit)))
-        choice = np.where(worth["specular"] > 2.0 * worth["diffuse"], 1, 0)
-        choice[worth["diffuse"] > 2.0 * worth["specular"]] = 2
-        return number, choice
+        return np.take(levels, np.searchsorted(levels, np.minimum(wanted, limit)))
 
     def _unmet(self):
         """Mask (Q,) of the pairs with a lobe that no ray has met so far."""
@@ -235,22 +386,29 @@ class RatioEstimator:
                 distance[:] = _FARTHEST
             aimed = self.surface.ray_origins.aimed(self.index[unmet], toward[:, None], distance[None], self.at_surface)
             visibility = (
-                self._transmittance(self.mask, *(rows[..., 0, :] for rows in aimed)) if self.chosen_by.light else _ONE
+                self._transmittance(self.mask, _ONE, *(rows[..., 0, :] for rows in aimed))
+                if self.chosen_by.light
+                else _ONE
             )
             # Next to nothing, so that it does not count in sums over samples.
             self.sum_w[number][:, unmet] = _TINY
             self.sum_wv[number][:, unmet] = visibility * _TINY
 
-    def _transmittance(self, mask, origins, directions, distances):
-        """Transmittance (R,) of rays with a mask, `origins` and `directions` (3, R) and `distances` (R,)."""
+    def _transmittance(self, mask, falling, origins, directions, distances):
+        """Transmittance (R,) of rays with a mask, `origins` and `directions` (3, R) and `distances` (R,), which meet
+        the light at angles with the cosines `falling` (R,)."""
         self.traced += len(distances)
+        if self.margin and self.is_tiny:
+            directions = self.light.center[:, None] - origins
+            distances = np.sqrt(dot(directions, directions))
+            directions /= np.maximum(distances, _TINY)
         masks, ends = np.broadcast_to(mask, distances.shape), distances * END
         if self.margin:
-            falling = np.maximum(-(self.light.direction.astype(np.float32) @ directions), _TINY)
-            ends = np.maximum(ends, distances * np.float32(1.0 - GAP) - self.margin / falling)
+            margin = self.margin / np.maximum(falling, _TINY)
+            ends = np.maximum(ends, distances * np.float32(1.0 - GAP) - margin)
         return self.surface.tracer.transmittance(origins.T, directions.T, ends, masks)
 
-    def _add_rays(self, members, first, last, split):
+    def _add_rays(self, members, first, last, split, order=None):
         """Trace the rays `first` to `last` of the pairs `members` (M,). `split` is a column of EVENLY."""
         diffuse, specular = (self.wanted[name][members] for name in ("diffuse", "specular"))
         for kind, chosen in enumerate((diffuse & specular, diffuse & ~specular, ~diffuse & specular)):
@@ -258,7 +416,8 @@ class RatioEstimator:
             for start in range(0, len(chosen), BLOCK_RAYS // PROBES):
                 block = chosen[start : start + BLOCK_RAYS // PROBES]
                 lobes = tuple(name for name in PASSES if self.wanted[name][block[0]])
-                sampler = RaySampler(self.surface, self.index[block], self.emitter, lobes)
+                numbers = None if order is None else order[self.index[block]]
+                sampler = RaySampler(self.surface, self.index[block], self.emitter, lobes, numbers)
                 step = BLOCK_RAYS // (PROBES * len(block)) * PROBES
                 for number in range(first, last, step):
                     light_sampled = LIGHT_SAMPLED[kind, 0], LIGHT_SAMPLED[kind, split]
@@ -274,7 +433,11 @@ class RatioEstimator:
         flat = np.flatnonzero(met)
         aimed = self.surface.ray_origins.aimed(sampler.index, directions, distance, self.at_surface)
         origins, *rest = (_taken(rows, flat) for rows in aimed)
-        visibility.ravel()[flat] = self._transmittance(self.mask, origins, *rest) if self.chosen_by.light else _ONE
+        if self.chosen_by.light:
+            falling = sampler.falling.ravel()[flat] if self.margin else _ONE
+            visibility.ravel()[flat] = self._transmittance(self.mask, falling, origins, *rest)
+        else:
+            visibility.ravel()[flat] = _ONE
         if self.chosen_by.surface:
             others = self._chosen_by_surface(sampler, (directions, distance), flat, origins, visibility)
         least, most = visibility, visibility
@@ -320,7 +483,9 @@ class RatioEstimator:
         if meet_the_same:
             chosen &= (start != origins).any(axis=0)
         chosen = np.flatnonzero(chosen)
-        visibility = self._transmittance(self.surface_mask, start[:, chosen], toward[:, chosen], distance[chosen])
+        falling = sampler.falling.ravel()[flat[chosen]] if self.margin else _ONE
+        rays = start[:, chosen], toward[:, chosen], distance[chosen]
+        visibility = self._transmittance(self.surface_mask, falling, *rays)
         differ = np.flatnonzero(visibility != light_visibility.ravel()[flat[chosen]])
         if len(differ) == 0:
             return None
@@ -337,11 +502,17 @@ class RatioEstimator:
     def visibility_ratio(self, name: str):
         """Shares (Q,) of a pass, and their approximate standard deviations (Q,)."""
         sum_w, sum_wv = self.sum_w[PASSES.index(name)], self.sum_wv[PASSES.index(name)]
+        count = np.maximum(self.count, 1).astype(np.float32)
+        if self.is_shared.any():
+            sums = self._neighbors.shared(name, self.index, np.stack([sum_w, sum_wv]) / count)
+            shared = self.is_shared & (self.count > PROBES) & self.wanted[name]
+            sum_w, sum_wv = np.where(shared, sums, (sum_w, sum_wv))
+            count = np.where(shared, count * self._neighbors.sharing(name, self.index), count)
         total = sum_w.sum(axis=0)
         ratio = np.divide(sum_wv.sum(axis=0), total, out=np.ones_like(total), where=total > 0.0)
         halves = np.divide(sum_wv, sum_w, out=np.stack([ratio, ratio]), where=sum_w > 0.0)
         # Pairs with probes only have no second half of rays: take the deviation of independent rays.
-        usual = np.sqrt(ratio * (_ONE - ratio) / np.maximum(self.count, 1).astype(np.float32))
+        usual = np.sqrt(ratio * (_ONE - ratio) / count)
         return ratio, np.where((sum_w > 0.0).all(axis=0), 0.5 * np.abs(halves[0] - halves[1]), usual)
 
 

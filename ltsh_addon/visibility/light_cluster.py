@@ -58,6 +58,7 @@ class LightCluster:
         self.corners = np.ascontiguousarray(corners.transpose(2, 1, 0), dtype=np.float32)
         self.normal = np.ascontiguousarray(normal.T, dtype=np.float32)
         self.is_round = is_round if is_round.any() else None
+        self.has_mesh = any(isinstance(light, PolygonLight) for light in lights)
         self._build(corners, normal, values * area)
 
     def _build(self, corners, normal, power):

@@ -22,11 +22,11 @@ from ..workers.pool import WorkerPool
 from .emitter import Emitter
 from .estimator import MOST_RAYS, LightSelection, PixelNeighbors, RatioEstimator
 from .light_cluster import LightCluster, emitters_of
-from .ray_sampler import PROBES, SampleRows
+from .ray_sampler import PROBES, JoinedLobes, SampleRows
 from .shadow_terminator import RayOrigins
 
-# Samples that one process takes at a time.
-BLOCK_SAMPLES = 1 << 14
+# Samples that one process takes at a time, approximately.
+BLOCK_SAMPLES = 1 << 15
 # Processor seconds for the probes of all pairs, and number of samples whose rays' origins are looked for, from which on
 # workers are worth their start.
 SECONDS_WORTH_A_WORKER, SAMPLES_WORTH_A_WORKER = 1.0, 1 << 17
@@ -115,7 +115,7 @@ def trace_visibility(
     shape = len(emitters), len(samples)
     visibility = {name: np.ones(shape, np.float32) for name in passes}
     radiance, deviation = ({name: np.zeros(shape[1], np.float32) for name in passes} for _ in range(2))
-    blocks, mixed = _blocks(shape[1]), np.zeros(shape, bool)
+    blocks, mixed = _blocks(shape[1], film), np.zeros(shape, bool)
     traced = np.zeros(len(blocks), np.int64)
 
     def job(number):
@@ -151,8 +151,15 @@ def trace_ray_origins(samples: SurfaceSamples, pool: WorkerPool) -> RayOrigins:
     return ray_origins
 
 
-def _blocks(count: int) -> list[slice]:
-    return [slice(start, min(start + BLOCK_SAMPLES, count)) for start in range(0, count, BLOCK_SAMPLES)]
+def _blocks(count: int, film: Film | None = None) -> list[slice] | list[np.ndarray]:
+    """The indices of the samples of each block: with a film, those in a square of its pixels."""
+    if film is None or count <= BLOCK_SAMPLES:
+        return [slice(start, min(start + BLOCK_SAMPLES, count)) for start in range(0, count, BLOCK_SAMPLES)]
+    y, x = np.divmod(film.pixel, film.width)
+    area = (np.ptp(y) + 1) * (np.ptp(x) + 1)
+    side = max(int(np.sqrt(area * BLOCK_SAMPLES / count)), 1)
+    _, block = np.unique(y // side * film.width + x // side, return_inverse=True)
+    return np.split(np.argsort(block, kind="stable"), np.cumsum(np.bincount(block))[:-1])
 
 
 @dataclass(frozen=True)
@@ -178,11 +185,16 @@ class ShadowTask:
         """The visibility from a block of samples on a film; the third is `tracer.ray_origins(samples)` if that is known
         already."""
         samples, film, ray_origins = job
+        joined = JoinedLobes(samples)
+        if joined.share is not None:
+            samples = joined.samples
+            film, ray_origins = (None if one is None else one.take(joined.first) for one in (film, ray_origins))
         shape = len(self.emitters), len(samples)
         visibility = {name: np.ones(shape, np.float32) for name in self.passes}
         radiance, variance = ({name: np.zeros(shape[1], np.float32) for name in self.passes} for _ in range(2))
         mixed, traced = np.zeros(shape, bool), 0
-        surface, neighbors = SampleRows(samples, self.passes, tracer, ray_origins), PixelNeighbors.of(film, shape[1])
+        surface = SampleRows(samples, self.passes, tracer, ray_origins, joined)
+        neighbors = PixelNeighbors(film, surface)
         # What each sample counts for its pixel.
         importance = np.ones(shape[1], np.float32)
         if film is not None and film.count is not None:
@@ -203,6 +215,14 @@ class ShadowTask:
                 radiance[name][index] += unshadowed * ratio
                 variance[name][index] += np.square(unshadowed * noise)
         deviation = {name: np.sqrt(values) for name, values in variance.items()}
+        if joined.share is not None:
+            index, first = joined.index, joined.first
+            visibility = {name: values[:, index] for name, values in visibility.items()}
+            # The first of two samples has the light of both.
+            radiance, deviation = (
+                {name: values[index] * first for name, values in one.items()} for one in (radiance, deviation)
+            )
+            mixed = mixed[:, index]
         return Visibility(visibility.get("specular"), visibility.get("diffuse"), radiance, deviation, traced, mixed)
 
 

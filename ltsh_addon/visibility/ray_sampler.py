@@ -12,10 +12,11 @@ components first.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..cycles.horizons import SPECULAR_FIELDS
 from ..emitters.facing import FacingDisk, emission, ray_length
 from ..emitters.light_polygons import LEAST_COSINE, LOBE_WIDTH, has_lobe, off_plane
 from ..lobes.brdf import dielectric_reflectance, schlick_curve, stretch
@@ -79,7 +80,14 @@ class RayBatch:
 class RaySampler:
     """A light seen from a block of samples: arrays (Q,) and (3, Q)."""
 
-    def __init__(self, surface: SampleRows, index: np.ndarray, emitter: Emitter | LightCluster, lobes: tuple[str, ...]):
+    def __init__(
+        self,
+        surface: SampleRows,
+        index: np.ndarray,
+        emitter: Emitter | LightCluster,
+        lobes: tuple[str, ...],
+        order: np.ndarray | None = None,
+    ):
         self.index, self.emitter, self.lobes = index, emitter, lobes
         light = emitter.light
         offset = light.center[:, None] - light.viewpoint(np.take(surface.position, index, axis=1))
@@ -101,7 +109,8 @@ class RaySampler:
         if isinstance(emitter, Sky):
             # The solid angle of one side: `LightSelection` knows the sides one by one.
             self.solid_angle = np.full(len(index), 4.0 * np.pi / 6.0, np.float32)
-        self.seeds = surface.seeds[index]
+        # Pairs that take one sequence in this `order` (Q,) have one seed.
+        self.order, self.seeds = order, surface.seeds[index] if order is None else surface.seeds[:1]
         if "diffuse" in lobes:
             self.horizons = [np.take(normal, index, axis=1) for normal in surface.horizons("diffuse")]
             self.bump_alpha2 = surface.bump_alpha2[index]
@@ -113,6 +122,9 @@ class RaySampler:
             normal, view = np.take(surface.normal, index, axis=1), np.take(surface.view, index, axis=1)
             self.geometric_normal = np.take(surface.geometric_normal, index, axis=1)
             self.has_own_horizon = surface.geometric_normal is not surface.normal
+            self.share = None
+            if surface.share is not None:
+                self.share, self.horizon = surface.share[index], np.take(surface.horizon, index, axis=1)
             self.cosine, self.sine, rows = frames(normal, view)
             self.view = view
             self.alpha, self.stretch = surface.alpha[index], None
@@ -129,7 +141,8 @@ class RaySampler:
             self.dielectric, self.ior = surface.dielectric[index], surface.ior[index]
 
     def sample(self, batch: RayBatch):
-        """Unit directions (3, S, Q) of `batch`, distances to the light (S, Q), and weights (S, Q) by lobe."""
+        """Unit directions (3, S, Q) of `batch`, distances to the light (S, Q), and weights (S, Q) by lobe; `falling`
+        gets the cosines (S, Q) at a light that is flat."""
         if isinstance(self.emitter, Sky):
             return self._sample_sky(batch)
         if isinstance(self.emitter, LightCluster):
@@ -138,12 +151,13 @@ class RaySampler:
         shape = (light_count + bsdf_count, len(self.index))
         directions = np.empty((3, *shape), np.float32)
         if light_count:
-            points = unit_points(self.seeds, 0, *batch.light_points)
+            points = unit_points(self.seeds, 0, *batch.light_points, self.order)
             self.quads.directions(*points, out=directions[:, :light_count])
         density = np.float32(light_count / shape[0]) / self.quads.solid_angle
         if bsdf_count:
             local = np.empty((3, *shape), np.float32)
-            self.warped_quads.directions(*unit_points(self.seeds, 1, *batch.bsdf_points), out=local[:, light_count:])
+            points = unit_points(self.seeds, 1, *batch.bsdf_points, self.order)
+            self.warped_quads.directions(*points, out=local[:, light_count:])
             length = self._unwarped(directions, local, light_count)
             scale = np.float32(bsdf_count / shape[0]) * self.warps.determinant / self.warped_quads.solid_angle
             scale *= self.has_solid_angle
@@ -153,6 +167,7 @@ class RaySampler:
         height = self.height if self.disk is None else self.disk.length
         distance = np.minimum(height / np.maximum(falling, _TINY), _FARTHEST)
         falls = falling > 0.0
+        self.falling = falling if self.disk is None else np.ones_like(falling)
         falls &= self.has_solid_angle
         factor = falls / density
         if self.disk is None:
@@ -192,11 +207,11 @@ class RaySampler:
         normal = self.horizons[0] if "diffuse" in self.lobes else self.geometric_normal
         directions = np.empty((3, *shape), np.float32)
         if light_count:
-            points = unit_points(self.seeds, 0, *batch.light_points)
+            points = unit_points(self.seeds, 0, *batch.light_points, self.order)
             directions[:, :light_count] = self.emitter.directions(*points, normal)
         if bsdf_count:
             local = np.empty((3, *shape), np.float32)
-            x, y = unit_points(self.seeds, 1, *batch.bsdf_points)
+            x, y = unit_points(self.seeds, 1, *batch.bsdf_points, self.order)
             radius, angle = np.sqrt(x), np.float32(2.0 * np.pi) * y
             chosen = (radius * np.cos(angle), radius * np.sin(angle), np.sqrt(_ONE - x))
             local[:, light_count:] = chosen
@@ -244,6 +259,7 @@ class RaySampler:
         normal = emitter.normal[:, leaf]
         falling, height = -dot(directions, normal), np.maximum(-dot(corners[:, 0], normal), _ZERO)
         distance = np.minimum(height / np.maximum(falling, _TINY), _FARTHEST)
+        self.falling = falling
         factor = has_solid_angle & (falling > 0.0) & (height > self.least_height) & (density > 0.0)
         if emitter.is_round is not None:
             factor &= self._inside_round(leaf, corners, directions * np.where(factor, distance, _ZERO))
@@ -355,7 +371,11 @@ class RaySampler:
         ratio *= mu
         ratio /= np.maximum(slope, _TINY, out=slope)
         ratio *= self._reflectance(squared)
-        if self.has_own_horizon:
+        if self.share is not None:
+            above = (dot(directions, self.geometric_normal) > 0.0) * (_ONE - self.share)
+            above += (dot(directions, self.horizon) > 0.0) * self.share
+            ratio *= above
+        elif self.has_own_horizon:
             ratio *= dot(directions, self.geometric_normal) > 0.0
         return ratio
 
@@ -384,10 +404,49 @@ def _after_warp(density, length):
 _MIN_ALPHA = np.float32(1e-5)
 
 
+class JoinedLobes:
+    """P samples of which two in succession that are one lobe with two horizons, as `cycles.horizons` makes them, count
+    as one: they share their rays.
+
+    `samples` (Q) are the joined ones, `first` (P,) the mask of those that they begin with, `index` (P,) their numbers.
+    """
+
+    def __init__(self, samples: SurfaceSamples):
+        is_second = np.zeros(len(samples), bool)
+        names = ("position", "normal", "view", "tangent")
+        same = [getattr(samples, name) for name in names] + [samples.roughness[:, None], samples.anisotropy[:, None]]
+        is_second[1:] = np.logical_and.reduce([(rows[1:] == rows[:-1]).all(axis=1) for rows in same])
+        is_second[1:] &= ~(samples.diffuse_albedo[1:].any(axis=1) | is_second[:-1])
+        colors = np.concatenate([getattr(samples, name) for name in SPECULAR_FIELDS], axis=1)
+        whole = np.abs(colors).sum(axis=1, keepdims=True)
+        apart = np.abs(colors[1:] * whole[:-1] - colors[:-1] * whole[1:]).max(axis=1)
+        is_second[1:] &= apart <= 1e-5 * (whole[1:] * whole[:-1])[:, 0]
+        self.first, self.index = ~is_second, np.cumsum(~is_second) - 1
+        self.samples, self.share, self.horizon = samples, None, None
+        second = np.flatnonzero(is_second)
+        if len(second):
+            joined, weight = self.index[second], (whole[second] + whole[second - 1])[:, 0]
+            samples, fields = samples.take(self.first), {}
+            for number, name in enumerate(SPECULAR_FIELDS):
+                fields[name] = getattr(samples, name).copy()
+                fields[name][joined] += colors[second, 3 * number : 3 * number + 3]
+            self.share, self.horizon = np.zeros(len(samples), np.float32), samples.geometric_normal.copy()
+            self.share[joined] = whole[second, 0] / np.maximum(weight, 1e-30)
+            self.horizon[joined] = self.samples.geometric_normal[second]
+            self.samples = replace(samples, **fields)
+
+
 class SampleRows:
     """Samples in single precision with components first: vectors are (3, P)."""
 
-    def __init__(self, samples: SurfaceSamples, passes: Sequence[str], tracer, ray_origins: RayOrigins | None = None):
+    def __init__(
+        self,
+        samples: SurfaceSamples,
+        passes: Sequence[str],
+        tracer,
+        ray_origins: RayOrigins | None = None,
+        lobes: JoinedLobes | None = None,
+    ):
         self.tracer, self.ray_origins = tracer, tracer.ray_origins(samples) if ray_origins is None else ray_origins
         self.position = np.ascontiguousarray(samples.position.T)
         self.receiver = samples.receiver
@@ -395,6 +454,8 @@ class SampleRows:
         self._known: list[np.ndarray] = []
         self.normal, self.view = self._rows(samples.normal), self._rows(samples.view)
         self.geometric_normal = self._rows(samples.geometric_normal)
+        self.share = None if lobes is None else lobes.share
+        self.horizon = None if self.share is None else self._rows(lobes.horizon)
         self.diffuse_normal, self.smooth_normal = self._rows(samples.diffuse_normal), self._rows(samples.smooth_normal)
         self.bump_alpha2 = samples.bump_alpha2.astype(np.float32)
         self.shapes = None
@@ -427,7 +488,7 @@ class SampleRows:
         """The normals (3, P) whose horizons bound the lobe of pass `name`: below any of them it is 0."""
         if name == "diffuse":
             return _different(self.diffuse_normal, self.smooth_normal)
-        return _different(self.normal, self.geometric_normal)
+        return _different(self.normal, self.geometric_normal if self.share is None else self.normal)
 
 
 def _different(first, second):

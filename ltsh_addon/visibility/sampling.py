@@ -189,16 +189,21 @@ def sequence(count: int, seed: int = 1) -> np.ndarray:
     Each block of 2^k points that starts at a multiple of 2^k is stratified as well as can be. XOR with any number keeps
     this property.
     """
-    number = np.arange(count, dtype=np.uint32)
-    points = np.zeros((2, count), np.uint32)
+    points = sobol(np.arange(count, dtype=np.uint32))
+    scrambled = [_nested_scramble(row, 2 * seed + axis) for axis, row in enumerate(points)]
+    return np.stack(scrambled) >> np.uint32(32 - BITS)
+
+
+def sobol(number: np.ndarray) -> np.ndarray:
+    """The points (2, ...) of these numbers, uint32, in the Sobol sequence, uint32 of 32 bits."""
+    points = np.zeros((2, *number.shape), np.uint32)
     direction = np.uint32(1) << np.uint32(31)
-    for bit in range(32):
+    for bit in range(int(number.max(initial=0)).bit_length()):
         is_set = (number >> np.uint32(bit)) & np.uint32(1)
         points[0] ^= is_set << np.uint32(31 - bit)
         points[1] ^= is_set * direction
         direction ^= direction >> np.uint32(1)
-    scrambled = [_nested_scramble(row, 2 * seed + axis) for axis, row in enumerate(points)]
-    return np.stack(scrambled) >> np.uint32(32 - BITS)
+    return points
 
 
 def _nested_scramble(values, seed):
@@ -220,13 +225,23 @@ def _reversed_bits(values):
 _POINTS = [sequence(MOST_POINTS, seed) for seed in (1, 2)]
 
 
-def unit_points(seeds: np.ndarray, stream: int, first: int, last: int) -> list[np.ndarray]:
+def unit_points(
+    seeds: np.ndarray, stream: int, first: int, last: int, order: np.ndarray | None = None
+) -> list[np.ndarray]:
     """Numbers x, y (S, Q) in (0, 1): the points `first` to `last` of the sequence `stream`, 0 or 1, scrambled by the
-    seeds (Q,)."""
-    coordinates = []
+    seeds (Q,) or one seed. With an `order` (Q,) the points of pairs whose numbers follow each other make up one
+    sequence."""
+    coordinates, shift = [], None
+    if order is not None:
+        size = np.uint32(1 << max(int(last - first) - 1, 0).bit_length())
+        # Pairs with fewer points than `size` do not all leave out the same ones.
+        shift = sobol(order * size + mixed_bits(order) % size)
+        seeds, last, first = seeds + np.uint32(first), last - first, 0
     for axis, points in enumerate(_POINTS[stream][:, first:last]):
-        scrambled = mixed_bits(seeds + np.uint32((2 * stream + axis) * 0x9E3779B1 & 0xFFFFFFFF)) >> np.uint32(32 - BITS)
-        numbers = (points[:, None] ^ scrambled).astype(np.float32)
+        scrambled = mixed_bits(seeds + np.uint32((2 * stream + axis) * 0x9E3779B1 & 0xFFFFFFFF))
+        if shift is not None:
+            scrambled = scrambled ^ shift[axis]
+        numbers = (points[:, None] ^ (scrambled >> np.uint32(32 - BITS))).astype(np.float32)
         numbers += np.float32(0.5)
         numbers *= np.float32(2.0**-BITS)
         coordinates.append(numbers)

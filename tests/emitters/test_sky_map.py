@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 from surface_scenes import random_samples, single_sample
 
-from ltsh_addon.cycles.environment import CUBE, SkyPicture, bright_spots, sky_lights, spot_frame, without_spots
+from ltsh_addon.cycles.environment import (
+    CUBE,
+    SkyPicture,
+    bright_spots,
+    fine_detail,
+    sky_lights,
+    spot_frame,
+    without_spots,
+)
 from ltsh_addon.scene import SkyLight
 from ltsh_addon.shading import shade
 
@@ -155,3 +163,30 @@ def test_a_sky_that_is_nearly_constant_reflects_what_a_constant_one_does():
         for given in (sky_lights(LIKE, constant)[0], lights)
     )
     np.testing.assert_allclose(found, exact, rtol=0.012, atol=1e-3)
+
+
+@pytest.mark.parametrize("kind", ["gradient", "steep", "window"])
+def test_near_mirrors_show_a_sky_without_fine_detail(kind):
+    """A lobe of roughness 0.05 is narrower than a degree; what it reflects is the radiance in its mirror direction."""
+    radiance = {
+        "gradient": lambda unit: 1.0 + 0.8 * unit[..., 2],
+        "steep": lambda unit: 0.1 + np.exp(3.0 * unit[..., 2]),
+        "window": lambda unit: 0.1 + 5.0 * ((unit[..., 0] > 0.8) & (np.abs(unit[..., 1]) < 0.3)),
+    }[kind]
+    sides = [SkyPicture(*axes, np.zeros((256, 256, 3))) for axes in CUBE]
+    units = (side.offsets() / np.linalg.norm(side.offsets(), axis=-1, keepdims=True) for side in sides)
+    sides = [replace(side, radiance=np.repeat(radiance(unit)[..., None], 3, -1))
+             for side, unit in zip(sides, units, strict=True)]  # fmt: skip
+    lights, _ = sky_lights(LIKE, sides)
+    samples = random_samples(300, seed=5, lowest_roughness=0.25)
+    white, none = np.ones((300, 3)), np.zeros((300, 3))
+    samples = replace(
+        samples, normal=samples.view, smooth_normal=samples.view, geometric_normal=samples.view,
+        roughness=np.full(300, 0.05), specular_f0=white, specular_f90=white, dielectric=none, diffuse_albedo=none,
+    )  # fmt: skip
+    expected = radiance(samples.view)
+    together = np.zeros(len(lights), int)
+    error = np.abs(shade(samples, lights, "ltsh4", rows=together).specular[0, :, 0] - expected).mean() / expected.mean()
+    is_smooth = fine_detail(sides) <= 0.01
+    # The patches are within 2 % of the sky on average, and the map that is interpolated between them is nearer.
+    assert is_smooth == (kind != "window") and (error < 0.01) == is_smooth, (fine_detail(sides), error)

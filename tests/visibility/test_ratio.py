@@ -352,21 +352,33 @@ def test_rays_to_distant_lights_have_no_end():
         assert np.sqrt(np.square(difference).mean()) < 0.04 and abs(difference.mean()) < 0.01
 
 
-@pytest.mark.parametrize("shape", ["RECTANGLE", "ELLIPSE"])
+@pytest.mark.parametrize(
+    "kind", ["RECTANGLE", "ELLIPSE", "POLYGON", "BALL", "FACING_DISK", "cluster", "glowing cluster"]
+)
 @pytest.mark.parametrize("tilt", [0.0, 0.6])
-def test_a_face_just_before_a_light_blocks_it_and_one_just_behind_does_not(shape, tilt):
-    """By the geometry. 4 um are 8 float steps of the coordinates here; the rays' ends keep 2, rounding takes 2."""
+def test_a_face_just_before_a_light_blocks_it_and_one_just_behind_does_not(kind, tilt):
+    """By the geometry. 4 um are 8 float steps of the coordinates here; the rays' ends keep 2, rounding takes 2. Faces
+    that glow block their rays too, so that these end farther away; rays to a point keep 8."""
     direction = np.array([0.0, np.sin(tilt), -np.cos(tilt)])
-    half_u = np.array([0.3, 0.0, 0.0])
-    places = {"center": np.array([0.0, 0.0, 3.1]), "half_u": half_u, "half_v": np.cross(direction, half_u)}
-    light = panel(shape=shape, direction=direction, **places)
-    for before in (4e-6, 3e-4, -4e-6):
+    half_u = np.array([0.3, 0.0, 0.0]) * (
+        1e-6 if kind in ("BALL", "FACING_DISK") else 0.1 if "cluster" in kind else 1.0
+    )
+    half_v, center = np.cross(direction, half_u), np.array([0.0, 0.0, 3.1])
+    corners = np.array([-half_u - half_v, half_u - half_v, half_u + half_v, half_v - half_u])
+    is_mesh = kind in ("POLYGON", "glowing cluster")
+    shape = "POLYGON" if is_mesh else "RECTANGLE" if kind == "cluster" else kind
+    common, lights = {"shape": shape, "half_u": half_u, "half_v": half_v, "direction": direction}, []
+    for x in range(-80, 80, 2) if "cluster" in kind else (0.0,):
+        outline = {"corners": center + x * half_u + corners} if is_mesh else {}
+        lights.append(panel(center=center + x * half_u, **common, **outline))
+    for before in (6e-5 if is_mesh else 1e-5 if half_u[0] < 1e-5 else 4e-6, 3e-4, -4e-6):
 
         def passed(origins, directions, distances, before=before):
-            height = (light.center + before * direction - origins) @ direction
-            return np.where((directions @ direction) * distances < height, 0.0, 1.0)
+            height = (center - origins) @ direction
+            first = height + (max(before, 0.0) if is_mesh else before)
+            return np.where((directions @ direction) * distances < first, 0.0, 1.0)
 
-        found = ratio.trace_visibility(floor(12)[0], [light], Tracer(passed))
+        found = ratio.trace_visibility(floor(12)[0], lights, Tracer(passed))
         for name in PASSES:
             share = getattr(found, name)
             assert (share == (0.0 if before > 0.0 else 1.0)).all(), (before, name, share.min(), share.max())

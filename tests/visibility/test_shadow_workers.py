@@ -15,7 +15,7 @@ from ltsh_addon.workers import pool, worker
 
 @pytest.fixture
 def scene(monkeypatch):
-    """A ball above the floor in blocks of 200 samples, and the processes that were started."""
+    """A ball above the floor in blocks of at most 200 samples, and the processes that were started."""
     monkeypatch.setattr(ratio, "BLOCK_SAMPLES", 200)
     monkeypatch.setattr(ratio, "SECONDS_WORTH_A_WORKER", -1.0)
     started, popen = [], pool.subprocess.Popen
@@ -54,7 +54,8 @@ def test_any_number_of_processes_gives_the_same_bytes(scene, monkeypatch):
             assert found.noise(name) == alone.noise(name)
         assert found.rays == alone.rays
     assert len(started) == 3 and all(process.poll() is not None for process in started)
-    assert sorted(by) == sorted(2 * list(range(8)))
+    # 1600 samples in squares of 14 x 14.
+    assert sorted(by) == sorted(2 * list(range(9)))
 
 
 def test_a_pool_that_stays_gives_the_same_bytes(scene):

@@ -287,7 +287,7 @@ def prepare_scene(
 
 def add_world(inventory: LightInventory, scene, world) -> None:
     """Complete `inventory` with the emission of its lights and the light of `world`, the former world of `scene`."""
-    of_world = world_lights(scene, world, inventory.warn)
+    of_world, inventory.sky_detail = world_lights(scene, world, inventory.warn)
     inventory.lights = rendered_lights(scene, inventory) + of_world
     note_overlaps(inventory)
     inventory.world = world if of_world else None
@@ -372,6 +372,7 @@ def extract_pixels(job: PixelJob, folder: Path, progress) -> dict:
         "camera": camera.name,
         **picture,
         "lights": light_records(inventory.lights),
+        "sky_detail": inventory.sky_detail,
         "light_settings": inventory.settings,
         "occluders": OCCLUDERS if has_shadows else None,
         "warnings": warnings,

@@ -59,6 +59,7 @@ class LightInventory:
     hit: set[str] = field(default_factory=set)  # names of the lights that random rays hit, if some overlap
     lit_points: tuple[np.ndarray, np.ndarray] = ()  # points of surfaces and their normals, if some overlap
     world: Any = None  # the world that lights the scene
+    sky_detail: float = 0.0  # see `environment.fine_detail`
     behind: Any = None  # the world that is seen behind the surfaces
     occluders: Any = None  # visibility.Occluders, if shadows are wanted
     made_opaque: list[OpaqueInput] = field(default_factory=list)  # see `inject_aovs`

@@ -10,7 +10,16 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
-from ...cycles.environment import CUBE, SkyPicture, bright_spots, sky_lights, spot_frame, spot_light, without_spots
+from ...cycles.environment import (
+    CUBE,
+    SkyPicture,
+    bright_spots,
+    fine_detail,
+    sky_lights,
+    spot_frame,
+    spot_light,
+    without_spots,
+)
 from ...scene import Light, SkyLight, listed
 from ..materials.graph import is_group, is_socket, source_of, surface_of, tree_in_use, value_of
 from .emission import CONSTANT_NODES, LIGHT_PATH, OF_CAMERA, open_studio, trees_of
@@ -96,11 +105,11 @@ def light_of_world(world) -> Light | None:
     )
 
 
-def world_lights(scene, world, warn) -> list[Light]:
-    """The light of the `world` of `scene` as distant lights that have its name; [] if it is dark."""
+def world_lights(scene, world, warn) -> tuple[list[Light], float]:
+    """The light of the `world` of `scene` as distant lights that have its name, [] if it is dark; its `fine_detail`."""
     like = light_of_world(world)
     if like is None:
-        return []
+        return [], 0.0
     pictures, lights = light_pictures(scene, world, like, warn)
     sky, error = sky_lights(like, pictures)
     if error > COARSE:
@@ -109,7 +118,7 @@ def world_lights(scene, world, warn) -> list[Light]:
             f"world {world.name!r}: it is shaded as {count} patches of constant radiance, which differ from it by "
             f"{100.0 * error:.0f} % on average"
         )
-    return sky + lights
+    return sky + lights, fine_detail(pictures)
 
 
 def light_pictures(scene, world, like: Light, warn) -> tuple[list[SkyPicture], list[Light]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -10,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ...cycles import gbuffer, lobes
+from ...cycles.environment import DETAIL_ANGLE
 from ...cycles.horizons import end_at_horizons_of_cycles
 from ...emitters.light_polygons import has_lobe, lights_that_reach_nothing
 from ...files import temporary_folder
@@ -21,8 +23,8 @@ from .blender_process import run_scene_job
 
 # REASONS: how many materials, or other reasons, an error names.
 REASONS = 5
-# SHARP_REFLECTION: surfaces of a smaller roughness show the patches of a world.
-SHARP_REFLECTION = 0.2
+# SHARP_REFLECTION: surfaces of a smaller roughness show the patches of a world whose `fine_detail` exceeds SMOOTH_SKY.
+SHARP_REFLECTION, SMOOTH_SKY = 0.2, 0.01
 # EDGE_SECONDS: processor seconds that a million pixels of `finished.FinishedJob.edges` take.
 EDGE_SECONDS = 12.0
 
@@ -192,10 +194,10 @@ def extract_pixels(
         warnings += gbuffer.rounded_positions(samples.position[has_lobe(samples).any(axis=0)], lights)
         left_to_cycles, points = None, PixelPoints()
         if job.for_finished:
-            left_to_cycles = renders.left_to_cycles(film, shows_patches(samples, lights))
+            left_to_cycles = renders.left_to_cycles(film, shows_patches(samples, lights, manifest["sky_detail"]))
             points = renders.points()
         elif not problems:
-            warnings += unlit(samples, lights, manifest["camera"]) + faceted(samples, lights)
+            warnings += unlit(samples, lights, manifest["camera"]) + faceted(samples, lights, manifest["sky_detail"])
         times = (manifest[name] for name in ("seconds", "processor_seconds", "direct_seconds"))
         extraction = Extraction(
             lights=tuple(lights),
@@ -362,21 +364,24 @@ def unlit(samples: SurfaceSamples, lights: tuple[Light, ...], camera: str) -> li
     return [f"nothing that camera {camera!r} sees is lit by {listed(map(repr, unseen))}"] if unseen else []
 
 
-def faceted(samples: SurfaceSamples, lights: tuple[Light, ...]) -> list[str]:
+def faceted(samples: SurfaceSamples, lights: tuple[Light, ...], sky_detail: float) -> list[str]:
     """The warning about reflections so sharp that they show the patches of a world; [] if there are none."""
-    sharp = shows_patches(samples, lights)
+    sharp = shows_patches(samples, lights, sky_detail)
     if not sharp.any():
         return []
     sky = next(light for light in lights if light.is_distant and light.children and light.affects_specular)
     return [
         f"world {sky.name!r}: it is blurred by a degree or more in reflections sharper than roughness "
-        f"{SHARP_REFLECTION:g}, which {100.0 * sharp.mean():.3g} % of the samples have, and in facets in reference"
+        f"{SHARP_REFLECTION:g}, which {100.0 * sharp.mean():.3g} % of the samples have, and in facets in reference; a "
+        f"blur of {math.degrees(DETAIL_ANGLE):.0f} degrees changes it by {100.0 * sky_detail:.2g} % on average"
     ]
 
 
-def shows_patches(samples: SurfaceSamples, lights: tuple[Light, ...]) -> np.ndarray:
-    """Mask (P,) of the samples whose reflections are so sharp that they show the patches of a world."""
-    if not any(light.is_distant and light.children and light.affects_specular for light in lights):
+def shows_patches(samples: SurfaceSamples, lights: tuple[Light, ...], sky_detail: float) -> np.ndarray:
+    """Mask (P,) of the samples whose reflections are so sharp that they show the patches of a world with detail."""
+    if sky_detail <= SMOOTH_SKY or not any(
+        light.is_distant and light.children and light.affects_specular for light in lights
+    ):
         return np.zeros(len(samples), bool)
     return has_lobe(samples)[1] & (samples.roughness < SHARP_REFLECTION)
 

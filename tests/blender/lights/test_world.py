@@ -179,11 +179,12 @@ def test_reflections_that_show_the_patches_of_a_world_are_named(tmp_path):
     picture("EQUIRECTANGULAR")
     prepared = scene_parts.prepare()
     ((surface, _, _),) = scene_parts.sample(tmp_path, prepared)[0]
-    assert faceted(surface, prepared[2].lights) == []
+    assert faceted(surface, prepared[2].lights, prepared[2].sky_detail) == []
     sharp = replace(surface, roughness=np.where(np.arange(len(surface)) % 4 == 0, 0.1, surface.roughness))
-    (line,) = faceted(sharp, prepared[2].lights)
+    (line,) = faceted(sharp, prepared[2].lights, prepared[2].sky_detail)
     assert "'World'" in line and "25 % of the samples" in line
-    assert faceted(sharp, [light for light in prepared[2].lights if not light.children]) == []
+    assert faceted(sharp, [light for light in prepared[2].lights if not light.children], 1.0) == []
+    assert faceted(sharp, prepared[2].lights, 0.0) == []
 
 
 @pytest.mark.parametrize("kind", ["constant", "sky with a sun"])

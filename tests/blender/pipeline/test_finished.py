@@ -303,7 +303,9 @@ def test_hard_edges_of_diffuse_light_are_nearer_to_cycles_than_ours_or_its_own(t
             (read_layer(made.cycles.channels, key, "RGB") for key in names),
         )
         written = read_layer(made.channels, made.cycles.names["diffuse_light"], "RGB") * color
+        points_color = made.comparison.film.image(made.comparison.extraction.samples.diffuse_albedo)
         whole = made.comparison.images["ltsh4c", "diffuse"]
+        whole = whole * compositing.recoloring_of_points(points_color, color)
         lit = (whole > 0.0) & (color > 0.0)
         left = (1.0 - own[lit] / whole[lit]) * (light * color)[lit]
         np.testing.assert_allclose(written[lit], own[lit] + left, rtol=1e-4, atol=1e-5)
@@ -604,3 +606,27 @@ def test_few_points_leave_to_cycles_what_its_samples_tell_better():
     corner = np.tile([0.25, 0.75, 0.25, 0.75], size * size)
     slope = film.pixel % size + corner
     assert compositing.weight_of_points(film, slope, film.image(slope) + 0.05 * noise).min() > 0.95
+
+
+@pytest.mark.newest
+def test_borders_of_colors_are_as_smooth_as_in_cycles(tmp_path):
+    """A white ball before a checkered floor, by one point a pixel: only the color within pixels is unknown."""
+    scene = floor_and_ball(bsdf("BsdfDiffuse"), 1)
+    checks = bsdf("BsdfDiffuse")()
+    tree = checks.node_tree
+    checker = tree.nodes.new("ShaderNodeTexChecker")
+    checker.inputs["Scale"].default_value = 23.0
+    tree.links.new(checker.outputs["Color"], tree.nodes["Diffuse BSDF"].inputs["Color"])
+    scene.objects["Plane"].data.materials[0] = checks
+    path = parts.save(tmp_path / "scene.blend")
+    scene.cycles.seed = 1
+    job = FinishedJob(parts.save(tmp_path / "true.blend"), *(None,) * 6, TRUE_SAMPLES, None)
+    (tmp_path / "true").mkdir()
+    true = render_finished(job, tmp_path / "true")
+    light, color = (read_layer(true.channels, true.names[f"diffuse_{key}"], "RGB") for key in ("light", "color"))
+    off = {}
+    for samples in (1, 64):  # with no more samples than points there is nothing to learn from Cycles
+        made = render.finish(RenderOptions(path, output=tmp_path, sub_samples=1, cycles_samples=samples, denoise="off"))
+        off[samples] = np.linalg.norm(made.ours["ltsh4c.diffuse"] - light * color)
+    # 64 random samples know a border twice as well as the points of about three pixels, which share one each.
+    assert off[64] < 0.6 * off[1], off

@@ -23,7 +23,7 @@ from ..pipeline.options import (
     options_from,
     real_number,
 )
-from ..pipeline.picture import Baseline, with_times
+from ..pipeline.picture import Baseline
 from ..pipeline.tasks import BatchJob
 from ..scene import SceneError, error_line
 from ..shading import TableError
@@ -82,8 +82,7 @@ An object that cannot be baked is named at the end, and the exit code is 1; the 
 VIEW = """Draw what the camera sees as the viewport does, in a fraction of the time that shade
 takes. Needs OpenGL or Vulkan, with a graphics card or without. OUT gets view.exr, with
 a layer for each technique, combined and by pass, view.png, which shows the first
-technique through the scene's view transform, and report.json. --json also tells draw_s,
-the median seconds of a redraw, and refined_s, those of N redraws with all shadow rays."""
+technique through the scene's view transform, and report.json."""
 VIEW_EXAMPLES = """examples:
   %(prog)s room.blend -o out/draft --resolution 480x270 --refine 1
   %(prog)s room.blend -o out/playblast --frames 1-240 --resume
@@ -409,8 +408,6 @@ def merge_job(output: Path, arguments, bar, baseline: Baseline | None = None) ->
         worse = baseline.worse(merged.report, arguments.tolerance)
         _complain(bar, "worse", worse)
     document = merged.report if baseline is None else {**merged.report, "worse": worse}
-    if merged.command == "view":
-        document = with_times(document, merged.seconds)
     return document, 1 if merged.missing or merged.problems or worse else 0
 
 

@@ -72,7 +72,7 @@ SMALLEST_ANGLE = 1e-4
 # A sample is split only if both parts have at least this share of the light from between the horizons.
 SMALLEST_SHARE = 5e-3
 # Share of the light that splitting would move and that a quick run leaves where it is.
-UNSPLIT = 0.1
+UNSPLIT = 0.03
 # Samples per block.
 BLOCK = 2048
 # If there are more flat lights of one spread, this many rectangles stand for them, about as fine as the directions.

@@ -1,33 +1,31 @@
 """The sky, that is `SkyLight`s with children, as a map of all directions, for single precision.
 
-A lobe is integrated over a fixed number of directions that cover it evenly, whatever its width; each gets the mean of
-the map around it (Krivanek and Colbert 2008, "Real-time Shading with Filtered Importance Sampling",
-doi:10.1111/j.1467-8659.2008.01252.x, but with fixed points in the domain in which lobes are spherical harmonics). The
-map is interpolated between the centers of patches, so that sharp reflections show no facets. Double precision uses the
+A lobe is the sum over a few directions that cover it evenly; each gets the mean of the map around it (Krivanek and
+Colbert 2008, "Real-time Shading with Filtered Importance Sampling", doi:10.1111/j.1467-8659.2008.01252.x, but with
+fixed points among the visible normals). Smooth skies need fewer directions; how many is measured for each sky. The map
+is interpolated between the centers of patches, so that sharp reflections show no facets. Double precision uses the
 patches themselves, `light_polygons.PatchTree`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
 
-from ..lobes.polygon import cross, dot
-from .light_polygons import PatchTree, cached_on_children
-from .light_profile import gauss_legendre
+from ..lobes.brdf import spiral, visible_directions
+from ..lobes.polygon import dot
+from .light_polygons import PatchTree, cached_on_children, local_frames
 
 # Greatest and least number of texels along each side of a side of a map.
 MOST_TEXELS, FEWEST_TEXELS = 256, 2
-# DIRECTIONS: how many a lobe takes of a map. DENSE: how much denser they are at its peak; their heights are equal steps
-# to this power. Off as many as one likes (relative L2): 0.1 % under a gradient, 0.4 % with a window six times as bright
-# as all the rest, 1.5 % with one thirty times as bright.
-DIRECTIONS, DENSE = 160, 0.85
+# Lobes whose rougher side has at most each of ROUGHNESS take the fewest of DIRECTIONS whose error is at most TOLERANCE
+# of the sky's light (relative L2 over TRIALS lobes), compared with MANY directions.
+ROUGHNESS, DIRECTIONS = (0.05, 0.15, 0.3, 0.5, 0.75, 1.0), (12, 24, 48, 96, 192)
+TOLERANCE, TRIALS, MANY = 0.005, 48, 576
 # Standard deviation of the mean around each direction, in units of the side of a square with its solid angle.
-BLUR = 0.45
-# Samples per chunk.
-MAP_CHUNK = 128
+BLUR = 0.35
 
 
 @dataclass(frozen=True)
@@ -38,12 +36,11 @@ class SkyMap:
 
     texels: np.ndarray  # (3, T)
     width: int
-    first: np.ndarray  # (N,) first texel of each level
-    rows: np.ndarray  # (N,) rows of a side
+    first: np.ndarray  # (N * 6,) first texel of each side of each level
     scale: np.ndarray  # (N,) half the texels along a side
     sharpest: float  # variance of the second level's blur, as an area on a cube of half side 1
     reflected: np.ndarray  # as in PatchTree
-    nodes: tuple[np.ndarray, ...]  # see `_nodes`; LAPACK need not give the same last bits in every process
+    directions: np.ndarray  # (len(ROUGHNESS),) how many lobes take
 
     @classmethod
     def of(cls, lights) -> SkyMap:
@@ -71,143 +68,117 @@ class SkyMap:
             wide = _sums_of_four(angle)
             radiance, angle = _sums_of_four(radiance * angle) / wide, wide
         count = np.array([level.shape[2] for level in levels])
-        return cls(
+        first = np.concatenate([[0], np.cumsum(6 * (count + 2) * (side + 2))[:-1]])
+        made = cls(
             np.concatenate([_in_rows(level, side + 2) for level in levels], axis=1),
             side + 2,
-            np.concatenate([[0], np.cumsum(6 * (count + 2) * (side + 2))[:-1]]),
-            count + 2,
+            (first[:, None] + np.arange(6) * ((count + 2) * (side + 2))[:, None]).ravel().astype(np.int32),
             (0.5 * count).astype(np.float32),
             0.75 * (2.0 / side) ** 2,
             sum(tree.reflected for tree in trees),
-            _nodes(DIRECTIONS),
+            np.empty(0),
         )
+        return replace(made, directions=np.array(list(map(made._fewest, ROUGHNESS))))
 
-    def _directions(self, rows):
-        """For lobes with the axes `rows` (3, 3, Q): directions along them (3, N, Q), the same in the world up to a
-        factor, their weights (N, Q), and the solid angles around them as in `means`."""
-        nodes, angle, weight = self.nodes
-        first, second, third = rows
-        axes = cross(second, third), cross(third, first), cross(first, second)
-        determinant = dot(first, axes[0])
-        stretch = _stretch(axes)
-        directions = [nodes[0] * stretch, nodes[1] / stretch, nodes[2]]
-        inverse = np.float32(1.0) / np.sqrt(dot(directions, directions))
-        directions = [coordinate * inverse for coordinate in directions]
-        inverse *= inverse * inverse
-        # The inverse of the lobe's axes gives the world direction up to a factor.
-        toward = sum(coordinate * axis[:, None] for coordinate, axis in zip(directions, axes, strict=True))
-        return directions, toward, weight * inverse, (angle * inverse) * (determinant * determinant)
+    @property
+    def is_positive(self) -> bool:
+        """True if the sky takes no light away."""
+        return bool(self.reflected.min() >= 0.0)
+
+    def _fewest(self, roughness: float) -> int:
+        """The number of directions that lobes of a `roughness` need."""
+        height, *turned = spiral(TRIALS).astype(np.float64)[..., 0]
+        up = 1.0 - 2.0 * height
+        normal = np.stack([*(np.sqrt(1.0 - up * up) * turned), up], axis=1)
+        cosine = np.linspace(1.0, 0.3, TRIALS, dtype=np.float32)
+        view = np.stack([np.sqrt(1.0 - cosine * cosine), 0.0 * cosine, cosine])
+        frames = local_frames(normal, np.roll(normal, 7, axis=0)).astype(np.float32)
+
+        def reflected(count):
+            alphas = np.full((2, TRIALS), roughness * roughness, np.float32)
+            directions, angle, weight, _ = visible_directions(spiral(count), view, alphas)
+            light = (self.means(to_world(frames, directions), angle) * weight).sum(axis=1)
+            return light / weight.sum(axis=0)
+
+        exact = reflected(MANY)
+        for count in DIRECTIONS[:-1]:
+            if np.linalg.norm(reflected(count) - exact) <= TOLERANCE * np.linalg.norm(exact):
+                return count
+        return DIRECTIONS[-1]
+
+    def counts(self, roughness: np.ndarray) -> np.ndarray:
+        """How many directions lobes of `roughness` (P,) take."""
+        return np.take(self.directions, np.minimum(np.searchsorted(ROUGHNESS, roughness), len(ROUGHNESS) - 1))
 
     def means(self, toward, area) -> np.ndarray:
         """Mean radiance (3, ...) around directions `toward` (3, ...). `area` (...) is the solid angle in sr over which
         the mean is taken, times the cube of the length of `toward`."""
         x, y, z = toward
-        size_x, size_y, size_z = np.abs(toward)
-        is_x, is_y = (size_x >= size_y) & (size_x >= size_z), size_y >= size_z
+        sizes = np.abs(x), np.abs(y), np.abs(z)
+        largest = np.maximum(np.maximum(*sizes[:2]), sizes[2])
+        is_x, is_y = sizes[0] == largest, sizes[1] == largest
         along, s, t = (
             np.where(is_x, first, np.where(is_y, second, third))
             for first, second, third in ((x, y, z), (y, z, x), (z, x, y))
         )
-        face = np.where(is_x, np.int8(0), np.where(is_y, np.int8(2), np.int8(4))) + (along < 0.0)
-        inverse = np.float32(1.0) / np.abs(along)
+        side = np.where(is_x, np.int32(0), np.where(is_y, np.int32(2), np.int32(4)))
+        side += along < 0.0
+        inverse = np.divide(np.float32(1.0), largest, out=largest)
         s *= inverse
         t *= inverse
-        # The area on a cube of half side 1, then the level.
+        # The area on a cube of half side 1, then the nearest level.
         level = inverse * inverse
         level *= inverse
         level *= area
+        np.maximum(level, np.float32(1e-30), out=level)
         np.log2(level, out=level)
-        level += np.float32(np.log2(BLUR * BLUR / self.sharpest) + 1.0)
-        np.clip(level, 0.0, len(self.first) - 1.001, out=level)
-        low = level.astype(np.intp)
-        level -= low
-        radiance = self._at(low, face, s, t)
-        low += 1
-        coarser = self._at(low, face, s, t)
-        coarser -= radiance
-        coarser *= level
-        radiance += coarser
-        return radiance
-
-    def _at(self, level, face, s, t) -> np.ndarray:
-        """Radiance (3, ...) of a level (...) at s, t (...) of a side of the cube."""
-        scale = np.take(self.scale, level)
-        half = scale + np.float32(0.5)
-        s, t = s * scale, t * scale
-        s += half
-        t += half
-        row, column = t.astype(np.intp), s.astype(np.intp)
+        level += np.float32(np.log2(BLUR * BLUR / self.sharpest) + 1.5)
+        np.clip(level, 0.0, len(self.scale) - 0.5, out=level)
+        level = level.astype(np.int32)
+        scale = np.take(self.scale, level, mode="clip")
+        level *= 6
+        level += side
+        texel = np.take(self.first, level, mode="clip")
+        for coordinate in (s, t):
+            coordinate += np.float32(1.0)
+            coordinate *= scale
+            coordinate += np.float32(0.5)
+        row, column = t.astype(np.int32), s.astype(np.int32)
         t -= row
         s -= column
-        row += face * np.take(self.rows, level)
         row *= self.width
-        row += column
-        row += np.take(self.first, level)
+        texel += row
+        texel += column
+        texel = texel.astype(np.intp)
         both = s * t
         below, right = t - both, s - both
         here = np.float32(1.0) - s - below
         radiance = np.empty((3, *s.shape), np.float32)
         for out, texels in zip(radiance, self.texels, strict=True):
-            np.multiply(np.take(texels, row), here, out=out)
-            out += np.take(texels[1:], row) * right
-            out += np.take(texels[self.width :], row) * below
-            out += np.take(texels[self.width + 1 :], row) * both
+            np.multiply(np.take(texels, texel, mode="clip"), here, out=out)
+            for step, share in ((1, right), (self.width, below), (self.width + 1, both)):
+                out += np.take(texels[step:], texel, mode="clip") * share
         return radiance
 
-    def add(self, lobes, chosen: np.ndarray, total: np.ndarray) -> None:
-        """Add what the columns `chosen` (Q',) of `lobes32.Lobes` reflect of the sky to `total` (F, 3, Q)."""
-        for start in range(0, len(chosen), MAP_CHUNK):
-            columns = chosen[start : start + MAP_CHUNK]
-            directions, toward, weight, area = self._directions(lobes.rows[:3, :, columns])
-            values = lobes.at_point.at_nodes(columns, directions, toward, weight)
-            if len(lobes.clip_rows) > 1:
-                values = values * _share_above(lobes, columns, toward, area)
-            radiance = self.means(toward, area)
-            for value, target in zip(values, total, strict=True):
-                for channel in range(3):
-                    target[channel, columns] += (value * radiance[channel]).sum(axis=0)
+
+def to_world(frames, directions) -> np.ndarray:
+    """Vectors (3, N, Q) in the world of local ones [x, y, z] (N, Q) in frames (3, 3, Q)."""
+    x, y, z = directions
+    world = frames[0][:, None] * x
+    world += frames[1][:, None] * y
+    world += frames[2][:, None] * z
+    return world
 
 
-def _stretch(axes):
-    """Factor (Q,) by which directions are stretched along the first axis (3, Q) of lobes and shrunk along the second.
-    It is the root of the factor that would make the area they cover round in the world."""
-    across = cross(axes[0], axes[2])
-    squares = dot(across, across) / (dot(axes[1], axes[1]) * dot(axes[2], axes[2]))
-    return squares ** np.float32(-0.125)
-
-
-def _share_above(lobes, columns, toward, area) -> np.ndarray:
-    """Share (N, Q) of the `area` around directions (3, N, Q) above the horizons of lobes, except for their own."""
-    squares = dot(toward, toward)
-    radius = np.sqrt(area / (np.float32(np.pi) * np.sqrt(squares)))
-    share = np.float32(1.0)
-    for row in lobes.clip_rows:
-        if row != 2:
-            height = dot(lobes.rows[row][:, None, columns], toward) / (lobes.lengths[row][columns] * radius)
-            share = share * np.clip(np.float32(0.5) + np.float32(0.5) * height, np.float32(0.0), np.float32(1.0))
-    return share
-
-
-def _nodes(count: int) -> tuple[np.ndarray, ...]:
-    """Unit vectors (3, N, 1) above z = 0, a spiral of golden angles, the solid angles (N, 1) around them, and weights
-    (N, 1), close to these, with which sums are exact for polynomials of degree 4."""
-    number = np.arange(count) + 0.5
-    z = (1.0 - number / count) ** DENSE
-    turn = np.pi * (np.sqrt(5.0) - 1.0) * number
-    nodes = np.stack([np.sqrt(1.0 - z * z) * np.cos(turn), np.sqrt(1.0 - z * z) * np.sin(turn), z])
-    angle = -2.0 * np.pi * np.diff((1.0 - np.arange(count + 1) / count) ** DENSE)
-    abscissa, weight = gauss_legendre(6)
-    high, around = np.meshgrid(0.5 * (abscissa + 1.0), 0.25 * np.pi * np.arange(8), indexing="ij")
-    wide = np.sqrt(1.0 - high * high)
-    exact = np.stack([wide * np.cos(around), wide * np.sin(around), high]).reshape(3, -1)
-    weight = np.repeat(weight, 8) * (np.pi / 8.0)
-    powers = [(i, j, k) for i in range(5) for j in range(min(5 - i, 2)) for k in range(5 - i - j)]
-    moments, wanted = (
-        np.array([np.prod([vector**power for vector, power in zip(vectors, exponents, strict=True)], axis=0)
-                  for exponents in powers]) for vectors in (nodes, exact)
-    )  # fmt: skip
-    change = np.linalg.lstsq(moments * angle, wanted @ weight - moments @ angle, rcond=None)[0]
-    return tuple(values[..., None].astype(np.float32) for values in (nodes, angle, angle * (1.0 + change)))
+def share_above(height, other, angle) -> np.ndarray:
+    """The share (N, Q) above both of two horizons of what is above the first, for the solid angles `angle` (N, Q) in sr
+    around directions with the sines `height` and `other` (N, Q) over them."""
+    inverse = np.float32(1.0) / (np.sqrt(angle * np.float32(4.0 / np.pi)) + np.float32(1e-30))
+    first, both = (
+        np.clip(sine * inverse + np.float32(0.5), np.float32(1e-30), np.float32(1.0))
+        for sine in (height, np.minimum(height, other))
+    )
+    return np.divide(both, first, out=both)
 
 
 def _cells(count: int, more: int = 0) -> np.ndarray:

@@ -10,8 +10,6 @@ The dots in shapes (...) stand for lights, samples or both; arrays broadcast ove
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
-from math import comb, gamma
 
 import numpy as np
 
@@ -167,13 +165,6 @@ class CosineAtPoint:
         values /= rays.squares * rays.squares
         return values[None]
 
-    def at_nodes(self, columns, nodes, toward, weights):
-        """Values (1, N, Q) of the lobes at unit vectors (3, N, Q) along their axes, times weights (N, Q), all scaled
-        so that they add up to the integral over the hemisphere."""
-        values = nodes[2] * weights
-        values /= values.sum(axis=0)
-        return values[None]
-
     def integral(self, columns, coordinates, weights):
         """Sums (1, Q) over points of the lobe divided by the cubed distance, times `weights` that broadcast to (S, T,
         Q). The points have `coordinates` (C, S, T, Q) along the rows of the lobes `columns` (Q,)."""
@@ -201,28 +192,22 @@ class ShadowedCosineAtPoint:
 
     def __call__(self, columns, rays: RaysToCenters):
         along = rays.heights(self.smooth[:, columns])
-        return self.plain(columns, rays) * self._shadowing(columns, along, rays.squares)
-
-    def at_nodes(self, columns, nodes, toward, weights):
-        """As in `CosineAtPoint`, without the shadowing in the scale. `toward` (3, N, Q) are the world directions of the
-        nodes."""
-        along = dot(self.smooth[:, None, columns], toward)
-        shadowing = self._shadowing(columns, along, dot(toward, toward))
-        return self.plain.at_nodes(columns, nodes, toward, weights) * shadowing
+        return self.plain(columns, rays) * bump_shadowing(along, rays.squares, self.bump_alpha2[columns])
 
     def integral(self, columns, coordinates, weights):
         """As in `CosineAtPoint`. There is one more coordinate, along the smooth normal."""
         values = self.plain.at(coordinates)
-        values *= self._shadowing(columns, coordinates[3], dot(coordinates[:3], coordinates[:3]))
+        squares = dot(coordinates[:3], coordinates[:3])
+        values *= bump_shadowing(coordinates[3], squares, self.bump_alpha2[columns])
         return _sum(values, weights)[None]
 
-    def _shadowing(self, columns, along, squares):
-        """Bump shadowing (...), given the height (...) over the plane of the smooth normal and the squared distance
-        (...)."""
-        along = np.maximum(along, np.float32(1e-15) * np.sqrt(squares))
-        tangent2 = np.maximum(squares / (along * along) - np.float32(1.0), np.float32(0.0))
-        shadowing = np.sqrt(np.float32(1.0) + self.bump_alpha2[columns] * tangent2)
-        return np.float32(2.0) / (np.float32(1.0) + shadowing)
+
+def bump_shadowing(along, squares, bump_alpha2):
+    """Bump shadowing (...) at heights (...) over the plane of the smooth normal and squared distances (...)."""
+    along = np.maximum(along, np.float32(1e-15) * np.sqrt(squares))
+    tangent2 = np.maximum(squares / (along * along) - np.float32(1.0), np.float32(0.0))
+    shadowing = np.sqrt(np.float32(1.0) + bump_alpha2.astype(np.float32) * tangent2)
+    return np.float32(2.0) / (np.float32(1.0) + shadowing)
 
 
 class LobeAtPoint:
@@ -234,7 +219,6 @@ class LobeAtPoint:
         x, y, z = rows[:3]
         self.determinant = dot(x, cross(y, z))
         self.terms = weights if self.is_cosine else polynomial_terms(weights)
-        self.wholes = hemisphere_integrals_of_terms(self.terms.shape[1], self.bend is not None)
 
     def __call__(self, columns, rays: RaysToCenters):
         x, y, z = (rays.heights(row[:, columns]) for row in self.rows[:3])
@@ -257,26 +241,6 @@ class LobeAtPoint:
         if rays.slack is None:
             return self.limits.true_in_tails(values[0], columns, rays, len(self.terms))
         self.limits.apply_at_centers(values, columns, rays)
-        return values
-
-    def at_nodes(self, columns, nodes, toward, weights):
-        """As in `CosineAtPoint`, but (F, N, Q), without limits. The scale is that of the lobe before it is kept from
-        falling below zero."""
-        x, y, z = nodes
-        cosine = z * weights
-        cosine *= np.float32(1.0 / np.pi)
-        if self.is_cosine:
-            return self.terms[:, :, columns] * (cosine / cosine.sum(axis=0))
-        leaning = None if self.bend is None else self._leaning(x, y, z)
-        terms = self.terms[..., columns]
-        values = np.stack([self._value(curve[:, None], x, z, leaning) for curve in terms])
-        values *= weights
-        exact = sum(term * integral for term, integral in zip(np.moveaxis(terms, 1, 0), self.wholes, strict=True))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            scale = np.fmin(np.fmax(exact / values.sum(axis=1), np.float32(0.5)), np.float32(2.0))
-        np.maximum(values, np.float32(0.0), out=values)
-        np.maximum(values[0], np.float32(LEAST_SHARE) * cosine, out=values[0])
-        values *= scale[:, None]
         return values
 
     def integral(self, columns, coordinates, weights):
@@ -346,19 +310,6 @@ def polynomial_terms(weights: np.ndarray) -> np.ndarray:
         terms[5] -= 3.0 * (w[12] + w[14])
         terms[10:15] = 5.0 * w[10], 20.0 * w[11], 30.0 * w[12], 20.0 * w[13], 5.0 * w[14]
     return np.ascontiguousarray(np.moveaxis(terms, 0, -2))
-
-
-@cache
-def hemisphere_integrals_of_terms(count: int, has_bend: bool) -> np.ndarray:
-    """Integrals (K,) over the hemisphere of the `count` functions whose coefficients are in `polynomial_terms`."""
-    degree = degree_of(count - 2 * has_bend)
-    # x^k z^power: the mean of cos^k around the axis, times a beta function of heights.
-    integrals = [
-        0.0 if k % 2 else np.pi * comb(k, k // 2) / 2.0**k * gamma(0.5 * k + 1.0) * gamma(0.5 * power + 0.5)
-        / gamma(0.5 * (k + power) + 1.5)
-        for n in range(degree + 1) for power in range(n + 1) for k in [n - power]
-    ]  # fmt: skip
-    return np.array(integrals + [0.0, 2.0 * np.pi] * has_bend, np.float32)
 
 
 def polynomial(terms: np.ndarray, x, z) -> np.ndarray:

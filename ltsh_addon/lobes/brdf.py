@@ -73,6 +73,70 @@ def visible_normal_density(cos_theta_o, horizontal, vertical, alpha_squared):
     return distribution / (2.0 * (cos_theta_o + _slope_length(cos_theta_o, alpha_squared)))
 
 
+def spiral(count: int) -> np.ndarray:
+    """Heights, cosines and sines (3, N, 1) in single precision: points that cover (0, 1) times the circle evenly."""
+    number = np.arange(count) + 0.5
+    turn = np.pi * (np.sqrt(5.0) - 1.0) * number
+    return np.stack([number / count, np.cos(turn), np.sin(turn)])[..., None].astype(np.float32)
+
+
+def visible_directions(nodes: np.ndarray, view: np.ndarray, alphas: np.ndarray):
+    """Directions [x, y, z] (N, Q) in which lobes reflect, all equally likely by visible normals; the solid angle (N, Q)
+    in sr for which each stands; its weight (N, Q), so that sums over N are integrals of the lobe with F = 1; and the
+    cosine (N, Q) of the half angle.
+
+    `nodes` (3, N, 1) are a `spiral`. `view` (3, Q) is local, above the horizon, and `alphas` (2, Q) are those of GGX
+    along the first two axes. Heitz 2018, doi:10.1145/3388767.3407321; Dupuy and Benyoub 2023, "Sampling Visible GGX
+    Normals with Spherical Caps", doi:10.1111/cgf.14867.
+    """
+    height, cos_turn, sin_turn = nodes
+    x, y, z = view
+    along, across = alphas
+    slope_x, slope_y = along * x, across * y
+    length = np.sqrt(slope_x * slope_x + slope_y * slope_y + z * z)
+    up = z / length
+    # The view and a direction of a cap around it, added up, are the normal of the stretched surface.
+    half_z = (np.float32(1.0) - height) * (np.float32(1.0) + up)
+    cap = half_z - up
+    cap *= cap
+    np.subtract(np.float32(1.0), cap, out=cap)
+    np.sqrt(np.maximum(cap, np.float32(0.0), out=cap), out=cap)
+    half_x, half_y = cap * cos_turn, cap * sin_turn
+    half_x += slope_x / length
+    half_y += slope_y / length
+    square = half_z * half_z
+    ratio = half_x * half_x
+    ratio += half_y * half_y
+    ratio += square
+    half_x *= along
+    half_y *= across
+    square += half_x * half_x
+    square += half_y * half_y
+    cosine = ratio / np.sqrt(square)
+    cosine *= np.float32(0.5) * length
+    ratio /= square
+    angle = ratio * ratio
+    angle *= np.float32(2.0 * np.pi / len(height)) * along * across * (z + length)
+    ratio *= length
+    for half, toward in ((half_x, x), (half_y, y), (half_z, z)):
+        half *= ratio
+        half -= toward
+    slope = half_x * along
+    slope *= slope
+    square = half_y * across
+    square *= square
+    slope += square
+    slope += half_z * half_z
+    np.sqrt(slope, out=slope)
+    slope *= z
+    above = np.maximum(half_z, np.float32(0.0))
+    slope += above * length
+    weight = above
+    weight *= (z + length) / np.float32(len(height))
+    weight /= np.maximum(slope, np.float32(1e-30))
+    return [half_x, half_y, half_z], angle, weight, cosine
+
+
 def _slope_length(mu, alpha_squared):
     return np.sqrt(mu * mu + alpha_squared * (1.0 - mu * mu))
 

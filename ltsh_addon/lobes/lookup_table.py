@@ -140,14 +140,25 @@ class LookupTable:
         parameters, (total, count) = self.warp.shape[2], self.coefficients.shape[2:]
         curves = total if curves is None else curves
         wanted = self._channels[: parameters + curves * count]
-        column = 1.0 - np.sqrt(np.maximum(1.0 - np.arccos(cosine) * (2.0 / np.pi), 0.0))
-        channels = _interpolate(wanted, self.warp.shape[:2], roughness, column)
+        channels = _interpolate(wanted, self.warp.shape[:2], roughness, _theta_coordinate(cosine))
         alpha = np.maximum(roughness * roughness, dtype.type(MIN_ALPHA))
         return Lobe(
             *warp_entries(cosine, alpha, *channels[:3]),
             tilt=channels[3] if parameters == 4 else None,
             coefficients=channels[parameters:].reshape(curves, count, -1),
         )
+
+    @cached_property
+    def _albedos(self) -> np.ndarray:
+        warp, coefficients = (
+            np.moveaxis(values.reshape(-1, *values.shape[2:]), 0, -1) for values in (self.warp, self.coefficients)
+        )
+        return Lobe(*warp[[0, 0, 0, 0]], warp[3] if len(warp) > 3 else None, coefficients).albedo().astype(np.float32)
+
+    def albedos(self, cos_theta_o: np.ndarray, roughness: np.ndarray) -> np.ndarray:
+        """Directional albedos (F, P) in single precision for all Fresnel curves; arguments as for `lookup`."""
+        cosine, roughness = (np.clip(values, 0.0, 1.0).astype(np.float32) for values in (cos_theta_o, roughness))
+        return _interpolate(self._albedos, self.warp.shape[:2], roughness, _theta_coordinate(cosine))
 
     def average_albedos(self, roughness: np.ndarray) -> np.ndarray:
         """`average_albedo` (F, P) at roughness (P,), clamped to [0, 1]."""
@@ -195,6 +206,10 @@ def warp_entries(cosine, alpha, a, b, c, sine=None):
         sine = np.sqrt(np.maximum(1.0 - cosine * cosine, 0.0))
     squared = cosine * cosine + (WARP_REGULARIZATION * alpha * sine) ** 2
     return a * squared, a * b * np.sqrt(squared) * sine, c, 2.0 * alpha
+
+
+def _theta_coordinate(cosine):
+    return 1.0 - np.sqrt(np.maximum(1.0 - np.arccos(cosine) * (2.0 / np.pi), 0.0))
 
 
 def theta_nodes(count: int) -> np.ndarray:

@@ -308,22 +308,14 @@ def _shared_out(rest: np.ndarray, groups: dict[str, np.ndarray], is_clean: bool)
 
 
 def noise(cycles, passes: dict[str, DirectPass]) -> list[float]:
-    """Noise before denoising, relative to the light: of Cycles' picture without what LTSH replaces, and of all of it.
-
-    Mean deviations of pixels, known by the difference of two parts of the samples; [] if there is one file of them.
-    """
-    if not cycles.largest:
+    """Mean noise of a pixel before denoising, relative to the light: of Cycles' picture without what LTSH replaces, and
+    of all of it; [] if it is not known."""
+    if not cycles.noise:
         return []
-    files, whole, replaced = (cycles.largest, cycles.channels), [], []
-    for channels in files:
-        whole.append(read_layer(channels, "Combined", "RGB").astype(np.float64))
-        for name, one in passes.items():
-            light, color = (read_layer(channels, cycles.names[key], "RGB") for key in DIRECT[name])
-            replaced.append(_share_of(one.share, light.astype(np.float64) * color))
-    difference, light = whole[0] - whole[1], max(whole[1].sum(), 1e-30)
-    rest = difference - sum(replaced[: len(passes)]) + sum(replaced[len(passes) :])
-    scale = np.sqrt(cycles.samples_of_largest / (cycles.samples - cycles.samples_of_largest))
-    return [float(scale * np.abs(one).sum() / light) for one in (rest, difference)]
+    whole, light = read_layer(cycles.noise, "Combined", "RGB"), read_layer(cycles.channels, "Combined", "RGB").sum()
+    direct = {name: read_layer(cycles.noise, cycles.names[light], "RGB") for name, (light, _) in DIRECT.items()}
+    replaced = sum(_share_of(one.share, direct[name] * one.color) for name, one in passes.items())
+    return [float(np.abs(one).sum() / max(light, 1e-30)) for one in (whole - replaced, whole)]
 
 
 # What is written:

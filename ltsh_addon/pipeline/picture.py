@@ -5,7 +5,6 @@ A baseline is the report of an earlier comparison: what got worse since, and whe
 
 from __future__ import annotations
 
-import statistics
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -32,8 +31,6 @@ SHOWN = "shown.png"  # temporary
 # Facts that two comparisons must share for their errors to be comparable.
 _SAME = ("resolution", "sub_samples", "cycles_samples", "surface_samples", "reference")
 _CLASSES = ("metals", "dielectrics")
-# Names of times in a report, and in the seconds of a task.
-TIMES = {"draw_s": "draw", "refined_s": "refined"}
 
 
 def shade_scene(options: PictureOptions, progress: Progress | None = None) -> dict:
@@ -114,8 +111,7 @@ def view_transformed(pixels: np.ndarray, options, folder: Path, progress) -> byt
 def draw_view(options: ViewOptions, progress: Progress | None = None) -> TaskResult:
     """Draw a scene as the viewport does and write its EXR and PNG.
 
-    The seconds have "draw": the median of a redraw with the first technique, without rays; "shadows": all rays; and
-    "refined": all `refine` redraws and the rays. Raises SceneError, TableError, OSError, Cancelled.
+    Raises SceneError, TableError, OSError, Cancelled.
     """
     from ..blender.process import view
 
@@ -144,17 +140,8 @@ def draw_view(options: ViewOptions, progress: Progress | None = None) -> TaskRes
     described = metadata(options.scene, *facts, exposure=repr(manifest["exposure"]))
     imaging.write_layers(path, layers, described, imaging.chromaticities(color_space), manifest["pixel_aspect"])
     write_bytes(path.with_suffix(".png"), shown)
-    redraws = {name: statistics.median(times) for name, times in zip(tables, manifest["redraws"], strict=True)}
-    draw, shadows = next(iter(redraws.values())), (manifest["shadows"] or {"seconds": 0.0})["seconds"]
-    seconds = {
-        "blender": manifest["seconds"],
-        "draw": draw,
-        "shadows": shadows,
-        "refined": draw * options.refine + shadows,
-        "techniques": {name: {"redraw": median} for name, median in redraws.items()},
-        "total": time.perf_counter() - start,
-    }
-    return TaskResult(report, seconds, (f"{name}.exr", f"{name}.png"))
+    seconds = {"blender": manifest["seconds"], "shadows": (manifest["shadows"] or {"seconds": 0.0})["seconds"]}
+    return TaskResult(report, {**seconds, "total": time.perf_counter() - start}, (f"{name}.exr", f"{name}.png"))
 
 
 def _view_report(options: ViewOptions, tables, manifest: dict, coverage: np.ndarray) -> dict:
@@ -186,28 +173,9 @@ def _view_report(options: ViewOptions, tables, manifest: dict, coverage: np.ndar
     }
 
 
-def with_times(report: dict, seconds: dict) -> dict:
-    """The report of one view or of several, with "draw_s" and "refined_s" of each; `seconds` are those of `merge`."""
-    if "reports" not in report:
-        return {**report, **_times(seconds)}
-    reports = [{**one, **_times(seconds.get(one["name"], {}))} for one in report["reports"]]
-    drawn = [one["draw_s"] for one in reports if "draw_s" in one]
-    return {**report, "reports": reports, **({"draw_s": statistics.median(drawn)} if drawn else {})}
-
-
-def _times(seconds: dict) -> dict:
-    return {name: seconds[key] for name, key in TIMES.items() if key in seconds}
-
-
 def view_summary(report: dict, seconds: dict) -> list[str]:
     """One line about a view."""
-    times = _times(seconds)
-    took = (
-        f": a redraw {times['draw_s']:.3f} s, all of {report['sub_samples']} {times['refined_s']:.2f} s"
-        if times
-        else ""
-    )
-    return [f"{report['resolution'][0]}x{report['resolution'][1]} on {report['graphics']}{took}"]
+    return [f"{report['resolution'][0]}x{report['resolution'][1]} on {report['graphics']}"]
 
 
 _ERRORS = {"relative_l2?": NUMBER | None}

@@ -364,15 +364,12 @@ def _report(comparison: Comparison, cycles, passes: dict, rest: compositing.Rest
 
 def _gain(cycles, passes: dict, combined: np.ndarray, stages: dict[str, float]) -> dict:
     """LTSH's share of the light; the noise before denoising, and that of Cycles alone in as many `stages` (s)."""
-    light = sum(one.image.sum() for one in passes.values())
-    gain = {"share_of_light": float(light / max(combined[..., :3].sum(), 1e-30))}
-    for name, value in zip(("noise", "noise_of_cycles"), compositing.noise(cycles, passes), strict=False):
-        gain[name] = value
-    if "noise" in gain:
-        sampling = max(cycles.processor_seconds - cycles.least_seconds, 1e-3)
-        more = (sum(stages.values()) - stages["cycles"] - stages["denoise"]) / sampling
-        gain["noise_of_cycles"] /= float(np.sqrt(1.0 + more))
-    return gain
+    light = sum(one.image.sum() for one in passes.values()) / max(combined[..., :3].sum(), 1e-30)
+    sampling = max(cycles.processor_seconds - cycles.least_seconds, 1e-3)
+    more = (sum(stages.values()) - stages["cycles"] - stages["denoise"]) / sampling
+    noise, alone = compositing.noise(cycles, passes) or (None, None)
+    alone = None if alone is None else float(alone / np.sqrt(1.0 + more))
+    return {"share_of_light": float(light), "noise": noise, "noise_of_cycles": alone}
 
 
 def summary(report: dict, seconds: dict) -> list[str]:
@@ -381,18 +378,16 @@ def summary(report: dict, seconds: dict) -> list[str]:
     shares = ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in finished["share_of_ours"].items())
     took = f", {seconds['processor']['total']:.1f} s of processor time" if "processor" in seconds else ""
     denoised = f"denoised by {finished['denoiser']}" if finished["denoiser"] else "not denoised"
+    gained, (light, *noise) = "", finished["gain"].values()
+    if noise[0] is not None:
+        gained = "; noise before denoising {:.1f} %, of Cycles alone in this time {:.1f} %".format(
+            *(100.0 * one for one in noise)
+        )
     return [
         f"{width}x{height}, {report['sub_samples']} points per pixel, {report['cycles_samples']} samples of Cycles, "
         f"{denoised}{took}",
-        f"direct light by LTSH on: {shares} of the pixels{_gained(finished['gain'])}",
+        f"direct light by LTSH on: {shares} of the pixels, {100.0 * light:.0f} % of the light{gained}",
     ]
-
-
-def _gained(gain: dict) -> str:
-    """What was gained, in words."""
-    noise = [f"{100.0 * gain[name]:.1f} %" for name in ("noise", "noise_of_cycles") if name in gain]
-    words = f"; noise before denoising {noise[0]}, of Cycles alone in this time {noise[1]}" if noise else ""
-    return f", {100.0 * gain['share_of_light']:.0f} % of the light{words}"
 
 
 def brief(report: dict) -> list[str]:

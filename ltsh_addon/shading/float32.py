@@ -15,7 +15,7 @@ import numpy as np
 
 from ..emitters import light_profile, profile_regions, small_lights
 from ..emitters.facing import AnalyticLobe, FacingDisk, mean_emission
-from ..emitters.light_polygons import interpolated, light_levels, local_corners, may_reach, off_plane
+from ..emitters.light_polygons import light_levels, local_corners, may_reach, off_plane
 from ..emitters.light_tree import FEWEST, LightTree, add_far_lights, is_special
 from ..emitters.sky_map import SkyMap
 from ..emitters.tails import LightFromPoints, TailLimits
@@ -80,9 +80,7 @@ def shade_specular(samples, lights, table, radiance, scratch, leftovers=None):
 
     lighting = _Lighting(samples, lights, radiance, scratch, specular_in_float64(table))
     far = sharp & False
-    if lights.skies:
-        far = sharp & ~(anisotropic | float64.has_bent_fresnel(samples))
-    elif lights.trees and table.family == "ltsh":
+    if lights.trees and table.family == "ltsh":
         far = sharp & ~anisotropic
     sharp = (sharp | anisotropic) & ~far
     for only_tails, chosen in ((False, lit & ~sharp & ~far), (True, far)):
@@ -207,12 +205,25 @@ class Lights(list):
 
     @cached_property
     def skies(self) -> list[tuple[SkyMap, object, int]]:
-        """Maps of the distant lights with a detail, each with one of its lights and their row."""
+        """Maps of lights that are all `float64.has_patches`, each with one of its lights and their row."""
         kinds: dict[tuple, list] = {}
         for light, row, _ in self:
-            if float64.has_patches(light):
-                kinds.setdefault((row, light.receivers), []).append(light)
-        return [(SkyMap.of(lights), lights[0], row) for (row, _), lights in kinds.items()]
+            kinds.setdefault((row, light.receivers), []).append(light)
+        maps = [SkyMap.of(lights) for lights in kinds.values()]
+        # With the same directions for all, the parts of a sky in several rows add up.
+        most = np.max([sky.directions for sky in maps], axis=0)
+        maps = [replace(sky, directions=most) for sky in maps]
+        return [(sky, lights[0], row) for sky, ((row, _), lights) in zip(maps, kinds.items(), strict=True)]
+
+
+def shade_skies(samples, lights, table, radiance) -> None:
+    """Add to `radiance`, (R, P, 3) by pass, what `samples` reflect of `Lights.skies`; `lights` has them by pass."""
+    adds = {"diffuse": lobes32.add_diffuse_of_sky, "specular": partial(lobes32.add_specular_of_sky, table=table)}
+    for name, add in adds.items():
+        for sky, light, row in lights[name].skies if name in radiance else ():
+            allowed = light.receives(samples.receiver)
+            index = np.arange(len(samples)) if allowed is None else np.nonzero(allowed)[0]
+            add(sky, samples, index, radiance[name][row])
 
 
 class _Lighting:
@@ -230,11 +241,9 @@ class _Lighting:
         index, colors = lobes.index, lobes.colors
         position = np.ascontiguousarray(self.samples.position[index].T)
         sums = {row: np.zeros((len(colors), 3, len(index)), np.float32) for row in {row for _, row, _ in self.lights}}
-        self._add_skies(lobes, sums)
         remaining = self._add_far(lobes, position, sums)
         for number in sorted([*self.lights.alone, *remaining]):
-            if not float64.has_patches(self.lights[number][0]):
-                self._add_light(lobes, number, position, remaining.get(number), sums)
+            self._add_light(lobes, number, position, remaining.get(number), sums)
         signed = (colors < 0.0).any()
         for row, total in sums.items():
             reflected = (colors * total).sum(axis=0)
@@ -302,17 +311,6 @@ class _Lighting:
         for channel in range(3):
             total[:, channel, columns] += integrals * np.float32(light.radiance[channel])
         return redo
-
-    def _add_skies(self, lobes, sums) -> None:
-        """Add the light of skies to the `sums` (F, 3, Q) by row."""
-        for sky, light, row in self.lights.skies:
-            allowed = light.receives(self.samples.receiver, lobes.index)
-            chosen = np.arange(len(lobes.index)) if allowed is None else np.nonzero(allowed)[0]
-            if lobes.sharpest is None and len(lobes.clip_rows) == 1:
-                normals = self.samples.diffuse_normal[lobes.index[chosen]]
-                sums[row][0][:, chosen] += interpolated(sky.reflected, normals)
-            else:
-                sky.add(lobes, chosen, sums[row])
 
     def _add_far(self, lobes, position, sums) -> dict[int, np.ndarray]:
         """Add the light of trees to the `sums` (F, 3, Q) by row. Returns the columns (Q',) that are left to do, by
@@ -467,8 +465,7 @@ class _Lighting:
         lights = self.lights[: len(self.lights) - self.lights.leaf_count]
         if len(members) == 0:
             return
-        has_patches = any(float64.has_patches(light) for light, _, _ in lights)
-        if not has_patches and len(members) * len(lights) < FLOAT64_CHUNK:
+        if len(members) * len(lights) < FLOAT64_CHUNK:
             for (light, _, _), needs_float64 in zip(lights, self.needs_float64, strict=False):
                 allowed = light.receives(self.samples.receiver, members)
                 needs_float64.append(members if allowed is None else members[allowed])

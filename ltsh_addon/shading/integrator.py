@@ -105,7 +105,9 @@ class Task:
         error = np.zeros(len(samples)) if self.has_error else None
         leftovers: dict[str, list] = {name: [] for name in self.passes}
         in_float64 = self._add(samples, self._plain, radiance, error, leftovers)
-        if self._with_patches is not None:
+        if self._with_patches is not None and self.single:
+            float32.shade_skies(samples, self._with_patches, self.table, radiance)
+        elif self._with_patches is not None:
             self._add(samples, self._with_patches, radiance, error, {})
         for light, row in self._rows_of_lights:
             if light.children and not float64.has_patches(light):

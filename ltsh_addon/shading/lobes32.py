@@ -13,16 +13,34 @@ from functools import cached_property, partial
 import numpy as np
 
 from ..emitters import light_profile, small_lights
+from ..emitters.light_polygons import interpolated
+from ..emitters.sky_map import SkyMap, share_above, to_world
+from ..emitters.small_lights import bump_shadowing
 from ..emitters.tails import TailLimits
 from ..lobes import moments32
+from ..lobes.brdf import (
+    clipped_metals,
+    dielectric_reflectance,
+    f82_reflectance,
+    schlick_curve,
+    spiral,
+    visible_directions,
+)
+from ..lobes.diffuse import diffuse_factor
 from ..lobes.lobe_integrals import LEAST_SHARE
-from ..lobes.polygon import dot
+from ..lobes.lookup_table import MIN_ALPHA
+from ..lobes.polygon import cross, dot
+from . import float64
 
 # If a block has more different indices of refraction, the dielectric's weights are summed up per sample.
 SEPARATE_IORS = 8
 # Samples per chunk. It is large because a call of numpy costs as much as some thousand elements. Its rows are not a
 # multiple of a page long, because the cache would hold few of such rows.
 CHUNK = 24592
+# Directions to a sky per chunk.
+SKY_NODES = 24576
+# Directions of diffuse lobes to a sky have equal steps of their heights to this power.
+DENSE = 0.7
 # Corners per chunk.
 CORNERS = 4 * CHUNK
 
@@ -122,11 +140,8 @@ def normal_frames(normal):
     return np.stack([tangent, np.stack([b, sign + y * y * a, -y]), normal])
 
 
-def lobe_axes(samples, index, axes, ridges, vectors, scratch):
-    """Axes (C, 3, Q) of the warped local frames, the numbers of the coordinates to clip, and the weights (F, K, Q), for
-    samples with the normals and views `axes`."""
-    normal, view = axes
-    cosine = dot(normal, view)
+def frames_toward(normal, view):
+    """Frames (3, 3, Q) around normals (3, Q) with tangents toward views (3, Q), whose lengths along these are (Q,)."""
     # Differences of close vectors are exact, so nothing of this one runs along the normal.
     tangent = view - normal
     tangent -= dot(normal, tangent) * normal
@@ -136,11 +151,15 @@ def lobe_axes(samples, index, axes, ridges, vectors, scratch):
         # The lobe is round there, so any tangent serves.
         tangent[:, straight] = normal_frames(normal[:, straight])[0]
     tangent /= np.where(sine < 1e-6, np.float32(1.0), sine)
-    bitangent = np.stack([
-        normal[1] * tangent[2] - normal[2] * tangent[1],
-        normal[2] * tangent[0] - normal[0] * tangent[2],
-        normal[0] * tangent[1] - normal[1] * tangent[0],
-    ])  # fmt: skip
+    return (tangent, cross(normal, tangent), normal), sine
+
+
+def lobe_axes(samples, index, axes, ridges, vectors, scratch):
+    """Axes (C, 3, Q) of the warped local frames, the numbers of the coordinates to clip, and the weights (F, K, Q), for
+    samples with the normals and views `axes`."""
+    normal, view = axes
+    cosine = dot(normal, view)
+    (tangent, bitangent, _), sine = frames_toward(normal, view)
     roughness = samples.roughness[index].astype(np.float32)
     angle = np.minimum(cosine, np.float32(1.0)), np.minimum(sine, np.float32(1.0))
     warp, weights, tilt = ridges.fetch(vectors, *angle, roughness, samples.ior[index], scratch)
@@ -172,6 +191,111 @@ def _selected(values, columns, index):
     """Values (..., Q) at the columns `index` (None: all) of the slice `part` of columns."""
     values = values[..., columns]
     return values if index is None else np.take(values, index, axis=-1)
+
+
+def add_diffuse_of_sky(sky: SkyMap, samples, index, radiance) -> None:
+    """Add to `radiance` (P, 3) what the diffuse lobes of the samples `index` reflect of a sky."""
+    index = index[any_component(samples.diffuse_albedo)[index]]
+    bumped = any_component(samples.diffuse_normal != samples.smooth_normal)[index]
+    velvet, sheen = samples.sheen_a[index] < 0.0, samples.sheen_a[index] > 0.0
+    shaped = velvet | sheen | (samples.diffuse_roughness[index] != 0.0)
+    plain = index[~(bumped | shaped)]
+    radiance[plain] += interpolated(sky.reflected, samples.diffuse_normal[plain]).T * samples.diffuse_albedo[plain]
+    # Velvet is brightest near the horizon.
+    for chosen, is_shaped, more in ((bumped & ~shaped, False, 1), (shaped & ~velvet, True, 1), (velvet, True, 4)):
+        (height, *turn), members = spiral(more * sky.directions[-1]), index[chosen]
+        up = (np.float32(1.0) - height) ** np.float32(DENSE)
+        local = [*(np.sqrt(np.float32(1.0) - up * up) * turn), up]
+        angles = np.float32(2.0 * np.pi / len(height) * DENSE) * up / (np.float32(1.0) - height)
+        for start in range(0, len(members), SKY_NODES // len(height)):
+            chosen = members[start : start + SKY_NODES // len(height)]
+            normal, smooth = (as_columns(of, chosen) for of in (samples.diffuse_normal, samples.smooth_normal))
+            toward = to_world(normal_frames(normal), local)
+            angle, cosine = (np.broadcast_to(values, toward.shape[1:]) for values in (angles, up))
+            above = dot(smooth[:, None], toward)
+            weight = share_above(cosine, above, angle) * (up * angles * np.float32(1.0 / np.pi))
+            weight *= bump_shadowing(above, np.float32(1.0), samples.bump_alpha2[chosen])
+            light, again = sky.means(toward, angle), 0.0
+            if is_shaped:
+                shape = [getattr(samples, name)[chosen] for name in ("diffuse_roughness", "sheen_a", "sheen_b")]
+                setting = toward, cosine, normal, as_columns(samples.view, chosen)
+                once, twice = (
+                    diffuse_factor(*setting, np.stack([*shape, rebound]))
+                    for rebound in np.float32([[0.0], [1.0]]).repeat(len(chosen), axis=1)
+                )
+                again = (light * (weight * (twice - once))).sum(axis=1).T * samples.diffuse_rebound[chosen]
+                weight *= once
+            radiance[chosen] += ((light * weight).sum(axis=1).T + again) * samples.diffuse_albedo[chosen]
+
+
+def add_specular_of_sky(sky: SkyMap, samples, index, radiance, table) -> None:
+    """Add to `radiance` (P, 3) what the specular lobes of the samples `index` reflect of a sky. These are GGX, whatever
+    the `table`, of which they have the albedo if they are isotropic."""
+    cosine = dot(samples.normal.T, samples.view.T).astype(np.float32)
+    index = index[cosine[index] > 0.0]
+    aspect = np.maximum(1.0 - samples.anisotropy, 1e-6)
+    alphas = np.maximum(np.square(samples.roughness) * np.stack([1.0 / aspect, aspect]), MIN_ALPHA).astype(np.float32)
+    anisotropic, bent = samples.anisotropy != 0.0, float64.has_bent_fresnel(samples)
+    counts = sky.counts(np.sqrt(alphas.max(axis=0))) * (1 + anisotropic)
+    kinds = [*fresnel_kinds(samples, index[~bent[index]]), ("bent", index[bent[index]], None)]
+    for vectors, members, colors_of in kinds:
+        for count in np.unique(counts[members]):
+            alike, nodes = members[counts[members] == count], spiral(count)
+            for start in range(0, len(alike), SKY_NODES // count):
+                chosen = alike[start : start + SKY_NODES // count]
+                normal, view, tangent, geometric = (
+                    as_columns(getattr(samples, name), chosen)
+                    for name in ("normal", "view", "tangent", "geometric_normal")
+                )
+                frames, _ = frames_toward(normal, np.where(anisotropic[chosen], normal + tangent, view))
+                local = np.stack([dot(axis, view) for axis in frames])
+                directions, angle, weight, half = visible_directions(nodes, local, alphas[:, chosen])
+                toward = to_world(frames, directions)
+                light = sky.means(toward, angle)
+                if (geometric != normal).any():
+                    light *= share_above(directions[2], dot(geometric[:, None], toward), angle)
+                if vectors == "bent":
+                    radiance[chosen] += (light * (weight * _bent_reflectance(samples, chosen, half))).sum(axis=1).T
+                    continue
+                albedos = table.albedos(cosine[chosen], samples.roughness[chosen])
+                albedos[:, anisotropic[chosen]] = np.nan
+                reflected = np.zeros((3, len(chosen)), np.float32)
+                for vector, color in zip(vectors, colors_of(chosen), strict=True):
+                    if color.any():
+                        curve, albedo = _fresnel_curve(vector, half, samples.ior[chosen], (table, albedos))
+                        curve *= weight
+                        # Without an albedo, which is NaN, the scale is 1.
+                        scale = albedo / np.maximum(curve.sum(axis=0), np.float32(1e-30))
+                        reflected += color * ((light * curve).sum(axis=1) * np.where(scale >= 0.0, scale, 1.0))
+                if sky.is_positive:
+                    # Terms that cancel in the Fresnel factor may leave a rest below zero.
+                    np.maximum(reflected, np.float32(0.0), out=reflected)
+                radiance[chosen] += reflected.T
+
+
+def _fresnel_curve(vector, half, ior, albedos):
+    """One of the `vectors` of `RidgeTable` at the cosines `half` (N, Q), and its albedo (Q,), given a table and the
+    albedos (F, Q) of the table's curves."""
+    table, albedos = albedos
+    if isinstance(vector, int):
+        curve = np.ones_like(half) if vector == 0 else schlick_curve(half)
+        if vector == 2:
+            curve *= half * (np.float32(1.0) - half)
+        return curve, albedos[vector]
+    ior = ior.astype(np.float32)
+    return dielectric_reflectance(half, ior), (table.dielectric_weights(ior) * albedos).sum(axis=0).astype(np.float32)
+
+
+def _bent_reflectance(samples, index, half):
+    """Fresnel factors (3, N, Q) at the cosines `half` (N, Q) of samples that are `float64.has_bent_fresnel`."""
+    samples = samples.take(index)
+    f0, f90, dip, dielectric = (
+        as_columns(getattr(samples, name), slice(None))[:, None]
+        for name in ("specular_f0", "specular_f90", "specular_dip", "dielectric")
+    )
+    metal = f82_reflectance(half, f0, f90, dip)
+    metal = np.where(clipped_metals(samples), np.maximum(metal, np.float32(0.0)), metal)
+    return metal + dielectric * dielectric_reflectance(half, samples.ior.astype(np.float32))
 
 
 class FormFactor:

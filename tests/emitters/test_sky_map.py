@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from surface_scenes import random_samples, single_sample
+import quadrature
+from surface_scenes import random_samples, single_sample, unit
 
 from ltsh_addon.cycles.environment import (
     CUBE,
@@ -48,6 +49,57 @@ def test_patches_chosen_by_lobes_give_what_the_smallest_do(technique, dtype):
     for name, most in (("specular", 0.01), ("diffuse", 2e-3)):
         own, exact = (getattr(shading, name).sum(axis=0) for shading in (found, expected))
         assert np.linalg.norm(own - exact) < most * np.linalg.norm(exact), name
+
+
+SKIES = {
+    "gradient": lambda d: (0.3 + 0.5 * (1.0 + d[..., 2:])) * [0.5, 0.6, 0.9],
+    "sun": lambda d: [0.25, 0.45, 0.9] + (3.0 * np.exp((d @ SUN - 1.0) / 0.03))[..., None] * [1.0, 0.9, 0.7],
+    "windows": lambda d: np.where((np.abs(np.sin(3.0 * d)) > 0.9).all(axis=-1, keepdims=True), 12.0, 0.4) * np.ones(3),
+    "checkers": lambda d: (0.1 + (np.floor(4.0 * d).sum(axis=-1) % 2.0))[..., None] * [1.0, 0.9, 0.8],
+}
+SUN = np.array([0.48, 0.36, 0.8])
+
+
+@pytest.mark.parametrize("sky", SKIES)
+@pytest.mark.parametrize("kind", ["isotropic", "anisotropic"])
+def test_glossy_surfaces_reflect_the_integral_of_a_sky(sky, kind):
+    """By the textbook's formulas in the middles of 6,144 pixels. The mean is within the 0.3 % that a picture may be
+    off; patches are 2 % of a sky from its pixels, and 192 directions leave 1 % of windows thirty times as bright."""
+    samples = random_samples(60, seed=6, lowest_roughness=0.35)
+    samples = replace(samples, geometric_normal=samples.normal)
+    if kind == "anisotropic":
+        tangent = np.random.default_rng(7).normal(size=(60, 3))
+        samples = replace(samples, anisotropy=np.linspace(-0.5, 0.47, 60), tangent=tangent)
+    taken = [replace(one, radiance=SKIES[sky](unit(one.offsets()))) for one in pictures(32)]
+    found = shade(samples, sky_lights(LIKE, taken)[0], passes=("specular",), workers=1).specular.sum(axis=0)
+    expected = sum(
+        np.einsum("psk,sk,s->pk", quadrature.ggx(unit(one.offsets()).reshape(1, -1, 3), samples),
+                  one.radiance.reshape(-1, 3), one.solid_angles().ravel())
+        for one in taken
+    )  # fmt: skip
+    assert abs(found.sum() / expected.sum() - 1.0) < 3e-3
+    assert np.linalg.norm(found - expected) < 0.02 * np.linalg.norm(expected)
+
+
+@pytest.mark.parametrize("field", ["sheen_a", "velvet", "diffuse_roughness", "bump"])
+def test_all_diffuse_lobes_reflect_a_sky_as_its_patches_do(field):
+    """In double precision each patch is integrated by closed forms. The mean is within the 0.3 % that a picture may be
+    off, but for velvet, which is brightest near the horizon. 192 directions leave 1 % of windows with six times the
+    rest."""
+    samples = random_samples(60, seed=8)
+    value = {"sheen_a": 0.8, "velvet": -0.4, "diffuse_roughness": 0.7, "bump": 0.3}[field]
+    name = {"velvet": "sheen_a", "bump": "bump_alpha2"}.get(field, field)
+    rebound = np.full((60, 3), 0.1 if field == "diffuse_roughness" else 0.0)
+    smooth = samples.normal if field == "bump" else samples.diffuse_normal
+    samples = replace(samples, **{name: np.full(60, value)}, diffuse_rebound=rebound, smooth_normal=smooth)
+    samples = replace(samples, sheen_b=0.3 + 0.0 * samples.sheen_a)
+    lights, _ = sky_lights(LIKE, pictures(16))
+    found, expected = (
+        shade(samples, lights, passes=("diffuse",), dtype=dtype, workers=1).diffuse.sum(axis=0)
+        for dtype in (np.float32, np.float64)
+    )
+    assert np.linalg.norm(found - expected) < 0.025 * np.linalg.norm(expected)
+    assert abs(found.sum() / expected.sum() - 1.0) < (5e-3 if field == "velvet" else 3e-3)
 
 
 def test_mirrors_reflect_a_sky():

@@ -75,22 +75,17 @@ def moved(rig, picture="6_moved"):
 
 
 def updated(rig, when, picture):
-    """The button: a draft, then the picture; how long they take, and the window does not answer."""
+    """The button, and the picture; how long it takes, and the window does not answer."""
     mixer, results, scene = hands.module("ui.mixer"), hands.module("ui.results"), bpy.context.scene
     before = results.mixed_pixels(scene).copy()
-    rows, draft, longest = results.mixer_of(scene).rows, None, 0.0
+    longest = 0.0
     start = last = time.perf_counter()
     hands.operate(rig, bpy.ops.ltsh.update_moved_lights, "INVOKE_DEFAULT", kind="IMAGE_EDITOR")
     while mixer._updating["update"] is not None and last - start < 300.0:
         yield 0.01
         now = time.perf_counter()
         longest, last = max(longest, now - last - 0.01), now
-        if draft is None and results.mixer_of(scene).rows is not rows:
-            draft = now - start
-            rig.shot(f"{picture}_draft.png")
-            last = time.perf_counter()
-    rig.fact(f"{picture}, {when}: draft, end, longest without an answer, s",
-             [draft and round(draft, 2), round(last - start, 2), round(longest, 2)])  # fmt: skip
+    rig.fact(f"{picture}, {when}: end, longest without an answer, s", [round(last - start, 2), round(longest, 2)])
     rig.check(mixer._updating["update"] is None, "moved lights are shaded")
     rig.check((results.mixed_pixels(scene) != before).mean() > 0.05, "and seen where they are")
     yield 1

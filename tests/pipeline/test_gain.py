@@ -27,8 +27,10 @@ def cycles(samples=SAMPLES):
         files.append({key: plane for name, one in light.items() for key, plane in Layer(one).planes(name).items()})
     total = sum(samples)
     mean = {key: sum(n / total * file[key] for n, file in zip(samples, files, strict=True)) for key in files[0]}
-    facts = {"samples": total, "samples_of_largest": samples[0], "processor_seconds": 5.0, "least_seconds": 2.0}
-    return SimpleNamespace(channels=mean, largest=files[0] if len(files) > 1 else {}, names=NAMES, **facts)
+    facts = {"samples": total, "processor_seconds": 5.0, "least_seconds": 2.0}
+    scale = np.sqrt(samples[0] / max(total - samples[0], 1))
+    noise = {key: scale * (plane - mean[key]) for key, plane in files[0].items() if len(files) > 1}
+    return SimpleNamespace(channels=mean, noise=noise, names=NAMES, **facts)
 
 
 def passes(is_replaced):
@@ -58,11 +60,15 @@ def test_cycles_alone_gets_the_time_of_direct_light_for_samples():
     )
     assert gain["share_of_light"] == pytest.approx(0.5)
     assert gain["noise_of_cycles"] == pytest.approx(whole / 2.0)  # 9 s more, 3 s for all samples: four times as many
-    assert _gain(cycles((8,)), passes(True), np.ones((*SHAPE[:2], 4)), stages).keys() == {"share_of_light"}
+    assert _gain(cycles((8,)), passes(True), np.ones((*SHAPE[:2], 4)), stages)["noise"] is None
 
 
 def test_the_summary_tells_it():
-    finished = {"share_of_ours": {"diffuse": 1.0}, "denoiser": "", "gain": {"share_of_light": 0.5}}
+    finished = {
+        "share_of_ours": {"diffuse": 1.0},
+        "denoiser": "",
+        "gain": {"share_of_light": 0.5, "noise": None, "noise_of_cycles": None},
+    }
     report = {"finished": finished, "resolution": (4, 3), "sub_samples": 1, "cycles_samples": 2}
     assert summary(report, {})[1].endswith("50 % of the light")
     finished["gain"] |= {"noise": 0.01, "noise_of_cycles": 0.025}

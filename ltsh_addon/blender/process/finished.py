@@ -40,8 +40,7 @@ class CyclesPicture:
     guides: dict[str, np.ndarray]  # the channels for the denoiser
     names: dict[str, str]  # of passes, as in `pass_names`
     samples: int
-    largest: dict[str, np.ndarray]  # the channels of light of the file with most samples; {} if there is no other
-    samples_of_largest: int
+    noise: dict[str, np.ndarray]  # of the channels of light, an example; {} if there is one file
     smooth_emission: dict[str, np.ndarray]  # (H, W, 3) what emits in sight, with smooth edges, by the key of its pass
     everything: tuple[str, ...]  # reasons why all direct light is left to Cycles
     warnings: tuple[str, ...]
@@ -54,7 +53,7 @@ class CyclesPicture:
 def render_finished(job: FinishedJob, folder: Path, *, progress: Progress | None = None) -> CyclesPicture:
     """The unchanged scene as Cycles renders it. Raises as `pixels.extract_pixels` does."""
     manifest = run_scene_job(job, folder, progress)
-    channels, largest = _mean_of_chunks(manifest, folder)
+    channels, noise = _mean_of_chunks(manifest, folder)
     samples = sum(count for _, count in manifest["files"])
     dropped = tuple(f"{name}." for name in manifest["dropped"])
     return CyclesPicture(
@@ -62,8 +61,7 @@ def render_finished(job: FinishedJob, folder: Path, *, progress: Progress | None
         guides={name: plane for name, plane in channels.items() if name.startswith("Denoising ")},
         names=manifest["passes"],
         samples=samples,
-        largest=largest,
-        samples_of_largest=max(count for _, count in manifest["files"]),
+        noise=noise,
         smooth_emission=_smooth_emission(manifest, folder, channels, samples),
         everything=tuple(manifest["everything"]),
         warnings=tuple(manifest["warnings"]),
@@ -88,8 +86,8 @@ def _smooth_emission(manifest: dict, folder: Path, channels: dict[str, np.ndarra
 
 
 def _mean_of_chunks(manifest: dict, folder: Path) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """The channels: those of light are means over all chunks, all others come from the largest chunk. And those of
-    light of the largest chunk, if there are others."""
+    """The channels: those of light are means over all chunks, all others come from the largest chunk. And noise with
+    the deviation of those of light, {} for one chunk."""
     files = sorted(manifest["files"], key=lambda item: -item[1])
     total, channels, largest = sum(count for _, count in files), {}, {}
     for name, count in files:
@@ -103,7 +101,8 @@ def _mean_of_chunks(manifest: dict, folder: Path) -> tuple[dict[str, np.ndarray]
         else:
             for key in light:
                 channels[key] += count / total * chunk[key]
-    return channels, largest
+    scale = np.sqrt(files[0][1] / max(total - files[0][1], 1))
+    return channels, {key: scale * (plane - channels[key]) for key, plane in largest.items()}
 
 
 def _without_layer(channels: dict[str, np.ndarray], layer: str) -> dict[str, np.ndarray]:

@@ -345,9 +345,7 @@ def ended_at_horizons(extraction: Extraction, progress: Progress | None = None) 
     """`extraction` with lobes that end at the horizons of Cycles."""
     samples, film = extraction.samples, extraction.film
     hit = np.arange(len(samples)) if film.first is None else np.cumsum(film.first)
-    is_quick = extraction.left_to_cycles is not None
-    options = {"is_quick": is_quick, "progress": progress}
-    samples, index = end_at_horizons_of_cycles(samples, extraction.lights, hit, **options)
+    samples, index = end_at_horizons_of_cycles(samples, extraction.lights, hit, is_quick=True, progress=progress)
     first = np.diff(index, prepend=-1) > 0
     if film.first is not None:
         first &= film.first[index]

@@ -175,8 +175,7 @@ def _draw_update(layout) -> None:
         layout.operator("ltsh.update_moved_lights", icon="ORIENTATION_GLOBAL")
         return
     row = layout.row(align=True)
-    text = f"{100.0 * update.done:.0f} %" if update.done else "Draft"
-    row.progress(factor=update.done, text=text)
+    row.progress(factor=update.done, text=f"{100.0 * update.done:.0f} %")
     row.operator("ltsh.cancel_moved_lights", text="", icon="X")
 
 
@@ -279,7 +278,7 @@ def _reason_not_to_apply(ob, values, given: dict) -> str:
 
 class LTSH_OT_update_moved_lights(_NeedsMixer, bpy.types.Operator):
     """Shade lights that have been moved or resized since the picture where they are now; the others stay.
-    A draft is shown first; lights that are moved meanwhile are followed"""
+    Lights that are moved meanwhile are followed"""
 
     bl_idname = "ltsh.update_moved_lights"
     bl_label = UPDATE

@@ -331,8 +331,7 @@ def end_processes() -> None:
 class Update:
     """Shades lights of a scene's mixer that have moved, by the numbers of their rows.
 
-    A thread shades them at their new places, first as drafts; `take` puts new pictures into the mixer. Raises
-    SceneError.
+    A thread shades them at their new places; `take` puts new pictures into the mixer. Raises SceneError.
     """
 
     def __init__(self, scene, moved: dict[int, Light]):
@@ -362,7 +361,7 @@ class Update:
             number, content, self.done = self._made.get()
             if number is None:
                 self.is_finished, self.error = True, content
-            else:
+            elif content is not None:
                 newest[number] = content
         for number, layer in newest.items():
             row = replace(self._before[number][0], light=self.moved[number].record())

@@ -25,10 +25,9 @@ from .light_texels import ShownSky, varied_sky
 from .live_cycles import rendered_world
 from .mirror import NOT_RESOLVED, SceneMirror, patterns_of
 from .pictures import ShownPicture
-from .renderer import CENTERS, ViewRenderer
+from .renderer import ViewRenderer
 from .shadow_rays import ShadowRays, too_many, view_occluders
 
-TIMED = 3  # redraws whose median time is reported
 # FEWEST_RAYS: a point of a pixel takes at least so many rays per light, however many points share those of the pixel.
 FEWEST_RAYS = 32
 # The last renderer, kept for its compiled shaders. Only where scripts may always use graphics.
@@ -193,7 +192,6 @@ def _draw(job: ViewJob, read: tuple, size: tuple[int, int], progress) -> tuple[l
     points = render_settings.sub_pixel_offsets(scene, job.refine)
     first, *others = ((technique, name) for technique in job.techniques for name in VIEW_PASSES)
     try:
-        seconds = [canvas.seconds_of_redraws(_shown(scene, technique)) for technique in job.techniques]
         shown = replace(_shown(scene, first[0]), also=tuple(others))
         pictures = canvas.draw(shown, points, shadows, lambda share: progress("draw", share))
     except ValueError as error:  # a table that the card does not take
@@ -213,7 +211,6 @@ def _draw(job: ViewJob, read: tuple, size: tuple[int, int], progress) -> tuple[l
         {
             "graphics": f"{gpu.platform.renderer_get()}, {gpu.platform.backend_type_get()}",
             "lights": sorted({light.name for light in (*mirror.lights, *mirror.sky.sides)}),
-            "redraws": seconds,
             "shadows": traced,
         },
     )
@@ -241,15 +238,6 @@ class _Canvas:
         self._texture = gpu.types.GPUTexture(size, format="RGBA32F")
         self._buffer = gpu.types.GPUFrameBuffer(color_slots=[self._texture])
 
-    def seconds_of_redraws(self, shown: ShownPicture) -> list[float]:
-        """The seconds of `TIMED` redraws of a moving view, after a first one that compiles the shaders."""
-        seconds = []
-        for number in range(TIMED + 1):
-            start = time.perf_counter()
-            self._redraw(shown, self._view.shifted((0.0, 1.0 + number), self._size), CENTERS)
-            seconds.append(time.perf_counter() - start)
-        return seconds[1:]
-
     def draw(self, shown: ShownPicture, points: np.ndarray, shadows: ShadowRays | None, progress: Callable) -> list:
         """Pictures (H, W, 4) of a view at rest, the means over `points`: the one `shown`, then its `also`.
 
@@ -259,7 +247,8 @@ class _Canvas:
         try:
             for number in range(len(points)):
                 progress(number / len(points))
-                self._redraw(shown, self._view, points)
+                self._renderer.draw(self._mirror, self._view, self._size, shown, self._buffer, points)
+                self._buffer.read_color(0, 0, 1, 1, 4, 0, "FLOAT")  # wait until the card has finished
         finally:
             self._renderer.shadows = None
         pictures = [read_texture(self._texture)]
@@ -272,11 +261,6 @@ class _Canvas:
                 lit[..., :3] *= np.float32(shown.exposure)
             pictures.append(lit)
         return [picture[::-1] for picture in pictures]
-
-    def _redraw(self, shown, view, points) -> None:
-        """Draw once more, and wait until the card has finished."""
-        self._renderer.draw(self._mirror, view, self._size, shown, self._buffer, points)
-        self._buffer.read_color(0, 0, 1, 1, 4, 0, "FLOAT")
 
     def free(self) -> None:
         """Free everything except a renderer that the next canvas can use."""

@@ -80,7 +80,7 @@ def test_a_view_is_the_picture_of_shade(capsys, tmp_path, count, most):
         "--json", "--quiet",
     )  # fmt: skip
     report = json.loads(stdout)
-    assert (code, stderr) == (0, "") and report["draw_s"] > 0.0 and report["refined_s"] > 0.0
+    assert (code, stderr) == (0, "")
     assert report["resolution"] == list(SIZE) and report["sub_samples"] == count
     arguments = ("--aa", count, "--shadows", "off", "--techniques", "ltsh4,ltc", "--quiet")
     assert run(capsys, "shade", path, "-o", shade, *arguments)[0] == 0
@@ -194,7 +194,7 @@ def test_what_a_view_leaves_out_is_named(capsys, tmp_path):
         "--json", "--quiet",
     )  # fmt: skip
     document = json.loads(stdout)
-    assert code == 0 and document["draw_s"] > 0.0
+    assert code == 0
     assert [(one["name"], one["frame"]) for one in document["reports"]] == [("view_0003", 3), ("view_0005", 5)]
     warnings = "\n".join(document["reports"][0]["warnings"])
     assert "depth of field" in warnings and "levels of subdivision of Other\n" in f"{warnings}\n"

@@ -315,7 +315,7 @@ def noise(cycles, passes: dict[str, DirectPass]) -> list[float]:
     whole, light = read_layer(cycles.noise, "Combined", "RGB"), read_layer(cycles.channels, "Combined", "RGB").sum()
     direct = {name: read_layer(cycles.noise, cycles.names[light], "RGB") for name, (light, _) in DIRECT.items()}
     replaced = sum(_share_of(one.share, direct[name] * one.color) for name, one in passes.items())
-    return [float(np.abs(one).sum() / max(light, 1e-30)) for one in (whole - replaced, whole)]
+    return [float(np.nansum(np.abs(one)) / max(light, 1e-30)) for one in (whole - replaced, whole)]
 
 
 # What is written:

@@ -378,11 +378,9 @@ def summary(report: dict, seconds: dict) -> list[str]:
     shares = ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in finished["share_of_ours"].items())
     took = f", {seconds['processor']['total']:.1f} s of processor time" if "processor" in seconds else ""
     denoised = f"denoised by {finished['denoiser']}" if finished["denoiser"] else "not denoised"
-    gained, (light, *noise) = "", finished["gain"].values()
-    if noise[0] is not None:
-        gained = "; noise before denoising {:.1f} %, of Cycles alone in this time {:.1f} %".format(
-            *(100.0 * one for one in noise)
-        )
+    light, noise, alone = finished["gain"].values()
+    noises = [100.0 * one for one in (noise, alone) if one is not None]
+    gained = "; noise {:.1f} % before denoising, Cycles alone in this time {:.1f} %".format(*noises) if noises else ""
     return [
         f"{width}x{height}, {report['sub_samples']} points per pixel, {report['cycles_samples']} samples of Cycles, "
         f"{denoised}{took}",

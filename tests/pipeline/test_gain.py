@@ -64,12 +64,9 @@ def test_cycles_alone_gets_the_time_of_direct_light_for_samples():
 
 
 def test_the_summary_tells_it():
-    finished = {
-        "share_of_ours": {"diffuse": 1.0},
-        "denoiser": "",
-        "gain": {"share_of_light": 0.5, "noise": None, "noise_of_cycles": None},
-    }
+    gain = {"share_of_light": 0.5, "noise": None, "noise_of_cycles": None}
+    finished = {"share_of_ours": {"diffuse": 1.0}, "denoiser": "", "gain": gain}
     report = {"finished": finished, "resolution": (4, 3), "sub_samples": 1, "cycles_samples": 2}
     assert summary(report, {})[1].endswith("50 % of the light")
-    finished["gain"] |= {"noise": 0.01, "noise_of_cycles": 0.025}
-    assert summary(report, {})[1].endswith("noise before denoising 1.0 %, of Cycles alone in this time 2.5 %")
+    gain |= {"noise": 0.01, "noise_of_cycles": 0.025}
+    assert summary(report, {})[1].endswith("noise 1.0 % before denoising, Cycles alone in this time 2.5 %")

@@ -102,7 +102,8 @@ def _mean_of_chunks(manifest: dict, folder: Path) -> tuple[dict[str, np.ndarray]
             for key in light:
                 channels[key] += count / total * chunk[key]
     scale = np.sqrt(files[0][1] / max(total - files[0][1], 1))
-    return channels, {key: scale * (plane - channels[key]) for key, plane in largest.items()}
+    with np.errstate(invalid="ignore"):  # a pixel may be Inf
+        return channels, {key: scale * (plane - channels[key]) for key, plane in largest.items()}
 
 
 def _without_layer(channels: dict[str, np.ndarray], layer: str) -> dict[str, np.ndarray]:

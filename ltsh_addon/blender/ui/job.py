@@ -52,8 +52,6 @@ STAGE_TITLES = {
 PRIOR_SECONDS, LITTLE_SECONDS = 5.0, 1.0
 # A stage's progress tells its length only from LEAST_FRACTION and LEAST_SECONDS on.
 LEAST_FRACTION, LEAST_SECONDS = 0.02, 1.0
-# From its inverse on, the fraction that is done tells more of a stage's length than what was expected.
-FRACTIONS_TRUST = 4.0
 MOST = 0.99  # the largest share that is shown before the end is reported
 # Costs in seconds on two cores: once, or per million points, or per million points times samples. Plans learn the pace
 # of the machine.
@@ -368,10 +366,10 @@ class Plan:
     def _rest_of_step(self, measured: StageTimes) -> float:
         """Seconds left of the step that runs; between reports they decay exponentially and never reach 0."""
         if self._is_followed:
-            step, whole = self._steps[self._at].stage, (self._reported - self._stage_started) / self._fraction
-            sure = min(FRACTIONS_TRUST * self._fraction, 1.0)
-            whole = sure * whole + (1.0 - sure) * self._expected_seconds.get(step, whole)
-            rest, since = (1.0 - self._fraction) * whole, self._reported
+            # What was expected counts less and less.
+            done, since = self._reported - self._stage_started, self._reported
+            expected = self._expected_seconds.get(self._steps[self._at].stage, done / self._fraction)
+            rest = (1.0 - self._fraction) * (done + (1.0 - self._fraction) * expected)
         else:
             rest, since = self._expected(self._steps[self._at], measured), self._stage_started
         return rest * math.exp(-(self._now() - since) / rest) if rest > 0.0 else 0.0

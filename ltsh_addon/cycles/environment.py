@@ -35,7 +35,8 @@ LEVELS = 2
 # A spot is brighter than the mean by SPOT_BRIGHTNESS, has at least the share SPOT_SHARE of the light, and fits into the
 # angle SPOT_RADIUS in rad.
 SPOT_BRIGHTNESS, SPOT_SHARE, SPOT_RADIUS = 100.0, 0.01, 0.06
-DETAIL_ANGLE = 0.1  # rad
+# A sky is smooth if it differs from itself blurred by squares of DETAIL_ANGLE, in rad, by at most the share SMOOTH_SKY.
+DETAIL_ANGLE, SMOOTH_SKY = 0.1, 0.01
 # MOST_SPOTS: most spots of a sky. SPOT_PATCHES: most patches of a spot that is no disk.
 MOST_SPOTS, SPOT_PATCHES = 8, 40
 # A spot becomes a disk of constant radiance if the disk misses at most this share of its light.

@@ -57,6 +57,16 @@ class Patches:
         """The uncut patches."""
         return [] if self.whole is None else list(self.whole.smallest())
 
+    @property
+    def spread(self) -> float:
+        """The mean difference of the image from its mean radiance, as a share of that."""
+        mean, difference = (np.zeros(3) if self.whole is None else self.whole.radiance), 0.0
+        for patch in self.smallest:
+            left, right, bottom, top = patch.cell
+            # Dark parts, which are in no patch, lack as much as the others have too much.
+            difference += 0.5 * (right - left) * (top - bottom) * np.maximum(patch.radiance - mean, 0.0).sum()
+        return difference / max(mean.sum(), 1e-30)
+
 
 def cut_into_patches(image: np.ndarray, covered: np.ndarray, most: int = GRID * GRID) -> Patches:
     """Patches of an `image` (H, W, 3), row 0 on top, of which only the pixels `covered` (H, W) count. Dark patches are

@@ -42,7 +42,7 @@ EDGE_ERROR, LEAST_CURVATURE, EDGE_RADIUS = 0.2, 0.1, 1
 # to Cycles than the second number; it begins to do so at the first. SLOPE_VARIANCE: the variance within a pixel,
 # relative to the squared slope from pixel to pixel; it is twice the true one, to be safe. SHARED_POINTS: points that
 # pixels share are worth so many.
-FEW_POINTS, SLOPE_VARIANCE, SHARED_POINTS = (0.25, 1.0), 1.0 / 6.0, 2.25
+FEW_POINTS, SLOPE_VARIANCE, SHARED_POINTS = (0.3, 0.9), 1.0 / 6.0, 2.25
 MOST_RECOLORING = 3.0  # how many times the color of LTSH's points Cycles' color of a pixel counts at most
 MOST_OF_EDGE = 3.0  # Cycles' light of an edge is at most this many times LTSH's
 

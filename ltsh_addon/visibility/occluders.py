@@ -412,25 +412,33 @@ def overlaps_in_planes(
     weights = np.outer(number, (0.7548776662466927, 0.5698402909980532)) % 1.0
     weights = np.where(weights.sum(axis=1, keepdims=True) > 1.0, 1.0 - weights, weights)
     points = corners[own, 0] + (weights[:, :, None] * sides[own]).sum(axis=1)
+    plane, order = group[own], np.argsort(group, kind="stable")
+    members, tried = np.bincount(group), np.bincount(plane, minlength=group.max() + 1)
+    step = -(-tried * members // MOST_TESTS)
+    rank = np.empty(len(own), np.int64)
+    rank[np.argsort(plane, kind="stable")] = np.arange(len(own)) - np.repeat(np.cumsum(tried) - tried, tried)
+    chosen = np.flatnonzero(rank % step[plane] == 0)
+    stands_for = weight[-1] / PLANE_POINTS * (tried / np.bincount(plane[chosen], minlength=len(tried)).clip(min=1))
+    # Rows that give the barycentric coordinates of a point in a triangle, and its height above it.
+    one, other = np.moveaxis(sides, 1, 0)
+    frames = np.stack([np.cross(other, normal), np.cross(normal, one)], axis=1)
+    frames = np.append(frames / (2.0 * planes.area).clip(min=1e-300)[:, None, None], normal[:, None], axis=1)
+    first, pairs = np.cumsum(members) - members, np.cumsum(members[plane[chosen]])
     result = [empty]
-    for shared in np.unique(group[own]):
-        here, members = np.flatnonzero(group[own] == shared), np.flatnonzero(group == shared)
-        tried = here[:: -(-len(here) * len(members) // MOST_TESTS)]
-        axes = np.argsort(np.abs(normal[members[0]]))[:2]
-        (a, b), (c, d) = (sides[members][:, k, axes].T for k in (0, 1))
-        x, y = (points[tried][:, None, axes] - corners[members, 0][:, axes]).transpose(2, 0, 1)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            u, v = (x * d - y * c) / (a * d - b * c), (a * y - b * x) / (a * d - b * c)
-        point, member = np.nonzero((u > 1e-6) & (v > 1e-6) & (u + v < 1.0 - 1e-6))
-        point, member = tried[point], members[member]
-        away = np.abs((normal[member] * (points[point] - corners[member, 0])).sum(axis=1))
-        chosen = away <= 4.0 * GAP * np.abs(corners[own[point]]).max(axis=(1, 2))
-        chosen &= numbers[member] != numbers[own[point]]
+    for block in np.split(chosen, np.flatnonzero(np.diff(pairs // MOST_TESTS)) + 1):
+        count = members[plane[block]]
+        point, number = np.repeat(block, count), np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+        member = order[first[plane[point]] + number]
+        away = points[point] - corners[member, 0]
+        u, v, height = np.einsum("pij,pj->ip", frames[member], away)
+        is_in = (u > 1e-6) & (v > 1e-6) & (u + v < 1.0 - 1e-6)
+        point, member, height = point[is_in], member[is_in], height[is_in]
+        is_in = np.abs(height) <= 4.0 * GAP * np.abs(corners[own[point]]).max(axis=(1, 2))
+        is_in &= numbers[member] != numbers[own[point]]
         is_flat = is_sheet[owners[member]] & is_sheet[owners[own[point]]]
-        chosen &= is_flat | (facing[member] == facing[own[point]])
-        point, index = np.unique(point[chosen], return_index=True)
-        share = np.full(len(point), weight[-1] / PLANE_POINTS * len(here) / len(tried))
-        result.append((owners[own[point]], owners[member[chosen][index]], share))
+        is_in &= is_flat | (facing[member] == facing[own[point]])
+        point, index = np.unique(point[is_in], return_index=True)
+        result.append((owners[own[point]], owners[member[is_in][index]], stands_for[plane[point]]))
     return tuple(map(np.concatenate, zip(*result, strict=True)))
 
 

@@ -5,8 +5,6 @@ Materials are made in the Properties editor during the preview, as artists do. S
 colors, directions of lights, and what is smooth.
 """
 
-from pathlib import Path
-
 import bpy
 import eyes
 import hands
@@ -24,7 +22,6 @@ LIGHT_FIELDS = {"power": (103, 319), "size": (103, 407)}
 MATERIAL_TAB, NEW = (12, 406), (97, 137)
 FIELDS = {"metallic": (82, 287), "roughness": (82, 312), "transmission": (82, 527)}
 TRANSMISSION = (211, 497)
-SAVE = (65, 21)  # from the right and lower end of the file browser
 BAKE_HEADER, BAKE, APPLY = (223, 420), (149, 477), (159, 506)
 SOLID_SECONDS = 3.0
 
@@ -97,16 +94,6 @@ def moved(rig, **axes):
         yield from hands.keys(rig, "Return")
 
 
-def field(rig, place, text, kind="VIEW_3D", which="UI"):
-    """Edit a field by Return, as a double click does, which a busy machine may take for two, and type."""
-    rig.xdo("mousemove", *hands.to_window(rig, kind, which, *place))
-    yield hands.CLICK_SECONDS
-    yield from hands.keys(rig, "Return", "ctrl+a")
-    rig.xdo("type", text)
-    yield hands.CLICK_SECONDS
-    yield from hands.keys(rig, "Return")
-
-
 def lights_added(rig):
     lights = (("Key", {"x": 2.5, "y": -2, "z": 3}, "300", (1.0, 0.8, 0.6)),
               ("Fill", {"x": -3, "y": -2, "z": 2.5}, "120", (0.5, 0.7, 1.0)),
@@ -118,8 +105,8 @@ def lights_added(rig):
         rig.check(abs(ob.location.z - place["z"]) < 1e-3, f"typing moves {name}")
         ob.rotation_euler = (-ob.location).to_track_quat("-Z", "Y").to_euler()
         yield 1
-        yield from field(rig, LIGHT_FIELDS["power"], power)
-        yield from field(rig, LIGHT_FIELDS["size"], "2")
+        yield from hands.field(rig, LIGHT_FIELDS["power"], power)
+        yield from hands.field(rig, LIGHT_FIELDS["size"], "2")
         rig.check((ob.data.energy, ob.data.size) == (float(power), 2.0), f"the panel sets {name}: {ob.data.energy} W")
     rig.shot("artist_02_lights.png")
 
@@ -163,7 +150,7 @@ def material(rig, ob, values):
         yield from hands.click(rig, *hands.to_window(rig, *editor.values(), *TRANSMISSION))
         yield 1
     for name in FIELDS.keys() & values.keys():
-        yield from field(rig, FIELDS[name], values[name], **editor)
+        yield from hands.field(rig, FIELDS[name], values[name], **editor)
     rig.shot(f"artist_02_{ob.name.lower()}.png")
     inputs = ob.material_slots[0].material.node_tree.nodes["Principled BSDF"].inputs
     names = {"metallic": "Metallic", "roughness": "Roughness", "transmission": "Transmission Weight"}
@@ -273,26 +260,7 @@ def beside_others(rig):
 def saved_as(rig):
     """Ctrl S asks for a name."""
     yield from typed(rig, "ctrl+s")
-    yield from hands.until(lambda: browser()[1] is not None)
-    yield 2
-    window, area = browser()
-    area.spaces.active.params.directory = str(rig.out).encode()
-    area.spaces.active.params.filename = "artist.blend"
-    yield 2
-    rig.shot("artist_12_saving.png")
-    yield from hands.click(rig, window.x + window.width - SAVE[0], rig.size[1] - window.y - SAVE[1])
-    yield from hands.until(lambda: bpy.data.filepath)
-    rig.check(Path(bpy.data.filepath).name == "artist.blend", f"the file is saved: {bpy.data.filepath}")
-    yield 2
-
-
-def browser():
-    """The window and the area of a file browser, None where there is none."""
-    for window in bpy.context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type == "FILE_BROWSER":
-                return window, area
-    return None, None
+    yield from hands.saved_in(rig, rig.out, "artist.blend", "artist_12_saving.png")
 
 
 def click_in_view(rig, name, right=0, up=0, key=""):

@@ -11,6 +11,8 @@ CLICK_SECONDS = 0.8
 # Where buttons of the main panel are in the sidebar, in pixels from its right and upper end at interface scale 1.
 MANUAL, PREVIEW, COMPARE, SHADE, CANCEL = (60, 15), (149, 52), (149, 339), (149, 367), (49, 339)
 
+SAVE = (65, 21)  # from the right and lower end of the file browser
+
 
 def module(name):
     """A module of the installed add-on."""
@@ -93,8 +95,8 @@ def close_window(window):
         bpy.ops.wm.window_close()
 
 
-def results_opened(rig):
-    """Show the results in an Image Editor in half of the 3D view, with our tab beside them."""
+def editor_beside_view(rig):
+    """Make half of the 3D view an Image Editor, with our tab."""
     screen = rig.window.screen
     for area in screen.areas:
         if area.type == "IMAGE_EDITOR":
@@ -104,9 +106,15 @@ def results_opened(rig):
     area = next(area for area in screen.areas if area not in known)
     area.ui_type = "IMAGE_EDITOR"
     area.spaces.active.show_region_ui = True
-    operate(rig, bpy.ops.ltsh.open_results)
     yield 2
     rig.region("IMAGE_EDITOR", "UI").active_panel_category = "LTSH"
+
+
+def results_opened(rig):
+    """Show the results in an Image Editor in half of the 3D view, with our tab beside them."""
+    yield from editor_beside_view(rig)
+    operate(rig, bpy.ops.ltsh.open_results)
+    yield 2
     operate(rig, bpy.ops.image.view_all, fit_view=True, kind="IMAGE_EDITOR")
     yield 1
 
@@ -155,6 +163,41 @@ def over(rig, kind="VIEW_3D", which="WINDOW", x=0.3, y=0.5):
     region = rig.region(kind, which)
     rig.xdo("mousemove", round(region.x + x * region.width), round(rig.size[1] - region.y - y * region.height))
     yield CLICK_SECONDS
+
+
+def field(rig, place, text, kind="VIEW_3D", which="UI"):
+    """Edit a field by Return, as a double click does, which a busy machine may take for two, and type."""
+    rig.xdo("mousemove", *to_window(rig, kind, which, *place))
+    yield CLICK_SECONDS
+    yield from keys(rig, "Return", "ctrl+a")
+    rig.xdo("type", text)
+    yield CLICK_SECONDS
+    yield from keys(rig, "Return")
+
+
+def browser():
+    """The window and the area of a file browser, None where there is none."""
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type == "FILE_BROWSER":
+                return window, area
+    return None, None
+
+
+def saved_in(rig, folder, name, shot=""):
+    """Fill in the file browser that opens, and click Save."""
+    yield from until(lambda: browser()[1] is not None, 60)
+    yield 2
+    window, area = browser()
+    area.spaces.active.params.directory = str(folder).encode()
+    area.spaces.active.params.filename = name
+    yield 2
+    if shot:
+        rig.shot(shot)
+    yield from click(rig, window.x + window.width - SAVE[0], rig.size[1] - window.y - SAVE[1])
+    yield from until(lambda: bpy.data.filepath.endswith(name), 60)
+    rig.check(bpy.data.filepath.endswith(name), f"the file is saved: {bpy.data.filepath}")
+    yield 2
 
 
 def image_pixels(name):

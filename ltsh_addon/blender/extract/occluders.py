@@ -297,11 +297,13 @@ class _Collector:
             _ClearMaterial(value, curve) if np.interp(image, *curve or ((0.0, 1.0), (0.0, 1.0))).max() > 0.0 else None
         )
 
-    def _unread_material(self, material) -> _ClearMaterial | None:
+    def _unread_material(self, material) -> _ClearMaterial:
         if self._unread is not None:
             return _ClearMaterial()
-        self._note("only Cycles can tell how transparent it is; here it blocks as if it were opaque", material)
-        return None
+        share = 0.5 * _most_at(surface_of(material))
+        text = f"only Cycles can tell how transparent it is; here it lets {100.0 * share:.0f} % of the light through"
+        self._note(f"{text}, at most as much off", material)
+        return _ClearMaterial(shares=(share,))
 
     def _image(self, value: values.Value) -> np.ndarray | None:
         """`value` at the pixels (H, W) of its image; None if only Cycles knows the colors."""
@@ -466,6 +468,21 @@ def _share_at(socket, groups: tuple = ()) -> values.Value | values.Curved | None
         begin, end = (float(value.offset.mean()) for value in inputs)
         return factor.mapped(end - begin, begin)
     return values.combined(first, values.product(factor, values.constant(second.offset - first.offset)), 1.0, 1.0)
+
+
+def _most_at(socket, groups: tuple = ()) -> float:
+    """The largest share of light that the shader at the input `socket` may let through."""
+    value, source = _share_at(socket, groups), source_of(socket, groups)
+    if _is_constant(value):
+        return float(np.clip(value.offset.mean(), 0.0, 1.0))
+    node, groups = source.node, source.groups
+    if node.bl_idname not in (MIX, ADD):
+        return 1.0
+    inputs = [_most_at(one, groups) for one in node.inputs if one.type == "SHADER"]
+    if node.bl_idname == ADD:
+        return min(sum(inputs), 1.0)
+    factor = values.limited(values.curved_at(node.inputs[0], groups))
+    return float(np.interp(factor.offset[0], (0.0, 1.0), inputs)) if _is_constant(factor) else max(inputs)
 
 
 def _is_constant(value: values.Value | values.Curved | None) -> bool:

@@ -391,10 +391,13 @@ class ShownTextures:
             self._seen[key] = emission, patches
         return _shown_patches(light, self._seen[key][1], notes)
 
-    def mean(self, factor: Value) -> np.ndarray:
-        """The mean color (3,) of an image on all of its UV square; 0 where only Cycles knows its colors."""
+    def mean(self, factor: Value) -> tuple[np.ndarray, float]:
+        """The mean color (3,) of an image on all of its UV square, and the mean difference from it as a share of it; 0
+        where only Cycles knows its colors."""
         patches = self._patches_of(False, factor)
-        return np.zeros(3) if patches is None or patches.whole is None else patches.whole.radiance
+        return (
+            (np.zeros(3), 0.0) if patches is None or patches.whole is None else (patches.whole.radiance, patches.spread)
+        )
 
     def _patches_of(self, is_round: bool, factor: Value) -> Patches | None:
         use = factor.image

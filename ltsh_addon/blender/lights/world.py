@@ -12,6 +12,7 @@ from mathutils import Matrix
 
 from ...cycles.environment import (
     CUBE,
+    SMOOTH_SKY,
     SkyPicture,
     bright_spots,
     fine_detail,
@@ -24,9 +25,9 @@ from ...scene import Light, SkyLight, listed
 from ..materials.graph import is_group, is_socket, source_of, surface_of, tree_in_use, value_of
 from .emission import CONSTANT_NODES, LIGHT_PATH, OF_CAMERA, open_studio, trees_of
 
-# Pixels along each side of a picture of a world. PLAIN: a world of one color. PROCEDURAL: one without images. LEAST,
-# MOST: limits for one with images. SPOT_PIXELS: a close picture of a small, bright spot.
-PLAIN, PROCEDURAL, LEAST, MOST = 8, 256, 256, 1024
+# Pixels along each side of a picture of a world. PLAIN: a world of one color. SMOOTH: one without fine detail.
+# PROCEDURAL: another without images. LEAST, MOST: limits for one with images. SPOT_PIXELS: a small, bright spot.
+PLAIN, SMOOTH, PROCEDURAL, LEAST, MOST = 8, 64, 256, 256, 1024
 SPOT_PIXELS, SAMPLES, SPOT_SAMPLES = 128, 8, 16
 # COARSE: mean relative error of patches above which there is a warning.
 COARSE = 0.05
@@ -125,8 +126,10 @@ def light_pictures(scene, world, like: Light, warn) -> tuple[list[SkyPicture], l
     """Six pictures (a cube) of `world` as surfaces see it, without small, bright spots, and lights like `like` for
     these."""
     with _observatory(scene, world, warn) as look:
-        pixels = _pixels(world)
-        pictures = [look(*axes, pixels, SAMPLES if pixels < MOST else SAMPLES // 2) for axes in CUBE]
+        for pixels in dict.fromkeys((min(_pixels(world), SMOOTH), _pixels(world))):
+            pictures = [look(*axes, pixels, SAMPLES if pixels < MOST else SAMPLES // 2) for axes in CUBE]
+            if fine_detail(pictures) <= SMOOTH_SKY:
+                break
         spots = bright_spots(pictures)
         lights = []
         for number, spot in enumerate(spots):

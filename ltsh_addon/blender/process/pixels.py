@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ...cycles import gbuffer, lobes
-from ...cycles.environment import DETAIL_ANGLE
+from ...cycles.environment import DETAIL_ANGLE, SMOOTH_SKY
 from ...cycles.horizons import end_at_horizons_of_cycles
 from ...emitters.light_polygons import has_lobe, lights_that_reach_nothing
 from ...files import temporary_folder
@@ -23,8 +23,7 @@ from .blender_process import run_scene_job
 
 # REASONS: how many materials, or other reasons, an error names.
 REASONS = 5
-# SHARP_REFLECTION: surfaces of a smaller roughness show the patches of a world whose `fine_detail` exceeds SMOOTH_SKY.
-SHARP_REFLECTION, SMOOTH_SKY = 0.2, 0.01
+SHARP_REFLECTION = 0.2  # surfaces of a smaller roughness show the patches of a world with fine detail
 # EDGE_SECONDS: processor seconds that a million pixels of `finished.FinishedJob.edges` take.
 EDGE_SECONDS = 12.0
 

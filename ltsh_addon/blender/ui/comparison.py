@@ -28,6 +28,8 @@ _state = {"settling": set(), "paths": [], "dragged": None, "probing": False}
 def changed(settings, context=None) -> None:
     """Called by Blender when a setting of the view changes. The panels say that a picture is gone when the results are
     shown again."""
+    if settings.mode != "MIX":
+        settings.mode_before_mix = settings.mode
     try:
         refresh(settings.id_data)
     except RuntimeError as error:
@@ -42,7 +44,6 @@ def mixed(item, context) -> None:
     if settings.mode == "MIX":
         changed(settings, context)
     else:
-        settings.mode_before_mix = settings.mode
         settings.mode = "MIX"
     put_in_editor(context, item.id_data)
 
@@ -256,10 +257,10 @@ def _arrange(window, area, attempt: int | None) -> float | None:
     return None
 
 
-def redraw_editors(kind: str) -> None:
-    """Draw all areas of a kind again: Blender does not redraw 3D views for properties of add-ons."""
+def redraw_editors(*kinds: str) -> None:
+    """Draw all areas of these kinds again: Blender does not redraw 3D views for properties of add-ons."""
     for area in _areas():
-        if area.type == kind:
+        if area.type in kinds:
             area.tag_redraw()
 
 
@@ -492,19 +493,14 @@ def _draw() -> None:
     right, top = region.view2d.view_to_region(1.0, 1.0, clip=False)
     rows = 2 if choice.mode == "ERROR" else 1
     start, end, below, above = label_places((left, bottom, right, top), context.area, region, scale, rows)
+    title = f"{first} \u2212 {second}" if choice.mode == "ERROR" else first
+    draw_label(start, below, results.mix_label(context.scene) if choice.mode == "MIX" else title, scale)
     if choice.mode == "WIPE":
         _draw_line(line_position(context), bottom, top, scale)
-        draw_label(start, below, first, scale)
         draw_label(end, below, second, scale, align=1.0)
     elif choice.mode == "SIDE":
-        draw_label(start, below, first, scale)
         draw_label(max((left + right) / 2.0, start), below, second, scale)
-    elif choice.mode == "MIX":
-        draw_label(start, below, results.mix_label(context.scene), scale)
-    elif choice.mode == "A":
-        draw_label(start, below, first, scale)
-    else:
-        draw_label(start, below, f"{first} \u2212 {second}", scale)
+    elif choice.mode == "ERROR":
         limit = error_scale(settings, result.groups[choice.group], choice)
         _draw_legend(start, below - ROW * scale, limit, scale)
     if results.lacks(result):

@@ -177,7 +177,8 @@ class _JobOperator:
             results.state["job"] = None
         for workspace in bpy.data.workspaces:
             workspace.status_text_set(None)
-        comparison.redraw_panels()
+        # Pictures too: labels and views say whether a job or a picture of Cycles is there.
+        comparison.redraw_editors(*comparison.PANEL_REGIONS)
         if job.error:
             self.report({"ERROR"}, job.error)
         elif job.cancelled:
@@ -343,6 +344,25 @@ class LTSH_OT_show_results(bpy.types.Operator):
         return {"FINISHED"}
 
 
+class LTSH_OT_choose(bpy.types.Operator):
+    """Choose what is shown of the results"""
+
+    bl_idname = "ltsh.choose"
+    bl_label = "Choose"
+    bl_options = {"UNDO", "INTERNAL"}
+
+    key: StringProperty(options={"HIDDEN"})  # of Scene.ltsh
+    value: StringProperty(options={"HIDDEN"})
+
+    @classmethod
+    def description(cls, context, properties):
+        return context.scene.ltsh.bl_rna.properties[properties.key].enum_items[properties.value].description
+
+    def execute(self, context):
+        setattr(context.scene.ltsh, self.key, self.value)
+        return {"FINISHED"}
+
+
 class LTSH_OT_swap(_NeedsResults, bpy.types.Operator):
     """Exchange the two pictures"""
 
@@ -352,7 +372,8 @@ class LTSH_OT_swap(_NeedsResults, bpy.types.Operator):
 
     def execute(self, context):
         settings = context.scene.ltsh
-        settings.first, settings.second = settings.second, settings.first
+        choice = results.choice_of(settings, results.result_of(context.scene))
+        settings.first, settings.second = choice.second, choice.first
         return {"FINISHED"}
 
 
@@ -520,6 +541,7 @@ CLASSES = (
     LTSH_OT_cancel,
     LTSH_OT_open_results,
     LTSH_OT_show_results,
+    LTSH_OT_choose,
     LTSH_OT_swap,
     LTSH_OT_save_exr,
     LTSH_OT_open_folder,

@@ -539,33 +539,33 @@ class LTSH_PT_IMAGE_results(_Results, bpy.types.Panel):
             row = modes.row(align=True)
             row.enabled = len(group["names"]) > 1 or item.identifier in results.OF_ONE_PICTURE
             row.enabled &= item.identifier != "MIX" or results.has_mixer(context.scene, result)
-            row.prop_enum(settings, "mode", item.identifier)
+            _draw_choices(row, settings, choice, "mode", (item.identifier,))
+        view = context.scene.view_settings
         if choice.mode == "MIX":
-            column.prop(context.scene.view_settings, "exposure", text="Exposure of the Scene")
+            column.prop(view, "exposure", text="Exposure of the Scene")
             return
-        self._draw_names(column, settings, "first", "A", group)
-        if choice.mode != "A":
-            self._draw_names(column, settings, "second", "B", group)
-        row = column.row(align=True)
-        for name in group["passes"]:
-            row.prop_enum(settings, "pass_name", name)
+        for key, label in (("first", "A"), ("second", "B"))[: 1 if choice.mode == "A" else 2]:
+            split = column.split(factor=0.1)
+            split.label(text=label, translate=False)
+            _draw_choices(split.row(align=True), settings, choice, key, group["names"])
+        _draw_choices(column.row(align=True), settings, choice, "pass_name", group["passes"])
         if choice.mode == "WIPE":
             row = column.row(align=True)
             row.prop(settings, "split", slider=True)
             row.operator("ltsh.swap", text="", icon="ARROW_LEFTRIGHT")
         elif choice.mode == "ERROR":
             column.prop(settings, "error_scale", text="Scale (0: Automatic)")
-        view = context.scene.view_settings
         column.prop(view, "exposure", text="Exposure of the Scene")
         layout.operator("ltsh.probe", icon="EYEDROPPER")
 
-    def _draw_names(self, column, settings, key, label, group):
-        split = column.split(factor=0.1)
-        split.label(text=label, translate=False)
-        row = split.row(align=True)
-        for name in group["names"]:
-            if name in settings.bl_rna.properties[key].enum_items:
-                row.prop_enum(settings, key, name)
+
+def _draw_choices(row, settings, choice, key: str, names) -> None:
+    """Draw a button for each name that the property `key` offers; pressed is the one of `choice`, which is shown."""
+    items = settings.bl_rna.properties[key].enum_items
+    for item in (items[name] for name in names if name in items):
+        pressed = getattr(choice, key) == item.identifier
+        button = row.operator("ltsh.choose", text=item.name, icon=item.icon, depress=pressed)
+        button.key, button.value = key, item.identifier
 
 
 CLASSES = (

@@ -124,11 +124,8 @@ def show(scene, folder: Path) -> None:
     for name in result.groups:
         settings.groups.add().name = name
     choice = choice_of(settings, result)
-    # The artist's choice stays if the new results have it, or will have it once they are complete.
-    for key in ("group", "first", "second", "pass_name") if not result.partial else ():
-        is_alone = key == "second" and choice.second == choice.first
-        if getattr(settings, key) != getattr(choice, key) and not is_alone:
-            set_silently(settings, key, getattr(choice, key))
+    if settings.group != choice.group:
+        set_silently(settings, "group", choice.group)
     wanted = {_full(name, layer) for name, group in result.groups.items() for layer in group["files"]}
     for image in [image for image in our_images(scene) if image[LAYER] not in wanted and image[LAYER]]:
         bpy.data.images.remove(image)

@@ -74,7 +74,7 @@ def view_lights(
             continue
         if ob.type in SURFACE_TYPES and not emits:
             few = textures if len(getattr(ob.data, "polygons", ())) <= MOST_TRIANGLES else None
-            emits = any(np.any(_emission(slot.material, few)) for slot in ob.material_slots)
+            emits = any(np.any(_emission(slot.material, few, [])) for slot in ob.material_slots)
         if ob.type != "LIGHT":
             continue
         matrix = np.array(instance.matrix_world, dtype=np.float64)
@@ -113,12 +113,14 @@ def strongest(lights: Sequence[Light], notes: list[str], most: int = MOST_LIGHTS
     return [lights[index] for index in chosen]
 
 
-def _emission(material, textures: ShownTextures | None) -> np.ndarray:
+def _emission(material, textures: ShownTextures | None, notes: list[str]) -> np.ndarray:
     """The mean emission (3,) of a material; without `textures` that of an image counts as 0."""
     look = None if material is None else preview_of(material.original)
     if look is None or not look.glow or textures is None:
         return np.zeros(3) if look is None else look.emission
-    return look.glow * textures.mean(look.value("color"))
+    mean, spread = textures.mean(look.value("color"))
+    notes.append(f"{material.name}: it lights as the mean of its image, which is {100.0 * spread:.0f} % off its colors")
+    return look.glow * mean
 
 
 def _mesh_lights(depsgraph, receivers: Receivers, textures: ShownTextures, notes: list[str]) -> list[Light]:
@@ -129,7 +131,8 @@ def _mesh_lights(depsgraph, receivers: Receivers, textures: ShownTextures, notes
     lights = []
     for mesh_light in mesh_lights:
         count = sum(len(placement.triangles) for placement in mesh_light.placements)
-        radiance_of = functools.partial(_emission, textures=textures if count <= MOST_TRIANGLES else None)
+        few = textures if count <= MOST_TRIANGLES else None
+        radiance_of = functools.partial(_emission, textures=few, notes=notes)
         lights += constant_mesh_lights([mesh_light], radiance_of, eye, notes.append)
     return lights
 

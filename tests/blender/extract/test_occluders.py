@@ -447,8 +447,44 @@ def test_what_is_not_as_in_cycles_is_named(name):
         pane(made.material)
     occluders, warnings = scene_parts.collected_occluders()
     assert len(warnings) == 1 and NAMED[name] in warnings[0] and "'Pane'" in warnings[0], warnings
-    share = 0.5 if name == "colored" else 0.0
+    share = {"procedural": 0.5, "colored": 0.5, "color under alpha": 0.4}.get(name, 0.0)
     assert seen_by_rays(occluders)[0].min() == pytest.approx(share, abs=1e-5)
+
+
+def noise(made):
+    return made.tree.nodes.new("ShaderNodeTexNoise").outputs[0]
+
+
+def with_alpha_by_noise(made):
+    node = made.tree.nodes.new("ShaderNodeBsdfPrincipled")
+    made.tree.links.new(noise(made), node.inputs["Alpha"])
+    return node.outputs[0]
+
+
+# Materials whose transparency Cycles alone knows, and half of the most that they may let through.
+UNREAD = {
+    "between two": (lambda made: made.mix(noise(made), clear(made, 0.2), clear(made, 0.9)), 0.45),
+    "a fifth": (lambda made: made.mix(0.2, made.leaf(0.5), procedural(made)), 0.1),
+    "alpha": (with_alpha_by_noise, 0.5),
+    "and a half more": (lambda made: made.mix(0.5, clear(made), procedural(made)), 0.5),
+}
+
+
+@pytest.mark.newest
+@pytest.mark.parametrize("name", UNREAD)
+def test_what_cycles_alone_knows_is_half_of_the_most_and_at_most_as_much_off(name):
+    """As views take it, beside what Cycles bakes."""
+    start()
+    build, share = UNREAD[name]
+    pane(shown(build))
+    occluders, (warning,) = scene_parts.collected_occluders()
+    assert f"lets {100.0 * share:.0f} % of the light through, at most as much off" in warning
+    found, baked = (seen_by_rays(one)[0] for one in (occluders, scene_parts.baked_occluders()[0]))
+    behind = found < 1.0
+    np.testing.assert_allclose(found[behind], share, atol=1e-5)
+    # The bake has 8 bits at least.
+    assert behind.any() and np.abs(found - baked).max() <= share + 0.004
+    assert np.abs(found - baked)[behind].mean() < baked[behind].mean()
 
 
 @pytest.mark.newest

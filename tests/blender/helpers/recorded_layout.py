@@ -4,7 +4,7 @@ Refuses what that would refuse, and remembers the rest.
 """
 
 import types
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import SimpleNamespace
 
 import bpy
@@ -15,12 +15,18 @@ NESTED = ("row", "column", "box", "split", "grid_flow", "column_flow")
 
 @dataclass(frozen=True)
 class Shown:
-    """One thing in a panel: `kind` is the function of the layout, `what` its text, property or operator."""
+    """One thing in a panel: `kind` is the function of the layout, `what` its text, property or operator.
+
+    A button has a `text` and the `values` of its operator, and may be `pressed`.
+    """
 
     kind: str
     what: str
     enabled: bool
     icon: str = ""
+    text: str = ""
+    pressed: bool = False
+    values: object = field(default=None, compare=False)
 
 
 class _Values:
@@ -65,9 +71,9 @@ class Layout:
             self._note(name, given["idname"], given)
             return nested, Layout(self.shown, self)
         if name.startswith("operator"):
-            kind = _operator(given["operator"])
-            self._note("operator", given["operator"], given)
-            return _Values(kind.properties)
+            values = _Values(_operator(given["operator"]).properties)
+            self._note("operator", given["operator"], given, values)
+            return values
         if name.startswith("prop"):
             for data, key in (("data", "property"), ("search_data", "search_property")):
                 if data in given:
@@ -83,8 +89,9 @@ class Layout:
             self._note(name, given.get("text", ""), given)
         return None
 
-    def _note(self, kind, what, given):
-        self.shown.append(Shown(kind, what, self._enabled(), given.get("icon", "")))
+    def _note(self, kind, what, given, values=None):
+        icon, text, pressed = given.get("icon", ""), given.get("text", ""), given.get("depress", False)
+        self.shown.append(Shown(kind, what, self._enabled(), icon, text, pressed, values))
 
 
 def _arguments(function, values, named) -> dict:

@@ -555,7 +555,7 @@ def test_what_cycles_keeps_does_not_fade_at_its_border(tmp_path):
     floor_and_ball(gray(Subsurface_Weight=0.01, Subsurface_Scale=0.01))
     path = parts.save(tmp_path / "scene.blend")
     made = render.finish(RenderOptions(path, output=tmp_path, cycles_samples=64, shadow_rays=256))
-    kept = made.relight_data["taken"]["diffuse"] == 0.0
+    kept = (made.relight_data["taken"]["diffuse"] == 0.0).all(axis=-1)
     noisy = read_layer(made.cycles.channels, "Combined", "RGB")
     # The border of what is kept, and what touches it.
     inside = kept.copy()

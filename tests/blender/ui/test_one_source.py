@@ -3,6 +3,7 @@
 import bpy
 import numpy as np
 import pytest
+import recorded_layout
 import scene_parts as parts
 from scene_parts import principled
 
@@ -17,6 +18,23 @@ def test_a_picture_is_not_compared_with_itself_after_one_that_was_alone(scene, t
         scene.ltsh.first = scene.ltsh.second = first
         choice = results.choice_of(scene.ltsh, results.result_of(scene))
         assert (choice.first, choice.second) == (first, second)
+
+
+@pytest.mark.parametrize(
+    ("names", "pressed"),
+    [
+        (("ltc", "ltsh4"), ["Wipe", "LTSH 4", "LTC", "Combined"]),
+        (("ltsh4c",), ["Single", "LTSH 4c", "Combined"]),
+        (("ltsh2", "cycles"), ["Wipe", "LTSH 2", "Cycles", "Combined"]),
+    ],
+)
+def test_the_pressed_buttons_are_those_of_the_pictures_that_are_shown(scene, tmp_path, show_results, names, pressed):
+    scene.ltsh.first, scene.ltsh.second, scene.ltsh.mode = "ltsh4", "cycles", "WIPE"
+    show_results(scene, tmp_path, names=names, partial="Not complete: without Cycles")
+    shown = recorded_layout.drawn(panels.LTSH_PT_IMAGE_results)
+    assert [entry.text for entry in shown if entry.what == "ltsh.choose" and entry.pressed] == pressed
+    bpy.ops.ltsh.choose(key="pass_name", value="diffuse")
+    assert scene.ltsh.pass_name == "diffuse"
 
 
 @pytest.mark.parametrize("end", ["undo", "button"])
@@ -81,6 +99,16 @@ def test_saving_elsewhere_keeps_all_results(scene, tmp_path, show_results, elsew
     assert results.result_of(bpy.context.scene).folder.resolve() == (tmp_path / "ltsh" / "compare" / "images")
 
 
+def test_without_a_light_none_is_to_be_clicked(scene):
+    lights = [ob for ob in scene.objects if ob.type == "LIGHT"]
+    panel = next(kind for kind in panels.CLASSES if kind.__name__ == "LTSH_PT_VIEW3D_lights")
+    assert lights and "Click a light" in recorded_layout.texts(recorded_layout.drawn(panel))
+    for light in lights:
+        bpy.data.objects.remove(light)
+    texts = recorded_layout.texts(recorded_layout.drawn(panel))
+    assert "Click a light" not in texts and "No light in the scene" in texts
+
+
 def test_files_are_saved_without_pictures(scene, tmp_path, show_results):
     show_results(scene, tmp_path)
     assert len(results.our_images(scene)) > 3
@@ -123,8 +151,8 @@ def test_views_of_one_world_look_at_it_once(monkeypatch):
 
 def test_a_final_render_and_other_results_leave_the_mix(scene, tmp_path, show_results):
     show_results(scene, tmp_path)
-    scene.ltsh.mode_before_mix = "SIDE"
-    scene.ltsh.mode = "MIX"
+    bpy.ops.ltsh.choose(key="mode", value="SIDE")
+    bpy.ops.ltsh.choose(key="mode", value="MIX")
     assert results.choice_of(scene.ltsh, results.result_of(scene)).mode == "SIDE"
     show_results(scene, tmp_path, seed=2)
     assert scene.ltsh.mode == "SIDE"

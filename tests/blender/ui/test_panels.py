@@ -297,12 +297,18 @@ def test_numbers_are_those_of_the_report(scene, tmp_path, add_results):
     assert "Not complete" not in texts(drawn(RESULTS))
 
 
+def choices(shown):
+    """The buttons that choose what the Image Editor shows, each with its property."""
+    return [(item.values.key, item) for item in shown if item.what == "ltsh.choose"]
+
+
 def test_the_image_editor_offers_the_pictures_that_are_there(scene, add_results):
     add_results()
     panel = panels.LTSH_PT_IMAGE_results
     scene.ltsh.mode = "WIPE"
-    shown = [item.what for item in drawn(panel)]
-    assert shown.count("first") == shown.count("second") == 2 and "split" in shown and "error_scale" not in shown
+    shown = drawn(panel)
+    keys, shown = [key for key, _ in choices(shown)], [item.what for item in shown]
+    assert keys.count("first") == keys.count("second") == 2 and "split" in shown and "error_scale" not in shown
     scene.ltsh.mode = "ERROR"
     shown = [item.what for item in drawn(panel)]
     assert "error_scale" in shown and "split" not in shown
@@ -313,7 +319,8 @@ def test_a_picture_alone_is_shown_whole_whatever_the_mode(scene, add_results, mo
     add_results(names=("ltsh4c",))
     scene.ltsh.mode = mode
     shown = drawn(panels.LTSH_PT_IMAGE_results)
-    assert not {"second", "split", "error_scale"} & {item.what for item in shown}
+    assert not {"split", "error_scale"} & {item.what for item in shown}
+    assert "second" not in [key for key, _ in choices(shown)]
     # Single alone: no lights were kept to mix.
-    assert [item.enabled for item in shown if item.what == "mode"] == [True, False, False, False, False]
+    assert [item.enabled for key, item in choices(shown) if key == "mode"] == [True, False, False, False, False]
     assert results.choice_of(scene.ltsh, results.result_of(scene)).mode == "A"

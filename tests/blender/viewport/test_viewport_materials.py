@@ -499,7 +499,10 @@ def test_an_image_that_shines_is_seen_and_lights_as_its_mean():
     assert [light.name for light in lights] == ["Plane", "Plane"]
     for light in lights:
         np.testing.assert_allclose(light.radiance, 2.0 * colors[..., :3].mean(axis=(0, 1)), rtol=1e-5)
-    assert len(notes) == 1 and notes[0].startswith("Baked: its emission varies: it lights as the mean of its image")
+    mean = colors[..., :3].mean(axis=(0, 1))
+    size = 100.0 * np.abs(colors[..., :3] - mean).sum(axis=-1).mean() / mean.sum()
+    assert notes[0].startswith("Baked: its emission varies: it lights as the mean of its image")
+    assert notes[1:] == [f"Baked: it lights as the mean of its image, which is {size:.0f} % off its colors"]
 
 
 def test_nothing_of_the_file_is_changed():

@@ -31,8 +31,8 @@ FEWEST_RAYS = 32
 REFERENCE_SEED = 20160725
 # LOOKS: shares of the samples by which the seconds of stages are foretold.
 LOOKS = 0.003, 0.012
-# Times of passes beside each other: diffuse light takes from a third to a thirtieth of specular light.
-PASS_WEIGHTS = {"specular": 0.8, "diffuse": 0.2}
+# SHARES_DONE: of the work of one or two passes after each. Diffuse light takes a third to a thirtieth of the other.
+SHARES_DONE = {1: ((0, 1), (0.0, 1.0)), 2: ((0, 1, 2), (0.0, 0.8, 1.0))}
 # Limits of the reference: MOST_REFERENCE_PAIRS pairs of a sample and a light, some 30 us each, but always
 # FEWEST_SAMPLES samples.
 MOST_REFERENCE_PAIRS, FEWEST_SAMPLES = 3_000_000, 32
@@ -149,7 +149,7 @@ def tell_expected(extraction, tables: dict[str, Shader], passes: Sequence[str], 
     if tell is None or sizes[0] < FEWEST_SAMPLES:
         return
     order = np.random.default_rng(0).permutation(count)
-    for size in sizes:
+    for size in (sizes[0], *sizes):  # the first look also loads what all need
         chosen, times = np.sort(order[:size]), [time.perf_counter()]
         looked = replace(extraction, samples=extraction.samples.take(chosen), film=extraction.film.take(chosen))
         looked, shadows = ended_at_horizons(looked), None
@@ -162,7 +162,8 @@ def tell_expected(extraction, tables: dict[str, Shader], passes: Sequence[str], 
             times.append(time.perf_counter())
         looks.append(np.diff(times))
     # What every number of samples takes alike is not multiplied.
-    seconds = looks[1] + (count - sizes[1]) / (sizes[1] - sizes[0]) * np.maximum(looks[1] - looks[0], 0.0)
+    _, less, more = looks
+    seconds = more + (count - sizes[1]) / (sizes[1] - sizes[0]) * np.maximum(more - less, 0.0)
     seconds[1:] /= cores()
     tell(dict(zip(["horizons", "shadows", *map(title, names)], seconds.tolist(), strict=True)))
 
@@ -330,7 +331,7 @@ def _evaluate(name, table, extraction, shadows, options, progress) -> TechniqueR
     for index, pass_name in enumerate(options.passes):
 
         def report(fraction, done=index):
-            whole = share_done(options.passes, done, fraction)
+            whole = float(np.interp(done + fraction, *SHARES_DONE[len(options.passes)]))
             return None if progress is None else progress(title(name), whole)
 
         if report(0.0) is False:
@@ -342,12 +343,6 @@ def _evaluate(name, table, extraction, shadows, options, progress) -> TechniqueR
         seconds[pass_name] = time.perf_counter() - start
     shaded, *unshadowed = map(_joined, lit)
     return TechniqueResult(shaded, seconds, subset, *unshadowed)
-
-
-def share_done(passes: Sequence[str], index: int, fraction: float) -> float:
-    """The share of the work of all `passes` that is done when a `fraction` of the one at `index` is."""
-    weights = [PASS_WEIGHTS[name] for name in passes]
-    return (sum(weights[:index]) + fraction * weights[index]) / sum(weights)
 
 
 def _joined(shaded: dict[str, shading.Shading]) -> shading.Shading:

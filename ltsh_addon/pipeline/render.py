@@ -194,7 +194,7 @@ def shade_direct_light(
         if points > extraction.film.sub_samples:
             extraction = extract_pixels(replace(job, sub_samples=points, seconds=None), progress=progress)
             clock.end("extraction", extraction.times.processor)
-        extraction = ended_at_horizons(with_points(extraction, points))
+        extraction = ended_at_horizons(with_points(extraction, points), progress)
         clock.end("extraction")
         shadows = shader.shadows(extraction, progress)
         clock.end("shadows")

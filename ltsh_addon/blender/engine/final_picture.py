@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...pipeline.lighting import shade_lights, share_done, tell_expected, trace_shadows
+from ...pipeline.lighting import SHARES_DONE, shade_lights, tell_expected, trace_shadows
 from ...pipeline.mixer import LightPictures, light_pictures
 from ...pipeline.options import RenderOptions
 from ...pipeline.relight import RelightData
@@ -135,7 +135,7 @@ def final_picture(
                 (lit_pass,),
                 (shadows,),
                 progress=lambda fraction, first=number, title=TECHNIQUES[technique].title: progress(
-                    title, share_done(PASSES, first, fraction)
+                    title, float(np.interp(first + fraction, *SHARES_DONE[2]))
                 ),
             )[0].combined
             image = inside_border(extraction.film.image(extraction.picture.exposure * lit), extraction.picture.border)

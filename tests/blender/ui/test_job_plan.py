@@ -169,7 +169,7 @@ def test_no_time_left_is_told_before_anything_is_measured_and_then_it_is_rough()
 
 # What pictures of 480 x 270 pixels with 4 points told on one idle core: after how many seconds, stage, fraction; or the
 # seconds that were expected of stages. A product shot with bumps, anisotropic metal and a world that varies; gold under
-# ten lights.
+# ten lights; the example scene.
 RECORDED = {
     "product": (
         (1.1, "open scene", 0.0), (2.4, "samples", 0.0),
@@ -185,6 +185,12 @@ RECORDED = {
         (14.0, "shadows", 0.02), (23.0, "shadows", 0.27), (32.6, "shadows", 0.51), (41.4, "shadows", 0.76),
         (50.1, "LTSH N=4", 0.0), (54.5, "LTSH N=4", 0.48), (58.7, "LTSH N=4", 0.83), (66.0, "write", 0.0),
         (66.5, "end", 0.0),
+    ),
+    "arcade": (
+        (1.1, "open scene", 0.0), (2.6, "samples", 0.0), (8.1, {"horizons": 1.8, "shadows": 21.6, "LTSH N=4": 6.9}),
+        (8.2, "horizons", 0.0), (10.8, "shadows", 0.06), (15.1, "shadows", 0.39), (19.0, "shadows", 0.56),
+        (23.1, "shadows", 0.78), (26.7, "shadows", 0.89), (28.2, "LTSH N=4", 0.0), (31.7, "LTSH N=4", 0.82),
+        (34.0, "write", 0.0), (34.6, "end", 0.0),
     ),
 }  # fmt: skip
 

@@ -227,6 +227,7 @@ class MessageProgress(ProgressBar):
     def __init__(self, send: Callable[[dict], None]):
         super().__init__(None)
         self._send, self._last = send, 0.0
+        self.expect = lambda seconds: send({"expected": seconds})
         self.notes: list[str] = []
 
     def __call__(self, stage: str, fraction: float) -> bool:
@@ -237,10 +238,6 @@ class MessageProgress(ProgressBar):
             self._last = now
             self._send({"stage": stage, "fraction": fraction})
         return True
-
-    def expect(self, seconds: dict[str, float]) -> None:
-        """Send the seconds that stages to come will take, by stage."""
-        self._send({"expected": seconds})
 
     def note(self, text: str) -> None:
         """Append the line to `notes`."""

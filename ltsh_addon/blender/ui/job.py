@@ -257,7 +257,6 @@ class Plan:
         self._now = now
         self._at, self._share = 0, 0.0
         self._measured: dict[str, float] = {}
-        self._expected_seconds: dict[str, float] = {}
         self._stage_times: StageTimes = {}
         self._done_cost = self._done_seconds = 0.0
         self._started = self._stage_started = self._reported = now()
@@ -285,7 +284,7 @@ class Plan:
 
     def expect(self, seconds: dict[str, float]) -> None:
         """Note the seconds that stages will take, as somebody has measured who knows what they do."""
-        self._expected_seconds.update(seconds)
+        self._measured.update(seconds)
 
     def _end_step(self) -> None:
         step, seconds = self._steps[self._at], self._reported - self._stage_started
@@ -331,14 +330,13 @@ class Plan:
         return seconds[True], seconds[False]
 
     def _is_known(self, step: Step, measured: StageTimes) -> bool:
-        kind = _kind(step.stage)
-        return kind in measured or kind in self._before or step.stage in self._expected_seconds
+        return step.stage in self._measured or _kind(step.stage) in {**measured, **self._before}
 
     def _expected(self, step: Step, measured: StageTimes) -> float:
         """Expected seconds of a step: as the same stage took, else by its cost and the pace of its kind, or of all."""
         seconds, cost = measured.get(_kind(step.stage), (0.0, 0.0))
         pace = seconds / cost if seconds > 0.0 and cost > 0.0 else self._pace()
-        return self._measured.get(step.stage, self._expected_seconds.get(step.stage, step.cost * pace))
+        return self._measured.get(step.stage, step.cost * pace)
 
     def _measured_costs(self) -> StageTimes:
         """Measured seconds and costs by kind, with an estimate for the step that runs if it tells enough."""
@@ -368,7 +366,7 @@ class Plan:
         if self._is_followed:
             # What was expected counts less and less.
             done, since = self._reported - self._stage_started, self._reported
-            expected = self._expected_seconds.get(self._steps[self._at].stage, done / self._fraction)
+            expected = self._measured.get(self._steps[self._at].stage, done / self._fraction)
             rest = (1.0 - self._fraction) * (done + (1.0 - self._fraction) * expected)
         else:
             rest, since = self._expected(self._steps[self._at], measured), self._stage_started

@@ -360,8 +360,7 @@ def neutralize(scene, view_layer, camera, warnings: list[str]) -> None:
     cycles.use_animated_seed = cycles.use_fast_gi = False
     cycles.time_limit = 0.0
     cycles.max_bounces = 0
-    # Rays pass through any number of wholly transparent surfaces, which leave no trace in the passes.
-    cycles.transparent_max_bounces, view_layer.pass_alpha_threshold = 1024, 0.5
+    view_layer.pass_alpha_threshold = 0.5
     cycles.sample_clamp_direct = cycles.sample_clamp_indirect = cycles.blur_glossy = 0.0
     cycles.light_sampling_threshold = 0.0
     # The probability with which Cycles chooses a light matters between two horizons; see `cycles.light_tree`.

@@ -199,7 +199,7 @@ def _merge(arguments, bar, open_file) -> int:
     if arguments.baseline is not None:
         raise Misuse("--baseline belongs into the job file, to the job that it is for")
 
-    def merge(job, settings, baseline):
+    def merge(job, settings, bar, baseline):
         return merge_job(job.options.output, settings, bar, baseline)
 
     return _for_each(read_jobs(arguments.output, job_parsers(), job_of), merge, arguments, bar)
@@ -327,13 +327,10 @@ def add_run(parser) -> None:
 
 
 def _run_jobs(arguments, bar, open_file) -> int:
-    def do(job, settings, baseline):
-        return do_job(job, settings, bar, baseline)
-
     def job_with_scripts(of_job, scenes):
         return job_of(argparse.Namespace(**{**vars(of_job), "scripts": arguments.scripts}), scenes)
 
-    return _for_each(read_jobs(arguments.file, job_parsers(), job_with_scripts), do, arguments, bar)
+    return _for_each(read_jobs(arguments.file, job_parsers(), job_with_scripts), do_job, arguments, bar)
 
 
 def job_parsers() -> dict[str, argparse.ArgumentParser]:
@@ -347,7 +344,8 @@ def job_parsers() -> dict[str, argparse.ArgumentParser]:
 
 
 def _for_each(jobs: list[FileJob], do, arguments, bar) -> int:
-    """Call do(job, settings, baseline) for every job; the others go on if one fails. Returns the worst exit code."""
+    """Call do(job, settings, bar, baseline) for every job; the others go on if one fails; returns the worst exit
+    code."""
     baselines = [baseline_of(wanted.arguments) for wanted in jobs]
     documents, worst = [], 0
     for number, (wanted, baseline) in enumerate(zip(jobs, baselines, strict=True), 1):
@@ -356,7 +354,7 @@ def _for_each(jobs: list[FileJob], do, arguments, bar) -> int:
         label = f"job {number} of {len(jobs)} ({wanted.job.command}, {output})"
         bar.begin_job(label)
         try:
-            document, code = do(wanted.job, settings, baseline)
+            document, code = do(wanted.job, settings, bar, baseline)
         except (SceneError, TableError, OSError, ValueError, ImportError, MemoryError) as error:
             bar.note(f"failed: {label}: {error_line(error)}")
             document, code = {"error": error_line(error)}, 1

@@ -78,12 +78,9 @@ def _albedo(normals, cosine, alpha, ior):
 def _smith_visibility(height, cosine, alpha):
     """Share of the light towards directions with cosine `height` that height-correlated Smith masking lets through, if
     the normal is visible; 0 below the horizon."""
-    entering, leaving = (_smith_lambda(value, alpha) for value in (cosine, np.maximum(height, 1e-9)))
+    cosines = cosine, np.maximum(height, 1e-9)
+    entering, leaving = (0.5 * (np.sqrt(1.0 + alpha**2 * (1.0 / value**2 - 1.0)) - 1.0) for value in cosines)
     return np.where(height > 0.0, (1.0 + entering) / (1.0 + entering + leaving), 0.0)
-
-
-def _smith_lambda(cosine, alpha):
-    return 0.5 * (np.sqrt(1.0 + alpha**2 * (1.0 / cosine**2 - 1.0)) - 1.0)
 
 
 PATH = Path(__file__).with_name("sheen.npy")

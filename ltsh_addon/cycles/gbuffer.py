@@ -18,6 +18,7 @@ from ..scene import FARTHEST, SCALAR_FIELDS, Film, SurfaceSamples, is_constant
 from .horizons import unit
 from .lobes import (
     AOV_PREFIX,
+    DENSITY_AOVS,
     HIT_AOVS,
     KEPT_AOV,
     SurfaceHits,
@@ -36,6 +37,7 @@ COARSE_ANGLE, COARSE_SHARE = math.radians(35.0), 0.02
 # A position counts as rounded if its rounding error exceeds the share ROUNDED of the distance to the nearest light. A
 # warning is worth it if more than the share ROUNDED_SHARE of the positions are.
 ROUNDED, ROUNDED_SHARE = 2e-3, 0.02
+MOST_DENSITY = 11.0  # glass above lets nothing through
 FEW_SAMPLES, MOST_PAIRS = 1000, 2_000_000  # about how many samples, and at most how many pairs with lights, are tested
 RIBBON_TOLERANCE = 1e-6  # squared angle, for the rounding of unit vectors in float32
 
@@ -118,6 +120,19 @@ def not_reflected(channels: dict[str, np.ndarray], names: dict[str, str], is_tra
     else:
         alpha = read_layer(channels, "Combined", "A")
     return np.concatenate([emission, background, alpha[..., None]], axis=-1)
+
+
+def seen_through(channels: dict[str, np.ndarray]) -> np.ndarray | None:
+    """The share (H, W, 3) of light that passes all glass of a pixel; 0 without glass. None if no material is."""
+    if not any(f"{AOV_PREFIX}{DENSITY_AOVS[0]}." in key for key in channels):
+        return None
+    density = np.stack([read_aov(channels, name) for name in DENSITY_AOVS], axis=-1)
+    return np.where((density > 0.0) & (density < MOST_DENSITY), np.exp(-density), 0.0)
+
+
+def tinted(samples: SurfaceSamples, tint: np.ndarray) -> SurfaceSamples:
+    """`samples` (P) that reflect `tint` (P, 3) times as much."""
+    return replace(samples, **{name: getattr(samples, name) * tint for name in COLORS})
 
 
 def unshaded_hits(channels: dict[str, np.ndarray], count: int) -> np.ndarray:

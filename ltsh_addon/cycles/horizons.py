@@ -296,7 +296,7 @@ class _LightsOfKind:
         radius = np.linalg.norm(corners - center[:, None], axis=2).max(axis=1)
         if alike[0].is_facing:
             radius = np.array([light.radius for light in alike])
-        axes = np.array([[*_plane_axes(light), -light.direction] for light in alike])
+        axes = _plane_axes(corners - center[:, None], np.array([light.direction for light in alike]))
         brightness = np.array([np.abs(light.radiance).sum() for light in alike])
         scales = np.linalg.pinv(np.array([[light.half_u, light.half_v] for light in alike]).swapaxes(1, 2))
         rest = radius, axes, scales, share, _is_side(alike[0])
@@ -404,11 +404,11 @@ class _LightsOfKind:
         return np.where(corners[2].mean(axis=0) > 0.0, whole, 0.0)
 
 
-def _plane_axes(light) -> np.ndarray:
-    """Two orthonormal axes (2, 3) in the plane of the light."""
-    first = light.polygon()[0] - light.center
-    first /= max(np.linalg.norm(first), 1e-30)
-    return np.stack([first, np.cross(light.direction, first)])
+def _plane_axes(corners, direction) -> np.ndarray:
+    """Orthonormal axes (L, 3, 3): two in the planes of lights with `corners` (L, V, 3), from their centers, and a
+    `direction` (L, 3); then the opposite of that."""
+    first = corners[:, 0] / np.maximum(np.linalg.norm(corners[:, 0], axis=1), 1e-30)[:, None]
+    return np.stack([first, np.cross(direction, first), -direction], axis=1)
 
 
 def _lobe_density(samples, towards) -> np.ndarray:

@@ -28,6 +28,8 @@ HIT_AOVS = {
 }
 # Only for finished pictures: the sum of the bits of the passes whose direct light is left to Cycles.
 KEPT_AOV, KEPT_BITS = "kept", {"specular": 1, "diffuse": 2}
+# -ln of the share of red, green and blue light that passes through glass, summed over all that a ray meets.
+DENSITY_AOVS = "density_r", "density_g", "density_b"
 # Name of the quantity -> type of the AOV, and the neutral value, which changes nothing. An AOV that no material needs
 # is left out, unless its neutral value is None.
 LOBE_AOVS = {
@@ -77,8 +79,8 @@ def lobe_aov(name: str, slot: int) -> str:
 
 
 def aov_kind(name: str) -> str:
-    """Type of an AOV, whose name is from HIT_AOVS or `lobe_aov`."""
-    if name == KEPT_AOV:
+    """Type of an AOV, whose name is from HIT_AOVS, DENSITY_AOVS or `lobe_aov`, or KEPT_AOV."""
+    if name in (KEPT_AOV, *DENSITY_AOVS):
         return "VALUE"
     return HIT_AOVS[name] if name in HIT_AOVS else LOBE_AOVS[name.rpartition("_")[0]][0]
 

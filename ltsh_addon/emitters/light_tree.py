@@ -41,8 +41,6 @@ COARSE = 0.6
 POINT = 0.08
 # The error of a node's points, in units of its light times the fourth power of its size.
 FOURTH_ORDER = 1.0
-# Angle in rad from the peak of a sharp lobe beyond which single precision finds its tail to 2e-4.
-SHARP_TAIL = 0.05
 # Leaves are shaded as polygons if their error exceeds LEAF_ERROR of the tile's light, or their size LEAF_SIZE. In the
 # finer tiles below the limit is FINER_LEAF_ERROR: these differ in where their lobes point, so that their light may be
 # far below its bound.
@@ -69,7 +67,7 @@ CORNERS = np.array([[1.0, 1.0, 1.0], [1.0, -1.0, -1.0], [-1.0, 1.0, -1.0], [-1.0
 def is_special(light: Light) -> bool:
     """True for a light that no tree takes."""
     is_plain = not (light.has_profile or light.is_distant or light.is_facing or light.cone is not None)
-    return not is_plain or light.radiance.min() < 0.0 or light.radiance.max() == 0.0
+    return not is_plain or min(radiance := light.radiance.tolist()) < 0.0 or max(radiance) == 0.0
 
 
 @dataclass(frozen=True)
@@ -96,7 +94,7 @@ class LightTree:
     @classmethod
     def of(cls, lights) -> LightTree:
         """The tree of lights whose radiance is positive."""
-        center, area, covariance, diagonal = small_lights.moments_of(lights)
+        center, area, covariance, diagonal, rim = small_lights.moments_of(lights)
         radiance = np.array([light.radiance for light in lights])
         brightness, size = radiance.mean(axis=1), np.linalg.norm(area, axis=1)
         power, normal = brightness * size, area / size[:, None]
@@ -132,8 +130,6 @@ class LightTree:
         number = np.where(end - start == 1, order[start], -1)
         diagonal = (sums(power * diagonal) / total).astype(np.float32)
         reach = np.sqrt(3.0 * variances.sum(axis=1))
-        rim = [np.linalg.norm(light.polygon() - one, axis=1).max() for light, one in zip(lights, center, strict=True)]
-        rim = np.array(rim)
         radius = over_lights(
             np.maximum, lambda node, light: lengths(offset[light] - middle[node]) + rim[light], (order, start, end)
         )
@@ -178,7 +174,7 @@ class NodeSums:
 def stand_ins(lights, most: int) -> tuple[list[Light], np.ndarray]:
     """Rectangles that stand for many flat lights with an area, and the share (N,) of each that shines. Each stands
     for neighbors that face alike. There are N = `most`, a power of two and at most as many as there are lights."""
-    center, area, covariance, _ = small_lights.moments_of(lights)
+    center, area, covariance, _, _ = small_lights.moments_of(lights)
     size = np.linalg.norm(area, axis=1)
     normal = area / size[:, None]
     order, start, end, _ = node_ranges(center, normal, most)
@@ -365,7 +361,7 @@ class TileNodePairs:
             near = NEAR_RADII * np.sqrt(tree.diagonal[node])
             are_in_tail = np.sin(np.minimum(away, 0.5 * np.pi)) * between.nearest > near
             if tiles.only_tails:
-                are_in_tail &= away > SHARP_TAIL
+                are_in_tail &= away > small_lights.SHARP_TAIL
                 is_wrong = ~are_in_tail
             light *= (width**2 / (width**2 + away**2)) ** 2
             length = np.minimum(width + away, 1.0)

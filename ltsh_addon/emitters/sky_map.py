@@ -10,7 +10,7 @@ patches themselves, `light_polygons.PatchTree`.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 
@@ -51,7 +51,7 @@ class SkyMap:
     def _made(cls, lights) -> SkyMap:
         trees = [PatchTree.of(light) for light in lights]
         grids = [_grid(tree) for tree in trees]
-        side = min(max(grid.shape[1] for grid in grids), MOST_TEXELS)
+        side = min(max(FEWEST_TEXELS, *(grid.shape[1] for grid in grids)), MOST_TEXELS)
         directions = _cells(side)
         radiance, angle = np.zeros((3, 6, side, side)), dot(directions, directions) ** -1.5
         for tree, grid in zip(trees, grids, strict=True):
@@ -79,6 +79,11 @@ class SkyMap:
             np.empty(0),
         )
         return replace(made, directions=np.array(list(map(made._fewest, ROUGHNESS))))
+
+    @cached_property
+    def is_constant(self) -> bool:
+        """True if the sky has one radiance, but for rounding."""
+        return bool((np.ptp(self.texels, axis=1) <= 1e-6 * np.abs(self.texels).max(axis=1)).all())
 
     @property
     def is_positive(self) -> bool:
@@ -113,6 +118,8 @@ class SkyMap:
     def means(self, toward, area) -> np.ndarray:
         """Mean radiance (3, ...) around directions `toward` (3, ...). `area` (...) is the solid angle in sr over which
         the mean is taken, times the cube of the length of `toward`."""
+        if self.is_constant:
+            return np.broadcast_to(self.texels[:, :1, None], (3, *area.shape)).copy()
         x, y, z = toward
         sizes = np.abs(x), np.abs(y), np.abs(z)
         largest = np.maximum(np.maximum(*sizes[:2]), sizes[2])

@@ -18,7 +18,10 @@ from ..lobes.lookup_table import bent_cosines
 from ..lobes.polygon import cross, dot
 from ..lobes.spherical_harmonics import degree_of
 from .light_polygons import LEAST_COSINE, LOBE_WIDTH
+from .tails import NEAR_RADII
 
+# Angle in rad from the peak of a sharp lobe beyond which single precision finds its tail to 2e-4.
+SHARP_TAIL = 0.05
 # Greatest radius of a small light in units of the length over which the integrand changes.
 LARGEST = 0.05
 # Relative change of GGX toward the rim of such a light, divided by that size.
@@ -47,14 +50,15 @@ class SmallLight:
         return cls(center, float(radius), area, diagonal)
 
 
-def moments_of(lights) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Centers (L, 3), area vectors (L, 3), covariances (L, 3, 3) of the points in m^2, and diagonals (L,) of lights, as
-    in `SmallLight`."""
+def moments_of(lights) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Centers (L, 3), area vectors (L, 3), covariances (L, 3, 3) of the points in m^2, diagonals (L,) and radii (L,) of
+    lights, as in `SmallLight`."""
     center, u, v, direction = (
         np.array([getattr(light, name) for light in lights]) for name in ("center", "half_u", "half_v", "direction")
     )
     area, is_round = np.array([light.area_vector for light in lights]), np.array([light.is_round for light in lights])
     diagonal = np.maximum(np.square(u + v).sum(axis=1), np.square(u - v).sum(axis=1))
+    radius = np.sqrt(np.where(is_round, np.maximum(np.square(u).sum(axis=1), np.square(v).sum(axis=1)), diagonal))
     covariance = u[:, :, None] * u[:, None] + v[:, :, None] * v[:, None]
     covariance /= np.where(is_round, 4.0, 3.0)[:, None, None]
     counts = np.array([0 if light.corners is None else len(light.corners) for light in lights])
@@ -62,7 +66,8 @@ def moments_of(lights) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         same = np.flatnonzero(counts == count)
         corners = np.array([lights[number].corners for number in same])
         center[same], covariance[same] = _moments(corners, area[same])
-    return center, area * np.copysign(1.0, (area * direction).sum(axis=1))[:, None], covariance, diagonal
+        radius[same] = np.sqrt(np.square(corners - center[same, None]).sum(axis=2).max(axis=1))
+    return center, area * np.copysign(1.0, (area * direction).sum(axis=1))[:, None], covariance, diagonal, radius
 
 
 def _moments(corners, area):
@@ -119,6 +124,14 @@ class SharpestLobes:
         cosine = dot(normal, view)
         self.mirrored = np.float32(2.0) * cosine * normal - view
         self.width = (LOBE_WIDTH * width * np.maximum(np.abs(cosine), LEAST_COSINE)).astype(np.float32)
+
+    def are_tails(self, light, position) -> np.ndarray:
+        """Mask (Q,) of the lobes at `position` (3, Q) of which a light meets only the tail, where limits hold."""
+        offset = (light.center[:, None] - light.viewpoint(position)).astype(np.float32)
+        distance = np.maximum(np.sqrt(dot(offset, offset)), np.float32(1e-30))
+        reach = np.arcsin(np.minimum(np.float32(NEAR_RADII * SmallLight.of(light).radius) / distance, np.float32(1.0)))
+        away = np.arccos(np.clip(dot(self.mirrored, offset) / distance, -1.0, 1.0))
+        return away > reach + np.float32(SHARP_TAIL)
 
     def lengths(self, columns, rays: RaysToCenters, size) -> np.ndarray:
         """The least angle (...) in rad, at most 1, over which the lobes `columns` change within lights of a radius of

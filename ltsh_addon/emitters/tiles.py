@@ -28,7 +28,7 @@ class Tiles:
     horizons: list[tuple[np.ndarray, np.ndarray]]  # cones around the normals of each horizon: axes (T, 3), angles (T,)
     mirrored: tuple[np.ndarray, np.ndarray] | None  # cones around the mirrored views; None for diffuse lobes
     width: np.ndarray | None  # (T,) rad, of the narrowest specular lobe
-    only_tails: bool  # True: nodes must be in the tails of the lobes, at least `SHARP_TAIL` from their peaks
+    only_tails: bool  # True: nodes must be in the tails of the lobes, `small_lights.SHARP_TAIL` from their peaks
 
     @classmethod
     def of(cls, lobes, position, columns) -> Tiles:

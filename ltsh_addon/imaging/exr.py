@@ -28,13 +28,13 @@ _HEADER_BYTES = 1 << 22  # more than the header of a file with thousands of chan
 _OF_THE_FORMAT = {"channels", "chromaticities", "compression", "dataWindow", "displayWindow", "lineOrder", "name",
                   "pixelAspectRatio", "type", "version"}  # fmt: skip
 # COMBINED: the pass of whole pictures. REST: the layer of a finished picture that holds what is not LTSH's.
-COMBINED, REST = "combined", "rest"
+COMBINED, REST, TRANSMITTED = "combined", "rest", "transmitted"
 # ERROR: prefix of a technique's name in the layers of its difference to Cycles. UNSHADOWED: suffix of a technique's
 # name in the layers without shadows, where others have shadows.
 ERROR, UNSHADOWED = "error_", "_unshadowed"
 # CYCLES_LAYERS: Cycles' picture, and the two halves whose mean it is.
 CYCLES_LAYERS = (CYCLES, f"{CYCLES}_A", f"{CYCLES}_B")
-COVERAGE = "coverage.hit"
+COVERAGE, GLASS = "coverage.hit", "coverage.glass"
 
 
 def layer_name(technique: str, pass_name: str, group: str = "") -> str:

@@ -110,6 +110,8 @@ def write_html(folder: str | os.PathLike, page: str, files: Sequence[str], texts
     layers, sheet, figures = (_link(page, name) for name in (*files, "report.json"))
     labels = "".join(f"<span>{_text(label)}</span>" for label in texts[0])
     legend = "".join(f"<li>{_text(line)}</li>" for line in texts[1])
+    warnings = "".join(f"<li>{_text(warning)}</li>" for warning in report["warnings"])
+    warnings = f"<ul>{warnings}</ul>" if warnings else "<p>None: everything in the scene was shaded.</p>"
     width, height = report["resolution"]
     facts = ", ".join(
         (
@@ -131,7 +133,7 @@ def write_html(folder: str | os.PathLike, page: str, files: Sequence[str], texts
         "<p>Below each row of pictures their errors, technique − Cycles: red is too bright, blue too dark. From the "
         f"top:</p><ol>{legend}</ol>",
         *(_pass_table(name, figures) for name, figures in report["passes"].items()),
-        _warnings(report["warnings"]),
+        f"<h2>Warnings</h2>{warnings}",
         f'<p>All layers: <a href="{layers}">{layers}</a>. All figures: <a href="{figures}">report.json</a>.</p>',
     ]
     write_bytes(os.path.join(folder, page), _page(f"{report['scene']}: comparison", body))
@@ -206,12 +208,6 @@ def _pass_table(name: str, figures: Mapping) -> str:
     ]
     noise = f", noise of the Cycles reference {_percent(figures['noise'])}" if "noise" in figures else ""
     return f"<h2>{_text(name)}{noise}</h2><table><tr><th>technique</th>{head}</tr>{''.join(rows)}</table>"
-
-
-def _warnings(warnings) -> str:
-    if not warnings:
-        return "<h2>Warnings</h2><p>None: everything in the scene was shaded.</p>"
-    return f"<h2>Warnings</h2><ul>{''.join(f'<li>{_text(warning)}</li>' for warning in warnings)}</ul>"
 
 
 def _percent(value) -> str:

@@ -63,9 +63,9 @@ class Scratch:
         return view
 
 
-def pieces(count: int, most: int) -> list[slice]:
-    """Slices of about equal length that make up `count` elements; at most `most` long, or 512 if that is more."""
-    number = max(-(-count // max(most, 512)), 1)
+def pieces(count: int, most: int, least: int = 512) -> list[slice]:
+    """Slices of about equal length that make up `count` elements; at most `most` long, or `least` if that is more."""
+    number = max(-(-count // max(most, least)), 1)
     size = max(-(-count // number), 1)
     return [slice(start, min(start + size, count)) for start in range(0, count, size)]
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from .. import imaging
 from ..imaging import exr
-from ..imaging.exr import COMBINED, layer_name
+from ..imaging.exr import COMBINED, TRANSMITTED, layer_name
 from ..scene import CYCLES, PASSES, REFERENCE, SCALAR_FIELDS, Film, SurfaceSamples
 from . import lighting
 from .lighting import REFERENCE_SEED, TechniqueResult, described, technique_names, title
@@ -38,6 +38,7 @@ class Comparison:
     extraction: Any  # blender.process.pixels.Extraction, which the core does not import
     results: dict[str, TechniqueResult]
     shadows: lighting.Shadows | None = None
+    transmitted: Comparison | None = None  # what is seen through glass
 
     @property
     def film(self) -> Film:
@@ -64,7 +65,19 @@ class Comparison:
 
     def whole(self, name: str) -> np.ndarray:
         """The whole picture (H, W, 4) of a technique: the sum of its passes, plus `rest` where that is known."""
-        return self._with_rest(sum(self.images[name, pass_name] for pass_name in self.options.passes))
+        whole = self._with_rest(sum(self.images[name, pass_name] for pass_name in self.options.passes))
+        if self.transmitted is not None:
+            whole[..., :3] += self.transmitted.whole(name)[..., :3]
+        return whole
+
+    def with_still_glass(self):
+        """The extraction, with what is seen through glass as if it shone by itself."""
+        extraction = self.extraction
+        if self.transmitted is None:
+            return extraction
+        light = self.transmitted.whole(most_accurate(self.results))[..., :3] / extraction.picture.exposure
+        cycles = replace(extraction.cycles, emission=extraction.cycles.emission + light)
+        return replace(extraction, cycles=cycles, behind=None)
 
     def _with_rest(self, light: np.ndarray) -> np.ndarray:
         """The picture (H, W, 4) with this reflected `light` (H, W, 3); alpha is the coverage where `rest` is None."""
@@ -226,6 +239,8 @@ class Comparison:
         for field, letters in SAMPLE_LAYERS.items():
             values = getattr(self.extraction.samples, field)[first]
             planes[layer_name("samples", field)] = imaging.Layer(film.image(values), letters)
+        if self.extraction.glass is not None:
+            planes[exr.GLASS] = imaging.Layer(self.extraction.glass, "V")
         planes[exr.COVERAGE] = imaging.Layer(self.film.coverage(), "V")
         return planes
 
@@ -241,6 +256,8 @@ class Comparison:
         for name, result in self.results.items():
             missing = is_surface & ~self._mask(result)
             planes[layer_name(name, COMBINED)] = np.where(missing[..., None], 0.0, self.whole(name))
+            if self.transmitted is not None:
+                planes[layer_name(name, TRANSMITTED)] = self.transmitted.whole(name)[..., :3]
             if cycles is not None:
                 error = sum(self._error(name, pass_name) for pass_name in PASSES)
                 planes[layer_name(f"{exr.ERROR}{name}", COMBINED)] = error

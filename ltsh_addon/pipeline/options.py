@@ -462,7 +462,8 @@ class RenderOptions(CameraOptions):
     resolution: tuple[int, int] | None = _resolution()
     sub_samples: int | None = option(
         "--aa", default=None, type=positive, metavar="N",
-        help="points per pixel of the direct light, shared by the pixel filter (default: 9, or by the budget)",
+        help="points per pixel of the direct light, shared by the pixel filter (default: 3 to 9 by the samples of "
+        "Cycles, or by the budget)",
     )  # fmt: skip
     cycles_samples: int | None = option(
         "--cycles-samples", default=None, type=cycles_samples, metavar="N", help="of Cycles; default: as in the file"

@@ -70,7 +70,9 @@ def make_picture(options: PictureOptions, with_cycles: bool, progress: Progress 
         if extraction.occluders is not None:
             shadows = lighting.trace_shadows(extraction, options.passes, options.shadow_rays, progress)
         results = evaluated(tables, extraction, shadows, options, progress)
-        comparison = Comparison(options, extraction, results, shadows)
+        comparison = Comparison(
+            options, extraction, results, shadows, _transmitted(tables, extraction, options, progress)
+        )
         png = None
         if folder is not None:
             pixels = comparison.whole(most_accurate(comparison.results))
@@ -82,9 +84,19 @@ def make_picture(options: PictureOptions, with_cycles: bool, progress: Progress 
         write_bytes(output / files[-1], png)
     if options.keep_visibility:
         path = (output / files[0]).with_suffix(RELIGHT_SUFFIX)
-        written = write_relight_data(extraction, shadows, options, path)
+        written = write_relight_data(comparison.with_still_glass(), shadows, options, path)
         files += [path.relative_to(output).as_posix() for path in written]
     return TaskResult(report, {**comparison.seconds(), "total": time.perf_counter() - start}, tuple(files))
+
+
+def _transmitted(tables, extraction, options: PictureOptions, progress) -> Comparison | None:
+    """What glass shows of the surfaces behind it, shaded; None without glass."""
+    behind, shadows = extraction.behind, None
+    if behind is None:
+        return None
+    if behind.occluders is not None:
+        shadows = lighting.trace_shadows(behind, options.passes, options.shadow_rays, progress)
+    return Comparison(options, behind, evaluated(tables, behind, shadows, options, progress), shadows)
 
 
 def _extracted(options: PictureOptions, with_cycles: bool, tables, progress):

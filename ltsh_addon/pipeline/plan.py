@@ -11,9 +11,10 @@ import numpy as np
 
 from .options import EDGE_POINTS, SHADOW_RAYS, RenderOptions
 
-# Points per pixel. DEFAULT_POINTS: without a budget. With one, FIRST_POINTS: of the samples on which the plan rests,
-# and MOST_POINTS: at most.
-DEFAULT_POINTS, FIRST_POINTS, MOST_POINTS = 9, 3, 17
+# Points per pixel. Without a budget, one for SAMPLES_OF_POINT samples of Cycles, from FIRST_POINTS to DEFAULT_POINTS:
+# beside few samples more points cost more than they win. With one, FIRST_POINTS: of the samples on which the plan
+# rests, and MOST_POINTS: at most.
+FIRST_POINTS, DEFAULT_POINTS, SAMPLES_OF_POINT, MOST_POINTS = 3, 9, 16, 17
 # Processor seconds of denoising. DENOISER_START_SECONDS: always. FIRST_DENOISING_SECONDS: for a picture of a million
 # pixels. NEXT_DENOISING_SECONDS: for each further picture of that size.
 DENOISER_START_SECONDS, FIRST_DENOISING_SECONDS, NEXT_DENOISING_SECONDS = 0.25, 12.0, 4.0
@@ -76,7 +77,10 @@ class DirectLightPlan:
 
 def first_and_most_points(options: RenderOptions) -> tuple[int, int]:
     """Points per pixel of the first samples, and the most that the plan may ask for."""
-    most = options.sub_samples or (DEFAULT_POINTS if options.budget is None else MOST_POINTS)
+    most = options.sub_samples or MOST_POINTS
+    if options.budget is None and options.sub_samples is None:
+        samples = options.cycles_samples or SAMPLES_OF_POINT * DEFAULT_POINTS
+        most = int(np.clip(samples // SAMPLES_OF_POINT, FIRST_POINTS, DEFAULT_POINTS))
     # Depth of field needs all of its points from the start.
     return (most if options.budget is None or most > MOST_POINTS else min(FIRST_POINTS, most)), most
 

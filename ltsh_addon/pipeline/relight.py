@@ -48,7 +48,7 @@ GRAIN = (
     "with depth of field finished pictures are denoised as a whole: light that changes shows its grain again; render "
     "the picture anew to be rid of it"
 )
-SAME_GLOW = "what glows, lights in sight and the background are seen as the lights were; there is no PNG"
+SAME_GLOW = "what glows, is behind glass, lights in sight and the background look as the lights were; there is no PNG"
 SAME_WEIGHTS = (
     "{} of {} samples, between the horizons of their face and of its smooth normal, weigh both as the lights were; "
     "render the picture again for the last digits there"

@@ -23,13 +23,15 @@ from ..lobes import moments32
 from ..lobes.lobe_integrals import FLOAT64_CHUNK, NARROWEST
 from ..lobes.lookup_table import MIN_ALPHA
 from ..lobes.polygon import MOSTLY_WHOLE, convex_pieces, dot, integrate_visible
-from ..scene import PolygonLight
+from ..scene import PolygonLight, SkyLight
 from . import float64, lobes32
 
 # Samples per chunk for small lights.
 SMALL_CHUNK = 6144
 # Points per chunk for lights with a profile.
 POINT_CHUNK = 40960
+# Half the directions of an anisotropic lobe to a constant sky: it is .5 % off (root mean square over lobes).
+OF_CONSTANT = 96
 # In rad. Lights with a narrower cone are too bright for the absolute error of single precision.
 NARROW_SPREAD = 0.35
 
@@ -80,7 +82,7 @@ def shade_specular(samples, lights, table, radiance, scratch, leftovers=None):
 
     lighting = _Lighting(samples, lights, radiance, scratch, specular_in_float64(table))
     far = sharp & False
-    if lights.trees and table.family == "ltsh":
+    if table.family == "ltsh":
         far = sharp & ~anisotropic
     sharp = (sharp | anisotropic) & ~far
     for only_tails, chosen in ((False, lit & ~sharp & ~far), (True, far)):
@@ -89,7 +91,13 @@ def shade_specular(samples, lights, table, radiance, scratch, leftovers=None):
                 lobes = _specular_lobes(samples, index, (table, ridges, vectors), colors_of(index), scratch)
                 lighting.add(replace(lobes, only_tails=only_tails))
     in_float64 = np.nonzero(sharp)[0]
-    lighting.add_in_float64(in_float64)
+    by_map = anisotropic if lights.whole_skies else sharp & False
+    for sky, light, row, _ in lights.whole_skies:
+        allowed = light.receives(samples.receiver)
+        index = np.nonzero(by_map if allowed is None else by_map & allowed)[0]
+        lobes32.add_specular_of_sky(sky, samples, index, radiance[row], table)
+    lighting.add_in_float64(np.nonzero(sharp & ~by_map)[0])
+    lighting.add_in_float64(np.nonzero(by_map)[0], {number for *_, numbers in lights.whole_skies for number in numbers})
     lighting.finish(leftovers)
     return in_float64
 
@@ -146,10 +154,9 @@ class AlikeLights:
     def of(cls, lights, numbers) -> AlikeLights:
         """Those of `lights`, (light, row, corners), with these `numbers` (L,)."""
         alike = [lights[number][0] for number in numbers]
-        centroid, area, _, diagonal = small_lights.moments_of(alike)
+        centroid, area, _, diagonal, radius = small_lights.moments_of(alike)
         center = np.array([light.center for light in alike])
         corners = np.array([lights[number][2] for number in numbers])
-        radius = np.sqrt(np.square(corners - centroid[:, None]).sum(axis=2).max(axis=1))
         names = ("half_u", "half_v", "direction", "radiance")
         vectors = [np.array([getattr(light, name) for light in alike]) for name in names]
         longest = np.square(corners - corners[:, :1]).sum(axis=2).max(axis=1)
@@ -215,6 +222,24 @@ class Lights(list):
         maps = [replace(sky, directions=most) for sky in maps]
         return [(sky, lights[0], row) for sky, ((row, _), lights) in zip(maps, kinds.items(), strict=True)]
 
+    @cached_property
+    def whole_skies(self) -> list[tuple[SkyMap, object, int, list[int]]]:
+        """Maps of skies whose six sides are constant, each with one of its lights, their row, and their positions."""
+        kinds: dict[tuple, list[int]] = {}
+        for number, (light, row, _) in enumerate(self):
+            vectors = np.abs([light.center, light.half_u, light.half_v])
+            if isinstance(light, SkyLight) and not light.children and (np.sort(vectors) == [0.0, 0.0, 1.0]).all():
+                kinds.setdefault((row, light.receivers), []).append(number)
+        skies = []
+        for (row, _), numbers in kinds.items():
+            sides = [self[number][0] for number in numbers]
+            if len({tuple(side.center) for side in sides}) == len(sides) == 6:
+                sky = SkyMap.of([replace(side, children=(side,)) for side in sides])
+                skies.append(
+                    (replace(sky, directions=np.full(len(sky.directions), OF_CONSTANT)), sides[0], row, numbers)
+                )
+        return skies
+
 
 def shade_skies(samples, lights, table, radiance) -> None:
     """Add to `radiance`, (R, P, 3) by pass, what `samples` reflect of `Lights.skies`; `lights` has them by pass."""
@@ -259,16 +284,20 @@ class _Lighting:
         if light.has_spread or light.cone is not None:
             near = may_reach(light, position)
             allowed = near if allowed is None else allowed & near
+        is_hard = light.spread < NARROW_SPREAD or _is_narrow(light, corners) or _is_in_pieces(light, corners)
+        if lobes.only_tails and not (is_hard or light.has_profile):
+            tail = lobes.sharpest.are_tails(light, position) & ~float64.has_bent_fresnel(self.samples)[index]
+            self.needs_float64[number].append(index[~tail if allowed is None else ~tail & allowed])
+            columns = np.nonzero(tail)[0]
         rest = columns
-        if not lobes.only_tails:
+        if not (lobes.only_tails and columns is None):
             if not light.has_profile:
                 rest = self._add_small(lobes, light, position, (columns, allowed), sums[row])
             elif profile_regions.ProfileRegions.suit(light):
                 rest = self._add_points(lobes, light, position, (columns, allowed), sums[row])
             if rest is not None and len(rest) == 0:
                 return
-        is_hard = light.spread < NARROW_SPREAD or _is_narrow(light, corners) or _is_in_pieces(light, corners)
-        if lobes.only_tails or is_hard:
+        if is_hard or (lobes.only_tails and columns is None):
             chosen = _both(allowed, rest)
             self.needs_float64[number].append(index if chosen is None else index[chosen])
             return
@@ -460,16 +489,17 @@ class _Lighting:
         alpha = np.maximum(samples.roughness[index].astype(np.float32) ** 2, np.float32(MIN_ALPHA))
         return AnalyticLobe(lobes32.as_columns(samples.normal, index), lobes32.as_columns(samples.view, index), alpha)
 
-    def add_in_float64(self, members) -> None:
-        """Add the light of all lights but leaves at the samples `members` (Q,)."""
-        lights = self.lights[: len(self.lights) - self.lights.leaf_count]
+    def add_in_float64(self, members, without=()) -> None:
+        """Add the light of all lights but leaves, and but those `without`, at the samples `members` (Q,)."""
+        numbers = [number for number in range(len(self.lights) - self.lights.leaf_count) if number not in without]
         if len(members) == 0:
             return
-        if len(members) * len(lights) < FLOAT64_CHUNK:
-            for (light, _, _), needs_float64 in zip(lights, self.needs_float64, strict=False):
-                allowed = light.receives(self.samples.receiver, members)
-                needs_float64.append(members if allowed is None else members[allowed])
+        if len(members) * len(numbers) < FLOAT64_CHUNK:
+            for number in numbers:
+                allowed = self.lights[number][0].receives(self.samples.receiver, members)
+                self.needs_float64[number].append(members if allowed is None else members[allowed])
             return
+        lights = [self.lights[number] for number in numbers]
         for start in range(0, len(members), FLOAT64_CHUNK):
             index = members[start : start + FLOAT64_CHUNK]
             target = np.zeros((len(self.radiance), len(index), 3))

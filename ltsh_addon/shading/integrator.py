@@ -48,6 +48,8 @@ _FIELDS_OF_ONE_PASS = {
 }  # fmt: skip
 # Up to so many lights, each has a row of the result unless the caller says otherwise.
 MOST_SINGLE_ROWS = 64
+# Number of lights of which all are looked at for an estimate of time.
+MANY = 256
 # Estimate of the most patches of a light that a sample takes.
 PATCHES = 60
 # Distant lights with a smaller half side, in units of their distance, are too small for a `SkyMap`.
@@ -87,7 +89,10 @@ class Task:
             per_light, per_corner = (
                 base + degree * more for base, more in zip(_SINGLE_COST, _COST_PER_DEGREE, strict=True)
             )
-        corners = sum(_corners_integrated(light, self.is_reference) for light in self.lights)
+        # Of many lights, some stand for all.
+        some = self.lights[:: max(1, len(self.lights) // MANY)]
+        corners = sum(_corners_integrated(light, self.is_reference) for light in some)
+        corners *= len(self.lights) / max(len(some), 1)
         return 1e-9 * count * len(self.passes) * (per_light * len(self.lights) + per_corner * corners)
 
     def do(self, job: SurfaceSamples | tuple[SurfaceSamples, str, np.ndarray], context=None):
@@ -451,7 +456,7 @@ def _task(lights, technique, passes, dtype, rows) -> Task:
         # Workers get this matrix with the table, because LAPACK need not give the same last bits in every process.
         _ = table.ridge_weights
     rows = _rows(rows, len(lights))
-    pairs = [pair for pair in zip(lights, rows, strict=True) if pair[0].area_vector.any()]
+    pairs = [pair for pair in zip(lights, rows, strict=True) if any(pair[0].area_vector.tolist())]
     pairs = [(one, row) for light, row in pairs for one in _parts(light)]
     count = 1 + max(rows, default=0)
     lights, rows = (tuple(values) for values in zip(*pairs, strict=True)) if pairs else ((), ())

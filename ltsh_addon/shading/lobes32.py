@@ -241,8 +241,8 @@ def add_specular_of_sky(sky: SkyMap, samples, index, radiance, table) -> None:
     for vectors, members, colors_of in kinds:
         for count in np.unique(counts[members]):
             alike, nodes = members[counts[members] == count], spiral(count)
-            for start in range(0, len(alike), SKY_NODES // count):
-                chosen = alike[start : start + SKY_NODES // count]
+            for piece in moments32.pieces(len(alike), SKY_NODES // count, 128):
+                chosen = alike[piece]
                 normal, view, tangent, geometric = (
                     as_columns(getattr(samples, name), chosen)
                     for name in ("normal", "view", "tangent", "geometric_normal")

@@ -12,6 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..emitters import light_profile
+from ..emitters.light_polygons import cached_on_children
 from ..lobes.polygon import convex_pieces, dot
 from ..scene import Light, PolygonLight
 
@@ -37,7 +38,7 @@ class Emitter:
         self.center, self.axes = _parallelogram(light) if self.corners is None else (None, None)
         self._picture = self._edge = None
         if self.corners is None and light.children:
-            self._picture = picture_of(light, self._places)
+            self._picture = cached_on_children("_picture", [light], lambda lights: picture_of(light, self._places))
         elif self.corners is None and isinstance(light, PolygonLight):
             self._edge = self._places(light.corners - light.center).astype(np.float32)
 
@@ -131,8 +132,10 @@ def picture_of(light, places_of):
     grid = (np.arange(_PICTURE) + 0.5) * (2.0 / _PICTURE) - 1.0
     picture = np.zeros((_PICTURE, _PICTURE), np.float32)
     mean = max(np.abs(light.radiance).mean(), 1e-30)
-    for patch in light.leaves:
-        outline = places_of(patch.polygon() - light.center)
+    outlines = [patch.polygon() for patch in light.leaves]
+    ends = np.cumsum([len(outline) for outline in outlines])[:-1]
+    places = np.split(places_of(np.concatenate(outlines) - light.center), ends)
+    for patch, outline in zip(light.leaves, places, strict=True):
         columns, rows = (slice(*np.searchsorted(grid, (axis.min(), axis.max()))) for axis in outline.T)
         cells = picture[rows, columns]
         cells[_inside(outline, *np.meshgrid(grid[columns], grid[rows]))] = np.abs(patch.radiance).mean() / mean

@@ -320,7 +320,7 @@ class RatioEstimator:
             normal = np.broadcast_to(light.direction, points.shape)
         if self.is_mesh:
             margin = MESH_STEPS * GAP * (np.abs(light.center).sum() + light.radius) + 1e-12
-            length = near - 2.0 * margin
+            length = near - margin
         rays = points + near * normal, -normal, np.full(len(points), length), np.full(len(points), self.mask)
         return _ZERO if (self.surface.tracer.transmittance(*rays) == 1.0).all() else np.float32(margin)
 

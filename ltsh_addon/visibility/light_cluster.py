@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..emitters import light_tree
-from ..lobes.polygon import convex_pieces, dot
+from ..lobes.polygon import STRAIGHT, convex_pieces, dot
 from ..scene import FlatLight, Light, PointLight, PolygonLight, QuadLight, SkyLight
 from .emitter import Emitter, Sky
 
@@ -27,12 +27,11 @@ class LightCluster:
     """
 
     def __init__(self, lights: Sequence[Light]):
-        pieces = [(piece, light) for light in lights for piece in _quads_of(light)]
-        corners = np.array([piece for piece, _ in pieces])
-        owners = [light for _, light in pieces]
-        normal = np.array([light.direction for light in owners])
-        radiance = np.array([light.radiance for light in owners])
-        is_round = np.array([light.is_round for light in owners])
+        corners, owner = _quads_of(lights)
+        normal, radiance, is_round = (
+            np.array([getattr(light, name) for light in lights])[owner]
+            for name in ("direction", "radiance", "is_round")
+        )
         across = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
         area = 0.5 * np.linalg.norm(across, axis=1) * np.where(is_round, 0.25 * np.pi, 1.0)
         low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
@@ -209,19 +208,41 @@ def _levels(children):
         levels.append((last, last + more))
 
 
-def _quads_of(light: Light) -> list[np.ndarray]:
-    """Convex quadrilaterals (4, 3) that make up a light; triangles repeat their last corner. A round light gives the
-    parallelogram around it."""
-    if not isinstance(light, PolygonLight):
-        u, v = light.half_u, light.half_v
-        return [light.center + np.stack([-u - v, u - v, u + v, v - u])]
-    if len(light.corners) == 3:
-        return [light.corners[[0, 1, 2, 2]]]
-    quads = []
-    for piece in convex_pieces(light.corners):
-        for first in range(1, len(piece) - 1, 2):
-            quads.append(piece[[0, first, first + 1, min(first + 2, len(piece) - 1)]])
-    return quads
+def _quads_of(lights: Sequence[Light]) -> tuple[np.ndarray, np.ndarray]:
+    """Convex quadrilaterals (N, 4, 3) that make up the lights, and the number (N,) of the light of each; triangles
+    repeat their last corner. A round light gives the parallelogram around it."""
+    quads, owner = [], []
+    counts = np.array([len(light.corners) if isinstance(light, PolygonLight) else 0 for light in lights])
+    for count in np.unique(counts):
+        numbers = np.flatnonzero(counts == count)
+        if count == 0:
+            center, u, v = (
+                np.array([getattr(lights[number], name) for number in numbers])
+                for name in ("center", "half_u", "half_v")
+            )
+            corners = center[:, None] + np.stack([-u - v, u - v, u + v, v - u], axis=1)
+        else:
+            corners = np.array([lights[number].corners for number in numbers])
+        if count == 3:
+            corners = corners[:, [0, 1, 2, 2]]
+        elif count > 3:
+            edges = np.roll(corners, -1, axis=1) - corners
+            normals = np.array([lights[number].direction for number in numbers])
+            turns = (np.cross(edges, np.roll(edges, -1, axis=1)) * normals[:, None]).sum(axis=2)
+            least = STRAIGHT * np.square(edges).sum(axis=2).max(axis=1, keepdims=True)
+            others = ~((turns > least).all(axis=1) | (turns < -least).all(axis=1)) | (count > 4)
+            for number, outline in zip(numbers[others], corners[others], strict=True):
+                for piece in convex_pieces(outline):
+                    starts = range(1, len(piece) - 1, 2)
+                    fan = [piece[[0, first, first + 1, min(first + 2, len(piece) - 1)]] for first in starts]
+                    quads.append(np.array(fan))
+                    owner.append(np.full(len(fan), number))
+            numbers, corners = numbers[~others], corners[~others]
+        quads.append(corners[:, :4])
+        owner.append(numbers)
+    quads, owner = np.concatenate(quads), np.concatenate(owner)
+    order = np.argsort(owner, kind="stable")
+    return quads[order], owner[order]
 
 
 # Decimals of a color, as a share of its largest channel, that must agree for lights to count as one: their colors
@@ -255,10 +276,11 @@ def _kind(light, number, masks) -> tuple:
     if _is_side(light):
         return "sky", light.name
     is_plain = isinstance(light, FlatLight) and not (light.has_profile or light.children)
-    brightest = light.radiance.max()
-    if not is_plain or light.radiance.min() < 0.0 or brightest == 0.0 or not light.area_vector.any():
+    radiance = light.radiance.tolist()
+    brightest = max(radiance)
+    if not is_plain or min(radiance) < 0.0 or brightest == 0.0 or not any(light.area_vector.tolist()):
         return "one", number
-    color = tuple(np.round(light.radiance / brightest, COLOR_DIGITS).tolist())
+    color = tuple(round(value / brightest, COLOR_DIGITS) for value in radiance)
     return "many", light.group, light.receivers, light.affects_diffuse, light.affects_specular, color, masks
 
 

@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ltsh_addon.scene import QuadLight, SurfaceSamples
+from ltsh_addon.cycles.environment import CUBE, SkyPicture, sky_lights
+from ltsh_addon.scene import QuadLight, SkyLight, SurfaceSamples
 
 
 def unit(vectors):
@@ -109,3 +110,28 @@ def ceiling(count, seed=1):
         half_v, color = np.cross(direction, half_u), generator.uniform(5.0, 10.0, 3)
         lights.append(QuadLight("Lamp", place, half_u, half_v, direction, color))
     return lights
+
+
+WORLDS = {
+    "constant": lambda unit: np.ones(unit.shape),
+    "gradient": lambda unit: (0.2 + 0.3 * (1.0 + unit[..., 2:])) * [0.8, 0.9, 1.0],
+    "windows": lambda unit: np.where(
+        (np.abs(np.sin(3.0 * unit)) > 0.9).all(axis=-1, keepdims=True), 12.0, 0.4 * unit**2
+    ),
+}
+
+
+def world(kind):
+    """The lights of one of WORLDS, as of a picture of 64 x 64 pixels a side."""
+    like = SkyLight("World", [0, 0, 1], [1, 0, 0], [0, 1, 0], [0, 0, -1], np.ones(3))
+    sides = [SkyPicture(*axes, np.zeros((64, 64, 3))) for axes in CUBE]
+    return list(sky_lights(like, [replace(one, radiance=WORLDS[kind](unit(one.offsets()))) for one in sides])[0])
+
+
+def metals_of_product(count, anisotropy):
+    """Brushed legs of a product shot: a metal of roughness 0.15 to 0.45, in the places of `floor_scene`."""
+    samples, lights = floor_scene(count, 3, "f82")
+    turn = np.random.default_rng(1).uniform(0.0, 2.0 * np.pi, count)
+    tangent = np.stack([np.cos(turn), np.sin(turn), np.zeros(count)], axis=1)
+    own = {"roughness": 0.15 + 0.3 * (samples.roughness - 0.1) / 0.9, "specular_f0": np.full((count, 3), 0.78)}
+    return replace(samples, **own, anisotropy=np.full(count, anisotropy), tangent=tangent), lights

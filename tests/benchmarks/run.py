@@ -19,7 +19,7 @@ sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
 
 import bake_cost  # noqa: E402
 import measure  # noqa: E402
-from bench_scenes import ceiling, floor_scene, random_polygons, wide_floor  # noqa: E402
+from bench_scenes import WORLDS, ceiling, floor_scene, metals_of_product, random_polygons, wide_floor, world  # noqa: E402
 from independent import independent_processes  # noqa: E402
 from textbook_ltc import TextbookLtc  # noqa: E402
 from zonal_harmonics import ZonalHarmonics  # noqa: E402
@@ -127,6 +127,22 @@ def light_kinds(options):
             for name, its in kinds.items()
         }
         compared(cases, f"rectangle, {part}", 3, 4 * count)
+
+
+def worlds(options):
+    """What anisotropic lobes and worlds that vary cost beside isotropic ones under a constant world."""
+    count = 10_000 if options.quick else 100_000
+    isotropic, lamps = metals_of_product(count, 0.0)
+    surfaces = {"isotropic": isotropic, "anisotropic": metals_of_product(count, 0.53)[0]}
+    for others, label in (([], "the world alone"), (lamps, "the world and three rectangles")):
+        heading(f"{label}: ltsh4c, specular, {count} samples of brushed metal, one process: ns per sample")
+        cases = {
+            f"{name}, {kind}": partial(in_one_row, samples, [*world(kind), *others], TABLES["ltsh4c"])
+            for kind in WORLDS for name, samples in surfaces.items()
+        }  # fmt: skip
+        ratio = compared(cases, "isotropic, constant", 3, count)
+        print(f"  targets: anisotropic <= 2: {ratio['anisotropic, constant']:.2f}; gradient <= 2: "
+              f"{ratio['isotropic, gradient']:.2f}; both <= 3: {ratio['anisotropic, gradient']:.2f}")  # fmt: skip
 
 
 def many_lights(options):
@@ -334,6 +350,7 @@ SECTIONS = {
     "polygons": polygons,
     "shade": shade,
     "lights": light_kinds,
+    "worlds": worlds,
     "many": many_lights,
     "bounds": bounds,
     "growth": growth,

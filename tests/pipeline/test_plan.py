@@ -79,6 +79,8 @@ def test_depth_of_field_has_all_of_its_points_or_none():
 def test_first_points_are_few_only_with_a_budget(tmp_path):
     options = RenderOptions(tmp_path / "room.blend", output=tmp_path)
     assert plan.first_and_most_points(options) == (plan.DEFAULT_POINTS, plan.DEFAULT_POINTS)
+    few = [plan.first_and_most_points(replace(options, cycles_samples=count))[1] for count in (1, 32, 80, 4096)]
+    assert few == [plan.FIRST_POINTS, plan.FIRST_POINTS, 5, plan.DEFAULT_POINTS]
     budget = replace(options, budget=5.0)
     assert plan.first_and_most_points(budget) == (plan.FIRST_POINTS, plan.MOST_POINTS)
     assert plan.first_and_most_points(replace(budget, sub_samples=2)) == (2, 2)

@@ -59,12 +59,13 @@ def test_lights_of_one_color_group_and_kind_share_their_rays():
     assert all(len(kinds) == 1 for kinds in shared)
 
 
-@pytest.mark.parametrize("roughness", (0.1, 0.4))
-def test_rays_bring_the_light_of_all_lamps(roughness):
+@pytest.mark.parametrize("roughness, count", ((0.1, 99), (0.4, 99), (0.4, 500)))
+def test_rays_bring_the_light_of_all_lamps(roughness, count):
     """The weights of 1024 rays beside midpoints of all lamps: at 2 m cells of 2 cm, errors of 1e-4."""
     samples, _ = floor(5, roughness)
-    lights = [light for light in ceiling(99) if not isinstance(light, PolygonLight)]
+    lights = [light for light in ceiling(count) if not isinstance(light, PolygonLight)]
     cluster = LightCluster(lights)
+    assert (len(cluster.cut) < len(cluster.brightness)) == (len(lights) > light_cluster.CUT)
     surface = SampleRows(samples, PASSES, OPEN.ray_origins(samples) and OPEN)
     pairs = estimator.RatioEstimator(surface, cluster, 0, LightSelection(samples, cluster.selected_as, False))
     pairs._add_rays(np.arange(len(pairs.index)), 0, estimator.MOST_RAYS, 0)
@@ -140,3 +141,25 @@ def test_lights_that_share_rays_are_relit_together():
     relight._check_shared(kept, [replace(light, radiance=[2.0, 3.0, 4.0] * light.radiance) for light in lights])
     with pytest.raises(ValueError, match="'Lamp 0' and 'Lamp 3' are two of 70 that share their shadow rays"):
         relight._check_shared(kept, [*lights[:3], replace(lights[3], radiance=np.zeros(3)), *lights[4:]])
+
+
+def test_lights_become_convex_quadrilaterals_of_their_area():
+    arrow = np.array([[0.0, 0.0], [1.0, 0.3], [2.0, 0.0], [1.0, 2.0]])
+    outlines = [
+        arrow,
+        arrow[::-1],
+        arrow[[0, 2, 3]],
+        [[0, 0], [2, 0], [2, 1], [0, 1]],
+        [[0, 0], [2, 0], [3, 1], [1, 2], [0, 1]],
+    ]
+    lights = [replace(ceiling(1)[0], half_u=np.array([0.3, 0.1, 0.0]))]
+    for outline in outlines:
+        corners = np.column_stack([outline, np.full(len(outline), 2.0)])
+        lights.append(PolygonLight.like(lights[0], corners=corners, direction=np.array([0.0, 0.0, -1.0])))
+    quads, owner = light_cluster._quads_of(lights)
+    before, after = quads - np.roll(quads, 1, axis=1), np.roll(quads, -1, axis=1) - quads
+    turns = np.cross(before, after)[:, :, 2] * np.sign(np.cross(before, after).sum(axis=1)[:, 2:])
+    assert (turns > -1e-12).all() and owner.tolist() == [0, 1, 1, 2, 2, 3, 4, 5, 5]
+    across = np.cross(quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1])
+    areas = np.bincount(owner, 0.5 * np.linalg.norm(across, axis=1))
+    assert np.allclose(areas[1:], [np.linalg.norm(light.area_vector) for light in lights[1:]])

@@ -142,10 +142,20 @@ def final_picture(
             prefixes = [prefix for prefix, name in job.shaded_as().items() if name == technique]
             passes.update({f"{prefix} {PASS_LABELS[lit_pass]}": image for prefix in prefixes})
             show(picture())
+    if extraction.behind is not None and job.shown == "combined":
+        rest[..., :3] += _behind_glass(job, extraction.behind, progress)
+        show(picture())
     if not job.keeps_lights:
         return picture()
     relight_data = RelightData(extraction, shadows, _relight_options(job, shown), False, {"": rest})
     return replace(picture(), lights=light_pictures(relight_data, progress), relight_data=relight_data)
+
+
+def _behind_glass(job: FinalJob, behind, progress: Progress) -> np.ndarray:
+    """The light (H, W, 3) of what is seen through glass, with the exposure."""
+    shadows = None if behind.occluders is None else trace_shadows(behind, PASSES, job.shadow_rays, progress)
+    lit = shade_lights(behind.samples, behind.lights, job.technique, PASSES, (shadows,))[0].combined
+    return behind.film.image(behind.picture.exposure * lit) + behind.rest[..., :3]
 
 
 def _relight_options(job: FinalJob, passes) -> dict:

@@ -10,6 +10,7 @@ import bpy
 import numpy as np
 
 from ...scene import SceneError, error_line, light_records, listed
+from ...visibility.occluders import UNLIMITED
 from .. import render_settings
 from ..evaluated import SURFACE_TYPES, owner_of, read_values, rendered_surfaces, with_render_depsgraph
 from ..lights.area import LightInventory, collect_lights, note_overlaps, rendered_lights
@@ -18,7 +19,7 @@ from ..lights.world import blocks_nothing, take_world, world_behind, world_light
 from ..materials import aovs
 from ..materials.graph import images_behind
 from ..process.blender_process import job_start, newer
-from ..process.pixels import EDGE_SECONDS, PixelJob, too_small
+from ..process.pixels import BEHIND, EDGE_SECONDS, PixelJob, too_small
 from .occluders import collect_occluders, with_baked_shares
 
 # FAST_PIXELS: up to this many samples (about 1 GB of files), files are compressed fast instead of well.
@@ -264,13 +265,15 @@ def prepare_scene(
 
     unread = []
     inventory, materials, bare = with_render_depsgraph(scene, visit)
+    # Camera rays pass through any number of wholly transparent surfaces, which leave no trace in the passes.
+    scene.cycles.transparent_max_bounces = UNLIMITED
     if unread:
         inventory.occluders = with_baked_shares(inventory.occluders, unread, scene, inventory.warn)
     default = aovs.give_default_material(bare)
     materials += [default] if default else []
-    left_to_cycles = inventory.left_to_cycles if for_finished else None
+    reasons, glass = (inventory.left_to_cycles, None) if for_finished else (None, inventory.glass)
     of_materials = aovs.inject_aovs(
-        materials, inventory.emitting_materials, inventory.unshaded, inventory.made_opaque, left_to_cycles
+        materials, inventory.emitting_materials, inventory.unshaded, inventory.made_opaque, reasons, glass
     )
     inventory.receivers.mark()
     if with_occluders:  # before a look at the lights, which shows them to such rays
@@ -357,6 +360,11 @@ def extract_pixels(job: PixelJob, folder: Path, progress) -> dict:
         # Lights that the camera sees are part of the rest.
         with nullcontext() if job.rest else render_settings.without_lights(scene):
             samples = render_pixel_samples(scene, view_layer, folder, offsets, progress, passes)
+    behind = None
+    if inventory.glass and job.rest and not job.cycles_samples:
+        _look_through_glass(scene, inventory)
+        with world_behind(scene, inventory.behind):
+            behind = render_pixel_samples(scene, view_layer, folder / BEHIND, offsets, progress, REST_PASSES)
     seconds["samples"] = time.monotonic() - started
 
     started, reference = time.monotonic(), None
@@ -379,6 +387,7 @@ def extract_pixels(job: PixelJob, folder: Path, progress) -> dict:
         "unshaded": inventory.unshaded,
         "left_to_cycles": {**vars(inventory.left_to_cycles), "warnings": inventory.warnings} if for_finished else None,
         "samples": samples,
+        "behind": behind,
         "has_lens": has_lens,
         "weights": None if weights is None else weights[: len(samples)].tolist(),
         "finer": finer,
@@ -389,10 +398,23 @@ def extract_pixels(job: PixelJob, folder: Path, progress) -> dict:
     }
 
 
+def _look_through_glass(scene, inventory: LightInventory) -> None:
+    """Let camera rays pass through glass, and meet the lights and the world that rays through glass meet."""
+    aovs.make_clear(inventory.glass)
+    for ob in scene.objects:
+        if ob.type == "LIGHT":
+            ob.visible_camera = ob.visible_transmission
+    if inventory.behind is not None:
+        visibility = inventory.behind.cycles_visibility
+        visibility.camera = visibility.transmission
+
+
 def _prepare_reference(scene, inventory: LightInventory) -> None:
     """Make Cycles light the scene as the techniques do, with or without shadows."""
     if inventory.occluders is None:
         remove_occlusion(scene)
+    else:
+        scene.cycles.transparent_max_bounces = inventory.occluders.transparent_surfaces
     scene.world = inventory.world
 
 

@@ -63,6 +63,7 @@ class LightInventory:
     behind: Any = None  # the world that is seen behind the surfaces
     occluders: Any = None  # visibility.Occluders, if shadows are wanted
     made_opaque: list[OpaqueInput] = field(default_factory=list)  # see `inject_aovs`
+    glass: list = field(default_factory=list)  # materials that are seen through, see `inject_aovs`
     settings: dict[str, list[float]] = field(default_factory=dict)  # see `Extraction.light_settings`
     left_to_cycles: CyclesReasons = field(default_factory=CyclesReasons)  # what finished pictures leave to Cycles
 

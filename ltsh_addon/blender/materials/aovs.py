@@ -8,16 +8,27 @@ from __future__ import annotations
 
 import functools
 import itertools
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 import bpy
 
-from ...cycles.lobes import AOV_PREFIX, HIT_AOVS, KEPT_AOV, KEPT_BITS, LOBE_AOVS, MAX_LOBES, aov_kind, lobe_aov
+from ...cycles.lobes import (
+    AOV_PREFIX,
+    DENSITY_AOVS,
+    HIT_AOVS,
+    KEPT_AOV,
+    KEPT_BITS,
+    LOBE_AOVS,
+    MAX_LOBES,
+    aov_kind,
+    lobe_aov,
+)
 from ...scene import listed
 from ..render_settings import SCRIPT
-from . import graph
+from . import bsdfs, graph
 from .bsdfs import BOTH, NEITHER, bsdf_of, emits, has_alpha, is_emission, lobe_values, notes_of, passes_of_cycles
 
 # Nodes whose values differ from those in the Cycles reference, and the note about each.
@@ -29,6 +40,9 @@ NOTED_NODES = {
 LEFT_OUT = "left out of the Cycles reference as well"
 # RECEIVER_PROPERTY: custom property of objects, a value of `Light.receivers` that tells which lights reach them.
 RECEIVER_PROPERTY = "ltsh_receiver"
+# AHEAD: how far in m a ray goes on behind a surface of glass. NOTHING, CLEAREST: the least share of light that passes
+# glass, and the least density that it writes.
+AHEAD, NOTHING, CLEAREST = 1e-4, 1e-5, 1e-6
 
 
 @dataclass(frozen=True)
@@ -53,6 +67,7 @@ class MaterialLobes:
     left_to_cycles: frozenset[str] = NEITHER  # passes in which direct light is not as in Cycles
     has_volume: bool = False
     is_displaced: bool = False  # its faces are displaced, but their shadows are not
+    through: tuple | None = None  # of glass: `bsdfs.let_through`, in the tree of the material
 
 
 @dataclass
@@ -115,10 +130,25 @@ def lobes_of(material, emitter: bool) -> MaterialLobes:
     shares = [{} if graph.is_constant(weight, 1.0) else {"weight": weight} for weight in weights]
     values = tuple({**lobe_values(leaf.node), **share} for leaf, share in zip(leaves, shares, strict=True))
     unknown = [leaf.node.name for leaf in shaders.leaves if bsdf_of(leaf.node) is None and not is_emission(leaf.node)]
-    unshaded = ""
-    if unknown and not leaves:
+    unshaded, through = "", _through(shaders.leaves, weight_of)
+    if unknown and not leaves and through is None:
         unshaded = f"material {material.name!r} has no shader that is supported, found {listed(map(repr, unknown))}"
-    return replace(without_lobe, leaves=tuple(leaves), values=values, unshaded=unshaded, made_opaque=tuple(made_opaque))
+    traits = {"unshaded": unshaded, "made_opaque": tuple(made_opaque), "through": through}
+    return replace(without_lobe, leaves=tuple(leaves), values=values, **traits)
+
+
+def _through(leaves, weight_of) -> tuple | None:
+    """`MaterialLobes.through` of the shaders `leaves`: the sum of the light, in the direction of the first."""
+    sums = None
+    for leaf in leaves:
+        if (values := bsdfs.let_through(leaf.node)) is None:
+            continue
+        weight = weight_of(leaf)
+        values = *(graph.product(weight, share) for share in values[:3]), values[3]
+        for group in reversed(leaf.groups):
+            values = [graph.carry_out_of_group(group, value) for value in values]
+        sums = values if sums is None else (*map(graph.total, sums[:3], values[:3]), sums[3])
+    return sums
 
 
 def _passes_left_to_cycles(output, shaders: graph.SurfaceShaders) -> frozenset[str]:
@@ -271,12 +301,14 @@ def inject_aovs(
     unshaded: list[str] | None = None,
     made_opaque: list[OpaqueInput] | None = None,
     reasons: CyclesReasons | None = None,
+    glass: list | None = None,
 ) -> list[str]:
     """Make every material write its lobes into AOVs; returns warnings.
 
     Only materials with a full name in `emitters` give light. A material that is not shaded at all writes -n as the
     kind of its first lobe, and the n-th entry of `unshaded` is the reason. `made_opaque` gets the entries that
-    `let_shadow_rays_through` takes, and `reasons` gets what a finished picture leaves to Cycles.
+    `let_shadow_rays_through` takes, `reasons` gets what a finished picture leaves to Cycles, and `glass` gets what
+    `make_clear` takes.
     """
     unshaded = [] if unshaded is None else unshaded
     made_opaque = [] if made_opaque is None else made_opaque
@@ -293,6 +325,12 @@ def inject_aovs(
             reasons.note(material, lobes)
             if lobes.left_to_cycles:
                 _write_aov(material.node_tree, KEPT_AOV, sum(KEPT_BITS[name] for name in lobes.left_to_cycles))
+        if lobes.through is not None and glass is not None:
+            glass.append((material, lobes.through[3]))
+            for name, share in zip(DENSITY_AOVS, lobes.through, strict=False):
+                logarithm = graph.computed("LOGARITHM", graph.computed("MAXIMUM", share, NOTHING), math.e)
+                density = graph.computed("SUBTRACT", 0.0, logarithm)
+                _write_aov(material.node_tree, name, graph.computed("MAXIMUM", density, CLEAREST))
         if not lobes.is_transparent:
             opaque.append(lobes)
             _write_hit(material)
@@ -308,6 +346,31 @@ def inject_aovs(
             value = lobes.values[slot].get(name, 0.0 if neutral is None else neutral)
             _write_aov(lobes.leaves[slot].node.id_data, lobe_aov(name, slot), value)
     return list(dict.fromkeys(warnings))
+
+
+def make_clear(glass: Iterable[tuple]) -> None:
+    """Let camera rays pass through `glass`, materials and directions, which then write DENSITY_AOVS alone."""
+    for material, direction in glass:
+        tree = material.node_tree
+        _forget(tree)
+        # To Cycles such a ray is still one of the camera, so what it meets next writes its AOVs.
+        portal, geometry = tree.nodes.new("ShaderNodeBsdfRayPortal"), tree.nodes.new("ShaderNodeNewGeometry")
+        ahead = graph.vector("MULTIPLY_ADD", direction, (AHEAD,) * 3, geometry.outputs["Position"])
+        tree.links.new(ahead, portal.inputs["Position"])
+        tree.links.new(direction, portal.inputs["Direction"])
+        tree.links.new(portal.outputs[0], graph.material_output(tree).inputs["Surface"])
+
+
+def _forget(tree) -> None:
+    """Remove the AOVs of `tree` and its groups, except DENSITY_AOVS."""
+    for node in list(tree.nodes):
+        if graph.is_group(node) and node.node_tree is not None:
+            _forget(node.node_tree)
+        elif (
+            getattr(node, "aov_name", "").startswith(AOV_PREFIX)
+            and node.aov_name[len(AOV_PREFIX) :] not in DENSITY_AOVS
+        ):
+            tree.nodes.remove(node)
 
 
 def _write_hit(material) -> None:

@@ -10,14 +10,16 @@ from dataclasses import dataclass, field, replace
 import bpy
 
 from ...cycles.lobes import LOBE_AOVS, LOBE_KINDS
-from .graph import PRINCIPLED, is_constant, is_socket, live_link, product, value_of
+from . import graph
+from .graph import PRINCIPLED, computed, is_constant, is_socket, live_link, product, value_of
 
 EMISSION = "ShaderNodeEmission"
 METALLIC, GLASS = "ShaderNodeBsdfMetallic", "ShaderNodeBsdfGlass"
 SHEEN, TOON = "ShaderNodeBsdfSheen", "ShaderNodeBsdfToon"
 SUBSURFACE = "ShaderNodeSubsurfaceScattering"
-# REFRACTION_NODE has no row: it reflects nothing, and pictures do not show transmitted light.
+# REFRACTION_NODE has no row: it reflects nothing.
 REFRACTION_NODE = "ShaderNodeBsdfRefraction"
+SEEN_THROUGH = "shows what is behind it sharp, in views also without refraction; comparisons and bakes leave it out"
 NOT_SUPPORTED = "is not supported, it is not shaded"
 # Node -> the property that selects one of its rows.
 VARIANTS = {METALLIC: "fresnel_type", SHEEN: "distribution", TOON: "component"}
@@ -58,7 +60,7 @@ BSDFS = {
         PRINCIPLED_SOCKETS,
         not_shaded={
             "Subsurface Weight": (0.0, "is shaded as diffuse reflection"),
-            "Transmission Weight": (0.0, "lets no light through: only the reflection is shaded"),
+            "Transmission Weight": (0.0, SEEN_THROUGH),
             "Thin Wall": (0.0, "is shaded as off"),
             "Thin Film Thickness": AS_ZERO,
         },
@@ -69,7 +71,7 @@ BSDFS = {
     (GLASS, ""): Bsdf(
         "glass",
         {**COLOR, **ROUGHNESS, "ior": "IOR"},
-        "lets no light through: only its reflection is shaded",
+        SEEN_THROUGH,
         {"Thin Film Thickness": AS_ZERO},
     ),
     (METALLIC, "F82"): Bsdf("metal", {**BRUSHED, "color": "Base Color", "tint": "Edge Tint"}, "", OF_METALLIC),
@@ -158,6 +160,57 @@ def _drop_absent_layers(node, values) -> None:
         del values["transmission"]
 
 
+def let_through(node) -> tuple | None:
+    """What the BSDF `node` lets through at a crossing: the share of red, green and blue light, constants or sockets of
+    its tree, and a socket with the direction in which a camera ray goes on. None for nodes that let nothing through.
+
+    Where light leaves glass, the share has what was reflected inside as well, as if the sides were parallel. A thin
+    wall is both crossings at once.
+    """
+    is_principled, is_wall, one = node.bl_idname == PRINCIPLED, False, 1.0
+    if is_principled:
+        metallic = value_of(node.inputs["Metallic"])
+        one = product(value_of(node.inputs["Transmission Weight"]), computed("SUBTRACT", 1.0, metallic))
+        is_wall = "Thin Wall" in node.inputs and not is_constant(value_of(node.inputs["Thin Wall"]), 0.0)
+    elif node.bl_idname not in (GLASS, REFRACTION_NODE):
+        return None
+    if is_constant(one, 0.0):
+        return None
+    tree, color = node.id_data, value_of(node.inputs["Base Color" if is_principled else "Color"])
+    if is_socket(color):
+        split = tree.nodes.new("ShaderNodeSeparateColor")
+        tree.links.new(color, split.inputs[0])
+        color = split.outputs
+    fresnel, geometry = tree.nodes.new("ShaderNodeFresnel"), tree.nodes.new("ShaderNodeNewGeometry")
+    reflected, normal, leaves = fresnel.outputs[0], geometry.outputs["Normal"], geometry.outputs["Backfacing"]
+    for name in ("IOR", "Normal"):
+        if (link := live_link(node.inputs[name])) is not None:
+            tree.links.new(link.from_socket, fresnel.inputs[name])
+            normal = link.from_socket if name == "Normal" else normal
+        elif name == "IOR":
+            fresnel.inputs[name].default_value = node.inputs[name].default_value
+    direction, passes = graph.vector("SCALE", geometry.outputs["Incoming"], -1.0), computed("SUBTRACT", 1.0, reflected)
+    if is_wall:
+        # (1 - F)^2 / (1 - F^2)
+        share = computed("DIVIDE", passes, computed("ADD", 1.0, reflected))
+        return *(product(product(one, share), channel) for channel in color[:3]), direction
+    side = computed("SUBTRACT", computed("MULTIPLY", leaves, 2.0), 1.0)
+    bent = graph.vector("REFRACT", direction, normal, computed("POWER", value_of(node.inputs["IOR"]), side))
+    is_reflected = computed("LESS_THAN", graph.vector("LENGTH", bent), 0.5)
+    mirrored = graph.vector("SCALE", graph.vector("REFLECT", direction, normal), is_reflected)
+    shares = []
+    for channel in color[:3]:
+        tint = computed("POWER", channel, 0.5) if is_principled else channel
+        if node.bl_idname == REFRACTION_NODE:
+            shares.append(product(tint, computed("SUBTRACT", 1.0, is_reflected)))
+            continue
+        inside = reflected if is_principled else product(reflected, tint)
+        more = computed("SUBTRACT", 1.0, product(leaves, product(inside, inside)))
+        share = computed("DIVIDE", product(passes, tint), more)
+        shares.append(product(one, computed("ADD", share, product(is_reflected, inside))))
+    return *shares, graph.vector("ADD", bent, mirrored)
+
+
 def emission_sockets(node) -> tuple:
     """The inputs (color, strength) of the emission of a node; () for nodes that cannot emit."""
     prefix = {EMISSION: "", PRINCIPLED: "Emission "}.get(node.bl_idname)
@@ -182,7 +235,7 @@ def notes_of(node) -> list[str]:
     """Notes about how the shading of a node differs from Cycles: what replaces it, and which parts are left out."""
     bsdf = bsdf_of(node)
     if bsdf is None:
-        return [f"node {node.name!r} {NOT_SUPPORTED}"]
+        return [f"node {node.name!r} {SEEN_THROUGH if node.bl_idname == REFRACTION_NODE else NOT_SUPPORTED}"]
     notes = [f"Alpha of {node.name!r} is cut, the surface is shaded and rendered opaque"] if has_alpha(node) else []
     notes += [f"node {node.name!r} {bsdf.nearest}"] if bsdf.nearest else []
     for name, (neutral, done) in bsdf.not_shaded.items():

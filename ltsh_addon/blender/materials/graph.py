@@ -338,8 +338,20 @@ def cut(socket) -> None:
         socket.id_data.links.remove(link)
 
 
+# FOLDED: what the operations of Math nodes are for numbers alone.
+FOLDED = {
+    "DIVIDE": lambda first, second: first / second,
+    "LOGARITHM": math.log,
+    "MAXIMUM": max,
+    "POWER": lambda base, exponent: max(base, 0.0) ** exponent,
+    "SUBTRACT": operator.sub,
+}
+
+
 def computed(operation: str, *values, clamp: bool = False):
-    """The output of a new Math node; `values` are numbers and at least one socket, all of one tree."""
+    """The output of a new Math node; `values` are numbers and sockets, of one tree. For numbers of FOLDED a number."""
+    if operation in FOLDED and not any(map(is_socket, values)):
+        return FOLDED[operation](*values)
     tree = next(value for value in values if is_socket(value)).id_data
     node = tree.nodes.new("ShaderNodeMath")
     node.operation, node.use_clamp = operation, clamp
@@ -349,6 +361,18 @@ def computed(operation: str, *values, clamp: bool = False):
         else:
             socket.default_value = value
     return node.outputs[0]
+
+
+def vector(operation: str, *values):
+    """The output of a new Vector Math node; `values` are sockets, the first one a vector, and numbers."""
+    node = values[0].id_data.nodes.new("ShaderNodeVectorMath")
+    node.operation = operation
+    for value, socket in zip(values, [socket for socket in node.inputs if socket.enabled], strict=False):
+        if is_socket(value):
+            node.id_data.links.new(value, socket)
+        else:
+            socket.default_value = value
+    return next(socket for socket in node.outputs if socket.enabled)
 
 
 def product(first, second):

@@ -18,6 +18,8 @@ IMAGE_SLOTS = ("color", "roughness", "metallic", "ior", "normal", "weight")
 # NEUTRAL: the value of each quantity of a `PreviewMaterial` that is left out.
 NEUTRAL = {"color": 0.8, "roughness": 1.0, "metallic": 0.0, "ior": 1.5, "specular_level": 0.5, "tint": 1.0,
            "transmission": 0.0, "weight": 1.0, "diffuse_roughness": 0.0}  # fmt: skip
+# METALS, SMOOTH: kinds that reflect all light in their direction, and the roughness below which they are mirrors.
+METALS, SMOOTH = ("glossy", "metal", "conductor", "conductor_4_5"), 0.3
 # ROUGH_KINDS: kinds whose diffuse part may be rough.
 ROUGH_KINDS = ("principled", "diffuse")
 # Two kinds beside those of `cycles.lobes.LOBE_KINDS`. COAT: the coat of another lobe. REFRACTION: lobes that only let
@@ -108,6 +110,13 @@ class PreviewMaterial:
         if self.kind in ("glass", REFRACTION):
             return 1.0
         return float(np.clip(self.value("transmission").offset[0], 0.0, 1.0)) if self.kind == "principled" else 0.0
+
+    @property
+    def is_mirror(self) -> bool:
+        """True for smooth metal, which shows what is around it."""
+        is_metal = self.kind in METALS or (self.kind == "principled" and self.value("metallic").offset[0] > 0.5)
+        roughness = self.value("roughness")
+        return is_metal and roughness.is_constant and bool(roughness.offset[0] < SMOOTH)
 
     @property
     def is_bent(self) -> bool:

@@ -26,6 +26,12 @@ REASONS = 5
 SHARP_REFLECTION = 0.2  # surfaces of a smaller roughness show the patches of a world with fine detail
 # EDGE_SECONDS: processor seconds that a million pixels of `finished.FinishedJob.edges` take.
 EDGE_SECONDS = 12.0
+BEHIND = "behind"  # the folder of the renders of what is behind glass
+# THROUGH_GLASS: what a picture shows behind glass, by whether that was rendered.
+THROUGH_GLASS = {
+    True: "what is behind it is sharp and not reflected inside it; light that it focuses is left out",
+    False: "what is behind it is left out, of the Cycles reference too (see the layer coverage.glass)",
+}
 
 
 @dataclass(frozen=True)
@@ -153,6 +159,8 @@ class Extraction:
     problems: tuple[str, ...] = ()  # why most of the picture is not shaded
     occluders: Occluders | None = None  # None without shadows
     light_settings: dict[str, list[float]] = field(default_factory=dict)  # power, exposure, red, green, blue by object
+    glass: np.ndarray | None = None  # (H, W) share of the points of a pixel that show glass; None: no glass in view
+    behind: Extraction | None = None  # what is seen through the glass, tinted
     # Of finished pictures:
     left_to_cycles: LeftToCycles | None = None
     points: PixelPoints = field(default_factory=PixelPoints)
@@ -209,9 +217,12 @@ def extract_pixels(
             problems=tuple(problems),
             occluders=Occluders.load(folder / manifest["occluders"]) if manifest["occluders"] else None,
             light_settings=manifest["light_settings"],
+            glass=renders.glass,
             left_to_cycles=left_to_cycles,
             points=points,
         )
+        if extraction.glass is not None and manifest["behind"]:
+            extraction = replace(extraction, behind=_behind(job, manifest, folder, extraction))
     if job.for_finished:
         return extraction
     if look is not None:
@@ -219,11 +230,22 @@ def extract_pixels(
     return ended_at_horizons(extraction, progress)
 
 
+def _behind(job: PixelJob, manifest: dict, folder: Path, extraction: Extraction) -> Extraction:
+    """What is seen through the glass of `extraction`."""
+    renders = _SampleRenders(job, {**manifest, "film_transparent": False}, is_behind=True)
+    for name in manifest["behind"]:
+        renders.add(rendered_channels(folder / BEHIND / name))
+    samples, film = renders.joined()
+    cycles = CyclesPasses(None, *renders.not_reflected())
+    return ended_at_horizons(replace(extraction, samples=samples, film=film, cycles=cycles))
+
+
 class _SampleRenders:
     """The sample renders of a picture, one for each point of a pixel, as `add` takes them."""
 
-    def __init__(self, job: PixelJob, manifest: dict):
-        self._job, self._manifest = job, manifest
+    def __init__(self, job: PixelJob, manifest: dict, *, is_behind: bool = False):
+        self._job, self._manifest, self._is_behind = job, manifest, is_behind
+        self._glass: np.ndarray | float = 0.0  # (H, W) number of renders that show glass
         self._renders: list[tuple[SurfaceSamples, np.ndarray]] = []  # samples and their pixels
         self._unusable = self._unnamed = 0  # samples that are not shaded
         self._unshaded = np.zeros(len(manifest["unshaded"]), dtype=int)  # samples by entry of `unshaded`
@@ -233,8 +255,15 @@ class _SampleRenders:
     def add(self, channels: dict[str, np.ndarray]) -> None:
         """Take the `channels` of the next render."""
         gbuffer.clear_holdouts(channels)
-        passes = self._manifest["passes"]
+        passes, through, tint = self._manifest["passes"], gbuffer.seen_through(channels), 1.0
+        if through is not None:
+            self._glass = self._glass + through.any(axis=-1)
+        if self._is_behind:
+            tint = through
+            lobes.read_aov(channels, "hit")[~through.any(axis=-1)] = 0.0
         samples, pixel, unusable = gbuffer.surface_samples(channels, passes["diffuse_color"])
+        if self._is_behind:
+            samples = gbuffer.tinted(samples, through.reshape(-1, 3)[pixel])
         self._renders.append((samples, pixel))
         self._unusable += unusable
         self._unnamed += gbuffer.surfaces_without_sample(channels)
@@ -243,7 +272,18 @@ class _SampleRenders:
             self._left_to_cycles.append(gbuffer.left_to_cycles(channels))
         if self._job.rest:
             rest = gbuffer.not_reflected(channels, passes, self._manifest["film_transparent"])
+            rest[..., :3], rest[..., 3:6] = rest[..., :3] * tint, rest[..., 3:6] * tint
             self._rest = self._rest + rest.astype(np.float64)
+
+    @property
+    def glass(self) -> np.ndarray | None:
+        """`Extraction.glass`."""
+        return self._glass / len(self._renders) if np.any(self._glass) else None
+
+    def not_reflected(self) -> tuple[np.ndarray, np.ndarray]:
+        """The emission and the background of `CyclesPasses`."""
+        rest = self._rest / len(self._renders)
+        return rest[..., :3], rest[..., 3:]
 
     def joined(self) -> tuple[SurfaceSamples, Film]:
         """Samples and film of all renders."""
@@ -282,6 +322,9 @@ class _SampleRenders:
             what = "see a surface whose material could not be read: not shaded"
             warnings.append(f"{100.0 * self._unnamed / total:.3g} % of the samples {what}")
         of_samples = len(warnings)
+        if self.glass is not None:
+            shown = THROUGH_GLASS[bool(self._manifest["behind"])]
+            warnings.append(f"{100.0 * self.glass.mean():.3g} % of the picture shows glass: {shown}")
         warnings += gbuffer.coarse_meshes(samples)
         lost = self._unusable + self._unnamed + int(self._unshaded.sum())
         if 2 * lost > total:
@@ -309,8 +352,7 @@ class _SampleRenders:
         """What Cycles rendered beside the samples."""
         manifest, emission, background, indices = self._manifest, None, None, {}
         if self._job.rest:
-            rest = self._rest / len(self._renders)
-            emission, background = rest[..., :3], rest[..., 3:]
+            emission, background = self.not_reflected()
         if self._job.indices:
             # The first render shows the centers of the pixels.
             channels = rendered_channels(folder / manifest["samples"][0])

@@ -409,17 +409,6 @@ class LTSH_OT_save_exr(_NeedsResults, ExportHelper, bpy.types.Operator):
         return result.folder.parent / group["multilayer"]
 
 
-class LTSH_OT_open_folder(_NeedsResults, bpy.types.Operator):
-    """Open the folder of the results in the system's file browser"""
-
-    bl_idname = "ltsh.open_folder"
-    bl_label = "Open Folder"
-
-    def execute(self, context):
-        bpy.ops.wm.path_open(filepath=str(results.result_of(context.scene).folder.parent))
-        return {"FINISHED"}
-
-
 class LTSH_OT_apply_bake(bpy.types.Operator):
     """Let the objects of the last bake show their textures: they get copies of their materials"""
 
@@ -544,7 +533,6 @@ CLASSES = (
     LTSH_OT_choose,
     LTSH_OT_swap,
     LTSH_OT_save_exr,
-    LTSH_OT_open_folder,
     LTSH_OT_apply_bake,
     LTSH_OT_restore_materials,
     LTSH_OT_manual,

@@ -503,7 +503,7 @@ class _Results:
         row = layout.row(align=True)
         short = {"text": "Save EXR"} if region_width(context) < SPLIT_PIXELS else {}
         row.operator("ltsh.save_exr", icon="FILE_TICK", **short)
-        row.operator("ltsh.open_folder", text="", icon="FILE_FOLDER")
+        row.operator("wm.path_open", text="", icon="FILE_FOLDER").filepath = str(result.folder.parent)
 
     def draw_choice(self, context, result):
         """Draw the choice of pictures; only the Image Editor, which shows them, has it."""

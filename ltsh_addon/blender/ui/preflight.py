@@ -33,6 +33,7 @@ from ..render_settings import CAMERA_KINDS, CAMERA_TYPES, picture_size
 from .preview import ENGINE, view_of
 
 EXACT, APPROXIMATED, LEFT_OUT = "exact", "approximated", "left out"
+OF_MIRRORS = "it reflects lights and the world, and is black where it would show anything else"
 
 
 @functools.cache
@@ -385,7 +386,8 @@ def _material(material, in_view: bool) -> Entry:
     shaders = shaders_behind(surface)
     # An emissive material is a kind, not a defect: leave out the note that it does not light the scene.
     notes = tuple(dict.fromkeys(notes_of_material(surface.node, shaders, emitter=True)))
-    of_view = preview_of(material).notes if in_view else ()
+    look = preview_of(material)
+    of_view = (*look.notes, *([OF_MIRRORS] if look.is_mirror else [])) if in_view else ()
     notes += tuple(f"in the view: {note.removeprefix(f'{material.name}: ')}" for note in dict.fromkeys(of_view))
     shown = [bsdf_of(leaf.node) or is_emission(leaf.node) or leaf.is_transparent for leaf in shaders.leaves]
     state = LEFT_OUT if shown and not any(shown) else APPROXIMATED if notes else EXACT

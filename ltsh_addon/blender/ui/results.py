@@ -124,8 +124,8 @@ def show(scene, folder: Path) -> None:
     for name in result.groups:
         settings.groups.add().name = name
     choice = choice_of(settings, result)
-    if settings.group != choice.group:
-        set_silently(settings, "group", choice.group)
+    # By these names no update function is called.
+    settings["group"] = choice.group
     wanted = {_full(name, layer) for name, group in result.groups.items() for layer in group["files"]}
     for image in [image for image in our_images(scene) if image[LAYER] not in wanted and image[LAYER]]:
         bpy.data.images.remove(image)
@@ -232,17 +232,10 @@ def blender_path(path, blend: str = "") -> str:
         return str(path)
 
 
-def set_silently(settings, key: str, value: str) -> None:
-    """Set a property, if it offers `value`, without a call of its update function."""
-    items = getattr(settings.bl_rna.properties[key], "enum_items", None)
-    if items is None or value in items:
-        settings[key] = value if items is None else items[value].value
-
-
 def leave_mix(settings) -> None:
     """Show the pictures again as before the light mixer."""
     if settings.mode == "MIX":
-        set_silently(settings, "mode", settings.mode_before_mix)
+        settings["mode"] = settings.bl_rna.properties["mode"].enum_items[settings.mode_before_mix].value
 
 
 # The light mixer:

@@ -60,7 +60,7 @@ def leaf(x):
 def half_clear(x):
     made = Build("Half")
     made.show(made.mix(made.value(0.5), made.leaf(0.5), made.shader("BsdfTransparent")))
-    pane(x, made.material)
+    return pane(x, made.material)
 
 
 def lamp(x):
@@ -179,6 +179,29 @@ def test_a_lamp_of_many_faces_has_the_shadows_that_it_has_in_cycles(tmp_path):
         own = report["shadows"]["noise"][part]
         assert squared - 3.0 * deviation < most**2 + own**2, part
         assert bias(layers[f"ltsh4_unshadowed.{part}"], halves)[0] > 0.05**2
+
+
+@pytest.mark.newest
+@pytest.mark.parametrize("most", (2, 3))
+def test_more_panes_than_the_bounces_of_the_file_block_as_in_cycles(most, tmp_path):
+    """Three panes between a floor and its light: in pictures and bakes, Transparent Max Bounces is that of the file."""
+    scene_parts.empty_scene(12, 8)
+    bpy.context.scene.cycles.transparent_max_bounces = most
+    floor = scene_parts.add_plane(scene_parts.principled("Floor", Roughness=0.5)[0], size=1.0, name="Floor")
+    scene_parts.add_camera((0.0, -1.5, 1.5), (0.8, 0.0, 0.0))
+    scene_parts.add_area_light("Light", (0.0, 0.3, 2.0), (-0.2, 0.0, 0.0), size=0.3)
+    for number in range(3):
+        half_clear(0.0).location.z = 0.5 + 0.2 * number
+    for ob in bpy.data.objects:
+        ob.scale *= 5.0 if ob.name.startswith("Pane") else 1.0
+    path = scene_parts.save(tmp_path / "panes.blend")
+    options = {"cycles_samples": 64, "shadow_rays": 16}
+    compare_scene(PictureOptions(scene=path, output=tmp_path, techniques=("ltsh4c",), **options))
+    baked = bake_scenes.baked(path, tmp_path / "bake", shadows="on", error=True, objects=(floor.name,), **options)
+    for layers in (imaging.read_layers(tmp_path / "compare.exr"), baked[1]["Floor.exr"]):
+        expected = np.mean([layers[f"cycles_{half}.diffuse"] for half in "AB"])
+        assert layers["ltsh4c.diffuse"].mean() == pytest.approx(expected, rel=0.02)  # noise of Cycles
+        assert (expected > 0.0) == (most == 3)
 
 
 def test_faces_whose_smooth_normals_point_to_their_other_side_are_lit_as_in_cycles_bake(tmp_path):

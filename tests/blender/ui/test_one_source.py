@@ -74,6 +74,20 @@ def test_materials_have_the_sign_of_what_the_view_says(scene):
     assert "in the view: Roughness is not resolved" in entry.notes
 
 
+@pytest.mark.parametrize(
+    ("metallic", "roughness", "is_black"), [(1.0, 0.05, True), (1.0, 0.5, False), (0.0, 0.05, False)]
+)
+def test_materials_name_chrome_which_views_draw_black(scene, metallic, roughness, is_black):
+    material, shader = principled("Chrome")
+    shader.inputs["Metallic"].default_value, shader.inputs["Roughness"].default_value = metallic, roughness
+    parts.add_plane(material, name="Chrome plane")
+    bpy.context.view_layer.update()
+    for engine in ("BLENDER_WORKBENCH", "LTSH"):
+        scene.render.engine = engine
+        (entry,) = [one for one in preflight.overview(scene).materials if one.name == "Chrome"]
+        assert any("it reflects lights" in note for note in entry.notes) == (is_black and engine == "LTSH")
+
+
 def test_the_eye_of_a_light_is_the_one_that_h_closes(scene):
     light = bpy.data.objects["Light"]
     light.hide_set(True)

@@ -2,7 +2,7 @@
 
 The lights of a group are the leaves of a binary tree. Neighboring samples form a tile. In every branch, a tile takes
 the coarsest node that is small, or whose error is at most ERROR of the light that the tile gets from the group on
-average. These are far fewer nodes than there are lights. A node becomes one point or four, with the mean and the
+average. These are far fewer nodes than there are lights. A node becomes one point, two or four, with the mean and the
 variances of its brightness and the mean of each color; the normals of its lights count as uniform around their mean.
 
 The error is estimated as the light of the node times the fourth power of its size, in units of the length over which
@@ -90,6 +90,7 @@ class LightTree:
     diagonal: np.ndarray  # (N,) mean of `SmallLight.diagonal`; float32, as are swing and color
     children: np.ndarray  # (N, 2) numbers of nodes
     number: np.ndarray  # (N,) of the light
+    is_even: bool  # all lights are equally bright
 
     @classmethod
     def of(cls, lights) -> LightTree:
@@ -115,6 +116,7 @@ class LightTree:
         length = np.linalg.norm(axis, axis=1, keepdims=True)
         axis = np.where(length > 1e-9 * total[:, None], axis / np.maximum(length, 1e-300), normal[order[start]])
         vector = sums(brightness[:, None] * area)
+        is_even = bool(np.ptp(radiance, axis=0).max() <= 1e-6 * radiance.max())
         powers = radiance * size[:, None]
         color = sums(powers).T / total
         away = sums(powers[:, :, None] * offset[:, None]).transpose(1, 2, 0)
@@ -133,10 +135,10 @@ class LightTree:
         radius = over_lights(
             np.maximum, lambda node, light: lengths(offset[light] - middle[node]) + rim[light], (order, start, end)
         )
-        sizes = (values.astype(np.float32) for values in (reach, np.maximum(radius, reach)))
+        sizes = (values.astype(np.float32) for values in (reach, radius))
         directions = (values.astype(np.float32) for values in (axis, normal_spread))
         lights_of_node = vector, swing, color, tint, total, diagonal
-        return cls(middle + origin, *sizes, axes, *directions, *lights_of_node, children, number)
+        return cls(middle + origin, *sizes, axes, *directions, *lights_of_node, children, number, is_even)
 
     @cached_property
     def is_turned(self) -> np.ndarray:
@@ -149,11 +151,18 @@ class LightTree:
         return np.sqrt(np.square(self.tint).sum(axis=1)).max(axis=0)
 
     @cached_property
-    def places(self) -> tuple[np.ndarray, np.ndarray]:
-        """The points (4 N, 3), four for each node, and their colors (3, 4 N)."""
-        points = self.center[:, None] + np.einsum("pk,kxn->npx", CORNERS, self.axes)
-        colors = 0.25 * self.color[..., None] * (1.0 + np.einsum("pk,ckn->cnp", CORNERS, self.tint))
-        return points.reshape(-1, 3), colors.reshape(3, -1).astype(np.float32)
+    def places(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Points (W N, 3), W for each node, and their colors (3, W N): for diffuse lobes, then for specular ones."""
+        number = np.arange(len(self.center))
+        # Of equally bright lights, two opposite corners are enough for specular lobes. Nodes take the pairs in turn, so
+        # that their errors cancel.
+        pairs = np.stack([CORNERS, -CORNERS], axis=1)[number % len(CORNERS)]
+        four, points_by_lobe = CORNERS[0 * number[:, None] + np.arange(len(CORNERS))], []
+        for corners in (four, pairs if self.is_even else four):
+            points = self.center[:, None] + np.einsum("npk,kxn->npx", corners, self.axes)
+            colors = self.color[..., None] * (1.0 + np.einsum("npk,ckn->cnp", corners, self.tint)) / corners.shape[1]
+            points_by_lobe.append((points.reshape(-1, 3), colors.reshape(3, -1).astype(np.float32)))
+        return points_by_lobe
 
 
 class NodeSums:
@@ -496,15 +505,16 @@ class PointDirections:
 class NodePoints:
     """The K points that stand for nodes of a tree in a tile."""
 
-    def __init__(self, tree, pairs: TileNodePairs, middle):
+    def __init__(self, tree, pairs: TileNodePairs, middle, is_specular):
         nodes, single, crossed = pairs.node, pairs.are_points, pairs.are_crossed
-        (places, colors), turned = tree.places, tree.is_turned[nodes]
+        (places, colors), turned = tree.places[is_specular], tree.is_turned[nodes]
         # Nodes that take longer come last.
         order = np.argsort(2 * turned + crossed, kind="stable")
-        count = np.where(single, 1, len(CORNERS))[order]
+        most = len(places) // len(tree.center)
+        count = np.where(single, 1, most)[order]
         node = np.repeat(nodes[order], count)
         ends = np.cumsum(count)
-        number = len(CORNERS) * node + np.arange(len(node)) - np.repeat(ends - count, count)
+        number = most * node + np.arange(len(node)) - np.repeat(ends - count, count)
         points, self.colors = places[number], colors[:, number]
         alone = ends[count == 1] - 1
         points[alone], self.colors[:, alone] = tree.center[node[alone]], tree.color[:, node[alone]]
@@ -551,7 +561,7 @@ def _light_of(tree, lobes, position, tile) -> np.ndarray:
     step = max(PAIRS // len(columns), 1)
     for is_tail in (True, False):
         exact = is_tail and lobes.limits is not None
-        points = NodePoints(tree, pairs.take(pairs.are_in_tail == is_tail), middle)
+        points = NodePoints(tree, pairs.take(pairs.are_in_tail == is_tail), middle, lobes.sharpest is not None)
         for first in range(0, len(points.squared), step):
             block = slice(first, first + step)
             rays = points.directions(block, origins)

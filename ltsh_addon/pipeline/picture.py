@@ -135,7 +135,7 @@ def draw_view(options: ViewOptions, progress: Progress | None = None) -> TaskRes
         layers = {
             layer_name(technique, pass_name): np.load(folder / f"{number}_{pass_name}.npy")
             for number, technique in enumerate(tables)
-            for pass_name in view.VIEW_PASSES
+            for pass_name in manifest["passes"]
         }
         shown = (folder / view.VIEW_PNG).read_bytes()
     check_before_writing(progress)

@@ -311,7 +311,7 @@ def test_nodes_have_the_power_and_the_moments_of_their_lights():
     moments = ((power[:, None] * shift).T @ shift + own) / power.sum()
     axes = tree.axes[:, :, 0]
     assert np.allclose(axes.T @ axes, moments)
-    points, colors = (values[..., :4] if len(values) == 3 else values[:4] - tree.center[0] for values in tree.places)
+    points, colors = tree.places[0][0][:4] - tree.center[0], tree.places[0][1][:, :4]
     assert np.allclose(points.mean(axis=0), 0.0) and np.allclose(points.T @ points / 4, moments)
     # Each color of the points has the power and the center of its color of the lights.
     powers = radiance * np.linalg.norm(area, axis=1)[:, None]

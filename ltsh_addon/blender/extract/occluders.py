@@ -177,8 +177,8 @@ class _Collector:
                     in_planes[f"{instance.object.original.name!r} in {name!r}"] = None
         if in_planes:
             warn(
-                f"shadows: area lights in the plane of a face: {listed(in_planes, NAMED)}: Cycles loses a part of "
-                "their light at random, the techniques lose nothing; move them off by 0.1 mm"
+                f"shadows: area lights in the plane of a face: {listed(in_planes, NAMED)}: Cycles shows at "
+                "random from all to none of their light, the techniques show all; move them off by 0.1 mm"
             )
         owners = np.array([instances.owner for instances in self._instances], np.int64)[instance_of]
         pairs = sorted(occluders.overlaps(owners).items(), key=lambda pair: -pair[1])

@@ -11,6 +11,7 @@ from ...shading.header import definitions
 from .drawing import PixelShader, ViewCamera, drawing, empty_texture, frame_buffer, glsl, size_of
 
 MODES = ("single", "split", "difference")
+TRANSMITTED = "transmitted"  # the passes of what glass shows alone
 # RAYS: the shader constants with the rays of `ViewCamera.rays`.
 RAYS = ("ray_x", "ray_y", "ray_center")
 
@@ -82,17 +83,18 @@ class VeilPass:
     """Draws what is behind glass; needs an active GPU context."""
 
     def __init__(self):
-        constants = {"is_seen": "FLOAT", **dict.fromkeys(RAYS, "VEC4")}
+        constants = {"is_seen": "FLOAT", "beside": "FLOAT", **dict.fromkeys(RAYS, "VEC4")}
         self._shader = PixelShader(glsl("octahedron") + glsl("veil"), ("behind", "left", "glass", "sky"), constants)
 
-    def draw(self, textures: dict[str, gpu.types.GPUTexture], target, view: ViewCamera, is_seen: bool) -> None:
+    def draw(self, textures: dict[str, gpu.types.GPUTexture], target, view: ViewCamera, passes: str) -> None:
         """Add the picture of the surfaces, over the background, to `target`, dimmed where there is glass.
 
         `textures` are `behind`, the picture (RGBA); `left`, the share that glass lets through (RGB); `glass`, its
-        positions; `sky`, the background. Without `is_seen` the background behind glass is black.
+        positions; `sky`, the background. Glass is black in `passes` of reflected light; beside glass TRANSMITTED is.
         """
         with drawing(target, (0, 0, *size_of(textures["behind"])), "ADDITIVE_PREMULT"):
-            self._shader.bind(textures, {"is_seen": float(is_seen), **_rays(view, 1.0)})
+            seen = {"is_seen": float(passes in ("combined", TRANSMITTED)), "beside": float(passes != TRANSMITTED)}
+            self._shader.bind(textures, {**seen, **_rays(view, 1.0)})
             self._shader.draw()
 
 

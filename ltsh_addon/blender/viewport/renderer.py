@@ -18,7 +18,17 @@ from .drawing import GBufferTextures, PixelShader, ViewCamera, VisibilityGrid, f
 from .light_texels import UploadedLights, background_texels, sky_texels, upload_lights
 from .lighting import GOLDEN, HorizonPass, LightingPass
 from .mirror import SceneMirror
-from .pictures import LightingState, PicturePass, SampleSum, ShownPicture, StaticLighting, VeilPass, copy, same_state
+from .pictures import (
+    TRANSMITTED,
+    LightingState,
+    PicturePass,
+    SampleSum,
+    ShownPicture,
+    StaticLighting,
+    VeilPass,
+    copy,
+    same_state,
+)
 from .shadow_rays import ShadowRays
 from .shadows import LiveShadows
 from .surfaces import SurfacePass, has_bent_lobes
@@ -195,18 +205,22 @@ class ViewRenderer:
             self._add_emission(self._surfaces, frame, self._sums)
             return True
         self._behind = _cleared(self._behind, frame, True)
-        self._light_surfaces(frame, self._behind, state)
-        self._add_emission(self._surfaces, frame, self._behind)
+        behind = [(technique, "combined" if passes == TRANSMITTED else passes) for technique, passes in frame.pictures]
+        behind = replace(frame, pictures=tuple(behind))
+        self._light_surfaces(behind, self._behind, state)
+        self._add_emission(self._surfaces, behind, self._behind)
         textures = {
             "left": self._glass.through(frame.mirror.instances, frame.view),
             "glass": self._glass.lobe(0, frame.mirror, frame.view, self._lights).position,
             "sky": self._background,
         }
         for picture, target, (_, passes) in zip(self._behind, self._sums, frame.pictures, strict=True):
-            is_seen = passes == "combined" and frame.with_emission
-            self._veil.draw({"behind": picture.texture, **textures}, target.within(), frame.view, is_seen)
-        self._light(self._glass, frame, self._sums, "ADDITIVE")
-        self._add_emission(self._glass, frame, self._sums)
+            shown = passes if frame.with_emission or passes != "combined" else "diffuse"
+            self._veil.draw({"behind": picture.texture, **textures}, target.within(), frame.view, shown)
+        front = [pair for pair in zip(frame.pictures, self._sums, strict=True) if pair[0][1] != TRANSMITTED]
+        frame, sums = replace(frame, pictures=tuple(pair[0] for pair in front)), [pair[1] for pair in front]
+        self._light(self._glass, frame, sums, "ADDITIVE")
+        self._add_emission(self._glass, frame, sums)
         return True
 
     def _draw_surfaces(self, frame: Frame) -> list[SurfaceLayer]:

@@ -16,6 +16,7 @@ from ...scene import SceneError, error_line, listed
 from .. import render_settings
 from ..extract.occluders import with_baked_shares
 from ..extract.pixels import missing_images, no_light, open_scene
+from ..lights.area import collect_lights, note_overlaps
 from ..lights.world import light_of_world
 from ..materials.preview_material import world_radiance
 from ..process.view import GRAPHICS, VIEW_PASSES, VIEW_PNG, ViewJob
@@ -24,7 +25,7 @@ from .drawing import ViewCamera, read_texture
 from .light_texels import ShownSky, varied_sky
 from .live_cycles import rendered_world
 from .mirror import NOT_RESOLVED, SceneMirror, patterns_of
-from .pictures import ShownPicture
+from .pictures import TRANSMITTED, ShownPicture
 from .renderer import ViewRenderer
 from .shadow_rays import ShadowRays, too_many, view_occluders
 
@@ -50,14 +51,15 @@ def draw_view(job: ViewJob, folder: Path, progress) -> dict:
         patterns = patterns_of(scene, depsgraph)
         occluders = view_occluders(depsgraph, warnings.append, unread) if job.shadows == "on" else None
         warnings += missing_images(depsgraph, scene.world, _layer(scene).material_override)
+        warnings += overlaps_of_lights(depsgraph)
     if unread:
         occluders = with_baked_shares(occluders, unread, scene, warnings.append)
     progress(GRAPHICS, 0.0)
     read = scene, camera, sky, patterns, occluders
     pictures, notes, facts = with_graphics(lambda: _draw(job, read, size, progress))
     for number, pixels in enumerate(pictures):
-        technique, index = divmod(number, len(VIEW_PASSES))
-        save_array(folder / f"{technique}_{VIEW_PASSES[index]}.npy", pixels)
+        technique, index = divmod(number, len(facts["passes"]))
+        save_array(folder / f"{technique}_{facts['passes'][index]}.npy", pixels)
     render_settings.save_png(scene, pictures[0], folder / VIEW_PNG)
     return {
         "blender_version": bpy.app.version_string,
@@ -73,6 +75,17 @@ def draw_view(job: ViewJob, folder: Path, progress) -> dict:
         **facts,
         "seconds": time.monotonic() - started,
     }
+
+
+def overlaps_of_lights(depsgraph) -> list[str]:
+    """Warnings about area lights that overlap in a plane."""
+    lights = [each.object for each in depsgraph.object_instances if each.object.type == "LIGHT"]
+    if sum(light.data.type == "AREA" for light in lights) < 2:
+        return []
+    inventory = collect_lights(depsgraph, depsgraph.view_layer_eval.material_override)
+    inventory.warnings.clear()
+    note_overlaps(inventory)
+    return inventory.warnings
 
 
 def with_graphics(function: Callable):
@@ -190,7 +203,8 @@ def _draw(job: ViewJob, read: tuple, size: tuple[int, int], progress) -> tuple[l
             shadows = ShadowRays(occluders, rays)
     canvas = _Canvas(mirror, view_of_camera(camera.evaluated_get(depsgraph), depsgraph, size), size)
     points = render_settings.sub_pixel_offsets(scene, job.refine)
-    first, *others = ((technique, name) for technique in job.techniques for name in VIEW_PASSES)
+    passes = (*VIEW_PASSES, TRANSMITTED) if mirror.has_glass else VIEW_PASSES
+    first, *others = ((technique, name) for technique in job.techniques for name in passes)
     try:
         shown = replace(_shown(scene, first[0]), also=tuple(others))
         pictures = canvas.draw(shown, points, shadows, lambda share: progress("draw", share))
@@ -212,6 +226,7 @@ def _draw(job: ViewJob, read: tuple, size: tuple[int, int], progress) -> tuple[l
             "graphics": f"{gpu.platform.renderer_get()}, {gpu.platform.backend_type_get()}",
             "lights": sorted({light.name for light in (*mirror.lights, *mirror.sky.sides)}),
             "shadows": traced,
+            "passes": passes,
         },
     )
 

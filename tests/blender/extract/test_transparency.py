@@ -173,12 +173,12 @@ def test_what_only_cycles_can_tell_is_baked(tmp_path, name):
     assert before == after
 
 
-def test_in_a_view_what_only_cycles_can_tell_blocks_and_is_named():
+def test_in_a_view_what_only_cycles_can_tell_counts_as_half_and_is_named():
     start()
     pane(shown(BAKED["noise"][0]))
     occluders, warnings = scene_parts.collected_occluders()
-    assert len(warnings) == 1 and "blocks as if it were opaque: 'Pane'" in warnings[0], warnings
-    assert seen_by_rays(occluders)[0].min() == 0.0
+    assert len(warnings) == 1 and "lets 50 % of the light through, at most as much off: 'Pane'" in warnings[0], warnings
+    assert seen_by_rays(occluders)[0].min() == 0.5
 
 
 @pytest.mark.parametrize("output", ["Ray Length", "Transparent Depth", "Incoming"])

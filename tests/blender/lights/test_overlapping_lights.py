@@ -9,6 +9,7 @@ import quadrature
 import scene_parts
 
 from ltsh_addon.blender.lights.area import overlapping_pairs
+from ltsh_addon.blender.viewport import still
 from ltsh_addon.scene import EllipseLight, QuadLight
 
 
@@ -36,6 +37,13 @@ def test_cycles_loses_light_and_the_warning_says_how_much(tmp_path):
     (line,) = prepared[3]
     assert "'Upper' and 'Lower' (100 %)" in line and "up to 50 %" in line
     assert 0.05 < excess(tmp_path, prepared) < 0.5
+
+
+@pytest.mark.parametrize(("apart", "count"), [(0.0, 1), (0.1, 0)])
+def test_views_name_them_too(apart, count):
+    two_lights(apart)
+    warnings = still.overlaps_of_lights(bpy.context.evaluated_depsgraph_get())
+    assert len(warnings) == count and all("'Upper' and 'Lower' (100 %)" in line for line in warnings)
 
 
 @pytest.mark.newest

@@ -551,7 +551,7 @@ def test_glass_shows_what_is_behind_tinted_and_the_reflection_before_it(kind):
                 camera.matrix_world.inverted(), camera.calc_matrix_camera(depsgraph, x=SIZE[0], y=SIZE[1]), True
             )
             pictures = []
-            for passes in ("combined", "specular"):
+            for passes in ("combined", "specular", "transmitted"):
                 shown = ShownPicture("ltsh4", passes)
                 for _ in range(2):
                     renderer.draw(mirror, view, SIZE, shown, canvas.buffer, np.zeros((2, 2)))
@@ -560,7 +560,7 @@ def test_glass_shows_what_is_behind_tinted_and_the_reflection_before_it(kind):
         finally:
             renderer.free()
 
-    combined, specular = with_graphics(draw)
+    combined, specular, transmitted = with_graphics(draw)
     height, width = combined.shape[:2]
 
     def at(picture, x, y):
@@ -576,5 +576,6 @@ def test_glass_shows_what_is_behind_tinted_and_the_reflection_before_it(kind):
     for x, y, behind, is_glass in places:
         expected = through * behind + reflected if is_glass else behind
         np.testing.assert_allclose(at(combined, x, y), expected, rtol=5e-3, err_msg=f"{x}, {y}")
+        np.testing.assert_allclose(at(transmitted, x, y), is_glass * through * behind, rtol=5e-3, err_msg=f"{x}, {y}")
     # The stick is before the glass.
     np.testing.assert_allclose(at(combined, 1.0, 0.0), glow, rtol=5e-3)

@@ -1,4 +1,4 @@
-/* The lit surfaces over the background, dimmed by glass where there is any. */
+/* The lit surfaces over the background, dimmed by glass where there is any; `beside` 0: only where there is. */
 void main()
 {
   ivec2 texel = ivec2(gl_FragCoord.xy);
@@ -7,5 +7,5 @@ void main()
   vec3 ray = place.x * ray_x.xyz + place.y * ray_y.xyz + ray_center.xyz;
   vec3 world = ltsh_sky_at(ray, ivec2(0), textureSize(sky, 0).x - 2);
   vec3 seen = is_seen * texelFetch(left, texel, 0).rgb * (lit.rgb + (1.0 - lit.a) * world);
-  color = texelFetch(glass, texel, 0).w > 0.0 ? vec4(seen, 1.0) : lit;
+  color = texelFetch(glass, texel, 0).w > 0.0 ? vec4(seen, 1.0) : beside * lit;
 }

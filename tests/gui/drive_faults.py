@@ -304,7 +304,7 @@ def saved(rig):
     rig.check(results.result_of(scene).command == "shade", "a click shows those of shading")
     rig.shot("15_saved.png")
     # Blender loads nothing from the file that is open.
-    with bpy.data.libraries.load(shutil.copy(bpy.data.filepath, folder / "copy.blend")) as (there, _):
+    with bpy.data.libraries.load(shutil.copy(bpy.data.filepath, str(folder / "copy.blend"))) as (there, _):
         names = [name for name in there.images if name.startswith("LTSH ") and name != "LTSH Comparison"]
     rig.check(names == [], f"no picture is in the file: {names}")
 

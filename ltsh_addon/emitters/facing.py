@@ -20,6 +20,8 @@ NEAR_DISK = 1e-3
 LEAST_SHRINKING = 1e-6
 # Least radius of a disk in units of its distance: in smaller ones too few digits of double precision tell edges apart.
 LEAST_SIZE = 1e-5
+# Squared radius in units of the squared distance below which single precision needs more care for the near side.
+SMALL = 1e-4
 # Shares of the brightest place of a disk. CHANGING: emission that varies by less takes a plain mean. STEP: emission
 # that falls below counts as having a step.
 CHANGING, STEP = 0.01, 0.1
@@ -154,9 +156,13 @@ def ray_length(light, offset: np.ndarray, directions: np.ndarray) -> np.ndarray:
     least = 1e-9 * np.sqrt(squared) + np.finfo(offset.dtype).tiny
     if not light.is_sphere:
         return squared / np.maximum(along, least)
-    rest, across = light.radius**2 - squared, offset - along * directions
+    rest = light.radius**2 - squared
+    if light.radius**2 < SMALL * squared.max(initial=0.0):
+        across = offset - along * directions
+        root = np.sqrt(np.maximum(light.radius**2 - dot(across, across), 0.0))
+    else:
+        root = np.sqrt(np.maximum(rest + along * along, 0.0))
     # The near side or, from within, the far one, computed without a difference of nearly equal numbers.
-    root = np.sqrt(np.maximum(light.radius**2 - dot(across, across), 0.0))
     return np.where(rest < 0.0, -rest / np.maximum(along + root, least), along + root)
 
 

@@ -48,13 +48,13 @@ ROUNDS = 4
 # by LIKE_ALPHA of one.
 LIKE_NORMAL, LIKE_LOBE, LIKE_ALPHA = np.float32(0.1), np.float32(0.7), np.float32(0.2)
 # Samples do not share rays where that would change their light by more than this share of the typical one, nor where
-# all their rays are blocked. These are enough rays to tell that all is blocked.
-MOST_BIAS, ENOUGH_RAYS = 0.007, 64
-# Pairs of opposite pixels (y, x) around a pixel that share rays, and their weights in (1, 2, 2, 2, 1) x (1, 2, 2, 2,
-# 1), which counts all places of a square of 4 x 4 pixels alike. TILE: the number of pixels that this is worth.
+# all their rays are blocked: of so many rays.
+MOST_BIAS, ENOUGH_RAYS = 0.01, 64
+# Pairs of opposite pixels (y, x) around a pixel that share rays. The weights of the kernel (1, 2, 2, 2, 1) x (1, 2, 2,
+# 2, 1) count all places of a square of 4 x 4 pixels alike. TILE: how many pixels this is worth, as measured.
 AROUND = [(y, x) for y in range(-2, 3) for x in range(-2, 3) if (y, x) > (0, 0)]
 KERNEL, CENTER = np.array([(2 - abs(y) // 2) * (2 - abs(x) // 2) for y, x in AROUND], np.float32), np.float32(4.0)
-TILE = np.float32(16.0)
+TILE = np.float32(12.0)
 # Numbers of AROUND two pixels away, and what the kernel adds to a picture per second difference of these: half its
 # variance of 1.5 pixels over the squared distance.
 ACROSS, BEND = [AROUND.index(step) for step in ((0, 2), (2, 0))], np.float32(0.75 / 4.0)
@@ -275,19 +275,19 @@ class RatioEstimator:
         self._aim_at_corners()
 
     def _trace_alone(self, number, choice, worth):
-        """Give up sharing where that changes the light: there, trace `number` (Q,) rays anew."""
-        bends = np.zeros(len(self.index), bool)
-        for name in PASSES:
-            change = self._neighbors.bend(name, self.index, self.visibility_ratio(name)[0])
-            bends |= np.abs(change) * worth[name] ** WORTH_POWER > MOST_BIAS
-        dark = ~self.visible & ~bends
-        number = np.where(dark, np.minimum(number, ENOUGH_RAYS), number)
-        alone = self.is_shared & (self.count > PROBES) & (bends | dark)
-        self.is_shared &= ~alone
-        for sums in (self.sum_w, self.sum_wv):
-            sums[:, :, alone] = 0.0
-        self._add_rays(np.flatnonzero(alone), 0, PROBES, 0)
-        self._trace_more(alone & (number > PROBES), number, choice, None)
+        """Give up sharing where that changes the light: there, trace up to `number` (Q,) rays anew."""
+        alone = ~self.visible
+        for last in (np.minimum(number, ENOUGH_RAYS), number):
+            alone &= self.is_shared & (self.count > PROBES)
+            self.is_shared &= ~alone
+            for sums in (self.sum_w, self.sum_wv):
+                sums[:, :, alone] = 0.0
+            self._add_rays(np.flatnonzero(alone), 0, PROBES, 0)
+            self._trace_more(alone & (last > PROBES), last, choice, None)
+            alone = np.zeros(len(self.index), bool)
+            for name in PASSES:
+                change = self._neighbors.bend(name, self.index, self.visibility_ratio(name)[0])
+                alone |= np.abs(change) * worth[name] ** WORTH_POWER > MOST_BIAS
 
     def _trace_more(self, chosen, number, choice, order):
         """Trace rays of the `chosen` pairs up to the `number`, split by `choice`; each (Q,)."""
@@ -504,7 +504,9 @@ class RatioEstimator:
         sum_w, sum_wv = self.sum_w[PASSES.index(name)], self.sum_wv[PASSES.index(name)]
         count = np.maximum(self.count, 1).astype(np.float32)
         if self.is_shared.any():
-            sums = self._neighbors.shared(name, self.index, np.stack([sum_w, sum_wv]) / count)
+            # Samples that see nothing of the sky would darken those beside a step.
+            sees, sums = self.visible, np.stack([sum_w, sum_wv]) / count
+            sums[..., sees] = self._neighbors.shared(name, self.index[sees], sums[..., sees])
             shared = self.is_shared & (self.count > PROBES) & self.wanted[name]
             sum_w, sum_wv = np.where(shared, sums, (sum_w, sum_wv))
             count = np.where(shared, count * self._neighbors.sharing(name, self.index), count)

@@ -5,7 +5,9 @@ doi:10.1145/3190834.3190852): shadowed radiance = closed form x sum(w V) / sum(w
 the light. w is what the pass reflects of the light along the ray, divided by the probability density of the ray. Both
 passes use the same rays.
 
-The result for a sample depends on its neighbors, but not on its place in the picture or in a block.
+Like samples of pixels beside each other share their rays to a sky. They take its directions in turns (Ahmed and Wonka
+2020, "Screen-space blue-noise diffusion of Monte Carlo sampling error via hierarchical ordering of pixels",
+doi:10.1145/3414685.3417881), so that the result depends on the block. All else depends on neighbors alone.
 """
 
 from __future__ import annotations
@@ -46,7 +48,8 @@ class Visibility:
 
     specular: np.ndarray | None  # (E, P) float32
     diffuse: np.ndarray | None
-    # By pass, over all lights: the approximate radiance (P,) that each sample reflects, and its standard deviation
+    # By pass, over all lights: the approximate radiance (P,) that each sample reflects, and its standard deviation. Of
+    # two samples that `JoinedLobes` joins, the first has both.
     radiance: dict[str, np.ndarray]
     deviation: dict[str, np.ndarray]
     rays: int  # number of rays traced

@@ -285,7 +285,9 @@ class _Collector:
                 return _ClearMaterial(shares=shares) if max(shares) > 0.0 else None
             return self._unread_material(material)
         if not values.is_gray(value):
-            self._note("colored transparency counts by its mean, shadows are gray", material)
+            most = np.abs(value.offset - value.offset.mean()).max() if value.is_constant else 1.0
+            size = f"up to {_percent(most)} of the light off in a color"
+            self._note(f"colored transparency counts by its mean, {size}, as shadows are gray", material)
             value = value.mapped(np.full((3, 3), 1.0 / 3.0))
         if value.is_constant:
             share = float(np.clip(value.offset[0], 0.0, 1.0))

@@ -377,7 +377,7 @@ def test_more_panes_than_cycles_goes_through_block(tmp_path):
 
 NAMED = {
     "procedural": "'Pane'",
-    "colored": "by its mean",
+    "colored": "by its mean, up to 50 % of the light off",
     "color under alpha": "only Cycles can tell",
     "displaced": "displacement",
     "hidden from reflections": "light that surfaces choose counts as glossy",

@@ -227,6 +227,7 @@ class MessageProgress(ProgressBar):
     def __init__(self, send: Callable[[dict], None]):
         super().__init__(None)
         self._send, self._last = send, 0.0
+        self.expect = lambda seconds: send({"expected": seconds})
         self.notes: list[str] = []
 
     def __call__(self, stage: str, fraction: float) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..emitters.light_tree import stand_ins
 from ..lobes import brdf, polygon
-from ..scene import Light, PolygonLight, SurfaceSamples
+from ..scene import Cancelled, Light, PolygonLight, Progress, SurfaceSamples
 from .light_tree import light_selection_pmf, light_tree_rows
 
 SPECULAR_FIELDS = ("specular_f0", "specular_f90", "specular_dip", "dielectric")
@@ -87,6 +87,7 @@ def end_at_horizons_of_cycles(
     hit: np.ndarray | None = None,
     is_baked: bool = False,
     is_quick: bool = False,
+    progress: Progress | None = None,
 ) -> tuple[SurfaceSamples, np.ndarray]:
     """Samples (Q) whose specular lobes end where those of Cycles do, and the index (Q,) of each one's sample (P).
 
@@ -106,7 +107,7 @@ def end_at_horizons_of_cycles(
     if len(differ) == 0 or not lights:
         return samples, index
     chances = lobe_selection_pmf(samples, index if hit is None else hit, is_baked)
-    excess = horizon_excess(samples.take(differ), lights, chances[:, differ], is_quick=is_quick)
+    excess = horizon_excess(samples.take(differ), lights, chances[:, differ], is_quick=is_quick, progress=progress)
     share, by_smooth = smooth_horizon_share(*excess), np.zeros(len(samples))
     by_smooth[differ] = _with_few_splits(share, sum(excess)) if is_quick else share
     by_smooth = np.where(by_smooth < SMALLEST_SHARE, 0.0, np.where(by_smooth > 1.0 - SMALLEST_SHARE, 1.0, by_smooth))
@@ -162,7 +163,12 @@ def _reflectance(samples, cosine) -> np.ndarray:
 
 
 def horizon_excess(
-    samples: SurfaceSamples, lights: tuple[Light, ...], chances: np.ndarray, choose=None, is_quick: bool = False
+    samples: SurfaceSamples,
+    lights: tuple[Light, ...],
+    chances: np.ndarray,
+    choose=None,
+    is_quick: bool = False,
+    progress: Progress | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The light (P,) that only one of the horizons lets through, split by who chose its direction: a lobe or the light.
     The smooth horizon is wrong about the first part, the mesh's horizon about the second.
@@ -179,6 +185,8 @@ def horizon_excess(
     step = min(max(MOST_PAIRS // len(lights), 1), BLOCK)
     excess = np.empty((2, len(samples)))
     for start in range(0, len(samples), step):
+        if progress is not None and progress("horizons", start / len(samples)) is False:
+            raise Cancelled("stopped at the horizons of bumped surfaces")
         block = slice(start, start + step)
         excess[:, block] = _excess(samples.take(block), shapes, chances[:, block], choose, is_quick)
     return excess[0], excess[1]

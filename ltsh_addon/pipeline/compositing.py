@@ -307,6 +307,17 @@ def _shared_out(rest: np.ndarray, groups: dict[str, np.ndarray], is_clean: bool)
     return {"": remaining, **groups}
 
 
+def noise(cycles, passes: dict[str, DirectPass]) -> list[float]:
+    """Mean noise of a pixel before denoising, relative to the light: of Cycles' picture without what LTSH replaces, and
+    of all of it; [] if it is not known."""
+    if not cycles.noise:
+        return []
+    whole, light = read_layer(cycles.noise, "Combined", "RGB"), read_layer(cycles.channels, "Combined", "RGB").sum()
+    direct = {name: read_layer(cycles.noise, cycles.names[light], "RGB") for name, (light, _) in DIRECT.items()}
+    replaced = sum(_share_of(one.share, direct[name] * one.color) for name, one in passes.items())
+    return [float(np.nansum(np.abs(one)) / max(light, 1e-30)) for one in (whole - replaced, whole)]
+
+
 # What is written:
 
 

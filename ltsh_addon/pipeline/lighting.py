@@ -21,6 +21,7 @@ from ..emitters.light_tree import FEWEST
 from ..files import check_takes_files
 from ..imaging.exr import unique_names
 from ..scene import CYCLES, REFERENCE, SHIPPED_TABLES, TECHNIQUES, Cancelled, Film, Light, Progress, SurfaceSamples
+from ..workers.pool import cores
 
 # MOST_PAIRS: how many pairs of a sample and a light have their radiance in memory at a time.
 MOST_PAIRS = 1 << 25
@@ -28,6 +29,10 @@ MOST_PAIRS = 1 << 25
 # eight only tell whether more are needed.
 FEWEST_RAYS = 32
 REFERENCE_SEED = 20160725
+# LOOKS: shares of the samples by which the seconds of stages are foretold.
+LOOKS = 0.003, 0.012
+# SHARES_DONE: of the work of one or two passes after each. Diffuse light takes a third to a thirtieth of the other.
+SHARES_DONE = {1: ((0, 1), (0.0, 1.0)), 2: ((0, 1, 2), (0.0, 0.8, 1.0))}
 # Limits of the reference: MOST_REFERENCE_PAIRS pairs of a sample and a light, some 30 us each, but always
 # FEWEST_SAMPLES samples.
 MOST_REFERENCE_PAIRS, FEWEST_SAMPLES = 3_000_000, 32
@@ -127,12 +132,40 @@ class ShadowTracer:
         return Shadows(shares, estimate.numbers, noise, estimate.rays, tracer, seconds, light, variance)
 
 
-def trace_shadows(extraction, passes: Sequence[str], rays: int, progress: Progress | None) -> Shadows:
+def trace_shadows(extraction, passes: Sequence[str], rays: int, progress: Progress | None, workers=None) -> Shadows:
     """The shadows of the samples of an `Extraction`; the samples of a pixel share `rays` per light."""
     film = extraction.film
     sampling = visibility.ShadowSampling(passes, rays_of_samples(rays, film), film)
     with ShadowTracer(extraction.occluders, extraction.lights) as tracer:
-        return tracer.trace(extraction.samples, sampling, progress=progress)
+        return tracer.trace(extraction.samples, sampling, workers=workers, progress=progress)
+
+
+def tell_expected(extraction, tables: dict[str, Shader], passes: Sequence[str], rays: int, progress) -> None:
+    """Call `progress.expect`, if there is one, with the seconds of stages to come, measured on LOOKS of the samples."""
+    from ..blender.process.pixels import ended_at_horizons
+
+    tell, count, looks = getattr(progress, "expect", None), len(extraction.samples), []
+    sizes, names = [int(share * count) for share in LOOKS], [name for name in tables if name != REFERENCE]
+    if tell is None or sizes[0] < FEWEST_SAMPLES:
+        return
+    order = np.random.default_rng(0).permutation(count)
+    for size in (sizes[0], *sizes):  # the first look also loads what all need
+        chosen, times = np.sort(order[:size]), [time.perf_counter()]
+        looked = replace(extraction, samples=extraction.samples.take(chosen), film=extraction.film.take(chosen))
+        looked, shadows = ended_at_horizons(looked), None
+        times.append(time.perf_counter())
+        if extraction.occluders is not None:
+            shadows = trace_shadows(looked, passes, rays, None, workers=1)
+        times.append(time.perf_counter())
+        for name in names:
+            shade_lights(looked.samples, looked.lights, tables[name], passes, (shadows, None), workers=1)
+            times.append(time.perf_counter())
+        looks.append(np.diff(times))
+    # What every number of samples takes alike is not multiplied.
+    _, less, more = looks
+    seconds = more + (count - sizes[1]) / (sizes[1] - sizes[0]) * np.maximum(more - less, 0.0)
+    seconds[1:] /= cores()
+    tell(dict(zip(["horizons", "shadows", *map(title, names)], seconds.tolist(), strict=True)))
 
 
 def shade_lights(
@@ -298,7 +331,7 @@ def _evaluate(name, table, extraction, shadows, options, progress) -> TechniqueR
     for index, pass_name in enumerate(options.passes):
 
         def report(fraction, done=index):
-            whole = (done + fraction) / len(options.passes)
+            whole = float(np.interp(done + fraction, *SHARES_DONE[len(options.passes)]))
             return None if progress is None else progress(title(name), whole)
 
         if report(0.0) is False:

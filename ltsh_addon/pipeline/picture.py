@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -64,7 +65,7 @@ def make_picture(options: PictureOptions, with_cycles: bool, progress: Progress 
             # One Blender for both: it extracts the samples and makes the PNG of the picture.
             folder = stack.enter_context(temporary_folder())
             stack.enter_context(shared_blender(folder))
-        extraction = _extracted(options, with_cycles, progress)
+        extraction = _extracted(options, with_cycles, tables, progress)
         shadows = None
         if extraction.occluders is not None:
             shadows = lighting.trace_shadows(extraction, options.passes, options.shadow_rays, progress)
@@ -98,7 +99,7 @@ def _transmitted(tables, extraction, options: PictureOptions, progress) -> Compa
     return Comparison(options, behind, evaluated(tables, behind, shadows, options, progress), shadows)
 
 
-def _extracted(options: PictureOptions, with_cycles: bool, progress):
+def _extracted(options: PictureOptions, with_cycles: bool, tables, progress):
     """The `Extraction` of a scene: samples and lights, with Cycles' picture where asked for."""
     from ..blender.process.pixels import PixelJob, extract_pixels
 
@@ -106,7 +107,8 @@ def _extracted(options: PictureOptions, with_cycles: bool, progress):
     samples = options.cycles_samples if with_cycles else 0
     rest = set(PASSES) <= set(options.passes)
     job = child_job(PixelJob, options, width=width, height=height, cycles_samples=samples, rest=rest)
-    return extract_pixels(job, progress=progress)
+    expected = {"passes": options.passes, "rays": options.shadow_rays, "progress": progress}
+    return extract_pixels(job, progress=progress, look=partial(lighting.tell_expected, tables=tables, **expected))
 
 
 def view_transformed(pixels: np.ndarray, options, folder: Path, progress) -> bytes:

@@ -128,6 +128,7 @@ def finish(
         clock.end("denoise")
         report = _report(comparison, cycles, passes, rest)
         report["finished"] |= {"denoiser": rest.denoiser, "budget_s": options.budget}
+        report["finished"]["gain"] = _gain(cycles, passes, combined, clock.stages)
         if not np.any(combined[..., :3]):
             report["warnings"].append(
                 f"camera {cycles.camera!r} sees no light at all, by Cycles neither: the picture is black; add a light, "
@@ -193,7 +194,7 @@ def shade_direct_light(
         if points > extraction.film.sub_samples:
             extraction = extract_pixels(replace(job, sub_samples=points, seconds=None), progress=progress)
             clock.end("extraction", extraction.times.processor)
-        extraction = ended_at_horizons(with_points(extraction, points))
+        extraction = ended_at_horizons(with_points(extraction, points), progress)
         clock.end("extraction")
         shadows = shader.shadows(extraction, progress)
         clock.end("shadows")
@@ -361,16 +362,29 @@ def _report(comparison: Comparison, cycles, passes: dict, rest: compositing.Rest
     }
 
 
+def _gain(cycles, passes: dict, combined: np.ndarray, stages: dict[str, float]) -> dict:
+    """LTSH's share of the light; the noise before denoising, and that of Cycles alone in as many `stages` (s)."""
+    light = sum(one.image.sum() for one in passes.values()) / max(combined[..., :3].sum(), 1e-30)
+    sampling = max(cycles.processor_seconds - cycles.least_seconds, 1e-3)
+    more = (sum(stages.values()) - stages["cycles"] - stages["denoise"]) / sampling
+    noise, alone = compositing.noise(cycles, passes) or (None, None)
+    alone = None if alone is None else float(alone / np.sqrt(1.0 + more))
+    return {"share_of_light": float(light), "noise": noise, "noise_of_cycles": alone}
+
+
 def summary(report: dict, seconds: dict) -> list[str]:
     """Lines about what a picture is made of, and how long it took."""
     finished, (width, height) = report["finished"], report["resolution"]
     shares = ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in finished["share_of_ours"].items())
     took = f", {seconds['processor']['total']:.1f} s of processor time" if "processor" in seconds else ""
     denoised = f"denoised by {finished['denoiser']}" if finished["denoiser"] else "not denoised"
+    light, noise, alone = finished["gain"].values()
+    noises = [100.0 * one for one in (noise, alone) if one is not None]
+    gained = "; noise {:.1f} % before denoising, Cycles alone in this time {:.1f} %".format(*noises) if noises else ""
     return [
         f"{width}x{height}, {report['sub_samples']} points per pixel, {report['cycles_samples']} samples of Cycles, "
         f"{denoised}{took}",
-        f"direct light by LTSH on: {shares} of the pixels",
+        f"direct light by LTSH on: {shares} of the pixels, {100.0 * light:.0f} % of the light{gained}",
     ]
 
 

@@ -192,7 +192,9 @@ def compare(scene: Scene, budget: float, seeds: int, more=()) -> np.ndarray:
         start = f"{scene.name:<10}{kind:<9}{budget:>4g} s" if row == 0 else " " * 25
         first, second, flip = medians[row]
         print(f"{start}  {label:<16}{took[row]:>7.1f} s{100 * first:>10.2f} %{100 * second:>10.2f} %{flip:>12.4f}")
-    table = np.array([medians[0] / medians[1], rooms[0] / rooms[1], np.sqrt(rooms[0] / rooms[1])])
+    # An error that drowns in the noise of the truth is 0.
+    ratio, room = (first / np.maximum(second, 1e-9) for first, second in (medians, rooms))
+    table = np.array([ratio, room, np.sqrt(room)])
     for label, values in zip(("ratio", "room", "goal"), table, strict=True):
         print(f"{'':<27}{label:<25}" + "".join(f"{value:>12.2f}" for value in values))
     sys.stdout.flush()

@@ -104,7 +104,7 @@ class FakeChild:
         picture = np.load(folder / finished.PICTURE)
         imaging.write_png(folder / name, to_srgb8(picture[..., :3]))
 
-    def extract(self, options, *, progress=None):
+    def extract(self, options, *, progress=None, look=None):
         self.asked.append(options)
         if self.error is not None:
             raise self.error

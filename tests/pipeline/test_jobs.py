@@ -121,7 +121,7 @@ def test_a_scene_that_fails_is_named_and_the_others_are_done(capsys, monkeypatch
     fake = fake_scene.FakeChild().install(monkeypatch)
     extract = fake.extract
 
-    def fail_at_two(options, *, progress=None):
+    def fail_at_two(options, *, progress=None, look=None):
         if options.frame == 2:
             raise SceneError("room.blend: no light\nat this frame")
         return extract(options, progress=progress)

@@ -145,7 +145,7 @@ def test_a_picture_lit_anew_keeps_its_shadows(capsys, monkeypatch, room, out):
 def test_weights_that_hang_on_the_former_lights_are_named(capsys, monkeypatch, room, out):
     fake = fake_scene.FakeChild()
 
-    def split(options, *, progress=None):
+    def split(options, *, progress=None, look=None):
         """The first three samples become two each, as where two horizons are apart."""
         found = fake.extract(options, progress=progress)
         index = np.sort(np.concatenate([np.arange(len(found.samples)), np.arange(3)]))

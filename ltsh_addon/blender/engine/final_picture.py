@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from ...pipeline.lighting import shade_lights, trace_shadows
+from ...pipeline.lighting import SHARES_DONE, shade_lights, tell_expected, trace_shadows
 from ...pipeline.mixer import LightPictures, light_pictures
 from ...pipeline.options import RenderOptions
 from ...pipeline.relight import RelightData
@@ -100,7 +101,9 @@ def final_picture(
         indices=job.indices,
         shadows=job.shadows,
     )
-    extraction = extract_pixels(options, progress=progress)
+    expected = {"passes": PASSES, "rays": job.shadow_rays, "progress": progress}
+    techniques = {name: name for name in job.shaded_as().values()}
+    extraction = extract_pixels(options, progress=progress, look=partial(tell_expected, tables=techniques, **expected))
     emission = extraction.picture.exposure * extraction.cycles.emission
     shown = PASSES if job.shown == "combined" else (job.shown,)
     rest = extraction.rest
@@ -132,7 +135,7 @@ def final_picture(
                 (lit_pass,),
                 (shadows,),
                 progress=lambda fraction, first=number, title=TECHNIQUES[technique].title: progress(
-                    title, (first + fraction) / len(PASSES)
+                    title, float(np.interp(first + fraction, *SHARES_DONE[2]))
                 ),
             )[0].combined
             image = inside_border(extraction.film.image(extraction.picture.exposure * lit), extraction.picture.border)

@@ -146,6 +146,7 @@ class LTSH_RenderEngine(bpy.types.RenderEngine):
                 self.update_stats("", f"LTSH: {stage_title(stage)}  {progress_text(plan, now - began)}")
             return not self.test_break()
 
+        progress.expect = plan.expect
         return progress
 
 
@@ -219,6 +220,8 @@ def stoppable(work: Callable[[Progress], object], progress: Progress):
     def report(stage: str, fraction: float) -> bool:
         state["last"] = stage, fraction
         return not stop.is_set()
+
+    report.expect = getattr(progress, "expect", None)
 
     def run() -> None:
         try:

@@ -40,6 +40,7 @@ class CyclesPicture:
     guides: dict[str, np.ndarray]  # the channels for the denoiser
     names: dict[str, str]  # of passes, as in `pass_names`
     samples: int
+    noise: dict[str, np.ndarray]  # of the channels of light, an example; {} if there is one file
     smooth_emission: dict[str, np.ndarray]  # (H, W, 3) what emits in sight, with smooth edges, by the key of its pass
     everything: tuple[str, ...]  # reasons why all direct light is left to Cycles
     warnings: tuple[str, ...]
@@ -52,7 +53,7 @@ class CyclesPicture:
 def render_finished(job: FinishedJob, folder: Path, *, progress: Progress | None = None) -> CyclesPicture:
     """The unchanged scene as Cycles renders it. Raises as `pixels.extract_pixels` does."""
     manifest = run_scene_job(job, folder, progress)
-    channels = _mean_of_chunks(manifest, folder)
+    channels, noise = _mean_of_chunks(manifest, folder)
     samples = sum(count for _, count in manifest["files"])
     dropped = tuple(f"{name}." for name in manifest["dropped"])
     return CyclesPicture(
@@ -60,6 +61,7 @@ def render_finished(job: FinishedJob, folder: Path, *, progress: Progress | None
         guides={name: plane for name, plane in channels.items() if name.startswith("Denoising ")},
         names=manifest["passes"],
         samples=samples,
+        noise=noise,
         smooth_emission=_smooth_emission(manifest, folder, channels, samples),
         everything=tuple(manifest["everything"]),
         warnings=tuple(manifest["warnings"]),
@@ -83,21 +85,25 @@ def _smooth_emission(manifest: dict, folder: Path, channels: dict[str, np.ndarra
     }
 
 
-def _mean_of_chunks(manifest: dict, folder: Path) -> dict[str, np.ndarray]:
-    """The channels: those of light are means over all chunks, all others come from the largest chunk."""
+def _mean_of_chunks(manifest: dict, folder: Path) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """The channels: those of light are means over all chunks, all others come from the largest chunk. And noise with
+    the deviation of those of light, {} for one chunk."""
     files = sorted(manifest["files"], key=lambda item: -item[1])
-    total, channels = sum(count for _, count in files), {}
+    total, channels, largest = sum(count for _, count in files), {}, {}
     for name, count in files:
         chunk = _without_layer(rendered_channels(folder / name), manifest["layer"])
         if not channels:
             channels = chunk
             light = [key for key in chunk if key[-2:] in (".R", ".G", ".B", ".A") or key.startswith("Denoising ")]
             if len(files) > 1:
+                largest = {key: chunk[key] for key in light}
                 channels |= {key: count / total * chunk[key] for key in light}
         else:
             for key in light:
                 channels[key] += count / total * chunk[key]
-    return channels
+    scale = np.sqrt(files[0][1] / max(total - files[0][1], 1))
+    with np.errstate(invalid="ignore"):  # a pixel may be Inf
+        return channels, {key: scale * (plane - channels[key]) for key, plane in largest.items()}
 
 
 def _without_layer(channels: dict[str, np.ndarray], layer: str) -> dict[str, np.ndarray]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -177,9 +178,12 @@ class Extraction:
         return np.concatenate([light, self.cycles.background[..., 3:]], axis=-1)
 
 
-def extract_pixels(job: PixelJob, *, progress: Progress | None = None) -> Extraction:
+def extract_pixels(
+    job: PixelJob, *, progress: Progress | None = None, look: Callable[[Extraction], None] | None = None
+) -> Extraction:
     """The lights, samples and (if asked for) the Cycles reference of a .blend.
 
+    `look` gets the extraction before its lobes end at horizons, which may take long. For finished pictures it stays so.
     Raises SceneError if the scene or file cannot be used, Cancelled if `progress(stage, fraction)` returned False.
     """
     if job.sub_samples < 1 or job.cycles_samples < 0:
@@ -219,7 +223,11 @@ def extract_pixels(job: PixelJob, *, progress: Progress | None = None) -> Extrac
         )
         if extraction.glass is not None and manifest["behind"]:
             extraction = replace(extraction, behind=_behind(job, manifest, folder, extraction))
-    return extraction if job.for_finished else ended_at_horizons(extraction)
+    if job.for_finished:
+        return extraction
+    if look is not None:
+        look(extraction)
+    return ended_at_horizons(extraction, progress)
 
 
 def _behind(job: PixelJob, manifest: dict, folder: Path, extraction: Extraction) -> Extraction:
@@ -374,11 +382,11 @@ def with_points(extraction: Extraction, count: int) -> Extraction:
     return replace(extraction, samples=samples, film=film, points=PixelPoints(finer=finer))
 
 
-def ended_at_horizons(extraction: Extraction) -> Extraction:
+def ended_at_horizons(extraction: Extraction, progress: Progress | None = None) -> Extraction:
     """`extraction` with lobes that end at the horizons of Cycles."""
     samples, film = extraction.samples, extraction.film
     hit = np.arange(len(samples)) if film.first is None else np.cumsum(film.first)
-    samples, index = end_at_horizons_of_cycles(samples, extraction.lights, hit, is_quick=True)
+    samples, index = end_at_horizons_of_cycles(samples, extraction.lights, hit, is_quick=True, progress=progress)
     first = np.diff(index, prepend=-1) > 0
     if film.first is not None:
         first &= film.first[index]

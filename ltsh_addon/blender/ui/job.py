@@ -37,6 +37,7 @@ NO_CYCLES = "Not complete: without Cycles"
 STAGE_TITLES = {
     "open scene": "Open Scene",
     "samples": "Sample Surfaces",
+    "horizons": "Horizons of Bumps",
     "Cycles A": "Cycles, First Half",
     "Cycles B": "Cycles, Second Half",
     "shadows": "Trace Shadows",
@@ -55,7 +56,7 @@ MOST = 0.99  # the largest share that is shown before the end is reported
 # Costs in seconds on two cores: once, or per million points, or per million points times samples. Plans learn the pace
 # of the machine.
 START_SECONDS, OPEN_SECONDS, RENDER_SECONDS = 1.5, 2.0, 0.5
-SAMPLE_SECONDS, FILE_SECONDS = 16.0, 3.0
+SAMPLE_SECONDS, FILE_SECONDS, HORIZON_SECONDS = 16.0, 3.0, 5.0
 CYCLES_SECONDS = 3.0  # per sample of Cycles, of direct light or of all
 SHADING_SECONDS = {"ltc": 6.5, "ltsh2": 8.0, "ltsh4": 10.0, "ltsh4c": 11.5, REFERENCE: 160.0}
 SHADOW_SECONDS, DENOISE_SECONDS = 30.0, 4.0  # shadows: with USUAL_RAYS rays
@@ -187,6 +188,7 @@ def shading_steps(points: float, sub_samples: int, shadow_rays: int, techniques)
     sampling = [
         Step("open scene", OPEN_SECONDS),
         Step("samples", RENDER_SECONDS * sub_samples + SAMPLE_SECONDS * points),
+        Step("horizons", HORIZON_SECONDS * points),
     ]
     shading = [Step(TECHNIQUES[name].title, _shading(name, points)) for name in techniques]
     # Most rays go to points that see a part of a light; elsewhere a few suffice.
@@ -280,6 +282,10 @@ class Plan:
             self._at, self._stage_started = at, self._reported
         self._fraction = min(max(fraction, 0.0), 1.0) if self._steps[self._at].stage == stage else 0.0
 
+    def expect(self, seconds: dict[str, float]) -> None:
+        """Note the seconds that stages will take, as somebody has measured who knows what they do."""
+        self._measured.update(seconds)
+
     def _end_step(self) -> None:
         step, seconds = self._steps[self._at], self._reported - self._stage_started
         self._measured[step.stage] = seconds
@@ -324,7 +330,7 @@ class Plan:
         return seconds[True], seconds[False]
 
     def _is_known(self, step: Step, measured: StageTimes) -> bool:
-        return _kind(step.stage) in measured or _kind(step.stage) in self._before
+        return step.stage in self._measured or _kind(step.stage) in {**measured, **self._before}
 
     def _expected(self, step: Step, measured: StageTimes) -> float:
         """Expected seconds of a step: as the same stage took, else by its cost and the pace of its kind, or of all."""
@@ -358,8 +364,10 @@ class Plan:
     def _rest_of_step(self, measured: StageTimes) -> float:
         """Seconds left of the step that runs; between reports they decay exponentially and never reach 0."""
         if self._is_followed:
-            done = self._reported - self._stage_started
-            rest, since = done / self._fraction - done, self._reported
+            # What was expected counts less and less.
+            done, since = self._reported - self._stage_started, self._reported
+            expected = self._measured.get(self._steps[self._at].stage, done / self._fraction)
+            rest = (1.0 - self._fraction) * (done + (1.0 - self._fraction) * expected)
         else:
             rest, since = self._expected(self._steps[self._at], measured), self._stage_started
         return rest * math.exp(-(self._now() - since) / rest) if rest > 0.0 else 0.0
@@ -424,6 +432,8 @@ class Job:
         if "stage" in message:
             self.stage = message["stage"]
             self.plan.report(self.stage, float(message["fraction"]))
+        elif "expected" in message:
+            self.plan.expect(message["expected"])
         elif "result" in message:
             self.results.append(Path(message["result"]))
         elif "error" in message:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from pathlib import Path
 
 import bpy
@@ -14,6 +14,7 @@ from ...visibility.occluders import UNLIMITED
 from .. import render_settings
 from ..evaluated import SURFACE_TYPES, owner_of, read_values, rendered_surfaces, with_render_depsgraph
 from ..lights.area import LightInventory, collect_lights, note_overlaps, rendered_lights
+from ..lights.emission import LookTooLong
 from ..lights.meshes import SIDE_PROPERTY, let_light_through
 from ..lights.world import blocks_nothing, take_world, world_behind, world_lights
 from ..materials import aovs
@@ -74,6 +75,12 @@ def affordable_points(seconds: float, pixels: int, lights: int, looked: float = 
     if DIRECT_SHARE * seconds < START_SECONDS + LOOKS * looked + each:
         return 0
     return max(int(POINTS_SHARE * (seconds - LOOKS * looked) / each), 1)
+
+
+def longest_look(seconds: float, pixels: int) -> float:
+    """How long a look at the scene may take for `affordable_points` in what is left of so many `seconds` afterwards."""
+    each = POINT_SECONDS * pixels * (1.0 + LIGHT_SHARE)
+    return (DIRECT_SHARE * seconds - START_SECONDS - each) / (LOOKS + DIRECT_SHARE)
 
 
 # REST_PASSES: passes of Cycles with the parts of the picture that are not reflected light.
@@ -241,12 +248,14 @@ def _reason(error: RuntimeError, path: Path) -> str:
 
 
 def prepare_scene(
-    scene, view_layer, camera, warnings: list[str], *, with_occluders: bool = False, for_finished: bool = False
+    scene, view_layer, camera, warnings: list[str], *, with_occluders: bool = False, look_until: float | None = None
 ) -> LightInventory:
     """Prepare the open scene for sample renders: returns its lights, leaves out what cannot be shaded, injects AOVs.
 
-    Raises SceneError if no light can be shaded, except `for_finished`.
+    For finished pictures `look_until` is the processor time until which this may take. Raises LookTooLong; and
+    SceneError if no light can be shaded, except for finished pictures.
     """
+    for_finished = look_until is not None
     render_settings.neutralize(scene, view_layer, camera, warnings)
     world = take_world(scene, view_layer, warnings)
     render_settings.prepare_surfaces(warnings)
@@ -258,6 +267,7 @@ def prepare_scene(
         override = view_layer.material_override
         bare = [] if override else aovs.objects_without_material(surfaces)
         inventory = collect_lights(depsgraph, override)
+        inventory.look_until = np.inf if look_until is None else look_until
         if with_occluders:
             inventory.occluders = collect_occluders(depsgraph, override, inventory.warn, inventory.left_out, unread)
         lost.extend(missing_images(depsgraph, world, override))
@@ -330,11 +340,12 @@ def extract_pixels(job: PixelJob, folder: Path, progress) -> dict:
         end = job_start() + job.seconds - (job.reserve + 1e-6 * EDGE_SECONDS) * pixels
     inventory, count = LightInventory(), 0
     if end is None or affordable_points(end - opened, pixels, 1):  # otherwise a look at the scene would be wasted
-        with_occluders, count = job.shadows == "on", job.sub_samples
-        inventory = prepare_scene(
-            scene, view_layer, camera, warnings, with_occluders=with_occluders, for_finished=for_finished
-        )
-        if end is not None and not has_lens:
+        look_until = np.inf if end is None or has_lens else opened + longest_look(end - opened, pixels)
+        options = {"with_occluders": job.shadows == "on", "look_until": look_until if for_finished else None}
+        with suppress(LookTooLong):
+            inventory = prepare_scene(scene, view_layer, camera, warnings, **options)
+            count = job.sub_samples
+        if end is not None and not has_lens and count:
             now = time.process_time()
             count = min(affordable_points(end - now, pixels, len(inventory.lights), now - opened), count)
     if is_sharp and for_finished:

@@ -60,6 +60,7 @@ class LightInventory:
     lit_points: tuple[np.ndarray, np.ndarray] = ()  # points of surfaces and their normals, if some overlap
     world: Any = None  # the world that lights the scene
     sky_detail: float = 0.0  # see `environment.fine_detail`
+    look_until: float = np.inf  # processor time
     behind: Any = None  # the world that is seen behind the surfaces
     occluders: Any = None  # visibility.Occluders, if shadows are wanted
     made_opaque: list[OpaqueInput] = field(default_factory=list)  # see `inject_aovs`
@@ -300,6 +301,7 @@ def rendered_lights(scene, inventory: LightInventory) -> list[Light]:
         return inventory.lights
     eye = np.array(scene.camera.matrix_world, dtype=np.float64)[:3, 3]
     with open_studio(scene) as studio:
+        studio.look_until = inventory.look_until
         lights = with_node_emission(inventory.lights, inventory.node_lights, studio, inventory.warn)
         of_meshes = mesh_area_lights(inventory.meshes, studio, eye, inventory.warn)
     dark = [mesh.ob.name for mesh in inventory.meshes if mesh.is_dropped]

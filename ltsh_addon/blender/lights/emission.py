@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+import time
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -392,11 +393,21 @@ PIXEL_ASPECT = 100.0
 CLIP = 1e-3
 
 
+class LookTooLong(Exception):
+    """A look at the lights took so much of a budget that too little is left for direct light."""
+
+
 class Studio:
     """A scene with one object and a camera that looks at it; `open_studio` makes one."""
 
     def __init__(self, scene, camera, base):
         self.scene, self.camera, self.base = scene, camera, base
+        self.look_until = np.inf  # processor time
+
+    def check_time(self) -> None:
+        """Raises LookTooLong after `look_until`."""
+        if time.process_time() > self.look_until:
+            raise LookTooLong
 
     @contextmanager
     def show(self, ob, matrix: np.ndarray, facts: ObjectFacts):

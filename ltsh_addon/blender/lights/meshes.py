@@ -188,6 +188,7 @@ def mesh_area_lights(mesh_lights: list[MeshLight], studio: Studio, eye: np.ndarr
 def _lights_of_all(mesh_lights: list[MeshLight], studio: Studio, eye: np.ndarray, warn) -> list[Light]:
     lights, known = [], {}
     for mesh_light in mesh_lights:
+        studio.check_time()
         radiance = [
             _material_radiance(studio, material, known) if emission.emits and not emission.varies else np.zeros((2, 3))
             for material, emission in zip(mesh_light.materials, mesh_light.emission, strict=True)
@@ -388,6 +389,7 @@ def _looks(mesh_light: MeshLight, textured, side: int, studio: Studio, pixels: i
     for placement, polygons in textured:
         with _shown(studio, _with_materials(mesh_light, placement), placement.matrix, placement.facts):
             for polygon, way in itertools.product(polygons, _sides(side)):
+                studio.check_time()
                 light = polygon_light(mesh_light.light_of(polygon.label), polygon, way, np.ones(3))
                 yield polygon, way, light, *_look_at_polygon(studio, light, pixels)
 

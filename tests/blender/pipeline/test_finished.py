@@ -14,6 +14,7 @@ from material_scenes import Build
 from ltsh_addon import imaging
 from ltsh_addon.blender import render_settings
 from ltsh_addon.blender.extract import pixels as pixels_module
+from ltsh_addon.blender.lights.emission import LookTooLong
 from ltsh_addon.blender.process.finished import FinishedJob, render_finished
 from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels, with_points
 from ltsh_addon.cli import main
@@ -441,6 +442,22 @@ def test_budgets_buy_points_by_what_they_cost():
     # Of large scenes each look takes long.
     looked = [pixels_module.affordable_points(8.0, pixels, 4, seconds) for seconds in (0.0, 0.2, 1.2)]
     assert looked[0] >= looked[1] > looked[2] == 0
+    for seconds in (4.0, 8.0, 32.0):
+        most = pixels_module.longest_look(seconds, pixels)
+        after = [
+            pixels_module.affordable_points(seconds - look, pixels, 1, look) for look in (0.99 * most, 1.01 * most)
+        ]
+        assert after[0] >= 1 and after[1] == 0
+
+
+@pytest.mark.newest
+def test_a_look_at_lights_that_takes_too_long_ends_and_leaves_nothing_behind():
+    scene = floor_and_ball(gray(Emission_Strength=3.0))
+    data = bpy.data.scenes, bpy.data.objects, bpy.data.cameras, bpy.data.meshes
+    before = [set(one.keys()) for one in data]
+    with pytest.raises(LookTooLong):
+        pixels_module.prepare_scene(scene, scene.view_layers[0], scene.camera, [], look_until=0.0)
+    assert [set(one.keys()) for one in data] == before
 
 
 @pytest.mark.newest

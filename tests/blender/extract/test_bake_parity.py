@@ -108,7 +108,7 @@ def pictures(tmp_path_factory):
     scene_parts.add_top_camera(SCALE)
     path = save(folder)
     make_picture(
-        PictureOptions(scene=path, output=folder / "picture", techniques=("ltsh4",), shadows="off"), with_cycles=False
+        PictureOptions(scene=path, output=folder / "picture", techniques=("ltsh4c",), shadows="off"), with_cycles=False
     )
     report, files = baked(path, folder / "bake", size=(WIDTH, HEIGHT))
     (picture,) = (folder / "picture").glob("*.exr")
@@ -122,7 +122,7 @@ def test_texels_are_what_pixels_are(pictures, name):
     both = (layers["coverage.hit"] > 0.0) & (picture["coverage.hit"] > 0.0)
     assert both.sum() > 0.98 * (layers["coverage.hit"] > 0.0).sum() > 500
     for pass_name, tolerance in (("specular", SPECULAR), ("diffuse", DIFFUSE)):
-        texels, pixels = (found[f"ltsh4.{pass_name}"][both] for found in (layers, picture))
+        texels, pixels = (found[f"ltsh4c.{pass_name}"][both] for found in (layers, picture))
         if pixels.max() == 0.0:
             assert texels.max() == 0.0
             continue

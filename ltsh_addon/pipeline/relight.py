@@ -243,7 +243,7 @@ def _relit(data: RelightData, changes: Sequence[LightChange], options: PictureOp
         warnings += (GRAIN,) if extraction.picture.has_lens else ()
         rest = _changed_rest(data, lights, tables[data.technique], results[data.technique].shading, progress)
         extraction = replace(extraction, warnings=warnings)
-        comparison = _FinishedComparison(options, extraction, results, data.shadows, data, rest)
+        comparison = _FinishedComparison(options, extraction, results, data.shadows, data=data, rest=rest)
     changed = [{"light": change.name, **{key: value for key, value in asdict(change).items() if key != "name"}}
                for change in changes]  # fmt: skip
     report = {**comparison.report(), "relit": changed}

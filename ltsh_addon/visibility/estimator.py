@@ -46,7 +46,7 @@ ROUNDS = 4
 # Samples that share the rays to a sky are alike: their normals differ by at most LIKE_NORMAL, they lie in one plane but
 # for a slope of LIKE_NORMAL, and for the specular pass their mirrored views differ by LIKE_LOBE alpha, and the alphas
 # by LIKE_ALPHA of one.
-LIKE_NORMAL, LIKE_LOBE, LIKE_ALPHA = np.float32(0.1), np.float32(0.7), np.float32(0.2)
+LIKE_NORMAL, LIKE_LOBE, LIKE_ALPHA = np.float32(0.1), np.float32(0.4), np.float32(0.2)
 # Samples do not share rays where that would change their light by more than this share of the typical one, nor where
 # all their rays are blocked: of so many rays.
 MOST_BIAS, ENOUGH_RAYS = 0.01, 64

@@ -86,7 +86,8 @@ def examine(seed, folder, techniques=(REFERENCE, "ltsh4c"), cycles_samples=192) 
         shadow_rays=1024,
         reference_samples=PIXELS,
     )
-    tables, extraction = lighting.load_tables(techniques), _extracted(options, True, None)
+    tables = lighting.load_tables(techniques)
+    extraction = _extracted(options, True, tables, None)
     shadows = lighting.trace_shadows(extraction, options.passes, options.shadow_rays, None)
     results = lighting.evaluated(tables, extraction, shadows, options, None)
     comparison = Comparison(options, extraction, results, shadows)

@@ -30,7 +30,9 @@ def reported(monkeypatch):
 
 
 def planned(command):
-    return [step.stage for step in job.steps(job.runs_of(bpy.context, command, Path("room.blend")))]
+    """The stages of a job on a scene without bumps."""
+    steps = job.steps(job.runs_of(bpy.context, command, Path("room.blend")))
+    return [step.stage for step in steps if step.stage != "horizons"]
 
 
 def command_line(*arguments):
@@ -76,7 +78,7 @@ def test_shading_and_baking_show_what_the_command_line_writes(scene, tmp_path, r
     np.testing.assert_array_equal(image_pixels("LTSH Floor ltsh2.specular"), expected)
     # Pictures of the other job go from the list of images, not from the disk: one click shows them again.
     assert "LTSH ltsh2.diffuse" not in bpy.data.images
-    assert bpy.ops.ltsh.show_results(command="shade") == {"FINISHED"} and "LTSH ltsh2.specular" in bpy.data.images
+    assert bpy.ops.ltsh.show_results(command="shade") == {"FINISHED"} and "LTSH ltsh2.diffuse" in bpy.data.images
 
 
 def baked(scene, tmp_path):

@@ -71,7 +71,7 @@ def affordable_points(seconds: float, pixels: int, lights: int, looked: float = 
 
     Each further look at the scene is expected to take as long as the first, `looked` seconds.
     """
-    each = POINT_SECONDS * pixels * (1.0 + LIGHT_SHARE * min(lights, MOST_LIGHTS))
+    each = _seconds_of_point(pixels, lights)
     if DIRECT_SHARE * seconds < START_SECONDS + LOOKS * looked + each:
         return 0
     return max(int(POINTS_SHARE * (seconds - LOOKS * looked) / each), 1)
@@ -79,8 +79,12 @@ def affordable_points(seconds: float, pixels: int, lights: int, looked: float = 
 
 def longest_look(seconds: float, pixels: int) -> float:
     """How long a look at the scene may take for `affordable_points` in what is left of so many `seconds` afterwards."""
-    each = POINT_SECONDS * pixels * (1.0 + LIGHT_SHARE)
-    return (DIRECT_SHARE * seconds - START_SECONDS - each) / (LOOKS + DIRECT_SHARE)
+    return (DIRECT_SHARE * seconds - START_SECONDS - _seconds_of_point(pixels, 1)) / (LOOKS + DIRECT_SHARE)
+
+
+def _seconds_of_point(pixels: int, lights: int) -> float:
+    """Processor seconds of direct light for a point of each pixel."""
+    return POINT_SECONDS * pixels * (1.0 + LIGHT_SHARE * min(lights, MOST_LIGHTS))
 
 
 # REST_PASSES: passes of Cycles with the parts of the picture that are not reflected light.

@@ -126,7 +126,7 @@ def light_pictures(scene, world, like: Light, warn) -> tuple[list[SkyPicture], l
     """Six pictures (a cube) of `world` as surfaces see it, without small, bright spots, and lights like `like` for
     these."""
     with _observatory(scene, world, warn) as look:
-        for pixels in dict.fromkeys((min(_pixels(world), SMOOTH), _pixels(world))):
+        for pixels in _pixels(world):
             pictures = [look(*axes, pixels, SAMPLES if pixels < MOST else SAMPLES // 2) for axes in CUBE]
             if fine_detail(pictures) <= SMOOTH_SKY:
                 break
@@ -141,7 +141,7 @@ def light_pictures(scene, world, like: Light, warn) -> tuple[list[SkyPicture], l
 def background_pictures(scene, world, warn) -> list[SkyPicture]:
     """Six pictures (a cube) of the `world` of `scene` as cameras see it."""
     with _observatory(scene, world, warn, by_cameras=True) as look:
-        pixels = _pixels(world)
+        *_, pixels = _pixels(world)
         pixels = pixels if pixels == PLAIN else max(pixels, 2 * PROCEDURAL)
         return [look(*axes, pixels, SAMPLES // 2) for axes in CUBE]
 
@@ -162,14 +162,15 @@ def may_shine(world) -> bool:
     return not (strength == 0.0 or (not is_socket(color) and max(color[:3]) <= 0.0))
 
 
-def _pixels(world) -> int:
-    """Pixels along each side of a picture of `world` that spans a quarter of the horizon."""
+def _pixels(world) -> tuple[int, ...]:
+    """Pixels along each side of pictures of `world` that span a quarter of the horizon, to be tried in turn until one
+    shows no fine detail. Images, which take long to read, have detail: they are looked at once."""
     if all(is_group(node) or node.bl_idname in EVERYWHERE_THE_SAME for node in _nodes(world)):
-        return PLAIN
+        return (PLAIN,)
     widths = [node.image.size[0] for node in _nodes(world) if getattr(node, "image", None) is not None]
     if not widths:
-        return PROCEDURAL
-    return int(2 ** np.clip(round(math.log2(max(max(widths) / 4, 1))), math.log2(LEAST), math.log2(MOST)))
+        return SMOOTH, PROCEDURAL
+    return (int(2 ** np.clip(round(math.log2(max(max(widths) / 4, 1))), math.log2(LEAST), math.log2(MOST))),)
 
 
 def _nodes(world) -> list:

@@ -70,7 +70,7 @@ class RelightData:
     rest: dict[str, np.ndarray] = field(default_factory=dict)
     # By pass (H, W, 3), in old files (H, W): the share that is LTSH's and not Cycles', recolored; left out: 1.
     taken: dict[str, np.ndarray] = field(default_factory=dict)
-    # By pass (H, W): a factor of hard edges of light, valid only while the lights stay where they were; left out: 1.
+    # By pass (H, W, 3), in old files (H, W): a factor of it by Cycles, valid while the lights stay where they were.
     edges: dict[str, np.ndarray] = field(default_factory=dict)
 
     @property
@@ -82,7 +82,7 @@ class RelightData:
     def shown(self, name: str, *, moved: bool = False) -> np.ndarray | float:
         """Factor (H, W, 1 or 3) of the image of a pass of the samples; without `edges` for `moved` lights."""
         taken = np.atleast_3d(self.taken[name]) if name in self.taken else 1.0
-        return taken if moved or name not in self.edges else taken * self.edges[name][..., None]
+        return taken if moved or name not in self.edges else taken * np.atleast_3d(self.edges[name])
 
     @classmethod
     def load(cls, path: Path) -> RelightData:

@@ -120,16 +120,13 @@ def finish(
         job = child_job(FinishedJob, options, **scene_and_layer, **size)
         cycles = render_finished(job, folder, progress=progress)
         clock.end("cycles", cycles.processor_seconds)
-        passes = compositing.direct_passes(comparison, cycles, options.denoise == "on")
-        rest = compositing.denoised_rest(cycles, passes, extraction, options.denoise, progress)
-        combined = rest.image.copy()
-        for one in passes.values():
-            combined[..., :3] += one.image
+        passes = compositing.direct_passes(comparison, cycles)
+        picture = compositing.composite(cycles, passes, extraction, options.denoise, progress)
         clock.end("denoise")
-        report = _report(comparison, cycles, passes, rest)
-        report["finished"] |= {"denoiser": rest.denoiser, "budget_s": options.budget}
-        report["finished"]["gain"] = _gain(cycles, passes, combined, clock.stages)
-        if not np.any(combined[..., :3]):
+        report = _report(comparison, cycles, picture)
+        report["finished"] |= {"denoiser": picture.denoiser, "budget_s": options.budget}
+        report["finished"]["gain"] = _gain(cycles, picture, clock.stages)
+        if not np.any(picture.combined[..., :3]):
             report["warnings"].append(
                 f"camera {cycles.camera!r} sees no light at all, by Cycles neither: the picture is black; add a light, "
                 "or let the world shine"
@@ -144,10 +141,10 @@ def finish(
             "processor": {**clock.stages, "total": clock.seconds()},
             "total": time.perf_counter() - start,
         }
-    ours = compositing.direct_layers(comparison, passes)
-    channels = compositing.cycles_channels(cycles, passes, rest)
-    relight_fields = compositing.relight_fields(passes, rest)
-    return Finished(combined, rest.image, ours, channels, report, seconds, relight_fields, comparison, cycles)
+    ours = compositing.direct_layers(comparison, picture.passes)
+    channels = compositing.cycles_channels(cycles, picture)
+    written = picture.combined, picture.rest, ours, channels, report, seconds, compositing.relight_fields(picture)
+    return Finished(*written, comparison, cycles)
 
 
 def shade_direct_light(
@@ -278,8 +275,7 @@ class DirectLightShader:
         samples, seconds = int(np.count_nonzero(chosen)), time.process_time() - start
         if not total > 0.0:
             return plan.Probe(samples, seconds)
-        clean = sum((compositing.clean_share(comparison.shadows, name) * light[name]).sum() for name in PASSES)
-        return plan.Probe(samples, seconds, float(np.sqrt(variance / squared)), float(clean / total))
+        return plan.Probe(samples, seconds, float(np.sqrt(variance / squared)))
 
     def with_edge_points(self, comparison: Comparison, more: float, progress) -> Comparison:
         """The same with more points for the pixels that edges of diffuse light run through, of shadows or of objects.
@@ -288,9 +284,7 @@ class DirectLightShader:
         """
         extraction, film = comparison.extraction, comparison.film
         light = comparison.images[next(iter(comparison.results)), "diffuse"].mean(axis=-1)
-        curvature = (
-            compositing.light_curvature(light) * compositing.clean_share(comparison.shadows, "diffuse")
-        ).ravel()
+        curvature = compositing.light_curvature(light).ravel()
         covered = np.minimum(film.coverage(), 1.0).ravel()
         by_cycles = extraction.left_to_cycles.by_pass["diffuse"].ravel()
         pixel = np.flatnonzero((curvature > 0.0) & ~by_cycles & (covered > 0.0))
@@ -335,19 +329,19 @@ class _ProcessorClock:
         return self._now() - self._start + self._others
 
 
-def _report(comparison: Comparison, cycles, passes: dict, rest: compositing.Rest) -> dict:
+def _report(comparison: Comparison, cycles, picture: compositing.Composite) -> dict:
     """The report of a picture, and under "finished" what is LTSH's and what is Cycles'."""
     left_to_cycles = comparison.extraction.left_to_cycles
     everything = [*cycles.everything, *left_to_cycles.everything]
-    warnings = [*cycles.warnings, *left_to_cycles.warnings, *rest.problems]
-    theirs = "Cycles' own and denoised" if rest.denoiser else "Cycles' own"
+    warnings = [*cycles.warnings, *left_to_cycles.warnings, *picture.problems]
+    theirs = "Cycles' own and denoised" if picture.denoiser else "Cycles' own"
     if everything:
         why = listed(everything, NAMED, "; ")
         warnings.append(f"all direct light is {theirs}, because LTSH does not shade: {why}")
     if left_to_cycles.materials and not everything:
         why = listed(left_to_cycles.materials, NAMED, "; ")
         warnings.append(f"direct light on some surfaces is {theirs}: {why}")
-    shares = {name: np.where(one.is_replaced, one.clean_share, 0.0).mean() for name, one in passes.items()}
+    shares = {name: np.where(one.is_replaced, picture.weight, 0.0).mean() for name, one in picture.passes.items()}
     return {
         **comparison.report(),
         "camera": cycles.camera,
@@ -362,14 +356,15 @@ def _report(comparison: Comparison, cycles, passes: dict, rest: compositing.Rest
     }
 
 
-def _gain(cycles, passes: dict, combined: np.ndarray, stages: dict[str, float]) -> dict:
-    """LTSH's share of the light; the noise before denoising, and that of Cycles alone in as many `stages` (s)."""
-    light = sum(one.image.sum() for one in passes.values()) / max(combined[..., :3].sum(), 1e-30)
+def _gain(cycles, picture: compositing.Composite, stages: dict[str, float]) -> dict:
+    """LTSH's share of the light; the error with half of the samples, and that of Cycles and its denoiser with so many
+    more that they take as long as all `stages` (s)."""
+    light = sum(one.image.sum() for one in picture.passes.values()) / max(picture.combined[..., :3].sum(), 1e-30)
     sampling = max(cycles.processor_seconds - cycles.least_seconds, 1e-3)
     more = (sum(stages.values()) - stages["cycles"] - stages["denoise"]) / sampling
-    noise, alone = compositing.noise(cycles, passes) or (None, None)
+    error, alone = picture.errors or (None, None)
     alone = None if alone is None else float(alone / np.sqrt(1.0 + more))
-    return {"share_of_light": float(light), "noise": noise, "noise_of_cycles": alone}
+    return {"share_of_light": float(light), "error": error, "error_of_cycles": alone}
 
 
 def summary(report: dict, seconds: dict) -> list[str]:
@@ -378,9 +373,10 @@ def summary(report: dict, seconds: dict) -> list[str]:
     shares = ", ".join(f"{name} {100.0 * share:.0f} %" for name, share in finished["share_of_ours"].items())
     took = f", {seconds['processor']['total']:.1f} s of processor time" if "processor" in seconds else ""
     denoised = f"denoised by {finished['denoiser']}" if finished["denoiser"] else "not denoised"
-    light, noise, alone = finished["gain"].values()
-    noises = [100.0 * one for one in (noise, alone) if one is not None]
-    gained = "; noise {:.1f} % before denoising, Cycles alone in this time {:.1f} %".format(*noises) if noises else ""
+    light, error, alone = finished["gain"].values()
+    errors = [100.0 * one for one in (error, alone) if one is not None]
+    told = "; error of half the samples {:.1f} %, of Cycles alone in this time {:.1f} %"
+    gained = told.format(*errors) if errors else ""
     return [
         f"{width}x{height}, {report['sub_samples']} points per pixel, {report['cycles_samples']} samples of Cycles, "
         f"{denoised}{took}",

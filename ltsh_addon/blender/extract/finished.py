@@ -137,11 +137,11 @@ def _render_chunks(scene, layer, folder: Path, samples, end, progress) -> tuple[
     """
     cycles, files, done, first, seed = scene.cycles, [], 0, 0.0, scene.cycles.seed
     if samples is None and end is None:
-        render_exr(scene, folder / "cycles_0.exr")
-        return [["cycles_0.exr", layer.samples or cycles.samples]], time.process_time()
+        return _render_as_saved(scene, layer, folder), time.process_time()
     layer.samples, cycles.use_adaptive_sampling, cycles.time_limit = 0, False, 0.0
     cycles.use_sample_subset = True
-    chunk = min(FIRST, samples) if end is None else PROBE
+    half = None if samples is None else -(-samples // 2)  # no file has more samples, so that there are two halves
+    chunk = min(FIRST, half) if end is None else PROBE
     of_file = 0.0 if end is None else FILE_SECONDS * math.prod(render_settings.picture_size(scene)) / 1e6
     while samples is None or done < samples:
         progress("Cycles", done / samples if samples else min(len(files) / 3, 1.0))
@@ -161,15 +161,35 @@ def _render_chunks(scene, layer, folder: Path, samples, end, progress) -> tuple[
         each = max(took - of_file, 0.1 * took) / chunk
         if end is not None:
             # The first file takes longer, since Cycles looks at the scene, so only the second one tells what a sample
-            # takes.
-            affordable = int((end - time.process_time() - of_file) / each)
-            chunk = affordable if len(files) > 1 else min(affordable, 4 * PROBE)
+            # takes. The third is half of the picture.
+            left = end - time.process_time() - of_file
+            chunk = int(left / each)
+            if len(files) < 3:
+                chunk = min(chunk, 4 * PROBE) if len(files) == 1 else int(0.5 * (done + (left - of_file) / each))
             if chunk < 1 + done // 10 or len(files) == MOST_FILES:
                 break
         else:
             chunks = min(MOST_CHUNKS, max(1, round(each * (samples - done) / CHUNK_SECONDS)))
-            chunk = max(1, min(-(-(samples - done) // chunks), samples - done))
+            chunk = max(1, min(-(-(samples - done) // chunks), half, samples - done))
     return files, first
+
+
+def _render_as_saved(scene, layer, folder: Path) -> list[list]:
+    """Render with the settings of the file, in two halves with seeds of their own."""
+    cycles, files = scene.cycles, []
+    samples, seed = layer.samples or cycles.samples, cycles.seed
+    counts = [count for count in (-(-samples // 2), samples // 2) if count]
+    if len(counts) == 2:
+        # Halves with sqrt(2) of the noise together have as much as the picture should have.
+        cycles.adaptive_threshold *= math.sqrt(2.0)
+        cycles.adaptive_min_samples = -(-cycles.adaptive_min_samples // 2)
+        cycles.time_limit *= 0.5
+    layer.samples = 0
+    for number, count in enumerate(counts):
+        cycles.samples, cycles.seed = count, (seed + number) % 2**31
+        files.append([f"cycles_{number}.exr", count])
+        render_exr(scene, folder / files[-1][0])
+    return files
 
 
 def _render_edges(scene, layer, folder: Path, progress) -> None:

@@ -13,6 +13,8 @@ from .blender_process import run_job, run_scene_job
 from .pixels import rendered_channels
 
 PICTURE = "picture.npy"
+# HALVED: the keys of passes that the halves of a picture have too.
+HALVED = ("diffuse_light", "specular_light", "emission", "background")
 
 
 @dataclass(frozen=True)
@@ -33,6 +35,14 @@ class FinishedJob:
 
 
 @dataclass(frozen=True)
+class CyclesHalf:
+    """What about half of the samples show."""
+
+    channels: dict[str, np.ndarray]  # (H, W) each, those of Combined and of the passes in HALVED
+    samples: int
+
+
+@dataclass(frozen=True)
 class CyclesPicture:
     """What Cycles rendered, row 0 on top."""
 
@@ -40,7 +50,7 @@ class CyclesPicture:
     guides: dict[str, np.ndarray]  # the channels for the denoiser
     names: dict[str, str]  # of passes, as in `pass_names`
     samples: int
-    noise: dict[str, np.ndarray]  # of the channels of light, an example; {} if there is one file
+    halves: tuple[CyclesHalf, ...]  # of its samples, with noise of their own; () if there is one file
     smooth_emission: dict[str, np.ndarray]  # (H, W, 3) what emits in sight, with smooth edges, by the key of its pass
     everything: tuple[str, ...]  # reasons why all direct light is left to Cycles
     warnings: tuple[str, ...]
@@ -53,7 +63,7 @@ class CyclesPicture:
 def render_finished(job: FinishedJob, folder: Path, *, progress: Progress | None = None) -> CyclesPicture:
     """The unchanged scene as Cycles renders it. Raises as `pixels.extract_pixels` does."""
     manifest = run_scene_job(job, folder, progress)
-    channels, noise = _mean_of_chunks(manifest, folder)
+    channels, halves = _mean_of_chunks(manifest, folder)
     samples = sum(count for _, count in manifest["files"])
     dropped = tuple(f"{name}." for name in manifest["dropped"])
     return CyclesPicture(
@@ -61,7 +71,7 @@ def render_finished(job: FinishedJob, folder: Path, *, progress: Progress | None
         guides={name: plane for name, plane in channels.items() if name.startswith("Denoising ")},
         names=manifest["passes"],
         samples=samples,
-        noise=noise,
+        halves=halves,
         smooth_emission=_smooth_emission(manifest, folder, channels, samples),
         everything=tuple(manifest["everything"]),
         warnings=tuple(manifest["warnings"]),
@@ -85,25 +95,31 @@ def _smooth_emission(manifest: dict, folder: Path, channels: dict[str, np.ndarra
     }
 
 
-def _mean_of_chunks(manifest: dict, folder: Path) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """The channels: those of light are means over all chunks, all others come from the largest chunk. And noise with
-    the deviation of those of light, {} for one chunk."""
+def _mean_of_chunks(manifest: dict, folder: Path) -> tuple[dict[str, np.ndarray], tuple[CyclesHalf, ...]]:
+    """The channels: those of light are means over all chunks, all others come from the largest chunk. And the halves,
+    () for one chunk."""
     files = sorted(manifest["files"], key=lambda item: -item[1])
-    total, channels, largest = sum(count for _, count in files), {}, {}
+    total, channels, halves, counts = sum(count for _, count in files), {}, ({}, {}), [0, 0]
+    halved = tuple(f"{name}." for name in ("Combined", *(manifest["passes"][key] for key in HALVED)))
     for name, count in files:
         chunk = _without_layer(rendered_channels(folder / name), manifest["layer"])
         if not channels:
-            channels = chunk
+            channels = dict(chunk)
             light = [key for key in chunk if key[-2:] in (".R", ".G", ".B", ".A") or key.startswith("Denoising ")]
-            if len(files) > 1:
-                largest = {key: chunk[key] for key in light}
-                channels |= {key: count / total * chunk[key] for key in light}
-        else:
-            for key in light:
-                channels[key] += count / total * chunk[key]
-    scale = np.sqrt(files[0][1] / max(total - files[0][1], 1))
-    with np.errstate(invalid="ignore"):  # a pixel may be Inf
-        return channels, {key: scale * (plane - channels[key]) for key, plane in largest.items()}
+            channels |= {key: np.zeros_like(chunk[key]) for key in light}
+        for key in light:
+            channels[key] += count / total * chunk[key]
+        smaller = int(np.argmin(counts))
+        half, counts[smaller] = halves[smaller], counts[smaller] + count
+        for key in chunk:
+            if key.startswith(halved):
+                half[key] = half.get(key, 0.0) + np.float32(count) * chunk[key]
+    if len(files) < 2:
+        return channels, ()
+    return channels, tuple(
+        CyclesHalf({key: plane / np.float32(count) for key, plane in half.items()}, count)
+        for half, count in zip(halves, counts, strict=True)
+    )
 
 
 def _without_layer(channels: dict[str, np.ndarray], layer: str) -> dict[str, np.ndarray]:

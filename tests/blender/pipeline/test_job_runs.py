@@ -197,23 +197,6 @@ def test_a_bake_with_apply_is_finished_by_merge(room, tmp_path):
         assert bpy.data.objects[name].material_slots[0].material.name.endswith(f"(baked {name})")
 
 
-@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="memory of processes as Linux tells it")
-def test_memory_does_not_grow_with_the_frames(room, tmp_path, own_blender):
-    """Of both processes, from the sixth frame on; a leak of a picture per frame would be 1 MiB each."""
-    sizes = []
-
-    def tell(state):
-        if state.seconds is not None:
-            (process,) = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
-            pages = [int(Path(f"/proc/{name}/statm").read_text().split()[1]) for name in (process, "self")]
-            sizes.append([count * os.sysconf("SC_PAGE_SIZE") / 2**20 for count in pages])
-
-    options = PictureOptions(room, tmp_path / "out", techniques=("ltsh4",), passes=("specular",), resolution=(128, 96))
-    batch.run_tasks(BatchJob("shade", options, (room,), frames=tuple(range(1, 26))), tell=tell)
-    for column in zip(*sizes, strict=True):
-        assert max(column[15:]) - max(column[5:15]) < 5.0, column
-
-
 def test_json_is_alone_on_stdout_whatever_blender_prints():
     code = (
         "import os, sys\nfrom ltsh_addon.cli.progress import reserve_stdout\n"

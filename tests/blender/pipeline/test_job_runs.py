@@ -131,12 +131,9 @@ def test_shards_at_the_same_time_in_one_folder_are_the_single_run(room, tmp_path
 def add_tiles_and_group():
     """A plane over two UDIM tiles, and one of the same material, whose color comes from within a group."""
     material, node = scene_parts.principled("Grouped")
-    group = bpy.data.node_groups.new("Inside", "ShaderNodeTree")
-    group.interface.new_socket("Color", in_out="OUTPUT", socket_type="NodeSocketColor")
-    wave = group.nodes.new("ShaderNodeTexWave")
-    group.links.new(wave.outputs["Color"], group.nodes.new("NodeGroupOutput").inputs[0])
-    outer = material.node_tree.nodes.new("ShaderNodeGroup")
-    outer.node_tree = group
+    group, _, end = scene_parts.new_group({}, {"Color": "Color"})
+    group.links.new(group.nodes.new("ShaderNodeTexWave").outputs["Color"], end.inputs[0])
+    outer = scene_parts.add_group(material.node_tree, group)
     material.node_tree.links.new(outer.outputs[0], node.inputs["Base Color"])
     corners = [(x, y, 0.5) for y in (0.0, 1.0) for x in (-1.0, 0.0, 1.0)]
     tiles = scene_parts.add_mesh("Tiles", corners, [(0, 1, 4, 3), (1, 2, 5, 4)])

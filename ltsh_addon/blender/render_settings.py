@@ -247,25 +247,6 @@ def balanced_points(kind: str, width: float, count: int) -> np.ndarray:
     return np.concatenate([np.zeros((1, 2)), np.stack([half, -half], axis=1).reshape(-1, 2)])[:count]
 
 
-def camera_rays(scene, matrix) -> list | None:
-    """Starts and directions (2, 3, 3) of the rays of a picture, for a camera at `matrix`; None for panoramas.
-
-    Each has three rows (3,): its value at the top left corner, and what one pixel to the right and one down add to it.
-    """
-    lens, (width, height) = scene.camera.data, picture_size(scene)
-    if lens.type not in {"PERSP", "ORTHO"}:
-        return None
-    frame = np.array(lens.view_frame(scene=scene), dtype=np.float64)
-    top_right, _, bottom_left, top_left = frame * ([1.0, 1.0, 0.0] if lens.type == "ORTHO" else 1.0)
-    steps = np.stack([top_left, (top_right - top_left) / width, (bottom_left - top_left) / height])
-    border = render_border(scene)
-    if border is not None and border.cropped:
-        steps[0] += border.left * steps[1] + border.top * steps[2]
-    matrix, still = np.array(matrix.normalized(), dtype=np.float64), np.zeros((2, 3))
-    steps, center = steps @ matrix[:3, :3].T, np.stack([matrix[:3, 3], *still])
-    return [center + steps, np.stack([-matrix[:3, 2], *still])] if lens.type == "ORTHO" else [center, steps]
-
-
 def sub_pixel_offsets(scene, count: int, points=filter_points):
     """What `points` returns for `count` points of the scene's filter. Call it outside `pinned_pixel_filter`, which
     replaces that filter."""

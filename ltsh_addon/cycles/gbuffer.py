@@ -6,10 +6,8 @@ file, so nothing is averaged across an edge.
 
 from __future__ import annotations
 
-import itertools
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import fields, replace
 
 import numpy as np
 
@@ -267,136 +265,6 @@ def _means(values: np.ndarray, group: np.ndarray, count: np.ndarray) -> np.ndarr
     """Means (Q, 3) of the rows of `values` (P, 3) with the same `group` (P,)."""
     sums = [np.bincount(group, weights=column, minlength=len(count)) for column in values.T]
     return np.stack(sums, axis=1) / count[:, None]
-
-
-# A finer point takes all values but position and view from a sample, in its pixel or around it, whose flat surface goes
-# through the point. FLAT: largest angle in rad between that sample's normals, and between its plane and the direction
-# to the point. ACROSS: weight of the distance across the plane, relative to the distance along it, in the choice of the
-# nearest sample. OFF_CENTER: distance in pixels. A pixel stays as it is if its center is farther than that from where
-# its sample is, or if one of its points lies on no such surface.
-FLAT, ACROSS, OFF_CENTER = 4e-3, 10.0, 0.1
-
-
-@dataclass(frozen=True)
-class FinerPoints:
-    """More points per pixel than a picture is rendered with."""
-
-    starts: np.ndarray  # (3, 3) m: ray origin at the top left corner, its change per pixel right and per pixel down
-    directions: np.ndarray  # (3, 3) the same for ray directions, of any length
-    offsets: np.ndarray  # (N, 2) pixels right of and above the center
-    weights: np.ndarray | None  # (N, D, D) as in `Film.shared`
-    sums: np.ndarray | None = None  # (D, D) of the weights of a pixel without finer points
-
-    @classmethod
-    def of(cls, values: dict) -> FinerPoints:
-        """The points that a manifest describes."""
-        return cls(**{name: None if value is None else np.array(value, float) for name, value in values.items()})
-
-    def rays(self, pixel: np.ndarray, offsets: np.ndarray, width: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Origins and unit directions (Q, 3) of rays through `offsets` (Q, 2) of pixels (Q,), and the width (Q,) of a
-        pixel at a distance of 1 m."""
-        raster = np.stack([np.ones(len(pixel)), pixel % width + 0.5, pixel // width + 0.5], axis=1)
-        raster[:, 1:] += offsets * [1.0, -1.0]
-        origin, direction = raster @ self.starts, raster @ self.directions
-        length = np.linalg.norm(direction, axis=1, keepdims=True)
-        return origin, direction / length, np.linalg.norm(self.directions[1]) / length[:, 0]
-
-
-def finer(
-    samples: SurfaceSamples, film: Film, points: FinerPoints, pixels: dict[str, np.ndarray], met: Callable
-) -> tuple[SurfaceSamples, Film, np.ndarray]:
-    """Samples at finer points, their film, and the mask (P,) of the `samples` that they replace.
-
-    Each `pixel` (E,) gets the first `number` (E,) of `points`, unless it is unknown what one of them shows.
-    `met(origins, directions)` is that of `visibility.rays.Tracer.first_met`.
-    """
-    known, (pixels, number) = _PixelHits.of(samples, film), (pixels["pixel"], pixels["number"])
-    center, direction, width = points.rays(pixels, np.zeros((len(pixels), 2)), film.width)
-    distance, is_behind = met(center, direction)
-    is_there = np.isfinite(distance) & ~is_behind
-    reach = np.maximum(width * np.where(is_there, distance, 0.0), np.linalg.norm(points.starts[1]))
-    off = known.nearest(_along(center, direction, distance), pixels, is_there)[1]
-    sure = (off <= OFF_CENTER * reach) | (~is_there & ~is_behind)
-    pixels, number = pixels[sure], number[sure]
-    row = np.repeat(np.arange(len(pixels)), number)
-    pixel, point = pixels[row], np.arange(len(row)) - np.repeat(np.cumsum(number) - number, number)
-    origin, direction, _ = points.rays(pixel, points.offsets[point], film.width)
-    distance, is_behind = met(origin, direction)
-    is_there = np.isfinite(distance) & ~is_behind
-    position = _along(origin, direction, distance)
-    hit = known.nearest(position, pixel, is_there)[0]
-    for down, right in itertools.product((-1, 0, 1), repeat=2):
-        column = pixel % film.width + right
-        others = is_there & (hit < 0) & (column >= 0) & (column < film.width)
-        around = known.nearest(position, pixel + down * film.width + right, others)[0]
-        hit = np.where(hit < 0, around, hit)
-    is_fine = np.bincount(row, is_behind | (is_there & (hit < 0)), len(pixels)) == 0.0
-    chosen = np.flatnonzero(is_fine[row] & (hit >= 0))
-    lengths = known.lengths[hit[chosen]]
-    of_point, first = np.repeat(chosen, lengths), np.repeat(np.cumsum(lengths) - lengths, lengths)
-    index = np.repeat(known.starts[hit[chosen]], lengths) + np.arange(len(of_point)) - first
-    row_of_sample = row[of_point]
-    values = {"pixel": pixel[of_point], "count": film.sub_samples / number[row_of_sample]}
-    values["first"] = None if film.first is None else film.first[index]
-    if film.spread is not None:
-        # The points of a pixel together weigh the same, however many there are.
-        whole, columns = film.sub_samples * points.weights.mean(axis=0), points.weights.reshape(len(points.weights), -1)
-        sums = np.stack([np.bincount(row, column[point], len(pixels)) for column in columns.T], axis=1)
-        scale = np.divide(whole.ravel(), sums, out=np.zeros(sums.shape), where=sums > 0.0)
-        spread = (
-            np.where(sums > 0.0, 0.0, whole.ravel() / number[:, None])[row_of_sample]
-            + scale[row_of_sample] * columns[point[of_point]]
-        )
-        values["spread"] = spread.reshape(-1, *whole.shape).astype(np.float32)
-        values["whole"] = film.whole + film.sums_around(pixels[is_fine], whole - points.sums)
-    fine = replace(samples.take(index), position=position[of_point], view=-direction[of_point])
-    return fine, replace(film, **values), np.isin(film.pixel, pixels[is_fine])
-
-
-def _along(origin, direction, distance):
-    return origin + direction * np.where(np.isfinite(distance), distance, 0.0)[:, None]
-
-
-@dataclass(frozen=True)
-class _PixelHits:
-    """The hits (H) of samples (P), and which hits each pixel has."""
-
-    samples: SurfaceSamples
-    starts: np.ndarray  # (H,) the first sample of each hit
-    lengths: np.ndarray  # (H,) the number of samples of each hit
-    is_flat: np.ndarray  # (P,) True for samples whose normals agree, so that they hold for points around, too
-    order: np.ndarray  # (H,) the hits sorted by pixel
-    first: np.ndarray  # (W * H,) position in `order` of the first hit of each pixel
-    number: np.ndarray  # (W * H,) of hits of each pixel
-
-    @classmethod
-    def of(cls, samples: SurfaceSamples, film: Film) -> _PixelHits:
-        """The hits of `samples` on `film`."""
-        starts = np.arange(len(samples)) if film.first is None else np.flatnonzero(film.first)
-        number = np.bincount(film.pixel[starts], minlength=film.width * film.height)
-        order = np.argsort(film.pixel[starts], kind="stable")
-        normals = (samples.normal, samples.diffuse_normal, samples.smooth_normal)
-        is_flat = np.all([np.abs(one - samples.geometric_normal).max(axis=1) < FLAT for one in normals], axis=0)
-        lengths = np.diff(starts, append=len(samples))
-        return cls(samples, starts, lengths, is_flat, order, np.cumsum(number) - number, number)
-
-    def nearest(self, position: np.ndarray, pixel: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """For points at `position` (Q, 3): the nearest hit (Q,) of `pixel` (Q,) on the same flat surface, and its
-        distance (Q,) in m. It is -1 if there is none, and where `mask` is False."""
-        hit, apart, least = np.full(len(pixel), -1), np.full(len(pixel), np.inf), np.full(len(pixel), np.inf)
-        rows = np.flatnonzero(mask & (pixel >= 0) & (pixel < len(self.number)))
-        for step in range(int(self.number[pixel[rows]].max(initial=0))):
-            rows = rows[self.number[pixel[rows]] > step]
-            other = self.order[self.first[pixel[rows]] + step]
-            sample = self.starts[other]
-            between = position[rows] - self.samples.position[sample]
-            length = np.linalg.norm(between, axis=1)
-            off = np.abs((between * self.samples.geometric_normal[sample]).sum(axis=1))
-            score = ACROSS * off + length
-            is_near = (off <= FLAT * length + 1e-6) & (score < least[rows])
-            better = np.flatnonzero(is_near & self.is_flat[sample])
-            hit[rows[better]], least[rows[better]], apart[rows[better]] = other[better], score[better], length[better]
-        return hit, apart
 
 
 def coarse_meshes(samples: SurfaceSamples) -> list[str]:

@@ -44,15 +44,6 @@ class Comparison:
     def film(self) -> Film:
         return self.extraction.film
 
-    def with_more(self, mask: np.ndarray, more: Comparison) -> Comparison:
-        """The samples in `mask` (P,), then those of `more`, a comparison of the same scene and film."""
-        one, other = self.extraction, more.extraction
-        samples = SurfaceSamples.joined([one.samples.take(mask), other.samples])
-        film = one.film.take(mask).with_more(other.film)
-        results = {name: result.with_more(mask, more.results[name]) for name, result in self.results.items()}
-        shadows = None if self.shadows is None else self.shadows.with_more(mask, more.shadows)
-        return replace(self, extraction=replace(one, samples=samples, film=film), results=results, shadows=shadows)
-
     @property
     def cycles(self) -> dict[str, np.ndarray]:
         """The two halves (2, H, W, 3) of Cycles' picture per pass; empty without a Cycles reference."""

@@ -42,9 +42,7 @@ GROUP_PREFIX = "Combined_"  # of the passes of light groups
 # The errors of pixels are means over those that are at most ERROR_RADIUS away. A picture weighs by its squared error to
 # the power -ERROR_POWER, which is at least LEAST_ERROR of Cycles' noise.
 ERROR_RADIUS, ERROR_POWER, LEAST_ERROR = 4, 2, 0.02
-# LEAST_CURVATURE: second difference of light from pixel to pixel, relative to the light, that counts as an edge.
-# EDGE_RADIUS: the pixels on each side over which the light is averaged.
-LEAST_CURVATURE, EDGE_RADIUS = 0.1, 1
+PRIOR = (1.0, 1.0, 1.0)
 MOST_RECOLORING = 3.0  # how many times the color of LTSH's points Cycles' color of a pixel counts at most
 MOST_FACTOR = 3.0  # direct light of the finished picture is at most this many times LTSH's
 
@@ -123,17 +121,6 @@ def recoloring_of_points(own_color: np.ndarray, color: np.ndarray) -> np.ndarray
     LTSH's few points, `own_color`. So borders of objects and textures are as smooth as Cycles'."""
     factor = np.divide(color, own_color, out=np.ones_like(own_color), where=own_color > 1e-6)
     return np.minimum(factor, MOST_RECOLORING)
-
-
-def light_curvature(light: np.ndarray) -> np.ndarray:
-    """The largest second difference (H, W) of `light` (H, W) from pixel to pixel; 0 below LEAST_CURVATURE of it."""
-    grid, (height, width) = np.pad(light, 1, mode="edge"), light.shape
-    shifted = [grid[y : y + height, x : x + width] for y in range(3) for x in range(3)]
-    # The pairs of opposite neighbors of a pixel.
-    pairs = zip(shifted[:4], shifted[:4:-1], strict=True)
-    curvature = np.max([np.abs(one + other - 2.0 * light) for one, other in pairs], axis=0)
-    curvature[curvature < LEAST_CURVATURE * box_mean(light, EDGE_RADIUS)] = 0.0
-    return curvature
 
 
 def point_statistics(film, radiance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -242,7 +229,7 @@ def _weights(noisy, others, samples) -> tuple[list[np.ndarray], tuple[float, flo
     denoised, lit = zip(*others, strict=True)
     squares = map(box_mean, (error(*lit), error(*denoised), noise))
     squares = [np.maximum(one, LEAST_ERROR * box_mean(noise)) for one in squares]
-    powers = [(one + 1e-20) ** -ERROR_POWER for one in squares]
+    powers = [prior * (one + 1e-20) ** -ERROR_POWER for prior, one in zip(PRIOR, squares, strict=True)]
     weights = [one / sum(powers) for one in powers]
     # A mean errs at most as much as its parts do on average.
     light = max(np.square(denoised).mean(), 1e-30)

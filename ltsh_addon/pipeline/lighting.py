@@ -16,7 +16,6 @@ from pathlib import Path
 import numpy as np
 
 from .. import shading, visibility
-from ..cycles.gbuffer import finer
 from ..emitters.light_tree import FEWEST
 from ..files import check_takes_files
 from ..imaging.exr import unique_names
@@ -55,11 +54,6 @@ class Shadows:
     def take(self, index: np.ndarray) -> Shadows:
         """The shadows of the samples at `index` (Q,)."""
         return replace(self, shares={name: values[:, index] for name, values in self.shares.items()})
-
-    def with_more(self, mask: np.ndarray, more: Shadows) -> Shadows:
-        """The shadows of the samples in `mask` (P,), then those of `more`; `light` and `variance` stay."""
-        shares = {name: np.concatenate([one[:, mask], more.shares[name]], 1) for name, one in self.shares.items()}
-        return replace(self, shares=shares, rays=self.rays + more.rays, seconds=self.seconds + more.seconds)
 
     def of_lights(self, numbers: Sequence[int]) -> Shadows:
         """The shadows of the lights with these sorted `numbers`, renumbered from 0.
@@ -103,10 +97,6 @@ class ShadowTracer:
 
     def __exit__(self, *error):
         self._tracer.close()
-
-    def finer(self, samples: SurfaceSamples, film: Film, points, pixels: np.ndarray):
-        """`gbuffer.finer` with this tracer's rays."""
-        return finer(samples, film, points, pixels, self._tracer.first_met)
 
     def trace(
         self,
@@ -306,12 +296,6 @@ class TechniqueResult:
     seconds: dict[str, float]  # per pass
     subset: np.ndarray | None  # (Q,) sorted indices of the samples that were evaluated, None for all
     unshadowed: shading.Shading | None = None  # the same without shadows, where `shading` has shadows
-
-    def with_more(self, mask: np.ndarray, more: TechniqueResult) -> TechniqueResult:
-        """The samples in `mask` (P,), then those of `more`; both results must be without a subset."""
-        seconds = {name: value + more.seconds[name] for name, value in self.seconds.items()}
-        unshadowed = None if self.unshadowed is None else self.unshadowed.with_more(mask, more.unshadowed)
-        return TechniqueResult(self.shading.with_more(mask, more.shading), seconds, None, unshadowed)
 
 
 def evaluated(tables, extraction, shadows, options, progress) -> dict[str, TechniqueResult]:

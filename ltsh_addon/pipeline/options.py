@@ -24,8 +24,6 @@ MOST_FRAMES = 100_000
 MOST_CYCLES_SAMPLES = 2 << 24
 TEXTURE_SIDES = (64, 8192)
 SHADOW_RAYS = 8, 1024
-# EDGE_POINTS: the most points of a pixel of a finished picture that an edge runs through.
-EDGE_POINTS = 64
 MOST_REFINEMENTS = 4096
 MOST_MARGIN = 512
 # MARGIN_TYPES: texels of the margin show the nearest texel, or the adjacent face of the mesh.

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .options import EDGE_POINTS, SHADOW_RAYS, RenderOptions
+from .options import SHADOW_RAYS, RenderOptions
 
 # Points per pixel. Without a budget, one for SAMPLES_OF_POINT samples of Cycles, from FIRST_POINTS to DEFAULT_POINTS:
 # beside few samples more points cost more than they win. With one, FIRST_POINTS: of the samples on which the plan
@@ -21,17 +21,14 @@ DENOISER_START_SECONDS, FIRST_DENOISING_SECONDS, NEXT_DENOISING_SECONDS = 0.25, 
 # SHADOWS_SHARE: the share of a budget that goes to the rays of soft shadows. RAY_SECONDS: processor time of a ray.
 # SOFT_SHARE: the share of the pairs of a pixel and a light that lie in soft shadows.
 SHADOWS_SHARE, RAY_SECONDS, SOFT_SHARE = 0.02, 6e-7, 0.1
-# More points for pixels with an edge. FEWEST_EDGE_POINTS: what such a pixel gets at least. MOST_EDGE_SAMPLES: how many
-# samples more they may take, relative to all. EDGE_SHARE: the share of the remaining budget that they may take.
-FEWEST_EDGE_POINTS, MOST_EDGE_SAMPLES, EDGE_SHARE = 8, 1.0, 0.3
 MOST_OVER = 1.1  # how many times the budget a picture may take without a warning
 # The time of direct light is extrapolated from a few squares of the picture. PROBES: the share of the samples that
 # these have, and the power of the number of samples with which the time grows from there: from the first squares at
 # least 0.45, from the second 0.49 to 0.7 in six scenes of 32,400 pixels, and 0.84 with nine times as many.
 # MADE_ONCE: how many times too long the first may seem, since it also makes what all others have (maps of skies).
 PROBES, MADE_ONCE = ((0.01, 0.45), (0.04, 0.6)), 2.0
-# Of the remaining budget: the share that direct light may take with the first points, and with more points. With as many
-# samples it leaves 0.75 to 0.95 of the error, which so much less time makes up for.
+# Of the remaining budget: the share that direct light may take with the first points, and with more points. With as
+# many samples it leaves 0.75 to 0.95 of the error, for which so much time makes up.
 DIRECT_SHARE, MORE_SHARE = 0.3, 0.2
 # THIN_CONTRAST: from this `Probe.contrast` on, highlights are thinner than pixels, and time is better spent on samples
 # of Cycles. In five scenes the contrast is at most 0.18, on the example scene 0.9, and 0.4 with 1280 x 720 pixels.
@@ -126,32 +123,6 @@ def shadow_rays(most: int, budget: float | None, pairs: float) -> int:
         return most
     affordable = SHADOWS_SHARE * budget / max(SOFT_SHARE * RAY_SECONDS * pairs, 1e-9)
     return int(np.clip(affordable, SHADOW_RAYS[0], most))
-
-
-def edge_samples(seconds_left: float | None, direct_seconds: float) -> float:
-    """How many samples more pixels at edges may take, relative to all samples, which took `direct_seconds`."""
-    if seconds_left is None:
-        return MOST_EDGE_SAMPLES
-    return min(EDGE_SHARE * seconds_left / direct_seconds, MOST_EDGE_SAMPLES)
-
-
-def points_of_edges(curvature: np.ndarray, covered: np.ndarray, most: float) -> np.ndarray:
-    """Numbers of points (Q,) of pixels at edges, at most `most` together, by the `curvature` (Q,) of the light there.
-
-    `covered` (Q,) is the share of a pixel that has a surface. The error of an edge falls with the number of points to
-    the power -0.75. A pixel gets at most EDGE_POINTS, and 0 in place of fewer than FEWEST_EDGE_POINTS.
-    """
-    worth = curvature**0.8
-    low, high = 0.0, EDGE_POINTS / max(worth.max(initial=0.0), 1e-30) * 1e3
-
-    def points(scale):
-        wanted = scale * worth
-        return np.where(wanted >= FEWEST_EDGE_POINTS, np.minimum(wanted, EDGE_POINTS), 0.0).astype(int)
-
-    for _ in range(40):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if (points(middle) * covered).sum() <= most else (low, middle)
-    return points(low)
 
 
 def seconds_before_denoising(budget: float | None, spent: float, pixels: int, denoisings: int) -> float | None:

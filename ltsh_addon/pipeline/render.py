@@ -25,7 +25,7 @@ from ..visibility import ShadowSampling
 from . import compositing, plan
 from .comparison import Comparison
 from .lighting import Shadows, ShadowTracer, evaluated, load_tables, rays_of_samples
-from .options import EDGE_POINTS, SHADOW_RAYS, PictureOptions, RenderOptions, child_job
+from .options import PictureOptions, RenderOptions, child_job
 from .picture import view_transformed
 from .relight import RELIGHT_SUFFIX, write_relight_data
 from .tasks import TaskResult, check_before_writing, write_reports
@@ -33,9 +33,6 @@ from .tasks import TaskResult, check_before_writing, write_reports
 NAMED = 8  # of what is left to Cycles, in a warning
 # SQUARE: the squares of a probe, in pixels on a side.
 SQUARE = 8
-# MOST_EDGES: where a larger share of the pixels has edges, these are the detail of surfaces, and samples of Cycles are
-# worth more than further points.
-MOST_EDGES = 0.3
 
 
 @dataclass(frozen=True)
@@ -172,7 +169,6 @@ def shade_direct_light(
         reserve=plan.FIRST_DENOISING_SECONDS / 1e6,
         cycles_samples=0,
         for_finished=True,
-        edge_points=EDGE_POINTS,
     )
     extraction = extract_pixels(job, progress=progress)
     clock.end("extraction", extraction.times.processor)
@@ -197,11 +193,6 @@ def shade_direct_light(
         clock.end("shadows")
         comparison = shader.shaded(extraction, shadows, progress)
         clock.end("shading")
-        if extraction.points.finer is not None:
-            direct_seconds = clock.stages["shadows"] + clock.stages["shading"]
-            more = plan.edge_samples(seconds_left(extraction), direct_seconds)
-            comparison = shader.with_edge_points(comparison, more, progress)
-            clock.end("edges")
     return comparison
 
 
@@ -276,32 +267,6 @@ class DirectLightShader:
         if not total > 0.0:
             return plan.Probe(samples, seconds)
         return plan.Probe(samples, seconds, float(np.sqrt(variance / squared)))
-
-    def with_edge_points(self, comparison: Comparison, more: float, progress) -> Comparison:
-        """The same with more points for the pixels that edges of diffuse light run through, of shadows or of objects.
-
-        There are at most `more` times as many new samples as samples.
-        """
-        extraction, film = comparison.extraction, comparison.film
-        light = comparison.images[next(iter(comparison.results)), "diffuse"].mean(axis=-1)
-        curvature = compositing.light_curvature(light).ravel()
-        covered = np.minimum(film.coverage(), 1.0).ravel()
-        by_cycles = extraction.left_to_cycles.by_pass["diffuse"].ravel()
-        pixel = np.flatnonzero((curvature > 0.0) & ~by_cycles & (covered > 0.0))
-        if len(pixel) > MOST_EDGES * len(curvature):
-            return comparison
-        points = plan.points_of_edges(curvature[pixel], covered[pixel], more * len(film.pixel))
-        is_finer = points > film.sub_samples
-        if not is_finer.any():
-            return comparison
-        pixels = {"pixel": pixel[is_finer], "number": points[is_finer]}
-        samples, fine_film, replaced = self.tracer.finer(extraction.samples, film, extraction.points.finer, pixels)
-        if len(samples) == 0:
-            return comparison
-        fine = replace(extraction, samples=samples, film=fine_film)
-        sampling = ShadowSampling(PASSES, SHADOW_RAYS[0], fine_film)
-        shadows = self.tracer.trace(samples, sampling, progress=progress)
-        return comparison.with_more(~replaced, self.shaded(fine, shadows, progress))
 
 
 class _ProcessorClock:

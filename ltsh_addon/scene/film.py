@@ -32,18 +32,6 @@ class Film:
         arrays = {name: None if values is None else values[index] for name, values in arrays.items()}
         return replace(self, pixel=self.pixel[index], **arrays)
 
-    def with_more(self, more: Film) -> Film:
-        """A film with the samples of this one and of `more`, which has the same pixels."""
-        arrays = {name: (getattr(self, name), getattr(more, name)) for name in ("pixel", "first", "count", "spread")}
-        joined = {name: None if one is None else np.concatenate([one, other]) for name, (one, other) in arrays.items()}
-        return replace(self, whole=more.whole, **joined)
-
-    def has_more(self) -> np.ndarray:
-        """Mask (H, W) of the pixels that have more than `sub_samples` samples, by `with_more`."""
-        first = self.pixel if self.first is None else self.pixel[self.first]
-        count = np.bincount(first, minlength=self.width * self.height)
-        return count.reshape(self.height, self.width) > self.sub_samples
-
     def unspread(self) -> Film:
         """The same samples, each only in its own pixel."""
         return replace(self, spread=None, whole=None)

@@ -205,16 +205,6 @@ class Shading:
         """Sum (P, 3) over the passes and rows."""
         return sum(radiance.sum(axis=0) for radiance in (self.specular, self.diffuse) if radiance is not None)
 
-    def with_more(self, mask: np.ndarray, more: Shading) -> Shading:
-        """The samples for which the mask `kept` (P,) is True, then those of `more`, with the same rows and passes."""
-
-        def joined(name, axis):
-            one, other = getattr(self, name), getattr(more, name)
-            return None if one is None else np.concatenate([np.compress(mask, one, axis), other], axis)
-
-        axes = {"specular": 1, "diffuse": 1, "quadrature_error": 0}
-        return Shading(**{name: joined(name, axis) for name, axis in axes.items()})
-
 
 class OwnTechnique(Protocol):
     """A technique of the user: anything with this method. An attribute `name` replaces the name of its class."""

@@ -376,22 +376,6 @@ class Tracer:
             index = index[transmittance[index] > 0.0]
         transmittance[index] = 0.0
 
-    def first_met(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Distance (R,) in m along unit `directions` (R, 3) to what blocks rays, inf if nothing does; and mask (R,) of
-        the rays with something transparent before that."""
-        nearest = np.full((2, len(origins)), np.inf, np.float32)
-        rays = [np.asarray(values, np.float32) for values in (origins, directions)]
-        masks, chunk = np.full(len(origins), ALL_RAYS, np.uint32), self._caster.chunk
-        with self._lock:
-            for is_clear in np.flatnonzero(self._caster.has):
-                for start in range(0, len(origins), chunk):
-                    rows = slice(start, start + chunk)
-                    chunk_rays = [values[rows] for values in rays]
-                    near, far = (np.full(len(chunk_rays[0]), end, np.float32) for end in (0.0, np.inf))
-                    hits = self._caster.closest(bool(is_clear), *chunk_rays, near, far, masks[rows])
-                    nearest[is_clear, start + hits.ray] = hits.distance
-        return nearest[0], nearest[1] < nearest[0]
-
     def mask_of(self, light: str) -> int:
         """Mask for `transmittance` of the rays to the light of that name; 0 if nothing is in its way."""
         return self.occluders.mask_of(light)

@@ -369,7 +369,6 @@ def extract_pixels(job: PixelJob, folder: Path, progress) -> dict:
         # If all direct light is left to Cycles, no samples are needed.
         count = 0 if inventory.left_to_cycles.everything else count
         offsets, weights = render_settings.sub_pixel_offsets(scene, count, render_settings.shared_points)
-    finer = _finer(scene, job.edge_points) if for_finished and has_shadows and count and not has_lens else None
     with world_behind(scene, inventory.behind if job.rest and not picture["film_transparent"] else None):
         passes = (*(REST_PASSES if job.rest else ()), *job.indices)
         # Lights that the camera sees are part of the rest.
@@ -405,7 +404,6 @@ def extract_pixels(job: PixelJob, folder: Path, progress) -> dict:
         "behind": behind,
         "has_lens": has_lens,
         "weights": None if weights is None else weights[: len(samples)].tolist(),
-        "finer": finer,
         "reference": reference,
         "passes": render_settings.pass_names(),
         "seconds": seconds,
@@ -431,24 +429,6 @@ def _prepare_reference(scene, inventory: LightInventory) -> None:
     else:
         scene.cycles.transparent_max_bounces = inventory.occluders.transparent_surfaces
     scene.world = inventory.world
-
-
-def _finer(scene, count: int) -> dict | None:
-    """The record of `gbuffer.FinerPoints` for `count` points per pixel; None if the camera's rays are not known."""
-
-    def visit(depsgraph):
-        return render_settings.camera_rays(scene, scene.camera.evaluated_get(depsgraph).matrix_world)
-
-    rays = with_render_depsgraph(scene, visit)
-    offsets, weights = render_settings.sub_pixel_offsets(scene, count, render_settings.shared_points)
-    if rays is None:
-        return None
-    return {
-        "starts": rays[0].tolist(),
-        "directions": rays[1].tolist(),
-        "offsets": offsets.tolist(),
-        "weights": None if weights is None else weights.tolist(),
-    }
 
 
 def scene_named(name: str | None):

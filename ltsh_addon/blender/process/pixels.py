@@ -52,7 +52,6 @@ class PixelJob:
     indices: tuple[str, ...] = ()  # keys of index passes, such as "object_index"; see `render_settings.pass_names`
     shadows: str = "off"  # "on": also the occluders, which then block light in the Cycles reference, too
     for_finished: bool = False  # also what a finished picture leaves to Cycles; no light is needed
-    edge_points: int = 0  # points of a pixel of a finished picture that has an edge
     seconds: float | None = None  # processor time for the whole picture, which limits its sub-samples
     reserve: float = 0.0  # the seconds of it that each pixel takes last, for denoising
 
@@ -142,7 +141,6 @@ class PixelPoints:
 
     number: np.ndarray | None = None  # (P,) of each sample's point in its pixel
     weights: np.ndarray | None = None  # (N, D, D) of the points, as in `Film.shared`
-    finer: gbuffer.FinerPoints | None = None  # for pixels at edges
 
 
 @dataclass(frozen=True)
@@ -295,9 +293,8 @@ class _SampleRenders:
     def points(self) -> PixelPoints:
         """The points of the pixels, and the number of each sample's render among them."""
         number = np.repeat(np.arange(len(self._renders)), [len(pixel) for _, pixel in self._renders])
-        weights, finer = self._manifest["weights"], self._manifest["finer"]
-        weights = np.array(weights) if weights else None
-        return PixelPoints(number, weights, gbuffer.FinerPoints.of(finer) if finer else None)
+        weights = self._manifest["weights"]
+        return PixelPoints(number, np.array(weights) if weights else None)
 
     def _rendered_pixels(self) -> np.ndarray:
         """Mask (H, W) of the pixels that were rendered."""
@@ -376,10 +373,7 @@ def with_points(extraction: Extraction, count: int) -> Extraction:
     # With depth of field the points of a pixel may be far from each other.
     if not extraction.picture.has_lens and len(samples):
         samples, film = gbuffer.merged(samples, film)
-    finer = points.finer
-    if finer is not None and points.weights is not None:
-        finer = replace(finer, sums=points.weights[:count].sum(axis=0))
-    return replace(extraction, samples=samples, film=film, points=PixelPoints(finer=finer))
+    return replace(extraction, samples=samples, film=film, points=PixelPoints())
 
 
 def ended_at_horizons(extraction: Extraction, progress: Progress | None = None) -> Extraction:

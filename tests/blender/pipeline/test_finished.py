@@ -12,19 +12,18 @@ import scene_parts as parts
 from material_scenes import Build
 
 from ltsh_addon import imaging
-from ltsh_addon.blender import render_settings
 from ltsh_addon.blender.extract import pixels as pixels_module
 from ltsh_addon.blender.lights.emission import LookTooLong
 from ltsh_addon.blender.process.finished import FinishedJob, render_finished
 from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels, with_points
 from ltsh_addon.cli import main
 from ltsh_addon.cycles.lobes import read_layer
-from ltsh_addon.pipeline import PictureOptions, RenderOptions, compositing, plan, render, shade_scene
+from ltsh_addon.pipeline import PictureOptions, RenderOptions, plan, render, shade_scene
 from ltsh_addon.pipeline.lighting import ShadowTracer, load_tables
 from ltsh_addon.pipeline.mixer import light_pictures
 from ltsh_addon.pipeline.moved_lights import MovedLights
 from ltsh_addon.pipeline.relight import LightChange, RelightData, relight
-from ltsh_addon.scene import PASSES, Film, light_of
+from ltsh_addon.scene import PASSES, light_of
 
 SIZE, BLOCK = 32, 8  # pixels
 SAMPLES, TRUE_SAMPLES = 64, 1024
@@ -238,10 +237,7 @@ def test_ours_and_the_rest_are_the_whole_in_the_files_of_a_command(out, tmp_path
 
 
 @pytest.mark.newest
-def test_denoising_takes_the_noise_of_the_rest_and_leaves_its_mean(tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        compositing, "weight_at_edges", lambda *images: 1.0
-    )  # at edges the rest holds direct light, too
+def test_denoising_takes_the_noise_of_the_rest_and_leaves_its_mean(tmp_path):
     floor_and_ball(gray(), 2)
     path = parts.save(tmp_path / "room.blend")
     rest = {
@@ -279,54 +275,6 @@ def test_edges_of_what_shines_are_smooth_with_few_samples(is_transparent, tmp_pa
     off, noise = (np.linalg.norm((image - true)[edge]) for image in (ours, cycles))
     assert off < 0.3 * noise, f"{off / noise:.2f} of the error that Cycles has with as many samples"
     assert abs(ours.mean() / true.mean() - 1.0) < 0.02
-
-
-@pytest.mark.newest
-def test_hard_edges_of_diffuse_light_are_nearer_to_cycles_than_ours_or_its_own(tmp_path, monkeypatch):
-    """A ball and its shadow in the sun: points and samples place their edges independently, so the mean of both has
-    0.7 of the error where both are alike, and less than either where they are nearly so."""
-    scene = floor_and_ball(bsdf("BsdfDiffuse"))
-    bpy.data.objects.remove(scene.objects["Light"])
-    sun = bpy.data.lights.new("Sun", "SUN")
-    sun.energy, sun.angle = 4.0, 0.01
-    parts.link(bpy.data.objects.new("Sun", sun), rotation=(0.6, 0.5, 0.0))
-    path = parts.save(tmp_path / "scene.blend")
-    scene.cycles.seed = 1
-    true = read_layer(by_cycles(tmp_path).channels, "Combined", "RGB")
-    off = {}
-    for name, weight in {"both": compositing.weight_at_edges, "ours": lambda *images: np.ones((SIZE, SIZE)),
-                         "cycles": lambda *images: np.zeros((SIZE, SIZE))}.items():  # fmt: skip
-        monkeypatch.setattr(compositing, "weight_at_edges", weight)
-        made = render.finish(RenderOptions(path, output=tmp_path, sub_samples=5, cycles_samples=8))
-        off[name] = np.linalg.norm(made.combined[..., :3] - true)
-        names = (made.cycles.names[key] for key in ("diffuse_light", "diffuse_color"))
-        own, (light, color) = (
-            made.ours["ltsh4c.diffuse"],
-            (read_layer(made.cycles.channels, key, "RGB") for key in names),
-        )
-        written = read_layer(made.channels, made.cycles.names["diffuse_light"], "RGB") * color
-        points_color = made.comparison.film.image(made.comparison.extraction.samples.diffuse_albedo)
-        whole = made.comparison.images["ltsh4c", "diffuse"]
-        whole = whole * compositing.recoloring_of_points(points_color, color)
-        lit = (whole > 0.0) & (color > 0.0)
-        left = (1.0 - own[lit] / whole[lit]) * (light * color)[lit]
-        np.testing.assert_allclose(written[lit], own[lit] + left, rtol=1e-4, atol=1e-5)
-    assert off["both"] < 0.9 * min(off["ours"], off["cycles"]), off
-
-
-@pytest.mark.newest
-def test_half_of_an_edge_is_left_to_cycles_but_not_of_what_is_smooth_or_noisy_there():
-    x, y = np.mgrid[:12, :12]
-    step, noise = np.where(x + 0.5 * y < 8.0, 1.0, 0.2)[..., None], np.random.default_rng(1).normal(size=(12, 12, 1))
-    edge = np.s_[5:8, 3]
-    weights = {
-        "edge": compositing.weight_at_edges(step, step)[edge].max(),
-        "slope": compositing.weight_at_edges(step * 0.0 + 0.1 * x[..., None], step)[2:-2, 2:-2].min(),
-        "noisy": compositing.weight_at_edges(step, step + 3.0 * noise)[edge].min(),
-    }
-    assert weights["edge"] == 1.0  # nothing is between both
-    weights["edge"] = compositing.weight_at_edges(step, step + 0.02 * noise)[edge].max()
-    assert weights["edge"] == 0.5 and weights["slope"] == pytest.approx(1.0) and weights["noisy"] > 0.95, weights
 
 
 @pytest.mark.newest
@@ -526,32 +474,6 @@ def test_the_files_of_a_budget_share_no_noise(tmp_path):
     assert all(not np.array_equal(one, other) for one, other in itertools.combinations(noise, 2))
 
 
-@pytest.mark.parametrize("lens", ["PERSP", "ORTHO"])
-def test_edges_of_shadows_on_flat_surfaces_are_where_cycles_has_them(lens, tmp_path, monkeypatch):
-    """Two boards above a floor, seen by a shifted camera, a part of whose picture is rendered."""
-    scene = parts.empty_scene(36, 48)
-    for location, size in (((0.0, 0.0, 0.0), 8.0), ((0.3, 0.2, 0.8), 0.9), ((-0.7, -0.4, 0.4), 0.5)):
-        parts.add_plane(gray()(), size=size, location=location, rotation=(0.0, 0.0, 0.5))
-    camera = parts.add_camera((0.0, -4.5, 3.5), (0.9, 0.0, 0.0)).data
-    camera.type, camera.ortho_scale, camera.shift_x, camera.sensor_fit = lens, 4.0, 0.1, "VERTICAL"
-    settings = scene.render
-    settings.pixel_aspect_x, settings.use_border, settings.use_crop_to_border = 1.5, True, True
-    settings.border_min_x, settings.border_max_y = 0.2, 0.9
-    parts.add_area_light(location=(0.8, -1.0, 3.0), size=0.05)
-    path = parts.save(tmp_path / "room.blend")
-    found = by_cycles(tmp_path, 256)
-    light, color = (read_layer(found.channels, found.names[f"diffuse_{part}"], "RGB") for part in ("light", "color"))
-    pictures = []
-    for most in (1.0, 0.0):
-        monkeypatch.setattr(render, "MOST_EDGES", most)
-        made = render.finish(RenderOptions(path, output=tmp_path, sub_samples=3, cycles_samples=4)).comparison
-        pictures.append((made.images["ltsh4c", "diffuse"], made.film.has_more()))
-    (fine, is_fine), (coarse, is_coarse) = pictures
-    assert np.count_nonzero(is_fine) > 60 and not is_coarse.any()
-    error, before = (np.linalg.norm((one - light * color)[is_fine]) for one in (fine, coarse))
-    assert error < 0.6 * before
-
-
 def test_the_first_points_of_a_pixel_are_those_of_a_picture_with_fewer(tmp_path):
     floor_and_ball(gray(), 1)
     path = parts.save(tmp_path / "room.blend")
@@ -591,37 +513,6 @@ def test_a_picture_without_any_light_says_that_it_is_black(tmp_path):
     path = parts.save(tmp_path / "dark.blend")
     report = render.finish(RenderOptions(path, output=tmp_path, sub_samples=1, cycles_samples=2, denoise="off")).report
     assert any("no light at all" in line and "'Camera'" in line for line in report["warnings"])
-
-
-@pytest.mark.newest
-def test_few_points_leave_to_cycles_what_its_samples_tell_better():
-    """Highlights thinner than a pixel, and a slope, by four points of each pixel beside samples of known variance."""
-    size, points = 48, 4
-    random = np.random.default_rng(5)
-    film = Film(size, size, np.repeat(np.arange(size * size), points), points)
-    noise = random.normal(size=(size, size))
-    thin, variance = 10.0 * (random.random(len(film.pixel)) < 0.1), 100.0 * 0.1 * 0.9
-    weight = {
-        samples: compositing.weight_of_points(film, thin, 1.0 + np.sqrt(variance / samples) * noise).mean()
-        for samples in (1, 4, 64)
-    }
-    # By chance the points of 81 pixels differ less than they should.
-    assert weight[1] > 0.95 and weight[64] < 0.1 and weight[1] > weight[4] > weight[64]
-    # The error of shared points is that of SHARED times as many.
-    kind = "BLACKMAN_HARRIS", 1.5
-    shared = film.shared(render_settings.shared_points(*kind, points)[1], np.tile(range(points), size**2), noise < 9.0)
-    own, fewer = (np.square(one.image(thin)[1:-1, 1:-1] - 1.0).mean() for one in (shared, film))
-    assert fewer / own == pytest.approx(compositing.SHARED_POINTS, rel=0.1)
-    for samples in (4, 16):
-        direct = 1.0 + np.sqrt(variance / samples) * noise
-        assert (
-            compositing.weight_of_points(shared, thin, direct).mean()
-            > compositing.weight_of_points(film, thin, direct).mean()
-        )
-    # Each point at the middle of a quarter of its pixel: their mean is the mean of the slope.
-    corner = np.tile([0.25, 0.75, 0.25, 0.75], size * size)
-    slope = film.pixel % size + corner
-    assert compositing.weight_of_points(film, slope, film.image(slope) + 0.05 * noise).min() > 0.95
 
 
 @pytest.mark.newest

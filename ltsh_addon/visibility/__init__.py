@@ -9,11 +9,8 @@ from __future__ import annotations
 from .light_cluster import shared_numbers
 from .occluders import Hits, OccluderMesh, Occluders, Transparency
 from .ratio import (
-    BLOCK_SAMPLES,
     ShadowSampling,
-    ShadowTask,
     Visibility,
-    shadow_task,
     trace_ray_origins,
     trace_visibility,
 )
@@ -21,18 +18,15 @@ from .rays import Tracer, open_tracer
 from .shadow_terminator import RayOrigins
 
 __all__ = [
-    "BLOCK_SAMPLES",
     "Hits",
     "OccluderMesh",
     "Occluders",
     "RayOrigins",
     "ShadowSampling",
-    "ShadowTask",
     "Tracer",
     "Transparency",
     "Visibility",
     "open_tracer",
-    "shadow_task",
     "shared_numbers",
     "trace_ray_origins",
     "trace_visibility",

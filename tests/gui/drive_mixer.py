@@ -76,17 +76,17 @@ def moved(rig, picture="6_moved"):
 
 def updated(rig, when, picture):
     """The button, and the picture; how long it takes, and the window does not answer."""
-    mixer, results, scene = hands.module("ui.mixer"), hands.module("ui.results"), bpy.context.scene
+    results, scene = hands.module("ui.results"), bpy.context.scene
     before = results.mixed_pixels(scene).copy()
     longest = 0.0
     start = last = time.perf_counter()
     hands.operate(rig, bpy.ops.ltsh.update_moved_lights, "INVOKE_DEFAULT", kind="IMAGE_EDITOR")
-    while mixer._updating["update"] is not None and last - start < 300.0:
+    while results.state["update"] is not None and last - start < 300.0:
         yield 0.01
         now = time.perf_counter()
         longest, last = max(longest, now - last - 0.01), now
     rig.fact(f"{picture}, {when}: end, longest without an answer, s", [round(last - start, 2), round(longest, 2)])
-    rig.check(mixer._updating["update"] is None, "moved lights are shaded")
+    rig.check(results.state["update"] is None, "moved lights are shaded")
     rig.check((results.mixed_pixels(scene) != before).mean() > 0.05, "and seen where they are")
     yield 1
     rig.shot(f"{picture}.png")

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..lobes.brdf import ggx_distribution, masking
-from ..lobes.polygon import dot
+from ..lobes.polygon import dot, normal_frames
 
 # Distance, in units of a sphere's radius, of the disk that stands for the half space seen from within.
 NEAR_DISK = 1e-3
@@ -89,13 +89,7 @@ class FacingDisk:
         if tiny.any():
             gain = np.where(tiny, np.square(disk_radius / (LEAST_SIZE * length)), gain)
             disk_radius = np.where(tiny, LEAST_SIZE * length, disk_radius)
-        x, y, z = -offset / length
-        # A frame around the direction of the light (Duff et al. 2017).
-        sign = np.copysign(offset.dtype.type(1.0), z)
-        a = -1.0 / (sign + z)
-        b = x * y * a
-        half_u = disk_radius * np.stack([1.0 + sign * x * x * a, sign * b, -sign * x])
-        half_v = disk_radius * np.stack([b, sign + y * y * a, -y])
+        half_u, half_v = (disk_radius * axis for axis in normal_frames(-offset / length)[:2])
         return cls(offset, half_u, half_v, length, disk_radius, gain)
 
     def take(self, index) -> FacingDisk:

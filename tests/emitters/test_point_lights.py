@@ -37,10 +37,6 @@ def test_every_point_sees_a_distant_light_as_the_origin_does(technique, dtype):
         assert np.array_equal(found.diffuse, expected.diffuse) and found.diffuse.any()
 
 
-def test_distant_lights_are_so_as_json():
-    assert light_of(distant_lights()[2].record()).is_distant
-
-
 @pytest.mark.parametrize("options", [{"spread": 1.0}, {"falloff": 1}])
 def test_distant_lights_have_no_profile(options):
     with pytest.raises(ValueError, match="it has (spread|falloff), expected none for a SkyLight"):
@@ -133,18 +129,6 @@ def test_form_factors_of_lights_that_face_every_point(kind, dtype):
     expected = oracle(samples, light, quadrature.lambert)
     error = np.linalg.norm(found - expected) / np.linalg.norm(expected)
     assert expected.any() and error < 2e-3
-
-
-def test_a_ball_shines_like_a_point_in_its_middle():
-    """On what faces it: the flux through a surface is that of all of its power."""
-    light = facing_light()
-    samples = lit_samples(50, light)
-    offset = light.center - samples.position
-    squared = (offset**2).sum(axis=1)
-    cosine = (samples.normal * offset).sum(axis=1) / np.sqrt(squared)
-    expected = (cosine / squared * np.pi * 0.4**2 / np.pi)[:, None] * samples.diffuse_albedo * light.radiance
-    found = shading.shade(samples, [light], "ltsh4", passes=["diffuse"], workers=1).diffuse[0]
-    assert np.allclose(found, expected, rtol=1e-4, atol=1e-5 * expected.max())
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])

@@ -153,52 +153,6 @@ def test_a_textured_light_counts_by_its_radiance():
         np.testing.assert_allclose(pairs.visibility_ratio(name)[0], share, atol=0.02)
 
 
-def test_a_half_plane_leaves_the_form_factor_of_what_it_does_not_hide():
-    """Lambert's formula for the part of a panel beside the edge x = 0 of a screen at y = 1."""
-    samples, _ = floor(10)
-    light = panel()
-    tracer = Tracer(lambda origins, directions, _: (origins + directions * crossing(origins, directions))[:, 0] < 0.0)
-
-    def crossing(origins, directions):
-        return ((1.0 - origins[:, 1]) / np.where(directions[:, 1] > 0.0, directions[:, 1], np.inf))[:, None]
-
-    behind = samples.take(samples.position[:, 1] < 1.0)
-    pairs = with_all_rays(behind, light, tracer)
-    shares = pairs.visibility_ratio("diffuse")[0]
-    for number, position in enumerate(behind.position[pairs.index]):
-        # The plane through the point and the edge: x (1 - y) + (y - py) px ... of the vertical line x = 0, y = 1.
-        edge = np.array([0.0, 1.0, 0.0]) - position
-        normal = np.cross(edge, [0.0, 0.0, 1.0])
-        corners = light.polygon() - position
-        left = clipped(corners, normal * np.sign(normal @ [-1.0, 0.0, 0.0]))
-        expected = lambert(left) / lambert(corners)
-        assert shares[number] == pytest.approx(expected, abs=0.01), position
-
-
-def clipped(corners, normal):
-    """The part of a polygon (V, 3) where normal . x >= 0."""
-    found = []
-    for one, other in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        a, b = one @ normal, other @ normal
-        if a >= 0.0:
-            found.append(one)
-        if a * b < 0.0:
-            found.append(one + a / (a - b) * (other - one))
-    return np.array(found)
-
-
-def lambert(corners):
-    """Form factor of a polygon (V, 3) above the floor (Lambert 1760)."""
-    if len(corners) < 3:
-        return 0.0
-    unit = random_surfaces.unit(corners)
-    following = np.roll(unit, -1, axis=0)
-    across = np.cross(unit, following)
-    length = np.linalg.norm(across, axis=1)
-    angle = np.arctan2(length, (unit * following).sum(axis=1))
-    return abs((angle * across[:, 2] / length).sum()) / (2.0 * np.pi)
-
-
 THREE_SPHERES = past_spheres(((0.0, 1.0, 0.5), 0.5), ((-1.2, -0.5, 0.3), 0.3), ((1.0, -1.0, 0.2), 0.2))
 
 

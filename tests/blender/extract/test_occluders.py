@@ -89,19 +89,12 @@ def vertex_instances():
 
 def generated_instances():
     """A geometry nodes modifier that puts two meshes it makes on points: a ball, and cubes."""
-    tree = bpy.data.node_groups.new("Scatter", "GeometryNodeTree")
-    tree.interface.new_socket("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
-    tree.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
-    entry, end, on_points, made = (
-        tree.nodes.new(kind)
-        for kind in ("NodeGroupInput", "NodeGroupOutput", "GeometryNodeInstanceOnPoints", "GeometryNodeMeshCube")
-    )
+    ob = hidden(scene_parts.add_plane(size=1.6, name="Points", location=(0.0, 0.0, 1.0), rotation=(0.2, 0.1, 0.3)))
+    tree, entry, end, on_points, made = scene_parts.add_geometry_nodes(ob, "InstanceOnPoints", "MeshCube")
     made.inputs["Size"].default_value = (0.5, 0.4, 0.3)
     tree.links.new(entry.outputs[0], on_points.inputs["Points"])
     tree.links.new(made.outputs[0], on_points.inputs["Instance"])
     tree.links.new(on_points.outputs[0], end.inputs[0])
-    ob = hidden(scene_parts.add_plane(size=1.6, name="Points", location=(0.0, 0.0, 1.0), rotation=(0.2, 0.1, 0.3)))
-    ob.modifiers.new("Scatter", "NODES").node_group = tree
 
 
 def shared_data():

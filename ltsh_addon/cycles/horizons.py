@@ -270,17 +270,9 @@ def _kinds_of_lights(lights) -> list[np.ndarray]:
     kinds = {}
     for number, light in enumerate(lights):
         outline = light.shape if light.is_facing else 0 if light.is_round else len(light.polygon())
-        kind = light.is_distant, isinstance(light, PolygonLight), outline, _is_side(light)
+        kind = light.is_distant, isinstance(light, PolygonLight), outline, light.is_side
         kinds.setdefault(kind, []).append(number)
     return [np.array(numbers) for numbers in kinds.values()]
-
-
-def _is_side(light) -> bool:
-    """True for a side of the cube that the light of a world makes (`environment.CUBE`)."""
-    if not light.is_distant or light.is_facing:
-        return False
-    axes = np.abs([light.center, light.half_u, light.half_v])
-    return bool(np.array_equal(np.sort(axes.max(axis=1)), np.ones(3)) and np.array_equal(axes.sum(axis=0), np.ones(3)))
 
 
 @dataclass(frozen=True)
@@ -309,7 +301,7 @@ class _LightsOfKind:
         axes = _plane_axes(corners - center[:, None], np.array([light.direction for light in alike]))
         brightness = np.array([np.abs(light.radiance).sum() for light in alike])
         scales = np.linalg.pinv(np.array([[light.half_u, light.half_v] for light in alike]).swapaxes(1, 2))
-        rest = radius, axes, scales, share, _is_side(alike[0])
+        rest = radius, axes, scales, share, alike[0].is_side
         return cls(number, alike[0], brightness, center, corners, *rest)
 
     def crossings(self, samples) -> tuple[np.ndarray, np.ndarray]:

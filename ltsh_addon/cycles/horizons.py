@@ -195,26 +195,19 @@ def horizon_excess(
 def _excess(samples, shapes, chances, choose, is_quick):
     """As `horizon_excess`, for one block of samples and lights in these `shapes`. `choose(position, normal)` returns
     the chances of the lights."""
-    crossings = [shape.crossings(samples) for shape in shapes]
-    index = np.unique(np.concatenate([sample for _, sample in crossings]))
+    crossings = [(shape, *pairs) for shape in shapes if len((pairs := shape.crossings(samples))[0])]
     by_lobe, by_light = np.ones(len(samples)), np.zeros(len(samples))
-    if len(index) == 0:
-        return by_lobe, by_light
-    by_lobe[index] = 0.0
+    for _, _, sample in crossings:
+        by_lobe[sample] = 0.0
     for is_side in (False, True):
-        of_kind = [
-            (shape, *pairs)
-            for shape, pairs in zip(shapes, crossings, strict=True)
-            if shape.is_side == is_side and len(pairs[0])
-        ]
+        of_kind = [one for one in crossings if one[0].is_side == is_side]
         if not of_kind:
             continue
-        there, _ = _numbered(np.concatenate([sample for _, _, sample in of_kind]), len(samples))
+        there, row = _numbered(np.concatenate([sample for _, _, sample in of_kind]), len(samples))
         some = samples.take(there)
-        rays = _HorizonDirections.of(some, is_quick, is_side)
-        hits = [
-            shape.hits(number, np.searchsorted(there, sample), some.position, rays) for shape, number, sample in of_kind
-        ]
+        rays, ends = _HorizonDirections.of(some, is_quick, is_side), np.cumsum([len(one[1]) for one in of_kind])[:-1]
+        rows = zip(of_kind, np.split(row, ends), strict=True)
+        hits = [shape.hits(number, row, some.position, rays) for (shape, number, _), row in rows]
         number, row, ray, brightness, solid_angle = (np.concatenate(values) for values in zip(*hits, strict=True))
         met, row = _numbered(row, len(there))
         if len(met) < len(there):

@@ -43,8 +43,8 @@ SKY_PRODUCT, LARGEST_OF_SKY = 0.1, 0.6
 # Least width of a lobe in rad, so that mirrors take the smallest patches.
 LEAST_WIDTH = 1e-7
 # The diffuse reflection of a sky is tabulated by normals on a cube. GRID: normals along each side of a face.
-# GRID_POINTS: directions that are added at a time, few enough for the cache. POINT_SIZE: largest half diagonal in rad of
-# what counts as a single direction.
+# GRID_POINTS: directions added at a time, few enough for the cache. POINT_SIZE: largest half diagonal in rad of what
+# counts as a single direction.
 GRID, GRID_POINTS, POINT_SIZE = 33, 256, 0.04
 # Samples whose patches are chosen at a time.
 PATCH_CHUNK = 1024

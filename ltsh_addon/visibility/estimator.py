@@ -393,11 +393,11 @@ class RatioEstimator:
             toward /= np.maximum(distance, _TINY)
             if self.light.is_distant:
                 distance[:] = _FARTHEST
-            *aimed, _ = self.surface.ray_origins.aimed(
+            *rays, _ = self.surface.ray_origins.aimed(
                 self.index[unmet], toward[:, None], distance[None], self.at_surface
             )
             visibility = (
-                self._transmittance(self.mask, _ONE, *(rows[..., 0, :] for rows in aimed))
+                self._transmittance(self.mask, _ONE, *(rows[..., 0, :] for rows in rays))
                 if self.chosen_by.light
                 else _ONE
             )

@@ -183,8 +183,8 @@ class RayOrigins:
     def aimed(
         self, index: np.ndarray, directions: np.ndarray, distances: np.ndarray, at_surface: bool = False
     ) -> tuple[np.ndarray, ...]:
-        """Origins and unit directions (3, S, Q) and distances (S, Q) of S rays from each of the samples `index` (Q,), and
-        the flat numbers (R,) of those that are lifted above their surface.
+        """Origins and unit directions (3, S, Q) and distances (S, Q) of S rays from each of the samples `index` (Q,),
+        and the flat numbers (R,) of those that are lifted above their surface.
 
         Wherever a ray starts, it ends at `distances`, finite, along `directions` from the sample. Rays that start just
         the clearance above the sample keep their direction. With `at_surface` they do not: they end on a face that

@@ -91,8 +91,8 @@ def pytest_collection_modifyitems(items):
         path = item.path.relative_to(TESTS).as_posix()
         if path.startswith("blender/"):
             item.add_marker("blender")
-            cases = CASES_OF_OLDER.get(item.originalname)
-            if path in NEWEST or (cases is not None and item.callspec.id not in cases):
+            test, _, case = item.name.partition("[")
+            if path in NEWEST or (test in CASES_OF_OLDER and case[:-1] not in CASES_OF_OLDER[test]):
                 item.add_marker("newest")
         elif path in SMOKE:
             item.add_marker("smoke")

@@ -269,7 +269,7 @@ class RatioEstimator:
             self.is_shared = alone > PROBES
         for _ in range(ROUNDS):
             chosen = np.logical_and(*(neighbors.any_around(self.index, mask) for mask in self._lit_and_dark()))
-            chosen |= self._unmet()
+            chosen |= np.logical_or(*self._unmet())
             chosen &= self.count < number
             if not chosen.any():
                 break
@@ -353,11 +353,8 @@ class RatioEstimator:
         return [(share > NEGLIGIBLE * sums).any(axis=0) for share in (passing, sums - passing)]
 
     def _unmet(self):
-        """Mask (Q,) of the pairs with a lobe that no ray has met so far."""
-        unmet = np.zeros(len(self.index), bool)
-        for number, name in enumerate(PASSES):
-            unmet |= self.wanted[name] & (self.sum_w[number].sum(axis=0) == 0.0)
-        return unmet
+        """Masks (Q,) by pass of the pairs with a lobe that no ray has met so far."""
+        return [self.wanted[name] & (sums.sum(axis=0) == 0.0) for name, sums in zip(PASSES, self.sum_w, strict=True)]
 
     def _corner_heights(self, name, members):
         """Least height (V, M) of the light's corners over the horizons of a lobe, and the offsets (3, V, M) from the
@@ -376,15 +373,13 @@ class RatioEstimator:
 
     def _leave_out_unlit(self):
         """Drop lobes for which the whole light is below the horizon."""
-        for number, name in enumerate(PASSES):
-            unmet = np.flatnonzero(self.wanted[name] & (self.sum_w[number].sum(axis=0) == 0.0))
+        for name, unmet in zip(PASSES, map(np.flatnonzero, self._unmet()), strict=True):
             self.wanted[name][unmet] = self._corner_heights(name, unmet)[0].max(axis=0) > 0.0
 
     def _aim_at_corners(self):
         """Trace one ray to the highest corner of the light for each lobe that no ray met so far: such a lobe sees only
         a corner of the light."""
-        for number, name in enumerate(PASSES):
-            unmet = np.flatnonzero(self.wanted[name] & (self.sum_w[number].sum(axis=0) == 0.0))
+        for number, (name, unmet) in enumerate(zip(PASSES, map(np.flatnonzero, self._unmet()), strict=True)):
             if len(unmet) == 0:
                 continue
             heights, offset = self._corner_heights(name, unmet)

@@ -313,7 +313,7 @@ class RatioEstimator:
             points, length = light.center + light.radius * normal, length + light.radius
             # The directions to a small light are uncertain; those to its center are not, which then stands for it.
             self.is_tiny = light.radius < 0.1 * near
-            margin = 4.0 * GAP * (np.abs(light.center).sum() + near / (1.0 - END)) if self.is_tiny else 0.1 * near
+            margin = 4.0 * GAP * (np.abs(light.center).sum() + near / (1.0 - END))
         else:
             s, t = np.meshgrid(*2 * [(np.arange(LOOKED_AT) + 0.5) * (2.0 / LOOKED_AT) - 1.0])
             points = light.center + s.reshape(-1, 1) * light.half_u + t.reshape(-1, 1) * light.half_v

@@ -125,16 +125,13 @@ class OccluderMesh:
             raise ValueError(f"mesh: a triangle names vertex {triangles.max()}, expected less than {len(vertices)}")
         object.__setattr__(self, "vertices", vertices)
         object.__setattr__(self, "triangles", triangles)
-        if self.normals is not None:
-            normals = np.ascontiguousarray(self.normals, np.float32)
-            if normals.shape not in (vertices.shape, (len(triangles), 3, 3)):
-                raise ValueError(f"mesh: normals {normals.shape}, expected {vertices.shape} or {len(triangles), 3, 3}")
-            object.__setattr__(self, "normals", normals)
-        if self.thickness is not None:
-            thickness = np.ascontiguousarray(self.thickness, np.float32)
-            if thickness.shape != (len(triangles),):
-                raise ValueError(f"mesh: thickness {thickness.shape}, expected {(len(triangles),)}")
-            object.__setattr__(self, "thickness", thickness)
+        allowed = {"normals": (vertices.shape, (len(triangles), 3, 3)), "thickness": ((len(triangles),),)}
+        for name, shapes in allowed.items():
+            if (values := getattr(self, name)) is not None:
+                values = np.ascontiguousarray(values, np.float32)
+                if values.shape not in shapes:
+                    raise ValueError(f"mesh: {name} {values.shape}, expected {' or '.join(map(str, shapes))}")
+                object.__setattr__(self, name, values)
         uv = None if self.transparency is None else self.transparency.uv
         if uv is not None and uv.shape != (len(triangles), 3, 2):
             raise ValueError(f"mesh: uv {uv.shape}, expected {len(triangles), 3, 2}")
@@ -225,9 +222,10 @@ class Occluders:
         alone = self.lone_choices.get(light)
         return ChosenBy(light=alone != "surface", surface=alone != "light")
 
-    def holding(self, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
-        """Numbers of the instances with a face that holds one of the `points` (N, 3) of a plane of unit `normal`."""
-        near = 4.0 * GAP * (np.abs(normal) @ np.abs(points[0]))
+    def holding(self, points: np.ndarray, normal: np.ndarray | None) -> np.ndarray:
+        """Numbers of the instances with a face that holds one of the `points` (N, 3) of a plane of unit `normal`; of a
+        plane of any normal if that is None."""
+        near = 4.0 * GAP * (np.abs(points[0]) @ (np.ones(3) if normal is None else np.abs(normal)))
         ends = [(mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)) for mesh in self.meshes]
         low, high = np.array(ends, np.float64).reshape(-1, 2, 3)[self.mesh].swapaxes(0, 1)
         centers = np.einsum("nij,nj->ni", self.matrices[:, :, :3], 0.5 * (low + high)) + self.matrices[:, :, 3]
@@ -236,17 +234,24 @@ class Occluders:
         close = np.flatnonzero((np.abs(centers - points.mean(axis=0)) <= reach).all(axis=1))
         result = []
         for number in close:
-            offset = self._in_plane(number, points[0], normal, near)[:, None] - points[:, None]
-            sides = np.cross(offset, np.roll(offset, -1, axis=2)) @ normal
-            if ((sides >= 0.0).all(axis=2) | (sides <= 0.0).all(axis=2)).any():
+            corners = self._in_plane(number, points[0], normal, near)
+            offset, face = corners[:, None] - points[:, None], _crosses(corners)[:, None, None]
+            sides = (np.cross(offset, np.roll(offset, -1, axis=2)) * face).sum(axis=-1)
+            if ((sides >= 0.0).all(axis=2) & (sides > 0.0).any(axis=2)).any():
                 result.append(number)
         return np.array(result, np.int64)
 
     def _in_plane(self, number, point, normal, near):
-        """Corners (T, 3, 3) of the triangles of an instance that are nearer to a plane than `near`, in m."""
+        """Corners (T, 3, 3) of the triangles of an instance that are nearer to a plane than `near`, in m; if `normal`
+        is None, of those whose planes are nearer to the point."""
         mesh, matrix = self.meshes[self.mesh[number]], self.matrices[number]
         vertices = mesh.vertices @ matrix[:, :3].T + matrix[:, 3]
-        return vertices[mesh.triangles[(np.abs((vertices - point) @ normal) <= near)[mesh.triangles].all(axis=1)]]
+        if normal is not None:
+            return vertices[mesh.triangles[(np.abs((vertices - point) @ normal) <= near)[mesh.triangles].all(axis=1)]]
+        corners = vertices[mesh.triangles]
+        face = _crosses(corners)
+        height = np.abs((face * (corners[:, 0] - point)).sum(axis=1))
+        return corners[height <= near * np.linalg.norm(face, axis=1)]
 
     def overlaps(self, owners: np.ndarray) -> dict[tuple[int, int], float]:
         """By pairs of two of the `owners` (I,) of the instances, which faces of one are in faces of the other: the
@@ -342,11 +347,16 @@ def overlap_within(meshes: list[OccluderMesh]) -> float:
     return float(overlaps_in_planes(corners, owners, np.zeros(1, bool), numbers)[2].sum())
 
 
+def _crosses(corners):
+    """The cross products (T, 3) of two sides of triangles (T, 3, 3)."""
+    return np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+
 def _largest(mesh, most):
     """Corners (T, 3, 3), float64, of the `most` largest triangles of a mesh."""
     corners = mesh.vertices[mesh.triangles]
     if len(corners) > most:
-        areas = np.square(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])).sum(axis=1)
+        areas = np.square(_crosses(corners)).sum(axis=1)
         corners = corners[np.sort(np.argpartition(areas, -most)[-most:])]
     return corners.astype(np.float64)
 
@@ -365,7 +375,7 @@ class _Planes:
     @classmethod
     def of(cls, corners: np.ndarray) -> _Planes:
         """The planes of triangles (T, 3, 3)."""
-        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        normal = _crosses(corners)
         length = np.linalg.norm(normal, axis=1)
         normal /= np.maximum(length, 1e-300)[:, None]
         facing = np.where(normal @ (0.61, 0.553, 0.567) < 0.0, -1.0, 1.0)

@@ -65,19 +65,6 @@ def test_samples_that_are_split_add_up():
     assert np.array_equal(found.geometric_normal[1::2], samples.smooth_normal)
 
 
-def test_a_bake_leaves_more_to_the_lobe_than_a_picture():
-    """Its directions all come from the specular lobe, which takes from the light's choice."""
-    samples = replace(samples_near_the_horizon(0.3, (-0.99, 0.0, 0.14)), diffuse_albedo=np.full((4, 3), 1.0))
-    lights, hit = (light_at(2.0, 0.6),), np.arange(4)
-    shares = [
-        horizons.smooth_horizon_share(
-            *horizons.horizon_excess(samples, lights, horizons.lobe_selection_pmf(samples, hit, baked))
-        )
-        for baked in (True, False)
-    ]
-    assert (shares[0] + 0.05 < shares[1]).all()
-
-
 def test_chances_of_two_lights_are_those_of_their_irradiance_where_they_are_far_away():
     """Bounds of small lights meet: the light sends its power times both cosines by the squared distance."""
     samples = samples_near_the_horizon(0.5, count=1)

@@ -476,11 +476,8 @@ class RatioEstimator:
         light's rays did; None if there are none. The light's rays start at `origins` (3, R), with
         `light_visibility` (S, Q)."""
         ray_origins = self.surface.ray_origins
-        if len(flat) == 0:
-            return None
         directions, distance = (_taken(rows, flat) for rows in rays)
-        column = flat % light_visibility.shape[1]
-        index = sampler.index[column]
+        index = sampler.index[flat % light_visibility.shape[1]]
         start, toward, distance = ray_origins.from_surface(index, directions, distance)
         # The light chooses directions above the smooth horizon; the surface chooses directions above the mesh's.
         smooth, flat_facing = (

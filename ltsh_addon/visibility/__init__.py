@@ -8,26 +8,6 @@ from __future__ import annotations
 
 from .light_cluster import shared_numbers
 from .occluders import Hits, OccluderMesh, Occluders, Transparency
-from .ratio import (
-    ShadowSampling,
-    Visibility,
-    trace_ray_origins,
-    trace_visibility,
-)
+from .ratio import ShadowSampling, Visibility, trace_ray_origins, trace_visibility
 from .rays import Tracer, open_tracer
 from .shadow_terminator import RayOrigins
-
-__all__ = [
-    "Hits",
-    "OccluderMesh",
-    "Occluders",
-    "RayOrigins",
-    "ShadowSampling",
-    "Tracer",
-    "Transparency",
-    "Visibility",
-    "open_tracer",
-    "shared_numbers",
-    "trace_ray_origins",
-    "trace_visibility",
-]

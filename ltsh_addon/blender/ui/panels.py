@@ -56,8 +56,6 @@ def _draw_problem(layout, context, problem) -> None:
     if problem.fix:
         side = row.row()
         side.alignment = "RIGHT" if beside else "EXPAND"
-        for name, value in problem.pointers.items():
-            side.context_pointer_set(name, value)
         fix = side.operator(problem.fix, text=label)
         for name, value in problem.fix_values.items():
             setattr(fix, name, value)

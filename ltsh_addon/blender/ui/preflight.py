@@ -65,7 +65,6 @@ class Problem:
     fix: str = ""  # identifier of the operator; "": none
     fix_label: str = ""
     fix_values: dict = field(default_factory=dict)  # properties of the operator
-    pointers: dict = field(default_factory=dict)  # members of its context
 
 
 def problems(context, command: str) -> list[Problem]:
@@ -147,8 +146,8 @@ def _object_problem(ob, uv_map: str) -> Problem | None:
 
 
 def _hidden(ob, text: str) -> Problem:
-    path = f'scene.objects["{bpy.utils.escape_identifier(ob.name)}"].hide_render'
-    return Problem(text, True, "wm.context_set_boolean", "Show", {"data_path": path, "value": False})
+    values = {"data_path": f"scene.objects[{ob.name!r}].hide_render", "value": False}
+    return Problem(text, True, "wm.context_set_boolean", "Show", values)
 
 
 def _camera(scene) -> list[Problem]:
@@ -198,7 +197,7 @@ def _files(settings) -> list[Problem]:
     for image in bpy.data.images:
         if image.is_dirty and image.users > image.use_fake_user and "ltsh_layer" not in image:
             text = f"Image {image.name!r} has changes that are not saved, and do not count"
-            problems.append(Problem(text, False, "image.pack", "Pack", pointers={"edit_image": image}))
+            problems.append(Problem(text, False, "ltsh.pack_image", "Pack", {"image_name": image.name}))
     return problems
 
 
@@ -279,6 +278,24 @@ class LTSH_OT_add_uv_map(bpy.types.Operator):
             for other in selected:
                 other.select_set(True)
             context.view_layer.objects.active = active
+        return {"FINISHED"}
+
+
+class LTSH_OT_pack_image(bpy.types.Operator):
+    """Keep the changes of the image in the .blend"""
+
+    bl_idname = "ltsh.pack_image"
+    bl_label = "Pack Image"
+    bl_options = {"REGISTER", "UNDO"}
+
+    image_name: StringProperty(name="Image", description="Name of the image")
+
+    def execute(self, context):
+        image = bpy.data.images.get(self.image_name)
+        if image is None:
+            self.report({"ERROR"}, f"Image {self.image_name!r} is not there any more")
+            return {"CANCELLED"}
+        image.pack()
         return {"FINISHED"}
 
 

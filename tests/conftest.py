@@ -74,6 +74,7 @@ CASES_OF_OLDER = {
     "test_the_viewport_shows_what_cycles_sampled": {
         f"{name}-PERSP" for name in ("plain", "scattered", "layered", "masked", "brushed", "rough", "bent")
     },
+    "test_the_render_region_is_a_part_of_the_whole_picture": {"False"},
     "test_a_final_picture_is_the_sum_of_its_lights_and_the_rest": {"settings0", "settings3"},
     "test_the_session_and_the_file_stay_as_they_are": {"compare", "cancelled in Cycles", "an exception in the middle"},
     "test_scripts_in_a_file_run_only_when_asked_for": {"False-shade", "True-bake"},

@@ -336,3 +336,30 @@ def test_a_face_just_before_a_light_blocks_it_and_one_just_behind_does_not(kind,
         for name in PASSES:
             share = getattr(found, name)
             assert (share == (0.0 if before > 0.0 else 1.0)).all(), (before, name, share.min(), share.max())
+
+
+@pytest.mark.parametrize("radius", [1.5e-4, 1e-3, 1e-2])
+@pytest.mark.parametrize("height", [1.5, 0.6, 0.3, -0.4])
+def test_a_face_through_a_small_ball_hides_what_is_behind_it(radius, height):
+    """From the floor, 3 to 5 m away: the share of the outline that rays find before the plane, written out."""
+    center, samples = np.array([0.0, 0.0, 3.1]), floor(12)[0]
+    light = panel(shape="BALL", half_u=(radius, 0, 0), half_v=(0, radius, 0), direction=(0, 0, -1.0), center=center)
+    plane = center[2] - height * radius
+
+    def passed(origins, directions, distances):
+        return np.where((origins + directions * distances[:, None])[:, 2] > plane, 0.0, 1.0)
+
+    found = ratio.trace_visibility(samples, [light], Tracer(passed), ratio.ShadowSampling(rays=256))
+    axis = (center - samples.position) / np.linalg.norm(center - samples.position, axis=1, keepdims=True)
+    side = np.cross(axis, [1.0, 0.0, 0.0])
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    x, y = np.meshgrid(*2 * [(np.arange(200) + 0.5) / 100 - 1.0])
+    inside = np.hypot(x, y) < 1.0
+    x, y = x[inside], y[inside]
+    near = x * side[:, 2:] + y * np.cross(axis, side)[:, 2:] - np.sqrt(1.0 - x * x - y * y) * axis[:, 2:]
+    expected = (near < -height).mean(axis=1)
+    # 256 rays miss a share by .06 at most. The rays end 4 steps of single precision, 6 um, before the ball, and the
+    # share changes by up to twice the step of the height.
+    moved = 2.0 * 7e-6 / radius
+    assert np.abs(found.diffuse[0] - expected).max() < 0.06 + moved
+    assert found.diffuse[0].mean() == pytest.approx(expected.mean(), abs=0.01 + moved)

@@ -20,10 +20,10 @@ from ltsh_addon.cli import main
 from ltsh_addon.cycles.lobes import read_layer
 from ltsh_addon.pipeline import PictureOptions, RenderOptions, plan, render, shade_scene
 from ltsh_addon.pipeline.lighting import ShadowTracer, load_tables
-from ltsh_addon.pipeline.mixer import light_pictures
-from ltsh_addon.pipeline.moved_lights import MovedLights
+from ltsh_addon.pipeline.mixer import light_pictures, moved_light
 from ltsh_addon.pipeline.relight import LightChange, RelightData, relight
 from ltsh_addon.scene import PASSES, light_of
+from ltsh_addon.visibility import Occluders
 
 SIZE, BLOCK = 32, 8  # pixels
 SAMPLES, TRUE_SAMPLES = 64, 1024
@@ -307,13 +307,13 @@ def test_a_kept_finished_picture_is_the_sum_of_its_lights_and_the_rest(out, tmp_
     options = RenderOptions(path, output=out, sub_samples=2, cycles_samples=8, keep_visibility=True)
     assert {"render.samples.npz", "render.occluders.npz"} < set(render.make_finished(options).files)
     combined = imaging.read_layers(out / "render.exr")["combined"]
-    mixed = light_pictures(RelightData.load(out / "render.samples.npz"))
+    data = RelightData.load(out / "render.samples.npz")
+    mixed = light_pictures(data)
     assert len(mixed.layers) == 2
     np.testing.assert_allclose(mixed.layers.sum(axis=0), combined[..., :3], rtol=1e-4, atol=1e-5)
     # Its light alone, where it was: rays of its own, as many as of all lights together.
-    lights = MovedLights.load(out / "render.samples.npz")
-    alone = lights.picture(light_of(mixed.rows[0].light))
-    lights.close()
+    occluders, light = Occluders.load(out / "render.occluders.npz"), light_of(mixed.rows[0].light)
+    alone = moved_light(data, occluders, light, mixed.rows[0], lambda share: True)
     assert np.linalg.norm(alone - mixed.layers[0]) < 0.02 * np.linalg.norm(alone)
 
 
@@ -384,14 +384,14 @@ def test_bounced_light_follows_the_lights_of_its_light_group(out, tmp_path):
 @pytest.mark.newest
 def test_budgets_buy_points_by_what_they_cost():
     pixels = 240 * 135
-    points = [pixels_module.affordable_points(seconds, pixels, 4) for seconds in (1.0, 4.0, 8.0, 32.0)]
+    points = [pixels_module.affordable_points(seconds, pixels, 4) for seconds in (1.0, 8.0, 24.0, 96.0)]
     assert points[0] == 0 and 1 <= points[1] < points[2] and points[3] == pytest.approx(4 * points[2], abs=4)
     # Thousands of lights are clustered.
     assert pixels_module.affordable_points(64.0, pixels, 100) == pixels_module.affordable_points(64.0, pixels, 9999)
     # Of large scenes each look takes long.
-    looked = [pixels_module.affordable_points(8.0, pixels, 4, seconds) for seconds in (0.0, 0.2, 1.2)]
+    looked = [pixels_module.affordable_points(16.0, pixels, 4, seconds) for seconds in (0.0, 0.2, 2.4)]
     assert looked[0] >= looked[1] > looked[2] == 0
-    for seconds in (4.0, 8.0, 32.0):
+    for seconds in (8.0, 16.0, 32.0):
         most = pixels_module.longest_look(seconds, pixels)
         after = [
             pixels_module.affordable_points(seconds - look, pixels, 1, look) for look in (0.99 * most, 1.01 * most)
@@ -432,7 +432,8 @@ def test_a_budget_chooses_points_rays_and_samples(tmp_path):
     # Cycles does it all where there is no time to look at the lights.
     assert small["finished"]["share_of_ours"] == {"specular": 0.0, "diffuse": 0.0}
     assert any("too small" in line for line in small["warnings"])
-    assert large["finished"]["share_of_ours"]["diffuse"] == 1.0
+    # Of hundreds of samples Cycles' picture is nearly as good.
+    assert large["finished"]["share_of_ours"]["diffuse"] > 0.0 and not large["finished"]["all_by_cycles"]
     (line,) = (line for line in small["warnings"] if "the budget is 0.01 s:" in line)
     least, took = (float(text.partition(" s")[0]) for text in re.split("at least|took", line)[1:])
     assert 0.0 < least <= took

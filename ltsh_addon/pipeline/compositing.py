@@ -39,10 +39,9 @@ from .lighting import light_groups
 DIRECT = {"specular": ("specular_light", "specular_color"), "diffuse": ("diffuse_light", "diffuse_color")}
 ALBEDO, NORMAL = ("Denoising Albedo", "RGB"), ("Denoising Normal", "XYZ")
 GROUP_PREFIX = "Combined_"  # of the passes of light groups
-# The errors of pixels are means over those that are at most ERROR_RADIUS away. A picture weighs by its squared error to
-# the power -ERROR_POWER, which is at least LEAST_ERROR of Cycles' noise.
-ERROR_RADIUS, ERROR_POWER, LEAST_ERROR = 4, 2, 0.02
-PRIOR = (1.0, 1.0, 1.0)
+# The errors of pixels are means over those that are at most ERROR_RADIUS away. Noisy and clean pictures weigh by their
+# squared errors to the power -ERROR_POWER, which are at least LEAST_ERROR of Cycles' noise.
+ERROR_RADIUS, ERROR_POWER, LEAST_ERROR = 4, 2, 0.1
 MOST_RECOLORING = 3.0  # how many times the color of LTSH's points Cycles' color of a pixel counts at most
 MOST_FACTOR = 3.0  # direct light of the finished picture is at most this many times LTSH's
 
@@ -225,16 +224,26 @@ def _weights(noisy, others, samples) -> tuple[list[np.ndarray], tuple[float, flo
         squares = np.square(ours - second) - variance / other + np.square(theirs - first) - variance / number
         return 0.5 * squares.mean(axis=-1)
 
-    noise = 0.5 * (variance / number + variance / other).mean(axis=-1)
+    def mean(products) -> np.ndarray:
+        return box_mean(0.5 * sum(products).mean(axis=-1))
+
+    noise = box_mean(0.5 * (variance / number + variance / other).mean(axis=-1))
     denoised, lit = zip(*others, strict=True)
-    squares = map(box_mean, (error(*lit), error(*denoised), noise))
-    squares = [np.maximum(one, LEAST_ERROR * box_mean(noise)) for one in squares]
-    powers = [prior * (one + 1e-20) ** -ERROR_POWER for prior, one in zip(PRIOR, squares, strict=True)]
-    weights = [one / sum(powers) for one in powers]
+    steps = [ours - theirs for ours, theirs in zip(lit, denoised, strict=True)]
+    # The step from the denoised picture towards LTSH's that is nearest to the other half: the least squares have far
+    # less noise than the difference of both errors. Where the step drowns in noise it is taken whole.
+    unsure = noise / (2 * ERROR_RADIUS + 1) ** 2
+    wanted = mean(step * (half - one) for step, half, one in zip(steps, (second, first), denoised, strict=True))
+    share = ((wanted + unsure) / (mean(map(np.square, steps)) + unsure + 1e-20)).clip(0.0, 1.0)
+    lit = [one + share[..., None] * step for one, step in zip(denoised, steps, strict=True)]
+    errors = [np.maximum(box_mean(error(*pair)), LEAST_ERROR * noise) for pair in (lit, denoised)]
+    powers = [(one + 1e-20) ** -ERROR_POWER for one in (errors[0], noise)]
+    clean, noisy = (one / sum(powers) for one in powers)
     # A mean errs at most as much as its parts do on average.
     light = max(np.square(denoised).mean(), 1e-30)
-    ours = sum(weight * one for weight, one in zip(weights, squares, strict=True))
-    return weights, tuple(float(np.sqrt(one.mean() / light)) for one in (ours, squares[1]))
+    ours = clean * errors[0] + noisy * noise
+    weights = [clean * share, clean * (1.0 - share), noisy]
+    return weights, tuple(float(np.sqrt(one.mean() / light)) for one in (ours, errors[1]))
 
 
 def most_denoisings(extraction) -> int:

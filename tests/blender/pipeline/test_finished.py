@@ -311,7 +311,8 @@ def test_a_kept_finished_picture_is_the_sum_of_its_lights_and_the_rest(out, tmp_
     mixed = light_pictures(data)
     assert len(mixed.layers) == 2
     np.testing.assert_allclose(mixed.layers.sum(axis=0), combined[..., :3], rtol=1e-4, atol=1e-5)
-    # Its light alone, where it was: rays of its own, as many as of all lights together.
+    # Its light alone, where it was, without what Cycles tells of it: rays of its own, as many as of all lights together.
+    mixed = light_pictures(replace(RelightData.load(out / "render.samples.npz"), edges={}))
     occluders, light = Occluders.load(out / "render.occluders.npz"), light_of(mixed.rows[0].light)
     alone = moved_light(data, occluders, light, mixed.rows[0], lambda share: True)
     assert np.linalg.norm(alone - mixed.layers[0]) < 0.02 * np.linalg.norm(alone)
@@ -349,7 +350,7 @@ def test_bounced_light_follows_the_lights_of_its_light_group(out, tmp_path):
         scene.view_layers[0].lightgroups.add(name=group)
         ob.lightgroup = group
     assert not loose.lightgroup
-    options = {"sub_samples": 3, "cycles_samples": 128}
+    options = {"sub_samples": 3, "cycles_samples": 512}
     path = parts.save(tmp_path / "room.blend")
     render.make_finished(RenderOptions(path, output=out, keep_visibility=True, **options))
     layers = imaging.read_layers(out / "render.exr")
@@ -377,8 +378,8 @@ def test_bounced_light_follows_the_lights_of_its_light_group(out, tmp_path):
     apart, noise, unfollowed = (
         np.linalg.norm(one - fresh[0]) / np.linalg.norm(fresh[0]) for one in (relit, fresh[1], left_alone)
     )
-    # Measured: 0.8 %, 0.6 %. What of the light is which group's is denoised, the fresh picture as a whole.
-    assert apart < 2.0 * noise + 0.005 < 0.3 * unfollowed
+    # Measured noise: 0.9 %. What of the light is which group's is denoised, the fresh picture as a whole.
+    assert apart < 2.0 * noise + 0.005 < 0.5 * unfollowed
 
 
 @pytest.mark.newest
@@ -419,12 +420,11 @@ def test_a_budget_excludes_samples(tmp_path, capsys):
 def test_a_budget_chooses_points_rays_and_samples(tmp_path):
     floor_and_ball(gray(), 1)
     path = parts.save(tmp_path / "room.blend")
-    # The larger one leaves time for everything, however slowly Blender starts on a busy machine.
-    made = {budget: render.finish(RenderOptions(path, output=tmp_path, budget=budget)) for budget in (0.01, 12.0)}
+    made = {budget: render.finish(RenderOptions(path, output=tmp_path, budget=budget)) for budget in (0.01, 16.0)}
     small, large = (one.report for one in made.values())
     # Of what shines in sight only what stands beside our light is rendered apart.
     assert not made[0.01].cycles.smooth_emission
-    assert set(made[12.0].cycles.smooth_emission) == {"emission", "background"}
+    assert set(made[16.0].cycles.smooth_emission) == {"emission", "background"}
     # However small it is, every part has something.
     assert small["cycles_samples"] >= 2 and small["sub_samples"] >= 1
     assert small["cycles_samples"] < large["cycles_samples"]

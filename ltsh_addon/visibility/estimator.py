@@ -43,9 +43,9 @@ LEVELS = (16, 32, 64, 128, 256, 512)
 BRIGHTEST, BRIGHTEST_OF_SKY = 4, 2
 # Rounds in which neighbors of mixed pairs get more rays. Neighbors that turn out mixed pass this on in the next round.
 ROUNDS = 4
-# Samples that share the rays to a sky are alike: their normals differ by at most LIKE_NORMAL, they lie in one plane but
-# for a slope of LIKE_NORMAL, and for the specular pass their mirrored views differ by LIKE_LOBE alpha, and the alphas
-# by LIKE_ALPHA of one.
+# Samples that share the rays to a sky or to many lights are alike: their normals differ by at most LIKE_NORMAL, they
+# lie in one plane but for a slope of LIKE_NORMAL, and for the specular pass their mirrored views differ by LIKE_LOBE
+# alpha, and the alphas by LIKE_ALPHA of one.
 LIKE_NORMAL, LIKE_LOBE, LIKE_ALPHA = np.float32(0.1), np.float32(0.4), np.float32(0.2)
 # Samples do not share rays where that would change their light by more than this share of the typical one, nor where
 # all their rays are blocked: of so many rays.
@@ -247,7 +247,7 @@ class RatioEstimator:
         if isinstance(self.light, FlatLight | PointLight) and len(self.index):
             self.margin = self._margin()
             self.at_surface |= bool(self.margin)
-        shares = isinstance(self.emitter, Sky) and neighbors.order is not None and rays > PROBES
+        shares = isinstance(self.emitter, Sky | LightCluster) and neighbors.order is not None and rays > PROBES
         self._neighbors, order = neighbors, neighbors.order if shares else None
         self._add_rays(np.arange(len(self.index)), 0, PROBES, 0, order)
         self._leave_out_unlit()
@@ -286,8 +286,14 @@ class RatioEstimator:
             self._trace_more(alone & (last > PROBES), last, choice, None)
             alone = np.zeros(len(self.index), bool)
             for name in PASSES:
-                change = self._neighbors.bend(name, self.index, self.visibility_ratio(name)[0])
-                alone |= np.abs(change) * worth[name] ** WORTH_POWER > MOST_BIAS
+                ratio = self.visibility_ratio(name)[0]
+                change = np.abs(self._neighbors.bend(name, self.index, ratio))
+                if isinstance(self.emitter, LightCluster):
+                    # Shadows as narrow as a pixel: its rays are three standard deviations off what it shares.
+                    sum_w, sum_wv = (sums[PASSES.index(name)].sum(axis=0) for sums in (self.sum_w, self.sum_wv))
+                    off = np.abs(sum_wv / np.maximum(sum_w, _TINY) - ratio)
+                    change = np.maximum(change, off - np.float32(3.0) * np.sqrt(ratio * (_ONE - ratio) / self.count))
+                alone |= change * worth[name] ** WORTH_POWER > MOST_BIAS
 
     def _trace_more(self, chosen, number, choice, order):
         """Trace rays of the `chosen` pairs up to the `number`, split by `choice`; each (Q,)."""

@@ -411,8 +411,6 @@ def _put_under_sheen(
     normal = slot.sheen_normal()
     albedo, a, b = sheen_lobe(slot.cosine(normal), slot.value("sheen_roughness"))
     albedo = albedo[:, None]
-    if hits.diffuse_albedo is not None:
-        albedo = _albedo_of_sheen(hits, slot, shine, base, batches)
     remaining = np.ones((len(hits.position), 1))
     remaining[base.index] = np.clip(1.0 - most * albedo, 0.0, 1.0)
     for batch in of_slot:
@@ -428,25 +426,6 @@ def _put_under_sheen(
 def _tilted(a: np.ndarray) -> np.ndarray:
     """`a` (Q,) of sheen, kept away from 0, which would mean no sheen."""
     return np.where(np.abs(a) < 1e-5, 1e-5, a)
-
-
-def _albedo_of_sheen(hits, slot, shine, base, batches) -> np.ndarray:
-    """Albedo R (Q, 1) of the sheen. It follows from the diffuse albedo of the hit, which is linear in R.
-
-    Without the sheen, the diffuse albedo would be the sum that all `batches` expect. With it, the slot's own diffuse
-    part D becomes w s R + (1 - max(s) R) D, where s (`shine`) is the weight times the tint of the sheen, and w is the
-    weight of the slot.
-    """
-    expected = np.zeros_like(hits.diffuse_albedo)
-    for batch in batches:
-        # Cycles does not count velvet as diffuse.
-        is_velvet = np.broadcast_to(np.asarray(batch.shape.get("sheen_a", 0.0)) < 0.0, len(batch.index))
-        expected[batch.index] += np.where(is_velvet[:, None], 0.0, batch.diffuse)
-    change = slot.weight[:, None] * shine - shine.max(axis=1, keepdims=True) * base.diffuse
-    missing = (hits.diffuse_albedo - expected)[base.index]
-    square = (change * change).sum(axis=1)
-    albedo = np.divide((missing * change).sum(axis=1), square, out=np.zeros(len(square)), where=square > 1e-9)
-    return np.clip(albedo, 0.0, 1.0)[:, None]
 
 
 def _coat_samples(slot: LobeSlot):

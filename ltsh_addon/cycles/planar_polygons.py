@@ -17,10 +17,6 @@ FLATNESS = 1e-4
 STRAIGHT = 1e-6
 # A closed surface is a sheet if its volume is below this share of the cube of its extent.
 SHEET = 1e-6
-# Products of triangles and vertices in the test for hollows. For larger meshes it tests a share of the triangles.
-HOLLOW_PRODUCTS = 20_000_000
-# Most connected parts of a surface that this test looks at.
-MOST_ISLANDS = 64
 
 
 @dataclass(frozen=True)
@@ -207,41 +203,3 @@ def is_inside(point: np.ndarray, vertices: np.ndarray, triangles: np.ndarray) ->
     volume = np.sum(a * np.cross(b, c), axis=-1)
     plane = la * lb * lc + np.sum(a * b, -1) * lc + np.sum(b * c, -1) * la + np.sum(c * a, -1) * lb
     return bool(abs(2.0 * np.arctan2(volume, plane).sum()) > 2.0 * np.pi)
-
-
-def hides_itself(vertices: np.ndarray, triangles: np.ndarray, closed: bool) -> bool:
-    """True if a part of the surface may shadow another part of the same connected surface."""
-    islands = _islands(triangles)
-    names = np.unique(islands)
-    return any(_is_hollow(vertices, triangles[islands == name], closed) for name in names[:MOST_ISLANDS])
-
-
-def _islands(triangles: np.ndarray) -> np.ndarray:
-    """A number (T,) that triangles connected by common edges share."""
-    edges = np.sort(np.stack([triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()], axis=-1), axis=-1)
-    _, edge = np.unique(edges, axis=0, return_inverse=True)
-    order = np.argsort(edge.ravel(), kind="stable")
-    owner, sorted_edge = order // 3, edge.ravel()[order]
-    same = sorted_edge[1:] == sorted_edge[:-1]
-    return connected(len(triangles), np.stack([owner[1:][same], owner[:-1][same]], axis=-1))
-
-
-def _is_hollow(vertices, triangles, closed: bool) -> bool:
-    """True unless all vertices are behind the plane of every triangle (or in it, for an open surface)."""
-    used = vertices[np.unique(triangles)]
-    used_center = used.mean(axis=0)
-    extent = np.ptp(used, axis=0).max(initial=0.0)
-    some = triangles[:: max(1, len(triangles) * len(used) // HOLLOW_PRODUCTS)]
-    first = vertices[some[:, 0]]
-    normals = np.cross(vertices[some[:, 1]] - first, vertices[some[:, 2]] - first)
-    lengths = np.linalg.norm(normals, axis=-1)
-    solid = lengths > 0.0
-    normals, first = normals[solid] / lengths[solid, None], first[solid] - used_center
-    outward = outward_side(vertices, triangles) if closed else 1
-    for start in range(0, len(first), 256):
-        chunk = slice(start, start + 256)
-        height = (used - used_center) @ normals[chunk].T - np.sum(first[chunk] * normals[chunk], axis=-1)
-        height *= outward
-        if height.max(initial=0.0) > FLATNESS * extent or (not closed and height.min() < -FLATNESS * extent):
-            return True
-    return False

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..lobes.brdf import ggx_distribution, masking
-from ..lobes.polygon import dot
+from ..lobes.polygon import dot, normal_frames
 
 # Distance, in units of a sphere's radius, of the disk that stands for the half space seen from within.
 NEAR_DISK = 1e-3
@@ -26,8 +26,9 @@ SMALL = 1e-4
 # that falls below counts as having a step.
 CHANGING, STEP = 0.01, 0.1
 # Orders of the quadrature rules on a disk: Chebyshev (second kind) along its first axis, Legendre across. The second
-# rule is for emission that goes all the way from bright to dark on the disk, perhaps in a step.
-ORDERS = ((16, 4), (64, 5))
+# rule is for emission that goes all the way from bright to dark on the disk, perhaps in a step. SPIRAL: points of the
+# rule for patterns, whose steps go anywhere.
+ORDERS, SPIRAL = ((16, 4), (64, 5)), 512
 # The center of a disk, and points around it.
 _RIM = np.array([[0.0, 1.0, -1.0, 0.0, 0.0, 0.7, -0.7, 0.7, -0.7], [0.0, 0.0, 0.0, 1.0, -1.0, 0.7, 0.7, -0.7, -0.7]])
 NODES_CHUNK = 1 << 17
@@ -44,7 +45,14 @@ def _disk_rule(along: int, across: int) -> tuple[np.ndarray, np.ndarray]:
     return places.reshape(2, -1), whole.ravel()
 
 
-_RULES = [_disk_rule(*orders) for orders in ORDERS]
+def _spiral(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """As `_disk_rule`, for points of equal weights along a sunflower's spiral (Vogel 1979)."""
+    number = np.arange(count)
+    radius, turn = np.sqrt((number + 0.5) / count), number * (np.pi * (3.0 - np.sqrt(5.0)))
+    return radius * np.stack([np.cos(turn), np.sin(turn)]), np.full(count, 1.0 / count)
+
+
+_RULES = [*(_disk_rule(*orders) for orders in ORDERS), _spiral(SPIRAL)]
 
 
 @dataclass(frozen=True)
@@ -81,13 +89,7 @@ class FacingDisk:
         if tiny.any():
             gain = np.where(tiny, np.square(disk_radius / (LEAST_SIZE * length)), gain)
             disk_radius = np.where(tiny, LEAST_SIZE * length, disk_radius)
-        x, y, z = -offset / length
-        # A frame around the direction of the light (Duff et al. 2017).
-        sign = np.copysign(offset.dtype.type(1.0), z)
-        a = -1.0 / (sign + z)
-        b = x * y * a
-        half_u = disk_radius * np.stack([1.0 + sign * x * x * a, sign * b, -sign * x])
-        half_v = disk_radius * np.stack([b, sign + y * y * a, -y])
+        half_u, half_v = (disk_radius * axis for axis in normal_frames(-offset / length)[:2])
         return cls(offset, half_u, half_v, length, disk_radius, gain)
 
     def take(self, index) -> FacingDisk:
@@ -234,7 +236,8 @@ def mean_emission(light, offset: np.ndarray, disk: FacingDisk, lobe: AnalyticLob
     least, most = few.min(axis=0), few.max(axis=0)
     # The center stands for half of the disk's area, the points around it for the other half: right for smooth changes.
     result = 0.5 * few[0] + 0.5 * few[1:].mean(axis=0)
-    rule = np.where(most - least > CHANGING * most, np.where(least < STEP * most, 1, 0), -1)
+    chosen = np.where(least < STEP * most, 1, 0) if light.pattern is None else 2
+    rule = np.where(most - least > CHANGING * most, chosen, -1)
     for points, (places, shares) in _parts(rule):
         values, directions, lengths = factors(places, points)
         lobes = lobe.take(points)

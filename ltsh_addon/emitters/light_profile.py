@@ -103,17 +103,6 @@ def has_shear(light) -> bool:
     return abs(u @ v) > SHEAR * np.linalg.norm(u) * np.linalg.norm(v)
 
 
-def upright(light):
-    """The same light as `profile_regions` needs it. The half axes of an ellipse become its principal axes, at right
-    angles even if a transform sheared the light; half_u of a parallelogram becomes the shorter side."""
-    u, v = light.half_u, light.half_v
-    if not light.is_round:
-        return light if u @ u <= v @ v else light.altered(half_u=v, half_v=u)
-    turn = 0.5 * np.arctan2(2.0 * (u @ v), u @ u - v @ v)
-    cosine, sine = np.cos(turn), np.sin(turn)
-    return light.altered(half_u=cosine * u + sine * v, half_v=cosine * v - sine * u)
-
-
 @dataclass(frozen=True)
 class DiskLayers:
     """Number of disks around the foot over which integrals run, and of chords per arc of a disk; at least 2 chords."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..lobes.polygon import dot
 from ..scene import EllipseLight, QuadLight
-from .light_profile import TINY, WIDE_OPEN, LightView, Profile, cross2, dot2, gauss_legendre, has_shear, plane_axes
+from .light_profile import TINY, WIDE_OPEN, LightView, Profile, cross2, dot2, gauss_legendre, has_shear
 
 # Least width of a peak in m.
 TINY_WIDTH = 1e-9
@@ -40,20 +40,14 @@ class ProfileRegions:
     not 0.
 
     The foot of the point plus s `along_s` plus t `along_t` is a point of the light's plane. The region consists of the
-    chords along t for every s in [low, high]. The light is a parallelogram or an ellipse, as returned by `upright`.
+    chords along t for every s in [low, high]. The light is a rectangle or an ellipse, see `suit`.
     """
 
     def __init__(self, light, view: LightView, horizons):
         """horizons: numbers of the coordinates of `view` that are positive above a horizon."""
         self.view, self.profile, self.is_round, self.horizons = view, Profile.of(light), light.is_round, horizons
-        self.is_sheared = not light.is_round and has_shear(light)
         dtype = view.distance.dtype.type
-        # Half extents along the axes of the plane, and by how much chords shift along t per unit of s.
-        u, v, self.skew = *view.extent, dtype(0.0)
-        if self.is_sheared:
-            along, v = (float(axis @ light.half_v) for axis in plane_axes(light))
-            self.skew = dtype(-along / v)
-            u, v = u + abs(along), abs(v)
+        u, v = view.extent
         self.is_long = max(u, v) > LONG * min(u, v)
         self.extent = dtype(u), dtype(v)
         self.reach = np.minimum(dtype(self.profile.tangent) * view.distance, dtype(WIDE_OPEN))
@@ -65,9 +59,8 @@ class ProfileRegions:
 
     @staticmethod
     def suit(light) -> bool:
-        """Whether the light is a parallelogram or an ellipse as returned by `upright`, and not distant."""
-        is_upright = not (light.is_round and has_shear(light))
-        return is_upright and isinstance(light, (QuadLight, EllipseLight))
+        """Whether the light is a rectangle, or an ellipse given by its principal axes."""
+        return isinstance(light, (QuadLight, EllipseLight)) and not has_shear(light)
 
     def _turns(self, dtype):
         """Unit vectors (2, P) along s. They follow the longer side of a long light. For other round lights they point
@@ -75,9 +68,8 @@ class ProfileRegions:
         horizons cut less."""
         view = self.view
         u, v = self.extent
-        if self.is_long or self.is_sheared:
-            # Chords of a sheared parallelogram run along half_u.
-            across = np.full(len(view.distance), v > u or self.is_sheared)
+        if self.is_long:
+            across = np.full(len(view.distance), v > u)
             return np.stack([~across, across]).astype(dtype)
         if self.is_round:
             length = np.sqrt(dot2(view.center, view.center))
@@ -103,10 +95,6 @@ class ProfileRegions:
         self.lowest, self.highest = np.maximum(t - half_t, -reach_t), np.minimum(t + half_t, reach_t)
         if self.is_round:
             self.is_whole_cone = np.sqrt(s * s + t * t) + reach < min(u, v)
-        elif self.is_sheared:
-            self.chord = self.view.distance.dtype.type(self.view.extent[0])
-            beside = np.abs(t - self.skew * s) + reach * np.sqrt(1.0 + self.skew * self.skew)
-            self.is_whole_cone = (np.abs(s) + reach < half_s) & (beside < self.chord)
         else:
             self.is_whole_cone = (np.abs(s) + reach < half_s) & (np.abs(t) + reach < half_t)
         for row in self.horizons:
@@ -212,15 +200,12 @@ class ProfileRegions:
         reach = self.reach[index]
         half = np.sqrt(np.maximum((reach - s) * (reach + s), 0.0))
         low, high = np.maximum(self.lowest[index], -half), np.minimum(self.highest[index], half)
-        off = s - self.center[0, index]
         if self.is_round:
+            off = s - self.center[0, index]
             middle = self.center[1, index] + self.shear[index] * off
             off = off / self.half[index]
             half = self.chord[index] * np.sqrt(np.maximum(1.0 - off * off, 0.0))
             low, high = np.maximum(low, middle - half), np.minimum(high, middle + half)
-        elif self.is_sheared:
-            middle = self.center[1, index] + self.skew * off
-            low, high = np.maximum(low, middle - self.chord), np.minimum(high, middle + self.chord)
         for row in self.horizons:
             across = self.along_t[row, index]
             height = self.view.foot[row, index] + self.along_s[row, index] * s

@@ -40,14 +40,8 @@ class SmallLight:
     @classmethod
     def of(cls, light) -> SmallLight:
         """For a `Light`."""
-        area = light.area_vector * np.copysign(1.0, light.area_vector @ light.direction)
-        u, v, center = light.half_u, light.half_v, light.center
-        diagonal = max(((u + v) ** 2).sum(), ((u - v) ** 2).sum())
-        radius = np.sqrt(max(u @ u, v @ v) if light.is_round else diagonal)
-        if light.corners is not None:
-            (center,), _ = _moments(light.corners[None], light.area_vector[None])
-            radius = np.linalg.norm(light.corners - center, axis=1).max()
-        return cls(center, float(radius), area, diagonal)
+        (center,), (area,), _, (diagonal,), (radius,) = moments_of([light])
+        return cls(center, float(radius), area, float(diagonal))
 
 
 def moments_of(lights) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -217,7 +211,7 @@ class ShadowedCosineAtPoint:
 
 def bump_shadowing(along, squares, bump_alpha2):
     """Bump shadowing (...) at heights (...) over the plane of the smooth normal and squared distances (...)."""
-    along = np.maximum(along, np.float32(1e-15) * np.sqrt(squares))
+    along = np.maximum(along, np.float32(1e-15) * np.sqrt(squares) + np.float32(1e-18))
     tangent2 = np.maximum(squares / (along * along) - np.float32(1.0), np.float32(0.0))
     shadowing = np.sqrt(np.float32(1.0) + bump_alpha2.astype(np.float32) * tangent2)
     return np.float32(2.0) / (np.float32(1.0) + shadowing)

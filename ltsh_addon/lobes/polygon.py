@@ -32,6 +32,18 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
+def normal_frames(normal: np.ndarray) -> np.ndarray:
+    """Frames (3, 3, P) around unit normals (3, P): rows of an arbitrary tangent, the bitangent and the normal (Duff et
+    al. 2017, "Building an Orthonormal Basis, Revisited")."""
+    x, y, z = normal
+    sign = np.copysign(1.0, z).astype(z.dtype)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    tangent = np.stack([1.0 + sign * x * x * a, sign * b, -sign * x])
+    bitangent = np.stack([b, sign + y * y * a, -y])
+    return np.stack([tangent, bitangent, normal])
+
+
 def clip_to_horizon(vertices: np.ndarray, axis: int = 2) -> np.ndarray:
     """The parts (C, W, P) of polygons (C, V, P) with C coordinates where coordinate `axis` is positive.
 
@@ -228,9 +240,8 @@ def solid_angle(unit: np.ndarray) -> np.ndarray:
 def convex_pieces(corners: np.ndarray) -> list[np.ndarray]:
     """Convex polygons (W, 3) that make up the simple, flat polygon `corners` (V, 3), with its sense of rotation.
 
-    Repeated corners and corners on straight edges are left out. A polygon without area gives no pieces. Ears are
-    clipped off, then pieces are joined as long as they stay convex (Hertel and Mehlhorn 1983). There are at most four
-    times as many pieces as needed.
+    Repeated corners and corners on straight edges are left out. A polygon without area gives no pieces, a convex one
+    itself, and others triangles: ears that are clipped off.
     """
     flat = _in_its_plane(corners)
     size = np.ptp(flat, axis=0).max()
@@ -238,8 +249,9 @@ def convex_pieces(corners: np.ndarray) -> list[np.ndarray]:
     ring = _without_straight_corners(list(range(len(flat))), flat, limit)
     if len(ring) < 3:
         return []
-    pieces = _joined(_ears(ring, flat, limit), flat, limit)
-    return [corners[piece] for piece in pieces]
+    points = flat[ring]
+    is_convex = (_turn(np.roll(points, 1, axis=0), points, np.roll(points, -1, axis=0)) > 0.0).all()
+    return [corners[piece] for piece in ([ring] if is_convex else _ears(ring, flat, limit))]
 
 
 def _in_its_plane(corners):
@@ -302,33 +314,3 @@ def _next_ear(ring, flat):
             return int(position)
     # The polygon is not simple: the smallest triangle does the least harm.
     return int(np.argmin(np.abs(area)))
-
-
-def _joined(pieces, flat, limit):
-    """The pieces, lists of corners, joined along common edges as long as the union is convex."""
-    pieces = [list(piece) for piece in pieces]
-    first = 0
-    while first < len(pieces):
-        for second in range(first + 1, len(pieces)):
-            union = _union(pieces[first], pieces[second], flat, limit)
-            if union is not None:
-                pieces[first] = union
-                del pieces[second]
-                break
-        else:
-            first += 1
-    return pieces
-
-
-def _union(a, b, flat, limit):
-    """The two polygons as one if they share an edge and their union is convex, otherwise None."""
-    for position, start in enumerate(a):
-        end = a[(position + 1) % len(a)]
-        for other, corner in enumerate(b):
-            if corner == end and b[(other + 1) % len(b)] == start:
-                # a from `end` around to `start`, then b from there to `end`
-                ring = a[position + 1 :] + a[: position + 1] + (b[other:] + b[:other])[2:]
-                points = flat[ring]
-                turns = _turn(np.roll(points, 1, axis=0), points, np.roll(points, -1, axis=0))
-                return ring if (turns >= -limit).all() else None
-    return None

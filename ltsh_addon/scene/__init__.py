@@ -38,50 +38,6 @@ from .techniques import (
     Technique,
 )
 
-__all__ = [
-    "BAKE_PASSES",
-    "Border",
-    "COMPARED_TECHNIQUES",
-    "CYCLES",
-    "Cancelled",
-    "ColorSpace",
-    "DEFAULT_TECHNIQUE",
-    "DistantLight",
-    "EllipseLight",
-    "FARTHEST",
-    "Film",
-    "FlatLight",
-    "Light",
-    "PASSES",
-    "Pattern",
-    "PointLight",
-    "PolygonLight",
-    "Progress",
-    "QuadLight",
-    "REC709",
-    "REFERENCE",
-    "SCALAR_FIELDS",
-    "SHIPPED_TABLES",
-    "SceneError",
-    "SkyLight",
-    "SpotCone",
-    "SpotLight",
-    "SunLight",
-    "SurfaceSamples",
-    "TECHNIQUES",
-    "Technique",
-    "VERSION",
-    "error_line",
-    "is_constant",
-    "light_of",
-    "light_records",
-    "lights_of",
-    "listed",
-    "round_outline",
-    "shortened",
-]
-
-
 VERSION = "0.1.0"  # also in blender_manifest.toml and pyproject.toml
 
 

@@ -77,6 +77,7 @@ class Light:
     is_round: ClassVar[bool] = False  # the outline is an ellipse
     is_facing: ClassVar[bool] = False  # it looks the same from every side (`emitters/facing.py`)
     is_distant: ClassVar[bool] = False  # it is infinitely far away
+    is_side: ClassVar[bool] = False  # it is a whole side of the sky
 
     name: str
     center: np.ndarray  # (3,) m
@@ -343,6 +344,12 @@ class SkyLight(DistantLight):
     SHAPES: ClassVar = ("RECTANGLE",)
     shape: str = "RECTANGLE"
     children: tuple[Light, ...] = ()  # finer lights that together are this one
+
+    @property
+    def is_side(self) -> bool:
+        """True for a whole side of that cube, along the axes of the world."""
+        axes = np.abs([self.center, self.half_u, self.half_v])
+        return bool((np.sort(axes) == [0.0, 0.0, 1.0]).all() and (axes.sum(axis=0) == 1.0).all())
 
 
 _KINDS = (QuadLight, EllipseLight, PolygonLight, PointLight, SunLight, SkyLight)

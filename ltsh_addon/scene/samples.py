@@ -57,27 +57,15 @@ class SurfaceSamples:
 
     def __post_init__(self):
         count = np.shape(self.position)[0]
-        defaults = {
-            "geometric_normal": self.normal,
-            "smooth_normal": self.diffuse_normal,
-            "bump_alpha2": np.broadcast_to(0.0, (count,)),
-            "specular_dip": np.broadcast_to(0.0, (count, 3)),
-            "diffuse_roughness": np.broadcast_to(0.0, (count,)),
-            "diffuse_rebound": np.broadcast_to(0.0, (count, 3)),
-            "sheen_a": np.broadcast_to(0.0, (count,)),
-            "sheen_b": np.broadcast_to(0.0, (count,)),
-            "receiver": np.broadcast_to(0, (count,)),
-            "anisotropy": np.broadcast_to(0.0, (count,)),
-            "tangent": np.broadcast_to(0.0, (count, 3)),
-        }
-        for name, value in defaults.items():
-            if getattr(self, name) is None:
-                object.__setattr__(self, name, value)
+        defaults = {"geometric_normal": self.normal, "smooth_normal": self.diffuse_normal, "receiver": 0}
         if np.ndim(self.dielectric) == 1:
             object.__setattr__(self, "dielectric", np.broadcast_to(np.asarray(self.dielectric)[:, None], (count, 3)))
         for field in fields(self):
-            value = np.asarray(getattr(self, field.name))
-            expected = (count,) if field.name in SCALAR_FIELDS else (count, 3)
+            value, expected = getattr(self, field.name), (count,) if field.name in SCALAR_FIELDS else (count, 3)
+            if value is None:
+                value = defaults.get(field.name, 0.0)
+                value = np.broadcast_to(value, expected) if np.isscalar(value) else value
+            value = np.asarray(value)
             if value.shape != expected:
                 raise ValueError(f"surface samples: {field.name} has shape {value.shape}, expected {expected}")
             object.__setattr__(self, field.name, value)

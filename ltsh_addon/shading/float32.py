@@ -1,9 +1,7 @@
 """The fast path of `shade`: lights, lookups and edge sums in float32, in chunks that fit the cache.
 
 `lobes32` has the lobes, whose frames are made once for all lights. `float64` shades what single precision cannot:
-points so close to a light's plane that an edge spans half a circle, tiny lights, and sharp lobes. If a block has few
-such pairs of a sample and a light, they are handed back, because `float64.shade_pairs` shades those of many blocks
-together.
+points so close to a light's plane that an edge spans half a circle, tiny lights, and sharp lobes.
 """
 
 from __future__ import annotations
@@ -22,8 +20,8 @@ from ..emitters.tails import LightFromPoints, TailLimits
 from ..lobes import moments32
 from ..lobes.lobe_integrals import FLOAT64_CHUNK, NARROWEST
 from ..lobes.lookup_table import MIN_ALPHA
-from ..lobes.polygon import MOSTLY_WHOLE, convex_pieces, dot, integrate_visible
-from ..scene import PolygonLight, SkyLight
+from ..lobes.polygon import MOSTLY_WHOLE, convex_pieces, dot, integrate_visible, normal_frames
+from ..scene import PolygonLight
 from . import float64, lobes32
 
 # Samples per chunk for small lights.
@@ -36,11 +34,8 @@ OF_CONSTANT = 96
 NARROW_SPREAD = 0.35
 
 
-def shade_diffuse(samples, lights, radiance, scratch, leftovers=None):
+def shade_diffuse(samples, lights, radiance, scratch):
     """Add to `radiance` (R, P, 3) what the diffuse lobes of `samples` reflect of `lights`, (light, row, corners).
-
-    A list `leftovers` receives the pairs for `float64.shade_pairs`, if they are fewer than FLOAT64_CHUNK: (samples
-    (N,), lights (N,)), where a light's number is its position among those that affect diffuse lobes.
 
     Returns the numbers (M,) of the samples that are shaded in double precision, without the `leaves` of `lights`.
     """
@@ -56,7 +51,7 @@ def shade_diffuse(samples, lights, radiance, scratch, leftovers=None):
     lit, bumped = lit[~shaped], bumped[~shaped]
     for is_bumped, members in ((False, lit[~bumped]), (True, lit[bumped])):
         for index in _chunks(members):
-            rows = lobes32.normal_frames(lobes32.as_columns(samples.diffuse_normal, index))
+            rows = normal_frames(lobes32.as_columns(samples.diffuse_normal, index))
             clip_rows, integrate, at_point = (2,), lobes32.FormFactor(scratch), small_lights.CosineAtPoint(rows)
             if is_bumped:
                 smooth, bump_alpha2 = lobes32.as_columns(samples.smooth_normal, index), samples.bump_alpha2[index]
@@ -66,11 +61,11 @@ def shade_diffuse(samples, lights, radiance, scratch, leftovers=None):
             colors = lobes32.as_columns(samples.diffuse_albedo, index)[None]
             others = (samples.bump_alpha2[index],) if is_bumped else ()
             lighting.add(lobes32.Lobes(index, rows, clip_rows, integrate, at_point, colors, 1.0, others=others))
-    lighting.finish(leftovers)
+    lighting.finish()
     return in_float64
 
 
-def shade_specular(samples, lights, table, radiance, scratch, leftovers=None):
+def shade_specular(samples, lights, table, radiance, scratch):
     """As `shade_diffuse`, for the specular lobes of `table`."""
     lights = Lights.of(lights, "specular")
     ridges = moments32.prepare(table)
@@ -80,7 +75,7 @@ def shade_specular(samples, lights, table, radiance, scratch, leftovers=None):
     sharp = lit & ((samples.roughness < moments32.SHARP_ROUGHNESS) | float64.has_bent_fresnel(samples))
     anisotropic = lit & (samples.anisotropy != 0.0)
 
-    lighting = _Lighting(samples, lights, radiance, scratch, specular_in_float64(table))
+    lighting = _Lighting(samples, lights, radiance, scratch, partial(float64.shade_specular, table=table))
     far = sharp & False
     if table.family == "ltsh":
         far = sharp & ~anisotropic
@@ -98,7 +93,7 @@ def shade_specular(samples, lights, table, radiance, scratch, leftovers=None):
         lobes32.add_specular_of_sky(sky, samples, index, radiance[row], table)
     lighting.add_in_float64(np.nonzero(sharp & ~by_map)[0])
     lighting.add_in_float64(np.nonzero(by_map)[0], {number for *_, numbers in lights.whole_skies for number in numbers})
-    lighting.finish(leftovers)
+    lighting.finish()
     return in_float64
 
 
@@ -118,16 +113,6 @@ def _specular_lobes(samples, index, kind, colors, scratch) -> lobes32.Lobes:
     sharpest = small_lights.SharpestLobes(*axes, width)
     others = samples.roughness[index], samples.ior[index]
     return lobes32.Lobes(index, rows, clip_rows, integrate, at_point, colors, width, limits, sharpest, others=others)
-
-
-def specular_in_float64(table):
-    """The argument `shade_in_float64` of `float64.shade_pairs` for specular lobes of `table`. For diffuse lobes it is
-    `float64.shade_diffuse`."""
-
-    def shade(samples, lights, radiance):
-        float64.shade_specular(samples, lights, table, radiance)
-
-    return shade
 
 
 def _chunks(members):
@@ -234,8 +219,7 @@ class Lights(list):
         """Maps of skies whose six sides are constant, each with one of its lights, their row, and their positions."""
         kinds: dict[tuple, list[int]] = {}
         for number, (light, row, _) in enumerate(self):
-            vectors = np.abs([light.center, light.half_u, light.half_v])
-            if isinstance(light, SkyLight) and not light.children and (np.sort(vectors) == [0.0, 0.0, 1.0]).all():
+            if light.is_side and not light.children:
                 kinds.setdefault((row, light.receivers), []).append(number)
         skies = []
         for (row, _), numbers in kinds.items():
@@ -259,7 +243,7 @@ def shade_skies(samples, lights, table, radiance) -> None:
 
 
 class _Lighting:
-    """Adds the light of `lights` at `samples` to `radiance` (R, P, 3). shade_in_float64(samples, lights, radiance)
+    """Adds the light of `lights` at `samples` to `radiance` (R, P, 3). shade_in_float64(samples, lights, radiance=)
     shades points that need double precision."""
 
     def __init__(self, samples, lights, radiance, scratch, shade_in_float64):
@@ -510,11 +494,11 @@ class _Lighting:
         for start in range(0, len(members), FLOAT64_CHUNK):
             index = members[start : start + FLOAT64_CHUNK]
             target = np.zeros((len(self.radiance), len(index), 3))
-            self.shade_in_float64(self.samples.take(index), lights, target)
+            self.shade_in_float64(self.samples.take(index), lights, radiance=target)
             self.radiance[:, index] += target.astype(np.float32)
 
-    def finish(self, leftovers) -> None:
-        """Add what was left to float64, or put it into the list `leftovers`."""
+    def finish(self) -> None:
+        """Add what was left to float64."""
         counts = [sum(map(len, parts)) for parts in self.needs_float64]
         pairs = [pair for pair in self.pairs_in_float64 if len(pair[0])]
         if not any(counts) and not pairs:
@@ -522,9 +506,6 @@ class _Lighting:
         members = [indices for of_light in self.needs_float64 for indices in of_light]
         members = np.concatenate([*members, *(indices for indices, _ in pairs)])
         number = np.concatenate([np.repeat(np.arange(len(counts)), counts), *(numbers for _, numbers in pairs)])
-        if leftovers is not None and len(members) < FLOAT64_CHUNK:
-            leftovers.append((members.astype(np.int32), number.astype(np.int32)))
-            return
         row = np.array([row for _, row, _ in self.lights])
         for pairs, values in float64.shade_pairs(self.samples, members, number, self.lights, self.shade_in_float64):
             # A sample may occur with several lights.

@@ -108,7 +108,7 @@ def shade_pairs(samples, members, number, lights, shade_in_float64):
             items = [lights[chosen[position]] for position in used]
             light = (items[0][0], 0, items[0][2]) if alone else _light_of_each(items, item_of_pair)
             target = np.zeros((1, len(pairs), 3))
-            shade_in_float64(samples.take(members[pairs]), [light], target)
+            shade_in_float64(samples.take(members[pairs]), [light], radiance=target)
             yield pairs, target[0]
 
 

@@ -6,7 +6,7 @@ A `Task` shades each block. It is the same in this process and in worker process
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
@@ -35,17 +35,6 @@ _DOUBLE_COST, _REFERENCE_COST = (100.0, 120.0), (20_000.0, 1000.0)
 SECONDS_WORTH_A_WORKER = 0.5
 # An anisotropic sample takes about as long as this many isotropic ones.
 ANISOTROPIC_COST = 6
-# Fields of SurfaceSamples that only one pass reads.
-_FIELDS_OF_ONE_PASS = {
-    "diffuse": (
-        "diffuse_normal", "smooth_normal", "bump_alpha2", "diffuse_albedo", "diffuse_roughness", "diffuse_rebound",
-        "sheen_a", "sheen_b",
-    ),
-    "specular": (
-        "normal", "geometric_normal", "roughness", "specular_f0", "specular_f90", "specular_dip", "dielectric", "ior",
-        "anisotropy", "tangent",
-    ),
-}  # fmt: skip
 # Up to so many lights, each has a row of the result unless the caller says otherwise.
 MOST_SINGLE_ROWS = 64
 # Number of lights of which all are looked at for an estimate of time.
@@ -95,49 +84,29 @@ class Task:
         corners *= len(self.lights) / max(len(some), 1)
         return 1e-9 * count * len(self.passes) * (per_light * len(self.lights) + per_corner * corners)
 
-    def do(self, job: SurfaceSamples | tuple[SurfaceSamples, str, np.ndarray], context=None):
-        """What `shade` returns for a block of samples, or `shade_pairs` for its arguments."""
-        return self.shade_pairs(*job) if isinstance(job, tuple) else self.shade(job)
-
     @cached_property
     def _scratch(self) -> moments32.Scratch:
         return moments32.Scratch()
 
-    def shade(self, samples: SurfaceSamples) -> tuple[dict[str, np.ndarray], np.ndarray | None, dict]:
-        """Radiance (R, B, 3) by pass of a block of B samples; the error (B,) of the reference, else None; and, by pass,
-        a list of what is left to `shade_pairs`: samples (N,) and numbers (N,) of lights."""
+    def do(self, samples: SurfaceSamples, context=None) -> tuple[dict[str, np.ndarray], np.ndarray | None]:
+        """Radiance (R, B, 3) by pass of a block of B samples, and the error (B,) of the reference, else None."""
         radiance = {name: np.zeros((self.row_count, len(samples), 3), self.dtype) for name in self.passes}
         error = np.zeros(len(samples)) if self.has_error else None
-        leftovers: dict[str, list] = {name: [] for name in self.passes}
-        in_float64 = self._add(samples, self._plain, radiance, error, leftovers)
+        in_float64 = self._add(samples, self._plain, radiance, error)
         if self._with_patches is not None and self.single:
             float32.shade_skies(samples, self._with_patches, self.table, radiance)
         elif self._with_patches is not None:
-            self._add(samples, self._with_patches, radiance, error, {})
+            self._add(samples, self._with_patches, radiance, error)
         for light, row in self._rows_of_lights:
             if light.children and not float64.has_patches(light):
                 for name in self.passes:
                     index = in_float64[name] if self._has_tree(light) else np.arange(len(samples))
                     self._add_detailed((samples, index), light, name, radiance[name][row : row + 1], error)
-        return radiance, error, leftovers
+        return radiance, error
 
     @property
     def _rows_of_lights(self):
         return zip(self.lights, self.rows, strict=True)
-
-    def lights_of_pairs(self, name: str) -> list[tuple[Light, int]]:
-        """The lights, each with its row, to which the numbers in `shade_pairs` refer."""
-        return [one[:2] for one in self._plain[name]]
-
-    def shade_pairs(self, samples: SurfaceSamples, name: str, number: np.ndarray) -> np.ndarray:
-        """Radiance (N, 3) of one pass of N samples under one light each."""
-        in_float64 = float64.shade_diffuse if name == "diffuse" else float32.specular_in_float64(self.table)
-        lights, (used, number) = self.lights_of_pairs(name), np.unique(number, return_inverse=True)
-        lights = _prepared(lights[one] for one in used)
-        result, every = np.zeros((len(samples), 3), self.dtype), np.arange(len(samples))
-        for pairs, radiance in float64.shade_pairs(samples, every, number, lights, in_float64):
-            result[pairs] = radiance
-        return result
 
     @cached_property
     def _plain(self) -> dict[str, float32.Lights]:
@@ -179,23 +148,25 @@ class Task:
             patch_radiance = {name: np.zeros((1, len(index), 3), self.dtype)}
             own_error = None if error is None else np.zeros(len(index))
             prepared = float32.Lights(_prepared((patch, 0) for patch in patches))
-            self._add(samples.take(index), {name: prepared}, patch_radiance, own_error, {})
+            self._add(samples.take(index), {name: prepared}, patch_radiance, own_error)
             radiance[:, index] += patch_radiance[name]
             if error is not None:
                 error[index] += own_error
 
-    def _add(self, samples, prepared, radiance, error, leftovers) -> dict[str, np.ndarray]:
-        """Add the light of the `prepared` lights by pass to `radiance`, except for pairs put into `leftovers`. Returns,
-        by pass, the numbers of the samples that took no leaves of textured lights."""
+    def _add(self, samples, prepared, radiance, error) -> dict[str, np.ndarray]:
+        """Add the light of the `prepared` lights by pass to `radiance`. Returns, by pass, the numbers of the samples
+        that took no leaves of textured lights."""
         in_float64 = {}
         if self.single:
             scratch = self._scratch
             if "diffuse" in radiance:
-                pairs, lights = leftovers.get("diffuse"), prepared["diffuse"]
-                in_float64["diffuse"] = float32.shade_diffuse(samples, lights, radiance["diffuse"], scratch, pairs)
+                in_float64["diffuse"] = float32.shade_diffuse(
+                    samples, prepared["diffuse"], radiance["diffuse"], scratch
+                )
             if "specular" in radiance:
-                pairs, lights, target = leftovers.get("specular"), prepared["specular"], radiance["specular"]
-                in_float64["specular"] = float32.shade_specular(samples, lights, self.table, target, scratch, pairs)
+                in_float64["specular"] = float32.shade_specular(
+                    samples, prepared["specular"], self.table, radiance["specular"], scratch
+                )
             return in_float64
         for start in range(0, len(samples), FLOAT64_CHUNK):
             chunk = slice(start, start + FLOAT64_CHUNK)
@@ -295,19 +266,24 @@ def shade(
     task = _task(tuple(lights), technique, passes, dtype, rows)
     task.prepare()
     blocks = _blocks(len(samples), *(REFERENCE_BLOCK_LIMITS if task.is_reference else BLOCK_LIMITS))
-    result = _Result(task, blocks, len(samples), np.dtype(dtype))
-    seconds = task.seconds(len(samples) + ANISOTROPIC_COST * np.count_nonzero(samples.anisotropy))
-    read = _fields_read(samples, task)
+    result = {name: np.zeros((task.row_count, len(samples), 3), dtype) for name in task.passes}
+    quadrature_error = np.zeros(len(samples)) if task.has_error else None
+    is_worth = (
+        task.seconds(len(samples) + ANISOTROPIC_COST * np.count_nonzero(samples.anisotropy)) >= SECONDS_WORTH_A_WORKER
+    )
+
+    def store(number, shaded):
+        radiance, error = shaded
+        for name, values in radiance.items():
+            result[name][:, blocks[number]] = values
+        if error is not None:
+            quadrature_error[blocks[number]] = error
+
     with WorkerPool(processes=workers) as pool:
-        is_worth = seconds >= SECONDS_WORTH_A_WORKER
-        for done in pool.run(task, len(blocks), lambda number: read.take(blocks[number]), result.store, is_worth):
+        for done in pool.run(task, len(blocks), lambda number: samples.take(blocks[number]), store, is_worth):
             if progress is not None and progress(done / len(blocks)) is False:
                 raise Cancelled("shading was stopped")
-        pairs = result.pairs()
-        for _ in pool.run(task, len(pairs), lambda number: pairs[number].job(read), result.store_pairs, False):
-            if progress is not None and progress(1.0) is False:
-                raise Cancelled("shading was stopped")
-    return Shading(result.radiance.get("specular"), result.radiance.get("diffuse"), result.error)
+    return Shading(result.get("specular"), result.get("diffuse"), quadrature_error)
 
 
 def _shade_with(technique, samples, lights, passes, how) -> Shading:
@@ -346,69 +322,6 @@ def _own_pass(technique, shaded, name, count) -> np.ndarray | None:
     return values
 
 
-def _fields_read(samples: SurfaceSamples, task: Task) -> SurfaceSamples:
-    """The samples with zeros, which are not sent to workers, in the fields that the task does not read."""
-    unread = {field for name in set(PASSES) - set(task.passes) for field in _FIELDS_OF_ONE_PASS[name]}
-    if all(light.receivers is None for light in task.lights):
-        unread.add("receiver")
-    return replace(samples, **{name: np.broadcast_to(0, getattr(samples, name).shape) for name in unread})
-
-
-@dataclass(frozen=True)
-class LightSamplePairs:
-    """Samples, each to be shaded under one light in one pass; fewer than two FLOAT64_CHUNK of them."""
-
-    name: str  # of the pass
-    index: np.ndarray  # (N,) of the samples; some occur several times
-    number: np.ndarray  # (N,) of the lights
-
-    def job(self, samples: SurfaceSamples) -> tuple[SurfaceSamples, str, np.ndarray]:
-        """The arguments of `Task.shade_pairs`."""
-        return samples.take(self.index), self.name, self.number
-
-
-class _Result:
-    """Collects what `blocks` reflect, and the pairs that they leave for the end."""
-
-    def __init__(self, task: Task, blocks: list[slice], count: int, dtype: np.dtype):
-        self._task, self._blocks = task, blocks
-        self.radiance = {name: np.zeros((task.row_count, count, 3), dtype) for name in task.passes}
-        self.error = np.zeros(count) if task.has_error else None
-        self._leftovers: list[dict[str, list]] = [{} for _ in blocks]
-        self._pairs: list[LightSamplePairs] = []
-
-    def store(self, number: int, shaded: tuple) -> None:
-        """Store what `Task.shade` returned for a block."""
-        (radiance, error, leftovers), block = shaded, self._blocks[number]
-        for name, values in radiance.items():
-            self.radiance[name][:, block] = values
-        if self.error is not None:
-            self.error[block] = error
-        self._leftovers[number] = {
-            name: [(members + block.start, light.copy()) for members, light in pairs]
-            for name, pairs in leftovers.items()
-        }
-
-    def pairs(self) -> list[LightSamplePairs]:
-        """What all blocks left, in batches. Neither the batches nor their order depend on which block was done first.
-        Each batch contains whole blocks."""
-        for name in self._task.passes:
-            batch: list[tuple] = []
-            for leftovers in [*self._leftovers, None]:
-                if batch and (leftovers is None or sum(len(members) for members, _ in batch) >= FLOAT64_CHUNK):
-                    self._pairs.append(LightSamplePairs(name, *map(np.concatenate, zip(*batch, strict=True))))
-                    batch = []
-                batch += [] if leftovers is None else leftovers[name]
-        return self._pairs
-
-    def store_pairs(self, number: int, radiance: np.ndarray) -> None:
-        """Add what `Task.shade_pairs` returned."""
-        pairs = self._pairs[number]
-        row = np.array([row for _, row in self._task.lights_of_pairs(pairs.name)])
-        # A sample may occur with several lights.
-        np.add.at(self.radiance[pairs.name], (row[pairs.number], pairs.index), radiance)
-
-
 def _blocks(count: int, least: int, most: int) -> list[slice]:
     """Slices that make up `count` samples. They are `most` long; when fewer than four such blocks are left, their
     length is halved, down to `least`. They do not depend on the number of processes."""
@@ -427,10 +340,7 @@ def _check_passes(passes) -> None:
 
 
 def _parts(light) -> tuple[Light, ...]:
-    """The parts of a light that get an integral each: the patches of a small distant light; otherwise the light itself.
-    Sheared lights with a profile are returned `upright`."""
-    if light.has_profile and not light.children and light_profile.has_shear(light):
-        return (light_profile.upright(light),)
+    """The parts of a light that get an integral each: the patches of a small distant light; else the light itself."""
     is_spot = float64.has_patches(light) and np.linalg.norm(light.half_u) < SPOT * np.linalg.norm(light.center)
     return light.leaves if is_spot else (light,)
 

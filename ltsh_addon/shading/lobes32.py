@@ -29,7 +29,7 @@ from ..lobes.brdf import (
 from ..lobes.diffuse import diffuse_factor
 from ..lobes.lobe_integrals import LEAST_SHARE
 from ..lobes.lookup_table import MIN_ALPHA
-from ..lobes.polygon import cross, dot
+from ..lobes.polygon import cross, dot, normal_frames
 from . import float64
 
 # If a block has more different indices of refraction, the dielectric's weights are summed up per sample.
@@ -128,16 +128,6 @@ def _by_ior(ior, members):
         return
     for position, value in enumerate(distinct):
         yield ("dielectric", float(value)), members[number == position]
-
-
-def normal_frames(normal):
-    """Frames (3, 3, P) around normals (3, P), with an arbitrary tangent (Duff et al. 2017)."""
-    x, y, z = normal
-    sign = np.copysign(np.float32(1.0), z)
-    a = np.float32(-1.0) / (sign + z)
-    b = x * y * a
-    tangent = np.stack([np.float32(1.0) + sign * x * x * a, sign * b, -sign * x])
-    return np.stack([tangent, np.stack([b, sign + y * y * a, -y]), normal])
 
 
 def frames_toward(normal, view):
@@ -322,9 +312,7 @@ class ShadowedFormFactor:
         smooth, bump_alpha2 = (_selected(values, columns, index) for values in (self.smooth, self.bump_alpha2))
         integrals, needs_float64 = moments32.vector_irradiance(corners, self.scratch, smallest)
         direction = np.negative(integrals, out=integrals)
-        along = np.maximum(dot(direction, smooth), np.float32(1e-15))
-        tangent2 = np.maximum(dot(direction, direction) / (along * along) - np.float32(1.0), np.float32(0.0))
-        shadowing = np.float32(2.0) / (np.float32(1.0) + np.sqrt(np.float32(1.0) + bump_alpha2 * tangent2))
+        shadowing = bump_shadowing(dot(direction, smooth), dot(direction, direction), bump_alpha2)
         values = np.maximum(direction[2], np.float32(0.0)) * shadowing * np.float32(1.0 / np.pi)
         return values[None], needs_float64
 

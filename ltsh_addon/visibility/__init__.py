@@ -19,21 +19,3 @@ from .ratio import (
 )
 from .rays import Tracer, open_tracer
 from .shadow_terminator import RayOrigins
-
-__all__ = [
-    "BLOCK_SAMPLES",
-    "Hits",
-    "OccluderMesh",
-    "Occluders",
-    "RayOrigins",
-    "ShadowSampling",
-    "ShadowTask",
-    "Tracer",
-    "Transparency",
-    "Visibility",
-    "open_tracer",
-    "shadow_task",
-    "shared_numbers",
-    "trace_ray_origins",
-    "trace_visibility",
-]

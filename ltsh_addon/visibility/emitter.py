@@ -13,7 +13,7 @@ import numpy as np
 
 from ..emitters import light_profile
 from ..emitters.light_polygons import cached_on_children
-from ..lobes.polygon import convex_pieces, dot
+from ..lobes.polygon import convex_pieces, dot, normal_frames
 from ..scene import Light, PolygonLight
 
 _ZERO, _ONE, _TINY = np.float32(0.0), np.float32(1.0), np.float32(1e-30)
@@ -238,11 +238,7 @@ class Sky(Emitter):
 
 def _by_cosine(x, y, normal):
     """Unit vectors (3, S, Q) around normals (3, Q), distributed as the cosine."""
-    sign = np.copysign(_ONE, normal[2])
-    a = -_ONE / (sign + normal[2])
-    b = normal[0] * normal[1] * a
-    tangent = np.stack([_ONE + sign * normal[0] * normal[0] * a, sign * b, -sign * normal[0]])[:, None]
-    bitangent = np.stack([b, sign + normal[1] * normal[1] * a, -normal[1]])[:, None]
+    tangent, bitangent, _ = normal_frames(normal)[:, :, None]
     radius, angle = np.sqrt(x), np.float32(2.0 * np.pi) * y
     directions = radius * np.cos(angle) * tangent + radius * np.sin(angle) * bitangent
     directions += np.sqrt(_ONE - x) * normal[:, None]

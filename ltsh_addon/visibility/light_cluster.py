@@ -10,7 +10,7 @@ import numpy as np
 
 from ..emitters import light_tree
 from ..lobes.polygon import STRAIGHT, convex_pieces, dot
-from ..scene import FlatLight, Light, PointLight, PolygonLight, QuadLight, SkyLight
+from ..scene import FlatLight, Light, PointLight, PolygonLight, QuadLight
 from .emitter import Emitter, Sky
 
 _ZERO, _ONE, _TINY = np.float32(0.0), np.float32(1.0), np.float32(1e-30)
@@ -273,7 +273,7 @@ def shared_numbers(lights: Sequence[Light], tracer=None) -> tuple[tuple[int, ...
 
 def _kind(light, number, masks) -> tuple:
     """A key that is equal for lights that share their rays."""
-    if _is_side(light):
+    if light.is_side:
         return "sky", light.name
     is_plain = isinstance(light, FlatLight) and not (light.has_profile or light.children)
     radiance = light.radiance.tolist()
@@ -291,14 +291,6 @@ def emitters_of(
     numbers, emitters = shared_numbers(lights, tracer), []
     for group in numbers:
         members = [lights[number] for number in group]
-        is_sky = _is_side(members[0])
-        emitters.append(Sky(members) if is_sky else LightCluster(members) if len(group) > 1 else Emitter(members[0]))
+        kind = LightCluster if len(group) > 1 else Emitter
+        emitters.append(Sky(members) if members[0].is_side else kind(members if kind is LightCluster else members[0]))
     return tuple(emitters), numbers
-
-
-def _is_side(light: Light) -> bool:
-    """True for a side of the sky, a cube around all samples."""
-    if not isinstance(light, SkyLight):
-        return False
-    axes = np.stack([light.center, light.half_u, light.half_v])
-    return bool(np.array_equal(np.abs(axes).sum(axis=0), np.ones(3)) and np.allclose(axes @ axes.T, np.eye(3)))

@@ -11,11 +11,8 @@ import argparse
 import json
 import math
 import os
-import resource
-import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -31,13 +28,13 @@ EQUAL_SIZE = 512
 FACTOR = 30.0
 
 
-def build_scene(path, textured=False):
-    """A glossy plane of 6 m under four rectangles; `textured`: its color and roughness are procedural textures."""
+def build_scene(path, textured=False, lights=4):
+    """A glossy plane of 6 m under rectangles; `textured`: its color and roughness are procedural textures."""
     import scene_parts
 
     scene_parts.empty_scene()
     scene_parts.add_camera((0.0, -4.0, 3.0), (0.0, 0.0, 0.0))
-    for number in range(4):
+    for number in range(lights):
         place = (1.6 * (number % 2) - 0.8, 1.6 * (number // 2) - 0.8, 1.5)
         scene_parts.add_area_light(location=place, rotation=(0.3, 0.0, 0.2))
     material, node = scene_parts.principled("Glossy", Roughness=0.35)
@@ -73,32 +70,17 @@ def with_shadows(sizes=(512, 1024)):
     with tempfile.TemporaryDirectory(prefix="ltsh-bench-") as name:
         scene = _scene(Path(name), "shadows")
         for size in sizes:
-            seconds = []
-            for shadows in ("on", "off"):
-                before = resource.getrusage(resource.RUSAGE_CHILDREN)
-                options = "--size", str(size), "--object", "Floor", "--shadows", shadows
-                bake(scene, Path(name) / f"{size}{shadows}", *options)
-                after = resource.getrusage(resource.RUSAGE_CHILDREN)
-                seconds.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
-            with_them, without = seconds
+            options = "--size", size, "--object", "Floor", "--shadows"
+            with_them, without = (
+                bake(scene, Path(name) / f"{size}{way}", *options, way)[1].processor for way in ("on", "off")
+            )
             print(f"  {size:>5}^2: {with_them:.1f} processor s, {without:.1f} without shadows", flush=True)
 
 
 def bake(scene, output, *options):
-    """Run the command; its seconds, as "processor" those of the processor for our own process, and the peak resident
-    sizes in MiB of it and of the Blender it starts."""
-    command = [sys.executable, "-m", "ltsh_addon", "bake", str(scene), "-o", str(output), "--json", "--quiet", *options]
-    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, text=True)
-    peaks, processor = {}, 0.0
-    while process.poll() is None:
-        processor = measure.processor_seconds(process.pid) or processor
-        for kind, pid in [("own", process.pid), *(("Blender", child) for child in measure.children(process.pid))]:
-            peaks[kind] = max(peaks.get(kind, 0.0), measure.resident(pid, "VmHWM"))
-        time.sleep(0.02)
-    if process.returncode:
-        raise SystemExit(f"{' '.join(command)}: exit code {process.returncode}")
-    json.loads(process.stdout.read())
-    return {**json.loads((output / "timing.json").read_text())["seconds"], "processor": processor}, peaks
+    """Run the command; its seconds by stage, and what the process took."""
+    usage = measure.run("-m", "ltsh_addon", "bake", scene, "-o", output, "--quiet", *options)
+    return json.loads((output / "timing.json").read_text())["seconds"], usage
 
 
 def memory(sizes, *options):
@@ -108,10 +90,10 @@ def memory(sizes, *options):
         folder = Path(name)
         scene = _scene(folder, "constant")
         for size in sizes:
-            seconds, peaks = bake(scene, folder / str(size), "--size", str(size), *options)
-            own.append(peaks["own"])
-            text = ", ".join(f"{kind} {peak:.0f} MiB" for kind, peak in peaks.items())
-            print(f"  {size:>5}^2: peak {text}; {seconds['total']:.1f} s, load {os.getloadavg()[0]:.1f}", flush=True)
+            seconds, usage = bake(scene, folder / str(size), "--size", size, *options)
+            own.append(usage.own_peak)
+            text = f"own {usage.own_peak:.0f} MiB, largest {usage.peak:.0f} MiB; {seconds['total']:.1f} s"
+            print(f"  {size:>5}^2: peak {text}, load {os.getloadavg()[0]:.1f}", flush=True)
     growth = own[-1] / own[-2] - 1.0
     print(f"  {sizes[-1]}^2 against {sizes[-2]}^2: {growth:+.1%} of our own process (target below {GROWTH_LIMIT:.0%})")
     return growth
@@ -125,16 +107,13 @@ def times():
         for size, (limit, most) in LIMITS.items():
             # Twice the smaller one, of which the second counts: a busy machine disturbs it most.
             for _ in range(2 if size < 2048 else 1):
-                seconds, peaks = bake(scene, Path(name) / str(size), "--size", str(size))
+                seconds, usage = bake(scene, Path(name) / str(size), "--size", size)
             own = seconds["Floor.exr"]
-            good &= own <= limit and max(peaks.values()) <= most
-            text = ", ".join(f"{kind} {peak:.0f} MiB" for kind, peak in peaks.items())
-            print(
-                f"  {size:>5}^2: {own:.1f} s (target {limit:.0f} s), processor {seconds['processor']:.1f} s, "
-                f"with Blender's part {seconds['total']:.1f} s; "
-                f"peak {text} (target {most:.0f} MiB); load {os.getloadavg()[0]:.1f}",
-                flush=True,
+            good &= own <= limit and usage.peak <= most
+            text = (
+                f"with Blender {seconds['total']:.1f} s, of processors {usage.processor:.1f} s; peak {usage.peak:.0f}"
             )
+            print(f"  {size:>5}^2: {own:.1f} s (target {limit:.0f}), {text} MiB (target {most:.0f})", flush=True)
     return good
 
 
@@ -192,8 +171,7 @@ def _layers(folder, *names):
 def _scene(folder, kind):
     """The file of a scene, built by a process of its own."""
     path = folder / "scene.blend"
-    command = [sys.executable, __file__, "scene", str(path), "--kind", kind]
-    subprocess.run(command, check=True, timeout=120, stdout=subprocess.DEVNULL)
+    measure.run(__file__, "scene", path, "--kind", kind)
     return path
 
 

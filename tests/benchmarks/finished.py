@@ -14,7 +14,6 @@ import hashlib
 import importlib.metadata
 import json
 import os
-import subprocess
 import sys
 import tempfile
 from dataclasses import dataclass, field
@@ -23,7 +22,9 @@ from pathlib import Path
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT)]
+sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
+
+import measure  # noqa: E402
 
 from ltsh_addon import imaging  # noqa: E402
 from ltsh_addon.blender.process.blender_process import denoiser_libraries  # noqa: E402
@@ -43,22 +44,6 @@ DIRECT = ((("Diffuse Direct", "DiffDir"), ("Diffuse Color", "DiffCol")),
           (("Glossy Direct", "GlossDir"), ("Glossy Color", "GlossCol")))  # fmt: skip
 MOST_OFF = 0.06  # of Cycles' time, before it is rendered again
 FIGURES = ("L2", f"L2 -{100 * BRIGHTEST:.1f} %", "FLIP")
-
-
-def run(*command) -> float:
-    """Processor seconds of a whole process, with the children that it has waited for."""
-    # Without compiled modules on disk, every Blender would compile those that it imports; an installed one has them.
-    variables = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
-    with tempfile.TemporaryFile() as output:
-        process = subprocess.Popen(
-            [sys.executable, *map(str, command)], cwd=ROOT, env=variables, stdout=output, stderr=output
-        )
-        _, status, usage = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-        if process.returncode:
-            output.seek(0)
-            raise RuntimeError(f"{command}: {output.read().decode(errors='replace')[-2000:]}")
-    return usage.ru_utime + usage.ru_stime
 
 
 def figures(pair, halves) -> np.ndarray:
@@ -104,7 +89,7 @@ class Scene:
         """The .blend with this seed of Cycles."""
         path = self.cache / f"{self.name}_{seed}.blend"
         if not path.exists():
-            run(Path(__file__).with_name("finished_scenes.py"), self.name, self.cache, seed)
+            measure.run(Path(__file__).with_name("finished_scenes.py"), self.name, self.cache, seed)
         return path
 
     def cycles(self, seed: int, samples: int, *passes: str, blend: Path | None = None) -> tuple[dict, float]:
@@ -113,7 +98,7 @@ class Scene:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "cycles.exr"
             script = Path(__file__).with_name("cycles_picture.py")
-            seconds = run(script, blend, path, *self.size, samples, seed, *passes)
+            seconds = measure.run(script, blend, path, *self.size, samples, seed, *passes).processor
             return read_channels(path), seconds
 
     def find_truth(self) -> None:
@@ -161,7 +146,7 @@ class Scene:
         with tempfile.TemporaryDirectory() as folder:
             size = "x".join(map(str, self.size))
             options = ("--resolution", size, "--budget", budget, "--quiet", *more)
-            seconds = run("-m", "ltsh_addon", "render", self.blend(seed), "-o", folder, *options)
+            seconds = measure.run("-m", "ltsh_addon", "render", self.blend(seed), "-o", folder, *options).processor
             image = read_layer(read_channels(Path(folder) / "render.exr"), COMBINED, "RGB").astype(float)
             report = json.loads((Path(folder) / "report.json").read_text())
         return figures((image, image), self.halves), seconds, report

@@ -1,4 +1,4 @@
-"""Twelve scenes of unlike kinds for finished pictures, as users of Blender build them, and a plain one; needs bpy.
+"""Twelve scenes of unlike kinds for finished pictures, as users of Blender build them, and some plain ones; needs bpy.
 
 python tests/benchmarks/finished_scenes.py NAME FOLDER SEED ...    writes FOLDER/NAME_SEED.blend
 """
@@ -537,7 +537,53 @@ def studio():
     camera((0.0, -6.0, 2.0), (0.0, 0.0, 0.8), 35)
 
 
-SCENES = (product, bathroom, cloth, window, street, arcade, car, foliage, glow, workshop, food, hall, studio)
+def contact():
+    """Small parts that lie on a table: shadows end where they touch it. `shadows.py` takes it and the next two."""
+    random = np.random.default_rng(1)
+    panel("Table", (-3, -3, 0), (6, 0, 0), (0, 6, 0), material("Table", (0.45, 0.42, 0.4), 0.35))
+    paints = [material("Part", color, 0.3) for color in ((0.7, 0.2, 0.1), (0.9, 0.8, 0.6), (0.1, 0.3, 0.7))]
+    for number, place in enumerate(np.stack(np.meshgrid(np.arange(-4, 5), np.arange(-2, 3)), axis=-1).reshape(-1, 2)):
+        x, y = 0.38 * place + random.uniform(-0.03, 0.03, 2)
+        surface, turn = paints[number % 3], random.uniform(0.0, math.pi)
+        if number % 3 == 0:
+            rod("Rod", surface, (x, y, 0.04), (0.04, 0.25), (0.5 * math.pi, 0.0, turn))
+        elif number % 3 == 1:
+            put("cube", "Cube", surface, (x, y, 0.07), (0.0, 0.0, turn), size=0.14)
+        else:
+            ball("Ball", surface, (x, y, 0.1), 0.1)
+    softbox("Key", 60, (0.8, 0.5), (1.8, -0.6, 2.2), (0.0, 0.0, 0.0))
+    softbox("Rim", 40, (1.4, 0.3), (-1.0, 2.4, 1.4), (0.0, 0.2, 0.0))
+    softbox("Spot", 15, 0.25, (-2.0, -1.0, 1.8), (0.0, 0.0, 0.0))
+    camera((0.0, -3.2, 1.9), (0.0, 0.1, 0.0), 35)
+
+
+def highlight():
+    """The mirror image of a long light in a glossy floor, half blocked by bars."""
+    panel("Floor", (-5, -5, 0), (10, 0, 0), (0, 10, 0), material("Floor", (0.3, 0.3, 0.32), 0.15))
+    for x, roughness in ((-1.1, 0.12), (1.1, 0.35)):
+        ball("Ball", material("Metal", (0.85, 0.75, 0.6), roughness, Metallic=1.0), (x, 0.0, 0.45), 0.45)
+    for height, width in ((0.8, 0.25), (1.3, 0.05), (1.55, 0.02)):
+        box("Bar", (-2.6, 1.9, height), (2.6, 1.95, height + width), material("Bar", (0.1, 0.1, 0.1), 0.5))
+    softbox("Tube", 120, (3.6, 0.8), (0.0, 3.2, 1.3), (0.0, 0.0, 0.4))
+    camera((0.0, -4.5, 1.6), (0.0, 0.6, 0.3), 35)
+
+
+def leaves():
+    """Ground in the shadow of leaves, whose outlines are the alpha of an image; the camera sees none of them."""
+    random = np.random.default_rng(1)
+    panel("Ground", (-6, -6, 0), (12, 0, 0), (0, 12, 0), material("Ground", (0.35, 0.3, 0.22), 0.45))
+    ball("Ball", material("Ball", (0.5, 0.1, 0.1), 0.3), (0.8, -0.2, 0.4), 0.4)
+    leaf = panel("Leaf", (-0.2, -0.2, 0), (0.4, 0, 0), (0, 0.4, 0), _leaf("Leaf", (0.1, 0.4, 0.05)), 2.5)
+    leaf.visible_camera = False
+    places = random.uniform((-2.8, -1.8, 1.5), (2.8, 1.4, 2.5), (420, 3))
+    copies(leaf, places, random.uniform((-0.9, -0.9, 0.0), (0.9, 0.9, 6.3), (420, 3)))
+    softbox("Sun", 500, 0.9, (1.2, -1.2, 5.0), (0.0, 0.3, 0.0))
+    softbox("Sky", 250, (2.5, 2.0), (-1.5, -0.5, 4.2), (0.0, 0.5, 0.3))
+    camera((0.0, -4.6, 1.7), (0.0, 0.6, 0.6), 35)
+
+
+SCENES = (product, bathroom, cloth, window, street, arcade, car, foliage, glow, workshop, food, hall, studio,
+          contact, highlight, leaves)  # fmt: skip
 
 
 def main(name: str, folder: str, *seeds: str) -> None:

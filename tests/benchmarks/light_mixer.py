@@ -1,6 +1,6 @@
 """What the light mixer takes at 960 x 540 with 8 lights; needs bpy.
 
-python tests/benchmarks/light_mixer.py [--folder DIR] [--lights N]
+python tests/benchmarks/light_mixer.py [--folder DIR]
 
 Prints milliseconds of a change, all in this thread: of the light that was changed before, of another one, of all;
 seconds until a picture can be mixed; those of a light that has moved, of this process + others. The picture is made
@@ -12,7 +12,7 @@ import os
 import time
 from pathlib import Path
 
-import many_lights
+import bake_cost
 import measure
 import numpy as np
 
@@ -51,15 +51,13 @@ def changes(mixer, rounds=20):
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--folder", type=Path, default=Path("light-mixer"))
-    parser.add_argument("--lights", type=int, default=8)
-    options = parser.parse_args()
-    out = options.folder.resolve() / f"{options.lights}"
+    out = parser.parse_args().folder.resolve()
     kept_file = out / f"shade{RELIGHT_SUFFIX}"
     if not kept_file.exists():
         out.mkdir(parents=True, exist_ok=True)
-        many_lights.build_scene(out / "room.blend", options.lights)
+        bake_cost.build_scene(out / "room.blend", lights=8)
         words = ("--keep-visibility", "--resolution", RESOLUTION, "--techniques", "ltsh4")
-        print("shade", many_lights.shade(out / "room.blend", out, *words))
+        print("shade", measure.run("-m", "ltsh_addon", "shade", out / "room.blend", "-o", out, *words))
     print(f"kept {kept_file.stat().st_size / 2**20:.0f} MiB")
     kept, *took = timed(lambda: RelightData.load(kept_file))
     print("read what is kept: {:.2f} s, {:.2f} s of processor time".format(*took))

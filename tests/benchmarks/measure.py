@@ -1,13 +1,17 @@
-"""Timing in rounds, time and memory of processes, and counting of what numpy writes."""
+"""Timing in rounds, time and memory of processes."""
 
 import gc
 import os
+import subprocess
+import sys
+import tempfile
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from ltsh_addon.lobes import moments32
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def ratios(cases, base, rounds=5):
@@ -58,35 +62,31 @@ def resident(pid, kind="VmRSS"):
     return max((int(line.split()[1]) / 1024.0 for line in status if kind in line), default=0.0)
 
 
-class _Counted(np.ndarray):
-    """Counts the elements that ufuncs write, or read where they reduce."""
+@dataclass(frozen=True)
+class Usage:
+    """Of a process and all that it has started: seconds, processor seconds; MiB at the peak of the process itself, and
+    of the largest of all."""
 
-    elements = 0
-    calls = 0
-
-    def __array_ufunc__(self, ufunc, method, *inputs, out=None, **options):
-        plain = [np.asarray(value) if isinstance(value, np.ndarray) else value for value in inputs]
-        if out is not None:
-            options["out"] = tuple(np.asarray(value) for value in out)
-        result = getattr(ufunc, method)(*plain, **options)
-        _Counted.elements += plain[0].size if method == "reduce" else np.asarray(result).size
-        _Counted.calls += 1
-        if out is not None:
-            return out[0]
-        return result.view(_Counted) if isinstance(result, np.ndarray) else result
+    seconds: float
+    processor: float
+    own_peak: float
+    peak: float
 
 
-class CountingScratch(moments32.Scratch):
-    """Arrays that count what is done to them."""
-
-    def _view(self, name, shape):
-        view = super()._view(name, shape).view(_Counted)
-        self._views[name, shape] = view
-        return view
-
-
-def elements_per_polygon(function, count):
-    """Array elements written per polygon, and calls of ufuncs, by function(scratch)."""
-    _Counted.elements = _Counted.calls = 0
-    function(CountingScratch())
-    return _Counted.elements / count, _Counted.calls
+def run(*command) -> Usage:
+    """Run Python with these words to the end. Raises RuntimeError with what it says."""
+    # Without compiled modules on disk, every Blender would compile those that it imports; an installed one has them.
+    variables = {key: value for key, value in os.environ.items() if key != "PYTHONDONTWRITEBYTECODE"}
+    start, own = time.perf_counter(), 0.0
+    with tempfile.TemporaryFile() as output:
+        process = subprocess.Popen(
+            [sys.executable, *map(str, command)], cwd=ROOT, env=variables, stdout=output, stderr=output
+        )
+        while not (ended := os.wait4(process.pid, os.WNOHANG))[0]:
+            own = max(own, resident(process.pid, "VmHWM"))
+            time.sleep(0.01)
+        process.returncode, usage = os.waitstatus_to_exitcode(ended[1]), ended[2]
+        if process.returncode:
+            output.seek(0)
+            raise RuntimeError(f"{command}: {output.read().decode(errors='replace')[-2000:]}")
+    return Usage(time.perf_counter() - start, usage.ru_utime + usage.ru_stime, own, usage.ru_maxrss / 1024.0)

@@ -20,13 +20,11 @@ sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
 import bake_cost  # noqa: E402
 import measure  # noqa: E402
 from bench_scenes import WORLDS, ceiling, floor_scene, metals_of_product, random_polygons, wide_floor, world  # noqa: E402
-from independent import independent_processes  # noqa: E402
 from textbook_ltc import TextbookLtc  # noqa: E402
 from zonal_harmonics import ZonalHarmonics  # noqa: E402
 
 from ltsh_addon import shading  # noqa: E402
 from ltsh_addon.cli.commands import DEMO_SCENE  # noqa: E402
-from ltsh_addon.emitters import light_polygons  # noqa: E402
 from ltsh_addon.lobes import edge_integrals, moments32  # noqa: E402
 from ltsh_addon.lobes.polygon import project_to_sphere, split_at_horizon  # noqa: E402
 from ltsh_addon.scene import EllipseLight, PolygonLight  # noqa: E402
@@ -163,35 +161,6 @@ def in_one_row(samples, lights, table, **options):
     return shading.shade(samples, lights, table, **options)
 
 
-def bounds(options):
-    """What bounds the ratios: numpy writes every intermediate result, so that elements written are time."""
-    heading(f"elements that numpy writes per rectangle and light (chunks of {CHUNK})")
-    _, _, vertices = random_polygons(CHUNK, "whole")
-    corners = np.ascontiguousarray(vertices.transpose(2, 1, 0))
-    kernels = {"ltc: integral": lambda scratch: moments32.cosine_integral(corners, scratch)}
-    for degree in (2, 4):
-        kernels[f"N={degree}: moments"] = lambda scratch, d=degree: moments32.moments(corners, d, scratch)
-    work, out = (np.ones((4, CHUNK), np.float32) for _ in range(2))
-    per_element = timed(repeated, partial(np.multiply, work, work, out=out), 200) / 200 / work.size
-    scratch = moments32.Scratch()
-    cases = {name: partial(repeated, partial(kernel, scratch), 10) for name, kernel in kernels.items()}
-    times = measure.interleaved(cases)
-    base = None
-    for name, kernel in kernels.items():
-        elements, calls = measure.elements_per_polygon(kernel, CHUNK)
-        base = base or elements
-        print(f"  {name:<18}{elements:>7.0f} elements{elements / base:>6.2f} x, {calls:>3} calls;"
-              f" at {per_element * 1e9:.3f} ns each {elements * per_element * 1e9:>6.1f} ns;"
-              f" measured {times[name] / 10 / CHUNK * 1e9:.1f} ns")  # fmt: skip
-    light = floor_scene(8, 1)[1][0]
-    rows = np.ones((3, 3, CHUNK), np.float32)
-    offset = np.ones((3, CHUNK), np.float32)
-    elements, calls = measure.elements_per_polygon(
-        lambda scratch: light_polygons.local_corners(light, light.polygon(), offset, rows, scratch), CHUNK
-    )
-    print(f"  {'corners of a light':<18}{elements:>7.0f} elements, {calls} calls, the same for all techniques")
-
-
 def growth(options):
     """How time grows with edges, lights, degree and samples."""
     count = 10_000 if options.quick else 40_000
@@ -229,13 +198,12 @@ def repeated(function, count):
 
 
 def processes(options):
-    """One and two processes, beside two that share nothing, and peak memory."""
+    """One and two processes, and peak memory."""
     count = 300_000 if options.quick else 2_000_000
     samples, lights = floor_scene(count, 8, "schlick")
     for name in ("ltc", "ltsh4"):
         heading(f"processes: {name}, Schlick, {count} samples, 8 lights")
-        with independent_processes(2, name, count, 8, "schlick") as two_apart:
-            speed_up(name, samples, lights, two_apart)
+        speed_up(name, samples, lights)
     sizes = (500_000, 2_000_000, *((8_294_400,) if options.large else ()))
     heading("peak memory beyond the samples: ltsh4, both passes, 8 lights, 1 and 2 processes")
     for size in sizes[: 1 if options.quick else None]:
@@ -243,8 +211,8 @@ def processes(options):
         subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parent, check=True, timeout=600)
 
 
-def speed_up(name, samples, lights, two_apart):
-    """Print what two workers gain over one, and what bounds it: two processes at once that do all of the work each."""
+def speed_up(name, samples, lights):
+    """Print what two workers gain over one."""
     found, cpu = {}, {}
 
     def run(number):
@@ -252,14 +220,13 @@ def speed_up(name, samples, lights, two_apart):
         found[number] = in_one_row(samples, lights, TABLES[name], workers=number).specular
         cpu[number] = cpu_seconds() - before
 
-    cases = {"1 process": partial(run, 1), "2 processes": partial(run, 2), "2 apart, all the work each": two_apart}
+    cases = {"1 process": partial(run, 1), "2 processes": partial(run, 2)}
     medians, ratio = measure.ratios(cases, "1 process", 3)
     for case, seconds in medians.items():
         row(case, seconds / len(samples) / 8 * 1e9, note=f"{seconds:.2f} s")
-    reached, possible = 1.0 / ratio["2 processes"], 2.0 / ratio["2 apart, all the work each"]
+    reached = 1.0 / ratio["2 processes"]
     same = np.array_equal(found[1], found[2])
     print(f"  speed-up, target 1.8: {reached:.2f} at a load of {os.getloadavg()[0]:.1f}; same bits: {same}")
-    print(f"  what the machine allows now, by two processes that share nothing: {possible:.2f}")
     print(f"  processor time of two against one: {cpu[2] / cpu[1]:.2f}")
 
 
@@ -352,7 +319,6 @@ SECTIONS = {
     "lights": light_kinds,
     "worlds": worlds,
     "many": many_lights,
-    "bounds": bounds,
     "growth": growth,
     "processes": processes,
     "cycles": cycles,

@@ -1,17 +1,13 @@
-"""Shadows beside Cycles: errors, time at equal error, rays per second, memory; part of `make bench`, needs bpy.
+"""Shadows beside Cycles: errors, rays per second, memory; part of `make bench`, needs bpy.
 
-python tests/benchmarks/shadows.py [SCENE ...] [--size WxH] [--cycles-samples N] [--most-rays N] [--pictures FOLDER]
+python tests/benchmarks/shadows.py [SCENE ...] [--size WxH] [--cycles-samples N] [--most-rays N]
 
 Errors are noise-cancelled: against two halves of Cycles, and two runs of our own that share no random number, so that
 neither noise counts. Times are processor time, that of child processes and of starting them included.
 """
 
 import argparse
-import json
 import math
-import os
-import shutil
-import subprocess
 import sys
 import tempfile
 import time
@@ -30,23 +26,18 @@ from surface_scenes import shifted  # noqa: E402
 from ltsh_addon import imaging, shading, visibility  # noqa: E402
 from ltsh_addon.blender.process.blender_process import embree_libraries  # noqa: E402
 from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels  # noqa: E402
-from ltsh_addon.cli.commands import DEMO_SCENE  # noqa: E402
 from ltsh_addon.pipeline import lighting  # noqa: E402
 from ltsh_addon.pipeline.options import PictureOptions  # noqa: E402
 from ltsh_addon.scene import PASSES  # noqa: E402
-from ltsh_addon.workers.pool import CORES_VARIABLE, cores  # noqa: E402
 
-NAMES = ("contact", "soft", "highlight", "window", "leaves", "demo")
+NAMES = ("contact", "highlight", "leaves", "arcade")
 # Of the error without the noise of Cycles and our own.
 MOST_BIAS = {"specular": 0.02, "diffuse": 0.005}
-# Of the error of Cycles in the same time.
-MOST_OF_CYCLES = 0.5
-RAYS_PER_SECOND, MOST_NUMPY, LEAST_SPEED_UP = 4e6, 2.0, 1.5
+RAYS_PER_SECOND, MOST_NUMPY = 4e6, 2.0
 # The most that a pair of a sample and a light may take: few, as by default, and many.
 FEW, DEFAULT, MANY = 16, PictureOptions.shadow_rays, 512
 # Moves everything, so that the rays of each sample are other ones.
 SHIFT = np.array([0.0625, 0.03125, 0.046875])
-CALIBRATION = (4, 32)
 
 
 @dataclass(frozen=True)
@@ -57,7 +48,6 @@ class Settings:
     cycles_samples: int = 1024
     most_rays: int = MANY
     rays: int = DEFAULT
-    pictures: Path | None = None
 
     @property
     def resolution(self):
@@ -66,88 +56,6 @@ class Settings:
 
 QUICK = Settings(size=(128, 72), cycles_samples=128, most_rays=256)
 LARGE = Settings(size=(640, 360), cycles_samples=4096, most_rays=1024)
-
-
-# Processes:
-
-
-@dataclass(frozen=True)
-class Usage:
-    """Of a process and all that it has started: seconds, processor seconds; MiB at the peak of the process itself, and
-    of the largest of all."""
-
-    seconds: float
-    processor: float
-    own_peak: float
-    peak: float
-
-
-def run(command, cores_used=None) -> Usage:
-    """Run to the end, on all cores or some. Raises CalledProcessError."""
-    environment = dict(os.environ)
-    pin = None
-    if cores_used is not None:
-        environment[CORES_VARIABLE] = str(cores_used)
-        chosen = sorted(os.sched_getaffinity(0))[:cores_used]
-
-        def pin():
-            os.sched_setaffinity(0, chosen)
-
-    start, own = time.perf_counter(), 0.0
-    with tempfile.TemporaryFile() as output:
-        process = subprocess.Popen(
-            list(map(str, command)), cwd=ROOT, env=environment, stdout=output, stderr=output, preexec_fn=pin
-        )
-        while True:
-            pid, status, usage = os.wait4(process.pid, os.WNOHANG)
-            if pid:
-                break
-            own = max(own, measure.resident(process.pid, "VmHWM"))
-            time.sleep(0.01)
-        process.returncode = os.waitstatus_to_exitcode(status)
-        if process.returncode:
-            output.seek(0)
-            raise subprocess.CalledProcessError(process.returncode, command, output.read()[-2000:])
-    seconds = time.perf_counter() - start
-    return Usage(seconds, usage.ru_utime + usage.ru_stime, own, usage.ru_maxrss / 1024.0)
-
-
-def shade(scene, output, settings, *more, **options) -> Usage:
-    """What `ltsh shade` takes."""
-    command = [sys.executable, "-m", "ltsh_addon", "shade", scene, "-o", output, "--techniques", "ltsh4", "--quiet"]
-    return run([*command, "--resolution", settings.resolution, *more], **options)
-
-
-def cycles(scene, output, settings, samples, denoised) -> Usage:
-    """What it takes Cycles to render direct light, as the comparison does, and to denoise it."""
-    command = [sys.executable, __file__, "--render", output, "--size", settings.resolution]
-    return run([*command, "--cycles-samples", samples, *(["--denoise"] if denoised else []), scene])
-
-
-def render(scene_path, output, size, samples, denoise):
-    """In a process of its own: what `cycles` measures."""
-    import bpy
-
-    from ltsh_addon.blender import render_settings
-
-    bpy.ops.wm.open_mainfile(filepath=str(scene_path))
-    scene = bpy.context.scene
-    camera = render_settings.choose_camera(scene, None)
-    layer = render_settings.choose_view_layer(scene, [])
-    render_settings.neutralize(scene, layer, camera, [])
-    render_settings.set_resolution(scene, *size)
-    render_settings.enable_passes(layer, ("combined",))
-    scene.cycles.samples, scene.cycles.seed = samples, 3
-    scene.cycles.use_denoising, scene.cycles.denoiser = denoise, "OPENIMAGEDENOISE"
-    with render_settings.pinned_pixel_filter(scene):
-        render_settings.render_exr(scene, output)
-
-
-def rendered(path) -> np.ndarray:
-    """The combined pass (H, W, 3) of a file that `render` wrote."""
-    channels = imaging.read_channels(path)
-    names = [next(name for name in channels if name.endswith(f"Combined.{letter}")) for letter in "RGB"]
-    return np.stack([channels[name] for name in names], axis=-1).astype(np.float64)
 
 
 # Errors:
@@ -163,11 +71,6 @@ class Error:
 
     def __str__(self):
         return f"{self.estimate:6.2%} (< {self.limit:.2%})"
-
-    @property
-    def figure(self) -> float:
-        """The estimate, or what it is below where nothing but noise is seen."""
-        return self.estimate or self.limit
 
 
 def unbiased(first, second, halves, mask) -> Error:
@@ -259,7 +162,7 @@ class Measured:
 
 
 def errors(scene: Measured):
-    """Print the errors by pass; the pictures with most rays, the mean of both."""
+    """Print the errors by pass."""
     most, few, default = scene.settings.most_rays, FEW, scene.settings.rays
     runs = {rays: scene.pictures(rays) for rays in sorted({few, default, most})}
     counts = [f"bias at {most} rays (limit)", *(f"{rays}: bias (limit), noise, told" for rays in (default, few))]
@@ -285,51 +188,6 @@ def errors(scene: Measured):
     brighter = sum((image > scene.unshadowed[name] * (1.0 + 1e-5)).sum() for name, image in every)
     finite = all(np.isfinite(image).all() for _, image in every)
     print(f"    values above the unshadowed picture: {brighter}; all finite: {finite}")
-    first, second = runs[most][0]
-    return {name: 0.5 * (first[name] + second[name]) for name in PASSES}
-
-
-# Equal time:
-
-
-def equal_time(scene: Measured, path, folder):
-    """Print our error and those of Cycles in the same processor time; the pictures by label."""
-    settings, rays = scene.settings, ("--shadow-rays", scene.settings.rays)
-    ours = shade(path, folder / "ours", settings, *rays)
-    line, counts = {}, {}
-    for denoised in (False, True):
-        low, high = (cycles(path, folder / "c.exr", settings, count, denoised).processor for count in CALIBRATION)
-        slope = max((high - low) / (CALIBRATION[1] - CALIBRATION[0]), 1e-6)
-        line[denoised] = low - slope * CALIBRATION[0], slope
-    ours = [ours, shade(path, folder / "ours", settings, *rays)]
-    seconds = np.median([usage.processor for usage in ours])
-    images, found = {}, {}
-    layers = imaging.read_layers(folder / "ours" / "shade.exr")
-    images["LTSH"] = sum(layers[f"ltsh4.{name}"].astype(np.float64) for name in PASSES)
-    for denoised in (False, True):
-        fixed, slope = line[denoised]
-        counts[denoised] = max(1, round((seconds - fixed) / slope))
-        took = cycles(path, folder / "c.exr", settings, counts[denoised], denoised).processor
-        label = "Cycles and OIDN" if denoised else "Cycles"
-        images[label] = rendered(folder / "c.exr")
-        found[label] = scene.error(images[label]).figure
-        print(f"    {label:<16}{found[label]:>8.2%}  {counts[denoised]:>5} samples, {took:.2f} s,"
-              f" of which {fixed:.2f} s whatever their number")  # fmt: skip
-    error = scene.error(images["LTSH"]).figure
-    ratio = error / min(found.values())
-    verdict = "" if ratio <= MOST_OF_CYCLES else "  MISSED"
-    stages = json.loads((folder / "ours" / "timing.json").read_text())["seconds"]
-    parts = ", ".join(f"{name} {stages[name]:.2f} s" for name in ("start", "samples", "shadows", "total"))
-    print(f"    {'LTSH':<16}{error:>8.2%}  {settings.rays:>5} rays,    {seconds:.2f} s; wall: {parts}")
-    print(f"    LTSH against the better: {ratio:.2f} (target {MOST_OF_CYCLES}){verdict}")
-    many = shade(path, folder / "many", settings, "--shadow-rays", MANY).processor
-    layers = imaging.read_layers(folder / "many" / "shade.exr")
-    error = scene.error(sum(layers[f"ltsh4.{name}"].astype(np.float64) for name in PASSES)).figure
-    print(
-        f"    {'LTSH':<16}{error:>8.2%}  {MANY:>5} rays,    {many:.2f} s, {many / seconds:.2f} times as long; "
-        f"against the better {error / min(found.values()):.2f}"
-    )
-    return images
 
 
 # Cost:
@@ -417,82 +275,23 @@ def ray_counts(scene: Measured):
           f"{(t2 - t1) / (n2 - n1) * 1e6:.3f} from {DEFAULT} to {MANY} (linear: the same)")  # fmt: skip
 
 
-def memory_and_cores(path, folder, settings):
-    """Print peaks for two sizes with and without shadows, and the time with one core and two."""
-    width, height = settings.size
+def memory(path, folder, settings):
+    """Print peaks of `ltsh shade` for two sizes, with and without shadows."""
     for factor in (1, 2):
-        larger = replace(settings, size=(factor * width, factor * height))
-        peaks = [shade(path, folder / "m", larger, "--shadows", way) for way in ("off", "on")]
-        print(f"  {larger.resolution}: peak of our process {peaks[1].own_peak:.0f} MiB, without shadows "
-              f"{peaks[0].own_peak:.0f} MiB; of the largest process {peaks[1].peak:.0f} MiB")  # fmt: skip
-    if cores() < 2:
-        print("  one core only: nothing to say about two")
-        return
-    times, totals = {1: [], 2: []}, {1: [], 2: []}
-    larger = replace(settings, size=(2 * width, 2 * height))
-    for _ in range(2):
-        for number in times:
-            usage = shade(path, folder / "m", larger, "--shadows", "on", cores_used=number)
-            stages = json.loads((folder / "m" / "timing.json").read_text())["seconds"]
-            times[number].append(stages["shadows"])
-            totals[number].append(usage.seconds)
-    gain, whole = (min(found[1]) / min(found[2]) for found in (times, totals))
-    verdict = "" if gain >= LEAST_SPEED_UP else "  MISSED"
-    print(f"  {larger.resolution}: shadows {min(times[1]):.2f} s on one core, {min(times[2]):.2f} s on two: {gain:.2f} "
-          f"times as fast (target {LEAST_SPEED_UP}){verdict}; the whole command {whole:.2f}; load "
-          f"{os.getloadavg()[0]:.1f}")  # fmt: skip
-
-
-# Pictures:
-
-
-def error_sheet(name, scene, ours, folder):
-    """Write NAME_errors.png: signed errors of our picture with most rays, the specular pass above the diffuse one."""
-    sheets = []
-    for part in PASSES:
-        mean = scene.halves[part].mean(axis=0)
-        tile = imaging.Tile(f"LTSH, {scene.settings.most_rays} rays", ours[part], np.where(
-            scene.mask[..., None], ours[part] - mean, 0.0))  # fmt: skip
-        sheets.append(imaging.comparison_sheet(mean, [tile])[0])
-    imaging.write_png(folder / f"{name}_errors.png", np.concatenate(sheets))
-
-
-_GAP = 6
-
-
-def side_by_side(rows, path):
-    """Write pictures (H, W, 3), lists of {label: linear image}, one below the other, each with one exposure."""
-    print(f"  {path.name}, from the left: {', '.join(rows[0])}")
-    columns = []
-    for images in rows:
-        exposure = imaging.exposure_factor(images["Cycles, converged"])
-        tiles = [imaging.to_srgb8(exposure * image) for image in images.values()]
-        gap = np.full((len(tiles[0]), _GAP, 3), 255, np.uint8)
-        columns.append(np.concatenate([part for tile in tiles for part in (tile, gap)][:-1], axis=1))
-    width = columns[0].shape[1]
-    gap = np.full((_GAP, width, 3), 255, np.uint8)
-    picture = np.concatenate([part for row in columns for part in (row, gap)][:-1])
-    # Noise fills the file: two bits less of it are not seen.
-    imaging.write_png(path, picture | 3)
-
-
-def scene_file(name, folder) -> Path:
-    """The file of a scene, built by a process of its own."""
-    path = folder / f"{name}.blend"
-    if name == "demo":
-        shutil.copy(DEMO_SCENE, path)
-    else:
-        run([sys.executable, Path(__file__).with_name("shadow_scenes.py"), name, path])
-    return path
+        size = "x".join(str(factor * length) for length in settings.size)
+        words = "-m", "ltsh_addon", "shade", path, "-o", folder / "m", "--quiet", "--resolution", size, "--shadows"
+        without, peaks = (measure.run(*words, way) for way in ("off", "on"))
+        print(f"  {size}: peak of our process {peaks.own_peak:.0f} MiB, without shadows {without.own_peak:.0f} MiB; of "
+              f"the largest process {peaks.peak:.0f} MiB")  # fmt: skip
 
 
 def report(settings: Settings, names=NAMES):
     """Print all of it."""
-    rows = []
     with tempfile.TemporaryDirectory(prefix="ltsh-bench-") as name:
         folder = Path(name)
         for name in names:
-            start, path = time.perf_counter(), scene_file(name, folder)
+            start, path = time.perf_counter(), folder / f"{name}_0.blend"
+            measure.run(Path(__file__).with_name("finished_scenes.py"), name, folder, 0)
             scene = Measured(path, settings)
             extraction = scene.extraction
             noise = [f"{imaging.reference_noise(*scene.halves[part], scene.mask):.2%} {part}" for part in PASSES]
@@ -500,18 +299,11 @@ def report(settings: Settings, names=NAMES):
             counts += f", {extraction.occluders.triangle_count} triangles"
             print(f"  {name}, {settings.resolution}, {counts}; noise of"
                   f" Cycles, {settings.cycles_samples} samples: {', '.join(noise)}")  # fmt: skip
-            ours = errors(scene)
-            images = equal_time(scene, path, folder)
-            images["Cycles, converged"] = sum(scene.halves.values()).mean(axis=0)
-            rows.append(images)
-            if settings.pictures:
-                error_sheet(name, scene, ours, settings.pictures)
+            errors(scene)
             print(f"    {time.perf_counter() - start:.0f} s", flush=True)
-        if settings.pictures:
-            side_by_side(rows, settings.pictures / "shadows.png")
         print(f"  cost, scene {name}")
         ray_counts(scene)
-        memory_and_cores(path, folder, settings)
+        memory(path, folder, settings)
     ray_speed()
 
 
@@ -520,21 +312,13 @@ def main():
     parser.add_argument("scenes", nargs="*", metavar="SCENE", help=f"default: {', '.join(NAMES)}")
     parser.add_argument("--size", default=Settings().resolution)
     parser.add_argument("--cycles-samples", type=int, default=Settings.cycles_samples)
-    parser.add_argument("--rays", type=int, default=DEFAULT, help="of the comparison at equal time")
+    parser.add_argument("--rays", type=int, default=DEFAULT, help="of a pair of a sample and a light")
     parser.add_argument("--most-rays", type=int, default=Settings.most_rays, help="where our noise is to vanish")
-    parser.add_argument("--pictures", type=Path, metavar="FOLDER", help="write signed errors, and all side by side")
-    parser.add_argument("--render", type=Path, help=argparse.SUPPRESS)
-    parser.add_argument("--denoise", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
     size = tuple(map(int, options.size.split("x")))
-    if options.render:
-        render(options.scenes[0], options.render, size, options.cycles_samples, options.denoise)
-        return
     if unknown := set(options.scenes) - set(NAMES):
         parser.error(f"unknown scenes {', '.join(sorted(unknown))}; expected some of {', '.join(NAMES)}")
-    if options.pictures:
-        options.pictures.mkdir(parents=True, exist_ok=True)
-    settings = Settings(size, options.cycles_samples, options.most_rays, options.rays, options.pictures)
+    settings = Settings(size, options.cycles_samples, options.most_rays, options.rays)
     report(settings, options.scenes or NAMES)
 
 

@@ -10,8 +10,7 @@ from surface_scenes import single_sample
 
 from ltsh_addon.cycles import gbuffer
 from ltsh_addon.cycles.gbuffer import FinerPoints, finer, merged
-from ltsh_addon.scene import Film, QuadLight, SurfaceSamples
-from ltsh_addon.shading import shade
+from ltsh_addon.scene import Film, SurfaceSamples
 
 POINTS, SIDE = 8, 4
 
@@ -49,17 +48,6 @@ def test_colors_keep_their_mean(seed, bend, step):
     samples, film = hits(seed, bend, step)
     found, small = gbuffer.merged(samples, film)
     np.testing.assert_allclose(small.image(found.diffuse_albedo), film.image(samples.diffuse_albedo), atol=1e-12)
-
-
-def test_the_picture_stays_what_it_was_where_light_is_smooth():
-    samples, film = hits(3, step=0.5)
-    samples = replace(samples, diffuse_albedo=np.full((len(samples), 3), 0.5))
-    x, y, z = np.eye(3)
-    light = QuadLight("Key", np.array([0.2, 0.2, 3.0]), x, y, -z, np.ones(3))
-    found, small = gbuffer.merged(samples, film)
-    whole, less = (shade(part, [light], "ltc").combined for part in (samples, found))
-    # The floor's light changes by a few percent over a pixel.
-    np.testing.assert_allclose(small.image(less), film.image(whole), rtol=0.05)
 
 
 def test_lobes_of_one_hit_stay_together():

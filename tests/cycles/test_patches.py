@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from ltsh_addon.cycles.patches import (
-    CUTS,
     ERROR,
     GRID,
     clip_to_cell,
@@ -75,22 +74,6 @@ def test_dark_patches_are_left_out_and_a_dark_image_has_none():
     assert cut_into_patches(image, everywhere(image)).whole is None
     image[:32] = 1.0
     assert [patch.cell for patch in cut_into_patches(image, everywhere(image)).smallest] == [(-1.0, 1.0, 0.0, 1.0)]
-
-
-def test_a_patch_that_was_cut_has_the_mean_of_its_parts():
-    image = np.random.default_rng(4).random((64, 64, 3)) ** 2
-    open_patches, seen = [cut_into_patches(image, everywhere(image), most=300).whole], 0
-    while open_patches:
-        patch = open_patches.pop()
-        areas = [(part.cell[1] - part.cell[0]) * (part.cell[3] - part.cell[2]) for part in patch.parts]
-        if patch.parts:
-            assert len(areas) <= 2**CUTS
-            assert np.allclose(
-                np.average([part.radiance for part in patch.parts], axis=0, weights=areas), patch.radiance
-            )
-            seen += 1
-        open_patches += patch.parts
-    assert seen > 300 / 2**CUTS
 
 
 def test_clipping_to_the_cells_of_a_grid_loses_no_area():

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ltsh_addon.cycles import planar_polygons
-from ltsh_addon.cycles.planar_polygons import flat_polygons, hides_itself, is_closed, is_inside, signed_volume
+from ltsh_addon.cycles.planar_polygons import flat_polygons, is_closed, is_inside, signed_volume
 
 CUBE = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
 CUBE_QUADS = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
@@ -139,18 +139,3 @@ def test_volume_tells_the_side_and_the_solid_angle_the_inside():
     for point, inside in (((0.9, 0.1, 0.5), True), ((1.1, 0.1, 0.5), False), ((-4.0, 9.0, 2.0), False)):
         assert is_inside(np.array(point), CUBE, CUBE_TRIANGLES) == inside
         assert is_inside(np.array(point), CUBE, CUBE_TRIANGLES[:, ::-1]) == inside
-
-
-def test_what_can_hide_itself():
-    assert not hides_itself(CUBE, CUBE_TRIANGLES, True)
-    assert not hides_itself(CUBE, CUBE_TRIANGLES[:, ::-1], True)
-    # A lid taken off: an open surface that bends.
-    assert hides_itself(CUBE, CUBE_TRIANGLES[2:], False)
-    flat, triangles = grid(3, 3)
-    assert not hides_itself(flat, triangles, False)
-    # Two flat islands are two lamps that may stand in each other's light like any others.
-    both = np.concatenate([flat, flat + (0.0, 0.0, 1.0)])
-    assert not hides_itself(both, np.concatenate([triangles, triangles + len(flat)]), False)
-    dented = CUBE.copy()
-    dented[7] = 0.4
-    assert hides_itself(dented, CUBE_TRIANGLES, True)

@@ -15,7 +15,6 @@ from ltsh_addon.shading import float32, integrator
 
 # What the lights of a tree may be off together; degree 4 is itself off by ten times as much.
 OFF = 3e-3
-BALL = np.array([0.0, 0.0, 4.0])
 
 
 def many_lights(count, seed=1, **options):
@@ -47,13 +46,6 @@ def floor_samples(count, lowest_roughness, seed=2):
 
 def relative_error(found, expected):
     return np.linalg.norm(found - expected) / np.linalg.norm(expected)
-
-
-def test_diffuse_light_of_many_is_that_of_each():
-    samples, lights = floor_samples(600, 0.3), many_lights(500)
-    found = shading.shade(samples, lights, "ltsh4", passes=["diffuse"], workers=1).diffuse
-    expected = shading.shade(samples, lights, "ltsh4", passes=["diffuse"], workers=1, dtype=np.float64).diffuse
-    assert relative_error(found, expected) < OFF
 
 
 @pytest.mark.parametrize("name", shading.PASSES)
@@ -90,15 +82,6 @@ def test_specular_light_of_many_is_closer_to_the_truth_than_that_of_each(name, l
     found = shading.shade(samples, lights, name, passes=["specular"], workers=1).specular
     each = shading.shade(samples, lights, name, passes=["specular"], workers=1, dtype=np.float64).specular
     assert relative_error(found, truth) < relative_error(each, truth) + OFF
-
-
-@pytest.mark.parametrize("name", shading.SHIPPED_TABLES)
-def test_every_technique_takes_many_lights(name):
-    """With all Fresnel terms, of which each has its own integral."""
-    samples, lights = floor_samples(100, 0.3), many_lights(100)
-    found = shading.shade(samples, lights, name, passes=["specular"], workers=1).specular
-    expected = shading.shade(samples, lights, name, passes=["specular"], workers=1, dtype=np.float64).specular
-    assert relative_error(found, expected) < 0.02
 
 
 def smooth_samples(side):
@@ -208,21 +191,6 @@ def test_cubics_of_two_coordinates_are_interpolated_and_nothing_else():
         assert not tiles.TileCubics.of(parts, keys, u[None]).are_smooth.any()
 
 
-@pytest.mark.parametrize("name", shading.SHIPPED_TABLES)
-def test_a_ball_of_many_faces_shines_as_the_ball(name):
-    """Unit radiance; half of the faces look away. Diffuse: cos r^2 / d^2 of the whole ball above the horizon."""
-    ball, samples = _ball_of_faces(24), floor_samples(200, 0.3)
-    up = np.broadcast_to([0.0, 0.0, 1.0], (200, 3))
-    samples = replace(samples, diffuse_normal=up, smooth_normal=up, diffuse_albedo=np.ones((200, 3)))
-    found = shading.shade(samples, ball, name, passes=["diffuse"], workers=1).diffuse[0, :, 0]
-    offset = BALL - samples.position
-    distance = np.linalg.norm(offset, axis=1)
-    area = sum(np.linalg.norm(light.area_vector) for light in ball)
-    expected = offset[:, 2] / distance * area / (4.0 * np.pi * distance**2)
-    # The faces are flat: their silhouette differs from that of the ball of their area by less than 1 %.
-    assert relative_error(found, expected) < 0.01
-
-
 def test_a_ring_of_many_faces_shines_as_its_faces():
     """Faces that turn around one axis do not look along it: 2.7 % off where they count as turning all ways. Three times
     OFF: within a node, those that face a point count as no nearer to it than the others."""
@@ -240,31 +208,6 @@ def test_a_ring_of_many_faces_shines_as_its_faces():
     found = shading.shade(samples, lights, "ltsh4", **options).diffuse[:, some]
     expected = shading.shade(samples.take(some), lights, "ltsh4", dtype=np.float64, **options).diffuse
     assert relative_error(found, expected) < 3.0 * OFF
-
-
-def _ball_of_faces(rings):
-    polar = np.linspace(0.0, np.pi, rings + 1)
-    around = np.linspace(0.0, 2.0 * np.pi, 2 * rings + 1)
-    corners = np.stack([
-        np.sin(polar)[:, None] * np.cos(around), np.sin(polar)[:, None] * np.sin(around),
-        np.cos(polar)[:, None] + 0.0 * around,
-    ], axis=-1)  # fmt: skip
-    lights = []
-    for row in range(rings):
-        for column in range(2 * rings):
-            quad = corners[[row, row + 1, row + 1, row], [column, column, column + 1, column + 1]]
-            quad = np.unique(quad.round(12), axis=0) if row in (0, rings - 1) else quad
-            if len(quad) == 3 or row not in (0, rings - 1):
-                direction = unit(quad.mean(axis=0))
-                u = 0.1 * unit(np.cross(direction, [0.3, 1.0, 0.2]))
-                flat = quad - ((quad - quad.mean(axis=0)) @ direction)[:, None] * direction + BALL
-                lights.append(
-                    area_light(
-                        "Ball", "POLYGON", flat.mean(axis=0), u, np.cross(direction, u), direction=direction,
-                        corners=flat, radiance=np.ones(3),
-                    )
-                )  # fmt: skip
-    return lights
 
 
 def test_rows_receivers_and_black_lights_are_kept_apart():

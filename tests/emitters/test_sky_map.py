@@ -102,21 +102,6 @@ def test_all_diffuse_lobes_reflect_a_sky_as_its_patches_do(field):
     assert abs(found.sum() / expected.sum() - 1.0) < (5e-3 if field == "velvet" else 3e-3)
 
 
-def test_mirrors_reflect_a_sky():
-    """A lobe without width meets the smallest patches, which have no parts; in single precision smooth ones."""
-    samples = random_samples(60, seed=2)
-    samples = replace(samples, roughness=np.zeros(len(samples)))
-    lights, _ = sky_lights(LIKE, pictures())
-    leaves = [leaf for light in lights for leaf in light.leaves]
-    found, expected = (
-        shade(samples, given, "ltsh4", passes=("specular",), workers=1).specular.sum(axis=0)
-        for given in (lights, leaves)
-    )
-    assert np.linalg.norm(expected) > 1.0
-    # Edges of the windows are an eighth of a window wide.
-    assert np.linalg.norm(found - expected) < 0.08 * np.linalg.norm(expected)
-
-
 def test_sharp_reflections_show_a_smooth_sky_without_facets():
     """A mirror turns by 60 degrees: what it shows is what the picture has there, and no step of a patch."""
     taken = [

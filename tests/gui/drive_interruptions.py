@@ -1,11 +1,10 @@
-"""What comes in between: undo, Escape and another file during the preview, F12, a bake and in the light mixer."""
+"""What comes in between: undo, Escape and another file during the preview, F12 and a bake."""
 
 from pathlib import Path
 
 import bpy
 import eyes
 import hands
-import numpy as np
 
 SIZE = "1280x900"
 SECONDS = 1800
@@ -21,7 +20,6 @@ def main(rig):
     yield from during_the_preview(rig, other)
     yield from during_a_render(rig, other)
     yield from during_a_bake(rig, other)
-    yield from in_the_mixer(rig, other)
     rig.shot("7_end.png")
 
 
@@ -166,35 +164,3 @@ def during_a_bake(rig, other):
             yield from opened(rig, other)
             rig.check(hands.job() is None and job.cancelled, "another file ends it")
         yield from gone(rig, job.folder, f"of the bake, after {what}")
-
-
-def in_the_mixer(rig, other):
-    """Undo of a mixed value, and another file while a mix is shown."""
-    settings = hands.settings()
-    settings.anti_aliasing, settings.resolution_percentage = 1, 40
-    hands.operate(rig, bpy.ops.ltsh.shade, "INVOKE_DEFAULT")
-    yield from hands.job_started(rig, "shading starts")
-    yield from hands.wait_for_job(rig, 600)
-    yield 1
-    settings = hands.settings()
-    rig.check(len(settings.mixed) > 1, "the mixer has lights")
-    hands.operate(rig, bpy.ops.ed.undo_push, message="Shaded")
-    settings.mixed[0].power = 3.0
-    hands.operate(rig, bpy.ops.ed.undo_push, message="Brighter")
-    brighter = np.array(hands.image_pixels("LTSH Comparison"))
-    settings.mixed[0].muted = True
-    hands.operate(rig, bpy.ops.ed.undo_push, message="Muted")
-    yield 1
-    muted = np.array(hands.image_pixels("LTSH Comparison"))
-    rig.check(np.abs(brighter - muted).max() > 1e-3, "muting changes the picture")
-    rig.shot("5_mixed.png")
-    yield from typed(rig, "ctrl+z")
-    yield 1
-    rig.check(not hands.settings().mixed[0].muted, "undo unmutes")
-    rig.check(np.allclose(hands.image_pixels("LTSH Comparison"), brighter, atol=1e-5), "and the picture follows")
-    yield from typed(rig, "ctrl+shift+z")
-    yield 1
-    rig.check(np.allclose(hands.image_pixels("LTSH Comparison"), muted, atol=1e-5), "redo mutes, and so it does again")
-    yield from opened(rig, other)
-    rig.check("LTSH Comparison" not in bpy.data.images and not hands.settings().mixed, "another file has no mix")
-    rig.shot("6_opened.png")

@@ -23,7 +23,6 @@ class Runs:
 
     def __init__(self, temporary: Path):
         self.temporary = temporary
-        self.slowest_end = 0.0  # seconds from a signal to the end of the process
         temporary.mkdir(parents=True)
 
     def start(self, command: list[str], **options) -> subprocess.Popen:
@@ -55,9 +54,7 @@ class Runs:
             while process.poll() is None:
                 if moment():
                     process.send_signal(number)
-                    start = time.monotonic()
                     process.wait(PATIENCE)
-                    self.slowest_end = max(self.slowest_end, time.monotonic() - start)
                     return True
                 time.sleep(0.001)
             return False

@@ -126,6 +126,44 @@ def radiance(samples, lights, brdf, count=64, weight=None) -> np.ndarray:
     return total
 
 
+def fujii_slope(cosine):
+    """G of Fujii's model, as OpenPBR has it."""
+    theta = np.arccos(cosine)
+    sine = np.sin(theta)
+    return sine * (theta - 2 / 3 - sine * cosine) + 2 / 3 * np.tan(theta) * (1.0 - sine**3)
+
+
+def rough(directions, normal, view, sigma):
+    """Fujii's BRDF of one point times the cosine for `directions` (..., 3): what it reflects at once, and again for
+    each unit of its rebound."""
+    z, cosine = np.clip(directions @ normal, 0.0, 1.0), normal @ view
+    a = 1.0 / (np.pi + sigma * (np.pi / 2 - 2 / 3))
+    t = directions @ view - z * cosine
+    t = np.where(t > 0.0, t / np.maximum(z, cosine), t)
+    return z * (a + sigma * a * t), z * (1.0 - np.pi * a - sigma * a * fujii_slope(np.maximum(z, 1e-9)))
+
+
+def velvet(directions, normal, view, sigma):
+    """Ashikhmin's BRDF of one point times the cosine for `directions` (..., 3), as its authors wrote it down."""
+    half = directions + view
+    up = half @ normal / np.linalg.norm(half, axis=-1)
+    cosines, seen, flat = directions @ normal, normal @ view, 1.0 - up**2
+    density = np.exp(-(up**2) / (flat * sigma**2)) / (np.pi * sigma**2 * flat**2)
+    masked = np.minimum(1.0, 2.0 * up * np.minimum(cosines, seen) * np.linalg.norm(half, axis=-1) / (half @ view))
+    return np.where(cosines > 0.0, density * masked / (4.0 * seen), 0.0)
+
+
+def reflected(samples, light, brdf, count=96):
+    """Reflected radiance (P, 3) without the albedo; `brdf(directions (S, 3), number)` (S, ...) of each point."""
+    (centers, area), total = patches_of(light, count), []
+    for number, position in enumerate(samples.position):
+        offset = centers - position
+        distance = np.linalg.norm(offset, axis=1)[:, None]
+        weight = area * np.maximum(-(offset @ light.direction), 0.0) / distance[:, 0] ** 3
+        total.append(weight @ brdf(offset / distance, number))
+    return np.reshape(total, (len(samples), -1)) * light.radiance
+
+
 def relative_l2(image, halves) -> float:
     """Relative L2 distance of `image` (P, 3) from the mean of two `halves` (2, P, 3), their own noise removed."""
     squared = np.sum((image - halves[0]) * (image - halves[1])) / np.sum(halves[0] * halves[1])

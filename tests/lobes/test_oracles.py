@@ -1,7 +1,6 @@
 """The oracles of this folder, checked where the answer is known in closed form."""
 
 import numpy as np
-import polar_quadrature
 import polygon_quadrature
 import pytest
 import textbook
@@ -20,48 +19,6 @@ def test_quadrature_over_an_octant_is_exact_for_any_apex(apex):
     expected = [np.pi / 2.0, np.pi / 4.0, np.pi / 6.0, 1.0 / 3.0]
     assert polygon_quadrature.integral(OCTANT, powers, apex) == pytest.approx(expected, abs=1e-13)
     assert polygon_quadrature.integral(OCTANT[::-1], powers, apex) == pytest.approx(-np.array(expected), abs=1e-13)
-
-
-def test_polar_quadrature_over_an_octant_is_exact():
-    """Also of its half above the horizon when it is turned about y, and of what is left around the nadir: nothing."""
-    expected = [np.pi / 2.0, np.pi / 4.0, np.pi / 6.0, 1.0 / 3.0]
-    half = np.sqrt(0.5)
-    turn = np.array([[half, 0.0, half], [0.0, 1.0, 0.0], [-half, 0.0, half]])
-    for power, value in enumerate(expected):
-
-        def function(directions, power=power):
-            return powers(directions)[power]
-
-        for sign, corners in ((1.0, OCTANT), (-1.0, OCTANT[::-1])):
-            assert polar_quadrature.integrate(corners[None], function)[0] == pytest.approx(sign * value, abs=1e-13)
-        square = np.array([[1.0, 1, -1], [-1, 1, -1], [-1, -1, -1], [1, -1, -1]])
-        assert abs(polar_quadrature.integrate(square[None], function)[0]) < 1e-13
-        whole = 2.0 * np.pi / (1.0, 2.0, 3.0, np.inf)[power]
-        big = square * np.array([1e3, 1e3, -1e-3])
-        # The square hides all but a rim of about 1e-6 rad.
-        assert polar_quadrature.integrate(big[None], function)[0] == pytest.approx(whole, abs=1e-4)
-    upper = polar_quadrature.integrate((OCTANT @ turn.T)[None], lambda directions: np.ones(directions.shape[:2]))[0]
-    # Turned by 45 degrees, the horizon cuts the octant through y and the middle of the opposite arc: in halves.
-    assert upper == pytest.approx(np.pi / 4.0, abs=1e-13)
-
-
-def test_polar_quadrature_is_the_other_one_on_cut_polygons():
-    """Random squares, most of them across the horizon, against fans of triangles of what is above."""
-    generator = np.random.default_rng(4)
-    polygons = generator.normal(size=(60, 1, 3)) + np.array([0.0, 0.0, 0.3])
-    u = generator.normal(size=(60, 3))
-    v = np.cross(u, generator.normal(size=(60, 3)))
-    polygons = polygons + np.stack([-u - v, u - v, u + v, v - u], axis=1)
-    found = polar_quadrature.integrate(polygons, lambda directions: powers(directions)[3])
-    compared = 0
-    for polygon, value in zip(polygons, found, strict=True):
-        kept = polygon_quadrature.above_horizon(polygon)
-        # The other one is exact where no edge passes by the point closely.
-        if len(kept) and np.linalg.norm(kept, axis=1).min() > 0.3 and abs(np.linalg.det(polygon[:3])) > 1.0:
-            expected = polygon_quadrature.integral(kept, lambda directions: powers(directions)[3], order=24)
-            assert value == pytest.approx(expected, abs=1e-7)
-            compared += 1
-    assert compared > 10
 
 
 def test_adaptive_quadrature_meets_its_bound_on_a_narrow_peak():

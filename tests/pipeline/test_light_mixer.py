@@ -130,25 +130,6 @@ def test_lights_that_change_together_are_one_row(capsys, monkeypatch, room, out)
     assert row.name == "M63 and 36 more" and row.note == WEAKEST
 
 
-def test_the_rest_of_a_picture_is_a_row_and_bounced_light_follows_its_light_group(capsys, monkeypatch, room, out):
-    whole = shade(capsys, monkeypatch, room, out)
-    kept = kept_in(out)
-    shape, random = whole.shape[:2], np.random.default_rng(3)
-    rest = {"": random.random((*shape, 4)), "Key": random.random((*shape, 3))}
-    taken = {"diffuse": random.random(shape)}
-    path = out / "render.samples.npz"
-    write_relight_data(kept.extraction, None, replace(options(room, out)), path, rest=rest, taken=taken)
-    pictures = light_pictures(RelightData.load(path))
-    assert [row.name for row in pictures.rows][-1] == REST and len(pictures.rows) == 4
-    np.testing.assert_allclose(pictures.alpha, rest[""][..., 3], rtol=1e-6)
-    plain = light_pictures(kept)
-    bounced = pictures.layers[0] - plain.layers[0]
-    channels = read_channels(out / "shade.exr")
-    diffuse = np.stack([channels[f"ltsh4.diffuse@Key.{c}"] for c in "RGB"], -1)
-    expected = rest["Key"] - (1.0 - taken["diffuse"])[..., None] * diffuse
-    np.testing.assert_allclose(bounced, expected, atol=1e-5)
-
-
 def test_a_finished_picture_lit_anew_keeps_the_rest(capsys, monkeypatch, room, out):
     whole = shade(capsys, monkeypatch, room, out / "first")
     kept, random = kept_in(out / "first"), np.random.default_rng(3)

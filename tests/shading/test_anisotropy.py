@@ -77,23 +77,6 @@ def test_anisotropic_lobes_meet_all_kinds_of_lights(kind):
     assert np.linalg.norm(found - expected) < 0.01 * np.linalg.norm(expected)
 
 
-def test_a_tangent_turned_by_a_right_angle_swaps_both_alphas():
-    samples = surfaces(0.5)
-    across = np.cross(samples.normal, samples.tangent)
-    other = replace(samples, tangent=across, anisotropy=np.full(COUNT, 1.0 - 1.0 / 0.5))
-    for technique in ("reference", "ltsh4"):
-        first, second = specular(samples, technique), specular(other, technique)
-        assert np.allclose(first, second, rtol=1e-3, atol=2e-4 * first.max())
-
-
-@pytest.mark.parametrize("technique", ["reference", "ltsh4"])
-def test_neither_the_length_nor_the_sign_of_a_tangent_matters(technique):
-    samples = surfaces(0.5)
-    first = specular(samples, technique)
-    second = specular(replace(samples, tangent=-3.0 * samples.tangent), technique)
-    assert np.allclose(first, second, rtol=1e-6, atol=1e-9)
-
-
 def test_hardly_anisotropic_is_isotropic():
     samples = surfaces(1e-9)
     plain = replace(samples, anisotropy=np.zeros(COUNT))

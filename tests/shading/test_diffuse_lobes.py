@@ -1,9 +1,11 @@
 """Sheen and rough diffuse lobes against quadratures of their formulas, written down here anew."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
+import quadrature
 from surface_scenes import area_light, single_sample
 
 from ltsh_addon import shading
@@ -28,19 +30,11 @@ def over_polygon(corners, lobe, count=100):
     return total
 
 
-def slope(cosine):
-    """G of Fujii's model, as OpenPBR has it."""
-    theta = np.arccos(cosine)
-    sine = np.sin(theta)
-    return sine * (theta - 2 / 3 - sine * cosine) + 2 / 3 * np.tan(theta) * (1.0 - sine**3)
+UP = np.array([0.0, 0.0, 1.0])
 
 
-def fujii(directions, cosine, sigma, rebound):
-    x, z = directions[..., 0], directions[..., 2]
-    a = 1.0 / (np.pi + sigma * (np.pi / 2 - 2 / 3))
-    s = x * np.sqrt(1.0 - cosine**2)
-    t = np.where(s > 0.0, s / np.maximum(z, cosine), s)
-    return z * (a + sigma * a * t + rebound * (1.0 - a * np.pi - sigma * a * slope(z)))
+def view_of(cosine):
+    return np.array([np.sqrt(1.0 - cosine**2), 0.0, cosine])
 
 
 def polygons(count, seed):
@@ -63,11 +57,13 @@ def test_rough_lobes_are_integrated_as_their_formula_says():
     single, several = diffuse.rough_integrals(corners.transpose(2, 1, 0), cosine, sigma)
     errors = np.zeros(count)
     for number, shape in enumerate(corners):
-        own = cosine[number], sigma[number]
-        plain = over_polygon(shape, lambda directions, own=own: fujii(directions, *own, 0.0))
-        whole = over_polygon(shape, lambda directions, own=own: fujii(directions, *own, 1.0))
+        own = UP, view_of(cosine[number]), sigma[number]
+        plain, again = (
+            over_polygon(shape, lambda directions, k=k, own=own: quadrature.rough(directions, *own)[k])
+            for k in range(2)
+        )
         errors[number] = single[number] / plain - 1.0
-        assert several[number] == pytest.approx(whole - plain, rel=1e-3)
+        assert several[number] == pytest.approx(again, rel=1e-3)
     # Where the kink at z = cosine is, both quadratures are off.
     assert np.abs(errors).max() < 6e-3 and np.sqrt(np.square(errors).mean()) < 1e-3
 
@@ -87,24 +83,14 @@ def test_sheen_is_integrated_as_its_formula_says():
 
 
 def test_velvet_is_integrated_as_its_formula_says():
-    """By the formula with half vectors, as its authors wrote it down."""
     random = np.random.default_rng(7)
     sigma, cosine = random.uniform(0.3, 1.0, 20), random.uniform(0.1, 1.0, 20)
     corners = polygons(20, 8)
     found = diffuse.velvet_integral(corners.transpose(2, 1, 0), cosine, sigma)
     turned = diffuse.velvet_integral(corners[:, ::-1].transpose(2, 1, 0), cosine, sigma)
     for number, shape in enumerate(corners):
-        view = np.array([np.sqrt(1.0 - cosine[number] ** 2), 0.0, cosine[number]])
-
-        def lobe(directions, view=view, sigma=sigma[number]):
-            half = directions + view
-            half = half / np.linalg.norm(half, axis=-1, keepdims=True)
-            slope2 = 1.0 / half[..., 2] ** 2 - 1.0
-            density = np.exp(-1.0 / (slope2 * sigma**2)) / (np.pi * sigma**2 * (1.0 - half[..., 2] ** 2) ** 2)
-            cosines = np.minimum(directions[..., 2], view[2])
-            masked = np.minimum(1.0, 2.0 * half[..., 2] * cosines / (half @ view))
-            return density * masked / (4.0 * view[2])
-
+        view = view_of(cosine[number])
+        lobe = partial(quadrature.velvet, normal=UP, view=view, sigma=sigma[number])
         expected = over_polygon(shape, lobe)
         # The kink of the masking crosses some polygons.
         assert found[number] == pytest.approx(expected, rel=2e-3, abs=1e-6)
@@ -124,7 +110,7 @@ def test_all_light_is_the_albedo():
         single, _ = diffuse.rough_integrals(ring, np.array([cosine]), np.array([0.7]))
         a, b = diffuse.rough_terms(np.array([0.7]))
         # The cut at x = 0 is half a circle.
-        assert single[0] == pytest.approx(np.pi * a[0] + b[0] * slope(cosine), rel=2e-4)
+        assert single[0] == pytest.approx(np.pi * a[0] + b[0] * quadrature.fujii_slope(cosine), rel=2e-4)
     assert abs(diffuse.sheen_form_factor(ring, np.array([0.5]), np.array([-0.8]))[0]) == pytest.approx(1.0, rel=1e-5)
 
 
@@ -137,8 +123,8 @@ def test_a_white_rough_surface_reflects_all_light(roughness):
     directions = np.stack([np.sqrt(1.0 - z * z) * np.cos(phi), np.zeros_like(z), z], axis=-1)
     for cosine in (0.2, 0.6, 0.95):
         rebound = diffuse.rebound(np.ones((1, 3)), np.array([cosine]), np.array([roughness]))[0, 0]
-        values = fujii(directions, cosine, roughness, rebound)
-        total = 2.0 * np.pi * (np.outer(weights, angle_weights) * values).sum()
+        once, again = quadrature.rough(directions, UP, view_of(cosine), roughness)
+        total = 2.0 * np.pi * (np.outer(weights, angle_weights) * (once + rebound * again)).sum()
         assert total == pytest.approx(1.0, abs=2e-3)
 
 

@@ -4,8 +4,6 @@ import header_harness
 import numpy as np
 import pytest
 from header_harness import points, random_polygons
-from lobe_cases import lobe_quadrature
-from polygon_quadrature import above_horizon
 
 from ltsh_addon import shading
 from ltsh_addon.lobes.polygon import clip_to_horizon, edge_sums, project_to_sphere, split_at_horizon
@@ -252,18 +250,6 @@ def test_a_triangle_traced_twice_has_twice_the_integral(compiled):
         found = header.call("integrate", cosine, roughness, 6, vertices)
         assert (np.abs(found - expected) <= tolerance).all()
     assert expected.max() > 1.0
-
-
-def test_polygon_integrals_agree_with_quadrature(compiled):
-    """Lobes of medium width."""
-    table, header = compiled
-    cosine, roughness = points(20, seed=20, lowest_roughness=0.6)
-    vertices = random_polygons(20, 4, seed=21)
-    found = header.call("integral", cosine, roughness, 0, 4, vertices)
-    for number, polygon in enumerate(vertices.astype(float)):
-        expected, bound = lobe_quadrature(table, cosine[number], roughness[number], above_horizon(polygon), 1e-6)
-        assert abs(found[number] - expected) <= bound + 1e-5 and bound < 1e-4
-    assert np.abs(found).max() > 0.1
 
 
 def test_a_polygon_over_the_whole_hemisphere_gives_the_albedo(compiled):

@@ -64,15 +64,6 @@ def test_moving_turning_mirroring_and_scaling_everything_changes_nothing(techniq
 
 
 @techniques
-def test_radiance_scales_with_the_light(technique):
-    samples = random_samples(60, seed=4)
-    once = both(shade(samples, [area_light(radiance=(1.0, 1.0, 1.0))], technique, workers=1))
-    color = np.array([2.0, 0.5, 7.0])
-    found = both(shade(samples, [area_light(radiance=color)], technique, workers=1))
-    assert np.abs(found - once * color).max() < 1e-12
-
-
-@techniques
 def test_lights_and_surfaces_have_one_side(technique):
     """A light that faces away, in its own plane or below the horizon gives nothing, a view from behind no specular."""
     white = {"specular_f0": (1, 1, 1), "specular_f90": (1, 1, 1)}

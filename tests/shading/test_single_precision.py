@@ -14,7 +14,7 @@ from ltsh_addon.emitters import small_lights as points
 from ltsh_addon.lobes import edge_integrals, moments32
 from ltsh_addon.lobes.polygon import project_to_sphere
 from ltsh_addon.scene import PolygonLight
-from ltsh_addon.shading import integrator, lobes32
+from ltsh_addon.shading import float64, lobes32
 
 
 def white_lights(lights):
@@ -90,13 +90,13 @@ def test_small_lights_keep_the_promise_and_their_share(name, size, monkeypatch):
     a light's corners. Bent horizons among them. Few pairs are left to double precision."""
     samples = all_kinds_of_samples(1000, seed=11)
     samples = replace(samples, roughness=np.maximum(samples.roughness, moments32.SHARP_ROUGHNESS))
-    asked, original = [], integrator.Task.shade_pairs
+    asked, original = [], float64.shade_pairs
 
-    def counted(self, samples, part, number):
-        asked.append(len(number))
-        return original(self, samples, part, number)
+    def counted(samples, members, *others):
+        asked.append(len(members))
+        return original(samples, members, *others)
 
-    monkeypatch.setattr(integrator.Task, "shade_pairs", counted)
+    monkeypatch.setattr(float64, "shade_pairs", counted)
     squares = {part: np.zeros(2) for part in shading.PASSES}
     for light in small_lights(size, seed=5):
         double = assert_close(samples, [light], name)

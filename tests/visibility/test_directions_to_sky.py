@@ -55,18 +55,6 @@ def test_weights_of_directions_add_up_to_the_irradiance(taken):
     np.testing.assert_allclose(found, expected, rtol=0.03)
 
 
-@pytest.mark.parametrize("taken", (pictures(), constant()), ids=("window", "constant"))
-def test_densities_add_up_to_one(taken):
-    """Over all directions, by the midpoints of pixels: there are none below the horizon of the normal."""
-    sky, total = Sky(sky_lights(LIKE, taken)[0]), np.zeros(3)
-    for picture in taken:
-        offsets = picture.offsets().reshape(-1, 3)
-        toward = (offsets / np.linalg.norm(offsets, axis=1, keepdims=True)).T[:, :, None]
-        directions = np.broadcast_to(toward, (*toward.shape[:2], 3)).astype(np.float32)
-        total += (sky.along(directions, NORMALS)[0] * picture.solid_angles().reshape(-1, 1)).sum(axis=0)
-    assert total == pytest.approx(np.ones(3), abs=0.02)
-
-
 def test_each_direction_to_a_constant_sky_tells_its_irradiance():
     """That is pi times the radiance. Planes tilted by an angle b get (1 + cos b) / 2 of it, on average."""
     sky = Sky(sky_lights(LIKE, constant())[0])

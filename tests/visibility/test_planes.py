@@ -79,7 +79,11 @@ def test_many_triangles_of_one_object_in_a_plane():
 
 @pytest.mark.parametrize(("height", "held"), [(0.0, True), (1e-5, False), (-1e-5, False)])
 def test_a_face_holds_points_of_its_plane(height, held):
-    occluders = placed(grid(4.0, 5), box(), at=[(0, 0, 2), (0, 0, -3)])
+    """Of a light without area the plane is not known: a point is in any face there. Slivers hold none."""
+    sliver = OccluderMesh(np.array([[-4, 0, 0], [4, 0, 0], [0, 0, 0]], np.float32), np.array([[0, 1, 2]]))
+    occluders = placed(grid(4.0, 5), box(), sliver, at=[(0, 0, 2), (0, 0, -3), (0, 0.2, 2)])
     inside = [(0.1, 0.2, 2 + height), (0.4, 0.2, 2 + height)]
     for points, expected in ((inside, [0] if held else []), ([(3.0, 0.2, 2), (2.2, 0.2, 2)], [])):
-        assert occluders.holding(np.array(points) @ TURN.T, TURN[:, 2]).tolist() == expected
+        points = np.array(points) @ TURN.T
+        assert occluders.holding(points, TURN[:, 2]).tolist() == expected
+        assert occluders.holding(points[:1], None).tolist() == expected

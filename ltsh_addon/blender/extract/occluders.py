@@ -23,8 +23,10 @@ from ..render_settings import cycles_setting
 from . import occluder_shapes as shapes
 
 # NAMED: how many names of a kind a warning lists. LEAST_DOUBLED: least share of the area of an object in other faces
-# that is named.
-NAMED, LEAST_DOUBLED = 3, 1e-3
+# that is named. TINY: radius of a light in m below which the geometry does not tell on which side of a face it is.
+# LEAST_COLOR: least difference of a color of transparent surfaces from the mean of all three that is named, as COLORED.
+NAMED, LEAST_DOUBLED, TINY, LEAST_COLOR = 3, 1e-3, 1e-4, 0.01
+COLORED = "colored transparency counts by its mean, up to {} of the light off in a color, as shadows are gray"
 # A light is sampled by rays toward points on the light, and by rays in directions that the surface chooses.
 # SURFACE_SHIFT: the bits of a mask for the latter are this much higher, if some object blocks only one kind of ray.
 SURFACE_SHIFT = 16
@@ -57,18 +59,22 @@ def with_baked_shares(occluders: Occluders, unread: list[UnreadSurface], scene, 
 
     Call this before materials are changed.
     """
-    meshes = list(occluders.meshes)
+    meshes, colored = list(occluders.meshes), {}
     for surface in unread:
         with open_studio(scene) as studio:
             if scene.camera is not None:
                 studio.camera.matrix_world = scene.camera.matrix_world
-            transparency = maps.baked_transparency(surface, studio)
+            transparency, off = maps.baked_transparency(surface, studio)
+        colored[surface.material.name] = max(colored.get(surface.material.name, 0.0), off)
         meshes[surface.number] = replace(meshes[surface.number], transparency=transparency)
         bpy.data.meshes.remove(surface.mesh)
     for material in dict.fromkeys(surface.material for surface in unread):
         problem = maps.depends_on_rays(trees_of([material]))
         if problem:
             warn(f"shadows: what material {material.name!r} lets through depends on {problem}")
+    for name, off in colored.items():
+        if off > LEAST_COLOR:
+            warn(f"shadows: {COLORED.format(_percent(off))}: {name!r}")
     return replace(occluders, meshes=tuple(meshes))
 
 
@@ -166,19 +172,19 @@ class _Collector:
         self._instances += [_Instances(number, matrices_3x4, mask, terminator, name, owner) for number in numbers]
 
     def _warn_of_planes(self, occluders, warn):
-        """Name area lights and faces in the plane of faces of other objects, up to rounding."""
+        """Name lights without depth and faces that lie in faces of other objects, up to rounding."""
         count = [len(instances.matrices) for instances in self._instances]
         instance_of = np.repeat(np.arange(len(self._instances)), count)
         in_planes = {}
         for instance in self._depsgraph.object_instances:
-            if instance.object.type == "LIGHT" and instance.object.data.type == "AREA":
-                for number in occluders.holding(*_points_of_area_light(instance)):
+            if instance.object.type == "LIGHT" and instance.show_self and _is_flat(instance.object.data):
+                for number in occluders.holding(*_points_of_light(instance)):
                     name = self._instances[instance_of[number]].name
                     in_planes[f"{instance.object.original.name!r} in {name!r}"] = None
         if in_planes:
             warn(
-                f"shadows: area lights in the plane of a face: {listed(in_planes, NAMED)}: Cycles shows at "
-                "random from all to none of their light, the techniques show all; move them off by 0.1 mm"
+                f"shadows: lights in the plane of a face: {listed(in_planes, NAMED)}: Cycles shows at random from "
+                "all to none of their light, the techniques show all; move them off by 0.1 mm"
             )
         owners = np.array([instances.owner for instances in self._instances], np.int64)[instance_of]
         pairs = sorted(occluders.overlaps(owners).items(), key=lambda pair: -pair[1])
@@ -280,24 +286,29 @@ class _Collector:
         if isinstance(value, values.Curved):
             value, curve = value.value, (value.places, value.numbers)
         if value is None:
-            shares = _shares_by_cosine(surface)
-            if shares is not None:
-                return _ClearMaterial(shares=shares) if max(shares) > 0.0 else None
-            return self._unread_material(material)
-        if not values.is_gray(value):
-            most = np.abs(value.offset - value.offset.mean()).max() if value.is_constant else 1.0
-            size = f"up to {_percent(most)} of the light off in a color"
-            self._note(f"colored transparency counts by its mean, {size}, as shadows are gray", material)
-            value = value.mapped(np.full((3, 3), 1.0 / 3.0))
+            colors = _colors_by_cosine(surface)
+            if colors is None:
+                return self._unread_material(material)
+            return self._gray(colors, material)
         if value.is_constant:
-            share = float(np.clip(value.offset[0], 0.0, 1.0))
-            return _ClearMaterial(shares=(share,)) if share > 0.0 else None
+            return self._gray(np.clip(value.offset, 0.0, 1.0)[None], material)
+        colors = [value] if values.is_gray(value) else [value.mapped(np.tile(row, (3, 1))) for row in np.eye(3)]
+        value = value.mapped(np.full((3, 3), 1.0 / 3.0)) if len(colors) == 3 else value
         image = self._image(value)
         if image is None:
             return self._unread_material(material)
+        if len(colors) == 3:
+            self._gray(np.clip([self._image(color) for color in colors], 0.0, 1.0).reshape(3, -1).T, material)
         return (
             _ClearMaterial(value, curve) if np.interp(image, *curve or ((0.0, 1.0), (0.0, 1.0))).max() > 0.0 else None
         )
+
+    def _gray(self, colors: np.ndarray, material) -> _ClearMaterial | None:
+        """What lets through the means of `colors` (A, 3), which is noted if they are colored; None if all are 0."""
+        shares = colors.mean(axis=1)
+        if (off := np.abs(colors - shares[:, None]).max()) > LEAST_COLOR:
+            self._note(COLORED.format(_percent(off)), material)
+        return _ClearMaterial(shares=tuple(shares.tolist())) if shares.max() > 0.0 else None
 
     def _unread_material(self, material) -> _ClearMaterial:
         if self._unread is not None:
@@ -423,16 +434,16 @@ def _read_for_shadow_rays(cosine: float | None = None):
             del values.READERS[kind]
 
 
-def _shares_by_cosine(surface) -> tuple[float, ...] | None:
-    """The shares at `maps.COSINES` of the shader at the input `surface`; None where not only they decide."""
-    shares = []
+def _colors_by_cosine(surface) -> np.ndarray | None:
+    """The shares (A, 3) at `maps.COSINES` of the shader at the input `surface`; None where not only they decide."""
+    colors = []
     for cosine in maps.COSINES.tolist():
         with _read_for_shadow_rays(cosine):
             value = _share_at(surface)
         if not _is_constant(value):
             return None
-        shares.append(min(max(float(value.offset.mean()), 0.0), 1.0))
-    return tuple(shares)
+        colors.append(np.clip(value.offset, 0.0, 1.0))
+    return np.array(colors)
 
 
 def _share_at(socket, groups: tuple = ()) -> values.Value | values.Curved | None:
@@ -518,9 +529,16 @@ def _is_displaced(material) -> bool:
     return getattr(material, "displacement_method", "BUMP") != "BUMP"
 
 
-def _points_of_area_light(instance) -> tuple[np.ndarray, np.ndarray]:
-    """The center and four points near the corners (5, 3) of an area light, and its unit normal (3,)."""
+def _is_flat(light) -> bool:
+    """True for area lights, and for points and spots that are hardly more than a point."""
+    return light.type == "AREA" or light.type in ("POINT", "SPOT") and light.shadow_soft_size < TINY
+
+
+def _points_of_light(instance) -> tuple[np.ndarray, np.ndarray | None]:
+    """The center of a light and, of an area light, four points near its corners (N, 3), and its unit normal (3,)."""
     light, matrix = instance.object.data, np.array(instance.matrix_world, dtype=np.float64)
+    if light.type != "AREA":
+        return matrix[None, :3, 3], None
     depth = light.size_y if light.shape in ("RECTANGLE", "ELLIPSE") else light.size
     places = 0.35 * np.array([[0, 0], [-1, -1], [-1, 1], [1, -1], [1, 1]]) * (light.size, depth)
     normal = np.cross(matrix[:3, 0], matrix[:3, 1])

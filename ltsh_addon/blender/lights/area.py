@@ -19,10 +19,8 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ...cycles.horizons import unit
-from ...cycles.light_tree import light_selection_pmf
 from ...scene import FARTHEST, EllipseLight, Light, PointLight, QuadLight, SpotCone, SpotLight, SunLight, listed
-from ..evaluated import EmitterTraits, RenderedSurface, is_surface, read_values, surface_instancer
+from ..evaluated import EmitterTraits, RenderedSurface, surface_instancer
 from ..materials.aovs import CyclesReasons, OpaqueInput
 from ..materials.graph import tree_in_use
 from ..render_settings import cycles_setting
@@ -57,7 +55,6 @@ class LightInventory:
     instancers: dict[str, RenderedSurface] = field(default_factory=dict)  # by full name
     unshaded: list[str] = field(default_factory=list)  # reasons why materials are not shaded, see `inject_aovs`
     hit: set[str] = field(default_factory=set)  # names of the lights that random rays hit, if some overlap
-    lit_points: tuple[np.ndarray, np.ndarray] = ()  # points of surfaces and their normals, if some overlap
     world: Any = None  # the world that lights the scene
     sky_detail: float = 0.0  # see `environment.fine_detail`
     look_until: float = np.inf  # processor time
@@ -122,7 +119,7 @@ def collect_lights(depsgraph, override=None) -> LightInventory:
                 inventory.node_lights[len(inventory.lights)] = source
             inventory.lights.append(light)
     if overlapping_pairs(hit):
-        inventory.hit, inventory.lit_points = {light.name for light in hit}, _lit_points(depsgraph)
+        inventory.hit = {light.name for light in hit}
     lost: list[str] = []
     inventory.meshes = collect_mesh_lights(depsgraph, override, receivers, lost.append)
     for reason in lost:
@@ -145,8 +142,6 @@ _AREA_LIGHTS = {shape: kind for kind in (QuadLight, EllipseLight) for shape in k
 TRIED = 16
 # CHUNK: how many lights are compared with all others at once.
 CHUNK = 256
-# LIT_POINTS: points of surfaces, for a mean over them. LEAST_LIT: see `_lost_diffuse_shares`.
-LIT_POINTS, LEAST_LIT = 512, 0.1
 
 
 def overlapping_pairs(lights: list[Light]) -> list[tuple[Light, Light, float]]:
@@ -215,67 +210,11 @@ def note_overlaps(inventory: LightInventory) -> None:
     names = [f"{first.name!r} and {second.name!r} ({100.0 * share:.0f} %)" for first, second, share in pairs]
     brightness = [[np.abs(light.radiance).sum() for light in pair[:2]] for pair in pairs]
     lost = max(max(pair) / sum(pair) for pair in brightness)
-    mean, most = max(_lost_diffuse_shares(pair[:2], inventory) for pair in pairs[:NAMED_PAIRS])
     inventory.warn(
         f"lights {listed(names, NAMED_PAIRS)}: each pair overlaps in one plane, by that share of the smaller light; "
-        f"there Cycles loses about {100.0 * mean:.3g} % of their diffuse light on all surfaces together, at "
-        f"points {100.0 * most:.3g} %, and up to {100.0 * lost:.0f} % of their light in sharp reflections, the "
-        "techniques lose nothing; move one of each pair forward by 0.1 mm"
+        f"there Cycles loses up to {100.0 * lost:.0f} % of their light, most in sharp reflections, the techniques lose "
+        "nothing; move one of each pair forward by 0.1 mm"
     )
-
-
-def _lost_diffuse_shares(pair: tuple[Light, Light], inventory: LightInventory) -> tuple[float, float]:
-    """The share of the light of an overlapping `pair` on diffuse surfaces that Cycles loses, and the largest at a point
-    that is lit by at least LEAST_LIT of the light of the brightest.
-
-    Rays that Cycles sends by the BSDF hit the first of both lights alone. So of the second it has only what rays to
-    lights count by the power heuristic (Veach and Guibas 1995), as if the other rays had found nothing.
-    """
-    # Cycles hardly ever chooses a world among lights that are so near.
-    lights = tuple(light for light in inventory.lights if not light.is_distant)
-    number = max(number for number, light in enumerate(lights) if light is pair[0] or light is pair[1])
-    first, second = pair if pair[1] is lights[number] else pair[::-1]
-    position, normal = inventory.lit_points
-    normal = normal * np.sign(((second.center - position) * normal).sum(axis=1, keepdims=True))  # lit on both sides
-    pmf = light_selection_pmf(position, normal, lights)
-    lost = total = np.full(len(position), 1e-30)
-    for light in (first, second):
-        points = _points_of(light)
-        offset = points - position[:, None]
-        square = (offset**2).sum(axis=-1)
-        offset /= np.sqrt(square)[..., None]
-        solid_angle = np.maximum(-(offset @ light.direction), 0.0) / square
-        solid_angle *= np.linalg.norm(light.area_vector) / len(points)
-        by_bsdf = np.maximum((offset * normal[:, None]).sum(axis=-1), 0.0) / math.pi
-        arriving = np.abs(light.radiance).sum() * by_bsdf * solid_angle
-        total = total + arriving.sum(axis=1)
-        if light is second:
-            # Cycles chooses points of rectangles evenly by solid angle, of ellipses by area.
-            whole = len(points) * solid_angle if light.is_round else solid_angle.sum(axis=1, keepdims=True)
-            by_light = pmf[number, :, None] / np.maximum(whole, 1e-30)
-            weight = by_bsdf**2 / np.maximum(by_bsdf**2 + by_light**2, 1e-30)
-            lost = (arriving * weight)[:, _is_inside(points, first)].sum(axis=1)
-    is_lit = total >= LEAST_LIT * total.max(initial=0.0)
-    return float(lost.sum() / total.sum()), float((lost / total)[is_lit].max(initial=0.0))
-
-
-def _lit_points(depsgraph) -> tuple[np.ndarray, np.ndarray]:
-    """Random points (Q, 3) on the surfaces of a scene, evenly by area, and their normals, in world space."""
-    random, chosen, total = np.random.default_rng(0), np.zeros((LIT_POINTS, 3, 3)), 1e-30
-    for instance in depsgraph.object_instances:
-        mesh = instance.object.data
-        if is_surface(instance) and isinstance(mesh, bpy.types.Mesh) and len(mesh.polygons):
-            mesh.calc_loop_triangles()
-            corners = read_values(mesh.loop_triangles, "vertices", (len(mesh.loop_triangles), 3), np.int32)
-            vertices = read_values(mesh.vertices, "co", (len(mesh.vertices), 3), np.float32)
-            matrix = np.array(instance.matrix_world)
-            world = (vertices @ matrix[:3, :3].T + matrix[:3, 3])[corners]
-            area = np.cumsum(np.linalg.norm(np.cross(world[:, 1] - world[:, 0], world[:, 2] - world[:, 0]), axis=1))
-            total += area[-1]
-            new = random.random(LIT_POINTS) < area[-1] / total
-            chosen[new] = world[np.searchsorted(area[:-1], area[-1] * random.random(np.count_nonzero(new)))]
-    normal = unit(np.cross(chosen[:, 1] - chosen[:, 0], chosen[:, 2] - chosen[:, 0]))
-    return (random.dirichlet(np.ones(3), LIT_POINTS)[..., None] * chosen).sum(axis=1), normal
 
 
 def half_hidden(light: Light) -> str:

@@ -193,7 +193,7 @@ def _lights_of_all(mesh_lights: list[MeshLight], studio: Studio, eye: np.ndarray
             _material_radiance(studio, material, known) if emission.emits and not emission.varies else np.zeros((2, 3))
             for material, emission in zip(mesh_light.materials, mesh_light.emission, strict=True)
         ]
-        side = _emitting_side(mesh_light, eye, warn)
+        side = _emitting_side(mesh_light, eye)
         placed_polygons = _polygons(mesh_light, radiance)
         count = sum(len(polygons) for _, polygons in placed_polygons) * (2 if side == 0 else 1)
         if count > MOST_POLYGONS:
@@ -216,7 +216,7 @@ def constant_mesh_lights(mesh_lights: list[MeshLight], radiance_of, eye: np.ndar
     lights = []
     for mesh_light in mesh_lights:
         radiance = [np.tile(radiance_of(material), (2, 1)) for material in mesh_light.materials]
-        side = _emitting_side(mesh_light, eye, warn)
+        side = _emitting_side(mesh_light, eye)
         of_mesh = _constant_lights(mesh_light, _polygons(mesh_light, radiance), radiance, side)
         of_mesh = [replace(light, falloff=0, smooth=0.0) for light in of_mesh]
         if len(of_mesh) > MOST_SHOWN:
@@ -246,15 +246,13 @@ def _warn_of_emission(mesh_light: MeshLight, warn) -> None:
             warn(f"material {material.name!r}: it emits from where its faces are without displacement")
 
 
-def _emitting_side(mesh_light: MeshLight, eye: np.ndarray, warn) -> int:
+def _emitting_side(mesh_light: MeshLight, eye: np.ndarray) -> int:
     """The value of SIDE_PROPERTY for an object."""
     sides = set()
     for placement in mesh_light.placements:
         vertices = placement.vertices
         triangles = planar_polygons.welded(vertices, placement.triangles)
         closed = planar_polygons.is_closed(triangles)
-        if planar_polygons.hides_itself(vertices, triangles, closed):
-            warn(f"object {mesh_light.ob.name!r}: its faces may stand in their own light, shaded as if they did not")
         outward = planar_polygons.outward_side(vertices, triangles) if closed else 0
         sides.add(-outward if closed and planar_polygons.is_inside(eye, vertices, triangles) else outward)
     return sides.pop() if len(sides) == 1 else 0

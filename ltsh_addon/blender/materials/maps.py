@@ -284,9 +284,9 @@ def even_transparency(shares: np.ndarray, cosines, triangles: int) -> Transparen
     return Transparency(1.0, shares[:, None, None], uv, "EXTEND", "Closest", cosines=tuple(cosines))
 
 
-def baked_transparency(surface, studio) -> Transparency:
+def baked_transparency(surface, studio) -> tuple[Transparency, float]:
     """What a `surface` (`extract.occluders.UnreadSurface`) lets through for shadow rays, as Cycles bakes it from its
-    mesh, which is changed."""
+    mesh, which is changed; and how far off a color may be from the mean of all three."""
     mesh, count = surface.mesh, len(surface.mesh.polygons)
     slots = read_values(mesh.polygons, "material_index", (count,), np.int32)
     is_chosen = np.clip(slots, 0, max(len(mesh.materials) - 1, 0)) == surface.slot
@@ -318,8 +318,9 @@ def baked_transparency(surface, studio) -> Transparency:
     triangles = len(mesh.loop_triangles)
     of_faces = is_chosen[read_values(mesh.loop_triangles, "polygon_index", (triangles,), np.int32)]
     corners = read_values(mesh.loop_triangles, "loops", (triangles, 3), np.int32)[of_faces]
-    shares = np.clip(np.nan_to_num(pixels.reshape(size, size, 4)[..., :3].mean(axis=-1)), 0.0, 1.0)
-    return Transparency(1.0, shares, uv[corners], "EXTEND")
+    colors = np.clip(np.nan_to_num(pixels.reshape(size, size, 4)[..., :3]), 0.0, 1.0)
+    shares = colors.mean(axis=-1)
+    return Transparency(1.0, shares, uv[corners], "EXTEND"), float(np.abs(colors - shares[..., None]).max())
 
 
 def _side_by_side(mesh, faces: np.ndarray) -> tuple[np.ndarray, int]:

@@ -9,7 +9,7 @@ import pytest
 import scene_parts
 from bake_scenes import SIZE, baked, save, start
 from material_scenes import Build
-from scene_parts import add_plane, principled
+from scene_parts import add_geometry_nodes, add_plane, principled
 
 from ltsh_addon.blender.process import blender_process
 from ltsh_addon.pipeline import BakeOptions, bake_scene
@@ -112,17 +112,12 @@ def mapped_by_nodes():
     ob = add_plane(principled("Plain", Roughness=0.6)[0], name="Nodes", location=(0.0, 0.0, 0.2))
     name = ob.data.uv_layers[0].name
     ob.data.uv_layers.remove(ob.data.uv_layers[0])
-    group = bpy.data.node_groups.new("Map", "GeometryNodeTree")
-    for way in ("INPUT", "OUTPUT"):
-        group.interface.new_socket("Geometry", in_out=way, socket_type="NodeSocketGeometry")
-    first, last = group.nodes.new("NodeGroupInput"), group.nodes.new("NodeGroupOutput")
-    store, place = group.nodes.new("GeometryNodeStoreNamedAttribute"), group.nodes.new("GeometryNodeInputPosition")
+    group, first, last, store, place = add_geometry_nodes(ob, "StoreNamedAttribute", "InputPosition")
     store.domain, store.data_type = "CORNER", "FLOAT2"
     store.inputs["Name"].default_value = name
     for start_, end in ((first.outputs[0], store.inputs["Geometry"]), (store.outputs[0], last.inputs[0])):
         group.links.new(start_, end)
     group.links.new(place.outputs[0], next(item for item in store.inputs if item.name == "Value" and item.enabled))
-    ob.modifiers.new("Nodes", "NODES").node_group = group
     return ob
 
 

@@ -6,7 +6,7 @@ import bpy
 import numpy as np
 import pytest
 from bake_scenes import SIZE, save, start
-from scene_parts import add_plane, principled
+from scene_parts import add_group, add_plane, new_group, principled
 
 from ltsh_addon.blender.process.bake import extract_bake
 from ltsh_addon.cycles import texels as texels_module
@@ -67,13 +67,9 @@ def plain_scene(folder):
 
     tree, node = textured("Group")
     bpy.data.objects["Group"].data.uv_layers["Tex"].active_render = True
-    group = bpy.data.node_groups.new("Inside", "ShaderNodeTree")
-    group.interface.new_socket("Out", in_out="OUTPUT", socket_type="NodeSocketColor")
-    shown = texture(group, image(folder, "data", "Non-Color"), "CLIP", "Closest")
-    group.links.new(shown.outputs[0], group.nodes.new("NodeGroupOutput").inputs[0])
-    outer = tree.nodes.new("ShaderNodeGroup")
-    outer.node_tree = group
-    tree.links.new(outer.outputs[0], node.inputs["Base Color"])
+    group, _, end = new_group({}, {"Out": "Color"})
+    group.links.new(texture(group, image(folder, "data", "Non-Color"), "CLIP", "Closest").outputs[0], end.inputs[0])
+    tree.links.new(add_group(tree, group).outputs[0], node.inputs["Base Color"])
 
     tree, node = textured("Floats")
     bpy.data.objects["Floats"].data.uv_layers["Tex"].active_render = True

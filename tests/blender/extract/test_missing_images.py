@@ -55,13 +55,9 @@ def mixed(name, image, factor, node_type="ShaderNodeMixRGB"):
 def grouped(image):
     """A material that shows `image` by way of a group's input."""
     made, node = scene_parts.principled("Grouped")
-    inner = bpy.data.node_groups.new("Inner", "ShaderNodeTree")
-    for way in ("INPUT", "OUTPUT"):
-        inner.interface.new_socket("Color", in_out=way, socket_type="NodeSocketColor")
-    first, last = inner.nodes.new("NodeGroupInput"), inner.nodes.new("NodeGroupOutput")
+    inner, first, last = scene_parts.new_group({"Color": "Color"}, {"Color": "Color"})
     inner.links.new(first.outputs[0], last.inputs[0])
-    group = made.node_tree.nodes.new("ShaderNodeGroup")
-    group.node_tree = inner
+    group = scene_parts.add_group(made.node_tree, inner)
     texture(made.node_tree, image, group.inputs[0])
     made.node_tree.links.new(group.outputs[0], node.inputs["Base Color"])
     return made
@@ -72,18 +68,11 @@ def in_the_modifiers(ob):
     heights = bpy.data.textures.new("Heights", "IMAGE")
     heights.image = lost("yes displace")
     ob.modifiers.new("Displace", "DISPLACE").texture = heights
-    tree = bpy.data.node_groups.new("Shape", "GeometryNodeTree")
-    tree.interface.new_socket("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
-    tree.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
-    start, end, move, read = (
-        tree.nodes.new(kind)
-        for kind in ("NodeGroupInput", "NodeGroupOutput", "GeometryNodeSetPosition", "GeometryNodeImageTexture")
-    )
+    tree, start, end, move, read = scene_parts.add_geometry_nodes(ob, "SetPosition", "ImageTexture")
     read.inputs["Image"].default_value = lost("yes geometry nodes")
     tree.links.new(start.outputs[0], move.inputs["Geometry"])
     tree.links.new(read.outputs["Color"], move.inputs["Offset"])
     tree.links.new(move.outputs[0], end.inputs[0])
-    ob.modifiers.new("Nodes", "NODES").node_group = tree
 
 
 def gallery():

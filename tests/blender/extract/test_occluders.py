@@ -1,5 +1,6 @@
 """What blocks light, against the shadows of Cycles under a light so small that a point is lit or not."""
 
+import re
 from dataclasses import dataclass
 
 import bpy
@@ -88,19 +89,12 @@ def vertex_instances():
 
 def generated_instances():
     """A geometry nodes modifier that puts two meshes it makes on points: a ball, and cubes."""
-    tree = bpy.data.node_groups.new("Scatter", "GeometryNodeTree")
-    tree.interface.new_socket("Geometry", in_out="INPUT", socket_type="NodeSocketGeometry")
-    tree.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
-    entry, end, on_points, made = (
-        tree.nodes.new(kind)
-        for kind in ("NodeGroupInput", "NodeGroupOutput", "GeometryNodeInstanceOnPoints", "GeometryNodeMeshCube")
-    )
+    ob = hidden(scene_parts.add_plane(size=1.6, name="Points", location=(0.0, 0.0, 1.0), rotation=(0.2, 0.1, 0.3)))
+    tree, entry, end, on_points, made = scene_parts.add_geometry_nodes(ob, "InstanceOnPoints", "MeshCube")
     made.inputs["Size"].default_value = (0.5, 0.4, 0.3)
     tree.links.new(entry.outputs[0], on_points.inputs["Points"])
     tree.links.new(made.outputs[0], on_points.inputs["Instance"])
     tree.links.new(on_points.outputs[0], end.inputs[0])
-    ob = hidden(scene_parts.add_plane(size=1.6, name="Points", location=(0.0, 0.0, 1.0), rotation=(0.2, 0.1, 0.3)))
-    ob.modifiers.new("Scatter", "NODES").node_group = tree
 
 
 def shared_data():
@@ -387,6 +381,8 @@ NAMED = {
     "overlapped": "50 % of its faces where others are",
     "rug in its plane": "100 % of those of 'Pane' in 'Rug'",
     "light in its plane": "in the plane of a face: 'Flush' in 'Pane'",
+    "point in its plane": "in the plane of a face: 'Flush' in 'Pane'",
+    "spot in its plane": "in the plane of a face: 'Flush' in 'Pane'",
 }
 
 
@@ -417,12 +413,12 @@ def test_what_is_not_as_in_cycles_is_named(name):
         twin = ob.copy()
         twin.data = ob.data if name.startswith("instance") else ob.data.copy()
         scene_parts.link(twin, ob.location)
-    elif name == "light in its plane":
+    elif name.endswith("t in its plane"):
         ob = pane(scene_parts.principled("Pane")[0])
         ob.name = "Pane"
         for light_name, height in (("Flush", 0.0), ("Below", -1e-4), ("Above", 1e-4)):
-            light = bpy.data.lights.new(light_name, "AREA")
-            light.size = 0.1
+            light = bpy.data.lights.new(light_name, {"l": "AREA", "p": "POINT", "s": "SPOT"}[name[0]])
+            setattr(light, *(("size", 0.1) if name[0] == "l" else ("shadow_soft_size", 0.0)))
             location = (ob.location.x, ob.location.y, ob.location.z + height)
             scene_parts.link(bpy.data.objects.new(light_name, light), location)
     elif name == "rug in its plane":
@@ -485,6 +481,35 @@ def test_what_cycles_alone_knows_is_half_of_the_most_and_at_most_as_much_off(nam
     # The bake has 8 bits at least.
     assert behind.any() and np.abs(found - baked).max() <= share + 0.004
     assert np.abs(found - baked)[behind].mean() < baked[behind].mean()
+
+
+def tinted(made, other=(1.0, 0.5, 0.3, 1.0)):
+    return made.shader("BsdfTransparent", Color=other)
+
+
+# Materials that let colors through, and the most that one of them is off the mean of all three.
+COLORED = {
+    "constant": (tinted, 40.0),
+    "image": (lambda made: made.mix(textured(made, "Alpha"), tinted(made), clear(made, 0.2)), 40.0),
+    "by the angle": (
+        lambda made: made.mix(made.tree.nodes.new("ShaderNodeFresnel").outputs[0], tinted(made), made.leaf(0.5)),
+        38.0,
+    ),
+    "noise": (lambda made: made.mix(noise(made), tinted(made), made.leaf(0.5)), 30.0),
+    "faint": (lambda made: tinted(made, (0.5, 0.51, 0.5, 1.0)), None),
+}
+
+
+@pytest.mark.newest
+@pytest.mark.parametrize("name", COLORED)
+def test_colored_transparency_is_named_with_its_size(name):
+    start()
+    build, size = COLORED[name]
+    pane(shown(build))
+    warnings = [line for line in scene_parts.baked_occluders()[1] if "colored" in line]
+    assert len(warnings) == (size is not None)
+    for line in warnings:
+        assert float(re.search(r"up to (\S+) % of the light off", line)[1]) == pytest.approx(size, abs=3.0), line
 
 
 @pytest.mark.newest

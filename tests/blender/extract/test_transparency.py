@@ -57,13 +57,8 @@ def by_curves(made):
 
 def in_group(made):
     """A mix in a group whose factor comes from outside."""
-    tree = bpy.data.node_groups.new("Inside", "ShaderNodeTree")
-    tree.interface.new_socket("Factor", in_out="INPUT", socket_type="NodeSocketFloat")
-    tree.interface.new_socket("Shader", in_out="OUTPUT", socket_type="NodeSocketShader")
-    inlet, outlet, mix, ends = (
-        tree.nodes.new(kind)
-        for kind in ("NodeGroupInput", "NodeGroupOutput", "ShaderNodeMixShader", "ShaderNodeBsdfTransparent")
-    )
+    tree, inlet, outlet = scene_parts.new_group({"Factor": "Float"}, {"Shader": "Shader"})
+    mix, ends = tree.nodes.new("ShaderNodeMixShader"), tree.nodes.new("ShaderNodeBsdfTransparent")
     for source, target in (
         (inlet.outputs[0], mix.inputs[0]),
         (ends.outputs[0], mix.inputs[1]),

@@ -124,19 +124,14 @@ def into_collection(name, *objects):
 
 def instance_on_points(maker, source):
     """Let `maker` show instances of the object `source` on its points, beside its own geometry, by geometry nodes."""
-    tree = bpy.data.node_groups.new("Instances", "GeometryNodeTree")
-    for way in ("INPUT", "OUTPUT"):
-        tree.interface.new_socket("Geometry", in_out=way, socket_type="NodeSocketGeometry")
     kinds = ("InstanceOnPoints", "JoinGeometry", "ObjectInfo")
-    place, join, info = (tree.nodes.new(f"GeometryNode{kind}") for kind in kinds)
-    entry, leave = tree.nodes.new("NodeGroupInput"), tree.nodes.new("NodeGroupOutput")
+    tree, entry, leave, place, join, info = scene_parts.add_geometry_nodes(maker, *kinds)
     info.inputs["Object"].default_value, info.inputs["As Instance"].default_value = source, True
     tree.links.new(entry.outputs[0], place.inputs["Points"])
     tree.links.new(info.outputs["Geometry"], place.inputs["Instance"])
     tree.links.new(place.outputs[0], join.inputs[0])
     tree.links.new(entry.outputs[0], join.inputs[0])
     tree.links.new(join.outputs[0], leave.inputs[0])
-    maker.modifiers.new("Instances", "NODES").node_group = tree
 
 
 def add_instancer(collection, name="Instancer", **placement):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import bpy
 import numpy as np
 import scene_parts
 
@@ -79,13 +78,10 @@ class Build:
 
     def group(self, fill, inputs=(), kind="ShaderNodeGroup", times=1):
         """Outputs of group nodes whose tree `fill(inputs inside)` returns the shader of."""
-        tree = bpy.data.node_groups.new("Inside", "ShaderNodeTree")
-        for socket in inputs:
-            type_inside = {"SHADER": "NodeSocketShader", "VALUE": "NodeSocketFloat"}[socket.type]
-            tree.interface.new_socket("In", in_out="INPUT", socket_type=type_inside)
-        tree.interface.new_socket("Out", in_out="OUTPUT", socket_type="NodeSocketShader")
+        types = {"SHADER": "Shader", "VALUE": "Float"}
+        sockets = {f"In {number}": types[socket.type] for number, socket in enumerate(inputs)}
+        tree, entry, end = scene_parts.new_group(sockets, {"Out": "Shader"})
         self.inside.append(tree)
-        entry, end = self.new("NodeGroupInput"), self.new("NodeGroupOutput")
         self.link(fill(*list(entry.outputs)[: len(inputs)]), end.inputs[0])
         self.inside.pop()
         nodes = [self.new(kind) for _ in range(times)]

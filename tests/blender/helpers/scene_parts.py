@@ -270,13 +270,33 @@ def reference(folder: Path, prepared, cycles_samples, sub_samples=1):
     return read_reference(manifest, folder)
 
 
+def new_group(inputs, outputs, name="Inside", kind="Shader"):
+    """A node group with sockets {name: type}; (tree, entry, end)."""
+    tree = bpy.data.node_groups.new(name, f"{kind}NodeTree")
+    for way, sockets in (("INPUT", inputs), ("OUTPUT", outputs)):
+        for label, socket in sockets.items():
+            tree.interface.new_socket(label, in_out=way, socket_type=f"NodeSocket{socket}")
+    return tree, tree.nodes.new("NodeGroupInput"), tree.nodes.new("NodeGroupOutput")
+
+
+def add_group(tree, group):
+    """A node of `tree` that shows the tree `group`."""
+    node = tree.nodes.new("ShaderNodeGroup")
+    node.node_tree = group
+    return node
+
+
+def add_geometry_nodes(ob, *kinds):
+    """A modifier of geometry nodes; (tree, entry, end, a node of each kind)."""
+    tree, *ends = new_group({"Geometry": "Geometry"}, {"Geometry": "Geometry"}, kind="Geometry")
+    ob.modifiers.new("Nodes", "NODES").node_group = tree
+    return tree, *ends, *(tree.nodes.new(f"GeometryNode{kind}") for kind in kinds)
+
+
 def group_with_principled(name="Group"):
     """A node group of one Principled BSDF whose roughness is an input; the group's tree."""
-    tree = bpy.data.node_groups.new(name, "ShaderNodeTree")
-    tree.interface.new_socket("Roughness", in_out="INPUT", socket_type="NodeSocketFloat")
-    tree.interface.new_socket("BSDF", in_out="OUTPUT", socket_type="NodeSocketShader")
-    shader = tree.nodes.new("ShaderNodeBsdfPrincipled")
-    shader.distribution = "GGX"
-    tree.links.new(tree.nodes.new("NodeGroupInput").outputs[0], shader.inputs["Roughness"])
-    tree.links.new(shader.outputs[0], tree.nodes.new("NodeGroupOutput").inputs[0])
+    tree, entry, end = new_group({"Roughness": "Float"}, {"BSDF": "Shader"}, name)
+    shader = add_node(tree, "ShaderNodeBsdfPrincipled")
+    tree.links.new(entry.outputs[0], shader.inputs["Roughness"])
+    tree.links.new(shader.outputs[0], end.inputs[0])
     return tree

@@ -9,10 +9,10 @@ from graphics_card import Canvas, with_graphics
 
 from ltsh_addon import shading
 from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels
-from ltsh_addon.blender.viewport.drawing import ViewCamera
 from ltsh_addon.blender.viewport.mirror import SceneMirror
 from ltsh_addon.blender.viewport.pictures import ShownPicture
 from ltsh_addon.blender.viewport.renderer import ViewRenderer
+from ltsh_addon.blender.viewport.still import view_of_camera
 
 SIZE = (96, 72)
 COLUMNS = 4
@@ -20,19 +20,36 @@ COLUMNS = 4
 RELATIVE, ABSOLUTE = 1e-2, 1e-4
 
 
-def viewport_picture(camera, shown, is_parallel):
+class OpenView:
+    """The view of a camera over the open scene, where the graphics card may be used."""
+
+    def __init__(self, camera, size=SIZE):
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+        self.size, self.view = size, view_of_camera(camera, depsgraph, size)
+        self.mirror, self.renderer, self.canvas = SceneMirror(), ViewRenderer(), Canvas(*size)
+        self.mirror.sync(depsgraph)
+
+    def draw(self, shown, *points):
+        """The canvas (H, W, 4), row 0 at the bottom, once it shows `shown`."""
+        self.renderer.draw(self.mirror, self.view, self.size, shown, self.canvas.buffer, *points)
+        return self.canvas.read()
+
+    def light(self, technique, passes, *points):
+        """What was drawn (H, W, 3) before a background and the color management of a window, row 0 at the bottom."""
+        self.draw(ShownPicture(technique, passes, transparent=True), *points)
+        return self.renderer.read()[..., :3].astype(np.float64)
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.renderer.free()
+
+
+def viewport_picture(camera, shown):
     """(H, W, 3), row 0 on top, and the notes."""
-    depsgraph = bpy.context.evaluated_depsgraph_get()
-    projection = camera.calc_matrix_camera(depsgraph, x=SIZE[0], y=SIZE[1])
-    mirror, renderer, canvas = SceneMirror(), ViewRenderer(), Canvas(*SIZE)
-    try:
-        mirror.sync(depsgraph)
-        view = ViewCamera.of(camera.matrix_world.inverted(), projection, is_parallel)
-        settings = ShownPicture("ltsh4", shown, transparent=True)
-        renderer.draw(mirror, view, SIZE, settings, canvas.buffer)
-        return renderer.read()[::-1, :, :3].astype(np.float64), mirror.notes
-    finally:
-        renderer.free()
+    with OpenView(camera) as opened:
+        return opened.light("ltsh4", shown)[::-1], opened.mirror.notes
 
 
 def away_from_edges(square):
@@ -122,7 +139,7 @@ def patches_too_far(path, materials, kind, passes) -> list[str]:
     """
     _, camera = patches_of(materials)
     camera.data.type, camera.data.ortho_scale = kind, 4.2
-    seen = with_graphics(lambda: [viewport_picture(camera, name, kind == "ORTHO") for name in passes])
+    seen = with_graphics(lambda: [viewport_picture(camera, name) for name in passes])
     expected, square = sampled_pictures(path, passes, -(-len(materials) // COLUMNS))
     usable = away_from_edges(square)
     failures = []

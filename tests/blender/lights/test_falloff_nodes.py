@@ -2,7 +2,6 @@
 
 import math
 
-import bpy
 import numpy as np
 import pytest
 import scene_parts
@@ -33,15 +32,12 @@ def test_a_picture_on_a_focused_light_keeps_its_falloff(tmp_path):
     start()
     tree, emission = light_tree(scene_parts.add_area_light(spread=2.0))
     tree.links.new(add_image(tree, np.random.default_rng(3).random((4, 8, 3))).outputs["Color"], emission.inputs[0])
-    group = bpy.data.node_groups.new("Fading", "ShaderNodeTree")
-    group.interface.new_socket("Strength", in_out="OUTPUT", socket_type="NodeSocketFloat")
+    group, _, end = scene_parts.new_group({}, {"Strength": "Float"})
     half = group.nodes.new("ShaderNodeMath")
     half.operation, half.inputs[0].default_value = "MULTIPLY", 0.5
     group.links.new(add_falloff(group, "Linear", 3.0), half.inputs[1])
-    group.links.new(half.outputs[0], group.nodes.new("NodeGroupOutput").inputs[0])
-    holder = tree.nodes.new("ShaderNodeGroup")
-    holder.node_tree = group
-    tree.links.new(holder.outputs[0], emission.inputs["Strength"])
+    group.links.new(half.outputs[0], end.inputs[0])
+    tree.links.new(scene_parts.add_group(tree, group).outputs[0], emission.inputs["Strength"])
     _, _, inventory, warnings = assert_agrees(tmp_path, samples=1024, count=6, tolerance=4e-3)
     assert warnings == [] and {light.falloff for light in inventory.lights[0].leaves} == {1}
 
@@ -80,11 +76,9 @@ def test_a_falloff_that_is_no_factor_is_named(kind):
         node.operation = "SINE"
         tree.links.new(add_falloff(tree, "Linear", math.pi / 2.0), node.inputs[0])
     else:
-        group = bpy.data.node_groups.new("Cut", "ShaderNodeTree")
-        group.interface.new_socket("Strength", in_out="OUTPUT", socket_type="NodeSocketInt")
-        group.links.new(add_falloff(group, "Linear", 1.0), group.nodes.new("NodeGroupOutput").inputs[0])
-        node = tree.nodes.new("ShaderNodeGroup")
-        node.node_tree = group
+        group, _, end = scene_parts.new_group({}, {"Strength": "Int"})
+        group.links.new(add_falloff(group, "Linear", 1.0), end.inputs[0])
+        node = scene_parts.add_group(tree, group)
     tree.links.new(node.outputs[0], emission.inputs["Strength"])
     _, _, inventory, warnings = scene_parts.prepare()
     assert sum("'Odd'" in line and "Light Falloff" in line for line in warnings) == 1, warnings

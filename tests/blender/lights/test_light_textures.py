@@ -70,13 +70,10 @@ def test_constant_nodes_keep_the_light_whole(tmp_path):
     """A black body inside a node group, with a strength computed from constants, on a disk with a spread."""
     start()
     tree, emission = light_tree(scene_parts.add_area_light(shape="DISK", spread=1.2, color=(1.0, 0.5, 1.0)))
-    group = bpy.data.node_groups.new("Warm", "ShaderNodeTree")
-    group.interface.new_socket("Color", in_out="OUTPUT", socket_type="NodeSocketColor")
-    black_body, out = group.nodes.new("ShaderNodeBlackbody"), group.nodes.new("NodeGroupOutput")
+    group, _, end = scene_parts.new_group({}, {"Color": "Color"})
+    black_body, holder = group.nodes.new("ShaderNodeBlackbody"), scene_parts.add_group(tree, group)
     black_body.inputs[0].default_value = 3000.0
-    group.links.new(black_body.outputs[0], out.inputs[0])
-    holder = tree.nodes.new("ShaderNodeGroup")
-    holder.node_tree = group
+    group.links.new(black_body.outputs[0], end.inputs[0])
     product = tree.nodes.new("ShaderNodeMath")
     product.operation = "MULTIPLY"
     product.inputs[0].default_value, product.inputs[1].default_value = 0.5, 3.0

@@ -120,16 +120,6 @@ def test_too_many_faces_are_refused_by_name(tmp_path, monkeypatch):
     assert sum("'Lamp'" in line and f"{BALL} flat faces" in line for line in prepared[3]) == 1, prepared[3]
 
 
-def test_a_hollow_lamp_is_named():
-    start()
-    bpy.ops.mesh.primitive_torus_add(location=(0.0, 1.0, 1.2), major_radius=0.3, minor_radius=0.1, major_segments=12)
-    torus = bpy.context.object
-    torus.name = "Ring"
-    torus.data.materials.append(lamp_material()[0])
-    warnings = scene_parts.prepare()[3]
-    assert sum("'Ring'" in line and "stand in their own light" in line for line in warnings) == 1, warnings
-
-
 def test_dark_materials_are_no_lights():
     start()
     for number, settings in enumerate(({"strength": 0.0}, {"color": (0.0, 0.0, 0.0, 1.0)})):

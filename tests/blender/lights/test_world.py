@@ -92,15 +92,12 @@ def seen_otherwise():
     """Red to the camera, and what surfaces see is in a group."""
     world, sky = scene_parts.add_world(Color=(0.2, 0.5, 1.0, 1.0))
     tree = world.node_tree
-    group = bpy.data.node_groups.new("Mixed", "ShaderNodeTree")
-    group.interface.new_socket("Color", in_out="OUTPUT", socket_type="NodeSocketColor")
+    group, _, end = scene_parts.new_group({}, {"Color": "Color"})
     path, mix = group.nodes.new("ShaderNodeLightPath"), group.nodes.new("ShaderNodeMixRGB")
     mix.inputs[1].default_value, mix.inputs[2].default_value = (0.2, 0.5, 1.0, 1.0), (9.0, 0.0, 0.0, 1.0)
     group.links.new(path.outputs["Is Camera Ray"], mix.inputs[0])
-    group.links.new(mix.outputs[0], group.nodes.new("NodeGroupOutput").inputs[0])
-    own = tree.nodes.new("ShaderNodeGroup")
-    own.node_tree = group
-    tree.links.new(own.outputs[0], sky.inputs["Color"])
+    group.links.new(mix.outputs[0], end.inputs[0])
+    tree.links.new(scene_parts.add_group(tree, group).outputs[0], sky.inputs["Color"])
 
 
 WORLDS = {

@@ -6,7 +6,7 @@ import pytest
 import quadrature
 import scene_parts
 from material_scenes import Build, seen_from_above
-from scene_parts import add_plane, bsdf_material, principled
+from scene_parts import add_geometry_nodes, add_plane, bsdf_material, principled
 
 from ltsh_addon.blender import render_settings
 from ltsh_addon.blender.materials.aovs import inject_aovs
@@ -113,14 +113,10 @@ def test_without_material_the_surface_is_cycles_default(tmp_path, slots):
 
 def test_a_material_set_by_geometry_nodes_is_sampled(tmp_path):
     plane = add_plane(size=6.0)
-    tree = bpy.data.node_groups.new("Set", "GeometryNodeTree")
-    for direction in ("INPUT", "OUTPUT"):
-        tree.interface.new_socket("Geometry", in_out=direction, socket_type="NodeSocketGeometry")
-    node = tree.nodes.new("GeometryNodeSetMaterial")
+    tree, entry, end, node = add_geometry_nodes(plane, "SetMaterial")
     node.inputs["Material"].default_value = principled("Set by nodes", Roughness=0.42)[0]
-    tree.links.new(tree.nodes.new("NodeGroupInput").outputs[0], node.inputs["Geometry"])
-    tree.links.new(node.outputs[0], tree.nodes.new("NodeGroupOutput").inputs[0])
-    plane.modifiers.new("Set", "NODES").node_group = tree
+    tree.links.new(entry.outputs[0], node.inputs["Geometry"])
+    tree.links.new(node.outputs[0], end.inputs[0])
     surface, _, _ = seen_from_above(tmp_path)
     assert np.allclose(surface.roughness, 0.42) and np.all(surface.dielectric == 1.0)
 

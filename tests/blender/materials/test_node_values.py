@@ -170,12 +170,9 @@ class Shown:
 
     def group(self, source, *kinds):
         """`source` passed through a group with sockets of two types."""
-        inner = bpy.data.node_groups.new("Pass", "ShaderNodeTree")
-        for direction, kind in zip(("INPUT", "OUTPUT"), kinds, strict=True):
-            inner.interface.new_socket("Through", in_out=direction, socket_type=f"NodeSocket{kind}")
-        inner.links.new(inner.nodes.new("NodeGroupInput").outputs[0], inner.nodes.new("NodeGroupOutput").inputs[0])
-        node = self.tree.nodes.new("ShaderNodeGroup")
-        node.node_tree = inner
+        inner, entry, end = scene_parts.new_group(*({"Through": kind} for kind in kinds))
+        inner.links.new(entry.outputs[0], end.inputs[0])
+        node = scene_parts.add_group(self.tree, inner)
         if source is not None:
             self.tree.links.new(source, node.inputs[0])
         self.told[-1].append(("group", kinds))

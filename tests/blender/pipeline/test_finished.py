@@ -149,6 +149,13 @@ SCENES = {
 }
 
 
+def by_cycles(folder, samples=TRUE_SAMPLES):
+    """What Cycles renders of the open scene, in a folder in `folder`."""
+    (folder / "true").mkdir()
+    job = FinishedJob(parts.save(folder / "true.blend"), *(None,) * 6, samples, None)
+    return render_finished(job, folder / "true")
+
+
 def blocks(image):
     """Means (B, B, C) of square blocks."""
     return image.reshape(SIZE // BLOCK, BLOCK, SIZE // BLOCK, BLOCK, -1).mean(axis=(1, 3))
@@ -163,9 +170,7 @@ def test_a_finished_picture_is_what_cycles_renders(name, tmp_path):
     options = RenderOptions(path, output=tmp_path, sub_samples=POINTS, cycles_samples=SAMPLES, denoise="off")
     made = render.finish(options)
     bpy.context.scene.cycles.seed = 2
-    job = FinishedJob(parts.save(tmp_path / "true.blend"), *(None,) * 6, TRUE_SAMPLES, None)
-    (tmp_path / "true").mkdir()
-    true = read_layer(render_finished(job, tmp_path / "true").channels, "Combined", "RGBA")
+    true = read_layer(by_cycles(tmp_path).channels, "Combined", "RGBA")
 
     for pass_name, share in zip(PASSES, shares, strict=True):
         found = made.report["finished"]["share_of_ours"][pass_name]
@@ -263,9 +268,7 @@ def test_edges_of_what_shines_are_smooth_with_few_samples(is_transparent, tmp_pa
     path = parts.save(tmp_path / "scene.blend")
     made = render.finish(RenderOptions(path, output=tmp_path, sub_samples=2, cycles_samples=8))
     scene.cycles.seed = 1
-    job = FinishedJob(parts.save(tmp_path / "true.blend"), *(None,) * 6, TRUE_SAMPLES, None)
-    (tmp_path / "true").mkdir()
-    true = read_layer(render_finished(job, tmp_path / "true").channels, "Combined", "RGB")
+    true = read_layer(by_cycles(tmp_path).channels, "Combined", "RGB")
     light = made.cycles.names["emission"]
     share = read_layer(made.cycles.channels, light, "RGB")[..., 0] / 20.0
     edge = (share > 0.1) & (share < 0.9)
@@ -289,9 +292,7 @@ def test_hard_edges_of_diffuse_light_are_nearer_to_cycles_than_ours_or_its_own(t
     parts.link(bpy.data.objects.new("Sun", sun), rotation=(0.6, 0.5, 0.0))
     path = parts.save(tmp_path / "scene.blend")
     scene.cycles.seed = 1
-    job = FinishedJob(parts.save(tmp_path / "true.blend"), *(None,) * 6, TRUE_SAMPLES, None)
-    (tmp_path / "true").mkdir()
-    true = read_layer(render_finished(job, tmp_path / "true").channels, "Combined", "RGB")
+    true = read_layer(by_cycles(tmp_path).channels, "Combined", "RGB")
     off = {}
     for name, weight in {"both": compositing.weight_at_edges, "ours": lambda *images: np.ones((SIZE, SIZE)),
                          "cycles": lambda *images: np.zeros((SIZE, SIZE))}.items():  # fmt: skip
@@ -538,9 +539,7 @@ def test_edges_of_shadows_on_flat_surfaces_are_where_cycles_has_them(lens, tmp_p
     settings.border_min_x, settings.border_max_y = 0.2, 0.9
     parts.add_area_light(location=(0.8, -1.0, 3.0), size=0.05)
     path = parts.save(tmp_path / "room.blend")
-    job = FinishedJob(path, *(None,) * 6, 256, None)
-    (tmp_path / "true").mkdir()
-    found = render_finished(job, tmp_path / "true")
+    found = by_cycles(tmp_path, 256)
     light, color = (read_layer(found.channels, found.names[f"diffuse_{part}"], "RGB") for part in ("light", "color"))
     pictures = []
     for most in (1.0, 0.0):
@@ -637,9 +636,7 @@ def test_borders_of_colors_are_as_smooth_as_in_cycles(tmp_path):
     scene.objects["Plane"].data.materials[0] = checks
     path = parts.save(tmp_path / "scene.blend")
     scene.cycles.seed = 1
-    job = FinishedJob(parts.save(tmp_path / "true.blend"), *(None,) * 6, TRUE_SAMPLES, None)
-    (tmp_path / "true").mkdir()
-    true = render_finished(job, tmp_path / "true")
+    true = by_cycles(tmp_path)
     light, color = (read_layer(true.channels, true.names[f"diffuse_{key}"], "RGB") for key in ("light", "color"))
     off = {}
     for samples in (1, 64):  # with no more samples than points there is nothing to learn from Cycles

@@ -131,12 +131,9 @@ def test_shards_at_the_same_time_in_one_folder_are_the_single_run(room, tmp_path
 def add_tiles_and_group():
     """A plane over two UDIM tiles, and one of the same material, whose color comes from within a group."""
     material, node = scene_parts.principled("Grouped")
-    group = bpy.data.node_groups.new("Inside", "ShaderNodeTree")
-    group.interface.new_socket("Color", in_out="OUTPUT", socket_type="NodeSocketColor")
-    wave = group.nodes.new("ShaderNodeTexWave")
-    group.links.new(wave.outputs["Color"], group.nodes.new("NodeGroupOutput").inputs[0])
-    outer = material.node_tree.nodes.new("ShaderNodeGroup")
-    outer.node_tree = group
+    group, _, end = scene_parts.new_group({}, {"Color": "Color"})
+    group.links.new(group.nodes.new("ShaderNodeTexWave").outputs["Color"], end.inputs[0])
+    outer = scene_parts.add_group(material.node_tree, group)
     material.node_tree.links.new(outer.outputs[0], node.inputs["Base Color"])
     corners = [(x, y, 0.5) for y in (0.0, 1.0) for x in (-1.0, 0.0, 1.0)]
     tiles = scene_parts.add_mesh("Tiles", corners, [(0, 1, 4, 3), (1, 2, 5, 4)])
@@ -195,23 +192,6 @@ def test_a_bake_with_apply_is_finished_by_merge(room, tmp_path):
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "out" / "room_baked.blend"))
     for name in ("Floor", "Slab"):
         assert bpy.data.objects[name].material_slots[0].material.name.endswith(f"(baked {name})")
-
-
-@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="memory of processes as Linux tells it")
-def test_memory_does_not_grow_with_the_frames(room, tmp_path, own_blender):
-    """Of both processes, from the sixth frame on; a leak of a picture per frame would be 1 MiB each."""
-    sizes = []
-
-    def tell(state):
-        if state.seconds is not None:
-            (process,) = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
-            pages = [int(Path(f"/proc/{name}/statm").read_text().split()[1]) for name in (process, "self")]
-            sizes.append([count * os.sysconf("SC_PAGE_SIZE") / 2**20 for count in pages])
-
-    options = PictureOptions(room, tmp_path / "out", techniques=("ltsh4",), passes=("specular",), resolution=(128, 96))
-    batch.run_tasks(BatchJob("shade", options, (room,), frames=tuple(range(1, 26))), tell=tell)
-    for column in zip(*sizes, strict=True):
-        assert max(column[15:]) - max(column[5:15]) < 5.0, column
 
 
 def test_json_is_alone_on_stdout_whatever_blender_prints():

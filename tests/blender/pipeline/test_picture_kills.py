@@ -56,6 +56,40 @@ def test_an_animation_of_finished_pictures_stands_still_and_goes_on_after_a_kill
     trial.check("half")
 
 
+@pytest.mark.soak
+@pytest.mark.parametrize(("command", "options"), [
+    ("bake", "--size 64 --margin 3 --error --cycles-samples 4"), ("shade", "--frames 1-2 --resolution 64x48"),
+    ("render", "--frames 1-2 --resolution 32x24 --aa 3 --cycles-samples 4"),
+    ("compare", "--frames 1-2 --resolution 64x48 --cycles-samples 4"),
+])  # fmt: skip
+def test_after_many_kills_at_random_moments_resume_gives_the_same_bytes(command, options, tmp_path):
+    """Half of them while a file is written, or by a disk that is full; a third are killed once more after that."""
+    bake_scenes.textured_scene()
+    path = bake_scenes.save(tmp_path)
+
+    def line(output, *more):
+        return programs.command_line(command, path, "-o", output, *options.split(), "--quiet", *more)
+
+    trial, generator = kills.Trial(line, tmp_path), np.random.default_rng(1)
+    ended, kinds = 0, (signal.SIGKILL, signal.SIGTERM)
+    for number, moment in enumerate(kills.moments(1, 30, trial.seconds)):
+        name, kind = f"killed_{number}", kinds[number % 2]
+        if number % 4 == 3:
+            ended += trial.end_while_writing(name, kind)
+        elif number % 4 == 2:
+            code, said = trial.end_by_limit(name, generator.integers(1, 400))
+            # A bake goes on with its other objects.
+            assert code in (0, 1) and "Traceback" not in said and trial.left(name) == [], said
+            ended += code
+        else:
+            ended += trial.end_after(name, moment, kind)
+        if number % 3 == 1:
+            trial.end_after(name, 0.7 * moment, kind)
+        trial.check(name)
+        shutil.rmtree(tmp_path / name)
+    assert ended > 15, "most runs had ended before they were killed"
+
+
 @pytest.fixture
 def small_disk(tmp_path):
     yield from kills.small_disk(tmp_path / "disk", "100k")

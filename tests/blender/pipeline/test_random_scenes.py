@@ -26,7 +26,7 @@ WINDOW = 5
 EXCUSES = {
     "its transform is sheared, which Cycles itself does not sample correctly": r"area[^,]*\(sheared\)",
     "Cycles is black there, here both are lit": "^snapped",
-    "shadows: area lights in the plane of a face": "^snapped.* area ",
+    "shadows: lights in the plane of a face": "^snapped.* area ",
 }
 # What is wrong without a warning.
 RARE = "Cycles samples the rim of the cone of a sheared spot so rarely that two halves do not tell its noise"

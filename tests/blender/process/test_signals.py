@@ -15,7 +15,7 @@ from kills import children, is_blenders_own
 ROOT = Path(__file__).resolve().parents[3]
 LINES = {signal.SIGINT: "ltsh: interrupted", signal.SIGTERM: "ltsh: terminated"}
 LARGE = "--reference-samples", "1000000"
-# Less than what the commands below would take; `make soak` prints in how many seconds signals end commands.
+# Less than what the commands below would take.
 SECONDS = 60.0
 pytestmark = pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="processes as Linux tells them")
 

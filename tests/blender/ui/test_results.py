@@ -302,7 +302,8 @@ def test_the_manual_names_what_the_panels_show(scene, tmp_path, monkeypatch):
     skipped = {"A", "B", "groups", "View", "Pass", "Object"}
     assert [word for word in (*buttons, *names) if word not in text and word not in skipped] == []
     assert len(text.splitlines()) < 150 and max(map(len, text.splitlines())) <= 120
-    monkeypatch.setattr(operators, "MANUAL", tmp_path / "manual.md")
+    manual = tmp_path / "manual.md"
+    monkeypatch.setattr(operators, "MANUAL", manual)
     with pytest.raises(RuntimeError, match="manual.md: cannot be read"):
         bpy.ops.ltsh.manual()
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import quadrature
 import random_surfaces
 from graphics_card import Canvas, with_graphics
 from random_surfaces import EYE, rounded, unit
@@ -167,30 +168,6 @@ def test_diffuse_light_of_balls_is_that_of_a_quadrature():
     assert excess(found, expected[:, None] * samples.diffuse_albedo, 3e-4).max() <= 1.0
 
 
-def midpoints_over(light, samples, count=96):
-    """What the diffuse lobes of `samples` reflect (P, 3) of a rectangle: Fujii's formula at the middles of count^2
-    parts of it."""
-    steps = (np.arange(count) + 0.5) * (2.0 / count) - 1.0
-    places = light.center + np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2) @ [light.half_u, light.half_v]
-    area = 4.0 * np.linalg.norm(np.cross(light.half_u, light.half_v)) / count**2
-    sigma, reflected = samples.diffuse_roughness, np.empty((len(samples), 3))
-    a = 1.0 / (np.pi + sigma * (np.pi / 2.0 - 2.0 / 3.0))
-    for number, normal in enumerate(samples.diffuse_normal):
-        offset = places - samples.position[number]
-        distance = np.linalg.norm(offset, axis=1)
-        toward = offset / distance[:, None]
-        z, cosine = np.maximum(toward @ normal, 1e-9), normal @ samples.view[number]
-        weight = area * z * np.maximum(-(toward @ light.direction), 0.0) / distance**2 * (toward @ normal > 0.0)
-        t = toward @ samples.view[number] - z * cosine
-        t = np.where(t > 0.0, t / np.maximum(z, cosine), t)
-        sine = np.sqrt(1.0 - z * z)
-        slope = sine * (np.arccos(z) - 2.0 / 3.0 - sine * z) + 2.0 / 3.0 * sine / z * (1.0 - sine**3)
-        b = sigma[number] * a[number]
-        once, often = weight @ (a[number] + b * t), weight @ (1.0 - np.pi * a[number] - b * slope)
-        reflected[number] = once + often * samples.diffuse_rebound[number]
-    return samples.diffuse_albedo * reflected * light.radiance
-
-
 @pytest.mark.newest
 def test_rough_diffuse_lobes_are_those_of_a_quadrature():
     """Of rectangles, by midpoints, which take a horizon that cuts them to 3e-4; of others, that of the integrator."""
@@ -198,6 +175,10 @@ def test_rough_diffuse_lobes_are_those_of_a_quadrature():
     smooth = np.arange(len(samples)) % 4 == 0
     sigma = rounded(np.where(smooth, 0.0, samples.diffuse_roughness))
     samples = replace(samples, diffuse_roughness=sigma, diffuse_rebound=rounded(samples.diffuse_rebound))
+
+    def brdf(directions, number):
+        once, again = quadrature.rough(directions, samples.diffuse_normal[number], samples.view[number], sigma[number])
+        return once[:, None] + again[:, None] * samples.diffuse_rebound[number]
 
     def compare():
         lighting, canvas = LightingPass("ltsh2"), Canvas(WIDTH, HEIGHT)
@@ -207,7 +188,7 @@ def test_rough_diffuse_lobes_are_those_of_a_quadrature():
             found = drawn(lighting, samples, canvas, "diffuse")
             most = CONES if light.cone is not None else 2e-3
             if kind in ("plain", "near"):
-                expected, most = midpoints_over(light, samples), 5e-4
+                expected, most = samples.diffuse_albedo * quadrature.reflected(samples, light, brdf), 5e-4
             else:
                 shaded = shading.shade(samples, [light], "ltsh2", passes=("diffuse",), workers=1, dtype=np.float64)
                 expected = shaded.combined
@@ -231,26 +212,10 @@ def test_velvet_is_that_of_a_quadrature():
     sigma[::4] = 0.0
     samples, soft = replace(samples, sheen_a=-sigma), sigma > 0.0
 
-    def lobes_over(light, count=96):
-        steps = (np.arange(count) + 0.5) * (2.0 / count) - 1.0
-        places = light.center + np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2) @ [
-            light.half_u,
-            light.half_v,
-        ]
-        area = 4.0 * np.linalg.norm(np.cross(light.half_u, light.half_v)) / count**2
-        found = np.empty(len(samples))
-        for number, (normal, view) in enumerate(zip(samples.diffuse_normal, samples.view, strict=True)):
-            offset = places - samples.position[number]
-            distance = np.linalg.norm(offset, axis=1)
-            toward, seen = offset / distance[:, None], normal @ view
-            half = unit(toward + view)
-            up, cosines = half @ normal, toward @ normal
-            slope = (1.0 - up**2) / up**2 * max(sigma[number], 0.1) ** 2
-            density = np.exp(-1.0 / slope) / (np.pi * slope * up**2 * (1.0 - up**2))
-            masked = np.minimum(1.0, 2.0 * up * np.minimum(cosines, seen) / (half * view).sum(axis=1))
-            weight = area * np.maximum(-(toward @ light.direction), 0.0) / distance**2 * (cosines > 0.0)
-            found[number] = (weight * density * masked).sum() / (4.0 * seen)
-        return found[:, None] * samples.diffuse_albedo * light.radiance
+    def brdf(directions, number):
+        return quadrature.velvet(
+            directions, samples.diffuse_normal[number], samples.view[number], max(sigma[number], 0.1)
+        )
 
     def compare():
         lighting, canvas = LightingPass("ltsh2"), Canvas(WIDTH, HEIGHT)
@@ -259,7 +224,7 @@ def test_velvet_is_that_of_a_quadrature():
             lighting.set_lights([light])
             found = drawn(lighting, samples, canvas, "diffuse")
             if kind in ("plain", "near"):
-                expected = lobes_over(light)
+                expected = samples.diffuse_albedo * quadrature.reflected(samples, light, brdf)
             else:
                 shaded = shading.shade(samples, [light], "ltsh2", passes=("diffuse",), workers=1, dtype=np.float64)
                 expected = shaded.combined

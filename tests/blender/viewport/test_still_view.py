@@ -19,9 +19,9 @@ import pytest
 import random_surfaces
 import scene_parts as parts
 from fake_scene import run
-from graphics_card import Canvas, edits_with_graphics, with_graphics
+from graphics_card import edits_with_graphics, with_graphics
 from lit_plane import light_tree
-from view_pictures import textured
+from view_pictures import OpenView, textured
 
 from ltsh_addon import imaging
 from ltsh_addon.blender.extract.occluders import collect_occluders
@@ -29,12 +29,9 @@ from ltsh_addon.blender.render_settings import filter_points
 from ltsh_addon.blender.viewport import shadows
 from ltsh_addon.blender.viewport.drawing import read_texture
 from ltsh_addon.blender.viewport.lighting import LightingPass
-from ltsh_addon.blender.viewport.mirror import SceneMirror
 from ltsh_addon.blender.viewport.pictures import ShownPicture, is_equal
-from ltsh_addon.blender.viewport.renderer import CENTERS, ViewRenderer
 from ltsh_addon.blender.viewport.shadow_rays import ShadowRays, too_many
 from ltsh_addon.blender.viewport.shadows import LiveShadows
-from ltsh_addon.blender.viewport.still import view_of_camera
 from ltsh_addon.scene import Cancelled, Pattern
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -69,7 +66,7 @@ def relative(picture, expected):
     return np.linalg.norm(picture - expected) / np.linalg.norm(expected)
 
 
-@pytest.mark.parametrize(("count", "most"), [pytest.param(1, 0.01, marks=pytest.mark.newest), (16, 0.02)])
+@pytest.mark.parametrize(("count", "most"), [(1, 0.01), pytest.param(16, 0.02, marks=pytest.mark.newest)])
 def test_a_view_is_the_picture_of_shade(capsys, tmp_path, count, most):
     with_graphics(lambda: None)
     set_up_scene()
@@ -220,29 +217,19 @@ def drawn_by_samples():
     for mesh in bpy.data.meshes:  # horizons of smooth ones change from point to point
         mesh.shade_flat()
     bpy.context.view_layer.update()
-    depsgraph = bpy.context.evaluated_depsgraph_get()
-    mirror, canvas, points = SceneMirror(), Canvas(*SIZE), filter_points("BLACKMAN_HARRIS", 1.5, 3)
-    mirror.sync(depsgraph)
-    view = view_of_camera(camera, depsgraph, SIZE)
-    shown = ShownPicture("ltsh4", "combined")
-    still, moved = ViewRenderer(), ViewRenderer()
-    try:
+    points, shown = filter_points("BLACKMAN_HARRIS", 1.5, 3), ShownPicture("ltsh4", "combined")
+    with OpenView(camera, SIZE) as still, OpenView(camera, SIZE) as moved:
         refined, alone, counts = [], [], []
         for _ in range(len(points) + 1):
-            still.draw(mirror, view, SIZE, shown, canvas.buffer, points)
-            refined.append(canvas.read())
-            counts.append(still.samples)
+            refined.append(still.draw(shown, points))
+            counts.append(still.renderer.samples)
         for point in points:
-            moved.draw(mirror, view.shifted(point, SIZE), SIZE, shown, canvas.buffer)
-            alone.append(canvas.read())
-        mirror.lights = tuple(mirror.lights[:1])
-        still.draw(mirror, view, SIZE, shown, canvas.buffer, points)
-        changed = canvas.read(), still.samples
-        moved.draw(mirror, view, SIZE, shown, canvas.buffer, CENTERS)
-        return refined, counts, alone, changed, canvas.read()
-    finally:
-        still.free()
-        moved.free()
+            moved.view = still.view.shifted(point, SIZE)
+            alone.append(moved.draw(shown))
+        for one in (still, moved):
+            one.mirror.lights = tuple(one.mirror.lights[:1])
+        changed, moved.view = (still.draw(shown, points), still.renderer.samples), still.view
+        return refined, counts, alone, changed, moved.draw(shown)
 
 
 @edits_with_graphics
@@ -255,29 +242,27 @@ def test_a_view_at_rest_is_the_mean_of_its_points_and_starts_again_after_a_chang
     np.testing.assert_array_equal(changed, expected)
 
 
-class LiveView:
+class LiveView(OpenView):
     """A view with live shadows, its scene, and what it draws of a pass."""
 
     def __init__(self, passes="diffuse", add=lambda: None):
-        self.camera, self.passes = set_up_scene(), passes
+        camera, self.passes, self.live = set_up_scene(), passes, LiveShadows()
         add()
         bpy.context.view_layer.update()
-        self.depsgraph = bpy.context.evaluated_depsgraph_get()
-        self.mirror, self.canvas, self.renderer = SceneMirror(), Canvas(*SIZE), ViewRenderer()
-        self.mirror.sync(self.depsgraph)
-        self.view = view_of_camera(self.camera, self.depsgraph, SIZE)
-        self.live = LiveShadows()
+        super().__init__(camera, SIZE)
 
-    def drawn(self, shadows, points=CENTERS):
+    def drawn(self, shadows, *points):
         """The picture (H, W, 3)."""
         self.live.follow((0,), self.occluders)
         self.renderer.shadows = shadows
-        shown = ShownPicture("ltsh4", self.passes, transparent=True)
-        self.renderer.draw(self.mirror, self.view, SIZE, shown, self.canvas.buffer, points)
-        return self.renderer.read()[..., :3].astype(np.float64)
+        return self.light("ltsh4", self.passes, *points)
+
+    def __exit__(self, *error):
+        self.live.stop()
+        super().__exit__(*error)
 
     def occluders(self):
-        return collect_occluders(self.depsgraph, None, lambda text: None)
+        return collect_occluders(bpy.context.evaluated_depsgraph_get(), None, lambda text: None)
 
     def traced(self):
         """The picture after the thread has ended, and numbers of the lights and level of what it has done."""
@@ -308,8 +293,7 @@ def stopped_shares(scene):
 
 
 def live_pictures():
-    scene = LiveView()
-    try:
+    with LiveView() as scene:
         plain, exact = scene.drawn(None), scene.drawn(ShadowRays(scene.occluders(), 256))
         first = scene.drawn(scene.live)
         levels = [scene.traced() for _ in range(2)]
@@ -330,9 +314,6 @@ def live_pictures():
         scene.live.take_news()
         scene.live.visibility(scene.renderer._surfaces._gbuffer, scene.view, scene.renderer._lights.lights, 0)
         return plain, exact, first, levels, rest, recolored, after_move, partial, scene.live.problem
-    finally:
-        scene.live.stop()
-        scene.renderer.free()
 
 
 @edits_with_graphics
@@ -384,7 +365,7 @@ def kept_pictures(has_shadows):
         patch.setattr(LightingPass, "draw", listening)
         # Coarse shadows alone: when finer ones come depends on the time.
         patch.setattr(LiveShadows, "_may_begin", lambda self, level, number: level == 0 and self._is_free)
-        try:
+        with scene:
             scene.drawn(live)
             if live is not None:
                 live._thread.join()
@@ -392,9 +373,6 @@ def kept_pictures(has_shadows):
             for edit in (*edits, lambda light: replace(light, radiance=0.5 * light.radiance), *edits[:1]):
                 found.append(after(edit))
             return found
-        finally:
-            scene.live.stop()
-            scene.renderer.free()
 
 
 @edits_with_graphics
@@ -500,16 +478,13 @@ def glass_pictures():
             threads[0].join()
         raise AssertionError("shadows never end")
 
-    try:
+    with scene:
         plain, exact = scene.drawn(None), scene.drawn(ShadowRays(scene.occluders(), 256))
         pane = read_texture(scene.renderer._glass._gbuffer.position)[..., 3] > 0.0
         live, lights = at_rest(), scene.mirror.lights
         scene.mirror.lights = (replace(lights[0], center=lights[0].center + [0.0, 0.2, 0.1]), *lights[1:])
         moved = at_rest(), scene.drawn(ShadowRays(scene.occluders(), 256))
         return plain, exact, live, moved, pane
-    finally:
-        scene.live.stop()
-        scene.renderer.free()
 
 
 @edits_with_graphics
@@ -525,8 +500,8 @@ def test_the_reflection_of_glass_has_live_shadows():
 def refined_pictures():
     """A view at rest with live shadows: its picture, how many points it has, how often it waited, its versions and
     points over time, and what many rays at every point give."""
-    scene, points = LiveView(), filter_points("BLACKMAN_HARRIS", 1.5, 20)
-    try:
+    points = filter_points("BLACKMAN_HARRIS", 1.5, 20)
+    with LiveView() as scene:
         waited, versions = 0, []
         for _ in range(80):
             live = scene.drawn(scene.live, points)
@@ -540,9 +515,6 @@ def refined_pictures():
         for _ in points:
             exact = scene.drawn(rays, points)
         return live, samples, waited, versions, exact
-    finally:
-        scene.live.stop()
-        scene.renderer.free()
 
 
 @edits_with_graphics

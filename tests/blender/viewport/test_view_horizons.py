@@ -1,5 +1,6 @@
 """Where specular lobes end in the viewport: at the horizon that numpy takes, as Cycles does."""
 
+import itertools
 from dataclasses import fields, replace
 from functools import partial
 
@@ -9,18 +10,15 @@ import numpy as np
 import pytest
 import random_surfaces
 import scene_parts as parts
-from graphics_card import Canvas, edits_with_graphics, with_graphics
+from graphics_card import edits_with_graphics, with_graphics
 from random_surfaces import EYE
 from uploaded_samples import upload_samples
+from view_pictures import OpenView
 
 from ltsh_addon import shading
 from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels
-from ltsh_addon.blender.viewport.drawing import ViewCamera
 from ltsh_addon.blender.viewport.light_texels import upload_lights
 from ltsh_addon.blender.viewport.lighting import HorizonPass
-from ltsh_addon.blender.viewport.mirror import SceneMirror
-from ltsh_addon.blender.viewport.pictures import ShownPicture
-from ltsh_addon.blender.viewport.renderer import ViewRenderer
 from ltsh_addon.cycles.horizons import SMALLEST_ANGLE, horizon_excess, lobe_selection_pmf, smooth_horizon_share
 from ltsh_addon.cycles.light_tree import light_bounds_at, light_tree_rows, selection_pmf
 from ltsh_addon.scene import SurfaceSamples
@@ -133,23 +131,11 @@ def samples_in(gbuffer, eye):
 
 def drawn(camera):
     """Lights, samples, their pixels, and pictures (P, 3) by technique and pass."""
-    depsgraph = bpy.context.evaluated_depsgraph_get()
-    mirror, renderer, canvas = SceneMirror(), ViewRenderer(), Canvas(*SIZE)
-    mirror.sync(depsgraph)
-    view = ViewCamera.of(
-        camera.matrix_world.inverted(), camera.calc_matrix_camera(depsgraph, x=SIZE[0], y=SIZE[1]), False
-    )
-    pictures = {}
-    try:
-        for technique in ("ltc", "ltsh2", "ltsh4", "ltsh4c"):
-            for name in shading.PASSES:
-                shown = ShownPicture(technique, name, transparent=True)
-                renderer.draw(mirror, view, SIZE, shown, canvas.buffer)
-                pictures[technique, name] = renderer.read().reshape(-1, 4)[:, :3].astype(np.float64)
-        samples, pixel = samples_in(renderer._surfaces._gbuffer, view.eye)
-        return mirror.lights, samples, pixel, {key: values[pixel] for key, values in pictures.items()}
-    finally:
-        renderer.free()
+    with OpenView(camera, SIZE) as opened:
+        keys = itertools.product(("ltc", "ltsh2", "ltsh4", "ltsh4c"), shading.PASSES)
+        pictures = {key: opened.light(*key).reshape(-1, 3) for key in keys}
+        samples, pixel = samples_in(opened.renderer._surfaces._gbuffer, opened.view.eye)
+        return opened.mirror.lights, samples, pixel, {key: values[pixel] for key, values in pictures.items()}
 
 
 @edits_with_graphics

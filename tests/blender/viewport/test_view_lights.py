@@ -373,7 +373,7 @@ def lit_scene():
 @edits_with_graphics
 def test_lights_of_every_kind_light_the_view_as_numpy_does(tmp_path):
     camera, ball = lit_scene()
-    pictures = with_graphics(lambda: [viewport_picture(camera, name, False) for name in shading.PASSES])
+    pictures = with_graphics(lambda: [viewport_picture(camera, name) for name in shading.PASSES])
     path = tmp_path / "lights.blend"
     bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
     found = extract_pixels(PixelJob(scene=path))
@@ -400,7 +400,7 @@ def test_a_flat_surface_that_shines_does_not_light_itself():
     camera = parts.add_camera((0.0, -4.0, 2.6), (1.02, 0.0, 0.0))
     bpy.context.view_layer.update()
     for passes in shading.PASSES:
-        picture, _ = with_graphics(lambda passes=passes: viewport_picture(camera, passes, False))
+        picture, _ = with_graphics(lambda passes=passes: viewport_picture(camera, passes))
         assert not picture.any()
 
 

@@ -121,7 +121,7 @@ def test_stretched_objects_shine_as_in_cycles(tmp_path):
     parts.add_area_light(location=(0.5, 0.6, 1.4), size=1.5, size_y=1.0)
     camera = parts.add_camera((0.0, -2.6, 3.4), (0.65, 0.0, 0.0))
     bpy.context.view_layer.update()
-    picture, notes = with_graphics(lambda: viewport_picture(camera, "specular", False))
+    picture, notes = with_graphics(lambda: viewport_picture(camera, "specular"))
     expected, square = sampled_pictures(tmp_path / "domes.blend", ("specular",), 2)
     assert notes == [] and flat.data.normals_domain == "FACE"
     times = times_too_far(picture, expected["specular"]).max(axis=-1)

@@ -27,7 +27,7 @@ def test_what_cameras_do_not_see_is_not_shown(tmp_path):
     planes[2].is_holdout = True
     parts.add_plane(chalk(), size=8.0, location=(0.0, 0.0, -0.3))
     bpy.context.view_layer.update()
-    ((picture, notes),) = with_graphics(lambda: [viewport_picture(camera, "diffuse", False)])
+    ((picture, notes),) = with_graphics(lambda: [viewport_picture(camera, "diffuse")])
     expected, square = sampled_pictures(tmp_path / "hidden.blend", ("diffuse",), 1)
     assert notes == []
     hidden = expected["diffuse"].max(axis=-1) == 0.0
@@ -39,13 +39,13 @@ def test_what_cameras_do_not_see_is_not_shown(tmp_path):
 @edits_with_graphics
 def test_what_does_nothing_is_seen_through():
     _, camera = patches_of([chalk] * 4)
-    ((expected, _),) = with_graphics(lambda: [viewport_picture(camera, "combined", False)])
+    ((expected, _),) = with_graphics(lambda: [viewport_picture(camera, "combined")])
     for number, kind in enumerate(("BsdfTransparent", "VolumePrincipled")):
         material, tree, output = parts.new_material("Air")
         tree.links.new(tree.nodes.new(f"ShaderNode{kind}").outputs[0], output.inputs["Volume" if number else "Surface"])
         parts.add_plane(material, size=8.0, location=(0.0, 0.0, 0.3 + 0.1 * number), name="Air")
     bpy.context.view_layer.update()
-    ((picture, _),) = with_graphics(lambda: [viewport_picture(camera, "combined", False)])
+    ((picture, _),) = with_graphics(lambda: [viewport_picture(camera, "combined")])
     assert expected.any() and np.array_equal(picture, expected)
 
 
@@ -65,7 +65,7 @@ def test_what_glows_is_as_bright_as_it_is_and_hidden_by_what_is_nearer():
     parts.add_plane(chalk(), size=1.0, location=(1.5, 0.0, 0.05), name="Cover")
     bpy.context.view_layer.update()
     shown = ("combined", "specular", "diffuse")
-    pictures = with_graphics(lambda: [viewport_picture(camera, name, False)[0] for name in shown])
+    pictures = with_graphics(lambda: [viewport_picture(camera, name)[0] for name in shown])
     emitted = pictures[0] - pictures[1] - pictures[2]
     matrix = camera.calc_matrix_camera(bpy.context.evaluated_depsgraph_get(), x=SIZE[0], y=SIZE[1])
     matrix = np.array(matrix @ camera.matrix_world.inverted())

@@ -7,9 +7,10 @@ import bpy
 import numpy as np
 import pytest
 import scene_parts as parts
-from graphics_card import Canvas, edits_with_graphics, with_graphics
+from graphics_card import edits_with_graphics, with_graphics
 from view_pictures import (
     SIZE,
+    OpenView,
     image,
     normal_map,
     patches_too_far,
@@ -33,11 +34,9 @@ from ltsh_addon.blender.lights.world import light_of_world
 from ltsh_addon.blender.materials import preview_material
 from ltsh_addon.blender.materials.preview_material import preview_of
 from ltsh_addon.blender.ui import panels
-from ltsh_addon.blender.viewport.drawing import ViewCamera
 from ltsh_addon.blender.viewport.light_texels import constant_sky
 from ltsh_addon.blender.viewport.mirror import SceneMirror, ShownLook
 from ltsh_addon.blender.viewport.pictures import ShownPicture
-from ltsh_addon.blender.viewport.renderer import ViewRenderer
 
 RED, GOLD, AMBER = (0.6, 0.25, 0.1, 1.0), (0.9, 0.7, 0.3, 1.0), (0.9, 0.6, 0.3, 1.0)
 TINT = (0.2, 0.4, 0.6, 1.0)
@@ -165,10 +164,7 @@ def mixed_colors():
 
 def grouped():
     """A BSDF in a node group, with values from outside."""
-    group = bpy.data.node_groups.new("Paint", "ShaderNodeTree")
-    group.interface.new_socket("Tint", in_out="INPUT", socket_type="NodeSocketColor")
-    group.interface.new_socket("Shader", in_out="OUTPUT", socket_type="NodeSocketShader")
-    start, end = group.nodes.new("NodeGroupInput"), group.nodes.new("NodeGroupOutput")
+    group, start, end = parts.new_group({"Tint": "Color"}, {"Shader": "Shader"})
     fill(end, {0: gloss(0.4, start.outputs["Tint"])})
     return made("grouped", "Group", {"node_tree": group, "Tint": (0.8, 0.4, 0.3, 1.0)})()
 
@@ -290,7 +286,7 @@ def test_tangents_run_around_the_axes_of_turned_and_stretched_objects(tmp_path, 
     parts.add_area_light(location=(0.5, -1.0, 2.0), size=2.0, size_y=1.0)
     camera = parts.add_camera((0.0, -2.6, 3.4), (0.6, 0.0, 0.0))
     bpy.context.view_layer.update()
-    seen, notes = with_graphics(lambda: viewport_picture(camera, "specular", False))
+    seen, notes = with_graphics(lambda: viewport_picture(camera, "specular"))
     expected, square = sampled_pictures(tmp_path / "balls.blend", ("specular",), 1)
     usable = (expected["specular"] > 0.0).all(axis=-1) & (seen > 0.0).all(axis=-1)
     assert notes == [] and usable.sum() > 500
@@ -430,7 +426,7 @@ def test_missing_images_are_pink_and_named():
     parts.add_area_light()
     camera = parts.add_camera()
     bpy.context.view_layer.update()
-    picture, notes = with_graphics(lambda: viewport_picture(camera, "diffuse", False))
+    picture, notes = with_graphics(lambda: viewport_picture(camera, "diffuse"))
     red, green, blue = picture.reshape(-1, 3).max(axis=0)
     assert red > 0.1 and blue == pytest.approx(red) and green == 0.0
     assert notes == ["Lost: image 'lost.png' is missing, it is pink"]
@@ -452,7 +448,7 @@ def test_colors_under_alpha_are_those_of_cycles(is_used, interpolation):
     parts.add_area_light()
     camera = parts.add_camera()
     bpy.context.view_layer.update()
-    picture, _ = with_graphics(lambda: viewport_picture(camera, "diffuse", False))
+    picture, _ = with_graphics(lambda: viewport_picture(camera, "diffuse"))
     color = picture.reshape(-1, 3)[picture.sum(axis=-1).argmax()]
     values = np.array([0.8, 0.6, 0.4]) * (1.0 if is_used else 0.5)
     expected = np.where(values > 0.04045, ((values + 0.055) / 1.055) ** 2.4, values / 12.92)
@@ -475,18 +471,9 @@ def test_an_image_that_shines_is_seen_and_lights_as_its_mean():
     bpy.context.view_layer.update()
 
     def draw():
-        depsgraph = bpy.context.evaluated_depsgraph_get()
-        mirror, renderer, canvas = SceneMirror(), ViewRenderer(), Canvas(*SIZE)
-        try:
-            mirror.sync(depsgraph)
-            projection = camera.calc_matrix_camera(depsgraph, x=SIZE[0], y=SIZE[1])
-            shown = ShownPicture("ltsh4", "combined")
-            view = ViewCamera.of(camera.matrix_world.inverted(), projection, True)
-            for _ in range(2):
-                renderer.draw(mirror, view, SIZE, shown, canvas.buffer, np.zeros((2, 2)))
-            return canvas.read()[..., :3], mirror.lights, mirror.notes
-        finally:
-            renderer.free()
+        with OpenView(camera) as opened:
+            _, picture = (opened.draw(ShownPicture("ltsh4", "combined"), np.zeros((2, 2))) for _ in range(2))
+            return picture[..., :3], opened.mirror.lights, opened.mirror.notes
 
     picture, lights, notes = with_graphics(draw)
     height, width = picture.shape[:2]
@@ -543,22 +530,9 @@ def test_glass_shows_what_is_behind_tinted_and_the_reflection_before_it(kind):
     camera = glass_wall(kind)
 
     def draw():
-        depsgraph = bpy.context.evaluated_depsgraph_get()
-        mirror, renderer, canvas = SceneMirror(), ViewRenderer(), Canvas(*SIZE)
-        try:
-            mirror.sync(depsgraph)
-            view = ViewCamera.of(
-                camera.matrix_world.inverted(), camera.calc_matrix_camera(depsgraph, x=SIZE[0], y=SIZE[1]), True
-            )
-            pictures = []
-            for passes in ("combined", "specular", "transmitted"):
-                shown = ShownPicture("ltsh4", passes)
-                for _ in range(2):
-                    renderer.draw(mirror, view, SIZE, shown, canvas.buffer, np.zeros((2, 2)))
-                pictures.append(canvas.read()[..., :3])
-            return pictures
-        finally:
-            renderer.free()
+        with OpenView(camera) as opened:
+            shown = [ShownPicture("ltsh4", name) for name in ("combined", "specular", "transmitted")]
+            return [[opened.draw(one, np.zeros((2, 2))) for _ in range(2)][1][..., :3] for one in shown]
 
     combined, specular, transmitted = with_graphics(draw)
     height, width = combined.shape[:2]

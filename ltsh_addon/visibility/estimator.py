@@ -260,8 +260,7 @@ class RatioEstimator:
         choice = np.where(worth["specular"] > 2.0 * worth["diffuse"], 1, 0)
         choice[worth["diffuse"] > 2.0 * worth["specular"]] = 2
         by_pass = [self._wanted_rays(rays, worth[name], importance) for name in PASSES]
-        alone = self._level(rays, np.maximum(*by_pass))
-        number = alone
+        number = alone = self._level(rays, np.maximum(*by_pass))
         if shares:
             sharing = [neighbors.sharing(name, self.index) for name in PASSES]
             each = [np.where(self.wanted[name], by_pass[k] / sharing[k], 0.0) for k, name in enumerate(PASSES)]
@@ -289,12 +288,11 @@ class RatioEstimator:
             self._add_rays(np.flatnonzero(alone), 0, PROBES, 0)
             self._trace_more(alone & (last > PROBES), last, choice, None)
             alone = np.zeros(len(self.index), bool)
-            for name in PASSES:
+            for name, sum_w, sum_wv in zip(PASSES, self.sum_w.sum(axis=1), self.sum_wv.sum(axis=1), strict=True):
                 ratio = self.visibility_ratio(name)[0]
                 change = np.abs(self._neighbors.bend(name, self.index, ratio))
                 if isinstance(self.emitter, LightCluster):
                     # Shadows as narrow as a pixel: its rays are three standard deviations off what it shares.
-                    sum_w, sum_wv = (sums[PASSES.index(name)].sum(axis=0) for sums in (self.sum_w, self.sum_wv))
                     off = np.abs(sum_wv / np.maximum(sum_w, _TINY) - ratio)
                     change = np.maximum(change, off - np.float32(3.0) * np.sqrt(ratio * (_ONE - ratio) / self.count))
                 alone |= change * worth[name] ** WORTH_POWER > MOST_BIAS
@@ -397,11 +395,9 @@ class RatioEstimator:
             *rays, _ = self.surface.ray_origins.aimed(
                 self.index[unmet], toward[:, None], distance[None], self.at_surface
             )
-            visibility = (
-                self._transmittance(self.mask, _ONE, *(rows[..., 0, :] for rows in rays))
-                if self.chosen_by.light
-                else _ONE
-            )
+            visibility = _ONE
+            if self.chosen_by.light:
+                visibility = self._transmittance(self.mask, _ONE, *(rows[..., 0, :] for rows in rays))
             # Next to nothing, so that it does not count in sums over samples.
             self.sum_w[number][:, unmet] = _TINY
             self.sum_wv[number][:, unmet] = visibility * _TINY
@@ -445,11 +441,10 @@ class RatioEstimator:
         flat = np.flatnonzero(met)
         *aimed, lifted = self.surface.ray_origins.aimed(sampler.index, directions, distance, self.at_surface)
         origins, *rest = (_taken(rows, flat) for rows in aimed)
+        visibility.ravel()[flat] = _ONE
         if self.chosen_by.light:
             falling = sampler.falling.ravel()[flat] if self.margin else _ONE
             visibility.ravel()[flat] = self._transmittance(self.mask, falling, origins, *rest)
-        else:
-            visibility.ravel()[flat] = _ONE
         if self.chosen_by.surface:
             if self.meet_the_same:
                 is_lifted = np.zeros(visibility.size, bool)

@@ -369,7 +369,7 @@ def test_lifted_rays_go_to_the_same_points(libraries):
     directions = rng.normal(size=(3, 7, 40)).astype(np.float32)
     directions /= np.linalg.norm(directions, axis=0)
     distances = rng.uniform(0.5, 5.0, (7, 40)).astype(np.float32)
-    origins, aimed, lengths = starts.aimed(index, directions, distances)
+    origins, aimed, lengths, _ = starts.aimed(index, directions, distances)
     for ray in range(7):
         np.testing.assert_array_equal(origins[:, ray].T, starts.origins(index, directions[:, ray].T))
     position = samples.position[index].T[:, None]

@@ -211,7 +211,8 @@ def _observatory(scene, world, warn, by_cameras: bool = False):
                 radiance = studio.picture()[..., :3]
                 odd = ~(np.abs(radiance) < MOST_RADIANCE).all(axis=-1)
                 if odd.any():
-                    warn(f"world {world.name!r}: its radiance is not finite, or beyond {MOST_RADIANCE:g}; dark there")
+                    share = f"on {100.0 * odd.mean():.2g} % of a side of the sky, dark there"
+                    warn(f"world {world.name!r}: its radiance is not finite, or beyond {MOST_RADIANCE:g}, {share}")
                     radiance[odd] = 0.0
                 return SkyPicture(ahead, right, up, radiance)
 

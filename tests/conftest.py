@@ -37,6 +37,45 @@ NEWEST = {
     "blender/pipeline/test_job_runs.py",
     "blender/pipeline/test_picture_kills.py",
 }
+# Of tests that look at many cases by Cycles, those that older versions of Blender run: each node, kind of light or way
+# of reading once. The others differ in numbers alone, and are marked `newest` as well.
+CASES_OF_OLDER = {
+    "test_a_material_is_shaded_as_cycles_does": {
+        "dielectric, specular level and IOR", "IOR by texture", "metal, multiple scattering", "half metal, bump",
+        "metallic node", "conductor", "textures", "coat over bumps", "glossy, multiple scattering",
+        "anisotropic dielectric", "anisotropic metal", "diffuse", "diffuse roughness", "rough diffuse node", "sheen",
+        "sheen node", "translucent",
+    },
+    "test_an_approximated_material_is_named_and_near": {"glass", "transmission", "subsurface", "Ashikhmin"},
+    "test_a_finished_picture_is_what_cycles_renders": {
+        "one bounce", "toon and alpha", "transparent film", "displacement",
+    },
+    "test_point_spot_and_sun_are_those_of_cycles": {
+        "point, not normalized, exposure, color", "point, soft falloff, temperature", "scaled spot", "sun",
+    },
+    "test_nodes_of_points_are_those_of_cycles": {"falloff-POINT", "stripes-SPOT", "lamp_of_files-SUN"},
+    "test_patterns_go_with_the_radius_as_in_cycles": {"by_place-0.2"},
+    "test_random_scenes_with_all_kinds_of_lights_are_those_of_cycles": {"0"},
+    "test_what_nodes_of_lights_read_is_what_cycles_gives_them": {"spot", "area", "mesh"},
+    "test_an_image_on_a_light_is_that_of_cycles": {"mirrored ellipse", "rectangle with a spread"},
+    "test_a_world_lights_as_in_cycles": {
+        "equirectangular", "sky with a sun", "Hosek and Wilkie", "Preetham", "seen otherwise by the camera",
+    },
+    "test_what_blocks_a_world_blocks_it_as_in_cycles": {"sky with a sun"},
+    "test_a_mesh_lights_as_in_cycles": {"plane, back down", "concave polygon", "mirrored and stretched ball"},
+    "test_texels_are_what_pixels_are": {"sheen_on_coat", "mix", "colors_under_alpha"},
+    "test_the_picture_is_that_of_a_plain_render": {"perspective", "orthographic", "tall pixels", "cropped at 50 %"},
+    "test_lobes_end_where_those_of_cycles_do": {"bumps-0.2-sides1-0.0", "coarse-0.9-sides3-0.0"},
+    "test_both_horizons_of_a_crease_count_as_much_as_in_cycles": {"metal-2", "dielectric-0"},
+    "test_a_surface_hides_itself_as_in_cycles": {"ball", "monkey of great offset", "instance of a monkey"},
+    "test_a_pane_shows_the_floor_behind_it_as_in_cycles": {"Principled", "Mix"},
+    "test_the_viewport_shows_what_cycles_sampled": {
+        f"{name}-PERSP" for name in ("plain", "scattered", "layered", "masked", "brushed", "rough", "bent")
+    },
+    "test_a_final_picture_is_the_sum_of_its_lights_and_the_rest": {"settings0", "settings3"},
+    "test_the_session_and_the_file_stay_as_they_are": {"compare", "cancelled in Cycles", "an exception in the middle"},
+    "test_scripts_in_a_file_run_only_when_asked_for": {"False-shade", "True-bake"},
+}  # fmt: skip
 
 
 def pytest_sessionstart(session):
@@ -52,7 +91,8 @@ def pytest_collection_modifyitems(items):
         path = item.path.relative_to(TESTS).as_posix()
         if path.startswith("blender/"):
             item.add_marker("blender")
-            if path in NEWEST:
+            test, _, case = item.name.partition("[")
+            if path in NEWEST or (test in CASES_OF_OLDER and case[:-1] not in CASES_OF_OLDER[test]):
                 item.add_marker("newest")
         elif path in SMOKE:
             item.add_marker("smoke")

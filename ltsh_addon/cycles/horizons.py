@@ -195,38 +195,36 @@ def horizon_excess(
 def _excess(samples, shapes, chances, choose, is_quick):
     """As `horizon_excess`, for one block of samples and lights in these `shapes`. `choose(position, normal)` returns
     the chances of the lights."""
-    crossings = [shape.crossings(samples) for shape in shapes]
-    index = np.unique(np.concatenate([sample for _, sample in crossings]))
+    crossings = [(shape, *pairs) for shape in shapes if len((pairs := shape.crossings(samples))[0])]
     by_lobe, by_light = np.ones(len(samples)), np.zeros(len(samples))
-    if len(index) == 0:
-        return by_lobe, by_light
-    by_lobe[index] = 0.0
-    samples, chances = samples.take(index), chances[:, index]
-    directions = _HorizonDirections.of(samples, is_quick)
-    # A few directions suffice for a light as large as a side of the sky.
-    for rays, is_side in ((directions, False), (directions if is_quick else directions.few(), True)):
-        hits = [
-            shape.hits(number, np.searchsorted(index, sample), samples.position, rays)
-            for shape, (number, sample) in zip(shapes, crossings, strict=True)
-            if shape.is_side == is_side and len(number)
-        ]
-        if not hits:
+    for _, _, sample in crossings:
+        by_lobe[sample] = 0.0
+    for is_side in (False, True):
+        of_kind = [one for one in crossings if one[0].is_side == is_side]
+        if not of_kind:
             continue
+        there, row = _numbered(np.concatenate([sample for _, _, sample in of_kind]), len(samples))
+        some = samples.take(there)
+        rays, ends = _HorizonDirections.of(some, is_quick, is_side), np.cumsum([len(one[1]) for one in of_kind])[:-1]
+        rows = zip(of_kind, np.split(row, ends), strict=True)
+        hits = [shape.hits(number, row, some.position, rays) for (shape, number, _), row in rows]
         number, row, ray, brightness, solid_angle = (np.concatenate(values) for values in zip(*hits, strict=True))
-        met, row = _numbered(row, len(index))
-        some, towards = samples.take(met), rays.towards[met]
+        met, row = _numbered(row, len(there))
+        if len(met) < len(there):
+            some, rays = some.take(met), rays.take(met)
+        chosen, towards = there[met], rays.towards
         chance = choose(some.position, some.smooth_normal)
         lobe = _lobe_density(some, towards)
-        half = np.sqrt(np.maximum(0.5 + 0.5 * np.einsum("pni,pi->pn", towards, some.view), 0.0))
-        reflected = lobe * _visible_microfacets(some, towards) * _reflectance(some, half) * rays.width[met]
-        diffuse = np.maximum(np.einsum("pni,pi->pn", towards, some.diffuse_normal), 0.0) / np.pi
-        chosen2 = np.square(chances[0, met, None] * lobe + chances[1, met, None] * diffuse)
+        half = np.sqrt(np.maximum(0.5 + 0.5 * _dots(towards, some.view), 0.0))
+        reflected = lobe * _visible_microfacets(some, towards) * _reflectance(some, half) * rays.width
+        diffuse = np.maximum(_dots(towards, some.diffuse_normal), 0.0) / np.pi
+        chosen2 = np.square(chances[0, chosen, None] * lobe + chances[1, chosen, None] * diffuse)
         pair = row * towards.shape[1] + ray
         excess = brightness * reflected.ravel()[pair]
         light2 = np.square(chance[number, row].astype(float) / np.maximum(solid_angle, 1e-12))
         weight = light2 / np.maximum(light2 + chosen2.ravel()[pair], 1e-30)
-        by_light[index[met]] += np.bincount(row, excess * weight, len(met))
-        by_lobe[index[met]] += np.bincount(row, excess * (1.0 - weight), len(met))
+        by_light[chosen] += np.bincount(row, excess * weight, len(met))
+        by_lobe[chosen] += np.bincount(row, excess * (1.0 - weight), len(met))
     return by_lobe, by_light
 
 
@@ -246,6 +244,11 @@ def _with_stand_ins(lights) -> tuple[tuple[Light, ...], np.ndarray]:
         others += group
         shares.append(share)
     return tuple(others), np.concatenate(shares)
+
+
+def _dots(directions, vectors) -> np.ndarray:
+    """Dot products (P, N) of directions (P, N, 3) with vectors (P, 3)."""
+    return np.einsum("pni,pi->pn", directions, vectors)
 
 
 def _numbered(values, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -406,7 +409,7 @@ def _plane_axes(corners, direction) -> np.ndarray:
 def _lobe_density(samples, towards) -> np.ndarray:
     """Probability (P, N) per sr with which the specular lobe chooses the directions."""
     half = towards + samples.view[:, None]
-    vertical = np.square(np.maximum(np.einsum("pni,pi->pn", half, samples.normal), 0.0))
+    vertical = np.square(np.maximum(_dots(half, samples.normal), 0.0))
     horizontal = np.maximum(np.square(half).sum(axis=2) - vertical, 0.0)
     alpha2 = np.square(np.maximum(samples.roughness**2, SMALLEST_ALPHA))[:, None]
     cosine = np.maximum((samples.normal * samples.view).sum(axis=1), 1e-3)[:, None]
@@ -418,7 +421,7 @@ def _visible_microfacets(samples, towards) -> np.ndarray:
     0 below the horizon of the lobe."""
     alpha2 = np.square(np.maximum(samples.roughness**2, SMALLEST_ALPHA))[:, None]
     to_eye = np.maximum((samples.normal * samples.view).sum(axis=1), 1e-3)[:, None]
-    to_light = np.maximum(np.einsum("pni,pi->pn", towards, samples.normal), 0.0)
+    to_light = np.maximum(_dots(towards, samples.normal), 0.0)
     slopes = [np.sqrt(cosine * cosine + alpha2 * (1.0 - cosine * cosine)) for cosine in (to_eye, to_light)]
     return to_light * (to_eye + slopes[0]) / np.maximum(to_eye * slopes[1] + to_light * slopes[0], 1e-30)
 
@@ -434,22 +437,24 @@ class _HorizonDirections:
     angle: np.ndarray  # (AROUND,) from the first of these to the second
 
     @classmethod
-    def of(cls, samples, is_quick: bool = False) -> _HorizonDirections:
-        """The directions of `samples`. With `is_quick`, each angle around the normal has only one of HEIGHTS."""
+    def of(cls, samples, is_quick: bool = False, is_side: bool = False) -> _HorizonDirections:
+        """The directions of `samples`. If any is True, each angle around the normal has only one of HEIGHTS; if both
+        are, there are half as many angles. A few suffice for a light as large as a side of the sky."""
         mirrored = 2.0 * (samples.normal * samples.view).sum(axis=1, keepdims=True) * samples.normal - samples.view
         flat = mirrored - (mirrored * samples.smooth_normal).sum(axis=1, keepdims=True) * samples.smooth_normal
         flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-12)
         across = np.cross(samples.smooth_normal, flat)
-        step = (np.arange(AROUND) + 0.5) / AROUND * 2.0 - 1.0
+        count = AROUND // 2 if is_quick and is_side else AROUND
+        step = (np.arange(count) + 0.5) / count * 2.0 - 1.0
         angle = np.pi * np.sinh(CONCENTRATION * step) / np.sinh(CONCENTRATION)
-        span = np.pi * CONCENTRATION * np.cosh(CONCENTRATION * step) / np.sinh(CONCENTRATION) * 2.0 / AROUND
+        span = np.pi * CONCENTRATION * np.cosh(CONCENTRATION * step) / np.sinh(CONCENTRATION) * 2.0 / count
         around = np.cos(angle)[:, None] * flat[:, None] + np.sin(angle)[:, None] * across[:, None]
         # Elevation of the mesh's horizon over the smooth one at these angles.
         gap = -np.arctan2(
-            np.einsum("pni,pi->pn", around, samples.geometric_normal),
+            _dots(around, samples.geometric_normal),
             np.einsum("pi,pi->p", samples.smooth_normal, samples.geometric_normal)[:, None],
         )
-        heights = np.resize(HEIGHTS, AROUND)[None] if is_quick else np.array(HEIGHTS)[:, None]
+        heights = np.resize(HEIGHTS, count)[None] if is_quick or is_side else np.array(HEIGHTS)[:, None]
         elevation = gap[:, None] * heights
         towards = np.cos(elevation)[..., None] * around[:, None]
         towards += np.sin(elevation)[..., None] * samples.smooth_normal[:, None, None]
@@ -457,13 +462,9 @@ class _HorizonDirections:
         count = len(samples)
         return cls(towards.reshape(count, -1, 3), width.reshape(count, -1), np.stack([flat, across], axis=1), angle)
 
-    def few(self) -> _HorizonDirections:
-        """A third of the directions, each with the solid angle of three, at alternating heights and without angles."""
-        around = np.arange(AROUND)
-        chosen = (around % len(HEIGHTS)) * AROUND + around
-        return _HorizonDirections(
-            self.towards[:, chosen], len(HEIGHTS) * self.width[:, chosen], self.flat, self.angle[:0]
-        )
+    def take(self, index) -> _HorizonDirections:
+        """The directions of the samples at `index` (Q,)."""
+        return _HorizonDirections(self.towards[index], self.width[index], self.flat[index], self.angle)
 
     def near(self, sample, offset, radius) -> tuple[np.ndarray, np.ndarray]:
         """Numbers (K,) of pairs, and of the directions of each pair that may meet its ball. The balls have the `radius`
@@ -474,8 +475,8 @@ class _HorizonDirections:
         turns = (self.angle + 2.0 * np.pi * np.array([-1.0, 0.0, 1.0])[:, None]).ravel()
         middle = np.arctan2(y, x)
         first = np.searchsorted(turns, middle - reach)
-        count = np.minimum(np.searchsorted(turns, middle + reach) - first, AROUND)
+        count = np.minimum(np.searchsorted(turns, middle + reach) - first, len(self.angle))
         pair = np.repeat(np.arange(len(sample)), count)
         step = np.arange(len(pair)) + np.repeat(first - np.cumsum(count) + count, count)
-        heights = np.arange(0, self.towards.shape[1], AROUND)
-        return np.repeat(pair, len(heights)), ((step % AROUND)[:, None] + heights).ravel()
+        heights = np.arange(0, self.towards.shape[1], len(self.angle))
+        return np.repeat(pair, len(heights)), ((step % len(self.angle))[:, None] + heights).ravel()

@@ -43,9 +43,9 @@ SKY_PRODUCT, LARGEST_OF_SKY = 0.1, 0.6
 # Least width of a lobe in rad, so that mirrors take the smallest patches.
 LEAST_WIDTH = 1e-7
 # The diffuse reflection of a sky is tabulated by normals on a cube. GRID: normals along each side of a face.
-# GRID_POINTS: directions that are added at a time. POINT_SIZE: largest half diagonal in rad of what counts as a single
-# direction.
-GRID, GRID_POINTS, POINT_SIZE = 33, 512, 0.04
+# GRID_POINTS: directions added at a time, few enough for the cache. POINT_SIZE: largest half diagonal in rad of what
+# counts as a single direction.
+GRID, GRID_POINTS, POINT_SIZE = 33, 256, 0.04
 # Samples whose patches are chosen at a time.
 PATCH_CHUNK = 1024
 # Width of GGX lobes in rad, in units of alpha: where the normal distribution has a quarter of its peak.
@@ -390,12 +390,15 @@ class PatchTree:
             normals[axis, 1, ..., axis] = -1.0
             normals[axis, ..., (axis + 1) % 3] = coordinate[:, None]
             normals[axis, ..., (axis + 2) % 3] = coordinate
-        normals = (normals / np.linalg.norm(normals, axis=-1, keepdims=True)).reshape(-1, 3).astype(np.float32)
-        result = np.zeros((len(normals), 3))
+        normals = (normals / np.linalg.norm(normals, axis=-1, keepdims=True)).reshape(6, -1, 3).astype(np.float32)
+        result = np.zeros(normals.shape)
         for toward, light in self._points():
             for start in range(0, toward.shape[1], GRID_POINTS):
-                block = slice(start, start + GRID_POINTS)
-                result += np.maximum(normals @ toward[:, block], np.float32(0.0)) @ light[:, block].T
+                directions, weights = (rows[:, start : start + GRID_POINTS] for rows in (toward, light))
+                weights = np.ascontiguousarray(weights.T)
+                for side, of_side in zip(result, normals, strict=True):
+                    cosine = of_side @ directions
+                    side += np.maximum(cosine, np.float32(0.0), out=cosine) @ weights
         return result.reshape(6, GRID, GRID, 3)
 
     def _points(self):

@@ -41,6 +41,8 @@ LEVELS = (16, 32, 64, 128, 256, 512)
 # The brightest pairs may get this many times the most rays of a pair: where lobes are narrow and lights half visible, a
 # few pixels cause most of the noise of a picture.
 BRIGHTEST, BRIGHTEST_OF_SKY = 4, 2
+# A pair needs more rays only if some of them arrive, and some do not, that carry more than this share of its light.
+NEGLIGIBLE = np.float32(0.01)
 # Rounds in which neighbors of mixed pairs get more rays. Neighbors that turn out mixed pass this on in the next round.
 ROUNDS = 4
 # Samples that share the rays to a sky are alike: their normals differ by at most LIKE_NORMAL, they lie in one plane but
@@ -209,6 +211,8 @@ class RatioEstimator:
         self.is_mesh = emitter.has_mesh if isinstance(emitter, LightCluster) else isinstance(light, PolygonLight)
         self.at_surface = self.is_mesh or isinstance(emitter, LightCluster)
         self.chosen_by, self.number, self.selection = surface.tracer.chosen_by(light.name), number, selection
+        # Rays that the surface and the light choose meet the same, but for those that are lifted.
+        self.meet_the_same = self.chosen_by.light and self.mask == self.surface_mask
         origins = light.viewpoint(surface.position)
         offset = (light.center[:, None] - origins).astype(np.float32)
         ahead = np.ones(offset.shape[1], bool)
@@ -264,8 +268,8 @@ class RatioEstimator:
             number = self._level(rays, np.maximum(*each))
             self.is_shared = alone > PROBES
         for _ in range(ROUNDS):
-            chosen = neighbors.any_around(self.index, self.visible) & neighbors.any_around(self.index, self.blocked)
-            chosen |= self._unmet()
+            chosen = np.logical_and(*(neighbors.any_around(self.index, mask) for mask in self._lit_and_dark()))
+            chosen |= np.logical_or(*self._unmet())
             chosen &= self.count < number
             if not chosen.any():
                 break
@@ -343,12 +347,14 @@ class RatioEstimator:
         levels = [level for level in LEVELS if level < limit] + [limit]
         return np.take(levels, np.searchsorted(levels, np.minimum(wanted, limit)))
 
+    def _lit_and_dark(self):
+        """Masks (2, Q) of the pairs of which a lobe has a share of more than NEGLIGIBLE, and less than 1 by as much."""
+        sums, passing = self.sum_w.sum(axis=1), self.sum_wv.sum(axis=1)
+        return [(share > NEGLIGIBLE * sums).any(axis=0) for share in (passing, sums - passing)]
+
     def _unmet(self):
-        """Mask (Q,) of the pairs with a lobe that no ray has met so far."""
-        unmet = np.zeros(len(self.index), bool)
-        for number, name in enumerate(PASSES):
-            unmet |= self.wanted[name] & (self.sum_w[number].sum(axis=0) == 0.0)
-        return unmet
+        """Masks (Q,) by pass of the pairs with a lobe that no ray has met so far."""
+        return [self.wanted[name] & (sums.sum(axis=0) == 0.0) for name, sums in zip(PASSES, self.sum_w, strict=True)]
 
     def _corner_heights(self, name, members):
         """Least height (V, M) of the light's corners over the horizons of a lobe, and the offsets (3, V, M) from the
@@ -367,15 +373,13 @@ class RatioEstimator:
 
     def _leave_out_unlit(self):
         """Drop lobes for which the whole light is below the horizon."""
-        for number, name in enumerate(PASSES):
-            unmet = np.flatnonzero(self.wanted[name] & (self.sum_w[number].sum(axis=0) == 0.0))
+        for name, unmet in zip(PASSES, map(np.flatnonzero, self._unmet()), strict=True):
             self.wanted[name][unmet] = self._corner_heights(name, unmet)[0].max(axis=0) > 0.0
 
     def _aim_at_corners(self):
         """Trace one ray to the highest corner of the light for each lobe that no ray met so far: such a lobe sees only
         a corner of the light."""
-        for number, name in enumerate(PASSES):
-            unmet = np.flatnonzero(self.wanted[name] & (self.sum_w[number].sum(axis=0) == 0.0))
+        for number, (name, unmet) in enumerate(zip(PASSES, map(np.flatnonzero, self._unmet()), strict=True)):
             if len(unmet) == 0:
                 continue
             heights, offset = self._corner_heights(name, unmet)
@@ -384,9 +388,11 @@ class RatioEstimator:
             toward /= np.maximum(distance, _TINY)
             if self.light.is_distant:
                 distance[:] = _FARTHEST
-            aimed = self.surface.ray_origins.aimed(self.index[unmet], toward[:, None], distance[None], self.at_surface)
+            *rays, _ = self.surface.ray_origins.aimed(
+                self.index[unmet], toward[:, None], distance[None], self.at_surface
+            )
             visibility = (
-                self._transmittance(self.mask, _ONE, *(rows[..., 0, :] for rows in aimed))
+                self._transmittance(self.mask, _ONE, *(rows[..., 0, :] for rows in rays))
                 if self.chosen_by.light
                 else _ONE
             )
@@ -431,7 +437,7 @@ class RatioEstimator:
         visibility, others = np.zeros(distance.shape, np.float32), None
         met = np.logical_or.reduce([weight > 0.0 for weight in weights.values()])
         flat = np.flatnonzero(met)
-        aimed = self.surface.ray_origins.aimed(sampler.index, directions, distance, self.at_surface)
+        *aimed, lifted = self.surface.ray_origins.aimed(sampler.index, directions, distance, self.at_surface)
         origins, *rest = (_taken(rows, flat) for rows in aimed)
         if self.chosen_by.light:
             falling = sampler.falling.ravel()[flat] if self.margin else _ONE
@@ -439,6 +445,10 @@ class RatioEstimator:
         else:
             visibility.ravel()[flat] = _ONE
         if self.chosen_by.surface:
+            if self.meet_the_same:
+                is_lifted = np.zeros(visibility.size, bool)
+                is_lifted[lifted] = True
+                origins, flat = origins[:, is_lifted[flat]], flat[is_lifted[flat]]
             others = self._chosen_by_surface(sampler, (directions, distance), flat, origins, visibility)
         least, most = visibility, visibility
         if others is not None:
@@ -466,12 +476,8 @@ class RatioEstimator:
         light's rays did; None if there are none. The light's rays start at `origins` (3, R), with
         `light_visibility` (S, Q)."""
         ray_origins = self.surface.ray_origins
-        meet_the_same = self.chosen_by.light and self.mask == self.surface_mask
-        if meet_the_same and not ray_origins.terminator[sampler.index].any():
-            return None
         directions, distance = (_taken(rows, flat) for rows in rays)
-        column = flat % light_visibility.shape[1]
-        index = sampler.index[column]
+        index = sampler.index[flat % light_visibility.shape[1]]
         start, toward, distance = ray_origins.from_surface(index, directions, distance)
         # The light chooses directions above the smooth horizon; the surface chooses directions above the mesh's.
         smooth, flat_facing = (
@@ -480,7 +486,7 @@ class RatioEstimator:
         )
         is_alone = (smooth <= 0.0) & (flat_facing > 0.0)
         chosen = (smooth <= 0.0) | (flat_facing > 0.0)
-        if meet_the_same:
+        if self.meet_the_same:
             chosen &= (start != origins).any(axis=0)
         chosen = np.flatnonzero(chosen)
         falling = sampler.falling.ravel()[flat[chosen]] if self.margin else _ONE

@@ -19,10 +19,6 @@ ALL_RAYS = 0xFFFFFFFF
 TERMINATOR_OFFSET = 0.1
 # Cycles' default of transparent bounces. A ray that meets more transparent surfaces is blocked.
 TRANSPARENT_SURFACES = 8
-# From this number of transparent surfaces on, parts that let all light through are dropped and no longer count.
-UNLIMITED = 1024
-# Most parts of all meshes with an image
-MOST_PIECES = 1 << 17
 # A ray continues behind a transparent surface at this multiple of its distance.
 STEP = np.float32(1.0 + 2.0**-21)
 # GAP: a step of single precision, as a share of the coordinates. What is within 4 of them of a plane is in it.
@@ -63,6 +59,12 @@ class Transparency:
                 f"transparency: {self.extension!r} and {self.interpolation!r}, expected one of {', '.join(EXTENSIONS)} "
                 f"and one of {', '.join(INTERPOLATIONS)}"
             )
+
+    @property
+    def is_opaque(self) -> bool:
+        """True if no pixel of the image lets light through, as of pictures with an alpha channel that is full."""
+        beside = self.outside if self.extension == "CLIP" else 0.0
+        return self.image is not None and not (self.transmittance_of(self.image).any() or self.transmittance_of(beside))
 
     def transmittance(self, triangle: np.ndarray, u: np.ndarray, v: np.ndarray, cosine=None) -> np.ndarray:
         """Shares (Q,) at the points (1 - u - v) a + u b + v c of triangles (Q,) with corners a, b, c.
@@ -202,7 +204,8 @@ class Occluders:
     def split(self) -> tuple[np.ndarray, np.ndarray]:
         """Numbers of the instances that block, and of those that let light through. Those without triangles are in
         neither."""
-        is_clear = np.array([mesh.transparency is not None for mesh in self.meshes], bool)[self.mesh]
+        is_clear = [mesh.transparency is not None and not mesh.transparency.is_opaque for mesh in self.meshes]
+        is_clear = np.array(is_clear, bool)[self.mesh]
         is_there = np.array([len(mesh.triangles) > 0 for mesh in self.meshes], bool)[self.mesh]
         return np.flatnonzero(is_there & ~is_clear), np.flatnonzero(is_there & is_clear)
 
@@ -462,135 +465,3 @@ class Hits:
     triangle: np.ndarray  # (H,)
     u: np.ndarray  # (H,) weight of the second corner
     v: np.ndarray  # (H,) weight of the third corner
-
-
-@dataclass(frozen=True)
-class TrianglePieces:
-    """T triangles to trace instead of a mesh. Each is a part of a `triangle` (T,) of the mesh; `corners` (T, 3, 2) are
-    the weights u, v of its corners there."""
-
-    triangle: np.ndarray
-    corners: np.ndarray
-
-    def vertices(self, mesh: OccluderMesh) -> np.ndarray:
-        """Corners (T, 3, 3) in float64."""
-        return _placed(mesh.vertices[mesh.triangles[self.triangle]].astype(np.float64), self.corners)
-
-    def take(self, mask: np.ndarray) -> TrianglePieces:
-        """The parts for which `mask` (T,) is True."""
-        return TrianglePieces(self.triangle[mask], self.corners[mask])
-
-    @classmethod
-    def joined(cls, several: list[TrianglePieces]) -> TrianglePieces:
-        """All pieces of `several`, one after another."""
-        return cls(*(np.concatenate([getattr(each, name) for each in several]) for name in ("triangle", "corners")))
-
-    def quarters(self) -> TrianglePieces:
-        """The four parts (4 T) into which the midpoints of its sides cut each."""
-        middles = 0.5 * (self.corners + self.corners[:, [1, 2, 0]])
-        a, b, c = (np.stack([self.corners[:, k], middles[:, k], middles[:, k - 1]], axis=1) for k in range(3))
-        return TrianglePieces(np.tile(self.triangle, 4), np.concatenate([a, b, c, middles]))
-
-
-def cut_outs(occluders: Occluders) -> dict[int, tuple[TrianglePieces, TrianglePieces]]:
-    """For meshes with an image, by number: the parts that block all light, and the parts that may let some through.
-
-    With them, few rays have to look at the image. Parts overlap a little, so that no ray slips between parts of
-    different sizes.
-    """
-    clear = [(number, mesh.transparency) for number, mesh in enumerate(occluders.meshes) if mesh.transparency]
-    cut = [number for number, one in clear if one.image is not None and one.extension != "MIRROR" and not one.cosines]
-    drops_clear = occluders.transparent_surfaces >= UNLIMITED
-    return {number: _cut_out(occluders.meshes[number], MOST_PIECES // len(cut), drops_clear) for number in cut}
-
-
-def _cut_out(mesh, most, drops_clear):
-    clear = mesh.transparency
-    values, outside = clear.transmittance_of(clear.image), clear.transmittance_of(clear.outside)
-    kinds = [_PixelCounts.of(values <= 0.0, clear, outside <= 0.0)]
-    if drops_clear:
-        kinds.append(_PixelCounts.of(values >= 1.0, clear, outside >= 1.0))
-    overlap, count = _overlaps(mesh), len(mesh.triangles)
-    remaining = TrianglePieces(np.arange(count), np.tile(_WHOLE, (count, 1, 1)))
-    blocking, mixed, count = [], [], 0
-    for level in range(_LEVELS + 1):
-        grown = remaining.corners
-        if level:
-            middle = remaining.corners.mean(axis=1, keepdims=True)
-            grown = grown + (2.0**level * overlap[remaining.triangle, None, None]) * (grown - middle)
-        pixel = _placed(clear.uv[remaining.triangle].astype(np.float64), grown) * clear.image.shape[::-1]
-        low, high = pixel.min(axis=1), pixel.max(axis=1)
-        is_one = [kind.all_within(low, high) for kind in kinds]
-        blocking.append(TrianglePieces(remaining.triangle, grown).take(is_one[0]))
-        rest = ~np.logical_or.reduce(is_one)
-        count += int(is_one[0].sum())
-        is_last = level == _LEVELS or count + 4 * int(rest.sum()) > most
-        fine = rest & (is_last | ((high - low).max(axis=1) < _FINEST) | ~(overlap[remaining.triangle] <= _WIDEST))
-        mixed.append(TrianglePieces(remaining.triangle, grown).take(fine))
-        count += int(fine.sum())
-        remaining = remaining.take(rest & ~fine).quarters()
-    return TrianglePieces.joined(blocking), TrianglePieces.joined(mixed)
-
-
-# _WHOLE: corners of a triangle. _LEVELS: most cuts of a triangle into four. _FINEST: size in pixels at which cutting
-# stops.
-_WHOLE, _LEVELS, _FINEST = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]), 8, 1.5
-# Largest overlap of parts as a share of their triangle.
-_WIDEST = 2.0**-12
-
-
-def _overlaps(mesh):
-    """Shares (T,) of triangles by which their parts overlap, more than the rounding of coordinates."""
-    a, b, c = np.moveaxis(mesh.vertices[mesh.triangles].astype(np.float64), 1, 0)
-    longest = np.sqrt(np.maximum.reduce([np.square(side).sum(axis=1) for side in (b - a, c - b, a - c)]))
-    height = np.linalg.norm(np.cross(b - a, c - a), axis=1) / np.maximum(longest, 1e-30)
-    reach = np.maximum.reduce([np.abs(corner).max(axis=1) for corner in (a, b, c)])
-    return 2.0**-20 * np.divide(reach, height, out=np.full(len(a), np.inf), where=height > 0.0)
-
-
-def _placed(corners, places):
-    """Points (T, N, K) with the weights u, v (T, N, 2) of triangles (T, 3, K)."""
-    a, b, c = np.moveaxis(corners[:, :, None], 1, 0)
-    u, v = places[..., :1], places[..., 1:]
-    return (1.0 - u - v) * a + u * b + v * c
-
-
-@dataclass(frozen=True)
-class _PixelCounts:
-    """How many pixels of an image are of a kind, to the left of and below each pixel."""
-
-    sums: np.ndarray  # (H + 1, W + 1)
-    repeats: bool
-    reach: float  # distance in pixels from its center up to which a pixel counts
-
-    @classmethod
-    def of(cls, mask, clear: Transparency, is_outside: bool) -> _PixelCounts:
-        """For a mask (H, W). If the image does not repeat, a border of one pixel stands for what is beside it."""
-        if clear.extension != "REPEAT":
-            mode = {"constant_values": is_outside} if clear.extension == "CLIP" else {"mode": "edge"}
-            mask = np.pad(mask, 1, **mode)
-        sums = np.zeros((mask.shape[0] + 1, mask.shape[1] + 1), np.int32)
-        np.cumsum(np.cumsum(mask, axis=0, dtype=np.int32), axis=1, out=sums[1:, 1:])
-        return cls(sums, clear.extension == "REPEAT", 0.5 if clear.interpolation == "Closest" else 1.0)
-
-    def all_within(self, low, high):
-        """Mask (T,) of the boxes from `low` to `high` (T, 2), in pixels, that see only pixels of the kind."""
-        slack = 0.01 + 1e-6 * np.maximum(np.abs(low), np.abs(high))
-        first = np.ceil(low - 0.5 - self.reach - slack).astype(np.int64)
-        last = np.floor(high - 0.5 + self.reach + slack).astype(np.int64) + 1
-        height, width = self.sums.shape[0] - 1, self.sums.shape[1] - 1
-        if not self.repeats:
-            size = width, height
-            first, last = np.clip(first + 1, 0, np.subtract(size, 1)), np.clip(last + 1, 1, size)
-        count = 0
-        for y, sign in ((last[:, 1], 1), (first[:, 1], -1)):
-            count = count + sign * (self._below(last[:, 0], y) - self._below(first[:, 0], y))
-        return count == (last - first).prod(axis=1)
-
-    def _below(self, x, y):
-        """Number (T,) of pixels of the kind to the left of columns x (T,) and below rows y (T,)."""
-        if not self.repeats:
-            return self.sums[y, x]
-        (rows, y), (columns, x) = np.divmod(y, self.sums.shape[0] - 1), np.divmod(x, self.sums.shape[1] - 1)
-        sums = self.sums
-        return rows * columns * int(sums[-1, -1]) + rows * sums[-1, x] + columns * sums[y, -1] + sums[y, x]

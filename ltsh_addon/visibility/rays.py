@@ -18,7 +18,7 @@ from itertools import repeat
 import numpy as np
 
 from ..scene import SceneError, SurfaceSamples, error_line, listed
-from .occluders import ALL_RAYS, STEP, ChosenBy, Hits, OccluderMesh, Occluders, Transparency, TrianglePieces, cut_outs
+from .occluders import ALL_RAYS, STEP, ChosenBy, Hits, OccluderMesh, Occluders, Transparency
 from .shadow_terminator import RayOrigins, ShadowTerminator
 
 # Names under which the system may know the library.
@@ -163,26 +163,24 @@ class _Packets:
 
 
 class _Scene:
-    """The instances `index` of `occluders` as an Embree scene. For meshes in `pieces`, by number, only these parts."""
+    """The instances `index` of `occluders` as an Embree scene."""
 
-    def __init__(self, embree: _Embree, occluders: Occluders, index: np.ndarray, pieces: dict[int, TrianglePieces]):
+    def __init__(self, embree: _Embree, occluders: Occluders, index: np.ndarray):
         self._embree, self._buffers, self._scenes = embree, [], []
-        self.scene, self.instances, self._pieces = None, index, pieces
-        self._mesh = occluders.mesh[index]
-        uses = np.bincount(self._mesh, minlength=len(occluders.meshes))
+        self.scene, self.instances = None, index
+        uses = np.bincount(occluders.mesh[index], minlength=len(occluders.meshes))
         shared: dict[int, int] = {}
         self.scene = self._new_scene()
         try:
             for number in index:
                 mesh, mask = int(occluders.mesh[number]), int(occluders.masks[number])
-                matrix, shape = occluders.matrices[number], (occluders.meshes[mesh], pieces.get(mesh))
-                # Parts keep the digits that they have in the space of their object.
-                if uses[mesh] == 1 and mesh not in pieces:
-                    self._add_triangles(self.scene, shape, matrix, mask)
+                matrix = occluders.matrices[number]
+                if uses[mesh] == 1:
+                    self._add_triangles(self.scene, occluders.meshes[mesh], matrix, mask)
                 else:
                     if mesh not in shared:
                         shared[mesh] = self._new_scene()
-                        self._add_triangles(shared[mesh], shape, None, ALL_RAYS)
+                        self._add_triangles(shared[mesh], occluders.meshes[mesh], None, ALL_RAYS)
                         embree.CommitScene(shared[mesh])
                     self._add_instance(shared[mesh], matrix, mask)
             embree.CommitScene(self.scene)
@@ -197,12 +195,8 @@ class _Scene:
         self._embree.SetSceneFlags(scene, _ROBUST)
         return scene
 
-    def _add_triangles(self, scene, shape, matrix, mask) -> None:
-        (mesh, pieces), embree = shape, self._embree
-        vertices, triangles = mesh.vertices, mesh.triangles
-        if pieces is not None:
-            vertices = pieces.vertices(mesh).reshape(-1, 3)
-            triangles = np.arange(len(vertices), dtype=np.uint32).reshape(-1, 3)
+    def _add_triangles(self, scene, mesh, matrix, mask) -> None:
+        embree, vertices, triangles = self._embree, mesh.vertices, mesh.triangles
         if matrix is not None:
             vertices = vertices.astype(np.float64) @ matrix[:, :3].T + matrix[:, 3]
         # Embree reads 4 bytes beyond the last vertex.
@@ -231,17 +225,6 @@ class _Scene:
         embree.AttachGeometry(scene, geometry)
         embree.ReleaseGeometry(geometry)
 
-    def hits(self, ray, distance, number, triangle, u, v) -> Hits:
-        """Hits by triangles and places on the meshes themselves. `number` (H,) counts the instances of this scene."""
-        mesh_of_hit = self._mesh[number] if self._pieces else ()
-        for mesh in self._pieces.keys() & set(np.unique(mesh_of_hit).tolist()):
-            here = np.flatnonzero(mesh_of_hit == mesh)
-            corners = self._pieces[mesh].corners[triangle[here]]
-            weights = np.stack([1.0 - u[here] - v[here], u[here], v[here]])
-            u[here], v[here] = np.einsum("cq,qck->kq", weights, corners)
-            triangle[here] = self._pieces[mesh].triangle[triangle[here]]
-        return Hits(ray, distance, self.instances[number], triangle, u, v)
-
     def close(self) -> None:
         while self._scenes:
             self._embree.ReleaseScene(self._scenes.pop(0))
@@ -259,13 +242,8 @@ class EmbreeCaster:
     def __init__(self, occluders: Occluders, embree: _Embree):
         self.description, self.library = f"Embree {embree.version}", embree.path
         self._embree, self._scenes = embree, []
-        pieces = cut_outs(occluders)
-        for number, index in enumerate(occluders.split()):
-            pieces_of_mesh = {mesh: both[number] for mesh, both in pieces.items()}
-            filled = [mesh for mesh, pieces in pieces_of_mesh.items() if len(pieces.triangle)]
-            whole = index[~np.isin(occluders.mesh[index], list(pieces_of_mesh))]
-            index = np.union1d(whole, np.flatnonzero(np.isin(occluders.mesh, filled)))
-            self._scenes.append(_Scene(embree, occluders, index, pieces_of_mesh))
+        for index in occluders.split():
+            self._scenes.append(_Scene(embree, occluders, index))
         self.has = tuple(len(scene.instances) > 0 for scene in self._scenes)
         self._packets = _Packets(embree.width, RAY_ROWS)
         self._hits = _Packets(embree.width, HIT_ROWS)
@@ -295,7 +273,7 @@ class EmbreeCaster:
         ray = np.flatnonzero(geometry != NONE)
         number = np.where(instance == NONE, geometry, instance)[ray]
         distance, u, v = (packets.get(row, count)[ray] for row in (FAR, U, V))
-        return scene.hits(ray, distance, number, packets.get(TRIANGLE, count, True)[ray], u, v)
+        return Hits(ray, distance, scene.instances[number], packets.get(TRIANGLE, count, True)[ray], u, v)
 
 
 class Tracer:

@@ -146,25 +146,30 @@ class RayOrigins:
 
     def origins(self, index: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Origins (R, 3) of rays along unit `directions` (R, 3) from the samples `index` (R,)."""
-        return self.origins_of_rows(index, directions.T[:, None])[:, 0].T
+        return self._origins_of_rows(index, directions.T[:, None])[0][:, 0].T
 
-    def origins_of_rows(self, index: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Origins (3, S, Q) of S rays from each of the samples `index` (Q,), along unit `directions` (3, S, Q)."""
-        normal, terminator = self.geometric_normal[index].T[:, None], self.terminator[index]
+    def _origins_of_rows(self, index: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Origins (3, S, Q) of S rays from each of the samples `index` (Q,), along unit `directions` (3, S, Q), and the
+        flat numbers (R,) of those that are lifted: all others are those of `from_surface`."""
+        normal, reach = self.geometric_normal[index].T[:, None], self.terminator[index]
         facing = dot(normal, directions)
-        side = np.copysign(self.clearance[index], facing)
-        smooth = np.flatnonzero(terminator)
-        lift = None
-        if len(smooth):
-            columns = slice(None) if len(smooth) == len(index) else smooth
-            rays = directions[:, :, columns], facing[:, columns], terminator[columns]
-            lift, side_of_triangle = self._lifts(index[columns], *rays)
-            side[:, columns] = np.where(side_of_triangle, np.abs(side[:, columns]) * side_of_triangle, side[:, columns])
-        origins = side * normal
+        origins = np.copysign(self.clearance[index], facing) * normal
         origins += self.position[index].T[:, None]
-        if lift is not None:
-            origins[:, :, columns] += lift
-        return origins
+        if not reach.any():
+            return origins, np.zeros(0, int)
+        height = dot(self.smooth_normal[index].T[:, None], directions)
+        flipped = np.where(height < 0.0, np.float32(-1.0), np.float32(1.0))
+        facing *= flipped
+        np.abs(height, out=height)
+        lifted = np.flatnonzero((facing < reach + np.maximum(reach - height, 0.0)) & (reach > 0.0))
+        facing, height, flipped = (values.ravel()[lifted] for values in (facing, height, flipped))
+        sample, reach = index[lifted % len(index)], reach[lifted % len(index)]
+        amount = np.clip(1.0 + np.maximum(1.0 - height / reach, 0.0) - facing / reach, 0.0, 1.0)
+        # As in Cycles, light from behind the sample's own triangle meets it.
+        moved = self.clearance[sample] * flipped * self.geometric_normal[sample].T + self.position[sample].T
+        moved += amount * self.lift[np.where(flipped < 0.0, 1, 0), sample].T
+        origins.reshape(3, -1)[:, lifted] = moved
+        return origins, lifted
 
     def from_surface(
         self, index: np.ndarray, directions: np.ndarray, distances: np.ndarray
@@ -178,36 +183,24 @@ class RayOrigins:
     def aimed(
         self, index: np.ndarray, directions: np.ndarray, distances: np.ndarray, at_surface: bool = False
     ) -> tuple[np.ndarray, ...]:
-        """Origins and unit directions (3, S, Q) and distances (S, Q) of S rays from each of the samples `index` (Q,).
+        """Origins and unit directions (3, S, Q) and distances (S, Q) of S rays from each of the samples `index` (Q,),
+        and the flat numbers (R,) of those that are lifted above their surface.
 
         Wherever a ray starts, it ends at `distances`, finite, along `directions` from the sample. Rays that start just
         the clearance above the sample keep their direction. With `at_surface` they do not: they end on a face that
         blocks rays itself, as the faces of mesh lights do, and at a grazing angle would meet it too early.
         """
-        origins = self.origins_of_rows(index, directions)
-        moved = origins - self.position[index].T[:, None]
+        origins, lifted = self._origins_of_rows(index, directions)
         if at_surface:
-            return origins, *_toward(directions, distances, moved)
-        lifted = np.flatnonzero(dot(moved, moved) > 4.0 * self.clearance[index] ** 2)
-        if len(lifted):
-            directions, distances = directions.copy(), distances.copy()
+            return origins, *_toward(directions, distances, origins - self.position[index].T[:, None]), lifted
+        sample = index[lifted % len(index)]
+        moved = origins.reshape(3, -1)[:, lifted] - self.position[sample].T
+        high = dot(moved, moved) > 4.0 * self.clearance[sample] ** 2
+        if high.any():
+            directions, distances, chosen = directions.copy(), distances.copy(), lifted[high]
             rows, ends = directions.reshape(3, -1), distances.ravel()
-            rows[:, lifted], ends[lifted] = _toward(rows[:, lifted], ends[lifted], moved.reshape(3, -1)[:, lifted])
-        return origins, directions, distances
-
-    def _lifts(self, index, directions, facing, terminator):
-        """How far above the sample (3, S, Q) rays of smooth samples start; and on which side of their own triangle (S,
-        Q) they start so as not to meet it: above (1), below (-1), or as the direction says (0)."""
-        smooth_facing = dot(self.smooth_normal[index].T[:, None], directions)
-        is_inside = smooth_facing < 0.0
-        flipped = np.where(is_inside, np.float32(-1.0), np.float32(1.0))
-        facing, smooth_facing = facing * flipped, np.abs(smooth_facing)
-        grazing = 1.0 + np.maximum(1.0 - smooth_facing / terminator, 0.0) - facing / terminator
-        amount = np.clip(grazing, 0.0, 1.0)
-        outside, inside = self.lift[:, index].transpose(0, 2, 1)[:, :, None]
-        # As in Cycles, light from behind the sample's own triangle meets it.
-        side_of_triangle = np.where((amount > 0.0) & (facing <= 0.0), flipped, np.float32(0.0))
-        return amount * np.where(is_inside, inside, outside), side_of_triangle
+            rows[:, chosen], ends[chosen] = _toward(rows[:, chosen], ends[chosen], moved[:, high])
+        return origins, directions, distances, lifted
 
 
 def _toward(directions, distances, moved):

@@ -29,7 +29,7 @@ class Tracer:
 
     def aimed(self, index, directions, distances, at_surface=False):
         origins = np.broadcast_to(self.position[index].T[:, None], directions.shape)
-        return origins.astype(np.float32), directions, distances
+        return origins.astype(np.float32), directions, distances, np.zeros(0, int)
 
     def transmittance(self, origins, directions, distances, masks):
         self.rays += len(origins)

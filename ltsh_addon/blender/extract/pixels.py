@@ -10,7 +10,6 @@ import bpy
 import numpy as np
 
 from ...scene import SceneError, error_line, light_records, listed
-from ...visibility.occluders import UNLIMITED
 from .. import render_settings
 from ..evaluated import SURFACE_TYPES, owner_of, read_values, rendered_surfaces, with_render_depsgraph
 from ..lights.area import LightInventory, collect_lights, note_overlaps, rendered_lights
@@ -25,6 +24,8 @@ from .occluders import collect_occluders, with_baked_shares
 
 # FAST_PIXELS: up to this many samples (about 1 GB of files), files are compressed fast instead of well.
 FAST_PIXELS = 10_000_000
+# Transparent surfaces that a camera ray passes, the most that Blender allows.
+UNLIMITED = 1024
 
 
 def render_pixel_samples(

@@ -14,7 +14,7 @@ from material_scenes import Build
 from ltsh_addon import imaging
 from ltsh_addon.pipeline import PictureOptions, compare_scene
 
-BAY, PIXELS = 2.4, 32  # m, and pixels of a side
+BAY, PIXELS = 2.4, 24  # m, and pixels of a side
 # Of the light that arrives in a bay, in each pass, beyond the noise of both sides.
 MOST_BIAS = {"specular": 0.02, "diffuse": 0.005}
 
@@ -144,6 +144,7 @@ def comparison(tmp_path_factory):
     return report, imaging.read_layers(folder / "compare.exr")
 
 
+@pytest.mark.newest
 @pytest.mark.parametrize("name", BAYS)
 def test_each_blocker_has_the_shadow_that_it_has_in_cycles(comparison, name):
     report, layers = comparison

@@ -309,6 +309,7 @@ def test_a_moved_light_is_followed_and_taken_back(shaded, go_on):
     assert bpy.ops.ltsh.shade() == {"FINISHED"}
 
 
+@pytest.mark.newest
 def test_pictures_without_kept_lights_say_so(shaded):
     scene, _ = shaded
     scene.ltsh.keep_lights = False

@@ -39,6 +39,7 @@ def command_line(*arguments):
     assert cli.main([*map(str, arguments), "--quiet"]) == 0
 
 
+@pytest.mark.newest
 def test_a_comparison_shows_what_the_command_line_writes(scene, tmp_path, reported):
     assert bpy.ops.ltsh.compare() == {"FINISHED"}
     assert [job.STARTING, *reported] == planned("compare")
@@ -126,6 +127,7 @@ def test_a_bake_is_shown_in_the_scene_and_taken_back(scene, tmp_path):
     assert preflight.problems(bpy.context, "bake") == []
 
 
+@pytest.mark.newest
 def test_a_scene_that_is_renamed_or_removed_meanwhile(scene):
     scene.name = "Before"
     hand = Hand("shade").start()
@@ -162,6 +164,7 @@ def test_a_process_that_dies_is_told(scene):
     assert hand.outcome == {"CANCELLED"} and hand.context.timers == []
 
 
+@pytest.mark.newest
 def test_what_cannot_be_shaded_or_started_is_told(scene, monkeypatch):
     bpy.data.objects["Light"].data.energy = 0.0
     assert "no light" in faults_of(bpy.ops.ltsh.shade)
@@ -169,6 +172,7 @@ def test_what_cannot_be_shaded_or_started_is_told(scene, monkeypatch):
     assert "cannot read" in faults_of(bpy.ops.ltsh.compare)
 
 
+@pytest.mark.newest
 def test_an_unexpected_fault_ends_the_job_with_one_line(scene, monkeypatch):
     monkeypatch.setattr(results, "show", fail)
     hand = Hand("shade").start().until(lambda: False)

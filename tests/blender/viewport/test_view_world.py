@@ -66,7 +66,7 @@ def set_up_scene(add_world):
 @pytest.mark.parametrize(
     ("add_world", "shadows", "most", "seen"),
     [
-        (add_constant, "on", 0.05, 2.0 * SEEN),
+        pytest.param(add_constant, "on", 0.05, 2.0 * SEEN, marks=pytest.mark.newest),
         (add_constant, "off", 0.012, 2.0 * SEEN),
         pytest.param(add_gradient, "off", 0.02, SEEN, marks=pytest.mark.newest),
     ],
@@ -89,7 +89,8 @@ def test_a_view_is_lit_by_the_world_as_pictures_are(capsys, tmp_path, add_world,
     assert not found["ltsh4.diffuse"][behind].any()
 
 
-@pytest.mark.parametrize("is_linked", [pytest.param(False, marks=pytest.mark.newest), True], ids=["own", "linked"])
+@pytest.mark.newest
+@pytest.mark.parametrize("is_linked", [False, True], ids=["own", "linked"])
 def test_windows_get_the_world_from_a_second_blender(tmp_path, is_linked):
     parts.empty_scene(*SIZE)
     world = add_gradient()

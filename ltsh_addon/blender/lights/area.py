@@ -337,7 +337,7 @@ def node_light(ob, matrix: np.ndarray, inventory: LightInventory, instance=None)
     if light.type == "SUN":
         # As in Cycles: a sun has no distance.
         emission.falloff = Falloff()
-    for problem in emission_warnings(emission, is_light=True):
+    for problem in emission_warnings(emission, is_light=True, is_flat=light.type == "AREA"):
         inventory.warn(f"light {ob.original.name!r}: {problem}")
     is_made = instance is not None and instance.is_instance
     of_parent = (instance.parent.original.name_full, *instance.persistent_id) if is_made else ()
@@ -347,11 +347,6 @@ def node_light(ob, matrix: np.ndarray, inventory: LightInventory, instance=None)
         "instance": (ob.original.name_full, *of_parent),
     }
     if light.type in ("AREA", "SUN"):
-        if emission.directional and light.type == "AREA":
-            nodes = ", ".join(sorted(emission.directional))
-            inventory.warn(
-                f"light {ob.original.name!r}: its emission depends on the direction ({nodes}), shaded as seen head-on"
-            )
         is_placed = light.type == "SUN" or emission.is_placed
         return NodeLight(light.original, matrix, emission.varies, is_placed=is_placed, **shared)
     is_ball = not light.use_soft_falloff and light.shadow_soft_size > 0.0

@@ -10,7 +10,7 @@ import bpy
 import numpy as np
 
 from ...cycles import planar_polygons
-from ...cycles.patches import ERROR, GRID, cut_into_patches, split_light
+from ...cycles.patches import GRID, cut_into_patches, note_patches, split_light
 from ...cycles.planar_polygons import FlatPolygon
 from ...scene import Light, PolygonLight, QuadLight
 from ..evaluated import SURFACE_TYPES, EmitterTraits, RenderedSurface, is_rendered, read_values, surface_instancer
@@ -238,9 +238,6 @@ def mark_transparent(ob, side: int, materials: list) -> None:
 
 def _warn_of_emission(mesh_light: MeshLight, warn) -> None:
     for material, emission in zip(mesh_light.materials, mesh_light.emission, strict=True):
-        if emission.emits and emission.directional:
-            nodes = ", ".join(sorted(emission.directional))
-            warn(f"material {material.name!r}: its emission depends on the direction ({nodes}), shaded as seen head-on")
         for problem in emission_warnings(emission, is_light=False) if emission.emits else ():
             warn(f"material {material.name!r}: {problem}")
         if emission.emits and material.displacement_method != "BUMP" and displaces(material):
@@ -374,12 +371,8 @@ def _patch_lights(mesh_light: MeshLight, textured, side: int, studio: Studio, wa
         if patches.whole is not None:
             lights.setdefault(polygon.label, []).extend(split_light(light, patches))
         errors.append(patches.error)
-    if max(errors) > ERROR:
-        patches = sum(len(light.leaves) for of_label in lights.values() for light in of_label)
-        warn(
-            f"object {mesh_light.ob.name!r}: its texture is shaded as {patches} patches of constant radiance, "
-            f"which differ from it by {100.0 * max(errors):.0f} % on average"
-        )
+    count = sum(len(light.leaves) for of_label in lights.values() for light in of_label)
+    note_patches(f"object {mesh_light.ob.name!r}: its texture", count, max(errors), warn)
     return lights
 
 

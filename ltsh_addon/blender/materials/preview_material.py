@@ -336,16 +336,13 @@ class _PreviewReader:
         """The lobes of one BSDF node."""
         bsdf = bsdf_of(source.node)
         if source.node.bl_idname == REFRACTION_NODE:
-            values = self._on_one_uv_map({"color": self._value(source, "color", "Color"), **share.values})
-            return [
-                PreviewMaterial(REFRACTION, values, weight=share.constant, view_factor=share.curve, is_stand_in=True)
-            ]
-        if bsdf is None:
+            kind, color = REFRACTION, self._value(source, "color", "Color")
+        elif bsdf is None:
             self.note(f"{source.node.bl_label} is not shown, its viewport color is")
-            values = {"color": constant(self.material.diffuse_color), **share.values}
-            return [
-                PreviewMaterial("diffuse", values, weight=share.constant, view_factor=share.curve, is_stand_in=True)
-            ]
+            kind, color = "diffuse", constant(self.material.diffuse_color)
+        if source.node.bl_idname == REFRACTION_NODE or bsdf is None:
+            values = self._on_one_uv_map({"color": color, **share.values})
+            return [PreviewMaterial(kind, values, weight=share.constant, view_factor=share.curve, is_stand_in=True)]
         look = self._lobe(source, bsdf, share)
         fuzz = self._sheen(source, look) if look.kind == "principled" else []
         coat = self._coat(source, look) if look.kind == "principled" else None
@@ -448,12 +445,10 @@ class _PreviewReader:
         normal = source.input("Normal") if "Normal" in source.node.inputs else None
         if normal is None or normal.node is None:
             return None, 1.0
-        node = normal.node
-        if node.bl_idname != "ShaderNodeNormalMap" or node.space != "TANGENT":
-            self.note(f"normals from {node.name!r} are not resolved, the surface is smooth")
-            return None, 1.0
-        color, strength = input_value(normal, "Color"), constant_inputs(normal, "Strength")
-        maps = {value.image.uv_map for value in values.values() if value.image is not None} | {node.uv_map}
+        node, color, strength, maps = normal.node, None, None, set()
+        if node.bl_idname == "ShaderNodeNormalMap" and node.space == "TANGENT":
+            color, strength = input_value(normal, "Color"), constant_inputs(normal, "Strength")
+            maps = {value.image.uv_map for value in values.values() if value.image is not None} | {node.uv_map}
         if color is None or strength is None or len(maps - {""}) > 1:
             self.note(f"normals from {node.name!r} are not resolved, the surface is smooth")
             return None, 1.0

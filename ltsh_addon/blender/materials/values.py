@@ -491,10 +491,8 @@ def is_srgb(image) -> bool | None:
 
 
 def opaque_pixels(image) -> np.ndarray | None:
-    """Pixels (H, W, 3) float32, row 0 at the bottom, Cycles' pink where there are none; None if not all are opaque."""
+    """Pixels (H, W, 3) float32, row 0 at the bottom; None if not all are opaque."""
     width, height = image.size
-    if not all(image.size):
-        return np.array([[[1.0, 0.0, 1.0]]], np.float32)
     pixels = np.empty(width * height * 4, np.float32)
     image.pixels.foreach_get(pixels)
     pixels = pixels.reshape(height, width, 4)

@@ -132,8 +132,13 @@ class ShadowTracer:
         return Shadows(shares, estimate.numbers, noise, estimate.rays, tracer, seconds, light, variance)
 
 
-def trace_shadows(extraction, passes: Sequence[str], rays: int, progress: Progress | None, workers=None) -> Shadows:
-    """The shadows of the samples of an `Extraction`; the samples of a pixel share `rays` per light."""
+def trace_shadows(
+    extraction, passes: Sequence[str], rays: int, progress: Progress | None, workers=None
+) -> Shadows | None:
+    """The shadows of the samples of an `Extraction`; the samples of a pixel share `rays` per light. None without
+    occluders."""
+    if extraction.occluders is None:
+        return None
     film = extraction.film
     sampling = visibility.ShadowSampling(passes, rays_of_samples(rays, film), film)
     with ShadowTracer(extraction.occluders, extraction.lights) as tracer:
@@ -152,10 +157,9 @@ def tell_expected(extraction, tables: dict[str, Shader], passes: Sequence[str], 
     for size in (sizes[0], *sizes):  # the first look also loads what all need
         chosen, times = np.sort(order[:size]), [time.perf_counter()]
         looked = replace(extraction, samples=extraction.samples.take(chosen), film=extraction.film.take(chosen))
-        looked, shadows = ended_at_horizons(looked), None
+        looked = ended_at_horizons(looked)
         times.append(time.perf_counter())
-        if extraction.occluders is not None:
-            shadows = trace_shadows(looked, passes, rays, None, workers=1)
+        shadows = trace_shadows(looked, passes, rays, None, workers=1)
         times.append(time.perf_counter())
         for name in names:
             shade_lights(looked.samples, looked.lights, tables[name], passes, (shadows, None), workers=1)

@@ -7,15 +7,17 @@ from __future__ import annotations
 
 import json
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
+from ..cycles.gbuffer import with_one_shadow
 from ..files import replacing
 from ..scene import Light, Progress, error_line, listed
-from .lighting import Shadows, load_tables, shade_lights
+from ..visibility import Occluders, ShadowSampling
+from .lighting import Shadows, ShadowTracer, load_tables, rays_of_samples, shade_lights
 from .relight import GRAIN, RelightData, color_of
 
 MIXER_FILE = "lights.npz"
@@ -197,6 +199,38 @@ def _with_bounces(data: RelightData, rows: list[MixerRow], members, layers) -> l
 def bounced_light(data: RelightData, row: MixerRow) -> np.ndarray:
     """The bounced light (H, W, 3) of a row; 0.0 where it has none."""
     return (np.array(row.share) * data.rest[row.group][..., :3]).astype(np.float32) if row.group else np.float32(0.0)
+
+
+RAYS_SHARE = 0.8  # of the time that a moved light takes
+
+
+def moved_light(
+    data: RelightData,
+    occluders: Occluders | None,
+    light: Light,
+    row: MixerRow,
+    progress: Callable[[float], bool | None],
+) -> np.ndarray:
+    """The picture (H, W, 3) of one light of `data` at a new place, by rays of it alone, plus the bounced light of its
+    `row`. `progress(fraction)` returns False to stop. Raises SceneError, TableError, Cancelled."""
+    (samples, film), picture = (data.extraction.samples, data.extraction.film), data.extraction.picture
+    passes, (table,), shadows = data.options["passes"], load_tables((data.technique,)).values(), None
+    if occluders is not None:
+        of_rays, film_of_rays, index = samples, film, slice(None)
+        if film.count is not None:
+            of_rays, film_of_rays, index = with_one_shadow(samples, film)
+        sampling = ShadowSampling(passes, rays_of_samples(data.options["shadow_rays"], film), film_of_rays)
+        with ShadowTracer(occluders, [light]) as tracer:
+            traced = tracer.trace(of_rays, sampling, progress=lambda _, share: progress(RAYS_SHARE * share))
+        shadows = traced.take(index)
+    start = 0.0 if shadows is None else RAYS_SHARE
+    (lit,) = shade_lights(
+        samples, [light], table, passes, (shadows,), progress=lambda share: progress(start + (1.0 - start) * share)
+    )
+    images = (
+        data.shown(name, moved=True) * film.image(picture.exposure * getattr(lit, name).sum(axis=0)) for name in passes
+    )
+    return (sum(images) + bounced_light(data, row)).astype(np.float32)
 
 
 class Mixer:

@@ -238,12 +238,3 @@ def typical_radiance(samples: SurfaceSamples, task: ShadowTask, tracer) -> tuple
     traced = replace(task, rays=PROBES).do((some, None, None), tracer)
     squares = {name: np.square(traced.radiance[name]).mean() if len(some) else 0.0 for name in task.passes}
     return {name: float(np.sqrt(square)) for name, square in squares.items()}, len(some)
-
-
-def shadow_task(
-    samples: SurfaceSamples, lights: Sequence[Light], tracer, passes: Sequence[str], rays: int
-) -> ShadowTask:
-    """The task that finds the shares of `lights` with at most `rays` per pair, as `trace_visibility` does."""
-    (emitters, _), passes = emitters_of(lights, tracer), tuple(passes)
-    task = ShadowTask(emitters, passes, rays // PROBES * PROBES, dict.fromkeys(passes, 1.0), False)
-    return replace(task, typical=typical_radiance(samples, task, tracer)[0])

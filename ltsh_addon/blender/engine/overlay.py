@@ -7,11 +7,9 @@ from dataclasses import dataclass, field
 
 import blf
 import bpy
-import gpu
-from gpu_extras.batch import batch_for_shader
 
 from ...scene import CYCLES, TECHNIQUES
-from ..ui.overlay import PLATE, covered, draw_rectangle
+from ..ui.overlay import PLATE, covered, draw_handle, draw_rectangle
 from ..ui.preview import ENGINE
 
 MOST_NOTES = 4
@@ -252,7 +250,6 @@ class LTSH_GGT_left_out(bpy.types.GizmoGroup):
 
 
 REACH = 8.0  # pixels of an unscaled interface
-HANDLE = 12.0
 
 
 def is_split(context) -> bool:
@@ -270,20 +267,9 @@ class LTSH_GT_split(bpy.types.Gizmo):
         return 0 if abs(location[0] - context.scene.ltsh_view.split_position * context.region.width) <= reach else -1
 
     def draw(self, context):
-        """Draw the handle, an arrow to either side; the line is part of the picture."""
-        size = HANDLE * context.preferences.system.ui_scale * (1.25 if self.is_highlight else 1.0)
-        x, y = context.scene.ltsh_view.split_position * context.region.width, 0.5 * context.region.height
-        shader = gpu.shader.from_builtin("UNIFORM_COLOR")
-        gpu.state.blend_set("ALPHA")
-        shader.bind()
-        for grown, color in ((0.3 * size, (0.0, 0.0, 0.0, 0.6)), (0.0, (0.95, 0.95, 0.95, 1.0))):
-            shader.uniform_float("color", color)
-            corners = []
-            for side in (-1.0, 1.0):
-                inner, tip = x + side * (0.4 * size - 0.5 * grown), x + side * (1.2 * size + grown)
-                corners += [(inner, y + 0.8 * size + grown), (inner, y - 0.8 * size - grown), (tip, y)]
-            batch_for_shader(shader, "TRIS", {"pos": [(*corner, 0.0) for corner in corners]}).draw(shader)
-        gpu.state.blend_set("NONE")
+        """Draw the handle; the line is part of the picture."""
+        region, scale = context.region, context.preferences.system.ui_scale * (1.25 if self.is_highlight else 1.0)
+        draw_handle(context.scene.ltsh_view.split_position * region.width, 0.5 * region.height, scale)
 
     def invoke(self, context, event):
         self.start = context.scene.ltsh_view.split_position
@@ -315,9 +301,6 @@ class LTSH_GGT_split(bpy.types.GizmoGroup):
     def setup(self, context):
         self.line = self.gizmos.new(LTSH_GT_split.bl_idname)
         self.line.use_draw_modal = True
-
-
-CLASSES = (LTSH_GT_left_out, LTSH_GGT_left_out, LTSH_GT_split, LTSH_GGT_split)
 
 
 def register() -> None:

@@ -13,7 +13,6 @@ from pathlib import Path
 import bpy
 from bpy.app.translations import pgettext_iface as translated
 from bpy.props import EnumProperty, StringProperty
-from bpy_extras.io_utils import ExportHelper
 
 from ...files import replacing
 from ...scene import SceneError, error_line, listed
@@ -377,38 +376,6 @@ class LTSH_OT_swap(_NeedsResults, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LTSH_OT_save_exr(_NeedsResults, ExportHelper, bpy.types.Operator):
-    """Save all layers of these results as one multi-layer OpenEXR file of 32-bit floats"""
-
-    bl_idname = "ltsh.save_exr"
-    bl_label = "Save As Multi-Layer EXR"
-
-    filename_ext = ".exr"
-    filter_glob: StringProperty(default="*.exr", options={"HIDDEN"})
-
-    def invoke(self, context, event):
-        self.filepath = self._source(context).name
-        return super().invoke(context, event)
-
-    def execute(self, context):
-        source = self._source(context)
-        try:
-            if Path(self.filepath).exists() and Path(self.filepath).samefile(source):
-                return {"FINISHED"}
-            with replacing(self.filepath) as temporary:
-                shutil.copyfile(source, temporary)
-        except OSError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
-        self.report({"INFO"}, f"Saved {self.filepath}")
-        return {"FINISHED"}
-
-    def _source(self, context) -> Path:
-        result = results.result_of(context.scene)
-        group = result.groups[results.choice_of(context.scene.ltsh, result).group]
-        return result.folder.parent / group["multilayer"]
-
-
 class LTSH_OT_apply_bake(bpy.types.Operator):
     """Let the objects of the last bake show their textures: they get copies of their materials"""
 
@@ -522,21 +489,6 @@ class LTSH_OT_manual(bpy.types.Operator):
         return {"FINISHED"}
 
 
-CLASSES = (
-    LTSH_OT_shade,
-    LTSH_OT_compare,
-    LTSH_OT_bake,
-    LTSH_OT_watch,
-    LTSH_OT_cancel,
-    LTSH_OT_open_results,
-    LTSH_OT_show_results,
-    LTSH_OT_choose,
-    LTSH_OT_swap,
-    LTSH_OT_save_exr,
-    LTSH_OT_apply_bake,
-    LTSH_OT_restore_materials,
-    LTSH_OT_manual,
-)
 HANDLERS = (("load_pre", _stop),)
 
 

@@ -12,11 +12,10 @@ from functools import cached_property
 
 import numpy as np
 
-from ..cycles.horizons import SMALLEST_ALPHA, lobe_selection_pmf
+from ..cycles.horizons import lobe_density, lobe_selection_pmf
 from ..cycles.light_tree import light_selection_pmf, light_tree_rows
 from ..emitters.facing import FacingDisk
 from ..emitters.light_polygons import may_reach, off_plane
-from ..lobes import brdf
 from ..lobes.polygon import dot
 from ..scene import FARTHEST, PASSES, Film, FlatLight, Light, PointLight, PolygonLight, SurfaceSamples, round_outline
 from .emitter import Emitter, Sky
@@ -584,17 +583,8 @@ class LightSelection:
                     specular / whole if name == "specular" else 0.0 * specular,
                     diffuse / whole if name == "diffuse" else 0.0 * diffuse,
                 )
-            density[here] += specular * self._lobe_density(sample, directions[here])
+            chosen = lobe_density(self._samples.take(sample), directions[here, None])[:, 0]
+            density[here] += specular * chosen
             cosine = np.einsum("rk,rk->r", directions[here], self._samples.diffuse_normal[sample])
             density[here] += diffuse * np.maximum(cosine, 0.0) / np.pi
         return density
-
-    def _lobe_density(self, index, directions):
-        samples = self._samples
-        normal, view = samples.normal[index], samples.view[index]
-        half = directions + view
-        vertical = np.square(np.maximum(np.einsum("rk,rk->r", half, normal), 0.0))
-        horizontal = np.maximum(np.square(half).sum(axis=1) - vertical, 0.0)
-        alpha2 = np.square(np.maximum(samples.roughness[index] ** 2, SMALLEST_ALPHA))
-        cosine = np.maximum(np.einsum("rk,rk->r", normal, view), 1e-3)
-        return brdf.visible_normal_density(cosine, horizontal, vertical, alpha2)

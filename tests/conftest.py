@@ -63,6 +63,8 @@ CASES_OF_OLDER = {
     },
     "test_what_blocks_a_world_blocks_it_as_in_cycles": {"sky with a sun"},
     "test_a_mesh_lights_as_in_cycles": {"plane, back down", "concave polygon", "mirrored and stretched ball"},
+    "test_a_metal_plane_is_shaded_as_the_integral_over_the_light_says": {"point"},
+    "test_points_spread_over_texels_give_the_mean_that_cycles_bakes": {"mapped tiles"},
     "test_texels_are_what_pixels_are": {"sheen_on_coat", "mix", "colors_under_alpha"},
     "test_the_picture_is_that_of_a_plain_render": {"perspective", "orthographic", "tall pixels", "cropped at 50 %"},
     "test_lobes_end_where_those_of_cycles_do": {"bumps-0.2-sides1-0.0", "coarse-0.9-sides3-0.0"},
@@ -72,6 +74,7 @@ CASES_OF_OLDER = {
     "test_the_viewport_shows_what_cycles_sampled": {
         f"{name}-PERSP" for name in ("plain", "scattered", "layered", "masked", "brushed", "rough", "bent")
     },
+    "test_the_render_region_is_a_part_of_the_whole_picture": {"False"},
     "test_a_final_picture_is_the_sum_of_its_lights_and_the_rest": {"settings0", "settings3"},
     "test_the_session_and_the_file_stay_as_they_are": {"compare", "cancelled in Cycles", "an exception in the middle"},
     "test_scripts_in_a_file_run_only_when_asked_for": {"False-shade", "True-bake"},

@@ -212,7 +212,7 @@ def _excess(samples, shapes, chances, choose, is_quick):
         met, row = _numbered(row, len(there))
         some, chosen, towards = some.take(met), there[met], rays.towards[met]
         chance = choose(some.position, some.smooth_normal)
-        lobe = _lobe_density(some, towards)
+        lobe = lobe_density(some, towards)
         half = np.sqrt(np.maximum(0.5 + 0.5 * _dots(towards, some.view), 0.0))
         reflected = lobe * _visible_microfacets(some, towards) * _reflectance(some, half) * rays.width[met]
         diffuse = np.maximum(_dots(towards, some.diffuse_normal), 0.0) / np.pi
@@ -404,8 +404,8 @@ def _plane_axes(corners, direction) -> np.ndarray:
     return np.stack([first, np.cross(direction, first), -direction], axis=1)
 
 
-def _lobe_density(samples, towards) -> np.ndarray:
-    """Probability (P, N) per sr with which the specular lobe chooses the directions."""
+def lobe_density(samples, towards: np.ndarray) -> np.ndarray:
+    """Probability (P, N) per sr with which the specular lobe chooses the unit directions (P, N, 3)."""
     half = towards + samples.view[:, None]
     vertical = np.square(np.maximum(_dots(half, samples.normal), 0.0))
     horizontal = np.maximum(np.square(half).sum(axis=2) - vertical, 0.0)

@@ -168,7 +168,7 @@ class AlikeLights:
 
 
 class Lights(list):
-    """Lights (light, row, corners) that affect one pass. Trees of many lights are built once.
+    """Lights (light, row, corners) that affect one pass. Trees of many lights are built once, and kept by the first.
 
     The last `leaf_count` are leaves of textured lights.
     """
@@ -183,7 +183,14 @@ class Lights(list):
         lights, leaves = ([one for one in many if getattr(one[0], f"affects_{name}")] for many in (lights, leaves))
         result = cls(lights + leaves)
         result.leaf_count = len(leaves)
-        return result
+        if len(result) < FEWEST:
+            return result
+        cached = vars(result[0][0]).setdefault("_lights", result)
+        pairs = zip(result, cached, strict=False)
+        is_same = (len(cached), cached.leaf_count) == (len(result), len(leaves))
+        if not (is_same and all(one[0] is other[0] and one[1] == other[1] for one, other in pairs)):
+            cached = vars(result[0][0])["_lights"] = result
+        return cached
 
     @cached_property
     def trees(self) -> list[tuple[LightTree, list[int]]]:

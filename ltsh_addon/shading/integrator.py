@@ -129,6 +129,8 @@ class Task:
         if self.single:
             for lights in (self._with_patches or {}).values():
                 _ = lights.skies
+            for lights in self._plain.values():
+                _ = lights.trees, lights.alike
 
     def _by_pass(self, lights, leaves=()):
         lights, leaves = _prepared(lights), _prepared(leaves)

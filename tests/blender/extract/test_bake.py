@@ -81,7 +81,7 @@ def test_diffuse_light_is_the_irradiance_over_pi_and_leaves_colors_out(tmp_path)
 def test_textures_groups_and_mixes_agree_with_the_bake_of_cycles(tmp_path):
     textured_scene()
     report, files = baked(
-        save(tmp_path), tmp_path / "out", techniques=("reference", "ltsh4c"), error=True, cycles_samples=256, margin=2
+        save(tmp_path), tmp_path / "out", techniques=("reference", "ltsh4c"), error=True, cycles_samples=128, margin=2
     )
     assert report["problems"] == [] and set(files) == {"Plane.exr", "Sphere.exr"}
     for name, layers in files.items():

@@ -164,7 +164,7 @@ def rendered_surfaces(depsgraph) -> list[RenderedSurface]:
 
 def is_surface(instance) -> bool:
     """True for an instance that has a surface and is shown."""
-    return instance.object.type in SURFACE_TYPES and instance.show_self
+    return instance.object.type in SURFACE_TYPES and instance.show_self and is_rendered(instance.object)
 
 
 def is_rendered(ob) -> bool:

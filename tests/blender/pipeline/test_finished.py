@@ -311,7 +311,7 @@ def test_a_kept_finished_picture_is_the_sum_of_its_lights_and_the_rest(out, tmp_
     mixed = light_pictures(data)
     assert len(mixed.layers) == 2
     np.testing.assert_allclose(mixed.layers.sum(axis=0), combined[..., :3], rtol=1e-4, atol=1e-5)
-    # Its light alone, where it was, without what Cycles tells of it: rays of its own, as many as of all lights together.
+    # Its light alone, where it was, without what Cycles tells: rays of its own, as many as of all lights together.
     mixed = light_pictures(replace(RelightData.load(out / "render.samples.npz"), edges={}))
     occluders, light = Occluders.load(out / "render.occluders.npz"), light_of(mixed.rows[0].light)
     alone = moved_light(data, occluders, light, mixed.rows[0], lambda share: True)

@@ -63,39 +63,35 @@ def normals_at_corners(mesh) -> np.ndarray:
 SURFACE_TYPES = ("MESH", "CURVE", "SURFACE", "FONT", "META", "CURVES", "POINTCLOUD")
 
 
-class _InventoryEngine(bpy.types.RenderEngine):
-    bl_idname = "LTSH_INVENTORY"
-    bl_label = "LTSH inventory"
-    visit: Callable | None = None
-    outcome: list = []
+def with_render_depsgraph(scene, visit: Callable, *, graphics: bool = False):
+    """The result of `visit(depsgraph)`, called with the depsgraph of a final render of `scene`; with `graphics` it may
+    use the graphics card."""
+    outcome: dict = {}
 
-    def render(self, depsgraph):
-        # An exception here would be printed and swallowed by Blender: hand it over instead.
-        try:
-            _InventoryEngine.outcome.append((_InventoryEngine.visit(depsgraph), None))
-        except Exception as error:
-            _InventoryEngine.outcome.append((None, error))
+    class Engine(bpy.types.RenderEngine):
+        bl_idname, bl_label, bl_use_gpu_context = "LTSH_INVENTORY", "LTSH inventory", graphics
 
+        def render(self, depsgraph):
+            # An exception here would be printed and swallowed by Blender: hand it over instead.
+            try:
+                outcome["value"] = visit(depsgraph)
+            except Exception as error:
+                outcome["error"] = error
 
-def with_render_depsgraph(scene, visit: Callable):
-    """The result of `visit(depsgraph)`, called with the depsgraph of a final render of `scene`."""
     engine, filepath = scene.render.engine, scene.render.filepath
-    _InventoryEngine.visit, _InventoryEngine.outcome = visit, []
-    bpy.utils.register_class(_InventoryEngine)
+    bpy.utils.register_class(Engine)
     try:
-        scene.render.engine = _InventoryEngine.bl_idname
+        scene.render.engine = Engine.bl_idname
         bpy.ops.render.render(scene=scene.name)
     finally:
         scene.render.engine, scene.render.filepath = engine, filepath
         # Blender 4.5 hangs at exit when an engine is still registered.
-        bpy.utils.unregister_class(_InventoryEngine)
-        _InventoryEngine.visit = None
-    if not _InventoryEngine.outcome:
+        bpy.utils.unregister_class(Engine)
+    if not outcome:
         raise RuntimeError(f"scene {scene.name!r}: Blender did not evaluate it for rendering, expected one view layer")
-    value, error = _InventoryEngine.outcome[0]
-    if error is not None:
-        raise error
-    return value
+    if "error" in outcome:
+        raise outcome["error"]
+    return outcome["value"]
 
 
 @dataclass(frozen=True)
@@ -168,7 +164,7 @@ def rendered_surfaces(depsgraph) -> list[RenderedSurface]:
 
 def is_surface(instance) -> bool:
     """True for an instance that has a surface and is shown."""
-    return instance.object.type in SURFACE_TYPES and instance.show_self
+    return instance.object.type in SURFACE_TYPES and instance.show_self and is_rendered(instance.object)
 
 
 def is_rendered(ob) -> bool:

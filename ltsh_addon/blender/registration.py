@@ -11,8 +11,8 @@ import bpy
 
 from ..cli.progress import reserve_stdout
 
-# Modules of this package: their CLASSES, HANDLERS (pairs of a name and a function), register() and unregister(), as far
-# as they have them. Each needs only those before it.
+# Modules of this package: their CLASSES (by default all that they define), HANDLERS (pairs of a name and a function),
+# register() and unregister(), as far as they have them. Each needs only those before it.
 PARTS = (
     "ui.settings",
     "engine.settings",
@@ -42,7 +42,7 @@ def register(command_line: Callable[..., int]) -> None:
         added.callback(bpy.utils.unregister_cli_command, bpy.utils.register_cli_command("ltsh", run))
         for name in PARTS:
             part = importlib.import_module(f".{name}", __package__)
-            for kind in getattr(part, "CLASSES", ()):
+            for kind in getattr(part, "CLASSES", None) or _defined_in(part):
                 bpy.utils.register_class(kind)
                 added.callback(bpy.utils.unregister_class, kind)
             for event, function in getattr(part, "HANDLERS", ()):
@@ -54,6 +54,12 @@ def register(command_line: Callable[..., int]) -> None:
         _registered.push(added.pop_all())
     # Blender 4.5 hangs at exit if an engine is still registered.
     atexit.register(unregister)
+
+
+def _defined_in(part) -> list[type]:
+    """The classes for Blender that the module `part` defines, in their order."""
+    kinds = [kind for kind in vars(part).values() if isinstance(kind, type) and hasattr(kind, "bl_rna")]
+    return [kind for kind in kinds if kind.__module__ == part.__name__]
 
 
 def _remove_handler(event: str, function: Callable) -> None:

@@ -18,6 +18,7 @@ DEFAULTS = {
     "film_exposure": 1.0,
     "filter_width": 1.5,
     "is_portal": False,
+    **{"camera_cull_margin": 0.1, "distance_cull_margin": 50.0},
     "pixel_filter_type": "BLACKMAN_HARRIS",
     "transparent_max_bounces": 8,
     "use_bump_map_correction": True,

@@ -235,6 +235,13 @@ def _in_space(light: Light, outline: np.ndarray) -> np.ndarray:
     return corners[::-1] if mirrored else corners
 
 
+def note_patches(whose: str, count: int, error: float, warn) -> None:
+    """Call `warn(text)` if `count` patches differ by more than ERROR from the emission for which they stand."""
+    if error > ERROR:
+        off = f"which differ from it by {100.0 * error:.0f} % on average"
+        warn(f"{whose} is shaded as {count} patches of constant radiance, {off}")
+
+
 def clip_to_cell(outline: np.ndarray, cell) -> np.ndarray:
     """The part (W, 2) of a polygon (V, 2) in the rectangle left, right, bottom, top (Sutherland and Hodgman 1974).
 

@@ -94,7 +94,6 @@ class TexelMesh:
     normals: np.ndarray  # (T, 3, 3) unit shading normals, custom normals included
     uv: np.ndarray  # (T, 3, 2)
     material: np.ndarray  # (T,) number of the material
-    vertices: np.ndarray  # (T, 3) numbers of the vertices in the mesh
     mirrored: bool | np.ndarray = False  # True: the transform turns right hands into left ones
     receiver: int | np.ndarray = 0  # as in `SurfaceSamples`
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .planar_polygons import connected
+from ..lobes.polygon import clip_to_horizon
 
 # Blender's bake shifts its sampling points by this much, in texels, so that centers exactly on an edge belong to one
 # side. The same shift here gives the same texels.
@@ -185,33 +185,14 @@ def _covered_point(corners, half, u, v):
 
 
 def _borders(corners, half):
-    """Ends (Q, 7, 2, 2) of the borders of the parts of the square of +-half around the origin that triangles (Q, 3, 2)
-    cover. These are the parts of the triangle's sides in the square, and of the square's sides in the triangle; both
-    ends are equal if there is none.
-    """
-    square = half * np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
-    square = np.broadcast_to(square, (len(corners), 4, 2))
-    turn = np.sign(cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))[:, None]
-    parts = [_clipped(corners, square, np.ones_like(turn)), _clipped(square, corners, turn)]
-    return np.concatenate(parts, axis=1)
-
-
-def _clipped(polygons, clips, turn):
-    """Ends (Q, V, 2, 2) of the parts of the sides of `polygons` (Q, V, 2) inside `clips` (Q, C, 2). `turn` (Q, 1) is
-    the sense of rotation of `clips`."""
-    start, side = polygons, np.roll(polygons, -1, axis=1) - polygons
-    first, last = np.zeros(polygons.shape[:2]), np.ones(polygons.shape[:2])
-    for corner, following in zip(np.moveaxis(clips, 1, 0), np.moveaxis(np.roll(clips, -1, axis=1), 1, 0), strict=True):
-        edge = (following - corner)[:, None]
-        inside = turn * cross(edge, start - corner[:, None])
-        rate = turn * cross(edge, side)
-        at = np.divide(-inside, rate, out=np.where(inside < 0.0, np.inf, -np.inf), where=rate != 0.0)
-        first = np.where((rate > 0.0) | ((rate == 0.0) & (inside < 0.0)), np.maximum(first, at), first)
-        last = np.where(rate < 0.0, np.minimum(last, at), last)
-    last = np.maximum(first, last)
-    some = last > first
-    shares = np.stack([np.where(some, first, 0.0), np.where(some, last, 0.0)], axis=-1)
-    return start[:, :, None] + shares[..., None] * side[:, :, None]
+    """Ends (Q, S, 2, 2) of the borders of the parts of the square of +-half around the origin that triangles (Q, 3, 2)
+    cover; both ends are equal if there is none. The origin is on each triangle."""
+    x, y = np.moveaxis(corners, (2, 1), (0, 1))
+    part = np.stack([x, y, half - x, half + x, half - y, half + y])
+    for side in range(2, len(part)):
+        part = clip_to_horizon(part, side)
+    corners = np.moveaxis(part[:2], (0, 1), (2, 1))
+    return np.stack([corners, np.roll(corners, -1, axis=1)], axis=2)
 
 
 def _center_spans(corners, first_row, row_count, size):
@@ -400,129 +381,3 @@ def tiles_of(uv: np.ndarray) -> tuple[list[int], float]:
         return sorted(set((1001 + column + 10 * row).tolist())), 0.0
     touching = (uv.min(axis=1) < 1.0).all(axis=1) & (uv.max(axis=1) > 0.0).all(axis=1)
     return ([1001] if touching.any() else []), float(0.5 * area.sum())
-
-
-# UV coordinates closer than this are the same.
-SAME_UV = 1e-6
-# Points in one chunk.
-POINTS_PER_BLOCK = 32768
-_NEIGHBORS = [(x, y) for y in (-1, 0, 1) for x in (-1, 0, 1)]
-
-
-@dataclass(frozen=True)
-class UvSeams:
-    """E edges of triangles where a UV map is cut but the surface is not, in texels of one tile."""
-
-    edges: np.ndarray  # (E, 2, 2) both ends
-    outward: np.ndarray  # (E, 2) unit
-    beyond: np.ndarray  # (E, 2, 2) the same ends on the other side of the cut
-    inward: np.ndarray  # (E, 2) unit, into the triangle on the other side
-    island: np.ndarray  # (E,) number of the island on the other side
-    islands: np.ndarray  # (T,) number of the island, the connected part of the UV map, of each triangle
-    size: tuple[int, int]  # width, height
-    cells: np.ndarray  # (N,) increasing: texels through which edges pass, (y + 1) * (W + 2) + x + 1
-    crossing: np.ndarray  # (N,) number of the edge
-
-    @classmethod
-    def of(cls, uv: np.ndarray, vertices: np.ndarray, width: int, height: int, tile=(0, 0)) -> UvSeams:
-        """Seams of triangles uv (T, 3, 2) with mesh vertices (T, 3), on a texture that fills the unit square at
-        `tile`."""
-        uv = np.asarray(uv, dtype=np.float64)
-        edge, partner = _paired(vertices)
-        same = _ends(vertices, edge) == _ends(vertices, partner)
-        ends, others = _ends(uv, edge), _ends(uv, partner)
-        others = np.where(same[:, :1, None], others, others[:, ::-1])
-        together = (np.abs(ends - others) <= SAME_UV).all(axis=(1, 2))
-        islands = connected(len(uv), np.stack([edge[together], partner[together]], axis=1) // 3)
-        corners = (uv - np.asarray(tile)) * (width, height)
-        third, other_third = _third(corners, edge), _third(corners, partner)
-        ends, others = ((pair - np.asarray(tile)) * (width, height) for pair in (ends, others))
-        with np.errstate(invalid="ignore"):
-            inward, other_inward = _towards(ends, third), _towards(others, other_third)
-            cut = ~together & np.isfinite(inward).all(axis=1) & np.isfinite(other_inward).all(axis=1)
-        edges = ends[cut]
-        cells, crossing = _cells(edges, width, height)
-        island = islands[partner[cut] // 3]
-        parts = (edges, -inward[cut], others[cut], other_inward[cut], island, islands)
-        return cls(*parts, (width, height), cells, crossing)
-
-    def reflected(self, points: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Where the surface goes on beyond a seam. Points (P, 2) in texels lie outside all triangles; `near` (P, 2) is
-        the covered texel closest to each. Returns the numbers (Q,) of the points that face an edge, the places (Q, 2)
-        beyond it, and the islands (Q,) there."""
-        chunks = [
-            self._reflected(points[first : first + POINTS_PER_BLOCK], near[first : first + POINTS_PER_BLOCK], first)
-            for first in range(0, max(len(points), 1), POINTS_PER_BLOCK)
-        ]
-        return tuple(np.concatenate(parts) for parts in zip(*chunks, strict=True))
-
-    def _reflected(self, points, near, first):
-        point, edge = self._candidates(near)
-        start, side = self.edges[edge, 0], self.edges[edge, 1] - self.edges[edge, 0]
-        offset = points[point] - start
-        share = (offset * side).sum(axis=1) / (side * side).sum(axis=1)
-        distance = (offset * self.outward[edge]).sum(axis=1)
-        facing = np.flatnonzero((share >= 0.0) & (share <= 1.0) & (distance > 0.0))
-        order = facing[np.lexsort((edge[facing], distance[facing], point[facing]))]
-        closest = order[np.flatnonzero(np.diff(point[order], prepend=-1))]
-        point, edge, share, distance = point[closest], edge[closest], share[closest, None], distance[closest, None]
-        beyond = self.beyond[edge, 0] * (1.0 - share) + self.beyond[edge, 1] * share
-        return point + first, beyond + distance * self.inward[edge], self.island[edge]
-
-    def _candidates(self, near):
-        """Pairs (point, edge) for the edges through the texels around `near`; a pair may occur several times."""
-        stride = self.size[0] + 2
-        cell = np.concatenate([(near[:, 1] + 1 + y) * stride + near[:, 0] + 1 + x for x, y in _NEIGHBORS])
-        low = np.searchsorted(self.cells, cell, side="left")
-        which, step = repeated(np.searchsorted(self.cells, cell, side="right") - low)
-        return which % max(len(near), 1), self.crossing[low[which] + step]
-
-
-def _paired(vertices):
-    """Numbers (N,) 3 * triangle + corner of edges that other triangles share, and the number of the other's edge."""
-    ends = np.sort(np.stack([vertices, np.roll(vertices, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
-    order = np.lexsort((ends[:, 1], ends[:, 0]))
-    new = np.concatenate([[True], (np.diff(ends[order], axis=0) != 0).any(axis=1)]) if len(order) else order
-    start = np.flatnonzero(new)
-    count = np.diff(start, append=len(order))
-    # If more than two triangles share an edge, each is paired with the next.
-    last = start + count - 1
-    following = np.arange(len(order)) + 1
-    following[last] = start
-    shared = np.repeat(count > 1, count)
-    return order[shared], order[following[shared]]
-
-
-def _ends(values, edge):
-    """Values (T, 3, ...) at both ends of edges (N,): (N, 2, ...)."""
-    return np.stack([values[edge // 3, edge % 3], values[edge // 3, (edge + 1) % 3]], axis=1)
-
-
-def _third(values, edge):
-    return values[edge // 3, (edge + 2) % 3]
-
-
-def _towards(ends, corner):
-    """Unit vectors (N, 2) perpendicular to edges (N, 2, 2), towards `corner` (N, 2); NaN for triangles without area."""
-    side = ends[:, 1] - ends[:, 0]
-    turn = np.sign(cross(side, corner - ends[:, 0]))
-    length = np.linalg.norm(side, axis=1)
-    scale = np.divide(turn, length, out=np.full(len(side), np.nan), where=(length > 0.0) & (turn != 0.0))
-    return np.stack([-side[:, 1], side[:, 0]], axis=-1) * scale[:, None]
-
-
-def _cells(edges, width, height):
-    """(cells, edges) as in UvSeams, from points half a texel apart on the part of each edge in the tile."""
-    start, side = edges[:, 0], edges[:, 1] - edges[:, 0]
-    first, last = np.zeros(len(edges)), np.ones(len(edges))
-    for axis, limit in ((0, width), (1, height)):
-        along = np.where(side[:, axis] != 0.0, side[:, axis], 1e-30)
-        to_low, to_high = (-1.0 - start[:, axis]) / along, (limit + 1.0 - start[:, axis]) / along
-        first, last = np.maximum(first, np.minimum(to_low, to_high)), np.minimum(last, np.maximum(to_low, to_high))
-    steps = np.ceil(2.0 * (last - first) * np.linalg.norm(side, axis=1)) + 1.0
-    edge, step = repeated(np.where(last >= first, steps, 0.0))
-    share = first[edge] + (last - first)[edge] * (step / np.maximum(steps[edge] - 1.0, 1.0))
-    at = np.floor(start[edge] + share[:, None] * side[edge]).astype(np.int64)
-    at = np.clip(at, -1, (width, height)) + 1
-    pairs = np.unique(np.stack([at[:, 1] * (width + 2) + at[:, 0], edge]), axis=1)
-    return pairs[0], pairs[1]

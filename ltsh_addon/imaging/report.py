@@ -221,7 +221,6 @@ def _text(value) -> str:
 FILE = "index.json"
 _GROUP = {
     "files": {str: file_name},
-    "multilayer": file_name,
     "labels": {str: str},
     "names": some([str]),
     "passes": some([str]),

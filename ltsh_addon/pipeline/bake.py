@@ -27,7 +27,7 @@ from ..workers.pool import cores
 from . import bake_files, lighting
 from .comparison import percent
 from .lighting import check_named, prepare
-from .options import BAKE_PASSES, MARGIN_TYPES, TEXTURE_SIDES, BakeOptions, child_job
+from .options import BAKE_PASSES, TEXTURE_SIDES, BakeOptions, child_job
 from .tasks import TaskResult, file_stems, versions, write_reports
 
 # NOTED_SHARE_OUTSIDE: a larger share of the UV map outside of the texture is reported. Less may come from texels along
@@ -104,8 +104,6 @@ def _check(options: BakeOptions) -> None:
         if not TEXTURE_SIDES[0] <= side <= TEXTURE_SIDES[1]:
             limits = "{} to {}".format(*TEXTURE_SIDES)
             raise ValueError(f"size is {width}x{height}, expected {limits} each")
-    if options.margin_type not in MARGIN_TYPES:
-        raise ValueError(f"margin_type is {options.margin_type!r}, expected {' or '.join(MARGIN_TYPES)}")
     unknown = [name for name in options.passes if name not in BAKE_PASSES]
     if unknown or not options.passes:
         raise ValueError(f"passes are {list(options.passes)}, expected some of {', '.join(BAKE_PASSES)}")
@@ -188,7 +186,7 @@ class ObjectBaker:
         options, file = self.options, f"{stem}{self._suffix(tile)}.exr"
         path = options.output / file
         errors, written = bake_files.ErrorSums(), [file]
-        with self._planes(tile) as planes:
+        with bake_files.Planes(self.folder / f"planes_{tile}", self.channels(), *options.size) as planes:
             record = self._shade(tile, planes, errors, progress)
             pictures = None
             if self.compared:
@@ -203,12 +201,6 @@ class ObjectBaker:
                 written.append(record["texture"])
             planes.write(path, options.margin, self._metadata(tile), pictures, texture)
         return record, written
-
-    def _planes(self, tile) -> bake_files.Planes:
-        options, seams = self.options, None
-        if options.margin_type == "adjacent" and options.margin > 0:
-            seams = uv.UvSeams.of(self.mesh.uv, self.mesh.vertices, *options.size, _column_and_row(tile))
-        return bake_files.Planes(self.folder / f"planes_{tile}", self.channels(), *options.size, seams)
 
     def _shade(self, tile, planes, errors, progress) -> dict:
         """Shade a tile block by block into `planes`; returns its counts of texels for the record."""

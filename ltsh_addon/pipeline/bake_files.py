@@ -19,7 +19,6 @@ from .tasks import Records, contents_digest, options_digest
 # WRITTEN_TEXELS: texels that are in memory while a file is written.
 WRITTEN_TEXELS = 1 << 18
 COVERAGE = "coverage.hit.V"
-_OWNER = "owner"  # channel with 1 + the number of the island, 0 where nothing is covered
 LARGEST_PICTURE = 2048  # the most texels of a side of an error picture
 # PICTURE_SCALE: the ends of the color scale of an error picture, as a share of the radiance of Cycles' brightest
 # texels, their percentile PICTURE_PERCENTILE.
@@ -39,14 +38,12 @@ _TILE_RECORD = {"task": {"object": str, "tile": int}, "report": TILE}
 class Planes:
     """Context: the channels of an image as files, so that memory holds only some rows. Row 0 is at the bottom."""
 
-    def __init__(self, folder: Path, names: list[str], width: int, height: int, seams=None):
-        """With `seams` (UvSeams) margins show the adjacent faces; None: the nearest texel."""
+    def __init__(self, folder: Path, names: list[str], width: int, height: int):
         folder.mkdir()
-        self.names, self.shape, self._seams = names, (height, width), seams
+        self.names, self.shape = names, (height, width)
         # One bit per texel: the only data of the whole image in memory.
         self._covered = np.zeros((height, -(-width // 8)), dtype=np.uint8)
-        files = [*names, _OWNER] if seams is not None else names
-        self._paths = {name: folder / f"{number}.bin" for number, name in enumerate(files)}
+        self._paths = {name: folder / f"{number}.bin" for number, name in enumerate(names)}
         self._files = {name: path.open("w+b") for name, path in self._paths.items()}
 
     def __enter__(self):
@@ -64,8 +61,8 @@ class Planes:
         covered.reshape(-1)[texels.index] = True
         self._covered[first : first + count] = np.packbits(covered, axis=1)
         for name, file in self._files.items():
-            rows = np.zeros(count * width, np.int32 if name == _OWNER else np.float32)
-            rows[texels.index] = 1 + self._seams.islands[texels.triangle] if name == _OWNER else values[name]
+            rows = np.zeros(count * width, np.float32)
+            rows[texels.index] = values[name]
             file.seek(4 * first * width)
             file.write(rows)
 
@@ -77,10 +74,6 @@ class Planes:
         file, width = self._files[name], self.shape[1]
         file.seek(4 * first * width)
         return np.frombuffer(file.read(4 * (last - first) * width), np.float32).reshape(-1, width)
-
-    def _at(self, name, index, dtype=np.float32):
-        """Values of a channel at texels `index` of the whole image."""
-        return np.memmap(self._paths[name], dtype, mode="r")[index]
 
     def write(self, path: Path, margin: int, metadata, pictures, texture=None) -> None:
         """Write the EXR with its margin filled, the ErrorPictures `pictures` (or None), and the `texture`.
@@ -115,40 +108,13 @@ class Planes:
         target, source = nearest_covered(self.coverage(low, high), margin)
         inside = (target >= (bottom - low) * width) & (target < (top - low) * width)
         target, source = target[inside] - (bottom - low) * width, source[inside]
-        beyond = None
-        if self._seams is not None and len(target):
-            beyond = self._beyond(target + bottom * width, source + low * width)
         block = {COVERAGE: self.coverage(bottom, top)[::-1].astype(np.float32)}
         for name in self.names:
             around = self._rows(name, low, high)
             plane = around[bottom - low : top - low].copy()
             plane.reshape(-1)[target] = around.reshape(-1)[source]
-            if beyond is not None:
-                which, index, weights = beyond
-                plane.reshape(-1)[target[which]] = (self._at(name, index) * weights).sum(axis=1)
             block[name] = plane[::-1]
         return block
-
-    def _beyond(self, target, source):
-        """Margin texels that show an adjacent face: their indices (Q,) in `target`, and the texels (Q, 4) that each
-        shows with weights (Q, 4). `source` are the nearest covered texels of `target`."""
-        height, width = self.shape
-        points, near = (np.stack([index % width, index // width], axis=-1) for index in (target, source))
-        which, position, island = self._seams.reflected(points + 0.5, near)
-        corner = np.floor(position - 0.5)
-        share = position - 0.5 - corner
-        index, weights = np.empty((len(which), 4), np.int64), np.empty((len(which), 4), np.float32)
-        for number, (x, y) in enumerate(((0, 0), (1, 0), (0, 1), (1, 1))):
-            column, row = corner[:, 0] + x, corner[:, 1] + y
-            within = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-            index[:, number] = np.where(within, row * width + column, 0.0)
-            weight = np.abs(1 - x - share[:, 0]) * np.abs(1 - y - share[:, 1])
-            weights[:, number] = np.where(within, weight, 0.0)
-        # Drop texels of other islands, and those that no face covers.
-        weights[self._at(_OWNER, index, np.int32) != 1 + island[:, None]] = 0.0
-        total = weights.sum(axis=1)
-        shown = np.flatnonzero(total > 1e-3)
-        return which[shown], index[shown], weights[shown] / total[shown, None]
 
 
 class ErrorSums:

@@ -77,7 +77,6 @@ def _group(path: Path, folder: Path, prefix: str, report: dict) -> dict:
         "labels": {name: LABELS.get(name, name) for name in names},
         "passes": passes,
         "files": written,
-        "multilayer": path.name,
         "figures": _figures(layers, names, passes, report),
         "scales": {pass_name: _scale(layers, names, pass_name) for pass_name in passes},
     }

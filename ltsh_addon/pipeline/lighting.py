@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from .. import shading, visibility
-from ..cycles.gbuffer import finer
+from ..cycles.gbuffer import finer, with_one_shadow
 from ..emitters.light_tree import FEWEST
 from ..files import check_takes_files
 from ..imaging.exr import unique_names
@@ -132,12 +132,20 @@ class ShadowTracer:
         return Shadows(shares, estimate.numbers, noise, estimate.rays, tracer, seconds, light, variance)
 
 
-def trace_shadows(extraction, passes: Sequence[str], rays: int, progress: Progress | None, workers=None) -> Shadows:
-    """The shadows of the samples of an `Extraction`; the samples of a pixel share `rays` per light."""
-    film = extraction.film
-    sampling = visibility.ShadowSampling(passes, rays_of_samples(rays, film), film)
+def trace_shadows(
+    extraction, passes: Sequence[str], rays: int, progress: Progress | None, workers=None
+) -> Shadows | None:
+    """The shadows of the samples of an `Extraction`; the samples of a pixel share `rays` per light. None without
+    occluders."""
+    if extraction.occluders is None:
+        return None
+    samples, film, index = extraction.samples, extraction.film, slice(None)
+    rays = rays_of_samples(rays, film)
+    if film.count is not None:
+        samples, film, index = with_one_shadow(samples, film)
+    sampling = visibility.ShadowSampling(passes, rays, film)
     with ShadowTracer(extraction.occluders, extraction.lights) as tracer:
-        return tracer.trace(extraction.samples, sampling, workers=workers, progress=progress)
+        return tracer.trace(samples, sampling, workers=workers, progress=progress).take(index)
 
 
 def tell_expected(extraction, tables: dict[str, Shader], passes: Sequence[str], rays: int, progress) -> None:
@@ -152,10 +160,9 @@ def tell_expected(extraction, tables: dict[str, Shader], passes: Sequence[str], 
     for size in (sizes[0], *sizes):  # the first look also loads what all need
         chosen, times = np.sort(order[:size]), [time.perf_counter()]
         looked = replace(extraction, samples=extraction.samples.take(chosen), film=extraction.film.take(chosen))
-        looked, shadows = ended_at_horizons(looked), None
+        looked = ended_at_horizons(looked)
         times.append(time.perf_counter())
-        if extraction.occluders is not None:
-            shadows = trace_shadows(looked, passes, rays, None, workers=1)
+        shadows = trace_shadows(looked, passes, rays, None, workers=1)
         times.append(time.perf_counter())
         for name in names:
             shade_lights(looked.samples, looked.lights, tables[name], passes, (shadows, None), workers=1)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
@@ -15,7 +15,8 @@ import numpy as np
 
 from ..files import replacing
 from ..scene import Light, Progress, error_line, listed
-from .lighting import Shadows, load_tables, shade_lights
+from ..visibility import Occluders
+from .lighting import Shadows, load_tables, shade_lights, trace_shadows
 from .relight import GRAIN, RelightData, color_of
 
 MIXER_FILE = "lights.npz"
@@ -197,6 +198,28 @@ def _with_bounces(data: RelightData, rows: list[MixerRow], members, layers) -> l
 def bounced_light(data: RelightData, row: MixerRow) -> np.ndarray:
     """The bounced light (H, W, 3) of a row; 0.0 where it has none."""
     return (np.array(row.share) * data.rest[row.group][..., :3]).astype(np.float32) if row.group else np.float32(0.0)
+
+
+RAYS_SHARE = 0.8  # of the time that a moved light takes
+
+
+def moved_light(
+    data: RelightData,
+    occluders: Occluders | None,
+    light: Light,
+    row: MixerRow,
+    progress: Callable[[float], bool | None],
+) -> np.ndarray:
+    """The picture (H, W, 3) of one light of `data` at a new place, by rays of it alone, plus the bounced light of its
+    `row`. `progress(fraction)` returns False to stop. Raises SceneError, TableError, Cancelled."""
+    extraction, rays = replace(data.extraction, lights=(light,), occluders=occluders), data.options["shadow_rays"]
+    (table,) = load_tables((data.technique,)).values()
+    shadows = trace_shadows(extraction, data.options["passes"], rays, lambda _, share: progress(RAYS_SHARE * share))
+    start = 0.0 if shadows is None else RAYS_SHARE
+    # The edges of light are other ones where it stands now.
+    moved = replace(data, extraction=extraction, shadows=shadows, edges={})
+    (layer,) = _layers(moved, table, [[0]], lambda share: progress(start + (1.0 - start) * share))
+    return layer + bounced_light(data, row)
 
 
 class Mixer:

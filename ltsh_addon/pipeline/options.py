@@ -11,6 +11,7 @@ import re
 import string
 from collections.abc import Callable, Iterable
 from dataclasses import MISSING, asdict, dataclass, field, fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +29,6 @@ SHADOW_RAYS = 8, 1024
 EDGE_POINTS = 64
 MOST_REFINEMENTS = 4096
 MOST_MARGIN = 512
-# MARGIN_TYPES: texels of the margin show the nearest texel, or the adjacent face of the mesh.
-MARGIN_TYPES = ("extend", "adjacent")
 # NAME_FIELDS: the fields of patterns of file names.
 NAME_FIELDS = ("scene", "camera", "frame", "object")
 LONGEST_NAME = 200
@@ -89,21 +88,16 @@ def seconds(text: str) -> float:
     return value
 
 
-def passes(text: str) -> tuple[str, ...]:
-    """Passes of a picture, separated by commas."""
-    return _passes(text, PASSES)
+def passes(known: tuple[str, ...]) -> Callable[[str], tuple[str, ...]]:
+    """The parser of some of the `known` passes, separated by commas."""
 
+    def parse(text: str) -> tuple[str, ...]:
+        names = _names(text)
+        if not names or not set(names) <= set(known):
+            raise ValueError(f"passes are {text!r}, expected some of {', '.join(known)}")
+        return names
 
-def bake_passes(text: str) -> tuple[str, ...]:
-    """Passes of a bake, separated by commas."""
-    return _passes(text, BAKE_PASSES)
-
-
-def _passes(text, known):
-    names = _names(text)
-    if not names or not set(names) <= set(known):
-        raise ValueError(f"passes are {text!r}, expected some of {', '.join(known)}")
-    return names
+    return parse
 
 
 def _names(text) -> tuple[str, ...]:
@@ -206,17 +200,7 @@ def folder(text: str) -> Path:
     return Path(text)
 
 
-def picture_name(text: str) -> str:
-    """A pattern for the names of pictures."""
-    return _name(text, tuple(name for name in NAME_FIELDS if name != "object"))
-
-
-def bake_name(text: str) -> str:
-    """A pattern for the names of baked objects."""
-    return _name(text, NAME_FIELDS)
-
-
-def _name(pattern: str, known: tuple[str, ...]) -> str:
+def file_pattern(pattern: str, known: tuple[str, ...] = NAME_FIELDS) -> str:
     """`pattern`, checked: it has only `known` fields and names files below the output folder. Raises ValueError."""
     expected = f"expected fields {', '.join('{' + name + '}' for name in known)}, such as {{scene}}_{{frame:04d}}"
     if not pattern or len(pattern) > LONGEST_NAME:
@@ -290,9 +274,9 @@ def _techniques(known: Iterable[str] = TECHNIQUES, default=(DEFAULT_TECHNIQUE,),
     return option("--techniques", default=default, type=parse, metavar="T", help=meaning)
 
 
-def _passes_of(known: tuple[str, ...], parse: Callable, default: str) -> Any:
+def _passes_of(known: tuple[str, ...], default: str) -> Any:
     meaning = f"some of {','.join(known)} (default: {default})"
-    return option("--passes", default=PASSES, type=parse, metavar="P", help=meaning)
+    return option("--passes", default=PASSES, type=passes(known), metavar="P", help=meaning)
 
 
 def _resolution() -> Any:
@@ -354,7 +338,9 @@ class CameraOptions:
     scene: Path = _scene("one or more; left out when Blender has a file open")
     frame: int | None = _frame()
     camera: str | None = _camera()
-    name: str | None = _stem(picture_name)  # of the files, without suffix, below `output`; None: the command
+    name: str | None = _stem(
+        partial(file_pattern, known=NAME_FIELDS[:-1])
+    )  # of the files, without suffix, below `output`; None: the command
     output: Path = _output()
 
 
@@ -364,7 +350,7 @@ class PictureOptions(CameraOptions):
 
     # Names, paths of tables, or (only from Python) a `shading.OwnTechnique`.
     techniques: tuple[Any, ...] = _techniques()
-    passes: tuple[str, ...] = _passes_of(PASSES, passes, "both")
+    passes: tuple[str, ...] = _passes_of(PASSES, "both")
     resolution: tuple[int, int] | None = _resolution()
     sub_samples: int = _sub_samples("points per pixel, drawn from its filter; 1: pixel centers")
     reference_samples: int = option(
@@ -416,20 +402,16 @@ class BakeOptions:
     )
     sub_samples: int = _sub_samples("points per texel, spread as in Cycles' bake; 1: texel centers")
     margin: int = option("--margin", default=16, type=margin, metavar="PX", help="in texels (default: %(default)s)")
-    margin_type: str = option(
-        "--margin-type", default="extend", choices=MARGIN_TYPES,
-        help="the margin repeats the nearest texel, or shows the adjacent face (default: %(default)s)",
-    )  # fmt: skip
     conservative: bool = flag("--conservative", "bake every texel that a face touches")
     view: tuple[float, float, float] | str = option(
         "--view", default="camera", type=view, metavar="V",
         help="camera, above (along the normals) or a position X,Y,Z in m (default: %(default)s)",
     )  # fmt: skip
     techniques: tuple[str, ...] = _techniques()
-    passes: tuple[str, ...] = _passes_of(BAKE_PASSES, bake_passes, ",".join(PASSES))
+    passes: tuple[str, ...] = _passes_of(BAKE_PASSES, ",".join(PASSES))
     frame: int | None = _frame()
     camera: str | None = _camera()
-    name: str | None = _stem(bake_name)  # of the file of the only object, without suffix, below `output`
+    name: str | None = _stem(file_pattern)  # of the file of the only object, without suffix, below `output`
     error: bool = flag("--error", "beside Cycles' bake: signed errors, also as pictures")
     cycles_samples: int = _cycles_samples("Cycles' bake", 256)  # with `error`
     shadows: str = _shadows()

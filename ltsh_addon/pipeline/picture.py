@@ -66,9 +66,7 @@ def make_picture(options: PictureOptions, with_cycles: bool, progress: Progress 
             folder = stack.enter_context(temporary_folder())
             stack.enter_context(shared_blender(folder))
         extraction = _extracted(options, with_cycles, tables, progress)
-        shadows = None
-        if extraction.occluders is not None:
-            shadows = lighting.trace_shadows(extraction, options.passes, options.shadow_rays, progress)
+        shadows = lighting.trace_shadows(extraction, options.passes, options.shadow_rays, progress)
         results = evaluated(tables, extraction, shadows, options, progress)
         comparison = Comparison(
             options, extraction, results, shadows, _transmitted(tables, extraction, options, progress)
@@ -91,11 +89,10 @@ def make_picture(options: PictureOptions, with_cycles: bool, progress: Progress 
 
 def _transmitted(tables, extraction, options: PictureOptions, progress) -> Comparison | None:
     """What glass shows of the surfaces behind it, shaded; None without glass."""
-    behind, shadows = extraction.behind, None
+    behind = extraction.behind
     if behind is None:
         return None
-    if behind.occluders is not None:
-        shadows = lighting.trace_shadows(behind, options.passes, options.shadow_rays, progress)
+    shadows = lighting.trace_shadows(behind, options.passes, options.shadow_rays, progress)
     return Comparison(options, behind, evaluated(tables, behind, shadows, options, progress), shadows)
 
 

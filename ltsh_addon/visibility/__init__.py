@@ -8,14 +8,6 @@ from __future__ import annotations
 
 from .light_cluster import shared_numbers
 from .occluders import Hits, OccluderMesh, Occluders, Transparency
-from .ratio import (
-    BLOCK_SAMPLES,
-    ShadowSampling,
-    ShadowTask,
-    Visibility,
-    shadow_task,
-    trace_ray_origins,
-    trace_visibility,
-)
+from .ratio import ShadowSampling, Visibility, trace_ray_origins, trace_visibility
 from .rays import Tracer, open_tracer
 from .shadow_terminator import RayOrigins

@@ -5,9 +5,9 @@ doi:10.1145/3190834.3190852): shadowed radiance = closed form x sum(w V) / sum(w
 the light. w is what the pass reflects of the light along the ray, divided by the probability density of the ray. Both
 passes use the same rays.
 
-Like samples of pixels beside each other share their rays to a sky. They take its directions in turns (Ahmed and Wonka
-2020, "Screen-space blue-noise diffusion of Monte Carlo sampling error via hierarchical ordering of pixels",
-doi:10.1145/3414685.3417881), so that the result depends on the block. All else depends on neighbors alone.
+Like samples of pixels beside each other share their rays to a sky or to many lights. They take directions in turns
+(Ahmed and Wonka 2020, "Screen-space blue-noise diffusion of Monte Carlo sampling error via hierarchical ordering of
+pixels", doi:10.1145/3414685.3417881), so that the result depends on the block. All else depends on neighbors alone.
 """
 
 from __future__ import annotations
@@ -238,12 +238,3 @@ def typical_radiance(samples: SurfaceSamples, task: ShadowTask, tracer) -> tuple
     traced = replace(task, rays=PROBES).do((some, None, None), tracer)
     squares = {name: np.square(traced.radiance[name]).mean() if len(some) else 0.0 for name in task.passes}
     return {name: float(np.sqrt(square)) for name, square in squares.items()}, len(some)
-
-
-def shadow_task(
-    samples: SurfaceSamples, lights: Sequence[Light], tracer, passes: Sequence[str], rays: int
-) -> ShadowTask:
-    """The task that finds the shares of `lights` with at most `rays` per pair, as `trace_visibility` does."""
-    (emitters, _), passes = emitters_of(lights, tracer), tuple(passes)
-    task = ShadowTask(emitters, passes, rays // PROBES * PROBES, dict.fromkeys(passes, 1.0), False)
-    return replace(task, typical=typical_radiance(samples, task, tracer)[0])

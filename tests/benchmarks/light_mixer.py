@@ -3,22 +3,22 @@
 python tests/benchmarks/light_mixer.py [--folder DIR]
 
 Prints milliseconds of a change, all in this thread: of the light that was changed before, of another one, of all;
-seconds until a picture can be mixed; those of a light that has moved, of this process + others. The picture is made
-once and stays in --folder.
+seconds until a picture can be mixed; those of a light that has moved. The picture is made once and stays in --folder.
 """
 
 import argparse
 import os
 import time
+from functools import partial
 from pathlib import Path
 
 import bake_cost
 import measure
 import numpy as np
 
-from ltsh_addon.pipeline.mixer import LightPictures, Mixer, light_pictures
-from ltsh_addon.pipeline.moved_lights import MovedLights
-from ltsh_addon.pipeline.relight import RELIGHT_SUFFIX, RelightData
+from ltsh_addon.pipeline.mixer import LightPictures, Mixer, light_pictures, moved_light
+from ltsh_addon.pipeline.relight import OCCLUDERS_SUFFIX, RELIGHT_SUFFIX, RelightData
+from ltsh_addon.visibility import Occluders
 
 RESOLUTION = "960x540"
 
@@ -69,25 +69,12 @@ def main():
     print(f"open: {took[0]:.2f} s")
     for kind, (median, longest) in changes(mixer).items():
         print(f"change {kind}: {median:.1f} ms, at most {longest:.1f}")
-    moved = MovedLights.load(kept_file)
-    for number, text in enumerate(("the first time", "again", "again")):
+    occluders = Occluders.load(out / f"shade{OCCLUDERS_SUFFIX}")
+    for number in range(3):
         light = kept.extraction.lights[0]
         light = light.altered(center=light.center + (0.5, 0.2 * number, 0.0))
-        print(f"a moved light, {text}: {shaded(moved, light)}")
-    moved.close()
-
-
-def shaded(moved, light) -> str:
-    """What the picture of a light takes."""
-    before = spent()
-    moved.picture(light)
-    return "{:.2f} s, {:.2f} + {:.2f} s of processor time".format(*np.subtract(spent(), before))
-
-
-def spent() -> tuple[float, float, float]:
-    """Seconds on the clock, of processor time of this process, and of those that it has started."""
-    others = measure.children(os.getpid())
-    return time.perf_counter(), time.process_time(), sum(map(measure.processor_seconds, others))
+        took = timed(partial(moved_light, kept, occluders, light, mixer.rows[0], lambda share: True))[1:]
+        print("a moved light: {:.2f} s, {:.2f} s of processor time".format(*took))
 
 
 if __name__ == "__main__":

@@ -108,7 +108,7 @@ SHADE = '[[job]]\ncommand = "shade"\nscene = "room.blend"\noutput = "out"\n'
         (SHADE.replace("shade", "bake") + "error = 1\n", ["job 1: error is 1, expected true or false"]),
         (SHADE.replace("shade", "bake") + "all = true\nselected = true\n", ["job 1:", "not allowed with"]),
         (SHADE.replace("shade", "bake") + "apply = true\ncamera = ['A', 'B']\n", ["job 1: --apply"]),
-        (SHADE.replace("shade", "bake") + 'margin-type = "none"\n', ["job 1: margin-type is 'none', expected"]),
+        (SHADE + 'shadows = "none"\n', ["job 1: shadows is 'none', expected"]),
         (SHADE + "frames = \n", ["is no TOML", "line 5"]),
         ("defaults = 3\n" + SHADE, ["night.toml: defaults: expected a table"]),
         ("job = 3\n", ["night.toml: no job is there"]),

@@ -1,6 +1,5 @@
 """The light mixer: a kept picture as the sum of its lights. No Blender: see `fake_scene`."""
 
-import gc
 from dataclasses import replace
 
 import fake_scene
@@ -10,7 +9,7 @@ from fake_scene import run, wall
 from surface_scenes import shifted
 
 from ltsh_addon.imaging.exr import read_channels
-from ltsh_addon.pipeline import lighting, moved_lights, relight
+from ltsh_addon.pipeline import lighting, relight
 from ltsh_addon.pipeline.mixer import (
     NOT_SHADED,
     REST,
@@ -22,11 +21,11 @@ from ltsh_addon.pipeline.mixer import (
     _members,
     _row,
     light_pictures,
+    moved_light,
 )
-from ltsh_addon.pipeline.moved_lights import MovedLights
 from ltsh_addon.pipeline.relight import RelightData, write_relight_data
 from ltsh_addon.scene import Cancelled
-from ltsh_addon.workers import pool
+from ltsh_addon.visibility import Occluders
 
 # float32 sums of three lights in another order, and what EXR files hold of them.
 ROUNDING = 1e-5
@@ -206,62 +205,17 @@ def test_a_moved_light_is_as_in_a_new_picture(capsys, monkeypatch, room, out):
     shade(capsys, monkeypatch, room, out / "second", **occluders, change=move)
     kept, expected = kept_in(out / "first"), light_pictures(kept_in(out / "second"))
     mixer = Mixer(light_pictures(kept))
-    lights = MovedLights.load(out / "first" / "shade.samples.npz")
-    moved = lights.picture(move(kept.extraction.lights)[0])
-    assert np.array_equal(moved, lights.picture(move(kept.extraction.lights)[0]))
+    shares, row = [], mixer.rows[0]
+    given = kept, Occluders.load(out / "first" / "shade.occluders.npz"), move(kept.extraction.lights)[0], row
+    moved = moved_light(*given, shares.append)
+    assert shares == sorted(shares) and 0.0 < shares[0] < shares[-1] <= 1.0
+    # It can be stopped.
+    with pytest.raises(Cancelled):
+        moved_light(*given, lambda share: False)
     # Rays of both are as many as the share of the light in all light, which differs, asks for.
     assert np.abs(moved - expected.layers[0]).mean() < 0.02 * expected.layers[0].mean()
     mixer.replace(0, mixer.rows[0], moved)
     assert not np.allclose(mixed(mixer, np.ones((3, 3))), before, rtol=0.05)
-
-
-def test_processes_that_stay_shade_moved_lights_alike_also_when_one_is_gone(capsys, monkeypatch, room, out):
-    shade(capsys, monkeypatch, room, out, wall=wall(0.7, left=0.0))
-    monkeypatch.setattr(moved_lights, "BLOCK_SAMPLES", 7)
-    alone = MovedLights.load(out / "shade.samples.npz")
-    monkeypatch.setattr(moved_lights, "SAMPLES_WORTH_A_WORKER", 0)
-    monkeypatch.setattr(pool, "cores", lambda: 3)
-    light = kept_in(out).extraction.lights[0]
-    lights = [shifted(light, (0.1 * step, 0.0, 0.0)) for step in range(3)]
-    expected = [alone.picture(one) for one in lights]
-    together = MovedLights.load(out / "shade.samples.npz")
-    try:
-        np.testing.assert_array_equal(together.picture(lights[0]), expected[0])
-        children = list(together._pool._workers)
-        assert len(children) == 2 and all(child._process.poll() is None for child in children)
-        children[1]._process.kill()
-        np.testing.assert_array_equal(together.picture(lights[1]), expected[1])
-    finally:
-        together.close()
-    assert all(child._process.poll() is not None for child in children)
-    # Made ready in a thread, while the light still moves.
-    together.get_ready(light)
-    np.testing.assert_array_equal(together.picture(lights[2]), expected[2])
-    (child, _), stays = together._pool._workers, together._pool
-    del together, stays
-    gc.collect()
-    assert child._process.poll() is not None
-    with pytest.raises(OSError, match="nothing"):
-        MovedLights.load(out / "nothing.samples.npz").picture(light)
-
-
-def test_the_picture_of_a_moved_light_tells_how_far_it_is_and_can_be_stopped(capsys, monkeypatch, room, out):
-    shade(capsys, monkeypatch, room, out, wall=wall(0.7, left=0.0))
-    monkeypatch.setattr(moved_lights, "BLOCK_SAMPLES", 16)
-    lights, light = MovedLights.load(out / "shade.samples.npz"), kept_in(out).extraction.lights[0]
-    *under_way, (last, share) = lights.pictures(light)
-    shares = [share for _, share in under_way]
-    assert share == 1.0 and len(shares) == 3 and shares == sorted(shares) and shares[0] > 0.0
-    assert all(image is None for image, _ in under_way)
-    whole = lights.picture(light)
-    np.testing.assert_array_equal(last, whole)
-    # Who asks for another picture ends this one.
-    begun = lights.pictures(light)
-    next(begun)
-    lights.stop()
-    with pytest.raises(Cancelled, match="moved again"):
-        next(begun)
-    np.testing.assert_array_equal(lights.picture(light), whole)
 
 
 def test_no_samples_give_a_black_picture(capsys, monkeypatch, room, out):

@@ -19,7 +19,7 @@ PICTURE = {
 }  # fmt: skip
 BAKE = {
     "objects": ("Floor", "-Wall"), "uv": "-Map", "size": (128, 64), "sub_samples": 4, "margin": 3,
-    "margin_type": "adjacent", "conservative": True, "view": (-1.0, 2.5, 0.0),
+    "conservative": True, "view": (-1.0, 2.5, 0.0),
     "techniques": ("reference",), "passes": ("diffuse_light",),
     "error": True, "cycles_samples": 32, "apply": True, "scripts": True,
     "shadows": "off", "shadow_rays": 16,

@@ -189,7 +189,7 @@ def option_values(generator, folder):
     options = {
         "shade": ["--aa", "--resolution", "--frames", "--camera", "--shard", "--techniques", "--passes"],
         "compare": ["--cycles-samples", "--reference-samples", "--tolerance", "--resolution", "--frames", "--camera"],
-        "bake": ["--size", "--margin", "--margin-type", "--view", "--uv", "--object", "--passes", "--cycles-samples"],
+        "bake": ["--size", "--margin", "--view", "--uv", "--object", "--passes", "--cycles-samples"],
     }
     numbers = ["1", "4", "1-3", "64x48", "ltc", "specular", "A", "1/2", "0,0,1", "10%"]
     count = generator.integers(1, 3)
@@ -441,7 +441,7 @@ def build(folder: Path) -> None:
     (folder / "images").mkdir()
     group = {"size": [4, 4], "names": ["ltc"], "labels": {"ltc": "LTC"}, "passes": ["diffuse"],
              "figures": {"diffuse": {"noise": 0.1, "techniques": {"ltc": {"relative_l2": 0.2, "bias": None}}}},
-             "files": {"ltc.diffuse": "a.exr"}, "multilayer": "shade.exr", "scales": {"diffuse": 0.5}}  # fmt: skip
+             "files": {"ltc.diffuse": "a.exr"}, "scales": {"diffuse": 0.5}}  # fmt: skip
     imaging.report.write_index(
         folder / "images", {"command": "shade", "partial": "", "report": {}, "groups": {"": group}}
     )

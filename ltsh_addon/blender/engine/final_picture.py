@@ -123,9 +123,7 @@ def final_picture(
         return FinalPicture(combined, dict(passes), warnings, extraction.problems)
 
     show(picture())
-    shadows = None
-    if extraction.occluders is not None:
-        shadows = trace_shadows(extraction, PASSES, job.shadow_rays, progress)
+    shadows = trace_shadows(extraction, PASSES, job.shadow_rays, progress)
     for technique in dict.fromkeys(job.shaded_as().values()):
         for number, lit_pass in enumerate(PASSES):
             lit = shade_lights(
@@ -153,7 +151,7 @@ def final_picture(
 
 def _behind_glass(job: FinalJob, behind, progress: Progress) -> np.ndarray:
     """The light (H, W, 3) of what is seen through glass, with the exposure."""
-    shadows = None if behind.occluders is None else trace_shadows(behind, PASSES, job.shadow_rays, progress)
+    shadows = trace_shadows(behind, PASSES, job.shadow_rays, progress)
     lit = shade_lights(behind.samples, behind.lights, job.technique, PASSES, (shadows,))[0].combined
     return behind.film.image(behind.picture.exposure * lit) + behind.rest[..., :3]
 

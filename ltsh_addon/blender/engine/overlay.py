@@ -7,17 +7,13 @@ from dataclasses import dataclass, field
 
 import blf
 import bpy
-import gpu
-from gpu_extras.batch import batch_for_shader
 
 from ...scene import CYCLES, TECHNIQUES
-from ..ui.overlay import PLATE, covered, draw_rectangle
+from ..ui.overlay import PLATE, covered, draw_handle, draw_rectangle
 from ..ui.preview import ENGINE
 
 MOST_NOTES = 4
 TEXT_SIZE, LINE = 11.0, 1.4  # and from line to line
-SHARES = 1.0, 0.9, 0.8, 0.7, 0.6  # of that size, for views that are narrower than a word
-LONG_WORD = 20  # letters; longer ones are rather broken
 CAPTION_SIZE = 13.0
 MARGIN = 12.0
 ERROR_COLOR = (1.0, 0.35, 0.3, 1.0)
@@ -127,14 +123,6 @@ def wrapped(lines: list[tuple[str, tuple]], width: float, width_of) -> list[tupl
     return broken
 
 
-def share_of_size(lines: list[tuple[str, tuple]], width: float, margin: float, width_of) -> float:
-    """The largest of `SHARES` at which all words of `lines` but long ones have room in `width` pixels, with a `margin`
-    on both sides that shrinks with them; `width_of(text, share)` says how wide text is. The smallest where none is."""
-    words = {word[:LONG_WORD] for text, _ in lines for word in text.split()}
-    fitting = (s for s in SHARES if all(width_of(word, s) + 2.0 * s * margin <= width for word in words))
-    return next(fitting, SHARES[-1])
-
-
 def is_drawn(context) -> bool:
     """True in 3D views that show the picture of the engine."""
     space = context.space_data
@@ -158,17 +146,14 @@ def _draw() -> None:
 def _draw_lines(font: int, texts: ViewTexts, region, sides: dict[str, int], scale: float) -> None:
     """The notes and below them the quiet line, at the lower right: Blender's own boxes are at the left and above."""
 
-    def width_of(text: str, share: float = 1.0) -> float:
-        blf.size(font, share * size)
+    def width_of(text: str) -> float:
         return blf.dimensions(font, text)[0]
 
     pointer, notes, quiet = region.as_pointer(), lines_of(texts.error, texts.notes), texts.quiet.text
     last = [(quiet, POINTED_COLOR if _pointed.get("region") == pointer else QUIET_COLOR)] if quiet else []
     size, margin = TEXT_SIZE * scale, MARGIN * scale
-    free = region.width - sides["RIGHT"] - max(sides["LEFT"], sides["FLOAT"])
-    share = share_of_size([*notes, *last], free, margin, width_of)
-    size, margin = share * size, share * margin
-    free -= 2.0 * margin
+    blf.size(font, size)
+    free = region.width - sides["RIGHT"] - max(sides["LEFT"], sides["FLOAT"]) - 2.0 * margin
     # Better no quiet line than one of broken words.
     last = wrapped(last, free, width_of) if all(width_of(word) <= free for word in quiet.split()) else []
     right, bottom = region.width - sides["RIGHT"] - margin, sides["BOTTOM"] + margin
@@ -252,7 +237,6 @@ class LTSH_GGT_left_out(bpy.types.GizmoGroup):
 
 
 REACH = 8.0  # pixels of an unscaled interface
-HANDLE = 12.0
 
 
 def is_split(context) -> bool:
@@ -270,20 +254,9 @@ class LTSH_GT_split(bpy.types.Gizmo):
         return 0 if abs(location[0] - context.scene.ltsh_view.split_position * context.region.width) <= reach else -1
 
     def draw(self, context):
-        """Draw the handle, an arrow to either side; the line is part of the picture."""
-        size = HANDLE * context.preferences.system.ui_scale * (1.25 if self.is_highlight else 1.0)
-        x, y = context.scene.ltsh_view.split_position * context.region.width, 0.5 * context.region.height
-        shader = gpu.shader.from_builtin("UNIFORM_COLOR")
-        gpu.state.blend_set("ALPHA")
-        shader.bind()
-        for grown, color in ((0.3 * size, (0.0, 0.0, 0.0, 0.6)), (0.0, (0.95, 0.95, 0.95, 1.0))):
-            shader.uniform_float("color", color)
-            corners = []
-            for side in (-1.0, 1.0):
-                inner, tip = x + side * (0.4 * size - 0.5 * grown), x + side * (1.2 * size + grown)
-                corners += [(inner, y + 0.8 * size + grown), (inner, y - 0.8 * size - grown), (tip, y)]
-            batch_for_shader(shader, "TRIS", {"pos": [(*corner, 0.0) for corner in corners]}).draw(shader)
-        gpu.state.blend_set("NONE")
+        """Draw the handle; the line is part of the picture."""
+        region, scale = context.region, context.preferences.system.ui_scale * (1.25 if self.is_highlight else 1.0)
+        draw_handle(context.scene.ltsh_view.split_position * region.width, 0.5 * region.height, scale)
 
     def invoke(self, context, event):
         self.start = context.scene.ltsh_view.split_position
@@ -315,9 +288,6 @@ class LTSH_GGT_split(bpy.types.GizmoGroup):
     def setup(self, context):
         self.line = self.gizmos.new(LTSH_GT_split.bl_idname)
         self.line.use_draw_modal = True
-
-
-CLASSES = (LTSH_GT_left_out, LTSH_GGT_left_out, LTSH_GT_split, LTSH_GGT_split)
 
 
 def register() -> None:

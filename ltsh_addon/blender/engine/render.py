@@ -279,7 +279,6 @@ def saved_copy() -> Path:
     return Path(_copy["folder"].name) / "scene.blend"
 
 
-CLASSES = (LTSH_RenderEngine,)
 HANDLERS = (("render_init", _save_copy), ("render_complete", _delete_copy), ("render_cancel", _delete_copy))
 register = _delete_copy
 

@@ -160,9 +160,6 @@ def _unshare_panels() -> None:
                 setattr(panel, name, value)
 
 
-CLASSES = (LTSH_ViewSettings,)
-
-
 def register() -> None:
     """Add the settings, and show the shared panels."""
     bpy.types.Scene.ltsh_view = bpy.props.PointerProperty(type=LTSH_ViewSettings)

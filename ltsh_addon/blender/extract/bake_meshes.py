@@ -130,7 +130,6 @@ def _read(ob, mesh, matrix, uv_name):
         normals=world_normals.reshape(count, 3, 3),
         uv=uv,
         material=np.minimum(read_values(mesh.loop_triangles, "material_index", (count,), np.int32), slots - 1),
-        vertices=vertices.reshape(count, 3),
         mirrored=bool(np.linalg.det(linear) < 0.0),
     )
     a, b, c = np.moveaxis(uv.astype(np.float64), 1, 0)

@@ -16,6 +16,8 @@ from ..evaluated import normals_at_corners, read_values
 ONE_INSTANCE = np.eye(4)[None]
 # MOST_PIECES: hair or points with more pieces block nothing; such hair would take some 0.7 GiB.
 MOST_PIECES = 1_000_000
+TOO_MANY = f"{{:,}} pieces of hair or points block nothing, more than {MOST_PIECES:,}; all of their shadow is lost"
+TUBES = "hair blocks as tubes of three flat sides: single hairs are up to 9 % too wide or too narrow, on average right"
 TUBE_SIDES = 3
 # BALL_THICKNESS: the largest distance of a ball of radius 1 from the flat faces that stand for it.
 BALL_THICKNESS = 0.08
@@ -28,11 +30,11 @@ def tubes_of_curves(ob, clear, note) -> list[OccluderMesh]:
     curves = ob.data
     points = len(curves.points)
     if points > MOST_PIECES:
-        note(f"more than {MOST_PIECES:,} pieces of hair or points, which block nothing", ob)
+        note(TOO_MANY.format(points), ob)
         return []
     if not points:
         return []
-    note("hair blocks as tubes of three flat sides", ob)
+    note(TUBES, ob)
     positions = read_values(curves.attributes["position"].data, "vector", (points, 3), np.float32)
     radii = np.full(points, POINT_RADIUS, np.float32)
     if "radius" in curves.attributes:
@@ -66,7 +68,7 @@ def _constant_transparency(clear, ob=None, note=None) -> Transparency | None:
     if clear.shares:
         return Transparency(float(np.mean(clear.shares)))
     if note is not None:
-        note("transparency that varies along hair or points is not read here, they block as if they were opaque", ob)
+        note("transparency that varies along hair or points is not read here, all of their shadow is there", ob)
     return None
 
 
@@ -102,11 +104,11 @@ def balls(ob, clear, note) -> tuple[list[OccluderMesh], np.ndarray]:
     cloud = ob.data
     count = len(cloud.points)
     if count > MOST_PIECES:
-        note(f"more than {MOST_PIECES:,} pieces of hair or points, which block nothing", ob)
+        note(TOO_MANY.format(count), ob)
         count = 0
     if not count:
         return [], ONE_INSTANCE
-    note("points block as balls of 80 flat faces", ob)
+    note("points block as balls of 80 flat faces: the outlines of their shadows are up to 4 % of the radius off", ob)
     radii = np.full(count, POINT_RADIUS, np.float32)
     if "radius" in cloud.attributes:
         radii = read_values(cloud.attributes["radius"].data, "value", (count,), np.float32)

@@ -8,9 +8,12 @@ from __future__ import annotations
 
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 
 import bpy
 import numpy as np
+from bpy_extras.object_utils import world_to_camera_view
+from mathutils import Vector
 
 from ...scene import FARTHEST, listed
 from ...visibility.occluders import TERMINATOR_OFFSET, OccluderMesh, Occluders, Transparency, overlap_within
@@ -122,6 +125,8 @@ class _Collector:
             matrix = np.array(instance.matrix_world, dtype=np.float64)
             if not np.isfinite(matrix).all() or np.abs(matrix).max() > FARTHEST:
                 continue
+            if self._is_culled(ob, matrix):
+                continue
             if instance.show_self and is_rendered(ob):
                 self._add(instance, matrix)
             if instance.show_particles and ob.particle_systems:
@@ -207,7 +212,7 @@ class _Collector:
         )
         if first is mesh_and_name or not _is_same(mesh, self._meshes[first[0]]):
             return False
-        self._note(f"in the same place as {first[1]!r}: Cycles is black there, here both are lit", ob)
+        self._note(f"in the same place as {first[1]!r}: Cycles is black there, here both are lit; remove one", ob)
         return True
 
     # Surfaces:
@@ -219,9 +224,8 @@ class _Collector:
             materials = [self._override] * len(materials)
         owner = owner_of(instance)
         if (ob.visible_diffuse and owner.visible_diffuse) != _meets(instance)[1]:
-            self._note("diffuse and glossy rays do not both meet it: light that surfaces choose counts as glossy", ob)
-        if self._simplified(ob):
-            self._note("camera or distance culling is on, but it blocks everywhere", ob)
+            text = "diffuse and glossy rays do not both meet it: light that surfaces choose counts as glossy"
+            self._note(f"{text}: its shadow in diffuse light is off, by half where a light fills half of the sky", ob)
         key = (*shapes.shape_key(ob), tuple(material.name_full if material else "" for material in materials))
         if key not in self._shapes:
             clear = [self._clear_of(material) for material in materials]
@@ -236,7 +240,7 @@ class _Collector:
                     text = "of its faces where others are: Cycles is black there, here all are lit"
                     self._note(f"{_percent(share)} {text}", ob)
                 if any(material is not None and _is_displaced(material) for material in materials):
-                    self._note("displacement is not in shadows, the surface blocks where it is without", ob)
+                    self._note("displacement is not in shadows, which are off by its height: use a modifier", ob)
             self._shapes[key] = self._number(meshes), matrices
             self._remember_unread(instance, matrix, materials, self._shapes[key][0])
         self._add_instances(instance, matrix, *self._shapes[key])
@@ -259,11 +263,20 @@ class _Collector:
                 surface = ob.original.name, mesh, slot, materials[slot].original, matrix
                 self._unread.append(UnreadSurface(*surface, ObjectFacts.of(ob, instance), number))
 
-    def _simplified(self, ob) -> bool:
-        scene, names = self._depsgraph.scene, ("use_camera_cull", "use_distance_cull")
-        return scene.render.use_simplify and any(
-            cycles_setting(scene, name) and cycles_setting(ob, name) for name in names
-        )
+    def _is_culled(self, ob, matrix) -> bool:
+        """Whether Cycles leaves out the object for the culling that Simplify asks for (`BlenderObjectCulling`)."""
+        scene, of_scene = self._depsgraph.scene, partial(cycles_setting, self._depsgraph.scene)
+        asked = [of_scene(name) and cycles_setting(ob, name) for name in ("use_camera_cull", "use_distance_cull")]
+        if not (scene.render.use_simplify and scene.camera and any(asked)):
+            return False
+        corners = np.array([(*corner, 1.0) for corner in ob.bound_box]) @ matrix[:3].T
+        shown = np.array([world_to_camera_view(scene, scene.camera, Vector(corner)) for corner in corners])
+        beside = np.where(shown[:, 2:] < 0.0, 0.5 - shown[:, :2], shown[:, :2] - 0.5)
+        margin, eye = of_scene("camera_cull_margin"), np.array(scene.camera.matrix_world.translation)
+        away = np.linalg.norm(np.clip(eye, corners.min(axis=0), corners.max(axis=0)) - eye)
+        beyond = (np.maximum(beside.min(axis=0), -beside.max(axis=0)) >= 0.5 + margin).any()
+        is_out = beyond or (shown[:, 2] < -margin).all(), away > of_scene("distance_cull_margin")
+        return all(out for is_asked, out in zip(asked, is_out, strict=True) if is_asked)
 
     def _clear_of(self, material) -> _ClearMaterial | None:
         """The light that a material lets through; None if it blocks all."""
@@ -338,13 +351,13 @@ class _Collector:
             if settings.type != "HAIR" or settings.render_type != "PATH":
                 continue
             if instance.is_instance:
-                self._note("hair on instances blocks nothing", ob)
+                self._note("hair on instances blocks nothing, in Cycles it has its shadow; make the instances real", ob)
                 continue
             count, steps = len(system.particles) + len(system.child_particles), 2**settings.render_step + 1
             if count * steps > shapes.MOST_PIECES:
-                self._note(f"more than {shapes.MOST_PIECES:,} pieces of hair or points, which block nothing", ob)
+                self._note(shapes.TOO_MANY.format(count * steps), ob)
                 continue
-            self._note("hair blocks as tubes of three flat sides", ob)
+            self._note(shapes.TUBES, ob)
             slot = min(settings.material, len(ob.material_slots)) - 1
             material = self._override or (ob.material_slots[slot].material if slot >= 0 else None)
             meshes = [shapes.tubes_of_hair(ob, system, count, steps, self._clear_of(material))]

@@ -180,7 +180,7 @@ def missing_images(depsgraph, world, override=None) -> list[str]:
 
     shown = {image for block in blocks - {None} for image in images_behind(block)}
     return [
-        f"image {image.name!r}: {image.filepath} is missing, Cycles shows it in one false color"
+        f"image {image.name!r}: {image.filepath} is missing, Cycles and the techniques show it in pink"
         for image in missing
         if image in shown or shapes(image)
     ]
@@ -240,7 +240,8 @@ def open_scene(path: Path, warnings: list[str], scripts: bool = False) -> None:
     if saved > here:
         raise SceneError(newer(path, saved, here))
     if bpy.app.autoexec_fail:
-        warnings.append(f"scripts in {path.name} do not run: {bpy.app.autoexec_fail_message}")
+        saved = "what they set stays as it was saved; --enable-autoexec runs them"
+        warnings.append(f"scripts in {path.name} do not run, {saved}: {bpy.app.autoexec_fail_message}")
     warnings.extend(lost_libraries())
 
 

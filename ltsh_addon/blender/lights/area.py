@@ -96,8 +96,9 @@ def collect_lights(depsgraph, override=None) -> LightInventory:
         problem = reason_to_leave_out(ob, matrix)
         if problem:
             inventory.left_out.add(ob.original.name_full)
-            inventory.warn(f"light {ob.original.name!r}: {problem}; left out of the Cycles reference as well")
-            if not cycles_setting(ob.data, "is_portal"):
+            if not cycles_setting(ob.data, "is_portal"):  # which only guides the sampling of the world
+                left_out = f"its {ob.data.energy:g} W are left out of the Cycles reference as well"
+                inventory.warn(f"light {ob.original.name!r}: {problem}; {left_out}")
                 inventory.left_to_cycles.everything.append(f"light {ob.original.name!r}, {problem}")
             continue
         light = area_light(ob, matrix, EmitterTraits.of(instance), receivers)
@@ -336,7 +337,7 @@ def node_light(ob, matrix: np.ndarray, inventory: LightInventory, instance=None)
     if light.type == "SUN":
         # As in Cycles: a sun has no distance.
         emission.falloff = Falloff()
-    for problem in emission_warnings(emission, is_light=True):
+    for problem in emission_warnings(emission, is_light=True, is_flat=light.type == "AREA"):
         inventory.warn(f"light {ob.original.name!r}: {problem}")
     is_made = instance is not None and instance.is_instance
     of_parent = (instance.parent.original.name_full, *instance.persistent_id) if is_made else ()
@@ -346,11 +347,6 @@ def node_light(ob, matrix: np.ndarray, inventory: LightInventory, instance=None)
         "instance": (ob.original.name_full, *of_parent),
     }
     if light.type in ("AREA", "SUN"):
-        if emission.directional and light.type == "AREA":
-            nodes = ", ".join(sorted(emission.directional))
-            inventory.warn(
-                f"light {ob.original.name!r}: its emission depends on the direction ({nodes}), shaded as seen head-on"
-            )
         is_placed = light.type == "SUN" or emission.is_placed
         return NodeLight(light.original, matrix, emission.varies, is_placed=is_placed, **shared)
     is_ball = not light.use_soft_falloff and light.shadow_soft_size > 0.0
@@ -372,7 +368,10 @@ def note_unsupported(ob, matrix: np.ndarray, inventory: LightInventory) -> None:
     if light.energy < 0.0:
         inventory.warn(f"light {name!r}: negative power {light.energy:g} W subtracts light")
     if _is_sheared(ob, matrix):
-        inventory.warn(f"light {name!r}: its transform is sheared, which Cycles itself does not sample correctly")
+        u, v = matrix[:3, 0], matrix[:3, 1]
+        more = np.linalg.norm(u) * np.linalg.norm(v) / max(np.linalg.norm(np.cross(u, v)), 1e-30) - 1.0
+        size = f"Cycles samples it as a rectangle, some {100.0 * more:.2g} % too bright far away"
+        inventory.warn(f"light {name!r}: its transform is sheared: {size}")
 
 
 def _is_sheared(ob, matrix: np.ndarray) -> bool:

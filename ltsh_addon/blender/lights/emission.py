@@ -308,12 +308,13 @@ def _is_among(source: Source, kinds: dict[str, tuple]) -> bool:
     return outputs is not None and (not outputs or source.socket.name in outputs)
 
 
-def emission_warnings(emission: Emission, is_light: bool) -> list[str]:
-    """Warnings about emission that is not shaded as in Cycles: that of a light (`is_light`) or of a material.
-
-    They leave out a dependence on the direction.
-    """
+def emission_warnings(emission: Emission, is_light: bool, is_flat: bool = True) -> list[str]:
+    """Warnings about emission that is not shaded as in Cycles: that of a light (`is_light`) or of a material. With
+    `is_flat` also about a dependence on the direction."""
     warnings = []
+    if is_flat and emission.directional:
+        nodes = ", ".join(sorted(emission.directional))
+        warnings.append(f"its emission depends on the direction ({nodes}), shaded as seen head-on")
     if emission.of_camera:
         nodes = ", ".join(sorted(emission.of_camera))
         warnings.append(f"its emission depends on the camera ({nodes}), shaded as from a camera right before it")

@@ -10,7 +10,7 @@ import bpy
 import numpy as np
 
 from ...cycles import planar_polygons
-from ...cycles.patches import ERROR, GRID, cut_into_patches, split_light
+from ...cycles.patches import GRID, cut_into_patches, note_patches, split_light
 from ...cycles.planar_polygons import FlatPolygon
 from ...scene import Light, PolygonLight, QuadLight
 from ..evaluated import SURFACE_TYPES, EmitterTraits, RenderedSurface, is_rendered, read_values, surface_instancer
@@ -219,11 +219,12 @@ def constant_mesh_lights(mesh_lights: list[MeshLight], radiance_of, eye: np.ndar
         side = _emitting_side(mesh_light, eye)
         of_mesh = _constant_lights(mesh_light, _polygons(mesh_light, radiance), radiance, side)
         of_mesh = [replace(light, falloff=0, smooth=0.0) for light in of_mesh]
-        if len(of_mesh) > MOST_SHOWN:
-            count = f"{len(of_mesh)} flat faces, more than the {MOST_SHOWN} that the viewport takes"
-            warn(f"object {mesh_light.ob.name!r}: it emits from {count}; pictures, bakes and F12 shade it")
-        else:
-            lights.extend(of_mesh)
+        if (step := -(-len(of_mesh) // MOST_SHOWN)) > 1:
+            power = [np.linalg.norm(light.area_vector) * light.radiance.sum() for light in of_mesh]
+            more, count = sum(power) / max(sum(power[::step]), 1e-30), len(of_mesh)
+            warn(f"object {mesh_light.ob.name!r}: of its {count} flat faces one in {step} shines for all, in views")
+            of_mesh = [replace(light, radiance=more * light.radiance) for light in of_mesh[::step]]
+        lights.extend(of_mesh)
     return lights
 
 
@@ -237,9 +238,6 @@ def mark_transparent(ob, side: int, materials: list) -> None:
 
 def _warn_of_emission(mesh_light: MeshLight, warn) -> None:
     for material, emission in zip(mesh_light.materials, mesh_light.emission, strict=True):
-        if emission.emits and emission.directional:
-            nodes = ", ".join(sorted(emission.directional))
-            warn(f"material {material.name!r}: its emission depends on the direction ({nodes}), shaded as seen head-on")
         for problem in emission_warnings(emission, is_light=False) if emission.emits else ():
             warn(f"material {material.name!r}: {problem}")
         if emission.emits and material.displacement_method != "BUMP" and displaces(material):
@@ -373,12 +371,8 @@ def _patch_lights(mesh_light: MeshLight, textured, side: int, studio: Studio, wa
         if patches.whole is not None:
             lights.setdefault(polygon.label, []).extend(split_light(light, patches))
         errors.append(patches.error)
-    if max(errors) > ERROR:
-        patches = sum(len(light.leaves) for of_label in lights.values() for light in of_label)
-        warn(
-            f"object {mesh_light.ob.name!r}: its texture is shaded as {patches} patches of constant radiance, "
-            f"which differ from it by {100.0 * max(errors):.0f} % on average"
-        )
+    count = sum(len(light.leaves) for of_label in lights.values() for light in of_label)
+    note_patches(f"object {mesh_light.ob.name!r}: its texture", count, max(errors), warn)
     return lights
 
 
@@ -444,18 +438,22 @@ def _mean_lights(mesh_light: MeshLight, textured, side: int, studio: Studio, war
         by_size = sorted(polygons, key=lambda polygon: (polygon.label, -np.ptp(polygon.corners, axis=0).max()))
         of_labels = itertools.groupby(by_size, key=lambda polygon: polygon.label)
         largest.append((placement, [one for _, alike in of_labels for one in list(alike)[:STAND_INS]]))
+    spread = np.zeros(2)
     for polygon, way, light, image, covered in _looks(mesh_light, largest, side, studio, PIXELS // 16):
         area = 4.0 * np.linalg.norm(np.cross(light.half_u, light.half_v)) * covered.mean()
         share = np.append(area * image[covered].mean(axis=0), area) if covered.any() else np.zeros(4)
         sums[polygon.label, way] = sums.get((polygon.label, way), np.zeros(4)) + share
+        if covered.any():
+            mean = sums[polygon.label, way][:3] / sums[polygon.label, way][3]
+            spread += area * np.abs(image[covered] - mean).mean(), area * mean.mean()
     for polygon, way in itertools.product((one for _, polygons in textured for one in polygons), _sides(side)):
         *light_sum, area = sums.get((polygon.label, way), np.zeros(4))
         if area > 0.0 and np.any(light_sum):
             light = polygon_light(mesh_light.light_of(polygon.label), polygon, way, np.array(light_sum) / area)
             lights.setdefault(polygon.label, []).append(light)
-    warn(
-        f"object {mesh_light.ob.name!r}: its texture on more than {MOST_RENDERED_POLYGONS} faces is shaded as its mean"
-    )
+    size = f"{100.0 * spread[0] / max(spread[1], 1e-30):.0f} % off on average"
+    many = f"its texture on more than {MOST_RENDERED_POLYGONS} faces is shaded as its mean"
+    warn(f"object {mesh_light.ob.name!r}: {many}, {size}")
     return lights
 
 

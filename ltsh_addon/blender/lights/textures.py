@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import bpy
 import numpy as np
 
-from ...cycles.patches import ERROR, Patches, cut_into_patches, split_light
+from ...cycles.patches import Patches, cut_into_patches, note_patches, split_light
 from ...cycles.texels import ImageTexture
 from ...emitters.facing import cone_angle, pattern_values
 from ...scene import Light, Pattern, SpotCone
@@ -342,11 +342,7 @@ def _covered(light: Light, rows: int, columns: int) -> np.ndarray:
 
 def _with_factor(light: Light, factor: np.ndarray, warn) -> list[Light]:
     patches = cut_into_patches(factor * light.radiance, _covered(light, *factor.shape[:2]))
-    if patches.error > ERROR:
-        warn(
-            f"light {light.name!r}: its texture is shaded as {len(patches.smallest)} patches of constant radiance, "
-            f"which differ from it by {100.0 * patches.error:.0f} % on average"
-        )
+    note_patches(f"light {light.name!r}: its texture", len(patches.smallest), patches.error, warn)
     return split_light(light, patches)
 
 
@@ -410,20 +406,16 @@ class ShownTextures:
 
 
 def _shown_patches(light: Light, patches: Patches, notes: list[str]) -> list[Light]:
-    if patches.error > ERROR:
-        notes.append(
-            f"{light.name}: its texture is shown as {len(patches.smallest)} patches, "
-            f"{100.0 * patches.error:.0f} % off on average"
-        )
+    note_patches(f"{light.name}: its texture", len(patches.smallest), patches.error, notes.append)
     shown = (patch for whole in split_light(light, patches) for patch in whole.leaves)
     return [replace(patch, radiance=patch.radiance * light.radiance) for patch in shown]
 
 
 def _texture(use) -> ImageTexture | None:
-    """The pixels of an image; None where only Cycles knows its colors."""
+    """The pixels of an image, as in Cycles one of pink where it is missing; None where only Cycles knows its colors."""
     image = use.image.original
-    srgb = is_srgb(image)
-    pixels = None if srgb is None else opaque_pixels(image)
+    srgb = is_srgb(image) if all(image.size) else False
+    pixels = np.array([[[1.0, 0.0, 1.0]]]) if not all(image.size) else None if srgb is None else opaque_pixels(image)
     if pixels is None:
         return None
     return ImageTexture(pixels, use.extension, "Closest" if use.closest else "Linear", srgb)

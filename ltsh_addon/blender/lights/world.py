@@ -21,6 +21,7 @@ from ...cycles.environment import (
     spot_light,
     without_spots,
 )
+from ...cycles.patches import note_patches
 from ...scene import Light, SkyLight, listed
 from ..materials.graph import is_group, is_socket, source_of, surface_of, tree_in_use, value_of
 from .emission import CONSTANT_NODES, LIGHT_PATH, OF_CAMERA, open_studio, trees_of
@@ -114,11 +115,7 @@ def world_lights(scene, world, warn) -> tuple[list[Light], float]:
     pictures, lights = light_pictures(scene, world, like, warn)
     sky, error = sky_lights(like, pictures)
     if error > COARSE:
-        count = sum(len(light.leaves) for light in sky)
-        warn(
-            f"world {world.name!r}: it is shaded as {count} patches of constant radiance, which differ from it by "
-            f"{100.0 * error:.0f} % on average"
-        )
+        note_patches(f"world {world.name!r}: it", sum(len(light.leaves) for light in sky), error, warn)
     return sky + lights, fine_detail(pictures)
 
 
@@ -211,7 +208,8 @@ def _observatory(scene, world, warn, by_cameras: bool = False):
                 radiance = studio.picture()[..., :3]
                 odd = ~(np.abs(radiance) < MOST_RADIANCE).all(axis=-1)
                 if odd.any():
-                    warn(f"world {world.name!r}: its radiance is not finite, or beyond {MOST_RADIANCE:g}; dark there")
+                    share = f"on {100.0 * odd.mean():.2g} % of a side of the sky, dark there"
+                    warn(f"world {world.name!r}: its radiance is not finite, or beyond {MOST_RADIANCE:g}, {share}")
                     radiance[odd] = 0.0
                 return SkyPicture(ahead, right, up, radiance)
 

@@ -306,9 +306,10 @@ def baked_transparency(surface, studio) -> tuple[Transparency, float]:
                 studio.show(ob, surface.matrix, surface.facts),
                 bpy.context.temp_override(scene=scene, object=ob, **context),
             ):
+                margin = {"margin": GAP // 2, "margin_type": "EXTEND"}
                 bpy.ops.object.bake(
-                    type="EMIT", margin=GAP // 2, margin_type="EXTEND", use_clear=False, uv_layer=layer.name,
-                    target="IMAGE_TEXTURES", save_mode="INTERNAL", use_selected_to_active=False,
+                    type="EMIT", use_clear=False, uv_layer=layer.name, target="IMAGE_TEXTURES", save_mode="INTERNAL",
+                    use_selected_to_active=False, **margin,
                 )  # fmt: skip
         pixels = np.empty(size * size * 4, np.float32)
         image.pixels.foreach_get(pixels)

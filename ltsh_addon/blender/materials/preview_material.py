@@ -11,7 +11,7 @@ from ...cycles.lobes import BRUSHED_KINDS, SMALLEST_WEIGHT, aspect_of
 from ..render_settings import cycles_setting
 from . import graph
 from .bsdfs import REFRACTION_NODE, Bsdf, bsdf_of, emission_sockets, has_alpha, is_emission
-from .values import ImageUse, Value, constant, constant_inputs, input_value, value_at
+from .values import ImageUse, Value, constant, constant_inputs, input_value, is_gray, value_at
 
 # Quantities that may come from an image; all others are constants.
 IMAGE_SLOTS = ("color", "roughness", "metallic", "ior", "normal", "weight")
@@ -254,9 +254,13 @@ class _PreviewReader:
         self.emitters = [(leaf.source, share) for leaf, share in pairs if is_emission(leaf.node)]
         self.leaves = [(leaf.source, share) for leaf, share in pairs if not is_emission(leaf.node)]
         if (self.leaves or self.emitters) and (shaders.cuts or any(leaf.is_transparent for leaf in shaders.leaves)):
-            self.note("transparency is not shown")
-        if any(has_alpha(leaf.node) for leaf in shaders.leaves):
-            self.note("alpha is not shown")
+            opaque = sum(share.shining for _, share in pairs) / sum(share.estimate for _, share in pairs)
+            self.note(f"transparency of about {100.0 * (1.0 - min(opaque, 1.0)):.0f} % is not shown")
+        for leaf in shaders.leaves:
+            if has_alpha(leaf.node):
+                alpha = constant_inputs(leaf.source, "Alpha")
+                size = "that varies" if alpha is None else f"of {float(alpha[0][0]):.2g}"
+                self.note(f"alpha {size} is not shown, the surface is opaque")
         self.notes += guesses
 
     def note(self, message: str) -> None:
@@ -284,7 +288,7 @@ class _PreviewReader:
     def _with_factor(self, share: LobeWeight, factor: graph.Factor) -> LobeWeight:
         whole = share.times(_value_of_factor(factor))
         if whole is None:
-            self.note(f"factor of {factor.node.name!r} is not resolved")
+            self.note(f"factor of {factor.node.name!r} is not resolved, half of each side is shown")
             whole = share.times(constant(0.5))
         return replace(share, shining=whole.shining) if factor.beside_transparency else whole
 
@@ -332,16 +336,13 @@ class _PreviewReader:
         """The lobes of one BSDF node."""
         bsdf = bsdf_of(source.node)
         if source.node.bl_idname == REFRACTION_NODE:
-            values = self._on_one_uv_map({"color": self._value(source, "color", "Color"), **share.values})
-            return [
-                PreviewMaterial(REFRACTION, values, weight=share.constant, view_factor=share.curve, is_stand_in=True)
-            ]
-        if bsdf is None:
+            kind, color = REFRACTION, self._value(source, "color", "Color")
+        elif bsdf is None:
             self.note(f"{source.node.bl_label} is not shown, its viewport color is")
-            values = {"color": constant(self.material.diffuse_color), **share.values}
-            return [
-                PreviewMaterial("diffuse", values, weight=share.constant, view_factor=share.curve, is_stand_in=True)
-            ]
+            kind, color = "diffuse", constant(self.material.diffuse_color)
+        if source.node.bl_idname == REFRACTION_NODE or bsdf is None:
+            values = self._on_one_uv_map({"color": color, **share.values})
+            return [PreviewMaterial(kind, values, weight=share.constant, view_factor=share.curve, is_stand_in=True)]
         look = self._lobe(source, bsdf, share)
         fuzz = self._sheen(source, look) if look.kind == "principled" else []
         coat = self._coat(source, look) if look.kind == "principled" else None
@@ -413,7 +414,7 @@ class _PreviewReader:
             lobe_normal = source.input("Normal")
             follows = look.normal is not None and (lobe_normal.node, lobe_normal.groups) == (normal.node, normal.groups)
             if not follows:
-                self.note("Coat Normal is not resolved")
+                self.note("Coat Normal is not resolved, the coat is smooth")
         roughness, ior = float(np.clip(roughness[0], 0.0, 1.0)), max(float(ior[0]), 1.0)
         return Coat(weight, roughness, ior, np.maximum(tint, 0.0) * np.ones(3), follows)
 
@@ -421,11 +422,11 @@ class _PreviewReader:
         value = input_value(source, socket_name)
         if value is not None and (value.is_constant or name in IMAGE_SLOTS):
             return value
-        self.note(f"{socket_name} is not resolved")
-        if name in STAND_INS:
-            return constant(getattr(self.material, STAND_INS[name]))
-        default = source.node.inputs[socket_name].default_value
-        return constant(default if value is None else value.offset)
+        shown = source.node.inputs[socket_name].default_value if value is None else value.offset
+        shown = constant(getattr(self.material, STAND_INS[name]) if name in STAND_INS else shown)
+        numbers = np.unique(shown.offset.round(3)) if is_gray(shown) else shown.offset
+        self.note(f"{socket_name} is not resolved, {' '.join(f'{one:.2g}' for one in numbers)} is shown")
+        return shown
 
     def _on_one_uv_map(self, values: dict[str, Value]) -> dict[str, Value]:
         """`values`, where images on other UV maps than the first image are replaced by constants."""
@@ -444,14 +445,12 @@ class _PreviewReader:
         normal = source.input("Normal") if "Normal" in source.node.inputs else None
         if normal is None or normal.node is None:
             return None, 1.0
-        node = normal.node
-        if node.bl_idname != "ShaderNodeNormalMap" or node.space != "TANGENT":
-            self.note(f"normals from {node.name!r} are not resolved")
-            return None, 1.0
-        color, strength = input_value(normal, "Color"), constant_inputs(normal, "Strength")
-        maps = {value.image.uv_map for value in values.values() if value.image is not None} | {node.uv_map}
+        node, color, strength, maps = normal.node, None, None, set()
+        if node.bl_idname == "ShaderNodeNormalMap" and node.space == "TANGENT":
+            color, strength = input_value(normal, "Color"), constant_inputs(normal, "Strength")
+            maps = {value.image.uv_map for value in values.values() if value.image is not None} | {node.uv_map}
         if color is None or strength is None or len(maps - {""}) > 1:
-            self.note(f"normals from {node.name!r} are not resolved")
+            self.note(f"normals from {node.name!r} are not resolved, the surface is smooth")
             return None, 1.0
         if color.image is None:
             return None, 1.0
@@ -459,12 +458,15 @@ class _PreviewReader:
 
     def _emission(self, source: graph.Source) -> np.ndarray:
         values = [value_at(socket, source.groups) for socket in emission_sockets(source.node)]
-        if all(value is not None and value.is_constant for value in values):
-            return np.prod([value.offset for value in values], axis=0) if values else np.zeros(3)
-        color, strength = values
-        if strength is None or not strength.is_constant or np.any(strength.offset):
-            self.note("its emission varies and is not shown")
-        return np.zeros(3)
+        known = [value.offset for value in values if value is not None and value.is_constant]
+        whole = np.prod(known, axis=0) * np.ones(3) if known else np.zeros(3)
+        if len(known) == len(values) or (known and not whole.any()):
+            return whole
+        if values[1] is None or not values[1].is_constant:
+            self.note("the strength of its emission varies: it is not shown and lights nothing")
+            return np.zeros(3)
+        self.note("the color of its emission varies: half of its strength is shown, at most as much off")
+        return 0.5 * whole
 
 
 def _direction_of(node) -> tuple[str | None, str]:

@@ -1,4 +1,4 @@
-"""The picture of a comparison in the Image Editor: composes two results, and draws the wipe line and the probe."""
+"""The picture of a comparison in the Image Editor: composes two results, and draws the wipe line."""
 
 from __future__ import annotations
 
@@ -14,15 +14,14 @@ from ...pipeline.relight import RelightData
 from ...scene import error_line
 from ..saving import is_working_copy
 from . import results
-from .overlay import LINE, PAPER, ROW, draw_gradient, draw_label, draw_rectangle, draw_text, label_places, text_width
+from .overlay import LINE, PAPER, ROW, draw_gradient, draw_handle, draw_label, draw_rectangle, label_places, text_width
 
 NAME = "LTSH Comparison"
 SETTLE_SECONDS = 1.0
 PANEL_REGIONS = {"VIEW_3D": "UI", "IMAGE_EDITOR": "UI", "PROPERTIES": "WINDOW"}
 GRIP_PIXELS = 12.0
-HANDLE_PIXELS = 9.0
 _LOOKUP_SIZE = 1024
-_state = {"settling": set(), "paths": [], "dragged": None, "probing": False}
+_state = {"settling": set(), "paths": [], "dragged": None}
 
 
 def changed(settings, context=None) -> None:
@@ -317,105 +316,6 @@ def _restore(*_):
     settle()
 
 
-class LTSH_OT_probe(bpy.types.Operator):
-    """Show the radiance of every picture at the pixel under the mouse. Click to leave the probe there, Esc to end"""
-
-    bl_idname = "ltsh.probe"
-    bl_label = "Pixel Probe"
-
-    @classmethod
-    def poll(cls, context):
-        space = context.space_data
-        if space is None or space.type != "IMAGE_EDITOR" or not is_viewer(space.image):
-            cls.poll_message_set("Show the image LTSH Comparison first")
-            return False
-        return True
-
-    def invoke(self, context, event):
-        self._area = context.area
-        _state["probing"] = True
-        context.window.cursor_modal_set("EYEDROPPER")
-        context.window_manager.modal_handler_add(self)
-        context.area.tag_redraw()
-        return {"RUNNING_MODAL"}
-
-    def modal(self, context, event):
-        region = next(region for region in self._area.regions if region.type == "WINDOW")
-        if event.type == "MOUSEMOVE":
-            x, y = region.view2d.region_to_view(event.mouse_x - region.x, event.mouse_y - region.y)
-            result = results.result_of(context.scene)
-            if result is not None and results.choice_of(context.scene.ltsh, result).mode == "SIDE":
-                x = 2.0 * x % 1.0
-            context.scene.ltsh.probe = min(max(x, 0.0), 1.0), min(max(y, 0.0), 1.0)
-            self._area.tag_redraw()
-            return {"PASS_THROUGH"}
-        if event.type in {"ESC", "RIGHTMOUSE"}:
-            _state["probing"] = False
-            return self._end(context, {"CANCELLED"})
-        if event.type == "LEFTMOUSE" and event.value == "PRESS":
-            return self._end(context, {"FINISHED"})
-        return {"PASS_THROUGH"}
-
-    def cancel(self, context):
-        """The window was closed."""
-        _state["probing"] = False
-
-    def _end(self, context, outcome):
-        context.window.cursor_modal_restore()
-        self._area.tag_redraw()
-        return outcome
-
-
-def values_at(scene, result, choice, point) -> tuple[tuple[int, int], list[tuple[str, tuple[float, ...]]]]:
-    """The pixel (column, row from the bottom) at `point` in [0, 1]^2, and (label, RGB) of every picture there."""
-    group = result.groups[choice.group]
-    width, height = group["size"]
-    column, row = (min(int(share * size), size - 1) for share, size in zip(point, (width, height), strict=True))
-    rows = []
-    for name in group["names"]:
-        layer = f"{name}.{choice.pass_name}"
-        if layer in group["files"]:
-            pixels = results.pixels_of(results.layer_image(scene, result, choice.group, layer))
-            if pixels.size:
-                rows.append((group["labels"][name], tuple(float(value) for value in pixels[row, column, :3])))
-    return (column, row), rows
-
-
-def draw_probe(context, result, choice, corners) -> None:
-    """Draw a cross at the probed pixel and a table of its values, while the probe is on."""
-    if not _state["probing"]:
-        return
-    scene, scale = context.scene, context.preferences.system.ui_scale
-    left, bottom, right, top = corners
-    (column, row), rows = values_at(scene, result, choice, scene.ltsh.probe)
-    share = 0.5 if choice.mode == "SIDE" else 1.0
-    x = left + share * scene.ltsh.probe[0] * (right - left)
-    y = bottom + scene.ltsh.probe[1] * (top - bottom)
-    half, arm, gap = 0.75 * scale, 9.0 * scale, 3.0 * scale
-    for a, b in ((gap, arm), (-arm, -gap)):
-        draw_rectangle(x + a, y - half, x + b, y + half, LINE)
-        draw_rectangle(x - half, y + a, x + half, y + b, LINE)
-    _draw_values(f"{column}, {row}", rows, x + 14.0 * scale, y - 14.0 * scale, scale)
-
-
-def _draw_values(title: str, rows, x: float, top: float, scale: float) -> None:
-    line, pad = 17.0 * scale, 8.0 * scale
-    label = max([text_width(name, scale) for name, _ in rows] + [text_width(title, scale)])
-    number = text_width("0000.0000", scale)
-    width = 2.0 * pad + label + 3.0 * (number + 4.0 * scale)
-    bottom = top - line * (len(rows) + 1) - pad
-    draw_rectangle(x, bottom, x + width, top, (0.0, 0.0, 0.0, 0.75))
-    y = top - line
-    draw_text(x + pad, y, title, scale, (0.75, 0.75, 0.75, 1.0))
-    for name, values in rows:
-        y -= line
-        draw_text(x + pad, y, name, scale)
-        for index, value in enumerate(values):
-            text = f"{value:.4f}"
-            right = x + pad + label + (index + 1) * (number + 4.0 * scale)
-            draw_text(right - text_width(text, scale), y, text, scale)
-
-
 def _compared_in(context):
     """Result and choice if the space of `context` shows the comparison of its scene, else None."""
     space, scene = context.space_data, context.scene
@@ -505,17 +405,13 @@ def _draw() -> None:
         _draw_legend(start, below - ROW * scale, limit, scale)
     if results.lacks(result):
         draw_label(start, above, results.lacks(result), scale)
-    draw_probe(context, result, choice, (left, bottom, right, top))
 
 
 def _draw_line(x: float, bottom: float, top: float, scale: float) -> None:
-    half, handle = 0.75 * scale, HANDLE_PIXELS * scale
+    half = 0.75 * scale
     draw_rectangle(x - 2.0 * half, bottom, x + 2.0 * half, top, PAPER)
     draw_rectangle(x - half, bottom, x + half, top, LINE)
-    middle = (bottom + top) / 2.0
-    draw_rectangle(x - handle, middle - handle, x + handle, middle + handle, PAPER)
-    for offset in (-3.0 * scale, 3.0 * scale):
-        draw_rectangle(x + offset - half, middle - 0.6 * handle, x + offset + half, middle + 0.6 * handle, LINE)
+    draw_handle(x, (bottom + top) / 2.0, scale)
 
 
 def _draw_legend(left: float, below: float, limit: float, scale: float) -> None:
@@ -542,10 +438,9 @@ def _forget_file(*_):
     """Before loading, forget the file: the next one may have scenes of the same names."""
     results.forget_renders()
     _state["settling"].clear()
-    _state.update(dragged=None, probing=False)
+    _state["dragged"] = None
 
 
-CLASSES = (LTSH_OT_probe, LTSH_GT_wipe, LTSH_GGT_wipe)
 HANDLERS = (
     ("load_pre", _forget_file),
     ("save_pre", _shrink), ("save_post", _restore), ("load_post", _restore),

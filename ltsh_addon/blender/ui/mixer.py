@@ -21,8 +21,6 @@ UPDATE, MOVED = "Update Moved Lights", "moved since this picture"
 # UNMOVED: smaller changes, relative to a light's distance and size, do not count as a move.
 UNMOVED = 1e-5
 TIMER_SECONDS = 0.1
-# The `results.Update` that shades moved lights now, or None.
-_updating: dict = {"update": None}
 
 
 def plain_lights(depsgraph) -> dict[str, Light]:
@@ -124,9 +122,7 @@ class LTSH_UL_mixer(bpy.types.UIList):
         line.enabled = row is not None
         line.prop(item, "muted", text="", icon="HIDE_ON" if item.muted else "HIDE_OFF", emboss=False)
         line.prop(item, "solo", text="", icon="SOLO_ON" if item.solo else "SOLO_OFF", emboss=False)
-        state, note = ("ERROR", "") if row is None else state_of(row, item)
-        if MOVED in note:
-            results.get_ready(context.scene, row)
+        state = "ERROR" if row is None else state_of(row, item)[0]
         line.label(text=item.name, icon=state, translate=False)
         values = line.row(align=True)
         values.scale_x = 0.9
@@ -170,7 +166,7 @@ class _Mixer:
 
 def _draw_update(layout) -> None:
     """The button that shades moved lights, or its progress while that is done."""
-    update = _updating["update"]
+    update = results.state["update"]
     if update is None:
         layout.operator("ltsh.update_moved_lights", icon="ORIENTATION_GLOBAL")
         return
@@ -285,7 +281,7 @@ class LTSH_OT_update_moved_lights(_NeedsMixer, bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
-        if _updating["update"] is not None:
+        if results.state["update"] is not None:
             cls.poll_message_set("Moved lights are being shaded")
             return False
         return super().poll(context)
@@ -310,8 +306,8 @@ class LTSH_OT_update_moved_lights(_NeedsMixer, bpy.types.Operator):
         return self._finish(context)
 
     def modal(self, context, event):
-        update, scene = self._update, self._scene()
-        if _updating["update"] is not update or scene is None or results.mixer_of(scene) is not update.mixer:
+        update, scene = self._update, results.scene_of(self._scene_uid)
+        if results.state["update"] is not update or scene is None or results.mixer_of(scene) is not update.mixer:
             # Cancelled by the cross, or another picture or file is open.
             update.stop()
             return self._finish(context)
@@ -336,10 +332,6 @@ class LTSH_OT_update_moved_lights(_NeedsMixer, bpy.types.Operator):
         self._update.stop()
         self._finish(context)
 
-    def _scene(self):
-        """The scene of the picture, even if it was renamed; None if it was removed."""
-        return next((scene for scene in bpy.data.scenes if scene.session_uid == self._scene_uid), None)
-
     def _begin(self, context) -> bool:
         scene = context.scene
         moved = moved_rows(context, results.mixer_of(scene).rows)
@@ -347,7 +339,7 @@ class LTSH_OT_update_moved_lights(_NeedsMixer, bpy.types.Operator):
             self.report({"INFO"}, "No light of the picture has moved")
             return False
         try:
-            self._update = _updating["update"] = results.Update(scene, moved)
+            self._update = results.state["update"] = results.Update(scene, moved)
         except SceneError as error:
             self.report({"ERROR"}, error_line(error))
             return False
@@ -356,13 +348,13 @@ class LTSH_OT_update_moved_lights(_NeedsMixer, bpy.types.Operator):
 
     def _finish(self, context):
         update = self._update
-        if _updating["update"] is update:
-            _updating["update"] = None
+        if results.state["update"] is update:
+            results.state["update"] = None
         if self._timer is not None:
             context.window_manager.event_timer_remove(self._timer)
         if update.error is not None and not isinstance(update.error, Cancelled):
             self.report({"ERROR"}, error_line(update.error))
-        scene = self._scene()
+        scene = results.scene_of(self._scene_uid)
         if scene is not None and results.mixer_of(scene) is update.mixer:
             comparison.refresh(scene)
         comparison.redraw_panels()
@@ -376,7 +368,7 @@ class LTSH_OT_cancel_moved_lights(bpy.types.Operator):
     bl_label = "Cancel"
 
     def execute(self, context):
-        _updating["update"] = None
+        results.state["update"] = None
         return {"FINISHED"}
 
 

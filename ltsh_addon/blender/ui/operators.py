@@ -13,7 +13,6 @@ from pathlib import Path
 import bpy
 from bpy.app.translations import pgettext_iface as translated
 from bpy.props import EnumProperty, StringProperty
-from bpy_extras.io_utils import ExportHelper
 
 from ...files import replacing
 from ...scene import SceneError, error_line, listed
@@ -142,7 +141,7 @@ class _JobOperator:
 
         Returns True if there was something to show, or will be.
         """
-        scene, job = self._scene(), self._job
+        scene, job = results.scene_of(self._job.scene), self._job
         if scene is None or job.shown == len(job.results):
             return False
         if not self._opened:
@@ -189,16 +188,12 @@ class _JobOperator:
         return {"FINISHED"} if job.shown else {"CANCELLED"}
 
     def _what_remains(self) -> str:
-        scene, job = self._scene(), self._job
+        scene, job = results.scene_of(self._job.scene), self._job
         result = results.result_of(scene) if scene is not None and job.shown else None
         if result is None:
             return f"what was finished is in {job.output}" if job.command == "bake" else "nothing was finished yet"
         names = next(iter(result.groups.values()))["labels"].values()
         return f"kept: {', '.join(names)}"
-
-    def _scene(self):
-        """The scene of the job, even if it was renamed; None if it was removed."""
-        return next((scene for scene in bpy.data.scenes if scene.session_uid == self._job.scene), None)
 
     def _report_success(self) -> None:
         result = results.result_in(str(self._job.results[-1])) if self._job.results else None
@@ -377,38 +372,6 @@ class LTSH_OT_swap(_NeedsResults, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LTSH_OT_save_exr(_NeedsResults, ExportHelper, bpy.types.Operator):
-    """Save all layers of these results as one multi-layer OpenEXR file of 32-bit floats"""
-
-    bl_idname = "ltsh.save_exr"
-    bl_label = "Save As Multi-Layer EXR"
-
-    filename_ext = ".exr"
-    filter_glob: StringProperty(default="*.exr", options={"HIDDEN"})
-
-    def invoke(self, context, event):
-        self.filepath = self._source(context).name
-        return super().invoke(context, event)
-
-    def execute(self, context):
-        source = self._source(context)
-        try:
-            if Path(self.filepath).exists() and Path(self.filepath).samefile(source):
-                return {"FINISHED"}
-            with replacing(self.filepath) as temporary:
-                shutil.copyfile(source, temporary)
-        except OSError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
-        self.report({"INFO"}, f"Saved {self.filepath}")
-        return {"FINISHED"}
-
-    def _source(self, context) -> Path:
-        result = results.result_of(context.scene)
-        group = result.groups[results.choice_of(context.scene.ltsh, result).group]
-        return result.folder.parent / group["multilayer"]
-
-
 class LTSH_OT_apply_bake(bpy.types.Operator):
     """Let the objects of the last bake show their textures: they get copies of their materials"""
 
@@ -522,21 +485,6 @@ class LTSH_OT_manual(bpy.types.Operator):
         return {"FINISHED"}
 
 
-CLASSES = (
-    LTSH_OT_shade,
-    LTSH_OT_compare,
-    LTSH_OT_bake,
-    LTSH_OT_watch,
-    LTSH_OT_cancel,
-    LTSH_OT_open_results,
-    LTSH_OT_show_results,
-    LTSH_OT_choose,
-    LTSH_OT_swap,
-    LTSH_OT_save_exr,
-    LTSH_OT_apply_bake,
-    LTSH_OT_restore_materials,
-    LTSH_OT_manual,
-)
 HANDLERS = (("load_pre", _stop),)
 
 

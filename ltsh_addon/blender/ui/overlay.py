@@ -53,6 +53,14 @@ def draw_gradient(left: float, bottom: float, right: float, top: float, colors) 
     batch_for_shader(shader, "TRI_STRIP", {"pos": positions, "color": values}).draw(shader)
 
 
+def draw_handle(x: float, y: float, scale: float) -> None:
+    """Draw the handle of a vertical line that can be dragged sideways, with its middle at (x, y)."""
+    half, handle = 0.75 * scale, 9.0 * scale
+    draw_rectangle(x - handle, y - handle, x + handle, y + handle, PAPER)
+    for offset in (-3.0 * scale, 3.0 * scale):
+        draw_rectangle(x + offset - half, y - 0.6 * handle, x + offset + half, y + 0.6 * handle, LINE)
+
+
 def text_width(text: str, scale: float) -> float:
     """Width of `text` in pixels."""
     blf.size(FONT, TEXT_SIZE * scale)

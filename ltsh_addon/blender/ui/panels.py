@@ -500,10 +500,8 @@ class _Results:
         self.draw_warnings(context, result)
         if context.space_data.type != "IMAGE_EDITOR":
             layout.operator("ltsh.open_results", icon="IMAGE_DATA")
-        row = layout.row(align=True)
-        short = {"text": "Save EXR"} if region_width(context) < SPLIT_PIXELS else {}
-        row.operator("ltsh.save_exr", icon="FILE_TICK", **short)
-        row.operator("wm.path_open", text="", icon="FILE_FOLDER").filepath = str(result.folder.parent)
+        folder = layout.operator("wm.path_open", text="Open Folder of Files", icon="FILE_FOLDER")
+        folder.filepath = str(result.folder.parent)
 
     def draw_choice(self, context, result):
         """Draw the choice of pictures; only the Image Editor, which shows them, has it."""
@@ -556,7 +554,6 @@ class LTSH_PT_IMAGE_results(_Results, bpy.types.Panel):
         elif choice.mode == "ERROR":
             column.prop(settings, "error_scale", text="Scale (0: Automatic)")
         column.prop(view, "exposure", text="Exposure of the Scene")
-        layout.operator("ltsh.probe", icon="EYEDROPPER")
 
 
 def _draw_choices(row, settings, choice, key: str, names) -> None:

@@ -11,7 +11,7 @@ import functools
 import math
 import os
 import platform
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import bpy
@@ -114,7 +114,7 @@ def bake_objects(context) -> tuple[list, list[Problem]]:
         else:
             problems.append(problem)
     if usable:
-        problems = [Problem(p.text, False, p.fix, p.fix_label, p.fix_values) for p in problems]
+        problems = [replace(problem, blocks=False) for problem in problems]
     return usable, problems
 
 
@@ -129,8 +129,7 @@ def _textures_shown(baked) -> Problem:
 
 def _object_problem(ob, uv_map: str) -> Problem | None:
     if ob.hide_render:
-        text = f"Object {ob.name!r} is hidden in renders"
-        return Problem(text, True, "ltsh.show_in_render", "Show", {"object_name": ob.name})
+        return _hidden(ob, f"Object {ob.name!r} is hidden in renders")
     try:
         check_object(ob)
     except ObjectError as error:
@@ -146,6 +145,11 @@ def _object_problem(ob, uv_map: str) -> Problem | None:
     return None
 
 
+def _hidden(ob, text: str) -> Problem:
+    values = {"data_path": f"scene.objects[{ob.name!r}].hide_render", "value": False}
+    return Problem(text, True, "wm.context_set_boolean", "Show", values)
+
+
 def _camera(scene) -> list[Problem]:
     camera = scene.camera
     if camera is None or camera.type != "CAMERA":
@@ -153,7 +157,10 @@ def _camera(scene) -> list[Problem]:
     if camera.data.type not in CAMERA_TYPES:
         kind = CAMERA_KINDS.get(camera.data.type, camera.data.type)
         text = f"Camera {camera.name!r} is {kind}, expected perspective or orthographic"
-        return [Problem(text, True, "ltsh.make_perspective", "Make Perspective")]
+        if camera.data.library is not None:
+            return [Problem(f"{text}; it is linked from {camera.data.library.filepath}: make it local")]
+        values = {"data_path": "scene.camera.data.type", "value": "PERSP"}
+        return [Problem(text, True, "wm.context_set_enum", "Make Perspective", values)]
     return []
 
 
@@ -164,8 +171,7 @@ def _lights(scene) -> list[Problem]:
     if any(not ob.hide_render for ob in lights) or any(glows(material) for material in materials_of(scene)):
         return []
     if lights:
-        text = f"Light {lights[0].name!r} is hidden in renders, and no other light is there"
-        return [Problem(text, True, "ltsh.show_in_render", "Show", {"object_name": lights[0].name})]
+        return [_hidden(lights[0], f"Light {lights[0].name!r} is hidden in renders, and no other light is there")]
     return [Problem("No light", True, "ltsh.add_area_light", "Add Light")]
 
 
@@ -222,26 +228,6 @@ class LTSH_OT_add_camera(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LTSH_OT_make_perspective(bpy.types.Operator):
-    """Make the scene's active camera a perspective one"""
-
-    bl_idname = "ltsh.make_perspective"
-    bl_label = "Make Perspective"
-    bl_options = {"REGISTER", "UNDO"}
-
-    @classmethod
-    def poll(cls, context):
-        return context.scene.camera is not None and context.scene.camera.type == "CAMERA"
-
-    def execute(self, context):
-        data = context.scene.camera.data
-        if data.library is not None:
-            self.report({"ERROR"}, f"Camera {data.name!r} is linked from {data.library.filepath}: make it local")
-            return {"CANCELLED"}
-        data.type = "PERSP"
-        return {"FINISHED"}
-
-
 class LTSH_OT_add_area_light(bpy.types.Operator):
     """Add an area light above the origin that shines down"""
 
@@ -255,24 +241,6 @@ class LTSH_OT_add_area_light(bpy.types.Operator):
         ob = bpy.data.objects.new("Area", light)
         context.collection.objects.link(ob)
         ob.location = (0.0, 0.0, 4.0)
-        return {"FINISHED"}
-
-
-class LTSH_OT_show_in_render(bpy.types.Operator):
-    """Show the object in renders"""
-
-    bl_idname = "ltsh.show_in_render"
-    bl_label = "Show in Renders"
-    bl_options = {"REGISTER", "UNDO"}
-
-    object_name: StringProperty(name="Object", description="Name of the object")
-
-    def execute(self, context):
-        ob = context.scene.objects.get(self.object_name)
-        if ob is None:
-            self.report({"ERROR"}, f"Object {self.object_name!r} is not in the scene any more")
-            return {"CANCELLED"}
-        ob.hide_render = False
         return {"FINISHED"}
 
 
@@ -399,14 +367,6 @@ def _forget(*_):
     _known.clear()
 
 
-CLASSES = (
-    LTSH_OT_add_camera,
-    LTSH_OT_make_perspective,
-    LTSH_OT_add_area_light,
-    LTSH_OT_show_in_render,
-    LTSH_OT_add_uv_map,
-    LTSH_OT_pack_image,
-)
 HANDLERS = tuple((event, _forget) for event in ("depsgraph_update_post", "load_post", "undo_post", "redo_post"))
 
 

@@ -162,7 +162,6 @@ def _subscribe() -> None:
     )
 
 
-CLASSES = (LTSH_OT_preview,)
 HANDLERS = (
     ("save_pre", _before_saving),
     ("save_post", _after_saving),

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import queue
 import threading
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing, suppress
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 
@@ -14,10 +14,10 @@ import numpy as np
 
 from ...imaging.report import index_stamp, read_index
 from ...pipeline.display_layers import FILES
-from ...pipeline.mixer import MIXER_FILE, LightPictures, Mixer, MixerRow
-from ...pipeline.moved_lights import MovedLights
-from ...pipeline.relight import RELIGHT_SUFFIX, RelightData, tint
-from ...scene import Light, SceneError, SurfaceSamples, light_of
+from ...pipeline.mixer import MIXER_FILE, LightPictures, Mixer, MixerRow, moved_light
+from ...pipeline.relight import OCCLUDERS_SUFFIX, RELIGHT_SUFFIX, RelightData, tint
+from ...scene import Light, SceneError, SurfaceSamples
+from ...visibility import Occluders
 
 LAYER, SCENE = "ltsh_layer", "ltsh_scene"  # custom properties that mark our images
 PREFIX = "LTSH "
@@ -54,11 +54,17 @@ class Choice:
     mode: str
 
 
-# The job that runs now, or None (see `operators.running_job`); True while this module sets values of the mixer.
-state: dict = {"job": None, "is_silent": False}
+# The job that runs now, or None (see `operators.running_job`); True while this module sets values of the mixer; the
+# `Update` that shades moved lights now, or None.
+state: dict = {"job": None, "is_silent": False, "update": None}
 _read: dict[str, tuple[tuple, Result]] = {}
 _pixels: dict[str, tuple[tuple, np.ndarray]] = {}
 PIXELS_KEPT = 8
+
+
+def scene_of(uid: int):
+    """The scene with this session uid, even if it was renamed; None if it was removed."""
+    return next((scene for scene in bpy.data.scenes if scene.session_uid == uid), None)
 
 
 def result_of(scene) -> Result | None:
@@ -240,15 +246,13 @@ def leave_mix(settings) -> None:
 
 # The light mixer:
 
-# The mixer of the picture that was asked for last, and its MovedLights.
+# The mixer of the picture that was asked for last, and its samples and occluders once a light has moved.
 _mixer: dict = {"stamp": None, "mixer": None, "moved": None}
 # Mixers that threads read, by the stamp of their file.
 _readings: dict[tuple, Future] = {}
-# Mixers and MovedLights of final renders by the name of their scene, while nothing else is shown. They are in no file.
-_rendered: dict[str, tuple[Mixer, MovedLights | None]] = {}
-# MOST_BYTES: final renders with larger samples do not keep them for moved lights. IDLE_SECONDS: the processes for moved
-# lights end after so long without use.
-MOST_BYTES, IDLE_SECONDS = 1 << 31, 60.0
+# Mixers and samples of final renders by the name of their scene, while nothing else is shown. They are in no file.
+_rendered: dict[str, tuple[Mixer, RelightData | None]] = {}
+MOST_BYTES = 1 << 31  # final renders with larger samples do not keep them for moved lights
 
 
 def has_mixer(scene, result: Result) -> bool:
@@ -267,13 +271,11 @@ def mixer_of(scene) -> Mixer | None:
     try:
         stamp = str(path), path.stat().st_mtime_ns
         if _mixer["stamp"] != stamp:
-            end_processes()
             _mixer.update(stamp=stamp, mixer=None, moved=None)
             reading = _readings.pop(stamp, None)
             _readings.clear()
             _mixer["mixer"] = Mixer(LightPictures.load(path)) if reading is None else reading.result()
     except (OSError, ValueError):
-        end_processes()
         _mixer.update(stamp=None, mixer=None, moved=None)
     return _mixer["mixer"]
 
@@ -296,8 +298,7 @@ def mix_render(scene, pictures: LightPictures, relight_data: RelightData) -> Non
     """Give the mixer of `scene` the lights of a final render, and the samples for lights that move."""
     forget_renders()
     size = sum(getattr(relight_data.extraction.samples, item.name).nbytes for item in fields(SurfaceSamples))
-    moved = MovedLights(lambda: (relight_data, relight_data.extraction.occluders)) if size <= MOST_BYTES else None
-    _rendered[scene.name] = Mixer(pictures), moved
+    _rendered[scene.name] = Mixer(pictures), relight_data if size <= MOST_BYTES else None
     # The picture shows the lights as they are in the scene.
     reset_mixer(scene)
     leave_mix(scene.ltsh)
@@ -305,30 +306,22 @@ def mix_render(scene, pictures: LightPictures, relight_data: RelightData) -> Non
 
 def forget_renders() -> None:
     """Forget final renders, because another picture is shown, or a file is opened whose scenes may have these names."""
-    end_processes()
+    if state["update"] is not None:
+        state["update"].is_finished, state["update"] = True, None
     _rendered.clear()
-
-
-def end_processes() -> None:
-    """End the processes that wait for moved lights. They start again when a light moves."""
-    for moved in (_mixer["moved"], *(moved for _, moved in _rendered.values())):
-        if moved is not None:
-            moved.close()
-    if bpy.app.timers.is_registered(end_processes):
-        bpy.app.timers.unregister(end_processes)
 
 
 class Update:
     """Shades lights of a scene's mixer that have moved, by the numbers of their rows.
 
-    A thread shades them at their new places; `take` puts new pictures into the mixer. Raises SceneError.
+    A thread shades them at their new places; `take` puts new pictures into the mixer.
     """
 
     def __init__(self, scene, moved: dict[int, Light]):
         self.mixer, self.moved, self.done = mixer_of(scene), moved, 0.0
         self.is_finished, self.error = False, None
         self._path = None if scene.name in _rendered else result_of(scene).folder / MIXER_FILE
-        self._source, self._made = _moved_lights(scene), queue.SimpleQueue()
+        self._read, self._made = _reader(scene), queue.SimpleQueue()
         layers = self.mixer.pictures.layers
         self._before = {number: (self.mixer.rows[number], layers[number].copy()) for number in moved}
         threading.Thread(target=self._work, name="LTSH moved lights", daemon=True).start()
@@ -336,38 +329,37 @@ class Update:
     def _work(self) -> None:
         error = None
         try:
+            data, occluders = self._read()
             for position, (number, light) in enumerate(self.moved.items()):
-                with closing(self._source.pictures(light, self._before[number][0])) as pictures:
-                    for layer, share in pictures:
-                        self._made.put((number, layer, (position + share) / len(self.moved)))
+
+                def report(share, position=position) -> bool:
+                    self.done = (position + share) / len(self.moved)
+                    return not self.is_finished
+
+                self._made.put((number, moved_light(data, occluders, light, self._before[number][0], report)))
         except Exception as raised:
             error = raised
-        self._made.put((None, error, 1.0))
+        self._made.put((None, error))
 
     def take(self) -> bool:
         """Put new pictures into the mixer, and at the end into its file; True if there were any, or all are done."""
-        newest = {}
+        is_new = False
         while not self.is_finished and not self._made.empty():
-            number, content, self.done = self._made.get()
+            number, content = self._made.get()
             if number is None:
                 self.is_finished, self.error = True, content
-            elif content is not None:
-                newest[number] = content
-        for number, layer in newest.items():
-            row = replace(self._before[number][0], light=self.moved[number].record())
-            self.mixer.replace(number, row, layer)
-        if newest:
-            _end_later()
+            else:
+                row, is_new = replace(self._before[number][0], light=self.moved[number].record()), True
+                self.mixer.replace(number, row, content)
         if self.error is not None:
             self._take_back()
         elif self.is_finished and self._path is not None:
             self._save()
-        return bool(newest) or self.is_finished
+        return is_new or self.is_finished
 
     def stop(self) -> None:
         """Make the thread end soon, and restore the lights in the mixer."""
         self.is_finished = True
-        self._source.stop()
         self._take_back()
 
     def _take_back(self) -> None:
@@ -382,29 +374,25 @@ class Update:
             self.error = error
 
 
-def get_ready(scene, row: MixerRow) -> None:
-    """Start what shading moved lights needs, because the light of `row` has moved or is still moving."""
-    with suppress(SceneError):
-        _moved_lights(scene).get_ready(light_of(row.light))
-        _end_later()
-
-
-def _end_later() -> None:
-    if bpy.app.timers.is_registered(end_processes):
-        bpy.app.timers.unregister(end_processes)
-    bpy.app.timers.register(end_processes, first_interval=IDLE_SECONDS)
-
-
-def _moved_lights(scene) -> MovedLights:
+def _reader(scene) -> Callable[[], tuple[RelightData, Occluders | None]]:
+    """A function, to be called in a thread, that returns what is needed to shade moved lights of the picture."""
     if scene.name in _rendered:
-        moved = _rendered[scene.name][1]
-        if moved is None:
+        data = _rendered[scene.name][1]
+        if data is None:
             raise SceneError("this final render has too many samples to keep them all: render again with fewer points")
-        return moved
-    if _mixer["moved"] is None:
-        result = result_of(scene)
-        _mixer["moved"] = MovedLights.load((result.folder.parent / FILES[result.command]).with_suffix(RELIGHT_SUFFIX))
-    return _mixer["moved"]
+        return lambda: (data, data.extraction.occluders)
+    result = result_of(scene)
+    path = (result.folder.parent / FILES[result.command]).with_suffix(RELIGHT_SUFFIX)
+
+    def read():
+        if _mixer["moved"] is None:
+            data, occluders = RelightData.load(path), None
+            if data.shadows is not None:
+                occluders = Occluders.load(path.with_name(path.name.removesuffix(RELIGHT_SUFFIX) + OCCLUDERS_SUFFIX))
+            _mixer["moved"] = data, occluders
+        return _mixer["moved"]
+
+    return read
 
 
 def mixer_pairs(scene) -> list:

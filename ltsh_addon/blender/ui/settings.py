@@ -378,10 +378,6 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
         name="Scale", description="Difference in radiance at which the colors end; 0 takes the one of the report",
         min=0.0, soft_max=10.0, precision=4, default=0.0, update=changed,
     )  # fmt: skip
-    probe: FloatVectorProperty(
-        name="Probe", description="Where the pixel probe was last, from the lower left corner",
-        size=2, default=(0.5, 0.5), options={"HIDDEN"},
-    )  # fmt: skip
 
 
 SUBFOLDER = "ltsh"
@@ -409,15 +405,6 @@ class LTSH_PT_presets(PresetPanel, bpy.types.Panel):
     preset_add_operator = "ltsh.add_preset"
 
 
-CLASSES = (
-    LTSH_AddonPreferences,
-    LTSH_PG_mixed_light,
-    LTSH_PG_light,
-    LTSH_PG_last_result,
-    LTSH_PG_scene,
-    LTSH_OT_add_preset,
-    LTSH_PT_presets,
-)
 # The folder in which Blender looks for a folder "presets".
 PRESETS_PARENT = str(Path(__file__).parent)
 

@@ -193,37 +193,32 @@ def _bound(light):
 IOR_STEPS = 200
 
 
-def table_texels(table: LookupTable, iors: tuple[float, ...] = ()) -> np.ndarray:
-    """Texels (N, R, T, 4) of a table in float32, with one more curve for every index of refraction of `iors`.
+def table_texels(table: LookupTable) -> np.ndarray:
+    """Texels (N, R, T, 4) of a table in float32.
 
     The first layer is the warp. Then come the layers of each curve, with four weights per layer. An integral over a
     polygon is the product of these weights with `edge_integrals.moments`.
     """
     ridges = moments32.along_directions(table)
     rows, columns, parameters = table.warp.shape
-    vectors = (*range(len(ridges.weights)), *(("dielectric", float(ior)) for ior in iors))
+    vectors = range(len(ridges.weights))
     channels = ridges.channels(vectors)
     parts = [channels[:parameters], *np.split(channels[parameters:], len(vectors))]
     padded = np.concatenate([np.pad(layers, ((0, -len(layers) % 4), (0, 0))) for layers in parts])
     return padded.reshape(-1, 4, rows, columns).transpose(0, 2, 3, 1)
 
 
-def dielectric_texels(table: LookupTable, iors: tuple[float, ...] = ()) -> np.ndarray:
+def dielectric_texels(table: LookupTable) -> np.ndarray:
     """Texels (S, 2, 4) of the weights of the table's curves for dielectrics; row y: ior = 1 + y / `IOR_STEPS`.
 
-    The first texel of a row has the weights of curves 0 to 3, the second those of curves 4 to 6, if there are any. The
-    w of the second is 1 + n where ior is number n of `iors`, else 0.
+    The first texel of a row has the weights of curves 0 to 3, the second those of curves 4 to 7, if there are any.
     """
     count = table.fresnel_weights.shape[1]
-    if count > 7:
-        raise ValueError(f"table {table.name} has {count} Fresnel curves, the graphics card's path takes up to 7")
+    if count > 8:
+        raise ValueError(f"table {table.name} has {count} Fresnel curves, the graphics card's path takes up to 8")
     grid = 1.0 + np.arange(round((float(table.fresnel_ior[-1]) - 1.0) * IOR_STEPS) + 1) / IOR_STEPS
     texels = np.zeros((len(grid), 8), np.float32)
     texels[:, :count] = table.dielectric_weights(grid).T
-    for number, ior in enumerate(iors):
-        nearest = round((ior - 1.0) * IOR_STEPS)
-        if 0 <= nearest < len(grid) and abs(grid[nearest] - ior) < 1e-6:
-            texels[nearest, 7] = 1.0 + number
     return texels.reshape(len(grid), 2, 4)
 
 

@@ -76,29 +76,18 @@ class HorizonPass:
 class LightingPass:
     """One technique, ready to draw. Needs an active GPU context, and must be dropped before that goes."""
 
-    def __init__(self, technique: str | LookupTable, iors: Sequence[float] = (1.5, 1.45)):
+    def __init__(self, technique: str | LookupTable):
         """`technique` is "ltc", "ltsh2", "ltsh4", "ltsh4c", the path of a table, or a table of degree up to 4.
 
-        Dielectrics with the indices of refraction `iors`, multiples of 0.005, are faster; others are as exact.
         Raises TableError and ValueError.
         """
         self.table = technique if isinstance(technique, LookupTable) else load_table(technique)
         self._shaders: dict[Features, tuple] = {}
-        self._iors: tuple[float, ...] = ()
         self.number = 0  # of the picture: selects the directions in which lobes sample the world
-        self._table = self._dielectrics = None
+        self._table = float_texture(table_texels(self.table))
+        self._dielectrics = float_texture(dielectric_texels(self.table))
         self._sky = None
-        self.set_iors(iors)
         self.set_lights(())
-
-    def set_iors(self, iors: Sequence[float]) -> None:
-        """Set the indices of refraction of the faster dielectrics, as in the constructor."""
-        iors = tuple(dict.fromkeys(float(ior) for ior in iors))
-        if self._table is not None and iors == self._iors:
-            return
-        self._iors = iors
-        self._table = float_texture(table_texels(self.table, iors))
-        self._dielectrics = float_texture(dielectric_texels(self.table, iors))
 
     def set_lights(self, lights: Iterable[Light] | UploadedLights) -> None:
         """Set the lights. Light groups are added up."""

@@ -13,6 +13,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ...cycles.gbuffer import rounded_positions
+from ...cycles.patches import ERROR
 from ...scene import Light, listed
 from ..evaluated import (
     SURFACE_TYPES,
@@ -94,7 +95,8 @@ def view_lights(
     for number, light in enumerate(shown):
         values += 0 if light.pattern is None else light.pattern.values.size
         if values > MOST_VALUES and light.pattern is not None:
-            notes.append(f"{light.name}: it shines without its pattern, those of the lights before it fill the texture")
+            off = f"{100.0 * np.abs(light.pattern.values - 1.0).mean():.0f} % off on average"
+            notes.append(f"{light.name}: it shines without its pattern, {off}: those of other lights fill the texture")
             shown[number] = replace(light, pattern=None)
     return tuple(shown), tuple(dict.fromkeys(notes))
 
@@ -119,7 +121,9 @@ def _emission(material, textures: ShownTextures | None, notes: list[str]) -> np.
     if look is None or not look.glow or textures is None:
         return np.zeros(3) if look is None else look.emission
     mean, spread = textures.mean(look.value("color"))
-    notes.append(f"{material.name}: it lights as the mean of its image, which is {100.0 * spread:.0f} % off its colors")
+    if spread > ERROR:
+        off = f"which is {100.0 * spread:.0f} % off its colors"
+        notes.append(f"{material.name}: it lights as the mean of its image, {off}")
     return look.glow * mean
 
 

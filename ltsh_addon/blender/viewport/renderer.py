@@ -13,7 +13,6 @@ from dataclasses import dataclass, replace
 import gpu
 import numpy as np
 
-from ..materials.values import Value
 from .drawing import GBufferTextures, PixelShader, ViewCamera, VisibilityGrid, float_texture, glsl, read_texture
 from .light_texels import UploadedLights, background_texels, sky_texels, upload_lights
 from .lighting import GOLDEN, HorizonPass, LightingPass
@@ -87,8 +86,6 @@ class SurfaceLayer:
         return replace(gbuffer, geometric_normal=horizon, smooth_normal=smooth_normal)
 
 
-# MOST_IORS: indices of refraction for which the lighting pass is fast. It is exact for all.
-MOST_IORS = 6
 # CENTERS: the points of pixels of a single frame, their centers, in pixels right and up of them.
 CENTERS = np.zeros((1, 2))
 
@@ -314,7 +311,7 @@ class ViewRenderer:
 
         The first lobe is blended by `first`. `numbers` are those of the lights, None: all.
         """
-        lightings = [self._lighting_of(technique, frame.mirror) for technique, _ in frame.pictures]
+        lightings = [self._lighting_of(technique) for technique, _ in frame.pictures]
         for lighting in lightings:
             lighting.number = self.samples
         traces = self.shadows is not None and self.shadows.traces_lobes
@@ -333,11 +330,10 @@ class ViewRenderer:
             if frame.with_emission and passes == "combined":
                 layer.add_emission(frame.mirror.instances, frame.view, target.within())
 
-    def _lighting_of(self, technique: str, mirror) -> LightingPass:
+    def _lighting_of(self, technique: str) -> LightingPass:
         if technique not in self._lighting:
             self._lighting[technique] = LightingPass(technique)
         lighting = self._lighting[technique]
-        lighting.set_iors(common_iors(mirror))
         lighting.set_lights(self._lights)
         return lighting
 
@@ -357,15 +353,3 @@ def _cleared(sums: list[SampleSum], frame: Frame, is_new: bool) -> list[SampleSu
     for each in sums if is_new else ():
         each.clear()
     return sums[: len(frame.pictures)]
-
-
-def common_iors(mirror: SceneMirror) -> tuple[float, ...]:
-    """The most frequent constant indices of refraction, rounded to the steps of the lighting pass."""
-    counts: dict[float, int] = {}
-    for instance in mirror.instances:
-        for lobe in (lobe for shown in instance.looks for lobe in shown.look.lobes):
-            value: Value = lobe.value("ior")
-            ior = round(200.0 * float(value.offset[0])) / 200.0
-            if value.is_constant and ior > 1.0:
-                counts[ior] = counts.get(ior, 0) + 1
-    return tuple(sorted(counts, key=counts.get, reverse=True)[:MOST_IORS]) or (1.5,)

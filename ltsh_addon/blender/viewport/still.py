@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import bpy
@@ -14,6 +13,7 @@ import numpy as np
 from ...files import save_array
 from ...scene import SceneError, error_line, listed
 from .. import render_settings
+from ..evaluated import with_render_depsgraph
 from ..extract.occluders import with_baked_shares
 from ..extract.pixels import missing_images, no_light, open_scene
 from ..lights.area import collect_lights, note_overlaps
@@ -21,7 +21,7 @@ from ..lights.world import light_of_world
 from ..materials.preview_material import world_radiance
 from ..process.view import GRAPHICS, VIEW_PASSES, VIEW_PNG, ViewJob
 from ..render_settings import cycles_setting
-from .drawing import ViewCamera, read_texture
+from .drawing import ViewCamera, frame_buffer, read_texture
 from .light_texels import ShownSky, varied_sky
 from .live_cycles import rendered_world
 from .mirror import NOT_RESOLVED, SceneMirror, patterns_of
@@ -114,33 +114,14 @@ def _has_context() -> bool:
 
 
 def _inside_render(function: Callable):
-    outcome: dict = {}
-
-    class Engine(bpy.types.RenderEngine):
-        bl_idname, bl_label, bl_use_gpu_context = "LTSH_GRAPHICS", "LTSH graphics", True
-
-        def render(self, depsgraph):
-            # Blender only prints exceptions that are raised in here.
-            try:
-                outcome["value"] = function()
-            except Exception as error:
-                outcome["error"] = error
-
     scene = bpy.data.scenes.new("LTSH graphics")
     scene.camera = bpy.data.objects.new("LTSH graphics", bpy.data.cameras.new("LTSH graphics"))
     scene.collection.objects.link(scene.camera)
     scene.render.resolution_x = scene.render.resolution_y = 4
-    bpy.utils.register_class(Engine)
     try:
-        scene.render.engine = Engine.bl_idname
-        bpy.ops.render.render(scene=scene.name)
+        return with_render_depsgraph(scene, lambda depsgraph: function(), graphics=True)
     finally:
-        # Blender 4.5 hangs at exit when an engine is still registered.
-        bpy.utils.unregister_class(Engine)
         bpy.data.scenes.remove(scene)
-    if "error" in outcome:
-        raise outcome["error"]
-    return outcome["value"]
 
 
 def _not_shown(scene, camera) -> list[str]:
@@ -201,19 +182,26 @@ def _draw(job: ViewJob, read: tuple, size: tuple[int, int], progress) -> tuple[l
             notes.append(problem)
         else:
             shadows = ShadowRays(occluders, rays)
-    canvas = _Canvas(mirror, view_of_camera(camera.evaluated_get(depsgraph), depsgraph, size), size)
+    drawn = mirror, view_of_camera(camera.evaluated_get(depsgraph), depsgraph, size), size
     points = render_settings.sub_pixel_offsets(scene, job.refine)
     passes = (*VIEW_PASSES, TRANSMITTED) if mirror.has_glass else VIEW_PASSES
     first, *others = ((technique, name) for technique in job.techniques for name in passes)
+    exposure, transparent = cycles_setting(scene, "film_exposure"), scene.render.film_transparent
+    shown = ShownPicture(first[0], "combined", exposure=exposure, transparent=transparent, also=tuple(others))
+    renderer = _renderer[0] if _renderer else ViewRenderer()
+    renderer.shadows = shadows
     try:
-        shown = replace(_shown(scene, first[0]), also=tuple(others))
-        pictures = canvas.draw(shown, points, shadows, lambda share: progress("draw", share))
+        pictures = _pictures(renderer, drawn, shown, points, progress)
     except ValueError as error:  # a table that the card does not take
         raise SceneError(error_line(error)) from error
     except SceneError as error:  # rays
         raise SceneError(f"{error}; --shadows off draws the view without") from error
     finally:
-        canvas.free()
+        renderer.shadows = None
+        if hasattr(gpu, "init"):
+            _renderer[:] = [renderer]
+        else:
+            renderer.free()
     traced = None
     if shadows is not None:
         # The facts of `pipeline.lighting.Shadows.report`, and the seconds.
@@ -239,47 +227,28 @@ def view_of_camera(camera, depsgraph, size: tuple[int, int]) -> ViewCamera:
     return ViewCamera.of(camera.matrix_world.normalized().inverted(), window, camera.data.type == "ORTHO")
 
 
-def _shown(scene, technique: str) -> ShownPicture:
-    exposure, transparent = cycles_setting(scene, "film_exposure"), scene.render.film_transparent
-    return ShownPicture(technique, "combined", exposure=exposure, transparent=transparent)
+def _pictures(
+    renderer: ViewRenderer, drawn: tuple, shown: ShownPicture, points: np.ndarray, progress: Callable
+) -> list:
+    """Pictures (H, W, 4) of a view at rest, the means over `points`: the one `shown`, then its `also`.
 
-
-class _Canvas:
-    """A floating-point picture that a view is drawn into; needs an active GPU context."""
-
-    def __init__(self, mirror: SceneMirror, view: ViewCamera, size: tuple[int, int]):
-        self._mirror, self._view, self._size = mirror, view, size
-        self._renderer = _renderer[0] if _renderer else ViewRenderer()
-        self._texture = gpu.types.GPUTexture(size, format="RGBA32F")
-        self._buffer = gpu.types.GPUFrameBuffer(color_slots=[self._texture])
-
-    def draw(self, shown: ShownPicture, points: np.ndarray, shadows: ShadowRays | None, progress: Callable) -> list:
-        """Pictures (H, W, 4) of a view at rest, the means over `points`: the one `shown`, then its `also`.
-
-        Row 0 is on top; the exposure is included.
-        """
-        self._renderer.shadows = shadows
-        try:
-            for number in range(len(points)):
-                progress(number / len(points))
-                self._renderer.draw(self._mirror, self._view, self._size, shown, self._buffer, points)
-                self._buffer.read_color(0, 0, 1, 1, 4, 0, "FLOAT")  # wait until the card has finished
-        finally:
-            self._renderer.shadows = None
-        pictures = [read_texture(self._texture)]
-        for number, (_, name) in enumerate(shown.also, 1):
-            if name == "combined":
-                self._renderer.show(number, self._view, shown, self._buffer)
-                lit = read_texture(self._texture)
-            else:
-                lit = self._renderer.read(number)
-                lit[..., :3] *= np.float32(shown.exposure)
-            pictures.append(lit)
-        return [picture[::-1] for picture in pictures]
-
-    def free(self) -> None:
-        """Free everything except a renderer that the next canvas can use."""
-        if hasattr(gpu, "init"):
-            _renderer[:] = [self._renderer]
+    Row 0 is on top; the exposure is included. `drawn` is the mirror, the camera and the size. Needs an active GPU
+    context.
+    """
+    mirror, view, size = drawn
+    texture = gpu.types.GPUTexture(size, format="RGBA32F")
+    buffer = frame_buffer(texture)
+    for number in range(len(points)):
+        progress("draw", number / len(points))
+        renderer.draw(mirror, view, size, shown, buffer, points)
+        buffer.read_color(0, 0, 1, 1, 4, 0, "FLOAT")  # wait until the card has finished
+    pictures = [read_texture(texture)]
+    for number, (_, name) in enumerate(shown.also, 1):
+        if name == "combined":
+            renderer.show(number, view, shown, buffer)
+            lit = read_texture(texture)
         else:
-            self._renderer.free()
+            lit = renderer.read(number)
+            lit[..., :3] *= np.float32(shown.exposure)
+        pictures.append(lit)
+    return [picture[::-1] for picture in pictures]

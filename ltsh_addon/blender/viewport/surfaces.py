@@ -38,12 +38,12 @@ class SurfacePass:
     def __init__(self, before: SurfacePass | None = None):
         self._before, self._is_glass = before, before is not None
         self._through: tuple | None = None
+        self._size = self._depth = None
+        self._targets: dict = {}
         if before is not None:
             self._shaders, self._tables = before._shaders, before._tables
             self._black_image, self._missing_image = before._black_image, before._missing_image
             self._mask_shader = before._mask_shader
-            self._size = self._depth = None
-            self._targets: dict = {}
             return
         self._shaders = {(outputs, False): _shader(outputs) for outputs in (SURFACES, NORMALS, EMISSION)}
         self._tables = {"albedo_table": float_table(albedo_table()), "blend_table": float_table(blend_table())}
@@ -51,8 +51,6 @@ class SurfacePass:
         self._mask_shader = PixelShader(glsl("mask"), ("positions",), {}, is_depth=True)
         self._black_image = float_texture(np.zeros((1, 1, 4)))
         self._missing_image = float_texture(np.array(MISSING_COLOR).reshape(1, 1, 4))
-        self._size = self._depth = None
-        self._targets: dict = {}
 
     def draw(self, instances: list[ShownInstance], view: ViewCamera, size: tuple[int, int]) -> GBufferTextures:
         """The G-buffer of `instances`, `size` (width, height) in pixels; valid until the next call.

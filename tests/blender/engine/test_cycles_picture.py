@@ -78,7 +78,7 @@ def found(addon, tmp_path):
         write_channels(tmp_path / "cycles.exr", {letter: PIXELS[..., i] for i, letter in enumerate("RGB")})
         report = {"camera": "Camera", "frame": 1, "resolution": SIZE, "pixel_aspect": 1.0, "border": None,
                   "exposure": 1.0, **facts}  # fmt: skip
-        group = {"files": {"cycles.combined": "cycles.exr"}, "multilayer": "compare.exr", "names": ["cycles"],
+        group = {"files": {"cycles.combined": "cycles.exr"}, "names": ["cycles"],
                  "labels": {"cycles": "Cycles"}, "passes": ["combined"], "scales": {"combined": 1.0}}  # fmt: skip
         write_index(tmp_path, {"command": "compare", "partial": "", "groups": {"": group}, "report": report})
         context = SimpleNamespace(

@@ -526,6 +526,38 @@ def test_doubled_faces_count_by_their_area(doubled, others, named):
     assert len(warnings) == bool(named) and all(named in line for line in warnings), warnings
 
 
+# By name: what culls a cube beside the view of +-3 m, 4.2 m from the middle and 7 m below the camera; the margins of
+# camera and distance, and whether it is culled.
+CULLED = {
+    "seen by the margin": ("camera", (0.5, 50.0), False),
+    "beyond the margin": ("camera", (0.1, 50.0), True),
+    "far away": ("distance", (0.1, 3.0), True),
+    "near enough": ("distance", (0.1, 9.0), False),
+    "beside but near": ("camera distance", (0.1, 9.0), False),
+    "beside and far away": ("camera distance", (0.1, 3.0), True),
+}
+
+
+@pytest.mark.newest
+@pytest.mark.parametrize("name", CULLED)
+def test_what_simplify_culls_has_no_shadow(name, tmp_path):
+    scene, light = start(), np.array([5.5, 0.0, 3.0])
+    flags, margins, is_culled = CULLED[name]
+    scene.render.use_simplify = True
+    scene.cycles.camera_cull_margin, scene.cycles.distance_cull_margin = margins
+    bpy.data.objects["Key"].location = light
+    cube((0.6, -0.4, 1.0), 0.4)
+    beside = cube((4.2, 0.0, 2.0), 0.5)
+    for flag in flags.split():
+        setattr(scene.cycles, f"use_{flag}_cull", True)
+        setattr(beside.cycles, f"use_{flag}_cull", True)
+    shown = seen_by_cycles(tmp_path)
+    occluders, warnings = scene_parts.collected_occluders()
+    beside.hide_render = True
+    assert np.array_equal(shown, seen_by_cycles(tmp_path)) == is_culled
+    assert not warnings and len(occluders.mesh) == 3 - is_culled  # the floor, another cube and this one
+
+
 # Hair and points:
 
 

@@ -21,10 +21,10 @@ from ltsh_addon.cli import main
 from ltsh_addon.cycles.lobes import read_layer
 from ltsh_addon.pipeline import PictureOptions, RenderOptions, compositing, plan, render, shade_scene
 from ltsh_addon.pipeline.lighting import ShadowTracer, load_tables
-from ltsh_addon.pipeline.mixer import light_pictures
-from ltsh_addon.pipeline.moved_lights import MovedLights
+from ltsh_addon.pipeline.mixer import light_pictures, moved_light
 from ltsh_addon.pipeline.relight import LightChange, RelightData, relight
 from ltsh_addon.scene import PASSES, Film, light_of
+from ltsh_addon.visibility import Occluders
 
 SIZE, BLOCK = 32, 8  # pixels
 SAMPLES, TRUE_SAMPLES = 64, 1024
@@ -359,13 +359,13 @@ def test_a_kept_finished_picture_is_the_sum_of_its_lights_and_the_rest(out, tmp_
     options = RenderOptions(path, output=out, sub_samples=2, cycles_samples=8, keep_visibility=True)
     assert {"render.samples.npz", "render.occluders.npz"} < set(render.make_finished(options).files)
     combined = imaging.read_layers(out / "render.exr")["combined"]
-    mixed = light_pictures(RelightData.load(out / "render.samples.npz"))
+    data = RelightData.load(out / "render.samples.npz")
+    mixed = light_pictures(data)
     assert len(mixed.layers) == 2
     np.testing.assert_allclose(mixed.layers.sum(axis=0), combined[..., :3], rtol=1e-4, atol=1e-5)
     # Its light alone, where it was: rays of its own, as many as of all lights together.
-    lights = MovedLights.load(out / "render.samples.npz")
-    alone = lights.picture(light_of(mixed.rows[0].light))
-    lights.close()
+    occluders, light = Occluders.load(out / "render.occluders.npz"), light_of(mixed.rows[0].light)
+    alone = moved_light(data, occluders, light, mixed.rows[0], lambda share: True)
     assert np.linalg.norm(alone - mixed.layers[0]) < 0.02 * np.linalg.norm(alone)
 
 

@@ -1,5 +1,6 @@
 """The light mixer in Blender: what it shows, what it writes to the lights of the scene, lights that have moved."""
 
+import queue
 import threading
 import time
 from dataclasses import replace
@@ -230,10 +231,9 @@ def test_a_moved_light_is_shaded_where_it_is_and_the_others_stay(shaded):
     bpy.context.view_layer.update()
     row, item = next(pair for pair in results.mixer_pairs(scene) if pair[0].name == "Fill")
     assert mixer.state_of(row, item)[1].startswith("Fill: moved since this picture")
-    # The list has it made ready meanwhile.
     layout = drawn(mixer.LTSH_PT_IMAGE_mixer) and Layout()
     stand_in(mixer.LTSH_UL_mixer)().draw_item(bpy.context, layout, scene.ltsh, item, 0, None, "", 0)
-    assert [one.icon for one in layout.shown if one.kind == "label"] == ["ERROR"] and results._mixer["moved"]._is_ready
+    assert [one.icon for one in layout.shown if one.kind == "label"] == ["ERROR"]
     assert bpy.ops.ltsh.update_moved_lights() == {"FINISHED"}
     assert [mixer.state_of(*pair)[1] for pair in results.mixer_pairs(scene)] == ["", "", ""]
     found = shown()
@@ -254,17 +254,20 @@ class MovedLights(Events, stand_in(mixer.LTSH_OT_update_moved_lights)):
 
 @pytest.fixture
 def go_on(monkeypatch):
-    """An event for which moved lights wait after a picture, until something else is asked of them."""
-    event, pictures_of = threading.Event(), results.MovedLights.pictures
+    """An event for which updates of moved lights wait before they end, until they are stopped."""
+    event, work = threading.Event(), results.Update._work
 
-    def waiting(self, light, row=None):
-        pictures, turn = pictures_of(self, light, row), self._turn
-        for found in pictures:
-            yield found
-            while found[0] is not None and not event.is_set() and self._turn == turn:
-                time.sleep(0.01)
+    def waiting(self):
+        class Queue(queue.SimpleQueue):
+            def put(queue, one):
+                while one[0] is None and not event.is_set() and not self.is_finished:
+                    time.sleep(0.01)
+                super().put(one)
 
-    monkeypatch.setattr(results.MovedLights, "pictures", waiting)
+        self._made = Queue()
+        work(self)
+
+    monkeypatch.setattr(results.Update, "_work", waiting)
     return event
 
 
@@ -279,13 +282,13 @@ def test_a_moved_light_is_followed_and_taken_back(shaded, go_on):
     names = buttons(drawn(mixer.LTSH_PT_IMAGE_mixer))
     assert "ltsh.cancel_moved_lights" in names and "ltsh.update_moved_lights" not in names
     assert not mixer.LTSH_OT_update_moved_lights.poll(bpy.context)
-    update = mixer._updating["update"]
+    update = results.state["update"]
     hand.until(lambda: not np.array_equal(shown(), before))
     first = shown()
     # Moved once more: the picture is of another place.
     fill.location.x = -0.2
     bpy.context.view_layer.update()
-    hand.until(lambda: mixer._updating["update"] is not update)
+    hand.until(lambda: results.state["update"] is not update)
     assert not np.array_equal(first, before) and hand.outcome == {"RUNNING_MODAL"}
     go_on.set()
     hand.until(lambda: False)
@@ -304,7 +307,7 @@ def test_a_moved_light_is_followed_and_taken_back(shaded, go_on):
         hand = MovedLights().start()
         end()
         hand.until(lambda: False)
-        assert np.array_equal(shown(), found) and mixer._updating["update"] is None
+        assert np.array_equal(shown(), found) and results.state["update"] is None
         assert hand.reports == [] and hand.context.timers == []
     assert bpy.ops.ltsh.shade() == {"FINISHED"}
 

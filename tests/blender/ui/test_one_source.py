@@ -71,7 +71,7 @@ def test_materials_have_the_sign_of_what_the_view_says(scene):
     scene.render.engine = "LTSH"
     entry = next(one for one in preflight.overview(scene).materials if one.name == "Rough")
     assert entry.state == preflight.APPROXIMATED
-    assert "in the view: Roughness is not resolved" in entry.notes
+    assert "in the view: Roughness is not resolved, 0.4 is shown" in entry.notes
 
 
 @pytest.mark.parametrize(

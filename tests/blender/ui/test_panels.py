@@ -49,7 +49,7 @@ def add_results(scene, tmp_path, show_results):
         lambda layout: layout.prop(bpy.context.scene, "no_such_property"),
         lambda layout: layout.lable(text="x"),
         lambda layout: setattr(layout, "enable", False),
-        lambda layout: setattr(layout.operator("ltsh.show_in_render"), "no_such_property", 1),
+        lambda layout: setattr(layout.operator("ltsh.add_uv_map"), "no_such_property", 1),
         lambda layout: layout.operator("ltsh.no_such_operator"),
     ],
 )
@@ -287,7 +287,7 @@ def test_numbers_are_those_of_the_report(scene, tmp_path, add_results):
     narrow = texts(drawn(RESULTS, width=220)).replace("\u00a0", " ")
     assert "LTSH 4c: L2 12.34 %, bias -1.51 %, FLIP 0.0321" in narrow
     assert "Not complete" not in narrow
-    assert buttons(shown)["ltsh.save_exr"] and "ltsh_warnings" in [item.what for item in shown if item.kind == "panel"]
+    assert buttons(shown)["wm.path_open"] and "ltsh_warnings" in [item.what for item in shown if item.kind == "panel"]
     # While the job runs that adds Cycles; pictures that a cancelled job left are what they are.
     add_results("Not complete: without Cycles", ("ltc", "ltsh4c"))
     job = results.state["job"] = Job("Compare with Cycles", Plan([Step("Cycles A", 1.0)]), tmp_path, "compare", 0)

@@ -168,7 +168,6 @@ def test_asking_changes_nothing(scene):
 @pytest.mark.parametrize(
     ("operator", "values", "text"),
     [
-        ("show_in_render", {"object_name": "Gone"}, "Object 'Gone' is not in the scene any more"),
         ("add_uv_map", {"object_name": "Light"}, "Object 'Light' is not a visible mesh of this view layer"),
         ("pack_image", {"image_name": "Gone"}, "Image 'Gone' is not there any more"),
     ],

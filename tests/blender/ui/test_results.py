@@ -1,4 +1,4 @@
-"""Results as images: wipe, difference, probe, numbers, multi-layer files, presets, the manual."""
+"""Results as images: wipe, difference, numbers, presets, the manual."""
 
 import json
 import re
@@ -109,16 +109,6 @@ def test_the_scale_of_the_difference_is_that_of_the_results_or_the_artists(scene
     assert comparison.error_scale(scene.ltsh, group, choice) == 0.25
 
 
-def test_the_probe_reads_every_picture_at_the_pixel(scene, pictures):
-    result, choice = result_and_choice(scene)
-    for point, place in (((0.0, 0.0), (0, 0)), ((1.0, 1.0), (WIDTH - 1, HEIGHT - 1)), ((0.55, 0.2), (5, 1))):
-        pixel, rows = comparison.values_at(scene, result, choice, point)
-        assert pixel == place and [label for label, _ in rows] == ["LTC", "LTSH 4c", "Cycles"]
-        for name, (_, values) in zip(PICTURES, rows, strict=True):
-            expected = pictures[f"{name}.combined"][HEIGHT - 1 - place[1], place[0]]
-            np.testing.assert_array_equal(np.float32(values), expected)
-
-
 def test_saving_and_loading_keep_what_is_shown_and_nothing_large(scene, tmp_path):
     scene.ltsh.mode, scene.ltsh.first = "WIPE", "ltc"
     before = seen().copy()
@@ -182,17 +172,6 @@ def test_two_scenes_have_results_of_their_own(scene, tmp_path, show_results):
     image = comparison.viewer_image(other)
     assert image.name == "LTSH Comparison.001"
     assert abs(image.pixels[0] - pictures["ltsh4c.combined"][-1, 0, 0]) == 0.0
-
-
-def test_the_multilayer_file_is_the_one_of_the_command(scene, tmp_path):
-    own = tmp_path / "ltsh" / "compare" / "compare.exr"
-    content = own.read_bytes()
-    # Onto itself it stays.
-    for target in (tmp_path / "saved.exr", own):
-        assert bpy.ops.ltsh.save_exr(filepath=str(target)) == {"FINISHED"}
-        assert target.read_bytes() == content
-    with pytest.raises(RuntimeError, match="Error: .*nowhere"):
-        bpy.ops.ltsh.save_exr(filepath=str(tmp_path / "nowhere" / "saved.exr"))
 
 
 def test_figures_of_passes_that_the_report_lacks_are_measured(scene, tmp_path):
@@ -284,7 +263,7 @@ def test_a_preset_of_the_artist_brings_the_settings_back(scene, tmp_path, monkey
 
 
 def test_every_setting_of_a_job_is_part_of_presets(scene):
-    about_view = {"mode", "groups", "group", "first", "second", "pass_name", "split", "error_scale", "probe"}
+    about_view = {"mode", "groups", "group", "first", "second", "pass_name", "split", "error_scale"}
     about_view |= {"mixed", "mixed_active", "active_light", "mode_before_mix"}
     of_the_file = {"output_folder", "result_folder", "last_results", "bake_uv_map"}
     settings = set(scene.ltsh.__class__.__annotations__)
@@ -295,7 +274,7 @@ def test_the_manual_names_what_the_panels_show(scene, tmp_path, monkeypatch):
     """Every button and every setting, by the words on it; a manual that is missing is told."""
     text = operators.PICTURE_LINE.sub("", operators.MANUAL.read_text(encoding="utf-8"))
     assert "![" not in text and "\n\n\n" not in text
-    buttons = ("Shade Camera View", "Compare with Cycles", "Bake Selected", "Pixel Probe", "Open in Image Editor",
+    buttons = ("Shade Camera View", "Compare with Cycles", "Bake Selected", "Open in Image Editor",
                "the cross", "Esc")  # fmt: skip
     names = [item.name for item in scene.ltsh.bl_rna.properties
              if item.identifier in scene.ltsh.__class__.__annotations__ and not item.is_hidden]  # fmt: skip

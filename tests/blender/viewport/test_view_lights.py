@@ -12,8 +12,12 @@ from lit_plane import add_image, add_lamp_plane, along_x, light_tree
 from view_pictures import SIZE, viewport_picture
 
 from ltsh_addon import shading
+from ltsh_addon.blender.evaluated import is_surface
 from ltsh_addon.blender.lights.emission import nodes_as_text
+from ltsh_addon.blender.lights.meshes import MOST_SHOWN
 from ltsh_addon.blender.lights.textures import ShownTextures
+from ltsh_addon.blender.materials.graph import ensure_nodes, fill_with_bsdf
+from ltsh_addon.blender.materials.preview_material import preview_of
 from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels
 from ltsh_addon.blender.viewport import mirror
 from ltsh_addon.blender.viewport.light_texels import ShownSky
@@ -417,3 +421,68 @@ def test_lights_and_those_of_the_world_fit_the_layers_of_a_card(monkeypatch):
     shown.take_sky(ShownSky(lights=(lamp,)))
     assert len(shown.lights) == 4 and shown.lights[-1] is lamp and shown.lights[0] is shown.lights_without_world[1]
     assert any("10.0 % of the power is missing" in note for note in shown.notes)
+
+
+def glowing(color_node=None, strength=3.0, **settings):
+    """A material that emits the color of a node, with `settings` of that."""
+    material = bpy.data.materials.new("Glow")
+    ensure_nodes(material)
+    fill_with_bsdf(material.node_tree, "ShaderNodeEmission", (1.0, 1.0, 1.0, 1.0))
+    emission = next(node for node in material.node_tree.nodes if node.bl_idname == "ShaderNodeEmission")
+    emission.inputs["Strength"].default_value = strength
+    if color_node:
+        node = material.node_tree.nodes.new(color_node)
+        for name, value in settings.items():
+            setattr(node, name, value)
+        material.node_tree.links.new(node.outputs[0], emission.inputs["Color"])
+    return material
+
+
+def missing_image():
+    image = bpy.data.images.new("Gone", 4, 4)
+    image.source, image.filepath = "FILE", "//gone.png"
+    return image
+
+
+@pytest.mark.newest
+@pytest.mark.parametrize(
+    ("node", "color", "note"),
+    [("ShaderNodeTexImage", (1.0, 0.0, 1.0), "mean of its image"), ("ShaderNodeVertexColor", (0.5,) * 3, "half of"),
+     ("ShaderNodeTexNoise", (0.5,) * 3, "at most as much off")],
+)  # fmt: skip
+def test_glowing_faces_of_colors_that_views_cannot_read_shine(node, color, note):
+    """Missing images are pink in Cycles; other colors from 0 to 1 are taken as half, and named."""
+    parts.empty_scene()
+    parts.add_camera()
+    options = {"image": missing_image()} if node == "ShaderNodeTexImage" else {}
+    parts.add_plane(glowing(node, **options), size=1.0)
+    lights, notes = seen()
+    for light in lights:
+        np.testing.assert_allclose(light.radiance, 3.0 * np.array(color), rtol=1e-6)
+    assert sum(np.linalg.norm(light.area_vector) for light in lights) == pytest.approx(2.0) and " 0 %" not in notes
+    assert any(note in line for line in preview_of(bpy.data.materials["Glow"]).notes)
+
+
+@pytest.mark.newest
+def test_some_of_very_many_glowing_faces_shine_for_all():
+    parts.empty_scene()
+    parts.add_camera()
+    bpy.ops.mesh.primitive_uv_sphere_add(segments=80, ring_count=60)
+    bpy.context.object.data.materials.append(glowing())
+    lights, notes = seen()
+    assert len(lights) <= MOST_SHOWN and "flat faces one in 3 shines for all" in notes
+    power = sum(np.linalg.norm(light.area_vector) * light.radiance for light in lights)
+    # The facets of a sphere: 1 - pi^2 / 6 (1 / 60^2 + 1 / 80^2) of its area, within .5 %.
+    np.testing.assert_allclose(power, 3.0 * 4.0 * np.pi, rtol=0.005)
+
+
+def test_texts_and_curves_are_drawn_and_shine_once():
+    parts.empty_scene()
+    parts.add_camera()
+    bpy.ops.object.text_add()
+    bpy.context.object.data.materials.append(glowing())
+    bpy.ops.curve.primitive_bezier_circle_add()
+    bpy.context.object.data.bevel_depth = 0.1
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    names = [instance.object.name for instance in depsgraph.object_instances if is_surface(instance)]
+    assert sorted(names) == ["BézierCircle", "Text"]

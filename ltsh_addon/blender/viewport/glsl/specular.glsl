@@ -45,8 +45,7 @@ specular_sum ltsh_curve_at(ltsh_cell cell, int curve)
     return weights;
 }
 
-/* A texel of `textures.dielectric_texels`: weights of curves for a dielectric. The w of column 1 is 1 + the number of
-   the dielectric's own curve, if it has one. */
+/* A texel of `light_texels.dielectric_texels`: weights of curves for a dielectric. */
 vec4 ltsh_dielectric_texel(float position, int column)
 {
     int last = textureSize(dielectrics, 0).y - 1;
@@ -71,23 +70,15 @@ specular_weights ltsh_weights(ltsh_cell cell, ltsh_point point)
     bool coated = any(notEqual(point.dielectric.xyz, vec3(0.0)));
     float last = float(textureSize(dielectrics, 0).y - 1);
     float position = ltsh_clamped((point.ior - 1.0) * LTSH_IOR_STEPS, last);
-    float nearest = floor(position + 0.5);
-    float own = texelFetch(dielectrics, ivec2(1, int(nearest)), 0).w;
-    bool known = own > 0.0 && abs(position - nearest) < 1e-3;
     vec4 first_shares = ltsh_dielectric_texel(position, 0);
     vec4 last_shares = ltsh_dielectric_texel(position, 1);
-    bool summed = coated && !known;
-    int count = summed ? LTSH_CURVES : (metal ? (dipped ? 3 : 2) : (coated ? 1 : 0));
-    int end = coated && known ? count + 1 : count;
-    for (int i = 0; i < end; ++i) {
-        bool is_own = i == count;
-        int curve = is_own ? LTSH_CURVES + int(own) - 1 : i;
+    int count = coated ? LTSH_CURVES : (metal ? (dipped ? 3 : 2) : 0);
+    for (int i = 0; i < count; ++i) {
         vec4 four = i < 4 ? first_shares : last_shares;
         int component = i % 4;
         float part = component == 0 ? four.x : (component == 1 ? four.y : (component == 2 ? four.z : four.w));
-        vec4 share = vec4(i == 0 ? 1.0 : 0.0, i == 1 ? 1.0 : 0.0, i == 2 ? 1.0 : 0.0, summed ? part : 0.0);
-        share = is_own ? vec4(0.0, 0.0, 0.0, 1.0) : share;
-        specular_sum values = ltsh_curve_at(cell, curve);
+        vec4 share = vec4(i == 0 ? 1.0 : 0.0, i == 1 ? 1.0 : 0.0, i == 2 ? 1.0 : 0.0, coated ? part : 0.0);
+        specular_sum values = ltsh_curve_at(cell, i);
 @TERMS@
     }
     w.width = max(point.roughness, LTSH_LEAST_ROUGHNESS) * max(point.roughness, LTSH_LEAST_ROUGHNESS);

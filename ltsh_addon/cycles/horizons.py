@@ -203,20 +203,18 @@ def _excess(samples, shapes, chances, choose, is_quick):
         of_kind = [one for one in crossings if one[0].is_side == is_side]
         if not of_kind:
             continue
-        there, row = _numbered(np.concatenate([sample for _, _, sample in of_kind]), len(samples))
+        there, _ = _numbered(np.concatenate([sample for _, _, sample in of_kind]), len(samples))
         some = samples.take(there)
-        rays, ends = _HorizonDirections.of(some, is_quick, is_side), np.cumsum([len(one[1]) for one in of_kind])[:-1]
-        rows = zip(of_kind, np.split(row, ends), strict=True)
-        hits = [shape.hits(number, row, some.position, rays) for (shape, number, _), row in rows]
+        rays = _HorizonDirections.of(some, is_quick, is_side)
+        rows = [np.searchsorted(there, sample) for _, _, sample in of_kind]
+        hits = [shape.hits(one, row, some.position, rays) for (shape, one, _), row in zip(of_kind, rows, strict=True)]
         number, row, ray, brightness, solid_angle = (np.concatenate(values) for values in zip(*hits, strict=True))
         met, row = _numbered(row, len(there))
-        if len(met) < len(there):
-            some, rays = some.take(met), rays.take(met)
-        chosen, towards = there[met], rays.towards
+        some, chosen, towards = some.take(met), there[met], rays.towards[met]
         chance = choose(some.position, some.smooth_normal)
-        lobe = _lobe_density(some, towards)
+        lobe = lobe_density(some, towards)
         half = np.sqrt(np.maximum(0.5 + 0.5 * _dots(towards, some.view), 0.0))
-        reflected = lobe * _visible_microfacets(some, towards) * _reflectance(some, half) * rays.width
+        reflected = lobe * _visible_microfacets(some, towards) * _reflectance(some, half) * rays.width[met]
         diffuse = np.maximum(_dots(towards, some.diffuse_normal), 0.0) / np.pi
         chosen2 = np.square(chances[0, chosen, None] * lobe + chances[1, chosen, None] * diffuse)
         pair = row * towards.shape[1] + ray
@@ -406,8 +404,8 @@ def _plane_axes(corners, direction) -> np.ndarray:
     return np.stack([first, np.cross(direction, first), -direction], axis=1)
 
 
-def _lobe_density(samples, towards) -> np.ndarray:
-    """Probability (P, N) per sr with which the specular lobe chooses the directions."""
+def lobe_density(samples, towards: np.ndarray) -> np.ndarray:
+    """Probability (P, N) per sr with which the specular lobe chooses the unit directions (P, N, 3)."""
     half = towards + samples.view[:, None]
     vertical = np.square(np.maximum(_dots(half, samples.normal), 0.0))
     horizontal = np.maximum(np.square(half).sum(axis=2) - vertical, 0.0)
@@ -461,10 +459,6 @@ class _HorizonDirections:
         width = gap[:, None] * span * np.cos(elevation) / len(heights)
         count = len(samples)
         return cls(towards.reshape(count, -1, 3), width.reshape(count, -1), np.stack([flat, across], axis=1), angle)
-
-    def take(self, index) -> _HorizonDirections:
-        """The directions of the samples at `index` (Q,)."""
-        return _HorizonDirections(self.towards[index], self.width[index], self.flat[index], self.angle)
 
     def near(self, sample, offset, radius) -> tuple[np.ndarray, np.ndarray]:
         """Numbers (K,) of pairs, and of the directions of each pair that may meet its ball. The balls have the `radius`

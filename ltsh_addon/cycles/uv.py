@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..lobes.polygon import clip_to_horizon
+
 # Blender's bake shifts its sampling points by this much, in texels, so that centers exactly on an edge belong to one
 # side. The same shift here gives the same texels.
 NUDGE = (0.001, 0.002)
@@ -183,33 +185,14 @@ def _covered_point(corners, half, u, v):
 
 
 def _borders(corners, half):
-    """Ends (Q, 7, 2, 2) of the borders of the parts of the square of +-half around the origin that triangles (Q, 3, 2)
-    cover. These are the parts of the triangle's sides in the square, and of the square's sides in the triangle; both
-    ends are equal if there is none.
-    """
-    square = half * np.array([(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)])
-    square = np.broadcast_to(square, (len(corners), 4, 2))
-    turn = np.sign(cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))[:, None]
-    parts = [_clipped(corners, square, np.ones_like(turn)), _clipped(square, corners, turn)]
-    return np.concatenate(parts, axis=1)
-
-
-def _clipped(polygons, clips, turn):
-    """Ends (Q, V, 2, 2) of the parts of the sides of `polygons` (Q, V, 2) inside `clips` (Q, C, 2). `turn` (Q, 1) is
-    the sense of rotation of `clips`."""
-    start, side = polygons, np.roll(polygons, -1, axis=1) - polygons
-    first, last = np.zeros(polygons.shape[:2]), np.ones(polygons.shape[:2])
-    for corner, following in zip(np.moveaxis(clips, 1, 0), np.moveaxis(np.roll(clips, -1, axis=1), 1, 0), strict=True):
-        edge = (following - corner)[:, None]
-        inside = turn * cross(edge, start - corner[:, None])
-        rate = turn * cross(edge, side)
-        at = np.divide(-inside, rate, out=np.where(inside < 0.0, np.inf, -np.inf), where=rate != 0.0)
-        first = np.where((rate > 0.0) | ((rate == 0.0) & (inside < 0.0)), np.maximum(first, at), first)
-        last = np.where(rate < 0.0, np.minimum(last, at), last)
-    last = np.maximum(first, last)
-    some = last > first
-    shares = np.stack([np.where(some, first, 0.0), np.where(some, last, 0.0)], axis=-1)
-    return start[:, :, None] + shares[..., None] * side[:, :, None]
+    """Ends (Q, S, 2, 2) of the borders of the parts of the square of +-half around the origin that triangles (Q, 3, 2)
+    cover; both ends are equal if there is none. The origin is on each triangle."""
+    x, y = np.moveaxis(corners, (2, 1), (0, 1))
+    part = np.stack([x, y, half - x, half + x, half - y, half + y])
+    for side in range(2, len(part)):
+        part = clip_to_horizon(part, side)
+    corners = np.moveaxis(part[:2], (0, 1), (2, 1))
+    return np.stack([corners, np.roll(corners, -1, axis=1)], axis=2)
 
 
 def _center_spans(corners, first_row, row_count, size):

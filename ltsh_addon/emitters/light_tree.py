@@ -84,6 +84,7 @@ class LightTree:
     )  # (N,) rad: largest angle of a light's direction from `axis`; reach, axis and normal_spread are float32
     vector: np.ndarray  # (N, 3): mean radiance times area vectors
     swing: np.ndarray  # (N,) mean radiance times area: how much of a vector may belong to lights that face away
+    turn: np.ndarray  # (3, 3, N) matrices of the squares of how far power times cosines may be off; float32
     color: np.ndarray  # (3, N) of the light, 1 on average
     tint: np.ndarray  # (3, 3, N): how far the mean of each color is off the center along each axis, in units of `axes`
     power: np.ndarray  # (N,) mean radiance times area
@@ -125,7 +126,14 @@ class LightTree:
         # No point gets less than nothing of a color.
         tint *= (color > 1e-12)[:, None] / np.maximum(np.abs(tint).sum(axis=1, keepdims=True), 1.0)
         color, tint = color.astype(np.float32), tint.astype(np.float32)
-        # Cosines are taken as uniform over sqrt(3) standard deviations of the directions on either side of the mean.
+        mean = vector / total[:, None]
+        turn = sums(power[:, None, None] * normal[:, :, None] * normal[:, None, :]) / total[:, None, None]
+        # Cosines are taken as uniform over sqrt(3) standard deviations on either side of the mean; around a tube, over
+        # 4 % more, which gives the mean of what faces a point there, 1 / pi.
+        least, middle_one, _ = np.linalg.eigvalsh(turn).T
+        width = 3.0 * (1.0 + 0.08 * (middle_one - least)) ** 2 * total**2
+        turn = turn - mean[:, :, None] * mean[:, None, :] + TURNED**2 * np.eye(3)[None]
+        turn = (width * turn.transpose(1, 2, 0)).astype(np.float32)
         turned = np.maximum(1.0 - (length[:, 0] / total) ** 2, 0.0) * (end - start > 1)
         swing = (total * np.maximum(np.sqrt(1.5 * turned), TURNED)).astype(np.float32)
         normal_spread = normal_spreads(axis, normal[order], start, end)
@@ -137,7 +145,7 @@ class LightTree:
         )
         sizes = (values.astype(np.float32) for values in (reach, radius))
         directions = (values.astype(np.float32) for values in (axis, normal_spread))
-        lights_of_node = vector, swing, color, tint, total, diagonal
+        lights_of_node = vector, swing, turn, color, tint, total, diagonal
         return cls(middle + origin, *sizes, axes, *directions, *lights_of_node, children, number, is_even)
 
     @cached_property
@@ -525,7 +533,11 @@ class NodePoints:
         self.ends[:3] = points.T
         self.from_squares[:3], self.from_squares[3] = -2.0 * points.T, self.squared
         self.from_plane[:3], self.from_plane[3] = vector.T, -(vector * points).sum(axis=1)
-        self.swing, self.diagonal = tree.swing[node], tree.diagonal[node]
+        self.diagonal = tree.diagonal[node]
+        # The squares of how far cosines may be off their mean, times the squared distance: a polynomial of the origin.
+        turn, ends = tree.turn[..., node], self.ends[:3]
+        bent = (turn * ends).sum(axis=1)
+        self.from_turn = np.concatenate([turn.reshape(9, -1), -2.0 * bent, (bent * ends).sum(axis=0)[None]])
 
     def directions(self, block, origins) -> PointDirections:
         """Rays from `origins` (4, Q) to the points `block`, a slice."""
@@ -540,7 +552,9 @@ class NodePoints:
         distance = np.sqrt(squares)
         flux = origins.T @ self.from_plane[:, block]
         if self.is_turned[block].any():
-            flux = _mean_above_zero(flux, self.swing[block] * distance)
+            pairs = (origins[:3, None] * origins[:3]).reshape(9, -1)
+            swing = np.concatenate([pairs, origins]).T @ self.from_turn[:, block]
+            flux = _mean_above_zero(flux, np.sqrt(np.maximum(swing, LEAST**2, out=swing), out=swing))
         else:
             np.maximum(flux, np.float32(0.0), out=flux)
         return PointDirections(ends, origins, squares, distance, flux, self.diagonal[block])

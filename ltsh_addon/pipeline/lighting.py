@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from .. import shading, visibility
-from ..cycles.gbuffer import finer
+from ..cycles.gbuffer import finer, with_one_shadow
 from ..emitters.light_tree import FEWEST
 from ..files import check_takes_files
 from ..imaging.exr import unique_names
@@ -139,10 +139,13 @@ def trace_shadows(
     occluders."""
     if extraction.occluders is None:
         return None
-    film = extraction.film
-    sampling = visibility.ShadowSampling(passes, rays_of_samples(rays, film), film)
+    samples, film, index = extraction.samples, extraction.film, slice(None)
+    rays = rays_of_samples(rays, film)
+    if film.count is not None:
+        samples, film, index = with_one_shadow(samples, film)
+    sampling = visibility.ShadowSampling(passes, rays, film)
     with ShadowTracer(extraction.occluders, extraction.lights) as tracer:
-        return tracer.trace(extraction.samples, sampling, workers=workers, progress=progress)
+        return tracer.trace(samples, sampling, workers=workers, progress=progress).take(index)
 
 
 def tell_expected(extraction, tables: dict[str, Shader], passes: Sequence[str], rays: int, progress) -> None:

@@ -13,11 +13,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ..cycles.gbuffer import with_one_shadow
 from ..files import replacing
 from ..scene import Light, Progress, error_line, listed
-from ..visibility import Occluders, ShadowSampling
-from .lighting import Shadows, ShadowTracer, load_tables, rays_of_samples, shade_lights
+from ..visibility import Occluders
+from .lighting import Shadows, load_tables, shade_lights, trace_shadows
 from .relight import GRAIN, RelightData, color_of
 
 MIXER_FILE = "lights.npz"
@@ -213,24 +212,14 @@ def moved_light(
 ) -> np.ndarray:
     """The picture (H, W, 3) of one light of `data` at a new place, by rays of it alone, plus the bounced light of its
     `row`. `progress(fraction)` returns False to stop. Raises SceneError, TableError, Cancelled."""
-    (samples, film), picture = (data.extraction.samples, data.extraction.film), data.extraction.picture
-    passes, (table,), shadows = data.options["passes"], load_tables((data.technique,)).values(), None
-    if occluders is not None:
-        of_rays, film_of_rays, index = samples, film, slice(None)
-        if film.count is not None:
-            of_rays, film_of_rays, index = with_one_shadow(samples, film)
-        sampling = ShadowSampling(passes, rays_of_samples(data.options["shadow_rays"], film), film_of_rays)
-        with ShadowTracer(occluders, [light]) as tracer:
-            traced = tracer.trace(of_rays, sampling, progress=lambda _, share: progress(RAYS_SHARE * share))
-        shadows = traced.take(index)
+    extraction, rays = replace(data.extraction, lights=(light,), occluders=occluders), data.options["shadow_rays"]
+    (table,) = load_tables((data.technique,)).values()
+    shadows = trace_shadows(extraction, data.options["passes"], rays, lambda _, share: progress(RAYS_SHARE * share))
     start = 0.0 if shadows is None else RAYS_SHARE
-    (lit,) = shade_lights(
-        samples, [light], table, passes, (shadows,), progress=lambda share: progress(start + (1.0 - start) * share)
-    )
-    images = (
-        data.shown(name, moved=True) * film.image(picture.exposure * getattr(lit, name).sum(axis=0)) for name in passes
-    )
-    return (sum(images) + bounced_light(data, row)).astype(np.float32)
+    # The edges of light are other ones where it stands now.
+    moved = replace(data, extraction=extraction, shadows=shadows, edges={})
+    (layer,) = _layers(moved, table, [[0]], lambda share: progress(start + (1.0 - start) * share))
+    return layer + bounced_light(data, row)
 
 
 class Mixer:

@@ -79,10 +79,10 @@ class RelightData:
         names = [name for name in self.options["techniques"] if name != REFERENCE]
         return names[-1] if names else DEFAULT_TECHNIQUE
 
-    def shown(self, name: str, *, moved: bool = False) -> np.ndarray | float:
-        """Factor (H, W, 1 or 3) of the image of a pass of the samples; without `edges` for `moved` lights."""
+    def shown(self, name: str) -> np.ndarray | float:
+        """Factor (H, W, 1 or 3) of the image of a pass of the samples."""
         taken = np.atleast_3d(self.taken[name]) if name in self.taken else 1.0
-        return taken if moved or name not in self.edges else taken * self.edges[name][..., None]
+        return taken if name not in self.edges else taken * self.edges[name][..., None]
 
     @classmethod
     def load(cls, path: Path) -> RelightData:

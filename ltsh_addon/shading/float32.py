@@ -60,7 +60,9 @@ def shade_diffuse(samples, lights, radiance, scratch):
                 at_point = small_lights.ShadowedCosineAtPoint(rows, bump_alpha2.astype(np.float32))
             colors = lobes32.as_columns(samples.diffuse_albedo, index)[None]
             others = (samples.bump_alpha2[index],) if is_bumped else ()
-            lighting.add(lobes32.Lobes(index, rows, clip_rows, integrate, at_point, colors, 1.0, others=others))
+            whole = None if is_bumped else np.ones((1, len(index)), np.float32)
+            lobes = lobes32.Lobes(index, rows, clip_rows, integrate, at_point, colors, 1.0, others=others, whole=whole)
+            lighting.add(lobes)
     lighting.finish()
     return in_float64
 
@@ -84,7 +86,8 @@ def shade_specular(samples, lights, table, radiance, scratch):
         for vectors, members, colors_of in lobes32.fresnel_kinds(samples, np.nonzero(chosen)[0]):
             for index in _chunks(members):
                 lobes = _specular_lobes(samples, index, (table, ridges, vectors), colors_of(index), scratch)
-                lighting.add(replace(lobes, only_tails=only_tails))
+                whole = _albedos(samples, index, table, vectors) if lights.whole_skies else None
+                lighting.add(replace(lobes, only_tails=only_tails, whole=whole))
     in_float64 = np.nonzero(sharp)[0]
     by_map = anisotropic if lights.whole_skies else sharp & False
     for sky, light, row, _ in lights.whole_skies:
@@ -113,6 +116,17 @@ def _specular_lobes(samples, index, kind, colors, scratch) -> lobes32.Lobes:
     sharpest = small_lights.SharpestLobes(*axes, width)
     others = samples.roughness[index], samples.ior[index]
     return lobes32.Lobes(index, rows, clip_rows, integrate, at_point, colors, width, limits, sharpest, others=others)
+
+
+def _albedos(samples, index, table, vectors) -> np.ndarray:
+    """`Lobes.whole` (F, Q) of the specular lobes of the samples `index` (Q,)."""
+    normal, view = samples.normal[index], samples.view[index]
+    albedos = table.albedos((normal * view).sum(axis=1), samples.roughness[index])
+    dielectric = (table.dielectric_weights(samples.ior[index]) * albedos).sum(axis=0)
+    whole = np.stack([albedos[one] if isinstance(one, int) else dielectric for one in vectors]).astype(np.float32)
+    has_two = (normal != samples.geometric_normal[index]).any(axis=1)
+    whole[:, has_two | float64.has_bent_fresnel(samples)[index]] = np.nan
+    return whole
 
 
 def _chunks(members):
@@ -154,7 +168,7 @@ class AlikeLights:
 
 
 class Lights(list):
-    """Lights (light, row, corners) that affect one pass. Trees of many lights are built once.
+    """Lights (light, row, corners) that affect one pass. Trees of many lights are built once, and kept by the first.
 
     The last `leaf_count` are leaves of textured lights.
     """
@@ -169,7 +183,14 @@ class Lights(list):
         lights, leaves = ([one for one in many if getattr(one[0], f"affects_{name}")] for many in (lights, leaves))
         result = cls(lights + leaves)
         result.leaf_count = len(leaves)
-        return result
+        if len(result) < FEWEST:
+            return result
+        cached = vars(result[0][0]).setdefault("_lights", result)
+        pairs = zip(result, cached, strict=False)
+        is_same = (len(cached), cached.leaf_count) == (len(result), len(leaves))
+        if not (is_same and all(one[0] is other[0] and one[1] == other[1] for one, other in pairs)):
+            cached = vars(result[0][0])["_lights"] = result
+        return cached
 
     @cached_property
     def trees(self) -> list[tuple[LightTree, list[int]]]:
@@ -250,9 +271,10 @@ class _Lighting:
         index, colors = lobes.index, lobes.colors
         position = np.ascontiguousarray(self.samples.position[index].T)
         sums = {row: np.zeros((len(colors), 3, len(index)), np.float32) for row in {row for _, row, _ in self.lights}}
-        remaining = self._add_far(lobes, position, sums)
-        for number in sorted([*self.lights.alone, *remaining]):
-            self._add_light(lobes, number, position, remaining.get(number), sums)
+        remaining = self._add_far(lobes, position, sums) | self._add_whole_skies(lobes, sums)
+        for number in sorted({*self.lights.alone, *remaining}):
+            if (columns := remaining.get(number)) is None or len(columns):
+                self._add_light(lobes, number, position, columns, sums)
         signed = (colors < 0.0).any()
         for row, total in sums.items():
             reflected = (colors * total).sum(axis=0)
@@ -260,6 +282,17 @@ class _Lighting:
                 # Terms that cancel in the Fresnel factor may leave a rest below zero.
                 np.maximum(reflected, np.float32(0.0), out=reflected)
             self.radiance[row, index] += reflected.T
+
+    def _add_whole_skies(self, lobes, sums) -> dict[int, np.ndarray]:
+        """Add the skies of one radiance. Returns, by light, the columns (Q',) of the lobes that have two horizons."""
+        remaining: dict[int, np.ndarray] = {}
+        for sky, light, row, numbers in self.lights.whole_skies if lobes.whole is not None else ():
+            is_whole = np.isfinite(lobes.whole[0])
+            if sky.is_constant and light.receivers is None and (is_whole.all() or not lobes.only_tails):
+                whole = np.where(is_whole, lobes.whole, np.float32(0.0))
+                sums[row] += whole[:, None] * light.radiance.astype(np.float32)[:, None]
+                remaining |= dict.fromkeys(numbers, np.flatnonzero(~is_whole))
+        return remaining
 
     def _add_light(self, lobes, number, position, columns, sums) -> None:
         """Add one light to the `sums` (F, 3, Q) by row, at the `columns` (Q',), None for all."""

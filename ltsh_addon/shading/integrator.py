@@ -129,6 +129,8 @@ class Task:
         if self.single:
             for lights in (self._with_patches or {}).values():
                 _ = lights.skies
+            for lights in self._plain.values():
+                _ = lights.trees, lights.alike
 
     def _by_pass(self, lights, leaves=()):
         lights, leaves = _prepared(lights), _prepared(leaves)
@@ -257,7 +259,8 @@ def shade(
     With `dtype` float32, radiance is float32 and within 2e-5 of that with float64, per unit of the lights' radiance;
     for lights with a spread, of their radiance straight ahead. Spreads are accurate to 0.3 % (see `light_profile`).
     Points for which single precision does not suffice are computed in double. So are lights a thousand times as long as
-    wide, whose error in single precision is 4e-4 of their light, and always "reference" and degrees above 4.
+    wide, whose error in single precision is 4e-4 of their light, and always "reference" and degrees above 4. A sky of
+    one radiance is the exception: of lobes with one horizon it gives their albedo in single precision alone.
     """
     if is_own(technique):
         return _shade_with(technique, samples, tuple(lights), tuple(passes), (workers, progress, dtype, rows))

@@ -60,6 +60,7 @@ class Lobes:
     sharpest: small_lights.SharpestLobes | None = None  # only for specular lobes
     only_tails: bool = False  # True: single precision suffices for lights in the tails of the lobes only
     others: tuple = ()  # (Q,) arrays of what the lobes depend on besides rows and widths
+    whole: np.ndarray | None = None  # (F, Q) integrals over all above the horizon, NaN for lobes with two horizons
 
     @cached_property
     def shape(self) -> np.ndarray:

@@ -249,7 +249,11 @@ def _cells_of(side: Light) -> np.ndarray:
     """Brightness (CELLS, CELLS) in units of the mean; rows along half_v, columns along half_u."""
     if not side.children:
         return np.ones((CELLS, CELLS))
-    axes = np.linalg.pinv(np.stack([side.half_u, side.half_v]))
-    picture = picture_of(side, lambda offset: offset @ axes)
-    step = len(picture) // CELLS
-    return picture.reshape(CELLS, step, CELLS, step).mean(axis=(1, 3))
+
+    def made(_):
+        axes = np.linalg.pinv(np.stack([side.half_u, side.half_v]))
+        picture = picture_of(side, lambda offset: offset @ axes)
+        step = len(picture) // CELLS
+        return picture.reshape(CELLS, step, CELLS, step).mean(axis=(1, 3))
+
+    return cached_on_children("_cells", [side], made)

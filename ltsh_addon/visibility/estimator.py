@@ -12,11 +12,10 @@ from functools import cached_property
 
 import numpy as np
 
-from ..cycles.horizons import SMALLEST_ALPHA, lobe_selection_pmf
+from ..cycles.horizons import lobe_density, lobe_selection_pmf
 from ..cycles.light_tree import light_selection_pmf, light_tree_rows
 from ..emitters.facing import FacingDisk
 from ..emitters.light_polygons import may_reach, off_plane
-from ..lobes import brdf
 from ..lobes.polygon import dot
 from ..scene import FARTHEST, PASSES, Film, FlatLight, Light, PointLight, PolygonLight, SurfaceSamples, round_outline
 from .emitter import Emitter, Sky
@@ -45,9 +44,9 @@ BRIGHTEST, BRIGHTEST_OF_SKY = 4, 2
 NEGLIGIBLE = np.float32(0.01)
 # Rounds in which neighbors of mixed pairs get more rays. Neighbors that turn out mixed pass this on in the next round.
 ROUNDS = 4
-# Samples that share the rays to a sky are alike: their normals differ by at most LIKE_NORMAL, they lie in one plane but
-# for a slope of LIKE_NORMAL, and for the specular pass their mirrored views differ by LIKE_LOBE alpha, and the alphas
-# by LIKE_ALPHA of one.
+# Samples that share the rays to a sky or to many lights are alike: their normals differ by at most LIKE_NORMAL, they
+# lie in one plane but for a slope of LIKE_NORMAL, and for the specular pass their mirrored views differ by LIKE_LOBE
+# alpha, and the alphas by LIKE_ALPHA of one.
 LIKE_NORMAL, LIKE_LOBE, LIKE_ALPHA = np.float32(0.1), np.float32(0.4), np.float32(0.2)
 # Samples do not share rays where that would change their light by more than this share of the typical one, nor where
 # all their rays are blocked: of so many rays.
@@ -251,7 +250,7 @@ class RatioEstimator:
         if isinstance(self.light, FlatLight | PointLight) and len(self.index):
             self.margin = self._margin()
             self.at_surface |= bool(self.margin)
-        shares = isinstance(self.emitter, Sky) and neighbors.order is not None and rays > PROBES
+        shares = isinstance(self.emitter, Sky | LightCluster) and neighbors.order is not None and rays > PROBES
         self._neighbors, order = neighbors, neighbors.order if shares else None
         self._add_rays(np.arange(len(self.index)), 0, PROBES, 0, order)
         self._leave_out_unlit()
@@ -260,8 +259,7 @@ class RatioEstimator:
         choice = np.where(worth["specular"] > 2.0 * worth["diffuse"], 1, 0)
         choice[worth["diffuse"] > 2.0 * worth["specular"]] = 2
         by_pass = [self._wanted_rays(rays, worth[name], importance) for name in PASSES]
-        alone = self._level(rays, np.maximum(*by_pass))
-        number = alone
+        number = alone = self._level(rays, np.maximum(*by_pass))
         if shares:
             sharing = [neighbors.sharing(name, self.index) for name in PASSES]
             each = [np.where(self.wanted[name], by_pass[k] / sharing[k], 0.0) for k, name in enumerate(PASSES)]
@@ -289,9 +287,14 @@ class RatioEstimator:
             self._add_rays(np.flatnonzero(alone), 0, PROBES, 0)
             self._trace_more(alone & (last > PROBES), last, choice, None)
             alone = np.zeros(len(self.index), bool)
-            for name in PASSES:
-                change = self._neighbors.bend(name, self.index, self.visibility_ratio(name)[0])
-                alone |= np.abs(change) * worth[name] ** WORTH_POWER > MOST_BIAS
+            for name, sum_w, sum_wv in zip(PASSES, self.sum_w.sum(axis=1), self.sum_wv.sum(axis=1), strict=True):
+                ratio = self.visibility_ratio(name)[0]
+                change = np.abs(self._neighbors.bend(name, self.index, ratio))
+                if isinstance(self.emitter, LightCluster):
+                    # Shadows as narrow as a pixel: its rays are three standard deviations off what it shares.
+                    off = np.abs(sum_wv / np.maximum(sum_w, _TINY) - ratio)
+                    change = np.maximum(change, off - np.float32(3.0) * np.sqrt(ratio * (_ONE - ratio) / self.count))
+                alone |= change * worth[name] ** WORTH_POWER > MOST_BIAS
 
     def _trace_more(self, chosen, number, choice, order):
         """Trace rays of the `chosen` pairs up to the `number`, split by `choice`; each (Q,)."""
@@ -391,11 +394,9 @@ class RatioEstimator:
             *rays, _ = self.surface.ray_origins.aimed(
                 self.index[unmet], toward[:, None], distance[None], self.at_surface
             )
-            visibility = (
-                self._transmittance(self.mask, _ONE, *(rows[..., 0, :] for rows in rays))
-                if self.chosen_by.light
-                else _ONE
-            )
+            visibility = _ONE
+            if self.chosen_by.light:
+                visibility = self._transmittance(self.mask, _ONE, *(rows[..., 0, :] for rows in rays))
             # Next to nothing, so that it does not count in sums over samples.
             self.sum_w[number][:, unmet] = _TINY
             self.sum_wv[number][:, unmet] = visibility * _TINY
@@ -439,11 +440,10 @@ class RatioEstimator:
         flat = np.flatnonzero(met)
         *aimed, lifted = self.surface.ray_origins.aimed(sampler.index, directions, distance, self.at_surface)
         origins, *rest = (_taken(rows, flat) for rows in aimed)
+        visibility.ravel()[flat] = _ONE
         if self.chosen_by.light:
             falling = sampler.falling.ravel()[flat] if self.margin else _ONE
             visibility.ravel()[flat] = self._transmittance(self.mask, falling, origins, *rest)
-        else:
-            visibility.ravel()[flat] = _ONE
         if self.chosen_by.surface:
             if self.meet_the_same:
                 is_lifted = np.zeros(visibility.size, bool)
@@ -583,17 +583,8 @@ class LightSelection:
                     specular / whole if name == "specular" else 0.0 * specular,
                     diffuse / whole if name == "diffuse" else 0.0 * diffuse,
                 )
-            density[here] += specular * self._lobe_density(sample, directions[here])
+            chosen = lobe_density(self._samples.take(sample), directions[here, None])[:, 0]
+            density[here] += specular * chosen
             cosine = np.einsum("rk,rk->r", directions[here], self._samples.diffuse_normal[sample])
             density[here] += diffuse * np.maximum(cosine, 0.0) / np.pi
         return density
-
-    def _lobe_density(self, index, directions):
-        samples = self._samples
-        normal, view = samples.normal[index], samples.view[index]
-        half = directions + view
-        vertical = np.square(np.maximum(np.einsum("rk,rk->r", half, normal), 0.0))
-        horizontal = np.maximum(np.square(half).sum(axis=1) - vertical, 0.0)
-        alpha2 = np.square(np.maximum(samples.roughness[index] ** 2, SMALLEST_ALPHA))
-        cosine = np.maximum(np.einsum("rk,rk->r", normal, view), 1e-3)
-        return brdf.visible_normal_density(cosine, horizontal, vertical, alpha2)

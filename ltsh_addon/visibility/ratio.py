@@ -5,9 +5,9 @@ doi:10.1145/3190834.3190852): shadowed radiance = closed form x sum(w V) / sum(w
 the light. w is what the pass reflects of the light along the ray, divided by the probability density of the ray. Both
 passes use the same rays.
 
-Like samples of pixels beside each other share their rays to a sky. They take its directions in turns (Ahmed and Wonka
-2020, "Screen-space blue-noise diffusion of Monte Carlo sampling error via hierarchical ordering of pixels",
-doi:10.1145/3414685.3417881), so that the result depends on the block. All else depends on neighbors alone.
+Like samples of pixels beside each other share their rays to a sky or to many lights. They take directions in turns
+(Ahmed and Wonka 2020, "Screen-space blue-noise diffusion of Monte Carlo sampling error via hierarchical ordering of
+pixels", doi:10.1145/3414685.3417881), so that the result depends on the block. All else depends on neighbors alone.
 """
 
 from __future__ import annotations

@@ -234,7 +234,7 @@ class RaySampler:
     def _sample_cluster(self, batch: RayBatch):
         """As `sample`, for a cluster: each ray goes to a leaf of its own."""
         even, sharp = (
-            unit_points(self.seeds, stream, *numbers)
+            unit_points(self.seeds, stream, *numbers, self.order)
             for stream, numbers in enumerate((batch.light_points, batch.bsdf_points))
         )
         light_count, shape = len(even[0]), (len(even[0]) + len(sharp[0]), len(self.index))

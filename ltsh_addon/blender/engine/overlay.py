@@ -14,8 +14,6 @@ from ..ui.preview import ENGINE
 
 MOST_NOTES = 4
 TEXT_SIZE, LINE = 11.0, 1.4  # and from line to line
-SHARES = 1.0, 0.9, 0.8, 0.7, 0.6  # of that size, for views that are narrower than a word
-LONG_WORD = 20  # letters; longer ones are rather broken
 CAPTION_SIZE = 13.0
 MARGIN = 12.0
 ERROR_COLOR = (1.0, 0.35, 0.3, 1.0)
@@ -125,14 +123,6 @@ def wrapped(lines: list[tuple[str, tuple]], width: float, width_of) -> list[tupl
     return broken
 
 
-def share_of_size(lines: list[tuple[str, tuple]], width: float, margin: float, width_of) -> float:
-    """The largest of `SHARES` at which all words of `lines` but long ones have room in `width` pixels, with a `margin`
-    on both sides that shrinks with them; `width_of(text, share)` says how wide text is. The smallest where none is."""
-    words = {word[:LONG_WORD] for text, _ in lines for word in text.split()}
-    fitting = (s for s in SHARES if all(width_of(word, s) + 2.0 * s * margin <= width for word in words))
-    return next(fitting, SHARES[-1])
-
-
 def is_drawn(context) -> bool:
     """True in 3D views that show the picture of the engine."""
     space = context.space_data
@@ -156,17 +146,14 @@ def _draw() -> None:
 def _draw_lines(font: int, texts: ViewTexts, region, sides: dict[str, int], scale: float) -> None:
     """The notes and below them the quiet line, at the lower right: Blender's own boxes are at the left and above."""
 
-    def width_of(text: str, share: float = 1.0) -> float:
-        blf.size(font, share * size)
+    def width_of(text: str) -> float:
         return blf.dimensions(font, text)[0]
 
     pointer, notes, quiet = region.as_pointer(), lines_of(texts.error, texts.notes), texts.quiet.text
     last = [(quiet, POINTED_COLOR if _pointed.get("region") == pointer else QUIET_COLOR)] if quiet else []
     size, margin = TEXT_SIZE * scale, MARGIN * scale
-    free = region.width - sides["RIGHT"] - max(sides["LEFT"], sides["FLOAT"])
-    share = share_of_size([*notes, *last], free, margin, width_of)
-    size, margin = share * size, share * margin
-    free -= 2.0 * margin
+    blf.size(font, size)
+    free = region.width - sides["RIGHT"] - max(sides["LEFT"], sides["FLOAT"]) - 2.0 * margin
     # Better no quiet line than one of broken words.
     last = wrapped(last, free, width_of) if all(width_of(word) <= free for word in quiet.split()) else []
     right, bottom = region.width - sides["RIGHT"] - margin, sides["BOTTOM"] + margin

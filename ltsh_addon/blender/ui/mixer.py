@@ -306,7 +306,7 @@ class LTSH_OT_update_moved_lights(_NeedsMixer, bpy.types.Operator):
         return self._finish(context)
 
     def modal(self, context, event):
-        update, scene = self._update, self._scene()
+        update, scene = self._update, results.scene_of(self._scene_uid)
         if results.state["update"] is not update or scene is None or results.mixer_of(scene) is not update.mixer:
             # Cancelled by the cross, or another picture or file is open.
             update.stop()
@@ -332,10 +332,6 @@ class LTSH_OT_update_moved_lights(_NeedsMixer, bpy.types.Operator):
         self._update.stop()
         self._finish(context)
 
-    def _scene(self):
-        """The scene of the picture, even if it was renamed; None if it was removed."""
-        return next((scene for scene in bpy.data.scenes if scene.session_uid == self._scene_uid), None)
-
     def _begin(self, context) -> bool:
         scene = context.scene
         moved = moved_rows(context, results.mixer_of(scene).rows)
@@ -358,7 +354,7 @@ class LTSH_OT_update_moved_lights(_NeedsMixer, bpy.types.Operator):
             context.window_manager.event_timer_remove(self._timer)
         if update.error is not None and not isinstance(update.error, Cancelled):
             self.report({"ERROR"}, error_line(update.error))
-        scene = self._scene()
+        scene = results.scene_of(self._scene_uid)
         if scene is not None and results.mixer_of(scene) is update.mixer:
             comparison.refresh(scene)
         comparison.redraw_panels()

@@ -141,7 +141,7 @@ class _JobOperator:
 
         Returns True if there was something to show, or will be.
         """
-        scene, job = self._scene(), self._job
+        scene, job = results.scene_of(self._job.scene), self._job
         if scene is None or job.shown == len(job.results):
             return False
         if not self._opened:
@@ -188,16 +188,12 @@ class _JobOperator:
         return {"FINISHED"} if job.shown else {"CANCELLED"}
 
     def _what_remains(self) -> str:
-        scene, job = self._scene(), self._job
+        scene, job = results.scene_of(self._job.scene), self._job
         result = results.result_of(scene) if scene is not None and job.shown else None
         if result is None:
             return f"what was finished is in {job.output}" if job.command == "bake" else "nothing was finished yet"
         names = next(iter(result.groups.values()))["labels"].values()
         return f"kept: {', '.join(names)}"
-
-    def _scene(self):
-        """The scene of the job, even if it was renamed; None if it was removed."""
-        return next((scene for scene in bpy.data.scenes if scene.session_uid == self._job.scene), None)
 
     def _report_success(self) -> None:
         result = results.result_in(str(self._job.results[-1])) if self._job.results else None

@@ -62,6 +62,11 @@ _pixels: dict[str, tuple[tuple, np.ndarray]] = {}
 PIXELS_KEPT = 8
 
 
+def scene_of(uid: int):
+    """The scene with this session uid, even if it was renamed; None if it was removed."""
+    return next((scene for scene in bpy.data.scenes if scene.session_uid == uid), None)
+
+
 def result_of(scene) -> Result | None:
     """The results of `scene`; None if there are none or their folder is gone. Files are read once."""
     return result_in(scene.ltsh.result_folder) if scene.ltsh.result_folder else None

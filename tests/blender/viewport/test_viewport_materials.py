@@ -24,10 +24,8 @@ from ltsh_addon import shading
 from ltsh_addon.blender.engine.overlay import (
     LIGHTS_PANEL,
     MATERIALS_PANEL,
-    SHARES,
     QuietLine,
     left_out,
-    share_of_size,
     wrapped,
 )
 from ltsh_addon.blender.lights.world import light_of_world
@@ -402,21 +400,6 @@ def test_long_lines_of_the_view_are_broken():
     # What counts is how wide the letters are.
     wide = wrapped([("ill ill ill WWW WWW WWW", "red")], 60.0, lambda part: sum(3 + 9 * (c == "W") for c in part))
     assert [part for part, _ in wide] == ["ill ill ill", "WWW", "WWW", "WWW"]
-
-
-@pytest.mark.parametrize(("width", "share"), [(500.0, 1.0), (153.0, 1.0), (152.0, 0.9), (97.0, 0.6), (20.0, 0.6)])
-def test_text_of_views_narrower_than_a_word_is_smaller(width, share):
-    lines = [("No bounces", "red"), ("/a/very/long/path/that/is/broken.png", "blue")]
-
-    def width_of(text, share):
-        return 15.0 * share * len(text)
-
-    assert share_of_size(lines[:1], width, 24.0, width_of) == share
-    if share > SHARES[-1]:
-        free = width - 2.0 * share * 24.0
-        parts = wrapped(lines, free, lambda text: width_of(text, share))
-        assert "bounces" in {part.split()[-1] for part, _ in parts}
-        assert all(width_of(part, share) <= free for part, _ in parts)
 
 
 @edits_with_graphics

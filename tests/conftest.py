@@ -71,9 +71,6 @@ CASES_OF_OLDER = {
     "test_both_horizons_of_a_crease_count_as_much_as_in_cycles": {"metal-2", "dielectric-0"},
     "test_a_surface_hides_itself_as_in_cycles": {"ball", "monkey of great offset", "instance of a monkey"},
     "test_a_pane_shows_the_floor_behind_it_as_in_cycles": {"Principled", "Mix"},
-    "test_the_viewport_shows_what_cycles_sampled": {
-        f"{name}-PERSP" for name in ("plain", "scattered", "layered", "masked", "brushed", "rough", "bent")
-    },
     "test_the_render_region_is_a_part_of_the_whole_picture": {"False"},
     "test_a_final_picture_is_the_sum_of_its_lights_and_the_rest": {"settings0", "settings3"},
     "test_the_session_and_the_file_stay_as_they_are": {"compare", "cancelled in Cycles", "an exception in the middle"},

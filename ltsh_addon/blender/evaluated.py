@@ -49,15 +49,16 @@ def _marks(mesh, name: str, count: int) -> np.ndarray:
     return np.zeros(count, bool) if attribute is None else read_values(attribute.data, "value", (count,), bool)
 
 
-def normals_at_corners(mesh) -> np.ndarray:
-    """Cycles' normals (C, 3) at all corners of `mesh`; corners of a flat face have the normal of the face."""
+def normals_at_corners(mesh) -> tuple[np.ndarray, np.ndarray]:
+    """Cycles' normals (C, 3) at all corners of `mesh`; corners of a flat face have the normal of the face. And the mask
+    (F,) of the flat faces: where such a face is bent, Cycles takes the normals of its triangles."""
     count = len(mesh.loops)
     vertex = read_values(mesh.loops, "vertex_index", (count,), np.int32)
     normal, flat = interpolated_normals(mesh, vertex)
     if flat.any():
         is_flat = np.repeat(flat, read_values(mesh.polygons, "loop_total", (len(flat),), np.int32))
         normal[is_flat] = read_values(mesh.corner_normals, "vector", (count, 3), np.float32)[is_flat]
-    return normal
+    return normal, flat
 
 
 SURFACE_TYPES = ("MESH", "CURVE", "SURFACE", "FONT", "META", "CURVES", "POINTCLOUD")

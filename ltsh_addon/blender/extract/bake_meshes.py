@@ -114,7 +114,7 @@ def _read(ob, mesh, matrix, uv_name):
         raise ObjectError(f"object {ob.name!r} has {wanted}, found {names}: unwrap it, or choose another UV map")
     loops, vertices = (read_values(mesh.loop_triangles, name, (3 * count,), np.int32) for name in ("loops", "vertices"))
     positions = read_values(mesh.vertices, "co", (len(mesh.vertices), 3), np.float32)
-    normals = normals_at_corners(mesh)
+    normals, flat = normals_at_corners(mesh)
     maps = {other.name: uv_of(other, len(mesh.loops))[loops].reshape(count, 3, 2) for other in mesh.uv_layers}
     uv = maps[layer.name]
     linear = matrix[:3, :3]
@@ -132,6 +132,8 @@ def _read(ob, mesh, matrix, uv_name):
         material=np.minimum(read_values(mesh.loop_triangles, "material_index", (count,), np.int32), slots - 1),
         mirrored=bool(np.linalg.det(linear) < 0.0),
     )
+    is_flat = flat[read_values(mesh.loop_triangles, "polygon_index", (count,), np.int32)]
+    texel_mesh.normals[is_flat] = texel_mesh.true_normals()[is_flat][:, None]
     a, b, c = np.moveaxis(uv.astype(np.float64), 1, 0)
     if not np.any((b - a)[:, 0] * (c - a)[:, 1] != (b - a)[:, 1] * (c - a)[:, 0]):
         raise ObjectError(f"object {ob.name!r}: all faces of UV map {layer.name!r} have no area: unwrap it")

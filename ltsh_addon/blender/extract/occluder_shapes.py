@@ -180,7 +180,7 @@ def split_by_slot(ob, clear: list, image_of) -> list[OccluderMesh]:
         if mesh.normals_domain == "POINT":
             normals = read_values(mesh.vertex_normals, "vector", (len(vertices), 3), np.float32)
         elif mesh.normals_domain == "CORNER":
-            normals = normals_at_corners(mesh)[loops]
+            normals = normals_at_corners(mesh)[0][loops]
 
         def uv_of(name):
             layers = mesh.uv_layers

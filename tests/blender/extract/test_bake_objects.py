@@ -121,7 +121,18 @@ def mapped_by_nodes():
     return ob
 
 
-@pytest.mark.parametrize("make", [cut_cube, warped_plane, mapped_by_nodes])
+def bent_quads():
+    """Flat faces of four corners that are not in a plane, which Cycles shades as two triangles."""
+    corners = [(x - 1.0, y - 1.0, 0.4 * ((x + y) % 2)) for y in range(3) for x in range(3)]
+    faces = [(x + y, x + y + 1, x + y + 4, x + y + 3) for y in (0, 3) for x in (0, 1)]
+    ob = scene_parts.add_mesh("Bent", corners, faces)
+    places = [np.array(corners[corner][:2]) * 0.5 + 0.5 for face in faces for corner in face]
+    ob.data.uv_layers.new(name="UVMap").data.foreach_set("uv", np.float32(places).ravel())
+    ob.data.materials.append(principled("Plain", Roughness=0.6)[0])
+    return ob
+
+
+@pytest.mark.parametrize("make", [cut_cube, warped_plane, mapped_by_nodes, bent_quads])
 def test_uv_maps_and_materials_that_modifiers_bring_in_are_baked_as_by_cycles(make, tmp_path):
     """Gray diffuse light is exact; Cycles' noise of 512 samples of a light that is seen as a whole is below 2 %."""
     start()

@@ -420,11 +420,12 @@ def test_a_budget_excludes_samples(tmp_path, capsys):
 def test_a_budget_chooses_points_rays_and_samples(tmp_path):
     floor_and_ball(gray(), 1)
     path = parts.save(tmp_path / "room.blend")
-    made = {budget: render.finish(RenderOptions(path, output=tmp_path, budget=budget)) for budget in (0.01, 16.0)}
+    # The larger one leaves time for everything, however slowly Blender starts on a busy machine.
+    made = {budget: render.finish(RenderOptions(path, output=tmp_path, budget=budget)) for budget in (0.01, 10.0)}
     small, large = (one.report for one in made.values())
     # Of what shines in sight only what stands beside our light is rendered apart.
     assert not made[0.01].cycles.smooth_emission
-    assert set(made[16.0].cycles.smooth_emission) == {"emission", "background"}
+    assert set(made[10.0].cycles.smooth_emission) == {"emission", "background"}
     # However small it is, every part has something.
     assert small["cycles_samples"] >= 2 and small["sub_samples"] >= 1
     assert small["cycles_samples"] < large["cycles_samples"]

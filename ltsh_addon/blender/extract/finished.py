@@ -34,8 +34,9 @@ PASSES = (*LIGHT_PASSES, "emit", "environment")
 GUIDES = ("Denoising Albedo", "Denoising Normal")
 NOT_WRITTEN = (*GUIDES, "Denoising Depth", "Denoising Specular Albedo", "Denoising Roughness")
 # What shines in sight is rendered apart, into the file EDGES. EDGE_SAMPLES: the fewest and the most samples of a pixel;
-# those at edges take more than the fewest, until their noise is below EDGE_LIMIT.
-EDGES, EDGE_SAMPLES, EDGE_LIMIT = "edges.exr", (16, 512), 0.003
+# those at edges take more than the fewest, until their noise is below EDGE_LIMIT. LATEST_EDGES: the share of a budget
+# after which they are left out.
+EDGES, EDGE_SAMPLES, EDGE_LIMIT, LATEST_EDGES = "edges.exr", (16, 512), 0.003, 1.05
 # REFLECTING: the inputs that make nodes which shine reflect as well.
 REFLECTING = ("Color", "Base Color", "Metallic", "Specular IOR Level", "Transmission Weight", "Subsurface Weight")
 
@@ -59,7 +60,8 @@ def render_finished(job: FinishedJob, folder: Path, progress) -> dict:
         reserve = EDGE_SECONDS * width * height / 1e6 if has_edges else 0.0
         end = started + SPENT * max(seconds - reserve, 0.0)
     files, least = _render_chunks(scene, layer, folder, job.cycles_samples, end, progress)
-    has_edges = has_edges and (end is None or time.process_time() < started + seconds)
+    # Their time is reserved; the last file may have taken a little longer than it should.
+    has_edges = has_edges and (end is None or time.process_time() < started + LATEST_EDGES * seconds)
     if has_edges:
         _render_edges(scene, layer, folder, progress)
     return {

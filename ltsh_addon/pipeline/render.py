@@ -122,7 +122,7 @@ def finish(
         clock.end("denoise")
         report = _report(comparison, cycles, picture)
         report["finished"] |= {"denoiser": picture.denoiser, "budget_s": options.budget}
-        report["finished"]["gain"] = _gain(cycles, picture, clock.stages)
+        report["finished"]["gain"] = _gain(picture)
         if not np.any(picture.combined[..., :3]):
             report["warnings"].append(
                 f"camera {cycles.camera!r} sees no light at all, by Cycles neither: the picture is black; add a light, "
@@ -166,7 +166,7 @@ def shade_direct_light(
         height=height,
         seconds=options.budget,
         sub_samples=first,
-        reserve=plan.FIRST_DENOISING_SECONDS / 1e6,
+        reserve=(plan.FIRST_DENOISING_SECONDS + 2.0 * plan.NEXT_DENOISING_SECONDS) / 1e6,
         cycles_samples=0,
         for_finished=True,
     )
@@ -321,14 +321,13 @@ def _report(comparison: Comparison, cycles, picture: compositing.Composite) -> d
     }
 
 
-def _gain(cycles, picture: compositing.Composite, stages: dict[str, float]) -> dict:
-    """LTSH's share of the light; the error with half of the samples, and that of Cycles and its denoiser with so many
-    more that they take as long as all `stages` (s)."""
+def _gain(picture: compositing.Composite) -> dict:
+    """LTSH's share of the light; the error with half of the samples, and that of Cycles and its denoiser with as many.
+
+    All of them are the same in each run.
+    """
     light = sum(one.image.sum() for one in picture.passes.values()) / max(picture.combined[..., :3].sum(), 1e-30)
-    sampling = max(cycles.processor_seconds - cycles.least_seconds, 1e-3)
-    more = (sum(stages.values()) - stages["cycles"] - stages["denoise"]) / sampling
     error, alone = picture.errors or (None, None)
-    alone = None if alone is None else float(alone / np.sqrt(1.0 + more))
     return {"share_of_light": float(light), "error": error, "error_of_cycles": alone}
 
 
@@ -339,9 +338,11 @@ def summary(report: dict, seconds: dict) -> list[str]:
     took = f", {seconds['processor']['total']:.1f} s of processor time" if "processor" in seconds else ""
     denoised = f"denoised by {finished['denoiser']}" if finished["denoiser"] else "not denoised"
     light, error, alone = finished["gain"].values()
-    errors = [100.0 * one for one in (error, alone) if one is not None]
-    told = "; error of half the samples {:.1f} %, of Cycles alone in this time {:.1f} %"
-    gained = told.format(*errors) if errors else ""
+    gained = ""
+    if error is not None and "processor" in seconds:
+        # Cycles alone could take all the time for samples.
+        alone *= np.sqrt(seconds["processor"]["cycles"] / seconds["processor"]["total"])
+        gained = f"; error of half the samples {100 * error:.1f} %, of Cycles alone in this time {100 * alone:.1f} %"
     return [
         f"{width}x{height}, {report['sub_samples']} points per pixel, {report['cycles_samples']} samples of Cycles, "
         f"{denoised}{took}",

@@ -48,23 +48,14 @@ def test_pictures_without_noise_or_light_are_taken_as_they_are():
     assert sum(weights) == pytest.approx(1.0) and errors == (0.0, 0.0)
 
 
-def test_cycles_alone_gets_the_time_of_direct_light_for_samples():
-    stages = {"extraction": 4.0, "shading": 5.0, "cycles": 5.0, "denoise": 1.0}
-    facts = SimpleNamespace(processor_seconds=5.0, least_seconds=2.0)
+def test_the_summary_gives_cycles_alone_the_time_of_direct_light():
     lit = {"diffuse": SimpleNamespace(image=np.ones(SHAPE))}
-    picture = SimpleNamespace(passes=lit, combined=np.full((*SHAPE[:2], 4), 2.0), errors=(0.01, 0.03))
-    gain = _gain(facts, picture, stages)
-    assert gain["share_of_light"] == pytest.approx(0.5)
-    # 9 s more, 3 s for all samples: four times as many.
-    assert (gain["error"], gain["error_of_cycles"]) == (0.01, pytest.approx(0.015))
-    picture.errors = None
-    assert _gain(facts, picture, stages)["error"] is None
-
-
-def test_the_summary_tells_it():
-    gain = {"share_of_light": 0.5, "error": None, "error_of_cycles": None}
-    finished = {"share_of_ours": {"diffuse": 1.0}, "denoiser": "", "gain": gain}
+    picture = SimpleNamespace(passes=lit, combined=np.full((*SHAPE[:2], 4), 2.0), errors=(0.01, 0.05))
+    finished = {"share_of_ours": {"diffuse": 1.0}, "denoiser": "", "gain": _gain(picture)}
     report = {"finished": finished, "resolution": (4, 3), "sub_samples": 1, "cycles_samples": 2}
+    # Four times as long as Cycles took: half of the error.
+    line = summary(report, {"processor": {"cycles": 3.0, "total": 12.0}})[1]
+    assert line.endswith("50 % of the light; error of half the samples 1.0 %, of Cycles alone in this time 2.5 %")
+    picture.errors = None
+    report["finished"]["gain"] = _gain(picture)
     assert summary(report, {})[1].endswith("50 % of the light")
-    gain |= {"error": 0.01, "error_of_cycles": 0.025}
-    assert summary(report, {})[1].endswith("error of half the samples 1.0 %, of Cycles alone in this time 2.5 %")

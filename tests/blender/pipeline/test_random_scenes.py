@@ -13,7 +13,7 @@ from ltsh_addon.pipeline.comparison import Comparison
 from ltsh_addon.pipeline.picture import _extracted
 from ltsh_addon.scene import REFERENCE
 
-SEEDS, QUICK, BLOCK = 200, 8, 8
+SEEDS, QUICK, BLOCK = 200, 20, 8
 # The reference costs up to 15 ms a pixel: this many pixels, about 16 of each block, at random.
 PIXELS = 192
 # An error counts beyond 4 standard errors of a block, which 1 of 16,000 exceeds by chance, and this share of the
@@ -74,7 +74,7 @@ def noise_variance(first, second):
     return np.maximum(squared, around)
 
 
-def examine(seed, folder, techniques=(REFERENCE,), cycles_samples=192) -> Finding:
+def examine(seed, folder, techniques=(REFERENCE, "ltsh4c"), cycles_samples=192) -> Finding:
     """Compare the scene of a seed with Cycles."""
     made = RandomScene(seed)
     path = parts.save(folder / f"{seed}.blend")

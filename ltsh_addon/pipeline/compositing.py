@@ -7,7 +7,8 @@ There are up to three pictures of the same light:
     3. Combined, with its noise
 
 Their errors are measured: from half of Cycles' samples each is made anew, and compared with the other half, which has
-noise of its own (Rousselle, Knaus & Zwicker 2012, Adaptive Rendering with Non-Local Means Filtering, section 4). So
+noise of its own (Rousselle, Knaus & Zwicker 2012, Adaptive Rendering with Non-Local Means Filtering, section 4). The
+first two are joined by least squares against that half; both together and the third weigh by their errors. So
 light that LTSH shades differently, or with too few points or shadow rays, and detail that the denoiser would blur, are
 Cycles'. In the files LTSH's light has a factor that says so, and the rest is what no light gives directly.
 
@@ -171,7 +172,7 @@ def composite(cycles, passes: dict[str, DirectPass], extraction, denoise: str, p
     halves = cycles.halves if denoise == "on" else ()
     noisy = [pictures(half) for half in (None, *halves)]
     groups = [_rest_of_group(cycles, passes, name) for name in names]
-    clean, *of_halves, groups, denoiser, problems = _denoised([*noisy, groups], cycles.guides, denoise, progress)
+    (clean, *of_halves, groups), denoiser, problems = _denoised([*noisy, groups], cycles.guides, denoise, progress)
     ours = np.choose(number, clean) + direct
     weights, errors = [np.ones(replaced.shape[:2]), 0.0, 0.0], None
     if denoiser and len(halves) == 2:
@@ -191,12 +192,12 @@ def composite(cycles, passes: dict[str, DirectPass], extraction, denoise: str, p
     return Composite(combined, rest, passes, factor, groups, denoiser, problems, weights[0], errors)
 
 
-def _denoised(lists: list[list[np.ndarray]], guides: dict, denoise: str, progress) -> list:
-    """The pictures (H, W, 3) in `lists`, denoised if `denoise` is "on"; then the name of the denoiser and problems."""
+def _denoised(lists: list[list[np.ndarray]], guides: dict, denoise: str, progress) -> tuple[list, str, list[str]]:
+    """`lists` of pictures (H, W, 3), denoised if `denoise` is "on"; the name of the denoiser, and its problems."""
     from ..blender.process.blender_process import denoiser_libraries
 
     if denoise != "on":
-        return [*lists, "", []]
+        return lists, "", []
     flat = [one for pictures in lists for one in pictures]
     try:
         with open_denoiser(denoiser_libraries(), cores()) as denoiser:
@@ -204,9 +205,9 @@ def _denoised(lists: list[list[np.ndarray]], guides: dict, denoise: str, progres
                 raise Cancelled("stopped before the picture was denoised")
             images = [read_layer(guides, *guide) for guide in (ALBEDO, NORMAL)]
             clean = iter(denoiser.all_denoised(flat, *images))
-            return [*([next(clean) for _ in pictures] for pictures in lists), denoiser.name, []]
+            return [[next(clean) for _ in pictures] for pictures in lists], denoiser.name, []
     except NoDenoiser as error:
-        return [*lists, "", [f"{error}; the picture is not denoised"]]
+        return lists, "", [f"{error}; the picture is not denoised"]
 
 
 def _weights(noisy, others, samples) -> tuple[list[np.ndarray], tuple[float, float]]:

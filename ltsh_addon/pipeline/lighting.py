@@ -9,7 +9,7 @@ import itertools
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -48,9 +48,6 @@ class Shadows:
     rays: int
     tracer: str  # name of the ray tracer
     seconds: float = 0.0
-    # By pass, estimates (H, W) of the radiance on the film and of its variance; empty without a film.
-    light: dict[str, np.ndarray] = field(default_factory=dict)
-    variance: dict[str, np.ndarray] = field(default_factory=dict)
 
     def take(self, index: np.ndarray) -> Shadows:
         """The shadows of the samples at `index` (Q,)."""
@@ -112,15 +109,10 @@ class ShadowTracer:
         estimate = visibility.trace_visibility(
             samples, self._lights, self._tracer, sampling, workers=workers, progress=progress
         )
-        passes, film = sampling.passes, sampling.film
-        shares = {name: getattr(estimate, name) for name in passes}
-        noise = {name: estimate.noise(name, film) for name in passes}
+        shares = {name: getattr(estimate, name) for name in sampling.passes}
+        noise = {name: estimate.noise(name, sampling.film) for name in sampling.passes}
         seconds, tracer = time.perf_counter() - start, self._tracer.description
-        light, variance = {}, {}
-        if film is not None:
-            light = {name: film.image(estimate.radiance[name]) for name in passes}
-            variance = {name: film.variance(np.square(estimate.deviation[name])) for name in passes}
-        return Shadows(shares, estimate.numbers, noise, estimate.rays, tracer, seconds, light, variance)
+        return Shadows(shares, estimate.numbers, noise, estimate.rays, tracer, seconds)
 
 
 def trace_shadows(

@@ -258,7 +258,8 @@ class RatioEstimator:
         self._leave_out_unlit()
         # The probes of a cluster go to a few of its lights; those that count may be others.
         for last in UNMET_LEVELS if isinstance(self.emitter, LightCluster) and rays > PROBES else ():
-            self._add_rays(np.flatnonzero(np.logical_or(*self._unmet())), int(self.count.max(initial=0)), min(last, rays), 0)
+            unmet, first = np.flatnonzero(np.logical_or(*self._unmet())), int(self.count.max(initial=0))
+            self._add_rays(unmet, first, min(last, rays), 0)
         importance = importance[self.index]
         worth = {name: importance * self.unshadowed(name) / max(typical.get(name, 0.0), 1e-30) for name in PASSES}
         choice = np.where(worth["specular"] > 2.0 * worth["diffuse"], 1, 0)

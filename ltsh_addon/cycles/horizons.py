@@ -166,22 +166,19 @@ def horizon_excess(
     samples: SurfaceSamples,
     lights: tuple[Light, ...],
     chances: np.ndarray,
-    choose=None,
     is_quick: bool = False,
     progress: Progress | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The light (P,) that only one of the horizons lets through, split by who chose its direction: a lobe or the light.
     The smooth horizon is wrong about the first part, the mesh's horizon about the second.
 
-    `chances` (2, P) come from `lobe_selection_pmf`. `choose` returns the probabilities of the lights; by default it
-    is `light_tree.light_selection_pmf`. Where the horizons make no difference, the first part is 1 and the second 0.
-    `is_quick` looks at a third of the directions; on the example scene the shares are then 0.4 % off, weighted by the
-    light.
+    `chances` (2, P) come from `lobe_selection_pmf`. Where the horizons make no difference, the first part is 1 and the
+    second 0. `is_quick` looks at a third of the directions; on the example scene the shares are then 0.4 % off,
+    weighted by the light.
     """
     lights, shares = _with_stand_ins(lights)
     shapes = [_LightsOfKind.of(lights, numbers, shares[numbers]) for numbers in _kinds_of_lights(lights)]
-    if choose is None:
-        choose = partial(light_selection_pmf, lights=lights, rows=light_tree_rows(lights))
+    choose = partial(light_selection_pmf, lights=lights, rows=light_tree_rows(lights))
     step = min(max(MOST_PAIRS // len(lights), 1), BLOCK)
     excess = np.empty((2, len(samples)))
     for start in range(0, len(samples), step):

@@ -202,16 +202,23 @@ def _active_index(settings) -> int:
 
 def _select(settings, index: int) -> None:
     """Select only the light at this index among the objects of the scene, and make it active."""
-    objects, layer = settings.id_data.objects, bpy.context.view_layer
-    if not 0 <= index < len(objects) or objects[index].name not in layer.objects:
+    objects = settings.id_data.objects
+    if 0 <= index < len(objects):
+        select_light(bpy.context, objects[index])
+
+
+def select_light(context, light) -> None:
+    """Select only this object, and make it active, if the view layer has it."""
+    layer = context.view_layer
+    if light.name not in layer.objects:
         return
-    if bpy.context.mode != "OBJECT" and bpy.ops.object.mode_set.poll():
+    if context.mode != "OBJECT" and bpy.ops.object.mode_set.poll():
         bpy.ops.object.mode_set(mode="OBJECT")
     for other in layer.objects:
         if other.select_get():
             other.select_set(False)
-    objects[index].select_set(True)
-    layer.objects.active = objects[index]
+    light.select_set(True)
+    layer.objects.active = light
 
 
 def _hidden(ob) -> int:

@@ -13,7 +13,7 @@ from .job import clock, output_folder, progress_text, stage_title
 from .operators import COMMANDS
 from .preflight import APPROXIMATED, EXACT, LEFT_OUT, overview
 from .preview import ENGINE, environment_of, is_previewing, looks_through, view_of
-from .settings import active_light, lights_of
+from .settings import active_light
 
 # Widths in pixels at interface scale 1.
 LETTER_PIXELS = 6.6  # mean width of a letter of Blender's interface
@@ -395,47 +395,26 @@ class _Lights(_Entries):
 
     def draw(self, context):
         layout, scene = self.layout, context.scene
-        row = layout.row()
-        row.template_list("LTSH_UL_lights", "", scene, "objects", scene.ltsh, "active_light", rows=LIGHT_ROWS)
-        side = row.column(align=True)
-        side.operator("ltsh.add_light", text="", icon="ADD")
-        side.operator("ltsh.delete_light", text="", icon="REMOVE")
-        side.operator("ltsh.duplicate_light", text="", icon="DUPLICATE")
-        side.separator()
+        layout.template_list("LTSH_UL_lights", "", scene, "objects", scene.ltsh, "active_light", rows=LIGHT_ROWS)
+        row, ob = layout.row(align=True), active_light(context)
         is_pressed = looks_through(view_of(context)) is not None
-        side.operator("ltsh.look_through_light", text="", icon="OUTLINER_OB_CAMERA", depress=is_pressed)
-        self.draw_light(context)
-        header, body = layout.panel("ltsh_environment")
-        header.label(text="World")
-        if body is not None:
-            draw_environment(body, context)
-
-    def draw_light(self, context):
-        """Draw the settings of the active light."""
-        layout, ob = self.layout, active_light(context)
-        if ob is None:
-            text = "Click a light to select it" if lights_of(context.scene) else "Add a light, then click a surface"
-            gray(layout).label(text=text)
-            return
-        entry = _entry_of(context, ob)
+        row.operator("ltsh.look_through_light", text="", icon="OUTLINER_OB_CAMERA", depress=is_pressed)
+        row.operator("ltsh.add_light", icon="ADD")
+        row.operator("ltsh.duplicate_light", text="", icon="DUPLICATE")
+        row.operator("ltsh.delete_light", text="", icon="TRASH")
+        entry = None if ob is None else _entry_of(context, ob)
         for note in entry.notes if entry is not None else ():
             draw_text(layout, context, note, STATE_ICONS[entry.state])
         split_names(layout, context)
         column = layout.column()
-        for name, label in light_properties(ob.data).items():
+        for name, label in (light_properties(ob.data) if ob is not None else {}).items():
             column.prop(ob.data, name, text=label)
-
-
-def draw_environment(layout, context) -> None:
-    """Draw the Environment Texture of the world with its strength, or a button that opens one."""
-    background, texture = environment_of(context.scene.world)
-    if texture is None:
-        layout.operator("ltsh.open_environment", icon="FILE_FOLDER")
-    else:
-        layout.template_ID(texture, "image", open="image.open")
-    if background is not None and not background.inputs["Strength"].is_linked:
-        split_names(layout, context)
-        layout.prop(background.inputs["Strength"], "default_value", text="Strength")
+        background, texture = environment_of(scene.world)
+        if texture is None:
+            layout.operator("ltsh.open_environment", icon="WORLD")
+        else:
+            layout.template_ID(texture, "image", open="image.open")
+            layout.prop(background.inputs["Strength"], "default_value", text="Strength")
 
 
 class _Materials(_Entries):

@@ -172,7 +172,7 @@ def _lights(scene) -> list[Problem]:
         return []
     if lights:
         return [_hidden(lights[0], f"Light {lights[0].name!r} is hidden in renders, and no other light is there")]
-    return [Problem("No light", True, "ltsh.add_area_light", "Add Light")]
+    return [Problem("No light", True, "ltsh.add_light", "Add Light", {"selects": False})]
 
 
 def materials_of(scene) -> list:
@@ -225,22 +225,6 @@ class LTSH_OT_add_camera(bpy.types.Operator):
             camera.matrix_world = view.region_3d.view_matrix.inverted()
         else:
             camera.location, camera.rotation_euler = (0.0, -6.0, 3.0), (math.radians(65.0), 0.0, 0.0)
-        return {"FINISHED"}
-
-
-class LTSH_OT_add_area_light(bpy.types.Operator):
-    """Add an area light above the origin that shines down"""
-
-    bl_idname = "ltsh.add_area_light"
-    bl_label = "Add Area Light"
-    bl_options = {"REGISTER", "UNDO"}
-
-    def execute(self, context):
-        light = bpy.data.lights.new("Area", "AREA")
-        light.shape, light.size, light.size_y, light.energy = "RECTANGLE", 2.0, 1.0, 200.0
-        ob = bpy.data.objects.new("Area", light)
-        context.collection.objects.link(ob)
-        ob.location = (0.0, 0.0, 4.0)
         return {"FINISHED"}
 
 

@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import bpy
 from bpy.app.handlers import persistent
-from bpy.props import BoolProperty, FloatProperty, FloatVectorProperty, StringProperty
+from bpy.props import BoolProperty, FloatProperty, FloatVectorProperty
 from bpy_extras import view3d_utils
+from bpy_extras.io_utils import ImportHelper
 from mathutils import Vector
 
 from ...scene import error_line
@@ -44,17 +45,17 @@ class LTSH_OT_preview(bpy.types.Operator):
             return {"FINISHED"}
         space = view_of(context)
         if scene.render.engine != ENGINE:
-            if space is not None:
-                _former_shading[space.as_pointer(), scene.session_uid] = space.shading.type
+            _former_shading[scene.session_uid] = {view.as_pointer(): view.shading.type for view in _views_of(scene)}
+            _former_shading[scene.session_uid][None] = "SOLID" if space is None else space.shading.type
             start_preview(scene)
         if space is not None:
             space.shading.type = "RENDERED"
         return {"FINISHED"}
 
 
-# The shading that views had before a preview, by their address and the session_uid of the scene. Only in memory, since
-# files are saved without previews.
-_former_shading: dict[tuple[int, int], str] = {}
+# By the session_uid of a scene with a preview: the shading that views had before it, by their address, and under None
+# the one for views that are opened meanwhile. Only in memory, since files are saved without previews.
+_former_shading: dict[int, dict] = {}
 
 
 def view_of(context):
@@ -67,16 +68,25 @@ def view_of(context):
     return space
 
 
-def _views_of(scene) -> list[tuple]:
-    """The 3D views that show the preview of `scene`, and the keys of their former shading; others are forgotten, whose
-    shading was changed by hand."""
-    spaces = [space for screen in bpy.data.screens for area in screen.areas for space in area.spaces]
-    keys = [(space, (space.as_pointer(), scene.session_uid)) for space in spaces if space.type == "VIEW_3D"]
-    lent = [(space, key) for space, key in keys if key in _former_shading]
-    for space, key in lent:
-        if space.shading.type != "RENDERED":
-            del _former_shading[key]
-    return [(space, key) for space, key in lent if key in _former_shading]
+def _views_of(scene) -> list:
+    """All 3D views, but for those of windows that show another scene."""
+    elsewhere = {window.screen for window in bpy.context.window_manager.windows if window.scene != scene}
+    areas = [area for screen in bpy.data.screens if screen not in elsewhere for area in screen.areas]
+    return [space for area in areas for space in area.spaces if space.type == "VIEW_3D"]
+
+
+def _give_views_back(scene) -> list:
+    """Let the views that show the preview of `scene` have their former shading, and return them.
+
+    Views whose shading was changed by hand since then stay as they are.
+    """
+    former, given = _former_shading.get(scene.session_uid, {}), []
+    for space in _views_of(scene):
+        shading = former.get(space.as_pointer(), former.get(None, "RENDERED"))
+        if space.shading.type == "RENDERED" != shading:
+            space.shading.type = shading
+            given.append(space)
+    return given
 
 
 def start_preview(scene) -> None:
@@ -89,8 +99,8 @@ def stop_preview(scene) -> None:
     """End the preview of `scene`: restore the artist's engine and the shading of views."""
     wanted = scene.ltsh_view.artist_engine
     scene.ltsh_view.artist_engine = ""
-    for space, key in _views_of(scene):
-        space.shading.type = _former_shading.pop(key)
+    _give_views_back(scene)
+    _former_shading.pop(scene.session_uid, None)
     try:
         scene.render.engine = wanted
     except TypeError:
@@ -99,9 +109,10 @@ def stop_preview(scene) -> None:
 
 
 # Of a light that is added to a surface: its distance by the width that the view shows there, its largest share of the
-# free room over the surface, its size by its distance, and its power by the square of it. A white surface is then about
-# as bright as 1.
+# free room over the surface, its size by its distance, and its power by the square of it, which makes white about 1.
 DISTANCE, FREE_SHARE, LIGHT_SIZE, LIGHT_POWER = 0.35, 0.6, 0.6, 10.0
+# Of events that go on meanwhile: moving the view, and jobs.
+PASSED_ON = ("MIDDLE", "WHEEL", "TRACKPAD", "NDOF", "TIMER")
 
 
 class LTSH_OT_add_light(bpy.types.Operator):
@@ -110,21 +121,22 @@ class LTSH_OT_add_light(bpy.types.Operator):
     bl_idname = "ltsh.add_light"
     bl_label = "Add Light"
     bl_options = {"REGISTER", "UNDO"}
+    _light = None
 
     location: FloatVectorProperty(name="Location", description="What the light shines on", subtype="TRANSLATION")
     normal: FloatVectorProperty(
         name="Normal", description="From there to the light", subtype="DIRECTION", default=(0.0, 0.0, 1.0)
     )
     distance: FloatProperty(
-        name="Distance", description="Between both; size and power follow", subtype="DISTANCE", min=1e-4, default=1.0
+        name="Distance", description="Between both; size and power follow", subtype="DISTANCE", min=1e-4, default=4.0
     )
+    selects: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})  # the light, and nothing else
 
     @classmethod
     def poll(cls, context):
         return context.mode == "OBJECT"
 
     def invoke(self, context, event):
-        self._light = None
         context.window_manager.modal_handler_add(self)
         context.workspace.status_text_set("Add Light: click a surface in a 3D view    Esc: Cancel")
         context.window.cursor_modal_set("CROSSHAIR")
@@ -135,23 +147,22 @@ class LTSH_OT_add_light(bpy.types.Operator):
         if event.type in ("ESC", "RIGHTMOUSE"):
             self.cancel(context)
             return {"CANCELLED"}
-        if event.type not in ("MOUSEMOVE", "LEFTMOUSE"):
+        if event.type.startswith(PASSED_ON):
             return {"PASS_THROUGH"}
         surface = surface_under(context, event.mouse_x, event.mouse_y)
-        if surface is not None:
-            self.location, self.normal, self.distance = surface
-            self._light = self._light or self._new(context)
-            self._put(self._light)
-            if event.type == "LEFTMOUSE" and event.value == "PRESS":
-                self._end(context)
-                select_light(context, self._light)
-                return {"FINISHED"}
-        return {"RUNNING_MODAL"}
+        if surface is None:
+            return {"RUNNING_MODAL"}
+        self.location, self.normal, self.distance = surface
+        self._put(context)
+        if event.type != "LEFTMOUSE" or event.value != "PRESS":
+            return {"RUNNING_MODAL"}
+        self._end(context)
+        return self.execute(context)
 
     def execute(self, context):
-        light = self._new(context)
-        self._put(light)
-        select_light(context, light)
+        self._put(context)
+        if self.selects:
+            select_light(context, self._light)
         return {"FINISHED"}
 
     def cancel(self, context):
@@ -164,20 +175,19 @@ class LTSH_OT_add_light(bpy.types.Operator):
         context.workspace.status_text_set(None)
         context.window.cursor_modal_restore()
 
-    def _new(self, context):
-        light = bpy.data.objects.new("Area", bpy.data.lights.new("Area", "AREA"))
-        context.collection.objects.link(light)
-        context.view_layer.update()
-        view = view_of(context)
-        if view is not None and view.local_view is not None:
-            light.local_view_set(view, True)
-        return light
-
-    def _put(self, light) -> None:
-        normal = Vector(self.normal).normalized()
-        light.location = Vector(self.location) + self.distance * normal
-        light.rotation_euler = normal.to_track_quat("Z", "Y").to_euler()
-        light.data.size, light.data.energy = LIGHT_SIZE * self.distance, LIGHT_POWER * self.distance**2
+    def _put(self, context) -> None:
+        """Put the light, which is made at first, over the surface."""
+        if self._light is None:
+            self._light = bpy.data.objects.new("Area", bpy.data.lights.new("Area", "AREA"))
+            context.collection.objects.link(self._light)
+            context.view_layer.update()
+            view = view_of(context)
+            if view is not None and view.local_view is not None:
+                self._light.local_view_set(view, True)
+        normal, data = Vector(self.normal).normalized(), self._light.data
+        self._light.location = Vector(self.location) + self.distance * normal
+        self._light.rotation_euler = normal.to_track_quat("Z", "Y").to_euler()
+        data.size, data.energy = LIGHT_SIZE * self.distance, LIGHT_POWER * self.distance**2
 
 
 def surface_under(context, x: int, y: int) -> tuple[Vector, Vector, float] | None:
@@ -301,14 +311,13 @@ def environment_of(world) -> tuple:
     return source.node, color.node if is_texture else None
 
 
-class LTSH_OT_open_environment(bpy.types.Operator):
+class LTSH_OT_open_environment(bpy.types.Operator, ImportHelper):
     """Light the scene by a picture, an Environment Texture of the world. Nodes that are there stay, unlinked"""
 
     bl_idname = "ltsh.open_environment"
     bl_label = "Open Environment Texture"
     bl_options = {"REGISTER", "UNDO"}
 
-    filepath: StringProperty(subtype="FILE_PATH", options={"HIDDEN", "SKIP_SAVE"})
     filter_image: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
     filter_folder: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
 
@@ -316,10 +325,6 @@ class LTSH_OT_open_environment(bpy.types.Operator):
     def poll(cls, context):
         world = context.scene.world
         return world is None or world.library is None
-
-    def invoke(self, context, event):
-        context.window_manager.fileselect_add(self)
-        return {"RUNNING_MODAL"}
 
     def execute(self, context):
         try:
@@ -354,19 +359,16 @@ def _before_saving(*_) -> None:
     # A copy for a render of our own keeps the engine: the render has begun.
     if keeps_engine():
         return
-    _saved[:] = [(scene.name, _views_of(scene)) for scene in bpy.data.scenes if is_previewing(scene)]
-    for name, views in _saved:
-        scene = bpy.data.scenes[name]
+    for scene in filter(is_previewing, bpy.data.scenes):
         scene.render.engine = scene.ltsh_view.artist_engine
-        for space, key in views:
-            space.shading.type = _former_shading[key]
+        _saved.append((scene.name, _give_views_back(scene)))
 
 
 @persistent
 def _after_saving(*_) -> None:
     for name, views in _saved:
         bpy.data.scenes[name].render.engine = ENGINE
-        for space, _ in views:
+        for space in views:
             space.shading.type = "RENDERED"
     _saved.clear()
 
@@ -391,13 +393,18 @@ def _restore_previews(*_) -> None:
 
 
 @persistent
+def _end_previews(*_) -> None:
+    for scene in filter(is_previewing, bpy.data.scenes):
+        stop_preview(scene)
+
+
+@persistent
 def _after_loading(*_) -> None:
     """Files have no preview. Those that Blender has saved by itself, as Auto Save, may still have its engine."""
     _former_shading.clear()
     _before_looking.clear()
+    _end_previews()
     for scene in bpy.data.scenes:
-        if is_previewing(scene):
-            stop_preview(scene)
         scene.ltsh_view.artist_engine = ""
     _subscribe()
 
@@ -407,8 +414,7 @@ def _engine_changed() -> None:
     for scene in bpy.data.scenes:
         if scene.render.engine != ENGINE and scene.ltsh_view.artist_engine:
             scene.ltsh_view.artist_engine = ""
-            for _, key in _views_of(scene):
-                del _former_shading[key]
+            _former_shading.pop(scene.session_uid, None)
 
 
 _subscriber = object()
@@ -430,6 +436,7 @@ HANDLERS = (
     ("redo_pre", _note_previews),
     ("undo_post", _restore_previews),
     ("redo_post", _restore_previews),
+    ("load_pre", _end_previews),
     ("load_post", _after_loading),
 )
 register = _subscribe
@@ -438,6 +445,4 @@ register = _subscribe
 def unregister() -> None:
     """End all previews."""
     bpy.msgbus.clear_by_owner(_subscriber)
-    for scene in bpy.data.scenes:
-        if is_previewing(scene):
-            stop_preview(scene)
+    _end_previews()

@@ -65,13 +65,22 @@ def default_output_folder() -> Path:
     return Path(bpy.utils.user_resource("DATAFILES", path="ltsh")) / RESULTS
 
 
+# Blender calls lambdas of properties without the names of this module.
+def _apply(chosen, context) -> None:
+    apply(context)
+
+
+def _redraw(settings, context) -> None:
+    redraw_editors("VIEW_3D")
+
+
 class LTSH_AddonPreferences(bpy.types.AddonPreferences):
     bl_idname = ADDON
 
     cores: bpy.props.IntProperty(
         name="Processor Cores",
         description="How many cores shading, baking and the Cycles reference may use; 0 takes all of them",
-        min=0, max=1024, soft_max=64, default=0, update=lambda self, context: apply(context),
+        min=0, max=1024, soft_max=64, default=0, update=_apply,
     )  # fmt: skip
     output_folder: bpy.props.StringProperty(
         name="Output Folder",
@@ -81,7 +90,7 @@ class LTSH_AddonPreferences(bpy.types.AddonPreferences):
     )  # fmt: skip
     log_level: bpy.props.EnumProperty(
         name="Log", description="What the add-on writes to the console that Blender was started from",
-        items=LOG_LEVELS, default=_DEFAULT_LOG_LEVEL, update=lambda self, context: apply(context),
+        items=LOG_LEVELS, default=_DEFAULT_LOG_LEVEL, update=_apply,
     )  # fmt: skip
 
     def draw(self, context):
@@ -308,7 +317,7 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
         name="Shadows",
         description="Surfaces stand in each other's light, in the Cycles reference too; without, pictures show how "
         "well a technique shades alone",
-        default=True, update=lambda self, context: redraw_editors("VIEW_3D"),
+        default=True, update=_redraw,
     )  # fmt: skip
     shadow_rays: IntProperty(
         name="Shadow Rays",

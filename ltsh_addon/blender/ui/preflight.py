@@ -31,6 +31,7 @@ from ..materials.graph import shaders_behind, surface_of
 from ..materials.preview_material import preview_of
 from ..render_settings import CAMERA_KINDS, CAMERA_TYPES, picture_size
 from .preview import ENGINE, view_of
+from .settings import lights_of, select_alone
 
 EXACT, APPROXIMATED, LEFT_OUT = "exact", "approximated", "left out"
 OF_MIRRORS = "it reflects lights and the world, and is black where it would show anything else"
@@ -167,7 +168,7 @@ def _camera(scene) -> list[Problem]:
 def _lights(scene) -> list[Problem]:
     if may_shine(scene.world):
         return []
-    lights = [ob for ob in scene.objects if ob.type == "LIGHT"]
+    lights = lights_of(scene)
     if any(not ob.hide_render for ob in lights) or any(glows(material) for material in materials_of(scene)):
         return []
     if lights:
@@ -248,10 +249,7 @@ class LTSH_OT_add_uv_map(bpy.types.Operator):
             return {"CANCELLED"}
         selected, active = context.selected_objects, context.view_layer.objects.active
         try:
-            for other in selected:
-                other.select_set(False)
-            ob.select_set(True)
-            context.view_layer.objects.active = ob
+            select_alone(context, ob)
             bpy.ops.object.mode_set(mode="EDIT")
             bpy.ops.mesh.select_all(action="SELECT")
             bpy.ops.uv.smart_project(island_margin=0.02)

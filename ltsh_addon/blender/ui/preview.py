@@ -18,7 +18,7 @@ from mathutils import Vector
 from ...scene import error_line
 from ..materials import graph
 from ..saving import keeps_engine
-from .settings import active_light, select_light
+from .settings import active_light, select_alone
 
 ENGINE = "LTSH"
 
@@ -162,7 +162,7 @@ class LTSH_OT_add_light(bpy.types.Operator):
     def execute(self, context):
         self._put(context)
         if self.selects:
-            select_light(context, self._light)
+            select_alone(context, self._light)
         return {"FINISHED"}
 
     def cancel(self, context):
@@ -238,13 +238,13 @@ class LTSH_OT_duplicate_light(_ActiveLight, bpy.types.Operator):
     def invoke(self, context, event):
         if context.area.type != "VIEW_3D":
             return self.execute(context)
-        select_light(context, active_light(context))
+        select_alone(context, active_light(context))
         bpy.ops.object.duplicate_move("INVOKE_DEFAULT")
         # The step of undo is that of Blender's operator, when it ends.
         return {"CANCELLED"}
 
     def execute(self, context):
-        select_light(context, active_light(context))
+        select_alone(context, active_light(context))
         return bpy.ops.object.duplicate()
 
 
@@ -321,18 +321,15 @@ class LTSH_OT_open_environment(bpy.types.Operator, ImportHelper):
     filter_image: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
     filter_folder: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
 
-    @classmethod
-    def poll(cls, context):
-        world = context.scene.world
-        return world is None or world.library is None
-
     def execute(self, context):
         try:
             image = bpy.data.images.load(self.filepath, check_existing=True)
         except RuntimeError as error:
             self.report({"ERROR"}, error_line(error))
             return {"CANCELLED"}
-        world = context.scene.world = context.scene.world or bpy.data.worlds.new("World")
+        world = context.scene.world
+        if world is None or world.library is not None:
+            world = context.scene.world = bpy.data.worlds.new("World")
         if graph.tree_in_use(world) is None:
             world.use_nodes = True
         nodes, links = world.node_tree.nodes, world.node_tree.links

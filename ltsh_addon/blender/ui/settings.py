@@ -213,21 +213,21 @@ def _select(settings, index: int) -> None:
     """Select only the light at this index among the objects of the scene, and make it active."""
     objects = settings.id_data.objects
     if 0 <= index < len(objects):
-        select_light(bpy.context, objects[index])
+        select_alone(bpy.context, objects[index])
 
 
-def select_light(context, light) -> None:
+def select_alone(context, ob) -> None:
     """Select only this object, and make it active, if the view layer has it."""
     layer = context.view_layer
-    if light.name not in layer.objects:
+    if ob.name not in layer.objects:
         return
     if context.mode != "OBJECT" and bpy.ops.object.mode_set.poll():
         bpy.ops.object.mode_set(mode="OBJECT")
     for other in layer.objects:
         if other.select_get():
             other.select_set(False)
-    light.select_set(True)
-    layer.objects.active = light
+    ob.select_set(True)
+    layer.objects.active = ob
 
 
 def _hidden(ob) -> int:

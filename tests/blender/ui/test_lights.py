@@ -90,7 +90,7 @@ def test_a_light_is_added_over_the_surface_under_the_mouse_within_the_room(scene
 
 def test_duplicates_and_deletes_the_active_light_alone(scene):
     light, floor = bpy.data.objects["Light"], bpy.data.objects["Floor"]
-    preview.select_light(bpy.context, light)
+    preview.select_alone(bpy.context, light)
     floor.select_set(True)
     assert bpy.ops.ltsh.duplicate_light() == {"FINISHED"}
     (copy,) = set(light_names()) - {"Light"}
@@ -111,12 +111,12 @@ def test_a_view_looks_through_a_light_and_returns(scene, view):
     fill = parts.add_area_light("Fill", location=(0.0, 3.0, 1.0))
     region.view_location, region.view_distance = (0.3, 0.2, -7.0), 3.0
     before = region.view_rotation.copy()
-    preview.select_light(bpy.context, key)
+    preview.select_alone(bpy.context, key)
     bpy.ops.ltsh.look_through_light()
     assert preview.looks_through(view) == key and view.lock_camera and scene.camera == camera
     pressed = [item.pressed for item in drawn(LIGHTS, space_data=view) if item.what == "ltsh.look_through_light"]
     assert pressed == [True]
-    preview.select_light(bpy.context, fill)
+    preview.select_alone(bpy.context, fill)
     bpy.ops.ltsh.look_through_light()
     assert preview.looks_through(view) == fill
     bpy.ops.ltsh.look_through_light()

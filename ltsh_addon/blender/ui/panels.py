@@ -12,8 +12,7 @@ from . import comparison, operators, preflight, results
 from .job import clock, output_folder, progress_text, stage_title
 from .operators import COMMANDS
 from .preflight import APPROXIMATED, EXACT, LEFT_OUT, overview
-from .preview import ENGINE, environment_of, is_previewing, looks_through, view_of
-from .settings import active_light
+from .preview import ENGINE, active_light, environment_of, is_previewing, lights_of, looks_through, view_of
 
 # Widths in pixels at interface scale 1.
 LETTER_PIXELS = 6.6  # mean width of a letter of Blender's interface
@@ -402,6 +401,8 @@ class _Lights(_Entries):
         row.operator("ltsh.add_light", icon="ADD")
         row.operator("ltsh.duplicate_light", text="", icon="DUPLICATE")
         row.operator("ltsh.delete_light", text="", icon="TRASH")
+        if ob is None:
+            gray(layout).label(text="Click a light to select it" if lights_of(scene) else "No light in the scene")
         entry = None if ob is None else _entry_of(context, ob)
         for note in entry.notes if entry is not None else ():
             draw_text(layout, context, note, STATE_ICONS[entry.state])

@@ -30,8 +30,7 @@ from ..materials.bsdfs import bsdf_of, is_emission
 from ..materials.graph import shaders_behind, surface_of
 from ..materials.preview_material import preview_of
 from ..render_settings import CAMERA_KINDS, CAMERA_TYPES, picture_size
-from .preview import ENGINE, view_of
-from .settings import lights_of, select_alone
+from .preview import ENGINE, lights_of, select_alone, view_of
 
 EXACT, APPROXIMATED, LEFT_OUT = "exact", "approximated", "left out"
 OF_MIRRORS = "it reflects lights and the world, and is black where it would show anything else"

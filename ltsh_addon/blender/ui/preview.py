@@ -18,7 +18,6 @@ from mathutils import Vector
 from ...scene import error_line
 from ..materials import graph
 from ..saving import keeps_engine
-from .settings import active_light, select_alone
 
 ENGINE = "LTSH"
 
@@ -106,6 +105,31 @@ def stop_preview(scene) -> None:
     except TypeError:
         # The former engine is not registered any more.
         scene.render.engine = "CYCLES"
+
+
+def lights_of(scene) -> list:
+    """The light objects of `scene`, hidden ones included."""
+    return [ob for ob in scene.objects if ob.type == "LIGHT"]
+
+
+def active_light(context):
+    """The active object, which is the chosen one in the list of lights; None if it is not a light."""
+    ob = context.view_layer.objects.active
+    return ob if ob is not None and ob.type == "LIGHT" else None
+
+
+def select_alone(context, ob) -> None:
+    """Select only this object, and make it active, if the view layer has it."""
+    layer = context.view_layer
+    if ob.name not in layer.objects:
+        return
+    if context.mode != "OBJECT" and bpy.ops.object.mode_set.poll():
+        bpy.ops.object.mode_set(mode="OBJECT")
+    for other in layer.objects:
+        if other.select_get():
+            other.select_set(False)
+    ob.select_set(True)
+    layer.objects.active = ob
 
 
 # Of a light that is added to a surface: its distance by the width that the view shows there, its largest share of the

@@ -24,6 +24,7 @@ from bpy.props import (
 from ...scene import COMPARED_TECHNIQUES, CYCLES, DEFAULT_TECHNIQUE, REFERENCE, TECHNIQUES
 from ...workers.pool import CORES_VARIABLE
 from .comparison import changed, mixed, redraw_editors
+from .preview import active_light, lights_of, select_alone
 
 # The name of the add-on: "bl_ext.user_default.ltsh" in Blender, "ltsh_addon" when imported from elsewhere.
 ADDON = __package__.rsplit(".", 3)[0]
@@ -191,17 +192,6 @@ class LTSH_PG_last_result(bpy.types.PropertyGroup):
 NOT_HELD = -1
 
 
-def lights_of(scene) -> list:
-    """The light objects of `scene`, hidden ones included."""
-    return [ob for ob in scene.objects if ob.type == "LIGHT"]
-
-
-def active_light(context):
-    """The active object, which is the chosen one in the list of lights; None if it is not a light."""
-    ob = context.view_layer.objects.active
-    return ob if ob is not None and ob.type == "LIGHT" else None
-
-
 def _active_index(settings) -> int:
     """Index of the active light among the objects of the scene; -1 if there is none."""
     scene = settings.id_data
@@ -214,20 +204,6 @@ def _select(settings, index: int) -> None:
     objects = settings.id_data.objects
     if 0 <= index < len(objects):
         select_alone(bpy.context, objects[index])
-
-
-def select_alone(context, ob) -> None:
-    """Select only this object, and make it active, if the view layer has it."""
-    layer = context.view_layer
-    if ob.name not in layer.objects:
-        return
-    if context.mode != "OBJECT" and bpy.ops.object.mode_set.poll():
-        bpy.ops.object.mode_set(mode="OBJECT")
-    for other in layer.objects:
-        if other.select_get():
-            other.select_set(False)
-    ob.select_set(True)
-    layer.objects.active = ob
 
 
 def _hidden(ob) -> int:

@@ -1,5 +1,6 @@
-"""Installing by the mouse: the zip from disk, by the preferences, twice; in between uninstalled."""
+"""Installing by the mouse: the zip dropped onto the window, then from the preferences; in between uninstalled."""
 
+import subprocess
 from pathlib import Path
 
 import bpy
@@ -19,12 +20,9 @@ CHECKBOX, EXTENSION_MENU, MENU, INSTALL_FROM_DISK, UNINSTALL = (211, 55), (851, 
 def main(rig):
     rig.check(not installed(), "nothing is installed at the start")
     before = state()
-    yield from open_preferences(rig)
-    yield from installed_from_disk(rig)
-    hands.close_window(bpy.context.window_manager.windows[-1])
+    yield from dropped(rig)
     yield from used(rig)
     yield from open_preferences(rig)
-    yield from section("ADDONS")
     yield from disabled_and_enabled(rig, before)
     yield from uninstalled(rig, before)
     yield from installed_from_disk(rig)
@@ -40,6 +38,19 @@ def folder():
 
 def zip_file():
     return next(HERE.glob("ltsh-*.zip"))
+
+
+def dropped(rig):
+    x, y = hands.view_middle(rig)
+    source = subprocess.Popen(["python3", HERE / "drag_file.py", zip_file(), str(x), str(y)])
+    yield from hands.until(lambda: source.poll() is not None, 60)
+    rig.check(source.poll() == 0, f"the window takes the zip: {source.poll()}")
+    yield 2
+    rig.shot("1_dropped.png")
+    rig.xdo("key", "Return")
+    yield from hands.until(installed, 60)
+    rig.check(installed(), "the zip that was dropped is installed and enabled")
+    rig.check((folder() / "blender_manifest.toml").is_file(), f"in {folder().parent.name}")
 
 
 def used(rig):
@@ -63,7 +74,7 @@ def open_preferences(rig):
     yield 2
     rig.xdo("search", "--name", "Preferences", "windowmove", *PREFERENCES)
     yield 1
-    yield from section("EXTENSIONS")
+    yield from section("ADDONS")
 
 
 def section(name):
@@ -126,9 +137,8 @@ def installed_from_disk(rig):
     yield from hands.click(rig, window.x + window.width - 70, rig.size[1] - window.y - 21)
     yield from hands.until(installed, 60)
     rig.check(installed(), "Install from Disk installs and enables it")
-    rig.check((folder() / "blender_manifest.toml").is_file(), f"in {folder().parent.name}")
     yield 2
-    rig.shot("1_installed.png")
+    rig.shot("7_installed.png")
 
 
 def file_browser():

@@ -82,14 +82,14 @@ def coated(name, **inputs):
     return bsdf(name, Base_Color=RED, **{"Roughness": 0.5, "Coat_Weight": 1.0, **inputs})
 
 
-def bumpy(**values):
+def bumpy(values):
     """A function that makes the material of a normal map with other inputs; a bumpy coat is as bumpy as its base."""
 
     def make():
         material = normal_map()
         node = next(node for node in material.node_tree.nodes if node.bl_idname == "ShaderNodeBsdfPrincipled")
         bumps = node.inputs["Normal"].links[0].from_socket
-        fill(node, {key.replace("_", " "): bumps if value == "bumps" else value for key, value in values.items()})
+        fill(node, {key: bumps if value == "bumps" else value for key, value in values.items()})
         return material
 
     return make
@@ -113,8 +113,8 @@ LAYERED = (
     coated("tinted varnish", Coat_Tint=AMBER, Coat_Roughness=0.15, Coat_IOR=1.35),
     coated("tint alone", Coat_Tint=AMBER, Coat_IOR=1.0),
     coated("car paint", Metallic=0.7, Coat_Roughness=0.1),
-    bumpy(Coat_Weight=0.8, Coat_Roughness=0.2),
-    bumpy(Coat_Weight=0.8, Coat_Roughness=0.2, Coat_Normal="bumps"),
+    bumpy({"Coat Weight": 0.8, "Coat Roughness": 0.2}),
+    bumpy({"Coat Weight": 0.8, "Coat Roughness": 0.2, "Coat Normal": "bumps"}),
     made("mixed", *mixed(0.3)),
     made("added", "AddShader", {0: CHALK, 1: gloss()}),
     made("mostly gloss", *mixed(0.9)),
@@ -208,7 +208,7 @@ BRUSHED = (
     bsdf("across", "BsdfAnisotropic", Anisotropy=-0.5, Roughness=0.9, Rotation=0.3),
     bsdf("brushed node", "BsdfMetallic", Anisotropy=0.5, Tangent=("NewGeometry.Tangent", {})),
     coated("brushed and coated", Anisotropic=0.9, Metallic=1.0, Coat_Roughness=0.2),
-    bumpy(Anisotropic=0.8, Metallic=1.0, Tangent=("Tangent", {"direction_type": "UV_MAP"})),
+    bumpy({"Anisotropic": 0.8, "Metallic": 1.0, "Tangent": ("Tangent", {"direction_type": "UV_MAP"})}),
     made(
         "some brushed", "MixShader", {0: 0.4, 1: CHALK, 2: ("BsdfAnisotropic", {"Anisotropy": 0.6, "Roughness": 0.5})}
     ),
@@ -225,7 +225,7 @@ ROUGH = (
     made("smooth chalk", *rough(0.0)),
     bsdf("rough plastic", Base_Color=AMBER, Roughness=0.3, Diffuse_Roughness=0.5),
     coated("rough under a coat", Diffuse_Roughness=0.8, Coat_Roughness=0.2, Sheen_Weight=0.5),
-    bumpy(Diffuse_Roughness=0.7),
+    bumpy({"Diffuse Roughness": 0.7}),
     made("two roughs", "MixShader", {0: 0.4, 1: rough(0.3), 2: rough(0.9, GOLD)}),
     made("rough and brushed", "MixShader", {0: 0.4, 1: rough(0.6), 2: ("BsdfAnisotropic", {"Anisotropy": 0.6})}),
     bsdf("rough image", Diffuse_Roughness=0.6, Base_Color=("TexImage", {"image": "colors"})),

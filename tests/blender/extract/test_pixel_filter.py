@@ -81,7 +81,7 @@ def test_edges_are_those_of_a_plain_render(tmp_path, kind, width):
 
 def test_shaded_edges_are_those_of_a_plain_render_and_of_the_reference(tmp_path):
     """All the way: radiance with --aa 64 in the filter that files have by default."""
-    scene = stripes("BLACKMAN_HARRIS", 1.5)
+    stripes("BLACKMAN_HARRIS", 1.5)
     report, layers = compared(tmp_path, sub_samples=64, cycles_samples=1024)
     assert report["pixel_filter"] == "BLACKMAN_HARRIS 1.5 px"
     plain, _ = plain_diffuse(tmp_path, samples=1024)

@@ -433,7 +433,7 @@ class ViewOptions(CameraOptions):
     shadow_rays: int = _shadow_rays()
     bounces: str = option(
         "--bounces", default="off", choices=("on", "off"),
-        help="also bounces, reflections, refraction and materials by nodes, by Cycles and denoised (default: %(default)s)",
+        help="also bounces, reflections, refraction, materials by nodes, by Cycles and denoised (default: %(default)s)",
     )  # fmt: skip
     rest_samples: int = option(
         "--rest-samples", default=64, type=cycles_samples, metavar="N",

@@ -91,7 +91,7 @@ class ShownRest:
 
     texture: gpu.types.GPUTexture  # RGBA, row 0 at the bottom; alpha 1: without light of the view itself
     projection: np.ndarray  # (4, 4) to the clip space that the texture fills
-    scale: tuple[float, float, float] = (1.0, 1.0, 1.0)  # the change of the light since then
+    light: np.ndarray | None = None  # the mean (3,) of the direct light that belongs to it; None: that of the picture
 
     def is_of(self, view: ViewCamera) -> bool:
         """True if it was rendered for this very view."""
@@ -106,17 +106,18 @@ class RestPass:
         constants = {"projection": "MAT4", "scale": "VEC4", "weight": "FLOAT", "has_moved": "INT"}
         self._shader, self._target = PixelShader(glsl("rest"), samplers, constants), None
 
-    def draw(self, textures: dict[str, gpu.types.GPUTexture], weight: float, rest: ShownRest, view: ViewCamera):
+    def draw(self, textures: dict[str, gpu.types.GPUTexture], weight: float, rest: ShownRest, view: ViewCamera, scale):
         """The picture (RGBA texture, valid until the next call with the same `picture`) with the `rest`.
 
         `textures` are by the names of the samplers: `picture` and `of_cycles`, the share of pixels that is Cycles'
-        alone, which count times `weight`; and the positions of the surfaces and of glass.
+        alone, which count times `weight`; and the positions of the surfaces and of glass. The rest counts times `scale`
+        (3,).
         """
         size = size_of(textures["picture"])
         target = SampleSum(size)
         constants = {
             "projection": Matrix(rest.projection.tolist()),
-            "scale": (*rest.scale, 0.0),
+            "scale": (*scale, 0.0),
             "weight": weight,
             "has_moved": not rest.is_of(view),
         }

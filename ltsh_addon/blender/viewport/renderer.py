@@ -24,7 +24,6 @@ from .pictures import (
     RestPass,
     SampleSum,
     ShownPicture,
-    ShownRest,
     StaticLighting,
     VeilPass,
     copy,
@@ -151,7 +150,7 @@ class ViewRenderer:
         self._sky, self._sky_light, self._background = None, None, None
         self.shadows: ShadowRays | LiveShadows | None = None
         # Pictures get a rest, and this one as soon as there is one; `_of_cycles`: what is Cycles' alone, a sum.
-        self.has_bounces, self.rest = False, None
+        self.has_bounces, self.rest = False, None  # bool, ShownRest | None
         self._rest_pass: RestPass | None = None
         self._of_cycles: list[SampleSum] = []
 
@@ -208,7 +207,14 @@ class ViewRenderer:
             self._rest_pass = RestPass()
         front = self._surfaces if self._glass is None or not self._has_glass else self._glass
         textures = {"picture": picture, "of_cycles": self._of_cycles[0].texture, "positions": self._surfaces.position}
-        return self._rest_pass.draw({**textures, "glass_positions": front.position}, 1.0 / self.samples, self.rest, view)
+        textures["glass_positions"], scale, light = front.position, np.ones(3), self.rest.light
+        if light is not None:
+            scale = np.divide(self.mean_light(), light, out=scale, where=light > 0.0)
+        return self._rest_pass.draw(textures, 1.0 / self.samples, self.rest, view, scale)
+
+    def mean_light(self) -> np.ndarray:
+        """The mean (3,) of some pixels of the last picture."""
+        return self.read()[2::5, 2::5, :3].mean(axis=(0, 1), dtype=np.float64)
 
     def _draw_sample(self, frame: Frame, state: tuple | None) -> bool:
         """Add one point of every pixel to the pictures; the first point replaces them.

@@ -11,18 +11,30 @@ Surfaces `is_of_cycles` are Cycles' alone. An AOV tells their share m of a pixel
 
 from __future__ import annotations
 
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import bpy
+import numpy as np
 from mathutils import Matrix
 
+from ...files import temporary_folder
+from ...scene import error_line
 from .. import render_settings
 from ..extract.finished import reasons_for_cycles
 from ..extract.pixels import open_scene, scene_named
 from ..materials.graph import ensure_nodes, live_link, material_output, tree_in_use
 from ..materials.preview_material import preview_of
-from ..process.view import REST_PICTURE, RestJob
+from ..process.blender_process import BlenderProcess
+from ..process.view import REST_PICTURE, RestJob, RestSum
 from ..render_settings import render_exr
+from ..saving import save_working_copy
+from .drawing import ViewCamera, float_texture
+from .pictures import ShownRest
 
 # MASK: the AOV with the share of a pixel that is Cycles' alone. SENSOR: the width of the camera's sensor in mm.
 MASK, SENSOR = "ltsh_of_cycles", 36.0
@@ -39,6 +51,240 @@ LEVELS = (
     ("simplify_subdivision", "simplify_subdivision_render"),
     ("simplify_child_particles", "simplify_child_particles_render"),
 )
+# A step takes at most STEP_SECONDS, beside the first. FIRST: samples of the first, which has half of the pixels each
+# way. TOTALS: the samples after which a picture is shown. REST_SECONDS: how long a view must stay as it is before.
+STEP_SECONDS, FIRST, TOTALS, REST_SECONDS = 1.0, 4, (4, 8, 16, 32, 64), 0.3
+# Settings of a scene that change its light, beside those of Cycles.
+SCENE_SETTINGS = ("use_simplify", "simplify_subdivision", "film_transparent", "hair_type")
+
+
+@dataclass(frozen=True)
+class RestView:
+    """What a rest is of: a state of the scene, and a view of it."""
+
+    scene: str
+    view_layer: str
+    version: tuple[int, int]  # of the scene, and of all in it but lights
+    frame: int
+    hidden: tuple[str, ...]
+    matrices: tuple  # see `RestJob`
+    size: tuple[int, int]
+
+
+@dataclass
+class _RestStep:
+    """A job on its way, and what it is added to."""
+
+    view: RestView
+    job: RestJob
+    total: RestSum
+    started: float
+    pixels: np.ndarray | None = None  # of the picture, if it is to be shown
+    seconds: float = 0.0
+    error: str = ""
+
+
+class LiveRest:
+    """The rest of one view. A second Blender renders it in steps while the view goes on; stale ones are not shown."""
+
+    def __init__(self):
+        self._stack: ExitStack | None = None
+        self._wanted: RestView | None = None
+        self._changed = 0.0
+        self._thread: threading.Thread | None = None
+        self._step: _RestStep | None = None
+        self._total = RestSum()  # of the view `_total_of`, in full resolution
+        self._total_of: RestView | None = None
+        self._opened: tuple | None = None  # the state of the scene that the second Blender has
+        self._seconds = {}  # of a sample, by number of pixels
+        self._pixels: tuple[np.ndarray, RestView] | None = None  # the picture to upload
+        self._shown: tuple[ShownRest, RestView] | None = None
+        self._light: tuple | None = None  # the mean of the direct light that belongs to it, by `_light_key`
+        self._version, self._surfaces, self._settings = 0, 0, None  # of the scene; of all in it but lights
+        self.problem = ""
+
+    def note(self, depsgraph) -> None:
+        """Take note of the changes of the scene."""
+        settings = _settings_of(depsgraph)
+        has_other, has_light = settings != self._settings, False
+        for update in depsgraph.updates:
+            block = update.id.original
+            kind = block.type if isinstance(block, bpy.types.Object) else ""
+            if kind == "LIGHT" or isinstance(block, bpy.types.Light | bpy.types.World | bpy.types.NodeTree):
+                has_light = True  # the trees of materials come with these
+            elif kind != "CAMERA" and not isinstance(block, bpy.types.Scene | bpy.types.Camera):
+                has_other = True
+        if has_other or has_light:
+            self._version, self._settings, self.problem = self._version + 1, settings, ""
+            self._surfaces += has_other
+
+    def follow(self, context, depsgraph) -> None:
+        """Want the rest of the region of `context`."""
+        region, view, space = context.region, context.region_data, context.space_data
+        hidden = ()
+        if space.local_view is not None:
+            objects = depsgraph.view_layer.objects
+            hidden = tuple(ob.name for ob in objects if not ob.original.local_view_get(space))
+        matrices = tuple(tuple(map(tuple, one)) for one in (view.view_matrix, view.window_matrix))
+        names, version = (depsgraph.scene.name, depsgraph.view_layer.name), (self._version, self._surfaces)
+        size = region.width, region.height
+        wanted = RestView(*names, version, depsgraph.scene.frame_current, hidden, matrices, size)
+        if wanted != self._wanted:
+            self._wanted, self._changed = wanted, time.monotonic()
+
+    def shown(self) -> ShownRest | None:
+        """The last picture; needs an active GPU context. After changes of lights alone it follows the direct light."""
+        if self._pixels is not None:
+            pixels, view = self._pixels
+            camera = ViewCamera.of(*map(Matrix, view.matrices), view.matrices[1][3][3] == 1.0)
+            self._shown, self._pixels = (ShownRest(float_texture(pixels[::-1]), camera.projection), view), None
+        if self._shown is None:
+            return None
+        rest, view = self._shown
+        has_old_light = self._wanted.version != view.version and self._light is not None
+        return replace(rest, light=self._light[1]) if has_old_light and self._light[0] == self._light_key else rest
+
+    @property
+    def _light_key(self) -> tuple:
+        """What the mean direct light depends on, apart from lights."""
+        return self._shown[1].version, self._wanted.version[1], self._wanted.matrices, self._wanted.size
+
+    def keep_light(self, mean: Callable[[], np.ndarray]) -> None:
+        """Keep the mean (3,) of the direct light that belongs to the picture that is shown."""
+        if self._shown is None or self._shown[1].version != self._wanted.version:
+            return
+        if self._light is None or self._light[0] != self._light_key:
+            self._light = self._light_key, mean()
+
+    @property
+    def is_busy(self) -> bool:
+        """True while a better picture is to come."""
+        is_short = self._wanted is not None and self._samples < TOTALS[-1]
+        return self._thread is not None or (is_short and not self.problem)
+
+    @property
+    def _samples(self) -> int:
+        """Samples in full resolution of what is wanted."""
+        return self._total.samples if self._total_of == self._wanted else 0
+
+    @property
+    def seconds(self) -> float:
+        """About how long the last picture will still take."""
+        width, height = (1, 1) if self._wanted is None else self._wanted.size
+        each = self._seconds.get(width * height, 4.0 * self._seconds.get(_half(width) * _half(height), 0.5))
+        return each * (TOTALS[-1] - self._samples)
+
+    def step(self) -> bool:
+        """Do the next step, in the main thread; True if there is a new picture."""
+        news = False
+        if self._thread is not None:
+            if self._thread.is_alive():
+                return False
+            news = self._finish()
+        is_at_rest = time.monotonic() - self._changed > REST_SECONDS
+        if self._wanted is not None and is_at_rest and self.is_busy:
+            try:
+                self._begin()
+            except (OSError, RuntimeError) as error:
+                self.problem = f"Bounces: {error_line(error)}"
+                news = True
+        return news
+
+    def _finish(self) -> bool:
+        """Take over what the last step has brought."""
+        step, self._thread, self._step = self._step, None, None
+        if step.error:
+            self.problem, self._opened = step.error, None
+            return True
+        self._seconds[step.job.width * step.job.height] = step.seconds / step.job.samples
+        if step.view != self._wanted:
+            return False
+        if (step.job.width, step.job.height) == step.view.size:
+            self._total, self._total_of = step.total, step.view
+        if step.pixels is None:
+            return False
+        self._pixels = step.pixels, step.view
+        return True
+
+    def _begin(self) -> None:
+        """Start the next step of what is wanted."""
+        wanted = self._wanted
+        if self._stack is None:
+            self._stack = ExitStack()
+            self._folder = self._stack.enter_context(temporary_folder())
+            self._process, self._opened = BlenderProcess(self._folder), None
+            self._stack.callback(self._process.end)
+        has_first = self._last_of == wanted
+        width, height = wanted.size if has_first else map(_half, wanted.size)
+        samples, total = FIRST, RestSum()
+        if has_first:
+            if self._total_of == wanted:
+                total = self._total
+            missing = next(count for count in TOTALS if count > total.samples) - total.samples
+            each = self._seconds.get(width * height) or 4.0 * self._seconds[_half(width) * _half(height)]
+            samples = min(missing, max(1, int(STEP_SECONDS / each)))
+        state = wanted.scene, wanted.view_layer, wanted.version, wanted.frame, wanted.hidden
+        path = None
+        if state != self._opened:
+            path, self._opened = self._folder / "scene.blend", state
+            save_working_copy(path)
+        job = RestJob(
+            scene=path,
+            width=width,
+            height=height,
+            samples=samples,
+            seed=total.samples,
+            frame=wanted.frame,
+            scene_name=wanted.scene,
+            view_layer=wanted.view_layer,
+            matrices=wanted.matrices,
+            hidden=wanted.hidden,
+        )
+        self._last_of = wanted
+        self._step = _RestStep(wanted, job, total, time.monotonic())
+        arguments = self._step, self._process, self._folder
+        self._thread = threading.Thread(target=_do_step, args=arguments, name="LTSH rest", daemon=True)
+        self._thread.start()
+
+    _last_of: RestView | None = None  # of the last step that was begun
+
+    def stop(self) -> None:
+        """End the second Blender, and forget what it has rendered."""
+        stack = self._stack
+        vars(self).update(vars(LiveRest()))
+        if stack is not None:
+            stack.close()
+
+
+def _half(side: int) -> int:
+    return max(side // 2, 1)
+
+
+def _do_step(step: _RestStep, process: BlenderProcess, folder: Path) -> None:
+    """Do a step, in a thread of its own."""
+    try:
+        manifest = process.do(step.job, folder, None)
+        step.seconds = manifest["seconds"]
+        step.total.add(manifest, folder)
+        if step.total.samples in TOTALS:
+            step.pixels = step.total.picture()
+    except Exception as error:
+        step.error = f"Bounces: {error_line(error)}"
+
+
+def _settings_of(depsgraph) -> tuple:
+    """The settings of a scene that change its light."""
+    scene, layer = depsgraph.scene, depsgraph.view_layer
+    blocks = scene.world, layer.world_override, layer.material_override
+    cycles = getattr(scene, "cycles", None)
+    names = [] if cycles is None else [one.identifier for one in cycles.bl_rna.properties if one.type != "POINTER"]
+    return (
+        scene.name,
+        layer.name,
+        *(None if block is None else block.name_full for block in blocks),
+        *(getattr(scene.render, name) for name in SCENE_SETTINGS),
+        *(str(getattr(cycles, name)) for name in names),
+    )
 
 
 # In the child:
@@ -65,9 +311,11 @@ def render_rest(job: RestJob, folder: Path, progress) -> dict:
         _look_through(scene, *map(Matrix, job.matrices), (job.width, job.height))
     scene.cycles.samples, scene.cycles.seed = job.samples, job.seed
     progress("bounces", 0.0)
+    started = time.monotonic()
     render_exr(scene, folder / REST_PICTURE, "NONE")
     return {
         "samples": job.samples,
+        "seconds": time.monotonic() - started,
         "mask": MASK,
         "passes": render_settings.pass_names(),
         "everything": _reasons_for_cycles(scene, layer),

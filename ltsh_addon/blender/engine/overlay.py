@@ -65,7 +65,8 @@ def left_out(mirror, scene, rest=None) -> QuietLine:
     if rest is None:
         parts = ["No bounces", *["glass without refraction"] * mirror.has_glass]
     else:
-        parts = [f"Bounces: {max(rest.seconds, 1.0):.0f} s"] if rest.is_busy else []
+        coming = "Bounces are coming" if rest.seconds is None else f"Bounces: {max(rest.seconds, 1.0):.0f} s"
+        parts = [coming] * rest.is_busy
     if not scene.ltsh.shadows:
         parts.append("no shadows")
     if not scene.ltsh_view.world and mirror.sky.sides:

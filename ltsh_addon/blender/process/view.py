@@ -149,6 +149,7 @@ class RestJob:
     view_layer: str | None = None
     matrices: tuple | None = None  # of a region: from the world to the view, and to clip space, (4, 4) each
     hidden: tuple[str, ...] = ()  # names of objects that its local view hides
+    changes: dict | None = None  # of the scene that the last job has opened, see `viewport.rest.RestChanges`
     scripts: bool = False  # run the scripts in the file
 
 

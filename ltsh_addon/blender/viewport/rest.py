@@ -14,8 +14,8 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from contextlib import ExitStack, nullcontext
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import bpy
@@ -23,7 +23,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ...files import temporary_folder
-from ...scene import error_line
+from ...scene import SceneError, error_line
 from .. import render_settings
 from ..extract.finished import reasons_for_cycles
 from ..extract.pixels import open_scene, scene_named
@@ -71,6 +71,72 @@ class RestView:
     size: tuple[int, int]
 
 
+# REPLACED: data-blocks that are handed over by themselves, and the collections of `bpy.data` that have them.
+REPLACED = {bpy.types.Light: "lights", bpy.types.Material: "materials", bpy.types.World: "worlds"}
+
+
+@dataclass
+class RestChanges:
+    """What has changed in a scene since the second Blender has it."""
+
+    everything: bool = True  # too much to hand it over piece by piece
+    objects: set[str] = field(default_factory=set)  # names of those that were moved
+    blocks: set[tuple[str, str]] = field(default_factory=set)  # names of collections of `bpy.data`, and in these
+
+    def add(self, depsgraph, has_new_settings: bool) -> tuple[bool, bool]:
+        """Add what an update of the depsgraph changes; returns whether it is any light, and anything else."""
+        blocks = [(update, update.id.original) for update in depsgraph.updates]
+        has_material = any(isinstance(block, bpy.types.Material) for _, block in blocks)
+        has_lamp = any(isinstance(block, bpy.types.Light) for _, block in blocks)
+        has_light, has_other = False, has_new_settings
+        for update, block in blocks:
+            kind = next((name for one, name in REPLACED.items() if isinstance(block, one)), "")
+            if kind:
+                self.blocks.add((kind, block.name))
+                self.everything |= block.library is not None or _refers_to_objects(block)
+                has_light, has_other = has_light or kind != "materials", has_other or kind == "materials"
+            elif isinstance(block, bpy.types.Object) and block.type != "CAMERA":
+                is_light = block.type == "LIGHT"
+                has_light, has_other = has_light or is_light, has_other or not is_light
+                if update.is_updated_transform:
+                    self.objects.add(block.name)
+                # The geometry of lights is that of their data-blocks, and materials come with their users.
+                has_shape = update.is_updated_geometry and not is_light
+                is_known = update.is_updated_transform or (has_lamp if is_light else has_material)
+                self.everything |= has_shape or not is_known
+            elif isinstance(block, bpy.types.NodeTree | bpy.types.Scene | bpy.types.Camera | bpy.types.Object):
+                pass  # node trees come with their users; scenes have settings
+            elif not isinstance(block, bpy.types.Mesh) or update.is_updated_geometry:
+                has_other = self.everything = True
+        self.everything |= has_new_settings
+        return has_light, has_other
+
+    def written(self, scene, path: Path) -> dict:
+        """The record of the changes for the second Blender; data-blocks go to the .blend `path`."""
+        blocks = {getattr(bpy.data, kind)[name, None] for kind, name in self.blocks}
+        if blocks:
+            bpy.data.libraries.write(str(path), blocks, path_remap="ABSOLUTE", fake_user=True)
+        objects = {name: scene.objects[name] for name in sorted(self.objects)}
+        moved = {
+            name: [[*map(tuple, one)] for one in (ob.matrix_basis, ob.matrix_world)] for name, ob in objects.items()
+        }
+        return {"file": str(path), "blocks": sorted(self.blocks), "moved": moved}
+
+
+def _refers_to_objects(block) -> bool:
+    """True if nodes of the data-block, or of its groups, take coordinates or more from objects."""
+    trees, names = [block.node_tree], set()
+    while trees:
+        tree = trees.pop()
+        if tree is None or tree.name_full in names:
+            continue
+        names.add(tree.name_full)
+        if any(getattr(node, "object", None) is not None for node in tree.nodes):
+            return True
+        trees += [node.node_tree for node in tree.nodes if getattr(node, "node_tree", None) is not None]
+    return False
+
+
 @dataclass
 class _RestStep:
     """A job on its way, and what it is added to."""
@@ -95,7 +161,9 @@ class LiveRest:
         self._step: _RestStep | None = None
         self._total = RestSum()  # of the view `_total_of`, in full resolution
         self._total_of: RestView | None = None
-        self._opened: tuple | None = None  # the state of the scene that the second Blender has
+        self._opened: tuple | None = None  # the scene that the second Blender has
+        self._changes = RestChanges()  # since then
+        self._last_of: RestView | None = None  # the view of the last step that was begun
         self._seconds = {}  # of a sample, by number of pixels
         self._pixels: tuple[np.ndarray, RestView] | None = None  # the picture to upload
         self._shown: tuple[ShownRest, RestView] | None = None
@@ -105,15 +173,10 @@ class LiveRest:
 
     def note(self, depsgraph) -> None:
         """Take note of the changes of the scene."""
-        settings = _settings_of(depsgraph)
-        has_other, has_light = settings != self._settings, False
-        for update in depsgraph.updates:
-            block = update.id.original
-            kind = block.type if isinstance(block, bpy.types.Object) else ""
-            if kind == "LIGHT" or isinstance(block, bpy.types.Light | bpy.types.World | bpy.types.NodeTree):
-                has_light = True  # the trees of materials come with these
-            elif kind != "CAMERA" and not isinstance(block, bpy.types.Scene | bpy.types.Camera):
-                has_other = True
+        settings, kinds = self._settings, bpy.types.Scene | bpy.types.Collection
+        if settings is None or any(isinstance(update.id, kinds) for update in depsgraph.updates):
+            settings = _settings_of(depsgraph)
+        has_light, has_other = self._changes.add(depsgraph, settings != self._settings)
         if has_other or has_light:
             self._version, self._settings, self.problem = self._version + 1, settings, ""
             self._surfaces += has_other
@@ -168,11 +231,11 @@ class LiveRest:
         return self._total.samples if self._total_of == self._wanted else 0
 
     @property
-    def seconds(self) -> float:
-        """About how long the last picture will still take."""
+    def seconds(self) -> float | None:
+        """About how long the last picture will still take; None: not known yet."""
         width, height = (1, 1) if self._wanted is None else self._wanted.size
-        each = self._seconds.get(width * height, 4.0 * self._seconds.get(_half(width) * _half(height), 0.5))
-        return each * (TOTALS[-1] - self._samples)
+        each = self._seconds.get(width * height)
+        return None if each is None else each * (TOTALS[-1] - self._samples)
 
     def step(self) -> bool:
         """Do the next step, in the main thread; True if there is a new picture."""
@@ -194,8 +257,10 @@ class LiveRest:
         """Take over what the last step has brought."""
         step, self._thread, self._step = self._step, None, None
         if step.error:
-            self.problem, self._opened = step.error, None
-            return True
+            self._opened = self._last_of = None
+            # What cannot be handed over piece by piece goes as a whole.
+            self.problem = "" if step.job.changes is not None else step.error
+            return bool(self.problem)
         self._seconds[step.job.width * step.job.height] = step.seconds / step.job.samples
         if step.view != self._wanted:
             return False
@@ -223,11 +288,13 @@ class LiveRest:
             missing = next(count for count in TOTALS if count > total.samples) - total.samples
             each = self._seconds.get(width * height) or 4.0 * self._seconds[_half(width) * _half(height)]
             samples = min(missing, max(1, int(STEP_SECONDS / each)))
-        state = wanted.scene, wanted.view_layer, wanted.version, wanted.frame, wanted.hidden
-        path = None
-        if state != self._opened:
+        state, path, changes = (wanted.scene, wanted.view_layer, wanted.frame, wanted.hidden), None, None
+        if state != self._opened or self._changes.everything:
             path, self._opened = self._folder / "scene.blend", state
             save_working_copy(path)
+        elif self._changes.objects or self._changes.blocks:
+            changes = self._changes.written(bpy.data.scenes[wanted.scene], self._folder / "changes.blend")
+        self._changes = RestChanges(everything=False)
         job = RestJob(
             scene=path,
             width=width,
@@ -239,14 +306,13 @@ class LiveRest:
             view_layer=wanted.view_layer,
             matrices=wanted.matrices,
             hidden=wanted.hidden,
+            changes=changes,
         )
         self._last_of = wanted
         self._step = _RestStep(wanted, job, total, time.monotonic())
         arguments = self._step, self._process, self._folder
         self._thread = threading.Thread(target=_do_step, args=arguments, name="LTSH rest", daemon=True)
         self._thread.start()
-
-    _last_of: RestView | None = None  # of the last step that was begun
 
     def stop(self) -> None:
         """End the second Blender, and forget what it has rendered."""
@@ -284,6 +350,7 @@ def _settings_of(depsgraph) -> tuple:
         *(None if block is None else block.name_full for block in blocks),
         *(getattr(scene.render, name) for name in SCENE_SETTINGS),
         *(str(getattr(cycles, name)) for name in names),
+        *(ob.name for ob in layer.objects if ob.visible_get(view_layer=layer)),
     )
 
 
@@ -302,6 +369,8 @@ def render_rest(job: RestJob, folder: Path, progress) -> dict:
         _show_as_views(scene, layer, job.hidden)
         _prepare(scene, layer)
     scene = scene_named(job.scene_name)
+    if job.changes is not None:
+        _take_changes(scene, **job.changes)
     layer = next(layer for layer in scene.view_layers if layer.use)
     if job.matrices is None:
         camera = render_settings.choose_camera(scene, job.camera)
@@ -320,6 +389,31 @@ def render_rest(job: RestJob, folder: Path, progress) -> dict:
         "passes": render_settings.pass_names(),
         "everything": _reasons_for_cycles(scene, layer),
     }
+
+
+def _take_changes(scene, file: str, blocks: list, moved: dict) -> None:
+    """Take over the changes that `RestChanges.written` has recorded. Raises SceneError where that is not possible."""
+    with bpy.data.libraries.load(file) if blocks else nullcontext(((), None)) as (_, wanted):
+        for kind, name in blocks:
+            setattr(wanted, kind, [*getattr(wanted, kind), name])
+    loaded = {kind: iter(getattr(wanted, kind)) for kind, _ in blocks}
+    for kind, name in blocks:
+        old, new = getattr(bpy.data, kind).get((name, None)), next(loaded[kind])
+        if old is None:
+            raise SceneError(f"{name!r} is new")
+        old.user_remap(new)
+        getattr(bpy.data, kind).remove(old)
+        new.name = name
+        if kind == "materials":
+            mark(new)
+    for name, (basis, _) in moved.items():
+        if name not in scene.objects:
+            raise SceneError(f"object {name!r} is new")
+        scene.objects[name].matrix_basis = Matrix(basis)
+    scene.view_layers.update()
+    for name, (_, world) in moved.items():
+        if not np.allclose(scene.objects[name].matrix_world, world, rtol=1e-5, atol=1e-5):
+            raise SceneError(f"object {name!r} does not follow")
 
 
 def _show_as_views(scene, layer, hidden: tuple[str, ...]) -> None:

@@ -305,21 +305,6 @@ def test_lights_and_the_viewport_see_the_same_emission_in_groups(kind):
     np.testing.assert_allclose(preview_of(build.material).emission, np.array([1.0, 0.5, 0.5]) * 0.125, rtol=1e-6)
 
 
-def test_no_reader_but_aovs_changes_a_material():
-    build = Build(is_linked=True)
-    build.show(nested_groups("ShaderNodeGroup")(build))
-    trees = [build.tree, *bpy.data.node_groups]
-
-    def state():
-        return [[(node.name, len(node.inputs), len(node.outputs)) for node in tree.nodes] for tree in trees]
-
-    before, count = state(), len(bpy.data.node_groups)
-    preview_of(build.material)
-    preflight._material(build.material, in_view=False)
-    emission_of(build.material)
-    assert state() == before and len(bpy.data.node_groups) == count
-
-
 def test_views_name_what_they_do_not_show_of_a_material():
     for name, value in (("Alpha", 0.5), ("Volume", None), ("Displacement", None)):
         material, node = scene_parts.principled(name)

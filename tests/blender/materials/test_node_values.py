@@ -269,35 +269,6 @@ def test_nodes_that_are_not_read_are_unknown():
     assert shown.read() == [None] * len(UNREAD)
 
 
-@pytest.mark.parametrize("kind", ["Mix", "MixRGB"])
-def test_a_sum_of_colors_is_clamped(kind):
-    shown = Shown()
-    shown.start()
-    settings = {"data_type": "RGBA", "clamp_result": True} if kind == "Mix" else {"use_clamp": True}
-    output = shown.node(kind, blend_type="ADD", **settings)
-    entries = [entry for entry in output.node.inputs if entry.enabled]
-    entries[0].default_value = 1.0
-    for entry in entries[1:]:
-        entry.default_value = (0.8, 0.1, 0.8, 1.0)
-    shown.show(output)
-    (value,) = shown.read()
-    assert np.allclose(value.offset, (1.0, 0.2, 1.0))
-
-
-def test_a_threshold_is_clamped_before_what_follows():
-    shown = Shown()
-    shown.start()
-    output = shown.image("Alpha")
-    for operation, number, clamp in (("GREATER_THAN", 0.5, False), ("SUBTRACT", 0.5, True), ("ADD", 0.5, False)):
-        node = scene_parts.add_node(shown.tree, "ShaderNodeMath")
-        node.operation, node.use_clamp, node.inputs[1].default_value = operation, clamp, number
-        shown.tree.links.new(output, node.inputs[0])
-        output = node.outputs[0]
-    shown.show(output, as_number=True)
-    (value,) = shown.read()
-    assert np.allclose(np.interp([0.0, 0.49, 0.51, 1.0], value.places, value.numbers), [0.5, 0.5, 1.0, 1.0])
-
-
 def test_limits_leave_images_alone_that_are_within_them():
     shown = Shown()
     shown.start()

@@ -410,7 +410,9 @@ def _take_changes(scene, file: str, blocks: list, moved: dict) -> None:
         if name not in scene.objects:
             raise SceneError(f"object {name!r} is new")
         scene.objects[name].matrix_basis = Matrix(basis)
-    scene.view_layers.update()
+    for layer in scene.view_layers:
+        if layer.use:
+            layer.update()
     for name, (_, world) in moved.items():
         if not np.allclose(scene.objects[name].matrix_world, world, rtol=1e-5, atol=1e-5):
             raise SceneError(f"object {name!r} does not follow")

@@ -194,7 +194,9 @@ def twice_the_same(b):
 
 
 def group_twice(b):
-    first, second = b.group(lambda: b.mix(0.2, b.leaf(0.1), b.leaf(0.2)), times=2)
+    """What is different from outside stays so inside."""
+    first, second = b.group(lambda deep: b.mix(0.2, b.leaf(0.1), deep), [b.leaf(0.2)], times=2)
+    b.link(b.leaf(0.3), second.node.inputs[0])
     return b.mix(0.4, first, second)
 
 
@@ -248,7 +250,7 @@ STRUCTURES = {
     "factors beyond 1": (lambda b: b.mix(1.5, b.leaf(0.1), b.leaf(0.2)), {0.2: 1.0}),
     "factor 0": (lambda b: b.mix(0.0, b.leaf(0.1), b.clear()), {0.1: 1.0}),
     "a node that is used twice": (twice_the_same, {0.1: 0.75 * 0.5 + 0.25, 0.2: 0.75 * 0.5}),
-    "a group that is used twice": (group_twice, {0.1: 0.8, 0.2: 0.2}),
+    "a group that is used twice": (group_twice, {0.1: 0.8, 0.2: 0.12, 0.3: 0.08}),
     "groups": (nested_groups("ShaderNodeGroup"), NESTED),
     "custom groups": (nested_groups("TestCustomGroup"), NESTED),
     "muted nodes and reroutes": (muted_and_rerouted, {0.1: 0.7, 0.2: 0.3}),

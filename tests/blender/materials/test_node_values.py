@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 import scene_parts
 
-from ltsh_addon.blender import render_settings
 from ltsh_addon.blender.materials.graph import constant_of
 from ltsh_addon.blender.materials.values import Curved, Value, curved_at, limited, value_at
 
@@ -97,12 +96,8 @@ class Shown:
         ob.data.polygons.foreach_set("material_index", np.minimum(np.arange(rows * COLUMNS), count - 1))
         scene_parts.add_top_camera(max(COLUMNS, rows))
         scene.render.resolution_x, scene.render.resolution_y = COLUMNS, rows
-        scene.render.engine, cycles = "CYCLES", scene.cycles
-        cycles.samples, cycles.max_bounces, cycles.use_adaptive_sampling, cycles.use_denoising = 1, 0, False, False
-        cycles.sample_clamp_direct, cycles.pixel_filter_type = 0.0, "BOX"
-        render_settings.enable_passes(bpy.context.view_layer, ("combined",))
-        render_settings.render_exr(scene, folder / "shown.exr")
-        channels = scene_parts.read_channels(folder / "shown.exr")
+        settings = {"max_bounces": 0, "sample_clamp_direct": 0.0, "pixel_filter_type": "BOX"}
+        channels = scene_parts.cycles_channels(folder, **settings)
         name = next(name for name in channels if name.endswith("Combined.R"))[:-1]
         return np.stack([channels[name + color] for color in "RGB"], axis=-1).reshape(-1, 3)[:count]
 

@@ -91,7 +91,8 @@ class Denoiser:
                 layout = _FLOAT3, width, height, 0, 0, 0
                 self._SetSharedFilterImage(made, name.encode(), image.ctypes.data, *layout)
             for name, value in settings.items():
-                (self._SetFilterBool if isinstance(value, bool) else self._SetFilterInt)(made, name.encode(), value)
+                set_value = getattr(self, "_SetFilterBool" if isinstance(value, bool) else "_SetFilterInt")
+                set_value(made, name.encode(), value)
             self._CommitFilter(made)
             self._ExecuteFilter(made)
             self._check()

@@ -8,6 +8,7 @@ import time
 import bpy
 from eyes import view
 from hands import module, over
+from mathutils import Matrix
 
 SIZE = "1000x640"
 SECONDS = 900
@@ -82,7 +83,7 @@ def main(rig):
     def orbit():
         region = rig.space.region_3d
         region.view_perspective = "PERSP"
-        region.view_rotation.rotate(__import__("mathutils").Euler((0.0, 0.0, 0.25)))
+        region.view_matrix = region.view_matrix @ Matrix.Rotation(0.25, 4, "Z")
 
     yield from changed(rig, "power", power)
     yield from changed(rig, "move", move)

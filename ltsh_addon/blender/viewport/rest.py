@@ -72,6 +72,8 @@ class RestView:
 
 
 # REPLACED: data-blocks that are handed over by themselves, and the collections of `bpy.data` that have them.
+# NOT_NOTED: kinds that change nothing themselves; scenes have settings, and node trees come with their users.
+NOT_NOTED = ("Scene", "Camera", "Object")
 REPLACED = {bpy.types.Light: "lights", bpy.types.Material: "materials", bpy.types.World: "worlds"}
 
 
@@ -104,8 +106,8 @@ class RestChanges:
                 has_shape = update.is_updated_geometry and not is_light
                 is_known = update.is_updated_transform or (has_lamp if is_light else has_material)
                 self.everything |= has_shape or not is_known
-            elif isinstance(block, bpy.types.NodeTree | bpy.types.Scene | bpy.types.Camera | bpy.types.Object):
-                pass  # node trees come with their users; scenes have settings
+            elif block.bl_rna.identifier in NOT_NOTED or isinstance(block, bpy.types.NodeTree):
+                pass
             elif not isinstance(block, bpy.types.Mesh) or update.is_updated_geometry:
                 has_other = self.everything = True
         self.everything |= has_new_settings
@@ -338,6 +340,12 @@ def _do_step(step: _RestStep, process: BlenderProcess, folder: Path) -> None:
         step.error = f"Bounces: {error_line(error)}"
 
 
+def shown_objects(layer) -> list:
+    """The objects of a view layer that views show, but for local views."""
+    visible_get = bpy.types.Object.visible_get
+    return [ob for ob in layer.objects if visible_get(ob, view_layer=layer)]
+
+
 def _settings_of(depsgraph) -> tuple:
     """The settings of a scene that change its light."""
     scene, layer = depsgraph.scene, depsgraph.view_layer
@@ -350,7 +358,7 @@ def _settings_of(depsgraph) -> tuple:
         *(None if block is None else block.name_full for block in blocks),
         *(getattr(scene.render, name) for name in SCENE_SETTINGS),
         *(str(getattr(cycles, name)) for name in names),
-        *(ob.name for ob in layer.objects if ob.visible_get(view_layer=layer)),
+        *(ob.name for ob in shown_objects(layer)),
     )
 
 
@@ -401,7 +409,8 @@ def _take_changes(scene, file: str, blocks: list, moved: dict) -> None:
         old, new = getattr(bpy.data, kind).get((name, None)), next(loaded[kind])
         if old is None:
             raise SceneError(f"{name!r} is new")
-        old.user_remap(new)
+        user_remap = old.user_remap
+        user_remap(new)
         getattr(bpy.data, kind).remove(old)
         new.name = name
         if kind == "materials":
@@ -420,7 +429,7 @@ def _take_changes(scene, file: str, blocks: list, moved: dict) -> None:
 
 def _show_as_views(scene, layer, hidden: tuple[str, ...]) -> None:
     """Let renders show what views show, in their detail; but for the objects `hidden`."""
-    shown = {ob for ob in layer.objects if ob.visible_get(view_layer=layer) and ob.name not in hidden}
+    shown = {ob for ob in shown_objects(layer) if ob.name not in hidden}
     for collection in bpy.data.collections:
         collection.hide_render = False
     for ob in bpy.data.objects:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import quadrature
 import scene_parts
-from lit_plane import along_x, light_tree
+from lit_plane import along_x, light_tree, measured
 
 from ltsh_addon import shading
 
@@ -46,19 +46,10 @@ def add_light(kind="POINT", location=(0.2, 1.6, 1.6), rotation=(-0.75, 0.1, 0.2)
     return scene_parts.link(bpy.data.objects.new(kind.title(), light), location, rotation, scale)
 
 
-def rendered(folder, samples=256):
-    """A plane that is diffuse and glossy: (lights, warnings, samples, Cycles' halves (2, P, 3) by pass)."""
-    prepared = scene_parts.prepare()
-    ((surface, pixel, unusable),) = scene_parts.sample(folder, prepared)[0]
-    assert unusable == 0
-    images = scene_parts.reference(folder, prepared, samples)
-    halves = {name: images[name].reshape(2, -1, 3)[:, pixel].astype(np.float64) for name in ("specular", "diffuse")}
-    return prepared[2].lights, prepared[3], surface, halves
-
-
 def assert_as_cycles(folder, limit, samples=256, bias=None, **others):
     """All lights by the reference within a `limit`, and by the techniques `others` within theirs; the lights."""
-    lights, warnings, surface, halves = rendered(folder, samples)
+    (_, _, inventory, warnings), surface, halves = measured(folder, samples)
+    lights = inventory.lights
     assert warnings == []
     for technique, most in {"reference": limit, **others}.items():
         found = shading.shade(surface, lights, technique, workers=1)
@@ -216,7 +207,8 @@ def distance_beyond_noise(found, halves):
 @pytest.mark.parametrize("seed", range(8))
 def test_random_scenes_with_all_kinds_of_lights_are_those_of_cycles(tmp_path, seed):
     random_scene(seed)
-    lights, _, surface, halves = rendered(tmp_path, 512)
+    prepared, surface, halves = measured(tmp_path, 512)
+    lights = prepared[2].lights
     steep = (surface.normal * surface.view).sum(axis=1) >= 0.2
     # Twice what single lights are held to.
     found = shading.shade(surface, lights, "reference", workers=1)

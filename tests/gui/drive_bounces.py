@@ -83,7 +83,9 @@ def main(rig):
     def orbit():
         region = rig.space.region_3d
         region.view_perspective = "PERSP"
-        region.view_matrix = region.view_matrix @ Matrix.Rotation(0.25, 4, "Z")
+        sine, cosine = 0.25, 0.968
+        turn = Matrix(((cosine, -sine, 0, 0), (sine, cosine, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)))
+        region.view_matrix = region.view_matrix @ turn
 
     yield from changed(rig, "power", power)
     yield from changed(rig, "move", move)

@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, field, replace
+from operator import methodcaller
 from pathlib import Path
 
 import bpy
@@ -342,8 +343,7 @@ def _do_step(step: _RestStep, process: BlenderProcess, folder: Path) -> None:
 
 def shown_objects(layer) -> list:
     """The objects of a view layer that views show, but for local views."""
-    visible_get = bpy.types.Object.visible_get
-    return [ob for ob in layer.objects if visible_get(ob, view_layer=layer)]
+    return list(filter(methodcaller("visible_get", view_layer=layer), layer.objects))
 
 
 def _settings_of(depsgraph) -> tuple:

@@ -20,7 +20,7 @@ WAIT = 900  # for a job or a picture, on a busy machine
 FIRST_LIGHT, BAKE_HEADER, BAKE, BAKE_SETTINGS = (215, 176), (219, 421), (149, 480), (219, 534)
 BESIDE_CYCLES, COMPLETE, MATERIALS = (161, 701), (258, 617), (219, 740)
 # The same of the Image Editor: results of shading, and the power of the first light of the mixer.
-SHADED, POWER = (227, 45), (108, 297)
+SHADED, POWER = (227, 45), (108, 276)
 
 
 def main(rig):

@@ -22,9 +22,9 @@ from .pixels import REST_PASSES, open_scene, scene_named
 # A given number of samples is rendered in files, so that progress can be told: the samples of the first file, the
 # seconds that each further one takes, and the most of these.
 FIRST, CHUNK_SECONDS, MOST_CHUNKS = 16, 6.0, 6
-# A budget is spent in files as well. PROBES: the samples of the first two. SPENT: the share of the time that all of them
-# may take. FILE_SECONDS: the processor seconds that a file takes beside its samples, for a million pixels.
-PROBES, SPENT, FILE_SECONDS = (2, 4), 0.97, 1.0
+# A budget is spent in files as well. PROBES: the samples of the first two, at most. SPENT: the share of the time that
+# all of them may take. FILE_SECONDS: the processor seconds that a file takes beside its samples, for a million pixels.
+PROBES, SPENT, FILE_SECONDS = (1, 3), 0.97, 1.0
 # PLAIN_PIXELS: up to this many pixels, files are not compressed, which takes 4 times as long as writing them.
 PLAIN_PIXELS = 1_000_000
 # PASSES: what a finished picture takes its parts from, and artists put together. GUIDES: what the denoiser needs.
@@ -139,7 +139,7 @@ def _prepare(scene, layer, warnings: list[str]) -> None:
 
 
 def _render_chunks(scene, layer, folder: Path, samples, end, progress) -> tuple[list[list], float]:
-    """Render `samples` samples; or as many as fit until a processor time, `end` of the first file; or what the file says.
+    """Render `samples` samples; or as many as fit until the processor time `end(first file)`; or what the file says.
 
     Returns [file name in `folder`, samples in it] for each file, and the processor time after the first one.
     """
@@ -189,8 +189,7 @@ def _render_until(end, scene, folder: Path, progress) -> tuple[list[list], float
 
     for count in PROBES:
         # The first file takes longer, since Cycles looks at the scene.
-        if files and affordable() < count:
-            return files, first
+        count = min(count, max(affordable(), 1)) if files else count
         each = render(count, count)
         if not first:
             first = time.process_time()
@@ -198,7 +197,7 @@ def _render_until(end, scene, folder: Path, progress) -> tuple[list[list], float
     if (sequence := affordable(2)) > 1:
         half = -(-sequence // 2)
         each = render(half, sequence)
-        if rest := min(affordable(), sequence - half):
+        if (rest := min(affordable(), sequence - half)) > 0:
             render(rest, sequence, half)
     return files, first
 

@@ -49,6 +49,11 @@ class LTSH_ViewSettings(bpy.types.PropertyGroup):
         name="World", description="The world lights what is seen; its background is there in any case",
         default=True, update=_redraw,
     )  # fmt: skip
+    bounces: bpy.props.BoolProperty(
+        name="Bounces", default=True, update=_redraw,
+        description="What is not direct light, by Cycles and denoised: bounces, reflections, refraction, materials by "
+        "nodes",
+    )  # fmt: skip
     mode: bpy.props.EnumProperty(
         name="Mode", description="One technique or two", items=MODES, default="single", update=_redraw
     )

@@ -53,7 +53,7 @@ def render_finished(job: FinishedJob, folder: Path, progress) -> dict:
     layer = render_settings.only_view_layer(scene, warnings, job.view_layer, "rendered")
     width, height = render_settings.set_resolution(scene, job.width, job.height)
     render_settings.render_border(scene)  # an error where it is less than a pixel
-    everything = _reasons_for_cycles(scene, layer)
+    everything = reasons_for_cycles(scene, layer)
     dropped = () if layer.cycles.denoising_store_passes else NOT_WRITTEN
     _prepare(scene, layer, warnings)
     has_edges, end = job.edges and not (everything or camera.data.dof.use_dof), None
@@ -96,7 +96,7 @@ def show_finished(job: ShowJob, folder: Path, progress) -> dict:
     return {}
 
 
-def _reasons_for_cycles(scene, layer) -> list[str]:
+def reasons_for_cycles(scene, layer) -> list[str]:
     """Why all direct light of the picture is left to Cycles."""
     world = layer.world_override or scene.world
     outputs = [] if world is None or tree_in_use(world) is None else tree_in_use(world).nodes

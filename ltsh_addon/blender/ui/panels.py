@@ -186,6 +186,7 @@ def draw_view_settings(layout, context) -> None:
     row.prop(scene.ltsh, "shadows")
     if scene.render.engine == ENGINE:
         row.prop(view, "world")
+        layout.prop(view, "bounces")
 
 
 class _Compare:

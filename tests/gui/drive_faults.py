@@ -101,15 +101,14 @@ def notes_of_views():
 
 def completed(rig):
     """F12 with Cycles' part: its setting is in sight, and "denoised" is said where a denoiser has run."""
-    yield from hands.click_button(rig, COMPLETE)
-    rig.check(eyes.view().complete, "a click chooses Complete, in a panel that is open")
+    rig.check(eyes.view().complete, "Complete is on at first")
     rig.shot("04_complete.png")
     yield from pressed_f12(rig)
     said, denoisers = reports(rig), hands.module("process.blender_process").denoiser_libraries()
     rig.fact("what F12 says", said.splitlines()[-4:])
     rig.check(bool(denoisers) != ("not denoised" in said), f"what is not denoised is not said to be: {denoisers}")
     yield from hands.click_button(rig, COMPLETE)
-    rig.check(not eyes.view().complete, "and leaves it")
+    rig.check(not eyes.view().complete, "a click leaves it, in a panel that is open")
     yield from hands.click_button(rig, hands.PREVIEW)
     yield from hands.until(lambda: shading(rig)[1] == "SOLID")
     rig.check(shading(rig)[1] == "SOLID", "a click ends the preview")

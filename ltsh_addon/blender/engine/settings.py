@@ -71,7 +71,7 @@ class LTSH_ViewSettings(bpy.types.PropertyGroup):
     complete: bpy.props.BoolProperty(
         name="Complete",
         description="Final renders also have what is not direct light, by Cycles and denoised: bounces, glass, "
-        "subsurface, and all its passes", default=False,
+        "subsurface, and all its passes", default=True,
     )  # fmt: skip
     technique_passes: bpy.props.BoolProperty(
         name="Passes of All Techniques", default=False,

@@ -1,5 +1,7 @@
 """The button "Preview with LTSH": what it gives back to scenes, views and files."""
 
+import random
+
 import bpy
 import pytest
 import scene_parts
@@ -27,18 +29,44 @@ def shading(views):
     return [space.shading.type for space in views]
 
 
-def end_by_undo():
-    bpy.ops.ed.undo_push(message="Preview")
-    assert bpy.ops.ed.undo() == {"FINISHED"}
-
-
-@pytest.mark.parametrize("end", [lambda: bpy.ops.ltsh.preview(), end_by_undo, ltsh_addon.unregister])
+@pytest.mark.parametrize("end", [lambda: bpy.ops.ltsh.preview(), ltsh_addon.unregister])
 def test_ending_a_preview_gives_its_view_back_and_no_other(views, end):
-    bpy.ops.ed.undo_push(message="Before")
     bpy.ops.ltsh.preview()
     assert shading(views) == ["RENDERED", "RENDERED"]
     end()
     assert bpy.context.scene.render.engine == ARTISTS and shading(views) == ["WIREFRAME", "RENDERED"]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_undo_and_redo_leave_the_preview_as_it_is(views, seed):
+    """A walk of edits, undo, redo and clicks on the button, beside a list of what each step of undo has."""
+    chosen, on, at = random.Random(seed), False, -1
+    data = bpy.data.lights.new("Key", "AREA")
+    bpy.context.scene.collection.objects.link(bpy.data.objects.new("Key", data))
+    steps = []  # energy and engine of the artist
+    kinds = ["edit", "engine", "preview", "preview", *3 * ["undo", "redo"]]
+    for number, kind in enumerate(["edit", "engine", "edit", "preview", *chosen.choices(kinds, k=60)]):
+        scene, light = bpy.context.scene, bpy.data.lights["Key"]
+        if kind == "preview":
+            bpy.ops.ltsh.preview()
+            on = not on
+        elif kind in ("edit", "engine"):
+            light.energy = number
+            if kind == "engine" and not on:
+                scene.render.engine = chosen.choice(["CYCLES", ARTISTS])
+            engine = scene.ltsh_view.artist_engine if on else scene.render.engine
+            del steps[at + 1 :]
+            at = len(steps)
+            steps.append((number, engine))
+            bpy.ops.ed.undo_push(message=kind)
+        elif 0 <= at + (move := 1 if kind == "redo" else -1) < len(steps):
+            at += move
+            assert getattr(bpy.ops.ed, kind)() == {"FINISHED"}
+        scene, energy, engine = bpy.context.scene, *steps[at]
+        assert bpy.data.lights["Key"].energy == energy
+        assert scene.render.engine == ("LTSH" if on else engine), (number, kind)
+        assert shading(views) == ["RENDERED" if on else "WIREFRAME", "RENDERED"], (number, kind)
+        assert preview.is_previewing(scene) == on and scene.ltsh_view.artist_engine == (engine if on else "")
 
 
 def test_a_view_that_is_changed_during_a_preview_is_the_artists_choice(views):

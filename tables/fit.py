@@ -13,7 +13,7 @@ import numpy as np
 from ltsh_addon.files import replacing
 from ltsh_addon.lobes.lookup_table import FORMAT_VERSION, roughness_nodes, theta_nodes, warp_entries
 
-from . import projection, refine, walk
+from . import projection, refine
 from .families import GGX, Brdf, Family
 from .projection import (
     CURVE_NAMES,
@@ -66,7 +66,7 @@ def settings(family, model, size) -> dict:
         "brdf": model.name,
         "size": size,
         "ridge": projection.RIDGE,
-        "walk_penalty": walk.PENALTY,
+        "walk_penalty": refine.PENALTY,
         "iterations": refine.ITERATIONS,
         "albedo_weight": refine.ALBEDO_WEIGHT,
         "negative_weight": refine.NEGATIVE_WEIGHT,
@@ -177,8 +177,8 @@ def _fitted_nodes(family, model, nodes, curves, progress, checkpoint):
             keep(parameters=state[0], diagonal=state[1])
             progress(WALK_SHARE * fraction)
 
-        parameters = walk.walk(family, model, roughness, cosine, walked, start)
-        warp = walk.stored_warp(parameters, roughness, cosine)
+        parameters = refine.walk(family, model, roughness, cosine, walked, start)
+        warp = refine.stored_warp(parameters, roughness, cosine)
         coefficients = project_nodes(family, model, roughness, cosine, warp, curves)[0]
         state = refine.State(np.concatenate([warp, coefficients[:, :, 0]], axis=2))
 

@@ -26,8 +26,8 @@ from ltsh_addon.shading import evaluate_lobe
 
 from .families import GGX, family_named
 from .projection import FLAT, Points, project, relative_error, warped_basis
+from .refine import bounds, minimize, warp_of
 from .validate import disks, grid, hemisphere_samples
-from .walk import bounds, minimize, warp_of
 
 COUNT = 12
 # Results of `tables optimum --all` for every family of CURVES at COUNT_OF_ALL x COUNT_OF_ALL points: {family: errors}.
@@ -181,7 +181,7 @@ def grazing_errors(table: LookupTable, count: int = len(ROUGHNESS)) -> list[Graz
 
 
 def _warp_of_table(table, cosine, roughness):
-    """Parameters (P, 3) of the table's warp at the points, in the form that `walk.warp_of` takes."""
+    """Parameters (P, 3) of the table's warp at the points, in the form that `refine.warp_of` takes."""
     lobe = table.lookup(cosine, roughness)
     scale = 2.0 * roughness**2 / lobe.zz
     xx, xz, yy = (np.asarray(entry, dtype=np.float64) * scale for entry in (lobe.xx, lobe.xz, lobe.yy))

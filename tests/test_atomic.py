@@ -49,17 +49,6 @@ def test_devices_and_names_that_are_no_utf8_are_left_alone(tmp_path):
     assert names(tmp_path) == ["link", "pipe"] and (tmp_path / "pipe").is_fifo()
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="processes are not killed by signals there")
-def test_what_a_killed_process_has_left_goes_with_the_next_write_of_that_file(tmp_path):
-    write_bytes(tmp_path / "a", b"old")
-    half_written(tmp_path / "a").communicate()
-    assert (tmp_path / "a").read_bytes() == b"old" and len(names(tmp_path)) == 2
-    write_bytes(tmp_path / "a.b", b"another file")
-    assert len(names(tmp_path)) == 3
-    write_bytes(tmp_path / "a", b"new")
-    assert (tmp_path / "a").read_bytes() == b"new" and names(tmp_path) == ["a", "a.b"]
-
-
 def test_what_another_process_is_writing_stays(tmp_path):
     process = half_written(tmp_path / "a")
     write_bytes(tmp_path / "a", b"first")

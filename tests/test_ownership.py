@@ -104,12 +104,6 @@ def test_names_that_are_nearly_ours_stay(folder):
     assert everything(folder) == sorted(names)
 
 
-def test_processes_of_one_machine_give_it_the_same_mark():
-    code = "from ltsh_addon import files; print(files.MACHINE)"
-    run = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert run.stdout.strip() == files.MACHINE
-
-
 def test_an_exception_removes_the_folder(folder):
     with pytest.raises(KeyError), files.temporary_folder() as made:
         (made / "file").write_bytes(b"x")

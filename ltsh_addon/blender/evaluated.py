@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
@@ -119,27 +120,20 @@ class EmitterTraits:
 
 
 @dataclass(frozen=True)
-class MaterialSlot:
-    """A slot of a rendered surface; `material` is the original or None."""
-
-    material: object
-
-
-@dataclass(frozen=True)
 class RenderedSurface:
-    """An original object with a surface, and the materials of its slots when it was evaluated.
+    """An original object with a surface, and its slots when it was evaluated, whose `material` is the original or None.
 
     It keeps no evaluated object: Blender makes those of instances for one step of the iteration only.
     """
 
     original: object
-    material_slots: tuple[MaterialSlot, ...]
+    material_slots: tuple[SimpleNamespace, ...]
 
     @classmethod
     def of(cls, ob) -> RenderedSurface:
         """The surface of the evaluated object `ob`."""
         materials = [slot.material for slot in ob.material_slots]
-        slots = (MaterialSlot(None if material is None else material.original) for material in materials)
+        slots = (SimpleNamespace(material=material and material.original) for material in materials)
         return cls(ob.original, tuple(slots))
 
 

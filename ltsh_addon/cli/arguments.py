@@ -20,8 +20,6 @@ from ..reading import Malformed, read_toml
 from ..scene import SceneError, shortened
 from ..shading import TableError
 
-# Options whose values are paths relative to the job file.
-_PATHS = ("baseline",)
 # Options of the run as a whole, which only `ltsh run` itself takes. Running scripts is among them, because a job file,
 # like a .blend, may come from anyone.
 _OF_THE_RUN = ("overwrite", "resume", "skip-existing", "shard", "json", "quiet", "log", "help", "enable-autoexec")
@@ -119,9 +117,9 @@ def add_baseline(parser) -> None:
     parser.add_argument("--tolerance", type=from_text(tolerance), default=Tolerance(), metavar="X", help=meaning)
 
 
-def add_talk(parser, json_meaning: str = "print the report on stdout as one JSON document") -> None:
+def add_talk(parser) -> None:
     """Add the arguments about what is printed."""
-    parser.add_argument("--json", action="store_true", help=json_meaning)
+    parser.add_argument("--json", action="store_true", help="print the report on stdout as one JSON document")
     parser.add_argument("--quiet", action="store_true", help="no progress on stderr")
     parser.add_argument("--log", type=Path, metavar="FILE", help="append to FILE what was done when")
 
@@ -282,7 +280,7 @@ class _JobFileReader:
         return [f"--{key}={item}" for item in items]
 
     def _path(self, key, item):
-        if key in _PATHS or (key == "techniques" and str(item).endswith(".npz")):
+        if key == "baseline" or (key == "techniques" and str(item).endswith(".npz")):
             return self.path.parent / str(item)
         return item
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
@@ -19,17 +18,10 @@ MAX_F0 = 0.99
 DIELECTRIC_AVERAGE = 4.08567, 1.00071
 
 
-@dataclass(frozen=True)
-class GlassAlbedos:
-    """Tables by roughness, cosine of the view and ((ior - 1) / (ior + 1))^(1/2), for one side of the surface."""
-
-    albedo: np.ndarray  # (R, C, Z) share of the light that is reflected or transmitted
-    average: np.ndarray  # (R, Z) integral of 2 mu albedo(mu)
-
-
 @cache
-def glass_albedos(inside: bool) -> GlassAlbedos:
-    """Tables of a surface seen from outside, or from `inside`."""
+def glass_albedos(inside: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Share (R, C, Z) of the light that a surface reflects or transmits, seen from outside or from `inside`, by
+    roughness, cosine of the view and ((ior - 1) / (ior + 1))^(1/2); and the integral (R, Z) of 2 mu times that."""
     nodes = np.clip(np.linspace(0.0, 1.0, GLASS_NODES), SMALLEST_COSINE, 1.0)
     albedo = np.empty((GLASS_NODES, GLASS_NODES, GLASS_NODES))
     root = np.sqrt(np.minimum(nodes**4, MAX_F0))
@@ -42,7 +34,7 @@ def glass_albedos(inside: bool) -> GlassAlbedos:
     ends = nodes[:, None] * albedo
     between = middle[:, None] * 0.5 * (albedo[:, 1:] + albedo[:, :-1])
     pieces = (ends[:, 1:] + ends[:, :-1] + 4.0 * between) * np.diff(nodes)[:, None] / 6.0
-    return GlassAlbedos(albedo, 2.0 * pieces.sum(axis=1))
+    return albedo, 2.0 * pieces.sum(axis=1)
 
 
 def _visible_normals(alpha, cosine):
@@ -246,9 +238,9 @@ def glass_scattering(tint: np.ndarray, ior: np.ndarray, roughness: np.ndarray, c
     for inside in (False, True):
         at = np.nonzero((ior < 1.0) == inside)[0]
         if len(at):
-            tables, coordinate = glass_albedos(inside), _ior_coordinate(ior[at])
-            albedo = _interpolate(tables.albedo, roughness[at], cosine[at], coordinate)
-            factor[at] = multiple_scattering(tint[at], albedo, _interpolate(tables.average, roughness[at], coordinate))
+            (table, average), coordinate = glass_albedos(inside), _ior_coordinate(ior[at])
+            albedo = _interpolate(table, roughness[at], cosine[at], coordinate)
+            factor[at] = multiple_scattering(tint[at], albedo, _interpolate(average, roughness[at], coordinate))
     return factor
 
 

@@ -67,25 +67,22 @@ def surface_samples(channels: dict[str, np.ndarray], diffuse_color: str) -> tupl
     pieces, index, usable = [], [], np.flatnonzero(usable)
     for start in range(0, max(len(usable), 1), HITS_PER_BLOCK):
         block = usable[start : start + HITS_PER_BLOCK]
-        hits = _hits_of({name: value[block] for name, value in values.items()})
+        at = {name: value[block] for name, value in values.items()}
+        hits = SurfaceHits(
+            position=at["position"],
+            view=unit(at["incoming"]),
+            smooth_normal=unit(at["smooth_normal"]),
+            true_normal=unit(at["true_normal"]),
+            corrected=at["correct_normal"] > 0.5,
+            receiver=np.rint(at["receiver"]).astype(np.int32),
+            diffuse_albedo=at["albedo"],
+        )
         samples, of_block = samples_of_lobes(
             hits, [{name: value[block] for name, value in lobe.items()} for lobe in lobes]
         )
         pieces.append(samples)
         index.append(block[of_block])
     return SurfaceSamples.joined(pieces), pixel[np.concatenate(index)], len(pixel) - len(usable)
-
-
-def _hits_of(values: dict[str, np.ndarray]) -> SurfaceHits:
-    return SurfaceHits(
-        position=values["position"],
-        view=unit(values["incoming"]),
-        smooth_normal=unit(values["smooth_normal"]),
-        true_normal=unit(values["true_normal"]),
-        corrected=values["correct_normal"] > 0.5,
-        receiver=np.rint(values["receiver"]).astype(np.int32),
-        diffuse_albedo=values["albedo"],
-    )
 
 
 def clear_holdouts(channels: dict[str, np.ndarray]) -> None:
@@ -186,7 +183,10 @@ def merged(samples: SurfaceSamples, film: Film) -> tuple[SurfaceSamples, Film]:
     """
     leaders, group = _groups(samples, film, 1.0)
     first, merged_film = samples.take(leaders), _together(film, leaders, group)
-    means = {name: _means(getattr(samples, name), group, merged_film.count) for name in COLORS}
+    means = {}
+    for name in COLORS:
+        sums = [np.bincount(group, weights=column, minlength=len(first)) for column in getattr(samples, name).T]
+        means[name] = np.stack(sums, axis=1) / merged_film.count[:, None]
     return replace(first, **means), merged_film
 
 
@@ -259,12 +259,6 @@ def one_shading(samples: SurfaceSamples, shines: np.ndarray, one, other, loosene
     apart = samples.position[one] - samples.position[other]
     off = np.abs((apart * samples.geometric_normal[other]).sum(axis=1))
     return same & (off <= OFF_PLANE * np.linalg.norm(apart, axis=1) + 1e-6)
-
-
-def _means(values: np.ndarray, group: np.ndarray, count: np.ndarray) -> np.ndarray:
-    """Means (Q, 3) of the rows of `values` (P, 3) with the same `group` (P,)."""
-    sums = [np.bincount(group, weights=column, minlength=len(count)) for column in values.T]
-    return np.stack(sums, axis=1) / count[:, None]
 
 
 def coarse_meshes(samples: SurfaceSamples) -> list[str]:

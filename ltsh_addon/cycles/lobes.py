@@ -218,11 +218,6 @@ class LobeSlot:
         """Shading normal (Q, 3) of the coat."""
         return self._bent(self._normal("coat_normal"))
 
-    def sheen_normal(self) -> np.ndarray:
-        """Shading normal (Q, 3) of the sheen: that of the base, blended with the coat's by the coat's weight."""
-        coat = np.clip(self.value("coat_weight"), 0.0, 1.0)[:, None]
-        return unit((1.0 - coat) * self.normal + coat * self.coat_normal())
-
     def cosine(self, normal) -> np.ndarray:
         """Cosine (Q,) of the angle between `normal` and the view, in [0, 1]."""
         return np.clip(np.sum(normal * self.hits.view, axis=-1), 0.0, 1.0)
@@ -299,7 +294,9 @@ def samples_of_lobes(hits: SurfaceHits, lobes: list[dict[str, np.ndarray]]) -> t
     bare = np.ones(len(hits.position), dtype=bool)
     for batch in batches:
         bare[batch.index] = False
-    return _joined(hits, [*batches, _bare_samples(hits, np.nonzero(bare)[0])])
+    at = np.nonzero(bare)[0]
+    normal, ones = hits.smooth_normal[at], np.ones(len(at))
+    return _joined(hits, [*batches, _LobeSamples(at, normal, normal, ones, ones)])
 
 
 def _joined(hits: SurfaceHits, batches: list[_LobeSamples]) -> tuple[SurfaceSamples, np.ndarray]:
@@ -352,13 +349,6 @@ def _split(albedo: np.ndarray, estimate: np.ndarray, index: np.ndarray) -> np.nd
     return share * albedo[index]
 
 
-def _bare_samples(hits, index) -> _LobeSamples:
-    """Samples at hits on surfaces without a lobe."""
-    normal = hits.smooth_normal[index]
-    ones = np.ones(len(index))
-    return _LobeSamples(index, normal, normal, ones, ones)
-
-
 def _slot_of(hits: SurfaceHits, lobe: dict[str, np.ndarray]) -> LobeSlot | None:
     """The hits that have a lobe in one slot; None if there are none."""
     weight = lobe["weight"] if "weight" in lobe else np.ones(len(hits.position))
@@ -408,7 +398,8 @@ def _put_under_sheen(
     shine = np.maximum(slot.value("sheen_weight"), 0.0)[:, None] * np.maximum(slot.value("sheen_tint"), 0.0)
     shine = np.where(slot.of("principled"), shine, 0.0)
     most = shine.max(axis=1, keepdims=True)
-    normal = slot.sheen_normal()
+    coat = np.clip(slot.value("coat_weight"), 0.0, 1.0)[:, None]
+    normal = unit((1.0 - coat) * slot.normal + coat * slot.coat_normal())
     albedo, a, b = sheen_lobe(slot.cosine(normal), slot.value("sheen_roughness"))
     albedo = albedo[:, None]
     remaining = np.ones((len(hits.position), 1))
@@ -494,7 +485,10 @@ def _base_samples(slot: LobeSlot, under: np.ndarray) -> _LobeSamples:
     ior = np.full(len(slot.index), closures.CONDUCTOR_FIT_IOR)
     for kind in ("conductor", "conductor_4_5"):
         if slot.of(kind).any():
-            specular += np.where(slot.of(kind), _conductor_terms(slot, kind == "conductor"), 0.0)
+            index, exact = (slot.color, np.maximum(slot.value("tint"), 0.0)), kind == "conductor"
+            terms = np.stack(closures.conductor_fit(*index, exact))
+            terms *= slot.scattered(closures.conductor_average(*index, exact))
+            specular += np.where(slot.of(kind), terms, 0.0)
     if slot.of("glass").any():
         terms, own_ior = _glass_terms(slot, np.ones_like(slot.color), slot.color)
         specular += np.where(slot.of("glass"), terms * slot.color, 0.0)
@@ -547,13 +541,6 @@ def _metal_terms(slot: LobeSlot) -> np.ndarray:
     if slot.of("glossy").any():
         terms[:2] += np.where(slot.of("glossy"), slot.color * slot.scattered(slot.color), 0.0)
     return terms
-
-
-def _conductor_terms(slot: LobeSlot, exact: bool) -> np.ndarray:
-    """Specular terms (4, Q, 3) of conductors with the complex refractive index `color` + i `tint`."""
-    extinction = np.maximum(slot.value("tint"), 0.0)
-    terms = np.stack(closures.conductor_fit(slot.color, extinction, exact))
-    return terms * slot.scattered(closures.conductor_average(slot.color, extinction, exact))
 
 
 def _dielectric_terms(slot: LobeSlot):

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..lobes.polygon import clip_to_horizon
 from ..scene import Light, PolygonLight, QuadLight
 
 # Mean absolute error at which cutting stops, as a share of the mean radiance.
@@ -243,25 +244,18 @@ def note_patches(whose: str, count: int, error: float, warn) -> None:
 
 
 def clip_to_cell(outline: np.ndarray, cell) -> np.ndarray:
-    """The part (W, 2) of a polygon (V, 2) in the rectangle left, right, bottom, top (Sutherland and Hodgman 1974).
+    """The part (W, 2) of a polygon (V, 2) in the rectangle left, right, bottom, top, see `clip_to_horizon`.
 
     If a concave polygon falls into several parts, edges that run there and back connect them.
     """
     x0, x1, y0, y1 = cell
-    for axis, sign, bound in ((0, 1.0, x0), (0, -1.0, x1), (1, 1.0, y0), (1, -1.0, y1)):
-        if len(outline) == 0:
-            break
-        height = sign * (outline[:, axis] - bound)
-        clipped = []
-        for index in range(len(outline)):
-            after = (index + 1) % len(outline)
-            if height[index] >= 0.0:
-                clipped.append(outline[index])
-            if (height[index] >= 0.0) != (height[after] >= 0.0):
-                share = height[index] / (height[index] - height[after])
-                clipped.append(outline[index] + share * (outline[after] - outline[index]))
-        outline = np.array(clipped).reshape(-1, 2)
-    return outline
+    x, y = outline.T
+    inside = np.stack([x, y, x - x0, x1 - x, y - y0, y1 - y])[..., None]
+    for side in range(2, len(inside)):
+        if not (inside[side] > 0.0).any():
+            return np.zeros((0, 2))
+        inside = clip_to_horizon(inside, side)
+    return inside[:2, :, 0].T
 
 
 def signed_area(outline: np.ndarray) -> float:

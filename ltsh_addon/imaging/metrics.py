@@ -66,15 +66,11 @@ def reference_noise(half_a, half_b, mask=None) -> float | None:
 
 def error_statistics(technique, reference, mask=None) -> ErrorStatistics:
     """Figures against a noise-free `reference`; arrays (..., 3), for images or plain samples."""
-    return _statistics(technique, reference, reference, mask)
+    return noisy_error_statistics(technique, reference, reference, mask)
 
 
 def noisy_error_statistics(technique, half_a, half_b, mask=None) -> ErrorStatistics:
     """Figures against the mean of two independent halves; only the unbiased figures are free of the halves' noise."""
-    return _statistics(technique, half_a, half_b, mask)
-
-
-def _statistics(technique, half_a, half_b, mask) -> ErrorStatistics:
     technique, half_a, half_b = (_picked(values, mask) for values in (technique, half_a, half_b))
     not_finite = int(np.count_nonzero(~np.isfinite(technique)))
     pixels = len(technique)
@@ -83,7 +79,9 @@ def _statistics(technique, half_a, half_b, mask) -> ErrorStatistics:
     difference = technique - reference
     unbiased, squared = unbiased_relative_error(technique, half_a, half_b)
     norm, total = np.linalg.norm(reference), reference.sum()
-    relative = _pixel_errors(difference, reference)
+    brightness = luminance(reference)
+    lit = brightness > LIT_SHARE * brightness.max(initial=0.0)  # |T - R| / |R| of the lit pixels
+    relative = np.linalg.norm(difference[lit], axis=1) / np.linalg.norm(reference[lit], axis=1)
     return ErrorStatistics(
         relative_l2=float(np.linalg.norm(difference) / norm) if norm > 0.0 else None,
         unbiased_relative_error=unbiased,
@@ -97,14 +95,6 @@ def _statistics(technique, half_a, half_b, mask) -> ErrorStatistics:
         not_finite=not_finite,
         pixels=pixels,
     )
-
-
-def _pixel_errors(difference, reference):
-    """|T - R| / |R| (Q,) of the lit pixels."""
-    brightness = luminance(reference)
-    lit = brightness > LIT_SHARE * brightness.max(initial=0.0)
-    lit &= brightness > 0.0
-    return np.linalg.norm(difference[lit], axis=1) / np.linalg.norm(reference[lit], axis=1)
 
 
 def _picked(values, mask):
@@ -174,12 +164,6 @@ def _opponents(ratio: np.ndarray) -> np.ndarray:
     return np.stack([116.0 * y - 16.0, 500.0 * (x - y), 200.0 * (y - z)], axis=-1)
 
 
-def _linear_of_opponents(opponents: np.ndarray) -> np.ndarray:
-    y = (opponents[..., 0] + 16.0) / 116.0
-    ratio = np.stack([opponents[..., 1] / 500.0 + y, y, y - opponents[..., 2] / 200.0], axis=-1)
-    return ratio @ np.linalg.inv(_TO_RATIO).astype(np.float32)
-
-
 def _filtered(opponent: np.ndarray, pixels_per_degree: float) -> np.ndarray:
     """The picture as far as the eye resolves it (Section 4.1), in CIELAB with the Hunt effect."""
     radius = int(np.ceil(3.0 * np.sqrt(_WIDEST / (2.0 * np.pi**2)) * pixels_per_degree))
@@ -194,8 +178,10 @@ def _filtered(opponent: np.ndarray, pixels_per_degree: float) -> np.ndarray:
             for weight, kernel in zip(weights, kernels, strict=True)
         )
         planes.append(sum(parts))
-    linear = np.clip(_linear_of_opponents(np.stack(planes, axis=-1)), 0.0, 1.0)
-    return _hunt(_lab(linear))
+    y = (planes[0] + 16.0) / 116.0
+    ratio = np.stack([planes[1] / 500.0 + y, y, y - planes[2] / 200.0], axis=-1)
+    linear = ratio @ np.linalg.inv(_TO_RATIO).astype(np.float32)
+    return _hunt(_lab(np.clip(linear, 0.0, 1.0)))
 
 
 def _lab(linear: np.ndarray) -> np.ndarray:

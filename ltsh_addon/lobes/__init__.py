@@ -9,5 +9,5 @@ Allmenroeder and Peters 2021, "Linearly Transformed Spherical Harmonics", and wh
     D_orig, the expansion (section 2)             `spherical_harmonics.evaluate`, coefficients from `LookupTable.lookup`
     the polygon clipped at the horizon            `polygon.clip_to_horizon`
     integrals of the expansion over a polygon     `edge_integrals.moments`, `moments32.moments` in single precision
-    the fit of M and of the coefficients          `tables/walk.py`, `tables/refine.py` and `tables/projection.py`
+    the fit of M and of the coefficients          `tables/refine.py` and `tables/projection.py`
 """

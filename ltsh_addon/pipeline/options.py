@@ -431,6 +431,14 @@ class ViewOptions(CameraOptions):
     )  # fmt: skip
     shadows: str = _shadows()
     shadow_rays: int = _shadow_rays()
+    bounces: str = option(
+        "--bounces", default="off", choices=("on", "off"),
+        help="also bounces, reflections, refraction, materials by nodes, by Cycles and denoised (default: %(default)s)",
+    )  # fmt: skip
+    rest_samples: int = option(
+        "--rest-samples", default=64, type=cycles_samples, metavar="N",
+        help="of Cycles for the bounces (default: %(default)s)",
+    )  # fmt: skip
     scripts: bool = _scripts()
 
 

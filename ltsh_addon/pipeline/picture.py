@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -123,13 +123,20 @@ def draw_view(options: ViewOptions, progress: Progress | None = None) -> TaskRes
     Raises SceneError, TableError, OSError, Cancelled.
     """
     from ..blender.process import view
+    from ..blender.process.blender_process import shared_blender
 
     start = time.perf_counter()
     tables = prepare(options)
     width, height = options.resolution or (None, None)
     given = tuple(name if name in SHIPPED_TABLES else str(Path(name).absolute()) for name in options.techniques)
     job = child_job(view.ViewJob, options, width=width, height=height, techniques=given)
-    with temporary_folder() as folder:
+    rest_seconds = 0.0
+    with temporary_folder() as folder, shared_blender(folder):
+        if options.bounces == "on":
+            job = replace(job, rest=folder / "rest.npy")
+            rest_job = child_job(view.RestJob, options, width=width, height=height, samples=options.rest_samples)
+            save_array(job.rest, view.render_rest(rest_job, folder, progress=progress).picture())
+            rest_seconds = time.perf_counter() - start
         manifest = view.draw_view(job, folder, progress=progress)
         layers = {
             layer_name(technique, pass_name): np.load(folder / f"{number}_{pass_name}.npy")
@@ -150,6 +157,7 @@ def draw_view(options: ViewOptions, progress: Progress | None = None) -> TaskRes
     imaging.write_layers(path, layers, described, imaging.chromaticities(color_space), manifest["pixel_aspect"])
     write_bytes(path.with_suffix(".png"), shown)
     seconds = {"blender": manifest["seconds"], "shadows": (manifest["shadows"] or {"seconds": 0.0})["seconds"]}
+    seconds |= {"direct_s": manifest["seconds"], "rest_s": rest_seconds}
     return TaskResult(report, {**seconds, "total": time.perf_counter() - start}, (f"{name}.exr", f"{name}.png"))
 
 

@@ -1,8 +1,8 @@
 """What a bake takes: seconds and memory by size, and its time at equal error beside Cycles' bake; needs bpy.
 
-python tests/benchmarks/bake_cost.py [time | memory | cycles | shadows]
+python tests/benchmarks/bake_cost.py [time | cycles | shadows]
 
-time: 1024^2 and 4096^2 under four lights, ltsh4, constant materials. memory: the peak by size. cycles: part of `make
+time: 1024^2 and 4096^2 under four lights, ltsh4, constant materials. cycles: part of `make
 bench`; how long Cycles' bake takes to come as near to the truth as ltsh4, which the quadrature of `reference` tells.
 shadows: processor seconds, with those of Blender, for a floor with shadows under one light and a constant world.
 """
@@ -20,7 +20,6 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "blender" / "helpers")]
 
 import measure  # noqa: E402
 
-GROWTH_LIMIT = 0.1
 # Size -> seconds of our own work and MiB that a bake may take.
 LIMITS = {1024: (3.0, 4096.0), 4096: (60.0, 4096.0)}
 # One block of rows: a bake of several blocks starts Cycles for each of them.
@@ -81,22 +80,6 @@ def bake(scene, output, *options):
     """Run the command; its seconds by stage, and what the process took."""
     usage = measure.run("-m", "ltsh_addon", "bake", scene, "-o", output, "--quiet", *options)
     return json.loads((output / "timing.json").read_text())["seconds"], usage
-
-
-def memory(sizes, *options):
-    """Print the peaks for every size, and how much the last has more than the one before."""
-    own = []
-    with tempfile.TemporaryDirectory(prefix="ltsh-bench-") as name:
-        folder = Path(name)
-        scene = _scene(folder, "constant")
-        for size in sizes:
-            seconds, usage = bake(scene, folder / str(size), "--size", size, *options)
-            own.append(usage.own_peak)
-            text = f"own {usage.own_peak:.0f} MiB, largest {usage.peak:.0f} MiB; {seconds['total']:.1f} s"
-            print(f"  {size:>5}^2: peak {text}, load {os.getloadavg()[0]:.1f}", flush=True)
-    growth = own[-1] / own[-2] - 1.0
-    print(f"  {sizes[-1]}^2 against {sizes[-2]}^2: {growth:+.1%} of our own process (target below {GROWTH_LIMIT:.0%})")
-    return growth
 
 
 def times():
@@ -177,11 +160,10 @@ def _scene(folder, kind):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("what", choices=("time", "memory", "cycles", "shadows", "scene"))
+    parser.add_argument("what", choices=("time", "cycles", "shadows", "scene"))
     parser.add_argument("path", nargs="?", type=Path)
     parser.add_argument("--kind", default="constant", choices=("constant", "textured", "shadows"))
-    parser.add_argument("--sizes", default="4096,8192")
-    options, more = parser.parse_known_args()
+    options = parser.parse_args()
     if options.what == "scene":
         if options.kind == "shadows":
             build_shadows(options.path)
@@ -193,8 +175,6 @@ def main():
         raise SystemExit("a bake takes too much")
     elif options.what == "cycles" and equal_error() < FACTOR:
         raise SystemExit("Cycles is not so much slower")
-    elif options.what == "memory" and memory([int(size) for size in options.sizes.split(",")], *more) > GROWTH_LIMIT:
-        raise SystemExit("the peak grows with the size")
 
 
 if __name__ == "__main__":

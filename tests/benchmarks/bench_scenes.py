@@ -12,8 +12,8 @@ def unit(vectors):
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-def random_polygons(count, kind, corners=4, seed=0):
-    """cos_theta_o (P,), roughness (P,) in [0.1, 1], vertices (P, V, 3), float32. `kind` "whole": above the horizon;
+def random_polygons(count, kind, seed=0):
+    """cos_theta_o (P,), roughness (P,) in [0.1, 1], vertices (P, 4, 3), float32. `kind` "whole": above the horizon;
     "mixed": 70 % above, 20 % cut by it, 10 % below; "cut": all of them cut."""
     generator = np.random.default_rng(seed)
     center = unit(generator.normal(size=(count, 3)))
@@ -21,7 +21,7 @@ def random_polygons(count, kind, corners=4, seed=0):
     size = 10.0 ** generator.uniform(-1.2, -0.2, size=(count, 1))
     u = unit(np.cross(center, generator.normal(size=(count, 3))))
     v = unit(np.cross(center, u) + 0.5 * generator.normal(size=(count, 3)))
-    angle = 2.0 * np.pi * (np.arange(corners) + 0.5) / corners
+    angle = 0.5 * np.pi * (np.arange(4) + 0.5)
     vertices = size[..., None] * (np.cos(angle)[:, None] * u[:, None] + np.sin(angle)[:, None] * v[:, None])
     half_height = -vertices[..., 2].min(axis=1)
     share = generator.random(count)
@@ -74,42 +74,6 @@ def _lamp(number, generator):
     half_v = 0.7 * np.cross(direction, unit(half_u))
     lamp = QuadLight("Lamp", center, half_u, half_v, direction, np.array([5.0, 4.0, 3.0]))
     return lamp if np.dot(np.cross(half_u, half_v), direction) > 0 else replace(lamp, half_v=-half_v)
-
-
-WIDE = 60.0
-
-
-def wide_floor(width, height):
-    """width x height samples, row by row, of a dielectric floor of 60 m, roughness 0.4, seen from one side."""
-    x, y = np.meshgrid(np.linspace(-0.5, 0.5, width) * WIDE, np.linspace(-0.5, 0.5, height) * WIDE)
-    position = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
-    normal = np.broadcast_to([0.0, 0.0, 1.0], position.shape)
-    count, none = len(position), np.zeros(position.shape)
-    return SurfaceSamples(
-        position=position,
-        view=unit(np.array([0.0, -40.0, 12.0]) - position),
-        normal=normal,
-        diffuse_normal=normal,
-        roughness=np.full(count, 0.4),
-        specular_f0=none,
-        specular_f90=none,
-        dielectric=np.ones(count),
-        ior=np.full(count, 1.5),
-        diffuse_albedo=np.full(position.shape, 0.5),
-    )
-
-
-def ceiling(count, seed=1):
-    """Rectangles of 0.5 to 1 m in all colors, 5 to 9 m over that floor, shining about downward."""
-    generator = np.random.default_rng(seed)
-    lights = []
-    for _ in range(count):
-        place = np.append(generator.uniform(-0.5, 0.5, 2) * WIDE, generator.uniform(5.0, 9.0))
-        direction = unit(np.array([0.0, 0.0, -1.0]) + 0.3 * generator.normal(size=3))
-        half_u = generator.uniform(0.25, 0.5) * unit(np.cross(direction, [0.0, 1.0, 0.0]))
-        half_v, color = np.cross(direction, half_u), generator.uniform(5.0, 10.0, 3)
-        lights.append(QuadLight("Lamp", place, half_u, half_v, direction, color))
-    return lights
 
 
 WORLDS = {

@@ -19,19 +19,17 @@ sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
 
 import bake_cost  # noqa: E402
 import measure  # noqa: E402
-from bench_scenes import WORLDS, ceiling, floor_scene, metals_of_product, random_polygons, wide_floor, world  # noqa: E402
+from bench_scenes import WORLDS, floor_scene, metals_of_product, random_polygons, world  # noqa: E402
 from textbook_ltc import TextbookLtc  # noqa: E402
 from zonal_harmonics import ZonalHarmonics  # noqa: E402
 
 from ltsh_addon import shading  # noqa: E402
 from ltsh_addon.cli.commands import DEMO_SCENE  # noqa: E402
-from ltsh_addon.lobes import edge_integrals, moments32  # noqa: E402
 from ltsh_addon.lobes.polygon import project_to_sphere, split_at_horizon  # noqa: E402
 from ltsh_addon.scene import EllipseLight, PolygonLight  # noqa: E402
 from ltsh_addon.workers import pool  # noqa: E402
 
 TABLES = {name: shading.load_table(name) for name in shading.SHIPPED_TABLES}
-CHUNK = 12288
 
 
 def heading(text):
@@ -143,58 +141,9 @@ def worlds(options):
               f"{ratio['isotropic, gradient']:.2f}; both <= 3: {ratio['anisotropic, gradient']:.2f}")  # fmt: skip
 
 
-def many_lights(options):
-    """Lights by the thousand on a floor of 60 m, 480 x 270 samples, beside four: processor time of one process."""
-    heading("many lights: ltsh4, both passes; target: at most 20 times the time of 4")
-    samples, four = wide_floor(480, 270), ceiling(4)
-    base = None
-    for count in (4, 100, 1000, *([] if options.quick else [10_000])):
-        start = time.process_time()
-        shading.shade(samples, ceiling(count) if count > 4 else four, "ltsh4", workers=1)
-        seconds = time.process_time() - start
-        base = base or seconds
-        row(f"{count} lights", seconds / len(samples) * 1e9, note=f"{seconds:.1f} s, {seconds / base:.1f} x")
-
-
 def in_one_row(samples, lights, table, **options):
     options = {"passes": ["specular"], "workers": 1, "rows": [0] * len(lights), **options}
     return shading.shade(samples, lights, table, **options)
-
-
-def growth(options):
-    """How time grows with edges, lights, degree and samples."""
-    count = 10_000 if options.quick else 40_000
-    heading(f"growth with edges: ltsh4, {count} polygons above the horizon, ns per polygon and per edge")
-    for corners in (3, 4, 6, 8, 16, 32, 64):
-        seconds = timed(shading.integrate_polygon, TABLES["ltsh4"], *random_polygons(count, "whole", corners))
-        row(f"{corners} edges", seconds / count * 1e9, note=f"{seconds / count / corners * 1e9:.1f} ns per edge")
-    heading(f"growth with lights: ltsh4, F = 1, {count} samples, ns per sample and light")
-    for lights in (1, 2, 4, 8, 16, 64):
-        seconds = timed(in_one_row, *floor_scene(count, lights), TABLES["ltsh4"])
-        row(f"{lights} lights", seconds / count / lights * 1e9)
-    heading("growth with degree: moments of rectangles, ns per polygon")
-    corners = np.ascontiguousarray(random_polygons(CHUNK, "whole")[2].transpose(2, 1, 0))
-    scratch = moments32.Scratch()
-    unit = project_to_sphere(corners.astype(np.float64))
-    cases = {f"N={d}, float32": lambda d=d: moments32.moments(corners, d, scratch) for d in range(1, 5)}
-    cases |= {f"N={d}, float64": lambda d=d: edge_integrals.moments(unit, d) for d in range(1, 9)}
-    for name, seconds in measure.interleaved(cases, 3).items():
-        row(name, seconds / CHUNK * 1e9)
-    heading("growth with samples: ltsh4, F = 1, 4 lights, ns per sample and light")
-    sizes = [10_000, 100_000, *([] if options.quick else [1_000_000]), *([10_000_000] if options.large else [])]
-    for size in sizes:
-        seconds = timed(in_one_row, *floor_scene(size, 4), TABLES["ltsh4"], rounds=3 if size <= 100_000 else 1)
-        row(f"{size:.0e} samples", seconds / size / 4 * 1e9, note=f"{seconds:.2f} s")
-
-
-def timed(function, *arguments, rounds=3):
-    """Median seconds of one call."""
-    return measure.interleaved({"": partial(function, *arguments)}, rounds)[""]
-
-
-def repeated(function, count):
-    for _ in range(count):
-        function()
 
 
 def processes(options):
@@ -318,8 +267,6 @@ SECTIONS = {
     "shade": shade,
     "lights": light_kinds,
     "worlds": worlds,
-    "many": many_lights,
-    "growth": growth,
     "processes": processes,
     "cycles": cycles,
     "shadows": shadows,
@@ -332,7 +279,7 @@ SECTIONS = {
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("sections", nargs="*", metavar="SECTION", help=f"default: all of {', '.join(SECTIONS)}")
-    parser.add_argument("--large", action="store_true", help="also 1e7 samples, memory of 3840 x 2160, frames of 1080p")
+    parser.add_argument("--large", action="store_true", help="also memory of 3840 x 2160, frames of 1080p")
     parser.add_argument("--quick", action="store_true", help="fewer samples and rounds")
     parser.add_argument("--no-cycles", action="store_true", help="leave out what needs bpy")
     options = parser.parse_args()

@@ -1,9 +1,7 @@
 """The command line without Blender: arguments, exit codes, what goes to stdout and stderr, what is left in OUT."""
 
-import errno
 import io
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +10,7 @@ import fake_scene
 import pytest
 from fake_scene import run
 
-from ltsh_addon import cli, files, panel_job
+from ltsh_addon import cli, panel_job
 from ltsh_addon.cli.commands import DEMO_SCENE
 from ltsh_addon.cli.progress import MessageProgress
 from ltsh_addon.scene import COMPARED_TECHNIQUES, Cancelled, SceneError
@@ -89,18 +87,6 @@ def test_without_json_a_table_of_errors_is_printed_and_warnings_go_to_stderr(cap
     rows = [line.split()[0] for line in stdout.splitlines()]
     table = ["technique", *COMPARED_TECHNIQUES]
     assert rows == ["specular,", *table, "diffuse,", *table, "written"]
-
-
-@pytest.mark.skipif(os.name != "posix", reason="permissions of folders as in POSIX")
-def test_an_output_folder_without_permission_fails(capsys, child, room, tmp_path, monkeypatch):
-    """The system's refusal is imitated: root, who may run the tests, is refused nothing."""
-
-    def refuse(path, *arguments):
-        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
-
-    monkeypatch.setattr(files.os, "open", refuse)
-    code, _, stderr = run(capsys, "shade", room, "-o", tmp_path, "--quiet")
-    assert code == 1 and len(stderr.splitlines()) == 1 and "Permission denied" in stderr and child.asked == []
 
 
 @pytest.mark.parametrize(

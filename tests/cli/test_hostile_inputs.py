@@ -282,14 +282,6 @@ def test_a_folder_whose_path_is_no_utf8_is_refused(tmp_path):
     assert sorted(path.name for path in folder.iterdir()) == ["room.blend"]
 
 
-def test_a_scene_that_fails_leaves_no_empty_folder(capsys, monkeypatch, room, tmp_path):
-    from ltsh_addon.scene import SceneError
-
-    fake_scene.FakeChild(error=SceneError("no light")).install(monkeypatch)
-    assert fake_scene.run(capsys, "shade", room, "-o", tmp_path / "a" / "b")[0] == 1
-    assert not (tmp_path / "a").exists()
-
-
 def test_cases_at_random_end_as_they_should():
     """Some of those that `make soak` tries."""
     command = [sys.executable, str(ROOT / "tests" / "soak" / "fuzz.py"), "--cases", "36", "--seed", "7"]

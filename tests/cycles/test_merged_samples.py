@@ -70,18 +70,3 @@ def test_points_that_share_a_shadow_are_alike_and_stand_for_all():
     np.testing.assert_allclose(small.coverage(), 1.0, atol=1e-6)
     apart = leaders.position[place] - merged.position
     assert np.abs((apart * merged.geometric_normal).sum(axis=1)).max() < 0.2 * np.linalg.norm(apart, axis=1).max()
-
-
-WIDTH, MORE = 12, 64
-
-
-def filtered(offset):
-    """The density of a pixel filter that reaches 0.75 pixels far."""
-    return np.where(np.abs(offset) < 0.75, 1.0 + np.cos(np.pi * offset / 0.75), 0.0)
-
-
-def shared_points(count):
-    """Points of a pixel, right and up of its center, evenly, and their weights in the pixels around."""
-    points = (np.arange(count)[:, None] * [0.7548776662466927, 0.5698402909980532] + 0.5) % 1.0 - 0.5
-    steps = np.arange(-1, 2)
-    return points, filtered(points[:, 1:] + steps)[:, :, None] * filtered(points[:, :1] - steps)[:, None]

@@ -7,6 +7,7 @@ the error is below 1e-4 for roughness of 0.3 and more.
 from __future__ import annotations
 
 import numpy as np
+import textbook
 
 from ltsh_addon.scene import PolygonLight
 
@@ -60,7 +61,8 @@ def ggx(directions, samples):
     """Specular BRDF times cosine (P, S, 3): GGX, height-correlated Smith, Fresnel as in `SurfaceSamples`.
 
     Anisotropic lobes by the formulas for alpha_x and alpha_y of Heitz 2014, all samples or none."""
-    alpha2 = samples.roughness[:, None] ** 4
+    alpha = samples.roughness[:, None] ** 2
+    alpha2 = alpha**2
     cos_o = np.sum(samples.normal * samples.view, axis=-1)[:, None]
     cos_i = _dot(directions, samples.normal)
     half = directions + samples.view[:, None]
@@ -68,10 +70,9 @@ def ggx(directions, samples):
     cos_h, cos_d = _dot(half, samples.normal), np.einsum("psk,psk->ps", half, directions)
     distribution = alpha2 / (np.pi * (cos_h**2 * (alpha2 - 1.0) + 1.0) ** 2)
     lit = (cos_i > 0.0) & (cos_o > 0.0)
-    smith = 1.0 / (1.0 + _smith(alpha2, cos_o) + _smith(alpha2, np.where(lit, cos_i, 1.0)))
+    smith = 1.0 / (1.0 + sum(textbook.smith_lambda(cosine, alpha) for cosine in (cos_o, np.where(lit, cos_i, 1.0))))
     if samples.anisotropy.any():
         along, across = _tangents(samples)
-        alpha = samples.roughness[:, None] ** 2
         x, y = alpha / (1.0 - samples.anisotropy[:, None]), alpha * (1.0 - samples.anisotropy[:, None])
         slopes = (_dot(half, along) / x) ** 2 + (_dot(half, across) / y) ** 2 + cos_h**2
         distribution = 1.0 / (np.pi * x * y * slopes**2)
@@ -86,7 +87,7 @@ def ggx(directions, samples):
     schlick = (1.0 - cos_d[..., None]) ** 5
     f0, f90 = samples.specular_f0[:, None], samples.specular_f90[:, None]
     dip = samples.specular_dip[:, None] * (cos_d * (1.0 - cos_d) ** 6)[..., None]
-    dielectric = samples.dielectric[:, None] * dielectric_fresnel(cos_d, samples.ior[:, None])[..., None]
+    dielectric = samples.dielectric[:, None] * textbook.dielectric_fresnel(cos_d, samples.ior[:, None])[..., None]
     metal = f0 + (f90 - f0) * schlick - dip
     alone = ~samples.dielectric.any(axis=1)[:, None, None]
     return value[..., None] * (np.where(alone, np.maximum(metal, 0.0), metal) + dielectric)
@@ -97,14 +98,6 @@ def _tangents(samples):
     across = np.cross(samples.normal, samples.tangent)
     across /= np.linalg.norm(across, axis=1, keepdims=True)
     return np.cross(across, samples.normal), across
-
-
-def dielectric_fresnel(cosine, ior):
-    """Reflectance of unpolarized light from the two amplitude formulas."""
-    cos_t = np.sqrt(np.maximum(1.0 - (1.0 - cosine**2) / ior**2, 0.0))
-    parallel = (ior * cosine - cos_t) / (ior * cosine + cos_t)
-    perpendicular = (cosine - ior * cos_t) / (cosine + ior * cos_t)
-    return 0.5 * (parallel**2 + perpendicular**2)
 
 
 def radiance(samples, lights, brdf, count=64, weight=None) -> np.ndarray:
@@ -177,7 +170,3 @@ def bias(image, halves) -> float:
 
 def _dot(directions, vectors):
     return np.einsum("psk,pk->ps", directions, vectors)
-
-
-def _smith(alpha2, cosine):
-    return 0.5 * (np.sqrt(1.0 + alpha2 * (1.0 / cosine**2 - 1.0)) - 1.0)

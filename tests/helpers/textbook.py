@@ -30,10 +30,15 @@ def ggx_brdf(view, light, alpha):
 
 def fresnel_amplitudes(cosine, ior):
     """(r_s^2, r_p^2) by Snell's law and the Fresnel equations."""
-    transmitted = np.sqrt(1.0 - (1.0 - cosine**2) / ior**2)
+    transmitted = np.sqrt(np.maximum(1.0 - (1.0 - cosine**2) / ior**2, 0.0))
     s = (cosine - ior * transmitted) / (cosine + ior * transmitted)
     p = (ior * cosine - transmitted) / (ior * cosine + transmitted)
     return s**2, p**2
+
+
+def dielectric_fresnel(cosine, ior):
+    """Reflectance of unpolarized light."""
+    return 0.5 * sum(fresnel_amplitudes(cosine, ior))
 
 
 def lhuilier(a, b, c):

@@ -9,16 +9,6 @@ import pytest
 pytestmark = pytest.mark.skipif(header_harness.C_COMPILER is None, reason="needs a C compiler")
 
 DOCUMENT = Path(__file__).resolve().parents[2] / "tables" / "EXPORT.md"
-# What GLSL 3.30 has no word for, or keeps for itself: the language of C that must not be left in its branch.
-NOT_GLSL = [
-    r"\b(static|inline|typedef|sizeof|extern|register|unsigned|long|short|char|double|NULL|malloc|memcpy)\b",
-    r"\b(near|far|half|fixed|input|output|sample|filter|common|partition|active|this|template|namespace|using)\b",
-    r"\b(sqrt|sin|cos|atan2?|fabs|fmax|fmin|floor)f\b|\batan2\b",
-    r"->|__|[\"'#\\]|\(\s*(int|float)\s*\)",
-    r"=\s*\{|\breturn\s*\{|\}\s*\w+\s*;",
-    r"(?<!&)&(?!&)|\b(int|float|vec3|ltsh\w*)\s*\*\s*\w+\s*[,)=;]|\(\s*\*",
-    r"\b(goto|switch|enum|union|asm)\b",
-]
 
 
 def test_c_and_cplusplus_take_all_headers_together(folder, tables):
@@ -46,23 +36,6 @@ def test_other_versions_and_glsl_without_data_are_refused(folder, tables, defini
 
 def _glsl(path, name):
     return header_harness.preprocessed(path, "GL_core_profile=1", f"{name.upper()}_DATA(index)=fetched(index)")
-
-
-@pytest.mark.parametrize("name", header_harness.NAMES)
-def test_the_glsl_branch_holds_nothing_that_is_c_only(folder, tables, name):
-    text = _glsl(folder / f"{name}.h", name)
-    for pattern in NOT_GLSL:
-        found = re.search(pattern, text)
-        assert found is None, text[max(found.start() - 80, 0) : found.end() + 80]
-    assert "fetched(" in text and f"{name}_data" not in text and len(text) < 60_000
-
-
-def test_the_search_for_c_finds_the_c_branch(folder, tables):
-    """Each kind of word that is forbidden in GLSL stands in the C branch, or is refused here by example."""
-    text = header_harness.preprocessed(folder / "ltc.h")
-    assert re.search(NOT_GLSL[0], text) and re.search(NOT_GLSL[2], text) and re.search(NOT_GLSL[4], text)
-    samples = ["float near = 1.0f;", "(int)x", "a->b", "ltsh_vec3 v = {1.0f};", "f(&x)", "float *p)", "goto end;"]
-    assert all(any(re.search(pattern, sample) for pattern in NOT_GLSL) for sample in samples)
 
 
 def _functions(text, name):

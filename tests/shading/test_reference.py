@@ -23,7 +23,7 @@ def ggx_color(cosine, roughness, light_directions, ior):
     lobe = textbook.ggx_brdf(view, light_directions, roughness**2) * light_directions[:, 2]
     half = view + light_directions
     half_cosine = np.clip((half @ view) / np.linalg.norm(half, axis=1), 0.0, 1.0)
-    dielectric = 0.5 * sum(textbook.fresnel_amplitudes(half_cosine, ior))
+    dielectric = textbook.dielectric_fresnel(half_cosine, ior)
     missing = 1.0 - half_cosine
     return lobe * np.stack([np.ones_like(lobe), missing**5, half_cosine * missing**6, dielectric])
 

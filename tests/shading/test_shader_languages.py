@@ -20,8 +20,6 @@ ROOT = Path(__file__).resolve().parents[2]
 ENGINES, EXPORT = ROOT / "docs" / "engines.md", ROOT / "tables" / "EXPORT.md"
 END_OF_SHADERS = "/* GLSL and HLSL may end here"
 COUNT = 256
-NUMBERS = 14  # of a point: cos_theta_o, roughness, four corners
-
 MAIN = {
     "glsl": """#version 450
 layout(local_size_x = 64) in;
@@ -147,7 +145,7 @@ def test_shaders_of_every_language_integrate_as_numpy_does(device, folder, table
     assert expected.max() > 0.5 and np.abs(found - expected).max() < 5e-5
 
 
-@pytest.mark.parametrize("name", ["ltc", "ltsh4"])
+@pytest.mark.parametrize("name", header_harness.NAMES)
 @pytest.mark.parametrize("whole", [True, False])
 def test_glsl_3_30_takes_the_header(folder, tables, tmp_path, name, whole):
     (example,) = re.findall(r"```glsl\n(.*?)```", EXPORT.read_text(encoding="utf-8"), flags=re.DOTALL)

@@ -8,7 +8,7 @@ import pytest
 from ltsh_addon.lobes import brdf, spherical_harmonics
 from ltsh_addon.lobes.lookup_table import roughness_nodes, theta_nodes
 from ltsh_addon.shading import load_table
-from tables import fit, refine, walk
+from tables import fit, refine
 from tables.families import BECKMANN, GGX, family_named, polar_samples
 from tables.projection import FLAT, Cells, Points, project, relative_error, warped_basis
 from tables.validate import hemisphere_samples, validate
@@ -86,7 +86,7 @@ def test_even_a_coarse_fit_is_a_usable_table(coarse, tmp_path):
 def test_refinement_lowers_the_error_between_the_nodes(coarse):
     """The walk alone, with coefficients solved at the nodes, against the whole fit: quadrature of the validation."""
     family, (roughness, cosine) = family_named("ltsh2"), fit._nodes(SIZE)
-    warp = walk.stored_warp(walk.walk(family, GGX, roughness, cosine), roughness, cosine)
+    warp = refine.stored_warp(refine.walk(family, GGX, roughness, cosine), roughness, cosine)
     walked = fit.project_nodes(family, GGX, roughness, cosine, warp, FLAT)[0]
     cells = Cells.of(GGX, (SIZE, SIZE), fit.GRAZING_COSINE, FLAT)
     arrays = coarse[0].arrays

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-import quadrature
+import textbook
 
 from ltsh_addon.shading import SHIPPED_TABLES, load_table
 from tables.projection import COSINES, TABULATED_IOR, combine, fresnel_basis
@@ -16,7 +16,7 @@ def basis():
 
 def relative_error(curves, weights, ior, lowest, highest):
     chosen = (ior >= lowest) & (ior <= highest)
-    exact = quadrature.dielectric_fresnel(COSINES, ior[chosen][:, None])
+    exact = textbook.dielectric_fresnel(COSINES, ior[chosen][:, None])
     return np.abs(weights[chosen] @ curves / exact - 1.0).max()
 
 

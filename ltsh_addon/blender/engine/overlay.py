@@ -60,11 +60,13 @@ class QuietLine:
     panel: str = MATERIALS_PANEL
 
 
-def left_out(mirror, scene) -> QuietLine:
-    """What no view of this scene shows, but its Cycles pictures do."""
-    parts = ["No bounces"]
-    if mirror.has_glass:
-        parts.append("glass without refraction")
+def left_out(mirror, scene, rest=None) -> QuietLine:
+    """What no view of this scene shows, but its Cycles pictures do; or when the `rest` of a view that has one comes."""
+    if rest is None:
+        parts = ["No bounces", *["glass without refraction"] * mirror.has_glass]
+    else:
+        coming = "Bounces are coming" if rest.seconds is None else f"Bounces: {max(rest.seconds, 1.0):.0f} s"
+        parts = [coming] * rest.is_busy
     if not scene.ltsh.shadows:
         parts.append("no shadows")
     if not scene.ltsh_view.world and mirror.sky.sides:

@@ -61,7 +61,7 @@ def watch() -> None:
     """Draw views again when results come in that are on their way now."""
     if any(shadows.is_busy for shadows in live_shadows):
         _start(_watch_shadows, POLL_SECONDS)
-    if node_lights.is_busy or any(view.waits_for_world for view in open_views):
+    if node_lights.is_busy or any(view.waits_for_world or view.rest.is_busy for view in open_views):
         _start(_watch_cycles, POLL_SECONDS)
 
 
@@ -94,14 +94,15 @@ def _end_helpers() -> None:
 def _watch_cycles() -> float | None:
     """Show worlds and lights in the views when Cycles has rendered them; look again while any is on its way."""
     views = list(open_views)
-    news = [view.take_world() for view in views]
+    news = [view.take_world() for view in views] + [view.rest.step() for view in views]
     if views and node_lights.step(bpy.context.scene.frame_current):
         news.append(True)
         for view in views:
             view.mirror.has_old_lights = True
     if any(news):
         tag_views()
-    return POLL_SECONDS if any(view.waits_for_world for view in views) or (views and node_lights.is_busy) else None
+    is_busy = node_lights.is_busy or any(view.waits_for_world or view.rest.is_busy for view in views)
+    return POLL_SECONDS if views and is_busy else None
 
 
 def tag_views() -> None:
@@ -119,4 +120,6 @@ def stop() -> None:
             bpy.app.timers.unregister(timer)
     for shadows in live_shadows:
         shadows.stop()
+    for view in open_views:
+        view.rest.stop()
     node_lights.stop()

@@ -17,6 +17,7 @@ from ..viewport.live_cycles import LiveWorld
 from ..viewport.mirror import SceneMirror
 from ..viewport.pictures import ShownPicture
 from ..viewport.renderer import ViewRenderer
+from ..viewport.rest import LiveRest
 from ..viewport.shadow_rays import too_many, view_occluders
 from ..viewport.shadows import LiveShadows
 from . import redraws
@@ -42,6 +43,7 @@ class EngineView:
         self._error = ""
         self._content: tuple[tuple, str] | None = None
         self._shadows = LiveShadows()
+        self.rest = LiveRest()
         self._occluder_notes: list[str] = []
         redraws.live_shadows.add(self._shadows)
         redraws.open_views.add(self)
@@ -50,6 +52,7 @@ class EngineView:
         # Blender lets go of a view that shows something else, or is closed: nothing here may be part of a circle.
         self._shadows.stop()
         self._world.stop()
+        self.rest.stop()
         redraws.open_views.discard(self)
         if not redraws.open_views:
             redraws.node_lights.stop()
@@ -61,6 +64,7 @@ class EngineView:
         """Take over what has changed in the scene."""
         if any(isinstance(update.id, bpy.types.Image) for update in depsgraph.updates):
             redraws.node_lights.note_images()
+        self.rest.note(depsgraph)
         try:
             self.mirror.sync(depsgraph, context.space_data)
             self._error = ""
@@ -99,10 +103,14 @@ class EngineView:
         except Exception as error:
             texts = ViewTexts(self._note(error))
             _clear(target)
-        notes = [*texts.notes, *self.mirror.notes, *self._shadow_notes(context.region)]
+        has_rest = self._renderer is not None and self._renderer.rest is not None
+        of_scene = self.mirror.notes_with_rest if has_rest else self.mirror.notes
+        notes = [*texts.notes, *of_scene, *self._shadow_notes(context.region)]
+        if self.rest.problem:
+            notes.append(self.rest.problem)
         if not texts.error and not self.mirror.lights and not self.mirror.sky.sides:
             notes.insert(0, NO_LIGHTS)
-        quiet = left_out(self.mirror, depsgraph.scene)
+        quiet = left_out(self.mirror, depsgraph.scene, self.rest if has_rest or self.rest.is_busy else None)
         show(context.region, replace(texts, notes=tuple(dict.fromkeys(notes)), quiet=quiet))
         is_waiting = self._draws_shadows and self._shadows.waits
         if not texts.error and self._renderer.samples < redraws.REFINEMENTS and not is_waiting:
@@ -123,9 +131,22 @@ class EngineView:
             mode, reference, notes = self._beside_cycles(context, depsgraph, camera, mode)
         shown = _shown(scene, mode, reference, context.preferences.system.ui_scale)
         self._follow_shadows(depsgraph)
+        self._follow_rest(context, depsgraph, shown)
         points = sub_pixel_offsets(scene, redraws.REFINEMENTS)
         self._renderer.draw(self.mirror, camera, (region.width, region.height), shown, target, points)
+        if self._renderer.rest is not None:
+            self.rest.keep_light(self._renderer.mean_light)
         return ViewTexts(self._error, tuple(notes), captions_of(scene.ltsh_view, mode))
+
+    def _follow_rest(self, context, depsgraph, shown: ShownPicture) -> None:
+        """Let the renderer add what Cycles has rendered, if the scene wants it and the picture takes it."""
+        renderer, is_wanted = self._renderer, depsgraph.scene.ltsh_view.bounces and shown.takes_rest
+        renderer.has_bounces = is_wanted
+        if not depsgraph.scene.ltsh_view.bounces:
+            self.rest.stop()
+        elif is_wanted:
+            self.rest.follow(context, depsgraph)
+        renderer.rest = self.rest.shown() if is_wanted else None
 
     @property
     def _draws_shadows(self) -> bool:

@@ -395,11 +395,13 @@ def _bake(opened, ob, plans, job, folder, progress) -> None:
     bake = ObjectBake(opened.scene, ob, read.uv_name, plans)
     try:
         with np.load(read.mesh) as data:
-            blocks = blocks_of(data["uv"], job.width, job.height, job.block_rows)
+            tiles = tiles_of(data["uv"])[0]
         finished = {tile for name, tile in job.finished if name == ob.name}
-        blocks = [Block(*values) for values in blocks if values[0] not in finished]
-        if job.tile is not None:
-            blocks = [block for block in blocks if block.tile == job.tile]
+        blocks = [
+            Block(tile, first, min(job.block_rows, job.height - first), job.width, job.height)
+            for tile in tiles if tile not in finished and job.tile in (None, tile)
+            for first in range(0, job.height, job.block_rows)
+        ]  # fmt: skip
         for number, block in enumerate(blocks):
             progress(f"bake {ob.name}", number / len(blocks))
             for point in range(points):
@@ -410,15 +412,6 @@ def _bake(opened, ob, plans, job, folder, progress) -> None:
                     save_array(folder / f"cycles_{kind}_{block.name}.npy", halves)
     finally:
         bake.close()
-
-
-def blocks_of(uv, width: int, height: int, block_rows: int) -> list[tuple[int, int, int, int, int]]:
-    """(tile, first row, rows, width, height) of every block of every UDIM tile in use."""
-    return [
-        (tile, first, min(block_rows, height - first), width, height)
-        for tile in tiles_of(uv)[0]
-        for first in range(0, height, block_rows)
-    ]
 
 
 def scene_facts(job: BakeFactsJob, folder: Path, progress) -> dict:

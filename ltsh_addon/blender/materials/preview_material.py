@@ -112,6 +112,12 @@ class PreviewMaterial:
         return float(np.clip(self.value("transmission").offset[0], 0.0, 1.0)) if self.kind == "principled" else 0.0
 
     @property
+    def is_of_cycles(self) -> bool:
+        """True if a view with bounces shows it whole as Cycles does: what shines, glass, and what is not resolved."""
+        shines = self.glow > 0.0 or bool(np.any(self.emission))
+        return not self.is_clear and (shines or bool(self.notes) or any(lobe.through > 0.0 for lobe in self.lobes))
+
+    @property
     def is_mirror(self) -> bool:
         """True for smooth metal, which shows what is around it."""
         is_metal = self.kind in METALS or (self.kind == "principled" and self.value("metallic").offset[0] > 0.5)

@@ -11,8 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
+from ...cycles.lobes import read_layer
+from ...imaging.denoise import NoDenoiser, open_denoiser
 from ...scene import Light, Progress, SceneError, light_of
-from .blender_process import run_job, run_scene_job
+from ...workers.pool import cores
+from .blender_process import denoiser_libraries, run_job, run_scene_job
+from .pixels import rendered_channels
 
 # VIEW_PASSES: the pictures that are drawn of a view. VIEW_PNG: the file of the first. GRAPHICS: the stage that the
 # child reports before it asks for a graphics card; on a machine without one it may crash there.
@@ -38,6 +42,7 @@ class ViewJob:
     camera: str | None
     shadows: str  # "on" or "off"
     shadow_rays: int  # per light and pixel
+    rest: Path | None = None  # the file of what Cycles adds, see `RestSum.picture`
     scripts: bool = False  # run the scripts in the file
 
 
@@ -124,3 +129,69 @@ def render_node_lights(lights: list[NodeLightFile], frame: int, folder: Path, ta
         return take(number, np.load(folder / f"{number}.npy"), np.load(folder / f"{number}_traits.npy").tolist())
 
     run_job(NodeLightJob([asdict(light) for light in lights], frame), folder, watched)
+
+
+REST_PICTURE = "rest.exr"
+
+
+@dataclass(frozen=True)
+class RestJob:
+    """Render what Cycles adds to the direct light of a view, for `camera` or for the matrices of a region."""
+
+    scene: Path | None  # None: the one that the last job has opened
+    width: int | None
+    height: int | None
+    samples: int
+    seed: int = 0
+    frame: int | None = None
+    camera: str | None = None
+    scene_name: str | None = None
+    view_layer: str | None = None
+    matrices: tuple | None = None  # of a region: from the world to the view, and to clip space, (4, 4) each
+    hidden: tuple[str, ...] = ()  # names of objects that its local view hides
+    changes: dict | None = None  # of the scene that the last job has opened, see `viewport.rest.RestChanges`
+    scripts: bool = False  # run the scripts in the file
+
+
+@dataclass
+class RestSum:
+    """The sum of the samples of one view, row 0 on top."""
+
+    light: np.ndarray | float = 0.0  # (H, W, 3)
+    guides: np.ndarray | float = 0.0  # (H, W, 6) albedo and normal
+    samples: int = 0
+    everything: tuple[str, ...] = ()  # why no light of the view itself remains
+
+    def add(self, manifest: dict, folder: Path) -> None:
+        """Add the picture of a RestJob that was done in `folder`: Combined without what the view draws itself."""
+        channels, names = rendered_channels(folder / REST_PICTURE), manifest["passes"]
+        count, self.everything = manifest["samples"], tuple(manifest["everything"])
+        light = read_layer(channels, "Combined", "RGB")
+        if not self.everything:
+            keys = "specular_light", "specular_color", "diffuse_light", "diffuse_color", "background"
+            specular, specular_color, diffuse, diffuse_color, background = (
+                read_layer(channels, names[key], "RGB") for key in keys
+            )
+            drawn = 1.0 - np.minimum(read_layer(channels, manifest["mask"], "X"), 1.0)
+            light = light - drawn[..., None] * (specular * specular_color + diffuse * diffuse_color + background)
+        guides = [read_layer(channels, *guide) for guide in (("Denoising Albedo", "RGB"), ("Denoising Normal", "XYZ"))]
+        self.light = self.light + np.float32(count) * light
+        self.guides = self.guides + np.float32(count) * np.concatenate(guides, axis=-1)
+        self.samples += count
+
+    def picture(self) -> np.ndarray:
+        """The denoised mean (H, W, 4); alpha is 1 where the view must show no light of its own."""
+        light, guides = (each / np.float32(self.samples) for each in (self.light, self.guides))
+        try:
+            with open_denoiser(denoiser_libraries(), cores()) as denoiser:
+                light = denoiser.quickly_denoised(light, guides[..., :3], guides[..., 3:])
+        except NoDenoiser:
+            light = np.maximum(np.nan_to_num(light), 0.0)
+        return np.concatenate([light, np.full_like(light[..., :1], bool(self.everything))], axis=-1)
+
+
+def render_rest(job: RestJob, folder: Path, *, progress: Progress | None = None) -> RestSum:
+    """What Cycles adds to the view of `job`. Raises as `pixels.extract_pixels` does."""
+    total = RestSum()
+    total.add(run_scene_job(job, folder, progress), folder)
+    return total

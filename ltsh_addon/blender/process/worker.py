@@ -50,6 +50,7 @@ JOBS = {
     "BakeFactsJob": ("bake", "extract.bake", "scene_facts"),
     "ApplyJob": ("bake", "extract.apply", "apply_bake"),
     "ViewJob": ("view", "viewport.still", "draw_view"),
+    "RestJob": ("view", "viewport.rest", "render_rest"),
     "WorldJob": ("view", "viewport.live_cycles", "render_world"),
     "NodeLightJob": ("view", "viewport.live_cycles", "render_node_lights"),
 }

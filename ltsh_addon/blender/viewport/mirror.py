@@ -362,6 +362,12 @@ class SceneMirror:
         return list(dict.fromkeys(note for kind in notes for note in kind))
 
     @property
+    def notes_with_rest(self) -> list[str]:
+        """Those of them that remain when Cycles adds the rest."""
+        glowing = [note for shown in self._looks.values() if shown.look.glow > 0.0 for note in shown.look.notes]
+        return list(dict.fromkeys([*glowing, *self._light_notes, *self._world_note, *self._limit_notes]))
+
+    @property
     def material_notes(self) -> list[str]:
         """The notes about materials."""
         return [note for shown in self._looks.values() for note in shown.look.notes]

@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields, is_dataclass
 
 import gpu
 import numpy as np
+from mathutils import Matrix
 
 from ...shading.header import definitions
 from .drawing import PixelShader, ViewCamera, drawing, empty_texture, frame_buffer, glsl, size_of
@@ -33,6 +34,11 @@ class ShownPicture:
     white: float = 1.0  # brightness that shows no difference, before the scene's own exposure
     also: tuple[tuple[str, str], ...] = ()  # further techniques and passes to draw, for `read`
     world: bool = True  # show the light of the world
+
+    @property
+    def takes_rest(self) -> bool:
+        """True if Cycles' rest belongs to it: neither to passes alone, nor beside a picture of direct light."""
+        return self.passes == "combined" and (self.mode == "single" or self.second_picture is None)
 
 
 class PicturePass:
@@ -77,6 +83,48 @@ def copy(shader: PixelShader, picture: gpu.types.GPUTexture, target: gpu.types.G
     with drawing(target, (0, 0, *size_of(picture))):
         shader.bind({"picture": picture})
         shader.draw()
+
+
+@dataclass(frozen=True)
+class ShownRest:
+    """What Cycles adds to a view (see `viewport.rest`), as it was rendered for some view."""
+
+    texture: gpu.types.GPUTexture  # RGBA, row 0 at the bottom; alpha 1: without light of the view itself
+    projection: np.ndarray  # (4, 4) to the clip space that the texture fills
+    light: np.ndarray | None = None  # the mean (3,) of the direct light that belongs to it; None: that of the picture
+
+    def is_of(self, view: ViewCamera) -> bool:
+        """True if it was rendered for this very view."""
+        return np.array_equal(self.projection, view.projection)
+
+
+class RestPass:
+    """Draws a picture with its rest; needs an active GPU context."""
+
+    def __init__(self):
+        samplers = ("picture", "of_cycles", "rest", "positions", "glass_positions")
+        constants = {"projection": "MAT4", "scale": "VEC4", "weight": "FLOAT", "has_moved": "INT"}
+        self._shader, self._target = PixelShader(glsl("rest"), samplers, constants), None
+
+    def draw(self, textures: dict[str, gpu.types.GPUTexture], weight: float, rest: ShownRest, view: ViewCamera, scale):
+        """The picture (RGBA texture, valid until the next call with the same `picture`) with the `rest`.
+
+        `textures` are by the names of the samplers: `picture` and `of_cycles`, the share of pixels that is Cycles'
+        alone, which count times `weight`; and the positions of the surfaces and of glass. The rest counts times `scale`
+        (3,).
+        """
+        size = size_of(textures["picture"])
+        target = SampleSum(size)
+        constants = {
+            "projection": Matrix(rest.projection.tolist()),
+            "scale": (*scale, 0.0),
+            "weight": weight,
+            "has_moved": not rest.is_of(view),
+        }
+        with drawing(target.within(), (0, 0, *size)):
+            self._shader.bind({**textures, "rest": rest.texture}, constants)
+            self._shader.draw()
+        return target.texture
 
 
 class VeilPass:

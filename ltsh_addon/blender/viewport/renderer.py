@@ -21,6 +21,7 @@ from .pictures import (
     TRANSMITTED,
     LightingState,
     PicturePass,
+    RestPass,
     SampleSum,
     ShownPicture,
     StaticLighting,
@@ -45,6 +46,12 @@ class SurfaceLayer:
         self.visibility: VisibilityGrid | None = None  # of the lights from all lobes
         self.threshold = 0.5  # see `HorizonPass.draw`
         self.through, self.add_emission = self._surfaces.through, self._surfaces.add_emission
+        self.add_share_of_cycles = self._surfaces.add_share_of_cycles
+
+    @property
+    def position(self) -> gpu.types.GPUTexture:
+        """The positions of the surfaces drawn last."""
+        return self._gbuffer.position
 
     def draw(self, mirror, view: ViewCamera, size) -> None:
         """Draw the surfaces."""
@@ -142,6 +149,10 @@ class ViewRenderer:
         self._is_split = False  # the pictures have static lighting
         self._sky, self._sky_light, self._background = None, None, None
         self.shadows: ShadowRays | LiveShadows | None = None
+        # Pictures get a rest, and this one as soon as there is one; `_of_cycles`: what is Cycles' alone, a sum.
+        self.has_bounces, self.rest = False, None  # bool, ShownRest | None
+        self._rest_pass: RestPass | None = None
+        self._of_cycles: list[SampleSum] = []
 
     def draw(
         self, mirror: SceneMirror, view: ViewCamera, size: tuple[int, int], shown: ShownPicture, target, points=CENTERS
@@ -160,7 +171,8 @@ class ViewRenderer:
         if self.shadows is not None:
             self.shadows.take_news()
             version = self.shadows.version
-        state = (mirror, mirror.lights, mirror.sky, self.shadows), (*frame.surfaces[1], frame.content, version)
+        values = *frame.surfaces[1], frame.content, version, self.has_bounces
+        state = (mirror, mirror.lights, mirror.sky, self.shadows), values
         is_same = same_state(state, self._shown)
         if not is_same or self._is_split:
             self.samples = 0
@@ -173,19 +185,36 @@ class ViewRenderer:
             is_drawn = self._draw_sample(sample, lit_by)
             self._shown, self.samples = state, self.samples + is_drawn
         count = len(frame.pictures) - len(shown.also)
-        self._show([each.texture for each in self._sums[:count]], frame.view, shown, target)
+        self._show(range(count), frame.view, shown, target)
 
     def show(self, number: int, view: ViewCamera, shown: ShownPicture, target) -> None:
         """Draw the picture `number` of those drawn last, as `draw` does; `shown` must have its passes."""
-        self._show([self._sums[number].texture], view, shown, target)
+        self._show([number], view, shown, target)
 
-    def _show(self, pictures, view, shown, target) -> None:
-        weights = [1.0 / self.samples] * len(pictures)
+    def _show(self, numbers, view, shown, target) -> None:
+        pictures, weights = [self._sums[number].texture for number in numbers], [1.0 / self.samples] * len(numbers)
+        if self.has_bounces and self.rest is not None and shown.takes_rest:
+            pictures, weights = [self._with_rest(one, view) for one in pictures], [1.0] * len(pictures)
         if shown.mode != "single" and shown.second_picture is not None:
             pictures, weights = [*pictures, shown.second_picture], [*weights, 1.0]
         # The sample has bound other buffers, and Blender's own binding is unknown to Python.
         with target.bind():
             self._picture.draw(pictures, weights, view, shown, self._background)
+
+    def _with_rest(self, picture: gpu.types.GPUTexture, view: ViewCamera) -> gpu.types.GPUTexture:
+        """The mean of a picture's samples with the rest."""
+        if self._rest_pass is None:
+            self._rest_pass = RestPass()
+        front = self._surfaces if self._glass is None or not self._has_glass else self._glass
+        textures = {"picture": picture, "of_cycles": self._of_cycles[0].texture, "positions": self._surfaces.position}
+        textures["glass_positions"], scale, light = front.position, np.ones(3), self.rest.light
+        if light is not None:
+            scale = np.divide(self.mean_light(), light, out=scale, where=light > 0.0)
+        return self._rest_pass.draw(textures, 1.0 / self.samples, self.rest, view, scale)
+
+    def mean_light(self) -> np.ndarray:
+        """The mean (3,) of some pixels of the last picture."""
+        return self.read()[2::5, 2::5, :3].mean(axis=(0, 1), dtype=np.float64)
 
     def _draw_sample(self, frame: Frame, state: tuple | None) -> bool:
         """Add one point of every pixel to the pictures; the first point replaces them.
@@ -197,6 +226,10 @@ class ViewRenderer:
         if not self._trace(layers, frame):
             return False
         self._sums = _cleared(self._sums, frame, self.samples == 0)
+        if self.has_bounces:
+            self._of_cycles = _cleared(self._of_cycles, replace(frame, pictures=frame.pictures[:1]), self.samples == 0)
+            for layer in layers:
+                layer.add_share_of_cycles(frame.mirror.instances, frame.view, self._of_cycles[0].within())
         if len(layers) == 1:
             self._light_surfaces(frame, self._sums, state)
             self._add_emission(self._surfaces, frame, self._sums)
@@ -223,6 +256,7 @@ class ViewRenderer:
     def _draw_surfaces(self, frame: Frame) -> list[SurfaceLayer]:
         """The layers, surfaces and glass, with G-buffers and horizons; drawn again if anything has changed."""
         has_glass, is_drawn = frame.mirror.has_glass, same_state(frame.surfaces, self._drawn)
+        self._has_glass = has_glass
         if not is_drawn:
             self._drawn = None
             self._surfaces.draw(frame.mirror, frame.view, frame.size)

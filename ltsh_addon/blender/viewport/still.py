@@ -21,11 +21,11 @@ from ..lights.world import light_of_world
 from ..materials.preview_material import world_radiance
 from ..process.view import GRAPHICS, VIEW_PASSES, VIEW_PNG, ViewJob
 from ..render_settings import cycles_setting
-from .drawing import ViewCamera, frame_buffer, read_texture
+from .drawing import ViewCamera, float_texture, frame_buffer, read_texture
 from .light_texels import ShownSky, varied_sky
 from .live_cycles import rendered_world
 from .mirror import NOT_RESOLVED, SceneMirror, patterns_of
-from .pictures import TRANSMITTED, ShownPicture
+from .pictures import TRANSMITTED, ShownPicture, ShownRest
 from .renderer import ViewRenderer
 from .shadow_rays import ShadowRays, too_many, view_occluders
 
@@ -189,7 +189,9 @@ def _draw(job: ViewJob, read: tuple, size: tuple[int, int], progress) -> tuple[l
     exposure, transparent = cycles_setting(scene, "film_exposure"), scene.render.film_transparent
     shown = ShownPicture(first[0], "combined", exposure=exposure, transparent=transparent, also=tuple(others))
     renderer = _renderer[0] if _renderer else ViewRenderer()
-    renderer.shadows = shadows
+    renderer.shadows, renderer.has_bounces = shadows, job.rest is not None
+    if job.rest is not None:
+        renderer.rest = ShownRest(float_texture(np.load(job.rest)[::-1]), drawn[1].projection)
     try:
         pictures = _pictures(renderer, drawn, shown, points, progress)
     except ValueError as error:  # a table that the card does not take
@@ -197,7 +199,7 @@ def _draw(job: ViewJob, read: tuple, size: tuple[int, int], progress) -> tuple[l
     except SceneError as error:  # rays
         raise SceneError(f"{error}; --shadows off draws the view without") from error
     finally:
-        renderer.shadows = None
+        renderer.shadows = renderer.rest = None
         if hasattr(gpu, "init"):
             _renderer[:] = [renderer]
         else:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import bpy
 import gpu
 import numpy as np
@@ -38,6 +40,7 @@ class SurfacePass:
     def __init__(self, before: SurfacePass | None = None):
         self._before, self._is_glass = before, before is not None
         self._through: tuple | None = None
+        self._shares: list | None = None
         self._size = self._depth = None
         self._targets: dict = {}
         if before is not None:
@@ -77,6 +80,19 @@ class SurfacePass:
         shining = [one for one in instances if any(np.any(it.look.emission) or it.look.glow > 0.0 for it in one.looks)]
         if shining:
             self._add(EMISSION, [(0, shining)], view, frame_buffer)
+
+    def add_share_of_cycles(self, instances: list[ShownInstance], view: ViewCamera, frame_buffer) -> None:
+        """Add 1 to `frame_buffer` where the surfaces drawn last are Cycles' alone in views with bounces."""
+        if self._shares is None:
+            values = np.zeros((2, LOOK_SIZE, 4))
+            values[1, 1, :3] = 1.0  # the emission of a look
+            self._shares = [uniform_buffer(one) for one in values]
+        marked = [
+            replace(one, looks=tuple(replace(it, uniforms=self._shares[it.look.is_of_cycles]) for it in one.looks))
+            for one in instances
+            if any(it.look.is_of_cycles for it in one.looks)
+        ]
+        self._add(EMISSION, [(0, marked)], view, frame_buffer)
 
     def through(self, instances: list[ShownInstance], view: ViewCamera) -> gpu.types.GPUTexture:
         """The texture (RGB) of the share of light from behind that the surfaces drawn last let through."""

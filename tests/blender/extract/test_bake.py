@@ -13,7 +13,6 @@ from material_scenes import Build
 from scene_parts import add_plane, principled
 
 from ltsh_addon import imaging
-from ltsh_addon.blender import render_settings
 from ltsh_addon.cycles import lobes
 from ltsh_addon.pipeline import bake
 from ltsh_addon.scene import QuadLight, SurfaceSamples
@@ -292,9 +291,6 @@ def test_apply_saves_a_file_whose_object_shows_the_texture(tmp_path):
     # A light shines on emission in vain: the picture is the texture, texel for pixel.
     scene = bpy.context.scene
     scene.render.resolution_x = scene.render.resolution_y = SIZE
-    scene.render.engine, scene.cycles.samples = "CYCLES", 1
-    render_settings.render_exr(scene, tmp_path / "picture.exr")
-    channels = imaging.read_channels(tmp_path / "picture.exr")
-    rendered = lobes.read_layer(channels, "Combined", "RGB")
+    rendered = lobes.read_layer(scene_parts.cycles_channels(tmp_path), "Combined", "RGB")
     # Cycles keeps the texture in half precision and blends neighbors by a thousandth of a texel.
     assert np.abs(rendered - combined).max() <= 5e-3 * combined.max()

@@ -151,18 +151,15 @@ def test_sheen_is_that_of_this_cycles():
 def test_the_albedos_of_velvet_are_those_of_this_cycles(tmp_path, roughness):
     """A ball under a sky of radiance 1 shines as bright as its albedo. 1024 samples of a lobe that Cycles samples
     uniformly leave 1 % of noise where few of them count, at the rough end less."""
-    scene = scene_parts.empty_scene(16, 16)
+    scene_parts.empty_scene(16, 16)
     made, node = bsdf_material("ShaderNodeBsdfSheen", Color=(1.0, 1.0, 1.0, 1.0), Roughness=roughness)
     node.distribution = "ASHIKHMIN"
     scene_parts.add_sphere(made, radius=1.0, segments=128)
     scene_parts.add_top_camera(2.0)
     scene_parts.add_white_world()
-    scene.render.engine, scene.cycles.samples, scene.cycles.max_bounces = "CYCLES", 1024, 0
-    scene.cycles.use_adaptive_sampling = scene.cycles.use_denoising = False
-    scene.cycles.pixel_filter_type, scene.cycles.filter_width = "GAUSSIAN", 0.01
-    render_settings.enable_passes(bpy.context.view_layer, ("combined", "normal", "glossy_direct", "glossy_color"))
-    render_settings.render_exr(scene, tmp_path / "velvet.exr")
-    channels = imaging.read_channels(tmp_path / "velvet.exr")
+    settings = {"max_bounces": 0, "pixel_filter_type": "GAUSSIAN", "filter_width": 0.01}
+    passes = ("combined", "normal", "glossy_direct", "glossy_color")
+    channels = scene_parts.cycles_channels(tmp_path, 1024, passes, **settings)
     names = render_settings.pass_names()
     light, color = (read_layer(channels, names[f"specular_{part}"], "RGB")[..., 0] for part in ("light", "color"))
     normal = read_layer(channels, "Normal", "XYZ")

@@ -8,7 +8,7 @@ import scene_parts
 from ltsh_addon import imaging
 from ltsh_addon.blender import render_settings
 from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels
-from ltsh_addon.blender.render_settings import enable_passes, render_exr
+from ltsh_addon.cycles.lobes import read_layer
 from ltsh_addon.pipeline import PictureOptions, shade_scene
 from ltsh_addon.scene import SceneError
 
@@ -23,13 +23,9 @@ def room(width=26, height=15):
     return scene
 
 
-def plain_positions(folder, scene):
+def plain_positions(folder):
     """Position (H, W, 3) as a plain render of the open file shows it: its first sample is at the pixels' centers."""
-    scene.render.engine, scene.cycles.samples = "CYCLES", 1
-    scene.cycles.use_denoising = False
-    enable_passes(scene.view_layers[0], ("combined", "position"))
-    render_exr(scene, folder / "plain.exr")
-    return imaging.read_layers(folder / "plain.exr")[f"{scene.view_layers[0].name}.Position"]
+    return read_layer(scene_parts.cycles_channels(folder, 1, ("combined", "position")), "Position", "XYZ")
 
 
 def saved(folder):
@@ -91,7 +87,7 @@ def test_the_picture_is_that_of_a_plain_render(tmp_path, case):
     scene = room()
     CASES[case](scene, scene.camera.data)
     path = saved(tmp_path)
-    expected = plain_positions(tmp_path, scene)
+    expected = plain_positions(tmp_path)
     found = extract_pixels(PixelJob(path))
     assert found.warnings == () and positions(found).shape == expected.shape
     # The first sample of a plain render is at the center as ours is, up to 1e-3 of a pixel by Cycles' table, which the
@@ -161,9 +157,9 @@ def test_shifted_rays_are_the_pixels_of_a_finer_picture(tmp_path, fit, kind, asp
     moved = {}
     for i, j in ((0, 2), (3, 4)):
         with render_settings.shifted_pixels(scene, np.array([i - 2, 2 - j]) / 5.0):
-            moved[i, j] = plain_positions(tmp_path, scene)
+            moved[i, j] = plain_positions(tmp_path)
     scene.render.resolution_percentage = 500
-    fine = plain_positions(tmp_path, scene)
+    fine = plain_positions(tmp_path)
     for (i, j), coarse in moved.items():
         difference = np.linalg.norm(fine[j::5, i::5] - coarse, axis=-1)
         # A pixel is 0.15 m; its center is met to 1e-3 pixels, in either picture.
@@ -194,7 +190,7 @@ def test_markers_choose_the_camera_of_the_frame_and_a_named_one_wins(tmp_path):
     path = saved(tmp_path)
     for frame, name in ((10, "At 1.0"), (20, "At 2.0")):
         scene.frame_set(frame)
-        expected = plain_positions(tmp_path, scene)
+        expected = plain_positions(tmp_path)
         assert scene.camera.name == name
         found = extract_pixels(PixelJob(path, frame=frame))
         assert found.picture.camera == name and np.abs(positions(found) - expected).max() < 0.01
@@ -202,10 +198,7 @@ def test_markers_choose_the_camera_of_the_frame_and_a_named_one_wins(tmp_path):
     for marker in scene.timeline_markers:
         marker.camera = None
     scene.camera = first
-    assert (
-        named.picture.camera == "Camera"
-        and np.median(np.abs(positions(named) - plain_positions(tmp_path, scene))) < 2e-4
-    )
+    assert named.picture.camera == "Camera" and np.median(np.abs(positions(named) - plain_positions(tmp_path))) < 2e-4
 
 
 def test_pictures_of_no_pixels_are_refused_in_one_line(tmp_path):
@@ -229,7 +222,7 @@ def test_a_given_size_replaces_the_percentage(tmp_path):
 
 def test_stereo_pictures_become_one_from_the_middle(tmp_path):
     scene = room()
-    expected = plain_positions(tmp_path, scene)
+    expected = plain_positions(tmp_path)
     scene.render.use_multiview = True
     found = extract_pixels(PixelJob(saved(tmp_path)))
     assert any("stereoscopy" in line for line in found.warnings)

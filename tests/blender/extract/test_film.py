@@ -10,7 +10,7 @@ def test_film_exposure_is_that_of_a_render(tmp_path):
     scene = tiles()
     plain, _ = compared(tmp_path)
     scene.cycles.film_exposure = 2.5
-    report, layers = check_like_plain(tmp_path, scene)
+    report, layers = check_like_plain(tmp_path)
     assert report["exposure"] == 2.5 and report["warnings"] == []
     # Errors are relative and the radiance of a light is that of the scene: neither knows of the film.
     assert report["lights"] == plain["lights"]
@@ -38,7 +38,7 @@ def test_the_view_layer_shows_what_a_render_shows(tmp_path, setting):
         layer.material_override = diffuse("Override", (0.1, 0.9, 0.2))
     else:
         setattr(layer.layer_collection.children["Tiles"], setting, True)
-    report, layers = check_like_plain(tmp_path, scene)
+    report, layers = check_like_plain(tmp_path)
     tile = layers["ltc.diffuse"][8, 7], layers["coverage.hit"][8, 7]
     assert report["warnings"] == []
     if "holdout" in setting:

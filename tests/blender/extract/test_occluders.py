@@ -1,7 +1,6 @@
 """What blocks light, against the shadows of Cycles under a light so small that a point is lit or not."""
 
 import re
-from dataclasses import dataclass
 
 import bpy
 import numpy as np
@@ -177,10 +176,70 @@ def test_what_casts_no_shadow_blocks_nothing(tmp_path):
 # Materials:
 
 
-def alpha_image(made, **settings):
+def noise(made):
+    return made.tree.nodes.new("ShaderNodeTexNoise").outputs[0]
+
+
+def procedural(made):
+    return made.mix(noise(made), made.leaf(0.5), clear(made))
+
+
+def with_alpha(made, alpha):
+    """A Principled BSDF with the output of a node as its alpha."""
     inside = made.shader("BsdfPrincipled")
-    made.tree.links.new(textured(made, "Alpha", **settings), inside.node.inputs["Alpha"])
+    made.tree.links.new(alpha, inside.node.inputs["Alpha"])
     return inside
+
+
+def alpha_image(made, **settings):
+    return with_alpha(made, textured(made, "Alpha", **settings))
+
+
+def counted(made, source, *steps, number_first=False):
+    """The output of Math nodes after `source`, each (operation, number, clamp)."""
+    for operation, number, clamp in steps:
+        node = made.tree.nodes.new("ShaderNodeMath")
+        node.operation, node.use_clamp, node.inputs[1 - number_first].default_value = operation, clamp, number
+        made.tree.links.new(source, node.inputs[int(number_first)])
+        source = node.outputs[0]
+    return source
+
+
+def cut_alpha(made, *steps, operation="GREATER_THAN", **settings):
+    """The alpha of an image, above or below a threshold, and what `steps` of `counted` make of it."""
+    return counted(made, textured(made, "Alpha", **settings), (operation, 0.4, False), *steps)
+
+
+def cut_image(made, **settings):
+    return with_alpha(made, cut_alpha(made, **settings))
+
+
+def clamped_cut(made, **settings):
+    """A threshold of which a clamped difference is taken: alphas of 0.25 and 0.75."""
+    return with_alpha(made, cut_alpha(made, ("SUBTRACT", 0.5, True), ("ADD", 0.25, False), **settings))
+
+
+def mixed_by_cut(made, **settings):
+    cut = cut_alpha(made, operation="LESS_THAN", **settings)
+    factor = counted(made, cut, ("SUBTRACT", 1.0, False), number_first=True)
+    return made.mix(factor, clear(made, 0.9), made.mix(made.value(0.5), made.leaf(0.5), clear(made)))
+
+
+def mixed_by_more_than_one(made, **settings):
+    """By an alpha of up to 2, which Cycles clamps."""
+    factor = counted(made, textured(made, "Alpha", **settings), ("MULTIPLY", 2.0, False))
+    return made.mix(factor, clear(made, 0.2), clear(made, 0.8))
+
+
+def limited(made, **settings):
+    node = made.tree.nodes.new("ShaderNodeClamp")
+    node.clamp_type, node.inputs["Min"].default_value, node.inputs["Max"].default_value = "RANGE", 0.7, 0.2
+    made.tree.links.new(textured(made, "Alpha", **settings), node.inputs[0])
+    return with_alpha(made, node.outputs[0])
+
+
+def by_ray(made, output, first, second):
+    return made.mix(made.tree.nodes.new("ShaderNodeLightPath").outputs[output], first, second)
 
 
 def mapped_image(made):
@@ -198,86 +257,16 @@ def mixed_by_image(made, **settings):
     return made.mix(textured(made, "Color", space="sRGB", **settings), clear(made, 0.2), clear(made, 0.8))
 
 
-def is_shadow_ray(made):
-    node = made.tree.nodes.new("ShaderNodeLightPath")
-    return made.mix(node.outputs["Is Shadow Ray"], made.shader("BsdfGlass"), clear(made, 0.7))
-
-
-def is_camera_ray(made):
-    node = made.tree.nodes.new("ShaderNodeLightPath")
-    return made.mix(node.outputs["Is Camera Ray"], made.leaf(0.5), clear(made))
-
-
 def stack(made):
     return made.mix(made.value(0.5), clear(made, 0.5), made.mix(made.value(0.25), made.leaf(0.5), clear(made)))
 
 
-def cut_alpha(made, operation="GREATER_THAN", **settings):
-    """The alpha of an image, above or below a threshold."""
-    node = made.tree.nodes.new("ShaderNodeMath")
-    node.operation, node.inputs[1].default_value = operation, 0.4
-    made.tree.links.new(textured(made, "Alpha", **settings), node.inputs[0])
-    return node.outputs[0]
-
-
-def cut_image(made, **settings):
-    inside = made.shader("BsdfPrincipled")
-    made.tree.links.new(cut_alpha(made, **settings), inside.node.inputs["Alpha"])
-    return inside
-
-
-def mixed_by_cut(made, **settings):
-    node = made.tree.nodes.new("ShaderNodeMath")
-    node.operation, node.inputs[0].default_value = "SUBTRACT", 1.0
-    made.tree.links.new(cut_alpha(made, "LESS_THAN", **settings), node.inputs[1])
-    return made.mix(node.outputs[0], clear(made, 0.9), made.mix(made.value(0.5), made.leaf(0.5), clear(made)))
-
-
 def ramped(made, steps="CONSTANT", **settings):
-    inside, node = made.shader("BsdfPrincipled"), made.tree.nodes.new("ShaderNodeValToRGB")
+    node = made.tree.nodes.new("ShaderNodeValToRGB")
     node.color_ramp.interpolation = steps
     node.color_ramp.elements[0].position, node.color_ramp.elements[1].position = 0.2, 0.7
     made.tree.links.new(textured(made, "Alpha", **settings), node.inputs[0])
-    made.tree.links.new(node.outputs["Color"], inside.node.inputs["Alpha"])
-    return inside
-
-
-def counted(made, source, *steps):
-    """The output of Math nodes after `source`, each (operation, number, clamp)."""
-    for operation, number, clamp in steps:
-        node = made.tree.nodes.new("ShaderNodeMath")
-        node.operation, node.use_clamp, node.inputs[1].default_value = operation, clamp, number
-        made.tree.links.new(source, node.inputs[0])
-        source = node.outputs[0]
-    return source
-
-
-def clamped_cut(made, **settings):
-    """A threshold of which a clamped difference is taken: alphas of 0.25 and 0.75."""
-    inside = made.shader("BsdfPrincipled")
-    alpha = counted(made, cut_alpha(made, **settings), ("SUBTRACT", 0.5, True), ("ADD", 0.25, False))
-    made.tree.links.new(alpha, inside.node.inputs["Alpha"])
-    return inside
-
-
-def mixed_by_more_than_one(made, **settings):
-    """By an alpha of up to 2, which Cycles clamps."""
-    return made.mix(counted(made, textured(made, "Alpha", **settings), ("MULTIPLY", 2.0, False)),
-                    clear(made, 0.2), clear(made, 0.8))  # fmt: skip
-
-
-def limited(made, **settings):
-    inside, node = made.shader("BsdfPrincipled"), made.tree.nodes.new("ShaderNodeClamp")
-    node.clamp_type, node.inputs["Min"].default_value, node.inputs["Max"].default_value = "RANGE", 0.7, 0.2
-    made.tree.links.new(textured(made, "Alpha", **settings), node.inputs[0])
-    made.tree.links.new(node.outputs[0], inside.node.inputs["Alpha"])
-    return inside
-
-
-def more_than_opaque(made):
-    inside = made.shader("BsdfPrincipled")
-    made.tree.links.new(made.value(1.6), inside.node.inputs["Alpha"])
-    return made.mix(made.value(0.5), clear(made), inside)
+    return with_alpha(made, node.outputs["Color"])
 
 
 CUT = {"above a threshold": cut_image, "below a threshold": mixed_by_cut, "ramp of steps": ramped,
@@ -287,13 +276,13 @@ CUT = {"above a threshold": cut_image, "below a threshold": mixed_by_cut, "ramp 
 # What a pane's share is, if it is the same everywhere.
 MATERIALS = {
     "constant": (lambda made: made.mix(made.value(0.3), made.leaf(0.5), clear(made)), 0.3),
-    "alpha beyond 1": (more_than_opaque, 0.5),
+    "alpha beyond 1": (lambda made: made.mix(made.value(0.5), clear(made), with_alpha(made, made.value(1.6))), 0.5),
     "principled alpha": (lambda made: made.shader("BsdfPrincipled", Alpha=0.35), 0.65),
     "added": (lambda made: made.add(clear(made, 0.25), made.add(clear(made, 0.25), made.leaf(0.5))), 0.5),
     "nested": (stack, 0.375),
     "holdout": (lambda made: made.mix(made.value(0.5), made.shader("Holdout"), clear(made)), 0.5),
-    "shadow rays": (is_shadow_ray, 0.7),
-    "camera rays": (is_camera_ray, 0.0),
+    "shadow rays": (lambda made: by_ray(made, "Is Shadow Ray", made.shader("BsdfGlass"), clear(made, 0.7)), 0.7),
+    "camera rays": (lambda made: by_ray(made, "Is Camera Ray", made.leaf(0.5), clear(made)), 0.0),
     "alpha of an image": (alpha_image, None),
     "clipped image": (lambda made: alpha_image(made, extension="CLIP"), None),
     "mapped image": (mapped_image, None),
@@ -386,10 +375,6 @@ NAMED = {
 }
 
 
-def procedural(made):
-    return made.mix(made.tree.nodes.new("ShaderNodeTexNoise").outputs[0], made.leaf(0.5), clear(made))
-
-
 @pytest.mark.parametrize("name", NAMED)
 def test_what_is_not_as_in_cycles_is_named(name):
     start()
@@ -400,13 +385,9 @@ def test_what_is_not_as_in_cycles_is_named(name):
     elif name == "color under alpha":
         pane(shown(mixed_by_image))
         bpy.data.images["Mask"].alpha_mode = "STRAIGHT"
-    elif name.startswith("hidden"):
+    elif name == "hidden from reflections":
         ob = pane(scene_parts.principled("Pane")[0])
-        ob.name, ob.visible_shadow, ob.visible_glossy = (
-            "Pane",
-            name.endswith("reflections"),
-            name.endswith("shadow rays"),
-        )
+        ob.name, ob.visible_glossy = "Pane", False
     elif name.endswith("same place"):
         ob = pane(scene_parts.principled("Material")[0])
         ob.name = "Pane"
@@ -447,21 +428,11 @@ def test_what_is_not_as_in_cycles_is_named(name):
     assert seen_by_rays(occluders)[0].min() == pytest.approx(share, abs=1e-5)
 
 
-def noise(made):
-    return made.tree.nodes.new("ShaderNodeTexNoise").outputs[0]
-
-
-def with_alpha_by_noise(made):
-    node = made.tree.nodes.new("ShaderNodeBsdfPrincipled")
-    made.tree.links.new(noise(made), node.inputs["Alpha"])
-    return node.outputs[0]
-
-
 # Materials whose transparency Cycles alone knows, and half of the most that they may let through.
 UNREAD = {
     "between two": (lambda made: made.mix(noise(made), clear(made, 0.2), clear(made, 0.9)), 0.45),
     "a fifth": (lambda made: made.mix(0.2, made.leaf(0.5), procedural(made)), 0.1),
-    "alpha": (with_alpha_by_noise, 0.5),
+    "alpha": (lambda made: with_alpha(made, noise(made)), 0.5),
     "and a half more": (lambda made: made.mix(0.5, clear(made), procedural(made)), 0.5),
 }
 
@@ -616,23 +587,17 @@ def two_lights(key_blockers=None, fill_blockers=None):
         light.light_linking.blocker_collection = collection
 
 
-@dataclass
-class Linked:
-    key: dict | None
-    fill: dict | None
-
-
 LINKED = {
-    "neither": Linked(None, None),
-    "included": Linked({"A": "INCLUDE"}, None),
-    "excluded": Linked({"A": "EXCLUDE"}, {"B": "EXCLUDE"}),
-    "both kinds": Linked({"A": "INCLUDE", "B": "EXCLUDE"}, {"B": "INCLUDE"}),
+    "neither": (None, None),
+    "included": ({"A": "INCLUDE"}, None),
+    "excluded": ({"A": "EXCLUDE"}, {"B": "EXCLUDE"}),
+    "both kinds": ({"A": "INCLUDE", "B": "EXCLUDE"}, {"B": "INCLUDE"}),
 }
 
 
 @pytest.mark.parametrize("name", LINKED)
 def test_blockers_of_lights_are_those_of_cycles(tmp_path, name):
-    two_lights(LINKED[name].key, LINKED[name].fill)
+    two_lights(*LINKED[name])
     places = {"Key": LIGHT, "Fill": np.array([-1.0, -0.8, 4.0])}
     for light in places:
         other = next(ob for ob in places if ob != light)

@@ -70,7 +70,7 @@ def test_edges_are_those_of_a_plain_render(tmp_path, kind, width):
             scene.cycles.pixel_filter_type, scene.cycles.filter_width = "GAUSSIAN", 3.0
         found = extract_pixels(PixelJob(path, sub_samples=count))
         white = found.film.image(found.samples.diffuse_albedo)[..., 0]
-        _, plain = plain_diffuse(tmp_path, scene, samples=1024)
+        _, plain = plain_diffuse(tmp_path, samples=1024)
         errors[name] = np.abs(white - plain[..., 0])
     assert white.min() == 0.0 and white.max() > 0.9 and ((white > 0.1) & (white < 0.9)).sum() > 60
     # The discrepancy of n points for half-planes is about n^(-3/4) (Beck 1987), and a pixel sees up to two edges. On
@@ -81,10 +81,10 @@ def test_edges_are_those_of_a_plain_render(tmp_path, kind, width):
 
 def test_shaded_edges_are_those_of_a_plain_render_and_of_the_reference(tmp_path):
     """All the way: radiance with --aa 64 in the filter that files have by default."""
-    scene = stripes("BLACKMAN_HARRIS", 1.5)
+    stripes("BLACKMAN_HARRIS", 1.5)
     report, layers = compared(tmp_path, sub_samples=64, cycles_samples=1024)
     assert report["pixel_filter"] == "BLACKMAN_HARRIS 1.5 px"
-    plain, _ = plain_diffuse(tmp_path, scene, samples=1024)
+    plain, _ = plain_diffuse(tmp_path, samples=1024)
     peak = plain.max()
     for name in ("ltc.diffuse", "cycles.diffuse"):
         error = np.abs(layers[name] - plain) / peak

@@ -1,13 +1,13 @@
 """A scene for tests of film, layers and filters, its comparison and its plain render."""
 
-import bpy
 import numpy as np
 import scene_parts
 from lit_plane import into_collection
 from scene_parts import add_plane, bsdf_material
 
 from ltsh_addon import imaging
-from ltsh_addon.blender.render_settings import enable_passes, render_exr
+from ltsh_addon.blender.render_settings import pass_names
+from ltsh_addon.cycles.lobes import read_layer
 from ltsh_addon.pipeline import PictureOptions, compare_scene
 
 SIZE = (26, 16)
@@ -31,18 +31,12 @@ def tiles():
     return scene
 
 
-def plain_diffuse(folder, scene, samples=256):
+def plain_diffuse(folder, samples=256):
     """Direct diffuse radiance and diffuse color (H, W, 3) of a plain render of the open file through its own pixel
     filter."""
-    scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", samples, False
-    scene.cycles.use_adaptive_sampling = False
-    layer = next(layer for layer in scene.view_layers if layer.use)
-    enable_passes(layer, ("combined", "diffuse_direct", "diffuse_color"))
-    render_exr(scene, folder / "plain.exr")
-    layers = imaging.read_layers(folder / "plain.exr")
-    old = bpy.app.version < (5, 0, 0)
-    light, color = ("DiffDir", "DiffCol") if old else ("Diffuse Direct", "Diffuse Color")
-    return layers[f"{layer.name}.{light}"] * layers[f"{layer.name}.{color}"], layers[f"{layer.name}.{color}"]
+    channels = scene_parts.cycles_channels(folder, samples, ("combined", "diffuse_direct", "diffuse_color"))
+    light, color = (read_layer(channels, pass_names()[f"diffuse_{part}"], "RGB") for part in ("light", "color"))
+    return light * color, color
 
 
 def compared(folder, **options):
@@ -53,10 +47,10 @@ def compared(folder, **options):
     return report, imaging.read_layers(folder / "out" / "compare.exr")
 
 
-def check_like_plain(folder, scene, **options):
+def check_like_plain(folder, **options):
     """All agree: technique, reference, and a plain render of the file; returns the report."""
     report, layers = compared(folder, **options)
-    plain, _ = plain_diffuse(folder, scene)
+    plain, _ = plain_diffuse(folder)
     for name in ("ltc.diffuse", "cycles.diffuse"):
         # The noise of 256 samples, and the mean over a pixel against its center; edges lie between pixels.
         assert np.linalg.norm(layers[name] - plain) < 0.02 * np.linalg.norm(plain), name

@@ -7,6 +7,9 @@ import numpy as np
 import quadrature
 import scene_parts
 
+from ltsh_addon.cycles.lobes import read_layer
+from ltsh_addon.imaging.exr import read_channels
+
 BRDFS = {"diffuse": quadrature.lambert, "specular": quadrature.ggx}
 
 
@@ -23,18 +26,41 @@ def start(width=24, height=16):
     return scene
 
 
-def compare(folder, samples=256, count=16):
-    """Errors of the quadrature against Cycles as {lobe: (relative L2 beyond noise, bias)}, and the prepared scene."""
-    prepared = scene_parts.prepare()
+def measured(folder, samples, prepared=None):
+    """The prepared scene, what its pixels see, and Cycles' halves (2, P, 3) there by lobe."""
+    prepared = prepared or scene_parts.prepare()
     ((surface, pixel, unusable),) = scene_parts.sample(folder, prepared)[0]
     assert unusable == 0 and len(surface) > 0
     images = scene_parts.reference(folder, prepared, samples)
+    return prepared, surface, {name: images[name].reshape(2, -1, 3)[:, pixel].astype(np.float64) for name in BRDFS}
+
+
+def combined_by_group(folder, prepared, samples, groups):
+    """Halves (2, P, 3) of Cycles' Combined pass of `groups` of lights ("" for all light), at all pixels."""
+    # The preparation takes passes of the user's own out, these among them.
+    for name in filter(None, groups):
+        prepared[1].lightgroups.add(name=name)
+    scene_parts.reference(folder, prepared, samples)
+    halves = {name: [] for name in groups}
+    for half in "AB":
+        chunks = [read_channels(path) for path in sorted(folder.glob(f"cycles_{half}_*.exr"))]
+        # Chunks hold 16 samples first and the rest after: weighted as `render_reference` says.
+        weights = np.array([16.0] + [(samples / 2.0 - 16.0) / (len(chunks) - 1)] * (len(chunks) - 1))
+        for name in groups:
+            layer = f"Combined_{name}" if name else "Combined"
+            images = [read_layer(chunk, layer, "RGB").reshape(-1, 3) for chunk in chunks]
+            halves[name].append(np.average(np.array(images, np.float64), axis=0, weights=weights))
+    return {name: np.array(images) for name, images in halves.items()}
+
+
+def compare(folder, samples=256, count=16):
+    """Errors of the quadrature against Cycles as {lobe: (relative L2 beyond noise, bias)}, and the prepared scene."""
+    prepared, surface, halves = measured(folder, samples)
     errors = {}
     lights = [patch for light in prepared[2].lights for patch in light.leaves]
     for lobe, brdf in BRDFS.items():
-        halves = images[lobe].reshape(2, -1, 3)[:, pixel].astype(np.float64)
         expected = quadrature.radiance(surface, lights, brdf, count=count)
-        errors[lobe] = quadrature.relative_l2(expected, halves), quadrature.bias(expected, halves)
+        errors[lobe] = quadrature.relative_l2(expected, halves[lobe]), quadrature.bias(expected, halves[lobe])
     return errors, prepared
 
 

@@ -8,8 +8,7 @@ import scene_parts
 from material_scenes import Build
 
 from ltsh_addon.blender.process.blender_process import embree_libraries
-from ltsh_addon.blender.render_settings import enable_passes, pass_names, pinned_pixel_filter, render_exr
-from ltsh_addon.imaging.exr import read_channels
+from ltsh_addon.blender.render_settings import pass_names, pinned_pixel_filter
 from ltsh_addon.visibility import open_tracer
 
 SIZE = (48, 32)
@@ -57,15 +56,10 @@ def floor_points():
 
 def seen_by_cycles(folder, light=LIGHT):
     """Share (N,) of the light that reaches the floor in Cycles."""
-    scene = bpy.context.scene
-    scene.render.engine = "CYCLES"
-    cycles = scene.cycles
-    cycles.samples, cycles.max_bounces, cycles.use_adaptive_sampling, cycles.use_denoising = 1, 0, False, False
-    cycles.light_sampling_threshold = cycles.sample_clamp_direct = 0.0
-    enable_passes(bpy.context.view_layer, ("combined", "diffuse_direct"))
-    with pinned_pixel_filter(scene):
-        render_exr(scene, folder / "cycles.exr")
-    channels, wanted = read_channels(folder / "cycles.exr"), f"{pass_names()['diffuse_light']}.R"
+    settings = dict.fromkeys(("max_bounces", "light_sampling_threshold", "sample_clamp_direct"), 0)
+    with pinned_pixel_filter(bpy.context.scene):
+        channels = scene_parts.cycles_channels(folder, 1, ("combined", "diffuse_direct"), **settings)
+    wanted = f"{pass_names()['diffuse_light']}.R"
     found = next(values for name, values in channels.items() if name.endswith(wanted)).ravel()
     power = 1000.0 / math.pi  # times cosine over pi, twice: at the light, whose area takes its radiance, and the floor
     to_light = light - floor_points()

@@ -213,6 +213,17 @@ def metal_room(path: Path) -> Path:
     return save(path)
 
 
+def cycles_channels(folder: Path, samples=1, passes=("combined",), **settings):
+    """Channels of the open scene as Cycles itself renders it, with these of its settings."""
+    scene = bpy.context.scene
+    scene.render.engine, scene.cycles.samples = "CYCLES", samples
+    for name, value in {"use_adaptive_sampling": False, "use_denoising": False, **settings}.items():
+        setattr(scene.cycles, name, value)
+    render_settings.enable_passes(bpy.context.view_layer, passes)
+    render_settings.render_exr(scene, folder / "cycles.exr")
+    return read_channels(folder / "cycles.exr")
+
+
 def prepare(with_occluders=False):
     """The scene's preparation as the child does it; (scene, view layer, light inventory, warnings)."""
     scene, warnings = bpy.context.scene, []

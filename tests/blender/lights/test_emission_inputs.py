@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 import quadrature
 import scene_parts
-from lit_plane import LAMP_CORNERS, add_lamp, lamp_material, light_tree
+from lit_plane import LAMP_CORNERS, add_lamp, combined_by_group, lamp_material, light_tree, measured
 
 from ltsh_addon import shading
 from ltsh_addon.blender.lights import meshes, textures
-from ltsh_addon.cycles import lobes
-from ltsh_addon.imaging.exr import read_channels
 
 # Outputs by node, with the names that they have below.
 INPUTS = {
@@ -56,15 +54,31 @@ def output_of(tree, name):
     return tree.nodes.new(f"ShaderNode{INPUTS[kind][0]}").outputs[output.replace("_", " ")]
 
 
-def shine_by(tree, emission, output):
-    """Let the strength be 0.2 more than the weighted sum of x, y and z of `output`, which counts as positive."""
-    total, size, more = (tree.nodes.new(f"ShaderNode{kind}") for kind in ("VectorMath", "Math", "Math"))
-    total.operation, size.operation, more.operation = "DOT_PRODUCT", "ABSOLUTE", "ADD"
-    total.inputs[1].default_value, more.inputs[1].default_value = WEIGHTS, 0.2
+def size_of(tree, output, weights):
+    """The output of nodes that give the weighted sum of x, y and z of `output`, which counts as positive."""
+    total, size = (tree.nodes.new(f"ShaderNode{kind}") for kind in ("VectorMath", "Math"))
+    total.operation, size.operation, total.inputs[1].default_value = "DOT_PRODUCT", "ABSOLUTE", weights
     tree.links.new(output, total.inputs[0])
     tree.links.new(total.outputs["Value"], size.inputs[0])
-    tree.links.new(size.outputs[0], more.inputs[0])
+    return size.outputs[0]
+
+
+def shine_by(tree, emission, output):
+    """Let the strength be 0.2 more than the size of `output`."""
+    more = tree.nodes.new("ShaderNodeMath")
+    more.operation, more.inputs[1].default_value = "ADD", 0.2
+    tree.links.new(size_of(tree, output, WEIGHTS), more.inputs[0])
     tree.links.new(more.outputs[0], emission.inputs["Strength"])
+
+
+def floor(width=10, height=6):
+    """A gray floor and an empty object."""
+    scene = scene_parts.empty_scene(width, height)
+    scene_parts.add_camera()
+    gray = scene_parts.bsdf_material("ShaderNodeBsdfDiffuse", "Floor", Color=(0.8, 0.8, 0.8, 1.0))[0]
+    scene_parts.add_plane(gray, size=12.0)
+    scene_parts.link(bpy.data.objects.new("Other", None), (0.3, -0.4, 0.7), (0.5, 0.2, 1.0), (0.7, 1.2, 1.0))
+    return scene
 
 
 def add_shining(name, number, settings):
@@ -89,34 +103,13 @@ def add_shining(name, number, settings):
     return light
 
 
-def halves_by_group(folder, prepared, samples):
-    """Cycles' Combined pass of each light by itself (2, P, 3), at all pixels."""
-    for name in NAMES:
-        prepared[1].lightgroups.add(name=name)
-    scene_parts.reference(folder, prepared, samples)
-    halves = {name: [] for name in NAMES}
-    for half in "AB":
-        chunks = [read_channels(path) for path in sorted(folder.glob(f"cycles_{half}_*.exr"))]
-        # As `render_reference` says.
-        weights = np.array([16.0] + [(samples / 2.0 - 16.0) / (len(chunks) - 1)] * (len(chunks) - 1))
-        for name in NAMES:
-            images = [lobes.read_layer(chunk, f"Combined_{name}", "RGB").reshape(-1, 3) for chunk in chunks]
-            halves[name].append(np.average(np.array(images, np.float64), axis=0, weights=weights))
-    return {name: np.array(images) for name, images in halves.items()}
-
-
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_nodes_of_lights_read_is_what_cycles_gives_them(tmp_path, monkeypatch, kind):
     settings, named = KINDS[kind]
     # Enough for what is smooth.
     for module, name in ((textures, "VIEW_PIXELS"), (textures, "PIXELS"), (meshes, "PIXELS")):
         monkeypatch.setattr(module, name, 64)
-    scene = scene_parts.empty_scene(10, 6)
-    scene_parts.add_camera()
-    floor = scene_parts.bsdf_material("ShaderNodeBsdfDiffuse", "Floor", Color=(0.8, 0.8, 0.8, 1.0))[0]
-    scene_parts.add_plane(floor, size=12.0)
-    other = bpy.data.objects.new("Other", None)
-    scene_parts.link(other, (0.3, -0.4, 0.7), (0.5, 0.2, 1.0), (0.7, 1.2, 1.0))
+    scene = floor()
     for number, name in enumerate(NAMES):
         scene.view_layers[0].lightgroups.add(name=name)
         add_shining(name, number, settings)
@@ -125,7 +118,7 @@ def test_what_nodes_of_lights_read_is_what_cycles_gives_them(tmp_path, monkeypat
     # A sun is as far away as the world is: no ray to it has a length.
     assert warned == named | NAMED_EVERYWHERE, warned ^ (named | NAMED_EVERYWHERE)
     ((surface, pixel, _),) = scene_parts.sample(tmp_path, prepared)[0]
-    halves = halves_by_group(tmp_path, prepared, 4096)
+    halves = combined_by_group(tmp_path, prepared, 4096, NAMES)
     shaded = shading.shade(surface, prepared[2].lights, "reference", workers=1)
     by_light, groups = shaded.specular + shaded.diffuse, [light.group for light in prepared[2].lights]
     found = {name: by_light[[group == name for group in groups]].sum(axis=0) for name in NAMES}
@@ -147,19 +140,14 @@ def test_what_nodes_of_lights_read_is_what_cycles_gives_them(tmp_path, monkeypat
 
 def test_a_sheared_mesh_is_looked_at_as_it_stands(tmp_path):
     """Under a turned parent of other scale along one axis: the picture was that of a rectangle."""
-    scene_parts.empty_scene(12, 8)
-    scene_parts.add_camera()
-    floor = scene_parts.bsdf_material("ShaderNodeBsdfDiffuse", "Floor", Color=(0.8, 0.8, 0.8, 1.0))[0]
-    scene_parts.add_plane(floor, size=12.0)
+    floor(12, 8)
     lamp = add_shining("Geometry Position", 0, {})
     parent = scene_parts.link(bpy.data.objects.new("Parent", None), scale=(1.0, 2.0, 0.8))
     lamp.parent = parent
-    prepared = scene_parts.prepare()
-    ((surface, pixel, _),) = scene_parts.sample(tmp_path, prepared)[0]
-    halves = scene_parts.reference(tmp_path, prepared, 1024)["diffuse"].reshape(2, -1, 3)[:, pixel]
+    prepared, surface, halves = measured(tmp_path, 1024)
     found = shading.shade(surface, prepared[2].lights, "reference", workers=1).diffuse.sum(axis=0, dtype=np.float64)
-    assert quadrature.relative_l2(found, halves.astype(np.float64)) < 0.01
-    assert abs(quadrature.bias(found, halves.astype(np.float64))) < 0.01
+    assert quadrature.relative_l2(found, halves["diffuse"]) < 0.01
+    assert abs(quadrature.bias(found, halves["diffuse"])) < 0.01
 
 
 WORLDS = {
@@ -171,38 +159,16 @@ WORLDS = {
 @pytest.mark.parametrize("inputs", WORLDS.values(), ids=WORLDS)
 def test_what_nodes_of_worlds_read_is_what_cycles_gives_them(tmp_path, inputs):
     """Three of them at once, as red, green and blue."""
-    scene_parts.empty_scene(10, 6)
-    scene_parts.add_camera()
-    floor = scene_parts.bsdf_material("ShaderNodeBsdfDiffuse", "Floor", Color=(0.8, 0.8, 0.8, 1.0))[0]
-    scene_parts.add_plane(floor, size=12.0)
-    scene_parts.link(bpy.data.objects.new("Other", None), (0.3, -0.4, 0.7), (0.5, 0.2, 1.0), (0.7, 1.2, 1.0))
+    floor()
     world, sky = scene_parts.add_world()
     tree = world.node_tree
     color = tree.nodes.new("ShaderNodeCombineColor")
     for name, channel in zip(inputs, color.inputs, strict=True):
-        value = tree.nodes.new("ShaderNodeVectorMath")
-        value.operation, value.inputs[1].default_value = "DOT_PRODUCT", (0.6, -0.5, 0.4)
-        size = tree.nodes.new("ShaderNodeMath")
-        size.operation = "ABSOLUTE"
-        tree.links.new(output_of(tree, name), value.inputs[0])
-        tree.links.new(value.outputs["Value"], size.inputs[0])
-        tree.links.new(size.outputs[0], channel)
+        tree.links.new(size_of(tree, output_of(tree, name), (0.6, -0.5, 0.4)), channel)
     tree.links.new(color.outputs[0], sky.inputs["Color"])
-    prepared = scene_parts.prepare()
+    prepared, surface, halves = measured(tmp_path, 1024)
     assert prepared[3] == []
-    ((surface, pixel, _),) = scene_parts.sample(tmp_path, prepared)[0]
-    halves = scene_parts.reference(tmp_path, prepared, 1024)["diffuse"].reshape(2, -1, 3)[:, pixel].astype(np.float64)
     found = shading.shade(surface, prepared[2].lights, "reference", workers=1).diffuse.sum(axis=0, dtype=np.float64)
     for channel, name in enumerate(inputs):
-        own, expected = found[:, channel : channel + 1], halves[..., channel : channel + 1]
+        own, expected = found[:, channel : channel + 1], halves["diffuse"][..., channel : channel + 1]
         assert quadrature.relative_l2(own, expected) < 0.015 and abs(quadrature.bias(own, expected)) < 0.01, name
-
-
-def test_a_world_that_depends_on_the_camera_is_named():
-    scene_parts.empty_scene(8, 8)
-    scene_parts.add_camera()
-    scene_parts.add_plane()
-    world, sky = scene_parts.add_world()
-    place = world.node_tree.nodes.new("ShaderNodeTexCoord").outputs["Window"]
-    world.node_tree.links.new(place, sky.inputs["Color"])
-    assert sum("'World'" in line and "Window" in line for line in scene_parts.prepare()[3]) == 1

@@ -4,31 +4,11 @@ import bpy
 import numpy as np
 import pytest
 import scene_parts
-from lit_plane import add_instancer, add_lamp_plane, into_collection, start
+from lit_plane import add_instancer, add_lamp_plane, combined_by_group, into_collection, start
 
-from ltsh_addon.cycles import lobes
-from ltsh_addon.imaging.exr import read_channels
 from ltsh_addon.shading import shade
 
 GROUPS = ("Keys", "Lamps")
-
-
-def combined_by_group(folder, prepared, samples):
-    """Halves (2, P, 3) of Cycles' Combined pass by light group ("" for all light), at the pixels of the samples."""
-    # The preparation takes passes of the user's own out, these among them.
-    for name in GROUPS:
-        prepared[1].lightgroups.add(name=name)
-    scene_parts.reference(folder, prepared, samples)
-    halves = {}
-    for half in "AB":
-        chunks = [read_channels(path) for path in sorted(folder.glob(f"cycles_{half}_*.exr"))]
-        for group in ("", *GROUPS):
-            name = f"Combined_{group}" if group else "Combined"
-            # Chunks hold 16 samples first and the rest after: weighted as `render_reference` says.
-            weights = np.array([16.0] + [(samples / 2.0 - 16.0) / (len(chunks) - 1)] * (len(chunks) - 1))
-            images = [lobes.read_layer(chunk, name, "RGB").reshape(-1, 3).astype(np.float64) for chunk in chunks]
-            halves.setdefault(group, []).append(np.average(images, axis=0, weights=weights))
-    return {group: np.array(images) for group, images in halves.items()}
 
 
 @pytest.fixture
@@ -51,7 +31,7 @@ def test_groups_are_those_of_cycles_and_sum_up(tmp_path, grouped_scene):
         "Second key": "Keys"
     }
     ((surface, pixel, _),) = scene_parts.sample(tmp_path, prepared)[0]
-    found = combined_by_group(tmp_path, prepared, 512)
+    found = combined_by_group(tmp_path, prepared, 512, ("", *GROUPS))
     shaded = shade(surface, lights, "reference")
     by_light = shaded.specular + shaded.diffuse
     image = {name: by_light[[light.group == name for light in lights]].sum(axis=0) for name in GROUPS}

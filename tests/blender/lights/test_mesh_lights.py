@@ -65,17 +65,6 @@ def test_a_mesh_lights_as_in_cycles(tmp_path, name):
     assert len(inventory.lights) == count and warnings == []
 
 
-def test_only_the_lit_side_of_a_closed_mesh_shines():
-    start()
-    add_lamp_ball()
-    center = np.array([0.0, 1.0, 1.2])
-    for light in scene_parts.prepare()[2].lights:
-        assert np.dot(light.center - center, light.direction) > 0.0
-        corners = light.polygon()
-        normal = np.cross(corners - light.center, np.roll(corners, -1, axis=0) - light.center).sum(axis=0)
-        assert np.dot(normal, light.direction) > 0.0
-
-
 def test_a_shell_around_the_camera_shines_inward(tmp_path):
     scene_parts.empty_scene(16, 12)
     scene_parts.add_camera()

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import quadrature
 import scene_parts
+from lit_plane import measured
 
 from ltsh_addon.blender.lights.area import overlapping_pairs
 from ltsh_addon.blender.viewport import still
@@ -25,10 +26,9 @@ def two_lights(apart=0.0, **settings):
 
 def excess(folder, prepared):
     """By what the quadrature exceeds Cycles, as a share of the quadrature."""
-    ((surface, pixel, _),) = scene_parts.sample(folder, prepared)[0]
-    halves = scene_parts.reference(folder, prepared, 256)["specular"].reshape(2, -1, 3)[:, pixel]
+    _, surface, halves = measured(folder, 256, prepared)
     expected = quadrature.radiance(surface, prepared[2].lights, quadrature.ggx, 48)
-    return 1.0 - halves.mean(axis=0).sum() / expected.sum()
+    return 1.0 - halves["specular"].mean(axis=0).sum() / expected.sum()
 
 
 def test_cycles_loses_light_and_the_warning_says_how_much(tmp_path):

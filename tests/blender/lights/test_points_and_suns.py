@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import quadrature
 import scene_parts
-from lit_plane import along_x, light_tree
+from lit_plane import along_x, light_tree, measured
 
 from ltsh_addon import shading
 
@@ -46,14 +46,18 @@ def add_light(kind="POINT", location=(0.2, 1.6, 1.6), rotation=(-0.75, 0.1, 0.2)
     return scene_parts.link(bpy.data.objects.new(kind.title(), light), location, rotation, scale)
 
 
-def rendered(folder, samples=256):
-    """A plane that is diffuse and glossy: (lights, warnings, samples, Cycles' halves (2, P, 3) by pass)."""
-    prepared = scene_parts.prepare()
-    ((surface, pixel, unusable),) = scene_parts.sample(folder, prepared)[0]
-    assert unusable == 0
-    images = scene_parts.reference(folder, prepared, samples)
-    halves = {name: images[name].reshape(2, -1, 3)[:, pixel].astype(np.float64) for name in ("specular", "diffuse")}
-    return prepared[2].lights, prepared[3], surface, halves
+def assert_as_cycles(folder, limit, samples=256, bias=None, **others):
+    """All lights by the reference within a `limit`, and by the techniques `others` within theirs; the lights."""
+    (_, _, inventory, warnings), surface, halves = measured(folder, samples)
+    lights = inventory.lights
+    assert warnings == []
+    for technique, most in {"reference": limit, **others}.items():
+        found = shading.shade(surface, lights, technique, workers=1)
+        for lobe in ("diffuse", "specular"):
+            values = getattr(found, lobe).sum(axis=0, dtype=np.float64)
+            assert quadrature.relative_l2(values, halves[lobe]) < most, (technique, lobe)
+            assert abs(quadrature.bias(values, halves[lobe])) < (bias or most), (technique, lobe)
+    return lights
 
 
 def plane_scene(roughness=0.4):
@@ -68,14 +72,7 @@ def test_point_spot_and_sun_are_those_of_cycles(tmp_path, name):
     add_light(**CASES[name])
     # Light from everywhere is noisy.
     samples = 2048 if name in ("wide sun", "point around the camera") else 256
-    lights, warnings, surface, halves = rendered(tmp_path, samples)
-    assert len(lights) == 1 and warnings == []
-    for technique, limit in (("reference", 3e-3), ("ltsh4", 1.5e-2)):
-        found = shading.shade(surface, lights, technique, workers=1)
-        for lobe in ("diffuse", "specular"):
-            values = getattr(found, lobe)[0].astype(np.float64)
-            assert quadrature.relative_l2(values, halves[lobe]) < limit, (technique, lobe)
-            assert abs(quadrature.bias(values, halves[lobe])) < limit, (technique, lobe)
+    assert len(assert_as_cycles(tmp_path, 3e-3, samples, ltsh4=1.5e-2)) == 1
 
 
 def with_nodes(kind, make, **settings):
@@ -118,16 +115,8 @@ def test_nodes_of_points_are_those_of_cycles(tmp_path, kind, nodes):
     plane_scene()
     settings = {"angle": 0.2, "energy": 3.0} if kind == "SUN" else {"shadow_soft_size": 0.2}
     with_nodes(kind, nodes, **settings)
-    lights, warnings, surface, halves = rendered(tmp_path)
-    assert warnings == []
     # Stripes vary by 5 % over the sun, of which the mean is taken: a highlight sees it.
-    middle = 1.2e-2 if kind == "SUN" and nodes is stripes else 6e-3
-    for technique, limit in (("reference", middle), ("ltsh4", 1.5e-2)):
-        found = shading.shade(surface, lights, technique, workers=1)
-        for lobe in ("diffuse", "specular"):
-            values = getattr(found, lobe)[0].astype(np.float64)
-            assert quadrature.relative_l2(values, halves[lobe]) < limit, (technique, lobe)
-            assert abs(quadrature.bias(values, halves[lobe])) < limit, (technique, lobe)
+    assert_as_cycles(tmp_path, 1.2e-2 if kind == "SUN" and nodes is stripes else 6e-3, ltsh4=1.5e-2)
 
 
 def by_place(tree):
@@ -140,12 +129,7 @@ def test_patterns_go_with_the_radius_as_in_cycles(tmp_path, nodes, radius):
     """A light without one emits as at its middle, with the normal that points where it shines."""
     plane_scene()
     with_nodes("POINT", nodes, shadow_soft_size=radius)
-    lights, warnings, surface, halves = rendered(tmp_path)
-    assert len(lights) == 1 and warnings == []
-    found = shading.shade(surface, lights, "reference", workers=1)
-    for lobe in ("diffuse", "specular"):
-        values = getattr(found, lobe)[0].astype(np.float64)
-        assert quadrature.relative_l2(values, halves[lobe]) < 6e-3, lobe
+    assert len(assert_as_cycles(tmp_path, 6e-3)) == 1
 
 
 def pattern_by_direction(kind, texture, fineness, **settings):
@@ -172,13 +156,7 @@ def test_sharp_patterns_are_those_of_cycles(tmp_path, name):
     plane_scene()
     kind, texture, fineness, settings = GOBOS[name]
     pattern_by_direction(kind, texture, fineness, **settings)
-    lights, warnings, surface, halves = rendered(tmp_path)
-    assert warnings == []
-    found = shading.shade(surface, lights, "reference", workers=1)
-    for lobe in ("diffuse", "specular"):
-        values = getattr(found, lobe).sum(axis=0, dtype=np.float64)
-        assert quadrature.relative_l2(values, halves[lobe]) < 3e-2, lobe
-        assert abs(quadrature.bias(values, halves[lobe])) < 1e-2, lobe
+    assert_as_cycles(tmp_path, 3e-2, bias=1e-2)
 
 
 @pytest.mark.newest
@@ -226,9 +204,11 @@ def distance_beyond_noise(found, halves):
     return math.sqrt(max((products.sum() - 3.0 * math.sqrt(np.square(products).sum())) / power, 0.0))
 
 
-def check_random_scene(folder, seed):
+@pytest.mark.parametrize("seed", range(8))
+def test_random_scenes_with_all_kinds_of_lights_are_those_of_cycles(tmp_path, seed):
     random_scene(seed)
-    lights, _, surface, halves = rendered(folder, 512)
+    prepared, surface, halves = measured(tmp_path, 512)
+    lights = prepared[2].lights
     steep = (surface.normal * surface.view).sum(axis=1) >= 0.2
     # Twice what single lights are held to.
     found = shading.shade(surface, lights, "reference", workers=1)
@@ -239,14 +219,3 @@ def check_random_scene(folder, seed):
     found = shading.shade(surface, lights, "ltsh4", workers=1).combined.astype(np.float64)
     distance = distance_beyond_noise(found[steep], sum(halves.values())[:, steep])
     assert distance < 3e-2, (seed, distance, [light.name for light in lights])
-
-
-@pytest.mark.parametrize("seed", range(8))
-def test_random_scenes_with_all_kinds_of_lights_are_those_of_cycles(tmp_path, seed):
-    check_random_scene(tmp_path, seed)
-
-
-@pytest.mark.soak
-@pytest.mark.parametrize("seed", range(8, 200))
-def test_many_random_scenes_are_those_of_cycles(tmp_path, seed):
-    check_random_scene(tmp_path, seed)

@@ -97,11 +97,7 @@ def test_without_material_the_surface_is_cycles_default(tmp_path, slots):
         plane.data.materials.append(None)
     scene_parts.add_area_light("Other")
     scene_parts.add_top_camera()
-    scene = bpy.context.scene
-    scene.render.engine, scene.cycles.samples, scene.cycles.max_bounces = "CYCLES", 1, 0
-    render_settings.enable_passes(bpy.context.view_layer, ("combined", "diffuse_color", "glossy_color"))
-    render_settings.render_exr(scene, tmp_path / "untouched.exr")
-    untouched = scene_parts.read_channels(tmp_path / "untouched.exr")
+    untouched = scene_parts.cycles_channels(tmp_path, 1, ("combined", "diffuse_color", "glossy_color"), max_bounces=0)
     names = render_settings.pass_names()
     expected = lobes.read_layer(untouched, names["diffuse_color"], "RGB").reshape(-1, 3)
     glossy = lobes.read_layer(untouched, names["specular_color"], "RGB").any()
@@ -193,11 +189,7 @@ def test_colors_under_a_cut_alpha_are_those_of_the_image(tmp_path, kind):
 
 
 def test_every_unsupported_input_is_named_once(tmp_path):
-    wanted = {
-        "Subsurface Weight": 0.2,
-        "Transmission Weight": 0.1,
-        "Thin Film Thickness": 100.0,
-    }
+    wanted = {"Subsurface Weight": 0.2, "Transmission Weight": 0.1, "Thin Film Thickness": 100.0}
     material, node = principled("Rich")
     if "Thin Wall" in node.inputs:
         wanted["Thin Wall"] = True

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 import scene_parts
 
-from ltsh_addon.blender import render_settings
 from ltsh_addon.blender.materials.graph import constant_of
 from ltsh_addon.blender.materials.values import Curved, Value, curved_at, limited, value_at
 
@@ -97,12 +96,8 @@ class Shown:
         ob.data.polygons.foreach_set("material_index", np.minimum(np.arange(rows * COLUMNS), count - 1))
         scene_parts.add_top_camera(max(COLUMNS, rows))
         scene.render.resolution_x, scene.render.resolution_y = COLUMNS, rows
-        scene.render.engine, cycles = "CYCLES", scene.cycles
-        cycles.samples, cycles.max_bounces, cycles.use_adaptive_sampling, cycles.use_denoising = 1, 0, False, False
-        cycles.sample_clamp_direct, cycles.pixel_filter_type = 0.0, "BOX"
-        render_settings.enable_passes(bpy.context.view_layer, ("combined",))
-        render_settings.render_exr(scene, folder / "shown.exr")
-        channels = scene_parts.read_channels(folder / "shown.exr")
+        settings = {"max_bounces": 0, "sample_clamp_direct": 0.0, "pixel_filter_type": "BOX"}
+        channels = scene_parts.cycles_channels(folder, **settings)
         name = next(name for name in channels if name.endswith("Combined.R"))[:-1]
         return np.stack([channels[name + color] for color in "RGB"], axis=-1).reshape(-1, 3)[:count]
 
@@ -267,35 +262,6 @@ def test_nodes_that_are_not_read_are_unknown():
         shown.start()
         shown.show(shown.node(name))
     assert shown.read() == [None] * len(UNREAD)
-
-
-@pytest.mark.parametrize("kind", ["Mix", "MixRGB"])
-def test_a_sum_of_colors_is_clamped(kind):
-    shown = Shown()
-    shown.start()
-    settings = {"data_type": "RGBA", "clamp_result": True} if kind == "Mix" else {"use_clamp": True}
-    output = shown.node(kind, blend_type="ADD", **settings)
-    entries = [entry for entry in output.node.inputs if entry.enabled]
-    entries[0].default_value = 1.0
-    for entry in entries[1:]:
-        entry.default_value = (0.8, 0.1, 0.8, 1.0)
-    shown.show(output)
-    (value,) = shown.read()
-    assert np.allclose(value.offset, (1.0, 0.2, 1.0))
-
-
-def test_a_threshold_is_clamped_before_what_follows():
-    shown = Shown()
-    shown.start()
-    output = shown.image("Alpha")
-    for operation, number, clamp in (("GREATER_THAN", 0.5, False), ("SUBTRACT", 0.5, True), ("ADD", 0.5, False)):
-        node = scene_parts.add_node(shown.tree, "ShaderNodeMath")
-        node.operation, node.use_clamp, node.inputs[1].default_value = operation, clamp, number
-        shown.tree.links.new(output, node.inputs[0])
-        output = node.outputs[0]
-    shown.show(output, as_number=True)
-    (value,) = shown.read()
-    assert np.allclose(np.interp([0.0, 0.49, 0.51, 1.0], value.places, value.numbers), [0.5, 0.5, 1.0, 1.0])
 
 
 def test_limits_leave_images_alone_that_are_within_them():

@@ -123,22 +123,6 @@ def test_a_shader_that_is_used_twice_is_one_lobe(tmp_path):
     assert np.abs(samples.specular_f90[::2] - (0.5 * (1.0 - u) + 0.5)[:, None]).max() < EXACT
 
 
-def test_a_group_that_is_used_twice_has_its_own_values_in_each_place(tmp_path):
-    s = Shaders()
-
-    def fill(roughness):
-        glossy = s.glossy()
-        s.link(roughness, glossy.node.inputs["Roughness"])
-        return glossy
-
-    first, second = s.group(fill, [s.value(0.2)], times=2)
-    s.link(s.value(0.7), second.node.inputs[0])
-    tree = first.node.node_tree
-    samples, pixel, _ = seen_from_above(tmp_path, s.show(s.mix(s.texture_u(), s.mix(0.5, first, s.diffuse()), second)))
-    assert np.array_equal(np.bincount(pixel), np.full(24 * 16, 3)) and len(tree.nodes) == 3
-    assert np.abs(samples.roughness.reshape(-1, 3)[:, [0, 2]] - (0.2, 0.7)).max() < EXACT
-
-
 def test_more_lobes_than_slots_keep_the_largest(tmp_path):
     s = Shaders()
     shader = s.glossy()

@@ -7,7 +7,6 @@ import scene_parts as parts
 
 from ltsh_addon import imaging
 from ltsh_addon.cycles.lobes import read_layer
-from ltsh_addon.imaging.exr import read_channels
 from ltsh_addon.pipeline import PictureOptions, compare_scene, shade_scene
 
 SIZE, SAMPLES = 24, 512
@@ -43,12 +42,8 @@ def room(transparent):
 
 def rendered(folder):
     """Combined (H, W, 4) of the open scene by Cycles, from the centers of the pixels."""
-    scene = bpy.context.scene
-    scene.render.engine, scene.cycles.samples, scene.cycles.use_adaptive_sampling = "CYCLES", SAMPLES, False
-    scene.cycles.use_denoising, scene.cycles.seed = False, 5
-    with parts.render_settings.pinned_pixel_filter(scene):
-        parts.render_settings.render_exr(scene, folder / "cycles.exr")
-    return read_layer(read_channels(folder / "cycles.exr"), "Combined", "RGBA").astype(float)
+    with parts.render_settings.pinned_pixel_filter(bpy.context.scene):
+        return read_layer(parts.cycles_channels(folder, SAMPLES, seed=5), "Combined", "RGBA").astype(float)
 
 
 @pytest.mark.parametrize("transparent", [False, True], ids=["opaque film", "transparent film"])

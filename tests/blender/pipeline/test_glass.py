@@ -7,7 +7,6 @@ import scene_parts as parts
 
 from ltsh_addon import imaging
 from ltsh_addon.cycles.lobes import read_layer
-from ltsh_addon.imaging.exr import read_channels
 from ltsh_addon.pipeline import PictureOptions, compare_scene, shade_scene
 
 SIZE, POINTS, SAMPLES = (40, 24), 9, 256
@@ -59,14 +58,10 @@ def glass(kind):
 
 def rendered(folder):
     """Combined (H, W, 3) of the open scene by Cycles, in which light bounces at glass alone."""
-    scene, cycles = bpy.context.scene, bpy.context.scene.cycles
-    scene.render.engine, cycles.samples, cycles.use_adaptive_sampling = "CYCLES", SAMPLES, False
-    cycles.use_denoising, cycles.pixel_filter_type = False, "BOX"
-    cycles.max_bounces, cycles.diffuse_bounces, cycles.glossy_bounces, cycles.transmission_bounces = 12, 0, 12, 12
-    cycles.caustics_reflective = cycles.caustics_refractive = False
-    cycles.sample_clamp_indirect = 0.0
-    parts.render_settings.render_exr(scene, folder / "cycles.exr")
-    return read_layer(read_channels(folder / "cycles.exr"), "Combined", "RGB").astype(float)
+    settings = dict.fromkeys(("max_bounces", "glossy_bounces", "transmission_bounces"), 12)
+    off = ("diffuse_bounces", "caustics_reflective", "caustics_refractive", "sample_clamp_indirect")
+    settings |= {**dict.fromkeys(off, 0), "pixel_filter_type": "BOX"}
+    return read_layer(parts.cycles_channels(folder, SAMPLES, **settings), "Combined", "RGB").astype(float)
 
 
 def shaded(folder, **options):

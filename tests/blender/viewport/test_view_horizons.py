@@ -2,7 +2,7 @@
 
 import itertools
 from dataclasses import fields, replace
-from functools import partial
+from unittest.mock import patch
 
 import bpy
 import gpu
@@ -19,8 +19,9 @@ from ltsh_addon import shading
 from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels
 from ltsh_addon.blender.viewport.light_texels import upload_lights
 from ltsh_addon.blender.viewport.lighting import HorizonPass
+from ltsh_addon.cycles import horizons
 from ltsh_addon.cycles.horizons import SMALLEST_ANGLE, horizon_excess, lobe_selection_pmf, smooth_horizon_share
-from ltsh_addon.cycles.light_tree import light_bounds_at, light_tree_rows, selection_pmf
+from ltsh_addon.cycles.light_tree import light_bounds_at, selection_pmf
 from ltsh_addon.scene import SurfaceSamples
 
 WIDTH, HEIGHT = 32, 16
@@ -37,17 +38,17 @@ def read(texture):
     return np.array(values, np.float32).astype(np.float64).reshape(-1, 4)
 
 
-def chances_in_one_leaf(position, normal, lights):
+def chances_in_one_leaf(position, normal, lights, rows):
     """Those of lights, which the card takes for one leaf of the tree."""
-    return selection_pmf(light_bounds_at(position, normal, lights, light_tree_rows(lights)))
+    return selection_pmf(light_bounds_at(position, normal, lights, rows))
 
 
 def shares(samples, lights, threshold=0.5):
     """Shares (P,) of the lobes that end at the smooth horizon; a mask (P,) of samples for which neither rounding can
     turn the choice at the `threshold` nor no light is between the horizons."""
     of_lobes = lobe_selection_pmf(samples, np.arange(len(samples)), False)
-    choose = partial(chances_in_one_leaf, lights=lights)
-    by_lobe, by_light = horizon_excess(samples, lights, of_lobes, choose, is_quick=True)
+    with patch.object(horizons, "light_selection_pmf", chances_in_one_leaf):
+        by_lobe, by_light = horizon_excess(samples, lights, of_lobes, is_quick=True)
     # Of what is between the horizons where they cross, one part may cancel the other.
     is_sum = np.abs(by_lobe + by_light) >= TIE * (np.abs(by_lobe) + np.abs(by_light))
     share = smooth_horizon_share(by_lobe, by_light)

@@ -21,17 +21,12 @@ from view_pictures import (
 )
 
 from ltsh_addon import shading
-from ltsh_addon.blender.engine.overlay import (
-    LIGHTS_PANEL,
-    MATERIALS_PANEL,
-    QuietLine,
-    left_out,
-    wrapped,
-)
+from ltsh_addon.blender.engine.overlay import LIGHTS_PANEL, MATERIALS_PANEL, QuietLine, left_out, wrapped
+from ltsh_addon.blender.lights.emission import emission_of
 from ltsh_addon.blender.lights.world import light_of_world
 from ltsh_addon.blender.materials import preview_material
 from ltsh_addon.blender.materials.preview_material import preview_of
-from ltsh_addon.blender.ui import panels
+from ltsh_addon.blender.ui import panels, preflight
 from ltsh_addon.blender.viewport.light_texels import constant_sky
 from ltsh_addon.blender.viewport.mirror import SceneMirror, ShownLook
 from ltsh_addon.blender.viewport.pictures import ShownPicture
@@ -81,15 +76,14 @@ def coated(name, **inputs):
     return bsdf(name, Base_Color=RED, **{"Roughness": 0.5, "Coat_Weight": 1.0, **inputs})
 
 
-def coated_normal_map(follows):
-    """A bumpy base under a coat that is as bumpy, or smooth."""
+def bumpy(values):
+    """A function that makes the material of a normal map with other inputs; a bumpy coat is as bumpy as its base."""
 
     def make():
         material = normal_map()
         node = next(node for node in material.node_tree.nodes if node.bl_idname == "ShaderNodeBsdfPrincipled")
-        bumps = {"Coat Normal": node.inputs["Normal"].links[0].from_socket} if follows else {}
-        fill(node, {"Coat Weight": 0.8, "Coat Roughness": 0.2, **bumps})
-        material.name = f"coat over bumps {follows}"
+        bumps = node.inputs["Normal"].links[0].from_socket
+        fill(node, {key: bumps if value == "bumps" else value for key, value in values.items()})
         return material
 
     return make
@@ -113,8 +107,8 @@ LAYERED = (
     coated("tinted varnish", Coat_Tint=AMBER, Coat_Roughness=0.15, Coat_IOR=1.35),
     coated("tint alone", Coat_Tint=AMBER, Coat_IOR=1.0),
     coated("car paint", Metallic=0.7, Coat_Roughness=0.1),
-    coated_normal_map(False),
-    coated_normal_map(True),
+    bumpy({"Coat Weight": 0.8, "Coat Roughness": 0.2}),
+    bumpy({"Coat Weight": 0.8, "Coat Roughness": 0.2, "Coat Normal": "bumps"}),
     made("mixed", *mixed(0.3)),
     made("added", "AddShader", {0: CHALK, 1: gloss()}),
     made("mostly gloss", *mixed(0.9)),
@@ -199,13 +193,6 @@ SCATTERED = (
 )
 
 
-def brushed_normal_map():
-    material = normal_map()
-    node = next(node for node in material.node_tree.nodes if node.bl_idname == "ShaderNodeBsdfPrincipled")
-    fill(node, {"Anisotropic": 0.8, "Metallic": 1.0, "Tangent": ("Tangent", {"direction_type": "UV_MAP"})})
-    return material
-
-
 BRUSHED = (
     bsdf("brushed", Base_Color=GOLD, Metallic=1.0, Anisotropic=0.7),
     bsdf("brushed plastic", Base_Color=RED, Roughness=0.4, Anisotropic=1.0, Anisotropic_Rotation=0.15),
@@ -215,18 +202,11 @@ BRUSHED = (
     bsdf("across", "BsdfAnisotropic", Anisotropy=-0.5, Roughness=0.9, Rotation=0.3),
     bsdf("brushed node", "BsdfMetallic", Anisotropy=0.5, Tangent=("NewGeometry.Tangent", {})),
     coated("brushed and coated", Anisotropic=0.9, Metallic=1.0, Coat_Roughness=0.2),
-    brushed_normal_map,
+    bumpy({"Anisotropic": 0.8, "Metallic": 1.0, "Tangent": ("Tangent", {"direction_type": "UV_MAP"})}),
     made(
         "some brushed", "MixShader", {0: 0.4, 1: CHALK, 2: ("BsdfAnisotropic", {"Anisotropy": 0.6, "Roughness": 0.5})}
     ),
 )
-
-
-def rough_normal_map():
-    material = normal_map()
-    node = next(node for node in material.node_tree.nodes if node.bl_idname == "ShaderNodeBsdfPrincipled")
-    fill(node, {"Diffuse Roughness": 0.7})
-    return material
 
 
 def rough(roughness, color=RED):
@@ -239,7 +219,7 @@ ROUGH = (
     made("smooth chalk", *rough(0.0)),
     bsdf("rough plastic", Base_Color=AMBER, Roughness=0.3, Diffuse_Roughness=0.5),
     coated("rough under a coat", Diffuse_Roughness=0.8, Coat_Roughness=0.2, Sheen_Weight=0.5),
-    rough_normal_map,
+    bumpy({"Diffuse Roughness": 0.7}),
     made("two roughs", "MixShader", {0: 0.4, 1: rough(0.3), 2: rough(0.9, GOLD)}),
     made("rough and brushed", "MixShader", {0: 0.4, 1: rough(0.6), 2: ("BsdfAnisotropic", {"Anisotropy": 0.6})}),
     bsdf("rough image", Diffuse_Roughness=0.6, Base_Color=("TexImage", {"image": "colors"})),
@@ -391,15 +371,19 @@ def test_long_lines_of_the_view_are_broken():
     # Between a toolbar and a sidebar of twice the scale there may be room for a word alone, or not even for that.
     narrow = [("No bounces", "red")]
     assert wrapped(narrow, 110.0, lambda part: 15.0 * len(part)) == [("No", "red"), ("bounces", "red")]
-    assert [part for part, _ in wrapped(narrow, 50.0, lambda part: 15.0 * len(part))] == [
-        "No",
-        "bou",
-        "nce",
-        "s",
-    ]
+    assert [part for part, _ in wrapped(narrow, 50.0, lambda part: 15.0 * len(part))] == ["No", "bou", "nce", "s"]
     # What counts is how wide the letters are.
     wide = wrapped([("ill ill ill WWW WWW WWW", "red")], 60.0, lambda part: sum(3 + 9 * (c == "W") for c in part))
     assert [part for part, _ in wide] == ["ill ill ill", "WWW", "WWW", "WWW"]
+
+
+def seen_plane(material):
+    """What a view shows of the diffuse light of a plane in an empty scene, and the notes."""
+    parts.add_plane(material)
+    parts.add_area_light()
+    camera = parts.add_camera()
+    bpy.context.view_layer.update()
+    return with_graphics(lambda: viewport_picture(camera, "diffuse"))
 
 
 @edits_with_graphics
@@ -409,11 +393,7 @@ def test_missing_images_are_pink_and_named():
     texture.image = bpy.data.images.new("lost.png", 4, 4)
     texture.image.source, texture.image.filepath = "FILE", "/nowhere/lost.png"
     texture.image.reload()
-    parts.add_plane(material)
-    parts.add_area_light()
-    camera = parts.add_camera()
-    bpy.context.view_layer.update()
-    picture, notes = with_graphics(lambda: viewport_picture(camera, "diffuse"))
+    picture, notes = seen_plane(material)
     red, green, blue = picture.reshape(-1, 3).max(axis=0)
     assert red > 0.1 and blue == pytest.approx(red) and green == 0.0
     assert notes == ["Lost: image 'lost.png' is missing, it is pink"]
@@ -431,11 +411,7 @@ def test_colors_under_alpha_are_those_of_cycles(is_used, interpolation):
     node.inputs["Specular IOR Level"].default_value = 0.0
     if is_used:
         material.node_tree.links.new(texture.outputs["Alpha"], node.inputs["Coat Roughness"])
-    parts.add_plane(material)
-    parts.add_area_light()
-    camera = parts.add_camera()
-    bpy.context.view_layer.update()
-    picture, _ = with_graphics(lambda: viewport_picture(camera, "diffuse"))
+    picture, _ = seen_plane(material)
     color = picture.reshape(-1, 3)[picture.sum(axis=-1).argmax()]
     values = np.array([0.8, 0.6, 0.4]) * (1.0 if is_used else 0.5)
     expected = np.where(values > 0.04045, ((values + 0.055) / 1.055) ** 2.4, values / 12.92)
@@ -463,10 +439,8 @@ def test_an_image_that_shines_is_seen_and_lights_as_its_mean():
             return picture[..., :3], opened.mirror.lights, opened.mirror.notes
 
     picture, lights, notes = with_graphics(draw)
-    height, width = picture.shape[:2]
     for row, column in np.ndindex(2, 2):
-        x, y = column - 0.5, row - 0.5
-        seen = picture[int((0.5 + y / (4.0 * height / width)) * height), int((0.5 + x / 4.0) * width)]
+        seen = at(picture, column - 0.5, row - 0.5)
         # Pictures of views are half floats.
         np.testing.assert_allclose(seen, 2.0 * colors[row, column, :3], rtol=2.0**-11, atol=1e-6)
     # It lights on both sides, as the mean of its image.
@@ -479,19 +453,28 @@ def test_an_image_that_shines_is_seen_and_lights_as_its_mean():
     assert notes[1:] == [f"Baked: it lights as the mean of its image, which is {size:.0f} % off its colors"]
 
 
-def test_nothing_of_the_file_is_changed():
+def test_what_reads_a_material_changes_nothing_of_the_file():
     parts.empty_scene()
     materials = [make() for make in MATERIALS]
 
     def content():
-        nodes = [node for material in materials for node in material.node_tree.nodes]
-        links = [link.to_socket.path_from_id() for material in materials for link in material.node_tree.links]
-        return [node.name for node in nodes], links, {made.name: tuple(made.pixels) for made in bpy.data.images}
+        trees = [*(material.node_tree for material in materials), *bpy.data.node_groups]
+        nodes = [(node.name, len(node.inputs), len(node.outputs)) for tree in trees for node in tree.nodes]
+        links = [link.to_socket.path_from_id() for tree in trees for link in tree.links]
+        return len(trees), nodes, links, {made.name: tuple(made.pixels) for made in bpy.data.images}
 
     before = content()
     for material in materials:
         preview_of(material)
+        preflight._material(material, in_view=False)
+        emission_of(material)
     assert content() == before
+
+
+def at(picture, x, y):
+    """The pixel of a place in meters, of the picture of a camera above that is 4 m wide."""
+    height, width = picture.shape[:2]
+    return picture[int((0.5 + y / (4.0 * height / width)) * height), int((0.5 + x / 4.0) * width)]
 
 
 def glass_wall(kind):
@@ -522,11 +505,6 @@ def test_glass_shows_what_is_behind_tinted_and_the_reflection_before_it(kind):
             return [[opened.draw(one, np.zeros((2, 2))) for _ in range(2)][1][..., :3] for one in shown]
 
     combined, specular, transmitted = with_graphics(draw)
-    height, width = combined.shape[:2]
-
-    def at(picture, x, y):
-        return picture[int((0.5 + y / (4.0 * height / width)) * height), int((0.5 + x / 4.0) * width)]
-
     world, glow = np.array([0.3, 0.2, 0.1]), np.array([0.2, 0.4, 0.8])
     fresnel = 0.04 if kind == "Glass" else 0.0
     through = (1.0 - fresnel) ** 2 * np.array([0.9, 0.5, 0.7]) ** 2

@@ -1,0 +1,529 @@
+"""The rest of a view's light: bounces, reflections, refraction, and materials that only Cycles knows.
+
+A view shows LTSH's direct light and, of surfaces that it cannot resolve, a guess. A second Blender renders the same
+view with Cycles, `render_rest`. What the view draws itself is taken out of each of its samples, so that its noise goes
+with it; what remains is denoised and added to the view.
+
+Surfaces `is_of_cycles` are Cycles' alone. An AOV tells their share m of a pixel, and the view draws the same share M:
+
+    rest = Combined - (1 - m) (direct light + background),  picture = (1 - M) (own light + background) + rest
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack, nullcontext
+from dataclasses import dataclass, field, replace
+from operator import methodcaller
+from pathlib import Path
+
+import bpy
+import numpy as np
+from mathutils import Matrix
+
+from ...files import temporary_folder
+from ...scene import SceneError, error_line
+from .. import render_settings
+from ..extract.finished import reasons_for_cycles
+from ..extract.pixels import open_scene, scene_named
+from ..materials.graph import ensure_nodes, live_link, material_output, tree_in_use
+from ..materials.preview_material import preview_of
+from ..process.blender_process import BlenderProcess
+from ..process.view import REST_PICTURE, RestJob, RestSum
+from ..render_settings import render_exr
+from ..saving import save_working_copy
+from .drawing import ViewCamera, float_texture
+from .pictures import ShownRest
+
+# MASK: the AOV with the share of a pixel that is Cycles' alone. SENSOR: the width of the camera's sensor in mm.
+MASK, SENSOR = "ltsh_of_cycles", 36.0
+CAMERA = "LTSH view"
+PASSES = ("combined", "diffuse_direct", "diffuse_color", "glossy_direct", "glossy_color", "environment")
+# Pairs of properties: what views take, and what renders take.
+LEVELS = (
+    ("show_viewport", "show_render"),
+    ("levels", "render_levels"),
+    ("resolution_u", "render_resolution_u"),
+    ("resolution_v", "render_resolution_v"),
+    ("resolution", "render_resolution"),
+    ("show_instancer_for_viewport", "show_instancer_for_render"),
+    ("simplify_subdivision", "simplify_subdivision_render"),
+    ("simplify_child_particles", "simplify_child_particles_render"),
+)
+# A step takes at most STEP_SECONDS, beside the first. FIRST: samples of the first, which has half of the pixels each
+# way. TOTALS: the samples after which a picture is shown. REST_SECONDS: how long a view must stay as it is before.
+STEP_SECONDS, FIRST, TOTALS, REST_SECONDS = 1.0, 4, (4, 8, 16, 32, 64), 0.3
+# Settings of a scene that change its light, beside those of Cycles.
+SCENE_SETTINGS = ("use_simplify", "simplify_subdivision", "film_transparent", "hair_type")
+
+
+@dataclass(frozen=True)
+class RestView:
+    """What a rest is of: a state of the scene, and a view of it."""
+
+    scene: str
+    view_layer: str
+    version: tuple[int, int]  # of the scene, and of all in it but lights
+    frame: int
+    hidden: tuple[str, ...]
+    matrices: tuple  # see `RestJob`
+    size: tuple[int, int]
+
+
+# REPLACED: data-blocks that are handed over by themselves, and the collections of `bpy.data` that have them.
+# NOT_NOTED: kinds that change nothing themselves; scenes have settings, and node trees come with their users.
+NOT_NOTED = ("Scene", "Camera", "Object")
+REPLACED = {bpy.types.Light: "lights", bpy.types.Material: "materials", bpy.types.World: "worlds"}
+
+
+@dataclass
+class RestChanges:
+    """What has changed in a scene since the second Blender has it."""
+
+    everything: bool = True  # too much to hand it over piece by piece
+    objects: set[str] = field(default_factory=set)  # names of those that were moved
+    blocks: set[tuple[str, str]] = field(default_factory=set)  # names of collections of `bpy.data`, and in these
+
+    def add(self, depsgraph, has_new_settings: bool) -> tuple[bool, bool]:
+        """Add what an update of the depsgraph changes; returns whether it is any light, and anything else."""
+        blocks = [(update, update.id.original) for update in depsgraph.updates]
+        has_material = any(isinstance(block, bpy.types.Material) for _, block in blocks)
+        has_lamp = any(isinstance(block, bpy.types.Light) for _, block in blocks)
+        has_light, has_other = False, has_new_settings
+        for update, block in blocks:
+            kind = next((name for one, name in REPLACED.items() if isinstance(block, one)), "")
+            if kind:
+                self.blocks.add((kind, block.name))
+                self.everything |= block.library is not None or _refers_to_objects(block)
+                has_light, has_other = has_light or kind != "materials", has_other or kind == "materials"
+            elif isinstance(block, bpy.types.Object) and block.type != "CAMERA":
+                is_light = block.type == "LIGHT"
+                has_light, has_other = has_light or is_light, has_other or not is_light
+                if update.is_updated_transform:
+                    self.objects.add(block.name)
+                # The geometry of lights is that of their data-blocks, and materials come with their users.
+                has_shape = update.is_updated_geometry and not is_light
+                is_known = update.is_updated_transform or (has_lamp if is_light else has_material)
+                self.everything |= has_shape or not is_known
+            elif block.bl_rna.identifier in NOT_NOTED or isinstance(block, bpy.types.NodeTree):
+                pass
+            elif not isinstance(block, bpy.types.Mesh) or update.is_updated_geometry:
+                has_other = self.everything = True
+        self.everything |= has_new_settings
+        return has_light, has_other
+
+    def written(self, scene, path: Path) -> dict:
+        """The record of the changes for the second Blender; data-blocks go to the .blend `path`."""
+        blocks = {getattr(bpy.data, kind)[name, None] for kind, name in self.blocks}
+        if blocks:
+            bpy.data.libraries.write(str(path), blocks, path_remap="ABSOLUTE", fake_user=True)
+        objects = {name: scene.objects[name] for name in sorted(self.objects)}
+        moved = {
+            name: [[*map(tuple, one)] for one in (ob.matrix_basis, ob.matrix_world)] for name, ob in objects.items()
+        }
+        return {"file": str(path), "blocks": sorted(self.blocks), "moved": moved}
+
+
+def _refers_to_objects(block) -> bool:
+    """True if nodes of the data-block, or of its groups, take coordinates or more from objects."""
+    trees, names = [block.node_tree], set()
+    while trees:
+        tree = trees.pop()
+        if tree is None or tree.name_full in names:
+            continue
+        names.add(tree.name_full)
+        if any(getattr(node, "object", None) is not None for node in tree.nodes):
+            return True
+        trees += [node.node_tree for node in tree.nodes if getattr(node, "node_tree", None) is not None]
+    return False
+
+
+@dataclass
+class _RestStep:
+    """A job on its way, and what it is added to."""
+
+    view: RestView
+    job: RestJob
+    total: RestSum
+    started: float
+    pixels: np.ndarray | None = None  # of the picture, if it is to be shown
+    seconds: float = 0.0
+    error: str = ""
+
+
+class LiveRest:
+    """The rest of one view. A second Blender renders it in steps while the view goes on; stale ones are not shown."""
+
+    def __init__(self):
+        self._stack: ExitStack | None = None
+        self._wanted: RestView | None = None
+        self._changed = 0.0
+        self._thread: threading.Thread | None = None
+        self._step: _RestStep | None = None
+        self._total = RestSum()  # of the view `_total_of`, in full resolution
+        self._total_of: RestView | None = None
+        self._opened: tuple | None = None  # the scene that the second Blender has
+        self._changes = RestChanges()  # since then
+        self._last_of: RestView | None = None  # the view of the last step that was begun
+        self._seconds = {}  # of a sample, by number of pixels
+        self._pixels: tuple[np.ndarray, RestView] | None = None  # the picture to upload
+        self._shown: tuple[ShownRest, RestView] | None = None
+        self._light: tuple | None = None  # the mean of the direct light that belongs to it, by `_light_key`
+        self._version, self._surfaces, self._settings = 0, 0, None  # of the scene; of all in it but lights
+        self.problem = ""
+
+    def note(self, depsgraph) -> None:
+        """Take note of the changes of the scene."""
+        settings, kinds = self._settings, bpy.types.Scene | bpy.types.Collection
+        if settings is None or any(isinstance(update.id, kinds) for update in depsgraph.updates):
+            settings = _settings_of(depsgraph)
+        has_light, has_other = self._changes.add(depsgraph, settings != self._settings)
+        if has_other or has_light:
+            self._version, self._settings, self.problem = self._version + 1, settings, ""
+            self._surfaces += has_other
+
+    def follow(self, context, depsgraph) -> None:
+        """Want the rest of the region of `context`."""
+        region, view, space = context.region, context.region_data, context.space_data
+        hidden = ()
+        if space.local_view is not None:
+            objects = depsgraph.view_layer.objects
+            hidden = tuple(ob.name for ob in objects if not ob.original.local_view_get(space))
+        matrices = tuple(tuple(map(tuple, one)) for one in (view.view_matrix, view.window_matrix))
+        names, version = (depsgraph.scene.name, depsgraph.view_layer.name), (self._version, self._surfaces)
+        size = region.width, region.height
+        wanted = RestView(*names, version, depsgraph.scene.frame_current, hidden, matrices, size)
+        if wanted != self._wanted:
+            self._wanted, self._changed = wanted, time.monotonic()
+
+    def shown(self) -> ShownRest | None:
+        """The last picture; needs an active GPU context. After changes of lights alone it follows the direct light."""
+        if self._pixels is not None:
+            pixels, view = self._pixels
+            camera = ViewCamera.of(*map(Matrix, view.matrices), view.matrices[1][3][3] == 1.0)
+            self._shown, self._pixels = (ShownRest(float_texture(pixels[::-1]), camera.projection), view), None
+        if self._shown is None:
+            return None
+        rest, view = self._shown
+        has_old_light = self._wanted.version != view.version and self._light is not None
+        return replace(rest, light=self._light[1]) if has_old_light and self._light[0] == self._light_key else rest
+
+    @property
+    def _light_key(self) -> tuple:
+        """What the mean direct light depends on, apart from lights."""
+        return self._shown[1].version, self._wanted.version[1], self._wanted.matrices, self._wanted.size
+
+    def keep_light(self, mean: Callable[[], np.ndarray]) -> None:
+        """Keep the mean (3,) of the direct light that belongs to the picture that is shown."""
+        if self._shown is None or self._shown[1].version != self._wanted.version:
+            return
+        if self._light is None or self._light[0] != self._light_key:
+            self._light = self._light_key, mean()
+
+    @property
+    def is_busy(self) -> bool:
+        """True while a better picture is to come."""
+        is_short = self._wanted is not None and self._samples < TOTALS[-1]
+        return self._thread is not None or (is_short and not self.problem)
+
+    @property
+    def _samples(self) -> int:
+        """Samples in full resolution of what is wanted."""
+        return self._total.samples if self._total_of == self._wanted else 0
+
+    @property
+    def seconds(self) -> float | None:
+        """About how long the last picture will still take; None: not known yet."""
+        width, height = (1, 1) if self._wanted is None else self._wanted.size
+        each = self._seconds.get(width * height)
+        return None if each is None else each * (TOTALS[-1] - self._samples)
+
+    def step(self) -> bool:
+        """Do the next step, in the main thread; True if there is a new picture."""
+        news = False
+        if self._thread is not None:
+            if self._thread.is_alive():
+                return False
+            news = self._finish()
+        is_at_rest = time.monotonic() - self._changed > REST_SECONDS
+        if self._wanted is not None and is_at_rest and self.is_busy:
+            try:
+                self._begin()
+            except (OSError, RuntimeError) as error:
+                self.problem = f"Bounces: {error_line(error)}"
+                news = True
+        return news
+
+    def _finish(self) -> bool:
+        """Take over what the last step has brought."""
+        step, self._thread, self._step = self._step, None, None
+        if step.error:
+            self._opened = self._last_of = None
+            # What cannot be handed over piece by piece goes as a whole.
+            self.problem = "" if step.job.changes is not None else step.error
+            return bool(self.problem)
+        self._seconds[step.job.width * step.job.height] = step.seconds / step.job.samples
+        if step.view != self._wanted:
+            return False
+        if (step.job.width, step.job.height) == step.view.size:
+            self._total, self._total_of = step.total, step.view
+        if step.pixels is None:
+            return False
+        self._pixels = step.pixels, step.view
+        return True
+
+    def _begin(self) -> None:
+        """Start the next step of what is wanted."""
+        wanted = self._wanted
+        if self._stack is None:
+            self._stack = ExitStack()
+            self._folder = self._stack.enter_context(temporary_folder())
+            self._process, self._opened = BlenderProcess(self._folder), None
+            self._stack.callback(self._process.end)
+        has_first = self._last_of == wanted
+        width, height = wanted.size if has_first else map(_half, wanted.size)
+        samples, total = FIRST, RestSum()
+        if has_first:
+            if self._total_of == wanted:
+                total = self._total
+            missing = next(count for count in TOTALS if count > total.samples) - total.samples
+            each = self._seconds.get(width * height) or 4.0 * self._seconds[_half(width) * _half(height)]
+            samples = min(missing, max(1, int(STEP_SECONDS / each)))
+        state, path, changes = (wanted.scene, wanted.view_layer, wanted.frame, wanted.hidden), None, None
+        if state != self._opened or self._changes.everything:
+            path, self._opened = self._folder / "scene.blend", state
+            save_working_copy(path)
+        elif self._changes.objects or self._changes.blocks:
+            changes = self._changes.written(bpy.data.scenes[wanted.scene], self._folder / "changes.blend")
+        self._changes = RestChanges(everything=False)
+        job = RestJob(
+            scene=path,
+            width=width,
+            height=height,
+            samples=samples,
+            seed=total.samples,
+            frame=wanted.frame,
+            scene_name=wanted.scene,
+            view_layer=wanted.view_layer,
+            matrices=wanted.matrices,
+            hidden=wanted.hidden,
+            changes=changes,
+        )
+        self._last_of = wanted
+        self._step = _RestStep(wanted, job, total, time.monotonic())
+        arguments = self._step, self._process, self._folder
+        self._thread = threading.Thread(target=_do_step, args=arguments, name="LTSH rest", daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the second Blender, and forget what it has rendered."""
+        stack = self._stack
+        vars(self).update(vars(LiveRest()))
+        if stack is not None:
+            stack.close()
+
+
+def _half(side: int) -> int:
+    return max(side // 2, 1)
+
+
+def _do_step(step: _RestStep, process: BlenderProcess, folder: Path) -> None:
+    """Do a step, in a thread of its own."""
+    try:
+        manifest = process.do(step.job, folder, None)
+        step.seconds = manifest["seconds"]
+        step.total.add(manifest, folder)
+        if step.total.samples in TOTALS:
+            step.pixels = step.total.picture()
+    except Exception as error:
+        step.error = f"Bounces: {error_line(error)}"
+
+
+def shown_objects(layer) -> list:
+    """The objects of a view layer that views show, but for local views."""
+    return list(filter(methodcaller("visible_get", view_layer=layer), layer.objects))
+
+
+def _settings_of(depsgraph) -> tuple:
+    """The settings of a scene that change its light."""
+    scene, layer = depsgraph.scene, depsgraph.view_layer
+    blocks = scene.world, layer.world_override, layer.material_override
+    cycles = getattr(scene, "cycles", None)
+    names = [] if cycles is None else [one.identifier for one in cycles.bl_rna.properties if one.type != "POINTER"]
+    return (
+        scene.name,
+        layer.name,
+        *(None if block is None else block.name_full for block in blocks),
+        *(getattr(scene.render, name) for name in SCENE_SETTINGS),
+        *(str(getattr(cycles, name)) for name in names),
+        *(ob.name for ob in shown_objects(layer)),
+    )
+
+
+# In the child:
+
+
+def render_rest(job: RestJob, folder: Path, progress) -> dict:
+    """Do the `job`: writes REST_PICTURE into `folder`. Returns the manifest."""
+    warnings: list[str] = []
+    if job.scene is not None:
+        progress("open scene", 0.0)
+        open_scene(Path(job.scene), warnings, job.scripts)
+        scene = scene_named(job.scene_name)
+        render_settings.go_to_frame(scene, job.frame)
+        layer = render_settings.only_view_layer(scene, warnings, job.view_layer)
+        _show_as_views(scene, layer, job.hidden)
+        _prepare(scene, layer)
+    scene = scene_named(job.scene_name)
+    if job.changes is not None:
+        _take_changes(scene, **job.changes)
+    layer = next(layer for layer in scene.view_layers if layer.use)
+    if job.matrices is None:
+        camera = render_settings.choose_camera(scene, job.camera)
+        camera.data.dof.use_dof = False
+        render_settings.set_resolution(scene, job.width, job.height)
+    else:
+        _look_through(scene, *map(Matrix, job.matrices), (job.width, job.height))
+    scene.cycles.samples, scene.cycles.seed = job.samples, job.seed
+    progress("bounces", 0.0)
+    started = time.monotonic()
+    render_exr(scene, folder / REST_PICTURE, "NONE")
+    return {
+        "samples": job.samples,
+        "seconds": time.monotonic() - started,
+        "mask": MASK,
+        "passes": render_settings.pass_names(),
+        "everything": _reasons_for_cycles(scene, layer),
+    }
+
+
+def _take_changes(scene, file: str, blocks: list, moved: dict) -> None:
+    """Take over the changes that `RestChanges.written` has recorded. Raises SceneError where that is not possible."""
+    with bpy.data.libraries.load(file) if blocks else nullcontext(((), None)) as (_, wanted):
+        for kind, name in blocks:
+            setattr(wanted, kind, [*getattr(wanted, kind), name])
+    loaded = {kind: iter(getattr(wanted, kind)) for kind, _ in blocks}
+    for kind, name in blocks:
+        old, new = getattr(bpy.data, kind).get((name, None)), next(loaded[kind])
+        if old is None:
+            raise SceneError(f"{name!r} is new")
+        user_remap = old.user_remap
+        user_remap(new)
+        getattr(bpy.data, kind).remove(old)
+        new.name = name
+        if kind == "materials":
+            mark(new)
+    for name, (basis, _) in moved.items():
+        if name not in scene.objects:
+            raise SceneError(f"object {name!r} is new")
+        scene.objects[name].matrix_basis = Matrix(basis)
+    for layer in scene.view_layers:
+        if layer.use:
+            layer.update()
+    for name, (_, world) in moved.items():
+        if not np.allclose(scene.objects[name].matrix_world, world, rtol=1e-5, atol=1e-5):
+            raise SceneError(f"object {name!r} does not follow")
+
+
+def _show_as_views(scene, layer, hidden: tuple[str, ...]) -> None:
+    """Let renders show what views show, in their detail; but for the objects `hidden`."""
+    shown = {ob for ob in shown_objects(layer) if ob.name not in hidden}
+    for collection in bpy.data.collections:
+        collection.hide_render = False
+    for ob in bpy.data.objects:
+        ob.hide_render = ob not in shown if ob.name in layer.objects else ob.hide_viewport
+        details = [ob, *ob.modifiers, *(() if ob.data is None else (ob.data,))]
+        for owner in details:
+            _take_levels(owner)
+    _take_levels(scene.render)
+
+
+def _take_levels(owner) -> None:
+    """Let renders take the values of LEVELS that views take."""
+    for name, of_renders in LEVELS:
+        if hasattr(owner, name) and hasattr(owner, of_renders):
+            setattr(owner, of_renders, getattr(owner, name))
+
+
+def _prepare(scene, layer) -> None:
+    """Let Cycles write what the rest is made of."""
+    render, cycles = scene.render, scene.cycles
+    if scene.animation_data is not None:
+        scene.animation_data_clear()
+    render.engine = "CYCLES"
+    render.threads_mode, render.threads = "FIXED", render_settings.cores()
+    for name in ("compositing", "sequencer", "multiview", "motion_blur", "border", "freestyle"):
+        setattr(render, f"use_{name}", False)
+    render.use_file_extension = render.use_overwrite = render.use_persistent_data = True
+    render.film_transparent = False
+    cycles.device, cycles.film_exposure, cycles.time_limit, layer.samples = "CPU", 1.0, 0.0, 0
+    cycles.use_denoising = cycles.use_animated_seed = cycles.use_sample_subset = cycles.use_adaptive_sampling = False
+    cycles.shading_system = False  # AOVs need it
+    for extra in (layer.aovs, layer.lightgroups):
+        for item in list(extra):
+            extra.remove(item)
+    render_settings.enable_passes(layer, PASSES)
+    layer.cycles.denoising_store_passes = True
+    aov = layer.aovs.add()
+    aov.name, aov.type = MASK, "VALUE"
+    for material in bpy.data.materials:
+        if not material.is_grease_pencil:
+            mark(material)
+
+
+def mark(material) -> None:
+    """Let `material` write MASK, if it is Cycles' alone."""
+    if not preview_of(material).is_of_cycles:
+        return
+    ensure_nodes(material)
+    node = material.node_tree.nodes.new("ShaderNodeOutputAOV")
+    node.aov_name = MASK
+    node.inputs["Value"].default_value = 1.0
+
+
+def _reasons_for_cycles(scene, layer) -> list[str]:
+    """Why the whole picture is Cycles': what views cannot draw between the eye and the surfaces."""
+    shown = [ob for ob in scene.objects if not ob.hide_render]
+    hair = [f"hair or points of {ob.name!r}" for ob in shown if _has_hair(ob)]
+    materials = {slot.material for ob in shown for slot in ob.material_slots} - {None}
+    volumes = [f"the volume of material {material.name!r}" for material in materials if _has_volume(material)]
+    return [*reasons_for_cycles(scene, layer), *hair, *volumes]
+
+
+def _has_volume(material) -> bool:
+    output = None if tree_in_use(material) is None else material_output(material.node_tree)
+    return output is not None and live_link(output.inputs["Volume"]) is not None
+
+
+def _has_hair(ob) -> bool:
+    return ob.type in ("CURVES", "POINTCLOUD") or any(each.settings.type == "HAIR" for each in ob.particle_systems)
+
+
+def _look_through(scene, view: Matrix, window: Matrix, size: tuple[int, int]) -> None:
+    """Let the scene have the camera of a region with these matrices and this size."""
+    camera = scene.objects.get(CAMERA)
+    if camera is None:
+        camera = bpy.data.objects.new(CAMERA, bpy.data.cameras.new(CAMERA))
+        scene.collection.objects.link(camera)
+    (width, height), lens, render = size, camera.data, scene.render
+    is_parallel = window[3][3] == 1.0
+    place = view.inverted()
+    column, sign = (3, -1.0) if is_parallel else (2, 1.0)
+    lens.sensor_fit, lens.sensor_width = "HORIZONTAL", SENSOR
+    lens.shift_x = 0.5 * sign * window[0][column]
+    lens.shift_y = 0.5 * sign * window[1][column] * height / width
+    if is_parallel:
+        lens.type, lens.ortho_scale = "ORTHO", 2.0 / window[0][0]
+        near, far = ((sign - window[2][3]) / window[2][2] for sign in (-1.0, 1.0))  # along z of the view
+        place = place @ Matrix.Translation((0.0, 0.0, near))
+        lens.clip_start, lens.clip_end = 1e-6, near - far
+    else:
+        lens.type, lens.lens = "PERSP", 0.5 * SENSOR * window[0][0]
+        lens.clip_start = window[2][3] / (window[2][2] - 1.0)
+        lens.clip_end = window[2][3] / (window[2][2] + 1.0)
+    camera.matrix_world = place
+    scene.camera = camera
+    render.resolution_x, render.resolution_y, render.resolution_percentage = width, height, 100
+    render.pixel_aspect_x = render.pixel_aspect_y = 1.0

@@ -36,12 +36,9 @@ class LTSH_ViewSettings(bpy.types.PropertyGroup):
     """Settings of the viewport and of final renders with the engine LTSH."""
 
     technique: bpy.props.EnumProperty(
-        name="Technique",
-        description="What shades the picture",
-        items=TECHNIQUE_ITEMS,
-        default=DEFAULT_TECHNIQUE,
-        update=_redraw,
-    )
+        name="Technique", description="What shades the picture",
+        items=TECHNIQUE_ITEMS, default=DEFAULT_TECHNIQUE, update=_redraw,
+    )  # fmt: skip
     shown: bpy.props.EnumProperty(
         name="Show", description="Which reflection is seen", items=SHOWN_PASSES, default="combined", update=_redraw
     )

@@ -33,10 +33,6 @@ class LTSH_OT_preview(bpy.types.Operator):
     bl_idname = "ltsh.preview"
     bl_label = "Preview with LTSH"
 
-    @classmethod
-    def poll(cls, context):
-        return context.scene is not None
-
     def execute(self, context):
         scene = context.scene
         if is_previewing(scene):

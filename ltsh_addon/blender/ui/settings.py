@@ -304,10 +304,8 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
         name="Output",
         description="Folder for the results, in folders of their own for shading, comparing and baking; // is the "
         "folder of the .blend. Empty takes the one of the preferences, as does a file that is not saved yet",
-        subtype="DIR_PATH",
-        options={"PATH_SUPPORTS_BLEND_RELATIVE"},
-        default="//ltsh/",
-    )
+        subtype="DIR_PATH", options={"PATH_SUPPORTS_BLEND_RELATIVE"}, default="//ltsh/",
+    )  # fmt: skip
     bake_size: EnumProperty(name="Size", description="Texels on each side of the texture", items=SIZES, default="1024")
     bake_margin: IntProperty(
         name="Margin", description="How far colors go on beyond the borders of UV islands, in texels",

@@ -7,6 +7,7 @@ import pytest
 import scene_parts
 
 import ltsh_addon
+from ltsh_addon.blender.saving import save_working_copy
 from ltsh_addon.blender.ui import preview
 
 ARTISTS = "BLENDER_WORKBENCH"
@@ -74,6 +75,30 @@ def test_a_view_that_is_changed_during_a_preview_is_the_artists_choice(views):
     views[0].shading.type = "SOLID"
     bpy.ops.ltsh.preview()
     assert shading(views) == ["SOLID", "RENDERED"]
+
+
+def test_views_that_are_opened_during_a_preview_end_with_it(views):
+    """As a new window or a split area: of such a view nobody knows what it showed before."""
+    bpy.ops.ltsh.preview()
+    del preview._former_shading[bpy.context.scene.session_uid][views[1].as_pointer()]
+    bpy.ops.ltsh.preview()
+    assert shading(views) == ["WIREFRAME", "WIREFRAME"]
+
+
+def test_another_file_in_the_same_windows_gives_the_views_back(views, tmp_path):
+    path = scene_parts.save(tmp_path / "other.blend")
+    bpy.ops.ltsh.preview()
+    bpy.ops.wm.open_mainfile(filepath=str(path), load_ui=False)
+    assert preview.view_of(bpy.context).shading.type == "WIREFRAME" and not preview._former_shading
+
+
+def test_a_file_that_blender_saved_by_itself_during_a_preview_opens_without_it(addon, tmp_path):
+    """Auto Save writes the state of the last step of undo, which has the engine of the preview."""
+    addon.render.engine, addon.ltsh_view.artist_engine = "LTSH", ARTISTS
+    path = tmp_path / "auto.blend"
+    save_working_copy(path, keep_engine=True)
+    bpy.ops.wm.open_mainfile(filepath=str(path))
+    assert bpy.context.scene.render.engine == ARTISTS and not preview.is_previewing(bpy.context.scene)
 
 
 def test_files_saved_during_a_preview_keep_engine_and_shading(addon, views, tmp_path):

@@ -174,6 +174,7 @@ class ViewRenderer:
         self._upload_sky(mirror)
         version = None
         if self.shadows is not None:
+            self.shadows.shown = size
             self.shadows.take_news()
             version = self.shadows.version
         values = *frame.surfaces[1], frame.content, version, self.has_bounces

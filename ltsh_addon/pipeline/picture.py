@@ -130,14 +130,16 @@ def draw_view(options: ViewOptions, progress: Progress | None = None) -> TaskRes
     width, height = options.resolution or (None, None)
     given = tuple(name if name in SHIPPED_TABLES else str(Path(name).absolute()) for name in options.techniques)
     job = child_job(view.ViewJob, options, width=width, height=height, techniques=given)
-    rest_seconds = 0.0
+    problems, rest_seconds = [], 0.0
     with temporary_folder() as folder, shared_blender(folder):
         if options.bounces == "on":
-            job = replace(job, rest=folder / "rest.npy")
             rest_job = child_job(view.RestJob, options, width=width, height=height, samples=options.rest_samples)
-            save_array(job.rest, view.render_rest(rest_job, folder, progress=progress).picture())
-            rest_seconds = time.perf_counter() - start
+            rest = view.render_rest(rest_job, folder, progress=progress)
+            job = replace(job, rest=folder / "rest.npy", is_everything=bool(rest.everything))
+            save_array(job.rest, rest.picture())
+            problems, rest_seconds = [rest.problem] * bool(rest.problem), time.perf_counter() - start
         manifest = view.draw_view(job, folder, progress=progress)
+        manifest["warnings"] += problems
         layers = {
             layer_name(technique, pass_name): np.load(folder / f"{number}_{pass_name}.npy")
             for number, technique in enumerate(tables)

@@ -191,7 +191,7 @@ def _draw(job: ViewJob, read: tuple, size: tuple[int, int], progress) -> tuple[l
     renderer = _renderer[0] if _renderer else ViewRenderer()
     renderer.shadows, renderer.has_bounces = shadows, job.rest is not None
     if job.rest is not None:
-        renderer.rest = ShownRest(float_texture(np.load(job.rest)[::-1]), drawn[1].projection)
+        renderer.rest = ShownRest(float_texture(np.load(job.rest)[::-1]), drawn[1], job.is_everything)
     try:
         pictures = _pictures(renderer, drawn, shown, points, progress)
     except ValueError as error:  # a table that the card does not take

@@ -149,6 +149,9 @@ def draw_view(options: ViewOptions, progress: Progress | None = None) -> TaskRes
     check_before_writing(progress)
     coverage = layers[layer_name(next(iter(tables)), "diffuse")][..., 3]
     report = _view_report(options, tables, manifest, coverage)
+    if options.bounces == "on":
+        times = {"direct_s": manifest["seconds"], "rest_s": rest_seconds}
+        report |= {"rest_samples": options.rest_samples, **{name: round(value, 3) for name, value in times.items()}}
     name = options.name or "view"
     layers = {name: image[..., :3] for name, image in layers.items()} | {COVERAGE: imaging.Layer(coverage, "V")}
     path = options.output / f"{name}.exr"
@@ -159,7 +162,6 @@ def draw_view(options: ViewOptions, progress: Progress | None = None) -> TaskRes
     imaging.write_layers(path, layers, described, imaging.chromaticities(color_space), manifest["pixel_aspect"])
     write_bytes(path.with_suffix(".png"), shown)
     seconds = {"blender": manifest["seconds"], "shadows": (manifest["shadows"] or {"seconds": 0.0})["seconds"]}
-    seconds |= {"direct_s": manifest["seconds"], "rest_s": rest_seconds}
     return TaskResult(report, {**seconds, "total": time.perf_counter() - start}, (f"{name}.exr", f"{name}.png"))
 
 

@@ -164,6 +164,13 @@ class RestSum:
     everything: tuple[str, ...] = ()  # why no light of the view itself remains
     problem: str = ""  # of the denoiser
 
+    @property
+    def ambient(self) -> tuple[float, ...]:
+        """The mean (3,) over that of the albedo."""
+        albedo = np.mean(self.guides[..., :3], axis=(0, 1), dtype=np.float64)
+        light = np.mean(self.light, axis=(0, 1), dtype=np.float64)
+        return tuple(np.nan_to_num(light / np.maximum(albedo, 0.05 * self.samples)))
+
     def add(self, manifest: dict, folder: Path) -> None:
         """Add the picture of a RestJob that was done in `folder`: Combined without what the view draws itself."""
         channels, names = rendered_channels(folder / REST_PICTURE), manifest["passes"]
@@ -188,8 +195,11 @@ class RestSum:
         try:
             with open_denoiser(denoiser_libraries(), cores()) as denoiser:
                 light = denoiser.quickly_denoised(light, guides[..., :3], guides[..., 3:6])
-        except NoDenoiser as error:
-            light, self.problem = np.maximum(np.nan_to_num(light), 0.0), f"bounces are not denoised: {error}"
+        except NoDenoiser:
+            light, self.problem = (
+                np.maximum(np.nan_to_num(light), 0.0),
+                "Bounces are not denoised: this Blender has no denoiser",
+            )
         return np.concatenate([light, guides[..., 6:]], axis=-1)
 
 

@@ -170,7 +170,7 @@ class LiveRest:
         self._seconds = {}  # of a sample, by number of pixels
         self._pixels: tuple[np.ndarray, RestView] | None = None  # the picture to upload
         self._shown: tuple[ShownRest, RestView] | None = None
-        self._mean, self._is_everything = np.zeros(3), False  # of the picture
+        self._facts: tuple = ()  # of the picture: `ShownRest.is_everything` and `ambient`
         self._light: tuple | None = None  # the mean of the direct light that belongs to it, by `_light_key`
         self._version, self._surfaces, self._settings = 0, 0, None  # of the scene; of all in it but lights
         self.problem, self.notes = "", ()  # why there is no picture; what there is to say about it
@@ -208,16 +208,12 @@ class LiveRest:
         if self._pixels is not None:
             pixels, view = self._pixels
             camera = ViewCamera.of(*map(Matrix, view.matrices), view.matrices[1][3][3] == 1.0)
-            rest = ShownRest(float_texture(pixels[::-1]), camera, self._is_everything)
+            rest = ShownRest(float_texture(pixels[::-1]), camera, *self._facts)
             self._shown, self._pixels = (rest, view), None
-            self._mean = pixels[..., :3].mean(axis=(0, 1), dtype=np.float64)
         if self._shown is None:
             return None
         rest, view = self._shown
         has_old_light = self._wanted.version != view.version and self._light is not None
-        if self._light is not None:
-            beside = np.divide(self._mean, self._light[1], out=np.zeros(3), where=self._light[1] > 0.0)
-            rest = replace(rest, beside=tuple(np.minimum(beside, 1.0)))
         return replace(rest, light=self._light[1]) if has_old_light and self._light[0] == self._light_key else rest
 
     @property
@@ -286,7 +282,7 @@ class LiveRest:
             self._total, self._total_of = step.total, step.view
         if step.pixels is None:
             return False
-        self._pixels, self._is_everything = (step.pixels, step.view), bool(step.total.everything)
+        self._pixels, self._facts = (step.pixels, step.view), (bool(step.total.everything), step.total.ambient)
         self.notes = (step.total.problem,) * bool(step.total.problem)
         return True
 
@@ -296,7 +292,7 @@ class LiveRest:
         if self._stack is None:
             self._stack = ExitStack()
             self._folder = self._stack.enter_context(temporary_folder())
-            self._process, self._opened = BlenderProcess(self._folder), None
+            self._process, self._opened = BlenderProcess(self._folder, background=True), None
             self._stack.callback(self._process.end)
         has_first = self._last_of == wanted
         width, height = wanted.size if has_first else map(_half, wanted.size)

@@ -174,7 +174,7 @@ def _draw(job: ViewJob, read: tuple, size: tuple[int, int], progress) -> tuple[l
     mirror.sync(depsgraph)
     if not mirror.lights and not mirror.sky.sides:
         raise no_light(scene, mirror.notes)
-    notes, shadows = list(mirror.notes), None
+    notes, shadows = list(mirror.notes if job.rest is None else mirror.notes_with_rest), None
     if occluders is not None:
         problem = too_many(len(mirror.lights), size)
         rays = max(min(FEWEST_RAYS, job.shadow_rays), job.shadow_rays // job.refine)
@@ -183,7 +183,9 @@ def _draw(job: ViewJob, read: tuple, size: tuple[int, int], progress) -> tuple[l
         else:
             shadows = ShadowRays(occluders, rays)
     drawn = mirror, view_of_camera(camera.evaluated_get(depsgraph), depsgraph, size), size
-    points = render_settings.sub_pixel_offsets(scene, job.refine)
+    # Beside Cycles' light the mean of the points must be the center.
+    offsets = render_settings.filter_points if job.rest is None else render_settings.balanced_points
+    points = render_settings.sub_pixel_offsets(scene, job.refine, offsets)
     passes = (*VIEW_PASSES, TRANSMITTED) if mirror.has_glass else VIEW_PASSES
     first, *others = ((technique, name) for technique in job.techniques for name in passes)
     exposure, transparent = cycles_setting(scene, "film_exposure"), scene.render.film_transparent

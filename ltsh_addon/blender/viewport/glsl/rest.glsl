@@ -16,11 +16,11 @@ vec4 rest_at(vec2 place)
 void main()
 {
   ivec2 texel = ivec2(gl_FragCoord.xy);
-  float weight = scale.w, is_everything = beside.w, is_known = 1.0;
+  float weight = scale.w, is_everything = ambient.w, is_known = 1.0;
   vec4 lit = weight * texelFetch(picture, texel, 0);
   vec2 place = gl_FragCoord.xy / vec2(textureSize(picture, 0));
   if (has_moved != 0) {
-    vec4 position = texelFetch(glass_positions, texel, 0);
+    vec4 position = texelFetch(front_positions, texel, 0);
     position = position.w > 0.0 ? position : texelFetch(positions, texel, 0);
     vec4 clip = projection * vec4(position.xyz, 1.0);
     place = 0.5 + 0.5 * clip.xy / max(clip.w, 1e-20);
@@ -30,7 +30,9 @@ void main()
     bool is_inside = clip.w > 0.0 && place == clamp(place, vec2(0.0), vec2(1.0));
     is_known = position.w > 0.0 && is_inside && is_near ? 1.0 : 0.0;
   }
-  vec3 added = mix(beside.rgb * lit.rgb, scale.rgb * rest_at(place).rgb, is_known);
+  vec3 front = texelFetch(diffuse_colors, texel, 0).rgb + texelFetch(specular_colors, texel, 0).rgb;
+  vec3 guess = texelFetch(front_positions, texel, 0).w > 0.0 ? ambient.rgb * front : vec3(0.0);
+  vec3 added = scale.rgb * mix(guess, rest_at(place).rgb, is_known);
   float share = is_known * max(clamp(weight * texelFetch(of_cycles, texel, 0).x, 0.0, 1.0), is_everything);
   color = vec4((1.0 - share) * lit.rgb + added, 1.0 - (1.0 - share) * (1.0 - lit.a));
 }

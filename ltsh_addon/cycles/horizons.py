@@ -286,7 +286,11 @@ class _LightsOfKind:
         radius = np.linalg.norm(corners - center[:, None], axis=2).max(axis=1)
         if alike[0].is_facing:
             radius = np.array([light.radius for light in alike])
-        axes = _plane_axes(corners - center[:, None], np.array([light.direction for light in alike]))
+        # Two axes in the planes of the lights, and the one that they face away from.
+        first = corners[:, 0] - center
+        first = first / np.maximum(np.linalg.norm(first, axis=1), 1e-30)[:, None]
+        direction = np.array([light.direction for light in alike])
+        axes = np.stack([first, np.cross(direction, first), -direction], axis=1)
         brightness = np.array([np.abs(light.radiance).sum() for light in alike])
         scales = np.linalg.pinv(np.array([[light.half_u, light.half_v] for light in alike]).swapaxes(1, 2))
         rest = radius, axes, scales, share, alike[0].is_side
@@ -392,13 +396,6 @@ class _LightsOfKind:
         corners = np.einsum("rai,rvi->avr", self.axes[light], corners)
         whole = np.abs(polygon.solid_angle(polygon.project_to_sphere(corners)))
         return np.where(corners[2].mean(axis=0) > 0.0, whole, 0.0)
-
-
-def _plane_axes(corners, direction) -> np.ndarray:
-    """Orthonormal axes (L, 3, 3): two in the planes of lights with `corners` (L, V, 3), from their centers, and a
-    `direction` (L, 3); then the opposite of that."""
-    first = corners[:, 0] / np.maximum(np.linalg.norm(corners[:, 0], axis=1), 1e-30)[:, None]
-    return np.stack([first, np.cross(direction, first), -direction], axis=1)
 
 
 def lobe_density(samples, towards: np.ndarray) -> np.ndarray:

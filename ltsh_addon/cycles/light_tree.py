@@ -80,8 +80,7 @@ class LightTreeNode:
 
 
 def _bounds(node, offset, normal, width, near, far):
-    """Bounds (2, P) for a node that lies within a cone around the offset; `width` (P,) is the cosine of its
-    angle."""
+    """Bounds (2, P) for a node that lies within a cone around the offset; `width` (P,) is the cosine of its angle."""
     axis = offset / np.maximum(np.linalg.norm(offset, axis=1), 1e-30)[:, None]
     here, there = (axis * normal).sum(axis=1), -(axis @ node.axis)
     most_here = np.where(here >= width, 1.0, _cosine_of_sum(here, width, -1.0))
@@ -265,8 +264,7 @@ def _all(nodes) -> LightTreeNode:
 
 
 def _grown(nodes: list[LightTreeNode], centers: np.ndarray) -> LightTreeNode:
-    """The tree over `nodes` of one light each, cut where it costs least; `centers` (L, 3) are those of all
-    lights."""
+    """The tree over `nodes` of one light each, cut where it costs least; `centers` (L, 3) are those of all lights."""
     whole = _all(nodes)
     if len(nodes) < 2:
         return whole

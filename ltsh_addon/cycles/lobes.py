@@ -218,11 +218,6 @@ class LobeSlot:
         """Shading normal (Q, 3) of the coat."""
         return self._bent(self._normal("coat_normal"))
 
-    def sheen_normal(self) -> np.ndarray:
-        """Shading normal (Q, 3) of the sheen: that of the base, blended with the coat's by the coat's weight."""
-        coat = np.clip(self.value("coat_weight"), 0.0, 1.0)[:, None]
-        return unit((1.0 - coat) * self.normal + coat * self.coat_normal())
-
     def cosine(self, normal) -> np.ndarray:
         """Cosine (Q,) of the angle between `normal` and the view, in [0, 1]."""
         return np.clip(np.sum(normal * self.hits.view, axis=-1), 0.0, 1.0)
@@ -403,7 +398,8 @@ def _put_under_sheen(
     shine = np.maximum(slot.value("sheen_weight"), 0.0)[:, None] * np.maximum(slot.value("sheen_tint"), 0.0)
     shine = np.where(slot.of("principled"), shine, 0.0)
     most = shine.max(axis=1, keepdims=True)
-    normal = slot.sheen_normal()
+    coat = np.clip(slot.value("coat_weight"), 0.0, 1.0)[:, None]
+    normal = unit((1.0 - coat) * slot.normal + coat * slot.coat_normal())
     albedo, a, b = sheen_lobe(slot.cosine(normal), slot.value("sheen_roughness"))
     albedo = albedo[:, None]
     remaining = np.ones((len(hits.position), 1))

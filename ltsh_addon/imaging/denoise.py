@@ -17,7 +17,8 @@ from ..scene import error_line, listed
 
 # Names under which the system may know the library.
 SYSTEM_LIBRARIES = ("libOpenImageDenoise.so.2", "libOpenImageDenoise.dylib", "OpenImageDenoise.dll")
-_CPU, _FLOAT3, _FAST = 1, 3, 4  # OIDNDeviceType, OIDNFormat, OIDNQuality
+_CPU, _FLOAT3 = 1, 3  # OIDNDeviceType, OIDNFormat
+_FAST, _BALANCED, _HIGH = 4, 5, 6  # OIDNQuality
 _POINTER, _SIZE, _TEXT, _BOOL, _INT = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_char_p, ctypes.c_bool, ctypes.c_int
 _FUNCTIONS = {
     "oidnNewDevice": (_POINTER, _INT),
@@ -68,13 +69,21 @@ class Denoiser:
         """Free the memory of the library."""
         self._ReleaseDevice(self._device)
 
-    def all_denoised(self, colors: Sequence[np.ndarray], albedo: np.ndarray, normal: np.ndarray) -> list[np.ndarray]:
+    def all_denoised(
+        self, colors: Sequence[np.ndarray], albedo: np.ndarray, normal: np.ndarray, rough: Sequence[int] = ()
+    ) -> list[np.ndarray]:
         """The denoised pictures, float32 and never negative, of pictures `colors` (H, W, 3) of the same surfaces.
 
-        `albedo` and `normal` (H, W, 3) may be noisy, too. NaN and Inf count as 0.
+        `albedo` and `normal` (H, W, 3) may be noisy, too. NaN and Inf count as 0. The guides, and the pictures with the
+        indices `rough`, are filtered in 0.4 of the time: with such guides pictures err 0.5 % more.
         """
-        guides = {"albedo": self._filtered({"albedo": albedo}), "normal": self._filtered({"normal": normal})}
-        return [self._filtered({"color": color, **guides}, hdr=True, cleanAux=True) for color in colors]
+        guides = {"albedo": albedo, "normal": normal}
+        guides = {name: self._filtered({name: one}, quality=_BALANCED) for name, one in guides.items()}
+        qualities = [_BALANCED if index in rough else _HIGH for index in range(len(colors))]
+        return [
+            self._filtered({"color": color, **guides}, hdr=True, cleanAux=True, quality=quality)
+            for color, quality in zip(colors, qualities, strict=True)
+        ]
 
     def quickly_denoised(self, color: np.ndarray, albedo: np.ndarray, normal: np.ndarray) -> np.ndarray:
         """As `all_denoised` of one picture, with the library's fast quality and the guides as they are."""

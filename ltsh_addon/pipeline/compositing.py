@@ -172,7 +172,11 @@ def composite(cycles, passes: dict[str, DirectPass], extraction, denoise: str, p
     halves = cycles.halves if denoise == "on" else ()
     noisy = [pictures(half) for half in (None, *halves)]
     groups = [_rest_of_group(cycles, passes, name) for name in names]
-    (clean, *of_halves, groups), denoiser, problems = _denoised([*noisy, groups], cycles.guides, denoise, progress)
+    # All but the halves are seen.
+    count = len(noisy[0])
+    rough = range(count, count * len(noisy))
+    (clean, *of_halves, groups), *told = _denoised([*noisy, groups], cycles.guides, rough, denoise, progress)
+    denoiser, problems = told
     ours = np.choose(number, clean) + direct
     weights, errors = [np.ones(replaced.shape[:2]), 0.0, 0.0], None
     if denoiser and len(halves) == 2:
@@ -192,8 +196,11 @@ def composite(cycles, passes: dict[str, DirectPass], extraction, denoise: str, p
     return Composite(combined, rest, passes, factor, groups, denoiser, problems, weights[0], errors)
 
 
-def _denoised(lists: list[list[np.ndarray]], guides: dict, denoise: str, progress) -> tuple[list, str, list[str]]:
-    """`lists` of pictures (H, W, 3), denoised if `denoise` is "on"; the name of the denoiser, and its problems."""
+def _denoised(lists: list[list], guides: dict, rough, denoise: str, progress) -> tuple[list, str, list[str]]:
+    """`lists` of pictures (H, W, 3), denoised if `denoise` is "on"; the name of the denoiser, and its problems.
+
+    Those with the indices `rough` in all lists together are filtered in less time.
+    """
     from ..blender.process.blender_process import denoiser_libraries
 
     if denoise != "on":
@@ -204,7 +211,7 @@ def _denoised(lists: list[list[np.ndarray]], guides: dict, denoise: str, progres
             if progress is not None and progress("denoise", 0.0) is False:
                 raise Cancelled("stopped before the picture was denoised")
             images = [read_layer(guides, *guide) for guide in (ALBEDO, NORMAL)]
-            clean = iter(denoiser.all_denoised(flat, *images))
+            clean = iter(denoiser.all_denoised(flat, *images, rough))
             return [[next(clean) for _ in pictures] for pictures in lists], denoiser.name, []
     except NoDenoiser as error:
         return lists, "", [f"{error}; the picture is not denoised"]

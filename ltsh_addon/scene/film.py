@@ -71,14 +71,11 @@ class Film:
     def shared(self, weights: np.ndarray, sub_sample: np.ndarray, rendered: np.ndarray) -> Film:
         """The film whose pixels share their samples. `weights` (N, D, D) are those of the N points of a pixel,
         `sub_sample` (P,) is the point of each sample, `rendered` (H, W) the mask of the rendered pixels."""
-        whole = self.sums_around(np.flatnonzero(rendered), weights.sum(axis=0))
+        every = replace(self, pixel=np.flatnonzero(rendered))
+        around = np.broadcast_to(weights.sum(axis=0), (len(every.pixel), *weights.shape[1:]))
+        whole = every._sums(np.ones((len(every.pixel), 1)), around)[..., 0]
         spread = weights.astype(np.float32)[sub_sample]
         return replace(self, spread=spread, whole=np.where(rendered, whole, np.inf))
-
-    def sums_around(self, pixel: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Sums (H, W) of `weights` (D, D) laid around each `pixel` (Q,)."""
-        every = replace(self, pixel=pixel)
-        return every._sums(np.ones((len(pixel), 1)), np.broadcast_to(weights, (len(pixel), *weights.shape)))[..., 0]
 
     def reached(self, mask: np.ndarray) -> np.ndarray:
         """Mask (H, W) of the pixels that share samples with a pixel of `mask` (H, W)."""

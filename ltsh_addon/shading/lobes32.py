@@ -290,8 +290,7 @@ def _bent_reflectance(samples, index, half):
 
 
 class FormFactor:
-    """Form factors (1, Q) of polygons whose corners run counterclockwise as seen from the point
-    (`Light.polygon`)."""
+    """Form factors (1, Q) of polygons whose corners run counterclockwise as seen from the point (`Light.polygon`)."""
 
     def __init__(self, scratch):
         self.scratch = scratch

@@ -37,6 +37,8 @@ WORTH_POWER = 0.75
 TYPICAL_SHARE = 0.4
 # Numbers of rays that a pair may get, besides the probes and the most rays.
 LEVELS = (16, 32, 64, 128, 256, 512)
+# Numbers of rays that a lobe gets as long as none has met any light of a cluster.
+UNMET_LEVELS = (32, 128, 256)
 # The brightest pairs may get this many times the most rays of a pair: where lobes are narrow and lights half visible, a
 # few pixels cause most of the noise of a picture.
 BRIGHTEST, BRIGHTEST_OF_SKY = 4, 2
@@ -254,6 +256,10 @@ class RatioEstimator:
         self._neighbors, order = neighbors, neighbors.order if shares else None
         self._add_rays(np.arange(len(self.index)), 0, PROBES, 0, order)
         self._leave_out_unlit()
+        # The probes of a cluster go to a few of its lights; those that count may be others.
+        for last in UNMET_LEVELS if isinstance(self.emitter, LightCluster) and rays > PROBES else ():
+            unmet, first = np.flatnonzero(np.logical_or(*self._unmet())), int(self.count.max(initial=0))
+            self._add_rays(unmet, first, min(last, rays), 0)
         importance = importance[self.index]
         worth = {name: importance * self.unshadowed(name) / max(typical.get(name, 0.0), 1e-30) for name in PASSES}
         choice = np.where(worth["specular"] > 2.0 * worth["diffuse"], 1, 0)
@@ -298,10 +304,9 @@ class RatioEstimator:
 
     def _trace_more(self, chosen, number, choice, order):
         """Trace rays of the `chosen` pairs up to the `number`, split by `choice`; each (Q,)."""
-        for last in np.unique(number[chosen]):
-            for split in range(3):
-                members = np.flatnonzero(chosen & (number == last) & (choice == split))
-                self._add_rays(members, PROBES, int(last), split, order)
+        for first, last, split in np.unique([self.count[chosen], number[chosen], choice[chosen]], axis=1).T.tolist():
+            members = np.flatnonzero(chosen & (self.count == first) & (number == last) & (choice == split))
+            self._add_rays(members, first, last, split, order)
 
     def _margin(self):
         """How far before the light's surface rays end, in m, if a face is so near that END may be behind it; else 0."""

@@ -3,14 +3,7 @@
 import numpy as np
 import pytest
 
-from ltsh_addon.cycles.patches import (
-    ERROR,
-    GRID,
-    clip_to_cell,
-    cut_into_patches,
-    signed_area,
-    split_light,
-)
+from ltsh_addon.cycles.patches import ERROR, GRID, clip_to_cell, cut_into_patches, signed_area, split_light
 from ltsh_addon.scene import light_of
 
 PLACED = {

@@ -174,8 +174,9 @@ def render_started(rig):
 
 
 def final_render(rig):
-    """Press F12 and wait; the passes of the picture as `passes_of` has them. To be used with `yield from`."""
+    """Press F12 for direct light alone and wait; its passes as `passes_of` has them. To be used with `yield from`."""
     scene = bpy.context.scene
+    view().complete = False
     ended = yield from render_started(rig)
     start = time.monotonic()
     yield from until(lambda: ended, RENDER_SECONDS)

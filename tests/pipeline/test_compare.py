@@ -389,10 +389,7 @@ def test_light_linking_and_the_passes_of_a_light_hold_for_techniques_of_ones_own
     ("returned", "problem"),
     [
         (np.zeros(3), "returned ndarray, expected a ltsh_addon.shading.Shading"),
-        (
-            shading.Shading(np.zeros((5, 3))),
-            r"returned specular of shape \(5, 3\), expected \(rows, 5, 3",
-        ),
+        (shading.Shading(np.zeros((5, 3))), r"returned specular of shape \(5, 3\), expected \(rows, 5, 3"),
     ],
 )
 def test_a_technique_that_returns_something_else_is_named(returned, problem):

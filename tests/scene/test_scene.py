@@ -7,15 +7,7 @@ import numpy as np
 import pytest
 from surface_scenes import area_light, random_samples
 
-from ltsh_addon.scene import (
-    EllipseLight,
-    Film,
-    PolygonLight,
-    QuadLight,
-    SurfaceSamples,
-    light_records,
-    lights_of,
-)
+from ltsh_addon.scene import EllipseLight, Film, PolygonLight, QuadLight, SurfaceSamples, light_records, lights_of
 
 shapes = pytest.mark.parametrize("shape", (*QuadLight.SHAPES, *EllipseLight.SHAPES))
 

@@ -55,8 +55,7 @@ def test_a_partition_of_the_receivers_adds_up(technique):
 
 
 @pytest.mark.parametrize(
-    ("technique", "part", "dtype"),
-    [("ltsh4", "specular", np.float32), ("ltc", "diffuse", np.float64)],
+    ("technique", "part", "dtype"), [("ltsh4", "specular", np.float32), ("ltc", "diffuse", np.float64)]
 )
 def test_workers_do_not_change_one_bit(technique, part, dtype, started, children_only):
     """The numbers travel with either pass; spread and corners with the lights."""

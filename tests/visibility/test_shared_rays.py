@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import textbook
-from known_tracers import OPEN, WALL, floor, past_spheres
+from known_tracers import OPEN, WALL, Tracer, floor, past_spheres
 from random_surfaces import unit
 
 from ltsh_addon import shading
@@ -118,6 +118,35 @@ def test_shadows_are_those_of_each_lamp_by_itself(roughness, monkeypatch):
         # Noise of each sample; none of it in the mean of all.
         assert np.linalg.norm(found - expected) < 0.03 * np.linalg.norm(expected)
         np.testing.assert_allclose(found.sum(axis=(0, 1)), expected.sum(axis=(0, 1)), rtol=1e-2)
+
+
+def test_a_point_beside_a_glowing_pebble_is_not_dark_because_its_first_rays_meet_nothing(monkeypatch):
+    """Of a ball of radius 5 cm, 1 cm is above the floor, and what is higher than 4 mm is hidden: most of the lamps
+    that rays choose are below the horizon, and the ray to the highest corner is blocked. Beside each lamp by itself no
+    sample has lost half: 256 rays of which one in twelve meets light have 20 % of noise."""
+    samples, film = floor(16)
+    turn, z = np.arange(400) * np.pi * (3.0 - np.sqrt(5.0)), (np.arange(400) + 0.5) / 200.0 - 1.0
+    normals = np.column_stack([np.cos(turn) * np.sqrt(1.0 - z * z), np.sin(turn) * np.sqrt(1.0 - z * z), z])
+    lights = []
+    for normal in normals:
+        half_u = 0.004 * unit(np.cross(normal, [0.3, 1.0, 0.2]))
+        shape = {"center": 0.05 * normal - [0.0, 0.0, 0.04], "half_u": half_u, "half_v": np.cross(normal, half_u)}
+        lights.append(
+            light_of({"name": "", "shape": "RECTANGLE", **shape, "direction": normal, "radiance": np.ones(3)})
+        )
+    angle = np.linspace(0.0, 2.0 * np.pi, len(samples), endpoint=False)
+    ring = np.column_stack([np.cos(angle), np.sin(angle), 0.0 * angle])
+    view, diffuse_albedo = unit(ring + [0.0, 0.0, 0.15]), np.zeros((len(samples), 3))
+    samples = replace(samples, position=0.034 * ring, view=view, diffuse_albedo=diffuse_albedo)
+    plate = Tracer(lambda origins, directions, distances: (origins + directions * distances[:, None])[:, 2] < 0.004)
+    shared = shadows_of(samples, lights, plate, film, rays=256)
+    monkeypatch.setattr(light_cluster.light_tree, "FEWEST", 500)
+    alone = shadows_of(samples, lights, plate, film, rays=64)
+    found, expected = (
+        lighting.shade_lights(samples, lights, "ltsh4", ("specular",), (one,), workers=1)[0].specular.sum(axis=(0, 2))
+        for one in (shared, alone)
+    )
+    assert (found > 0.5 * expected).all()
 
 
 def test_lamps_that_nothing_hides_shade_as_without_shadows_bit_by_bit():

@@ -36,12 +36,9 @@ class LTSH_ViewSettings(bpy.types.PropertyGroup):
     """Settings of the viewport and of final renders with the engine LTSH."""
 
     technique: bpy.props.EnumProperty(
-        name="Technique",
-        description="What shades the picture",
-        items=TECHNIQUE_ITEMS,
-        default=DEFAULT_TECHNIQUE,
-        update=_redraw,
-    )
+        name="Technique", description="What shades the picture",
+        items=TECHNIQUE_ITEMS, default=DEFAULT_TECHNIQUE, update=_redraw,
+    )  # fmt: skip
     shown: bpy.props.EnumProperty(
         name="Show", description="Which reflection is seen", items=SHOWN_PASSES, default="combined", update=_redraw
     )
@@ -71,7 +68,7 @@ class LTSH_ViewSettings(bpy.types.PropertyGroup):
     complete: bpy.props.BoolProperty(
         name="Complete",
         description="Final renders also have what is not direct light, by Cycles and denoised: bounces, glass, "
-        "subsurface, and all its passes", default=False,
+        "subsurface, and all its passes", default=True,
     )  # fmt: skip
     technique_passes: bpy.props.BoolProperty(
         name="Passes of All Techniques", default=False,

@@ -100,7 +100,8 @@ class _Collector:
             instance.object.original.name_full: instance.object.original for instance in depsgraph.object_instances
         }
         # If some object blocks only one kind of ray, each kind has its own half of a mask.
-        self._shift = SURFACE_SHIFT if any(map(_is_met_by_some, depsgraph.object_instances)) else 0
+        surfaces = (one for one in depsgraph.object_instances if one.object.type in SURFACE_TYPES)
+        self._shift = SURFACE_SHIFT if any(len(set(_meets(one))) > 1 for one in surfaces) else 0
         self._most_sets = (SURFACE_SHIFT if self._shift else MOST_BLOCKER_SETS + 1) - 1
         self._blockers = Blockers(list(objects.values()), self._most_sets)
         self._meshes: list[OccluderMesh] = []
@@ -369,11 +370,6 @@ def _meets(instance) -> tuple[bool, bool]:
     """Whether the instance blocks rays toward points on lights, and glossy rays in directions that surfaces choose."""
     ob, owner = instance.object, owner_of(instance)
     return tuple(getattr(ob, name) and getattr(owner, name) for name in ("visible_shadow", "visible_glossy"))
-
-
-def _is_met_by_some(instance) -> bool:
-    by_light, by_surface = _meets(instance)
-    return instance.object.type in SURFACE_TYPES and by_light != by_surface
 
 
 def _percent(share) -> str:

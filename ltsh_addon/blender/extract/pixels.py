@@ -63,7 +63,7 @@ FINISHED_LENS = 32
 # more points, and by Cycles for these and for its picture. POINT_SECONDS: for a point of a pixel, which grows by
 # LIGHT_SHARE with each light, up to MOST_LIGHTS.
 # Shares of the seconds that are left. POINTS_SHARE: at most for points. DIRECT_SHARE: at most for all of direct light.
-START_SECONDS, LOOKS, POINT_SECONDS, LIGHT_SHARE = 1.0, 3, 1.2e-5, 0.125
+START_SECONDS, LOOKS, POINT_SECONDS, LIGHT_SHARE = 1.8, 3, 1.2e-5, 0.125
 POINTS_SHARE, DIRECT_SHARE, MOST_LIGHTS = 0.15, 0.3, 100
 
 

@@ -68,12 +68,7 @@ BSDFS = {
     ("ShaderNodeBsdfAnisotropic", ""): Bsdf("glossy", {**COLOR, **BRUSHED}),
     ("ShaderNodeBsdfDiffuse", ""): Bsdf("diffuse", {**COLOR, "diffuse_roughness": "Roughness"}),
     ("ShaderNodeBsdfTranslucent", ""): Bsdf("translucent", COLOR),
-    (GLASS, ""): Bsdf(
-        "glass",
-        {**COLOR, **ROUGHNESS, "ior": "IOR"},
-        SEEN_THROUGH,
-        {"Thin Film Thickness": AS_ZERO},
-    ),
+    (GLASS, ""): Bsdf("glass", {**COLOR, **ROUGHNESS, "ior": "IOR"}, SEEN_THROUGH, {"Thin Film Thickness": AS_ZERO}),
     (METALLIC, "F82"): Bsdf("metal", {**BRUSHED, "color": "Base Color", "tint": "Edge Tint"}, "", OF_METALLIC),
     (METALLIC, "PHYSICAL_CONDUCTOR"): Bsdf(
         CONDUCTOR, {**BRUSHED, "color": "IOR", "tint": "Extinction"}, "", OF_METALLIC

@@ -305,10 +305,6 @@ def _restore(*_):
         return
     _write_paths(bpy.data.filepath)
     _state["paths"].clear()
-    # Files of former versions keep the pictures of layers.
-    for image in bpy.data.images:
-        if results.LAYER in image and image.use_fake_user:
-            image.use_fake_user = False
     for scene in bpy.data.scenes:
         is_shown = any(is_viewer(image) for image in results.our_images(scene))
         if is_shown or results.result_of(scene) is not None:

@@ -12,8 +12,7 @@ from . import comparison, operators, preflight, results
 from .job import clock, output_folder, progress_text, stage_title
 from .operators import COMMANDS
 from .preflight import APPROXIMATED, EXACT, LEFT_OUT, overview
-from .preview import ENGINE, is_previewing
-from .settings import active_light, lights_of
+from .preview import ENGINE, active_light, environment_of, is_previewing, lights_of, looks_through, view_of
 
 # Widths in pixels at interface scale 1.
 LETTER_PIXELS = 6.6  # mean width of a letter of Blender's interface
@@ -396,21 +395,28 @@ class _Lights(_Entries):
 
     def draw(self, context):
         layout, scene = self.layout, context.scene
-        if not lights_of(scene):
-            draw_text(gray(layout), context, "No light in the scene: add one (Shift A)", "INFO")
-            return
         layout.template_list("LTSH_UL_lights", "", scene, "objects", scene.ltsh, "active_light", rows=LIGHT_ROWS)
-        ob = active_light(context)
+        row, ob = layout.row(align=True), active_light(context)
+        is_pressed = looks_through(view_of(context)) is not None
+        row.operator("ltsh.look_through_light", text="", icon="OUTLINER_OB_CAMERA", depress=is_pressed)
+        row.operator("ltsh.add_light", icon="ADD")
+        row.operator("ltsh.duplicate_light", text="", icon="DUPLICATE")
+        row.operator("ltsh.delete_light", text="", icon="TRASH")
         if ob is None:
-            gray(layout).label(text="Click a light to select it")
-            return
-        entry = _entry_of(context, ob)
+            gray(layout).label(text="Click a light to select it" if lights_of(scene) else "No light in the scene")
+        entry = None if ob is None else _entry_of(context, ob)
         for note in entry.notes if entry is not None else ():
             draw_text(layout, context, note, STATE_ICONS[entry.state])
         split_names(layout, context)
         column = layout.column()
-        for name, label in light_properties(ob.data).items():
+        for name, label in (light_properties(ob.data) if ob is not None else {}).items():
             column.prop(ob.data, name, text=label)
+        background, texture = environment_of(scene.world)
+        if texture is None:
+            layout.operator("ltsh.open_environment", icon="WORLD")
+        else:
+            layout.template_ID(texture, "image", open="image.open")
+            layout.prop(background.inputs["Strength"], "default_value", text="Strength")
 
 
 class _Materials(_Entries):

@@ -30,7 +30,7 @@ from ..materials.bsdfs import bsdf_of, is_emission
 from ..materials.graph import shaders_behind, surface_of
 from ..materials.preview_material import preview_of
 from ..render_settings import CAMERA_KINDS, CAMERA_TYPES, picture_size
-from .preview import ENGINE, view_of
+from .preview import ENGINE, lights_of, select_alone, view_of
 
 EXACT, APPROXIMATED, LEFT_OUT = "exact", "approximated", "left out"
 OF_MIRRORS = "it reflects lights and the world, and is black where it would show anything else"
@@ -167,12 +167,12 @@ def _camera(scene) -> list[Problem]:
 def _lights(scene) -> list[Problem]:
     if may_shine(scene.world):
         return []
-    lights = [ob for ob in scene.objects if ob.type == "LIGHT"]
+    lights = lights_of(scene)
     if any(not ob.hide_render for ob in lights) or any(glows(material) for material in materials_of(scene)):
         return []
     if lights:
         return [_hidden(lights[0], f"Light {lights[0].name!r} is hidden in renders, and no other light is there")]
-    return [Problem("No light", True, "ltsh.add_area_light", "Add Light")]
+    return [Problem("No light", True, "ltsh.add_light", "Add Light", {"selects": False})]
 
 
 def materials_of(scene) -> list:
@@ -228,22 +228,6 @@ class LTSH_OT_add_camera(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LTSH_OT_add_area_light(bpy.types.Operator):
-    """Add an area light above the origin that shines down"""
-
-    bl_idname = "ltsh.add_area_light"
-    bl_label = "Add Area Light"
-    bl_options = {"REGISTER", "UNDO"}
-
-    def execute(self, context):
-        light = bpy.data.lights.new("Area", "AREA")
-        light.shape, light.size, light.size_y, light.energy = "RECTANGLE", 2.0, 1.0, 200.0
-        ob = bpy.data.objects.new("Area", light)
-        context.collection.objects.link(ob)
-        ob.location = (0.0, 0.0, 4.0)
-        return {"FINISHED"}
-
-
 class LTSH_OT_add_uv_map(bpy.types.Operator):
     """Unwrap the object into a new UV map (Smart UV Project)"""
 
@@ -264,10 +248,7 @@ class LTSH_OT_add_uv_map(bpy.types.Operator):
             return {"CANCELLED"}
         selected, active = context.selected_objects, context.view_layer.objects.active
         try:
-            for other in selected:
-                other.select_set(False)
-            ob.select_set(True)
-            context.view_layer.objects.active = ob
+            select_alone(context, ob)
             bpy.ops.object.mode_set(mode="EDIT")
             bpy.ops.mesh.select_all(action="SELECT")
             bpy.ops.uv.smart_project(island_margin=0.02)

@@ -1,15 +1,22 @@
-"""The button "Preview with LTSH": shows the scene with our engine, and restores the artist's engine afterwards.
+"""What buttons do to 3D views: show the scene with our engine, and place lights in it.
 
-Files are saved with the artist's engine and viewport shading, so that they open and render elsewhere as before.
+The button "Preview with LTSH" restores the artist's engine when it is clicked again.
+
+Files are saved with the artist's engine and viewport shading, so that they open and render elsewhere as before. Undo
+and redo leave the preview as it is: it is no change of the scene.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import bpy
 from bpy.app.handlers import persistent
+from bpy.props import BoolProperty, FloatProperty, FloatVectorProperty
+from bpy_extras import view3d_utils
+from bpy_extras.io_utils import ImportHelper
+from mathutils import Vector
 
+from ...scene import error_line
+from ..materials import graph
 from ..saving import keeps_engine
 
 ENGINE = "LTSH"
@@ -25,11 +32,6 @@ class LTSH_OT_preview(bpy.types.Operator):
 
     bl_idname = "ltsh.preview"
     bl_label = "Preview with LTSH"
-    bl_options = {"REGISTER", "UNDO"}
-
-    @classmethod
-    def poll(cls, context):
-        return context.scene is not None
 
     def execute(self, context):
         scene = context.scene
@@ -38,27 +40,17 @@ class LTSH_OT_preview(bpy.types.Operator):
             return {"FINISHED"}
         space = view_of(context)
         if scene.render.engine != ENGINE:
-            if space is not None:
-                _lent_views[space.as_pointer()] = _LentView(scene.session_uid, space.shading.type)
-            scene.ltsh_view.artist_engine = scene.render.engine
-            scene.render.engine = ENGINE
+            _former_shading[scene.session_uid] = {view.as_pointer(): view.shading.type for view in _views_of(scene)}
+            _former_shading[scene.session_uid][None] = "SOLID" if space is None else space.shading.type
+            start_preview(scene)
         if space is not None:
             space.shading.type = "RENDERED"
         return {"FINISHED"}
 
 
-@dataclass
-class _LentView:
-    """A 3D view that shows a preview, or has shown one that undo or redo may bring back."""
-
-    scene: int  # its session_uid
-    former: str  # the shading to restore
-    shows: bool = True  # the preview, now
-
-
-# By the address of the view. Kept only in memory, since undo does not change views, and files are saved without
-# previews.
-_lent_views: dict[int, _LentView] = {}
+# By the session_uid of a scene with a preview: the shading that views had before it, by their address, and under None
+# the one for views that are opened meanwhile. Only in memory, since files are saved without previews.
+_former_shading: dict[int, dict] = {}
 
 
 def view_of(context):
@@ -71,31 +63,39 @@ def view_of(context):
     return space
 
 
-def _views_of(scene) -> list[tuple]:
-    """The 3D views that were lent to the preview of `scene`, each with its `_LentView`."""
-    spaces = [space for screen in bpy.data.screens for area in screen.areas for space in area.spaces]
-    views = [(space, _lent_views.get(space.as_pointer())) for space in spaces if space.type == "VIEW_3D"]
-    return [(space, lent) for space, lent in views if lent is not None and lent.scene == scene.session_uid]
+def _views_of(scene) -> list:
+    """All 3D views, but for those of windows that show another scene."""
+    elsewhere = {window.screen for window in bpy.context.window_manager.windows if window.scene != scene}
+    areas = [area for screen in bpy.data.screens if screen not in elsewhere for area in screen.areas]
+    return [space for area in areas for space in area.spaces if space.type == "VIEW_3D"]
 
 
-def _let_views_follow(scene) -> None:
-    """Show the preview of `scene` in its views, or restore them, after its engine has changed.
+def _give_views_back(scene) -> list:
+    """Let the views that show the preview of `scene` have their former shading, and return them.
 
     Views whose shading was changed by hand since then stay as they are.
     """
-    shows = is_previewing(scene)
-    for space, lent in _views_of(scene):
-        if space.shading.type != ("RENDERED" if lent.shows else lent.former):
-            del _lent_views[space.as_pointer()]
-        elif shows != lent.shows:
-            space.shading.type, lent.shows = "RENDERED" if shows else lent.former, shows
+    former, given = _former_shading.get(scene.session_uid, {}), []
+    for space in _views_of(scene):
+        shading = former.get(space.as_pointer(), former.get(None, "RENDERED"))
+        if space.shading.type == "RENDERED" != shading:
+            space.shading.type = shading
+            given.append(space)
+    return given
+
+
+def start_preview(scene) -> None:
+    """Let `scene` have our engine, and remember the artist's."""
+    scene.ltsh_view.artist_engine = scene.render.engine
+    scene.render.engine = ENGINE
 
 
 def stop_preview(scene) -> None:
     """End the preview of `scene`: restore the artist's engine and the shading of views."""
     wanted = scene.ltsh_view.artist_engine
     scene.ltsh_view.artist_engine = ""
-    _let_views_follow(scene)
+    _give_views_back(scene)
+    _former_shading.pop(scene.session_uid, None)
     try:
         scene.render.engine = wanted
     except TypeError:
@@ -103,7 +103,272 @@ def stop_preview(scene) -> None:
         scene.render.engine = "CYCLES"
 
 
-_saved: list[str] = []
+def lights_of(scene) -> list:
+    """The light objects of `scene`, hidden ones included."""
+    return [ob for ob in scene.objects if ob.type == "LIGHT"]
+
+
+def active_light(context):
+    """The active object, which is the chosen one in the list of lights; None if it is not a light."""
+    ob = context.view_layer.objects.active
+    return ob if ob is not None and ob.type == "LIGHT" else None
+
+
+def select_alone(context, ob) -> None:
+    """Select only this object, and make it active, if the view layer has it."""
+    layer = context.view_layer
+    if ob.name not in layer.objects:
+        return
+    if context.mode != "OBJECT" and bpy.ops.object.mode_set.poll():
+        bpy.ops.object.mode_set(mode="OBJECT")
+    for other in layer.objects:
+        if other.select_get():
+            other.select_set(False)
+    ob.select_set(True)
+    layer.objects.active = ob
+
+
+# Of a light that is added to a surface: its distance by the width that the view shows there, its largest share of the
+# free room over the surface, its size by its distance, and its power by the square of it, which makes white about 1.
+DISTANCE, FREE_SHARE, LIGHT_SIZE, LIGHT_POWER = 0.35, 0.6, 0.6, 10.0
+# Of events that go on meanwhile: moving the view, and jobs.
+PASSED_ON = ("MIDDLE", "WHEEL", "TRACKPAD", "NDOF", "TIMER")
+
+
+class LTSH_OT_add_light(bpy.types.Operator):
+    """Add an area light: click a surface in a 3D view, which the light then faces"""
+
+    bl_idname = "ltsh.add_light"
+    bl_label = "Add Light"
+    bl_options = {"REGISTER", "UNDO"}
+    _light = None
+
+    location: FloatVectorProperty(name="Location", description="What the light shines on", subtype="TRANSLATION")
+    normal: FloatVectorProperty(
+        name="Normal", description="From there to the light", subtype="DIRECTION", default=(0.0, 0.0, 1.0)
+    )
+    distance: FloatProperty(
+        name="Distance", description="Between both; size and power follow", subtype="DISTANCE", min=1e-4, default=4.0
+    )
+    selects: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})  # the light, and nothing else
+
+    @classmethod
+    def poll(cls, context):
+        return context.mode == "OBJECT"
+
+    def invoke(self, context, event):
+        context.window_manager.modal_handler_add(self)
+        context.workspace.status_text_set("Add Light: click a surface in a 3D view    Esc: Cancel")
+        context.window.cursor_modal_set("CROSSHAIR")
+        return {"RUNNING_MODAL"}
+
+    def modal(self, context, event):
+        """The light follows the mouse until a click."""
+        if event.type in ("ESC", "RIGHTMOUSE"):
+            self.cancel(context)
+            return {"CANCELLED"}
+        if event.type.startswith(PASSED_ON):
+            return {"PASS_THROUGH"}
+        surface = surface_under(context, event.mouse_x, event.mouse_y)
+        if surface is None:
+            return {"RUNNING_MODAL"}
+        self.location, self.normal, self.distance = surface
+        self._put(context)
+        if event.type != "LEFTMOUSE" or event.value != "PRESS":
+            return {"RUNNING_MODAL"}
+        self._end(context)
+        return self.execute(context)
+
+    def execute(self, context):
+        self._put(context)
+        if self.selects:
+            select_alone(context, self._light)
+        return {"FINISHED"}
+
+    def cancel(self, context):
+        """Leave the scene as it was; also called by Blender when the window is closed."""
+        self._end(context)
+        if self._light is not None:
+            bpy.data.lights.remove(self._light.data)
+
+    def _end(self, context) -> None:
+        context.workspace.status_text_set(None)
+        context.window.cursor_modal_restore()
+
+    def _put(self, context) -> None:
+        """Put the light, which is made at first, over the surface."""
+        if self._light is None:
+            self._light = bpy.data.objects.new("Area", bpy.data.lights.new("Area", "AREA"))
+            context.collection.objects.link(self._light)
+            context.view_layer.update()
+            view = view_of(context)
+            if view is not None and view.local_view is not None:
+                self._light.local_view_set(view, True)
+        normal, data = Vector(self.normal).normalized(), self._light.data
+        self._light.location = Vector(self.location) + self.distance * normal
+        self._light.rotation_euler = normal.to_track_quat("Z", "Y").to_euler()
+        data.size, data.energy = LIGHT_SIZE * self.distance, LIGHT_POWER * self.distance**2
+
+
+def surface_under(context, x: int, y: int) -> tuple[Vector, Vector, float] | None:
+    """The point of a surface at a pixel of the window in any 3D view, its normal towards the view, and the distance for
+    a light there; None where there is none."""
+    for area in context.window.screen.areas:
+        regions = [one for one in area.regions if 0 <= x - one.x < one.width > 1 and 0 <= y - one.y < one.height > 1]
+        # Elsewhere a panel lies over the view.
+        if area.type == "VIEW_3D" and [region.type for region in regions] == ["WINDOW"]:
+            return _surface_at(context, regions[0], (x - regions[0].x, y - regions[0].y))
+    return None
+
+
+def _surface_at(context, region, pixel) -> tuple[Vector, Vector, float] | None:
+    scene, depsgraph, data = context.scene, context.evaluated_depsgraph_get(), region.data
+    start = view3d_utils.region_2d_to_origin_3d(region, data, pixel)
+    direction = view3d_utils.region_2d_to_vector_3d(region, data, pixel)
+    is_hit, point, normal, *_ = scene.ray_cast(depsgraph, start, direction)
+    if not is_hit:
+        return None
+    if normal.dot(direction) > 0.0:
+        normal.negate()
+    ends = [view3d_utils.region_2d_to_location_3d(region, data, (end, pixel[1]), point) for end in (0, region.width)]
+    distance = DISTANCE * (ends[1] - ends[0]).length
+    is_hit, other, *_ = scene.ray_cast(depsgraph, point + 1e-3 * distance * normal, normal)
+    return point, normal, min(distance, FREE_SHARE * (other - point).length) if is_hit else distance
+
+
+class _ActiveLight:
+    """An operator on the active light."""
+
+    @classmethod
+    def poll(cls, context):
+        light = active_light(context)
+        if light is None or context.mode != "OBJECT":
+            cls.poll_message_set("No light is active")
+            return False
+        return True
+
+
+class LTSH_OT_duplicate_light(_ActiveLight, bpy.types.Operator):
+    """Duplicate the active light; in a 3D view the mouse moves the copy until a click"""
+
+    bl_idname = "ltsh.duplicate_light"
+    bl_label = "Duplicate Light"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def invoke(self, context, event):
+        if context.area.type != "VIEW_3D":
+            return self.execute(context)
+        select_alone(context, active_light(context))
+        bpy.ops.object.duplicate_move("INVOKE_DEFAULT")
+        # The step of undo is that of Blender's operator, when it ends.
+        return {"CANCELLED"}
+
+    def execute(self, context):
+        select_alone(context, active_light(context))
+        return bpy.ops.object.duplicate()
+
+
+class LTSH_OT_delete_light(_ActiveLight, bpy.types.Operator):
+    """Delete the active light"""
+
+    bl_idname = "ltsh.delete_light"
+    bl_label = "Delete Light"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def execute(self, context):
+        with context.temp_override(selected_objects=[active_light(context)]):
+            return bpy.ops.object.delete(confirm=False)
+
+
+# Of views that look through lights, by their address: camera, whether it is local and locked, perspective,
+# location, rotation and distance.
+_before_looking: dict[int, tuple] = {}
+
+
+def looks_through(space):
+    """The light through which a 3D view looks; None if there is none."""
+    is_local = space is not None and space.use_local_camera and space.region_3d.view_perspective == "CAMERA"
+    return space.camera if is_local and space.camera is not None and space.camera.type == "LIGHT" else None
+
+
+class LTSH_OT_look_through_light(bpy.types.Operator):
+    """Look through the active light as through a camera, and move it by moving the view; once more: return"""
+
+    bl_idname = "ltsh.look_through_light"
+    bl_label = "Look Through Light"
+
+    @classmethod
+    def poll(cls, context):
+        space = view_of(context)
+        return space is not None and (active_light(context) is not None or looks_through(space) is not None)
+
+    def execute(self, context):
+        space, light = view_of(context), active_light(context)
+        former, region, key = looks_through(space), space.region_3d, space.as_pointer()
+        moves = region.view_location.copy(), region.view_rotation.copy(), region.view_distance
+        if former is None:
+            camera = space.camera, space.use_local_camera, space.lock_camera
+            _before_looking[key] = *camera, region.view_perspective, *moves
+        if light is not None and light != former:
+            # Only of this view: renders keep the camera of the scene.
+            space.use_local_camera = space.lock_camera = True
+            space.camera, region.view_perspective = light, "CAMERA"
+            return {"FINISHED"}
+        state = _before_looking.pop(key, (context.scene.camera, False, False, "PERSP", *moves))
+        space.camera, space.use_local_camera, space.lock_camera = state[:3]
+        region.view_perspective, region.view_location, region.view_rotation, region.view_distance = state[3:]
+        return {"FINISHED"}
+
+
+def environment_of(world) -> tuple:
+    """The Background node of a world and the Environment Texture that colors it; None for what is not there."""
+    surface = graph.surface_of(world) if world is not None else None
+    source = graph.source_of(surface) if surface is not None else None
+    if source is None or source.node is None or source.node.bl_idname != "ShaderNodeBackground":
+        return None, None
+    color = source.input("Color")
+    is_texture = color is not None and color.node is not None and color.node.bl_idname == "ShaderNodeTexEnvironment"
+    return source.node, color.node if is_texture else None
+
+
+class LTSH_OT_open_environment(bpy.types.Operator, ImportHelper):
+    """Light the scene by a picture, an Environment Texture of the world. Nodes that are there stay, unlinked"""
+
+    bl_idname = "ltsh.open_environment"
+    bl_label = "Open Environment Texture"
+    bl_options = {"REGISTER", "UNDO"}
+
+    filter_image: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
+    filter_folder: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
+
+    def execute(self, context):
+        try:
+            image = bpy.data.images.load(self.filepath, check_existing=True)
+        except RuntimeError as error:
+            self.report({"ERROR"}, error_line(error))
+            return {"CANCELLED"}
+        world = context.scene.world
+        if world is None or world.library is not None:
+            world = context.scene.world = bpy.data.worlds.new("World")
+        if graph.tree_in_use(world) is None:
+            world.use_nodes = True
+        nodes, links = world.node_tree.nodes, world.node_tree.links
+        background, texture = environment_of(world)
+        if background is None:
+            output = graph.material_output(world.node_tree) or nodes.new("ShaderNodeOutputWorld")
+            background = nodes.new("ShaderNodeBackground")
+            background.location = output.location - Vector((200.0, 0.0))
+            links.new(background.outputs[0], output.inputs["Surface"])
+        if texture is None:
+            texture = nodes.new("ShaderNodeTexEnvironment")
+            texture.location = background.location - Vector((300.0, 0.0))
+            links.new(texture.outputs[0], background.inputs["Color"])
+        texture.image = image
+        return {"FINISHED"}
+
+
+# What a file is saved without: scenes by name, and their views.
+_saved: list[tuple[str, list]] = []
 
 
 @persistent
@@ -111,34 +376,53 @@ def _before_saving(*_) -> None:
     # A copy for a render of our own keeps the engine: the render has begun.
     if keeps_engine():
         return
-    _saved[:] = [scene.name for scene in bpy.data.scenes if is_previewing(scene)]
-    for scene in (bpy.data.scenes[name] for name in _saved):
+    for scene in filter(is_previewing, bpy.data.scenes):
         scene.render.engine = scene.ltsh_view.artist_engine
-        _let_views_follow(scene)
+        _saved.append((scene.name, _give_views_back(scene)))
 
 
 @persistent
 def _after_saving(*_) -> None:
-    for scene in (bpy.data.scenes[name] for name in _saved if name in bpy.data.scenes):
-        scene.render.engine = ENGINE
-        _let_views_follow(scene)
+    for name, views in _saved:
+        bpy.data.scenes[name].render.engine = ENGINE
+        for space in views:
+            space.shading.type = "RENDERED"
     _saved.clear()
 
 
+# Which scenes had a preview before undo or redo, by their session_uid.
+_before_undo: dict[int, bool] = {}
+
+
 @persistent
-def _after_undo(*_) -> None:
-    """Undo and redo may end a preview or bring it back: they restore the engine, but not the views."""
+def _note_previews(*_) -> None:
+    _before_undo.clear()
+    _before_undo.update({scene.session_uid: is_previewing(scene) for scene in bpy.data.scenes})
+
+
+@persistent
+def _restore_previews(*_) -> None:
+    """Undo and redo also restore the engine of a scene: the preview is on or off as it was before them."""
     for scene in bpy.data.scenes:
-        _let_views_follow(scene)
+        wanted = _before_undo.get(scene.session_uid, is_previewing(scene))
+        if wanted != is_previewing(scene):
+            (start_preview if wanted else stop_preview)(scene)
+
+
+@persistent
+def _end_previews(*_) -> None:
+    for scene in filter(is_previewing, bpy.data.scenes):
+        stop_preview(scene)
 
 
 @persistent
 def _after_loading(*_) -> None:
-    """Files that were saved during a preview have the artist's engine, and no preview."""
-    _lent_views.clear()
+    """Files have no preview. Those that Blender has saved by itself, as Auto Save, may still have its engine."""
+    _former_shading.clear()
+    _before_looking.clear()
+    _end_previews()
     for scene in bpy.data.scenes:
-        if scene.render.engine != ENGINE:
-            scene.ltsh_view.artist_engine = ""
+        scene.ltsh_view.artist_engine = ""
     _subscribe()
 
 
@@ -147,8 +431,7 @@ def _engine_changed() -> None:
     for scene in bpy.data.scenes:
         if scene.render.engine != ENGINE and scene.ltsh_view.artist_engine:
             scene.ltsh_view.artist_engine = ""
-            for space, _ in _views_of(scene):
-                del _lent_views[space.as_pointer()]
+            _former_shading.pop(scene.session_uid, None)
 
 
 _subscriber = object()
@@ -166,8 +449,11 @@ HANDLERS = (
     ("save_pre", _before_saving),
     ("save_post", _after_saving),
     ("save_post_fail", _after_saving),
-    ("undo_post", _after_undo),
-    ("redo_post", _after_undo),
+    ("undo_pre", _note_previews),
+    ("redo_pre", _note_previews),
+    ("undo_post", _restore_previews),
+    ("redo_post", _restore_previews),
+    ("load_pre", _end_previews),
     ("load_post", _after_loading),
 )
 register = _subscribe
@@ -176,6 +462,4 @@ register = _subscribe
 def unregister() -> None:
     """End all previews."""
     bpy.msgbus.clear_by_owner(_subscriber)
-    for scene in bpy.data.scenes:
-        if is_previewing(scene):
-            stop_preview(scene)
+    _end_previews()

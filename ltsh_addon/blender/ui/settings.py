@@ -24,6 +24,7 @@ from bpy.props import (
 from ...scene import COMPARED_TECHNIQUES, CYCLES, DEFAULT_TECHNIQUE, REFERENCE, TECHNIQUES
 from ...workers.pool import CORES_VARIABLE
 from .comparison import changed, mixed, redraw_editors
+from .preview import active_light, lights_of, select_alone
 
 # The name of the add-on: "bl_ext.user_default.ltsh" in Blender, "ltsh_addon" when imported from elsewhere.
 ADDON = __package__.rsplit(".", 3)[0]
@@ -65,13 +66,22 @@ def default_output_folder() -> Path:
     return Path(bpy.utils.user_resource("DATAFILES", path="ltsh")) / RESULTS
 
 
+# Blender calls lambdas of properties without the names of this module.
+def _apply(chosen, context) -> None:
+    apply(context)
+
+
+def _redraw(settings, context) -> None:
+    redraw_editors("VIEW_3D")
+
+
 class LTSH_AddonPreferences(bpy.types.AddonPreferences):
     bl_idname = ADDON
 
     cores: bpy.props.IntProperty(
         name="Processor Cores",
         description="How many cores shading, baking and the Cycles reference may use; 0 takes all of them",
-        min=0, max=1024, soft_max=64, default=0, update=lambda self, context: apply(context),
+        min=0, max=1024, soft_max=64, default=0, update=_apply,
     )  # fmt: skip
     output_folder: bpy.props.StringProperty(
         name="Output Folder",
@@ -81,7 +91,7 @@ class LTSH_AddonPreferences(bpy.types.AddonPreferences):
     )  # fmt: skip
     log_level: bpy.props.EnumProperty(
         name="Log", description="What the add-on writes to the console that Blender was started from",
-        items=LOG_LEVELS, default=_DEFAULT_LOG_LEVEL, update=lambda self, context: apply(context),
+        items=LOG_LEVELS, default=_DEFAULT_LOG_LEVEL, update=_apply,
     )  # fmt: skip
 
     def draw(self, context):
@@ -182,17 +192,6 @@ class LTSH_PG_last_result(bpy.types.PropertyGroup):
 NOT_HELD = -1
 
 
-def lights_of(scene) -> list:
-    """The light objects of `scene`, hidden ones included."""
-    return [ob for ob in scene.objects if ob.type == "LIGHT"]
-
-
-def active_light(context):
-    """The active object, which is the chosen one in the list of lights; None if it is not a light."""
-    ob = context.view_layer.objects.active
-    return ob if ob is not None and ob.type == "LIGHT" else None
-
-
 def _active_index(settings) -> int:
     """Index of the active light among the objects of the scene; -1 if there is none."""
     scene = settings.id_data
@@ -202,16 +201,9 @@ def _active_index(settings) -> int:
 
 def _select(settings, index: int) -> None:
     """Select only the light at this index among the objects of the scene, and make it active."""
-    objects, layer = settings.id_data.objects, bpy.context.view_layer
-    if not 0 <= index < len(objects) or objects[index].name not in layer.objects:
-        return
-    if bpy.context.mode != "OBJECT" and bpy.ops.object.mode_set.poll():
-        bpy.ops.object.mode_set(mode="OBJECT")
-    for other in layer.objects:
-        if other.select_get():
-            other.select_set(False)
-    objects[index].select_set(True)
-    layer.objects.active = objects[index]
+    objects = settings.id_data.objects
+    if 0 <= index < len(objects):
+        select_alone(bpy.context, objects[index])
 
 
 def _hidden(ob) -> int:
@@ -301,7 +293,7 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
         name="Shadows",
         description="Surfaces stand in each other's light, in the Cycles reference too; without, pictures show how "
         "well a technique shades alone",
-        default=True, update=lambda self, context: redraw_editors("VIEW_3D"),
+        default=True, update=_redraw,
     )  # fmt: skip
     shadow_rays: IntProperty(
         name="Shadow Rays",
@@ -312,10 +304,8 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
         name="Output",
         description="Folder for the results, in folders of their own for shading, comparing and baking; // is the "
         "folder of the .blend. Empty takes the one of the preferences, as does a file that is not saved yet",
-        subtype="DIR_PATH",
-        options={"PATH_SUPPORTS_BLEND_RELATIVE"},
-        default="//ltsh/",
-    )
+        subtype="DIR_PATH", options={"PATH_SUPPORTS_BLEND_RELATIVE"}, default="//ltsh/",
+    )  # fmt: skip
     bake_size: EnumProperty(name="Size", description="Texels on each side of the texture", items=SIZES, default="1024")
     bake_margin: IntProperty(
         name="Margin", description="How far colors go on beyond the borders of UV islands, in texels",

@@ -45,7 +45,7 @@ def lit_scene():
     scene = bpy.context.scene
     scene.render.engine = "LTSH"
     scene.ltsh.anti_aliasing, scene.ltsh_view.technique = 1, "ltsh2"
-    scene.ltsh.shadows = False
+    scene.ltsh.shadows = scene.ltsh_view.complete = False
     settings = scene.render.image_settings
     settings.file_format, settings.color_depth = "OPEN_EXR", "32"
     return plane, sphere

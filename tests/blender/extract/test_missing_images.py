@@ -8,8 +8,6 @@ from lit_plane import light_tree
 
 from ltsh_addon.blender.evaluated import with_render_depsgraph
 from ltsh_addon.blender.extract.pixels import missing_images
-from ltsh_addon.blender.render_settings import render_exr
-from ltsh_addon.imaging.exr import read_channels
 
 pytestmark = pytest.mark.newest
 
@@ -131,12 +129,9 @@ def test_missing_images_are_named_if_and_only_if_cycles_shows_them(tmp_path):
     """With another color in place of an image, Cycles' picture is another one if it shows the image."""
     scene = gallery()
     names = named(scene)
-    scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", 1, False
 
     def picture():
-        path = tmp_path / "picture.exr"
-        render_exr(scene, path)
-        return np.stack(list(read_channels(path).values()))
+        return np.stack(list(scene_parts.cycles_channels(tmp_path).values()))
 
     def is_other_with(images):
         before = [(image, image.source, image.filepath) for image in images]

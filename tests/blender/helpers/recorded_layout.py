@@ -139,7 +139,7 @@ def drawn(panel, function="draw", width=300, scale=1.0, **context) -> list[Shown
     """What `panel` draws in a region `width` pixels wide."""
     found = stand_in(panel)()
     found.layout = Layout()
-    space = SimpleNamespace(type=panel.bl_space_type, image=None)
+    space = SimpleNamespace(type=panel.bl_space_type, image=None, use_local_camera=False)
     getattr(found, function)(context_of(width, scale, **{"space_data": space, **context}))
     return found.layout.shown
 
@@ -147,7 +147,8 @@ def drawn(panel, function="draw", width=300, scale=1.0, **context) -> list[Shown
 def context_of(width=300, scale=1.0, **context):
     """Stands for the context of a region `width` pixels wide."""
     preferences = SimpleNamespace(system=SimpleNamespace(ui_scale=scale), addons=bpy.context.preferences.addons)
-    now = {name: getattr(bpy.context, name) for name in ("scene", "object", "selected_objects", "view_layer", "mode")}
+    now = {name: getattr(bpy.context, name) for name in ("scene", "object", "selected_objects", "view_layer", "mode",
+                                                       "screen")}  # fmt: skip
     now |= {"region": SimpleNamespace(width=width), "preferences": preferences}
     return SimpleNamespace(**{**now, **context})
 

@@ -60,10 +60,7 @@ def test_parents_and_constraints_move_lights(tmp_path):
 def test_lights_instanced_by_geometry_nodes(tmp_path):
     """Lights and lamps on the points of a visible mesh that would stand in their light."""
     start()
-    for x, source in (
-        (0.5, scene_parts.add_area_light(size=0.4)),
-        (-0.5, add_lamp_plane(scale=(0.4, 0.4, 1))),
-    ):
+    for x, source in ((0.5, scene_parts.add_area_light(size=0.4)), (-0.5, add_lamp_plane(scale=(0.4, 0.4, 1)))):
         source.location, source.rotation_euler = (0.0, 0.0, 50.0), (0.0, 0.0, 0.0)
         maker = scene_parts.add_mesh("Maker", [(x, 0.4, 1.2), (x, 1.2, 1.4), (x + 0.4, 1.2, 1.5)], [(0, 1, 2)])
         maker.visible_camera = False

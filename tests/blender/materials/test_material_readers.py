@@ -243,10 +243,7 @@ STRUCTURES = {
         {0.1: 0.42, 0.2: 0.28, 0.3: 0.03, 0.4: 0.27},
     ),
     "sum": (lambda b: b.add(b.leaf(0.1), b.mix(0.2, b.leaf(0.2), b.leaf(0.3))), {0.1: 1.0, 0.2: 0.8, 0.3: 0.2}),
-    "a mixed sum": (
-        lambda b: b.mix(0.2, b.add(b.leaf(0.1), b.leaf(0.2)), b.leaf(0.3)),
-        {0.1: 0.8, 0.2: 0.8, 0.3: 0.2},
-    ),
+    "a mixed sum": (lambda b: b.mix(0.2, b.add(b.leaf(0.1), b.leaf(0.2)), b.leaf(0.3)), {0.1: 0.8, 0.2: 0.8, 0.3: 0.2}),
     "factors beyond 1": (lambda b: b.mix(1.5, b.leaf(0.1), b.leaf(0.2)), {0.2: 1.0}),
     "factor 0": (lambda b: b.mix(0.0, b.leaf(0.1), b.clear()), {0.1: 1.0}),
     "a node that is used twice": (twice_the_same, {0.1: 0.75 * 0.5 + 0.25, 0.2: 0.75 * 0.5}),

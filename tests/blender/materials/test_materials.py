@@ -189,11 +189,7 @@ def test_colors_under_a_cut_alpha_are_those_of_the_image(tmp_path, kind):
 
 
 def test_every_unsupported_input_is_named_once(tmp_path):
-    wanted = {
-        "Subsurface Weight": 0.2,
-        "Transmission Weight": 0.1,
-        "Thin Film Thickness": 100.0,
-    }
+    wanted = {"Subsurface Weight": 0.2, "Transmission Weight": 0.1, "Thin Film Thickness": 100.0}
     material, node = principled("Rich")
     if "Thin Wall" in node.inputs:
         wanted["Thin Wall"] = True

@@ -419,6 +419,7 @@ def test_a_budget_excludes_samples(tmp_path, capsys):
 @pytest.mark.newest
 def test_a_budget_chooses_points_rays_and_samples(tmp_path):
     floor_and_ball(gray(), 1)
+    parts.add_world(Color=(0.2, 0.2, 0.2, 1.0))
     path = parts.save(tmp_path / "room.blend")
     # The larger one leaves time for everything, however slowly Blender starts on a busy machine.
     made = {budget: render.finish(RenderOptions(path, output=tmp_path, budget=budget)) for budget in (0.01, 10.0)}

@@ -205,27 +205,6 @@ def test_more_panes_than_the_bounces_of_the_file_block_as_in_cycles(most, tmp_pa
         assert (expected > 0.0) == (most == 3)
 
 
-def test_faces_whose_smooth_normals_point_to_their_other_side_are_lit_as_in_cycles_bake(tmp_path):
-    """As half of a bent quad is. Light from above the face must not start below it, also where its horizon cuts the
-    light, so that the specular lobe ends at the smooth horizon."""
-    scene_parts.empty_scene()
-    face = scene_parts.add_plane(scene_parts.principled(Roughness=0.4)[0], size=0.02, name="Face")
-    face.data.polygons.foreach_set("use_smooth", [True])
-    face.data.normals_split_custom_set([(math.sin(1.9), 0.0, math.cos(1.9))] * 4)
-    scene_parts.add_camera((2.0, 0.0, 1.5))
-    scene_parts.add_area_light(location=(2.0, 0.5, 0.4), rotation=(0.0, 1.3, 0.2))
-    path = scene_parts.save(tmp_path / "face.blend")
-    options = {"shadows": "on", "error": True, "cycles_samples": 64}
-    for scale in (1.0, -1.0):
-        bpy.data.objects["Face"].scale[1] = scale
-        scene_parts.save(path)
-        layers = bake_scenes.baked(path, tmp_path / f"bake {scale:g}", **options)[1]["Face.exr"]
-        for part in ("specular", "diffuse"):
-            found, expected = (layers[f"{name}.{part}"].mean() for name in ("ltsh4c", "cycles"))
-            # LTSH4C's own error; light that started below the face would be lost.
-            assert expected > 0.0 and abs(found / expected - 1.0) < 0.03, (part, scale)
-
-
 def test_what_a_curved_surface_chooses_starts_at_its_faces_as_in_cycles_bake(tmp_path):
     """Light that falls along a face passes a fence for rays that the light chose, which start above the curved
     surface, and is blocked for those that the surface chose."""

@@ -7,7 +7,7 @@ import recorded_layout
 import scene_parts as parts
 from scene_parts import principled
 
-from ltsh_addon.blender.ui import comparison, panels, preflight, preview, results
+from ltsh_addon.blender.ui import comparison, panels, preflight, results
 from ltsh_addon.blender.viewport import live_cycles
 
 
@@ -35,28 +35,6 @@ def test_the_pressed_buttons_are_those_of_the_pictures_that_are_shown(scene, tmp
     assert [entry.text for entry in shown if entry.what == "ltsh.choose" and entry.pressed] == pressed
     bpy.ops.ltsh.choose(key="pass_name", value="diffuse")
     assert scene.ltsh.pass_name == "diffuse"
-
-
-@pytest.mark.parametrize("end", ["undo", "button"])
-def test_redo_and_undo_of_an_end_bring_the_preview_back_into_its_view(scene, end):
-    scene.render.engine = "BLENDER_WORKBENCH"
-    space = preview.view_of(bpy.context)
-    space.shading.type = "WIREFRAME"
-    bpy.ops.ed.undo_push(message="Before")
-    bpy.ops.ltsh.preview()
-    bpy.ops.ed.undo_push(message="Preview")
-    if end == "undo":
-        bpy.ops.ed.undo()
-        assert space.shading.type == "WIREFRAME"
-        bpy.ops.ed.redo()
-    else:
-        bpy.ops.ltsh.preview()
-        bpy.ops.ed.undo_push(message="End")
-        assert space.shading.type == "WIREFRAME"
-        bpy.ops.ed.undo()
-    assert preview.is_previewing(bpy.context.scene) and space.shading.type == "RENDERED"
-    bpy.ops.ltsh.preview()
-    assert space.shading.type == "WIREFRAME"
 
 
 def test_materials_have_the_sign_of_what_the_view_says(scene):

@@ -5,7 +5,7 @@ import pytest
 import scene_parts as parts
 from recorded_layout import Layout, buttons, context_of, drawn, stand_in, texts
 
-from ltsh_addon.blender.ui import panels, preflight, results
+from ltsh_addon.blender.ui import panels, preflight, results, settings
 from ltsh_addon.blender.ui.job import Job, Plan, Step
 
 MAIN_3D, MAIN_RENDER, *PARTS = panels.CLASSES[1:-1]
@@ -262,6 +262,19 @@ def test_solo_hides_the_others_and_gives_back_what_was_hidden(scene):
     bpy.data.objects.remove(key)
     rim.ltsh_light.mute = False
     assert not rim.hide_render and not rim.hide_viewport
+
+
+def test_views_show_shadows_that_are_switched_off_at_once(scene, monkeypatch):
+    drawn_again = []
+    monkeypatch.setattr(settings, "redraw_editors", lambda *kinds: drawn_again.append(kinds))
+    scene.ltsh.shadows = not scene.ltsh.shadows
+    assert drawn_again == [("VIEW_3D",)]
+
+
+def test_complete_is_on_at_first_and_in_a_panel_that_is_open(scene):
+    scene.render.engine = "LTSH"
+    assert scene.ltsh_view.complete and "DEFAULT_CLOSED" not in getattr(FINAL, "bl_options", ())
+    assert "complete" in [item.what for item in drawn(FINAL)] and FINAL.poll(bpy.context)
 
 
 def test_lights_and_materials_are_listed_with_what_is_not_exact(scene):

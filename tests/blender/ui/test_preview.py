@@ -1,10 +1,13 @@
 """The button "Preview with LTSH": what it gives back to scenes, views and files."""
 
+import random
+
 import bpy
 import pytest
 import scene_parts
 
 import ltsh_addon
+from ltsh_addon.blender.saving import save_working_copy
 from ltsh_addon.blender.ui import preview
 
 ARTISTS = "BLENDER_WORKBENCH"
@@ -27,18 +30,44 @@ def shading(views):
     return [space.shading.type for space in views]
 
 
-def end_by_undo():
-    bpy.ops.ed.undo_push(message="Preview")
-    assert bpy.ops.ed.undo() == {"FINISHED"}
-
-
-@pytest.mark.parametrize("end", [lambda: bpy.ops.ltsh.preview(), end_by_undo, ltsh_addon.unregister])
+@pytest.mark.parametrize("end", [lambda: bpy.ops.ltsh.preview(), ltsh_addon.unregister])
 def test_ending_a_preview_gives_its_view_back_and_no_other(views, end):
-    bpy.ops.ed.undo_push(message="Before")
     bpy.ops.ltsh.preview()
     assert shading(views) == ["RENDERED", "RENDERED"]
     end()
     assert bpy.context.scene.render.engine == ARTISTS and shading(views) == ["WIREFRAME", "RENDERED"]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_undo_and_redo_leave_the_preview_as_it_is(views, seed):
+    """A walk of edits, undo, redo and clicks on the button, beside a list of what each step of undo has."""
+    chosen, on, at = random.Random(seed), False, -1
+    data = bpy.data.lights.new("Key", "AREA")
+    bpy.context.scene.collection.objects.link(bpy.data.objects.new("Key", data))
+    steps = []  # energy and engine of the artist
+    kinds = ["edit", "engine", "preview", "preview", *3 * ["undo", "redo"]]
+    for number, kind in enumerate(["edit", "engine", "edit", "preview", *chosen.choices(kinds, k=60)]):
+        scene, light = bpy.context.scene, bpy.data.lights["Key"]
+        if kind == "preview":
+            bpy.ops.ltsh.preview()
+            on = not on
+        elif kind in ("edit", "engine"):
+            light.energy = number
+            if kind == "engine" and not on:
+                scene.render.engine = chosen.choice(["CYCLES", ARTISTS])
+            engine = scene.ltsh_view.artist_engine if on else scene.render.engine
+            del steps[at + 1 :]
+            at = len(steps)
+            steps.append((number, engine))
+            bpy.ops.ed.undo_push(message=kind)
+        elif 0 <= at + (move := 1 if kind == "redo" else -1) < len(steps):
+            at += move
+            assert getattr(bpy.ops.ed, kind)() == {"FINISHED"}
+        scene, energy, engine = bpy.context.scene, *steps[at]
+        assert bpy.data.lights["Key"].energy == energy
+        assert scene.render.engine == ("LTSH" if on else engine), (number, kind)
+        assert shading(views) == ["RENDERED" if on else "WIREFRAME", "RENDERED"], (number, kind)
+        assert preview.is_previewing(scene) == on and scene.ltsh_view.artist_engine == (engine if on else "")
 
 
 def test_a_view_that_is_changed_during_a_preview_is_the_artists_choice(views):
@@ -46,6 +75,30 @@ def test_a_view_that_is_changed_during_a_preview_is_the_artists_choice(views):
     views[0].shading.type = "SOLID"
     bpy.ops.ltsh.preview()
     assert shading(views) == ["SOLID", "RENDERED"]
+
+
+def test_views_that_are_opened_during_a_preview_end_with_it(views):
+    """As a new window or a split area: of such a view nobody knows what it showed before."""
+    bpy.ops.ltsh.preview()
+    del preview._former_shading[bpy.context.scene.session_uid][views[1].as_pointer()]
+    bpy.ops.ltsh.preview()
+    assert shading(views) == ["WIREFRAME", "WIREFRAME"]
+
+
+def test_another_file_in_the_same_windows_gives_the_views_back(views, tmp_path):
+    path = scene_parts.save(tmp_path / "other.blend")
+    bpy.ops.ltsh.preview()
+    bpy.ops.wm.open_mainfile(filepath=str(path), load_ui=False)
+    assert preview.view_of(bpy.context).shading.type == "WIREFRAME" and not preview._former_shading
+
+
+def test_a_file_that_blender_saved_by_itself_during_a_preview_opens_without_it(addon, tmp_path):
+    """Auto Save writes the state of the last step of undo, which has the engine of the preview."""
+    addon.render.engine, addon.ltsh_view.artist_engine = "LTSH", ARTISTS
+    path = tmp_path / "auto.blend"
+    save_working_copy(path, keep_engine=True)
+    bpy.ops.wm.open_mainfile(filepath=str(path))
+    assert bpy.context.scene.render.engine == ARTISTS and not preview.is_previewing(bpy.context.scene)
 
 
 def test_files_saved_during_a_preview_keep_engine_and_shading(addon, views, tmp_path):

@@ -21,13 +21,7 @@ from view_pictures import (
 )
 
 from ltsh_addon import shading
-from ltsh_addon.blender.engine.overlay import (
-    LIGHTS_PANEL,
-    MATERIALS_PANEL,
-    QuietLine,
-    left_out,
-    wrapped,
-)
+from ltsh_addon.blender.engine.overlay import LIGHTS_PANEL, MATERIALS_PANEL, QuietLine, left_out, wrapped
 from ltsh_addon.blender.lights.emission import emission_of
 from ltsh_addon.blender.lights.world import light_of_world
 from ltsh_addon.blender.materials import preview_material

@@ -2,17 +2,6 @@
 /* Distances from the eye that differ by this share are those of different surfaces. */
 const float NEAR = 0.05;
 
-vec4 rest_at(vec2 place)
-{
-  ivec2 size = textureSize(rest, 0);
-  vec2 at = clamp(place * vec2(size), vec2(0.5), vec2(size) - 0.5) - 0.5;
-  ivec2 low = ivec2(floor(at)), high = min(low + 1, size - 1);
-  vec2 share = at - vec2(low);
-  vec4 below = mix(texelFetch(rest, low, 0), texelFetch(rest, ivec2(high.x, low.y), 0), share.x);
-  vec4 above = mix(texelFetch(rest, ivec2(low.x, high.y), 0), texelFetch(rest, high, 0), share.x);
-  return mix(below, above, share.y);
-}
-
 void main()
 {
   ivec2 texel = ivec2(gl_FragCoord.xy);
@@ -32,7 +21,7 @@ void main()
   }
   vec3 front = texelFetch(diffuse_colors, texel, 0).rgb + texelFetch(specular_colors, texel, 0).rgb;
   vec3 guess = texelFetch(front_positions, texel, 0).w > 0.0 ? ambient.rgb * front : vec3(0.0);
-  vec3 added = scale.rgb * mix(guess, rest_at(place).rgb, is_known);
+  vec3 added = scale.rgb * mix(guess, rest_between(place * vec2(textureSize(rest, 0))).rgb, is_known);
   float share = is_known * max(clamp(weight * texelFetch(of_cycles, texel, 0).x, 0.0, 1.0), is_everything);
   color = vec4((1.0 - share) * lit.rgb + added, 1.0 - (1.0 - share) * (1.0 - lit.a));
 }

@@ -1,7 +1,7 @@
-/* The light of the view itself, but where the surface is Cycles' alone, and the rest, found by the surface's place. */
 /* Distances from the eye that differ by this share are those of different surfaces. */
 const float NEAR = 0.05;
 
+/* The light of the view itself, but where the surface is Cycles' alone, and the rest, found by the surface's place. */
 void main()
 {
   ivec2 texel = ivec2(gl_FragCoord.xy);

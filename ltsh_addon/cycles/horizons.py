@@ -75,8 +75,9 @@ SMALLEST_SHARE = 5e-3
 UNSPLIT = 0.03
 # Samples per block.
 BLOCK = 2048
-# If there are more flat lights of one spread, this many rectangles stand for them, about as fine as the directions.
-MOST_LIGHTS = 512
+# If there are more flat lights of one spread, this many rectangles stand for them: pictures of three scenes of 939 to
+# 9,799 change by .06 % (L2), their means by .005 %.
+MOST_LIGHTS = 128
 # Pairs of samples and lights in one chunk: MOST_PAIRS where few arrays are needed for each, PAIRS where many are.
 MOST_PAIRS, PAIRS = 2**21, 2**14
 

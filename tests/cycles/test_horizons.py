@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from surface_scenes import shifted
 
+from ltsh_addon import shading
 from ltsh_addon.cycles import horizons
 from ltsh_addon.cycles.environment import CUBE
 from ltsh_addon.cycles.gbuffer import coarse_meshes
@@ -186,6 +187,22 @@ def test_rectangles_stand_for_thousands_of_lights(monkeypatch):
     weight = found[1].sum(axis=0)
     few, all_of_them = (horizons.smooth_horizon_share(*own) for own in found)
     assert (weight * np.abs(few - all_of_them)).sum() < 0.05 * weight.sum() and np.ptp(all_of_them) > 0.9
+
+
+def test_few_rectangles_for_thousands_of_lights_change_less_than_three_thousandths_of_the_light(monkeypatch):
+    """Horizons of a ball of 48 segments are 3 degrees apart. The light between them is little, so that a coarse guess
+    of who lets it through is enough."""
+    generator = np.random.default_rng(3)
+    samples, lights = samples_around(generator, 300), lights_around(generator, 1500)
+    true = horizons.unit(samples.smooth_normal + 0.05 * generator.normal(size=(300, 3)))
+    samples = replace(samples, geometric_normal=true)
+    reflected = []
+    for most in (horizons.MOST_LIGHTS, len(lights)):
+        monkeypatch.setattr(horizons, "MOST_LIGHTS", most)
+        ended, index = end_at_horizons_of_cycles(samples, lights, is_quick=True)
+        light = shading.shade(ended, lights, "ltc", passes=("specular",), rows=[0] * len(lights), workers=1).specular[0]
+        reflected.append(np.stack([np.bincount(index, color) for color in light.T]))
+    assert 0.0 < np.linalg.norm(reflected[0] - reflected[1]) < 3e-3 * np.linalg.norm(reflected[1])
 
 
 @pytest.mark.parametrize("is_quick", [False, True])

@@ -17,12 +17,12 @@ SIZE = "1600x900"
 NAME, STAR, EYE, ROW = 225, 78, 58, 174
 # The same of the menu of presets, and, while a light is chosen during the preview, of its fields.
 PRESETS, DRAFT = (90, 15), (102, 53)
-LIGHT_FIELDS = {"power": (103, 319), "size": (103, 407)}
+LIGHT_FIELDS = {"power": (103, 345), "size": (103, 433)}
 # From the right and upper end of the Properties editor: its tab of materials, and what is in it.
 MATERIAL_TAB, NEW = (12, 406), (97, 137)
 FIELDS = {"metallic": (82, 287), "roughness": (82, 312), "transmission": (82, 527)}
 TRANSMISSION = (211, 497)
-BAKE_HEADER, BAKE, APPLY = (223, 420), (149, 477), (159, 506)
+BAKE_HEADER, BAKE, APPLY = (223, 477), (149, 534), (159, 563)
 SOLID_SECONDS = 3.0
 
 

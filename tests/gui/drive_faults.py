@@ -17,8 +17,8 @@ SETTLE_SECONDS = 4  # panels below one that became shorter move for a moment
 WAIT = 900  # for a job or a picture, on a busy machine
 # From the right and upper end of the sidebar, see `hands`: the first light of the list, the header of Bake, and with it
 # open its button and settings; while a preview is on, the header of Materials and the first setting of Final Render.
-FIRST_LIGHT, BAKE_HEADER, BAKE, BAKE_SETTINGS = (215, 176), (219, 421), (149, 480), (219, 534)
-BESIDE_CYCLES, COMPLETE, MATERIALS = (161, 701), (258, 617), (219, 740)
+FIRST_LIGHT, BAKE_HEADER, BAKE, BAKE_SETTINGS = (215, 176), (219, 478), (149, 537), (219, 591)
+BESIDE_CYCLES, COMPLETE, MATERIALS = (161, 758), (258, 674), (219, 819)
 # The same of the Image Editor: results of shading, and the power of the first light of the mixer.
 SHADED, POWER = (227, 45), (108, 276)
 

@@ -9,7 +9,7 @@ import bpy
 ADDON = "bl_ext.user_default.ltsh.ltsh_addon"
 CLICK_SECONDS = 0.8
 # Where buttons of the main panel are in the sidebar, in pixels from its right and upper end at interface scale 1.
-PREVIEW, COMPARE, SHADE = (149, 52), (149, 339), (149, 367)
+PREVIEW, COMPARE, SHADE = (149, 52), (149, 396), (149, 424)
 
 SAVE = (65, 21)  # from the right and lower end of the file browser
 

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import time
 import weakref
 
 import bpy
 
 from ..viewport.live_cycles import LiveNodeLights
+from ..viewport.pictures import same_state
 
 # Points of a pixel of which a view at rest is the mean.
 REFINEMENTS = 64
@@ -17,6 +19,9 @@ QUICK_SECONDS = 0.03
 POLL_SECONDS = 0.05
 # After so long without new shadows the processes end that help to trace them.
 IDLE_SECONDS = 60.0
+# Pictures of a view that changes take about FRAME_SECONDS, with a pixel for each of 1, 2 x 2 or 4 x 4. A view that has
+# not changed for MOVING_SECONDS gets all its pixels.
+FRAME_SECONDS, STEPS, MOVING_SECONDS = 0.1, (1, 2, 4), 0.5
 # All views, their shadows, and what they know of lights with nodes.
 open_views: weakref.WeakSet = weakref.WeakSet()
 live_shadows: weakref.WeakSet = weakref.WeakSet()
@@ -24,6 +29,38 @@ node_lights = LiveNodeLights()
 # Moments as `time.monotonic` has them: the next redraw of views at rest, the end of their last one, and the end of the
 # last drawing of any view.
 moments = {"next": 0.0, "refined": 0.0, "drawn": 0.0}
+
+
+class PixelSize:
+    """How many pixels in either direction share one of the picture, as by Blender's *Pixel Size*: the more while a view
+    changes, the longer its pictures take."""
+
+    def __init__(self):
+        self._state, self._seconds, self._changed = None, 0.0, -MOVING_SECONDS
+        self.step, self.is_new = 1, False  # is_new: its picture is not drawn yet
+
+    def follow(self, state: tuple) -> int:
+        """The `step` of a view whose camera, surfaces and lights have this state, see `same_state`."""
+        before, is_first, has_changed = self.step, self._state is None, not same_state(state, self._state)
+        self._state = state
+        if has_changed and not is_first:
+            self.step = next((one for one in STEPS if self._seconds <= FRAME_SECONDS * one**2), STEPS[-1])
+            self._changed = math.inf  # until it is drawn
+        elif time.monotonic() >= self.end:
+            self.step = 1
+        self.is_new |= has_changed or self.step != before
+        return self.step
+
+    def note(self, seconds: float) -> None:
+        """Take note of how long a new picture took."""
+        self._seconds, self.is_new = seconds * self.step**2, False
+        if self._changed == math.inf:
+            self._changed = time.monotonic()
+
+    @property
+    def end(self) -> float:
+        """The moment from which the view is at rest, if it does not change any more."""
+        return self._changed + MOVING_SECONDS
 
 
 def redraw_later(start: float, samples: int) -> None:

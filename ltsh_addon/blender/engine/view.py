@@ -43,6 +43,7 @@ class EngineView:
         self._error = ""
         self._content: tuple[tuple, str] | None = None
         self._shadows = LiveShadows()
+        self._pixel_size = redraws.PixelSize()
         self.rest = LiveRest()
         self._occluder_notes: list[str] = []
         redraws.live_shadows.add(self._shadows)
@@ -113,7 +114,9 @@ class EngineView:
         quiet = left_out(self.mirror, depsgraph.scene, self.rest if has_rest or self.rest.is_busy else None)
         show(context.region, replace(texts, notes=tuple(dict.fromkeys(notes)), quiet=quiet))
         is_waiting = self._draws_shadows and self._shadows.waits
-        if not texts.error and self._renderer.samples < redraws.REFINEMENTS and not is_waiting:
+        if not texts.error and self._pixel_size.step > 1:
+            redraws.redraw_at(self._pixel_size.end)
+        elif not texts.error and self._renderer.samples < redraws.REFINEMENTS and not is_waiting:
             redraws.redraw_later(start, self._renderer.samples)
         redraws.moments["drawn"] = time.monotonic()
         redraws.watch()
@@ -133,7 +136,12 @@ class EngineView:
         self._follow_shadows(depsgraph)
         self._follow_rest(context, depsgraph, shown)
         points = sub_pixel_offsets(scene, redraws.REFINEMENTS)
-        self._renderer.draw(self.mirror, camera, (region.width, region.height), shown, target, points)
+        size, started = (region.width, region.height), time.monotonic()
+        self._renderer.step = self._pixel_size.follow(_state_of(self.mirror, camera, size))
+        self._renderer.draw(self.mirror, camera, size, shown, target, points)
+        if self._pixel_size.is_new:
+            self._renderer.wait()
+            self._pixel_size.note(time.monotonic() - started)
         if self._renderer.rest is not None:
             self.rest.keep_light(self._renderer.mean_light)
         return ViewTexts(self._error, tuple(notes), captions_of(scene.ltsh_view, mode))
@@ -199,6 +207,11 @@ class EngineView:
             _logger.exception("the viewport could not be drawn")
         self._error = text
         return text
+
+
+def _state_of(mirror: SceneMirror, camera: ViewCamera, size: tuple[int, int]) -> tuple:
+    """The state that changes while a view moves, see `same_state`."""
+    return (mirror.lights, mirror.sky), (camera.projection.tobytes(), size, mirror.surfaces_version)
 
 
 def _shown(scene, mode: str, reference, ui_scale: float) -> ShownPicture:

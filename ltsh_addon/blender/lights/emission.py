@@ -56,9 +56,10 @@ LIGHT_PATH, CAMERA_RAY, IES = "ShaderNodeLightPath", "Is Camera Ray", "ShaderNod
 
 
 LIGHT_FALLOFF = "ShaderNodeLightFalloff"
+COMPARE_TELLS = "how far off that is, only a comparison with Cycles can tell"
 NO_FACTOR = (
     "its emission is not a product of one Light Falloff and the rest; shaded as if Light Falloff nodes gave their "
-    "Strength at any distance"
+    f"Strength at any distance; right at 1 m, {COMPARE_TELLS}"
 )
 POWERS = {"Quadratic": 0, "Linear": 1, "Constant": 2}  # output of the Light Falloff node -> power of the distance
 
@@ -314,16 +315,17 @@ def emission_warnings(emission: Emission, is_light: bool, is_flat: bool = True) 
     warnings = []
     if is_flat and emission.directional:
         nodes = ", ".join(sorted(emission.directional))
-        warnings.append(f"its emission depends on the direction ({nodes}), shaded as seen head-on")
+        warnings.append(f"its emission depends on the direction ({nodes}), shaded as seen head-on; {COMPARE_TELLS}")
     if emission.of_camera:
         nodes = ", ".join(sorted(emission.of_camera))
-        warnings.append(f"its emission depends on the camera ({nodes}), shaded as from a camera right before it")
+        shown = f"shaded as from a camera right before it; {COMPARE_TELLS}"
+        warnings.append(f"its emission depends on the camera ({nodes}), {shown}")
     # Cycles evaluates the nodes of lights without a ray type ("Is ..."), those of materials with several ray types.
     paths = sorted(name for name in emission.of_path if not (is_light and name.startswith("Is ")))
     if paths:
         warnings.append(
             f"its emission depends on {listed(paths, 3)} of a Light Path node, of which Cycles takes a mixture that "
-            "hangs on how it samples, shaded as seen by a camera right before it"
+            f"hangs on how it samples, shaded as seen by a camera right before it; {COMPARE_TELLS}"
         )
     if emission.falloff is None:
         warnings.append(NO_FACTOR)

@@ -87,7 +87,7 @@ def collect_mesh_lights(depsgraph, override, receivers: Receivers, warn, copies:
         if key not in mesh_lights:
             mesh_lights[key] = _mesh_light(ob, traits, override, receivers, known)
             if mesh_lights[key] is not None and ob.type in ("CURVES", "POINTCLOUD"):
-                warn(f"object {ob.original.name!r}: the emission of {ob.type.lower()} is not shaded, it lights nothing")
+                warn(f"object {ob.original.name!r}: all light of its {ob.type.lower()} is lost, it lights nothing")
                 mesh_lights[key] = None
         if mesh_lights[key] is not None:
             matrix = np.array(instance.matrix_world, dtype=np.float64)

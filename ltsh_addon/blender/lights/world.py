@@ -24,7 +24,7 @@ from ...cycles.environment import (
 from ...cycles.patches import note_patches
 from ...scene import Light, SkyLight, listed
 from ..materials.graph import is_group, is_socket, source_of, surface_of, tree_in_use, value_of
-from .emission import CONSTANT_NODES, LIGHT_PATH, OF_CAMERA, open_studio, trees_of
+from .emission import COMPARE_TELLS, CONSTANT_NODES, LIGHT_PATH, OF_CAMERA, open_studio, trees_of
 
 # Pixels along each side of a picture of a world. PLAIN: a world of one color. SMOOTH: one without fine detail.
 # PROCEDURAL: another without images. LEAST, MOST: limits for one with images. SPOT_PIXELS: a small, bright spot.
@@ -252,7 +252,7 @@ def _note_cameras(world, name: str, warn) -> None:
     if labels:
         warn(
             f"world {name!r}: it depends on the camera ({listed(sorted(labels))}); its light and its background are "
-            "those of six cameras, one for each side of a cube"
+            f"those of six cameras, one for each side of a cube; {COMPARE_TELLS}"
         )
 
 
@@ -274,5 +274,5 @@ def _as_surfaces_see(world, name: str, warn) -> None:
     if unclear:
         warn(
             f"world {name!r}: its light depends on {listed(sorted(unclear))} of a Light Path node, of which Cycles "
-            "takes a mixture that depends on how it samples; shaded as for rays that are none of these"
+            f"takes a mixture that depends on how it samples; shaded as for rays that are none; {COMPARE_TELLS}"
         )

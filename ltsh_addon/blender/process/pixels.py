@@ -21,8 +21,8 @@ from ...scene import REC709, Border, ColorSpace, Film, Light, Progress, SurfaceS
 from ...visibility import Occluders
 from .blender_process import run_scene_job
 
-# REASONS: how many materials, or other reasons, an error names.
-REASONS = 5
+# REASONS: how many materials, or other reasons, an error names. LEAST_PERCENT: of the samples that no warning tells.
+REASONS, LEAST_PERCENT = 5, 0.1
 SHARP_REFLECTION = 0.2  # surfaces of a smaller roughness show the patches of a world with fine detail
 # EDGE_SECONDS: processor seconds that a million pixels of `finished.FinishedJob.edges` take.
 EDGE_SECONDS = 12.0
@@ -330,6 +330,9 @@ class _SampleRenders:
             reasons = listed(reasons, REASONS, "; ")
             share = f"{100.0 * lost / total:.3g} %"
             return warnings, [f"{share} of what camera {camera!r} sees is not shaded: {reasons}"]
+        for number in () if self._job.for_finished else np.argsort(-self._unshaded, kind="stable"):
+            if (percent := 100.0 * self._unshaded[number] / total) > LEAST_PERCENT:
+                warnings.append(f"{percent:.3g} % of the samples are not shaded: {materials[number]}")
         if len(samples) == 0:
             warnings.append(f"camera {camera!r} sees no surface that can be shaded")
         return warnings, []

@@ -185,7 +185,7 @@ def draw_view_settings(layout, context) -> None:
     row.prop(scene.ltsh, "shadows")
     if scene.render.engine == ENGINE:
         row.prop(view, "world")
-        layout.prop(view, "bounces")
+        row.prop(view, "bounces")
 
 
 class _Compare:

@@ -48,7 +48,7 @@ MOST_LIGHTS = 2047
 MOST_VALUES = 1 << 24  # of all patterns: they fill a quarter of the largest texture of lights
 MOST_TRIANGLES = 64  # of objects that light by an image; more are mostly baked, with their light in the image
 # Reasons why a light has no pattern.
-NOT_RESOLVED = "its nodes are not resolved, it shines as without them"
+NOT_RESOLVED = "its nodes are not resolved, it shines as without them, how far off that is only Cycles can tell"
 NOT_YET = "it shines as without its nodes until Cycles has sources at them"
 # Patterns: a function that returns how Cycles sees the nodes of evaluated light data, or why that is not known.
 Patterns = Callable[[bpy.types.Light, NodeLight], NodeEmission | str]

@@ -8,7 +8,7 @@ import gpu
 import numpy as np
 from mathutils import Matrix
 
-from ...shading.header import definitions
+from ...shading.header import definitions, filled
 from .drawing import PixelShader, ViewCamera, drawing, empty_texture, frame_buffer, glsl, size_of
 
 MODES = ("single", "split", "difference")
@@ -45,32 +45,38 @@ class PicturePass:
     """Draws one or two pictures into the bound frame buffer; needs an active GPU context."""
 
     def __init__(self):
-        constants = {"mode": "INT", "scales": "VEC4", "opacity": "FLOAT", "white": "FLOAT", "weights": "VEC2"}
+        constants = {"mode": "INT", "scales": "VEC4", "opacity": "FLOAT", "white": "FLOAT"}
+        constants |= dict.fromkeys(("weights", "size"), "VEC2")
         constants |= dict.fromkeys(RAYS, "VEC4")
         modes = definitions({mode.upper(): number for number, mode in enumerate(MODES)})
-        source = modes + glsl("octahedron") + glsl("picture")
+        source = modes + glsl("octahedron") + _between("first_picture", "second_picture") + glsl("picture")
         self._shader = PixelShader(source, ("first_picture", "second_picture", "sky"), constants)
 
-    def draw(self, pictures, weights, view: ViewCamera, shown: ShownPicture, background) -> None:
-        """Fill the bound frame buffer, scene-linear, from one or two RGBA textures times their `weights`.
+    def draw(self, pictures, weights, view: ViewCamera, size, shown: ShownPicture, background) -> None:
+        """Fill the bound frame buffer of `size`, scene-linear, from one or two RGBA textures times their `weights`.
 
         The weighted alpha is the share of a pixel that shows a surface. `background` is a texture of
         `light_texels.background_texels`.
         """
-        width, height = size_of(pictures[0])
         is_behind = shown.passes == "combined" and not shown.transparent
         constants = {
             "weights": (weights[0], weights[-1]),
+            "size": size,
             "mode": MODES.index(shown.mode),
-            "scales": (shown.exposure, shown.difference_scale, shown.split * width, 0.5 * shown.line_width),
+            "scales": (shown.exposure, shown.difference_scale, shown.split * size[0], 0.5 * shown.line_width),
             "opacity": 0.0 if shown.transparent else 1.0,
             "white": shown.white,
             **_rays(view, float(is_behind)),
         }
         textures = {"first_picture": pictures[0], "second_picture": pictures[-1], "sky": background}
-        with drawing(None, (0, 0, width, height)):
+        with drawing(None, (0, 0, *size)):
             self._shader.bind(textures, constants)
             self._shader.draw()
+
+
+def _between(*names: str) -> str:
+    """GLSL of vec4 `name`_between(vec2 at) for samplers with these names."""
+    return "".join(filled(glsl("between"), {"name": name}) for name in names)
 
 
 def _rays(view: ViewCamera, is_seen: float) -> dict[str, tuple]:
@@ -78,8 +84,13 @@ def _rays(view: ViewCamera, is_seen: float) -> dict[str, tuple]:
     return {name: (*ray, is_seen) for name, ray in zip(RAYS, view.rays, strict=True)}
 
 
+def copy_shader() -> PixelShader:
+    """The shader of `copy`."""
+    return PixelShader("void main() { color = texelFetch(picture, ivec2(gl_FragCoord.xy), 0); }", ("picture",), {})
+
+
 def copy(shader: PixelShader, picture: gpu.types.GPUTexture, target: gpu.types.GPUFrameBuffer) -> None:
-    """Copy `picture` into `target`, which has its size, by the shader of copy.glsl."""
+    """Copy `picture` into `target`, which has its size, by `copy_shader`."""
     with drawing(target, (0, 0, *size_of(picture))):
         shader.bind({"picture": picture})
         shader.draw()
@@ -104,7 +115,7 @@ class RestPass:
     def __init__(self):
         samplers = ("picture", "of_cycles", "rest", "positions", "glass_positions")
         constants = {"projection": "MAT4", "scale": "VEC4", "weight": "FLOAT", "has_moved": "INT"}
-        self._shader, self._target = PixelShader(glsl("rest"), samplers, constants), None
+        self._shader, self._target = PixelShader(_between("rest") + glsl("rest"), samplers, constants), None
 
     def draw(self, textures: dict[str, gpu.types.GPUTexture], weight: float, rest: ShownRest, view: ViewCamera, scale):
         """The picture (RGBA texture, valid until the next call with the same `picture`) with the `rest`.

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import gpu
 import numpy as np
 
-from .drawing import GBufferTextures, PixelShader, ViewCamera, VisibilityGrid, float_texture, glsl, read_texture
+from .drawing import GBufferTextures, PixelShader, ViewCamera, VisibilityGrid, float_texture, read_texture
 from .light_texels import UploadedLights, background_texels, sky_texels, upload_lights
 from .lighting import GOLDEN, HorizonPass, LightingPass
 from .mirror import SceneMirror
@@ -27,6 +27,7 @@ from .pictures import (
     StaticLighting,
     VeilPass,
     copy,
+    copy_shader,
     same_state,
 )
 from .shadow_rays import ShadowRays
@@ -148,6 +149,8 @@ class ViewRenderer:
         self._static: StaticLighting | None = None
         self._is_split = False  # the pictures have static lighting
         self._sky, self._sky_light, self._background = None, None, None
+        self.step = 1  # pixels in either direction for which one is drawn, as while a view moves
+        self._size = (1, 1)  # of what is shown
         self.shadows: ShadowRays | LiveShadows | None = None
         # Pictures get a rest, and this one as soon as there is one; `_of_cycles`: what is Cycles' alone, a sum.
         self.has_bounces, self.rest = False, None  # bool, ShownRest | None
@@ -161,11 +164,13 @@ class ViewRenderer:
 
         The first call shows pixels at the first of `points` (N, 2), in pixels right and up of their centers. While
         nothing changes, every further call adds the next point. The picture is their mean; `samples` is their number.
+        Of `step` pixels in either direction one is computed, and what is between them is interpolated.
 
         Where only some lights have changed, the others are not drawn again: their light keeps the horizons that were
         chosen before. The next call without a change begins anew with all lights.
         """
-        frame = Frame.of(mirror, view, size, shown)
+        self._size = size
+        frame = Frame.of(mirror, view, tuple(-(-side // self.step) for side in size), shown)
         self._upload_sky(mirror)
         version = None
         if self.shadows is not None:
@@ -199,7 +204,7 @@ class ViewRenderer:
             pictures, weights = [*pictures, shown.second_picture], [*weights, 1.0]
         # The sample has bound other buffers, and Blender's own binding is unknown to Python.
         with target.bind():
-            self._picture.draw(pictures, weights, view, shown, self._background)
+            self._picture.draw(pictures, weights, view, self._size, shown, self._background)
 
     def _with_rest(self, picture: gpu.types.GPUTexture, view: ViewCamera) -> gpu.types.GPUTexture:
         """The mean of a picture's samples with the rest."""
@@ -211,6 +216,10 @@ class ViewRenderer:
         if light is not None:
             scale = np.divide(self.mean_light(), light, out=scale, where=light > 0.0)
         return self._rest_pass.draw(textures, 1.0 / self.samples, self.rest, view, scale)
+
+    def wait(self) -> None:
+        """Wait until the card has finished the picture."""
+        self._sums[0].within().read_color(0, 0, 1, 1, 4, 0, "FLOAT")
 
     def mean_light(self) -> np.ndarray:
         """The mean (3,) of some pixels of the last picture."""
@@ -327,7 +336,7 @@ class ViewRenderer:
             self._light(layer, frame, static, numbers=frozenset(range(len(lights))) - moving)
             self._static = StaticLighting(self._lighting_state, moving, static)
         if self._copy is None:
-            self._copy = PixelShader(glsl("copy"), ("picture",), {})
+            self._copy = copy_shader()
         for static, target in zip(self._static.pictures, targets, strict=True):
             copy(self._copy, static.texture, target.within())
         self._light(layer, frame, targets, "ADDITIVE", self._static.moving)

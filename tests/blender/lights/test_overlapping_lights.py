@@ -86,6 +86,5 @@ def test_overlaps_are_those_of_the_shapes():
 def test_of_many_lights_each_pair_is_found_once():
     lights = [light(str(number), 3.0 * (number % 400)) for number in range(800)]
     pairs = {tuple(sorted((first.name, second.name), key=int)) for first, second, _ in overlapping_pairs(lights)}
-    assert len(overlapping_pairs(lights)) == 400 and pairs == {
-        (str(number), str(number + 400)) for number in range(400)
-    }
+    assert len(overlapping_pairs(lights)) == 400
+    assert pairs == {(str(number), str(number + 400)) for number in range(400)}

@@ -56,7 +56,11 @@ PICTURES = {
         (f"failed: 100 % of {CAMERA} is not shaded: {REASON}", "warning: material 'Fur': node 'Hair BSDF'"),
     ),
     "most": (lambda: hair(0.75), 1, (f"failed: 75 % of {CAMERA} is not shaded: {REASON}", "warning: material 'Fur'")),
-    "half": (lambda: hair(0.5), 0, ("warning: material 'Fur': node 'Hair BSDF' is not supported",)),
+    "half": (
+        lambda: hair(0.5),
+        0,
+        ("warning: 50 % of the samples are not shaded: material 'Fur'", "warning: material 'Fur': node 'Hair BSDF'"),
+    ),
     "turned away": (turned_away, 0, (f"warning: no light reaches {CAMERA}: the picture is black",)),
     "lost light": (lost_light, 0, ("warning: nothing that camera 'Camera' sees is lit by 'Lost'",)),
     "black": (

@@ -1,15 +1,4 @@
 /* The light of the view itself, but where the surface is Cycles' alone, and the rest, found by the surface's place. */
-vec4 rest_at(vec2 place)
-{
-  ivec2 size = textureSize(rest, 0);
-  vec2 at = clamp(place * vec2(size), vec2(0.5), vec2(size) - 0.5) - 0.5;
-  ivec2 low = ivec2(floor(at)), high = min(low + 1, size - 1);
-  vec2 share = at - vec2(low);
-  vec4 below = mix(texelFetch(rest, low, 0), texelFetch(rest, ivec2(high.x, low.y), 0), share.x);
-  vec4 above = mix(texelFetch(rest, ivec2(low.x, high.y), 0), texelFetch(rest, high, 0), share.x);
-  return mix(below, above, share.y);
-}
-
 void main()
 {
   ivec2 texel = ivec2(gl_FragCoord.xy);
@@ -23,7 +12,7 @@ void main()
     is_known = position.w > 0.0 && clip.w > 0.0 ? 1.0 : 0.0;
     place = 0.5 + 0.5 * clip.xy / max(clip.w, 1e-20);
   }
-  vec4 added = is_known * rest_at(place);
+  vec4 added = is_known * rest_between(place * vec2(textureSize(rest, 0)));
   float share = is_known * clamp(weight * texelFetch(of_cycles, texel, 0).x, 0.0, 1.0);
   share = max(share, added.a);
   color = vec4((1.0 - share) * lit.rgb + scale.rgb * added.rgb, 1.0 - (1.0 - share) * (1.0 - lit.a));

@@ -217,7 +217,7 @@ class ViewRenderer:
             self._rest_pass = RestPass()
         front = self._surfaces if self._glass is None or not self._has_glass else self._glass
         textures = {"picture": picture, "of_cycles": self._of_cycles[0].texture, "positions": self._surfaces.position}
-        textures |= {"front_positions": front.position, **front.colors}
+        textures |= {"front_positions": front.position, **self._surfaces.colors}
         scale, light = np.ones(3), self.rest.light
         if light is not None:
             scale = np.divide(self.mean_light(), light, out=scale, where=light > 0.0)

@@ -175,6 +175,8 @@ def test_a_moved_view_keeps_the_rest_where_its_surface_was_seen():
     """A constant rest on a plane: there it is added; beside, and where another surface was, its color tells."""
     parts.empty_scene(*SIZE)
     parts.add_plane(parts.principled("paper", Roughness=0.9)[0], size=40.0)
+    glass = parts.principled("glass", **{"Transmission Weight": 1.0})[0]
+    parts.add_plane(glass, size=0.1, name="Beside", location=(15.0, 0.0, 0.5))  # in the scene, not in sight
     parts.add_area_light()
     camera = parts.add_camera((0.0, 0.0, 3.0), (0.0, 0.0, 0.0))
     bpy.context.view_layer.update()

@@ -77,13 +77,11 @@ class Denoiser:
         `albedo` and `normal` (H, W, 3) may be noisy, too. NaN and Inf count as 0. The guides, and the pictures with the
         indices `rough`, are filtered in 0.4 of the time: with such guides pictures err 0.5 % more.
         """
-        guides = {"albedo": albedo, "normal": normal}
-        guides = {name: self._filtered({name: one}, quality=_BALANCED) for name, one in guides.items()}
-        qualities = [_BALANCED if index in rough else _HIGH for index in range(len(colors))]
-        return [
-            self._filtered({"color": color, **guides}, hdr=True, cleanAux=True, quality=quality)
-            for color, quality in zip(colors, qualities, strict=True)
-        ]
+        images = {"albedo": albedo, "normal": normal}
+        guides = {name: self._filtered({name: one}, quality=_BALANCED) for name, one in images.items()}
+        quality, settings = {True: _BALANCED, False: _HIGH}, {"hdr": True, "cleanAux": True}
+        pictures = [{"color": color, **guides} for color in colors]
+        return [self._filtered(one, quality=quality[i in rough], **settings) for i, one in enumerate(pictures)]
 
     def quickly_denoised(self, color: np.ndarray, albedo: np.ndarray, normal: np.ndarray) -> np.ndarray:
         """As `all_denoised` of one picture, with the library's fast quality and the guides as they are."""

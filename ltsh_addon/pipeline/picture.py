@@ -130,14 +130,16 @@ def draw_view(options: ViewOptions, progress: Progress | None = None) -> TaskRes
     width, height = options.resolution or (None, None)
     given = tuple(name if name in SHIPPED_TABLES else str(Path(name).absolute()) for name in options.techniques)
     job = child_job(view.ViewJob, options, width=width, height=height, techniques=given)
-    rest_seconds = 0.0
+    problems, rest_seconds = [], 0.0
     with temporary_folder() as folder, shared_blender(folder):
         if options.bounces == "on":
-            job = replace(job, rest=folder / "rest.npy")
             rest_job = child_job(view.RestJob, options, width=width, height=height, samples=options.rest_samples)
-            save_array(job.rest, view.render_rest(rest_job, folder, progress=progress).picture())
-            rest_seconds = time.perf_counter() - start
+            rest = view.render_rest(rest_job, folder, progress=progress)
+            job = replace(job, rest=folder / "rest.npy", is_everything=bool(rest.everything))
+            save_array(job.rest, rest.picture())
+            problems, rest_seconds = [rest.problem] * bool(rest.problem), time.perf_counter() - start
         manifest = view.draw_view(job, folder, progress=progress)
+        manifest["warnings"] += problems
         layers = {
             layer_name(technique, pass_name): np.load(folder / f"{number}_{pass_name}.npy")
             for number, technique in enumerate(tables)
@@ -147,6 +149,9 @@ def draw_view(options: ViewOptions, progress: Progress | None = None) -> TaskRes
     check_before_writing(progress)
     coverage = layers[layer_name(next(iter(tables)), "diffuse")][..., 3]
     report = _view_report(options, tables, manifest, coverage)
+    if options.bounces == "on":
+        times = {"direct_s": manifest["seconds"], "rest_s": rest_seconds}
+        report |= {"rest_samples": options.rest_samples, **{name: round(value, 3) for name, value in times.items()}}
     name = options.name or "view"
     layers = {name: image[..., :3] for name, image in layers.items()} | {COVERAGE: imaging.Layer(coverage, "V")}
     path = options.output / f"{name}.exr"
@@ -157,7 +162,6 @@ def draw_view(options: ViewOptions, progress: Progress | None = None) -> TaskRes
     imaging.write_layers(path, layers, described, imaging.chromaticities(color_space), manifest["pixel_aspect"])
     write_bytes(path.with_suffix(".png"), shown)
     seconds = {"blender": manifest["seconds"], "shadows": (manifest["shadows"] or {"seconds": 0.0})["seconds"]}
-    seconds |= {"direct_s": manifest["seconds"], "rest_s": rest_seconds}
     return TaskResult(report, {**seconds, "total": time.perf_counter() - start}, (f"{name}.exr", f"{name}.png"))
 
 

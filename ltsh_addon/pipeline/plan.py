@@ -26,8 +26,7 @@ MOST_OVER = 1.1  # how many times the budget a picture may take without a warnin
 # these have, and the power of the number of samples with which the time grows from there: from the first squares at
 # least 0.45, from the second 0.49 to 0.7 in six scenes of 32,400 pixels, and 0.84 with nine times as many.
 # MADE_ONCE: how many times too long the first may seem, since it also makes what all others have (maps of skies).
-# The second has fewer where it would take more than PROBE_SHARE of the time that is left.
-PROBES, MADE_ONCE, PROBE_SHARE = ((0.01, 0.45), (0.04, 0.6)), 2.0, 0.03
+PROBES, MADE_ONCE = ((0.01, 0.45), (0.04, 0.6)), 2.0
 # Of the remaining budget: the share that direct light may take with the first points, and with more points. With as
 # many samples it leaves 0.75 to 0.95 of the error, for which so much time makes up.
 DIRECT_SHARE, MORE_SHARE = 0.3, 0.2
@@ -109,8 +108,7 @@ def direct_light_plan(scene: SceneMeasurements) -> DirectLightPlan:
     if small.seconds * (samples[0] / small.samples) ** small_power > MADE_ONCE * allowed[0]:
         return by_cycles
     if not large:
-        affordable = small_share * PROBE_SHARE * seconds / max(small.seconds, 1e-9)
-        return DirectLightPlan(probe_share=float(np.clip(affordable, small_share, large_share)))
+        return DirectLightPlan(probe_share=large_share)
     (large,) = large
     expected = large.seconds * (samples / large.samples) ** large_power
     affordable = counts[expected <= allowed]

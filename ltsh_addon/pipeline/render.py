@@ -257,16 +257,11 @@ class DirectLightShader:
         squares = ended_at_horizons(squares)
         comparison = self.shaded(squares, self.shadows(squares))
         (technique, result), *_ = comparison.results.items()
-        variance, _ = compositing.point_statistics(
-            squares.film, compositing.radiance_of_samples(squares, result, "specular")
-        )
+        variance = compositing.variance_of_points(squares, result, "specular")
         variance = variance[~squares.left_to_cycles.by_pass["specular"]].sum()
-        light = {name: comparison.images[technique, name].mean(axis=-1) for name in PASSES}
-        total, squared = sum(light.values()).sum(), np.square(sum(light.values())).sum()
-        samples, seconds = int(np.count_nonzero(chosen)), time.process_time() - start
-        if not total > 0.0:
-            return plan.Probe(samples, seconds)
-        return plan.Probe(samples, seconds, float(np.sqrt(variance / squared)))
+        squared = np.square(sum(comparison.images[technique, name].mean(axis=-1) for name in PASSES)).sum()
+        contrast = float(np.sqrt(variance / squared)) if squared > 0.0 else 0.0
+        return plan.Probe(int(np.count_nonzero(chosen)), time.process_time() - start, contrast)
 
 
 class _ProcessorClock:

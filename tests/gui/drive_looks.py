@@ -3,11 +3,10 @@
 from pathlib import Path
 
 import bpy
-from hands import close_window, drag, module, operate, over, results_opened, select, settings
+from hands import close_window, module, narrow, operate, over, results_opened, select, settings
 
 SECONDS = 1200
 SIZE = "1600x900"
-NARROW = 220  # pixels at scale 1
 
 
 def main(rig):
@@ -106,16 +105,6 @@ def theme(name):
     folders = [folder, *(Path(path) / "interface_theme" for path in bpy.utils.preset_paths(""))]
     path = next(path for folder in folders if (path := folder / f"{name}.xml").exists())
     bpy.ops.script.execute_preset(filepath=str(path), menu_idname="USERPREF_MT_interface_theme_presets")
-
-
-def narrow(rig):
-    """Make the sidebar of the 3D view narrow by its edge."""
-    region = rig.region("VIEW_3D", "UI")
-    y = rig.size[1] - region.y - region.height // 8
-    yield from drag(rig, (region.x - 1, y), (region.x + region.width - NARROW, y))
-    yield 1
-    width = rig.region("VIEW_3D", "UI").width
-    rig.check(abs(width - NARROW) < 30, f"the sidebar is narrow: {width}")
 
 
 def preferences(rig):

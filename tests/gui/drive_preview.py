@@ -252,6 +252,10 @@ def reloaded(rig):
     rig.check(state(rig) == (artist, "SOLID", False), f"enabled again there is none: {state(rig)}")
     yield from started(rig)
     yield from eyes.settled(rig, "20_enabled.png")
+    hands.select(rig, bpy.data.objects["Neon"])
+    yield from hands.narrow(rig)
+    yield 2
+    rig.shot("20_narrow.png")
 
 
 def other_file(rig, other):

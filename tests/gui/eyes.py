@@ -35,7 +35,8 @@ def engine_started(rig):
 
 
 def pixel_centers():
-    """Views come to rest with their first picture, which sees pixels at their centers."""
+    """Views come to rest with their first picture, of direct light alone, which sees pixels at their centers."""
+    view().bounces = False
     module("engine.redraws").REFINEMENTS = 1
 
 

@@ -11,6 +11,7 @@ CLICK_SECONDS = 0.8
 # Where buttons of the main panel are in the sidebar, in pixels from its right and upper end at interface scale 1.
 PREVIEW, COMPARE, SHADE = (149, 52), (149, 396), (149, 424)
 
+NARROW = 220  # pixels at scale 1
 SAVE = (65, 21)  # from the right and lower end of the file browser
 
 
@@ -142,6 +143,16 @@ def drag(rig, start, end):
         yield CLICK_SECONDS
     rig.xdo("mouseup", 1)
     yield CLICK_SECONDS
+
+
+def narrow(rig):
+    """Make the sidebar of the 3D view narrow by its edge."""
+    region = rig.region("VIEW_3D", "UI")
+    y = rig.size[1] - region.y - region.height // 8
+    yield from drag(rig, (region.x - 1, y), (region.x + region.width - NARROW, y))
+    yield 1
+    width = rig.region("VIEW_3D", "UI").width
+    rig.check(abs(width - NARROW) < 30, f"the sidebar is narrow: {width}")
 
 
 def line_at(rig, share, most):

@@ -28,6 +28,7 @@ from .overlay import ViewTexts, captions_of, left_out, show
 LINE_WIDTH = 2.0
 COMPILING = "Compiling shaders"
 NO_LIGHTS = "No light and no glowing mesh shines here: add a light"
+FIRST_POINTS = 4  # of pixels, which do not wait for bounces
 EMPTY_COLOR = (0.05, 0.05, 0.05, 1.0)
 _logger = logging.getLogger(__name__)
 
@@ -107,13 +108,14 @@ class EngineView:
         has_rest = self._renderer is not None and self._renderer.rest is not None
         of_scene = self.mirror.notes_with_rest if has_rest else self.mirror.notes
         notes = [*texts.notes, *of_scene, *self._shadow_notes(context.region)]
-        if self.rest.problem:
-            notes.append(self.rest.problem)
+        notes += [self.rest.problem] if self.rest.problem else self.rest.notes
         if not texts.error and not self.mirror.lights and not self.mirror.sky.sides:
             notes.insert(0, NO_LIGHTS)
         quiet = left_out(self.mirror, depsgraph.scene, self.rest if has_rest or self.rest.is_busy else None)
         show(context.region, replace(texts, notes=tuple(dict.fromkeys(notes)), quiet=quiet))
         is_waiting = self._draws_shadows and self._shadows.waits
+        # Both work at the same time: the first bounces are worth more than further points of pixels.
+        is_waiting |= self.rest.is_urgent and self._renderer is not None and self._renderer.samples >= FIRST_POINTS
         if not texts.error and self._pixel_size.step > 1:
             redraws.redraw_at(self._pixel_size.end)
         elif not texts.error and self._renderer.samples < redraws.REFINEMENTS and not is_waiting:
@@ -150,10 +152,12 @@ class EngineView:
         """Let the renderer add what Cycles has rendered, if the scene wants it and the picture takes it."""
         renderer, is_wanted = self._renderer, depsgraph.scene.ltsh_view.bounces and shown.takes_rest
         renderer.has_bounces = is_wanted
-        if not depsgraph.scene.ltsh_view.bounces:
-            self.rest.stop()
-        elif is_wanted:
+        if is_wanted:
             self.rest.follow(context, depsgraph)
+        elif depsgraph.scene.ltsh_view.bounces:
+            self.rest.pause()
+        else:
+            self.rest.stop()
         renderer.rest = self.rest.shown() if is_wanted else None
 
     @property

@@ -184,9 +184,13 @@ def start(command: list[str], folder: Path, *, background: bool = False) -> subp
 
 
 class BlenderProcess:
-    """A Blender that runs worker.py, started by the first job; `folder` takes the files that Blender itself writes."""
+    """A Blender that runs worker.py, started by the first job; `folder` takes the files that Blender itself writes.
 
-    def __init__(self, folder: Path):
+    For `background` see `start`.
+    """
+
+    def __init__(self, folder: Path, *, background: bool = False):
+        self._background = background
         self.temporary = [folder]  # folders that it deletes if this process is gone; it writes to the first
         self._child: subprocess.Popen | None = None
 
@@ -212,7 +216,7 @@ class BlenderProcess:
                 return
             except OSError:  # it is gone
                 self.end()
-        self._child = start(child_command(job_path), self.temporary[0])
+        self._child = start(child_command(job_path), self.temporary[0], background=self._background)
 
     def _follow(self, progress) -> None:
         """Report progress until the job is done. Raises SceneError, and Cancelled if `progress` returns False."""

@@ -43,6 +43,7 @@ class ViewJob:
     shadows: str  # "on" or "off"
     shadow_rays: int  # per light and pixel
     rest: Path | None = None  # the file of what Cycles adds, see `RestSum.picture`
+    is_everything: bool = False  # it is the whole picture
     scripts: bool = False  # run the scripts in the file
 
 
@@ -158,9 +159,17 @@ class RestSum:
     """The sum of the samples of one view, row 0 on top."""
 
     light: np.ndarray | float = 0.0  # (H, W, 3)
-    guides: np.ndarray | float = 0.0  # (H, W, 6) albedo and normal
+    guides: np.ndarray | float = 0.0  # (H, W, 7) albedo, normal and distance
     samples: int = 0
     everything: tuple[str, ...] = ()  # why no light of the view itself remains
+    problem: str = ""  # of the denoiser
+
+    @property
+    def ambient(self) -> tuple[float, ...]:
+        """The mean (3,) over that of the albedo."""
+        albedo = np.mean(self.guides[..., :3], axis=(0, 1), dtype=np.float64)
+        light = np.mean(self.light, axis=(0, 1), dtype=np.float64)
+        return tuple(np.nan_to_num(light / np.maximum(albedo, 0.05 * self.samples)))
 
     def add(self, manifest: dict, folder: Path) -> None:
         """Add the picture of a RestJob that was done in `folder`: Combined without what the view draws itself."""
@@ -174,20 +183,24 @@ class RestSum:
             )
             drawn = 1.0 - np.minimum(read_layer(channels, manifest["mask"], "X"), 1.0)
             light = light - drawn[..., None] * (specular * specular_color + diffuse * diffuse_color + background)
-        guides = [read_layer(channels, *guide) for guide in (("Denoising Albedo", "RGB"), ("Denoising Normal", "XYZ"))]
+        names = ("Denoising Albedo", "RGB"), ("Denoising Normal", "XYZ"), ("Denoising Depth", "Z")
+        guides = [np.atleast_3d(read_layer(channels, *name)) for name in names]
         self.light = self.light + np.float32(count) * light
         self.guides = self.guides + np.float32(count) * np.concatenate(guides, axis=-1)
         self.samples += count
 
     def picture(self) -> np.ndarray:
-        """The denoised mean (H, W, 4); alpha is 1 where the view must show no light of its own."""
+        """The denoised mean (H, W, 4); alpha is the distance in m."""
         light, guides = (each / np.float32(self.samples) for each in (self.light, self.guides))
         try:
             with open_denoiser(denoiser_libraries(), cores()) as denoiser:
-                light = denoiser.quickly_denoised(light, guides[..., :3], guides[..., 3:])
+                light = denoiser.quickly_denoised(light, guides[..., :3], guides[..., 3:6])
         except NoDenoiser:
-            light = np.maximum(np.nan_to_num(light), 0.0)
-        return np.concatenate([light, np.full_like(light[..., :1], bool(self.everything))], axis=-1)
+            light, self.problem = (
+                np.maximum(np.nan_to_num(light), 0.0),
+                "Bounces are not denoised: this Blender has no denoiser",
+            )
+        return np.concatenate([light, guides[..., 6:]], axis=-1)
 
 
 def render_rest(job: RestJob, folder: Path, *, progress: Progress | None = None) -> RestSum:

@@ -1,7 +1,5 @@
 """What buttons do to 3D views: show the scene with our engine, and place lights in it.
 
-The button "Preview with LTSH" restores the artist's engine when it is clicked again.
-
 Files are saved with the artist's engine and viewport shading, so that they open and render elsewhere as before. Undo
 and redo leave the preview as it is: it is no change of the scene.
 """
@@ -144,11 +142,9 @@ class LTSH_OT_add_light(bpy.types.Operator):
     _light = None
 
     location: FloatVectorProperty(name="Location", description="What the light shines on", subtype="TRANSLATION")
-    normal: FloatVectorProperty(
-        name="Normal", description="From there to the light", subtype="DIRECTION", default=(0.0, 0.0, 1.0)
-    )
+    normal: FloatVectorProperty(name="Normal", description="From there to the light", default=(0.0, 0.0, 1.0))
     distance: FloatProperty(
-        name="Distance", description="Between both; size and power follow", subtype="DISTANCE", min=1e-4, default=4.0
+        name="Distance", description="Of both; size and power follow", subtype="DISTANCE", min=1e-4, default=4.0
     )
     selects: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})  # the light, and nothing else
 
@@ -331,6 +327,14 @@ def environment_of(world) -> tuple:
     return source.node, color.node if is_texture else None
 
 
+def _put_before(socket, kind: str):
+    """A new node that feeds the input `socket`, left of its node."""
+    node = socket.id_data.nodes.new(kind)
+    node.location = socket.node.location - Vector((300.0, 0.0))
+    socket.id_data.links.new(node.outputs[0], socket)
+    return node
+
+
 class LTSH_OT_open_environment(bpy.types.Operator, ImportHelper):
     """Light the scene by a picture, an Environment Texture of the world. Nodes that are there stay, unlinked"""
 
@@ -352,17 +356,13 @@ class LTSH_OT_open_environment(bpy.types.Operator, ImportHelper):
             world = context.scene.world = bpy.data.worlds.new("World")
         if graph.tree_in_use(world) is None:
             world.use_nodes = True
-        nodes, links = world.node_tree.nodes, world.node_tree.links
+        nodes = world.node_tree.nodes
         background, texture = environment_of(world)
         if background is None:
             output = graph.material_output(world.node_tree) or nodes.new("ShaderNodeOutputWorld")
-            background = nodes.new("ShaderNodeBackground")
-            background.location = output.location - Vector((200.0, 0.0))
-            links.new(background.outputs[0], output.inputs["Surface"])
+            background = _put_before(output.inputs["Surface"], "ShaderNodeBackground")
         if texture is None:
-            texture = nodes.new("ShaderNodeTexEnvironment")
-            texture.location = background.location - Vector((300.0, 0.0))
-            links.new(texture.outputs[0], background.inputs["Color"])
+            texture = _put_before(background.inputs["Color"], "ShaderNodeTexEnvironment")
         texture.image = image
         return {"FINISHED"}
 

@@ -100,36 +100,39 @@ def copy(shader: PixelShader, picture: gpu.types.GPUTexture, target: gpu.types.G
 class ShownRest:
     """What Cycles adds to a view (see `viewport.rest`), as it was rendered for some view."""
 
-    texture: gpu.types.GPUTexture  # RGBA, row 0 at the bottom; alpha 1: without light of the view itself
-    projection: np.ndarray  # (4, 4) to the clip space that the texture fills
+    texture: gpu.types.GPUTexture  # RGBA, row 0 at the bottom; alpha is the distance from the eye in m
+    view: ViewCamera
+    is_everything: bool = False  # it is the whole picture
+    ambient: tuple = (0.0, 0.0, 0.0)  # a guess of it over the colors of surfaces, where it is not known
     light: np.ndarray | None = None  # the mean (3,) of the direct light that belongs to it; None: that of the picture
 
     def is_of(self, view: ViewCamera) -> bool:
         """True if it was rendered for this very view."""
-        return np.array_equal(self.projection, view.projection)
+        return np.array_equal(self.view.projection, view.projection)
 
 
 class RestPass:
     """Draws a picture with its rest; needs an active GPU context."""
 
     def __init__(self):
-        samplers = ("picture", "of_cycles", "rest", "positions", "glass_positions")
-        constants = {"projection": "MAT4", "scale": "VEC4", "weight": "FLOAT", "has_moved": "INT"}
+        samplers = ("picture", "of_cycles", "rest", "positions", "front_positions", "diffuse_colors", "specular_colors")
+        constants = {"projection": "MAT4", **dict.fromkeys(("scale", "ambient", "eye"), "VEC4"), "has_moved": "INT"}
         self._shader, self._target = PixelShader(_between("rest") + glsl("rest"), samplers, constants), None
 
     def draw(self, textures: dict[str, gpu.types.GPUTexture], weight: float, rest: ShownRest, view: ViewCamera, scale):
         """The picture (RGBA texture, valid until the next call with the same `picture`) with the `rest`.
 
         `textures` are by the names of the samplers: `picture` and `of_cycles`, the share of pixels that is Cycles'
-        alone, which count times `weight`; and the positions of the surfaces and of glass. The rest counts times `scale`
-        (3,).
+        alone, which count times `weight`; positions and colors of the surfaces, and positions of glass before them.
+        The rest counts times `scale` (3,).
         """
         size = size_of(textures["picture"])
         target = SampleSum(size)
         constants = {
-            "projection": Matrix(rest.projection.tolist()),
-            "scale": (*scale, 0.0),
-            "weight": weight,
+            "projection": Matrix(rest.view.projection.tolist()),
+            "scale": (*scale, weight),
+            "ambient": (*rest.ambient, float(rest.is_everything)),
+            "eye": rest.view.homogeneous_eye,
             "has_moved": not rest.is_of(view),
         }
         with drawing(target.within(), (0, 0, *size)):

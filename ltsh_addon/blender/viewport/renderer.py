@@ -54,6 +54,11 @@ class SurfaceLayer:
         """The positions of the surfaces drawn last."""
         return self._gbuffer.position
 
+    @property
+    def colors(self) -> dict[str, gpu.types.GPUTexture]:
+        """The colors of their first lobes."""
+        return {"diffuse_colors": self._gbuffer.base, "specular_colors": self._gbuffer.f0}
+
     def draw(self, mirror, view: ViewCamera, size) -> None:
         """Draw the surfaces."""
         self._first_lobe = None
@@ -213,7 +218,8 @@ class ViewRenderer:
             self._rest_pass = RestPass()
         front = self._surfaces if self._glass is None or not self._has_glass else self._glass
         textures = {"picture": picture, "of_cycles": self._of_cycles[0].texture, "positions": self._surfaces.position}
-        textures["glass_positions"], scale, light = front.position, np.ones(3), self.rest.light
+        textures |= {"front_positions": front.position, **self._surfaces.colors}
+        scale, light = np.ones(3), self.rest.light
         if light is not None:
             scale = np.divide(self.mean_light(), light, out=scale, where=light > 0.0)
         return self._rest_pass.draw(textures, 1.0 / self.samples, self.rest, view, scale)

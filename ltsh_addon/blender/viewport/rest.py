@@ -170,9 +170,10 @@ class LiveRest:
         self._seconds = {}  # of a sample, by number of pixels
         self._pixels: tuple[np.ndarray, RestView] | None = None  # the picture to upload
         self._shown: tuple[ShownRest, RestView] | None = None
+        self._facts: tuple = ()  # of the picture: `ShownRest.is_everything` and `ambient`
         self._light: tuple | None = None  # the mean of the direct light that belongs to it, by `_light_key`
         self._version, self._surfaces, self._settings = 0, 0, None  # of the scene; of all in it but lights
-        self.problem = ""
+        self.problem, self.notes = "", ()  # why there is no picture; what there is to say about it
 
     def note(self, depsgraph) -> None:
         """Take note of the changes of the scene."""
@@ -198,12 +199,17 @@ class LiveRest:
         if wanted != self._wanted:
             self._wanted, self._changed = wanted, time.monotonic()
 
+    def pause(self) -> None:
+        """Nothing is wanted at the moment."""
+        self._wanted = None
+
     def shown(self) -> ShownRest | None:
         """The last picture; needs an active GPU context. After changes of lights alone it follows the direct light."""
         if self._pixels is not None:
             pixels, view = self._pixels
             camera = ViewCamera.of(*map(Matrix, view.matrices), view.matrices[1][3][3] == 1.0)
-            self._shown, self._pixels = (ShownRest(float_texture(pixels[::-1]), camera.projection), view), None
+            rest = ShownRest(float_texture(pixels[::-1]), camera, *self._facts)
+            self._shown, self._pixels = (rest, view), None
         if self._shown is None:
             return None
         rest, view = self._shown
@@ -227,6 +233,11 @@ class LiveRest:
         """True while a better picture is to come."""
         is_short = self._wanted is not None and self._samples < TOTALS[-1]
         return self._thread is not None or (is_short and not self.problem)
+
+    @property
+    def is_urgent(self) -> bool:
+        """True while the first picture of this view in full resolution is to come."""
+        return self.is_busy and self._samples < TOTALS[0]
 
     @property
     def _samples(self) -> int:
@@ -271,7 +282,8 @@ class LiveRest:
             self._total, self._total_of = step.total, step.view
         if step.pixels is None:
             return False
-        self._pixels = step.pixels, step.view
+        self._pixels, self._facts = (step.pixels, step.view), (bool(step.total.everything), step.total.ambient)
+        self.notes = (step.total.problem,) * bool(step.total.problem)
         return True
 
     def _begin(self) -> None:
@@ -280,7 +292,7 @@ class LiveRest:
         if self._stack is None:
             self._stack = ExitStack()
             self._folder = self._stack.enter_context(temporary_folder())
-            self._process, self._opened = BlenderProcess(self._folder), None
+            self._process, self._opened = BlenderProcess(self._folder, background=True), None
             self._stack.callback(self._process.end)
         has_first = self._last_of == wanted
         width, height = wanted.size if has_first else map(_half, wanted.size)

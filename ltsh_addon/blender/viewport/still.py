@@ -174,7 +174,7 @@ def _draw(job: ViewJob, read: tuple, size: tuple[int, int], progress) -> tuple[l
     mirror.sync(depsgraph)
     if not mirror.lights and not mirror.sky.sides:
         raise no_light(scene, mirror.notes)
-    notes, shadows = list(mirror.notes), None
+    notes, shadows = list(mirror.notes if job.rest is None else mirror.notes_with_rest), None
     if occluders is not None:
         problem = too_many(len(mirror.lights), size)
         rays = max(min(FEWEST_RAYS, job.shadow_rays), job.shadow_rays // job.refine)
@@ -183,7 +183,9 @@ def _draw(job: ViewJob, read: tuple, size: tuple[int, int], progress) -> tuple[l
         else:
             shadows = ShadowRays(occluders, rays)
     drawn = mirror, view_of_camera(camera.evaluated_get(depsgraph), depsgraph, size), size
-    points = render_settings.sub_pixel_offsets(scene, job.refine)
+    # Beside Cycles' light the mean of the points must be the center.
+    offsets = render_settings.filter_points if job.rest is None else render_settings.balanced_points
+    points = render_settings.sub_pixel_offsets(scene, job.refine, offsets)
     passes = (*VIEW_PASSES, TRANSMITTED) if mirror.has_glass else VIEW_PASSES
     first, *others = ((technique, name) for technique in job.techniques for name in passes)
     exposure, transparent = cycles_setting(scene, "film_exposure"), scene.render.film_transparent
@@ -191,7 +193,7 @@ def _draw(job: ViewJob, read: tuple, size: tuple[int, int], progress) -> tuple[l
     renderer = _renderer[0] if _renderer else ViewRenderer()
     renderer.shadows, renderer.has_bounces = shadows, job.rest is not None
     if job.rest is not None:
-        renderer.rest = ShownRest(float_texture(np.load(job.rest)[::-1]), drawn[1].projection)
+        renderer.rest = ShownRest(float_texture(np.load(job.rest)[::-1]), drawn[1], job.is_everything)
     try:
         pictures = _pictures(renderer, drawn, shown, points, progress)
     except ValueError as error:  # a table that the card does not take

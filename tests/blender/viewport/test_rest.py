@@ -1,0 +1,212 @@
+"""Bounces of a view: with them the view is Cycles' whole picture, and the second Blender follows the scene by its
+changes."""
+
+import json
+import time
+from types import SimpleNamespace
+
+import bpy
+import numpy as np
+import pytest
+import scene_parts as parts
+from fake_scene import run
+from graphics_card import edits_with_graphics, with_graphics
+from view_pictures import OpenView
+
+from ltsh_addon.blender.viewport import rest
+from ltsh_addon.blender.viewport.drawing import float_texture
+from ltsh_addon.blender.viewport.pictures import ShownPicture, ShownRest
+from ltsh_addon.cycles.lobes import read_layer
+from ltsh_addon.imaging.exr import read_channels
+
+SIZE = (48, 32)
+# Cycles' steps between float32 sums of other seeds' order, and rounding of matrices that were set.
+SAME = {"rtol": 1e-3, "atol": 1e-3}
+
+
+def room():
+    """A gray corner with chrome, wood by nodes, glass before them, and a sign that shines; the camera."""
+    scene = parts.empty_scene(*SIZE)
+    parts.add_plane(parts.principled("paper", Roughness=0.9)[0], size=4.0)
+    red = {"Base Color": (0.8, 0.2, 0.1, 1.0), "Roughness": 0.8}
+    wall = parts.principled("wall", **red)[0]
+    parts.add_plane(wall, name="Wall", size=4.0, location=(0, 1.2, 0), rotation=(1.5708, 0, 0))
+    chrome = parts.principled("chrome", Metallic=1.0, Roughness=0.4)[0]
+    parts.add_sphere(chrome, radius=0.45, name="Chrome", location=(-0.7, 0.3, 0.45))
+    wood, node = parts.principled("wood", Roughness=0.6)
+    noise = wood.node_tree.nodes.new("ShaderNodeTexWave")
+    wood.node_tree.links.new(noise.outputs["Color"], node.inputs["Base Color"])
+    parts.add_plane(wood, name="Wood", size=0.8, location=(0.4, 0.5, 0.5), rotation=(0.9, 0, 0))
+    glass = parts.principled("glass", **{"Transmission Weight": 1.0, "Roughness": 0.1})[0]
+    parts.add_sphere(glass, radius=0.3, name="Glass", location=(0.6, -0.5, 0.35))
+    sign = parts.principled("sign", **{"Emission Color": (0.1, 0.4, 1.0, 1.0), "Emission Strength": 0.7})[0]
+    parts.add_plane(sign, name="Sign", size=0.4, location=(0.0, 1.1, 0.9), rotation=(1.5708, 0, 0))
+    parts.add_area_light(location=(0.6, -1.0, 2.2), energy=60.0)
+    parts.add_world(Color=(0.3, 0.4, 0.6, 1.0), Strength=0.4)
+    scene.cycles.use_adaptive_sampling = False
+    camera = parts.add_camera((0.0, -3.4, 1.6), (1.25, 0.0, 0.0))
+    camera.data.shift_x = 0.03
+    bpy.context.view_layer.update()
+    return camera
+
+
+def test_a_view_with_bounces_is_the_picture_of_cycles(tmp_path, capsys):
+    with_graphics(lambda: None)
+    room()
+    path = parts.save(tmp_path / "room.blend")
+    options = ("--techniques", "ltsh4c", "--shadow-rays", 256, "--json", "--quiet")
+    errors = {}
+    # Two halves with noise of their own: the product of the differences from them has no noise on average.
+    renders = [parts.cycles_channels(tmp_path, 150, seed=seed) for seed in (1, 2)]
+    halves = [read_layer(one, "Combined", "RGB").astype(float) for one in renders]
+    for bounces, points in (("on", 17), ("off", 1)):
+        arguments = ("--refine", points, "--bounces", bounces, "--rest-samples", 64)
+        code, stdout, _ = run(capsys, "view", path, "-o", tmp_path / bounces, *options, *arguments)
+        assert code == 0
+        channels = read_channels(tmp_path / bounces / "view.exr")
+        picture = np.stack([channels[f"ltsh4c.combined.{letter}"] for letter in "RGB"], axis=-1)
+        products = np.prod([picture - half for half in halves], axis=0)
+        errors[bounces] = np.sqrt(products.sum() / np.prod(halves, axis=0).sum())
+        report = json.loads(stdout)
+        assert ("rest_s" in report) == (bounces == "on")
+        # What Cycles shows of the materials itself needs no excuse.
+        assert any("not resolved" in line for line in report["warnings"]) == (bounces == "off")
+    # 64 samples, denoised, and 17 points at the edges of highlights leave some percent; without, a fifth is missing.
+    assert errors["on"] < 0.06 and errors["off"] > 0.2, errors
+
+
+@pytest.mark.newest
+@pytest.mark.parametrize("kind", ["shifted", "parallel"])
+def test_the_camera_of_a_region_has_its_matrices(kind):
+    scene, (width, height) = (parts.empty_scene(), (64, 40))
+    camera = parts.add_camera((1.0, -4.0, 2.0), (1.1, 0.1, 0.4))
+    camera.data.lens, camera.data.shift_x, camera.data.shift_y = 35.0, 0.2, -0.1
+    if kind == "parallel":
+        camera.data.type, camera.data.ortho_scale = "ORTHO", 5.0
+    bpy.context.view_layer.update()
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    window = camera.calc_matrix_camera(depsgraph, x=width, y=height)
+    view = camera.matrix_world.inverted()
+    rest._look_through(scene, view, window, (width, height))
+    made = scene.camera
+    bpy.context.view_layer.update()
+    seen = made.calc_matrix_camera(bpy.context.evaluated_depsgraph_get(), x=width, y=height)
+    # A point in front of the camera is at the same place of the picture; depth may differ in parallel views.
+    for place in (0.3, -0.4, -3.0), (-1.0, 0.2, -9.0):
+        point = np.array(view.inverted()) @ [*place, 1.0]
+        clips = [np.array(window @ view) @ point, np.array(seen @ made.matrix_world.inverted()) @ point]
+        places = [clip[:2] / clip[3] for clip in clips]
+        np.testing.assert_allclose(places[0], places[1], atol=1e-4)
+
+
+def followed(live, context, monkeypatch):
+    """Let `live` do its steps until it rests; the last picture, and the jobs that were done."""
+    jobs, pixels, begin = [], None, rest.LiveRest._begin
+
+    def noted(self):
+        begin(self)
+        jobs.append(self._step.job)
+
+    monkeypatch.setattr(rest.LiveRest, "_begin", noted)
+    live.follow(context, SimpleNamespace(scene=bpy.context.scene, view_layer=bpy.context.view_layer))
+    end = time.monotonic() + 120.0
+    while live.is_busy and time.monotonic() < end:
+        if live.step() and live._pixels is not None:
+            pixels = live._pixels[0]
+        time.sleep(0.02)
+    monkeypatch.setattr(rest.LiveRest, "_begin", begin)
+    assert not live.problem and not live.is_busy
+    return pixels, jobs
+
+
+def context_of(camera):
+    """A region that sees what `camera` sees."""
+    window = camera.calc_matrix_camera(bpy.context.view_layer.depsgraph, x=SIZE[0], y=SIZE[1])
+    view = SimpleNamespace(view_matrix=camera.matrix_world.inverted(), window_matrix=window)
+    region = SimpleNamespace(width=SIZE[0], height=SIZE[1])
+    return SimpleNamespace(region=region, region_data=view, space_data=SimpleNamespace(local_view=None))
+
+
+def test_changes_are_handed_over_by_themselves_and_show_what_a_whole_file_shows(monkeypatch):
+    monkeypatch.setattr(rest, "TOTALS", (4,))
+    monkeypatch.setattr(rest, "REST_SECONDS", 0.0)
+    monkeypatch.setattr(rest, "STEP_SECONDS", 60.0)
+    camera = room()
+    context, live = context_of(camera), rest.LiveRest()
+    handlers = bpy.app.handlers.depsgraph_update_post
+    note = lambda scene, depsgraph: live.note(depsgraph)  # noqa: E731
+    live.note(bpy.context.view_layer.depsgraph)
+    handlers.append(note)
+    try:
+        first, jobs = followed(live, context, monkeypatch)
+        assert [job.scene is None for job in jobs] == [False, True]  # in half resolution, and whole
+        light, chrome = bpy.data.objects["Light"], bpy.data.objects["Chrome"]
+        light.data.energy *= 2.0
+        light.location.x -= 0.5
+        chrome.location.z += 0.1
+        bpy.data.materials["wall"].node_tree.nodes[-1].inputs["Base Color"].default_value = (0.1, 0.7, 0.2, 1.0)
+        bpy.data.materials["wood"].node_tree.nodes["Wave Texture"].inputs["Scale"].default_value = 9.0
+        bpy.context.scene.world.node_tree.nodes["Background"].inputs["Strength"].default_value = 0.8
+        bpy.context.view_layer.update()
+        second, jobs = followed(live, context, monkeypatch)
+        assert all(job.scene is None for job in jobs) and jobs[0].changes["moved"]
+        # Selecting renders nothing; what cannot be told piece by piece goes as a whole.
+        chrome.select_set(True)
+        bpy.context.view_layer.update()
+        assert followed(live, context, monkeypatch)[1] == []
+        child = live._process._child
+        live.stop()
+        assert child.poll() is not None
+        live.note(bpy.context.view_layer.depsgraph)
+        whole, jobs = followed(live, context, monkeypatch)
+        assert jobs[0].scene is not None
+        chrome.modifiers.new("Wave", "SUBSURF")
+        bpy.context.view_layer.update()
+        assert live._changes.everything
+    finally:
+        handlers.remove(note)
+        live.stop()
+    assert np.abs(first - whole).max() > 0.05
+    np.testing.assert_allclose(second[..., :3], whole[..., :3], **SAME)
+
+
+@edits_with_graphics
+def test_a_moved_view_keeps_the_rest_where_its_surface_was_seen():
+    """A constant rest on a plane: there it is added; beside, and where another surface was, its color tells."""
+    parts.empty_scene(*SIZE)
+    parts.add_plane(parts.principled("paper", Roughness=0.9)[0], size=40.0)
+    glass = parts.principled("glass", **{"Transmission Weight": 1.0})[0]
+    parts.add_plane(glass, size=0.1, name="Beside", location=(15.0, 0.0, 0.5))  # in the scene, not in sight
+    parts.add_area_light()
+    camera = parts.add_camera((0.0, 0.0, 3.0), (0.0, 0.0, 0.0))
+    bpy.context.view_layer.update()
+
+    def pictures():
+        with OpenView(camera, SIZE) as opened:
+            shown = ShownPicture("ltsh4", "combined")
+            camera_before, added = opened.view, {}
+            for name, distance, x in (("same", 9.0, 0.0), ("moved", 0.0, 0.3), ("hidden", 9.0, 0.3)):
+                texels = np.full((SIZE[1], SIZE[0], 4), 0.25, np.float32)
+                # The distance of the plane from the eye, where it is not another surface.
+                place = np.stack(np.meshgrid(*(2.0 * (np.arange(n) + 0.5) / n - 1.0 for n in SIZE)), axis=-1)
+                rays = camera_before.rays
+                ray = place @ rays[:2] + rays[2]
+                texels[..., 3] = distance or 3.0 * np.linalg.norm(ray, axis=-1) / np.abs(ray[..., 2])
+                opened.renderer.rest = ShownRest(float_texture(texels), camera_before, ambient=(0.5, 0.5, 0.5))
+                camera.location.x = x
+                bpy.context.view_layer.update()
+                opened.view = OpenView(camera, SIZE).view
+                opened.renderer.has_bounces = False
+                plain = opened.draw(shown)
+                opened.renderer.has_bounces = True
+                added[name] = (opened.draw(shown) - plain)[..., :3]
+            return added
+
+    added = with_graphics(pictures)
+    np.testing.assert_allclose(added["same"], 0.25, atol=1e-5)
+    inside, outside = np.s_[2:-2, 2:40], np.s_[2:-2, -3:]
+    np.testing.assert_allclose(added["moved"][inside], 0.25, atol=1e-5)
+    for name, pixels in (("moved", outside), ("hidden", inside)):
+        # Half of the color of the diffuse lobe, .8 but for what the specular one reflects, and of that, .04.
+        change = added[name][pixels]
+        assert np.all((change > 0.35) & (change < 0.42)), name

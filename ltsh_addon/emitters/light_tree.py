@@ -79,9 +79,7 @@ class LightTree:
     radius: np.ndarray  # (N,) m: no point of the lights is farther from the center
     axes: np.ndarray  # (3, 3, N) m: principal axes of the brightness (first axis), a standard deviation long
     axis: np.ndarray  # (N, 3) mean direction into which the lights shine
-    normal_spread: (
-        np.ndarray
-    )  # (N,) rad: largest angle of a light's direction from `axis`; reach, axis and normal_spread are float32
+    normal_spread: np.ndarray  # (N,) rad: largest angle of a light's direction from `axis`; float32, as reach and axis
     vector: np.ndarray  # (N, 3): mean radiance times area vectors
     swing: np.ndarray  # (N,) mean radiance times area: how much of a vector may belong to lights that face away
     turn: np.ndarray  # (3, 3, N) matrices of the squares of how far power times cosines may be off; float32
@@ -454,9 +452,8 @@ def add_far_lights(tree: LightTree, lobes, position, chosen, total) -> tuple[np.
     light = np.bincount(coarse.tile, coarse.mean, len(tile_members))
     most = ERROR[is_specular] * light
     pairs = _refined(tree, tiles, lambda pairs: pairs.are_fine(most[pairs.tile]))
-    pairs.is_smooth &= cubics.are_smooth[pairs.tile] & (
-        INTERPOLATED * pairs.change**4 * pairs.light <= most[pairs.tile]
-    )
+    bent = INTERPOLATED * pairs.change**4 * pairs.light
+    pairs.is_smooth &= cubics.are_smooth[pairs.tile] & (bent <= most[pairs.tile])
     near = pairs.are_near(LEAF_ERROR * light[pairs.tile])
     for number, tile_pairs in pairs.take(~near).by_tile():
         columns = tiles.columns[number]

@@ -37,8 +37,6 @@ WORTH_POWER = 0.75
 TYPICAL_SHARE = 0.4
 # Numbers of rays that a pair may get, besides the probes and the most rays.
 LEVELS = (16, 32, 64, 128, 256, 512)
-# Numbers of rays that a lobe gets as long as none has met any light of a cluster.
-UNMET_LEVELS = (32, 128, 256)
 # The brightest pairs may get this many times the most rays of a pair: where lobes are narrow and lights half visible, a
 # few pixels cause most of the noise of a picture.
 BRIGHTEST, BRIGHTEST_OF_SKY = 4, 2
@@ -257,7 +255,7 @@ class RatioEstimator:
         self._add_rays(np.arange(len(self.index)), 0, PROBES, 0, order)
         self._leave_out_unlit()
         # The probes of a cluster go to a few of its lights; those that count may be others.
-        for last in UNMET_LEVELS if isinstance(self.emitter, LightCluster) and rays > PROBES else ():
+        for last in LEVELS if isinstance(self.emitter, LightCluster) and rays > PROBES else ():
             unmet, first = np.flatnonzero(np.logical_or(*self._unmet())), int(self.count.max(initial=0))
             self._add_rays(unmet, first, min(last, rays), 0)
         importance = importance[self.index]
@@ -396,12 +394,10 @@ class RatioEstimator:
             toward /= np.maximum(distance, _TINY)
             if self.light.is_distant:
                 distance[:] = _FARTHEST
-            *rays, _ = self.surface.ray_origins.aimed(
-                self.index[unmet], toward[:, None], distance[None], self.at_surface
-            )
+            aimed = self.surface.ray_origins.aimed(self.index[unmet], toward[:, None], distance[None], self.at_surface)
             visibility = _ONE
             if self.chosen_by.light:
-                visibility = self._transmittance(self.mask, _ONE, *(rows[..., 0, :] for rows in rays))
+                visibility = self._transmittance(self.mask, _ONE, *(rows[..., 0, :] for rows in aimed[:3]))
             # Next to nothing, so that it does not count in sums over samples.
             self.sum_w[number][:, unmet] = _TINY
             self.sum_wv[number][:, unmet] = visibility * _TINY

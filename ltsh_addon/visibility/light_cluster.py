@@ -28,10 +28,8 @@ class LightCluster:
 
     def __init__(self, lights: Sequence[Light]):
         corners, owner = _quads_of(lights)
-        normal, radiance, is_round = (
-            np.array([getattr(light, name) for light in lights])[owner]
-            for name in ("direction", "radiance", "is_round")
-        )
+        names = "direction", "radiance", "is_round"
+        normal, radiance, is_round = (np.array([getattr(light, name) for light in lights])[owner] for name in names)
         across = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
         area = 0.5 * np.linalg.norm(across, axis=1) * np.where(is_round, 0.25 * np.pi, 1.0)
         low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))

@@ -6,7 +6,7 @@ import bpy
 
 from ...scene import CYCLES, DEFAULT_TECHNIQUE, SHIPPED_TABLES, TECHNIQUES
 from ..ui.preview import ENGINE
-from .redraws import tag_views
+from .redraws import open_views, tag_views
 
 # Files store these numbers, so they must not change.
 _NUMBERS = {"ltc": 0, "ltsh2": 1, "ltsh4": 2, CYCLES: 3, "ltsh4c": 4}
@@ -32,6 +32,13 @@ def _redraw(settings, context) -> None:
     tag_views()
 
 
+def _switch_bounces(settings, context) -> None:
+    """Without bounces their Blender ends at once; views that still want it start another."""
+    for view in () if settings.bounces else list(open_views):
+        view.rest.stop()
+    tag_views()
+
+
 class LTSH_ViewSettings(bpy.types.PropertyGroup):
     """Settings of the viewport and of final renders with the engine LTSH."""
 
@@ -47,7 +54,7 @@ class LTSH_ViewSettings(bpy.types.PropertyGroup):
         default=True, update=_redraw,
     )  # fmt: skip
     bounces: bpy.props.BoolProperty(
-        name="Bounces", default=True, update=_redraw,
+        name="Bounces", default=True, update=_switch_bounces,
         description="What is not direct light, by Cycles and denoised: bounces, reflections, refraction, materials by "
         "nodes",
     )  # fmt: skip

@@ -312,21 +312,18 @@ def _is_among(source: Source, kinds: dict[str, tuple]) -> bool:
 def emission_warnings(emission: Emission, is_light: bool, is_flat: bool = True) -> list[str]:
     """Warnings about emission that is not shaded as in Cycles: that of a light (`is_light`) or of a material. With
     `is_flat` also about a dependence on the direction."""
-    warnings = []
+    warnings, shown = [], f"shaded as from a camera right before it; {COMPARE_TELLS}"
     if is_flat and emission.directional:
         nodes = ", ".join(sorted(emission.directional))
         warnings.append(f"its emission depends on the direction ({nodes}), shaded as seen head-on; {COMPARE_TELLS}")
     if emission.of_camera:
         nodes = ", ".join(sorted(emission.of_camera))
-        shown = f"shaded as from a camera right before it; {COMPARE_TELLS}"
         warnings.append(f"its emission depends on the camera ({nodes}), {shown}")
     # Cycles evaluates the nodes of lights without a ray type ("Is ..."), those of materials with several ray types.
     paths = sorted(name for name in emission.of_path if not (is_light and name.startswith("Is ")))
     if paths:
-        warnings.append(
-            f"its emission depends on {listed(paths, 3)} of a Light Path node, of which Cycles takes a mixture that "
-            f"hangs on how it samples, shaded as seen by a camera right before it; {COMPARE_TELLS}"
-        )
+        mixture = "of which Cycles takes a mixture that hangs on how it samples"
+        warnings.append(f"its emission depends on {listed(paths, 3)} of a Light Path node, {mixture}, {shown}")
     if emission.falloff is None:
         warnings.append(NO_FACTOR)
     return warnings

@@ -123,7 +123,7 @@ class RestPass:
         """The picture (RGBA texture, valid until the next call with the same `picture`) with the `rest`.
 
         `textures` are by the names of the samplers: `picture` and `of_cycles`, the share of pixels that is Cycles'
-        alone, which count times `weight`; positions of the surfaces and of what is in front of them, with its colors.
+        alone, which count times `weight`; positions and colors of the surfaces, and positions of glass before them.
         The rest counts times `scale` (3,).
         """
         size = size_of(textures["picture"])

@@ -217,7 +217,7 @@ class ViewRenderer:
             self._rest_pass = RestPass()
         front = self._surfaces if self._glass is None or not self._has_glass else self._glass
         textures = {"picture": picture, "of_cycles": self._of_cycles[0].texture, "positions": self._surfaces.position}
-        textures |= {"front_positions": front.position, **front.colors}
+        textures |= {"front_positions": front.position, **self._surfaces.colors}
         scale, light = np.ones(3), self.rest.light
         if light is not None:
             scale = np.divide(self.mean_light(), light, out=scale, where=light > 0.0)
@@ -225,7 +225,9 @@ class ViewRenderer:
 
     def wait(self) -> None:
         """Wait until the card has finished the picture."""
-        self._sums[0].within().read_color(0, 0, 1, 1, 4, 0, "FLOAT")
+        # Blender knows the size of a buffer only once it has been bound.
+        with (buffer := self._sums[0].within()).bind():
+            buffer.read_color(0, 0, 1, 1, 4, 0, "FLOAT")
 
     def mean_light(self) -> np.ndarray:
         """The mean (3,) of some pixels of the last picture."""

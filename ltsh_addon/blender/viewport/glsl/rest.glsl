@@ -19,8 +19,8 @@ void main()
     bool is_inside = clip.w > 0.0 && place == clamp(place, vec2(0.0), vec2(1.0));
     is_known = position.w > 0.0 && is_inside && is_near ? 1.0 : 0.0;
   }
-  vec3 front = texelFetch(diffuse_colors, texel, 0).rgb + texelFetch(specular_colors, texel, 0).rgb;
-  vec3 guess = texelFetch(front_positions, texel, 0).w > 0.0 ? ambient.rgb * front : vec3(0.0);
+  vec3 colors = texelFetch(diffuse_colors, texel, 0).rgb + texelFetch(specular_colors, texel, 0).rgb;
+  vec3 guess = texelFetch(positions, texel, 0).w > 0.0 ? ambient.rgb * colors : vec3(0.0);
   vec3 added = scale.rgb * mix(guess, rest_between(place * vec2(textureSize(rest, 0))).rgb, is_known);
   float share = is_known * max(clamp(weight * texelFetch(of_cycles, texel, 0).x, 0.0, 1.0), is_everything);
   color = vec4((1.0 - share) * lit.rgb + added, 1.0 - (1.0 - share) * (1.0 - lit.a));

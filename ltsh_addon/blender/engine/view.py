@@ -153,7 +153,7 @@ class EngineView:
         renderer, is_wanted = self._renderer, depsgraph.scene.ltsh_view.bounces and shown.takes_rest
         renderer.has_bounces = is_wanted
         if is_wanted:
-            self.rest.follow(context, depsgraph)
+            self.rest.follow(context, depsgraph, shown.world)
         elif depsgraph.scene.ltsh_view.bounces:
             self.rest.pause()
         else:

@@ -150,6 +150,7 @@ class RestJob:
     view_layer: str | None = None
     matrices: tuple | None = None  # of a region: from the world to the view, and to clip space, (4, 4) each
     hidden: tuple[str, ...] = ()  # names of objects that its local view hides
+    world: bool = True  # with the light of the world
     changes: dict | None = None  # of the scene that the last job has opened, see `viewport.rest.RestChanges`
     scripts: bool = False  # run the scripts in the file
 

@@ -181,7 +181,7 @@ def draw_view_settings(layout, context) -> None:
             column.prop(view, "split_position", slider=True)
         elif view.mode == "difference":
             column.prop(view, "difference_scale")
-    row = layout.row()
+    row = toggles(layout, context, 3)
     row.prop(scene.ltsh, "shadows")
     if scene.render.engine == ENGINE:
         row.prop(view, "world")

@@ -226,7 +226,9 @@ class ViewRenderer:
 
     def wait(self) -> None:
         """Wait until the card has finished the picture."""
-        self._sums[0].within().read_color(0, 0, 1, 1, 4, 0, "FLOAT")
+        # Blender knows the size of a buffer only once it has been bound.
+        with (buffer := self._sums[0].within()).bind():
+            buffer.read_color(0, 0, 1, 1, 4, 0, "FLOAT")
 
     def mean_light(self) -> np.ndarray:
         """The mean (3,) of some pixels of the last picture."""

@@ -16,7 +16,6 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, field, replace
-from operator import methodcaller
 from pathlib import Path
 
 import bpy
@@ -68,6 +67,7 @@ class RestView:
     version: tuple[int, int]  # of the scene, and of all in it but lights
     frame: int
     hidden: tuple[str, ...]
+    world: bool
     matrices: tuple  # see `RestJob`
     size: tuple[int, int]
 
@@ -185,8 +185,8 @@ class LiveRest:
             self._version, self._settings, self.problem = self._version + 1, settings, ""
             self._surfaces += has_other
 
-    def follow(self, context, depsgraph) -> None:
-        """Want the rest of the region of `context`."""
+    def follow(self, context, depsgraph, world: bool = True) -> None:
+        """Want the rest of the region of `context`, with the light of the `world` or without."""
         region, view, space = context.region, context.region_data, context.space_data
         hidden = ()
         if space.local_view is not None:
@@ -195,7 +195,7 @@ class LiveRest:
         matrices = tuple(tuple(map(tuple, one)) for one in (view.view_matrix, view.window_matrix))
         names, version = (depsgraph.scene.name, depsgraph.view_layer.name), (self._version, self._surfaces)
         size = region.width, region.height
-        wanted = RestView(*names, version, depsgraph.scene.frame_current, hidden, matrices, size)
+        wanted = RestView(*names, version, depsgraph.scene.frame_current, hidden, world, matrices, size)
         if wanted != self._wanted:
             self._wanted, self._changed = wanted, time.monotonic()
 
@@ -303,7 +303,8 @@ class LiveRest:
             missing = next(count for count in TOTALS if count > total.samples) - total.samples
             each = self._seconds.get(width * height) or 4.0 * self._seconds[_half(width) * _half(height)]
             samples = min(missing, max(1, int(STEP_SECONDS / each)))
-        state, path, changes = (wanted.scene, wanted.view_layer, wanted.frame, wanted.hidden), None, None
+        state = wanted.scene, wanted.view_layer, wanted.frame, wanted.hidden, wanted.world
+        path = changes = None
         if state != self._opened or self._changes.everything:
             path, self._opened = self._folder / "scene.blend", state
             save_working_copy(path)
@@ -321,6 +322,7 @@ class LiveRest:
             view_layer=wanted.view_layer,
             matrices=wanted.matrices,
             hidden=wanted.hidden,
+            world=wanted.world,
             changes=changes,
         )
         self._last_of = wanted
@@ -355,7 +357,7 @@ def _do_step(step: _RestStep, process: BlenderProcess, folder: Path) -> None:
 
 def shown_objects(layer) -> list:
     """The objects of a view layer that views show, but for local views."""
-    return list(filter(methodcaller("visible_get", view_layer=layer), layer.objects))
+    return [ob for ob in layer.objects if ob.visible_get(view_layer=layer)]
 
 
 def _settings_of(depsgraph) -> tuple:
@@ -392,6 +394,9 @@ def render_rest(job: RestJob, folder: Path, progress) -> dict:
     if job.changes is not None:
         _take_changes(scene, **job.changes)
     layer = next(layer for layer in scene.view_layers if layer.use)
+    world = layer.world_override or scene.world
+    for name in () if job.world or world is None else ("diffuse", "glossy", "transmission", "scatter"):
+        setattr(world.cycles_visibility, name, False)
     if job.matrices is None:
         camera = render_settings.choose_camera(scene, job.camera)
         camera.data.dof.use_dof = False
@@ -421,8 +426,7 @@ def _take_changes(scene, file: str, blocks: list, moved: dict) -> None:
         old, new = getattr(bpy.data, kind).get((name, None)), next(loaded[kind])
         if old is None:
             raise SceneError(f"{name!r} is new")
-        user_remap = old.user_remap
-        user_remap(new)
+        old.user_remap(new)
         getattr(bpy.data, kind).remove(old)
         new.name = name
         if kind == "materials":

@@ -67,6 +67,7 @@ def test_a_picture_with_fewer_pixels_is_interpolated_and_as_bright_and_leaves_no
     def draw():
         with OpenView(camera, SIZE) as opened:
             before = opened.draw(shown)
+            opened.renderer.wait()  # the picture was drawn with depths alone
             opened.renderer.step = step
             moving = opened.draw(shown)
             opened.renderer.has_bounces, added = True, float_texture(np.full((4, 6, 4), (0.5, 0.25, 0.125, 0.0)))

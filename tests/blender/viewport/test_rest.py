@@ -99,7 +99,7 @@ def test_the_camera_of_a_region_has_its_matrices(kind):
         np.testing.assert_allclose(places[0], places[1], atol=1e-4)
 
 
-def followed(live, context, monkeypatch):
+def followed(live, context, monkeypatch, world=True):
     """Let `live` do its steps until it rests; the last picture, and the jobs that were done."""
     jobs, pixels, begin = [], None, rest.LiveRest._begin
 
@@ -108,7 +108,7 @@ def followed(live, context, monkeypatch):
         jobs.append(self._step.job)
 
     monkeypatch.setattr(rest.LiveRest, "_begin", noted)
-    live.follow(context, SimpleNamespace(scene=bpy.context.scene, view_layer=bpy.context.view_layer))
+    live.follow(context, SimpleNamespace(scene=bpy.context.scene, view_layer=bpy.context.view_layer), world)
     end = time.monotonic() + 120.0
     while live.is_busy and time.monotonic() < end:
         if live.step() and live._pixels is not None:
@@ -160,6 +160,13 @@ def test_changes_are_handed_over_by_themselves_and_show_what_a_whole_file_shows(
         live.note(bpy.context.view_layer.depsgraph)
         whole, jobs = followed(live, context, monkeypatch)
         assert jobs[0].scene is not None
+        # Without the light of the world the rest is that of a world that only the camera sees.
+        without, _ = followed(live, context, monkeypatch, world=False)
+        bpy.context.scene.world.cycles_visibility.diffuse = bpy.context.scene.world.cycles_visibility.glossy = False
+        bpy.context.scene.world.cycles_visibility.transmission = False
+        live.stop()
+        live.note(bpy.context.view_layer.depsgraph)
+        unseen, _ = followed(live, context, monkeypatch)
         chrome.modifiers.new("Wave", "SUBSURF")
         bpy.context.view_layer.update()
         assert live._changes.everything
@@ -168,6 +175,8 @@ def test_changes_are_handed_over_by_themselves_and_show_what_a_whole_file_shows(
         live.stop()
     assert np.abs(first - whole).max() > 0.05
     np.testing.assert_allclose(second[..., :3], whole[..., :3], **SAME)
+    np.testing.assert_allclose(without[..., :3], unseen[..., :3], **SAME)
+    assert without[..., :3].mean() < 0.9 * whole[..., :3].mean()
 
 
 @edits_with_graphics

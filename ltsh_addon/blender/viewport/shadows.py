@@ -168,18 +168,11 @@ class ShadowRequest:
         groups = shared_numbers(lights, tracer)
         step = BATCH if self.level == 1 else len(groups)
         sampling = ShadowSampling(rays=self.rays, film=film)
+        options = {"workers": self.tracing.pool, "ray_origins": origins, "progress": progress}
         for start in range(0, len(groups), step):
             chosen = [number for group in groups[start : start + step] for number in group]
             try:
-                traced = trace_visibility(
-                    samples,
-                    [lights[number] for number in chosen],
-                    tracer,
-                    sampling,
-                    workers=self.tracing.pool,
-                    ray_origins=origins,
-                    progress=progress,
-                )
+                traced = trace_visibility(samples, [lights[number] for number in chosen], tracer, sampling, **options)
             except Cancelled:
                 if not results:
                     raise
@@ -269,10 +262,8 @@ class LiveShadows:
         self._traced_scene = TracedScene() if behind is None else behind._traced_scene
         self._version, self._problem = 0, ""
         self._waits = False  # the picture whose shadows were asked for last must wait for the thread
-        self._group_grid: tuple[int, VisibilityGrid | None] = (
-            0,
-            None,
-        )  # number and visibility of a group of further points
+        # Number and visibility of a group of further points.
+        self._group_grid: tuple[int, VisibilityGrid | None] = (0, None)
         self._thread: threading.Thread | None = None
         self._stop = threading.Event()
         self._request: ShadowRequest | None = None  # the current one of the thread, or its last
@@ -283,7 +274,7 @@ class LiveShadows:
         self._wanted: tuple = ()  # state of scene and view that is to be shown
         # The size of what is shown. Where pictures have fewer pixels, only coarse shadows are traced.
         self.shown: tuple[int, int] | None = None
-        self._size = (1, 1)  # of the picture
+        self._is_whole = True  # the picture has all pixels of what is shown
         # State and size of a picture, and points, by whether they are coarse.
         self._pixels: dict[bool, tuple[tuple, PixelGrid]] = {}
         self._state: tuple = ()  # state that was traced last; the next two belong to it
@@ -404,7 +395,8 @@ class LiveShadows:
                 self._show()
         if number == 0:
             size = (self._behind or self).shown or gbuffer.size
-            self._wanted, self._size = (self._traced_scene.scene, view.projection.tobytes(), size), gbuffer.size
+            self._wanted = (self._traced_scene.scene, view.projection.tobytes(), size)
+            self._is_whole = size == gbuffer.size
             self._group_grid = (0, None)
         for one in self._both:
             one._waits = False
@@ -448,11 +440,6 @@ class LiveShadows:
             return 0
         best = min(max(self._known.get(key, (-1,))) for key in self._keys)
         return None if best == len(LEVELS) - 1 else int(best) + 1
-
-    @property
-    def _is_whole(self) -> bool:
-        """True if the picture has all pixels of what is shown."""
-        return self._size == self._wanted[-1]
 
     @property
     def _is_free(self) -> bool:

@@ -64,10 +64,11 @@ def test_a_picture_with_fewer_pixels_is_interpolated_and_as_bright_and_leaves_no
     def draw():
         with OpenView(camera, SIZE) as opened:
             before = opened.draw(shown)
+            opened.renderer.wait()  # the picture was drawn with depths alone
             opened.renderer.step = step
             moving = opened.draw(shown)
             opened.renderer.has_bounces, added = True, float_texture(np.full((4, 6, 4), (0.5, 0.25, 0.125, 0.0)))
-            opened.renderer.rest = ShownRest(added, opened.view.projection)
+            opened.renderer.rest = ShownRest(added, opened.view)
             with_rest = opened.draw(shown)
             opened.renderer.step, opened.renderer.has_bounces = 1, False
             after = opened.draw(shown)

@@ -39,14 +39,15 @@ class PixelSize:
         self._state, self._seconds, self._changed = None, 0.0, -MOVING_SECONDS
         self.step, self.is_new = 1, False  # is_new: its picture is not drawn yet
 
-    def follow(self, state: tuple) -> int:
-        """The `step` of a view whose camera, surfaces and lights have this state, see `same_state`."""
+    def follow(self, state: tuple, is_waiting: bool = False) -> int:
+        """The `step` of a view whose camera, surfaces and lights have this state, see `same_state`. If it `is_waiting`
+        for shadows, the whole picture, which holds them up, comes a little later."""
         before, is_first, has_changed = self.step, self._state is None, not same_state(state, self._state)
         self._state = state
         if has_changed and not is_first:
             self.step = next((one for one in STEPS if self._seconds <= FRAME_SECONDS * one**2), STEPS[-1])
             self._changed = math.inf  # until it is drawn
-        elif time.monotonic() >= self.end:
+        elif time.monotonic() >= self.end + (MOVING_SECONDS if is_waiting and self.step > 1 else 0.0):
             self.step = 1
         self.is_new |= has_changed or self.step != before
         return self.step

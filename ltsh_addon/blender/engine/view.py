@@ -117,7 +117,7 @@ class EngineView:
         # Both work at the same time: the first bounces are worth more than further points of pixels.
         is_waiting |= self.rest.is_urgent and self._renderer is not None and self._renderer.samples >= FIRST_POINTS
         if not texts.error and self._pixel_size.step > 1:
-            redraws.redraw_at(self._pixel_size.end)
+            redraws.redraw_at(max(self._pixel_size.end, time.monotonic() + redraws.POLL_SECONDS))
         elif not texts.error and self._renderer.samples < redraws.REFINEMENTS and not is_waiting:
             redraws.redraw_later(start, self._renderer.samples)
         redraws.moments["drawn"] = time.monotonic()
@@ -139,7 +139,7 @@ class EngineView:
         self._follow_rest(context, depsgraph, shown)
         points = sub_pixel_offsets(scene, redraws.REFINEMENTS)
         size, started = (region.width, region.height), time.monotonic()
-        self._renderer.step = self._pixel_size.follow(_state_of(self.mirror, camera, size))
+        self._renderer.step = self._pixel_size.follow(_state_of(self.mirror, camera, size), self._shadows.is_busy)
         self._renderer.draw(self.mirror, camera, size, shown, target, points)
         if self._pixel_size.is_new:
             self._renderer.wait()

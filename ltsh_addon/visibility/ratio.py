@@ -134,24 +134,32 @@ def trace_visibility(
     with ExitStack() as stack:
         pool = workers if isinstance(workers, WorkerPool) else stack.enter_context(WorkerPool(tracer, workers))
         for done in pool.run(task, len(blocks), job, store, seconds > SECONDS_WORTH_A_WORKER):
-            if progress is not None and progress("shadows", done / len(blocks)) is False:
-                raise Cancelled("shadows were stopped")
+            _go_on(progress, done / len(blocks))
     by_pass = visibility.get("specular"), visibility.get("diffuse")
     return Visibility(*by_pass, radiance, deviation, int(traced.sum()), mixed, numbers)
 
 
-def trace_ray_origins(samples: SurfaceSamples, pool: WorkerPool) -> RayOrigins:
-    """Where rays from P samples start, found by the processes of `pool`, whose context is a tracer."""
+def trace_ray_origins(samples: SurfaceSamples, pool: WorkerPool, progress: Progress | None = None) -> RayOrigins:
+    """Where rays from P samples start, found by the processes of `pool`, whose context is a tracer.
+
+    `progress` may stop it, as in `trace_visibility`.
+    """
     blocks, ray_origins = _blocks(len(samples)), RayOrigins.empty(len(samples))
-    for _ in pool.run(
+    for done in pool.run(
         OriginTask(),
         len(blocks),
         lambda number: samples.take(blocks[number]),
         lambda number, origins: ray_origins.put(blocks[number], origins),
         len(samples) >= SAMPLES_WORTH_A_WORKER,
     ):
-        pass
+        _go_on(progress, done / len(blocks))
     return ray_origins
+
+
+def _go_on(progress: Progress | None, share: float) -> None:
+    """Report the share that is done. Raises Cancelled if `progress` stops the work."""
+    if progress is not None and progress("shadows", share) is False:
+        raise Cancelled("shadows were stopped")
 
 
 def _blocks(count: int, film: Film | None = None) -> list[slice] | list[np.ndarray]:

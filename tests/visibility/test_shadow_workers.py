@@ -67,6 +67,8 @@ def test_a_pool_that_stays_gives_the_same_bytes(scene):
                 # What has begun is not waited for, and is not taken for a result later on.
                 with pytest.raises(Cancelled):
                     shares(workers=both, progress=lambda stage, share: share < 0.5)
+                with pytest.raises(Cancelled):
+                    ratio.trace_ray_origins(floor(40)[0], both, lambda stage, share: share < 0.5)
             # Where rays start may be known, from the same processes.
             origins = None if number == 0 else ratio.trace_ray_origins(floor(40)[0], both)
             found = shares(workers=both, ray_origins=origins)

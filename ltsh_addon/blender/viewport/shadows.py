@@ -80,10 +80,10 @@ class PixelGrid:
         if gbuffer.geometric_normal is not None:
             self._normal = every_texel(gbuffer.geometric_normal, self._step)
 
-    def ray_origins(self, pool: WorkerPool) -> RayOrigins:
-        """Where rays from the samples start. They stay when only lights change."""
+    def ray_origins(self, pool: WorkerPool, progress: Callable) -> RayOrigins:
+        """Where rays from the samples start. They stay when only lights change. `progress` may stop the work."""
         if self._ray_origins is None:
-            self._ray_origins = trace_ray_origins(self.samples()[0], pool)
+            self._ray_origins = trace_ray_origins(self.samples()[0], pool, progress)
         return self._ray_origins
 
     def samples(self) -> tuple[SurfaceSamples, Film]:
@@ -161,7 +161,7 @@ class ShadowRequest:
     def _traced(self, samples: SurfaceSamples, film: Film, progress: Callable) -> dict[int, np.ndarray]:
         """The shares of `samples`, as `visibility` returns them."""
         tracer, results = self.tracing.tracer, {}
-        origins = self.points.ray_origins(self.tracing.pool) if self.level == 1 else None
+        origins = self.points.ray_origins(self.tracing.pool, progress) if self.level == 1 else None
         lights = [light for lights in self.lights for light in lights]
         starts = np.cumsum([0, *map(len, self.lights)])[:-1]
         index_of = dict(zip(starts.tolist(), range(len(starts)), strict=True))

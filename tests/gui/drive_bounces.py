@@ -53,12 +53,11 @@ def main(rig):
     yield from over(rig)
     rig.space.overlay.show_overlays = False
     rig.space.show_region_ui = False
-    scene = bpy.context.scene
     rig.camera_view()
     yield 1
-    scene.render.engine = "LTSH"
     start = time.monotonic()
-    rig.space.shading.type = "RENDERED"
+    with rig.override():
+        bpy.ops.ltsh.preview()
     yield 0.5
     yield from waited(rig, lambda: len(module("engine.redraws").open_views) > 0, FIRST_SECONDS)
     yield from waited(rig, lambda: shown_of(rest()) is not None, FIRST_SECONDS)
@@ -112,7 +111,7 @@ def main(rig):
     yield from waited(rig, lambda: rest()._stack is not None and rest()._process._child is not None, NEXT_SECONDS)
     child = rest()._process._child
     start = time.monotonic()
-    scene.render.engine = "CYCLES"
-    rig.space.shading.type = "SOLID"
+    with rig.override():
+        bpy.ops.ltsh.preview()
     yield ENDED_SECONDS
     rig.check(child.poll() is not None, f"it ends within {ENDED_SECONDS:g} s with the engine")

@@ -307,7 +307,7 @@ class LiveRest:
         path = changes = None
         if state != self._opened or self._changes.everything:
             path, self._opened = self._folder / "scene.blend", state
-            save_working_copy(path)
+            save_working_copy(path, keep_engine=True)
         elif self._changes.objects or self._changes.blocks:
             changes = self._changes.written(bpy.data.scenes[wanted.scene], self._folder / "changes.blend")
         self._changes = RestChanges(everything=False)

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from ...cycles.lobes import read_layer
-from ...imaging.denoise import NoDenoiser, open_denoiser
+from ...imaging.denoise import NoDenoiser, open_denoiser, smoothed
 from ...scene import Light, Progress, SceneError, light_of
 from ...workers.pool import cores
 from .blender_process import denoiser_libraries, run_job, run_scene_job
@@ -197,10 +197,8 @@ class RestSum:
             with open_denoiser(denoiser_libraries(), cores()) as denoiser:
                 light = denoiser.quickly_denoised(light, guides[..., :3], guides[..., 3:6])
         except NoDenoiser:
-            light, self.problem = (
-                np.maximum(np.nan_to_num(light), 0.0),
-                "Bounces are not denoised: this Blender has no denoiser",
-            )
+            light = smoothed(light, guides, self.samples)
+            self.problem = "Bounces are smoothed, not denoised: this Blender has no denoiser"
         return np.concatenate([light, guides[..., 6:]], axis=-1)
 
 

@@ -258,7 +258,8 @@ class LiveRest:
             if self._thread.is_alive():
                 return False
             news = self._finish()
-        is_at_rest = time.monotonic() - self._changed > REST_SECONDS
+        # A render of the artist's has the processor for itself.
+        is_at_rest = time.monotonic() - self._changed > REST_SECONDS and not bpy.app.is_job_running("RENDER")
         if self._wanted is not None and is_at_rest and self.is_busy:
             try:
                 self._begin()

@@ -155,7 +155,7 @@ def smoothed(light: np.ndarray, guides: np.ndarray, samples: int) -> np.ndarray:
     brightest = np.max([_shifted(brightness, *way) for way in _WAYS], axis=0)
     light = light * np.minimum(1.0, MOST * brightest / np.maximum(brightness, 1e-9))[..., None]
     normal = guides[..., 3:6] / np.maximum(np.linalg.norm(guides[..., 3:6], axis=-1, keepdims=True), 1e-6)
-    surface = np.concatenate([guides[..., :3], normal, np.minimum(guides[..., 6:], FARTHEST)], axis=-1)
+    surface = np.concatenate([guides[..., :3], normal, guides[..., 6:]], axis=-1)
     for step in (1, 2, 4)[: max(3 - int(np.log2(max(samples, 4) / 4)) // 2, 1)]:
         total, weights = light, np.ones_like(brightness)
         for down, right in _WAYS:

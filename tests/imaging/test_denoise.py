@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from ltsh_addon.imaging.denoise import smoothed
+from ltsh_addon.imaging.denoise import FARTHEST, smoothed
 
 
 def test_light_is_smoothed_along_surfaces_and_not_across():
     """Two halves of other color, and a sky behind: the mean of noise stays, and no light crosses over."""
     random, true = np.random.default_rng(3), np.zeros((48, 60, 3))
     guides = np.zeros((48, 60, 7))
-    guides[..., 5], guides[..., 6], guides[:12, :, 6] = 1.0, 3.0, 1e10
+    guides[..., 5], guides[..., 6], guides[:12, :, 6] = 1.0, 3.0, FARTHEST
     guides[12:, :30, :3], guides[12:, 30:, :3], guides[:12, :, 3:6] = 0.2, 0.8, 0.0
     true[12:, :30], true[12:, 30:] = (0.5, 0.2, 0.1), (0.1, 0.6, 0.9)
     np.testing.assert_allclose(smoothed(true, guides, 4), true, atol=1e-3)

@@ -126,6 +126,12 @@ def child_command(job: Path, script: Path = WORKER) -> list[str]:
     return [sys.executable, str(script), str(job)]
 
 
+def packages() -> list[str]:
+    """The folder of OpenEXR, if this process has it: a Blender without extensions does not find it by itself."""
+    spec = importlib.util.find_spec("OpenEXR")
+    return [str(Path(spec.origin).parent)] if spec is not None and spec.origin else []
+
+
 # Where Blender and pip's bpy keep libraries on Linux, Windows and macOS, relative to the binary or the module.
 LIBRARY_PATTERNS = ("lib/lib{}*", "blender.shared/{}*.dll", "{}*.dll", "../Resources/lib/lib{}*")
 
@@ -198,6 +204,7 @@ class BlenderProcess:
         """Do `job`, see `run_job`, in `folder` and report its progress. An error ends this Blender."""
         job_path = folder / "job.json"
         record = {"job": type(job).__name__, "fields": dataclasses.asdict(job), "temporary": self.temporary}
+        record["path"] = packages()
         job_path.write_text(json.dumps(record, default=str), encoding="utf-8")
         try:
             self._hand_over(job_path)

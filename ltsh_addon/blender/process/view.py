@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from ...cycles.lobes import read_layer
-from ...imaging.denoise import NoDenoiser, open_denoiser, smoothed
+from ...imaging.denoise import FARTHEST, NoDenoiser, open_denoiser, smoothed
 from ...scene import Light, Progress, SceneError, light_of
 from ...workers.pool import cores
 from .blender_process import denoiser_libraries, run_job, run_scene_job
@@ -185,7 +185,7 @@ class RestSum:
             drawn = 1.0 - np.minimum(read_layer(channels, manifest["mask"], "X"), 1.0)
             light = light - drawn[..., None] * (specular * specular_color + diffuse * diffuse_color + background)
         names = ("Denoising Albedo", "RGB"), ("Denoising Normal", "XYZ"), ("Denoising Depth", "Z")
-        guides = [np.atleast_3d(read_layer(channels, *name)) for name in names]
+        guides = [np.atleast_3d(np.minimum(read_layer(channels, *name), FARTHEST)) for name in names]
         self.light = self.light + np.float32(count) * light
         self.guides = self.guides + np.float32(count) * np.concatenate(guides, axis=-1)
         self.samples += count

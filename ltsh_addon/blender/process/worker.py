@@ -37,6 +37,7 @@ def main() -> None:
     while True:
         record = json.loads(path.read_text(encoding="utf-8"))
         temporary[:] = map(Path, record["temporary"])
+        sys.path += [folder for folder in record["path"] if folder not in sys.path]
         process.tell(_answer(record, path.parent, progress))
         path = Path(jobs.get())
 

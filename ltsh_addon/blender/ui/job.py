@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import math
 import shutil
@@ -396,9 +395,8 @@ class Job:
 
         Raises SceneError and OSError.
         """
-        job, spec = self.folder / "job.json", importlib.util.find_spec("OpenEXR")
-        libraries = [str(Path(spec.origin).parent)] if spec is not None and spec.origin else []
-        document = {"runs": runs, "path": libraries, "temporary": str(self.folder)}
+        job = self.folder / "job.json"
+        document = {"runs": runs, "path": blender_process.packages(), "temporary": str(self.folder)}
         job.write_text(json.dumps(document), encoding="utf-8")
         self._messages: SimpleQueue = SimpleQueue()
         command = blender_process.child_command(job, SCRIPT)

@@ -3,6 +3,7 @@
 import hashlib
 import os
 import subprocess
+import sys
 from pathlib import Path
 
 import bpy
@@ -12,6 +13,8 @@ import pytest
 import scene_parts
 from kills import children, is_running
 
+from ltsh_addon.blender.process import blender_process
+from ltsh_addon.blender.process.finished import FinishedJob, render_finished
 from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels
 from ltsh_addon.scene import Cancelled
 
@@ -118,3 +121,16 @@ def test_a_child_that_still_speaks_deletes_the_folders_of_a_parent_that_is_gone(
     child.stdin.close()
     assert (child.wait(60.0), child.stderr.read()) == (3, b"") and not folder.exists()
     child.stderr.close()
+
+
+def test_the_second_blender_reads_its_renders_though_it_has_no_extensions(tmp_path, own_blender, monkeypatch):
+    """Beside bpy and numpy it has OpenEXR from the folder that this process has it from."""
+    site = Path(np.__file__).parents[1]
+    for path in (*site.glob("bpy*"), *site.glob("numpy*")):
+        (tmp_path / path.name).symlink_to(path)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    bare = [sys.executable, "-S", str(blender_process.WORKER)]
+    monkeypatch.setattr(blender_process, "child_command", lambda job: [*bare, str(job)])
+    scene = saved_scene(tmp_path / "scene.blend")
+    job = FinishedJob(scene, None, None, None, None, None, None, cycles_samples=2, seconds=None)
+    assert render_finished(job, tmp_path).samples == 2

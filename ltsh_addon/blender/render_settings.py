@@ -300,11 +300,26 @@ def choose_view_layer(scene, warnings: list[str], name: str | None = None):
     """As `only_view_layer`; the layer also gets the name VIEW_LAYER and loses its AOVs and light groups."""
     layer = only_view_layer(scene, warnings, name)
     layer.name = VIEW_LAYER
-    # Nothing reads these passes, and their names could clash with those of passes that are read.
+    remove_extra_passes(layer)
+    return layer
+
+
+def remove_extra_passes(layer) -> None:
+    """Remove AOVs and light groups: nothing reads them, and their names could clash with those of other passes."""
     for extra in (layer.aovs, layer.lightgroups):
         for item in list(extra):
             extra.remove(item)
-    return layer
+
+
+def render_with_cycles(scene) -> None:
+    """Let Cycles render `scene` on the processor, with nothing after it: no compositing, no denoiser."""
+    render, cycles = scene.render, scene.cycles
+    render.engine = "CYCLES"
+    render.threads_mode, render.threads = "FIXED", cores()
+    render.use_compositing = render.use_sequencer = render.use_multiview = False
+    render.use_file_extension = render.use_overwrite = True
+    cycles.device = "CPU"
+    cycles.use_denoising = cycles.use_animated_seed = cycles.use_sample_subset = False
 
 
 def neutralize(scene, view_layer, camera, warnings: list[str]) -> None:
@@ -326,20 +341,15 @@ def neutralize(scene, view_layer, camera, warnings: list[str]) -> None:
     warnings.extend(steps_after_rendering(scene))
     scene.camera = camera
     hold_still(scene, camera)
-    render.engine = "CYCLES"
-    render.threads_mode, render.threads = "FIXED", cores()
-    render.use_compositing = render.use_sequencer = False
+    render_with_cycles(scene)
     # With an opaque film only holdouts have alpha 0; the passes do not change.
     render.film_transparent = False
     render.use_freestyle = render.use_persistent_data = False
-    render.use_file_extension = render.use_overwrite = True
-    cycles.device = "CPU"
     # AOVs need the shading system without scripts; files without scripts look the same in both.
     cycles.shading_system = cycles.shading_system and bool(script_nodes())
     # The exposure is applied after reading the rendered files, free of the property's limits.
     cycles.film_exposure = 1.0
-    cycles.use_adaptive_sampling = cycles.use_denoising = cycles.use_sample_subset = False
-    cycles.use_animated_seed = cycles.use_fast_gi = False
+    cycles.use_adaptive_sampling = cycles.use_fast_gi = False
     cycles.time_limit = 0.0
     cycles.max_bounces = 0
     view_layer.pass_alpha_threshold = 0.5

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from functools import cache
 from pathlib import Path
 
 import bpy
@@ -55,16 +56,17 @@ def render_finished(job: FinishedJob, folder: Path, progress) -> dict:
     dropped = () if layer.cycles.denoising_store_passes else NOT_WRITTEN
     _prepare(scene, layer, warnings)
     has_edges, end = job.edges and not (everything or camera.data.dof.use_dof), None
+    shines = cache(_anything_shines)
     if seconds is not None:
 
         def end(first: Path) -> float:
-            reserve = has_edges and _anything_shines(first)
+            reserve = has_edges and shines(first)
             return started + SPENT * max(seconds - reserve * EDGE_SECONDS * width * height / 1e6, 0.0)
 
     files, least = _render_chunks(scene, layer, folder, job.cycles_samples, end, progress)
     # Their time is reserved; the last file may have taken a little longer than it should.
     in_time = seconds is None or time.process_time() < started + LATEST_EDGES * seconds
-    if has_edges := has_edges and in_time and _anything_shines(folder / files[0][0]):
+    if has_edges := has_edges and in_time and shines(folder / files[0][0]):
         _render_edges(scene, layer, folder, progress)
     return {
         "frame": scene.frame_current,
@@ -119,17 +121,12 @@ def _prepare(scene, layer, warnings: list[str]) -> None:
     # A render evaluates the scene's animation again, which would undo these settings.
     if scene.animation_data is not None:
         scene.animation_data_clear()
-    render.engine = "CYCLES"
-    render.threads_mode, render.threads = "FIXED", render_settings.cores()
-    render.use_compositing = render.use_sequencer = render.use_multiview = False
-    render.use_file_extension = render.use_overwrite = True
     # Cycles keeps the scene for the second and further files.
     render.use_persistent_data = True
     if cycles.device != "CPU":
         warnings.append("Cycles renders on the processor, the file asks for a graphics card")
-    cycles.device = "CPU"
     # The parent denoises what remains without our light. Noise that is the same in each frame does not flicker.
-    cycles.use_denoising = cycles.use_animated_seed = cycles.use_sample_subset = False
+    render_settings.render_with_cycles(scene)
     for name in PASSES:
         setattr(layer, f"use_pass_{name}", True)
     layer.cycles.denoising_store_passes = True

@@ -147,7 +147,6 @@ class _RestStep:
     view: RestView
     job: RestJob
     total: RestSum
-    started: float
     pixels: np.ndarray | None = None  # of the picture, if it is to be shown
     seconds: float = 0.0
     error: str = ""
@@ -327,7 +326,7 @@ class LiveRest:
             changes=changes,
         )
         self._last_of = wanted
-        self._step = _RestStep(wanted, job, total, time.monotonic())
+        self._step = _RestStep(wanted, job, total)
         arguments = self._step, self._process, self._folder
         self._thread = threading.Thread(target=_do_step, args=arguments, name="LTSH rest", daemon=True)
         self._thread.start()
@@ -469,18 +468,12 @@ def _prepare(scene, layer) -> None:
     render, cycles = scene.render, scene.cycles
     if scene.animation_data is not None:
         scene.animation_data_clear()
-    render.engine = "CYCLES"
-    render.threads_mode, render.threads = "FIXED", render_settings.cores()
-    for name in ("compositing", "sequencer", "multiview", "motion_blur", "border", "freestyle"):
-        setattr(render, f"use_{name}", False)
-    render.use_file_extension = render.use_overwrite = render.use_persistent_data = True
-    render.film_transparent = False
-    cycles.device, cycles.film_exposure, cycles.time_limit, layer.samples = "CPU", 1.0, 0.0, 0
-    cycles.use_denoising = cycles.use_animated_seed = cycles.use_sample_subset = cycles.use_adaptive_sampling = False
+    render_settings.render_with_cycles(scene)
+    render.use_motion_blur = render.use_border = render.use_freestyle = render.film_transparent = False
+    render.use_persistent_data = True
+    cycles.film_exposure, cycles.time_limit, layer.samples, cycles.use_adaptive_sampling = 1.0, 0.0, 0, False
     cycles.shading_system = False  # AOVs need it
-    for extra in (layer.aovs, layer.lightgroups):
-        for item in list(extra):
-            extra.remove(item)
+    render_settings.remove_extra_passes(layer)
     render_settings.enable_passes(layer, PASSES)
     layer.cycles.denoising_store_passes = True
     aov = layer.aovs.add()

@@ -13,6 +13,7 @@ from ...pipeline.mixer import MixerRow
 from ...scene import Cancelled, Light, SceneError, error_line, light_of, listed
 from ..evaluated import EmitterTraits
 from ..lights.area import area_light, reason_to_leave_out
+from ..lights.groups import reason_to_keep
 from ..lights.linking import Receivers
 from . import comparison, results
 from .panels import draw_text, gray, in_both_places, split_names
@@ -262,11 +263,8 @@ def _reason_not_to_apply(ob, values, given: dict) -> str:
     """Why a light cannot get `values`; "" if it can. `given` are the values of the data of earlier lights."""
     if ob is None or ob.type != "LIGHT":
         return "not in the scene any more"
-    if ob.library is not None or ob.data.library is not None:
-        return "it is linked from another file"
-    animation = ob.data.animation_data
-    if animation is not None and (animation.action or len(animation.drivers)):
-        return "its settings are animated or driven"
+    if reason := reason_to_keep(ob):
+        return reason
     if given.setdefault(ob.data.name, values) != values:
         return "it shares its data with a light that got other values; make it a single user"
     return ""

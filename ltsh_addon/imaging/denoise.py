@@ -88,6 +88,11 @@ class Denoiser:
         """As `all_denoised` of one picture, with the library's fast quality and the guides as they are."""
         return self._filtered({"color": color, "albedo": albedo, "normal": normal}, hdr=True, quality=_FAST)
 
+    def guided(self, color: np.ndarray, albedo: np.ndarray, normal: np.ndarray) -> np.ndarray:
+        """As `all_denoised` of one picture, with guides without noise."""
+        images = {"color": color, "albedo": albedo, "normal": normal}
+        return self._filtered(images, quality=_HIGH, hdr=True, cleanAux=True)
+
     def _filtered(self, images: dict[str, np.ndarray], **settings: int) -> np.ndarray:
         """The first of the `images`, filtered with the help of the others."""
         images = {name: _plain(image) for name, image in images.items()}

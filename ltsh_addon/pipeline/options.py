@@ -325,6 +325,16 @@ def _shadow_rays() -> Any:
     return option("--shadow-rays", default=256, type=shadow_rays, metavar="N", help=meaning)
 
 
+def _bounces(what: str) -> Any:
+    meaning = f"also {what}, by Cycles and denoised (default: %(default)s)"
+    return option("--bounces", default="off", choices=("on", "off"), help=meaning)
+
+
+def _rest_samples() -> Any:
+    meaning = "of Cycles for the bounces (default: %(default)s)"
+    return option("--rest-samples", default=64, type=cycles_samples, metavar="N", help=meaning)
+
+
 def _scripts() -> Any:
     return flag("--enable-autoexec", "run the scripts and Python drivers in the .blend, which is not done otherwise")
 
@@ -414,6 +424,8 @@ class BakeOptions:
     cycles_samples: int = _cycles_samples("Cycles' bake", 256)  # with `error`
     shadows: str = _shadows()
     shadow_rays: int = _shadow_rays()
+    bounces: str = _bounces("bounced light")
+    rest_samples: int = _rest_samples()
     apply: bool = flag("--apply", "also a texture of each object, and a copy of the .blend whose materials show it")
     scripts: bool = _scripts()
     resume: bool = option(default=False, matters=False)  # keep what the same job has finished
@@ -431,14 +443,8 @@ class ViewOptions(CameraOptions):
     )  # fmt: skip
     shadows: str = _shadows()
     shadow_rays: int = _shadow_rays()
-    bounces: str = option(
-        "--bounces", default="off", choices=("on", "off"),
-        help="also bounces, reflections, refraction, materials by nodes, by Cycles and denoised (default: %(default)s)",
-    )  # fmt: skip
-    rest_samples: int = option(
-        "--rest-samples", default=64, type=cycles_samples, metavar="N",
-        help="of Cycles for the bounces (default: %(default)s)",
-    )  # fmt: skip
+    bounces: str = _bounces("bounces, reflections, refraction, materials by nodes")
+    rest_samples: int = _rest_samples()
     scripts: bool = _scripts()
 
 

@@ -1,7 +1,7 @@
 """The islands of a UV map: pictures of them in which the surface goes on beyond seams, and lights that fit there.
 
-Works on one texture with any number of objects. Texels are counted from the lower left corner of the texture; the center
-of the first one is at (.5, .5).
+Works on one texture with any number of objects. Texels are counted from the lower left corner of the texture; the
+center of the first one is at (.5, .5).
 """
 
 from __future__ import annotations
@@ -18,11 +18,12 @@ from ..cycles.uv import cross, repeated
 
 # SAME_PLACE: corners that are nearer count as one, relative to the size of all. SAME_UV: the same in texels.
 SAME_PLACE, SAME_UV = 1e-6, 1.0 / 64.0
-# SMOOTH: cosine of normals on both sides of a seam that show the same light.
-SMOOTH = 0.999
+# Cosines of the normals on both sides of a seam. SMOOTH: they show the same light. FOLD: the surface turns back, like
+# that of a sheet of paper.
+SMOOTH, FOLD = 0.999, -0.5
 # FRAMES: texels around islands, the first that needs no more than MOST_CANVAS times the texture. STEP: between points
 # at which a frame is looked up.
-FRAMES, MOST_CANVAS, STEP = (16, 8, 4, 2), 6.0, 0.7
+FRAMES, MOST_CANVAS, STEP = (8, 4, 2), 6.0, 0.7
 # LEAST_WEIGHT: of the texels that show a place beyond a seam, out of 1.
 LEAST_WEIGHT = 0.25
 # What fits seams: RINGS of texels around them change, SMOOTHLY; COVERED and MARGIN texels resist a change so much,
@@ -81,7 +82,9 @@ def islands_of(grid: TexelGrid) -> Islands:
     place = np.round(grid.corners.reshape(-1, 3) / (SAME_PLACE * size)).astype(np.int64)
     vertex = np.unique(place, axis=0, return_inverse=True)[1].reshape(count, 3)
     first, second, third = np.arange(3), np.array([1, 2, 0]), np.array([2, 0, 1])
-    low = np.where(vertex[:, first] <= vertex[:, second], first, second)  # (T, 3) corner of the end with the lower number
+    low = np.where(
+        vertex[:, first] <= vertex[:, second], first, second
+    )  # (T, 3) corner of the end with the lower number
     triangle = np.repeat(np.arange(count), 3)
     low, high, apex = low.ravel(), (np.add(first, second) - low).ravel(), np.tile(third, count)
     ends = np.stack([grid.uv[triangle, low], grid.uv[triangle, high]], axis=1)
@@ -229,7 +232,7 @@ def _frame(islands: Islands, seams: Seams, depth: float, located: Callable, take
 
 def _beyond(seams: Seams, edge: np.ndarray, point: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Where the texture shows the surface of points (Q, 2) beyond edges (Q,): places (Q, 2), and the mask (Q,) of those
-    where it goes on without a fold."""
+    where it is not folded back."""
     other = seams.other[edge]
     along, along_other = seams.end[edge] - seams.start[edge], seams.end[other] - seams.start[other]
     squared = (along * along).sum(axis=1)
@@ -237,7 +240,7 @@ def _beyond(seams: Seams, edge: np.ndarray, point: np.ndarray) -> tuple[np.ndarr
     distance = -((point - seams.start[edge]) * seams.inward[edge]).sum(axis=1)
     distance *= np.sqrt((along_other * along_other).sum(axis=1) / squared)
     place = seams.start[other] + share[:, None] * along_other + distance[:, None] * seams.inward[other]
-    is_flat = (seams.normal[edge] * seams.normal[other]).sum(axis=-1).min(axis=1, initial=1.0) > 0.0
+    is_flat = (seams.normal[edge] * seams.normal[other]).sum(axis=-1).min(axis=1, initial=1.0) > FOLD
     return place, is_flat
 
 
@@ -277,7 +280,9 @@ class SeamFit:
 
     def __init__(self, islands: Islands):
         (height, width), of_texels, seams = islands.grid.triangle.shape, islands.of_texels, islands.seams
-        seams = _chosen(seams, (seams.normal * seams.normal[seams.other]).sum(axis=-1).min(axis=1, initial=1.0) > SMOOTH)
+        seams = _chosen(
+            seams, (seams.normal * seams.normal[seams.other]).sum(axis=-1).min(axis=1, initial=1.0) > SMOOTH
+        )
 
         one_side = np.flatnonzero(np.arange(len(seams.other)) < seams.other)
         along = seams.end - seams.start
@@ -354,7 +359,7 @@ class SeamFit:
 
 
 def _beside(texels: np.ndarray, claim: np.ndarray, of_texels: np.ndarray):
-    """As `_frame`, for `texels` that no surface beyond a seam shows: the nearest ones of the islands that claim them."""
+    """As `_frame`, for `texels` that no surface beyond a seam shows: the nearest ones of islands that `claim` them."""
     height, width = of_texels.shape
     y, x = np.divmod(texels, width)
     source = np.full(len(texels), -1)

@@ -19,6 +19,7 @@ from ..cycles import uv
 from ..cycles.texels import NOT_BAKED, BakeMaterial, BakeView, TexelMesh, texel_guides, texel_samples
 from ..files import temporary_folder
 from ..imaging import exr, grouped
+from ..imaging.denoise import DENOISER
 from ..imaging.exr import COMBINED, REST, layer_name
 from ..imaging.seams import SeamFit, TexelGrid, islands_of
 from ..reading import NUMBER, Malformed, check, file_name
@@ -109,7 +110,9 @@ def _check(options: BakeOptions) -> None:
     if unknown or not options.passes:
         raise ValueError(f"passes are {list(options.passes)}, expected some of {', '.join(BAKE_PASSES)}")
     if options.bounces == "on" and options.shadows == "off":
-        raise ValueError("bounces are on and shadows off, expected both: bounced light has shadows; leave out one of both")
+        raise ValueError(
+            "bounces are on and shadows off, expected both: bounced light has shadows; leave out one of both"
+        )
 
 
 def _job(options, finished, tile=None, following=()):
@@ -515,6 +518,11 @@ def _report(options, manifest, records) -> dict:
             if share := 100 * tile["unbaked_texels"] / max(tile["texels"] + tile["unbaked_texels"], 1):
                 why = "because Cycles bakes nothing there: apply the modifiers"
                 warnings.append(f"{name}: {share:.3g} % of its texels are left out, {why}")
+            if share := 100 * tile.get("dull_texels", 0) / max(tile["texels"], 1):
+                why = "have no diffuse color: the light that bounces there is reflected, which no lightmap holds"
+                warnings.append(f"{name}: {share:.3g} % of its texels {why}; bake the pass specular or combined")
+            if not tile.get("denoiser", DENOISER).startswith(DENOISER):
+                warnings.append(f"{name}: {tile['denoiser']}")
     return {
         "scene": str(options.scene),
         "frame": manifest["frame"],

@@ -47,19 +47,15 @@ def denoised_rest(
     from ..blender.process.blender_process import denoiser_libraries
 
     canvas, is_covered = canvas_of(islands), islands.grid.triangle >= 0
-    color, normal = guides[..., :3], guides[..., 3:]
     images = {}
     for kind, light in rest.items():
         is_lit = (light[..., 0] != np.float32(NOT_BAKED)) & is_covered
         if kind == "diffuse":
-            is_lit &= color.max(axis=-1) > DULL
+            is_lit &= guides[..., :3].max(axis=-1) > DULL
         images[kind] = np.where(is_lit[..., None], light, 0.0), is_lit
     try:
         with open_denoiser(denoiser_libraries(), cores()) as denoiser:
-            done = {
-                kind: _on_canvas(canvas, light, is_lit, guides if kind == "specular" else normal, denoiser.guided)
-                for kind, (light, is_lit) in images.items()
-            }
+            done = {kind: _on_canvas(canvas, *one, guides, denoiser.guided) for kind, one in images.items()}
             return done, denoiser.name
     except NoDenoiser as error:
 
@@ -67,19 +63,25 @@ def denoised_rest(
             return smoothed(light, np.concatenate([albedo, normals, np.ones_like(light[..., :1])], axis=-1), samples)
 
         done = {kind: _on_canvas(canvas, *one, guides, smooth) for kind, one in images.items()}
-        return done, f"{error}; bounced light is smoothed along the surfaces"
+        return done, f"its bounced light is smoothed along the surface, not denoised: {error}"
 
 
 def _on_canvas(canvas, light, is_lit, guides, denoise: Callable) -> np.ndarray:
-    """The light (H, W, 3) of a texture, denoised on its canvas. `guides` (H, W, 3 or 6) end with the normal."""
+    """The light (H, W, 3) of a texture, denoised on its canvas. `guides` are as for `denoised_rest`."""
     planes, mask = canvas.put(np.concatenate([light, guides, is_lit[..., None]], axis=-1))
-    # Whole texels alone; those between lit ones and others are filled with what is next to them.
+    # Beyond lit texels the picture is mirrored: noise that is repeated would look like light. Texels between lit ones
+    # and others count as others.
     lit = mask & (planes[..., -1] > 0.999)
     target, source = nearest_covered(lit, max(FRAMES))
+    row, column = (
+        2 * (source // lit.shape[1]) - target // lit.shape[1],
+        2 * (source % lit.shape[1]) - target % lit.shape[1],
+    )
+    inside = (row >= 0) & (row < lit.shape[0]) & (column >= 0) & (column < lit.shape[1])
+    mirrored = np.where(inside, row * lit.shape[1] + column, 0)
+    source = np.where(inside & lit.reshape(-1)[mirrored], mirrored, source)
     flat, is_bare = planes.reshape(-1, planes.shape[-1]), ~mask.reshape(-1)
     flat[target, :3] = flat[source, :3]
     bare = is_bare[target]
     flat[target[bare], 3:-1] = flat[source[bare], 3:-1]
-    normal = planes[..., -4:-1]
-    albedo = planes[..., 3:6] if guides.shape[-1] == 6 else np.ones_like(normal)
-    return canvas.taken(denoise(planes[..., :3], albedo, normal), light)
+    return canvas.taken(denoise(planes[..., :3], planes[..., 3:6], planes[..., 6:9]), light)

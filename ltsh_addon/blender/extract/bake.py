@@ -278,7 +278,9 @@ BOUNCES = ("max_bounces", "sample_clamp_indirect", "blur_glossy", "caustics_refl
 
 def bounces_of(scene) -> list[tuple]:
     """The settings of the file, as for `changed_properties`, on which its indirect light depends."""
-    emission = [(material.cycles, "emission_sampling", material.cycles.emission_sampling) for material in bpy.data.materials]
+    emission = [
+        (material.cycles, "emission_sampling", material.cycles.emission_sampling) for material in bpy.data.materials
+    ]
     return [(scene.cycles, name, getattr(scene.cycles, name)) for name in BOUNCES] + emission
 
 

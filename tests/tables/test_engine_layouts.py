@@ -223,5 +223,5 @@ def test_the_documents_name_each_layout_and_its_source():
     text = (ROOT / "docs" / "engines.md").read_text(encoding="utf-8")
     assert set(documented()) == set(layouts.LAYOUTS)
     for layout in layouts.LAYOUTS.values():
-        assert all(f"`{name}`" in text for name in layout.files) and layout.engine in text
+        assert all(f"/{name}`" in text for name in layout.files) and layout.engine in text
         assert re.search(r"[0-9a-f]{7}\b|0\.187\.0", layout.source)

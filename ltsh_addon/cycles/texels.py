@@ -37,10 +37,7 @@ class ImageTexture:
         """Linear colors (Q, 3) at uv (Q, 2)."""
         height, width = self.pixels.shape[:2]
         values = interpolated(np.asarray(uv, dtype=np.float64), (width, height), self.interpolation, self._at)
-        if not self.srgb:
-            return values
-        # IEC 61966-2-1
-        return np.where(values <= 0.04045, values / 12.92, ((np.maximum(values, 0.0) + 0.055) / 1.055) ** 2.4)
+        return srgb_decode(values) if self.srgb else values
 
     def _at(self, x, y):
         """Values (Q, 3) of pixels at integers x, y (Q,), which may lie outside the image."""
@@ -52,6 +49,11 @@ class ImageTexture:
         if self.extension == "CLIP":
             values[(x != columns) | (y != rows)] = 0.0
         return values
+
+
+def srgb_decode(values: np.ndarray) -> np.ndarray:
+    """Linear values of sRGB ones (IEC 61966-2-1)."""
+    return np.where(values <= 0.04045, values / 12.92, ((np.maximum(values, 0.0) + 0.055) / 1.055) ** 2.4)
 
 
 def interpolated(uv: np.ndarray, size: tuple[int, int], interpolation: str, pixel: Callable) -> np.ndarray:

@@ -62,7 +62,7 @@ class OpenScene:
         def note(scene, depsgraph) -> None:
             self._changes.add(depsgraph)
 
-        handlers = bpy.app.handlers.frame_change_post, bpy.app.handlers.depsgraph_update_post
+        handlers = [getattr(bpy.app.handlers, name) for name in ("frame_change_post", "depsgraph_update_post")]
         for each in handlers:
             each.append(note)
         try:

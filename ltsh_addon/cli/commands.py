@@ -303,7 +303,7 @@ not count. Bounces follow their lights.
 def add_match(parser) -> None:
     """`ltsh match`."""
     with_examples(parser, MATCH, MATCH_EXAMPLES)
-    add_options(parser, MatchOptions)
+    add_options(parser, MatchOptions, but=("name",))
     add_talk(parser)
     parser.set_defaults(run=_match)
 

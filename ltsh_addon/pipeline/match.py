@@ -7,7 +7,7 @@ none; the factors of these pictures are those of non-negative least squares (Law
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -31,10 +31,10 @@ STEADY = 1e-6
 # SQUARE: pictures are compared by the means of squares of so many pixels on a side: edges that lie differently within
 # pixels would count as light otherwise (errors of powers 2.4 % in place of .6 % in a room of eight lights).
 SQUARE = 5
-# LEAST_SHARE: lights with less of the picture's light keep their power within noise: the report says so.
+# LEAST_SHARE: of lights with less of the picture's light a target hardly tells the power: the report says so.
 LEAST_SHARE = 0.005
 FEWEST = 100  # pixels of a target
-NOT_TOLD = "{} give less than {:.1f} % of the picture: the target hardly tells their power"
+NOT_TOLD = "less than {1:.1f} % of the picture is light of {0}: the target hardly tells its power"
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class LightFactors:
     """What the target says of the lights."""
 
     factors: np.ndarray  # (R, 3), by which the radiance of each row is multiplied
-    shares: np.ndarray  # (R,) of the light of the picture, with these factors
+    shares: np.ndarray  # (R,) of the light of the picture as it is
     before: float  # relative error of the picture, weighted as it is minimized
     after: float
 
@@ -109,7 +109,7 @@ def matched_factors(
         difference = np.einsum("rpc,rc->pc", scaled, by) + scale * fixed - wanted
         return float(np.linalg.norm(difference) / np.linalg.norm(wanted))
 
-    light = np.einsum("rpc,rc,p->r", layers, factors, weights)
+    light = np.einsum("rpc,p->r", layers, weights)
     shares = light / max(light.sum() + np.einsum("pc,p->", fixed, weights), 1e-30)
     return LightFactors(factors, shares, error(np.ones_like(factors)), error(factors))
 
@@ -138,15 +138,16 @@ def match_scene(options: MatchOptions, progress: Progress | None = None) -> dict
 
     prepare(options)
     with temporary_folder() as folder, shared_blender(folder):
-        paths = {name: value and Path(value).absolute() for name, value in (("target", options.target), ("mask", options.mask))}
-        target, weights, warnings = read_target(child_job(TargetJob, options, **paths), folder, progress)
+        paths = options.target.absolute(), options.mask and options.mask.absolute()
+        job = child_job(TargetJob, options, target=paths[0], mask=paths[1])
+        target, weights, warnings = read_target(job, folder, progress)
         # Of a pixel of which some is clipped or masked, the rest tells nothing about the mean.
         is_whole = reduced((weights > 0.0).astype(np.float64)) > 0.999
         target, weights = reduced(target), np.where(is_whole, reduced(weights), 0.0)
-        if np.count_nonzero(weights) < FEWEST:
+        if (telling := np.count_nonzero(weights)) < FEWEST:
             raise SceneError(
-                f"{options.target}: only {np.count_nonzero(weights)} pixels tell anything, expected {FEWEST}: the others "
-                "are clipped, black or outside the mask"
+                f"{options.target}: {telling} pixels tell anything, expected {FEWEST} at least: the others are clipped, "
+                "black or outside of the mask"
             )
         height, width = weights.shape
         settings = {"own_groups": options.lights, "resolution": (width, height)}
@@ -170,7 +171,7 @@ def match_scene(options: MatchOptions, progress: Progress | None = None) -> dict
     report = {
         "target": str(options.target),
         "resolution": [width, height],
-        "pixels": int(np.count_nonzero(weights)),
+        "pixels": telling,
         "lights": lights,
         "error_before": result.before,
         "error_after": result.after,
@@ -197,7 +198,9 @@ def light_layers(picture: Finished) -> tuple[list[str], np.ndarray, np.ndarray]:
 def reduced(image: np.ndarray) -> np.ndarray:
     """`image` (H, W) or (H, W, C) with at most PIXELS pixels: means over areas of equal size."""
     height, width = image.shape[:2]
-    factor = min(1.0, math.sqrt(PIXELS / (height * width)))
+    factor = math.sqrt(PIXELS / (height * width))
+    if factor >= 1.0:
+        return image
     for axis, side in enumerate((height, width)):
         smaller = max(1, round(factor * side))
         sums = np.concatenate([np.zeros_like(image.take([0], axis)), np.cumsum(image, axis=axis)], axis=axis)

@@ -14,8 +14,8 @@ from ..process.match import TARGET, LightsJob, TargetJob
 from ..saving import save_copy
 from .pixels import open_scene
 
-# SPACES: color spaces of pictures by the view transform that made them, without look, on an sRGB display. Their way back
-# to light is Blender's own.
+# SPACES: color spaces of pictures by the view transform that made them, without look, on an sRGB display. Blender knows
+# their way back to light.
 SPACES = {
     "Standard": "sRGB",
     "AgX": "AgX Base sRGB",
@@ -39,9 +39,7 @@ def read_target(job: TargetJob, folder: Path, progress) -> dict:
         raise SceneError(
             f"{job.target}: is {size[0]}x{size[1]} pixels, expected the shape of the scene's picture, {own[0]}x{own[1]}"
         )
-    weights = np.isfinite(target).all(axis=-1).astype(np.float32)
-    if encoded is not None:
-        weights *= ((encoded > CLIPPED[0]) & (encoded < CLIPPED[1])).all(axis=-1)
+    weights = is_telling(target, encoded).astype(np.float32)
     if job.mask is not None:
         mask, _ = _picture(Path(job.mask), scene, "Standard", folder)
         if mask.shape != target.shape:
@@ -54,39 +52,53 @@ def read_target(job: TargetJob, folder: Path, progress) -> dict:
 
 
 def _picture(path: Path, scene, view: str | None, folder: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """The light (H, W, 3) of a picture file, and its own values if it went through the `view` transform.
-
-    `folder` is temporary.
-    """
+    """`light_of_image` of a picture file."""
     try:
         image = bpy.data.images.load(str(path), check_existing=False)
-        width, height = image.size
+        width, _ = image.size
     except RuntimeError:
         width = 0
     if width == 0:
         raise SceneError(f"{path}: Blender cannot read it as a picture, expected EXR, HDR, PNG, JPEG or TIFF")
+    return light_of_image(image, scene, view, folder)
+
+
+def light_of_image(image, scene, view: str | None, folder: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    """The light (H, W, 3) of an image, and its own values if it went through the `view` transform (None: the scene's).
+
+    Images of floats are light. `folder` is temporary. Raises SceneError where there is no way back to light.
+    """
     if image.is_float:
         return _pixels(image), None
-    view = view or scene.view_settings.view_transform
+    settings = scene.view_settings
+    view = view or settings.view_transform
     if view not in SPACES:
         raise SceneError(f"view transform {view!r} has no way back to light, expected one of {listed(SPACES)}")
-    settings = scene.view_settings
     if settings.use_curve_mapping or settings.look != "None":
         raise SceneError(
             f"scene {scene.name!r}: its view has a look or curves, which have no way back to light; switch them off, "
             "or give an EXR as target"
         )
-    encoded = _pixels(image)
-    floats = bpy.data.images.new("LTSH target", width, height, float_buffer=True)
+    encoded, path = _pixels(image), str(folder / "encoded.exr")
+    floats = bpy.data.images.new("LTSH encoded", *image.size, float_buffer=True)
     floats.colorspace_settings.name = "Non-Color"
-    values = np.ones((height, width, 4), np.float32)
+    values = np.ones((*encoded.shape[:2], 4), np.float32)
     values[..., :3] = (encoded**settings.gamma)[::-1]
     floats.pixels.foreach_set(values.ravel())
-    floats.file_format, floats.filepath_raw = "OPEN_EXR", str(folder / "encoded.exr")
+    floats.file_format, floats.filepath_raw = "OPEN_EXR", path
     floats.save()
-    loaded = bpy.data.images.load(floats.filepath_raw, check_existing=False)
+    loaded = bpy.data.images.load(path, check_existing=False)
     loaded.colorspace_settings.name = SPACES[view]
-    return _pixels(loaded) / 2.0**settings.exposure, encoded
+    light = _pixels(loaded) / 2.0**settings.exposure
+    for made in (floats, loaded):
+        bpy.data.images.remove(made)
+    return light, encoded
+
+
+def is_telling(light: np.ndarray, encoded: np.ndarray | None) -> np.ndarray:
+    """True (H, W) where no channel of a picture is clipped."""
+    finite = np.isfinite(light).all(axis=-1)
+    return finite if encoded is None else finite & ((encoded > CLIPPED[0]) & (encoded < CLIPPED[1])).all(axis=-1)
 
 
 def _pixels(image) -> np.ndarray:

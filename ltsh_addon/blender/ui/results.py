@@ -18,6 +18,7 @@ from ...pipeline.mixer import MIXER_FILE, LightPictures, Mixer, MixerRow, moved_
 from ...pipeline.relight import OCCLUDERS_SUFFIX, RELIGHT_SUFFIX, RelightData, tint
 from ...scene import Light, SceneError, SurfaceSamples
 from ...visibility import Occluders
+from ..evaluated import image_pixels
 
 LAYER, SCENE = "ltsh_layer", "ltsh_scene"  # custom properties that mark our images
 PREFIX = "LTSH "
@@ -196,11 +197,8 @@ def pixels_of(image) -> np.ndarray:
         return np.empty((0, 0, 4), np.float32)
     known = _pixels.get(path)
     if known is None or known[0] != stamp:
-        width, height = image.size
-        flat = np.empty(4 * width * height, dtype=np.float32)
-        if flat.size:
-            image.pixels.foreach_get(flat)
-        known = (Path(path).stat().st_mtime_ns, (width, height)), flat.reshape(height, width, 4)
+        pixels = image_pixels(image)
+        known = (Path(path).stat().st_mtime_ns, tuple(image.size)), pixels
         while len(_pixels) >= PIXELS_KEPT:
             _pixels.pop(next(iter(_pixels)))
         _pixels[path] = known
@@ -450,6 +448,17 @@ def _take_rows(scene) -> None:
             continue
         item.power, item.exposure, item.color, item.settings = 1.0, 0.0, row.color, settings
         item.muted = item.solo = item.applied = False
+    state["is_silent"] = False
+
+
+def set_factors(scene, factors: dict[str, np.ndarray]) -> None:
+    """Give rows of the mixer, by name, `factors` (3,) of what was rendered; all others show what was rendered."""
+    reset_mixer(scene)
+    state["is_silent"] = True
+    for row, item in mixer_pairs(scene):
+        if row.name in factors:
+            most = float(factors[row.name].max())
+            item.power, item.color = most, np.array(row.color) * (factors[row.name] / most if most > 0.0 else 1.0)
     state["is_silent"] = False
 
 

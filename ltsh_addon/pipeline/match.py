@@ -146,8 +146,8 @@ def match_scene(options: MatchOptions, progress: Progress | None = None) -> dict
         target, weights = reduced(target), np.where(is_whole, reduced(weights), 0.0)
         if (telling := np.count_nonzero(weights)) < FEWEST:
             raise SceneError(
-                f"{options.target}: {telling} pixels tell anything, expected {FEWEST} at least: the others are clipped, "
-                "black or outside of the mask"
+                f"{options.target}: {telling} pixels tell anything, expected {FEWEST} or more: the others are clipped "
+                "or outside of the mask"
             )
         height, width = weights.shape
         settings = {"own_groups": options.lights, "resolution": (width, height)}

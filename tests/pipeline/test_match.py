@@ -31,7 +31,8 @@ def test_the_solver_has_the_least_error_of_all_active_sets(seed):
     matrix = rng.normal(size=(12, 5)) if seed % 2 else rng.uniform(size=(12, 5))
     target = matrix @ rng.normal(size=5) + 0.1 * rng.normal(size=12)
     # The normal equations square the condition, which is below 1e3 here: errors of 1e-16 x 1e6.
-    np.testing.assert_allclose(non_negative_least_squares(matrix, target), by_all_active_sets(matrix, target), atol=1e-9)
+    solution = non_negative_least_squares(matrix, target)
+    np.testing.assert_allclose(solution, by_all_active_sets(matrix, target), atol=1e-9)
 
 
 def test_equal_columns_and_a_zero_column_end_with_the_least_error():

@@ -37,8 +37,10 @@ def room(tmp_path_factory):
     folder = tmp_path_factory.mktemp("match")
     scene = empty_scene(*SIZE)
     scene.view_settings.view_transform, scene.view_settings.exposure = "AgX", 0.5
-    add_plane(principled("Floor", **{"Base Color": (0.7, 0.6, 0.5, 1.0), "Roughness": 0.6})[0])
-    add_sphere(principled("Ball", **{"Base Color": (0.3, 0.5, 0.8, 1.0), "Roughness": 0.5})[0], location=(0.0, 0.0, 0.8))
+    floor = principled("Floor", **{"Base Color": (0.7, 0.6, 0.5, 1.0), "Roughness": 0.6})[0]
+    ball = principled("Ball", **{"Base Color": (0.3, 0.5, 0.8, 1.0), "Roughness": 0.5})[0]
+    add_plane(floor)
+    add_sphere(ball, location=(0.0, 0.0, 0.8))
     add_camera()
     add_area_light(name="Key", location=(-2.0, -1.0, 2.5), energy=60.0)
     add_area_light(name="Fill", location=(2.0, -1.0, 2.5), energy=40.0)
@@ -92,7 +94,7 @@ def test_what_does_not_fit_is_named_and_nothing_is_written(room, tmp_path):
         ({"target": room[2], "target_view": "Film"}, "'Film' has no way back to light, expected one of Standard, AgX"),
         ({"target": room[2], "mask": wide}, "is 50x50 pixels, expected the target's 60x40"),
         ({"target": tmp_path / "black.png"}, "0 pixels tell anything"),
-        ({"target": room[1], "lights": ("Sun",)}, "light 'Sun' is not in scene 'Scene'; lights there: 'Key', 'Fill', 'Lamp'"),
+        ({"target": room[1], "lights": ("Sun",)}, "light 'Sun' is not in scene .*: 'Key', 'Fill', 'Lamp'"),
     ):
         with pytest.raises(SceneError, match=message):
             match_scene(MatchOptions(scene=room[0], output=tmp_path / "out", **options))

@@ -111,8 +111,8 @@ def followed(live, context, monkeypatch, world=True):
     live.follow(context, SimpleNamespace(scene=bpy.context.scene, view_layer=bpy.context.view_layer), world)
     end = time.monotonic() + 120.0
     while live.is_busy and time.monotonic() < end:
-        if live.step() and live._pixels is not None:
-            pixels = live._pixels[0]
+        if live.step() and live.has_news:
+            pixels = live._picture.pixels
         time.sleep(0.02)
     monkeypatch.setattr(rest.LiveRest, "_begin", begin)
     assert not live.problem and not live.is_busy
@@ -130,7 +130,6 @@ def context_of(camera):
 def test_changes_are_handed_over_by_themselves_and_show_what_a_whole_file_shows(monkeypatch):
     monkeypatch.setattr(rest, "TOTALS", (4,))
     monkeypatch.setattr(rest, "REST_SECONDS", 0.0)
-    monkeypatch.setattr(rest, "STEP_SECONDS", 60.0)
     camera = room()
     context, live = context_of(camera), rest.LiveRest()
     handlers = bpy.app.handlers.depsgraph_update_post
@@ -139,7 +138,7 @@ def test_changes_are_handed_over_by_themselves_and_show_what_a_whole_file_shows(
     handlers.append(note)
     try:
         first, jobs = followed(live, context, monkeypatch)
-        assert [job.scene is None for job in jobs] == [False, True]  # in half resolution, and whole
+        assert [job.scene is None for job in jobs] == [False] and jobs[0].shrink == 1  # all pixels take one step
         light, chrome = bpy.data.objects["Light"], bpy.data.objects["Chrome"]
         light.data.energy *= 2.0
         light.location.x -= 0.5

@@ -20,9 +20,9 @@ POLL_SECONDS = 0.05
 # After so long without new shadows the processes end that help to trace them.
 IDLE_SECONDS = 60.0
 # Pictures of a view that changes take about FRAME_SECONDS, with a pixel for each of 1, 2 x 2 or 4 x 4. A view that has
-# not changed for MOVING_SECONDS gets all its pixels. If these take long, they come WAITING_SECONDS later while they would
-# delay the first shadows or bounces, and are refined HELD_SECONDS later while that delays all pixels of the bounces.
-FRAME_SECONDS, STEPS, MOVING_SECONDS, WAITING_SECONDS, HELD_SECONDS = 0.1, (1, 2, 4), 0.5, 1.5, 8.0
+# not changed for MOVING_SECONDS gets all its pixels. Slow ones come WAITING_SECONDS later while they would delay the
+# first shadows or bounces, and are refined HELD_SECONDS later while that delays all pixels of bounces.
+FRAME_SECONDS, STEPS, MOVING_SECONDS, WAITING_SECONDS, HELD_SECONDS = 0.1, (1, 2, 4), 0.5, 1.5, 20.0
 # All views, their shadows, and what they know of lights with nodes.
 open_views: weakref.WeakSet = weakref.WeakSet()
 live_shadows: weakref.WeakSet = weakref.WeakSet()

@@ -175,11 +175,16 @@ class RestPictureJob:
 class RestSum:
     """The sum of the samples of one view, row 0 on top."""
 
-    light: np.ndarray | float = 0.0  # (H, W, 3)
-    guides: np.ndarray | float = 0.0  # (H, W, 7) albedo, normal and distance
+    light: np.ndarray  # (H, W, 3)
+    guides: np.ndarray  # (H, W, 7) albedo, normal and distance
     samples: int = 0
     everything: tuple[str, ...] = ()  # why no light of the view itself remains
     problem: str = ""  # of the denoiser
+
+    @classmethod
+    def of_size(cls, width: int, height: int) -> RestSum:
+        """No samples yet."""
+        return cls(*(np.zeros((height, width, count), np.float32) for count in (3, 7)))
 
     @property
     def ambient(self) -> tuple[float, ...]:
@@ -188,10 +193,10 @@ class RestSum:
         light = np.mean(self.light, axis=(0, 1), dtype=np.float64)
         return tuple(np.nan_to_num(light / np.maximum(albedo, 0.05 * self.samples)).tolist())
 
-    def add(self, path: Path, count: int, names: dict[str, str]) -> None:
-        """Add `count` samples of the EXR `path`: Combined without what the view draws itself.
+    def add(self, path: Path, row: int, count: int, names: dict[str, str]) -> None:
+        """Add `count` samples of the EXR `path`, rows from `row` on: Combined without what the view draws itself.
 
-        `names` are those of passes by our keys, and of the AOV "mask". Rows that were not rendered are black there.
+        `names` are those of passes by our keys, and of the AOV "mask".
         """
         channels = rendered_channels(path)
         light = read_layer(channels, "Combined", "RGB")
@@ -204,8 +209,9 @@ class RestSum:
             light = light - drawn[..., None] * (specular * specular_color + diffuse * diffuse_color + background)
         names = ("Denoising Albedo", "RGB"), ("Denoising Normal", "XYZ"), ("Denoising Depth", "Z")
         guides = [np.atleast_3d(np.minimum(read_layer(channels, *name), FARTHEST)) for name in names]
-        self.light = self.light + np.float32(count) * light
-        self.guides = self.guides + np.float32(count) * np.concatenate(guides, axis=-1)
+        rows = slice(row, row + len(light))
+        self.light[rows] += np.float32(count) * light
+        self.guides[rows] += np.float32(count) * np.concatenate(guides, axis=-1)
 
     def picture(self) -> np.ndarray:
         """The denoised mean (H, W, 4); alpha is the distance in m."""

@@ -58,7 +58,7 @@ LEVELS = (
 STEP_SECONDS, SHRINKS, TOTALS, REST_SECONDS = 0.5, (4, 2, 1), (4, 8, 16, 32, 64), 0.3
 # FEWEST: samples of single pixels that a step takes at least, as fewer take as long. MOST_CHANGE: how many times as
 # many or as few the next one takes.
-FEWEST, MOST_CHANGE = 1 << 15, 2.0
+FEWEST, MOST_CHANGE = 1 << 17, 2.0
 # Settings of a scene that change its light, beside those of Cycles.
 SCENE_SETTINGS = ("use_simplify", "simplify_subdivision", "film_transparent", "hair_type")
 
@@ -415,7 +415,7 @@ def _settings_of(depsgraph) -> tuple:
 
 # In the child:
 
-_sum = [RestSum()]
+_sum: list[RestSum] = []
 
 
 def render_rest(job: RestJob, folder: Path, progress) -> dict:
@@ -443,19 +443,22 @@ def render_rest(job: RestJob, folder: Path, progress) -> dict:
     else:
         size = tuple(max(side // job.shrink, 1) for side in view.size)
         _look_through(scene, *map(Matrix, view.matrices), size)
-    render, height = scene.render, scene.render.resolution_y
-    # Whole rows, from the upper end down; the others are black.
-    render.use_border, render.use_crop_to_border = tuple(job.rows) != (0.0, 1.0), False
+    render, (width, height) = scene.render, render_settings.picture_size(scene)
+    first, last = (round(share * height) for share in job.rows)
+    last = max(last, first + 1)
+    render.use_border = render.use_crop_to_border = last - first < height
     render.border_min_x, render.border_max_x = 0.0, 1.0
-    render.border_max_y, render.border_min_y = (1.0 - round(share * height) / height for share in job.rows)
+    render.border_min_y, render.border_max_y = 1.0 - last / height, 1.0 - first / height
     scene.cycles.samples, scene.cycles.seed = job.samples, job.seed
     progress("bounces", 0.0)
     started = time.monotonic()
     render_exr(scene, folder / REST_RENDER, "NONE")
     seconds = time.monotonic() - started
-    total = _sum[0] = _sum[0] if job.continues else RestSum()
+    if not job.continues:
+        _sum[:] = [RestSum.of_size(width, height)]
+    total = _sum[0]
     total.everything = tuple(_reasons_for_cycles(scene, layer))
-    total.add(folder / REST_RENDER, job.samples, {**render_settings.pass_names(), "mask": MASK})
+    total.add(folder / REST_RENDER, first, job.samples, {**render_settings.pass_names(), "mask": MASK})
     total.samples += job.samples if job.rows[1] == 1.0 else 0
     return {"seconds": seconds}
 

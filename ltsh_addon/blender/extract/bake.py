@@ -24,7 +24,7 @@ from ..materials import aovs
 from ..materials.graph import ensure_nodes
 from ..materials.maps import UV_MAP, MaterialPlan, SavedImages
 from ..process.bake import BakeFactsJob, BakeJob
-from ..render_settings import working_space
+from ..render_settings import changed_properties, working_space
 from . import bake_meshes, pixels
 from .occluders import collect_occluders, with_baked_shares
 from .pixels import OCCLUDERS, SEEDS, remove_occlusion
@@ -106,15 +106,16 @@ class ObjectBake:
             cycles.use_sample_subset = False
         return np.array(maps)
 
-    def radiance(self, block: Block, kind: str, samples: int) -> np.ndarray:
-        """Cycles' direct light (2, rows, W, 3), colors included: two halves with different seeds."""
+    def halves(self, block: Block, kind: str, samples: int, light: set[str]) -> np.ndarray:
+        """Cycles' light (2, rows, W, 3) of the passes `light`, colors included: two halves with different seeds."""
+        return np.array([self.radiance(block, kind, (seed, samples), {*light, "COLOR"}) for seed in SEEDS.values()])
+
+    def radiance(self, block: Block, kind: str, sampling: tuple[int, int], light: set[str]) -> np.ndarray:
+        """Cycles' light (rows, W, 3) of the passes `light`; `sampling` is a seed and a number of samples."""
         for plan in self.plans:
             plan.show(None)
-        halves = []
-        for seed in SEEDS.values():
-            self.scene.cycles.seed, self.scene.cycles.samples = seed, samples
-            halves.append(self._bake(block, CYCLES_TYPES[kind], {"DIRECT", "COLOR"}))
-        return np.array(halves)
+        self.scene.cycles.seed, self.scene.cycles.samples = sampling
+        return self._bake(block, CYCLES_TYPES[kind], light)
 
     def _bake(self, block: Block, kind: str, pass_filter) -> np.ndarray:
         image = self._image(block)
@@ -176,6 +177,7 @@ class BakeScene:
     meshes: dict[str, bake_meshes.MeshFiles]
     problems: dict[str, str]
     lobes: dict[str, aovs.MaterialLobes]  # by full name of the material
+    bounces: list[tuple]  # what `changed_properties` sets so that Cycles bakes the indirect light as the file has it
     folder: tempfile.TemporaryDirectory = field(repr=False)
 
     def plans(self, ob, images) -> tuple[list[MaterialPlan], list[str]]:
@@ -225,7 +227,7 @@ def _open(job: BakeJob) -> BakeScene:
     render_settings.go_to_frame(scene, job.frame)
     camera = _camera(scene, job)
     view_layer = render_settings.choose_view_layer(scene, warnings)
-    names = job.objects
+    bounces, names = bounces_of(scene), job.objects
     if not isinstance(names, str):
         names = list(dict.fromkeys([*names, *job.following]))
     objects = bake_meshes.chosen_objects(scene, view_layer, names)
@@ -254,7 +256,9 @@ def _open(job: BakeJob) -> BakeScene:
     warnings += inventory.warnings + rounded_positions(_points_in_boxes(objects), inventory.lights)
     if not inventory.lights:
         raise pixels.no_light(scene, inventory.warnings)
-    render_settings.leave_out_objects(scene, inventory.left_out, warnings)
+    if job.bounces == "off":
+        render_settings.leave_out_objects(scene, inventory.left_out, warnings)
+    bounces.append((scene, "world", world))
     if job.cycles_samples:
         scene.world = inventory.world
     view = view_of(job.view, camera, bent=job.cycles_samples > 0)
@@ -264,7 +268,20 @@ def _open(job: BakeJob) -> BakeScene:
     name, names = camera.name if job.view == "camera" else "", [ob.name for ob in objects]
     if has_shadows:
         inventory.occluders.save(Path(folder.name) / OCCLUDERS)
-    return BakeScene(scene, name, view, inventory.lights, warnings, names, meshes, problems, lobes, folder)
+    of_objects = names, meshes, problems, lobes
+    return BakeScene(scene, name, view, inventory.lights, warnings, *of_objects, bounces, folder)
+
+
+# BOUNCES: settings of Cycles on which indirect light depends, and which pictures of direct light switch off.
+BOUNCES = ("max_bounces", "sample_clamp_indirect", "blur_glossy", "caustics_reflective", "use_fast_gi")
+
+
+def bounces_of(scene) -> list[tuple]:
+    """The settings of the file, as for `changed_properties`, on which its indirect light depends."""
+    emission = [
+        (material.cycles, "emission_sampling", material.cycles.emission_sampling) for material in bpy.data.materials
+    ]
+    return [(scene.cycles, name, getattr(scene.cycles, name)) for name in BOUNCES] + emission
 
 
 def _points_in_boxes(objects) -> np.ndarray:
@@ -384,7 +401,7 @@ def _object(opened, name, images, job, folder, progress) -> dict:
     for uv_name, file in record["uv_maps"].items():
         save_array(folder / file, read.uv_map(uv_name))
     record["maps"] = any(plan.count for plan in distinct)
-    if record["maps"] or job.cycles_samples:
+    if record["maps"] or job.cycles_samples or job.bounces == "on":
         _bake(opened, ob, distinct, job, folder, progress)
     return record
 
@@ -392,26 +409,37 @@ def _object(opened, name, images, job, folder, progress) -> dict:
 def _bake(opened, ob, plans, job, folder, progress) -> None:
     """Write the maps and Cycles' bake of an object, for the wanted tiles that are not finished."""
     read, points = opened.meshes[ob.name], job.sub_samples if any(plan.count for plan in plans) else 0
-    bake = ObjectBake(opened.scene, ob, read.uv_name, plans)
+    bake, has_bounces = ObjectBake(opened.scene, ob, read.uv_name, plans), job.bounces == "on"
     try:
         with np.load(read.mesh) as data:
             tiles = tiles_of(data["uv"])[0]
         finished = {tile for name, tile in job.finished if name == ob.name}
-        blocks = [
-            Block(tile, first, min(job.block_rows, job.height - first), job.width, job.height)
-            for tile in tiles if tile not in finished and job.tile in (None, tile)
-            for first in range(0, job.height, job.block_rows)
-        ]  # fmt: skip
+        wanted = [tile for tile in tiles if tile not in finished and job.tile in (None, tile)]
+        blocks, rest = (_blocks(job, wanted, count) for count in (job.block_rows, job.rest_rows))
         for number, block in enumerate(blocks):
             progress(f"bake {ob.name}", number / len(blocks))
             for point in range(points):
                 save_array(folder / f"maps_{block.name}_{point}.npy", bake.maps(block, point, points))
-            if job.cycles_samples:
-                for kind in job.passes:
-                    halves = bake.radiance(block, kind, max(1, job.cycles_samples // 2))
-                    save_array(folder / f"cycles_{kind}_{block.name}.npy", halves)
+            for kind in job.passes if job.cycles_samples else ():
+                with changed_properties(opened.bounces if has_bounces else []):
+                    light = {"DIRECT", "INDIRECT"} if has_bounces else {"DIRECT"}
+                    halves = bake.halves(block, kind, max(1, job.cycles_samples // 2), light)
+                save_array(folder / f"cycles_{kind}_{block.name}.npy", halves)
+        for number, block in enumerate(rest if has_bounces else ()):
+            for kind in job.rest_passes:
+                progress(f"bounces {ob.name}", number / len(rest))
+                with changed_properties(opened.bounces):
+                    light = {"INDIRECT", "COLOR"} if kind == "specular" else {"INDIRECT"}
+                    baked = bake.radiance(block, kind, (SEEDS["A"], job.rest_samples), light)
+                save_array(folder / f"rest_{kind}_{block.name}.npy", baked)
     finally:
         bake.close()
+
+
+def _blocks(job: BakeJob, tiles, rows: int) -> list[Block]:
+    """The blocks of so many `rows` of the UDIM `tiles`."""
+    firsts = range(0, job.height, rows)
+    return [Block(tile, y, min(rows, job.height - y), job.width, job.height) for tile in tiles for y in firsts]
 
 
 def scene_facts(job: BakeFactsJob, folder: Path, progress) -> dict:

@@ -54,6 +54,7 @@ JOBS = {
     "LightsJob": ("match", "extract.match", "save_lights"),
     "ViewJob": ("view", "viewport.still", "draw_view"),
     "RestJob": ("view", "viewport.rest", "render_rest"),
+    "RestPictureJob": ("view", "viewport.rest", "denoise_rest"),
     "WorldJob": ("view", "viewport.live_cycles", "render_world"),
     "NodeLightJob": ("view", "viewport.live_cycles", "render_node_lights"),
 }

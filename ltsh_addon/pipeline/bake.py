@@ -49,7 +49,7 @@ def bake_scene(options: BakeOptions, progress: Progress | None = None) -> dict:
     report = result.report
     if options.apply and report["objects"]:
         layer = bake_files.applied_layer(options)
-        report["applied"] = bake_files.apply_textures(options.scene, options.output, report["objects"], layer, progress)
+        report["applied"] = bake_files.apply_textures(options.scene, options.output, report, layer, progress)
     return write_reports(result, options.output)
 
 
@@ -77,7 +77,7 @@ def bake_objects(
         records, files, seconds = [], [], {"blender": manifest["seconds"]}
         with _shadow_tracer(options, manifest, folder) as tracer:
             for record, stem in zip(manifest["objects"], stems, strict=True):
-                if record["problem"] is None:
+                if record["folder"]:
                     (options.output / stem).parent.mkdir(parents=True, exist_ok=True)
                     baker = ObjectBaker(options, tables, manifest, record, folder / record["folder"], tracer)
                     baked = baker.bake(stem, [] if tile is None else [tile], finished, progress)
@@ -123,7 +123,18 @@ def _job(options, finished, tile=None, following=()):
         finished=tuple(finished),
         tile=tile,
         following=following,
+        atlas=atlas_settings(options),
+        in_one=options.atlas is not None,
     )
+
+
+def atlas_settings(options):
+    """The AtlasSettings of the UV map that the bake makes; None without an atlas, or where `uv` names its UV map."""
+    from ..blender.process.bake import AtlasSettings
+
+    if options.atlas is None or options.uv is not None:
+        return None
+    return AtlasSettings(options.atlas, options.texels_per_metre, options.unwrap)
 
 
 def block_rows(options) -> int:
@@ -146,7 +157,7 @@ class ObjectBaker:
     def __init__(self, options, tables, manifest, record, folder, tracer=None):
         self.options, self.tables, self.manifest, self.record, self.folder = options, tables, manifest, record, folder
         self.lights, self.tracer = lights_of(manifest["lights"]), tracer
-        self.mesh = replace(TexelMesh.load(folder / "mesh.npz"), receiver=record["receiver"])
+        self.mesh = TexelMesh.load(folder / "mesh.npz")
         uv_maps = {name: folder / file for name, file in record["uv_maps"].items()}
         self.materials = [BakeMaterial.of(material, folder.parent, uv_maps) for material in record["materials"]]
         self.view = BakeView(**manifest["view"])
@@ -162,6 +173,8 @@ class ObjectBaker:
         """
         name, files, seconds = self.record["name"], [], {}
         result = {"name": name, "uv": self.record["uv"], "outside": 0.0, "tiles": {}}
+        if self.options.atlas is not None:
+            result |= {"members": self.record["members"], "atlas": self.record["atlas"]}
         for tile in tiles or self.tiles:
             file = f"{stem}{self._suffix(tile)}.exr"
             start = time.perf_counter()
@@ -206,6 +219,7 @@ class ObjectBaker:
         """Shade a tile block by block into `planes`; returns its counts of texels for the record."""
         options, covered, covers, overlaps, unshaded, unbaked, lit = self.options, 0, 0, 0, 0, 0, False
         is_unshaded = np.array([bool(reason) for reason in self.record["unshaded"]])
+        of_members = np.zeros(len(self.record["members"]), np.int64)
         rows, height = block_rows(options), options.size[1]
         points, spread = options.sub_samples, TilePoints(self, tile, self._threads())
 
@@ -225,6 +239,7 @@ class ObjectBaker:
                 overlaps += texels.overlaps
                 unbaked += texels.unbaked
                 unshaded += int(is_unshaded[self.mesh.material[texels.triangle]].sum())
+                of_members += np.bincount(self.mesh.object[texels.triangle], minlength=len(of_members))
                 names = (layer_name(name, pass_name) for name in self.tables for pass_name in options.passes)
                 lit = lit or any(planes_of[name].any() for name in names)
                 planes.put(first, min(rows, height - first), texels, _channels(planes_of))
@@ -236,6 +251,8 @@ class ObjectBaker:
             if progress is not None and progress(f"shade {self.record['name']}", share) is False:
                 raise Cancelled("the bake was stopped")
         counts = {"texels": covered, "covered_times": covers, "overlapping_texels": overlaps}
+        if options.atlas is not None:
+            counts["member_texels"] = dict(zip(self.record["members"], of_members.tolist(), strict=True))
         return {**counts, "unshaded_texels": unshaded, "unbaked_texels": unbaked, "is_lit": lit}
 
     def _threads(self) -> int:
@@ -338,7 +355,9 @@ class TilePoints:
 
     def __init__(self, baker: ObjectBaker, tile: int, threads: int):
         options = baker.options
-        self._options, self._folder, self._tile, self._mapped = options, baker.folder, tile, baker.record["maps"]
+        self._options, self._folder, self._tile = options, baker.folder, tile
+        self._mapped, self._all_mapped = any(baker.record["maps"]), all(baker.record["maps"])
+        self._has_maps = np.array(baker.record["maps"])[baker.mesh.object]  # (T,)
         self._width = baker.manifest["sampled_texels"]
         self._triangles = uv.UvTriangles.in_tile(baker.mesh.uv, *options.size, _column_and_row(tile))
         self._at_centers = bakes_centers_alone(options, baker.record)
@@ -353,22 +372,29 @@ class TilePoints:
         the point, 1 on average (None: all points count alike).
         """
         texels = self.texels(first)
+        count = self._options.sub_samples
         if not self._mapped:
-            return self._triangles.spread(texels, point, self._options.sub_samples, self._width), None, None
+            return self._triangles.spread(texels, point, count, self._width), None, None
         maps = np.load(self._file(first, point))
-        if self._options.sub_samples == 1:
+        if count == 1:
             return texels, maps, None
         positions = self._positions(texels, maps, first, point)
-        return self._triangles.at(texels, positions), maps, self._weights_of(first).at(positions)
+        moved, weights = self._triangles.at(texels, positions), self._weights_of(first).at(positions)
+        if not self._all_mapped:
+            free, even = ~self._has_maps[texels.triangle], self._triangles.spread(texels, point, count, self._width)
+            moved.barycentric[free], weights[free] = even.barycentric[free], 1.0
+        return moved, maps, weights
 
     def _covered(self, first):
         rows = min(block_rows(self._options), self._options.size[1] - first)
         texels = self._triangles.texels(first, rows, self._options.conservative and not self._at_centers)
         if not self._at_centers:
             return texels
-        of_pass = f"cycles_{sorted(shaded_passes(self._options))[0]}_{self._tile}_{first}.npy"
-        baked = np.load(self._file(first, 0) if self._mapped else self._folder / of_pass, mmap_mode="r")
-        return texels.baked(baked[0].reshape(-1, 3)[texels.index, 0] != np.float32(NOT_BAKED))
+        path = self._file(first, 0)
+        if not self._mapped:
+            path = self._folder / f"cycles_{sorted(shaded_passes(self._options))[0]}_{self._tile}_{first}.npy"
+        baked = np.load(path, mmap_mode="r")[0].reshape(-1, 3)[texels.index, 0] != np.float32(NOT_BAKED)
+        return texels.baked(baked if self._options.error else baked | ~self._has_maps[texels.triangle])
 
     def _file(self, first, point):
         return self._folder / f"maps_{self._tile}_{first}_{point}.npy"
@@ -378,7 +404,11 @@ class TilePoints:
         if point == 0:
             return self._triangles.places(texels)
         rows, width = maps.shape[1:3]
-        return maps[-1].reshape(-1, 3)[texels.index, :2] * (width, rows) + (0, first)
+        positions = maps[-1].reshape(-1, 3)[texels.index, :2] * (width, rows) + (0, first)
+        if not self._all_mapped:
+            free = ~self._has_maps[texels.triangle]
+            positions[free] = self._triangles.places(texels)[free]
+        return positions
 
     def _fitted_weights(self, first):
         texels, points = self.texels(first), range(self._options.sub_samples)
@@ -389,7 +419,7 @@ class TilePoints:
 
 def bakes_centers_alone(options: BakeOptions, record: dict) -> bool:
     """True where an object needs Cycles' own bake, which has only texels whose centers are covered."""
-    return record["maps"] or options.error
+    return any(record["maps"]) or options.error
 
 
 def _column_and_row(tile: int) -> tuple[int, int]:
@@ -432,22 +462,22 @@ def _first_samples(texel: np.ndarray) -> np.ndarray:
 
 
 def _report(options, manifest, records) -> dict:
-    problems = [record["problem"] for record in manifest["objects"] if record["problem"]]
+    problems = [line for record in manifest["objects"] for line in record["problems"]]
     lines = [line for record in manifest["objects"] for line in record["warnings"]]
     warnings = [*manifest["warnings"], *lines]
     if options.conservative:
         warnings += [
-            f"object {record['name']!r}: texels whose centers no face covers are left out, because Cycles bakes none "
+            f"{record['name']!r}: texels whose centers no face covers are left out, because Cycles bakes none "
             f"of them: leave out {'--error' if options.error else '--conservative, or bake its textures to images'}"
             for record in manifest["objects"]
-            if record["problem"] is None and bakes_centers_alone(options, record)
+            if record["folder"] and bakes_centers_alone(options, record)
         ]
     reasons = {record["name"]: record.get("unshaded", ()) for record in manifest["objects"]}
     for record in records:
         wrong, note = _darkness(record, reasons[record["name"]])
         problems += wrong
         warnings += note
-        name = f"object {record['name']!r}"
+        name = title(record)
         if (share := 100 * record["outside"]) > 100 * NOTED_SHARE_OUTSIDE:
             warnings.append(f"{name}: {share:.3g} % of UV map {record['uv']!r} lies outside of the texture, not baked")
         for tile in record["tiles"].values():
@@ -456,6 +486,11 @@ def _report(options, manifest, records) -> dict:
             if share := 100 * tile["unbaked_texels"] / max(tile["texels"] + tile["unbaked_texels"], 1):
                 why = "because Cycles bakes nothing there: apply the modifiers"
                 warnings.append(f"{name}: {share:.3g} % of its texels are left out, {why}")
+            warnings += [
+                f"object {member!r} has no texel of the atlas: its islands are smaller than one; raise its ltsh_density"
+                for member, texels in tile.get("member_texels", {}).items()
+                if not texels
+            ]
     return {
         "scene": str(options.scene),
         "frame": manifest["frame"],
@@ -469,9 +504,14 @@ def _report(options, manifest, records) -> dict:
     }
 
 
+def title(record: dict) -> str:
+    """What the warnings about a record of the report begin with."""
+    return "the atlas" if "members" in record else f"object {record['name']!r}"
+
+
 def _darkness(record, reasons) -> tuple[list[str], list[str]]:
     """Problems and warnings of a dark object: most of its texels are not shaded, for `reasons`, or no light arrives."""
-    tiles, name = record["tiles"].values(), f"object {record['name']!r}"
+    tiles, name = record["tiles"].values(), title(record)
     texels, unshaded = (sum(tile[key] for tile in tiles) for key in ("texels", "unshaded_texels"))
     if 2 * unshaded > texels:
         share = f"{100.0 * unshaded / texels:.3g} %"

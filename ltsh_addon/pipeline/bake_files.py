@@ -29,6 +29,7 @@ _ERRORS = {"unbiased_squared_error?": NUMBER | None, "unbiased_error?": NUMBER |
 TILE = {
     **dict.fromkeys(("texels", "unshaded_texels", "unbaked_texels", "covered_times", "overlapping_texels"), NUMBER),
     "is_lit": bool,
+    "member_texels?": {str: NUMBER},
     "texture?": file_name,
     "errors?": {str: {"noise?": NUMBER | None, "techniques": {str: _ERRORS}}},
 }
@@ -275,12 +276,17 @@ def applied_layers(options) -> list[str]:
     return [layer_name(next(iter(technique_names(options.techniques))), pass_name) for pass_name in passes]
 
 
-def apply_textures(scene: Path, output: Path, records: list[dict], layer: str, progress=None) -> str:
-    """Save a copy of the .blend whose objects show the textures of the report's `records`; returns its file name."""
-    from ..blender.process.bake import BakedTextures, apply_bake
+def bake_members(record: dict) -> list[str]:
+    """The names of the objects that a record of the report is about."""
+    return list(record.get("members", [record["name"]]))
+
+
+def apply_textures(scene: Path, output: Path, report: dict, layer: str, progress=None) -> str:
+    """Save a copy of the .blend whose objects show the textures of a bake's `report`; returns its file name."""
+    from ..blender.process.bake import ApplyJob, BakedTextures, apply_bake
 
     textures = []
-    for record in records:
+    for record in report["objects"]:
         if any("texture" not in tile for tile in record["tiles"].values()):
             raise ValueError(f"object {record['name']!r}: has no texture to show; run the job again with --apply")
         files = [
@@ -288,7 +294,8 @@ def apply_textures(scene: Path, output: Path, records: list[dict], layer: str, p
             for number, tile in record["tiles"].items()
         ]
         name = f"{record['name']} {layer}"
-        textures.append(BakedTextures(record["name"], record["uv"], name, files))
+        textures.append(BakedTextures(bake_members(record), record["uv"], name, files))
     path = output / f"{Path(scene).stem}_baked.blend"
-    apply_bake(scene, path, textures, progress=progress)
+    atlas = report["objects"][0].get("atlas")
+    apply_bake(ApplyJob(scene, path, textures, report["frame"], atlas), progress=progress)
     return path.name

@@ -171,6 +171,17 @@ shadow_rays = whole_number("shadow rays are", *SHADOW_RAYS)  # number of rays pe
 margin = whole_number("margin is", 0, MOST_MARGIN)  # width of the margin around islands in texels
 
 
+atlas = whole_number("atlas is", *TEXTURE_SIDES)  # texels on each side of the texture that all objects share
+
+
+def texels_per_metre(text: str) -> float:
+    """A density of texels, above 0."""
+    value = real_number(text)
+    if not 0.0 < value < 1e6:
+        raise ValueError(f"texels per metre are {text!r}, expected a number above 0")
+    return value
+
+
 def cycles_samples(text: str) -> int:
     """Number of samples of both halves of a Cycles reference together."""
     value = positive(text)
@@ -398,6 +409,18 @@ class BakeOptions:
     size: tuple[int, int] = option(
         "--size", default=(1024, 1024), type=size, metavar="N", help="N or WxH in texels (default: 1024)"
     )
+    atlas: int | None = option(
+        "--atlas", default=None, type=atlas, metavar="N",
+        help="one texture of N x N texels for all objects, on a UV map Lightmap that is made for it, or on --uv",
+    )  # fmt: skip
+    texels_per_metre: float | None = option(
+        "--texels-per-metre", default=None, type=texels_per_metre, metavar="D",
+        help="of the atlas, times the property ltsh_density of an object (default: as many as fit)",
+    )  # fmt: skip
+    unwrap: str = option(
+        "--unwrap", default="smart", choices=("smart", "faces"),
+        help="for the atlas: islands by direction, or each face alone (default: %(default)s)",
+    )  # fmt: skip
     sub_samples: int = _sub_samples("points per texel, spread as in Cycles' bake; 1: texel centers")
     margin: int = option("--margin", default=16, type=margin, metavar="PX", help="in texels (default: %(default)s)")
     conservative: bool = flag("--conservative", "bake every texel that a face touches")
@@ -417,6 +440,10 @@ class BakeOptions:
     apply: bool = flag("--apply", "also a texture of each object, and a copy of the .blend whose materials show it")
     scripts: bool = _scripts()
     resume: bool = option(default=False, matters=False)  # keep what the same job has finished
+
+    def __post_init__(self):
+        if self.atlas is not None:
+            object.__setattr__(self, "size", (self.atlas, self.atlas))
 
 
 @dataclass(frozen=True)
@@ -510,7 +537,10 @@ def _text(name, value) -> str:
 def what_matters(options: Any) -> dict[str, Any]:
     """The options on which the result depends."""
     values = asdict(options)
-    return {item.name: values[item.name] for item in fields(options) if item.metadata["matters"]}
+    matters = {item.name for item in fields(options) if item.metadata["matters"]}
+    if values.get("atlas") is not None:
+        matters.add("objects")
+    return {name: value for name, value in values.items() if name in matters}
 
 
 def child_job(kind: type, options: Any, **settings) -> Any:

@@ -75,8 +75,10 @@ class MeshFiles:
     uv_names: tuple[str, ...]  # "" for the one that renders
     uv_maps: Path  # .npz of arrays (T, 3, 2), named by the position in `uv_names`
 
-    def uv_map(self, name: str) -> np.ndarray:
-        """The UV map `name` (T, 3, 2)."""
+    def uv_map(self, name: str, mesh: TexelMesh) -> np.ndarray:
+        """The UV map `name` (T, 3, 2) of the `mesh`; zeros if it has none of that name."""
+        if name not in self.uv_names:
+            return np.zeros_like(mesh.uv)
         with np.load(self.uv_maps) as data:
             return data[str(self.uv_names.index(name))]
 
@@ -150,16 +152,17 @@ def uv_of(layer, count):
     return read_values(layer.uv, "vector", (count, 2), np.float32)
 
 
-def apply_modifiers(scene, objects, uv_name: str | None) -> None:
+def apply_modifiers(scene, objects, uv_name: str | None, *, every: bool = False) -> None:
     """Replace the meshes of objects by evaluated ones where modifiers change the UV map or the materials.
 
-    Booleans, arrays with caps and geometry nodes can do so; Cycles' bake reads both from the object's own mesh.
+    Booleans, arrays with caps and geometry nodes can do so; Cycles' bake reads both from the object's own mesh. With
+    `every`, all modifiers are applied that make no instances: copies of faces need texels of their own.
     """
     probed = {}
     for ob in objects:
         if ob.type == "MESH" and ob.library is None and ob.data.library is None and len(ob.modifiers):
             layer = ob.data.uv_layers.get(uv_name) if uv_name else ob.data.uv_layers.active
-            probed[ob] = "" if layer is None else _probe(ob.data, layer)
+            probed[ob] = "" if layer is None or every else _probe(ob.data, layer)
     if not probed:
         return
 
@@ -168,7 +171,7 @@ def apply_modifiers(scene, objects, uv_name: str | None) -> None:
         return {
             ob: _evaluated_copy(ob, depsgraph)
             for ob, probe in probed.items()
-            if ob not in instancers and not _bakes_from_own_mesh(ob, depsgraph, uv_name, probe)
+            if ob not in instancers and (every or not _bakes_from_own_mesh(ob, depsgraph, uv_name, probe))
         }
 
     made = with_render_depsgraph(scene, visit)

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from ...files import replacing_by_copy, temporary_folder
 from ...scene import Progress
 from .blender_process import run_job, run_scene_job
+
+
+@dataclass(frozen=True)
+class AtlasSettings:
+    """How many objects share one texture; see `extract.atlas`."""
+
+    side: int  # texels
+    texels_per_metre: float | None = None  # None: as many as fit
+    unwrap: str = "smart"  # "faces": every edge is a seam
 
 
 @dataclass(frozen=True)
@@ -32,6 +41,8 @@ class BakeJob:
     tile: int | None = None  # the only UDIM tile to extract; None: all
     sub_samples: int = 1  # points of a texel that need maps
     shadows: str = "off"  # see `pixels.PixelJob`
+    atlas: AtlasSettings | None = None  # make the UV map of an atlas
+    in_one: bool = False  # all objects share one texture, as one record
 
 
 def extract_bake(job: BakeJob, folder: Path, *, progress: Progress | None = None) -> dict:
@@ -44,9 +55,9 @@ def extract_bake(job: BakeJob, folder: Path, *, progress: Progress | None = None
 
 @dataclass(frozen=True)
 class BakedTextures:
-    """The baked textures of one object."""
+    """The baked textures of an object, or of those that share an atlas."""
 
-    object: str
+    objects: list[str]
     uv: str  # the UV map on which they lie
     name: str  # of the image in Blender
     files: list[dict]  # {"path", "tile"} each
@@ -58,18 +69,19 @@ class ApplyJob:
 
     scene: Path
     path: Path
-    textures: list[dict]  # fields of `BakedTextures`
+    textures: list[BakedTextures]  # in the child their fields
+    frame: int | None = None
+    atlas: dict | None = None  # fields of AtlasSettings, and the "objects" that share the atlas
 
 
-def apply_bake(
-    scene: Path, path: Path, textures: list[BakedTextures], *, progress: Progress | None = None
-) -> list[str]:
-    """Save a copy of `scene` as the .blend `path`, in which objects show baked textures; returns warnings.
+def apply_bake(job: ApplyJob, *, progress: Progress | None = None) -> list[str]:
+    """Save a copy of the scene as job.path, in which objects show baked textures; returns warnings.
 
     The copy appears complete or not at all. Raises as `pixels.extract_pixels` does.
     """
-    with replacing_by_copy(Path(path).absolute()) as unfinished, temporary_folder() as folder:
-        job = ApplyJob(Path(scene).absolute(), unfinished, [asdict(entry) for entry in textures])
+    with replacing_by_copy(Path(job.path).absolute()) as unfinished, temporary_folder() as folder:
+        textures = [asdict(entry) for entry in job.textures]
+        job = replace(job, scene=Path(job.scene).absolute(), path=unfinished, textures=textures)
         return run_job(job, folder, progress)["warnings"]
 
 

@@ -10,7 +10,7 @@ PYTEST_OPTIONS ?=
 # Non-empty: a Blender version whose Python is absent fails `make test` instead of being left out.
 STRICT ?=
 
-.PHONY: help demo test test-fast lint tables lock clean bench soak extension test-blender test-gui test-farm test-3.13 test-3.11
+.PHONY: help demo test test-fast lint tables lock clean bench soak extension test-blender test-gui test-farm test-page test-3.13 test-3.11
 .NOTPARALLEL:
 
 help:
@@ -20,6 +20,7 @@ help:
 	@echo 'make test-blender BLENDER=path  the tests of tests/blender inside that Blender'
 	@echo 'make test-gui RUNNER=command  clicks through the extension in a Blender with a window, see tests/gui/README.md'
 	@echo 'make test-farm   the Slurm scripts in farm/ on a Slurm of one machine (installs it where root on Debian)'
+	@echo 'make test-page   pages and exported files in a headless browser, which comes from npm (installs node where root on Debian)'
 	@echo 'make lint    ruff only'
 	@echo 'make extension  the zips that Blender installs, one per platform: build/ltsh-*.zip'
 	@echo 'make bench   what shading costs, beside a textbook LTC, zonal harmonics and Cycles (20 minutes or more)'
@@ -79,6 +80,10 @@ test-farm:
 	@$(SETUP) slurm && python=$$($(SETUP) python newest) && \
 	LTSH_TEST_SLURM=1 $(LIMIT) "$$python" -m pytest -s $(or $(PYTEST_OPTIONS),tests/farm)
 
+test-page:
+	@$(SETUP) browser >/dev/null && python=$$($(SETUP) python newest) && \
+	$(LIMIT) "$$python" -m pytest -m 'soak or not soak' $(or $(PYTEST_OPTIONS),tests/page)
+
 extension:
 	@python=$$($(SETUP) python newest) && "$$python" -m requirements.build_extension $(EXTENSION_OPTIONS)
 
@@ -86,7 +91,7 @@ bench:
 	@python=$$($(SETUP) python newest) && "$$python" tests/benchmarks/run.py $(BENCH_OPTIONS)
 
 soak:
-	@python=$$($(SETUP) python newest) && "$$python" -m pytest -m soak && "$$python" tests/soak/fuzz.py $(FUZZ_OPTIONS) && \
+	@$(SETUP) browser >/dev/null && python=$$($(SETUP) python newest) && "$$python" -m pytest -m soak && "$$python" tests/soak/fuzz.py $(FUZZ_OPTIONS) && \
 	LTSH_EACH=1000000 "$$python" -m pytest tests/lobes/test_lobe_robustness.py -k finite_numbers && \
 	LTSH_MANY_LIGHTS=10000 "$$python" -m pytest tests/blender/pipeline/test_hostile_scenes.py -k many_lights && \
 	"$$python" tests/benchmarks/animation.py shade $(ANIMATION_OPTIONS) && \

@@ -4,6 +4,7 @@
 #   setup.sh find VERSION     print the interpreter of that version; exit code 3 when there is none
 #   setup.sh python VERSION   make the environment if it is missing or outdated, print its interpreter
 #   setup.sh blender PROGRAM  install what tests need in that Blender beside its own Python, print the folder
+#   setup.sh browser          unpack a browser that needs no window, and three.js, into .venv/browser; print the folder
 #   setup.sh slurm            install Slurm, which the tests of the farm scripts start on this machine
 #   setup.sh lock [OPTION..]  rewrite the lock files (options go to `uv pip compile`, for example --upgrade)
 #
@@ -192,6 +193,40 @@ make_environment() {
     printf '%s\n' "$directory/bin/python"
 }
 
+# ---- the browser of the tests of pages
+
+# npm's packages of browser/package-lock.json. One of them holds Chromium, its software for drawing, the libraries that
+# it needs and a font, each compressed.
+make_browser() {
+    local directory=$environments/browser stamp
+    if ! { command -v node && command -v npm; } >/dev/null 2>&1; then
+        install_packages "node and npm are not there" nodejs npm
+    fi
+    mkdir -p "$environments"
+    exec 9>"$environments/.browser-lock"
+    if command -v flock >/dev/null 2>&1; then flock 9; fi
+    stamp=$(cat "$here/browser/package-lock.json")
+    if [ "$(cat "$directory/ltsh-stamp" 2>/dev/null)" != "$stamp" ]; then
+        say "making $directory (300 MB)"
+        rm -rf "$directory"
+        mkdir -p "$directory/chromium"
+        cp "$here/browser/package.json" "$here/browser/package-lock.json" "$directory"
+        (cd "$directory" && npm ci --ignore-scripts --no-audit --no-fund --loglevel=error) >&2 </dev/null ||
+            fail "npm could not install requirements/browser/package-lock.json; see its messages above"
+        (cd "$directory" && TMPDIR=$directory/chromium node --input-type=module --eval '
+import { inflate } from "./node_modules/@sparticuz/chromium/build/esm/lambdafs.js";
+for (const name of ["chromium.br", "fonts.tar.br", "swiftshader.tar.br", "al2023.tar.br"]) {
+    await inflate(`node_modules/@sparticuz/chromium/bin/${name}`);
+}') >&2 </dev/null || fail "$directory: the browser could not be unpacked; see the messages above"
+        rm -rf "$directory/node_modules/@sparticuz/chromium/bin"
+        printf '%s\n' "$stamp" >"$directory/ltsh-stamp.new"
+        mv "$directory/ltsh-stamp.new" "$directory/ltsh-stamp"
+        say "$directory is ready"
+    fi
+    exec 9>&-
+    printf '%s\n' "$directory"
+}
+
 # ---- packages for the tests in a real Blender
 
 # The folder is named after the Python: pip fills it for that one, whatever Python runs pip.
@@ -254,9 +289,10 @@ main() {
         if [ "$1" = find ]; then find_python "$version"; else make_environment "$version"; fi
         ;;
     blender) make_blender_packages "${2:-blender}" ;;
+    browser) make_browser ;;
     slurm) install_slurm ;;
     lock) shift && write_locks "$@" ;;
-    *) fail "usage: setup.sh find VERSION | python VERSION | blender PROGRAM | slurm | lock [OPTION..]" ;;
+    *) fail "usage: setup.sh find VERSION | python VERSION | blender PROGRAM | browser | slurm | lock [OPTION..]" ;;
     esac
 }
 

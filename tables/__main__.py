@@ -19,10 +19,11 @@ import numpy as np
 from ltsh_addon.pipeline.options import table
 from ltsh_addon.shading import SHIPPED_TABLES, TableError, load_table
 
-from . import export, families, fit, optimum, validate
+from . import export, families, fit, layouts, optimum, validate
 from .families import BRDFS
 
 FOLDER = Path(__file__).resolve().parent
+_LAYOUT_NAMES = ", ".join(layouts.LAYOUTS)
 
 
 def main(arguments: list[str]) -> int:
@@ -78,6 +79,9 @@ def _parser():
         "names", nargs="*", type=_table, metavar="TABLE", help="or a path (.npz); default: all shipped"
     )
     exporting.add_argument("-o", dest="output", type=Path, required=True, metavar="OUT", help="folder for the files")
+    exporting.add_argument(
+        "--layout", choices=layouts.LAYOUTS, metavar="ENGINE", help=f"LTC as one engine takes it: {_LAYOUT_NAMES}"
+    )
     exporting.add_argument("--json", action="store_true", help="name the files on stdout in one JSON document")
     exporting.set_defaults(run=_export)
     return parser
@@ -301,13 +305,23 @@ def _plot(options) -> int:
 
 def _export(options) -> int:
     try:
-        prefixes = export.export_prefixes(options.names or SHIPPED_TABLES)
+        prefixes = export.export_prefixes(options.names or (["ltc"] if options.layout else SHIPPED_TABLES))
+        if options.layout and len(prefixes) > 1:
+            raise ValueError(f"--layout {options.layout} writes the files of one table, not of {len(prefixes)}")
     except ValueError as error:
         print(f"tables: {error}", file=sys.stderr)
         return 2
-    files = export.export_tables(prefixes, options.output)
+    if options.layout:
+        layout, (name,) = layouts.LAYOUTS[options.layout], prefixes
+        files = {name: export.export_layout(layout, name, options.output)}
+        for text in layout.dropped:
+            print(f"tables: warning: {name} in {layout.engine}: {text}", file=sys.stderr)
+    else:
+        files = export.export_tables(prefixes, options.output)
+    licenses = [str(path) for path in export.write_licenses(options.output, code=not options.layout)]
     paths = {name: [str(path) for path in written] for name, written in files.items()}
-    print(json.dumps({"tables": paths}, indent=2) if options.json else "\n".join(sum(paths.values(), [])))
+    shown = {"tables": paths, "licenses": licenses}
+    print(json.dumps(shown, indent=2) if options.json else "\n".join(sum(paths.values(), []) + licenses))
     return 0
 
 

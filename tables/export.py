@@ -21,7 +21,7 @@ from ltsh_addon.lobes.lookup_table import MIN_ALPHA, WARP_REGULARIZATION, Lookup
 from ltsh_addon.scene import VERSION
 from ltsh_addon.shading import load_table
 
-from . import header
+from . import header, layouts
 
 _WARP_NAMES = ("A", "B", "C", "tilt")
 
@@ -32,16 +32,22 @@ def export_tables(prefixes: Mapping[str, str], folder: str | os.PathLike) -> dic
     All tables are read before anything is written. The files of a table appear all or none. Raises TableError,
     OSError.
     """
-    folder = Path(folder)
     tables = {given: load_table(given) for given in prefixes}
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OSError(f"output folder {folder}: cannot be made ({error.strerror}); choose another folder") from error
+    folder = _made(folder)
     files = {}
     for given, table in tables.items():
         files[given] = export_table(table, Path(given).stem, prefixes[given], folder)
     return files
+
+
+def _made(folder) -> Path:
+    """The folder, created if needed."""
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OSError(f"output folder {folder}: cannot be made ({error.strerror}); choose another folder") from error
+    return folder
 
 
 def export_prefixes(given: list[str] | tuple[str, ...]) -> dict[str, str]:
@@ -74,15 +80,39 @@ def export_table(table: LookupTable, name: str, prefix: str, folder: Path) -> li
         f"{name}.dds": header.dds(header.half_layers(table)),
     }
     if table.family == "ltc":
-        for number, texture in enumerate(header.two_textures(table), start=1):
+        for number, texture in enumerate(layouts.layout_textures(layouts.LAYOUTS["three"], table), start=1):
             contents[f"{name}_{number}.dds"] = header.dds(texture[None])
     image = folder / f"{name}.exr"
     with ExitStack() as stack:
-        for own, data in contents.items():
-            stack.enter_context(replacing(folder / own)).write_bytes(data)
+        written = _write(contents, folder, stack)
         # The image takes its name here, the other files when their contexts end.
         write_channels(image, table_channels(table), _attributes(table))
-    return [image, *(folder / own for own in contents)]
+    return [image, *written]
+
+
+def export_layout(layout: layouts.Layout, given: str, folder: str | os.PathLike) -> list[Path]:
+    """Write a table, shipped or a path, as an engine takes it; all files or none. Raises OSError, TableError."""
+    contents = layouts.layout_files(layout, load_table(given))
+    with ExitStack() as stack:
+        return _write(contents, _made(folder), stack)
+
+
+def write_licenses(folder: str | os.PathLike, *, code: bool = True) -> list[Path]:
+    """Write the licenses of exported files beside them: CC0 of the numbers and, with `code`, MIT. Raises OSError."""
+    contents = {"LICENSE-CC0.txt": Path(__file__).with_name("LICENSE").read_bytes()}
+    if code:
+        notice = re.search(r"Copyright .*?(?= \*/)", header.TEMPLATE.read_text(encoding="ascii"), re.DOTALL)[0]
+        notice = notice.replace("\n   ", "\n")
+        contents["LICENSE-MIT.txt"] = f"MIT License\n\n{notice}\n".encode("ascii")
+    with ExitStack() as stack:
+        return _write(contents, Path(folder), stack)
+
+
+def _write(contents, folder, stack) -> list[Path]:
+    """Write files by name; they take their names when `stack` ends."""
+    for name, data in contents.items():
+        stack.enter_context(replacing(folder / name)).write_bytes(data)
+    return [folder / name for name in contents]
 
 
 def table_channels(table: LookupTable) -> dict[str, np.ndarray]:
@@ -160,9 +190,12 @@ def _curve_names(table) -> list[str]:
 
 def _about(table, name) -> str:
     curves = "\n".join(f"    {number}: {text}" for number, text in enumerate(_curve_names(table)))
+    prefix = identifier(name)
     return f"""\
 {name}: {table.metadata.get("brdf", "a fitted BRDF")}, as linearly transformed lobes ({table.family}).
-Made by `python -m tables export` of LTSH {VERSION}. C99, C++, GLSL 3.30 and HLSL, or WGSL.
+Needs C99 or C++; or GLSL 3.30, or GLSL ES 3.00 (WebGL 2) with `precision highp float; precision highp int;`; or HLSL of
+shader model 5. In GLSL and HLSL define the macro {prefix.upper()}_DATA before, in WGSL the function {prefix}_data.
+Made by `python -m tables export` of LTSH {VERSION}.
 Frame: z is the shading normal, the view direction is (sin theta_o, 0, cos theta_o). roughness^2 = alpha of GGX.
 Fresnel curves of c, the cosine of the half angle; a reflectance that is a sum of them needs the same sum of integrals:
 {curves}

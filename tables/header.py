@@ -1,12 +1,7 @@
-"""Tables for other engines: a header for C, C++, GLSL and HLSL with the code that evaluates them; WGSL; and textures.
+"""Tables for other engines: a header for C, C++, GLSL and HLSL with the code that evaluates them; WGSL; DDS.
 
 The header is core.h of `ltsh_addon/shading/glsl`, the same for all tables, and table.h, which each table adds. This
 module writes the lines that depend on a table's numbers and degree.
-
-The two textures of LTC have the layout of the shaders of Heitz et al. 2016 and of their successors. Row j of N is
-theta_o with sqrt(1 - cos(theta_o)) = j / (N - 1); column i is roughness i / (N - 1). The first texture holds m00, m20,
-m02 and m22 of M^-1, divided by m11. The second holds the integrals of the lobe over the whole sphere for F = 1 and for
-(1 - c)^5, then zero, then the factor of the form factor of a sphere that the horizon cuts.
 """
 
 from __future__ import annotations
@@ -36,7 +31,6 @@ from ltsh_addon.shading.header import (
 _TERMS_PER_LINE = 3
 _VALUES_PER_LINE = 8
 TEMPLATE = Path(__file__).with_name("table.h")
-TEXTURE_SIZE = 64  # texels along each side of the two textures
 
 
 def header_text(table: LookupTable, prefix: str, about: str) -> str:
@@ -212,44 +206,6 @@ def half_layers(table: LookupTable) -> np.ndarray:
     padded = np.zeros((rows, columns, 4 * layers), np.float16)
     padded[..., : channels.shape[2]] = channels
     return np.ascontiguousarray(np.moveaxis(padded.reshape(rows, columns, layers, 4), 2, 0))
-
-
-def two_textures(table: LookupTable) -> np.ndarray:
-    """(2, N, N, 4) float32: the two textures of a table of the family "ltc"."""
-    nodes = np.linspace(0.0, 1.0, TEXTURE_SIZE)
-    theta, roughness = (grid.ravel() for grid in np.meshgrid(nodes, nodes, indexing="ij"))
-    lobe = table.lookup(1.0 - theta * theta, roughness, curves=2)
-    sine, cosine = np.sin(lobe.tilt), np.cos(lobe.tilt)
-    # Rotate the axis of the cosine into z.
-    across = cosine * lobe.xx, cosine * lobe.xz - sine * lobe.zz
-    along = sine * lobe.xx, sine * lobe.xz + cosine * lobe.zz
-    inverse = np.stack([across[0], along[0], across[1], along[1]], axis=-1) / lobe.yy[:, None]
-    sphere = clipped_sphere_factor(2.0 * roughness - 1.0, theta)
-    second = np.stack([*lobe.coefficients[:, 0], np.zeros_like(sphere), sphere], axis=-1)
-    return np.stack([inverse, second]).reshape(2, TEXTURE_SIZE, TEXTURE_SIZE, 4).astype(np.float32)
-
-
-def clipped_sphere_factor(height: np.ndarray, form_factor: np.ndarray) -> np.ndarray:
-    """Form factor of a sphere in a direction with z = `height` over the horizon, relative to `form_factor`, its form
-    factor straight above.
-
-    Snyder 1996, "Area light sources for real-time graphics", Microsoft Research MSR-TR-96-11, as in Heitz et al. 2016.
-    """
-    squared = np.maximum(form_factor, 1e-9)
-    sigma = np.arcsin(np.sqrt(np.minimum(squared, 1.0)))
-    omega = np.arccos(np.clip(height, -1.0, 1.0))
-    whole = np.maximum(height, 0.0) * squared
-    # This is for spheres that the horizon cuts.
-    ratio = np.clip(np.cos(sigma) / np.maximum(np.sin(omega), 1e-9), -1.0, 1.0)
-    gamma = np.arcsin(ratio)
-    under_root = np.maximum(squared - np.cos(gamma) ** 2, 0.0)
-    turned = np.arcsin(np.clip(np.cos(gamma) / np.sin(sigma), -1.0, 1.0))
-    g = 0.5 * np.pi - 2.0 * np.sin(omega) * np.cos(sigma) * np.cos(gamma) - gamma + np.sin(gamma) * np.cos(gamma)
-    h = height * (np.cos(gamma) * np.sqrt(under_root) + squared * turned)
-    above = height * squared + (g - h) / np.pi
-    cut = np.where(omega < 0.5 * np.pi, above, (g + h) / np.pi)
-    is_cut = np.abs(omega - 0.5 * np.pi) < sigma
-    return np.maximum(np.where(is_cut, cut, whole), 0.0) / squared
 
 
 def dds(layers: np.ndarray) -> bytes:

@@ -17,7 +17,7 @@ from ltsh_addon.lobes.lookup_table import LookupTable
 from ltsh_addon.scene import EllipseLight, SurfaceSamples
 from ltsh_addon.shading import evaluate_lobe, shade
 
-from . import header
+from . import header, layouts
 from .families import gauss_legendre
 
 IOR = (1.1, 1.2, 1.33, 1.5, 1.8, 2.4, 3.0)
@@ -92,7 +92,7 @@ def layout_errors(table: LookupTable, count: int = 28) -> dict[str, float]:
     )
     found = {"half": float(error_map(rounded, count).mean())}
     if table.family == "ltc":
-        textures = header.two_textures(table)
+        textures = layouts.layout_textures(layouts.LAYOUTS["three"], table)
         found["two_textures"] = float(np.mean([_textures_error(textures, *point) for point in grid(count)]))
     return found
 

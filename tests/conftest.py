@@ -3,6 +3,7 @@
 import atexit
 import os
 import platform
+import shutil
 import signal
 import subprocess
 import sys
@@ -130,6 +131,20 @@ def child(monkeypatch):
     import fake_scene
 
     return fake_scene.FakeChild().install(monkeypatch)
+
+
+@pytest.fixture(scope="session")
+def chromium():
+    """A running browser, see tests/helpers/browser.py. It is made where node and npm are there."""
+    import browser
+
+    if browser.missing() and not (shutil.which("node") and shutil.which("npm")):
+        pytest.skip("no browser: node and npm are not there (`make test-page` installs them where it may)")
+    subprocess.run(
+        ["bash", TESTS.parent / "requirements" / "setup.sh", "browser"], stdout=subprocess.DEVNULL, check=True
+    )
+    with browser.Browser() as running:
+        yield running
 
 
 @pytest.fixture

@@ -17,6 +17,15 @@ def read_values(collection, name: str, shape: tuple[int, ...], dtype) -> np.ndar
     return values.reshape(shape)
 
 
+def image_pixels(image) -> np.ndarray:
+    """Pixels (H, W, 4) float32 of an image, row 0 at the bottom."""
+    width, height = image.size
+    flat = np.empty(width * height * 4, np.float32)
+    if flat.size:
+        image.pixels.foreach_get(flat)
+    return flat.reshape(height, width, 4)
+
+
 # Before 5.0 Cycles did not use corner normals in meshes whose only sharp elements are faces.
 _CORNERS_OF_SHARP_FACES = bpy.app.version >= (5, 0, 0)
 

@@ -214,12 +214,12 @@ class _SkyQuadtree:
             errors.append(0.8 * weight * np.sqrt(variance))
             if len(weight) == 1:
                 break
-            light, squares, weight = (_summed(values) for values in (light, squares, weight))
+            light, squares, weight = (summed(values) for values in (light, squares, weight))
         errors[0][:] = 0.0
         return cls(means[::-1], errors[::-1])
 
 
-def _summed(values):
+def summed(values):
     """Sums over squares of 2 x 2."""
     rows = values[0::2] + values[1::2]
     return rows[:, 0::2] + rows[:, 1::2]

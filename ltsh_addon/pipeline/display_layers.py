@@ -60,7 +60,7 @@ def _group(path: Path, folder: Path, prefix: str, report: dict) -> dict:
     whole = [name for name in layers if exr.parse_layer_name(name)[1] == exr.COMBINED and layers[name].shape[-1] == 4]
     shown = {name: layers.pop(name)[..., :3] for name in whole}
     names = [name for name in _techniques(layers) if not name.startswith((*exr.CYCLES_LAYERS[1:], exr.ERROR))]
-    names = [name for name in names if not name.endswith(exr.UNSHADOWED)]
+    names = [name for name in names if name != exr.REST and not name.endswith(exr.UNSHADOWED)]
     passes = [name for name in BAKE_PASSES if exr.layer_name(names[0], name) in layers]
     _add_combined(layers, names, passes)
     written = {}

@@ -268,15 +268,6 @@ def flag(name: str, meaning: str) -> Any:
     return option(name, default=False, action="store_true", help=meaning)
 
 
-def _scene(meaning: str) -> Any:
-    return option("scenes", matters=False, nargs="*", metavar="SCENE.blend", help=meaning)
-
-
-def _output() -> Any:
-    meaning = "folder for the results"
-    return option("-o", matters=False, dest="output", type=folder, required=True, metavar="OUT", help=meaning)
-
-
 def _techniques(known: Iterable[str] = TECHNIQUES, default=(DEFAULT_TECHNIQUE,), parse: Callable = techniques) -> Any:
     one = "the path of a table (.npz)" if parse is one_table else "paths of tables (.npz), separated by commas"
     meaning = f"{', '.join(known)} or {one} (default: {','.join(default)})"
@@ -286,21 +277,6 @@ def _techniques(known: Iterable[str] = TECHNIQUES, default=(DEFAULT_TECHNIQUE,),
 def _passes_of(known: tuple[str, ...], default: str) -> Any:
     meaning = f"some of {','.join(known)} (default: {default})"
     return option("--passes", default=PASSES, type=passes(known), metavar="P", help=meaning)
-
-
-def _resolution() -> Any:
-    return option("--resolution", default=None, type=resolution, metavar="WxH", help="default: as in the file")
-
-
-def _frame() -> Any:
-    meaning = "such as 12 or 1-240:2,300 (--frames=-10--1 where the first is negative); default: the file's current one"
-    # The command line takes several frames. Each is a task of its own, with one frame in this field.
-    return option("--frames", "--frame", default=None, dest="frames", type=frames, metavar="F", help=meaning)
-
-
-def _camera() -> Any:
-    meaning = "may be given several times; default: the scene's camera"
-    return option("--camera", default=None, dest="cameras", action="append", metavar="NAME", help=meaning)
 
 
 def _stem(parse: Callable) -> Any:
@@ -316,10 +292,6 @@ def _cycles_samples(what: str, default: int) -> Any:
     return option("--cycles-samples", default=default, type=cycles_samples, metavar="N", help=meaning)
 
 
-def _sub_samples(meaning: str) -> Any:
-    return option("--aa", default=1, type=positive, metavar="N", help=meaning)
-
-
 def _shadows() -> Any:
     meaning = (
         "whether surfaces stand in each other's light, in the Cycles reference too; off compares the lobes alone "
@@ -328,29 +300,52 @@ def _shadows() -> Any:
     return option("--shadows", default="on", choices=("on", "off"), help=meaning)
 
 
-def _shadow_rays() -> Any:
-    meaning = (
-        "at most so many per light and point where some are blocked and some are not; shared by the points of a pixel "
-        "or texel (default: %(default)s)"
-    )
-    return option("--shadow-rays", default=256, type=shadow_rays, metavar="N", help=meaning)
+def _bounces(what: str) -> Any:
+    meaning = f"also {what}, by Cycles and denoised (default: %(default)s)"
+    return option("--bounces", default="off", choices=("on", "off"), help=meaning)
 
 
-def _scripts() -> Any:
-    return flag("--enable-autoexec", "run the scripts and Python drivers in the .blend, which is not done otherwise")
+def _rest_samples() -> Any:
+    meaning = "of Cycles for the bounces (default: %(default)s)"
+    return option("--rest-samples", default=64, type=cycles_samples, metavar="N", help=meaning)
 
 
 @dataclass(frozen=True)
-class CameraOptions:
-    """Scene, camera, frame and output; None means as in the file."""
+class TaskOptions:
+    """What all commands share; None means as in the file."""
 
-    scene: Path = _scene("one or more; left out when Blender has a file open")
-    frame: int | None = _frame()
-    camera: str | None = _camera()
-    name: str | None = _stem(
-        partial(file_pattern, known=NAME_FIELDS[:-1])
-    )  # of the files, without suffix, below `output`; None: the command
-    output: Path = _output()
+    scene: Path = option(
+        "scenes", matters=False, nargs="*", metavar="SCENE.blend",
+        help="one or more; left out when Blender has a file open",
+    )  # fmt: skip
+    # The command line takes several frames. Each is a task of its own, with one frame in this field.
+    frame: int | None = option(
+        "--frames", "--frame", default=None, dest="frames", type=frames, metavar="F",
+        help="such as 12 or 1-240:2,300 (--frames=-10--1 where the first is negative); default: the file's current one",
+    )  # fmt: skip
+    camera: str | None = option(
+        "--camera", default=None, dest="cameras", action="append", metavar="NAME",
+        help="may be given several times; default: the scene's camera",
+    )  # fmt: skip
+    name: str | None = _stem(partial(file_pattern, known=NAME_FIELDS[:-1]))  # without suffix; None: the command
+    output: Path = option(
+        "-o", matters=False, dest="output", type=folder, required=True, metavar="OUT", help="folder for the results"
+    )
+    shadow_rays: int = option(
+        "--shadow-rays", default=256, type=shadow_rays, metavar="N",
+        help="at most so many per light and point where some are blocked and some are not; shared by the points of a "
+        "pixel or texel (default: %(default)s)",
+    )  # fmt: skip
+    scripts: bool = flag("--enable-autoexec", "run the scripts and Python drivers in the .blend, else they do not run")
+
+
+@dataclass(frozen=True)
+class CameraOptions(TaskOptions):
+    """What pictures share."""
+
+    resolution: tuple[int, int] | None = option(
+        "--resolution", default=None, type=resolution, metavar="WxH", help="default: as in the file"
+    )
 
 
 @dataclass(frozen=True)
@@ -360,17 +355,16 @@ class PictureOptions(CameraOptions):
     # Names, paths of tables, or (only from Python) a `shading.OwnTechnique`.
     techniques: tuple[Any, ...] = _techniques()
     passes: tuple[str, ...] = _passes_of(PASSES, "both")
-    resolution: tuple[int, int] | None = _resolution()
-    sub_samples: int = _sub_samples("points per pixel, drawn from its filter; 1: pixel centers")
+    sub_samples: int = option(
+        "--aa", default=1, type=positive, metavar="N", help="points per pixel, drawn from its filter; 1: pixel centers"
+    )
     reference_samples: int = option(
         "--reference-samples", default=150_000, type=positive, metavar="N",
         help="'reference' takes a random subset of this size where there are more samples (default: %(default)s)",
     )  # fmt: skip
     cycles_samples: int = _cycles_samples("the Cycles reference", 512)
     shadows: str = _shadows()
-    shadow_rays: int = _shadow_rays()
     keep_visibility: bool = flag("--keep-visibility", "also keep what `relight` needs, beside the EXR as two .npz")
-    scripts: bool = _scripts()
     page: str = option(default="report.html", matters=False)  # file name of a comparison's HTML page
 
 
@@ -389,11 +383,10 @@ class DemoOptions(CompareOptions):
 
 
 @dataclass(frozen=True)
-class BakeOptions:
+class BakeOptions(TaskOptions):
     """What to bake and how; None means as in the file."""
 
-    scene: Path = _scene("left out when Blender has a file open")
-    output: Path = _output()
+    name: str | None = _stem(file_pattern)  # of the file of the only object
     objects: tuple[str, ...] | str = option(  # names, "selected" or "all"
         default="all",
         matters=False,
@@ -421,7 +414,9 @@ class BakeOptions:
         "--unwrap", default="smart", choices=("smart", "faces"),
         help="for the atlas: islands by direction, or each face alone (default: %(default)s)",
     )  # fmt: skip
-    sub_samples: int = _sub_samples("points per texel, spread as in Cycles' bake; 1: texel centers")
+    sub_samples: int = option(
+        "--aa", default=1, type=positive, metavar="N", help="points per texel, spread as in Cycles' bake; 1: centers"
+    )
     margin: int = option("--margin", default=16, type=margin, metavar="PX", help="in texels (default: %(default)s)")
     conservative: bool = flag("--conservative", "bake every texel that a face touches")
     view: tuple[float, float, float] | str = option(
@@ -430,15 +425,12 @@ class BakeOptions:
     )  # fmt: skip
     techniques: tuple[str, ...] = _techniques()
     passes: tuple[str, ...] = _passes_of(BAKE_PASSES, ",".join(PASSES))
-    frame: int | None = _frame()
-    camera: str | None = _camera()
-    name: str | None = _stem(file_pattern)  # of the file of the only object, without suffix, below `output`
     error: bool = flag("--error", "beside Cycles' bake: signed errors, also as pictures")
     cycles_samples: int = _cycles_samples("Cycles' bake", 256)  # with `error`
     shadows: str = _shadows()
-    shadow_rays: int = _shadow_rays()
+    bounces: str = _bounces("bounced light")
+    rest_samples: int = _rest_samples()
     apply: bool = flag("--apply", "also a texture of each object, and a copy of the .blend whose materials show it")
-    scripts: bool = _scripts()
     resume: bool = option(default=False, matters=False)  # keep what the same job has finished
 
     def __post_init__(self):
@@ -451,22 +443,13 @@ class ViewOptions(CameraOptions):
     """What to draw as the viewport does; None means as in the file."""
 
     techniques: tuple[str, ...] = _techniques(SHIPPED_TABLES, parse=tables)
-    resolution: tuple[int, int] | None = _resolution()
     refine: int = option(
         "--refine", default=16, type=refinements, metavar="N",
         help="mean of N pictures, each of other points of the pixels; 1: pixel centers (default: %(default)s)",
     )  # fmt: skip
     shadows: str = _shadows()
-    shadow_rays: int = _shadow_rays()
-    bounces: str = option(
-        "--bounces", default="off", choices=("on", "off"),
-        help="also bounces, reflections, refraction, materials by nodes, by Cycles and denoised (default: %(default)s)",
-    )  # fmt: skip
-    rest_samples: int = option(
-        "--rest-samples", default=64, type=cycles_samples, metavar="N",
-        help="of Cycles for the bounces (default: %(default)s)",
-    )  # fmt: skip
-    scripts: bool = _scripts()
+    bounces: str = _bounces("bounces, reflections, refraction, materials by nodes")
+    rest_samples: int = _rest_samples()
 
 
 @dataclass(frozen=True)
@@ -474,7 +457,6 @@ class RenderOptions(CameraOptions):
     """What finished picture to render and how; None means as in the file."""
 
     techniques: tuple[str, ...] = _techniques(SHIPPED_TABLES, parse=one_table)
-    resolution: tuple[int, int] | None = _resolution()
     sub_samples: int | None = option(
         "--aa", default=None, type=positive, metavar="N",
         help="points per pixel of the direct light, shared by the pixel filter (default: 3 to 9 by the samples of "
@@ -490,9 +472,7 @@ class RenderOptions(CameraOptions):
     denoise: str = option(
         "--denoise", default="on", choices=("on", "off"), help="what Cycles renders (default: %(default)s)"
     )
-    shadow_rays: int = _shadow_rays()
     keep_visibility: bool = flag("--keep-visibility", "also keep what `relight` needs, beside the EXR as .npz")
-    scripts: bool = _scripts()
 
 
 # Derived from the declarations:

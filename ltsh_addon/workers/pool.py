@@ -177,17 +177,14 @@ class Worker:
     """A child process that does jobs of a pool, and the thread that feeds it."""
 
     def __init__(self, pool: WorkerPool, context: bytes):
-        self._pool, self._process, self._memory = pool, None, worker.SharedMemory()
-        self._context = context
+        self._pool, self._process, self._context = pool, None, context
         self._thread = threading.Thread(target=self._serve, name="ltsh-worker", daemon=True)
-        handle = self._memory.handle
         try:
             self._process = subprocess.Popen(
-                [interpreter(), worker.__file__, *([] if handle is None else [str(handle)])],
+                [interpreter(), worker.__file__],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
-                pass_fds=() if handle is None else (handle,),
                 # Nothing here uses BLAS, and its threads take time to start.
                 env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
                 # Ctrl-C goes to the parent alone, which ends the worker. No console window on Windows.
@@ -202,9 +199,7 @@ class Worker:
     def _serve(self) -> None:
         run = number = None
         try:
-            channel = worker.Channel(
-                self._process.stdin, self._process.stdout, self._memory, worker.PACKAGE_FOLDER.name
-            )
+            channel = worker.Channel(self._process.stdin, self._process.stdout, worker.PACKAGE_FOLDER.name)
             channel.send((sys.path, worker.PACKAGE))
             self._ask(channel, self._context)
             self._context, packed_task = b"", None
@@ -241,4 +236,3 @@ class Worker:
             for stream in (self._process.stdin, self._process.stdout):
                 with suppress(OSError):  # data that could not be sent any more
                     stream.close()
-        self._memory.close()

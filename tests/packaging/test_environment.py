@@ -1,5 +1,6 @@
 """The set-up script, tried with small stand-ins for Python and apt-get, and the lock files."""
 
+import json
 import re
 import shutil
 import subprocess
@@ -30,6 +31,15 @@ def test_every_pin_has_hashes_and_no_place_of_download(lock):
     assert not bare, f"without a hash: {bare}"
     # Only names, versions, markers and hashes: an address or a path of some machine would break elsewhere.
     assert not re.search(r"://|^--|find-links|index-url|[ =]/", text, flags=re.MULTILINE)
+
+
+def test_packages_of_npm_have_hashes_and_no_place_of_download():
+    folder = ROOT / "requirements" / "browser"
+    packages = json.loads((folder / "package-lock.json").read_text(encoding="utf-8"))["packages"]
+    asked = packages.pop("")["dependencies"]
+    assert asked == json.loads((folder / "package.json").read_text(encoding="utf-8"))["dependencies"]
+    assert len(packages) >= len(asked) and all(item["integrity"].startswith("sha512-") for item in packages.values())
+    assert not any("resolved" in item for item in packages.values())
 
 
 def test_locks_pin_blender_with_the_numpy_of_its_generation_and_the_same_tools():
@@ -213,3 +223,11 @@ def test_what_is_missing_stops_another_user_with_the_line_to_type(world, lack, c
     run = world.make()
     assert (run.returncode, run.stdout) == (1, "") and all(complaint in run.stderr for complaint in complaints)
     assert not (world.environment / "ltsh-stamp").exists()
+
+
+def test_without_node_the_browser_stops_with_the_line_to_type(world, setup_script):
+    world.command("id", "echo 1000")
+    world.command("apt-get", "exit 99")
+    run = setup_script("browser", path=[world.folder / "bin"])
+    assert (run.returncode, run.stdout) == (1, "")
+    assert "sudo apt-get update && sudo apt-get install -y --no-install-recommends nodejs npm" in run.stderr

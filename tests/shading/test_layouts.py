@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ltsh_addon import shading
-from tables import header, validate
+from tables import header, layouts, validate
 from tables.header import data_blocks
 
 
@@ -46,7 +46,7 @@ def shader(textures, cosine, roughness, corners):
 def test_a_shader_of_the_usual_kind_takes_the_two_textures():
     """Beside the table's own lookup: the same at its nodes, close to it between them."""
     table, generator = shading.load_table("ltc"), np.random.default_rng(1)
-    textures = header.two_textures(table)
+    textures = layouts.layout_textures(layouts.LAYOUTS["three"], table)
     for number in range(60):
         row, column = generator.integers(8, 64), generator.integers(0, 63)
         at_node = number % 2 == 0
@@ -82,7 +82,7 @@ def test_the_clipped_sphere_is_the_cosine_over_its_cap_above_the_horizon(height,
     cosine = np.cos(turn) * z[:, None] + np.sin(turn) * np.sqrt(1.0 - z * z)[:, None] * np.cos(angle)
     weights = 0.5 * (1.0 - np.cos(sigma)) * weights * 2.0 * np.pi / 800
     expected = (weights @ np.maximum(cosine, 0.0)).sum() / np.pi / form_factor
-    assert header.clipped_sphere_factor(np.array([height]), np.array([form_factor]))[0] == pytest.approx(
+    assert layouts.clipped_sphere_factor(np.array([height]), np.array([form_factor]))[0] == pytest.approx(
         expected, abs=2e-4
     )
 

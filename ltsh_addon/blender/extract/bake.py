@@ -24,7 +24,7 @@ from ..materials import aovs
 from ..materials.graph import ensure_nodes
 from ..materials.maps import UV_MAP, MaterialPlan, SavedImages
 from ..process.bake import AtlasSettings, BakeFactsJob, BakeJob
-from ..render_settings import working_space
+from ..render_settings import changed_properties, working_space
 from . import atlas, bake_meshes, pixels
 from .occluders import collect_occluders, with_baked_shares
 from .pixels import OCCLUDERS, SEEDS, remove_occlusion
@@ -112,15 +112,16 @@ class ObjectBake:
             cycles.use_sample_subset = False
         return np.array(maps)
 
-    def radiance(self, block: Block, kind: str, samples: int) -> np.ndarray:
-        """Cycles' direct light (2, rows, W, 3), colors included: two halves with different seeds."""
+    def halves(self, block: Block, kind: str, samples: int, light: set[str]) -> np.ndarray:
+        """Cycles' light (2, rows, W, 3) of the passes `light`, colors included: two halves with different seeds."""
+        return np.array([self.radiance(block, kind, (seed, samples), {*light, "COLOR"}) for seed in SEEDS.values()])
+
+    def radiance(self, block: Block, kind: str, sampling: tuple[int, int], light: set[str]) -> np.ndarray:
+        """Cycles' light (rows, W, 3) of the passes `light`; `sampling` is a seed and a number of samples."""
         for plan in self.plans:
             plan.show(None)
-        halves = []
-        for seed in SEEDS.values():
-            self.scene.cycles.seed, self.scene.cycles.samples = seed, samples
-            halves.append(self._bake(block, CYCLES_TYPES[kind], {"DIRECT", "COLOR"}))
-        return np.array(halves)
+        self.scene.cycles.seed, self.scene.cycles.samples = sampling
+        return self._bake(block, CYCLES_TYPES[kind], light)
 
     def _bake(self, block: Block, kind: str, pass_filter) -> np.ndarray:
         image = self._image(block)
@@ -185,6 +186,7 @@ class BakeScene:
     problems: dict[str, str]
     lobes: dict[str, aovs.MaterialLobes]  # by full name of the material
     densities: dict[str, float]  # texels per metre of the objects of an atlas that was made
+    bounces: list[tuple]  # what `changed_properties` sets so that Cycles bakes the indirect light as the file has it
     folder: tempfile.TemporaryDirectory = field(repr=False)
 
     def plans(self, objects, images) -> tuple[dict[str, MaterialPlan], list[str]]:
@@ -236,7 +238,7 @@ def _open(job: BakeJob) -> BakeScene:
     render_settings.go_to_frame(scene, job.frame)
     camera = _camera(scene, job)
     view_layer = render_settings.choose_view_layer(scene, warnings)
-    names = job.objects
+    bounces, names = bounces_of(scene), job.objects
     if not isinstance(names, str):
         names = list(dict.fromkeys([*names, *job.following]))
     objects = bake_meshes.chosen_objects(scene, view_layer, names)
@@ -271,7 +273,9 @@ def _open(job: BakeJob) -> BakeScene:
     warnings += inventory.warnings + rounded_positions(_points_in_boxes(objects), inventory.lights)
     if not inventory.lights:
         raise pixels.no_light(scene, inventory.warnings)
-    render_settings.leave_out_objects(scene, inventory.left_out, warnings)
+    if job.bounces == "off":
+        render_settings.leave_out_objects(scene, inventory.left_out, warnings)
+    bounces.append((scene, "world", world))
     if job.cycles_samples:
         scene.world = inventory.world
     view = view_of(job.view, camera, bent=job.cycles_samples > 0)
@@ -282,7 +286,19 @@ def _open(job: BakeJob) -> BakeScene:
     if has_shadows:
         inventory.occluders.save(Path(folder.name) / OCCLUDERS)
     facts = names, meshes, problems | unfit, lobes, densities
-    return BakeScene(scene, name, view, inventory.lights, warnings, *facts, folder)
+    return BakeScene(scene, name, view, inventory.lights, warnings, *facts, bounces, folder)
+
+
+# BOUNCES: settings of Cycles on which indirect light depends, and which pictures of direct light switch off.
+BOUNCES = ("max_bounces", "sample_clamp_indirect", "blur_glossy", "caustics_reflective", "use_fast_gi")
+
+
+def bounces_of(scene) -> list[tuple]:
+    """The settings of the file, as for `changed_properties`, on which its indirect light depends."""
+    emission = [
+        (material.cycles, "emission_sampling", material.cycles.emission_sampling) for material in bpy.data.materials
+    ]
+    return [(scene.cycles, name, getattr(scene.cycles, name)) for name in BOUNCES] + emission
 
 
 def _points_in_boxes(objects) -> np.ndarray:
@@ -415,35 +431,47 @@ def _objects(opened, names, images, job, folder, progress) -> dict:
         maps = (opened.meshes[ob.name].uv_map(name, mesh) for ob, mesh in zip(objects, meshes, strict=True))
         save_array(folder / file, np.concatenate(list(maps)))
     record["maps"] = [any(plans[slot.material.name_full].count for slot in ob.material_slots) for ob in objects]
-    baked = [ob for ob, needs_maps in zip(objects, record["maps"], strict=True) if needs_maps or job.cycles_samples]
+    is_light_baked = job.cycles_samples or job.bounces == "on"
+    baked = [ob for ob, needs_maps in zip(objects, record["maps"], strict=True) if needs_maps or is_light_baked]
     if baked:
         finished = {tile for name, tile in job.finished if name == (ATLAS if job.in_one else names[0])}
         tiles = [tile for tile in tiles_of(joined.uv)[0] if tile not in finished and job.tile in (None, tile)]
         uv_names = {ob: opened.meshes[ob.name].uv_name for ob in baked}
-        _bake(ObjectBake(opened.scene, uv_names, list(plans.values())), tiles, job, folder, progress)
+        bake = ObjectBake(opened.scene, uv_names, list(plans.values()))
+        _bake(bake, tiles, job, opened.bounces, (folder, progress))
     return record
 
 
-def _bake(bake, tiles, job, folder, progress) -> None:
-    """Write the maps and Cycles' bake of the objects of an ObjectBake, and close it."""
-    points = job.sub_samples if any(plan.count for plan in bake.plans) else 0
-    name = ATLAS if job.in_one else next(iter(bake.uv_names)).name
+def _bake(bake, tiles, job, bounces, files) -> None:
+    """Write the maps and Cycles' bake of the objects of an ObjectBake, and close it; `bounces`: see BakeScene."""
+    points, has_bounces = job.sub_samples if any(plan.count for plan in bake.plans) else 0, job.bounces == "on"
+    name, (folder, progress) = ATLAS if job.in_one else next(iter(bake.uv_names)).name, files
     try:
-        blocks = [
-            Block(tile, first, min(job.block_rows, job.height - first), job.width, job.height)
-            for tile in tiles
-            for first in range(0, job.height, job.block_rows)
-        ]
+        blocks, rest = (_blocks(job, tiles, count) for count in (job.block_rows, job.rest_rows))
         for number, block in enumerate(blocks):
             progress(f"bake {name}", number / len(blocks))
             for point in range(points):
                 save_array(folder / f"maps_{block.name}_{point}.npy", bake.maps(block, point, points))
-            if job.cycles_samples:
-                for kind in job.passes:
-                    halves = bake.radiance(block, kind, max(1, job.cycles_samples // 2))
-                    save_array(folder / f"cycles_{kind}_{block.name}.npy", halves)
+            for kind in job.passes if job.cycles_samples else ():
+                with changed_properties(bounces if has_bounces else []):
+                    light = {"DIRECT", "INDIRECT"} if has_bounces else {"DIRECT"}
+                    halves = bake.halves(block, kind, max(1, job.cycles_samples // 2), light)
+                save_array(folder / f"cycles_{kind}_{block.name}.npy", halves)
+        for number, block in enumerate(rest if has_bounces else ()):
+            for kind in job.rest_passes:
+                progress(f"bounces {name}", number / len(rest))
+                with changed_properties(bounces):
+                    light = {"INDIRECT", "COLOR"} if kind == "specular" else {"INDIRECT"}
+                    baked = bake.radiance(block, kind, (SEEDS["A"], job.rest_samples), light)
+                save_array(folder / f"rest_{kind}_{block.name}.npy", baked)
     finally:
         bake.close()
+
+
+def _blocks(job: BakeJob, tiles, rows: int) -> list[Block]:
+    """The blocks of so many `rows` of the UDIM `tiles`."""
+    firsts = range(0, job.height, rows)
+    return [Block(tile, y, min(rows, job.height - y), job.width, job.height) for tile in tiles for y in firsts]
 
 
 def scene_facts(job: BakeFactsJob, folder: Path, progress) -> dict:

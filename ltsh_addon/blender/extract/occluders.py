@@ -15,9 +15,10 @@ import numpy as np
 from bpy_extras.object_utils import world_to_camera_view
 from mathutils import Vector
 
+from ...cycles.texels import srgb_decode
 from ...scene import FARTHEST, listed
 from ...visibility.occluders import TERMINATOR_OFFSET, OccluderMesh, Occluders, Transparency, overlap_within
-from ..evaluated import SURFACE_TYPES, is_rendered, owner_of
+from ..evaluated import SURFACE_TYPES, image_pixels, is_rendered, owner_of
 from ..lights.emission import ObjectFacts, open_studio, trees_of
 from ..lights.linking import MOST_BLOCKER_SETS, OTHER_LIGHTS, Blockers
 from ..materials import maps, values
@@ -517,17 +518,13 @@ def _values_of_image(value: values.Value) -> np.ndarray | None:
     srgb = values.is_srgb(image)
     if not all(image.size) or (colors_count and srgb is None):
         return None
-    width, height = image.size
-    pixels = np.empty(width * height * 4, np.float32)
-    image.pixels.foreach_get(pixels)
-    pixels = pixels.reshape(height, width, 4)
+    pixels = image_pixels(image)
     if image.alpha_mode == "NONE":
         pixels[..., 3] = 1.0
     if colors_count and image.alpha_mode != "CHANNEL_PACKED" and (pixels[..., 3] != 1.0).any():
         return None  # Cycles multiplies colors by alpha unless the material uses both
     if colors_count and srgb:
-        colors = pixels[..., :3]
-        pixels[..., :3] = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
+        pixels[..., :3] = srgb_decode(pixels[..., :3])
     return pixels @ value.matrix[0].astype(np.float32) + np.float32(value.offset[0])
 
 

@@ -13,8 +13,20 @@ import numpy as np
 from mathutils import Color, Euler, Matrix, Vector
 
 from ...scene import listed
+from ..evaluated import image_pixels
 from ..materials.bsdfs import EMISSION, emission_sockets, emits
-from ..materials.graph import Source, is_group, is_socket, shaders_behind, source_of, surface_of, tree_in_use, value_of
+from ..materials.graph import (
+    Source,
+    feed_instead,
+    is_group,
+    is_socket,
+    replaced_by_number,
+    shaders_behind,
+    source_of,
+    surface_of,
+    tree_in_use,
+    value_of,
+)
 from ..materials.values import value_at
 from ..render_settings import enable_passes
 
@@ -369,19 +381,12 @@ def without_camera_rays(blocks, random: float):
         for tree in trees_of(blocks):
             for node in [node for node in tree.nodes if node.bl_idname in values]:
                 name, value = values[node.bl_idname]
-                targets = [link.to_socket for link in node.outputs[name].links]
-                if targets:
-                    value_node = tree.nodes.new("ShaderNodeValue")
-                    value_node.outputs[0].default_value = value
-                    moved.append((tree, value_node, node.outputs[name], targets))
-                    for target in targets:
-                        tree.links.new(value_node.outputs[0], target)
+                moved.append((replaced_by_number(node.outputs[name], value), node.outputs[name]))
         yield
     finally:
-        for tree, value_node, output, targets in moved:
-            for target in targets:
-                tree.links.new(output, target)
-            tree.nodes.remove(value_node)
+        for number, output in moved:
+            feed_instead(number, output)
+            number.id_data.nodes.remove(number.node)
 
 
 # PIXELS: along each side of a picture.
@@ -495,12 +500,9 @@ def _read_pixels(path: Path) -> np.ndarray:
     try:
         image.colorspace_settings.name = "Non-Color"
         image.alpha_mode = "CHANNEL_PACKED"
-        width, height = image.size
-        pixels = np.empty(width * height * 4, np.float32)
-        image.pixels.foreach_get(pixels)
+        return image_pixels(image)[::-1].astype(np.float64)
     finally:
         bpy.data.images.remove(image)
-    return pixels.reshape(height, width, 4)[::-1].astype(np.float64)
 
 
 @contextmanager

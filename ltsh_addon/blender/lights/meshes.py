@@ -14,7 +14,7 @@ from ...cycles.patches import GRID, cut_into_patches, note_patches, split_light
 from ...cycles.planar_polygons import FlatPolygon
 from ...scene import Light, PolygonLight, QuadLight
 from ..evaluated import SURFACE_TYPES, EmitterTraits, RenderedSurface, is_rendered, read_values, surface_instancer
-from ..materials.graph import computed, ensure_nodes, fill_with_bsdf, live_link, material_output
+from ..materials.graph import computed, ensure_nodes, fill_with_bsdf, live_link, material_output, mixed
 from ..render_settings import changed_properties
 from .emission import (
     PIXELS,
@@ -486,18 +486,11 @@ def _let_through(material) -> None:
     both = tree.nodes.new("ShaderNodeAddShader")
     tree.links.new(original, both.inputs[0])
     tree.links.new(clear, both.inputs[1])
-    one_sided = _mix(tree, _is_dark_side(tree), both.outputs[0], clear)
+    one_sided = mixed(_is_dark_side(tree), both.outputs[0], clear)
     is_camera_ray = tree.nodes.new("ShaderNodeLightPath").outputs["Is Camera Ray"]
-    tree.links.new(_mix(tree, is_camera_ray, one_sided, original), output.inputs["Surface"])
+    tree.links.new(mixed(is_camera_ray, one_sided, original), output.inputs["Surface"])
     # The setting in the file only affects how well Cycles samples the light.
     material.cycles.emission_sampling = "FRONT_BACK"
-
-
-def _mix(tree, factor, first, second):
-    node = tree.nodes.new("ShaderNodeMixShader")
-    for source, target in zip((factor, first, second), node.inputs, strict=True):
-        tree.links.new(source, target)
-    return node.outputs[0]
 
 
 def _is_dark_side(tree):

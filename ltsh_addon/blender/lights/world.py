@@ -23,7 +23,16 @@ from ...cycles.environment import (
 )
 from ...cycles.patches import note_patches
 from ...scene import Light, SkyLight, listed
-from ..materials.graph import is_group, is_socket, source_of, surface_of, tree_in_use, value_of
+from ..materials.graph import (
+    is_group,
+    is_socket,
+    own_groups,
+    replaced_by_number,
+    source_of,
+    surface_of,
+    tree_in_use,
+    value_of,
+)
 from .emission import COMPARE_TELLS, CONSTANT_NODES, LIGHT_PATH, OF_CAMERA, open_studio, trees_of
 
 # Pixels along each side of a picture of a world. PLAIN: a world of one color. SMOOTH: one without fine detail.
@@ -188,7 +197,7 @@ def _observatory(scene, world, warn, by_cameras: bool = False):
         if not by_cameras:
             _store(copied.cycles_visibility, "camera", True)
         if tree_in_use(copied) is not None and not by_cameras:
-            groups = _own_groups(copied.node_tree)
+            groups = own_groups(copied.node_tree)
             _as_surfaces_see(copied, world.name, warn)
         with open_studio(scene) as studio:
             studio.scene.world = copied
@@ -231,16 +240,6 @@ def _without_volume(world) -> bool:
     return bool(links)
 
 
-def _own_groups(tree) -> list:
-    """Replace all node groups in `tree`, nested ones too, by copies; returns the copies."""
-    made = []
-    for node in tree.nodes:
-        if is_group(node) and node.node_tree is not None:
-            node.node_tree = node.node_tree.copy()
-            made += [node.node_tree, *_own_groups(node.node_tree)]
-    return made
-
-
 def _note_cameras(world, name: str, warn) -> None:
     """Warn of nodes whose values depend on the camera."""
     labels = set()
@@ -262,15 +261,10 @@ def _as_surfaces_see(world, name: str, warn) -> None:
     for node in _nodes(world):
         if node.bl_idname != LIGHT_PATH:
             continue
-        tree = node.id_data
-        for output in node.outputs:
-            targets = [link.to_socket for link in output.links]
-            if targets and output.name not in SEEN_BY_SURFACES:
+        for output in [output for output in node.outputs if output.is_linked]:
+            if output.name not in SEEN_BY_SURFACES:
                 unclear.add(output.name)
-            value = tree.nodes.new("ShaderNodeValue").outputs[0] if targets else None
-            for target in targets:
-                value.default_value = SEEN_BY_SURFACES.get(output.name, 0.0)
-                tree.links.new(value, target)
+            replaced_by_number(output, SEEN_BY_SURFACES.get(output.name, 0.0))
     if unclear:
         warn(
             f"world {name!r}: its light depends on {listed(sorted(unclear))} of a Light Path node, of which Cycles "

@@ -190,12 +190,7 @@ def let_shadow_rays_through(made_opaque: Iterable[OpaqueInput]) -> None:
                 )
             continue
         now = graph.live_link(target)
-        node = tree.nodes.new("ShaderNodeMixShader")
-        tree.links.new(is_camera_ray, node.inputs[0])
-        tree.links.new(before, node.inputs[1])
-        if now is not None:
-            tree.links.new(now.from_socket, node.inputs[2])
-        tree.links.new(node.outputs[0], target)
+        tree.links.new(graph.mixed(is_camera_ray, before, now and now.from_socket), target)
 
 
 def _show(surface, node_type: str, level: float) -> None:
@@ -398,12 +393,7 @@ def _write_aov(tree, name: str, value) -> None:
     node = tree.nodes.new("ShaderNodeOutputAOV")
     node.aov_name = AOV_PREFIX + name
     target = node.inputs["Color" if aov_kind(name) == "COLOR" else "Value"]
-    if graph.is_socket(value):
-        tree.links.new(value, target)
-    elif isinstance(value, tuple):
-        target.default_value = (*value[:3], 1.0)
-    else:
-        target.default_value = float(value)
+    graph.feed(target, (*value[:3], 1.0) if isinstance(value, tuple) else value)
 
 
 def declare_aovs(view_layer) -> None:

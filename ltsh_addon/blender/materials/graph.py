@@ -338,6 +338,47 @@ def cut(socket) -> None:
         socket.id_data.links.remove(link)
 
 
+def feed(socket, value) -> None:
+    """Let `value`, a socket or a constant, feed the input `socket`."""
+    if is_socket(value):
+        socket.id_data.links.new(value, socket)
+    else:
+        socket.default_value = value
+
+
+def feed_instead(output, other) -> None:
+    """Let the output `other` feed what `output` has fed."""
+    for target in [link.to_socket for link in output.links]:
+        output.id_data.links.new(other, target)
+
+
+def replaced_by_number(output, number: float):
+    """The output of a new node of this `number`, which feeds what `output` has fed."""
+    value = output.id_data.nodes.new("ShaderNodeValue").outputs[0]
+    value.default_value = number
+    feed_instead(output, value)
+    return value
+
+
+def mixed(factor, first, second):
+    """The output of a new Mix Shader node by the socket `factor`; None in place of a shader: nothing."""
+    node = factor.id_data.nodes.new(MIX)
+    for source, target in zip((factor, first, second), node.inputs, strict=True):
+        if source is not None:
+            node.id_data.links.new(source, target)
+    return node.outputs[0]
+
+
+def own_groups(tree) -> list:
+    """Replace all node groups in `tree`, nested ones too, by copies; returns the copies."""
+    made = []
+    for node in tree.nodes:
+        if is_group(node) and node.node_tree is not None:
+            node.node_tree = node.node_tree.copy()
+            made += [node.node_tree, *own_groups(node.node_tree)]
+    return made
+
+
 # FOLDED: what the operations of Math nodes are for numbers alone.
 FOLDED = {
     "DIVIDE": lambda first, second: first / second,
@@ -356,10 +397,7 @@ def computed(operation: str, *values, clamp: bool = False):
     node = tree.nodes.new("ShaderNodeMath")
     node.operation, node.use_clamp = operation, clamp
     for value, socket in zip(values, node.inputs, strict=False):
-        if is_socket(value):
-            tree.links.new(value, socket)
-        else:
-            socket.default_value = value
+        feed(socket, value)
     return node.outputs[0]
 
 
@@ -368,10 +406,7 @@ def vector(operation: str, *values):
     node = values[0].id_data.nodes.new("ShaderNodeVectorMath")
     node.operation = operation
     for value, socket in zip(values, [socket for socket in node.inputs if socket.enabled], strict=False):
-        if is_socket(value):
-            node.id_data.links.new(value, socket)
-        else:
-            socket.default_value = value
+        feed(socket, value)
     return next(socket for socket in node.outputs if socket.enabled)
 
 

@@ -19,10 +19,11 @@ from ...cycles.texels import MapValue, TextureFile, TextureValue
 from ...files import save_array
 from ...lobes.brdf import dielectric_reflectance
 from ...visibility.occluders import Transparency
-from ..evaluated import read_values
+from ..evaluated import image_pixels, read_values
 from ..render_settings import working_space
 from . import graph
 from .bsdfs import EMISSION
+from .preview_material import ViewFactor
 from .values import IDENTITY, READERS, is_srgb, opaque_pixels
 
 # UV_MAP: number of the map that shows the coordinates of the UV map being baked.
@@ -224,8 +225,8 @@ class MaterialPlan:
 
 # Transparency:
 
-LIGHT_PATH = "ShaderNodeLightPath"
-DIRECTIONAL = FRESNEL, LAYER_WEIGHT, GEOMETRY = "ShaderNodeFresnel", "ShaderNodeLayerWeight", "ShaderNodeNewGeometry"
+LIGHT_PATH, LAYER_WEIGHT, GEOMETRY = "ShaderNodeLightPath", "ShaderNodeLayerWeight", "ShaderNodeNewGeometry"
+DIRECTIONAL = "ShaderNodeFresnel", LAYER_WEIGHT, GEOMETRY
 # UNKNOWN: outputs of nodes that differ from shadow ray to shadow ray by more than `Transparency.cosines`.
 UNKNOWN = {"Ray Length", "Transparent Depth", "Incoming", "Reflection", "Window"}
 # COSINES: those of `Transparency.cosines` for shares that do not vary, closest at grazing angles, where Fresnel is
@@ -247,10 +248,10 @@ def shown_to_shadow_ray(node, output: str, number: float | None, cosine: float |
         return None
     if kind == GEOMETRY:
         return float(cosine < 0.0)
-    if output == "Facing":
-        blend = min(max(number, 0.0), 1.0 - 1e-5)
-        return 1.0 - abs(cosine) ** (2.0 * blend if blend < 0.5 else 0.5 / (1.0 - blend))
-    index = max(number, 1e-5) if kind == FRESNEL else 1.0 / max(1.0 - number, 1e-5)
+    factor = ViewFactor.of("facing" if output == "Facing" else "fresnel", number, kind == LAYER_WEIGHT)
+    if factor.kind == "facing":
+        return 1.0 - abs(cosine) ** factor.parameter
+    index = factor.parameter
     return float(dielectric_reflectance(abs(cosine), index if cosine >= 0.0 else 1.0 / index))
 
 
@@ -311,15 +312,14 @@ def baked_transparency(surface, studio) -> tuple[Transparency, float]:
                     type="EMIT", use_clear=False, uv_layer=layer.name, target="IMAGE_TEXTURES", save_mode="INTERNAL",
                     use_selected_to_active=False, **margin,
                 )  # fmt: skip
-        pixels = np.empty(size * size * 4, np.float32)
-        image.pixels.foreach_get(pixels)
+        pixels = image_pixels(image)
     finally:
         bpy.data.images.remove(image)
     mesh.calc_loop_triangles()
     triangles = len(mesh.loop_triangles)
     of_faces = is_chosen[read_values(mesh.loop_triangles, "polygon_index", (triangles,), np.int32)]
     corners = read_values(mesh.loop_triangles, "loops", (triangles, 3), np.int32)[of_faces]
-    colors = np.clip(np.nan_to_num(pixels.reshape(size, size, 4)[..., :3]), 0.0, 1.0)
+    colors = np.clip(np.nan_to_num(pixels[..., :3]), 0.0, 1.0)
     shares = colors.mean(axis=-1)
     return Transparency(1.0, shares, uv[corners], "EXTEND"), float(np.abs(colors - shares[..., None]).max())
 
@@ -348,17 +348,15 @@ def _emitting_share(material, random: float, image):
     """Within this context: a copy of `material` that emits what it lets through for shadow rays and bakes to `image`;
     what depends on their direction has its mean over COSINES. `random` is that of Object Info."""
     material = material.copy()
-    trees = [material.node_tree]
+    groups = graph.own_groups(material.node_tree)
     try:
         material.cycles.emission_sampling = "NONE"
         for name in ("Volume", "Displacement"):
             graph.cut(graph.material_output(material.node_tree).inputs[name])
-        for tree in trees:
+        for tree in (material.node_tree, *groups):
             for node in list(tree.nodes):
-                if graph.is_group(node) and node.node_tree is not None:
-                    node.node_tree = node.node_tree.copy()
-                    trees.append(node.node_tree)
-                elif any(socket.type == "SHADER" for socket in node.outputs):
+                is_whole = not (graph.is_group(node) and node.node_tree is not None)
+                if is_whole and any(socket.type == "SHADER" for socket in node.outputs):
                     _emit_share(node)
                 for output in [output for output in node.outputs if output.is_linked]:
                     values = _by_cosine(output)
@@ -366,40 +364,28 @@ def _emitting_share(material, random: float, image):
                     if (node.bl_idname, output.name) == ("ShaderNodeObjectInfo", "Random"):
                         mean = random
                     if mean is not None:
-                        value = tree.nodes.new("ShaderNodeValue").outputs[0]
-                        value.default_value = mean
-                        _feed_instead(output, value)
-        nodes = trees[0].nodes
+                        graph.replaced_by_number(output, mean)
+        nodes = material.node_tree.nodes
         nodes.active = nodes.new("ShaderNodeTexImage")
         nodes.active.image = image
         yield material
     finally:
         bpy.data.materials.remove(material)
-        for tree in trees[1:]:
-            bpy.data.node_groups.remove(tree)
+        for group in groups:
+            bpy.data.node_groups.remove(group)
 
 
 def _emit_share(node) -> None:
     """Let a shader node emit what it lets through instead; mixes and sums of shaders stay."""
     if any(socket.type == "SHADER" for socket in node.inputs):
         return
-    tree = node.id_data
-    emission = tree.nodes.new(EMISSION)
+    emission = node.id_data.nodes.new(EMISSION)
     value, target = 0.0, emission.inputs["Strength"]
     if node.bl_idname == graph.CLEAR:
         value, target = graph.value_of(node.inputs["Color"]), emission.inputs["Color"]
     elif node.bl_idname == graph.PRINCIPLED:
         alpha = graph.value_of(node.inputs["Alpha"])
         value = graph.computed("SUBTRACT", 1.0, alpha, clamp=True) if graph.is_socket(alpha) else max(1.0 - alpha, 0.0)
-    if graph.is_socket(value):
-        tree.links.new(value, target)
-    else:
-        target.default_value = value
+    graph.feed(target, value)
     for output in node.outputs:
-        _feed_instead(output, emission.outputs[0])
-
-
-def _feed_instead(output, other) -> None:
-    """Let the output `other` feed what `output` has fed."""
-    for target in [link.to_socket for link in output.links]:
-        output.id_data.links.new(other, target)
+        graph.feed_instead(output, emission.outputs[0])

@@ -11,6 +11,7 @@ import bpy
 import numpy as np
 
 from ...cycles.texels import EXTENSIONS, GRAY, INTERPOLATIONS
+from ..evaluated import image_pixels
 from .graph import Source, source_of
 
 # How Blender converts colors and vectors to numbers.
@@ -492,8 +493,5 @@ def is_srgb(image) -> bool | None:
 
 def opaque_pixels(image) -> np.ndarray | None:
     """Pixels (H, W, 3) float32, row 0 at the bottom; None if not all are opaque."""
-    width, height = image.size
-    pixels = np.empty(width * height * 4, np.float32)
-    image.pixels.foreach_get(pixels)
-    pixels = pixels.reshape(height, width, 4)
+    pixels = image_pixels(image)
     return pixels[..., :3] if (pixels[..., 3] == 1.0).all() else None

@@ -43,6 +43,10 @@ class BakeJob:
     shadows: str = "off"  # see `pixels.PixelJob`
     atlas: AtlasSettings | None = None  # make the UV map of an atlas
     in_one: bool = False  # all objects share one texture, as one record
+    bounces: str = "off"  # "on": also Cycles' indirect light, and Cycles' bake has it too
+    rest_samples: int = 64  # of Cycles for the indirect light
+    rest_passes: tuple[str, ...] = ()  # with bounces: of the indirect light; the diffuse one has no color
+    rest_rows: int = 1  # rows of texels of which it is baked at a time
 
 
 def extract_bake(job: BakeJob, folder: Path, *, progress: Progress | None = None) -> dict:

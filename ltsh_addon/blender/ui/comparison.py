@@ -8,6 +8,7 @@ import logging
 import bpy
 import numpy as np
 
+from ...cycles.texels import srgb_decode
 from ...imaging.color import LUMINANCE_WEIGHTS, color_bar, signed_error_colors
 from ...pipeline.mixer import LightPictures
 from ...pipeline.relight import RelightData
@@ -176,9 +177,7 @@ def _lookup_index(difference: np.ndarray, scale: float) -> np.ndarray:
 def _error_lookup() -> np.ndarray:
     """Linear colors (N, 3) that Blender's default display shows as the colors of `signed_error_colors`."""
     values = np.append(np.linspace(-1.0, 1.0, _LOOKUP_SIZE - 1), np.nan)
-    colors = signed_error_colors(values[None], 1.0)[0]
-    linear = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)  # IEC 61966-2-1
-    return linear.astype(np.float32)
+    return srgb_decode(signed_error_colors(values[None], 1.0)[0]).astype(np.float32)
 
 
 def _settle_later(scene) -> None:

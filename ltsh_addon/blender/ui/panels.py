@@ -244,6 +244,9 @@ class _Bake:
             column.prop(settings, name)
         if ob is not None and ob.type == "MESH":
             column.prop_search(settings, "bake_uv_map", ob.data, "uv_layers", icon="GROUP_UVS")
+        column.prop(settings, "bake_bounces")
+        if settings.bake_bounces:
+            column.prop(settings, "bake_rest_samples")
         column.prop(settings, "bake_error")
 
 

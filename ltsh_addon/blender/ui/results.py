@@ -18,6 +18,7 @@ from ...pipeline.mixer import MIXER_FILE, LightPictures, Mixer, MixerRow, moved_
 from ...pipeline.relight import OCCLUDERS_SUFFIX, RELIGHT_SUFFIX, RelightData, tint
 from ...scene import Light, SceneError, SurfaceSamples
 from ...visibility import Occluders
+from ..evaluated import image_pixels
 
 LAYER, SCENE = "ltsh_layer", "ltsh_scene"  # custom properties that mark our images
 PREFIX = "LTSH "
@@ -196,11 +197,8 @@ def pixels_of(image) -> np.ndarray:
         return np.empty((0, 0, 4), np.float32)
     known = _pixels.get(path)
     if known is None or known[0] != stamp:
-        width, height = image.size
-        flat = np.empty(4 * width * height, dtype=np.float32)
-        if flat.size:
-            image.pixels.foreach_get(flat)
-        known = (Path(path).stat().st_mtime_ns, (width, height)), flat.reshape(height, width, 4)
+        pixels = image_pixels(image)
+        known = (Path(path).stat().st_mtime_ns, tuple(image.size)), pixels
         while len(_pixels) >= PIXELS_KEPT:
             _pixels.pop(next(iter(_pixels)))
         _pixels[path] = known

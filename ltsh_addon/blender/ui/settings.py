@@ -320,6 +320,13 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
         name="Bake Passes", description="Parts of the reflected light. Shift-click to choose several",
         items=BAKE_PASS_ITEMS, options={"ENUM_FLAG"}, default={"specular", "diffuse"},
     )  # fmt: skip
+    bake_bounces: BoolProperty(
+        name="Bounces", description="Add bounced light by Cycles, denoised, and fit light at the seams of UV maps",
+    )  # fmt: skip
+    bake_rest_samples: IntProperty(
+        name="Bounce Samples", description="Samples per texel of Cycles for the bounced light",
+        default=64, min=1, max=65536,
+    )  # fmt: skip
     bake_error: BoolProperty(
         name="Compare with Cycles", description="Bake the same texels with Cycles too and measure the signed error",
         default=False,
@@ -372,7 +379,8 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
 
 SUBFOLDER = "ltsh"
 KEPT = ("techniques", "resolution_percentage", "anti_aliasing", "cycles_samples", "shadows", "shadow_rays",
-        "keep_lights", "bake_size", "bake_margin", "bake_view", "bake_passes", "bake_error")  # fmt: skip
+        "keep_lights", "bake_size", "bake_margin", "bake_view", "bake_passes", "bake_error",
+        "bake_bounces", "bake_rest_samples")  # fmt: skip
 
 
 class LTSH_OT_add_preset(AddPresetBase, bpy.types.Operator):

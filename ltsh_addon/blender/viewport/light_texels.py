@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import gpu
 import numpy as np
 
-from ...cycles.environment import CUBE, SkyPicture, sky_lights
+from ...cycles.environment import CUBE, SkyPicture, sky_lights, summed
 from ...emitters import light_profile
 from ...emitters.facing import LEAST_SHRINKING, NEAR_DISK
 from ...emitters.light_polygons import ROUND_CORNERS, ROUND_LIMITS
@@ -302,14 +302,8 @@ def coarse(picture: SkyPicture) -> SkyPicture:
     """The picture, reduced to at most `CUBE_SIZE` pixels along each side."""
     while len(picture.radiance) > CUBE_SIZE:
         weight = picture.solid_angles()[..., None]
-        picture = replace(picture, radiance=_summed(picture.radiance * weight) / _summed(weight))
+        picture = replace(picture, radiance=summed(picture.radiance * weight) / summed(weight))
     return picture
-
-
-def _summed(values: np.ndarray) -> np.ndarray:
-    """Sums over blocks of 2 x 2."""
-    rows = values[0::2] + values[1::2]
-    return rows[:, 0::2] + rows[:, 1::2]
 
 
 def directions(size: int) -> np.ndarray:
@@ -360,7 +354,7 @@ def _interpolated(values: np.ndarray, row: np.ndarray, column: np.ndarray) -> np
 def halved(picture: np.ndarray) -> np.ndarray:
     """Means over blocks of 2 x 2 texels, weighted by their solid angles."""
     weight = solid_angles(len(picture))[..., None]
-    return _summed(picture * weight) / _summed(weight)
+    return summed(picture * weight) / summed(weight)
 
 
 def mean_of(picture: np.ndarray) -> np.ndarray:

@@ -152,7 +152,8 @@ class ViewRenderer:
         self._shown, self.samples = None, 0  # the state of the pictures, and the number of their points
         self._lighting_state: LightingState | None = None
         self._static: StaticLighting | None = None
-        self._is_split = False  # the pictures have static lighting
+        # Where lights alone have changed, the first picture has the others' light of before: the pictures are split.
+        self.may_split, self._is_split = True, False
         self._sky, self._sky_light, self._background = None, None, None
         self.step = 1  # pixels in either direction for which one is drawn, as while a view moves
         self._size = (1, 1)  # of what is shown
@@ -190,7 +191,7 @@ class ViewRenderer:
         if self.samples < len(points):
             self._shown = None  # until the sample is complete
             lit_by = None
-            if not is_same:
+            if self.may_split and not is_same:
                 lit_by = (mirror, mirror.sky, self.shadows), (*frame.surfaces[1], frame.content)
             sample = replace(frame, view=frame.view.shifted(points[self.samples], size))
             is_drawn = self._draw_sample(sample, lit_by)

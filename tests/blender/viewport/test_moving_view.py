@@ -11,7 +11,7 @@ from ltsh_addon.blender.engine import redraws
 from ltsh_addon.blender.viewport import shadows
 from ltsh_addon.blender.viewport.drawing import float_texture
 from ltsh_addon.blender.viewport.pictures import ShownPicture, ShownRest
-from ltsh_addon.blender.viewport.shadow_rays import ShadowRays, view_occluders
+from ltsh_addon.blender.viewport.shadow_rays import ShadowRays, ViewTracer, view_occluders
 from ltsh_addon.blender.viewport.shadows import LiveShadows, ShadowRequest
 
 SIZE = (72, 48)
@@ -110,7 +110,7 @@ def live_steps():
             return opened.draw(shown)[..., :3].astype(np.float64)
 
         try:
-            exact, plain = drawn(1, ShadowRays(collect(), 256)), drawn(1, None)
+            exact, plain = drawn(1, ShadowRays(ViewTracer(collect()), 256)), drawn(1, None)
             drawn(2, live)
             live._thread.join()
             drawn(2, live)

@@ -21,6 +21,10 @@ from .bake_meshes import ObjectError, apply_modifiers, check_object, uv_of
 BORDER = 2
 # SHARPEST: faces of an island face within this angle of its direction, as Blender's Smart UV Project has it.
 SHARPEST = math.radians(66.0)
+# EACH_FACE: settings of Blender's Lightmap Pack.
+EACH_FACE = {"PREF_CONTEXT": "ALL_FACES", "PREF_PACK_IN_ONE": True, "PREF_NEW_UVLAYER": False}
+# BOXES: islands are packed as boxes: their shapes save 5 % and take a thousand times as long.
+BOXES = {"shape_method": "AABB"}
 # DENSITY: custom property of objects, a factor of their texels per metre.
 DENSITY = "ltsh_density"
 
@@ -30,6 +34,7 @@ class Island:
     """The mesh of an object in world space, in a scene of its own, with a UV map."""
 
     copy: bpy.types.Object
+    scene: bpy.types.Scene
     density: float  # factor of the texels per metre
 
     @property
@@ -81,8 +86,9 @@ def make_atlas(objects, settings: AtlasSettings) -> tuple[dict[str, float], dict
     with _islands(objects) as (islands, problems):
         if not islands:
             return {}, problems
-        _unwrap(islands.values(), settings.unwrap)
-        Packing(list(islands.values()), settings).pack()
+        unwrapped = list(islands.values())
+        _unwrap(unwrapped, settings.unwrap)
+        Packing(unwrapped, settings).pack()
         for ob, island in islands.items():
             ob.data.uv_layers[ATLAS].uv.foreach_set("vector", island.uv().astype(np.float32).ravel())
         return {ob.name: settings.side * island.units_per_metre() for ob, island in islands.items()}, problems
@@ -105,8 +111,8 @@ def _islands(objects):
     """
     scene, islands, problems = bpy.data.scenes.new("ltsh atlas"), {}, {}
     try:
-        # Without, 4.5 packs nothing.
-        scene.tool_settings.use_uv_select_sync = True
+        tool_settings = scene.tool_settings
+        tool_settings.use_uv_select_sync = True  # without, 4.5 packs nothing
         for ob in objects:
             try:
                 islands[ob] = _island(ob, scene)
@@ -114,8 +120,9 @@ def _islands(objects):
                 problems[ob.name] = str(error)
         yield islands, problems
     finally:
-        meshes = [ob.data for ob in scene.objects]
-        bpy.data.batch_remove([*scene.objects, *meshes, scene])
+        for mesh in [ob.data for ob in scene.objects]:
+            bpy.data.meshes.remove(mesh)  # with its object
+        bpy.data.scenes.remove(scene)
 
 
 def _island(ob, scene) -> Island:
@@ -132,7 +139,7 @@ def _island(ob, scene) -> Island:
     mesh.uv_layers.new(do_init=False)
     copy = bpy.data.objects.new(ob.name, mesh)
     scene.collection.objects.link(copy)
-    island = Island(copy, float(density))
+    island = Island(copy, scene, float(density))
     if not island.area() > 0.0:
         raise ObjectError(f"object {ob.name!r} has no faces with an area, nothing to bake")
     layers = ob.data.uv_layers
@@ -148,7 +155,7 @@ def _island(ob, scene) -> Island:
 def _editing(islands):
     """Within this context all faces are edited, selected."""
     copies = [island.copy for island in islands]
-    scene = copies[0].users_scene[0]
+    scene = islands[0].scene
     layer = scene.view_layers[0]
     for copy in copies:
         copy.select_set(True, view_layer=layer)
@@ -158,7 +165,8 @@ def _editing(islands):
     with bpy.context.temp_override(**context, **dict.fromkeys(names[:2], copies)):
         bpy.ops.object.mode_set(mode="EDIT")
         try:
-            with bpy.context.temp_override(edit_object=copies[0], **dict.fromkeys(names, copies)):
+            edited = {"edit_object": copies[0], **dict.fromkeys(names, copies)}
+            with bpy.context.temp_override(**edited):
                 bpy.ops.mesh.select_all(action="SELECT")
                 yield
         finally:
@@ -168,10 +176,12 @@ def _editing(islands):
 def _unwrap(islands, how: str) -> None:
     with _editing(islands):
         if how == "faces":
-            bpy.ops.uv.lightmap_pack(PREF_CONTEXT="ALL_FACES", PREF_PACK_IN_ONE=True, PREF_NEW_UVLAYER=False)
+            lightmap_pack = bpy.ops.uv.lightmap_pack
+            lightmap_pack(**EACH_FACE)
         else:
-            bpy.ops.uv.smart_project(angle_limit=SHARPEST, correct_aspect=False)
-        bpy.ops.uv.average_islands_scale()
+            bpy.ops.uv.smart_project(angle_limit=SHARPEST)
+        average_islands_scale = bpy.ops.uv.average_islands_scale
+        average_islands_scale()
 
 
 class Packing:
@@ -204,19 +214,19 @@ class Packing:
 
     def _fit(self) -> float:
         """Pack the islands as large as they fit; returns their density, rounded down to hundredths."""
-        self._pack(1.0, margin_method="FRACTION", margin=BORDER / self.settings.side)
+        self._pack(1.0, {"margin_method": "FRACTION", "margin": BORDER / self.settings.side})
         first = self.islands[0]
         return math.floor(100.0 * self.settings.side * first.units_per_metre() / first.density) / 100.0
 
     def _extent(self, side: int, density: float) -> float:
         """Pack the islands with so many texels per metre; returns what share of the `side` they take."""
-        self._pack(density / side, scale=False, margin_method="ADD", margin=BORDER / side)
+        self._pack(density / side, {"scale": False, "margin_method": "ADD", "margin": BORDER / side})
         # Half a texel is no reason to take another size.
         return max(island.uv().max() for island in self.islands) + (BORDER - 0.5) / side
 
-    def _pack(self, factor: float, **options) -> None:
+    def _pack(self, factor: float, options: dict) -> None:
+        pack_islands = bpy.ops.uv.pack_islands
         for island, uv in zip(self.islands, self._uv, strict=True):
             island.set_uv(uv * factor)
-        # Boxes around islands: their shapes save 5 % and take a thousand times as long.
         with _editing(self.islands):
-            bpy.ops.uv.pack_islands(rotate=True, shape_method="AABB", **options)
+            pack_islands(**options, **BOXES)

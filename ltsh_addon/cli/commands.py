@@ -20,7 +20,6 @@ from ..pipeline.options import (
     PictureOptions,
     RenderOptions,
     ViewOptions,
-    arguments_of,
     options_from,
     real_number,
 )
@@ -163,24 +162,17 @@ def job_of(arguments, scenes: tuple[Path, ...]) -> BatchJob:
     if command == "bake" and arguments.apply and (len(cameras) > 1 or len(frames) > 1):
         raise Misuse("--apply makes materials show one texture: give one frame and one camera with it")
     if command == "bake":
-        _check_atlas(arguments)
+        side, size = arguments.atlas, arguments.size
+        if (side is None or arguments.uv) and (arguments.texels_per_metre or arguments.unwrap != "smart"):
+            raise Misuse(
+                "--texels-per-metre and --unwrap are for the UV map of --atlas N: give it, without --uv"
+            )
+        if side is not None and size not in (BakeOptions.size, (side, side)):
+            raise Misuse("--atlas N is the size of the texture that all objects share: leave out --size")
     if command == "render" and arguments.budget is not None and arguments.cycles_samples is not None:
         raise Misuse("--budget chooses the samples of Cycles: give it or --cycles-samples, not both")
     options = options_from(kind, vars(arguments), scene=scenes[0])
     return BatchJob(command, options, scenes, cameras, frames, arguments.pattern)
-
-
-def _check_atlas(arguments) -> None:
-    """Raise Misuse where arguments of a bake say different things about an atlas, or need one."""
-    default = arguments_of(BakeOptions)["size"][0]
-    if arguments.atlas is None and (arguments.texels_per_metre is not None or arguments.unwrap != "smart"):
-        raise Misuse("--texels-per-metre and --unwrap are for an atlas: give --atlas N with them")
-    if arguments.atlas is None:
-        return
-    if arguments.size not in (default, (arguments.atlas, arguments.atlas)):
-        raise Misuse("--atlas N is the size of the texture that all objects share: leave out --size")
-    if arguments.uv is not None and (arguments.texels_per_metre is not None or arguments.unwrap != "smart"):
-        raise Misuse("--uv names an atlas that is there: leave out --texels-per-metre and --unwrap")
 
 
 def _printed(arguments, document: dict, code: int) -> int:

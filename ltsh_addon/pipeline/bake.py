@@ -549,7 +549,7 @@ def _report(options, manifest, records) -> dict:
                 why = "because Cycles bakes nothing there: apply the modifiers"
                 warnings.append(f"{name}: {share:.3g} % of its texels are left out, {why}")
             warnings += [
-                f"object {member!r} has no texel of the atlas: its islands are smaller than one; raise its ltsh_density"
+                f"object {member!r} has no texel of the atlas: its islands are too small, or lie below others"
                 for member, texels in tile.get("member_texels", {}).items()
                 if not texels
             ]

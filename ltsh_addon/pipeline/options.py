@@ -78,12 +78,20 @@ def one_table(text: str) -> tuple[str, ...]:
     return (table(text),)
 
 
-def seconds(text: str) -> float:
-    """Seconds of a budget."""
-    value = real_number(text)
-    if not 0.0 < value < 1e9:
-        raise ValueError(f"budget is {text!r}, expected seconds of processor time, more than 0")
-    return value
+def amount(what: str, expected: str) -> Callable[[str], float]:
+    """The parser of numbers above 0; errors begin with `what`, such as "budget is"."""
+
+    def parse(text: str) -> float:
+        value = real_number(text)
+        if not 0.0 < value < 1e9:
+            raise ValueError(f"{what} {text!r}, expected {expected}, more than 0")
+        return value
+
+    return parse
+
+
+seconds = amount("budget is", "seconds of processor time")
+texels_per_metre = amount("texels per metre are", "a number")
 
 
 def passes(known: tuple[str, ...]) -> Callable[[str], tuple[str, ...]]:
@@ -172,14 +180,6 @@ margin = whole_number("margin is", 0, MOST_MARGIN)  # width of the margin around
 
 
 atlas = whole_number("atlas is", *TEXTURE_SIDES)  # texels on each side of the texture that all objects share
-
-
-def texels_per_metre(text: str) -> float:
-    """A density of texels, above 0."""
-    value = real_number(text)
-    if not 0.0 < value < 1e6:
-        raise ValueError(f"texels per metre are {text!r}, expected a number above 0")
-    return value
 
 
 def cycles_samples(text: str) -> int:

@@ -11,7 +11,8 @@ from ..materials.graph import cut, ensure_nodes, material_output
 from ..process.bake import ApplyJob, AtlasSettings, BakedTextures
 from ..render_settings import go_to_frame
 from ..saving import save_copy
-from .atlas import add_atlas
+from .atlas import make_atlas
+from .bake_meshes import apply_modifiers
 from .pixels import open_scene
 
 GROUP_PREFIX = "LTSH Bake"
@@ -42,7 +43,8 @@ def restore_atlas(job) -> None:
     go_to_frame(bpy.context.scene, job.frame)
     settings, names = dict(job.atlas), job.atlas["objects"]
     del settings["objects"]
-    add_atlas(bpy.context.scene, _objects(names, job), AtlasSettings(**settings))
+    apply_modifiers(bpy.context.scene, _objects(names, job), None, every=True)
+    make_atlas(_objects(names, job), AtlasSettings(**settings))
 
 
 def _objects(names, job) -> list:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -14,7 +13,7 @@ from ...cycles.uv import cross
 from ...scene import ATLAS, SceneError
 from ..evaluated import read_values
 from ..process.bake import AtlasSettings
-from .bake_meshes import ObjectError, apply_modifiers, check_object, uv_of
+from .bake_meshes import ObjectError, check_object, uv_of
 
 # BORDER: texels around islands that no other has, so that twice as many lie between islands: bilinear lookups stay
 # within the margin of an island down to the second mip level.
@@ -37,17 +36,9 @@ class Island:
     scene: bpy.types.Scene
     density: float  # factor of the texels per metre
 
-    @property
-    def layer(self):
-        return self.copy.data.uv_layers[0]
-
     def uv(self) -> np.ndarray:
         """UV coordinates (C, 2) of the corners of the faces."""
-        return uv_of(self.layer, len(self.copy.data.loops)).astype(np.float64)
-
-    def set_uv(self, uv: np.ndarray) -> None:
-        """Set the UV coordinates (C, 2)."""
-        self.layer.uv.foreach_set("vector", uv.astype(np.float32).ravel())
+        return uv_of(self.copy.data.uv_layers[0], len(self.copy.data.loops)).astype(np.float64)
 
     def area(self) -> float:
         """Area of the surface in square metres."""
@@ -62,27 +53,12 @@ class Island:
         return math.sqrt(0.5 * np.abs(cross(b - a, c - a)).sum() / self.area())
 
 
-def add_atlas(scene, objects, settings: AtlasSettings) -> tuple[dict[str, float], dict[str, str]]:
-    """`make_atlas` for a bake, in a copy of the file: all modifiers are applied, since copied faces need texels too."""
-    problems = {}
-    for ob in objects:
-        try:
-            check_object(ob)
-        except ObjectError as error:
-            problems[ob.name] = str(error)
-    usable = [ob for ob in objects if ob.name not in problems]
-    apply_modifiers(scene, usable, None, every=True)
-    densities, unfit = make_atlas(usable, settings)
-    return densities, problems | unfit
-
-
 def make_atlas(objects, settings: AtlasSettings) -> tuple[dict[str, float], dict[str, str]]:
-    """Give mesh `objects` the UV map of an atlas; returns the texels per metre, and the problems of others, by name.
+    """Give `objects` the UV map of an atlas; returns the texels per metre, and the problems of others, by name.
 
     Objects that share a mesh get one each. Nothing else of the scene changes. Raises SceneError where the islands do
     not fit.
     """
-    make_single(objects)
     with _islands(objects) as (islands, problems):
         if not islands:
             return {}, problems
@@ -94,13 +70,10 @@ def make_atlas(objects, settings: AtlasSettings) -> tuple[dict[str, float], dict
         return {ob.name: settings.side * island.units_per_metre() for ob, island in islands.items()}, problems
 
 
-def make_single(objects) -> None:
-    """Give each of `objects` that share a mesh one of its own."""
-    shared = Counter(ob.data for ob in objects)
-    for ob in objects:
-        if shared[ob.data] > 1:
-            shared[ob.data] -= 1
-            ob.data = ob.data.copy()
+def make_single(ob) -> None:
+    """Give `ob` a mesh that no other object has."""
+    if ob.type == "MESH" and ob.library is None and ob.data.users > 1:
+        ob.data = ob.data.copy()
 
 
 @contextmanager
@@ -127,6 +100,8 @@ def _islands(objects):
 
 def _island(ob, scene) -> Island:
     """The Island of `ob` in `scene`; the mesh of `ob` gets the UV map of the atlas, not yet filled."""
+    check_object(ob)
+    make_single(ob)
     density = ob.get(DENSITY, 1.0)
     if not isinstance(density, int | float) or not 0.0 < density < math.inf:
         raise ObjectError(f"object {ob.name!r}: its property {DENSITY!r} is {density!r}, expected a number above 0")
@@ -227,6 +202,6 @@ class Packing:
     def _pack(self, factor: float, options: dict) -> None:
         pack_islands = bpy.ops.uv.pack_islands
         for island, uv in zip(self.islands, self._uv, strict=True):
-            island.set_uv(uv * factor)
+            island.copy.data.uv_layers[0].uv.foreach_set("vector", (uv * factor).astype(np.float32).ravel())
         with _editing(self.islands):
             pack_islands(**options, **BOXES)

@@ -251,11 +251,13 @@ def _open(job: BakeJob) -> BakeScene:
         view_layer.material_override = None
     folder = tempfile.TemporaryDirectory(prefix="ltsh-meshes-", ignore_cleanup_errors=True)
     has_shadows = job.shadows == "on"
+    # Faces that modifiers copy need texels of an atlas too.
+    bake_meshes.apply_modifiers(scene, objects, job.uv, every=job.atlas is not None)
+    for ob in objects if job.in_one else ():
+        atlas.make_single(ob)
     densities, unfit = {}, {}
-    if job.atlas is None:
-        bake_meshes.apply_modifiers(scene, objects, job.uv)
-    else:
-        densities, unfit = atlas.add_atlas(scene, objects, AtlasSettings(**job.atlas))
+    if job.atlas is not None:
+        densities, unfit = atlas.make_atlas(objects, AtlasSettings(**job.atlas))
     usable = [ob for ob in objects if ob.name not in unfit]
     uv_name = job.uv if job.atlas is None else ATLAS
     files = Path(folder.name), has_shadows

@@ -164,9 +164,7 @@ def job_of(arguments, scenes: tuple[Path, ...]) -> BatchJob:
     if command == "bake":
         side, size = arguments.atlas, arguments.size
         if (side is None or arguments.uv) and (arguments.texels_per_metre or arguments.unwrap != "smart"):
-            raise Misuse(
-                "--texels-per-metre and --unwrap are for the UV map of --atlas N: give it, without --uv"
-            )
+            raise Misuse("--texels-per-metre and --unwrap are for the UV map of --atlas N: give it, without --uv")
         if side is not None and size not in (BakeOptions.size, (side, side)):
             raise Misuse("--atlas N is the size of the texture that all objects share: leave out --size")
     if command == "render" and arguments.budget is not None and arguments.cycles_samples is not None:

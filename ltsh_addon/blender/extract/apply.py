@@ -43,7 +43,7 @@ def restore_atlas(job) -> None:
     go_to_frame(bpy.context.scene, job.frame)
     settings, names = dict(job.atlas), job.atlas["objects"]
     del settings["objects"]
-    apply_modifiers(bpy.context.scene, _objects(names, job), None, every=True)
+    apply_modifiers(bpy.context.scene, _objects(names, job))
     make_atlas(_objects(names, job), AtlasSettings(**settings))
 
 

@@ -251,8 +251,7 @@ def _open(job: BakeJob) -> BakeScene:
         view_layer.material_override = None
     folder = tempfile.TemporaryDirectory(prefix="ltsh-meshes-", ignore_cleanup_errors=True)
     has_shadows = job.shadows == "on"
-    # Faces that modifiers copy need texels of an atlas too.
-    bake_meshes.apply_modifiers(scene, objects, job.uv, every=job.atlas is not None)
+    bake_meshes.apply_modifiers(scene, objects)
     for ob in objects if job.in_one else ():
         atlas.make_single(ob)
     densities, unfit = {}, {}

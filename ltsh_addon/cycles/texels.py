@@ -102,15 +102,8 @@ class TexelMesh:
 
     @classmethod
     def joined(cls, meshes: Sequence[TexelMesh]) -> TexelMesh:
-        """All `meshes` as one; numbers that hold for a whole mesh become arrays (T,)."""
-
-        def of_triangles(name):
-            whole = name in ("mirrored", "receiver", "object")
-            values = [getattr(mesh, name) for mesh in meshes]
-            counts = [len(mesh.corners) for mesh in meshes]
-            return [np.full(n, value) for value, n in zip(values, counts, strict=True)] if whole else values
-
-        return cls(**{item.name: np.concatenate(of_triangles(item.name)) for item in fields(cls)})
+        """All `meshes` as one; what may hold for a whole mesh must be arrays (T,)."""
+        return cls(**{item.name: np.concatenate([getattr(mesh, item.name) for mesh in meshes]) for item in fields(cls)})
 
     def true_normals(self) -> np.ndarray:
         """Unit normals (T, 3) of the faces. A smooth normal may point to the other side, for example on a bent quad."""

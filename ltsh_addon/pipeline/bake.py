@@ -129,20 +129,9 @@ def _job(options, finished, tile=None, following=()):
         finished=tuple(finished),
         tile=tile,
         following=following,
-        atlas=atlas_settings(options),
-        in_one=options.atlas is not None,
         rest_passes=lightmap.rest_passes(options.passes),
         rest_rows=lightmap.rest_rows(options.size),
     )
-
-
-def atlas_settings(options):
-    """The AtlasSettings of the UV map that the bake makes; None without an atlas, or where `uv` names its UV map."""
-    from ..blender.process.bake import AtlasSettings
-
-    if options.atlas is None or options.uv is not None:
-        return None
-    return AtlasSettings(options.atlas, options.texels_per_metre, options.unwrap)
 
 
 def block_rows(options) -> int:
@@ -393,8 +382,7 @@ class TilePoints:
     def __init__(self, baker: ObjectBaker, tile: int, threads: int):
         options = baker.options
         self._options, self._folder, self._tile = options, baker.folder, tile
-        self._mapped, self._all_mapped = any(baker.record["maps"]), all(baker.record["maps"])
-        self._has_maps = np.array(baker.record["maps"])[baker.mesh.object]  # (T,)
+        self._mapped = baker.record["maps"]
         self._width = baker.manifest["sampled_texels"]
         self._triangles = uv.UvTriangles.in_tile(baker.mesh.uv, *options.size, _column_and_row(tile))
         self._at_centers = bakes_centers_alone(options, baker.record)
@@ -420,11 +408,7 @@ class TilePoints:
         if count == 1:
             return texels, maps, None
         positions = self._positions(texels, maps, first, point)
-        moved, weights = self._triangles.at(texels, positions), self._weights_of(first).at(positions)
-        if not self._all_mapped:
-            free, even = ~self._has_maps[texels.triangle], self._triangles.spread(texels, point, count, self._width)
-            moved.barycentric[free], weights[free] = even.barycentric[free], 1.0
-        return moved, maps, weights
+        return self._triangles.at(texels, positions), maps, self._weights_of(first).at(positions)
 
     @property
     def corners(self) -> np.ndarray:
@@ -451,7 +435,7 @@ class TilePoints:
         if not self._mapped:
             path = self._folder / f"cycles_{sorted(shaded_passes(self._options))[0]}_{self._tile}_{first}.npy"
         baked = np.load(path, mmap_mode="r")[0].reshape(-1, 3)[texels.index, 0] != np.float32(NOT_BAKED)
-        return texels.baked(baked if self._options.error else baked | ~self._has_maps[texels.triangle])
+        return texels.baked(baked)
 
     def _file(self, first, point):
         return self._folder / f"maps_{self._tile}_{first}_{point}.npy"
@@ -461,11 +445,7 @@ class TilePoints:
         if point == 0:
             return self._triangles.places(texels)
         rows, width = maps.shape[1:3]
-        positions = maps[-1].reshape(-1, 3)[texels.index, :2] * (width, rows) + (0, first)
-        if not self._all_mapped:
-            free = ~self._has_maps[texels.triangle]
-            positions[free] = self._triangles.places(texels)[free]
-        return positions
+        return maps[-1].reshape(-1, 3)[texels.index, :2] * (width, rows) + (0, first)
 
     def _fitted_weights(self, first):
         texels, points = self.texels(first), range(self._options.sub_samples)
@@ -476,7 +456,7 @@ class TilePoints:
 
 def bakes_centers_alone(options: BakeOptions, record: dict) -> bool:
     """True where an object needs Cycles' own bake, which has only texels whose centers are covered."""
-    return any(record["maps"]) or options.error or options.bounces == "on"
+    return record["maps"] or options.error or options.bounces == "on"
 
 
 def _map_reader(maps, texels):
@@ -539,7 +519,7 @@ def _report(options, manifest, records) -> dict:
         wrong, note = _darkness(record, reasons[record["name"]])
         problems += wrong
         warnings += note
-        name = title(record)
+        name = f"object {record['name']!r}"
         if (share := 100 * record["outside"]) > 100 * NOTED_SHARE_OUTSIDE:
             warnings.append(f"{name}: {share:.3g} % of UV map {record['uv']!r} lies outside of the texture, not baked")
         for tile in record["tiles"].values():
@@ -571,14 +551,9 @@ def _report(options, manifest, records) -> dict:
     }
 
 
-def title(record: dict) -> str:
-    """What the warnings about a record of the report begin with."""
-    return "the atlas" if "members" in record else f"object {record['name']!r}"
-
-
 def _darkness(record, reasons) -> tuple[list[str], list[str]]:
     """Problems and warnings of a dark object: most of its texels are not shaded, for `reasons`, or no light arrives."""
-    tiles, name = record["tiles"].values(), title(record)
+    tiles, name = record["tiles"].values(), f"object {record['name']!r}"
     texels, unshaded = (sum(tile[key] for tile in tiles) for key in ("texels", "unshaded_texels"))
     if 2 * unshaded > texels:
         share = f"{100.0 * unshaded / texels:.3g} %"

@@ -8,7 +8,7 @@ import bpy
 
 from ...scene import SceneError
 from ..materials.graph import cut, ensure_nodes, material_output
-from ..process.bake import ApplyJob, AtlasSettings, BakedTextures
+from ..process.bake import ApplyJob, BakedTextures
 from ..render_settings import go_to_frame
 from ..saving import save_copy
 from .atlas import make_atlas
@@ -41,10 +41,9 @@ def restore_atlas(job) -> None:
     if job.atlas is None:
         return
     go_to_frame(bpy.context.scene, job.frame)
-    settings, names = dict(job.atlas), job.atlas["objects"]
-    del settings["objects"]
-    apply_modifiers(bpy.context.scene, _objects(names, job))
-    make_atlas(_objects(names, job), AtlasSettings(**settings))
+    objects = _objects(job.atlas["objects"], job)
+    apply_modifiers(bpy.context.scene, objects)
+    make_atlas(**{**job.atlas, "objects": objects})
 
 
 def _objects(names, job) -> list:

@@ -12,7 +12,6 @@ import numpy as np
 from ...cycles.uv import cross
 from ...scene import ATLAS, SceneError
 from ..evaluated import read_values
-from ..process.bake import AtlasSettings
 from .bake_meshes import ObjectError, check_object, uv_of
 
 # BORDER: texels around islands that no other has, so that twice as many lie between islands: bilinear lookups stay
@@ -53,21 +52,24 @@ class Island:
         return math.sqrt(0.5 * np.abs(cross(b - a, c - a)).sum() / self.area())
 
 
-def make_atlas(objects, settings: AtlasSettings) -> tuple[dict[str, float], dict[str, str]]:
+def make_atlas(
+    objects, side: int, density: float | None = None, unwrap: str = "smart"
+) -> tuple[dict[str, float], dict[str, str]]:
     """Give `objects` the UV map of an atlas; returns the texels per metre, and the problems of others, by name.
 
-    Objects that share a mesh get one each. Nothing else of the scene changes. Raises SceneError where the islands do
-    not fit.
+    The texture has `side` texels a side, the surface `density` texels per metre (None: as many as fit); `unwrap` is
+    "smart", or "faces" where every edge is a seam. Objects that share a mesh get one each. Nothing else of the scene
+    changes. Raises SceneError where the islands do not fit.
     """
     with _islands(objects) as (islands, problems):
         if not islands:
             return {}, problems
         unwrapped = list(islands.values())
-        _unwrap(unwrapped, settings.unwrap)
-        Packing(unwrapped, settings).pack()
+        _unwrap(unwrapped, unwrap)
+        Packing(unwrapped, side).pack(density)
         for ob, island in islands.items():
             ob.data.uv_layers[ATLAS].uv.foreach_set("vector", island.uv().astype(np.float32).ravel())
-        return {ob.name: settings.side * island.units_per_metre() for ob, island in islands.items()}, problems
+        return {ob.name: side * island.units_per_metre() for ob, island in islands.items()}, problems
 
 
 def make_single(ob) -> None:
@@ -162,14 +164,14 @@ def _unwrap(islands, how: str) -> None:
 class Packing:
     """Packs unwrapped `islands` into the unit square. Each try begins with the same islands, so it can be repeated."""
 
-    def __init__(self, islands: list[Island], settings: AtlasSettings):
-        self.islands, self.settings = islands, settings
+    def __init__(self, islands: list[Island], side: int):
+        self.islands, self.side = islands, side
         # Their units are metres, but for the islands' own densities.
         self._uv = [island.uv() * (island.density / island.units_per_metre()) for island in islands]
 
-    def pack(self) -> None:
+    def pack(self, density: float | None) -> None:
         """Pack them at the wanted density, or as large as they fit. Raises SceneError where they do not fit."""
-        side, density = self.settings.side, self.settings.texels_per_metre
+        side = self.side
         if density is None:
             self._fit()
             return
@@ -180,18 +182,18 @@ class Packing:
             side = max(math.ceil(side * extent), side + 1)
             extent = self._extent(side, density)
         possible = self._fit()
-        while self._extent(self.settings.side, possible) > 1.0:
+        while self._extent(self.side, possible) > 1.0:
             possible = math.floor(possible * 99.0) / 100.0
         raise SceneError(
-            f"the atlas has {self.settings.side} texels a side, {density:g} texels per metre take {side}: make it "
+            f"the atlas has {self.side} texels a side, {density:g} texels per metre take {side}: make it "
             f"larger, or take at most {possible:g} texels per metre"
         )
 
     def _fit(self) -> float:
         """Pack the islands as large as they fit; returns their density, rounded down to hundredths."""
-        self._pack(1.0, {"margin_method": "FRACTION", "margin": BORDER / self.settings.side})
+        self._pack(1.0, {"margin_method": "FRACTION", "margin": BORDER / self.side})
         first = self.islands[0]
-        return math.floor(100.0 * self.settings.side * first.units_per_metre() / first.density) / 100.0
+        return math.floor(100.0 * self.side * first.units_per_metre() / first.density) / 100.0
 
     def _extent(self, side: int, density: float) -> float:
         """Pack the islands with so many texels per metre; returns what share of the `side` they take."""

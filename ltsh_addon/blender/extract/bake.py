@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 import time
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import bpy
@@ -23,7 +23,7 @@ from ..lights.world import take_world
 from ..materials import aovs
 from ..materials.graph import ensure_nodes
 from ..materials.maps import UV_MAP, MaterialPlan, SavedImages
-from ..process.bake import AtlasSettings, BakeFactsJob, BakeJob
+from ..process.bake import BakeFactsJob, BakeJob
 from ..render_settings import changed_properties, working_space
 from . import atlas, bake_meshes, pixels
 from .occluders import collect_occluders, with_baked_shares
@@ -252,13 +252,13 @@ def _open(job: BakeJob) -> BakeScene:
     folder = tempfile.TemporaryDirectory(prefix="ltsh-meshes-", ignore_cleanup_errors=True)
     has_shadows = job.shadows == "on"
     bake_meshes.apply_modifiers(scene, objects)
-    for ob in objects if job.in_one else ():
+    for ob in objects if job.atlas else ():
         atlas.make_single(ob)
-    densities, unfit = {}, {}
-    if job.atlas is not None:
-        densities, unfit = atlas.make_atlas(objects, AtlasSettings(**job.atlas))
+    densities, unfit, uv_name = {}, {}, job.uv
+    if job.atlas and job.uv is None:
+        uv_name = ATLAS
+        densities, unfit = atlas.make_atlas(objects, job.atlas, job.texels_per_metre, job.unwrap)
     usable = [ob for ob in objects if ob.name not in unfit]
-    uv_name = job.uv if job.atlas is None else ATLAS
     files = Path(folder.name), has_shadows
     inventory, meshes, problems, bare, lost = _inspect(scene, world, usable, uv_name, files)
     warnings += lost
@@ -380,7 +380,7 @@ def extract_bake(job: BakeJob, folder: Path, progress) -> dict:
     images = SavedImages(folder) if job.look_up_images else None
     if job.shadows == "on":
         shutil.copyfile(Path(opened.folder.name) / OCCLUDERS, folder / OCCLUDERS)
-    units = {ATLAS: opened.names} if job.in_one else {name: [name] for name in names}
+    units = {ATLAS: opened.names} if job.atlas else {name: [name] for name in names}
     records = []
     for number, (name, members) in enumerate(units.items()):
         problems = [opened.problems[member] for member in members if member in opened.problems]
@@ -418,26 +418,26 @@ def _objects(opened, names, images, job, folder, progress) -> dict:
         of_slots = np.array([numbers[slot.material.name_full] for slot in ob.material_slots])
         mesh = TexelMesh.load(opened.meshes[ob.name].mesh)
         receiver = int(ob.get(aovs.RECEIVER_PROPERTY, 0))
-        meshes.append(replace(mesh, material=of_slots[mesh.material], receiver=receiver, object=number))
+        whole = (np.full(len(mesh.corners), value) for value in (mesh.mirrored, receiver, number))
+        meshes.append(TexelMesh(mesh.corners, mesh.normals, mesh.uv, of_slots[mesh.material], *whole))
     joined = TexelMesh.joined(meshes)
     joined.save(folder / "mesh.npz")
     uv_name = opened.meshes[names[0]].uv_name
     record = {"folder": folder.name, "uv": uv_name, "materials": [plan.record() for plan in plans.values()]}
     record["unshaded"] = [opened.lobes[name].unshaded for name in plans]
     record |= {"warnings": warnings, "members": {name: opened.densities.get(name) for name in names}}
-    record["atlas"] = None if job.atlas is None else {**job.atlas, "objects": list(opened.densities)}
+    made = {"side": job.atlas, "density": job.texels_per_metre, "unwrap": job.unwrap, "objects": list(opened.densities)}
+    record["atlas"] = made if opened.densities else None
     used = sorted({texture.uv for plan in plans.values() for texture in plan.textures})
     record["uv_maps"] = {name: f"uv_{number}.npy" for number, name in enumerate(used)}
     for name, file in record["uv_maps"].items():
         maps = (opened.meshes[ob.name].uv_map(name, mesh) for ob, mesh in zip(objects, meshes, strict=True))
         save_array(folder / file, np.concatenate(list(maps)))
-    record["maps"] = [any(plans[slot.material.name_full].count for slot in ob.material_slots) for ob in objects]
-    is_light_baked = job.cycles_samples or job.bounces == "on"
-    baked = [ob for ob, needs_maps in zip(objects, record["maps"], strict=True) if needs_maps or is_light_baked]
-    if baked:
-        finished = {tile for name, tile in job.finished if name == (ATLAS if job.in_one else names[0])}
+    record["maps"] = any(plan.count for plan in plans.values())
+    if record["maps"] or job.cycles_samples or job.bounces == "on":
+        finished = {tile for name, tile in job.finished if name == (ATLAS if job.atlas else names[0])}
         tiles = [tile for tile in tiles_of(joined.uv)[0] if tile not in finished and job.tile in (None, tile)]
-        uv_names = {ob: opened.meshes[ob.name].uv_name for ob in baked}
+        uv_names = {ob: opened.meshes[ob.name].uv_name for ob in objects}
         bake = ObjectBake(opened.scene, uv_names, list(plans.values()))
         _bake(bake, tiles, job, opened.bounces, (folder, progress))
     return record
@@ -446,7 +446,7 @@ def _objects(opened, names, images, job, folder, progress) -> dict:
 def _bake(bake, tiles, job, bounces, files) -> None:
     """Write the maps and Cycles' bake of the objects of an ObjectBake, and close it; `bounces`: see BakeScene."""
     points, has_bounces = job.sub_samples if any(plan.count for plan in bake.plans) else 0, job.bounces == "on"
-    name, (folder, progress) = ATLAS if job.in_one else next(iter(bake.uv_names)).name, files
+    name, (folder, progress) = ATLAS if job.atlas else next(iter(bake.uv_names)).name, files
     try:
         blocks, rest = (_blocks(job, tiles, count) for count in (job.block_rows, job.rest_rows))
         for number, block in enumerate(blocks):

@@ -11,15 +11,6 @@ from .blender_process import run_job, run_scene_job
 
 
 @dataclass(frozen=True)
-class AtlasSettings:
-    """How many objects share one texture; see `extract.atlas`."""
-
-    side: int  # texels
-    texels_per_metre: float | None = None  # None: as many as fit
-    unwrap: str = "smart"  # "faces": every edge is a seam
-
-
-@dataclass(frozen=True)
 class BakeJob:
     """What to extract from which file for a bake; None means as in the file."""
 
@@ -41,8 +32,9 @@ class BakeJob:
     tile: int | None = None  # the only UDIM tile to extract; None: all
     sub_samples: int = 1  # points of a texel that need maps
     shadows: str = "off"  # see `pixels.PixelJob`
-    atlas: AtlasSettings | None = None  # make the UV map of an atlas
-    in_one: bool = False  # all objects share one texture, as one record
+    atlas: int | None = None  # all objects share a texture with so many texels a side; without `uv` its map is made
+    texels_per_metre: float | None = None  # of the atlas; None: as many as fit
+    unwrap: str = "smart"  # "faces": every edge is a seam
     bounces: str = "off"  # "on": also Cycles' indirect light, and Cycles' bake has it too
     rest_samples: int = 64  # of Cycles for the indirect light
     rest_passes: tuple[str, ...] = ()  # with bounces: of the indirect light; the diffuse one has no color
@@ -75,7 +67,7 @@ class ApplyJob:
     path: Path
     textures: list[BakedTextures]  # in the child their fields
     frame: int | None = None
-    atlas: dict | None = None  # fields of AtlasSettings, and the "objects" that share the atlas
+    atlas: dict | None = None  # arguments of `extract.atlas.make_atlas`, the "objects" by name
 
 
 def apply_bake(job: ApplyJob, *, progress: Progress | None = None) -> list[str]:

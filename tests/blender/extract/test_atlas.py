@@ -9,7 +9,6 @@ from material_scenes import Build
 from scene_parts import add_plane, add_sphere, principled
 
 from ltsh_addon.blender.extract.atlas import BORDER, DENSITY, make_atlas
-from ltsh_addon.blender.process.bake import AtlasSettings
 from ltsh_addon.cycles.uv import UvTriangles
 from ltsh_addon.scene import ATLAS, SceneError
 
@@ -89,7 +88,7 @@ def distance_of(owner):
 def test_islands_have_one_density_and_keep_their_distance(unwrap):
     objects = room()
     objects[1][DENSITY] = 2.0
-    densities, problems = make_atlas(objects, AtlasSettings(256, 25.0, unwrap))
+    densities, problems = make_atlas(objects, 256, 25.0, unwrap)
     assert not problems
     for ob in objects:
         uv, world = triangles_of(ob)
@@ -115,7 +114,7 @@ def test_making_an_atlas_adds_a_uv_map_and_nothing_else():
     before = [(ob.select_get(), ob.mode, list(ob.data.materials), ob.data.uv_layers.active.name) for ob in objects]
     active, scene = bpy.context.view_layer.objects.active, bpy.context.scene
     first = [triangles_of_map(ob, 0) for ob in objects]
-    make_atlas(objects, AtlasSettings(SIDE))
+    make_atlas(objects, SIDE)
     assert counts == [
         len(getattr(bpy.data, name)) for name in ("objects", "meshes", "scenes", "materials", "collections")
     ]
@@ -139,16 +138,16 @@ def test_an_atlas_that_is_too_small_names_the_size_that_suffices():
     with pytest.raises(
         SceneError, match=r"has 64 texels a side, 40 texels per metre take (\d+): make it larger"
     ) as hit:
-        make_atlas(objects, AtlasSettings(64, 40.0))
+        make_atlas(objects, 64, 40.0)
     side, density = int(str(hit.value).split(" take ")[1].split(":")[0]), float(str(hit.value).split()[-4])
-    assert make_atlas(objects, AtlasSettings(side, 40.0))[0]["Floor"] == pytest.approx(40.0, rel=1e-4)
-    assert make_atlas(objects, AtlasSettings(64, density))[0]["Floor"] == pytest.approx(density, rel=1e-4)
+    assert make_atlas(objects, side, 40.0)[0]["Floor"] == pytest.approx(40.0, rel=1e-4)
+    assert make_atlas(objects, 64, density)[0]["Floor"] == pytest.approx(density, rel=1e-4)
 
 
 def test_each_texel_of_an_atlas_is_that_of_its_object_alone(tmp_path):
     objects = room()
-    make_atlas(objects, AtlasSettings(SIDE))
-    path, of_all = save(tmp_path), {"view": "above", "passes": ("diffuse", "specular"), "sub_samples": 2}
+    make_atlas(objects, SIDE)
+    path, of_all = save(tmp_path), {"view": "above", "passes": ("diffuse", "specular"), "sub_samples": 1}
     report, files = baked(path, tmp_path / "atlas", atlas=SIDE, uv=ATLAS, **of_all)
     of_objects = baked(path, tmp_path / "alone", size=(SIDE, SIDE), uv=ATLAS, **of_all)[1]
     atlas = files[f"{ATLAS}.exr"]

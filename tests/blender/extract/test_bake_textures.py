@@ -101,14 +101,14 @@ def samples_by_object(path, folder, look_up):
         uv_maps = {name: of_object / file for name, file in record["uv_maps"].items()}
         materials = [texels_module.BakeMaterial.of(value, folder, uv_maps) for value in record["materials"]]
         texels = UvTriangles.in_tile(mesh.uv, SIZE, SIZE).texels(0, SIZE)
-        maps = np.load(of_object / "maps_1001_0_0.npy") if any(record["maps"]) else None
+        maps = np.load(of_object / "maps_1001_0_0.npy") if record["maps"] else None
 
         def read_map(number, maps=maps, index=texels.index):
             return maps[number].reshape(-1, 3)[index]
 
         view = texels_module.BakeView(**manifest["view"])
         samples, _ = texels_module.texel_samples(mesh, materials, texels, read_map, view, lights)
-        found[record["name"]] = samples, any(record["maps"])
+        found[record["name"]] = samples, record["maps"]
     return found
 
 

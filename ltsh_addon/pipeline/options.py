@@ -407,13 +407,15 @@ class BakeOptions(TaskOptions):
         help="one texture of N x N texels for all objects, on a UV map Lightmap that is made for it, or on --uv",
     )  # fmt: skip
     texels_per_metre: float | None = option(
-        "--texels-per-metre", default=None, type=texels_per_metre, metavar="D",
-        help="of the atlas, times the property ltsh_density of an object (default: as many as fit)",
-    )  # fmt: skip
+        "--texels-per-metre",
+        default=None,
+        type=texels_per_metre,
+        metavar="D",
+        help="of the atlas (default: all that fit)",
+    )
     unwrap: str = option(
-        "--unwrap", default="smart", choices=("smart", "faces"),
-        help="for the atlas: islands by direction, or each face alone (default: %(default)s)",
-    )  # fmt: skip
+        "--unwrap", default="smart", choices=("smart", "faces"), help="atlas: by direction, or each face"
+    )
     sub_samples: int = option(
         "--aa", default=1, type=positive, metavar="N", help="points per texel, spread as in Cycles' bake; 1: centers"
     )

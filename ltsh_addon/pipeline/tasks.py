@@ -107,10 +107,8 @@ class BatchTask:
     def options(self, job: BatchJob) -> Any:
         """The job's options for this task."""
         options = replace(job.options, scene=Path(self.scene), camera=self.camera, frame=self.frame)
-        if job.command == "bake" and job.options.atlas is not None:
-            return replace(options, name=self.stem)
         if self.object is not None:
-            return replace(options, objects=(self.object,), name=self.stem)
+            return replace(options, objects=options.objects if options.atlas else (self.object,), name=self.stem)
         if job.command in ("view", "render"):
             return replace(options, name=self.name)
         return replace(options, name=self.name, page="report.html" if job.single else f"{self.name}.html")

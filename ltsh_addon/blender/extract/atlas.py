@@ -66,7 +66,7 @@ def make_atlas(
             return {}, problems
         unwrapped = list(islands.values())
         _unwrap(unwrapped, unwrap)
-        Packing(unwrapped, side).pack(density)
+        _pack(unwrapped, side, density)
         for ob, island in islands.items():
             ob.data.uv_layers[ATLAS].uv.foreach_set("vector", island.uv().astype(np.float32).ravel())
         return {ob.name: side * island.units_per_metre() for ob, island in islands.items()}, problems
@@ -161,49 +161,28 @@ def _unwrap(islands, how: str) -> None:
         average_islands_scale()
 
 
-class Packing:
-    """Packs unwrapped `islands` into the unit square. Each try begins with the same islands, so it can be repeated."""
+def _pack(islands, side: int, density: float | None) -> None:
+    """Pack unwrapped `islands` into the unit square, as `make_atlas` says."""
+    # Their units are metres, but for the islands' own densities.
+    unpacked = [island.uv() * (island.density / island.units_per_metre()) for island in islands]
 
-    def __init__(self, islands: list[Island], side: int):
-        self.islands, self.side = islands, side
-        # Their units are metres, but for the islands' own densities.
-        self._uv = [island.uv() * (island.density / island.units_per_metre()) for island in islands]
-
-    def pack(self, density: float | None) -> None:
-        """Pack them at the wanted density, or as large as they fit. Raises SceneError where they do not fit."""
-        side = self.side
-        if density is None:
-            self._fit()
-            return
-        extent = self._extent(side, density)
-        if extent <= 1.0:
-            return
-        while extent > 1.0:
-            side = max(math.ceil(side * extent), side + 1)
-            extent = self._extent(side, density)
-        possible = self._fit()
-        while self._extent(self.side, possible) > 1.0:
-            possible = math.floor(possible * 99.0) / 100.0
-        raise SceneError(
-            f"the atlas has {self.side} texels a side, {density:g} texels per metre take {side}: make it "
-            f"larger, or take at most {possible:g} texels per metre"
-        )
-
-    def _fit(self) -> float:
-        """Pack the islands as large as they fit; returns their density, rounded down to hundredths."""
-        self._pack(1.0, {"margin_method": "FRACTION", "margin": BORDER / self.side})
-        first = self.islands[0]
-        return math.floor(100.0 * self.side * first.units_per_metre() / first.density) / 100.0
-
-    def _extent(self, side: int, density: float) -> float:
-        """Pack the islands with so many texels per metre; returns what share of the `side` they take."""
-        self._pack(density / side, {"scale": False, "margin_method": "ADD", "margin": BORDER / side})
-        # Half a texel is no reason to take another size.
-        return max(island.uv().max() for island in self.islands) + (BORDER - 0.5) / side
-
-    def _pack(self, factor: float, options: dict) -> None:
+    def packed(factor: float, options: dict) -> float:
         pack_islands = bpy.ops.uv.pack_islands
-        for island, uv in zip(self.islands, self._uv, strict=True):
+        for island, uv in zip(islands, unpacked, strict=True):
             island.copy.data.uv_layers[0].uv.foreach_set("vector", (uv * factor).astype(np.float32).ravel())
-        with _editing(self.islands):
+        with _editing(islands):
             pack_islands(**options, **BOXES)
+        return max(island.uv().max() for island in islands)
+
+    if density is None:
+        packed(1.0, {"margin_method": "FRACTION", "margin": BORDER / side})
+        return
+    needed, options = side, {"scale": False, "margin_method": "ADD"}
+    # Each try begins with the same islands, so that it can be repeated. Half a texel is no reason for another size.
+    while (extent := packed(density / needed, {**options, "margin": BORDER / needed}) + (BORDER - 0.5) / needed) > 1.0:
+        needed = max(math.ceil(needed * extent), needed + 1)
+    if needed > side:
+        raise SceneError(
+            f"the atlas has {side} texels a side, but {density:g} texels per metre take {needed}: make it larger, or "
+            "lower the texels per metre"
+        )

@@ -129,6 +129,7 @@ def bake_options(context, scene_file: Path) -> BakeOptions:
         shadow_rays=settings.shadow_rays,
         bounces="on" if settings.bake_bounces else "off",
         rest_samples=settings.bake_rest_samples,
+        per_light=settings.bake_per_light,
     )
 
 

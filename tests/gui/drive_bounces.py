@@ -22,8 +22,8 @@ def rest():
 
 
 def shown_of(rest):
-    """The view and the number of samples of the picture that is shown."""
-    return None if rest._shown is None else rest._shown[1]
+    """The view of the picture that is shown."""
+    return None if rest._picture is None or rest.has_news else rest._picture.view
 
 
 def waited(rig, until, most):

@@ -52,6 +52,7 @@ JOBS = {
     "ApplyJob": ("bake", "extract.apply", "apply_bake"),
     "ViewJob": ("view", "viewport.still", "draw_view"),
     "RestJob": ("view", "viewport.rest", "render_rest"),
+    "RestPictureJob": ("view", "viewport.rest", "denoise_rest"),
     "WorldJob": ("view", "viewport.live_cycles", "render_world"),
     "NodeLightJob": ("view", "viewport.live_cycles", "render_node_lights"),
 }

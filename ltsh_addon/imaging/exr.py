@@ -168,9 +168,9 @@ def writing_rows(
     header = OpenEXR.Header(width, height)
     header["channels"] = dict.fromkeys(names, header["channels"]["R"])
     if half:
-        import Imath
+        from Imath import Channel, PixelType
 
-        header["channels"] |= dict.fromkeys(half, Imath.Channel(Imath.PixelType(Imath.PixelType.HALF)))
+        header["channels"] |= dict.fromkeys(half, Channel(PixelType(PixelType.HALF)))
     header |= {"type": b"scanlineimage", "pixelAspectRatio": float(pixel_aspect)}
     header |= {key: value.encode() for key, value in metadata.items()}
     if chromaticities is not None:

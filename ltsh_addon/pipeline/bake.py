@@ -548,7 +548,7 @@ def _report(options, manifest, records) -> dict:
     }
     if options.per_light:
         rows = rows_of_groups(lights_of(manifest["lights"]), manifest["light_settings"])
-        report |= {"lights": [asdict(row) for row in rows], "camera": manifest["camera"]}
+        report |= {"light_rows": [asdict(row) for row in rows], "camera": manifest["camera"]}
     return report
 
 

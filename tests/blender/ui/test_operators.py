@@ -143,7 +143,7 @@ def test_the_mixer_changes_a_bake_of_each_light(scene, tmp_path):
     settings = {lamp.name: [lamp.data.energy, lamp.data.exposure, *lamp.data.color]}
     rows = [asdict(MixerRow(name, (name,), settings=settings if name == lamp.name else {})) for name in names]
     record = {"name": "Floor", "uv": "UVMap", "tiles": {"1001": {"file": "Floor.exr"}}}
-    report = {"objects": [record], "warnings": [], "lights": rows, "frame": 1, "camera": ""}
+    report = {"objects": [record], "warnings": [], "light_rows": rows, "frame": 1, "camera": ""}
     folder = display_layers.write("bake", output, report)
     display_layers.write_lights(folder, ["bake"], report)
     results.show(scene, folder)
@@ -156,7 +156,7 @@ def test_the_mixer_changes_a_bake_of_each_light(scene, tmp_path):
     written = imaging.read_layers(output / "Floor.ltsh4c.diffuse_light.exr")[""]
     np.testing.assert_allclose(written, expected, rtol=1e-6)
     # A bake without --per-light has no mixer, and none that an earlier one left.
-    display_layers.write_lights(folder, ["bake"], {**report, "lights": []})
+    display_layers.write_lights(folder, ["bake"], {**report, "light_rows": []})
     assert results.mixer_of(scene) is None
 
 

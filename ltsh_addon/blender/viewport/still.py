@@ -24,7 +24,7 @@ from ..lights.world import light_of_world
 from ..materials.preview_material import world_radiance
 from ..process.view import GRAPHICS, VIEW_PASSES, VIEW_PNG, ViewJob
 from ..render_settings import cycles_setting
-from .drawing import ViewCamera, float_texture, frame_buffer, read_texture
+from .drawing import ViewCamera, float_texture, forget_shaders, frame_buffer, read_texture
 from .light_texels import ShownSky, varied_sky
 from .live_cycles import rendered_world
 from .mirror import NOT_RESOLVED, Changes, SceneMirror, patterns_of
@@ -58,6 +58,7 @@ class OpenScene:
 
     def go_to_frame(self, frame: int | None) -> None:
         """Go to a frame and take note of what that changes."""
+        self.depsgraph()  # settings of pictures are no changes
 
         def note(scene, depsgraph) -> None:
             self._changes.add(depsgraph)
@@ -99,8 +100,6 @@ class OpenScene:
                 self.tracing = ViewTracer(occluders, cores())
             images = missing_images(depsgraph, scene.world, _layer(scene).material_override)
             notes = [*self._sky_notes, *self._shadow_notes, *images, *overlaps_of_lights(depsgraph)]
-        # What the studios of Cycles leave behind is no change of the scene.
-        self.depsgraph()
         return notes
 
     def mirror(self) -> SceneMirror:
@@ -305,6 +304,7 @@ def _draw(
             _renderer[:] = [renderer]
         else:
             renderer.free()
+            forget_shaders()
     traced = None
     if shadows is not None:
         # The facts of `pipeline.lighting.Shadows.report`, and the seconds.

@@ -53,8 +53,10 @@ def write_lights(folder: Path, arguments: Sequence[str], report: dict, progress:
     if "--keep-visibility" in arguments:
         samples = Path(FILES[arguments[0]]).with_suffix(RELIGHT_SUFFIX)
         light_pictures(RelightData.load(folder.parent / samples), progress).save(folder / MIXER_FILE)
-    rows, facts = [MixerRow.of(row) for row in report.get("light_rows", ())], {name: report.get(name) for name in OF_BAKES}
-    for tile in (tile for record in report["objects"] for tile in record["tiles"].values()) if len(rows) > 1 else ():
+    rows = [MixerRow.of(row) for row in report.get("light_rows", ())]
+    tiles = (tile for record in report["objects"] for tile in record["tiles"].values()) if len(rows) > 1 else ()
+    facts = {name: report.get(name) for name in OF_BAKES}
+    for tile in tiles:
         path = folder.parent / tile["file"]
         baked_light_pictures(imaging.read_layers(path), rows, facts).save(folder / mixer_file(path.stem))
 

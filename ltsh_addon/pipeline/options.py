@@ -191,6 +191,21 @@ def view(text: str) -> tuple[float, ...] | str:
     raise ValueError(f"view is {text!r}, expected camera, above or a position such as 0,-4,1.5")
 
 
+def frame_number(text: str) -> int:
+    """One frame."""
+    numbers = frames(text)
+    if len(numbers) != 1:
+        raise ValueError(f"frame is {text!r}, expected one number")
+    return numbers[0]
+
+
+def picture_file(text: str) -> Path:
+    """The name of a file that exists."""
+    if not Path(text).is_file():
+        raise ValueError(f"picture {text!r}: no such file")
+    return Path(text)
+
+
 def folder(text: str) -> Path:
     """The name of a folder."""
     if not text.strip():
@@ -447,6 +462,34 @@ class RenderOptions(CameraOptions):
         "--denoise", default="on", choices=("on", "off"), help="what Cycles renders (default: %(default)s)"
     )
     keep_visibility: bool = flag("--keep-visibility", "also keep what `relight` needs, beside the EXR as .npz")
+    own_groups: tuple[str, ...] | None = option(default=None)  # lights, () for all, that get light groups of their own
+
+
+@dataclass(frozen=True)
+class MatchOptions(TaskOptions):
+    """Which lights should make the scene look like a picture; None means as in the file."""
+
+    frame: int | None = option("--frame", default=None, type=frame_number, metavar="F", help="default: the file's")
+    camera: str | None = option("--camera", default=None, metavar="NAME", help="default: the scene's camera")
+    target: Path = option(
+        "--target", default=Path(), type=picture_file, required=True, metavar="IMAGE",
+        help="the picture that the scene should look like, of the same camera",
+    )  # fmt: skip
+    target_view: str | None = option(
+        "--target-view", default=None, metavar="VIEW",
+        help="view transform of a target of 8 or 16 bits, such as Standard or AgX (default: the scene's)",
+    )  # fmt: skip
+    mask: Path | None = option(
+        "--mask", default=None, type=picture_file, metavar="IMAGE", help="white where the target counts, else black"
+    )
+    lights: tuple[str, ...] = option(
+        "--light", default=(), action="append", metavar="NAME", help="may be given several times; default: all"
+    )
+    colors: bool = flag("--colors", "also change the colors of lights, not only their powers")
+    techniques: tuple[str, ...] = _techniques(SHIPPED_TABLES, parse=one_table)
+    cycles_samples: int = option(
+        "--cycles-samples", default=256, type=cycles_samples, metavar="N", help="of Cycles (default: %(default)s)"
+    )
 
 
 # Derived from the declarations:

@@ -36,6 +36,7 @@ class EngineView:
     """One 3D view with the engine."""
 
     def __init__(self):
+        self.region = 0  # the pointer of the one that it was drawn in last
         self._world = LiveWorld()
         self.mirror = self._new_mirror()
         self._renderer: ViewRenderer | None = None
@@ -91,7 +92,7 @@ class EngineView:
 
     def draw(self, context, depsgraph) -> None:
         """Draw into the region of `context`, and ask to be drawn again while the picture can be refined."""
-        start, target = time.monotonic(), gpu.state.active_framebuffer_get()
+        start, target, self.region = time.monotonic(), gpu.state.active_framebuffer_get(), context.region.as_pointer()
         if not _has_drawn[0]:
             _has_drawn[0] = True
             _clear(target)

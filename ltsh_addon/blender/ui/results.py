@@ -471,6 +471,17 @@ def _take_rows(scene) -> None:
     state["is_silent"] = False
 
 
+def set_factors(scene, factors: dict[str, np.ndarray]) -> None:
+    """Give rows of the mixer, by name, `factors` (3,) of what was rendered; all others show what was rendered."""
+    reset_mixer(scene)
+    state["is_silent"] = True
+    for row, item in mixer_pairs(scene):
+        if row.name in factors:
+            most = float(factors[row.name].max())
+            item.power, item.color = most, np.array(row.color) * (factors[row.name] / most if most > 0.0 else 1.0)
+    state["is_silent"] = False
+
+
 def mix_label(scene) -> str:
     """The label below the mixed picture."""
     pairs = [(row, item) for row, item in mixer_pairs(scene) if item is not None]

@@ -339,6 +339,11 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
         description="Keep a picture of each light, so that the Light Mixer can change them in the finished picture",
         default=True,
     )  # fmt: skip
+    match_target: PointerProperty(
+        name="Target", description="Picture of the same size that the lights should come closest to",
+        type=bpy.types.Image,
+    )  # fmt: skip
+    match_colors: BoolProperty(name="Colors", description="Also change the colors of the lights", default=False)
     mixed: CollectionProperty(type=LTSH_PG_mixed_light, options={"HIDDEN"})
     mixed_active: IntProperty(name="Light", options={"HIDDEN"})
     active_light: IntProperty(

@@ -318,8 +318,10 @@ def _export(options) -> int:
             print(f"tables: warning: {name} in {layout.engine}: {text}", file=sys.stderr)
     else:
         files = export.export_tables(prefixes, options.output)
+    licenses = [str(path) for path in export.write_licenses(options.output, code=not options.layout)]
     paths = {name: [str(path) for path in written] for name, written in files.items()}
-    print(json.dumps({"tables": paths}, indent=2) if options.json else "\n".join(sum(paths.values(), [])))
+    shown = {"tables": paths, "licenses": licenses}
+    print(json.dumps(shown, indent=2) if options.json else "\n".join(sum(paths.values(), []) + licenses))
     return 0
 
 

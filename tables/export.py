@@ -97,6 +97,17 @@ def export_layout(layout: layouts.Layout, given: str, folder: str | os.PathLike)
         return _write(contents, _made(folder), stack)
 
 
+def write_licenses(folder: str | os.PathLike, *, code: bool = True) -> list[Path]:
+    """Write the licenses of exported files beside them: CC0 of the numbers and, with `code`, MIT. Raises OSError."""
+    contents = {"LICENSE-CC0.txt": Path(__file__).with_name("LICENSE").read_bytes()}
+    if code:
+        notice = re.search(r"Copyright .*?(?= \*/)", header.TEMPLATE.read_text(encoding="ascii"), re.DOTALL)[0]
+        notice = notice.replace("\n   ", "\n")
+        contents["LICENSE-MIT.txt"] = f"MIT License\n\n{notice}\n".encode("ascii")
+    with ExitStack() as stack:
+        return _write(contents, Path(folder), stack)
+
+
 def _write(contents, folder, stack) -> list[Path]:
     """Write files by name; they take their names when `stack` ends."""
     for name, data in contents.items():
@@ -179,9 +190,12 @@ def _curve_names(table) -> list[str]:
 
 def _about(table, name) -> str:
     curves = "\n".join(f"    {number}: {text}" for number, text in enumerate(_curve_names(table)))
+    prefix = identifier(name)
     return f"""\
 {name}: {table.metadata.get("brdf", "a fitted BRDF")}, as linearly transformed lobes ({table.family}).
-Made by `python -m tables export` of LTSH {VERSION}. C99, C++, GLSL 3.30 and HLSL, or WGSL.
+Needs C99 or C++; or GLSL 3.30, or GLSL ES 3.00 (WebGL 2) with `precision highp float; precision highp int;`; or HLSL of
+shader model 5. In GLSL and HLSL define the macro {prefix.upper()}_DATA before, in WGSL the function {prefix}_data.
+Made by `python -m tables export` of LTSH {VERSION}.
 Frame: z is the shading normal, the view direction is (sin theta_o, 0, cos theta_o). roughness^2 = alpha of GGX.
 Fresnel curves of c, the cosine of the half angle; a reflectance that is a sum of them needs the same sum of integrals:
 {curves}

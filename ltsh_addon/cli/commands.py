@@ -17,6 +17,7 @@ from ..pipeline.options import (
     BakeOptions,
     CompareOptions,
     DemoOptions,
+    MatchOptions,
     PictureOptions,
     RenderOptions,
     ViewOptions,
@@ -284,6 +285,40 @@ def _relight(arguments, bar, open_file) -> int:
     bar.finish()
     if not arguments.json:
         print_out("\n".join(str(output / name) for one in report.get("reports", [report]) for name in one["files"]))
+    return _printed(arguments, report, 0)
+
+
+MATCH = """Find powers of lights for which the scene looks like a picture of the same camera, and with
+--colors their colors too. OUT gets matched.blend, a copy of the scene with these lights,
+match.png (before, after, target) and report.json with each light's old and new power."""
+MATCH_EXAMPLES = """examples:
+  %(prog)s room.blend --target graded.exr -o out/match
+  %(prog)s room.blend --target painted.png --mask window.png --light Key --light Fill --colors -o out/match
+
+A picture of 8 or 16 bits goes back through the view transform of the scene; pixels that are clipped do
+not count. Bounces follow their lights.
+"""
+
+
+def add_match(parser) -> None:
+    """`ltsh match`."""
+    with_examples(parser, MATCH, MATCH_EXAMPLES)
+    add_options(parser, MatchOptions, but=("name",))
+    add_talk(parser)
+    parser.set_defaults(run=_match)
+
+
+def _match(arguments, bar, open_file) -> int:
+    from ..pipeline.match import match_scene, summary
+
+    (scene, *more) = scenes_of(arguments, open_file)
+    if more:
+        raise Misuse(f"{more[0]}: expected one SCENE.blend, because one picture shows one scene")
+    report = match_scene(options_from(MatchOptions, vars(arguments), scene=scene), bar)
+    bar.finish()
+    _complain(bar, "warning", on_screen(report["warnings"], f"{arguments.output}/report.json"))
+    if not arguments.json:
+        print_out("\n".join(summary(report)))
     return _printed(arguments, report, 0)
 
 

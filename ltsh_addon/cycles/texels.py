@@ -210,11 +210,32 @@ def texel_samples(
 
     read_map(number) returns a baked map at the texels, (Q, 3).
     """
+    pieces, index = [], []
+    for start, samples, texel in _lobes_of_texels(mesh, materials, texels, read_map, view):
+        samples, of_sample = end_at_horizons_of_cycles(samples, lights, texel, is_baked=True)
+        pieces.append(samples)
+        index.append(texel[of_sample] + start)
+    return SurfaceSamples.joined(pieces), np.concatenate(index)
+
+
+def texel_guides(mesh: TexelMesh, materials: list[BakeMaterial], texels: Texels, read_map) -> np.ndarray:
+    """The diffuse color and the normal, (Q, 6), of texels (Q); for `read_map` see `texel_samples`."""
+    guides = np.zeros((len(texels.index), 6), np.float32)
+    for start, samples, texel in _lobes_of_texels(mesh, materials, texels, read_map, BakeView("above")):
+        np.add.at(guides[start:, :3], texel, samples.diffuse_albedo)
+        # The normals of lobes count by their color.
+        weight = samples.diffuse_albedo.mean(axis=1) + 1e-3
+        np.add.at(guides[start:, 3:], texel, weight[:, None] * samples.diffuse_normal)
+    guides[:, 3:] = unit(guides[:, 3:])
+    return guides
+
+
+def _lobes_of_texels(mesh, materials, texels, read_map, view):
+    """Blocks of texels: the first texel, the samples (S) of the block, and the texel (S,) of each, counted from it."""
     true_normals = mesh.true_normals()
     corrected = np.array([material.corrected for material in materials], dtype=bool)
     values = (value for material in materials for lobe in material.lobes for value in lobe.values())
     maps = {number: read_map(number) for number in {value.map for value in values if isinstance(value, MapValue)}}
-    pieces, index = [], []
     for start in range(0, max(len(texels.index), 1), HITS_PER_BLOCK):
         block = slice(start, start + HITS_PER_BLOCK)
         triangle, weights = texels.triangle[block], texels.barycentric[block]
@@ -232,11 +253,7 @@ def texel_samples(
             diffuse_albedo=None,
         )
         of_block = {name: values[block] for name, values in maps.items()}
-        samples, texel = samples_of_lobes(hits, _lobes(materials, number, of_block, triangle, weights))
-        samples, of_sample = end_at_horizons_of_cycles(samples, lights, texel, is_baked=True)
-        pieces.append(samples)
-        index.append(texel[of_sample] + start)
-    return SurfaceSamples.joined(pieces), np.concatenate(index)
+        yield start, *samples_of_lobes(hits, _lobes(materials, number, of_block, triangle, weights))
 
 
 def _interpolated(values, triangle, weights):

@@ -10,23 +10,26 @@ import time
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import PurePosixPath
 
 import numpy as np
 
 from ..cycles import uv
-from ..cycles.texels import NOT_BAKED, BakeMaterial, BakeView, TexelMesh, texel_samples
+from ..cycles.texels import NOT_BAKED, BakeMaterial, BakeView, TexelMesh, texel_guides, texel_samples
 from ..files import temporary_folder
 from ..imaging import exr, grouped
-from ..imaging.exr import COMBINED, layer_name
+from ..imaging.denoise import DENOISER
+from ..imaging.exr import COMBINED, REST, layer_name
+from ..imaging.seams import SeamFit, TexelGrid, islands_of
 from ..reading import NUMBER, Malformed, check, file_name
 from ..scene import PASSES, REFERENCE, Cancelled, Film, Progress, SurfaceSamples, lights_of, listed
 from ..visibility import Occluders, ShadowSampling
 from ..workers.pool import cores
-from . import bake_files, lighting
+from . import bake_files, lighting, lightmap
 from .comparison import percent
 from .lighting import check_named, prepare
+from .mixer import rows_of_groups
 from .options import BAKE_PASSES, TEXTURE_SIDES, BakeOptions, child_job
 from .tasks import TaskResult, file_stems, versions, write_reports
 
@@ -107,6 +110,10 @@ def _check(options: BakeOptions) -> None:
     unknown = [name for name in options.passes if name not in BAKE_PASSES]
     if unknown or not options.passes:
         raise ValueError(f"passes are {list(options.passes)}, expected some of {', '.join(BAKE_PASSES)}")
+    if options.bounces == "on" and options.shadows == "off":
+        raise ValueError(
+            "bounces are on and shadows off, expected both: bounced light has shadows; leave out one of both"
+        )
 
 
 def _job(options, finished, tile=None, following=()):
@@ -123,6 +130,8 @@ def _job(options, finished, tile=None, following=()):
         finished=tuple(finished),
         tile=tile,
         following=following,
+        rest_passes=lightmap.rest_passes(options.passes),
+        rest_rows=lightmap.rest_rows(options.size),
     )
 
 
@@ -199,7 +208,8 @@ class ObjectBaker:
                 record["texture"] = f"{stem}.{bake_files.applied_layer(options)}{self._suffix(tile)}.exr"
                 texture = options.output / record["texture"], bake_files.applied_layers(options)
                 written.append(record["texture"])
-            planes.write(path, options.margin, self._metadata(tile), pictures, texture)
+            half = [name for name in planes.names if "@" in name] if options.per_light else []
+            planes.write(path, options.margin, (self._metadata(tile), half), pictures, texture)
         return record, written
 
     def _shade(self, tile, planes, errors, progress) -> dict:
@@ -208,6 +218,9 @@ class ObjectBaker:
         is_unshaded = np.array([bool(reason) for reason in self.record["unshaded"]])
         rows, height = block_rows(options), options.size[1]
         points, spread = options.sub_samples, TilePoints(self, tile, self._threads())
+        facts, seams = {}, None
+        if options.bounces == "on":
+            facts, seams = self._take_bounces(spread, progress)
 
         def shaded(task):
             return *task, self._block(spread, *task)
@@ -236,7 +249,28 @@ class ObjectBaker:
             if progress is not None and progress(f"shade {self.record['name']}", share) is False:
                 raise Cancelled("the bake was stopped")
         counts = {"texels": covered, "covered_times": covers, "overlapping_texels": overlaps}
-        return {**counts, "unshaded_texels": unshaded, "unbaked_texels": unbaked, "is_lit": lit}
+        if seams is not None:
+            planes.fit(seams)
+        return {**counts, "unshaded_texels": unshaded, "unbaked_texels": unbaked, "is_lit": lit, **facts}
+
+    def _take_bounces(self, spread, progress) -> tuple[dict, SeamFit]:
+        """Denoise the bounced light of the texels; returns entries of the tile's record, and what fits its seams."""
+        width, height = self.options.size
+        triangle, guides = np.full(height * width, -1), np.zeros((height * width, 6), np.float32)
+        if progress is not None and progress(f"denoise {self.record['name']}", 0.0) is False:
+            raise Cancelled("the bake was stopped")
+        for first in range(0, height, block_rows(self.options)):
+            texels, maps, _ = spread.at(first, 0)
+            at = texels.index + first * width
+            triangle[at] = texels.triangle
+            guides[at] = texel_guides(self.mesh, self.materials, texels, _map_reader(maps, texels))
+        shape = height, width
+        grid = TexelGrid.of(triangle.reshape(shape), spread.corners, self.mesh)
+        guides = guides.reshape(*shape, 6)
+        islands = islands_of(grid)
+        spread.rest, denoiser = lightmap.denoised_rest(spread.rest, guides, islands, self.options.rest_samples)
+        dull = (guides[..., :3].max(axis=-1) <= lightmap.DULL) & (grid.triangle >= 0)
+        return {"denoiser": denoiser, "dull_texels": int(np.count_nonzero(dull))}, SeamFit(islands)
 
     def _threads(self) -> int:
         """Blocks to shade at a time: one with the reference, whose shading of a block takes all cores itself."""
@@ -246,6 +280,8 @@ class ObjectBaker:
         """Names of the channels of the EXR, without the coverage."""
         names = [layer_name(name, pass_name) for name in self.tables for pass_name in self.options.passes]
         names += [of_group for name in names for of_group in exr.by_group(name, self.groups, self.groups)]
+        if self.options.bounces == "on":
+            names += [layer_name(REST, pass_name) for pass_name in self.options.passes]
         for pass_name in self.compared:
             images = [*exr.CYCLES_LAYERS, *(f"{exr.ERROR}{name}" for name in self.tables)]
             names += [layer_name(image, pass_name) for image in images]
@@ -255,11 +291,13 @@ class ObjectBaker:
         """Layers (Q, 3) of the Q texels of a block, shaded at one point of each texel."""
         texels, maps, weights = spread.at(first, point)
 
-        def read_map(number):
-            return maps[number].reshape(-1, 3)[texels.index]
-
+        read_map = _map_reader(maps, texels)
         samples, texel = texel_samples(self.mesh, self.materials, texels, read_map, self.view, self.lights)
-        images, shadows = {}, None
+        images, shadows, bounces = {}, None, {}
+        if self.options.bounces == "on":
+            color = _summed(samples.diffuse_albedo[None], texel, len(texels.index))[0]
+            bounces = spread.bounces(first, texels, color)
+            images = {layer_name(REST, name): bounces[name].sum(axis=0) for name in self.options.passes}
         if self.tracer is not None:
             options = self.options
             passes = shaded_passes(options)
@@ -274,7 +312,11 @@ class ObjectBaker:
         for name, table in self.tables.items():
             for pass_name, radiance in self._passes(samples, texel, len(texels.index), table, shadows).items():
                 layer = layer_name(name, pass_name)
-                images |= {layer: radiance.sum(axis=0), **exr.by_group(layer, self.groups, radiance)}
+                whole = radiance.sum(axis=0)
+                if bounces:
+                    whole = whole + bounces[pass_name].sum(axis=0)
+                    radiance = radiance + bounces[pass_name] if self.options.per_light else radiance
+                images |= {layer: whole, **exr.by_group(layer, self.groups, radiance)}
         return images if weights is None else {name: values * weights[:, None] for name, values in images.items()}
 
     def _add_cycles(self, images, tile, first, texels) -> dict[str, np.ndarray]:
@@ -342,6 +384,11 @@ class TilePoints:
         self._width = baker.manifest["sampled_texels"]
         self._triangles = uv.UvTriangles.in_tile(baker.mesh.uv, *options.size, _column_and_row(tile))
         self._at_centers = bakes_centers_alone(options, baker.record)
+        self.rest, size = {}, options.size
+        if options.bounces == "on":
+            rows = range(len(baker.groups) if options.per_light else 1)
+            keys = itertools.product(lightmap.rest_passes(options.passes), rows)
+            self.rest = {key: lightmap.read_rest(baker.folder, key, tile, size) for key in keys}
         # The points of a block are shaded one after another, so few blocks need to be cached.
         cached = functools.lru_cache(maxsize=2 + threads // options.sub_samples)
         self.texels, self._weights_of = cached(self._covered), cached(self._fitted_weights)
@@ -361,11 +408,33 @@ class TilePoints:
         positions = self._positions(texels, maps, first, point)
         return self._triangles.at(texels, positions), maps, self._weights_of(first).at(positions)
 
+    @property
+    def corners(self) -> np.ndarray:
+        """The corners (T, 3, 2) of the triangles in the texture, in texels."""
+        return self._triangles.corners
+
+    def bounces(self, first: int, texels, color: np.ndarray) -> dict[str, np.ndarray]:
+        """Bounced light (R, Q, 3) by pass of the `texels` of the block from row `first` on, of the diffuse `color`.
+
+        It has a row for each light group with `per_light`, else one for all.
+        """
+        at = texels.index + first * self._options.size[0]
+        light = {}
+        for (kind, _), image in self.rest.items():
+            light.setdefault(kind, []).append(image.reshape(-1, 3)[at])
+        light = {kind: np.array(rows) for kind, rows in light.items()}
+        if "diffuse" in light:
+            light["diffuse_light"], light["diffuse"] = light["diffuse"], color * light["diffuse"]
+        return light | {COMBINED: sum(light[name] for name in ("specular", "diffuse") if name in light)}
+
     def _covered(self, first):
         rows = min(block_rows(self._options), self._options.size[1] - first)
         texels = self._triangles.texels(first, rows, self._options.conservative and not self._at_centers)
         if not self._at_centers:
             return texels
+        if self.rest:
+            baked = next(iter(self.rest.values()))[first : first + rows]
+            return texels.baked(baked.reshape(-1, 3)[texels.index, 0] != np.float32(NOT_BAKED))
         of_pass = f"cycles_{sorted(shaded_passes(self._options))[0]}_{self._tile}_{first}.npy"
         baked = np.load(self._file(first, 0) if self._mapped else self._folder / of_pass, mmap_mode="r")
         return texels.baked(baked[0].reshape(-1, 3)[texels.index, 0] != np.float32(NOT_BAKED))
@@ -389,7 +458,12 @@ class TilePoints:
 
 def bakes_centers_alone(options: BakeOptions, record: dict) -> bool:
     """True where an object needs Cycles' own bake, which has only texels whose centers are covered."""
-    return record["maps"] or options.error
+    return record["maps"] or options.error or options.bounces == "on"
+
+
+def _map_reader(maps, texels):
+    """The function that returns map `number` (Q, 3) at the `texels`."""
+    return lambda number: maps[number].reshape(-1, 3)[texels.index]
 
 
 def _column_and_row(tile: int) -> tuple[int, int]:
@@ -456,7 +530,12 @@ def _report(options, manifest, records) -> dict:
             if share := 100 * tile["unbaked_texels"] / max(tile["texels"] + tile["unbaked_texels"], 1):
                 why = "because Cycles bakes nothing there: apply the modifiers"
                 warnings.append(f"{name}: {share:.3g} % of its texels are left out, {why}")
-    return {
+            if share := 100 * tile.get("dull_texels", 0) / max(tile["texels"], 1):
+                why = "have no diffuse color: the light that bounces there is reflected, which no lightmap holds"
+                warnings.append(f"{name}: {share:.3g} % of its texels {why}; bake the pass specular or combined")
+            if not tile.get("denoiser", DENOISER).startswith(DENOISER):
+                warnings.append(f"{name}: {tile['denoiser']}")
+    report = {
         "scene": str(options.scene),
         "frame": manifest["frame"],
         "size": list(options.size),
@@ -467,6 +546,10 @@ def _report(options, manifest, records) -> dict:
         "warnings": grouped(warnings),
         "versions": versions(manifest["blender_version"]),
     }
+    if options.per_light:
+        rows = rows_of_groups(lights_of(manifest["lights"]), manifest["light_settings"])
+        report |= {"light_rows": [asdict(row) for row in rows], "camera": manifest["camera"]}
+    return report
 
 
 def _darkness(record, reasons) -> tuple[list[str], list[str]]:

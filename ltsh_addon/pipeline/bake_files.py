@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from .. import imaging
+from ..imaging import exr
 from ..imaging.exr import COMBINED, layer_name, parse_layer_name, writing_rows
+from ..imaging.seams import SeamFit
 from ..reading import NUMBER, file_name
 from ..scene import PASSES
 from .lighting import technique_names
@@ -30,6 +32,8 @@ TILE = {
     **dict.fromkeys(("texels", "unshaded_texels", "unbaked_texels", "covered_times", "overlapping_texels"), NUMBER),
     "is_lit": bool,
     "texture?": file_name,
+    "denoiser?": str,
+    "dull_texels?": NUMBER,
     "errors?": {str: {"noise?": NUMBER | None, "techniques": {str: _ERRORS}}},
 }
 _TILE_RECORD = {"task": {"object": str, "tile": int}, "report": TILE}
@@ -43,6 +47,7 @@ class Planes:
         self.names, self.shape = names, (height, width)
         # One bit per texel: the only data of the whole image in memory.
         self._covered = np.zeros((height, -(-width // 8)), dtype=np.uint8)
+        self._beyond_seams: np.ndarray | None = None  # as `_covered`: texels of the margin that `fit` has set
         self._paths = {name: folder / f"{number}.bin" for number, name in enumerate(names)}
         self._files = {name: path.open("w+b") for name, path in self._paths.items()}
 
@@ -70,23 +75,45 @@ class Planes:
         """Mask (last - first, W) of the texels that were put."""
         return np.unpackbits(self._covered[first:last], axis=1, count=self.shape[1]).view(bool)
 
+    def fit(self, seams: SeamFit) -> None:
+        """Let light, as far as it is not an error or Cycles' own, fit at smooth seams; the margin there goes on."""
+        height, width = self.shape
+        for layer in dict.fromkeys(name.rpartition(".")[0] for name in self.names):
+            names = [f"{layer}.{letter}" for letter in "RGB"]
+            image = np.stack([self._rows(name, 0, height) for name in names], axis=-1)
+            seams.fit(image, changed=not layer.startswith((exr.ERROR, *exr.CYCLES_LAYERS)))
+            for name, plane in zip(names, np.moveaxis(image, -1, 0), strict=True):
+                self._files[name].seek(0)
+                self._files[name].write(np.ascontiguousarray(plane))
+        margin = np.zeros(height * width, bool)
+        margin[seams.margin] = True
+        self._beyond_seams = np.packbits(margin.reshape(height, width), axis=1)
+
+    def _known(self, first: int, last: int) -> np.ndarray:
+        """Mask (last - first, W) of the texels that have values."""
+        known = self._covered if self._beyond_seams is None else self._covered | self._beyond_seams
+        return np.unpackbits(known[first:last], axis=1, count=self.shape[1]).view(bool)
+
     def _rows(self, name, first, last):
         file, width = self._files[name], self.shape[1]
         file.seek(4 * first * width)
         return np.frombuffer(file.read(4 * (last - first) * width), np.float32).reshape(-1, width)
 
-    def write(self, path: Path, margin: int, metadata, pictures, texture=None) -> None:
+    def write(self, path: Path, margin: int, header: tuple, pictures, texture=None) -> None:
         """Write the EXR with its margin filled, the ErrorPictures `pictures` (or None), and the `texture`.
 
+        `header` is the metadata, and the names of the channels that become half floats.
         `texture` is (path, layers): an EXR with the sum of these layers. None: no texture.
         """
-        height, width = self.shape
+        (height, width), (metadata, half) = self.shape, header
         rows = max(1, WRITTEN_TEXELS // width)
         for file in self._files.values():
             file.flush()
         with ExitStack() as files:
             # The files take their names in reverse order, the large one last: with it the tile counts as finished.
-            writer = files.enter_context(writing_rows(path, [*self.names, COVERAGE], (width, height), metadata))
+            writer = files.enter_context(
+                writing_rows(path, [*self.names, COVERAGE], (width, height), metadata, half=half)
+            )
             small = None
             if texture is not None:
                 small = files.enter_context(writing_rows(texture[0], "RGB", (width, height), metadata))
@@ -105,7 +132,7 @@ class Planes:
         """Rows `bottom` to `top` of all channels by name, margin filled, flipped so that row 0 is on top."""
         height, width = self.shape
         low, high = max(bottom - margin, 0), min(top + margin, height)
-        target, source = nearest_covered(self.coverage(low, high), margin)
+        target, source = nearest_covered(self._known(low, high), margin)
         inside = (target >= (bottom - low) * width) & (target < (top - low) * width)
         target, source = target[inside] - (bottom - low) * width, source[inside]
         block = {COVERAGE: self.coverage(bottom, top)[::-1].astype(np.float32)}

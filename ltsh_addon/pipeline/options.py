@@ -191,6 +191,21 @@ def view(text: str) -> tuple[float, ...] | str:
     raise ValueError(f"view is {text!r}, expected camera, above or a position such as 0,-4,1.5")
 
 
+def frame_number(text: str) -> int:
+    """One frame."""
+    numbers = frames(text)
+    if len(numbers) != 1:
+        raise ValueError(f"frame is {text!r}, expected one number")
+    return numbers[0]
+
+
+def picture_file(text: str) -> Path:
+    """The name of a file that exists."""
+    if not Path(text).is_file():
+        raise ValueError(f"picture {text!r}: no such file")
+    return Path(text)
+
+
 def folder(text: str) -> Path:
     """The name of a folder."""
     if not text.strip():
@@ -287,6 +302,16 @@ def _shadows() -> Any:
         "(default: %(default)s)"
     )
     return option("--shadows", default="on", choices=("on", "off"), help=meaning)
+
+
+def _bounces(what: str) -> Any:
+    meaning = f"also {what}, by Cycles and denoised (default: %(default)s)"
+    return option("--bounces", default="off", choices=("on", "off"), help=meaning)
+
+
+def _rest_samples() -> Any:
+    meaning = "of Cycles for the bounces (default: %(default)s)"
+    return option("--rest-samples", default=64, type=cycles_samples, metavar="N", help=meaning)
 
 
 @dataclass(frozen=True)
@@ -395,6 +420,9 @@ class BakeOptions(TaskOptions):
     error: bool = flag("--error", "beside Cycles' bake: signed errors, also as pictures")
     cycles_samples: int = _cycles_samples("Cycles' bake", 256)  # with `error`
     shadows: str = _shadows()
+    bounces: str = _bounces("bounced light")
+    rest_samples: int = _rest_samples()
+    per_light: bool = flag("--per-light", "a layer for each light, with its bounced light, so that powers can change")
     apply: bool = flag("--apply", "also a texture of each object, and a copy of the .blend whose materials show it")
     resume: bool = option(default=False, matters=False)  # keep what the same job has finished
 
@@ -409,14 +437,8 @@ class ViewOptions(CameraOptions):
         help="mean of N pictures, each of other points of the pixels; 1: pixel centers (default: %(default)s)",
     )  # fmt: skip
     shadows: str = _shadows()
-    bounces: str = option(
-        "--bounces", default="off", choices=("on", "off"),
-        help="also bounces, reflections, refraction, materials by nodes, by Cycles and denoised (default: %(default)s)",
-    )  # fmt: skip
-    rest_samples: int = option(
-        "--rest-samples", default=64, type=cycles_samples, metavar="N",
-        help="of Cycles for the bounces (default: %(default)s)",
-    )  # fmt: skip
+    bounces: str = _bounces("bounces, reflections, refraction, materials by nodes")
+    rest_samples: int = _rest_samples()
 
 
 @dataclass(frozen=True)
@@ -440,6 +462,34 @@ class RenderOptions(CameraOptions):
         "--denoise", default="on", choices=("on", "off"), help="what Cycles renders (default: %(default)s)"
     )
     keep_visibility: bool = flag("--keep-visibility", "also keep what `relight` needs, beside the EXR as .npz")
+    own_groups: tuple[str, ...] | None = option(default=None)  # lights, () for all, that get light groups of their own
+
+
+@dataclass(frozen=True)
+class MatchOptions(TaskOptions):
+    """Which lights should make the scene look like a picture; None means as in the file."""
+
+    frame: int | None = option("--frame", default=None, type=frame_number, metavar="F", help="default: the file's")
+    camera: str | None = option("--camera", default=None, metavar="NAME", help="default: the scene's camera")
+    target: Path = option(
+        "--target", default=Path(), type=picture_file, required=True, metavar="IMAGE",
+        help="the picture that the scene should look like, of the same camera",
+    )  # fmt: skip
+    target_view: str | None = option(
+        "--target-view", default=None, metavar="VIEW",
+        help="view transform of a target of 8 or 16 bits, such as Standard or AgX (default: the scene's)",
+    )  # fmt: skip
+    mask: Path | None = option(
+        "--mask", default=None, type=picture_file, metavar="IMAGE", help="white where the target counts, else black"
+    )
+    lights: tuple[str, ...] = option(
+        "--light", default=(), action="append", metavar="NAME", help="may be given several times; default: all"
+    )
+    colors: bool = flag("--colors", "also change the colors of lights, not only their powers")
+    techniques: tuple[str, ...] = _techniques(SHIPPED_TABLES, parse=one_table)
+    cycles_samples: int = option(
+        "--cycles-samples", default=256, type=cycles_samples, metavar="N", help="of Cycles (default: %(default)s)"
+    )
 
 
 # Derived from the declarations:

@@ -22,6 +22,7 @@ BAKE = {
     "conservative": True, "view": (-1.0, 2.5, 0.0),
     "techniques": ("reference",), "passes": ("diffuse_light",),
     "error": True, "cycles_samples": 32, "apply": True, "scripts": True,
+    "bounces": "on", "rest_samples": 16, "per_light": True,
     "shadows": "off", "shadow_rays": 16,
 }  # fmt: skip
 OF_A_TASK = {"scene", "output", "frame", "camera", "name"}

@@ -156,6 +156,18 @@ def test_glsl_3_30_takes_the_header(folder, tables, tmp_path, name, whole):
 
 
 @pytest.mark.parametrize("name", header_harness.NAMES)
+def test_glsl_es_3_00_takes_the_header(folder, tables, tmp_path, name):
+    """WebGL 2: the data from a texture of width 1024."""
+    source = f"""#version 300 es
+precision highp float; precision highp int; precision highp sampler2D;
+uniform sampler2D data;
+#define {name.upper()}_DATA(index) texelFetch(data, ivec2((index) % 1024, (index) / 1024), 0).r
+{(folder / f"{name}.h").read_text("ascii")}
+out vec4 color; void main() {{ color = vec4({name}_integrate_polygon(0.5, 0.5, ltsh_empty_polygon())); }}"""
+    glslang(source, tmp_path / "header.frag", "glsl", "frag", for_vulkan=False)
+
+
+@pytest.mark.parametrize("name", header_harness.NAMES)
 def test_every_table_translates_to_wgsl(folder, tables, device, name):
     """Those of other degrees too, and their code runs without complaint."""
     text = (folder / f"{name}.wgsl").read_text(encoding="ascii")

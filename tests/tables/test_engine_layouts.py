@@ -199,7 +199,9 @@ def run(capsys, *arguments):
 @pytest.mark.parametrize("name", layouts.LAYOUTS)
 def test_the_command_writes_the_files_and_says_what_is_dropped(name, files, capsys, out):
     code, stdout, stderr = run(capsys, "--layout", name, "-o", out, "--json")
-    written = [Path(path) for path in json.loads(stdout)["tables"]["ltc"]]
+    document = json.loads(stdout)
+    written = [Path(path) for path in document["tables"]["ltc"]]
+    assert document["licenses"] == [str(out / "LICENSE-CC0.txt")]
     assert code == 0 and {path.name: path.read_bytes() for path in written} == files[name]
     layout = layouts.LAYOUTS[name]
     assert stderr.splitlines() == [f"tables: warning: ltc in {layout.engine}: {text}" for text in layout.dropped]

@@ -18,6 +18,7 @@ from tables import __main__, export
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCUMENT = ROOT / "tables" / "EXPORT.md"
+LICENSES = ["LICENSE-CC0.txt", "LICENSE-MIT.txt"]
 
 
 def files_of(name: str, family: str = "") -> list[str]:
@@ -103,7 +104,7 @@ def test_names_in_headers_are_identifiers(name, expected):
 
 def test_all_shipped_tables_are_the_default(capsys, out):
     code, stdout, stderr = run(capsys, "-o", out)
-    names = [file for name in shading.SHIPPED_TABLES for file in files_of(name)]
+    names = [file for name in shading.SHIPPED_TABLES for file in files_of(name)] + LICENSES
     assert (code, stderr) == (0, "") and stdout.splitlines() == [str(out / name) for name in names]
     assert sorted(path.name for path in out.iterdir()) == sorted(names)
 
@@ -112,11 +113,13 @@ def test_json_is_one_document_that_names_the_files(capsys, out, tmp_path):
     path = tmp_path / "My table.npz"
     shutil.copy(ROOT / "tables" / "ltc.npz", path)
     code, stdout, stderr = run(capsys, "ltc", path, "ltc", "-o", out / "deep", "--json")
-    files = json.loads(stdout)["tables"]
+    document = json.loads(stdout)
+    files = document["tables"]
+    assert [Path(path).name for path in document["licenses"]] == LICENSES
     assert (code, stderr) == (0, "") and list(files) == ["ltc", str(path)]
     expected = {*files_of("ltc"), *files_of("My table", "ltc")}
     assert {Path(file).name for written in files.values() for file in written} == expected
-    assert {file.name for file in (out / "deep").iterdir()} == expected
+    assert {file.name for file in (out / "deep").iterdir()} == expected | set(LICENSES)
     assert "my_table_integrate_polygon" in (out / "deep" / "My table.h").read_text(encoding="ascii")
 
 
@@ -175,7 +178,7 @@ def test_a_failure_keeps_what_was_there(capsys, out, name):
     assert (out / other).read_bytes() == b"old" and len(list(out.iterdir())) == 2
 
 
-def test_every_file_says_its_license(exported):
+def test_every_file_says_its_license(exported, tmp_path):
     for name in shading.SHIPPED_TABLES:
         for ending in ("h", "wgsl"):
             text = (exported / f"{name}.{ending}").read_text(encoding="ascii")
@@ -184,4 +187,17 @@ def test_every_file_says_its_license(exported):
             assert "Permission is hereby granted, free of charge" in start and "GPL" not in text
         with OpenEXR.File(str(exported / f"{name}.exr"), header_only=True) as file:
             assert json.loads(file.header()["ltsh:conventions"])["license"] == "CC0-1.0"
-    assert "CC0 1.0 Universal" in (ROOT / "tables" / "LICENSE").read_text(encoding="utf-8")
+    export.write_licenses(tmp_path)
+    public_domain, mit = ((tmp_path / name).read_text(encoding="utf-8") for name in LICENSES)
+    assert "CC0 1.0 Universal" in public_domain
+    assert mit.startswith("MIT License\n\nCopyright 2026 LTSH contributors\n\nPermission is hereby granted")
+    assert mit.endswith("OTHER DEALINGS IN THE SOFTWARE.\n") and "\n   " not in mit
+
+
+@pytest.mark.parametrize("name", shading.SHIPPED_TABLES)
+def test_headers_say_first_what_they_need(exported, name):
+    """tests/shading/test_header_languages.py and test_shader_languages.py try all of these."""
+    for ending in ("h", "wgsl"):
+        start = (exported / f"{name}.{ending}").read_text(encoding="ascii").splitlines()[:4]
+        assert "Needs C99 or C++" in start[1] and "GLSL ES 3.00 (WebGL 2)" in start[1] and "HLSL" in start[1]
+        assert f"{name.upper()}_DATA" in start[2] and f"{name}_data" in start[2]

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import shutil
 import tempfile
 import time
-from dataclasses import dataclass, field
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import bpy
@@ -21,10 +23,10 @@ from ..evaluated import rendered_surfaces, with_render_depsgraph
 from ..lights.area import collect_lights
 from ..lights.world import take_world
 from ..materials import aovs
-from ..materials.graph import ensure_nodes
+from ..materials.graph import cut, ensure_nodes
 from ..materials.maps import UV_MAP, MaterialPlan, SavedImages
 from ..process.bake import BakeFactsJob, BakeJob
-from ..render_settings import working_space
+from ..render_settings import changed_properties, working_space
 from . import bake_meshes, pixels
 from .occluders import collect_occluders, with_baked_shares
 from .pixels import OCCLUDERS, SEEDS, remove_occlusion
@@ -106,15 +108,16 @@ class ObjectBake:
             cycles.use_sample_subset = False
         return np.array(maps)
 
-    def radiance(self, block: Block, kind: str, samples: int) -> np.ndarray:
-        """Cycles' direct light (2, rows, W, 3), colors included: two halves with different seeds."""
+    def halves(self, block: Block, kind: str, samples: int, light: set[str]) -> np.ndarray:
+        """Cycles' light (2, rows, W, 3) of the passes `light`, colors included: two halves with different seeds."""
+        return np.array([self.radiance(block, kind, (seed, samples), {*light, "COLOR"}) for seed in SEEDS.values()])
+
+    def radiance(self, block: Block, kind: str, sampling: tuple[int, int], light: set[str]) -> np.ndarray:
+        """Cycles' light (rows, W, 3) of the passes `light`; `sampling` is a seed and a number of samples."""
         for plan in self.plans:
             plan.show(None)
-        halves = []
-        for seed in SEEDS.values():
-            self.scene.cycles.seed, self.scene.cycles.samples = seed, samples
-            halves.append(self._bake(block, CYCLES_TYPES[kind], {"DIRECT", "COLOR"}))
-        return np.array(halves)
+        self.scene.cycles.seed, self.scene.cycles.samples = sampling
+        return self._bake(block, CYCLES_TYPES[kind], light)
 
     def _bake(self, block: Block, kind: str, pass_filter) -> np.ndarray:
         image = self._image(block)
@@ -176,6 +179,9 @@ class BakeScene:
     meshes: dict[str, bake_meshes.MeshFiles]
     problems: dict[str, str]
     lobes: dict[str, aovs.MaterialLobes]  # by full name of the material
+    bounces: list[tuple]  # what `changed_properties` sets so that Cycles bakes the indirect light as the file has it
+    world: object  # of the file, or None
+    settings: dict[str, list[float]]  # of light objects, by name
     folder: tempfile.TemporaryDirectory = field(repr=False)
 
     def plans(self, ob, images) -> tuple[list[MaterialPlan], list[str]]:
@@ -225,7 +231,7 @@ def _open(job: BakeJob) -> BakeScene:
     render_settings.go_to_frame(scene, job.frame)
     camera = _camera(scene, job)
     view_layer = render_settings.choose_view_layer(scene, warnings)
-    names = job.objects
+    bounces, names = bounces_of(scene), job.objects
     if not isinstance(names, str):
         names = list(dict.fromkeys([*names, *job.following]))
     objects = bake_meshes.chosen_objects(scene, view_layer, names)
@@ -254,7 +260,8 @@ def _open(job: BakeJob) -> BakeScene:
     warnings += inventory.warnings + rounded_positions(_points_in_boxes(objects), inventory.lights)
     if not inventory.lights:
         raise pixels.no_light(scene, inventory.warnings)
-    render_settings.leave_out_objects(scene, inventory.left_out, warnings)
+    if job.bounces == "off":
+        render_settings.leave_out_objects(scene, inventory.left_out, warnings)
     if job.cycles_samples:
         scene.world = inventory.world
     view = view_of(job.view, camera, bent=job.cycles_samples > 0)
@@ -264,7 +271,57 @@ def _open(job: BakeJob) -> BakeScene:
     name, names = camera.name if job.view == "camera" else "", [ob.name for ob in objects]
     if has_shadows:
         inventory.occluders.save(Path(folder.name) / OCCLUDERS)
-    return BakeScene(scene, name, view, inventory.lights, warnings, names, meshes, problems, lobes, folder)
+    of_objects = names, meshes, problems, lobes
+    lights = lights_by_row(scene, world, inventory.lights) if job.per_light else inventory.lights
+    return BakeScene(scene, name, view, lights, warnings, *of_objects, bounces, world, inventory.settings, folder)
+
+
+# BOUNCES: settings of Cycles on which indirect light depends, and which pictures of direct light switch off.
+BOUNCES = ("max_bounces", "sample_clamp_indirect", "blur_glossy", "caustics_reflective", "use_fast_gi")
+# GLOW: the row of all surfaces that glow. EMITTING: sockets that make surfaces glow, by node.
+GLOW = "Glowing surfaces"
+EMITTING = {"ShaderNodeEmission": "Strength", "ShaderNodeBsdfPrincipled": "Emission Strength"}
+
+
+def bounces_of(scene) -> list[tuple]:
+    """The settings of the file, as for `changed_properties`, on which its indirect light depends."""
+    owners = [(scene.cycles, name) for name in BOUNCES]
+    owners += [(material.cycles, "emission_sampling") for material in bpy.data.materials]
+    return [(owner, name, getattr(owner, name)) for owner, name in owners]
+
+
+def lights_by_row(scene, world, lights: list) -> list:
+    """The lights with the group by whose name they are baked for themselves: their own, else one of their name."""
+    alone = {ob.name for ob in scene.objects if ob.type == "LIGHT"} | ({world.name} if world is not None else set())
+    return [replace(one, group=(one.group or one.name) if one.name in alone else GLOW) for one in lights]
+
+
+@contextmanager
+def lit_by(opened: BakeScene, row: str):
+    """Within this context only the lights of a `row` shine, and bounce as the file has it; "": all lights do."""
+    scene, world, dark, cuts = opened.scene, opened.world, [], []
+    if row:
+        names = {light.name for light in opened.lights if light.group == row}
+        dark = [ob for ob in scene.objects if ob.type == "LIGHT" and ob.name not in names]
+        world = world if world is not None and world.name in names else None
+        cuts = [] if row == GLOW else _glowing_sockets()
+    changes = [*opened.bounces, (scene, "world", world), *((ob, "hide_render", True) for ob in dark)]
+    links = [(link.from_socket, link.to_socket) for socket in cuts for link in socket.links]
+    for socket in cuts:
+        cut(socket)
+    try:
+        with changed_properties(changes + [(socket, "default_value", 0.0) for socket in cuts]):
+            yield
+    finally:
+        for source, socket in links:
+            socket.id_data.links.new(source, socket)
+
+
+def _glowing_sockets() -> list:
+    """The sockets by which surfaces glow, in materials and in groups."""
+    owners = [material.node_tree for material in bpy.data.materials] + list(bpy.data.node_groups)
+    nodes = [node for tree in owners if tree is not None and tree.type == "SHADER" for node in tree.nodes]
+    return [node.inputs[EMITTING[node.bl_idname]] for node in nodes if node.bl_idname in EMITTING]
 
 
 def _points_in_boxes(objects) -> np.ndarray:
@@ -358,6 +415,7 @@ def extract_bake(job: BakeJob, folder: Path, progress) -> dict:
         "blender_version": bpy.app.version_string,
         "frame": opened.scene.frame_current,
         "lights": light_records(opened.lights),
+        "light_settings": opened.settings,
         "occluders": OCCLUDERS if job.shadows == "on" else None,
         "color_space": working_space(),
         "warnings": opened.warnings,
@@ -384,7 +442,7 @@ def _object(opened, name, images, job, folder, progress) -> dict:
     for uv_name, file in record["uv_maps"].items():
         save_array(folder / file, read.uv_map(uv_name))
     record["maps"] = any(plan.count for plan in distinct)
-    if record["maps"] or job.cycles_samples:
+    if record["maps"] or job.cycles_samples or job.bounces == "on":
         _bake(opened, ob, distinct, job, folder, progress)
     return record
 
@@ -392,26 +450,40 @@ def _object(opened, name, images, job, folder, progress) -> dict:
 def _bake(opened, ob, plans, job, folder, progress) -> None:
     """Write the maps and Cycles' bake of an object, for the wanted tiles that are not finished."""
     read, points = opened.meshes[ob.name], job.sub_samples if any(plan.count for plan in plans) else 0
-    bake = ObjectBake(opened.scene, ob, read.uv_name, plans)
+    bake, has_bounces = ObjectBake(opened.scene, ob, read.uv_name, plans), job.bounces == "on"
     try:
         with np.load(read.mesh) as data:
             tiles = tiles_of(data["uv"])[0]
         finished = {tile for name, tile in job.finished if name == ob.name}
-        blocks = [
-            Block(tile, first, min(job.block_rows, job.height - first), job.width, job.height)
-            for tile in tiles if tile not in finished and job.tile in (None, tile)
-            for first in range(0, job.height, job.block_rows)
-        ]  # fmt: skip
+        wanted = [tile for tile in tiles if tile not in finished and job.tile in (None, tile)]
+        blocks, rest = (_blocks(job, wanted, count) for count in (job.block_rows, job.rest_rows))
         for number, block in enumerate(blocks):
             progress(f"bake {ob.name}", number / len(blocks))
             for point in range(points):
                 save_array(folder / f"maps_{block.name}_{point}.npy", bake.maps(block, point, points))
-            if job.cycles_samples:
-                for kind in job.passes:
-                    halves = bake.radiance(block, kind, max(1, job.cycles_samples // 2))
-                    save_array(folder / f"cycles_{kind}_{block.name}.npy", halves)
+            for kind in job.passes if job.cycles_samples else ():
+                with lit_by(opened, "") if has_bounces else nullcontext():
+                    light = {"DIRECT", "INDIRECT"} if has_bounces else {"DIRECT"}
+                    halves = bake.halves(block, kind, max(1, job.cycles_samples // 2), light)
+                save_array(folder / f"cycles_{kind}_{block.name}.npy", halves)
+        rows = list(dict.fromkeys(light.group for light in opened.lights)) if job.per_light else [""]
+        # One light by itself has less noise, since no sample goes to others.
+        samples = job.rest_samples if len(rows) == 1 else max(job.rest_samples // 2, 1)
+        steps = itertools.product(rest if has_bounces else (), enumerate(rows), job.rest_passes)
+        for number, (block, (row, name), kind) in enumerate(steps):
+            progress(f"bounces {ob.name}", number / (len(rest) * len(rows) * len(job.rest_passes)))
+            with lit_by(opened, name):
+                light = {"INDIRECT", "COLOR"} if kind == "specular" else {"INDIRECT"}
+                baked = bake.radiance(block, kind, (SEEDS["A"], samples), light)
+            save_array(folder / f"rest_{kind}_{row}_{block.name}.npy", baked)
     finally:
         bake.close()
+
+
+def _blocks(job: BakeJob, tiles, rows: int) -> list[Block]:
+    """The blocks of so many `rows` of the UDIM `tiles`."""
+    firsts = range(0, job.height, rows)
+    return [Block(tile, y, min(rows, job.height - y), job.width, job.height) for tile in tiles for y in firsts]
 
 
 def scene_facts(job: BakeFactsJob, folder: Path, progress) -> dict:

@@ -125,8 +125,11 @@ def bake_options(context, scene_file: Path) -> BakeOptions:
         passes=chosen(settings, "bake_passes"),
         error=settings.bake_error,
         cycles_samples=settings.cycles_samples,
-        shadows="on" if settings.shadows else "off",
+        shadows="on" if settings.shadows or settings.bake_bounces else "off",
         shadow_rays=settings.shadow_rays,
+        bounces="on" if settings.bake_bounces else "off",
+        rest_samples=settings.bake_rest_samples,
+        per_light=settings.bake_per_light,
     )
 
 
@@ -212,9 +215,12 @@ def _bake(options: BakeOptions) -> list[Step]:
     texels = 1e-6 * math.prod(options.size)
     samples = options.cycles_samples * len(options.passes) if options.error else options.sub_samples
     shading = sum(_shading(name, texels) for name in options.techniques) * options.sub_samples
-    stages = [Step("open scene", OPEN_SECONDS)]
+    bounces, stages = options.bounces == "on", [Step("open scene", OPEN_SECONDS)]
     for name in options.objects:
         stages.append(Step(f"bake {name}", RENDER_SECONDS + SAMPLE_SECONDS * texels * samples))
+        if bounces:
+            stages.append(Step(f"bounces {name}", RENDER_SECONDS + CYCLES_SECONDS * texels * options.rest_samples))
+            stages.append(Step(f"denoise {name}", DENOISE_SECONDS * texels))
         stages.append(Step(f"shade {name}", shading + FILE_SECONDS * texels))
     return [*stages, Step("images", FILE_SECONDS * texels * len(options.objects))]
 
@@ -231,7 +237,7 @@ session_times: StageTimes = {}
 def _kind(stage: str) -> str:
     """The kind of a stage; stages of one kind have one pace: those of all objects of a bake, both halves of Cycles."""
     first = stage.partition(" ")[0]
-    return first if first in ("bake", "shade", "Cycles") else stage
+    return first if first in ("bake", "bounces", "shade", "Cycles") else stage
 
 
 def paces(measured: StageTimes) -> dict[str, float]:

@@ -10,7 +10,7 @@ import time
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import PurePosixPath
 
 import numpy as np
@@ -29,6 +29,7 @@ from ..workers.pool import cores
 from . import bake_files, lighting, lightmap
 from .comparison import percent
 from .lighting import check_named, prepare
+from .mixer import rows_of_groups
 from .options import BAKE_PASSES, TEXTURE_SIDES, BakeOptions, child_job
 from .tasks import TaskResult, file_stems, versions, write_reports
 
@@ -209,7 +210,8 @@ class ObjectBaker:
                 record["texture"] = f"{stem}.{bake_files.applied_layer(options)}{self._suffix(tile)}.exr"
                 texture = options.output / record["texture"], bake_files.applied_layers(options)
                 written.append(record["texture"])
-            planes.write(path, options.margin, self._metadata(tile), pictures, texture)
+            half = [name for name in planes.names if "@" in name] if options.per_light else []
+            planes.write(path, options.margin, (self._metadata(tile), half), pictures, texture)
         return record, written
 
     def _shade(self, tile, planes, errors, progress) -> dict:
@@ -301,7 +303,7 @@ class ObjectBaker:
         if self.options.bounces == "on":
             color = _summed(samples.diffuse_albedo[None], texel, len(texels.index))[0]
             bounces = spread.bounces(first, texels, color)
-            images = {layer_name(REST, name): bounces[name] for name in self.options.passes}
+            images = {layer_name(REST, name): bounces[name].sum(axis=0) for name in self.options.passes}
         if self.tracer is not None:
             options = self.options
             passes = shaded_passes(options)
@@ -316,7 +318,10 @@ class ObjectBaker:
         for name, table in self.tables.items():
             for pass_name, radiance in self._passes(samples, texel, len(texels.index), table, shadows).items():
                 layer = layer_name(name, pass_name)
-                whole = radiance.sum(axis=0) + bounces.get(pass_name, 0.0)
+                whole = radiance.sum(axis=0)
+                if bounces:
+                    whole = whole + bounces[pass_name].sum(axis=0)
+                    radiance = radiance + bounces[pass_name] if self.options.per_light else radiance
                 images |= {layer: whole, **exr.by_group(layer, self.groups, radiance)}
         return images if weights is None else {name: values * weights[:, None] for name, values in images.items()}
 
@@ -388,8 +393,9 @@ class TilePoints:
         self._at_centers = bakes_centers_alone(options, baker.record)
         self.rest, size = {}, options.size
         if options.bounces == "on":
-            kinds = lightmap.rest_passes(options.passes)
-            self.rest = {kind: lightmap.read_rest(baker.folder, kind, tile, size) for kind in kinds}
+            rows = range(len(baker.groups) if options.per_light else 1)
+            keys = itertools.product(lightmap.rest_passes(options.passes), rows)
+            self.rest = {key: lightmap.read_rest(baker.folder, key, tile, size) for key in keys}
         # The points of a block are shaded one after another, so few blocks need to be cached.
         cached = functools.lru_cache(maxsize=2 + threads // options.sub_samples)
         self.texels, self._weights_of = cached(self._covered), cached(self._fitted_weights)
@@ -416,9 +422,15 @@ class TilePoints:
         return self._triangles.corners
 
     def bounces(self, first: int, texels, color: np.ndarray) -> dict[str, np.ndarray]:
-        """Bounced light (Q, 3) by pass of the `texels` of the block from row `first` on, of the diffuse `color`."""
+        """Bounced light (R, Q, 3) by pass of the `texels` of the block from row `first` on, of the diffuse `color`.
+
+        It has a row for each light group with `per_light`, else one for all.
+        """
         at = texels.index + first * self._options.size[0]
-        light = {kind: image.reshape(-1, 3)[at] for kind, image in self.rest.items()}
+        light = {}
+        for (kind, _), image in self.rest.items():
+            light.setdefault(kind, []).append(image.reshape(-1, 3)[at])
+        light = {kind: np.array(rows) for kind, rows in light.items()}
         if "diffuse" in light:
             light["diffuse_light"], light["diffuse"] = light["diffuse"], color * light["diffuse"]
         return light | {COMBINED: sum(light[name] for name in ("specular", "diffuse") if name in light)}
@@ -538,7 +550,7 @@ def _report(options, manifest, records) -> dict:
                 warnings.append(f"{name}: {share:.3g} % of its texels {why}; bake the pass specular or combined")
             if not tile.get("denoiser", DENOISER).startswith(DENOISER):
                 warnings.append(f"{name}: {tile['denoiser']}")
-    return {
+    report = {
         "scene": str(options.scene),
         "frame": manifest["frame"],
         "size": list(options.size),
@@ -549,6 +561,10 @@ def _report(options, manifest, records) -> dict:
         "warnings": grouped(warnings),
         "versions": versions(manifest["blender_version"]),
     }
+    if options.per_light:
+        rows = rows_of_groups(lights_of(manifest["lights"]), manifest["light_settings"])
+        report |= {"light_rows": [asdict(row) for row in rows], "camera": manifest["camera"]}
+    return report
 
 
 def _darkness(record, reasons) -> tuple[list[str], list[str]]:

@@ -100,18 +100,21 @@ class Planes:
         file.seek(4 * first * width)
         return np.frombuffer(file.read(4 * (last - first) * width), np.float32).reshape(-1, width)
 
-    def write(self, path: Path, margin: int, metadata, pictures, texture=None) -> None:
+    def write(self, path: Path, margin: int, header: tuple, pictures, texture=None) -> None:
         """Write the EXR with its margin filled, the ErrorPictures `pictures` (or None), and the `texture`.
 
+        `header` is the metadata, and the names of the channels that become half floats.
         `texture` is (path, layers): an EXR with the sum of these layers. None: no texture.
         """
-        height, width = self.shape
+        (height, width), (metadata, half) = self.shape, header
         rows = max(1, WRITTEN_TEXELS // width)
         for file in self._files.values():
             file.flush()
         with ExitStack() as files:
             # The files take their names in reverse order, the large one last: with it the tile counts as finished.
-            writer = files.enter_context(writing_rows(path, [*self.names, COVERAGE], (width, height), metadata))
+            writer = files.enter_context(
+                writing_rows(path, [*self.names, COVERAGE], (width, height), metadata, half=half)
+            )
             small = None
             if texture is not None:
                 small = files.enter_context(writing_rows(texture[0], "RGB", (width, height), metadata))

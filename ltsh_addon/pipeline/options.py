@@ -447,6 +447,7 @@ class BakeOptions(TaskOptions):
     shadows: str = _shadows()
     bounces: str = _bounces("bounced light")
     rest_samples: int = _rest_samples()
+    per_light: bool = flag("--per-light", "a layer for each light, with its bounced light, so that powers can change")
     apply: bool = flag("--apply", "also a texture of each object, and a copy of the .blend whose materials show it")
     resume: bool = option(default=False, matters=False)  # keep what the same job has finished
 

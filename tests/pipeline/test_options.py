@@ -21,7 +21,8 @@ BAKE = {
     "objects": ("Floor", "-Wall"), "uv": "-Map", "size": (128, 64), "sub_samples": 4, "margin": 3,
     "conservative": True, "view": (-1.0, 2.5, 0.0),
     "techniques": ("reference",), "passes": ("diffuse_light",),
-    "error": True, "cycles_samples": 32, "apply": True, "bounces": "on", "rest_samples": 16, "scripts": True,
+    "error": True, "cycles_samples": 32, "apply": True, "scripts": True,
+    "bounces": "on", "rest_samples": 16, "per_light": True,
     "shadows": "off", "shadow_rays": 16,
 }  # fmt: skip
 # Options that go together.

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import shutil
 import tempfile
 import time
-from dataclasses import dataclass, field
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import bpy
@@ -21,7 +23,7 @@ from ..evaluated import rendered_surfaces, with_render_depsgraph
 from ..lights.area import collect_lights
 from ..lights.world import take_world
 from ..materials import aovs
-from ..materials.graph import ensure_nodes
+from ..materials.graph import cut, ensure_nodes
 from ..materials.maps import UV_MAP, MaterialPlan, SavedImages
 from ..process.bake import BakeFactsJob, BakeJob
 from ..render_settings import changed_properties, working_space
@@ -187,6 +189,8 @@ class BakeScene:
     lobes: dict[str, aovs.MaterialLobes]  # by full name of the material
     densities: dict[str, float]  # texels per metre of the objects of an atlas that was made
     bounces: list[tuple]  # what `changed_properties` sets so that Cycles bakes the indirect light as the file has it
+    world: object  # of the file, or None
+    settings: dict[str, list[float]]  # of light objects, by name
     folder: tempfile.TemporaryDirectory = field(repr=False)
 
     def plans(self, objects, images) -> tuple[dict[str, MaterialPlan], list[str]]:
@@ -276,7 +280,6 @@ def _open(job: BakeJob) -> BakeScene:
         raise pixels.no_light(scene, inventory.warnings)
     if job.bounces == "off":
         render_settings.leave_out_objects(scene, inventory.left_out, warnings)
-    bounces.append((scene, "world", world))
     if job.cycles_samples:
         scene.world = inventory.world
     view = view_of(job.view, camera, bent=job.cycles_samples > 0)
@@ -287,19 +290,56 @@ def _open(job: BakeJob) -> BakeScene:
     if has_shadows:
         inventory.occluders.save(Path(folder.name) / OCCLUDERS)
     facts = names, meshes, problems | unfit, lobes, densities
-    return BakeScene(scene, name, view, inventory.lights, warnings, *facts, bounces, folder)
+    lights = lights_by_row(scene, world, inventory.lights) if job.per_light else inventory.lights
+    return BakeScene(scene, name, view, lights, warnings, *facts, bounces, world, inventory.settings, folder)
 
 
 # BOUNCES: settings of Cycles on which indirect light depends, and which pictures of direct light switch off.
 BOUNCES = ("max_bounces", "sample_clamp_indirect", "blur_glossy", "caustics_reflective", "use_fast_gi")
+# GLOW: the row of all surfaces that glow. EMITTING: sockets that make surfaces glow, by node.
+GLOW = "Glowing surfaces"
+EMITTING = {"ShaderNodeEmission": "Strength", "ShaderNodeBsdfPrincipled": "Emission Strength"}
 
 
 def bounces_of(scene) -> list[tuple]:
     """The settings of the file, as for `changed_properties`, on which its indirect light depends."""
-    emission = [
-        (material.cycles, "emission_sampling", material.cycles.emission_sampling) for material in bpy.data.materials
-    ]
-    return [(scene.cycles, name, getattr(scene.cycles, name)) for name in BOUNCES] + emission
+    owners = [(scene.cycles, name) for name in BOUNCES]
+    owners += [(material.cycles, "emission_sampling") for material in bpy.data.materials]
+    return [(owner, name, getattr(owner, name)) for owner, name in owners]
+
+
+def lights_by_row(scene, world, lights: list) -> list:
+    """The lights with the group by whose name they are baked for themselves: their own, else one of their name."""
+    alone = {ob.name for ob in scene.objects if ob.type == "LIGHT"} | ({world.name} if world is not None else set())
+    return [replace(one, group=(one.group or one.name) if one.name in alone else GLOW) for one in lights]
+
+
+@contextmanager
+def lit_by(opened: BakeScene, row: str):
+    """Within this context only the lights of a `row` shine, and bounce as the file has it; "": all lights do."""
+    scene, world, dark, cuts = opened.scene, opened.world, [], []
+    if row:
+        names = {light.name for light in opened.lights if light.group == row}
+        dark = [ob for ob in scene.objects if ob.type == "LIGHT" and ob.name not in names]
+        world = world if world is not None and world.name in names else None
+        cuts = [] if row == GLOW else _glowing_sockets()
+    changes = [*opened.bounces, (scene, "world", world), *((ob, "hide_render", True) for ob in dark)]
+    links = [(link.from_socket, link.to_socket) for socket in cuts for link in socket.links]
+    for socket in cuts:
+        cut(socket)
+    try:
+        with changed_properties(changes + [(socket, "default_value", 0.0) for socket in cuts]):
+            yield
+    finally:
+        for source, socket in links:
+            socket.id_data.links.new(source, socket)
+
+
+def _glowing_sockets() -> list:
+    """The sockets by which surfaces glow, in materials and in groups."""
+    owners = [material.node_tree for material in bpy.data.materials] + list(bpy.data.node_groups)
+    nodes = [node for tree in owners if tree is not None and tree.type == "SHADER" for node in tree.nodes]
+    return [node.inputs[EMITTING[node.bl_idname]] for node in nodes if node.bl_idname in EMITTING]
 
 
 def _points_in_boxes(objects) -> np.ndarray:
@@ -396,6 +436,7 @@ def extract_bake(job: BakeJob, folder: Path, progress) -> dict:
         "blender_version": bpy.app.version_string,
         "frame": opened.scene.frame_current,
         "lights": light_records(opened.lights),
+        "light_settings": opened.settings,
         "occluders": OCCLUDERS if job.shadows == "on" else None,
         "color_space": working_space(),
         "warnings": opened.warnings,
@@ -439,12 +480,12 @@ def _objects(opened, names, images, job, folder, progress) -> dict:
         tiles = [tile for tile in tiles_of(joined.uv)[0] if tile not in finished and job.tile in (None, tile)]
         uv_names = {ob: opened.meshes[ob.name].uv_name for ob in objects}
         bake = ObjectBake(opened.scene, uv_names, list(plans.values()))
-        _bake(bake, tiles, job, opened.bounces, (folder, progress))
+        _bake(bake, tiles, job, opened, (folder, progress))
     return record
 
 
-def _bake(bake, tiles, job, bounces, files) -> None:
-    """Write the maps and Cycles' bake of the objects of an ObjectBake, and close it; `bounces`: see BakeScene."""
+def _bake(bake, tiles, job, opened, files) -> None:
+    """Write the maps and Cycles' bake of the objects of an ObjectBake, and close it; `files`: folder, progress."""
     points, has_bounces = job.sub_samples if any(plan.count for plan in bake.plans) else 0, job.bounces == "on"
     name, (folder, progress) = ATLAS if job.atlas else next(iter(bake.uv_names)).name, files
     try:
@@ -454,17 +495,20 @@ def _bake(bake, tiles, job, bounces, files) -> None:
             for point in range(points):
                 save_array(folder / f"maps_{block.name}_{point}.npy", bake.maps(block, point, points))
             for kind in job.passes if job.cycles_samples else ():
-                with changed_properties(bounces if has_bounces else []):
+                with lit_by(opened, "") if has_bounces else nullcontext():
                     light = {"DIRECT", "INDIRECT"} if has_bounces else {"DIRECT"}
                     halves = bake.halves(block, kind, max(1, job.cycles_samples // 2), light)
                 save_array(folder / f"cycles_{kind}_{block.name}.npy", halves)
-        for number, block in enumerate(rest if has_bounces else ()):
-            for kind in job.rest_passes:
-                progress(f"bounces {name}", number / len(rest))
-                with changed_properties(bounces):
-                    light = {"INDIRECT", "COLOR"} if kind == "specular" else {"INDIRECT"}
-                    baked = bake.radiance(block, kind, (SEEDS["A"], job.rest_samples), light)
-                save_array(folder / f"rest_{kind}_{block.name}.npy", baked)
+        rows = list(dict.fromkeys(light.group for light in opened.lights)) if job.per_light else [""]
+        # One light by itself has less noise, since no sample goes to others.
+        samples = job.rest_samples if len(rows) == 1 else max(job.rest_samples // 2, 1)
+        steps = itertools.product(rest if has_bounces else (), enumerate(rows), job.rest_passes)
+        for number, (block, (row, light_name), kind) in enumerate(steps):
+            progress(f"bounces {name}", number / (len(rest) * len(rows) * len(job.rest_passes)))
+            with lit_by(opened, light_name):
+                light = {"INDIRECT", "COLOR"} if kind == "specular" else {"INDIRECT"}
+                baked = bake.radiance(block, kind, (SEEDS["A"], samples), light)
+            save_array(folder / f"rest_{kind}_{row}_{block.name}.npy", baked)
     finally:
         bake.close()
 

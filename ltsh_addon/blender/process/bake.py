@@ -39,6 +39,7 @@ class BakeJob:
     rest_samples: int = 64  # of Cycles for the indirect light
     rest_passes: tuple[str, ...] = ()  # with bounces: of the indirect light; the diffuse one has no color
     rest_rows: int = 1  # rows of texels of which it is baked at a time
+    per_light: bool = False  # each light by itself: its group is its own name, if it has none
 
 
 def extract_bake(job: BakeJob, folder: Path, *, progress: Progress | None = None) -> dict:

@@ -468,10 +468,10 @@ def _complain(bar, what: str, lines) -> None:
 
 
 def _summary(merged: Merged, output) -> str:
-    from ..pipeline import bake, picture, render
+    from ..pipeline import bake_files, picture, render
 
     summary, brief = {
-        "bake": (bake.summary, bake.brief),
+        "bake": (bake_files.summary, bake_files.brief),
         "view": (picture.view_summary, render.brief),
         "render": (render.summary, render.brief),
     }.get(merged.command, (picture.summary, picture.brief))

@@ -22,12 +22,11 @@ from ..imaging import exr, grouped
 from ..imaging.denoise import DENOISER
 from ..imaging.exr import COMBINED, REST, layer_name
 from ..imaging.seams import SeamFit, TexelGrid, islands_of
-from ..reading import NUMBER, Malformed, check, file_name
+from ..reading import Malformed, check, file_name
 from ..scene import PASSES, REFERENCE, Cancelled, Film, Progress, SurfaceSamples, lights_of, listed
 from ..visibility import Occluders, ShadowSampling
 from ..workers.pool import cores
 from . import bake_files, lighting, lightmap
-from .comparison import percent
 from .lighting import check_named, prepare
 from .mixer import rows_of_groups
 from .options import BAKE_PASSES, TEXTURE_SIDES, BakeOptions, child_job
@@ -590,25 +589,3 @@ REPORT = {
     **dict.fromkeys(("problems", "warnings"), [str]),
     "versions": dict,
 }
-
-
-def summary(report: dict, seconds: dict) -> list[str]:
-    """Lines of text about the bake of one scene, camera and frame: a line per file, and the errors if there are any."""
-    lines = []
-    for record in report["objects"]:
-        for tile in record["tiles"].values():
-            took = seconds.get(tile["file"])
-            seconds_text = f"{took:>8.2f} s" if isinstance(took, NUMBER) else ""
-            lines.append(f"{tile['file']:<40}{tile['texels']:>10} texels{seconds_text}")
-            for pass_name, figures in tile.get("errors", {}).items():
-                for name, error in figures["techniques"].items():
-                    in_noise = (error.get("unbiased_squared_error") or 0.0) < 0.0
-                    beside = "in noise" if in_noise else percent(error.get("unbiased_error"))
-                    noise = f"(noise {percent(figures.get('noise'))})"
-                    lines.append(f"  {name + '.' + pass_name:<30}{beside:>10} beside Cycles {noise}")
-    return lines
-
-
-def brief(report: dict) -> list[str]:
-    """The lines of `summary` without times, under the name of the bake, for one of several."""
-    return [f"{report['name']}:", *(f"  {line}" for line in summary(report, {}))]

@@ -14,6 +14,7 @@ from ..imaging.exr import COMBINED, layer_name, parse_layer_name, writing_rows
 from ..imaging.seams import SeamFit
 from ..reading import NUMBER, file_name
 from ..scene import PASSES
+from .comparison import percent
 from .lighting import technique_names
 from .options import BakeOptions
 from .tasks import Records, contents_digest, options_digest
@@ -326,3 +327,25 @@ def apply_textures(scene: Path, output: Path, report: dict, layer: str, progress
     atlas = report["objects"][0].get("atlas")
     apply_bake(ApplyJob(scene, path, textures, report["frame"], atlas), progress=progress)
     return path.name
+
+
+def summary(report: dict, seconds: dict) -> list[str]:
+    """Lines of text about the bake of one scene, camera and frame: a line per file, and the errors if there are any."""
+    lines = []
+    for record in report["objects"]:
+        for tile in record["tiles"].values():
+            took = seconds.get(tile["file"])
+            seconds_text = f"{took:>8.2f} s" if isinstance(took, NUMBER) else ""
+            lines.append(f"{tile['file']:<40}{tile['texels']:>10} texels{seconds_text}")
+            for pass_name, figures in tile.get("errors", {}).items():
+                for name, error in figures["techniques"].items():
+                    in_noise = (error.get("unbiased_squared_error") or 0.0) < 0.0
+                    beside = "in noise" if in_noise else percent(error.get("unbiased_error"))
+                    noise = f"(noise {percent(figures.get('noise'))})"
+                    lines.append(f"  {name + '.' + pass_name:<30}{beside:>10} beside Cycles {noise}")
+    return lines
+
+
+def brief(report: dict) -> list[str]:
+    """The lines of `summary` without times, under the name of the bake, for one of several."""
+    return [f"{report['name']}:", *(f"  {line}" for line in summary(report, {}))]

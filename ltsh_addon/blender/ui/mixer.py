@@ -146,7 +146,7 @@ class _Mixer:
         split_names(layout, context)
         if not rows:
             layout.prop(settings, "keep_lights")
-            draw_text(layout, context, "Shade the picture with it: then its lights can be changed here", "INFO")
+            draw_text(layout, context, "Shade the picture with it, or bake Per Light: then lights change here", "INFO")
             return
         layout.template_list("LTSH_UL_mixer", "", settings, "mixed", settings, "mixed_active", rows=min(len(rows), 8))
         item = settings.mixed[settings.mixed_active] if settings.mixed_active < len(settings.mixed) else None
@@ -191,7 +191,7 @@ def notes(scene) -> list[str]:
     texts, camera = list(facts["notes"]), scene.camera
     if facts["frame"] != scene.frame_current:
         texts.append(f"The picture is of frame {facts['frame']}, the scene is at frame {scene.frame_current}")
-    if camera is None or facts["camera"] != camera.name:
+    if facts["camera"] and (camera is None or facts["camera"] != camera.name):
         texts.append(f"The picture is of camera {facts['camera']}")
     return texts
 
@@ -209,7 +209,7 @@ class _NeedsMixer:
     @classmethod
     def poll(cls, context):
         if results.mixer_of(context.scene) is None:
-            cls.poll_message_set("Shade a picture first, with Keep Lights")
+            cls.poll_message_set("Shade a picture first, with Keep Lights, or bake Per Light")
             return False
         return True
 

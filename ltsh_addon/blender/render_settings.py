@@ -73,8 +73,8 @@ def choose_camera(scene, name: str | None):
             f"camera {camera.name!r} is {kind}, expected a perspective or orthographic one; "
             "change its type, or name another camera"
         )
-    # A render would switch to the camera of the last marker.
-    for marker in scene.timeline_markers:
+    # A render would switch to the camera of the last marker, which is another one only if one is named.
+    for marker in scene.timeline_markers if name is not None else ():
         marker.camera = None
     scene.camera = camera
     return camera

@@ -6,7 +6,7 @@ is black outside and blends to black within half a pixel.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -98,11 +98,17 @@ class TexelMesh:
     material: np.ndarray  # (T,) number of the material
     mirrored: bool | np.ndarray = False  # True: the transform turns right hands into left ones
     receiver: int | np.ndarray = 0  # as in `SurfaceSamples`
+    object: int | np.ndarray = 0  # number of the object of the atlas
+
+    @classmethod
+    def joined(cls, meshes: Sequence[TexelMesh]) -> TexelMesh:
+        """All `meshes` as one; what may hold for a whole mesh must be arrays (T,)."""
+        return cls(**{item.name: np.concatenate([getattr(mesh, item.name) for mesh in meshes]) for item in fields(cls)})
 
     def true_normals(self) -> np.ndarray:
         """Unit normals (T, 3) of the faces. A smooth normal may point to the other side, for example on a bent quad."""
         sides = self.corners[:, 1:] - self.corners[:, :1]
-        return unit(np.cross(sides[:, 0], sides[:, 1])) * (-1.0 if self.mirrored else 1.0)
+        return unit(np.cross(sides[:, 0], sides[:, 1])) * np.where(self.mirrored, -1.0, 1.0).reshape(-1, 1)
 
     def save(self, path) -> None:
         """Write an .npz."""
@@ -210,11 +216,32 @@ def texel_samples(
 
     read_map(number) returns a baked map at the texels, (Q, 3).
     """
+    pieces, index = [], []
+    for start, samples, texel in _lobes_of_texels(mesh, materials, texels, read_map, view):
+        samples, of_sample = end_at_horizons_of_cycles(samples, lights, texel, is_baked=True)
+        pieces.append(samples)
+        index.append(texel[of_sample] + start)
+    return SurfaceSamples.joined(pieces), np.concatenate(index)
+
+
+def texel_guides(mesh: TexelMesh, materials: list[BakeMaterial], texels: Texels, read_map) -> np.ndarray:
+    """The diffuse color and the normal, (Q, 6), of texels (Q); for `read_map` see `texel_samples`."""
+    guides = np.zeros((len(texels.index), 6), np.float32)
+    for start, samples, texel in _lobes_of_texels(mesh, materials, texels, read_map, BakeView("above")):
+        np.add.at(guides[start:, :3], texel, samples.diffuse_albedo)
+        # The normals of lobes count by their color.
+        weight = samples.diffuse_albedo.mean(axis=1) + 1e-3
+        np.add.at(guides[start:, 3:], texel, weight[:, None] * samples.diffuse_normal)
+    guides[:, 3:] = unit(guides[:, 3:])
+    return guides
+
+
+def _lobes_of_texels(mesh, materials, texels, read_map, view):
+    """Blocks of texels: the first texel, the samples (S) of the block, and the texel (S,) of each, counted from it."""
     true_normals = mesh.true_normals()
     corrected = np.array([material.corrected for material in materials], dtype=bool)
     values = (value for material in materials for lobe in material.lobes for value in lobe.values())
     maps = {number: read_map(number) for number in {value.map for value in values if isinstance(value, MapValue)}}
-    pieces, index = [], []
     for start in range(0, max(len(texels.index), 1), HITS_PER_BLOCK):
         block = slice(start, start + HITS_PER_BLOCK)
         triangle, weights = texels.triangle[block], texels.barycentric[block]
@@ -228,15 +255,11 @@ def texel_samples(
             smooth_normal=smooth_normal,
             true_normal=true_normal,
             corrected=corrected[number],
-            receiver=np.full(len(position), mesh.receiver),
+            receiver=np.broadcast_to(mesh.receiver, (len(mesh.corners),))[triangle],
             diffuse_albedo=None,
         )
         of_block = {name: values[block] for name, values in maps.items()}
-        samples, texel = samples_of_lobes(hits, _lobes(materials, number, of_block, triangle, weights))
-        samples, of_sample = end_at_horizons_of_cycles(samples, lights, texel, is_baked=True)
-        pieces.append(samples)
-        index.append(texel[of_sample] + start)
-    return SurfaceSamples.joined(pieces), np.concatenate(index)
+        yield start, *samples_of_lobes(hits, _lobes(materials, number, of_block, triangle, weights))
 
 
 def _interpolated(values, triangle, weights):

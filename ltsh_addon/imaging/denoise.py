@@ -16,6 +16,7 @@ import numpy as np
 
 from ..scene import error_line, listed
 
+DENOISER = "Open Image Denoise"  # how `Denoiser.name` begins
 # Names under which the system may know the library.
 SYSTEM_LIBRARIES = ("libOpenImageDenoise.so.2", "libOpenImageDenoise.dylib", "OpenImageDenoise.dll")
 _CPU, _FLOAT3 = 1, 3  # OIDNDeviceType, OIDNFormat
@@ -64,7 +65,7 @@ class Denoiser:
         self._CommitDevice(self._device)
         self._check()
         version = self._GetDeviceInt(self._device, b"version")
-        self.name = f"Open Image Denoise {version // 10000}.{version // 100 % 100}.{version % 100}"
+        self.name = f"{DENOISER} {version // 10000}.{version // 100 % 100}.{version % 100}"
 
     def close(self) -> None:
         """Free the memory of the library."""
@@ -87,6 +88,11 @@ class Denoiser:
     def quickly_denoised(self, color: np.ndarray, albedo: np.ndarray, normal: np.ndarray) -> np.ndarray:
         """As `all_denoised` of one picture, with the library's fast quality and the guides as they are."""
         return self._filtered({"color": color, "albedo": albedo, "normal": normal}, hdr=True, quality=_FAST)
+
+    def guided(self, color: np.ndarray, albedo: np.ndarray, normal: np.ndarray) -> np.ndarray:
+        """As `all_denoised` of one picture, with guides without noise."""
+        images = {"color": color, "albedo": albedo, "normal": normal}
+        return self._filtered(images, quality=_HIGH, hdr=True, cleanAux=True)
 
     def _filtered(self, images: dict[str, np.ndarray], **settings: int) -> np.ndarray:
         """The first of the `images`, filtered with the help of the others."""

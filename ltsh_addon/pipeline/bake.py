@@ -10,23 +10,25 @@ import time
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import PurePosixPath
 
 import numpy as np
 
 from ..cycles import uv
-from ..cycles.texels import NOT_BAKED, BakeMaterial, BakeView, TexelMesh, texel_samples
+from ..cycles.texels import NOT_BAKED, BakeMaterial, BakeView, TexelMesh, texel_guides, texel_samples
 from ..files import temporary_folder
 from ..imaging import exr, grouped
-from ..imaging.exr import COMBINED, layer_name
-from ..reading import NUMBER, Malformed, check, file_name
+from ..imaging.denoise import DENOISER
+from ..imaging.exr import COMBINED, REST, layer_name
+from ..imaging.seams import SeamFit, TexelGrid, islands_of
+from ..reading import Malformed, check, file_name
 from ..scene import PASSES, REFERENCE, Cancelled, Film, Progress, SurfaceSamples, lights_of, listed
 from ..visibility import Occluders, ShadowSampling
 from ..workers.pool import cores
-from . import bake_files, lighting
-from .comparison import percent
+from . import bake_files, lighting, lightmap
 from .lighting import check_named, prepare
+from .mixer import rows_of_groups
 from .options import BAKE_PASSES, TEXTURE_SIDES, BakeOptions, child_job
 from .tasks import TaskResult, file_stems, versions, write_reports
 
@@ -49,7 +51,7 @@ def bake_scene(options: BakeOptions, progress: Progress | None = None) -> dict:
     report = result.report
     if options.apply and report["objects"]:
         layer = bake_files.applied_layer(options)
-        report["applied"] = bake_files.apply_textures(options.scene, options.output, report["objects"], layer, progress)
+        report["applied"] = bake_files.apply_textures(options.scene, options.output, report, layer, progress)
     return write_reports(result, options.output)
 
 
@@ -77,7 +79,7 @@ def bake_objects(
         records, files, seconds = [], [], {"blender": manifest["seconds"]}
         with _shadow_tracer(options, manifest, folder) as tracer:
             for record, stem in zip(manifest["objects"], stems, strict=True):
-                if record["problem"] is None:
+                if record["folder"]:
                     (options.output / stem).parent.mkdir(parents=True, exist_ok=True)
                     baker = ObjectBaker(options, tables, manifest, record, folder / record["folder"], tracer)
                     baked = baker.bake(stem, [] if tile is None else [tile], finished, progress)
@@ -107,6 +109,10 @@ def _check(options: BakeOptions) -> None:
     unknown = [name for name in options.passes if name not in BAKE_PASSES]
     if unknown or not options.passes:
         raise ValueError(f"passes are {list(options.passes)}, expected some of {', '.join(BAKE_PASSES)}")
+    if options.bounces == "on" and options.shadows == "off":
+        raise ValueError(
+            "bounces are on and shadows off, expected both: bounced light has shadows; leave out one of both"
+        )
 
 
 def _job(options, finished, tile=None, following=()):
@@ -123,6 +129,8 @@ def _job(options, finished, tile=None, following=()):
         finished=tuple(finished),
         tile=tile,
         following=following,
+        rest_passes=lightmap.rest_passes(options.passes),
+        rest_rows=lightmap.rest_rows(options.size),
     )
 
 
@@ -146,7 +154,7 @@ class ObjectBaker:
     def __init__(self, options, tables, manifest, record, folder, tracer=None):
         self.options, self.tables, self.manifest, self.record, self.folder = options, tables, manifest, record, folder
         self.lights, self.tracer = lights_of(manifest["lights"]), tracer
-        self.mesh = replace(TexelMesh.load(folder / "mesh.npz"), receiver=record["receiver"])
+        self.mesh = TexelMesh.load(folder / "mesh.npz")
         uv_maps = {name: folder / file for name, file in record["uv_maps"].items()}
         self.materials = [BakeMaterial.of(material, folder.parent, uv_maps) for material in record["materials"]]
         self.view = BakeView(**manifest["view"])
@@ -162,6 +170,8 @@ class ObjectBaker:
         """
         name, files, seconds = self.record["name"], [], {}
         result = {"name": name, "uv": self.record["uv"], "outside": 0.0, "tiles": {}}
+        if self.options.atlas is not None:
+            result |= {"members": self.record["members"], "atlas": self.record["atlas"]}
         for tile in tiles or self.tiles:
             file = f"{stem}{self._suffix(tile)}.exr"
             start = time.perf_counter()
@@ -199,15 +209,20 @@ class ObjectBaker:
                 record["texture"] = f"{stem}.{bake_files.applied_layer(options)}{self._suffix(tile)}.exr"
                 texture = options.output / record["texture"], bake_files.applied_layers(options)
                 written.append(record["texture"])
-            planes.write(path, options.margin, self._metadata(tile), pictures, texture)
+            half = [name for name in planes.names if "@" in name] if options.per_light else []
+            planes.write(path, options.margin, (self._metadata(tile), half), pictures, texture)
         return record, written
 
     def _shade(self, tile, planes, errors, progress) -> dict:
         """Shade a tile block by block into `planes`; returns its counts of texels for the record."""
         options, covered, covers, overlaps, unshaded, unbaked, lit = self.options, 0, 0, 0, 0, 0, False
         is_unshaded = np.array([bool(reason) for reason in self.record["unshaded"]])
+        of_members = np.zeros(len(self.record["members"]), np.int64)
         rows, height = block_rows(options), options.size[1]
         points, spread = options.sub_samples, TilePoints(self, tile, self._threads())
+        facts, seams = {}, None
+        if options.bounces == "on":
+            facts, seams = self._take_bounces(spread, progress)
 
         def shaded(task):
             return *task, self._block(spread, *task)
@@ -225,6 +240,7 @@ class ObjectBaker:
                 overlaps += texels.overlaps
                 unbaked += texels.unbaked
                 unshaded += int(is_unshaded[self.mesh.material[texels.triangle]].sum())
+                of_members += np.bincount(self.mesh.object[texels.triangle], minlength=len(of_members))
                 names = (layer_name(name, pass_name) for name in self.tables for pass_name in options.passes)
                 lit = lit or any(planes_of[name].any() for name in names)
                 planes.put(first, min(rows, height - first), texels, _channels(planes_of))
@@ -236,7 +252,30 @@ class ObjectBaker:
             if progress is not None and progress(f"shade {self.record['name']}", share) is False:
                 raise Cancelled("the bake was stopped")
         counts = {"texels": covered, "covered_times": covers, "overlapping_texels": overlaps}
-        return {**counts, "unshaded_texels": unshaded, "unbaked_texels": unbaked, "is_lit": lit}
+        if options.atlas is not None:
+            counts["member_texels"] = dict(zip(self.record["members"], of_members.tolist(), strict=True))
+        if seams is not None:
+            planes.fit(seams)
+        return {**counts, "unshaded_texels": unshaded, "unbaked_texels": unbaked, "is_lit": lit, **facts}
+
+    def _take_bounces(self, spread, progress) -> tuple[dict, SeamFit]:
+        """Denoise the bounced light of the texels; returns entries of the tile's record, and what fits its seams."""
+        width, height = self.options.size
+        triangle, guides = np.full(height * width, -1), np.zeros((height * width, 6), np.float32)
+        if progress is not None and progress(f"denoise {self.record['name']}", 0.0) is False:
+            raise Cancelled("the bake was stopped")
+        for first in range(0, height, block_rows(self.options)):
+            texels, maps, _ = spread.at(first, 0)
+            at = texels.index + first * width
+            triangle[at] = texels.triangle
+            guides[at] = texel_guides(self.mesh, self.materials, texels, _map_reader(maps, texels))
+        shape = height, width
+        grid = TexelGrid.of(triangle.reshape(shape), spread.corners, self.mesh)
+        guides = guides.reshape(*shape, 6)
+        islands = islands_of(grid)
+        spread.rest, denoiser = lightmap.denoised_rest(spread.rest, guides, islands, self.options.rest_samples)
+        dull = (guides[..., :3].max(axis=-1) <= lightmap.DULL) & (grid.triangle >= 0)
+        return {"denoiser": denoiser, "dull_texels": int(np.count_nonzero(dull))}, SeamFit(islands)
 
     def _threads(self) -> int:
         """Blocks to shade at a time: one with the reference, whose shading of a block takes all cores itself."""
@@ -246,6 +285,8 @@ class ObjectBaker:
         """Names of the channels of the EXR, without the coverage."""
         names = [layer_name(name, pass_name) for name in self.tables for pass_name in self.options.passes]
         names += [of_group for name in names for of_group in exr.by_group(name, self.groups, self.groups)]
+        if self.options.bounces == "on":
+            names += [layer_name(REST, pass_name) for pass_name in self.options.passes]
         for pass_name in self.compared:
             images = [*exr.CYCLES_LAYERS, *(f"{exr.ERROR}{name}" for name in self.tables)]
             names += [layer_name(image, pass_name) for image in images]
@@ -255,11 +296,13 @@ class ObjectBaker:
         """Layers (Q, 3) of the Q texels of a block, shaded at one point of each texel."""
         texels, maps, weights = spread.at(first, point)
 
-        def read_map(number):
-            return maps[number].reshape(-1, 3)[texels.index]
-
+        read_map = _map_reader(maps, texels)
         samples, texel = texel_samples(self.mesh, self.materials, texels, read_map, self.view, self.lights)
-        images, shadows = {}, None
+        images, shadows, bounces = {}, None, {}
+        if self.options.bounces == "on":
+            color = _summed(samples.diffuse_albedo[None], texel, len(texels.index))[0]
+            bounces = spread.bounces(first, texels, color)
+            images = {layer_name(REST, name): bounces[name].sum(axis=0) for name in self.options.passes}
         if self.tracer is not None:
             options = self.options
             passes = shaded_passes(options)
@@ -274,7 +317,11 @@ class ObjectBaker:
         for name, table in self.tables.items():
             for pass_name, radiance in self._passes(samples, texel, len(texels.index), table, shadows).items():
                 layer = layer_name(name, pass_name)
-                images |= {layer: radiance.sum(axis=0), **exr.by_group(layer, self.groups, radiance)}
+                whole = radiance.sum(axis=0)
+                if bounces:
+                    whole = whole + bounces[pass_name].sum(axis=0)
+                    radiance = radiance + bounces[pass_name] if self.options.per_light else radiance
+                images |= {layer: whole, **exr.by_group(layer, self.groups, radiance)}
         return images if weights is None else {name: values * weights[:, None] for name, values in images.items()}
 
     def _add_cycles(self, images, tile, first, texels) -> dict[str, np.ndarray]:
@@ -338,10 +385,16 @@ class TilePoints:
 
     def __init__(self, baker: ObjectBaker, tile: int, threads: int):
         options = baker.options
-        self._options, self._folder, self._tile, self._mapped = options, baker.folder, tile, baker.record["maps"]
+        self._options, self._folder, self._tile = options, baker.folder, tile
+        self._mapped = baker.record["maps"]
         self._width = baker.manifest["sampled_texels"]
         self._triangles = uv.UvTriangles.in_tile(baker.mesh.uv, *options.size, _column_and_row(tile))
         self._at_centers = bakes_centers_alone(options, baker.record)
+        self.rest, size = {}, options.size
+        if options.bounces == "on":
+            rows = range(len(baker.groups) if options.per_light else 1)
+            keys = itertools.product(lightmap.rest_passes(options.passes), rows)
+            self.rest = {key: lightmap.read_rest(baker.folder, key, tile, size) for key in keys}
         # The points of a block are shaded one after another, so few blocks need to be cached.
         cached = functools.lru_cache(maxsize=2 + threads // options.sub_samples)
         self.texels, self._weights_of = cached(self._covered), cached(self._fitted_weights)
@@ -353,22 +406,47 @@ class TilePoints:
         the point, 1 on average (None: all points count alike).
         """
         texels = self.texels(first)
+        count = self._options.sub_samples
         if not self._mapped:
-            return self._triangles.spread(texels, point, self._options.sub_samples, self._width), None, None
+            return self._triangles.spread(texels, point, count, self._width), None, None
         maps = np.load(self._file(first, point))
-        if self._options.sub_samples == 1:
+        if count == 1:
             return texels, maps, None
         positions = self._positions(texels, maps, first, point)
         return self._triangles.at(texels, positions), maps, self._weights_of(first).at(positions)
+
+    @property
+    def corners(self) -> np.ndarray:
+        """The corners (T, 3, 2) of the triangles in the texture, in texels."""
+        return self._triangles.corners
+
+    def bounces(self, first: int, texels, color: np.ndarray) -> dict[str, np.ndarray]:
+        """Bounced light (R, Q, 3) by pass of the `texels` of the block from row `first` on, of the diffuse `color`.
+
+        It has a row for each light group with `per_light`, else one for all.
+        """
+        at = texels.index + first * self._options.size[0]
+        light = {}
+        for (kind, _), image in self.rest.items():
+            light.setdefault(kind, []).append(image.reshape(-1, 3)[at])
+        light = {kind: np.array(rows) for kind, rows in light.items()}
+        if "diffuse" in light:
+            light["diffuse_light"], light["diffuse"] = light["diffuse"], color * light["diffuse"]
+        return light | {COMBINED: sum(light[name] for name in ("specular", "diffuse") if name in light)}
 
     def _covered(self, first):
         rows = min(block_rows(self._options), self._options.size[1] - first)
         texels = self._triangles.texels(first, rows, self._options.conservative and not self._at_centers)
         if not self._at_centers:
             return texels
-        of_pass = f"cycles_{sorted(shaded_passes(self._options))[0]}_{self._tile}_{first}.npy"
-        baked = np.load(self._file(first, 0) if self._mapped else self._folder / of_pass, mmap_mode="r")
-        return texels.baked(baked[0].reshape(-1, 3)[texels.index, 0] != np.float32(NOT_BAKED))
+        if self.rest:
+            baked = next(iter(self.rest.values()))[first : first + rows]
+            return texels.baked(baked.reshape(-1, 3)[texels.index, 0] != np.float32(NOT_BAKED))
+        path = self._file(first, 0)
+        if not self._mapped:
+            path = self._folder / f"cycles_{sorted(shaded_passes(self._options))[0]}_{self._tile}_{first}.npy"
+        baked = np.load(path, mmap_mode="r")[0].reshape(-1, 3)[texels.index, 0] != np.float32(NOT_BAKED)
+        return texels.baked(baked)
 
     def _file(self, first, point):
         return self._folder / f"maps_{self._tile}_{first}_{point}.npy"
@@ -389,7 +467,12 @@ class TilePoints:
 
 def bakes_centers_alone(options: BakeOptions, record: dict) -> bool:
     """True where an object needs Cycles' own bake, which has only texels whose centers are covered."""
-    return record["maps"] or options.error
+    return record["maps"] or options.error or options.bounces == "on"
+
+
+def _map_reader(maps, texels):
+    """The function that returns map `number` (Q, 3) at the `texels`."""
+    return lambda number: maps[number].reshape(-1, 3)[texels.index]
 
 
 def _column_and_row(tile: int) -> tuple[int, int]:
@@ -432,15 +515,15 @@ def _first_samples(texel: np.ndarray) -> np.ndarray:
 
 
 def _report(options, manifest, records) -> dict:
-    problems = [record["problem"] for record in manifest["objects"] if record["problem"]]
+    problems = [line for record in manifest["objects"] for line in record["problems"]]
     lines = [line for record in manifest["objects"] for line in record["warnings"]]
     warnings = [*manifest["warnings"], *lines]
     if options.conservative:
         warnings += [
-            f"object {record['name']!r}: texels whose centers no face covers are left out, because Cycles bakes none "
+            f"{record['name']!r}: texels whose centers no face covers are left out, because Cycles bakes none "
             f"of them: leave out {'--error' if options.error else '--conservative, or bake its textures to images'}"
             for record in manifest["objects"]
-            if record["problem"] is None and bakes_centers_alone(options, record)
+            if record["folder"] and bakes_centers_alone(options, record)
         ]
     reasons = {record["name"]: record.get("unshaded", ()) for record in manifest["objects"]}
     for record in records:
@@ -456,7 +539,17 @@ def _report(options, manifest, records) -> dict:
             if share := 100 * tile["unbaked_texels"] / max(tile["texels"] + tile["unbaked_texels"], 1):
                 why = "because Cycles bakes nothing there: apply the modifiers"
                 warnings.append(f"{name}: {share:.3g} % of its texels are left out, {why}")
-    return {
+            warnings += [
+                f"object {member!r} has no texel of the atlas: its islands are too small, or lie below others"
+                for member, texels in tile.get("member_texels", {}).items()
+                if not texels
+            ]
+            if share := 100 * tile.get("dull_texels", 0) / max(tile["texels"], 1):
+                why = "have no diffuse color: the light that bounces there is reflected, which no lightmap holds"
+                warnings.append(f"{name}: {share:.3g} % of its texels {why}; bake the pass specular or combined")
+            if not tile.get("denoiser", DENOISER).startswith(DENOISER):
+                warnings.append(f"{name}: {tile['denoiser']}")
+    report = {
         "scene": str(options.scene),
         "frame": manifest["frame"],
         "size": list(options.size),
@@ -467,6 +560,10 @@ def _report(options, manifest, records) -> dict:
         "warnings": grouped(warnings),
         "versions": versions(manifest["blender_version"]),
     }
+    if options.per_light:
+        rows = rows_of_groups(lights_of(manifest["lights"]), manifest["light_settings"])
+        report |= {"light_rows": [asdict(row) for row in rows], "camera": manifest["camera"]}
+    return report
 
 
 def _darkness(record, reasons) -> tuple[list[str], list[str]]:
@@ -492,25 +589,3 @@ REPORT = {
     **dict.fromkeys(("problems", "warnings"), [str]),
     "versions": dict,
 }
-
-
-def summary(report: dict, seconds: dict) -> list[str]:
-    """Lines of text about the bake of one scene, camera and frame: a line per file, and the errors if there are any."""
-    lines = []
-    for record in report["objects"]:
-        for tile in record["tiles"].values():
-            took = seconds.get(tile["file"])
-            seconds_text = f"{took:>8.2f} s" if isinstance(took, NUMBER) else ""
-            lines.append(f"{tile['file']:<40}{tile['texels']:>10} texels{seconds_text}")
-            for pass_name, figures in tile.get("errors", {}).items():
-                for name, error in figures["techniques"].items():
-                    in_noise = (error.get("unbiased_squared_error") or 0.0) < 0.0
-                    beside = "in noise" if in_noise else percent(error.get("unbiased_error"))
-                    noise = f"(noise {percent(figures.get('noise'))})"
-                    lines.append(f"  {name + '.' + pass_name:<30}{beside:>10} beside Cycles {noise}")
-    return lines
-
-
-def brief(report: dict) -> list[str]:
-    """The lines of `summary` without times, under the name of the bake, for one of several."""
-    return [f"{report['name']}:", *(f"  {line}" for line in summary(report, {}))]

@@ -133,11 +133,11 @@ def draw_view(options: ViewOptions, progress: Progress | None = None) -> TaskRes
     problems, rest_seconds = [], 0.0
     with temporary_folder() as folder, shared_blender(folder):
         if options.bounces == "on":
-            rest_job = child_job(view.RestJob, options, width=width, height=height, samples=options.rest_samples)
+            of_camera = view.RestView(frame=options.frame, size=(width, height))
+            rest_job = child_job(view.RestJob, options, view=of_camera, samples=options.rest_samples)
             rest = view.render_rest(rest_job, folder, progress=progress)
-            job = replace(job, rest=folder / "rest.npy", is_everything=bool(rest.everything))
-            save_array(job.rest, rest.picture())
-            problems, rest_seconds = [rest.problem] * bool(rest.problem), time.perf_counter() - start
+            job = replace(job, rest=folder / view.REST_PICTURE, is_everything=bool(rest["everything"]))
+            problems, rest_seconds = [rest["problem"]] * bool(rest["problem"]), time.perf_counter() - start
         manifest = view.draw_view(job, folder, progress=progress)
         manifest["warnings"] += problems
         layers = {

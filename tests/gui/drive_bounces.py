@@ -22,8 +22,8 @@ def rest():
 
 
 def shown_of(rest):
-    """The view and the number of samples of the picture that is shown."""
-    return None if rest._shown is None else rest._shown[1]
+    """The view of the picture that is shown."""
+    return None if rest._picture is None or rest.has_news else rest._picture.view
 
 
 def waited(rig, until, most):
@@ -96,8 +96,17 @@ def main(rig):
     shade.objects.active = ob
     yield 2
     rig.check(rest()._wanted.version == before.version, "selecting renders nothing again")
-    child = rest()._process._child
+    child, opened = rest()._process._child, next(iter(module("engine.redraws").open_views))
     rig.check(child is not None and child.poll() is None, "the second Blender waits for changes")
+    bpy.ops.wm.save_mainfile()
+    yield 3
+    rig.check(list(module("engine.redraws").open_views) == [opened], "a save leaves the view of a preview")
+    rig.check(child.poll() is None and rest()._wanted.version == before.version, "nor is anything rendered again")
+    with bpy.data.libraries.load(bpy.data.filepath) as (saved, wanted):
+        wanted.scenes = saved.scenes[:1]
+    rig.check(wanted.scenes[0].render.engine != "LTSH", "the file has the artist's engine")
+    bpy.data.scenes.remove(wanted.scenes[0])
+    yield from changed(rig, "move after a save", move)
     start = time.monotonic()
     view().bounces = False
     while child.poll() is None and time.monotonic() - start < 5:

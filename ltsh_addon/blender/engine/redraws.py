@@ -20,8 +20,9 @@ POLL_SECONDS = 0.05
 # After so long without new shadows the processes end that help to trace them.
 IDLE_SECONDS = 60.0
 # Pictures of a view that changes take about FRAME_SECONDS, with a pixel for each of 1, 2 x 2 or 4 x 4. A view that has
-# not changed for MOVING_SECONDS gets all its pixels.
-FRAME_SECONDS, STEPS, MOVING_SECONDS = 0.1, (1, 2, 4), 0.5
+# not changed for MOVING_SECONDS gets all its pixels. Slow ones come WAITING_SECONDS later while they would delay the
+# first shadows or bounces, and are refined HELD_SECONDS later while that delays all pixels of bounces.
+FRAME_SECONDS, STEPS, MOVING_SECONDS, WAITING_SECONDS, HELD_SECONDS = 0.1, (1, 2, 4), 0.5, 1.5, 20.0
 # All views, their shadows, and what they know of lights with nodes.
 open_views: weakref.WeakSet = weakref.WeakSet()
 live_shadows: weakref.WeakSet = weakref.WeakSet()
@@ -41,13 +42,13 @@ class PixelSize:
 
     def follow(self, state: tuple, is_waiting: bool = False) -> int:
         """The `step` of a view whose camera, surfaces and lights have this state, see `same_state`. If it `is_waiting`
-        for shadows, the whole picture, which holds them up, comes a little later."""
+        for shadows or bounces, the whole picture, which holds them up, comes later."""
         before, is_first, has_changed = self.step, self._state is None, not same_state(state, self._state)
         self._state = state
-        if has_changed and not is_first:
-            self.step = next((one for one in STEPS if self._seconds <= FRAME_SECONDS * one**2), STEPS[-1])
-            self._changed = math.inf  # until it is drawn
-        elif time.monotonic() >= self.end + (MOVING_SECONDS if is_waiting and self.step > 1 else 0.0):
+        if has_changed:
+            quick = next((one for one in STEPS if self._seconds <= FRAME_SECONDS * one**2), STEPS[-1])
+            self.step, self._changed = 1 if is_first else quick, math.inf  # until it is drawn
+        elif time.monotonic() >= self.end + (WAITING_SECONDS if is_waiting and self.step > 1 else 0.0):
             self.step = 1
         self.is_new |= has_changed or self.step != before
         return self.step
@@ -57,6 +58,11 @@ class PixelSize:
         self._seconds, self.is_new = seconds * self.step**2, False
         if self._changed == math.inf:
             self._changed = time.monotonic()
+
+    @property
+    def is_slow(self) -> bool:
+        """True if a picture with all pixels takes longer than a frame should."""
+        return self._seconds > FRAME_SECONDS
 
     @property
     def end(self) -> float:

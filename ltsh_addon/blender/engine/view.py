@@ -28,7 +28,6 @@ from .overlay import ViewTexts, captions_of, left_out, show
 LINE_WIDTH = 2.0
 COMPILING = "Compiling shaders"
 NO_LIGHTS = "No light and no glowing mesh shines here: add a light"
-FIRST_POINTS = 4  # of pixels, which do not wait for bounces
 EMPTY_COLOR = (0.05, 0.05, 0.05, 1.0)
 _logger = logging.getLogger(__name__)
 
@@ -37,6 +36,7 @@ class EngineView:
     """One 3D view with the engine."""
 
     def __init__(self):
+        self.region = 0  # the pointer of the one that it was drawn in last
         self._world = LiveWorld()
         self.mirror = self._new_mirror()
         self._renderer: ViewRenderer | None = None
@@ -92,7 +92,7 @@ class EngineView:
 
     def draw(self, context, depsgraph) -> None:
         """Draw into the region of `context`, and ask to be drawn again while the picture can be refined."""
-        start, target = time.monotonic(), gpu.state.active_framebuffer_get()
+        start, target, self.region = time.monotonic(), gpu.state.active_framebuffer_get(), context.region.as_pointer()
         if not _has_drawn[0]:
             _has_drawn[0] = True
             _clear(target)
@@ -108,20 +108,25 @@ class EngineView:
         has_rest = self._renderer is not None and self._renderer.rest is not None
         of_scene = self.mirror.notes_with_rest if has_rest else self.mirror.notes
         notes = [*texts.notes, *of_scene, *self._shadow_notes(context.region)]
-        notes += [self.rest.problem] if self.rest.problem else self.rest.notes
+        notes += self.rest.notes
         if not texts.error and not self.mirror.lights and not self.mirror.sky.sides:
             notes.insert(0, NO_LIGHTS)
         quiet = left_out(self.mirror, depsgraph.scene, self.rest if has_rest or self.rest.is_busy else None)
         show(context.region, replace(texts, notes=tuple(dict.fromkeys(notes)), quiet=quiet))
-        is_waiting = self._draws_shadows and self._shadows.waits
-        # Both work at the same time: the first bounces are worth more than further points of pixels.
-        is_waiting |= self.rest.is_urgent and self._renderer is not None and self._renderer.samples >= FIRST_POINTS
-        if not texts.error and self._pixel_size.step > 1:
-            redraws.redraw_at(max(self._pixel_size.end, time.monotonic() + redraws.POLL_SECONDS))
-        elif not texts.error and self._renderer.samples < redraws.REFINEMENTS and not is_waiting:
-            redraws.redraw_later(start, self._renderer.samples)
+        self._redraw_later(start, bool(texts.error))
         redraws.moments["drawn"] = time.monotonic()
         redraws.watch()
+
+    def _redraw_later(self, start: float, has_failed: bool) -> None:
+        """Ask for the next picture after the one that began at `start`. News of shadows and bounces come before."""
+        size = self._pixel_size
+        if has_failed:
+            return
+        if size.step > 1 or self._holds_up:
+            moment = self._held_until if size.step == 1 else size.end + redraws.WAITING_SECONDS * self._is_waiting
+            redraws.redraw_at(max(moment, time.monotonic() + redraws.POLL_SECONDS))
+        elif self._renderer.samples < redraws.REFINEMENTS and not (self._draws_shadows and self._shadows.waits):
+            redraws.redraw_later(start, self._renderer.samples)
 
     def _draw_picture(self, context, depsgraph, target) -> ViewTexts:
         """Draw the picture into the frame buffer `target`; returns what there is to say about it."""
@@ -134,12 +139,16 @@ class EngineView:
         mode, reference, notes = scene.ltsh_view.mode, None, ()
         if mode != "single" and scene.ltsh_view.second_technique == CYCLES:
             mode, reference, notes = self._beside_cycles(context, depsgraph, camera, mode)
-        shown = _shown(scene, mode, reference, context.preferences.system.ui_scale)
+        shown, has_news = _shown(scene, mode, reference, context.preferences.system.ui_scale), self.rest.has_news
         self._follow_shadows(depsgraph)
         self._follow_rest(context, depsgraph, shown)
         points = sub_pixel_offsets(scene, redraws.REFINEMENTS)
+        if has_news:  # it is shown at once, with the points that there are
+            points = points[: max(self._renderer.samples, 1)]
         size, started = (region.width, region.height), time.monotonic()
-        self._renderer.step = self._pixel_size.follow(_state_of(self.mirror, camera, size), self._shadows.is_busy)
+        is_waiting = has_news or self._is_waiting
+        self._renderer.step = self._pixel_size.follow(_state_of(self.mirror, camera, size), is_waiting)
+        self._shadows.hold(self._holds_up)
         self._renderer.draw(self.mirror, camera, size, shown, target, points)
         if self._pixel_size.is_new:
             self._renderer.wait()
@@ -159,6 +168,22 @@ class EngineView:
         else:
             self.rest.stop()
         renderer.rest = self.rest.shown() if is_wanted else None
+
+    @property
+    def _is_waiting(self) -> bool:
+        """True while the first shadows and bounces of this state are to come, which a whole picture would hold up."""
+        return self._shadows.is_busy or self.rest.is_new
+
+    @property
+    def _held_until(self) -> float:
+        """The moment until which bounces come before further points of pixels and the last shadows. All share the
+        processor where pictures take long."""
+        return self._pixel_size.end + redraws.HELD_SECONDS if self._pixel_size.is_slow and self.rest.is_urgent else 0.0
+
+    @property
+    def _holds_up(self) -> bool:
+        """True if that is to come."""
+        return time.monotonic() < self._held_until
 
     @property
     def _draws_shadows(self) -> bool:

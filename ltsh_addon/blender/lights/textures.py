@@ -13,7 +13,7 @@ from ...cycles.texels import ImageTexture
 from ...emitters.facing import cone_angle, pattern_values
 from ...scene import Light, Pattern, SpotCone
 from ..materials.values import Value, is_srgb, opaque_pixels
-from .emission import PIXELS, Falloff, ObjectFacts, Studio, without_camera_rays, without_falloff
+from .emission import PIXELS, Falloff, ObjectFacts, Studio, nodes_as_text, without_camera_rays, without_falloff
 
 # MOST_INSTANCES: how many lights of one data block are rendered where they stand; others get the result of the first.
 MOST_INSTANCES = 100
@@ -63,6 +63,19 @@ class NodeLight:
         axes, sizes = np.linalg.qr(self.render_matrix[:3, [2, 0, 1]])
         z, x = (axes[:, number] * np.copysign(1.0, sizes[number, number]) for number in (0, 1))
         return np.stack([x, np.cross(z, x), z])
+
+
+def state_of(data, source: NodeLight, images: int = 0) -> tuple:
+    """All that the emission of a light with nodes depends on; `images` counts the changes of images."""
+    names = {"AREA": ("shape", "size", "size_y"), "SUN": ("angle",)}.get(data.type, ("use_soft_falloff",))
+    if data.type in ("POINT", "SPOT") and (source.is_mixed or not source.by_ray):
+        names = (*names, "shadow_soft_size")
+    if source.by_spot or source.by_ray and data.type == "SPOT":
+        names = (*names, "spot_size")
+    where = (source.matrix.tobytes(), source.facts) if source.is_placed else ()
+    text = nodes_as_text(data)
+    images = images if "image: " in text else 0
+    return data.type, *(getattr(data, name) for name in names), *source.flags.values(), where, text, images
 
 
 def with_node_emission(lights: list[Light], unseen: dict[int, NodeLight], studio: Studio, warn) -> list:

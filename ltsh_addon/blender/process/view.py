@@ -132,63 +132,86 @@ def render_node_lights(lights: list[NodeLightFile], frame: int, folder: Path, ta
     run_job(NodeLightJob([asdict(light) for light in lights], frame), folder, watched)
 
 
-REST_PICTURE = "rest.exr"
+# REST_RENDER: what Cycles renders for a RestJob. REST_PICTURE: the picture of a RestPictureJob.
+REST_RENDER, REST_PICTURE = "rest.exr", "rest.npy"
+
+
+@dataclass(frozen=True)
+class RestView:
+    """What a rest is of: a state of a scene, and a view of it; None means as in the file."""
+
+    scene: str | None = None
+    view_layer: str | None = None
+    version: tuple[int, int] = (0, 0)  # of the scene, and of all in it but lights
+    frame: int | None = None
+    hidden: tuple[str, ...] = ()  # names of objects that its local view hides
+    world: bool = True  # with the light of the world
+    matrices: tuple | None = None  # of a region: from the world to the view, and to clip space, (4, 4) each
+    size: tuple[int, int] | tuple[None, None] = (None, None)
 
 
 @dataclass(frozen=True)
 class RestJob:
-    """Render what Cycles adds to the direct light of a view, for `camera` or for the matrices of a region."""
+    """Render what Cycles adds to the direct light of a view, and add it to the sum of samples that the child has."""
 
     scene: Path | None  # None: the one that the last job has opened
-    width: int | None
-    height: int | None
+    view: RestView  # in the child a dict
     samples: int
     seed: int = 0
-    frame: int | None = None
-    camera: str | None = None
-    scene_name: str | None = None
-    view_layer: str | None = None
-    matrices: tuple | None = None  # of a region: from the world to the view, and to clip space, (4, 4) each
-    hidden: tuple[str, ...] = ()  # names of objects that its local view hides
-    world: bool = True  # with the light of the world
+    shrink: int = 1  # pixels of the view in either direction that share one
+    rows: tuple[float, float] = (0.0, 1.0)  # the shares of the height between which it is rendered
+    camera: str | None = None  # where the view has no matrices
     changes: dict | None = None  # of the scene that the last job has opened, see `viewport.rest.RestChanges`
+    continues: bool = False  # the sum of the last job; else it is begun anew
     scripts: bool = False  # run the scripts in the file
+
+
+@dataclass(frozen=True)
+class RestPictureJob:
+    """Write REST_PICTURE: the denoised mean (H, W, 4) of the sum, row 0 on top; alpha is the distance in m."""
 
 
 @dataclass
 class RestSum:
     """The sum of the samples of one view, row 0 on top."""
 
-    light: np.ndarray | float = 0.0  # (H, W, 3)
-    guides: np.ndarray | float = 0.0  # (H, W, 7) albedo, normal and distance
+    light: np.ndarray  # (H, W, 3)
+    guides: np.ndarray  # (H, W, 7) albedo, normal and distance
     samples: int = 0
     everything: tuple[str, ...] = ()  # why no light of the view itself remains
     problem: str = ""  # of the denoiser
+
+    @classmethod
+    def of_size(cls, width: int, height: int) -> RestSum:
+        """No samples yet."""
+        return cls(*(np.zeros((height, width, count), np.float32) for count in (3, 7)))
 
     @property
     def ambient(self) -> tuple[float, ...]:
         """The mean (3,) over that of the albedo."""
         albedo = np.mean(self.guides[..., :3], axis=(0, 1), dtype=np.float64)
         light = np.mean(self.light, axis=(0, 1), dtype=np.float64)
-        return tuple(np.nan_to_num(light / np.maximum(albedo, 0.05 * self.samples)))
+        return tuple(np.nan_to_num(light / np.maximum(albedo, 0.05 * self.samples)).tolist())
 
-    def add(self, manifest: dict, folder: Path) -> None:
-        """Add the picture of a RestJob that was done in `folder`: Combined without what the view draws itself."""
-        channels, names = rendered_channels(folder / REST_PICTURE), manifest["passes"]
-        count, self.everything = manifest["samples"], tuple(manifest["everything"])
+    def add(self, path: Path, row: int, count: int, names: dict[str, str]) -> None:
+        """Add `count` samples of the EXR `path`, rows from `row` on: Combined without what the view draws itself.
+
+        `names` are those of passes by our keys, and of the AOV "mask".
+        """
+        channels = rendered_channels(path)
         light = read_layer(channels, "Combined", "RGB")
         if not self.everything:
             keys = "specular_light", "specular_color", "diffuse_light", "diffuse_color", "background"
             specular, specular_color, diffuse, diffuse_color, background = (
                 read_layer(channels, names[key], "RGB") for key in keys
             )
-            drawn = 1.0 - np.minimum(read_layer(channels, manifest["mask"], "X"), 1.0)
+            drawn = 1.0 - np.minimum(read_layer(channels, names["mask"], "X"), 1.0)
             light = light - drawn[..., None] * (specular * specular_color + diffuse * diffuse_color + background)
         names = ("Denoising Albedo", "RGB"), ("Denoising Normal", "XYZ"), ("Denoising Depth", "Z")
         guides = [np.atleast_3d(np.minimum(read_layer(channels, *name), FARTHEST)) for name in names]
-        self.light = self.light + np.float32(count) * light
-        self.guides = self.guides + np.float32(count) * np.concatenate(guides, axis=-1)
-        self.samples += count
+        rows = slice(row, row + len(light))
+        self.light[rows] += np.float32(count) * light
+        self.guides[rows] += np.float32(count) * np.concatenate(guides, axis=-1)
 
     def picture(self) -> np.ndarray:
         """The denoised mean (H, W, 4); alpha is the distance in m."""
@@ -202,8 +225,8 @@ class RestSum:
         return np.concatenate([light, guides[..., 6:]], axis=-1)
 
 
-def render_rest(job: RestJob, folder: Path, *, progress: Progress | None = None) -> RestSum:
-    """What Cycles adds to the view of `job`. Raises as `pixels.extract_pixels` does."""
-    total = RestSum()
-    total.add(run_scene_job(job, folder, progress), folder)
-    return total
+def render_rest(job: RestJob, folder: Path, *, progress: Progress | None = None) -> dict:
+    """Write what Cycles adds to the view of `job` as REST_PICTURE into `folder`; returns its manifest: "everything" and
+    "problem" as in `RestSum`, and "ambient". Needs a `shared_blender`. Raises as `pixels.extract_pixels` does."""
+    run_scene_job(job, folder, progress)
+    return run_job(RestPictureJob(), folder, progress)

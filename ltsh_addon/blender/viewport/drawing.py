@@ -3,7 +3,7 @@ the graphics card."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -27,6 +27,22 @@ def glsl(name: str) -> str:
     return source_text(Path(__file__).with_name("glsl") / f"{name}.glsl")
 
 
+# Compiled shaders by what they are made from: all views of a session share them.
+_compiled: dict[tuple, object] = {}
+
+
+def compiled(key: tuple, make: Callable):
+    """What `make()` compiles, once for each `key`; needs an active GPU context."""
+    if key not in _compiled:
+        _compiled[key] = make()
+    return _compiled[key]
+
+
+def forget_shaders() -> None:
+    """Free the shaders that no view has any more."""
+    _compiled.clear()
+
+
 class PixelShader:
     """A shader that runs `source` for every pixel of the viewport; needs an active GPU context.
 
@@ -35,22 +51,10 @@ class PixelShader:
     `is_depth` gl_FragDepth.
     """
 
-    def __init__(self, source: str, samplers: Iterable[str], constants: Mapping[str, str], is_depth: bool = False):
-        info = gpu.types.GPUShaderCreateInfo()
-        info.vertex_in(0, "VEC2", "corner")
-        if is_depth:
-            info.depth_write("ANY")
-        else:
-            info.fragment_out(0, "VEC4", "color")
-        for name, kind in constants.items():
-            info.push_constant(kind, name)
-        for slot, name in enumerate(samplers):
-            info.sampler(slot, "FLOAT_2D_ARRAY" if name in ("table", "visibility") else "FLOAT_2D", name)
-        info.vertex_source(glsl("triangle"))
-        info.fragment_source(source)
+    def __init__(self, source: str, samplers: Sequence[str], constants: Mapping[str, str], is_depth: bool = False):
         self._integers = {name for name, kind in constants.items() if kind in _INTEGERS}
-        self._shader = gpu.shader.create_from_info(info)
-        self._batch = batch_for_shader(self._shader, "TRIS", {"corner": _TRIANGLE})
+        key = source, *samplers, *constants.items(), is_depth
+        self._shader, self._batch = compiled(key, lambda: _pixel_shader(source, samplers, constants, is_depth))
 
     def bind(self, textures: Mapping[str, gpu.types.GPUTexture], constants: Mapping | None = None) -> None:
         """Make this the shader that draws, with `textures` by the names of samplers, and push constants."""
@@ -67,6 +71,24 @@ class PixelShader:
     def _set(self, constants) -> None:
         for name, value in constants.items():
             (self._shader.uniform_int if name in self._integers else self._shader.uniform_float)(name, value)
+
+
+def _pixel_shader(source, samplers, constants, is_depth) -> tuple:
+    """The shader and the batch of a `PixelShader`."""
+    info = gpu.types.GPUShaderCreateInfo()
+    info.vertex_in(0, "VEC2", "corner")
+    if is_depth:
+        info.depth_write("ANY")
+    else:
+        info.fragment_out(0, "VEC4", "color")
+    for name, kind in constants.items():
+        info.push_constant(kind, name)
+    for slot, name in enumerate(samplers):
+        info.sampler(slot, "FLOAT_2D_ARRAY" if name in ("table", "visibility") else "FLOAT_2D", name)
+    info.vertex_source(glsl("triangle"))
+    info.fragment_source(source)
+    shader = gpu.shader.create_from_info(info)
+    return shader, batch_for_shader(shader, "TRIS", {"corner": _TRIANGLE})
 
 
 @contextmanager

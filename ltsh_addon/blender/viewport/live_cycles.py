@@ -15,8 +15,8 @@ import numpy as np
 from ...cycles.environment import CUBE, SkyPicture
 from ...files import save_array, temporary_folder
 from ...scene import Cancelled, Light, SceneError, error_line
-from ..lights.emission import ObjectFacts, nodes_as_text, open_studio
-from ..lights.textures import NodeEmission, NodeLight, node_emission
+from ..lights.emission import ObjectFacts, open_studio
+from ..lights.textures import NodeEmission, NodeLight, node_emission, state_of
 from ..lights.world import background_pictures, light_of_world, light_pictures
 from ..process import view
 from ..process.view import NODE_LIGHTS, NodeLightFile, NodeLightJob, WorldJob
@@ -51,7 +51,7 @@ class LiveNodeLights:
 
     def pattern(self, data, source: NodeLight) -> NodeEmission | str:
         """The last result for a light, or a note that there is none yet. Requests a new look if the light changed."""
-        key, state = source.key, self._state(data, source)
+        key, state = source.key, state_of(data, source, self._images)
         known, result = self._known.get(key, ((), NOT_YET))
         on_its_way = self._wanted.get(key) or (self._job.states.get(key) if self._job is not None else None)
         if known == state:
@@ -59,17 +59,6 @@ class LiveNodeLights:
         elif on_its_way != state:
             self._wanted[key], self._sources[key], self._changed = state, source, time.monotonic()
         return result
-
-    def _state(self, data, source: NodeLight) -> tuple:
-        text = nodes_as_text(data)
-        names = {"AREA": ("shape", "size", "size_y"), "SUN": ("angle",)}.get(data.type, ("use_soft_falloff",))
-        if data.type in ("POINT", "SPOT") and (source.is_mixed or not source.by_ray):
-            names = (*names, "shadow_soft_size")
-        if source.by_spot or source.by_ray and data.type == "SPOT":
-            names = (*names, "spot_size")
-        where = (source.matrix.tobytes(), source.facts) if source.is_placed else ()
-        images = self._images if "image: " in text else 0
-        return data.type, *(getattr(data, name) for name in names), *source.flags.values(), where, text, images
 
     def note_images(self) -> None:
         """Images have changed: look at lights with images again."""

@@ -29,7 +29,15 @@ from ..lights.area import area_light, node_light, note_unsupported, reason_to_le
 from ..lights.emission import emission_of, factors_of, open_studio
 from ..lights.linking import Receivers
 from ..lights.meshes import collect_mesh_lights, constant_mesh_lights
-from ..lights.textures import MOST_INSTANCES, NodeEmission, NodeLight, ShownTextures, node_emission, with_pattern
+from ..lights.textures import (
+    MOST_INSTANCES,
+    NodeEmission,
+    NodeLight,
+    ShownTextures,
+    node_emission,
+    state_of,
+    with_pattern,
+)
 from ..lights.world import light_of_world
 from ..materials.graph import source_of, surface_of, tree_in_use
 from ..materials.preview_material import PreviewMaterial, preview_of, world_radiance
@@ -141,16 +149,15 @@ def _mesh_lights(depsgraph, receivers: Receivers, textures: ShownTextures, notes
     return lights
 
 
-def patterns_of(scene, depsgraph) -> dict[tuple, NodeEmission]:
-    """How Cycles sees the nodes of lights that views cannot read themselves, by the `key` of the `NodeLight`.
-
-    `scene` is left as it was.
+def patterns_of(scene, depsgraph, known: dict[tuple, tuple]) -> dict[tuple, tuple[tuple, NodeEmission]]:
+    """How Cycles sees the nodes of lights that views cannot read themselves, by the `key` of the `NodeLight`, with the
+    `state_of` them; what is `known` of these states is not rendered again. `scene` is left as it was.
     """
-    wanted: dict[tuple, NodeLight] = {}
+    wanted: dict[tuple, tuple[tuple, NodeLight]] = {}
 
     def note(data, source: NodeLight) -> str:
         if len(wanted) < MOST_INSTANCES:
-            wanted[source.key] = source
+            wanted[source.key] = state_of(data, source), source
         return NOT_YET
 
     receivers, sources = Receivers([]), (ShownTextures(), note)
@@ -160,10 +167,13 @@ def patterns_of(scene, depsgraph) -> dict[tuple, NodeEmission]:
             matrix = np.array(instance.matrix_world, dtype=np.float64)
             if not reason_to_leave_out(ob, matrix):
                 _with_nodes(area_light(ob, matrix, EmitterTraits.of(instance), receivers), instance, sources, [])
-    if not wanted:
-        return {}
-    with open_studio(scene) as studio:
-        return {key: node_emission(source, studio) for key, source in wanted.items()}
+    patterns = {key: known[key] for key, (state, _) in wanted.items() if key in known and known[key][0] == state}
+    if len(patterns) < len(wanted):
+        with open_studio(scene) as studio:
+            for key in wanted.keys() - patterns.keys():
+                state, source = wanted[key]
+                patterns[key] = state, node_emission(source, studio)
+    return patterns
 
 
 def _with_nodes(light: Light, instance, sources: tuple, notes: list[str]) -> list[Light]:
@@ -267,39 +277,47 @@ class Changes:
         """True if the G-buffer changes."""
         return self.everything or self.instances or self.images or bool(self.geometry or self.materials)
 
+    @property
+    def emitters(self) -> bool:
+        """True if lights must be read again."""
+        return self.everything or self.lights or self.images or bool(self.materials)
 
-def changes_of(depsgraph, first: bool) -> Changes:
-    """The changes in `depsgraph.updates`; everything on the `first` call, where that list is empty."""
-    changes = Changes(everything=first)
-    for update in depsgraph.updates:
-        block = update.id.original
-        if isinstance(block, bpy.types.Object):
-            _note_object(changes, block, update)
-        elif isinstance(block, bpy.types.Light | bpy.types.NodeTree):
-            # Node trees of materials and worlds come with their owners, so others belong to lights.
-            changes.lights = True
-        elif isinstance(block, bpy.types.Material):
-            changes.materials.add(block.name_full)
-        elif isinstance(block, bpy.types.Image):
-            changes.images = True
-        elif isinstance(block, bpy.types.World):
-            changes.world = True
-        elif isinstance(block, bpy.types.Collection | bpy.types.Scene):
-            changes.instances = changes.lights = changes.world = True
-        elif update.is_updated_geometry:
-            changes.geometry.add(block.session_uid)
-    return changes
+    @property
+    def sky(self) -> bool:
+        """True if the world must be read again."""
+        return self.everything or self.world or self.images
 
+    def add(self, depsgraph) -> None:
+        """Add those in `depsgraph.updates`."""
+        for update in depsgraph.updates:
+            block = update.id.original
+            if isinstance(block, bpy.types.Object):
+                self._add_object(block, update)
+            elif isinstance(block, bpy.types.Light | bpy.types.NodeTree):
+                # Node trees of materials and worlds come with their owners, so others belong to lights.
+                self.lights = True
+            elif isinstance(block, bpy.types.Material):
+                self.materials.add(block.name_full)
+            elif isinstance(block, bpy.types.Image):
+                self.images = True
+            elif isinstance(block, bpy.types.World):
+                self.world = True
+            elif isinstance(block, bpy.types.Collection | bpy.types.Scene):
+                self.instances = self.lights = self.world = True
+            elif update.is_updated_geometry:
+                self.geometry.add(block.session_uid)
 
-def _note_object(changes: Changes, block, update) -> None:
-    if block.type == "LIGHT":
-        changes.lights = True
-        return
-    # Other objects may be mesh lights, or instance lights.
-    changes.lights |= update.is_updated_transform or update.is_updated_geometry
-    changes.instances = True
-    if update.is_updated_geometry:
-        changes.geometry.add(block.session_uid)
+    def _add_object(self, block, update) -> None:
+        if block.type == "LIGHT":
+            self.lights = True
+            return
+        # Other objects may be mesh lights, which look at the camera, or instance lights.
+        self.lights |= update.is_updated_transform or update.is_updated_geometry
+        if block.type == "CAMERA":
+            return
+        self.instances = True
+        if update.is_updated_geometry:
+            self.geometry.add(block.session_uid)
 
 
 def object_notes(depsgraph) -> list[str]:
@@ -364,8 +382,8 @@ class SceneMirror:
     @property
     def notes_with_rest(self) -> list[str]:
         """Those of them that remain when Cycles adds the rest."""
-        glowing = [note for shown in self._looks.values() if shown.look.glow > 0.0 for note in shown.look.notes]
-        return list(dict.fromkeys([*glowing, *self._light_notes, *self._world_note, *self._limit_notes]))
+        of_materials = [note for shown in self._looks.values() for note in shown.look.notes_in_view(with_bounces=True)]
+        return list(dict.fromkeys([*of_materials, *self._light_notes, *self._world_note, *self._limit_notes]))
 
     @property
     def material_notes(self) -> list[str]:
@@ -386,17 +404,19 @@ class SceneMirror:
         """True if anything is seen through a surface."""
         return any(shown.is_glass for shown in self._looks.values())
 
-    def sync(self, depsgraph, space=None) -> None:
-        """Take over all changes; `space` is the 3D view, for its local view."""
-        changes = changes_of(depsgraph, not self._synced)
+    def sync(self, depsgraph, space=None, changes: Changes | None = None) -> None:
+        """Take over all changes; `space` is the 3D view, for its local view. None: those in `depsgraph.updates`."""
+        if changes is None:
+            changes = Changes(everything=not self._synced)
+            changes.add(depsgraph)
         self._drop_changed(changes)
         in_view = visibility(depsgraph, space)
         if changes.surfaces:
             self._read_instances(depsgraph, changes, in_view)
             self.surfaces_version += 1
-        if changes.lights or changes.everything or changes.materials or changes.images:
+        if changes.emitters:
             self.read_lights(depsgraph, in_view)
-        if changes.world or changes.everything or changes.images:
+        if changes.sky:
             self._read_world(depsgraph.view_layer.world_override or depsgraph.scene.world)
         self._synced = True
 

@@ -89,9 +89,11 @@ def copy_shader() -> PixelShader:
     return PixelShader("void main() { color = texelFetch(picture, ivec2(gl_FragCoord.xy), 0); }", ("picture",), {})
 
 
-def copy(shader: PixelShader, picture: gpu.types.GPUTexture, target: gpu.types.GPUFrameBuffer) -> None:
+def copy(
+    shader: PixelShader, picture: gpu.types.GPUTexture, target: gpu.types.GPUFrameBuffer, blend: str = "NONE"
+) -> None:
     """Copy `picture` into `target`, which has its size, by `copy_shader`."""
-    with drawing(target, (0, 0, *size_of(picture))):
+    with drawing(target, (0, 0, *size_of(picture)), blend):
         shader.bind({"picture": picture})
         shader.draw()
 

@@ -9,10 +9,12 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Collection
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import gpu
 import numpy as np
 
+from ...scene import PASSES
 from .drawing import GBufferTextures, PixelShader, ViewCamera, VisibilityGrid, float_texture, read_texture
 from .light_texels import UploadedLights, background_texels, sky_texels, upload_lights
 from .lighting import GOLDEN, HorizonPass, LightingPass
@@ -143,17 +145,19 @@ class ViewRenderer:
         self._glass: SurfaceLayer | None = None
         self._picture = PicturePass()
         self._veil: VeilPass | None = None
-        self._copy: PixelShader | None = None
         self._lighting: dict[str, LightingPass] = {}
         self._sums: list[SampleSum] = []  # of the pictures
         self._behind: list[SampleSum] = []  # what is lit behind glass
+        self._parts: list[SampleSum] = []  # the lights of passes that several pictures have
         self._lights: UploadedLights | None = None
         self._drawn, self._uploaded = None, (None, None)
         self._shown, self.samples = None, 0  # the state of the pictures, and the number of their points
         self._lighting_state: LightingState | None = None
         self._static: StaticLighting | None = None
-        self._is_split = False  # the pictures have static lighting
+        # Where lights alone have changed, the first picture has the others' light of before: the pictures are split.
+        self.may_split, self._is_split = True, False
         self._sky, self._sky_light, self._background = None, None, None
+        self.first = 0  # the number of the first point of a pixel
         self.step = 1  # pixels in either direction for which one is drawn, as while a view moves
         self._size = (1, 1)  # of what is shown
         self.shadows: ShadowRays | LiveShadows | None = None
@@ -190,7 +194,7 @@ class ViewRenderer:
         if self.samples < len(points):
             self._shown = None  # until the sample is complete
             lit_by = None
-            if not is_same:
+            if self.may_split and not is_same:
                 lit_by = (mirror, mirror.sky, self.shadows), (*frame.surfaces[1], frame.content)
             sample = replace(frame, view=frame.view.shifted(points[self.samples], size))
             is_drawn = self._draw_sample(sample, lit_by)
@@ -286,7 +290,7 @@ class ViewRenderer:
         is_lit = not self._upload_lights(frame)
         layers = [self._surfaces, self._glass] if has_glass else [self._surfaces]
         for layer in layers:
-            layer.threshold = (0.5 + self.samples * GOLDEN) % 1.0
+            layer.threshold = (0.5 + (self.first + self.samples) * GOLDEN) % 1.0
             if not (is_drawn and is_lit and layer.is_ready):
                 layer.choose_horizons(frame.mirror, frame.view, self._lights)
         return layers
@@ -344,10 +348,8 @@ class ViewRenderer:
             static = [SampleSum(layer.size) for _ in frame.pictures]
             self._light(layer, frame, static, numbers=frozenset(range(len(lights))) - moving)
             self._static = StaticLighting(self._lighting_state, moving, static)
-        if self._copy is None:
-            self._copy = copy_shader()
         for static, target in zip(self._static.pictures, targets, strict=True):
-            copy(self._copy, static.texture, target.within())
+            copy(self._copy_shader, static.texture, target.within())
         self._light(layer, frame, targets, "ADDITIVE", self._static.moving)
         self._is_split = True
 
@@ -363,18 +365,32 @@ class ViewRenderer:
 
         The first lobe is blended by `first`. `numbers` are those of the lights, None: all.
         """
-        lightings = [self._lighting_of(technique) for technique, _ in frame.pictures]
+        shares = _shares(frame.pictures)
+        lightings, sums = [self._lighting_of(technique) for technique, _ in shares], targets
+        if tuple(shares) != frame.pictures:
+            sums = self._parts = _cleared(self._parts, replace(frame, pictures=tuple(shares)), True)
         for lighting in lightings:
-            lighting.number = self.samples
+            lighting.number = self.first + self.samples
         traces = self.shadows is not None and self.shadows.traces_lobes
         for number in range(max(frame.mirror.most_lobes, 1)):
             gbuffer = layer.lobe(number, frame.mirror, frame.view, self._lights)
             visibility = self._visibility(layer, gbuffer, frame) if traces else layer.visibility
             gbuffer = replace(gbuffer, visibility=visibility)
-            blend, view = first if number == 0 else "ADDITIVE", frame.view.homogeneous_eye
-            for lighting, target, (_, passes) in zip(lightings, targets, frame.pictures, strict=True):
+            opaque = first if sums is targets else "ADDITIVE_PREMULT"
+            blend, view = opaque if number == 0 else "ADDITIVE", frame.view.homogeneous_eye
+            for lighting, target, (_, passes) in zip(lightings, sums, shares, strict=True):
                 buffer = target.within(gbuffer.mask)
                 lighting.draw(gbuffer, buffer, passes, view=view, blend=blend, numbers=numbers)
+        begun = set()
+        for part, pictures in zip(sums, shares.values(), strict=True) if sums is not targets else ():
+            for number in pictures:
+                blend = "ADDITIVE" if number in begun else first
+                copy(self._copy_shader, part.texture, targets[number].within(), blend)
+                begun.add(number)
+
+    @cached_property
+    def _copy_shader(self) -> PixelShader:
+        return copy_shader()
 
     @staticmethod
     def _add_emission(layer: SurfaceLayer, frame: Frame, targets: list[SampleSum]) -> None:
@@ -396,6 +412,20 @@ class ViewRenderer:
     def free(self) -> None:
         """Free all textures and shaders: the renderer cannot draw any more."""
         vars(self).clear()
+
+
+def _shares(pictures: tuple[tuple[str, str], ...]) -> dict[tuple[str, str], list[int]]:
+    """What to draw, techniques and passes, and the numbers of the `pictures` that are sums of it.
+
+    A combined picture is the sum of both passes, and diffuse light is the same with all techniques.
+    """
+    shares: dict[tuple[str, str], list[int]] = {}
+    for number, (technique, passes) in enumerate(pictures):
+        for one in PASSES if passes == "combined" else (passes,):
+            shares.setdefault((pictures[0][0] if one == "diffuse" else technique, one), []).append(number)
+    if len(shares) <= len(pictures):
+        return shares
+    return {picture: [number] for number, picture in enumerate(pictures)}
 
 
 def _cleared(sums: list[SampleSum], frame: Frame, is_new: bool) -> list[SampleSum]:

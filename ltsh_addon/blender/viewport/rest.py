@@ -11,6 +11,7 @@ Surfaces `is_of_cycles` are Cycles' alone. An AOV tells their share m of a pixel
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable
@@ -22,7 +23,7 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
-from ...files import temporary_folder
+from ...files import save_array, temporary_folder
 from ...scene import SceneError, error_line
 from .. import render_settings
 from ..extract.finished import reasons_for_cycles
@@ -30,7 +31,7 @@ from ..extract.pixels import open_scene, scene_named
 from ..materials.graph import ensure_nodes, live_link, material_output, tree_in_use
 from ..materials.preview_material import preview_of
 from ..process.blender_process import BlenderProcess
-from ..process.view import REST_PICTURE, RestJob, RestSum
+from ..process.view import REST_PICTURE, REST_RENDER, RestJob, RestPictureJob, RestSum, RestView
 from ..render_settings import render_exr
 from ..saving import save_working_copy
 from .drawing import ViewCamera, float_texture
@@ -51,25 +52,15 @@ LEVELS = (
     ("simplify_subdivision", "simplify_subdivision_render"),
     ("simplify_child_particles", "simplify_child_particles_render"),
 )
-# A step takes at most STEP_SECONDS, beside the first. FIRST: samples of the first, which has half of the pixels each
-# way. TOTALS: the samples after which a picture is shown. REST_SECONDS: how long a view must stay as it is before.
-STEP_SECONDS, FIRST, TOTALS, REST_SECONDS = 1.0, 4, (4, 8, 16, 32, 64), 0.3
+# A step takes about STEP_SECONDS: so long a new state may wait for the step of an old one. SHRINKS: pixels in either
+# direction that share one, in the pictures that come one after another; the first is the finest that takes one step.
+# TOTALS: the samples after which a picture is shown. REST_SECONDS: how long a view must stay as it is before.
+STEP_SECONDS, SHRINKS, TOTALS, REST_SECONDS = 0.5, (4, 2, 1), (4, 8, 16, 32, 64), 0.3
+# FEWEST: samples of single pixels that a step takes at least, as fewer take as long. MOST_CHANGE: how many times as
+# many or as few the next one takes.
+FEWEST, MOST_CHANGE = 1 << 17, 2.0
 # Settings of a scene that change its light, beside those of Cycles.
 SCENE_SETTINGS = ("use_simplify", "simplify_subdivision", "film_transparent", "hair_type")
-
-
-@dataclass(frozen=True)
-class RestView:
-    """What a rest is of: a state of the scene, and a view of it."""
-
-    scene: str
-    view_layer: str
-    version: tuple[int, int]  # of the scene, and of all in it but lights
-    frame: int
-    hidden: tuple[str, ...]
-    world: bool
-    matrices: tuple  # see `RestJob`
-    size: tuple[int, int]
 
 
 # REPLACED: data-blocks that are handed over by themselves, and the collections of `bpy.data` that have them.
@@ -140,16 +131,77 @@ def _refers_to_objects(block) -> bool:
     return False
 
 
+@dataclass(frozen=True)
+class _RestProgress:
+    """What the second Blender has rendered last of a view."""
+
+    view: RestView | None = None
+    shrink: int = SHRINKS[-1]
+    samples: int = 0  # that all rows have
+    rows: float = 0.0  # the share of the rows that have one more
+
+    def next(self, view: RestView, share: float) -> _RestProgress:
+        """The state after the next step for `view`, which takes the `share` of a sample of all its pixels."""
+        if self.view != view:
+            fits = [shrink for shrink in SHRINKS if TOTALS[0] <= share * shrink**2]
+            return _RestProgress(view, min(fits, default=SHRINKS[0])).next(view, share)
+        if self.is_shown and self.shrink > 1:
+            return _RestProgress(view, SHRINKS[SHRINKS.index(self.shrink) + 1]).next(view, share)
+        most = share * self.shrink**2  # samples in a step
+        if self.rows == 0.0 and most >= 1.0:
+            missing = next(count for count in TOTALS if count > self.samples) - self.samples
+            return replace(self, samples=self.samples + min(missing, int(most)))
+        rows = self.rows + 1.0 / math.ceil(1.0 / most)
+        return replace(self, rows=rows) if rows < 0.999 else replace(self, samples=self.samples + 1, rows=0.0)
+
+    @property
+    def is_shown(self) -> bool:
+        """True if it makes a picture."""
+        return self.samples in TOTALS and self.rows == 0.0
+
+
 @dataclass
 class _RestStep:
-    """A job on its way, and what it is added to."""
+    """A job on its way."""
+
+    job: RestJob
+    after: _RestProgress
+    wanted: RestView  # that of the job, unless another is wanted meanwhile
+    seconds: float = 0.0  # that Cycles took
+    picture: _RestPicture | None = None
+    error: str = ""
+
+    def do(self, process: BlenderProcess, folder: Path) -> None:
+        """Do the job, in a thread of its own."""
+        try:
+            job, after = self.job, self.after
+            self.seconds = process.do(job, folder, None)["seconds"]
+            if after.is_shown and self.wanted == job.view:
+                manifest = process.do(RestPictureJob(), folder, None)
+                facts = bool(manifest["everything"]), tuple(manifest["ambient"]), manifest["problem"]
+                self.picture = _RestPicture(job.view, np.load(folder / REST_PICTURE), *facts)
+        except Exception as error:
+            self.error = f"Bounces: {error_line(error)}"
+
+
+@dataclass
+class _RestPicture:
+    """A denoised picture of the second Blender's."""
 
     view: RestView
-    job: RestJob
-    total: RestSum
-    pixels: np.ndarray | None = None  # of the picture, if it is to be shown
-    seconds: float = 0.0
-    error: str = ""
+    pixels: np.ndarray  # (H, W, 4), row 0 on top
+    is_everything: bool
+    ambient: tuple[float, ...]
+    problem: str
+    shown: ShownRest | None = None  # on the graphics card
+    light: tuple | None = None  # the mean of the direct light that belongs to it, and what it depends on
+
+    def upload(self) -> ShownRest:
+        """The picture on the graphics card; needs an active GPU context."""
+        if self.shown is None:
+            camera = ViewCamera.of(*map(Matrix, self.view.matrices), self.view.matrices[1][3][3] == 1.0)
+            self.shown = ShownRest(float_texture(self.pixels[::-1]), camera, self.is_everything, self.ambient)
+        return self.shown
 
 
 class LiveRest:
@@ -161,18 +213,13 @@ class LiveRest:
         self._changed = 0.0
         self._thread: threading.Thread | None = None
         self._step: _RestStep | None = None
-        self._total = RestSum()  # of the view `_total_of`, in full resolution
-        self._total_of: RestView | None = None
+        self._progress = _RestProgress()
         self._opened: tuple | None = None  # the scene that the second Blender has
         self._changes = RestChanges()  # since then
-        self._last_of: RestView | None = None  # the view of the last step that was begun
-        self._seconds = {}  # of a sample, by number of pixels
-        self._pixels: tuple[np.ndarray, RestView] | None = None  # the picture to upload
-        self._shown: tuple[ShownRest, RestView] | None = None
-        self._facts: tuple = ()  # of the picture: `ShownRest.is_everything` and `ambient`
-        self._light: tuple | None = None  # the mean of the direct light that belongs to it, by `_light_key`
+        self._work, self._seconds = 0.0, 0.0  # samples of single pixels in a step; seconds of one; 0: not known
+        self._picture: _RestPicture | None = None  # the last one
         self._version, self._surfaces, self._settings = 0, 0, None  # of the scene; of all in it but lights
-        self.problem, self.notes = "", ()  # why there is no picture; what there is to say about it
+        self.problem = ""  # why there is no picture
 
     def note(self, depsgraph) -> None:
         """Take note of the changes of the scene."""
@@ -197,35 +244,44 @@ class LiveRest:
         wanted = RestView(*names, version, depsgraph.scene.frame_current, hidden, world, matrices, size)
         if wanted != self._wanted:
             self._wanted, self._changed = wanted, time.monotonic()
+            if self._step is not None:
+                self._step.wanted = wanted
 
     def pause(self) -> None:
         """Nothing is wanted at the moment."""
         self._wanted = None
 
+    @property
+    def has_news(self) -> bool:
+        """True if there is a picture that is not shown yet."""
+        return self._picture is not None and self._picture.shown is None
+
     def shown(self) -> ShownRest | None:
         """The last picture; needs an active GPU context. After changes of lights alone it follows the direct light."""
-        if self._pixels is not None:
-            pixels, view = self._pixels
-            camera = ViewCamera.of(*map(Matrix, view.matrices), view.matrices[1][3][3] == 1.0)
-            rest = ShownRest(float_texture(pixels[::-1]), camera, *self._facts)
-            self._shown, self._pixels = (rest, view), None
-        if self._shown is None:
+        picture = self._picture
+        if picture is None:
             return None
-        rest, view = self._shown
-        has_old_light = self._wanted.version != view.version and self._light is not None
-        return replace(rest, light=self._light[1]) if has_old_light and self._light[0] == self._light_key else rest
+        has_old_light = self._wanted.version != picture.view.version and picture.light is not None
+        is_same = has_old_light and picture.light[0] == self._light_key
+        return replace(picture.upload(), light=picture.light[1]) if is_same else picture.upload()
 
     @property
     def _light_key(self) -> tuple:
         """What the mean direct light depends on, apart from lights."""
-        return self._shown[1].version, self._wanted.version[1], self._wanted.matrices, self._wanted.size
+        return self._wanted.version[1], self._wanted.matrices, self._wanted.size
 
     def keep_light(self, mean: Callable[[], np.ndarray]) -> None:
         """Keep the mean (3,) of the direct light that belongs to the picture that is shown."""
-        if self._shown is None or self._shown[1].version != self._wanted.version:
+        picture = self._picture
+        if picture is None or picture.view.version != self._wanted.version:
             return
-        if self._light is None or self._light[0] != self._light_key:
-            self._light = self._light_key, mean()
+        if picture.light is None or picture.light[0] != self._light_key:
+            picture.light = self._light_key, mean()
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What there is to say about the picture, or why there is none."""
+        return tuple(filter(None, (self.problem or (self._picture and self._picture.problem),)))
 
     @property
     def is_busy(self) -> bool:
@@ -239,16 +295,21 @@ class LiveRest:
         return self.is_busy and self._samples < TOTALS[0]
 
     @property
+    def is_new(self) -> bool:
+        """True while the first picture of this view is to come."""
+        has_one = self._wanted is None or (self._picture is not None and self._picture.view == self._wanted)
+        return self.is_busy and not has_one
+
+    @property
     def _samples(self) -> int:
         """Samples in full resolution of what is wanted."""
-        return self._total.samples if self._total_of == self._wanted else 0
+        return self._progress.samples if self._progress.view == self._wanted and self._progress.shrink == 1 else 0
 
     @property
     def seconds(self) -> float | None:
         """About how long the last picture will still take; None: not known yet."""
-        width, height = (1, 1) if self._wanted is None else self._wanted.size
-        each = self._seconds.get(width * height)
-        return None if each is None else each * (TOTALS[-1] - self._samples)
+        missing = TOTALS[-1] - self._samples
+        return None if self._wanted is None else self._seconds * math.prod(self._wanted.size) * missing or None
 
     def step(self) -> bool:
         """Do the next step, in the main thread; True if there is a new picture."""
@@ -271,20 +332,21 @@ class LiveRest:
         """Take over what the last step has brought."""
         step, self._thread, self._step = self._step, None, None
         if step.error:
-            self._opened = self._last_of = None
+            self._opened, self._progress = None, _RestProgress()
             # What cannot be handed over piece by piece goes as a whole.
             self.problem = "" if step.job.changes is not None else step.error
             return bool(self.problem)
-        self._seconds[step.job.width * step.job.height] = step.seconds / step.job.samples
-        if step.view != self._wanted:
-            return False
-        if (step.job.width, step.job.height) == step.view.size:
-            self._total, self._total_of = step.total, step.view
-        if step.pixels is None:
-            return False
-        self._pixels, self._facts = (step.pixels, step.view), (bool(step.total.everything), step.total.ambient)
-        self.notes = (step.total.problem,) * bool(step.total.problem)
-        return True
+        job = step.job
+        work = math.prod(job.view.size) / job.shrink**2 * job.samples * (job.rows[1] - job.rows[0])
+        self._seconds = step.seconds / work
+        work *= min(max(STEP_SECONDS / step.seconds, 1.0 / MOST_CHANGE), MOST_CHANGE)
+        if job.scene is None:
+            self._work = max(work, FEWEST if step.seconds > STEP_SECONDS else self._work)
+        is_of_wanted = job.view == self._wanted and (step.picture is not None or not step.after.is_shown)
+        self._progress = step.after if is_of_wanted else _RestProgress()
+        if is_of_wanted and step.picture is not None:
+            self._picture = step.picture
+        return self.has_news
 
     def _begin(self) -> None:
         """Start the next step of what is wanted."""
@@ -294,15 +356,11 @@ class LiveRest:
             self._folder = self._stack.enter_context(temporary_folder())
             self._process, self._opened = BlenderProcess(self._folder, background=True), None
             self._stack.callback(self._process.end)
-        has_first = self._last_of == wanted
-        width, height = wanted.size if has_first else map(_half, wanted.size)
-        samples, total = FIRST, RestSum()
-        if has_first:
-            if self._total_of == wanted:
-                total = self._total
-            missing = next(count for count in TOTALS if count > total.samples) - total.samples
-            each = self._seconds.get(width * height) or 4.0 * self._seconds[_half(width) * _half(height)]
-            samples = min(missing, max(1, int(STEP_SECONDS / each)))
+        pixels = math.prod(wanted.size)
+        self._work = self._work or max(FEWEST, pixels * TOTALS[0] / SHRINKS[0] ** 2)
+        before, after = self._progress, self._progress.next(wanted, self._work / pixels)
+        continues = before.view == wanted and before.shrink == after.shrink
+        samples, rows = (before.samples, before.rows) if continues else (0, 0.0)
         state = wanted.scene, wanted.view_layer, wanted.frame, wanted.hidden, wanted.world
         path = changes = None
         if state != self._opened or self._changes.everything:
@@ -313,22 +371,17 @@ class LiveRest:
         self._changes = RestChanges(everything=False)
         job = RestJob(
             scene=path,
-            width=width,
-            height=height,
-            samples=samples,
-            seed=total.samples,
-            frame=wanted.frame,
-            scene_name=wanted.scene,
-            view_layer=wanted.view_layer,
-            matrices=wanted.matrices,
-            hidden=wanted.hidden,
-            world=wanted.world,
+            view=wanted,
+            samples=max(after.samples - samples, 1),
+            seed=samples,
+            shrink=after.shrink,
+            rows=(rows, after.rows or 1.0),
             changes=changes,
+            continues=continues,
         )
-        self._last_of = wanted
-        self._step = _RestStep(wanted, job, total)
-        arguments = self._step, self._process, self._folder
-        self._thread = threading.Thread(target=_do_step, args=arguments, name="LTSH rest", daemon=True)
+        self._step = _RestStep(job, after, wanted)
+        arguments = self._process, self._folder
+        self._thread = threading.Thread(target=self._step.do, args=arguments, name="LTSH rest", daemon=True)
         self._thread.start()
 
     def stop(self) -> None:
@@ -337,22 +390,6 @@ class LiveRest:
         vars(self).update(vars(LiveRest()))
         if stack is not None:
             stack.close()
-
-
-def _half(side: int) -> int:
-    return max(side // 2, 1)
-
-
-def _do_step(step: _RestStep, process: BlenderProcess, folder: Path) -> None:
-    """Do a step, in a thread of its own."""
-    try:
-        manifest = process.do(step.job, folder, None)
-        step.seconds = manifest["seconds"]
-        step.total.add(manifest, folder)
-        if step.total.samples in TOTALS:
-            step.pixels = step.total.picture()
-    except Exception as error:
-        step.error = f"Bounces: {error_line(error)}"
 
 
 def shown_objects(layer) -> list:
@@ -378,42 +415,59 @@ def _settings_of(depsgraph) -> tuple:
 
 # In the child:
 
+_sum: list[RestSum] = []
+
 
 def render_rest(job: RestJob, folder: Path, progress) -> dict:
-    """Do the `job`: writes REST_PICTURE into `folder`. Returns the manifest."""
-    warnings: list[str] = []
+    """Do the `job`: adds to the sum. Returns the manifest: the seconds that Cycles took."""
+    view, warnings = RestView(**job.view), []
     if job.scene is not None:
         progress("open scene", 0.0)
         open_scene(Path(job.scene), warnings, job.scripts)
-        scene = scene_named(job.scene_name)
-        render_settings.go_to_frame(scene, job.frame)
-        layer = render_settings.only_view_layer(scene, warnings, job.view_layer)
-        _show_as_views(scene, layer, job.hidden)
+        scene = scene_named(view.scene)
+        render_settings.go_to_frame(scene, view.frame)
+        layer = render_settings.only_view_layer(scene, warnings, view.view_layer)
+        _show_as_views(scene, layer, view.hidden)
         _prepare(scene, layer)
-    scene = scene_named(job.scene_name)
+    scene = scene_named(view.scene)
     if job.changes is not None:
         _take_changes(scene, **job.changes)
     layer = next(layer for layer in scene.view_layers if layer.use)
     world = layer.world_override or scene.world
-    for name in () if job.world or world is None else ("diffuse", "glossy", "transmission", "scatter"):
+    for name in () if view.world or world is None else ("diffuse", "glossy", "transmission", "scatter"):
         setattr(world.cycles_visibility, name, False)
-    if job.matrices is None:
+    if view.matrices is None:
         camera = render_settings.choose_camera(scene, job.camera)
         camera.data.dof.use_dof = False
-        render_settings.set_resolution(scene, job.width, job.height)
+        render_settings.set_resolution(scene, *view.size)
     else:
-        _look_through(scene, *map(Matrix, job.matrices), (job.width, job.height))
+        size = tuple(max(side // job.shrink, 1) for side in view.size)
+        _look_through(scene, *map(Matrix, view.matrices), size)
+    render, (width, height) = scene.render, render_settings.picture_size(scene)
+    first, last = (round(share * height) for share in job.rows)
+    last = max(last, first + 1)
+    render.use_border = render.use_crop_to_border = last - first < height
+    render.border_min_x, render.border_max_x = 0.0, 1.0
+    render.border_min_y, render.border_max_y = 1.0 - last / height, 1.0 - first / height
     scene.cycles.samples, scene.cycles.seed = job.samples, job.seed
     progress("bounces", 0.0)
     started = time.monotonic()
-    render_exr(scene, folder / REST_PICTURE, "NONE")
-    return {
-        "samples": job.samples,
-        "seconds": time.monotonic() - started,
-        "mask": MASK,
-        "passes": render_settings.pass_names(),
-        "everything": _reasons_for_cycles(scene, layer),
-    }
+    render_exr(scene, folder / REST_RENDER, "NONE")
+    seconds = time.monotonic() - started
+    if not job.continues:
+        _sum[:] = [RestSum.of_size(width, height)]
+    total = _sum[0]
+    total.everything = tuple(_reasons_for_cycles(scene, layer))
+    total.add(folder / REST_RENDER, first, job.samples, {**render_settings.pass_names(), "mask": MASK})
+    total.samples += job.samples if job.rows[1] == 1.0 else 0
+    return {"seconds": seconds}
+
+
+def denoise_rest(job: RestPictureJob, folder: Path, progress) -> dict:
+    """Do the `job`; returns the manifest, see `process.view.render_rest`."""
+    total = _sum[0]
+    save_array(folder / REST_PICTURE, total.picture())
+    return {"everything": total.everything, "ambient": total.ambient, "problem": total.problem}
 
 
 def _take_changes(scene, file: str, blocks: list, moved: dict) -> None:

@@ -24,17 +24,17 @@ _LIGHT_BYTES = 4
 
 
 class ViewTracer:
-    """A tracer of occluders, and the pool of this process and a worker that trace with it."""
+    """A tracer of occluders, and the pool of this process and workers, at most `processes`, that trace with it."""
 
-    def __init__(self, occluders: Occluders):
-        self._occluders = occluders
+    def __init__(self, occluders: Occluders, processes: int = 2):
+        self._occluders, self._processes = occluders, processes
         self.pool: WorkerPool | None = None
 
     @cached_property
     def tracer(self) -> Tracer:
         """The tracer. Raises SceneError where Embree is missing."""
         tracer = open_tracer(self._occluders, embree_libraries())
-        self.pool = WorkerPool(tracer, min(cores(), 2))
+        self.pool = WorkerPool(tracer, min(cores(), self._processes))
         return tracer
 
     def close(self) -> None:
@@ -44,7 +44,7 @@ class ViewTracer:
 
 
 class ShadowRays:
-    """Traces, at once, the visibility of lights from the pixels of G-buffers past `occluders`.
+    """Traces, at once, the visibility of lights from the pixels of G-buffers.
 
     A pixel takes at most `rays` rays per light.
     """
@@ -59,8 +59,8 @@ class ShadowRays:
     def take_news(self) -> None:
         """Do nothing: there is never news, because everything is traced at once."""
 
-    def __init__(self, occluders: Occluders, rays: int):
-        self._tracing, self._rays = ViewTracer(occluders), rays
+    def __init__(self, tracing: ViewTracer, rays: int):
+        self._tracing, self._rays = tracing, rays
         self.seconds, self.traced, self.description = 0.0, 0, ""
         # By pass, summed over all calls: squares of the reflected light of pixels, and of its standard deviation.
         self._power = {name: np.zeros(2) for name in PASSES}
@@ -77,7 +77,8 @@ class ShadowRays:
         width, height = gbuffer.size
         tracer = self._tracing.tracer
         film = Film(width, height, pixel)
-        traced = trace_visibility(samples, (*lights, *sides), tracer, ShadowSampling(rays=self._rays, film=film))
+        sampling, pool = ShadowSampling(rays=self._rays, film=film), self._tracing.pool
+        traced = trace_visibility(samples, (*lights, *sides), tracer, sampling, workers=pool)
         count = len(lights) + bool(sides)
         values = np.ones((count, height * width, len(PASSES)), np.float32)
         for index, name in enumerate(PASSES):

@@ -274,6 +274,7 @@ class LiveShadows:
         self._wanted: tuple = ()  # state of scene and view that is to be shown
         # The size of what is shown. Where pictures have fewer pixels, only coarse shadows are traced.
         self.shown: tuple[int, int] | None = None
+        self._is_patient = False  # the last level waits, because something else is more urgent
         self._is_whole = True  # the picture has all pixels of what is shown
         # State and size of a picture, and points, by whether they are coarse.
         self._pixels: dict[bool, tuple[tuple, PixelGrid]] = {}
@@ -343,6 +344,12 @@ class LiveShadows:
         """End the helping process unless the thread works. It is started again when it pays."""
         if all(one._thread is None or not one._thread.is_alive() for one in self._both):
             self._traced_scene.close()
+
+    def hold(self, is_patient: bool) -> None:
+        """Let the last level of large pictures wait, or not any more: then it begins with a new first picture."""
+        if self._is_patient and not is_patient and any(one._best_level == QUICK for one in self._both if one._keys):
+            self._version += 1
+        self._is_patient = is_patient
 
     def take_news(self) -> None:
         """Take over the results of the thread. If `version` changes, pictures must be drawn anew."""
@@ -436,10 +443,18 @@ class LiveShadows:
         """The coarsest level that some light lacks in the wanted state; None: all are there."""
         if self._is_off:
             return None
-        if self._state != self._wanted:
-            return 0
-        best = min(max(self._known.get(key, (-1,))) for key in self._keys)
+        best = self._best_level
         return None if best == len(LEVELS) - 1 else int(best) + 1
+
+    @property
+    def _best_level(self) -> float:
+        """The level that all lights have in the wanted state; -1: none."""
+        known = self._known if self._state == self._wanted else {}
+        return min(max(known.get(key, (-1,))) for key in self._keys)
+
+    @property
+    def _has_patience(self) -> bool:
+        return (self._behind or self)._is_patient
 
     @property
     def _is_free(self) -> bool:
@@ -456,7 +471,8 @@ class LiveShadows:
             if self._thread is None and self._glass is not None and self._glass._request.level > 0:
                 self._glass._stop.set()
             return False
-        return self._traced_scene.may_collect() and (level == 0 or (number == 0 and self._is_whole))
+        is_finer = number == 0 and self._is_whole and not (self._has_patience and self._best_level == QUICK)
+        return self._traced_scene.may_collect() and (level == 0 or is_finer)
 
     def _begin(self, level: int, gbuffer: GBufferTextures, view: ViewCamera) -> None:
         self._traced_scene.collect_now()
@@ -465,7 +481,8 @@ class LiveShadows:
             requests.append(self._request_of(1, gbuffer, view))
         if requests[-1].level == 1 and np.prod(gbuffer.size) > MANY_POINTS:
             quick = self._request_of(QUICK, gbuffer, view)
-            requests[-1:-1] = [quick] * bool(quick.numbers)
+            if quick.numbers:
+                requests[-1:] = [quick] if self._has_patience else [quick, requests[-1]]
         self._start(requests)
 
     def _request_of(self, level: float, gbuffer: GBufferTextures, view: ViewCamera) -> ShadowRequest:

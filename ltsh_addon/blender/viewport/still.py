@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import bpy
@@ -12,22 +13,24 @@ import numpy as np
 
 from ...files import save_array
 from ...scene import SceneError, error_line, listed
+from ...workers.pool import cores
 from .. import render_settings
 from ..evaluated import with_render_depsgraph
 from ..extract.occluders import with_baked_shares
-from ..extract.pixels import missing_images, no_light, open_scene
+from ..extract.pixels import files_opened, missing_images, no_light, open_scene
 from ..lights.area import collect_lights, note_overlaps
+from ..lights.textures import NodeEmission
 from ..lights.world import light_of_world
 from ..materials.preview_material import world_radiance
 from ..process.view import GRAPHICS, VIEW_PASSES, VIEW_PNG, ViewJob
 from ..render_settings import cycles_setting
-from .drawing import ViewCamera, float_texture, frame_buffer, read_texture
+from .drawing import ViewCamera, float_texture, forget_shaders, frame_buffer, read_texture
 from .light_texels import ShownSky, varied_sky
 from .live_cycles import rendered_world
-from .mirror import NOT_RESOLVED, SceneMirror, patterns_of
+from .mirror import NOT_RESOLVED, Changes, SceneMirror, patterns_of
 from .pictures import TRANSMITTED, ShownPicture, ShownRest
 from .renderer import ViewRenderer
-from .shadow_rays import ShadowRays, too_many, view_occluders
+from .shadow_rays import ShadowRays, ViewTracer, too_many, view_occluders
 
 # FEWEST_RAYS: a point of a pixel takes at least so many rays per light, however many points share those of the pixel.
 FEWEST_RAYS = 32
@@ -35,28 +38,126 @@ FEWEST_RAYS = 32
 _renderer: list[ViewRenderer] = []
 
 
+class OpenScene:
+    """The scene of a view, open for further frames: what does not change from one to the next is not read again."""
+
+    def __init__(self, job: ViewJob, progress):
+        self.warnings: list[str] = []
+        progress("open scene", 0.0)
+        open_scene(Path(job.scene), self.warnings, job.scripts)
+        self.scene, self._state = bpy.context.scene, _state_of(job)
+        self._changes, self._patterns, self._sky, self._lights = Changes(everything=True), {}, None, None
+        self._sky_notes: list[str] = []
+        self._shadow_notes: list[str] = []
+        self._mirror: SceneMirror | None = None
+        self.tracing: ViewTracer | None = None
+
+    def is_of(self, job: ViewJob) -> bool:
+        """True if it is the scene of a job, and nothing else has been opened since."""
+        return self._state == _state_of(job)
+
+    def go_to_frame(self, frame: int | None) -> None:
+        """Go to a frame and take note of what that changes."""
+        self.depsgraph()  # settings of pictures are no changes
+
+        def note(scene, depsgraph) -> None:
+            self._changes.add(depsgraph)
+
+        handlers = [getattr(bpy.app.handlers, name) for name in ("frame_change_post", "depsgraph_update_post")]
+        for each in handlers:
+            each.append(note)
+        try:
+            render_settings.go_to_frame(self.scene, frame)
+            self.depsgraph()
+        finally:
+            for each in handlers:
+                each.remove(note)
+
+    def depsgraph(self):
+        """The evaluated scene, up to date."""
+        with bpy.context.temp_override(scene=self.scene, view_layer=_layer(self.scene)):
+            return bpy.context.evaluated_depsgraph_get()
+
+    def read(self, has_shadows: bool) -> list[str]:
+        """Read again what Cycles tells about the world and lights, and the occluders; returns warnings."""
+        scene, changes = self.scene, self._changes
+        if changes.sky:
+            self._sky_notes = []
+            self._sky = _sky(scene, self._sky_notes)
+        with bpy.context.temp_override(scene=scene, view_layer=_layer(scene)):
+            depsgraph, unread = self.depsgraph(), []
+            if changes.emitters:
+                self._patterns = patterns_of(scene, depsgraph, {} if changes.images else self._patterns)
+            lights = [ob.name_full for ob in depsgraph.objects if ob.type == "LIGHT"]
+            # Simplify may leave out what the camera does not see.
+            if has_shadows and (changes.surfaces or lights != self._lights or scene.render.use_simplify):
+                self._lights, self._shadow_notes = lights, []
+                occluders = view_occluders(depsgraph, self._shadow_notes.append, unread)
+                if unread:
+                    occluders = with_baked_shares(occluders, unread, scene, self._shadow_notes.append)
+                if self.tracing is not None:
+                    self.tracing.close()
+                self.tracing = ViewTracer(occluders, cores())
+            images = missing_images(depsgraph, scene.world, _layer(scene).material_override)
+            notes = [*self._sky_notes, *self._shadow_notes, *images, *overlaps_of_lights(depsgraph)]
+        return notes
+
+    def mirror(self) -> SceneMirror:
+        """The mirror of the scene, up to date; needs an active GPU context."""
+        depsgraph = self.depsgraph()
+        if self._mirror is None or not MAY_DRAW_ALWAYS:
+            self._mirror = SceneMirror(lambda world: self._sky, self._pattern)
+            self._mirror.sync(depsgraph)
+        else:
+            self._mirror.sync(depsgraph, changes=self._changes)
+        self._changes = Changes()
+        return self._mirror
+
+    def _pattern(self, data, source) -> NodeEmission | str:
+        return self._patterns[source.key][1] if source.key in self._patterns else NOT_RESOLVED
+
+    def close(self) -> None:
+        """End the processes that trace, and free what is on the graphics card."""
+        if self.tracing is not None:
+            self.tracing.close()
+        self._mirror = None
+
+
+# The scene of the last job, and whether scripts may use the graphics card outside of renders.
+_open: list[OpenScene] = []
+MAY_DRAW_ALWAYS = hasattr(gpu, "init")
+
+
+def _state_of(job: ViewJob) -> tuple:
+    """What an open scene is of."""
+    return files_opened(), Path(job.scene).stat().st_mtime_ns, replace(job, frame=None, rest=None, is_everything=False)
+
+
 def draw_view(job: ViewJob, folder: Path, progress) -> dict:
     """Do the `job` and write arrays and a PNG into `folder`; returns the manifest."""
-    started, warnings = time.monotonic(), []
-    progress("open scene", 0.0)
-    open_scene(Path(job.scene), warnings, job.scripts)
-    scene = bpy.context.scene
-    render_settings.go_to_frame(scene, job.frame)
+    started = time.monotonic()
+    if not (_open and _open[0].is_of(job)):
+        for other in _open:
+            other.close()
+        _open[:] = [OpenScene(job, progress)]
+    opened = _open[0]
+    try:
+        return {**_drawn(opened, job, folder, progress), "seconds": time.monotonic() - started}
+    except BaseException:
+        opened.close()
+        _open.clear()
+        raise
+
+
+def _drawn(opened: OpenScene, job: ViewJob, folder: Path, progress) -> dict:
+    """Draw a frame of the open scene; returns the manifest."""
+    scene = opened.scene
+    opened.go_to_frame(job.frame)
     camera = render_settings.choose_camera(scene, job.camera)
     size = render_settings.set_resolution(scene, job.width, job.height)
-    warnings += _not_shown(scene, camera)
-    sky = _sky(scene, warnings)
-    with bpy.context.temp_override(scene=scene, view_layer=_layer(scene)):
-        depsgraph, unread = bpy.context.evaluated_depsgraph_get(), []
-        patterns = patterns_of(scene, depsgraph)
-        occluders = view_occluders(depsgraph, warnings.append, unread) if job.shadows == "on" else None
-        warnings += missing_images(depsgraph, scene.world, _layer(scene).material_override)
-        warnings += overlaps_of_lights(depsgraph)
-    if unread:
-        occluders = with_baked_shares(occluders, unread, scene, warnings.append)
+    warnings = [*opened.warnings, *_not_shown(scene, camera), *opened.read(job.shadows == "on")]
     progress(GRAPHICS, 0.0)
-    read = scene, camera, sky, patterns, occluders
-    pictures, notes, facts = with_graphics(lambda: _draw(job, read, size, progress))
+    pictures, notes, facts = with_graphics(lambda: _draw(job, opened, camera, size, progress))
     for number, pixels in enumerate(pictures):
         technique, index = divmod(number, len(facts["passes"]))
         save_array(folder / f"{technique}_{facts['passes'][index]}.npy", pixels)
@@ -73,7 +174,6 @@ def draw_view(job: ViewJob, folder: Path, progress) -> dict:
         "color_space": render_settings.working_space(),
         "warnings": [*warnings, *notes],
         **facts,
-        "seconds": time.monotonic() - started,
     }
 
 
@@ -93,7 +193,7 @@ def with_graphics(function: Callable):
 
     Before Blender 5.2, scripts without a window may use the card only inside a render whose engine asks for it.
     """
-    if not hasattr(gpu, "init"):
+    if not MAY_DRAW_ALWAYS:
         return _inside_render(function)
     try:
         gpu.init()
@@ -164,24 +264,22 @@ def _layer(scene):
     return next((layer for layer in scene.view_layers if layer.use), scene.view_layers[0])
 
 
-def _draw(job: ViewJob, read: tuple, size: tuple[int, int], progress) -> tuple[list[np.ndarray], list[str], dict]:
+def _draw(
+    job: ViewJob, opened: OpenScene, camera, size: tuple[int, int], progress
+) -> tuple[list[np.ndarray], list[str], dict]:
     """Pictures (H, W, 4), row 0 on top, of all techniques and passes, notes, and facts for the manifest."""
     progress("draw", 0.0)
-    scene, camera, sky, patterns, occluders = read
-    with bpy.context.temp_override(scene=scene, view_layer=_layer(scene)):
-        depsgraph = bpy.context.evaluated_depsgraph_get()
-    mirror = SceneMirror(lambda world: sky, lambda data, source: patterns.get(source.key, NOT_RESOLVED))
-    mirror.sync(depsgraph)
+    scene, mirror, depsgraph = opened.scene, opened.mirror(), opened.depsgraph()
     if not mirror.lights and not mirror.sky.sides:
         raise no_light(scene, mirror.notes)
     notes, shadows = list(mirror.notes if job.rest is None else mirror.notes_with_rest), None
-    if occluders is not None:
+    if opened.tracing is not None:
         problem = too_many(len(mirror.lights), size)
         rays = max(min(FEWEST_RAYS, job.shadow_rays), job.shadow_rays // job.refine)
         if problem:
             notes.append(problem)
         else:
-            shadows = ShadowRays(occluders, rays)
+            shadows = ShadowRays(opened.tracing, rays)
     drawn = mirror, view_of_camera(camera.evaluated_get(depsgraph), depsgraph, size), size
     # Beside Cycles' light the mean of the points must be the center.
     offsets = render_settings.filter_points if job.rest is None else render_settings.balanced_points
@@ -191,7 +289,7 @@ def _draw(job: ViewJob, read: tuple, size: tuple[int, int], progress) -> tuple[l
     exposure, transparent = cycles_setting(scene, "film_exposure"), scene.render.film_transparent
     shown = ShownPicture(first[0], "combined", exposure=exposure, transparent=transparent, also=tuple(others))
     renderer = _renderer[0] if _renderer else ViewRenderer()
-    renderer.shadows, renderer.has_bounces = shadows, job.rest is not None
+    renderer.shadows, renderer.has_bounces, renderer.may_split = shadows, job.rest is not None, False
     if job.rest is not None:
         renderer.rest = ShownRest(float_texture(np.load(job.rest)[::-1]), drawn[1], job.is_everything)
     try:
@@ -202,10 +300,11 @@ def _draw(job: ViewJob, read: tuple, size: tuple[int, int], progress) -> tuple[l
         raise SceneError(f"{error}; --shadows off draws the view without") from error
     finally:
         renderer.shadows = renderer.rest = None
-        if hasattr(gpu, "init"):
+        if MAY_DRAW_ALWAYS:
             _renderer[:] = [renderer]
         else:
             renderer.free()
+            forget_shaders()
     traced = None
     if shadows is not None:
         # The facts of `pipeline.lighting.Shadows.report`, and the seconds.

@@ -10,7 +10,17 @@ import numpy as np
 
 from ...shading.header import filled
 from ..materials.preview_material import IMAGE_SLOTS, is_missing
-from .drawing import GBufferTextures, PixelShader, ViewCamera, drawing, float_table, float_texture, glsl, uniform_buffer
+from .drawing import (
+    GBufferTextures,
+    PixelShader,
+    ViewCamera,
+    compiled,
+    drawing,
+    float_table,
+    float_texture,
+    glsl,
+    uniform_buffer,
+)
 from .meshes import DEFINES, LOOK_SIZE, albedo_table, blend_table, sheen_table
 from .mirror import ShownInstance, ShownLook
 from .shaders import slope_text
@@ -253,4 +263,4 @@ def _shader(outputs, is_further: bool = False):
     if outputs == REBOUNDS:
         functions += slope_text() + glsl("rebound")
     info.fragment_source(filled(glsl("surface"), {"FUNCTIONS": functions}))
-    return gpu.shader.create_from_info(info)
+    return compiled((outputs, is_further), lambda: gpu.shader.create_from_info(info))

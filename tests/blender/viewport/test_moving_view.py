@@ -11,7 +11,7 @@ from ltsh_addon.blender.engine import redraws
 from ltsh_addon.blender.viewport import shadows
 from ltsh_addon.blender.viewport.drawing import float_texture
 from ltsh_addon.blender.viewport.pictures import ShownPicture, ShownRest
-from ltsh_addon.blender.viewport.shadow_rays import ShadowRays, view_occluders
+from ltsh_addon.blender.viewport.shadow_rays import ShadowRays, ViewTracer, view_occluders
 from ltsh_addon.blender.viewport.shadows import LiveShadows, ShadowRequest
 
 SIZE = (72, 48)
@@ -93,9 +93,10 @@ def test_a_picture_with_fewer_pixels_is_interpolated_and_as_bright_and_leaves_no
     assert np.abs(with_rest[..., :3] - moving[..., :3] - (0.5, 0.25, 0.125)).max() < 1e-5 * small.max()
 
 
-def live_steps():
+def live_steps(is_held):
     """A view with live shadows that moves and comes to rest: exact pictures, and after each step of the thread the
-    levels that it did, and the picture; and what many rays at every pixel give."""
+    levels that it did, and the picture; and what many rays at every pixel give. If it `is_held`, the last level waits
+    until it may begin."""
     camera, shown, live = set_up_scene(), ShownPicture("ltsh4", "combined", transparent=True), LiveShadows()
 
     def collect():
@@ -110,17 +111,24 @@ def live_steps():
             return opened.draw(shown)[..., :3].astype(np.float64)
 
         try:
-            exact, plain = drawn(1, ShadowRays(collect(), 256)), drawn(1, None)
+            exact, plain = drawn(1, ShadowRays(ViewTracer(collect()), 256)), drawn(1, None)
             drawn(2, live)
             live._thread.join()
             drawn(2, live)
             is_done = not live.is_busy  # the smaller picture gets no finer ones
+            live.hold(is_held)
             coarse = drawn(1, live)
             live._thread.join()
             done = [(request.level, len(outcome)) for request, outcome in live._outcomes]
-            last = live._outcomes.pop()
+            last = [] if is_held else [live._outcomes.pop()]
             quick = drawn(1, live)
-            live._outcomes.append(last)
+            if is_held:
+                is_done &= not live.is_busy
+                live.hold(False)
+                drawn(1, live)
+                live._thread.join()
+                done += [(request.level, len(outcome)) for request, outcome in live._outcomes]
+            live._outcomes.extend(last)
             live.take_news()
             return exact, plain, is_done, done, coarse, quick, drawn(1, live)
         finally:
@@ -128,13 +136,14 @@ def live_steps():
 
 
 @edits_with_graphics
-def test_shadows_of_what_has_moved_are_near_at_once_and_need_few_rays(monkeypatch):
+@pytest.mark.parametrize("is_held", [False, True])
+def test_shadows_of_what_has_moved_are_near_at_once_and_need_few_rays(monkeypatch, is_held):
     monkeypatch.setattr(shadows, "MANY_POINTS", 1000)
     points, traced = [], ShadowRequest._traced
     monkeypatch.setattr(
         ShadowRequest, "_traced", lambda self, *given: (points.append(len(given[0])), traced(self, *given))[1]
     )
-    exact, plain, is_done, done, *pictures = with_graphics(live_steps)
+    exact, plain, is_done, done, *pictures = with_graphics(lambda: live_steps(is_held))
     without, coarse, quick, fine = (np.linalg.norm(one - exact) / np.linalg.norm(exact) for one in (plain, *pictures))
     assert is_done and done == [(shadows.QUICK, 2), (1, 2)]
     # The coarse ones of the smaller picture are shown in the whole one; those of every 16th pixel, with the pixels

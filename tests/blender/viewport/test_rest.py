@@ -3,6 +3,7 @@ changes."""
 
 import json
 import time
+from dataclasses import asdict
 from types import SimpleNamespace
 
 import bpy
@@ -13,6 +14,7 @@ from fake_scene import run
 from graphics_card import edits_with_graphics, with_graphics
 from view_pictures import OpenView
 
+from ltsh_addon.blender.process.view import RestJob, RestView
 from ltsh_addon.blender.viewport import rest
 from ltsh_addon.blender.viewport.drawing import float_texture
 from ltsh_addon.blender.viewport.pictures import ShownPicture, ShownRest
@@ -111,8 +113,8 @@ def followed(live, context, monkeypatch, world=True):
     live.follow(context, SimpleNamespace(scene=bpy.context.scene, view_layer=bpy.context.view_layer), world)
     end = time.monotonic() + 120.0
     while live.is_busy and time.monotonic() < end:
-        if live.step() and live._pixels is not None:
-            pixels = live._pixels[0]
+        if live.step() and live.has_news:
+            pixels = live._picture.pixels
         time.sleep(0.02)
     monkeypatch.setattr(rest.LiveRest, "_begin", begin)
     assert not live.problem and not live.is_busy
@@ -130,7 +132,6 @@ def context_of(camera):
 def test_changes_are_handed_over_by_themselves_and_show_what_a_whole_file_shows(monkeypatch):
     monkeypatch.setattr(rest, "TOTALS", (4,))
     monkeypatch.setattr(rest, "REST_SECONDS", 0.0)
-    monkeypatch.setattr(rest, "STEP_SECONDS", 60.0)
     camera = room()
     context, live = context_of(camera), rest.LiveRest()
     handlers = bpy.app.handlers.depsgraph_update_post
@@ -139,7 +140,7 @@ def test_changes_are_handed_over_by_themselves_and_show_what_a_whole_file_shows(
     handlers.append(note)
     try:
         first, jobs = followed(live, context, monkeypatch)
-        assert [job.scene is None for job in jobs] == [False, True]  # in half resolution, and whole
+        assert [(job.scene is None, job.shrink, job.rows) for job in jobs] == [(False, 1, (0.0, 1.0))]
         light, chrome = bpy.data.objects["Light"], bpy.data.objects["Chrome"]
         light.data.energy *= 2.0
         light.location.x -= 0.5
@@ -177,6 +178,43 @@ def test_changes_are_handed_over_by_themselves_and_show_what_a_whole_file_shows(
     np.testing.assert_allclose(second[..., :3], whole[..., :3], **SAME)
     np.testing.assert_allclose(without[..., :3], unseen[..., :3], **SAME)
     assert without[..., :3].mean() < 0.9 * whole[..., :3].mean()
+
+
+@pytest.mark.newest
+def test_a_step_takes_what_there_is_time_for_and_pictures_come_with_more_and_more_pixels():
+    """Each picture has all its samples, whatever the share of a picture that a step takes."""
+    one, other = RestView(scene="one"), RestView(scene="other")
+    for share, shrinks in ((0.13, [4, 2, 1]), (0.3, [4, 2, 1]), (1.0, [2, 1]), (5.0, [1])):
+        before, done, pictures = rest._RestProgress(other, 1, 16), 0.0, []
+        while not pictures or pictures[-1] != (1, 64):
+            after = before.next(one, share)
+            rows = before.rows if before.view == one and before.shrink == after.shrink else 0.0
+            samples = before.samples if before.view == one and before.shrink == after.shrink else 0
+            step = (max(after.samples - samples, 1) * ((after.rows or 1.0) - rows)) / after.shrink**2
+            assert 0.0 < step <= share or after.rows == 0.0 and step <= 1.001 * share
+            done = step if before.shrink != after.shrink or before.view != one else done + step
+            if after.is_shown:
+                pictures.append((after.shrink, after.samples))
+                assert done * after.shrink**2 == pytest.approx(after.samples)
+            before = after
+        assert pictures == [*((shrink, 4) for shrink in shrinks), *((1, count) for count in (8, 16, 32, 64))]
+
+
+@pytest.mark.newest
+def test_rows_that_are_rendered_apart_are_those_of_the_whole_picture(tmp_path):
+    camera = room()
+    path, sums = parts.save(tmp_path / "room.blend"), []
+    context = context_of(camera)
+    matrices = tuple(tuple(map(tuple, getattr(context.region_data, name))) for name in ("view_matrix", "window_matrix"))
+    for bands in (((0.0, 1.0),), ((0.0, 0.3), (0.3, 0.9), (0.9, 1.0))):
+        for number, rows in enumerate(bands):
+            view = asdict(RestView(matrices=matrices, size=SIZE))
+            job = RestJob(None if sums or number else path, view, 2, rows=rows, continues=number > 0)
+            rest.render_rest(job, tmp_path, lambda *stage: None)
+        sums.append(rest._sum[0])
+    assert [one.samples for one in sums] == [2, 2]
+    for name in ("light", "guides"):
+        np.testing.assert_array_equal(*(getattr(one, name) for one in sums))
 
 
 @edits_with_graphics

@@ -1,0 +1,88 @@
+"""The bounced light of a lightmap: Cycles' indirect light of the texels, denoised island by island."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from ..cycles.texels import NOT_BAKED
+from ..imaging.denoise import NoDenoiser, open_denoiser, smoothed
+from ..imaging.seams import FRAMES, Islands, canvas_of
+from ..workers.pool import cores
+from .bake_files import nearest_covered
+
+# REST_TEXELS: the most that Cycles bakes at a time for the bounced light, since it reads the whole scene each time.
+REST_TEXELS = 1 << 22
+# DULL: a diffuse color below which Cycles' diffuse light, divided by it, says nothing.
+DULL = 1e-3
+
+
+def rest_rows(size: tuple[int, int]) -> int:
+    """Rows of texels whose bounced light is baked at a time."""
+    width, height = size
+    return max(1, min(height, REST_TEXELS // width))
+
+
+def rest_passes(passes: set[str]) -> tuple[str, ...]:
+    """The passes of Cycles' indirect light from which that of the wanted `passes` follows."""
+    kinds = {"specular": {"specular", "combined"}, "diffuse": {"diffuse", "diffuse_light", "combined"}}
+    return tuple(kind for kind, wanted in kinds.items() if wanted & set(passes))
+
+
+def read_rest(folder: Path, key: tuple[str, int], tile: int, size: tuple[int, int]) -> np.ndarray:
+    """Cycles' indirect light (H, W, 3) of a tile, of a kind and row of lights, NOT_BAKED where there is none."""
+    firsts = range(0, size[1], rest_rows(size))
+    kind, row = key
+    return np.concatenate([np.load(folder / f"rest_{kind}_{row}_{tile}_{first}.npy") for first in firsts])
+
+
+def denoised_rest(
+    rest: dict[tuple[str, int], np.ndarray], guides: np.ndarray, islands: Islands, samples: int
+) -> tuple[dict[tuple[str, int], np.ndarray], str]:
+    """The light `rest` (H, W, 3) by kind and row of lights, each denoised by itself; and what denoised it.
+
+    It is 0 where no island is. `guides` (H, W, 6) are the diffuse color and the normal. There are so many `samples`.
+    """
+    from ..blender.process.blender_process import denoiser_libraries
+
+    canvas, is_covered = canvas_of(islands), islands.grid.triangle >= 0
+    images = {}
+    for key, light in rest.items():
+        is_lit = (light[..., 0] != np.float32(NOT_BAKED)) & is_covered
+        if key[0] == "diffuse":
+            is_lit &= guides[..., :3].max(axis=-1) > DULL
+        images[key] = np.where(is_lit[..., None], light, 0.0), is_lit
+    try:
+        with open_denoiser(denoiser_libraries(), cores()) as denoiser:
+            done = {key: _on_canvas(canvas, *one, guides, denoiser.guided) for key, one in images.items()}
+            return done, denoiser.name
+    except NoDenoiser as error:
+
+        def smooth(light, albedo, normals):
+            return smoothed(light, np.concatenate([albedo, normals, np.ones_like(light[..., :1])], axis=-1), samples)
+
+        done = {key: _on_canvas(canvas, *one, guides, smooth) for key, one in images.items()}
+        return done, f"its bounced light is smoothed along the surface, not denoised: {error}"
+
+
+def _on_canvas(canvas, light, is_lit, guides, denoise: Callable) -> np.ndarray:
+    """The light (H, W, 3) of a texture, denoised on its canvas. `guides` are as for `denoised_rest`."""
+    planes, mask = canvas.put(np.concatenate([light, guides, is_lit[..., None]], axis=-1))
+    # Beyond lit texels the picture is mirrored: noise that is repeated would look like light. Texels between lit ones
+    # and others count as others.
+    lit = mask & (planes[..., -1] > 0.999)
+    target, source = nearest_covered(lit, max(FRAMES))
+    row, column = (
+        2 * (source // lit.shape[1]) - target // lit.shape[1],
+        2 * (source % lit.shape[1]) - target % lit.shape[1],
+    )
+    inside = (row >= 0) & (row < lit.shape[0]) & (column >= 0) & (column < lit.shape[1])
+    mirrored = np.where(inside, row * lit.shape[1] + column, 0)
+    source = np.where(inside & lit.reshape(-1)[mirrored], mirrored, source)
+    flat, is_bare = planes.reshape(-1, planes.shape[-1]), ~mask.reshape(-1)
+    flat[target, :3] = flat[source, :3]
+    bare = is_bare[target]
+    flat[target[bare], 3:-1] = flat[source[bare], 3:-1]
+    return canvas.taken(denoise(planes[..., :3], planes[..., 3:6], planes[..., 6:9]), light)

@@ -1,0 +1,100 @@
+"""Bakes with bounced light beside Cycles' own bake of direct and indirect light, in scenes where both matter."""
+
+import math
+
+import bpy
+import numpy as np
+from bake_scenes import SIZE, baked, save, start
+from scene_parts import add_mesh, add_plane, add_sphere, add_world, principled
+
+TRUTH = 256  # samples; a half of them is off by 1.5 % of the light
+
+
+def corner(floor=None, **world):
+    """A white floor beside a red wall, a glowing ball and a lamp, under a dim world."""
+    start(camera=None)
+    bpy.data.objects["Key"].data.energy = 20.0
+    add_plane(floor or principled("White", Base_Color=(0.8, 0.8, 0.8, 1.0), Roughness=1.0)[0], size=2.0, name="Floor")
+    red = principled("Red", Base_Color=(0.8, 0.1, 0.1, 1.0), Roughness=1.0)[0]
+    for number, x in enumerate((-1.0, 1.0)):
+        wall = add_mesh("Wall", [(x, -1, 0), (x, 1, 0), (x, 1, 2), (x, -1, 2)], [(0, 1, 2, 3)[:: 1 - 2 * number]])
+        wall.data.materials.append(red)
+    glow = principled(
+        "Glow", Emission_Color=(0.2, 0.5, 1.0, 1.0), Emission_Strength=2.0, Base_Color=(0.1, 0.1, 0.1, 1.0)
+    )
+    add_sphere(glow[0], radius=0.2, location=(0.5, 0.3, 0.6), segments=16)
+    add_world(Color=(0.2, 0.25, 0.3, 1.0), **world)
+
+
+def by_cycles(name="Floor", light=("DIRECT", "INDIRECT"), samples=TRUTH):
+    """Cycles' diffuse light (2, SIZE, SIZE, 3) of an object, without color: two halves, row 0 on top."""
+    scene, ob = bpy.context.scene, bpy.data.objects[name]
+    scene.render.engine, scene.cycles.samples = "CYCLES", samples // 2
+    scene.cycles.use_adaptive_sampling, halves = False, []
+    image = bpy.data.images.new("truth", SIZE, SIZE, alpha=True, float_buffer=True, is_data=True)
+    for slot in ob.material_slots:
+        node = slot.material.node_tree.nodes.new("ShaderNodeTexImage")
+        node.image, slot.material.node_tree.nodes.active = image, node
+    for other in scene.objects:
+        other.select_set(other is ob)
+    bpy.context.view_layer.objects.active = ob
+    for scene.cycles.seed in (3, 4):
+        bpy.ops.object.bake(type="DIFFUSE", pass_filter=set(light), margin=0, use_clear=True)
+        pixels = np.empty(SIZE * SIZE * 4, np.float32)
+        image.pixels.foreach_get(pixels)
+        halves.append(pixels.reshape(SIZE, SIZE, 4)[::-1, :, :3])
+    return np.array(halves)
+
+
+def off(light, halves):
+    """The error of light (N, 3) beside halves (2, N, 3) without their noise, and its mean, both relative."""
+    light, a, b = light.astype(float), *halves.astype(float)
+    squared = ((light - a) * (light - b)).mean() / (a * b).mean()
+    return math.sqrt(max(squared, 0.0)), light.mean() / (0.5 * (a + b).mean()) - 1.0
+
+
+def lightmap(tmp_path, **options):
+    """The report and the layers of a bake of the open file with bounced light, and its coverage."""
+    values = {"passes": ("diffuse_light",), "shadows": "on", "bounces": "on", "view": "above", "objects": ("Floor",)}
+    tmp_path.mkdir(exist_ok=True)
+    report, files = baked(save(tmp_path), tmp_path / "out", **{**values, **options})
+    (layers,) = files.values()
+    return report, layers, layers["coverage.hit"].reshape(SIZE, SIZE) > 0.0
+
+
+def test_direct_and_bounced_light_are_that_of_cycles(tmp_path):
+    corner()
+    report, layers, covered = lightmap(tmp_path)
+    truth = by_cycles()[:, covered]
+    error, mean = off(layers["ltsh4c.diffuse_light"][covered], truth)
+    # Light that is left out, or counts twice: a fifth is bounced, a tenth is of the world, another one of the ball.
+    assert abs(mean) < 0.01
+    # 64 samples without the denoiser are 4 % off (the next test tells that the denoiser gains).
+    assert error < 0.02
+    assert report["warnings"] == []
+
+
+def test_the_denoiser_halves_the_error_of_what_bounces(tmp_path):
+    corner()
+    _, layers, covered = lightmap(tmp_path, rest_samples=16)
+    truth, noisy = by_cycles(light=("INDIRECT",))[:, covered], by_cycles(light=("INDIRECT",), samples=32)[0, covered]
+    assert off(layers["rest.diffuse_light"][covered], truth)[0] < 0.5 * off(noisy, truth)[0]
+
+
+def test_lights_by_themselves_add_up_to_other_powers(tmp_path):
+    corner()
+    options = {"per_light": True, "rest_samples": 32}
+    _, layers, covered = lightmap(tmp_path, **options)
+    of_lights = {name.partition("@")[2]: light for name, light in layers.items() if "@" in name}
+    assert set(of_lights) == {"Key", "World", "Glowing surfaces"}
+    assert {light.dtype for light in of_lights.values()} == {np.dtype(np.float16)}
+    whole = sum(light.astype(float) for light in of_lights.values())[covered]
+    # Half floats have 11 bits, and the seams of each are fitted to a ten-thousandth.
+    assert np.abs(whole - layers["ltsh4c.diffuse_light"][covered]).max() < 1e-3 * whole.max()
+    of_lights["Key"] = 3.0 * of_lights["Key"]
+    bpy.data.objects["Key"].data.energy *= 3.0
+    mixed = sum(light.astype(float) for light in of_lights.values())[covered]
+    fresh = lightmap(tmp_path / "fresh", **options)[1]["ltsh4c.diffuse_light"][covered]
+    assert np.sqrt(np.square(mixed - fresh).mean()) < 0.01 * fresh.mean()
+    plain = lightmap(tmp_path / "plain", rest_samples=64)[1]["ltsh4c.diffuse_light"][covered]
+    assert abs(mixed.mean() / plain.mean() - 1.0) < 0.01

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from dataclasses import replace
 
@@ -123,7 +124,7 @@ class EngineView:
         if has_failed:
             return
         if size.step > 1 or self._holds_up:
-            moment = self._held_until if size.step == 1 else size.end + redraws.WAITING_SECONDS * self._is_waiting
+            moment = self._held_until if size.step == 1 else size.end + self._wait
             redraws.redraw_at(max(moment, time.monotonic() + redraws.POLL_SECONDS))
         elif self._renderer.samples < redraws.REFINEMENTS and not (self._draws_shadows and self._shadows.waits):
             redraws.redraw_later(start, self._renderer.samples)
@@ -146,8 +147,8 @@ class EngineView:
         if has_news:  # it is shown at once, with the points that there are
             points = points[: max(self._renderer.samples, 1)]
         size, started = (region.width, region.height), time.monotonic()
-        is_waiting = has_news or self._is_waiting
-        self._renderer.step = self._pixel_size.follow(_state_of(self.mirror, camera, size), is_waiting)
+        wait = math.inf if has_news else self._wait
+        self._renderer.step = self._pixel_size.follow(_state_of(self.mirror, camera, size), wait)
         self._shadows.hold(self._holds_up)
         self._renderer.draw(self.mirror, camera, size, shown, target, points)
         if self._pixel_size.is_new:
@@ -170,9 +171,9 @@ class EngineView:
         renderer.rest = self.rest.shown() if is_wanted else None
 
     @property
-    def _is_waiting(self) -> bool:
-        """True while the first shadows and bounces of this state are to come, which a whole picture would hold up."""
-        return self._shadows.is_busy or self.rest.is_new
+    def _wait(self) -> float:
+        """How many seconds a whole picture waits for the first shadows and bounces, which it would hold up."""
+        return redraws.WAITING_SECONDS if self._shadows.is_busy or self.rest.is_new else 0.0
 
     @property
     def _held_until(self) -> float:

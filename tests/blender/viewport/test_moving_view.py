@@ -50,7 +50,7 @@ def test_pictures_of_what_moves_have_as_many_pixels_as_the_time_allows(monkeypat
     assert step("d", slow / 2.0) == 4 and step("e", slow / 2.0) == 2
     assert 0.0 < size.end - now[0] <= redraws.MOVING_SECONDS
     now[0] = size.end
-    assert size.follow(((light,), ("e",)), is_waiting=True) == 2, "shadows are traced while nothing is drawn"
+    assert size.follow(((light,), ("e",)), wait=0.1) == 2, "shadows are traced while nothing is drawn"
     assert step("e", slow) == 1 and not size.is_new
     assert step("f", slow) == 4
     # A drawing that fails keeps neither a view from being drawn nor one that moves from being quick.

@@ -121,10 +121,10 @@ class EngineView:
     def _redraw_later(self, start: float, has_failed: bool) -> None:
         """Ask for the next picture after the one that began at `start`. News of shadows and bounces come before."""
         size = self._pixel_size
+        moment = self._held_until if size.step == 1 else size.end + self._wait
         if has_failed:
             return
-        if size.step > 1 or self._holds_up:
-            moment = self._held_until if size.step == 1 else size.end + self._wait
+        if size.step > 1 or time.monotonic() < moment:
             redraws.redraw_at(max(moment, time.monotonic() + redraws.POLL_SECONDS))
         elif self._renderer.samples < redraws.REFINEMENTS and not (self._draws_shadows and self._shadows.waits):
             redraws.redraw_later(start, self._renderer.samples)
@@ -149,7 +149,7 @@ class EngineView:
         size, started = (region.width, region.height), time.monotonic()
         wait = math.inf if has_news else self._wait
         self._renderer.step = self._pixel_size.follow(_state_of(self.mirror, camera, size), wait)
-        self._shadows.hold(self._holds_up)
+        self._shadows.hold(time.monotonic() < self._held_until)
         self._renderer.draw(self.mirror, camera, size, shown, target, points)
         if self._pixel_size.is_new:
             self._renderer.wait()
@@ -180,11 +180,6 @@ class EngineView:
         """The moment until which bounces come before further points of pixels and the last shadows. All share the
         processor where pictures take long."""
         return self._pixel_size.end + redraws.HELD_SECONDS if self._pixel_size.is_slow and self.rest.is_urgent else 0.0
-
-    @property
-    def _holds_up(self) -> bool:
-        """True if that is to come."""
-        return time.monotonic() < self._held_until
 
     @property
     def _draws_shadows(self) -> bool:

@@ -83,8 +83,7 @@ def render_passes(scene, path):
 
 def extracted(tmp_path, **options):
     """Samples and lights of a copy of the open file."""
-    path = tmp_path / "scene.blend"
-    bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
+    path = parts.save(tmp_path / "scene.blend", copy=True)
     return extract_pixels(PixelJob(scene=path, **options))
 
 
@@ -136,8 +135,7 @@ def test_a_complete_render_is_the_picture_that_the_command_makes_with_the_passes
     layer.use_pass_diffuse_indirect = layer.use_pass_diffuse_direct = layer.use_pass_z = layer.use_pass_uv = True
     layer.use_pass_glossy_direct = layer.use_pass_cryptomatte_object = True
     channels = render_passes(scene, tmp_path / "final.exr")
-    path = tmp_path / "scene.blend"
-    bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
+    path = parts.save(tmp_path / "scene.blend", copy=True)
     options = RenderOptions(path, output=tmp_path, techniques=("ltsh2",), sub_samples=1, cycles_samples=8)
     made = finish(options)
     np.testing.assert_allclose(picture(channels, "ViewLayer.Combined."), made.combined[..., :3], rtol=1e-4, atol=1e-5)
@@ -169,8 +167,7 @@ def test_final_render_is_the_picture_that_shade_makes(scene, tmp_path):
 def test_final_render_has_the_shadows_that_shade_makes(scene, tmp_path):
     scene.ltsh.shadows, scene.ltsh.shadow_rays = True, 16
     found = picture(render_passes(scene, tmp_path / "final.exr"), "ViewLayer.Combined.")
-    path = tmp_path / "scene.blend"
-    bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
+    path = parts.save(tmp_path / "scene.blend", copy=True)
     shade_scene(PictureOptions(path, tmp_path / "out", techniques=("ltsh2",), shadow_rays=16))
     channels = read_channels(tmp_path / "out" / "shade.exr")
     expected, bare = (

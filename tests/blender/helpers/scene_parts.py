@@ -32,9 +32,9 @@ def empty_scene(width: int = SIZE[0], height: int = SIZE[1]):
     return scene
 
 
-def save(path: Path) -> Path:
-    """Save the open file as `path`; the path."""
-    bpy.ops.wm.save_as_mainfile(filepath=str(path))
+def save(path: Path, copy: bool = False) -> Path:
+    """Save the open file as `path`, or a copy of it there; the path."""
+    bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=copy)
     return path
 
 

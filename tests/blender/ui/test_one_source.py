@@ -113,8 +113,7 @@ def test_without_a_light_none_is_to_be_clicked(scene):
 def test_files_are_saved_without_pictures(scene, tmp_path, show_results):
     show_results(scene, tmp_path)
     assert len(results.our_images(scene)) > 3
-    path = tmp_path / "copy.blend"
-    bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
+    path = parts.save(tmp_path / "copy.blend", copy=True)
     with bpy.data.libraries.load(str(path)) as (there, _):
         names = [name for name in there.images if name.startswith(results.PREFIX)]
     assert names == []

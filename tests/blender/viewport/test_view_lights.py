@@ -378,8 +378,7 @@ def lit_scene():
 def test_lights_of_every_kind_light_the_view_as_numpy_does(tmp_path):
     camera, ball = lit_scene()
     pictures = with_graphics(lambda: [viewport_picture(camera, name) for name in shading.PASSES])
-    path = tmp_path / "lights.blend"
-    bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
+    path = parts.save(tmp_path / "lights.blend", copy=True)
     found = extract_pixels(PixelJob(scene=path))
     distance = np.linalg.norm(found.samples.position - np.array(ball.location), axis=1)
     # Away from the edge of the ball and what is hidden behind it, where positions differ by more than a pixel.

@@ -162,6 +162,12 @@ def job_of(arguments, scenes: tuple[Path, ...]) -> BatchJob:
     cameras, frames = tuple(dict.fromkeys(arguments.cameras or ())), arguments.frames or ()
     if command == "bake" and arguments.apply and (len(cameras) > 1 or len(frames) > 1):
         raise Misuse("--apply makes materials show one texture: give one frame and one camera with it")
+    if command == "bake":
+        side, size = arguments.atlas, arguments.size
+        if (side is None or arguments.uv) and (arguments.texels_per_metre or arguments.unwrap != "smart"):
+            raise Misuse("--texels-per-metre and --unwrap are for the UV map of --atlas N: give it, without --uv")
+        if side is not None and size not in (BakeOptions.size, (side, side)):
+            raise Misuse("--atlas N is the size of the texture that all objects share: leave out --size")
     if command == "render" and arguments.budget is not None and arguments.cycles_samples is not None:
         raise Misuse("--budget chooses the samples of Cycles: give it or --cycles-samples, not both")
     options = options_from(kind, vars(arguments), scene=scenes[0])
@@ -462,10 +468,10 @@ def _complain(bar, what: str, lines) -> None:
 
 
 def _summary(merged: Merged, output) -> str:
-    from ..pipeline import bake, picture, render
+    from ..pipeline import bake_files, picture, render
 
     summary, brief = {
-        "bake": (bake.summary, bake.brief),
+        "bake": (bake_files.summary, bake_files.brief),
         "view": (picture.view_summary, render.brief),
         "render": (render.summary, render.brief),
     }.get(merged.command, (picture.summary, picture.brief))

@@ -22,12 +22,11 @@ from ..imaging import exr, grouped
 from ..imaging.denoise import DENOISER
 from ..imaging.exr import COMBINED, REST, layer_name
 from ..imaging.seams import SeamFit, TexelGrid, islands_of
-from ..reading import NUMBER, Malformed, check, file_name
+from ..reading import Malformed, check, file_name
 from ..scene import PASSES, REFERENCE, Cancelled, Film, Progress, SurfaceSamples, lights_of, listed
 from ..visibility import Occluders, ShadowSampling
 from ..workers.pool import cores
 from . import bake_files, lighting, lightmap
-from .comparison import percent
 from .lighting import check_named, prepare
 from .mixer import rows_of_groups
 from .options import BAKE_PASSES, TEXTURE_SIDES, BakeOptions, child_job
@@ -52,7 +51,7 @@ def bake_scene(options: BakeOptions, progress: Progress | None = None) -> dict:
     report = result.report
     if options.apply and report["objects"]:
         layer = bake_files.applied_layer(options)
-        report["applied"] = bake_files.apply_textures(options.scene, options.output, report["objects"], layer, progress)
+        report["applied"] = bake_files.apply_textures(options.scene, options.output, report, layer, progress)
     return write_reports(result, options.output)
 
 
@@ -80,7 +79,7 @@ def bake_objects(
         records, files, seconds = [], [], {"blender": manifest["seconds"]}
         with _shadow_tracer(options, manifest, folder) as tracer:
             for record, stem in zip(manifest["objects"], stems, strict=True):
-                if record["problem"] is None:
+                if record["folder"]:
                     (options.output / stem).parent.mkdir(parents=True, exist_ok=True)
                     baker = ObjectBaker(options, tables, manifest, record, folder / record["folder"], tracer)
                     baked = baker.bake(stem, [] if tile is None else [tile], finished, progress)
@@ -155,7 +154,7 @@ class ObjectBaker:
     def __init__(self, options, tables, manifest, record, folder, tracer=None):
         self.options, self.tables, self.manifest, self.record, self.folder = options, tables, manifest, record, folder
         self.lights, self.tracer = lights_of(manifest["lights"]), tracer
-        self.mesh = replace(TexelMesh.load(folder / "mesh.npz"), receiver=record["receiver"])
+        self.mesh = TexelMesh.load(folder / "mesh.npz")
         uv_maps = {name: folder / file for name, file in record["uv_maps"].items()}
         self.materials = [BakeMaterial.of(material, folder.parent, uv_maps) for material in record["materials"]]
         self.view = BakeView(**manifest["view"])
@@ -171,6 +170,8 @@ class ObjectBaker:
         """
         name, files, seconds = self.record["name"], [], {}
         result = {"name": name, "uv": self.record["uv"], "outside": 0.0, "tiles": {}}
+        if self.options.atlas is not None:
+            result |= {"members": self.record["members"], "atlas": self.record["atlas"]}
         for tile in tiles or self.tiles:
             file = f"{stem}{self._suffix(tile)}.exr"
             start = time.perf_counter()
@@ -216,6 +217,7 @@ class ObjectBaker:
         """Shade a tile block by block into `planes`; returns its counts of texels for the record."""
         options, covered, covers, overlaps, unshaded, unbaked, lit = self.options, 0, 0, 0, 0, 0, False
         is_unshaded = np.array([bool(reason) for reason in self.record["unshaded"]])
+        of_members = np.zeros(len(self.record["members"]), np.int64)
         rows, height = block_rows(options), options.size[1]
         points, spread = options.sub_samples, TilePoints(self, tile, self._threads())
         facts, seams = {}, None
@@ -238,6 +240,7 @@ class ObjectBaker:
                 overlaps += texels.overlaps
                 unbaked += texels.unbaked
                 unshaded += int(is_unshaded[self.mesh.material[texels.triangle]].sum())
+                of_members += np.bincount(self.mesh.object[texels.triangle], minlength=len(of_members))
                 names = (layer_name(name, pass_name) for name in self.tables for pass_name in options.passes)
                 lit = lit or any(planes_of[name].any() for name in names)
                 planes.put(first, min(rows, height - first), texels, _channels(planes_of))
@@ -249,6 +252,8 @@ class ObjectBaker:
             if progress is not None and progress(f"shade {self.record['name']}", share) is False:
                 raise Cancelled("the bake was stopped")
         counts = {"texels": covered, "covered_times": covers, "overlapping_texels": overlaps}
+        if options.atlas is not None:
+            counts["member_texels"] = dict(zip(self.record["members"], of_members.tolist(), strict=True))
         if seams is not None:
             planes.fit(seams)
         return {**counts, "unshaded_texels": unshaded, "unbaked_texels": unbaked, "is_lit": lit, **facts}
@@ -380,7 +385,8 @@ class TilePoints:
 
     def __init__(self, baker: ObjectBaker, tile: int, threads: int):
         options = baker.options
-        self._options, self._folder, self._tile, self._mapped = options, baker.folder, tile, baker.record["maps"]
+        self._options, self._folder, self._tile = options, baker.folder, tile
+        self._mapped = baker.record["maps"]
         self._width = baker.manifest["sampled_texels"]
         self._triangles = uv.UvTriangles.in_tile(baker.mesh.uv, *options.size, _column_and_row(tile))
         self._at_centers = bakes_centers_alone(options, baker.record)
@@ -400,10 +406,11 @@ class TilePoints:
         the point, 1 on average (None: all points count alike).
         """
         texels = self.texels(first)
+        count = self._options.sub_samples
         if not self._mapped:
-            return self._triangles.spread(texels, point, self._options.sub_samples, self._width), None, None
+            return self._triangles.spread(texels, point, count, self._width), None, None
         maps = np.load(self._file(first, point))
-        if self._options.sub_samples == 1:
+        if count == 1:
             return texels, maps, None
         positions = self._positions(texels, maps, first, point)
         return self._triangles.at(texels, positions), maps, self._weights_of(first).at(positions)
@@ -435,9 +442,11 @@ class TilePoints:
         if self.rest:
             baked = next(iter(self.rest.values()))[first : first + rows]
             return texels.baked(baked.reshape(-1, 3)[texels.index, 0] != np.float32(NOT_BAKED))
-        of_pass = f"cycles_{sorted(shaded_passes(self._options))[0]}_{self._tile}_{first}.npy"
-        baked = np.load(self._file(first, 0) if self._mapped else self._folder / of_pass, mmap_mode="r")
-        return texels.baked(baked[0].reshape(-1, 3)[texels.index, 0] != np.float32(NOT_BAKED))
+        path = self._file(first, 0)
+        if not self._mapped:
+            path = self._folder / f"cycles_{sorted(shaded_passes(self._options))[0]}_{self._tile}_{first}.npy"
+        baked = np.load(path, mmap_mode="r")[0].reshape(-1, 3)[texels.index, 0] != np.float32(NOT_BAKED)
+        return texels.baked(baked)
 
     def _file(self, first, point):
         return self._folder / f"maps_{self._tile}_{first}_{point}.npy"
@@ -506,15 +515,15 @@ def _first_samples(texel: np.ndarray) -> np.ndarray:
 
 
 def _report(options, manifest, records) -> dict:
-    problems = [record["problem"] for record in manifest["objects"] if record["problem"]]
+    problems = [line for record in manifest["objects"] for line in record["problems"]]
     lines = [line for record in manifest["objects"] for line in record["warnings"]]
     warnings = [*manifest["warnings"], *lines]
     if options.conservative:
         warnings += [
-            f"object {record['name']!r}: texels whose centers no face covers are left out, because Cycles bakes none "
+            f"{record['name']!r}: texels whose centers no face covers are left out, because Cycles bakes none "
             f"of them: leave out {'--error' if options.error else '--conservative, or bake its textures to images'}"
             for record in manifest["objects"]
-            if record["problem"] is None and bakes_centers_alone(options, record)
+            if record["folder"] and bakes_centers_alone(options, record)
         ]
     reasons = {record["name"]: record.get("unshaded", ()) for record in manifest["objects"]}
     for record in records:
@@ -530,6 +539,11 @@ def _report(options, manifest, records) -> dict:
             if share := 100 * tile["unbaked_texels"] / max(tile["texels"] + tile["unbaked_texels"], 1):
                 why = "because Cycles bakes nothing there: apply the modifiers"
                 warnings.append(f"{name}: {share:.3g} % of its texels are left out, {why}")
+            warnings += [
+                f"object {member!r} has no texel of the atlas: its islands are too small, or lie below others"
+                for member, texels in tile.get("member_texels", {}).items()
+                if not texels
+            ]
             if share := 100 * tile.get("dull_texels", 0) / max(tile["texels"], 1):
                 why = "have no diffuse color: the light that bounces there is reflected, which no lightmap holds"
                 warnings.append(f"{name}: {share:.3g} % of its texels {why}; bake the pass specular or combined")
@@ -575,25 +589,3 @@ REPORT = {
     **dict.fromkeys(("problems", "warnings"), [str]),
     "versions": dict,
 }
-
-
-def summary(report: dict, seconds: dict) -> list[str]:
-    """Lines of text about the bake of one scene, camera and frame: a line per file, and the errors if there are any."""
-    lines = []
-    for record in report["objects"]:
-        for tile in record["tiles"].values():
-            took = seconds.get(tile["file"])
-            seconds_text = f"{took:>8.2f} s" if isinstance(took, NUMBER) else ""
-            lines.append(f"{tile['file']:<40}{tile['texels']:>10} texels{seconds_text}")
-            for pass_name, figures in tile.get("errors", {}).items():
-                for name, error in figures["techniques"].items():
-                    in_noise = (error.get("unbiased_squared_error") or 0.0) < 0.0
-                    beside = "in noise" if in_noise else percent(error.get("unbiased_error"))
-                    noise = f"(noise {percent(figures.get('noise'))})"
-                    lines.append(f"  {name + '.' + pass_name:<30}{beside:>10} beside Cycles {noise}")
-    return lines
-
-
-def brief(report: dict) -> list[str]:
-    """The lines of `summary` without times, under the name of the bake, for one of several."""
-    return [f"{report['name']}:", *(f"  {line}" for line in summary(report, {}))]

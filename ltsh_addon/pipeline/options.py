@@ -78,12 +78,20 @@ def one_table(text: str) -> tuple[str, ...]:
     return (table(text),)
 
 
-def seconds(text: str) -> float:
-    """Seconds of a budget."""
-    value = real_number(text)
-    if not 0.0 < value < 1e9:
-        raise ValueError(f"budget is {text!r}, expected seconds of processor time, more than 0")
-    return value
+def amount(what: str, expected: str) -> Callable[[str], float]:
+    """The parser of numbers above 0; errors begin with `what`, such as "budget is"."""
+
+    def parse(text: str) -> float:
+        value = real_number(text)
+        if not 0.0 < value < 1e9:
+            raise ValueError(f"{what} {text!r}, expected {expected}, more than 0")
+        return value
+
+    return parse
+
+
+seconds = amount("budget is", "seconds of processor time")
+texels_per_metre = amount("texels per metre are", "a number")
 
 
 def passes(known: tuple[str, ...]) -> Callable[[str], tuple[str, ...]]:
@@ -169,6 +177,9 @@ def whole_number(what: str, least: int, most: int) -> Callable[[str], int]:
 refinements = whole_number("refine is", 1, MOST_REFINEMENTS)  # number of pictures whose mean is a view
 shadow_rays = whole_number("shadow rays are", *SHADOW_RAYS)  # number of rays per light and point
 margin = whole_number("margin is", 0, MOST_MARGIN)  # width of the margin around islands in texels
+
+
+atlas = whole_number("atlas is", *TEXTURE_SIDES)  # texels on each side of the texture that all objects share
 
 
 def cycles_samples(text: str) -> int:
@@ -406,6 +417,20 @@ class BakeOptions(TaskOptions):
     size: tuple[int, int] = option(
         "--size", default=(1024, 1024), type=size, metavar="N", help="N or WxH in texels (default: 1024)"
     )
+    atlas: int | None = option(
+        "--atlas", default=None, type=atlas, metavar="N",
+        help="one texture of N x N texels for all objects, on a UV map Lightmap that is made for it, or on --uv",
+    )  # fmt: skip
+    texels_per_metre: float | None = option(
+        "--texels-per-metre",
+        default=None,
+        type=texels_per_metre,
+        metavar="D",
+        help="of the atlas (default: all that fit)",
+    )
+    unwrap: str = option(
+        "--unwrap", default="smart", choices=("smart", "faces"), help="atlas: by direction, or each face"
+    )
     sub_samples: int = option(
         "--aa", default=1, type=positive, metavar="N", help="points per texel, spread as in Cycles' bake; 1: centers"
     )
@@ -425,6 +450,10 @@ class BakeOptions(TaskOptions):
     per_light: bool = flag("--per-light", "a layer for each light, with its bounced light, so that powers can change")
     apply: bool = flag("--apply", "also a texture of each object, and a copy of the .blend whose materials show it")
     resume: bool = option(default=False, matters=False)  # keep what the same job has finished
+
+    def __post_init__(self):
+        if self.atlas is not None:
+            object.__setattr__(self, "size", (self.atlas, self.atlas))
 
 
 @dataclass(frozen=True)
@@ -534,7 +563,10 @@ def _text(name, value) -> str:
 def what_matters(options: Any) -> dict[str, Any]:
     """The options on which the result depends."""
     values = asdict(options)
-    return {item.name: values[item.name] for item in fields(options) if item.metadata["matters"]}
+    matters = {item.name for item in fields(options) if item.metadata["matters"]}
+    if values.get("atlas") is not None:
+        matters.add("objects")
+    return {name: value for name, value in values.items() if name in matters}
 
 
 def child_job(kind: type, options: Any, **settings) -> Any:

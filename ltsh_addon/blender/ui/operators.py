@@ -16,6 +16,7 @@ from bpy.props import EnumProperty, StringProperty
 
 from ...files import replacing
 from ...imaging.exr import write_channels
+from ...pipeline.bake_files import bake_members
 from ...scene import SceneError, error_line, listed
 from ..extract.apply import restore_materials, show_texture, shows_texture
 from ..process.bake import BakedTextures
@@ -390,16 +391,18 @@ class LTSH_OT_apply_bake(bpy.types.Operator):
     def execute(self, context):
         result, gone, shown = last_bake(context.scene), [], []
         for record in result.report["objects"]:
-            ob = context.scene.objects.get(record["name"])
-            if ob is None:
-                gone.append(record["name"])
+            names = bake_members(record)
+            gone += [name for name in names if name not in context.scene.objects]
+            objects = [context.scene.objects[name] for name in names if name in context.scene.objects]
+            if not objects:
                 continue
             try:
-                show_texture(ob, baked_texture(context.scene, result, record))
+                show_texture(objects, baked_texture(context.scene, result, record))
             except (OSError, RuntimeError, KeyError, ValueError) as error:
-                self.report({"ERROR"}, f"Object {ob.name!r} cannot show its texture ({error_line(error)}): bake again")
+                name = objects[0].name
+                self.report({"ERROR"}, f"Object {name!r} cannot show its texture ({error_line(error)}): bake again")
                 continue
-            shown.append(ob.name)
+            shown += [ob.name for ob in objects]
         if gone:
             self.report({"WARNING"}, f"Not in the scene any more: {listed(map(repr, gone))}")
         if not shown:
@@ -460,7 +463,7 @@ def baked_texture(scene, result, record: dict) -> BakedTextures:
         else:
             write_channels(path, {letter: mixture[..., number] for number, letter in enumerate("RGB")})
         files.append({"path": str(path), "tile": int(number)})
-    return BakedTextures(record["name"], record["uv"], f"{record['name']} {layer}", files)
+    return BakedTextures(bake_members(record), record["uv"], f"{record['name']} {layer}", files)
 
 
 class LTSH_OT_manual(bpy.types.Operator):

@@ -123,14 +123,14 @@ class SplineCells:
     """Points of the fit, P = POINTS^2, with the methods of `projection.Cells`."""
 
     def __init__(self, model, lowest_cosine, curves):
-        from scipy import sparse
+        from scipy.sparse import csr_matrix, kron
 
         from .projection import batches, directional_albedo
 
         positions = (np.arange(POINTS) + 0.5) / POINTS
-        axis = sparse.csr_matrix(matrix(positions))
-        self._matrix = sparse.csr_matrix(sparse.kron(axis, axis))
-        self._transposed = sparse.csr_matrix(self._matrix.T)
+        axis = csr_matrix(matrix(positions))
+        self._matrix = csr_matrix(kron(axis, axis))
+        self._transposed = csr_matrix(self._matrix.T)
         self._squared = self._transposed.power(2)
         grids = np.meshgrid(positions, lookup_table.theta_at(positions), indexing="ij")
         self.shape, (self.roughness, theta) = (SIZE, SIZE), (grid.ravel() for grid in grids)

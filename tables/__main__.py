@@ -333,10 +333,8 @@ def _grazing(options) -> int:
 
 
 def _plot(options) -> int:
-    from . import plots
-
     options.output.mkdir(parents=True, exist_ok=True)
-    for path in plots.draw_all(options.output, lambda text: print(text, file=sys.stderr, flush=True)):
+    for path in optimum.draw_all(options.output, lambda text: print(text, file=sys.stderr, flush=True)):
         print(path)
     return 0
 

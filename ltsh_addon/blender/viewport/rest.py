@@ -152,7 +152,7 @@ class _RestProgress:
             missing = next(count for count in TOTALS if count > self.samples) - self.samples
             return replace(self, samples=self.samples + min(missing, int(most)))
         rows = self.rows + 1.0 / math.ceil(1.0 / most)
-        return replace(self, rows=rows) if rows < 0.999 else replace(self, samples=self.samples + 1, rows=0.0)
+        return replace(self, rows=rows) if rows < 0.99 else replace(self, samples=self.samples + 1, rows=0.0)
 
     @property
     def is_shown(self) -> bool:
@@ -240,7 +240,7 @@ class LiveRest:
             hidden = tuple(ob.name for ob in objects if not ob.original.local_view_get(space))
         matrices = tuple(tuple(map(tuple, one)) for one in (view.view_matrix, view.window_matrix))
         names, version = (depsgraph.scene.name, depsgraph.view_layer.name), (self._version, self._surfaces)
-        size = region.width, region.height
+        size = max(region.width, 1), max(region.height, 1)
         wanted = RestView(*names, version, depsgraph.scene.frame_current, hidden, world, matrices, size)
         if wanted != self._wanted:
             self._wanted, self._changed = wanted, time.monotonic()
@@ -441,10 +441,10 @@ def render_rest(job: RestJob, folder: Path, progress) -> dict:
         _look_through(scene, *map(Matrix, view.matrices), size)
     render, (width, height) = scene.render, render_settings.picture_size(scene)
     first, last = (round(share * height) for share in job.rows)
-    last = max(last, first + 1)
     render.use_border = render.use_crop_to_border = last - first < height
     render.border_min_x, render.border_max_x = 0.0, 1.0
-    render.border_min_y, render.border_max_y = 1.0 - last / height, 1.0 - first / height
+    # Blender rounds down.
+    render.border_min_y, render.border_max_y = ((height - row + 0.5) / height for row in (last, first))
     scene.cycles.samples, scene.cycles.seed = job.samples, job.seed
     progress("bounces", 0.0)
     started = time.monotonic()

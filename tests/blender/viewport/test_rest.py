@@ -4,6 +4,7 @@ changes."""
 import json
 import time
 from dataclasses import asdict
+from itertools import pairwise
 from types import SimpleNamespace
 
 import bpy
@@ -206,15 +207,18 @@ def test_rows_that_are_rendered_apart_are_those_of_the_whole_picture(tmp_path):
     path, sums = parts.save(tmp_path / "room.blend"), []
     context = context_of(camera)
     matrices = tuple(tuple(map(tuple, getattr(context.region_data, name))) for name in ("view_matrix", "window_matrix"))
-    for bands in (((0.0, 1.0),), ((0.0, 0.3), (0.3, 0.9), (0.9, 1.0))):
+    for shares in ((0.0, 1.0), (0.0, 0.3, 0.9, 1.0), (0.0, 0.1, 0.17, 0.4, 0.55, 0.68, 0.71, 1.0)):
+        bands = [*pairwise(shares)]
         for number, rows in enumerate(bands):
             view = asdict(RestView(matrices=matrices, size=SIZE))
             job = RestJob(None if sums or number else path, view, 2, rows=rows, continues=number > 0)
             rest.render_rest(job, tmp_path, lambda *stage: None)
         sums.append(rest._sum[0])
-    assert [one.samples for one in sums] == [2, 2]
+    assert [one.samples for one in sums] == [2, 2, 2]
     for name in ("light", "guides"):
-        np.testing.assert_array_equal(*(getattr(one, name) for one in sums))
+        whole, *others = (getattr(one, name) for one in sums)
+        for other in others:
+            np.testing.assert_array_equal(other, whole)
 
 
 @edits_with_graphics

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import blf
 import bpy
 from hands import close_window, module, narrow, operate, over, results_opened, select, settings
 
@@ -93,12 +94,16 @@ def quiet_line_is_clear(rig, where):
     view, region = module("engine.overlay"), rig.region()
     sides = view.covered(rig.area("VIEW_3D"), region)
     place = view._quiet_lines.get(region.as_pointer())
-    if not view._texts[region.as_pointer()].quiet.text:
-        rig.fact(f"quiet line {where}", "nothing is left out, and no bounces are coming")
-        return
+    words = view._texts[region.as_pointer()].quiet.text.split()
     rig.fact(f"quiet line {where}: left and right, px", place and (round(place[0]), round(place[2])))
     left, right = max(sides["LEFT"], sides["FLOAT"]), region.width - sides["RIGHT"]
     rig.fact(f"room for it {where}, px", (left, right))
+    scale = bpy.context.preferences.system.ui_scale
+    blf.size(0, view.TEXT_SIZE * scale)
+    widest = max((blf.dimensions(0, word)[0] for word in words), default=0.0)
+    if not words or widest > right - left - 2.0 * view.MARGIN * scale:
+        rig.check(place is None, f"nothing is left out {where}, or a word has no room: there is no quiet line")
+        return
     rig.check(place is not None and left <= place[0] and place[2] <= right, f"the quiet line is clear {where}")
 
 

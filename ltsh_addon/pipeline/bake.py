@@ -9,7 +9,7 @@ import shutil
 import time
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import nullcontext
 from dataclasses import asdict, replace
 from pathlib import PurePosixPath
 
@@ -77,11 +77,11 @@ def bake_objects(
         names = [record["name"] for record in manifest["objects"]]
         stems = file_stems(names) if options.name is None else [options.name]
         records, files, seconds = [], [], {"blender": manifest["seconds"]}
-        with _shadow_tracers(options, manifest, folder) as tracers:
+        with _shadow_tracer(options, manifest, folder) as tracer:
             for record, stem in zip(manifest["objects"], stems, strict=True):
                 if record["folder"]:
                     (options.output / stem).parent.mkdir(parents=True, exist_ok=True)
-                    baker = ObjectBaker(options, tables, manifest, record, folder / record["folder"], tracers)
+                    baker = ObjectBaker(options, tables, manifest, record, folder / record["folder"], tracer)
                     baked = baker.bake(stem, [] if tile is None else [tile], finished, progress)
                     records.append(baked.report)
                     files += baked.files
@@ -92,16 +92,12 @@ def bake_objects(
     return TaskResult(document, seconds, tuple(files))
 
 
-@contextmanager
-def _shadow_tracers(options, manifest, folder):
-    """A context with the ShadowTracers of the `lightmap.crisp_and_soft` lights; None where there are none to trace."""
-    with ExitStack() as stack:
-        occluders, tracers = manifest["occluders"], [None, None]
-        for number, lights in enumerate(lightmap.crisp_and_soft(lights_of(manifest["lights"]), options)):
-            if occluders is not None and lights:
-                loaded = Occluders.load(folder / occluders)
-                tracers[number] = stack.enter_context(lighting.ShadowTracer(loaded, lights))
-        yield tracers
+def _shadow_tracer(options, manifest, folder):
+    """A context with the ShadowTracer; it gives None where shadows are off."""
+    if manifest["occluders"] is None:
+        return nullcontext()
+    lights = lightmap.crisp_and_soft(lights_of(manifest["lights"]), options)[0]
+    return lighting.ShadowTracer(Occluders.load(folder / manifest["occluders"]), lights)
 
 
 def _check(options: BakeOptions) -> None:
@@ -155,11 +151,11 @@ def shaded_passes(options) -> set[str]:
 class ObjectBaker:
     """Bakes the tiles of one object, the `record` of the `manifest`, in blocks of rows from the bottom."""
 
-    def __init__(self, options, tables, manifest, record, folder, tracers=(None, None)):
+    def __init__(self, options, tables, manifest, record, folder, tracer=None):
         self.options, self.tables, self.manifest, self.record, self.folder = options, tables, manifest, record, folder
         lights = lights_of(manifest["lights"])
         self.lights, self.soft_lights = lightmap.crisp_and_soft(lights, options)
-        self.tracer, self.soft_tracer = tracers
+        self.tracer = tracer
         self.mesh = TexelMesh.load(folder / "mesh.npz")
         uv_maps = {name: folder / file for name, file in record["uv_maps"].items()}
         self.materials = [BakeMaterial.of(material, folder.parent, uv_maps) for material in record["materials"]]
@@ -270,35 +266,18 @@ class ObjectBaker:
         triangle, guides = np.full(height * width, -1), np.zeros((height * width, 6), np.float32)
         if progress is not None and progress(f"denoise {self.record['name']}", 0.0) is False:
             raise Cancelled("the bake was stopped")
-        soft = np.zeros((height * width, 3), np.float32)
         for first in range(0, height, block_rows(self.options)):
             texels, maps, _ = spread.at(first, 0)
             at, read_map = texels.index + first * width, _map_reader(maps, texels)
             triangle[at] = texels.triangle
             guides[at] = texel_guides(self.mesh, self.materials, texels, read_map)
-            if self.soft_lights:
-                soft[at] = self._soft_light(texels, read_map, first)
         shape = height, width
         grid = TexelGrid.of(triangle.reshape(shape), spread.corners, self.mesh)
         guides = guides.reshape(*shape, 6)
         islands = islands_of(grid)
-        if self.soft_lights:
-            spread.rest[lightmap.SOFT, 0] = soft.reshape(*shape, 3)
         spread.rest, denoiser = lightmap.denoised_rest(spread.rest, guides, islands, self.options.rest_samples)
         dull = (guides[..., :3].max(axis=-1) <= lightmap.DULL) & (grid.triangle >= 0)
         return {"denoiser": denoiser, "dull_texels": int(np.count_nonzero(dull))}, SeamFit(islands)
-
-    def _soft_light(self, texels, read_map, first) -> np.ndarray:
-        """Direct light (Q, 3) of the soft lights on the texels of the block from row `first` on, without color."""
-        samples, texel = texel_samples(self.mesh, self.materials, texels, read_map, self.view, self.soft_lights)
-        at = _first_samples(texel)
-        white, shadows = replace(samples.take(at), diffuse_albedo=np.ones((len(at), 3))), None
-        if self.soft_tracer is not None:
-            sampling = self._sampling(("diffuse",), first, texels.index[texel[at]], 1)
-            shadows = self.soft_tracer.trace(white, replace(sampling, rays=lightmap.SOFT_RAYS))
-        table, rows = next(iter(self.tables.values())), [0] * len(self.soft_lights)
-        (lit,) = lighting.shade_lights(white, self.soft_lights, table, ("diffuse",), (shadows,), rows=rows)
-        return lit.diffuse[0]
 
     def _sampling(self, passes, first, texel, points) -> ShadowSampling:
         """How to find the shadows of samples of a block, of the texels `texel` (S,), with so many points each."""
@@ -421,7 +400,8 @@ class TilePoints:
         self.rest, self._baked, size = {}, None, options.size
         if options.bounces == "on":
             rows = range(len(baker.groups) if options.per_light else 1)
-            keys = itertools.product(lightmap.rest_passes(options.passes), rows)
+            keys = [*itertools.product(lightmap.rest_passes(options.passes), rows)]
+            keys += [(lightmap.SOFT, 0)] if baker.soft_lights else []
             self.rest = {key: lightmap.read_rest(baker.folder, key, tile, size) for key in keys}
             self._baked = next(iter(self.rest.values()))[..., 0] != np.float32(NOT_BAKED)
         # The points of a block are shaded one after another, so few blocks need to be cached.

@@ -23,17 +23,16 @@ REST_TEXELS = 1 << 22
 DULL = 1e-3
 
 
-# SOFT: the kind of direct light that is denoised, beside the kinds of bounced light. SOFT_RAYS: its shadow rays. Of the
-# sky through a window 256 give 12 % too much, since more of them go where some have met it; so many give 3 %.
-SOFT, SOFT_RAYS = "soft", 1024
+SOFT = "soft"  # the kind of direct light that is denoised, beside the kinds of bounced light
 
 
 def crisp_and_soft(lights: tuple[Light, ...], options: BakeOptions) -> tuple[list[Light], list[Light]]:
-    """The lights that a bake shades as they are, and those whose diffuse light it denoises: with bounces the sky.
+    """The lights that a bake shades as they are, and those whose diffuse light Cycles bakes with the bounces: the sky.
 
-    Through a window few rays meet the sky: even 256 leave noise of 4 % of all light. Its shadows are seldom crisp.
+    Through a window few rays meet it, of ours as of Cycles' samples, and its shadows are seldom crisp.
     """
-    soft = [light for light in lights if options.bounces == "on" and light.is_side and light.affects_diffuse]
+    is_soft = options.bounces == "on" and "diffuse" in rest_passes(options.passes)
+    soft = [light for light in lights if is_soft and light.is_side and light.affects_diffuse]
     names = {light.name for light in soft}
     return [replace(one, affects_diffuse=False) if one.name in names and one.is_side else one for one in lights], soft
 
@@ -88,7 +87,7 @@ def denoised_rest(
     images = {}
     for key, light in rest.items():
         is_lit = (light[..., 0] != np.float32(NOT_BAKED)) & is_covered
-        if key[0] == "diffuse":
+        if key[0] != "specular":
             is_lit &= guides[..., :3].max(axis=-1) > DULL
         images[key] = np.where(is_lit[..., None], light, 0.0), is_lit
     try:

@@ -320,9 +320,7 @@ def test_edges_go_with_the_light_that_makes_them(out, tmp_path):
     scene = floor_and_ball(bsdf("BsdfDiffuse"))
     bpy.data.objects.remove(scene.objects["Light"])
     for name, angle, energy in (("Sun", 0.6, 4.0), ("Moon", -0.4, 0.5)):
-        data = bpy.data.lights.new(name, "SUN")
-        data.energy, data.angle = energy, 0.01
-        parts.link(bpy.data.objects.new(name, data), rotation=(angle, angle, 0.0))
+        parts.link(parts.new_light(name, "SUN", energy=energy, angle=0.01), rotation=(angle, angle, 0.0))
     scene.cycles.max_bounces = 0
     options = {"sub_samples": 5, "cycles_samples": 64}
     path = parts.save(tmp_path / "room.blend")
@@ -446,10 +444,8 @@ def test_highlights_thinner_than_pixels_are_told_from_those_that_points_show(tmp
         x, y = (grid.ravel() for grid in np.meshgrid(side, side))
         z = height * np.random.default_rng(2).random(len(x))
         corner = (np.arange(99)[:, None] * 100 + np.arange(99)).ravel()
-        mesh = bpy.data.meshes.new(name)
-        mesh.from_pydata(np.stack([x, y, z], axis=1), [], corner[:, None] + np.array([0, 1, 101, 100]))
-        mesh.materials.append(parts.principled(Metallic=1.0, Roughness=0.1)[0])
-        bpy.context.scene.collection.objects.link(bpy.data.objects.new(name, mesh))
+        floor = parts.add_mesh(name, np.stack([x, y, z], axis=1), corner[:, None] + np.array([0, 1, 101, 100]))
+        floor.data.materials.append(parts.principled(Metallic=1.0, Roughness=0.1)[0])
         parts.add_camera((0.0, 0.0, 4.0), (0.0, 0.0, 0.0))
         parts.add_area_light(location=(0.5, 0.0, 3.0), size=0.2)
         path = parts.save(tmp_path / f"{name}.blend")

@@ -21,7 +21,7 @@ import random_surfaces
 import scene_parts as parts
 from fake_scene import run
 from graphics_card import edits_with_graphics, with_graphics
-from lit_plane import light_tree
+from lit_plane import into_collection, light_tree
 from view_pictures import OpenView, textured
 
 from ltsh_addon import imaging
@@ -128,9 +128,8 @@ def test_a_view_shows_lamps_of_files_as_pictures_do(capsys, tmp_path):
     parts.empty_scene(*SIZE)
     parts.add_plane(parts.principled("Floor", Roughness=0.3)[0], size=6.0)
     for kind, x in (("POINT", -1.2), ("SPOT", 1.2)):
-        data = bpy.data.lights.new(kind, kind)
-        data.energy, data.shadow_soft_size = 80.0, 0.1
-        light = parts.link(bpy.data.objects.new(kind, data), (x, 0.0, 1.6), (0.3, 0.2, 0.0))
+        light = parts.new_light(kind, kind, energy=80.0, shadow_soft_size=0.1)
+        parts.link(light, (x, 0.0, 1.6), (0.3, 0.2, 0.0))
         tree, emission = light_tree(light)
         node = tree.nodes.new("ShaderNodeTexIES")
         node.mode, node.ies = "INTERNAL", bpy.data.texts.new(kind)
@@ -545,10 +544,7 @@ def test_what_a_view_leaves_out_is_named_and_hides_nothing(capsys, tmp_path):
     set_up_scene()
     wall = parts.add_plane(None, 4.0, "Wall", location=(0.0, -1.0, 1.0), rotation=(1.4, 0.0, 0.0))
     wall.visible_shadow = wall.visible_diffuse = wall.visible_glossy = False
-    hidden = bpy.data.collections.new("Indirect")
-    bpy.context.scene.collection.children.link(hidden)
-    hidden.objects.link(wall)
-    bpy.context.scene.collection.objects.unlink(wall)
+    bpy.context.scene.collection.children.link(into_collection("Indirect", wall))
     bpy.context.view_layer.layer_collection.children["Indirect"].indirect_only = True
     path = parts.save(tmp_path / "without.blend")
     parts.link(bpy.data.objects.new("Hair", parts.hair_curves(3)))

@@ -37,6 +37,7 @@ JOB = {
     "command": ("shade", "compare", "bake", "view", "render"),
     **dict.fromkeys(("single", "any_key"), bool),
     "applied_layer": str | None,
+    "exported_layers?": {str: [str]},
     "tasks": some([_TASK]),
 }
 

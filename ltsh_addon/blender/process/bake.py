@@ -71,6 +71,26 @@ class ApplyJob:
     atlas: dict | None = None  # arguments of `extract.atlas.make_atlas`, the "objects" by name
 
 
+@dataclass(frozen=True)
+class ExportJob:
+    """Export objects of `scene` as the .glb `path`."""
+
+    scene: Path
+    path: Path
+    uv_names: dict[str, str]  # the UV map of each object, by its name
+    frame: int | None = None
+    atlas: dict | None = None  # as in `ApplyJob`
+
+
+def export_objects(job: ExportJob, *, progress: Progress | None = None) -> dict[str, int]:
+    """Export objects with all modifiers applied; returns the number of the UV map of each in glTF, by its name.
+
+    Raises as `pixels.extract_pixels` does.
+    """
+    with temporary_folder() as folder:
+        return run_job(job, folder, progress)["coordinates"]
+
+
 def apply_bake(job: ApplyJob, *, progress: Progress | None = None) -> list[str]:
     """Save a copy of the scene as job.path, in which objects show baked textures; returns warnings.
 

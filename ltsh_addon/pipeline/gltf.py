@@ -9,6 +9,7 @@ import json
 import math
 import struct
 from copy import deepcopy
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,8 +29,9 @@ _LINEAR, _REPEAT = 9729, 10497  # glTF's numbers of GL_LINEAR and GL_REPEAT
 def exported_layers(options) -> dict[str, list[str]]:
     """The layers whose sum a .glb takes, by what it is: "lightmap", "unlit"; an empty list where none is baked."""
     name = next(iter(technique_names(options.techniques)))
-    layers = [layer for layer in applied_layers(options) if not layer.endswith(LIGHT)]
-    return {"lightmap": [layer_name(name, LIGHT)] if LIGHT in options.passes else [], "unlit": layers}
+    others = tuple(kind for kind in options.passes if kind != LIGHT)
+    colors = applied_layers(replace(options, passes=others)) if others else []
+    return {"lightmap": [layer_name(name, LIGHT)] if LIGHT in options.passes else [], "unlit": colors}
 
 
 def export_glb(scene: Path, output: Path, report: dict, layers: dict[str, list[str]], progress=None) -> list[str]:
@@ -80,7 +82,7 @@ def read_glb(glb: bytes) -> tuple[dict, bytes]:
 def write_glb(document: dict, data: bytes) -> bytes:
     """The bytes of a .glb."""
     document["buffers"] = [{"byteLength": len(data)}]
-    text = json.dumps(document, separators=(",", ":")).encode()
+    text = json.dumps(document).encode()
     chunks = [(b"JSON", text + b" " * (-len(text) % 4)), (b"BIN\0", data + b"\0" * (-len(data) % 4))]
     body = b"".join(_CHUNK.pack(len(chunk), kind) + chunk for kind, chunk in chunks)
     return _HEADER.pack(b"glTF", 2, _HEADER.size + len(body)) + body

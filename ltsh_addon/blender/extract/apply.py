@@ -16,8 +16,8 @@ from .atlas import make_atlas
 from .bake_meshes import apply_modifiers, uv_of
 from .pixels import open_scene
 
-# EXPORT: what glTF takes: meshes and materials at one frame.
-EXPORT = {"export_apply": True, "export_animations": False, "export_cameras": False, "export_lights": False}
+# EXPORT: what glTF takes: the selected meshes and their materials at one frame.
+EXPORT = {"export_format": "GLB", "use_selection": True, "export_animations": False, "export_cameras": False}
 GROUP_PREFIX = "LTSH Bake"
 # Custom properties of a material that shows a texture. FORMER: the material that it replaces (0: none). FORMER_LINK:
 # the link setting that the slot had.
@@ -76,7 +76,8 @@ def export_objects(job: ExportJob, folder: Path, progress) -> dict:
             layers.new(name=job.uv_names[ob.name], do_init=False).uv.foreach_set("vector", uv.ravel())
         coordinates[ob.name] = layers.keys().index(job.uv_names[ob.name])
     progress("export", 0.0)
-    bpy.ops.export_scene.gltf(filepath=str(job.path), export_format="GLB", use_selection=True, **EXPORT)
+    export_scene = bpy.ops.export_scene
+    export_scene.gltf(filepath=str(job.path), **EXPORT)
     return {"coordinates": coordinates}
 
 

@@ -136,7 +136,7 @@ def draw_view(options: ViewOptions, progress: Progress | None = None) -> TaskRes
             of_camera = view.RestView(frame=options.frame, size=(width, height))
             rest_job = child_job(view.RestJob, options, view=of_camera, samples=options.rest_samples)
             rest = view.render_rest(rest_job, folder, progress=progress)
-            job = replace(job, rest=folder / view.REST_PICTURE, is_everything=bool(rest["everything"]))
+            job = replace(job, rest=folder / view.REST_PICTURE, is_everything=rest["is_everything"])
             problems, rest_seconds = [rest["problem"]] * bool(rest["problem"]), time.perf_counter() - start
         manifest = view.draw_view(job, folder, progress=progress)
         manifest["warnings"] += problems

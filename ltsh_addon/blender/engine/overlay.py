@@ -241,11 +241,6 @@ class LTSH_GGT_left_out(bpy.types.GizmoGroup):
 REACH = 8.0  # pixels of an unscaled interface
 
 
-def is_split(context) -> bool:
-    """True in 3D views that show a split picture of the engine."""
-    return is_drawn(context) and context.scene.ltsh_view.mode == "split"
-
-
 class LTSH_GT_split(bpy.types.Gizmo):
     """A vertical line that moves sideways."""
 
@@ -285,7 +280,7 @@ class LTSH_GGT_split(bpy.types.GizmoGroup):
 
     @classmethod
     def poll(cls, context):
-        return is_split(context)
+        return is_drawn(context) and context.scene.ltsh_view.mode == "split"
 
     def setup(self, context):
         self.line = self.gizmos.new(LTSH_GT_split.bl_idname)

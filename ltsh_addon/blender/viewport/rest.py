@@ -170,6 +170,7 @@ class _RestStep:
     seconds: float = 0.0  # that Cycles took
     picture: _RestPicture | None = None
     error: str = ""
+    thread: threading.Thread | None = None
 
     def do(self, process: BlenderProcess, folder: Path) -> None:
         """Do the job, in a thread of its own."""
@@ -177,9 +178,9 @@ class _RestStep:
             job, after = self.job, self.after
             self.seconds = process.do(job, folder, None)["seconds"]
             if after.is_shown and self.wanted == job.view:
-                manifest = process.do(RestPictureJob(), folder, None)
-                facts = bool(manifest["everything"]), tuple(manifest["ambient"]), manifest["problem"]
-                self.picture = _RestPicture(job.view, np.load(folder / REST_PICTURE), *facts)
+                facts = process.do(RestPictureJob(), folder, None)
+                facts = {name: facts[name] for name in ("is_everything", "ambient", "problem")}
+                self.picture = _RestPicture(job.view, np.load(folder / REST_PICTURE), **facts)
         except Exception as error:
             self.error = f"Bounces: {error_line(error)}"
 
@@ -191,7 +192,7 @@ class _RestPicture:
     view: RestView
     pixels: np.ndarray  # (H, W, 4), row 0 on top
     is_everything: bool
-    ambient: tuple[float, ...]
+    ambient: list[float]
     problem: str
     shown: ShownRest | None = None  # on the graphics card
     light: tuple | None = None  # the mean of the direct light that belongs to it, and what it depends on
@@ -200,7 +201,7 @@ class _RestPicture:
         """The picture on the graphics card; needs an active GPU context."""
         if self.shown is None:
             camera = ViewCamera.of(*map(Matrix, self.view.matrices), self.view.matrices[1][3][3] == 1.0)
-            self.shown = ShownRest(float_texture(self.pixels[::-1]), camera, self.is_everything, self.ambient)
+            self.shown = ShownRest(float_texture(self.pixels[::-1]), camera, self.is_everything, tuple(self.ambient))
         return self.shown
 
 
@@ -211,8 +212,7 @@ class LiveRest:
         self._stack: ExitStack | None = None
         self._wanted: RestView | None = None
         self._changed = 0.0
-        self._thread: threading.Thread | None = None
-        self._step: _RestStep | None = None
+        self._step: _RestStep | None = None  # the one on its way
         self._progress = _RestProgress()
         self._opened: tuple | None = None  # the scene that the second Blender has
         self._changes = RestChanges()  # since then
@@ -258,12 +258,10 @@ class LiveRest:
 
     def shown(self) -> ShownRest | None:
         """The last picture; needs an active GPU context. After changes of lights alone it follows the direct light."""
-        picture = self._picture
-        if picture is None:
-            return None
-        has_old_light = self._wanted.version != picture.view.version and picture.light is not None
-        is_same = has_old_light and picture.light[0] == self._light_key
-        return replace(picture.upload(), light=picture.light[1]) if is_same else picture.upload()
+        picture, shown = self._picture, None if self._picture is None else self._picture.upload()
+        if shown is None or picture.light is None or self._wanted.version == picture.view.version:
+            return shown
+        return replace(shown, light=picture.light[1]) if picture.light[0] == self._light_key else shown
 
     @property
     def _light_key(self) -> tuple:
@@ -273,9 +271,8 @@ class LiveRest:
     def keep_light(self, mean: Callable[[], np.ndarray]) -> None:
         """Keep the mean (3,) of the direct light that belongs to the picture that is shown."""
         picture = self._picture
-        if picture is None or picture.view.version != self._wanted.version:
-            return
-        if picture.light is None or picture.light[0] != self._light_key:
+        is_current = picture is not None and picture.view.version == self._wanted.version
+        if is_current and (picture.light is None or picture.light[0] != self._light_key):
             picture.light = self._light_key, mean()
 
     @property
@@ -287,7 +284,7 @@ class LiveRest:
     def is_busy(self) -> bool:
         """True while a better picture is to come."""
         is_short = self._wanted is not None and self._samples < TOTALS[-1]
-        return self._thread is not None or (is_short and not self.problem)
+        return self._step is not None or (is_short and not self.problem)
 
     @property
     def is_urgent(self) -> bool:
@@ -297,8 +294,7 @@ class LiveRest:
     @property
     def is_new(self) -> bool:
         """True while the first picture of this view is to come."""
-        has_one = self._wanted is None or (self._picture is not None and self._picture.view == self._wanted)
-        return self.is_busy and not has_one
+        return self.is_busy and self._wanted not in (None, self._picture and self._picture.view)
 
     @property
     def _samples(self) -> int:
@@ -314,8 +310,8 @@ class LiveRest:
     def step(self) -> bool:
         """Do the next step, in the main thread; True if there is a new picture."""
         news = False
-        if self._thread is not None:
-            if self._thread.is_alive():
+        if self._step is not None:
+            if self._step.thread.is_alive():
                 return False
             news = self._finish()
         # A render of the artist's has the processor for itself.
@@ -330,7 +326,7 @@ class LiveRest:
 
     def _finish(self) -> bool:
         """Take over what the last step has brought."""
-        step, self._thread, self._step = self._step, None, None
+        step, self._step = self._step, None
         if step.error:
             self._opened, self._progress = None, _RestProgress()
             # What cannot be handed over piece by piece goes as a whole.
@@ -380,9 +376,9 @@ class LiveRest:
             continues=continues,
         )
         self._step = _RestStep(job, after, wanted)
-        arguments = self._process, self._folder
-        self._thread = threading.Thread(target=self._step.do, args=arguments, name="LTSH rest", daemon=True)
-        self._thread.start()
+        arguments = {"target": self._step.do, "args": (self._process, self._folder), "name": "LTSH rest"}
+        self._step.thread = threading.Thread(**arguments, daemon=True)
+        self._step.thread.start()
 
     def stop(self) -> None:
         """End the second Blender, and forget what it has rendered."""
@@ -455,9 +451,9 @@ def render_rest(job: RestJob, folder: Path, progress) -> dict:
     render_exr(scene, folder / REST_RENDER, "NONE")
     seconds = time.monotonic() - started
     if not job.continues:
-        _sum[:] = [RestSum.of_size(width, height)]
+        sizes = [(height, width, channels) for channels in (3, 7)]
+        _sum[:] = [RestSum(*(np.zeros(size, np.float32) for size in sizes), is_everything=_is_everything(scene, layer))]
     total = _sum[0]
-    total.everything = tuple(_reasons_for_cycles(scene, layer))
     total.add(folder / REST_RENDER, first, job.samples, {**render_settings.pass_names(), "mask": MASK})
     total.samples += job.samples if job.rows[1] == 1.0 else 0
     return {"seconds": seconds}
@@ -467,7 +463,7 @@ def denoise_rest(job: RestPictureJob, folder: Path, progress) -> dict:
     """Do the `job`; returns the manifest, see `process.view.render_rest`."""
     total = _sum[0]
     save_array(folder / REST_PICTURE, total.picture())
-    return {"everything": total.everything, "ambient": total.ambient, "problem": total.problem}
+    return {"is_everything": total.is_everything, "ambient": total.ambient, "problem": total.problem}
 
 
 def _take_changes(scene, file: str, blocks: list, moved: dict) -> None:
@@ -547,13 +543,11 @@ def mark(material) -> None:
     node.inputs["Value"].default_value = 1.0
 
 
-def _reasons_for_cycles(scene, layer) -> list[str]:
-    """Why the whole picture is Cycles': what views cannot draw between the eye and the surfaces."""
+def _is_everything(scene, layer) -> bool:
+    """True if the whole picture is Cycles': views cannot draw what is between the eye and the surfaces."""
     shown = [ob for ob in scene.objects if not ob.hide_render]
-    hair = [f"hair or points of {ob.name!r}" for ob in shown if _has_hair(ob)]
     materials = {slot.material for ob in shown for slot in ob.material_slots} - {None}
-    volumes = [f"the volume of material {material.name!r}" for material in materials if _has_volume(material)]
-    return [*reasons_for_cycles(scene, layer), *hair, *volumes]
+    return bool(reasons_for_cycles(scene, layer)) or any(map(_has_hair, shown)) or any(map(_has_volume, materials))
 
 
 def _has_volume(material) -> bool:

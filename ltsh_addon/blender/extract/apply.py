@@ -7,7 +7,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ...scene import SceneError
+from ...scene import SceneError, error_line
 from ..materials.graph import cut, ensure_nodes, material_output
 from ..process.bake import ApplyJob, BakedTextures, ExportJob
 from ..render_settings import go_to_frame
@@ -16,6 +16,7 @@ from .atlas import make_atlas
 from .bake_meshes import apply_modifiers, uv_of
 from .pixels import open_scene
 
+EXPORTER = "io_scene_gltf2"
 # EXPORT: what glTF takes: the selected meshes and their materials at one frame.
 EXPORT = {"export_format": "GLB", "use_selection": True, "export_animations": False, "export_cameras": False}
 GROUP_PREFIX = "LTSH Bake"
@@ -51,12 +52,15 @@ def restore_atlas(job) -> None:
 
 def export_objects(job: ExportJob, folder: Path, progress) -> dict:
     """Do the `job` with Blender's own exporter of glTF; returns the manifest."""
-    import addon_utils  # which is there after bpy
-
     progress("open scene", 0.0)
     open_scene(Path(job.scene), [])
-    if "io_scene_gltf2" not in bpy.context.preferences.addons and addon_utils.enable("io_scene_gltf2") is None:
-        raise SceneError("this Blender has no exporter of glTF: install its add-on io_scene_gltf2")
+    if EXPORTER not in bpy.context.preferences.addons:
+        try:
+            bpy.ops.preferences.addon_enable(module=EXPORTER)
+        except RuntimeError as error:
+            raise SceneError(
+                f"this Blender has no exporter of glTF, its add-on {EXPORTER}: {error_line(error)}"
+            ) from error
     restore_atlas(job)
     objects = _objects(job.uv_names, job)
     go_to_frame(bpy.context.scene, job.frame)

@@ -26,7 +26,7 @@ from ..reading import Malformed, check, file_name
 from ..scene import PASSES, REFERENCE, Cancelled, Film, Progress, SurfaceSamples, lights_of, listed
 from ..visibility import Occluders, ShadowSampling
 from ..workers.pool import cores
-from . import bake_files, gltf, lighting, lightmap
+from . import bake_files, lighting, lightmap
 from .lighting import check_named, prepare
 from .mixer import rows_of_groups
 from .options import BAKE_PASSES, TEXTURE_SIDES, BakeOptions, child_job
@@ -53,8 +53,8 @@ def bake_scene(options: BakeOptions, progress: Progress | None = None) -> dict:
         layer = bake_files.applied_layer(options)
         report["applied"] = bake_files.apply_textures(options.scene, options.output, report, layer, progress)
     if options.export and report["objects"]:
-        layers = gltf.exported_layers(options)
-        report["exported"] = gltf.export_glb(options.scene, options.output, report, layers, progress)
+        layers = bake_files.exported_layers(options)
+        report["exported"] = bake_files.export_glb(options.scene, options.output, report, layers, progress)
     return write_reports(result, options.output)
 
 

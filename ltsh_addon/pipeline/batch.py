@@ -13,7 +13,7 @@ from ..files import no_empty_folder, temporary_folder
 from ..imaging import grouped, write_json, write_overview
 from ..reading import NUMBER, Malformed, read_json
 from ..scene import Progress, SceneError, error_line
-from . import bake, bake_files, gltf, picture, render
+from . import bake, bake_files, picture, render
 from . import tasks as batch_tasks
 from .lighting import prepare
 
@@ -132,7 +132,9 @@ def _write_job(job, tasks, existing) -> None:
         "single": job.single,
         "any_key": existing == SKIP,
         "applied_layer": bake_files.applied_layer(job.options) if applied else None,
-        "exported_layers": gltf.exported_layers(job.options) if job.command == "bake" and job.options.export else {},
+        "exported_layers": bake_files.exported_layers(job.options)
+        if job.command == "bake" and job.options.export
+        else {},
         "tasks": [asdict(task) for task in tasks],
     }
     batch_tasks.write_record(Path(job.options.output) / batch_tasks.FOLDER / "job.json", document)
@@ -235,7 +237,7 @@ def _unit(job, output, tasks, finished, progress) -> tuple[str, dict] | None:
         )
     if job.get("exported_layers") and report["objects"]:
         exported = Path(tasks[0].scene), output, report, job["exported_layers"], progress
-        report["exported"] = gltf.export_glb(*exported)
+        report["exported"] = bake_files.export_glb(*exported)
     name = " ".join(str(word) for word in (Path(tasks[0].scene).stem, *tasks[0].unit[1:]) if word is not None)
     return name, report if job["single"] else {"files": files, **report}
 

@@ -13,7 +13,7 @@ from ltsh_addon import imaging  # noqa: E402
 from ltsh_addon.cycles.texels import ImageTexture  # noqa: E402
 from ltsh_addon.cycles.uv import UvTriangles  # noqa: E402
 from ltsh_addon.imaging import to_srgb8  # noqa: E402
-from ltsh_addon.pipeline import BakeOptions, bake_scene, gltf  # noqa: E402
+from ltsh_addon.pipeline import BakeOptions, bake_files, bake_scene  # noqa: E402
 
 SIDE, SIZE, COLOR = 128, 96, (0.6, 0.4, 0.3)
 DOCUMENT = (Path(__file__).parents[2] / "docs" / "lightmaps.md").read_text(encoding="utf-8")
@@ -65,7 +65,7 @@ def baked(tmp_path_factory):
 
 def seen_from_above(glb, channel):
     """The UV coordinates (Q, 2) of pixels (Q,) of a picture SIZE x SIZE of 4 m, row 0 below, by the file itself."""
-    document, data = gltf.read_glb(glb)
+    document, data = bake_files.read_glb(glb)
 
     def values(number):
         accessor = document["accessors"][number]

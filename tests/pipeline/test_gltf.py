@@ -5,14 +5,14 @@ import struct
 
 import numpy as np
 
-from ltsh_addon.pipeline import gltf
+from ltsh_addon.pipeline import bake_files
 
 
 def test_rgbm_decodes_to_the_colors_within_half_a_step_of_its_alpha():
     rng = np.random.default_rng(3)
     pixels = (5.0 * rng.random((16, 24, 3)) ** 4).astype(np.float32)
     pixels[0, 0] = 0.0
-    encoded = gltf.rgbm(pixels, 5.0)
+    encoded = bake_files.rgbm(pixels, 5.0)
     assert encoded.dtype == np.uint8 and encoded[..., 3].min() >= 1
     alpha = encoded[..., 3:] / 255.0
     decoded = encoded[..., :3] / 255.0 * alpha * 5.0
@@ -31,16 +31,16 @@ def triangle():
 
 def test_a_glb_is_read_as_it_was_written_with_whole_words():
     document, data = triangle()
-    glb = gltf.write_glb(document, data)
+    glb = bake_files.write_glb(document, data)
     # glTF 2.0, section 4.4: magic, version 2, length of all; chunks of whole words.
     assert glb[:4] == b"glTF" and struct.unpack_from("<II", glb, 4) == (2, len(glb)) and len(glb) % 4 == 0
-    read, more = gltf.read_glb(glb)
+    read, more = bake_files.read_glb(glb)
     assert read == document and more[:6] == data and read["buffers"] == [{"byteLength": 6}]
 
 
 def test_lightmaps_stand_in_the_extras_of_the_nodes_they_are_for():
     document, _ = triangle()
-    gltf._add_lightmap(document, {"file": "a.exr"}, {"A": 1})
+    bake_files._add_lightmap(document, {"file": "a.exr"}, {"A": 1})
     assert document["nodes"][0]["extras"] == {"lightmap": {"file": "a.exr", "texCoord": 1}}
     assert "extras" not in document["nodes"][1]
 
@@ -49,7 +49,7 @@ def test_nodes_that_share_a_mesh_show_textures_of_their_own():
     document, data = triangle()
     more = bytearray(data)
     for name, png in (("A", b"png a"), ("B", b"png b")):
-        gltf._show_unlit(document, more, png, {name: 1})
+        bake_files._show_unlit(document, more, png, {name: 1})
     for node, png in zip(document["nodes"], (b"png a", b"png b"), strict=False):
         (primitive,) = document["meshes"][node["mesh"]]["primitives"]
         material = document["materials"][primitive["material"]]

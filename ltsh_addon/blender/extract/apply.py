@@ -81,7 +81,8 @@ def export_objects(job: ExportJob, folder: Path, progress) -> dict:
         coordinates[ob.name] = layers.keys().index(job.uv_names[ob.name])
     progress("export", 0.0)
     export_scene = bpy.ops.export_scene
-    export_scene.gltf(filepath=str(job.path), **EXPORT)
+    gltf = export_scene.gltf
+    gltf(filepath=str(job.path), **EXPORT)
     return {"coordinates": coordinates}
 
 

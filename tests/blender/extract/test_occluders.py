@@ -397,11 +397,11 @@ def test_what_is_not_as_in_cycles_is_named(name):
     elif name.endswith("t in its plane"):
         ob = pane(scene_parts.principled("Pane")[0])
         ob.name = "Pane"
+        size = {"size": 0.1} if name[0] == "l" else {"shadow_soft_size": 0.0}
+        kind = {"l": "AREA", "p": "POINT", "s": "SPOT"}[name[0]]
         for light_name, height in (("Flush", 0.0), ("Below", -1e-4), ("Above", 1e-4)):
-            light = bpy.data.lights.new(light_name, {"l": "AREA", "p": "POINT", "s": "SPOT"}[name[0]])
-            setattr(light, *(("size", 0.1) if name[0] == "l" else ("shadow_soft_size", 0.0)))
-            location = (ob.location.x, ob.location.y, ob.location.z + height)
-            scene_parts.link(bpy.data.objects.new(light_name, light), location)
+            light = scene_parts.new_light(light_name, kind, **size)
+            scene_parts.link(light, (ob.location.x, ob.location.y, ob.location.z + height))
     elif name == "rug in its plane":
         corners = [(-1, -1, 0), (1, -1, 0), (0, 1, 0)]
         hidden(scene_parts.add_mesh("Pane", corners, [(0, 1, 2)], location=(0.3, 0.2, 1.0)))

@@ -320,9 +320,7 @@ def test_edges_go_with_the_light_that_makes_them(out, tmp_path):
     scene = floor_and_ball(bsdf("BsdfDiffuse"))
     bpy.data.objects.remove(scene.objects["Light"])
     for name, angle, energy in (("Sun", 0.6, 4.0), ("Moon", -0.4, 0.5)):
-        data = bpy.data.lights.new(name, "SUN")
-        data.energy, data.angle = energy, 0.01
-        parts.link(bpy.data.objects.new(name, data), rotation=(angle, angle, 0.0))
+        parts.link(parts.new_light(name, "SUN", energy=energy, angle=0.01), rotation=(angle, angle, 0.0))
     scene.cycles.max_bounces = 0
     options = {"sub_samples": 5, "cycles_samples": 64}
     path = parts.save(tmp_path / "room.blend")

@@ -208,7 +208,7 @@ def shaded(tmp_path):
     with add_on_in_room(tmp_path / "room.blend") as scene:
         scene.ltsh.techniques = {"ltsh4c"}
         fill = parts.add_area_light("Fill", location=(-1.0, 0.5, 1.5), size=0.5)
-        parts.link(bpy.data.objects.new("Sun", bpy.data.lights.new("Sun", "SUN")), rotation=(0.5, 0.0, 0.0))
+        parts.link(parts.new_light("Sun", "SUN"), rotation=(0.5, 0.0, 0.0))
         parts.add_sphere(parts.principled("Ball")[0], smooth=False, radius=0.3, location=(0.0, 0.0, 0.6))
         assert bpy.ops.ltsh.shade() == {"FINISHED"}
         yield scene, fill

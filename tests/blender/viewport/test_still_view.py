@@ -128,9 +128,8 @@ def test_a_view_shows_lamps_of_files_as_pictures_do(capsys, tmp_path):
     parts.empty_scene(*SIZE)
     parts.add_plane(parts.principled("Floor", Roughness=0.3)[0], size=6.0)
     for kind, x in (("POINT", -1.2), ("SPOT", 1.2)):
-        data = bpy.data.lights.new(kind, kind)
-        data.energy, data.shadow_soft_size = 80.0, 0.1
-        light = parts.link(bpy.data.objects.new(kind, data), (x, 0.0, 1.6), (0.3, 0.2, 0.0))
+        light = parts.new_light(kind, kind, energy=80.0, shadow_soft_size=0.1)
+        parts.link(light, (x, 0.0, 1.6), (0.3, 0.2, 0.0))
         tree, emission = light_tree(light)
         node = tree.nodes.new("ShaderNodeTexIES")
         node.mode, node.ies = "INTERNAL", bpy.data.texts.new(kind)

@@ -1,4 +1,4 @@
-"""Files of a bake: planes of texels with margins, pictures of errors, records of tiles, the .blend and .glb that show
+"""Files of a bake: planes of texels with margins, pictures of errors, the .blend and .glb that show
 them."""
 
 from __future__ import annotations
@@ -22,8 +22,6 @@ from ..reading import NUMBER, file_name
 from ..scene import PASSES
 from .comparison import percent
 from .lighting import technique_names
-from .options import BakeOptions
-from .tasks import Records, contents_digest, options_digest
 
 # WRITTEN_TEXELS: texels that are in memory while a file is written.
 WRITTEN_TEXELS = 1 << 18
@@ -44,7 +42,6 @@ TILE = {
     "dull_texels?": NUMBER,
     "errors?": {str: {"noise?": NUMBER | None, "techniques": {str: _ERRORS}}},
 }
-_TILE_RECORD = {"task": {"object": str, "tile": int}, "report": TILE}
 
 
 class Planes:
@@ -273,29 +270,6 @@ def _within_reach(mask, margin):
     return counts[np.minimum(rows + margin + 1, height)] > counts[np.maximum(rows - margin, 0)]
 
 
-class TileRecords:
-    """Records of finished tiles: reads those of the same job (with `resume`) and writes new ones.
-
-    Where the options have a `name`, only records of that name are read.
-    """
-
-    def __init__(self, options: BakeOptions):
-        self._records = Records(options.output, "tiles", _TILE_RECORD)
-        self._key = options_digest("bake", options, contents_digest(options))
-        names = None if options.name is None else [options.name]
-        whole = self._records.all_whole(self._key, names) if options.resume else []
-        self.finished = {(record["task"]["object"], record["task"]["tile"]): record for record in whole}
-
-    def take(self, name: str, tile: int, file: str) -> dict | None:
-        """The record of a finished tile of the object `name` with the `file`, else None."""
-        record = self.finished.get((name, tile))
-        return record if record is not None and file in record["files"] else None
-
-    def write(self, name: str, tile: int, stem: str, files, report: dict) -> dict:
-        """Write the record of a finished tile; returns it."""
-        return self._records.write(f"{stem}.{tile}", self._key, {"object": name, "tile": tile}, files, report=report)
-
-
 def applied_layer(options) -> str:
     """The layer that `apply` shows: the first technique's combined light, or its first pass where only one is baked."""
     names = applied_layers(options)
@@ -362,7 +336,6 @@ def brief(report: dict) -> list[str]:
 LIGHT = "diffuse_light"
 # The chunks of a .glb: its JSON, and its data (glTF 2.0, section 4.4).
 _HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
-_LINEAR, _REPEAT = 9729, 10497  # glTF's numbers of GL_LINEAR and GL_REPEAT
 
 
 def exported_layers(options) -> dict[str, list[str]]:
@@ -402,7 +375,8 @@ def export_glb(scene: Path, output: Path, report: dict, layers: dict[str, list[s
             if kind == "lightmap":
                 facts = _write_lightmap(output, stem, pixels)
                 files += [facts["file"], facts["png"]]
-                _add_lightmap(copy, facts, uv)
+                for node in (node for node in copy["nodes"] if node.get("name") in uv):
+                    node["extras"] = {"lightmap": {**facts, "texCoord": uv[node["name"]]}}
             else:
                 _show_unlit(copy, more, imaging.encode_png(imaging.to_srgb8(pixels)), uv)
         file = f"{Path(scene).stem}{'_unlit' if kind == 'unlit' else ''}.glb"
@@ -444,13 +418,6 @@ def rgbm(pixels: np.ndarray, most: float) -> np.ndarray:
     return np.concatenate([np.rint(255.0 * share / (alpha / 255.0)), alpha], axis=-1).clip(0, 255).astype(np.uint8)
 
 
-def _add_lightmap(document, facts, coordinates) -> None:
-    for node in document["nodes"]:
-        if node.get("name") in coordinates:
-            lightmap = {**facts, "texCoord": coordinates[node["name"]]}
-            node["extras"] = {**node.get("extras", {}), "lightmap": lightmap}
-
-
 def _show_unlit(document, data: bytearray, png: bytes, coordinates) -> None:
     """Let the nodes of objects, by the number of their UV map, show a picture without light (KHR_materials_unlit)."""
     data += b"\0" * (-len(data) % 4)
@@ -462,8 +429,7 @@ def _show_unlit(document, data: bytearray, png: bytes, coordinates) -> None:
         return len(document[kind]) - 1
 
     image = added("images", {"bufferView": added("bufferViews", view), "mimeType": "image/png"})
-    sampler = added("samplers", {"magFilter": _LINEAR, "minFilter": _LINEAR, "wrapS": _REPEAT, "wrapT": _REPEAT})
-    texture, materials = added("textures", {"source": image, "sampler": sampler}), {}
+    texture, materials = added("textures", {"source": image}), {}
     for node in document["nodes"]:
         if node.get("name") not in coordinates or "mesh" not in node:
             continue

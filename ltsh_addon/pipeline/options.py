@@ -453,7 +453,6 @@ class BakeOptions(TaskOptions):
         "--export", default=None, choices=("glb",), matters=False,
         help="also the objects as glTF, with lightmaps (pass diffuse_light), with unlit colors (other passes)",
     )  # fmt: skip
-    resume: bool = option(default=False, matters=False)  # keep what the same job has finished
 
     def __post_init__(self):
         if self.atlas is not None:

@@ -38,13 +38,6 @@ def test_a_glb_is_read_as_it_was_written_with_whole_words():
     assert read == document and more[:6] == data and read["buffers"] == [{"byteLength": 6}]
 
 
-def test_lightmaps_stand_in_the_extras_of_the_nodes_they_are_for():
-    document, _ = triangle()
-    bake_files._add_lightmap(document, {"file": "a.exr"}, {"A": 1})
-    assert document["nodes"][0]["extras"] == {"lightmap": {"file": "a.exr", "texCoord": 1}}
-    assert "extras" not in document["nodes"][1]
-
-
 def test_nodes_that_share_a_mesh_show_textures_of_their_own():
     document, data = triangle()
     more = bytearray(data)

@@ -25,7 +25,6 @@ class BakeJob:
     frame: int | None
     cycles_samples: int
     passes: tuple[str, ...]  # of Cycles
-    finished: tuple[tuple[str, int], ...] = ()  # (object, tile) that need no maps
     look_up_images: bool = True  # False: everything that varies is a map
     following: tuple[str, ...] = ()  # objects of the same file that later jobs need
     scripts: bool = False  # run the scripts in the file

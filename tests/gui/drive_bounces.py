@@ -3,6 +3,7 @@
 With `--blend` of a scene with a mirror or glass the pictures show what direct light alone does not.
 """
 
+import shutil
 import time
 
 import bpy
@@ -102,7 +103,8 @@ def main(rig):
     yield 3
     rig.check(list(module("engine.redraws").open_views) == [opened], "a save leaves the view of a preview")
     rig.check(child.poll() is None and rest()._wanted.version == before.version, "nor is anything rendered again")
-    with bpy.data.libraries.load(bpy.data.filepath) as (saved, wanted):
+    copied = shutil.copy(bpy.data.filepath, rig.out / "saved.blend")
+    with bpy.data.libraries.load(str(copied)) as (saved, wanted):
         wanted.scenes = saved.scenes[:1]
     rig.check(wanted.scenes[0].render.engine != "LTSH", "the file has the artist's engine")
     bpy.data.scenes.remove(wanted.scenes[0])

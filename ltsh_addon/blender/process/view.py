@@ -157,13 +157,18 @@ class RestJob:
     scene: Path | None  # None: the one that the last job has opened
     view: RestView  # in the child a dict
     samples: int
-    seed: int = 0
+    seed: int = 0  # the samples that the sum has in all rows
     shrink: int = 1  # pixels of the view in either direction that share one
     rows: tuple[float, float] = (0.0, 1.0)  # the shares of the height between which it is rendered
     camera: str | None = None  # where the view has no matrices
     changes: dict | None = None  # of the scene that the last job has opened, see `viewport.rest.RestChanges`
     continues: bool = False  # the sum of the last job; else it is begun anew
     scripts: bool = False  # run the scripts in the file
+
+    @property
+    def total(self) -> int:
+        """The samples that the sum has in all rows after it."""
+        return self.seed + (self.samples if self.rows[1] == 1.0 else 0)
 
 
 @dataclass(frozen=True)

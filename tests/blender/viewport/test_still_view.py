@@ -21,7 +21,7 @@ import random_surfaces
 import scene_parts as parts
 from fake_scene import run
 from graphics_card import edits_with_graphics, with_graphics
-from lit_plane import light_tree
+from lit_plane import into_collection, light_tree
 from view_pictures import OpenView, textured
 
 from ltsh_addon import imaging
@@ -544,10 +544,7 @@ def test_what_a_view_leaves_out_is_named_and_hides_nothing(capsys, tmp_path):
     set_up_scene()
     wall = parts.add_plane(None, 4.0, "Wall", location=(0.0, -1.0, 1.0), rotation=(1.4, 0.0, 0.0))
     wall.visible_shadow = wall.visible_diffuse = wall.visible_glossy = False
-    hidden = bpy.data.collections.new("Indirect")
-    bpy.context.scene.collection.children.link(hidden)
-    hidden.objects.link(wall)
-    bpy.context.scene.collection.objects.unlink(wall)
+    bpy.context.scene.collection.children.link(into_collection("Indirect", wall))
     bpy.context.view_layer.layer_collection.children["Indirect"].indirect_only = True
     path = parts.save(tmp_path / "without.blend")
     parts.link(bpy.data.objects.new("Hair", parts.hair_curves(3)))

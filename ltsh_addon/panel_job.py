@@ -38,7 +38,7 @@ def perform(job: dict) -> None:
         try:
             output = Path(run["output"])
             folder = display_layers.write(run["arguments"][0], output, report, run["partial"])
-            display_layers.write_lights(folder, run["arguments"], progress)
+            display_layers.write_lights(folder, run["arguments"], report, progress)
         except (OSError, ValueError, MemoryError) as error:
             send({"error": str(error) or type(error).__name__})
             return

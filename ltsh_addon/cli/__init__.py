@@ -20,7 +20,7 @@ from ..reading import is_text
 from ..scene import VERSION, Cancelled, SceneError, error_line
 from ..shading import TableError
 from .arguments import Mistakes, Misuse
-from .commands import add_demo, add_job, add_merge, add_relight, add_run
+from .commands import add_demo, add_job, add_match, add_merge, add_relight, add_run
 from .progress import ProgressBar, RunLog, print_json, print_out
 
 EXAMPLES = """examples:
@@ -162,6 +162,7 @@ def _parser(program: str) -> tuple[argparse.ArgumentParser, dict[str, argparse.A
         ("view", add_job, "the viewport's own picture, without a window"),
         ("render", add_job, "the finished picture: direct light by LTSH, the rest by Cycles, denoised"),
         ("relight", add_relight, "other powers and colors of lights in pictures that are there"),
+        ("match", add_match, "powers and colors of lights for which the scene looks like a picture"),
         ("run", add_run, "do the jobs of a file"),
         ("merge", add_merge, "assemble the report of what shards have done"),
     ):

@@ -17,6 +17,7 @@ from ..pipeline.options import (
     BakeOptions,
     CompareOptions,
     DemoOptions,
+    MatchOptions,
     PictureOptions,
     RenderOptions,
     ViewOptions,
@@ -161,6 +162,12 @@ def job_of(arguments, scenes: tuple[Path, ...]) -> BatchJob:
     cameras, frames = tuple(dict.fromkeys(arguments.cameras or ())), arguments.frames or ()
     if command == "bake" and arguments.apply and (len(cameras) > 1 or len(frames) > 1):
         raise Misuse("--apply makes materials show one texture: give one frame and one camera with it")
+    if command == "bake":
+        side, size = arguments.atlas, arguments.size
+        if (side is None or arguments.uv) and (arguments.texels_per_metre or arguments.unwrap != "smart"):
+            raise Misuse("--texels-per-metre and --unwrap are for the UV map of --atlas N: give it, without --uv")
+        if side is not None and size not in (BakeOptions.size, (side, side)):
+            raise Misuse("--atlas N is the size of the texture that all objects share: leave out --size")
     if command == "render" and arguments.budget is not None and arguments.cycles_samples is not None:
         raise Misuse("--budget chooses the samples of Cycles: give it or --cycles-samples, not both")
     options = options_from(kind, vars(arguments), scene=scenes[0])
@@ -284,6 +291,40 @@ def _relight(arguments, bar, open_file) -> int:
     bar.finish()
     if not arguments.json:
         print_out("\n".join(str(output / name) for one in report.get("reports", [report]) for name in one["files"]))
+    return _printed(arguments, report, 0)
+
+
+MATCH = """Find powers of lights for which the scene looks like a picture of the same camera, and with
+--colors their colors too. OUT gets matched.blend, a copy of the scene with these lights,
+match.png (before, after, target) and report.json with each light's old and new power."""
+MATCH_EXAMPLES = """examples:
+  %(prog)s room.blend --target graded.exr -o out/match
+  %(prog)s room.blend --target painted.png --mask window.png --light Key --light Fill --colors -o out/match
+
+A picture of 8 or 16 bits goes back through the view transform of the scene; pixels that are clipped do
+not count. Bounces follow their lights.
+"""
+
+
+def add_match(parser) -> None:
+    """`ltsh match`."""
+    with_examples(parser, MATCH, MATCH_EXAMPLES)
+    add_options(parser, MatchOptions, but=("name",))
+    add_talk(parser)
+    parser.set_defaults(run=_match)
+
+
+def _match(arguments, bar, open_file) -> int:
+    from ..pipeline.match import match_scene, summary
+
+    (scene, *more) = scenes_of(arguments, open_file)
+    if more:
+        raise Misuse(f"{more[0]}: expected one SCENE.blend, because one picture shows one scene")
+    report = match_scene(options_from(MatchOptions, vars(arguments), scene=scene), bar)
+    bar.finish()
+    _complain(bar, "warning", on_screen(report["warnings"], f"{arguments.output}/report.json"))
+    if not arguments.json:
+        print_out("\n".join(summary(report)))
     return _printed(arguments, report, 0)
 
 
@@ -427,10 +468,10 @@ def _complain(bar, what: str, lines) -> None:
 
 
 def _summary(merged: Merged, output) -> str:
-    from ..pipeline import bake, picture, render
+    from ..pipeline import bake_files, picture, render
 
     summary, brief = {
-        "bake": (bake.summary, bake.brief),
+        "bake": (bake_files.summary, bake_files.brief),
         "view": (picture.view_summary, render.brief),
         "render": (render.summary, render.brief),
     }.get(merged.command, (picture.summary, picture.brief))

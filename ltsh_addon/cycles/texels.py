@@ -6,7 +6,7 @@ is black outside and blends to black within half a pixel.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -98,11 +98,17 @@ class TexelMesh:
     material: np.ndarray  # (T,) number of the material
     mirrored: bool | np.ndarray = False  # True: the transform turns right hands into left ones
     receiver: int | np.ndarray = 0  # as in `SurfaceSamples`
+    object: int | np.ndarray = 0  # number of the object of the atlas
+
+    @classmethod
+    def joined(cls, meshes: Sequence[TexelMesh]) -> TexelMesh:
+        """All `meshes` as one; what may hold for a whole mesh must be arrays (T,)."""
+        return cls(**{item.name: np.concatenate([getattr(mesh, item.name) for mesh in meshes]) for item in fields(cls)})
 
     def true_normals(self) -> np.ndarray:
         """Unit normals (T, 3) of the faces. A smooth normal may point to the other side, for example on a bent quad."""
         sides = self.corners[:, 1:] - self.corners[:, :1]
-        return unit(np.cross(sides[:, 0], sides[:, 1])) * (-1.0 if self.mirrored else 1.0)
+        return unit(np.cross(sides[:, 0], sides[:, 1])) * np.where(self.mirrored, -1.0, 1.0).reshape(-1, 1)
 
     def save(self, path) -> None:
         """Write an .npz."""
@@ -249,7 +255,7 @@ def _lobes_of_texels(mesh, materials, texels, read_map, view):
             smooth_normal=smooth_normal,
             true_normal=true_normal,
             corrected=corrected[number],
-            receiver=np.full(len(position), mesh.receiver),
+            receiver=np.broadcast_to(mesh.receiver, (len(mesh.corners),))[triangle],
             diffuse_albedo=None,
         )
         of_block = {name: values[block] for name, values in maps.items()}

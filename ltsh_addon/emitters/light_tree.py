@@ -100,20 +100,14 @@ class LightTree:
         power, normal = brightness * size, area / size[:, None]
         order, start, end, children = node_ranges(center, normal)
         sums = NodeSums(order, start, end)
-        total = sums(power)
         origin = center.mean(axis=0)
-        middle = sums(power[:, None] * (center - origin)) / total[:, None]
         offset = center - origin
-        spread = power[:, None, None] * (covariance + offset[:, :, None] * offset[:, None, :])
-        spread = sums(spread) / total[:, None, None] - middle[:, :, None] * middle[:, None, :]
+        total, middle, spread, axis, length = sums.moments(power, offset, covariance, normal)
         alone = end - start == 1
         spread[alone] = covariance[order[start[alone]]]
         variances, axes = np.linalg.eigh(spread)
         variances = np.maximum(variances, 0.0)
         axes = (np.sqrt(variances)[:, None] * axes).transpose(2, 1, 0)
-        axis = sums(power[:, None] * normal)
-        length = np.linalg.norm(axis, axis=1, keepdims=True)
-        axis = np.where(length > 1e-9 * total[:, None], axis / np.maximum(length, 1e-300), normal[order[start]])
         vector = sums(brightness[:, None] * area)
         is_even = bool(np.ptp(radiance, axis=0).max() <= 1e-6 * radiance.max())
         powers = radiance * size[:, None]
@@ -132,7 +126,7 @@ class LightTree:
         width = 3.0 * (1.0 + 0.08 * (middle_one - least)) ** 2 * total**2
         turn = turn - mean[:, :, None] * mean[:, None, :] + TURNED**2 * np.eye(3)[None]
         turn = (width * turn.transpose(1, 2, 0)).astype(np.float32)
-        turned = np.maximum(1.0 - (length[:, 0] / total) ** 2, 0.0) * (end - start > 1)
+        turned = np.maximum(1.0 - (length / total) ** 2, 0.0) * (end - start > 1)
         swing = (total * np.maximum(np.sqrt(1.5 * turned), TURNED)).astype(np.float32)
         normal_spread = normal_spreads(axis, normal[order], start, end)
         number = np.where(end - start == 1, order[start], -1)
@@ -185,6 +179,18 @@ class NodeSums:
         sums[alone] = values[self.order[self.start[alone]]]
         return sums
 
+    def moments(self, weight, offset, covariance, normal):
+        """Of lights of a `weight` (L,): the sums of these (N,), the means (N, 3) and covariances (N, 3, 3) of what lies
+        around `offset` (L, 3), the mean direction (N, 3) of unit `normal`s, and the length (N,) of their sum."""
+        total = self(weight)
+        middle = self(weight[:, None] * offset) / total[:, None]
+        spread = weight[:, None, None] * (covariance + offset[:, :, None] * offset[:, None, :])
+        spread = self(spread) / total[:, None, None] - middle[:, :, None] * middle[:, None, :]
+        axis = self(weight[:, None] * normal)
+        length = np.linalg.norm(axis, axis=1, keepdims=True)
+        axis, first = axis / np.maximum(length, 1e-300), normal[self.order[self.start]]
+        return total, middle, spread, np.where(length > 1e-9 * total[:, None], axis, first), length[:, 0]
+
 
 def stand_ins(lights, most: int) -> tuple[list[Light], np.ndarray]:
     """Rectangles that stand for many flat lights with an area, and the share (N,) of each that shines. Each stands
@@ -194,16 +200,9 @@ def stand_ins(lights, most: int) -> tuple[list[Light], np.ndarray]:
     normal = area / size[:, None]
     order, start, end, _ = node_ranges(center, normal, most)
     sums = NodeSums(order, start[-most:], end[-most:])
-    whole = sums(size)
-    radiance = sums(size[:, None] * np.array([light.radiance for light in lights])) / whole[:, None]
     origin = center.mean(axis=0)
-    offset = center - origin
-    middle = sums(size[:, None] * offset) / whole[:, None]
-    spread = covariance + offset[:, :, None] * offset[:, None, :]
-    spread = sums(size[:, None, None] * spread) / whole[:, None, None] - middle[:, :, None] * middle[:, None, :]
-    axis = sums(size[:, None] * normal)
-    length = np.linalg.norm(axis, axis=1, keepdims=True)
-    axis = np.where(length > 1e-9 * whole[:, None], axis / np.maximum(length, 1e-300), normal[order[sums.start]])
+    whole, middle, spread, axis, _ = sums.moments(size, center - origin, covariance, normal)
+    radiance = sums(size[:, None] * np.array([light.radiance for light in lights])) / whole[:, None]
     along = np.eye(3) - axis[:, :, None] * axis[:, None, :]
     variances, axes = np.linalg.eigh(along @ spread @ along)
     # Uniform rectangles with these variances, but no smaller than their shining area.

@@ -7,7 +7,7 @@ of their albedo and normal, which are denoised first.
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import product
 from pathlib import Path
@@ -163,20 +163,31 @@ def smoothed(light: np.ndarray, guides: np.ndarray, samples: int) -> np.ndarray:
     normal = guides[..., 3:6] / np.maximum(np.linalg.norm(guides[..., 3:6], axis=-1, keepdims=True), 1e-6)
     surface = np.concatenate([guides[..., :3], normal, guides[..., 6:]], axis=-1)
     for step in (1, 2, 4)[: max(3 - int(np.log2(max(samples, 4) / 4)) // 2, 1)]:
-        total, weights = light, np.ones_like(brightness)
-        for down, right in _WAYS:
-            there = _shifted(surface, step * down, step * right)
+
+        def weight(there: np.ndarray, _, step=step) -> np.ndarray:
             off = ((there[..., :3] - surface[..., :3]) ** 2).sum(axis=-1) / ALBEDO**2
             off += (1.0 - (there[..., 3:6] * normal).sum(axis=-1)).clip(0.0) / NORMAL
             off += ((there[..., 6] - surface[..., 6]) / (DISTANCE * step * np.maximum(surface[..., 6], 1e-6))) ** 2
-            weight = np.exp(-off) * (0.5 if down and right else 1.0)
-            total = total + weight[..., None] * _shifted(light, step * down, step * right)
-            weights += weight
-        light = total / weights[..., None]
+            return np.exp(-off)[..., None]
+
+        light = means_of_neighbors(light, surface, weight, step)
     return light
 
 
 _WAYS = sorted({*product((-1, 0, 1), repeat=2)} - {(0, 0)})
+
+
+def means_of_neighbors(values: np.ndarray, surface: np.ndarray, weight: Callable, step: int = 1) -> np.ndarray:
+    """Values (H, W, C) as weighted means of 3 x 3 pixels `step` apart, the corners with half of their weights.
+
+    `weight(surface, values)` of one neighbor of each pixel is (H, W, C or 1); that of the pixel itself is 1.
+    """
+    total, weights = values, 1.0
+    for down, right in _WAYS:
+        there = [_shifted(one, step * down, step * right) for one in (surface, values)]
+        one = weight(*there) * (0.5 if down and right else 1.0)
+        total, weights = total + one * there[1], weights + one
+    return total / weights
 
 
 def _shifted(picture: np.ndarray, down: int, right: int) -> np.ndarray:

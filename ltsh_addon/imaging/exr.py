@@ -23,6 +23,7 @@ _DEFAULT_CHANNELS = {1: "V", 3: "RGB", 4: "RGBA"}
 _CHANNEL_ORDERS = ("RGBA", "XYZW", "UVW")
 _BLOCK_VALUES = 1 << 22
 _ZIP_ROWS = 16  # rows that are compressed together
+LARGEST_HALF = 65504.0
 _LONGEST_NAME = 255  # bytes, OpenEXR's limit
 _HEADER_BYTES = 1 << 22  # more than the header of a file with thousands of channels
 _OF_THE_FORMAT = {"channels", "chromaticities", "compression", "dataWindow", "displayWindow", "lineOrder", "name",
@@ -151,10 +152,13 @@ def writing_rows(
     metadata: Mapping[str, str] | None = None,
     chromaticities: Sequence[float] | None = None,
     pixel_aspect: float = 1.0,
+    *,
+    half: Sequence[str] = (),
 ) -> Iterator[RowWriter]:
     """Context with a RowWriter for a file of `size` (width, height) with the channels `names`.
 
-    The other arguments are those of `write_layers`. Also raises ValueError if rows are missing at the end.
+    Those of `half` are stored as half floats, values beyond theirs as the largest. The other arguments are those of
+    `write_layers`. Also raises ValueError if rows are missing at the end.
     """
     OpenEXR = _openexr()
     metadata = {str(key): str(value) for key, value in (metadata or {}).items()}
@@ -163,6 +167,10 @@ def writing_rows(
     width, height = size
     header = OpenEXR.Header(width, height)
     header["channels"] = dict.fromkeys(names, header["channels"]["R"])
+    if half:
+        from Imath import Channel, PixelType
+
+        header["channels"] |= dict.fromkeys(half, Channel(PixelType(PixelType.HALF)))
     header |= {"type": b"scanlineimage", "pixelAspectRatio": float(pixel_aspect)}
     header |= {key: value.encode() for key, value in metadata.items()}
     if chromaticities is not None:
@@ -176,7 +184,7 @@ def writing_rows(
             file = OpenEXR.OutputFile(str(temporary), header)
         except OSError as error:
             raise OSError(_reason(error, temporary)) from error
-        writer = RowWriter(file, temporary, tuple(names), (height, width))
+        writer = RowWriter(file, temporary, tuple(names), (height, width), frozenset(half))
         try:
             yield writer
         finally:
@@ -195,6 +203,7 @@ class RowWriter:
     path: Path
     names: tuple[str, ...]
     shape: tuple[int, int]
+    half: frozenset[str] = frozenset()  # the channels of half floats
     done: int = 0  # rows
 
     def write(self, planes: Mapping[str, np.ndarray]) -> None:
@@ -212,7 +221,10 @@ class RowWriter:
                 raise ValueError(f"channel {name!r}: rows have shape {plane.shape}, expected {(rows, width)}")
             with np.errstate(over="ignore"):
                 # The writer ignores strides and types other than its own: it would store wrong numbers or crash.
-                data[name] = np.ascontiguousarray(plane, dtype=np.float32).tobytes()
+                kind = np.float32
+                if name in self.half:
+                    kind, plane = np.float16, np.clip(plane, -LARGEST_HALF, LARGEST_HALF)
+                data[name] = np.ascontiguousarray(plane, dtype=kind).tobytes()
         try:
             self.file.writePixels(data, rows)
         except (RuntimeError, OSError) as error:

@@ -10,7 +10,7 @@ import time
 from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import PurePosixPath
 
 import numpy as np
@@ -22,13 +22,13 @@ from ..imaging import exr, grouped
 from ..imaging.denoise import DENOISER
 from ..imaging.exr import COMBINED, REST, layer_name
 from ..imaging.seams import SeamFit, TexelGrid, islands_of
-from ..reading import NUMBER, Malformed, check, file_name
+from ..reading import Malformed, check, file_name
 from ..scene import PASSES, REFERENCE, Cancelled, Film, Progress, SurfaceSamples, lights_of, listed
 from ..visibility import Occluders, ShadowSampling
 from ..workers.pool import cores
 from . import bake_files, lighting, lightmap
-from .comparison import percent
 from .lighting import check_named, prepare
+from .mixer import rows_of_groups
 from .options import BAKE_PASSES, TEXTURE_SIDES, BakeOptions, child_job
 from .tasks import TaskResult, file_stems, versions, write_reports
 
@@ -51,7 +51,7 @@ def bake_scene(options: BakeOptions, progress: Progress | None = None) -> dict:
     report = result.report
     if options.apply and report["objects"]:
         layer = bake_files.applied_layer(options)
-        report["applied"] = bake_files.apply_textures(options.scene, options.output, report["objects"], layer, progress)
+        report["applied"] = bake_files.apply_textures(options.scene, options.output, report, layer, progress)
     return write_reports(result, options.output)
 
 
@@ -79,7 +79,7 @@ def bake_objects(
         records, files, seconds = [], [], {"blender": manifest["seconds"]}
         with _shadow_tracer(options, manifest, folder) as tracer:
             for record, stem in zip(manifest["objects"], stems, strict=True):
-                if record["problem"] is None:
+                if record["folder"]:
                     (options.output / stem).parent.mkdir(parents=True, exist_ok=True)
                     baker = ObjectBaker(options, tables, manifest, record, folder / record["folder"], tracer)
                     baked = baker.bake(stem, [] if tile is None else [tile], finished, progress)
@@ -154,7 +154,7 @@ class ObjectBaker:
     def __init__(self, options, tables, manifest, record, folder, tracer=None):
         self.options, self.tables, self.manifest, self.record, self.folder = options, tables, manifest, record, folder
         self.lights, self.tracer = lights_of(manifest["lights"]), tracer
-        self.mesh = replace(TexelMesh.load(folder / "mesh.npz"), receiver=record["receiver"])
+        self.mesh = TexelMesh.load(folder / "mesh.npz")
         uv_maps = {name: folder / file for name, file in record["uv_maps"].items()}
         self.materials = [BakeMaterial.of(material, folder.parent, uv_maps) for material in record["materials"]]
         self.view = BakeView(**manifest["view"])
@@ -170,6 +170,8 @@ class ObjectBaker:
         """
         name, files, seconds = self.record["name"], [], {}
         result = {"name": name, "uv": self.record["uv"], "outside": 0.0, "tiles": {}}
+        if self.options.atlas is not None:
+            result |= {"members": self.record["members"], "atlas": self.record["atlas"]}
         for tile in tiles or self.tiles:
             file = f"{stem}{self._suffix(tile)}.exr"
             start = time.perf_counter()
@@ -207,13 +209,15 @@ class ObjectBaker:
                 record["texture"] = f"{stem}.{bake_files.applied_layer(options)}{self._suffix(tile)}.exr"
                 texture = options.output / record["texture"], bake_files.applied_layers(options)
                 written.append(record["texture"])
-            planes.write(path, options.margin, self._metadata(tile), pictures, texture)
+            half = [name for name in planes.names if "@" in name] if options.per_light else []
+            planes.write(path, options.margin, (self._metadata(tile), half), pictures, texture)
         return record, written
 
     def _shade(self, tile, planes, errors, progress) -> dict:
         """Shade a tile block by block into `planes`; returns its counts of texels for the record."""
         options, covered, covers, overlaps, unshaded, unbaked, lit = self.options, 0, 0, 0, 0, 0, False
         is_unshaded = np.array([bool(reason) for reason in self.record["unshaded"]])
+        of_members = np.zeros(len(self.record["members"]), np.int64)
         rows, height = block_rows(options), options.size[1]
         points, spread = options.sub_samples, TilePoints(self, tile, self._threads())
         facts, seams = {}, None
@@ -236,6 +240,7 @@ class ObjectBaker:
                 overlaps += texels.overlaps
                 unbaked += texels.unbaked
                 unshaded += int(is_unshaded[self.mesh.material[texels.triangle]].sum())
+                of_members += np.bincount(self.mesh.object[texels.triangle], minlength=len(of_members))
                 names = (layer_name(name, pass_name) for name in self.tables for pass_name in options.passes)
                 lit = lit or any(planes_of[name].any() for name in names)
                 planes.put(first, min(rows, height - first), texels, _channels(planes_of))
@@ -247,6 +252,8 @@ class ObjectBaker:
             if progress is not None and progress(f"shade {self.record['name']}", share) is False:
                 raise Cancelled("the bake was stopped")
         counts = {"texels": covered, "covered_times": covers, "overlapping_texels": overlaps}
+        if options.atlas is not None:
+            counts["member_texels"] = dict(zip(self.record["members"], of_members.tolist(), strict=True))
         if seams is not None:
             planes.fit(seams)
         return {**counts, "unshaded_texels": unshaded, "unbaked_texels": unbaked, "is_lit": lit, **facts}
@@ -295,7 +302,7 @@ class ObjectBaker:
         if self.options.bounces == "on":
             color = _summed(samples.diffuse_albedo[None], texel, len(texels.index))[0]
             bounces = spread.bounces(first, texels, color)
-            images = {layer_name(REST, name): bounces[name] for name in self.options.passes}
+            images = {layer_name(REST, name): bounces[name].sum(axis=0) for name in self.options.passes}
         if self.tracer is not None:
             options = self.options
             passes = shaded_passes(options)
@@ -310,7 +317,10 @@ class ObjectBaker:
         for name, table in self.tables.items():
             for pass_name, radiance in self._passes(samples, texel, len(texels.index), table, shadows).items():
                 layer = layer_name(name, pass_name)
-                whole = radiance.sum(axis=0) + bounces.get(pass_name, 0.0)
+                whole = radiance.sum(axis=0)
+                if bounces:
+                    whole = whole + bounces[pass_name].sum(axis=0)
+                    radiance = radiance + bounces[pass_name] if self.options.per_light else radiance
                 images |= {layer: whole, **exr.by_group(layer, self.groups, radiance)}
         return images if weights is None else {name: values * weights[:, None] for name, values in images.items()}
 
@@ -375,14 +385,16 @@ class TilePoints:
 
     def __init__(self, baker: ObjectBaker, tile: int, threads: int):
         options = baker.options
-        self._options, self._folder, self._tile, self._mapped = options, baker.folder, tile, baker.record["maps"]
+        self._options, self._folder, self._tile = options, baker.folder, tile
+        self._mapped = baker.record["maps"]
         self._width = baker.manifest["sampled_texels"]
         self._triangles = uv.UvTriangles.in_tile(baker.mesh.uv, *options.size, _column_and_row(tile))
         self._at_centers = bakes_centers_alone(options, baker.record)
         self.rest, size = {}, options.size
         if options.bounces == "on":
-            kinds = lightmap.rest_passes(options.passes)
-            self.rest = {kind: lightmap.read_rest(baker.folder, kind, tile, size) for kind in kinds}
+            rows = range(len(baker.groups) if options.per_light else 1)
+            keys = itertools.product(lightmap.rest_passes(options.passes), rows)
+            self.rest = {key: lightmap.read_rest(baker.folder, key, tile, size) for key in keys}
         # The points of a block are shaded one after another, so few blocks need to be cached.
         cached = functools.lru_cache(maxsize=2 + threads // options.sub_samples)
         self.texels, self._weights_of = cached(self._covered), cached(self._fitted_weights)
@@ -394,10 +406,11 @@ class TilePoints:
         the point, 1 on average (None: all points count alike).
         """
         texels = self.texels(first)
+        count = self._options.sub_samples
         if not self._mapped:
-            return self._triangles.spread(texels, point, self._options.sub_samples, self._width), None, None
+            return self._triangles.spread(texels, point, count, self._width), None, None
         maps = np.load(self._file(first, point))
-        if self._options.sub_samples == 1:
+        if count == 1:
             return texels, maps, None
         positions = self._positions(texels, maps, first, point)
         return self._triangles.at(texels, positions), maps, self._weights_of(first).at(positions)
@@ -408,9 +421,15 @@ class TilePoints:
         return self._triangles.corners
 
     def bounces(self, first: int, texels, color: np.ndarray) -> dict[str, np.ndarray]:
-        """Bounced light (Q, 3) by pass of the `texels` of the block from row `first` on, of the diffuse `color`."""
+        """Bounced light (R, Q, 3) by pass of the `texels` of the block from row `first` on, of the diffuse `color`.
+
+        It has a row for each light group with `per_light`, else one for all.
+        """
         at = texels.index + first * self._options.size[0]
-        light = {kind: image.reshape(-1, 3)[at] for kind, image in self.rest.items()}
+        light = {}
+        for (kind, _), image in self.rest.items():
+            light.setdefault(kind, []).append(image.reshape(-1, 3)[at])
+        light = {kind: np.array(rows) for kind, rows in light.items()}
         if "diffuse" in light:
             light["diffuse_light"], light["diffuse"] = light["diffuse"], color * light["diffuse"]
         return light | {COMBINED: sum(light[name] for name in ("specular", "diffuse") if name in light)}
@@ -423,9 +442,11 @@ class TilePoints:
         if self.rest:
             baked = next(iter(self.rest.values()))[first : first + rows]
             return texels.baked(baked.reshape(-1, 3)[texels.index, 0] != np.float32(NOT_BAKED))
-        of_pass = f"cycles_{sorted(shaded_passes(self._options))[0]}_{self._tile}_{first}.npy"
-        baked = np.load(self._file(first, 0) if self._mapped else self._folder / of_pass, mmap_mode="r")
-        return texels.baked(baked[0].reshape(-1, 3)[texels.index, 0] != np.float32(NOT_BAKED))
+        path = self._file(first, 0)
+        if not self._mapped:
+            path = self._folder / f"cycles_{sorted(shaded_passes(self._options))[0]}_{self._tile}_{first}.npy"
+        baked = np.load(path, mmap_mode="r")[0].reshape(-1, 3)[texels.index, 0] != np.float32(NOT_BAKED)
+        return texels.baked(baked)
 
     def _file(self, first, point):
         return self._folder / f"maps_{self._tile}_{first}_{point}.npy"
@@ -494,15 +515,15 @@ def _first_samples(texel: np.ndarray) -> np.ndarray:
 
 
 def _report(options, manifest, records) -> dict:
-    problems = [record["problem"] for record in manifest["objects"] if record["problem"]]
+    problems = [line for record in manifest["objects"] for line in record["problems"]]
     lines = [line for record in manifest["objects"] for line in record["warnings"]]
     warnings = [*manifest["warnings"], *lines]
     if options.conservative:
         warnings += [
-            f"object {record['name']!r}: texels whose centers no face covers are left out, because Cycles bakes none "
+            f"{record['name']!r}: texels whose centers no face covers are left out, because Cycles bakes none "
             f"of them: leave out {'--error' if options.error else '--conservative, or bake its textures to images'}"
             for record in manifest["objects"]
-            if record["problem"] is None and bakes_centers_alone(options, record)
+            if record["folder"] and bakes_centers_alone(options, record)
         ]
     reasons = {record["name"]: record.get("unshaded", ()) for record in manifest["objects"]}
     for record in records:
@@ -518,12 +539,17 @@ def _report(options, manifest, records) -> dict:
             if share := 100 * tile["unbaked_texels"] / max(tile["texels"] + tile["unbaked_texels"], 1):
                 why = "because Cycles bakes nothing there: apply the modifiers"
                 warnings.append(f"{name}: {share:.3g} % of its texels are left out, {why}")
+            warnings += [
+                f"object {member!r} has no texel of the atlas: its islands are too small, or lie below others"
+                for member, texels in tile.get("member_texels", {}).items()
+                if not texels
+            ]
             if share := 100 * tile.get("dull_texels", 0) / max(tile["texels"], 1):
                 why = "have no diffuse color: the light that bounces there is reflected, which no lightmap holds"
                 warnings.append(f"{name}: {share:.3g} % of its texels {why}; bake the pass specular or combined")
             if not tile.get("denoiser", DENOISER).startswith(DENOISER):
                 warnings.append(f"{name}: {tile['denoiser']}")
-    return {
+    report = {
         "scene": str(options.scene),
         "frame": manifest["frame"],
         "size": list(options.size),
@@ -534,6 +560,10 @@ def _report(options, manifest, records) -> dict:
         "warnings": grouped(warnings),
         "versions": versions(manifest["blender_version"]),
     }
+    if options.per_light:
+        rows = rows_of_groups(lights_of(manifest["lights"]), manifest["light_settings"])
+        report |= {"light_rows": [asdict(row) for row in rows], "camera": manifest["camera"]}
+    return report
 
 
 def _darkness(record, reasons) -> tuple[list[str], list[str]]:
@@ -559,25 +589,3 @@ REPORT = {
     **dict.fromkeys(("problems", "warnings"), [str]),
     "versions": dict,
 }
-
-
-def summary(report: dict, seconds: dict) -> list[str]:
-    """Lines of text about the bake of one scene, camera and frame: a line per file, and the errors if there are any."""
-    lines = []
-    for record in report["objects"]:
-        for tile in record["tiles"].values():
-            took = seconds.get(tile["file"])
-            seconds_text = f"{took:>8.2f} s" if isinstance(took, NUMBER) else ""
-            lines.append(f"{tile['file']:<40}{tile['texels']:>10} texels{seconds_text}")
-            for pass_name, figures in tile.get("errors", {}).items():
-                for name, error in figures["techniques"].items():
-                    in_noise = (error.get("unbiased_squared_error") or 0.0) < 0.0
-                    beside = "in noise" if in_noise else percent(error.get("unbiased_error"))
-                    noise = f"(noise {percent(figures.get('noise'))})"
-                    lines.append(f"  {name + '.' + pass_name:<30}{beside:>10} beside Cycles {noise}")
-    return lines
-
-
-def brief(report: dict) -> list[str]:
-    """The lines of `summary` without times, under the name of the bake, for one of several."""
-    return [f"{report['name']}:", *(f"  {line}" for line in summary(report, {}))]

@@ -14,6 +14,7 @@ from ..imaging.exr import COMBINED, layer_name, parse_layer_name, writing_rows
 from ..imaging.seams import SeamFit
 from ..reading import NUMBER, file_name
 from ..scene import PASSES
+from .comparison import percent
 from .lighting import technique_names
 from .options import BakeOptions
 from .tasks import Records, contents_digest, options_digest
@@ -31,6 +32,7 @@ _ERRORS = {"unbiased_squared_error?": NUMBER | None, "unbiased_error?": NUMBER |
 TILE = {
     **dict.fromkeys(("texels", "unshaded_texels", "unbaked_texels", "covered_times", "overlapping_texels"), NUMBER),
     "is_lit": bool,
+    "member_texels?": {str: NUMBER},
     "texture?": file_name,
     "denoiser?": str,
     "dull_texels?": NUMBER,
@@ -99,18 +101,21 @@ class Planes:
         file.seek(4 * first * width)
         return np.frombuffer(file.read(4 * (last - first) * width), np.float32).reshape(-1, width)
 
-    def write(self, path: Path, margin: int, metadata, pictures, texture=None) -> None:
+    def write(self, path: Path, margin: int, header: tuple, pictures, texture=None) -> None:
         """Write the EXR with its margin filled, the ErrorPictures `pictures` (or None), and the `texture`.
 
+        `header` is the metadata, and the names of the channels that become half floats.
         `texture` is (path, layers): an EXR with the sum of these layers. None: no texture.
         """
-        height, width = self.shape
+        (height, width), (metadata, half) = self.shape, header
         rows = max(1, WRITTEN_TEXELS // width)
         for file in self._files.values():
             file.flush()
         with ExitStack() as files:
             # The files take their names in reverse order, the large one last: with it the tile counts as finished.
-            writer = files.enter_context(writing_rows(path, [*self.names, COVERAGE], (width, height), metadata))
+            writer = files.enter_context(
+                writing_rows(path, [*self.names, COVERAGE], (width, height), metadata, half=half)
+            )
             small = None
             if texture is not None:
                 small = files.enter_context(writing_rows(texture[0], "RGB", (width, height), metadata))
@@ -299,12 +304,17 @@ def applied_layers(options) -> list[str]:
     return [layer_name(next(iter(technique_names(options.techniques))), pass_name) for pass_name in passes]
 
 
-def apply_textures(scene: Path, output: Path, records: list[dict], layer: str, progress=None) -> str:
-    """Save a copy of the .blend whose objects show the textures of the report's `records`; returns its file name."""
-    from ..blender.process.bake import BakedTextures, apply_bake
+def bake_members(record: dict) -> list[str]:
+    """The names of the objects that a record of the report is about."""
+    return list(record.get("members", [record["name"]]))
+
+
+def apply_textures(scene: Path, output: Path, report: dict, layer: str, progress=None) -> str:
+    """Save a copy of the .blend whose objects show the textures of a bake's `report`; returns its file name."""
+    from ..blender.process.bake import ApplyJob, BakedTextures, apply_bake
 
     textures = []
-    for record in records:
+    for record in report["objects"]:
         if any("texture" not in tile for tile in record["tiles"].values()):
             raise ValueError(f"object {record['name']!r}: has no texture to show; run the job again with --apply")
         files = [
@@ -312,7 +322,30 @@ def apply_textures(scene: Path, output: Path, records: list[dict], layer: str, p
             for number, tile in record["tiles"].items()
         ]
         name = f"{record['name']} {layer}"
-        textures.append(BakedTextures(record["name"], record["uv"], name, files))
+        textures.append(BakedTextures(bake_members(record), record["uv"], name, files))
     path = output / f"{Path(scene).stem}_baked.blend"
-    apply_bake(scene, path, textures, progress=progress)
+    atlas = report["objects"][0].get("atlas")
+    apply_bake(ApplyJob(scene, path, textures, report["frame"], atlas), progress=progress)
     return path.name
+
+
+def summary(report: dict, seconds: dict) -> list[str]:
+    """Lines of text about the bake of one scene, camera and frame: a line per file, and the errors if there are any."""
+    lines = []
+    for record in report["objects"]:
+        for tile in record["tiles"].values():
+            took = seconds.get(tile["file"])
+            seconds_text = f"{took:>8.2f} s" if isinstance(took, NUMBER) else ""
+            lines.append(f"{tile['file']:<40}{tile['texels']:>10} texels{seconds_text}")
+            for pass_name, figures in tile.get("errors", {}).items():
+                for name, error in figures["techniques"].items():
+                    in_noise = (error.get("unbiased_squared_error") or 0.0) < 0.0
+                    beside = "in noise" if in_noise else percent(error.get("unbiased_error"))
+                    noise = f"(noise {percent(figures.get('noise'))})"
+                    lines.append(f"  {name + '.' + pass_name:<30}{beside:>10} beside Cycles {noise}")
+    return lines
+
+
+def brief(report: dict) -> list[str]:
+    """The lines of `summary` without times, under the name of the bake, for one of several."""
+    return [f"{report['name']}:", *(f"  {line}" for line in summary(report, {}))]

@@ -230,7 +230,7 @@ def _unit(job, output, tasks, finished, progress) -> tuple[str, dict] | None:
     }
     if job["applied_layer"] and report["objects"]:
         report["applied"] = bake_files.apply_textures(
-            Path(tasks[0].scene), output, report["objects"], job["applied_layer"], progress
+            Path(tasks[0].scene), output, report, job["applied_layer"], progress
         )
     name = " ".join(str(word) for word in (Path(tasks[0].scene).stem, *tasks[0].unit[1:]) if word is not None)
     return name, report if job["single"] else {"files": files, **report}

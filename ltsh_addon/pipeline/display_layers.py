@@ -13,10 +13,11 @@ from ..imaging.report import FILE, write_index
 from ..imaging.sheet import common_error_scale
 from ..scene import BAKE_PASSES, CYCLES, REFERENCE, TECHNIQUES, Progress
 from .comparison import against_cycles
-from .mixer import MIXER_FILE, light_pictures
+from .mixer import MIXER_FILE, MixerRow, baked_light_pictures, light_pictures, mixer_file
 from .relight import RELIGHT_SUFFIX, RelightData
 
 FOLDER = "images"
+OF_BAKES = "frame", "camera"  # facts about the pictures of lights of a bake, in its report
 LABELS = {CYCLES: "Cycles", **{name: technique.label for name, technique in TECHNIQUES.items()}}
 FILES = {"shade": "shade.exr", "compare": "compare.exr"}
 
@@ -42,15 +43,22 @@ def write(command: str, output: Path, report: dict, partial: str = "") -> Path:
     return folder
 
 
-def write_lights(folder: Path, arguments: Sequence[str], progress: Progress | None = None) -> None:
-    """Write the file of the light mixer into the `folder` of `write`, if the command with these `arguments` wrote
-    relight data; else remove an old one."""
-    path = folder / MIXER_FILE
+def write_lights(folder: Path, arguments: Sequence[str], report: dict, progress: Progress | None = None) -> None:
+    """Write the files of the light mixer into the `folder` of `write`, and remove others.
+
+    There are such where the command with these `arguments` and this `report` wrote relight data, or baked each light.
+    """
+    for path in folder.glob(f"*{MIXER_FILE}"):
+        path.unlink()
     if "--keep-visibility" in arguments:
         samples = Path(FILES[arguments[0]]).with_suffix(RELIGHT_SUFFIX)
-        light_pictures(RelightData.load(folder.parent / samples), progress).save(path)
-    else:
-        path.unlink(missing_ok=True)
+        light_pictures(RelightData.load(folder.parent / samples), progress).save(folder / MIXER_FILE)
+    rows = [MixerRow.of(row) for row in report.get("light_rows", ())]
+    tiles = (tile for record in report["objects"] for tile in record["tiles"].values()) if len(rows) > 1 else ()
+    facts = {name: report.get(name) for name in OF_BAKES}
+    for tile in tiles:
+        path = folder.parent / tile["file"]
+        baked_light_pictures(imaging.read_layers(path), rows, facts).save(folder / mixer_file(path.stem))
 
 
 def _group(path: Path, folder: Path, prefix: str, report: dict) -> dict:

@@ -31,38 +31,39 @@ def rest_passes(passes: set[str]) -> tuple[str, ...]:
     return tuple(kind for kind, wanted in kinds.items() if wanted & set(passes))
 
 
-def read_rest(folder: Path, kind: str, tile: int, size: tuple[int, int]) -> np.ndarray:
-    """Cycles' indirect light (H, W, 3) of a tile, NOT_BAKED where there is none."""
+def read_rest(folder: Path, key: tuple[str, int], tile: int, size: tuple[int, int]) -> np.ndarray:
+    """Cycles' indirect light (H, W, 3) of a tile, of a kind and row of lights, NOT_BAKED where there is none."""
     firsts = range(0, size[1], rest_rows(size))
-    return np.concatenate([np.load(folder / f"rest_{kind}_{tile}_{first}.npy") for first in firsts])
+    kind, row = key
+    return np.concatenate([np.load(folder / f"rest_{kind}_{row}_{tile}_{first}.npy") for first in firsts])
 
 
 def denoised_rest(
-    rest: dict[str, np.ndarray], guides: np.ndarray, islands: Islands, samples: int
-) -> tuple[dict[str, np.ndarray], str]:
-    """The light `rest` (H, W, 3) by kind, denoised, 0 where no island is; and what denoised it.
+    rest: dict[tuple[str, int], np.ndarray], guides: np.ndarray, islands: Islands, samples: int
+) -> tuple[dict[tuple[str, int], np.ndarray], str]:
+    """The light `rest` (H, W, 3) by kind and row of lights, each denoised by itself; and what denoised it.
 
-    `guides` (H, W, 6) are the diffuse color and the normal. Each kind had so many `samples`.
+    It is 0 where no island is. `guides` (H, W, 6) are the diffuse color and the normal. There are so many `samples`.
     """
     from ..blender.process.blender_process import denoiser_libraries
 
     canvas, is_covered = canvas_of(islands), islands.grid.triangle >= 0
     images = {}
-    for kind, light in rest.items():
+    for key, light in rest.items():
         is_lit = (light[..., 0] != np.float32(NOT_BAKED)) & is_covered
-        if kind == "diffuse":
+        if key[0] == "diffuse":
             is_lit &= guides[..., :3].max(axis=-1) > DULL
-        images[kind] = np.where(is_lit[..., None], light, 0.0), is_lit
+        images[key] = np.where(is_lit[..., None], light, 0.0), is_lit
     try:
         with open_denoiser(denoiser_libraries(), cores()) as denoiser:
-            done = {kind: _on_canvas(canvas, *one, guides, denoiser.guided) for kind, one in images.items()}
+            done = {key: _on_canvas(canvas, *one, guides, denoiser.guided) for key, one in images.items()}
             return done, denoiser.name
     except NoDenoiser as error:
 
         def smooth(light, albedo, normals):
             return smoothed(light, np.concatenate([albedo, normals, np.ones_like(light[..., :1])], axis=-1), samples)
 
-        done = {kind: _on_canvas(canvas, *one, guides, smooth) for kind, one in images.items()}
+        done = {key: _on_canvas(canvas, *one, guides, smooth) for key, one in images.items()}
         return done, f"its bounced light is smoothed along the surface, not denoised: {error}"
 
 

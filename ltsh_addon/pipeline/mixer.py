@@ -14,9 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from ..files import replacing
-from ..scene import Light, Progress, error_line, listed
+from ..imaging.exr import COMBINED, group_names, layer_name, parse_layer_name
+from ..scene import PASSES, Light, Progress, error_line, listed
 from ..visibility import Occluders
-from .lighting import Shadows, load_tables, shade_lights, trace_shadows
+from .lighting import Shadows, light_groups, load_tables, shade_lights, trace_shadows
 from .relight import GRAIN, RelightData, color_of
 
 MIXER_FILE = "lights.npz"
@@ -51,6 +52,11 @@ class MixerRow:
     group: str = ""  # light group of whose bounced light the row has a share
     share: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of this bounced light, per channel
 
+    @classmethod
+    def of(cls, record: dict) -> MixerRow:
+        """The row of a JSON record of its fields. Raises KeyError, TypeError."""
+        return cls(**{**record, **{name: tuple(record[name]) for name in ("lights", "color", "share")}})
+
 
 @dataclass(frozen=True)
 class LightPictures:
@@ -73,10 +79,7 @@ class LightPictures:
         try:
             with Path(path).open("rb") as file, np.load(file) as data:
                 facts, layers, alpha = json.loads(str(data["document"])), data["layers"], data["alpha"]
-            rows = tuple(
-                MixerRow(**{**row, **{name: tuple(row[name]) for name in ("lights", "color", "share")}})
-                for row in facts.pop("rows")
-            )
+            rows = tuple(map(MixerRow.of, facts.pop("rows")))
             if layers.ndim != 4 or layers.shape != (len(rows), *alpha.shape, 3):
                 raise ValueError(f"{len(rows)} rows, layers {layers.shape}, alpha {alpha.shape}")
         except (ValueError, KeyError, TypeError, AttributeError, EOFError, zipfile.BadZipFile) as error:
@@ -220,6 +223,37 @@ def moved_light(
     moved = replace(data, extraction=extraction, shadows=shadows, edges={})
     (layer,) = _layers(moved, table, [[0]], lambda share: progress(start + (1.0 - start) * share))
     return layer + bounced_light(data, row)
+
+
+def mixer_file(group: str) -> str:
+    """The name of the mixer's file of a group of pictures: of a baked texture, "" for the camera's picture."""
+    return f"{group}.{MIXER_FILE}" if group else MIXER_FILE
+
+
+def rows_of_groups(lights: Sequence[Light], settings: dict[str, list[float]]) -> list[MixerRow]:
+    """A row for each light group of `lights`, named as its layers; `settings` are those of light objects by name."""
+    groups = light_groups(lights)
+    members = [[light for light in lights if light.group == group] for group in groups]
+    rows = []
+    for name, some in zip(group_names(groups), members, strict=True):
+        names = tuple(dict.fromkeys(light.name for light in some))
+        known = {light: settings[light] for light in names if light in settings}
+        rows.append(MixerRow(name, names, tuple(color_of(some).tolist()), known))
+    return rows
+
+
+def baked_light_pictures(layers: dict[str, np.ndarray], rows: list[MixerRow], facts: dict) -> LightPictures:
+    """The pictures of the lights of a baked texture, with its `layers` by name, that was baked for each light.
+
+    They show all of its light, or the first of its passes where it has no such.
+    """
+    names = [parse_layer_name(name) for name in layers]
+    technique, first, _ = next(name for name in names if name[2])
+    passes = {pass_name for name, pass_name, group in names if group and name == technique}
+    whole = next((one for one in ({COMBINED}, set(PASSES)) if one <= passes), {first})
+    pictures = [sum(layers[layer_name(technique, name, row.name)].astype(np.float32) for name in whole) for row in rows]
+    alpha = np.ones(pictures[0].shape[:2], np.float32)
+    return LightPictures(tuple(rows), np.array(pictures), alpha, {**facts, "technique": technique, "notes": []})
 
 
 class Mixer:

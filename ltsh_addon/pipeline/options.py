@@ -78,12 +78,20 @@ def one_table(text: str) -> tuple[str, ...]:
     return (table(text),)
 
 
-def seconds(text: str) -> float:
-    """Seconds of a budget."""
-    value = real_number(text)
-    if not 0.0 < value < 1e9:
-        raise ValueError(f"budget is {text!r}, expected seconds of processor time, more than 0")
-    return value
+def amount(what: str, expected: str) -> Callable[[str], float]:
+    """The parser of numbers above 0; errors begin with `what`, such as "budget is"."""
+
+    def parse(text: str) -> float:
+        value = real_number(text)
+        if not 0.0 < value < 1e9:
+            raise ValueError(f"{what} {text!r}, expected {expected}, more than 0")
+        return value
+
+    return parse
+
+
+seconds = amount("budget is", "seconds of processor time")
+texels_per_metre = amount("texels per metre are", "a number")
 
 
 def passes(known: tuple[str, ...]) -> Callable[[str], tuple[str, ...]]:
@@ -171,6 +179,9 @@ shadow_rays = whole_number("shadow rays are", *SHADOW_RAYS)  # number of rays pe
 margin = whole_number("margin is", 0, MOST_MARGIN)  # width of the margin around islands in texels
 
 
+atlas = whole_number("atlas is", *TEXTURE_SIDES)  # texels on each side of the texture that all objects share
+
+
 def cycles_samples(text: str) -> int:
     """Number of samples of both halves of a Cycles reference together."""
     value = positive(text)
@@ -189,6 +200,21 @@ def view(text: str) -> tuple[float, ...] | str:
     if len(position) == 3 and all(abs(value) < 1e12 for value in position):
         return position
     raise ValueError(f"view is {text!r}, expected camera, above or a position such as 0,-4,1.5")
+
+
+def frame_number(text: str) -> int:
+    """One frame."""
+    numbers = frames(text)
+    if len(numbers) != 1:
+        raise ValueError(f"frame is {text!r}, expected one number")
+    return numbers[0]
+
+
+def picture_file(text: str) -> Path:
+    """The name of a file that exists."""
+    if not Path(text).is_file():
+        raise ValueError(f"picture {text!r}: no such file")
+    return Path(text)
 
 
 def folder(text: str) -> Path:
@@ -391,6 +417,20 @@ class BakeOptions(TaskOptions):
     size: tuple[int, int] = option(
         "--size", default=(1024, 1024), type=size, metavar="N", help="N or WxH in texels (default: 1024)"
     )
+    atlas: int | None = option(
+        "--atlas", default=None, type=atlas, metavar="N",
+        help="one texture of N x N texels for all objects, on a UV map Lightmap that is made for it, or on --uv",
+    )  # fmt: skip
+    texels_per_metre: float | None = option(
+        "--texels-per-metre",
+        default=None,
+        type=texels_per_metre,
+        metavar="D",
+        help="of the atlas (default: all that fit)",
+    )
+    unwrap: str = option(
+        "--unwrap", default="smart", choices=("smart", "faces"), help="atlas: by direction, or each face"
+    )
     sub_samples: int = option(
         "--aa", default=1, type=positive, metavar="N", help="points per texel, spread as in Cycles' bake; 1: centers"
     )
@@ -407,8 +447,13 @@ class BakeOptions(TaskOptions):
     shadows: str = _shadows()
     bounces: str = _bounces("bounced light")
     rest_samples: int = _rest_samples()
+    per_light: bool = flag("--per-light", "a layer for each light, with its bounced light, so that powers can change")
     apply: bool = flag("--apply", "also a texture of each object, and a copy of the .blend whose materials show it")
     resume: bool = option(default=False, matters=False)  # keep what the same job has finished
+
+    def __post_init__(self):
+        if self.atlas is not None:
+            object.__setattr__(self, "size", (self.atlas, self.atlas))
 
 
 @dataclass(frozen=True)
@@ -446,6 +491,34 @@ class RenderOptions(CameraOptions):
         "--denoise", default="on", choices=("on", "off"), help="what Cycles renders (default: %(default)s)"
     )
     keep_visibility: bool = flag("--keep-visibility", "also keep what `relight` needs, beside the EXR as .npz")
+    own_groups: tuple[str, ...] | None = option(default=None)  # lights, () for all, that get light groups of their own
+
+
+@dataclass(frozen=True)
+class MatchOptions(TaskOptions):
+    """Which lights should make the scene look like a picture; None means as in the file."""
+
+    frame: int | None = option("--frame", default=None, type=frame_number, metavar="F", help="default: the file's")
+    camera: str | None = option("--camera", default=None, metavar="NAME", help="default: the scene's camera")
+    target: Path = option(
+        "--target", default=Path(), type=picture_file, required=True, metavar="IMAGE",
+        help="the picture that the scene should look like, of the same camera",
+    )  # fmt: skip
+    target_view: str | None = option(
+        "--target-view", default=None, metavar="VIEW",
+        help="view transform of a target of 8 or 16 bits, such as Standard or AgX (default: the scene's)",
+    )  # fmt: skip
+    mask: Path | None = option(
+        "--mask", default=None, type=picture_file, metavar="IMAGE", help="white where the target counts, else black"
+    )
+    lights: tuple[str, ...] = option(
+        "--light", default=(), action="append", metavar="NAME", help="may be given several times; default: all"
+    )
+    colors: bool = flag("--colors", "also change the colors of lights, not only their powers")
+    techniques: tuple[str, ...] = _techniques(SHIPPED_TABLES, parse=one_table)
+    cycles_samples: int = option(
+        "--cycles-samples", default=256, type=cycles_samples, metavar="N", help="of Cycles (default: %(default)s)"
+    )
 
 
 # Derived from the declarations:
@@ -490,7 +563,10 @@ def _text(name, value) -> str:
 def what_matters(options: Any) -> dict[str, Any]:
     """The options on which the result depends."""
     values = asdict(options)
-    return {item.name: values[item.name] for item in fields(options) if item.metadata["matters"]}
+    matters = {item.name for item in fields(options) if item.metadata["matters"]}
+    if values.get("atlas") is not None:
+        matters.add("objects")
+    return {name: value for name, value in values.items() if name in matters}
 
 
 def child_job(kind: type, options: Any, **settings) -> Any:

@@ -138,7 +138,7 @@ def draw_view(options: ViewOptions, progress: Progress | None = None, is_playbla
             rest_job = child_job(view.RestJob, options, view=of_camera, samples=options.rest_samples)
             with second_blender() if is_playblast else nullcontext():
                 rest = view.render_rest(rest_job, folder, progress=progress)
-            job = replace(job, rest=folder / view.REST_PICTURE, is_everything=bool(rest["everything"]))
+            job = replace(job, rest=folder / view.REST_PICTURE, is_everything=rest["is_everything"])
             problems, rest_seconds = [rest["problem"]] * bool(rest["problem"]), time.perf_counter() - start
         manifest = view.draw_view(job, folder, progress=progress)
         manifest["warnings"] += problems

@@ -169,6 +169,7 @@ def shade_direct_light(
         reserve=(plan.FIRST_DENOISING_SECONDS + 2.0 * plan.NEXT_DENOISING_SECONDS) / 1e6,
         cycles_samples=0,
         for_finished=True,
+        own_groups=options.own_groups,
     )
     extraction = extract_pixels(job, progress=progress)
     clock.end("extraction", extraction.times.processor)

@@ -18,7 +18,7 @@ import numpy as np
 
 from ..imaging import write_json
 from ..reading import Malformed, check, file_name, read_json, some
-from ..scene import VERSION, Cancelled, Progress, shortened
+from ..scene import ATLAS, VERSION, Cancelled, Progress, shortened
 from .options import what_matters
 
 FOLDER = ".ltsh"
@@ -108,7 +108,7 @@ class BatchTask:
         """The job's options for this task."""
         options = replace(job.options, scene=Path(self.scene), camera=self.camera, frame=self.frame)
         if self.object is not None:
-            return replace(options, objects=(self.object,), name=self.stem)
+            return replace(options, objects=options.objects if options.atlas else (self.object,), name=self.stem)
         if job.command in ("view", "render"):
             return replace(options, name=self.name)
         return replace(options, name=self.name, page="report.html" if job.single else f"{self.name}.html")
@@ -204,10 +204,11 @@ def _tasks(job, unit, fields, facts, contents) -> list[BatchTask]:
     key = options_digest(job.command, replace(job.options, scene=Path(scene), camera=camera, frame=frame), contents)
     if job.command != "bake":
         return [BatchTask(str(scene), camera, frame, None, job.pattern.format(**fields), key)]
-    tasks, objects = [], list(dict.fromkeys(facts["objects"]))
+    is_atlas = job.options.atlas is not None
+    tasks, objects = [], [ATLAS] if is_atlas else list(dict.fromkeys(facts["objects"]))
     for name, stem in zip(objects, file_stems(objects), strict=True):
         stem = job.pattern.format(**fields, object=stem)
-        tiles = facts["tiles"].get(name, ())
+        tiles = () if is_atlas else facts["tiles"].get(name, ())
         tasks += [BatchTask(str(scene), camera, frame, name, f"{stem}.{tile}", key, tile) for tile in tiles]
         tasks += [] if tiles else [BatchTask(str(scene), camera, frame, name, stem, key)]
     return tasks

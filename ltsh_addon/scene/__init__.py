@@ -81,6 +81,8 @@ PASSES = ("specular", "diffuse")
 
 
 BAKE_PASSES = (*PASSES, "diffuse_light", "combined")
+# ATLAS: the UV map of an atlas, and the name of its texture among those of objects.
+ATLAS = "Lightmap"
 
 
 class Cancelled(Exception):

@@ -50,12 +50,12 @@ def test_wrong_values_are_misuse(capsys, child, room, out, arguments, complaint)
         (["compare", "room.blend", "-o", "out", "--cycles-samples", "1"], "expected at least 2"),
         (["compare", "room.blend", "-o", "out", "--cycles-samples", "0"], "'0' was given"),
         ("shad room.blend -o out".split(), "ltsh: command 'shad' is unknown (expected one of demo, compare, "
-         "shade, bake, view, render, relight, run, merge); see ltsh --help"),
+         "shade, bake, view, render, relight, match, run, merge); see ltsh --help"),
         ("shade room.blend -o out --techniqes ltc".split(), "ltsh shade: option --techniqes is unknown here; see ltsh "
          "shade --help"),
         ("shade room.blend -o out --techniqes=ltc".split(), "option --techniqes is unknown here"),
         ("shade room.blend -o out --cycles-samples 8".split(),
-         "--cycles-samples is unknown here (an option of demo, compare, bake, render)"),
+         "--cycles-samples is unknown here (an option of demo, compare, bake, render, match)"),
         ("shade room.blend -o out hall.blend".split(),
          "'hall.blend' is not expected here (name all files one after another); see"),
         ("demo room.blend -o out".split(), "ltsh demo: 'room.blend' is not expected here; see ltsh demo --help"),

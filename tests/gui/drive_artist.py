@@ -42,18 +42,12 @@ def main(rig):
     yield from saved(rig)
 
 
-def typed(rig, *names):
-    """Press keys with the mouse over the 3D view."""
-    yield from hands.over(rig)
-    yield from hands.keys(rig, *names)
-
-
 def new_scene(rig):
     """File > New by its shortcut; delete the point light."""
-    yield from typed(rig, "ctrl+n", "g")
+    yield from hands.typed(rig, "ctrl+n", "g")
     yield 3
     rig.check(set(bpy.data.objects.keys()) == {"Cube", "Light", "Camera"}, "File > New gives Blender's own scene")
-    yield from typed(rig, "n")
+    yield from hands.typed(rig, "n")
     yield 1
     rig.tab("LTSH")
     yield 2
@@ -61,10 +55,10 @@ def new_scene(rig):
     yield from click_light(rig, 0)
     rig.check(bpy.context.view_layer.objects.active.name == "Light", "a click in the list selects the light")
     rig.shot("artist_01_selected.png")
-    yield from typed(rig, "Delete")
+    yield from hands.typed(rig, "Delete")
     rig.check("Light" not in bpy.context.scene.objects, "Delete removes it")
     hands.select(rig, bpy.data.objects["Cube"])
-    yield from typed(rig, "Delete")
+    yield from hands.typed(rig, "Delete")
 
 
 def click_light(rig, row, right=NAME):
@@ -75,7 +69,7 @@ def click_light(rig, row, right=NAME):
 def added(rig, words):
     """Add an object by typing its name into the menu Add."""
     before = set(bpy.data.objects)
-    yield from typed(rig, "shift+a")
+    yield from hands.typed(rig, "shift+a")
     rig.xdo("type", words)
     yield 1.5
     rig.xdo("key", "Return")
@@ -88,7 +82,7 @@ def added(rig, words):
 def moved(rig, **axes):
     """Move the selected object by typing."""
     for axis, value in axes.items():
-        yield from typed(rig, "g", axis)
+        yield from hands.typed(rig, "g", axis)
         rig.xdo("type", "--", str(value))
         yield hands.CLICK_SECONDS
         yield from hands.keys(rig, "Return")
@@ -123,7 +117,7 @@ def objects_added(rig):
         ob = yield from added(rig, words)
         ob.name = name
         yield from moved(rig, **place)
-        yield from typed(rig, "s")
+        yield from hands.typed(rig, "s")
         rig.xdo("type", scale)
         yield hands.CLICK_SECONDS
         yield from hands.keys(rig, "Return")
@@ -202,13 +196,13 @@ def lights_changed(rig):
     rig.xdo("click", 1)
     yield hands.CLICK_SECONDS
     rig.check((key.location - place).length > 0.1, "the mouse drags the light")
-    yield from typed(rig, "s")
+    yield from hands.typed(rig, "s")
     rig.xdo("type", "1.5")
     yield hands.CLICK_SECONDS
     yield from hands.keys(rig, "Return")
     rig.check(abs(key.scale.x - 1.5) < 1e-3 and key.data.size == size, "typing resizes it")
     yield from at_rest(rig, "artist_05_dragged.png")
-    yield from typed(rig, "ctrl+z", "ctrl+z")
+    yield from hands.typed(rig, "ctrl+z", "ctrl+z")
     key = bpy.data.objects["Key"]
     rig.check((key.location - place).length < 1e-4 and abs(key.scale.x - 1.0) < 1e-4, "undo takes both back")
     full = yield from brightness(rig, "artist_06_all.png")
@@ -220,12 +214,12 @@ def lights_changed(rig):
     hidden = [name for name in names if bpy.data.objects[name].hide_render]
     rig.check(hidden == [name for name in names if name != "Fill"], f"which hides the others: {hidden}")
     alone = yield from brightness(rig, "artist_07_solo.png")
-    yield from typed(rig, "ctrl+z")
+    yield from hands.typed(rig, "ctrl+z")
     rig.check(not any(bpy.data.objects[name].hide_render for name in names), "undo brings them back")
     yield from click_light(rig, row, EYE)
     rig.check(bpy.data.objects["Fill"].hide_render, "a click on the eye mutes")
     muted = yield from brightness(rig, "artist_08_muted.png")
-    yield from typed(rig, "ctrl+z")
+    yield from hands.typed(rig, "ctrl+z")
     rig.check(not bpy.data.objects["Fill"].hide_render, "and undo unmutes")
     again = yield from brightness(rig, "artist_09_again.png")
     rig.fact("brightness of all, solo, muted, again", [round(value, 3) for value in (full, alone, muted, again)])
@@ -259,7 +253,7 @@ def beside_others(rig):
 
 def saved_as(rig):
     """Ctrl S asks for a name."""
-    yield from typed(rig, "ctrl+s")
+    yield from hands.typed(rig, "ctrl+s")
     yield from hands.saved_in(rig, rig.out, "artist.blend", "artist_12_saving.png")
 
 
@@ -284,8 +278,7 @@ def compared(rig):
     yield 1
     rig.shot("artist_12_presets.png")
     yield from hands.click_button(rig, DRAFT)
-    yield from hands.until(lambda: hands.settings().cycles_samples == 64)
-    rig.check(hands.settings().cycles_samples == 64, "the menu of presets has Draft")
+    yield from hands.comes(rig, lambda: hands.settings().cycles_samples == 64, "the menu of presets has Draft")
     # The menu stays open, and would take the next click.
     yield from hands.keys(rig, "Escape")
     yield 1
@@ -355,7 +348,7 @@ def baked(rig):
 
 
 def saved(rig):
-    yield from typed(rig, "ctrl+s")
+    yield from hands.typed(rig, "ctrl+s")
     yield 2
     rig.check(not bpy.data.is_dirty, "Ctrl S saves")
     bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)

@@ -3,6 +3,7 @@
 With `--blend` of a scene with a mirror or glass the pictures show what direct light alone does not.
 """
 
+import shutil
 import time
 
 import bpy
@@ -96,8 +97,18 @@ def main(rig):
     shade.objects.active = ob
     yield 2
     rig.check(rest()._wanted.version == before.version, "selecting renders nothing again")
-    child = rest()._process._child
+    child, opened = rest()._process._child, next(iter(module("engine.redraws").open_views))
     rig.check(child is not None and child.poll() is None, "the second Blender waits for changes")
+    bpy.ops.wm.save_mainfile()
+    yield 3
+    rig.check(list(module("engine.redraws").open_views) == [opened], "a save leaves the view of a preview")
+    rig.check(child.poll() is None and rest()._wanted.version == before.version, "nor is anything rendered again")
+    copied = shutil.copy(bpy.data.filepath, rig.out / "saved.blend")
+    with bpy.data.libraries.load(str(copied)) as (saved, wanted):
+        wanted.scenes = saved.scenes[:1]
+    rig.check(wanted.scenes[0].render.engine != "LTSH", "the file has the artist's engine")
+    bpy.data.scenes.remove(wanted.scenes[0])
+    yield from changed(rig, "move after a save", move)
     start = time.monotonic()
     view().bounces = False
     while child.poll() is None and time.monotonic() - start < 5:

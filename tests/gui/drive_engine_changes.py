@@ -4,13 +4,11 @@ two windows, another scene, another file.
 To be opened with the example scene.
 """
 
-from pathlib import Path
-
 import bpy
 import eyes
 import numpy as np
 from bpy_extras import view3d_utils
-from hands import close_window, keys, operate, over, select, until
+from hands import close_window, comes, file_copy, operate, select, typed
 
 SECONDS = 1800
 EXPOSURE = -1.5
@@ -77,15 +75,11 @@ def deleted_and_undone(rig, whole):
     select(rig, target)
     operate(rig, bpy.ops.ed.undo_push, message="Selected")
     name = target.name
-    yield from over(rig)
-    yield from keys(rig, "Delete")
-    yield from until(lambda: name not in bpy.data.objects)
-    rig.check(name not in bpy.data.objects, f"Delete removes {name}")
+    yield from typed(rig, "Delete")
+    yield from comes(rig, lambda: name not in bpy.data.objects, f"Delete removes {name}")
     yield from eyes.differs(rig, "changes_3_deleted.png", whole, "and the view no longer shows it")
-    yield from over(rig)
-    yield from keys(rig, "ctrl+z")
-    yield from until(lambda: name in bpy.data.objects)
-    rig.check(name in bpy.data.objects, "Ctrl Z brings it back")
+    yield from typed(rig, "ctrl+z")
+    yield from comes(rig, lambda: name in bpy.data.objects, "Ctrl Z brings it back")
     yield from eyes.same_again(rig, "changes_3_undone.png", whole, "and the picture is what it was")
 
 
@@ -215,8 +209,7 @@ def another_scene(rig):
 
 def another_file(rig):
     """A file is opened, and a new one begun, while the engine draws."""
-    other = str(Path(bpy.data.filepath).with_name("changes.blend"))
-    bpy.ops.wm.save_as_mainfile(filepath=other, copy=True)
+    other = file_copy()
     before = eyes.view_pixels(rig, "changes_8_before.png")
     for number in (1, 2):
         bpy.ops.wm.open_mainfile(filepath=other)

@@ -58,8 +58,7 @@ def chosen():
 def previewed(rig):
     """The preview by its button; undo and redo leave it."""
     yield from hands.click_button(rig, hands.PREVIEW)
-    yield from hands.until(lambda: shading(rig) == ("LTSH", "RENDERED"))
-    rig.check(shading(rig) == ("LTSH", "RENDERED"), "a click shows the preview")
+    yield from hands.comes(rig, lambda: shading(rig) == ("LTSH", "RENDERED"), "a click shows the preview")
     yield 3
     rig.shot("01_preview.png")
     yield from hands.over(rig)
@@ -87,8 +86,7 @@ def listed(rig):
     rig.shot("03_materials.png")
     yield from hands.click_button(rig, MATERIALS)
     tree.nodes.remove(noise)
-    yield from hands.until(lambda: not notes_of_views()[0], 60)
-    rig.check(not notes_of_views()[0], "and nothing when it is resolved again")
+    yield from hands.comes(rig, lambda: not notes_of_views()[0], "and nothing when it is resolved again", 60)
 
 
 def notes_of_views():
@@ -107,8 +105,7 @@ def completed(rig):
     yield from hands.click_button(rig, COMPLETE)
     rig.check(not eyes.view().complete, "a click leaves it, in a panel that is open")
     yield from hands.click_button(rig, hands.PREVIEW)
-    yield from hands.until(lambda: shading(rig)[1] == "SOLID")
-    rig.check(shading(rig)[1] == "SOLID", "a click ends the preview")
+    yield from hands.comes(rig, lambda: shading(rig)[1] == "SOLID", "a click ends the preview")
     yield SETTLE_SECONDS
 
 
@@ -143,8 +140,7 @@ def hidden(rig):
     yield from hands.click_button(rig, FIRST_LIGHT)
     light = bpy.context.view_layer.objects.active
     rig.check(light is not None and light.type == "LIGHT", f"a click in the list selects {light and light.name}")
-    yield from hands.over(rig)
-    yield from hands.keys(rig, "h")
+    yield from hands.typed(rig, "h")
     yield from hands.until(light.hide_get)
     rig.check(light.hide_get() and light.ltsh_light.mute, "H closes the eye of the light")
     yield 1
@@ -169,8 +165,7 @@ def cancelled(rig):
     rig.check("Cycles" in results.lacks(results.result_of(scene)), "what lacks is said while Cycles renders")
     yield 2
     rig.shot("06_comparing.png")
-    yield from hands.over(rig)
-    yield from hands.keys(rig, "Escape")
+    yield from hands.typed(rig, "Escape")
     yield from hands.until(lambda: hands.job() is None)
     rig.check(results.lacks(results.result_of(scene)) == "", "and not when nothing will come any more")
     yield 3
@@ -191,8 +186,7 @@ def mixed(rig):
     mix = hands.image_pixels("LTSH Comparison")
     rig.check(mix != plain and chosen().mode == "MIX", "a value shows the mix")
     rig.shot("09_mixed.png")
-    yield from hands.over(rig, "IMAGE_EDITOR")
-    yield from hands.keys(rig, "ctrl+z")
+    yield from hands.typed(rig, "ctrl+z", kind="IMAGE_EDITOR")
     yield from power_is(rig, 1.0, "undo takes it back")
     rig.check(hands.image_pixels("LTSH Comparison") == plain, "and the picture")
     rig.shot("10_undone.png")
@@ -288,8 +282,7 @@ def saved(rig):
     before = {command: operators.last_folder(scene, command).resolve() for command in commands}
     folder = rig.out / "elsewhere"
     folder.mkdir(exist_ok=True)
-    yield from hands.over(rig)
-    yield from hands.keys(rig, "ctrl+shift+s")
+    yield from hands.typed(rig, "ctrl+shift+s")
     yield from hands.saved_in(rig, folder, "renamed.blend")
     scene, results = bpy.context.scene, hands.module("ui.results")
     after = {command: operators.last_folder(scene, command).resolve() for command in commands}
@@ -344,8 +337,7 @@ def dark(rig):
     yield SETTLE_SECONDS
     for _ in [ob for ob in bpy.context.scene.objects if ob.type == "LIGHT"]:
         yield from hands.click_button(rig, FIRST_LIGHT)
-        yield from hands.over(rig)
-        yield from hands.keys(rig, "Delete")
+        yield from hands.typed(rig, "Delete")
         yield 1
     rig.check(not hands.module("ui.settings").lights_of(bpy.context.scene), "Delete removes the lights of the list")
     yield SETTLE_SECONDS

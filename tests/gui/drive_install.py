@@ -48,8 +48,7 @@ def dropped(rig):
     yield 2
     rig.shot("1_dropped.png")
     rig.xdo("key", "Return")
-    yield from hands.until(installed, 60)
-    rig.check(installed(), "the zip that was dropped is installed and enabled")
+    yield from hands.comes(rig, installed, "the zip that was dropped is installed and enabled", 60)
     rig.check((folder() / "blender_manifest.toml").is_file(), f"in {folder().parent.name}")
 
 
@@ -59,7 +58,7 @@ def used(rig):
     yield from hands.open_panel(rig)
     yield 2
     yield from hands.click_button(rig, hands.SHADE)
-    yield from hands.until(lambda: hands.job() is not None)
+    yield from hands.job_started(rig, "a click starts a job")
     yield from hands.wait_for_job(rig, 300)
     rig.check(len(hands.image_pixels("LTSH ltsh4c.combined")) > 0, "shading the camera view shows an image")
     yield 3
@@ -91,16 +90,14 @@ def click_there(rig, place):
 def disabled_and_enabled(rig, before):
     """By the checkbox, while the preview is seen."""
     yield from click_there(rig, CHECKBOX)
-    yield from hands.until(lambda: not installed(), 30)
-    rig.check(not installed(), "the checkbox disables the add-on")
+    yield from hands.comes(rig, lambda: not installed(), "the checkbox disables the add-on", 30)
     yield 2
     rig.shot("3_disabled.png")
     seen = bpy.context.scene.render.engine, rig.space.shading.type
     rig.check(seen == ("CYCLES", "SOLID"), f"the view shows what it did before the preview: {seen}")
     rig.check(not left(before), f"the disabled add-on leaves nothing: {left(before)}")
     yield from click_there(rig, CHECKBOX)
-    yield from hands.until(installed, 30)
-    rig.check(installed(), "the checkbox enables it again")
+    yield from hands.comes(rig, installed, "the checkbox enables it again", 30)
 
 
 def left(before):
@@ -127,21 +124,14 @@ def uninstalled(rig, before):
 def installed_from_disk(rig):
     yield from click_there(rig, MENU)
     yield from click_there(rig, INSTALL_FROM_DISK)
-    yield from hands.until(lambda: file_browser() is not None, 30)
+    yield from hands.until(lambda: hands.browser()[1] is not None, 30)
     yield 2
-    parameters = file_browser().params
+    window, area = hands.browser()
+    parameters = area.spaces.active.params
     parameters.directory, parameters.filename = str(HERE).encode(), zip_file().name
     yield 2
-    window = bpy.context.window_manager.windows[-1]
     rig.shot("6_from_disk.png")
     yield from hands.click(rig, window.x + window.width - 70, rig.size[1] - window.y - 21)
-    yield from hands.until(installed, 60)
-    rig.check(installed(), "Install from Disk installs and enables it")
+    yield from hands.comes(rig, installed, "Install from Disk installs and enables it", 60)
     yield 2
     rig.shot("7_installed.png")
-
-
-def file_browser():
-    """The newest window's file browser, or None."""
-    areas = bpy.context.window_manager.windows[-1].screen.areas
-    return next((area.spaces.active for area in areas if area.type == "FILE_BROWSER"), None)

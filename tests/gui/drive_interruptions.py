@@ -13,8 +13,7 @@ ENDING_SECONDS = 20.0
 
 def main(rig):
     hands.patient(rig)
-    other = str(Path(bpy.data.filepath).with_name("other.blend"))
-    bpy.ops.wm.save_as_mainfile(filepath=other, copy=True)
+    other = hands.file_copy()
     yield from hands.open_panel(rig)
     yield 1
     yield from during_the_preview(rig, other)
@@ -31,13 +30,7 @@ def copy_of_render():
 
 def gone(rig, folder, what):
     """Check that a folder goes."""
-    yield from hands.until(lambda: not folder.exists(), ENDING_SECONDS)
-    rig.check(not folder.exists(), f"nothing is left {what}")
-
-
-def typed(rig, *names):
-    yield from hands.over(rig)
-    yield from hands.keys(rig, *names)
+    yield from hands.comes(rig, lambda: not folder.exists(), f"nothing is left {what}", ENDING_SECONDS)
 
 
 def opened(rig, path):
@@ -62,23 +55,22 @@ def during_the_preview(rig, other):
     hands.operate(rig, bpy.ops.ed.undo_push, message="Selected")
     place = light.location.copy()
     x, y = hands.view_middle(rig)
-    yield from typed(rig, "g")
+    yield from hands.typed(rig, "g")
     for step in range(1, 6):
         rig.xdo("mousemove", x - 30 * step, y)
         yield 0.2
     rig.check((light.location - place).length > 0.01, "the mouse drags the light")
     yield from hands.keys(rig, "Escape")
     rig.check((light.location - place).length < 1e-6, "Escape puts it back")
-    yield from typed(rig, "Delete")
-    yield from hands.until(lambda: "Neon" not in bpy.context.scene.objects)
-    rig.check("Neon" not in bpy.context.scene.objects, "Delete removes it")
-    yield from typed(rig, "ctrl+z")
+    yield from hands.typed(rig, "Delete")
+    yield from hands.comes(rig, lambda: "Neon" not in bpy.context.scene.objects, "Delete removes it")
+    yield from hands.typed(rig, "ctrl+z")
     yield from hands.until(lambda: "Neon" in bpy.context.scene.objects)
     rig.check(engine() == "LTSH", "one undo brings the light back, and the preview stays")
     rig.shot("1_preview.png")
-    yield from typed(rig, "ctrl+z", "ctrl+z", "ctrl+z")
+    yield from hands.typed(rig, "ctrl+z", "ctrl+z", "ctrl+z")
     rig.check(engine() == "LTSH" and rig.space.shading.type == "RENDERED", f"undo leaves the preview on: {engine()}")
-    yield from typed(rig, "ctrl+shift+z", "ctrl+shift+z", "ctrl+shift+z")
+    yield from hands.typed(rig, "ctrl+shift+z", "ctrl+shift+z", "ctrl+shift+z")
     rig.check(engine() == "LTSH" and rig.space.shading.type == "RENDERED", f"so does redo: {engine()}")
     yield 0.5
     # While shadows are traced and the view is refined.
@@ -144,19 +136,19 @@ def during_a_bake(rig, other):
         job = hands.job()
         yield from hands.until(lambda job=job: job.stage != "Starting", 60)
         if what == "Escape":
-            yield from typed(rig, "Escape")
+            yield from hands.typed(rig, "Escape")
             yield from hands.until(lambda: hands.job() is None)
             rig.check(job.cancelled, "Escape ends it")
             bpy.data.objects["Neon"].data.energy = energy
         elif what == "undo":
-            yield from typed(rig, "ctrl+z")
+            yield from hands.typed(rig, "ctrl+z")
             rig.check(abs(bpy.data.objects["Neon"].data.energy - energy) < 1e-4, "undo reaches the light")
             yield from hands.wait_for_job(rig, 600)
             rig.check(not job.error and job.shown == 1, f"and the bake ends well: {job.error}")
             yield 1
             rig.check(hands.image_pixels("LTSH floor ltsh4c.combined") != (), "with its texture")
             rig.shot("4_baked.png")
-            yield from typed(rig, "ctrl+z")
+            yield from hands.typed(rig, "ctrl+z")
             rig.check("LTSH floor ltsh4c.combined" not in bpy.data.images, "one undo takes it away")
         else:
             yield from opened(rig, other)

@@ -6,15 +6,14 @@ import time
 from pathlib import Path
 
 import bpy
-from hands import job, keys, module, open_panel, over, settings, start_comparison, until
+from hands import file_copy, job, module, open_panel, settings, start_comparison, typed, until
 
 SECONDS = 400
 ENDING_SECONDS = 15.0
 
 
 def main(rig):
-    other = str(Path(bpy.data.filepath).with_name("other.blend"))
-    bpy.ops.wm.save_as_mainfile(filepath=other, copy=True)
+    other = file_copy()
     before = our_folders()
     yield from started(rig)
     stopped = job()
@@ -32,8 +31,7 @@ def main(rig):
     yield from until(lambda: running.stage != "Starting", 120)
     rig.shot("2_before_quitting.png")
     after_the_add_on(lambda: quit_was_clean(rig, running, before))
-    yield from over(rig)
-    yield from keys(rig, "ctrl+q")
+    yield from typed(rig, "ctrl+q")
     yield 30
     rig.check(False, "Ctrl Q quits")
 

@@ -4,7 +4,6 @@ a render region, local view, a light as camera, another file, the add-on disable
 import itertools
 import random
 import time
-from pathlib import Path
 
 import bpy
 import eyes
@@ -19,8 +18,7 @@ SAME_SECONDS = 60
 
 def main(rig):
     hands.patient(rig)
-    other = str(Path(bpy.data.filepath).with_name("other.blend"))
-    bpy.ops.wm.save_as_mainfile(filepath=other, copy=True)
+    other = hands.file_copy()
     # A picture that is there at once, and the same each time.
     bpy.context.scene.ltsh.shadows = eyes.view().bounces = False
     eyes.pixel_centers()
@@ -30,6 +28,7 @@ def main(rig):
     rig.shot("00_start.png")
     yield from undone_and_redone(rig)
     yield from added(rig)
+    yield from highlighted(rig)
     yield from looked_through(rig)
     yield from regions(rig)
     yield from second_window(rig)
@@ -76,8 +75,7 @@ def undone_and_redone(rig):
         if kind == "edit" or not 0 <= at + move < len(steps):
             at = yield from edited(rig, steps, at)
         else:
-            yield from hands.over(rig)
-            yield from hands.keys(rig, "ctrl+z" if kind == "undo" else "ctrl+shift+z")
+            yield from hands.typed(rig, "ctrl+z" if kind == "undo" else "ctrl+shift+z")
             at += move
         yield from hands.until(lambda at=at: heights() == steps[at])
         rig.check(heights() == steps[at], f"step {number}, {kind}: the light is where it was: {heights()}, {steps}")
@@ -96,8 +94,7 @@ def undone_and_redone(rig):
     rig.check(all(np.abs(one - other).max() > 0.02 for one, other in itertools.combinations(pictures.values(), 2)),
               "each place of the light has a picture of its own")  # fmt: skip
     yield from ended(rig, artist)
-    yield from hands.over(rig)
-    yield from hands.keys(rig, *["ctrl+z"] * len(steps), *["ctrl+shift+z"] * len(steps))
+    yield from hands.typed(rig, *["ctrl+z"] * len(steps), *["ctrl+shift+z"] * len(steps))
     rig.check(state(rig) == (artist, "SOLID", False), f"no undo and no redo brings it back: {state(rig)}")
     rig.shot("02_ended.png")
 
@@ -110,8 +107,7 @@ def view_alone(rig):
 
 def edited(rig, steps, at):
     """Move the light up by keys; the number of the state after it."""
-    yield from hands.over(rig)
-    yield from hands.keys(rig, "g", "z", "0", "period", "1", "Return")
+    yield from hands.typed(rig, "g", "z", "0", "period", "1", "Return")
     del steps[at + 1 :]
     steps.append(round(steps[at] + 0.1, 3))
     yield from hands.until(lambda: heights() == steps[-1])
@@ -137,8 +133,7 @@ def added(rig):
         rig.shot(f"04_adding_{end}.png")
         if end == "Escape":
             yield from hands.keys(rig, "Escape")
-            yield from hands.until(lambda: lights() == before)
-            rig.check(lights() == before, f"Escape takes it away: {lights()}")
+            yield from hands.comes(rig, lambda: lights() == before, lambda: f"Escape takes it away: {lights()}")
     rig.xdo("click", 1)
     yield 1
     ob = bpy.context.view_layer.objects.active
@@ -148,8 +143,7 @@ def added(rig):
     yield from hands.until(lambda: lights() == before)
     rig.check(lights() == before and state(rig)[2], f"one undo takes it back: {lights()}")
     yield from hands.keys(rig, "ctrl+shift+z")
-    yield from hands.until(lambda: name in lights())
-    rig.check(name in lights(), "and redo brings it")
+    yield from hands.comes(rig, lambda: name in lights(), "and redo brings it")
     # A copy that the mouse moves.
     hands.operate(rig, bpy.ops.ltsh.duplicate_light, "INVOKE_DEFAULT")
     yield from hands.over(rig, x=0.5, y=0.5)
@@ -165,6 +159,38 @@ def added(rig):
     rig.check(lights() == before | {name}, f"one undo takes the copy back: {lights()}")
 
 
+def highlighted(rig):
+    """Drag Highlight: the light follows the mouse over surfaces, Escape puts it back, a release leaves it, one undo
+    takes it back."""
+    ob = bpy.data.objects["Neon"]
+    hands.select(rig, ob)
+
+    def place():
+        return np.array(bpy.data.objects["Neon"].matrix_world).round(4).tolist()
+
+    before = place()
+    for end in ("Escape", "release"):
+        hands.operate(rig, bpy.ops.ltsh.drag_highlight, "INVOKE_DEFAULT")
+        yield from hands.over(rig, x=0.4, y=0.3)
+        rig.xdo("mousedown", 1)
+        yield from hands.until(lambda: place() != before)
+        first = place()
+        yield from hands.over(rig, x=0.35, y=0.22)
+        yield from hands.comes(rig, lambda first=first: place() not in (before, first), f"{end}: it follows the mouse")
+        yield 2
+        rig.shot(f"05_highlight_{end}.png")
+        if end == "Escape":
+            yield from hands.keys(rig, "Escape")
+            yield from hands.comes(rig, lambda: place() == before, lambda: f"Escape puts it back: {place()}")
+        rig.xdo("mouseup", 1)
+        yield 1
+    rig.check(place() != before, "a release leaves it")
+    yield from eyes.settled(rig, "05_highlight_left.png")
+    yield from hands.keys(rig, "ctrl+z")
+    yield from hands.comes(rig, lambda: place() == before, lambda: f"one undo takes it back: {place()}")
+    rig.check(state(rig)[2], "and the preview is on")
+
+
 def looked_through(rig):
     before = yield from eyes.settled(rig, "07_camera.png")
     ob = bpy.context.view_layer.objects.active
@@ -172,8 +198,7 @@ def looked_through(rig):
     hands.operate(rig, bpy.ops.ltsh.look_through_light)
     yield from eyes.differs(rig, "08_light.png", before, "a light is looked through")
     place = ob.matrix_world.copy()
-    yield from hands.over(rig)
-    yield from hands.keys(rig, "ctrl+alt+KP_2", "KP_6")
+    yield from hands.typed(rig, "ctrl+alt+KP_2", "KP_6")
     rig.check(ob.matrix_world != place and bpy.context.scene.camera == camera, "moving the view moves the light")
     hands.operate(rig, bpy.ops.ltsh.look_through_light)
     yield 1
@@ -197,13 +222,11 @@ def regions(rig):
     hands.select(rig, bpy.data.objects["floor"])
     space.region_3d.view_perspective = "PERSP"
     free = yield from eyes.settled(rig, "13_free.png")
-    yield from hands.over(rig)
-    yield from hands.keys(rig, "ctrl+b")
+    yield from hands.typed(rig, "ctrl+b")
     yield from hands.drag(rig, *((rig.region().x + x, hands.view_middle(rig)[1] + x // 2) for x in (200, 500)))
     rig.check(space.use_render_border, "Ctrl B draws a render region")
     yield from eyes.settled(rig, "14_border_free.png")
-    yield from hands.over(rig)
-    yield from hands.keys(rig, "ctrl+alt+b")
+    yield from hands.typed(rig, "ctrl+alt+b")
     yield from eyes.same_again(rig, "14_no_border.png", free, "the view is whole without it")
     hands.operate(rig, bpy.ops.view3d.localview, frame_selected=False)
     yield from eyes.differs(rig, "15_local.png", free, "local view shows one object")
@@ -211,8 +234,7 @@ def regions(rig):
     yield from eyes.same_again(rig, "16_not_local.png", free, "and all of them again")
     eyes.view().mode = "split"
     yield from eyes.settled(rig, "17_split.png")
-    yield from hands.over(rig)
-    yield from hands.keys(rig, "ctrl+z", "ctrl+shift+z")
+    yield from hands.typed(rig, "ctrl+z", "ctrl+shift+z")
     rig.check(state(rig) == ("LTSH", "RENDERED", True), f"undo in a split view: {state(rig)}")
     eyes.view().mode = "single"
     rig.camera_view()

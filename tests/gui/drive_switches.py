@@ -97,11 +97,9 @@ def closed(rig):
 
 def another_file(rig):
     engine = hands.module("engine.redraws")
-    path = str(Path(bpy.data.filepath).with_name("other.blend"))
     rig.space.shading.type = "RENDERED"
     before = [weakref.ref(view) for view in engine.open_views]
-    bpy.ops.wm.save_as_mainfile(filepath=path, copy=True)
-    bpy.ops.wm.open_mainfile(filepath=path)
+    bpy.ops.wm.open_mainfile(filepath=hands.file_copy())
     yield 1
     rig.check(not any(view() for view in before), "those of another file are gone when it is opened")
     gc.enable()

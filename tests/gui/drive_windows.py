@@ -63,8 +63,7 @@ def undone_while_it_runs(rig):
         light.data.energy = 3.0 * energy
         bpy.ops.ed.undo_push(message="Brighter")
     yield from hands.start_comparison(rig)
-    yield from hands.over(rig)
-    yield from hands.keys(rig, "ctrl+z")
+    yield from hands.typed(rig, "ctrl+z")
     yield from hands.until(lambda: bpy.data.objects[name].data.energy == energy)
     rig.check(bpy.data.objects[name].data.energy == energy, "Ctrl Z undoes the change of the light")
     rig.check(hands.job() is not None, "and the job goes on")
@@ -94,8 +93,7 @@ def own_window_closed(rig):
         rig.shot("5_job_in_the_first.png")
         rig.check(hands.job() is started, f"the window that is left goes on with it {end}")
         if end == "to Escape":
-            yield from hands.over(rig)
-            yield from hands.keys(rig, "Escape")
+            yield from hands.typed(rig, "Escape")
             yield from hands.until(lambda: hands.job() is None)
             rig.check(started.cancelled, "Escape ends it there")
         else:

@@ -3,6 +3,7 @@
 import importlib
 import subprocess
 import time
+from pathlib import Path
 
 import bpy
 
@@ -87,8 +88,7 @@ def select(rig, ob):
 
 def job_started(rig, what):
     """Wait for the job that was asked for."""
-    yield from until(lambda: job() is not None)
-    rig.check(job() is not None, what)
+    yield from comes(rig, lambda: job() is not None, what)
 
 
 def close_window(window):
@@ -169,6 +169,12 @@ def keys(rig, *names):
         yield CLICK_SECONDS
 
 
+def typed(rig, *names, kind="VIEW_3D"):
+    """Press `keys` with the mouse over an area."""
+    yield from over(rig, kind)
+    yield from keys(rig, *names)
+
+
 def over(rig, kind="VIEW_3D", which="WINDOW", x=0.3, y=0.5):
     """Put the mouse at a share of a region."""
     region = rig.region(kind, which)
@@ -206,9 +212,15 @@ def saved_in(rig, folder, name, shot=""):
     if shot:
         rig.shot(shot)
     yield from click(rig, window.x + window.width - SAVE[0], rig.size[1] - window.y - SAVE[1])
-    yield from until(lambda: bpy.data.filepath.endswith(name), 60)
-    rig.check(bpy.data.filepath.endswith(name), f"the file is saved: {bpy.data.filepath}")
+    yield from comes(rig, lambda: bpy.data.filepath.endswith(name), f"the file is saved as {name}", 60)
     yield 2
+
+
+def file_copy():
+    """The path of a copy of the file beside it."""
+    path = str(Path(bpy.data.filepath).with_name("other.blend"))
+    bpy.ops.wm.save_as_mainfile(filepath=path, copy=True)
+    return path
 
 
 def image_pixels(name):
@@ -222,6 +234,12 @@ def until(condition, seconds=15.0):
     end = time.monotonic() + seconds
     while not condition() and time.monotonic() < end:
         yield 0.02
+
+
+def comes(rig, condition, what, seconds=15.0):
+    """Wait for `condition()`, and check that it has come; `what` may be a function of what is said then."""
+    yield from until(condition, seconds)
+    rig.check(bool(condition()), what() if callable(what) else what)
 
 
 def wait_for_job(rig, seconds, shots=()):

@@ -21,9 +21,12 @@ BAKE = {
     "objects": ("Floor", "-Wall"), "uv": "-Map", "size": (128, 64), "sub_samples": 4, "margin": 3,
     "conservative": True, "view": (-1.0, 2.5, 0.0),
     "techniques": ("reference",), "passes": ("diffuse_light",),
-    "error": True, "cycles_samples": 32, "apply": True, "bounces": "on", "rest_samples": 16, "scripts": True,
+    "error": True, "cycles_samples": 32, "apply": True, "scripts": True,
+    "bounces": "on", "rest_samples": 16, "per_light": True,
     "shadows": "off", "shadow_rays": 16,
 }  # fmt: skip
+# Options that go together.
+ATLAS = {"atlas": 2048, "texels_per_metre": 20.0, "unwrap": "faces"}
 OF_A_TASK = {"scene", "output", "frame", "camera", "name"}
 KINDS = pytest.mark.parametrize(
     ("command", "kind", "values"), [("compare", CompareOptions, PICTURE), ("bake", BakeOptions, BAKE)]
@@ -37,11 +40,11 @@ def parsed(command, words):
 
 @KINDS
 def test_the_command_line_gives_every_option_back(command, kind, values):
-    assert set(values) == set(arguments_of(kind)) - OF_A_TASK
+    assert set(values) == set(arguments_of(kind)) - OF_A_TASK - set(ATLAS)
     plain = kind(SCENE, OUT)
     assert parsed(command, command_line(plain)) == plain and len(command_line(plain)) == 3
     given = [*({name: value} for name, value in values.items()), values]
-    given += [{"objects": "selected"}, {"objects": "all"}] if kind is BakeOptions else []
+    given += [{"objects": "selected"}, {"objects": "all"}, {"atlas": 512}, ATLAS] if kind is BakeOptions else []
     for wanted in (kind(SCENE, OUT, **options) for options in given):
         assert parsed(command, command_line(wanted)) == wanted
 
@@ -60,6 +63,8 @@ def test_a_digest_holds_what_results_depend_on(command, kind, values):
     for name, value in values.items():
         changed = what_matters(replace(plain, **{name: value})) != what_matters(plain)
         assert changed is (name != "objects"), name  # each object is a task of its own
+    for name, value in ATLAS.items() if kind is BakeOptions else ():
+        assert what_matters(replace(plain, **{name: value})) != what_matters(plain)
     for name in ("scene", "output"):
         assert what_matters(replace(plain, **{name: Path("other")})) == what_matters(plain)
 

@@ -156,8 +156,12 @@ def _draw_lines(font: int, texts: ViewTexts, region, sides: dict[str, int], scal
     size, margin = TEXT_SIZE * scale, MARGIN * scale
     blf.size(font, size)
     free = region.width - sides["RIGHT"] - max(sides["LEFT"], sides["FLOAT"]) - 2.0 * margin
-    # Better no quiet line than one of broken words.
-    last = wrapped(last, free, width_of) if all(width_of(word) <= free for word in quiet.split()) else []
+    # Better no line than one of broken words, but for errors.
+    last, notes = (
+        [line for line in some if line[1] == ERROR_COLOR or all(width_of(word) <= free for word in line[0].split())]
+        for some in (last, notes)
+    )
+    last = wrapped(last, free, width_of)
     right, bottom = region.width - sides["RIGHT"] - margin, sides["BOTTOM"] + margin
     most = int((region.height - sides["TOP"] - bottom) / (LINE * size)) - len(last)
     lines = [*(wrapped(notes, free, width_of)[: max(most, 0)] if free > size else []), *last]
@@ -241,11 +245,6 @@ class LTSH_GGT_left_out(bpy.types.GizmoGroup):
 REACH = 8.0  # pixels of an unscaled interface
 
 
-def is_split(context) -> bool:
-    """True in 3D views that show a split picture of the engine."""
-    return is_drawn(context) and context.scene.ltsh_view.mode == "split"
-
-
 class LTSH_GT_split(bpy.types.Gizmo):
     """A vertical line that moves sideways."""
 
@@ -285,7 +284,7 @@ class LTSH_GGT_split(bpy.types.GizmoGroup):
 
     @classmethod
     def poll(cls, context):
-        return is_split(context)
+        return is_drawn(context) and context.scene.ltsh_view.mode == "split"
 
     def setup(self, context):
         self.line = self.gizmos.new(LTSH_GT_split.bl_idname)

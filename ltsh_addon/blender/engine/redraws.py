@@ -40,15 +40,15 @@ class PixelSize:
         self._state, self._seconds, self._changed = None, 0.0, -MOVING_SECONDS
         self.step, self.is_new = 1, False  # is_new: its picture is not drawn yet
 
-    def follow(self, state: tuple, is_waiting: bool = False) -> int:
-        """The `step` of a view whose camera, surfaces and lights have this state, see `same_state`. If it `is_waiting`
-        for shadows or bounces, the whole picture, which holds them up, comes later."""
+    def follow(self, state: tuple, wait: float = 0.0) -> int:
+        """The `step` of a view whose camera, surfaces and lights have this state, see `same_state`. A whole picture,
+        which would hold up others, waits for so many seconds more."""
         before, is_first, has_changed = self.step, self._state is None, not same_state(state, self._state)
         self._state = state
         if has_changed:
             quick = next((one for one in STEPS if self._seconds <= FRAME_SECONDS * one**2), STEPS[-1])
             self.step, self._changed = 1 if is_first else quick, math.inf  # until it is drawn
-        elif time.monotonic() >= self.end + (WAITING_SECONDS if is_waiting and self.step > 1 else 0.0):
+        elif time.monotonic() >= self.end + (wait if self.step > 1 else 0.0):
             self.step = 1
         self.is_new |= has_changed or self.step != before
         return self.step

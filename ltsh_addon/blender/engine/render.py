@@ -20,10 +20,10 @@ from ...shading import TableError
 from ..materials.preview_material import world_radiance
 from ..render_settings import pass_names as names_in_files
 from ..render_settings import picture_size
-from ..saving import save_working_copy
+from ..saving import keeps_engine, save_working_copy
 from ..ui import comparison
 from ..ui.job import Plan, progress_text, session_times, stage_title
-from ..ui.preview import ENGINE
+from ..ui.preview import ENGINE, is_previewing
 from . import redraws
 from .final_picture import DEPTH, NORMAL, POSITION, FinalJob, FinalPicture, final_picture, pass_names
 from .view import EngineView
@@ -54,15 +54,15 @@ class LTSH_RenderEngine(bpy.types.RenderEngine):
 
     def view_update(self, context, depsgraph):
         """Take over what has changed in the scene."""
-        self._engine_view().update(context, depsgraph)
+        self._engine_view(context).update(context, depsgraph)
 
     def view_draw(self, context, depsgraph):
         """Draw the view."""
-        self._engine_view().draw(context, depsgraph)
+        self._engine_view(context).draw(context, depsgraph)
 
-    def _engine_view(self) -> EngineView:
+    def _engine_view(self, context) -> EngineView:
         if self._view is None:
-            self._view = EngineView()
+            self._view = _parked.pop(context.region.as_pointer(), None) or EngineView()
         return self._view
 
     # Final render:
@@ -279,11 +279,35 @@ def saved_copy() -> Path:
     return Path(_copy["folder"].name) / "scene.blend"
 
 
-HANDLERS = (("render_init", _save_copy), ("render_complete", _delete_copy), ("render_cancel", _delete_copy))
+# Views by their regions. Previews are saved with the artist's engine: Blender ends them, and begins them anew after it.
+_parked: dict[int, EngineView] = {}
+PARKED_SECONDS = 2.0
+
+
+@persistent
+def _park_views(*_) -> None:
+    """Let the views of previews outlast the save that begins."""
+    if not keeps_engine() and any(map(is_previewing, bpy.data.scenes)):
+        _parked.update({view.region: view for view in redraws.open_views})
+        bpy.app.timers.register(_let_parked_go, first_interval=PARKED_SECONDS)
+
+
+def _let_parked_go() -> None:
+    """End those that nothing shows any more."""
+    _parked.clear()
+
+
+HANDLERS = (
+    ("render_init", _save_copy),
+    ("render_complete", _delete_copy),
+    ("render_cancel", _delete_copy),
+    ("save_pre", _park_views),
+)
 register = _delete_copy
 
 
 def unregister() -> None:
     """End what goes on for views and renders."""
+    _parked.clear()
     redraws.stop()
     _delete_copy()

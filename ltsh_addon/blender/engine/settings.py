@@ -58,6 +58,12 @@ class LTSH_ViewSettings(bpy.types.PropertyGroup):
         description="What is not direct light, by Cycles and denoised: bounces, reflections, refraction, materials by "
         "nodes",
     )  # fmt: skip
+
+    @property
+    def shows_bounces(self) -> bool:
+        """True if views have bounces: neither passes alone, nor a picture beside that of Cycles."""
+        return self.bounces and self.shown == "combined" and (self.mode == "single" or self.second_technique != CYCLES)
+
     mode: bpy.props.EnumProperty(
         name="Mode", description="One technique or two", items=MODES, default="single", update=_redraw
     )

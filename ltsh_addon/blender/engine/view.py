@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from dataclasses import replace
 
@@ -36,6 +37,7 @@ class EngineView:
     """One 3D view with the engine."""
 
     def __init__(self):
+        self.region = 0  # the pointer of the one that it was drawn in last
         self._world = LiveWorld()
         self.mirror = self._new_mirror()
         self._renderer: ViewRenderer | None = None
@@ -91,7 +93,7 @@ class EngineView:
 
     def draw(self, context, depsgraph) -> None:
         """Draw into the region of `context`, and ask to be drawn again while the picture can be refined."""
-        start, target = time.monotonic(), gpu.state.active_framebuffer_get()
+        start, target, self.region = time.monotonic(), gpu.state.active_framebuffer_get(), context.region.as_pointer()
         if not _has_drawn[0]:
             _has_drawn[0] = True
             _clear(target)
@@ -119,10 +121,10 @@ class EngineView:
     def _redraw_later(self, start: float, has_failed: bool) -> None:
         """Ask for the next picture after the one that began at `start`. News of shadows and bounces come before."""
         size = self._pixel_size
+        moment = self._held_until if size.step == 1 else size.end + self._wait
         if has_failed:
             return
-        if size.step > 1 or self._holds_up:
-            moment = self._held_until if size.step == 1 else size.end + redraws.WAITING_SECONDS * self._is_waiting
+        if size.step > 1 or time.monotonic() < moment:
             redraws.redraw_at(max(moment, time.monotonic() + redraws.POLL_SECONDS))
         elif self._renderer.samples < redraws.REFINEMENTS and not (self._draws_shadows and self._shadows.waits):
             redraws.redraw_later(start, self._renderer.samples)
@@ -145,9 +147,9 @@ class EngineView:
         if has_news:  # it is shown at once, with the points that there are
             points = points[: max(self._renderer.samples, 1)]
         size, started = (region.width, region.height), time.monotonic()
-        is_waiting = has_news or self._is_waiting
-        self._renderer.step = self._pixel_size.follow(_state_of(self.mirror, camera, size), is_waiting)
-        self._shadows.hold(self._holds_up)
+        wait = math.inf if has_news else self._wait
+        self._renderer.step = self._pixel_size.follow(_state_of(self.mirror, camera, size), wait)
+        self._shadows.hold(time.monotonic() < self._held_until)
         self._renderer.draw(self.mirror, camera, size, shown, target, points)
         if self._pixel_size.is_new:
             self._renderer.wait()
@@ -169,20 +171,15 @@ class EngineView:
         renderer.rest = self.rest.shown() if is_wanted else None
 
     @property
-    def _is_waiting(self) -> bool:
-        """True while the first shadows and bounces of this state are to come, which a whole picture would hold up."""
-        return self._shadows.is_busy or self.rest.is_new
+    def _wait(self) -> float:
+        """How many seconds a whole picture waits for the first shadows and bounces, which it would hold up."""
+        return redraws.WAITING_SECONDS if self._shadows.is_busy or self.rest.is_new else 0.0
 
     @property
     def _held_until(self) -> float:
         """The moment until which bounces come before further points of pixels and the last shadows. All share the
         processor where pictures take long."""
         return self._pixel_size.end + redraws.HELD_SECONDS if self._pixel_size.is_slow and self.rest.is_urgent else 0.0
-
-    @property
-    def _holds_up(self) -> bool:
-        """True if that is to come."""
-        return time.monotonic() < self._held_until
 
     @property
     def _draws_shadows(self) -> bool:

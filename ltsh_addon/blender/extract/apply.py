@@ -9,7 +9,10 @@ import bpy
 from ...scene import SceneError
 from ..materials.graph import cut, ensure_nodes, material_output
 from ..process.bake import ApplyJob, BakedTextures
+from ..render_settings import go_to_frame
 from ..saving import save_copy
+from .atlas import make_atlas
+from .bake_meshes import apply_modifiers
 from .pixels import open_scene
 
 GROUP_PREFIX = "LTSH Bake"
@@ -24,21 +27,39 @@ def apply_bake(job: ApplyJob, folder: Path, progress) -> dict:
     progress("open scene", 0.0)
     open_scene(Path(job.scene), warnings)
     path = Path(job.path)
+    restore_atlas(job)
     for fields in job.textures:
         entry = BakedTextures(**fields)
-        ob = bpy.data.objects.get(entry.object)
-        if ob is None:
-            raise SceneError(f"object {entry.object!r} is gone from {job.scene}")
-        show_texture(ob, entry)
+        show_texture(_objects(entry.objects, job), entry)
     bpy.context.preferences.filepaths.save_version = 0  # no backup of our own empty file there
     save_copy(path, relative_remap=True)
     return {"warnings": warnings}
 
 
-def show_texture(ob, entry: BakedTextures) -> None:
-    """Give `ob` copies of its materials that show its baked textures."""
-    restore_materials(ob)
-    _show(ob, _group(ob.name, _image(entry), entry.uv))
+def restore_atlas(job) -> None:
+    """Make the atlas of a job in the file that is opened: the one that was baked."""
+    if job.atlas is None:
+        return
+    go_to_frame(bpy.context.scene, job.frame)
+    objects = _objects(job.atlas["objects"], job)
+    apply_modifiers(bpy.context.scene, objects)
+    make_atlas(**{**job.atlas, "objects": objects})
+
+
+def _objects(names, job) -> list:
+    missing = [name for name in names if name not in bpy.data.objects]
+    if missing:
+        raise SceneError(f"object {missing[0]!r} is gone from {job.scene}")
+    return [bpy.data.objects[name] for name in names]
+
+
+def show_texture(objects, entry: BakedTextures) -> None:
+    """Give `objects` copies of their materials that show their baked textures."""
+    for ob in objects:
+        restore_materials(ob)
+    group = _group(entry.name.rpartition(" ")[0], _image(entry), entry.uv)
+    for ob in objects:
+        _show(ob, group)
 
 
 def shows_texture(ob) -> bool:

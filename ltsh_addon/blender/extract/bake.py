@@ -2,35 +2,38 @@
 
 from __future__ import annotations
 
+import itertools
 import shutil
 import tempfile
 import time
-from dataclasses import dataclass, field
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import bpy
 import numpy as np
 
 from ...cycles.gbuffer import rounded_positions
-from ...cycles.texels import NOT_BAKED, BakeView
+from ...cycles.texels import NOT_BAKED, BakeView, TexelMesh
 from ...cycles.uv import tiles_of
 from ...files import save_array
-from ...scene import error_line, light_records
+from ...scene import ATLAS, error_line, light_records
 from .. import render_settings
 from ..evaluated import rendered_surfaces, with_render_depsgraph
 from ..lights.area import collect_lights
 from ..lights.world import take_world
 from ..materials import aovs
-from ..materials.graph import ensure_nodes
+from ..materials.graph import cut, ensure_nodes
 from ..materials.maps import UV_MAP, MaterialPlan, SavedImages
 from ..process.bake import BakeFactsJob, BakeJob
 from ..render_settings import changed_properties, working_space
-from . import bake_meshes, pixels
+from . import atlas, bake_meshes, pixels
 from .occluders import collect_occluders, with_baked_shares
 from .pixels import OCCLUDERS, SEEDS, remove_occlusion
 
 # SAMPLED_TEXELS: width of the part of a texel over which Cycles' bake spreads its samples; the whole texel since 5.2.
 SAMPLED_TEXELS = 1.0 if bpy.app.version >= (5, 2, 0) else 0.5
+MOST_UV_MAPS = 8
 CYCLES_TYPES = {"specular": "GLOSSY", "diffuse": "DIFFUSE"}
 
 
@@ -56,30 +59,35 @@ class Block:
 
 
 class ObjectBake:
-    """Bakes maps of one object through Cycles, block by block."""
+    """Bakes maps of objects through Cycles, block by block. Several objects share the texture."""
 
-    def __init__(self, scene, ob, uv_name: str, plans: list[MaterialPlan]):
-        self.scene, self.ob, self.uv_name, self.plans = scene, ob, uv_name, plans
-        if uv_name not in ob.data.uv_layers:
-            raise bake_meshes.ObjectError(
-                f"object {ob.name!r}: its UV map {uv_name!r} is made by modifiers that make instances as well, where "
-                "textures cannot be baked: apply the modifiers"
-            )
-        active = ob.data.uv_layers.active_index
-        layer = ob.data.uv_layers.new(name=bake_meshes.UV_LAYER, do_init=False)
-        if layer is None:
-            raise bake_meshes.ObjectError(
-                f"object {ob.name!r} has eight UV maps, and baking needs one more: remove one"
-            )
-        ob.data.uv_layers.active_index = active
-        # Blender appends a number if the name is in use.
-        self.layer_name, self.images = layer.name, {}
+    def __init__(self, scene, uv_names: dict, plans: list[MaterialPlan]):
+        """`uv_names` has the UV map of each object to bake."""
+        self.scene, self.uv_names, self.plans = scene, uv_names, plans
+        for ob, uv_name in uv_names.items():
+            if uv_name not in ob.data.uv_layers:
+                raise bake_meshes.ObjectError(
+                    f"object {ob.name!r}: its UV map {uv_name!r} is made by modifiers that make instances as well, "
+                    "where textures cannot be baked: apply the modifiers"
+                )
+            if len(ob.data.uv_layers) == MOST_UV_MAPS:
+                raise bake_meshes.ObjectError(
+                    f"object {ob.name!r} has eight UV maps, and baking needs one more: remove one"
+                )
+        self.layer_name, self.images = bake_meshes.UV_LAYER, {}
+        while any(self.layer_name in ob.data.attributes for ob in uv_names):
+            self.layer_name += "_"
+        for ob in uv_names:
+            active = ob.data.uv_layers.active_index
+            ob.data.uv_layers.new(name=self.layer_name, do_init=False)
+            ob.data.uv_layers.active_index = active
         for plan in plans:
             plan.prepare(self.layer_name)
 
     def close(self) -> None:
-        """Remove the UV map, the nodes and the images."""
-        self.ob.data.uv_layers.remove(self.ob.data.uv_layers[self.layer_name])
+        """Remove the UV maps, the nodes and the images."""
+        for ob in self.uv_names:
+            ob.data.uv_layers.remove(ob.data.uv_layers[self.layer_name])
         for plan in self.plans:
             plan.remove()
         for image in self.images.values():
@@ -124,8 +132,9 @@ class ObjectBake:
         for plan in self.plans:
             plan.target(image)
         options = {"pass_filter": pass_filter} if pass_filter else {}
+        objects = list(self.uv_names)
         with bpy.context.temp_override(
-            scene=self.scene, active_object=self.ob, object=self.ob, selected_objects=[self.ob]
+            scene=self.scene, active_object=objects[0], object=objects[0], selected_objects=objects
         ):
             bpy.ops.object.bake(
                 type=kind, margin=0, use_clear=False, uv_layer=self.layer_name, target="IMAGE_TEXTURES",
@@ -142,10 +151,11 @@ class ObjectBake:
         return self.images[size]
 
     def _place(self, block):
-        layers = self.ob.data.uv_layers
-        uv = bake_meshes.uv_of(layers[self.uv_name], len(self.ob.data.loops)).astype(np.float64)
-        layers[self.layer_name].uv.foreach_set("vector", block.placed(uv).astype(np.float32).ravel())
-        self.ob.data.update()
+        for ob, uv_name in self.uv_names.items():
+            layers = ob.data.uv_layers
+            uv = bake_meshes.uv_of(layers[uv_name], len(ob.data.loops)).astype(np.float64)
+            layers[self.layer_name].uv.foreach_set("vector", block.placed(uv).astype(np.float32).ravel())
+            ob.data.update()
 
 
 def view_of(wanted, camera, bent: bool) -> BakeView:
@@ -177,20 +187,25 @@ class BakeScene:
     meshes: dict[str, bake_meshes.MeshFiles]
     problems: dict[str, str]
     lobes: dict[str, aovs.MaterialLobes]  # by full name of the material
+    densities: dict[str, float]  # texels per metre of the objects of an atlas that was made
     bounces: list[tuple]  # what `changed_properties` sets so that Cycles bakes the indirect light as the file has it
+    world: object  # of the file, or None
+    settings: dict[str, list[float]]  # of light objects, by name
     folder: tempfile.TemporaryDirectory = field(repr=False)
 
-    def plans(self, ob, images) -> tuple[list[MaterialPlan], list[str]]:
-        """The plan of each material slot of an object, and warnings about its materials."""
-        uv_names, made, warnings = set(self.meshes[ob.name].uv_names), {}, []
-        for slot in ob.material_slots:
-            material = slot.material
-            if material.name_full not in made:
-                lobes = self.lobes[material.name_full]
-                paths = tuple(leaf.groups for leaf in lobes.leaves)
-                made[material.name_full] = MaterialPlan(material, lobes.values, paths, images, uv_names)
-                warnings += lobes.warnings
-        return [made[slot.material.name_full] for slot in ob.material_slots], list(dict.fromkeys(warnings))
+    def plans(self, objects, images) -> tuple[dict[str, MaterialPlan], list[str]]:
+        """The plan of each material of `objects` by its full name, and warnings about them."""
+        made, warnings, uv_names = {}, [], {}
+        for ob in objects:
+            for slot in ob.material_slots:
+                known = uv_names.setdefault(slot.material, set(self.meshes[ob.name].uv_names))
+                known &= set(self.meshes[ob.name].uv_names)
+        for material, names in uv_names.items():
+            lobes = self.lobes[material.name_full]
+            paths = tuple(leaf.groups for leaf in lobes.leaves)
+            made[material.name_full] = MaterialPlan(material, lobes.values, paths, images, names)
+            warnings += lobes.warnings
+        return made, list(dict.fromkeys(warnings))
 
 
 _cached: dict[str, tuple] = {}
@@ -240,9 +255,16 @@ def _open(job: BakeJob) -> BakeScene:
         view_layer.material_override = None
     folder = tempfile.TemporaryDirectory(prefix="ltsh-meshes-", ignore_cleanup_errors=True)
     has_shadows = job.shadows == "on"
-    bake_meshes.apply_modifiers(scene, objects, job.uv)
+    bake_meshes.apply_modifiers(scene, objects)
+    for ob in objects if job.atlas else ():
+        atlas.make_single(ob)
+    densities, unfit, uv_name = {}, {}, job.uv
+    if job.atlas and job.uv is None:
+        uv_name = ATLAS
+        densities, unfit = atlas.make_atlas(objects, job.atlas, job.texels_per_metre, job.unwrap)
+    usable = [ob for ob in objects if ob.name not in unfit]
     files = Path(folder.name), has_shadows
-    inventory, meshes, problems, bare, lost = _inspect(scene, world, objects, job.uv, files)
+    inventory, meshes, problems, bare, lost = _inspect(scene, world, usable, uv_name, files)
     warnings += lost
     aovs.give_default_material(bare)
     lobes = _lobes([ob for ob in objects if ob.name in meshes], inventory.emitting_materials)
@@ -258,7 +280,6 @@ def _open(job: BakeJob) -> BakeScene:
         raise pixels.no_light(scene, inventory.warnings)
     if job.bounces == "off":
         render_settings.leave_out_objects(scene, inventory.left_out, warnings)
-    bounces.append((scene, "world", world))
     if job.cycles_samples:
         scene.world = inventory.world
     view = view_of(job.view, camera, bent=job.cycles_samples > 0)
@@ -268,20 +289,57 @@ def _open(job: BakeJob) -> BakeScene:
     name, names = camera.name if job.view == "camera" else "", [ob.name for ob in objects]
     if has_shadows:
         inventory.occluders.save(Path(folder.name) / OCCLUDERS)
-    of_objects = names, meshes, problems, lobes
-    return BakeScene(scene, name, view, inventory.lights, warnings, *of_objects, bounces, folder)
+    facts = names, meshes, problems | unfit, lobes, densities
+    lights = lights_by_row(scene, world, inventory.lights) if job.per_light else inventory.lights
+    return BakeScene(scene, name, view, lights, warnings, *facts, bounces, world, inventory.settings, folder)
 
 
 # BOUNCES: settings of Cycles on which indirect light depends, and which pictures of direct light switch off.
 BOUNCES = ("max_bounces", "sample_clamp_indirect", "blur_glossy", "caustics_reflective", "use_fast_gi")
+# GLOW: the row of all surfaces that glow. EMITTING: sockets that make surfaces glow, by node.
+GLOW = "Glowing surfaces"
+EMITTING = {"ShaderNodeEmission": "Strength", "ShaderNodeBsdfPrincipled": "Emission Strength"}
 
 
 def bounces_of(scene) -> list[tuple]:
     """The settings of the file, as for `changed_properties`, on which its indirect light depends."""
-    emission = [
-        (material.cycles, "emission_sampling", material.cycles.emission_sampling) for material in bpy.data.materials
-    ]
-    return [(scene.cycles, name, getattr(scene.cycles, name)) for name in BOUNCES] + emission
+    owners = [(scene.cycles, name) for name in BOUNCES]
+    owners += [(material.cycles, "emission_sampling") for material in bpy.data.materials]
+    return [(owner, name, getattr(owner, name)) for owner, name in owners]
+
+
+def lights_by_row(scene, world, lights: list) -> list:
+    """The lights with the group by whose name they are baked for themselves: their own, else one of their name."""
+    alone = {ob.name for ob in scene.objects if ob.type == "LIGHT"} | ({world.name} if world is not None else set())
+    return [replace(one, group=(one.group or one.name) if one.name in alone else GLOW) for one in lights]
+
+
+@contextmanager
+def lit_by(opened: BakeScene, row: str):
+    """Within this context only the lights of a `row` shine, and bounce as the file has it; "": all lights do."""
+    scene, world, dark, cuts = opened.scene, opened.world, [], []
+    if row:
+        names = {light.name for light in opened.lights if light.group == row}
+        dark = [ob for ob in scene.objects if ob.type == "LIGHT" and ob.name not in names]
+        world = world if world is not None and world.name in names else None
+        cuts = [] if row == GLOW else _glowing_sockets()
+    changes = [*opened.bounces, (scene, "world", world), *((ob, "hide_render", True) for ob in dark)]
+    links = [(link.from_socket, link.to_socket) for socket in cuts for link in socket.links]
+    for socket in cuts:
+        cut(socket)
+    try:
+        with changed_properties(changes + [(socket, "default_value", 0.0) for socket in cuts]):
+            yield
+    finally:
+        for source, socket in links:
+            socket.id_data.links.new(source, socket)
+
+
+def _glowing_sockets() -> list:
+    """The sockets by which surfaces glow, in materials and in groups."""
+    owners = [material.node_tree for material in bpy.data.materials] + list(bpy.data.node_groups)
+    nodes = [node for tree in owners if tree is not None and tree.type == "SHADER" for node in tree.nodes]
+    return [node.inputs[EMITTING[node.bl_idname]] for node in nodes if node.bl_idname in EMITTING]
 
 
 def _points_in_boxes(objects) -> np.ndarray:
@@ -362,19 +420,23 @@ def extract_bake(job: BakeJob, folder: Path, progress) -> dict:
     images = SavedImages(folder) if job.look_up_images else None
     if job.shadows == "on":
         shutil.copyfile(Path(opened.folder.name) / OCCLUDERS, folder / OCCLUDERS)
+    units = {ATLAS: opened.names} if job.atlas else {name: [name] for name in names}
     records = []
-    for number, name in enumerate(names):
-        record = {"name": name, "problem": opened.problems.get(name), "warnings": []}
-        if record["problem"] is None:
+    for number, (name, members) in enumerate(units.items()):
+        problems = [opened.problems[member] for member in members if member in opened.problems]
+        members = [member for member in members if member not in opened.problems]
+        record = {"name": name, "folder": None, "problems": problems, "warnings": []}
+        if members:
             try:
-                record |= _object(opened, name, images, job, folder / f"object_{number}", progress)
+                record |= _objects(opened, members, images, job, folder / f"object_{number}", progress)
             except (bake_meshes.ObjectError, RuntimeError) as error:
-                record["problem"] = error_line(error)
+                problems.append(error_line(error))
         records.append(record)
     return {
         "blender_version": bpy.app.version_string,
         "frame": opened.scene.frame_current,
         "lights": light_records(opened.lights),
+        "light_settings": opened.settings,
         "occluders": OCCLUDERS if job.shadows == "on" else None,
         "color_space": working_space(),
         "warnings": opened.warnings,
@@ -386,52 +448,67 @@ def extract_bake(job: BakeJob, folder: Path, progress) -> dict:
     }
 
 
-def _object(opened, name, images, job, folder, progress) -> dict:
-    """Write the files of one object into `folder`; returns its record."""
-    ob, read = bpy.context.view_layer.objects[name], opened.meshes[name]
-    plans, warnings = opened.plans(ob, images)
+def _objects(opened, names, images, job, folder, progress) -> dict:
+    """Write the files of objects that share a texture, or of a single one, into `folder`; returns their record."""
+    objects = [bpy.context.view_layer.objects[name] for name in names]
+    plans, warnings = opened.plans(objects, images)
+    numbers = {name: number for number, name in enumerate(plans)}
     folder.mkdir(parents=True, exist_ok=True)
-    shutil.copyfile(read.mesh, folder / "mesh.npz")
-    distinct = list({id(plan): plan for plan in plans}.values())
-    record = {"folder": folder.name, "uv": read.uv_name, "materials": [plan.record() for plan in plans]}
-    record["unshaded"] = [opened.lobes[slot.material.name_full].unshaded for slot in ob.material_slots]
-    record |= {"warnings": warnings, "receiver": int(ob.get(aovs.RECEIVER_PROPERTY, 0))}
-    used = sorted({texture.uv for plan in plans for texture in plan.textures})
+    meshes = []
+    for number, ob in enumerate(objects):
+        of_slots = np.array([numbers[slot.material.name_full] for slot in ob.material_slots])
+        mesh = TexelMesh.load(opened.meshes[ob.name].mesh)
+        receiver = int(ob.get(aovs.RECEIVER_PROPERTY, 0))
+        whole = (np.full(len(mesh.corners), value) for value in (mesh.mirrored, receiver, number))
+        meshes.append(TexelMesh(mesh.corners, mesh.normals, mesh.uv, of_slots[mesh.material], *whole))
+    joined = TexelMesh.joined(meshes)
+    joined.save(folder / "mesh.npz")
+    uv_name = opened.meshes[names[0]].uv_name
+    record = {"folder": folder.name, "uv": uv_name, "materials": [plan.record() for plan in plans.values()]}
+    record["unshaded"] = [opened.lobes[name].unshaded for name in plans]
+    record |= {"warnings": warnings, "members": {name: opened.densities.get(name) for name in names}}
+    made = {"side": job.atlas, "density": job.texels_per_metre, "unwrap": job.unwrap, "objects": list(opened.densities)}
+    record["atlas"] = made if opened.densities else None
+    used = sorted({texture.uv for plan in plans.values() for texture in plan.textures})
     record["uv_maps"] = {name: f"uv_{number}.npy" for number, name in enumerate(used)}
-    for uv_name, file in record["uv_maps"].items():
-        save_array(folder / file, read.uv_map(uv_name))
-    record["maps"] = any(plan.count for plan in distinct)
+    for name, file in record["uv_maps"].items():
+        maps = (opened.meshes[ob.name].uv_map(name, mesh) for ob, mesh in zip(objects, meshes, strict=True))
+        save_array(folder / file, np.concatenate(list(maps)))
+    record["maps"] = any(plan.count for plan in plans.values())
     if record["maps"] or job.cycles_samples or job.bounces == "on":
-        _bake(opened, ob, distinct, job, folder, progress)
+        finished = {tile for name, tile in job.finished if name == (ATLAS if job.atlas else names[0])}
+        tiles = [tile for tile in tiles_of(joined.uv)[0] if tile not in finished and job.tile in (None, tile)]
+        uv_names = {ob: opened.meshes[ob.name].uv_name for ob in objects}
+        bake = ObjectBake(opened.scene, uv_names, list(plans.values()))
+        _bake(bake, tiles, job, opened, (folder, progress))
     return record
 
 
-def _bake(opened, ob, plans, job, folder, progress) -> None:
-    """Write the maps and Cycles' bake of an object, for the wanted tiles that are not finished."""
-    read, points = opened.meshes[ob.name], job.sub_samples if any(plan.count for plan in plans) else 0
-    bake, has_bounces = ObjectBake(opened.scene, ob, read.uv_name, plans), job.bounces == "on"
+def _bake(bake, tiles, job, opened, files) -> None:
+    """Write the maps and Cycles' bake of the objects of an ObjectBake, and close it; `files`: folder, progress."""
+    points, has_bounces = job.sub_samples if any(plan.count for plan in bake.plans) else 0, job.bounces == "on"
+    name, (folder, progress) = ATLAS if job.atlas else next(iter(bake.uv_names)).name, files
     try:
-        with np.load(read.mesh) as data:
-            tiles = tiles_of(data["uv"])[0]
-        finished = {tile for name, tile in job.finished if name == ob.name}
-        wanted = [tile for tile in tiles if tile not in finished and job.tile in (None, tile)]
-        blocks, rest = (_blocks(job, wanted, count) for count in (job.block_rows, job.rest_rows))
+        blocks, rest = (_blocks(job, tiles, count) for count in (job.block_rows, job.rest_rows))
         for number, block in enumerate(blocks):
-            progress(f"bake {ob.name}", number / len(blocks))
+            progress(f"bake {name}", number / len(blocks))
             for point in range(points):
                 save_array(folder / f"maps_{block.name}_{point}.npy", bake.maps(block, point, points))
             for kind in job.passes if job.cycles_samples else ():
-                with changed_properties(opened.bounces if has_bounces else []):
+                with lit_by(opened, "") if has_bounces else nullcontext():
                     light = {"DIRECT", "INDIRECT"} if has_bounces else {"DIRECT"}
                     halves = bake.halves(block, kind, max(1, job.cycles_samples // 2), light)
                 save_array(folder / f"cycles_{kind}_{block.name}.npy", halves)
-        for number, block in enumerate(rest if has_bounces else ()):
-            for kind in job.rest_passes:
-                progress(f"bounces {ob.name}", number / len(rest))
-                with changed_properties(opened.bounces):
-                    light = {"INDIRECT", "COLOR"} if kind == "specular" else {"INDIRECT"}
-                    baked = bake.radiance(block, kind, (SEEDS["A"], job.rest_samples), light)
-                save_array(folder / f"rest_{kind}_{block.name}.npy", baked)
+        rows = list(dict.fromkeys(light.group for light in opened.lights)) if job.per_light else [""]
+        # One light by itself has less noise, since no sample goes to others.
+        samples = job.rest_samples if len(rows) == 1 else max(job.rest_samples // 2, 1)
+        steps = itertools.product(rest if has_bounces else (), enumerate(rows), job.rest_passes)
+        for number, (block, (row, light_name), kind) in enumerate(steps):
+            progress(f"bounces {name}", number / (len(rest) * len(rows) * len(job.rest_passes)))
+            with lit_by(opened, light_name):
+                light = {"INDIRECT", "COLOR"} if kind == "specular" else {"INDIRECT"}
+                baked = bake.radiance(block, kind, (SEEDS["A"], samples), light)
+            save_array(folder / f"rest_{kind}_{row}_{block.name}.npy", baked)
     finally:
         bake.close()
 

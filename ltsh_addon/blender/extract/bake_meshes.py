@@ -75,8 +75,10 @@ class MeshFiles:
     uv_names: tuple[str, ...]  # "" for the one that renders
     uv_maps: Path  # .npz of arrays (T, 3, 2), named by the position in `uv_names`
 
-    def uv_map(self, name: str) -> np.ndarray:
-        """The UV map `name` (T, 3, 2)."""
+    def uv_map(self, name: str, mesh: TexelMesh) -> np.ndarray:
+        """The UV map `name` (T, 3, 2) of the `mesh`; zeros if it has none of that name."""
+        if name not in self.uv_names:
+            return np.zeros_like(mesh.uv)
         with np.load(self.uv_maps) as data:
             return data[str(self.uv_names.index(name))]
 
@@ -150,71 +152,24 @@ def uv_of(layer, count):
     return read_values(layer.uv, "vector", (count, 2), np.float32)
 
 
-def apply_modifiers(scene, objects, uv_name: str | None) -> None:
-    """Replace the meshes of objects by evaluated ones where modifiers change the UV map or the materials.
+def apply_modifiers(scene, objects) -> None:
+    """Replace the meshes of objects by evaluated ones, except for modifiers that make instances as well.
 
-    Booleans, arrays with caps and geometry nodes can do so; Cycles' bake reads both from the object's own mesh.
+    Modifiers may change UV maps and materials, which Cycles' bake reads from the object's own mesh, and copy faces,
+    which need texels of their own in an atlas.
     """
-    probed = {}
-    for ob in objects:
-        if ob.type == "MESH" and ob.library is None and ob.data.library is None and len(ob.modifiers):
-            layer = ob.data.uv_layers.get(uv_name) if uv_name else ob.data.uv_layers.active
-            probed[ob] = "" if layer is None else _probe(ob.data, layer)
-    if not probed:
+    modified = [ob for ob in objects if ob.type == "MESH" and not (ob.library or ob.data.library) and len(ob.modifiers)]
+    if not modified:
         return
 
     def visit(depsgraph):
         instancers = {item.parent.original for item in depsgraph.object_instances if item.is_instance and item.parent}
-        return {
-            ob: _evaluated_copy(ob, depsgraph)
-            for ob, probe in probed.items()
-            if ob not in instancers and not _bakes_from_own_mesh(ob, depsgraph, uv_name, probe)
-        }
+        return {ob: _evaluated_copy(ob, depsgraph) for ob in modified if ob not in instancers}
 
-    made = with_render_depsgraph(scene, visit)
-    for ob, probe in probed.items():
-        if probe:
-            ob.data.uv_layers.remove(ob.data.uv_layers[probe])
-    for ob, mesh in made.items():
+    for ob, mesh in with_render_depsgraph(scene, visit).items():
         ob.data = mesh
         for modifier in [modifier for modifier in ob.modifiers if modifier.type != "PARTICLE_SYSTEM"]:
             ob.modifiers.remove(modifier)
-
-
-def _probe(mesh, layer) -> str:
-    """The name of a new UV map of `mesh`, a copy of `layer` moved as `Block.placed` does; "" if there is no room."""
-    name, active = layer.name, mesh.uv_layers.active_index
-    probe = mesh.uv_layers.new(name=UV_LAYER, do_init=False)
-    if probe is None:
-        return ""
-    mesh.uv_layers.active_index = active
-    probe.uv.foreach_set("vector", _probed(uv_of(mesh.uv_layers[name], len(mesh.loops))).ravel())
-    return probe.name
-
-
-def _probed(uv: np.ndarray) -> np.ndarray:
-    return (uv * (1.0, 4.0) - (0.0, 1.0)).astype(np.float32)
-
-
-def _bakes_from_own_mesh(ob, depsgraph, uv_name, probe: str) -> bool:
-    """True if the object's own mesh has the UV map and the materials with which it is rendered."""
-    evaluated = ob.evaluated_get(depsgraph)
-    if [slot.material and slot.material.original for slot in evaluated.material_slots] != [
-        slot.material for slot in ob.material_slots
-    ]:
-        return False
-    mesh = evaluated.to_mesh(preserve_all_data_layers=True, depsgraph=depsgraph)
-    try:
-        layers = mesh.uv_layers
-        layer = layers.get(uv_name) if uv_name else layers.active
-        if layer is None or not probe:
-            return layer is None or layer.name in ob.data.uv_layers
-        probe_layer, count = layers.get(probe), len(mesh.loops)
-        return probe_layer is not None and np.allclose(
-            uv_of(probe_layer, count), _probed(uv_of(layer, count)), atol=1e-4
-        )
-    finally:
-        evaluated.to_mesh_clear()
 
 
 def _evaluated_copy(ob, depsgraph):

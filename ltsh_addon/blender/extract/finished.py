@@ -12,6 +12,7 @@ import numpy as np
 
 from .. import render_settings
 from ..evaluated import SURFACE_TYPES
+from ..lights.groups import regroup
 from ..materials.aovs import give_default_material, objects_without_material
 from ..materials.bsdfs import emits, is_emission
 from ..materials.graph import cut, ensure_nodes, is_seen_through, material_output, shaders_behind, tree_in_use
@@ -52,6 +53,10 @@ def render_finished(job: FinishedJob, folder: Path, progress) -> dict:
     layer = render_settings.only_view_layer(scene, warnings, job.view_layer, "rendered")
     width, height = render_settings.set_resolution(scene, job.width, job.height)
     render_settings.render_border(scene)  # an error where it is less than a pixel
+    if job.own_groups is not None:
+        render_settings.remove_extra_passes(layer)
+        for name in regroup(scene, tuple(job.own_groups)):
+            layer.lightgroups.add(name=name)
     everything = reasons_for_cycles(scene, layer)
     dropped = () if layer.cycles.denoising_store_passes else NOT_WRITTEN
     _prepare(scene, layer, warnings)

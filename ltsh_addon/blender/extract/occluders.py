@@ -22,7 +22,7 @@ from ..evaluated import SURFACE_TYPES, image_pixels, is_rendered, owner_of
 from ..lights.emission import ObjectFacts, open_studio, trees_of
 from ..lights.linking import MOST_BLOCKER_SETS, OTHER_LIGHTS, Blockers
 from ..materials import maps, values
-from ..materials.graph import ADD, CLEAR, MIX, PRINCIPLED, Source, live_link, source_of, surface_of
+from ..materials.graph import ADD, CLEAR, MIX, PRINCIPLED, Source, is_displaced, live_link, source_of, surface_of
 from ..render_settings import cycles_setting
 from . import occluder_shapes as shapes
 
@@ -241,7 +241,7 @@ class _Collector:
                 if (share := overlap_within(meshes)) > LEAST_DOUBLED:
                     text = "of its faces where others are: Cycles is black there, here all are lit"
                     self._note(f"{_percent(share)} {text}", ob)
-                if any(material is not None and _is_displaced(material) for material in materials):
+                if any(material is not None and is_displaced(material) for material in materials):
                     self._note("displacement is not in shadows, which are off by its height: use a modifier", ob)
             self._shapes[key] = self._number(meshes), matrices
             self._remember_unread(instance, matrix, materials, self._shapes[key][0])
@@ -526,13 +526,6 @@ def _values_of_image(value: values.Value) -> np.ndarray | None:
     if colors_count and srgb:
         pixels[..., :3] = srgb_decode(pixels[..., :3])
     return pixels @ value.matrix[0].astype(np.float32) + np.float32(value.offset[0])
-
-
-def _is_displaced(material) -> bool:
-    surface = surface_of(material)
-    if surface is None or live_link(surface.node.inputs["Displacement"]) is None:
-        return False
-    return getattr(material, "displacement_method", "BUMP") != "BUMP"
 
 
 def _is_flat(light) -> bool:

@@ -14,6 +14,7 @@ from .. import render_settings
 from ..evaluated import SURFACE_TYPES, owner_of, read_values, rendered_surfaces, with_render_depsgraph
 from ..lights.area import LightInventory, collect_lights, note_overlaps, rendered_lights
 from ..lights.emission import LookTooLong
+from ..lights.groups import regroup
 from ..lights.meshes import SIDE_PROPERTY, let_light_through
 from ..lights.world import blocks_nothing, take_world, world_behind, world_lights
 from ..materials import aovs
@@ -336,6 +337,8 @@ def extract_pixels(job: PixelJob, folder: Path, progress) -> dict:
     render_settings.go_to_frame(scene, job.frame)
     camera = render_settings.choose_camera(scene, job.camera)
     view_layer = render_settings.choose_view_layer(scene, warnings, job.view_layer)
+    if job.own_groups is not None:
+        regroup(scene, tuple(job.own_groups))
     picture, for_finished = _picture(scene, job), job.for_finished
     # The points of a pixel give the depth of field. With a reference there is none: its lens points would differ.
     lens, fewest = camera.data.dof, FINISHED_LENS if for_finished else 2

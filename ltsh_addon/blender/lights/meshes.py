@@ -14,7 +14,7 @@ from ...cycles.patches import GRID, cut_into_patches, note_patches, split_light
 from ...cycles.planar_polygons import FlatPolygon
 from ...scene import Light, PolygonLight, QuadLight
 from ..evaluated import SURFACE_TYPES, EmitterTraits, RenderedSurface, is_rendered, read_values, surface_instancer
-from ..materials.graph import computed, ensure_nodes, fill_with_bsdf, live_link, material_output, mixed
+from ..materials.graph import computed, ensure_nodes, fill_with_bsdf, is_displaced, live_link, material_output, mixed
 from ..render_settings import changed_properties
 from .emission import (
     PIXELS,
@@ -122,12 +122,6 @@ def _mesh_light(ob, traits: EmitterTraits, override, receivers: Receivers, known
         receivers=receivers.of(ob.original),
     )
     return MeshLight(ob.original, light, materials, emission)
-
-
-def displaces(material) -> bool:
-    """True if something feeds the Displacement socket of `material`."""
-    output = material_output(material.node_tree)
-    return output is not None and live_link(output.inputs["Displacement"]) is not None
 
 
 def _placement(ob, matrix: np.ndarray, light: MeshLight, depsgraph) -> Placement | None:
@@ -240,7 +234,7 @@ def _warn_of_emission(mesh_light: MeshLight, warn) -> None:
     for material, emission in zip(mesh_light.materials, mesh_light.emission, strict=True):
         for problem in emission_warnings(emission, is_light=False) if emission.emits else ():
             warn(f"material {material.name!r}: {problem}")
-        if emission.emits and material.displacement_method != "BUMP" and displaces(material):
+        if emission.emits and is_displaced(material):
             warn(f"material {material.name!r}: it emits from where its faces are without displacement")
 
 

@@ -96,7 +96,7 @@ def lobes_of(material, emitter: bool) -> MaterialLobes:
     shaders = graph.shaders_behind(surface, tree_of=functools.cache(_own_tree))
     notes = notes_of_material(output, shaders, emitter)
     warnings = tuple(dict.fromkeys(f"material {material.name!r}: {note}" for note in notes))
-    is_displaced = material.displacement_method != "BUMP" and graph.live_link(output.inputs["Displacement"]) is not None
+    is_displaced = graph.is_displaced(material)
     left_to_cycles = BOTH if is_displaced else _passes_left_to_cycles(output, shaders)
     has_volume = graph.live_link(output.inputs["Volume"]) is not None
     traits = {"left_to_cycles": left_to_cycles, "has_volume": has_volume, "is_displaced": is_displaced}

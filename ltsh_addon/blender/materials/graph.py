@@ -83,6 +83,13 @@ def surface_of(data):
     return None if output is None else output.inputs["Surface"]
 
 
+def is_displaced(material) -> bool:
+    """True if the Displacement socket of `material` moves its surface, and not its normals alone."""
+    surface = surface_of(material)
+    is_fed = surface is not None and live_link(surface.node.inputs["Displacement"]) is not None
+    return is_fed and material.displacement_method != "BUMP"
+
+
 def group_output(tree):
     """The Group Output in use of a group's `tree`, or None."""
     for node in tree.nodes:

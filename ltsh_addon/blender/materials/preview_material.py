@@ -117,6 +117,10 @@ class PreviewMaterial:
         shines = self.glow > 0.0 or bool(np.any(self.emission))
         return not self.is_clear and (shines or bool(self.notes) or any(lobe.through > 0.0 for lobe in self.lobes))
 
+    def notes_in_view(self, with_bounces: bool) -> tuple[str, ...]:
+        """What views do not show of it as Cycles does. With bounces that is the light of what shines alone."""
+        return self.notes if self.glow > 0.0 or not with_bounces else ()
+
     @property
     def is_mirror(self) -> bool:
         """True for smooth metal, which shows what is around it."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from ...files import replacing_by_copy, temporary_folder
@@ -32,10 +32,14 @@ class BakeJob:
     tile: int | None = None  # the only UDIM tile to extract; None: all
     sub_samples: int = 1  # points of a texel that need maps
     shadows: str = "off"  # see `pixels.PixelJob`
+    atlas: int | None = None  # all objects share a texture with so many texels a side; without `uv` its map is made
+    texels_per_metre: float | None = None  # of the atlas; None: as many as fit
+    unwrap: str = "smart"  # "faces": every edge is a seam
     bounces: str = "off"  # "on": also Cycles' indirect light, and Cycles' bake has it too
     rest_samples: int = 64  # of Cycles for the indirect light
     rest_passes: tuple[str, ...] = ()  # with bounces: of the indirect light; the diffuse one has no color
     rest_rows: int = 1  # rows of texels of which it is baked at a time
+    per_light: bool = False  # each light by itself: its group is its own name, if it has none
 
 
 def extract_bake(job: BakeJob, folder: Path, *, progress: Progress | None = None) -> dict:
@@ -48,9 +52,9 @@ def extract_bake(job: BakeJob, folder: Path, *, progress: Progress | None = None
 
 @dataclass(frozen=True)
 class BakedTextures:
-    """The baked textures of one object."""
+    """The baked textures of an object, or of those that share an atlas."""
 
-    object: str
+    objects: list[str]
     uv: str  # the UV map on which they lie
     name: str  # of the image in Blender
     files: list[dict]  # {"path", "tile"} each
@@ -62,18 +66,19 @@ class ApplyJob:
 
     scene: Path
     path: Path
-    textures: list[dict]  # fields of `BakedTextures`
+    textures: list[BakedTextures]  # in the child their fields
+    frame: int | None = None
+    atlas: dict | None = None  # arguments of `extract.atlas.make_atlas`, the "objects" by name
 
 
-def apply_bake(
-    scene: Path, path: Path, textures: list[BakedTextures], *, progress: Progress | None = None
-) -> list[str]:
-    """Save a copy of `scene` as the .blend `path`, in which objects show baked textures; returns warnings.
+def apply_bake(job: ApplyJob, *, progress: Progress | None = None) -> list[str]:
+    """Save a copy of the scene as job.path, in which objects show baked textures; returns warnings.
 
     The copy appears complete or not at all. Raises as `pixels.extract_pixels` does.
     """
-    with replacing_by_copy(Path(path).absolute()) as unfinished, temporary_folder() as folder:
-        job = ApplyJob(Path(scene).absolute(), unfinished, [asdict(entry) for entry in textures])
+    with replacing_by_copy(Path(job.path).absolute()) as unfinished, temporary_folder() as folder:
+        textures = [asdict(entry) for entry in job.textures]
+        job = replace(job, scene=Path(job.scene).absolute(), path=unfinished, textures=textures)
         return run_job(job, folder, progress)["warnings"]
 
 

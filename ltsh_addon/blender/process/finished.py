@@ -31,6 +31,7 @@ class FinishedJob:
     cycles_samples: int | None
     seconds: float | None  # processor time, in place of samples
     scripts: bool = False  # run the scripts in the file
+    own_groups: tuple[str, ...] | None = None  # lights, () for all, that get light groups of their own
     edges: bool = True  # also render what emits in sight separately, with smooth edges
 
 

@@ -53,6 +53,7 @@ class PixelJob:
     shadows: str = "off"  # "on": also the occluders, which then block light in the Cycles reference, too
     for_finished: bool = False  # also what a finished picture leaves to Cycles; no light is needed
     seconds: float | None = None  # processor time for the whole picture, which limits its sub-samples
+    own_groups: tuple[str, ...] | None = None  # as in `finished.FinishedJob`
     reserve: float = 0.0  # the seconds of it that each pixel takes last, for denoising
 
 

@@ -158,13 +158,18 @@ class RestJob:
     scene: Path | None  # None: the one that the last job has opened
     view: RestView  # in the child a dict
     samples: int
-    seed: int = 0
+    seed: int = 0  # the samples that the sum has in all rows
     shrink: int = 1  # pixels of the view in either direction that share one
     rows: tuple[float, float] = (0.0, 1.0)  # the shares of the height between which it is rendered
     camera: str | None = None  # where the view has no matrices
     changes: dict | None = None  # of the scene that the last job has opened, see `viewport.rest.RestChanges`
     continues: bool = False  # the sum of the last job; else it is begun anew
     scripts: bool = False  # run the scripts in the file
+
+    @property
+    def total(self) -> int:
+        """The samples that the sum has in all rows after it."""
+        return self.seed + (self.samples if self.rows[1] == 1.0 else 0)
 
 
 @dataclass(frozen=True)
@@ -179,13 +184,8 @@ class RestSum:
     light: np.ndarray  # (H, W, 3)
     guides: np.ndarray  # (H, W, 7) albedo, normal and distance
     samples: int = 0
-    everything: tuple[str, ...] = ()  # why no light of the view itself remains
+    is_everything: bool = False  # no light of the view itself remains
     problem: str = ""  # of the denoiser
-
-    @classmethod
-    def of_size(cls, width: int, height: int) -> RestSum:
-        """No samples yet."""
-        return cls(*(np.zeros((height, width, count), np.float32) for count in (3, 7)))
 
     @property
     def ambient(self) -> tuple[float, ...]:
@@ -201,7 +201,7 @@ class RestSum:
         """
         channels = rendered_channels(path)
         light = read_layer(channels, "Combined", "RGB")
-        if not self.everything:
+        if not self.is_everything:
             keys = "specular_light", "specular_color", "diffuse_light", "diffuse_color", "background"
             specular, specular_color, diffuse, diffuse_color, background = (
                 read_layer(channels, names[key], "RGB") for key in keys
@@ -227,7 +227,7 @@ class RestSum:
 
 
 def render_rest(job: RestJob, folder: Path, *, progress: Progress | None = None) -> dict:
-    """Write what Cycles adds to the view of `job` as REST_PICTURE into `folder`; returns its manifest: "everything" and
-    "problem" as in `RestSum`, and "ambient". Needs a `shared_blender`. Raises as `pixels.extract_pixels` does."""
+    """Write what Cycles adds to the view of `job` as REST_PICTURE into `folder`; returns its manifest: "is_everything",
+    "problem" and "ambient" as of `RestSum`. Needs a `shared_blender`. Raises as `pixels.extract_pixels` does."""
     run_scene_job(job, folder, progress)
     return run_job(RestPictureJob(), folder, progress)

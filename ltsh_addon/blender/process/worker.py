@@ -50,6 +50,8 @@ JOBS = {
     "BakeJob": ("bake", "extract.bake", "extract_bake"),
     "BakeFactsJob": ("bake", "extract.bake", "scene_facts"),
     "ApplyJob": ("bake", "extract.apply", "apply_bake"),
+    "TargetJob": ("match", "extract.match", "read_target"),
+    "LightsJob": ("match", "extract.match", "save_lights"),
     "ViewJob": ("view", "viewport.still", "draw_view"),
     "RestJob": ("view", "viewport.rest", "render_rest"),
     "RestPictureJob": ("view", "viewport.rest", "denoise_rest"),

@@ -129,6 +129,7 @@ def bake_options(context, scene_file: Path) -> BakeOptions:
         shadow_rays=settings.shadow_rays,
         bounces="on" if settings.bake_bounces else "off",
         rest_samples=settings.bake_rest_samples,
+        per_light=settings.bake_per_light,
     )
 
 
@@ -247,6 +248,12 @@ def paces(measured: StageTimes) -> dict[str, float]:
     return {**by_kind, "": (seconds + PRIOR_SECONDS) / (cost + PRIOR_SECONDS)}
 
 
+def _with_step(times: StageTimes, step: Step, seconds: float) -> StageTimes:
+    """`times` and those of a step that took `seconds`."""
+    before = times.get(_kind(step.stage), (0.0, 0.0))
+    return {**times, _kind(step.stage): (before[0] + seconds, before[1] + step.cost)}
+
+
 class Plan:
     """Follows a job through its `steps` and estimates the time left, with the paces of the jobs `measured` before.
 
@@ -256,15 +263,11 @@ class Plan:
     def __init__(
         self, steps: Sequence[Step], now: Callable[[], float] = time.monotonic, measured: StageTimes | None = None
     ):
-        pace, self._asked, self._before = paces(measured or {}), tuple(steps), dict(measured or {})
-        self._steps = tuple(replace(step, cost=step.cost * pace.get(_kind(step.stage), pace[""])) for step in steps)
-        self._now = now
-        self._at, self._share = 0, 0.0
+        self._steps, self._now, self._paces = tuple(steps), now, paces(measured or {})
+        self._at, self._share, self._fraction = 0, 0.0, 0.0
         self._measured: dict[str, float] = {}
-        self._stage_times: StageTimes = {}
-        self._done_cost = self._done_seconds = 0.0
+        self._ended: StageTimes = {}
         self._started = self._stage_started = self._reported = now()
-        self._fraction = 0.0
 
     @property
     def number(self) -> int:
@@ -293,18 +296,14 @@ class Plan:
     def _end_step(self) -> None:
         step, seconds = self._steps[self._at], self._reported - self._stage_started
         self._measured[step.stage] = seconds
-        kind, cost = _kind(step.stage), self._asked[self._at].cost
-        before = self._stage_times.get(kind, (0.0, 0.0))
-        self._stage_times[kind] = before[0] + seconds, before[1] + cost
-        self._done_cost += step.cost
-        self._done_seconds += seconds
+        self._ended = _with_step(self._ended, step, seconds)
 
     def end(self, measured: StageTimes) -> None:
         """Note that the job has succeeded, and add the times of its stages to `measured`."""
         self._reported = self._now()
         if self._at == self.count - 1:
             self._end_step()
-        measured.update(self._stage_times)
+        measured.update(self._ended)
 
     def share(self) -> float:
         """The share of the whole job that is done, in [0, `MOST`]; it never falls."""
@@ -325,56 +324,42 @@ class Plan:
 
     def _known_and_guessed(self) -> tuple[float, float]:
         """Seconds left that rest on measurements, and those that are guessed by costs."""
-        measured = self._measured_costs()
-        step = self._steps[self._at]
+        running, *later = self._steps[self._at :]
+        done, since, times = self._reported - self._stage_started, self._stage_started, self._ended
+        is_followed = self._fraction >= LEAST_FRACTION and done >= LEAST_SECONDS
+        rest = self._expected(running, times)
+        if is_followed:
+            # What was expected counts less and less.
+            times, since = _with_step(times, running, done / self._fraction), self._reported
+            expected = self._measured.get(running.stage, done / self._fraction)
+            rest = (1.0 - self._fraction) * (done + (1.0 - self._fraction) * expected)
         seconds = {True: 0.0, False: 0.0}
-        seconds[self._is_followed or self._is_known(step, measured)] += self._rest_of_step(measured)
-        for step in self._steps[self._at + 1 :]:
-            seconds[self._is_known(step, measured)] += self._expected(step, measured)
+        # Between reports it decays exponentially and never reaches 0.
+        rest *= math.exp(-(self._now() - since) / rest) if rest > 0.0 else 0.0
+        seconds[is_followed or self._is_known(running, times)] += rest
+        for step in later:
+            seconds[self._is_known(step, times)] += self._expected(step, times)
         return seconds[True], seconds[False]
 
-    def _is_known(self, step: Step, measured: StageTimes) -> bool:
-        return step.stage in self._measured or _kind(step.stage) in {**measured, **self._before}
+    def _is_known(self, step: Step, times: StageTimes) -> bool:
+        return step.stage in self._measured or _kind(step.stage) in {**times, **self._paces}
 
-    def _expected(self, step: Step, measured: StageTimes) -> float:
+    def _expected(self, step: Step, times: StageTimes) -> float:
         """Expected seconds of a step: as the same stage took, else by its cost and the pace of its kind, or of all."""
-        seconds, cost = measured.get(_kind(step.stage), (0.0, 0.0))
-        pace = seconds / cost if seconds > 0.0 and cost > 0.0 else self._pace()
-        return self._measured.get(step.stage, step.cost * pace)
+        seconds, cost = times.get(_kind(step.stage), (0.0, 0.0))
+        guess = step.cost * seconds / cost if seconds > 0.0 and cost > 0.0 else self._prior(step) * self._pace()
+        return self._measured.get(step.stage, guess)
 
-    def _measured_costs(self) -> StageTimes:
-        """Measured seconds and costs by kind, with an estimate for the step that runs if it tells enough."""
-        costs: StageTimes = {}
-        for step in self._steps[: self._at + 1]:
-            seconds = self._measured.get(step.stage)
-            if step is self._steps[self._at]:
-                seconds = (self._reported - self._stage_started) / self._fraction if self._is_followed else None
-            if seconds is not None:
-                before = costs.get(_kind(step.stage), (0.0, 0.0))
-                costs[_kind(step.stage)] = before[0] + seconds, before[1] + step.cost
-        return costs
-
-    @property
-    def _is_followed(self) -> bool:
-        """True if the step that runs has told enough to estimate its length."""
-        return self._fraction >= LEAST_FRACTION and self._reported - self._stage_started >= LEAST_SECONDS
+    def _prior(self, step: Step) -> float:
+        """Seconds that a step would take by the jobs before."""
+        return step.cost * self._paces.get(_kind(step.stage), self._paces[""])
 
     def _pace(self) -> float:
-        """Seconds per cost over all steps; a step that takes longer than expected raises it at once."""
-        seconds, cost = self._done_seconds + PRIOR_SECONDS, self._done_cost + PRIOR_SECONDS
+        """By how much steps take longer than by the jobs before; one that is late raises it at once."""
+        seconds = PRIOR_SECONDS + sum(seconds for seconds, _ in self._ended.values())
+        cost = PRIOR_SECONDS + sum(self._prior(Step(kind, cost)) for kind, (_, cost) in self._ended.items())
         so_far = seconds + self._now() - self._stage_started
-        return max(seconds / cost, so_far / (cost + self._steps[self._at].cost))
-
-    def _rest_of_step(self, measured: StageTimes) -> float:
-        """Seconds left of the step that runs; between reports they decay exponentially and never reach 0."""
-        if self._is_followed:
-            # What was expected counts less and less.
-            done, since = self._reported - self._stage_started, self._reported
-            expected = self._measured.get(self._steps[self._at].stage, done / self._fraction)
-            rest = (1.0 - self._fraction) * (done + (1.0 - self._fraction) * expected)
-        else:
-            rest, since = self._expected(self._steps[self._at], measured), self._stage_started
-        return rest * math.exp(-(self._now() - since) / rest) if rest > 0.0 else 0.0
+        return max(seconds / cost, so_far / (cost + self._prior(self._steps[self._at])))
 
 
 @dataclass

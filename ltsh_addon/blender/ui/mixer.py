@@ -9,10 +9,14 @@ from typing import ClassVar
 import bpy
 import numpy as np
 
+from ...files import temporary_folder
+from ...pipeline.match import LightFactors, matched_factors
 from ...pipeline.mixer import MixerRow
 from ...scene import Cancelled, Light, SceneError, error_line, light_of, listed
 from ..evaluated import EmitterTraits
+from ..extract.match import is_telling, light_of_image
 from ..lights.area import area_light, reason_to_leave_out
+from ..lights.groups import reason_to_keep
 from ..lights.linking import Receivers
 from . import comparison, results
 from .panels import draw_text, gray, in_both_places, split_names
@@ -142,7 +146,7 @@ class _Mixer:
         split_names(layout, context)
         if not rows:
             layout.prop(settings, "keep_lights")
-            draw_text(layout, context, "Shade the picture with it: then its lights can be changed here", "INFO")
+            draw_text(layout, context, "Shade the picture with it, or bake Per Light: then lights change here", "INFO")
             return
         layout.template_list("LTSH_UL_mixer", "", settings, "mixed", settings, "mixed_active", rows=min(len(rows), 8))
         item = settings.mixed[settings.mixed_active] if settings.mixed_active < len(settings.mixed) else None
@@ -160,6 +164,12 @@ class _Mixer:
         row.operator("ltsh.reset_mixer", icon="LOOP_BACK")
         row.operator("ltsh.apply_mixer", icon="CHECKMARK")
         _draw_update(layout)
+        row = layout.row(align=True)
+        row.prop(settings, "match_target", text="")
+        row.operator("ltsh.paint_target", text="", icon="BRUSH_DATA")
+        row = layout.row(align=True)
+        row.operator("ltsh.match_target", icon="LIGHT")
+        row.prop(settings, "match_colors", toggle=True)
         for note in notes(context.scene):
             draw_text(gray(layout), context, note, "INFO")
 
@@ -181,7 +191,7 @@ def notes(scene) -> list[str]:
     texts, camera = list(facts["notes"]), scene.camera
     if facts["frame"] != scene.frame_current:
         texts.append(f"The picture is of frame {facts['frame']}, the scene is at frame {scene.frame_current}")
-    if camera is None or facts["camera"] != camera.name:
+    if facts["camera"] and (camera is None or facts["camera"] != camera.name):
         texts.append(f"The picture is of camera {facts['camera']}")
     return texts
 
@@ -199,7 +209,7 @@ class _NeedsMixer:
     @classmethod
     def poll(cls, context):
         if results.mixer_of(context.scene) is None:
-            cls.poll_message_set("Shade a picture first, with Keep Lights")
+            cls.poll_message_set("Shade a picture first, with Keep Lights, or bake Per Light")
             return False
         return True
 
@@ -262,14 +272,78 @@ def _reason_not_to_apply(ob, values, given: dict) -> str:
     """Why a light cannot get `values`; "" if it can. `given` are the values of the data of earlier lights."""
     if ob is None or ob.type != "LIGHT":
         return "not in the scene any more"
-    if ob.library is not None or ob.data.library is not None:
-        return "it is linked from another file"
-    animation = ob.data.animation_data
-    if animation is not None and (animation.action or len(animation.drivers)):
-        return "its settings are animated or driven"
+    if reason := reason_to_keep(ob):
+        return reason
     if given.setdefault(ob.data.name, values) != values:
         return "it shares its data with a light that got other values; make it a single user"
     return ""
+
+
+class LTSH_OT_paint_target(_NeedsMixer, bpy.types.Operator):
+    """Make a target to paint on: a copy of the picture as the mixer shows it"""
+
+    bl_idname = "ltsh.paint_target"
+    bl_label = "Paint a Target"
+    bl_options = {"UNDO"}
+
+    def execute(self, context):
+        pixels = results.mixed_pixels(context.scene)
+        image = bpy.data.images.new("LTSH Target", *pixels.shape[1::-1], float_buffer=True)
+        image.colorspace_settings.name = results.linear_space()
+        image.pixels.foreach_set(np.ascontiguousarray(pixels).ravel())
+        context.scene.ltsh.match_target = image
+        if context.area is not None and context.area.type == "IMAGE_EDITOR":
+            context.space_data.image, context.space_data.mode = image, "PAINT"
+        self.report({"INFO"}, f"Paint brighter, darker or colored light on {image.name!r}, then Match")
+        return {"FINISHED"}
+
+
+class LTSH_OT_match_target(_NeedsMixer, bpy.types.Operator):
+    """Give the lights the powers with which the picture comes closest to the target"""
+
+    bl_idname = "ltsh.match_target"
+    bl_label = "Match"
+    bl_options = {"UNDO"}
+
+    @classmethod
+    def poll(cls, context):
+        if context.scene.ltsh.match_target is None:
+            cls.poll_message_set("Choose a target, or paint one")
+            return False
+        return super().poll(context)
+
+    def execute(self, context):
+        scene, settings = context.scene, context.scene.ltsh
+        try:
+            result = match_mixer(scene, settings.match_target, settings.match_colors)
+        except SceneError as error:
+            self.report({"ERROR"}, error_line(error))
+            return {"CANCELLED"}
+        if settings.mode == "MIX":
+            comparison.changed(settings, context)
+        else:
+            settings.mode = "MIX"
+        before, after = 100.0 * result.before, 100.0 * result.after
+        self.report({"INFO"}, f"The picture is {after:.1f} % from the target, it was {before:.1f} % as rendered")
+        return {"FINISHED"}
+
+
+def match_mixer(scene, image, colors: bool) -> LightFactors:
+    """Set the mixer's lights so that its picture comes closest to `image`. Raises SceneError."""
+    mixer = results.mixer_of(scene)
+    layers, size = mixer.pictures.layers, mixer.pictures.alpha.shape[::-1]
+    if tuple(image.size) != size:
+        found = "x".join(map(str, image.size))
+        raise SceneError(f"image {image.name!r} is {found} pixels, expected {size[0]}x{size[1]} as the picture")
+    with temporary_folder() as folder:
+        target, encoded = light_of_image(image, scene, None, folder)
+    of_lights = np.array([bool(row.lights) for row in mixer.rows])
+    weights = is_telling(target, encoded).astype(np.float64)
+    target = np.where(weights[..., None] > 0.0, target, 0.0)
+    result = matched_factors(layers[of_lights], layers[~of_lights].sum(axis=0), target, weights, colors=colors)
+    names = [row.name for row in mixer.rows if row.lights]
+    results.set_factors(scene, dict(zip(names, result.factors, strict=True)))
+    return result
 
 
 class LTSH_OT_update_moved_lights(_NeedsMixer, bpy.types.Operator):
@@ -378,6 +452,8 @@ CLASSES = (
     LTSH_PT_IMAGE_mixer,
     LTSH_OT_reset_mixer,
     LTSH_OT_apply_mixer,
+    LTSH_OT_paint_target,
+    LTSH_OT_match_target,
     LTSH_OT_update_moved_lights,
     LTSH_OT_cancel_moved_lights,
 )

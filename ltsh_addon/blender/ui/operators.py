@@ -15,6 +15,8 @@ from bpy.app.translations import pgettext_iface as translated
 from bpy.props import EnumProperty, StringProperty
 
 from ...files import replacing
+from ...imaging.exr import write_channels
+from ...pipeline.bake_files import bake_members
 from ...scene import SceneError, error_line, listed
 from ..extract.apply import restore_materials, show_texture, shows_texture
 from ..process.bake import BakedTextures
@@ -145,7 +147,7 @@ class _JobOperator:
         if scene is None or job.shown == len(job.results):
             return False
         if not self._opened:
-            if not results.is_mixer_read(job.results[job.shown]):
+            if not results.is_mixer_read(scene, job.results[job.shown]):
                 return True
             results.show(scene, job.results[job.shown])
             self._opened = True
@@ -389,16 +391,18 @@ class LTSH_OT_apply_bake(bpy.types.Operator):
     def execute(self, context):
         result, gone, shown = last_bake(context.scene), [], []
         for record in result.report["objects"]:
-            ob = context.scene.objects.get(record["name"])
-            if ob is None:
-                gone.append(record["name"])
+            names = bake_members(record)
+            gone += [name for name in names if name not in context.scene.objects]
+            objects = [context.scene.objects[name] for name in names if name in context.scene.objects]
+            if not objects:
                 continue
             try:
-                show_texture(ob, baked_texture(result, record))
-            except (OSError, RuntimeError, KeyError) as error:
-                self.report({"ERROR"}, f"Object {ob.name!r} cannot show its texture ({error_line(error)}): bake again")
+                show_texture(objects, baked_texture(context.scene, result, record))
+            except (OSError, RuntimeError, KeyError, ValueError) as error:
+                name = objects[0].name
+                self.report({"ERROR"}, f"Object {name!r} cannot show its texture ({error_line(error)}): bake again")
                 continue
-            shown.append(ob.name)
+            shown += [ob.name for ob in objects]
         if gone:
             self.report({"WARNING"}, f"Not in the scene any more: {listed(map(repr, gone))}")
         if not shown:
@@ -438,10 +442,11 @@ def last_bake(scene):
     return result if result is not None and result.command == "bake" and result.report["objects"] else None
 
 
-def baked_texture(result, record: dict) -> BakedTextures:
-    """The texture of an object for `show_texture`: its combined light, or its first pass.
+def baked_texture(scene, result, record: dict) -> BakedTextures:
+    """The texture of an object for `show_texture`: the mix that is shown, else its combined light, or its first pass.
 
-    The pictures are copied to files of their own, which stay when the next bake replaces the pictures. Raises OSError.
+    The pictures are copied to files of their own, which stay when the next bake replaces the pictures. Raises OSError,
+    ValueError.
     """
     files = []
     for number, tile in record["tiles"].items():
@@ -451,10 +456,14 @@ def baked_texture(result, record: dict) -> BakedTextures:
         source = result.folder / group["files"][layer]
         name = f"{stem}.{layer}" if len(record["tiles"]) == 1 else f"{stem.rpartition('.')[0]}.{layer}.{number}"
         path = result.folder.parent / f"{name}.exr"
-        with replacing(path) as temporary:
-            shutil.copyfile(source, temporary)
+        mixture = results.mixed_texture(scene, result, stem)
+        if mixture is None:
+            with replacing(path) as temporary:
+                shutil.copyfile(source, temporary)
+        else:
+            write_channels(path, {letter: mixture[..., number] for number, letter in enumerate("RGB")})
         files.append({"path": str(path), "tile": int(number)})
-    return BakedTextures(record["name"], record["uv"], f"{record['name']} {layer}", files)
+    return BakedTextures(bake_members(record), record["uv"], f"{record['name']} {layer}", files)
 
 
 class LTSH_OT_manual(bpy.types.Operator):

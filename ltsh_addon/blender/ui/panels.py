@@ -247,6 +247,12 @@ class _Bake:
         column.prop(settings, "bake_bounces")
         if settings.bake_bounces:
             column.prop(settings, "bake_rest_samples")
+        column.prop(settings, "bake_per_light")
+        if settings.bake_per_light and settings.bake_bounces:
+            count = len([ob for ob in context.scene.objects if ob.type == "LIGHT" and not ob.hide_render])
+            rows = count + (context.scene.world is not None)
+            text = translated("{} lights: bounces take {:g} times as long").format(rows, max(0.5 * rows, 1.0))
+            draw_text(gray(column), context, text, "INFO")
         column.prop(settings, "bake_error")
 
 
@@ -402,6 +408,7 @@ class _Lights(_Entries):
         row, ob = layout.row(align=True), active_light(context)
         is_pressed = looks_through(view_of(context)) is not None
         row.operator("ltsh.look_through_light", text="", icon="OUTLINER_OB_CAMERA", depress=is_pressed)
+        row.operator("ltsh.drag_highlight", text="", icon="LIGHT_POINT")
         row.operator("ltsh.add_light", icon="ADD")
         row.operator("ltsh.duplicate_light", text="", icon="DUPLICATE")
         row.operator("ltsh.delete_light", text="", icon="TRASH")

@@ -298,18 +298,19 @@ class Overview:
     materials: tuple[Entry, ...]
 
 
-_known: dict[tuple[str, bool], Overview] = {}
+_known: dict[tuple, Overview] = {}
 
 
 def overview(scene) -> Overview:
     """Lights and materials of `scene`; read again after any change of the file."""
     in_view = scene.render.engine == ENGINE
-    if (scene.name, in_view) not in _known:
-        _known[scene.name, in_view] = Overview(
+    key = scene.name, in_view, in_view and scene.ltsh_view.shows_bounces
+    if key not in _known:
+        _known[key] = Overview(
             tuple(_light(ob) for ob in scene.objects if ob.type == "LIGHT" and not ob.hide_render),
-            tuple(_material(material, in_view) for material in materials_of(scene)),
+            tuple(_material(material, *key[1:]) for material in materials_of(scene)),
         )
-    return _known[scene.name, in_view]
+    return _known[key]
 
 
 def _light(ob) -> Entry:
@@ -327,8 +328,8 @@ def _light(ob) -> Entry:
     return Entry(ob.name, kind, APPROXIMATED if notes else EXACT, tuple(notes))
 
 
-def _material(material, in_view: bool) -> Entry:
-    """The entry of a material; with what the view says of it, if the view is ours."""
+def _material(material, in_view: bool, with_bounces: bool) -> Entry:
+    """The entry of a material; with what the view, `with_bounces` or without, says of it, if the view is ours."""
     surface = surface_of(material)
     if surface is None:
         return Entry(material.name, "", EXACT)
@@ -336,7 +337,8 @@ def _material(material, in_view: bool) -> Entry:
     # An emissive material is a kind, not a defect: leave out the note that it does not light the scene.
     notes = tuple(dict.fromkeys(notes_of_material(surface.node, shaders, emitter=True)))
     look = preview_of(material)
-    of_view = (*look.notes, *([OF_MIRRORS] if look.is_mirror else [])) if in_view else ()
+    of_mirrors = [OF_MIRRORS] if look.is_mirror and not with_bounces else []
+    of_view = (*look.notes_in_view(with_bounces), *of_mirrors) if in_view else ()
     notes += tuple(f"in the view: {note.removeprefix(f'{material.name}: ')}" for note in dict.fromkeys(of_view))
     shown = [bsdf_of(leaf.node) or is_emission(leaf.node) or leaf.is_transparent for leaf in shaders.leaves]
     state = LEFT_OUT if shown and not any(shown) else APPROXIMATED if notes else EXACT

@@ -14,7 +14,7 @@ import numpy as np
 
 from ...imaging.report import index_stamp, read_index
 from ...pipeline.display_layers import FILES
-from ...pipeline.mixer import MIXER_FILE, LightPictures, Mixer, MixerRow, moved_light
+from ...pipeline.mixer import LightPictures, Mixer, MixerRow, mixer_file, moved_light
 from ...pipeline.relight import OCCLUDERS_SUFFIX, RELIGHT_SUFFIX, RelightData, tint
 from ...scene import Light, SceneError, SurfaceSamples
 from ...visibility import Occluders
@@ -255,7 +255,12 @@ MOST_BYTES = 1 << 31  # final renders with larger samples do not keep them for m
 
 def has_mixer(scene, result: Result) -> bool:
     """True if `mixer_of` has a mixer, without reading it."""
-    return scene.name in _rendered or (result.folder / MIXER_FILE).exists()
+    return scene.name in _rendered or _mixer_path(scene.ltsh, result).exists()
+
+
+def _mixer_path(settings, result: Result) -> Path:
+    """The file of the mixer of the chosen group of `result`."""
+    return result.folder / mixer_file(result.group(settings.group)[0])
 
 
 def mixer_of(scene) -> Mixer | None:
@@ -265,7 +270,7 @@ def mixer_of(scene) -> Mixer | None:
     result = result_of(scene)
     if result is None:
         return None
-    path = result.folder / MIXER_FILE
+    path = _mixer_path(scene.ltsh, result)
     try:
         stamp = str(path), path.stat().st_mtime_ns
         if _mixer["stamp"] != stamp:
@@ -278,9 +283,12 @@ def mixer_of(scene) -> Mixer | None:
     return _mixer["mixer"]
 
 
-def is_mixer_read(folder: Path) -> bool:
+def is_mixer_read(scene, folder: Path) -> bool:
     """True if `mixer_of` can return the mixer of the results in `folder` at once; else a thread begins to read it."""
-    path = folder / MIXER_FILE
+    result = result_in(str(folder))
+    if result is None:
+        return True
+    path = _mixer_path(scene.ltsh, result)
     try:
         stamp = str(path), path.stat().st_mtime_ns
     except OSError:
@@ -318,7 +326,7 @@ class Update:
     def __init__(self, scene, moved: dict[int, Light]):
         self.mixer, self.moved, self.done = mixer_of(scene), moved, 0.0
         self.is_finished, self.error = False, None
-        self._path = None if scene.name in _rendered else result_of(scene).folder / MIXER_FILE
+        self._path = None if scene.name in _rendered else _mixer_path(scene.ltsh, result_of(scene))
         self._read, self._made = _reader(scene), queue.SimpleQueue()
         layers = self.mixer.pictures.layers
         self._before = {number: (self.mixer.rows[number], layers[number].copy()) for number in moved}
@@ -405,6 +413,18 @@ def mixed_pixels(scene) -> np.ndarray | None:
     return None if mixer is None else mixer.mixed([_factor(scene, row, item) for row, item in mixer_pairs(scene)])
 
 
+def mixed_texture(scene, result: Result, group: str) -> np.ndarray | None:
+    """The baked texture `group` (H, W, 4) as the mixer shows it, row 0 on top; None where no mix is shown.
+
+    Raises OSError, ValueError.
+    """
+    path = result.folder / mixer_file(group)
+    if scene.ltsh.mode != "MIX" or not path.exists():
+        return None
+    mixer, items = Mixer(LightPictures.load(path)), {item.name: item for item in scene.ltsh.mixed}
+    return mixer.mixed([_factor(scene, row, items.get(row.name)) for row in mixer.rows])[::-1]
+
+
 def _factor(scene, row: MixerRow, item) -> np.ndarray:
     if item is None:
         return np.ones(3)
@@ -448,6 +468,17 @@ def _take_rows(scene) -> None:
             continue
         item.power, item.exposure, item.color, item.settings = 1.0, 0.0, row.color, settings
         item.muted = item.solo = item.applied = False
+    state["is_silent"] = False
+
+
+def set_factors(scene, factors: dict[str, np.ndarray]) -> None:
+    """Give rows of the mixer, by name, `factors` (3,) of what was rendered; all others show what was rendered."""
+    reset_mixer(scene)
+    state["is_silent"] = True
+    for row, item in mixer_pairs(scene):
+        if row.name in factors:
+            most = float(factors[row.name].max())
+            item.power, item.color = most, np.array(row.color) * (factors[row.name] / most if most > 0.0 else 1.0)
     state["is_silent"] = False
 
 

@@ -327,6 +327,9 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
         name="Bounce Samples", description="Samples per texel of Cycles for the bounced light",
         default=64, min=1, max=65536,
     )  # fmt: skip
+    bake_per_light: BoolProperty(
+        name="Per Light", description="Bake each light by itself too, so that the Light Mixer can change the textures",
+    )  # fmt: skip
     bake_error: BoolProperty(
         name="Compare with Cycles", description="Bake the same texels with Cycles too and measure the signed error",
         default=False,
@@ -336,6 +339,11 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
         description="Keep a picture of each light, so that the Light Mixer can change them in the finished picture",
         default=True,
     )  # fmt: skip
+    match_target: PointerProperty(
+        name="Target", description="Picture of the same size that the lights should come closest to",
+        type=bpy.types.Image,
+    )  # fmt: skip
+    match_colors: BoolProperty(name="Colors", description="Also change the colors of the lights", default=False)
     mixed: CollectionProperty(type=LTSH_PG_mixed_light, options={"HIDDEN"})
     mixed_active: IntProperty(name="Light", options={"HIDDEN"})
     active_light: IntProperty(
@@ -380,7 +388,7 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
 SUBFOLDER = "ltsh"
 KEPT = ("techniques", "resolution_percentage", "anti_aliasing", "cycles_samples", "shadows", "shadow_rays",
         "keep_lights", "bake_size", "bake_margin", "bake_view", "bake_passes", "bake_error",
-        "bake_bounces", "bake_rest_samples")  # fmt: skip
+        "bake_bounces", "bake_rest_samples", "bake_per_light")  # fmt: skip
 
 
 class LTSH_OT_add_preset(AddPresetBase, bpy.types.Operator):

@@ -382,8 +382,8 @@ class SceneMirror:
     @property
     def notes_with_rest(self) -> list[str]:
         """Those of them that remain when Cycles adds the rest."""
-        glowing = [note for shown in self._looks.values() if shown.look.glow > 0.0 for note in shown.look.notes]
-        return list(dict.fromkeys([*glowing, *self._light_notes, *self._world_note, *self._limit_notes]))
+        of_materials = [note for shown in self._looks.values() for note in shown.look.notes_in_view(with_bounces=True)]
+        return list(dict.fromkeys([*of_materials, *self._light_notes, *self._world_note, *self._limit_notes]))
 
     @property
     def material_notes(self) -> list[str]:

@@ -131,33 +131,27 @@ def _refers_to_objects(block) -> bool:
     return False
 
 
-@dataclass(frozen=True)
-class _RestProgress:
-    """What the second Blender has rendered last of a view."""
+def next_job(before: RestJob | None, view: RestView, share: float) -> RestJob:
+    """The job for `view` after the job `before`, which takes about the `share` of a sample of all its pixels."""
+    if before is None or before.view != view:
+        fits = [shrink for shrink in SHRINKS if TOTALS[0] <= share * shrink**2]
+        before, shrink = None, min(fits, default=SHRINKS[0])
+    elif makes_picture(before) and before.shrink > 1:
+        before, shrink = None, SHRINKS[SHRINKS.index(before.shrink) + 1]
+    else:
+        shrink = before.shrink
+    done, first = (0, 0.0) if before is None else (before.total, before.rows[1] % 1.0)
+    samples, most = 1, share * shrink**2  # most: samples in a step
+    last = first + 1.0 / math.ceil(1.0 / most)
+    if first == 0.0 and most >= 1.0:
+        samples = min(next(count for count in TOTALS if count > done) - done, int(most))
+    rows = first, last if last < 0.99 else 1.0
+    return RestJob(None, view, samples, done, shrink, rows, continues=before is not None)
 
-    view: RestView | None = None
-    shrink: int = SHRINKS[-1]
-    samples: int = 0  # that all rows have
-    rows: float = 0.0  # the share of the rows that have one more
 
-    def next(self, view: RestView, share: float) -> _RestProgress:
-        """The state after the next step for `view`, which takes the `share` of a sample of all its pixels."""
-        if self.view != view:
-            fits = [shrink for shrink in SHRINKS if TOTALS[0] <= share * shrink**2]
-            return _RestProgress(view, min(fits, default=SHRINKS[0])).next(view, share)
-        if self.is_shown and self.shrink > 1:
-            return _RestProgress(view, SHRINKS[SHRINKS.index(self.shrink) + 1]).next(view, share)
-        most = share * self.shrink**2  # samples in a step
-        if self.rows == 0.0 and most >= 1.0:
-            missing = next(count for count in TOTALS if count > self.samples) - self.samples
-            return replace(self, samples=self.samples + min(missing, int(most)))
-        rows = self.rows + 1.0 / math.ceil(1.0 / most)
-        return replace(self, rows=rows) if rows < 0.999 else replace(self, samples=self.samples + 1, rows=0.0)
-
-    @property
-    def is_shown(self) -> bool:
-        """True if it makes a picture."""
-        return self.samples in TOTALS and self.rows == 0.0
+def makes_picture(job: RestJob) -> bool:
+    """True if there is a picture to show after the job."""
+    return job.rows[1] == 1.0 and job.total in TOTALS
 
 
 @dataclass
@@ -165,21 +159,20 @@ class _RestStep:
     """A job on its way."""
 
     job: RestJob
-    after: _RestProgress
     wanted: RestView  # that of the job, unless another is wanted meanwhile
     seconds: float = 0.0  # that Cycles took
     picture: _RestPicture | None = None
     error: str = ""
+    thread: threading.Thread | None = None
 
     def do(self, process: BlenderProcess, folder: Path) -> None:
         """Do the job, in a thread of its own."""
         try:
-            job, after = self.job, self.after
-            self.seconds = process.do(job, folder, None)["seconds"]
-            if after.is_shown and self.wanted == job.view:
-                manifest = process.do(RestPictureJob(), folder, None)
-                facts = bool(manifest["everything"]), tuple(manifest["ambient"]), manifest["problem"]
-                self.picture = _RestPicture(job.view, np.load(folder / REST_PICTURE), *facts)
+            self.seconds, view = process.do(self.job, folder, None)["seconds"], self.job.view
+            if makes_picture(self.job) and self.wanted == view:
+                facts = process.do(RestPictureJob(), folder, None)
+                facts = {name: facts[name] for name in ("is_everything", "ambient", "problem")}
+                self.picture = _RestPicture(view, np.load(folder / REST_PICTURE), **facts)
         except Exception as error:
             self.error = f"Bounces: {error_line(error)}"
 
@@ -191,7 +184,7 @@ class _RestPicture:
     view: RestView
     pixels: np.ndarray  # (H, W, 4), row 0 on top
     is_everything: bool
-    ambient: tuple[float, ...]
+    ambient: list[float]
     problem: str
     shown: ShownRest | None = None  # on the graphics card
     light: tuple | None = None  # the mean of the direct light that belongs to it, and what it depends on
@@ -200,7 +193,7 @@ class _RestPicture:
         """The picture on the graphics card; needs an active GPU context."""
         if self.shown is None:
             camera = ViewCamera.of(*map(Matrix, self.view.matrices), self.view.matrices[1][3][3] == 1.0)
-            self.shown = ShownRest(float_texture(self.pixels[::-1]), camera, self.is_everything, self.ambient)
+            self.shown = ShownRest(float_texture(self.pixels[::-1]), camera, self.is_everything, tuple(self.ambient))
         return self.shown
 
 
@@ -211,9 +204,8 @@ class LiveRest:
         self._stack: ExitStack | None = None
         self._wanted: RestView | None = None
         self._changed = 0.0
-        self._thread: threading.Thread | None = None
-        self._step: _RestStep | None = None
-        self._progress = _RestProgress()
+        self._step: _RestStep | None = None  # the one on its way
+        self._done: RestJob | None = None  # the last one of those whose sum the second Blender has
         self._opened: tuple | None = None  # the scene that the second Blender has
         self._changes = RestChanges()  # since then
         self._work, self._seconds = 0.0, 0.0  # samples of single pixels in a step; seconds of one; 0: not known
@@ -240,7 +232,7 @@ class LiveRest:
             hidden = tuple(ob.name for ob in objects if not ob.original.local_view_get(space))
         matrices = tuple(tuple(map(tuple, one)) for one in (view.view_matrix, view.window_matrix))
         names, version = (depsgraph.scene.name, depsgraph.view_layer.name), (self._version, self._surfaces)
-        size = region.width, region.height
+        size = max(region.width, 1), max(region.height, 1)
         wanted = RestView(*names, version, depsgraph.scene.frame_current, hidden, world, matrices, size)
         if wanted != self._wanted:
             self._wanted, self._changed = wanted, time.monotonic()
@@ -258,12 +250,10 @@ class LiveRest:
 
     def shown(self) -> ShownRest | None:
         """The last picture; needs an active GPU context. After changes of lights alone it follows the direct light."""
-        picture = self._picture
-        if picture is None:
-            return None
-        has_old_light = self._wanted.version != picture.view.version and picture.light is not None
-        is_same = has_old_light and picture.light[0] == self._light_key
-        return replace(picture.upload(), light=picture.light[1]) if is_same else picture.upload()
+        picture, shown = self._picture, None if self._picture is None else self._picture.upload()
+        if shown is None or picture.light is None or self._wanted.version == picture.view.version:
+            return shown
+        return replace(shown, light=picture.light[1]) if picture.light[0] == self._light_key else shown
 
     @property
     def _light_key(self) -> tuple:
@@ -273,9 +263,8 @@ class LiveRest:
     def keep_light(self, mean: Callable[[], np.ndarray]) -> None:
         """Keep the mean (3,) of the direct light that belongs to the picture that is shown."""
         picture = self._picture
-        if picture is None or picture.view.version != self._wanted.version:
-            return
-        if picture.light is None or picture.light[0] != self._light_key:
+        is_current = picture is not None and picture.view.version == self._wanted.version
+        if is_current and (picture.light is None or picture.light[0] != self._light_key):
             picture.light = self._light_key, mean()
 
     @property
@@ -287,7 +276,7 @@ class LiveRest:
     def is_busy(self) -> bool:
         """True while a better picture is to come."""
         is_short = self._wanted is not None and self._samples < TOTALS[-1]
-        return self._thread is not None or (is_short and not self.problem)
+        return self._step is not None or (is_short and not self.problem)
 
     @property
     def is_urgent(self) -> bool:
@@ -297,13 +286,13 @@ class LiveRest:
     @property
     def is_new(self) -> bool:
         """True while the first picture of this view is to come."""
-        has_one = self._wanted is None or (self._picture is not None and self._picture.view == self._wanted)
-        return self.is_busy and not has_one
+        return self.is_busy and self._wanted not in (None, self._picture and self._picture.view)
 
     @property
     def _samples(self) -> int:
         """Samples in full resolution of what is wanted."""
-        return self._progress.samples if self._progress.view == self._wanted and self._progress.shrink == 1 else 0
+        done = self._done
+        return done.total if done is not None and (done.view, done.shrink) == (self._wanted, 1) else 0
 
     @property
     def seconds(self) -> float | None:
@@ -314,8 +303,8 @@ class LiveRest:
     def step(self) -> bool:
         """Do the next step, in the main thread; True if there is a new picture."""
         news = False
-        if self._thread is not None:
-            if self._thread.is_alive():
+        if self._step is not None:
+            if self._step.thread.is_alive():
                 return False
             news = self._finish()
         # A render of the artist's has the processor for itself.
@@ -330,9 +319,9 @@ class LiveRest:
 
     def _finish(self) -> bool:
         """Take over what the last step has brought."""
-        step, self._thread, self._step = self._step, None, None
+        step, self._step = self._step, None
         if step.error:
-            self._opened, self._progress = None, _RestProgress()
+            self._opened = self._done = None
             # What cannot be handed over piece by piece goes as a whole.
             self.problem = "" if step.job.changes is not None else step.error
             return bool(self.problem)
@@ -342,8 +331,8 @@ class LiveRest:
         work *= min(max(STEP_SECONDS / step.seconds, 1.0 / MOST_CHANGE), MOST_CHANGE)
         if job.scene is None:
             self._work = max(work, FEWEST if step.seconds > STEP_SECONDS else self._work)
-        is_of_wanted = job.view == self._wanted and (step.picture is not None or not step.after.is_shown)
-        self._progress = step.after if is_of_wanted else _RestProgress()
+        is_of_wanted = job.view == self._wanted and (step.picture is not None or not makes_picture(job))
+        self._done = job if is_of_wanted else None
         if is_of_wanted and step.picture is not None:
             self._picture = step.picture
         return self.has_news
@@ -358,9 +347,6 @@ class LiveRest:
             self._stack.callback(self._process.end)
         pixels = math.prod(wanted.size)
         self._work = self._work or max(FEWEST, pixels * TOTALS[0] / SHRINKS[0] ** 2)
-        before, after = self._progress, self._progress.next(wanted, self._work / pixels)
-        continues = before.view == wanted and before.shrink == after.shrink
-        samples, rows = (before.samples, before.rows) if continues else (0, 0.0)
         state = wanted.scene, wanted.view_layer, wanted.frame, wanted.hidden, wanted.world
         path = changes = None
         if state != self._opened or self._changes.everything:
@@ -369,20 +355,11 @@ class LiveRest:
         elif self._changes.objects or self._changes.blocks:
             changes = self._changes.written(bpy.data.scenes[wanted.scene], self._folder / "changes.blend")
         self._changes = RestChanges(everything=False)
-        job = RestJob(
-            scene=path,
-            view=wanted,
-            samples=max(after.samples - samples, 1),
-            seed=samples,
-            shrink=after.shrink,
-            rows=(rows, after.rows or 1.0),
-            changes=changes,
-            continues=continues,
-        )
-        self._step = _RestStep(job, after, wanted)
-        arguments = self._process, self._folder
-        self._thread = threading.Thread(target=self._step.do, args=arguments, name="LTSH rest", daemon=True)
-        self._thread.start()
+        job = next_job(self._done, wanted, self._work / pixels)
+        self._step = _RestStep(replace(job, scene=path, changes=changes), wanted)
+        arguments = {"target": self._step.do, "args": (self._process, self._folder), "name": "LTSH rest"}
+        self._step.thread = threading.Thread(**arguments, daemon=True)
+        self._step.thread.start()
 
     def stop(self) -> None:
         """End the second Blender, and forget what it has rendered."""
@@ -452,21 +429,21 @@ def render_rest(job: RestJob, folder: Path, progress) -> dict:
         _look_through(scene, *map(Matrix, view.matrices), size)
     render, (width, height) = scene.render, render_settings.picture_size(scene)
     first, last = (round(share * height) for share in job.rows)
-    last = max(last, first + 1)
     render.use_border = render.use_crop_to_border = last - first < height
     render.border_min_x, render.border_max_x = 0.0, 1.0
-    render.border_min_y, render.border_max_y = 1.0 - last / height, 1.0 - first / height
+    # Blender rounds down.
+    render.border_min_y, render.border_max_y = ((height - row + 0.5) / height for row in (last, first))
     scene.cycles.samples, scene.cycles.seed = job.samples, job.seed
     progress("bounces", 0.0)
     started = time.monotonic()
     render_exr(scene, folder / REST_RENDER, "NONE")
     seconds = time.monotonic() - started
     if not job.continues:
-        _sum[:] = [RestSum.of_size(width, height)]
+        sizes = [(height, width, channels) for channels in (3, 7)]
+        _sum[:] = [RestSum(*(np.zeros(size, np.float32) for size in sizes), is_everything=_is_everything(scene, layer))]
     total = _sum[0]
-    total.everything = tuple(_reasons_for_cycles(scene, layer))
     total.add(folder / REST_RENDER, first, job.samples, {**render_settings.pass_names(), "mask": MASK})
-    total.samples += job.samples if job.rows[1] == 1.0 else 0
+    total.samples = job.total
     return {"seconds": seconds}
 
 
@@ -484,7 +461,7 @@ def denoise_rest(job: RestPictureJob, folder: Path, progress) -> dict:
     """Do the `job`; returns the manifest, see `process.view.render_rest`."""
     total = _sum[0]
     save_array(folder / REST_PICTURE, total.picture())
-    return {"everything": total.everything, "ambient": total.ambient, "problem": total.problem}
+    return {"is_everything": total.is_everything, "ambient": total.ambient, "problem": total.problem}
 
 
 def _take_changes(scene, file: str, blocks: list, moved: dict) -> None:
@@ -574,13 +551,11 @@ def mark(material) -> None:
     node.inputs["Value"].default_value = 1.0
 
 
-def _reasons_for_cycles(scene, layer) -> list[str]:
-    """Why the whole picture is Cycles': what views cannot draw between the eye and the surfaces."""
+def _is_everything(scene, layer) -> bool:
+    """True if the whole picture is Cycles': views cannot draw what is between the eye and the surfaces."""
     shown = [ob for ob in scene.objects if not ob.hide_render]
-    hair = [f"hair or points of {ob.name!r}" for ob in shown if _has_hair(ob)]
     materials = {slot.material for ob in shown for slot in ob.material_slots} - {None}
-    volumes = [f"the volume of material {material.name!r}" for material in materials if _has_volume(material)]
-    return [*reasons_for_cycles(scene, layer), *hair, *volumes]
+    return bool(reasons_for_cycles(scene, layer)) or any(map(_has_hair, shown)) or any(map(_has_volume, materials))
 
 
 def _has_volume(material) -> bool:

@@ -11,6 +11,7 @@ from itertools import product
 
 import numpy as np
 
+from ...imaging.denoise import means_of_neighbors
 from ...scene import PASSES, Cancelled, Film, Light, SurfaceSamples, error_line
 from ...visibility import Occluders, RayOrigins, ShadowSampling, shared_numbers, trace_ray_origins, trace_visibility
 from ...workers.pool import WorkerPool
@@ -130,7 +131,7 @@ class ShadowRequest:
         if self.level > 0:
             return results
         surface = _surface_of(samples, film)
-        return {number: _smoothed(values[None], *surface)[0] for number, values in results.items()}
+        return {number: _smoothed(values, *surface) for number, values in results.items()}
 
     def _quick(self, samples: SurfaceSamples, film: Film, progress: Callable) -> dict[int, np.ndarray]:
         """The shares at some pixels, smoothed, and what lies between these or is traced where that does not do."""
@@ -150,7 +151,7 @@ class ShadowRequest:
         for number, values in results.items():
             near_values = np.ma.array(values.reshape(-1, 2)[index], mask=np.repeat(is_far[..., None], 2, axis=-1))
             differs |= (np.ptp(near_values, axis=0).filled(0.0) > QUICK_DIFFERENCE).any(axis=-1)
-            smooth = _smoothed(values[None], *surface).reshape(-1, 2)[index]
+            smooth = _smoothed(values, *surface).reshape(-1, 2)[index]
             results[number] = np.ones((film.height, film.width, 2), np.float32)
             results[number].reshape(-1, 2)[film.pixel] = (weights[..., None] * smooth).sum(axis=0)
         pixel = film.pixel[differs]
@@ -202,19 +203,15 @@ def _nearness(way: np.ndarray, normal: np.ndarray) -> np.ndarray:
 
 
 def _smoothed(values: np.ndarray, position: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    """Shares (N, H, W, 2) as weighted means of 3 x 3 pixels of the same surface, see `_surface_of`."""
-    total, weights = 4.0 * values, np.full(values.shape, 4.0)
-    for ways in {*product((-1, 0, 1), repeat=2)} - {(0, 0)}:
-        steps = [*zip(ways, position.shape[:2], strict=True)]
-        here, there = (tuple(slice(max(-s * way, 0), n - max(s * way, 0)) for way, n in steps) for s in (1, -1))
-        weight = _nearness(position[there][..., :3] - position[here][..., :3], normal[here]) * position[there][..., 3]
-        alike = np.clip((normal[here] * normal[there]).sum(axis=-1), 0.0, 1.0)
-        weight *= alike**16 if all(ways) else 2.0 * alike**16
-        here, there = (slice(None), *here), (slice(None), *there)
-        by_value = weight[..., None] * np.exp(-(((values[there] - values[here]) / QUICK_DIFFERENCE) ** 2))
-        total[here] += by_value * values[there]
-        weights[here] += by_value
-    return (total / weights).astype(np.float32)
+    """Shares (H, W, 2) as weighted means of 3 x 3 pixels of the same surface, see `_surface_of`."""
+
+    def weight(surface: np.ndarray, shares: np.ndarray) -> np.ndarray:
+        near = _nearness(surface[..., :3] - position[..., :3], normal) * surface[..., 3]
+        alike = np.clip((normal * surface[..., 4:]).sum(axis=-1), 0.0, 1.0)
+        by_value = np.exp(-(((shares - values) / QUICK_DIFFERENCE) ** 2))
+        return 0.5 * (near * alike**16)[..., None] * by_value
+
+    return means_of_neighbors(values, np.concatenate([position, normal], axis=-1), weight).astype(np.float32)
 
 
 class TracedScene:

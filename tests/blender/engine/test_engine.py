@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import scene_parts as parts
 from job_window import image_pixels
+from lit_plane import into_collection
 
 import ltsh_addon
 from ltsh_addon import shading
@@ -83,8 +84,7 @@ def render_passes(scene, path):
 
 def extracted(tmp_path, **options):
     """Samples and lights of a copy of the open file."""
-    path = tmp_path / "scene.blend"
-    bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
+    path = parts.save(tmp_path / "scene.blend", copy=True)
     return extract_pixels(PixelJob(scene=path, **options))
 
 
@@ -136,8 +136,7 @@ def test_a_complete_render_is_the_picture_that_the_command_makes_with_the_passes
     layer.use_pass_diffuse_indirect = layer.use_pass_diffuse_direct = layer.use_pass_z = layer.use_pass_uv = True
     layer.use_pass_glossy_direct = layer.use_pass_cryptomatte_object = True
     channels = render_passes(scene, tmp_path / "final.exr")
-    path = tmp_path / "scene.blend"
-    bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
+    path = parts.save(tmp_path / "scene.blend", copy=True)
     options = RenderOptions(path, output=tmp_path, techniques=("ltsh2",), sub_samples=1, cycles_samples=8)
     made = finish(options)
     np.testing.assert_allclose(picture(channels, "ViewLayer.Combined."), made.combined[..., :3], rtol=1e-4, atol=1e-5)
@@ -169,8 +168,7 @@ def test_final_render_is_the_picture_that_shade_makes(scene, tmp_path):
 def test_final_render_has_the_shadows_that_shade_makes(scene, tmp_path):
     scene.ltsh.shadows, scene.ltsh.shadow_rays = True, 16
     found = picture(render_passes(scene, tmp_path / "final.exr"), "ViewLayer.Combined.")
-    path = tmp_path / "scene.blend"
-    bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
+    path = parts.save(tmp_path / "scene.blend", copy=True)
     shade_scene(PictureOptions(path, tmp_path / "out", techniques=("ltsh2",), shadow_rays=16))
     channels = read_channels(tmp_path / "out" / "shade.exr")
     expected, bare = (
@@ -182,11 +180,7 @@ def test_final_render_has_the_shadows_that_shade_makes(scene, tmp_path):
 
 
 def test_every_view_layer_has_its_own_picture(scene, tmp_path):
-    sphere = bpy.data.objects["Sphere"]
-    other = bpy.data.collections.new("Other")
-    scene.collection.children.link(other)
-    scene.collection.objects.unlink(sphere)
-    other.objects.link(sphere)
+    scene.collection.children.link(into_collection("Other", bpy.data.objects["Sphere"]))
     layer = scene.view_layers.new("Without sphere")
     layer.layer_collection.children["Other"].exclude = True
     scene.render.film_transparent = True
@@ -201,12 +195,7 @@ def test_every_view_layer_has_its_own_picture(scene, tmp_path):
 
 
 def test_the_world_is_seen_behind_surfaces_alone(scene, tmp_path):
-    world = scene.world = bpy.data.worlds.new("World")
-    if bpy.app.version < (5, 0, 0):
-        world.use_nodes = True
-    background = next(node for node in world.node_tree.nodes if node.bl_idname == "ShaderNodeBackground")
-    background.inputs["Color"].default_value = (0.1, 0.2, 0.4, 1.0)
-    background.inputs["Strength"].default_value = 2.0
+    parts.add_world(Color=(0.1, 0.2, 0.4, 1.0), Strength=2.0)
     channels = render_passes(scene, tmp_path / "world.exr")
     combined = picture(channels, "ViewLayer.Combined.")
     np.testing.assert_allclose(combined[0, 0], (0.2, 0.4, 0.8), rtol=1e-6)

@@ -95,7 +95,7 @@ def samples_by_object(path, folder, look_up):
     lights = tuple(light_of(record) for record in manifest["lights"])
     found = {}
     for record in manifest["objects"]:
-        assert record["problem"] is None
+        assert not record["problems"]
         of_object = folder / record["folder"]
         mesh = texels_module.TexelMesh.load(of_object / "mesh.npz")
         uv_maps = {name: of_object / file for name, file in record["uv_maps"].items()}

@@ -56,6 +56,7 @@ def off(light, halves):
 def lightmap(tmp_path, **options):
     """The report and the layers of a bake of the open file with bounced light, and its coverage."""
     values = {"passes": ("diffuse_light",), "shadows": "on", "bounces": "on", "view": "above", "objects": ("Floor",)}
+    tmp_path.mkdir(exist_ok=True)
     report, files = baked(save(tmp_path), tmp_path / "out", **{**values, **options})
     (layers,) = files.values()
     return report, layers, layers["coverage.hit"].reshape(SIZE, SIZE) > 0.0
@@ -78,3 +79,22 @@ def test_the_denoiser_halves_the_error_of_what_bounces(tmp_path):
     _, layers, covered = lightmap(tmp_path, rest_samples=16)
     truth, noisy = by_cycles(light=("INDIRECT",))[:, covered], by_cycles(light=("INDIRECT",), samples=32)[0, covered]
     assert off(layers["rest.diffuse_light"][covered], truth)[0] < 0.5 * off(noisy, truth)[0]
+
+
+def test_lights_by_themselves_add_up_to_other_powers(tmp_path):
+    corner()
+    options = {"per_light": True, "rest_samples": 32}
+    _, layers, covered = lightmap(tmp_path, **options)
+    of_lights = {name.partition("@")[2]: light for name, light in layers.items() if "@" in name}
+    assert set(of_lights) == {"Key", "World", "Glowing surfaces"}
+    assert {light.dtype for light in of_lights.values()} == {np.dtype(np.float16)}
+    whole = sum(light.astype(float) for light in of_lights.values())[covered]
+    # Half floats have 11 bits, and the seams of each are fitted to a ten-thousandth.
+    assert np.abs(whole - layers["ltsh4c.diffuse_light"][covered]).max() < 1e-3 * whole.max()
+    of_lights["Key"] = 3.0 * of_lights["Key"]
+    bpy.data.objects["Key"].data.energy *= 3.0
+    mixed = sum(light.astype(float) for light in of_lights.values())[covered]
+    fresh = lightmap(tmp_path / "fresh", **options)[1]["ltsh4c.diffuse_light"][covered]
+    assert np.sqrt(np.square(mixed - fresh).mean()) < 0.01 * fresh.mean()
+    plain = lightmap(tmp_path / "plain", rest_samples=64)[1]["ltsh4c.diffuse_light"][covered]
+    assert abs(mixed.mean() / plain.mean() - 1.0) < 0.01

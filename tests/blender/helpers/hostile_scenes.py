@@ -47,7 +47,7 @@ def placed(name, attribute, *values):
 
 def other_lights_only():
     plain(light=False)
-    scene_parts.link(bpy.data.objects.new("Sun", bpy.data.lights.new("Sun", "SUN")))
+    scene_parts.link(scene_parts.new_light("Sun", "SUN"))
 
 
 def empty_meshes():

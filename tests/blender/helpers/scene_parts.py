@@ -32,9 +32,9 @@ def empty_scene(width: int = SIZE[0], height: int = SIZE[1]):
     return scene
 
 
-def save(path: Path) -> Path:
-    """Save the open file as `path`; the path."""
-    bpy.ops.wm.save_as_mainfile(filepath=str(path))
+def save(path: Path, copy: bool = False) -> Path:
+    """Save the open file as `path`, or a copy of it there; the path."""
+    bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=copy)
     return path
 
 
@@ -63,11 +63,16 @@ def add_area_light(
     name="Light", location=(0.3, 0.2, 1.5), rotation=(0.2, -0.3, 0.4), scale=(1.0, 1.0, 1.0), **settings
 ):
     """An area light of 1.2 x 0.7 m and 100 W, changed by `settings`."""
-    light = bpy.data.lights.new(name, "AREA")
-    light.shape, light.size, light.size_y, light.energy = "RECTANGLE", 1.2, 0.7, 100.0
+    settings = {"shape": "RECTANGLE", "size": 1.2, "size_y": 0.7, "energy": 100.0, **settings}
+    return link(new_light(name, "AREA", **settings), location, rotation, scale)
+
+
+def new_light(name, kind, **settings):
+    """An object, to be linked, with a light of a kind such as POINT that has these `settings`."""
+    light = bpy.data.lights.new(name, kind)
     for key, value in settings.items():
         setattr(light, key, value)
-    return link(bpy.data.objects.new(name, light), location, rotation, scale)
+    return bpy.data.objects.new(name, light)
 
 
 def add_mesh(name, vertices, faces, **placement):

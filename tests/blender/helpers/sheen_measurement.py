@@ -41,9 +41,7 @@ def measure(pixels: int = PIXELS) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     layer.use_pass_normal = layer.use_pass_diffuse_color = layer.use_pass_diffuse_direct = True
     names, lights, found = render_settings.pass_names(), np.array(LIGHTS), []
     lights /= np.linalg.norm(lights, axis=1, keepdims=True)
-    sun = bpy.data.lights.new("Sun", "SUN")
-    sun.energy, sun.angle = 1.0, 0.0
-    ob = scene_parts.link(bpy.data.objects.new("Sun", sun))
+    ob = scene_parts.link(scene_parts.new_light("Sun", "SUN", energy=1.0, angle=0.0))
     with tempfile.TemporaryDirectory(prefix="ltsh-") as name:
         path = Path(name) / "sheen.exr"
         for light in lights:

@@ -92,11 +92,8 @@ def add_shining(name, number, settings):
         uv = light.data.uv_layers.new(name="UVMap")
         uv.data.foreach_set("uv", np.array([0, 0, 1, 0, 1, 1, 0, 1], dtype=np.float32))
     else:
-        data = bpy.data.lights.new(name, settings["kind"])
-        for key, value in {"energy": 100.0, **settings}.items():
-            if key != "kind":
-                setattr(data, key, value)
-        light = scene_parts.link(bpy.data.objects.new(name, data), rotation=(0.3, -0.2, 0.4), **place)
+        light = scene_parts.new_light(name, **{"energy": 100.0, **settings})
+        scene_parts.link(light, rotation=(0.3, -0.2, 0.4), **place)
         tree, emission = light_tree(light)
         shine_by(tree, emission, output_of(tree, name))
     light.color, light.pass_index, light.lightgroup = (0.9, 0.1, 0.4, 1.0), 2, name

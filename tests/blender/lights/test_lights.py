@@ -53,8 +53,7 @@ def test_what_is_not_shaded_is_named_and_left_out(tmp_path):
     scene_parts.add_plane(scene_parts.bsdf_material(LAMBERT, Color=(1.0, 1.0, 1.0, 1.0))[0])
     scene_parts.add_area_light("Key")
     scene_parts.add_area_light("Flat", scale=(1.0, 0.0, 1.0))
-    light = bpy.data.lights.new("Torn", "SPOT")
-    scene_parts.link(bpy.data.objects.new("Torn", light), location=(0.0, 0.0, 2.0), scale=(1.0, 0.0, 1.0))
+    scene_parts.link(scene_parts.new_light("Torn", "SPOT"), location=(0.0, 0.0, 2.0), scale=(1.0, 0.0, 1.0))
     (_, _, inventory, warnings), surface, halves = measured(tmp_path, 128)
     text = "\n".join(warnings)
     for name in ("'Flat'", "'Torn'"):

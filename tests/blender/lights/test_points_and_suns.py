@@ -37,13 +37,9 @@ CASES = {
 
 def add_light(kind="POINT", location=(0.2, 1.6, 1.6), rotation=(-0.75, 0.1, 0.2), scale=(1.0, 1.0, 1.0), **settings):
     """A light of 100 W with a radius of 20 cm, changed by `settings`."""
-    light = bpy.data.lights.new(kind.title(), kind)
-    light.energy = 100.0
-    if kind != "SUN":
-        light.shadow_soft_size, light.use_soft_falloff = 0.2, False
-    for key, value in settings.items():
-        setattr(light, key, value)
-    return scene_parts.link(bpy.data.objects.new(kind.title(), light), location, rotation, scale)
+    soft = {} if kind == "SUN" else {"shadow_soft_size": 0.2, "use_soft_falloff": False}
+    light = scene_parts.new_light(kind.title(), kind, **{"energy": 100.0, **soft, **settings})
+    return scene_parts.link(light, location, rotation, scale)
 
 
 def assert_as_cycles(folder, limit, samples=256, bias=None, **others):

@@ -29,9 +29,8 @@ def room(transparent):
     parts.add_camera((0.0, -4.0, 2.0), (1.2, 0.0, 0.0))
     parts.add_area_light("Seen", (-0.6, 0.6, 1.6), (0.3, 0.0, 0.0), energy=30.0, size=0.5, size_y=0.4)
     bpy.data.objects["Seen"].visible_camera = True
-    point = bpy.data.lights.new("Bulb", "POINT")
-    point.energy, point.shadow_soft_size = 20.0, 0.15
-    parts.link(bpy.data.objects.new("Bulb", point), (0.7, 0.8, 1.5)).visible_camera = True
+    bulb = parts.new_light("Bulb", "POINT", energy=20.0, shadow_soft_size=0.15)
+    parts.link(bulb, (0.7, 0.8, 1.5)).visible_camera = True
     world, sky = parts.add_world(Strength=0.5)
     gradient = parts.add_node(world.node_tree, "ShaderNodeTexGradient")
     place = parts.add_node(world.node_tree, "ShaderNodeTexCoord")

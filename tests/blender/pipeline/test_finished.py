@@ -157,6 +157,11 @@ def by_cycles(folder, samples=TRUE_SAMPLES):
     return render_finished(job, folder / "true")
 
 
+def finished(folder, **options):
+    """The finished picture of the open scene."""
+    return render.finish(RenderOptions(parts.save(folder / "scene.blend"), output=folder, **options))
+
+
 def blocks(image):
     """Means (B, B, C) of square blocks."""
     return image.reshape(SIZE // BLOCK, BLOCK, SIZE // BLOCK, BLOCK, -1).mean(axis=(1, 3))
@@ -167,9 +172,7 @@ def test_a_finished_picture_is_what_cycles_renders(name, tmp_path):
     build, shares = SCENES[name]
     build()
     bpy.context.scene.cycles.seed = 1
-    path = parts.save(tmp_path / "scene.blend")
-    options = RenderOptions(path, output=tmp_path, sub_samples=POINTS, cycles_samples=SAMPLES, denoise="off")
-    made = render.finish(options)
+    made = finished(tmp_path, sub_samples=POINTS, cycles_samples=SAMPLES, denoise="off")
     bpy.context.scene.cycles.seed = 2
     true = read_layer(by_cycles(tmp_path).channels, "Combined", "RGBA")
 
@@ -241,11 +244,8 @@ def test_ours_and_the_rest_are_the_whole_in_the_files_of_a_command(out, tmp_path
 @pytest.mark.newest
 def test_denoising_takes_the_noise_of_the_rest_and_leaves_its_mean(tmp_path):
     floor_and_ball(gray(), 2)
-    path = parts.save(tmp_path / "room.blend")
     rest = {
-        (samples, denoise): render.finish(
-            RenderOptions(path, output=tmp_path, sub_samples=1, cycles_samples=samples, denoise=denoise)
-        ).rest[..., :3]
+        (samples, denoise): finished(tmp_path, sub_samples=1, cycles_samples=samples, denoise=denoise).rest[..., :3]
         for samples, denoise in ((8, "on"), (8, "off"), (512, "off"))
     }
     true = rest[512, "off"]
@@ -263,8 +263,7 @@ def test_edges_of_what_shines_are_smooth_with_few_samples(is_transparent, tmp_pa
     scene.objects["Sphere"].location.z = 1.2
     scene.objects["Plane"].data.materials.clear()
     parts.add_world(Color=(0.4, 0.6, 1.0, 1.0), Strength=2.0)
-    path = parts.save(tmp_path / "scene.blend")
-    made = render.finish(RenderOptions(path, output=tmp_path, sub_samples=2, cycles_samples=8))
+    made = finished(tmp_path, sub_samples=2, cycles_samples=8)
     scene.cycles.seed = 1
     true = read_layer(by_cycles(tmp_path).channels, "Combined", "RGB")
     light = made.cycles.names["emission"]
@@ -287,13 +286,8 @@ def test_noisy_shadows_are_left_to_the_denoiser(tmp_path):
         parts.add_plane(parts.bsdf_material("ShaderNodeBsdfDiffuse", "Wall")[0], 4.0, f"Wall {side}")
         scene.objects[f"Wall {side}"].location = (2.02 * side, 0.0, 2.4)
     scene.objects["Light"].data.size = 3.0
-    path = parts.save(tmp_path / "room.blend")
-    made = {
-        denoise: render.finish(
-            RenderOptions(path, output=tmp_path, sub_samples=1, cycles_samples=512, shadow_rays=8, denoise=denoise)
-        )
-        for denoise in ("on", "off")
-    }
+    options = {"sub_samples": 1, "cycles_samples": 512, "shadow_rays": 8}
+    made = {denoise: finished(tmp_path, denoise=denoise, **options) for denoise in ("on", "off")}
     shares = {name: one.report["finished"]["share_of_ours"]["diffuse"] for name, one in made.items()}
     assert shares["off"] == 1.0 and shares["on"] < 0.9
     whole = made["on"].rest[..., :3] + sum(made["on"].ours.values())
@@ -326,16 +320,15 @@ def test_edges_go_with_the_light_that_makes_them(out, tmp_path):
     scene = floor_and_ball(bsdf("BsdfDiffuse"))
     bpy.data.objects.remove(scene.objects["Light"])
     for name, angle, energy in (("Sun", 0.6, 4.0), ("Moon", -0.4, 0.5)):
-        data = bpy.data.lights.new(name, "SUN")
-        data.energy, data.angle = energy, 0.01
-        parts.link(bpy.data.objects.new(name, data), rotation=(angle, angle, 0.0))
+        parts.link(parts.new_light(name, "SUN", energy=energy, angle=0.01), rotation=(angle, angle, 0.0))
     scene.cycles.max_bounces = 0
-    options = {"output": out, "sub_samples": 5, "cycles_samples": 64}
-    render.make_finished(RenderOptions(parts.save(tmp_path / "room.blend"), keep_visibility=True, **options))
+    options = {"sub_samples": 5, "cycles_samples": 64}
+    path = parts.save(tmp_path / "room.blend")
+    render.make_finished(RenderOptions(path, output=out, keep_visibility=True, **options))
     relight(out, [LightChange("Sun", muted=True)], tmp_path / "relit")
     relit = imaging.read_layers(tmp_path / "relit" / "render.exr")["combined"][..., :3]
     scene.objects["Sun"].hide_render = True
-    fresh = render.finish(RenderOptions(parts.save(tmp_path / "moon.blend"), **options)).combined[..., :3]
+    fresh = finished(tmp_path, **options).combined[..., :3]
     off = np.linalg.norm(relit - fresh) / np.linalg.norm(fresh)
     # Which edge is whose is not told: those of the sun leave a line in the light of the moon.
     assert off < 0.1, f"{100.0 * off:.1f} %"
@@ -373,8 +366,7 @@ def test_bounced_light_follows_the_lights_of_its_light_group(out, tmp_path):
     fresh = []
     for seed in range(2):
         scene.cycles.seed = seed
-        path = parts.save(tmp_path / f"changed_{seed}.blend")
-        fresh.append(render.finish(RenderOptions(path, output=out, **options)).combined[..., :3])
+        fresh.append(finished(tmp_path, **options).combined[..., :3])
     direct = relit - imaging.read_layers(tmp_path / "relit" / "render.exr")["rest"][..., :3]
     left_alone = direct + layers["rest"][..., :3]
     apart, noise, unfollowed = (
@@ -422,9 +414,8 @@ def test_a_budget_excludes_samples(tmp_path, capsys):
 def test_a_budget_chooses_points_rays_and_samples(tmp_path):
     floor_and_ball(gray(), 1)
     parts.add_world(Color=(0.2, 0.2, 0.2, 1.0))
-    path = parts.save(tmp_path / "room.blend")
     # The larger one leaves time for everything, however slowly Blender starts on a busy machine.
-    made = {budget: render.finish(RenderOptions(path, output=tmp_path, budget=budget)) for budget in (0.01, 10.0)}
+    made = {budget: finished(tmp_path, budget=budget) for budget in (0.01, 10.0)}
     small, large = (one.report for one in made.values())
     # Of what shines in sight only what stands beside our light is rendered apart.
     assert not made[0.01].cycles.smooth_emission
@@ -453,10 +444,8 @@ def test_highlights_thinner_than_pixels_are_told_from_those_that_points_show(tmp
         x, y = (grid.ravel() for grid in np.meshgrid(side, side))
         z = height * np.random.default_rng(2).random(len(x))
         corner = (np.arange(99)[:, None] * 100 + np.arange(99)).ravel()
-        mesh = bpy.data.meshes.new(name)
-        mesh.from_pydata(np.stack([x, y, z], axis=1), [], corner[:, None] + np.array([0, 1, 101, 100]))
-        mesh.materials.append(parts.principled(Metallic=1.0, Roughness=0.1)[0])
-        bpy.context.scene.collection.objects.link(bpy.data.objects.new(name, mesh))
+        floor = parts.add_mesh(name, np.stack([x, y, z], axis=1), corner[:, None] + np.array([0, 1, 101, 100]))
+        floor.data.materials.append(parts.principled(Metallic=1.0, Roughness=0.1)[0])
         parts.add_camera((0.0, 0.0, 4.0), (0.0, 0.0, 0.0))
         parts.add_area_light(location=(0.5, 0.0, 3.0), size=0.2)
         path = parts.save(tmp_path / f"{name}.blend")
@@ -524,8 +513,7 @@ def test_the_first_points_of_a_pixel_are_those_of_a_picture_with_fewer(tmp_path)
 def test_what_cycles_keeps_does_not_fade_at_its_border(tmp_path):
     """Around a ball whose diffuse light is Cycles' own, pixels show as much of the floor as those beside them."""
     floor_and_ball(gray(Subsurface_Weight=0.01, Subsurface_Scale=0.01))
-    path = parts.save(tmp_path / "scene.blend")
-    made = render.finish(RenderOptions(path, output=tmp_path, cycles_samples=64, shadow_rays=256))
+    made = finished(tmp_path, cycles_samples=64, shadow_rays=256)
     kept = (made.relight_data["taken"]["diffuse"] == 0.0).all(axis=-1)
     noisy = read_layer(made.cycles.channels, "Combined", "RGB")
     # The border of what is kept, and what touches it.
@@ -543,8 +531,7 @@ def test_a_picture_without_any_light_says_that_it_is_black(tmp_path):
         if ob.type == "LIGHT":
             bpy.data.objects.remove(ob)
     scene.world = None
-    path = parts.save(tmp_path / "dark.blend")
-    report = render.finish(RenderOptions(path, output=tmp_path, sub_samples=1, cycles_samples=2, denoise="off")).report
+    report = finished(tmp_path, sub_samples=1, cycles_samples=2, denoise="off").report
     assert any("no light at all" in line and "'Camera'" in line for line in report["warnings"])
 
 
@@ -558,13 +545,13 @@ def test_borders_of_colors_are_as_smooth_as_in_cycles(tmp_path):
     checker.inputs["Scale"].default_value = 23.0
     tree.links.new(checker.outputs["Color"], tree.nodes["Diffuse BSDF"].inputs["Color"])
     scene.objects["Plane"].data.materials[0] = checks
-    path = parts.save(tmp_path / "scene.blend")
     scene.cycles.seed = 1
     true = by_cycles(tmp_path)
+    scene.cycles.seed = 0
     light, color = (read_layer(true.channels, true.names[f"diffuse_{key}"], "RGB") for key in ("light", "color"))
     off = {}
     for samples in (1, 64):  # with no more samples than points there is nothing to learn from Cycles
-        made = render.finish(RenderOptions(path, output=tmp_path, sub_samples=1, cycles_samples=samples, denoise="off"))
+        made = finished(tmp_path, sub_samples=1, cycles_samples=samples, denoise="off")
         off[samples] = np.linalg.norm(made.ours["ltsh4c.diffuse"] - light * color)
     # 64 random samples know a border twice as well as the points of about three pixels, which share one each.
     assert off[64] < 0.6 * off[1], off

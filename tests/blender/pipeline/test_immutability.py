@@ -26,8 +26,7 @@ def rich_file(folder):
     catcher = scene_parts.add_plane(scene_parts.principled("Floor")[0], name="Catcher")
     catcher.is_shadow_catcher = True
     scene_parts.add_area_light("Key")
-    point = bpy.data.lights.new("Bulb", "POINT")
-    scene_parts.link(bpy.data.objects.new("Bulb", point), (1.0, 0.0, 2.0))
+    scene_parts.link(scene_parts.new_light("Bulb", "POINT"), (1.0, 0.0, 2.0))
     camera = scene_parts.add_camera()
     camera.data.dof.use_dof = True
     camera.keyframe_insert("location", frame=1)

@@ -18,9 +18,7 @@ CHANGES = {"Key": (2.5, 0.0, (1.0, 0.6, 0.3)), "Spot": (1.0, -1.5, (0.8, 0.9, 1.
 
 
 def add_light(kind, name, energy, color, **placement):
-    data = bpy.data.lights.new(name, kind)
-    data.energy, data.color = energy, color
-    return parts.link(bpy.data.objects.new(name, data), **placement)
+    return parts.link(parts.new_light(name, kind, energy=energy, color=color), **placement)
 
 
 @pytest.fixture

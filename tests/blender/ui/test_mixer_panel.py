@@ -208,7 +208,7 @@ def shaded(tmp_path):
     with add_on_in_room(tmp_path / "room.blend") as scene:
         scene.ltsh.techniques = {"ltsh4c"}
         fill = parts.add_area_light("Fill", location=(-1.0, 0.5, 1.5), size=0.5)
-        parts.link(bpy.data.objects.new("Sun", bpy.data.lights.new("Sun", "SUN")), rotation=(0.5, 0.0, 0.0))
+        parts.link(parts.new_light("Sun", "SUN"), rotation=(0.5, 0.0, 0.0))
         parts.add_sphere(parts.principled("Ball")[0], smooth=False, radius=0.3, location=(0.0, 0.0, 0.6))
         assert bpy.ops.ltsh.shade() == {"FINISHED"}
         yield scene, fill
@@ -319,3 +319,40 @@ def test_pictures_without_kept_lights_say_so(shaded):
     assert bpy.ops.ltsh.shade() == {"FINISHED"}
     assert results.mixer_of(scene) is None and results.mix_label(scene) == "No lights were kept: shade again"
     assert not bpy.ops.ltsh.reset_mixer.poll()
+
+
+@pytest.mark.parametrize("colors", [False, True])
+def test_lights_are_matched_to_a_painted_target(scene, pictures, colors):
+    factors = np.array([[0.25, 0.5, 0.5], [3.0, 2.0, 1.0], [0.0] * 3, [1.0] * 3]) if colors else np.ones((4, 3))
+    factors[:3] = factors[:3] if colors else np.array([0.5, 2.0, 0.0])[:, None]
+    assert bpy.ops.ltsh.paint_target() == {"FINISHED"}
+    target = scene.ltsh.match_target
+    np.testing.assert_allclose(image_pixels(target.name), pictures.sum(axis=0), rtol=1e-5)
+    wanted = np.einsum("rc,rhwc->hwc", factors, pictures)
+    pixels = np.ones((HEIGHT, WIDTH, 4), np.float32)
+    pixels[..., :3] = wanted[::-1]
+    target.pixels.foreach_set(pixels.ravel())
+    scene.ltsh.match_colors = colors
+    assert bpy.ops.ltsh.match_target() == {"FINISHED"}
+    # The solver draws factors a little to 1, more where layers look alike: these random ones do within squares.
+    np.testing.assert_allclose(shown(), wanted, atol=0.02)
+    own = items(scene)
+    for name, factor in zip(NAMES, factors, strict=True):
+        np.testing.assert_allclose(results._factor(scene, row_of(scene, name), own[name]), factor, atol=0.02)
+    assert scene.ltsh.mode == "MIX"
+    bpy.ops.ltsh.reset_mixer()
+    np.testing.assert_allclose(shown(), pictures.sum(axis=0), rtol=1e-5)
+
+
+def row_of(scene, name):
+    return next(row for row in results.mixer_of(scene).rows if row.name == name)
+
+
+def test_a_target_of_another_size_is_named_and_changes_nothing(scene):
+    scene.ltsh.match_target = bpy.data.images.new("Small", 3, 2)
+    items(scene)["Key"].power = 3.0
+    with pytest.raises(RuntimeError, match="image 'Small' is 3x2 pixels, expected 10x6 as the picture"):
+        bpy.ops.ltsh.match_target()
+    assert items(scene)["Key"].power == 3.0
+    scene.ltsh.match_target = None
+    assert not bpy.ops.ltsh.match_target.poll()

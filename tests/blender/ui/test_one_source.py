@@ -48,8 +48,16 @@ def test_materials_have_the_sign_of_what_the_view_says(scene):
     assert entry.state == preflight.EXACT
     scene.render.engine = "LTSH"
     entry = next(one for one in preflight.overview(scene).materials if one.name == "Rough")
-    assert entry.state == preflight.APPROXIMATED
-    assert "in the view: Roughness is not resolved, 0.4 is shown" in entry.notes
+    assert entry.state == preflight.EXACT, "bounces show it as Cycles does"
+    # Passes alone have no bounces, nor has a picture beside that of Cycles.
+    for name, value in (("shown", "diffuse"), ("bounces", False), ("mode", "split")):
+        view, before = scene.ltsh_view, getattr(scene.ltsh_view, name)
+        setattr(view, name, value)
+        view.second_technique = "cycles" if name == "mode" else "ltc"
+        entry = next(one for one in preflight.overview(scene).materials if one.name == "Rough")
+        assert entry.state == preflight.APPROXIMATED
+        assert "in the view: Roughness is not resolved, 0.4 is shown" in entry.notes
+        setattr(view, name, before)
 
 
 @pytest.mark.parametrize(
@@ -60,10 +68,11 @@ def test_materials_name_chrome_which_views_draw_black(scene, metallic, roughness
     shader.inputs["Metallic"].default_value, shader.inputs["Roughness"].default_value = metallic, roughness
     parts.add_plane(material, name="Chrome plane")
     bpy.context.view_layer.update()
-    for engine in ("BLENDER_WORKBENCH", "LTSH"):
-        scene.render.engine = engine
+    for engine, bounces in (("BLENDER_WORKBENCH", False), ("LTSH", False), ("LTSH", True)):
+        scene.render.engine, scene.ltsh_view.bounces = engine, bounces
         (entry,) = [one for one in preflight.overview(scene).materials if one.name == "Chrome"]
-        assert any("it reflects lights" in note for note in entry.notes) == (is_black and engine == "LTSH")
+        is_named = is_black and engine == "LTSH" and not bounces
+        assert any("it reflects lights" in note for note in entry.notes) == is_named
 
 
 def test_the_eye_of_a_light_is_the_one_that_h_closes(scene):
@@ -104,8 +113,7 @@ def test_without_a_light_none_is_to_be_clicked(scene):
 def test_files_are_saved_without_pictures(scene, tmp_path, show_results):
     show_results(scene, tmp_path)
     assert len(results.our_images(scene)) > 3
-    path = tmp_path / "copy.blend"
-    bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
+    path = parts.save(tmp_path / "copy.blend", copy=True)
     with bpy.data.libraries.load(str(path)) as (there, _):
         names = [name for name in there.images if name.startswith(results.PREFIX)]
     assert names == []

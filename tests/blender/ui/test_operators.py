@@ -1,5 +1,6 @@
 """The operators that run jobs: their pictures, and what happens when something goes wrong."""
 
+from dataclasses import asdict
 from pathlib import Path
 
 import bpy
@@ -13,6 +14,7 @@ from ltsh_addon.blender.ui import job, operators, preflight, results
 from ltsh_addon.blender.ui.job import Job, Plan
 from ltsh_addon.imaging.exr import write_channels
 from ltsh_addon.pipeline import display_layers
+from ltsh_addon.pipeline.mixer import MixerRow
 
 
 @pytest.fixture
@@ -125,6 +127,37 @@ def test_a_bake_is_shown_in_the_scene_and_taken_back(scene, tmp_path):
     assert bpy.ops.ltsh.restore_materials() == {"FINISHED"}
     assert (slot.link, slot.material) == ("DATA", former) and set(bpy.data.materials) == materials
     assert preflight.problems(bpy.context, "bake") == []
+
+
+def test_the_mixer_changes_a_bake_of_each_light(scene, tmp_path):
+    output = tmp_path / "ltsh" / "bake"
+    output.mkdir(parents=True)
+    pictures = np.random.default_rng(6).random((2, 6, 10, 3), np.float32)
+    lamp = next(ob for ob in scene.objects if ob.type == "LIGHT")
+    names = [lamp.name, "World"]
+    layers = {"ltsh4c.diffuse_light": pictures.sum(axis=0)}
+    layers |= {f"ltsh4c.diffuse_light@{name}": picture for name, picture in zip(names, pictures, strict=True)}
+    channels = {f"{layer}.{letter}": picture[..., index] for layer, picture in layers.items()
+                for index, letter in enumerate("RGB")}  # fmt: skip
+    write_channels(output / "Floor.exr", channels)
+    settings = {lamp.name: [lamp.data.energy, lamp.data.exposure, *lamp.data.color]}
+    rows = [asdict(MixerRow(name, (name,), settings=settings if name == lamp.name else {})) for name in names]
+    record = {"name": "Floor", "uv": "UVMap", "tiles": {"1001": {"file": "Floor.exr"}}}
+    report = {"objects": [record], "warnings": [], "light_rows": rows, "frame": 1, "camera": ""}
+    folder = display_layers.write("bake", output, report)
+    display_layers.write_lights(folder, ["bake"], report)
+    results.show(scene, folder)
+    assert [item.name for item in scene.ltsh.mixed] == names
+    scene.ltsh.mixed[lamp.name].power = 2.5
+    expected = 2.5 * pictures[0] + pictures[1]
+    assert scene.ltsh.mode == "MIX"
+    np.testing.assert_allclose(results.mixed_pixels(scene)[::-1, :, :3], expected, rtol=1e-6)
+    assert bpy.ops.ltsh.apply_bake() == {"FINISHED"}
+    written = imaging.read_layers(output / "Floor.ltsh4c.diffuse_light.exr")[""]
+    np.testing.assert_allclose(written, expected, rtol=1e-6)
+    # A bake without --per-light has no mixer, and none that an earlier one left.
+    display_layers.write_lights(folder, ["bake"], {**report, "light_rows": []})
+    assert results.mixer_of(scene) is None
 
 
 @pytest.mark.newest

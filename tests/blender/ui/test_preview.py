@@ -42,8 +42,7 @@ def test_ending_a_preview_gives_its_view_back_and_no_other(views, end):
 def test_undo_and_redo_leave_the_preview_as_it_is(views, seed):
     """A walk of edits, undo, redo and clicks on the button, beside a list of what each step of undo has."""
     chosen, on, at = random.Random(seed), False, -1
-    data = bpy.data.lights.new("Key", "AREA")
-    bpy.context.scene.collection.objects.link(bpy.data.objects.new("Key", data))
+    scene_parts.link(scene_parts.new_light("Key", "AREA"))
     steps = []  # energy and engine of the artist
     kinds = ["edit", "engine", "preview", "preview", *3 * ["undo", "redo"]]
     for number, kind in enumerate(["edit", "engine", "edit", "preview", *chosen.choices(kinds, k=60)]):

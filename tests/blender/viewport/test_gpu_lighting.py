@@ -50,6 +50,26 @@ def excess(found, expected, relative):
     return (np.abs(found - expected) / (ABSOLUTE + relative * np.abs(expected))).max(axis=1)
 
 
+def distance(found, expected):
+    """Relative L2."""
+    return np.linalg.norm(found - expected) / np.linalg.norm(expected)
+
+
+def integrated(samples, lights, technique, name="combined"):
+    """Radiance (P, 3) of a pass by the integrator in double precision."""
+    passes = shading.PASSES if name == "combined" else (name,)
+    return shading.shade(samples, lights, technique, passes=passes, workers=1, dtype=np.float64).combined
+
+
+def each_light(technique, kinds, name):
+    """A light of each kind, with what draws a pass of samples under this light alone."""
+    lighting, canvas = LightingPass(technique), Canvas(WIDTH, HEIGHT)
+    for kind in kinds:
+        light = random_surfaces.light(kind, 0, np.random.default_rng(len(kind)))
+        lighting.set_lights([light])
+        yield kind, light, lambda samples: drawn(lighting, samples, canvas, name)
+
+
 @pytest.mark.parametrize(
     ("surface", "kinds", "techniques"),
     [
@@ -80,16 +100,15 @@ def test_radiance_is_that_of_the_integrator(surface, kinds, techniques):
                 lighting.set_lights(lights)
                 for name in shading.PASSES:
                     found = drawn(lighting, samples, canvas, name)
-                    shaded = shading.shade(samples, lights, technique, passes=(name,), workers=1, dtype=np.float64)
+                    shaded = integrated(samples, lights, technique, name)
                     if lights[0].cone is not None:
                         # Fewer points than there say what a cone leaves of the light where it ends.
-                        distance = np.linalg.norm(found - shaded.combined) / np.linalg.norm(shaded.combined)
-                        assert distance < CONES, f"{kind}, {technique}, {name}: {distance:.4f}"
+                        assert distance(found, shaded) < CONES, (kind, technique, name)
                         continue
                     relative = RELATIVE_OF_PROFILES if lights[0].has_profile else RELATIVE
                     relative = RELATIVE_OF_CAPS if kind in random_surfaces.FACING_LIGHTS else relative
-                    times = excess(found, shaded.combined, relative)
-                    brightest[name] = max(brightest[name], float(shaded.combined.max()))
+                    times = excess(found, shaded, relative)
+                    brightest[name] = max(brightest[name], float(shaded.max()))
                     assert times.max() <= 1.0, f"{kind}, {technique}, {name}: {times.max():.1f} x at {times.argmax()}"
         # There is enough light that the absolute part of the tolerance is not what lets them pass.
         assert min(brightest.values()) > 1e3 * ABSOLUTE
@@ -128,9 +147,8 @@ def test_patterns_are_those_of_a_quadrature():
             )
             patterned, without = (found[2 * number + k][name] for k in range(2))
             ratio = np.divide(patterned, without, out=np.ones_like(without), where=without > 1e-12)
-            distance = np.linalg.norm(ratio * plain - expected) / np.linalg.norm(expected)
-            assert distance < PATTERNS, f"{pair[0].name}, {name}: {distance:.4f}"
-            assert np.linalg.norm(plain - expected) > 0.1 * np.linalg.norm(expected)
+            assert distance(ratio * plain, expected) < PATTERNS, (pair[0].name, name)
+            assert distance(plain, expected) > 0.1
 
 
 @pytest.mark.newest
@@ -152,10 +170,10 @@ def test_diffuse_light_of_balls_is_that_of_a_quadrature():
     cuts = 0
     for light in lights:
         offset = light.center - samples.position
-        distance = np.linalg.norm(offset, axis=1)
-        sine2 = (light.half_u @ light.half_u) / distance**2
+        away = np.linalg.norm(offset, axis=1)
+        sine2 = (light.half_u @ light.half_u) / away**2
         assert sine2.max() < 1.0
-        along = (offset * samples.diffuse_normal).sum(axis=1) / distance
+        along = (offset * samples.diffuse_normal).sum(axis=1) / away
         cuts += (np.abs(along) < np.sqrt(sine2)).sum()
         half = 0.5 * sine2 / (1.0 + np.sqrt(1.0 - sine2))
         cosine = 1.0 - half[:, None] * (1.0 + nodes)
@@ -168,73 +186,53 @@ def test_diffuse_light_of_balls_is_that_of_a_quadrature():
     assert excess(found, expected[:, None] * samples.diffuse_albedo, 3e-4).max() <= 1.0
 
 
+def compare_diffuse(samples, plain, is_other, brdf, limits):
+    """Compare with midpoints over rectangles, which take a horizon that cuts them to 3e-4, and with the integrator over
+    the other kinds of light in `limits`; where not `is_other` (P,), with the lobes of `plain` samples."""
+    for kind, light, draw in each_light("ltsh2", limits, "diffuse"):
+        found, lambert = draw(samples), draw(plain)
+        if kind in ("plain", "near"):
+            expected = samples.diffuse_albedo * quadrature.reflected(samples, light, brdf)
+        else:
+            expected = integrated(samples, [light], "ltsh2", "diffuse")
+        assert distance(found[is_other], expected[is_other]) < limits[kind], kind
+        assert np.allclose(found[~is_other], lambert[~is_other], rtol=1e-5, atol=1e-9), kind
+        assert distance(lambert, expected) > 0.05, kind
+
+
 @pytest.mark.newest
 def test_rough_diffuse_lobes_are_those_of_a_quadrature():
-    """Of rectangles, by midpoints, which take a horizon that cuts them to 3e-4; of others, that of the integrator."""
     samples = random_surfaces.samples("rough", WIDTH * HEIGHT, np.random.default_rng(7))
-    smooth = np.arange(len(samples)) % 4 == 0
-    sigma = rounded(np.where(smooth, 0.0, samples.diffuse_roughness))
+    is_rough = np.arange(len(samples)) % 4 > 0
+    sigma = rounded(np.where(is_rough, samples.diffuse_roughness, 0.0))
     samples = replace(samples, diffuse_roughness=sigma, diffuse_rebound=rounded(samples.diffuse_rebound))
+    plain = replace(samples, diffuse_roughness=None, diffuse_rebound=None)
+    limits = dict.fromkeys(("horizon", "tiny disk", "disk", "polygon", "spread", "ball", "sun"), 2e-3)
+    limits |= {"plain": 5e-4, "near": 5e-4, "spot": CONES}
 
     def brdf(directions, number):
         once, again = quadrature.rough(directions, samples.diffuse_normal[number], samples.view[number], sigma[number])
         return once[:, None] + again[:, None] * samples.diffuse_rebound[number]
 
-    def compare():
-        lighting, canvas = LightingPass("ltsh2"), Canvas(WIDTH, HEIGHT)
-        for kind in ("plain", "near", "horizon", "tiny disk", "disk", "polygon", "spread", "ball", "spot", "sun"):
-            light = random_surfaces.light(kind, 0, np.random.default_rng(len(kind)))
-            lighting.set_lights([light])
-            found = drawn(lighting, samples, canvas, "diffuse")
-            most = CONES if light.cone is not None else 2e-3
-            if kind in ("plain", "near"):
-                expected, most = samples.diffuse_albedo * quadrature.reflected(samples, light, brdf), 5e-4
-            else:
-                shaded = shading.shade(samples, [light], "ltsh2", passes=("diffuse",), workers=1, dtype=np.float64)
-                expected = shaded.combined
-            distance = np.linalg.norm(found - expected) / np.linalg.norm(expected)
-            assert distance < most, f"{kind}: {distance:.5f}"
-            # Lambert's are what they were.
-            plain = replace(samples, diffuse_roughness=None, diffuse_rebound=None)
-            lambert = drawn(lighting, plain, canvas, "diffuse")
-            assert np.allclose(found[smooth], lambert[smooth], rtol=1e-5, atol=1e-9), kind
-            assert np.linalg.norm(found - lambert) > 0.05 * np.linalg.norm(expected)
-
-    with_graphics(compare)
+    with_graphics(lambda: compare_diffuse(samples, plain, is_rough, brdf, limits))
 
 
 @pytest.mark.newest
 def test_velvet_is_that_of_a_quadrature():
-    """Of rectangles by midpoints, of others that of the integrator."""
     random = np.random.default_rng(9)
-    samples = random_surfaces.samples("plain", WIDTH * HEIGHT, random)
-    sigma = rounded(random.uniform(0.1, 1.0, len(samples)))
+    plain = random_surfaces.samples("plain", WIDTH * HEIGHT, random)
+    sigma = rounded(random.uniform(0.1, 1.0, len(plain)))
     sigma[::4] = 0.0
-    samples, soft = replace(samples, sheen_a=-sigma), sigma > 0.0
+    samples = replace(plain, sheen_a=-sigma)
+    # Where a horizon cuts a light that is close, the integrator is 9 % off at one point.
+    limits = {**dict.fromkeys(("plain", "near", "tiny disk", "disk", "spread", "ball"), 1e-3), "horizon": 3e-2}
 
     def brdf(directions, number):
         return quadrature.velvet(
             directions, samples.diffuse_normal[number], samples.view[number], max(sigma[number], 0.1)
         )
 
-    def compare():
-        lighting, canvas = LightingPass("ltsh2"), Canvas(WIDTH, HEIGHT)
-        for kind in ("plain", "near", "horizon", "tiny disk", "disk", "spread", "ball"):
-            light = random_surfaces.light(kind, 0, np.random.default_rng(len(kind)))
-            lighting.set_lights([light])
-            found = drawn(lighting, samples, canvas, "diffuse")
-            if kind in ("plain", "near"):
-                expected = samples.diffuse_albedo * quadrature.reflected(samples, light, brdf)
-            else:
-                shaded = shading.shade(samples, [light], "ltsh2", passes=("diffuse",), workers=1, dtype=np.float64)
-                expected = shaded.combined
-            # Where a horizon cuts a light that is close, the integrator is 9 % off at one point.
-            distance = np.linalg.norm((found - expected)[soft]) / np.linalg.norm(expected[soft])
-            assert distance < (3e-2 if kind == "horizon" else 1e-3), f"{kind}: {distance:.5f}"
-            lambert = drawn(lighting, replace(samples, sheen_a=None), canvas, "diffuse")
-            assert np.allclose(found[~soft], lambert[~soft], rtol=1e-5, atol=1e-9), kind
-
-    with_graphics(compare)
+    with_graphics(lambda: compare_diffuse(samples, plain, sigma > 0.0, brdf, limits))
 
 
 def test_rough_diffuse_lobes_beside_all_others_read_no_more_textures_than_there_are():
@@ -270,21 +268,13 @@ def test_dielectrics_with_an_index_below_1_reflect_as_the_reference_has_it():
     )
 
     def compare():
-        lighting, canvas = LightingPass("ltsh4"), Canvas(WIDTH, HEIGHT)
-        for kind, most in BENT.items():
-            light = random_surfaces.light(kind, 0, np.random.default_rng(len(kind)))
-            lighting.set_lights([light])
-            found = drawn(lighting, samples, canvas, "specular")
-            expected, shaded = (
-                shading.shade(samples, [light], name, passes=("specular",), workers=1, dtype=np.float64).combined
-                for name in ("reference", "ltsh4")
-            )
-            for other, limit in ((expected, most), (shaded, 1e-2)):
-                distance = np.linalg.norm((found - other)[bent]) / np.linalg.norm(other[bent])
-                assert distance < limit, f"{kind}: {distance:.5f}"
-            plain = drawn(lighting, replace(samples, ior=np.maximum(samples.ior, 1.0)), canvas, "specular")
+        for kind, light, draw in each_light("ltsh4", BENT, "specular"):
+            found, plain = draw(samples), draw(replace(samples, ior=np.maximum(samples.ior, 1.0)))
+            expected, shaded = (integrated(samples, [light], name, "specular") for name in ("reference", "ltsh4"))
+            assert distance(found[bent], expected[bent]) < BENT[kind], kind
+            assert distance(found[bent], shaded[bent]) < 1e-2, kind
             assert np.array_equal(found[~bent], plain[~bent])
-            assert np.linalg.norm((plain - expected)[bent]) > 0.05 * np.linalg.norm(expected[bent])
+            assert distance(plain[bent], expected[bent]) > 0.05
 
     with_graphics(compare)
 
@@ -313,9 +303,8 @@ def test_anisotropic_lobes_are_those_of_the_reference_beside_isotropic_ones(surf
             lighting.set_lights(lights)
             found = drawn(lighting, samples, canvas, "combined")
             assert (canvas.read()[..., 3] == 1.0).all()
-            shaded = shading.shade(samples, lights, "reference", workers=1, dtype=np.float64).combined
-            distance = np.linalg.norm((found - shaded)[brushed]) / np.linalg.norm(shaded[brushed])
-            assert distance < BRUSHED[kind], f"{kind}: {distance:.5f}"
+            shaded = integrated(samples, lights, "reference")
+            assert distance(found[brushed], shaded[brushed]) < BRUSHED[kind], kind
             plain = replace(samples, anisotropy=None, tangent=None)
             others = drawn(lighting, plain, canvas, "combined")[~brushed]
             assert np.array_equal(found[~brushed], others), kind
@@ -355,12 +344,10 @@ def test_no_input_gives_anything_but_finite_light():
             lighting = LightingPass(technique)
             for light in lights:
                 lighting.set_lights([light])
-                for name in ("specular", "diffuse", "combined"):
-                    found = drawn(lighting, samples, canvas, name)
+                drawings = [(samples, name) for name in ("specular", "diffuse", "combined")]
+                for surfaces, name in [*drawings, *[(brushed, "specular")] * (technique == "ltsh4")]:
+                    found = drawn(lighting, surfaces, canvas, name)
                     assert np.isfinite(found).all() and (found >= 0.0).all(), (technique, name, light.name)
-                if technique == "ltsh4":
-                    found = drawn(lighting, brushed, canvas, "specular")
-                    assert np.isfinite(found).all() and (found >= 0.0).all(), ("brushed", light.name)
 
     with_graphics(draw_all)
 
@@ -390,8 +377,7 @@ def test_a_thousand_lights_add_up():
         return samples, lights, drawn(lighting, samples, Canvas(WIDTH, HEIGHT), "specular")
 
     samples, lights, found = with_graphics(draw)
-    shaded = shading.shade(samples, lights, "ltsh2", passes=("specular",), workers=1, dtype=np.float64).combined
-    assert excess(found, shaded, RELATIVE).max() <= 1.0
+    assert excess(found, integrated(samples, lights, "ltsh2", "specular"), RELATIVE).max() <= 1.0
 
 
 def test_pixels_without_a_surface_stay_dark():

@@ -4,6 +4,7 @@ changes."""
 import json
 import time
 from dataclasses import asdict
+from itertools import pairwise
 from types import SimpleNamespace
 
 import bpy
@@ -185,18 +186,15 @@ def test_a_step_takes_what_there_is_time_for_and_pictures_come_with_more_and_mor
     """Each picture has all its samples, whatever the share of a picture that a step takes."""
     one, other = RestView(scene="one"), RestView(scene="other")
     for share, shrinks in ((0.13, [4, 2, 1]), (0.3, [4, 2, 1]), (1.0, [2, 1]), (5.0, [1])):
-        before, done, pictures = rest._RestProgress(other, 1, 16), 0.0, []
+        job, rendered, pictures = RestJob(None, other, 16), 0.0, []
         while not pictures or pictures[-1] != (1, 64):
-            after = before.next(one, share)
-            rows = before.rows if before.view == one and before.shrink == after.shrink else 0.0
-            samples = before.samples if before.view == one and before.shrink == after.shrink else 0
-            step = (max(after.samples - samples, 1) * ((after.rows or 1.0) - rows)) / after.shrink**2
-            assert 0.0 < step <= share or after.rows == 0.0 and step <= 1.001 * share
-            done = step if before.shrink != after.shrink or before.view != one else done + step
-            if after.is_shown:
-                pictures.append((after.shrink, after.samples))
-                assert done * after.shrink**2 == pytest.approx(after.samples)
-            before = after
+            job = rest.next_job(job, one, share)
+            samples = job.samples * (job.rows[1] - job.rows[0])
+            assert job.view == one and 0.0 < samples <= 1.02 * share * job.shrink**2
+            rendered = rendered + samples if job.continues else samples
+            if rest.makes_picture(job):
+                pictures.append((job.shrink, job.total))
+                assert rendered == pytest.approx(job.total)
         assert pictures == [*((shrink, 4) for shrink in shrinks), *((1, count) for count in (8, 16, 32, 64))]
 
 
@@ -206,15 +204,18 @@ def test_rows_that_are_rendered_apart_are_those_of_the_whole_picture(tmp_path):
     path, sums = parts.save(tmp_path / "room.blend"), []
     context = context_of(camera)
     matrices = tuple(tuple(map(tuple, getattr(context.region_data, name))) for name in ("view_matrix", "window_matrix"))
-    for bands in (((0.0, 1.0),), ((0.0, 0.3), (0.3, 0.9), (0.9, 1.0))):
+    for shares in ((0.0, 1.0), (0.0, 0.3, 0.9, 1.0), (0.0, 0.1, 0.17, 0.4, 0.55, 0.68, 0.71, 1.0)):
+        bands = [*pairwise(shares)]
         for number, rows in enumerate(bands):
             view = asdict(RestView(matrices=matrices, size=SIZE))
             job = RestJob(None if sums or number else path, view, 2, rows=rows, continues=number > 0)
             rest.render_rest(job, tmp_path, lambda *stage: None)
         sums.append(rest._sum[0])
-    assert [one.samples for one in sums] == [2, 2]
+    assert [one.samples for one in sums] == [2, 2, 2]
     for name in ("light", "guides"):
-        np.testing.assert_array_equal(*(getattr(one, name) for one in sums))
+        whole, *others = (getattr(one, name) for one in sums)
+        for other in others:
+            np.testing.assert_array_equal(other, whole)
 
 
 @edits_with_graphics

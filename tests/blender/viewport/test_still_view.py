@@ -20,7 +20,7 @@ import random_surfaces
 import scene_parts as parts
 from fake_scene import run
 from graphics_card import edits_with_graphics, with_graphics
-from lit_plane import light_tree
+from lit_plane import into_collection, light_tree
 from view_pictures import OpenView, textured
 
 from ltsh_addon import imaging
@@ -62,6 +62,13 @@ def set_up_scene():
     return camera
 
 
+def made(capsys, command, path, folder, *words):
+    """Report and layers of the picture that a command makes in a folder, without a word on stderr."""
+    code, stdout, stderr = run(capsys, command, path, "-o", folder, *words, "--json", "--quiet")
+    assert (code, stderr) == (0, "")
+    return json.loads(stdout), imaging.read_layers(folder / f"{command}.exr")
+
+
 def relative(picture, expected):
     return np.linalg.norm(picture - expected) / np.linalg.norm(expected)
 
@@ -71,17 +78,10 @@ def test_a_view_is_the_picture_of_shade(capsys, tmp_path, count, most):
     with_graphics(lambda: None)
     set_up_scene()
     path = parts.save(tmp_path / "room.blend")
-    view, shade = tmp_path / "view", tmp_path / "shade"
-    code, stdout, stderr = run(
-        capsys, "view", path, "-o", view, "--refine", count, "--shadows", "off", "--techniques", "ltsh4,ltc",
-        "--json", "--quiet",
-    )  # fmt: skip
-    report = json.loads(stdout)
-    assert (code, stderr) == (0, "")
+    both = ("--shadows", "off", "--techniques", "ltsh4,ltc")
+    report, found = made(capsys, "view", path, tmp_path / "view", "--refine", count, *both)
     assert report["resolution"] == list(SIZE) and report["sub_samples"] == count
-    arguments = ("--aa", count, "--shadows", "off", "--techniques", "ltsh4,ltc", "--quiet")
-    assert run(capsys, "shade", path, "-o", shade, *arguments)[0] == 0
-    found, expected = imaging.read_layers(view / "view.exr"), imaging.read_layers(shade / "shade.exr")
+    _, expected = made(capsys, "shade", path, tmp_path / "shade", "--aa", count, *both)
     for technique in ("ltsh4", "ltc"):
         for name in ("specular", "diffuse"):
             layer = f"{technique}.{name}"
@@ -93,7 +93,7 @@ def test_a_view_is_the_picture_of_shade(capsys, tmp_path, count, most):
     coverage = np.abs(found["coverage.hit"] - expected["coverage.hit"])
     assert coverage.max() <= 2.0 / count and coverage.mean() < 0.01
     # The PNG is the same picture as screens show it, within steps of 256 values.
-    shown = bpy.data.images.load(str(view / "view.png"))
+    shown = bpy.data.images.load(str(tmp_path / "view" / "view.png"))
     pixels = np.array(shown.pixels[:]).reshape(SIZE[1], SIZE[0], 4)[::-1, :, :3]
     linear = np.clip(found["ltsh4.combined"], 0.0, 1.0)
     screen = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)
@@ -106,18 +106,15 @@ def test_shadows_of_a_view_are_those_of_shade(capsys, tmp_path):
     with_graphics(lambda: None)
     set_up_scene()
     path = parts.save(tmp_path / "room.blend")
-    found, noise = [], []
-    for command, option in (("view", "--refine"), ("shade", "--aa")):
-        arguments = (command, path, "-o", tmp_path / command, option, 4, "--techniques", "ltsh4", "--json", "--quiet")
-        code, stdout, _ = run(capsys, *arguments)
-        report = json.loads(stdout)
-        assert code == 0 and report["shadows"]["rays"] > 0
-        noise.append(report["shadows"]["noise"])
-        found.append(imaging.read_layers(tmp_path / command / f"{command}.exr"))
-    view, shade = found
+    (of_view, view), (of_shade, shade) = (
+        made(capsys, command, path, tmp_path / command, option, 4, "--techniques", "ltsh4")
+        for command, option in (("view", "--refine"), ("shade", "--aa"))
+    )
+    shadows = of_view["shadows"], of_shade["shadows"]
+    assert all(one["rays"] > 0 for one in shadows)
     for name in ("specular", "diffuse"):
         layer = f"ltsh4.{name}"
-        both = np.hypot(*(one[name] for one in noise))
+        both = np.hypot(*(one["noise"][name] for one in shadows))
         # The unshadowed pictures of so few points are up to 2 % apart at edges.
         assert relative(view[layer], shade[layer]) < 0.02 + 2.0 * both, name
     # There is something to see.
@@ -130,9 +127,8 @@ def test_a_view_shows_lamps_of_files_as_pictures_do(capsys, tmp_path):
     parts.empty_scene(*SIZE)
     parts.add_plane(parts.principled("Floor", Roughness=0.3)[0], size=6.0)
     for kind, x in (("POINT", -1.2), ("SPOT", 1.2)):
-        data = bpy.data.lights.new(kind, kind)
-        data.energy, data.shadow_soft_size = 80.0, 0.1
-        light = parts.link(bpy.data.objects.new(kind, data), (x, 0.0, 1.6), (0.3, 0.2, 0.0))
+        light = parts.new_light(kind, kind, energy=80.0, shadow_soft_size=0.1)
+        parts.link(light, (x, 0.0, 1.6), (0.3, 0.2, 0.0))
         tree, emission = light_tree(light)
         node = tree.nodes.new("ShaderNodeTexIES")
         node.mode, node.ies = "INTERNAL", bpy.data.texts.new(kind)
@@ -141,12 +137,9 @@ def test_a_view_shows_lamps_of_files_as_pictures_do(capsys, tmp_path):
         tree.links.new(node.outputs[0], emission.inputs["Strength"])
     parts.add_camera((0.0, -4.0, 3.4), (0.85, 0.0, 0.0))
     path = parts.save(tmp_path / "lamps.blend")
-    view, shade = tmp_path / "view", tmp_path / "shade"
-    both = ("--shadows", "off", "--techniques", "ltsh4", "--quiet")
-    code, _, stderr = run(capsys, "view", path, "-o", view, "--refine", "1", *both)
-    assert (code, stderr) == (0, "")
-    assert run(capsys, "shade", path, "-o", shade, *both)[0] == 0
-    found, expected = imaging.read_layers(view / "view.exr"), imaging.read_layers(shade / "shade.exr")
+    both = ("--shadows", "off", "--techniques", "ltsh4")
+    _, found = made(capsys, "view", path, tmp_path / "view", "--refine", "1", *both)
+    _, expected = made(capsys, "shade", path, tmp_path / "shade", *both)
     for name in ("specular", "diffuse"):
         layer = f"ltsh4.{name}"
         assert expected[layer].max() > 0.0
@@ -551,10 +544,7 @@ def test_what_a_view_leaves_out_is_named_and_hides_nothing(capsys, tmp_path):
     set_up_scene()
     wall = parts.add_plane(None, 4.0, "Wall", location=(0.0, -1.0, 1.0), rotation=(1.4, 0.0, 0.0))
     wall.visible_shadow = wall.visible_diffuse = wall.visible_glossy = False
-    hidden = bpy.data.collections.new("Indirect")
-    bpy.context.scene.collection.children.link(hidden)
-    hidden.objects.link(wall)
-    bpy.context.scene.collection.objects.unlink(wall)
+    bpy.context.scene.collection.children.link(into_collection("Indirect", wall))
     bpy.context.view_layer.layer_collection.children["Indirect"].indirect_only = True
     path = parts.save(tmp_path / "without.blend")
     parts.link(bpy.data.objects.new("Hair", parts.hair_curves(3)))
@@ -563,20 +553,15 @@ def test_what_a_view_leaves_out_is_named_and_hides_nothing(capsys, tmp_path):
     bpy.data.objects["Sign"].particle_systems[0].settings.type = "HAIR"
     bpy.data.objects["Plane"].is_shadow_catcher = True
     more = parts.save(tmp_path / "more.blend")
-    layers, warnings = [], []
-    for file in (path, more):
-        arguments = ("-o", tmp_path / file.stem, "--refine", 1, "--shadows", "off", "--json", "--quiet")
-        code, stdout, stderr = run(capsys, "view", file, *arguments)
-        assert (code, stderr) == (0, "")
-        warnings.append(json.loads(stdout)["warnings"])
-        layers.append(imaging.read_layers(tmp_path / file.stem / "view.exr"))
-    assert warnings[0] == []
+    plain, (report, layers) = (
+        made(capsys, "view", file, tmp_path / file.stem, "--refine", 1, "--shadows", "off") for file in (path, more)
+    )
+    assert plain[0]["warnings"] == []
     for part in ("Hair", "Sign", "Cloud: point clouds", "Plane: shown as any surface"):
-        assert any(part in line for line in warnings[1]), (part, warnings[1])
-    np.testing.assert_array_equal(layers[0]["ltsh4c.combined"], layers[1]["ltsh4c.combined"])
-    assert run(capsys, "shade", path, "-o", tmp_path / "shade", "--techniques", "ltsh4c", "--quiet")[0] == 0
-    seen = imaging.read_layers(tmp_path / "shade" / "shade.exr")["coverage.hit"]
-    assert np.abs(layers[0]["coverage.hit"] - seen).mean() < 0.01
+        assert any(part in line for line in report["warnings"]), (part, report["warnings"])
+    np.testing.assert_array_equal(plain[1]["ltsh4c.combined"], layers["ltsh4c.combined"])
+    _, shade = made(capsys, "shade", path, tmp_path / "shade", "--techniques", "ltsh4c")
+    assert np.abs(layers["coverage.hit"] - shade["coverage.hit"]).mean() < 0.01
 
 
 def test_a_view_after_a_render_with_grease_pencil(capsys, tmp_path):
@@ -587,9 +572,7 @@ def test_a_view_after_a_render_with_grease_pencil(capsys, tmp_path):
     parts.link(bpy.data.objects.new("Strokes", kinds.new("Strokes")))
     path, found = parts.save(tmp_path / "room.blend"), []
     for _ in range(2):
-        arguments = ("-o", tmp_path / "view", "--refine", 1, "--shadows", "off", "--quiet")
-        assert run(capsys, "view", path, *arguments)[::2] == (0, "")
-        found.append(imaging.read_layers(tmp_path / "view" / "view.exr")["ltsh4c.combined"])
-        arguments = ("--resolution", "8x8", "--cycles-samples", 2, "--quiet")
-        assert run(capsys, "render", path, "-o", tmp_path / "render", *arguments)[0] == 0
+        layers = made(capsys, "view", path, tmp_path / "view", "--refine", 1, "--shadows", "off")[1]
+        found.append(layers["ltsh4c.combined"])
+        made(capsys, "render", path, tmp_path / "render", "--resolution", "8x8", "--cycles-samples", 2)
     np.testing.assert_array_equal(*found)

@@ -157,8 +157,7 @@ def test_lobes_of_a_coarse_smooth_mesh_end_where_those_of_numpy_do(tmp_path):
     # The horizon of the mesh makes a difference.
     assert wrong.sum() > 20
     # The samples of the viewport are those that Cycles takes of the saved file, but for edges of faces.
-    path = tmp_path / "sphere.blend"
-    bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
+    path = parts.save(tmp_path / "sphere.blend", copy=True)
     found = extract_pixels(PixelJob(scene=path))
     row, column = np.divmod(found.film.pixel, SIZE[0])
     place = np.full(SIZE[0] * SIZE[1], -1)

@@ -36,7 +36,7 @@ def seen(patterns=no_patterns):
 def test_lights_are_those_that_shading_takes():
     parts.empty_scene()
     for kind in ("POINT", "SPOT", "SUN"):
-        parts.link(bpy.data.objects.new(kind, bpy.data.lights.new("Bulb", kind)), (1.0, 2.0, 3.0), (0.1, 0.2, 0.3))
+        parts.link(parts.new_light(kind, kind), (1.0, 2.0, 3.0), (0.1, 0.2, 0.3))
     for shape in ("SQUARE", "RECTANGLE", "DISK", "ELLIPSE"):
         parts.add_area_light(shape, shape=shape, spread=1.2 if shape == "ELLIPSE" else np.pi)
     parts.add_camera()
@@ -57,8 +57,7 @@ def test_lights_are_those_that_shading_takes():
 
 def test_what_is_shown_otherwise_or_not_at_all_is_named():
     parts.empty_scene()
-    torn = bpy.data.objects.new("Torn", bpy.data.lights.new("Torn", "SPOT"))
-    parts.link(torn, scale=(1.0, 0.0, 1.0))
+    parts.link(parts.new_light("Torn", "SPOT"), scale=(1.0, 0.0, 1.0))
     parts.add_area_light("Dark", energy=-5.0)
     parent = parts.link(bpy.data.objects.new("Parent", None), scale=(1.0, 3.0, 1.0))
     sheared = parts.add_area_light("Sheared", rotation=(0.3, 0.2, 0.7))
@@ -139,9 +138,8 @@ def test_of_too_many_lights_the_strongest_are_shown():
 
 def add_bulb(name, kind, make):
     """A light with the strength that `make` gives of its tree; object and tree."""
-    data = bpy.data.lights.new(name, kind)
-    data.energy, data.shadow_soft_size = 50.0, 0.1
-    light = parts.link(bpy.data.objects.new(name, data), (0.5, -0.3, 2.0), (0.3, 0.2, 0.1))
+    light = parts.new_light(name, kind, energy=50.0, shadow_soft_size=0.1)
+    parts.link(light, (0.5, -0.3, 2.0), (0.3, 0.2, 0.1))
     tree, emission = light_tree(light)
     tree.links.new(make(tree), emission.inputs["Strength"])
     return light, tree
@@ -378,8 +376,7 @@ def lit_scene():
 def test_lights_of_every_kind_light_the_view_as_numpy_does(tmp_path):
     camera, ball = lit_scene()
     pictures = with_graphics(lambda: [viewport_picture(camera, name) for name in shading.PASSES])
-    path = tmp_path / "lights.blend"
-    bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
+    path = parts.save(tmp_path / "lights.blend", copy=True)
     found = extract_pixels(PixelJob(scene=path))
     distance = np.linalg.norm(found.samples.position - np.array(ball.location), axis=1)
     # Away from the edge of the ball and what is hidden behind it, where positions differ by more than a pixel.

@@ -70,8 +70,7 @@ def test_normals_are_those_that_cycles_interpolates(tmp_path):
     parts.add_area_light()
     camera = parts.add_top_camera(float(len(KINDS)))
     camera.location.x = 0.5 * (len(KINDS) - 1)
-    path = tmp_path / "normals.blend"
-    bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
+    path = parts.save(tmp_path / "normals.blend", copy=True)
     samples = extract_pixels(PixelJob(scene=path)).samples
     column = np.round(samples.position[:, 0]).astype(int)
     for x, ob in enumerate(objects):

@@ -1,0 +1,137 @@
+"""What `match` needs of Blender: target pictures as light, and changed lights (runs in the child)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from ...scene import SceneError, listed
+from .. import render_settings
+from ..lights.groups import own_light_groups
+from ..process.match import TARGET, LightsJob, TargetJob
+from ..saving import save_copy
+from .pixels import open_scene
+
+# SPACES: color spaces of pictures by the view transform that made them, without look, on an sRGB display. Blender knows
+# their way back to light.
+SPACES = {
+    "Standard": "sRGB",
+    "AgX": "AgX Base sRGB",
+    "Filmic": "Filmic sRGB",
+    "Khronos PBR Neutral": "Khronos PBR Neutral sRGB",
+}
+# Channels of 8 bits: nearer to black or white than these, they are clipped, or rounded by more than 2 %.
+CLIPPED = (8.0 / 255.0, 252.0 / 255.0)
+
+
+def read_target(job: TargetJob, folder: Path, progress) -> dict:
+    """Do the `job`: write the target's light and its weights as TARGET. Returns the manifest."""
+    warnings: list[str] = []
+    progress("target", 0.0)
+    open_scene(Path(job.scene), warnings, job.scripts)
+    scene = bpy.context.scene
+    render_settings.go_to_frame(scene, job.frame)
+    target, encoded = _picture(Path(job.target), scene, job.target_view, folder)
+    size, own = target.shape[1::-1], render_settings.picture_size(scene)
+    if abs(size[0] * own[1] / (size[1] * own[0]) - 1.0) > 0.01:
+        raise SceneError(
+            f"{job.target}: is {size[0]}x{size[1]} pixels, expected the shape of the scene's picture, {own[0]}x{own[1]}"
+        )
+    weights = is_telling(target, encoded).astype(np.float32)
+    if job.mask is not None:
+        mask, _ = _picture(Path(job.mask), scene, "Standard", folder)
+        if mask.shape != target.shape:
+            raise SceneError(
+                f"{job.mask}: is {mask.shape[1]}x{mask.shape[0]} pixels, expected the target's {size[0]}x{size[1]}"
+            )
+        weights *= np.clip(mask.mean(axis=-1), 0.0, 1.0)
+    np.savez(folder / TARGET, target=np.where(weights[..., None] > 0.0, target, 0.0), weights=weights)
+    return {"warnings": []}
+
+
+def _picture(path: Path, scene, view: str | None, folder: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    """`light_of_image` of a picture file."""
+    try:
+        image = bpy.data.images.load(str(path), check_existing=False)
+        width, _ = image.size
+    except RuntimeError:
+        width = 0
+    if width == 0:
+        raise SceneError(f"{path}: Blender cannot read it as a picture, expected EXR, HDR, PNG, JPEG or TIFF")
+    return light_of_image(image, scene, view, folder)
+
+
+def light_of_image(image, scene, view: str | None, folder: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    """The light (H, W, 3) of an image, and its own values if it went through the `view` transform (None: the scene's).
+
+    Images of floats are light. `folder` is temporary. Raises SceneError where there is no way back to light.
+    """
+    if image.is_float:
+        return _pixels(image), None
+    settings = scene.view_settings
+    view = view or settings.view_transform
+    if view not in SPACES:
+        raise SceneError(f"view transform {view!r} has no way back to light, expected one of {listed(SPACES)}")
+    if settings.use_curve_mapping or settings.look != "None":
+        raise SceneError(
+            f"scene {scene.name!r}: its view has a look or curves, which have no way back to light; switch them off, "
+            "or give an EXR as target"
+        )
+    encoded, path = _pixels(image), str(folder / "encoded.exr")
+    floats = bpy.data.images.new("LTSH encoded", *image.size, float_buffer=True)
+    floats.colorspace_settings.name = "Non-Color"
+    values = np.ones((*encoded.shape[:2], 4), np.float32)
+    values[..., :3] = (encoded**settings.gamma)[::-1]
+    floats.pixels.foreach_set(values.ravel())
+    floats.file_format, floats.filepath_raw = "OPEN_EXR", path
+    floats.save()
+    loaded = bpy.data.images.load(path, check_existing=False)
+    loaded.colorspace_settings.name = SPACES[view]
+    light = _pixels(loaded) / 2.0**settings.exposure
+    for made in (floats, loaded):
+        bpy.data.images.remove(made)
+    return light, encoded
+
+
+def is_telling(light: np.ndarray, encoded: np.ndarray | None) -> np.ndarray:
+    """True (H, W) where no channel of a picture is clipped."""
+    finite = np.isfinite(light).all(axis=-1)
+    return finite if encoded is None else finite & ((encoded > CLIPPED[0]) & (encoded < CLIPPED[1])).all(axis=-1)
+
+
+def _pixels(image) -> np.ndarray:
+    """The colors (H, W, 3) of an image, row 0 on top."""
+    values = np.empty(image.size[0] * image.size[1] * image.channels, np.float32)
+    image.pixels.foreach_get(values)
+    values = values.reshape(image.size[1], image.size[0], image.channels)[::-1]
+    return values[..., :3] if image.channels > 2 else np.repeat(values[..., :1], 3, axis=-1)
+
+
+def save_lights(job: LightsJob, folder: Path, progress) -> dict:
+    """Do the `job`: change the lights of the scene and save a copy. Returns the manifest."""
+    warnings: list[str] = []
+    progress("write", 0.0)
+    open_scene(Path(job.scene), warnings, job.scripts)
+    scene = bpy.context.scene
+    groups, lights = own_light_groups(scene, tuple(job.lights)), []
+    for group, factor in job.factors.items():
+        objects, most = groups[group], max(factor)
+        data, before = objects[0].data, objects[0].data.energy
+        data.energy = most * before
+        if most > 0.0:
+            data.color = [value * one / most for value, one in zip(data.color, factor, strict=True)]
+        lights += [
+            {
+                "name": ob.name,
+                "group": group,
+                "power_before": before,
+                "power_after": data.energy,
+                "color": list(data.color),
+            }
+            for ob in objects
+        ]
+    bpy.context.preferences.filepaths.save_version = 0  # no backup of our own empty file there
+    save_copy(Path(job.path), relative_remap=True)
+    return {"lights": lights}

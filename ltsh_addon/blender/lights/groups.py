@@ -1,0 +1,40 @@
+"""Light groups of `match`: one for each light whose settings can be changed."""
+
+from __future__ import annotations
+
+from ...scene import SceneError, listed
+
+
+def own_light_groups(scene, lights: tuple[str, ...]) -> dict[str, list]:
+    """Names of a light group for each of the light objects called `lights`, () for all, and its objects: those that
+    share their data. Lights whose settings cannot be changed are in none. Raises SceneError for a name of no light."""
+    known = {ob.name: ob for ob in scene.objects if ob.type == "LIGHT" and not ob.hide_render}
+    if unknown := [name for name in lights if name not in known]:
+        names = listed(map(repr, known)) or "none"
+        raise SceneError(f"light {unknown[0]!r} is not in scene {scene.name!r}; lights there: {names}")
+    chosen = [ob for name, ob in sorted(known.items()) if name in (lights or known) and not reason_to_keep(ob)]
+    several = dict.fromkeys(ob.data for ob in chosen)
+    return {f"Light {n}": [ob for ob in known.values() if ob.data == data] for n, data in enumerate(several, 1)}
+
+
+def regroup(scene, lights: tuple[str, ...]) -> list[str]:
+    """Put `lights`, () for all, into light groups of their own, and nothing else into any; returns the groups."""
+    for ob in scene.objects:
+        ob.lightgroup = ""
+    if scene.world is not None:
+        scene.world.lightgroup = ""
+    groups = own_light_groups(scene, lights)
+    for name, objects in groups.items():
+        for ob in objects:
+            ob.lightgroup = name
+    return list(groups)
+
+
+def reason_to_keep(ob) -> str:
+    """Why the settings of a light object cannot be changed; "" if they can."""
+    if ob.library is not None or ob.data.library is not None:
+        return "it is linked from another file"
+    animation = ob.data.animation_data
+    if animation is not None and (animation.action or len(animation.drivers)):
+        return "its settings are animated or driven"
+    return ""

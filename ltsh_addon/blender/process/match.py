@@ -1,0 +1,57 @@
+"""The jobs of `match`: reading a target picture, and a copy of the scene with changed lights. Imports no bpy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ...files import replacing_by_copy, temporary_folder
+from ...scene import Progress
+from .blender_process import run_scene_job
+
+TARGET = "target.npz"
+
+
+@dataclass(frozen=True)
+class TargetJob:
+    """Read the pictures `target` and `mask` as the light of a scene; None means as in the file."""
+
+    scene: Path
+    target: Path
+    mask: Path | None
+    target_view: str | None
+    frame: int | None
+    scripts: bool = False
+
+
+@dataclass(frozen=True)
+class LightsJob:
+    """Save a copy of `scene` as `path`, whose lights have `factors` (3,) times their radiance, by light group.
+
+    The groups are those of `lights` by `extract.match.own_light_groups`.
+    """
+
+    scene: Path
+    path: Path
+    factors: dict[str, list[float]]
+    lights: tuple[str, ...]
+    scripts: bool = False
+
+
+def read_target(
+    job: TargetJob, folder: Path, progress: Progress | None = None
+) -> tuple[np.ndarray, np.ndarray, list[str]]:
+    """The target (H, W, 3), row 0 on top, in scene-referred radiance; the weights (H, W) of its pixels, 0 where it is
+    clipped or outside of the mask; and warnings. Raises as `pixels.extract_pixels` does."""
+    manifest = run_scene_job(job, folder, progress)
+    with np.load(folder / TARGET) as arrays:
+        return arrays["target"].astype(np.float64), arrays["weights"].astype(np.float64), manifest["warnings"]
+
+
+def save_lights(job: LightsJob, progress: Progress | None = None) -> list[dict]:
+    """Do the `job`; the copy appears complete or not at all. Returns "name", "group", "power_before", "power_after"
+    and "color" of each light. Raises as `pixels.extract_pixels` does."""
+    with replacing_by_copy(Path(job.path).absolute()) as unfinished, temporary_folder() as folder:
+        return run_scene_job(replace(job, path=unfinished), folder, progress)["lights"]

@@ -13,7 +13,7 @@ from ..imaging import exr
 from ..imaging.exr import COMBINED, layer_name, parse_layer_name, writing_rows
 from ..imaging.seams import SeamFit
 from ..reading import NUMBER, file_name
-from ..scene import PASSES
+from ..scene import PASSES, listed
 from .comparison import percent
 from .lighting import technique_names
 from .options import BakeOptions
@@ -349,3 +349,14 @@ def summary(report: dict, seconds: dict) -> list[str]:
 def brief(report: dict) -> list[str]:
     """The lines of `summary` without times, under the name of the bake, for one of several."""
     return [f"{report['name']}:", *(f"  {line}" for line in summary(report, {}))]
+
+
+def darkness(record, reasons) -> tuple[list[str], list[str]]:
+    """Problems and warnings of a dark object: most of its texels are not shaded, for `reasons`, or no light arrives."""
+    tiles, name = record["tiles"].values(), f"object {record['name']!r}"
+    texels, unshaded = (sum(tile[key] for tile in tiles) for key in ("texels", "unshaded_texels"))
+    if 2 * unshaded > texels:
+        share = f"{100.0 * unshaded / texels:.3g} %"
+        return [f"{name}: {share} of its texels are not shaded: {listed(dict.fromkeys(filter(None, reasons)))}"], []
+    is_dark = texels > 0 and not any(tile["is_lit"] for tile in tiles)
+    return [], [f"{name}: no light reaches it, or it reflects none: its texture is black"] if is_dark else []

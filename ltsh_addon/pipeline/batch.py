@@ -118,7 +118,7 @@ def _perform(
     if job.command == "render":
         return render.make_finished(options, progress)
     if job.command == "view":
-        return picture.draw_view(options, progress)
+        return picture.draw_view(options, progress, len(job.frames) > 1)
     return picture.make_picture(options, job.command == "compare", progress)
 
 

@@ -1,4 +1,4 @@
-"""`python -m tables fit|validate|optimum|plot|export ...`: makes, measures and exports the lookup tables.
+"""`python -m tables fit|validate|optimum|plot|export|page ...`: makes, measures and exports the lookup tables.
 
 Needs scipy, and `plot` matplotlib, which the add-on does not need.
 """
@@ -6,6 +6,7 @@ Needs scipy, and `plot` matplotlib, which the add-on does not need.
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import os
 import subprocess
@@ -16,10 +17,11 @@ from pathlib import Path
 
 import numpy as np
 
+from ltsh_addon.files import write_bytes
 from ltsh_addon.pipeline.options import table
 from ltsh_addon.shading import SHIPPED_TABLES, TableError, load_table
 
-from . import export, families, fit, layouts, optimum, validate
+from . import bench, export, families, fit, header, layouts, optimum, pack, validate
 from .families import BRDFS
 
 FOLDER = Path(__file__).resolve().parent
@@ -40,7 +42,7 @@ def main(arguments: list[str]) -> int:
 
 def _parser():
     parser = argparse.ArgumentParser(prog="python -m tables")
-    actions = parser.add_subparsers(dest="action", required=True, metavar="fit|validate|optimum|plot|export")
+    actions = parser.add_subparsers(dest="action", required=True, metavar="fit|validate|optimum|plot|export|page")
     default = f"default: {', '.join(SHIPPED_TABLES)}"
     fitting = actions.add_parser("fit", help="fit tables; goes on where a fit of the same settings was stopped")
     names = f"ltc, ltsh1 to ltsh8, or these with a c; {default}"
@@ -49,6 +51,7 @@ def _parser():
     fitting.add_argument("--brdf", choices=BRDFS, default="ggx", help="other BRDFs get the name <brdf>_<table>")
     fitting.add_argument("--size", type=_size, default=64, metavar="N", help="nodes per axis, default 64")
     fitting.add_argument("--jobs", type=_jobs, default=2, metavar="N", help="tables at a time, default 2")
+    fitting.add_argument("--pack", action="store_true", help="fit the pack to the shipped tables instead")
     fitting.set_defaults(run=_fit_all)
     single = actions.add_parser("fit-one")
     for name, kind in (("name", _name), ("path", Path), ("brdf", str), ("size", int)):
@@ -57,6 +60,7 @@ def _parser():
     checking = actions.add_parser("validate", help="measure tables between their nodes")
     checking.add_argument("names", nargs="*", metavar="TABLE", help=f"or a path; {default}")
     checking.add_argument("--count", type=_size, default=28, metavar="N", help="points per axis, default 28")
+    checking.add_argument("--pack", action="store_true", help="the tables of the pack beside the shipped ones")
     checking.add_argument("--json", action="store_true", help="one JSON document on stdout")
     checking.set_defaults(run=_validate)
     bounding = actions.add_parser("optimum", help="the least error of families of lobes at single points")
@@ -80,10 +84,21 @@ def _parser():
     )
     exporting.add_argument("-o", dest="output", type=Path, required=True, metavar="OUT", help="folder for the files")
     exporting.add_argument(
-        "--layout", choices=layouts.LAYOUTS, metavar="ENGINE", help=f"LTC as one engine takes it: {_LAYOUT_NAMES}"
+        "--layout",
+        choices=(*layouts.LAYOUTS, "pack"),
+        metavar="LAYOUT",
+        help=f"LTC as one engine takes it: {_LAYOUT_NAMES}; or pack: all tables in one small texture",
+    )
+    exporting.add_argument(
+        "--two-curves", action="store_true", help="only F = 1 and (1 - c)^5: smaller, dielectrics are Schlick's"
     )
     exporting.add_argument("--json", action="store_true", help="name the files on stdout in one JSON document")
     exporting.set_defaults(run=_export)
+    paging = actions.add_parser("page", help="a page that compares the techniques in a browser, without a network")
+    paging.add_argument("-o", dest="output", type=Path, required=True, metavar="FOLDER", help="folder for the page")
+    width = f"pixels of the pictures, a multiple of 16, default {bench.WIDTH}"
+    paging.add_argument("--width", type=_width, default=bench.WIDTH, metavar="N", help=width)
+    paging.set_defaults(run=_page)
     return parser
 
 
@@ -118,12 +133,21 @@ def _size(text):
     return _number(text, 4, "size")
 
 
+def _width(text):
+    width = _number(text, 16, "width")
+    if width % 16:
+        raise argparse.ArgumentTypeError(f"width is {width}, expected a multiple of 16")
+    return width
+
+
 def _jobs(text):
     return _number(text, 1, "number of jobs")
 
 
 def _fit_all(options) -> int:
     """Fit each table in an interpreter of its own with a single thread, so that the bytes do not depend on threads."""
+    if options.pack:
+        return _fit_pack(options)
     folder = options.output.resolve()
     folder.mkdir(parents=True, exist_ok=True)
     # The largest first, so that the others share the remaining time.
@@ -155,6 +179,15 @@ def _fit_all(options) -> int:
         if sys.stderr.isatty():
             print(file=sys.stderr)
     return 1 if failed else 0
+
+
+def _fit_pack(options) -> int:
+    """Fit all tables of the pack in this process."""
+    progress = functools.partial(print, file=sys.stderr, flush=True)
+    channels = {name: pack.fit_table(name, progress) for name in pack.FIRST_LAYERS}
+    options.output.mkdir(parents=True, exist_ok=True)
+    write_bytes(options.output / pack.PATH.name, header.dds(pack.pack_layers(channels)))
+    return 0
 
 
 def _show(shares, shown):
@@ -197,6 +230,8 @@ def _fit_and_write(options) -> int:
 
 
 def _validate(options) -> int:
+    if options.pack:
+        return _validate_pack(options)
     results = {}
     for name in options.names or SHIPPED_TABLES:
         table = load_table(name)
@@ -214,6 +249,21 @@ def _validate(options) -> int:
     else:
         print(_as_text(results))
         print(_anisotropic_text(brushed) if brushed else "", end="")
+    return 0
+
+
+def _validate_pack(options) -> int:
+    print("| table | mean | shipped | median | shipped | smooth | shipped | albedo | shipped | curvature | shipped |")
+    print("|---" * 11 + "|")
+    for name, packed in pack.load_pack().items():
+        cells = []
+        for measured in (packed, load_table(name)):
+            errors = validate.validate(measured, options.count)
+            smooth = validate.validate_corners(measured, max(options.count // 2, 4)).smooth_mean
+            curved = validate.curvature(measured, options.count)
+            cells.append([f"{errors.mean:.4f}", f"{errors.median:.4f}", f"{smooth:.4f}",
+                          f"{100.0 * errors.albedo_mean:.3f} %", f"{curved:.3f}"])  # fmt: skip
+        print(f"| `{name}` | {' | '.join(f'{ours} | {full}' for ours, full in zip(*cells, strict=True))} |", flush=True)
     return 0
 
 
@@ -295,10 +345,8 @@ def _grazing(options) -> int:
 
 
 def _plot(options) -> int:
-    from . import plots
-
     options.output.mkdir(parents=True, exist_ok=True)
-    for path in plots.draw_all(options.output, lambda text: print(text, file=sys.stderr, flush=True)):
+    for path in optimum.draw_all(options.output, lambda text: print(text, file=sys.stderr, flush=True)):
         print(path)
     return 0
 
@@ -306,22 +354,34 @@ def _plot(options) -> int:
 def _export(options) -> int:
     try:
         prefixes = export.export_prefixes(options.names or (["ltc"] if options.layout else SHIPPED_TABLES))
+        if options.layout == "pack" and options.names:
+            raise ValueError("--layout pack writes all shipped tables; give no TABLE")
+        if options.layout and options.two_curves:
+            raise ValueError(f"--layout {options.layout} has two curves anyway; leave --two-curves out")
         if options.layout and len(prefixes) > 1:
             raise ValueError(f"--layout {options.layout} writes the files of one table, not of {len(prefixes)}")
     except ValueError as error:
         print(f"tables: {error}", file=sys.stderr)
         return 2
-    if options.layout:
+    if options.layout == "pack":
+        files = {"pack": export.export_pack(options.output)}
+    elif options.layout:
         layout, (name,) = layouts.LAYOUTS[options.layout], prefixes
         files = {name: export.export_layout(layout, name, options.output)}
         for text in layout.dropped:
             print(f"tables: warning: {name} in {layout.engine}: {text}", file=sys.stderr)
     else:
-        files = export.export_tables(prefixes, options.output)
-    licenses = [str(path) for path in export.write_licenses(options.output, code=not options.layout)]
+        files = export.export_tables(prefixes, options.output, two_curves=options.two_curves)
+    licenses = [str(path) for path in export.write_licenses(options.output, code=options.layout in (None, "pack"))]
     paths = {name: [str(path) for path in written] for name, written in files.items()}
     shown = {"tables": paths, "licenses": licenses}
     print(json.dumps(shown, indent=2) if options.json else "\n".join(sum(paths.values(), []) + licenses))
+    return 0
+
+
+def _page(options) -> int:
+    for path in bench.write_page(options.output, options.width, lambda text: print(text, file=sys.stderr, flush=True)):
+        print(path)
     return 0
 
 

@@ -21,18 +21,23 @@ from ltsh_addon.lobes.lookup_table import MIN_ALPHA, WARP_REGULARIZATION, Lookup
 from ltsh_addon.scene import VERSION
 from ltsh_addon.shading import load_table
 
-from . import header, layouts
+from . import header, layouts, pack
 
 _WARP_NAMES = ("A", "B", "C", "tilt")
 
 
-def export_tables(prefixes: Mapping[str, str], folder: str | os.PathLike) -> dict[str, list[Path]]:
-    """Write the tables of `export_prefixes` into `folder`, created if needed; returns the files by table.
+def export_tables(
+    prefixes: Mapping[str, str], folder: str | os.PathLike, *, two_curves: bool = False
+) -> dict[str, list[Path]]:
+    """Write the tables of `export_prefixes` into `folder`, created if needed; returns the files by table. With
+    `two_curves` they have only F = 1 and (1 - c)^5.
 
     All tables are read before anything is written. The files of a table appear all or none. Raises TableError,
     OSError.
     """
     tables = {given: load_table(given) for given in prefixes}
+    if two_curves:
+        tables = {given: pack.with_two_curves(table) for given, table in tables.items()}
     folder = _made(folder)
     files = {}
     for given, table in tables.items():
@@ -95,6 +100,24 @@ def export_layout(layout: layouts.Layout, given: str, folder: str | os.PathLike)
     contents = layouts.layout_files(layout, load_table(given))
     with ExitStack() as stack:
         return _write(contents, _made(folder), stack)
+
+
+def export_pack(folder: str | os.PathLike) -> list[Path]:
+    """Write the pack (`pack.py`): three array textures, and code for each of its tables. Raises OSError."""
+    textures = np.frombuffer(pack.PATH.read_bytes(), "<f2", offset=148).reshape(-1, pack.SIZE, pack.SIZE, 4)
+    contents = {f"{name}.dds": header.dds(textures[:count]) for name, count in pack.LAYERS.items()}
+    for name, table in pack.load_pack().items():
+        prefix = f"pack_{name}"
+        about = _about(table, prefix) + _ABOUT_PACK.format(size=pack.SIZE, layer=pack.FIRST_LAYERS[name])
+        contents[f"{prefix}.h"] = header.header_text(table, prefix, about).encode("ascii")
+        contents[f"{prefix}.wgsl"] = header.wgsl_text(table, prefix, about).encode("ascii")
+    with ExitStack() as stack:
+        return _write(contents, _made(folder), stack)
+
+
+_ABOUT_PACK = """
+The numbers of the nodes are {size} x {size} coefficients of cubic B-splines. The textures pack_*.dds have them too,
+from layer {layer} on, four channels to a layer, roughness down the rows. The rest of the data is here alone."""
 
 
 def write_licenses(folder: str | os.PathLike, *, code: bool = True) -> list[Path]:

@@ -28,6 +28,8 @@ from ltsh_addon.shading.header import (
     table_sizes,
 )
 
+from .pack import SplineTable
+
 _TERMS_PER_LINE = 3
 _VALUES_PER_LINE = 8
 TEMPLATE = Path(__file__).with_name("table.h")
@@ -45,6 +47,7 @@ def header_text(table: LookupTable, prefix: str, about: str) -> str:
         "CONSTANTS": _constants(table, blocks, prefix.upper()),
         "VALUES": "\n".join(_data_lines(blocks)),
         "ONE_OVER_PI": float_literal(1.0 / np.pi),
+        "SIXTH": float_literal(1.0 / 6.0),
     }
     if table.family == "ltsh":
         values |= {
@@ -55,7 +58,8 @@ def header_text(table: LookupTable, prefix: str, about: str) -> str:
             "ALBEDO": _sum(lookup_table.basis_integrals(table.coefficients.shape[3]), 1e-12),
             "LEAST_OF_COSINE": float_literal(0.5 * LEAST_SHARE / np.pi),
         }
-    return filled(_of_family(TEMPLATE.read_text(encoding="ascii"), table.family), values)
+    kinds = {table.family, *(["spline"] if isinstance(table, SplineTable) else [])}
+    return filled(_of_kinds(TEMPLATE.read_text(encoding="ascii"), kinds), values)
 
 
 # Markers: the end of what is the same for all tables in WGSL, and the end of what shaders need in a header.
@@ -72,11 +76,13 @@ def wgsl_text(table: LookupTable, prefix: str, about: str) -> str:
     return f"{translated_to_wgsl(text, prefix).strip()}\n"
 
 
-def _of_family(text, family) -> str:
-    """`text` for a family of tables: keeps one of the two parts between the lines `@if ltsh`, `@else` and `@end`."""
-    group = 1 if family == "ltsh" else 2
+def _of_kinds(text, kinds) -> str:
+    """`text` for a kind of tables: keeps one of the two parts between the lines `@if KIND`, `@else` and `@end`."""
     return re.sub(
-        r"^@if ltsh\n(.*?)^@else\n(.*?)^@end\n", lambda match: match[group], text, flags=re.DOTALL | re.MULTILINE
+        r"^@if (\w+)\n(.*?)^@else\n(.*?)^@end\n",
+        lambda match: match[2] if match[1] in kinds else match[3],
+        text,
+        flags=re.DOTALL | re.MULTILINE,
     )
 
 

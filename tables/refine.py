@@ -201,7 +201,9 @@ class Linearization:
         return 1.0 / np.maximum(self.error, ERROR_FLOOR)
 
 
-def linearize(family, model, cells, nodes, curves=FLAT, *, derivatives=True) -> Linearization:
+def linearize(
+    family, model, cells, nodes, curves=FLAT, *, derivatives=True, albedo_weight=ALBEDO_WEIGHT
+) -> Linearization:
     """Linearization at `nodes` (R, T, n + size): the channels of the warp, then the coefficients for F = 1."""
     values = cells.interpolate(nodes)
     found = []
@@ -209,11 +211,11 @@ def linearize(family, model, cells, nodes, curves=FLAT, *, derivatives=True) -> 
         points = Points.at(
             model, cells.cosine[part], cells.roughness[part] ** 2, curves, albedo=cells.albedo[part, : len(curves)]
         )
-        found.append(_linearize(family, points, values[part], derivatives))
+        found.append(_linearize(family, points, values[part], derivatives, albedo_weight))
     return Linearization(*(None if part[0] is None else np.concatenate(part) for part in zip(*found, strict=True)))
 
 
-def _linearize(family, points, values, derivatives):
+def _linearize(family, points, values, derivatives, albedo_weight):
     warp, coefficients = values[:, : family.parameters], values[:, family.parameters :]
     basis = _basis(family, points, warp)
     lobe = np.einsum("psk,pk->ps", basis, coefficients)
@@ -231,7 +233,7 @@ def _linearize(family, points, values, derivatives):
     excess_row = np.where(lobe < 0.0, points.quadrature, 0.0) / points.albedo[:, :1]
     excess = np.maximum(-(excess_row * lobe).sum(axis=1) - NEGATIVE_SHARE, 0.0)
     excess_row *= (excess > 0.0)[:, None]
-    error = np.sqrt(squared + ALBEDO_WEIGHT * albedo_misses[:, 0] ** 2 + EXCESS_WEIGHT * excess**2)
+    error = np.sqrt(squared + albedo_weight * albedo_misses[:, 0] ** 2 + EXCESS_WEIGHT * excess**2)
     if not derivatives:
         return error, None, None
     importance = 1.0 / np.maximum(error, ERROR_FLOOR)
@@ -239,7 +241,7 @@ def _linearize(family, points, values, derivatives):
     matrices, right = _normal(jacobian, weights * importance[:, None], targets)
     scales = np.broadcast_to((scales * importance)[:, None], misses.shape[:2])
     rows = [(np.matmul(functionals, jacobian), scales, misses)]
-    rows.append((albedo_row[:, None], (ALBEDO_WEIGHT * importance)[:, None], albedo_misses[:, None]))
+    rows.append((albedo_row[:, None], (albedo_weight * importance)[:, None], albedo_misses[:, None]))
     if points.lobes.shape[2] == 1:
         slopes = np.matmul(excess_row[:, None], jacobian)
         rows.append((slopes, (EXCESS_WEIGHT * importance)[:, None], excess[:, None, None]))
@@ -319,7 +321,7 @@ def refine(family, model, cells, state: State, progress=None) -> np.ndarray:
     free = free_entries(family, model, cells.shape)
     here = linearize(family, model, cells, state.nodes) if state.iteration < ITERATIONS else None
     while state.iteration < ITERATIONS:
-        change = _solve(cells, here.matrices, here.right[..., 0], free, state.damping, tie_round_warp=True)
+        change = damped_change(cells, here.matrices, here.right[..., 0], free, state.damping, tie_round_warp=True)
         trial = state.nodes + change
         there = linearize(family, model, cells, trial, derivatives=state.iteration + 1 < ITERATIONS)
         better = (here.importance * there.error**2).sum() < (here.importance * here.error**2).sum()
@@ -342,7 +344,7 @@ def fresnel_coefficients(family, model, cells, nodes, limit, curves) -> np.ndarr
     for curve in range(1, len(curves)):
         fixed = cells.interpolate(coefficients[:, :, curve])
         right = here.right[:, family.parameters :, curve] - np.matmul(matrices, fixed[..., None])[..., 0]
-        coefficients[:, :, curve] += _solve(cells, matrices, right, free, 1e-6)
+        coefficients[:, :, curve] += damped_change(cells, matrices, right, free, 1e-6)
     return coefficients
 
 
@@ -372,7 +374,7 @@ def free_entries(family, model, shape) -> np.ndarray:
     return free
 
 
-def _solve(cells, matrices, right, free, damping, *, tie_round_warp=False):
+def damped_change(cells, matrices, right, free, damping, *, tie_round_warp=False):
     """The change (R, T, d) of the nodes that solves the damped normal equations, by conjugate gradients."""
     blocks = cells.node_blocks(matrices)
     diagonal = np.einsum("ijkk->ijk", blocks)

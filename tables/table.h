@@ -47,6 +47,36 @@ LTSH_FUNCTION float @prefix@_data_at(int index);
 /* The cell of the table at cos_theta_o and roughness, both clamped to [0, 1]. */
 LTSH_FUNCTION ltsh_cell @prefix@_cell(float cos_theta_o, float roughness)
 {
+@if spline
+    return ltsh_make_cell(cos_theta_o, roughness, @PREFIX@_ROWS - 2, @PREFIX@_COLUMNS - 2);
+}
+
+/* Weight of coefficient `tap` = 0 .. 3 of the cubic B-spline, a share of 0 to 1 after coefficient 1. */
+LTSH_FUNCTION float @prefix@_tap_weight(int tap, float share)
+{
+    float rest = 1.0f - share;
+    float cube = tap < 2 ? rest : share;
+    float other = tap < 2 ? share : rest;
+    return (tap == 0 || tap == 3 ? cube * cube * cube : 1.0f + 3.0f * cube * (1.0f + cube * other)) * @SIXTH@;
+}
+
+/* One channel, of 4 x 4 coefficients. The warp comes first, then @PREFIX@_COEFFICIENTS for every curve. */
+LTSH_FUNCTION float @prefix@_channel(ltsh_cell cell, int channel)
+{
+    int row = cell.node / (@PREFIX@_COLUMNS - 2);
+    int corner = cell.node + 2 * row;
+    float sum = 0.0f;
+    for (int i = 0; i < 4; ++i) {
+        float along = 0.0f;
+        for (int j = 0; j < 4; ++j) {
+            int at = (corner + i * @PREFIX@_COLUMNS + j) * @PREFIX@_CHANNELS + channel;
+            along += @prefix@_tap_weight(j, cell.column_weight) * @PREFIX@_DATA(at);
+        }
+        sum += @prefix@_tap_weight(i, cell.row_weight) * along;
+    }
+    return sum;
+}
+@else
     return ltsh_make_cell(cos_theta_o, roughness, @PREFIX@_ROWS, @PREFIX@_COLUMNS);
 }
 
@@ -60,6 +90,7 @@ LTSH_FUNCTION float @prefix@_channel(ltsh_cell cell, int channel)
     float second = @PREFIX@_DATA(upper) * (1.0f - share) + @PREFIX@_DATA(upper + @PREFIX@_CHANNELS) * share;
     return first * (1.0f - cell.row_weight) + second * cell.row_weight;
 }
+@end
 
 LTSH_FUNCTION ltsh_warp @prefix@_lookup_warp(ltsh_cell cell)
 {

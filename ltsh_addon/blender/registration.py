@@ -24,6 +24,7 @@ PARTS = (
     "ui.comparison",
     "ui.panels",
     "ui.mixer",
+    "ui.highlight",
 )
 
 # Unregisters everything, last first, even if one part fails.

@@ -93,6 +93,9 @@ def quiet_line_is_clear(rig, where):
     view, region = module("engine.overlay"), rig.region()
     sides = view.covered(rig.area("VIEW_3D"), region)
     place = view._quiet_lines.get(region.as_pointer())
+    if not view._texts[region.as_pointer()].quiet.text:
+        rig.fact(f"quiet line {where}", "nothing is left out, and no bounces are coming")
+        return
     rig.fact(f"quiet line {where}: left and right, px", place and (round(place[0]), round(place[2])))
     left, right = max(sides["LEFT"], sides["FLOAT"]), region.width - sides["RIGHT"]
     rig.fact(f"room for it {where}, px", (left, right))

@@ -28,6 +28,7 @@ def main(rig):
     rig.shot("00_start.png")
     yield from undone_and_redone(rig)
     yield from added(rig)
+    yield from highlighted(rig)
     yield from looked_through(rig)
     yield from regions(rig)
     yield from second_window(rig)
@@ -156,6 +157,38 @@ def added(rig):
     yield from hands.keys(rig, "ctrl+z")
     yield from hands.until(lambda: len(lights()) == len(before) + 1)
     rig.check(lights() == before | {name}, f"one undo takes the copy back: {lights()}")
+
+
+def highlighted(rig):
+    """Drag Highlight: the light follows the mouse over surfaces, Escape puts it back, a release leaves it, one undo
+    takes it back."""
+    ob = bpy.data.objects["Neon"]
+    hands.select(rig, ob)
+
+    def place():
+        return np.array(bpy.data.objects["Neon"].matrix_world).round(4).tolist()
+
+    before = place()
+    for end in ("Escape", "release"):
+        hands.operate(rig, bpy.ops.ltsh.drag_highlight, "INVOKE_DEFAULT")
+        yield from hands.over(rig, x=0.4, y=0.3)
+        rig.xdo("mousedown", 1)
+        yield from hands.until(lambda: place() != before)
+        first = place()
+        yield from hands.over(rig, x=0.35, y=0.22)
+        yield from hands.comes(rig, lambda first=first: place() not in (before, first), f"{end}: it follows the mouse")
+        yield 2
+        rig.shot(f"05_highlight_{end}.png")
+        if end == "Escape":
+            yield from hands.keys(rig, "Escape")
+            yield from hands.comes(rig, lambda: place() == before, lambda: f"Escape puts it back: {place()}")
+        rig.xdo("mouseup", 1)
+        yield 1
+    rig.check(place() != before, "a release leaves it")
+    yield from eyes.settled(rig, "05_highlight_left.png")
+    yield from hands.keys(rig, "ctrl+z")
+    yield from hands.comes(rig, lambda: place() == before, lambda: f"one undo takes it back: {place()}")
+    rig.check(state(rig)[2], "and the preview is on")
 
 
 def looked_through(rig):

@@ -16,6 +16,7 @@ from ltsh_addon.lobes.edge_integrals import MAX_DEGREE
 from ltsh_addon.lobes.lookup_table import LookupTable
 from ltsh_addon.lobes.spherical_harmonics import coefficient_count
 from tables import export as export_module
+from tables import pack
 
 C_COMPILER = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 CXX_COMPILER = shutil.which("c++") or shutil.which("g++") or shutil.which("clang++")
@@ -26,9 +27,11 @@ TABLES = {name: None for name in shading.SHIPPED_TABLES} | {
     f"random_{degree}": ("ltsh", degree) for degree in (1, 5, MAX_DEGREE)
 }
 TABLES["random_ltc"] = ("ltc", 1)
+# Splines
+TABLES |= {"pack_ltsh4": None, "pack_ltc": None}
 # A compiler takes a second for each; two of the degrees between and an LTC of random matrices are for `make soak`.
 NAMES = [
-    pytest.param(name, marks=pytest.mark.soak) if name in ("ltsh2", "random_5", "random_ltc") else name
+    pytest.param(name, marks=pytest.mark.soak) if name in ("ltsh2", "random_5", "random_ltc", "pack_ltc") else name
     for name in TABLES
 ]
 
@@ -220,7 +223,10 @@ def export(folder: Path) -> dict[str, LookupTable]:
     """Write the header of every table into `folder`; the tables by name."""
     tables = {}
     for name, recipe in TABLES.items():
-        tables[name] = synthetic_table(*recipe) if recipe else shading.load_table(name)
+        if name.startswith("pack_"):
+            tables[name] = pack.load_pack()[name.removeprefix("pack_")]
+        else:
+            tables[name] = synthetic_table(*recipe) if recipe else shading.load_table(name)
         export_module.export_table(tables[name], name, name, folder)
     return tables
 

@@ -112,7 +112,7 @@ def test_lobes_agree(compiled):
     found = header.call("lobe", cosine, roughness, directions)
     exact = [array.astype(float) for array in (cosine, roughness, directions[:, None])]
     expected = shading.evaluate_lobe(table, *exact)[:, 0]
-    size = np.abs(table.coefficients[:, :, 0]).sum(axis=2).max()
+    size = largest_sum(table, *exact[:2])
     tolerance = 500.0 * EPS / roughness**2 * (np.abs(expected) + 0.01 * size)
     assert (np.abs(found - expected) <= tolerance).all()
     assert (found[directions[:, 2] <= 0.0] == 0.0).all() and np.abs(expected).max() > 0.1
@@ -123,6 +123,8 @@ def test_what_shading_takes_of_an_integral_agrees(compiled):
     the tails where the integral alone would be negative. The header has errors of a few eps / alpha of a lobe's size.
     """
     table, header = compiled
+    if len(table.fresnel_curves) < 3:
+        pytest.skip("`shade` takes tables with the F82 curve")
     cosine, roughness = points(1500, seed=8, lowest_roughness=0.3)
     generator = np.random.default_rng(9)
     ior = generator.uniform(1.05, 2.5, len(cosine)).astype(np.float32)
@@ -197,6 +199,11 @@ def test_local_frames_are_rotations_that_lay_the_view_direction_flat(compiled):
     assert after == pytest.approx(before, abs=1e-2)
 
 
+def largest_sum(table, cosine, roughness, curve=0):
+    """Largest sum of the magnitudes of a lobe's coefficients."""
+    return float(np.abs(table.lookup(cosine, roughness).coefficients[curve]).sum(axis=0).max())
+
+
 def half_circle_gaps(table, cosine, roughness, vertices):
     """How far (P,) from a half circle the edges are, in rad, that the closed form meets after clipping and warping."""
     lobe, gap = table.lookup(cosine, roughness), np.full(len(cosine), 2.0)
@@ -223,7 +230,7 @@ def test_polygon_integrals_agree_with_the_add_on(compiled, corners):
     cosine, roughness = points(2000, seed=8)
     vertices = random_polygons(2000, corners, seed=9 + corners)
     exact = [array.astype(float) for array in (cosine, roughness, vertices)]
-    tolerance = 20.0 * EPS / half_circle_gaps(table, *exact) * np.abs(table.coefficients[:, :, 0]).sum(axis=2).max()
+    tolerance = 20.0 * EPS / half_circle_gaps(table, *exact) * largest_sum(table, *exact[:2])
     found = header.call("integrate", cosine, roughness, corners, vertices)
     assert (np.abs(found - shading.integrate_polygon(table, *exact)) <= tolerance).all()
     signed = header.call("integral", cosine, roughness, 0, corners, vertices)
@@ -244,7 +251,7 @@ def test_a_triangle_traced_twice_has_twice_the_integral(compiled):
     once = once.astype(np.float32)
     exact = [array.astype(float) for array in (cosine, roughness, once)]
     expected = 2.0 * shading.integrate_polygon(table, *exact)
-    tolerance = 40.0 * EPS / half_circle_gaps(table, *exact) * np.abs(table.coefficients[:, :, 0]).sum(axis=2).max()
+    tolerance = 40.0 * EPS / half_circle_gaps(table, *exact) * largest_sum(table, *exact[:2])
     twice = np.tile(once, (1, 2, 1))
     for vertices in (twice, twice[:, ::-1]):
         found = header.call("integrate", cosine, roughness, 6, vertices)
@@ -265,7 +272,7 @@ def test_a_polygon_over_the_whole_hemisphere_gives_the_albedo(compiled):
     vertices = np.stack([np.cos(angle), np.sin(angle), height], axis=-1).astype(np.float32)
     for curve in range(len(table.fresnel_curves)):
         expected = header.call("albedo", cosine, roughness, curve)
-        tolerance = 0.02 * float(np.abs(table.coefficients[:, :, curve]).sum(axis=2).max())
+        tolerance = 0.02 * largest_sum(table, cosine.astype(float), roughness.astype(float), curve)
         found = header.call("integral", cosine, roughness, curve, 4, vertices)
         assert found == pytest.approx(expected, abs=tolerance)
         found = header.call("integral", cosine, roughness, curve, 4, vertices[:, ::-1])

@@ -130,7 +130,9 @@ def exported(name: str, language: str, folder: Path) -> str:
 
 
 @pytest.mark.parametrize("language", MAIN)
-@pytest.mark.parametrize("name", ["ltc", pytest.param("ltsh2", marks=pytest.mark.soak), "ltsh4", "ltsh4c"])
+@pytest.mark.parametrize(
+    "name", ["ltc", pytest.param("ltsh2", marks=pytest.mark.soak), "ltsh4", "ltsh4c", "pack_ltsh4"]
+)
 def test_shaders_of_every_language_integrate_as_numpy_does(device, folder, tables, tmp_path, name, language):
     source = MAIN[language].replace("HEADER", exported(name, language, folder))
     source += BODY if language != "wgsl" else ""
@@ -202,9 +204,17 @@ def test_conditions_loops_and_changed_parameters_are_translated():
     )
 
 
+def test_the_code_for_the_pack_compiles(folder, tables, tmp_path):
+    _, example = re.findall(r"```glsl\n(.*?)```", ENGINES.read_text(encoding="utf-8"), flags=re.DOTALL)
+    include = next(line for line in example.splitlines() if "the text of pack_ltsh4" in line)
+    source = example.replace(include, exported("pack_ltsh4", "glsl", folder))
+    source += "out vec4 color; void main() { color = vec4(pack_ltsh4_albedo(pack_ltsh4_cell(0.5, 0.5), 1)); }"
+    glslang(source, tmp_path / "pack.frag", "glsl", "frag", for_vulkan=False)
+
+
 @pytest.mark.parametrize("language", ["glsl", "hlsl", "wgsl"])
 def test_the_code_that_engines_are_shown_compiles(device, folder, tables, tmp_path, language):
-    (example,) = re.findall(rf"```{language}\n(.*?)```", ENGINES.read_text(encoding="utf-8"), flags=re.DOTALL)
+    example, *_ = re.findall(rf"```{language}\n(.*?)```", ENGINES.read_text(encoding="utf-8"), flags=re.DOTALL)
     text = exported("ltsh4", language, folder)
     include = next(line for line in example.splitlines() if "the text of ltsh4" in line)
     source = example.replace(include, text)

@@ -156,8 +156,12 @@ def _draw_lines(font: int, texts: ViewTexts, region, sides: dict[str, int], scal
     size, margin = TEXT_SIZE * scale, MARGIN * scale
     blf.size(font, size)
     free = region.width - sides["RIGHT"] - max(sides["LEFT"], sides["FLOAT"]) - 2.0 * margin
-    # Better no quiet line than one of broken words.
-    last = wrapped(last, free, width_of) if all(width_of(word) <= free for word in quiet.split()) else []
+    # Better no line than one of broken words, but for errors.
+    last, notes = (
+        [line for line in some if line[1] == ERROR_COLOR or all(width_of(word) <= free for word in line[0].split())]
+        for some in (last, notes)
+    )
+    last = wrapped(last, free, width_of)
     right, bottom = region.width - sides["RIGHT"] - margin, sides["BOTTOM"] + margin
     most = int((region.height - sides["TOP"] - bottom) / (LINE * size)) - len(last)
     lines = [*(wrapped(notes, free, width_of)[: max(most, 0)] if free > size else []), *last]

@@ -209,11 +209,16 @@ class LTSH_OT_add_light(bpy.types.Operator):
 def surface_under(context, x: int, y: int) -> tuple[Vector, Vector, float] | None:
     """The point of a surface at a pixel of the window in any 3D view, its normal towards the view, and the distance for
     a light there; None where there is none."""
+    region = region_under(context, x, y)
+    return None if region is None else _surface_at(context, region, (x - region.x, y - region.y))
+
+
+def region_under(context, x: int, y: int):
+    """The region of a 3D view at a pixel of the window; None where there is none, or where a panel lies over it."""
     for area in context.window.screen.areas:
         regions = [one for one in area.regions if 0 <= x - one.x < one.width > 1 and 0 <= y - one.y < one.height > 1]
-        # Elsewhere a panel lies over the view.
         if area.type == "VIEW_3D" and [region.type for region in regions] == ["WINDOW"]:
-            return _surface_at(context, regions[0], (x - regions[0].x, y - regions[0].y))
+            return regions[0]
     return None
 
 

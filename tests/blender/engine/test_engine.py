@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import scene_parts as parts
 from job_window import image_pixels
+from lit_plane import into_collection
 
 import ltsh_addon
 from ltsh_addon import shading
@@ -179,11 +180,7 @@ def test_final_render_has_the_shadows_that_shade_makes(scene, tmp_path):
 
 
 def test_every_view_layer_has_its_own_picture(scene, tmp_path):
-    sphere = bpy.data.objects["Sphere"]
-    other = bpy.data.collections.new("Other")
-    scene.collection.children.link(other)
-    scene.collection.objects.unlink(sphere)
-    other.objects.link(sphere)
+    scene.collection.children.link(into_collection("Other", bpy.data.objects["Sphere"]))
     layer = scene.view_layers.new("Without sphere")
     layer.layer_collection.children["Other"].exclude = True
     scene.render.film_transparent = True
@@ -198,12 +195,7 @@ def test_every_view_layer_has_its_own_picture(scene, tmp_path):
 
 
 def test_the_world_is_seen_behind_surfaces_alone(scene, tmp_path):
-    world = scene.world = bpy.data.worlds.new("World")
-    if bpy.app.version < (5, 0, 0):
-        world.use_nodes = True
-    background = next(node for node in world.node_tree.nodes if node.bl_idname == "ShaderNodeBackground")
-    background.inputs["Color"].default_value = (0.1, 0.2, 0.4, 1.0)
-    background.inputs["Strength"].default_value = 2.0
+    parts.add_world(Color=(0.1, 0.2, 0.4, 1.0), Strength=2.0)
     channels = render_passes(scene, tmp_path / "world.exr")
     combined = picture(channels, "ViewLayer.Combined.")
     np.testing.assert_allclose(combined[0, 0], (0.2, 0.4, 0.8), rtol=1e-6)

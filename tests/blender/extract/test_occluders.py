@@ -6,6 +6,7 @@ import bpy
 import numpy as np
 import pytest
 import scene_parts
+from lit_plane import add_instancer, into_collection
 from material_scenes import Build
 from panes import (
     LIGHT,
@@ -68,14 +69,10 @@ def nurbs_surface():
 
 def collection_instances():
     """Instances of a collection that is itself not in the scene, mirrored and of different sizes."""
-    collection = bpy.data.collections.new("Parts")
-    ob = cube((0.3, 0.0, 0.0), 0.6)
-    bpy.context.scene.collection.objects.unlink(ob)
-    collection.objects.link(ob)
+    collection = into_collection("Parts", cube((0.3, 0.0, 0.0), 0.6))
     for number, scale in enumerate(((1.0, 1.0, 1.0), (-0.7, 1.2, 0.5))):
-        instance = scene_parts.link(bpy.data.objects.new(f"I{number}", None), (number - 0.8, 0.3, 1.0), scale=scale)
-        instance.instance_type, instance.instance_collection = "COLLECTION", collection
-        instance.rotation_euler = (0.3, 0.2, 0.4 * number)
+        placement = {"location": (number - 0.8, 0.3, 1.0), "rotation": (0.3, 0.2, 0.4 * number), "scale": scale}
+        add_instancer(collection, f"I{number}", **placement)
 
 
 def vertex_instances():
@@ -107,10 +104,7 @@ def not_in_the_picture():
     a, b, c = cube((-1.0, 0.0, 1.0), 0.6), cube((0.2, 0.0, 1.0), 0.6), cube((1.0, 0.8, 1.0), 0.4)
     a.visible_diffuse = a.visible_glossy = False
     b.is_holdout = True
-    collection = bpy.data.collections.new("Indirect")
-    bpy.context.scene.collection.children.link(collection)
-    bpy.context.scene.collection.objects.unlink(c)
-    collection.objects.link(c)
+    bpy.context.scene.collection.children.link(into_collection("Indirect", c))
     bpy.context.view_layer.layer_collection.children["Indirect"].indirect_only = True
 
 

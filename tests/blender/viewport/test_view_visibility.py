@@ -4,6 +4,7 @@ import bpy
 import numpy as np
 import scene_parts as parts
 from graphics_card import edits_with_graphics, with_graphics
+from lit_plane import add_instancer, into_collection
 from view_pictures import SIZE, away_from_edges, patches_of, sampled_pictures, times_too_far, viewport_picture
 
 from ltsh_addon.blender.viewport.mirror import object_notes
@@ -18,11 +19,8 @@ def test_what_cameras_do_not_see_is_not_shown(tmp_path):
     _, camera = patches_of([chalk] * 4)
     planes = [ob for ob in bpy.data.objects if ob.type == "MESH"]
     planes[0].visible_camera = False
-    instancer = parts.link(bpy.data.objects.new("Instancer", None))
-    instancer.instance_type, instancer.instance_collection = "COLLECTION", bpy.data.collections.new("Inside")
-    instancer.visible_camera = False
-    instancer.instance_collection.objects.link(parts.add_plane(chalk(), location=(1.5, 0.5, 0.2), name="Inside"))
-    bpy.context.scene.collection.objects.unlink(bpy.data.objects["Inside"])
+    inside = into_collection("Inside", parts.add_plane(chalk(), location=(1.5, 0.5, 0.2), name="Inside"))
+    add_instancer(inside).visible_camera = False
     # What lies behind a holdout is not seen either.
     planes[2].is_holdout = True
     parts.add_plane(chalk(), size=8.0, location=(0.0, 0.0, -0.3))

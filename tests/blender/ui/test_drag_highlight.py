@@ -1,0 +1,97 @@
+"""The highlight under the mouse: surfaces that rays of a view meet, where the light goes, and lights that must stay."""
+
+import bpy
+import numpy as np
+import pytest
+import scene_parts as parts
+from mathutils import Vector
+
+from ltsh_addon.blender.evaluated import EmitterTraits
+from ltsh_addon.blender.lights.area import area_light
+from ltsh_addon.blender.lights.linking import Receivers
+from ltsh_addon.blender.ui.highlight import glossy_lobe, place_of, reason_to_stay, samples_of, surface_hit
+from ltsh_addon.shading import shade
+from ltsh_addon.shading.highlight import STENCIL
+
+EYE, PIXEL = Vector((0.3, -4.0, 2.2)), 0.003
+
+
+@pytest.fixture
+def scene():
+    """A smooth ball, squeezed and turned, on a floor, and a light."""
+    scene = parts.empty_scene()
+    ball = parts.principled("Ball", Roughness=0.25)[0]
+    parts.add_sphere(ball, segments=64, location=(0.0, 0.0, 0.8), rotation=(0.3, 0.2, 0.0), scale=(1.2, 0.8, 0.7))
+    parts.add_plane(parts.principled("Floor", Roughness=0.45, Metallic=1.0)[0])
+    parts.add_area_light("Key", location=(-2.0, -2.0, 3.0))
+    return scene
+
+
+def hits_at(scene, pixels, target):
+    """What rays through `pixels` (P, 2) around a target meet."""
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    toward = (target - EYE).normalized()
+    right = toward.cross(Vector((0.0, 0.0, 1.0))).normalized()
+    above = right.cross(toward)
+    rays = [(toward + PIXEL * (x * right + y * above)).normalized() for x, y in pixels.tolist()]
+    return [surface_hit(scene, depsgraph, EYE, ray) for ray in rays]
+
+
+@pytest.mark.parametrize("target", [(0.2, -0.5, 1.1), (-0.4, -0.4, 0.9), (1.3, -0.8, 0.0), (-1.0, -1.4, 0.0)])
+def test_the_highlight_is_where_the_mouse_is(scene, target):
+    light = bpy.data.objects["Key"]
+    hits = hits_at(scene, 2.0 * STENCIL, Vector(target))
+    matrix, note = place_of(light, hits, 2.5)
+    assert not note
+    middle = hits[len(hits) // 2]
+    assert (matrix.translation - middle.position).length == pytest.approx(2.5, rel=1e-5)
+    facing = -matrix.col[2].xyz
+    assert facing.dot((middle.position - matrix.translation).normalized()) == pytest.approx(1.0, abs=1e-5)
+    # All pixels around, by the radiance itself.
+    grid = np.stack(np.meshgrid(np.arange(-12, 13), np.arange(-12, 13)), axis=-1).reshape(-1, 2)
+    around = [(pixel, hit) for pixel, hit in zip(grid, hits_at(scene, grid, Vector(target)), strict=True)
+              if hit is not None and hit.material == middle.material]  # fmt: skip
+    pixels, seen = np.array([pixel for pixel, _ in around]), [hit for _, hit in around]
+    lamp = area_light(light, np.array(matrix), EmitterTraits("", True, True), Receivers([]))
+    samples = samples_of(seen, glossy_lobe(middle.material))
+    radiance = shade(samples, [lamp], passes=("specular",), workers=1).specular.sum(axis=(0, 2))
+    lost = 1.0 - radiance[(pixels == 0).all(axis=-1)][0] / radiance.max()
+    # Facets of 64 segments bend the interpolated normals by a little.
+    assert lost < 0.01 or np.linalg.norm(pixels[np.argmax(radiance)]) <= 2.0
+
+
+def test_normals_are_those_of_the_smooth_surface(scene):
+    (hit,) = hits_at(scene, np.zeros((1, 2)), Vector((0.2, -0.5, 1.1)))
+    ob = bpy.data.objects["Sphere"]
+    inside = ob.matrix_world.inverted() @ hit.position
+    expected = (ob.matrix_world.to_3x3().inverted().transposed() @ inside).normalized()
+    # Interpolated over facets of 64 segments: some 1e-3.
+    assert hit.normal.dot(expected) > 1.0 - 1e-4
+    assert hit.material.name == "Ball" and hit.view.dot((EYE - hit.position).normalized()) == pytest.approx(1.0)
+    assert hits_at(scene, np.zeros((1, 2)), Vector((0.0, 0.0, 4.0))) == [None]
+
+
+def test_dull_surfaces_say_so_and_a_sun_stays_where_it_is(scene):
+    bpy.data.objects["Plane"].data.materials[0] = parts.bsdf_material("ShaderNodeBsdfDiffuse")[0]
+    hits = hits_at(scene, 2.0 * STENCIL, Vector((1.3, -0.8, 0.0)))
+    _, note = place_of(bpy.data.objects["Key"], hits, 2.0)
+    assert note == "this surface has no highlight"
+    sun = parts.link(bpy.data.objects.new("Sun", bpy.data.lights.new("Sun", "SUN")), (1.0, 2.0, 3.0))
+    bpy.context.view_layer.update()
+    matrix, note = place_of(sun, hits_at(scene, 2.0 * STENCIL, Vector((0.2, -0.5, 1.1))), 2.0)
+    assert not note and matrix.translation == sun.matrix_world.translation
+
+
+def test_lights_that_something_holds_stay(scene):
+    light = bpy.data.objects["Key"]
+    assert reason_to_stay(light) == ""
+    light.lock_location[2] = True
+    assert "locked" in reason_to_stay(light)
+    light.lock_location[2] = False
+    constraint = light.constraints.new("TRACK_TO")
+    constraint.name = "Aim"
+    assert "its constraint 'Aim' moves it" in reason_to_stay(light)
+    constraint.enabled = False
+    assert reason_to_stay(light) == ""
+    light.keyframe_insert("location", frame=1)
+    assert reason_to_stay(light) == "it is animated or driven"

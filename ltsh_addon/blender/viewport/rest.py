@@ -56,9 +56,9 @@ LEVELS = (
 # direction that share one, in the pictures that come one after another; the first is the finest that takes one step.
 # TOTALS: the samples after which a picture is shown. REST_SECONDS: how long a view must stay as it is before.
 STEP_SECONDS, SHRINKS, TOTALS, REST_SECONDS = 0.5, (4, 2, 1), (4, 8, 16, 32, 64), 0.3
-# FEWEST: samples of single pixels that a step takes at least, as fewer take as long. MOST_CHANGE: how many times as
-# many or as few the next one takes.
-FEWEST, MOST_CHANGE = 1 << 17, 2.0
+# FEWEST: samples of single pixels that a step takes at least: the first picture of 1000 x 640 pixels. MOST_CHANGE: how
+# many times as many or as few the next one takes.
+FEWEST, MOST_CHANGE = 160_000, 2.0
 # Settings of a scene that change its light, beside those of Cycles.
 SCENE_SETTINGS = ("use_simplify", "simplify_subdivision", "film_transparent", "hair_type")
 

@@ -20,6 +20,7 @@ from bpy.props import StringProperty
 
 from ...scene import error_line
 from ..extract.apply import shows_texture
+from ..extract.atlas import make_atlas
 from ..extract.bake_meshes import ObjectError, check_object
 from ..lights.area import LightInventory, node_light, reason_to_leave_out
 from ..lights.area import note_unsupported as note_unsupported_light
@@ -30,9 +31,10 @@ from ..materials.bsdfs import bsdf_of, is_emission
 from ..materials.graph import shaders_behind, surface_of
 from ..materials.preview_material import preview_of
 from ..render_settings import CAMERA_KINDS, CAMERA_TYPES, picture_size
-from .preview import ENGINE, lights_of, select_alone, view_of
+from .preview import ENGINE, lights_of, view_of
 
 EXACT, APPROXIMATED, LEFT_OUT = "exact", "approximated", "left out"
+UNWRAPPED_SIDE = 128  # the least texels a side for which islands of an object keep their distance
 OF_MIRRORS = "it reflects lights and the world, and is black where it would show anything else"
 
 
@@ -246,19 +248,9 @@ class LTSH_OT_add_uv_map(bpy.types.Operator):
         if ob is None or ob.type != "MESH" or ob.hide_get():
             self.report({"ERROR"}, f"Object {self.object_name!r} is not a visible mesh of this view layer")
             return {"CANCELLED"}
-        selected, active = context.selected_objects, context.view_layer.objects.active
-        try:
-            select_alone(context, ob)
-            bpy.ops.object.mode_set(mode="EDIT")
-            bpy.ops.mesh.select_all(action="SELECT")
-            bpy.ops.uv.smart_project(island_margin=0.02)
-        finally:
-            if ob.mode == "EDIT":
-                bpy.ops.object.mode_set(mode="OBJECT")
-            ob.select_set(False)
-            for other in selected:
-                other.select_set(True)
-            context.view_layer.objects.active = active
+        for problem in make_atlas([ob], UNWRAPPED_SIDE, name="UVMap")[1].values():
+            self.report({"ERROR"}, problem)
+            return {"CANCELLED"}
         return {"FINISHED"}
 
 

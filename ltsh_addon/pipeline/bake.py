@@ -29,7 +29,7 @@ from ..workers.pool import cores
 from . import bake_files, lighting, lightmap
 from .lighting import check_named, prepare
 from .mixer import rows_of_groups
-from .options import BAKE_PASSES, TEXTURE_SIDES, BakeOptions, child_job
+from .options import BAKE_PASSES, BakeOptions, child_job, passes, size
 from .tasks import TaskResult, file_stems, versions, write_reports
 
 # NOTED_SHARE_OUTSIDE: a larger share of the UV map outside of the texture is reported. Less may come from texels along
@@ -52,6 +52,9 @@ def bake_scene(options: BakeOptions, progress: Progress | None = None) -> dict:
     if options.apply and report["objects"]:
         layer = bake_files.applied_layer(options)
         report["applied"] = bake_files.apply_textures(options.scene, options.output, report, layer, progress)
+    if options.export and report["objects"]:
+        layers = bake_files.exported_layers(options)
+        report["exported"] = bake_files.export_glb(options.scene, options.output, report, layers, progress)
     return write_reports(result, options.output)
 
 
@@ -71,9 +74,8 @@ def bake_objects(
     check_readable(options.scene)
     check_named(options.techniques, "a bake that is resumed")
     tables = prepare(options)
-    finished = bake_files.TileRecords(options)
     with temporary_folder() as folder:
-        manifest = extract_bake(_job(options, finished.finished, tile, following), folder, progress=progress)
+        manifest = extract_bake(_job(options, tile, following), folder, progress=progress)
         names = [record["name"] for record in manifest["objects"]]
         stems = file_stems(names) if options.name is None else [options.name]
         records, files, seconds = [], [], {"blender": manifest["seconds"]}
@@ -82,7 +84,7 @@ def bake_objects(
                 if record["folder"]:
                     (options.output / stem).parent.mkdir(parents=True, exist_ok=True)
                     baker = ObjectBaker(options, tables, manifest, record, folder / record["folder"], tracer)
-                    baked = baker.bake(stem, [] if tile is None else [tile], finished, progress)
+                    baked = baker.bake(stem, [] if tile is None else [tile], progress)
                     records.append(baked.report)
                     files += baked.files
                     seconds |= baked.seconds
@@ -101,21 +103,15 @@ def _shadow_tracer(options, manifest, folder):
 
 
 def _check(options: BakeOptions) -> None:
-    width, height = options.size
-    for side in options.size:
-        if not TEXTURE_SIDES[0] <= side <= TEXTURE_SIDES[1]:
-            limits = "{} to {}".format(*TEXTURE_SIDES)
-            raise ValueError(f"size is {width}x{height}, expected {limits} each")
-    unknown = [name for name in options.passes if name not in BAKE_PASSES]
-    if unknown or not options.passes:
-        raise ValueError(f"passes are {list(options.passes)}, expected some of {', '.join(BAKE_PASSES)}")
+    size("x".join(map(str, options.size)))
+    passes(BAKE_PASSES)(",".join(options.passes))
     if options.bounces == "on" and options.shadows == "off":
         raise ValueError(
-            "bounces are on and shadows off, expected both: bounced light has shadows; leave out one of both"
+            "bounces are on and shadows off, expected both, since bounced light has shadows: leave out one"
         )
 
 
-def _job(options, finished, tile=None, following=()):
+def _job(options, tile=None, following=()):
     from ..blender.process.bake import BakeJob
 
     return child_job(
@@ -126,7 +122,6 @@ def _job(options, finished, tile=None, following=()):
         block_rows=block_rows(options),
         cycles_samples=options.cycles_samples if options.error else 0,
         passes=tuple(name for name in PASSES if name in shaded_passes(options)),
-        finished=tuple(finished),
         tile=tile,
         following=following,
         rest_passes=lightmap.rest_passes(options.passes),
@@ -165,25 +160,18 @@ class ObjectBaker:
         known = shaded_passes(options) | {COMBINED} if options.error else ()
         self.compared = tuple(name for name in options.passes if name in known)
 
-    def bake(self, stem: str, tiles: list[int], records, progress) -> TaskResult:
-        """Write the files of `tiles` (empty: all tiles), except those that the TileRecords `records` have as finished.
-
-        The report of the result is the object's entry in the whole report.
-        """
-        name, files, seconds = self.record["name"], [], {}
-        result = {"name": name, "uv": self.record["uv"], "outside": 0.0, "tiles": {}}
+    def bake(self, stem: str, tiles: list[int], progress) -> TaskResult:
+        """Write the files of `tiles` (empty: all tiles). The report is the object's entry in the whole report."""
+        files, seconds = [], {}
+        result = {"name": self.record["name"], "uv": self.record["uv"], "outside": 0.0, "tiles": {}}
         if self.options.atlas is not None:
             result |= {"members": self.record["members"], "atlas": self.record["atlas"]}
         for tile in tiles or self.tiles:
             file = f"{stem}{self._suffix(tile)}.exr"
             start = time.perf_counter()
-            record = records.take(name, tile, file)
-            if record is None:
-                report, written = self._tile(tile, stem, progress)
-                record = records.write(name, tile, stem, written, report)
+            report, written = self._tile(tile, stem, progress)
             seconds[file] = time.perf_counter() - start
-            files += record["files"]
-            report = record["report"]
+            files += written
             result["tiles"][str(tile)] = {"file": file, **report}
             if self.area > 0.0:
                 baked = report["covered_times"] / math.prod(self.options.size)

@@ -170,7 +170,7 @@ def view_of(wanted, camera, bent: bool) -> BakeView:
 
 
 # Keys of a job that may change while the same file stays open.
-_OF_ONE_JOB = ("objects", "following", "tile", "finished", "look_up_images")
+_OF_ONE_JOB = ("objects", "following", "tile", "look_up_images")
 
 
 @dataclass
@@ -476,8 +476,7 @@ def _objects(opened, names, images, job, folder, progress) -> dict:
         save_array(folder / file, np.concatenate(list(maps)))
     record["maps"] = any(plan.count for plan in plans.values())
     if record["maps"] or job.cycles_samples or job.bounces == "on":
-        finished = {tile for name, tile in job.finished if name == (ATLAS if job.atlas else names[0])}
-        tiles = [tile for tile in tiles_of(joined.uv)[0] if tile not in finished and job.tile in (None, tile)]
+        tiles = [tile for tile in tiles_of(joined.uv)[0] if job.tile in (None, tile)]
         uv_names = {ob: opened.meshes[ob.name].uv_name for ob in objects}
         bake = ObjectBake(opened.scene, uv_names, list(plans.values()))
         _bake(bake, tiles, job, opened, (folder, progress))

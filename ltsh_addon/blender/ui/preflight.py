@@ -18,7 +18,7 @@ import bpy
 import numpy as np
 from bpy.props import StringProperty
 
-from ...scene import error_line
+from ...scene import ATLAS, SceneError, error_line, listed
 from ..extract.apply import shows_texture
 from ..extract.atlas import make_atlas
 from ..extract.bake_meshes import ObjectError, check_object
@@ -110,13 +110,16 @@ def bake_objects(context) -> tuple[list, list[Problem]]:
     for ob in selected:
         if ob in baked:
             continue
-        problem = _object_problem(ob, context.scene.ltsh.bake_uv_map)
+        problem = _object_problem(ob, context.scene.ltsh)
         if problem is None:
             usable.append(ob)
         else:
             problems.append(problem)
     if usable:
         problems = [replace(problem, blocks=False) for problem in problems]
+    if context.scene.ltsh.bake_atlas and (bare := [ob.name for ob in usable if ATLAS not in ob.data.uv_layers]):
+        text = f"Not in the atlas yet: {listed(map(repr, bare))}"
+        problems.append(Problem(text, True, "ltsh.make_atlas", "Make Atlas"))
     return usable, problems
 
 
@@ -129,7 +132,8 @@ def _textures_shown(baked) -> Problem:
     return Problem(text, True, "ltsh.restore_materials", "Restore")
 
 
-def _object_problem(ob, uv_map: str) -> Problem | None:
+def _object_problem(ob, settings) -> Problem | None:
+    uv_map = settings.bake_uv_map
     if ob.hide_render:
         return _hidden(ob, f"Object {ob.name!r} is hidden in renders")
     try:
@@ -138,6 +142,8 @@ def _object_problem(ob, uv_map: str) -> Problem | None:
         return Problem(str(error)[:1].upper() + str(error)[1:])
     if not ob.data.polygons and not ob.modifiers:
         return Problem(f"Object {ob.name!r} has no faces")
+    if settings.bake_atlas:
+        return None
     if uv_map and uv_map not in ob.data.uv_layers and ob.data.uv_layers:
         names = ", ".join(repr(layer.name) for layer in ob.data.uv_layers)
         return Problem(f"Object {ob.name!r} has no UV map {uv_map!r}, found {names}")
@@ -251,6 +257,31 @@ class LTSH_OT_add_uv_map(bpy.types.Operator):
         for problem in make_atlas([ob], UNWRAPPED_SIDE, name="UVMap")[1].values():
             self.report({"ERROR"}, problem)
             return {"CANCELLED"}
+        return {"FINISHED"}
+
+
+class LTSH_OT_make_atlas(bpy.types.Operator):
+    """Unwrap the selected objects into one texture, on a UV map Lightmap that is added; all others stay.
+    Objects that share a mesh get one each"""
+
+    bl_idname = "ltsh.make_atlas"
+    bl_label = "Make Atlas"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context):
+        return context.mode == "OBJECT"
+
+    def execute(self, context):
+        try:
+            densities, problems = make_atlas(bake_objects(context)[0], int(context.scene.ltsh.bake_size))
+        except SceneError as error:
+            densities, problems = {}, {"": str(error)}
+        for problem in problems.values():
+            self.report({"WARNING" if densities else "ERROR"}, problem)
+        if not densities:
+            return {"CANCELLED"}
+        self.report({"INFO"}, f"{len(densities)} objects, {min(densities.values()):.3g} texels per metre")
         return {"FINISHED"}
 
 

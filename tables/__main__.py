@@ -1,4 +1,4 @@
-"""`python -m tables fit|validate|optimum|plot|export ...`: makes, measures and exports the lookup tables.
+"""`python -m tables fit|validate|optimum|plot|export|page ...`: makes, measures and exports the lookup tables.
 
 Needs scipy, and `plot` matplotlib, which the add-on does not need.
 """
@@ -21,7 +21,7 @@ from ltsh_addon.files import write_bytes
 from ltsh_addon.pipeline.options import table
 from ltsh_addon.shading import SHIPPED_TABLES, TableError, load_table
 
-from . import export, families, fit, header, layouts, optimum, pack, validate
+from . import bench, export, families, fit, header, layouts, optimum, pack, validate
 from .families import BRDFS
 
 FOLDER = Path(__file__).resolve().parent
@@ -42,7 +42,7 @@ def main(arguments: list[str]) -> int:
 
 def _parser():
     parser = argparse.ArgumentParser(prog="python -m tables")
-    actions = parser.add_subparsers(dest="action", required=True, metavar="fit|validate|optimum|plot|export")
+    actions = parser.add_subparsers(dest="action", required=True, metavar="fit|validate|optimum|plot|export|page")
     default = f"default: {', '.join(SHIPPED_TABLES)}"
     fitting = actions.add_parser("fit", help="fit tables; goes on where a fit of the same settings was stopped")
     names = f"ltc, ltsh1 to ltsh8, or these with a c; {default}"
@@ -94,6 +94,11 @@ def _parser():
     )
     exporting.add_argument("--json", action="store_true", help="name the files on stdout in one JSON document")
     exporting.set_defaults(run=_export)
+    paging = actions.add_parser("page", help="a page that compares the techniques in a browser, without a network")
+    paging.add_argument("-o", dest="output", type=Path, required=True, metavar="FOLDER", help="folder for the page")
+    width = f"pixels of the pictures, a multiple of 16, default {bench.WIDTH}"
+    paging.add_argument("--width", type=_width, default=bench.WIDTH, metavar="N", help=width)
+    paging.set_defaults(run=_page)
     return parser
 
 
@@ -126,6 +131,13 @@ def _number(text, lowest, what):
 
 def _size(text):
     return _number(text, 4, "size")
+
+
+def _width(text):
+    width = _number(text, 16, "width")
+    if width % 16:
+        raise argparse.ArgumentTypeError(f"width is {width}, expected a multiple of 16")
+    return width
 
 
 def _jobs(text):
@@ -364,6 +376,12 @@ def _export(options) -> int:
     paths = {name: [str(path) for path in written] for name, written in files.items()}
     shown = {"tables": paths, "licenses": licenses}
     print(json.dumps(shown, indent=2) if options.json else "\n".join(sum(paths.values(), []) + licenses))
+    return 0
+
+
+def _page(options) -> int:
+    for path in bench.write_page(options.output, options.width, lambda text: print(text, file=sys.stderr, flush=True)):
+        print(path)
     return 0
 
 

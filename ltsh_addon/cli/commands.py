@@ -160,8 +160,8 @@ def job_of(arguments, scenes: tuple[Path, ...]) -> BatchJob:
     kind, *_ = JOBS[arguments.command]
     command = "compare" if arguments.command == "demo" else arguments.command
     cameras, frames = tuple(dict.fromkeys(arguments.cameras or ())), arguments.frames or ()
-    if command == "bake" and arguments.apply and (len(cameras) > 1 or len(frames) > 1):
-        raise Misuse("--apply makes materials show one texture: give one frame and one camera with it")
+    if command == "bake" and (arguments.apply or arguments.export) and (len(cameras) > 1 or len(frames) > 1):
+        raise Misuse("--apply and --export show one texture of an object: give one frame and one camera with them")
     if command == "bake":
         side, size = arguments.atlas, arguments.size
         if (side is None or arguments.uv) and (arguments.texels_per_metre or arguments.unwrap != "smart"):

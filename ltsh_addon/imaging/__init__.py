@@ -5,7 +5,7 @@ scene-referred linear RGB, Rec.709 where a function says nothing else, unless a 
 reference, red too bright, blue too dark.
 """
 
-from .color import chromaticities, exposure_factor, signed_error_colors, to_srgb8, write_png
+from .color import chromaticities, encode_png, exposure_factor, signed_error_colors, to_srgb8, write_png
 from .exr import Layer, read_channels, read_layers, write_layers
 from .metrics import (
     ErrorStatistics,

@@ -151,15 +151,19 @@ def write_png(path: str | os.PathLike, image: np.ndarray) -> None:
 
 
 def encode_png(image: np.ndarray) -> bytes:
-    """The bytes of a PNG file of `image` (H, W, 3) uint8."""
+    """The bytes of a PNG file of `image` (H, W, 3) uint8, or (H, W, 4) with alpha and numbers that are no colors."""
     image = np.asarray(image)
-    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or not 0 < min(image.shape[:2]):
-        raise ValueError(f"PNG: expected an image (height, width, 3) of uint8, found {image.shape} of {image.dtype}")
+    if image.ndim != 3 or image.shape[2] not in (3, 4) or image.dtype != np.uint8 or not 0 < min(image.shape[:2]):
+        raise ValueError(
+            f"PNG: expected an image (height, width, 3 or 4) of uint8, found {image.shape} of {image.dtype}"
+        )
     height, width = image.shape[:2]
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)  # 8 bits, RGB, deflate, adaptive, not interlaced
+    # 8 bits, RGB or RGBA, deflate, adaptive, not interlaced
+    header = struct.pack(">IIBBBBB", width, height, 8, 2 if image.shape[2] == 3 else 6, 0, 0, 0)
     pixels = zlib.compress(_filtered(image).tobytes(), 6)
     perceptual = b"\0"
-    chunks = ((b"IHDR", header), (b"sRGB", perceptual), (b"IDAT", pixels), (b"IEND", b""))
+    color = [(b"sRGB", perceptual)] if image.shape[2] == 3 else []
+    chunks = [(b"IHDR", header), *color, (b"IDAT", pixels), (b"IEND", b"")]
     return _SIGNATURE + b"".join(_chunk(kind, data) for kind, data in chunks)
 
 
@@ -168,11 +172,11 @@ def _chunk(kind: bytes, data: bytes) -> bytes:
 
 
 def _filtered(image: np.ndarray) -> np.ndarray:
-    """Rows (H, 1 + 3 W) of PNG's filter 1: its number, then differences from the pixel to the left, modulo 256.
+    """Rows (H, 1 + C W) of PNG's filter 1: its number, then differences from the pixel to the left, modulo 256.
 
     Choosing a filter for every row would make photographs 2 % smaller and sheets 2 % larger.
     """
-    height, width = image.shape[:2]
-    rows = np.ones((height, 1 + 3 * width), dtype=np.uint8)
-    rows[:, 1:] = np.diff(image, axis=1, prepend=np.zeros((height, 1, 3), np.uint8)).reshape(height, -1)
+    height, width, channels = image.shape
+    rows = np.ones((height, 1 + channels * width), dtype=np.uint8)
+    rows[:, 1:] = np.diff(image, axis=1, prepend=np.zeros((height, 1, channels), np.uint8)).reshape(height, -1)
     return rows

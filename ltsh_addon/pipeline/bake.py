@@ -23,13 +23,13 @@ from ..imaging.denoise import DENOISER
 from ..imaging.exr import COMBINED, REST, layer_name
 from ..imaging.seams import SeamFit, TexelGrid, islands_of
 from ..reading import Malformed, check, file_name
-from ..scene import PASSES, REFERENCE, Cancelled, Film, Progress, SurfaceSamples, lights_of, listed
+from ..scene import PASSES, REFERENCE, Cancelled, Film, Progress, SurfaceSamples, lights_of
 from ..visibility import Occluders, ShadowSampling
 from ..workers.pool import cores
 from . import bake_files, lighting, lightmap
 from .lighting import check_named, prepare
 from .mixer import rows_of_groups
-from .options import BAKE_PASSES, TEXTURE_SIDES, BakeOptions, child_job
+from .options import BAKE_PASSES, BakeOptions, child_job, passes, size
 from .tasks import TaskResult, file_stems, versions, write_reports
 
 # NOTED_SHARE_OUTSIDE: a larger share of the UV map outside of the texture is reported. Less may come from texels along
@@ -52,6 +52,9 @@ def bake_scene(options: BakeOptions, progress: Progress | None = None) -> dict:
     if options.apply and report["objects"]:
         layer = bake_files.applied_layer(options)
         report["applied"] = bake_files.apply_textures(options.scene, options.output, report, layer, progress)
+    if options.export and report["objects"]:
+        layers = bake_files.exported_layers(options)
+        report["exported"] = bake_files.export_glb(options.scene, options.output, report, layers, progress)
     return write_reports(result, options.output)
 
 
@@ -71,9 +74,8 @@ def bake_objects(
     check_readable(options.scene)
     check_named(options.techniques, "a bake that is resumed")
     tables = prepare(options)
-    finished = bake_files.TileRecords(options)
     with temporary_folder() as folder:
-        manifest = extract_bake(_job(options, finished.finished, tile, following), folder, progress=progress)
+        manifest = extract_bake(_job(options, tile, following), folder, progress=progress)
         names = [record["name"] for record in manifest["objects"]]
         stems = file_stems(names) if options.name is None else [options.name]
         records, files, seconds = [], [], {"blender": manifest["seconds"]}
@@ -82,7 +84,7 @@ def bake_objects(
                 if record["folder"]:
                     (options.output / stem).parent.mkdir(parents=True, exist_ok=True)
                     baker = ObjectBaker(options, tables, manifest, record, folder / record["folder"], tracer)
-                    baked = baker.bake(stem, [] if tile is None else [tile], finished, progress)
+                    baked = baker.bake(stem, [] if tile is None else [tile], progress)
                     records.append(baked.report)
                     files += baked.files
                     seconds |= baked.seconds
@@ -96,26 +98,20 @@ def _shadow_tracer(options, manifest, folder):
     """A context with the ShadowTracer; it gives None where shadows are off."""
     if manifest["occluders"] is None:
         return nullcontext()
-    occluders = Occluders.load(folder / manifest["occluders"])
-    return lighting.ShadowTracer(occluders, lights_of(manifest["lights"]))
+    lights = lightmap.crisp_and_soft(lights_of(manifest["lights"]), options)[0]
+    return lighting.ShadowTracer(Occluders.load(folder / manifest["occluders"]), lights)
 
 
 def _check(options: BakeOptions) -> None:
-    width, height = options.size
-    for side in options.size:
-        if not TEXTURE_SIDES[0] <= side <= TEXTURE_SIDES[1]:
-            limits = "{} to {}".format(*TEXTURE_SIDES)
-            raise ValueError(f"size is {width}x{height}, expected {limits} each")
-    unknown = [name for name in options.passes if name not in BAKE_PASSES]
-    if unknown or not options.passes:
-        raise ValueError(f"passes are {list(options.passes)}, expected some of {', '.join(BAKE_PASSES)}")
+    size("x".join(map(str, options.size)))
+    passes(BAKE_PASSES)(",".join(options.passes))
     if options.bounces == "on" and options.shadows == "off":
         raise ValueError(
-            "bounces are on and shadows off, expected both: bounced light has shadows; leave out one of both"
+            "bounces are on and shadows off, expected both, since bounced light has shadows: leave out one"
         )
 
 
-def _job(options, finished, tile=None, following=()):
+def _job(options, tile=None, following=()):
     from ..blender.process.bake import BakeJob
 
     return child_job(
@@ -126,7 +122,6 @@ def _job(options, finished, tile=None, following=()):
         block_rows=block_rows(options),
         cycles_samples=options.cycles_samples if options.error else 0,
         passes=tuple(name for name in PASSES if name in shaded_passes(options)),
-        finished=tuple(finished),
         tile=tile,
         following=following,
         rest_passes=lightmap.rest_passes(options.passes),
@@ -153,7 +148,9 @@ class ObjectBaker:
 
     def __init__(self, options, tables, manifest, record, folder, tracer=None):
         self.options, self.tables, self.manifest, self.record, self.folder = options, tables, manifest, record, folder
-        self.lights, self.tracer = lights_of(manifest["lights"]), tracer
+        lights = lights_of(manifest["lights"])
+        self.lights, self.soft_lights = lightmap.crisp_and_soft(lights, options)
+        self.tracer = tracer
         self.mesh = TexelMesh.load(folder / "mesh.npz")
         uv_maps = {name: folder / file for name, file in record["uv_maps"].items()}
         self.materials = [BakeMaterial.of(material, folder.parent, uv_maps) for material in record["materials"]]
@@ -163,25 +160,18 @@ class ObjectBaker:
         known = shaded_passes(options) | {COMBINED} if options.error else ()
         self.compared = tuple(name for name in options.passes if name in known)
 
-    def bake(self, stem: str, tiles: list[int], records, progress) -> TaskResult:
-        """Write the files of `tiles` (empty: all tiles), except those that the TileRecords `records` have as finished.
-
-        The report of the result is the object's entry in the whole report.
-        """
-        name, files, seconds = self.record["name"], [], {}
-        result = {"name": name, "uv": self.record["uv"], "outside": 0.0, "tiles": {}}
+    def bake(self, stem: str, tiles: list[int], progress) -> TaskResult:
+        """Write the files of `tiles` (empty: all tiles). The report is the object's entry in the whole report."""
+        files, seconds = [], {}
+        result = {"name": self.record["name"], "uv": self.record["uv"], "outside": 0.0, "tiles": {}}
         if self.options.atlas is not None:
             result |= {"members": self.record["members"], "atlas": self.record["atlas"]}
         for tile in tiles or self.tiles:
             file = f"{stem}{self._suffix(tile)}.exr"
             start = time.perf_counter()
-            record = records.take(name, tile, file)
-            if record is None:
-                report, written = self._tile(tile, stem, progress)
-                record = records.write(name, tile, stem, written, report)
+            report, written = self._tile(tile, stem, progress)
             seconds[file] = time.perf_counter() - start
-            files += record["files"]
-            report = record["report"]
+            files += written
             result["tiles"][str(tile)] = {"file": file, **report}
             if self.area > 0.0:
                 baked = report["covered_times"] / math.prod(self.options.size)
@@ -266,9 +256,9 @@ class ObjectBaker:
             raise Cancelled("the bake was stopped")
         for first in range(0, height, block_rows(self.options)):
             texels, maps, _ = spread.at(first, 0)
-            at = texels.index + first * width
+            at, read_map = texels.index + first * width, _map_reader(maps, texels)
             triangle[at] = texels.triangle
-            guides[at] = texel_guides(self.mesh, self.materials, texels, _map_reader(maps, texels))
+            guides[at] = texel_guides(self.mesh, self.materials, texels, read_map)
         shape = height, width
         grid = TexelGrid.of(triangle.reshape(shape), spread.corners, self.mesh)
         guides = guides.reshape(*shape, 6)
@@ -276,6 +266,12 @@ class ObjectBaker:
         spread.rest, denoiser = lightmap.denoised_rest(spread.rest, guides, islands, self.options.rest_samples)
         dull = (guides[..., :3].max(axis=-1) <= lightmap.DULL) & (grid.triangle >= 0)
         return {"denoiser": denoiser, "dull_texels": int(np.count_nonzero(dull))}, SeamFit(islands)
+
+    def _sampling(self, passes, first, texel, points) -> ShadowSampling:
+        """How to find the shadows of samples of a block, of the texels `texel` (S,), with so many points each."""
+        size = self.options.size
+        film = Film(size[0], min(block_rows(self.options), size[1] - first), texel)
+        return ShadowSampling(passes, lighting.rays_of_point(self.options.shadow_rays, points), film, is_baked=True)
 
     def _threads(self) -> int:
         """Blocks to shade at a time: one with the reference, whose shading of a block takes all cores itself."""
@@ -298,25 +294,24 @@ class ObjectBaker:
 
         read_map = _map_reader(maps, texels)
         samples, texel = texel_samples(self.mesh, self.materials, texels, read_map, self.view, self.lights)
-        images, shadows, bounces = {}, None, {}
+        images, shadows, bounces, soft = {}, None, {}, {}
         if self.options.bounces == "on":
             color = _summed(samples.diffuse_albedo[None], texel, len(texels.index))[0]
-            bounces = spread.bounces(first, texels, color)
+            bounces, soft = spread.soft_light(first, texels, color)
             images = {layer_name(REST, name): bounces[name].sum(axis=0) for name in self.options.passes}
         if self.tracer is not None:
             options = self.options
             passes = shaded_passes(options)
             if "diffuse_light" in options.passes:
                 passes = passes | {"diffuse"}
-            rays = lighting.rays_of_point(options.shadow_rays, options.sub_samples)
             workers = 1 if self._threads() > 1 else None
-            rows = min(block_rows(options), options.size[1] - first)
-            film = Film(options.size[0], rows, texels.index[texel])
-            sampling = ShadowSampling(sorted(passes), rays, film, is_baked=True)
+            sampling = self._sampling(sorted(passes), first, texels.index[texel], options.sub_samples)
             shadows = self.tracer.trace(samples, sampling, workers=workers)
         for name, table in self.tables.items():
             for pass_name, radiance in self._passes(samples, texel, len(texels.index), table, shadows).items():
                 layer = layer_name(name, pass_name)
+                if pass_name in soft:
+                    radiance[self.groups.index(self.soft_lights[0].group)] += soft[pass_name]
                 whole = radiance.sum(axis=0)
                 if bounces:
                     whole = whole + bounces[pass_name].sum(axis=0)
@@ -390,11 +385,13 @@ class TilePoints:
         self._width = baker.manifest["sampled_texels"]
         self._triangles = uv.UvTriangles.in_tile(baker.mesh.uv, *options.size, _column_and_row(tile))
         self._at_centers = bakes_centers_alone(options, baker.record)
-        self.rest, size = {}, options.size
+        self.rest, self._baked, size = {}, None, options.size
         if options.bounces == "on":
             rows = range(len(baker.groups) if options.per_light else 1)
-            keys = itertools.product(lightmap.rest_passes(options.passes), rows)
+            keys = [*itertools.product(lightmap.rest_passes(options.passes), rows)]
+            keys += [(lightmap.SOFT, 0)] if baker.soft_lights else []
             self.rest = {key: lightmap.read_rest(baker.folder, key, tile, size) for key in keys}
+            self._baked = next(iter(self.rest.values()))[..., 0] != np.float32(NOT_BAKED)
         # The points of a block are shaded one after another, so few blocks need to be cached.
         cached = functools.lru_cache(maxsize=2 + threads // options.sub_samples)
         self.texels, self._weights_of = cached(self._covered), cached(self._fitted_weights)
@@ -420,28 +417,17 @@ class TilePoints:
         """The corners (T, 3, 2) of the triangles in the texture, in texels."""
         return self._triangles.corners
 
-    def bounces(self, first: int, texels, color: np.ndarray) -> dict[str, np.ndarray]:
-        """Bounced light (R, Q, 3) by pass of the `texels` of the block from row `first` on, of the diffuse `color`.
-
-        It has a row for each light group with `per_light`, else one for all.
-        """
-        at = texels.index + first * self._options.size[0]
-        light = {}
-        for (kind, _), image in self.rest.items():
-            light.setdefault(kind, []).append(image.reshape(-1, 3)[at])
-        light = {kind: np.array(rows) for kind, rows in light.items()}
-        if "diffuse" in light:
-            light["diffuse_light"], light["diffuse"] = light["diffuse"], color * light["diffuse"]
-        return light | {COMBINED: sum(light[name] for name in ("specular", "diffuse") if name in light)}
+    def soft_light(self, first: int, texels, color: np.ndarray) -> tuple[dict, dict]:
+        """`lightmap.of_passes` for the `texels` of the block from row `first` on, of the diffuse `color` (Q, 3)."""
+        return lightmap.of_passes(self.rest, texels.index + first * self._options.size[0], color)
 
     def _covered(self, first):
         rows = min(block_rows(self._options), self._options.size[1] - first)
         texels = self._triangles.texels(first, rows, self._options.conservative and not self._at_centers)
         if not self._at_centers:
             return texels
-        if self.rest:
-            baked = next(iter(self.rest.values()))[first : first + rows]
-            return texels.baked(baked.reshape(-1, 3)[texels.index, 0] != np.float32(NOT_BAKED))
+        if self._baked is not None:
+            return texels.baked(self._baked[first : first + rows].reshape(-1)[texels.index])
         path = self._file(first, 0)
         if not self._mapped:
             path = self._folder / f"cycles_{sorted(shaded_passes(self._options))[0]}_{self._tile}_{first}.npy"
@@ -527,7 +513,7 @@ def _report(options, manifest, records) -> dict:
         ]
     reasons = {record["name"]: record.get("unshaded", ()) for record in manifest["objects"]}
     for record in records:
-        wrong, note = _darkness(record, reasons[record["name"]])
+        wrong, note = bake_files.darkness(record, reasons[record["name"]])
         problems += wrong
         warnings += note
         name = f"object {record['name']!r}"
@@ -564,17 +550,6 @@ def _report(options, manifest, records) -> dict:
         rows = rows_of_groups(lights_of(manifest["lights"]), manifest["light_settings"])
         report |= {"light_rows": [asdict(row) for row in rows], "camera": manifest["camera"]}
     return report
-
-
-def _darkness(record, reasons) -> tuple[list[str], list[str]]:
-    """Problems and warnings of a dark object: most of its texels are not shaded, for `reasons`, or no light arrives."""
-    tiles, name = record["tiles"].values(), f"object {record['name']!r}"
-    texels, unshaded = (sum(tile[key] for tile in tiles) for key in ("texels", "unshaded_texels"))
-    if 2 * unshaded > texels:
-        share = f"{100.0 * unshaded / texels:.3g} %"
-        return [f"{name}: {share} of its texels are not shaded: {listed(dict.fromkeys(filter(None, reasons)))}"], []
-    is_dark = texels > 0 and not any(tile["is_lit"] for tile in tiles)
-    return [], [f"{name}: no light reaches it, or it reflects none: its texture is black"] if is_dark else []
 
 
 def _tiles(value, name) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from itertools import groupby
 from pathlib import Path
 
@@ -73,7 +73,7 @@ def run_tasks(
             if tell is not None:
                 tell(TaskState(number, len(wanted), task.name))
             following = tuple(other.object for other in wanted[number:] if other.unit == task.unit)
-            outcome, seconds, files = _attempt(job, task, following, existing, progress, alone=len(tasks) == 1)
+            outcome, seconds, files = _attempt(job, task, following, progress, alone=len(tasks) == 1)
             try:
                 # Only once: the document holds all tasks, perhaps thousands.
                 if not told:
@@ -90,11 +90,11 @@ def run_tasks(
     return RunResult(len(mine), len(wanted), len(mine) - len(wanted), tuple(problems))
 
 
-def _attempt(job, task, following, existing, progress, alone) -> tuple[dict, dict, tuple[str, ...]]:
+def _attempt(job, task, following, progress, alone) -> tuple[dict, dict, tuple[str, ...]]:
     """Do a task; returns its "report" or "problem" for the record, its seconds and files. `alone`: failures raise."""
     start = time.perf_counter()
     try:
-        made = _perform(job, task, following, existing, progress)
+        made = _perform(job, task, following, progress)
         return {"report": made.report}, made.seconds, made.files
     except (SceneError, OSError) as error:
         if alone:
@@ -110,16 +110,15 @@ def _is_done(records, task, existing) -> bool:
 
 
 def _perform(
-    job: batch_tasks.BatchJob, task: batch_tasks.BatchTask, following: tuple, existing: str, progress
+    job: batch_tasks.BatchJob, task: batch_tasks.BatchTask, following: tuple, progress
 ) -> batch_tasks.TaskResult:
     options = task.options(job)
     if job.command == "bake":
-        options = replace(options, resume=existing == RESUME)
         return bake.bake_objects(options, progress, tile=task.tile, following=following)
     if job.command == "render":
         return render.make_finished(options, progress)
     if job.command == "view":
-        return picture.draw_view(options, progress)
+        return picture.draw_view(options, progress, len(job.frames) > 1)
     return picture.make_picture(options, job.command == "compare", progress)
 
 
@@ -132,6 +131,9 @@ def _write_job(job, tasks, existing) -> None:
         "single": job.single,
         "any_key": existing == SKIP,
         "applied_layer": bake_files.applied_layer(job.options) if applied else None,
+        "exported_layers": bake_files.exported_layers(job.options)
+        if job.command == "bake" and job.options.export
+        else {},
         "tasks": [asdict(task) for task in tasks],
     }
     batch_tasks.write_record(Path(job.options.output) / batch_tasks.FOLDER / "job.json", document)
@@ -232,6 +234,9 @@ def _unit(job, output, tasks, finished, progress) -> tuple[str, dict] | None:
         report["applied"] = bake_files.apply_textures(
             Path(tasks[0].scene), output, report, job["applied_layer"], progress
         )
+    if job.get("exported_layers") and report["objects"]:
+        exported = Path(tasks[0].scene), output, report, job["exported_layers"], progress
+        report["exported"] = bake_files.export_glb(*exported)
     name = " ".join(str(word) for word in (Path(tasks[0].scene).stem, *tasks[0].unit[1:]) if word is not None)
     return name, report if job["single"] else {"files": files, **report}
 

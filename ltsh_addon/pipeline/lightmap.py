@@ -3,20 +3,56 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from ..cycles.texels import NOT_BAKED
 from ..imaging.denoise import NoDenoiser, open_denoiser, smoothed
+from ..imaging.exr import COMBINED
 from ..imaging.seams import FRAMES, Islands, canvas_of
+from ..scene import PASSES, Light
 from ..workers.pool import cores
 from .bake_files import nearest_covered
+from .options import BakeOptions
 
 # REST_TEXELS: the most that Cycles bakes at a time for the bounced light, since it reads the whole scene each time.
 REST_TEXELS = 1 << 22
 # DULL: a diffuse color below which Cycles' diffuse light, divided by it, says nothing.
 DULL = 1e-3
+
+
+SOFT = "soft"  # the kind of direct light that is denoised, beside the kinds of bounced light
+
+
+def crisp_and_soft(lights: tuple[Light, ...], options: BakeOptions) -> tuple[list[Light], list[Light]]:
+    """The lights that a bake shades as they are, and those whose diffuse light Cycles bakes with the bounces: the sky.
+
+    Through a window few rays meet it, of ours as of Cycles' samples, and its shadows are seldom crisp.
+    """
+    is_soft = options.bounces == "on" and "diffuse" in rest_passes(options.passes)
+    soft = [light for light in lights if is_soft and light.is_side and light.affects_diffuse]
+    names = {light.name for light in soft}
+    return [replace(one, affects_diffuse=False) if one.name in names and one.is_side else one for one in lights], soft
+
+
+def of_passes(light: dict[tuple[str, int], np.ndarray], texels: np.ndarray, color: np.ndarray) -> tuple[dict, dict]:
+    """Denoised `light` by pass on the `texels` (Q,) of the diffuse `color` (Q, 3): bounced (R, Q, 3), and soft (Q, 3).
+
+    Bounced light has a row for each light group that was baked by itself, else one for all.
+    """
+    rows: dict[str, list[np.ndarray]] = {}
+    for (kind, _), image in light.items():
+        rows.setdefault(kind, []).append(image.reshape(-1, 3)[texels])
+    soft = rows.pop(SOFT, None)
+    bounced = {kind: np.array(images) for kind, images in rows.items()}
+    if "diffuse" in bounced:
+        bounced["diffuse_light"], bounced["diffuse"] = bounced["diffuse"], color * bounced["diffuse"]
+    bounced[COMBINED] = sum(bounced[name] for name in PASSES if name in bounced)
+    if soft is None:
+        return bounced, {}
+    return bounced, {"diffuse_light": soft[0], "diffuse": color * soft[0], COMBINED: color * soft[0]}
 
 
 def rest_rows(size: tuple[int, int]) -> int:
@@ -51,7 +87,7 @@ def denoised_rest(
     images = {}
     for key, light in rest.items():
         is_lit = (light[..., 0] != np.float32(NOT_BAKED)) & is_covered
-        if key[0] == "diffuse":
+        if key[0] != "specular":
             is_lit &= guides[..., :3].max(axis=-1) > DULL
         images[key] = np.where(is_lit[..., None], light, 0.0), is_lit
     try:

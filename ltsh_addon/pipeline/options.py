@@ -449,7 +449,10 @@ class BakeOptions(TaskOptions):
     rest_samples: int = _rest_samples()
     per_light: bool = flag("--per-light", "a layer for each light, with its bounced light, so that powers can change")
     apply: bool = flag("--apply", "also a texture of each object, and a copy of the .blend whose materials show it")
-    resume: bool = option(default=False, matters=False)  # keep what the same job has finished
+    export: str | None = option(
+        "--export", default=None, choices=("glb",), matters=False,
+        help="also the objects as glTF, with lightmaps (pass diffuse_light), with unlit colors (other passes)",
+    )  # fmt: skip
 
     def __post_init__(self):
         if self.atlas is not None:

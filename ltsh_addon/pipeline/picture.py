@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -117,25 +117,27 @@ def view_transformed(pixels: np.ndarray, options, folder: Path, progress) -> byt
     return (folder / SHOWN).read_bytes()
 
 
-def draw_view(options: ViewOptions, progress: Progress | None = None) -> TaskResult:
-    """Draw a scene as the viewport does and write its EXR and PNG.
+def draw_view(options: ViewOptions, progress: Progress | None = None, is_playblast: bool = False) -> TaskResult:
+    """Draw a scene as the viewport does and write its EXR and PNG; `is_playblast`: it is one of several frames.
 
     Raises SceneError, TableError, OSError, Cancelled.
     """
     from ..blender.process import view
-    from ..blender.process.blender_process import shared_blender
+    from ..blender.process.blender_process import second_blender, shared_blender
 
     start = time.perf_counter()
     tables = prepare(options)
     width, height = options.resolution or (None, None)
     given = tuple(name if name in SHIPPED_TABLES else str(Path(name).absolute()) for name in options.techniques)
-    job = child_job(view.ViewJob, options, width=width, height=height, techniques=given)
+    more = {"techniques": given, "is_playblast": is_playblast}
+    job = child_job(view.ViewJob, options, width=width, height=height, **more)
     problems, rest_seconds = [], 0.0
     with temporary_folder() as folder, shared_blender(folder):
         if options.bounces == "on":
             of_camera = view.RestView(frame=options.frame, size=(width, height))
             rest_job = child_job(view.RestJob, options, view=of_camera, samples=options.rest_samples)
-            rest = view.render_rest(rest_job, folder, progress=progress)
+            with second_blender() if is_playblast else nullcontext():
+                rest = view.render_rest(rest_job, folder, progress=progress)
             job = replace(job, rest=folder / view.REST_PICTURE, is_everything=rest["is_everything"])
             problems, rest_seconds = [rest["problem"]] * bool(rest["problem"]), time.perf_counter() - start
         manifest = view.draw_view(job, folder, progress=progress)

@@ -10,8 +10,7 @@ import string
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
-from glob import escape
-from pathlib import Path, PurePath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -37,6 +36,7 @@ JOB = {
     "command": ("shade", "compare", "bake", "view", "render"),
     **dict.fromkeys(("single", "any_key"), bool),
     "applied_layer": str | None,
+    "exported_layers?": {str: [str]},
     "tasks": some([_TASK]),
 }
 
@@ -287,17 +287,6 @@ class Records:
             )
         except OSError:
             return False
-
-    def all_whole(self, key: str, stems: Iterable[str] | None = None) -> list[dict]:
-        """All records with that key whose files are whole; with `stems` only those named "<stem>.<anything>"."""
-        if stems is None:
-            paths = sorted(self._folder.rglob("*.json"))
-        else:
-            # Names may contain wildcards.
-            groups = (self._path(stem).parent.glob(f"{escape(PurePath(stem).name)}.*.json") for stem in stems)
-            paths = sorted(path for group in groups for path in group)
-        records = map(self._read, paths)
-        return [record for record in records if record and record["key"] == key and self.has_files(record)]
 
     def _path(self, name: str) -> Path:
         return self._folder / f"{name}.json"

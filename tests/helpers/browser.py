@@ -21,7 +21,7 @@ import subprocess
 import tempfile
 import threading
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -40,6 +40,9 @@ FLAGS = (
     "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1",
 )  # fmt: skip
 
+# Chromium ends without any font.
+FONTS = f"""<?xml version="1.0"?><!DOCTYPE fontconfig SYSTEM "fonts.dtd"><fontconfig>
+<dir>{HOME}/chromium/fonts</dir><dir>/usr/share/fonts</dir><cachedir>{{profile}}/fonts</cachedir></fontconfig>"""
 KEY_CODES = {"Tab": 9, "Enter": 13, "Escape": 27, "ArrowLeft": 37, "ArrowUp": 38, "ArrowRight": 39, "ArrowDown": 40}
 
 
@@ -64,11 +67,12 @@ class Browser:
         self._folder = tempfile.TemporaryDirectory(prefix="ltsh-browser-", ignore_cleanup_errors=True)
         profile = Path(self._folder.name)
         self._log = (profile / "stderr").open("w+b")
+        (profile / "fonts.conf").write_text(FONTS.format(profile=profile), encoding="utf-8")
         libraries = f"{HOME}/chromium:{HOME}/chromium/al2023/lib"
         environment = {
             **os.environ,
             "HOME": str(profile),
-            "FONTCONFIG_PATH": f"{HOME}/chromium/fonts",
+            "FONTCONFIG_FILE": str(profile / "fonts.conf"),
             "LD_LIBRARY_PATH": f"{libraries}:{os.environ.get('LD_LIBRARY_PATH', '')}".rstrip(":"),
         }
         # Chromium reads commands from file 3 and answers on file 4.
@@ -101,7 +105,8 @@ class Browser:
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
         self._reader.join(10)
-        self._process.stdin.close()
+        with suppress(BrokenPipeError):  # of a command that came after the browser's end
+            self._process.stdin.close()
         self._process.stdout.close()
         self._log.close()
         self._folder.cleanup()

@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 
+from ltsh_addon.cycles.texels import NOT_BAKED
 from ltsh_addon.cycles.uv import UvTriangles
+from ltsh_addon.imaging.denoise import NoDenoiser
 from ltsh_addon.imaging.seams import SeamFit, TexelGrid, canvas_of, islands_of
+from ltsh_addon.pipeline import lightmap
 
 SIZE = 64
 
@@ -130,3 +133,18 @@ def test_a_fold_has_a_light_for_each_of_its_sides(angle):
     assert np.array_equal(fitted, image)
     # At 60 degrees a filter sees the next face; a sheet's other side is none.
     assert (len(canvas_of(islands).frame) > 0) == (angle < 90.0)
+
+
+def test_without_a_denoiser_light_is_smoothed_and_it_is_said(monkeypatch):
+    def none(*arguments):
+        raise NoDenoiser("no library")
+
+    monkeypatch.setattr(lightmap, "open_denoiser", none)
+    made = wall()
+    covered = made.triangle >= 0
+    noisy = np.where(covered[..., None], np.random.default_rng(2).gamma(4.0, 0.25, (SIZE, SIZE, 3)), NOT_BAKED)
+    guides = np.where(covered[..., None], np.array([0.5, 0.5, 0.5, 0.0, 0.0, 1.0]), 0.0)
+    done, said = lightmap.denoised_rest({("diffuse", 0): noisy.astype(np.float32)}, guides, islands_of(made), 64)
+    smooth = done["diffuse", 0]
+    assert "not denoised" in said and "no library" in said
+    assert smooth[covered].std() < 0.5 * noisy[covered].std() and not smooth[~covered].any()

@@ -96,23 +96,6 @@ def test_shards_are_disjoint_and_together_everything(room, tmp_path):
         assert max(map(len, shards)) - min(map(len, shards)) <= 1
 
 
-def test_records_of_some_names_are_looked_up_without_reading_the_others(tmp_path, monkeypatch):
-    records = tasks.Records(tmp_path, "tiles", {"task": {"name": str}})
-    names = ["Floor.1001", "Floor.1002", "Floor 2.1001", "a[b].1001", "x/Floor.1001", "ab.1001"]
-    for name in names:
-        records.write(name, "key", {"name": name}, (), report={})
-    read = []
-    read_one = tasks.read_document
-    monkeypatch.setattr(tasks, "read_document", lambda path, shape: read.append(path) or read_one(path, shape))
-
-    def found(*stems):
-        return {record["task"]["name"] for record in records.all_whole("key", stems or None)}
-
-    assert found() == set(names) and found("Floor") == {"Floor.1001", "Floor.1002"} and len(read) == len(names) + 2
-    assert found("a[b]") == {"a[b].1001"} and found("y") == set()
-    assert found("x/Floor", "ab") == {"x/Floor.1001", "ab.1001"}
-
-
 def test_a_changed_file_has_another_digest(tmp_path):
     room = tmp_path / "room.blend"
     room.write_bytes(b"BLENDER")

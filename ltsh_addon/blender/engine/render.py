@@ -24,6 +24,7 @@ from ..saving import keeps_engine, save_working_copy
 from ..ui import comparison
 from ..ui.job import Plan, progress_text, session_times, stage_title
 from ..ui.preview import ENGINE, is_previewing
+from ..viewport.drawing import forget_shaders
 from . import redraws
 from .final_picture import DEPTH, NORMAL, POSITION, FinalJob, FinalPicture, final_picture, pass_names
 from .view import EngineView
@@ -310,4 +311,5 @@ def unregister() -> None:
     """End what goes on for views and renders."""
     _parked.clear()
     redraws.stop()
+    forget_shaders()
     _delete_copy()

@@ -13,7 +13,7 @@ import gpu
 from ...scene import CYCLES, error_line
 from ..evaluated import visibility
 from ..render_settings import cycles_setting, sub_pixel_offsets
-from ..viewport.drawing import ViewCamera
+from ..viewport.drawing import ShadersMissing, ViewCamera, new_shaders_until
 from ..viewport.live_cycles import LiveWorld
 from ..viewport.mirror import SceneMirror
 from ..viewport.pictures import ShownPicture
@@ -29,6 +29,7 @@ from .overlay import ViewTexts, captions_of, left_out, show
 LINE_WIDTH = 2.0
 COMPILING = "Compiling shaders"
 NO_LIGHTS = "No light and no glowing mesh shines here: add a light"
+COMPILE_SECONDS = 0.05  # of a drawing, after which no more shaders are compiled
 EMPTY_COLOR = (0.05, 0.05, 0.05, 1.0)
 _logger = logging.getLogger(__name__)
 
@@ -102,7 +103,13 @@ class EngineView:
             return
         texts = ViewTexts(self._error)
         try:
-            texts = self._draw_picture(context, depsgraph, target)
+            with new_shaders_until(start + COMPILE_SECONDS):
+                texts = self._draw_picture(context, depsgraph, target)
+        except ShadersMissing:
+            _clear(target)
+            show(context.region, ViewTexts(notes=(COMPILING,)))
+            redraws.redraw_at(time.monotonic() + redraws.POLL_SECONDS)
+            return
         except Exception as error:
             texts = ViewTexts(self._note(error))
             _clear(target)

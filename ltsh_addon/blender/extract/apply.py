@@ -5,16 +5,20 @@ from __future__ import annotations
 from pathlib import Path
 
 import bpy
+import numpy as np
 
-from ...scene import SceneError
+from ...scene import SceneError, error_line
 from ..materials.graph import cut, ensure_nodes, material_output
-from ..process.bake import ApplyJob, BakedTextures
+from ..process.bake import ApplyJob, BakedTextures, ExportJob
 from ..render_settings import go_to_frame
 from ..saving import save_copy
 from .atlas import make_atlas
-from .bake_meshes import apply_modifiers
+from .bake_meshes import apply_modifiers, uv_of
 from .pixels import open_scene
 
+EXPORTER = "io_scene_gltf2"
+# EXPORT: what glTF takes: the selected meshes and their materials at one frame.
+EXPORT = {"export_format": "GLB", "use_selection": True, "export_animations": False, "export_cameras": False}
 GROUP_PREFIX = "LTSH Bake"
 # Custom properties of a material that shows a texture. FORMER: the material that it replaces (0: none). FORMER_LINK:
 # the link setting that the slot had.
@@ -44,6 +48,42 @@ def restore_atlas(job) -> None:
     objects = _objects(job.atlas["objects"], job)
     apply_modifiers(bpy.context.scene, objects)
     make_atlas(**{**job.atlas, "objects": objects})
+
+
+def export_objects(job: ExportJob, folder: Path, progress) -> dict:
+    """Do the `job` with Blender's own exporter of glTF; returns the manifest."""
+    progress("open scene", 0.0)
+    open_scene(Path(job.scene), [])
+    if EXPORTER not in bpy.context.preferences.addons:
+        try:
+            bpy.ops.preferences.addon_enable(module=EXPORTER)
+        except RuntimeError as error:
+            raise SceneError(
+                f"this Blender has no exporter of glTF, its add-on {EXPORTER}: {error_line(error)}"
+            ) from error
+    restore_atlas(job)
+    objects = _objects(job.uv_names, job)
+    go_to_frame(bpy.context.scene, job.frame)
+    apply_modifiers(bpy.context.scene, objects)
+    for ob in bpy.context.view_layer.objects:
+        ob.hide_viewport = ob.hide_select = False
+        ob.hide_set(False)
+        ob.select_set(ob in objects)
+    coordinates = {}
+    for ob in objects:
+        layers = ob.data.uv_layers
+        if len(layers) == 1 and job.atlas is not None:
+            # Lightmaps are the second UV map everywhere; objects without a first one have the point that Blender takes.
+            uv = uv_of(layers[0], len(ob.data.loops))
+            layers[0].name = "UVMap"
+            layers[0].uv.foreach_set("vector", np.zeros_like(uv).ravel())
+            layers.new(name=job.uv_names[ob.name], do_init=False).uv.foreach_set("vector", uv.ravel())
+        coordinates[ob.name] = layers.keys().index(job.uv_names[ob.name])
+    progress("export", 0.0)
+    export_scene = bpy.ops.export_scene
+    gltf = export_scene.gltf
+    gltf(filepath=str(job.path), **EXPORT)
+    return {"coordinates": coordinates}
 
 
 def _objects(names, job) -> list:

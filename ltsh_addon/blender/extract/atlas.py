@@ -53,22 +53,22 @@ class Island:
 
 
 def make_atlas(
-    objects, side: int, density: float | None = None, unwrap: str = "smart"
+    objects, side: int, density: float | None = None, unwrap: str = "smart", name: str = ATLAS
 ) -> tuple[dict[str, float], dict[str, str]]:
-    """Give `objects` the UV map of an atlas; returns the texels per metre, and the problems of others, by name.
+    """Give `objects` the UV map `name` of an atlas; returns the texels per metre, and the problems of others, by name.
 
     The texture has `side` texels a side, the surface `density` texels per metre (None: as many as fit); `unwrap` is
     "smart", or "faces" where every edge is a seam. Objects that share a mesh get one each. Nothing else of the scene
     changes. Raises SceneError where the islands do not fit.
     """
-    with _islands(objects) as (islands, problems):
+    with _islands(objects, name) as (islands, problems):
         if not islands:
             return {}, problems
         unwrapped = list(islands.values())
         _unwrap(unwrapped, unwrap)
         _pack(unwrapped, side, density)
         for ob, island in islands.items():
-            ob.data.uv_layers[ATLAS].uv.foreach_set("vector", island.uv().astype(np.float32).ravel())
+            ob.data.uv_layers[name].uv.foreach_set("vector", island.uv().astype(np.float32).ravel())
         return {ob.name: side * island.units_per_metre() for ob, island in islands.items()}, problems
 
 
@@ -79,7 +79,7 @@ def make_single(ob) -> None:
 
 
 @contextmanager
-def _islands(objects):
+def _islands(objects, name):
     """Within this context: the Island of each of `objects`, in a scene of their own, so that no selection changes.
 
     Yields them by object, and the problems of other objects by name.
@@ -90,7 +90,7 @@ def _islands(objects):
         tool_settings.use_uv_select_sync = True  # without, 4.5 packs nothing
         for ob in objects:
             try:
-                islands[ob] = _island(ob, scene)
+                islands[ob] = _island(ob, scene, name)
             except ObjectError as error:
                 problems[ob.name] = str(error)
         yield islands, problems
@@ -100,7 +100,7 @@ def _islands(objects):
         bpy.data.scenes.remove(scene)
 
 
-def _island(ob, scene) -> Island:
+def _island(ob, scene, name) -> Island:
     """The Island of `ob` in `scene`; the mesh of `ob` gets the UV map of the atlas, not yet filled."""
     check_object(ob)
     make_single(ob)
@@ -120,9 +120,9 @@ def _island(ob, scene) -> Island:
     if not island.area() > 0.0:
         raise ObjectError(f"object {ob.name!r} has no faces with an area, nothing to bake")
     layers = ob.data.uv_layers
-    if ATLAS not in layers:
+    if name not in layers:
         active = layers.active_index
-        if layers.new(name=ATLAS, do_init=False) is None:
+        if layers.new(name=name, do_init=False) is None:
             raise ObjectError(f"object {ob.name!r} has eight UV maps, and the atlas needs one of its own: remove one")
         layers.active_index = max(active, 0)
     return island

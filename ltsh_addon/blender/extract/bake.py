@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import shutil
 import tempfile
 import time
@@ -34,7 +33,7 @@ from .pixels import OCCLUDERS, SEEDS, remove_occlusion
 # SAMPLED_TEXELS: width of the part of a texel over which Cycles' bake spreads its samples; the whole texel since 5.2.
 SAMPLED_TEXELS = 1.0 if bpy.app.version >= (5, 2, 0) else 0.5
 MOST_UV_MAPS = 8
-CYCLES_TYPES = {"specular": "GLOSSY", "diffuse": "DIFFUSE"}
+CYCLES_TYPES = {"specular": "GLOSSY", "diffuse": "DIFFUSE", "soft": "DIFFUSE"}
 
 
 @dataclass(frozen=True)
@@ -171,7 +170,7 @@ def view_of(wanted, camera, bent: bool) -> BakeView:
 
 
 # Keys of a job that may change while the same file stays open.
-_OF_ONE_JOB = ("objects", "following", "tile", "finished", "look_up_images")
+_OF_ONE_JOB = ("objects", "following", "tile", "look_up_images")
 
 
 @dataclass
@@ -315,14 +314,15 @@ def lights_by_row(scene, world, lights: list) -> list:
 
 
 @contextmanager
-def lit_by(opened: BakeScene, row: str):
-    """Within this context only the lights of a `row` shine, and bounce as the file has it; "": all lights do."""
+def lit_by(opened: BakeScene, names: set[str] | None = None):
+    """Within this context only the lights `names` shine, and bounce as the file has it; None: all do."""
     scene, world, dark, cuts = opened.scene, opened.world, [], []
-    if row:
-        names = {light.name for light in opened.lights if light.group == row}
-        dark = [ob for ob in scene.objects if ob.type == "LIGHT" and ob.name not in names]
+    if names is not None:
+        lamps = {ob for ob in scene.objects if ob.type == "LIGHT"}
+        dark = [ob for ob in lamps if ob.name not in names]
+        alone = {ob.name for ob in lamps} | ({world.name} if world is not None else set())
         world = world if world is not None and world.name in names else None
-        cuts = [] if row == GLOW else _glowing_sockets()
+        cuts = [] if names - alone else _glowing_sockets()
     changes = [*opened.bounces, (scene, "world", world), *((ob, "hide_render", True) for ob in dark)]
     links = [(link.from_socket, link.to_socket) for socket in cuts for link in socket.links]
     for socket in cuts:
@@ -476,8 +476,7 @@ def _objects(opened, names, images, job, folder, progress) -> dict:
         save_array(folder / file, np.concatenate(list(maps)))
     record["maps"] = any(plan.count for plan in plans.values())
     if record["maps"] or job.cycles_samples or job.bounces == "on":
-        finished = {tile for name, tile in job.finished if name == (ATLAS if job.atlas else names[0])}
-        tiles = [tile for tile in tiles_of(joined.uv)[0] if tile not in finished and job.tile in (None, tile)]
+        tiles = [tile for tile in tiles_of(joined.uv)[0] if job.tile in (None, tile)]
         uv_names = {ob: opened.meshes[ob.name].uv_name for ob in objects}
         bake = ObjectBake(opened.scene, uv_names, list(plans.values()))
         _bake(bake, tiles, job, opened, (folder, progress))
@@ -495,18 +494,22 @@ def _bake(bake, tiles, job, opened, files) -> None:
             for point in range(points):
                 save_array(folder / f"maps_{block.name}_{point}.npy", bake.maps(block, point, points))
             for kind in job.passes if job.cycles_samples else ():
-                with lit_by(opened, "") if has_bounces else nullcontext():
+                with lit_by(opened) if has_bounces else nullcontext():
                     light = {"DIRECT", "INDIRECT"} if has_bounces else {"DIRECT"}
                     halves = bake.halves(block, kind, max(1, job.cycles_samples // 2), light)
                 save_array(folder / f"cycles_{kind}_{block.name}.npy", halves)
-        rows = list(dict.fromkeys(light.group for light in opened.lights)) if job.per_light else [""]
+        groups = list(dict.fromkeys(light.group for light in opened.lights)) if job.per_light else [""]
+        rows = [{one.name for one in opened.lights if one.group == group} for group in groups] if groups[1:] else [None]
         # One light by itself has less noise, since no sample goes to others.
         samples = job.rest_samples if len(rows) == 1 else max(job.rest_samples // 2, 1)
-        steps = itertools.product(rest if has_bounces else (), enumerate(rows), job.rest_passes)
-        for number, (block, (row, light_name), kind) in enumerate(steps):
-            progress(f"bounces {name}", number / (len(rest) * len(rows) * len(job.rest_passes)))
-            with lit_by(opened, light_name):
-                light = {"INDIRECT", "COLOR"} if kind == "specular" else {"INDIRECT"}
+        tasks = [(kind, row, names) for row, names in enumerate(rows) for kind in job.rest_passes]
+        if sky := {one.name for one in opened.lights if one.is_side and one.affects_diffuse}:
+            tasks += [("soft", 0, sky)] * ("diffuse" in job.rest_passes)
+        steps = [(block, *task) for block in (rest if has_bounces else ()) for task in tasks]
+        for number, (block, kind, row, names) in enumerate(steps):
+            progress(f"bounces {name}", number / len(steps))
+            with lit_by(opened, names):
+                light = {"diffuse": {"INDIRECT"}, "specular": {"INDIRECT", "COLOR"}, "soft": {"DIRECT"}}[kind]
                 baked = bake.radiance(block, kind, (SEEDS["A"], samples), light)
             save_array(folder / f"rest_{kind}_{row}_{block.name}.npy", baked)
     finally:

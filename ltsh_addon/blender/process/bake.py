@@ -25,7 +25,6 @@ class BakeJob:
     frame: int | None
     cycles_samples: int
     passes: tuple[str, ...]  # of Cycles
-    finished: tuple[tuple[str, int], ...] = ()  # (object, tile) that need no maps
     look_up_images: bool = True  # False: everything that varies is a map
     following: tuple[str, ...] = ()  # objects of the same file that later jobs need
     scripts: bool = False  # run the scripts in the file
@@ -69,6 +68,26 @@ class ApplyJob:
     textures: list[BakedTextures]  # in the child their fields
     frame: int | None = None
     atlas: dict | None = None  # arguments of `extract.atlas.make_atlas`, the "objects" by name
+
+
+@dataclass(frozen=True)
+class ExportJob:
+    """Export objects of `scene` as the .glb `path`."""
+
+    scene: Path
+    path: Path
+    uv_names: dict[str, str]  # the UV map of each object, by its name
+    frame: int | None = None
+    atlas: dict | None = None  # as in `ApplyJob`
+
+
+def export_objects(job: ExportJob, *, progress: Progress | None = None) -> dict[str, int]:
+    """Export objects with all modifiers applied; returns the number of the UV map of each in glTF, by its name.
+
+    Raises as `pixels.extract_pixels` does.
+    """
+    with temporary_folder() as folder:
+        return run_job(job, folder, progress)["coordinates"]
 
 
 def apply_bake(job: ApplyJob, *, progress: Progress | None = None) -> list[str]:

@@ -199,6 +199,7 @@ class BlenderProcess:
         self._background = background
         self.temporary = [folder]  # folders that it deletes if this process is gone; it writes to the first
         self._child: subprocess.Popen | None = None
+        self.second: BlenderProcess | None = None  # see `second_blender`
 
     def do(self, job, folder: Path, progress: Progress | None) -> dict:
         """Do `job`, see `run_job`, in `folder` and report its progress. An error ends this Blender."""
@@ -239,6 +240,8 @@ class BlenderProcess:
 
     def end(self) -> None:
         """End Blender, whatever it is doing; it has nothing to save."""
+        if self.second is not None:
+            self.second.end()
         child, self._child = self._child, None
         if child is None:
             return
@@ -271,6 +274,20 @@ def shared_blender(folder: Path):
     finally:
         _shared.reset(token)
         process.end()
+
+
+@contextlib.contextmanager
+def second_blender():
+    """Within this context, inside a `shared_blender`, another Blender does all jobs, so that both keep their scenes."""
+    first = _shared.get()
+    if first.second is None:
+        first.second = BlenderProcess(first.temporary[0])
+        first.second.temporary = first.temporary
+    token = _shared.set(first.second)
+    try:
+        yield
+    finally:
+        _shared.reset(token)
 
 
 def run_job(job, folder: Path, progress: Progress | None) -> dict:

@@ -45,6 +45,7 @@ class ViewJob:
     rest: Path | None = None  # the file of what Cycles adds, see `RestSum.picture`
     is_everything: bool = False  # it is the whole picture
     scripts: bool = False  # run the scripts in the file
+    is_playblast: bool = False  # one of several frames
 
 
 def draw_view(job: ViewJob, folder: Path, *, progress: Progress | None = None) -> dict:

@@ -50,6 +50,7 @@ JOBS = {
     "BakeJob": ("bake", "extract.bake", "extract_bake"),
     "BakeFactsJob": ("bake", "extract.bake", "scene_facts"),
     "ApplyJob": ("bake", "extract.apply", "apply_bake"),
+    "ExportJob": ("bake", "extract.apply", "export_objects"),
     "TargetJob": ("match", "extract.match", "read_target"),
     "LightsJob": ("match", "extract.match", "save_lights"),
     "ViewJob": ("view", "viewport.still", "draw_view"),

@@ -18,7 +18,7 @@ import bpy
 from bpy.app.translations import pgettext_iface as translated
 
 from ...pipeline.options import BakeOptions, CompareOptions, PictureOptions, command_line
-from ...scene import DEFAULT_TECHNIQUE, REFERENCE, TECHNIQUES
+from ...scene import ATLAS, DEFAULT_TECHNIQUE, REFERENCE, TECHNIQUES
 from ..process import blender_process
 from . import preflight
 from .settings import preferences
@@ -116,7 +116,8 @@ def bake_options(context, scene_file: Path) -> BakeOptions:
         scene=scene_file,
         output=output_folder(context.scene, "bake"),
         objects=tuple(ob.name for ob in preflight.bake_objects(context)[0]),
-        uv=settings.bake_uv_map or None,
+        uv=ATLAS if settings.bake_atlas else settings.bake_uv_map or None,
+        atlas=side if settings.bake_atlas else None,
         size=(side, side),
         sub_samples=settings.anti_aliasing,
         margin=settings.bake_margin,
@@ -216,7 +217,7 @@ def _bake(options: BakeOptions) -> list[Step]:
     samples = options.cycles_samples * len(options.passes) if options.error else options.sub_samples
     shading = sum(_shading(name, texels) for name in options.techniques) * options.sub_samples
     bounces, stages = options.bounces == "on", [Step("open scene", OPEN_SECONDS)]
-    for name in options.objects:
+    for name in (ATLAS,) if options.atlas else options.objects:
         stages.append(Step(f"bake {name}", RENDER_SECONDS + SAMPLE_SECONDS * texels * samples))
         if bounces:
             stages.append(Step(f"bounces {name}", RENDER_SECONDS + CYCLES_SECONDS * texels * options.rest_samples))

@@ -240,9 +240,9 @@ class _Bake:
         toggles(layout, context, 4).prop(settings, "bake_passes")
         split_names(layout, context)
         column = layout.column()
-        for name in ("bake_size", "bake_margin", "bake_view"):
+        for name in ("bake_size", "bake_atlas", "bake_margin", "bake_view"):
             column.prop(settings, name)
-        if ob is not None and ob.type == "MESH":
+        if ob is not None and ob.type == "MESH" and not settings.bake_atlas:
             column.prop_search(settings, "bake_uv_map", ob.data, "uv_layers", icon="GROUP_UVS")
         column.prop(settings, "bake_bounces")
         if settings.bake_bounces:

@@ -18,8 +18,9 @@ import bpy
 import numpy as np
 from bpy.props import StringProperty
 
-from ...scene import error_line
+from ...scene import ATLAS, SceneError, error_line, listed
 from ..extract.apply import shows_texture
+from ..extract.atlas import make_atlas
 from ..extract.bake_meshes import ObjectError, check_object
 from ..lights.area import LightInventory, node_light, reason_to_leave_out
 from ..lights.area import note_unsupported as note_unsupported_light
@@ -30,9 +31,10 @@ from ..materials.bsdfs import bsdf_of, is_emission
 from ..materials.graph import shaders_behind, surface_of
 from ..materials.preview_material import preview_of
 from ..render_settings import CAMERA_KINDS, CAMERA_TYPES, picture_size
-from .preview import ENGINE, lights_of, select_alone, view_of
+from .preview import ENGINE, lights_of, view_of
 
 EXACT, APPROXIMATED, LEFT_OUT = "exact", "approximated", "left out"
+UNWRAPPED_SIDE = 128  # the least texels a side for which islands of an object keep their distance
 OF_MIRRORS = "it reflects lights and the world, and is black where it would show anything else"
 
 
@@ -108,13 +110,16 @@ def bake_objects(context) -> tuple[list, list[Problem]]:
     for ob in selected:
         if ob in baked:
             continue
-        problem = _object_problem(ob, context.scene.ltsh.bake_uv_map)
+        problem = _object_problem(ob, context.scene.ltsh)
         if problem is None:
             usable.append(ob)
         else:
             problems.append(problem)
     if usable:
         problems = [replace(problem, blocks=False) for problem in problems]
+    if context.scene.ltsh.bake_atlas and (bare := [ob.name for ob in usable if ATLAS not in ob.data.uv_layers]):
+        text = f"Not in the atlas yet: {listed(map(repr, bare))}"
+        problems.append(Problem(text, True, "ltsh.make_atlas", "Make Atlas"))
     return usable, problems
 
 
@@ -127,7 +132,8 @@ def _textures_shown(baked) -> Problem:
     return Problem(text, True, "ltsh.restore_materials", "Restore")
 
 
-def _object_problem(ob, uv_map: str) -> Problem | None:
+def _object_problem(ob, settings) -> Problem | None:
+    uv_map = settings.bake_uv_map
     if ob.hide_render:
         return _hidden(ob, f"Object {ob.name!r} is hidden in renders")
     try:
@@ -136,6 +142,8 @@ def _object_problem(ob, uv_map: str) -> Problem | None:
         return Problem(str(error)[:1].upper() + str(error)[1:])
     if not ob.data.polygons and not ob.modifiers:
         return Problem(f"Object {ob.name!r} has no faces")
+    if settings.bake_atlas:
+        return None
     if uv_map and uv_map not in ob.data.uv_layers and ob.data.uv_layers:
         names = ", ".join(repr(layer.name) for layer in ob.data.uv_layers)
         return Problem(f"Object {ob.name!r} has no UV map {uv_map!r}, found {names}")
@@ -246,19 +254,34 @@ class LTSH_OT_add_uv_map(bpy.types.Operator):
         if ob is None or ob.type != "MESH" or ob.hide_get():
             self.report({"ERROR"}, f"Object {self.object_name!r} is not a visible mesh of this view layer")
             return {"CANCELLED"}
-        selected, active = context.selected_objects, context.view_layer.objects.active
+        for problem in make_atlas([ob], UNWRAPPED_SIDE, name="UVMap")[1].values():
+            self.report({"ERROR"}, problem)
+            return {"CANCELLED"}
+        return {"FINISHED"}
+
+
+class LTSH_OT_make_atlas(bpy.types.Operator):
+    """Unwrap the selected objects into one texture, on a UV map Lightmap that is added; all others stay.
+    Objects that share a mesh get one each"""
+
+    bl_idname = "ltsh.make_atlas"
+    bl_label = "Make Atlas"
+    bl_options = {"REGISTER", "UNDO"}
+
+    @classmethod
+    def poll(cls, context):
+        return context.mode == "OBJECT"
+
+    def execute(self, context):
         try:
-            select_alone(context, ob)
-            bpy.ops.object.mode_set(mode="EDIT")
-            bpy.ops.mesh.select_all(action="SELECT")
-            bpy.ops.uv.smart_project(island_margin=0.02)
-        finally:
-            if ob.mode == "EDIT":
-                bpy.ops.object.mode_set(mode="OBJECT")
-            ob.select_set(False)
-            for other in selected:
-                other.select_set(True)
-            context.view_layer.objects.active = active
+            densities, problems = make_atlas(bake_objects(context)[0], int(context.scene.ltsh.bake_size))
+        except SceneError as error:
+            densities, problems = {}, {"": str(error)}
+        for problem in problems.values():
+            self.report({"WARNING" if densities else "ERROR"}, problem)
+        if not densities:
+            return {"CANCELLED"}
+        self.report({"INFO"}, f"{len(densities)} objects, {min(densities.values()):.3g} texels per metre")
         return {"FINISHED"}
 
 

@@ -312,6 +312,9 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
         subtype="PIXEL", min=0, max=256, soft_max=64, default=16,
     )  # fmt: skip
     bake_view: EnumProperty(name="View From", description="From where surfaces are seen", items=VIEWS, default="camera")
+    bake_atlas: BoolProperty(
+        name="Atlas", description="The selected objects share one texture, on a UV map of its own that Make Atlas adds",
+    )  # fmt: skip
     bake_uv_map: StringProperty(
         name="UV Map",
         description="Name of the UV map to bake into; empty for the active one, highlighted in the list UV Maps",
@@ -387,7 +390,7 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
 
 SUBFOLDER = "ltsh"
 KEPT = ("techniques", "resolution_percentage", "anti_aliasing", "cycles_samples", "shadows", "shadow_rays",
-        "keep_lights", "bake_size", "bake_margin", "bake_view", "bake_passes", "bake_error",
+        "keep_lights", "bake_size", "bake_atlas", "bake_margin", "bake_view", "bake_passes", "bake_error",
         "bake_bounces", "bake_rest_samples", "bake_per_light")  # fmt: skip
 
 

@@ -3,6 +3,8 @@ the graphics card."""
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, fields
@@ -29,12 +31,30 @@ def glsl(name: str) -> str:
 
 # Compiled shaders by what they are made from: all views of a session share them.
 _compiled: dict[tuple, object] = {}
+_deadline = [math.inf]  # see `new_shaders_until`
+
+
+class ShadersMissing(Exception):
+    """Shaders are missing that the next drawing makes."""
+
+
+@contextmanager
+def new_shaders_until(moment: float) -> Iterator[None]:
+    """Within this, once the `moment` has passed (in `time.monotonic`), a shader that has been compiled raises
+    ShadersMissing, so that each drawing compiles one at least; the next one uses it, and drivers compile then again."""
+    _deadline[0] = moment
+    try:
+        yield
+    finally:
+        _deadline[0] = math.inf
 
 
 def compiled(key: tuple, make: Callable):
-    """What `make()` compiles, once for each `key`; needs an active GPU context."""
+    """What `make()` compiles, once for each `key`; needs an active GPU context. Raises ShadersMissing."""
     if key not in _compiled:
         _compiled[key] = make()
+        if time.monotonic() > _deadline[0]:
+            raise ShadersMissing
     return _compiled[key]
 
 

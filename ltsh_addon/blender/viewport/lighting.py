@@ -113,8 +113,8 @@ class LightingPass:
         `passes` is "specular", "diffuse" or "combined"; `view` is that of `HorizonPass.draw`. `target` has the size of
         the G-buffer. Of a G-buffer with a mask only surfaces are written; the mask must be the target's depth buffer.
         `blend` is "NONE", "ADDITIVE" to add the radiance (a further lobe of the same surfaces), or "ADDITIVE_PREMULT"
-        to add radiance and alpha. `numbers` are those of the lights to draw, at least one; None: all. The world's light
-        is drawn with light 0.
+        to add radiance and alpha. `numbers` are those of the lights to draw, with that of the world's light after
+        the others; None: all.
         """
         if passes not in _SHOWN_PASSES:
             raise ValueError(f"lighting pass: passes is {passes!r}, expected one of {', '.join(_SHOWN_PASSES)}")
@@ -145,21 +145,21 @@ class LightingPass:
             shaders = [*(replace(shader, **none) for shader in shaders), alone]
         with drawing(target, (0, 0, *gbuffer.size), blend, WITHIN_MASK[gbuffer.mask is not None]):
             for features in shaders:
-                self._draw(features, gbuffer, view, self._ranges(numbers))
+                self._draw(features, gbuffer, view, numbers)
 
     def _ranges(self, numbers: Collection[int] | None) -> list[tuple[int, int]]:
         """The lights (first, end) of each draw call."""
         if numbers is None:
             return draw_ranges(self._loops)
-        chosen = np.array(sorted(numbers))
-        runs = np.split(chosen, np.flatnonzero(np.diff(chosen) > 1) + 1)
+        chosen = np.array(sorted(set(numbers) - {len(self._loops)}), int)
+        runs = np.split(chosen, np.flatnonzero(np.diff(chosen) > 1) + 1) if len(chosen) else ()
         return [
             (int(run[0]) + first, int(run[0]) + end)
             for run in runs
             for first, end in draw_ranges(self._loops[run[0] : run[-1] + 1])
-        ]
+        ] or [(0, 0)]
 
-    def _draw(self, features: Features, gbuffer: GBufferTextures, view, ranges) -> None:
+    def _draw(self, features: Features, gbuffer: GBufferTextures, view, numbers) -> None:
         if features not in self._shaders:
             self._shaders[features] = lighting_shader(self.table, features)
         shader = self._shaders[features]
@@ -170,8 +170,10 @@ class LightingPass:
         }
         textures = {name: self._texture(name, gbuffer) for name in features.samplers}
         shader.bind(textures, {name: constants[name] for name in features.constants if name in constants})
-        for draw_range in ranges:
-            shader.draw(draw_range=draw_range)
+        has_sky = {"has_sky": numbers is None or len(self._loops) in numbers} if features.sky else {}
+        for draw_range in self._ranges(numbers):
+            shader.draw(draw_range=draw_range, **has_sky)
+            has_sky = dict.fromkeys(has_sky, False)
             gpu.state.blend_set("ADDITIVE")
 
     def _texture(self, name, gbuffer):

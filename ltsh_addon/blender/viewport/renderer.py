@@ -137,6 +137,10 @@ class Frame:
         return self.pictures, self.with_emission, self.world
 
 
+# Of each point of the pixels, for `ViewRenderer.keeps_points`.
+_OF_POINTS = ("_surfaces", "_glass", "_drawn", "_horizons_of", "_static", "_lighting_state")
+
+
 class ViewRenderer:
     """The GPU's side of one view; needs an active GPU context."""
 
@@ -149,15 +153,16 @@ class ViewRenderer:
         self._sums: list[SampleSum] = []  # of the pictures
         self._behind: list[SampleSum] = []  # what is lit behind glass
         self._parts: list[SampleSum] = []  # the lights of passes that several pictures have
-        self._lights: UploadedLights | None = None
+        self._lights, self._horizons_of = None, None  # UploadedLights | None
         self._drawn, self._uploaded = None, (None, None)
         self._shown, self.samples = None, 0  # the state of the pictures, and the number of their points
         self._lighting_state: LightingState | None = None
         self._static: StaticLighting | None = None
         # Where lights alone have changed, the first picture has the others' light of before: the pictures are split.
         self.may_split, self._is_split = True, False
+        # For further frames: keep all points of pixels apart, so that what has not changed in each is not drawn again.
+        self.keeps_points, self._points, self._point = False, {}, 0
         self._sky, self._sky_light, self._background = None, None, None
-        self.first = 0  # the number of the first point of a pixel
         self.step = 1  # pixels in either direction for which one is drawn, as while a view moves
         self._size = (1, 1)  # of what is shown
         self.shadows: ShadowRays | LiveShadows | None = None
@@ -189,12 +194,12 @@ class ViewRenderer:
         values = *frame.surfaces[1], frame.content, version, self.has_bounces
         state = (mirror, mirror.lights, mirror.sky, self.shadows), values
         is_same = same_state(state, self._shown)
-        if not is_same or self._is_split:
+        if not is_same or (self._is_split and not self.keeps_points):
             self.samples = 0
         if self.samples < len(points):
             self._shown = None  # until the sample is complete
             lit_by = None
-            if self.may_split and not is_same:
+            if self.keeps_points or (self.may_split and not is_same):
                 lit_by = (mirror, mirror.sky, self.shadows), (*frame.surfaces[1], frame.content)
             sample = replace(frame, view=frame.view.shifted(points[self.samples], size))
             is_drawn = self._draw_sample(sample, lit_by)
@@ -244,6 +249,10 @@ class ViewRenderer:
         The first point may keep the light of lights that have not changed, in the same `state`; None: it may not.
         Returns False where nothing was drawn because its shadows are not ready.
         """
+        if self.keeps_points:
+            self._take_point()
+        else:
+            self._points.clear()
         layers = self._draw_surfaces(frame)
         if not self._trace(layers, frame):
             return False
@@ -275,6 +284,13 @@ class ViewRenderer:
         self._add_emission(self._glass, frame, sums)
         return True
 
+    def _take_point(self) -> None:
+        """Take the layers of the next point, and keep those of the last one."""
+        self._points[self._point] = {name: getattr(self, name) for name in _OF_POINTS}
+        fresh = {"_surfaces": SurfaceLayer(), **dict.fromkeys(_OF_POINTS[1:])}
+        self._point = self.samples
+        vars(self).update(self._points.get(self._point) or fresh)
+
     def _draw_surfaces(self, frame: Frame) -> list[SurfaceLayer]:
         """The layers, surfaces and glass, with G-buffers and horizons; drawn again if anything has changed."""
         has_glass, is_drawn = frame.mirror.has_glass, same_state(frame.surfaces, self._drawn)
@@ -287,10 +303,11 @@ class ViewRenderer:
                     self._glass, self._veil = SurfaceLayer(self._surfaces), VeilPass()
                 self._glass.draw(frame.mirror, frame.view, frame.size)
             self._drawn = frame.surfaces
-        is_lit = not self._upload_lights(frame)
+        self._upload_lights(frame)
+        is_lit, self._horizons_of = self._horizons_of is self._lights, self._lights
         layers = [self._surfaces, self._glass] if has_glass else [self._surfaces]
         for layer in layers:
-            layer.threshold = (0.5 + (self.first + self.samples) * GOLDEN) % 1.0
+            layer.threshold = (0.5 + self.samples * GOLDEN) % 1.0
             if not (is_drawn and is_lit and layer.is_ready):
                 layer.choose_horizons(frame.mirror, frame.view, self._lights)
         return layers
@@ -314,14 +331,12 @@ class ViewRenderer:
         self._sky_light = float_texture(sky_texels(sky)) if sky.sides else None
         self._background = float_texture(background_texels(sky))
 
-    def _upload_lights(self, frame: Frame) -> bool:
-        """Upload the lights if they have changed; True if so."""
+    def _upload_lights(self, frame: Frame) -> None:
+        """Upload the lights if they have changed."""
         lights = frame.mirror.lights if frame.world else frame.mirror.lights_without_world
         sky = self._sky_light if frame.world else None
-        if self._uploaded[0] is lights and self._uploaded[1] is sky:
-            return False
-        self._lights, self._uploaded = upload_lights(lights, sky), (lights, sky)
-        return True
+        if self._uploaded[0] is not lights or self._uploaded[1] is not sky:
+            self._lights, self._uploaded = upload_lights(lights, sky), (lights, sky)
 
     def _visibility(self, layer: SurfaceLayer, gbuffer: GBufferTextures, frame: Frame) -> VisibilityGrid | None:
         """The visibility of the lights from the lobe `gbuffer` of a layer."""
@@ -334,7 +349,8 @@ class ViewRenderer:
         """Light the surfaces as `_light` does; with a `state` (see `_draw_sample`) perhaps only by what has changed."""
         layer, lights = self._surfaces, self._lights.lights
         self._is_split = False
-        if state is None or self.samples > 0 or (self.shadows is not None and self.shadows.traces_lobes):
+        is_further = self.samples > 0 and not self.keeps_points
+        if state is None or is_further or (self.shadows is not None and self.shadows.traces_lobes):
             self._light(layer, frame, targets)
             return
         grid = layer.visibility
@@ -346,10 +362,10 @@ class ViewRenderer:
                 self._light(layer, frame, targets)
                 return
             static = [SampleSum(layer.size) for _ in frame.pictures]
-            self._light(layer, frame, static, numbers=frozenset(range(len(lights))) - moving)
+            self._light(layer, frame, static, numbers=frozenset(range(len(lights) + 1)) - moving)
             self._static = StaticLighting(self._lighting_state, moving, static)
         for static, target in zip(self._static.pictures, targets, strict=True):
-            copy(self._copy_shader, static.texture, target.within())
+            copy(self._copy_shader, static.texture, target.within(), "ADDITIVE_PREMULT")
         self._light(layer, frame, targets, "ADDITIVE", self._static.moving)
         self._is_split = True
 
@@ -370,7 +386,7 @@ class ViewRenderer:
         if tuple(shares) != frame.pictures:
             sums = self._parts = _cleared(self._parts, replace(frame, pictures=tuple(shares)), True)
         for lighting in lightings:
-            lighting.number = self.first + self.samples
+            lighting.number = self.samples
         traces = self.shadows is not None and self.shadows.traces_lobes
         for number in range(max(frame.mirror.most_lobes, 1)):
             gbuffer = layer.lobe(number, frame.mirror, frame.view, self._lights)

@@ -27,7 +27,7 @@ from ...files import save_array, temporary_folder
 from ...scene import SceneError, error_line
 from .. import render_settings
 from ..extract.finished import reasons_for_cycles
-from ..extract.pixels import open_scene, scene_named
+from ..extract.pixels import files_opened, open_scene, scene_named
 from ..materials.graph import ensure_nodes, live_link, material_output, tree_in_use
 from ..materials.preview_material import preview_of
 from ..process.blender_process import BlenderProcess
@@ -56,9 +56,9 @@ LEVELS = (
 # direction that share one, in the pictures that come one after another; the first is the finest that takes one step.
 # TOTALS: the samples after which a picture is shown. REST_SECONDS: how long a view must stay as it is before.
 STEP_SECONDS, SHRINKS, TOTALS, REST_SECONDS = 0.5, (4, 2, 1), (4, 8, 16, 32, 64), 0.3
-# FEWEST: samples of single pixels that a step takes at least, as fewer take as long. MOST_CHANGE: how many times as
-# many or as few the next one takes.
-FEWEST, MOST_CHANGE = 1 << 17, 2.0
+# FEWEST: samples of single pixels that a step takes at least: the first picture of 1000 x 640 pixels. MOST_CHANGE: how
+# many times as many or as few the next one takes.
+FEWEST, MOST_CHANGE = 160_000, 2.0
 # Settings of a scene that change its light, beside those of Cycles.
 SCENE_SETTINGS = ("use_simplify", "simplify_subdivision", "film_transparent", "hair_type")
 
@@ -398,14 +398,21 @@ _sum: list[RestSum] = []
 def render_rest(job: RestJob, folder: Path, progress) -> dict:
     """Do the `job`: adds to the sum. Returns the manifest: the seconds that Cycles took."""
     view, warnings = RestView(**job.view), []
-    if job.scene is not None:
+    if job.scene is not None and _state_of(job, view) != _opened[0]:
         progress("open scene", 0.0)
         open_scene(Path(job.scene), warnings, job.scripts)
         scene = scene_named(view.scene)
         render_settings.go_to_frame(scene, view.frame)
         layer = render_settings.only_view_layer(scene, warnings, view.view_layer)
         _show_as_views(scene, layer, view.hidden)
+        # The animation of the scene itself ends here.
+        _opened[0] = None if scene.animation_data is not None else _state_of(job, view)
         _prepare(scene, layer)
+    elif job.scene is not None:
+        scene = scene_named(view.scene)
+        render_settings.go_to_frame(scene, view.frame)
+        _show_as_views(scene, next(layer for layer in scene.view_layers if layer.use), view.hidden)
+        _mark_materials()
     scene = scene_named(view.scene)
     if job.changes is not None:
         _take_changes(scene, **job.changes)
@@ -438,6 +445,16 @@ def render_rest(job: RestJob, folder: Path, progress) -> dict:
     total.add(folder / REST_RENDER, first, job.samples, {**render_settings.pass_names(), "mask": MASK})
     total.samples = job.total
     return {"seconds": seconds}
+
+
+# The state of the last job's scene, if its next frame needs no other one.
+_opened: list[tuple | None] = [None]
+
+
+def _state_of(job: RestJob, view: RestView) -> tuple:
+    """What an open scene is of."""
+    modified = Path(job.scene).stat().st_mtime_ns
+    return files_opened(), job.scene, modified, job.camera, job.scripts, replace(view, frame=None)
 
 
 def denoise_rest(job: RestPictureJob, folder: Path, progress) -> dict:
@@ -509,14 +526,24 @@ def _prepare(scene, layer) -> None:
     layer.cycles.denoising_store_passes = True
     aov = layer.aovs.add()
     aov.name, aov.type = MASK, "VALUE"
+    _mark_materials()
+
+
+def _mark_materials() -> None:
     for material in bpy.data.materials:
         if not material.is_grease_pencil:
             mark(material)
 
 
 def mark(material) -> None:
-    """Let `material` write MASK, if it is Cycles' alone."""
-    if not preview_of(material).is_of_cycles:
+    """Let `material` write MASK if it is Cycles' alone, and else not."""
+    nodes = () if material.node_tree is None else material.node_tree.nodes
+    marks = [node for node in nodes if getattr(node, "aov_name", "") == MASK]
+    if preview_of(material).is_of_cycles == bool(marks):
+        return
+    for node in marks:
+        nodes.remove(node)
+    if marks:
         return
     ensure_nodes(material)
     node = material.node_tree.nodes.new("ShaderNodeOutputAOV")

@@ -93,6 +93,7 @@ class Features:
         """The types of the push constants that the shader reads, by name."""
         needed = {
             "draw_range": ("IVEC2", True),
+            "has_sky": ("INT", self.sky),
             "view": ("VEC4", self.specular or self.sheen or self.rough),
             "grid": ("MAT4", self.shadowed),
             "jitter": ("VEC2", self.sky and (self.specular or self.rough)),

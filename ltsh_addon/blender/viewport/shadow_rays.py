@@ -29,6 +29,7 @@ class ViewTracer:
     def __init__(self, occluders: Occluders, processes: int = 2):
         self._occluders, self._processes = occluders, processes
         self.pool: WorkerPool | None = None
+        self.rays = 0  # traced by requests
 
     @cached_property
     def tracer(self) -> Tracer:
@@ -89,12 +90,14 @@ class ShadowRays:
         self.traced, self.description = self.traced + traced.rays, tracer.description
         return VisibilityGrid(visibility_texture(values, gbuffer.size), gbuffer.position, view.projection)
 
-    def noise(self, samples: int) -> dict[str, float]:
-        """Estimated relative L2 error by pass of the shadows in the mean of `samples` pictures."""
-        return {
+    def facts(self, samples: int) -> dict:
+        """Those of `pipeline.lighting.Shadows.report`, and the seconds; the noise is the estimated relative L2 error by
+        pass of the shadows in the mean of `samples` pictures."""
+        noise = {
             name: float(np.sqrt(variance / max(power, 1e-30) / samples))
             for name, (power, variance) in self._power.items()
         }
+        return {"rays": self.traced, "noise": noise, "tracer": self.description, "seconds": self.seconds}
 
 
 def view_occluders(depsgraph, note: Callable[[str], None], unread: list | None = None) -> Occluders:

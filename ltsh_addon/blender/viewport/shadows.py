@@ -107,7 +107,7 @@ class ShadowRequest:
     level: float  # number in LEVELS, or QUICK; len(LEVELS): for a group of further points
     group: int
     numbers: tuple  # of the lights in the view
-    keys: tuple  # of the lights, see `_shape_of`
+    keys: tuple  # of the lights, see `shape_of`
     lights: tuple[Lights, ...]
     points: PixelGrid
     rays: int
@@ -178,6 +178,7 @@ class ShadowRequest:
                 if not results:
                     raise
                 break
+            self.tracing.rays += traced.rays
             by_pass = [traced.of_lights(name) for name in PASSES]
             for row, number in enumerate(chosen):
                 if number in index_of:
@@ -393,7 +394,7 @@ class LiveShadows:
         if self._given is None or lights is not self._given[0] or sides is not self._given[1]:
             self._given = lights, sides
             self._lights = (*((light,) for light in lights), *((sides,) if sides else ()))
-            self._keys = (*map(_shape_of, lights), *((_shape_of_sky(sides),) if sides else ()))
+            self._keys = (*map(shape_of, lights), *((shape_of_sky(sides),) if sides else ()))
             if self._grid is not None and len(self._keys) != len(self._layers):
                 self._latest = {}
                 self._show()
@@ -563,12 +564,12 @@ def coarse_step(size: tuple[int, int]) -> int:
     return max(2, round((size[0] * size[1] / COARSE_POINTS) ** 0.5))
 
 
-def _shape_of(light: Light) -> str:
+def shape_of(light: Light) -> str:
     """A key of all that the visibility of `light` depends on: everything but its brightness."""
     return repr({name: value for name, value in light.record().items() if name not in ("radiance", "detail")})
 
 
-def _shape_of_sky(sides: Lights) -> str:
+def shape_of_sky(sides: Lights) -> str:
     """A key of all that the visibility of a sky depends on: the relative, not absolute brightness of its patches."""
     values = np.array([patch.radiance.mean() for side in sides for patch in side.leaves])
     traits = sides[0].affects_diffuse, sides[0].affects_specular, sides[0].name

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 
 import bpy
@@ -24,16 +25,20 @@ from ..lights.world import light_of_world
 from ..materials.preview_material import world_radiance
 from ..process.view import GRAPHICS, VIEW_PASSES, VIEW_PNG, ViewJob
 from ..render_settings import cycles_setting
-from .drawing import ViewCamera, float_texture, forget_shaders, frame_buffer, read_texture
+from .drawing import ViewCamera, VisibilityGrid, float_texture, forget_shaders, frame_buffer, read_texture
 from .light_texels import ShownSky, varied_sky
 from .live_cycles import rendered_world
 from .mirror import NOT_RESOLVED, Changes, SceneMirror, patterns_of
 from .pictures import TRANSMITTED, ShownPicture, ShownRest
 from .renderer import ViewRenderer
-from .shadow_rays import ShadowRays, ViewTracer, too_many, view_occluders
+from .shadow_rays import MOST_BYTES, ShadowRays, ViewTracer, too_many, view_occluders, visibility_texture
+from .shadows import QUICK, QUICK_RAYS, PixelGrid, ShadowRequest, shape_of, shape_of_sky
 
 # FEWEST_RAYS: a point of a pixel takes at least so many rays per light, however many points share those of the pixel.
 FEWEST_RAYS = 32
+# SHARE_OF_RAYS: in a playblast, where all points of a pixel share the rays, they take one of so many. POINT_BYTES: what
+# is kept of a point of a pixel for the next frame.
+SHARE_OF_RAYS, POINT_BYTES = 8, 500
 # The last renderer, kept for its compiled shaders. Only where scripts may always use graphics.
 _renderer: list[ViewRenderer] = []
 
@@ -51,6 +56,7 @@ class OpenScene:
         self._shadow_notes: list[str] = []
         self._mirror: SceneMirror | None = None
         self.tracing: ViewTracer | None = None
+        self._shadows: FrameShadows | None = None
 
     def is_of(self, job: ViewJob) -> bool:
         """True if it is the scene of a job, and nothing else has been opened since."""
@@ -113,6 +119,12 @@ class OpenScene:
         self._changes = Changes()
         return self._mirror
 
+    def shadows(self, rays: int) -> FrameShadows:
+        """The shadows of frames."""
+        if self._shadows is None or self._shadows.tracing is not self.tracing:
+            self._shadows = FrameShadows(self.tracing, rays)
+        return self._shadows
+
     def _pattern(self, data, source) -> NodeEmission | str:
         return self._patterns[source.key][1] if source.key in self._patterns else NOT_RESOLVED
 
@@ -120,7 +132,61 @@ class OpenScene:
         """End the processes that trace, and free what is on the graphics card."""
         if self.tracing is not None:
             self.tracing.close()
-        self._mirror = None
+        self._mirror = self._shadows = None
+
+
+class FrameShadows:
+    """Shadows of the frames of a playblast, as views have them soon after they come to rest: once for all points of a
+    pixel. A light that stays keeps them as long as the surfaces and the camera stay."""
+
+    version, waits, traces_lobes = 0, False, False
+
+    def __init__(self, tracing: ViewTracer, rays: int):
+        self.tracing, self._rays, self.seconds = tracing, rays, 0.0
+        self._state, self._points, self._known, self._grid = None, None, {}, None
+
+    @cached_property
+    def of_glass(self) -> FrameShadows:
+        """The shadows of the glass in front of the surfaces."""
+        return FrameShadows(self.tracing, self._rays)
+
+    def take_news(self) -> None:
+        """Do nothing: there is never news, because everything is traced at once."""
+
+    def visibility(self, gbuffer, view: ViewCamera, lights, sides=(), number: int = 0) -> VisibilityGrid | None:
+        """As `ShadowRays.visibility`."""
+        if number > 0:
+            return self._grid
+        start, self._grid = time.monotonic(), None
+        state = view.projection.tobytes(), gbuffer.size
+        if state != self._state:
+            self._state, self._points, self._known = state, PixelGrid(1, gbuffer, view), {}
+        else:
+            self._points.follow(gbuffer)
+        emitters = {shape_of(light): (light,) for light in lights}
+        emitters |= {shape_of_sky(sides): sides} if sides else {}
+        keys = [*map(shape_of, lights), *([shape_of_sky(sides)] if sides else [])]
+        if keys and len(self._points.samples()[0]):
+            self._known = {key: self._known.get(key) for key in emitters}
+            for key, values in self._known.items():
+                if values is None:
+                    self._known[key] = self._traced(key, emitters[key])
+            values, (positions, projection) = [self._known[key] for key in keys], self._points.grid
+            texture = visibility_texture(np.stack(values), positions.shape[1::-1])
+            sources = tuple((positions, one) for one in values)
+            self._grid = VisibilityGrid(texture, float_texture(positions), projection, sources)
+        self.seconds += time.monotonic() - start
+        return self._grid
+
+    def _traced(self, key, lights) -> np.ndarray:
+        work = ShadowRequest((), QUICK, 0, (0,), (key,), (lights,), self._points, self._rays, self.tracing)
+        return work.visibility(lambda stage, fraction: None)[0]
+
+    def facts(self, samples: int) -> dict:
+        """As `ShadowRays.facts`, since the last call and without the noise."""
+        seconds, rays = self.seconds + self.of_glass.seconds, self.tracing.rays
+        self.seconds = self.of_glass.seconds = self.tracing.rays = 0
+        return {"rays": rays, "noise": {}, "tracer": self.tracing.tracer.description, "seconds": seconds}
 
 
 # The scene of the last job, and whether scripts may use the graphics card outside of renders.
@@ -278,6 +344,8 @@ def _draw(
         rays = max(min(FEWEST_RAYS, job.shadow_rays), job.shadow_rays // job.refine)
         if problem:
             notes.append(problem)
+        elif job.is_playblast:
+            shadows = opened.shadows(max(QUICK_RAYS, job.shadow_rays // SHARE_OF_RAYS))
         else:
             shadows = ShadowRays(opened.tracing, rays)
     drawn = mirror, view_of_camera(camera.evaluated_get(depsgraph), depsgraph, size), size
@@ -289,7 +357,9 @@ def _draw(
     exposure, transparent = cycles_setting(scene, "film_exposure"), scene.render.film_transparent
     shown = ShownPicture(first[0], "combined", exposure=exposure, transparent=transparent, also=tuple(others))
     renderer = _renderer[0] if _renderer else ViewRenderer()
-    renderer.shadows, renderer.has_bounces, renderer.may_split = shadows, job.rest is not None, False
+    renderer.shadows, renderer.has_bounces = shadows, job.rest is not None
+    renderer.keeps_points = job.is_playblast and job.refine * size[0] * size[1] * POINT_BYTES <= MOST_BYTES
+    renderer.may_split = renderer.keeps_points
     if job.rest is not None:
         renderer.rest = ShownRest(float_texture(np.load(job.rest)[::-1]), drawn[1], job.is_everything)
     try:
@@ -305,11 +375,7 @@ def _draw(
         else:
             renderer.free()
             forget_shaders()
-    traced = None
-    if shadows is not None:
-        # The facts of `pipeline.lighting.Shadows.report`, and the seconds.
-        traced = {"rays": shadows.traced, "noise": shadows.noise(len(points)), "tracer": shadows.description}
-        traced["seconds"] = shadows.seconds
+    traced = None if shadows is None else shadows.facts(len(points))
     return (
         pictures,
         notes,

@@ -90,7 +90,7 @@ def samples_by_object(path, folder, look_up):
     """Samples (SurfaceSamples) of every object and whether maps were baked for it."""
     folder.mkdir()
     options = BakeOptions(scene=path, output=folder, size=(SIZE, SIZE), view="above")
-    job = replace(bake._job(options, {}), look_up_images=look_up)
+    job = replace(bake._job(options), look_up_images=look_up)
     manifest = extract_bake(job, folder)
     lights = tuple(light_of(record) for record in manifest["lights"])
     found = {}

@@ -175,3 +175,20 @@ def test_asking_changes_nothing(scene):
 def test_what_is_gone_meanwhile_is_told(scene, operator, values, text):
     with pytest.raises(RuntimeError, match=f"Error: {text}"):
         getattr(bpy.ops.ltsh, operator)(**values)
+
+
+def test_an_atlas_is_made_by_a_button_and_then_baked(scene):
+    scene.ltsh.bake_atlas = True
+    usable, (problem,) = preflight.bake_objects(bpy.context)
+    assert (problem.text, problem.blocks, problem.fix) == (
+        "Not in the atlas yet: 'Floor'",
+        True,
+        "ltsh.make_atlas",
+    )
+    first = usable[0].data.uv_layers.active.name
+    assert bpy.ops.ltsh.make_atlas() == {"FINISHED"}
+    assert [layer.name for layer in usable[0].data.uv_layers] == [first, "Lightmap"]
+    assert usable[0].data.uv_layers.active.name == first and preflight.bake_objects(bpy.context)[1] == []
+    options = job.bake_options(bpy.context, Path("x.blend"))
+    assert (options.uv, options.atlas, options.size) == ("Lightmap", 256, (256, 256))
+    assert {"bake Lightmap", "shade Lightmap"} <= {step.stage for step in job.steps([job.Run("bake", options)])}

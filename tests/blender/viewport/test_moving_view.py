@@ -9,7 +9,7 @@ from view_pictures import OpenView
 
 from ltsh_addon.blender.engine import redraws
 from ltsh_addon.blender.viewport import shadows
-from ltsh_addon.blender.viewport.drawing import float_texture
+from ltsh_addon.blender.viewport.drawing import ShadersMissing, float_texture, forget_shaders, new_shaders_until
 from ltsh_addon.blender.viewport.pictures import ShownPicture, ShownRest
 from ltsh_addon.blender.viewport.shadow_rays import ShadowRays, ViewTracer, view_occluders
 from ltsh_addon.blender.viewport.shadows import LiveShadows, ShadowRequest
@@ -173,3 +173,25 @@ def test_shares_are_smoothed_along_surfaces_and_shadows_stay_sharp():
     found = shadows._smoothed(values, position, normal)
     np.testing.assert_allclose(np.delete(found, 5, axis=1), np.delete(values, 5, axis=1), atol=2e-3)
     np.testing.assert_allclose(found[4, 4], 0.3, atol=1e-6)
+
+
+@pytest.mark.newest
+def test_a_drawing_that_has_no_time_compiles_one_shader_and_the_last_one_has_the_picture():
+    camera, shown = set_up_scene(), ShownPicture("ltsh4", "combined")
+
+    def draw():
+        with OpenView(camera, SIZE) as opened:
+            expected = opened.draw(shown)
+        forget_shaders()
+        with OpenView(camera, SIZE) as opened:
+            for drawings in range(20):
+                try:
+                    with new_shaders_until(0.0):
+                        return drawings, opened.draw(shown), expected
+                except ShadersMissing:
+                    pass
+
+    drawings, picture, expected = with_graphics(draw)
+    # At least those of two steps of the horizons and of the lighting are missing.
+    assert drawings >= 2
+    np.testing.assert_array_equal(picture, expected)

@@ -230,7 +230,7 @@ void main()
     /* The world's light is added in the draw call of the first lights. */
     vec4 mean = texelFetch(sky, ivec2(0, 0), 0);
     vec4 traits = texelFetch(sky, ivec2(1, 0), 0);
-    if (here && draw_range.x == 0) {
+    if (here && has_sky != 0) {
         vec2 open = vec2(1.0);
 #ifdef LTSH_SHADOWED
         open = ltsh_seen(near, textureSize(visibility, 0).z - 1);

@@ -131,7 +131,7 @@ class Comparison:
             "shadows": None if self.shadows is None else self.shadows.report(),
             "passes": {name: self._pass_report(name) for name in options.passes},
             "problems": list(extraction.problems),
-            "warnings": imaging.grouped(extraction.warnings),
+            "warnings": imaging.grouped([*extraction.warnings, *(self.shadows.warnings() if self.shadows else ())]),
         }
 
     def _reference_facts(self) -> dict | None:

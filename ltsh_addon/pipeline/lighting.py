@@ -20,7 +20,18 @@ from ..cycles.gbuffer import with_one_shadow
 from ..emitters.light_tree import FEWEST
 from ..files import check_takes_files
 from ..imaging.exr import unique_names
-from ..scene import CYCLES, REFERENCE, SHIPPED_TABLES, TECHNIQUES, Cancelled, Film, Light, Progress, SurfaceSamples
+from ..scene import (
+    CYCLES,
+    REFERENCE,
+    SHIPPED_TABLES,
+    TECHNIQUES,
+    Cancelled,
+    Film,
+    Light,
+    Progress,
+    SurfaceSamples,
+    listed,
+)
 from ..workers.pool import cores
 
 # MOST_PAIRS: how many pairs of a sample and a light have their radiance in memory at a time.
@@ -36,6 +47,11 @@ SHARES_DONE = {1: ((0, 1), (0.0, 1.0)), 2: ((0, 1, 2), (0.0, 0.8, 1.0))}
 # Limits of the reference: MOST_REFERENCE_PAIRS pairs of a sample and a light, some 30 us each, but always
 # FEWEST_SAMPLES samples.
 MOST_REFERENCE_PAIRS, FEWEST_SAMPLES = 3_000_000, 32
+
+
+# NOTED_NOISE: relative errors of shadows that a warning tells: as much light may be missing where few rays meet it.
+NOTED_NOISE = 0.1
+NOISY = "shadows: noise of {} light, of which as much may be missing: few rays meet it, as through a window; {}"
 
 
 @dataclass(frozen=True)
@@ -62,6 +78,11 @@ class Shadows:
         rows = [row for row, (first, *_) in enumerate(self.numbers) if first in index_of]
         renumbered = tuple(tuple(index_of[number] for number in self.numbers[row]) for row in rows)
         return replace(self, shares={name: one[rows] for name, one in self.shares.items()}, numbers=renumbered)
+
+    def warnings(self) -> list[str]:
+        """What to say of much noise."""
+        noisy = [f"{100.0 * noise:.0f} % of the {name}" for name, noise in self.noise.items() if noise > NOTED_NOISE]
+        return [NOISY.format(listed(noisy), "raise --shadow-rays, or --aa")] if noisy else []
 
     def report(self) -> dict:
         """The entry of report.json."""

@@ -198,3 +198,10 @@ def test_folders_and_files_that_keep_nothing_are_refused(capsys, monkeypatch, ro
         (out / "shade.samples.npz").write_bytes(content)
         code, _, stderr = run(capsys, "relight", out, "--light", "Light 0")
         assert code == 1 and "is no file of --keep-visibility" in stderr and len(stderr.splitlines()) == 1
+
+
+def test_much_noise_of_shadows_is_told_with_its_size():
+    quiet = lighting.Shadows({}, (), {"specular": 0.02, "diffuse": 0.09}, 0, "")
+    assert quiet.warnings() == []
+    (told,) = replace(quiet, noise={"specular": 0.02, "diffuse": 0.576}).warnings()
+    assert "noise of 58 % of the diffuse light" in told and "specular" not in told and "--shadow-rays" in told

@@ -42,8 +42,9 @@ LEVELS = (16, 32, 64, 128, 256, 512)
 BRIGHTEST, BRIGHTEST_OF_SKY = 4, 2
 # A pair needs more rays only if some of them arrive, and some do not, that carry more than this share of its light.
 NEGLIGIBLE = np.float32(0.01)
-# Rounds in which neighbors of mixed pairs get more rays. Neighbors that turn out mixed pass this on in the next round.
-ROUNDS = 4
+# Rounds in which neighbors of mixed pairs get more rays. Neighbors that turn out mixed pass this on in the next round;
+# where little light comes through a window, probes meet it so rarely that it takes many.
+ROUNDS = 16
 # Samples that share the rays to a sky or to many lights are alike: their normals differ by at most LIKE_NORMAL, they
 # lie in one plane but for a slope of LIKE_NORMAL, and for the specular pass their mirrored views differ by LIKE_LOBE
 # alpha, and the alphas by LIKE_ALPHA of one.
@@ -356,7 +357,9 @@ class RatioEstimator:
     def _lit_and_dark(self):
         """Masks (2, Q) of the pairs of which a lobe has a share of more than NEGLIGIBLE, and less than 1 by as much."""
         sums, passing = self.sum_w.sum(axis=1), self.sum_wv.sum(axis=1)
-        return [(share > NEGLIGIBLE * sums).any(axis=0) for share in (passing, sums - passing)]
+        # Where little of a light arrives anywhere, as through a window, little is not negligible.
+        arriving = passing.sum(axis=1, keepdims=True) / np.maximum(sums.sum(axis=1, keepdims=True), _TINY)
+        return [(passing > NEGLIGIBLE * arriving * sums).any(axis=0), (sums - passing > NEGLIGIBLE * sums).any(axis=0)]
 
     def _unmet(self):
         """Masks (Q,) by pass of the pairs with a lobe that no ray has met so far."""

@@ -43,6 +43,7 @@ def recorded(monkeypatch):
     monkeypatch.setattr(gpu.types, "GPUStageInterfaceInfo", Recorder)
     monkeypatch.setattr(gpu.shader, "create_from_info", lambda info: info)
     monkeypatch.setattr(drawing, "batch_for_shader", lambda *arguments: None)
+    monkeypatch.setattr(drawing, "_compiled", {})  # what stands in for shaders is no shader of the session
 
     def run(function):
         made.clear()

@@ -130,6 +130,7 @@ def test_views_of_one_world_look_at_it_once(monkeypatch):
     world, begun = parts.add_world()[0], []
     sky = live_cycles.ShownSky()
     monkeypatch.setattr(live_cycles, "REST_SECONDS", -1.0)
+    monkeypatch.setattr(live_cycles, "_world_looks", type(live_cycles._world_looks)())
     monkeypatch.setattr(live_cycles._WorldLook, "_begin", lambda look, frame: begun.append(look) or found(look))
 
     def found(look):

@@ -466,7 +466,7 @@ def test_what_reads_a_material_changes_nothing_of_the_file():
     before = content()
     for material in materials:
         preview_of(material)
-        preflight._material(material, in_view=False)
+        preflight._material(material, in_view=False, with_bounces=False)
         emission_of(material)
     assert content() == before
 

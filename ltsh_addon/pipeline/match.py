@@ -23,9 +23,8 @@ from .picture import view_transformed
 from .render import Finished, finish
 from .tasks import TaskResult, check_before_writing, write_reports
 
-# PIXELS: of the pictures of the lights, at most; targets with more are reduced. ASPECT: how far the sides of a target
-# may be from the scene's, relatively.
-PIXELS, ASPECT = 480 * 270, 0.01
+# PIXELS: of the pictures of the lights, at most; targets with more are reduced.
+PIXELS = 480 * 270
 # STEADY: the weight of the present factors, relative to the target's. It holds lights that give next to nothing.
 STEADY = 1e-6
 # SQUARE: pictures are compared by the means of squares of so many pixels on a side: edges that lie differently within
@@ -140,7 +139,7 @@ def match_scene(options: MatchOptions, progress: Progress | None = None) -> dict
     with temporary_folder() as folder, shared_blender(folder):
         paths = options.target.absolute(), options.mask and options.mask.absolute()
         job = child_job(TargetJob, options, target=paths[0], mask=paths[1])
-        target, weights, warnings = read_target(job, folder, progress)
+        target, weights = read_target(job, folder, progress)
         # Of a pixel of which some is clipped or masked, the rest tells nothing about the mean.
         is_whole = reduced((weights > 0.0).astype(np.float64)) > 0.999
         target, weights = reduced(target), np.where(is_whole, reduced(weights), 0.0)
@@ -166,8 +165,8 @@ def match_scene(options: MatchOptions, progress: Progress | None = None) -> dict
     write_bytes(Path(options.output) / "match.png", png)
     shares = dict(zip(groups, result.shares.tolist(), strict=True))
     lights = [{**light, "share": shares[light.pop("group")]} for light in lights]
-    if weak := [repr(light["name"]) for light in lights if light["share"] < LEAST_SHARE]:
-        warnings = [*warnings, NOT_TOLD.format(listed(weak), 100.0 * LEAST_SHARE)]
+    weak = [repr(light["name"]) for light in lights if light["share"] < LEAST_SHARE]
+    warnings = [NOT_TOLD.format(listed(weak), 100.0 * LEAST_SHARE)] if weak else []
     report = {
         "target": str(options.target),
         "resolution": [width, height],

@@ -14,9 +14,10 @@ from pathlib import Path
 import engine_shaders
 import numpy as np
 import pytest
+from table_exports import run
 
 from ltsh_addon import shading
-from tables import __main__, header, layouts
+from tables import header, layouts
 
 ROOT = Path(__file__).resolve().parents[2]
 TABLE = shading.load_table("ltc")
@@ -186,14 +187,6 @@ def test_the_two_textures_of_the_default_are_those_of_three(files):
     for texture, read in zip(textures, read_three(files["three"]), strict=True):
         assert np.array_equal(texture, read)
         assert np.frombuffer(header.dds(texture[None]), "<f4", offset=148).tobytes() == read.tobytes()
-
-
-def run(capsys, *arguments):
-    try:
-        code = __main__.main(["export", *map(str, arguments)])
-    except SystemExit as end:
-        code = end.code
-    return code, *capsys.readouterr()
 
 
 @pytest.mark.parametrize("name", layouts.LAYOUTS)

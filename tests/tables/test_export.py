@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 import OpenEXR
 import pytest
+from table_exports import run
 
 from ltsh_addon import shading
 from ltsh_addon.imaging import read_channels
 from ltsh_addon.lobes import lookup_table
-from tables import __main__, export
+from tables import export
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCUMENT = ROOT / "tables" / "EXPORT.md"
@@ -25,15 +26,6 @@ def files_of(name: str, family: str = "") -> list[str]:
     """What is written of a table, in order."""
     textures = [f"{name}_{number}.dds" for number in (1, 2)] if "ltc" in (name, family) else []
     return [*(f"{name}.{ending}" for ending in ("exr", "h", "wgsl", "dds")), *textures]
-
-
-def run(capsys, *arguments):
-    """Exit code, stdout and stderr of `python -m tables export`."""
-    try:
-        code = __main__.main(["export", *map(str, arguments)])
-    except SystemExit as end:
-        code = end.code
-    return code, *capsys.readouterr()
 
 
 @pytest.fixture(scope="module")

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from scipy.interpolate import BSpline
+from table_exports import run
 
 from ltsh_addon import shading
 from tables import __main__, export, header, pack, validate
@@ -97,14 +98,6 @@ def test_the_closest_splines_keep_a_polynomial():
     at = np.random.default_rng(3).random((2, 40))
     found = np.einsum("pi,pj,ij->p", pack.matrix(at[0]), pack.matrix(at[1]), pack.closest(table)[..., 0])
     assert found == pytest.approx((1.0 + at[0] - 2.0 * at[0] ** 3) * (0.5 - at[1] ** 2 + at[1] ** 3), abs=1e-9)
-
-
-def run(capsys, *arguments):
-    try:
-        code = __main__.main(["export", *map(str, arguments)])
-    except SystemExit as end:
-        code = end.code
-    return code, *capsys.readouterr()
 
 
 def test_the_command_writes_the_pack_with_both_licenses(capsys, out):

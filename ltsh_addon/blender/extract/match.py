@@ -27,10 +27,9 @@ CLIPPED = (8.0 / 255.0, 252.0 / 255.0)
 
 
 def read_target(job: TargetJob, folder: Path, progress) -> dict:
-    """Do the `job`: write the target's light and its weights as TARGET. Returns the manifest."""
-    warnings: list[str] = []
+    """Do the `job`: write the target's light and its weights as TARGET. Returns an empty manifest."""
     progress("target", 0.0)
-    open_scene(Path(job.scene), warnings, job.scripts)
+    open_scene(Path(job.scene), [], job.scripts)  # the finished picture of the scene tells its warnings
     scene = bpy.context.scene
     render_settings.go_to_frame(scene, job.frame)
     target, encoded = _picture(Path(job.target), scene, job.target_view, folder)
@@ -48,7 +47,7 @@ def read_target(job: TargetJob, folder: Path, progress) -> dict:
             )
         weights *= np.clip(mask.mean(axis=-1), 0.0, 1.0)
     np.savez(folder / TARGET, target=np.where(weights[..., None] > 0.0, target, 0.0), weights=weights)
-    return {"warnings": []}
+    return {}
 
 
 def _picture(path: Path, scene, view: str | None, folder: Path) -> tuple[np.ndarray, np.ndarray | None]:
@@ -111,11 +110,9 @@ def _pixels(image) -> np.ndarray:
 
 def save_lights(job: LightsJob, folder: Path, progress) -> dict:
     """Do the `job`: change the lights of the scene and save a copy. Returns the manifest."""
-    warnings: list[str] = []
     progress("write", 0.0)
-    open_scene(Path(job.scene), warnings, job.scripts)
-    scene = bpy.context.scene
-    groups, lights = own_light_groups(scene, tuple(job.lights)), []
+    open_scene(Path(job.scene), [], job.scripts)
+    groups, lights = own_light_groups(bpy.context.scene, tuple(job.lights)), []
     for group, factor in job.factors.items():
         objects, most = groups[group], max(factor)
         data, before = objects[0].data, objects[0].data.energy

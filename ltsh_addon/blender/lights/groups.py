@@ -34,7 +34,10 @@ def reason_to_keep(ob) -> str:
     """Why the settings of a light object cannot be changed; "" if they can."""
     if ob.library is not None or ob.data.library is not None:
         return "it is linked from another file"
-    animation = ob.data.animation_data
-    if animation is not None and (animation.action or len(animation.drivers)):
-        return "its settings are animated or driven"
-    return ""
+    return "its settings are animated or driven" if is_animated(ob.data) else ""
+
+
+def is_animated(owner) -> bool:
+    """True if keyframes or drivers set properties of an object or its data."""
+    animation = owner.animation_data
+    return animation is not None and bool(animation.action or len(animation.drivers))

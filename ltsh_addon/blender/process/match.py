@@ -40,14 +40,12 @@ class LightsJob:
     scripts: bool = False
 
 
-def read_target(
-    job: TargetJob, folder: Path, progress: Progress | None = None
-) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """The target (H, W, 3), row 0 on top, in scene-referred radiance; the weights (H, W) of its pixels, 0 where it is
-    clipped or outside of the mask; and warnings. Raises as `pixels.extract_pixels` does."""
-    manifest = run_scene_job(job, folder, progress)
+def read_target(job: TargetJob, folder: Path, progress: Progress | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """The target (H, W, 3), row 0 on top, in scene-referred radiance; and the weights (H, W) of its pixels, 0 where it
+    is clipped or outside of the mask. Raises as `pixels.extract_pixels` does."""
+    run_scene_job(job, folder, progress)
     with np.load(folder / TARGET) as arrays:
-        return arrays["target"].astype(np.float64), arrays["weights"].astype(np.float64), manifest["warnings"]
+        return arrays["target"].astype(np.float64), arrays["weights"].astype(np.float64)
 
 
 def save_lights(job: LightsJob, progress: Progress | None = None) -> list[dict]:

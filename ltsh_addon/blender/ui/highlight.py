@@ -14,9 +14,10 @@ from ...scene import SurfaceSamples
 from ...shading.highlight import STENCIL, mirrored, place_for_highlight
 from ..evaluated import EmitterTraits
 from ..lights.area import area_light
+from ..lights.groups import is_animated
 from ..lights.linking import Receivers
 from ..materials.preview_material import COAT, METALS, PreviewMaterial, preview_of
-from .preview import PASSED_ON, active_light, region_under
+from .preview import PASSED_ON, OnActiveLight, active_light, region_under
 
 # SPACING: pixels between the rays around the cursor. FARTHER: the factor of the distance by a step of the wheel.
 SPACING, FARTHER = 2.0, 1.1
@@ -42,8 +43,7 @@ def reason_to_stay(ob) -> str:
         return "it is linked from another file"
     if active := [constraint.name for constraint in ob.constraints if constraint.enabled]:
         return f"its constraint {active[0]!r} moves it: switch it off or apply it"
-    animation = ob.animation_data
-    if animation is not None and (animation.action or len(animation.drivers)):
+    if is_animated(ob):
         return "it is animated or driven"
     if any(ob.lock_rotation) or (any(ob.lock_location) and ob.data.type != "SUN"):
         return "its location or rotation is locked: unlock it in the tab Item"
@@ -101,24 +101,22 @@ def place_of(ob, hits: list[SurfaceHit], distance: float) -> tuple[Matrix, str]:
     """The matrix of the light object `ob` for a highlight at the middle one of the nine `hits`, or at the only one by
     its mirrored view; and what there is to say about it."""
     hit = hits[len(hits) // 2]
-    lobe = glossy_lobe(hit.material)
-    view, normal = np.array(hit.view), np.array(hit.normal)
-    if lobe is None:
-        return light_matrix(ob, hit.position, Vector(mirrored(view, normal)), distance), "this surface has no highlight"
-    if len(hits) < len(STENCIL):
-        return light_matrix(ob, hit.position, Vector(mirrored(view, normal)), distance), ""
-    receivers = Receivers([])
+    lobe, receivers = glossy_lobe(hit.material), Receivers([])
 
-    def light_at(direction):
-        matrix = light_matrix(ob, hit.position, Vector(direction), distance)
-        return area_light(ob, np.array(matrix), EmitterTraits("", True, True), receivers)
+    def matrix_at(direction: np.ndarray) -> Matrix:
+        return light_matrix(ob, hit.position, Vector(direction), distance)
 
+    def light_at(direction: np.ndarray):
+        return area_light(ob, np.array(matrix_at(direction)), EmitterTraits("", True, True), receivers)
+
+    if lobe is None or len(hits) < len(STENCIL):
+        matrix = matrix_at(mirrored(np.array(hit.view), np.array(hit.normal)))
+        return matrix, "this surface has no highlight" if lobe is None else ""
     place = place_for_highlight(samples_of(hits, lobe), light_at)
-    matrix = light_matrix(ob, hit.position, Vector(place.direction), distance)
-    return matrix, "" if place.is_peak else NO_PEAK
+    return matrix_at(place.direction), "" if place.is_peak else NO_PEAK
 
 
-class LTSH_OT_drag_highlight(bpy.types.Operator):
+class LTSH_OT_drag_highlight(OnActiveLight, bpy.types.Operator):
     """Drag the highlight of the active light over surfaces in a 3D view: the light follows, keeps its distance and
     faces them"""
 
@@ -128,14 +126,12 @@ class LTSH_OT_drag_highlight(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
-        light = active_light(context)
-        if light is None or context.mode != "OBJECT":
-            cls.poll_message_set("No light is active")
+        if not super().poll(context):
             return False
+        light = active_light(context)
         if reason := reason_to_stay(light):
             cls.poll_message_set(f"{light.name}: {reason}")
-            return False
-        return True
+        return not reason
 
     def invoke(self, context, event):
         self._light = active_light(context)
@@ -195,12 +191,12 @@ class LTSH_OT_drag_highlight(bpy.types.Operator):
 
 def hits_around(context, region, pixel: tuple[float, float]) -> list[SurfaceHit]:
     """What the view of a region meets at a pixel and at those of STENCIL around it: nine, one, or none."""
-    hits = []
+    hits, depsgraph = [], context.evaluated_depsgraph_get()
     for right, up in STENCIL:
         where = pixel[0] + SPACING * right, pixel[1] + SPACING * up
         start = view3d_utils.region_2d_to_origin_3d(region, region.data, where)
         direction = view3d_utils.region_2d_to_vector_3d(region, region.data, where)
-        hits.append(surface_hit(context.scene, context.evaluated_depsgraph_get(), start, direction))
+        hits.append(surface_hit(context.scene, depsgraph, start, direction))
     middle = hits[len(hits) // 2]
     if middle is None:
         return []

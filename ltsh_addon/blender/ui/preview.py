@@ -237,7 +237,7 @@ def _surface_at(context, region, pixel) -> tuple[Vector, Vector, float] | None:
     return point, normal, min(distance, FREE_SHARE * (other - point).length) if is_hit else distance
 
 
-class _ActiveLight:
+class OnActiveLight:
     """An operator on the active light."""
 
     @classmethod
@@ -249,7 +249,7 @@ class _ActiveLight:
         return True
 
 
-class LTSH_OT_duplicate_light(_ActiveLight, bpy.types.Operator):
+class LTSH_OT_duplicate_light(OnActiveLight, bpy.types.Operator):
     """Duplicate the active light; in a 3D view the mouse moves the copy until a click"""
 
     bl_idname = "ltsh.duplicate_light"
@@ -269,7 +269,7 @@ class LTSH_OT_duplicate_light(_ActiveLight, bpy.types.Operator):
         return bpy.ops.object.duplicate()
 
 
-class LTSH_OT_delete_light(_ActiveLight, bpy.types.Operator):
+class LTSH_OT_delete_light(OnActiveLight, bpy.types.Operator):
     """Delete the active light"""
 
     bl_idname = "ltsh.delete_light"

@@ -11,6 +11,7 @@ from hands import ADDON, module, over, until
 # Pixels at the edge of a region, over which Blender draws the rounded corners of its areas.
 EDGE = 12
 SETTLE_SECONDS = 0.7
+COMING_SECONDS = 60.0  # the longest that a view compiles shaders, or draws what moves with fewer pixels
 # The key by its code: for the name xdotool also presses Alt.
 F12 = 96
 # Graphics cards round corners to 1/256 pixel: at an edge they may see the other surface at a pixel's center.
@@ -85,11 +86,20 @@ def inside(image):
     return image[EDGE:-EDGE, EDGE:-EDGE]
 
 
+def is_coming(region):
+    """True while the view of a region compiles shaders, or while what moves is shown with fewer pixels."""
+    texts = module("engine.overlay")._texts.get(region.as_pointer())
+    is_compiling = texts is not None and module("engine.view").COMPILING in texts.notes
+    return is_compiling or any(view._pixel_size.step > 1 for view in module("engine.redraws").open_views)
+
+
 def settled(rig, name, tries=40):
     """Wait until the view does not change any more; use as `pixels = yield from settled(...)`."""
-    before = None
+    before, end = None, time.monotonic() + COMING_SECONDS
     for _ in range(tries):
         yield SETTLE_SECONDS
+        while is_coming(rig.region()) and time.monotonic() < end:
+            yield SETTLE_SECONDS
         pixels = view_pixels(rig, name)
         if before is not None and np.array_equal(pixels, before):
             return pixels

@@ -1,7 +1,7 @@
 """What the window says is what is so, by mouse and keys: previews and materials after undo and redo, H beside the eye
 of a light, F12, a cancelled comparison, the mixer, a bake beside Cycles, results after saving, two views of a world.
 
-Set by their properties are only sizes, numbers of samples, the nodes of a material and a world, and the editors.
+Set by their properties are only sizes, numbers of samples, bounces, the nodes of a material and a world, the editors.
 """
 
 import shutil
@@ -18,7 +18,7 @@ WAIT = 900  # for a job or a picture, on a busy machine
 # From the right and upper end of the sidebar, see `hands`: the first light of the list, the header of Bake, and with it
 # open its button and settings; while a preview is on, the header of Materials and the first setting of Final Render.
 FIRST_LIGHT, BAKE_HEADER, BAKE, BAKE_SETTINGS = (215, 176), (219, 478), (149, 537), (219, 591)
-BESIDE_CYCLES, COMPLETE, MATERIALS = (161, 758), (258, 674), (219, 819)
+BESIDE_CYCLES, COMPLETE, MATERIALS = (161, 827), (258, 674), (219, 819)
 # The same of the Image Editor: results of shading, and the power of the first light of the mixer.
 SHADED, POWER = (227, 45), (108, 276)
 
@@ -71,7 +71,8 @@ def previewed(rig):
 
 
 def listed(rig):
-    """The list of materials has a sign for what the view says about one."""
+    """The list of materials has a sign for what the view says about one; with bounces both have nothing to say."""
+    eyes.view().bounces = False
     tree = bpy.data.materials["floor tiles"].node_tree
     shader = next(node for node in tree.nodes if node.bl_idname == "ShaderNodeBsdfPrincipled")
     noise = tree.nodes.new("ShaderNodeTexNoise")
@@ -87,6 +88,7 @@ def listed(rig):
     yield from hands.click_button(rig, MATERIALS)
     tree.nodes.remove(noise)
     yield from hands.comes(rig, lambda: not notes_of_views()[0], "and nothing when it is resolved again", 60)
+    eyes.view().bounces = True
 
 
 def notes_of_views():

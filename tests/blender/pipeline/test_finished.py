@@ -472,7 +472,7 @@ def test_the_files_of_a_budget_share_no_noise(tmp_path):
 def test_a_budget_renders_the_samples_that_cycles_would_render_at_once(tmp_path, monkeypatch):
     """On a clock by which a file takes a second and each sample one more."""
     scene = floor_and_ball(gray(), 1)
-    scene.render.engine, clock, files = "CYCLES", [0.0], []
+    scene.render.engine, clock = "CYCLES", [0.0]
     scene.cycles.use_adaptive_sampling, scene.cycles.use_denoising, scene.cycles.use_sample_subset = False, False, True
 
     def render_file(scene, folder, files, count):
@@ -483,15 +483,20 @@ def test_a_budget_renders_the_samples_that_cycles_would_render_at_once(tmp_path,
     monkeypatch.setattr(finished_module, "_render_file", render_file)
     monkeypatch.setattr(finished_module, "FILE_SECONDS", 1e6 / SIZE**2)
     monkeypatch.setattr(finished_module.time, "process_time", lambda: clock[0])
-    files, first = finished_module._render_until(lambda path: 28.5, scene, tmp_path, lambda *told: None)
-    counts = [count for _, count in files]
-    assert counts == [1, 3, 10, 10] and first == 2.0 and clock[0] == 28.0
-    halves = [imaging.read_layers(tmp_path / name)["ViewLayer.Combined"] for name, _ in files[2:]]
-    scene.cycles.use_sample_subset, scene.cycles.samples, scene.cycles.seed = False, 20, 2
+    rendered, first = finished_module._render_until(lambda path: 28.5, scene, tmp_path, lambda *told: None)
+    counts = [count for _, count in rendered]
+    assert counts == [1, 3, 2, 9, 8] and first == 2.0 and clock[0] == 28.0
+    halves = [imaging.read_layers(tmp_path / name)["ViewLayer.Combined"] for name, _ in rendered[3:]]
+    scene.cycles.use_sample_subset, scene.cycles.samples, scene.cycles.seed = False, 17, 3
     render_settings.render_exr(scene, tmp_path / "whole.exr")
     whole = imaging.read_layers(tmp_path / "whole.exr")["ViewLayer.Combined"]
     # Sums in another order.
-    assert np.abs(0.5 * sum(halves) - whole).max() < 1e-5 < 1e-2 < np.abs(halves[0] - whole).max()
+    assert (
+        np.abs(np.average(halves, axis=0, weights=counts[3:]) - whole).max()
+        < 1e-5
+        < 1e-2
+        < np.abs(halves[0] - whole).max()
+    )
     # However little time there is, there are two files.
     assert len(finished_module._render_until(lambda path: 0.0, scene, tmp_path, lambda *told: None)[0]) == 2
 

@@ -6,20 +6,18 @@ a neighbor in the picture says otherwise. The other pairs get more rays, the mor
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from ..cycles.horizons import lobe_density, lobe_selection_pmf
-from ..cycles.light_tree import light_selection_pmf, light_tree_rows
 from ..emitters.facing import FacingDisk
 from ..emitters.light_polygons import may_reach, off_plane
 from ..lobes.polygon import dot
-from ..scene import FARTHEST, PASSES, Film, FlatLight, Light, PointLight, PolygonLight, SurfaceSamples, round_outline
+from ..scene import FARTHEST, PASSES, Film, FlatLight, PointLight, PolygonLight, round_outline
 from .emitter import Emitter, Sky
 from .light_cluster import LightCluster
+from .light_selection import LightSelection
 from .occluders import GAP
 from .ray_sampler import PROBES, RayBatch, RaySampler, SampleRows
 
@@ -42,6 +40,8 @@ LEVELS = (16, 32, 64, 128, 256, 512)
 BRIGHTEST, BRIGHTEST_OF_SKY = 4, 2
 # A pair needs more rays only if some of them arrive, and some do not, that carry more than this share of its light.
 NEGLIGIBLE = np.float32(0.01)
+# Where less than the share WINDOW of a sky arrives in the mean, no pair is settled by its probes.
+WINDOW = 0.05
 # Rounds in which neighbors of mixed pairs get more rays. Neighbors that turn out mixed pass this on in the next round;
 # where little light comes through a window, probes meet it so rarely that it takes many.
 ROUNDS = 16
@@ -52,6 +52,8 @@ LIKE_NORMAL, LIKE_LOBE, LIKE_ALPHA = np.float32(0.1), np.float32(0.4), np.float3
 # Samples do not share rays where that would change their light by more than this share of the typical one, nor where
 # all their rays are blocked: of so many rays.
 MOST_BIAS, ENOUGH_RAYS = 0.01, 64
+# Samples that see nothing share nothing, unless that is as likely as this by what is seen around: few rays count.
+BY_CHANCE = 1e-7
 # Pairs of opposite pixels (y, x) around a pixel that share rays. The weights of the kernel (1, 2, 2, 2, 1) x (1, 2, 2,
 # 2, 1) count all places of a square of 4 x 4 pixels alike. TILE: how many pixels this is worth, as measured.
 AROUND = [(y, x) for y in range(-2, 3) for x in range(-2, 3) if (y, x) > (0, 0)]
@@ -283,7 +285,7 @@ class RatioEstimator:
 
     def _trace_alone(self, number, choice, worth):
         """Give up sharing where that changes the light: there, trace up to `number` (Q,) rays anew."""
-        alone = ~self.visible
+        alone = ~self._sees()
         for last in (np.minimum(number, ENOUGH_RAYS), number):
             alone &= self.is_shared & (self.count > PROBES)
             self.is_shared &= ~alone
@@ -300,6 +302,16 @@ class RatioEstimator:
                     off = np.abs(sum_wv / np.maximum(sum_w, _TINY) - ratio)
                     change = np.maximum(change, off - np.float32(3.0) * np.sqrt(ratio * (_ONE - ratio) / self.count))
                 alone |= change * worth[name] ** WORTH_POWER > MOST_BIAS
+
+    def _sees(self):
+        """Mask (Q,) of the `visible` pairs, now with those that as few rays would often show nothing of what others
+        around see."""
+        missed = ~self.visible
+        for name, sum_w, sum_wv in zip(PASSES, self.sum_w.sum(axis=1), self.sum_wv.sum(axis=1), strict=True):
+            passing, met = self._neighbors.shared(name, self.index, np.stack([sum_wv, sum_w * self.visible]))
+            missed &= (_ONE - passing / np.maximum(met, _TINY)) ** self.count > BY_CHANCE
+        self.visible |= missed
+        return self.visible
 
     def _trace_more(self, chosen, number, choice, order):
         """Trace rays of the `chosen` pairs up to the `number`, split by `choice`; each (Q,)."""
@@ -359,7 +371,10 @@ class RatioEstimator:
         sums, passing = self.sum_w.sum(axis=1), self.sum_wv.sum(axis=1)
         # Where little of a light arrives anywhere, as through a window, little is not negligible.
         arriving = passing.sum(axis=1, keepdims=True) / np.maximum(sums.sum(axis=1, keepdims=True), _TINY)
-        return [(passing > NEGLIGIBLE * arriving * sums).any(axis=0), (sums - passing > NEGLIGIBLE * sums).any(axis=0)]
+        lit = passing > NEGLIGIBLE * arriving * sums
+        if self.is_shared.any() and isinstance(self.emitter, Sky):
+            lit |= (arriving > 0.0) & (arriving < WINDOW)
+        return [lit.any(axis=0), (sums - passing > NEGLIGIBLE * sums).any(axis=0)]
 
     def _unmet(self):
         """Masks (Q,) by pass of the pairs with a lobe that no ray has met so far."""
@@ -531,64 +546,3 @@ class RatioEstimator:
 def _taken(rows, flat):
     """Values (3, R) or (R,) at the places `flat` of the flattened last two axes of `rows`, (3, S, Q) or (S, Q)."""
     return np.take(rows.reshape(*rows.shape[:-2], -1), flat, axis=-1)
-
-
-class LightSelection:
-    """How likely Cycles chooses directions from samples (P) by `lights` (L) and by the lobes of the surface.
-
-    Who chose a ray decides what it meets. Rays that the light chose start above a curved surface, and are not blocked
-    if the light casts no shadow. Rays that the surface chose start at the surface, and are always blocked.
-    """
-
-    def __init__(self, samples: SurfaceSamples, lights: Sequence[Light], is_baked: bool):
-        self._samples, self._lights, self._is_baked = samples, tuple(lights), is_baked
-        self._first = None
-
-    def _prepare(self):
-        """Compute the chances on first use; most scenes never need them."""
-        samples = self._samples
-        moved = np.any(samples.position[1:] != samples.position[:-1], axis=1)
-        # The samples of one hit are consecutive.
-        self._hit = np.concatenate([np.zeros(min(len(samples), 1), int), np.cumsum(moved)])
-        self._count = np.bincount(self._hit)
-        self._first = np.cumsum(self._count) - self._count
-        self._lobes = lobe_selection_pmf(samples, self._hit, is_baked=False)
-        self._light_selection_pmf = np.full((len(self._lights), len(samples)), np.nan, np.float32)
-        self._rows = light_tree_rows(self._lights)
-
-    def bsdf_share(self, name: str, number: int, index, directions, solid_angle) -> np.ndarray:
-        """Share (R,) of the light of light `number` that a pass gets because the surface chose the unit directions
-        (3, R), seen from the samples `index` (R,). The light has the `solid_angle` (R,) in sr."""
-        if self._first is None:
-            self._prepare()
-        by_light = self._pmf(number, index) / np.maximum(solid_angle, 1e-12)
-        bsdf_share = self._density(name, index, directions.T.astype(np.float64))
-        return (bsdf_share**2 / np.maximum(bsdf_share**2 + by_light**2, 1e-30)).astype(np.float32)
-
-    def _pmf(self, number, index):
-        unknown = np.unique(index[np.isnan(self._light_selection_pmf[number, index])])
-        if len(unknown):
-            position, normal = self._samples.position[unknown], self._samples.smooth_normal[unknown]
-            self._light_selection_pmf[:, unknown] = light_selection_pmf(position, normal, self._lights, self._rows)
-        return self._light_selection_pmf[number, index]
-
-    def _density(self, name, index, directions):
-        """Probability density (R,) per sr with which the lobes of a hit choose the directions (R, 3)."""
-        hit, density = self._hit[index], np.zeros(len(index))
-        for number in range(self._count[hit].max(initial=0)):
-            here = np.flatnonzero(self._count[hit] > number)
-            sample = self._first[hit[here]] + number
-            specular, diffuse = self._lobes[:, sample]
-            # A bake of one pass chooses by the lobes of that pass alone.
-            if self._is_baked:
-                sums = np.bincount(self._hit, weights=self._lobes[int(name == "diffuse")])
-                whole = np.maximum(sums[hit[here]], 1e-12)
-                specular, diffuse = (
-                    specular / whole if name == "specular" else 0.0 * specular,
-                    diffuse / whole if name == "diffuse" else 0.0 * diffuse,
-                )
-            chosen = lobe_density(self._samples.take(sample), directions[here, None])[:, 0]
-            density[here] += specular * chosen
-            cosine = np.einsum("rk,rk->r", directions[here], self._samples.diffuse_normal[sample])
-            density[here] += diffuse * np.maximum(cosine, 0.0) / np.pi
-        return density

@@ -22,8 +22,9 @@ import numpy as np
 from ..scene import PASSES, Cancelled, Film, Light, Progress, SurfaceSamples
 from ..workers.pool import WorkerPool
 from .emitter import Emitter
-from .estimator import MOST_RAYS, LightSelection, PixelNeighbors, RatioEstimator
+from .estimator import MOST_RAYS, PixelNeighbors, RatioEstimator
 from .light_cluster import LightCluster, emitters_of
+from .light_selection import LightSelection
 from .ray_sampler import PROBES, JoinedLobes, SampleRows
 from .shadow_terminator import RayOrigins
 

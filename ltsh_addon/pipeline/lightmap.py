@@ -15,10 +15,9 @@ from ..imaging.seams import FRAMES, Islands, canvas_of
 from ..scene import PASSES, Light
 from ..workers.pool import cores
 from .bake_files import nearest_covered
+from .forecast import REST_TEXELS, rest_passes
 from .options import BakeOptions
 
-# REST_TEXELS: the most that Cycles bakes at a time for the bounced light, since it reads the whole scene each time.
-REST_TEXELS = 1 << 22
 # DULL: a diffuse color below which Cycles' diffuse light, divided by it, says nothing.
 DULL = 1e-3
 
@@ -59,12 +58,6 @@ def rest_rows(size: tuple[int, int]) -> int:
     """Rows of texels whose bounced light is baked at a time."""
     width, height = size
     return max(1, min(height, REST_TEXELS // width))
-
-
-def rest_passes(passes: set[str]) -> tuple[str, ...]:
-    """The passes of Cycles' indirect light from which that of the wanted `passes` follows."""
-    kinds = {"specular": {"specular", "combined"}, "diffuse": {"diffuse", "diffuse_light", "combined"}}
-    return tuple(kind for kind, wanted in kinds.items() if wanted & set(passes))
 
 
 def read_rest(folder: Path, key: tuple[str, int], tile: int, size: tuple[int, int]) -> np.ndarray:

@@ -248,11 +248,6 @@ class _Bake:
         if settings.bake_bounces:
             column.prop(settings, "bake_rest_samples")
         column.prop(settings, "bake_per_light")
-        if settings.bake_per_light and settings.bake_bounces:
-            count = len([ob for ob in context.scene.objects if ob.type == "LIGHT" and not ob.hide_render])
-            rows = count + (context.scene.world is not None)
-            text = translated("{} lights: bounces take {:g} times as long").format(rows, max(0.5 * rows, 1.0))
-            draw_text(gray(column), context, text, "INFO")
         column.prop(settings, "bake_error")
 
 

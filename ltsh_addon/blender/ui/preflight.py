@@ -18,9 +18,12 @@ import bpy
 import numpy as np
 from bpy.props import StringProperty
 
+from ...pipeline.forecast import announced
+from ...pipeline.options import BakeOptions
 from ...scene import ATLAS, SceneError, error_line, listed
 from ..extract.apply import shows_texture
 from ..extract.atlas import make_atlas
+from ..extract.bake import rows_of_lights
 from ..extract.bake_meshes import ObjectError, check_object
 from ..lights.area import LightInventory, node_light, reason_to_leave_out
 from ..lights.area import note_unsupported as note_unsupported_light
@@ -82,10 +85,19 @@ def problems(context, command: str) -> list[Problem]:
     result += _camera(scene) if needs_camera else []
     result += _lights(scene)
     if command == "bake":
-        result += bake_objects(context)[1]
+        result += bake_objects(context)[1] + [Problem(line, False) for line in _announced(scene)]
     elif min(picture_of(scene)) < 4:
         result.append(Problem("The picture is smaller than 4 pixels: raise the resolution"))
     return result + _files(settings)
+
+
+def _announced(scene) -> list[str]:
+    """What the bake will take, as the command line tells it."""
+    settings, side = scene.ltsh, int(scene.ltsh.bake_size)
+    bounces, per_light = "on" if settings.bake_bounces else "off", settings.bake_per_light
+    options = {"size": (side, side), "passes": tuple(settings.bake_passes), "bounces": bounces, "per_light": per_light}
+    rows = rows_of_lights(scene) if per_light and settings.bake_bounces else 0
+    return announced(BakeOptions(Path(), Path(), **options), rows)
 
 
 def blocking(context, command: str) -> str:

@@ -78,6 +78,16 @@ def test_what_can_be_mended_is_mended_by_one_click(scene, spoil, commands, text)
     assert bpy.context.selected_objects == selected and bpy.context.mode == "OBJECT"
 
 
+def test_what_a_large_bake_takes_is_told_before_it_starts(scene):
+    settings = scene.ltsh
+    settings.bake_size, settings.bake_bounces, settings.bake_per_light = "4096", True, True
+    memory, lights = problems("bake")
+    assert not memory.blocks and "GiB of memory" in memory.text
+    assert not lights.blocks and lights.text.startswith("1 light: bounces take 1 times as long")
+    settings.bake_size, settings.bake_per_light = "1024", False
+    assert problems("bake") == []
+
+
 def test_unwrapping_gives_every_face_a_place_in_the_square(scene):
     remove_uv_map()
     sphere = parts.add_sphere(name="Ball", segments=8)

@@ -27,7 +27,6 @@ from ..scene import PASSES, REFERENCE, Cancelled, Film, Progress, SurfaceSamples
 from ..visibility import Occluders, ShadowSampling
 from ..workers.pool import cores
 from . import bake_files, lighting, lightmap
-from .forecast import rest_passes
 from .lighting import check_named, prepare
 from .mixer import rows_of_groups
 from .options import BAKE_PASSES, BakeOptions, child_job, passes, size
@@ -125,7 +124,7 @@ def _job(options, tile=None, following=()):
         passes=tuple(name for name in PASSES if name in shaded_passes(options)),
         tile=tile,
         following=following,
-        rest_passes=rest_passes(options.passes),
+        rest_passes=lightmap.rest_passes(options.passes),
         rest_rows=lightmap.rest_rows(options.size),
     )
 
@@ -389,7 +388,7 @@ class TilePoints:
         self.rest, self._baked, size = {}, None, options.size
         if options.bounces == "on":
             rows = range(len(baker.groups) if options.per_light else 1)
-            keys = [*itertools.product(rest_passes(options.passes), rows)]
+            keys = [*itertools.product(lightmap.rest_passes(options.passes), rows)]
             keys += [(lightmap.SOFT, 0)] if baker.soft_lights else []
             self.rest = {key: lightmap.read_rest(baker.folder, key, tile, size) for key in keys}
             self._baked = next(iter(self.rest.values()))[..., 0] != np.float32(NOT_BAKED)

@@ -18,7 +18,7 @@ import numpy as np
 from ..imaging import write_json
 from ..reading import Malformed, check, file_name, read_json, some
 from ..scene import ATLAS, VERSION, Cancelled, Progress, shortened
-from . import forecast
+from . import lightmap
 from .options import what_matters
 
 FOLDER = ".ltsh"
@@ -184,9 +184,9 @@ def tasks_of(job: BatchJob, progress=None) -> list[BatchTask]:
 
 def _announce(options, lights: int, progress) -> None:
     """Tell what a bake will take before it starts. Raises SceneError where it certainly cannot work."""
-    forecast.check_memory(options, lights)
+    lightmap.check_memory(options, lights)
     remark = getattr(progress, "remark", None)
-    for line in forecast.announced(options, lights) if remark is not None else ():
+    for line in lightmap.announced(options, lights) if remark is not None else ():
         remark(line)
 
 

@@ -18,7 +18,7 @@ import bpy
 import numpy as np
 from bpy.props import StringProperty
 
-from ...pipeline.forecast import announced
+from ...pipeline.lightmap import announced
 from ...pipeline.options import BakeOptions
 from ...scene import ATLAS, SceneError, error_line, listed
 from ..extract.apply import shows_texture

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from ltsh_addon.pipeline import BakeOptions, forecast, tasks
+from ltsh_addon.pipeline import BakeOptions, lightmap, tasks
 from ltsh_addon.scene import SceneError
 
 # Peaks of both processes in MiB, as the kernel counts them (ru_maxrss), two cores, a plane and three boxes under a sky:
@@ -23,20 +23,20 @@ def bake(side, **options):
 
 @pytest.mark.parametrize(("side", "options", "lights", "peak"), MEASURED)
 def test_memory_is_right_within_a_factor_of_one_and_a_half(monkeypatch, side, options, lights, peak):
-    monkeypatch.setattr(forecast, "cores", lambda: 2)
-    assert peak / 1.5 < forecast.memory_needed(bake(side, **options), lights) / 2**20 < 1.5 * peak
+    monkeypatch.setattr(lightmap, "cores", lambda: 2)
+    assert peak / 1.5 < lightmap.memory_needed(bake(side, **options), lights) / 2**20 < 1.5 * peak
 
 
 def test_large_bakes_and_lights_by_themselves_are_told(monkeypatch):
-    monkeypatch.setattr(forecast, "machine_memory", lambda: 16.0 * 2**30)
-    monkeypatch.setattr(forecast, "cores", lambda: 2)
-    assert forecast.announced(bake(1024, bounces="on"), 3) == []
-    (memory,) = forecast.announced(bake(4096), 3)
+    monkeypatch.setattr(lightmap, "machine_memory", lambda: 16.0 * 2**30)
+    monkeypatch.setattr(lightmap, "cores", lambda: 2)
+    assert lightmap.announced(bake(1024, bounces="on"), 3) == []
+    (memory,) = lightmap.announced(bake(4096), 3)
     assert memory == "The bake takes about 0.8 GiB of memory"
-    memory, lights = forecast.announced(bake(4096, bounces="on", per_light=True), 6)
+    memory, lights = lightmap.announced(bake(4096, bounces="on", per_light=True), 6)
     assert lights == "6 lights: bounces take 3 times as long as those of all at once"
     assert "GiB of memory, and this machine has 16.0: fewer texels take less" in memory
-    assert forecast.announced(bake(64, bounces="on", per_light=True), 1)[-1].startswith("1 light: bounces take 1 times")
+    assert lightmap.announced(bake(64, bounces="on", per_light=True), 1)[-1].startswith("1 light: bounces take 1 times")
 
 
 def test_only_a_bake_that_cannot_work_is_refused(monkeypatch):
@@ -46,12 +46,12 @@ def test_only_a_bake_that_cannot_work_is_refused(monkeypatch):
         remark = remarks.append
 
     options = bake(8192, bounces="on")
-    needed = forecast.memory_needed(options, 1)
-    monkeypatch.setattr(forecast, "machine_memory", lambda: needed / 1.4)
+    needed = lightmap.memory_needed(options, 1)
+    monkeypatch.setattr(lightmap, "machine_memory", lambda: needed / 1.4)
     tasks._announce(options, 1, Told)
     assert len(remarks) == 1
-    monkeypatch.setattr(forecast, "machine_memory", lambda: needed / 1.6)
+    monkeypatch.setattr(lightmap, "machine_memory", lambda: needed / 1.6)
     with pytest.raises(SceneError, match="8192 x 8192 texels takes about .* GiB of memory, .*: lower --size$"):
         tasks._announce(options, 1, None)
-    monkeypatch.setattr(forecast, "machine_memory", lambda: None)
+    monkeypatch.setattr(lightmap, "machine_memory", lambda: None)
     tasks._announce(options, 1, None)

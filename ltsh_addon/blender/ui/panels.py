@@ -220,6 +220,9 @@ class _Bake:
     def draw(self, context):
         layout = self.layout
         ready = draw_problems(layout, context, "bake")
+        if sum(ob.type == "MESH" for ob in context.selected_objects) > 1:
+            scene = context.scene
+            layout.template_list("LTSH_UL_baked", "", scene, "objects", scene.ltsh, "bake_active", rows=3)
         count = len(preflight.bake_objects(context)[0])
         if count:
             text = translated("1 object") if count == 1 else translated("{} objects").format(count)

@@ -113,10 +113,13 @@ def picture_of(scene) -> tuple[int, int]:
 
 
 def bake_objects(context) -> tuple[list, list[Problem]]:
-    """The selected objects that can be baked, and the problems of the others."""
-    selected = [ob for ob in context.selected_objects if ob.type == "MESH"]
-    if not selected:
+    """The selected objects that are checked and can be baked, and the problems of the others."""
+    meshes = [ob for ob in context.selected_objects if ob.type == "MESH"]
+    selected = [ob for ob in meshes if ob.ltsh_baked]
+    if not meshes:
         return [], [Problem("No mesh is selected: select the objects to bake")]
+    if not selected:
+        return [], [Problem("No selected object is checked: check those to bake")]
     baked = [ob for ob in selected if shows_texture(ob) and not ob.hide_render]
     usable, problems = [], [_textures_shown(baked)] if baked else []
     for ob in selected:
@@ -227,6 +230,22 @@ def _not_writable(folder: str) -> str:
     if existing is None or not existing.is_dir() or not os.access(existing, os.W_OK):
         return f"Output folder {folder!r} cannot be written: choose another"
     return ""
+
+
+class LTSH_UL_baked(bpy.types.UIList):
+    """The selected objects, with a check mark at those to bake"""
+
+    def filter_items(self, context, data, name):
+        """Selected meshes alone, those whose names have what is searched for."""
+        wanted, selected = self.filter_name.lower(), set(context.selected_objects)
+        shown = [ob.type == "MESH" and ob in selected and wanted in ob.name.lower() for ob in getattr(data, name)]
+        return [self.bitflag_filter_item * is_shown for is_shown in shown], []
+
+    def draw_item(self, context, layout, data, item, icon, active_data, active_property, index=0, flag=0):
+        """The check mark and the name of an object."""
+        row = layout.row(align=True)
+        row.prop(item, "ltsh_baked", text="")
+        row.label(text=item.name, icon="MESH_DATA", translate=False)
 
 
 class LTSH_OT_add_camera(bpy.types.Operator):

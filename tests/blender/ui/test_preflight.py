@@ -165,6 +165,25 @@ def test_one_object_that_cannot_be_baked_does_not_stop_the_others(scene):
     assert [(problem.text, problem.blocks) for problem in found] == [("Object 'Bare' has no UV map", False)]
 
 
+def test_only_checked_objects_of_the_selection_are_baked(scene):
+    ball = parts.add_sphere(name="Ball", segments=8)
+    for ob in (ball, bpy.data.objects["Floor"]):
+        ob.select_set(True)
+
+    def asked():
+        return sorted(job.bake_options(bpy.context, Path("x.blend")).objects)
+
+    assert asked() == ["Ball", "Floor"]
+    ball.ltsh_baked = False
+    assert asked() == ["Floor"] and problems("bake") == []
+    bpy.data.objects["Floor"].ltsh_baked = False
+    (problem,) = problems("bake")
+    assert problem.blocks and problem.text == "No selected object is checked: check those to bake"
+    ball.ltsh_baked = True
+    ball.select_set(False)
+    assert preflight.blocking(bpy.context, "bake") == problem.text
+
+
 def test_asking_changes_nothing(scene):
     """Panels ask with every redraw."""
     bpy.ops.wm.save_mainfile()

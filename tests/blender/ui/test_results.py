@@ -268,7 +268,7 @@ def test_a_preset_of_the_artist_brings_the_settings_back(scene, tmp_path, monkey
 def test_every_setting_of_a_job_is_part_of_presets(scene):
     about_view = {"mode", "groups", "group", "first", "second", "pass_name", "split", "error_scale"}
     about_view |= {"mixed", "mixed_active", "active_light", "mode_before_mix", "match_target", "match_colors"}
-    of_the_file = {"output_folder", "result_folder", "last_results", "bake_uv_map"}
+    of_the_file = {"output_folder", "result_folder", "last_results", "bake_uv_map", "bake_active"}
     settings = set(scene.ltsh.__class__.__annotations__)
     assert settings - about_view - of_the_file == set(settings_module.KEPT)
 

@@ -13,6 +13,7 @@ MEASURED = [
     (1024, {"shadows": "off"}, 1, 493 + 303),
     (1024, {"shadows": "off", "per_light": True}, 4, 549 + 303),
     (1024, {"bounces": "on"}, 1, 1108 + 526),
+    (1024, {"bounces": "on", "per_light": True}, 4, 1326 + 525),
     (2048, {"bounces": "on"}, 1, 3989 + 1142),
 ]
 

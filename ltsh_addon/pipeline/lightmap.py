@@ -24,9 +24,10 @@ REST_TEXELS = 1 << 22
 # each texel with bounces CANVAS_BYTES, PICTURE_BYTES for each picture of bounced light, CYCLES_BYTES for Cycles.
 PROGRAM_BYTES, BLOCK_BYTES, LAYER_BYTES = 460e6, 200e6, 22e6
 CANVAS_BYTES, PICTURE_BYTES, CYCLES_BYTES = 850, 37, 215
-# Memory is told from so many texels, or bytes, on. A bake that needs MOST_OF_MACHINE times what there is cannot work:
-# the estimate is right within this factor.
-TOLD_TEXELS, TOLD_BYTES, MOST_OF_MACHINE = 1 << 24, 4 * 2**30, 1.5
+# Canvases are as large as what the islands cover; LEAST_BYTES of a texel are there in any case: its face and guides.
+LEAST_BYTES = 32
+# Memory is told from so many texels, or bytes, on.
+TOLD_TEXELS, TOLD_BYTES = 1 << 24, 4 * 2**30
 # DULL: a diffuse color below which Cycles' diffuse light, divided by it, says nothing.
 DULL = 1e-3
 
@@ -75,14 +76,17 @@ def rest_passes(passes: set[str]) -> tuple[str, ...]:
     return tuple(kind for kind, wanted in kinds.items() if wanted & set(passes))
 
 
-def memory_needed(options: BakeOptions, lights: int) -> float:
-    """About the most bytes of memory that a bake takes, with so many rows of lights. Objects take it one by one."""
+def memory_needed(options: BakeOptions, lights: int, canvas: float = CANVAS_BYTES) -> float:
+    """About the most bytes of memory that a bake takes, with so many rows of lights. Objects take it one by one.
+
+    `canvas` are the bytes of a texel for canvases, by default of a texture that islands fill.
+    """
     texels, layers = math.prod(options.size), lights if options.per_light else 1
     shading, bounces, cycles = cores() * BLOCK_BYTES + layers * LAYER_BYTES, 0.0, 0.0
     if options.bounces == "on":
         kinds = rest_passes(options.passes)
         pictures = len(kinds) * layers + ("diffuse" in kinds)
-        bounces = texels * (CANVAS_BYTES + pictures * PICTURE_BYTES)
+        bounces = texels * (canvas + pictures * PICTURE_BYTES)
         cycles = min(texels, REST_TEXELS) * CYCLES_BYTES
     return PROGRAM_BYTES + max(shading, bounces) + cycles
 
@@ -104,12 +108,12 @@ def announced(options: BakeOptions, lights: int) -> list[str]:
 
 def check_memory(options: BakeOptions, lights: int) -> None:
     """Raises SceneError where the machine certainly has too little memory for a bake."""
-    needed, there = memory_needed(options, lights), machine_memory()
-    if there is not None and needed > MOST_OF_MACHINE * there:
+    needed, there = memory_needed(options, lights, LEAST_BYTES), machine_memory()
+    if there is not None and needed > there:
         less = "lower --size" + (", or leave out --per-light" if options.per_light else "")
         raise SceneError(
-            f"a bake of {options.size[0]} x {options.size[1]} texels takes about {needed / 2**30:.1f} GiB of memory, "
-            f"this machine has {there / 2**30:.1f}, swap included: {less}"
+            f"a bake of {options.size[0]} x {options.size[1]} texels takes at least {needed / 2**30:.1f} GiB, "
+            f"and this machine has {there / 2**30:.1f} GiB, swap included: {less}"
         )
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from ..imaging import write_json
 from ..reading import Malformed, check, file_name, read_json, some
 from ..scene import ATLAS, VERSION, Cancelled, Progress, shortened
+from . import lightmap
 from .options import what_matters
 
 FOLDER = ".ltsh"
@@ -166,6 +167,8 @@ def tasks_of(job: BatchJob, progress=None) -> list[BatchTask]:
     camera_stems = file_stems(job.cameras) or [None]
     for scene, stem in zip(job.scenes, file_stems(Path(scene).stem for scene in job.scenes), strict=True):
         facts = _facts(job, scene, progress)
+        if job.command == "bake":
+            _announce(job.options, max((of_frame["lights"] for of_frame in facts), default=0), progress)
         contents = contents_digest(replace(job.options, scene=Path(scene)))
         for camera, camera_stem in zip(job.cameras or (None,), camera_stems, strict=True):
             for frame, of_frame in zip(job.frames or (None,), facts, strict=True):
@@ -177,6 +180,14 @@ def tasks_of(job: BatchJob, progress=None) -> list[BatchTask]:
                 tasks += _tasks(job, (scene, camera, frame), fields, of_frame, contents)
     _check_names(job, tasks)
     return tasks
+
+
+def _announce(options, lights: int, progress) -> None:
+    """Tell what a bake will take before it starts. Raises SceneError where it certainly cannot work."""
+    lightmap.check_memory(options, lights)
+    remark = getattr(progress, "remark", None)
+    for line in lightmap.announced(options, lights) if remark is not None else ():
+        remark(line)
 
 
 def shard_of(tasks: list[BatchTask], shard: tuple[int, int]) -> list[BatchTask]:

@@ -93,8 +93,8 @@ class SceneError(Exception):
     """The task cannot be done with this scene, file or Blender; the message is one line."""
 
 
-# progress(stage, fraction of the stage that is done); returning False stops the work. Some have a method `expect`, that
-# takes the seconds of stages to come, by stage.
+# progress(stage, fraction of the stage that is done); returning False stops the work. Some have methods: `expect`
+# takes the seconds of stages to come, by stage, `remark` a line for the user.
 Progress = Callable[[str, float], "bool | None"]
 
 

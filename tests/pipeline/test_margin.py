@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ltsh_addon.pipeline.bake_files import nearest_covered
+from ltsh_addon.imaging.seams import nearest_covered
 
 
 @pytest.mark.parametrize("share", [0.0, 0.002, 0.02, 0.4, 1.0])

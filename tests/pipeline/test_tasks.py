@@ -81,7 +81,7 @@ def test_tasks_that_would_write_the_same_file_are_misuse(capsys, child, room, tm
 def test_names_of_the_file_are_asked_for_where_the_pattern_needs_them(monkeypatch, capsys, child, room, tmp_path):
     from ltsh_addon.blender.process import bake
 
-    found = {"frame": 12, "camera": "Main/1", "objects": [], "tiles": {}}
+    found = {"frame": 12, "camera": "Main/1", "objects": [], "tiles": {}, "lights": 1}
     monkeypatch.setattr(bake, "scene_facts", lambda *arguments, **options: [found])
     name = "{camera}_{frame:03d}"
     assert run(capsys, "shade", room, "-o", tmp_path / "out", "--name", name, *SMALL)[0] == 0

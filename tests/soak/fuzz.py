@@ -487,7 +487,7 @@ def stand_in() -> None:
 
     blender_process.run_job = bake.run_job = cannot
     bake.scene_facts = lambda scene, frames, objects, uv=None, **options: [
-        {"frame": 1, "camera": "Camera", "objects": ["Floor"], "tiles": {}} for _ in frames
+        {"frame": 1, "camera": "Camera", "objects": ["Floor"], "tiles": {}, "lights": 1} for _ in frames
     ]
 
 

@@ -20,7 +20,8 @@ from ...scene import ATLAS, error_line, light_records
 from .. import render_settings
 from ..evaluated import rendered_surfaces, with_render_depsgraph
 from ..lights.area import collect_lights
-from ..lights.world import take_world
+from ..lights.emission import emission_of
+from ..lights.world import may_shine, take_world
 from ..materials import aovs
 from ..materials.graph import cut, ensure_nodes
 from ..materials.maps import UV_MAP, MaterialPlan, SavedImages
@@ -313,6 +314,15 @@ def lights_by_row(scene, world, lights: list) -> list:
     return [replace(one, group=(one.group or one.name) if one.name in alone else GLOW) for one in lights]
 
 
+def rows_of_lights(scene) -> int:
+    """About how many rows `lights_by_row` makes, told by the file alone."""
+    rows = {ob.lightgroup or ob.name for ob in scene.objects if ob.type == "LIGHT" and not ob.hide_render}
+    if scene.world is not None and may_shine(scene.world):
+        rows.add(scene.world.lightgroup or scene.world.name)
+    materials = {slot.material for ob in scene.objects if not ob.hide_render for slot in ob.material_slots} - {None}
+    return len(rows) + any(emission_of(material).emits for material in materials)
+
+
 @contextmanager
 def lit_by(opened: BakeScene, names: set[str] | None = None):
     """Within this context only the lights `names` shine, and bounce as the file has it; None: all do."""
@@ -537,5 +547,6 @@ def scene_facts(job: BakeFactsJob, folder: Path, progress) -> dict:
             if ob.name not in tiles:
                 tiles[ob.name] = bake_meshes.tiles_without_modifiers(ob, job.uv)
         record = {"frame": scene.frame_current, "camera": name, "objects": [ob.name for ob in chosen]}
+        record["lights"] = rows_of_lights(scene)
         facts.append({**record, "tiles": {ob.name: tiles[ob.name] for ob in chosen if len(tiles[ob.name]) > 1}})
     return {"facts": facts}

@@ -220,6 +220,9 @@ class _Bake:
     def draw(self, context):
         layout = self.layout
         ready = draw_problems(layout, context, "bake")
+        if sum(ob.type == "MESH" for ob in context.selected_objects) > 1:
+            scene = context.scene
+            layout.template_list("LTSH_UL_baked", "", scene, "objects", scene.ltsh, "bake_active", rows=3)
         count = len(preflight.bake_objects(context)[0])
         if count:
             text = translated("1 object") if count == 1 else translated("{} objects").format(count)
@@ -248,11 +251,6 @@ class _Bake:
         if settings.bake_bounces:
             column.prop(settings, "bake_rest_samples")
         column.prop(settings, "bake_per_light")
-        if settings.bake_per_light and settings.bake_bounces:
-            count = len([ob for ob in context.scene.objects if ob.type == "LIGHT" and not ob.hide_render])
-            rows = count + (context.scene.world is not None)
-            text = translated("{} lights: bounces take {:g} times as long").format(rows, max(0.5 * rows, 1.0))
-            draw_text(gray(column), context, text, "INFO")
         column.prop(settings, "bake_error")
 
 

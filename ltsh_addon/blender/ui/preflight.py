@@ -18,9 +18,12 @@ import bpy
 import numpy as np
 from bpy.props import StringProperty
 
+from ...pipeline.lightmap import announced
+from ...pipeline.options import BakeOptions
 from ...scene import ATLAS, SceneError, error_line, listed
 from ..extract.apply import shows_texture
 from ..extract.atlas import make_atlas
+from ..extract.bake import rows_of_lights
 from ..extract.bake_meshes import ObjectError, check_object
 from ..lights.area import LightInventory, node_light, reason_to_leave_out
 from ..lights.area import note_unsupported as note_unsupported_light
@@ -82,10 +85,19 @@ def problems(context, command: str) -> list[Problem]:
     result += _camera(scene) if needs_camera else []
     result += _lights(scene)
     if command == "bake":
-        result += bake_objects(context)[1]
+        result += bake_objects(context)[1] + [Problem(line, False) for line in _announced(scene)]
     elif min(picture_of(scene)) < 4:
         result.append(Problem("The picture is smaller than 4 pixels: raise the resolution"))
     return result + _files(settings)
+
+
+def _announced(scene) -> list[str]:
+    """What the bake will take, as the command line tells it."""
+    settings, side = scene.ltsh, int(scene.ltsh.bake_size)
+    bounces, per_light = "on" if settings.bake_bounces else "off", settings.bake_per_light
+    options = {"size": (side, side), "passes": tuple(settings.bake_passes), "bounces": bounces, "per_light": per_light}
+    rows = rows_of_lights(scene) if per_light and settings.bake_bounces else 0
+    return announced(BakeOptions(Path(), Path(), **options), rows)
 
 
 def blocking(context, command: str) -> str:
@@ -101,10 +113,13 @@ def picture_of(scene) -> tuple[int, int]:
 
 
 def bake_objects(context) -> tuple[list, list[Problem]]:
-    """The selected objects that can be baked, and the problems of the others."""
-    selected = [ob for ob in context.selected_objects if ob.type == "MESH"]
-    if not selected:
+    """The selected objects that are checked and can be baked, and the problems of the others."""
+    meshes = [ob for ob in context.selected_objects if ob.type == "MESH"]
+    selected = [ob for ob in meshes if ob.ltsh_baked]
+    if not meshes:
         return [], [Problem("No mesh is selected: select the objects to bake")]
+    if not selected:
+        return [], [Problem("No selected object is checked: check those to bake")]
     baked = [ob for ob in selected if shows_texture(ob) and not ob.hide_render]
     usable, problems = [], [_textures_shown(baked)] if baked else []
     for ob in selected:
@@ -215,6 +230,22 @@ def _not_writable(folder: str) -> str:
     if existing is None or not existing.is_dir() or not os.access(existing, os.W_OK):
         return f"Output folder {folder!r} cannot be written: choose another"
     return ""
+
+
+class LTSH_UL_baked(bpy.types.UIList):
+    """The selected objects, with a check mark at those to bake"""
+
+    def filter_items(self, context, data, name):
+        """Selected meshes alone, those whose names have what is searched for."""
+        wanted, selected = self.filter_name.lower(), set(context.selected_objects)
+        shown = [ob.type == "MESH" and ob in selected and wanted in ob.name.lower() for ob in getattr(data, name)]
+        return [self.bitflag_filter_item * is_shown for is_shown in shown], []
+
+    def draw_item(self, context, layout, data, item, icon, active_data, active_property, index=0, flag=0):
+        """The check mark and the name of an object."""
+        row = layout.row(align=True)
+        row.prop(item, "ltsh_baked", text="")
+        row.label(text=item.name, icon="MESH_DATA", translate=False)
 
 
 class LTSH_OT_add_camera(bpy.types.Operator):

@@ -323,6 +323,7 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
         name="Bake Passes", description="Parts of the reflected light. Shift-click to choose several",
         items=BAKE_PASS_ITEMS, options={"ENUM_FLAG"}, default={"specular", "diffuse"},
     )  # fmt: skip
+    bake_active: IntProperty(options={"HIDDEN"})  # the row that is marked in the list of objects
     bake_bounces: BoolProperty(
         name="Bounces", description="Add bounced light by Cycles, denoised, and fit light at the seams of UV maps",
     )  # fmt: skip
@@ -423,6 +424,9 @@ def register() -> None:
     apply(bpy.context)
     bpy.types.Scene.ltsh = PointerProperty(type=LTSH_PG_scene, name="LTSH")
     bpy.types.Object.ltsh_light = PointerProperty(type=LTSH_PG_light, name="LTSH Light")
+    bpy.types.Object.ltsh_baked = BoolProperty(
+        name="Bake", description="Bake this object where it is selected", default=True
+    )
     bpy.utils.register_preset_path(PRESETS_PARENT)
 
 
@@ -433,6 +437,7 @@ def unregister() -> None:
             _release(ob)
             ob.ltsh_light.property_unset("solo")
     bpy.utils.unregister_preset_path(PRESETS_PARENT)
+    del bpy.types.Object.ltsh_baked
     del bpy.types.Object.ltsh_light
     del bpy.types.Scene.ltsh
     logger = logging.getLogger(LOGGER)

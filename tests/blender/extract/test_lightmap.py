@@ -8,6 +8,8 @@ import pytest
 from bake_scenes import SIZE, baked, save, start
 from scene_parts import add_bump, add_mesh, add_plane, add_sphere, add_world, principled
 
+from ltsh_addon.blender.extract.bake import rows_of_lights
+
 TRUTH = 256  # samples; a half of them is off by 1.5 % of the light
 
 
@@ -88,6 +90,7 @@ def test_lights_by_themselves_add_up_to_other_powers(tmp_path):
     _, layers, covered = lightmap(tmp_path, **options)
     of_lights = {name.partition("@")[2]: light for name, light in layers.items() if "@" in name}
     assert set(of_lights) == {"Key", "World", "Glowing surfaces"}
+    assert rows_of_lights(bpy.context.scene) == len(of_lights)
     assert {light.dtype for light in of_lights.values()} == {np.dtype(np.float16)}
     whole = sum(light.astype(float) for light in of_lights.values())[covered]
     # Half floats have 11 bits, and the seams of each are fitted to a ten-thousandth.

@@ -104,6 +104,7 @@ def test_a_killed_blender_is_one_failed_task(room, tmp_path, own_blender):
 def test_facts_are_those_of_the_frame_and_of_the_file(room):
     facts = scene_facts(room, (1, None), "all")
     assert [(fact["frame"], fact["camera"]) for fact in facts] == [(1, "Camera"), (3, "Camera")]
+    assert [fact["lights"] for fact in facts] == [1, 1]
     assert all(sorted(fact["objects"]) == ["Bare", "Floor", "Slab"] for fact in facts)
     assert scene_facts(room, (None,), None)[0]["objects"] == []
     with pytest.raises(blender_process.SceneError, match="object 'Roof' is not in scene"):

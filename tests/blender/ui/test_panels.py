@@ -193,6 +193,21 @@ def row(ob, width=300):
     return layout.shown
 
 
+def test_several_selected_objects_are_listed_with_check_marks(scene):
+    ball = parts.add_sphere(name="Ball", segments=8)
+    for ob in (ball, bpy.data.objects["Floor"], bpy.data.objects["Light"]):
+        ob.select_set(True)
+    listed, layout = stand_in(preflight.LTSH_UL_baked)(), Layout()
+    listed.bitflag_filter_item, listed.filter_name = 1 << 30, ""
+    flags, order = listed.filter_items(bpy.context, scene, "objects")
+    assert order == [] and {ob.name for ob, flag in zip(scene.objects, flags, strict=True) if flag} == {"Ball", "Floor"}
+    listed.draw_item(bpy.context, layout, scene, ball, 0, None, "")
+    assert "Ball" in texts(layout.shown) and "ltsh_baked" in [item.what for item in layout.shown]
+    assert "2 objects" in texts(drawn(BAKE))
+    ball.ltsh_baked = False
+    assert "1 object" in texts(drawn(BAKE))
+
+
 def test_the_list_of_lights_shows_lights_alone_and_finds_them_by_name(scene):
     parts.add_area_light("Key")
     listed = stand_in(panels.LTSH_UL_lights)()

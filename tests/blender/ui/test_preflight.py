@@ -78,6 +78,16 @@ def test_what_can_be_mended_is_mended_by_one_click(scene, spoil, commands, text)
     assert bpy.context.selected_objects == selected and bpy.context.mode == "OBJECT"
 
 
+def test_what_a_large_bake_takes_is_told_before_it_starts(scene):
+    settings = scene.ltsh
+    settings.bake_size, settings.bake_bounces, settings.bake_per_light = "4096", True, True
+    memory, lights = problems("bake")
+    assert not memory.blocks and "GiB of memory" in memory.text
+    assert not lights.blocks and lights.text.startswith("1 light: bounces take 1 times as long")
+    settings.bake_size, settings.bake_per_light = "1024", False
+    assert problems("bake") == []
+
+
 def test_unwrapping_gives_every_face_a_place_in_the_square(scene):
     remove_uv_map()
     sphere = parts.add_sphere(name="Ball", segments=8)
@@ -153,6 +163,25 @@ def test_one_object_that_cannot_be_baked_does_not_stop_the_others(scene):
     usable, found = preflight.bake_objects(bpy.context)
     assert [ob.name for ob in usable] == ["Floor"] == list(job.bake_options(bpy.context, Path("x.blend")).objects)
     assert [(problem.text, problem.blocks) for problem in found] == [("Object 'Bare' has no UV map", False)]
+
+
+def test_only_checked_objects_of_the_selection_are_baked(scene):
+    ball = parts.add_sphere(name="Ball", segments=8)
+    for ob in (ball, bpy.data.objects["Floor"]):
+        ob.select_set(True)
+
+    def asked():
+        return sorted(job.bake_options(bpy.context, Path("x.blend")).objects)
+
+    assert asked() == ["Ball", "Floor"]
+    ball.ltsh_baked = False
+    assert asked() == ["Floor"] and problems("bake") == []
+    bpy.data.objects["Floor"].ltsh_baked = False
+    (problem,) = problems("bake")
+    assert problem.blocks and problem.text == "No selected object is checked: check those to bake"
+    ball.ltsh_baked = True
+    ball.select_set(False)
+    assert preflight.blocking(bpy.context, "bake") == problem.text
 
 
 def test_asking_changes_nothing(scene):

@@ -226,7 +226,7 @@ def test_results_open_in_an_image_editor_that_is_free(scene):
 
 def test_presets_of_ours_set_everything_they_name(scene):
     files = sorted(Path(settings_module.PRESETS_PARENT, "presets", "ltsh").glob("*.py"))
-    assert [path.stem for path in files] == ["Draft", "Measurement", "Standard"]
+    assert [path.stem for path in files] == ["Draft", "Lightmap_Archviz", "Lightmap_Level", "Measurement", "Standard"]
     seen_values = set()
     for path in files:
         assert bpy.ops.script.execute_preset(filepath=str(path), menu_idname="LTSH_PT_presets") == {"FINISHED"}
@@ -234,7 +234,10 @@ def test_presets_of_ours_set_everything_they_name(scene):
         named = re.findall(r'^settings\.(?:property_unset\("(\w+)"\)|(\w+) = )', path.read_text(), re.MULTILINE)
         assert len(named) == path.read_text().count("settings.")
         assert {first or second for first, second in named} <= set(settings_module.KEPT)
-    assert len(seen_values) == 3
+        if path.stem.startswith("Lightmap"):
+            of_bakes = {name for name in settings_module.KEPT if name.startswith("bake_")}
+            assert {"shadows", "shadow_rays", *of_bakes} <= {first or second for first, second in named}
+    assert len(seen_values) == 5
 
 
 @pytest.mark.newest
@@ -265,7 +268,7 @@ def test_a_preset_of_the_artist_brings_the_settings_back(scene, tmp_path, monkey
 def test_every_setting_of_a_job_is_part_of_presets(scene):
     about_view = {"mode", "groups", "group", "first", "second", "pass_name", "split", "error_scale"}
     about_view |= {"mixed", "mixed_active", "active_light", "mode_before_mix", "match_target", "match_colors"}
-    of_the_file = {"output_folder", "result_folder", "last_results", "bake_uv_map"}
+    of_the_file = {"output_folder", "result_folder", "last_results", "bake_uv_map", "bake_active"}
     settings = set(scene.ltsh.__class__.__annotations__)
     assert settings - about_view - of_the_file == set(settings_module.KEPT)
 

@@ -285,7 +285,8 @@ class RatioEstimator:
 
     def _trace_alone(self, number, choice, worth):
         """Give up sharing where that changes the light: there, trace up to `number` (Q,) rays anew."""
-        alone = ~self._sees()
+        self._add_unlucky()
+        alone = ~self.visible
         for last in (np.minimum(number, ENOUGH_RAYS), number):
             alone &= self.is_shared & (self.count > PROBES)
             self.is_shared &= ~alone
@@ -303,15 +304,14 @@ class RatioEstimator:
                     change = np.maximum(change, off - np.float32(3.0) * np.sqrt(ratio * (_ONE - ratio) / self.count))
                 alone |= change * worth[name] ** WORTH_POWER > MOST_BIAS
 
-    def _sees(self):
-        """Mask (Q,) of the `visible` pairs, now with those that as few rays would often show nothing of what others
-        around see."""
+    def _add_unlucky(self):
+        """Let pairs that saw nothing count as `visible` where as few rays would often see nothing of what is seen
+        around."""
         missed = ~self.visible
         for name, sum_w, sum_wv in zip(PASSES, self.sum_w.sum(axis=1), self.sum_wv.sum(axis=1), strict=True):
             passing, met = self._neighbors.shared(name, self.index, np.stack([sum_wv, sum_w * self.visible]))
             missed &= (_ONE - passing / np.maximum(met, _TINY)) ** self.count > BY_CHANCE
         self.visible |= missed
-        return self.visible
 
     def _trace_more(self, chosen, number, choice, order):
         """Trace rays of the `chosen` pairs up to the `number`, split by `choice`; each (Q,)."""

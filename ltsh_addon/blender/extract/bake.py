@@ -319,8 +319,7 @@ def rows_of_lights(scene) -> int:
     rows = {ob.lightgroup or ob.name for ob in scene.objects if ob.type == "LIGHT" and not ob.hide_render}
     if scene.world is not None and may_shine(scene.world):
         rows.add(scene.world.lightgroup or scene.world.name)
-    materials = {slot.material for ob in scene.objects if not ob.hide_render for slot in ob.material_slots} - {None}
-    return len(rows) + any(emission_of(material).emits for material in materials)
+    return len(rows) + any(emission_of(material).emits for material in aovs.materials_of(scene))
 
 
 @contextmanager

@@ -429,6 +429,13 @@ def materials_in_use(surfaces: list, override=None) -> list:
     return list(materials.values())
 
 
+def materials_of(scene) -> list:
+    """Materials of the objects of `scene` that render, each once, sorted by name."""
+    objects = (ob for ob in scene.objects if not ob.hide_render and ob.type not in ("LIGHT", "CAMERA"))
+    materials = {slot.material for ob in objects for slot in ob.material_slots} - {None}
+    return sorted(materials, key=lambda material: material.name_full)
+
+
 def objects_without_material(surfaces: list) -> list:
     """Original objects of `surfaces` with no material slot or an empty one."""
     objects = {}

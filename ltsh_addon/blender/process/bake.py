@@ -117,10 +117,10 @@ def scene_facts(
 ) -> list[dict]:
     """What there is to bake in each of `frames` (None: the file's own).
 
-    Each entry has "frame", "camera" (name or None), "objects" (names of objects to bake) and "tiles" (the UDIM tiles
-    by object, for objects with several), "lights" (about how many `per_light` has).
-    `objects` are names, "selected", "all", or None for none. `uv` is a UV map;
-    None: the active ones. `scripts`: run those in the file. Raises as `pixels.extract_pixels` does.
+    Each entry has "frame", "camera" (name or None), "objects" (names of objects to bake), "tiles" (the UDIM tiles by
+    object, for objects with several) and "lights" (about how many rows of lights `per_light` makes). `objects` are
+    names, "selected", "all", or None for none. `uv` is a UV map; None: the active ones. `scripts`: run
+    those in the file. Raises as `pixels.extract_pixels` does.
     """
     job = BakeFactsJob(scene, list(frames), objects, uv, scripts)
     with temporary_folder() as folder:

@@ -29,7 +29,7 @@ from ..lights.area import LightInventory, node_light, reason_to_leave_out
 from ..lights.area import note_unsupported as note_unsupported_light
 from ..lights.emission import emission_of
 from ..lights.world import may_shine
-from ..materials.aovs import notes_of_material
+from ..materials.aovs import materials_of, notes_of_material
 from ..materials.bsdfs import bsdf_of, is_emission
 from ..materials.graph import shaders_behind, surface_of
 from ..materials.preview_material import preview_of
@@ -191,23 +191,11 @@ def _lights(scene) -> list[Problem]:
     if may_shine(scene.world):
         return []
     lights = lights_of(scene)
-    if any(not ob.hide_render for ob in lights) or any(glows(material) for material in materials_of(scene)):
+    if any(not ob.hide_render for ob in lights) or any(emission_of(material).emits for material in materials_of(scene)):
         return []
     if lights:
         return [_hidden(lights[0], f"Light {lights[0].name!r} is hidden in renders, and no other light is there")]
     return [Problem("No light", True, "ltsh.add_light", "Add Light", {"selects": False})]
-
-
-def materials_of(scene) -> list:
-    """Materials of the objects of `scene` that render, each once, sorted by name."""
-    objects = (ob for ob in scene.objects if not ob.hide_render and ob.type not in ("LIGHT", "CAMERA"))
-    materials = {slot.material for ob in objects for slot in ob.material_slots} - {None}
-    return sorted(materials, key=lambda material: material.name_full)
-
-
-def glows(material) -> bool:
-    """True if the surface of the material may emit light."""
-    return emission_of(material).emits
 
 
 def _files(settings) -> list[Problem]:
@@ -396,7 +384,7 @@ def _material(material, in_view: bool, with_bounces: bool) -> Entry:
     notes += tuple(f"in the view: {note.removeprefix(f'{material.name}: ')}" for note in dict.fromkeys(of_view))
     shown = [bsdf_of(leaf.node) or is_emission(leaf.node) or leaf.is_transparent for leaf in shaders.leaves]
     state = LEFT_OUT if shown and not any(shown) else APPROXIMATED if notes else EXACT
-    return Entry(material.name, "emissive" if glows(material) else "", state, notes)
+    return Entry(material.name, "emissive" if emission_of(material).emits else "", state, notes)
 
 
 @bpy.app.handlers.persistent

@@ -22,7 +22,7 @@ LIGHT_FIELDS = {"power": (103, 345), "size": (103, 433)}
 MATERIAL_TAB, NEW = (12, 406), (97, 137)
 FIELDS = {"metallic": (82, 287), "roughness": (82, 312), "transmission": (82, 527)}
 TRANSMISSION = (211, 497)
-BAKE_HEADER, BAKE, APPLY = (223, 477), (149, 534), (159, 563)
+BAKE_HEADER, BAKE, APPLY = (223, 477), (149, 625), (159, 654)
 SOLID_SECONDS = 3.0
 
 

@@ -237,12 +237,17 @@ def open_editor(context, scene) -> bool:
     area.spaces.active.show_region_ui = True
     # Blender knows the size and the tabs of the new area only after drawing it.
     tries = iter(range(ARRANGE_TRIES))
-    bpy.app.timers.register(lambda: _arrange(window, area, next(tries, None)), first_interval=ARRANGE_SECONDS)
+    bpy.app.timers.register(lambda: _arrange(area, next(tries, None)), first_interval=ARRANGE_SECONDS)
     return True
 
 
-def _arrange(window, area, attempt: int | None) -> float | None:
+def _arrange(area, attempt: int | None) -> float | None:
     """Fit the picture into its new area and open our tab. Returns the seconds until the next attempt; None: done."""
+    # To read an area that has been closed ends Blender: its memory is gone. To compare it with others reads nothing.
+    windows = bpy.context.window_manager.windows
+    window = next((one for one in windows if area in one.screen.areas[:]), None)
+    if window is None:
+        return None
     try:
         regions = {region.type: region for region in area.regions}
         regions["UI"].active_panel_category = "LTSH"
@@ -251,7 +256,7 @@ def _arrange(window, area, attempt: int | None) -> float | None:
     except TypeError:
         return None if attempt is None else ARRANGE_SECONDS
     except (ReferenceError, KeyError, RuntimeError):
-        pass  # the area has been closed meanwhile, or shows something else
+        pass  # the area shows something else
     return None
 
 

@@ -224,6 +224,16 @@ def test_results_open_in_an_image_editor_that_is_free(scene):
     assert not comparison.open_editor(SimpleNamespace(window=None), scene)
 
 
+def test_an_area_that_has_been_closed_is_not_read(scene):
+    """Its memory is gone, and Blender would end; here reading it is an error."""
+
+    class Closed:
+        def __getattribute__(self, name):
+            raise AssertionError(name)
+
+    assert comparison._arrange(Closed(), 0) is None
+
+
 def test_presets_of_ours_set_everything_they_name(scene):
     files = sorted(Path(settings_module.PRESETS_PARENT, "presets", "ltsh").glob("*.py"))
     assert [path.stem for path in files] == ["Draft", "Lightmap_Archviz", "Lightmap_Level", "Measurement", "Standard"]

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from ..emitters.light_tree import stand_ins
+from ..emitters.light_nodes import stand_ins
 from ..lobes import brdf, polygon
 from ..scene import Cancelled, Light, PolygonLight, Progress, SurfaceSamples
 from .light_tree import light_selection_pmf, light_tree_rows

@@ -11,8 +11,9 @@ plane of one of the lights may cross the node, some of the node's light adds to 
 "ltsh" lobe get its true value there, as in `tails`.
 
 If a tile has many leaves that are still too large, smaller tiles look at them again. The leaves that remain are shaded
-together as polygons. On smooth surfaces, the light of ten samples of a tile is interpolated to the others, except for
-near nodes. (Walter et al. 2005, "Lightcuts", with tiles instead of points, doi:10.1145/1073204.1073318.)
+together as polygons; where they are many of one convex body, all of it is shaded as its outline. On smooth surfaces,
+the light of ten samples of a tile is interpolated to the others, except for near nodes. (Walter et al. 2005,
+"Lightcuts", with tiles instead of points, doi:10.1145/1073204.1073318.)
 """
 
 from __future__ import annotations
@@ -23,8 +24,10 @@ from functools import cached_property
 import numpy as np
 
 from ..lobes.polygon import dot
-from ..scene import Light, QuadLight
+from ..scene import Light
 from . import small_lights
+from .convex_bodies import ConvexBody
+from .light_nodes import NodeSums, node_ranges, normal_spreads, over_lights
 from .tails import NEAR_RADII
 from .tiles import TileCubics, Tiles, lengths, neighbor_keys, products, split_columns
 
@@ -54,6 +57,8 @@ LEAST = np.float32(1e-12)
 TILE, PAIRS = (400, 200), 32768
 # A tile that must shade more than MANY_LEAVES leaves as polygons is cut into tiles of at most FINER_TILE samples.
 FINER_TILE, MANY_LEAVES = 25, 20
+# Bodies of which a tile must shade more lights as polygons are shaded as outlines.
+MANY_OF_A_BODY = 2
 # Least swing of a node, as a share of its power. Up to twice that, its lights count as parallel.
 TURNED = 1e-6
 # CROSSED: largest error of a node that a horizon crosses, as a share of its light times the sine of its radius. SWUNG:
@@ -89,16 +94,23 @@ class LightTree:
     diagonal: np.ndarray  # (N,) mean of `SmallLight.diagonal`; float32, as are swing and color
     children: np.ndarray  # (N, 2) numbers of nodes
     number: np.ndarray  # (N,) of the light
+    body: np.ndarray  # (N,) number of the body to which all lights of the node belong, or -1
+    bodies: tuple[ConvexBody, ...]
     is_even: bool  # all lights are equally bright
 
     @classmethod
-    def of(cls, lights) -> LightTree:
-        """The tree of lights whose radiance is positive."""
+    def of(cls, lights, bodies=()) -> LightTree:
+        """The tree of lights whose radiance is positive, some of which form `bodies`."""
         center, area, covariance, diagonal, rim = small_lights.moments_of(lights)
         radiance = np.array([light.radiance for light in lights])
         brightness, size = radiance.mean(axis=1), np.linalg.norm(area, axis=1)
         power, normal = brightness * size, area / size[:, None]
-        order, start, end, children = node_ranges(center, normal)
+        body = np.arange(len(lights)) + len(bodies)
+        for number_of_body, one in enumerate(bodies):
+            body[one.numbers] = number_of_body
+        order, start, end, children = node_ranges(center, normal, body=body if bodies else None)
+        body_of_node = np.where(body[order[start]] == body[order[end - 1]], body[order[start]], -1)
+        body_of_node[body_of_node >= len(bodies)] = -1
         sums = NodeSums(order, start, end)
         origin = center.mean(axis=0)
         offset = center - origin
@@ -138,7 +150,10 @@ class LightTree:
         sizes = (values.astype(np.float32) for values in (reach, radius))
         directions = (values.astype(np.float32) for values in (axis, normal_spread))
         lights_of_node = vector, swing, turn, color, tint, total, diagonal
-        return cls(middle + origin, *sizes, axes, *directions, *lights_of_node, children, number, is_even)
+        return cls(
+            middle + origin, *sizes, axes, *directions, *lights_of_node, children, number, body_of_node, tuple(bodies),
+            is_even,
+        )  # fmt: skip
 
     @cached_property
     def is_turned(self) -> np.ndarray:
@@ -163,118 +178,6 @@ class LightTree:
             colors = self.color[..., None] * (1.0 + np.einsum("npk,ckn->cnp", corners, self.tint)) / corners.shape[1]
             points_by_lobe.append((points.reshape(-1, 3), colors.reshape(3, -1).astype(np.float32)))
         return points_by_lobe
-
-
-class NodeSums:
-    """Sums over the lights of nodes. The lights of a node are `order[start:end]`."""
-
-    def __init__(self, order, start, end):
-        self.order, self.start, self.end = order, start, end
-
-    def __call__(self, values):
-        """Sums (N, ...) of the lights' `values` (L, ...)."""
-        running = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values[self.order], axis=0)])
-        sums = running[self.end] - running[self.start]
-        alone = self.end - self.start == 1
-        sums[alone] = values[self.order[self.start[alone]]]
-        return sums
-
-    def moments(self, weight, offset, covariance, normal):
-        """Of lights of a `weight` (L,): the sums of these (N,), the means (N, 3) and covariances (N, 3, 3) of what lies
-        around `offset` (L, 3), the mean direction (N, 3) of unit `normal`s, and the length (N,) of their sum."""
-        total = self(weight)
-        middle = self(weight[:, None] * offset) / total[:, None]
-        spread = weight[:, None, None] * (covariance + offset[:, :, None] * offset[:, None, :])
-        spread = self(spread) / total[:, None, None] - middle[:, :, None] * middle[:, None, :]
-        axis = self(weight[:, None] * normal)
-        length = np.linalg.norm(axis, axis=1, keepdims=True)
-        axis, first = axis / np.maximum(length, 1e-300), normal[self.order[self.start]]
-        return total, middle, spread, np.where(length > 1e-9 * total[:, None], axis, first), length[:, 0]
-
-
-def stand_ins(lights, most: int) -> tuple[list[Light], np.ndarray]:
-    """Rectangles that stand for many flat lights with an area, and the share (N,) of each that shines. Each stands
-    for neighbors that face alike. There are N = `most`, a power of two and at most as many as there are lights."""
-    center, area, covariance, _, _ = small_lights.moments_of(lights)
-    size = np.linalg.norm(area, axis=1)
-    normal = area / size[:, None]
-    order, start, end, _ = node_ranges(center, normal, most)
-    sums = NodeSums(order, start[-most:], end[-most:])
-    origin = center.mean(axis=0)
-    whole, middle, spread, axis, _ = sums.moments(size, center - origin, covariance, normal)
-    radiance = sums(size[:, None] * np.array([light.radiance for light in lights])) / whole[:, None]
-    along = np.eye(3) - axis[:, :, None] * axis[:, None, :]
-    variances, axes = np.linalg.eigh(along @ spread @ along)
-    # Uniform rectangles with these variances, but no smaller than their shining area.
-    half_v, half_u = (np.sqrt(3.0 * np.maximum(variances[:, k], 0.0)) for k in (1, 2))
-    half_u = np.maximum(half_u, 1e-6 * np.sqrt(whole))
-    half_v = np.maximum(half_v, 0.25 * whole / half_u)
-    rows = zip(middle + origin, half_u[:, None] * axes[:, :, 2], half_v[:, None] * axes[:, :, 1], axis, strict=True)
-    share = whole / (4.0 * half_u * half_v)
-    radiance *= share[:, None]
-    like = QuadLight.like(lights[0])
-    names = ("center", "half_u", "half_v", "direction")
-    rectangles = [
-        like.altered(**dict(zip(names, row, strict=True)), radiance=mean)
-        for row, mean in zip(rows, radiance, strict=True)
-    ]
-    return rectangles, share
-
-
-def node_ranges(center, normal, most=np.inf):
-    """The order (L,) of the lights, the starts and the ends (N,) of the nodes in that order, and the children (N, 2) of
-    the nodes. Each level halves the nodes above it where their lights differ most. The last level is the first that has
-    `most` nodes."""
-    count = len(center)
-    order = np.arange(count)
-    starts, ends, children = [np.array([0])], [np.array([count])], []
-    first = 1
-    while True:
-        start, end = starts[-1], ends[-1]
-        inner = np.nonzero(end - start > 1)[0]
-        child = np.full((len(start), 2), -1)
-        child[inner] = first + np.arange(2 * len(inner)).reshape(-1, 2)
-        children.append(child)
-        if len(inner) == 0 or len(start) >= most:
-            return order, np.concatenate(starts), np.concatenate(ends), np.concatenate(children)
-        start, end = start[inner], end[inner]
-        first += 2 * len(inner)
-        size = end - start
-        member = np.repeat(np.arange(len(inner)), size)
-        places = np.repeat(start - np.concatenate([[0], np.cumsum(size)[:-1]]), size) + np.arange(size.sum())
-        bounds = np.concatenate([[0], np.cumsum(size)[:-1]])
-        values = np.concatenate([center[order[places]], normal[order[places]]], axis=1)
-        extent = np.maximum.reduceat(values, bounds) - np.minimum.reduceat(values, bounds)
-        # A turn by 1 rad counts half as much as the whole width of a node.
-        extent[:, 3:] *= 0.5 * np.linalg.norm(extent[:, :3], axis=1, keepdims=True)
-        key = values[np.arange(len(values)), extent.argmax(axis=1)[member]]
-        order[places] = order[places][np.lexsort((key, member))]
-        middle = (start + end) // 2
-        starts.append(np.stack([start, middle], axis=1).ravel())
-        ends.append(np.stack([middle, end], axis=1).ravel())
-
-
-def normal_spreads(axis, normals, start, end):
-    """The largest angles (N,) in rad between the axes (N, 3) and the normals (L, 3) `start` to `end` of each node."""
-    cosines = over_lights(
-        np.minimum, lambda node, light: products(axis[node], normals[light]), (np.arange(len(normals)), start, end)
-    )
-    return np.arccos(np.clip(cosines, -1.0, 1.0))
-
-
-def over_lights(function, values, ranges):
-    """For each of N nodes, the `function` of the values(nodes (M,), lights (M,)) of its lights, order[start:end]."""
-    order, start, end = ranges
-    result, largest = np.empty(len(start)), 1 << 16
-    size = end - start
-    for first in range(0, len(start), largest):
-        chosen = np.arange(first, min(first + largest, len(start)))
-        # Go level by level: each level has every light at most once.
-        member = np.repeat(chosen, size[chosen])
-        offset = np.concatenate([[0], np.cumsum(size[chosen])[:-1]])
-        places = np.arange(len(member)) + np.repeat(start[chosen] - offset, size[chosen])
-        result[chosen] = function.reduceat(values(member, order[places]), offset)
-    return result
 
 
 def _angles(offset, distance, axis):
@@ -439,9 +342,10 @@ def _refined(tree, tiles, is_fine) -> TileNodePairs:
     return TileNodePairs.joined(fine)
 
 
-def add_far_lights(tree: LightTree, lobes, position, chosen, total) -> tuple[np.ndarray, np.ndarray]:
+def add_far_lights(tree: LightTree, lobes, position, chosen, total) -> tuple[tuple, tuple]:
     """Add the light of the tree to `total` (F, 3, Q), for the columns `chosen` (Q',) of `lobes`, at x, y, z in
-    `position` (3, Q). Returns the pairs (K,) that are left: columns, and numbers of the lights to shade as polygons."""
+    `position` (3, Q). Returns the pairs (K,) that are left: columns, and numbers of the lights to shade as polygons;
+    then columns, and numbers of the bodies to shade as outlines."""
     is_specular = lobes.sharpest is not None
     keys = neighbor_keys(lobes, position, chosen)
     tile_members = split_columns(keys, np.arange(len(chosen)), TILE[is_specular])
@@ -454,6 +358,10 @@ def add_far_lights(tree: LightTree, lobes, position, chosen, total) -> tuple[np.
     bent = INTERPOLATED * pairs.change**4 * pairs.light
     pairs.is_smooth &= cubics.are_smooth[pairs.tile] & (bent <= most[pairs.tile])
     near = pairs.are_near(LEAF_ERROR * light[pairs.tile])
+    light = np.bincount(pairs.tile[~near], pairs.mean[~near], len(tile_members))
+    outlined = _bodies_near(tree, pairs, near)
+    remains = ~np.isin(_tile_and_body(tree, pairs), outlined)
+    pairs, near = pairs.take(remains), near[remains]
     for number, tile_pairs in pairs.take(~near).by_tile():
         columns = tiles.columns[number]
         smooth = tile_pairs.is_smooth
@@ -463,7 +371,6 @@ def add_far_lights(tree: LightTree, lobes, position, chosen, total) -> tuple[np.
             tile_pairs = tile_pairs.take(~smooth)
         if not smooth.all():
             total[:, :, columns] += _light_of(tree, lobes, position[:, columns], (columns, tile_pairs))
-    light = np.bincount(pairs.tile[~near], pairs.mean[~near], len(tile_members))
     near, remaining, tile, node, finer = pairs.take(near), [], [], [], []
     for number, tile_pairs in near.by_tile():
         if len(tile_pairs.node) <= MANY_LEAVES:
@@ -485,7 +392,26 @@ def add_far_lights(tree: LightTree, lobes, position, chosen, total) -> tuple[np.
         remaining += [(columns[number], tile_pairs) for number, tile_pairs in pairs.take(near).by_tile()]
     columns = [np.repeat(members, len(tile_pairs.node)) for members, tile_pairs in remaining]
     numbers = [np.tile(tree.number[tile_pairs.node], len(members)) for members, tile_pairs in remaining]
-    return tuple(np.concatenate([np.empty(0, np.intp), *values]) for values in (columns, numbers))
+    tile, body = np.divmod(outlined, max(len(tree.bodies), 1))
+    outlined_columns = [tiles.columns[one] for one in tile]
+    outlined_bodies = [np.full(len(columns), one) for columns, one in zip(outlined_columns, body, strict=True)]
+    pairs = columns, numbers, outlined_columns, outlined_bodies
+    columns, numbers, *outlined = (np.concatenate([np.empty(0, np.intp), *values]) for values in pairs)
+    return (columns, numbers), tuple(outlined)
+
+
+def _tile_and_body(tree, pairs) -> np.ndarray:
+    """A number (K,) for each tile and body; -1 for nodes that are no part of a body."""
+    body = tree.body[pairs.node]
+    return np.where(body >= 0, pairs.tile * len(tree.bodies) + body, -1)
+
+
+def _bodies_near(tree, pairs, near) -> np.ndarray:
+    """Numbers from `_tile_and_body` of the bodies of which a tile must shade many of the `near` lights (K,) as
+    polygons."""
+    keys = _tile_and_body(tree, pairs)[near]
+    keys, count = np.unique(keys[keys >= 0], return_counts=True)
+    return keys[count > MANY_OF_A_BODY]
 
 
 @dataclass(frozen=True)

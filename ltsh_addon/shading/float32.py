@@ -6,16 +6,15 @@ points so close to a light's plane that an edge spans half a circle, tiny lights
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from ..emitters import light_profile, profile_regions, small_lights
 from ..emitters.facing import AnalyticLobe, FacingDisk, mean_emission
 from ..emitters.light_polygons import light_levels, local_corners, may_reach, off_plane
-from ..emitters.light_tree import FEWEST, LightTree, add_far_lights, is_special
-from ..emitters.sky_map import SkyMap
+from ..emitters.light_tree import add_far_lights
 from ..emitters.tails import LightFromPoints, TailLimits
 from ..lobes import moments32
 from ..lobes.lobe_integrals import FLOAT64_CHUNK, NARROWEST
@@ -23,13 +22,14 @@ from ..lobes.lookup_table import MIN_ALPHA
 from ..lobes.polygon import MOSTLY_WHOLE, convex_pieces, dot, integrate_visible, normal_frames
 from ..scene import PolygonLight
 from . import float64, lobes32
+from .lights32 import Lights
 
 # Samples per chunk for small lights.
 SMALL_CHUNK = 6144
 # Points per chunk for lights with a profile.
 POINT_CHUNK = 40960
-# Half the directions of an anisotropic lobe to a constant sky: it is .5 % off (root mean square over lobes).
-OF_CONSTANT = 96
+# Points per chunk that see bodies as outlines.
+OUTLINED_CHUNK = 4096
 # In rad. Lights with a narrower cone are too bright for the absolute error of single precision.
 NARROW_SPREAD = 0.35
 
@@ -133,119 +133,6 @@ def _chunks(members):
     return (members[piece] for piece in moments32.pieces(len(members), lobes32.CHUNK))
 
 
-@dataclass(frozen=True)
-class AlikeLights:
-    """L lights with equally many corners: vectors (3, L) and numbers (L,), all but `centers` in single precision."""
-
-    centers: np.ndarray  # (2, 3, L) center and centroid
-    corners: np.ndarray  # (V, 3, L) of `Light.polygon`, relative to the center
-    half_u: np.ndarray
-    half_v: np.ndarray
-    direction: np.ndarray
-    radiance: np.ndarray
-    area_vector: np.ndarray
-    radius: np.ndarray  # m, around the centroid
-    diagonal: np.ndarray  # as in `small_lights.SmallLight`
-    numbers: np.ndarray  # among all lights
-    column: np.ndarray  # (N,) column here of each of the N lights; -1 for those not here or too narrow
-
-    @classmethod
-    def of(cls, lights, numbers) -> AlikeLights:
-        """Those of `lights`, (light, row, corners), with these `numbers` (L,)."""
-        alike = [lights[number][0] for number in numbers]
-        centroid, area, _, diagonal, radius = small_lights.moments_of(alike)
-        center = np.array([light.center for light in alike])
-        corners = np.array([lights[number][2] for number in numbers])
-        names = ("half_u", "half_v", "direction", "radiance")
-        vectors = [np.array([getattr(light, name) for light in alike]) for name in names]
-        longest = np.square(corners - corners[:, :1]).sum(axis=2).max(axis=1)
-        is_narrow = np.sqrt(np.square(area).sum(axis=1)) < NARROWEST * longest
-        column = np.full(len(lights), -1)
-        column[numbers] = np.where(is_narrow, -1, np.arange(len(numbers)))
-        corners = (corners - center[:, None]).transpose(1, 2, 0)
-        others = (values.T.astype(np.float32, order="C") for values in (*vectors, area, radius, diagonal))
-        return cls(np.stack([center.T, centroid.T]), corners.astype(np.float32, order="C"), *others, numbers, column)
-
-
-class Lights(list):
-    """Lights (light, row, corners) that affect one pass. Trees of many lights are built once, and kept by the first.
-
-    The last `leaf_count` are leaves of textured lights.
-    """
-
-    leaf_count = 0
-
-    @classmethod
-    def of(cls, lights, name, leaves=()) -> Lights:
-        """Those of `lights` and `leaves` that affect the pass `name`. A Lights object is returned as it is."""
-        if isinstance(lights, Lights):
-            return lights
-        lights, leaves = ([one for one in many if getattr(one[0], f"affects_{name}")] for many in (lights, leaves))
-        result = cls(lights + leaves)
-        result.leaf_count = len(leaves)
-        if len(result) < FEWEST:
-            return result
-        cached = vars(result[0][0]).setdefault("_lights", result)
-        pairs = zip(result, cached, strict=False)
-        is_same = (len(cached), cached.leaf_count) == (len(result), len(leaves))
-        if not (is_same and all(one[0] is other[0] and one[1] == other[1] for one, other in pairs)):
-            cached = vars(result[0][0])["_lights"] = result
-        return cached
-
-    @cached_property
-    def trees(self) -> list[tuple[LightTree, list[int]]]:
-        """Trees of many lights, and the positions here of their lights."""
-        kinds: dict[tuple, list[int]] = {}
-        for number, (light, row, _) in enumerate(self):
-            if not is_special(light):
-                kinds.setdefault((row, light.receivers), []).append(number)
-        many = [numbers for numbers in kinds.values() if len(numbers) >= FEWEST]
-        return [(LightTree.of([self[number][0] for number in numbers]), numbers) for numbers in many]
-
-    @cached_property
-    def alike(self) -> list[AlikeLights]:
-        """The lights in trees that are not round, grouped by their number of corners."""
-        kinds: dict[int, list[int]] = {}
-        for number in (number for _, numbers in self.trees for number in numbers):
-            kinds.setdefault(0 if self[number][0].is_round else len(self[number][2]), []).append(number)
-        return [AlikeLights.of(self, np.array(numbers)) for count, numbers in kinds.items() if count]
-
-    @cached_property
-    def alone(self) -> list[int]:
-        """The positions here of the lights that are in no tree."""
-        taken = {number for _, numbers in self.trees for number in numbers}
-        return [number for number in range(len(self)) if number not in taken]
-
-    @cached_property
-    def skies(self) -> list[tuple[SkyMap, object, int]]:
-        """Maps of lights that are all `float64.has_patches`, each with one of its lights and their row."""
-        kinds: dict[tuple, list] = {}
-        for light, row, _ in self:
-            kinds.setdefault((row, light.receivers), []).append(light)
-        maps = [SkyMap.of(lights) for lights in kinds.values()]
-        # With the same directions for all, the parts of a sky in several rows add up.
-        most = np.max([sky.directions for sky in maps], axis=0)
-        maps = [replace(sky, directions=most) for sky in maps]
-        return [(sky, lights[0], row) for sky, ((row, _), lights) in zip(maps, kinds.items(), strict=True)]
-
-    @cached_property
-    def whole_skies(self) -> list[tuple[SkyMap, object, int, list[int]]]:
-        """Maps of skies whose six sides are constant, each with one of its lights, their row, and their positions."""
-        kinds: dict[tuple, list[int]] = {}
-        for number, (light, row, _) in enumerate(self):
-            if light.is_side and not light.children:
-                kinds.setdefault((row, light.receivers), []).append(number)
-        skies = []
-        for (row, _), numbers in kinds.items():
-            sides = [self[number][0] for number in numbers]
-            if len({tuple(side.center) for side in sides}) == len(sides) == 6:
-                sky = SkyMap.of([replace(side, children=(side,)) for side in sides])
-                skies.append(
-                    (replace(sky, directions=np.full(len(sky.directions), OF_CONSTANT)), sides[0], row, numbers)
-                )
-        return skies
-
-
 def shade_skies(samples, lights, table, radiance) -> None:
     """Add to `radiance`, (R, P, 3) by pass, what `samples` reflect of `Lights.skies`; `lights` has them by pass."""
     adds = {"diffuse": lobes32.add_diffuse_of_sky, "specular": partial(lobes32.add_specular_of_sky, table=table)}
@@ -265,6 +152,7 @@ class _Lighting:
         self.shade_in_float64 = shade_in_float64
         self.needs_float64 = [[] for _ in lights]  # indices of samples, per light
         self.pairs_in_float64: list[tuple] = []  # the same as pairs (K,) of a sample and a light
+        self.outlined_in_float64: list[tuple] = []  # indices (K,) of samples, a body, and the positions of its lights
 
     def add(self, lobes: lobes32.Lobes) -> None:
         """Add the light that `lobes` reflect."""
@@ -368,11 +256,20 @@ class _Lighting:
             chosen = np.arange(len(lobes.index)) if allowed is None else np.nonzero(allowed)[0]
             if not len(chosen):
                 continue
-            columns, light_number = add_far_lights(tree, lobes, position, chosen, sums[row])
-            pairs = columns, np.array(numbers)[light_number]
+            (columns, light_number), outlined = add_far_lights(tree, lobes, position, chosen, sums[row])
+            pairs = [(columns, numbers[light_number])]
+            for number in np.unique(outlined[1]):
+                body, columns = tree.bodies[number], outlined[0][outlined[1] == number]
+                if lobes.only_tails:
+                    self.outlined_in_float64.append((lobes.index[columns], body, numbers[body.numbers]))
+                    continue
+                rest = self._add_outlines(lobes, position, (columns, body), light.radiance, sums[row])
+                pairs.append(_all_pairs(rest, numbers[body.numbers]))
+            pairs = tuple(np.concatenate(values) for values in zip(*pairs, strict=True))
             if lobes.only_tails:
-                self.pairs_in_float64.append((lobes.index[columns], pairs[1]))
+                self.pairs_in_float64.append((lobes.index[pairs[0]], pairs[1]))
                 continue
+            columns = pairs[0]
             rest = np.ones(len(columns), bool)
             for alike in self.lights.alike:
                 column = alike.column[pairs[1]]
@@ -383,6 +280,30 @@ class _Lighting:
             for light in np.unique(number):
                 remaining[int(light)] = np.sort(columns[number == light])
         return remaining
+
+    def _add_outlines(self, lobes, position, among, radiance, total) -> np.ndarray:
+        """Add to `total` (F, 3, Q) the light of a body where it is seen as an outline. `among` is columns (K,) and the
+        body. Returns the columns (K',) for which this does not suffice."""
+        columns, body = among
+        rest = [columns[:0]]
+        for piece in moments32.pieces(len(columns), OUTLINED_CHUNK):
+            some, is_seen = columns[piece], np.zeros(len(columns[piece]), bool)
+            width = lobes.width if np.ndim(lobes.width) == 0 else lobes.width[some]
+            for seen in body.outlines(position[:, some], width):
+                batch, facing = some[seen.points], np.ones(len(seen.points), bool)
+                axes, integrate = lobes.rows[:, :, batch], partial(lobes.integrate, batch)
+                polygons = local_corners(None, seen.corners, seen.offset, axes, self.scratch)
+                integrals, redo = integrate_visible(polygons, facing, lobes.clip_rows, len(total), integrate)
+                if lobes.limits is not None:
+                    toward, halves = dot(seen.offset, seen.direction), (seen.half_u, seen.half_v)
+                    light = LightFromPoints.of_plain(halves, seen.area * seen.direction, seen.offset, toward)
+                    lobes.limits.apply(integrals, batch, light, self.scratch)
+                integrals[:, redo] = 0.0
+                is_seen[seen.points] = ~redo
+                for channel in range(3):
+                    total[:, channel, batch] += integrals * np.float32(radiance[channel])
+            rest.append(some[~is_seen])
+        return np.concatenate(rest)
 
     def _add_near(self, lobes, position, pairs, total) -> None:
         """Add to `total` (F, 3, Q) the light of `pairs`: columns (K,), numbers (K,) of lights, and the AlikeLights."""
@@ -508,9 +429,15 @@ class _Lighting:
 
     def add_in_float64(self, members, without=()) -> None:
         """Add the light of all lights but leaves, and but those `without`, at the samples `members` (Q,)."""
-        numbers = [number for number in range(len(self.lights) - self.lights.leaf_count) if number not in without]
         if len(members) == 0:
             return
+        without = {*without}
+        for body, numbers in self.lights.bodies:
+            light = self.lights[numbers[0]][0]
+            allowed = light.receives(self.samples.receiver, members)
+            self.outlined_in_float64.append((members if allowed is None else members[allowed], body, numbers))
+            without.update(numbers.tolist())
+        numbers = [number for number in range(len(self.lights) - self.lights.leaf_count) if number not in without]
         if len(members) * len(numbers) < FLOAT64_CHUNK:
             for number in numbers:
                 allowed = self.lights[number][0].receives(self.samples.receiver, members)
@@ -525,6 +452,9 @@ class _Lighting:
 
     def finish(self) -> None:
         """Add what was left to float64."""
+        for members, body, numbers in self.outlined_in_float64:
+            rest = self._add_outlines_in_float64(members, body, self.lights[numbers[0]])
+            self.pairs_in_float64.append(_all_pairs(rest, numbers))
         counts = [sum(map(len, parts)) for parts in self.needs_float64]
         pairs = [pair for pair in self.pairs_in_float64 if len(pair[0])]
         if not any(counts) and not pairs:
@@ -536,6 +466,30 @@ class _Lighting:
         for pairs, values in float64.shade_pairs(self.samples, members, number, self.lights, self.shade_in_float64):
             # A sample may occur with several lights.
             np.add.at(self.radiance, (row[number[pairs]], members[pairs]), values.astype(np.float32))
+
+
+    def _add_outlines_in_float64(self, members, body, light) -> np.ndarray:
+        """Add the light of a body, of which `light` is one, at the samples `members` (K,) that see it as an outline.
+        Returns the others."""
+        rest = [members[:0]]
+        specular = self.shade_in_float64 is not float64.shade_diffuse
+        for piece in moments32.pieces(len(members), FLOAT64_CHUNK):
+            chosen, is_seen = members[piece], np.zeros(len(members[piece]), bool)
+            width = float64.lobe_width(self.samples, chosen) if specular else 1.0
+            for seen in body.outlines(np.ascontiguousarray(self.samples.position[chosen].T), width):
+                index, target = chosen[seen.points], np.zeros((1, len(seen.points), 3))
+                samples = self.samples.take(index)
+                outlined = float64.outlined_light(seen, samples.position, light[0].radiance)
+                self.shade_in_float64(samples, [outlined], radiance=target)
+                self.radiance[light[1], index] += target[0].astype(np.float32)
+                is_seen[seen.points] = True
+            rest.append(chosen[~is_seen])
+        return np.concatenate(rest)
+
+
+def _all_pairs(columns, numbers) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs (K,) of all columns with all numbers."""
+    return np.repeat(columns, len(numbers)), np.tile(numbers, len(columns))
 
 
 def _scatter(integrals, columns, radiance, total) -> None:

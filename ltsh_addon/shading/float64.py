@@ -124,6 +124,15 @@ def _light_of_each(items, number):
     return LightOfEachSample(**fields, is_distant=distant), 0, corners[number].transpose(1, 0, 2)
 
 
+def outlined_light(seen, position, radiance):
+    """One (light, row, corners) that stands for the `Outlines` that samples at `position` (Q, 3) see."""
+    center, direction = position + seen.offset.T, seen.direction.T.astype(np.float64)
+    half_u, half_v = (half.T.astype(np.float64) for half in (seen.half_u, seen.half_v))
+    area = seen.area[:, None] * direction
+    light = LightOfEachSample(center, direction, np.broadcast_to(radiance, center.shape), half_u, half_v, area)
+    return light, 0, seen.corners.transpose(0, 2, 1) + center
+
+
 def _of(vector, index):
     """`vector` if it is (3,), the same for all samples; otherwise its rows for the samples `index`."""
     return vector if vector.ndim == 1 else vector[index]

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..emitters import light_tree
+from ..emitters import light_nodes, light_tree
 from ..lobes.polygon import STRAIGHT, convex_pieces, dot
 from ..scene import FlatLight, Light, PointLight, PolygonLight, QuadLight
 from .emitter import Emitter, Sky
@@ -61,7 +61,7 @@ class LightCluster:
     def _build(self, corners, normal, power):
         """Set the arrays of the nodes, with the root first."""
         low, high = corners.min(axis=1), corners.max(axis=1)
-        order, start, end, self.children = light_tree.node_ranges(0.5 * (low + high), normal)
+        order, start, end, self.children = light_nodes.node_ranges(0.5 * (low + high), normal)
         alone = end - start == 1
         first = order[start]
         self.leaf = np.where(alone, first, -1)
@@ -76,7 +76,7 @@ class LightCluster:
         self.center = np.ascontiguousarray(0.5 * (low + high).T, dtype=np.float32)
         self.radius = (0.5 * np.linalg.norm(high - low, axis=1)).astype(np.float32)
         self.axis = np.ascontiguousarray(axis.T, dtype=np.float32)
-        self.cone = light_tree.normal_spreads(axis, normal[order], start, end).astype(np.float32)
+        self.cone = light_nodes.normal_spreads(axis, normal[order], start, end).astype(np.float32)
         self.power = (sums / sums[0]).astype(np.float32)
         self.order, self.start, self.end = order, start, end
         self.running = np.append(0.0, np.cumsum(power[order]))

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field, replace
 import bpy
 import numpy as np
 
-from ...cycles import planar_polygons
+from ...emitters import planar_polygons
 from ...cycles.patches import GRID, cut_into_patches, note_patches, split_light
-from ...cycles.planar_polygons import FlatPolygon
+from ...emitters.planar_polygons import FlatPolygon
 from ...scene import Light, PolygonLight, QuadLight
 from ..evaluated import SURFACE_TYPES, EmitterTraits, RenderedSurface, is_rendered, read_values, surface_instancer
 from ..materials.graph import computed, ensure_nodes, fill_with_bsdf, is_displaced, live_link, material_output, mixed

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ltsh_addon.cycles import planar_polygons
-from ltsh_addon.cycles.planar_polygons import flat_polygons, is_closed, is_inside, signed_volume
+from ltsh_addon.emitters import planar_polygons
+from ltsh_addon.emitters.planar_polygons import flat_polygons, is_closed, is_inside, signed_volume
 
 CUBE = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
 CUBE_QUADS = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]

@@ -1,0 +1,145 @@
+"""How neighboring lights are grouped: binary trees of nodes, sums over their lights, stand-ins for many lights."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..scene import Light, QuadLight
+from . import small_lights
+from .tiles import products
+
+
+class NodeSums:
+    """Sums over the lights of nodes. The lights of a node are `order[start:end]`."""
+
+    def __init__(self, order, start, end):
+        self.order, self.start, self.end = order, start, end
+
+    def __call__(self, values):
+        """Sums (N, ...) of the lights' `values` (L, ...)."""
+        running = np.concatenate([np.zeros((1, *values.shape[1:])), np.cumsum(values[self.order], axis=0)])
+        sums = running[self.end] - running[self.start]
+        alone = self.end - self.start == 1
+        sums[alone] = values[self.order[self.start[alone]]]
+        return sums
+
+    def moments(self, weight, offset, covariance, normal):
+        """Of lights of a `weight` (L,): the sums of these (N,), the means (N, 3) and covariances (N, 3, 3) of what lies
+        around `offset` (L, 3), the mean direction (N, 3) of unit `normal`s, and the length (N,) of their sum."""
+        total = self(weight)
+        middle = self(weight[:, None] * offset) / total[:, None]
+        spread = weight[:, None, None] * (covariance + offset[:, :, None] * offset[:, None, :])
+        spread = self(spread) / total[:, None, None] - middle[:, :, None] * middle[:, None, :]
+        axis = self(weight[:, None] * normal)
+        length = np.linalg.norm(axis, axis=1, keepdims=True)
+        axis, first = axis / np.maximum(length, 1e-300), normal[self.order[self.start]]
+        return total, middle, spread, np.where(length > 1e-9 * total[:, None], axis, first), length[:, 0]
+
+
+def stand_ins(lights, most: int) -> tuple[list[Light], np.ndarray]:
+    """Rectangles that stand for many flat lights with an area, and the share (N,) of each that shines. Each stands
+    for neighbors that face alike. There are N = `most`, a power of two and at most as many as there are lights."""
+    center, area, covariance, _, _ = small_lights.moments_of(lights)
+    size = np.linalg.norm(area, axis=1)
+    normal = area / size[:, None]
+    order, start, end, _ = node_ranges(center, normal, most)
+    sums = NodeSums(order, start[-most:], end[-most:])
+    origin = center.mean(axis=0)
+    whole, middle, spread, axis, _ = sums.moments(size, center - origin, covariance, normal)
+    radiance = sums(size[:, None] * np.array([light.radiance for light in lights])) / whole[:, None]
+    along = np.eye(3) - axis[:, :, None] * axis[:, None, :]
+    variances, axes = np.linalg.eigh(along @ spread @ along)
+    # Uniform rectangles with these variances, but no smaller than their shining area.
+    half_v, half_u = (np.sqrt(3.0 * np.maximum(variances[:, k], 0.0)) for k in (1, 2))
+    half_u = np.maximum(half_u, 1e-6 * np.sqrt(whole))
+    half_v = np.maximum(half_v, 0.25 * whole / half_u)
+    rows = zip(middle + origin, half_u[:, None] * axes[:, :, 2], half_v[:, None] * axes[:, :, 1], axis, strict=True)
+    share = whole / (4.0 * half_u * half_v)
+    radiance *= share[:, None]
+    like = QuadLight.like(lights[0])
+    names = ("center", "half_u", "half_v", "direction")
+    rectangles = [
+        like.altered(**dict(zip(names, row, strict=True)), radiance=mean)
+        for row, mean in zip(rows, radiance, strict=True)
+    ]
+    return rectangles, share
+
+
+def node_ranges(center, normal, most=np.inf, body=None):
+    """The order (L,) of the lights, the starts and the ends (N,) of the nodes in that order, and the children (N, 2) of
+    the nodes. Each level halves the nodes above it where their lights differ most. The last level is the first that has
+    `most` nodes. Lights of the same `body` (L,) stay together, until a node has no others."""
+    count = len(center)
+    order = np.arange(count)
+    if body is not None:
+        sizes = np.bincount(body)[body]
+        middles = np.stack([np.bincount(body, values)[body] for values in center.T], axis=1) / sizes[:, None]
+        normals = np.where(sizes[:, None] > 1, 0.0, normal)
+    starts, ends, children = [np.array([0])], [np.array([count])], []
+    first = 1
+    while True:
+        start, end = starts[-1], ends[-1]
+        inner = np.nonzero(end - start > 1)[0]
+        child = np.full((len(start), 2), -1)
+        child[inner] = first + np.arange(2 * len(inner)).reshape(-1, 2)
+        children.append(child)
+        if len(inner) == 0 or len(start) >= most:
+            return order, np.concatenate(starts), np.concatenate(ends), np.concatenate(children)
+        start, end = start[inner], end[inner]
+        first += 2 * len(inner)
+        size = end - start
+        member = np.repeat(np.arange(len(inner)), size)
+        bounds = np.concatenate([[0], np.cumsum(size)[:-1]])
+        places = np.repeat(start - bounds, size) + np.arange(size.sum())
+        lights = order[places]
+        values = np.concatenate([center[lights], normal[lights]], axis=1)
+        if body is not None:
+            numbers = body[lights]
+            is_mixed = np.maximum.reduceat(numbers, bounds) > np.minimum.reduceat(numbers, bounds)
+            together = np.concatenate([middles[lights], normals[lights]], axis=1)
+            values = np.where(is_mixed[member, None], together, values)
+        extent = np.maximum.reduceat(values, bounds) - np.minimum.reduceat(values, bounds)
+        # A turn by 1 rad counts half as much as the whole width of a node.
+        extent[:, 3:] *= 0.5 * np.linalg.norm(extent[:, :3], axis=1, keepdims=True)
+        key = values[np.arange(len(values)), extent.argmax(axis=1)[member]]
+        middle = (start + end) // 2
+        if body is None:
+            order[places] = lights[np.lexsort((key, member))]
+        else:
+            sort = np.lexsort((np.where(is_mixed[member], numbers, 0), key, member))
+            order[places], numbers = lights[sort], numbers[sort]
+            # Halve mixed nodes between two bodies.
+            between = np.flatnonzero(np.diff(numbers) * (np.diff(member) == 0) * is_mixed[member[1:]]) + 1
+            if len(between):
+                aim, low = (middle - start + bounds)[is_mixed], bounds[is_mixed]
+                after = np.searchsorted(between, aim)
+                candidates = between[np.clip(np.stack([after - 1, after]), 0, len(between) - 1)]
+                inside = (candidates > low) & (candidates < low + size[is_mixed])
+                away = np.where(inside, np.abs(candidates - aim), len(places))
+                chosen = candidates[away.argmin(axis=0), np.arange(len(aim))]
+                middle[is_mixed] = chosen - low + start[is_mixed]
+        starts.append(np.stack([start, middle], axis=1).ravel())
+        ends.append(np.stack([middle, end], axis=1).ravel())
+
+
+def normal_spreads(axis, normals, start, end):
+    """The largest angles (N,) in rad between the axes (N, 3) and the normals (L, 3) `start` to `end` of each node."""
+    cosines = over_lights(
+        np.minimum, lambda node, light: products(axis[node], normals[light]), (np.arange(len(normals)), start, end)
+    )
+    return np.arccos(np.clip(cosines, -1.0, 1.0))
+
+
+def over_lights(function, values, ranges):
+    """For each of N nodes, the `function` of the values(nodes (M,), lights (M,)) of its lights, order[start:end]."""
+    order, start, end = ranges
+    result, largest = np.empty(len(start)), 1 << 16
+    size = end - start
+    for first in range(0, len(start), largest):
+        chosen = np.arange(first, min(first + largest, len(start)))
+        # Go level by level: each level has every light at most once.
+        member = np.repeat(chosen, size[chosen])
+        offset = np.concatenate([[0], np.cumsum(size[chosen])[:-1]])
+        places = np.arange(len(member)) + np.repeat(start[chosen] - offset, size[chosen])
+        result[chosen] = function.reduceat(values(member, order[places]), offset)
+    return result

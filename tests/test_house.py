@@ -35,7 +35,7 @@ ROOMS = """
     pipeline cli panel_job
     blender.ui blender.engine blender.registration
 """.split()
-TABLES_MAY_USE = ("scene", "reading", "files", "lobes", "shading", "imaging", "pipeline")
+TABLES_MAY_USE = ("scene", "reading", "files", "lobes", "shading", "cycles", "imaging", "pipeline")
 # Room or folder of rooms -> distributions that it may use besides the standard library.
 MAY_USE = {
     "blender": {"numpy", "OpenEXR"} | BLENDER_MODULES,

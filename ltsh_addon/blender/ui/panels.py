@@ -252,6 +252,7 @@ class _Bake:
             column.prop(settings, "bake_rest_samples")
         column.prop(settings, "bake_per_light")
         column.prop(settings, "bake_error")
+        column.prop(settings, "bake_changed")
 
 
 # Settings of the view layer, and their short names.

@@ -1,4 +1,4 @@
-"""The highlight under the mouse: surfaces that rays of a view meet, where the light goes, and lights that must stay."""
+"""Lights that the mouse drags by their highlight, and lights that must stay."""
 
 import bpy
 import numpy as np
@@ -9,7 +9,9 @@ from mathutils import Vector
 from ltsh_addon.blender.evaluated import EmitterTraits
 from ltsh_addon.blender.lights.area import area_light
 from ltsh_addon.blender.lights.linking import Receivers
-from ltsh_addon.blender.ui.highlight import glossy_lobe, place_of, reason_to_stay, samples_of, surface_hit
+from ltsh_addon.blender.lights.textures import ShownTextures
+from ltsh_addon.blender.ui.gestures import LightPose, glossy_lobe, place_of, reason_to_stay, samples_of
+from ltsh_addon.blender.ui.lit_point import surface_hit
 from ltsh_addon.shading import shade
 from ltsh_addon.shading.highlight import STENCIL
 
@@ -41,7 +43,7 @@ def hits_at(scene, pixels, target):
 def test_the_highlight_is_where_the_mouse_is(scene, target):
     light = bpy.data.objects["Key"]
     hits = hits_at(scene, 2.0 * STENCIL, Vector(target))
-    matrix, note = place_of(light, hits, 2.5)
+    matrix, note = place_of(light, LightPose.of(light), hits, 2.5, ShownTextures())
     assert not note
     middle = hits[len(hits) // 2]
     assert (matrix.translation - middle.position).length == pytest.approx(2.5, rel=1e-5)
@@ -53,7 +55,7 @@ def test_the_highlight_is_where_the_mouse_is(scene, target):
               if hit is not None and hit.material == middle.material]  # fmt: skip
     pixels, seen = np.array([pixel for pixel, _ in around]), [hit for _, hit in around]
     lamp = area_light(light, np.array(matrix), EmitterTraits("", True, True), Receivers([]))
-    samples = samples_of(seen, glossy_lobe(middle.material))
+    samples = samples_of(seen, glossy_lobe(middle.material), ShownTextures())
     radiance = shade(samples, [lamp], passes=("specular",), workers=1).specular.sum(axis=(0, 2))
     lost = 1.0 - radiance[(pixels == 0).all(axis=-1)][0] / radiance.max()
     # Facets of 64 segments bend the interpolated normals by a little.
@@ -74,11 +76,13 @@ def test_normals_are_those_of_the_smooth_surface(scene):
 def test_dull_surfaces_say_so_and_a_sun_stays_where_it_is(scene):
     bpy.data.objects["Plane"].data.materials[0] = parts.bsdf_material("ShaderNodeBsdfDiffuse")[0]
     hits = hits_at(scene, 2.0 * STENCIL, Vector((1.3, -0.8, 0.0)))
-    _, note = place_of(bpy.data.objects["Key"], hits, 2.0)
+    key = bpy.data.objects["Key"]
+    _, note = place_of(key, LightPose.of(key), hits, 2.0, ShownTextures())
     assert note == "this surface has no highlight"
     sun = parts.link(bpy.data.objects.new("Sun", bpy.data.lights.new("Sun", "SUN")), (1.0, 2.0, 3.0))
     bpy.context.view_layer.update()
-    matrix, note = place_of(sun, hits_at(scene, 2.0 * STENCIL, Vector((0.2, -0.5, 1.1))), 2.0)
+    hits = hits_at(scene, 2.0 * STENCIL, Vector((0.2, -0.5, 1.1)))
+    matrix, note = place_of(sun, LightPose.of(sun), hits, 2.0, ShownTextures())
     assert not note and matrix.translation == sun.matrix_world.translation
 
 
@@ -95,3 +99,27 @@ def test_lights_that_something_holds_stay(scene):
     assert reason_to_stay(light) == ""
     light.keyframe_insert("location", frame=1)
     assert reason_to_stay(light) == "it is animated or driven"
+
+
+@pytest.mark.parametrize("mode", ["XYZ", "QUATERNION", "AXIS_ANGLE"])
+def test_a_light_under_a_sheared_parent_faces_the_point_and_comes_back_to_the_last_bit(scene, mode):
+    outer = parts.link(bpy.data.objects.new("Outer", None), (0.3, 0.1, 0.2), (0.3, 0.5, 0.9), (1.0, 3.0, 0.4))
+    inner = parts.link(bpy.data.objects.new("Inner", None), (0.1, 0.0, 0.2), (0.7, 0.1, 0.3), (0.8, 1.0, 2.0))
+    inner.parent, light = outer, bpy.data.objects["Key"]
+    light.parent, light.rotation_mode = inner, mode
+    light.rotation_euler, light.scale, light.delta_location = (0.1, 7.0, 0.3), (1.0, 1.3, 0.7), (0.1, 0.2, 0.3)
+    light.rotation_quaternion, light.rotation_axis_angle = (0.7, 0.1, -0.5, 0.4), (0.4, 0.1, 0.9, 0.2)
+    bpy.context.view_layer.update()
+    names = ("location", "rotation_euler", "rotation_quaternion", "rotation_axis_angle", "scale")
+    before, world = [tuple(getattr(light, name)) for name in names], light.matrix_world.copy()
+    pose, point, direction = LightPose.of(light), Vector((0.4, 0.2, 0.1)), Vector((0.36, 0.48, 0.8))
+    matrix = pose.facing(point, direction, 2.5)
+    pose.put(light, matrix)
+    bpy.context.view_layer.update()
+    # Rounding of single precision through matrices with scales from 0.4 to 3.
+    assert np.abs(np.array(light.matrix_world) - np.array(matrix)).max() < 1e-4
+    assert (light.matrix_world.translation - (point + 2.5 * direction)).length < 1e-4
+    assert light.matrix_world.col[2].xyz.normalized().dot(direction) == pytest.approx(1.0, abs=1e-6)
+    pose.put_back(light)
+    bpy.context.view_layer.update()
+    assert before == [tuple(getattr(light, name)) for name in names] and light.matrix_world == world

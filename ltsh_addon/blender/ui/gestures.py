@@ -19,7 +19,7 @@ from ..lights.linking import Receivers
 from ..lights.textures import ShownTextures
 from ..materials.preview_material import COAT, METALS, PreviewMaterial, preview_of
 from .lit_point import LightShare, SceneLights, SurfaceHit, share_line, surface_hit, value_at_hit
-from .preview import PASSED_ON, OnActiveLight, active_light, lights_of, region_under
+from .preview import PASSED_ON, active_light, lights_of, region_under
 from .shadow_edge import NEAR_EDGE, OccluderRays, shadow_edge_near
 
 # SPACING: pixels between the rays around the cursor. FARTHER: the factor of the distance by a step of the wheel.
@@ -174,14 +174,33 @@ class Gesture:
         self._is_dragged, self._note, self._scene_lights, self._textures = False, "", None, ShownTextures()
         self._scale, self._is_told, self._is_still = context.preferences.system.ui_scale, False, False
         self._timer = context.window_manager.event_timer_add(REST_SECONDS, window=context.window)
-        context.window_manager.modal_handler_add(self)
         context.window.cursor_modal_set("CROSSHAIR")
-        context.workspace.status_text_set(f"{self.KEYS.format(self.light_name(context))}    Esc: Cancel")
+        context.workspace.status_text_set(f"{self.words(context)}    Esc: Cancel")
+        # A tool starts it by the press itself, a button by its release.
+        if event.type == "LEFTMOUSE" and event.value == "PRESS":
+            self._is_dragged = self._do(context, event, self.press)
+            if not self._is_dragged:
+                self._end(context)
+                self.report({"WARNING"}, self._note)
+                return {"CANCELLED"}
+        context.window_manager.modal_handler_add(self)
         return {"RUNNING_MODAL"}
 
-    def light_name(self, context) -> str:
-        """For KEYS."""
-        return ""
+    @classmethod
+    def poll(cls, context):
+        if reason := cls.reason_against(context):
+            cls.poll_message_set(reason)
+        return not reason
+
+    @classmethod
+    def reason_against(cls, context) -> str:
+        """Why the gesture cannot begin; "" if it can."""
+        return "" if context.mode == "OBJECT" else "Lights are dragged in Object Mode"
+
+    @classmethod
+    def words(cls, context) -> str:
+        """KEYS, with the name of the light."""
+        return cls.KEYS
 
     def modal(self, context, event):
         if event.type in ("ESC", "RIGHTMOUSE"):
@@ -263,25 +282,27 @@ class Gesture:
         return None if region is None else hit_at(context, region, (event.mouse_x - region.x, event.mouse_y - region.y))
 
 
-class MovingGesture(OnActiveLight, Gesture):
+class MovingGesture(Gesture):
     """A gesture that moves the active light."""
 
     @classmethod
-    def poll(cls, context):
-        if not super().poll(context):
-            return False
+    def reason_against(cls, context) -> str:
+        """As `Gesture.reason_against`."""
         light = active_light(context)
-        if reason := reason_to_stay(light):
-            cls.poll_message_set(f"{light.name}: {reason}")
-        return not reason
+        if light is None:
+            return "No light is active"
+        reason = reason_to_stay(light)
+        return super().reason_against(context) or (f"{light.name}: {reason}" if reason else "")
+
+    @classmethod
+    def words(cls, context) -> str:
+        """As `Gesture.words`."""
+        return cls.KEYS.format(active_light(context).name)
 
     def invoke(self, context, event):
         self._light = active_light(context)
         self._pose, self._distance = LightPose.of(self._light), 0.0
         return super().invoke(context, event)
-
-    def light_name(self, context) -> str:
-        return self._light.name
 
     def put_back(self) -> None:
         """Put the light back where it was."""
@@ -333,11 +354,9 @@ class LTSH_OT_drag_brightness(Gesture, bpy.types.Operator):
     KEYS = "Press on a surface, drag up or down: its brightness follows    Shift: precise    Ctrl: thirds of a stop"
 
     @classmethod
-    def poll(cls, context):
-        if context.mode != "OBJECT" or not lights_of(context.scene):
-            cls.poll_message_set("The scene has no light, or is not in Object Mode")
-            return False
-        return True
+    def reason_against(cls, context) -> str:
+        """As `Gesture.reason_against`."""
+        return super().reason_against(context) or ("" if lights_of(context.scene) else "The scene has no light")
 
     def press(self, context, event) -> bool:
         """Choose the light; False where none may be changed."""
@@ -422,6 +441,67 @@ class LTSH_OT_drag_shadow(MovingGesture, bpy.types.Operator):
         kind = "Shadow" if self._edge.across is None else "Edge of the shadow"
         self._note = f"{kind} of {self._edge.ob.name}" + (f"    {note}" if note else "")
         return True
+
+
+class LTSH_OT_aim_light(MovingGesture, bpy.types.Operator):
+    """Turn the active light, where it is, to face the point of a surface under the mouse in a 3D view"""
+
+    bl_idname = "ltsh.aim_light"
+    bl_label = "Aim Light"
+    bl_options = {"UNDO"}
+    KEYS = "Press where {} shall shine, and drag"
+
+    @classmethod
+    def reason_against(cls, context) -> str:
+        """As `Gesture.reason_against`."""
+        reason = super().reason_against(context)
+        return reason or ("A point light shines everywhere" if active_light(context).data.type == "POINT" else "")
+
+    def press(self, context, event) -> bool:
+        """Turn the light to the mouse; False where no surface is."""
+        return self.follow(context, event)
+
+    def follow(self, context, event) -> bool:
+        """As `press`."""
+        hit = self.hit_under(context, event)
+        if hit is None:
+            self._note = NO_SURFACE
+            return False
+        way = self._pose.matrix.translation - hit.position
+        self._put(self._pose.facing(hit.position, way.normalized(), way.length))
+        self._note = f"Distance {way.length:.3g} m"
+        return True
+
+
+GESTURES = (LTSH_OT_drag_highlight, LTSH_OT_drag_shadow, LTSH_OT_drag_brightness, LTSH_OT_aim_light)
+# A tool for each of them, in one group of the toolbar.
+_tools: list[type] = []
+
+
+def _tool_of(gesture) -> type:
+    def draw_settings(context, layout, tool):
+        layout.label(text=gesture.reason_against(context) or gesture.words(context))
+
+    return type(f"{gesture.__name__}_tool", (bpy.types.WorkSpaceTool,), {
+        "bl_space_type": "VIEW_3D", "bl_context_mode": "OBJECT", "bl_idname": f"{gesture.bl_idname}_tool",
+        "bl_label": gesture.bl_label, "bl_description": gesture.__doc__.replace("\n    ", " "),
+        "bl_icon": "ops.generic.cursor", "draw_settings": staticmethod(draw_settings),
+        "bl_keymap": ((gesture.bl_idname, {"type": "LEFTMOUSE", "value": "PRESS"}, None),),
+    })  # fmt: skip
+
+
+def register() -> None:
+    """Add the tools."""
+    for gesture in GESTURES:
+        _tools.append(_tool_of(gesture))
+        place = {"separator": True, "group": True} if len(_tools) == 1 else {"after": {_tools[-2].bl_idname}}
+        bpy.utils.register_tool(_tools[-1], **place)
+
+
+def unregister() -> None:
+    """Take them away."""
+    while _tools:
+        bpy.utils.unregister_tool(_tools.pop())
 
 
 def hit_at(context, region, pixel: tuple[float, float], depsgraph=None) -> SurfaceHit | None:

@@ -1,15 +1,19 @@
 """Lights that the mouse drags by their highlight, and lights that must stay."""
 
+from types import SimpleNamespace
+
 import bpy
 import numpy as np
 import pytest
 import scene_parts as parts
+from bl_ui.space_toolsystem_toolbar import VIEW3D_PT_tools_active
 from mathutils import Vector
 
 from ltsh_addon.blender.evaluated import EmitterTraits
 from ltsh_addon.blender.lights.area import area_light
 from ltsh_addon.blender.lights.linking import Receivers
 from ltsh_addon.blender.lights.textures import ShownTextures
+from ltsh_addon.blender.ui import gestures
 from ltsh_addon.blender.ui.gestures import LightPose, glossy_lobe, place_of, reason_to_stay, samples_of
 from ltsh_addon.blender.ui.lit_point import surface_hit
 from ltsh_addon.shading import shade
@@ -123,3 +127,39 @@ def test_a_light_under_a_sheared_parent_faces_the_point_and_comes_back_to_the_la
     pose.put_back(light)
     bpy.context.view_layer.update()
     assert before == [tuple(getattr(light, name)) for name in names] and light.matrix_world == world
+
+
+def test_a_light_is_aimed_where_it_is(scene):
+    light, kind = bpy.data.objects["Key"], gestures.LTSH_OT_aim_light
+    (hit,) = hits_at(scene, np.zeros((1, 2)), Vector((1.3, -0.8, 0.0)))
+    pose = LightPose.of(light)
+    this = SimpleNamespace(
+        hit_under=lambda context, event: hit, _pose=pose, _put=lambda matrix: pose.put(light, matrix)
+    )
+    assert kind.follow(this, bpy.context, None)
+    bpy.context.view_layer.update()
+    assert (light.matrix_world.translation - Vector((-2.0, -2.0, 3.0))).length < 1e-5
+    way = (hit.position - light.matrix_world.translation).normalized()
+    assert way.dot(-light.matrix_world.col[2].xyz.normalized()) == pytest.approx(1.0, abs=1e-6)
+    bpy.context.view_layer.objects.active = light
+    assert kind.reason_against(bpy.context) == ""
+    light.data.type = "POINT"
+    assert kind.reason_against(bpy.context) == "A point light shines everywhere"
+
+
+def test_each_gesture_is_a_tool_that_says_why_it_cannot_begin(addon):
+    groups = [item for item in VIEW3D_PT_tools_active._tools["OBJECT"] if isinstance(item, tuple)]
+    (ours,) = [group for group in groups if getattr(group[0], "idname", "") == "ltsh.drag_highlight_tool"]
+    assert [tool.idname for tool in ours] == [f"{gesture.bl_idname}_tool" for gesture in gestures.GESTURES]
+    texts = []
+    layout = SimpleNamespace(label=lambda text: texts.append(text))
+    ours[0].draw_settings(bpy.context, layout, None)
+    light = parts.add_area_light("Key")
+    bpy.context.view_layer.objects.active = light
+    ours[0].draw_settings(bpy.context, layout, None)
+    light.lock_rotation[0] = True
+    ours[1].draw_settings(bpy.context, layout, None)
+    assert texts == [
+        "No light is active", "Drag the highlight of Key    Wheel: distance",
+        "Key: its location or rotation is locked: unlock it in the tab Item",
+    ]  # fmt: skip

@@ -210,7 +210,8 @@ class Gesture:
             if event.value == "RELEASE" and self._is_dragged:
                 self._end(context)
                 return {"FINISHED" if self.is_changed() else "CANCELLED"}
-            self._is_dragged = event.value == "PRESS" and self._do(context, event, self.press)
+            if event.value in ("PRESS", "DOUBLE_CLICK"):
+                self._is_dragged = self._do(context, event, self.press)
         elif self._is_dragged and event.type in ("WHEELUPMOUSE", "WHEELDOWNMOUSE"):
             self.wheel(FARTHER if event.type == "WHEELUPMOUSE" else 1.0 / FARTHER)
             self._do(context, event, self.follow)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import dataclass
 
@@ -10,7 +11,7 @@ import numpy as np
 from bpy_extras import view3d_utils
 from mathutils import Matrix, Vector
 
-from ...scene import SurfaceSamples
+from ...scene import SurfaceSamples, error_line
 from ...shading.highlight import STENCIL, mirrored, place_for_highlight
 from ..evaluated import EmitterTraits
 from ..lights.area import area_light
@@ -35,6 +36,9 @@ DULL = ("diffuse", "sheen", "velvet", "translucent")
 FOLLOWED = ("MOUSEMOVE", "LEFT_SHIFT", "LEFT_CTRL", "RIGHT_SHIFT", "RIGHT_CTRL")
 NO_PEAK = "no peak of the highlight here: the surface is seen too flat, or is too rough"
 NO_SURFACE = "there is no surface under the mouse"
+
+
+_logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -178,7 +182,10 @@ class Gesture:
         context.workspace.status_text_set(f"{self.words(context)}    Esc: Cancel")
         # A tool starts it by the press itself, a button by its release.
         if event.type == "LEFTMOUSE" and event.value == "PRESS":
-            self._is_dragged = self._do(context, event, self.press)
+            try:
+                self._is_dragged = self._do(context, event, self.press)
+            except Exception as error:
+                return self._failed(context, error)
             if not self._is_dragged:
                 self._end(context)
                 self.report({"WARNING"}, self._note)
@@ -203,6 +210,18 @@ class Gesture:
         return cls.KEYS
 
     def modal(self, context, event):
+        try:
+            return self._answer(context, event)
+        except Exception as error:
+            return self._failed(context, error)
+
+    def _failed(self, context, error: Exception) -> set[str]:
+        _logger.exception("%s failed", self.bl_label)
+        self.cancel(context)
+        self.report({"ERROR"}, f"{self.bl_label}: {error_line(error)}")
+        return {"CANCELLED"}
+
+    def _answer(self, context, event) -> set[str]:
         if event.type in ("ESC", "RIGHTMOUSE"):
             self.cancel(context)
             return {"CANCELLED"}
@@ -253,11 +272,7 @@ class Gesture:
                 area.header_text_set(text)
 
     def _do(self, context, event, step) -> bool:
-        try:
-            is_done = step(context, event)
-        except Exception:
-            self.cancel(context)
-            raise
+        is_done = step(context, event)
         self._tell(context, self._note)
         return is_done
 

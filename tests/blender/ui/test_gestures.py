@@ -163,3 +163,102 @@ def test_each_gesture_is_a_tool_that_says_why_it_cannot_begin(addon):
         "No light is active", "Drag the highlight of Key    Wheel: distance",
         "Key: its location or rotation is locked: unlock it in the tab Item",
     ]  # fmt: skip
+
+
+class Recorded(gestures.Gesture):
+    """A gesture that notes what is asked of it."""
+
+    KEYS, bl_label = "Keys", "Gesture"
+
+    def __init__(self, can_press=True):
+        self.asked, self._can_press = [], can_press
+
+    def press(self, context, event):
+        self.asked.append("press")
+        self._note = "pressed"
+        return self._can_press
+
+    def follow(self, context, event):
+        if event.type == "RIGHT_CTRL":
+            raise RuntimeError("broken")
+        self.asked.append("follow")
+        return True
+
+    def wheel(self, factor):
+        self.asked.append(f"wheel {factor:.3g}")
+
+    def put_back(self):
+        self.asked.append("put back")
+
+    def _hover(self, context, event):
+        self.asked.append("hover")
+        return True
+
+    def report(self, kind, text):
+        self.asked.append(text)
+
+
+def window():
+    """A context that counts what a gesture leaves in the window; (context, what is there)."""
+    there = {"timers": 0, "handlers": 0, "cursors": 0, "status": None, "header": None}
+
+    def more(name, step):
+        return lambda *_, **__: there.update({name: there[name] + step})
+
+    area = SimpleNamespace(type="VIEW_3D", header_text_set=lambda text: there.update(header=text))
+    context = SimpleNamespace(
+        window_manager=SimpleNamespace(
+            event_timer_add=more("timers", 1), event_timer_remove=more("timers", -1),
+            modal_handler_add=more("handlers", 1),
+        ),
+        window=SimpleNamespace(
+            cursor_modal_set=more("cursors", 1), cursor_modal_restore=more("cursors", -1),
+            screen=SimpleNamespace(areas=[area]),
+        ),
+        workspace=SimpleNamespace(status_text_set=lambda text: there.update(status=text)),
+        preferences=bpy.context.preferences,
+    )  # fmt: skip
+    return context, there
+
+
+@pytest.mark.parametrize(("events", "asked", "result"), [
+    # (type, value) of events; what is asked; what the last event returns.
+    (["press", "move", "release"], ["press", "follow"], "FINISHED"),
+    (["press", "move", "ESC"], ["press", "follow", "put back"], "CANCELLED"),
+    (["press", "RIGHTMOUSE"], ["press", "put back"], "CANCELLED"),
+    (["move", "ESC"], [], "CANCELLED"),
+    (["release", "double", "move", "release"], ["press", "follow"], "FINISHED"),
+    (["press", "LEFT_CTRL", "WHEELUPMOUSE", "release"], ["press", "follow", "wheel 1.1", "follow"], "FINISHED"),
+    # Shares are told once where the mouse rests, and not during a drag.
+    (["move", "TIMER", "TIMER", "TIMER", "move", "TIMER", "ESC"], ["hover"], "CANCELLED"),
+    (["move", "TIMER", "press", "TIMER", "TIMER", "release"], ["press"], "FINISHED"),
+])  # fmt: skip
+def test_a_gesture_lasts_from_a_press_to_a_release(events, asked, result):
+    button = {"press": "PRESS", "release": "RELEASE", "double": "DOUBLE_CLICK"}
+    words = {name: ("LEFTMOUSE", value) for name, value in button.items()} | {"move": ("MOUSEMOVE", "NOTHING")}
+    gesture, (context, there) = Recorded(), window()
+    assert gesture.invoke(context, SimpleNamespace(type="LEFTMOUSE", value="RELEASE")) == {"RUNNING_MODAL"}
+    assert there["status"] == "Keys    Esc: Cancel"
+    for event in events:
+        kind, value = words.get(event, (event, "PRESS"))
+        returned = gesture.modal(context, SimpleNamespace(type=kind, value=value))
+    assert gesture.asked == asked and returned == {result}
+    assert there == {"timers": 0, "handlers": 1, "cursors": 0, "status": None, "header": None}
+
+
+def test_a_gesture_of_a_tool_begins_with_the_press_and_says_why_it_cannot():
+    press = SimpleNamespace(type="LEFTMOUSE", value="PRESS")
+    gesture, (context, there) = Recorded(), window()
+    assert gesture.invoke(context, press) == {"RUNNING_MODAL"} and there["header"] == "pressed"
+    assert gesture.modal(context, SimpleNamespace(type="LEFTMOUSE", value="RELEASE")) == {"FINISHED"}
+    gesture, (context, there) = Recorded(can_press=False), window()
+    assert gesture.invoke(context, press) == {"CANCELLED"} and gesture.asked == ["press", "pressed"]
+    assert there == {"timers": 0, "handlers": 0, "cursors": 0, "status": None, "header": None}
+
+
+def test_a_gesture_that_fails_puts_everything_back():
+    gesture, (context, there) = Recorded(), window()
+    gesture.invoke(context, SimpleNamespace(type="LEFTMOUSE", value="PRESS"))
+    assert gesture.modal(context, SimpleNamespace(type="RIGHT_CTRL", value="PRESS")) == {"CANCELLED"}
+    assert gesture.asked == ["press", "put back", "Gesture: broken"]
+    assert there == {"timers": 0, "handlers": 1, "cursors": 0, "status": None, "header": None}

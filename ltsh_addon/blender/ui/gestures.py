@@ -406,9 +406,9 @@ class LTSH_OT_drag_brightness(Gesture, bpy.types.Operator):
         unit = "W/m²" if self._light.data.type == "SUN" else "W"
         text = f"{self._light.name}: {self._power:.4g} to {power:.4g} {unit}"
         if power > 0.0 or factor >= 1.0:
-            text += f"    here {factor:.3g} times as bright, {stops:+.2f} stops"
+            text += f"    here {factor:.3g} times the direct light, {stops:+.2f} stops"
         else:
-            text += f"    off: the other lights leave {1.0 - self._share:.3g} times the brightness here"
+            text += f"    off: the other lights leave {1.0 - self._share:.3g} times the direct light here"
         self._note = f"{text}    before: {self._shares}"
         return True
 
@@ -430,6 +430,12 @@ class LTSH_OT_drag_shadow(MovingGesture, bpy.types.Operator):
     bl_options = {"UNDO"}
     KEYS = "Drag the edge of a shadow of {}"
 
+    @classmethod
+    def reason_against(cls, context) -> str:
+        """As `Gesture.reason_against`."""
+        reason, light = super().reason_against(context), active_light(context)
+        return reason or ("" if light.data.use_shadow else f"{light.name}: its shadows are off")
+
     def press(self, context, event) -> bool:
         """Choose the edge of a shadow near the mouse; False where there is none."""
         region = region_under(context, event.mouse_x, event.mouse_y)
@@ -439,7 +445,7 @@ class LTSH_OT_drag_shadow(MovingGesture, bpy.types.Operator):
         mouse = np.array([event.mouse_x - region.x, event.mouse_y - region.y])
         depsgraph = context.evaluated_depsgraph_get()
         self._edge, self._note = shadow_edge_near(
-            OccluderRays(context.scene, depsgraph),
+            OccluderRays(context.scene, depsgraph, self._light),
             lambda offset: hit_at(context, region, mouse + offset, depsgraph),
             self._pose.matrix, self._light.data.type, NEAR_EDGE * self._scale,
         )  # fmt: skip
@@ -451,7 +457,8 @@ class LTSH_OT_drag_shadow(MovingGesture, bpy.types.Operator):
         if hit is None:
             self._note = NO_SURFACE
             return False
-        place, note = self._edge.light_for(OccluderRays(context.scene, context.evaluated_depsgraph_get()), hit)
+        rays = OccluderRays(context.scene, context.evaluated_depsgraph_get(), self._light)
+        place, note = self._edge.light_for(rays, hit)
         if place is not None:
             self._put(self._pose.facing(*place))
         kind = "Shadow" if self._edge.across is None else "Edge of the shadow"

@@ -12,6 +12,7 @@ from bpy_extras import view3d_utils
 from mathutils import Matrix, Vector
 
 from ...scene import SurfaceSamples, error_line
+from ...shading import shade
 from ...shading.highlight import STENCIL, mirrored, place_for_highlight
 from ..evaluated import EmitterTraits
 from ..lights.area import area_light
@@ -19,7 +20,7 @@ from ..lights.groups import is_animated
 from ..lights.linking import Receivers
 from ..lights.textures import ShownTextures
 from ..materials.preview_material import COAT, METALS, PreviewMaterial, preview_of
-from .lit_point import LightShare, SceneLights, SurfaceHit, share_line, surface_hit, value_at_hit
+from .lit_point import LightShare, SceneLights, SurfaceHit, share_line, shipped_table, surface_hit, value_at_hit
 from .preview import PASSED_ON, active_light, lights_of, region_under
 from .shadow_edge import NEAR_EDGE, OccluderRays, shadow_edge_near
 
@@ -30,11 +31,16 @@ SPACING, FARTHER = 2.0, 1.1
 STOP, PRECISE, SNAPS = 100.0, 0.1, 3
 # REST_SECONDS: after so long without a move the shares of the lights at the mouse are told, which may take a while.
 REST_SECONDS = 0.2
+# RING: pixels from the mouse, in steps of SPACING, where a highlight may not be brighter by more than BRIGHTER.
+_TURNS = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
+RING = np.concatenate([radius * np.stack([np.cos(_TURNS), np.sin(_TURNS)], axis=-1) for radius in (3.0, 6.0, 10.0)])
+BRIGHTER = 0.01
 # Kinds of lobes without a highlight.
 DULL = ("diffuse", "sheen", "velvet", "translucent")
 # FOLLOWED: what a drag follows.
 FOLLOWED = ("MOUSEMOVE", "LEFT_SHIFT", "LEFT_CTRL", "RIGHT_SHIFT", "RIGHT_CTRL")
 NO_PEAK = "no peak of the highlight here: the surface is seen too flat, or is too rough"
+BESIDE = "the surface bends: its highlight beside the mouse is brighter"
 NO_SURFACE = "there is no surface under the mouse"
 
 
@@ -141,8 +147,9 @@ def samples_of(hits: list[SurfaceHit], lobe: PreviewMaterial, textures: ShownTex
 
 
 def place_of(ob, pose: LightPose, hits: list[SurfaceHit], distance: float, textures: ShownTextures) -> tuple:
-    """The matrix of the light object `ob` for a highlight at the middle one of the nine `hits`, or at the only one by
-    its mirrored view; and what there is to say about it."""
+    """The matrix of the light object `ob` for a highlight at the middle one of the nine `hits`, which others of the
+    same surface around may follow, or at the only one by its mirrored view; and what there is to say about it."""
+    hits, others = hits[: len(STENCIL)], hits[len(STENCIL) :]
     hit = hits[len(hits) // 2]
     lobe, receivers = glossy_lobe(hit.material), Receivers([])
 
@@ -155,8 +162,16 @@ def place_of(ob, pose: LightPose, hits: list[SurfaceHit], distance: float, textu
     if lobe is None or len(hits) < len(STENCIL):
         matrix = matrix_at(mirrored(np.array(hit.view), np.array(hit.normal)))
         return matrix, "this surface has no highlight" if lobe is None else ""
-    place = place_for_highlight(samples_of(hits, lobe, textures), light_at)
-    return matrix_at(place.direction), "" if place.is_peak else NO_PEAK
+    place, note = place_for_highlight(samples_of(hits, lobe, textures), light_at, shipped_table()), ""
+    if not place.is_peak:
+        note = NO_PEAK
+    elif others:
+        samples = samples_of([hit, *others], lobe, textures)
+        lights = [light_at(place.direction)]
+        shining = shade(samples, lights, shipped_table(), passes=("specular",), workers=1, dtype=np.float64)
+        here, *around = shining.specular.sum(axis=(0, 2)).tolist()
+        note = BESIDE if max(around) > (1.0 + BRIGHTER) * here else ""
+    return matrix_at(place.direction), note
 
 
 def power_for(factor: float, power: float, share: float) -> float:
@@ -535,12 +550,13 @@ def hit_at(context, region, pixel: tuple[float, float], depsgraph=None) -> Surfa
 
 
 def hits_around(context, region, pixel: tuple[float, float]) -> list[SurfaceHit]:
-    """What the view of a region meets at a pixel and at those of STENCIL around it: nine, one, or none."""
+    """What the view of a region meets at a pixel and at those of STENCIL around it: nine, one, or none. After nine,
+    what it meets of the same surface in the RING."""
     depsgraph = context.evaluated_depsgraph_get()
-    pixels = (np.array(pixel) + SPACING * STENCIL).tolist()
+    pixels = (np.array(pixel) + SPACING * np.concatenate([STENCIL, RING])).tolist()
     hits = [hit_at(context, region, one, depsgraph) for one in pixels]
-    middle = hits[len(hits) // 2]
+    middle = hits[len(STENCIL) // 2]
     if middle is None:
         return []
-    is_one = all(hit is not None and hit.material == middle.material for hit in hits)
-    return hits if is_one else [middle]
+    same = [hit for hit in hits if hit is not None and hit.ob == middle.ob and hit.material == middle.material]
+    return same if same[: len(STENCIL)] == hits[: len(STENCIL)] else [middle]

@@ -183,7 +183,7 @@ def power_for(factor: float, power: float, share: float) -> float:
 class Gesture:
     """A modal operator: a drag with the left button over surfaces changes a light, until the button is released.
 
-    Subclasses have `press`, `follow`, `put_back` and KEYS. The headers of the 3D views tell the share of each light
+    Subclasses have `press`, `follow`, `put_back`, KEYS and the ICON of their tool. The headers of the 3D views tell the share of each light
     where the mouse rests, during a drag what `follow` notes.
     """
 
@@ -350,7 +350,7 @@ class LTSH_OT_drag_highlight(MovingGesture, bpy.types.Operator):
     bl_idname = "ltsh.drag_highlight"
     bl_label = "Drag Highlight"
     bl_options = {"UNDO"}
-    KEYS = "Drag the highlight of {}    Wheel: distance"
+    KEYS, ICON = "Drag the highlight of {}    Wheel: distance", "ops.transform.tosphere"
 
     def wheel(self, factor: float) -> None:
         """Change the distance."""
@@ -383,6 +383,7 @@ class LTSH_OT_drag_brightness(Gesture, bpy.types.Operator):
     bl_label = "Drag Brightness"
     bl_options = {"UNDO"}
     KEYS = "Press on a surface, drag up or down: its brightness follows    Shift: precise    Ctrl: thirds of a stop"
+    ICON = "ops.curve.radius"
 
     @classmethod
     def reason_against(cls, context) -> str:
@@ -443,7 +444,7 @@ class LTSH_OT_drag_shadow(MovingGesture, bpy.types.Operator):
     bl_idname = "ltsh.drag_shadow"
     bl_label = "Drag Shadow"
     bl_options = {"UNDO"}
-    KEYS = "Drag the edge of a shadow of {}"
+    KEYS, ICON = "Drag the edge of a shadow of {}", "ops.transform.shear"
 
     @classmethod
     def reason_against(cls, context) -> str:
@@ -487,7 +488,7 @@ class LTSH_OT_aim_light(MovingGesture, bpy.types.Operator):
     bl_idname = "ltsh.aim_light"
     bl_label = "Aim Light"
     bl_options = {"UNDO"}
-    KEYS = "Press where {} shall shine, and drag"
+    KEYS, ICON = "Press where {} shall shine, and drag", "ops.transform.tilt"
 
     @classmethod
     def reason_against(cls, context) -> str:
@@ -523,7 +524,7 @@ def _tool_of(gesture) -> type:
     return type(f"{gesture.__name__}_tool", (bpy.types.WorkSpaceTool,), {
         "bl_space_type": "VIEW_3D", "bl_context_mode": "OBJECT", "bl_idname": f"{gesture.bl_idname}_tool",
         "bl_label": gesture.bl_label, "bl_description": gesture.__doc__.replace("\n    ", " "),
-        "bl_icon": "ops.generic.cursor", "draw_settings": staticmethod(draw_settings),
+        "bl_icon": gesture.ICON, "draw_settings": staticmethod(draw_settings),
         "bl_keymap": ((gesture.bl_idname, {"type": "LEFTMOUSE", "value": "PRESS"}, None),),
     })  # fmt: skip
 

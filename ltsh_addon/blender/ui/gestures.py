@@ -183,8 +183,8 @@ def power_for(factor: float, power: float, share: float) -> float:
 class Gesture:
     """A modal operator: a drag with the left button over surfaces changes a light, until the button is released.
 
-    Subclasses have `press`, `follow`, `put_back`, KEYS and the ICON of their tool. The headers of the 3D views tell the share of each light
-    where the mouse rests, during a drag what `follow` notes.
+    Subclasses have `press`, `follow`, `put_back`, KEYS and the ICON of their tool. The headers of the 3D views tell the
+    share of each light where the mouse rests, during a drag what `follow` notes.
     """
 
     KEYS = ""  # what the status bar says

@@ -17,6 +17,12 @@ TABLES = ("ltc", "ltsh2", "ltsh4", "ltsh4c")
 WIDTH, HEIGHT = 80, 45
 
 
+CENTER_OF_LIGHT = """(() => {
+    const box = document.getElementById("handle").getBoundingClientRect();
+    return [box.x + box.width / 2, box.y + box.height / 2];
+})()"""
+
+
 @pytest.fixture(scope="session")
 def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("page")
@@ -116,14 +122,11 @@ def test_the_page_draws_what_one_does_with_it_and_needs_no_network(page):
     page.wait_for("[...bench.results.values()].filter(result => result.difference).length === 5", 60)
     errors = {name: page.evaluate(f"bench.results.get('{name}').difference.error") for name in TABLES}
     assert errors["ltsh4c"] < errors["ltsh4"] < errors["ltsh2"] < errors["ltc"] < 0.2
-    place = page.evaluate(
-        "(() => { const box = document.getElementById('handle').getBoundingClientRect();"
-        " return [box.x + box.width / 2, box.y + box.height / 2, bench.state.x]; })()"
-    )
-    page.mouse("pressed", *place[:2])
-    page.mouse("moved", place[0] + 60, place[1])
-    page.mouse("released", place[0] + 60, place[1])
-    assert page.evaluate("bench.scene") == -1 and page.evaluate("bench.state.x") > place[2] + 0.1
+    (x, y), before = page.evaluate(CENTER_OF_LIGHT), page.evaluate("bench.state.x")
+    page.mouse("pressed", x, y)
+    page.mouse("moved", x + 60, y)
+    page.mouse("released", x + 60, y)
+    assert page.evaluate("bench.scene") == -1 and page.evaluate("bench.state.x") > before + 0.1
     page.wait_for("bench.points >= 16 && bench.results.get('ltsh4')?.difference", 60)
     x = page.evaluate("bench.state.x")
     page.evaluate("document.getElementById('picture').focus()")
@@ -133,6 +136,45 @@ def test_the_page_draws_what_one_does_with_it_and_needs_no_network(page):
     assert page.evaluate("[bench.technique, bench.showsError]") == ["ltsh2", True]
     assert page.evaluate("bench.state.x") > x
     assert len(page.requests()) == 1, page.requests()
+
+
+def test_all_errors_are_shown_before_the_stage_is_drawn_finely(page):
+    """What one waits for after a drag comes first, in a frame before; the fine stage has all of its rows."""
+    events = page.evaluate("""(async () => {
+        let frame = 0, events = [];
+        const count = () => { ++frame; counting = requestAnimationFrame(count); };
+        let counting = requestAnimationFrame(count);
+        const own = ["compare", "drawBand"];
+        for (const name of own) {
+            bench[name] = (...given) => (events.push([name, frame]), Bench.prototype[name].apply(bench, given));
+        }
+        bench.show("ltsh4", false);
+        bench.change({ x: bench.state.x - 0.1 });
+        while (bench.stageShows !== "fine") {
+            await new Promise(requestAnimationFrame);
+        }
+        own.forEach(name => delete bench[name]);
+        cancelAnimationFrame(counting);
+        return events;
+    })()""")
+    frames = {name: [frame for kind, frame in events if kind == name] for name in ("compare", "drawBand")}
+    assert len(frames["compare"]) >= 5 and max(frames["compare"][:5]) < min(frames["drawBand"])
+    in_bands, whole = (
+        page.array(
+            f"""(() => {{
+                const target = bench.renderer.target("band", 60, 40);
+                {draw}
+                return bench.renderer.read(target);
+            }})()""",
+            np.float32,
+        )
+        for draw in (
+            "bench.renderer.drawTechnique(bench.technique, bench.content.scenes[2], target);"
+            "bench.state = {...bench.content.scenes[3]}; while (!bench.drawBand(target, 0.15));",
+            "bench.renderer.drawTechnique(bench.technique, bench.content.scenes[3], target);",
+        )
+    )
+    assert (in_bands == whole).all()
 
 
 def test_a_shader_of_ones_own_is_drawn_and_its_errors_name_the_line(page):
@@ -158,12 +200,28 @@ def test_a_shader_of_ones_own_is_drawn_and_its_errors_name_the_line(page):
     assert found[chosen, 0] == pytest.approx(0.5 * bench.RADIANCE * normal[chosen, 2], abs=1e-4)
 
 
+def drag_vertically(page, x, y, way):
+    page.touch("start", (x, y))
+    for step in range(1, 9):
+        page.touch("move", (x, y + way * step / 8))
+    page.touch("end")
+
+
 def test_the_page_fits_a_phone(chromium, folder):
     page = chromium.page(folder / "index.html", 390, 844, touch=True)
     page.wait_for("window.bench")
     assert page.evaluate("document.documentElement.scrollWidth") == 390
     small = page.evaluate("[...document.querySelectorAll('.choice button')].filter(b => b.clientHeight < 32).length")
     assert small == 0
+    # A finger on the light drags it.
+    drag_vertically(page, *page.evaluate(CENTER_OF_LIGHT), 24)
+    assert page.evaluate("[scrollY, bench.scene]") == [0, -1] and page.evaluate("bench.state.z") < 1.1
+    # A finger that scrolls the page changes nothing.
+    page.evaluate("bench.choose(2)")
+    x, y = page.evaluate(CENTER_OF_LIGHT)
+    drag_vertically(page, 390 - x, y + 120, -80)
+    page.wait_for("scrollY > 20 && !bench.isDragging", 10)
+    assert page.evaluate("[bench.scene, bench.state.rise, bench.state.orbit]") == [2, 16, 0]
     page.close()
 
 
@@ -213,6 +271,16 @@ def test_three_js_shades_its_rect_area_lights_by_ltsh(chromium, folder):
     off = np.abs(pixels[inside] - expected)
     # Rounding to 8 bits is .5. The largest, 4.3, are in a row beside the light's own plane.
     assert inside.mean() > 0.4 and np.quantile(off, 0.99) < 1.5 and off.max() < 6.0
+
+
+def test_the_first_picture_gets_as_fine_as_the_stage(chromium, folder):
+    page = chromium.page(folder / "index.html", 600, 900)
+    page.wait_for("window.bench && bench.stageShows === 'fine'")
+    width, drawn_width = page.evaluate(
+        "(({ clientWidth, width }) => [clientWidth, width])(document.getElementById('picture'))"
+    )
+    assert drawn_width == 4 * WIDTH and width > 4 * WIDTH
+    page.close()
 
 
 @pytest.mark.soak

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import math
+import sys
 import time
 import weakref
 
@@ -19,6 +22,8 @@ QUICK_SECONDS = 0.03
 POLL_SECONDS = 0.05
 # After so long without new shadows the processes end that help to trace them.
 IDLE_SECONDS = 60.0
+# FREEING_SECONDS: after a view is left, until Blender has freed its textures.
+FREEING_SECONDS = 0.3
 # Pictures of a view that changes take about FRAME_SECONDS, with a pixel for each of 1, 2 x 2 or 4 x 4. A view that has
 # not changed for MOVING_SECONDS gets all its pixels. Slow ones come WAITING_SECONDS later while they would delay the
 # first shadows or bounces, and are refined HELD_SECONDS later while that delays all pixels of bounces.
@@ -157,9 +162,21 @@ def tag_views() -> None:
                 area.tag_redraw()
 
 
+def view_left() -> None:
+    """Take note that a view is freed: once its textures are too, the system gets their memory back."""
+    if sys.platform == "linux":
+        _start(_give_back_memory, FREEING_SECONDS)
+
+
+def _give_back_memory() -> None:
+    """Let glibc give back what is free: it keeps megabytes of freed textures and samples, the more with each view."""
+    with contextlib.suppress(OSError, AttributeError):  # of other libraries
+        ctypes.CDLL(None).malloc_trim(0)
+
+
 def stop() -> None:
     """End all timers, and all work for views."""
-    for timer in (redraw, _watch_shadows, _end_helpers, _watch_cycles):
+    for timer in (redraw, _watch_shadows, _end_helpers, _watch_cycles, _give_back_memory):
         if bpy.app.timers.is_registered(timer):
             bpy.app.timers.unregister(timer)
     for shadows in live_shadows:

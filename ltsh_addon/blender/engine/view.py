@@ -58,6 +58,7 @@ class EngineView:
         self._world.stop()
         self.rest.stop()
         redraws.open_views.discard(self)
+        redraws.view_left()
         if not redraws.open_views:
             redraws.node_lights.stop()
 

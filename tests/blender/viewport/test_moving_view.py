@@ -1,6 +1,11 @@
 """Views while they move: fewer pixels, drawn between, and shadows that are near at once."""
 
+import gc
+import weakref
+from dataclasses import replace
+
 import bpy
+import gpu
 import numpy as np
 import pytest
 import scene_parts as parts
@@ -9,10 +14,17 @@ from view_pictures import OpenView
 
 from ltsh_addon.blender.engine import redraws
 from ltsh_addon.blender.viewport import shadows
-from ltsh_addon.blender.viewport.drawing import ShadersMissing, float_texture, forget_shaders, new_shaders_until
-from ltsh_addon.blender.viewport.pictures import ShownPicture, ShownRest
+from ltsh_addon.blender.viewport.drawing import (
+    ShadersMissing,
+    float_texture,
+    forget_shaders,
+    new_shaders_until,
+    read_texture,
+)
+from ltsh_addon.blender.viewport.pictures import SampleSum, ShownPicture, ShownRest
 from ltsh_addon.blender.viewport.shadow_rays import ShadowRays, ViewTracer, view_occluders
 from ltsh_addon.blender.viewport.shadows import LiveShadows, ShadowRequest
+from ltsh_addon.lobes.lookup_table import LookupTable
 
 SIZE = (72, 48)
 
@@ -195,3 +207,58 @@ def test_a_drawing_that_has_no_time_compiles_one_shader_and_the_last_one_has_the
     # At least those of two steps of the horizons and of the lighting are missing.
     assert drawings >= 2
     np.testing.assert_array_equal(picture, expected)
+
+
+@edits_with_graphics
+def test_masks_mark_anisotropic_surfaces_and_change_no_picture():
+    """The ball is brushed, floor and wall are not; the shader of anisotropic lobes runs where a mask is 1."""
+    camera = set_up_scene()
+    ball = bpy.data.objects["Sphere"].data.materials[0]
+    ball.node_tree.nodes["Principled BSDF"].inputs["Anisotropic"].default_value = 0.8
+    bpy.context.view_layer.update()
+
+    def draw():
+        with OpenView(camera, SIZE) as opened:
+            opened.draw(ShownPicture("ltsh4", "specular"))
+            layer, lighting = opened.renderer._surfaces, opened.renderer._lighting["ltsh4"]
+            gbuffer = layer.lobe(0, opened.mirror, opened.view, opened.renderer._lights)
+            buffer = gpu.types.GPUFrameBuffer(depth_slot=gbuffer.mask)
+            with buffer.bind():
+                depth = buffer.read_depth(0, 0, *SIZE)
+            depth.dimensions = SIZE[0] * SIZE[1]
+            masks, pictures = np.array(depth).reshape(SIZE[::-1]), []
+            for one in (gbuffer, replace(gbuffer, mask=None)):
+                target = SampleSum(SIZE)
+                lighting.draw(one, target.within(one.mask), "specular", view=opened.view.homogeneous_eye)
+                pictures.append(read_texture(target.texture))
+            return masks, *(read_texture(one)[..., 3] for one in (gbuffer.position, gbuffer.tangent)), *pictures
+
+    mask, receiver, anisotropy, within, without = with_graphics(draw)
+    brushed = anisotropy != 0.0
+    assert 100 < brushed.sum() < 0.5 * brushed.size
+    np.testing.assert_array_equal(mask, np.where(receiver > 0.0, np.where(brushed, 1.0, 0.75), 0.0))
+    np.testing.assert_array_equal(within, without)
+    assert (within[brushed].max(axis=-1) > 0.0).any()
+
+
+@edits_with_graphics
+def test_views_that_are_left_are_freed_at_once_with_their_tables():
+    """The garbage collector, which would free cycles of references, comes late: a table with its weights is 5 MiB."""
+    camera = set_up_scene()
+
+    def left():
+        opened = OpenView(camera, SIZE)
+        opened.draw(ShownPicture("ltsh4c", "combined"))
+        return weakref.ref(opened.renderer)
+
+    def draw():
+        gc.disable()
+        try:
+            views = [left() for _ in range(3)]
+            tables = {id(one) for one in gc.get_objects() if isinstance(one, LookupTable) and one.name == "ltsh4c"}
+            return [view() for view in views], tables
+        finally:
+            gc.enable()
+
+    views, tables = with_graphics(draw)
+    assert views == [None] * 3 and len(tables) == 1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import bpy
 import numpy as np
@@ -444,13 +444,17 @@ class LTSH_OT_drag_shadow(MovingGesture, bpy.types.Operator):
     bl_idname = "ltsh.drag_shadow"
     bl_label = "Drag Shadow"
     bl_options = {"UNDO"}
-    KEYS, ICON = "Drag the edge of a shadow of {}", "ops.transform.shear"
+    KEYS, ICON = "Drag the edge of a shadow of {}    Wheel: distance", "ops.transform.shear"
 
     @classmethod
     def reason_against(cls, context) -> str:
         """As `Gesture.reason_against`."""
         reason, light = super().reason_against(context), active_light(context)
         return reason or ("" if light.data.use_shadow else f"{light.name}: its shadows are off")
+
+    def wheel(self, factor: float) -> None:
+        """Change the distance from what the light faces."""
+        self._edge = replace(self._edge, distance=factor * self._edge.distance)
 
     def press(self, context, event) -> bool:
         """Choose the edge of a shadow near the mouse; False where there is none."""
@@ -478,7 +482,8 @@ class LTSH_OT_drag_shadow(MovingGesture, bpy.types.Operator):
         if place is not None:
             self._put(self._pose.facing(*place))
         kind = "Shadow" if self._edge.across is None else "Edge of the shadow"
-        self._note = f"{kind} of {self._edge.ob.name}" + (f"    {note}" if note else "")
+        far = "" if math.isinf(self._edge.distance) else f"    Distance {self._edge.distance:.3g} m"
+        self._note = f"{kind} of {self._edge.ob.name}{far}" + (f"    {note}" if note else "")
         return True
 
 

@@ -9,14 +9,16 @@ from mathutils import Vector
 
 SIZE = "1400x1000"
 SECONDS = 900
-# Points of the floor: lit, at the edge of the box's shadow, and where that edge is dragged.
-LIT, EDGE, NEW_EDGE = Vector((-1.0, -1.0, 0.0)), Vector((0.9, 0.0, 0.0)), Vector((1.4, 0.3, 0.0))
+# Points of the floor: lit by both lights, at the edge of the box's shadow, and where that edge is dragged.
+LIT, EDGE, NEW_EDGE = Vector((-1.2, 0.8, 0.0)), Vector((0.9, 0.0, 0.0)), Vector((1.4, 0.3, 0.0))
+KEY, RIM = 100.0, 40.0  # W
 
 
 def main(rig):
     hands.patient(rig)
     told = heard()
     built()
+    bpy.context.scene.ltsh_view.bounces = False
     yield from hands.open_panel(rig)
     hands.operate(rig, bpy.ops.ed.undo_push, message="Built")
     yield 1
@@ -27,7 +29,8 @@ def main(rig):
         rig.shot(f"00_{shading}.png")
         yield from brightness(rig, told, shading)
         yield from moved(rig, told, shading, "drag_shadow", EDGE, NEW_EDGE)
-        yield from moved(rig, told, shading, "drag_highlight", LIT, Vector((-0.6, -1.3, 0.0)))
+        yield from moved(rig, told, shading, "drag_highlight", LIT, Vector((-0.9, -0.6, 0.0)))
+    yield from by_tool(rig)
     yield from refused(rig, told)
 
 
@@ -64,7 +67,7 @@ def built():
         ob.location = location
         bpy.context.scene.collection.objects.link(ob)
     # From the key light, at a height of 4, the upper edge of the box at x = 0.5 casts its shadow at x = 0.9.
-    for name, location, power in (("Key", (-0.7, 0.0, 4.0), 400.0), ("Rim", (2.5, 3.0, 3.0), 100.0)):
+    for name, location, power in (("Key", (-0.7, 0.0, 4.0), KEY), ("Rim", (2.5, 3.0, 3.0), RIM)):
         light = bpy.data.objects.new(name, bpy.data.lights.new(name, "AREA"))
         light.location, light.data.energy, light.data.size = location, power, 0.15
         light.rotation_euler = Vector(location).to_track_quat("Z", "Y").to_euler()
@@ -116,7 +119,9 @@ def brightness(rig, told, shading):
         rig.xdo("mousedown", 1)
         yield hands.CLICK_SECONDS
         yield from at(rig, LIT, -round(100 * scale))
-        yield from hands.comes(rig, lambda: power() > 800.0, lambda: f"a stop takes more than twice 400 W: {power()}")
+        yield from hands.comes(
+            rig, lambda: power() > 2.0 * KEY, lambda: f"a stop takes more than twice its power: {power()}"
+        )
         # With Ctrl in thirds of a stop: 60 of 100 pixels are 2/3.
         rig.xdo("keydown", "ctrl")
         yield from at(rig, LIT, -round(60 * scale))
@@ -127,17 +132,17 @@ def brightness(rig, told, shading):
         rig.shot(f"02_{shading}_brighter_{end}.png")
         if end != "release":
             rig.xdo(*(("key", "Escape") if end == "Escape" else ("click", 3)))
-            yield from hands.comes(rig, lambda: power() == 400.0, lambda end=end: f"{end} puts it back: {power()}")
+            yield from hands.comes(rig, lambda: power() == KEY, lambda end=end: f"{end} puts it back: {power()}")
             rig.check(told[-1] is None, "the header is Blender's again")
         rig.xdo("mouseup", 1)
         yield 1
-    rig.check(power() > 500.0 and told[-1] is None, f"{shading}: a release leaves it: {power()}")
+    rig.check(power() > 1.3 * KEY and told[-1] is None, f"{shading}: a release leaves it: {power()}")
     yield from hands.typed(rig, "ctrl+z")
-    yield from hands.comes(rig, lambda: power() == 400.0, lambda: f"{shading}: one undo takes it back: {power()}")
+    yield from hands.comes(rig, lambda: power() == KEY, lambda: f"{shading}: one undo takes it back: {power()}")
     yield from hands.keys(rig, "ctrl+shift+z")
-    yield from hands.comes(rig, lambda: power() > 500.0, lambda: f"and redo brings it: {power()}")
+    yield from hands.comes(rig, lambda: power() > 1.3 * KEY, lambda: f"and redo brings it: {power()}")
     yield from hands.keys(rig, "ctrl+z")
-    yield from hands.until(lambda: power() == 400.0)
+    yield from hands.until(lambda: power() == KEY)
 
 
 def moved(rig, told, shading, name, start, end):
@@ -165,6 +170,33 @@ def moved(rig, told, shading, name, start, end):
     yield from hands.comes(rig, lambda: place() == before, f"{shading}, {name}: one undo takes it back")
 
 
+def by_tool(rig):
+    """The tools of the toolbar: each drag is a gesture, without a click on a button."""
+    hands.operate(rig, bpy.ops.wm.tool_set_by_id, name="ltsh.drag_brightness_tool")
+    for step in (1, 2):
+        yield from at(rig, LIT)
+        rig.xdo("mousedown", 1)
+        yield hands.CLICK_SECONDS
+        yield from at(rig, LIT, -50)
+        rig.xdo("mouseup", 1)
+        yield from hands.comes(
+            rig, lambda step=step: power() > 1.3**step * KEY, lambda: f"a drag by the tool: {power()}"
+        )
+    rig.shot("04_tool.png")
+    yield from hands.typed(rig, "ctrl+z", "ctrl+z")
+    yield from hands.comes(rig, lambda: power() == KEY, lambda: f"two drags are two steps of undo: {power()}")
+    before = place()
+    hands.operate(rig, bpy.ops.wm.tool_set_by_id, name="ltsh.aim_light_tool")
+    bpy.context.view_layer.objects.active = bpy.data.objects["Key"]
+    yield from hands.drag(rig, pixel(rig, LIT), pixel(rig, EDGE))
+    key = bpy.data.objects["Key"].matrix_world
+    way = (EDGE - key.translation).normalized()
+    rig.check(-key.col[2].xyz.normalized().dot(way) > 0.9999, f"the light is aimed: {place()}")
+    yield from hands.typed(rig, "ctrl+z")
+    yield from hands.comes(rig, lambda: place() == before, "one undo takes it back")
+    hands.operate(rig, bpy.ops.wm.tool_set_by_id, name="builtin.select_box")
+
+
 def on_edge(point):
     """True if the line from the light to a point of the floor passes the box by less than 2 cm, or enters it by less:
     the slabs of the box, made larger and smaller."""
@@ -187,9 +219,9 @@ def refused(rig, told):
     rig.xdo("mousedown", 1)
     yield hands.CLICK_SECONDS
     rig.check(told[-1] == "Key: its power is animated or driven", f"it says why not: {told[-1:]}")
-    rig.shot("04_refused.png")
+    rig.shot("05_refused.png")
     rig.xdo("mouseup", 1)
     yield hands.CLICK_SECONDS
     yield from hands.keys(rig, "Escape")
     yield from hands.comes(rig, lambda: told[-1] is None, "Escape ends it")
-    rig.check(power() == 400.0, f"its power stays: {power()}")
+    rig.check(power() == KEY, f"its power stays: {power()}")

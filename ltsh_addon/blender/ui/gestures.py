@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import bpy
 import numpy as np
@@ -183,8 +183,8 @@ def power_for(factor: float, power: float, share: float) -> float:
 class Gesture:
     """A modal operator: a drag with the left button over surfaces changes a light, until the button is released.
 
-    Subclasses have `press`, `follow`, `put_back` and KEYS. The headers of the 3D views tell the share of each light
-    where the mouse rests, during a drag what `follow` notes.
+    Subclasses have `press`, `follow`, `put_back`, KEYS and the ICON of their tool. The headers of the 3D views tell the
+    share of each light where the mouse rests, during a drag what `follow` notes.
     """
 
     KEYS = ""  # what the status bar says
@@ -350,7 +350,7 @@ class LTSH_OT_drag_highlight(MovingGesture, bpy.types.Operator):
     bl_idname = "ltsh.drag_highlight"
     bl_label = "Drag Highlight"
     bl_options = {"UNDO"}
-    KEYS = "Drag the highlight of {}    Wheel: distance"
+    KEYS, ICON = "Drag the highlight of {}    Wheel: distance", "ops.transform.tosphere"
 
     def wheel(self, factor: float) -> None:
         """Change the distance."""
@@ -383,6 +383,7 @@ class LTSH_OT_drag_brightness(Gesture, bpy.types.Operator):
     bl_label = "Drag Brightness"
     bl_options = {"UNDO"}
     KEYS = "Press on a surface, drag up or down: its brightness follows    Shift: precise    Ctrl: thirds of a stop"
+    ICON = "ops.curve.radius"
 
     @classmethod
     def reason_against(cls, context) -> str:
@@ -443,13 +444,17 @@ class LTSH_OT_drag_shadow(MovingGesture, bpy.types.Operator):
     bl_idname = "ltsh.drag_shadow"
     bl_label = "Drag Shadow"
     bl_options = {"UNDO"}
-    KEYS = "Drag the edge of a shadow of {}"
+    KEYS, ICON = "Drag the edge of a shadow of {}    Wheel: distance", "ops.transform.shear"
 
     @classmethod
     def reason_against(cls, context) -> str:
         """As `Gesture.reason_against`."""
         reason, light = super().reason_against(context), active_light(context)
         return reason or ("" if light.data.use_shadow else f"{light.name}: its shadows are off")
+
+    def wheel(self, factor: float) -> None:
+        """Change the distance from what the light faces."""
+        self._edge = replace(self._edge, distance=factor * self._edge.distance)
 
     def press(self, context, event) -> bool:
         """Choose the edge of a shadow near the mouse; False where there is none."""
@@ -477,7 +482,8 @@ class LTSH_OT_drag_shadow(MovingGesture, bpy.types.Operator):
         if place is not None:
             self._put(self._pose.facing(*place))
         kind = "Shadow" if self._edge.across is None else "Edge of the shadow"
-        self._note = f"{kind} of {self._edge.ob.name}" + (f"    {note}" if note else "")
+        far = "" if math.isinf(self._edge.distance) else f"    Distance {self._edge.distance:.3g} m"
+        self._note = f"{kind} of {self._edge.ob.name}{far}" + (f"    {note}" if note else "")
         return True
 
 
@@ -487,7 +493,7 @@ class LTSH_OT_aim_light(MovingGesture, bpy.types.Operator):
     bl_idname = "ltsh.aim_light"
     bl_label = "Aim Light"
     bl_options = {"UNDO"}
-    KEYS = "Press where {} shall shine, and drag"
+    KEYS, ICON = "Press where {} shall shine, and drag", "ops.transform.tilt"
 
     @classmethod
     def reason_against(cls, context) -> str:
@@ -523,7 +529,7 @@ def _tool_of(gesture) -> type:
     return type(f"{gesture.__name__}_tool", (bpy.types.WorkSpaceTool,), {
         "bl_space_type": "VIEW_3D", "bl_context_mode": "OBJECT", "bl_idname": f"{gesture.bl_idname}_tool",
         "bl_label": gesture.bl_label, "bl_description": gesture.__doc__.replace("\n    ", " "),
-        "bl_icon": "ops.generic.cursor", "draw_settings": staticmethod(draw_settings),
+        "bl_icon": gesture.ICON, "draw_settings": staticmethod(draw_settings),
         "bl_keymap": ((gesture.bl_idname, {"type": "LEFTMOUSE", "value": "PRESS"}, None),),
     })  # fmt: skip
 

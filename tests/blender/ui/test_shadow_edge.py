@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import replace
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
@@ -237,3 +238,16 @@ def test_a_light_without_shadows_says_so(scene):
     assert LTSH_OT_drag_shadow.reason_against(bpy.context) == ""
     key.data.use_shadow = False
     assert LTSH_OT_drag_shadow.reason_against(bpy.context) == "Key: its shadows are off"
+
+
+def test_the_wheel_changes_the_distance_and_leaves_the_edge(scene):
+    _, key = board_and_key()
+    camera, kind = Camera(scene), LTSH_OT_drag_shadow
+    edge, _ = edge_at(camera, camera.pixel((2.0 / 3.0, 0.0, 0.0)), key)
+    this, hit = SimpleNamespace(_edge=edge), camera.hit(camera.pixel((1.0, 0.0, 0.0)))
+    for distance in (3.0, 3.3):
+        place, note = this._edge.light_for(rays(key), hit)
+        center = LightPose.of(key).facing(*place).translation
+        assert not note and (center - edge.aim).length == pytest.approx(distance, rel=1e-4)
+        assert center.x == pytest.approx(1.0 - 0.5 * center.z, abs=1e-3)
+        kind.wheel(this, 1.1)

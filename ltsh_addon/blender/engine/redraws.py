@@ -48,11 +48,10 @@ class PixelSize:
     def follow(self, state: tuple, wait: float = 0.0) -> int:
         """The `step` of a view whose camera, surfaces and lights have this state, see `same_state`. A whole picture,
         which would hold up others, waits for so many seconds more."""
-        before, is_first, has_changed = self.step, self._state is None, not same_state(state, self._state)
-        self._state = state
+        before, has_changed, self._state = self.step, not same_state(state, self._state), state
         if has_changed:
             quick = next((one for one in STEPS if self._seconds <= FRAME_SECONDS * one**2), STEPS[-1])
-            self.step, self._changed = 1 if is_first else quick, math.inf  # until it is drawn
+            self.step, self._changed = quick, math.inf  # until it is drawn
         elif time.monotonic() >= self.end + (wait if self.step > 1 else 0.0):
             self.step = 1
         self.is_new |= has_changed or self.step != before
@@ -63,6 +62,10 @@ class PixelSize:
         self._seconds, self.is_new = seconds * self.step**2, False
         if self._changed == math.inf:
             self._changed = time.monotonic()
+
+    def begin_small(self) -> None:
+        """The first picture is not there yet, and should be drawn with few pixels."""
+        self._state, self._seconds = None, math.inf
 
     @property
     def is_slow(self) -> bool:

@@ -32,17 +32,20 @@ def glsl(name: str) -> str:
 
 # Compiled shaders by what they are made from: all views of a session share them.
 _compiled: dict[tuple, object] = {}
-_deadline = [math.inf]  # see `new_shaders_until`
+_deadline, _is_due = [math.inf], [False]  # see `new_shaders_until`; is the next one compiled in any case?
+
+
+SLOW_SECONDS = 0.05  # of one image
 
 
 class ShadersMissing(Exception):
-    """Shaders are missing that the next drawing makes."""
+    """Shaders or images are missing that the next drawing makes."""
 
 
 @contextmanager
 def new_shaders_until(moment: float) -> Iterator[None]:
-    """Within this, once the `moment` has passed (in `time.monotonic`), a shader that has been compiled raises
-    ShadersMissing, so that each drawing compiles one at least; the next one uses it, and drivers compile then again."""
+    """Within this, once the `moment` has passed (in `time.monotonic`), missing shaders raise ShadersMissing, in turn
+    after and before they are compiled: a drawing that compiles one uses none of which drivers compile more then."""
     _deadline[0] = moment
     try:
         yield
@@ -53,10 +56,20 @@ def new_shaders_until(moment: float) -> Iterator[None]:
 def compiled(key: tuple, make: Callable):
     """What `make()` compiles, once for each `key`; needs an active GPU context. Raises ShadersMissing."""
     if key not in _compiled:
-        _compiled[key] = make()
+        if time.monotonic() > _deadline[0] and not _is_due[0]:
+            _is_due[0] = True
+            raise ShadersMissing
+        _compiled[key], _is_due[0] = make(), False
         if time.monotonic() > _deadline[0]:
             raise ShadersMissing
     return _compiled[key]
+
+
+def pause_if_slow(started: float) -> None:
+    """Where drawings may be left to the next one (see `new_shaders_until`), and what was `started` then took so long
+    that the window should answer, raise ShadersMissing."""
+    if _deadline[0] != math.inf and time.monotonic() > max(started + SLOW_SECONDS, _deadline[0]):
+        raise ShadersMissing
 
 
 def forget_shaders() -> None:

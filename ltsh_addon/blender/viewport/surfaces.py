@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 import bpy
@@ -19,6 +20,7 @@ from .drawing import (
     float_table,
     float_texture,
     glsl,
+    pause_if_slow,
     uniform_buffer,
 )
 from .meshes import DEFINES, LOOK_SIZE, albedo_table, blend_table, sheen_table
@@ -214,10 +216,12 @@ class SurfacePass:
 
     def _bind_images(self, shader, shown: ShownLook, slots: tuple[str, ...]) -> None:
         if shown.textures is None:
-            shown.textures = {
-                name: self._missing_image if is_missing(use.image) else gpu.texture.from_image(use.image)
-                for name, use in shown.look.images.items()
-            }
+            shown.textures = {}
+        for name, use in shown.look.images.items():
+            if name not in shown.textures:
+                started, is_lost = time.monotonic(), is_missing(use.image)
+                shown.textures[name] = self._missing_image if is_lost else gpu.texture.from_image(use.image)
+                pause_if_slow(started)
         for name in slots:
             shader.uniform_sampler(f"{name}_image", shown.textures.get(name, self._black_image))
 

@@ -246,10 +246,21 @@ def _interpolate(channels, shape, roughness, theta_coordinate):
 
 
 def load_table(name_or_path: str | Path) -> LookupTable:
-    """A shipped table ("ltc", "ltsh2", "ltsh4" or "ltsh4c"), or the one in a .npz file. Raises TableError."""
-    path = Path(name_or_path)
+    """A shipped table ("ltc", "ltsh2", "ltsh4" or "ltsh4c"), or the one in a .npz file. Raises TableError.
+
+    Shipped tables are loaded once. A user's table may change meanwhile.
+    """
     if str(name_or_path) in SHIPPED_TABLES:
-        path = _tables_folder() / f"{name_or_path}.npz"
+        return _shipped_table(str(name_or_path))
+    return _read_table(name_or_path, Path(name_or_path))
+
+
+@cache
+def _shipped_table(name: str) -> LookupTable:
+    return _read_table(name, _tables_folder() / f"{name}.npz")
+
+
+def _read_table(name_or_path: str | Path, path: Path) -> LookupTable:
     if not path.is_file():
         raise TableError(f"lookup table {name_or_path}: no such file or table; shipped are {', '.join(SHIPPED_TABLES)}")
     try:

@@ -110,6 +110,12 @@ def assert_refused(path, *words):
         assert word in message, message
 
 
+def test_a_shipped_table_is_loaded_once_and_a_users_table_each_time(tmp_path):
+    path = written(tmp_path / "own.npz", *contents("ltsh2"))
+    assert shading.load_table("ltsh2") is shading.load_table("ltsh2")
+    assert shading.load_table(path) is not shading.load_table(path)
+
+
 def test_a_written_table_is_read_back(tmp_path):
     arrays, metadata = contents("ltsh2")
     table = shading.load_table(written(tmp_path / "own.npz", arrays, metadata))

@@ -58,7 +58,7 @@ class WebGpu {
             return (performance.now() - start) / repeats;
         };
         await time(1); // the first also finishes the shader
-        const once = await time(1), took = once < 4 ? await time(16) : once;
+        const once = Math.min(await time(1), await time(1)), took = once < 4 ? await time(16) : once;
         const encoder = device.createCommandEncoder();
         encoder.copyBufferToBuffer(picture, 0, copy, 0, size);
         device.queue.submit([encoder.finish()]);

@@ -108,7 +108,7 @@ def test_webgpu_shades_as_numpy_does(page, number):
 def test_without_webgpu_the_page_is_the_same(chromium, folder):
     page = chromium.page(folder / "index.html", 600, 900)
     page.evaluate("navigator.gpu.requestAdapter = async () => null")
-    page.wait_for("bench.webGpu && document.querySelector('#table td').textContent", 60)
+    page.wait_for("window.bench?.webGpu && document.querySelector('#table td').textContent", 60)
     assert page.evaluate("[bench.webGpu.size, document.querySelectorAll('#table th').length]") == [0, 7]
     assert "WebGPU" not in page.evaluate("document.body.innerText")
     page.close()

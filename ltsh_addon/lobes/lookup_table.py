@@ -38,14 +38,14 @@ WARP_REGULARIZATION = 0.5
 # Below this alpha every surface counts as a mirror at the size of real lights; above it, the warp is invertible.
 MIN_ALPHA = 1e-5
 _MOST_BENT = 1e3
-# Arrays by name, and the least length of each of their axes.
+# Arrays by name, and the least length of each of their axes. Shading needs the first three Fresnel curves.
 _FEWEST = {
     "warp": (2, 2, 3),
-    "coefficients": (2, 2, 2, 1),
-    "fresnel_curves": (2, 2),
+    "coefficients": (2, 2, 3, 1),
+    "fresnel_curves": (3, 2),
     "fresnel_ior": (1,),
-    "fresnel_weights": (1, 2),
-    "average_albedo": (2, 2),
+    "fresnel_weights": (1, 3),
+    "average_albedo": (2, 3),
 }
 _METADATA = {
     "family": str, "degree": int, "name?": str, "brdf?": str, "fresnel_curve_names?": [str], "bend?": [NUMBER],

@@ -189,6 +189,15 @@ def test_arrays_and_metadata_that_make_no_table_are_refused(tmp_path, spoil, wor
     assert_refused(written(tmp_path / "spoiled.npz", arrays, metadata), word)
 
 
+def test_a_table_of_two_fresnel_curves_is_refused(tmp_path):
+    """Engines need no more, see `tables.pack.with_two_curves`; shading takes a third."""
+    arrays, metadata = contents("ltsh2")
+    arrays["fresnel_curves"] = arrays["fresnel_curves"][:2]
+    for key, axis in (("coefficients", 2), ("fresnel_weights", 1), ("average_albedo", 1)):
+        arrays[key] = arrays[key].take([0, 1], axis=axis)
+    assert_refused(written(tmp_path / "two.npz", arrays, metadata), "expected at least (2, 2, 3, 1)")
+
+
 @pytest.mark.parametrize("metadata", [None, "not json {", "[1, 2]", "null"])
 def test_broken_metadata_is_refused(tmp_path, metadata):
     arrays, _ = contents("ltc")

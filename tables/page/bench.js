@@ -19,7 +19,7 @@ const POINTS = 8; // of the reference, in a draw
 const FIRST_POINTS = 16, MOST_POINTS = 4096, LEAST_NOISE = 5e-4;
 const FRAME_MS = 12; // of work in a frame at rest
 const NEXT_FRAME = null; // in place of a task: what follows waits for the next frame
-const STILL_MS = 600, MOVING_MS = 28; // a picture on the stage may take as long
+const STILL_MS = 1000, MOVING_MS = 28; // a picture on the stage may take as long, at rest in bands
 const BAND_MS = 40; // of work on the fine stage at a time: a click need not wait longer
 const LARGEST_STAGE = 4; // times the width of the small pictures
 
@@ -429,6 +429,9 @@ class Bench {
         for (const [scene, name] of this.unranked()) {
             yield () => this.rank(scene, name);
         }
+        if (!this.webGpu) {
+            yield () => this.askWebGpu();
+        }
     }
 
     * differences() {
@@ -441,6 +444,7 @@ class Bench {
 
     compileRest() {
         this.compiled = true;
+        this.renderer.compile("surfaces", this.renderer.text("", this.joined("surfaces")));
         this.renderer.compile("reference", this.renderer.text("", this.joined("reference")));
         for (const name of this.names) {
             if (name !== OWN && name !== this.technique) {
@@ -666,6 +670,27 @@ class Bench {
         this.drawRanks();
     }
 
+    /* The techniques by WebGPU in the first frozen scene: time, and the largest difference from WebGL in 255ths. */
+    async askWebGpu() {
+        this.webGpu = new Map();
+        const scene = this.content.scenes[0], size = [this.width, this.height];
+        const shown = value => 255 * Math.min(value * 2 ** scene.exposure, 1) ** (1 / 2.2);
+        try {
+            const webGpu = await WebGpu.make(this.renderer);
+            for (const name of webGpu ? Object.keys(this.content.tables) : []) {
+                const { pixels, took } = await webGpu.draw(name, scene, ...size);
+                const target = this.renderer.target("rank", ...size);
+                this.renderer.drawTechnique(name, scene, target);
+                const off = this.renderer.read(target).reduce(
+                    (most, value, i) => i % 4 < 3 ? Math.max(most, Math.abs(shown(value) - shown(pixels[i]))) : most, 0);
+                this.webGpu.set(name, { took, off });
+                this.drawRanks();
+            }
+        } catch (error) {
+            element("machine").textContent += ` WebGPU: ${error.message}`;
+        }
+    }
+
     drawRanks() {
         const mean = values => values.reduce((total, value) => total + value, 0) / values.length;
         const median = values => {
@@ -680,8 +705,9 @@ class Bench {
         rows.sort((a, b) => a.median - b.median);
         const table = element("table");
         table.textContent = "";
+        const byGpu = this.webGpu?.size ? ["WebGPU"] : [];
         const head = created(created(table, "thead"), "tr"), body = created(table, "tbody");
-        for (const label of ["", "technique", "median", "worst", "best in", "time", "table"]) {
+        for (const label of ["", "technique", "median", "worst", "best in", "time", ...byGpu, "table"]) {
             created(head, "th", {}, label);
         }
         const best = this.content.scenes.map(
@@ -696,6 +722,11 @@ class Bench {
             created(line, "td", {}, done ? percent(row.worst) : "");
             created(line, "td", {}, done ? `${wins}` : "");
             created(line, "td", {}, done && this.times.has(row.name) ? milliseconds(this.times.get(row.name)) : "");
+            for (const _ of byGpu) {
+                const { took, off } = this.webGpu.get(row.name) ?? {};
+                const title = took ? `${off.toFixed(2)} of 255 beside WebGL at most` : "";
+                created(line, "td", { title }, took ? `${milliseconds(took)}${off < 1 ? "" : ", differs"}` : "");
+            }
             created(line, "td", {}, size ? `${Math.round(size / 1000)} kB` : "–");
         });
     }

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import logging
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import bpy
 import numpy as np
 from bpy_extras import view3d_utils
 from mathutils import Matrix, Vector
 
-from ...scene import SurfaceSamples
+from ...scene import SurfaceSamples, error_line
+from ...shading import shade
 from ...shading.highlight import STENCIL, mirrored, place_for_highlight
 from ..evaluated import EmitterTraits
 from ..lights.area import area_light
@@ -18,8 +20,8 @@ from ..lights.groups import is_animated
 from ..lights.linking import Receivers
 from ..lights.textures import ShownTextures
 from ..materials.preview_material import COAT, METALS, PreviewMaterial, preview_of
-from .lit_point import LightShare, SceneLights, SurfaceHit, share_line, surface_hit, value_at_hit
-from .preview import PASSED_ON, OnActiveLight, active_light, lights_of, region_under
+from .lit_point import LightShare, SceneLights, SurfaceHit, share_line, shipped_table, surface_hit, value_at_hit
+from .preview import PASSED_ON, active_light, lights_of, region_under
 from .shadow_edge import NEAR_EDGE, OccluderRays, shadow_edge_near
 
 # SPACING: pixels between the rays around the cursor. FARTHER: the factor of the distance by a step of the wheel.
@@ -29,12 +31,20 @@ SPACING, FARTHER = 2.0, 1.1
 STOP, PRECISE, SNAPS = 100.0, 0.1, 3
 # REST_SECONDS: after so long without a move the shares of the lights at the mouse are told, which may take a while.
 REST_SECONDS = 0.2
+# RING: pixels from the mouse, in steps of SPACING, where a highlight may not be brighter by more than BRIGHTER.
+_TURNS = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
+RING = np.concatenate([radius * np.stack([np.cos(_TURNS), np.sin(_TURNS)], axis=-1) for radius in (3.0, 6.0, 10.0)])
+BRIGHTER = 0.01
 # Kinds of lobes without a highlight.
 DULL = ("diffuse", "sheen", "velvet", "translucent")
 # FOLLOWED: what a drag follows.
 FOLLOWED = ("MOUSEMOVE", "LEFT_SHIFT", "LEFT_CTRL", "RIGHT_SHIFT", "RIGHT_CTRL")
 NO_PEAK = "no peak of the highlight here: the surface is seen too flat, or is too rough"
+BESIDE = "the surface bends: its highlight beside the mouse is brighter"
 NO_SURFACE = "there is no surface under the mouse"
+
+
+_logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -137,8 +147,9 @@ def samples_of(hits: list[SurfaceHit], lobe: PreviewMaterial, textures: ShownTex
 
 
 def place_of(ob, pose: LightPose, hits: list[SurfaceHit], distance: float, textures: ShownTextures) -> tuple:
-    """The matrix of the light object `ob` for a highlight at the middle one of the nine `hits`, or at the only one by
-    its mirrored view; and what there is to say about it."""
+    """The matrix of the light object `ob` for a highlight at the middle one of the nine `hits`, which others of the
+    same surface around may follow, or at the only one by its mirrored view; and what there is to say about it."""
+    hits, others = hits[: len(STENCIL)], hits[len(STENCIL) :]
     hit = hits[len(hits) // 2]
     lobe, receivers = glossy_lobe(hit.material), Receivers([])
 
@@ -151,8 +162,16 @@ def place_of(ob, pose: LightPose, hits: list[SurfaceHit], distance: float, textu
     if lobe is None or len(hits) < len(STENCIL):
         matrix = matrix_at(mirrored(np.array(hit.view), np.array(hit.normal)))
         return matrix, "this surface has no highlight" if lobe is None else ""
-    place = place_for_highlight(samples_of(hits, lobe, textures), light_at)
-    return matrix_at(place.direction), "" if place.is_peak else NO_PEAK
+    place, note = place_for_highlight(samples_of(hits, lobe, textures), light_at, shipped_table()), ""
+    if not place.is_peak:
+        note = NO_PEAK
+    elif others:
+        samples = samples_of([hit, *others], lobe, textures)
+        lights = [light_at(place.direction)]
+        shining = shade(samples, lights, shipped_table(), passes=("specular",), workers=1, dtype=np.float64)
+        here, *around = shining.specular.sum(axis=(0, 2)).tolist()
+        note = BESIDE if max(around) > (1.0 + BRIGHTER) * here else ""
+    return matrix_at(place.direction), note
 
 
 def power_for(factor: float, power: float, share: float) -> float:
@@ -164,8 +183,8 @@ def power_for(factor: float, power: float, share: float) -> float:
 class Gesture:
     """A modal operator: a drag with the left button over surfaces changes a light, until the button is released.
 
-    Subclasses have `press`, `follow`, `put_back` and KEYS. The headers of the 3D views tell the share of each light
-    where the mouse rests, during a drag what `follow` notes.
+    Subclasses have `press`, `follow`, `put_back`, KEYS and the ICON of their tool. The headers of the 3D views tell the
+    share of each light where the mouse rests, during a drag what `follow` notes.
     """
 
     KEYS = ""  # what the status bar says
@@ -174,16 +193,50 @@ class Gesture:
         self._is_dragged, self._note, self._scene_lights, self._textures = False, "", None, ShownTextures()
         self._scale, self._is_told, self._is_still = context.preferences.system.ui_scale, False, False
         self._timer = context.window_manager.event_timer_add(REST_SECONDS, window=context.window)
-        context.window_manager.modal_handler_add(self)
         context.window.cursor_modal_set("CROSSHAIR")
-        context.workspace.status_text_set(f"{self.KEYS.format(self.light_name(context))}    Esc: Cancel")
+        context.workspace.status_text_set(f"{self.words(context)}    Esc: Cancel")
+        # A tool starts it by the press itself, a button by its release.
+        if event.type == "LEFTMOUSE" and event.value == "PRESS":
+            try:
+                self._is_dragged = self._do(context, event, self.press)
+            except Exception as error:
+                return self._failed(context, error)
+            if not self._is_dragged:
+                self._end(context)
+                self.report({"WARNING"}, self._note)
+                return {"CANCELLED"}
+        context.window_manager.modal_handler_add(self)
         return {"RUNNING_MODAL"}
 
-    def light_name(self, context) -> str:
-        """For KEYS."""
-        return ""
+    @classmethod
+    def poll(cls, context):
+        if reason := cls.reason_against(context):
+            cls.poll_message_set(reason)
+        return not reason
+
+    @classmethod
+    def reason_against(cls, context) -> str:
+        """Why the gesture cannot begin; "" if it can."""
+        return "" if context.mode == "OBJECT" else "Lights are dragged in Object Mode"
+
+    @classmethod
+    def words(cls, context) -> str:
+        """KEYS, with the name of the light."""
+        return cls.KEYS
 
     def modal(self, context, event):
+        try:
+            return self._answer(context, event)
+        except Exception as error:
+            return self._failed(context, error)
+
+    def _failed(self, context, error: Exception) -> set[str]:
+        _logger.exception("%s failed", self.bl_label)
+        self.cancel(context)
+        self.report({"ERROR"}, f"{self.bl_label}: {error_line(error)}")
+        return {"CANCELLED"}
+
+    def _answer(self, context, event) -> set[str]:
         if event.type in ("ESC", "RIGHTMOUSE"):
             self.cancel(context)
             return {"CANCELLED"}
@@ -191,7 +244,8 @@ class Gesture:
             if event.value == "RELEASE" and self._is_dragged:
                 self._end(context)
                 return {"FINISHED" if self.is_changed() else "CANCELLED"}
-            self._is_dragged = event.value == "PRESS" and self._do(context, event, self.press)
+            if event.value in ("PRESS", "DOUBLE_CLICK"):
+                self._is_dragged = self._do(context, event, self.press)
         elif self._is_dragged and event.type in ("WHEELUPMOUSE", "WHEELDOWNMOUSE"):
             self.wheel(FARTHER if event.type == "WHEELUPMOUSE" else 1.0 / FARTHER)
             self._do(context, event, self.follow)
@@ -233,11 +287,7 @@ class Gesture:
                 area.header_text_set(text)
 
     def _do(self, context, event, step) -> bool:
-        try:
-            is_done = step(context, event)
-        except Exception:
-            self.cancel(context)
-            raise
+        is_done = step(context, event)
         self._tell(context, self._note)
         return is_done
 
@@ -263,25 +313,27 @@ class Gesture:
         return None if region is None else hit_at(context, region, (event.mouse_x - region.x, event.mouse_y - region.y))
 
 
-class MovingGesture(OnActiveLight, Gesture):
+class MovingGesture(Gesture):
     """A gesture that moves the active light."""
 
     @classmethod
-    def poll(cls, context):
-        if not super().poll(context):
-            return False
+    def reason_against(cls, context) -> str:
+        """As `Gesture.reason_against`."""
         light = active_light(context)
-        if reason := reason_to_stay(light):
-            cls.poll_message_set(f"{light.name}: {reason}")
-        return not reason
+        if light is None:
+            return "No light is active"
+        reason = reason_to_stay(light)
+        return super().reason_against(context) or (f"{light.name}: {reason}" if reason else "")
+
+    @classmethod
+    def words(cls, context) -> str:
+        """As `Gesture.words`."""
+        return cls.KEYS.format(active_light(context).name)
 
     def invoke(self, context, event):
         self._light = active_light(context)
         self._pose, self._distance = LightPose.of(self._light), 0.0
         return super().invoke(context, event)
-
-    def light_name(self, context) -> str:
-        return self._light.name
 
     def put_back(self) -> None:
         """Put the light back where it was."""
@@ -298,7 +350,7 @@ class LTSH_OT_drag_highlight(MovingGesture, bpy.types.Operator):
     bl_idname = "ltsh.drag_highlight"
     bl_label = "Drag Highlight"
     bl_options = {"UNDO"}
-    KEYS = "Drag the highlight of {}    Wheel: distance"
+    KEYS, ICON = "Drag the highlight of {}    Wheel: distance", "ops.transform.tosphere"
 
     def wheel(self, factor: float) -> None:
         """Change the distance."""
@@ -331,13 +383,12 @@ class LTSH_OT_drag_brightness(Gesture, bpy.types.Operator):
     bl_label = "Drag Brightness"
     bl_options = {"UNDO"}
     KEYS = "Press on a surface, drag up or down: its brightness follows    Shift: precise    Ctrl: thirds of a stop"
+    ICON = "ops.curve.radius"
 
     @classmethod
-    def poll(cls, context):
-        if context.mode != "OBJECT" or not lights_of(context.scene):
-            cls.poll_message_set("The scene has no light, or is not in Object Mode")
-            return False
-        return True
+    def reason_against(cls, context) -> str:
+        """As `Gesture.reason_against`."""
+        return super().reason_against(context) or ("" if lights_of(context.scene) else "The scene has no light")
 
     def press(self, context, event) -> bool:
         """Choose the light; False where none may be changed."""
@@ -371,9 +422,9 @@ class LTSH_OT_drag_brightness(Gesture, bpy.types.Operator):
         unit = "W/m²" if self._light.data.type == "SUN" else "W"
         text = f"{self._light.name}: {self._power:.4g} to {power:.4g} {unit}"
         if power > 0.0 or factor >= 1.0:
-            text += f"    here {factor:.3g} times as bright, {stops:+.2f} stops"
+            text += f"    here {factor:.3g} times the direct light, {stops:+.2f} stops"
         else:
-            text += f"    off: the other lights leave {1.0 - self._share:.3g} times the brightness here"
+            text += f"    off: the other lights leave {1.0 - self._share:.3g} times the direct light here"
         self._note = f"{text}    before: {self._shares}"
         return True
 
@@ -393,7 +444,17 @@ class LTSH_OT_drag_shadow(MovingGesture, bpy.types.Operator):
     bl_idname = "ltsh.drag_shadow"
     bl_label = "Drag Shadow"
     bl_options = {"UNDO"}
-    KEYS = "Drag the edge of a shadow of {}"
+    KEYS, ICON = "Drag the edge of a shadow of {}    Wheel: distance", "ops.transform.shear"
+
+    @classmethod
+    def reason_against(cls, context) -> str:
+        """As `Gesture.reason_against`."""
+        reason, light = super().reason_against(context), active_light(context)
+        return reason or ("" if light.data.use_shadow else f"{light.name}: its shadows are off")
+
+    def wheel(self, factor: float) -> None:
+        """Change the distance from what the light faces."""
+        self._edge = replace(self._edge, distance=factor * self._edge.distance)
 
     def press(self, context, event) -> bool:
         """Choose the edge of a shadow near the mouse; False where there is none."""
@@ -404,7 +465,7 @@ class LTSH_OT_drag_shadow(MovingGesture, bpy.types.Operator):
         mouse = np.array([event.mouse_x - region.x, event.mouse_y - region.y])
         depsgraph = context.evaluated_depsgraph_get()
         self._edge, self._note = shadow_edge_near(
-            OccluderRays(context.scene, depsgraph),
+            OccluderRays(context.scene, depsgraph, self._light),
             lambda offset: hit_at(context, region, mouse + offset, depsgraph),
             self._pose.matrix, self._light.data.type, NEAR_EDGE * self._scale,
         )  # fmt: skip
@@ -416,12 +477,75 @@ class LTSH_OT_drag_shadow(MovingGesture, bpy.types.Operator):
         if hit is None:
             self._note = NO_SURFACE
             return False
-        place, note = self._edge.light_for(OccluderRays(context.scene, context.evaluated_depsgraph_get()), hit)
+        rays = OccluderRays(context.scene, context.evaluated_depsgraph_get(), self._light)
+        place, note = self._edge.light_for(rays, hit)
         if place is not None:
             self._put(self._pose.facing(*place))
         kind = "Shadow" if self._edge.across is None else "Edge of the shadow"
-        self._note = f"{kind} of {self._edge.ob.name}" + (f"    {note}" if note else "")
+        far = "" if math.isinf(self._edge.distance) else f"    Distance {self._edge.distance:.3g} m"
+        self._note = f"{kind} of {self._edge.ob.name}{far}" + (f"    {note}" if note else "")
         return True
+
+
+class LTSH_OT_aim_light(MovingGesture, bpy.types.Operator):
+    """Turn the active light, where it is, to face the point of a surface under the mouse in a 3D view"""
+
+    bl_idname = "ltsh.aim_light"
+    bl_label = "Aim Light"
+    bl_options = {"UNDO"}
+    KEYS, ICON = "Press where {} shall shine, and drag", "ops.transform.tilt"
+
+    @classmethod
+    def reason_against(cls, context) -> str:
+        """As `Gesture.reason_against`."""
+        reason = super().reason_against(context)
+        return reason or ("A point light shines everywhere" if active_light(context).data.type == "POINT" else "")
+
+    def press(self, context, event) -> bool:
+        """Turn the light to the mouse; False where no surface is."""
+        return self.follow(context, event)
+
+    def follow(self, context, event) -> bool:
+        """As `press`."""
+        hit = self.hit_under(context, event)
+        if hit is None:
+            self._note = NO_SURFACE
+            return False
+        way = self._pose.matrix.translation - hit.position
+        self._put(self._pose.facing(hit.position, way.normalized(), way.length))
+        self._note = f"Distance {way.length:.3g} m"
+        return True
+
+
+GESTURES = (LTSH_OT_drag_highlight, LTSH_OT_drag_shadow, LTSH_OT_drag_brightness, LTSH_OT_aim_light)
+# A tool for each of them, in one group of the toolbar.
+_tools: list[type] = []
+
+
+def _tool_of(gesture) -> type:
+    def draw_settings(context, layout, tool):
+        layout.label(text=gesture.reason_against(context) or gesture.words(context))
+
+    return type(f"{gesture.__name__}_tool", (bpy.types.WorkSpaceTool,), {
+        "bl_space_type": "VIEW_3D", "bl_context_mode": "OBJECT", "bl_idname": f"{gesture.bl_idname}_tool",
+        "bl_label": gesture.bl_label, "bl_description": gesture.__doc__.replace("\n    ", " "),
+        "bl_icon": gesture.ICON, "draw_settings": staticmethod(draw_settings),
+        "bl_keymap": ((gesture.bl_idname, {"type": "LEFTMOUSE", "value": "PRESS"}, None),),
+    })  # fmt: skip
+
+
+def register() -> None:
+    """Add the tools."""
+    for gesture in GESTURES:
+        _tools.append(_tool_of(gesture))
+        place = {"separator": True, "group": True} if len(_tools) == 1 else {"after": {_tools[-2].bl_idname}}
+        bpy.utils.register_tool(_tools[-1], **place)
+
+
+def unregister() -> None:
+    """Take them away."""
+    while _tools:
+        bpy.utils.unregister_tool(_tools.pop())
 
 
 def hit_at(context, region, pixel: tuple[float, float], depsgraph=None) -> SurfaceHit | None:
@@ -432,12 +556,13 @@ def hit_at(context, region, pixel: tuple[float, float], depsgraph=None) -> Surfa
 
 
 def hits_around(context, region, pixel: tuple[float, float]) -> list[SurfaceHit]:
-    """What the view of a region meets at a pixel and at those of STENCIL around it: nine, one, or none."""
+    """What the view of a region meets at a pixel and at those of STENCIL around it: nine, one, or none. After nine,
+    what it meets of the same surface in the RING."""
     depsgraph = context.evaluated_depsgraph_get()
-    pixels = (np.array(pixel) + SPACING * STENCIL).tolist()
+    pixels = (np.array(pixel) + SPACING * np.concatenate([STENCIL, RING])).tolist()
     hits = [hit_at(context, region, one, depsgraph) for one in pixels]
-    middle = hits[len(hits) // 2]
+    middle = hits[len(STENCIL) // 2]
     if middle is None:
         return []
-    is_one = all(hit is not None and hit.material == middle.material for hit in hits)
-    return hits if is_one else [middle]
+    same = [hit for hit in hits if hit is not None and hit.ob == middle.ob and hit.material == middle.material]
+    return same if same[: len(STENCIL)] == hits[: len(STENCIL)] else [middle]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, field
 
 import bpy
@@ -13,7 +14,8 @@ from ...cycles.horizons import end_at_horizons_of_cycles
 from ...cycles.lobes import LOBE_AOVS, LOBE_KINDS, SurfaceHits, samples_of_lobes
 from ...cycles.texels import GRAY
 from ...lobes.brdf import dielectric_reflectance
-from ...scene import PolygonLight, SceneError, SurfaceSamples
+from ...lobes.lookup_table import LookupTable, load_table
+from ...scene import DEFAULT_TECHNIQUE, PolygonLight, SceneError, SurfaceSamples
 from ...shading import shade
 from ...visibility import ShadowSampling, trace_visibility
 from ..evaluated import visibility
@@ -69,6 +71,12 @@ def surface_hit(scene, depsgraph, start: Vector, direction: Vector) -> SurfaceHi
     override = depsgraph.view_layer_eval.material_override
     material = override or (slots[min(number, len(slots) - 1)].material if len(slots) else None)
     return SurfaceHit(position, normal, -direction, material, face_normal, uv, ob.original)
+
+
+@functools.cache
+def shipped_table() -> LookupTable:
+    """That of the default technique, read once: each move of the mouse shades."""
+    return load_table(DEFAULT_TECHNIQUE)
 
 
 def value_at_hit(value: Value, hit: SurfaceHit, textures: ShownTextures) -> np.ndarray:
@@ -172,7 +180,7 @@ class SceneLights:
             return []
         samples = samples_at_hit(hit, self.textures, self.receivers.numbers.get(hit.ob.name_full, 0))
         samples, _ = end_at_horizons_of_cycles(samples, lights, np.zeros(len(samples), int))
-        shading = shade(samples, lights, rows=range(len(lights)), workers=1)
+        shading = shade(samples, lights, shipped_table(), rows=range(len(lights)), workers=1)
         radiance = {"specular": shading.specular, "diffuse": shading.diffuse}
         if self.tracing is not None:
             traced = trace_visibility(samples, lights, self.tracing.tracer, ShadowSampling(), workers=self.tracing.pool)

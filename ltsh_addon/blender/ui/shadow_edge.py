@@ -14,6 +14,7 @@ import bpy
 import numpy as np
 from mathutils import Matrix, Vector
 
+from ..lights.linking import linked_objects
 from .lit_point import SurfaceHit
 
 # NEAR_EDGE: pixels, at interface scale 1, within which a press takes the edge of a shadow.
@@ -29,10 +30,15 @@ NO_SHADOW = "no shadow of it is here: press near the edge of one"
 
 
 class OccluderRays:
-    """Rays through a scene."""
+    """Rays through a scene, which what casts no shadow of a light lets through."""
 
-    def __init__(self, scene, depsgraph):
+    def __init__(self, scene, depsgraph, light):
         self._scene, self._depsgraph = scene, depsgraph
+        blockers = light.light_linking.blocker_collection
+        self._linked = None if blockers is None else linked_objects(blockers)
+
+    def _is_blocker(self, ob) -> bool:
+        return ob.visible_shadow and (self._linked is None or self._linked.reach(ob.name_full))
 
     def blocker(self, hit: SurfaceHit, toward: Vector, distance: float, only=None) -> tuple | None:
         """As `first`, from the surface at `hit` on."""
@@ -46,7 +52,7 @@ class OccluderRays:
             is_hit, point, _, _, ob, matrix = self._scene.ray_cast(self._depsgraph, start, toward, distance=distance)
             if not is_hit:
                 return None
-            if ob.original.visible_shadow if only is None else (ob.original, matrix) == only:
+            if self._is_blocker(ob.original) if only is None else (ob.original, matrix) == only:
                 return ob.original, matrix.copy(), point
             way = (point - start).length + LIFT + LIFT_SHARE * point.length
             start, distance = start + way * toward, distance - way

@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import replace
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
@@ -10,7 +11,7 @@ import scene_parts as parts
 from mathutils import Vector
 from mathutils.bvhtree import BVHTree
 
-from ltsh_addon.blender.ui.gestures import LightPose
+from ltsh_addon.blender.ui.gestures import LightPose, LTSH_OT_drag_shadow
 from ltsh_addon.blender.ui.lit_point import surface_hit
 from ltsh_addon.blender.ui.shadow_edge import NEAR_EDGE, NO_SHADOW, OccluderRays, shadow_edge_near
 
@@ -50,14 +51,14 @@ class Camera:
         return np.array(EYE - EYE.z / ray.z * ray)
 
 
-def rays():
-    return OccluderRays(bpy.context.scene, bpy.context.evaluated_depsgraph_get())
+def rays(light):
+    return OccluderRays(bpy.context.scene, bpy.context.evaluated_depsgraph_get(), light)
 
 
 def edge_at(camera, pixel, light):
     bpy.context.view_layer.update()
     return shadow_edge_near(
-        rays(), lambda offset: camera.hit(pixel + offset), light.matrix_world, light.data.type, NEAR_EDGE
+        rays(light), lambda offset: camera.hit(pixel + offset), light.matrix_world, light.data.type, NEAR_EDGE
     )
 
 
@@ -140,7 +141,7 @@ def test_the_edge_of_a_shadow_is_where_the_mouse_is(scene, kind, add, blocks):
         pose, place = LightPose.of(light), None
         edge, note = edge_at(camera, start, light)
         if edge is not None:
-            place, note = edge.light_for(rays(), hit)
+            place, note = edge.light_for(rays(light), hit)
         if place is None:
             reasons.append(note)
             continue
@@ -168,7 +169,7 @@ def test_away_from_edges_the_pressed_place_of_the_object_casts_its_shadow_at_the
     camera = Camera(scene)
     edge, note = edge_at(camera, camera.pixel((0.0, 0.3, 0.0)), key)
     assert not note and edge.across is None and edge.point.z == pytest.approx(1.0, abs=1e-5)
-    place, note = edge.light_for(rays(), camera.hit(camera.pixel((0.5, 0.1, 0.0))))
+    place, note = edge.light_for(rays(key), camera.hit(camera.pixel((0.5, 0.1, 0.0))))
     assert not note
     matrix = LightPose.of(key).facing(*place)
     # From the mouse through the pressed place to the light.
@@ -184,6 +185,12 @@ def test_a_press_without_a_shadow_says_so(scene):
     board.visible_shadow = False
     assert edge_at(camera, camera.pixel((0.0, 0.0, 0.0)), key) == (None, NO_SHADOW)
     board.visible_shadow = True
+    # An object that light linking lets this light pass.
+    others = bpy.data.collections.new("Others")
+    others.objects.link(bpy.data.objects["Floor"])
+    key.light_linking.blocker_collection = others
+    assert edge_at(camera, camera.pixel((0.0, 0.0, 0.0)), key) == (None, NO_SHADOW)
+    key.light_linking.blocker_collection = None
     # Above the horizon, and where the floor faces away.
     facing = "no surface that faces the light is under the mouse"
     assert edge_at(camera, np.array([480.0, 5000.0]), key) == (None, facing)
@@ -198,11 +205,11 @@ def test_what_else_is_in_the_way_is_named(scene):
     assert edge.across is not None and edge.ob.name == "Board"
     parts.add_plane(size=0.4, name="Screen", location=(1.1, 0.0, 0.5))
     bpy.context.view_layer.update()
-    place, note = edge.light_for(rays(), camera.hit(camera.pixel((1.6, -0.1, 0.0))))
+    place, note = edge.light_for(rays(key), camera.hit(camera.pixel((1.6, -0.1, 0.0))))
     assert place is not None and note == "the shadow of Screen is here as well"
     # A ray that passes its aim by more than its distance.
     far = replace(edge, aim=Vector((0.0, 0.0, 9.0)), distance=0.1)
-    (_, _, distance), note = far.light_for(rays(), camera.hit(camera.pixel((1.0, 1.0, 0.0))))
+    (_, _, distance), note = far.light_for(rays(key), camera.hit(camera.pixel((1.0, 1.0, 0.0))))
     assert distance > 1.0 and note == f"its distance becomes {distance:.3g} m"
 
 
@@ -218,8 +225,29 @@ def test_the_shadow_of_one_instance_is_dragged(scene):
     camera = Camera(scene)
     edge, _ = edge_at(camera, camera.pixel((2.0 / 3.0, 0.0, 0.0)), key)
     assert edge.matrix.translation.x == pytest.approx(0.0)
-    place, note = edge.light_for(rays(), camera.hit(camera.pixel((1.0, 0.0, 0.0))))
+    place, note = edge.light_for(rays(key), camera.hit(camera.pixel((1.0, 0.0, 0.0))))
     assert not note
     # The edge of the board at x = 0.5 casts its shadow at x = 1: the light is on that line.
     center = LightPose.of(key).facing(*place).translation
     assert center.x == pytest.approx(1.0 - 0.5 * center.z, abs=1e-3)
+
+
+def test_a_light_without_shadows_says_so(scene):
+    _, key = board_and_key()
+    bpy.context.view_layer.objects.active = key
+    assert LTSH_OT_drag_shadow.reason_against(bpy.context) == ""
+    key.data.use_shadow = False
+    assert LTSH_OT_drag_shadow.reason_against(bpy.context) == "Key: its shadows are off"
+
+
+def test_the_wheel_changes_the_distance_and_leaves_the_edge(scene):
+    _, key = board_and_key()
+    camera, kind = Camera(scene), LTSH_OT_drag_shadow
+    edge, _ = edge_at(camera, camera.pixel((2.0 / 3.0, 0.0, 0.0)), key)
+    this, hit = SimpleNamespace(_edge=edge), camera.hit(camera.pixel((1.0, 0.0, 0.0)))
+    for distance in (3.0, 3.3):
+        place, note = this._edge.light_for(rays(key), hit)
+        center = LightPose.of(key).facing(*place).translation
+        assert not note and (center - edge.aim).length == pytest.approx(distance, rel=1e-4)
+        assert center.x == pytest.approx(1.0 - 0.5 * center.z, abs=1e-3)
+        kind.wheel(this, 1.1)

@@ -30,6 +30,8 @@ def perform(job: dict) -> None:
 
     progress = MessageProgress(send)
     for run in job["runs"]:
+        baked = _BakedObjects(Path(run["output"]), send)
+        progress.watch = baked.follow
         report, complaint = _command(run["arguments"], progress)
         if report is None:
             send({"error": complaint})
@@ -37,12 +39,38 @@ def perform(job: dict) -> None:
         progress("images", 0.0)
         try:
             output = Path(run["output"])
-            folder = display_layers.write(run["arguments"][0], output, report, run["partial"])
+            folder = display_layers.write(run["arguments"][0], output, report, run["partial"], baked.groups)
             display_layers.write_lights(folder, run["arguments"], report, progress)
         except (OSError, ValueError, MemoryError) as error:
             send({"error": str(error) or type(error).__name__})
             return
         send({"result": str(folder)})
+
+
+class _BakedObjects:
+    """Tells the state of the objects of a bake, and shows each as soon as it is done."""
+
+    def __init__(self, output: Path, send):
+        self._output, self._send = output, send
+        self._reports: list[dict] = []
+        self.groups: dict = {}  # of the pictures that are written
+
+    def follow(self, state) -> None:
+        """Take a `TaskState`."""
+        from .pipeline import batch, display_layers
+
+        if state.object is None:
+            return
+        is_bad = state.problem is not None
+        ended = "unchanged" if state.number == 0 else "failed" if is_bad else "done"
+        is_running = state.number > 0 and state.seconds is None
+        if state.report is not None and state.report["objects"]:
+            self._reports.append(state.report)
+            report = batch.joined_bakes(self._reports)
+            if 0 < state.number < state.tasks:
+                folder = display_layers.write("bake", self._output, report, "Not complete: more objects", self.groups)
+                self._send({"result": str(folder)})
+        self._send({"object": state.object, "state": "baking" if is_running else ended})
 
 
 def _command(arguments: list[str], progress) -> tuple[dict | None, str]:

@@ -21,7 +21,7 @@ from ltsh_addon.files import write_bytes
 from ltsh_addon.pipeline.options import table
 from ltsh_addon.shading import SHIPPED_TABLES, TableError, load_table
 
-from . import bench, export, families, fit, header, layouts, optimum, pack, validate
+from . import bench, export, families, fit, header, layouts, optimum, pack, sheen, validate
 from .families import BRDFS
 
 FOLDER = Path(__file__).resolve().parent
@@ -184,7 +184,7 @@ def _fit_all(options) -> int:
 def _fit_pack(options) -> int:
     """Fit all tables of the pack in this process."""
     progress = functools.partial(print, file=sys.stderr, flush=True)
-    channels = {name: pack.fit_table(name, progress) for name in pack.FIRST_LAYERS}
+    channels = {name: pack.fit_table(name, progress) for name in pack.TABLES} | {"sheen": sheen.fit()}
     options.output.mkdir(parents=True, exist_ok=True)
     write_bytes(options.output / pack.PATH.name, header.dds(pack.pack_layers(channels)))
     return 0
@@ -264,6 +264,9 @@ def _validate_pack(options) -> int:
             cells.append([f"{errors.mean:.4f}", f"{errors.median:.4f}", f"{smooth:.4f}",
                           f"{100.0 * errors.albedo_mean:.3f} %", f"{curved:.3f}"])  # fmt: skip
         print(f"| `{name}` | {' | '.join(f'{ours} | {full}' for ours, full in zip(*cells, strict=True))} |", flush=True)
+    found, albedo = sheen.errors(sheen.load_sheen(), options.count)
+    print(f"\nsheen beside that of Cycles: mean {found.mean():.4f}, median {np.median(found):.4f}, "
+          f"albedo {albedo.mean():.4f} (largest {albedo.max():.4f})")  # fmt: skip
     return 0
 
 

@@ -281,7 +281,7 @@ def page_text(tables: dict[str, LookupTable], pictures: list[np.ndarray]) -> str
     payload += b"".join(_high_and_low(blob) for blob in blobs)
     values = {
         "STYLE": _source("bench.css"),
-        "SCRIPT": "\n".join(_source(name) for name in ("renderer.js", "bench.js")),
+        "SCRIPT": "\n".join(_source(name) for name in ("renderer.js", "webgpu.js", "bench.js")),
         "PAYLOAD": base64.b64encode(zlib.compress(payload, 9)).decode(),
     }
     return filled(_source("index.html"), values)
@@ -309,15 +309,27 @@ def _shaders(tables) -> dict[str, str]:
     }  # fmt: skip
     values = {name: _number(value) for name, value in numbers.items()}
     values |= {name: _vector(vector) for name, vector in vectors.items()}
-    shaders = {name: _source(f"{name}.glsl") for name in ("technique", "reference", "display")}
+    shaders = {name: _source(f"{name}.glsl") for name in ("technique", "reference", "display", "surfaces")}
     shaders["surface"] = filled(_source("surface.glsl"), values)
     shaders["display"] = filled(shaders["display"], {"ERROR_COLORS": _error_color_lines()})
     for name, table in tables.items():
         limits = _source("limits.glsl").rstrip() if table.family == "ltsh" else ""
         shaders[f"lobe_{name}"] = filled(_source("lobe.glsl"), {"prefix": name, "LIMITS": limits})
+        shaders[f"wgsl_{name}"] = _wgsl(table)
     for path in sorted(SOURCES.glob("own_*.glsl")):
         shaders[path.stem] = filled(path.read_text(encoding="utf-8"), {"prefix": "ltsh4"})
     return shaders
+
+
+def _wgsl(table: LookupTable) -> str:
+    """The compute shader of a table for WebGPU."""
+    values = {
+        "prefix": table.name,
+        "HEADER": header.wgsl_text(header.header_text(table, table.name, table.name), table.name),
+        "LIMITS": _source("limits.wgsl").rstrip() if table.family == "ltsh" else "",
+        "RADIANCE": _number(RADIANCE),
+    }
+    return filled(_source("lobe.wgsl"), values)
 
 
 def _error_color_lines() -> str:

@@ -21,7 +21,7 @@ from ltsh_addon.lobes.lookup_table import MIN_ALPHA, WARP_REGULARIZATION, Lookup
 from ltsh_addon.scene import VERSION
 from ltsh_addon.shading import load_table
 
-from . import header, layouts, pack
+from . import header, layouts, pack, sheen
 
 _WARP_NAMES = ("A", "B", "C", "tilt")
 
@@ -80,8 +80,7 @@ def export_table(table: LookupTable, name: str, prefix: str, folder: Path) -> li
     """Write the files of a table to `folder`, all or none; returns them. Raises OSError, TableError."""
     about = _about(table, name)
     contents = {
-        f"{name}.h": header.header_text(table, prefix, about).encode("ascii"),
-        f"{name}.wgsl": header.wgsl_text(table, prefix, about).encode("ascii"),
+        **_code(name, header.header_text(table, prefix, about), prefix),
         f"{name}.dds": header.dds(header.half_layers(table)),
     }
     if table.family == "ltc":
@@ -103,16 +102,24 @@ def export_layout(layout: layouts.Layout, given: str, folder: str | os.PathLike)
 
 
 def export_pack(folder: str | os.PathLike) -> list[Path]:
-    """Write the pack (`pack.py`): three array textures, and code for each of its tables. Raises OSError."""
-    textures = np.frombuffer(pack.PATH.read_bytes(), "<f2", offset=148).reshape(-1, pack.SIZE, pack.SIZE, 4)
-    contents = {f"{name}.dds": header.dds(textures[:count]) for name, count in pack.LAYERS.items()}
-    for name, table in pack.load_pack().items():
-        prefix = f"pack_{name}"
-        about = _about(table, prefix) + _ABOUT_PACK.format(size=pack.SIZE, layer=pack.FIRST_LAYERS[name])
-        contents[f"{prefix}.h"] = header.header_text(table, prefix, about).encode("ascii")
-        contents[f"{prefix}.wgsl"] = header.wgsl_text(table, prefix, about).encode("ascii")
+    """Write the pack (`pack.py`): three array textures, and code for each of its tables and sheen. Raises OSError."""
+    contents = {f"{name}.dds": header.dds(pack.layers()[:count]) for name, count in pack.LAYERS.items()}
+    for name, first in pack.FIRST_LAYERS.items():
+        prefix, where = f"pack_{name}", _ABOUT_PACK.format(size=pack.SIZE, layer=first)
+        if name == "sheen":
+            text = header.sheen_text(sheen.load_sheen(), prefix, _about_sheen(prefix) + where)
+        else:
+            table = pack.load_pack()[name]
+            text = header.header_text(table, prefix, _about(table, prefix) + where)
+        contents |= _code(prefix, text, prefix)
     with ExitStack() as stack:
         return _write(contents, _made(folder), stack)
+
+
+def _code(name, text, prefix) -> dict[str, bytes]:
+    """The header of a table and its WGSL, by the name of the file."""
+    texts = {f"{name}.h": text, f"{name}.wgsl": header.wgsl_text(text, prefix)}
+    return {file: content.encode("ascii") for file, content in texts.items()}
 
 
 _ABOUT_PACK = """
@@ -213,13 +220,24 @@ def _curve_names(table) -> list[str]:
 
 def _about(table, name) -> str:
     curves = "\n".join(f"    {number}: {text}" for number, text in enumerate(_curve_names(table)))
-    prefix = identifier(name)
     return f"""\
 {name}: {table.metadata.get("brdf", "a fitted BRDF")}, as linearly transformed lobes ({table.family}).
-Needs C99 or C++; or GLSL 3.30, or GLSL ES 3.00 (WebGL 2) with `precision highp float; precision highp int;`; or HLSL of
-shader model 5. In GLSL and HLSL define the macro {prefix.upper()}_DATA before, in WGSL the function {prefix}_data.
-Made by `python -m tables export` of LTSH {VERSION}.
-Frame: z is the shading normal, the view direction is (sin theta_o, 0, cos theta_o). roughness^2 = alpha of GGX.
+{_needs(identifier(name))} roughness^2 = alpha of GGX.
 Fresnel curves of c, the cosine of the half angle; a reflectance that is a sum of them needs the same sum of integrals:
 {curves}
 Every function is explained where it stands; tables/EXPORT.md of LTSH has examples."""
+
+
+def _about_sheen(name) -> str:
+    return f"""\
+{name}: the microfiber sheen of Cycles, a linearly transformed cosine (Zeltner, Burley and Chiang 2022).
+{_needs(name)} The roughness is Blender's.
+Every function is explained where it stands."""
+
+
+def _needs(prefix) -> str:
+    return f"""\
+Needs C99 or C++; or GLSL 3.30, or GLSL ES 3.00 (WebGL 2) with `precision highp float; precision highp int;`; or HLSL of
+shader model 5. In GLSL and HLSL define the macro {prefix.upper()}_DATA before, in WGSL the function {prefix}_data.
+Made by `python -m tables export` of LTSH {VERSION}.
+Frame: z is the shading normal, the view direction is (sin theta_o, 0, cos theta_o)."""

@@ -29,6 +29,7 @@ from ltsh_addon.shading.header import (
 )
 
 from .pack import SplineTable
+from .sheen import LEAST_A
 
 _TERMS_PER_LINE = 3
 _VALUES_PER_LINE = 8
@@ -37,20 +38,9 @@ TEMPLATE = Path(__file__).with_name("table.h")
 
 def header_text(table: LookupTable, prefix: str, about: str) -> str:
     """The header. `prefix` begins all of its own names; `about` is the text of its first comment."""
-    blocks = data_blocks(table)
-    about = about.encode("ascii", "backslashreplace").decode("ascii").replace("*/", "* /").replace("/*", "/ *")
-    values = {
-        "prefix": prefix,
-        "PREFIX": prefix.upper(),
-        "ABOUT": "\n   ".join(about.splitlines()),
-        "CORE": core_text(),
-        "CONSTANTS": _constants(table, blocks, prefix.upper()),
-        "VALUES": "\n".join(_data_lines(blocks)),
-        "ONE_OVER_PI": float_literal(1.0 / np.pi),
-        "SIXTH": float_literal(1.0 / 6.0),
-    }
+    blocks, values = data_blocks(table), {}
     if table.family == "ltsh":
-        values |= {
+        values = {
             "WEIGHT_LINES": "\n".join(_weight_lines(table.ridge_weights)),
             "BENT_POLYGON": _bent_polygon(table),
             "MOMENT_LINES": "\n".join(f"        {line}" for line in _all_moment_lines(table)),
@@ -59,6 +49,30 @@ def header_text(table: LookupTable, prefix: str, about: str) -> str:
             "LEAST_OF_COSINE": float_literal(0.5 * LEAST_SHARE / np.pi),
         }
     kinds = {table.family, *(["spline"] if isinstance(table, SplineTable) else [])}
+    return _text(kinds, prefix, about, blocks, _constants(table, blocks), values)
+
+
+def sheen_text(coefficients: np.ndarray, prefix: str, about: str) -> str:
+    """The header of the sheen of the pack, from its spline coefficients (R, T, 3)."""
+    rows, columns, channels = coefficients.shape
+    constants = {"ROWS": rows, "COLUMNS": columns, "CHANNELS": channels, "DATA_COUNT": coefficients.size}
+    values = {"LEAST_A": float_literal(LEAST_A)}
+    return _text({"sheen", "spline"}, prefix, about, {"NODES": coefficients.ravel()}, constants, values)
+
+
+def _text(kinds, prefix, about, blocks, constants, values) -> str:
+    about = about.encode("ascii", "backslashreplace").decode("ascii").replace("*/", "* /").replace("/*", "/ *")
+    values = {
+        "prefix": prefix,
+        "PREFIX": prefix.upper(),
+        "ABOUT": "\n   ".join(about.splitlines()),
+        "CORE": core_text(),
+        "CONSTANTS": definitions(constants, prefix.upper()),
+        "VALUES": "\n".join(_data_lines(blocks)),
+        "ONE_OVER_PI": float_literal(1.0 / np.pi),
+        "SIXTH": float_literal(1.0 / 6.0),
+        **values,
+    }
     return filled(_of_kinds(TEMPLATE.read_text(encoding="ascii"), kinds), values)
 
 
@@ -67,9 +81,8 @@ _OWN = "/* What stands above is the same for all tables: leave it out of a secon
 _END_OF_SHADERS = "/* GLSL and HLSL may end here"
 
 
-def wgsl_text(table: LookupTable, prefix: str, about: str) -> str:
-    """The functions of the header in WGSL, without the data."""
-    text = header_text(table, prefix, about)
+def wgsl_text(text: str, prefix: str) -> str:
+    """The functions of a header `text` in WGSL, without the data."""
     text = text[: text.index(_END_OF_SHADERS)]
     core_end = text.index("#elif LTSH_SHARED")
     text = text[:core_end] + f"{_OWN}\n" + text[core_end:]
@@ -77,13 +90,19 @@ def wgsl_text(table: LookupTable, prefix: str, about: str) -> str:
 
 
 def _of_kinds(text, kinds) -> str:
-    """`text` for a kind of tables: keeps one of the two parts between the lines `@if KIND`, `@else` and `@end`."""
-    return re.sub(
-        r"^@if (\w+)\n(.*?)^@else\n(.*?)^@end\n",
-        lambda match: match[2] if match[1] in kinds else match[3],
-        text,
-        flags=re.DOTALL | re.MULTILINE,
-    )
+    """`text` for `kinds` of tables: without the lines that `@if KIND`, `@else` and `@end` leave out."""
+    lines, active = [], []
+    for line in text.splitlines(keepends=True):
+        word, _, kind = line.strip().partition(" ")
+        if word == "@if":
+            active.append(kind in kinds)
+        elif word == "@else":
+            active[-1] = not active[-1]
+        elif word == "@end":
+            active.pop()
+        elif all(active):
+            lines.append(line)
+    return "".join(lines)
 
 
 def data_blocks(table: LookupTable) -> dict[str, np.ndarray]:
@@ -99,20 +118,17 @@ def data_blocks(table: LookupTable) -> dict[str, np.ndarray]:
     return {name: np.asarray(block, dtype=np.float32).ravel() for name, block in blocks.items()}
 
 
-def _constants(table, blocks, prefix) -> str:
+def _constants(table, blocks) -> dict[str, int]:
     sizes = table_sizes(table)
     ends = np.cumsum([0, *(len(block) for block in blocks.values())]).tolist()
-    return definitions(
-        {
-            **sizes,
-            "CHANNELS": sizes["PARAMETERS"] + sizes["CURVES"] * sizes["COEFFICIENTS"],
-            "IOR_COUNT": len(table.fresnel_ior),
-            "COSINE_COUNT": table.fresnel_curves.shape[1],
-            **{f"{name}_OFFSET": start for name, start in zip(blocks, ends, strict=False)},
-            "DATA_COUNT": ends[-1],
-        },
-        prefix,
-    )
+    return {
+        **sizes,
+        "CHANNELS": sizes["PARAMETERS"] + sizes["CURVES"] * sizes["COEFFICIENTS"],
+        "IOR_COUNT": len(table.fresnel_ior),
+        "COSINE_COUNT": table.fresnel_curves.shape[1],
+        **{f"{name}_OFFSET": start for name, start in zip(blocks, ends, strict=False)},
+        "DATA_COUNT": ends[-1],
+    }
 
 
 def _data_lines(blocks):

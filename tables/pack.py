@@ -1,11 +1,11 @@
-"""The pack: LTC, LTSH 2, LTSH 4 and LTSH 4c for F = 1 and (1 - c)^5 in one small array texture of half floats.
+"""The pack: LTC, LTSH 2, sheen, LTSH 4 and LTSH 4c in one small array texture of half floats, for F = 1 and (1 - c)^5.
 
 The shipped tables have 64 x 64 nodes with bilinear interpolation. The pack has 16 x 16 coefficients of cubic B-splines,
 uniform over the same two axes. A spline is smooth everywhere, and so few coefficients suffice.
 
 `python -m tables pack` fits it, starting from the splines closest to the shipped tables: Gauss-Newton on all
 coefficients together, for the same sum of errors as `refine.refine`, at POINTS x POINTS points. The result is
-tables/pack.dds. Channel c of a table is channel c % 4 of layer FIRST_LAYERS[name] + c // 4.
+tables/pack.dds. Channel c of a table is channel c % 4 of layer FIRST_LAYERS[name] + c // 4. `sheen.py` fits sheen.
 """
 
 from __future__ import annotations
@@ -29,8 +29,9 @@ FIRST_DAMPING = 0.1
 NEARLY_EXACT = 1e3  # weight of the albedo in the end, as `refine.ALBEDO_WEIGHT`
 PATH = Path(__file__).with_name("pack.dds")
 # The first layer of each table, and how many layers the three textures have.
-FIRST_LAYERS = {"ltc": 0, "ltsh2": 2, "ltsh4": 6, "ltsh4c": 15}
-LAYERS = {"pack_2": 6, "pack_4": 15, "pack_4c": 25}
+FIRST_LAYERS = {"ltc": 0, "ltsh2": 2, "sheen": 6, "ltsh4": 7, "ltsh4c": 16}
+LAYERS = {"pack_2": 7, "pack_4": 16, "pack_4c": 26}
+TABLES = [name for name in FIRST_LAYERS if name != "sheen"]
 # The four pieces of the cubic B-spline on a unit interval: coefficients of 1, t, t^2, t^3 by tap.
 PIECES = np.array([[1.0, -3.0, 3.0, -1.0], [4.0, 0.0, -6.0, 3.0], [1.0, 3.0, 3.0, -3.0], [0.0, 0.0, 0.0, 1.0]]) / 6.0
 
@@ -50,6 +51,16 @@ def matrix(positions: np.ndarray, size: int = SIZE) -> np.ndarray:
     return rows
 
 
+def splines_at(cosine: np.ndarray, roughness: np.ndarray, *coefficients: np.ndarray):
+    """Yields the values (..., P) of splines with coefficients (SIZE, SIZE, ...), at cosines of theta_o and roughness,
+    (P,) in [0, 1]."""
+    theta = 1.0 - np.sqrt(np.maximum(1.0 - np.arccos(cosine) * (2.0 / np.pi), 0.0))
+    (row, down), (column, right) = taps(roughness), taps(theta)
+    rows, columns = row[:, None, None] + np.arange(4)[:, None], column[:, None, None] + np.arange(4)
+    for values in coefficients:
+        yield np.einsum("pi,pj,pij...->...p", down, right, values[rows, columns].astype(float), optimize=True)
+
+
 class SplineTable(LookupTable):
     """A table whose `warp` and `coefficients` are B-spline coefficients."""
 
@@ -58,13 +69,7 @@ class SplineTable(LookupTable):
 
     def lookup(self, cos_theta_o: np.ndarray, roughness: np.ndarray, curves: int | None = None) -> Lobe:
         cosine, roughness = np.clip(cos_theta_o, 0.0, 1.0), np.clip(roughness, 0.0, 1.0)
-        theta = 1.0 - np.sqrt(np.maximum(1.0 - np.arccos(cosine) * (2.0 / np.pi), 0.0))
-        (row, down), (column, right) = taps(roughness), taps(theta)
-        rows, columns = row[:, None, None] + np.arange(4)[:, None], column[:, None, None] + np.arange(4)
-        warp, coefficients = (
-            np.einsum("pi,pj,pij...->...p", down, right, values[rows, columns].astype(float), optimize=True)
-            for values in (self.warp, self.coefficients[:, :, :curves])
-        )
+        warp, coefficients = splines_at(cosine, roughness, self.warp, self.coefficients[:, :, :curves])
         alpha = np.maximum(roughness * roughness, lookup_table.MIN_ALPHA)
         entries = warp_entries(cosine, alpha, *warp[:3])
         return Lobe(*entries, tilt=warp[3] if len(warp) == 4 else None, coefficients=coefficients)
@@ -86,16 +91,20 @@ def with_two_curves(table: LookupTable) -> LookupTable:
 
 @cache
 def load_pack() -> dict[str, SplineTable]:
-    """The tables of the pack by name."""
-    layers = np.frombuffer(PATH.read_bytes(), "<f2", offset=148).reshape(-1, SIZE, SIZE, 4)
-    return {name: _table(load_table(name), layers[first:]) for name, first in FIRST_LAYERS.items()}
+    """The tables of the pack by name; `sheen.load_sheen` has sheen."""
+    return {name: _table(load_table(name), layers()[FIRST_LAYERS[name] :]) for name in TABLES}
 
 
-def _table(shipped, layers) -> SplineTable:
+def layers() -> np.ndarray:
+    """The layers (N, SIZE, SIZE, 4) of the pack, float16."""
+    return np.frombuffer(PATH.read_bytes(), "<f2", offset=148).reshape(-1, SIZE, SIZE, 4)
+
+
+def _table(shipped, texture) -> SplineTable:
     shipped = with_two_curves(shipped)
     parameters, count = shipped.warp.shape[2], shipped.coefficients.shape[3]
     used = parameters + CURVES * count
-    channels = np.moveaxis(layers, 0, 2).reshape(SIZE, SIZE, -1)[..., :used].astype(np.float32)
+    channels = np.moveaxis(texture, 0, 2).reshape(SIZE, SIZE, -1)[..., :used].astype(np.float32)
     nodes = np.linspace(0.0, 1.0, SIZE), np.linspace(0.0, 1.0, len(shipped.average_albedo))
     average = np.stack([np.interp(*nodes, column) for column in shipped.average_albedo.T], axis=1)
     fields = {name: getattr(shipped, name) for name in LookupTable.__dataclass_fields__}
@@ -108,12 +117,12 @@ def _table(shipped, layers) -> SplineTable:
 
 
 def pack_layers(channels: dict[str, np.ndarray]) -> np.ndarray:
-    """Layers (N, SIZE, SIZE, 4) float16 of the channels (SIZE, SIZE, C) of each table."""
-    layers = np.zeros((LAYERS["pack_4c"], SIZE, SIZE, 4), np.float16)
+    """Layers (N, SIZE, SIZE, 4) float16 of the channels (SIZE, SIZE, C) of each table and of sheen."""
+    texture = np.zeros((LAYERS["pack_4c"], SIZE, SIZE, 4), np.float16)
     for name, first in FIRST_LAYERS.items():
         for channel in range(channels[name].shape[2]):
-            layers[first + channel // 4, :, :, channel % 4] = channels[name][..., channel]
-    return layers
+            texture[first + channel // 4, :, :, channel % 4] = channels[name][..., channel]
+    return texture
 
 
 # The fit:

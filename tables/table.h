@@ -30,6 +30,11 @@
 
 @CORE@
 @CONSTANTS@
+@if sheen
+struct @prefix@_lobe { float albedo; float a; float b; };
+#ifndef LTSH_SHADER
+typedef struct @prefix@_lobe @prefix@_lobe;
+@else
 struct @prefix@_coefficients { float values[@PREFIX@_COEFFICIENTS]; };
 struct @prefix@_weights { float values[@PREFIX@_COEFFICIENTS]; };
 struct @prefix@_moments { float values[@PREFIX@_COEFFICIENTS]; };
@@ -37,6 +42,7 @@ struct @prefix@_moments { float values[@PREFIX@_COEFFICIENTS]; };
 typedef struct @prefix@_coefficients @prefix@_coefficients;
 typedef struct @prefix@_weights @prefix@_weights;
 typedef struct @prefix@_moments @prefix@_moments;
+@end
 #ifndef @PREFIX@_DATA
 LTSH_FUNCTION float @prefix@_data_at(int index);
 #define @PREFIX@_DATA(index) @prefix@_data_at(index)
@@ -60,7 +66,7 @@ LTSH_FUNCTION float @prefix@_tap_weight(int tap, float share)
     return (tap == 0 || tap == 3 ? cube * cube * cube : 1.0f + 3.0f * cube * (1.0f + cube * other)) * @SIXTH@;
 }
 
-/* One channel, of 4 x 4 coefficients. The warp comes first, then @PREFIX@_COEFFICIENTS for every curve. */
+/* One channel, of 4 x 4 coefficients. */
 LTSH_FUNCTION float @prefix@_channel(ltsh_cell cell, int channel)
 {
     int row = cell.node / (@PREFIX@_COLUMNS - 2);
@@ -80,7 +86,7 @@ LTSH_FUNCTION float @prefix@_channel(ltsh_cell cell, int channel)
     return ltsh_make_cell(cos_theta_o, roughness, @PREFIX@_ROWS, @PREFIX@_COLUMNS);
 }
 
-/* One channel, interpolated bilinearly. The warp comes first, then @PREFIX@_COEFFICIENTS for every curve. */
+/* One channel, interpolated bilinearly. */
 LTSH_FUNCTION float @prefix@_channel(ltsh_cell cell, int channel)
 {
     int lower = cell.node * @PREFIX@_CHANNELS + channel;
@@ -92,6 +98,43 @@ LTSH_FUNCTION float @prefix@_channel(ltsh_cell cell, int channel)
 }
 @end
 
+@if sheen
+/* Sheen at the cosine and roughness of a cell: BRDF times cosine = albedo z / pi (a / ((a x + b z)^2 + (a y)^2 + z^2))^2. */
+LTSH_FUNCTION @prefix@_lobe @prefix@_lookup(ltsh_cell cell)
+{
+    @prefix@_lobe lobe;
+    lobe.albedo = ltsh_larger(@prefix@_channel(cell, 0), 0.0f);
+    lobe.a = ltsh_larger(@prefix@_channel(cell, 1), @LEAST_A@);
+    lobe.b = @prefix@_channel(cell, 2);
+    return lobe;
+}
+
+/* BRDF times cosine in sr^-1 at a unit direction; 0 below the horizon. */
+LTSH_FUNCTION float @prefix@_evaluate_lobe(@prefix@_lobe lobe, ltsh_vec3 direction)
+{
+    float x = lobe.a * direction.x + lobe.b * direction.z;
+    float y = lobe.a * direction.y;
+    float ratio = lobe.a / (x * x + y * y + direction.z * direction.z);
+    return @ONE_OVER_PI@ * lobe.albedo * ltsh_larger(direction.z, 0.0f) * ratio * ratio;
+}
+
+/* Integral of the lobe over a polygon in z >= 0. Either winding; never negative. */
+LTSH_FUNCTION float @prefix@_integral(@prefix@_lobe lobe, ltsh_polygon polygon)
+{
+    for (int i = 0; i < polygon.count; ++i) {
+        ltsh_vec3 corner = polygon.corners[i];
+        polygon.corners[i] = ltsh_make_vec3(lobe.a * corner.x + lobe.b * corner.z, lobe.a * corner.y, corner.z);
+    }
+    return lobe.albedo * ltsh_form_factor(polygon);
+}
+
+/* Integral over the part of a polygon above the horizon. Either winding; never negative. */
+LTSH_FUNCTION float @prefix@_integrate_polygon(float cos_theta_o, float roughness, ltsh_polygon polygon)
+{
+    return @prefix@_integral(@prefix@_lookup(@prefix@_cell(cos_theta_o, roughness)), ltsh_clip_to_horizon(polygon));
+}
+@else
+/* The warp. Its numbers are the first channels; @PREFIX@_COEFFICIENTS for every curve follow. */
 LTSH_FUNCTION ltsh_warp @prefix@_lookup_warp(ltsh_cell cell)
 {
     float a = @prefix@_channel(cell, 0);
@@ -291,6 +334,7 @@ LTSH_FUNCTION float @prefix@_dielectric_integral(
     float root = (index - 1.0f) / (index + 1.0f);
     return ltsh_larger(orientation * @prefix@_integral(dielectric, moments), root * root * plain_integral);
 }
+@end
 
 /* GLSL and HLSL may end here, with the #endif of the last line. What follows is for C and C++ only. */
 #ifdef @PREFIX@_DATA_FOLLOWS

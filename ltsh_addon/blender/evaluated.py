@@ -172,8 +172,8 @@ def is_surface(instance) -> bool:
 
 
 def is_rendered(ob) -> bool:
-    """False for curves and texts: a render shows the mesh made from them, which is a separate instance."""
-    return ob.type not in ("CURVE", "FONT", "SURFACE") or isinstance(ob.data, bpy.types.Mesh)
+    """False for curves, texts and metaballs: a render shows the mesh made from them, which is a separate instance."""
+    return ob.type not in ("CURVE", "FONT", "SURFACE", "META") or isinstance(ob.data, bpy.types.Mesh)
 
 
 def owner_of(instance):

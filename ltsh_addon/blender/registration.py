@@ -24,7 +24,7 @@ PARTS = (
     "ui.comparison",
     "ui.panels",
     "ui.mixer",
-    "ui.highlight",
+    "ui.gestures",
 )
 
 # Unregisters everything, last first, even if one part fails.

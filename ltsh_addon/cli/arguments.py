@@ -99,7 +99,11 @@ def add_batch(parser) -> None:
     chosen = parser.add_mutually_exclusive_group()
     for flag, existing, meaning in (
         ("--overwrite", batch.OVERWRITE, "do all again (default)"),
-        ("--resume", batch.RESUME, "keep what the same options and files have made in OUT"),
+        (
+            "--resume",
+            batch.RESUME,
+            "keep what the same options and files have made in OUT; do objects of bakes that changed",
+        ),
         ("--skip-existing", batch.SKIP, "keep what is finished in OUT, whatever made it"),
     ):
         chosen.add_argument(flag, dest="existing", action="store_const", const=existing, help=meaning)

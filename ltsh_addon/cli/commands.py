@@ -11,7 +11,7 @@ from pathlib import Path
 
 from ..files import write_bytes
 from ..imaging import on_screen
-from ..pipeline.batch import Merged, merge, run_tasks
+from ..pipeline.batch import RESUME, Merged, merge, run_tasks
 from ..pipeline.lighting import prepare
 from ..pipeline.options import (
     BakeOptions,
@@ -26,7 +26,7 @@ from ..pipeline.options import (
 )
 from ..pipeline.picture import Baseline
 from ..pipeline.tasks import BatchJob
-from ..scene import SceneError, error_line
+from ..scene import SceneError, error_line, listed
 from ..shading import TableError
 from .arguments import (
     FileJob,
@@ -409,14 +409,17 @@ def do_job(job: BatchJob, arguments, bar, baseline: Baseline | None = None) -> t
     shard = arguments.shard or (1, 1)
 
     def tell(state):
-        if state.seconds is None:
+        bar.watch(state)
+        if state.number and state.seconds is None:
             bar.begin_task(state.number, state.tasks)
-        else:
+        elif state.number:
             bar.end_task(state.name, state.seconds, state.problem is not None)
 
     done = run_tasks(job, shard=shard, existing=arguments.existing, progress=bar, tell=tell)
     if shard[1] == 1:
-        if done.finished_before:
+        if done.kept and job.command == "bake" and arguments.existing == RESUME:
+            bar.remark(f"unchanged, not baked again: {listed(done.kept)}; without --resume all are")
+        elif done.kept:
             bar.remark(f"{done.finished_before} of {done.tasks} tasks were there already")
         return merge_job(job.options.output, arguments, bar, baseline)
     bar.finish()

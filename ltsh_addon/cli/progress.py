@@ -70,6 +70,7 @@ class ProgressBar:
         self._terminal = bool(getattr(stream, "isatty", lambda: False)())
         self._stage, self._line_open = None, False
         self._stage_start = self._fraction = self._last_shown = 0.0
+        self.watch: Callable = lambda state: None  # called with each `TaskState`
 
     def __call__(self, stage: str, fraction: float) -> bool:
         """Show the progress of `stage`, a fraction in [0, 1]. Always returns True, since a bar never stops the work."""

@@ -38,14 +38,14 @@ WARP_REGULARIZATION = 0.5
 # Below this alpha every surface counts as a mirror at the size of real lights; above it, the warp is invertible.
 MIN_ALPHA = 1e-5
 _MOST_BENT = 1e3
-# Arrays by name, and the least length of each of their axes.
+# Arrays by name, and the least length of each of their axes. Shading needs the first three Fresnel curves.
 _FEWEST = {
     "warp": (2, 2, 3),
-    "coefficients": (2, 2, 2, 1),
-    "fresnel_curves": (2, 2),
+    "coefficients": (2, 2, 3, 1),
+    "fresnel_curves": (3, 2),
     "fresnel_ior": (1,),
-    "fresnel_weights": (1, 2),
-    "average_albedo": (2, 2),
+    "fresnel_weights": (1, 3),
+    "average_albedo": (2, 3),
 }
 _METADATA = {
     "family": str, "degree": int, "name?": str, "brdf?": str, "fresnel_curve_names?": [str], "bend?": [NUMBER],
@@ -246,10 +246,21 @@ def _interpolate(channels, shape, roughness, theta_coordinate):
 
 
 def load_table(name_or_path: str | Path) -> LookupTable:
-    """A shipped table ("ltc", "ltsh2", "ltsh4" or "ltsh4c"), or the one in a .npz file. Raises TableError."""
-    path = Path(name_or_path)
+    """A shipped table ("ltc", "ltsh2", "ltsh4" or "ltsh4c"), or the one in a .npz file. Raises TableError.
+
+    Shipped tables are loaded once. A user's table may change meanwhile.
+    """
     if str(name_or_path) in SHIPPED_TABLES:
-        path = _tables_folder() / f"{name_or_path}.npz"
+        return _shipped_table(str(name_or_path))
+    return _read_table(name_or_path, Path(name_or_path))
+
+
+@cache
+def _shipped_table(name: str) -> LookupTable:
+    return _read_table(name, _tables_folder() / f"{name}.npz")
+
+
+def _read_table(name_or_path: str | Path, path: Path) -> LookupTable:
     if not path.is_file():
         raise TableError(f"lookup table {name_or_path}: no such file or table; shipped are {', '.join(SHIPPED_TABLES)}")
     try:

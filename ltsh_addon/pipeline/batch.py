@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from itertools import groupby
 from pathlib import Path
 
@@ -26,19 +26,29 @@ class RunResult:
 
     tasks: int  # all
     done: int  # attempted now
-    finished_before: int  # by an earlier run
+    kept: tuple[str, ...]  # names, or objects of bakes, of those that an earlier run has finished
     problems: tuple[str, ...]
+
+    @property
+    def finished_before(self) -> int:
+        """The number of tasks that an earlier run has finished."""
+        return len(self.kept)
 
 
 @dataclass(frozen=True)
 class TaskState:
-    """Task `number` of `tasks`, counted from 1: it has ended if there are `seconds`, else it begins."""
+    """Task `number` of `tasks`, counted from 1: it has ended if there are `seconds`, else it begins.
+
+    Number 0 is a task that an earlier run has finished.
+    """
 
     number: int
     tasks: int
     name: str
+    object: str | None = None  # of a bake
     seconds: float | None = None
     problem: str | None = None
+    report: dict | None = None  # of a task that has succeeded
 
 
 def run_tasks(
@@ -61,17 +71,20 @@ def run_tasks(
     output = job.options.output
     with no_empty_folder(output), temporary_folder() as folder, shared_blender(folder):
         prepare(job.options)
-        tasks = batch_tasks.tasks_of(job, progress)
+        tell = tell or (lambda state: None)
+        tasks = batch_tasks.tasks_of(job, progress, resumed=existing == RESUME)
         mine = batch_tasks.shard_of(tasks, shard)
         records = _task_records(output, job.command)
-        wanted = [task for task in mine if existing == OVERWRITE or not _is_done(records, task, existing)]
-        problems = []
-        told = len(wanted) < len(mine)
+        kept = {} if existing == OVERWRITE else {task: _finished(records, task, existing) for task in mine}
+        kept = {task: report for task, report in kept.items() if report is not None}
+        wanted, problems = [task for task in mine if task not in kept], []
+        told = bool(kept)
         if told:
             _write_job(job, tasks, existing)
+        for task, report in kept.items():
+            tell(TaskState(0, len(wanted), task.name, task.object, report=report))
         for number, task in enumerate(wanted, 1):
-            if tell is not None:
-                tell(TaskState(number, len(wanted), task.name))
+            tell(TaskState(number, len(wanted), task.name, task.object))
             following = tuple(other.object for other in wanted[number:] if other.unit == task.unit)
             outcome, seconds, files = _attempt(job, task, following, progress, alone=len(tasks) == 1)
             try:
@@ -85,9 +98,10 @@ def run_tasks(
                 raise OSError(outcome.get("problem", str(error))) from error
             wrong = [outcome["problem"]] if "problem" in outcome else outcome["report"].get("problems", [])
             problems += wrong
-            if tell is not None:
-                tell(TaskState(number, len(wanted), task.name, seconds["total"], "; ".join(wrong) or None))
-    return RunResult(len(mine), len(wanted), len(mine) - len(wanted), tuple(problems))
+            state = TaskState(number, len(wanted), task.name, task.object, seconds["total"], "; ".join(wrong) or None)
+            tell(replace(state, report=outcome.get("report")))
+    names = tuple(dict.fromkeys(task.object or task.name for task in kept))
+    return RunResult(len(mine), len(wanted), names, tuple(problems))
 
 
 def _attempt(job, task, following, progress, alone) -> tuple[dict, dict, tuple[str, ...]]:
@@ -103,10 +117,12 @@ def _attempt(job, task, following, progress, alone) -> tuple[dict, dict, tuple[s
         return {"problem": problem}, {"total": time.perf_counter() - start}, ()
 
 
-def _is_done(records, task, existing) -> bool:
+def _finished(records, task, existing) -> dict | None:
+    """The report of a task that need not be done again; None for the others."""
     record = records.whole(task.name, task.key if existing == RESUME else None)
+    report = None if record is None else record.get("report")
     # Tasks with problems are done again: their cause may be gone.
-    return record is not None and "report" in record and not record["report"].get("problems")
+    return None if report is None or report.get("problems") else report
 
 
 def _perform(
@@ -224,12 +240,7 @@ def _unit(job, output, tasks, finished, progress) -> tuple[str, dict] | None:
     reports = [record["report"] for record in records]
     if job["command"] != "bake":
         return tasks[0].name, reports[0] if job["single"] else {"files": files, **reports[0]}
-    report = {
-        **reports[0],
-        "objects": _objects(item for one in reports for item in one["objects"]),
-        "problems": list(dict.fromkeys(line for one in reports for line in one["problems"])),
-        "warnings": grouped(line for one in reports for line in one["warnings"]),
-    }
+    report = joined_bakes(reports)
     if job["applied_layer"] and report["objects"]:
         report["applied"] = bake_files.apply_textures(
             Path(tasks[0].scene), output, report, job["applied_layer"], progress
@@ -241,13 +252,18 @@ def _unit(job, output, tasks, finished, progress) -> tuple[str, dict] | None:
     return name, report if job["single"] else {"files": files, **report}
 
 
-def _objects(items) -> list[dict]:
-    """The reports of objects, merged so that each object comes once with all of its tiles."""
+def joined_bakes(reports: list[dict]) -> dict:
+    """The report of a bake from those of its tasks, in which each object comes once with all of its tiles."""
     objects: dict[str, dict] = {}
-    for item in items:
+    for item in (item for one in reports for item in one["objects"]):
         known = objects.setdefault(item["name"], {**item, "tiles": {}})
         known["tiles"] |= item["tiles"]
-    return list(objects.values())
+    return {
+        **reports[0],
+        "objects": list(objects.values()),
+        "problems": list(dict.fromkeys(line for one in reports for line in one["problems"])),
+        "warnings": grouped(line for one in reports for line in one["warnings"]),
+    }
 
 
 def _different_versions(records) -> list[str]:

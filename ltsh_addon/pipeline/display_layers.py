@@ -22,19 +22,19 @@ LABELS = {CYCLES: "Cycles", **{name: technique.label for name, technique in TECH
 FILES = {"shade": "shade.exr", "compare": "compare.exr"}
 
 
-def write(command: str, output: Path, report: dict, partial: str = "") -> Path:
+def write(command: str, output: Path, report: dict, partial: str = "", groups: dict | None = None) -> Path:
     """Write OUT/images/<layer>.exr and index.json for the results of `command` in `output`; returns the folder.
 
-    `partial` says what is missing; empty: nothing.
+    `partial` says what is missing; empty: nothing. `groups` has the pictures of objects that are there already; those
+    of the others are added to it.
     """
     folder = output / FOLDER
     folder.mkdir(parents=True, exist_ok=True)
     if command == "bake":
-        groups = {}
-        for record in report["objects"]:
-            for tile in record["tiles"].values():
-                path = output / tile["file"]
-                groups[path.stem] = _group(path, folder, f"{path.stem}.", {})
+        groups = {} if groups is None else groups
+        paths = (output / tile["file"] for record in report["objects"] for tile in record["tiles"].values())
+        for path in (path for path in paths if path.stem not in groups):
+            groups[path.stem] = _group(path, folder, f"{path.stem}.", {})
     else:
         groups = {"": _group(output / FILES[command], folder, "", report["passes"])}
     index = {"command": command, "partial": partial, "groups": groups, "report": report}

@@ -10,7 +10,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +22,6 @@ from ..imaging.exr import unique_names
 from ..scene import (
     CYCLES,
     REFERENCE,
-    SHIPPED_TABLES,
     TECHNIQUES,
     Cancelled,
     Film,
@@ -271,11 +269,7 @@ def load_tables(techniques: Sequence[str | shading.OwnTechnique]) -> dict[str, S
 def _table(given) -> Shader:
     if shading.is_own(given) or given == REFERENCE:
         return given
-    # Shipped tables are cached: a job of many frames loads them for each. A user's table may change meanwhile.
-    return _shipped_table(given) if given in SHIPPED_TABLES else shading.load_table(given)
-
-
-_shipped_table = cache(shading.load_table)
+    return shading.load_table(given)
 
 
 def technique_names(techniques: Sequence[str | shading.OwnTechnique]) -> dict[str, str | shading.OwnTechnique]:

@@ -19,7 +19,7 @@ from ..imaging import write_json
 from ..reading import Malformed, check, file_name, read_json, some
 from ..scene import ATLAS, VERSION, Cancelled, Progress, shortened
 from . import lightmap
-from .options import what_matters
+from .options import child_job, what_matters
 
 FOLDER = ".ltsh"
 FORMAT = 1
@@ -154,8 +154,10 @@ class NameClash(ValueError):
     """Several tasks would get the same name, or one gets a name that is too long."""
 
 
-def tasks_of(job: BatchJob, progress=None) -> list[BatchTask]:
+def tasks_of(job: BatchJob, progress=None, *, resumed: bool = False) -> list[BatchTask]:
     """All tasks of `job`. Opens the files in Blender if tasks or names depend on their contents.
+
+    Where the job is `resumed`, it is told if changes cannot be judged object by object.
 
     Raises NameClash where two tasks would write the same file, or a name is too long, SceneError, OSError.
     """
@@ -169,7 +171,8 @@ def tasks_of(job: BatchJob, progress=None) -> list[BatchTask]:
         facts = _facts(job, scene, progress)
         if job.command == "bake":
             _announce(job.options, max((of_frame["lights"] for of_frame in facts), default=0), progress)
-        contents = contents_digest(replace(job.options, scene=Path(scene)))
+            if (unknown := facts[0]["not_judged"]) and resumed and progress is not None:
+                progress.remark(f"{unknown}: all objects are baked again, unless {scene} is the same file")
         for camera, camera_stem in zip(job.cameras or (None,), camera_stems, strict=True):
             for frame, of_frame in zip(job.frames or (None,), facts, strict=True):
                 fields = {
@@ -177,7 +180,7 @@ def tasks_of(job: BatchJob, progress=None) -> list[BatchTask]:
                     "camera": camera_stem or file_stems([of_frame.get("camera") or "camera"])[0],
                     "frame": of_frame.get("frame", 0) if frame is None else frame,
                 }
-                tasks += _tasks(job, (scene, camera, frame), fields, of_frame, contents)
+                tasks += _tasks(job, (scene, camera, frame), fields, of_frame)
     _check_names(job, tasks)
     return tasks
 
@@ -198,28 +201,34 @@ def shard_of(tasks: list[BatchTask], shard: tuple[int, int]) -> list[BatchTask]:
 
 def _facts(job, scene, progress) -> list[dict]:
     """Facts of the file per frame: camera, frame, objects and tiles. Empty dicts where none are needed."""
-    from ..blender.process.bake import scene_facts
+    from ..blender.process.bake import BakeFactsJob, scene_facts
 
     fields = fields_of(job.pattern)
     unknown = ("camera" in fields and not job.cameras) or ("frame" in fields and not job.frames)
     if job.command != "bake" and not unknown:
         return [{}] * max(len(job.frames), 1)
-    objects, uv = (job.options.objects, job.options.uv) if job.command == "bake" else (None, None)
-    frames, scripts = job.frames or (None,), job.options.scripts
-    return scene_facts(Path(scene), frames, objects, uv, scripts=scripts, progress=progress)
+    frames, options = list(job.frames or (None,)), job.options
+    if job.command != "bake":
+        return scene_facts(BakeFactsJob(Path(scene), frames, scripts=options.scripts), progress=progress)
+    return scene_facts(child_job(BakeFactsJob, options, scene=Path(scene), frames=frames), progress=progress)
 
 
-def _tasks(job, unit, fields, facts, contents) -> list[BatchTask]:
+def _tasks(job, unit, fields, facts) -> list[BatchTask]:
     """The tasks of one scene, camera and frame: one picture, or one per object or UDIM tile of a bake."""
     scene, camera, frame = unit
-    key = options_digest(job.command, replace(job.options, scene=Path(scene), camera=camera, frame=frame), contents)
+    options = replace(job.options, scene=Path(scene), camera=camera, frame=frame)
     if job.command != "bake":
+        key = options_digest(job.command, options, contents_digest(options))
         return [BatchTask(str(scene), camera, frame, None, job.pattern.format(**fields), key)]
-    is_atlas = job.options.atlas is not None
+    is_atlas, digests = job.options.atlas is not None, facts["digests"]
     tasks, objects = [], [ATLAS] if is_atlas else list(dict.fromkeys(facts["objects"]))
     for name, stem in zip(objects, file_stems(objects), strict=True):
         stem = job.pattern.format(**fields, object=stem)
         tiles = () if is_atlas else facts["tiles"].get(name, ())
+        surfaces = (
+            " ".join(digests[member] for member in facts["objects"]) if is_atlas and digests else digests.get(name)
+        )
+        key = options_digest("bake", options, contents_digest(options, surfaces))
         tasks += [BatchTask(str(scene), camera, frame, name, f"{stem}.{tile}", key, tile) for tile in tiles]
         tasks += [] if tiles else [BatchTask(str(scene), camera, frame, name, stem, key)]
     return tasks
@@ -331,10 +340,13 @@ def options_digest(command: str, options, contents: str) -> str:
     return hashlib.sha256(json.dumps(matters, sort_keys=True, default=str).encode()).hexdigest()
 
 
-def contents_digest(options) -> str:
-    """Digest of the files that a task reads: the scene and tables. Libraries and textures of the scene do not count."""
-    tables = [Path(name) for name in options.techniques if name.endswith(".npz")]
-    return " ".join(_known_digest(path) for path in (Path(options.scene), *tables))
+def contents_digest(options, surfaces: str | None = None) -> str:
+    """Digest of what a task reads: tables, and `surfaces`, the digest of what an object depends on.
+
+    None: the file of the scene. Its libraries and textures do not count then.
+    """
+    tables = [_known_digest(Path(name)) for name in options.techniques if name.endswith(".npz")]
+    return " ".join([surfaces or _known_digest(Path(options.scene)), *tables])
 
 
 def _known_digest(path: Path) -> str:

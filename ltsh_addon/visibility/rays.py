@@ -225,6 +225,10 @@ class _Scene:
         embree.AttachGeometry(scene, geometry)
         embree.ReleaseGeometry(geometry)
 
+    def __del__(self):
+        # Views drop tracers that a thread may still use.
+        self.close()
+
     def close(self) -> None:
         while self._scenes:
             self._embree.ReleaseScene(self._scenes.pop(0))

@@ -18,7 +18,9 @@ const ERROR_SCALE = 0.1; // of white
 const POINTS = 8; // of the reference, in a draw
 const FIRST_POINTS = 16, MOST_POINTS = 4096, LEAST_NOISE = 5e-4;
 const FRAME_MS = 12; // of work in a frame at rest
-const STILL_MS = 600, MOVING_MS = 28; // a picture on the stage may take as long
+const NEXT_FRAME = null; // in place of a task: what follows waits for the next frame
+const STILL_MS = 1000, MOVING_MS = 28; // a picture on the stage may take as long, at rest in bands
+const BAND_MS = 40; // of work on the fine stage at a time: a click need not wait longer
 const LARGEST_STAGE = 4; // times the width of the small pictures
 
 const element = id => document.getElementById(id);
@@ -260,12 +262,13 @@ class Bench {
 
     listen() {
         const view = element("view");
-        let last = null, isLight = false;
+        let last = null, isLight = false, before = null;
         view.addEventListener("pointerdown", event => {
             if (event.button !== 0) {
                 return;
             }
-            isLight = event.target.id === "halo" || this.isOverLight(event);
+            isLight = ["halo", "outline"].includes(event.target.id);
+            before = { scene: this.scene, state: { ...this.state } };
             last = [event.clientX, event.clientY];
             this.isDragging = true;
             view.setPointerCapture(event.pointerId);
@@ -288,6 +291,8 @@ class Bench {
                 this.change({ orbit: (orbit + 540) % 360 - 180, rise });
             }
         });
+        // A finger on the light does not scroll. `touch-action` is not enough: Chromium does not heed it inside of SVG.
+        element("overlay").addEventListener("touchstart", event => event.preventDefault(), { passive: false });
         const end = () => {
             if (this.isDragging) {
                 this.isDragging = false;
@@ -297,7 +302,13 @@ class Bench {
             }
         };
         view.addEventListener("pointerup", end);
-        view.addEventListener("pointercancel", end);
+        view.addEventListener("pointercancel", () => { // the finger scrolls the page
+            if (this.isDragging) {
+                Object.assign(this, before);
+                this.changed();
+                end();
+            }
+        });
         element("picture").addEventListener("keydown", event => {
             const step = event.shiftKey ? 0.2 : 0.05;
             const moves = {
@@ -323,17 +334,6 @@ class Bench {
         this.renderer.canvas.addEventListener("webglcontextlost", () => trouble("The graphics card has stopped; load the page again."));
     }
 
-    isOverLight(event) {
-        const box = element("view").getBoundingClientRect();
-        const x = 1600 * (event.clientX - box.left) / box.width, y = 900 * (event.clientY - box.top) / box.height;
-        const [, ...corners] = this.projectedLight();
-        const sides = corners.map(([ax, ay], i) => {
-            const [bx, by] = corners[(i + 1) % 4];
-            return (bx - ax) * (y - ay) - (by - ay) * (x - ax);
-        });
-        return sides.every(side => side > 0) || sides.every(side => side < 0);
-    }
-
     // What is drawn when:
 
     wake() {
@@ -351,7 +351,16 @@ class Bench {
             this.frameRequest ?? this.wakeLater();
             return;
         }
+        let isFirst = true;
         for (const task of this.tasks()) {
+            if (task === NEXT_FRAME) {
+                if (isFirst) {
+                    continue;
+                }
+                this.wake();
+                return;
+            }
+            isFirst = false;
             task();
             if (performance.now() - start > FRAME_MS) {
                 this.wake();
@@ -401,7 +410,11 @@ class Bench {
             yield () => this.addPoints();
         }
         yield* this.differences();
-        if (this.stageShows !== "fine") {
+        yield NEXT_FRAME; // show all errors before the fine stage
+        if (this.results.has(this.technique) && !this.times.has(this.technique)) {
+            yield () => this.takeTime(this.technique);
+        }
+        while (this.stageShows !== "fine" && this.canDraw(this.technique)) {
             yield () => this.drawStage(false, true);
         }
         for (const name of this.names) {
@@ -416,6 +429,9 @@ class Bench {
         for (const [scene, name] of this.unranked()) {
             yield () => this.rank(scene, name);
         }
+        if (!this.webGpu) {
+            yield () => this.askWebGpu();
+        }
     }
 
     * differences() {
@@ -428,6 +444,7 @@ class Bench {
 
     compileRest() {
         this.compiled = true;
+        this.renderer.compile("surfaces", this.renderer.text("", this.joined("surfaces")));
         this.renderer.compile("reference", this.renderer.text("", this.joined("reference")));
         for (const name of this.names) {
             if (name !== OWN && name !== this.technique) {
@@ -471,7 +488,7 @@ class Bench {
             return;
         }
         const one = this.times.get(name) ?? (isMoving ? MOVING_MS : STILL_MS);
-        const wanted = Math.max(canvas.clientWidth * devicePixelRatio / this.width, 1);
+        const wanted = Math.ceil(canvas.clientWidth * devicePixelRatio / this.width);
         const affordable = Math.sqrt((isMoving ? MOVING_MS : STILL_MS) / Math.max(one, 0.01));
         const scale = isMoving || isFine ? Math.max(Math.floor(Math.min(affordable, wanted, LARGEST_STAGE)), 1) : 1;
         if (scale === 1) {
@@ -482,13 +499,27 @@ class Bench {
             this.renderer.show(canvas, this.state, texture, this.width, this.height);
         } else {
             const target = this.renderer.target("stage", scale * this.width, scale * this.height);
-            const took = this.renderer.drawTechnique(name, this.state, target) / scale ** 2;
-            this.learnTime(name, took);
+            if (isMoving) {
+                this.learnTime(name, this.renderer.drawTechnique(name, this.state, target) / scale ** 2);
+            } else if (!this.drawBand(target, BAND_MS / (one * scale ** 2))) {
+                return;
+            }
             this.renderer.show(canvas, this.state, target.texture, target.width, target.height);
         }
         this.stageShows = isFine ? "fine" : "coarse";
         this.firstAt ??= performance.now();
         this.tell();
+    }
+
+    /* Draw the next rows of the stage, a share of all. Returns whether they were the last ones. */
+    drawBand(target, share) {
+        if (this.stageShows !== target) {
+            [this.stageShows, this.rows] = [target, 0];
+        }
+        const rows = Math.ceil(target.height * Math.min(share, 1));
+        this.renderer.drawTechnique(this.technique, this.state, target, 1, [this.rows, rows]);
+        this.rows += rows;
+        return this.rows >= target.height;
     }
 
     /* The stage where it needs the reference: it is shown itself, or an error. */
@@ -639,6 +670,27 @@ class Bench {
         this.drawRanks();
     }
 
+    /* The techniques by WebGPU in the first frozen scene: time, and the largest difference from WebGL in 255ths. */
+    async askWebGpu() {
+        this.webGpu = new Map();
+        const scene = this.content.scenes[0], size = [this.width, this.height];
+        const shown = value => 255 * Math.min(value * 2 ** scene.exposure, 1) ** (1 / 2.2);
+        try {
+            const webGpu = await WebGpu.make(this.renderer);
+            for (const name of webGpu ? Object.keys(this.content.tables) : []) {
+                const { pixels, took } = await webGpu.draw(name, scene, ...size);
+                const target = this.renderer.target("rank", ...size);
+                this.renderer.drawTechnique(name, scene, target);
+                const off = this.renderer.read(target).reduce(
+                    (most, value, i) => i % 4 < 3 ? Math.max(most, Math.abs(shown(value) - shown(pixels[i]))) : most, 0);
+                this.webGpu.set(name, { took, off });
+                this.drawRanks();
+            }
+        } catch (error) {
+            element("machine").textContent += ` WebGPU: ${error.message}`;
+        }
+    }
+
     drawRanks() {
         const mean = values => values.reduce((total, value) => total + value, 0) / values.length;
         const median = values => {
@@ -653,8 +705,9 @@ class Bench {
         rows.sort((a, b) => a.median - b.median);
         const table = element("table");
         table.textContent = "";
+        const byGpu = this.webGpu?.size ? ["WebGPU"] : [];
         const head = created(created(table, "thead"), "tr"), body = created(table, "tbody");
-        for (const label of ["", "technique", "median", "worst", "best in", "time", "table"]) {
+        for (const label of ["", "technique", "median", "worst", "best in", "time", ...byGpu, "table"]) {
             created(head, "th", {}, label);
         }
         const best = this.content.scenes.map(
@@ -669,6 +722,11 @@ class Bench {
             created(line, "td", {}, done ? percent(row.worst) : "");
             created(line, "td", {}, done ? `${wins}` : "");
             created(line, "td", {}, done && this.times.has(row.name) ? milliseconds(this.times.get(row.name)) : "");
+            for (const _ of byGpu) {
+                const { took, off } = this.webGpu.get(row.name) ?? {};
+                const title = took ? `${off.toFixed(2)} of 255 beside WebGL at most` : "";
+                created(line, "td", { title }, took ? `${milliseconds(took)}${off < 1 ? "" : ", differs"}` : "");
+            }
             created(line, "td", {}, size ? `${Math.round(size / 1000)} kB` : "–");
         });
     }

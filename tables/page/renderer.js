@@ -252,13 +252,17 @@ ${this.content.tables[name].header}`;
         this.gl.drawArrays(this.gl.TRIANGLES, 0, 3);
     }
 
-    /* Draw a technique (or the program of that name) into a target. Returns the time in ms of one draw of `repeats`. */
-    drawTechnique(program, state, target, repeats = 1) {
-        const start = performance.now();
+    /* Draw a technique (or the program of that name) into a target, or into [first row, rows] of it. Returns the time in
+       ms of one draw of `repeats`. */
+    drawTechnique(program, state, target, repeats = 1, [firstRow, rows] = [0, target.height]) {
+        const start = performance.now(), gl = this.gl;
         this.setState(this.use(program), state, target.width, target.height);
+        gl.enable(gl.SCISSOR_TEST);
+        gl.scissor(0, firstRow, target.width, rows);
         for (let i = 0; i < repeats; ++i) {
             this.draw(target.framebuffer, target.width, target.height);
         }
+        gl.disable(gl.SCISSOR_TEST);
         this.finish();
         return (performance.now() - start) / repeats;
     }

@@ -2,6 +2,7 @@
 Before that, how soon the preview of the example scene has its first shadows."""
 
 import gc
+import itertools
 import os
 import statistics
 import subprocess
@@ -31,12 +32,23 @@ def main(rig):
 
 def first_shadows(rig):
     """With as many points as artists have."""
-    engine = hands.module("engine.redraws")
+    engine, ticks = hands.module("engine.redraws"), []
+
+    def tick():
+        ticks.append(time.monotonic())
+        return 0.01
+
+    bpy.app.timers.register(tick)
     bpy.context.scene.render.engine = "LTSH"
     start = time.monotonic()
     rig.space.shading.type = "RENDERED"
     yield from hands.until(lambda: drawn(engine), 300)
     rig.fact("first picture, s", round(time.monotonic() - start, 1))
+    yield from hands.until(lambda: drawn(engine) and all(one._pixel_size.step == 1 for one in engine.open_views), 300)
+    rig.fact("first picture with all pixels, s", round(time.monotonic() - start, 1))
+    gaps = sorted((round(after - before, 2) for before, after in itertools.pairwise(ticks)), reverse=True)
+    rig.fact("longest times until then in which the window did not answer, s", gaps[:8])
+    bpy.app.timers.unregister(tick)
     yield from hands.until(lambda: any(shown._shadows._grid for shown in engine.open_views), 300)
     rig.fact("first shadows, s", round(time.monotonic() - start, 1))
     rig.check(any(shown._shadows._grid for shown in engine.open_views), "shadows come")

@@ -268,8 +268,13 @@ class Header:
 
 def compiled(header: Path, folder: Path, prefix: str) -> Header:
     """The header as C99, every warning an error."""
-    source = f'#include "{header}"\n{_named(_CALLS + _DATA_CALL, prefix)}'
-    return Header(_build([C_COMPILER, "-std=c99", *WARNINGS], source, folder / f"{prefix}.c"))
+    return compiled_calls(header, folder, _named(_CALLS + _DATA_CALL, prefix))
+
+
+def compiled_calls(header: Path, folder: Path, calls: str) -> Header:
+    """The header as C99 with the functions of `calls` after it, every warning an error."""
+    source = f'#include "{header}"\n{calls}'
+    return Header(_build([C_COMPILER, "-std=c99", *WARNINGS], source, folder / f"{header.stem}.c"))
 
 
 def compiled_glsl_branch(header: Path, folder: Path, prefix: str, data: np.ndarray) -> Header:

@@ -110,6 +110,12 @@ def assert_refused(path, *words):
         assert word in message, message
 
 
+def test_a_shipped_table_is_loaded_once_and_a_users_table_each_time(tmp_path):
+    path = written(tmp_path / "own.npz", *contents("ltsh2"))
+    assert shading.load_table("ltsh2") is shading.load_table("ltsh2")
+    assert shading.load_table(path) is not shading.load_table(path)
+
+
 def test_a_written_table_is_read_back(tmp_path):
     arrays, metadata = contents("ltsh2")
     table = shading.load_table(written(tmp_path / "own.npz", arrays, metadata))
@@ -181,6 +187,15 @@ def test_arrays_and_metadata_that_make_no_table_are_refused(tmp_path, spoil, wor
     arrays, metadata = contents("ltsh2")
     spoil(arrays, metadata)
     assert_refused(written(tmp_path / "spoiled.npz", arrays, metadata), word)
+
+
+def test_a_table_of_two_fresnel_curves_is_refused(tmp_path):
+    """Engines need no more, see `tables.pack.with_two_curves`; shading takes a third."""
+    arrays, metadata = contents("ltsh2")
+    arrays["fresnel_curves"] = arrays["fresnel_curves"][:2]
+    for key, axis in (("coefficients", 2), ("fresnel_weights", 1), ("average_albedo", 1)):
+        arrays[key] = arrays[key].take([0, 1], axis=axis)
+    assert_refused(written(tmp_path / "two.npz", arrays, metadata), "expected at least (2, 2, 3, 1)")
 
 
 @pytest.mark.parametrize("metadata", [None, "not json {", "[1, 2]", "null"])

@@ -17,6 +17,12 @@ TABLES = ("ltc", "ltsh2", "ltsh4", "ltsh4c")
 WIDTH, HEIGHT = 80, 45
 
 
+CENTER_OF_LIGHT = """(() => {
+    const box = document.getElementById("handle").getBoundingClientRect();
+    return [box.x + box.width / 2, box.y + box.height / 2];
+})()"""
+
+
 @pytest.fixture(scope="session")
 def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("page")
@@ -46,6 +52,17 @@ def drawn(page, name, number) -> np.ndarray:
     return pixels_of(page, target)
 
 
+def drawn_by_webgpu(page, name, number) -> np.ndarray:
+    size = f"{WIDTH}, {HEIGHT}"
+    return page.array(
+        f"""(async () => {{
+            const webGpu = await WebGpu.make(bench.renderer);
+            return (await webGpu.draw('{name}', bench.content.scenes[{number}], {size})).pixels;
+        }})()""",
+        np.float32,
+    ).reshape(-1, 4)
+
+
 def off_edges(scene) -> np.ndarray:
     """The pixels (P,) whose ray meets the same object in single precision: rays beside it by 1e-5 do."""
     eye, rays = bench.rays_of(scene, WIDTH)
@@ -60,11 +77,11 @@ def shown(radiance, scene) -> np.ndarray:
     return 255.0 * color.srgb_encode(np.clip(radiance * 2.0**scene.exposure, 0.0, 1.0))
 
 
-def largest_difference(page, name, number) -> float:
+def largest_difference(page, name, number, draw=drawn) -> float:
     """Between pixels of the page and of numpy, in steps of 8 bits as shown."""
     scene = bench.SCENES[number]
     expected = bench.picture(scene, WIDTH, name).reshape(-1, 3)
-    found, inside = drawn(page, name, number), off_edges(scene)
+    found, inside = draw(page, name, number), off_edges(scene)
     surface = np.isfinite(expected[:, 0])
     assert ((found[:, 3] > 0) == surface)[inside].all()
     inside &= surface
@@ -81,6 +98,20 @@ def test_every_technique_shades_a_scene_as_numpy_does(page):
 def test_every_technique_shades_all_frozen_scenes_as_numpy_does(page, name):
     differences = {scene.name: largest_difference(page, name, n) for n, scene in enumerate(bench.SCENES)}
     assert max(differences.values()) < 1.0, differences
+
+
+@pytest.mark.parametrize("number", [0, *(pytest.param(n, marks=pytest.mark.soak) for n in range(1, 10))])
+def test_webgpu_shades_as_numpy_does(page, number):
+    assert max(largest_difference(page, name, number, drawn_by_webgpu) for name in TABLES) < 1.0
+
+
+def test_without_webgpu_the_page_is_the_same(chromium, folder):
+    page = chromium.page(folder / "index.html", 600, 900)
+    page.evaluate("navigator.gpu.requestAdapter = async () => null")
+    page.wait_for("window.bench?.webGpu && document.querySelector('#table td').textContent", 60)
+    assert page.evaluate("[bench.webGpu.size, document.querySelectorAll('#table th').length]") == [0, 7]
+    assert "WebGPU" not in page.evaluate("document.body.innerText")
+    page.close()
 
 
 @pytest.mark.parametrize("number", [0, pytest.param(1, marks=pytest.mark.soak), 9])
@@ -116,14 +147,11 @@ def test_the_page_draws_what_one_does_with_it_and_needs_no_network(page):
     page.wait_for("[...bench.results.values()].filter(result => result.difference).length === 5", 60)
     errors = {name: page.evaluate(f"bench.results.get('{name}').difference.error") for name in TABLES}
     assert errors["ltsh4c"] < errors["ltsh4"] < errors["ltsh2"] < errors["ltc"] < 0.2
-    place = page.evaluate(
-        "(() => { const box = document.getElementById('handle').getBoundingClientRect();"
-        " return [box.x + box.width / 2, box.y + box.height / 2, bench.state.x]; })()"
-    )
-    page.mouse("pressed", *place[:2])
-    page.mouse("moved", place[0] + 60, place[1])
-    page.mouse("released", place[0] + 60, place[1])
-    assert page.evaluate("bench.scene") == -1 and page.evaluate("bench.state.x") > place[2] + 0.1
+    (x, y), before = page.evaluate(CENTER_OF_LIGHT), page.evaluate("bench.state.x")
+    page.mouse("pressed", x, y)
+    page.mouse("moved", x + 60, y)
+    page.mouse("released", x + 60, y)
+    assert page.evaluate("bench.scene") == -1 and page.evaluate("bench.state.x") > before + 0.1
     page.wait_for("bench.points >= 16 && bench.results.get('ltsh4')?.difference", 60)
     x = page.evaluate("bench.state.x")
     page.evaluate("document.getElementById('picture').focus()")
@@ -133,6 +161,45 @@ def test_the_page_draws_what_one_does_with_it_and_needs_no_network(page):
     assert page.evaluate("[bench.technique, bench.showsError]") == ["ltsh2", True]
     assert page.evaluate("bench.state.x") > x
     assert len(page.requests()) == 1, page.requests()
+
+
+def test_all_errors_are_shown_before_the_stage_is_drawn_finely(page):
+    """What one waits for after a drag comes first, in a frame before; the fine stage has all of its rows."""
+    events = page.evaluate("""(async () => {
+        let frame = 0, events = [];
+        const count = () => { ++frame; counting = requestAnimationFrame(count); };
+        let counting = requestAnimationFrame(count);
+        const own = ["compare", "drawBand"];
+        for (const name of own) {
+            bench[name] = (...given) => (events.push([name, frame]), Bench.prototype[name].apply(bench, given));
+        }
+        bench.show("ltsh4", false);
+        bench.change({ x: bench.state.x - 0.1 });
+        while (bench.stageShows !== "fine") {
+            await new Promise(requestAnimationFrame);
+        }
+        own.forEach(name => delete bench[name]);
+        cancelAnimationFrame(counting);
+        return events;
+    })()""")
+    frames = {name: [frame for kind, frame in events if kind == name] for name in ("compare", "drawBand")}
+    assert len(frames["compare"]) >= 5 and max(frames["compare"][:5]) < min(frames["drawBand"])
+    in_bands, whole = (
+        page.array(
+            f"""(() => {{
+                const target = bench.renderer.target("band", 60, 40);
+                {draw}
+                return bench.renderer.read(target);
+            }})()""",
+            np.float32,
+        )
+        for draw in (
+            "bench.renderer.drawTechnique(bench.technique, bench.content.scenes[2], target);"
+            "bench.state = {...bench.content.scenes[3]}; while (!bench.drawBand(target, 0.15));",
+            "bench.renderer.drawTechnique(bench.technique, bench.content.scenes[3], target);",
+        )
+    )
+    assert (in_bands == whole).all()
 
 
 def test_a_shader_of_ones_own_is_drawn_and_its_errors_name_the_line(page):
@@ -158,12 +225,28 @@ def test_a_shader_of_ones_own_is_drawn_and_its_errors_name_the_line(page):
     assert found[chosen, 0] == pytest.approx(0.5 * bench.RADIANCE * normal[chosen, 2], abs=1e-4)
 
 
+def drag_vertically(page, x, y, way):
+    page.touch("start", (x, y))
+    for step in range(1, 9):
+        page.touch("move", (x, y + way * step / 8))
+    page.touch("end")
+
+
 def test_the_page_fits_a_phone(chromium, folder):
     page = chromium.page(folder / "index.html", 390, 844, touch=True)
     page.wait_for("window.bench")
     assert page.evaluate("document.documentElement.scrollWidth") == 390
     small = page.evaluate("[...document.querySelectorAll('.choice button')].filter(b => b.clientHeight < 32).length")
     assert small == 0
+    # A finger on the light drags it.
+    drag_vertically(page, *page.evaluate(CENTER_OF_LIGHT), 24)
+    assert page.evaluate("[scrollY, bench.scene]") == [0, -1] and page.evaluate("bench.state.z") < 1.1
+    # A finger that scrolls the page changes nothing.
+    page.evaluate("bench.choose(2)")
+    x, y = page.evaluate(CENTER_OF_LIGHT)
+    drag_vertically(page, 390 - x, y + 120, -80)
+    page.wait_for("scrollY > 20 && !bench.isDragging", 10)
+    assert page.evaluate("[bench.scene, bench.state.rise, bench.state.orbit]") == [2, 16, 0]
     page.close()
 
 
@@ -213,6 +296,14 @@ def test_three_js_shades_its_rect_area_lights_by_ltsh(chromium, folder):
     off = np.abs(pixels[inside] - expected)
     # Rounding to 8 bits is .5. The largest, 4.3, are in a row beside the light's own plane.
     assert inside.mean() > 0.4 and np.quantile(off, 0.99) < 1.5 and off.max() < 6.0
+
+
+def test_the_first_picture_gets_as_fine_as_the_stage(chromium, folder):
+    page = chromium.page(folder / "index.html", 600, 900)
+    page.wait_for("window.bench && bench.stageShows === 'fine'")
+    # How fine depends on the machine; 40 times as long as usual would still give twice as many pixels.
+    assert page.evaluate("document.getElementById('picture').width") >= 2 * WIDTH
+    page.close()
 
 
 @pytest.mark.soak

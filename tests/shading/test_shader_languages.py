@@ -13,7 +13,9 @@ import pytest
 from header_harness import points, random_polygons
 
 from ltsh_addon import shading
-from tables import header
+from ltsh_addon.lobes.diffuse import sheen_form_factor
+from ltsh_addon.lobes.polygon import split_at_horizon
+from tables import export, header, sheen
 from tables.header import data_blocks
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -134,17 +136,42 @@ def exported(name: str, language: str, folder: Path) -> str:
     "name", ["ltc", pytest.param("ltsh2", marks=pytest.mark.soak), "ltsh4", "ltsh4c", "pack_ltsh4"]
 )
 def test_shaders_of_every_language_integrate_as_numpy_does(device, folder, tables, tmp_path, name, language):
-    source = MAIN[language].replace("HEADER", exported(name, language, folder))
-    source += BODY if language != "wgsl" else ""
-    source = source.replace("NAME", name).replace("UPPER", name.upper())
-    code = source if language == "wgsl" else glslang(source, tmp_path / f"{name}.{language}", language)
-    cosine, roughness = points(COUNT, 3, 0.05)
-    polygons = random_polygons(COUNT, 4, 4)
-    given = np.concatenate([cosine[:, None], roughness[:, None], polygons.reshape(COUNT, -1)], axis=1)
     table = tables[name]
-    found = evaluated(device, code, np.concatenate(list(data_blocks(table).values())), given)
+    cosine, roughness, polygons = given = random_light()
+    data = np.concatenate(list(data_blocks(table).values()))
+    found = integrated(device, name, exported(name, language, folder), language, data, given, tmp_path)
     expected = shading.integrate_polygon(table, cosine.astype(float), roughness.astype(float), polygons.astype(float))
     assert expected.max() > 0.5 and np.abs(found - expected).max() < 5e-5
+
+
+@pytest.mark.parametrize("language", MAIN)
+def test_sheen_of_the_pack_integrates_as_numpy_does(device, tmp_path, language):
+    """The form factor of the transformed polygon, in double precision; lobes of sheen have a mass of at most 0.75."""
+    export.export_pack(tmp_path)
+    cosine, roughness, polygons = given = random_light()
+    data, text = sheen.load_sheen().ravel(), exported("pack_sheen", language, tmp_path)
+    found = integrated(device, "pack_sheen", text, language, data, given, tmp_path)
+    albedo, a, b = sheen.lookup(sheen.load_sheen(), cosine.astype(float), roughness.astype(float))
+    expected = np.zeros(COUNT)
+    for index, above in split_at_horizon(np.moveaxis(polygons.astype(float), 0, 2).swapaxes(0, 1)):
+        expected[index] = np.abs(albedo[index] * sheen_form_factor(above, a[index], b[index]))
+    assert expected.max() > 0.2 and np.abs(found - expected).max() < 5e-5
+
+
+def random_light():
+    """Cosines, roughness (COUNT,) and polygons (COUNT, 4, 3)."""
+    return *points(COUNT, 3, 0.05), random_polygons(COUNT, 4, 4)
+
+
+def integrated(device, name, text, language, data, given, folder) -> np.ndarray:
+    """What `NAME_integrate_polygon` of an exported `text` returns for `random_light`."""
+    source = MAIN[language].replace("HEADER", text)
+    source += BODY if language != "wgsl" else ""
+    source = source.replace("NAME", name).replace("UPPER", name.upper())
+    code = source if language == "wgsl" else glslang(source, folder / f"{name}.{language}", language)
+    cosine, roughness, polygons = given
+    rows = np.concatenate([cosine[:, None], roughness[:, None], polygons.reshape(COUNT, -1)], axis=1)
+    return evaluated(device, code, data, rows)
 
 
 @pytest.mark.parametrize("name", header_harness.NAMES)
@@ -204,11 +231,16 @@ def test_conditions_loops_and_changed_parameters_are_translated():
     )
 
 
-def test_the_code_for_the_pack_compiles(folder, tables, tmp_path):
-    _, example = re.findall(r"```glsl\n(.*?)```", ENGINES.read_text(encoding="utf-8"), flags=re.DOTALL)
-    include = next(line for line in example.splitlines() if "the text of pack_ltsh4" in line)
-    source = example.replace(include, exported("pack_ltsh4", "glsl", folder))
-    source += "out vec4 color; void main() { color = vec4(pack_ltsh4_albedo(pack_ltsh4_cell(0.5, 0.5), 1)); }"
+def test_the_code_for_the_pack_compiles(tmp_path):
+    """A table and sheen in one shader."""
+    export.export_pack(tmp_path)
+    _, *examples = re.findall(r"```glsl\n(.*?)```", ENGINES.read_text(encoding="utf-8"), flags=re.DOTALL)
+    source = "".join(examples)
+    for name in ("pack_ltsh4", "pack_sheen"):
+        include = next(line for line in source.splitlines() if f"the text of {name}" in line)
+        source = source.replace(include, exported(name, "glsl", tmp_path))
+    value = "pack_ltsh4_albedo(pack_ltsh4_cell(0.5, 0.5), 1) + sheen(0.5, 0.5, ltsh_empty_polygon())"
+    source += f"out vec4 color; void main() {{ color = vec4({value}); }}"
     glslang(source, tmp_path / "pack.frag", "glsl", "frag", for_vulkan=False)
 
 

@@ -486,9 +486,8 @@ def stand_in() -> None:
         raise SceneError("this second Blender is none")
 
     blender_process.run_job = bake.run_job = cannot
-    bake.scene_facts = lambda scene, frames, objects, uv=None, **options: [
-        {"frame": 1, "camera": "Camera", "objects": ["Floor"], "tiles": {}, "lights": 1} for _ in frames
-    ]
+    facts = {"frame": 1, "camera": "Camera", "objects": ["Floor"], "tiles": {}, "lights": 1}
+    bake.scene_facts = lambda job, **options: [{**facts, "digests": {}, "not_judged": ""} for _ in job.frames]
 
 
 # Running:

@@ -434,3 +434,13 @@ def test_a_convex_lamp_does_not_stand_in_its_own_light(libraries, rows):
             np.testing.assert_array_equal(share[is_sure], 1.0)
         else:
             assert share.min() > 0.99 and share.mean() > 0.9999
+
+
+def test_a_tracer_that_is_dropped_frees_what_embree_holds(libraries, monkeypatch):
+    """Views drop theirs after each change of a surface, unclosed: a thread may still use it."""
+    tracer, released = open_tracer(random_occluders(np.random.default_rng(1)), libraries), []
+    embree, scenes = tracer._caster._embree, [one for scene in tracer._caster._scenes for one in scene._scenes]
+    release = embree.ReleaseScene
+    monkeypatch.setattr(embree, "ReleaseScene", lambda scene: (released.append(scene), release(scene)))
+    del tracer
+    assert len(scenes) >= 2 and sorted(released) == sorted(scenes)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import ctypes
 import math
+import sys
 import time
 import weakref
 
@@ -19,6 +22,8 @@ QUICK_SECONDS = 0.03
 POLL_SECONDS = 0.05
 # After so long without new shadows the processes end that help to trace them.
 IDLE_SECONDS = 60.0
+# FREEING_SECONDS: after a view is left, until Blender has freed its textures.
+FREEING_SECONDS = 0.3
 # Pictures of a view that changes take about FRAME_SECONDS, with a pixel for each of 1, 2 x 2 or 4 x 4. A view that has
 # not changed for MOVING_SECONDS gets all its pixels. Slow ones come WAITING_SECONDS later while they would delay the
 # first shadows or bounces, and are refined HELD_SECONDS later while that delays all pixels of bounces.
@@ -43,11 +48,10 @@ class PixelSize:
     def follow(self, state: tuple, wait: float = 0.0) -> int:
         """The `step` of a view whose camera, surfaces and lights have this state, see `same_state`. A whole picture,
         which would hold up others, waits for so many seconds more."""
-        before, is_first, has_changed = self.step, self._state is None, not same_state(state, self._state)
-        self._state = state
+        before, has_changed, self._state = self.step, not same_state(state, self._state), state
         if has_changed:
             quick = next((one for one in STEPS if self._seconds <= FRAME_SECONDS * one**2), STEPS[-1])
-            self.step, self._changed = 1 if is_first else quick, math.inf  # until it is drawn
+            self.step, self._changed = quick, math.inf  # until it is drawn
         elif time.monotonic() >= self.end + (wait if self.step > 1 else 0.0):
             self.step = 1
         self.is_new |= has_changed or self.step != before
@@ -58,6 +62,10 @@ class PixelSize:
         self._seconds, self.is_new = seconds * self.step**2, False
         if self._changed == math.inf:
             self._changed = time.monotonic()
+
+    def begin_small(self) -> None:
+        """The first picture is not there yet, and should be drawn with few pixels."""
+        self._state, self._seconds = None, math.inf
 
     @property
     def is_slow(self) -> bool:
@@ -157,9 +165,21 @@ def tag_views() -> None:
                 area.tag_redraw()
 
 
+def view_left() -> None:
+    """Take note that a view is freed: once its textures are too, the system gets their memory back."""
+    if sys.platform == "linux":
+        _start(_give_back_memory, FREEING_SECONDS)
+
+
+def _give_back_memory() -> None:
+    """Let glibc give back what is free: it keeps megabytes of freed textures and samples, the more with each view."""
+    with contextlib.suppress(OSError, AttributeError):  # of other libraries
+        ctypes.CDLL(None).malloc_trim(0)
+
+
 def stop() -> None:
     """End all timers, and all work for views."""
-    for timer in (redraw, _watch_shadows, _end_helpers, _watch_cycles):
+    for timer in (redraw, _watch_shadows, _end_helpers, _watch_cycles, _give_back_memory):
         if bpy.app.timers.is_registered(timer):
             bpy.app.timers.unregister(timer)
     for shadows in live_shadows:

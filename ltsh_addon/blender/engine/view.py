@@ -58,6 +58,7 @@ class EngineView:
         self._world.stop()
         self.rest.stop()
         redraws.open_views.discard(self)
+        redraws.view_left()
         if not redraws.open_views:
             redraws.node_lights.stop()
 
@@ -106,6 +107,8 @@ class EngineView:
             with new_shaders_until(start + COMPILE_SECONDS):
                 texts = self._draw_picture(context, depsgraph, target)
         except ShadersMissing:
+            # Drawings that compile draw all before that shader again.
+            self._pixel_size.begin_small()
             _clear(target)
             show(context.region, ViewTexts(notes=(COMPILING,)))
             redraws.redraw_at(time.monotonic() + redraws.POLL_SECONDS)

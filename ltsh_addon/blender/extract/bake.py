@@ -7,6 +7,7 @@ import tempfile
 import time
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import bpy
@@ -28,6 +29,7 @@ from ..materials.maps import UV_MAP, MaterialPlan, SavedImages
 from ..process.bake import BakeFactsJob, BakeJob
 from ..render_settings import changed_properties, working_space
 from . import atlas, bake_meshes, pixels
+from .dependencies import NotJudged, dependencies
 from .occluders import collect_occluders, with_baked_shares
 from .pixels import OCCLUDERS, SEEDS, remove_occlusion
 
@@ -535,7 +537,7 @@ def scene_facts(job: BakeFactsJob, folder: Path, progress) -> dict:
     """Do the `job`: returns a manifest of what there is to bake in each frame."""
     progress("open scene", 0.0)
     pixels.open_scene(Path(job.scene), [], job.scripts)
-    scene, facts, tiles = bpy.context.scene, [], {}
+    scene, facts, tiles, digests, unknown = bpy.context.scene, [], {}, {}, ""
     view_layer = render_settings.choose_view_layer(scene, [])
     saved_frame = scene.frame_current
     for frame in job.frames:
@@ -547,5 +549,11 @@ def scene_facts(job: BakeFactsJob, folder: Path, progress) -> dict:
                 tiles[ob.name] = bake_meshes.tiles_without_modifiers(ob, job.uv)
         record = {"frame": scene.frame_current, "camera": name, "objects": [ob.name for ob in chosen]}
         record["lights"] = rows_of_lights(scene)
+        if chosen and len(job.frames) == 1:
+            try:
+                digests = with_render_depsgraph(scene, partial(dependencies, names=record["objects"], job=job))
+            except (NotJudged, RuntimeError) as error:
+                unknown = error_line(error)
+        record |= {"digests": digests, "not_judged": unknown}
         facts.append({**record, "tiles": {ob.name: tiles[ob.name] for ob in chosen if len(tiles[ob.name]) > 1}})
     return {"facts": facts}

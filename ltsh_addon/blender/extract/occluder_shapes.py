@@ -167,45 +167,52 @@ def split_by_slot(ob, clear: list, image_of) -> list[OccluderMesh]:
     if mesh is None:
         return []
     try:
-        mesh.calc_loop_triangles()
-        count = len(mesh.loop_triangles)
-        if not count:
-            return []
-        loops, triangles = (
-            read_values(mesh.loop_triangles, name, (count, 3), np.int32) for name in ("loops", "vertices")
-        )
-        slots = np.clip(read_values(mesh.loop_triangles, "material_index", (count,), np.int32), 0, len(clear) - 1)
-        vertices = read_values(mesh.vertices, "co", (len(mesh.vertices), 3), np.float32)
-        normals = None
-        if mesh.normals_domain == "POINT":
-            normals = read_values(mesh.vertex_normals, "vector", (len(vertices), 3), np.float32)
-        elif mesh.normals_domain == "CORNER":
-            normals = normals_at_corners(mesh)[0][loops]
-
-        def uv_of(name):
-            layers = mesh.uv_layers
-            layer = layers.get(name) if name else next((other for other in layers if other.active_render), None)
-            if layer is None:
-                return np.zeros((count, 3, 2), np.float32)
-            return read_values(layer.uv, "vector", (len(mesh.loops), 2), np.float32)[loops]
-
-        meshes = []
-        blocking = np.array([transparency is None for transparency in clear])
-        for slot in [None, *(np.flatnonzero(~blocking))]:
-            here = blocking[slots] if slot is None else slots == slot
-            if not here.any():
-                continue
-            transparency = None
-            if slot is not None:
-                transparency = clear[slot].transparency(
-                    int(slot), int(here.sum()), lambda name, here=here: uv_of(name)[here], image_of
-                )
-                if transparency.share == 1.0 and transparency.image is None:
-                    continue
-            meshes.append(_submesh(vertices, triangles, normals, here, transparency))
-        return meshes
+        return split_mesh(mesh, clear, image_of)
     finally:
         ob.to_mesh_clear()
+
+
+def split_mesh(mesh, clear: list, image_of, moved=None) -> list[OccluderMesh]:
+    """As `split_by_slot`, of a mesh, whose vertices are then changed by `moved` (V, 3)."""
+    mesh.calc_loop_triangles()
+    count = len(mesh.loop_triangles)
+    if not count:
+        return []
+    loops, triangles = (read_values(mesh.loop_triangles, name, (count, 3), np.int32) for name in ("loops", "vertices"))
+    slots = np.clip(read_values(mesh.loop_triangles, "material_index", (count,), np.int32), 0, len(clear) - 1)
+    vertices = read_values(mesh.vertices, "co", (len(mesh.vertices), 3), np.float32)
+    if moved is not None:  # which triangles faces have does not change
+        vertices += moved
+        mesh.vertices.foreach_set("co", vertices.ravel())
+        mesh.update()
+    normals = None
+    if mesh.normals_domain == "POINT":
+        normals = read_values(mesh.vertex_normals, "vector", (len(vertices), 3), np.float32)
+    elif mesh.normals_domain == "CORNER":
+        normals = normals_at_corners(mesh)[0][loops]
+
+    def uv_of(name):
+        layers = mesh.uv_layers
+        layer = layers.get(name) if name else next((other for other in layers if other.active_render), None)
+        if layer is None:
+            return np.zeros((count, 3, 2), np.float32)
+        return read_values(layer.uv, "vector", (len(mesh.loops), 2), np.float32)[loops]
+
+    meshes = []
+    blocking = np.array([transparency is None for transparency in clear])
+    for slot in [None, *(np.flatnonzero(~blocking))]:
+        here = blocking[slots] if slot is None else slots == slot
+        if not here.any():
+            continue
+        transparency = None
+        if slot is not None:
+            transparency = clear[slot].transparency(
+                int(slot), int(here.sum()), lambda name, here=here: uv_of(name)[here], image_of
+            )
+            if transparency.share == 1.0 and transparency.image is None:
+                continue
+        meshes.append(_submesh(vertices, triangles, normals, here, transparency))
+    return meshes
 
 
 def _submesh(vertices, triangles, normals, here, transparency) -> OccluderMesh:

@@ -6,6 +6,7 @@ What their shapes are is in `occluder_shapes`.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -36,13 +37,16 @@ COLORED = "colored transparency counts by its mean, up to {} of the light off in
 SURFACE_SHIFT = 16
 
 
-def collect_occluders(depsgraph, override, warn, left_out=frozenset(), unread: list | None = None) -> Occluders:
+def collect_occluders(
+    depsgraph, override, warn, left_out=frozenset(), unread: list | None = None, displaced: list | None = None
+) -> Occluders:
     """What blocks shadow rays in a render of `depsgraph`, without the objects with full names in `left_out`.
 
     The material `override` replaces all others. `warn(text)` is called for differences from Cycles. Call this before
-    materials are changed. `unread` gets each `UnreadSurface`; without that list they block, which is warned of.
+    materials are changed. `unread` gets each `UnreadSurface`, and `displaced` each `DisplacedSurface`; without these
+    lists such surfaces block, or block where they are without displacement, which is warned of.
     """
-    return _Collector(depsgraph, override, left_out, unread).collect(warn)
+    return _Collector(depsgraph, override, left_out, unread, displaced).collect(warn)
 
 
 @dataclass(frozen=True)
@@ -56,6 +60,30 @@ class UnreadSurface:
     matrix: np.ndarray  # (4, 4)
     facts: ObjectFacts
     number: int  # of the mesh in the occluders
+
+
+@dataclass(frozen=True)
+class DisplacedSurface:
+    """An object whose material displaces it: a copy of its mesh without that."""
+
+    mesh: object
+    materials: tuple  # originals, by slot
+    matrix: np.ndarray  # (4, 4)
+    facts: ObjectFacts
+    numbers: tuple[int, ...]  # of its meshes in the occluders
+    split: Callable  # `shapes.split_mesh`, which makes these meshes of `mesh`
+
+
+def with_displacement(occluders: Occluders, displaced: list[DisplacedSurface], scene) -> Occluders:
+    """`occluders` with the `displaced` surfaces where Cycles has them. Call this before materials are changed."""
+    meshes = list(occluders.meshes)
+    for surface in displaced:
+        with open_studio(scene) as studio:
+            moved = maps.baked_displacement(surface, studio)
+        for number, mesh in zip(surface.numbers, surface.split(surface.mesh, moved=moved), strict=True):
+            meshes[number] = mesh
+        bpy.data.meshes.remove(surface.mesh)
+    return replace(occluders, meshes=tuple(meshes))
 
 
 def with_baked_shares(occluders: Occluders, unread: list[UnreadSurface], scene, warn) -> Occluders:
@@ -95,8 +123,9 @@ class _Instances:
 
 
 class _Collector:
-    def __init__(self, depsgraph, override, left_out, unread):
-        self._depsgraph, self._override, self._left_out, self._unread = depsgraph, override, left_out, unread
+    def __init__(self, depsgraph, override, left_out, unread, displaced):
+        self._depsgraph, self._override, self._left_out = depsgraph, override, left_out
+        self._unread, self._displaced = unread, displaced
         objects = {
             instance.object.original.name_full: instance.object.original for instance in depsgraph.object_instances
         }
@@ -241,10 +270,10 @@ class _Collector:
                 if (share := overlap_within(meshes)) > LEAST_DOUBLED:
                     text = "of its faces where others are: Cycles is black there, here all are lit"
                     self._note(f"{_percent(share)} {text}", ob)
-                if any(material is not None and is_displaced(material) for material in materials):
-                    self._note("displacement is not in shadows, which are off by its height: use a modifier", ob)
             self._shapes[key] = self._number(meshes), matrices
             self._remember_unread(instance, matrix, materials, self._shapes[key][0])
+            if any(material is not None and is_displaced(material) for material in materials):
+                self._remember_displaced(instance, matrix, materials, clear, self._shapes[key][0])
         self._add_instances(instance, matrix, *self._shapes[key])
 
     def _number(self, meshes) -> list[int]:
@@ -258,12 +287,32 @@ class _Collector:
         for number in numbers:
             slot = getattr(self._meshes[number].transparency, "slot", None)
             if slot is not None:
-                mesh = bpy.data.meshes.new_from_object(ob, preserve_all_data_layers=True, depsgraph=self._depsgraph)
-                if ob.type == "MESH":
-                    mesh.use_auto_texspace, data = False, ob.original.data
-                    mesh.texspace_location, mesh.texspace_size = data.texspace_location, data.texspace_size
-                surface = ob.original.name, mesh, slot, materials[slot].original, matrix
+                surface = ob.original.name, self._copy_of(ob), slot, materials[slot].original, matrix
                 self._unread.append(UnreadSurface(*surface, ObjectFacts.of(ob, instance), number))
+
+    def _remember_displaced(self, instance, matrix, materials, clear, numbers) -> None:
+        ob = instance.object
+        # Before 5.0 a setting of objects, later of modifiers.
+        subdivided = getattr(ob.original, "cycles", None), *ob.modifiers
+        is_diced = any(getattr(one, "use_adaptive_subdivision", False) for one in subdivided)
+        if is_diced:
+            text = "displacement with adaptive subdivision is not in shadows: faces are dark where it takes them inward"
+            self._note(f"{text}: switch that subdivision off", ob)
+        elif self._displaced is None or ob.type in ("CURVES", "POINTCLOUD"):
+            self._note("displacement is not in shadows, which are off by its height: use a modifier", ob)
+        elif numbers:
+            mesh, originals = self._copy_of(ob), tuple(material and material.original for material in materials)
+            split = partial(shapes.split_mesh, clear=clear, image_of=self._image)
+            surface = mesh, originals, matrix, ObjectFacts.of(ob, instance), tuple(numbers)
+            self._displaced.append(DisplacedSurface(*surface, split))
+
+    def _copy_of(self, ob):
+        """A mesh with the shape of `ob`, for objects of other scenes."""
+        mesh = bpy.data.meshes.new_from_object(ob, preserve_all_data_layers=True, depsgraph=self._depsgraph)
+        if ob.type == "MESH":
+            mesh.use_auto_texspace, data = False, ob.original.data
+            mesh.texspace_location, mesh.texspace_size = data.texspace_location, data.texspace_size
+        return mesh
 
     def _is_culled(self, ob, matrix) -> bool:
         """Whether Cycles leaves out the object for the culling that Simplify asks for (`BlenderObjectCulling`)."""

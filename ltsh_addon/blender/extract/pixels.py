@@ -21,7 +21,7 @@ from ..materials import aovs
 from ..materials.graph import images_behind
 from ..process.blender_process import job_start, newer
 from ..process.pixels import BEHIND, EDGE_SECONDS, PixelJob, too_small
-from .occluders import collect_occluders, with_baked_shares
+from .occluders import collect_occluders, with_baked_shares, with_displacement
 
 # FAST_PIXELS: up to this many samples (about 1 GB of files), files are compressed fast instead of well.
 FAST_PIXELS = 10_000_000
@@ -276,14 +276,18 @@ def prepare_scene(
         inventory = collect_lights(depsgraph, override)
         inventory.look_until = np.inf if look_until is None else look_until
         if with_occluders:
-            inventory.occluders = collect_occluders(depsgraph, override, inventory.warn, inventory.left_out, unread)
+            inventory.occluders = collect_occluders(
+                depsgraph, override, inventory.warn, inventory.left_out, unread, displaced
+            )
         lost.extend(missing_images(depsgraph, world, override))
         return inventory, aovs.materials_in_use(surfaces, override), bare
 
-    unread = []
+    unread, displaced = [], []
     inventory, materials, bare = with_render_depsgraph(scene, visit)
     # Camera rays pass through any number of wholly transparent surfaces, which leave no trace in the passes.
     scene.cycles.transparent_max_bounces = UNLIMITED
+    if displaced:
+        inventory.occluders = with_displacement(inventory.occluders, displaced, scene)
     if unread:
         inventory.occluders = with_baked_shares(inventory.occluders, unread, scene, inventory.warn)
     default = aovs.give_default_material(bare)

@@ -269,14 +269,15 @@ def nodes_as_text(data) -> str:
     for tree in trees_of([data]):
         for node in tree.nodes:
             sockets = [_value(getattr(socket, "default_value", None)) for socket in (*node.inputs, *node.outputs)]
-            lines.append(f"{node.name!r}{sockets}{_values(node, UNSEEN)}")
+            lines.append(f"{node.name!r}{sockets}{values_as_text(node, UNSEEN)}")
         for link in tree.links:
             ends = link.from_node.name, link.from_socket.identifier, link.to_node.name, link.to_socket.identifier
             lines.append(f"{ends}{link.is_muted}")
     return "\n".join(lines)
 
 
-def _values(block, unseen: tuple = ("rna_type",)) -> list:
+def values_as_text(block, unseen: tuple = ("rna_type",)) -> list[str]:
+    """Name and value of the properties of `block`, without those of the names `unseen`."""
     names = (prop.identifier for prop in block.bl_rna.properties)
     return [f"{name}: {_value(getattr(block, name))}" for name in names if name not in unseen and name[:3] != "bl_"]
 
@@ -285,9 +286,11 @@ def _value(value):
     if isinstance(value, bpy.types.bpy_prop_array | Vector | Euler | Color):
         return tuple(value)
     if isinstance(value, bpy.types.bpy_prop_collection):
-        return [_values(one) for one in value if isinstance(one, PARTS)]
+        return [values_as_text(one) for one in value if isinstance(one, PARTS)]
     if isinstance(value, PARTS):
-        return _values(value)
+        return values_as_text(value)
+    if isinstance(value, set):
+        return sorted(value)
     if isinstance(value, bpy.types.Text):
         return value.as_string()
     if isinstance(value, bpy.types.Object):

@@ -37,7 +37,17 @@ def reason_to_keep(ob) -> str:
     return "its settings are animated or driven" if is_animated(ob.data) else ""
 
 
-def is_animated(owner) -> bool:
-    """True if keyframes or drivers set properties of an object or its data."""
+def is_animated(owner, path: str = "") -> bool:
+    """True if keyframes or drivers set properties of an object or its data; with a `path`, that property."""
     animation = owner.animation_data
-    return animation is not None and bool(animation.action or len(animation.drivers))
+    if animation is None:
+        return False
+    if not path:
+        return bool(animation.action or len(animation.drivers))
+    strips = [strip for track in animation.nla_tracks for strip in track.strips]
+    pairs = [(used.action, used.action_slot) for used in (animation, *strips) if used.action is not None]
+    curves = [*animation.drivers]
+    for action, slot in pairs:
+        bags = [strip.channelbag(slot) for layer in action.layers for strip in layer.strips] if slot else []
+        curves += [curve for bag in bags if bag is not None for curve in bag.fcurves]
+    return any(curve.data_path == path for curve in curves)

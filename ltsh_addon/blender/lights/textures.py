@@ -12,7 +12,7 @@ from ...cycles.patches import Patches, cut_into_patches, note_patches, split_lig
 from ...cycles.texels import ImageTexture
 from ...emitters.facing import cone_angle, pattern_values
 from ...scene import Light, Pattern, SpotCone
-from ..materials.values import Value, is_srgb, opaque_pixels
+from ..materials.values import ImageUse, Value, is_srgb, opaque_pixels
 from .emission import PIXELS, Falloff, ObjectFacts, Studio, nodes_as_text, without_camera_rays, without_falloff
 
 # MOST_INSTANCES: how many lights of one data block are rendered where they stand; others get the result of the first.
@@ -375,10 +375,20 @@ class ShownTextures:
     def __init__(self):
         self._patches: dict[tuple, Patches | None] = {}
         self._seen: dict[tuple, tuple[NodeEmission, Patches]] = {}
+        self._textures: dict[tuple, ImageTexture | None] = {}  # only of `color_at`: patches need their image once
 
     def clear(self) -> None:
         """Forget the patches of images, so that the images are read again."""
         self._patches.clear()
+        self._textures.clear()
+
+    def color_at(self, use: ImageUse, uv: np.ndarray) -> np.ndarray | None:
+        """The linear color (3,) of an image at coordinates (2,) of its UV map; None where only Cycles knows it."""
+        key = use.image.session_uid, use.closest, use.extension
+        if key not in self._textures:
+            self._textures[key] = _texture(use)
+        texture = self._textures[key]
+        return None if texture is None else texture.colors(np.array([[*uv, 1.0]]) @ np.array(use.mapping).T)[0]
 
     def split(self, light: Light, factor: Value, notes: list[str]) -> list[Light] | None:
         """`light` times the image `factor` as patches; None where only Cycles knows the colors of the image.

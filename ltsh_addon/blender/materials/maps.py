@@ -324,6 +324,45 @@ def baked_transparency(surface, studio) -> tuple[Transparency, float]:
     return Transparency(1.0, shares, uv[corners], "EXTEND"), float(np.abs(colors - shares[..., None]).max())
 
 
+def baked_displacement(surface, studio) -> np.ndarray:
+    """By how much Cycles displaces the vertices (V, 3) of a `surface` (`extract.occluders.DisplacedSurface`), in the
+    space of its mesh.
+
+    Cycles bakes the positions of corners, a little inside of their faces, with and without displacement. The mean of
+    the differences at all corners of a vertex is its own.
+    """
+    mesh = surface.mesh
+    materials = [material for material in dict.fromkeys(surface.materials) if material is not None]
+    for number, material in enumerate(surface.materials[: len(mesh.materials)]):
+        mesh.materials[number] = material
+    layer = mesh.color_attributes.new("ltsh_position", "FLOAT_COLOR", "CORNER")
+    mesh.color_attributes.active_color = layer
+    ob, scene, count = bpy.data.objects.new("ltsh displaced", mesh), studio.scene, len(mesh.loops)
+    context = {"view_layer": scene.view_layers[0], "active_object": ob, "selected_objects": [ob]}
+
+    def positions():
+        bpy.ops.object.bake(type="POSITION", target="VERTEX_COLORS", use_selected_to_active=False)
+        colors = mesh.color_attributes["ltsh_position"].data
+        return read_values(colors, "color", (count, 4), np.float32)[:, :3].astype(float)
+
+    methods = [material.displacement_method for material in materials]
+    scene.cycles.samples = 1
+    with studio.show(ob, surface.matrix, surface.facts), bpy.context.temp_override(scene=scene, object=ob, **context):
+        moved = positions()
+        try:
+            for material in materials:
+                material.displacement_method = "BUMP"
+            moved -= positions()
+        finally:
+            for material, method in zip(materials, methods, strict=True):
+                material.displacement_method = method
+    mesh.color_attributes.remove(mesh.color_attributes["ltsh_position"])
+    vertex = read_values(mesh.loops, "vertex_index", (count,), np.int32)
+    number = np.maximum(np.bincount(vertex, minlength=len(mesh.vertices)), 1)
+    moved = np.stack([np.bincount(vertex, column, len(mesh.vertices)) / number for column in moved.T], axis=1)
+    return np.linalg.solve(surface.matrix[:3, :3], moved.T).T.astype(np.float32)
+
+
 def _side_by_side(mesh, faces: np.ndarray) -> tuple[np.ndarray, int]:
     """UV coordinates (C, 2) of the corners of `mesh` that place the `faces` side by side in a square picture, and the
     texels along its side. The corners of other faces lie at one place outside."""

@@ -103,25 +103,27 @@ def apply_bake(job: ApplyJob, *, progress: Progress | None = None) -> list[str]:
 
 @dataclass(frozen=True)
 class BakeFactsJob:
-    """See `scene_facts`."""
+    """What there is to find out about a bake of `objects`: names, "selected", "all", or None for none.
+
+    `uv` is a UV map; None: the active ones. `scripts`: run those in the file. `view` and `bounces` are as in `BakeJob`.
+    """
 
     scene: Path
-    frames: list[int | None]
-    objects: tuple[str, ...] | str | None
-    uv: str | None
-    scripts: bool
+    frames: list[int | None]  # None: the file's own
+    objects: tuple[str, ...] | str | None = None
+    uv: str | None = None
+    scripts: bool = False
+    view: tuple[float, float, float] | str = "camera"
+    bounces: str = "off"
 
 
-def scene_facts(
-    scene: Path, frames, objects, uv=None, *, scripts: bool = False, progress: Progress | None = None
-) -> list[dict]:
-    """What there is to bake in each of `frames` (None: the file's own).
+def scene_facts(job: BakeFactsJob, *, progress: Progress | None = None) -> list[dict]:
+    """What there is to bake in each frame of the `job`.
 
     Each entry has "frame", "camera" (name or None), "objects" (names of objects to bake), "tiles" (the UDIM tiles by
-    object, for objects with several) and "lights" (about how many rows of lights `per_light` makes). `objects` are
-    names, "selected", "all", or None for none. `uv` is a UV map; None: the active ones. `scripts`: run
-    those in the file. Raises as `pixels.extract_pixels` does.
+    object, for objects with several), "lights" (about how many rows of lights `per_light` makes), and for a single
+    frame "digests" (by object, see `extract.dependencies`) or "not_judged" (why there are none).
+    Raises as `pixels.extract_pixels` does.
     """
-    job = BakeFactsJob(scene, list(frames), objects, uv, scripts)
     with temporary_folder() as folder:
         return run_scene_job(job, folder, progress)["facts"]

@@ -51,6 +51,7 @@ STAGE_TITLES = {
 PRIOR_SECONDS, LITTLE_SECONDS = 5.0, 1.0
 # A stage's progress tells its length only from LEAST_FRACTION and LEAST_SECONDS on.
 LEAST_FRACTION, LEAST_SECONDS = 0.02, 1.0
+OBJECT_STAGES = "bake", "bounces", "denoise", "shade"  # of a bake, followed by the object's name
 MOST = 0.99  # the largest share that is shown before the end is reported
 # Costs in seconds on two cores: once, or per million points, or per million points times samples. Plans learn the pace
 # of the machine.
@@ -70,17 +71,18 @@ class Run:
     command: str
     options: PictureOptions | BakeOptions
     partial: str = ""  # what its pictures lack, if a later command of the job adds it
+    resumes: bool = False  # do only what has changed
 
     def to_dict(self) -> dict:
         """The dictionary that `panel_job.perform` takes."""
-        arguments = [self.command, *command_line(self.options)]
+        arguments = [self.command, *command_line(self.options), *(["--resume"] if self.resumes else [])]
         return {"arguments": arguments, "output": str(self.options.output), "partial": self.partial}
 
 
 def runs_of(context, command: str, scene_file: Path) -> list[Run]:
     """The commands of a job."""
     if command == "bake":
-        return [Run(command, bake_options(context, scene_file))]
+        return [Run(command, bake_options(context, scene_file), resumes=context.scene.ltsh.bake_changed)]
     wanted = picture_options(context.scene, command, scene_file)
     first = tuple(name for name in wanted.techniques if name != REFERENCE)
     if command == "shade" or not first:
@@ -238,7 +240,7 @@ session_times: StageTimes = {}
 def _kind(stage: str) -> str:
     """The kind of a stage; stages of one kind have one pace: those of all objects of a bake, both halves of Cycles."""
     first = stage.partition(" ")[0]
-    return first if first in ("bake", "bounces", "shade", "Cycles") else stage
+    return first if first in (*OBJECT_STAGES, "Cycles") else stage
 
 
 def paces(measured: StageTimes) -> dict[str, float]:
@@ -376,6 +378,7 @@ class Job:
     output: Path | None = None  # folder of files for the user
     stage: str = STARTING
     results: list[Path] = field(default_factory=list)  # folders of pictures so far
+    objects: dict[str, str] = field(default_factory=dict)  # of a bake: baking, done, unchanged or failed, by name
     error: str = ""  # one line that says why the job failed; "" if it did not
     finished: bool = False
     cancelled: bool = False
@@ -423,6 +426,11 @@ class Job:
             self.plan.report(self.stage, float(message["fraction"]))
         elif "expected" in message:
             self.plan.expect(message["expected"])
+        elif "object" in message:
+            name = message["object"]
+            self.objects[name] = message["state"]
+            if message["state"] == "unchanged":
+                self.plan.expect({f"{kind} {name}": 0.0 for kind in OBJECT_STAGES})
         elif "result" in message:
             self.results.append(Path(message["result"]))
         elif "error" in message:

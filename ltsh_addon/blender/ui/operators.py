@@ -125,6 +125,8 @@ class _JobOperator:
             self.report({"ERROR"}, error_line(error))
             return False
         self._job = results.state["job"] = job
+        if self.command == "bake":
+            results.state["baked"] = job.scene, job.objects
         return True
 
     def _show_progress(self, context) -> None:
@@ -172,7 +174,7 @@ class _JobOperator:
     def _finish(self, context):
         job = self._job
         self._end_timer(context)
-        if self._opened and not job.error:
+        if not job.error:
             self._show_all_results(context)
         if running_job() is job:
             results.state["job"] = None
@@ -192,6 +194,8 @@ class _JobOperator:
     def _what_remains(self) -> str:
         scene, job = results.scene_of(self._job.scene), self._job
         result = results.result_of(scene) if scene is not None and job.shown else None
+        if result is not None and job.command == "bake":
+            return f"kept: {listed(record['name'] for record in result.report['objects'])}"
         if result is None:
             return f"what was finished is in {job.output}" if job.command == "bake" else "nothing was finished yet"
         names = next(iter(result.groups.values()))["labels"].values()
@@ -204,6 +208,8 @@ class _JobOperator:
             self.report({"WARNING"}, problem)
         count = len(report["warnings"])
         noted = f", {count} warning{'s' if count > 1 else ''}" if count else ""
+        if unchanged := sum(state == "unchanged" for state in self._job.objects.values()):
+            noted += f", not baked again since nothing has changed: {unchanged} of {len(self._job.objects)}"
         self.report({"INFO"}, f"{self._job.title} took {clock(self._job.seconds())}{noted}")
 
 

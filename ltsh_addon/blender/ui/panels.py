@@ -252,6 +252,7 @@ class _Bake:
             column.prop(settings, "bake_rest_samples")
         column.prop(settings, "bake_per_light")
         column.prop(settings, "bake_error")
+        column.prop(settings, "bake_changed")
 
 
 # Settings of the view layer, and their short names.
@@ -406,7 +407,8 @@ class _Lights(_Entries):
         row, ob = layout.row(align=True), active_light(context)
         is_pressed = looks_through(view_of(context)) is not None
         row.operator("ltsh.look_through_light", text="", icon="OUTLINER_OB_CAMERA", depress=is_pressed)
-        row.operator("ltsh.drag_highlight", text="", icon="LIGHT_POINT")
+        for gesture, icon in (("highlight", "LIGHT_POINT"), ("shadow", "OVERLAY"), ("brightness", "LIGHT_SUN")):
+            row.operator(f"ltsh.drag_{gesture}", text="", icon=icon)
         row.operator("ltsh.add_light", icon="ADD")
         row.operator("ltsh.duplicate_light", text="", icon="DUPLICATE")
         row.operator("ltsh.delete_light", text="", icon="TRASH")

@@ -34,6 +34,7 @@ from ..materials.bsdfs import bsdf_of, is_emission
 from ..materials.graph import shaders_behind, surface_of
 from ..materials.preview_material import preview_of
 from ..render_settings import CAMERA_KINDS, CAMERA_TYPES, picture_size
+from . import results
 from .preview import ENGINE, lights_of, view_of
 
 EXACT, APPROXIMATED, LEFT_OUT = "exact", "approximated", "left out"
@@ -220,6 +221,15 @@ def _not_writable(folder: str) -> str:
     return ""
 
 
+# The states of objects of a bake: text and icon.
+BAKE_STATES = {
+    "baking": ("Baking", "PLAY"),
+    "done": ("Done", "CHECKMARK"),
+    "unchanged": ("Unchanged", "CHECKMARK"),
+    "failed": ("Failed", "ERROR"),
+}
+
+
 class LTSH_UL_baked(bpy.types.UIList):
     """The selected objects, with a check mark at those to bake"""
 
@@ -234,6 +244,12 @@ class LTSH_UL_baked(bpy.types.UIList):
         row = layout.row(align=True)
         row.prop(item, "ltsh_baked", text="")
         row.label(text=item.name, icon="MESH_DATA", translate=False)
+        scene, states = results.state["baked"]
+        state = states.get(ATLAS if data.ltsh.bake_atlas else item.name)
+        if scene == data.session_uid and state is not None:
+            side = row.row()
+            side.active, side.alignment = state in ("baking", "failed"), "RIGHT"
+            side.label(text=BAKE_STATES[state][0], icon=BAKE_STATES[state][1])
 
 
 class LTSH_OT_add_camera(bpy.types.Operator):

@@ -6,9 +6,11 @@ and redo leave the preview as it is: it is no change of the scene.
 
 from __future__ import annotations
 
+import math
+
 import bpy
 from bpy.app.handlers import persistent
-from bpy.props import BoolProperty, FloatProperty, FloatVectorProperty
+from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProperty
 from bpy_extras import view3d_utils
 from bpy_extras.io_utils import ImportHelper
 from mathutils import Vector
@@ -129,6 +131,15 @@ def select_alone(context, ob) -> None:
 # Of a light that is added to a surface: its distance by the width that the view shows there, its largest share of the
 # free room over the surface, its size by its distance, and its power by the square of it, which makes white about 1.
 DISTANCE, FREE_SHARE, LIGHT_SIZE, LIGHT_POWER = 0.35, 0.6, 0.6, 10.0
+# ROLES: of lights that are placed by the view instead of the surface: degrees to the right of the eye and above the
+# horizon as the point sees them, the factors of size and power of the light.
+ROLES = {
+    "SURFACE": ("Facing the Surface", None),
+    "KEY": ("Key Light", (-45.0, 40.0, 1.0, 1.0)),
+    "FILL": ("Fill Light", (50.0, 15.0, 2.0, 0.25)),
+    "RIM": ("Rim Light", (155.0, 45.0, 1.0, 1.0)),
+}
+MOST_CROSSED = 16  # surfaces of the object itself that the way to such a light may cross
 # Of events that go on meanwhile: moving the view, and jobs.
 PASSED_ON = ("MIDDLE", "WHEEL", "TRACKPAD", "NDOF", "TIMER")
 
@@ -146,6 +157,11 @@ class LTSH_OT_add_light(bpy.types.Operator):
     distance: FloatProperty(
         name="Distance", description="Of both; size and power follow", subtype="DISTANCE", min=1e-4, default=4.0
     )
+    role: EnumProperty(
+        name="Role", items=[(key, label, "") for key, (label, _) in ROLES.items()], default="SURFACE",
+        description="Facing the surface; or by the view: before it on the left, beside it, behind it",
+        options={"HIDDEN", "SKIP_SAVE"},
+    )  # fmt: skip
     selects: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})  # the light, and nothing else
 
     @classmethod
@@ -165,7 +181,7 @@ class LTSH_OT_add_light(bpy.types.Operator):
             return {"CANCELLED"}
         if event.type.startswith(PASSED_ON):
             return {"PASS_THROUGH"}
-        surface = surface_under(context, event.mouse_x, event.mouse_y)
+        surface = surface_under(context, event.mouse_x, event.mouse_y, self.role)
         if surface is None:
             return {"RUNNING_MODAL"}
         self.location, self.normal, self.distance = surface
@@ -194,7 +210,8 @@ class LTSH_OT_add_light(bpy.types.Operator):
     def _put(self, context) -> None:
         """Put the light, which is made at first, over the surface."""
         if self._light is None:
-            self._light = bpy.data.objects.new("Area", bpy.data.lights.new("Area", "AREA"))
+            name = "Area" if self.role == "SURFACE" else ROLES[self.role][0]
+            self._light = bpy.data.objects.new(name, bpy.data.lights.new(name, "AREA"))
             context.collection.objects.link(self._light)
             context.view_layer.update()
             view = view_of(context)
@@ -203,14 +220,35 @@ class LTSH_OT_add_light(bpy.types.Operator):
         normal, data = Vector(self.normal).normalized(), self._light.data
         self._light.location = Vector(self.location) + self.distance * normal
         self._light.rotation_euler = normal.to_track_quat("Z", "Y").to_euler()
-        data.size, data.energy = LIGHT_SIZE * self.distance, LIGHT_POWER * self.distance**2
+        *_, larger, stronger = ROLES[self.role][1] or (1.0, 1.0)
+        data.size, data.energy = larger * LIGHT_SIZE * self.distance, stronger * LIGHT_POWER * self.distance**2
 
 
-def surface_under(context, x: int, y: int) -> tuple[Vector, Vector, float] | None:
-    """The point of a surface at a pixel of the window in any 3D view, its normal towards the view, and the distance for
-    a light there; None where there is none."""
+def add_lights_to_menu(menu, context) -> None:
+    """Draw the lights by role in Blender's own menu of lights."""
+    column = menu.layout.column()
+    column.operator_context = "INVOKE_REGION_WIN"
+    column.separator()
+    for role, (label, _) in ROLES.items():
+        column.operator("ltsh.add_light", text=f"LTSH {label}", icon="LIGHT_AREA").role = role
+
+
+def surface_under(context, x: int, y: int, role: str = "SURFACE") -> tuple[Vector, Vector, float] | None:
+    """The point of a surface at a pixel of the window in any 3D view, the direction from there to a light of this role,
+    by default its normal towards the view, and the light's distance; None where there is none."""
     region = region_under(context, x, y)
-    return None if region is None else _surface_at(context, region, (x - region.x, y - region.y))
+    return None if region is None else _surface_at(context, region, (x - region.x, y - region.y), role)
+
+
+def toward_role(role: str, toward_eye: Vector) -> Vector:
+    """The direction in which a point that the eye sees in the direction `toward_eye` has a light of this role."""
+    degrees, height = (math.radians(angle) for angle in ROLES[role][1][:2])
+    back = Vector((toward_eye.x, toward_eye.y, 0.0))
+    # From right above, the light is as seen from the south.
+    back = back.normalized() if back.length > 1e-3 * toward_eye.length else Vector((0.0, -1.0, 0.0))
+    beside = Vector((-back.y, back.x, 0.0))
+    flat = math.cos(degrees) * back + math.sin(degrees) * beside
+    return math.cos(height) * flat + Vector((0.0, 0.0, math.sin(height)))
 
 
 def region_under(context, x: int, y: int):
@@ -222,19 +260,25 @@ def region_under(context, x: int, y: int):
     return None
 
 
-def _surface_at(context, region, pixel) -> tuple[Vector, Vector, float] | None:
+def _surface_at(context, region, pixel, role: str = "SURFACE") -> tuple[Vector, Vector, float] | None:
     scene, depsgraph, data = context.scene, context.evaluated_depsgraph_get(), region.data
     start = view3d_utils.region_2d_to_origin_3d(region, data, pixel)
     direction = view3d_utils.region_2d_to_vector_3d(region, data, pixel)
-    is_hit, point, normal, *_ = scene.ray_cast(depsgraph, start, direction)
+    is_hit, point, normal, _, own, _ = scene.ray_cast(depsgraph, start, direction)
     if not is_hit:
         return None
     if normal.dot(direction) > 0.0:
         normal.negate()
     ends = [view3d_utils.region_2d_to_location_3d(region, data, (end, pixel[1]), point) for end in (0, region.width)]
     distance = DISTANCE * (ends[1] - ends[0]).length
-    is_hit, other, *_ = scene.ray_cast(depsgraph, point + 1e-3 * distance * normal, normal)
-    return point, normal, min(distance, FREE_SHARE * (other - point).length) if is_hit else distance
+    toward = normal if role == "SURFACE" else toward_role(role, -direction)
+    start = point + 1e-3 * distance * normal
+    for _ in range(MOST_CROSSED):
+        is_hit, other, _, _, ob, _ = scene.ray_cast(depsgraph, start, toward)
+        if not is_hit or role == "SURFACE" or ob != own:
+            break
+        start = other + 1e-3 * distance * toward
+    return point, toward, min(distance, FREE_SHARE * (other - point).length) if is_hit else distance
 
 
 class OnActiveLight:
@@ -461,10 +505,16 @@ HANDLERS = (
     ("load_pre", _end_previews),
     ("load_post", _after_loading),
 )
-register = _subscribe
+
+
+def register() -> None:
+    """Follow the engine, and add the lights to Blender's menu."""
+    _subscribe()
+    bpy.types.VIEW3D_MT_light_add.append(add_lights_to_menu)
 
 
 def unregister() -> None:
     """End all previews."""
+    bpy.types.VIEW3D_MT_light_add.remove(add_lights_to_menu)
     bpy.msgbus.clear_by_owner(_subscriber)
     _end_previews()

@@ -55,9 +55,10 @@ class Choice:
     mode: str
 
 
-# The job that runs now, or None (see `operators.running_job`); True while this module sets values of the mixer; the
+# The job that runs now, or None (see `operators.running_job`); the session uid of the scene that was baked last, with
+# the states of its objects by name; True while this module sets values of the mixer; the
 # `Update` that shades moved lights now, or None.
-state: dict = {"job": None, "is_silent": False, "update": None}
+state: dict = {"job": None, "baked": (0, {}), "is_silent": False, "update": None}
 _read: dict[str, tuple[tuple, Result]] = {}
 _pixels: dict[str, tuple[tuple, np.ndarray]] = {}
 PIXELS_KEPT = 8

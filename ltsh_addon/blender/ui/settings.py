@@ -334,6 +334,10 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
     bake_per_light: BoolProperty(
         name="Per Light", description="Bake each light by itself too, so that the Light Mixer can change the textures",
     )  # fmt: skip
+    bake_changed: BoolProperty(
+        name="Only Changed", default=True,
+        description="Keep the textures of objects that would be the same as those of the last bake; off: bake all",
+    )  # fmt: skip
     bake_error: BoolProperty(
         name="Compare with Cycles", description="Bake the same texels with Cycles too and measure the signed error",
         default=False,
@@ -392,7 +396,7 @@ class LTSH_PG_scene(bpy.types.PropertyGroup):
 SUBFOLDER = "ltsh"
 KEPT = ("techniques", "resolution_percentage", "anti_aliasing", "cycles_samples", "shadows", "shadow_rays",
         "keep_lights", "bake_size", "bake_atlas", "bake_margin", "bake_view", "bake_passes", "bake_error",
-        "bake_bounces", "bake_rest_samples", "bake_per_light")  # fmt: skip
+        "bake_bounces", "bake_rest_samples", "bake_per_light", "bake_changed")  # fmt: skip
 
 
 class LTSH_OT_add_preset(AddPresetBase, bpy.types.Operator):

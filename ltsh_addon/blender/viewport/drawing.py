@@ -16,11 +16,12 @@ from gpu_extras.batch import batch_for_shader
 from mathutils import Matrix
 
 from ...scene import SurfaceSamples
-from ...shading.header import source_text
+from ...shading.header import filled, source_text
 
 _TRIANGLE = ((-1.0, -1.0), (3.0, -1.0), (-1.0, 3.0))
 _INTEGERS = ("INT", "IVEC2", "IVEC4")
-# The depth test without a mask and with one: pixels are drawn at the depth 1/2.
+# The depth test without a mask and with one. In a mask pixels have the depth 0 where there is no surface, 1 where it is
+# anisotropic, 3/4 or 1 elsewhere. Shaders draw at 1/2, those of anisotropic lobes at 7/8: cards skip the others.
 WITHIN_MASK = ("NONE", "LESS")
 
 
@@ -31,17 +32,20 @@ def glsl(name: str) -> str:
 
 # Compiled shaders by what they are made from: all views of a session share them.
 _compiled: dict[tuple, object] = {}
-_deadline = [math.inf]  # see `new_shaders_until`
+_deadline, _is_due = [math.inf], [False]  # see `new_shaders_until`; is the next one compiled in any case?
+
+
+SLOW_SECONDS = 0.05  # of one image
 
 
 class ShadersMissing(Exception):
-    """Shaders are missing that the next drawing makes."""
+    """Shaders or images are missing that the next drawing makes."""
 
 
 @contextmanager
 def new_shaders_until(moment: float) -> Iterator[None]:
-    """Within this, once the `moment` has passed (in `time.monotonic`), a shader that has been compiled raises
-    ShadersMissing, so that each drawing compiles one at least; the next one uses it, and drivers compile then again."""
+    """Within this, once the `moment` has passed (in `time.monotonic`), missing shaders raise ShadersMissing, in turn
+    after and before they are compiled: a drawing that compiles one uses none of which drivers compile more then."""
     _deadline[0] = moment
     try:
         yield
@@ -52,10 +56,20 @@ def new_shaders_until(moment: float) -> Iterator[None]:
 def compiled(key: tuple, make: Callable):
     """What `make()` compiles, once for each `key`; needs an active GPU context. Raises ShadersMissing."""
     if key not in _compiled:
-        _compiled[key] = make()
+        if time.monotonic() > _deadline[0] and not _is_due[0]:
+            _is_due[0] = True
+            raise ShadersMissing
+        _compiled[key], _is_due[0] = make(), False
         if time.monotonic() > _deadline[0]:
             raise ShadersMissing
     return _compiled[key]
+
+
+def pause_if_slow(started: float) -> None:
+    """Where drawings may be left to the next one (see `new_shaders_until`), and what was `started` then took so long
+    that the window should answer, raise ShadersMissing."""
+    if _deadline[0] != math.inf and time.monotonic() > max(started + SLOW_SECONDS, _deadline[0]):
+        raise ShadersMissing
 
 
 def forget_shaders() -> None:
@@ -68,13 +82,21 @@ class PixelShader:
 
     `samplers` are the names of its textures, `constants` the types of its push constants by name. Name only those that
     the source uses: the compiler removes others, and setting them is an error. The source writes `color`, or with
-    `is_depth` gl_FragDepth.
+    `is_depth` gl_FragDepth. With `is_brushed` it runs for the pixels of anisotropic surfaces, see WITHIN_MASK.
     """
 
-    def __init__(self, source: str, samplers: Sequence[str], constants: Mapping[str, str], is_depth: bool = False):
+    def __init__(
+        self,
+        source: str,
+        samplers: Sequence[str],
+        constants: Mapping[str, str],
+        *,
+        is_depth: bool = False,
+        is_brushed: bool = False,
+    ):
         self._integers = {name for name, kind in constants.items() if kind in _INTEGERS}
-        key = source, *samplers, *constants.items(), is_depth
-        self._shader, self._batch = compiled(key, lambda: _pixel_shader(source, samplers, constants, is_depth))
+        key = source, *samplers, *constants.items(), is_depth, is_brushed
+        self._shader, self._batch = compiled(key, lambda: _pixel_shader(source, samplers, constants, key[-2:]))
 
     def bind(self, textures: Mapping[str, gpu.types.GPUTexture], constants: Mapping | None = None) -> None:
         """Make this the shader that draws, with `textures` by the names of samplers, and push constants."""
@@ -93,8 +115,9 @@ class PixelShader:
             (self._shader.uniform_int if name in self._integers else self._shader.uniform_float)(name, value)
 
 
-def _pixel_shader(source, samplers, constants, is_depth) -> tuple:
-    """The shader and the batch of a `PixelShader`."""
+def _pixel_shader(source, samplers, constants, traits) -> tuple:
+    """The shader and the batch of a `PixelShader`; `traits` are is_depth and is_brushed."""
+    is_depth, is_brushed = traits
     info = gpu.types.GPUShaderCreateInfo()
     info.vertex_in(0, "VEC2", "corner")
     if is_depth:
@@ -105,7 +128,7 @@ def _pixel_shader(source, samplers, constants, is_depth) -> tuple:
         info.push_constant(kind, name)
     for slot, name in enumerate(samplers):
         info.sampler(slot, "FLOAT_2D_ARRAY" if name in ("table", "visibility") else "FLOAT_2D", name)
-    info.vertex_source(glsl("triangle"))
+    info.vertex_source(filled(glsl("triangle"), {"Z": "0.75" if is_brushed else "0.0"}))
     info.fragment_source(source)
     shader = gpu.shader.create_from_info(info)
     return shader, batch_for_shader(shader, "TRIS", {"corner": _TRIANGLE})
@@ -266,7 +289,7 @@ class GBufferTextures:
     tangent: gpu.types.GPUTexture | None = None  # of anisotropic lobes; w = anisotropy; None: 0
     rebound: gpu.types.GPUTexture | None = None  # diffuse_rebound; w = diffuse_roughness; None: 0
     visibility: VisibilityGrid | None = None  # None: every light is seen whole
-    mask: gpu.types.GPUTexture | None = None  # depth buffer, 0 where there is no surface; None: all pixels are lit
+    mask: gpu.types.GPUTexture | None = None  # depth buffer, see WITHIN_MASK; None: all pixels are lit
     has_sheen: bool = False  # there are texels of sheen: base.w = -sheen_a, normal.w = sheen_b
     has_velvet: bool = False  # there are texels of velvet: rebound.w = -sigma, rebound.rgb = albedo
     has_bent: bool = False  # there are dielectrics with an index of refraction between 0 and 1

@@ -45,6 +45,7 @@ class SurfaceLayer:
         self._horizons = defaultdict(HorizonPass)  # of the first lobes (False), which stay, and of further ones (True)
         self._gbuffer: GBufferTextures | None = None
         self._first_lobe: GBufferTextures | None = None
+        self._further_lobe: tuple[int, GBufferTextures | None] = (0, None)  # the last, before its horizons
         self.smooth_normal: gpu.types.GPUTexture | None = None  # of the lobe that is lit
         self.visibility: VisibilityGrid | None = None  # of the lights from all lobes
         self.threshold = 0.5  # see `HorizonPass.draw`
@@ -63,7 +64,7 @@ class SurfaceLayer:
 
     def draw(self, mirror, view: ViewCamera, size) -> None:
         """Draw the surfaces."""
-        self._first_lobe = None
+        self._first_lobe, self._further_lobe = None, (0, None)
         self._gbuffer = self._surfaces.draw(mirror.instances, view, size)
 
     def choose_horizons(self, mirror, view: ViewCamera, lights: UploadedLights) -> None:
@@ -89,8 +90,9 @@ class SurfaceLayer:
         if number == 0:
             self.smooth_normal = self._gbuffer.smooth_normal
             return self._first_lobe
-        gbuffer = self._surfaces.draw_lobe(number, mirror.instances, view)
-        return self._with_horizons(gbuffer, True, mirror, view, lights)
+        if self._further_lobe[0] != number:
+            self._further_lobe = number, self._surfaces.draw_lobe(number, mirror.instances, view)
+        return self._with_horizons(self._further_lobe[1], True, mirror, view, lights)
 
     def _with_horizons(self, gbuffer, is_further: bool, mirror, view: ViewCamera, lights) -> GBufferTextures:
         self.smooth_normal = gbuffer.smooth_normal

@@ -103,7 +103,8 @@ class Features:
 
 def lighting_shader(table: LookupTable, features: Features) -> PixelShader:
     """The lighting shader for `table` of degree 1 to 4."""
-    return PixelShader(_lighting_source(table, features), features.samplers, features.constants)
+    source = _lighting_source(table, features)
+    return PixelShader(source, features.samplers, features.constants, is_brushed=features.brushed)
 
 
 def _lighting_source(table, features) -> str:

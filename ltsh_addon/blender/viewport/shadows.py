@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import product
 
 import numpy as np
@@ -55,10 +56,8 @@ PAUSE_SECONDS = 0.15
 
 
 class PixelGrid:
-    """Every `step`-th pixel of a G-buffer in either direction.
-
-    The window's thread reads the pixels; the tracing thread turns them into samples.
-    """
+    """Every `step`-th pixel of a G-buffer in either direction, read by the window's thread. The tracing thread turns
+    them into samples."""
 
     def __init__(self, step: int, gbuffer: GBufferTextures, view: ViewCamera):
         self._step, self._view, (width, height) = step, view, gbuffer.size
@@ -98,6 +97,39 @@ class PixelGrid:
         rows, columns = self.grid[0].shape[:2]
         return samples, Film(columns, rows, pixel)
 
+    @cached_property
+    def around(self) -> CoarsePixels:
+        """What level QUICK traces at first. It stays when only lights change."""
+        return CoarsePixels.of(*self.samples())
+
+
+@dataclass(frozen=True)
+class CoarsePixels:
+    """Every QUICK_STEP-th pixel of a picture in either direction, and how the P samples lie between these."""
+
+    pixels: np.ndarray  # the samples in these pixels
+    film: Film
+    surface: tuple  # of these samples, see `_surface_of`
+    index: np.ndarray  # (4, P) the pixels around each sample, their weights, and which are of another surface
+    weights: np.ndarray
+    is_far: np.ndarray
+
+    @classmethod
+    def of(cls, samples: SurfaceSamples, film: Film) -> CoarsePixels:
+        """Those of a picture."""
+        row_and_column, first = np.stack(np.divmod(film.pixel, film.width)), QUICK_STEP // 2
+        height, width = (-(-(side - first) // QUICK_STEP) for side in (film.height, film.width))
+        few = np.flatnonzero((row_and_column % QUICK_STEP == first).all(axis=0))
+        coarse = Film(width, height, (width, 1) @ (row_and_column[:, few] // QUICK_STEP))
+        surface, normal = _surface_of(samples.take(few), coarse), _smooth_normal(samples)
+        share, low = np.modf(np.maximum(row_and_column - first, 0) / QUICK_STEP)
+        corners = np.array([*product((0, 1), repeat=2)])[..., None]  # (4, 2, 1) in rows and columns
+        index = (width, 1) @ np.clip(low + corners, 0, [[height - 1], [width - 1]]).astype(int)
+        points = surface[0].reshape(-1, 4)[index]
+        near = _nearness(points[..., :3] - samples.position, normal) * points[..., 3]
+        weights = near * (np.abs(1 - corners - share).prod(axis=1) + 1e-9)
+        return cls(few, coarse, surface, index, weights / (weights.sum(axis=0) + 1e-15), near < 0.5)
+
 
 @dataclass(frozen=True)
 class ShadowRequest:
@@ -119,11 +151,8 @@ class ShadowRequest:
         return self.level == len(LEVELS)
 
     def visibility(self, progress: Callable) -> dict[int, np.ndarray]:
-        """Shares (H, W, 2), row 0 at the bottom, by the index of a light in `keys`.
-
-        If `progress` stops the work, the result has only the lights that are finished; without any, Cancelled is
-        raised.
-        """
+        """Shares (H, W, 2), row 0 at the bottom, by the index of a light in `keys`; where `progress` stops the work,
+        only those that are finished. Raises Cancelled where none is."""
         samples, film = self.points.samples()
         if self.level == QUICK:
             return self._quick(samples, film, progress)
@@ -135,25 +164,16 @@ class ShadowRequest:
 
     def _quick(self, samples: SurfaceSamples, film: Film, progress: Callable) -> dict[int, np.ndarray]:
         """The shares at some pixels, smoothed, and what lies between these or is traced where that does not do."""
-        row_and_column, first = np.stack(np.divmod(film.pixel, film.width)), QUICK_STEP // 2
-        height, width = (-(-(side - first) // QUICK_STEP) for side in (film.height, film.width))
-        few = np.flatnonzero((row_and_column % QUICK_STEP == first).all(axis=0))
-        some, coarse = samples.take(few), Film(width, height, (width, 1) @ (row_and_column[:, few] // QUICK_STEP))
-        results = self._traced(some, coarse, progress)
-        surface, normal = _surface_of(some, coarse), _surface_of(samples, film)[1]
-        share, low = np.modf(np.maximum(row_and_column - first, 0) / QUICK_STEP)
-        corners = np.array([*product((0, 1), repeat=2)])[..., None]  # (4, 2, 1) in rows and columns
-        index = (width, 1) @ np.clip(low + corners, 0, [[height - 1], [width - 1]]).astype(int)  # (4, P)
-        points, normal = surface[0].reshape(-1, 4)[index], normal.reshape(-1, 3)[film.pixel]
-        near = _nearness(points[..., :3] - samples.position, normal) * points[..., 3]
-        weights = near * (np.abs(1 - corners - share).prod(axis=1) + 1e-9)
-        weights, is_far, differs = weights / (weights.sum(axis=0) + 1e-15), near < 0.5, (near < 0.5).all(axis=0)
+        around = self.points.around
+        results = self._traced(samples.take(around.pixels), around.film, progress)
+        index, differs = around.index, around.is_far.all(axis=0)
         for number, values in results.items():
-            near_values = np.ma.array(values.reshape(-1, 2)[index], mask=np.repeat(is_far[..., None], 2, axis=-1))
-            differs |= (np.ptp(near_values, axis=0).filled(0.0) > QUICK_DIFFERENCE).any(axis=-1)
-            smooth = _smoothed(values, *surface).reshape(-1, 2)[index]
+            near_values, skipped = values.reshape(-1, 2)[index], around.is_far[..., None]
+            most, least = (np.where(skipped, one, near_values) for one in (0.0, 1.0))
+            differs |= (most.max(axis=0) - least.min(axis=0) > QUICK_DIFFERENCE).any(axis=-1)
+            smooth = _smoothed(values, *around.surface).reshape(-1, 2)[index]
             results[number] = np.ones((film.height, film.width, 2), np.float32)
-            results[number].reshape(-1, 2)[film.pixel] = (weights[..., None] * smooth).sum(axis=0)
+            results[number].reshape(-1, 2)[film.pixel] = np.einsum("kp,kpc->pc", around.weights, smooth)
         pixel = film.pixel[differs]
         for number, values in self._traced(samples.take(differs), film.take(differs), progress).items():
             results[number].reshape(-1, 2)[pixel] = values.reshape(-1, 2)[pixel]
@@ -190,10 +210,14 @@ class ShadowRequest:
 
 def _surface_of(samples: SurfaceSamples, film: Film) -> tuple[np.ndarray, np.ndarray]:
     """Positions (H, W, 4), w = 0 where there are no samples, and normals (H, W, 3) in the pixels of a film."""
-    values, normal = np.zeros((film.height, film.width, 7)), samples.geometric_normal
-    normal = samples.normal if normal is None else normal
-    values.reshape(-1, 7)[film.pixel] = np.c_[samples.position, np.ones(len(samples)), normal]
+    values = np.zeros((film.height, film.width, 7))
+    values.reshape(-1, 7)[film.pixel] = np.c_[samples.position, np.ones(len(samples)), _smooth_normal(samples)]
     return values[..., :4], values[..., 4:]
+
+
+def _smooth_normal(samples: SurfaceSamples) -> np.ndarray:
+    """The normals (P, 3) without bumps; those of horizons depend on lights."""
+    return samples.normal if samples.smooth_normal is None else samples.smooth_normal
 
 
 def _nearness(way: np.ndarray, normal: np.ndarray) -> np.ndarray:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import time
 from dataclasses import replace
 
 import bpy
 import gpu
 import numpy as np
 
-from ...shading.header import filled
+from ...shading.header import definitions, filled
 from ..materials.preview_material import IMAGE_SLOTS, is_missing
 from .drawing import (
     GBufferTextures,
@@ -19,6 +20,7 @@ from .drawing import (
     float_table,
     float_texture,
     glsl,
+    pause_if_slow,
     uniform_buffer,
 )
 from .meshes import DEFINES, LOOK_SIZE, albedo_table, blend_table, sheen_table
@@ -56,12 +58,12 @@ class SurfacePass:
         if before is not None:
             self._shaders, self._tables = before._shaders, before._tables
             self._black_image, self._missing_image = before._black_image, before._missing_image
-            self._mask_shader = before._mask_shader
+            self._mask_shaders = before._mask_shaders
             return
         self._shaders = {(outputs, False): _shader(outputs) for outputs in (SURFACES, NORMALS, EMISSION)}
         self._tables = {"albedo_table": float_table(albedo_table()), "blend_table": float_table(blend_table())}
         self._tables["sheen_table"] = float_texture(sheen_table())
-        self._mask_shader = PixelShader(glsl("mask"), ("positions",), {}, is_depth=True)
+        self._mask_shaders: dict[bool, PixelShader] = {}  # by whether surfaces are anisotropic
         self._black_image = float_texture(np.zeros((1, 1, 4)))
         self._missing_image = float_texture(np.array(MISSING_COLOR).reshape(1, 1, 4))
 
@@ -139,17 +141,24 @@ class SurfacePass:
             "has_velvet": any(look.kind == "velvet" for look in lobes),
             "has_bent": any(look.is_bent for look in lobes),
         }
-        return GBufferTextures(**textures, **marks, mask=self._draw_mask(textures["position"], number > 0))
+        return GBufferTextures(**textures, **marks, mask=self._draw_mask(textures, number > 0))
 
-    def _draw_mask(self, position, is_further: bool) -> gpu.types.GPUTexture:
-        """A depth buffer with 1 where there is a surface, else 0: cards skip other pixels before they shade."""
+    def _draw_mask(self, textures: dict, is_further: bool) -> gpu.types.GPUTexture:
+        """The depth buffer by which cards skip pixels before they shade, see `drawing.WITHIN_MASK`."""
         if (MASK, is_further) not in self._targets:
             texture = gpu.types.GPUTexture(self._size, format="DEPTH_COMPONENT32F")
             self._targets[MASK, is_further] = texture, gpu.types.GPUFrameBuffer(depth_slot=texture)
         texture, buffer = self._targets[MASK, is_further]
+        read = {"positions": textures["position"]}
+        if has_brushed := "tangent" in textures:
+            read["tangents"] = textures["tangent"]
+        if has_brushed not in self._mask_shaders:
+            text = definitions({"BRUSHING": 1} if has_brushed else {}) + glsl("mask")
+            self._mask_shaders[has_brushed] = PixelShader(text, tuple(read), {}, is_depth=True)
+        shader = self._mask_shaders[has_brushed]
         with drawing(buffer, (0, 0, *self._size), depth="ALWAYS", writes_depth=True):
-            self._mask_shader.bind({"positions": position})
-            self._mask_shader.draw()
+            shader.bind(read)
+            shader.draw()
         return texture
 
     def _target(self, outputs, is_further: bool):
@@ -207,10 +216,12 @@ class SurfacePass:
 
     def _bind_images(self, shader, shown: ShownLook, slots: tuple[str, ...]) -> None:
         if shown.textures is None:
-            shown.textures = {
-                name: self._missing_image if is_missing(use.image) else gpu.texture.from_image(use.image)
-                for name, use in shown.look.images.items()
-            }
+            shown.textures = {}
+        for name, use in shown.look.images.items():
+            if name not in shown.textures:
+                started, is_lost = time.monotonic(), is_missing(use.image)
+                shown.textures[name] = self._missing_image if is_lost else gpu.texture.from_image(use.image)
+                pause_if_slow(started)
         for name in slots:
             shader.uniform_sampler(f"{name}_image", shown.textures.get(name, self._black_image))
 

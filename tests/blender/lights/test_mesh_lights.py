@@ -142,15 +142,29 @@ def test_evaluated_geometry_and_all_instances_shine(tmp_path):
     assert len(prepared[2].lights) == 8
 
 
-@pytest.mark.parametrize("extrude", [0.0, 0.03])
-def test_text_shines_once(tmp_path, extrude):
-    """Blender shows renders a text and the mesh that it makes."""
+def text(extrude):
+    data = bpy.data.curves.new("Sign", "FONT")
+    data.body, data.extrude = "LI", extrude
+    return data
+
+
+def metaballs():
+    data = bpy.data.metaballs.new("Sign")
+    data.resolution = data.render_resolution = 0.3
+    for x in (0.0, 0.3):
+        ball = data.elements.new()
+        ball.co, ball.radius = (x, 0.0, 0.0), 0.5
+    return data
+
+
+@pytest.mark.parametrize("make", [lambda: text(0.0), lambda: text(0.03), metaballs], ids=["flat", "thick", "metaballs"])
+def test_text_and_metaballs_shine_once(tmp_path, make):
+    """Blender shows renders the object and the mesh that it makes."""
     start()
-    text = bpy.data.curves.new("Sign", "FONT")
-    text.body, text.extrude = "LI", extrude
-    text.materials.append(lamp_material()[0])
+    data = make()
+    data.materials.append(lamp_material()[0])
     sign = scene_parts.link(
-        bpy.data.objects.new("Sign", text), location=(-0.4, 1.2, 1.0), rotation=(math.pi - 0.7, 0.0, 0.0)
+        bpy.data.objects.new("Sign", data), location=(-0.4, 1.2, 1.0), rotation=(math.pi - 0.7, 0.0, 0.0)
     )
     sign.visible_camera = False
     lights = assert_agrees(tmp_path, samples=1024, count=16, tolerance=6e-3)[2].lights

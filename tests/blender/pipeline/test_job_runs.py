@@ -14,7 +14,7 @@ import scene_parts
 from kills import contents
 
 from ltsh_addon.blender.process import blender_process
-from ltsh_addon.blender.process.bake import scene_facts
+from ltsh_addon.blender.process.bake import BakeFactsJob, scene_facts
 from ltsh_addon.cli import main
 from ltsh_addon.pipeline import BakeOptions, PictureOptions, batch
 from ltsh_addon.pipeline.batch import merge
@@ -102,13 +102,13 @@ def test_a_killed_blender_is_one_failed_task(room, tmp_path, own_blender):
 
 
 def test_facts_are_those_of_the_frame_and_of_the_file(room):
-    facts = scene_facts(room, (1, None), "all")
+    facts = scene_facts(BakeFactsJob(room, [1, None], "all"))
     assert [(fact["frame"], fact["camera"]) for fact in facts] == [(1, "Camera"), (3, "Camera")]
     assert [fact["lights"] for fact in facts] == [1, 1]
     assert all(sorted(fact["objects"]) == ["Bare", "Floor", "Slab"] for fact in facts)
-    assert scene_facts(room, (None,), None)[0]["objects"] == []
+    assert scene_facts(BakeFactsJob(room, [None]))[0]["objects"] == []
     with pytest.raises(blender_process.SceneError, match="object 'Roof' is not in scene"):
-        scene_facts(room, (None,), ("Roof",))
+        scene_facts(BakeFactsJob(room, [None], ("Roof",)))
 
 
 def test_shards_at_the_same_time_in_one_folder_are_the_single_run(room, tmp_path):

@@ -8,6 +8,7 @@ from pathlib import Path
 import bpy
 import programs
 import pytest
+import scene_parts
 from job_window import SECONDS, Hand, ended, image_pixels
 from kills import is_running
 
@@ -64,6 +65,41 @@ def test_cancelling_keeps_what_is_finished_and_marks_it(never_ends, stop):
     assert image_pixels("LTSH ltsh4c.combined").max() > 0.0
     # The choice is there again when Cycles is.
     assert never_ends.ltsh.second == "cycles"
+
+
+def test_a_cancelled_bake_keeps_and_shows_finished_objects_and_the_next_does_the_others(scene):
+    names = ["Floor", *(f"Tile {number}" for number in range(3))]
+    for number, name in enumerate(names[1:]):
+        scene_parts.add_plane(bpy.data.materials["Floor"], size=0.5, name=name, location=(number, 0.0, 0.3))
+    for name in names:
+        bpy.data.objects[name].select_set(True)
+    scene.ltsh.bake_view = "above"
+    hand = Hand("bake").start()
+    job = operators.running_job()
+    hand.until(lambda: job.shown)
+    assert "done" in job.objects.values() and len(job.objects) < len(names)
+    # The object is there to look at while the others go on.
+    assert all(image_pixels(f"LTSH {name} ltsh4c.combined").any() for name in shown_names(scene))
+    assert results.lacks(results.result_of(scene)) == "Not complete: more objects"
+    hand.send("ESC", "PRESS")
+    done = [name for name, state in job.objects.items() if state == "done"]
+    assert hand.reports == [("WARNING", f"bake was cancelled; kept: {', '.join(done)}")]
+    folder = job.output
+    files = {name: (folder / f"{name}.exr").read_bytes() for name in done}
+    hand = Hand("bake").start()
+    job = operators.running_job()
+    hand.until(lambda: False)
+    assert job.objects == {name: "unchanged" if name in done else "done" for name in names}
+    assert hand.reports[-1][1].endswith(f"not baked again since nothing has changed: {len(done)} of 4")
+    assert files == {name: (folder / f"{name}.exr").read_bytes() for name in done}
+    assert set(shown_names(scene)) == set(names)
+    scene.ltsh.bake_changed = False
+    Hand("bake").start().until(lambda: False)
+    assert set(results.state["baked"][1].values()) == {"done"}
+
+
+def shown_names(scene):
+    return list(results.result_of(scene).groups)
 
 
 class Watcher(Hand):

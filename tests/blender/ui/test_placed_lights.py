@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import scene_parts as parts
 from mathutils import Matrix, Vector
-from recorded_layout import buttons, drawn
+from recorded_layout import Layout, buttons, drawn
 
 from ltsh_addon.blender.ui import panels, preview
 
@@ -185,3 +185,44 @@ def test_a_picture_becomes_the_environment_of_any_world(scene, picture, make):
     assert "ltsh.open_environment" not in buttons(shown) and "default_value" in [item.what for item in shown]
     with pytest.raises(RuntimeError, match="nowhere"):
         bpy.ops.ltsh.open_environment(filepath=str(picture.with_name("nowhere.exr")))
+
+
+@pytest.mark.parametrize(("role", "toward", "larger", "stronger"), [
+    # From the south the eye sees west on its left.
+    ("KEY", (-0.5417, -0.5417, 0.6428), 1.0, 1.0), ("FILL", (0.7399, -0.6209, 0.2588), 2.0, 0.25),
+    ("RIM", (0.2988, 0.6409, 0.7071), 1.0, 1.0),
+])  # fmt: skip
+def test_lights_by_role_stand_around_the_object_as_the_view_sees_it(scene, role, toward, larger, stronger):
+    for ob in [ob for ob in scene.objects if ob.type == "MESH"]:
+        bpy.data.objects.remove(ob)
+    parts.add_sphere(radius=0.5, location=(0.0, 0.0, 0.5))
+    scene.camera.matrix_world = Matrix.Translation((0.0, -10.0, 0.5)) @ Matrix.Rotation(np.pi / 2.0, 4, "X")
+    scene.camera.data.type, scene.camera.data.ortho_scale = "ORTHO", 4.0
+    point, direction, distance = preview._surface_at(bpy.context, seen_from(scene.camera), (80, 45), role)
+    assert (point - Vector((0.0, -0.5, 0.5))).length < 0.01 and (direction - Vector(toward)).length < 1e-3
+    # The ball itself, which the way to the rim light crosses, does not bound it.
+    assert distance == pytest.approx(preview.DISTANCE * 4.0, rel=1e-3)
+    wall = parts.add_plane(size=40.0, name="Wall", location=(0.0, 1.5, 0.0), rotation=(np.pi / 2.0, 0.0, 0.0))
+    bpy.context.view_layer.update()
+    *_, distance = preview._surface_at(bpy.context, seen_from(scene.camera), (80, 45), role)
+    free = 2.0 / toward[1] if toward[1] > 0.0 else np.inf
+    assert distance == pytest.approx(min(preview.DISTANCE * 4.0, preview.FREE_SHARE * free), rel=0.01)
+    bpy.data.objects.remove(wall)
+    bpy.ops.ltsh.add_light(location=point, normal=direction, distance=2.0, role=role)
+    light = bpy.context.view_layer.objects.active
+    assert light.name == preview.ROLES[role][0] and light.data.size == pytest.approx(larger * 1.2)
+    assert light.data.energy == pytest.approx(stronger * 40.0)
+
+
+def test_the_menu_of_lights_has_those_by_role(addon):
+    menu = SimpleNamespace(layout=Layout())
+    preview.add_lights_to_menu(menu, bpy.context)
+    entries = [item for item in menu.layout.shown if item.what == "ltsh.add_light"]
+    assert [item.values.role for item in entries] == list(preview.ROLES)
+    assert [item.text for item in entries] == [
+        "LTSH Facing the Surface",
+        "LTSH Key Light",
+        "LTSH Fill Light",
+        "LTSH Rim Light",
+    ]
+    assert preview.add_lights_to_menu in bpy.types.VIEW3D_MT_light_add.draw._draw_funcs

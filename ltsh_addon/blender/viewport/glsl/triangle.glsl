@@ -1,4 +1,4 @@
 void main()
 {
-    gl_Position = vec4(corner, 0.0, 1.0);
+    gl_Position = vec4(corner, @Z@, 1.0);
 }

@@ -14,3 +14,4 @@ settings.bake_error = False
 settings.bake_bounces = True
 settings.bake_rest_samples = 256
 settings.bake_per_light = True
+settings.bake_changed = True

@@ -2,7 +2,7 @@ import bpy
 
 settings = bpy.context.scene.ltsh
 
-settings.anti_aliasing = 1
+settings.anti_aliasing = 4
 settings.shadows = True
 settings.shadow_rays = 256
 settings.bake_size = "2048"
@@ -14,3 +14,4 @@ settings.bake_error = False
 settings.bake_bounces = True
 settings.bake_rest_samples = 64
 settings.bake_per_light = False
+settings.bake_changed = True

@@ -1,0 +1,173 @@
+"""Lightmaps beside Cycles' own bake in the same processor time, as it is and denoised by the same denoiser; needs bpy.
+
+python tests/benchmarks/lightmaps.py [--size 256] [--samples 64] [--points 1 4] [--truth 512] [--objects Floor Table]
+
+A room of twelve objects with a window and two lamps. Printed for each object: the errors beside two converged bakes of
+Cycles, relative to the light and without their noise, and what ours are of the others. Processor seconds are of all
+processes, with starting Blender and reading the scene. Texels of Cycles' bake are means over the texel: with more
+`--points` ours are, too.
+"""
+
+import argparse
+import math
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "blender" / "helpers")]
+
+
+def build(path):
+    """Save the room: floor, ceiling, four walls, a table, two boxes, two balls and a rug."""
+    import bpy
+    import scene_parts as parts
+
+    parts.empty_scene()
+    paints = {
+        name: parts.principled(name, Base_Color=(*color, 1.0), Roughness=1.0)[0]
+        for name, color in {"White": (0.8,) * 3, "Red": (0.7, 0.15, 0.1), "Oak": (0.45, 0.3, 0.15)}.items()
+    }
+
+    def wall(name, corners, paint="White"):
+        ob = parts.add_mesh(name, corners, [(0, 1, 2, 3)])
+        layer = ob.data.uv_layers.get("UVMap") or ob.data.uv_layers.new(name="UVMap")
+        layer.uv.foreach_set("vector", np.array([0, 0, 1, 0, 1, 1, 0, 1], np.float32))
+        ob.data.materials.append(paints[paint])
+
+    def box(name, location, size, paint):
+        bpy.ops.mesh.primitive_cube_add(size=1.0, location=location, scale=size)
+        bpy.context.object.name = name
+        bpy.context.object.data.materials.append(paints[paint])
+
+    wall("Floor", [(-2, -2, 0), (2, -2, 0), (2, 2, 0), (-2, 2, 0)], "Oak")
+    wall("Ceiling", [(-2, 2, 2.5), (2, 2, 2.5), (2, -2, 2.5), (-2, -2, 2.5)])
+    wall("Back", [(-2, 2, 0), (2, 2, 0), (2, 2, 2.5), (-2, 2, 2.5)])
+    wall("Front", [(2, -2, 0), (-2, -2, 0), (-2, -2, 2.5), (2, -2, 2.5)])
+    wall("Left", [(-2, -2, 0), (-2, 2, 0), (-2, 2, 2.5), (-2, -2, 2.5)], "Red")
+    # Its upper part is the window.
+    wall("Right", [(2, 2, 0), (2, -2, 0), (2, -2, 1.2), (2, 2, 1.2)])
+    box("Table", (0.3, 0.4, 0.7), (1.4, 0.8, 0.05), "Oak")
+    box("Chest", (-1.3, 1.2, 0.4), (0.8, 0.6, 0.8), "White")
+    box("Stool", (0.9, -0.9, 0.25), (0.4, 0.4, 0.5), "Red")
+    box("Rug", (-0.5, -0.8, 0.01), (1.6, 1.0, 0.02), "Red")
+    for name, place, radius in (("Ball", (0.5, 0.4, 0.925), 0.2), ("Globe", (-1.3, 1.2, 1.05), 0.25)):
+        parts.add_sphere(paints["White"], radius=radius, name=name, location=place)
+    parts.add_area_light("Lamp", (0.0, 0.5, 2.4), (0.0, 0.0, 0.0), energy=30.0)
+    parts.add_area_light("Sconce", (-1.9, -0.5, 1.6), (0.0, -1.2, 0.0), energy=12.0)
+    parts.add_world(Color=(0.6, 0.75, 1.0, 1.0), Strength=1.5)
+    parts.save(path)
+
+
+def by_cycles(scene, size, names, samples, seed, path):
+    """Bake diffuse light without color by Cycles, in a process of its own; (objects, H, W, 3), row 0 at the bottom."""
+    import bpy
+
+    bpy.ops.wm.open_mainfile(filepath=str(scene))
+    context = bpy.context.scene
+    context.render.engine, context.cycles.samples, context.cycles.seed = "CYCLES", samples, seed
+    context.cycles.use_adaptive_sampling, light = False, []
+    image = bpy.data.images.new("bake", size, size, alpha=True, float_buffer=True, is_data=True)
+    for material in bpy.data.materials:
+        node = material.node_tree.nodes.new("ShaderNodeTexImage")
+        node.image, material.node_tree.nodes.active = image, node
+    for name in names:
+        for ob in context.objects:
+            ob.select_set(ob.name == name)
+        bpy.context.view_layer.objects.active = context.objects[name]
+        bpy.ops.object.bake(type="DIFFUSE", pass_filter={"DIRECT", "INDIRECT"}, margin=0, use_clear=True)
+        pixels = np.empty(size * size * 4, np.float32)
+        image.pixels.foreach_get(pixels)
+        light.append(pixels.reshape(size, size, 4)[..., :3].copy())
+    np.save(path, np.array(light))
+
+
+def cycles_process(folder, options, samples, seed):
+    """The light of `by_cycles`, and the processor seconds of its process."""
+    path, before = folder / f"cycles_{samples}_{seed}.npy", _processor_seconds()
+    words = ["--cycles", str(folder / "room.blend"), str(path), str(samples), str(seed)]
+    words += ["--size", str(options.size), "--objects", *options.objects]
+    subprocess.run([sys.executable, __file__, *words], check=True, stdout=subprocess.DEVNULL)
+    return np.load(path), _processor_seconds() - before
+
+
+def _processor_seconds() -> float:
+    usages = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(usage.ru_utime + usage.ru_stime for usage in usages)
+
+
+def ours(folder, options, points):
+    """Our light by object as `by_cycles` has it, the arguments of each denoising, and processor seconds."""
+    from ltsh_addon import imaging
+    from ltsh_addon.pipeline import BakeOptions, bake_scene, lightmap
+
+    calls, denoised, before = [], lightmap.denoised_rest, _processor_seconds()
+
+    def noted(rest, *arguments):
+        calls.append(arguments)
+        return denoised(rest, *arguments)
+
+    lightmap.denoised_rest = noted
+    bake_scene(
+        BakeOptions(
+            scene=folder / "room.blend", output=folder / "ours", objects=tuple(options.objects), margin=0, view="above",
+            size=(options.size, options.size), passes=("diffuse_light",), bounces="on", rest_samples=options.samples,
+            sub_samples=points,
+        )
+    )  # fmt: skip
+    lightmap.denoised_rest = denoised
+    layers = [imaging.read_layers(folder / "ours" / f"{name}.exr") for name in options.objects]
+    light = np.array([one["ltsh4c.diffuse_light"][::-1] for one in layers])
+    covered = np.array([one["coverage.hit"].reshape(light.shape[1:3])[::-1] > 0.0 for one in layers])
+    return light, covered, calls, _processor_seconds() - before
+
+
+def error(light, halves) -> float:
+    """The error of light (N, 3) beside halves (2, N, 3), without the noise of these."""
+    light, a, b = light.astype(float), *halves.astype(float)
+    return math.sqrt(max(((light - a) * (light - b)).mean(), 0.0) / (a * b).mean())
+
+
+def main(options):
+    """Print the errors."""
+    from ltsh_addon.pipeline.lightmap import denoised_rest
+
+    with tempfile.TemporaryDirectory(prefix="ltsh-bench-") as name:
+        folder = Path(name)
+        build(folder / "room.blend")
+        costs = [cycles_process(folder, options, samples, 1)[1] for samples in (16, 64)]
+        slope = (costs[1] - costs[0]) / 48
+        truth = np.array([cycles_process(folder, options, options.truth, seed)[0] for seed in (3, 4)])
+        for points in options.points:
+            light, covered, calls, seconds = ours(folder, options, points)
+            samples = max(1, round(16 + (seconds - costs[0]) / slope))
+            noisy, took = cycles_process(folder, options, samples, 2)
+            print(f"{options.size}^2, {options.samples} bounce samples, {points} points; load {os.getloadavg()[0]:.0f}")
+            print(f"  ours {seconds:.0f} processor s; Cycles {samples} samples, {took:.0f} s ({slope:.2f} s a sample)")
+            for number, name in enumerate(options.objects):
+                hit, halves = covered[number], truth[:, number][:, covered[number]]
+                (smooth,) = denoised_rest({("diffuse", 0): noisy[number]}, *calls[number][:2], samples)[0].values()
+                pictures = light[number], noisy[number], smooth.reshape(noisy[number].shape)
+                mine, plain, best = (error(one[hit], halves) for one in pictures)
+                others = f"Cycles {plain:.2%} ({mine / plain:.2f} of it), denoised {best:.2%} ({mine / best:.2f} of it)"
+                print(f"  {name:<8} {mine:.2%}, {others}", flush=True)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cycles", nargs=4, help=argparse.SUPPRESS)
+    for flag, default in (("--size", 256), ("--samples", 64), ("--truth", 512)):
+        parser.add_argument(flag, type=int, default=default)
+    parser.add_argument("--points", type=int, nargs="+", default=[1, 4])
+    parser.add_argument("--objects", nargs="+", default=["Floor", "Back", "Table", "Ball"])
+    chosen = parser.parse_args()
+    if chosen.cycles:
+        scene, path, count, seed = chosen.cycles
+        by_cycles(scene, chosen.size, chosen.objects, int(count), int(seed), path)
+    else:
+        main(chosen)

@@ -1,0 +1,298 @@
+"""Lights that the mouse drags by their highlight, and lights that must stay."""
+
+from types import SimpleNamespace
+
+import bpy
+import numpy as np
+import pytest
+import scene_parts as parts
+from bl_ui.space_toolsystem_toolbar import VIEW3D_PT_tools_active
+from mathutils import Vector
+
+from ltsh_addon.blender.evaluated import EmitterTraits
+from ltsh_addon.blender.lights.area import area_light
+from ltsh_addon.blender.lights.linking import Receivers
+from ltsh_addon.blender.lights.textures import ShownTextures
+from ltsh_addon.blender.ui import gestures
+from ltsh_addon.blender.ui.gestures import LightPose, glossy_lobe, place_of, reason_to_stay, samples_of
+from ltsh_addon.blender.ui.lit_point import surface_hit
+from ltsh_addon.shading import shade
+from ltsh_addon.shading.highlight import STENCIL
+
+EYE, PIXEL = Vector((0.3, -4.0, 2.2)), 0.003
+
+
+@pytest.fixture
+def scene():
+    """A smooth ball, squeezed and turned, on a floor, and a light."""
+    scene = parts.empty_scene()
+    ball = parts.principled("Ball", Roughness=0.25)[0]
+    parts.add_sphere(ball, segments=64, location=(0.0, 0.0, 0.8), rotation=(0.3, 0.2, 0.0), scale=(1.2, 0.8, 0.7))
+    parts.add_plane(parts.principled("Floor", Roughness=0.45, Metallic=1.0)[0])
+    parts.add_area_light("Key", location=(-2.0, -2.0, 3.0))
+    return scene
+
+
+def hits_at(scene, pixels, target):
+    """What rays through `pixels` (P, 2) around a target meet."""
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    toward = (target - EYE).normalized()
+    right = toward.cross(Vector((0.0, 0.0, 1.0))).normalized()
+    above = right.cross(toward)
+    rays = [(toward + PIXEL * (x * right + y * above)).normalized() for x, y in pixels.tolist()]
+    return [surface_hit(scene, depsgraph, EYE, ray) for ray in rays]
+
+
+@pytest.mark.parametrize("target", [(0.2, -0.5, 1.1), (-0.4, -0.4, 0.9), (1.3, -0.8, 0.0), (-1.0, -1.4, 0.0)])
+def test_the_highlight_is_where_the_mouse_is(scene, target):
+    light = bpy.data.objects["Key"]
+    hits = hits_at(scene, 2.0 * STENCIL, Vector(target))
+    matrix, note = place_of(light, LightPose.of(light), hits, 2.5, ShownTextures())
+    assert not note
+    middle = hits[len(hits) // 2]
+    assert (matrix.translation - middle.position).length == pytest.approx(2.5, rel=1e-5)
+    facing = -matrix.col[2].xyz
+    assert facing.dot((middle.position - matrix.translation).normalized()) == pytest.approx(1.0, abs=1e-5)
+    # All pixels around, by the radiance itself.
+    grid = np.stack(np.meshgrid(np.arange(-12, 13), np.arange(-12, 13)), axis=-1).reshape(-1, 2)
+    around = [(pixel, hit) for pixel, hit in zip(grid, hits_at(scene, grid, Vector(target)), strict=True)
+              if hit is not None and hit.material == middle.material]  # fmt: skip
+    pixels, seen = np.array([pixel for pixel, _ in around]), [hit for _, hit in around]
+    lamp = area_light(light, np.array(matrix), EmitterTraits("", True, True), Receivers([]))
+    samples = samples_of(seen, glossy_lobe(middle.material), ShownTextures())
+    radiance = shade(samples, [lamp], passes=("specular",), workers=1).specular.sum(axis=(0, 2))
+    lost = 1.0 - radiance[(pixels == 0).all(axis=-1)][0] / radiance.max()
+    # Facets of 64 segments bend the interpolated normals by a little.
+    assert lost < 0.01 or np.linalg.norm(pixels[np.argmax(radiance)]) <= 2.0
+
+
+def test_normals_are_those_of_the_smooth_surface(scene):
+    (hit,) = hits_at(scene, np.zeros((1, 2)), Vector((0.2, -0.5, 1.1)))
+    ob = bpy.data.objects["Sphere"]
+    inside = ob.matrix_world.inverted() @ hit.position
+    expected = (ob.matrix_world.to_3x3().inverted().transposed() @ inside).normalized()
+    # Interpolated over facets of 64 segments: some 1e-3.
+    assert hit.normal.dot(expected) > 1.0 - 1e-4
+    assert hit.material.name == "Ball" and hit.view.dot((EYE - hit.position).normalized()) == pytest.approx(1.0)
+    assert hits_at(scene, np.zeros((1, 2)), Vector((0.0, 0.0, 4.0))) == [None]
+
+
+def test_dull_surfaces_say_so_and_a_sun_stays_where_it_is(scene):
+    bpy.data.objects["Plane"].data.materials[0] = parts.bsdf_material("ShaderNodeBsdfDiffuse")[0]
+    hits = hits_at(scene, 2.0 * STENCIL, Vector((1.3, -0.8, 0.0)))
+    key = bpy.data.objects["Key"]
+    _, note = place_of(key, LightPose.of(key), hits, 2.0, ShownTextures())
+    assert note == "this surface has no highlight"
+    sun = parts.link(bpy.data.objects.new("Sun", bpy.data.lights.new("Sun", "SUN")), (1.0, 2.0, 3.0))
+    bpy.context.view_layer.update()
+    hits = hits_at(scene, 2.0 * STENCIL, Vector((0.2, -0.5, 1.1)))
+    matrix, note = place_of(sun, LightPose.of(sun), hits, 2.0, ShownTextures())
+    assert not note and matrix.translation == sun.matrix_world.translation
+
+
+def test_lights_that_something_holds_stay(scene):
+    light = bpy.data.objects["Key"]
+    assert reason_to_stay(light) == ""
+    light.lock_location[2] = True
+    assert "locked" in reason_to_stay(light)
+    light.lock_location[2] = False
+    constraint = light.constraints.new("TRACK_TO")
+    constraint.name = "Aim"
+    assert "its constraint 'Aim' moves it" in reason_to_stay(light)
+    constraint.enabled = False
+    assert reason_to_stay(light) == ""
+    light.keyframe_insert("location", frame=1)
+    assert reason_to_stay(light) == "it is animated or driven"
+
+
+@pytest.mark.parametrize("mode", ["XYZ", "QUATERNION", "AXIS_ANGLE"])
+def test_a_light_under_a_sheared_parent_faces_the_point_and_comes_back_to_the_last_bit(scene, mode):
+    outer = parts.link(bpy.data.objects.new("Outer", None), (0.3, 0.1, 0.2), (0.3, 0.5, 0.9), (1.0, 3.0, 0.4))
+    inner = parts.link(bpy.data.objects.new("Inner", None), (0.1, 0.0, 0.2), (0.7, 0.1, 0.3), (0.8, 1.0, 2.0))
+    inner.parent, light = outer, bpy.data.objects["Key"]
+    light.parent, light.rotation_mode = inner, mode
+    light.rotation_euler, light.scale, light.delta_location = (0.1, 7.0, 0.3), (1.0, 1.3, 0.7), (0.1, 0.2, 0.3)
+    light.rotation_quaternion, light.rotation_axis_angle = (0.7, 0.1, -0.5, 0.4), (0.4, 0.1, 0.9, 0.2)
+    bpy.context.view_layer.update()
+    names = ("location", "rotation_euler", "rotation_quaternion", "rotation_axis_angle", "scale")
+    before, world = [tuple(getattr(light, name)) for name in names], light.matrix_world.copy()
+    pose, point, direction = LightPose.of(light), Vector((0.4, 0.2, 0.1)), Vector((0.36, 0.48, 0.8))
+    matrix = pose.facing(point, direction, 2.5)
+    pose.put(light, matrix)
+    bpy.context.view_layer.update()
+    # Rounding of single precision through matrices with scales from 0.4 to 3.
+    assert np.abs(np.array(light.matrix_world) - np.array(matrix)).max() < 1e-4
+    assert (light.matrix_world.translation - (point + 2.5 * direction)).length < 1e-4
+    assert light.matrix_world.col[2].xyz.normalized().dot(direction) == pytest.approx(1.0, abs=1e-6)
+    pose.put_back(light)
+    bpy.context.view_layer.update()
+    assert before == [tuple(getattr(light, name)) for name in names] and light.matrix_world == world
+
+
+def test_a_light_is_aimed_where_it_is(scene):
+    light, kind = bpy.data.objects["Key"], gestures.LTSH_OT_aim_light
+    (hit,) = hits_at(scene, np.zeros((1, 2)), Vector((1.3, -0.8, 0.0)))
+    pose = LightPose.of(light)
+    this = SimpleNamespace(
+        hit_under=lambda context, event: hit, _pose=pose, _put=lambda matrix: pose.put(light, matrix)
+    )
+    assert kind.follow(this, bpy.context, None)
+    bpy.context.view_layer.update()
+    assert (light.matrix_world.translation - Vector((-2.0, -2.0, 3.0))).length < 1e-5
+    way = (hit.position - light.matrix_world.translation).normalized()
+    assert way.dot(-light.matrix_world.col[2].xyz.normalized()) == pytest.approx(1.0, abs=1e-6)
+    bpy.context.view_layer.objects.active = light
+    assert kind.reason_against(bpy.context) == ""
+    light.data.type = "POINT"
+    assert kind.reason_against(bpy.context) == "A point light shines everywhere"
+
+
+def test_each_gesture_is_a_tool_that_says_why_it_cannot_begin(addon):
+    groups = [item for item in VIEW3D_PT_tools_active._tools["OBJECT"] if isinstance(item, tuple)]
+    (ours,) = [group for group in groups if getattr(group[0], "idname", "") == "ltsh.drag_highlight_tool"]
+    assert [tool.idname for tool in ours] == [f"{gesture.bl_idname}_tool" for gesture in gestures.GESTURES]
+    texts = []
+    layout = SimpleNamespace(label=lambda text: texts.append(text))
+    ours[0].draw_settings(bpy.context, layout, None)
+    light = parts.add_area_light("Key")
+    bpy.context.view_layer.objects.active = light
+    ours[0].draw_settings(bpy.context, layout, None)
+    light.lock_rotation[0] = True
+    ours[1].draw_settings(bpy.context, layout, None)
+    assert texts == [
+        "No light is active", "Drag the highlight of Key    Wheel: distance",
+        "Key: its location or rotation is locked: unlock it in the tab Item",
+    ]  # fmt: skip
+
+
+class Recorded(gestures.Gesture):
+    """A gesture that notes what is asked of it."""
+
+    KEYS, bl_label = "Keys", "Gesture"
+
+    def __init__(self, can_press=True):
+        self.asked, self._can_press = [], can_press
+
+    def press(self, context, event):
+        self.asked.append("press")
+        self._note = "pressed"
+        return self._can_press
+
+    def follow(self, context, event):
+        if event.type == "RIGHT_CTRL":
+            raise RuntimeError("broken")
+        self.asked.append("follow")
+        return True
+
+    def wheel(self, factor):
+        self.asked.append(f"wheel {factor:.3g}")
+
+    def put_back(self):
+        self.asked.append("put back")
+
+    def _hover(self, context, event):
+        self.asked.append("hover")
+        return True
+
+    def report(self, kind, text):
+        self.asked.append(text)
+
+
+def window():
+    """A context that counts what a gesture leaves in the window; (context, what is there)."""
+    there = {"timers": 0, "handlers": 0, "cursors": 0, "status": None, "header": None}
+
+    def more(name, step):
+        return lambda *_, **__: there.update({name: there[name] + step})
+
+    area = SimpleNamespace(type="VIEW_3D", header_text_set=lambda text: there.update(header=text))
+    context = SimpleNamespace(
+        window_manager=SimpleNamespace(
+            event_timer_add=more("timers", 1), event_timer_remove=more("timers", -1),
+            modal_handler_add=more("handlers", 1),
+        ),
+        window=SimpleNamespace(
+            cursor_modal_set=more("cursors", 1), cursor_modal_restore=more("cursors", -1),
+            screen=SimpleNamespace(areas=[area]),
+        ),
+        workspace=SimpleNamespace(status_text_set=lambda text: there.update(status=text)),
+        preferences=bpy.context.preferences,
+    )  # fmt: skip
+    return context, there
+
+
+@pytest.mark.parametrize(("events", "asked", "result"), [
+    # (type, value) of events; what is asked; what the last event returns.
+    (["press", "move", "release"], ["press", "follow"], "FINISHED"),
+    (["press", "move", "ESC"], ["press", "follow", "put back"], "CANCELLED"),
+    (["press", "RIGHTMOUSE"], ["press", "put back"], "CANCELLED"),
+    (["move", "ESC"], [], "CANCELLED"),
+    (["release", "double", "move", "release"], ["press", "follow"], "FINISHED"),
+    (["press", "LEFT_CTRL", "WHEELUPMOUSE", "release"], ["press", "follow", "wheel 1.1", "follow"], "FINISHED"),
+    # Shares are told once where the mouse rests, and not during a drag.
+    (["move", "TIMER", "TIMER", "TIMER", "move", "TIMER", "ESC"], ["hover"], "CANCELLED"),
+    (["move", "TIMER", "press", "TIMER", "TIMER", "release"], ["press"], "FINISHED"),
+])  # fmt: skip
+def test_a_gesture_lasts_from_a_press_to_a_release(events, asked, result):
+    button = {"press": "PRESS", "release": "RELEASE", "double": "DOUBLE_CLICK"}
+    words = {name: ("LEFTMOUSE", value) for name, value in button.items()} | {"move": ("MOUSEMOVE", "NOTHING")}
+    gesture, (context, there) = Recorded(), window()
+    assert gesture.invoke(context, SimpleNamespace(type="LEFTMOUSE", value="RELEASE")) == {"RUNNING_MODAL"}
+    assert there["status"] == "Keys    Esc: Cancel"
+    for event in events:
+        kind, value = words.get(event, (event, "PRESS"))
+        returned = gesture.modal(context, SimpleNamespace(type=kind, value=value))
+    assert gesture.asked == asked and returned == {result}
+    assert there == {"timers": 0, "handlers": 1, "cursors": 0, "status": None, "header": None}
+
+
+def test_a_gesture_of_a_tool_begins_with_the_press_and_says_why_it_cannot():
+    press = SimpleNamespace(type="LEFTMOUSE", value="PRESS")
+    gesture, (context, there) = Recorded(), window()
+    assert gesture.invoke(context, press) == {"RUNNING_MODAL"} and there["header"] == "pressed"
+    assert gesture.modal(context, SimpleNamespace(type="LEFTMOUSE", value="RELEASE")) == {"FINISHED"}
+    gesture, (context, there) = Recorded(can_press=False), window()
+    assert gesture.invoke(context, press) == {"CANCELLED"} and gesture.asked == ["press", "pressed"]
+    assert there == {"timers": 0, "handlers": 0, "cursors": 0, "status": None, "header": None}
+
+
+def test_a_gesture_that_fails_puts_everything_back():
+    gesture, (context, there) = Recorded(), window()
+    gesture.invoke(context, SimpleNamespace(type="LEFTMOUSE", value="PRESS"))
+    assert gesture.modal(context, SimpleNamespace(type="RIGHT_CTRL", value="PRESS")) == {"CANCELLED"}
+    assert gesture.asked == ["press", "put back", "Gesture: broken"]
+    assert there == {"timers": 0, "handlers": 1, "cursors": 0, "status": None, "header": None}
+
+
+def test_where_a_bent_surface_shines_brighter_beside_the_mouse_it_says_so():
+    """On a monkey, beside the radiance at all pixels around; the others leave the highlight at the mouse."""
+    scene = parts.empty_scene()
+    material, node = parts.principled("Skin", Metallic=1.0)
+    bpy.ops.mesh.primitive_monkey_add(location=(0.0, 0.0, 0.9))
+    bpy.ops.object.shade_smooth()
+    bpy.context.object.data.materials.append(material)
+    bpy.context.object.modifiers.new("Smooth", "SUBSURF").levels = 2
+    light, textures = parts.add_area_light("Key", size=0.4, size_y=0.3), ShownTextures()
+    random = np.random.default_rng(4)
+    grid = np.stack(np.meshgrid(np.arange(-10, 11), np.arange(-10, 11)), axis=-1).reshape(-1, 2) * 2.0
+    grid, fine = grid[np.hypot(*grid.T) <= 20.0], 0.4  # fine: the pixels of a larger picture
+    good = quiet = told = 0
+    for _ in range(40):
+        node.inputs["Roughness"].default_value = random.uniform(0.1, 0.6)
+        light.location = random.uniform([-3.0, -4.0, 1.5], [3.0, 0.0, 4.0])
+        target = Vector(random.uniform([-0.7, 0.0, 0.3], [0.7, 0.0, 1.5]))
+        hits = hits_at(scene, fine * 2.0 * np.concatenate([STENCIL, gestures.RING]), target)
+        if None in hits[: len(STENCIL)]:
+            continue
+        hits = [hit for hit in hits if hit is not None]
+        matrix, note = place_of(light, LightPose.of(light), hits, 3.0, textures)
+        lamp = area_light(light, np.array(matrix), EmitterTraits("", True, True), Receivers([]))
+        around = [hit for hit in hits_at(scene, fine * grid, target) if hit is not None]
+        samples = samples_of([hits[4], *around], glossy_lobe(material), textures)
+        here, *others = shade(samples, [lamp], passes=("specular",), workers=1).specular.sum(axis=(0, 2)).tolist()
+        assert note in ("", gestures.BESIDE, gestures.NO_PEAK)
+        quiet, told = quiet + (note == ""), told + (note == gestures.BESIDE)
+        good += note == "" and max(others) < 1.02 * here
+        assert note != gestures.BESIDE or max(others) > 1.009 * here
+    # Peaks that are narrower than what is between the rays around are missed.
+    assert quiet >= 5 and told >= 3 and good >= 0.8 * quiet, (good, quiet, told)

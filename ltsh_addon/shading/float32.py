@@ -467,7 +467,6 @@ class _Lighting:
             # A sample may occur with several lights.
             np.add.at(self.radiance, (row[number[pairs]], members[pairs]), values.astype(np.float32))
 
-
     def _add_outlines_in_float64(self, members, body, light) -> np.ndarray:
         """Add the light of a body, of which `light` is one, at the samples `members` (K,) that see it as an outline.
         Returns the others."""

@@ -11,7 +11,7 @@ from ltsh_addon import shading
 from ltsh_addon.emitters import light_nodes, light_tree, tiles
 from ltsh_addon.emitters.light_tree import LightTree
 from ltsh_addon.scene import EllipseLight, PolygonLight, QuadLight
-from ltsh_addon.shading import float32, integrator
+from ltsh_addon.shading import float32, integrator, lights32
 
 # What the lights of a tree may be off together; degree 4 is itself off by ten times as much.
 OFF = 3e-3
@@ -126,7 +126,7 @@ def test_uneven_surfaces_need_few_near_lights_whole(monkeypatch):
 
     def counting(*arguments):
         found = add(*arguments)
-        counts.append(len(found[0]))
+        counts.append(len(found[0][0]))
         return found
 
     monkeypatch.setattr(float32, "add_far_lights", counting)
@@ -144,7 +144,7 @@ def test_few_samples_between_many_lights_get_the_light_of_each(name, monkeypatch
     options = {"passes": [name], "workers": 1}
     found = getattr(shading.shade(samples, lights, "ltsh4", **options), name)
     # The tails of lobes are true where lights are points: specular light is compared with that of a fine tree.
-    monkeypatch.setattr(*((float32, "FEWEST", 1000) if name == "diffuse" else (light_tree, "TILE", (10, 10))))
+    monkeypatch.setattr(*((lights32, "FEWEST", 1000) if name == "diffuse" else (light_tree, "TILE", (10, 10))))
     monkeypatch.setattr(light_tree, "ERROR", (1e-5, 1e-5))
     expected = getattr(shading.shade(samples, lights, "ltsh4", **options), name)
     assert relative_error(found, expected) < OFF
@@ -282,4 +282,4 @@ def test_nodes_have_the_power_and_the_moments_of_their_lights():
     assert all(
         np.linalg.norm(light.polygon() - tree.center[0], axis=1).max() < 1.001 * tree.radius[0] for light in lights
     )
-    assert len(lights) < float32.FEWEST  # so that few lights are shaded one by one
+    assert len(lights) < lights32.FEWEST  # so that few lights are shaded one by one

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field, replace
 import bpy
 import numpy as np
 
-from ...emitters import planar_polygons
 from ...cycles.patches import GRID, cut_into_patches, note_patches, split_light
+from ...emitters import planar_polygons
 from ...emitters.planar_polygons import FlatPolygon
 from ...scene import Light, PolygonLight, QuadLight
 from ..evaluated import SURFACE_TYPES, EmitterTraits, RenderedSurface, is_rendered, read_values, surface_instancer

@@ -165,7 +165,7 @@ def test_lights_shaded_together_are_those_of_each(shape, monkeypatch):
     smooth = unit(np.array([0.0, 0.0, 1.0]) + 0.1 * np.random.default_rng(5).normal(size=(300, 3)))
     samples = replace(samples, smooth_normal=smooth, geometric_normal=smooth)
     shades = [shading.shade(samples, lights, "ltsh4", workers=1)]
-    monkeypatch.setattr(float32, "FEWEST", 1000)
+    monkeypatch.setattr(lights32, "FEWEST", 1000)
     shades.append(shading.shade(samples, lights, "ltsh4", workers=1))
     for name in ("specular", "diffuse"):
         assert relative_error(*(getattr(one, name) for one in shades)) < 2e-4

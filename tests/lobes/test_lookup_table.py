@@ -115,7 +115,7 @@ def test_a_shipped_table_is_loaded_once_and_a_users_table_each_time(tmp_path):
     assert shading.load_table("ltsh2") is shading.load_table("ltsh2")
     assert shading.load_table(path) is not shading.load_table(path)
     with pytest.raises(ValueError, match="read-only"):
-        load_table("ltc").warp[0, 0, 0] = 1.0
+        shading.load_table("ltc").warp[0, 0, 0] = 1.0
 
 
 def test_a_written_table_is_read_back(tmp_path):

@@ -248,7 +248,7 @@ def _interpolate(channels, shape, roughness, theta_coordinate):
 def load_table(name_or_path: str | Path) -> LookupTable:
     """A shipped table ("ltc", "ltsh2", "ltsh4" or "ltsh4c"), or the one in a .npz file. Raises TableError.
 
-    Shipped tables are loaded once. A user's table may change meanwhile.
+    Shipped tables are loaded once, and their arrays cannot be written. A user's table may change meanwhile.
     """
     if str(name_or_path) in SHIPPED_TABLES:
         return _shipped_table(str(name_or_path))
@@ -257,7 +257,10 @@ def load_table(name_or_path: str | Path) -> LookupTable:
 
 @cache
 def _shipped_table(name: str) -> LookupTable:
-    return _read_table(name, _tables_folder() / f"{name}.npz")
+    table = _read_table(name, _tables_folder() / f"{name}.npz")
+    for array in (value for value in vars(table).values() if isinstance(value, np.ndarray)):
+        array.setflags(write=False)
+    return table
 
 
 def _read_table(name_or_path: str | Path, path: Path) -> LookupTable:

@@ -114,6 +114,8 @@ def test_a_shipped_table_is_loaded_once_and_a_users_table_each_time(tmp_path):
     path = written(tmp_path / "own.npz", *contents("ltsh2"))
     assert shading.load_table("ltsh2") is shading.load_table("ltsh2")
     assert shading.load_table(path) is not shading.load_table(path)
+    with pytest.raises(ValueError, match="read-only"):
+        shading.load_table("ltc").warp[0, 0, 0] = 1.0
 
 
 def test_a_written_table_is_read_back(tmp_path):

@@ -333,8 +333,11 @@ def baked_displacement(surface, studio) -> np.ndarray:
     """
     mesh = surface.mesh
     materials = [material for material in dict.fromkeys(surface.materials) if material is not None]
-    for number, material in enumerate(surface.materials[: len(mesh.materials)]):
-        mesh.materials[number] = material
+    for number, material in enumerate(surface.materials):
+        if number < len(mesh.materials):
+            mesh.materials[number] = material
+        else:  # an override needs no slot
+            mesh.materials.append(material)
     layer = mesh.color_attributes.new("ltsh_position", "FLOAT_COLOR", "CORNER")
     mesh.color_attributes.active_color = layer
     ob, scene, count = bpy.data.objects.new("ltsh displaced", mesh), studio.scene, len(mesh.loops)

@@ -42,6 +42,12 @@ def two_slots():
         face.material_index = int(face.center.x > 0.0)
 
 
+def overridden():
+    """Without slots, of which an override needs none."""
+    ground(None).data.materials.clear()
+    bpy.context.view_layer.material_override = moved_material(0.6)
+
+
 def rocks():
     """Instances of a ball whose quadrangles become bent."""
     ground(parts.principled("Floor", Roughness=0.7)[0], 2)
@@ -50,7 +56,9 @@ def rocks():
     assert twin.data is rock.data
 
 
-@pytest.mark.parametrize("build", [hilly_ground, stretched_ground, two_slots, rocks], ids=lambda build: build.__name__)
+@pytest.mark.parametrize(
+    "build", [hilly_ground, stretched_ground, two_slots, overridden, rocks], ids=lambda build: build.__name__
+)
 def test_displaced_surfaces_are_lit_as_in_cycles(tmp_path, build):
     """Of 96 x 64 pixels half were black where surfaces lie lower than without displacement. Within 2 %: the noise of
     shadows, of 256 rays, and single pixels at ridges."""

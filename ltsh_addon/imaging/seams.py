@@ -15,6 +15,7 @@ import numpy as np
 
 from ..cycles.texels import TexelMesh
 from ..cycles.uv import cross, repeated
+from ..emitters.planar_polygons import connected
 
 # SAME_PLACE: corners that are nearer count as one, relative to the size of all. SAME_UV: the same in texels.
 SAME_PLACE, SAME_UV = 1e-6, 1.0 / 64.0
@@ -98,7 +99,8 @@ def islands_of(grid: TexelGrid) -> Islands:
     of_edge = np.cumsum(is_first) - 1
     pair = (np.bincount(of_edge)[of_edge] == 2)[:-1] if len(order) else np.zeros(0, bool)
     is_same = np.abs(ends[a] - ends[b]).max(axis=(1, 2), initial=0.0) < SAME_UV
-    islands = _joined(count, triangle[a[meets & is_same]], triangle[b[meets & is_same]])
+    joined = np.stack([triangle[a[meets & is_same]], triangle[b[meets & is_same]]], axis=1)
+    islands = np.unique(connected(count, joined), return_inverse=True)[1]
     side = grid.uv[triangle, apex] - ends[:, 0]
     along = ends[:, 1] - ends[:, 0]
     seam = np.flatnonzero(meets & ~is_same & pair)
@@ -120,18 +122,6 @@ def _chosen(seams: Seams, mask: np.ndarray) -> Seams:
     number = np.cumsum(mask) - 1
     values = (seams.start, seams.end, seams.inward, seams.triangle, seams.normal, number[seams.other])
     return Seams(*(value[mask] for value in values))
-
-
-def _joined(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Numbers (count,) that are equal for all that pairs (a, b) join."""
-    label = np.arange(count)
-    while True:
-        low = np.minimum(label[a], label[b])
-        np.minimum.at(label, label[a], low)
-        np.minimum.at(label, label[b], low)
-        label = label[label]
-        if np.array_equal(label[a], label[b]):
-            return np.unique(label, return_inverse=True)[1] if count else label
 
 
 @dataclass(frozen=True)

@@ -180,6 +180,13 @@ def power_for(factor: float, power: float, share: float) -> float:
     return max(0.0, power * (1.0 + (factor - 1.0) / share))
 
 
+def view_under(context, event) -> tuple:
+    """The region of the 3D view under the mouse, None where there is none, and the pixel (2,) in it."""
+    region = region_under(context, event.mouse_x, event.mouse_y)
+    corner = (0, 0) if region is None else (region.x, region.y)
+    return region, np.array([event.mouse_x, event.mouse_y]) - corner
+
+
 class Gesture:
     """A modal operator: a drag with the left button over surfaces changes a light, until the button is released.
 
@@ -309,8 +316,8 @@ class Gesture:
 
     def hit_under(self, context, event) -> SurfaceHit | None:
         """The surface under the mouse."""
-        region = region_under(context, event.mouse_x, event.mouse_y)
-        return None if region is None else hit_at(context, region, (event.mouse_x - region.x, event.mouse_y - region.y))
+        region, mouse = view_under(context, event)
+        return None if region is None else hit_at(context, region, mouse)
 
 
 class MovingGesture(Gesture):
@@ -362,9 +369,8 @@ class LTSH_OT_drag_highlight(MovingGesture, bpy.types.Operator):
 
     def follow(self, context, event) -> bool:
         """As `press`."""
-        region = region_under(context, event.mouse_x, event.mouse_y)
-        where = (event.mouse_x - region.x, event.mouse_y - region.y) if region is not None else ()
-        hits = hits_around(context, region, where) if region is not None else []
+        region, mouse = view_under(context, event)
+        hits = hits_around(context, region, mouse) if region is not None else []
         if not hits:
             self._note = NO_SURFACE
             return False
@@ -458,11 +464,10 @@ class LTSH_OT_drag_shadow(MovingGesture, bpy.types.Operator):
 
     def press(self, context, event) -> bool:
         """Choose the edge of a shadow near the mouse; False where there is none."""
-        region = region_under(context, event.mouse_x, event.mouse_y)
+        region, mouse = view_under(context, event)
         if region is None:
             self._note = NO_SURFACE
             return False
-        mouse = np.array([event.mouse_x - region.x, event.mouse_y - region.y])
         depsgraph = context.evaluated_depsgraph_get()
         self._edge, self._note = shadow_edge_near(
             OccluderRays(context.scene, depsgraph, self._light),

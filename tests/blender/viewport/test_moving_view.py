@@ -192,6 +192,19 @@ def test_shares_are_smoothed_along_surfaces_and_shadows_stay_sharp():
     np.testing.assert_allclose(found[4, 4], 0.3, atol=1e-6)
 
 
+def drawn_in_steps(camera, shown, most, unfinished=lambda drawings: None):
+    """The number of drawings without time before the last of at most `most`, and its picture. `unfinished` is called
+    with the number of those before each that ends without a picture."""
+    with OpenView(camera, SIZE) as opened:
+        for drawings in range(most):
+            try:
+                with new_shaders_until(0.0):
+                    return drawings, opened.draw(shown)
+            except ShadersMissing:
+                unfinished(drawings)
+    raise AssertionError(f"{most} drawings made no picture")
+
+
 @pytest.mark.newest
 def test_a_drawing_that_has_no_time_compiles_one_shader_at_most_and_the_last_one_has_the_picture():
     camera, shown = set_up_scene(), ShownPicture("ltsh4", "combined")
@@ -200,13 +213,7 @@ def test_a_drawing_that_has_no_time_compiles_one_shader_at_most_and_the_last_one
         with OpenView(camera, SIZE) as opened:
             expected = opened.draw(shown)
         forget_shaders()
-        with OpenView(camera, SIZE) as opened:
-            for drawings in range(40):
-                try:
-                    with new_shaders_until(0.0):
-                        return drawings, opened.draw(shown), expected
-                except ShadersMissing:
-                    pass
+        return *drawn_in_steps(camera, shown, 40), expected
 
     drawings, picture, expected = with_graphics(draw)
     # At least those of two steps of the horizons and of the lighting are missing; every other drawing compiles one.
@@ -288,13 +295,11 @@ def test_a_drawing_that_has_no_time_loads_one_slow_image(monkeypatch):
             expected = opened.draw(shown)
         loaded.clear()
         monkeypatch.setattr(drawing, "SLOW_SECONDS", -1.0)
-        with OpenView(camera, SIZE) as opened:
-            for drawings in range(9):
-                try:
-                    with new_shaders_until(0.0):
-                        return drawings, opened.draw(shown), expected
-                except ShadersMissing:
-                    assert len(loaded) == drawings + 1
+
+        def one_more(drawings):
+            assert len(loaded) == drawings + 1
+
+        return *drawn_in_steps(camera, shown, 9, one_more), expected
 
     drawings, picture, expected = with_graphics(draw)
     assert drawings == 2 and sorted(loaded) == ["image 0", "image 1"]

@@ -40,7 +40,7 @@ from .pictures import ShownRest
 # MASK: the AOV with the share of a pixel that is Cycles' alone. SENSOR: the width of the camera's sensor in mm.
 MASK, SENSOR = "ltsh_of_cycles", 36.0
 CAMERA = "LTSH view"
-PASSES = ("combined", "diffuse_direct", "diffuse_color", "glossy_direct", "glossy_color", "environment")
+PASSES = ("combined", "diffuse_direct", "diffuse_color", "glossy_direct", "glossy_color", "environment", "z")
 # Pairs of properties: what views take, and what renders take.
 LEVELS = (
     ("show_viewport", "show_render"),

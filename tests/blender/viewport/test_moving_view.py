@@ -3,6 +3,7 @@
 import gc
 import weakref
 from dataclasses import replace
+from types import SimpleNamespace
 
 import bpy
 import gpu
@@ -47,6 +48,7 @@ def test_pictures_of_what_moves_have_as_many_pixels_as_the_time_allows(monkeypat
     """Of 64 s^-2 units of time at step s, with a goal of 10: at first whole, then 1 of 4 x 4 pixels while it moves."""
     now = [0.0]
     monkeypatch.setattr(redraws.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(redraws.PixelSize, "last_seconds", 0.0)
     light, size = object(), redraws.PixelSize()
 
     def step(state, whole):
@@ -75,6 +77,25 @@ def test_pictures_of_what_moves_have_as_many_pixels_as_the_time_allows(monkeypat
     assert size.is_new and step("g", slow) == 4 and size.end < now[0] + 1.0
     quick = [step(state, 0.9 * redraws.FRAME_SECONDS) for state in "hij"]
     assert quick == [4, 1, 1]
+    # Another view of a slow machine begins with few pixels.
+    step("k", slow)
+    assert redraws.PixelSize().follow(((light,), ("k",))) == 4
+
+
+def test_a_picture_that_is_wanted_sooner_does_not_wait_for_a_later_one(monkeypatch):
+    """Timers of Blender keep the time that they were given first."""
+    timers = {}
+    calls = SimpleNamespace(
+        is_registered=timers.__contains__,
+        unregister=timers.pop,
+        register=lambda timer, first_interval: timers.__setitem__(timer, first_interval),
+    )
+    monkeypatch.setattr(redraws, "bpy", SimpleNamespace(app=SimpleNamespace(timers=calls)))
+    monkeypatch.setattr(redraws, "moments", {"next": 0.0})
+    now = redraws.time.monotonic()
+    for seconds in (20.0, 0.1, 5.0):
+        redraws.redraw_at(now + seconds)
+        assert timers[redraws.redraw] <= seconds
 
 
 @pytest.mark.newest

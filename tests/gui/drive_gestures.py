@@ -165,13 +165,17 @@ def moved(rig, told, shading, name, start, end):
         if way == "Escape":
             rig.fact(f"{shading}, {name}", told[-1])
             rig.xdo("key", "Escape")
-            yield from hands.comes(rig, lambda: place() == before, f"{shading}, {name}: Escape puts it back")
+            yield from hands.comes(
+                rig, lambda: place() == before, lambda: f"{shading}, {name}: Escape puts {before} back: {place()}"
+            )
         rig.xdo("mouseup", 1)
         yield 1
     if name == "drag_shadow":
         rig.check(on_edge(end), f"{shading}: the edge of the shadow is where it was dragged: {place()}")
     yield from hands.typed(rig, "ctrl+z")
-    yield from hands.comes(rig, lambda: place() == before, f"{shading}, {name}: one undo takes it back")
+    yield from hands.comes(
+        rig, lambda: place() == before, lambda: f"{shading}, {name}: one undo takes {before} back: {place()}"
+    )
 
 
 def by_tool(rig):

@@ -129,6 +129,8 @@ class Gesture:
                 return {"FINISHED" if self.is_changed() else "CANCELLED"}
             if event.value in ("PRESS", "DOUBLE_CLICK"):
                 self._is_dragged = self._do(context, event, self.press)
+                # Why a drag cannot begin is told until the mouse moves.
+                self._is_told = not self._is_dragged
         elif self._is_dragged and event.type in ("WHEELUPMOUSE", "WHEELDOWNMOUSE"):
             self.wheel(FARTHER if event.type == "WHEELUPMOUSE" else 1.0 / FARTHER)
             self._do(context, event, self.follow)
@@ -274,7 +276,7 @@ class MovingGesture(Gesture):
 
     def move(self, way: np.ndarray) -> None:
         """As `Gesture.move`; after a key of MODES it changes what that says."""
-        factor = 2.0 ** (way[0] / (STOP * self._scale))
+        factor = 2.0 ** (float(way[0]) / (STOP * self._scale))
         if not self._mode:
             super().move(way)
         elif self._mode == "D":

@@ -264,6 +264,18 @@ def test_a_gesture_of_a_tool_begins_with_the_press_and_says_why_it_cannot():
     assert there == {"timers": 0, "handlers": 0, "cursors": 0, "status": None, "header": None}
 
 
+def test_why_a_drag_cannot_begin_is_told_until_the_mouse_moves():
+    gesture, (context, there) = Recorded(can_press=False), window()
+    gesture.invoke(context, event("LEFTMOUSE", "RELEASE"))
+    for what in ("LEFTMOUSE", "TIMER", "TIMER", "TIMER"):
+        gesture.modal(context, event(what))
+    assert gesture.asked == ["press"] and there["header"] == "pressed"
+    gesture.modal(context, event("MOUSEMOVE", "NOTHING"))
+    for _ in range(2):
+        gesture.modal(context, event("TIMER"))
+    assert gesture.asked == ["press", "hover"]
+
+
 def test_a_gesture_that_fails_puts_everything_back():
     gesture, (context, there) = Recorded(), window()
     gesture.invoke(context, event("LEFTMOUSE", "PRESS"))
@@ -286,6 +298,7 @@ class Moved(gestures.MovingGesture):
         return True
 
     def wheel(self, factor):
+        assert type(factor) is float  # numbers of numpy make arrays of vectors
         self.distance *= factor
 
 

@@ -102,7 +102,8 @@ def power():
 
 
 def place():
-    return np.array(bpy.data.objects["Key"].matrix_world).round(5).tolist()
+    # That of the world is old until the scene is evaluated after an undo.
+    return np.array(bpy.data.objects["Key"].matrix_basis).round(5).tolist()
 
 
 def begun(rig, name):

@@ -311,3 +311,12 @@ def _lobes(materials, number, maps, triangle, weights) -> list[dict[str, np.ndar
                 values[name][texels[which]] = value
         slots.append(values)
     return slots
+
+
+def light_bend(light: np.ndarray, index: np.ndarray, width: int) -> np.ndarray:
+    """How much the light (Q, 3) of the texels `index` of a block bends at each (Q,), by its root mean square."""
+    picture = np.full((index[-1] // width + 3, width + 2, 3), np.nan, np.float32)
+    row, column = index // width + 1, index % width + 1
+    picture[row, column] = light
+    bends = [picture[row + y, column + x] + picture[row - y, column - x] - 2.0 * light for y, x in ((0, 1), (1, 0))]
+    return np.nanmax(np.abs(bends), axis=(0, 2), initial=0.0) / max(float(np.sqrt(np.square(light).mean())), 1e-30)

@@ -16,7 +16,7 @@ from ...shading import shade
 from ...shading.highlight import STENCIL, mirrored, place_for_highlight
 from ..evaluated import EmitterTraits
 from ..lights.area import area_light
-from ..lights.groups import is_animated
+from ..lights.groups import is_animated, is_linked, reason_to_stay
 from ..lights.linking import Receivers
 from ..lights.textures import ShownTextures
 from ..materials.preview_material import COAT, METALS, PreviewMaterial, preview_of
@@ -90,19 +90,6 @@ class LightPose:
         ob.matrix_basis = self.parent.inverted_safe() @ matrix
 
 
-def reason_to_stay(ob) -> str:
-    """Why the mouse may not move a light; "" if it may."""
-    if is_linked(ob):
-        return "it is linked from another file"
-    if active := [constraint.name for constraint in ob.constraints if constraint.enabled]:
-        return f"its constraint {active[0]!r} moves it: switch it off or apply it"
-    if is_animated(ob):
-        return "it is animated or driven"
-    if any(ob.lock_rotation) or (any(ob.lock_location) and ob.data.type != "SUN"):
-        return "its location or rotation is locked: unlock it in the tab Item"
-    return ""
-
-
 def reason_to_keep_power(ob) -> str:
     """Why the mouse may not change the power of a light; "" if it may."""
     if is_linked(ob.data):
@@ -113,12 +100,6 @@ def reason_to_keep_power(ob) -> str:
     if users > 1:
         return f"its data {ob.data.name!r} has {users} users: make it single-user first"
     return ""
-
-
-def is_linked(block) -> bool:
-    """True for what another file owns, overrides that may not be edited included."""
-    override = block.override_library
-    return block.library is not None or (override is not None and override.is_system_override)
 
 
 def glossy_lobe(material) -> PreviewMaterial | None:

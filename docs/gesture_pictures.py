@@ -18,10 +18,11 @@ sys.path.insert(0, str(ROOT))
 
 from ltsh_addon import imaging  # noqa: E402
 from ltsh_addon.blender.lights.textures import ShownTextures  # noqa: E402
-from ltsh_addon.blender.ui.gestures import RING, LightPose, place_of, power_for  # noqa: E402
+from ltsh_addon.blender.ui.gestures import power_for  # noqa: E402
+from ltsh_addon.blender.ui.highlight_place import hits_around, place_of  # noqa: E402
+from ltsh_addon.blender.ui.light_pose import LightPose  # noqa: E402
 from ltsh_addon.blender.ui.lit_point import surface_hit  # noqa: E402
 from ltsh_addon.blender.ui.shadow_edge import OccluderRays, shadow_edge_near  # noqa: E402
-from ltsh_addon.shading.highlight import STENCIL  # noqa: E402
 
 matplotlib.use("Agg")
 WIDTH, HEIGHT, EXPOSURE = 420, 320, 0.9
@@ -86,9 +87,9 @@ def main() -> None:
     lamp = scene()
     pictures = {"Before": (picture("before"), None)}
     pose = LightPose.of(lamp)
-    hits = [hit(np.array(HIGHLIGHT[1]) + 2.0 * offset) for offset in (*STENCIL, *RING)]
+    hits = hits_around(lambda offset: hit(np.array(HIGHLIGHT[1]) + offset))
     distance = (pose.matrix.translation - hits[4].position).length
-    matrix, note = place_of(lamp, pose, [one for one in hits if one is not None], distance, ShownTextures())
+    matrix, note = place_of(lamp, pose, hits, distance, ShownTextures())
     print("highlight:", note or "at the mouse")
     pose.put(lamp, matrix)
     pictures["Drag Highlight"] = picture("highlight"), HIGHLIGHT

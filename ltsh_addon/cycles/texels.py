@@ -190,6 +190,7 @@ class BakeMaterial:
     corrected: bool
     lobes: tuple[dict[str, MapValue | TextureValue | float | list], ...]
     textures: tuple[tuple[ImageTexture, np.ndarray], ...] = ()  # each with its UV map (T, 3, 2)
+    moved: tuple[int, ...] = ()  # displaced: the maps of positions, shading normals and normals of faces
 
     @classmethod
     def of(cls, record: dict, images: Path, uv_maps: dict[str, Path]) -> BakeMaterial:
@@ -201,7 +202,7 @@ class BakeMaterial:
             image = ImageTexture(pixels, texture.extension, texture.interpolation, texture.srgb)
             textures.append((image, np.load(uv_maps[texture.uv])))
         lobes = tuple({name: _value_of(value) for name, value in lobe.items()} for lobe in record["lobes"])
-        return cls(record["corrected"], lobes, tuple(textures))
+        return cls(record["corrected"], lobes, tuple(textures), tuple(record["moved"]))
 
     def colors(self, number: int, triangle: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Colors (Q, 3) of texture `number` at points of triangles (Q,), given by barycentric weights (Q, 3)."""
@@ -241,7 +242,8 @@ def _lobes_of_texels(mesh, materials, texels, read_map, view):
     true_normals = mesh.true_normals()
     corrected = np.array([material.corrected for material in materials], dtype=bool)
     values = (value for material in materials for lobe in material.lobes for value in lobe.values())
-    maps = {number: read_map(number) for number in {value.map for value in values if isinstance(value, MapValue)}}
+    numbers = {value.map for value in values if isinstance(value, MapValue)}
+    maps = {number: read_map(number) for number in numbers.union(*(material.moved for material in materials))}
     for start in range(0, max(len(texels.index), 1), HITS_PER_BLOCK):
         block = slice(start, start + HITS_PER_BLOCK)
         triangle, weights = texels.triangle[block], texels.barycentric[block]
@@ -249,6 +251,12 @@ def _lobes_of_texels(mesh, materials, texels, read_map, view):
         smooth_normal = unit(_interpolated(mesh.normals, triangle, weights))
         true_normal = true_normals[triangle]
         number = mesh.material[triangle]
+        for which, material in enumerate(materials):
+            if material.moved:
+                at = np.flatnonzero(number == which)
+                surface = position, smooth_normal, true_normal
+                for quantity, of_map in zip(surface, material.moved, strict=True):
+                    quantity[at] = maps[of_map][block][at]
         hits = SurfaceHits(
             position=position,
             view=view.towards(position, smooth_normal, true_normal),
@@ -303,3 +311,12 @@ def _lobes(materials, number, maps, triangle, weights) -> list[dict[str, np.ndar
                 values[name][texels[which]] = value
         slots.append(values)
     return slots
+
+
+def light_bend(light: np.ndarray, index: np.ndarray, width: int) -> np.ndarray:
+    """How much the light (Q, 3) of the texels `index` of a block bends at each (Q,), by its root mean square."""
+    picture = np.full((index[-1] // width + 3, width + 2, 3), np.nan, np.float32)
+    row, column = index // width + 1, index % width + 1
+    picture[row, column] = light
+    bends = [picture[row + y, column + x] + picture[row - y, column - x] - 2.0 * light for y, x in ((0, 1), (1, 0))]
+    return np.nanmax(np.abs(bends), axis=(0, 2), initial=0.0) / max(float(np.sqrt(np.square(light).mean())), 1e-30)

@@ -16,7 +16,7 @@ from pathlib import PurePosixPath
 import numpy as np
 
 from ..cycles import uv
-from ..cycles.texels import NOT_BAKED, BakeMaterial, BakeView, TexelMesh, texel_guides, texel_samples
+from ..cycles.texels import NOT_BAKED, BakeMaterial, BakeView, TexelMesh, light_bend, texel_guides, texel_samples
 from ..files import temporary_folder
 from ..imaging import exr, grouped
 from ..imaging.denoise import DENOISER
@@ -38,6 +38,9 @@ NOTED_SHARE_OUTSIDE, NOTED_SHARE_DOUBLE = 0.01, 0.001
 # BLOCK_TEXELS: texels that a thread shades at a time. The allocator reuses arrays of this size; larger ones would be
 # new memory each time.
 BLOCK_TEXELS = 1 << 18
+# With bounces, texels at the edges of shadows get EDGE_POINTS: there light bends by more than EDGE of its root mean
+# square from one texel to the next ones. At most MOST_EDGES of the texels do, those where it bends most.
+EDGE, EDGE_POINTS, MOST_EDGES = 0.05, 16, 0.125
 
 
 def bake_scene(options: BakeOptions, progress: Progress | None = None) -> dict:
@@ -224,6 +227,8 @@ class ObjectBaker:
             if point == points - 1:
                 texels = spread.texels(first)
                 planes_of = {name: values / points for name, values in sums.items()}
+                if options.bounces == "on" and points < (2 if self.record["maps"] else EDGE_POINTS):
+                    self._refine_edges(planes_of, spread, first)
                 halves = self._add_cycles(planes_of, tile, first, texels)
                 covered += len(texels.index)
                 covers += texels.covers
@@ -267,6 +272,26 @@ class ObjectBaker:
         dull = (guides[..., :3].max(axis=-1) <= lightmap.DULL) & (grid.triangle >= 0)
         return {"denoiser": denoiser, "dull_texels": int(np.count_nonzero(dull))}, SeamFit(islands)
 
+    def _refine_edges(self, images, spread, first) -> None:
+        """Replace the layers `images` (Q, 3) of texels of a block at edges of shadows by those of more points."""
+        index, width = spread.texels(first).index, self.options.size[0]
+        if not len(index):
+            return
+        light = (images[layer_name(name, kind)] for name in self.tables for kind in self.options.passes)
+        bend = np.max([light_bend(one, index, width) for one in light], axis=0)
+        chosen = np.sort(np.argsort(-bend, kind="stable")[: int(MOST_EDGES * len(bend))])
+        chosen = chosen[bend[chosen] > EDGE]
+        if not len(chosen):
+            return
+        images_of = _in_order(
+            lambda point: self._block(spread, first, point, chosen), range(EDGE_POINTS), self._threads()
+        )
+        sums = next(images_of)
+        for more in images_of:
+            sums = {name: sums[name] + values for name, values in more.items()}
+        for name, values in sums.items():
+            images[name][chosen] = values / EDGE_POINTS
+
     def _sampling(self, passes, first, texel, points) -> ShadowSampling:
         """How to find the shadows of samples of a block, of the texels `texel` (S,), with so many points each."""
         size = self.options.size
@@ -288,10 +313,11 @@ class ObjectBaker:
             names += [layer_name(image, pass_name) for image in images]
         return [f"{name}.{letter}" for name in names for letter in "RGB"]
 
-    def _block(self, spread, first, point) -> dict[str, np.ndarray]:
-        """Layers (Q, 3) of the Q texels of a block, shaded at one point of each texel."""
-        texels, maps, weights = spread.at(first, point)
-
+    def _block(self, spread, first, point, chosen=None) -> dict[str, np.ndarray]:
+        """Layers (Q, 3) of the Q texels of a block, shaded at one point of each texel: of `sub_samples`, or of
+        EDGE_POINTS for the `chosen` ones."""
+        points = self.options.sub_samples if chosen is None else EDGE_POINTS
+        texels, maps, weights = spread.at(first, point) if chosen is None else spread.at_edges(first, point, chosen)
         read_map = _map_reader(maps, texels)
         samples, texel = texel_samples(self.mesh, self.materials, texels, read_map, self.view, self.lights)
         images, shadows, bounces, soft = {}, None, {}, {}
@@ -305,7 +331,7 @@ class ObjectBaker:
             if "diffuse_light" in options.passes:
                 passes = passes | {"diffuse"}
             workers = 1 if self._threads() > 1 else None
-            sampling = self._sampling(sorted(passes), first, texels.index[texel], options.sub_samples)
+            sampling = self._sampling(sorted(passes), first, texels.index[texel], points)
             shadows = self.tracer.trace(samples, sampling, workers=workers)
         for name, table in self.tables.items():
             for pass_name, radiance in self._passes(samples, texel, len(texels.index), table, shadows).items():
@@ -411,6 +437,14 @@ class TilePoints:
             return texels, maps, None
         positions = self._positions(texels, maps, first, point)
         return self._triangles.at(texels, positions), maps, self._weights_of(first).at(positions)
+
+    def at_edges(self, first: int, point: int, chosen: np.ndarray):
+        """As `at` for one of EDGE_POINTS of the `chosen` texels of the block. Maps there are those of their centers."""
+        texels = self.texels(first)
+        some = texels.index[chosen], texels.triangle[chosen], texels.barycentric[chosen]
+        texels = replace(texels, index=some[0], triangle=some[1], barycentric=some[2])
+        maps = np.load(self._file(first, 0)) if self._mapped else None
+        return self._triangles.spread(texels, point, EDGE_POINTS, self._width), maps, None
 
     @property
     def corners(self) -> np.ndarray:

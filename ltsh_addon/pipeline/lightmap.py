@@ -144,22 +144,23 @@ def denoised_rest(
     from ..blender.process.blender_process import denoiser_libraries
 
     canvas, is_covered = canvas_of(islands), islands.grid.triangle >= 0
-    images = {}
+    images, white = {}, np.concatenate([np.ones_like(guides[..., :3]), guides[..., 3:]], axis=-1)
     for key, light in rest.items():
         is_lit = (light[..., 0] != np.float32(NOT_BAKED)) & is_covered
         if key[0] != "specular":
             is_lit &= guides[..., :3].max(axis=-1) > DULL
-        images[key] = np.where(is_lit[..., None], light, 0.0), is_lit
+        # Light without color owes nothing to that of the surface.
+        images[key] = np.where(is_lit[..., None], light, 0.0), is_lit, guides if key[0] == "specular" else white
     try:
         with open_denoiser(denoiser_libraries(), cores()) as denoiser:
-            done = {key: _on_canvas(canvas, *one, guides, denoiser.guided) for key, one in images.items()}
+            done = {key: _on_canvas(canvas, *one, denoiser.guided) for key, one in images.items()}
             return done, denoiser.name
     except NoDenoiser as error:
 
         def smooth(light, albedo, normals):
             return smoothed(light, np.concatenate([albedo, normals, np.ones_like(light[..., :1])], axis=-1), samples)
 
-        done = {key: _on_canvas(canvas, *one, guides, smooth) for key, one in images.items()}
+        done = {key: _on_canvas(canvas, *one, smooth) for key, one in images.items()}
         return done, f"its bounced light is smoothed along the surface, not denoised: {error}"
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,13 +13,33 @@ from .integrator import shade
 # STENCIL: the pixels around the cursor, in steps; the fifth is the cursor. Their radiance is fitted by a quadratic.
 STENCIL = np.stack(np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]), axis=-1).reshape(-1, 2)
 _FIT = np.linalg.pinv(np.stack([np.ones(9), *STENCIL.T, *(0.5 * STENCIL**2).T, STENCIL.prod(axis=1)], axis=-1))
-# STEPS: of Newton's method. NEAR: steps of the stencil from the cursor to the peak at which it ends.
-STEPS, NEAR = 12, 0.05
+# STEPS: of Newton's method from each start. NEAR: steps of the stencil from the cursor to the peak at which it ends.
+STEPS, NEAR = 10, 0.05
 # FLAT: a gradient, per step of the stencil, of a radiance that hardly varies around the cursor: large lights in smooth
 # surfaces.
 FLAT = 5e-4
 # PROBE: the angle of the differences, relative to that of the lobe; LARGEST: of a step.
 PROBE, LARGEST = 0.1, 0.8
+# RIGID: how far a matrix may be from a rotation. SPATIAL: what moves with samples.
+RIGID, SPATIAL = 1e-5, (
+    "position", "view", "normal", "diffuse_normal", "geometric_normal", "smooth_normal", "tangent",
+)  # fmt: skip
+# STRICT: by how much a sample further away may be brighter than the cursor. In a picture that is a hundredth: what is
+# between samples may be brighter by a little more than they are. GOOD: with less, a search ends.
+STRICT, GOOD = 0.006, 0.003
+# Where Newton's method fails, directions around the mirrored view are tried: on circles at ANGLES rad, TURNS on each,
+# by the cursor and every THINNED-th sample. The best ones with at least DIM of the radiance of the mirrored view are
+# STARTS of a search by smaller and smaller circles, SEARCHED times the lobe, by the FEW brightest samples.
+ANGLES, TURNS, THINNED, DIM, STARTS = (0.08, 0.2, 0.35, 0.55, 0.8), 10, 4, 0.1, 3
+SEARCHED, FEW = (0.3, 0.12, 0.05, 0.02), 24
+
+
+@dataclass(frozen=True)
+class MovedLight:
+    """A light that may be elsewhere."""
+
+    matrix_at: Callable[[np.ndarray], np.ndarray]  # (4, 4) of it in a unit direction (3,) from the cursor
+    at: Callable[[np.ndarray], Light]  # it at such a matrix
 
 
 @dataclass(frozen=True)
@@ -28,6 +48,7 @@ class HighlightPlace:
 
     direction: np.ndarray  # (3,) unit, from the point to the light
     is_peak: bool  # False: nowhere near the mirrored view is there a peak at this pixel, and the radiance varies
+    is_beside: bool = False  # there is no peak because a sample further away is brighter
 
 
 def mirrored(view: np.ndarray, normal: np.ndarray) -> np.ndarray:
@@ -35,53 +56,139 @@ def mirrored(view: np.ndarray, normal: np.ndarray) -> np.ndarray:
     return 2.0 * (view * normal).sum(axis=-1, keepdims=True) * normal - view
 
 
-def place_for_highlight(
-    samples: SurfaceSamples, light_at: Callable[[np.ndarray], Light], technique="ltsh4c"
-) -> HighlightPlace:
-    """The direction for which the specular radiance of a light has its peak at the middle one of the nine `samples`.
+def place_for_highlight(samples: SurfaceSamples, light: MovedLight, technique="ltsh4c") -> HighlightPlace:
+    """The direction for which the specular radiance of a light has its peak at the middle one of the first nine of the
+    `samples`, those of the pixels of STENCIL; no other may be brighter.
 
-    The samples are those of the pixels of STENCIL; `light_at(direction)` is the light in a unit direction (3,) from the
-    middle one. Newton's method for the gradient of the logarithm of the radiance, which is 0 at the peak, from the
-    mirrored view on: of rough and curved surfaces the peak is elsewhere.
+    Newton's method for the gradient of the logarithm of the radiance, which is 0 at the peak, from the mirrored view
+    on: of rough and curved surfaces the peak is elsewhere. Where that fails, the directions around are tried.
     """
     middle = len(STENCIL) // 2
-    direction = mirrored(samples.view[middle], samples.normal[middle])
+    mirror = mirrored(samples.view[middle], samples.normal[middle])
     lobe = max(float(samples.sharpest_roughness[middle]) ** 2, 1e-3)
-    best = None
-    for _ in range(STEPS):
-        first = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))])
-        first /= np.linalg.norm(first)
-        axes = np.stack([first, np.cross(direction, first)])
-        turned = direction + np.concatenate([np.zeros((1, 3)), PROBE * lobe * axes])
-        turned /= np.linalg.norm(turned, axis=-1, keepdims=True)
-        gradient, curvature, is_lit = _fitted(samples, [light_at(one) for one in turned], technique)
-        if not is_lit:
-            break
-        # How far the peak is, in steps of the stencil. Without a peak, by the size of the curvature alone.
-        values, vectors = np.linalg.eigh(curvature)
-        offset = float(np.linalg.norm(vectors.T @ gradient[0] / np.maximum(np.abs(values), 1e-12)))
-        if best is None or offset < best[0]:
-            is_flat = float(np.linalg.norm(gradient[0])) < FLAT
-            best = offset, direction, is_flat or (values.max() < 0.0 and offset < 1.0)
-        if offset < NEAR and values.max() < 0.0:
-            break
-        jacobian = (gradient[1:] - gradient[0]).T / (PROBE * lobe)
-        step = np.linalg.lstsq(jacobian, -gradient[0], rcond=None)[0]
-        step *= min(1.0, LARGEST * lobe / max(np.linalg.norm(step), 1e-30))
-        direction = direction + step @ axes
-        direction /= np.linalg.norm(direction)
-    if best is None:
-        return HighlightPlace(mirrored(samples.view[middle], samples.normal[middle]), False)
-    _, direction, is_peak = best
-    return HighlightPlace(direction, bool(is_peak))
+    problem = _Problem(samples, light, technique, lobe)
+    direction, is_peak = problem.by_newton(mirror)
+    (excess,), _ = problem.excess([direction])
+    if is_peak and excess <= STRICT:
+        return HighlightPlace(direction, True)
+    starts = problem.starts(mirror, [direction] if excess < np.inf else [])
+    for start in starts:
+        searched, now = problem.by_search(start)
+        if now < excess:
+            direction, excess = searched, now
+        if excess <= STRICT:
+            return HighlightPlace(direction, True)
+    return HighlightPlace(direction, False, excess > STRICT)
 
 
-def _fitted(samples: SurfaceSamples, lights: list[Light], technique) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Gradients (L, 2) of the logarithm of the specular radiance of each light, the curvature (2, 2) of the first, and
-    whether it lights all samples."""
-    shaded = shade(samples, lights, technique, passes=("specular",), workers=1, dtype=np.float64)
-    radiance = shaded.specular.sum(axis=-1)
+@dataclass(frozen=True)
+class _Problem:
+    """A highlight to be placed."""
+
+    samples: SurfaceSamples
+    light: MovedLight
+    technique: object
+    lobe: float  # its angle in rad
+
+    def by_newton(self, direction: np.ndarray) -> tuple[np.ndarray, bool]:
+        """The direction (3,) to which Newton's method leads, and whether it is that of a peak."""
+        best, samples = None, self.samples.take(np.arange(len(STENCIL)))
+        for _ in range(STEPS):
+            axes = _axes(direction)
+            turned = _unit(direction + np.concatenate([np.zeros((1, 3)), PROBE * self.lobe * axes]))
+            gradient, curvature, is_lit = _fitted(self._specular(turned, samples, np.float64))
+            if not is_lit:
+                break
+            # How far the peak is, in steps of the stencil. Without a peak, by the size of the curvature alone.
+            values, vectors = np.linalg.eigh(curvature)
+            offset = float(np.linalg.norm(vectors.T @ gradient[0] / np.maximum(np.abs(values), 1e-12)))
+            if best is None or offset < best[0]:
+                is_flat = float(np.linalg.norm(gradient[0])) < FLAT
+                best = offset, direction, is_flat or (values.max() < 0.0 and offset < 1.0)
+            if offset < NEAR and values.max() < 0.0:
+                break
+            jacobian = (gradient[1:] - gradient[0]).T / (PROBE * self.lobe)
+            step = np.linalg.lstsq(jacobian, -gradient[0], rcond=None)[0]
+            step *= min(1.0, LARGEST * self.lobe / max(np.linalg.norm(step), 1e-30))
+            direction = _unit(direction + step @ axes)
+        return (direction, False) if best is None else best[1:]
+
+    def excess(self, directions, samples=None) -> tuple[np.ndarray, np.ndarray]:
+        """By how much (D,) the brightest of the samples is brighter than the cursor, of lights in `directions` (D, 3);
+        and the radiance (D,) there."""
+        radiance = self._specular(directions, self.samples if samples is None else samples)
+        here = radiance[:, len(STENCIL) // 2]
+        return np.where(here > 0.0, radiance.max(axis=-1) / np.maximum(here, 1e-30) - 1.0, np.inf), here
+
+    def starts(self, mirror: np.ndarray, further: list) -> list[np.ndarray]:
+        """The directions (3,) around the mirrored view from which to search, the most promising first."""
+        turned = np.tensordot(np.sin(ANGLES), _circle() @ _axes(mirror), axes=0).reshape(-1, 3)
+        tried = np.stack([mirror, *further, *(turned + np.cos(ANGLES).repeat(TURNS)[:, None] * mirror)])
+        few = np.concatenate([np.arange(len(STENCIL)), np.arange(len(STENCIL), len(self.samples), THINNED)])
+        excess, radiance = self.excess(tried, self.samples.take(few))
+        excess[radiance < DIM * radiance[0]] = np.inf
+        order = np.argsort(excess)[:STARTS]
+        return list(tried[order[excess[order] < np.inf]])
+
+    def by_search(self, direction: np.ndarray) -> tuple[np.ndarray, float]:
+        """The direction (3,) around which no other has less excess, and that excess."""
+        bright = len(STENCIL) + np.argsort(-self._specular([direction], self.samples)[0, len(STENCIL) :])[:FEW]
+        samples = self.samples.take(np.append(np.arange(len(STENCIL)), bright))
+        (excess,), (first,) = self.excess([direction], samples)
+        for angle in SEARCHED:
+            for _ in range(STEPS):
+                tried = _unit(direction + angle * self.lobe * _circle() @ _axes(direction))
+                excesses, radiance = self.excess(tried, samples)
+                excesses[radiance < 0.5 * first] = np.inf
+                least = int(np.argmin(excesses))
+                if excess <= GOOD or not excesses[least] < excess:
+                    break
+                direction, excess = tried[least], float(excesses[least])
+        return direction, float(self.excess([direction])[0][0])
+
+    def _specular(self, directions, samples: SurfaceSamples, dtype=np.float32) -> np.ndarray:
+        """The specular radiance (D, P) of the light in each of the directions (D, 3) from the cursor.
+
+        Samples that move in a rigid way before one light are shaded faster than many lights.
+        """
+        options = {"passes": ("specular",), "workers": 1, "dtype": dtype}
+        matrices = np.array([self.light.matrix_at(direction) for direction in directions])
+        moves = matrices[0] @ np.linalg.inv(matrices)
+        if np.abs(moves[:, :3, :3] @ moves[:, :3, :3].transpose(0, 2, 1) - np.eye(3)).max() < RIGID:
+            moved = samples.take(np.tile(np.arange(len(samples)), len(moves)))
+            arrays = {name: _moved(moves, getattr(samples, name), name == "position") for name in SPATIAL}
+            shading = shade(replace(moved, **arrays), [self.light.at(matrices[0])], self.technique, **options)
+            return shading.specular.sum(axis=(0, 2)).reshape(len(moves), len(samples))
+        lights = [self.light.at(matrix) for matrix in matrices]
+        return shade(samples, lights, self.technique, rows=range(len(lights)), **options).specular.sum(axis=-1)
+
+
+def _moved(moves: np.ndarray, vectors: np.ndarray, are_positions: bool) -> np.ndarray:
+    """Vectors (P, 3) after each of the moves (D, 4, 4), (D P, 3)."""
+    moved = vectors @ moves[:, :3, :3].transpose(0, 2, 1)
+    return (moved + moves[:, None, :3, 3] if are_positions else moved).reshape(-1, 3)
+
+
+def _circle() -> np.ndarray:
+    """Points (TURNS, 2) of the unit circle."""
+    turns = 2.0 * np.pi * np.arange(TURNS) / TURNS
+    return np.stack([np.cos(turns), np.sin(turns)], axis=-1)
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def _axes(direction: np.ndarray) -> np.ndarray:
+    """Two unit vectors (2, 3) across a direction and each other."""
+    first = _unit(np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))]))
+    return np.stack([first, np.cross(direction, first)])
+
+
+def _fitted(radiance: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:
+    """Gradients (L, 2) of the logarithm of the radiance (L, 9) of each light, the curvature (2, 2) of the first, and
+    whether all of it is above 0."""
     if not (radiance > 0.0).all():
-        return np.zeros((len(lights), 2)), np.zeros((2, 2)), False
+        return np.zeros((len(radiance), 2)), np.zeros((2, 2)), False
     _, right, up, right_right, up_up, right_up = _FIT @ np.log(radiance).T
     return np.stack([right, up], axis=-1), np.array([[right_right[0], right_up[0]], [right_up[0], up_up[0]]]), True

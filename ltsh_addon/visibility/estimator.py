@@ -64,7 +64,8 @@ TILE = np.float32(12.0)
 ACROSS, BEND = [AROUND.index(step) for step in ((0, 2), (2, 0))], np.float32(0.75 / 4.0)
 # Rays end at this share of their distance to the light, just before it; but to a light with a face as near as that, GAP
 # of the coordinates before its surface, a step of single precision, or MESH_STEPS of them before a face that glows.
-END, MESH_STEPS = np.float32(1.0 - 1e-4), 16.0
+# FACE_STEPS: but never nearer than so many to a face that glows, which would be in its own light: far from the origin.
+END, MESH_STEPS, FACE_STEPS = np.float32(1.0 - 1e-4), 16.0, 2.0
 # Points along each side of a flat light from which near faces are looked for; as many squared around a point.
 LOOKED_AT = 8
 _ZERO, _ONE, _TINY = np.float32(0.0), np.float32(1.0), np.float32(1e-30)
@@ -243,6 +244,7 @@ class RatioEstimator:
         self.traced = 0
         # How far before the plane of the light rays end, in m, but for what follows from their length; 0: at END.
         self.margin, self.is_tiny = _ZERO, False
+        self.rounding = np.float32(FACE_STEPS * GAP * np.abs(light.center).sum()) if self.is_mesh else _ZERO
         self.is_shared = np.zeros(count, bool)
 
     def trace(self, rays: int, neighbors: PixelNeighbors, typical: dict[str, float], importance: np.ndarray) -> None:
@@ -432,6 +434,8 @@ class RatioEstimator:
         if self.margin:
             margin = self.margin / np.maximum(falling, _TINY)
             ends = np.maximum(ends, distances * np.float32(1.0 - GAP) - margin)
+        if self.rounding:
+            ends = np.clip(distances - self.rounding / np.maximum(falling, _TINY), _ZERO, ends)
         return self.surface.tracer.transmittance(origins.T, directions.T, ends, masks)
 
     def _add_rays(self, members, first, last, split, order=None):
@@ -461,7 +465,7 @@ class RatioEstimator:
         origins, *rest = (_taken(rows, flat) for rows in aimed)
         visibility.ravel()[flat] = _ONE
         if self.chosen_by.light:
-            falling = sampler.falling.ravel()[flat] if self.margin else _ONE
+            falling = sampler.falling.ravel()[flat] if self.is_mesh or self.margin else _ONE
             visibility.ravel()[flat] = self._transmittance(self.mask, falling, origins, *rest)
         if self.chosen_by.surface:
             if self.meet_the_same:
@@ -508,7 +512,7 @@ class RatioEstimator:
         if self.meet_the_same:
             chosen &= (start != origins).any(axis=0)
         chosen = np.flatnonzero(chosen)
-        falling = sampler.falling.ravel()[flat[chosen]] if self.margin else _ONE
+        falling = sampler.falling.ravel()[flat[chosen]] if self.is_mesh or self.margin else _ONE
         rays = start[:, chosen], toward[:, chosen], distance[chosen]
         visibility = self._transmittance(self.surface_mask, falling, *rays)
         differ = np.flatnonzero(visibility != light_visibility.ravel()[flat[chosen]])

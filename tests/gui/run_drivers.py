@@ -26,6 +26,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--runner", required=True, type=shlex.split, help="command, with options of its own")
     parser.add_argument("--out", type=Path, default=ROOT / "out" / "gui")
+    parser.add_argument("--scene", type=Path, help=".blend to open; default: the example scene")
     parser.add_argument("drivers", nargs="*", type=Path, metavar="DRIVER", help="default: all")
     arguments = parser.parse_args()
     drivers = [path.resolve() for path in arguments.drivers] or sorted(HERE.glob("drive_*.py"))
@@ -35,7 +36,7 @@ def main() -> int:
         return 2
     arguments.out.mkdir(parents=True, exist_ok=True)
     archive = built_zip()
-    fixed = ["--blend", str(demo_scene(arguments.out))]
+    fixed = ["--blend", str(arguments.scene or demo_scene(arguments.out))]
     for name in ("random_surfaces", "surface_scenes", "uploaded_samples"):
         fixed += ["--file", str(HERE.parent / "helpers" / f"{name}.py")]
     fixed += ["--file", str(HERE.parent / "blender" / "helpers" / "blender_state.py")]

@@ -148,3 +148,16 @@ def test_without_a_denoiser_light_is_smoothed_and_it_is_said(monkeypatch):
     smooth = done["diffuse", 0]
     assert "not denoised" in said and "no library" in said
     assert smooth[covered].std() < 0.5 * noisy[covered].std() and not smooth[~covered].any()
+
+
+def test_light_without_color_owes_nothing_to_the_color_of_the_surface():
+    made = wall()
+    covered = made.triangle >= 0
+    noisy = np.where(covered[..., None], np.random.default_rng(2).gamma(4.0, 0.25, (SIZE, SIZE, 3)), NOT_BAKED)
+    done = []
+    for color in (0.5, np.random.default_rng(3).uniform(0.1, 0.9, (SIZE, SIZE, 1))):
+        guides = np.zeros((SIZE, SIZE, 6), np.float32)
+        guides[..., :3], guides[..., 5] = color, 1.0
+        light = {("diffuse", 0): noisy.astype(np.float32)}
+        done.append(lightmap.denoised_rest(light, guides, islands_of(made), 64)[0]["diffuse", 0])
+    np.testing.assert_array_equal(*done)

@@ -6,7 +6,7 @@ from surface_scenes import area_light, unit
 
 from ltsh_addon.scene import SurfaceSamples
 from ltsh_addon.shading import shade
-from ltsh_addon.shading.highlight import STENCIL, mirrored, place_for_highlight
+from ltsh_addon.shading.highlight import STENCIL, MovedLight, mirrored, place_for_highlight
 
 # A camera at EYE looks at the origin; a pixel is 1/500 of the distance wide.
 PIXEL = 0.002
@@ -56,18 +56,23 @@ class Scene:
             specular_f0=0.9 * white, specular_f90=white, dielectric=0.0 * white, ior=np.full(count, 1.5),
         )  # fmt: skip
 
-    def light(self, direction):
-        """A square in `direction` from the origin, which it faces."""
+    def matrix_at(self, direction):
+        """That of a square in `direction` from the origin, which it faces."""
         u = unit(np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))]))
-        v = np.cross(direction, u)
-        return area_light(
-            center=self.distance * direction, half_u=self.size * u, half_v=self.size * v, direction=-direction
-        )
+        matrix = np.eye(4)
+        matrix[:3] = np.stack([u, np.cross(direction, u), direction, self.distance * direction], axis=-1)
+        return matrix
+
+    def light(self, matrix):
+        """The square there."""
+        u, v, direction, center = matrix[:3].T
+        return area_light(center=center, half_u=self.size * u, half_v=self.size * v, direction=-direction)
 
     def miss(self, direction):
         """How far the radiance at the cursor is from the largest within 20 pixels, and how far that is in pixels."""
         pixels = AROUND[self.rays(AROUND)[1]]
-        radiance = shade(self.samples(pixels), [self.light(direction)], passes=("specular",)).specular.sum(axis=(0, 2))
+        light = self.light(self.matrix_at(direction))
+        radiance = shade(self.samples(pixels), [light], passes=("specular",)).specular.sum(axis=(0, 2))
         cursor = radiance[(pixels == 0).all(axis=-1)][0]
         return 1.0 - cursor / radiance.max(), float(np.linalg.norm(pixels[np.argmax(radiance)]))
 
@@ -75,7 +80,10 @@ class Scene:
 @pytest.fixture(scope="module")
 def drags():
     scenes = [scene for scene in map(Scene, range(24)) if scene.rays(STENCIL)[1].all()]
-    return [(scene, place_for_highlight(scene.samples(STENCIL), scene.light)) for scene in scenes]
+    lights = [MovedLight(scene.matrix_at, scene.light) for scene in scenes]
+    return [
+        (scene, place_for_highlight(scene.samples(STENCIL), light)) for scene, light in zip(scenes, lights, strict=True)
+    ]
 
 
 def mirror(scene):

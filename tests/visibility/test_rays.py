@@ -444,3 +444,39 @@ def test_a_tracer_that_is_dropped_frees_what_embree_holds(libraries, monkeypatch
     monkeypatch.setattr(embree, "ReleaseScene", lambda scene: (released.append(scene), release(scene)))
     del tracer
     assert len(scenes) >= 2 and sorted(released) == sorted(scenes)
+
+
+@pytest.mark.parametrize("corners", [3, 4, 9])
+@pytest.mark.parametrize("count", [1, 80])
+def test_a_face_that_glows_is_not_in_its_own_light_far_from_the_origin(libraries, corners, count):
+    """At 3 km positions are rounded to .24 mm, which was more than rays end before a light at grazing angles: up to a
+    fifth of its light was missing. 80 faces share their rays."""
+    center, tilt = np.array([3000.0, -1500.0, 750.0]), 0.7
+    right, away = np.array([np.cos(tilt), np.sin(tilt), 0.0]), np.array([-np.sin(tilt), np.cos(tilt), 0.1])
+    away /= np.linalg.norm(away)
+    up = np.cross(away, right)
+    angle = 2.0 * np.pi * np.arange(corners) / corners + 0.3
+    ring = 0.5 * (np.cos(angle)[:, None] * right + np.sin(angle)[:, None] * up) / np.sqrt(count)
+    lights, vertices = [], []
+    for number in range(count):
+        middle = center + (number - 0.5 * count + 0.5) * right / np.sqrt(count)
+        vertices.append(middle + ring)
+        shape = {
+            "half_u": 0.5 * right,
+            "half_v": 0.5 * np.cross(away, right),
+            "direction": away,
+            "radiance": np.ones(3),
+        }
+        lights.append(PolygonLight("Lamp", center=middle, corners=middle + ring, **shape))
+    fan = np.array([[0, place, place + 1] for place in range(1, corners - 1)])
+    triangles = np.concatenate([fan + number * corners for number in range(count)])
+    # A wall beside the light, seen from the light at all angles down to a thousandth.
+    height = np.geomspace(3e-3, 0.6, 40)[:, None]
+    across = np.linspace(-1.0, 1.0, 20)[None]
+    position = center + height[..., None] * away + across[..., None] * right - 1.2 * up
+    position = position.reshape(-1, 3).astype(np.float32).astype(float)
+    samples = surface_samples(position, *2 * [np.broadcast_to(up, position.shape)])
+    faces = OccluderMesh(np.concatenate(vertices), triangles)
+    with open_tracer(Occluders((faces,), [0], [np.eye(3, 4)]), libraries) as tracer:
+        found = trace_visibility(samples, lights, tracer, ShadowSampling(passes=("diffuse",)))
+    assert (found.diffuse == 1.0).all(), np.sort(found.diffuse, axis=None)[:9]

@@ -41,8 +41,11 @@ class PixelSize:
     """How many pixels in either direction share one of the picture, as by Blender's *Pixel Size*: the more while a view
     changes, the longer its pictures take."""
 
+    # Seconds that a whole picture of the last view took, which a new view takes for its own at first.
+    last_seconds = 0.0
+
     def __init__(self):
-        self._state, self._seconds, self._changed = None, 0.0, -MOVING_SECONDS
+        self._state, self._seconds, self._changed = None, PixelSize.last_seconds, -MOVING_SECONDS
         self.step, self.is_new = 1, False  # is_new: its picture is not drawn yet
 
     def follow(self, state: tuple, wait: float = 0.0) -> int:
@@ -60,6 +63,7 @@ class PixelSize:
     def note(self, seconds: float) -> None:
         """Take note of how long a new picture took."""
         self._seconds, self.is_new = seconds * self.step**2, False
+        PixelSize.last_seconds = self._seconds
         if self._changed == math.inf:
             self._changed = time.monotonic()
 
@@ -96,6 +100,8 @@ def redraw_later(start: float, samples: int) -> None:
 
 def redraw_at(moment: float) -> None:
     """Let all views be drawn again at the `moment`."""
+    if moment < moments["next"] and bpy.app.timers.is_registered(redraw):  # it sleeps until a later one
+        bpy.app.timers.unregister(redraw)
     moments["next"] = moment
     _start(redraw, max(moment - time.monotonic(), 0.0))
 

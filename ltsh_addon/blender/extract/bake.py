@@ -24,13 +24,13 @@ from ..lights.area import collect_lights
 from ..lights.emission import emission_of
 from ..lights.world import may_shine, take_world
 from ..materials import aovs
-from ..materials.graph import cut, ensure_nodes
+from ..materials.graph import cut, ensure_nodes, has_displacement
 from ..materials.maps import UV_MAP, MaterialPlan, SavedImages
 from ..process.bake import BakeFactsJob, BakeJob
 from ..render_settings import changed_properties, working_space
 from . import atlas, bake_meshes, pixels
 from .dependencies import NotJudged, dependencies
-from .occluders import collect_occluders, with_baked_shares
+from .occluders import collect_occluders, with_baked_shares, with_displacement
 from .pixels import OCCLUDERS, SEEDS, remove_occlusion
 
 # SAMPLED_TEXELS: width of the part of a texel over which Cycles' bake spreads its samples; the whole texel since 5.2.
@@ -197,8 +197,10 @@ class BakeScene:
 
     def plans(self, objects, images) -> tuple[dict[str, MaterialPlan], list[str]]:
         """The plan of each material of `objects` by its full name, and warnings about them."""
-        made, warnings, uv_names = {}, [], {}
+        made, warnings, uv_names, displaced = {}, [], {}, set()
         for ob in objects:
+            materials = {slot.material for slot in ob.material_slots}
+            displaced |= materials if any(map(has_displacement, materials)) else set()
             for slot in ob.material_slots:
                 known = uv_names.setdefault(slot.material, set(self.meshes[ob.name].uv_names))
                 known &= set(self.meshes[ob.name].uv_names)
@@ -206,6 +208,8 @@ class BakeScene:
             lobes = self.lobes[material.name_full]
             paths = tuple(leaf.groups for leaf in lobes.leaves)
             made[material.name_full] = MaterialPlan(material, lobes.values, paths, images, names)
+            if material in displaced:
+                made[material.name_full].add_surface()
             warnings += lobes.warnings
         return made, list(dict.fromkeys(warnings))
 
@@ -403,11 +407,14 @@ def _inspect(scene, world, objects, uv_name, files):
         bare = aovs.objects_without_material([rendered[ob.name_full] for ob in objects if ob.name in meshes])
         inventory = collect_lights(depsgraph)
         if with_occluders:
-            inventory.occluders = collect_occluders(depsgraph, None, inventory.warn, inventory.left_out, unread)
+            lists = unread, displaced
+            inventory.occluders = collect_occluders(depsgraph, None, inventory.warn, inventory.left_out, *lists)
         return inventory, meshes, problems, bare, pixels.missing_images(depsgraph, world)
 
-    unread = []
+    unread, displaced = [], []
     inventory, *others = with_render_depsgraph(scene, visit)
+    if displaced:
+        inventory.occluders = with_displacement(inventory.occluders, displaced, scene)
     if unread:
         inventory.occluders = with_baked_shares(inventory.occluders, unread, scene, inventory.warn)
     return inventory, *others

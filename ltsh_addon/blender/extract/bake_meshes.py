@@ -110,6 +110,9 @@ def _read(ob, mesh, matrix, uv_name):
     if count == 0:
         raise ObjectError(f"object {ob.name!r} has no faces, nothing to bake")
     layer = mesh.uv_layers.get(uv_name) if uv_name else mesh.uv_layers.active
+    if layer is None and not uv_name and len(mesh.uv_layers):  # geometry nodes have made the mesh
+        original = ob.data.uv_layers.active
+        layer = mesh.uv_layers.get(original.name if original else "") or mesh.uv_layers[0]
     if layer is None:
         names = ", ".join(repr(other.name) for other in mesh.uv_layers) or "none"
         wanted = f"no UV map {uv_name!r}" if uv_name else "no UV map"

@@ -66,7 +66,6 @@ class MaterialLobes:
     made_opaque: tuple[OpaqueInput, ...] = ()
     left_to_cycles: frozenset[str] = NEITHER  # passes in which direct light is not as in Cycles
     has_volume: bool = False
-    is_displaced: bool = False  # its faces are displaced, but their shadows are not
     through: tuple | None = None  # of glass: `bsdfs.let_through`, in the tree of the material
 
 
@@ -82,8 +81,7 @@ class CyclesReasons:
         if lobes.has_volume:
             self.everything.append(f"the volume of material {material.name!r}")
         if lobes.left_to_cycles:
-            reasons = ["its displacement is not in shadows"] * lobes.is_displaced
-            reasons += [line.partition(": ")[2] for line in lobes.warnings]
+            reasons = [line.partition(": ")[2] for line in lobes.warnings]
             why = listed(reasons or [lobes.unshaded], 2, "; ")
             self.materials.append(f"material {material.name!r} ({' and '.join(sorted(lobes.left_to_cycles))}: {why})")
 
@@ -96,10 +94,9 @@ def lobes_of(material, emitter: bool) -> MaterialLobes:
     shaders = graph.shaders_behind(surface, tree_of=functools.cache(_own_tree))
     notes = notes_of_material(output, shaders, emitter)
     warnings = tuple(dict.fromkeys(f"material {material.name!r}: {note}" for note in notes))
-    is_displaced = graph.is_displaced(material)
-    left_to_cycles = BOTH if is_displaced else _passes_left_to_cycles(output, shaders)
+    left_to_cycles = _passes_left_to_cycles(output, shaders)
     has_volume = graph.live_link(output.inputs["Volume"]) is not None
-    traits = {"left_to_cycles": left_to_cycles, "has_volume": has_volume, "is_displaced": is_displaced}
+    traits = {"left_to_cycles": left_to_cycles, "has_volume": has_volume}
     without_lobe, made_opaque = MaterialLobes((), (), warnings, **traits), []
     for cut_node in shaders.cuts:
         if cut_node.node.bl_idname == graph.MIX:

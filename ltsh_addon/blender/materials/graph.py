@@ -85,9 +85,13 @@ def surface_of(data):
 
 def is_displaced(material) -> bool:
     """True if the Displacement socket of `material` moves its surface, and not its normals alone."""
+    return has_displacement(material) and material.displacement_method != "BUMP"
+
+
+def has_displacement(material) -> bool:
+    """True if the Displacement socket of `material` moves its surface, or its normals alone."""
     surface = surface_of(material)
-    is_fed = surface is not None and live_link(surface.node.inputs["Displacement"]) is not None
-    return is_fed and material.displacement_method != "BUMP"
+    return surface is not None and live_link(surface.node.inputs["Displacement"]) is not None
 
 
 def group_output(tree):

@@ -28,6 +28,8 @@ from .values import IDENTITY, READERS, is_srgb, opaque_pixels
 
 # UV_MAP: number of the map that shows the coordinates of the UV map being baked.
 UV_MAP = -1
+# SURFACE: outputs of the Geometry node for `cycles.texels.BakeMaterial.moved`.
+SURFACE = "Position", "Normal", "True Normal"
 # SAME_SPACE: the working space is Rec.709 if its matrix to Rec.709 differs less from the identity.
 SAME_SPACE = 1e-4
 
@@ -117,6 +119,7 @@ class MaterialPlan:
             for lobe, groups in zip(lobes, paths, strict=True)
         )
         self._alphas = list(_alphas_in_use(self.tree, paths))
+        self._geometry, self._moved = None, []
         self._output, self._surface, self._image_node, self._places = None, None, None, None
         self._emissions: dict[int, object] = {}  # number of a map -> the node that emits it
 
@@ -125,6 +128,11 @@ class MaterialPlan:
         """Number of maps."""
         return len(self._maps)
 
+    def add_surface(self) -> None:
+        """Add the maps of SURFACE, for objects that materials displace, where their mesh does not tell them."""
+        self._geometry = self.tree.nodes.new(GEOMETRY)
+        self._moved = [self._color_map(self._geometry.outputs[name]) for name in SURFACE]
+
     def record(self) -> dict:
         """The record of the material for `cycles.texels.BakeMaterial.of`."""
         corrected = bool(self.material.cycles.use_bump_map_correction)
@@ -132,7 +140,8 @@ class MaterialPlan:
             {name: vars(value) if isinstance(value, MapValue | TextureValue) else value for name, value in lobe.items()}
             for lobe in self.lobes
         ]
-        return {"corrected": corrected, "lobes": lobes, "textures": [vars(texture) for texture in self.textures]}
+        textures = [vars(texture) for texture in self.textures]
+        return {"corrected": corrected, "lobes": lobes, "textures": textures, "moved": self._moved}
 
     def _recorded(self, name, value, groups):
         if not graph.is_socket(value):
@@ -144,14 +153,18 @@ class MaterialPlan:
         for group in reversed(groups):
             socket = graph.carry_out_of_group(group, socket)
         if LOBE_AOVS[name][0] == "COLOR":
-            self._colors.add(len(self._maps))
-            self._maps.append([socket])
-            return MapValue(len(self._maps) - 1)
+            return MapValue(self._color_map(socket))
         if self._numbers is None or len(self._maps[self._numbers]) == 3:
             self._maps.append([])
             self._numbers = len(self._maps) - 1
         self._maps[self._numbers].append(socket)
         return MapValue(self._numbers, len(self._maps[self._numbers]) - 1)
+
+    def _color_map(self, socket) -> int:
+        """The number of a further map, which shows a color or a vector."""
+        self._colors.add(len(self._maps))
+        self._maps.append([socket])
+        return len(self._maps) - 1
 
     def _looked_up(self, name, socket, groups):
         """The `TextureValue` of a socket that shows an image unchanged, or None."""
@@ -219,7 +232,8 @@ class MaterialPlan:
     def remove(self) -> None:
         """Remove the nodes of `prepare` and restore the surface."""
         self.show(None)
-        for node in (self._image_node, self._places, *self._emissions.values()):
+        geometry = () if self._geometry is None else (self._geometry,)
+        for node in (self._image_node, self._places, *self._emissions.values(), *geometry):
             self.tree.nodes.remove(node)
 
 

@@ -174,7 +174,19 @@ class RestJob:
 
 @dataclass(frozen=True)
 class RestPictureJob:
-    """Write REST_PICTURE: the denoised mean (H, W, 4) of the sum, row 0 on top; alpha is the distance in m."""
+    """Write REST_PICTURE: the denoised mean (H, W, 4) of the sum, row 0 on top; alpha is `marked_depth`."""
+
+
+NEAR = 0.05  # depths that differ by this share are those of different surfaces
+
+
+def marked_depth(depth: np.ndarray) -> np.ndarray:
+    """Depths (H, W) of surfaces in m, negative where pixels beside are of other surfaces, whose light they share."""
+    low = high = np.pad(depth, 1, mode="edge")
+    for axis in (0, 1):
+        rows = [np.take(each, range(n, n + depth.shape[axis]), axis) for each in (low, high) for n in range(3)]
+        low, high = np.min(rows[:3], axis=0), np.max(rows[3:], axis=0)
+    return np.where((low < depth * (1.0 - NEAR)) | (high > depth * (1.0 + NEAR)), -depth, depth)
 
 
 @dataclass
@@ -182,7 +194,7 @@ class RestSum:
     """The sum of the samples of one view, row 0 on top."""
 
     light: np.ndarray  # (H, W, 3)
-    guides: np.ndarray  # (H, W, 7) albedo, normal and distance
+    guides: np.ndarray  # (H, W, 7) albedo, normal and depth
     samples: int = 0
     is_everything: bool = False  # no light of the view itself remains
     problem: str = ""  # of the denoiser
@@ -208,14 +220,15 @@ class RestSum:
             )
             drawn = 1.0 - np.minimum(read_layer(channels, names["mask"], "X"), 1.0)
             light = light - drawn[..., None] * (specular * specular_color + diffuse * diffuse_color + background)
-        names = ("Denoising Albedo", "RGB"), ("Denoising Normal", "XYZ"), ("Denoising Depth", "Z")
+        # Cycles' denoising depth is that of what a mirror shows.
+        names = ("Denoising Albedo", "RGB"), ("Denoising Normal", "XYZ"), ("Depth", "Z")
         guides = [np.atleast_3d(np.minimum(read_layer(channels, *name), FARTHEST)) for name in names]
         rows = slice(row, row + len(light))
         self.light[rows] += np.float32(count) * light
         self.guides[rows] += np.float32(count) * np.concatenate(guides, axis=-1)
 
     def picture(self) -> np.ndarray:
-        """The denoised mean (H, W, 4); alpha is the distance in m."""
+        """The denoised mean (H, W, 4); alpha is `marked_depth`."""
         light, guides = (each / np.float32(self.samples) for each in (self.light, self.guides))
         try:
             with open_denoiser(denoiser_libraries(), cores()) as denoiser:
@@ -223,7 +236,7 @@ class RestSum:
         except NoDenoiser:
             light = smoothed(light, guides, self.samples)
             self.problem = "Bounces are smoothed, not denoised: this Blender has no denoiser"
-        return np.concatenate([light, guides[..., 6:]], axis=-1)
+        return np.concatenate([light, marked_depth(guides[..., 6])[..., None]], axis=-1)
 
 
 def render_rest(job: RestJob, folder: Path, *, progress: Progress | None = None) -> dict:

@@ -4,155 +4,36 @@ from __future__ import annotations
 
 import logging
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import bpy
 import numpy as np
 from bpy_extras import view3d_utils
-from mathutils import Matrix, Vector
+from mathutils import Matrix
 
-from ...scene import SurfaceSamples, error_line
-from ...shading import shade
-from ...shading.highlight import STENCIL, mirrored, place_for_highlight
-from ..evaluated import EmitterTraits
-from ..lights.area import area_light
-from ..lights.groups import is_animated, is_linked, reason_to_stay
-from ..lights.linking import Receivers
+from ...scene import error_line
+from ...shading.highlight import STENCIL
+from ..lights.groups import reason_to_stay
 from ..lights.textures import ShownTextures
-from ..materials.preview_material import COAT, METALS, PreviewMaterial, preview_of
-from .lit_point import LightShare, SceneLights, SurfaceHit, share_line, shipped_table, surface_hit, value_at_hit
+from .highlight_place import DISK, PIXELS, hits_around, note_by_pixels, place_of
+from .light_pose import LightPose, reason_to_keep_power
+from .lit_point import LightShare, SceneLights, SurfaceHit, share_line, surface_hit
 from .preview import PASSED_ON, active_light, lights_of, region_under
 from .shadow_edge import NEAR_EDGE, OccluderRays, shadow_edge_near
 
-# SPACING: pixels between the rays around the cursor. FARTHER: the factor of the distance by a step of the wheel.
-SPACING, FARTHER = 2.0, 1.1
+# FARTHER: the factor of the distance by a step of the wheel.
+FARTHER = 1.1
 # Of drags of the brightness: STOP: pixels, at interface scale 1, of a factor of 2. PRECISE: the factor of the mouse's
 # way with Shift. SNAPS: steps of a stop with Ctrl.
 STOP, PRECISE, SNAPS = 100.0, 0.1, 3
 # REST_SECONDS: after so long without a move the shares of the lights at the mouse are told, which may take a while.
 REST_SECONDS = 0.2
-# RING: pixels from the mouse, in steps of SPACING, where a highlight may not be brighter by more than BRIGHTER.
-_TURNS = np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False)
-RING = np.concatenate([radius * np.stack([np.cos(_TURNS), np.sin(_TURNS)], axis=-1) for radius in (3.0, 6.0, 10.0)])
-BRIGHTER = 0.01
-# Kinds of lobes without a highlight.
-DULL = ("diffuse", "sheen", "velvet", "translucent")
 # FOLLOWED: what a drag follows.
 FOLLOWED = ("MOUSEMOVE", "LEFT_SHIFT", "LEFT_CTRL", "RIGHT_SHIFT", "RIGHT_CTRL")
-NO_PEAK = "no peak of the highlight here: the surface is seen too flat, or is too rough"
-BESIDE = "the surface bends: its highlight beside the mouse is brighter"
 NO_SURFACE = "there is no surface under the mouse"
 
 
 _logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class LightPose:
-    """How a light object stood before a drag, and where its channels may put it."""
-
-    channels: dict[str, tuple]
-    basis: Matrix
-    parent: Matrix  # of the world, from what the channels say
-    is_sun: bool
-
-    @classmethod
-    def of(cls, ob) -> LightPose:
-        """That of the light object `ob` now."""
-        names = ("location", "rotation_euler", "rotation_quaternion", "rotation_axis_angle", "scale")
-        channels = {name: tuple(getattr(ob, name)) for name in names}
-        basis = ob.matrix_basis.copy()
-        parent = Matrix() if ob.parent is None else ob.matrix_world @ basis.inverted_safe()
-        return cls(channels, basis, parent, ob.data.type == "SUN")
-
-    @property
-    def matrix(self) -> Matrix:
-        """In the world."""
-        return self.parent @ self.basis
-
-    def put_back(self, ob) -> None:
-        """Give `ob` its channels back, to the last bit: a matrix would come back through a parent's rounding."""
-        for name, values in self.channels.items():
-            setattr(ob, name, values)
-
-    def facing(self, point: Vector, direction: Vector, distance: float) -> Matrix:
-        """The matrix in the world of the light in `direction` from a point, which it faces, turned no further than it
-        must; a sun stays where it is. Also under a parent of uneven scale the light faces the point exactly."""
-        location, rotation, scale = self.basis.decompose()
-        if not self.is_sun:
-            location = self.parent.inverted_safe() @ (point + distance * direction)
-        backward = self.parent.to_3x3().inverted_safe() @ direction * math.copysign(1.0, scale.z)
-        turn = (rotation @ Vector((0.0, 0.0, 1.0))).rotation_difference(backward.normalized())
-        return self.parent @ Matrix.LocRotScale(location, turn @ rotation, scale)
-
-    def put(self, ob, matrix: Matrix) -> None:
-        """Put `ob` there; `matrix` is one of `facing`."""
-        ob.matrix_basis = self.parent.inverted_safe() @ matrix
-
-
-def reason_to_keep_power(ob) -> str:
-    """Why the mouse may not change the power of a light; "" if it may."""
-    if is_linked(ob.data):
-        return "its power is linked from another file"
-    if is_animated(ob.data, "energy"):
-        return "its power is animated or driven"
-    users = ob.data.users - ob.data.use_fake_user
-    if users > 1:
-        return f"its data {ob.data.name!r} has {users} users: make it single-user first"
-    return ""
-
-
-def glossy_lobe(material) -> PreviewMaterial | None:
-    """The first lobe of a material that has highlights."""
-    lobes = preview_of(None if material is None else material.original).lobes
-    return next((lobe for lobe in lobes if lobe.kind not in DULL and not lobe.is_clear), None)
-
-
-def samples_of(hits: list[SurfaceHit], lobe: PreviewMaterial, textures: ShownTextures) -> SurfaceSamples:
-    """Samples at `hits` of the reflection of one lobe, with its values at the middle one."""
-    count, white, middle = len(hits), np.ones((len(hits), 3)), hits[len(hits) // 2]
-    position, view, normal = (np.array([getattr(hit, name) for hit in hits]) for name in ("position", "view", "normal"))
-    coat = lobe.coat if lobe.kind == COAT else None
-
-    def at_middle(name: str) -> float:
-        return float(np.mean(value_at_hit(lobe.value(name), middle, textures)))
-
-    roughness = float(np.clip(coat.roughness if coat is not None else at_middle("roughness"), 0.0, 1.0))
-    is_metal = coat is None and (lobe.kind in METALS or at_middle("metallic") > 0.5)
-    ior = coat.ior if coat is not None else max(at_middle("ior"), 1.01)
-    return SurfaceSamples(
-        position=position, view=view, normal=normal, diffuse_normal=normal, roughness=np.full(count, roughness),
-        specular_f0=0.8 * is_metal * white, specular_f90=float(is_metal) * white,
-        dielectric=(1.0 - is_metal) * white, ior=np.full(count, ior), diffuse_albedo=0.0 * white,
-    )  # fmt: skip
-
-
-def place_of(ob, pose: LightPose, hits: list[SurfaceHit], distance: float, textures: ShownTextures) -> tuple:
-    """The matrix of the light object `ob` for a highlight at the middle one of the nine `hits`, which others of the
-    same surface around may follow, or at the only one by its mirrored view; and what there is to say about it."""
-    hits, others = hits[: len(STENCIL)], hits[len(STENCIL) :]
-    hit = hits[len(hits) // 2]
-    lobe, receivers = glossy_lobe(hit.material), Receivers([])
-
-    def matrix_at(direction: np.ndarray) -> Matrix:
-        return pose.facing(hit.position, Vector(direction), distance)
-
-    def light_at(direction: np.ndarray):
-        return area_light(ob, np.array(matrix_at(direction)), EmitterTraits("", True, True), receivers)
-
-    if lobe is None or len(hits) < len(STENCIL):
-        matrix = matrix_at(mirrored(np.array(hit.view), np.array(hit.normal)))
-        return matrix, "this surface has no highlight" if lobe is None else ""
-    place, note = place_for_highlight(samples_of(hits, lobe, textures), light_at, shipped_table()), ""
-    if not place.is_peak:
-        note = NO_PEAK
-    elif others:
-        samples = samples_of([hit, *others], lobe, textures)
-        lights = [light_at(place.direction)]
-        shining = shade(samples, lights, shipped_table(), passes=("specular",), workers=1, dtype=np.float64)
-        here, *around = shining.specular.sum(axis=(0, 2)).tolist()
-        note = BESIDE if max(around) > (1.0 + BRIGHTER) * here else ""
-    return matrix_at(place.direction), note
 
 
 def power_for(factor: float, power: float, share: float) -> float:
@@ -230,6 +111,8 @@ class Gesture:
             return {"CANCELLED"}
         if event.type == "LEFTMOUSE":
             if event.value == "RELEASE" and self._is_dragged:
+                if not self._is_told and (warning := self.warning(context, event)):
+                    self.report({"WARNING"}, warning)
                 self._end(context)
                 return {"FINISHED" if self.is_changed() else "CANCELLED"}
             if event.value in ("PRESS", "DOUBLE_CLICK"):
@@ -238,12 +121,14 @@ class Gesture:
             self.wheel(FARTHER if event.type == "WHEELUPMOUSE" else 1.0 / FARTHER)
             self._do(context, event, self.follow)
         elif self._is_dragged and event.type in FOLLOWED:
+            self._is_told = self._is_still = False
             self._do(context, event, self.follow)
         elif event.type == "MOUSEMOVE":
             self._is_told = self._is_still = False
         elif event.type.startswith(PASSED_ON):
-            if event.type == "TIMER" and not (self._is_dragged or self._is_told):
-                self._is_told = self._is_still and self._do(context, event, self._hover)
+            if event.type == "TIMER" and not self._is_told:
+                step = self._rest if self._is_dragged else self._hover
+                self._is_told = self._is_still and self._do(context, event, step)
                 self._is_still = True
             return {"PASS_THROUGH"}
         return {"RUNNING_MODAL"}
@@ -256,6 +141,10 @@ class Gesture:
 
     def wheel(self, factor: float) -> None:
         """A step of the wheel while dragging."""
+
+    def warning(self, context, event) -> str:
+        """What is wrong with what the drag has reached, if telling takes longer than a move may; "" if nothing."""
+        return ""
 
     def is_changed(self) -> bool:
         """True if the drag needs a step of undo."""
@@ -278,6 +167,12 @@ class Gesture:
         is_done = step(context, event)
         self._tell(context, self._note)
         return is_done
+
+    def _rest(self, context, event) -> bool:
+        """Note what is wrong with what a drag has reached, where the mouse rests."""
+        if warning := self.warning(context, event):
+            self._note = warning
+        return True
 
     def _hover(self, context, event) -> bool:
         """Note the share of each light at the mouse."""
@@ -350,17 +245,28 @@ class LTSH_OT_drag_highlight(MovingGesture, bpy.types.Operator):
 
     def follow(self, context, event) -> bool:
         """As `press`."""
-        region, mouse = view_under(context, event)
-        hits = hits_around(context, region, mouse) if region is not None else []
+        hits = self._hits(context, event, DISK)
         if not hits:
             self._note = NO_SURFACE
             return False
-        middle = hits[len(hits) // 2].position
+        middle = hits[0 if len(hits) == 1 else len(STENCIL) // 2].position
         self._distance = self._distance or max((self._pose.matrix.translation - middle).length, 1e-3)
-        matrix, note = place_of(self._light, self._pose, hits, self._distance, self._textures)
-        self._put(matrix)
+        self._matrix, note = place_of(self._light, self._pose, hits, self._distance, self._textures)
+        self._put(self._matrix)
         self._note = f"Distance {self._distance:.3g} m" + (f"    {note}" if note else "")
         return True
+
+    def warning(self, context, event) -> str:
+        """As `Gesture.warning`: by all pixels around the mouse."""
+        hits = self._hits(context, event, PIXELS)
+        return note_by_pixels(self._light, self._matrix, hits, self._textures) if hits else NO_SURFACE
+
+    def _hits(self, context, event, disk) -> list[SurfaceHit]:
+        region, mouse = view_under(context, event)
+        if region is None:
+            return []
+        depsgraph, faces = context.evaluated_depsgraph_get(), {}
+        return hits_around(lambda offset: hit_at(context, region, mouse + offset, depsgraph, faces), disk)
 
 
 class LTSH_OT_drag_brightness(Gesture, bpy.types.Operator):
@@ -534,21 +440,8 @@ def unregister() -> None:
         bpy.utils.unregister_tool(_tools.pop())
 
 
-def hit_at(context, region, pixel: tuple[float, float], depsgraph=None) -> SurfaceHit | None:
-    """What the view of a region meets at a pixel."""
+def hit_at(context, region, pixel: tuple[float, float], depsgraph=None, faces=None) -> SurfaceHit | None:
+    """What the view of a region meets at a pixel; `faces` as for `surface_hit`."""
     start = view3d_utils.region_2d_to_origin_3d(region, region.data, pixel)
     direction = view3d_utils.region_2d_to_vector_3d(region, region.data, pixel)
-    return surface_hit(context.scene, depsgraph or context.evaluated_depsgraph_get(), start, direction)
-
-
-def hits_around(context, region, pixel: tuple[float, float]) -> list[SurfaceHit]:
-    """What the view of a region meets at a pixel and at those of STENCIL around it: nine, one, or none. After nine,
-    what it meets of the same surface in the RING."""
-    depsgraph = context.evaluated_depsgraph_get()
-    pixels = (np.array(pixel) + SPACING * np.concatenate([STENCIL, RING])).tolist()
-    hits = [hit_at(context, region, one, depsgraph) for one in pixels]
-    middle = hits[len(STENCIL) // 2]
-    if middle is None:
-        return []
-    same = [hit for hit in hits if hit is not None and hit.ob == middle.ob and hit.material == middle.material]
-    return same if same[: len(STENCIL)] == hits[: len(STENCIL)] else [middle]
+    return surface_hit(context.scene, depsgraph or context.evaluated_depsgraph_get(), start, direction, faces)

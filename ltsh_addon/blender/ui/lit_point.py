@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import bpy
 import numpy as np
-from mathutils import Vector
+from mathutils import Matrix, Vector
 from mathutils.interpolate import poly_3d_calc
 
 from ...cycles.horizons import end_at_horizons_of_cycles
@@ -46,31 +46,66 @@ class SurfaceHit:
     face_normal: Vector  # towards the view
     uv: dict[str, np.ndarray]  # (2,) by UV map; "" is the one that renders
     ob: bpy.types.Object  # the original
+    matrix: Matrix  # of the object, or of the instance of it
+    corners: np.ndarray  # (K, 3) of its face, in the object; K = 0: not a mesh
+    corner_uv: dict[str, np.ndarray]  # (K, 2)
+
+    def uv_frame(self, uv_map: str) -> tuple[np.ndarray, np.ndarray] | None:
+        """The directions (3,) in the world in which u and v grow on the face; None where they do not."""
+        uv = self.corner_uv.get(uv_map)
+        if uv is None:
+            return None
+        grows = np.linalg.lstsq(uv - uv.mean(axis=0), self.corners - self.corners.mean(axis=0), rcond=None)[0]
+        along = grows @ np.array(self.matrix.to_3x3()).T
+        sizes = np.linalg.norm(along, axis=-1, keepdims=True)
+        return tuple(along / sizes) if sizes.all() else None
+
+    def around(self, axis: int) -> np.ndarray:
+        """The direction (3,) in the world around an axis of the object, as a Tangent node has it."""
+        mesh = self.ob.data
+        place = np.array(self.matrix.inverted_safe() @ self.position)
+        if isinstance(mesh, bpy.types.Mesh):
+            place = (place - np.array(mesh.texspace_location)) / np.maximum(mesh.texspace_size, 1e-30)
+        return np.array(self.matrix.to_3x3().inverted_safe().transposed()) @ np.cross(np.eye(3)[axis], place)
 
 
-def surface_hit(scene, depsgraph, start: Vector, direction: Vector) -> SurfaceHit | None:
-    """The first surface in a unit `direction` from `start`; None where there is none."""
+def surface_hit(scene, depsgraph, start: Vector, direction: Vector, faces: dict | None = None) -> SurfaceHit | None:
+    """The first surface in a unit `direction` from `start`; None where there is none. Of many rays at once, those that
+    share the dictionary `faces` read each face once."""
     is_hit, position, face_normal, face, ob, matrix = scene.ray_cast(depsgraph, start, direction)
     if not is_hit:
         return None
-    mesh, slots, number, uv = ob.evaluated_get(depsgraph).data, ob.material_slots, 0, {}
+    mesh, slots, number, uv, corner_uv = ob.evaluated_get(depsgraph).data, ob.material_slots, 0, {}, {}
+    corners = np.zeros((0, 3))
     normal = face_normal = -face_normal if face_normal.dot(direction) > 0.0 else face_normal
     if isinstance(mesh, bpy.types.Mesh) and face < len(mesh.polygons):
-        polygon = mesh.polygons[face]
-        loops, number = list(polygon.loop_indices), polygon.material_index
-        corners = [mesh.vertices[mesh.loops[index].vertex_index].co for index in loops]
-        weights = poly_3d_calc(corners, matrix.inverted_safe() @ position)
-        normals = (mesh.corner_normals[index].vector for index in loops)
-        smooth = sum((weight * one for weight, one in zip(weights, normals, strict=True)), Vector())
-        normal = (matrix.to_3x3().inverted_safe().transposed() @ smooth).normalized()
+        faces, key = {} if faces is None else faces, (ob.session_uid, face)
+        if key not in faces:
+            faces[key] = _face_of(mesh, face)
+        number, places, corners, normals, corner_uv = faces[key]
+        weights = np.array(poly_3d_calc(places, matrix.inverted_safe() @ position))
+        normal = (matrix.to_3x3().inverted_safe().transposed() @ Vector(weights @ normals)).normalized()
         normal = -normal if normal.dot(direction) > 0.0 else normal
-        for layer in mesh.uv_layers:
-            uv[layer.name] = weights @ np.array([layer.uv[index].vector for index in loops])
-            if layer.active_render:
-                uv[""] = uv[layer.name]
+        uv = {name: weights @ values for name, values in corner_uv.items()}
     override = depsgraph.view_layer_eval.material_override
     material = override or (slots[min(number, len(slots) - 1)].material if len(slots) else None)
-    return SurfaceHit(position, normal, -direction, material, face_normal, uv, ob.original)
+    return SurfaceHit(
+        position, normal, -direction, material, face_normal, uv, ob.original, matrix.copy(), corners, corner_uv
+    )
+
+
+def _face_of(mesh, face: int) -> tuple:
+    """The material slot of a face, its corners as a list of vectors and (K, 3), their normals (K, 3) and their UV
+    coordinates (K, 2) by map."""
+    polygon, uv = mesh.polygons[face], {}
+    loops = list(polygon.loop_indices)
+    places = [mesh.vertices[mesh.loops[index].vertex_index].co.copy() for index in loops]
+    normals = np.array([mesh.corner_normals[index].vector for index in loops])
+    for layer in mesh.uv_layers:
+        uv[layer.name] = np.array([layer.uv[index].vector for index in loops])
+        if layer.active_render:
+            uv[""] = uv[layer.name]
+    return polygon.material_index, places, np.array(places), normals, uv
 
 
 @functools.cache

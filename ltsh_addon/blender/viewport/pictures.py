@@ -8,7 +8,9 @@ import gpu
 import numpy as np
 from mathutils import Matrix
 
+from ...imaging.denoise import FARTHEST
 from ...shading.header import definitions, filled
+from ..process.view import NEAR
 from .drawing import PixelShader, ViewCamera, drawing, empty_texture, frame_buffer, glsl, size_of
 
 MODES = ("single", "split", "difference")
@@ -102,7 +104,7 @@ def copy(
 class ShownRest:
     """What Cycles adds to a view (see `viewport.rest`), as it was rendered for some view."""
 
-    texture: gpu.types.GPUTexture  # RGBA, row 0 at the bottom; alpha is the distance from the eye in m
+    texture: gpu.types.GPUTexture  # RGBA, row 0 at the bottom; alpha is `process.view.marked_depth`
     view: ViewCamera
     is_everything: bool = False  # it is the whole picture
     ambient: tuple = (0.0, 0.0, 0.0)  # a guess of it over the colors of surfaces, where it is not known
@@ -118,8 +120,10 @@ class RestPass:
 
     def __init__(self):
         samplers = ("picture", "of_cycles", "rest", "positions", "front_positions", "diffuse_colors", "specular_colors")
-        constants = {"projection": "MAT4", **dict.fromkeys(("scale", "ambient", "eye"), "VEC4"), "has_moved": "INT"}
-        self._shader, self._target = PixelShader(_between("rest") + glsl("rest"), samplers, constants), None
+        constants = {"projection": "MAT4", **dict.fromkeys(("scale", "ambient"), "VEC4")}
+        constants |= dict.fromkeys(("has_moved", "is_parallel"), "INT")
+        source = definitions({"FARTHEST": FARTHEST, "NEAR": NEAR}) + _between("rest") + glsl("rest")
+        self._shader = PixelShader(source, samplers, constants)
 
     def draw(self, textures: dict[str, gpu.types.GPUTexture], weight: float, rest: ShownRest, view: ViewCamera, scale):
         """The picture (RGBA texture, valid until the next call with the same `picture`) with the `rest`.
@@ -134,8 +138,8 @@ class RestPass:
             "projection": Matrix(rest.view.projection.tolist()),
             "scale": (*scale, weight),
             "ambient": (*rest.ambient, float(rest.is_everything)),
-            "eye": rest.view.homogeneous_eye,
             "has_moved": not rest.is_of(view),
+            "is_parallel": rest.view.is_parallel,
         }
         with drawing(target.within(), (0, 0, *size)):
             self._shader.bind({**textures, "rest": rest.texture}, constants)
@@ -208,9 +212,11 @@ class LightingState:
 
 
 def is_equal(a, b) -> bool:
-    """True for lights that look the same, and for their parts: arrays, cones, patterns, words and numbers."""
+    """True for lights that look the same, occluders, and their parts: tuples, arrays, cones, words and numbers."""
     if a is b or type(a) is not type(b):
         return a is b
+    if isinstance(a, tuple):
+        return len(a) == len(b) and all(map(is_equal, a, b))
     if not is_dataclass(a):
         return np.array_equal(a, b)
     names = (item.name for item in fields(a) if item.name != "children")

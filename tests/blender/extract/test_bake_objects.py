@@ -124,6 +124,21 @@ def mapped_by_nodes():
     return ob
 
 
+def made_by_nodes():
+    """A cube in place of the mesh of the object, with a UV map that is not the active one."""
+    ob = add_plane(principled("Plain", Roughness=0.6)[0], name="Made")
+    group, _, last, cube, store, dress = add_geometry_nodes(ob, "MeshCube", "StoreNamedAttribute", "SetMaterial")
+    store.domain, store.data_type, store.inputs["Name"].default_value = "CORNER", "FLOAT2", "UVMap"
+    dress.inputs["Material"].default_value = ob.data.materials[0]
+    value = next(item for item in store.inputs if item.name == "Value" and item.enabled)
+    for start_, end in (
+        (cube.outputs["Mesh"], store.inputs["Geometry"]), (cube.outputs["UV Map"], value),
+        (store.outputs[0], dress.inputs["Geometry"]), (dress.outputs[0], last.inputs[0]),
+    ):  # fmt: skip
+        group.links.new(start_, end)
+    return ob
+
+
 def bent_quads():
     """Flat faces of four corners that are not in a plane, which Cycles shades as two triangles."""
     corners = [(x - 1.0, y - 1.0, 0.4 * ((x + y) % 2)) for y in range(3) for x in range(3)]
@@ -135,12 +150,13 @@ def bent_quads():
     return ob
 
 
-@pytest.mark.parametrize("make", [cut_cube, warped_plane, mapped_by_nodes, bent_quads])
+@pytest.mark.parametrize("make", [cut_cube, warped_plane, mapped_by_nodes, made_by_nodes, bent_quads])
 def test_uv_maps_and_materials_that_modifiers_bring_in_are_baked_as_by_cycles(make, tmp_path):
     """Gray diffuse light is exact; Cycles' noise of 512 samples of a light that is seen as a whole is below 2 %."""
     start()
     ob = make()
-    options = {"objects": (ob.name,), "uv": "UVMap", "passes": ("diffuse",), "error": True, "cycles_samples": 512}
+    uv = None if make is made_by_nodes else "UVMap"
+    options = {"objects": (ob.name,), "uv": uv, "passes": ("diffuse",), "error": True, "cycles_samples": 512}
     report, files = baked(save(tmp_path), tmp_path / "out", **options, sub_samples=4)
     assert report["problems"] == [] and not [line for line in report["warnings"] if "left out" in line]
     layers = files[f"{ob.name}.exr"]

@@ -124,3 +124,19 @@ def test_bumps_mirrored_objects_and_tiles_have_the_light_of_cycles(tmp_path):
     for name, figure in figures.items():
         # A wrong side, a flipped normal or a tile of its own is off by tens of percent; 32 samples denoised by 1 or 2.
         assert figure["techniques"]["ltsh4c"]["unbiased_error"] < 0.03, name
+
+
+def test_texels_that_an_edge_of_a_shadow_crosses_have_their_mean(tmp_path):
+    start(camera=None)
+    white = principled("White", Base_Color=(0.8, 0.8, 0.8, 1.0), Roughness=1.0)[0]
+    add_plane(white, size=2.0, name="Floor")
+    # A plate a tenth of a millimeter above the floor, whose sides lie .3 and .8 of a texel from the border of a texel.
+    left, right = (20.3 / SIZE) * 2.0 - 1.0, (40.8 / SIZE) * 2.0 - 1.0
+    corners = [(left, -0.5, 1e-4), (right, -0.5, 1e-4), (right, 0.5, 1e-4), (left, 0.5, 1e-4)]
+    add_mesh("Plate", corners, [(0, 1, 2, 3)]).data.materials.append(white)
+    _, layers, _ = lightmap(tmp_path, rest_samples=4)
+    light = (layers["ltsh4c.diffuse_light"] - layers["rest.diffuse_light"])[24:40].mean(axis=(0, 2)).astype(float)
+    assert light[22] < 0.01 * light[19]
+    # Within the texel points are a sixteenth apart.
+    assert light[20] == pytest.approx(0.3 * light[19], abs=light[19] / 16.0)
+    assert light[40] == pytest.approx(0.2 * light[41], abs=light[41] / 16.0)

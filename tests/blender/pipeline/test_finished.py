@@ -146,7 +146,7 @@ SCENES = {
     "transparent film": (transparent_film, (1, 1)),
     "depth of field": (depth_of_field, (1, 1)),
     "sheared light": (sheared_lamp, (0, 0)),
-    "displacement": (displaced, (None, None)),
+    "displacement": (displaced, (1, 1)),
 }
 
 

@@ -3,6 +3,7 @@
 import gc
 import weakref
 from dataclasses import replace
+from types import SimpleNamespace
 
 import bpy
 import gpu
@@ -21,6 +22,7 @@ from ltsh_addon.blender.viewport.drawing import (
     new_shaders_until,
     read_texture,
 )
+from ltsh_addon.blender.viewport.mirror import Changes
 from ltsh_addon.blender.viewport.pictures import SampleSum, ShownPicture, ShownRest
 from ltsh_addon.blender.viewport.shadow_rays import ShadowRays, ViewTracer, view_occluders
 from ltsh_addon.blender.viewport.shadows import LiveShadows, ShadowRequest
@@ -47,6 +49,7 @@ def test_pictures_of_what_moves_have_as_many_pixels_as_the_time_allows(monkeypat
     """Of 64 s^-2 units of time at step s, with a goal of 10: at first whole, then 1 of 4 x 4 pixels while it moves."""
     now = [0.0]
     monkeypatch.setattr(redraws.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(redraws.PixelSize, "last_seconds", 0.0)
     light, size = object(), redraws.PixelSize()
 
     def step(state, whole):
@@ -75,6 +78,25 @@ def test_pictures_of_what_moves_have_as_many_pixels_as_the_time_allows(monkeypat
     assert size.is_new and step("g", slow) == 4 and size.end < now[0] + 1.0
     quick = [step(state, 0.9 * redraws.FRAME_SECONDS) for state in "hij"]
     assert quick == [4, 1, 1]
+    # Another view of a slow machine begins with few pixels.
+    step("k", slow)
+    assert redraws.PixelSize().follow(((light,), ("k",))) == 4
+
+
+def test_a_picture_that_is_wanted_sooner_does_not_wait_for_a_later_one(monkeypatch):
+    """Timers of Blender keep the time that they were given first."""
+    timers = {}
+    calls = SimpleNamespace(
+        is_registered=timers.__contains__,
+        unregister=timers.pop,
+        register=lambda timer, first_interval: timers.__setitem__(timer, first_interval),
+    )
+    monkeypatch.setattr(redraws, "bpy", SimpleNamespace(app=SimpleNamespace(timers=calls)))
+    monkeypatch.setattr(redraws, "moments", {"next": 0.0})
+    now = redraws.time.monotonic()
+    for seconds in (20.0, 0.1, 5.0):
+        redraws.redraw_at(now + seconds)
+        assert timers[redraws.redraw] <= seconds
 
 
 @pytest.mark.newest
@@ -304,3 +326,55 @@ def test_a_drawing_that_has_no_time_loads_one_slow_image(monkeypatch):
     drawings, picture, expected = with_graphics(draw)
     assert drawings == 2 and sorted(loaded) == ["image 0", "image 1"]
     np.testing.assert_array_equal(picture, expected)
+
+
+@edits_with_graphics
+def test_shadows_stay_fine_while_colors_change_and_are_coarse_again_once_an_object_moves():
+    """Levels that the thread begins after each change; and the picture at once after a new color, beside the last."""
+    camera, shown, live = set_up_scene(), ShownPicture("ltsh4", "combined", transparent=True), LiveShadows()
+    base = bpy.data.materials["gray"].node_tree.nodes["Principled BSDF"].inputs["Base Color"]
+
+    def draw():
+        pictures, levels = [], []
+        with OpenView(camera, SIZE) as opened:
+            opened.renderer.shadows = live
+
+            def drawn(version):
+                live.follow((version,), lambda: view_occluders(depsgraph(), lambda text: None))
+                pictures.append(opened.draw(shown)[..., :3].astype(np.float64))
+
+            def settled(version):
+                done = []
+                drawn(version)
+                while live._thread is not None:
+                    live._thread.join()
+                    done += [request.level for request, _ in live._outcomes]
+                    drawn(version)
+                levels.append(done)
+
+            try:
+                settled(0)
+                tracer = live._traced_scene.tracing
+                # Twice as bright, which shadows do not depend on.
+                base.default_value = (0.4, 0.4, 0.4, 1.0)
+                opened.mirror.sync(depsgraph(), changes=Changes(materials={"gray"}))
+                settled(1)
+                assert live._traced_scene.tracing is tracer
+                bpy.data.objects["Sphere"].location.x += 0.5
+                opened.mirror.sync(depsgraph(), changes=Changes(instances=True))
+                settled(2)
+                assert live._traced_scene.tracing is not tracer
+            finally:
+                live.stop()
+        return pictures, levels
+
+    def depsgraph():
+        bpy.context.view_layer.update()
+        return bpy.context.evaluated_depsgraph_get()
+
+    base.default_value = (0.8, 0.8, 0.8, 1.0)
+    pictures, levels = with_graphics(draw)
+    assert levels == [[0, 1], [1], [0, 1]]
+    at_once, finest = pictures[3:5]
+    # Both have noise of 32 rays; those of 8 rays at some pixels are four times as far off.
+    assert np.linalg.norm(at_once - finest) < 0.02 * np.linalg.norm(finest)

@@ -15,9 +15,9 @@ from fake_scene import run
 from graphics_card import edits_with_graphics, with_graphics
 from view_pictures import OpenView
 
-from ltsh_addon.blender.process.view import RestJob, RestView
+from ltsh_addon.blender.process.view import RestJob, RestView, marked_depth
 from ltsh_addon.blender.viewport import rest
-from ltsh_addon.blender.viewport.drawing import float_texture
+from ltsh_addon.blender.viewport.drawing import float_texture, read_texture
 from ltsh_addon.blender.viewport.pictures import ShownPicture, ShownRest
 from ltsh_addon.cycles.lobes import read_layer
 from ltsh_addon.imaging.exr import read_channels
@@ -185,7 +185,7 @@ def test_changes_are_handed_over_by_themselves_and_show_what_a_whole_file_shows(
 def test_a_step_takes_what_there_is_time_for_and_pictures_come_with_more_and_more_pixels():
     """Each picture has all its samples, whatever the share of a picture that a step takes."""
     one, other = RestView(scene="one"), RestView(scene="other")
-    for share, shrinks in ((0.13, [4, 2, 1]), (0.3, [4, 2, 1]), (1.0, [2, 1]), (5.0, [1])):
+    for share, shrinks in ((0.02, [4, 2, 1]), (0.13, [4, 2, 1]), (0.3, [2, 1]), (1.0, [1]), (5.0, [1])):
         job, rendered, pictures = RestJob(None, other, 16), 0.0, []
         while not pictures or pictures[-1] != (1, 64):
             job = rest.next_job(job, one, share)
@@ -195,7 +195,7 @@ def test_a_step_takes_what_there_is_time_for_and_pictures_come_with_more_and_mor
             if rest.makes_picture(job):
                 pictures.append((job.shrink, job.total))
                 assert rendered == pytest.approx(job.total)
-        assert pictures == [*((shrink, 4) for shrink in shrinks), *((1, count) for count in (8, 16, 32, 64))]
+        assert pictures == [*((shrink, 1) for shrink in shrinks), *((1, 2**power) for power in range(1, 7))]
 
 
 @pytest.mark.newest
@@ -233,13 +233,10 @@ def test_a_moved_view_keeps_the_rest_where_its_surface_was_seen():
         with OpenView(camera, SIZE) as opened:
             shown = ShownPicture("ltsh4", "combined")
             camera_before, added = opened.view, {}
-            for name, distance, x in (("same", 9.0, 0.0), ("moved", 0.0, 0.3), ("hidden", 9.0, 0.3)):
+            # The plane is 3 m deep, where it is not another surface.
+            for name, depth, x in (("same", 9.0, 0.0), ("moved", 3.0, 0.3), ("hidden", 9.0, 0.3)):
                 texels = np.full((SIZE[1], SIZE[0], 4), 0.25, np.float32)
-                # The distance of the plane from the eye, where it is not another surface.
-                place = np.stack(np.meshgrid(*(2.0 * (np.arange(n) + 0.5) / n - 1.0 for n in SIZE)), axis=-1)
-                rays = camera_before.rays
-                ray = place @ rays[:2] + rays[2]
-                texels[..., 3] = distance or 3.0 * np.linalg.norm(ray, axis=-1) / np.abs(ray[..., 2])
+                texels[..., 3] = depth
                 opened.renderer.rest = ShownRest(float_texture(texels), camera_before, ambient=(0.5, 0.5, 0.5))
                 camera.location.x = x
                 bpy.context.view_layer.update()
@@ -258,3 +255,45 @@ def test_a_moved_view_keeps_the_rest_where_its_surface_was_seen():
         # Half of the color of the diffuse lobe, .8 but for what the specular one reflects, and of that, .04.
         change = added[name][pixels]
         assert np.all((change > 0.35) & (change < 0.42)), name
+
+
+@edits_with_graphics
+def test_light_of_few_pixels_stays_on_its_surface():
+    """A bright plane over a dark floor, in a quarter of the pixels: the floor beside it stays dark."""
+    parts.empty_scene(*SIZE)
+    paper = parts.principled("paper", Roughness=0.9)[0]
+    parts.add_plane(paper, size=40.0)
+    parts.add_plane(paper, size=0.4, name="Table", location=(0.03, 0.02, 1.0))
+    parts.add_area_light()
+    camera = parts.add_camera((0.0, 0.0, 3.0), (0.0, 0.0, 0.0))
+    bpy.context.view_layer.update()
+
+    def drawn():
+        with OpenView(camera, SIZE) as opened:
+            shown = ShownPicture("ltsh4", "combined")
+            plain, positions = opened.draw(shown), read_texture(opened.renderer._surfaces.position)
+            is_table = positions[..., 2] > 0.5
+            # Each pixel has the mean of the light of its 4 x 4, and the depth of one of them.
+            light, depth = np.where(is_table, 1.0, 0.1), np.where(is_table, 2.0, 3.0)[2::4, 1::4]
+            light = light.reshape(SIZE[1] // 4, 4, SIZE[0] // 4, 4).mean(axis=(1, 3))
+            texels = np.stack([light, light, light, marked_depth(depth)], axis=-1).astype(np.float32)
+            opened.renderer.rest, opened.renderer.has_bounces = ShownRest(float_texture(texels), opened.view), True
+            return is_table, (opened.draw(shown) - plain)[..., 0]
+
+    is_table, added = with_graphics(drawn)
+    assert 0.05 < is_table.mean() < 0.5
+    np.testing.assert_allclose(added, np.where(is_table, 1.0, 0.1), atol=1e-3)
+
+
+@pytest.mark.newest
+def test_the_depth_of_a_mirror_is_its_own(tmp_path):
+    """Not that of what it shows: a moved view finds its light by the place of its surface."""
+    parts.empty_scene(*SIZE)
+    mirror = parts.principled("mirror", Metallic=1.0, Roughness=0.0)[0]
+    parts.add_plane(mirror, size=40.0)
+    parts.add_plane(parts.principled("paper")[0], size=40.0, name="Above", location=(0.0, 0.0, 9.0))
+    parts.add_area_light()
+    parts.add_camera((0.0, 0.0, 3.0), (0.0, 0.0, 0.0))
+    path = parts.save(tmp_path / "mirror.blend")
+    rest.render_rest(RestJob(path, asdict(RestView(size=SIZE)), 2), tmp_path, lambda *stage: None)
+    np.testing.assert_allclose(rest._sum[0].picture()[..., 3], 3.0, rtol=1e-5)

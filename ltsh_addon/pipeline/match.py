@@ -49,8 +49,8 @@ FINE, COARSE = (5, 4, 64), (12, 8, 32)
 # STILL_OFF: the error of a picture from which on the report says that the lights may not be where the target's were.
 STILL_OFF = 0.05
 STILL_OFF_BY = (
-    "the picture is still {:.1f} % off the target: lights that start nearer to where they should be may come closer; or "
-    "the target shows what no light of this scene gives"
+    "the picture is still {:.1f} % off the target: lights that start nearer to where they should be may come closer; "
+    "or the target shows what no light of this scene gives"
 )
 NOT_TOLD = "less than {1:.1f} % of the picture is light of {0}: the target hardly tells its power"
 

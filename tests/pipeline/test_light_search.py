@@ -15,8 +15,10 @@ from ltsh_addon.pipeline.light_search import (
 from ltsh_addon.scene import EllipseLight, QuadLight, SunLight, SurfaceSamples
 
 SIDE = 12
-TRUE = QuadLight("Key", [0.4, -0.3, 1.5], [0.4, 0.0, 0.1], [0.0, 0.25, 0.0], rotation([0.0, -0.245, 0.0]) @ [0, 0, -1.0],
-                 [8.0, 6.0, 4.0])  # fmt: skip
+TRUE = QuadLight(
+    name="Key", center=[0.4, -0.3, 1.5], half_u=[0.4, 0.0, 0.1], half_v=[0.0, 0.25, 0.0],
+    direction=np.array([0.1, 0.0, -0.4]) / np.hypot(0.1, 0.4), radiance=[8.0, 6.0, 4.0],
+)  # fmt: skip
 
 
 def floor() -> SurfaceSamples:

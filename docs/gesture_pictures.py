@@ -1,4 +1,4 @@
-"""Makes docs/gestures.png: a scene, and what three gestures make of it.
+"""Makes docs/gestures.png: a scene, and what four gestures make of it.
 
 python docs/gesture_pictures.py        with pip's bpy; needs matplotlib
 """
@@ -27,8 +27,9 @@ from ltsh_addon.blender.ui.shadow_edge import OccluderRays, shadow_edge_near  # 
 matplotlib.use("Agg")
 WIDTH, HEIGHT, EXPOSURE = 420, 320, 0.9
 OUT = ROOT / "out" / "gesture_pictures"
-# Pixels, from the lower left: the highlight on the ball, the edge of the ball's shadow, and a place on the floor.
+# Pixels, from the lower left: the highlight on the ball, the edge of the ball's shadow, and places on the floor.
 HIGHLIGHT, SHADOW, BRIGHTER = ((150, 204), (206, 196)), ((318, 108), (352, 76)), ((90, 60), (90, 120))
+AIM = (190, 130), (90, 60)
 
 
 def scene() -> bpy.types.Object:
@@ -76,7 +77,7 @@ def picture(name: str) -> np.ndarray:
     """The open scene as LTSH shades it."""
     path = OUT / f"{name}.blend"
     bpy.ops.wm.save_as_mainfile(filepath=str(path), copy=True)
-    command = [sys.executable, "-m", "ltsh_addon", "shade", str(path), "-o", str(OUT / name), "--aa", "8", "--quiet"]
+    command = [sys.executable, "-m", "ltsh_addon", "shade", str(path), "-o", str(OUT / name), "--aa", "4", "--quiet"]
     subprocess.run([*command, "--overwrite"], cwd=ROOT, check=True)
     return imaging.to_srgb8(EXPOSURE * imaging.read_layers(OUT / name / "shade.exr")["ltsh4c.combined"][..., :3])
 
@@ -102,9 +103,14 @@ def main() -> None:
     pose.put(lamp, pose.facing(*place))
     pictures["Drag Shadow"] = picture("shadow"), SHADOW
     pose.put_back(lamp)
+    aim = hit(AIM[1]).position
+    way = pose.matrix.translation - aim
+    pose.put(lamp, pose.facing(aim, way.normalized(), way.length))
+    pictures["Aim Light"] = picture("aim"), AIM
+    pose.put_back(lamp)
     lamp.data.energy = power_for(2.0 ** ((BRIGHTER[1][1] - BRIGHTER[0][1]) / 100.0), lamp.data.energy, 0.9)
     pictures["Drag Brightness"] = picture("brightness"), BRIGHTER
-    figure, axes = plt.subplots(1, 4, figsize=(14.0, 3.0), constrained_layout=True)
+    figure, axes = plt.subplots(1, 5, figsize=(17.0, 2.9), constrained_layout=True)
     for axis, (title, (image, drag)) in zip(axes, pictures.items(), strict=True):
         axis.imshow(image)
         axis.set_title(title)

@@ -72,27 +72,26 @@ def truth_of(path: Path, samples: int) -> tuple[np.ndarray, ...]:
         bpy.ops.render.render(write_still=True)
         channels = read_channels(kept.with_suffix(".exr"))
         names = ("Combined", "RGB"), (GUIDES[0], "RGB"), (GUIDES[1], "XYZ")
-        exposure = 2.0**scene.view_settings.exposure
-        layers = [read_layer(channels, *name) for name in names]
-        np.save(kept, np.array([layers[0] * exposure, *layers[1:]]))
+        np.save(kept, np.array([read_layer(channels, *name) for name in names]))
     return tuple(np.load(kept))
 
 
 def main(arguments) -> None:
     folder, errors = arguments.folder, {}
     facts = json.loads((folder / "result.json").read_text())["facts"]
+    brighter = 2.0 ** facts["stops darker"]
     for state in STATES:
         truth, *guides = truth_of(folder / f"truth_{state}.blend", arguments.samples)
+        truth = truth * 2.0 ** facts["exposure"]
         write_png(folder / f"truth_{state}.png", np.rint(255.0 * srgb(truth)).astype(np.uint8))
         for engine in ENGINES:
             for moment in MOMENTS:
-                picture = screen(folder / f"{engine}_{state}_{moment}.png")
+                light = brighter * linear(screen(folder / f"{engine}_{state}_{moment}.png"))
                 if engine == "cycles" and not facts["Cycles has its denoiser"]:
                     with open_denoiser(denoiser_libraries(), 1) as denoiser:
-                        light = denoiser.quickly_denoised(linear(picture).astype(np.float32), *guides)
-                    picture = srgb(light)
-                    name = f"denoised_{state}_{moment}.png"
-                    write_png(folder / name, np.rint(255.0 * picture).astype(np.uint8))
+                        light = denoiser.quickly_denoised(light.astype(np.float32), *guides)
+                picture = srgb(light)
+                write_png(folder / f"shown_{engine}_{state}_{moment}.png", np.rint(255.0 * picture).astype(np.uint8))
                 difference = (picture - srgb(truth))[EDGE:-EDGE, EDGE:-EDGE]
                 errors[engine, state, moment] = 100.0 * math.sqrt(np.mean(difference**2))
     print("| state | engine |" + "".join(f" {moment} s |" for moment in MOMENTS))

@@ -21,6 +21,7 @@ SIZE = "960x540"
 SECONDS = 900
 MOMENTS = (1, 2, 5, 10)
 ENGINES = {"ltsh": "LTSH", "cycles": "CYCLES", "eevee": "BLENDER_EEVEE"}
+DARKER = 2.0  # stops
 COLD_SECONDS, EEVEE_SECONDS, IDLE_SECONDS = 20, 60, 1.0
 
 # Another process takes the pictures: this one may be busy with drawing.
@@ -116,7 +117,10 @@ def main(rig):
     if (rig.here / "oidn").is_dir():
         os.environ["LD_LIBRARY_PATH"] = str(rig.here / "oidn")  # of the second Blender
     scene = bpy.context.scene
-    eyes.plain_colors(scene, scene.view_settings.exposure)
+    rig.fact("exposure", scene.view_settings.exposure)
+    # Noise that is clipped could not be denoised.
+    eyes.plain_colors(scene, scene.view_settings.exposure - DARKER)
+    rig.fact("stops darker", DARKER)
     scene.eevee.use_raytracing = scene.cycles.use_preview_denoising = True
     rig.fact("Cycles has its denoiser", _cycles.with_openimagedenoise)
     eyes.free_view(rig, scene.camera)

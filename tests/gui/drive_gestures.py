@@ -31,7 +31,9 @@ def main(rig):
         yield from moved(rig, told, shading, "drag_shadow", EDGE, NEW_EDGE)
         yield from moved(rig, told, shading, "drag_highlight", LIT, Vector((-0.9, -0.6, 0.0)))
     yield from by_tool(rig)
+    yield from by_keys(rig, told)
     yield from refused(rig, told)
+    yield from second_view(rig)
 
 
 def heard():
@@ -80,10 +82,12 @@ def built():
     bpy.context.view_layer.objects.active = bpy.data.objects["Key"]
 
 
-def pixel(rig, point):
-    """X11 coordinates of a point in the 3D view."""
-    region = rig.region()
-    x, y = view3d_utils.location_3d_to_region_2d(region, rig.space.region_3d, point)
+def pixel(rig, point, area=None):
+    """X11 coordinates of a point in the 3D view, or in that of an area."""
+    region, space = rig.region(), rig.space
+    if area is not None:
+        region, space = next(one for one in area.regions if one.type == "WINDOW"), area.spaces.active
+    x, y = view3d_utils.location_3d_to_region_2d(region, space.region_3d, point)
     return round(region.x + x), round(rig.size[1] - region.y - y)
 
 
@@ -98,7 +102,8 @@ def power():
 
 
 def place():
-    return np.array(bpy.data.objects["Key"].matrix_world).round(5).tolist()
+    # That of the world is old until the scene is evaluated after an undo.
+    return np.array(bpy.data.objects["Key"].matrix_basis).round(5).tolist()
 
 
 def begun(rig, name):
@@ -161,13 +166,17 @@ def moved(rig, told, shading, name, start, end):
         if way == "Escape":
             rig.fact(f"{shading}, {name}", told[-1])
             rig.xdo("key", "Escape")
-            yield from hands.comes(rig, lambda: place() == before, f"{shading}, {name}: Escape puts it back")
+            yield from hands.comes(
+                rig, lambda: place() == before, lambda: f"{shading}, {name}: Escape puts {before} back: {place()}"
+            )
         rig.xdo("mouseup", 1)
         yield 1
     if name == "drag_shadow":
         rig.check(on_edge(end), f"{shading}: the edge of the shadow is where it was dragged: {place()}")
     yield from hands.typed(rig, "ctrl+z")
-    yield from hands.comes(rig, lambda: place() == before, f"{shading}, {name}: one undo takes it back")
+    yield from hands.comes(
+        rig, lambda: place() == before, lambda: f"{shading}, {name}: one undo takes {before} back: {place()}"
+    )
 
 
 def by_tool(rig):
@@ -208,6 +217,105 @@ def on_edge(point):
         ends = np.sort([(low - start) / way, (high - start) / way], axis=0)
         meets.append(ends[0].max() < ends[1].min())
     return meets == [True, False]
+
+
+def by_keys(rig, told):
+    """Keys during a drag: Shift, D, S, C, axes; Escape gives all of it back, a release is one step of undo."""
+    key = bpy.data.objects["Key"]
+    before, size, color = place(), key.data.size, tuple(key.data.color)
+    for end in ("Escape", "release"):
+        begun(rig, "drag_highlight")
+        yield from at(rig, LIT)
+        rig.xdo("mousedown", 1)
+        yield from hands.comes(rig, lambda: place() != before, f"by keys, {end}: the light follows")
+        for name, word in (("d", "distance"), ("s", "size"), ("c", "color")):
+            was = place(), key.data.size, tuple(key.data.color)
+            rig.xdo("key", name)
+            yield from at(rig, LIT, -1)
+            rig.xdo("mousemove_relative", 60, 30)
+            yield from hands.comes(
+                rig, lambda word=word: f"the mouse changes the {word}" in (told[-1] or ""), f"{name}: {told[-1:]}"
+            )
+            yield from hands.comes(
+                rig, lambda was=was: was != (place(), key.data.size, tuple(key.data.color)), f"{word} changes"
+            )
+            rig.shot(f"06_key_{name}.png")
+            rig.xdo("key", name)
+            yield hands.CLICK_SECONDS
+            yield from at(rig, LIT)
+        height = place()[2][3]
+        rig.xdo("keydown", "shift")
+        rig.xdo("key", "z")
+        yield hands.CLICK_SECONDS
+        rig.xdo("keyup", "shift")
+        yield from at(rig, Vector((-0.9, -0.6, 0.0)))
+        yield from hands.comes(rig, lambda: "along XY" in (told[-1] or ""), lambda: f"Shift Z locks: {told[-1:]}")
+        rig.check(abs(place()[2][3] - 4.0) < 1e-3, f"its height is that of the start: {height} to {place()[2][3]}")
+        yield 1
+        rig.shot("07_locked.png")
+        if end == "Escape":
+            rig.xdo("key", "Escape")
+            yield from hands.comes(
+                rig, lambda: (place(), key.data.size, tuple(key.data.color)) == (before, size, color), "all is back"
+            )
+        rig.xdo("mouseup", 1)
+        yield 1
+    yield from hands.typed(rig, "ctrl+z")
+    key = bpy.data.objects["Key"]
+    yield from hands.comes(
+        rig, lambda: (place(), bpy.data.objects["Key"].data.size) == (before, size), "one undo takes all of it back"
+    )
+
+
+def second_view(rig):
+    """A drag in each of two views moves the light, and both pictures change."""
+    hands.operate(rig, bpy.ops.screen.area_split, direction="VERTICAL", factor=0.5)
+    yield 2
+    areas = [area for area in rig.window.screen.areas if area.type == "VIEW_3D"]
+    rig.check(len(areas) == 2, "there are two views")
+    other = areas[1].spaces.active
+    other.region_3d.view_perspective = "PERSP"
+    other.region_3d.view_location, other.region_3d.view_distance = (0.0, 0.0, 0.2), 9.0
+    other.region_3d.view_rotation = Vector((-3.0, -4.0, 5.0)).to_track_quat("Z", "Y")
+    for area in areas:
+        area.spaces.active.shading.type, area.spaces.active.show_region_ui = "RENDERED", False
+    yield 15
+    start = place()
+    for number, area in enumerate(areas):
+        before = place()
+        rig.shot(f"08_views_{number}_before.png")
+        begun(rig, "drag_highlight")
+        rig.xdo("mousemove", *pixel(rig, LIT, area))
+        yield hands.CLICK_SECONDS
+        rig.xdo("mousedown", 1)
+        yield hands.CLICK_SECONDS
+        rig.xdo("mousemove", *pixel(rig, Vector((-1.0, -0.9 + 0.5 * number, 0.0)), area))
+        yield from hands.comes(rig, lambda before=before: place() != before, f"view {number}: the light follows")
+        yield 8
+        rig.shot(f"08_views_{number}_dragged.png")
+        changed = [differs(rig, f"08_views_{number}", region_of(one)) for one in areas]
+        rig.fact(f"view {number}: shares of pixels that change", changed)
+        rig.check(min(changed) > 0.01, f"a drag in view {number} changes both pictures: {changed}")
+        rig.xdo("mouseup", 1)
+        yield 1
+    for _ in areas:
+        yield from hands.keys(rig, "ctrl+z")
+        yield 1
+    yield from hands.comes(rig, lambda: place() == start, "a step of undo for each")
+
+
+def region_of(area):
+    return next(region for region in area.regions if region.type == "WINDOW")
+
+
+def differs(rig, name, region):
+    """The share of points of a region that differ between two pictures."""
+    columns, rows = np.meshgrid(np.linspace(0.1, 0.9, 24), np.linspace(0.1, 0.8, 16))
+    x, y = (region.x + columns * region.width) / rig.size[0], (region.y + rows * region.height) / rig.size[1]
+    paths = [rig.out / f"{name}_{when}.png" for when in ("before", "dragged")]
+    points = list(zip(x.ravel().tolist(), y.ravel().tolist(), strict=True))
+    first, second = (np.array([rig.pixel(path, *point) for point in points], float) for path in paths)
+    return round(float((np.abs(first - second).max(axis=-1) > 3.0).mean()), 3)
 
 
 def refused(rig, told):

@@ -9,24 +9,35 @@ from dataclasses import replace
 import bpy
 import numpy as np
 from bpy_extras import view3d_utils
-from mathutils import Matrix
+from mathutils import Matrix, Vector
 
 from ...scene import error_line
 from ...shading.highlight import STENCIL
+from ..lights.groups import reason_to_stay
 from ..lights.textures import ShownTextures
 from .highlight_place import DISK, PIXELS, hits_around, note_by_pixels, place_of
-from .light_pose import LightPose, reason_to_keep_power, reason_to_stay
+from .light_pose import (
+    LightLook,
+    LightPose,
+    locked_place,
+    reason_to_keep_look,
+    reason_to_keep_power,
+)
 from .lit_point import LightShare, SceneLights, SurfaceHit, share_line, surface_hit
 from .preview import PASSED_ON, active_light, lights_of, region_under
 from .shadow_edge import NEAR_EDGE, OccluderRays, shadow_edge_near
 
 # FARTHER: the factor of the distance by a step of the wheel.
 FARTHER = 1.1
-# Of drags of the brightness: STOP: pixels, at interface scale 1, of a factor of 2. PRECISE: the factor of the mouse's
-# way with Shift. SNAPS: steps of a stop with Ctrl.
-STOP, PRECISE, SNAPS = 100.0, 0.1, 3
+# STOP: pixels, at interface scale 1, of a factor of 2 of a brightness, distance or size; HUES: of all hues. PRECISE:
+# the factor of the mouse's way with Shift. SNAPS: steps of a stop of a brightness with Ctrl.
+STOP, HUES, PRECISE, SNAPS = 100.0, 400.0, 0.1, 3
+# AXES: the keys that lock one. MODES: keys after which the mouse changes something else, until they come again.
+AXES, MODES = "XYZ", {"D": "distance", "S": "size", "C": "color"}
 # REST_SECONDS: after so long without a move the shares of the lights at the mouse are told, which may take a while.
 REST_SECONDS = 0.2
+# MOVING_KEYS: what the status bar says of keys while a light is moved.
+MOVING_KEYS = "Wheel, D: distance    S: size    C: color    X, Y, Z: lock    Shift: precise    Ctrl: corners"
 # FOLLOWED: what a drag follows.
 FOLLOWED = ("MOUSEMOVE", "LEFT_SHIFT", "LEFT_CTRL", "RIGHT_SHIFT", "RIGHT_CTRL")
 NO_SURFACE = "there is no surface under the mouse"
@@ -41,11 +52,10 @@ def power_for(factor: float, power: float, share: float) -> float:
     return max(0.0, power * (1.0 + (factor - 1.0) / share))
 
 
-def view_under(context, event) -> tuple:
-    """The region of the 3D view under the mouse, None where there is none, and the pixel (2,) in it."""
-    region = region_under(context, event.mouse_x, event.mouse_y)
-    corner = (0, 0) if region is None else (region.x, region.y)
-    return region, np.array([event.mouse_x, event.mouse_y]) - corner
+def view_under(context, mouse: np.ndarray) -> tuple:
+    """The region of the 3D view under the `mouse` (2,) of the window, None where there is none, and the pixel in it."""
+    region = region_under(context, *mouse.tolist())
+    return region, mouse if region is None else mouse - (region.x, region.y)
 
 
 class Gesture:
@@ -60,6 +70,7 @@ class Gesture:
     def invoke(self, context, event):
         self._is_dragged, self._note, self._scene_lights, self._textures = False, "", None, ShownTextures()
         self._scale, self._is_told, self._is_still = context.preferences.system.ui_scale, False, False
+        self._mouse = self._last = pointer(event)
         self._timer = context.window_manager.event_timer_add(REST_SECONDS, window=context.window)
         context.window.cursor_modal_set("CROSSHAIR")
         context.workspace.status_text_set(f"{self.words(context)}    Esc: Cancel")
@@ -105,6 +116,8 @@ class Gesture:
         return {"CANCELLED"}
 
     def _answer(self, context, event) -> set[str]:
+        if not self._is_dragged:
+            self._mouse = self._last = pointer(event)
         if event.type in ("ESC", "RIGHTMOUSE"):
             self.cancel(context)
             return {"CANCELLED"}
@@ -116,11 +129,18 @@ class Gesture:
                 return {"FINISHED" if self.is_changed() else "CANCELLED"}
             if event.value in ("PRESS", "DOUBLE_CLICK"):
                 self._is_dragged = self._do(context, event, self.press)
+                # Why a drag cannot begin is told until the mouse moves.
+                self._is_told = not self._is_dragged
         elif self._is_dragged and event.type in ("WHEELUPMOUSE", "WHEELDOWNMOUSE"):
             self.wheel(FARTHER if event.type == "WHEELUPMOUSE" else 1.0 / FARTHER)
             self._do(context, event, self.follow)
         elif self._is_dragged and event.type in FOLLOWED:
+            now = pointer(event)
+            way, self._last = (PRECISE if event.shift else 1.0) * (now - self._last), now
             self._is_told = self._is_still = False
+            self.move(way)
+            self._do(context, event, self.follow)
+        elif self._is_dragged and event.value == "PRESS" and self.key(event):
             self._do(context, event, self.follow)
         elif event.type == "MOUSEMOVE":
             self._is_told = self._is_still = False
@@ -140,6 +160,14 @@ class Gesture:
 
     def wheel(self, factor: float) -> None:
         """A step of the wheel while dragging."""
+
+    def move(self, way: np.ndarray) -> None:
+        """The mouse has gone a `way` (2,) in pixels while dragging; with Shift it is a tenth of it."""
+        self._mouse = self._mouse + way
+
+    def key(self, event) -> bool:
+        """Take a key that is pressed while dragging; False if it has no meaning."""
+        return False
 
     def warning(self, context, event) -> str:
         """What is wrong with what the drag has reached, if telling takes longer than a move may; "" if nothing."""
@@ -191,12 +219,19 @@ class Gesture:
 
     def hit_under(self, context, event) -> SurfaceHit | None:
         """The surface under the mouse."""
-        region, mouse = view_under(context, event)
+        region, mouse = view_under(context, self._mouse)
         return None if region is None else hit_at(context, region, mouse)
 
 
+def pointer(event) -> np.ndarray:
+    """Where the mouse is (2,) in the window."""
+    return np.array([event.mouse_x, event.mouse_y], float)
+
+
 class MovingGesture(Gesture):
-    """A gesture that moves the active light."""
+    """A gesture that moves the active light. LOCKS: axes may be locked."""
+
+    LOCKS = True
 
     @classmethod
     def reason_against(cls, context) -> str:
@@ -214,15 +249,75 @@ class MovingGesture(Gesture):
 
     def invoke(self, context, event):
         self._light = active_light(context)
-        self._pose, self._distance = LightPose.of(self._light), 0.0
+        self._pose, self._look, self._distance = LightPose.of(self._light), LightLook.of(self._light), 0.0
+        self._free, self._mode = (True, True, True), ""
         return super().invoke(context, event)
 
     def put_back(self) -> None:
-        """Put the light back where it was."""
+        """Put the light back where it was, as it was."""
         self._pose.put_back(self._light)
+        self._look.put_back(self._light)
+
+    def is_changed(self) -> bool:
+        """As `Gesture.is_changed`."""
+        is_moved = LightPose.of(self._light).channels != self._pose.channels
+        return is_moved or LightLook.of(self._light) != self._look
+
+    def key(self, event) -> bool:
+        """As `Gesture.key`: X, Y and Z lock, D, S and C change what the mouse does."""
+        if event.type in AXES and self.LOCKS and not self._pose.is_sun:
+            free = tuple((axis == event.type) != event.shift for axis in AXES)
+            self._free = (True, True, True) if free == self._free else free
+        elif event.type in MODES:
+            self._mode = "" if self._mode == event.type else event.type
+        else:
+            return False
+        return True
+
+    def move(self, way: np.ndarray) -> None:
+        """As `Gesture.move`; after a key of MODES it changes what that says."""
+        factor = 2.0 ** (float(way[0]) / (STOP * self._scale))
+        if not self._mode:
+            super().move(way)
+        elif self._mode == "D":
+            self.wheel(factor)
+        elif not reason_to_keep_look(self._light, MODES[self._mode]):
+            if self._mode == "S":
+                self._look.scale(self._light, factor)
+            else:
+                self._look.tint(self._light, *(way / (HUES * self._scale)).tolist())
+
+    def hit_under(self, context, event) -> SurfaceHit | None:
+        """As `Gesture.hit_under`, with Ctrl at a corner or the middle of the face."""
+        self._snap(context, event)
+        return super().hit_under(context, event)
+
+    def _snap(self, context, event) -> None:
+        """With Ctrl let the mouse be at the nearest corner of the face under it, or at its middle."""
+        region, mouse = view_under(context, self._mouse)
+        hit = hit_at(context, region, mouse) if self._is_dragged and event.ctrl and region is not None else None
+        if hit is None or not len(hit.corners):
+            return
+        places = (hit.matrix @ Vector(place) for place in (*hit.corners, hit.corners.mean(axis=0)))
+        pixels = [view3d_utils.location_3d_to_region_2d(region, region.data, place) for place in places]
+        pixels = np.array([pixel for pixel in pixels if pixel is not None])
+        if len(pixels):
+            self._mouse = pixels[np.argmin(np.linalg.norm(pixels - mouse, axis=-1))] + (region.x, region.y)
 
     def _put(self, matrix: Matrix) -> None:
         self._pose.put(self._light, matrix)
+
+    def _noted(self, distance: float, *notes: str) -> str:
+        """What the header says: the distance, what is locked, what the mouse changes, and notes."""
+        texts = [] if math.isinf(distance) else [f"Distance {distance:.3g} m"]
+        if not all(self._free):
+            free = "".join(axis for axis, is_free in zip(AXES, self._free, strict=True) if is_free)
+            texts.append(f"along {free}")
+        if self._mode:
+            changed = MODES[self._mode]
+            reason = "" if self._mode == "D" else reason_to_keep_look(self._light, changed)
+            texts.append(reason or f"the mouse changes the {changed}{self._look.text(self._light, self._mode)}")
+        return "    ".join(filter(None, [*texts, *notes]))
 
 
 class LTSH_OT_drag_highlight(MovingGesture, bpy.types.Operator):
@@ -232,7 +327,7 @@ class LTSH_OT_drag_highlight(MovingGesture, bpy.types.Operator):
     bl_idname = "ltsh.drag_highlight"
     bl_label = "Drag Highlight"
     bl_options = {"UNDO"}
-    KEYS, ICON = "Drag the highlight of {}    Wheel: distance", "ops.transform.tosphere"
+    KEYS, ICON = f"Drag the highlight of {{}}    {MOVING_KEYS}", "ops.transform.tosphere"
 
     def wheel(self, factor: float) -> None:
         """Change the distance."""
@@ -250,9 +345,13 @@ class LTSH_OT_drag_highlight(MovingGesture, bpy.types.Operator):
             return False
         middle = hits[0 if len(hits) == 1 else len(STENCIL) // 2].position
         self._distance = self._distance or max((self._pose.matrix.translation - middle).length, 1e-3)
-        self._matrix, note = place_of(self._light, self._pose, hits, self._distance, self._textures)
-        self._put(self._matrix)
-        self._note = f"Distance {self._distance:.3g} m" + (f"    {note}" if note else "")
+        matrix, note = place_of(self._light, self._pose, hits, self._distance, self._textures)
+        if not all(self._free):
+            way = locked_place(self._pose.matrix.translation, middle, matrix.translation, self._free) - middle
+            matrix = self._pose.facing(middle, way.normalized(), way.length)
+        self._matrix = matrix
+        self._put(matrix)
+        self._note = self._noted((matrix.translation - middle).length, note)
         return True
 
     def warning(self, context, event) -> str:
@@ -261,7 +360,8 @@ class LTSH_OT_drag_highlight(MovingGesture, bpy.types.Operator):
         return note_by_pixels(self._light, self._matrix, hits, self._textures) if hits else NO_SURFACE
 
     def _hits(self, context, event, disk) -> list[SurfaceHit]:
-        region, mouse = view_under(context, event)
+        self._snap(context, event)
+        region, mouse = view_under(context, self._mouse)
         if region is None:
             return []
         depsgraph, faces = context.evaluated_depsgraph_get(), {}
@@ -299,15 +399,13 @@ class LTSH_OT_drag_brightness(Gesture, bpy.types.Operator):
             self._note = f"{self._light.name}: {reason}"
             return False
         self._power, self._share = self._light.data.energy, first.luminance / whole
-        self._stops, self._last, self._shares = 0.0, event.mouse_y, self.share_line(hit, shares)
+        self._start, self._shares = self._mouse, self.share_line(hit, shares)
         return self.follow(context, event)
 
     def follow(self, context, event) -> bool:
         """Change the power by the way of the mouse."""
-        way = (event.mouse_y - self._last) / (STOP * self._scale)
-        self._last = event.mouse_y
-        self._stops += way * (PRECISE if event.shift else 1.0)
-        stops = round(SNAPS * self._stops) / SNAPS if event.ctrl else self._stops
+        stops = (self._mouse - self._start)[1] / (STOP * self._scale)
+        stops = round(SNAPS * stops) / SNAPS if event.ctrl else stops
         factor = 2.0**stops
         power = power_for(factor, self._power, self._share)
         self._light.data.energy = power
@@ -336,7 +434,7 @@ class LTSH_OT_drag_shadow(MovingGesture, bpy.types.Operator):
     bl_idname = "ltsh.drag_shadow"
     bl_label = "Drag Shadow"
     bl_options = {"UNDO"}
-    KEYS, ICON = "Drag the edge of a shadow of {}    Wheel: distance", "ops.transform.shear"
+    KEYS, ICON = f"Drag the edge of a shadow of {{}}    {MOVING_KEYS}", "ops.transform.shear"
 
     @classmethod
     def reason_against(cls, context) -> str:
@@ -350,7 +448,7 @@ class LTSH_OT_drag_shadow(MovingGesture, bpy.types.Operator):
 
     def press(self, context, event) -> bool:
         """Choose the edge of a shadow near the mouse; False where there is none."""
-        region, mouse = view_under(context, event)
+        region, mouse = view_under(context, self._mouse)
         if region is None:
             self._note = NO_SURFACE
             return False
@@ -371,10 +469,15 @@ class LTSH_OT_drag_shadow(MovingGesture, bpy.types.Operator):
         rays = OccluderRays(context.scene, context.evaluated_depsgraph_get(), self._light)
         place, note = self._edge.light_for(rays, hit)
         if place is not None:
+            if not all(self._free):
+                aim, direction, distance = place
+                target = aim + distance * direction
+                way = locked_place(self._pose.matrix.translation, hit.position, target, self._free) - aim
+                place = aim, way.normalized(), way.length
             self._put(self._pose.facing(*place))
         kind = "Shadow" if self._edge.across is None else "Edge of the shadow"
-        far = "" if math.isinf(self._edge.distance) else f"    Distance {self._edge.distance:.3g} m"
-        self._note = f"{kind} of {self._edge.ob.name}{far}" + (f"    {note}" if note else "")
+        distance = self._edge.distance if place is None or self._pose.is_sun else place[2]
+        self._note = f"{kind} of {self._edge.ob.name}    {self._noted(distance, note)}"
         return True
 
 
@@ -384,7 +487,8 @@ class LTSH_OT_aim_light(MovingGesture, bpy.types.Operator):
     bl_idname = "ltsh.aim_light"
     bl_label = "Aim Light"
     bl_options = {"UNDO"}
-    KEYS, ICON = "Press where {} shall shine, and drag", "ops.transform.tilt"
+    KEYS = "Press where {} shall shine, and drag    S: size    C: color    Shift: precise    Ctrl: corners"
+    ICON, LOCKS = "ops.transform.tilt", False
 
     @classmethod
     def reason_against(cls, context) -> str:
@@ -404,7 +508,7 @@ class LTSH_OT_aim_light(MovingGesture, bpy.types.Operator):
             return False
         way = self._pose.matrix.translation - hit.position
         self._put(self._pose.facing(hit.position, way.normalized(), way.length))
-        self._note = f"Distance {way.length:.3g} m"
+        self._note = self._noted(way.length)
         return True
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from mathutils import Matrix, Vector
@@ -14,7 +15,7 @@ from ...shading import shade
 from ...shading.highlight import STENCIL, MovedLight, mirrored, place_for_highlight
 from ..evaluated import EmitterTraits
 from ..lights.area import area_light
-from ..lights.linking import Receivers
+from ..lights.linking import Receivers, linked_objects, receiver_collection
 from ..lights.textures import ShownTextures
 from ..materials.preview_material import COAT, METALS, PreviewMaterial, preview_of
 from .light_pose import LightPose
@@ -117,7 +118,14 @@ def place_of(ob, pose: LightPose, hits: list[SurfaceHit], distance: float, textu
     light = MovedLight(lambda direction: np.array(matrix_at(direction)), lambda matrix: _light(ob, matrix))
     place = place_for_highlight(samples_of(hits, lobe, textures), light, shipped_table())
     note = (BESIDE if place.is_beside else NO_PEAK) if not place.is_peak else ""
-    return matrix_at(place.direction), note or unread(hit.material)
+    return matrix_at(place.direction), unlinked(ob, hit) or note or unread(hit.material)
+
+
+def unlinked(ob, hit: SurfaceHit) -> str:
+    """That light linking keeps the light object `ob` from the surface; "" if it does not."""
+    receivers = receiver_collection(ob)
+    is_lit = receivers is None or linked_objects(receivers).reach(hit.ob.name_full)
+    return "" if is_lit else f"{ob.name} does not light {hit.ob.name}, by light linking"
 
 
 def unread(material) -> str:
@@ -132,6 +140,8 @@ def note_by_pixels(ob, matrix: Matrix, hits: list[SurfaceHit], textures: ShownTe
     lobe = glossy_lobe(hits[0].material)
     if len(hits) == 1 or lobe is None:
         return NO_HIGHLIGHT if lobe is None else AT_RIM
+    if note := unlinked(ob, hits[0]):
+        return note
     samples, light = samples_of(hits, lobe, textures), _light(ob, np.array(matrix))
     samples, _ = end_at_horizons_of_cycles(samples, [light], np.zeros(len(samples), int))
     radiance = shade(samples, [light], shipped_table(), passes=("specular",), workers=1).specular.sum(axis=(0, 2))
@@ -142,7 +152,8 @@ def note_by_pixels(ob, matrix: Matrix, hits: list[SurfaceHit], textures: ShownTe
 
 
 def _light(ob, matrix: np.ndarray):
-    return area_light(ob, matrix, EmitterTraits("", True, True), Receivers([]))
+    # Samples have no numbers of receivers: `unlinked` tells of light linking.
+    return replace(area_light(ob, matrix, EmitterTraits("", True, True), Receivers([ob])), receivers=None)
 
 
 def hits_around(hit_at: Callable[[np.ndarray], SurfaceHit | None], disk: np.ndarray = DISK) -> list[SurfaceHit]:

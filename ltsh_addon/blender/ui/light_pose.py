@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import colorsys
 import math
 from dataclasses import dataclass
 
 from mathutils import Matrix, Vector
 
-from ..lights.groups import is_animated
+from ..lights.groups import is_animated, is_linked
 
 
 @dataclass(frozen=True)
@@ -53,34 +54,92 @@ class LightPose:
         ob.matrix_basis = self.parent.inverted_safe() @ matrix
 
 
-def reason_to_stay(ob) -> str:
-    """Why the mouse may not move a light; "" if it may."""
-    if is_linked(ob):
-        return "it is linked from another file"
-    if active := [constraint.name for constraint in ob.constraints if constraint.enabled]:
-        return f"its constraint {active[0]!r} moves it: switch it off or apply it"
-    if is_animated(ob):
-        return "it is animated or driven"
-    if any(ob.lock_rotation) or (any(ob.lock_location) and ob.data.type != "SUN"):
-        return "its location or rotation is locked: unlock it in the tab Item"
-    return ""
+# SIZES: the settings of a light's size, by its type.
+SIZES = {"AREA": ("size", "size_y"), "POINT": ("shadow_soft_size",), "SPOT": ("shadow_soft_size",), "SUN": ("angle",)}
+
+
+@dataclass(frozen=True)
+class LightLook:
+    """The color and size of a light object before a drag."""
+
+    color: tuple[float, ...]
+    sizes: dict[str, float]
+
+    @classmethod
+    def of(cls, ob) -> LightLook:
+        """That of the light object `ob` now."""
+        return cls(tuple(ob.data.color), {name: getattr(ob.data, name) for name in SIZES[ob.data.type]})
+
+    def put_back(self, ob) -> None:
+        """Give `ob` what has changed."""
+        now = LightLook.of(ob)
+        if now.color != self.color:
+            ob.data.color = self.color
+        for name, size in self.sizes.items():
+            if now.sizes[name] != size:
+                setattr(ob.data, name, size)
+
+    def scale(self, ob, factor: float) -> None:
+        """Make the light larger by a factor."""
+        for name in self.sizes:
+            setattr(ob.data, name, factor * max(getattr(ob.data, name), 1e-3))
+
+    def tint(self, ob, hue: float, saturation: float) -> None:
+        """Turn the light's hue, and add to its saturation; its brightest channel stays as bright."""
+        h, s, v = colorsys.rgb_to_hsv(*ob.data.color)
+        ob.data.color = colorsys.hsv_to_rgb((h + hue) % 1.0, min(max(s + saturation, 0.0), 1.0), v)
+
+    def text(self, ob, mode: str) -> str:
+        """What the light has now of the size (mode S) or color (mode C), after a colon."""
+        if mode == "D":
+            return ""
+        if mode == "C":
+            return ": " + ", ".join(f"{value:.3g}" for value in ob.data.color)
+        sizes = LightLook.of(ob).sizes.items()
+        return ": " + ", ".join(f"{math.degrees(v):.3g}°" if name == "angle" else f"{v:.3g} m" for name, v in sizes)
+
+
+def locked_place(start: Vector, point: Vector, place: Vector, free: tuple[bool, bool, bool]) -> Vector:
+    """Where a light is that may move from `start` along the `free` axes alone, and shall be seen from `point` in the
+    direction of `place`: there exactly where two axes are free and that direction leads there, else next to it."""
+    toward, moved = (place - point).normalized(), start.copy()
+    axes = [axis for axis in range(3) if free[axis]]
+    if len(axes) == 2:
+        (fixed,) = {0, 1, 2} - set(axes)
+        way = (start - point)[fixed] / toward[fixed] if abs(toward[fixed]) > 1e-6 else -1.0
+        target = point + way * toward if way > 0.0 else place
+        for axis in axes:
+            moved[axis] = target[axis]
+        return moved
+    (axis,) = axes
+    across = 1.0 - toward[axis] ** 2
+    if across > 1e-6:
+        # The place of the axis that is next to the ray from the point; not behind the point.
+        gap = start - point
+        along = (gap.dot(toward) * toward[axis] - gap[axis]) / across
+        if gap.dot(toward) + along * toward[axis] > 0.0:
+            moved[axis] += along
+            return moved
+    moved[axis] = place[axis]
+    return moved
 
 
 def reason_to_keep_power(ob) -> str:
     """Why the mouse may not change the power of a light; "" if it may."""
+    return _reason_to_keep(ob, "power", ("energy",))
+
+
+def reason_to_keep_look(ob, quantity: str) -> str:
+    """Why the mouse may not change the size or color of a light; "" if it may."""
+    return _reason_to_keep(ob, quantity, ("color",) if quantity == "color" else SIZES[ob.data.type])
+
+
+def _reason_to_keep(ob, quantity: str, names: tuple[str, ...]) -> str:
     if is_linked(ob.data):
-        return "its power is linked from another file"
-    if is_animated(ob.data, "energy"):
-        return "its power is animated or driven"
+        return f"its {quantity} is linked from another file"
+    if any(is_animated(ob.data, name) for name in names):
+        return f"its {quantity} is animated or driven"
     users = ob.data.users - ob.data.use_fake_user
     if users > 1:
         return f"its data {ob.data.name!r} has {users} users: make it single-user first"
     return ""
-
-
-def is_linked(block) -> bool:
-    """True for what another file owns, overrides that may not be edited included."""
-    override = block.override_library
-    return block.library is not None or (override is not None and override.is_system_override)
-
-

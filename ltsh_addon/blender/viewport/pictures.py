@@ -212,9 +212,11 @@ class LightingState:
 
 
 def is_equal(a, b) -> bool:
-    """True for lights that look the same, and for their parts: arrays, cones, patterns, words and numbers."""
+    """True for lights that look the same, occluders, and their parts: tuples, arrays, cones, words and numbers."""
     if a is b or type(a) is not type(b):
         return a is b
+    if isinstance(a, tuple):
+        return len(a) == len(b) and all(map(is_equal, a, b))
     if not is_dataclass(a):
         return np.array_equal(a, b)
     names = (item.name for item in fields(a) if item.name != "children")

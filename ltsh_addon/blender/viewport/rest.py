@@ -54,8 +54,9 @@ LEVELS = (
 )
 # A step takes about STEP_SECONDS: so long a new state may wait for the step of an old one. SHRINKS: pixels in either
 # direction that share one, in the pictures that come one after another; the first is the finest that takes one step.
-# TOTALS: the samples after which a picture is shown. REST_SECONDS: how long a view must stay as it is before.
-STEP_SECONDS, SHRINKS, TOTALS, REST_SECONDS = 0.5, (4, 2, 1), (4, 8, 16, 32, 64), 0.3
+# TOTALS: the samples after which a picture is shown; denoised, one of all pixels is nearer than four of a quarter of
+# them. REST_SECONDS: how long a view must stay as it is before.
+STEP_SECONDS, SHRINKS, TOTALS, REST_SECONDS = 0.5, (4, 2, 1), (1, 2, 4, 8, 16, 32, 64), 0.3
 # FEWEST: samples of single pixels that a step takes at least: the first picture of 1000 x 640 pixels. MOST_CHANGE: how
 # many times as many or as few the next one takes.
 FEWEST, MOST_CHANGE = 160_000, 2.0
@@ -346,7 +347,7 @@ class LiveRest:
             self._process, self._opened = BlenderProcess(self._folder, background=True), None
             self._stack.callback(self._process.end)
         pixels = math.prod(wanted.size)
-        self._work = self._work or max(FEWEST, pixels * TOTALS[0] / SHRINKS[0] ** 2)
+        self._work = self._work or FEWEST
         state = wanted.scene, wanted.view_layer, wanted.frame, wanted.hidden, wanted.world
         path = changes = None
         if state != self._opened or self._changes.everything:

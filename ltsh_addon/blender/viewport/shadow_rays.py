@@ -16,25 +16,28 @@ from ..extract.occluders import collect_occluders
 from ..lights.world import blocks_nothing
 from ..process.blender_process import embree_libraries
 from .drawing import GBufferTextures, ViewCamera, VisibilityGrid, float_buffer, gbuffer_samples
+from .pictures import is_equal
 
 Lights = Sequence[Light]
 # MOST_BYTES: graphics memory for the visibility of all lights. _LIGHT_BYTES: of a light and a pixel, two half floats.
 MOST_BYTES = 1 << 30
 _LIGHT_BYTES = 4
+# QUICK_SECONDS: occluders that take longer to collect are only collected once no object moves any more.
+QUICK_SECONDS = 0.03
 
 
 class ViewTracer:
     """A tracer of occluders, and the pool of this process and workers, at most `processes`, that trace with it."""
 
     def __init__(self, occluders: Occluders, processes: int = 2):
-        self._occluders, self._processes = occluders, processes
+        self.occluders, self._processes = occluders, processes
         self.pool: WorkerPool | None = None
         self.rays = 0  # traced by requests
 
     @cached_property
     def tracer(self) -> Tracer:
         """The tracer. Raises SceneError where Embree is missing."""
-        tracer = open_tracer(self._occluders, embree_libraries())
+        tracer = open_tracer(self.occluders, embree_libraries())
         self.pool = WorkerPool(tracer, min(cores(), self._processes))
         return tracer
 
@@ -42,6 +45,37 @@ class ViewTracer:
         """End the worker."""
         if self.pool is not None:
             self.pool.close()
+
+
+class TracedScene:
+    """The scene whose shadows are shown, and its tracer, which stays while only colors change."""
+
+    def __init__(self):
+        self.scene, self.collect, self.collected, self.before = None, None, None, None
+        self.tracing: ViewTracer | None = None
+        self.collect_seconds, self.version = 0.0, 0  # version: of the occluders
+
+    def may_collect(self) -> bool:
+        """True if the occluders are known or quick to collect, or if nothing has moved since the last call."""
+        if self.collected == self.scene or self.collect_seconds <= QUICK_SECONDS or self.scene == self.before:
+            return True
+        self.before = self.scene
+        return False
+
+    def collect_now(self) -> None:
+        """Collect the occluders, unless they are known."""
+        if self.collected == self.scene:
+            return
+        start, occluders = time.perf_counter(), self.collect()
+        if self.tracing is None or not is_equal(occluders, self.tracing.occluders):
+            self.close()
+            self.tracing, self.version = ViewTracer(occluders), self.version + 1
+        self.collected, self.collect_seconds = self.scene, time.perf_counter() - start
+
+    def close(self) -> None:
+        """End the process that helps the tracer."""
+        if self.tracing is not None:
+            self.tracing.close()
 
 
 class ShadowRays:

@@ -26,7 +26,7 @@ from .drawing import (
     samples_of_texels,
     unit_xyz,
 )
-from .shadow_rays import Lights, ViewTracer, too_many, visibility_texture
+from .shadow_rays import Lights, TracedScene, ViewTracer, too_many, visibility_texture
 
 
 def _blank() -> VisibilityGrid:
@@ -47,8 +47,8 @@ MANY_POINTS, QUICK, QUICK_STEP, QUICK_RAYS, QUICK_DIFFERENCE = 40000, 0.5, 4, 16
 # FIRST_POINTS: sub-pixel points that a view at rest draws with the shadows of its first picture, so that edges become
 # smooth soon. The later points come in groups of GROUP, each group with new shadows of GROUP_RAYS rays.
 FIRST_POINTS, GROUP, GROUP_RAYS = 8, 4, 64
-# QUICK_SECONDS: occluders that take longer to collect are only collected once no object moves any more.
-QUICK_SECONDS = 0.03
+# STAYING: the level of fine shadows of the same occluders, before a material was changed.
+STAYING = 0.25
 # BATCH: emitters that are traced together. Stopped work keeps finished batches.
 BATCH = 4
 # PAUSE_SECONDS: finer shadows follow the coarse ones of a light if it has stayed still for so long.
@@ -238,36 +238,6 @@ def _smoothed(values: np.ndarray, position: np.ndarray, normal: np.ndarray) -> n
     return means_of_neighbors(values, np.concatenate([position, normal], axis=-1), weight).astype(np.float32)
 
 
-class TracedScene:
-    """The scene whose shadows are shown, and its tracer."""
-
-    def __init__(self):
-        self.scene, self.collect, self.collected, self.before = None, None, None, None
-        self.tracing: ViewTracer | None = None
-        self.collect_seconds = 0.0
-
-    def may_collect(self) -> bool:
-        """True if the occluders are known or quick to collect, or if nothing has moved since the last call."""
-        if self.collected == self.scene or self.collect_seconds <= QUICK_SECONDS or self.scene == self.before:
-            return True
-        self.before = self.scene
-        return False
-
-    def collect_now(self) -> None:
-        """Collect the occluders, unless they are known."""
-        if self.collected == self.scene:
-            return
-        start = time.perf_counter()
-        self.close()
-        self.tracing, self.collected = ViewTracer(self.collect()), self.scene
-        self.collect_seconds = time.perf_counter() - start
-
-    def close(self) -> None:
-        """End the process that helps the tracer."""
-        if self.tracing is not None:
-            self.tracing.close()
-
-
 class LiveShadows:
     """Shadows while an artist works: a thread traces them, coarse at first, finer while nothing changes.
 
@@ -282,7 +252,7 @@ class LiveShadows:
     def __init__(self, behind: LiveShadows | None = None):
         self._behind, self._glass = behind, None
         self._traced_scene = TracedScene() if behind is None else behind._traced_scene
-        self._version, self._problem = 0, ""
+        self._version, self._problem, self._traced = 0, "", 0  # _traced: the version of the occluders
         self._waits = False  # the picture whose shadows were asked for last must wait for the thread
         # Number and visibility of a group of further points.
         self._group_grid: tuple[int, VisibilityGrid | None] = (0, None)
@@ -300,7 +270,7 @@ class LiveShadows:
         self._is_whole = True  # the picture has all pixels of what is shown
         # State and size of a picture, and points, by whether they are coarse.
         self._pixels: dict[bool, tuple[tuple, PixelGrid]] = {}
-        self._state: tuple = ()  # state that was traced last; the next two belong to it
+        self._state: tuple = ()  # state that was traced last; the next two and `_traced` belong to it
         self._known: dict[tuple, dict[int, np.ndarray]] = {}  # visibility (H, W, 2), by the key of a light and level
         self._points: dict[bool, PixelGrid] = {}  # by whether they are coarse
         self._latest: dict[int, dict[int, np.ndarray]] = {}  # latest visibility by the number of a light and level
@@ -401,6 +371,7 @@ class LiveShadows:
             return
         if request.state != self._state:
             self._state, self._known, self._points, self._latest = request.state, {}, {}, {}
+            self._traced = self._traced_scene.version
         self._points[request.level == 0] = request.points
         self._known = {key: levels for key, levels in self._known.items() if key in self._keys}
         for index, values in outcome.items():
@@ -432,7 +403,11 @@ class LiveShadows:
         level = self._next_level()
         if level is not None and self._may_begin(level, number):
             try:
-                self._begin(level, gbuffer, view)
+                self._traced_scene.collect_now()
+                if level > 0 or not self._keeps_fine():
+                    self._begin(level, gbuffer, view)
+                elif self._may_begin(1, number):
+                    self._begin(1, gbuffer, view)
             except Exception as error:
                 self._problem = f"shadows: {error_line(error)}"
         elif self._thread is not None and self._is_outdated:
@@ -497,7 +472,6 @@ class LiveShadows:
         return self._traced_scene.may_collect() and (level == 0 or is_finer)
 
     def _begin(self, level: int, gbuffer: GBufferTextures, view: ViewCamera) -> None:
-        self._traced_scene.collect_now()
         requests = [self._request_of(level, gbuffer, view)]
         if level == 0 and self._pixels.get(False, (None,))[0] == (self._wanted, gbuffer.size):
             requests.append(self._request_of(1, gbuffer, view))
@@ -506,6 +480,16 @@ class LiveShadows:
             if quick.numbers:
                 requests[-1:] = [quick] if self._has_patience else [quick, requests[-1]]
         self._start(requests)
+
+    def _keeps_fine(self) -> bool:
+        """Keep fine shadows where only materials have changed, until finer ones are there; False: there are none."""
+        finest = {key: max(levels) for key, levels in self._known.items()}
+        is_same = self._traced == self._traced_scene.version and self._state[1:] == self._wanted[1:]
+        if not is_same or any(finest.get(key, -1) < STAYING for key in self._keys):
+            return False
+        self._state = self._wanted
+        self._known = {key: {STAYING: self._known[key][finest[key]]} for key in self._keys}
+        return True
 
     def _request_of(self, level: float, gbuffer: GBufferTextures, view: ViewCamera) -> ShadowRequest:
         """The request of `level` for the lights that lack it."""

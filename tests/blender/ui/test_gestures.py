@@ -11,11 +11,12 @@ from mathutils import Vector
 
 from ltsh_addon.blender.evaluated import EmitterTraits
 from ltsh_addon.blender.lights.area import area_light
+from ltsh_addon.blender.lights.groups import reason_to_stay
 from ltsh_addon.blender.lights.linking import Receivers
 from ltsh_addon.blender.lights.textures import ShownTextures
 from ltsh_addon.blender.ui import gestures
-from ltsh_addon.blender.ui.highlight_place import NO_HIGHLIGHT, glossy_lobe, place_of, samples_of
-from ltsh_addon.blender.ui.light_pose import LightPose, reason_to_stay
+from ltsh_addon.blender.ui.highlight_place import NO_HIGHLIGHT, glossy_lobe, note_by_pixels, place_of, samples_of
+from ltsh_addon.blender.ui.light_pose import LightPose, locked_place, reason_to_keep_look
 from ltsh_addon.blender.ui.lit_point import surface_hit
 from ltsh_addon.shading import shade
 from ltsh_addon.shading.highlight import STENCIL
@@ -135,7 +136,10 @@ def test_a_light_is_aimed_where_it_is(scene):
     (hit,) = hits_at(scene, np.zeros((1, 2)), Vector((1.3, -0.8, 0.0)))
     pose = LightPose.of(light)
     this = SimpleNamespace(
-        hit_under=lambda context, event: hit, _pose=pose, _put=lambda matrix: pose.put(light, matrix)
+        hit_under=lambda context, event: hit,
+        _pose=pose,
+        _put=lambda matrix: pose.put(light, matrix),
+        _noted=str,
     )
     assert kind.follow(this, bpy.context, None)
     bpy.context.view_layer.update()
@@ -161,9 +165,15 @@ def test_each_gesture_is_a_tool_that_says_why_it_cannot_begin(addon):
     light.lock_rotation[0] = True
     ours[1].draw_settings(bpy.context, layout, None)
     assert texts == [
-        "No light is active", "Drag the highlight of Key    Wheel: distance",
+        "No light is active", f"Drag the highlight of Key    {gestures.MOVING_KEYS}",
         "Key: its location or rotation is locked: unlock it in the tab Item",
     ]  # fmt: skip
+
+
+def event(kind, value="PRESS", mouse=(0, 0), **held):
+    """An event of a key or the mouse; `held`: shift, ctrl."""
+    held = {"shift": False, "ctrl": False, "alt": False, **held}
+    return SimpleNamespace(type=kind, value=value, mouse_x=mouse[0], mouse_y=mouse[1], **held)
 
 
 class Recorded(gestures.Gesture):
@@ -238,28 +248,165 @@ def test_a_gesture_lasts_from_a_press_to_a_release(events, asked, result):
     button = {"press": "PRESS", "release": "RELEASE", "double": "DOUBLE_CLICK"}
     words = {name: ("LEFTMOUSE", value) for name, value in button.items()} | {"move": ("MOUSEMOVE", "NOTHING")}
     gesture, (context, there) = Recorded(), window()
-    assert gesture.invoke(context, SimpleNamespace(type="LEFTMOUSE", value="RELEASE")) == {"RUNNING_MODAL"}
+    assert gesture.invoke(context, event("LEFTMOUSE", "RELEASE")) == {"RUNNING_MODAL"}
     assert there["status"] == "Keys    Esc: Cancel"
-    for event in events:
-        kind, value = words.get(event, (event, "PRESS"))
-        returned = gesture.modal(context, SimpleNamespace(type=kind, value=value))
+    for name in events:
+        kind, value = words.get(name, (name, "PRESS"))
+        returned = gesture.modal(context, event(kind, value))
     assert gesture.asked == asked and returned == {result}
     assert there == {"timers": 0, "handlers": 1, "cursors": 0, "status": None, "header": None}
 
 
 def test_a_gesture_of_a_tool_begins_with_the_press_and_says_why_it_cannot():
-    press = SimpleNamespace(type="LEFTMOUSE", value="PRESS")
+    press = event("LEFTMOUSE", "PRESS")
     gesture, (context, there) = Recorded(), window()
     assert gesture.invoke(context, press) == {"RUNNING_MODAL"} and there["header"] == "pressed"
-    assert gesture.modal(context, SimpleNamespace(type="LEFTMOUSE", value="RELEASE")) == {"FINISHED"}
+    assert gesture.modal(context, event("LEFTMOUSE", "RELEASE")) == {"FINISHED"}
     gesture, (context, there) = Recorded(can_press=False), window()
     assert gesture.invoke(context, press) == {"CANCELLED"} and gesture.asked == ["press", "pressed"]
     assert there == {"timers": 0, "handlers": 0, "cursors": 0, "status": None, "header": None}
 
 
+def test_why_a_drag_cannot_begin_is_told_until_the_mouse_moves():
+    gesture, (context, there) = Recorded(can_press=False), window()
+    gesture.invoke(context, event("LEFTMOUSE", "RELEASE"))
+    for what in ("LEFTMOUSE", "TIMER", "TIMER", "TIMER"):
+        gesture.modal(context, event(what))
+    assert gesture.asked == ["press"] and there["header"] == "pressed"
+    gesture.modal(context, event("MOUSEMOVE", "NOTHING"))
+    for _ in range(2):
+        gesture.modal(context, event("TIMER"))
+    assert gesture.asked == ["press", "hover"]
+
+
 def test_a_gesture_that_fails_puts_everything_back():
     gesture, (context, there) = Recorded(), window()
-    gesture.invoke(context, SimpleNamespace(type="LEFTMOUSE", value="PRESS"))
-    assert gesture.modal(context, SimpleNamespace(type="RIGHT_CTRL", value="PRESS")) == {"CANCELLED"}
+    gesture.invoke(context, event("LEFTMOUSE", "PRESS"))
+    assert gesture.modal(context, event("RIGHT_CTRL", "PRESS")) == {"CANCELLED"}
     assert gesture.asked == ["press", "put back", "Gesture: broken"]
     assert there == {"timers": 0, "handlers": 1, "cursors": 0, "status": None, "header": None}
+
+
+class Moved(gestures.MovingGesture):
+    """A gesture that notes the mouse and its distance."""
+
+    KEYS, bl_label = "Keys of {}", "Moved"
+
+    def press(self, context, event):
+        self.distance = 2.0
+        return self.follow(context, event)
+
+    def follow(self, context, event):
+        self._note = self._noted(self.distance)
+        return True
+
+    def wheel(self, factor):
+        assert type(factor) is float  # numbers of numpy make arrays of vectors
+        self.distance *= factor
+
+
+@pytest.fixture
+def moved(scene):
+    """A drag of the active light that has begun; (it, a function that sends an event and returns the answer)."""
+    bpy.context.view_layer.objects.active = bpy.data.objects["Key"]
+    gesture, (context, _) = Moved(), window()
+    context.view_layer = bpy.context.view_layer
+    gesture.invoke(context, event("LEFTMOUSE"))
+    gesture._scale = 1.0
+    return gesture, lambda *what, **held: gesture.modal(context, event(*what, **held))
+
+
+def test_keys_change_distance_size_and_color_and_escape_puts_all_back(moved):
+    (gesture, send), data = moved, bpy.data.objects["Key"].data
+    before = data.size, data.size_y, tuple(data.color)
+    stop = gestures.STOP
+    send("MOUSEMOVE", "NOTHING", (10, 0))
+    mouse = gesture._mouse
+    send("D")
+    send("MOUSEMOVE", "NOTHING", (10 + stop, 0))
+    assert gesture.distance == pytest.approx(4.0) and "the mouse changes the distance" in gesture._note
+    send("S")
+    send("MOUSEMOVE", "NOTHING", (10 + 2 * stop, 0))
+    assert (data.size, data.size_y) == pytest.approx((2.0 * before[0], 2.0 * before[1]))
+    send("C")
+    send("MOUSEMOVE", "NOTHING", (10 + 2 * stop, 0.5 * gestures.HUES))
+    assert sorted(data.color) == pytest.approx([0.5, 0.5, 1.0]) and "color: 1, 0.5, 0.5" in gesture._note
+    # What is dragged is still where it was.
+    assert (gesture._mouse == mouse).all()
+    send("C")
+    send("MOUSEMOVE", "NOTHING", (20 + 2 * stop, 0.5 * gestures.HUES))
+    assert (gesture._mouse - mouse).tolist() == [10.0, 0.0]
+    assert send("ESC") == {"CANCELLED"}
+    assert (data.size, data.size_y, tuple(data.color)) == before
+
+
+def test_with_shift_the_mouse_goes_a_tenth_of_its_way(moved):
+    gesture, send = moved
+    send("MOUSEMOVE", "NOTHING", (100, 0), shift=True)
+    send("LEFT_SHIFT", "RELEASE", (100, 0))
+    send("MOUSEMOVE", "NOTHING", (110, 20))
+    assert gesture._mouse.tolist() == [20.0, 20.0]
+
+
+def test_size_and_color_of_data_that_others_share_stay(moved):
+    (gesture, send), light = moved, bpy.data.objects["Key"]
+    parts.link(bpy.data.objects.new("Other", light.data))
+    before = light.data.size
+    send("S")
+    send("MOUSEMOVE", "NOTHING", (50, 0))
+    assert light.data.size == before and "has 2 users: make it single-user first" in gesture._note
+
+
+def test_keys_lock_axes(moved):
+    gesture, send = moved
+    send("Z")
+    assert gesture._free == (False, False, True) and "along Z" in gesture._note
+    send("X", shift=True)
+    assert gesture._free == (False, True, True) and "along YZ" in gesture._note
+    send("X", shift=True)
+    assert gesture._free == (True, True, True)
+
+
+def test_a_locked_light_moves_along_its_axes_alone_and_is_seen_where_it_should_be():
+    start, point = Vector((2.0, -2.0, 3.0)), Vector((0.5, 0.2, 0.1))
+    toward = Vector((0.4, -0.5, 0.7)).normalized()
+    for number in range(3):
+        in_plane = locked_place(start, point, point + toward, tuple(axis != number for axis in range(3)))
+        assert in_plane[number] == start[number]
+        assert (in_plane - point).normalized().dot(toward) == pytest.approx(1.0, abs=1e-6)
+        axis = Vector([float(one == number) for one in range(3)])
+        along = locked_place(start, point, point + toward, tuple(one == number for one in range(3)))
+        assert (along - start).cross(axis).length < 1e-6
+        # No other place of the axis is nearer to the ray.
+        here, *beside = ((along + way * axis - point).cross(toward).length for way in (0.0, 0.01, -0.01))
+        assert here < min(beside) and (along - point).dot(toward) > 0.0
+
+
+def test_driven_linked_and_unlinked_lights_say_so(scene, tmp_path):
+    light = bpy.data.objects["Key"]
+    curve = light.driver_add("location", 2)
+    curve.driver.expression = "2.0"
+    assert reason_to_stay(light) == "it is animated or driven"
+    light.driver_remove("location", 2)
+    assert reason_to_stay(light) == ""
+    light.data.driver_add("size")
+    assert reason_to_keep_look(light, "size") == "its size is animated or driven"
+    assert reason_to_keep_look(light, "color") == ""
+    light.data.driver_remove("size")
+    # Light linking stays, and is told.
+    hits = hits_at(scene, 2.0 * STENCIL, Vector((0.2, -0.5, 1.1)))
+    light.light_linking.receiver_collection = receivers = bpy.data.collections.new("Lit")
+    receivers.objects.link(bpy.data.objects["Plane"])
+    matrix, note = place_of(light, LightPose.of(light), hits, 2.5, ShownTextures())
+    assert note == "Key does not light Sphere, by light linking"
+    assert note_by_pixels(light, matrix, hits, ShownTextures()) == note
+    assert light.light_linking.receiver_collection == receivers
+    # Of another file.
+    bpy.data.libraries.write(str(tmp_path / "lights.blend"), {light})
+    with bpy.data.libraries.load(str(tmp_path / "lights.blend"), link=True) as (_, wanted):
+        wanted.objects = ["Key"]
+    linked = next(ob for ob in bpy.data.objects if ob.library is not None and ob.type == "LIGHT")
+    assert reason_to_stay(linked) == "it is linked from another file"
+    assert reason_to_keep_look(linked, "size") == "its size is linked from another file"
+    own = parts.link(bpy.data.objects.new("Own", linked.data))
+    assert reason_to_stay(own) == "" and "linked" in reason_to_keep_look(own, "color")

@@ -22,6 +22,7 @@ from ltsh_addon.blender.viewport.drawing import (
     new_shaders_until,
     read_texture,
 )
+from ltsh_addon.blender.viewport.mirror import Changes
 from ltsh_addon.blender.viewport.pictures import SampleSum, ShownPicture, ShownRest
 from ltsh_addon.blender.viewport.shadow_rays import ShadowRays, ViewTracer, view_occluders
 from ltsh_addon.blender.viewport.shadows import LiveShadows, ShadowRequest
@@ -325,3 +326,55 @@ def test_a_drawing_that_has_no_time_loads_one_slow_image(monkeypatch):
     drawings, picture, expected = with_graphics(draw)
     assert drawings == 2 and sorted(loaded) == ["image 0", "image 1"]
     np.testing.assert_array_equal(picture, expected)
+
+
+@edits_with_graphics
+def test_shadows_stay_fine_while_colors_change_and_are_coarse_again_once_an_object_moves():
+    """Levels that the thread begins after each change; and the picture at once after a new color, beside the last."""
+    camera, shown, live = set_up_scene(), ShownPicture("ltsh4", "combined", transparent=True), LiveShadows()
+    base = bpy.data.materials["gray"].node_tree.nodes["Principled BSDF"].inputs["Base Color"]
+
+    def draw():
+        pictures, levels = [], []
+        with OpenView(camera, SIZE) as opened:
+            opened.renderer.shadows = live
+
+            def drawn(version):
+                live.follow((version,), lambda: view_occluders(depsgraph(), lambda text: None))
+                pictures.append(opened.draw(shown)[..., :3].astype(np.float64))
+
+            def settled(version):
+                done = []
+                drawn(version)
+                while live._thread is not None:
+                    live._thread.join()
+                    done += [request.level for request, _ in live._outcomes]
+                    drawn(version)
+                levels.append(done)
+
+            try:
+                settled(0)
+                tracer = live._traced_scene.tracing
+                # Twice as bright, which shadows do not depend on.
+                base.default_value = (0.4, 0.4, 0.4, 1.0)
+                opened.mirror.sync(depsgraph(), changes=Changes(materials={"gray"}))
+                settled(1)
+                assert live._traced_scene.tracing is tracer
+                bpy.data.objects["Sphere"].location.x += 0.5
+                opened.mirror.sync(depsgraph(), changes=Changes(instances=True))
+                settled(2)
+                assert live._traced_scene.tracing is not tracer
+            finally:
+                live.stop()
+        return pictures, levels
+
+    def depsgraph():
+        bpy.context.view_layer.update()
+        return bpy.context.evaluated_depsgraph_get()
+
+    base.default_value = (0.8, 0.8, 0.8, 1.0)
+    pictures, levels = with_graphics(draw)
+    assert levels == [[0, 1], [1], [0, 1]]
+    at_once, finest = pictures[3:5]
+    # Both have noise of 32 rays; those of 8 rays at some pixels are four times as far off.
+    assert np.linalg.norm(at_once - finest) < 0.02 * np.linalg.norm(finest)

@@ -185,7 +185,7 @@ def test_changes_are_handed_over_by_themselves_and_show_what_a_whole_file_shows(
 def test_a_step_takes_what_there_is_time_for_and_pictures_come_with_more_and_more_pixels():
     """Each picture has all its samples, whatever the share of a picture that a step takes."""
     one, other = RestView(scene="one"), RestView(scene="other")
-    for share, shrinks in ((0.13, [4, 2, 1]), (0.3, [4, 2, 1]), (1.0, [2, 1]), (5.0, [1])):
+    for share, shrinks in ((0.02, [4, 2, 1]), (0.13, [4, 2, 1]), (0.3, [2, 1]), (1.0, [1]), (5.0, [1])):
         job, rendered, pictures = RestJob(None, other, 16), 0.0, []
         while not pictures or pictures[-1] != (1, 64):
             job = rest.next_job(job, one, share)
@@ -195,7 +195,7 @@ def test_a_step_takes_what_there_is_time_for_and_pictures_come_with_more_and_mor
             if rest.makes_picture(job):
                 pictures.append((job.shrink, job.total))
                 assert rendered == pytest.approx(job.total)
-        assert pictures == [*((shrink, 4) for shrink in shrinks), *((1, count) for count in (8, 16, 32, 64))]
+        assert pictures == [*((shrink, 1) for shrink in shrinks), *((1, 2**power) for power in range(1, 7))]
 
 
 @pytest.mark.newest

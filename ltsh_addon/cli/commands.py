@@ -294,15 +294,21 @@ def _relight(arguments, bar, open_file) -> int:
     return _printed(arguments, report, 0)
 
 
-MATCH = """Find powers of lights for which the scene looks like a picture of the same camera, and with
---colors their colors too. OUT gets matched.blend, a copy of the scene with these lights,
-match.png (before, after, target) and report.json with each light's old and new power."""
+MATCH = """Find powers of lights for which the scene looks like a picture of the same camera, with --colors
+their colors too, with --move their places and directions. OUT gets matched.blend, a copy of the scene
+with these lights, match.png (before, after, target) and report.json with each light's old and new
+values."""
 MATCH_EXAMPLES = """examples:
   %(prog)s room.blend --target graded.exr -o out/match
   %(prog)s room.blend --target painted.png --mask window.png --light Key --light Fill --colors -o out/match
+  %(prog)s room.blend --target photo.exr --light Key --move -o out/match
 
 A picture of 8 or 16 bits goes back through the view transform of the scene; pixels that are clipped do
 not count. Bounces follow their lights.
+
+--move is surest from within a tenth of the distance between a light and what it lights. The report says
+by how much the picture is still off the target. Lights with constraints, locks, keyframes, drivers,
+textures or shared data keep their places.
 """
 
 

@@ -7,17 +7,28 @@ none; the factors of these pictures are those of non-negative least squares (Law
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from .. import imaging
+from .. import imaging, visibility
 from ..files import temporary_folder, write_bytes
 from ..imaging.color import luminance
 from ..imaging.exr import group_names, parse_layer_name
-from ..scene import Progress, SceneError, listed
-from .lighting import light_groups, prepare
+from ..scene import Cancelled, Light, Progress, SceneError, listed
+from .light_search import (
+    LightFreedom,
+    LightMove,
+    LightSearch,
+    TargetSamples,
+    in_squares,
+    non_negative_least_squares,
+    searched,
+    sums_in_squares,
+)
+from .lighting import light_groups, load_tables, prepare
 from .options import MatchOptions, RenderOptions, child_job
 from .picture import view_transformed
 from .render import Finished, finish
@@ -27,12 +38,20 @@ from .tasks import TaskResult, check_before_writing, write_reports
 PIXELS = 480 * 270
 # STEADY: the weight of the present factors, relative to the target's. It holds lights that give next to nothing.
 STEADY = 1e-6
-# SQUARE: pictures are compared by the means of squares of so many pixels on a side: edges that lie differently within
-# pixels would count as light otherwise (errors of powers 2.4 % in place of .6 % in a room of eight lights).
-SQUARE = 5
 # LEAST_SHARE: of lights with less of the picture's light a target hardly tells the power: the report says so.
 LEAST_SHARE = 0.005
 FEWEST = 100  # pixels of a target
+# ROUNDS: of moving lights, at most. Each begins with a new picture, with the bounces of the lights where they are by
+# then. A step smaller than STILL of a light's distance ends them.
+ROUNDS, STILL = 3, 0.01
+# FINE, COARSE: sides of squares in pixels, points in each, and rays of a point, with which lights are moved.
+FINE, COARSE = (5, 4, 64), (12, 8, 32)
+# STILL_OFF: the error of a picture from which on the report says that the lights may not be where the target's were.
+STILL_OFF = 0.05
+STILL_OFF_BY = (
+    "the picture is still {:.1f} % off the target: lights that start nearer to where they should be may come closer; "
+    "or the target shows what no light of this scene gives"
+)
 NOT_TOLD = "less than {1:.1f} % of the picture is light of {0}: the target hardly tells its power"
 
 
@@ -46,35 +65,6 @@ class LightFactors:
     after: float
 
 
-def non_negative_least_squares(matrix: np.ndarray, target: np.ndarray) -> np.ndarray:
-    """The x (N,) without negative values for which |matrix x - target|^2 is least; matrix (M, N), target (M,).
-
-    Lawson and Hanson 1974, algorithm NNLS (23.10), by the normal equations: N is small and M large.
-    """
-    normal, right = matrix.T @ matrix, matrix.T @ target
-    count = len(right)
-    x, is_free = np.zeros(count), np.zeros(count, bool)
-    tolerance = 1e-12 * max(np.abs(right).max(initial=0.0), 1e-300)
-    for _ in range(3 * count):
-        gradient = right - normal @ x
-        if is_free.all() or gradient[~is_free].max() <= tolerance:
-            break
-        is_free[np.argmax(np.where(is_free, -np.inf, gradient))] = True
-        while True:
-            step = np.zeros(count)
-            step[is_free] = np.linalg.lstsq(normal[np.ix_(is_free, is_free)], right[is_free], rcond=None)[0]
-            if step[is_free].min(initial=0.0) >= 0.0:
-                x = step
-                break
-            # Go as far as no value becomes negative; the first that becomes 0 stays there.
-            falls = is_free & (step < 0.0)
-            ratio = np.where(falls, x / np.where(falls, x - step, 1.0), np.inf)
-            x = x + ratio.min() * (step - x)
-            is_free &= ratio > ratio.min()
-            x[~is_free] = 0.0
-    return x
-
-
 def matched_factors(
     layers: np.ndarray, fixed: np.ndarray, target: np.ndarray, weights: np.ndarray, *, colors: bool = False
 ) -> LightFactors:
@@ -83,7 +73,7 @@ def matched_factors(
     The `weights` (H, W) count pixels. Errors are relative to the target's luminance, where it is above its mean, and
     else to this mean. Each layer has one factor, with `colors` one for each channel.
     """
-    count = _sums(weights, (0, 1))
+    count = sums_in_squares(weights, (0, 1))
     layers, fixed, target = (
         in_squares(image, weights).reshape(*image.shape[:-3], -1, 3)[..., count.ravel() > 0.0, :]
         for image in (layers, fixed, target)
@@ -113,19 +103,6 @@ def matched_factors(
     return LightFactors(factors, shares, error(np.ones_like(factors)), error(factors))
 
 
-def in_squares(image: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Means of `image` (..., H, W, C) over squares, weighted by `weights` (H, W)."""
-    total = np.maximum(_sums(weights, (0, 1)), 1e-30)
-    return _sums(image * weights[..., None], (-3, -2)) / total[..., None]
-
-
-def _sums(values: np.ndarray, axes: tuple[int, int]) -> np.ndarray:
-    """Sums over squares of SQUARE on a side along two `axes`."""
-    for axis in axes:
-        values = np.add.reduceat(values, np.arange(0, values.shape[axis], SQUARE), axis)
-    return values
-
-
 def match_scene(options: MatchOptions, progress: Progress | None = None) -> dict:
     """Write matched.blend, a copy of the scene whose lights fit the target, match.png (before, after, target), and
     report.json. Returns the report.
@@ -133,13 +110,13 @@ def match_scene(options: MatchOptions, progress: Progress | None = None) -> dict
     Raises SceneError for a target or mask that does not fit, TableError, OSError, Cancelled.
     """
     from ..blender.process.blender_process import shared_blender
-    from ..blender.process.match import LightsJob, TargetJob, read_target, save_lights
+    from ..blender.process.match import TargetJob, read_target
 
     prepare(options)
     with temporary_folder() as folder, shared_blender(folder):
         paths = options.target.absolute(), options.mask and options.mask.absolute()
         job = child_job(TargetJob, options, target=paths[0], mask=paths[1])
-        target, weights = read_target(job, folder, progress)
+        target, weights, reasons = read_target(job, folder, progress)
         # Of a pixel of which some is clipped or masked, the rest tells nothing about the mean.
         is_whole = reduced((weights > 0.0).astype(np.float64)) > 0.999
         target, weights = reduced(target), np.where(is_whole, reduced(weights), 0.0)
@@ -149,35 +126,152 @@ def match_scene(options: MatchOptions, progress: Progress | None = None) -> dict
                 "or outside of the mask"
             )
         height, width = weights.shape
-        settings = {"own_groups": options.lights, "resolution": (width, height)}
-        picture = finish(child_job(RenderOptions, options, **settings), progress)
-        groups, layers, fixed = light_layers(picture)
-        if not groups:
-            raise SceneError(f"{options.scene}: no light of the picture can be changed, expected light objects")
-        result = matched_factors(layers, fixed, target, weights, colors=options.colors)
-        pictures = [fixed + layers.sum(axis=0), fixed + np.einsum("rhwc,rc->hwc", layers, result.factors), target]
+        matching = _Matching(options, target, weights, reasons, folder, progress)
+        before = now = matching.picture()
+        for number in range(ROUNDS if options.move else 0):
+            largest = matching.move(now, number)
+            now = matching.picture()
+            if largest < STILL:
+                break
+        result = matched_factors(now.layers, now.fixed, target, weights, colors=options.colors)
+        first = before.layers, before.fixed, target, weights
+        error_before = result.before if now is before else matched_factors(*first, colors=options.colors).before
+        pictures = [before.fixed + before.layers.sum(axis=0)]
+        pictures += [now.fixed + np.einsum("rhwc,rc->hwc", now.layers, result.factors), target]
         sheet = np.concatenate([np.concatenate(pictures, axis=1), np.ones((height, 3 * width, 1))], axis=-1)
         png = view_transformed(sheet, options, folder, progress)
         check_before_writing(progress)
-        factors = dict(zip(groups, result.factors.tolist(), strict=True))
-        path = Path(options.output) / "matched.blend"
-        lights = save_lights(child_job(LightsJob, options, path=path, factors=factors), progress)
+        matching.save(Path(options.output) / "matched.blend", dict(zip(now.groups, result.factors, strict=True)))
     write_bytes(Path(options.output) / "match.png", png)
-    shares = dict(zip(groups, result.shares.tolist(), strict=True))
-    lights = [{**light, "share": shares[light.pop("group")]} for light in lights]
+    shares = dict(zip(now.groups, result.shares.tolist(), strict=True))
+    lights = [{**light, "share": shares[light.pop("group")]} for light in matching.lights.values()]
     weak = [repr(light["name"]) for light in lights if light["share"] < LEAST_SHARE]
     warnings = [NOT_TOLD.format(listed(weak), 100.0 * LEAST_SHARE)] if weak else []
+    warnings += [f"light {name!r} keeps its place: {reason}" for name, reason in matching.staying.items()]
+    if options.move and result.after > STILL_OFF:
+        warnings.append(STILL_OFF_BY.format(100.0 * result.after))
     report = {
         "target": str(options.target),
         "resolution": [width, height],
         "pixels": telling,
         "lights": lights,
-        "error_before": result.before,
+        "error_before": error_before,
         "error_after": result.after,
-        "warnings": imaging.grouped([*picture.report["warnings"], *warnings]),
+        "search": {"processor_s": matching.seconds},
+        "warnings": imaging.grouped([*now.finished.report["warnings"], *warnings]),
         "files": ["matched.blend", "match.png"],
     }
-    return write_reports(TaskResult(report, picture.seconds, tuple(report["files"])), options.output)
+    return write_reports(TaskResult(report, now.finished.seconds, tuple(report["files"])), options.output)
+
+
+@dataclass(frozen=True)
+class _Layers:
+    """A finished picture, apart into what each group of lights gives it."""
+
+    finished: Finished
+    groups: list[str]  # R
+    layers: np.ndarray  # (R, H, W, 3)
+    fixed: np.ndarray  # (H, W, 3)
+
+
+class _Matching:
+    """A scene whose lights come closer to a target, from copy to copy."""
+
+    def __init__(self, options: MatchOptions, target, weights, reasons: dict[str, str], folder: Path, progress):
+        self.scene, self.lights, self.staying, self.seconds = Path(options.scene), {}, {}, 0.0
+        self._options, self._target, self._weights, self._reasons = options, target, weights, reasons
+        self._folder, self._progress = folder, progress
+
+    def picture(self) -> _Layers:
+        """The picture of the scene as it is now."""
+        height, width = self._weights.shape
+        settings = {"scene": self.scene, "own_groups": self._options.lights, "resolution": (width, height)}
+        picture = finish(child_job(RenderOptions, self._options, **settings), self._progress)
+        groups, layers, fixed = light_layers(picture)
+        if not groups:
+            raise SceneError(f"{self._options.scene}: no light of the picture can be changed, expected light objects")
+        return _Layers(picture, groups, layers, fixed)
+
+    def save(self, path: Path, factors: dict[str, np.ndarray], moves: dict[str, LightMove] | None = None) -> None:
+        """Save the scene with changed lights as `path`, and go on with that."""
+        from ..blender.process.match import LightsJob, save_lights
+
+        changes = {"path": path, "factors": {group: one.tolist() for group, one in factors.items()}}
+        changes["moves"] = {group: move.record() for group, move in (moves or {}).items()}
+        for light in save_lights(child_job(LightsJob, self._options, scene=self.scene, **changes), self._progress):
+            former = self.lights.get(light["name"], light)
+            self.lights[light["name"]] = {**light, **{key: former[key] for key in light if key.endswith("_before")}}
+        self.scene = path
+
+    def move(self, now: _Layers, number: int) -> float:
+        """Search better places of the lights, in the first round from several starts; the largest step, relative to the
+        distances of the lights."""
+        from ..blender.process.blender_process import embree_libraries
+
+        start, extraction = time.process_time(), now.finished.comparison.extraction
+        if not now.finished.comparison.results:
+            raise SceneError(
+                f"{self._options.scene}: lights cannot be moved, because Cycles shades all direct light: "
+                f"{listed(now.finished.report['finished']['all_by_cycles'], 4, '; ')}; leave out --move"
+            )
+        moving = self._moving(now.groups, extraction)
+        if not moving:
+            raise SceneError(f"{self._options.scene}: no light can be moved: " + "; ".join(
+                f"{name!r}, {reason}" for name, reason in self.staying.items()))  # fmt: skip
+        (table,) = load_tables(self._options.techniques).values()
+        by_pass = extraction.left_to_cycles.by_pass
+        weights = np.where(np.logical_or(*by_pass.values()), 0.0, self._weights)
+        with visibility.open_tracer(extraction.occluders, embree_libraries()) as tracer:
+
+            def search(side: int, points: int, rays: int) -> LightSearch:
+                places = TargetSamples.of(extraction, self._target, weights, (side, points), (tracer, rays), table)
+                squares = [places.mean(image, weights, side) for image in (now.layers, now.fixed)]
+                is_moving = np.isin(now.groups, list(moving))
+                freedoms = [
+                    LightFreedom(moving[group], places.distance(moving[group]), self._options.sizes)
+                    for group in now.groups
+                    if group in moving
+                ]
+                direct = np.array([places.picture(one.light) for one in freedoms])
+                rest = squares[0][is_moving] - direct
+                others = squares[0][~is_moving]
+                return LightSearch(
+                    places, tuple(freedoms), rest, others, squares[1], direct.sum(axis=1), self._options.colors
+                )
+
+            def report(share: float) -> None:
+                if self._progress is not None and self._progress("search", share) is False:
+                    raise Cancelled("stopped before the lights were placed")
+
+            fine = search(*FINE)
+            x = searched(search(*COARSE) if number == 0 else None, fine, progress=report)
+            factors = np.stack(fine.factors(x), axis=-1)
+        factors = np.broadcast_to(factors, (len(factors), 3))
+        names = [group for group in now.groups if group in moving]
+        ordered = [*names, *(group for group in now.groups if group not in moving)]
+        moves = {name: one.move(part) for name, one, part in zip(names, fine.freedoms, fine.split(x), strict=True)}
+        self.seconds += time.process_time() - start
+        # A light without power would have no place in the next picture.
+        self.save(
+            self._folder / f"round_{number}.blend", dict(zip(ordered, np.maximum(factors, 1e-3), strict=True)), moves
+        )
+        return float(np.abs(x).max())
+
+    def _moving(self, groups: list[str], extraction) -> dict[str, Light]:
+        """The lights that may move by their groups; notes why others may not."""
+        moving = {}
+        for group in groups:
+            lights = [light for light in extraction.lights if light.group == group]
+            names = sorted({light.name for light in lights})
+            reason = self._reasons.get(names[0], "") if names else ""
+            if len(lights) > 1:
+                reason = reason or "its data or object stands in several places"
+            elif lights and (lights[0].children or lights[0].pattern is not None):
+                reason = reason or "it has a texture"
+            if lights and not reason:
+                moving[group] = lights[0]
+            self.staying |= dict.fromkeys(names, reason) if reason else {}
+        return moving
 
 
 def light_layers(picture: Finished) -> tuple[list[str], np.ndarray, np.ndarray]:
@@ -213,9 +307,11 @@ def reduced(image: np.ndarray) -> np.ndarray:
 
 def summary(report: dict) -> list[str]:
     """A line for each light, and the errors."""
-    lines = [
-        f"{light['name']:<24} {light['power_before']:10.4g} W -> {light['power_after']:10.4g} W   "
-        f"{100.0 * light['share']:5.1f} % of the picture"
-        for light in report["lights"]
-    ]
+    lines = []
+    for light in report["lights"]:
+        way = np.linalg.norm(np.subtract(light["location_after"], light["location_before"]))
+        lines.append(
+            f"{light['name']:<24} {light['power_before']:10.4g} W -> {light['power_after']:10.4g} W   "
+            f"{100.0 * light['share']:5.1f} % of the picture" + (f"   moved {way:.3g} m" if way > 0.0 else "")
+        )
     return [*lines, f"error {100.0 * report['error_before']:.2f} % -> {100.0 * report['error_after']:.2f} %"]

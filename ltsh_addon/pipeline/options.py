@@ -518,6 +518,8 @@ class MatchOptions(TaskOptions):
         "--light", default=(), action="append", metavar="NAME", help="may be given several times; default: all"
     )
     colors: bool = flag("--colors", "also change the colors of lights, not only their powers")
+    move: bool = flag("--move", "also change the places and directions of lights")
+    sizes: bool = flag("--sizes", "with --move, also change the sizes of lights")
     techniques: tuple[str, ...] = _techniques(SHIPPED_TABLES, parse=one_table)
     cycles_samples: int = option(
         "--cycles-samples", default=256, type=cycles_samples, metavar="N", help="of Cycles (default: %(default)s)"

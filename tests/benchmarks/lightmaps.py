@@ -1,11 +1,11 @@
 """Lightmaps beside Cycles' own bake in the same processor time, as it is and denoised by the same denoiser; needs bpy.
 
-python tests/benchmarks/lightmaps.py [--size 256] [--samples 64] [--points 1 4] [--truth 512] [--objects Floor Table]
+python tests/benchmarks/lightmaps.py [--scene corridor] [--size 256] [--samples 64] [--points 1] [--objects A B]
 
-A room of twelve objects with a window and two lamps. Printed for each object: the errors beside two converged bakes of
-Cycles, relative to the light and without their noise, and what ours are of the others. Processor seconds are of all
-processes, with starting Blender and reading the scene. Texels of Cycles' bake are means over the texel: with more
-`--points` ours are, too.
+Scenes: a room of twelve objects with a window and two lamps; a corridor; an artist's first hour's scene. Printed for
+each object: the errors beside two converged bakes of Cycles, relative to the light and without their noise, and what
+ours are of the others. Processor seconds are of all processes, with starting Blender and reading the scene. Texels of
+Cycles' bake are means over the texel: with more `--points` ours are, too, and at edges of shadows they are anyway.
 """
 
 import argparse
@@ -20,30 +20,46 @@ from pathlib import Path
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "blender" / "helpers")]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "blender" / "helpers"), str(Path(__file__).parent)]
+PAINTS = {"White": (0.8,) * 3, "Red": (0.7, 0.15, 0.1), "Oak": (0.45, 0.3, 0.15)}
+# What is baked of each scene by default.
+OBJECTS = {"room": ["Floor", "Back", "Table", "Ball"], "corridor": ["Floor", "Left"], "artist": ["Floor", "Monkey"]}
 
 
-def build(path):
-    """Save the room: floor, ceiling, four walls, a table, two boxes, two balls and a rug."""
-    import bpy
+def build(path, scene="room"):
+    """Save a scene."""
     import scene_parts as parts
 
     parts.empty_scene()
-    paints = {
-        name: parts.principled(name, Base_Color=(*color, 1.0), Roughness=1.0)[0]
-        for name, color in {"White": (0.8,) * 3, "Red": (0.7, 0.15, 0.1), "Oak": (0.45, 0.3, 0.15)}.items()
-    }
+    for name, color in PAINTS.items():
+        parts.principled(name, Base_Color=(*color, 1.0), Roughness=1.0)
+    {"room": room, "corridor": corridor, "artist": artist}[scene](parts)
+    parts.save(path)
 
-    def wall(name, corners, paint="White"):
-        ob = parts.add_mesh(name, corners, [(0, 1, 2, 3)])
-        layer = ob.data.uv_layers.get("UVMap") or ob.data.uv_layers.new(name="UVMap")
-        layer.uv.foreach_set("vector", np.array([0, 0, 1, 0, 1, 1, 0, 1], np.float32))
-        ob.data.materials.append(paints[paint])
 
-    def box(name, location, size, paint):
-        bpy.ops.mesh.primitive_cube_add(size=1.0, location=location, scale=size)
-        bpy.context.object.name = name
-        bpy.context.object.data.materials.append(paints[paint])
+def wall(name, corners, paint="White"):
+    """Add a quad that fills its texture."""
+    import bpy
+    import scene_parts as parts
+
+    ob = parts.add_mesh(name, corners, [(0, 1, 2, 3)])
+    layer = ob.data.uv_layers.get("UVMap") or ob.data.uv_layers.new(name="UVMap")
+    layer.uv.foreach_set("vector", np.array([0, 0, 1, 0, 1, 1, 0, 1], np.float32))
+    ob.data.materials.append(bpy.data.materials[paint])
+
+
+def box(name, location, size, paint):
+    """Add a box."""
+    import bpy
+
+    bpy.ops.mesh.primitive_cube_add(size=1.0, location=location, scale=size)
+    bpy.context.object.name = name
+    bpy.context.object.data.materials.append(bpy.data.materials[paint])
+
+
+def room(parts):
+    """Floor, ceiling, four walls, a table, two boxes, two balls and a rug."""
+    import bpy
 
     wall("Floor", [(-2, -2, 0), (2, -2, 0), (2, 2, 0), (-2, 2, 0)], "Oak")
     wall("Ceiling", [(-2, 2, 2.5), (2, 2, 2.5), (2, -2, 2.5), (-2, -2, 2.5)])
@@ -57,11 +73,41 @@ def build(path):
     box("Stool", (0.9, -0.9, 0.25), (0.4, 0.4, 0.5), "Red")
     box("Rug", (-0.5, -0.8, 0.01), (1.6, 1.0, 0.02), "Red")
     for name, place, radius in (("Ball", (0.5, 0.4, 0.925), 0.2), ("Globe", (-1.3, 1.2, 1.05), 0.25)):
-        parts.add_sphere(paints["White"], radius=radius, name=name, location=place)
+        parts.add_sphere(bpy.data.materials["White"], radius=radius, name=name, location=place)
     parts.add_area_light("Lamp", (0.0, 0.5, 2.4), (0.0, 0.0, 0.0), energy=30.0)
     parts.add_area_light("Sconce", (-1.9, -0.5, 1.6), (0.0, -1.2, 0.0), energy=12.0)
     parts.add_world(Color=(0.6, 0.75, 1.0, 1.0), Strength=1.5)
-    parts.save(path)
+
+
+def corridor(parts):
+    """Ten metres with three lamps, pillars along a wall, and a door that is open at the end."""
+    wall("Floor", [(-1, 0, 0), (1, 0, 0), (1, 10, 0), (-1, 10, 0)], "Oak")
+    wall("Ceiling", [(-1, 10, 2.4), (1, 10, 2.4), (1, 0, 2.4), (-1, 0, 2.4)])
+    wall("Left", [(-1, 0, 0), (-1, 10, 0), (-1, 10, 2.4), (-1, 0, 2.4)])
+    wall("Right", [(1, 10, 0), (1, 0, 0), (1, 0, 2.4), (1, 10, 2.4)], "Red")
+    wall("End", [(1, 0, 0), (-1, 0, 0), (-1, 0, 2.4), (1, 0, 2.4)])
+    for number in range(4):
+        box(f"Pillar {number}", (-0.85, 1.2 + 2.4 * number, 1.2), (0.3, 0.3, 2.4), "White")
+    for number in range(3):
+        parts.add_area_light(f"Lamp {number}", (0.2, 1.6 + 3.2 * number, 2.35), (0.0, 0.0, 0.0), energy=12.0)
+    parts.add_world(Color=(0.6, 0.75, 1.0, 1.0), Strength=1.0)
+
+
+def artist(parts):
+    """The scene of bounces.py of this name, unwrapped."""
+    import bounces
+    import bpy
+
+    bounces.artist()
+    for name in OBJECTS["artist"]:
+        ob = bpy.data.objects[name]
+        for other in bpy.context.scene.objects:
+            other.select_set(other is ob)
+        bpy.context.view_layer.objects.active = ob
+        bpy.ops.object.mode_set(mode="EDIT")
+        bpy.ops.mesh.select_all(action="SELECT")
+        bpy.ops.uv.smart_project(island_margin=0.01)
+        bpy.ops.object.mode_set(mode="OBJECT")
 
 
 def by_cycles(scene, size, names, samples, seed, path):
@@ -90,7 +136,7 @@ def by_cycles(scene, size, names, samples, seed, path):
 def cycles_process(folder, options, samples, seed):
     """The light of `by_cycles`, and the processor seconds of its process."""
     path, before = folder / f"cycles_{samples}_{seed}.npy", _processor_seconds()
-    words = ["--cycles", str(folder / "room.blend"), str(path), str(samples), str(seed)]
+    words = ["--cycles", str(folder / "scene.blend"), str(path), str(samples), str(seed)]
     words += ["--size", str(options.size), "--objects", *options.objects]
     subprocess.run([sys.executable, __file__, *words], check=True, stdout=subprocess.DEVNULL)
     return np.load(path), _processor_seconds() - before
@@ -115,9 +161,9 @@ def ours(folder, options, points):
     lightmap.denoised_rest = noted
     bake_scene(
         BakeOptions(
-            scene=folder / "room.blend", output=folder / "ours", objects=tuple(options.objects), margin=0, view="above",
-            size=(options.size, options.size), passes=("diffuse_light",), bounces="on", rest_samples=options.samples,
-            sub_samples=points,
+            scene=folder / "scene.blend", output=folder / "ours", objects=tuple(options.objects), margin=0,
+            view="above", size=(options.size, options.size), passes=("diffuse_light",), bounces="on",
+            rest_samples=options.samples, sub_samples=points,
         )
     )  # fmt: skip
     lightmap.denoised_rest = denoised
@@ -139,15 +185,16 @@ def main(options):
 
     with tempfile.TemporaryDirectory(prefix="ltsh-bench-") as name:
         folder = Path(name)
-        build(folder / "room.blend")
-        costs = [cycles_process(folder, options, samples, 1)[1] for samples in (16, 64)]
-        slope = (costs[1] - costs[0]) / 48
+        build(folder / "scene.blend", options.scene)
+        costs = [cycles_process(folder, options, samples, 1)[1] for samples in (8, 24)]
+        slope = (costs[1] - costs[0]) / 16
         truth = np.array([cycles_process(folder, options, options.truth, seed)[0] for seed in (3, 4)])
         for points in options.points:
             light, covered, calls, seconds = ours(folder, options, points)
-            samples = max(1, round(16 + (seconds - costs[0]) / slope))
+            samples = max(1, round(8 + (seconds - costs[0]) / slope))
             noisy, took = cycles_process(folder, options, samples, 2)
-            print(f"{options.size}^2, {options.samples} bounce samples, {points} points; load {os.getloadavg()[0]:.0f}")
+            print(f"{options.scene}, {options.size}^2, {options.samples} bounce samples, {points} points", end="; ")
+            print(f"load {os.getloadavg()[0]:.0f}")
             print(f"  ours {seconds:.0f} processor s; Cycles {samples} samples, {took:.0f} s ({slope:.2f} s a sample)")
             for number, name in enumerate(options.objects):
                 hit, halves = covered[number], truth[:, number][:, covered[number]]
@@ -161,11 +208,13 @@ def main(options):
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cycles", nargs=4, help=argparse.SUPPRESS)
-    for flag, default in (("--size", 256), ("--samples", 64), ("--truth", 512)):
+    for flag, default in (("--size", 256), ("--samples", 64), ("--truth", 128)):
         parser.add_argument(flag, type=int, default=default)
-    parser.add_argument("--points", type=int, nargs="+", default=[1, 4])
-    parser.add_argument("--objects", nargs="+", default=["Floor", "Back", "Table", "Ball"])
+    parser.add_argument("--points", type=int, nargs="+", default=[1])
+    parser.add_argument("--scene", choices=list(OBJECTS), default="room")
+    parser.add_argument("--objects", nargs="+")
     chosen = parser.parse_args()
+    chosen.objects = chosen.objects or OBJECTS[chosen.scene]
     if chosen.cycles:
         scene, path, count, seed = chosen.cycles
         by_cycles(scene, chosen.size, chosen.objects, int(count), int(seed), path)

@@ -5,7 +5,8 @@ import itertools
 import numpy as np
 import pytest
 
-from ltsh_addon.pipeline.match import PIXELS, SQUARE, in_squares, matched_factors, non_negative_least_squares, reduced
+from ltsh_addon.pipeline.light_search import SQUARE, in_squares, non_negative_least_squares
+from ltsh_addon.pipeline.match import PIXELS, matched_factors, reduced
 
 # STEADY draws factors to 1 by 1e-6 x (target / what differs between the layers)^2. Means over squares of these random
 # layers differ by some 20 % of a layer, a tenth of the target, and the factors are up to 3.

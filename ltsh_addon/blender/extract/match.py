@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import bpy
 import numpy as np
+from mathutils import Matrix, Vector
 
 from ...scene import SceneError, listed
 from .. import render_settings
-from ..lights.groups import own_light_groups
+from ..lights.groups import own_light_groups, reason_to_stay
 from ..process.match import TARGET, LightsJob, TargetJob
 from ..saving import save_copy
 from .pixels import open_scene
@@ -27,7 +29,7 @@ CLIPPED = (8.0 / 255.0, 252.0 / 255.0)
 
 
 def read_target(job: TargetJob, folder: Path, progress) -> dict:
-    """Do the `job`: write the target's light and its weights as TARGET. Returns an empty manifest."""
+    """Do the `job`: write the target's light and its weights as TARGET. Returns the manifest."""
     progress("target", 0.0)
     open_scene(Path(job.scene), [], job.scripts)  # the finished picture of the scene tells its warnings
     scene = bpy.context.scene
@@ -47,7 +49,15 @@ def read_target(job: TargetJob, folder: Path, progress) -> dict:
             )
         weights *= np.clip(mask.mean(axis=-1), 0.0, 1.0)
     np.savez(folder / TARGET, target=np.where(weights[..., None] > 0.0, target, 0.0), weights=weights)
-    return {}
+    return {"reasons": {ob.name: _reason_to_stay(ob) for ob in scene.objects if ob.type == "LIGHT"}}
+
+
+def _reason_to_stay(ob) -> str:
+    """Why a light object may not be moved; "" if it may."""
+    parent = ob.matrix_world @ ob.matrix_basis.inverted_safe()
+    lengths = [axis.length for axis in parent.to_3x3().col]
+    is_uneven = max(lengths) > (1.0 + 1e-4) * min(lengths)
+    return reason_to_stay(ob) or ("its parent is scaled unevenly: apply the scale of the parent" if is_uneven else "")
 
 
 def _picture(path: Path, scene, view: str | None, folder: Path) -> tuple[np.ndarray, np.ndarray | None]:
@@ -115,20 +125,44 @@ def save_lights(job: LightsJob, folder: Path, progress) -> dict:
     groups, lights = own_light_groups(bpy.context.scene, tuple(job.lights)), []
     for group, factor in job.factors.items():
         objects, most = groups[group], max(factor)
-        data, before = objects[0].data, objects[0].data.energy
-        data.energy = most * before
+        data, before = objects[0].data, [_values(ob) for ob in objects]
+        data.energy = most * data.energy
         if most > 0.0:
             data.color = [value * one / most for value, one in zip(data.color, factor, strict=True)]
-        lights += [
-            {
-                "name": ob.name,
-                "group": group,
-                "power_before": before,
-                "power_after": data.energy,
-                "color": list(data.color),
-            }
-            for ob in objects
-        ]
+        if group in job.moves:
+            _move(objects[0], **job.moves[group])
+        for ob, old in zip(objects, before, strict=True):
+            new = _values(ob)
+            values = {f"{key}_{when}": one[key] for key in old for when, one in (("before", old), ("after", new))}
+            lights.append({"name": ob.name, "group": group, **values, "color": list(data.color)})
     bpy.context.preferences.filepaths.save_version = 0  # no backup of our own empty file there
     save_copy(Path(job.path), relative_remap=True)
     return {"lights": lights}
+
+
+def _values(ob) -> dict:
+    """The power, place (m), rotation (degrees) and size (m) of a light."""
+    data, (place, turn, _) = ob.data, ob.matrix_world.decompose()
+    sizes = {"AREA": "size", "SUN": "angle"}
+    return {
+        "power": data.energy,
+        "location": list(place),
+        "rotation": [math.degrees(angle) for angle in turn.to_euler()],
+        "size": getattr(data, sizes.get(data.type, "shadow_soft_size")),
+    }
+
+
+def _move(ob, shift, turn, growth) -> None:
+    """Move a light object by `shift` (3,), turn it by the matrix `turn` (3, 3), and make it exp(`growth`) as large."""
+    matrix = ob.matrix_world.copy()
+    turned = Matrix(turn) @ matrix.to_3x3()
+    wanted = Matrix.Translation(matrix.translation + Vector(shift)) @ turned.to_4x4()
+    ob.matrix_world = wanted
+    bpy.context.view_layer.update()
+    if not np.allclose(ob.matrix_world, wanted, atol=1e-4 * (1.0 + np.abs(matrix.translation).max())):
+        raise SceneError(f"light {ob.name!r} cannot be put where it should be: clear its parent, keep its transform")
+    data, factor = ob.data, math.exp(growth)
+    if factor != 1.0:
+        for name in ("size", "size_y") if data.type == "AREA" else ("shadow_soft_size",):
+            setattr(data, name, factor * getattr(data, name))
+        data.energy /= 1.0 if data.normalize else factor**2

@@ -37,6 +37,25 @@ def reason_to_keep(ob) -> str:
     return "its settings are animated or driven" if is_animated(ob.data) else ""
 
 
+def reason_to_stay(ob) -> str:
+    """Why a light object may not be moved; "" if it may."""
+    if is_linked(ob):
+        return "it is linked from another file"
+    if active := [constraint.name for constraint in ob.constraints if constraint.enabled]:
+        return f"its constraint {active[0]!r} moves it: switch it off or apply it"
+    if is_animated(ob):
+        return "it is animated or driven"
+    if any(ob.lock_rotation) or (any(ob.lock_location) and ob.data.type != "SUN"):
+        return "its location or rotation is locked: unlock it in the tab Item"
+    return ""
+
+
+def is_linked(block) -> bool:
+    """True for what another file owns, overrides that may not be edited included."""
+    override = block.override_library
+    return block.library is not None or (override is not None and override.is_system_override)
+
+
 def is_animated(owner, path: str = "") -> bool:
     """True if keyframes or drivers set properties of an object or its data; with a `path`, that property."""
     animation = owner.animation_data

@@ -30,22 +30,23 @@ class TargetJob:
 class LightsJob:
     """Save a copy of `scene` as `path`, whose lights have `factors` (3,) times their radiance, by light group.
 
-    The groups are those of `lights` by `extract.match.own_light_groups`.
+    The groups are those of `lights` by `own_light_groups`. `moves` are records of `LightMove` by group.
     """
 
     scene: Path
     path: Path
     factors: dict[str, list[float]]
     lights: tuple[str, ...]
+    moves: dict[str, dict]
     scripts: bool = False
 
 
-def read_target(job: TargetJob, folder: Path, progress: Progress | None = None) -> tuple[np.ndarray, np.ndarray]:
+def read_target(job: TargetJob, folder: Path, progress: Progress | None = None) -> tuple[np.ndarray, np.ndarray, dict]:
     """The target (H, W, 3), row 0 on top, in scene-referred radiance; and the weights (H, W) of its pixels, 0 where it
-    is clipped or outside of the mask. Raises as `pixels.extract_pixels` does."""
-    run_scene_job(job, folder, progress)
+    is clipped or outside of the mask; by light object, why it may not move. Raises as `pixels.extract_pixels` does."""
+    reasons = run_scene_job(job, folder, progress)["reasons"]
     with np.load(folder / TARGET) as arrays:
-        return arrays["target"].astype(np.float64), arrays["weights"].astype(np.float64)
+        return arrays["target"].astype(np.float64), arrays["weights"].astype(np.float64), reasons
 
 
 def save_lights(job: LightsJob, progress: Progress | None = None) -> list[dict]:

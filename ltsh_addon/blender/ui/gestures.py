@@ -13,6 +13,7 @@ from mathutils import Matrix, Vector
 
 from ...scene import error_line
 from ...shading.highlight import STENCIL
+from ..lights.groups import reason_to_stay
 from ..lights.textures import ShownTextures
 from .highlight_place import DISK, PIXELS, hits_around, note_by_pixels, place_of
 from .light_pose import (
@@ -21,7 +22,6 @@ from .light_pose import (
     locked_place,
     reason_to_keep_look,
     reason_to_keep_power,
-    reason_to_stay,
 )
 from .lit_point import LightShare, SceneLights, SurfaceHit, share_line, surface_hit
 from .preview import PASSED_ON, active_light, lights_of, region_under

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from mathutils import Matrix, Vector
 
-from ..lights.groups import is_animated
+from ..lights.groups import is_animated, is_linked
 
 
 @dataclass(frozen=True)
@@ -130,19 +130,6 @@ def locked_place(start: Vector, point: Vector, place: Vector, free: tuple[bool, 
     return moved
 
 
-def reason_to_stay(ob) -> str:
-    """Why the mouse may not move a light; "" if it may."""
-    if is_linked(ob):
-        return "it is linked from another file"
-    if active := [constraint.name for constraint in ob.constraints if constraint.enabled]:
-        return f"its constraint {active[0]!r} moves it: switch it off or apply it"
-    if is_animated(ob):
-        return "it is animated or driven"
-    if any(ob.lock_rotation) or (any(ob.lock_location) and ob.data.type != "SUN"):
-        return "its location or rotation is locked: unlock it in the tab Item"
-    return ""
-
-
 def reason_to_keep_power(ob) -> str:
     """Why the mouse may not change the power of a light; "" if it may."""
     return _reason_to_keep(ob, "power", ("energy",))
@@ -162,11 +149,3 @@ def _reason_to_keep(ob, quantity: str, names: tuple[str, ...]) -> str:
     if users > 1:
         return f"its data {ob.data.name!r} has {users} users: make it single-user first"
     return ""
-
-
-def is_linked(block) -> bool:
-    """True for what another file owns, overrides that may not be edited included."""
-    override = block.override_library
-    return block.library is not None or (override is not None and override.is_system_override)
-
-

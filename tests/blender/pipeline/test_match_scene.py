@@ -77,6 +77,44 @@ def test_the_powers_of_a_target_come_back(room, number, tmp_path):
         assert ob.lightgroup == ""
 
 
+def test_a_moved_light_comes_back_through_its_parent_and_others_stay(tmp_path):
+    empty_scene(96, 64)
+    add_plane(principled("Floor", **{"Base Color": (0.7, 0.6, 0.5, 1.0), "Roughness": 0.6})[0])
+    add_sphere(principled("Ball", **{"Base Color": (0.3, 0.5, 0.8, 1.0)})[0], radius=0.5, location=(0.2, 0.0, 0.5))
+    add_camera()
+    parent = link(bpy.data.objects.new("Stand", None), (0.3, 0.2, 0.1), (0.3, 0.2, 1.0), (2.0, 2.0, 2.0))
+    key = add_area_light(name="Key", location=(-1.5, -1.0, 2.2), rotation=(0.3, -0.6, 0.4), size=0.4, size_y=0.3)
+    fill = add_area_light(name="Fill", location=(2.0, -1.0, 2.5), energy=20.0)
+    fill.constraints.new("TRACK_TO").target = parent
+    bpy.context.view_layer.update()
+    matrix = key.matrix_world.copy()
+    key.parent, key.matrix_world = parent, matrix
+    bpy.context.view_layer.update()
+    true = np.array(key.matrix_world)
+    target = render(tmp_path / "target.exr", file_format="OPEN_EXR", color_depth="32")
+    key.location.x += 0.06
+    key.rotation_euler.y += 0.1
+    bpy.context.view_layer.update()
+    start = np.array(key.matrix_world)
+    path = save(tmp_path / "start.blend")
+    options = {"techniques": ("ltsh2",), "cycles_samples": 32, "move": True}
+    report = match_scene(MatchOptions(scene=path, output=tmp_path / "out", target=target, **options))
+    assert any("light 'Fill' keeps its place: its constraint 'Track To' moves it" in one for one in report["warnings"])
+    of_key = next(light for light in report["lights"] if light["name"] == "Key")
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "out" / "matched.blend"))
+    moved = np.array(bpy.data.objects["Key"].matrix_world)
+    np.testing.assert_allclose(of_key["location_before"], start[:3, 3], atol=1e-4)
+    np.testing.assert_allclose(of_key["location_after"], moved[:3, 3], atol=1e-4)
+    # 3 % of the 2.9 m to what it lights; it began 0.12 m off.
+    assert np.linalg.norm(start[:3, 3] - true[:3, 3]) > 0.1
+    assert np.linalg.norm(moved[:3, 3] - true[:3, 3]) < 0.03 * 2.9
+    assert of_key["power_after"] == pytest.approx(100.0, rel=0.05)
+    assert report["error_after"] < 0.3 * report["error_before"]
+    with pytest.raises(SceneError, match="no light can be moved: 'Fill', its constraint 'Track To' moves it"):
+        match_scene(MatchOptions(scene=path, output=tmp_path / "no", target=target, lights=("Fill",), **options))
+    assert not (tmp_path / "no" / "matched.blend").exists()
+
+
 def test_what_does_not_fit_is_named_and_nothing_is_written(room, tmp_path):
     text = tmp_path / "notes.png"
     text.write_text("no picture")

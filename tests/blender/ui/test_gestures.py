@@ -11,11 +11,12 @@ from mathutils import Vector
 
 from ltsh_addon.blender.evaluated import EmitterTraits
 from ltsh_addon.blender.lights.area import area_light
+from ltsh_addon.blender.lights.groups import reason_to_stay
 from ltsh_addon.blender.lights.linking import Receivers
 from ltsh_addon.blender.lights.textures import ShownTextures
 from ltsh_addon.blender.ui import gestures
 from ltsh_addon.blender.ui.highlight_place import NO_HIGHLIGHT, glossy_lobe, note_by_pixels, place_of, samples_of
-from ltsh_addon.blender.ui.light_pose import LightPose, locked_place, reason_to_keep_look, reason_to_stay
+from ltsh_addon.blender.ui.light_pose import LightPose, locked_place, reason_to_keep_look
 from ltsh_addon.blender.ui.lit_point import surface_hit
 from ltsh_addon.shading import shade
 from ltsh_addon.shading.highlight import STENCIL
@@ -135,7 +136,9 @@ def test_a_light_is_aimed_where_it_is(scene):
     (hit,) = hits_at(scene, np.zeros((1, 2)), Vector((1.3, -0.8, 0.0)))
     pose = LightPose.of(light)
     this = SimpleNamespace(
-        hit_under=lambda context, event: hit, _pose=pose, _put=lambda matrix: pose.put(light, matrix),
+        hit_under=lambda context, event: hit,
+        _pose=pose,
+        _put=lambda matrix: pose.put(light, matrix),
         _noted=str,
     )
     assert kind.follow(this, bpy.context, None)

@@ -141,13 +141,16 @@ def drag(hit, lights, *moves):
     """What a drag of the brightness that is pressed at `hit` leaves; `moves` are (y, shift, ctrl)."""
     this = SimpleNamespace(
         _scale=1.0, hit_under=lambda context, event: hit, shares_at=lambda context, hit: lights.shares_at(hit),
-        share_line=lambda hit, shares: share_line(shares),
+        share_line=lambda hit, shares: share_line(shares), _mouse=np.array([0.0, 100.0]),
     )  # fmt: skip
     kind = gestures.LTSH_OT_drag_brightness
     this.follow = lambda context, event: kind.follow(this, context, event)
-    is_pressed = kind.press(this, bpy.context, SimpleNamespace(mouse_y=100, shift=False, ctrl=False))
+    is_pressed = kind.press(this, bpy.context, SimpleNamespace(ctrl=False))
+    last = 100.0
     for y, shift, ctrl in moves:
-        this.follow(bpy.context, SimpleNamespace(mouse_y=y, shift=shift, ctrl=ctrl))
+        kind.move(this, (gestures.PRECISE if shift else 1.0) * np.array([0.0, y - last]))
+        last = y
+        this.follow(bpy.context, SimpleNamespace(ctrl=ctrl))
     return this, is_pressed
 
 

@@ -35,10 +35,12 @@ def interpolated_normals(mesh, vertex: np.ndarray) -> tuple[np.ndarray, np.ndarr
     interpolates no normals.
 
     Faces are flat as in Cycles, which may differ from Blender's solid view: no face is flat if the normals belong to
-    corners, and edges that are all sharp make no face flat.
+    corners, and edges that are all sharp make faces flat only in meshes that do not mark faces.
     """
     faces = len(mesh.polygons)
     sharp = _marks(mesh, "sharp_face", faces)
+    if "sharp_face" not in mesh.attributes and mesh.normals_domain == "FACE":
+        sharp[:] = True
     by_vertex = not mesh.has_custom_normals and not sharp.all() and _edges_do_not_count(mesh, sharp)
     if by_vertex:
         normal = read_values(mesh.vertex_normals, "vector", (len(mesh.vertices), 3), np.float32).take(vertex, axis=0)

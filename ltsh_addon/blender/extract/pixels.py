@@ -12,7 +12,7 @@ import numpy as np
 from ...scene import SceneError, error_line, light_records, listed
 from .. import render_settings
 from ..evaluated import SURFACE_TYPES, owner_of, read_values, rendered_surfaces, with_render_depsgraph
-from ..lights.area import LightInventory, collect_lights, note_overlaps, rendered_lights
+from ..lights.area import LightInventory, collect_lights, note_colors, note_overlaps, rendered_lights
 from ..lights.emission import LookTooLong
 from ..lights.groups import regroup
 from ..lights.meshes import SIDE_PROPERTY, let_light_through
@@ -316,6 +316,7 @@ def add_world(inventory: LightInventory, scene, world) -> None:
     note_overlaps(inventory)
     inventory.world = world if of_world else None
     if inventory.occluders is not None:
+        note_colors(inventory)
         inventory.occluders = blocks_nothing(inventory.occluders, inventory.world)
 
 

@@ -134,8 +134,8 @@ def collect_lights(depsgraph, override=None) -> LightInventory:
     return inventory
 
 
-# NAMED_PAIRS: how many pairs of overlapping lights a warning names.
-NAMED_PAIRS = 3
+# NAMED_PAIRS: how many lights, or pairs of overlapping ones, a warning names. LEAST_COLORS: least `color_spread` named.
+NAMED_PAIRS, LEAST_COLORS = 3, 0.05
 # MOST_PAIRS: the search ends after this many pairs.
 MOST_PAIRS = 1000
 _AREA_LIGHTS = {shape: kind for kind in (QuadLight, EllipseLight) for shape in kind.SHAPES}
@@ -216,6 +216,38 @@ def note_overlaps(inventory: LightInventory) -> None:
         f"there Cycles loses up to {100.0 * lost:.0f} % of their light, most in sharp reflections, the techniques lose "
         "nothing; move one of each pair forward by 0.1 mm"
     )
+
+
+def note_colors(inventory: LightInventory) -> None:
+    """Warn of lights of several colors, whose shadows are gray: each light, and the sky, has one visibility."""
+    groups = [[light] for light in inventory.lights if not light.is_side and light.children]
+    groups += [sides] if (sides := [light for light in inventory.lights if light.is_side]) else []
+    spreads = {group[0].name: color_spread([leaf for light in group for leaf in light.leaves]) for group in groups}
+    names = [
+        f"{name!r} ({100.0 * spread:.0f} %)"
+        for name, spread in sorted(spreads.items(), key=lambda item: -item[1])
+        if spread > LEAST_COLORS
+    ]
+    if names:
+        inventory.warn(
+            f"shadows: lights of several colors: {listed(names, NAMED_PAIRS)}: where some of these colors are hidden "
+            "and others are not, up to that share of the light is off in a color, as a light has one shadow"
+        )
+
+
+def color_spread(leaves: list[Light]) -> float:
+    """By how much the share of a light that is hidden may differ between a color and the mean of all colors."""
+    area, center, radiance = (
+        np.array([getattr(leaf, name) for leaf in leaves]) for name in ("area_vector", "center", "radiance")
+    )
+    size = np.linalg.norm(area, axis=1)
+    if leaves[0].is_distant:  # solid angles from the origin
+        size = np.abs((area * center).sum(axis=1)) / np.maximum((center * center).sum(axis=1) ** 1.5, 1e-30)
+    power = np.abs(radiance) * size[:, None]
+    shares = power / np.maximum(power.sum(axis=0), 1e-30)
+    gray = power.sum(axis=1) / max(power.sum(), 1e-30)
+    off = 0.5 * np.abs(shares - gray[:, None]).sum(axis=0)
+    return float(off[power.sum(axis=0) > 1e-6 * power.sum()].max(initial=0.0))
 
 
 def half_hidden(light: Light) -> str:

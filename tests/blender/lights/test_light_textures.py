@@ -6,7 +6,7 @@ import bpy
 import numpy as np
 import pytest
 import scene_parts
-from lit_plane import add_image, add_instancer, assert_agrees, into_collection, light_tree, start
+from lit_plane import add_image, add_instancer, add_lamp_plane, assert_agrees, into_collection, light_tree, start
 
 from ltsh_addon.blender.lights import textures
 
@@ -151,3 +151,41 @@ def test_looking_leaves_nothing_behind():
     scene_parts.prepare()
     assert not any("look" in image.name for image in bpy.data.images)
     assert {name: len(getattr(bpy.data, name)) for name in before} == before and bpy.context.scene == scene
+
+
+def halves(first, second):
+    """Colors (4, 8, 3): one half of the picture `first`, the other `second`."""
+    return np.where(np.arange(8)[None, :, None] < 4, np.array(first), np.array(second)) * np.ones((4, 8, 1))
+
+
+def panel_of_colors(colors):
+    tree, emission = light_tree(scene_parts.add_area_light("Lit"))
+    tree.links.new(add_image(tree, colors).outputs["Color"], emission.inputs["Color"])
+
+
+def screen_of_colors(colors):
+    material, emission = scene_parts.bsdf_material("ShaderNodeEmission", "Screen")
+    tree = material.node_tree
+    tree.links.new(add_image(tree, colors).outputs["Color"], emission.inputs["Color"])
+    add_lamp_plane(material, "Lit")
+
+
+def sky_of_colors(colors):
+    world, sky = scene_parts.add_world("Lit")
+    texture, image = world.node_tree.nodes.new("ShaderNodeTexEnvironment"), add_image(world.node_tree, colors)
+    texture.image, texture.interpolation = image.image, "Closest"
+    world.node_tree.links.new(texture.outputs["Color"], sky.inputs["Color"])
+
+
+@pytest.mark.parametrize("build", [panel_of_colors, screen_of_colors, sky_of_colors])
+def test_lights_of_several_colors_are_named_with_what_their_gray_shadows_may_be_off(build):
+    """Of halves (3, 0, 0) and (0, 0, 1), the first of which has 3/4 of the mean of all colors, a shadow on the second
+    takes all of the blue and shows 1/4: .75 off. One hue needs no colors, in whatever pattern."""
+    for colors, share in ((halves((3.0, 0, 0), (0, 0, 1.0)), 75), (halves((1.0, 0.5, 0.5), (4.0, 2.0, 2.0)), None)):
+        start()
+        build(colors)
+        lines = [line for line in scene_parts.prepare(with_occluders=True)[3] if "several colors" in line]
+        assert len(lines) == (share is not None)
+        if lines:
+            told = int(lines[0].partition("'Lit' (")[2].partition(" %")[0])
+            assert abs(told - share) <= 2, lines  # edges of patches of a sky

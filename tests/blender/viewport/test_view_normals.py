@@ -15,12 +15,14 @@ from ltsh_addon.blender.viewport import meshes
 HEIGHTS = (0.0, 0.1, 0.0, 0.1, 0.0, 0.15)
 
 
-def two_quads(name, x, flat=(), sharp_edges=(), custom=False):
+def two_quads(name, x, flat=(), sharp_edges=(), custom=False, marks_faces=True):
     """A mesh of two bent quads, the faces `flat` and the edges `sharp_edges` marked."""
     corners = [(0.5 * (i % 3 - 1), i // 3 - 0.5, height) for i, height in enumerate(HEIGHTS)]
     ob = parts.add_mesh(name, corners, [(0, 1, 4, 3), (1, 2, 5, 4)], location=(x, 0.0, 0.0))
     mesh = ob.data
     mesh.polygons.foreach_set("use_smooth", [number not in flat for number in range(2)])
+    if not marks_faces and "sharp_face" in mesh.attributes:
+        mesh.attributes.remove(mesh.attributes["sharp_face"])
     if sharp_edges:
         marks = mesh.attributes.new("sharp_edge", "BOOLEAN", "EDGE")
         marks.data.foreach_set("value", [edge in sharp_edges for edge in range(len(mesh.edges))])
@@ -38,6 +40,9 @@ KINDS = {
     "some sharp edges": {"sharp_edges": (0, 1, 2)},
     "mixed, some sharp edges": {"flat": (1,), "sharp_edges": (0, 1, 2)},
     "all edges sharp": {"sharp_edges": EVERY_EDGE},
+    "all edges sharp, no marks of faces": {"sharp_edges": EVERY_EDGE, "marks_faces": False},
+    "some sharp edges, no marks of faces": {"sharp_edges": (0, 1, 2), "marks_faces": False},
+    "smooth, no marks of faces": {"marks_faces": False},
     "mixed, all edges sharp": {"flat": (0,), "sharp_edges": EVERY_EDGE},
     "flat, custom": {"flat": (0, 1), "custom": True},
     "mixed, custom": {"flat": (1,), "custom": True},

@@ -326,6 +326,8 @@ def _match(arguments, bar, open_file) -> int:
     (scene, *more) = scenes_of(arguments, open_file)
     if more:
         raise Misuse(f"{more[0]}: expected one SCENE.blend, because one picture shows one scene")
+    if arguments.sizes and not (arguments.move or arguments.add):
+        raise Misuse("--sizes: expected --move or --add with it; lights that keep their places keep their sizes")
     report = match_scene(options_from(MatchOptions, vars(arguments), scene=scene), bar)
     bar.finish()
     _complain(bar, "warning", on_screen(report["warnings"], f"{arguments.output}/report.json"))

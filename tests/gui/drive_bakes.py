@@ -55,10 +55,12 @@ def scene(rig):
     for x in (-1.5, 1.5):
         hands.operate(rig, bpy.ops.object.light_add, type="AREA", location=(x, -0.5, 2.5))
         bpy.context.view_layer.objects.active.data.energy = 60.0
+    hands.operate(rig, bpy.ops.object.camera_add, location=(0, -6, 4), rotation=(1.0, 0, 0))
+    bpy.context.scene.camera = bpy.context.view_layer.objects.active
     hands.operate(rig, bpy.ops.object.select_by_type, type="MESH")
     bpy.context.view_layer.objects.active = bpy.data.objects["Floor"]
     settings = hands.settings()
-    settings.bake_size, settings.bake_view, settings.bake_bounces, settings.bake_rest_samples = "256", "above", True, 32
+    settings.bake_size, settings.bake_view, settings.bake_bounces, settings.bake_rest_samples = "256", "above", True, 16
     yield from hands.typed(rig, "n")
     yield 1
     rig.tab("LTSH")

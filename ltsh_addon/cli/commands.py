@@ -295,9 +295,9 @@ def _relight(arguments, bar, open_file) -> int:
 
 
 MATCH = """Find powers of lights for which the scene looks like a picture of the same camera, with --colors
-their colors too, with --move their places and directions. OUT gets matched.blend, a copy of the scene
-with these lights, match.png (before, after, target) and report.json with each light's old and new
-values."""
+their colors too, with --move their places and directions; --add makes new lights. OUT gets
+matched.blend, a copy of the scene with these lights, match.png (before, after, target) and report.json
+with each light's old and new values."""
 MATCH_EXAMPLES = """examples:
   %(prog)s room.blend --target graded.exr -o out/match
   %(prog)s room.blend --target painted.png --mask window.png --light Key --light Fill --colors -o out/match

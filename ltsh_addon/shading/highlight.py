@@ -30,8 +30,8 @@ STRICT, GOOD = 0.006, 0.003
 # Where Newton's method fails, directions around the mirrored view are tried: on circles at ANGLES rad, TURNS on each,
 # by the cursor and every THINNED-th sample. The best ones with at least DIM of the radiance of the mirrored view are
 # STARTS of a search by smaller and smaller circles, SEARCHED times the lobe, by the FEW brightest samples.
-ANGLES, TURNS, THINNED, DIM, STARTS = (0.08, 0.2, 0.35, 0.55, 0.8), 10, 4, 0.1, 3
-SEARCHED, FEW = (0.3, 0.12, 0.05, 0.02), 24
+ANGLES, TURNS, THINNED, DIM, STARTS = (0.03, 0.08, 0.2, 0.35, 0.55, 0.8), 10, 4, 0.1, 4
+SEARCHED, FEW = (0.5, 0.2, 0.08, 0.03), 32
 
 
 @dataclass(frozen=True)

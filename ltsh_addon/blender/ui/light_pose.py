@@ -58,6 +58,12 @@ class LightPose:
 SIZES = {"AREA": ("size", "size_y"), "POINT": ("shadow_soft_size",), "SPOT": ("shadow_soft_size",), "SUN": ("angle",)}
 
 
+def _sizes_of(data) -> tuple[str, ...]:
+    """The settings of the size of a light's data that have an effect."""
+    is_even = data.type == "AREA" and data.shape in ("SQUARE", "DISK")
+    return ("size",) if is_even else SIZES[data.type]
+
+
 @dataclass(frozen=True)
 class LightLook:
     """The color and size of a light object before a drag."""
@@ -68,7 +74,7 @@ class LightLook:
     @classmethod
     def of(cls, ob) -> LightLook:
         """That of the light object `ob` now."""
-        return cls(tuple(ob.data.color), {name: getattr(ob.data, name) for name in SIZES[ob.data.type]})
+        return cls(tuple(ob.data.color), {name: getattr(ob.data, name) for name in _sizes_of(ob.data)})
 
     def put_back(self, ob) -> None:
         """Give `ob` what has changed."""
@@ -131,7 +137,7 @@ def reason_to_keep_power(ob) -> str:
 
 def reason_to_keep_look(ob, quantity: str) -> str:
     """Why the mouse may not change the size or color of a light; "" if it may."""
-    return _reason_to_keep(ob, quantity, ("color",) if quantity == "color" else SIZES[ob.data.type])
+    return _reason_to_keep(ob, quantity, ("color",) if quantity == "color" else _sizes_of(ob.data))
 
 
 def _reason_to_keep(ob, quantity: str, names: tuple[str, ...]) -> str:

@@ -295,9 +295,9 @@ def _relight(arguments, bar, open_file) -> int:
 
 
 MATCH = """Find powers of lights for which the scene looks like a picture of the same camera, with --colors
-their colors too, with --move their places and directions. OUT gets matched.blend, a copy of the scene
-with these lights, match.png (before, after, target) and report.json with each light's old and new
-values."""
+their colors too, with --move their places and directions; --add makes new lights. OUT gets
+matched.blend, a copy of the scene with these lights, match.png (before, after, target) and report.json
+with each light's old and new values."""
 MATCH_EXAMPLES = """examples:
   %(prog)s room.blend --target graded.exr -o out/match
   %(prog)s room.blend --target painted.png --mask window.png --light Key --light Fill --colors -o out/match
@@ -326,6 +326,8 @@ def _match(arguments, bar, open_file) -> int:
     (scene, *more) = scenes_of(arguments, open_file)
     if more:
         raise Misuse(f"{more[0]}: expected one SCENE.blend, because one picture shows one scene")
+    if arguments.sizes and not (arguments.move or arguments.add):
+        raise Misuse("--sizes: expected --move or --add with it; lights that keep their places keep their sizes")
     report = match_scene(options_from(MatchOptions, vars(arguments), scene=scene), bar)
     bar.finish()
     _complain(bar, "warning", on_screen(report["warnings"], f"{arguments.output}/report.json"))

@@ -15,7 +15,7 @@ import numpy as np
 
 from .. import shading, visibility
 from ..imaging.color import luminance
-from ..scene import PASSES, Light, PointLight, SpotLight, SunLight, SurfaceSamples
+from ..scene import PASSES, EllipseLight, Light, PointLight, SpotLight, SunLight, SurfaceSamples
 
 # SQUARE: pictures are compared by the means of squares of so many pixels on a side: edges that lie differently within
 # pixels would count as light otherwise (errors of powers 2.4 % in place of .6 % in a room of eight lights).
@@ -29,6 +29,10 @@ FAR, TURN = 0.35, 0.4
 # STARTS: that are looked at; SEARCHED: from which it is searched with few samples; REFINED: of whose results are then
 # improved with more.
 STARTS, SEARCHED, REFINED = 48, 4, 2
+
+# NEW_LIGHTS: places for a new light on each sphere; NEW_DISTANCES: their radii, relative to the root mean square
+# distance of the samples from their middle; NEW_SIZE: of the light, relative to its distance.
+NEW_LIGHTS, NEW_DISTANCES, NEW_SIZE = 96, (1.0, 1.8), 0.12
 
 
 def non_negative_least_squares(matrix: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -383,3 +387,36 @@ def _coarse_results(coarse, starts, progress) -> list[np.ndarray]:
         results.append(levenberg_marquardt(coarse.residuals, coarse.jacobian, starts[start], near=COARSE_ENOUGH))
         progress(0.2 + 0.4 * number / (1 + SEARCHED))
     return [x for x, _ in sorted(results, key=lambda result: result[1])[:REFINED]]
+
+
+def added_light(places: TargetSamples, layers: np.ndarray, fixed: np.ndarray) -> Light:
+    """A new light that brings the pictures `layers` (R, Q, 3) and `fixed` (Q, 3) of other lights closest to the target.
+
+    One of NEW_LIGHTS disks on spheres around the samples, which face their middle; the powers of all lights are those
+    of least squares. Raises ValueError where none of them lights anything.
+    """
+    position, best = places.samples.position, None
+    middle = np.average(position, axis=0, weights=places.share + 1e-30)
+    reach = np.sqrt(np.average(np.square(position - middle).sum(axis=-1), weights=places.share + 1e-30))
+    wanted = (places.scale[:, None] * (places.target - fixed)).ravel()
+    columns = [(places.scale[:, None] * layer).ravel() for layer in layers]
+    number = np.arange(NEW_LIGHTS)
+    height, angle = 1.0 - (2.0 * number + 1.0) / NEW_LIGHTS, np.pi * (1.0 + np.sqrt(5.0)) * number
+    across = np.sqrt(1.0 - height**2)
+    ways = np.stack([across * np.cos(angle), across * np.sin(angle), height], axis=-1)
+    for way, far in ((way, far) for far in NEW_DISTANCES for way in ways):
+        first = np.cross(way, np.eye(3)[np.argmin(np.abs(way))])
+        first *= NEW_SIZE * far * reach / np.linalg.norm(first)
+        place = middle + far * reach * way
+        light = EllipseLight("", place, first, np.cross(way, first), -way, np.ones(3), shape="DISK")
+        column = (places.scale[:, None] * places.picture(light)).ravel()
+        if not column.any():
+            continue
+        matrix = np.stack([*columns, column], axis=-1)
+        factors = non_negative_least_squares(matrix, wanted)
+        error = float(np.square(matrix @ factors - wanted).sum())
+        if factors[-1] > 0.0 and (best is None or error < best[0]):
+            best = error, replace(light, radiance=factors[-1] * np.ones(3))
+    if best is None:
+        raise ValueError("no further light makes the picture more like the target")
+    return best[1]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import time
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from .light_search import (
     LightMove,
     LightSearch,
     TargetSamples,
+    added_light,
     in_squares,
     non_negative_least_squares,
     searched,
@@ -128,7 +130,10 @@ def match_scene(options: MatchOptions, progress: Progress | None = None) -> dict
         height, width = weights.shape
         matching = _Matching(options, target, weights, reasons, folder, progress)
         before = now = matching.picture()
-        for number in range(ROUNDS if options.move else 0):
+        for _ in range(options.add):
+            matching.add(now)
+            now = matching.picture()
+        for number in range(ROUNDS if options.move or options.add else 0):
             largest = matching.move(now, number)
             now = matching.picture()
             if largest < STILL:
@@ -145,6 +150,7 @@ def match_scene(options: MatchOptions, progress: Progress | None = None) -> dict
     write_bytes(Path(options.output) / "match.png", png)
     shares = dict(zip(now.groups, result.shares.tolist(), strict=True))
     lights = [{**light, "share": shares[light.pop("group")]} for light in matching.lights.values()]
+    lights = [{**light, "power_before": 0.0} if light["name"] in matching.added else light for light in lights]
     weak = [repr(light["name"]) for light in lights if light["share"] < LEAST_SHARE]
     warnings = [NOT_TOLD.format(listed(weak), 100.0 * LEAST_SHARE)] if weak else []
     warnings += [f"light {name!r} keeps its place: {reason}" for name, reason in matching.staying.items()]
@@ -180,64 +186,75 @@ class _Matching:
     def __init__(self, options: MatchOptions, target, weights, reasons: dict[str, str], folder: Path, progress):
         self.scene, self.lights, self.staying, self.seconds = Path(options.scene), {}, {}, 0.0
         self._options, self._target, self._weights, self._reasons = options, target, weights, reasons
-        self._folder, self._progress = folder, progress
+        self._folder, self._progress, self.added = folder, progress, []
+
+    @property
+    def _names(self) -> tuple[str, ...]:
+        """The lights that may change, () for all."""
+        return (*self._options.lights, *self.added) if self._options.lights else ()
 
     def picture(self) -> _Layers:
         """The picture of the scene as it is now."""
         height, width = self._weights.shape
-        settings = {"scene": self.scene, "own_groups": self._options.lights, "resolution": (width, height)}
+        settings = {"scene": self.scene, "own_groups": self._names, "resolution": (width, height)}
         picture = finish(child_job(RenderOptions, self._options, **settings), self._progress)
         groups, layers, fixed = light_layers(picture)
-        if not groups:
+        if not groups and not self._options.add:
             raise SceneError(f"{self._options.scene}: no light of the picture can be changed, expected light objects")
         return _Layers(picture, groups, layers, fixed)
 
-    def save(self, path: Path, factors: dict[str, np.ndarray], moves: dict[str, LightMove] | None = None) -> None:
-        """Save the scene with changed lights as `path`, and go on with that."""
+    def save(
+        self,
+        path: Path,
+        factors: dict[str, np.ndarray],
+        moves: dict[str, LightMove] | None = None,
+        added: dict | None = None,
+    ) -> None:
+        """Save the scene with changed lights, and a new one of the record `added`, as `path`, and go on with that."""
         from ..blender.process.match import LightsJob, save_lights
 
         changes = {"path": path, "factors": {group: one.tolist() for group, one in factors.items()}}
         changes["moves"] = {group: move.record() for group, move in (moves or {}).items()}
+        changes |= {"lights": self._names, "added": added}
         for light in save_lights(child_job(LightsJob, self._options, scene=self.scene, **changes), self._progress):
             former = self.lights.get(light["name"], light)
+            if light["group"] == "":
+                self.added.append(light["name"])
             self.lights[light["name"]] = {**light, **{key: former[key] for key in light if key.endswith("_before")}}
         self.scene = path
+
+    def add(self, now: _Layers) -> None:
+        """Add a light to the scene, where it brings the picture closest to the target."""
+        start = time.process_time()
+        with self._places(now) as places_of:
+            places, layers, fixed = places_of(*COARSE)
+            try:
+                light = added_light(places, layers, fixed)
+            except ValueError as error:
+                raise SceneError(f"{self._options.scene}: {error}; lower --add") from error
+        self.seconds += time.process_time() - start
+        path = self._folder / f"added_{len(self.added)}.blend"
+        self.save(path, dict.fromkeys(now.groups, np.ones(3)), added=light.record())
 
     def move(self, now: _Layers, number: int) -> float:
         """Search better places of the lights, in the first round from several starts; the largest step, relative to the
         distances of the lights."""
-        from ..blender.process.blender_process import embree_libraries
-
         start, extraction = time.process_time(), now.finished.comparison.extraction
-        if not now.finished.comparison.results:
-            raise SceneError(
-                f"{self._options.scene}: lights cannot be moved, because Cycles shades all direct light: "
-                f"{listed(now.finished.report['finished']['all_by_cycles'], 4, '; ')}; leave out --move"
-            )
         moving = self._moving(now.groups, extraction)
         if not moving:
             raise SceneError(f"{self._options.scene}: no light can be moved: " + "; ".join(
                 f"{name!r}, {reason}" for name, reason in self.staying.items()))  # fmt: skip
-        (table,) = load_tables(self._options.techniques).values()
-        by_pass = extraction.left_to_cycles.by_pass
-        weights = np.where(np.logical_or(*by_pass.values()), 0.0, self._weights)
-        with visibility.open_tracer(extraction.occluders, embree_libraries()) as tracer:
+        with self._places(now) as places_of:
 
             def search(side: int, points: int, rays: int) -> LightSearch:
-                places = TargetSamples.of(extraction, self._target, weights, (side, points), (tracer, rays), table)
-                squares = [places.mean(image, weights, side) for image in (now.layers, now.fixed)]
+                places, layers, fixed = places_of(side, points, rays)
                 is_moving = np.isin(now.groups, list(moving))
-                freedoms = [
-                    LightFreedom(moving[group], places.distance(moving[group]), self._options.sizes)
-                    for group in now.groups
-                    if group in moving
-                ]
-                direct = np.array([places.picture(one.light) for one in freedoms])
-                rest = squares[0][is_moving] - direct
-                others = squares[0][~is_moving]
-                return LightSearch(
-                    places, tuple(freedoms), rest, others, squares[1], direct.sum(axis=1), self._options.colors
-                )
+                lights = [moving[group] for group in now.groups if group in moving]
+                freedoms = [LightFreedom(light, places.distance(light), self._options.sizes) for light in lights]
+                direct = np.array([places.picture(light) for light in lights])
+                rest, others = layers[is_moving] - direct, layers[~is_moving]
+                of_lights = tuple(freedoms), rest, others, fixed, direct.sum(axis=1)
+                return LightSearch(places, *of_lights, self._options.colors)
 
             def report(share: float) -> None:
                 if self._progress is not None and self._progress("search", share) is False:
@@ -257,12 +274,36 @@ class _Matching:
         )
         return float(np.abs(x).max())
 
+    @contextmanager
+    def _places(self, now: _Layers):
+        """Context with a function: for a side of squares, points in each and rays of a point, the samples there, and
+        the means of the layers of `now`."""
+        from ..blender.process.blender_process import embree_libraries
+
+        if now.finished.report["finished"]["all_by_cycles"]:
+            raise SceneError(
+                f"{self._options.scene}: lights cannot be moved, because Cycles shades all direct light: "
+                f"{listed(now.finished.report['finished']['all_by_cycles'], 4, '; ')}; leave out --move and --add"
+            )
+        extraction = now.finished.comparison.extraction
+        (table,) = load_tables(self._options.techniques).values()
+        weights = np.where(np.logical_or(*extraction.left_to_cycles.by_pass.values()), 0.0, self._weights)
+        with visibility.open_tracer(extraction.occluders, embree_libraries()) as tracer:
+
+            def places_of(side: int, points: int, rays: int) -> tuple[TargetSamples, np.ndarray, np.ndarray]:
+                places = TargetSamples.of(extraction, self._target, weights, (side, points), (tracer, rays), table)
+                return places, *(places.mean(image, weights, side) for image in (now.layers, now.fixed))
+
+            yield places_of
+
     def _moving(self, groups: list[str], extraction) -> dict[str, Light]:
         """The lights that may move by their groups; notes why others may not."""
         moving = {}
         for group in groups:
             lights = [light for light in extraction.lights if light.group == group]
             names = sorted({light.name for light in lights})
+            if not self._options.move and set(names).isdisjoint(self.added):
+                continue
             reason = self._reasons.get(names[0], "") if names else ""
             if len(lights) > 1:
                 reason = reason or "its data or object stands in several places"
@@ -285,7 +326,11 @@ def light_layers(picture: Finished) -> tuple[list[str], np.ndarray, np.ndarray]:
         group = parse_layer_name(name)[2]
         if group or len(of_lights) == 1:
             images[names[group] if group else of_lights[0]] += image
-    return groups, np.stack([images[group] for group in groups]) if groups else np.zeros(0), images[""]
+    return (
+        groups,
+        np.stack([images[group] for group in groups]) if groups else np.zeros((0, *images[""].shape)),
+        images[""],
+    )
 
 
 def reduced(image: np.ndarray) -> np.ndarray:

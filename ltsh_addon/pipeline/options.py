@@ -519,6 +519,7 @@ class MatchOptions(TaskOptions):
     )
     colors: bool = flag("--colors", "also change the colors of lights, not only their powers")
     move: bool = flag("--move", "also change the places and directions of lights")
+    add: int = option("--add", default=0, type=positive, metavar="N", help="new area lights (default: none)")
     sizes: bool = flag("--sizes", "with --move, also change the sizes of lights")
     techniques: tuple[str, ...] = _techniques(SHIPPED_TABLES, parse=one_table)
     cycles_samples: int = option(

@@ -9,6 +9,7 @@ from ltsh_addon.pipeline.light_search import (
     LightMove,
     LightSearch,
     TargetSamples,
+    added_light,
     levenberg_marquardt,
     rotation,
     searched,
@@ -147,3 +148,16 @@ def test_moves_keep_power_and_shape_and_suns_stay_far():
     sun = SunLight("Sun", [0, 0, 1], [0.01, 0, 0], [0, 0.01, 0], [0, 0, -1], [1, 1, 1])
     np.testing.assert_allclose(move.of(sun).center, rotation(move.turn) @ sun.center)
     assert LightFreedom(sun, 1.0).count == 2
+
+
+def test_a_new_light_is_added_where_the_target_shines_from():
+    key = EllipseLight("", [0.4, -0.3, 2.2], [0.3, 0, 0], [0, 0.3, 0], [0, 0, -1], [2, 2, 2], shape="DISK")
+    search = search_for(quadrature(floor(), TRUE), key)
+    target, nothing = search.places.picture(key), np.zeros_like(search.fixed)
+    search = search_for(target + 0.1, key)
+    light = added_light(search.places, np.zeros((0, *target.shape)), nothing + 0.1)
+    way, true = light.center - np.mean(floor().position, axis=0), key.center - np.mean(floor().position, axis=0)
+    # Neighbors among 96 directions are some 20 degrees apart.
+    assert way @ true > np.cos(np.radians(35.0)) * np.linalg.norm(way) * np.linalg.norm(true)
+    with pytest.raises(ValueError, match="no further light"):
+        added_light(search.places, target[None] + 0.1, nothing)

@@ -135,8 +135,9 @@ class ObjectBake:
             plan.target(image)
         options = {"pass_filter": pass_filter} if pass_filter else {}
         objects = list(self.uv_names)
+        context = {"scene": self.scene, "view_layer": self.scene.view_layers[render_settings.VIEW_LAYER]}
         with bpy.context.temp_override(
-            scene=self.scene, active_object=objects[0], object=objects[0], selected_objects=objects
+            **context, active_object=objects[0], object=objects[0], selected_objects=objects
         ):
             bpy.ops.object.bake(
                 type=kind, margin=0, use_clear=False, uv_layer=self.layer_name, target="IMAGE_TEXTURES",
@@ -252,6 +253,9 @@ def _open(job: BakeJob) -> BakeScene:
     if not isinstance(names, str):
         names = list(dict.fromkeys([*names, *job.following]))
     objects = bake_meshes.chosen_objects(scene, view_layer, names)
+    for hidden in (*objects, *bpy.data.collections):
+        if hidden.library is None:
+            hidden.hide_viewport = False  # Cycles' bake refuses such objects, which renders show
     render_settings.neutralize(scene, view_layer, camera, warnings)
     world = take_world(scene, view_layer, warnings)
     render_settings.prepare_surfaces(warnings)
@@ -468,7 +472,7 @@ def extract_bake(job: BakeJob, folder: Path, progress) -> dict:
 
 def _objects(opened, names, images, job, folder, progress) -> dict:
     """Write the files of objects that share a texture, or of a single one, into `folder`; returns their record."""
-    objects = [bpy.context.view_layer.objects[name] for name in names]
+    objects = [opened.scene.view_layers[render_settings.VIEW_LAYER].objects[name] for name in names]
     plans, warnings = opened.plans(objects, images)
     numbers = {name: number for number, name in enumerate(plans)}
     folder.mkdir(parents=True, exist_ok=True)

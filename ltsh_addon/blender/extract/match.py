@@ -9,7 +9,7 @@ import bpy
 import numpy as np
 from mathutils import Matrix, Vector
 
-from ...scene import SceneError, listed
+from ...scene import Light, SceneError, light_of, listed
 from .. import render_settings
 from ..lights.groups import own_light_groups, reason_to_stay
 from ..process.match import TARGET, LightsJob, TargetJob
@@ -135,6 +135,10 @@ def save_lights(job: LightsJob, folder: Path, progress) -> dict:
             new = _values(ob)
             values = {f"{key}_{when}": one[key] for key in old for when, one in (("before", old), ("after", new))}
             lights.append({"name": ob.name, "group": group, **values, "color": list(data.color)})
+    if job.added is not None:
+        ob = _add(light_of(job.added))
+        values = {f"{key}_{when}": value for key, value in _values(ob).items() for when in ("before", "after")}
+        lights.append({"name": ob.name, "group": "", **values, "color": list(ob.data.color)})
     bpy.context.preferences.filepaths.save_version = 0  # no backup of our own empty file there
     save_copy(Path(job.path), relative_remap=True)
     return {"lights": lights}
@@ -150,6 +154,19 @@ def _values(ob) -> dict:
         "rotation": [math.degrees(angle) for angle in turn.to_euler()],
         "size": getattr(data, sizes.get(data.type, "shadow_soft_size")),
     }
+
+
+def _add(light: Light):
+    """A new light object, a disk, like `light`, of gray radiance."""
+    data, radius = bpy.data.lights.new("Match", "AREA"), float(np.linalg.norm(light.half_u))
+    data.shape, data.size = "DISK", 2.0 * radius
+    data.energy = float(light.radiance[0]) * math.pi * math.pi * radius**2
+    ob = bpy.data.objects.new("Match", data)
+    bpy.context.scene.collection.objects.link(ob)
+    turn = Vector(light.direction).to_track_quat("-Z", "Y")
+    ob.matrix_world = Matrix.Translation(light.center) @ turn.to_matrix().to_4x4()
+    bpy.context.view_layer.update()
+    return ob
 
 
 def _move(ob, shift, turn, growth) -> None:

@@ -30,7 +30,8 @@ class TargetJob:
 class LightsJob:
     """Save a copy of `scene` as `path`, whose lights have `factors` (3,) times their radiance, by light group.
 
-    The groups are those of `lights` by `own_light_groups`. `moves` are records of `LightMove` by group.
+    The groups are those of `lights` by `own_light_groups`. `moves` are records of `LightMove` by group,
+    `added` is the record of a light to add.
     """
 
     scene: Path
@@ -38,6 +39,7 @@ class LightsJob:
     factors: dict[str, list[float]]
     lights: tuple[str, ...]
     moves: dict[str, dict]
+    added: dict | None = None
     scripts: bool = False
 
 
@@ -50,7 +52,7 @@ def read_target(job: TargetJob, folder: Path, progress: Progress | None = None) 
 
 
 def save_lights(job: LightsJob, progress: Progress | None = None) -> list[dict]:
-    """Do the `job`; the copy appears complete or not at all. Returns "name", "group", "power_before", "power_after"
-    and "color" of each light. Raises as `pixels.extract_pixels` does."""
+    """Do the `job`; the copy appears complete or not at all. Returns of each light "name", "group" ("": it is new),
+    "color", and "power_before", "power_after" and so on. Raises as `pixels.extract_pixels` does."""
     with replacing_by_copy(Path(job.path).absolute()) as unfinished, temporary_folder() as folder:
         return run_scene_job(replace(job, path=unfinished), folder, progress)["lights"]

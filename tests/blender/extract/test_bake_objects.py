@@ -291,3 +291,26 @@ def test_resume_bakes_again_what_belongs_to_another_job(tmp_path):
     (tmp_path / "out" / "Plane.exr").write_bytes(b"no EXR")
     before, third = specular("camera")
     assert before == 0 and np.array_equal(second, third) and specular("camera")[0] == 1
+
+
+@pytest.mark.parametrize("how", ["object", "collection", "second view layer"])
+def test_objects_that_only_renders_show_are_baked_as_cycles_renders_them(how, tmp_path):
+    """Cycles' bake refused them, without their names, or baked what another view layer shows."""
+    start()
+    ob, scene = add_plane(principled("Plain", Roughness=0.6)[0], name="Floor"), bpy.context.scene
+    shade = add_plane(principled("Shade")[0], size=0.4, name="Shade", location=(0.0, 0.0, 0.7))
+    collection = bpy.data.collections.new("Other")
+    scene.collection.children.link(collection)
+    moved = shade if how == "second view layer" else ob
+    scene.collection.objects.unlink(moved)
+    collection.objects.link(moved)
+    ob.hide_viewport, collection.hide_viewport = how == "object", how == "collection"
+    if how == "second view layer":
+        scene.view_layers.new("Second").layer_collection.children["Other"].exclude = True
+        scene.view_layers[0].use = False
+    options = {"objects": ("Floor",), "passes": ("diffuse",), "error": True, "cycles_samples": 128, "shadows": "on"}
+    report, files = baked(save(tmp_path), tmp_path / "out", **options)
+    assert report["problems"] == []
+    layers = files["Floor.exr"]
+    ours, cycles = layers["ltsh4c.diffuse"], layers["cycles.diffuse"]
+    assert np.linalg.norm(ours - cycles) <= 0.1 * np.linalg.norm(cycles)  # the noise of penumbras; a shadow is 25 %

@@ -115,6 +115,31 @@ def test_a_moved_light_comes_back_through_its_parent_and_others_stay(tmp_path):
     assert not (tmp_path / "no" / "matched.blend").exists()
 
 
+def test_a_light_that_is_missing_is_added(tmp_path):
+    empty_scene(96, 64)
+    add_plane(principled("Floor", **{"Base Color": (0.7, 0.6, 0.5, 1.0), "Roughness": 0.6})[0])
+    add_sphere(principled("Ball", **{"Base Color": (0.3, 0.5, 0.8, 1.0)})[0], radius=0.5, location=(0.2, 0.0, 0.5))
+    add_camera()
+    add_area_light(name="Fill", location=(2.0, -1.0, 2.5), energy=20.0)
+    key = add_area_light(name="Key", location=(-1.5, -1.0, 2.2), rotation=(0.3, -0.6, 0.0), size=0.4, size_y=0.4)
+    target = render(tmp_path / "target.exr", file_format="OPEN_EXR", color_depth="32")
+    bpy.data.objects.remove(key)
+    path = save(tmp_path / "start.blend")
+    report = match_scene(
+        MatchOptions(
+            scene=path, output=tmp_path / "out", target=target, techniques=("ltsh2",), cycles_samples=32, add=1
+        )
+    )
+    fill, new = report["lights"]
+    assert (fill["name"], new["name"], new["power_before"]) == ("Fill", "Match", 0.0)
+    assert fill["location_after"] == fill["location_before"]
+    assert report["error_after"] < 0.15 * report["error_before"]
+    # Of a light of another shape the place is known less well: a sixth of the 2.9 m to what it lights.
+    assert np.linalg.norm(np.subtract(new["location_after"], (-1.5, -1.0, 2.2))) < 0.5
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "out" / "matched.blend"))
+    assert bpy.data.objects["Match"].data.energy == pytest.approx(new["power_after"])
+
+
 def test_what_does_not_fit_is_named_and_nothing_is_written(room, tmp_path):
     text = tmp_path / "notes.png"
     text.write_text("no picture")

@@ -556,8 +556,8 @@ class LiveShadows:
         for number, levels in enumerate(known):
             if levels:
                 values = sources[number] = levels[max(levels)]
-                if is_coarse and max(levels):
-                    places = zip(self._points[True].places, values.shape, strict=False)
+                if values.shape[:2] != (height, width):  # finer, or of a picture with more or fewer pixels
+                    places = zip(self._points[is_coarse].places, values.shape, strict=False)
                     values = values[np.ix_(*((place * side).astype(int) for place, side in places))]
                 layers[number] = values
             elif self._layers.shape == layers.shape:

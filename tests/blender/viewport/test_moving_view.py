@@ -378,3 +378,40 @@ def test_shadows_stay_fine_while_colors_change_and_are_coarse_again_once_an_obje
     at_once, finest = pictures[3:5]
     # Both have noise of 32 rays; those of 8 rays at some pixels are four times as far off.
     assert np.linalg.norm(at_once - finest) < 0.02 * np.linalg.norm(finest)
+
+
+@edits_with_graphics
+def test_lights_keep_coarse_shadows_where_a_picture_of_another_pixel_size_follows():
+    """A light moves while pictures become smaller: the other light's coarse shadows are those of more pixels."""
+    camera, shown, live = set_up_scene(), ShownPicture("ltsh4", "combined", transparent=True), LiveShadows()
+
+    def draw():
+        with OpenView(camera, SIZE) as opened:
+            opened.renderer.shadows = live
+
+            def drawn(step):
+                live.follow((0,), lambda: view_occluders(depsgraph(), lambda text: None))
+                opened.renderer.step = step
+                return opened.draw(shown)[..., :3].astype(np.float64)
+
+            def settled(step):
+                drawn(step)
+                while live._thread is not None:
+                    live._thread.join()
+                    picture = drawn(step)
+                return picture
+
+            try:
+                settled(2)
+                bpy.data.objects["Left"].location.x += 0.1
+                opened.mirror.sync(depsgraph(), changes=Changes(lights=True))
+                return settled(3), [values.shape for values in live._sources]
+            finally:
+                live.stop()
+
+    def depsgraph():
+        bpy.context.view_layer.update()
+        return bpy.context.evaluated_depsgraph_get()
+
+    picture, shapes = with_graphics(draw)
+    assert len(set(shapes)) == 2 and live.problem == "" and np.isfinite(picture).all()

@@ -23,7 +23,7 @@ from ..imaging.denoise import DENOISER
 from ..imaging.exr import COMBINED, REST, layer_name
 from ..imaging.seams import SeamFit, TexelGrid, islands_of
 from ..reading import Malformed, check, file_name
-from ..scene import PASSES, REFERENCE, Cancelled, Film, Progress, SurfaceSamples, lights_of
+from ..scene import REFERENCE, Cancelled, Film, Progress, SurfaceSamples, lights_of
 from ..visibility import Occluders, ShadowSampling
 from ..workers.pool import cores
 from . import bake_files, lighting, lightmap
@@ -124,7 +124,7 @@ def _job(options, tile=None, following=()):
         height=options.size[1],
         block_rows=block_rows(options),
         cycles_samples=options.cycles_samples if options.error else 0,
-        passes=tuple(name for name in PASSES if name in shaded_passes(options)),
+        passes=passes_of_cycles(options),
         tile=tile,
         following=following,
         rest_passes=lightmap.rest_passes(options.passes),
@@ -140,10 +140,14 @@ def block_rows(options) -> int:
 
 def shaded_passes(options) -> set[str]:
     """The passes of `shading.shade` from which the wanted passes follow; `diffuse_light` is shaded apart."""
-    wanted = set(options.passes)
-    if COMBINED in wanted:
-        wanted |= {"specular", "diffuse"}
-    return wanted & {"specular", "diffuse"}
+    both = {"specular", "diffuse"}
+    return both if COMBINED in options.passes else both & set(options.passes)
+
+
+def passes_of_cycles(options) -> tuple[str, ...]:
+    """The passes of Cycles' bake from which the wanted passes follow."""
+    wanted = {*shaded_passes(options), *options.passes} - {COMBINED}
+    return tuple(name for name in BAKE_PASSES if name in wanted)
 
 
 class ObjectBaker:
@@ -160,8 +164,7 @@ class ObjectBaker:
         self.view = BakeView(**manifest["view"])
         self.groups = lighting.light_groups(self.lights)
         self.tiles, self.area = uv.tiles_of(self.mesh.uv)
-        known = shaded_passes(options) | {COMBINED} if options.error else ()
-        self.compared = tuple(name for name in options.passes if name in known)
+        self.compared = options.passes if options.error else ()
 
     def bake(self, stem: str, tiles: list[int], progress) -> TaskResult:
         """Write the files of `tiles` (empty: all tiles). The report is the object's entry in the whole report."""
@@ -283,9 +286,8 @@ class ObjectBaker:
         chosen = chosen[bend[chosen] > EDGE]
         if not len(chosen):
             return
-        images_of = _in_order(
-            lambda point: self._block(spread, first, point, chosen), range(EDGE_POINTS), self._threads()
-        )
+        shaded = functools.partial(self._block, spread, first, chosen=chosen)
+        images_of = _in_order(shaded, range(EDGE_POINTS), self._threads())
         sums = next(images_of)
         for more in images_of:
             sums = {name: sums[name] + values for name, values in more.items()}
@@ -326,12 +328,9 @@ class ObjectBaker:
             bounces, soft = spread.soft_light(first, texels, color)
             images = {layer_name(REST, name): bounces[name].sum(axis=0) for name in self.options.passes}
         if self.tracer is not None:
-            options = self.options
-            passes = shaded_passes(options)
-            if "diffuse_light" in options.passes:
-                passes = passes | {"diffuse"}
+            passes = sorted({name.removesuffix("_light") for name in passes_of_cycles(self.options)})
             workers = 1 if self._threads() > 1 else None
-            sampling = self._sampling(sorted(passes), first, texels.index[texel], points)
+            sampling = self._sampling(passes, first, texels.index[texel], points)
             shadows = self.tracer.trace(samples, sampling, workers=workers)
         for name, table in self.tables.items():
             for pass_name, radiance in self._passes(samples, texel, len(texels.index), table, shadows).items():
@@ -359,7 +358,7 @@ class ObjectBaker:
     def _halves(self, tile, first, texels) -> dict[str, np.ndarray]:
         """Cycles' bake of the texels by pass: two independent halves (2, Q, 3)."""
         halves = {}
-        for pass_name in shaded_passes(self.options) if self.compared else ():
+        for pass_name in passes_of_cycles(self.options) if self.compared else ():
             baked = np.load(self.folder / f"cycles_{pass_name}_{tile}_{first}.npy")
             halves[pass_name] = baked.reshape(2, -1, 3)[:, texels.index]
         if COMBINED in self.compared:
@@ -464,7 +463,7 @@ class TilePoints:
             return texels.baked(self._baked[first : first + rows].reshape(-1)[texels.index])
         path = self._file(first, 0)
         if not self._mapped:
-            path = self._folder / f"cycles_{sorted(shaded_passes(self._options))[0]}_{self._tile}_{first}.npy"
+            path = self._folder / f"cycles_{passes_of_cycles(self._options)[0]}_{self._tile}_{first}.npy"
         baked = np.load(path, mmap_mode="r")[0].reshape(-1, 3)[texels.index, 0] != np.float32(NOT_BAKED)
         return texels.baked(baked)
 

@@ -36,7 +36,7 @@ from .pixels import OCCLUDERS, SEEDS, remove_occlusion
 # SAMPLED_TEXELS: width of the part of a texel over which Cycles' bake spreads its samples; the whole texel since 5.2.
 SAMPLED_TEXELS = 1.0 if bpy.app.version >= (5, 2, 0) else 0.5
 MOST_UV_MAPS = 8
-CYCLES_TYPES = {"specular": "GLOSSY", "diffuse": "DIFFUSE", "soft": "DIFFUSE"}
+CYCLES_TYPES = {"specular": "GLOSSY", "diffuse": "DIFFUSE", "diffuse_light": "DIFFUSE", "soft": "DIFFUSE"}
 
 
 @dataclass(frozen=True)
@@ -117,8 +117,10 @@ class ObjectBake:
         return np.array(maps)
 
     def halves(self, block: Block, kind: str, samples: int, light: set[str]) -> np.ndarray:
-        """Cycles' light (2, rows, W, 3) of the passes `light`, colors included: two halves with different seeds."""
-        return np.array([self.radiance(block, kind, (seed, samples), {*light, "COLOR"}) for seed in SEEDS.values()])
+        """Cycles' light (2, rows, W, 3) of the passes `light`, with colors where the `kind` has them: two halves with
+        different seeds."""
+        light = light if kind == "diffuse_light" else {*light, "COLOR"}
+        return np.array([self.radiance(block, kind, (seed, samples), light) for seed in SEEDS.values()])
 
     def radiance(self, block: Block, kind: str, sampling: tuple[int, int], light: set[str]) -> np.ndarray:
         """Cycles' light (rows, W, 3) of the passes `light`; `sampling` is a seed and a number of samples."""

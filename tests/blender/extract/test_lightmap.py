@@ -141,3 +141,15 @@ def test_texels_that_an_edge_of_a_shadow_crosses_have_their_mean(tmp_path):
         # As Cycles, over the middle of the texel. The points there are a sixteenth apart.
         mean = min(max(0.5 + (share - 0.5) / SAMPLED_TEXELS, 0.0), 1.0)
         assert light[dark] == pytest.approx(mean * light[lit], abs=light[lit] / 16.0)
+
+
+@pytest.mark.parametrize("passes", [("diffuse_light",), ("combined", "diffuse_light")])
+def test_a_lightmap_is_compared_with_that_of_cycles(tmp_path, passes):
+    """Without the color of the surface, which is red. A texel's center beside its mean: 1 % of a soft light."""
+    start()
+    add_plane(principled("Red", Base_Color=(0.8, 0.1, 0.1, 1.0), Roughness=0.8)[0], size=2.0, name="Floor")
+    options = {"passes": passes, "error": True, "cycles_samples": TRUTH}
+    report, _ = baked(save(tmp_path), tmp_path / "out", **options)
+    errors = report["objects"][0]["tiles"]["1001"]["errors"]
+    assert set(errors) == set(passes)
+    assert errors["diffuse_light"]["techniques"]["ltsh4c"]["unbiased_error"] < 0.01

@@ -161,3 +161,15 @@ def test_light_without_color_owes_nothing_to_the_color_of_the_surface():
         light = {("diffuse", 0): noisy.astype(np.float32)}
         done.append(lightmap.denoised_rest(light, guides, islands_of(made), 64)[0]["diffuse", 0])
     np.testing.assert_array_equal(*done)
+
+
+def test_the_sharp_edge_of_a_shadow_across_a_seam_stays_between_dark_and_lit():
+    made = wall()
+    place = positions(made)
+    for slope in (-0.4, 0.0, 0.3, 1.1):
+        is_lit = (made.triangle >= 0) & (place[..., 1] > 0.45 + slope * (place[..., 0] - 1.0))
+        fitted = np.repeat(is_lit[..., None], 3, axis=-1).astype(float)
+        SeamFit(islands_of(made)).fit(fitted)
+        covered = fitted[made.triangle >= 0]
+        # Weights of the margin have single precision.
+        assert covered.min() >= -1e-6 and covered.max() <= 1.0 + 1e-6

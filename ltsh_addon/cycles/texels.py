@@ -314,9 +314,13 @@ def _lobes(materials, number, maps, triangle, weights) -> list[dict[str, np.ndar
 
 
 def light_bend(light: np.ndarray, index: np.ndarray, width: int) -> np.ndarray:
-    """How much the light (Q, 3) of the texels `index` of a block bends at each (Q,), by its root mean square."""
+    """How much the light (Q, 3) of the texels `index` of a block bends at each (Q,), relative to its root mean square:
+    at borders by the neighbor that there is, infinitely across strips of one texel."""
     picture = np.full((index[-1] // width + 3, width + 2, 3), np.nan, np.float32)
     row, column = index // width + 1, index % width + 1
     picture[row, column] = light
-    bends = [picture[row + y, column + x] + picture[row - y, column - x] - 2.0 * light for y, x in ((0, 1), (1, 0))]
-    return np.nanmax(np.abs(bends), axis=(0, 2), initial=0.0) / max(float(np.sqrt(np.square(light).mean())), 1e-30)
+    bends = []
+    for y, x in ((0, 1), (1, 0)):
+        away = np.stack([picture[row + y, column + x], picture[row - y, column - x]]) - light
+        bends.append(np.where(np.isnan(away).all(axis=0), np.inf, np.abs(np.nansum(away, axis=0))))
+    return np.max(bends, axis=(0, 2)) / max(float(np.sqrt(np.square(light).mean())), 1e-30)

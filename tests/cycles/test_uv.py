@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from ltsh_addon.cycles.texels import light_bend
 from ltsh_addon.cycles.uv import LATTICE, NUDGE, PointWeights, Texels, UvTriangles, barycentric_of_nearest, tiles_of
 
 WIDTH, HEIGHT = 61, 47
@@ -202,3 +203,13 @@ def test_tiles_that_hold_a_face_stay_however_small_it_is():
     assert tiles_of(on_the_border[None]) == ([1002], 0.0)
     across = small + np.float32([0.499, 0.0])
     assert tiles_of(across[None])[0] == [1001] and tiles_of(across[None])[1] > 0.0
+
+
+def test_light_bends_at_borders_too():
+    """A 3 x 3 island without light in one corner, and a texel by itself; the light of all others is 1."""
+    width, index = 8, np.array([0, 1, 2, 8, 9, 10, 16, 17, 18, 31])
+    light = np.where(index == 18, 0.0, 1.0)[:, None].repeat(3, axis=1)
+    size = np.sqrt(np.square(light).mean())
+    bend = light_bend(light.astype(np.float32), index, width) * size
+    expected = [0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 1.0, np.inf]
+    np.testing.assert_allclose(bend, expected, rtol=1e-6)

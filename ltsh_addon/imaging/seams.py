@@ -308,19 +308,14 @@ class SeamFit:
         self._keep = np.where(of_texels[self.texels] >= 0, COVERED, MARGIN)[:, None]
 
     def fit(self, image: np.ndarray, *, changed: bool = True) -> None:
-        """Set the texels of an image (H, W, C) in the `margin` of smooth seams; `changed`: fit the others near them,
-        between their neighbors."""
+        """Set the texels of an image (H, W, C) in the `margin` of smooth seams; `changed`: fit the others near them."""
         flat = image.reshape(-1, image.shape[-1])
         sources, weights = self._shown
         flat[self.margin] = sum(weights[:, n, None] * flat[sources[:, n]] for n in range(4))
         if changed and len(self.texels):
             light = flat[self.texels].astype(np.float64)
-            # A sharp edge of a shadow across a seam would swing: below black, or beyond the light.
-            low, high = light.copy(), light.copy()
-            for one, other in (self._links, self._links[::-1]):
-                np.minimum.at(low, one, light[other])
-                np.maximum.at(high, one, light[other])
-            flat[self.texels] = np.clip(light + self._changes(light), low, high)
+            # A sharp edge of a shadow across a seam would swing below black.
+            flat[self.texels] = np.maximum(light + self._changes(light), np.minimum(light, 0.0))
 
     def _changes(self, light: np.ndarray) -> np.ndarray:
         """The changes (N, C) of the `light` (N, C), by conjugate gradients."""

@@ -10,11 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
 from .. import shading, visibility
 from ..imaging.color import luminance
+from ..lobes.polygon import normal_frames
 from ..scene import PASSES, EllipseLight, Light, PointLight, SpotLight, SunLight, SurfaceSamples
 
 # SQUARE: pictures are compared by the means of squares of so many pixels on a side: edges that lie differently within
@@ -164,12 +166,9 @@ class LightFreedom:
         light = self.light
         if isinstance(light, PointLight) and not isinstance(light, SpotLight):
             return np.zeros((0, 3))
-        first = np.cross(light.direction, np.eye(3)[np.argmin(np.abs(light.direction))])
-        first /= np.linalg.norm(first)
-        across = [first, np.cross(light.direction, first)]
         lengths = np.linalg.norm(light.half_u), np.linalg.norm(light.half_v)
         is_disk = light.is_round and abs(lengths[0] - lengths[1]) < 1e-6 * lengths[0]
-        return np.array(across if is_disk or light.is_facing else [*across, light.direction])
+        return normal_frames(light.direction[:, None])[: 2 if is_disk or light.is_facing else 3, :, 0]
 
     @property
     def is_placed(self) -> bool:
@@ -260,10 +259,10 @@ class TargetSamples:
         weight = self.picture(light).sum(axis=-1)[self.area] * self.share + 1e-30
         return float(np.average(np.linalg.norm(self.samples.position - light.center, axis=-1), weights=weight))
 
-    def picture(self, light: Light, with_shadows: bool = True) -> np.ndarray:
+    def picture(self, light: Light) -> np.ndarray:
         """The direct light (Q, 3) of one light."""
         shaded = shading.shade(self.samples, [light], self.technique, passes=PASSES, workers=1)
-        visible = self.visibility(self.samples, [light]) if with_shadows else dict.fromkeys(PASSES, np.ones((1, 1)))
+        visible = self.visibility(self.samples, [light])
         values = sum(getattr(shaded, name)[0] * visible[name][0][:, None] for name in PASSES)
         values = self.exposure * self.share[:, None] * values
         areas = len(self.target)
@@ -272,7 +271,7 @@ class TargetSamples:
 
 @dataclass(frozen=True)
 class LightSearch:
-    """The search for the lights of a target: `lights` (R) may move, each with a rest that scales with its light."""
+    """The search for the lights of a target: those of `freedoms` may move, each with bounces that scale with it."""
 
     places: TargetSamples
     freedoms: tuple[LightFreedom, ...]  # R
@@ -281,10 +280,11 @@ class LightSearch:
     fixed: np.ndarray  # (Q, 3)
     direct: np.ndarray  # (R, 3) sums of the direct light of the lights where they are
     colors: bool = False
-    with_shadows: bool = True
 
-    def __post_init__(self):
-        object.__setattr__(self, "_pictures", {})
+    @cached_property
+    def _pictures(self) -> dict[tuple[int, bytes], np.ndarray]:
+        """The latest `layer`s by number and parameters."""
+        return {}
 
     def split(self, x: np.ndarray) -> list[np.ndarray]:
         """The parameters of each light."""
@@ -297,7 +297,7 @@ class LightSearch:
             if len(self._pictures) > 64 * len(self.freedoms):
                 self._pictures.clear()
             freedom = self.freedoms[number]
-            direct = self.places.picture(freedom.move(x).of(freedom.light), self.with_shadows)
+            direct = self.places.picture(freedom.move(x).of(freedom.light))
             factor = direct.sum(axis=0).sum() / max(self.direct[number].sum(), 1e-30)
             self._pictures[key] = direct + factor * self.bounced[number]
         return self._pictures[key]
@@ -314,24 +314,27 @@ class LightSearch:
             return [scaled[..., channel].T for channel in range(3)]
         return [scaled.reshape(len(layers), -1).T]
 
+    @cached_property
     def _targets(self) -> list[np.ndarray]:
         return [one[:, 0] for one in self._columns((self.places.target - self.fixed)[None])]
 
-    def factors(self, x: np.ndarray) -> list[np.ndarray]:
-        """The factors of all lights (R + N,), by channel or one for all."""
+    def _solved(self, x: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """The columns of all lights, and their best factors."""
         columns = self._columns(self.layers(x))
-        return [non_negative_least_squares(*pair) for pair in zip(columns, self._targets(), strict=True)]
+        return columns, [non_negative_least_squares(*pair) for pair in zip(columns, self._targets, strict=True)]
+
+    def factors(self, x: np.ndarray) -> list[np.ndarray]:
+        """The best factors of all lights (R + N,), by channel or one for all."""
+        return self._solved(x)[1]
 
     def residuals(self, x: np.ndarray) -> np.ndarray:
         """The scaled errors (M,) with the best factors."""
-        columns, factors = self._columns(self.layers(x)), self.factors(x)
-        return np.concatenate(
-            [one @ by - wanted for one, by, wanted in zip(columns, factors, self._targets(), strict=True)]
-        )
+        terms = zip(*self._solved(x), self._targets, strict=True)
+        return np.concatenate([one @ by - wanted for one, by, wanted in terms])
 
     def jacobian(self, x: np.ndarray) -> np.ndarray:
         """The derivatives (M, N) of the residuals: differences, without what other factors would take away."""
-        factors, columns = self.factors(x), self._columns(self.layers(x))
+        columns, factors = self._solved(x)
         bases = []
         for one, by in zip(columns, factors, strict=True):
             bases.append(np.linalg.qr(one[:, by > 0.0])[0] if (by > 0.0).any() else np.zeros((len(one), 0)))
@@ -405,10 +408,8 @@ def added_light(places: TargetSamples, layers: np.ndarray, fixed: np.ndarray) ->
     across = np.sqrt(1.0 - height**2)
     ways = np.stack([across * np.cos(angle), across * np.sin(angle), height], axis=-1)
     for way, far in ((way, far) for far in NEW_DISTANCES for way in ways):
-        first = np.cross(way, np.eye(3)[np.argmin(np.abs(way))])
-        first *= NEW_SIZE * far * reach / np.linalg.norm(first)
-        place = middle + far * reach * way
-        light = EllipseLight("", place, first, np.cross(way, first), -way, np.ones(3), shape="DISK")
+        half_u, half_v = NEW_SIZE * far * reach * normal_frames(way[:, None])[:2, :, 0]
+        light = EllipseLight("", middle + far * reach * way, half_u, half_v, -way, np.ones(3), shape="DISK")
         column = (places.scale[:, None] * places.picture(light)).ravel()
         if not column.any():
             continue

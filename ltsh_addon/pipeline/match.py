@@ -326,11 +326,8 @@ def light_layers(picture: Finished) -> tuple[list[str], np.ndarray, np.ndarray]:
         group = parse_layer_name(name)[2]
         if group or len(of_lights) == 1:
             images[names[group] if group else of_lights[0]] += image
-    return (
-        groups,
-        np.stack([images[group] for group in groups]) if groups else np.zeros((0, *images[""].shape)),
-        images[""],
-    )
+    layers = [images[group] for group in groups]
+    return groups, np.reshape(layers, (-1, *images[""].shape)), images[""]
 
 
 def reduced(image: np.ndarray) -> np.ndarray:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..lobes.polygon import normal_frames
 from ..scene import Light, SurfaceSamples
 from .integrator import shade
 
@@ -181,8 +182,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 def _axes(direction: np.ndarray) -> np.ndarray:
     """Two unit vectors (2, 3) across a direction and each other."""
-    first = _unit(np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))]))
-    return np.stack([first, np.cross(direction, first)])
+    return normal_frames(direction[:, None])[:2, :, 0]
 
 
 def _fitted(radiance: np.ndarray) -> tuple[np.ndarray, np.ndarray, bool]:

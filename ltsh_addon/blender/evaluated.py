@@ -35,7 +35,8 @@ def interpolated_normals(mesh, vertex: np.ndarray) -> tuple[np.ndarray, np.ndarr
     interpolates no normals."""
     has_vertex_normals, flat = kind_of_normals(mesh)
     if has_vertex_normals:
-        return read_values(mesh.vertex_normals, "vector", (len(mesh.vertices), 3), np.float32).take(vertex, axis=0), flat
+        normals = read_values(mesh.vertex_normals, "vector", (len(mesh.vertices), 3), np.float32)
+        return normals.take(vertex, axis=0), flat
     return read_values(mesh.corner_normals, "vector", (len(vertex), 3), np.float32), flat
 
 

@@ -25,8 +25,8 @@ PROBE, LARGEST = 0.1, 0.8
 RIGID, SPATIAL = 1e-5, (
     "position", "view", "normal", "diffuse_normal", "geometric_normal", "smooth_normal", "tangent",
 )  # fmt: skip
-# BRIGHTER: by how much a pixel around may be brighter than the cursor. STRICT: with more than this at one of the samples
-# there is a search: what is between samples may be a little brighter than they are. GOOD: with less, it ends.
+# BRIGHTER: by how much a pixel around may be brighter than the cursor. STRICT: with more than this at a sample there is
+# a search: what is between samples may be a little brighter than they are. GOOD: with less, it ends.
 BRIGHTER, STRICT, GOOD = 0.01, 0.006, 0.003
 # Where Newton's method fails, directions around the mirrored view are tried: on circles at ANGLES rad, TURNS on each,
 # by the first samples and every THINNED-th of the others. The STARTS best ones with at least DIM of the radiance of the

@@ -82,9 +82,8 @@ class Scene:
 def drags():
     scenes = [scene for scene in map(Scene, range(24)) if scene.rays(STENCIL)[1].all()]
     lights = [MovedLight(scene.matrix_at, scene.light) for scene in scenes]
-    return [
-        (scene, place_for_highlight(scene.samples(FEW[scene.rays(FEW)[1]]), light)) for scene, light in zip(scenes, lights, strict=True)
-    ]
+    samples = [scene.samples(FEW[scene.rays(FEW)[1]]) for scene in scenes]
+    return [(scene, place_for_highlight(*those)) for scene, *those in zip(scenes, samples, lights, strict=True)]
 
 
 def mirror(scene):

@@ -14,7 +14,7 @@ from mathutils import Matrix, Vector
 from ...scene import error_line
 from ..lights.groups import reason_to_stay
 from ..lights.textures import ShownTextures
-from .highlight_place import DISK, PIXELS, HitsAround, hits_around, note_by_pixels, place_of
+from .highlight_place import DISK, PIXELS, HitsAround, hits_around, note_by_pixels, place_by_pixels, place_of
 from .light_pose import (
     LightLook,
     LightPose,
@@ -358,7 +358,11 @@ class LTSH_OT_drag_highlight(MovingGesture, bpy.types.Operator):
         around = self._hits(context, event, PIXELS)
         if around is None:
             return NO_SURFACE
-        return note_by_pixels(self._light, self._matrix, around, self._textures)
+        if not all(self._free):
+            return note_by_pixels(self._light, self._matrix, around, self._textures)
+        self._matrix, note = place_by_pixels(self._light, self._pose, self._matrix, around, self._textures)
+        self._put(self._matrix)
+        return note
 
     def _hits(self, context, event, disk) -> HitsAround | None:
         self._snap(context, event)

@@ -161,6 +161,18 @@ def note_by_pixels(ob, matrix: Matrix, around: HitsAround, textures: ShownTextur
     return unread(hits[0].material) if is_there else BESIDE
 
 
+def place_by_pixels(ob, pose: LightPose, matrix: Matrix, around: HitsAround, textures: ShownTextures) -> tuple:
+    """As `place_of`, by all pixels `around`, where the light object `ob` is not yet right at `matrix`: what shines
+    between the samples of a move is brighter. Takes too long for a move."""
+    note = note_by_pixels(ob, matrix, around, textures)
+    if note == BESIDE:
+        distance = (matrix.translation - around.hits[0].position).length
+        better, _ = place_of(ob, pose, around, distance, textures)
+        if (again := note_by_pixels(ob, better, around, textures)) != BESIDE:
+            return better, again
+    return matrix, note
+
+
 def _light(ob, matrix: np.ndarray):
     # Samples have no numbers of receivers: `unlinked` tells of light linking.
     return replace(area_light(ob, matrix, EmitterTraits("", True, True), Receivers([ob])), receivers=None)

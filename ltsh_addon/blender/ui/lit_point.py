@@ -43,7 +43,8 @@ class MeshFace:
         self.slot, self.is_flat = face.material_index, is_flat
         self.corners = np.array([mesh.vertices[vertex].co for vertex in vertices])  # (K, 3)
         self.uv = {layer.name: np.array([layer.uv[loop].vector for loop in loops]) for layer in mesh.uv_layers}
-        self.uv |= {"": self.uv[layer.name] for layer in mesh.uv_layers if layer.active_render}
+        rendered = [uv for layer, uv in zip(mesh.uv_layers, self.uv.values(), strict=True) if layer.active_render]
+        self.uv |= {"": rendered[0]} if rendered else {}
         normals, at = (mesh.vertex_normals, vertices) if has_vertex_normals else (mesh.corner_normals, loops)
         self._normals = np.array([normals[index].vector for index in at])
         # Before a face of K corners its mesh has so many loops less two for each face.
@@ -172,7 +173,8 @@ def samples_at_hit(hit: SurfaceHit, textures: ShownTextures, receiver: int = 0) 
 
 
 def _lobe_at(lobe: PreviewMaterial, hit: SurfaceHit, cosine: float, textures: ShownTextures) -> dict[str, np.ndarray]:
-    values = {name: value_at_hits(value, [hit], textures)[0] for name, value in lobe.values.items() if name in LOBE_AOVS}
+    read = {name: value for name, value in lobe.values.items() if name in LOBE_AOVS}
+    values = {name: value_at_hits(value, [hit], textures)[0] for name, value in read.items()}
     values |= {"kind": LOBE_KINDS[lobe.kind], "multiple_scattering": float(lobe.scattered)}
     values["weight"] = lobe.weight * np.ravel(values.get("weight", 1.0))[0] * _factor_of(lobe.view_factor, cosine)
     if lobe.coat is not None:

@@ -15,7 +15,14 @@ from ltsh_addon.blender.lights.groups import reason_to_stay
 from ltsh_addon.blender.lights.linking import Receivers
 from ltsh_addon.blender.lights.textures import ShownTextures
 from ltsh_addon.blender.ui import gestures
-from ltsh_addon.blender.ui.highlight_place import NO_HIGHLIGHT, HitsAround, glossy_lobe, note_by_pixels, place_of, samples_of
+from ltsh_addon.blender.ui.highlight_place import (
+    NO_HIGHLIGHT,
+    HitsAround,
+    glossy_lobe,
+    note_by_pixels,
+    place_of,
+    samples_of,
+)
 from ltsh_addon.blender.ui.light_pose import LightPose, locked_place, reason_to_keep_look
 from ltsh_addon.blender.ui.lit_point import surface_hit
 from ltsh_addon.shading import shade

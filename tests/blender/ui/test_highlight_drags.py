@@ -154,9 +154,10 @@ class Drags:
 
         around = highlight_place.hits_around(hit_at)
         distance = float(random.uniform(1.5, 4.0))
-        matrix, note = highlight_place.place_of(self.light, LightPose.of(self.light), around, distance, self.textures)
-        note = note or highlight_place.note_by_pixels(
-            self.light, matrix, highlight_place.hits_around(hit_at, highlight_place.PIXELS), self.textures
+        matrix, _ = highlight_place.place_of(self.light, LightPose.of(self.light), around, distance, self.textures)
+        around = highlight_place.hits_around(hit_at, highlight_place.PIXELS)
+        matrix, note = highlight_place.place_by_pixels(
+            self.light, LightPose.of(self.light), matrix, around, self.textures
         )
         lamp = area_light(self.light, np.array(matrix), EmitterTraits("", True, True), Receivers([]))
         x, y = np.meshgrid(np.arange(-NEAR, NEAR + 1), np.arange(-NEAR, NEAR + 1))

@@ -417,14 +417,15 @@ class RatioEstimator:
             aimed = self.surface.ray_origins.aimed(self.index[unmet], toward[:, None], distance[None], self.at_surface)
             visibility = _ONE
             if self.chosen_by.light:
-                visibility = self._transmittance(self.mask, _ONE, *(rows[..., 0, :] for rows in aimed[:3]))
+                rays = (rows[..., 0, :] for rows in aimed[:3])
+                visibility = self._transmittance(self.index[unmet], self.mask, _ONE, *rays)
             # Next to nothing, so that it does not count in sums over samples.
             self.sum_w[number][:, unmet] = _TINY
             self.sum_wv[number][:, unmet] = visibility * _TINY
 
-    def _transmittance(self, mask, falling, origins, directions, distances):
-        """Transmittance (R,) of rays with a mask, `origins` and `directions` (3, R) and `distances` (R,), which meet
-        the light at angles with the cosines `falling` (R,)."""
+    def _transmittance(self, index, mask, falling, origins, directions, distances):
+        """Transmittance (R,) of rays of the samples `index` (R,) with a mask, `origins` and `directions` (3, R) and
+        `distances` (R,), which meet the light at angles with the cosines `falling` (R,)."""
         self.traced += len(distances)
         if self.margin and self.is_tiny:
             directions = self.light.center[:, None] - origins
@@ -436,7 +437,9 @@ class RatioEstimator:
             ends = np.maximum(ends, distances * np.float32(1.0 - GAP) - margin)
         if self.rounding:
             ends = np.clip(distances - self.rounding / np.maximum(falling, _TINY), _ZERO, ends)
-        return self.surface.tracer.transmittance(origins.T, directions.T, ends, masks)
+        transmittance = self.surface.tracer.transmittance(origins.T, directions.T, ends, masks)
+        share = self.surface.ray_origins.past_touching(index, directions, mask)
+        return transmittance if share is None else transmittance * share
 
     def _add_rays(self, members, first, last, split, order=None):
         """Trace the rays `first` to `last` of the pairs `members` (M,). `split` is a column of EVENLY."""
@@ -466,7 +469,8 @@ class RatioEstimator:
         visibility.ravel()[flat] = _ONE
         if self.chosen_by.light:
             falling = sampler.falling.ravel()[flat] if self.is_mesh or self.margin else _ONE
-            visibility.ravel()[flat] = self._transmittance(self.mask, falling, origins, *rest)
+            index = sampler.index[flat % visibility.shape[1]]
+            visibility.ravel()[flat] = self._transmittance(index, self.mask, falling, origins, *rest)
         if self.chosen_by.surface:
             if self.meet_the_same:
                 is_lifted = np.zeros(visibility.size, bool)
@@ -514,7 +518,7 @@ class RatioEstimator:
         chosen = np.flatnonzero(chosen)
         falling = sampler.falling.ravel()[flat[chosen]] if self.is_mesh or self.margin else _ONE
         rays = start[:, chosen], toward[:, chosen], distance[chosen]
-        visibility = self._transmittance(self.surface_mask, falling, *rays)
+        visibility = self._transmittance(index[chosen], self.surface_mask, falling, *rays)
         differ = np.flatnonzero(visibility != light_visibility.ravel()[flat[chosen]])
         if len(differ) == 0:
             return None

@@ -234,7 +234,7 @@ class Occluders:
         close = np.flatnonzero((np.abs(centers - points.mean(axis=0)) <= reach).all(axis=1))
         result = []
         for number in close:
-            corners = self._in_plane(number, points[0], normal, near)
+            corners = self._in_plane(number, points[0], normal, near)[1]
             offset, face = corners[:, None] - points[:, None], _crosses(corners)[:, None, None]
             sides = (np.cross(offset, np.roll(offset, -1, axis=2)) * face).sum(axis=-1)
             if ((sides >= 0.0).all(axis=2) & (sides > 0.0).any(axis=2)).any():
@@ -242,43 +242,71 @@ class Occluders:
         return np.array(result, np.int64)
 
     def _in_plane(self, number, point, normal, near):
-        """Corners (T, 3, 3) of the triangles of an instance that are nearer to a plane than `near`, in m; if `normal`
-        is None, of those whose planes are nearer to the point."""
+        """The triangles (T,) of an instance that are nearer to a plane than `near`, in m, and their corners (T, 3, 3);
+        if `normal` is None, those whose planes are nearer to the point."""
         mesh, matrix = self.meshes[self.mesh[number]], self.matrices[number]
         vertices = mesh.vertices @ matrix[:, :3].T + matrix[:, 3]
         if normal is not None:
-            return vertices[mesh.triangles[(np.abs((vertices - point) @ normal) <= near)[mesh.triangles].all(axis=1)]]
+            index = np.flatnonzero((np.abs((vertices - point) @ normal) <= near)[mesh.triangles].all(axis=1))
+            return index, vertices[mesh.triangles[index]]
         corners = vertices[mesh.triangles]
         face = _crosses(corners)
         height = np.abs((face * (corners[:, 0] - point)).sum(axis=1))
-        return corners[height <= near * np.linalg.norm(face, axis=1)]
+        index = np.flatnonzero(height <= near * np.linalg.norm(face, axis=1))
+        return index, corners[index]
 
     def overlaps(self, owners: np.ndarray) -> dict[tuple[int, int], float]:
         """By pairs of two of the `owners` (I,) of the instances, which faces of one are in faces of the other: the
         share of its faces in that plane. An owner below 0 does not count."""
-        chosen = np.flatnonzero(owners >= 0)[: MOST_IN_PLANES // 2]
-        most = min(max(MOST_IN_PLANES // max(len(chosen), 1), 2), LARGEST)
-        largest = {number: _largest(self.meshes[number], most) for number in set(self.mesh[chosen].tolist())}
-        corners = [np.zeros((0, 3, 3)), *(largest[self.mesh[number]] for number in chosen)]
-        count = list(map(len, corners[1:]))
-        corners, number = np.concatenate(corners), np.repeat(chosen, count)
-        corners = np.einsum("tkj,tij->tki", corners, self.matrices[number, :, :3]) + self.matrices[number, None, :, 3]
-        planes = _Planes.of(corners)
-        is_sheet, shared = planes.sheets(owners[number]), planes.shared_by(owners[number])[planes.group]
-        heights = np.rint(planes.height / GAP / 8.0)
-        _, index = np.unique(np.column_stack([planes.group, number, heights])[shared], axis=0, return_index=True)
-        corners, number, normal = corners[shared][index], number[shared][index], planes.normal[shared][index]
-        rest, faces = 32 * MOST_IN_PLANES, []
-        for instance, triangle, direction in zip(number, corners, normal, strict=True):
-            rest -= len(self.meshes[self.mesh[instance]].triangles)
-            near = 4.0 * GAP * np.abs(triangle).max()
-            faces.append(self._in_plane(instance, triangle[0], direction, near) if rest > 0 else triangle[None])
-        corners = np.concatenate([np.zeros((0, 3, 3)), *faces])
+        triangles, planes = self._large_triangles(np.flatnonzero(owners >= 0))
+        is_sheet, shared = planes.sheets(owners[triangles.instance]), planes.shared_by(owners[triangles.instance])
+        found = self._all_in_planes(triangles, planes, shared[planes.group])
+        corners, owners = found.corners, owners[found.instance]
+        is_mirrored = self.handedness()[found.instance] < 0.0
+        corners[is_mirrored] = corners[is_mirrored, ::-1]
         result = {}
-        points = overlaps_in_planes(corners, np.repeat(owners[number], list(map(len, faces))), is_sheet)
+        points = overlaps_in_planes(corners, owners, is_sheet)
         for first, other, share in zip(*map(np.ndarray.tolist, points), strict=True):
             result[first, other] = result.get((first, other), 0.0) + share
         return result
+
+    def opposed(self) -> PlacedTriangles:
+        """The triangles in whose planes others face the other way, as where a box stands on a floor."""
+        triangles, planes = self._large_triangles(np.flatnonzero(self.masks != 0))
+        facing = planes.facing * self.handedness()[triangles.instance]
+        return self._all_in_planes(triangles, planes, planes.shared_by(facing)[planes.group])
+
+    def handedness(self) -> np.ndarray:
+        """-1 for instances (I,) that are mirrored, 1 for others."""
+        return np.where(np.linalg.det(self.matrices[:, :, :3]) < 0.0, -1.0, 1.0)
+
+    def _large_triangles(self, chosen):
+        """The largest triangles of the instances `chosen`, and their planes."""
+        chosen = chosen[: MOST_IN_PLANES // 2]
+        most = min(max(MOST_IN_PLANES // max(len(chosen), 1), 2), LARGEST)
+        largest = {number: _largest(self.meshes[number], most) for number in set(self.mesh[chosen].tolist())}
+        index, corners = _joined([largest[self.mesh[number]] for number in chosen])
+        number = np.repeat(chosen, [len(largest[self.mesh[number]][0]) for number in chosen])
+        matrix = self.matrices[number]
+        corners = np.einsum("tkj,tij->tki", corners, matrix[:, :, :3]) + matrix[:, None, :, 3]
+        return PlacedTriangles(number, index, corners), _Planes.of(corners)
+
+    def _all_in_planes(self, triangles, planes, chosen):
+        """All triangles of the instances of those `chosen` that are in planes with these."""
+        heights = np.rint(planes.height / GAP / 8.0)
+        _, index = np.unique(
+            np.column_stack([planes.group, triangles.instance, heights])[chosen], axis=0, return_index=True
+        )
+        index = np.flatnonzero(chosen)[index]
+        rest, faces = 32 * MOST_IN_PLANES, []
+        for number in index:
+            instance, corners = triangles.instance[number], triangles.corners[number]
+            rest -= len(self.meshes[self.mesh[instance]].triangles)
+            near = 4.0 * GAP * np.abs(corners).max()
+            in_plane = self._in_plane(instance, corners[0], planes.normal[number], near) if rest > 0 else None
+            faces.append(in_plane or (triangles.triangle[number, None], corners[None]))
+        number, corners = _joined(faces)
+        return PlacedTriangles(np.repeat(triangles.instance[index], [len(one) for one, _ in faces]), number, corners)
 
     @property
     def triangle_count(self) -> int:
@@ -342,7 +370,7 @@ _SETTINGS = "transparent_surfaces", "light_masks", "lone_choices", "surface_shif
 def overlap_within(meshes: list[OccluderMesh]) -> float:
     """The share of the area of the triangles of an object that lies in others of the same plane which face alike; at
     least so much if there are more than MOST_IN_PLANES."""
-    corners = np.concatenate([np.zeros((0, 3, 3)), *(_largest(mesh, MOST_IN_PLANES) for mesh in meshes)])
+    corners = _joined([_largest(mesh, MOST_IN_PLANES) for mesh in meshes])[1]
     owners, numbers = np.zeros(len(corners), np.int64), np.arange(len(corners))
     return float(overlaps_in_planes(corners, owners, np.zeros(1, bool), numbers)[2].sum())
 
@@ -353,12 +381,31 @@ def _crosses(corners):
 
 
 def _largest(mesh, most):
-    """Corners (T, 3, 3), float64, of the `most` largest triangles of a mesh."""
-    corners = mesh.vertices[mesh.triangles]
-    if len(corners) > most:
-        areas = np.square(_crosses(corners)).sum(axis=1)
-        corners = corners[np.sort(np.argpartition(areas, -most)[-most:])]
-    return corners.astype(np.float64)
+    """The numbers (T,) of the `most` largest triangles of a mesh, and their corners (T, 3, 3), float64."""
+    index = np.arange(len(mesh.triangles))
+    if len(index) > most:
+        areas = np.square(_crosses(mesh.vertices[mesh.triangles])).sum(axis=1)
+        index = np.sort(np.argpartition(areas, -most)[-most:])
+    return index, mesh.vertices[mesh.triangles[index]].astype(np.float64)
+
+
+def _joined(triangles):
+    """Many pairs of numbers (T,) and corners (T, 3, 3) as one."""
+    empty = np.zeros(0, np.int64), np.zeros((0, 3, 3))
+    return tuple(map(np.concatenate, zip(empty, *triangles, strict=True)))
+
+
+@dataclass(frozen=True)
+class PlacedTriangles:
+    """Triangles in world space: their instances, their numbers in their meshes, and their corners in m."""
+
+    instance: np.ndarray  # (T,)
+    triangle: np.ndarray  # (T,)
+    corners: np.ndarray  # (T, 3, 3)
+
+    def take(self, index: np.ndarray) -> PlacedTriangles:
+        """The triangles at `index`: integers or a mask."""
+        return PlacedTriangles(self.instance[index], self.triangle[index], self.corners[index])
 
 
 @dataclass(frozen=True)

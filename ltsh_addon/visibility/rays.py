@@ -252,6 +252,10 @@ class EmbreeCaster:
         self._packets = _Packets(embree.width, RAY_ROWS)
         self._hits = _Packets(embree.width, HIT_ROWS)
 
+    def of(self, occluders: Occluders) -> EmbreeCaster:
+        """A caster for other occluders."""
+        return EmbreeCaster(occluders, self._embree)
+
     def close(self) -> None:
         """Free the memory that Embree holds."""
         for scene in self._scenes:
@@ -306,6 +310,7 @@ class Tracer:
         """Free what the caster holds."""
         with self._lock:
             self._caster.close()
+            self._terminator.close()
 
     def transmittance(
         self, origins: np.ndarray, directions: np.ndarray, distances: np.ndarray, masks: np.ndarray | None = None

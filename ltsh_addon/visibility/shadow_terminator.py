@@ -8,7 +8,7 @@ import numpy as np
 
 from ..lobes.polygon import dot
 from ..scene import SurfaceSamples
-from .occluders import ALL_RAYS, STEP, Hits, Occluders
+from .occluders import ALL_RAYS, GAP, STEP, Hits, OccluderMesh, Occluders
 
 # Distance from its triangle at which a ray does not meet it, as a share of the size of coordinates: 8 times their
 # rounding in single precision. 2 times are too few; 4 seem to suffice.
@@ -16,6 +16,8 @@ CLEARANCE = 2.0**-21
 # NEARBY: distance from a sample, in m near the origin, within which its surface is looked for. LAYERS: most surfaces
 # looked at. CERTAIN: share of that distance at which a surface is close enough to stop looking.
 NEARBY, LAYERS, CERTAIN = 2.0**-14, 4, 2.0**-3
+# Tells the two sides of planes apart; no common plane holds it.
+CANONICAL = np.array([0.61, 0.553, 0.567])
 
 
 class ShadowTerminator:
@@ -29,6 +31,7 @@ class ShadowTerminator:
         thick = [mesh.thickness is not None and len(mesh.triangles) > 0 for mesh in occluders.meshes]
         for number in np.flatnonzero(np.array(thick, bool)[occluders.mesh]):
             self._thickness[number] = self._thickness_of(number, slice(None)).max()
+        self._opposed: OpposedFaces | None = None  # made by the first call of `ray_origins`
 
     def ray_origins(self, samples: SurfaceSamples) -> RayOrigins:
         """Where rays from `samples` start: as in Cycles, on the triangle, which they leave without meeting it.
@@ -66,7 +69,10 @@ class ShadowTerminator:
             index = index[smooth]
             lift[:, index] = shape.take(smooth).lifts(normal[index])
             terminator[index] = self._occluders.terminators[hits.instance[smooth]] * lift[:, index].any(axis=(0, 2))
-        return RayOrigins(position, normal, smooth_normal, clearance, lift, terminator)
+        if self._opposed is None:
+            self._opposed = OpposedFaces(self._occluders, self._caster)
+        touching = self._opposed.at(position, normal, clearance)
+        return RayOrigins(position, normal, smooth_normal, clearance, lift, terminator, *touching)
 
     def _thickness_of(self, instance, triangle) -> np.ndarray:
         """World-space thickness (Q,) of triangles of an instance that has one, in m."""
@@ -93,27 +99,83 @@ class ShadowTerminator:
         return Hits(*(np.concatenate([one, other[within]]) for one, other in joined))
 
     def _nearest(self, position, normal, reach) -> Hits:
-        """Hits on the triangles nearest to samples along their normals, up to `reach` m away."""
-        count = len(position)
-        origins, everything = position + reach[:, None] * normal, np.full(count, ALL_RAYS, np.uint32)
-        off = np.full(count, np.inf, np.float32)
-        best = Hits(np.arange(count), off, *(np.zeros(count, kind) for kind in (int, int, np.float32, np.float32)))
-        for is_clear in (False, True):
-            near, index = np.zeros(count, np.float32), np.arange(count)
-            # The first triangle may belong to another surface close above.
-            for _ in range(LAYERS if self._caster.has[is_clear] else 0):
-                rays = origins[index], -normal[index], near[index], 2.0 * reach[index], everything[index]
-                hits = self._caster.closest(is_clear, *rays)
-                index = index[hits.ray]
-                offset = np.abs(hits.distance - reach[index])
-                closer = offset < off[index]
-                for field in fields(Hits)[2:]:
-                    getattr(best, field.name)[index[closer]] = getattr(hits, field.name)[closer]
-                off[index[closer]] = offset[closer]
-                near[index] = hits.distance * STEP
-                index = index[off[index] > CERTAIN * reach[index]]
-        there = np.isfinite(off)
-        return Hits(*(getattr(best, field.name)[there] for field in fields(Hits)))
+        return _nearest(self._caster, position, normal, reach)
+
+    def close(self) -> None:
+        """Free what the casters of opposed faces hold."""
+        if self._opposed is not None:
+            self._opposed.close()
+
+
+class OpposedFaces:
+    """Faces that touch others and face them, as where a box stands on a floor: what they block of the rays that start
+    on these. `caster` is one of the `occluders`."""
+
+    def __init__(self, occluders: Occluders, caster):
+        self._occluders, self._triangles, self._casters = occluders, [], []
+        opposed = occluders.opposed()
+        normals = np.cross(*np.moveaxis(opposed.corners[:, 1:] - opposed.corners[:, :1], 1, 0))
+        normals *= occluders.handedness()[opposed.instance, None]
+        for side in (1.0, -1.0):
+            triangles = opposed.take(side * (normals @ CANONICAL) > 0.0)
+            corners = triangles.corners.reshape(-1, 3)
+            self._triangles.append(triangles)
+            mesh = OccluderMesh(corners, np.arange(len(corners)).reshape(-1, 3))
+            self._casters.append(caster.of(Occluders((mesh,), [0], [np.eye(3, 4)])))
+
+    def close(self) -> None:
+        """Free what the casters hold."""
+        for caster in self._casters:
+            caster.close()
+
+    def at(self, position, normal, clearance) -> tuple[np.ndarray, np.ndarray]:
+        """The masks (P,) of the faces that touch samples from above, within their clearances (P,) m, 0 for none; and
+        the shares (P,) of light that these let through.
+
+        As in Cycles, what is in the plane of a sample blocks, and what is below by more than rounding does not.
+        """
+        occluders, is_up = self._occluders, normal @ CANONICAL > 0.0
+        masks, shares = np.zeros(len(position), np.uint32), np.ones(len(position), np.float32)
+        for triangles, caster, chosen in zip(self._triangles, self._casters, (~is_up, is_up), strict=True):
+            for start in range(0, len(position) if len(triangles.instance) else 0, caster.chunk):
+                index = start + np.flatnonzero(chosen[start : start + caster.chunk])
+                reach = (NEARBY * (1.0 + np.abs(position[index]).max(axis=1, initial=0.0))).astype(np.float32)
+                hits = _nearest(caster, position[index], normal[index], reach)
+                index, faces = index[hits.ray], triangles.take(hits.triangle)
+                height = _dot(faces.corners[:, 0].astype(np.float32) - position[index], normal[index])
+                rounding = GAP * np.abs(_dot(position[index], normal[index]))
+                touches = np.flatnonzero((height >= -rounding) & (height <= clearance[index]))
+                masks[index[touches]] = occluders.masks[faces.instance[touches]]
+                mesh = occluders.mesh[faces.instance]
+                for number in np.unique(mesh[touches]):
+                    here, clear = touches[mesh[touches] == number], occluders.meshes[number].transparency
+                    rows = faces.triangle[here], hits.u[here], hits.v[here], np.ones(len(here))
+                    shares[index[here]] = 0.0 if clear is None else clear.transmittance(*rows)
+        return masks, shares
+
+
+def _nearest(caster, position, normal, reach) -> Hits:
+    """Hits of a `caster` on the triangles nearest to samples along their normals, up to `reach` (P,) m away."""
+    count = len(position)
+    origins, everything = position + reach[:, None] * normal, np.full(count, ALL_RAYS, np.uint32)
+    off = np.full(count, np.inf, np.float32)
+    best = Hits(np.arange(count), off, *(np.zeros(count, kind) for kind in (int, int, np.float32, np.float32)))
+    for is_clear in (False, True):
+        near, index = np.zeros(count, np.float32), np.arange(count)
+        # The first triangle may belong to another surface close above.
+        for _ in range(LAYERS if caster.has[is_clear] else 0):
+            rays = origins[index], -normal[index], near[index], 2.0 * reach[index], everything[index]
+            hits = caster.closest(is_clear, *rays)
+            index = index[hits.ray]
+            offset = np.abs(hits.distance - reach[index])
+            closer = offset < off[index]
+            for field in fields(Hits)[2:]:
+                getattr(best, field.name)[index[closer]] = getattr(hits, field.name)[closer]
+            off[index[closer]] = offset[closer]
+            near[index] = hits.distance * STEP
+            index = index[off[index] > CERTAIN * reach[index]]
+    there = np.isfinite(off)
+    return Hits(*(getattr(best, field.name)[there] for field in fields(Hits)))
 
 
 @dataclass(frozen=True)
@@ -126,12 +188,16 @@ class RayOrigins:
     clearance: np.ndarray  # (P,) m, distance from its plane at which a ray surely misses the sample's own triangle
     lift: np.ndarray  # (2, P, 3) m, to where a smooth surface would be: for light from outside, and from inside
     terminator: np.ndarray  # (P,) as Occluders.terminators; 0 on flat triangles
+    # Faces that touch samples from above: masks (P,) of the rays that they block, 0: there is none, and the shares (P,)
+    # of light that they let through.
+    touching: np.ndarray
+    touching_share: np.ndarray
 
     @classmethod
     def empty(cls, count: int) -> RayOrigins:
         """Room for those of `count` samples, see `put`."""
-        vectors, numbers = np.zeros((5, count, 3), np.float32), np.zeros((2, count), np.float32)
-        return cls(*vectors[:3], numbers[0], vectors[3:], numbers[1])
+        vectors, numbers = np.zeros((5, count, 3), np.float32), np.zeros((3, count), np.float32)
+        return cls(*vectors[:3], numbers[0], vectors[3:], numbers[1], np.zeros(count, np.uint32), numbers[2])
 
     def put(self, block: slice, values: RayOrigins) -> None:
         """Set those of the samples of a block."""
@@ -143,6 +209,14 @@ class RayOrigins:
         """The starts of the samples at `index`: integers (Q,) or a slice."""
         lift = self.lift[:, index]
         return RayOrigins(*(lift if each.name == "lift" else getattr(self, each.name)[index] for each in fields(self)))
+
+    def past_touching(self, index: np.ndarray, directions: np.ndarray, masks: np.ndarray) -> np.ndarray | None:
+        """The shares (R,) that the faces which touch the samples `index` (R,) let through of rays with `masks` (R,)
+        along `directions` (3, R); None where there is no such face."""
+        if not self.touching.any():
+            return None
+        blocked = (self.touching[index] & masks != 0) & (dot(self.geometric_normal[index].T, directions) > 0.0)
+        return np.where(blocked, self.touching_share[index], np.float32(1.0))
 
     def origins(self, index: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Origins (R, 3) of rays along unit `directions` (R, 3) from the samples `index` (R,)."""
@@ -246,7 +320,8 @@ class _TrianglePoints:
         in_world = _turned(corners, matrix)
         size = np.abs(in_world - in_world[:, :1]).max(axis=(1, 2))
         size += np.where(applied[:, 0, 0], 0.0, np.abs(in_world).max(axis=(1, 2)))
-        weights = np.stack([1.0 - hits.u - hits.v, hits.u, hits.v], axis=-1)
+        u, v = hits.u.astype(np.float64), hits.v.astype(np.float64)
+        weights = np.stack([1.0 - u - v, u, v], axis=-1)
         turned = _turned(normals, _cofactors(matrix))
         turned /= np.maximum(np.linalg.norm(turned, axis=-1, keepdims=True), 1e-30)
         return cls(

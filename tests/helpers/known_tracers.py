@@ -31,6 +31,9 @@ class Tracer:
         origins = np.broadcast_to(self.position[index].T[:, None], directions.shape)
         return origins.astype(np.float32), directions, distances, np.zeros(0, int)
 
+    def past_touching(self, index, directions, masks):
+        return None
+
     def transmittance(self, origins, directions, distances, masks):
         self.rays += len(origins)
         assert np.allclose(np.linalg.norm(directions, axis=1), 1.0, atol=1e-5)

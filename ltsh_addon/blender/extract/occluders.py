@@ -231,8 +231,8 @@ class _Collector:
                 texts[frozenset(names)] = f"{_percent(share)} of those of {names[0]!r} in {names[1]!r}"
         if texts:
             warn(
-                f"shadows: faces in one plane: {listed(texts.values(), NAMED)}: Cycles is black there, here both are "
-                "lit; move one off by 0.1 mm"
+                f"shadows: faces in one plane: {listed(texts.values(), NAMED)}: Cycles is black there, here faces that "
+                "face alike are lit; move one off by 0.1 mm"
             )
 
     def _is_twin(self, number, matrix, ob) -> bool:

@@ -412,16 +412,11 @@ class TilePoints:
         self._width = baker.manifest["sampled_texels"]
         self._triangles = uv.UvTriangles.in_tile(baker.mesh.uv, *options.size, _column_and_row(tile))
         self._at_centers = bakes_centers_alone(options, baker.record)
-        self.rest, self._baked, size = {}, None, options.size
+        self.rest, self._baked = {}, None
         if options.bounces == "on":
-            rows = range(len(baker.groups) if options.per_light else 1)
-            keys = [*itertools.product(lightmap.rest_passes(options.passes), rows)]
-            keys += [(lightmap.SOFT, 0)] if baker.soft_lights else []
-            self.rest = {key: lightmap.read_rest(baker.folder, key, tile, size) for key in keys}
-            self._baked = next(iter(self.rest.values()))[..., 0] != np.float32(NOT_BAKED)
-            if baker.soft_lights and baker.groups == [""]:
-                # Nobody asks for the sky by itself: one picture is denoised in half of the time of two.
-                self.rest["diffuse", 0] += np.where(self._baked[..., None], self.rest.pop((lightmap.SOFT, 0)), 0.0)
+            self.rest, self._baked = lightmap.read_rest(
+                baker.folder, tile, options, baker.groups, bool(baker.soft_lights)
+            )
         # The points of a block are shaded one after another, so few blocks need to be cached.
         cached = functools.lru_cache(maxsize=2 + threads // options.sub_samples)
         self.texels, self._weights_of = cached(self._covered), cached(self._fitted_weights)

@@ -86,6 +86,7 @@ def test_faces_whose_smooth_normals_turn_away_have_the_bounces_of_a_render(tmp_p
     fold.data.uv_layers.new(name="UVMap").uv.foreach_set("vector", uv)
     fold.data.materials.append(bpy.data.materials["White"])
     fold.data.shade_smooth()
+    bpy.context.scene.world = None  # its direct light would be in the rest as well
     _, layers, covered = lightmap(tmp_path, objects=("Fold",))
     camera = bpy.context.scene.camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
     camera.data.type = "ORTHO"
@@ -104,6 +105,7 @@ def test_faces_whose_smooth_normals_turn_away_have_the_bounces_of_a_render(tmp_p
 
 def test_the_denoiser_halves_the_error_of_what_bounces(tmp_path):
     corner()
+    bpy.context.scene.world = None  # its direct light would be in the rest as well
     _, layers, covered = lightmap(tmp_path, rest_samples=16)
     truth, noisy = by_cycles(light=("INDIRECT",))[:, covered], by_cycles(light=("INDIRECT",), samples=32)[0, covered]
     assert off(layers["rest.diffuse_light"][covered], truth)[0] < 0.5 * off(noisy, truth)[0]

@@ -75,8 +75,8 @@ def test_integrals_are_within_the_bounds(technique, dtype):
 @pytest.mark.parametrize("shape", ["RECTANGLE", "ELLIPSE"])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_in_tails_where_the_lobe_changes_little_the_light_is_right(technique, shape, dtype):
-    """Within 4 %, half of them within .4 %, where the integrand changes by less than a factor of three over the light: fitted lobes are off by up
-    to several times their value there."""
+    """Within 4 %, half of them within .4 %, where the integrand changes by less than a factor of three over the light.
+    Fitted lobes are off by up to several times their value there."""
     errors = []
     for view, roughness, light, (least, most) in cases(150):
         if least <= 0.0 or 3.0 * least < most:

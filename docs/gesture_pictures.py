@@ -88,9 +88,9 @@ def main() -> None:
     lamp = scene()
     pictures = {"Before": (picture("before"), None)}
     pose = LightPose.of(lamp)
-    hits = hits_around(lambda offset: hit(np.array(HIGHLIGHT[1]) + offset))
-    distance = (pose.matrix.translation - hits[4].position).length
-    matrix, note = place_of(lamp, pose, hits, distance, ShownTextures())
+    around = hits_around(lambda offset: hit(np.array(HIGHLIGHT[1]) + offset))
+    distance = (pose.matrix.translation - around.hits[0].position).length
+    matrix, note = place_of(lamp, pose, around, distance, ShownTextures())
     print("highlight:", note or "at the mouse")
     pose.put(lamp, matrix)
     pictures["Drag Highlight"] = picture("highlight"), HIGHLIGHT

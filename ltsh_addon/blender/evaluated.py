@@ -32,7 +32,16 @@ _CORNERS_OF_SHARP_FACES = bpy.app.version >= (5, 0, 0)
 
 def interpolated_normals(mesh, vertex: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Normals (C, 3) at the corners, whose vertices are `vertex` (C,), and the mask (F,) of flat faces, on which Cycles
-    interpolates no normals.
+    interpolates no normals."""
+    has_vertex_normals, flat = kind_of_normals(mesh)
+    if has_vertex_normals:
+        normals = read_values(mesh.vertex_normals, "vector", (len(mesh.vertices), 3), np.float32)
+        return normals.take(vertex, axis=0), flat
+    return read_values(mesh.corner_normals, "vector", (len(vertex), 3), np.float32), flat
+
+
+def kind_of_normals(mesh) -> tuple[bool, np.ndarray]:
+    """Whether Cycles interpolates the normals of vertices, else those of corners; and the mask (F,) of flat faces.
 
     Faces are flat as in Cycles, which may differ from Blender's solid view: no face is flat if the normals belong to
     corners, and edges that are all sharp make faces flat only in meshes that do not mark faces.
@@ -42,12 +51,7 @@ def interpolated_normals(mesh, vertex: np.ndarray) -> tuple[np.ndarray, np.ndarr
     if "sharp_face" not in mesh.attributes and mesh.normals_domain == "FACE":
         sharp[:] = True
     by_vertex = not mesh.has_custom_normals and not sharp.all() and _edges_do_not_count(mesh, sharp)
-    if by_vertex:
-        normal = read_values(mesh.vertex_normals, "vector", (len(mesh.vertices), 3), np.float32).take(vertex, axis=0)
-    else:
-        normal = read_values(mesh.corner_normals, "vector", (len(vertex), 3), np.float32)
-    flat = sharp if by_vertex or mesh.normals_domain == "FACE" else np.zeros(faces, bool)
-    return normal, flat
+    return by_vertex, sharp if by_vertex or mesh.normals_domain == "FACE" else np.zeros(faces, bool)
 
 
 def _edges_do_not_count(mesh, sharp_faces: np.ndarray) -> bool:

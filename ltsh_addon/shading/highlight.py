@@ -11,11 +11,11 @@ from ..lobes.polygon import normal_frames
 from ..scene import Light, SurfaceSamples
 from .integrator import shade
 
-# STENCIL: the pixels around the cursor, in steps; the fifth is the cursor. Their radiance is fitted by a quadratic.
-STENCIL = np.stack(np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]), axis=-1).reshape(-1, 2)
+# STENCIL: the cursor and the pixels around it, in steps. Their radiance is fitted by a quadratic.
+STENCIL = np.stack(np.meshgrid([0.0, -1.0, 1.0], [0.0, -1.0, 1.0]), axis=-1).reshape(-1, 2)
 _FIT = np.linalg.pinv(np.stack([np.ones(9), *STENCIL.T, *(0.5 * STENCIL**2).T, STENCIL.prod(axis=1)], axis=-1))
 # STEPS: of Newton's method from each start. NEAR: steps of the stencil from the cursor to the peak at which it ends.
-STEPS, NEAR = 10, 0.05
+STEPS, NEAR = 6, 0.05
 # FLAT: a gradient, per step of the stencil, of a radiance that hardly varies around the cursor: large lights in smooth
 # surfaces.
 FLAT = 5e-4
@@ -25,14 +25,20 @@ PROBE, LARGEST = 0.1, 0.8
 RIGID, SPATIAL = 1e-5, (
     "position", "view", "normal", "diffuse_normal", "geometric_normal", "smooth_normal", "tangent",
 )  # fmt: skip
-# STRICT: by how much a sample further away may be brighter than the cursor. In a picture that is a hundredth: what is
-# between samples may be brighter by a little more than they are. GOOD: with less, a search ends.
-STRICT, GOOD = 0.006, 0.003
+# BRIGHTER: by how much a pixel around may be brighter than the cursor. STRICT: with more than this at a sample there is
+# a search: what is between samples may be a little brighter than they are. GOOD: with less, it ends.
+BRIGHTER, STRICT, GOOD = 0.01, 0.006, 0.003
 # Where Newton's method fails, directions around the mirrored view are tried: on circles at ANGLES rad, TURNS on each,
-# by the cursor and every THINNED-th sample. The best ones with at least DIM of the radiance of the mirrored view are
-# STARTS of a search by smaller and smaller circles, SEARCHED times the lobe, by the FEW brightest samples.
-ANGLES, TURNS, THINNED, DIM, STARTS = (0.03, 0.08, 0.2, 0.35, 0.55, 0.8), 10, 4, 0.1, 4
-SEARCHED, FEW = (0.5, 0.2, 0.08, 0.03), 32
+# by the first samples and every THINNED-th of the others. The STARTS best ones with at least DIM of the radiance of the
+# mirrored view are searched from, by MOST_MOVES moves of at most REACH times the lobe, which a move that leads to no
+# better place makes SHORTER.
+ANGLES, TURNS, THINNED, DIM, STARTS = (0.04, 0.12, 0.25, 0.5, 0.8), 8, 4, 0.1, 2
+MOST_MOVES, REACH, SHORTER = 5, 0.5, 0.3
+# MOVES: the moves (M, 2) that are looked at, in units of the longest.
+MOVES = np.concatenate([
+    radius * np.stack([np.cos(turns), np.sin(turns)], axis=-1)
+    for radius in (0.05, 0.15, 0.3, 0.5, 0.75, 1.0) for turns in [2.0 * np.pi * np.arange(24) / 24]
+])  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -48,8 +54,12 @@ class HighlightPlace:
     """Where a light is for a highlight."""
 
     direction: np.ndarray  # (3,) unit, from the point to the light
-    is_peak: bool  # False: nowhere near the mirrored view is there a peak at this pixel, and the radiance varies
-    is_beside: bool = False  # there is no peak because a sample further away is brighter
+    excess: float  # by how much a sample is brighter than the cursor; inf: no light arrives there
+
+    @property
+    def is_peak(self) -> bool:
+        """True if the highlight is at the cursor."""
+        return self.excess <= BRIGHTER
 
 
 def mirrored(view: np.ndarray, normal: np.ndarray) -> np.ndarray:
@@ -57,29 +67,26 @@ def mirrored(view: np.ndarray, normal: np.ndarray) -> np.ndarray:
     return 2.0 * (view * normal).sum(axis=-1, keepdims=True) * normal - view
 
 
-def place_for_highlight(samples: SurfaceSamples, light: MovedLight, technique="ltsh4c") -> HighlightPlace:
-    """The direction for which the specular radiance of a light has its peak at the middle one of the first nine of the
-    `samples`, those of the pixels of STENCIL; no other may be brighter.
+def place_for_highlight(
+    samples: SurfaceSamples, light: MovedLight, technique="ltsh4c", has_stencil=True
+) -> HighlightPlace:
+    """The direction for which the specular radiance of a light has its peak at the first one of the `samples`; no other
+    may be brighter.
 
-    Newton's method for the gradient of the logarithm of the radiance, which is 0 at the peak, from the mirrored view
-    on: of rough and curved surfaces the peak is elsewhere. Where that fails, the directions around are tried.
+    If the first nine are those of the pixels of STENCIL: Newton's method for the gradient of the logarithm of the
+    radiance, which is 0 at the peak, from the mirrored view on: of rough and curved surfaces the peak is elsewhere.
+    Where that fails, the directions around are tried.
     """
-    middle = len(STENCIL) // 2
-    mirror = mirrored(samples.view[middle], samples.normal[middle])
-    lobe = max(float(samples.sharpest_roughness[middle]) ** 2, 1e-3)
-    problem = _Problem(samples, light, technique, lobe)
-    direction, is_peak = problem.by_newton(mirror)
-    (excess,), _ = problem.excess([direction])
+    mirror = mirrored(samples.view[0], samples.normal[0])
+    problem = _Problem(samples, light, technique, max(float(samples.sharpest_roughness[0]) ** 2, 1e-3))
+    direction, is_peak = problem.by_newton(mirror) if has_stencil else (mirror, False)
+    excess = float(problem.excess([direction])[0][0])
     if is_peak and excess <= STRICT:
-        return HighlightPlace(direction, True)
-    starts = problem.starts(mirror, [direction] if excess < np.inf else [])
-    for start in starts:
-        searched, now = problem.by_search(start)
-        if now < excess:
-            direction, excess = searched, now
-        if excess <= STRICT:
-            return HighlightPlace(direction, True)
-    return HighlightPlace(direction, False, excess > STRICT)
+        return HighlightPlace(direction, excess)
+    searched, least = problem.by_search(problem.starts(mirror, [direction] if excess < np.inf else []))
+    if least < excess:
+        direction, excess = searched, least
+    return HighlightPlace(direction, excess)
 
 
 @dataclass(frozen=True)
@@ -118,34 +125,51 @@ class _Problem:
         """By how much (D,) the brightest of the samples is brighter than the cursor, of lights in `directions` (D, 3);
         and the radiance (D,) there."""
         radiance = self._specular(directions, self.samples if samples is None else samples)
-        here = radiance[:, len(STENCIL) // 2]
+        here = radiance[:, 0]
         return np.where(here > 0.0, radiance.max(axis=-1) / np.maximum(here, 1e-30) - 1.0, np.inf), here
 
-    def starts(self, mirror: np.ndarray, further: list) -> list[np.ndarray]:
-        """The directions (3,) around the mirrored view from which to search, the most promising first."""
+    def starts(self, mirror: np.ndarray, further: list) -> np.ndarray:
+        """The directions (N, 3) around the mirrored view from which to search, the most promising first."""
         turned = np.tensordot(np.sin(ANGLES), _circle() @ _axes(mirror), axes=0).reshape(-1, 3)
         tried = np.stack([mirror, *further, *(turned + np.cos(ANGLES).repeat(TURNS)[:, None] * mirror)])
         few = np.concatenate([np.arange(len(STENCIL)), np.arange(len(STENCIL), len(self.samples), THINNED)])
-        excess, radiance = self.excess(tried, self.samples.take(few))
+        excess, radiance = self.excess(tried, self.samples.take(few[few < len(self.samples)]))
         excess[radiance < DIM * radiance[0]] = np.inf
         order = np.argsort(excess)[:STARTS]
-        return list(tried[order[excess[order] < np.inf]])
+        return tried[order[excess[order] < np.inf]]
 
-    def by_search(self, direction: np.ndarray) -> tuple[np.ndarray, float]:
-        """The direction (3,) around which no other has less excess, and that excess."""
-        bright = len(STENCIL) + np.argsort(-self._specular([direction], self.samples)[0, len(STENCIL) :])[:FEW]
-        samples = self.samples.take(np.append(np.arange(len(STENCIL)), bright))
-        (excess,), (first,) = self.excess([direction], samples)
-        for angle in SEARCHED:
-            for _ in range(STEPS):
-                tried = _unit(direction + angle * self.lobe * _circle() @ _axes(direction))
-                excesses, radiance = self.excess(tried, samples)
-                excesses[radiance < 0.5 * first] = np.inf
-                least = int(np.argmin(excesses))
-                if excess <= GOOD or not excesses[least] < excess:
-                    break
-                direction, excess = tried[least], float(excesses[least])
-        return direction, float(self.excess([direction])[0][0])
+    def by_search(self, starts: np.ndarray) -> tuple[np.ndarray | None, float]:
+        """The direction (3,) with the least excess to which searches from `starts` (N, 3) lead, and that excess.
+
+        Each move is the one with the least excess by first differences of the logarithms of all samples (a minimax
+        problem, by sequential linear programming; the moves are so few that all of them are looked at).
+        """
+        best, least = starts, np.full(len(starts), np.inf)
+        slopes = axes = np.zeros((len(starts), 2, 0))
+        logs, reach, now = np.zeros((len(starts), 0)), np.full(len(starts), REACH * self.lobe), starts
+        for _ in range(MOST_MOVES if len(starts) else 0):
+            axes_now = np.array([_axes(direction) for direction in now])
+            tried = np.concatenate([now[:, None], _unit(now[:, None] + PROBE * self.lobe * axes_now)], axis=1)
+            radiance = self._specular(tried.reshape(-1, 3), self.samples).reshape(len(now), 3, -1)
+            relative = np.log(np.maximum(radiance, 1e-30) / np.maximum(radiance[..., :1], 1e-30))
+            excess = np.where(radiance[:, 0, 0] > 0.0, np.expm1(relative[:, 0].max(axis=-1)), np.inf)
+            is_better, slopes_now = excess < least, (relative[:, 1:] - relative[:, :1]) / (PROBE * self.lobe)
+            if not slopes.size:
+                slopes, logs, axes = slopes_now, relative[:, 0], axes_now
+            else:
+                slopes[is_better], logs[is_better] = slopes_now[is_better], relative[is_better, 0]
+                axes[is_better] = axes_now[is_better]
+                reach[~is_better] *= SHORTER
+            best, least = np.where(is_better[:, None], now, best), np.where(is_better, excess, least)
+            if least.min() <= GOOD:
+                break
+            expected = (logs[:, None] + (MOVES @ slopes) * reach[:, None, None]).max(axis=-1)
+            moves = reach[:, None] * MOVES[np.argmin(expected, axis=-1)]
+            now = _unit(best + np.einsum("ni,nij->nj", moves, axes))
+        if not len(starts):
+            return None, np.inf
+        first = int(np.argmin(least))
+        return best[first], float(least[first])
 
     def _specular(self, directions, samples: SurfaceSamples, dtype=np.float32) -> np.ndarray:
         """The specular radiance (D, P) of the light in each of the directions (D, 3) from the cursor.

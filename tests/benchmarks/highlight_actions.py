@@ -140,7 +140,7 @@ def actions_with_g_and_r(center, target, roughness):
 def actions_by_drag(center, target, roughness):
     """As `actions_with_g_and_r`: a click on the light, and a drag that ends at the target."""
     samples, _ = samples_at(target + 2.0 * STENCIL, roughness)
-    point = samples.position[len(STENCIL) // 2]
+    point = samples.position[0]
     distance = np.linalg.norm(center - point)
     light = MovedLight(lambda direction: matrix_at(point + distance * direction, point), light_at)
     place = place_for_highlight(samples, light)

@@ -10,6 +10,7 @@ from ltsh_addon.shading.highlight import STENCIL, MovedLight, mirrored, place_fo
 
 # A camera at EYE looks at the origin; a pixel is 1/500 of the distance wide.
 PIXEL = 0.002
+FEW = np.concatenate([STENCIL, 20.0 * np.random.default_rng(0).uniform(-0.7, 0.7, (100, 2))])
 AROUND = np.stack(np.meshgrid(np.arange(-20, 21), np.arange(-20, 21)), axis=-1).reshape(-1, 2)
 
 
@@ -81,9 +82,8 @@ class Scene:
 def drags():
     scenes = [scene for scene in map(Scene, range(24)) if scene.rays(STENCIL)[1].all()]
     lights = [MovedLight(scene.matrix_at, scene.light) for scene in scenes]
-    return [
-        (scene, place_for_highlight(scene.samples(STENCIL), light)) for scene, light in zip(scenes, lights, strict=True)
-    ]
+    samples = [scene.samples(FEW[scene.rays(FEW)[1]]) for scene in scenes]
+    return [(scene, place_for_highlight(*those)) for scene, *those in zip(scenes, samples, lights, strict=True)]
 
 
 def mirror(scene):

@@ -383,12 +383,14 @@ class ShownTextures:
         self._textures.clear()
 
     def color_at(self, use: ImageUse, uv: np.ndarray) -> np.ndarray | None:
-        """The linear color (3,) of an image at coordinates (2,) of its UV map; None where only Cycles knows it."""
+        """Linear colors (P, 3) of an image at coordinates (P, 2) of its UV map; None where only Cycles knows them."""
         key = use.image.session_uid, use.closest, use.extension
         if key not in self._textures:
             self._textures[key] = _texture(use)
         texture = self._textures[key]
-        return None if texture is None else texture.colors(np.array([[*uv, 1.0]]) @ np.array(use.mapping).T)[0]
+        if texture is None:
+            return None
+        return texture.colors(np.append(uv, np.ones((len(uv), 1)), axis=-1) @ np.array(use.mapping).T)
 
     def split(self, light: Light, factor: Value, notes: list[str]) -> list[Light] | None:
         """`light` times the image `factor` as patches; None where only Cycles knows the colors of the image.

@@ -12,10 +12,9 @@ from bpy_extras import view3d_utils
 from mathutils import Matrix, Vector
 
 from ...scene import error_line
-from ...shading.highlight import STENCIL
 from ..lights.groups import reason_to_stay
 from ..lights.textures import ShownTextures
-from .highlight_place import DISK, PIXELS, hits_around, note_by_pixels, place_of
+from .highlight_place import DISK, PIXELS, HitsAround, hits_around, note_by_pixels, place_by_pixels, place_of
 from .light_pose import (
     LightLook,
     LightPose,
@@ -296,9 +295,9 @@ class MovingGesture(Gesture):
         """With Ctrl let the mouse be at the nearest corner of the face under it, or at its middle."""
         region, mouse = view_under(context, self._mouse)
         hit = hit_at(context, region, mouse) if self._is_dragged and event.ctrl and region is not None else None
-        if hit is None or not len(hit.corners):
+        if hit is None or hit.face is None:
             return
-        places = (hit.matrix @ Vector(place) for place in (*hit.corners, hit.corners.mean(axis=0)))
+        places = (hit.matrix @ Vector(place) for place in (*hit.face.corners, hit.face.corners.mean(axis=0)))
         pixels = [view3d_utils.location_3d_to_region_2d(region, region.data, place) for place in places]
         pixels = np.array([pixel for pixel in pixels if pixel is not None])
         if len(pixels):
@@ -339,13 +338,13 @@ class LTSH_OT_drag_highlight(MovingGesture, bpy.types.Operator):
 
     def follow(self, context, event) -> bool:
         """As `press`."""
-        hits = self._hits(context, event, DISK)
-        if not hits:
+        around = self._hits(context, event, DISK)
+        if around is None:
             self._note = NO_SURFACE
             return False
-        middle = hits[0 if len(hits) == 1 else len(STENCIL) // 2].position
+        middle = around.hits[0].position
         self._distance = self._distance or max((self._pose.matrix.translation - middle).length, 1e-3)
-        matrix, note = place_of(self._light, self._pose, hits, self._distance, self._textures)
+        matrix, note = place_of(self._light, self._pose, around, self._distance, self._textures)
         if not all(self._free):
             way = locked_place(self._pose.matrix.translation, middle, matrix.translation, self._free) - middle
             matrix = self._pose.facing(middle, way.normalized(), way.length)
@@ -356,14 +355,20 @@ class LTSH_OT_drag_highlight(MovingGesture, bpy.types.Operator):
 
     def warning(self, context, event) -> str:
         """As `Gesture.warning`: by all pixels around the mouse."""
-        hits = self._hits(context, event, PIXELS)
-        return note_by_pixels(self._light, self._matrix, hits, self._textures) if hits else NO_SURFACE
+        around = self._hits(context, event, PIXELS)
+        if around is None:
+            return NO_SURFACE
+        if not all(self._free):
+            return note_by_pixels(self._light, self._matrix, around, self._textures)
+        self._matrix, note = place_by_pixels(self._light, self._pose, self._matrix, around, self._textures)
+        self._put(self._matrix)
+        return note
 
-    def _hits(self, context, event, disk) -> list[SurfaceHit]:
+    def _hits(self, context, event, disk) -> HitsAround | None:
         self._snap(context, event)
         region, mouse = view_under(context, self._mouse)
         if region is None:
-            return []
+            return None
         depsgraph, faces = context.evaluated_depsgraph_get(), {}
         return hits_around(lambda offset: hit_at(context, region, mouse + offset, depsgraph, faces), disk)
 

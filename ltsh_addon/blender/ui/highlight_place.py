@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from mathutils import Matrix, Vector
@@ -12,14 +12,14 @@ from mathutils import Matrix, Vector
 from ...cycles.horizons import end_at_horizons_of_cycles, unit, valid_specular_normal
 from ...scene import SurfaceSamples
 from ...shading import shade
-from ...shading.highlight import STENCIL, MovedLight, mirrored, place_for_highlight
+from ...shading.highlight import BRIGHTER, STENCIL, MovedLight, mirrored, place_for_highlight
 from ..evaluated import EmitterTraits
 from ..lights.area import area_light
 from ..lights.linking import Receivers, linked_objects, receiver_collection
 from ..lights.textures import ShownTextures
 from ..materials.preview_material import COAT, METALS, PreviewMaterial, preview_of
 from .light_pose import LightPose
-from .lit_point import SurfaceHit, shipped_table, value_at_hit
+from .lit_point import SurfaceHit, shipped_table, value_at_hits
 
 # SPACING: pixels between the nine rays around the mouse. DISK: further rays, pixels from it, in which no highlight may
 # be brighter than at the mouse: rings, denser near it.
@@ -28,17 +28,24 @@ DISK = np.concatenate([
     radius * np.stack([np.cos(turns), np.sin(turns)], axis=-1)
     for radius, count in RINGS for turns in [2.0 * np.pi * (np.arange(count) + 0.5 * (count % 4)) / count]
 ])  # fmt: skip
-# BRIGHTER: by how much a pixel around may be brighter. PIXELS: those that DISK stands for.
-BRIGHTER = 0.01
+# PIXELS: those that DISK stands for. NEAR: pixels from the mouse to a peak that counts as there.
+NEAR = 2.0
 _GRID = np.stack(np.meshgrid(np.arange(-20.0, 21.0), np.arange(-20.0, 21.0)), axis=-1).reshape(-1, 2)
 PIXELS = _GRID[np.hypot(*_GRID.T) <= 20.0]
 # Kinds of lobes without a highlight.
 DULL = ("diffuse", "sheen", "velvet", "translucent")
 NO_HIGHLIGHT = "this surface has no highlight"
-NO_PEAK = "no peak of the highlight here: the surface is seen too flat, or is too rough"
 BEHIND = "the light does not reach this side of the surface"
 BESIDE = "the surface bends: its highlight beside the mouse is brighter"
-AT_RIM = "the surface ends here: its highlight follows the mirrored view"
+
+
+@dataclass(frozen=True)
+class HitsAround:
+    """What a view shows of one surface around the mouse."""
+
+    hits: list[SurfaceHit]  # the one at the mouse first
+    pixels: np.ndarray  # (P, 2) of the hits, from the mouse
+    has_stencil: bool  # the first nine are those of STENCIL; False at rims
 
 
 def glossy_lobe(material) -> PreviewMaterial | None:
@@ -48,15 +55,15 @@ def glossy_lobe(material) -> PreviewMaterial | None:
 
 
 def samples_of(hits: list[SurfaceHit], lobe: PreviewMaterial, textures: ShownTextures) -> SurfaceSamples:
-    """Samples at `hits` of the reflection of one lobe, with its values at the middle one of the first nine, and the
-    normals of its normal map."""
-    count, white, middle = len(hits), np.ones((len(hits), 3)), hits[len(STENCIL) // 2 if len(hits) > 1 else 0]
+    """Samples at `hits` of the reflection of one lobe, with its values at the first one, and the normals of its normal
+    map."""
+    count, white = len(hits), np.ones((len(hits), 3))
     position, view, normal, true = (
         np.array([getattr(hit, name) for hit in hits]) for name in ("position", "view", "normal", "face_normal")
     )
     smooth, coat, brush = normal, lobe.coat if lobe.kind == COAT else None, lobe.brush
     if lobe.normal is not None:
-        normal = unit(np.array([_mapped_normal(hit, lobe, textures) for hit in hits]))
+        normal = _mapped_normals(hits, smooth, lobe, textures)
     bent = valid_specular_normal(normal, true, view) if lobe.corrected else normal
     anisotropy, tangent = 0.0, np.zeros((count, 3))
     if brush is not None:
@@ -68,12 +75,12 @@ def samples_of(hits: list[SurfaceHit], lobe: PreviewMaterial, textures: ShownTex
         turn = 2.0 * math.pi * brush.rotation
         tangent = beside + math.cos(turn) * (along - beside) + math.sin(turn) * np.cross(axis, along)
 
-    def at_middle(name: str) -> float:
-        return float(np.mean(value_at_hit(lobe.value(name), middle, textures)))
+    def first(name: str) -> float:
+        return float(np.mean(value_at_hits(lobe.value(name), hits[:1], textures)))
 
-    roughness = float(np.clip(coat.roughness if coat is not None else at_middle("roughness"), 0.0, 1.0))
-    is_metal = coat is None and (lobe.kind in METALS or at_middle("metallic") > 0.5)
-    ior = coat.ior if coat is not None else max(at_middle("ior"), 1.01)
+    roughness = float(np.clip(coat.roughness if coat is not None else first("roughness"), 0.0, 1.0))
+    is_metal = coat is None and (lobe.kind in METALS or first("metallic") > 0.5)
+    ior = coat.ior if coat is not None else max(first("ior"), 1.01)
     return SurfaceSamples(
         position=position, view=view, normal=bent, diffuse_normal=bent, geometric_normal=true,
         roughness=np.full(count, roughness), specular_f0=0.8 * is_metal * white, specular_f90=is_metal * white,
@@ -82,18 +89,19 @@ def samples_of(hits: list[SurfaceHit], lobe: PreviewMaterial, textures: ShownTex
     )  # fmt: skip
 
 
-def _mapped_normal(hit: SurfaceHit, lobe: PreviewMaterial, textures: ShownTextures) -> np.ndarray:
-    """The normal (3,) of a tangent space normal map."""
-    normal, frame = np.array(hit.normal), hit.uv_frame(lobe.uv_map)
-    if frame is None:
-        return normal
-    x, y, z = 2.0 * value_at_hit(lobe.normal, hit, textures) - 1.0
-    tangent = unit(frame[0] - (frame[0] @ normal) * normal)
+def _mapped_normals(hits: list[SurfaceHit], normals: np.ndarray, lobe: PreviewMaterial, textures) -> np.ndarray:
+    """The normals (P, 3) of a tangent space normal map on surfaces with `normals` (P, 3)."""
+    frames = [hit.uv_frame(lobe.uv_map) for hit in hits]
+    along_u, along_v = np.array([np.zeros((2, 3)) if frame is None else frame for frame in frames]).transpose(1, 0, 2)
+    x, y, z = (2.0 * value_at_hits(lobe.normal, hits, textures) - 1.0).T[..., None]
+    tangent = along_u - (along_u * normals).sum(axis=-1, keepdims=True) * normals
+    tangent /= np.maximum(np.linalg.norm(tangent, axis=-1, keepdims=True), 1e-30)
+    bitangent = np.cross(normals, tangent)
+    bitangent *= np.copysign(1.0, (along_v * bitangent).sum(axis=-1, keepdims=True))
     strength = lobe.normal_strength
     z = 1.0 + min(max(strength, 0.0), 1.0) * (z - 1.0)
-    bitangent = np.cross(normal, tangent)
-    bitangent *= math.copysign(1.0, frame[1] @ bitangent)
-    return strength * x * tangent + strength * y * bitangent + z * normal
+    mapped = strength * x * tangent + strength * y * bitangent + z * normals
+    return unit(np.where([[frame is None] for frame in frames], normals, mapped))
 
 
 def _brush_direction(hit: SurfaceHit, brush) -> np.ndarray:
@@ -104,20 +112,20 @@ def _brush_direction(hit: SurfaceHit, brush) -> np.ndarray:
     return hit.around("XYZ".index(brush.direction))
 
 
-def place_of(ob, pose: LightPose, hits: list[SurfaceHit], distance: float, textures: ShownTextures) -> tuple:
-    """The matrix of the light object `ob` for a highlight at the middle one of the nine first `hits`, which others of
-    the same surface around follow, or at the only one by its mirrored view; and what there is to say about it."""
-    hit = hits[len(STENCIL) // 2 if len(hits) > 1 else 0]
+def place_of(ob, pose: LightPose, around: HitsAround, distance: float, textures: ShownTextures) -> tuple:
+    """The matrix of the light object `ob` for a highlight at the mouse; and what there is to say about it."""
+    hit = around.hits[0]
     lobe = glossy_lobe(hit.material)
 
     def matrix_at(direction: np.ndarray) -> Matrix:
         return pose.facing(hit.position, Vector(direction), distance)
 
-    if lobe is None or len(hits) == 1:
-        return matrix_at(mirrored(np.array(hit.view), np.array(hit.normal))), NO_HIGHLIGHT if lobe is None else AT_RIM
+    if lobe is None:
+        return matrix_at(mirrored(np.array(hit.view), np.array(hit.normal))), NO_HIGHLIGHT
     light = MovedLight(lambda direction: np.array(matrix_at(direction)), lambda matrix: _light(ob, matrix))
-    place = place_for_highlight(samples_of(hits, lobe, textures), light, shipped_table())
-    note = (BESIDE if place.is_beside else NO_PEAK) if not place.is_peak else ""
+    samples = samples_of(around.hits, lobe, textures)
+    place = place_for_highlight(samples, light, shipped_table(), around.has_stencil)
+    note = "" if place.is_peak else BEHIND if math.isinf(place.excess) else BESIDE
     return matrix_at(place.direction), unlinked(ob, hit) or note or unread(hit.material)
 
 
@@ -134,21 +142,35 @@ def unread(material) -> str:
     return ", ".join(note for note in notes if "normals from" in note or "anisotropy" in note)
 
 
-def note_by_pixels(ob, matrix: Matrix, hits: list[SurfaceHit], textures: ShownTextures) -> str:
-    """Why the highlight of the light object `ob`, at `matrix` now, is not at the middle one of the nine first
-    `hits`, by all of them; "" where it is."""
+def note_by_pixels(ob, matrix: Matrix, around: HitsAround, textures: ShownTextures) -> str:
+    """Why the highlight of the light object `ob`, at `matrix` now, is not at the mouse, by all that is `around`; ""
+    where it is."""
+    hits = around.hits
     lobe = glossy_lobe(hits[0].material)
-    if len(hits) == 1 or lobe is None:
-        return NO_HIGHLIGHT if lobe is None else AT_RIM
+    if lobe is None:
+        return NO_HIGHLIGHT
     if note := unlinked(ob, hits[0]):
         return note
     samples, light = samples_of(hits, lobe, textures), _light(ob, np.array(matrix))
     samples, _ = end_at_horizons_of_cycles(samples, [light], np.zeros(len(samples), int))
     radiance = shade(samples, [light], shipped_table(), passes=("specular",), workers=1).specular.sum(axis=(0, 2))
-    here = radiance[len(STENCIL) // 2]
+    here = radiance[0]
     if here <= 0.0:
         return BEHIND
-    return unread(hits[0].material) if radiance.max() <= (1.0 + BRIGHTER) * here else BESIDE
+    is_there = radiance.max() <= (1.0 + BRIGHTER) * here or np.hypot(*around.pixels[np.argmax(radiance)]) <= NEAR
+    return unread(hits[0].material) if is_there else BESIDE
+
+
+def place_by_pixels(ob, pose: LightPose, matrix: Matrix, around: HitsAround, textures: ShownTextures) -> tuple:
+    """As `place_of`, by all pixels `around`, where the light object `ob` is not yet right at `matrix`: what shines
+    between the samples of a move is brighter. Takes too long for a move."""
+    note = note_by_pixels(ob, matrix, around, textures)
+    if note == BESIDE:
+        distance = (matrix.translation - around.hits[0].position).length
+        better, _ = place_of(ob, pose, around, distance, textures)
+        if (again := note_by_pixels(ob, better, around, textures)) != BESIDE:
+            return better, again
+    return matrix, note
 
 
 def _light(ob, matrix: np.ndarray):
@@ -156,17 +178,13 @@ def _light(ob, matrix: np.ndarray):
     return replace(area_light(ob, matrix, EmitterTraits("", True, True), Receivers([ob])), receivers=None)
 
 
-def hits_around(hit_at: Callable[[np.ndarray], SurfaceHit | None], disk: np.ndarray = DISK) -> list[SurfaceHit]:
-    """What a view shows around the mouse, by `hit_at` for pixels from there: nine hits at those of STENCIL, then those
-    of the same surface in the `disk` (P, 2); one or none at rims."""
-    nine = [hit_at(offset) for offset in SPACING * STENCIL]
-    at_mouse = nine[len(STENCIL) // 2]
+def hits_around(hit_at: Callable[[np.ndarray], SurfaceHit | None], disk: np.ndarray = DISK) -> HitsAround | None:
+    """What a view shows around the mouse in the `disk` (P, 2), by `hit_at` for pixels from there; None without a
+    surface at the mouse."""
+    stencil = SPACING * STENCIL
+    at_mouse, *near = map(hit_at, stencil)
     if at_mouse is None:
-        return []
-
-    def is_same(hit: SurfaceHit | None) -> bool:
-        return hit is not None and hit.ob == at_mouse.ob and hit.material == at_mouse.material
-
-    if not all(map(is_same, nine)):
-        return [at_mouse]
-    return [*nine, *filter(is_same, map(hit_at, disk))]
+        return None
+    hits, pixels = [at_mouse, *near, *map(hit_at, disk)], np.concatenate([stencil, disk])
+    same = [n for n, hit in enumerate(hits) if hit and (hit.ob, hit.material) == (at_mouse.ob, at_mouse.material)]
+    return HitsAround([hits[n] for n in same], pixels[same], same[: len(stencil)] == list(range(len(stencil))))

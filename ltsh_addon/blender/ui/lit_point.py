@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 import bpy
 import numpy as np
 from mathutils import Matrix, Vector
-from mathutils.interpolate import poly_3d_calc
 
 from ...cycles.horizons import end_at_horizons_of_cycles
 from ...cycles.lobes import LOBE_AOVS, LOBE_KINDS, SurfaceHits, samples_of_lobes
@@ -18,7 +17,7 @@ from ...lobes.lookup_table import LookupTable, load_table
 from ...scene import DEFAULT_TECHNIQUE, PolygonLight, SceneError, SurfaceSamples
 from ...shading import shade
 from ...visibility import ShadowSampling, trace_visibility
-from ..evaluated import visibility
+from ..evaluated import kind_of_normals, visibility
 from ..lights.linking import Receivers
 from ..lights.textures import ShownTextures
 from ..lights.world import light_of_world
@@ -35,28 +34,67 @@ UNKNOWN = np.full(3, 0.5)
 NAMED = 4
 
 
+class MeshFace:
+    """A face of a mesh, in its object, and the triangles in which Cycles interpolates."""
+
+    def __init__(self, mesh, number: int, has_vertex_normals: bool, is_flat: bool):
+        face = mesh.polygons[number]
+        loops, vertices = list(face.loop_indices), list(face.vertices)
+        self.slot, self.is_flat = face.material_index, is_flat
+        self.corners = np.array([mesh.vertices[vertex].co for vertex in vertices])  # (K, 3)
+        self.uv = {layer.name: np.array([layer.uv[loop].vector for loop in loops]) for layer in mesh.uv_layers}
+        rendered = [uv for layer, uv in zip(mesh.uv_layers, self.uv.values(), strict=True) if layer.active_render]
+        self.uv |= {"": rendered[0]} if rendered else {}
+        normals, at = (mesh.vertex_normals, vertices) if has_vertex_normals else (mesh.corner_normals, loops)
+        self._normals = np.array([normals[index].vector for index in at])
+        # Before a face of K corners its mesh has so many loops less two for each face.
+        first = face.loop_start - 2 * number
+        triangles = [mesh.loop_triangles[first + index].loops for index in range(len(loops) - 2)]
+        self._triangles = np.array(triangles) - face.loop_start  # (T, 3)
+        self._ends = self.corners[self._triangles[:, 2]]
+        edges = self.corners[self._triangles[:, :2]] - self._ends[:, None]
+        self._weights = np.linalg.pinv(edges.transpose(0, 2, 1))  # (T, 2, 3)
+        self._growth: dict[str, np.ndarray | None] = {}
+
+    def interpolated(self, place: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+        """The normal (3,) at a place (3,) of the object on the face, and its coordinates (2,) in each UV map."""
+        two = np.einsum("tij,tj->ti", self._weights, place - self._ends)
+        weights = np.append(two, 1.0 - two.sum(axis=-1, keepdims=True), axis=-1)
+        best = int(np.argmax(weights.min(axis=-1)))
+        weights, corners = weights[best], self._triangles[best]
+        return weights @ self._normals[corners], {name: weights @ uv[corners] for name, uv in self.uv.items()}
+
+    def growth(self, uv_map: str) -> np.ndarray | None:
+        """The vectors (2, 3) in the object along which u and v grow on the face; None without the map."""
+        if uv_map not in self._growth:
+            uv = self.uv.get(uv_map)
+            vectors = None
+            if uv is not None:
+                vectors = np.linalg.lstsq(uv - uv.mean(axis=0), self.corners - self.corners.mean(axis=0), rcond=None)[0]
+            self._growth[uv_map] = vectors
+        return self._growth[uv_map]
+
+
 @dataclass(frozen=True)
 class SurfaceHit:
     """What a ray of the view meets."""
 
     position: Vector
-    normal: Vector  # interpolated, towards the view
+    normal: Vector  # interpolated; where the surface is seen from behind, turned round
     view: Vector
     material: bpy.types.Material | None
     face_normal: Vector  # towards the view
     uv: dict[str, np.ndarray]  # (2,) by UV map; "" is the one that renders
     ob: bpy.types.Object  # the original
     matrix: Matrix  # of the object, or of the instance of it
-    corners: np.ndarray  # (K, 3) of its face, in the object; K = 0: not a mesh
-    corner_uv: dict[str, np.ndarray]  # (K, 2)
+    face: MeshFace | None  # None: not of a mesh
 
     def uv_frame(self, uv_map: str) -> tuple[np.ndarray, np.ndarray] | None:
         """The directions (3,) in the world in which u and v grow on the face; None where they do not."""
-        uv = self.corner_uv.get(uv_map)
-        if uv is None:
+        growth = None if self.face is None else self.face.growth(uv_map)
+        if growth is None:
             return None
-        grows = np.linalg.lstsq(uv - uv.mean(axis=0), self.corners - self.corners.mean(axis=0), rcond=None)[0]
-        along = grows @ np.array(self.matrix.to_3x3()).T
+        along = growth @ np.array(self.matrix.to_3x3()).T
         sizes = np.linalg.norm(along, axis=-1, keepdims=True)
         return tuple(along / sizes) if sizes.all() else None
 
@@ -71,41 +109,29 @@ class SurfaceHit:
 
 def surface_hit(scene, depsgraph, start: Vector, direction: Vector, faces: dict | None = None) -> SurfaceHit | None:
     """The first surface in a unit `direction` from `start`; None where there is none. Of many rays at once, those that
-    share the dictionary `faces` read each face once."""
-    is_hit, position, face_normal, face, ob, matrix = scene.ray_cast(depsgraph, start, direction)
+    share the dictionary `faces` read each mesh and face once."""
+    is_hit, position, normal, number, ob, matrix = scene.ray_cast(depsgraph, start, direction)
     if not is_hit:
         return None
-    mesh, slots, number, uv, corner_uv = ob.evaluated_get(depsgraph).data, ob.material_slots, 0, {}, {}
-    corners = np.zeros((0, 3))
-    normal = face_normal = -face_normal if face_normal.dot(direction) > 0.0 else face_normal
-    if isinstance(mesh, bpy.types.Mesh) and face < len(mesh.polygons):
-        faces, key = {} if faces is None else faces, (ob.session_uid, face)
+    mesh, slots, slot, uv, face = ob.evaluated_get(depsgraph).data, ob.material_slots, 0, {}, None
+    side = -1.0 if normal.dot(direction) > 0.0 else 1.0
+    face_normal = normal = side * normal
+    if isinstance(mesh, bpy.types.Mesh) and number < len(mesh.polygons):
+        faces, key = {} if faces is None else faces, (ob.session_uid, number)
+        if key[0] not in faces:
+            mesh.calc_loop_triangles()
+            faces[key[0]] = kind_of_normals(mesh)
         if key not in faces:
-            faces[key] = _face_of(mesh, face)
-        number, places, corners, normals, corner_uv = faces[key]
-        weights = np.array(poly_3d_calc(places, matrix.inverted_safe() @ position))
-        normal = (matrix.to_3x3().inverted_safe().transposed() @ Vector(weights @ normals)).normalized()
-        normal = -normal if normal.dot(direction) > 0.0 else normal
-        uv = {name: weights @ values for name, values in corner_uv.items()}
+            has_vertex_normals, flat = faces[key[0]]
+            faces[key] = MeshFace(mesh, number, has_vertex_normals, bool(flat[number]))
+        face = faces[key]
+        inverse, slot = matrix.inverted_safe(), face.slot
+        smooth, uv = face.interpolated(np.array(inverse @ position))
+        if not face.is_flat:
+            normal = (side * (inverse.to_3x3().transposed() @ Vector(smooth))).normalized()
     override = depsgraph.view_layer_eval.material_override
-    material = override or (slots[min(number, len(slots) - 1)].material if len(slots) else None)
-    return SurfaceHit(
-        position, normal, -direction, material, face_normal, uv, ob.original, matrix.copy(), corners, corner_uv
-    )
-
-
-def _face_of(mesh, face: int) -> tuple:
-    """The material slot of a face, its corners as a list of vectors and (K, 3), their normals (K, 3) and their UV
-    coordinates (K, 2) by map."""
-    polygon, uv = mesh.polygons[face], {}
-    loops = list(polygon.loop_indices)
-    places = [mesh.vertices[mesh.loops[index].vertex_index].co.copy() for index in loops]
-    normals = np.array([mesh.corner_normals[index].vector for index in loops])
-    for layer in mesh.uv_layers:
-        uv[layer.name] = np.array([layer.uv[index].vector for index in loops])
-        if layer.active_render:
-            uv[""] = uv[layer.name]
-    return polygon.material_index, places, np.array(places), normals, uv
+    material = override or (slots[min(slot, len(slots) - 1)].material if len(slots) else None)
+    return SurfaceHit(position, normal, -direction, material, face_normal, uv, ob.original, matrix.copy(), face)
 
 
 @functools.cache
@@ -114,12 +140,14 @@ def shipped_table() -> LookupTable:
     return load_table(DEFAULT_TECHNIQUE)
 
 
-def value_at_hit(value: Value, hit: SurfaceHit, textures: ShownTextures) -> np.ndarray:
-    """The value (3,) of a quantity of a material at `hit`."""
+def value_at_hits(value: Value, hits: list[SurfaceHit], textures: ShownTextures) -> np.ndarray:
+    """The values (P, 3) of a quantity of a material at P `hits`."""
     if value.is_constant:
-        return value.offset
-    color = textures.color_at(value.image, hit.uv.get(value.image.uv_map, np.zeros(2)))
-    return value.offset + value.matrix @ np.append(UNKNOWN if color is None else color, 1.0)
+        return np.tile(value.offset, (len(hits), 1))
+    uv = np.array([hit.uv.get(value.image.uv_map, np.zeros(2)) for hit in hits])
+    colors = textures.color_at(value.image, uv)
+    colors = np.tile(UNKNOWN, (len(hits), 1)) if colors is None else colors
+    return value.offset + np.append(colors, np.ones((len(hits), 1)), axis=-1) @ value.matrix.T
 
 
 def samples_at_hit(hit: SurfaceHit, textures: ShownTextures, receiver: int = 0) -> SurfaceSamples:
@@ -145,7 +173,8 @@ def samples_at_hit(hit: SurfaceHit, textures: ShownTextures, receiver: int = 0) 
 
 
 def _lobe_at(lobe: PreviewMaterial, hit: SurfaceHit, cosine: float, textures: ShownTextures) -> dict[str, np.ndarray]:
-    values = {name: value_at_hit(value, hit, textures) for name, value in lobe.values.items() if name in LOBE_AOVS}
+    read = {name: value for name, value in lobe.values.items() if name in LOBE_AOVS}
+    values = {name: value_at_hits(value, [hit], textures)[0] for name, value in read.items()}
     values |= {"kind": LOBE_KINDS[lobe.kind], "multiple_scattering": float(lobe.scattered)}
     values["weight"] = lobe.weight * np.ravel(values.get("weight", 1.0))[0] * _factor_of(lobe.view_factor, cosine)
     if lobe.coat is not None:

@@ -15,7 +15,14 @@ from ltsh_addon.blender.lights.groups import reason_to_stay
 from ltsh_addon.blender.lights.linking import Receivers
 from ltsh_addon.blender.lights.textures import ShownTextures
 from ltsh_addon.blender.ui import gestures
-from ltsh_addon.blender.ui.highlight_place import NO_HIGHLIGHT, glossy_lobe, note_by_pixels, place_of, samples_of
+from ltsh_addon.blender.ui.highlight_place import (
+    NO_HIGHLIGHT,
+    HitsAround,
+    glossy_lobe,
+    note_by_pixels,
+    place_of,
+    samples_of,
+)
 from ltsh_addon.blender.ui.light_pose import LightPose, locked_place, reason_to_keep_look
 from ltsh_addon.blender.ui.lit_point import surface_hit
 from ltsh_addon.shading import shade
@@ -49,9 +56,9 @@ def hits_at(scene, pixels, target):
 def test_the_highlight_is_where_the_mouse_is(scene, target):
     light = bpy.data.objects["Key"]
     hits = hits_at(scene, 2.0 * STENCIL, Vector(target))
-    matrix, note = place_of(light, LightPose.of(light), hits, 2.5, ShownTextures())
+    matrix, note = place_of(light, LightPose.of(light), HitsAround(hits, 2.0 * STENCIL, True), 2.5, ShownTextures())
     assert not note
-    middle = hits[len(hits) // 2]
+    middle = hits[0]
     assert (matrix.translation - middle.position).length == pytest.approx(2.5, rel=1e-5)
     facing = -matrix.col[2].xyz
     assert facing.dot((middle.position - matrix.translation).normalized()) == pytest.approx(1.0, abs=1e-5)
@@ -83,12 +90,12 @@ def test_dull_surfaces_say_so_and_a_sun_stays_where_it_is(scene):
     bpy.data.objects["Plane"].data.materials[0] = parts.bsdf_material("ShaderNodeBsdfDiffuse")[0]
     hits = hits_at(scene, 2.0 * STENCIL, Vector((1.3, -0.8, 0.0)))
     key = bpy.data.objects["Key"]
-    _, note = place_of(key, LightPose.of(key), hits, 2.0, ShownTextures())
+    _, note = place_of(key, LightPose.of(key), HitsAround(hits, 2.0 * STENCIL, True), 2.0, ShownTextures())
     assert note == NO_HIGHLIGHT
     sun = parts.link(bpy.data.objects.new("Sun", bpy.data.lights.new("Sun", "SUN")), (1.0, 2.0, 3.0))
     bpy.context.view_layer.update()
     hits = hits_at(scene, 2.0 * STENCIL, Vector((0.2, -0.5, 1.1)))
-    matrix, note = place_of(sun, LightPose.of(sun), hits, 2.0, ShownTextures())
+    matrix, note = place_of(sun, LightPose.of(sun), HitsAround(hits, 2.0 * STENCIL, True), 2.0, ShownTextures())
     assert not note and matrix.translation == sun.matrix_world.translation
 
 
@@ -397,9 +404,9 @@ def test_driven_linked_and_unlinked_lights_say_so(scene, tmp_path):
     hits = hits_at(scene, 2.0 * STENCIL, Vector((0.2, -0.5, 1.1)))
     light.light_linking.receiver_collection = receivers = bpy.data.collections.new("Lit")
     receivers.objects.link(bpy.data.objects["Plane"])
-    matrix, note = place_of(light, LightPose.of(light), hits, 2.5, ShownTextures())
+    matrix, note = place_of(light, LightPose.of(light), HitsAround(hits, 2.0 * STENCIL, True), 2.5, ShownTextures())
     assert note == "Key does not light Sphere, by light linking"
-    assert note_by_pixels(light, matrix, hits, ShownTextures()) == note
+    assert note_by_pixels(light, matrix, HitsAround(hits, 2.0 * STENCIL, True), ShownTextures()) == note
     assert light.light_linking.receiver_collection == receivers
     # Of another file.
     bpy.data.libraries.write(str(tmp_path / "lights.blend"), {light})

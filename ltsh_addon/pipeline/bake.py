@@ -216,13 +216,12 @@ class ObjectBaker:
         of_members = np.zeros(len(self.record["members"]), np.int64)
         rows, height = block_rows(options), options.size[1]
         points, spread = options.sub_samples, TilePoints(self, tile, self._threads())
-        facts, seams = {}, None
-        if options.bounces == "on":
-            facts, seams = self._take_bounces(spread, progress)
+        facts, seams = self._take_bounces(spread, progress) if options.bounces == "on" else ({}, None)
 
         def shaded(task):
             return *task, self._block(spread, *task)
 
+        self._tell(progress, "shade", 0.0)
         firsts, sums = range(0, height, rows), {}
         tasks = ((first, point) for first in firsts for point in range(points))
         for number, (first, point, block) in enumerate(_in_order(shaded, tasks, self._threads())):
@@ -246,9 +245,7 @@ class ObjectBaker:
                     errors.add_halves(pass_name, a, b)
                     for name in self.tables:
                         errors.add(name, pass_name, planes_of[layer_name(name, pass_name)], a, b)
-            share = (number + 1) / (len(firsts) * points)
-            if progress is not None and progress(f"shade {self.record['name']}", share) is False:
-                raise Cancelled("the bake was stopped")
+            self._tell(progress, "shade", (number + 1) / (len(firsts) * points))
         counts = {"texels": covered, "covered_times": covers, "overlapping_texels": overlaps}
         if options.atlas is not None:
             counts["member_texels"] = dict(zip(self.record["members"], of_members.tolist(), strict=True))
@@ -256,12 +253,16 @@ class ObjectBaker:
             planes.fit(seams)
         return {**counts, "unshaded_texels": unshaded, "unbaked_texels": unbaked, "is_lit": lit, **facts}
 
+    def _tell(self, progress, stage: str, share: float) -> None:
+        """Report the share of a stage that is done. Raises Cancelled."""
+        if progress is not None and progress(f"{stage} {self.record['name']}", share) is False:
+            raise Cancelled("the bake was stopped")
+
     def _take_bounces(self, spread, progress) -> tuple[dict, SeamFit]:
         """Denoise the bounced light of the texels; returns entries of the tile's record, and what fits its seams."""
         width, height = self.options.size
         triangle, guides = np.full(height * width, -1), np.zeros((height * width, 6), np.float32)
-        if progress is not None and progress(f"denoise {self.record['name']}", 0.0) is False:
-            raise Cancelled("the bake was stopped")
+        self._tell(progress, "denoise", 0.0)
         for first in range(0, height, block_rows(self.options)):
             texels, maps, _ = spread.at(first, 0)
             at, read_map = texels.index + first * width, _map_reader(maps, texels)

@@ -321,7 +321,9 @@ class ObjectBaker:
         points = self.options.sub_samples if chosen is None else EDGE_POINTS
         texels, maps, weights = spread.at(first, point) if chosen is None else spread.at_edges(first, point, chosen)
         read_map = _map_reader(maps, texels)
-        samples, texel = texel_samples(self.mesh, self.materials, texels, read_map, self.view, self.lights)
+        # Lights only say where specular lobes end.
+        lights = self.lights if "specular" in shaded_passes(self.options) else ()
+        samples, texel = texel_samples(self.mesh, self.materials, texels, read_map, self.view, lights)
         images, shadows, bounces, soft = {}, None, {}, {}
         if self.options.bounces == "on":
             color = _summed(samples.diffuse_albedo[None], texel, len(texels.index))[0]
@@ -410,13 +412,11 @@ class TilePoints:
         self._width = baker.manifest["sampled_texels"]
         self._triangles = uv.UvTriangles.in_tile(baker.mesh.uv, *options.size, _column_and_row(tile))
         self._at_centers = bakes_centers_alone(options, baker.record)
-        self.rest, self._baked, size = {}, None, options.size
+        self.rest, self._baked = {}, None
         if options.bounces == "on":
-            rows = range(len(baker.groups) if options.per_light else 1)
-            keys = [*itertools.product(lightmap.rest_passes(options.passes), rows)]
-            keys += [(lightmap.SOFT, 0)] if baker.soft_lights else []
-            self.rest = {key: lightmap.read_rest(baker.folder, key, tile, size) for key in keys}
-            self._baked = next(iter(self.rest.values()))[..., 0] != np.float32(NOT_BAKED)
+            self.rest, self._baked = lightmap.read_rest(
+                baker.folder, tile, options, baker.groups, bool(baker.soft_lights)
+            )
         # The points of a block are shaded one after another, so few blocks need to be cached.
         cached = functools.lru_cache(maxsize=2 + threads // options.sub_samples)
         self.texels, self._weights_of = cached(self._covered), cached(self._fitted_weights)

@@ -15,7 +15,7 @@ import numpy as np
 
 from ...cycles.gbuffer import rounded_positions
 from ...cycles.texels import NOT_BAKED, BakeView, TexelMesh
-from ...cycles.uv import tiles_of
+from ...cycles.uv import column_and_row, tiles_of
 from ...files import save_array
 from ...scene import ATLAS, error_line, light_records
 from .. import render_settings
@@ -55,7 +55,7 @@ class Block:
 
     def placed(self, uv: np.ndarray) -> np.ndarray:
         """`uv` (N, 2), moved and scaled so that the block fills the unit square."""
-        column, row = (self.tile - 1001) % 10, (self.tile - 1001) // 10
+        column, row = column_and_row(self.tile)
         v = (uv[:, 1] - row) * (self.height / self.rows) - self.first_row / self.rows
         return np.stack([uv[:, 0] - column, v], axis=-1)
 

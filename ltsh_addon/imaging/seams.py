@@ -29,7 +29,7 @@ FRAMES, MOST_CANVAS, STEP = (8, 4, 2), 6.0, 0.7
 LEAST_WEIGHT = 0.25
 # What fits seams: RINGS of texels around them change, SMOOTHLY; COVERED and MARGIN texels resist a change so much,
 # relative to a step at a seam. PRECISION: of the solution, relative. MOST_STEPS: of the solver.
-RINGS, SMOOTHLY, COVERED, MARGIN, PRECISION, MOST_STEPS = 3, 0.01, 0.01, 0.001, 1e-4, 200
+RINGS, SMOOTHLY, COVERED, MARGIN, PRECISION, MOST_STEPS = 3, 0.01, 0.1, 0.001, 1e-4, 200
 # MARGIN_TEXELS: how far the margin beside a seam shows the surface beyond it, so that lookups near the seam do.
 MARGIN_TEXELS = 2.0
 

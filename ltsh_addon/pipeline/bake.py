@@ -164,7 +164,7 @@ class ObjectBaker:
         self.view = BakeView(**manifest["view"])
         self.groups = lighting.light_groups(self.lights)
         self.tiles, self.area = uv.tiles_of(self.mesh.uv)
-        self.compared = options.passes if options.error else ()
+        self.compared, self._trace_progress = options.passes if options.error else (), None
 
     def bake(self, stem: str, tiles: list[int], progress) -> TaskResult:
         """Write the files of `tiles` (empty: all tiles). The report is the object's entry in the whole report."""
@@ -216,14 +216,15 @@ class ObjectBaker:
         of_members = np.zeros(len(self.record["members"]), np.int64)
         rows, height = block_rows(options), options.size[1]
         points, spread = options.sub_samples, TilePoints(self, tile, self._threads())
-        facts, seams = {}, None
-        if options.bounces == "on":
-            facts, seams = self._take_bounces(spread, progress)
+        facts, seams = self._take_bounces(spread, progress) if options.bounces == "on" else ({}, None)
 
         def shaded(task):
             return *task, self._block(spread, *task)
 
-        firsts, sums = range(0, height, rows), {}
+        self._tell(progress, "shade", 0.0)
+        firsts, sums, is_refined = range(0, height, rows), {}, options.bounces == "on" and points < EDGE_POINTS
+        if len(firsts) * points == 1:  # Nothing else tells how far a single block is.
+            self._trace_progress = lambda _, share: self._tell(progress, "shade", share * (0.3 if is_refined else 0.9))
         tasks = ((first, point) for first in firsts for point in range(points))
         for number, (first, point, block) in enumerate(_in_order(shaded, tasks, self._threads())):
             sums = {name: sums[name] + values for name, values in block.items()} if point else block
@@ -246,9 +247,7 @@ class ObjectBaker:
                     errors.add_halves(pass_name, a, b)
                     for name in self.tables:
                         errors.add(name, pass_name, planes_of[layer_name(name, pass_name)], a, b)
-            share = (number + 1) / (len(firsts) * points)
-            if progress is not None and progress(f"shade {self.record['name']}", share) is False:
-                raise Cancelled("the bake was stopped")
+            self._tell(progress, "shade", (number + 1) / (len(firsts) * points))
         counts = {"texels": covered, "covered_times": covers, "overlapping_texels": overlaps}
         if options.atlas is not None:
             counts["member_texels"] = dict(zip(self.record["members"], of_members.tolist(), strict=True))
@@ -256,12 +255,16 @@ class ObjectBaker:
             planes.fit(seams)
         return {**counts, "unshaded_texels": unshaded, "unbaked_texels": unbaked, "is_lit": lit, **facts}
 
+    def _tell(self, progress, stage: str, share: float) -> None:
+        """Report the share of a stage that is done. Raises Cancelled."""
+        if progress is not None and progress(f"{stage} {self.record['name']}", share) is False:
+            raise Cancelled("the bake was stopped")
+
     def _take_bounces(self, spread, progress) -> tuple[dict, SeamFit]:
         """Denoise the bounced light of the texels; returns entries of the tile's record, and what fits its seams."""
         width, height = self.options.size
         triangle, guides = np.full(height * width, -1), np.zeros((height * width, 6), np.float32)
-        if progress is not None and progress(f"denoise {self.record['name']}", 0.0) is False:
-            raise Cancelled("the bake was stopped")
+        self._tell(progress, "denoise", 0.0)
         for first in range(0, height, block_rows(self.options)):
             texels, maps, _ = spread.at(first, 0)
             at, read_map = texels.index + first * width, _map_reader(maps, texels)
@@ -321,7 +324,9 @@ class ObjectBaker:
         points = self.options.sub_samples if chosen is None else EDGE_POINTS
         texels, maps, weights = spread.at(first, point) if chosen is None else spread.at_edges(first, point, chosen)
         read_map = _map_reader(maps, texels)
-        samples, texel = texel_samples(self.mesh, self.materials, texels, read_map, self.view, self.lights)
+        # Lights only say where specular lobes end.
+        lights = self.lights if "specular" in shaded_passes(self.options) else ()
+        samples, texel = texel_samples(self.mesh, self.materials, texels, read_map, self.view, lights)
         images, shadows, bounces, soft = {}, None, {}, {}
         if self.options.bounces == "on":
             color = _summed(samples.diffuse_albedo[None], texel, len(texels.index))[0]
@@ -331,7 +336,8 @@ class ObjectBaker:
             passes = sorted({name.removesuffix("_light") for name in passes_of_cycles(self.options)})
             workers = 1 if self._threads() > 1 else None
             sampling = self._sampling(passes, first, texels.index[texel], points)
-            shadows = self.tracer.trace(samples, sampling, workers=workers)
+            told = self._trace_progress if chosen is None else None
+            shadows = self.tracer.trace(samples, sampling, workers=workers, progress=told)
         for name, table in self.tables.items():
             for pass_name, radiance in self._passes(samples, texel, len(texels.index), table, shadows).items():
                 layer = layer_name(name, pass_name)
@@ -408,15 +414,13 @@ class TilePoints:
         self._options, self._folder, self._tile = options, baker.folder, tile
         self._mapped = baker.record["maps"]
         self._width = baker.manifest["sampled_texels"]
-        self._triangles = uv.UvTriangles.in_tile(baker.mesh.uv, *options.size, _column_and_row(tile))
+        self._triangles = uv.UvTriangles.in_tile(baker.mesh.uv, *options.size, uv.column_and_row(tile))
         self._at_centers = bakes_centers_alone(options, baker.record)
-        self.rest, self._baked, size = {}, None, options.size
+        self.rest, self._baked = {}, None
         if options.bounces == "on":
-            rows = range(len(baker.groups) if options.per_light else 1)
-            keys = [*itertools.product(lightmap.rest_passes(options.passes), rows)]
-            keys += [(lightmap.SOFT, 0)] if baker.soft_lights else []
-            self.rest = {key: lightmap.read_rest(baker.folder, key, tile, size) for key in keys}
-            self._baked = next(iter(self.rest.values()))[..., 0] != np.float32(NOT_BAKED)
+            self.rest, self._baked = lightmap.read_rest(
+                baker.folder, tile, options, baker.groups, bool(baker.soft_lights)
+            )
         # The points of a block are shaded one after another, so few blocks need to be cached.
         cached = functools.lru_cache(maxsize=2 + threads // options.sub_samples)
         self.texels, self._weights_of = cached(self._covered), cached(self._fitted_weights)
@@ -492,11 +496,6 @@ def bakes_centers_alone(options: BakeOptions, record: dict) -> bool:
 def _map_reader(maps, texels):
     """The function that returns map `number` (Q, 3) at the `texels`."""
     return lambda number: maps[number].reshape(-1, 3)[texels.index]
-
-
-def _column_and_row(tile: int) -> tuple[int, int]:
-    """Column and row of a UDIM tile."""
-    return (tile - 1001) % 10, (tile - 1001) // 10
 
 
 def _in_order(function, items, threads: int):

@@ -18,7 +18,7 @@ from ..lobes import edge_integrals, lookup_table
 from ..lobes.lookup_table import LookupTable
 
 # Raise this when a function of core.h changes: headers of different versions then refuse to be included together.
-CORE_VERSION = 7
+CORE_VERSION = 8
 _HALF_ARC_NODES = 16
 
 
@@ -53,6 +53,8 @@ def core_text() -> str:
         "ONE_OVER_PI": float_literal(1.0 / np.pi),
         "FOUR_PI": float_literal(4.0 * np.pi),
         "NEAR_SQUARED": float_literal(tails.NEAR_RADII**2),
+        "ONE_THIRD": float_literal(1.0 / 3.0),
+        "TAIL_SLACK": float_literal(tails.SLACK),
         "ARC_NODES": "\n".join(_arc_node_lines()),
     }
     return filled(source_text(Path(__file__).with_name("glsl") / "core.h"), values)

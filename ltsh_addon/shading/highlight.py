@@ -29,11 +29,11 @@ RIGID, SPATIAL = 1e-5, (
 # a search: what is between samples may be a little brighter than they are. GOOD: with less, it ends.
 BRIGHTER, STRICT, GOOD = 0.01, 0.006, 0.003
 # Where Newton's method fails, directions around the mirrored view are tried: on circles at ANGLES rad, TURNS on each,
-# by the first samples and every THINNED-th of the others. The STARTS best ones with at least DIM of the radiance of the
-# mirrored view are searched from, by MOST_MOVES moves of at most REACH times the lobe, which a move that leads to no
-# better place makes SHORTER.
-ANGLES, TURNS, THINNED, DIM, STARTS = (0.04, 0.12, 0.25, 0.5, 0.8), 8, 4, 0.1, 2
-MOST_MOVES, REACH, SHORTER = 5, 0.5, 0.3
+# by the first samples and every THINNED-th of the others. Searches from the best ones with at least DIM of the radiance
+# of the mirrored view take moves of at most REACH times the lobe, which a move that leads to no better place makes
+# SHORTER. QUICK, THOROUGH: how many searches, and moves of each.
+ANGLES, TURNS, THINNED, DIM = (0.04, 0.12, 0.25, 0.5, 0.8), 8, 4, 0.1
+REACH, SHORTER, QUICK, THOROUGH = 0.5, 0.3, (2, 5), (4, 12)
 # MOVES: the moves (M, 2) that are looked at, in units of the longest.
 MOVES = np.concatenate([
     radius * np.stack([np.cos(turns), np.sin(turns)], axis=-1)
@@ -68,14 +68,14 @@ def mirrored(view: np.ndarray, normal: np.ndarray) -> np.ndarray:
 
 
 def place_for_highlight(
-    samples: SurfaceSamples, light: MovedLight, technique="ltsh4c", has_stencil=True
+    samples: SurfaceSamples, light: MovedLight, technique="ltsh4c", has_stencil=True, is_thorough=False
 ) -> HighlightPlace:
     """The direction for which the specular radiance of a light has its peak at the first one of the `samples`; no other
     may be brighter.
 
     If the first nine are those of the pixels of STENCIL: Newton's method for the gradient of the logarithm of the
     radiance, which is 0 at the peak, from the mirrored view on: of rough and curved surfaces the peak is elsewhere.
-    Where that fails, the directions around are tried.
+    Where that fails, the directions around are tried; if `is_thorough`, many more.
     """
     mirror = mirrored(samples.view[0], samples.normal[0])
     problem = _Problem(samples, light, technique, max(float(samples.sharpest_roughness[0]) ** 2, 1e-3))
@@ -83,7 +83,9 @@ def place_for_highlight(
     excess = float(problem.excess([direction])[0][0])
     if is_peak and excess <= STRICT:
         return HighlightPlace(direction, excess)
-    searched, least = problem.by_search(problem.starts(mirror, [direction] if excess < np.inf else []))
+    count, moves = THOROUGH if is_thorough else QUICK
+    starts = problem.starts(mirror, [direction] if excess < np.inf else [])
+    searched, least = problem.by_search(starts[:count], moves)
     if least < excess:
         direction, excess = searched, least
     return HighlightPlace(direction, excess)
@@ -135,10 +137,10 @@ class _Problem:
         few = np.concatenate([np.arange(len(STENCIL)), np.arange(len(STENCIL), len(self.samples), THINNED)])
         excess, radiance = self.excess(tried, self.samples.take(few[few < len(self.samples)]))
         excess[radiance < DIM * radiance[0]] = np.inf
-        order = np.argsort(excess)[:STARTS]
+        order = np.argsort(excess)
         return tried[order[excess[order] < np.inf]]
 
-    def by_search(self, starts: np.ndarray) -> tuple[np.ndarray | None, float]:
+    def by_search(self, starts: np.ndarray, most_moves: int) -> tuple[np.ndarray | None, float]:
         """The direction (3,) with the least excess to which searches from `starts` (N, 3) lead, and that excess.
 
         Each move is the one with the least excess by first differences of the logarithms of all samples (a minimax
@@ -147,7 +149,7 @@ class _Problem:
         best, least = starts, np.full(len(starts), np.inf)
         slopes = axes = np.zeros((len(starts), 2, 0))
         logs, reach, now = np.zeros((len(starts), 0)), np.full(len(starts), REACH * self.lobe), starts
-        for _ in range(MOST_MOVES if len(starts) else 0):
+        for _ in range(most_moves if len(starts) else 0):
             axes_now = np.array([_axes(direction) for direction in now])
             tried = np.concatenate([now[:, None], _unit(now[:, None] + PROBE * self.lobe * axes_now)], axis=1)
             radiance = self._specular(tried.reshape(-1, 3), self.samples).reshape(len(now), 3, -1)

@@ -438,8 +438,10 @@ class RatioEstimator:
         if self.rounding:
             ends = np.clip(distances - self.rounding / np.maximum(falling, _TINY), _ZERO, ends)
         transmittance = self.surface.tracer.transmittance(origins.T, directions.T, ends, masks)
-        share = self.surface.ray_origins.past_touching(index, directions, mask)
-        return transmittance if share is None else transmittance * share
+        if (touching := self.surface.ray_origins.past_touching(index, directions, mask)) is not None:
+            rays, share = touching
+            transmittance[rays] *= share
+        return transmittance
 
     def _add_rays(self, members, first, last, split, order=None):
         """Trace the rays `first` to `last` of the pairs `members` (M,). `split` is a column of EVENLY."""

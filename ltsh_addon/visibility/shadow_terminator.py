@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import cached_property
 
 import numpy as np
 
@@ -210,13 +211,20 @@ class RayOrigins:
         lift = self.lift[:, index]
         return RayOrigins(*(lift if each.name == "lift" else getattr(self, each.name)[index] for each in fields(self)))
 
-    def past_touching(self, index: np.ndarray, directions: np.ndarray, masks: np.ndarray) -> np.ndarray | None:
-        """The shares (R,) that the faces which touch the samples `index` (R,) let through of rays with `masks` (R,)
-        along `directions` (3, R); None where there is no such face."""
-        if not self.touching.any():
+    def past_touching(self, index: np.ndarray, directions: np.ndarray, masks: np.ndarray) -> tuple | None:
+        """The rays (H,) that meet faces which touch their samples, and the shares (H,) that these let through; of rays
+        from the samples `index` (R,) along `directions` (3, R) with `masks`. None where nothing touches."""
+        if not self.is_touched:
             return None
-        blocked = (self.touching[index] & masks != 0) & (dot(self.geometric_normal[index].T, directions) > 0.0)
-        return np.where(blocked, self.touching_share[index], np.float32(1.0))
+        rays = np.flatnonzero(self.touching[index] & masks)
+        sample = index[rays]
+        meets = dot(self.geometric_normal[sample].T, directions[:, rays]) > 0.0
+        return rays[meets], self.touching_share[sample[meets]]
+
+    @cached_property
+    def is_touched(self) -> bool:
+        """True if a face touches one of the samples."""
+        return bool(self.touching.any())
 
     def origins(self, index: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Origins (R, 3) of rays along unit `directions` (R, 3) from the samples `index` (R,)."""

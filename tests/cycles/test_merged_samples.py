@@ -70,3 +70,72 @@ def test_points_that_share_a_shadow_are_alike_and_stand_for_all():
     np.testing.assert_allclose(small.coverage(), 1.0, atol=1e-6)
     apart = leaders.position[place] - merged.position
     assert np.abs((apart * merged.geometric_normal).sum(axis=1)).max() < 0.2 * np.linalg.norm(apart, axis=1).max()
+
+
+def ball(points, seed, roughness, side=12):
+    """Samples of the top of a shiny ball, seen from above in square pixels that turn by 2 degrees each way."""
+    random = np.random.default_rng(seed)
+    pixel = np.tile(np.arange(side * side), points)
+    inside = random.random((len(pixel), 2))
+    # A point in each strip of a pixel.
+    inside[:, 0] = (np.repeat(np.arange(points), side * side) + inside[:, 0]) / points
+    place = np.stack([pixel % side, pixel // side], axis=1) + inside - 0.5 * side
+    normal = np.concatenate([np.radians(2.0) * place, np.ones((len(pixel), 1))], axis=1)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    one = single_sample(roughness=roughness).take(np.zeros(len(pixel), int))
+    one = replace(one, specular_f0=np.ones((len(pixel), 3)))
+    fields = {name: normal for name in ("normal", "diffuse_normal", "geometric_normal", "smooth_normal")}
+    view = np.broadcast_to([0.0, 0.0, 1.0], normal.shape)
+    return replace(one, position=normal, view=view, **fields), Film(side, side, pixel, points)
+
+
+def picture(samples, film):
+    """Specular light of a small lamp, by GGX itself."""
+    lamp = np.array([0.3, 0.1, 3.0])
+    direction = lamp - samples.position
+    distance = np.linalg.norm(direction, axis=1, keepdims=True)
+    direction /= distance
+    half = samples.view + direction
+    half /= np.linalg.norm(half, axis=1, keepdims=True)
+    cosine, alpha = (half * samples.normal).sum(axis=1), samples.roughness**2
+    density = alpha**2 / (np.pi * (1.0 + (alpha**2 - 1.0) * cosine**2) ** 2)
+    return film.image(density / distance[:, 0] ** 2)
+
+
+@pytest.mark.parametrize("points", [3, 8])
+def test_highlights_thinner_than_pixels_do_not_fall_between_points(points):
+    # The highlight is a tenth of a pixel wide.
+    truth = picture(*ball(2000, 0, 0.05))
+    errors = []
+    for seed in range(60):
+        samples, film = ball(points, seed, 0.05)
+        errors.append([picture(one, film) - truth for one in (samples, gbuffer.with_widened_lobes(samples, film))])
+    plain, widened = np.sqrt(np.square(errors).mean(axis=(0, 2, 3)))
+    # Twice as many points, or more, would have this error without wider lobes.
+    assert widened < 0.65 * plain
+
+
+def test_what_is_flat_or_an_edge_or_rough_stays_as_sharp():
+    samples, film = hits(0)
+    np.testing.assert_array_equal(gbuffer.with_widened_lobes(samples, film).roughness, samples.roughness)
+    # Two walls at a right angle in each pixel.
+    wall = np.where((np.arange(len(samples)) % 2 == 0)[:, None], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+    walls = replace(samples, **dict.fromkeys(("normal", "geometric_normal"), wall))
+    np.testing.assert_array_equal(gbuffer.with_widened_lobes(walls, film).roughness, samples.roughness)
+    bent, film = hits(0, bend=0.3)
+    widened = gbuffer.with_widened_lobes(bent, film).roughness
+    assert (widened >= bent.roughness).all() and widened.max() < 1.01 * bent.roughness.max()
+
+
+def test_each_axis_of_a_brushed_lobe_takes_the_same_in():
+    samples, film = ball(4, 1, 0.2)
+    samples = replace(samples, anisotropy=np.full(len(samples), 0.5))
+    widened = gbuffer.with_widened_lobes(samples, film)
+
+    def squares(one):
+        alpha, across = one.roughness**2, 1.0 - one.anisotropy
+        return np.square([alpha / across, alpha * across])
+
+    added = squares(widened) - squares(samples)
+    np.testing.assert_allclose(added[0], added[1], rtol=1e-9, atol=1e-12)
+    assert (added > 0.0).all()

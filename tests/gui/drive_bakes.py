@@ -28,10 +28,20 @@ def main(rig):
     rig.check(set(states.values()) == {"done"}, f"without bounces all are others: {states}")
     material = bpy.data.objects["Box"].material_slots[0].material
     material.node_tree.nodes["Principled BSDF"].inputs["Base Color"].default_value = (0.1, 0.3, 0.9, 1.0)
+    states = yield from baked(rig, "color")
+    # Direct light on the others does not depend on it.
+    rig.check(of(states, "done") == {"Box"}, f"a new color is baked again, and nothing else: {states}")
+    bpy.context.scene.camera.location.x = 1.0
+    states = yield from baked(rig, "camera")
+    rig.check(not of(states, "done"), f"seen from above, none needs the camera: {states}")
     bpy.data.objects["Ball"].scale.z = 1.5
-    states = yield from baked(rig, "changed")
-    rig.check(states["Box"] == "done", f"another color is baked again: {states}")
-    rig.check(states["Ball"] == "done", f"and another shape: {states}")
+    states = yield from baked(rig, "shape")
+    rig.check(of(states, "done") == set(states), f"another shape has other shadows on all: {states}")
+
+
+def of(states, state):
+    """The objects of a state."""
+    return {name for name, one in states.items() if one == state}
 
 
 def scene(rig):

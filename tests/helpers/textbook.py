@@ -86,8 +86,9 @@ def mirror_direction(cos_theta_o):
     return view_direction(cos_theta_o) * np.array([-1.0, 1.0, 1.0])
 
 
-def tail_bounds(view, roughness, light):
-    """(least, greatest) integral for F = 1 at the origin, normal z; None for lights without limits."""
+def tail_values(view, roughness, light):
+    """The integral for F = 1 at the origin, normal z, if the integrand were everywhere as at the center, and at each
+    corner, (5,); None for lights without limits."""
     signs = ((0, 0), (1, 1), (1, -1), (-1, 1), (-1, -1))
     points = [light.center + s * light.half_u + t * light.half_v for s, t in signs]
     distance, radius = np.linalg.norm(light.center), max(np.linalg.norm(p - light.center) for p in points)
@@ -101,10 +102,23 @@ def tail_bounds(view, roughness, light):
         length = np.linalg.norm(point)
         brdf = ggx_brdf(view, point / length, roughness**2) if point[2] > 0.0 else 0.0
         values.append(brdf * max(point[2], 0.0) * area * abs(light.direction @ point) / length**4)
-    return min(values), max(values)
+    return np.array(values)
+
+
+def tail_bounds(view, roughness, light):
+    """(least, greatest) of `tail_values`; None for lights without limits."""
+    values = tail_values(view, roughness, light)
+    return None if values is None else (values.min(), values.max())
 
 
 def within_tail_bounds(value, view, roughness, light):
-    """`value` between the bounds, if there are any."""
-    limits = tail_bounds(view, roughness, light)
-    return value if limits is None else min(max(value, limits[0]), limits[1])
+    """`value` between the bounds, if there are any: for a rectangle above the horizon those of the rule of degree 3."""
+    values = tail_values(view, roughness, light)
+    if values is None:
+        return value
+    least, most = values.min(), values.max()
+    if least > 0.0:
+        mean = values @ [8, 1, 1, 1, 1] / 12.0
+        slack = 0.2 * mean * ((most - least) / (most + least)) ** 4
+        least, most = max(least, mean - slack), min(most, mean + slack)
+    return min(max(value, least), most)

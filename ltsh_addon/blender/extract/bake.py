@@ -15,7 +15,7 @@ import numpy as np
 
 from ...cycles.gbuffer import rounded_positions
 from ...cycles.texels import NOT_BAKED, BakeView, TexelMesh
-from ...cycles.uv import tiles_of
+from ...cycles.uv import column_and_row, tiles_of
 from ...files import save_array
 from ...scene import ATLAS, error_line, light_records
 from .. import render_settings
@@ -55,7 +55,7 @@ class Block:
 
     def placed(self, uv: np.ndarray) -> np.ndarray:
         """`uv` (N, 2), moved and scaled so that the block fills the unit square."""
-        column, row = (self.tile - 1001) % 10, (self.tile - 1001) // 10
+        column, row = column_and_row(self.tile)
         v = (uv[:, 1] - row) * (self.height / self.rows) - self.first_row / self.rows
         return np.stack([uv[:, 0] - column, v], axis=-1)
 
@@ -127,7 +127,12 @@ class ObjectBake:
         for plan in self.plans:
             plan.show(None)
         self.scene.cycles.seed, self.scene.cycles.samples = sampling
-        return self._bake(block, CYCLES_TYPES[kind], light)
+        bake = self.scene.render.bake
+        # Diffuse light is the same from everywhere. Seen from above, faces whose smooth normals turn away show that of
+        # their other side.
+        view = "ACTIVE_CAMERA" if CYCLES_TYPES[kind] == "DIFFUSE" and "COLOR" not in light else bake.view_from
+        with changed_properties([(bake, "view_from", view)]):
+            return self._bake(block, CYCLES_TYPES[kind], light)
 
     def _bake(self, block: Block, kind: str, pass_filter) -> np.ndarray:
         image = self._image(block)
@@ -378,6 +383,8 @@ def _camera(scene, job):
     if job.view == "camera":
         return render_settings.choose_camera(scene, job.camera)
     camera = bpy.data.objects.new("ltsh bake", bpy.data.cameras.new("ltsh bake"))
+    if job.view == "above":
+        camera.data.type = "ORTHO"  # a point of a surface might be where a camera stands
     scene.collection.objects.link(camera)
     scene.camera = camera
     return camera

@@ -94,6 +94,23 @@ def has_displacement(material) -> bool:
     return surface is not None and live_link(surface.node.inputs["Displacement"]) is not None
 
 
+# The nodes that move a surface by a height times a scale.
+DISPLACING = ("ShaderNodeDisplacement", "ShaderNodeVectorDisplacement")
+
+
+def displacement_height(material) -> float | None:
+    """How far `material` moves its surface at most, in m of its object, where heights are from 0 to 1; None where that
+    is unknown."""
+    source = source_of(surface_of(material).node.inputs["Displacement"])
+    if source is None or source.node is None or source.node.bl_idname not in DISPLACING:
+        return None
+    factors = [source.input(name) for name in ("Scale", "Midlevel")]
+    if not all(factor is not None and factor.node is None for factor in factors):
+        return None
+    scale, middle = (factor.socket.default_value for factor in factors)
+    return abs(scale) * max(abs(middle), abs(1.0 - middle))
+
+
 def group_output(tree):
     """The Group Output in use of a group's `tree`, or None."""
     for node in tree.nodes:

@@ -192,9 +192,10 @@ def preview_of(material) -> PreviewMaterial:
         return plain_preview(0.0)
     shaders = graph.shaders_behind(surface)
     look = _PreviewReader(material, shaders).look()
-    lost = [
-        name.lower() for name in ("Volume", "Displacement") if graph.live_link(surface.node.inputs[name]) is not None
-    ]
+    lost = ["volume"] if graph.live_link(surface.node.inputs["Volume"]) is not None else []
+    if graph.has_displacement(material):
+        height = graph.displacement_height(material)
+        lost.append("displacement" if height is None else f"displacement, by up to {height:.3g} m,")
     notes = (*look.notes, *(f"{material.name}: its {name} is not shown" for name in lost))
     return replace(look, notes=notes, is_clear=graph.is_seen_through(surface.node, shaders))
 

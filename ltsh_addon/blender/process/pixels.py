@@ -376,7 +376,7 @@ def with_points(extraction: Extraction, count: int) -> Extraction:
             film = film.unspread().shared(points.weights[:count], points.number[mask], is_rendered)
     # With depth of field the points of a pixel may be far from each other.
     if not extraction.picture.has_lens and len(samples):
-        samples, film = gbuffer.merged(samples, film)
+        samples, film = gbuffer.merged(gbuffer.with_widened_lobes(samples, film), film)
     return replace(extraction, samples=samples, film=film, points=PixelPoints())
 
 

@@ -112,7 +112,9 @@ def _brush_direction(hit: SurfaceHit, brush) -> np.ndarray:
     return hit.around("XYZ".index(brush.direction))
 
 
-def place_of(ob, pose: LightPose, around: HitsAround, distance: float, textures: ShownTextures) -> tuple:
+def place_of(
+    ob, pose: LightPose, around: HitsAround, distance: float, textures: ShownTextures, is_thorough=False
+) -> tuple[Matrix, str]:
     """The matrix of the light object `ob` for a highlight at the mouse; and what there is to say about it."""
     hit = around.hits[0]
     lobe = glossy_lobe(hit.material)
@@ -124,7 +126,7 @@ def place_of(ob, pose: LightPose, around: HitsAround, distance: float, textures:
         return matrix_at(mirrored(np.array(hit.view), np.array(hit.normal))), NO_HIGHLIGHT
     light = MovedLight(lambda direction: np.array(matrix_at(direction)), lambda matrix: _light(ob, matrix))
     samples = samples_of(around.hits, lobe, textures)
-    place = place_for_highlight(samples, light, shipped_table(), around.has_stencil)
+    place = place_for_highlight(samples, light, shipped_table(), around.has_stencil, is_thorough)
     note = "" if place.is_peak else BEHIND if math.isinf(place.excess) else BESIDE
     return matrix_at(place.direction), unlinked(ob, hit) or note or unread(hit.material)
 
@@ -161,13 +163,15 @@ def note_by_pixels(ob, matrix: Matrix, around: HitsAround, textures: ShownTextur
     return unread(hits[0].material) if is_there else BESIDE
 
 
-def place_by_pixels(ob, pose: LightPose, matrix: Matrix, around: HitsAround, textures: ShownTextures) -> tuple:
+def place_by_pixels(
+    ob, pose: LightPose, matrix: Matrix, around: HitsAround, textures: ShownTextures
+) -> tuple[Matrix, str]:
     """As `place_of`, by all pixels `around`, where the light object `ob` is not yet right at `matrix`: what shines
-    between the samples of a move is brighter. Takes too long for a move."""
+    between the samples of a move may be brighter. Takes too long for a move."""
     note = note_by_pixels(ob, matrix, around, textures)
     if note == BESIDE:
         distance = (matrix.translation - around.hits[0].position).length
-        better, _ = place_of(ob, pose, around, distance, textures)
+        better, _ = place_of(ob, pose, around, distance, textures, is_thorough=True)
         if (again := note_by_pixels(ob, better, around, textures)) != BESIDE:
             return better, again
     return matrix, note

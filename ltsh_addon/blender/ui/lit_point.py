@@ -9,7 +9,7 @@ import bpy
 import numpy as np
 from mathutils import Matrix, Vector
 
-from ...cycles.horizons import end_at_horizons_of_cycles
+from ...cycles.horizons import end_at_horizons_of_cycles, unit
 from ...cycles.lobes import LOBE_AOVS, LOBE_KINDS, SurfaceHits, samples_of_lobes
 from ...cycles.texels import GRAY
 from ...lobes.brdf import dielectric_reflectance
@@ -56,13 +56,20 @@ class MeshFace:
         self._weights = np.linalg.pinv(edges.transpose(0, 2, 1))  # (T, 2, 3)
         self._growth: dict[str, np.ndarray | None] = {}
 
-    def interpolated(self, place: np.ndarray) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """The normal (3,) at a place (3,) of the object on the face, and its coordinates (2,) in each UV map."""
+    def at(self, place: np.ndarray, inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+        """The normals (3,) in the world, that of the triangle and the interpolated one, at a place (3,) of the object
+        on the face, and its coordinates (2,) in each UV map. `inverse` (3, 3) leads from the world into the object.
+
+        As in Cycles, what is interpolated are unit vectors of the world.
+        """
         two = np.einsum("tij,tj->ti", self._weights, place - self._ends)
         weights = np.append(two, 1.0 - two.sum(axis=-1, keepdims=True), axis=-1)
         best = int(np.argmax(weights.min(axis=-1)))
         weights, corners = weights[best], self._triangles[best]
-        return weights @ self._normals[corners], {name: weights @ uv[corners] for name, uv in self.uv.items()}
+        coordinates = {name: weights @ uv[corners] for name, uv in self.uv.items()}
+        first, second, third = self.corners[corners]
+        flat = unit(np.cross(second - first, third - first) @ inverse)
+        return flat, flat if self.is_flat else unit(weights @ unit(self._normals[corners] @ inverse)), coordinates
 
     def growth(self, uv_map: str) -> np.ndarray | None:
         """The vectors (2, 3) in the object along which u and v grow on the face; None without the map."""
@@ -114,8 +121,7 @@ def surface_hit(scene, depsgraph, start: Vector, direction: Vector, faces: dict 
     if not is_hit:
         return None
     mesh, slots, slot, uv, face = ob.evaluated_get(depsgraph).data, ob.material_slots, 0, {}, None
-    side = -1.0 if normal.dot(direction) > 0.0 else 1.0
-    face_normal = normal = side * normal
+    smooth = normal
     if isinstance(mesh, bpy.types.Mesh) and number < len(mesh.polygons):
         faces, key = {} if faces is None else faces, (ob.session_uid, number)
         if key[0] not in faces:
@@ -126,12 +132,15 @@ def surface_hit(scene, depsgraph, start: Vector, direction: Vector, faces: dict 
             faces[key] = MeshFace(mesh, number, has_vertex_normals, bool(flat[number]))
         face = faces[key]
         inverse, slot = matrix.inverted_safe(), face.slot
-        smooth, uv = face.interpolated(np.array(inverse @ position))
-        if not face.is_flat:
-            normal = (side * (inverse.to_3x3().transposed() @ Vector(smooth))).normalized()
+        # Blender 4.5 returns other normals of unevenly scaled objects.
+        normal, smooth, uv = face.at(np.array(inverse @ position), np.array(inverse.to_3x3()))
+        normal, smooth = Vector(normal), Vector(smooth)
+    side = -1.0 if normal.dot(direction) > 0.0 else 1.0
     override = depsgraph.view_layer_eval.material_override
     material = override or (slots[min(slot, len(slots) - 1)].material if len(slots) else None)
-    return SurfaceHit(position, normal, -direction, material, face_normal, uv, ob.original, matrix.copy(), face)
+    return SurfaceHit(
+        position, side * smooth, -direction, material, side * normal, uv, ob.original, matrix.copy(), face
+    )
 
 
 @functools.cache

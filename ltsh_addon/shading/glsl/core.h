@@ -420,7 +420,8 @@ LTSH_FUNCTION float ltsh_between(float value, float least, float most)
 /* Limits for integrals over the light in the tail of a lobe. In the tail the mirrored view ray misses the light by far,
    and a fitted lobe may be off by more than its value. The limits are the least and the greatest GGX BRDF times both
    cosines divided by the squared distance, at the center and the corners, times the area. Points below the horizon of
-   `normal` count as 0, and in the least value those below the horizon of `second` too. */
+   `normal` count as 0, and in the least value those below the horizon of `second` too. Where all are above, the integral
+   of a cubic polynomial over the rectangle or ellipse narrows the limits. */
 LTSH_FUNCTION ltsh_limits ltsh_tail_limits(
     ltsh_vec3 normal, ltsh_vec3 second, ltsh_vec3 view, float roughness, ltsh_extent light)
 {
@@ -444,6 +445,8 @@ LTSH_FUNCTION ltsh_limits ltsh_tail_limits(
     float slope = LTSH_SQRT(alpha_squared + rest * mu * mu);
     float factor = -0.5f * @ONE_OVER_PI@ * alpha_squared * ltsh_dot(light.center, light.area);
     float least_half = 1.0f;
+    float center_value = 0.0f;
+    float sum_of_values = 0.0f;
     for (int i = 0; i < 5; ++i) {
         ltsh_vec3 along = i < 3 ? sum : difference;
         float sign = i == 0 ? 0.0f : ((i == 1 || i == 3) ? 1.0f : -1.0f);
@@ -460,10 +463,23 @@ LTSH_FUNCTION ltsh_limits ltsh_tail_limits(
         float seen = ltsh_dot(second, offset) > 0.0f ? value : 0.0f;
         limits.least = i == 0 || seen < limits.least ? seen : limits.least;
         limits.most = i == 0 ? value : ltsh_larger(limits.most, value);
+        center_value = i == 0 ? value : center_value;
+        sum_of_values += value;
         halved = 0.5f * halved / square;
         least_half = halved < least_half ? halved : least_half;
     }
     limits.cosine = LTSH_SQRT(ltsh_larger(least_half, 0.0f));
+    ltsh_vec3 across = ltsh_cross(light.half_u, light.half_v);
+    float fills = LTSH_SQRT(ltsh_dot(light.area, light.area) / ltsh_larger(16.0f * ltsh_dot(across, across), 1e-30f));
+    float weight = fills > 0.784f && fills < 0.787f ? 0.25f : 0.0f;
+    weight = fills > 0.999f && fills < 1.001f ? @ONE_THIRD@ : weight;
+    if (limits.least > 0.0f && weight > 0.0f) {
+        float mean = (1.0f - 1.25f * weight) * center_value + 0.25f * weight * sum_of_values;
+        float contrast = (limits.most - limits.least) / (limits.most + limits.least);
+        float slack = @TAIL_SLACK@ * mean * contrast * contrast * contrast * contrast;
+        limits.least = ltsh_larger(limits.least, mean - slack);
+        limits.most = limits.most < mean + slack ? limits.most : mean + slack;
+    }
     return limits;
 }
 

@@ -314,3 +314,16 @@ def test_objects_that_only_renders_show_are_baked_as_cycles_renders_them(how, tm
     layers = files["Floor.exr"]
     ours, cycles = layers["ltsh4c.diffuse"], layers["cycles.diffuse"]
     assert np.linalg.norm(ours - cycles) <= 0.1 * np.linalg.norm(cycles)  # the noise of penumbras; a shadow is 25 %
+
+
+def test_a_bake_of_one_block_tells_how_far_its_shadows_are(tmp_path):
+    start()
+    add_plane(principled("Gray")[0], size=2.0, name="Floor")
+    told = []
+    options = BakeOptions(
+        save(tmp_path), tmp_path / "out", objects=("Floor",), size=(256, 256), view="above", passes=("diffuse_light",)
+    )
+    bake_scene(options, lambda stage, share: told.append((stage, share)))
+    shares = [share for stage, share in told if stage == "shade Floor"]
+    assert shares[0] == 0.0 and shares[-1] == 1.0 and shares == sorted(shares)
+    assert any(0.0 < share < 1.0 for share in shares)

@@ -301,6 +301,31 @@ def test_lobes_have_their_shares_and_what_is_not_shown_is_named(shader, lobes, n
     assert found == pytest.approx(lobes) and list(look.notes) == [f"Material: {note}" for note in notes]
 
 
+@pytest.mark.parametrize(
+    ("kind", "values", "size"),
+    [
+        ("Displacement", {"Scale": 0.3, "Midlevel": 0.5}, ", by up to 0.15 m,"),
+        ("Displacement", {"Scale": -2.0, "Midlevel": 0.0}, ", by up to 2 m,"),
+        ("VectorDisplacement", {"Scale": 0.1, "Midlevel": 0.0}, ", by up to 0.1 m,"),
+        ("Displacement", {"Scale": ("TexNoise", {})}, ""),
+        ("TexNoise", {}, ""),
+    ],
+    ids=["about the middle", "inward", "vectors", "varying scale", "no node of displacement"],
+)
+def test_displacement_that_is_not_shown_is_named_with_its_height(kind, values, size):
+    parts.empty_scene()
+    material = made("Hill", "BsdfDiffuse", {})()
+    nodes, links = material.node_tree.nodes, material.node_tree.links
+    node = nodes.new(f"ShaderNode{kind}")
+    for name, value in values.items():
+        if isinstance(value, tuple):
+            links.new(nodes.new(f"ShaderNode{value[0]}").outputs[0], node.inputs[name])
+        else:
+            node.inputs[name].default_value = value
+    links.new(node.outputs[0], nodes["Material Output"].inputs["Displacement"])
+    assert preview_of(material).notes == (f"Hill: its displacement{size} is not shown",)
+
+
 @pytest.mark.parametrize(("emitter", "strength"), [("Emission", "Strength"), ("BsdfPrincipled", "Emission Strength")])
 def test_what_a_transparent_share_takes_from_emission_and_not_from_lobes(emitter, strength):
     parts.empty_scene()

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..lobes.bump_shadowing import bump_shadowing
+from ..lobes.edge_integrals import bump_shadowing
 from ..lobes.lobe_integrals import LEAST_SHARE
 from ..lobes.lookup_table import bent_cosines
 from ..lobes.polygon import cross, dot

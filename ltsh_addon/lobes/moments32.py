@@ -14,8 +14,7 @@ from math import prod
 
 import numpy as np
 
-from .bump_shadowing import shadowed_integral
-from .edge_integrals import RIDGE_DIRECTIONS, arc_polynomial
+from .edge_integrals import RIDGE_DIRECTIONS, arc_polynomial, shadowed_integral
 from .lookup_table import MIN_ALPHA, LookupTable, warp_entries
 from .spherical_harmonics import coefficient_count
 

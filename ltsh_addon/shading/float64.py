@@ -15,8 +15,7 @@ from ..emitters.facing import FacingDisk
 from ..emitters.light_polygons import LocalFrames, PatchTree, has_lobe, light_view, to_local, visible_polygons_by_level
 from ..emitters.tails import LightFromPoints, TailLimits
 from ..lobes import brdf, diffuse, lobe_integrals
-from ..lobes.bump_shadowing import shadowed_integral, shadowing_terms
-from ..lobes.edge_integrals import arc_factors
+from ..lobes.edge_integrals import arc_factors, shadowed_integral, shadowing_terms
 from ..lobes.lookup_table import MIN_ALPHA, Lobe, LookupTable
 from ..lobes.polygon import dot, edge_sums, one_plus_cosine
 from ..lobes.spherical_harmonics import coefficient_index

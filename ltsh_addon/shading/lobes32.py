@@ -25,8 +25,8 @@ from ..lobes.brdf import (
     spiral,
     visible_directions,
 )
-from ..lobes.bump_shadowing import bump_shadowing, shadowing_terms
 from ..lobes.diffuse import diffuse_factor
+from ..lobes.edge_integrals import bump_shadowing, shadowing_terms
 from ..lobes.lobe_integrals import LEAST_SHARE
 from ..lobes.lookup_table import MIN_ALPHA
 from ..lobes.polygon import cross, dot, normal_frames

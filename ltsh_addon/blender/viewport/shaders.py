@@ -17,9 +17,8 @@ from ...emitters import facing, light_profile
 from ...emitters.light_polygons import FOCUSED_ROUND_CORNERS, ROUND_CORNERS
 from ...emitters.tails import NEAR_RADII
 from ...lobes import moments32
-from ...lobes.bump_shadowing import ARC_NODES as BUMP_NODES
-from ...lobes.bump_shadowing import TERM_POLYNOMIALS
 from ...lobes.diffuse import ARC_NODES, albedo_slope, mean_slope_above
+from ...lobes.edge_integrals import BUMP_NODES, TERM_POLYNOMIALS
 from ...lobes.lobe_integrals import LEAST_SHARE
 from ...lobes.lookup_table import MIN_ALPHA, LookupTable
 from ...shading import header

@@ -1,4 +1,4 @@
-/* Bump shadowing, as in `lobes.bump_shadowing`. Set for each point: the bent and the smooth normal; alpha^2; and k, a, b
+/* Bump shadowing, as in `lobes.edge_integrals`. Set for each point: the bent and the smooth normal; alpha^2; and k, a, b
    and c. */
 vec3 ltsh_bent_normal;
 vec3 ltsh_smooth_normal;

@@ -180,7 +180,9 @@ def moved(rig, told, shading, name, start, end):
 
 
 def by_tool(rig):
-    """The tools of the toolbar: each drag is a gesture, without a click on a button."""
+    """The tools of the toolbar: each drag is a gesture, without a click on a button. Also where Alt makes the left
+    button the middle one."""
+    bpy.context.preferences.inputs.use_mouse_emulate_3_button = True
     hands.operate(rig, bpy.ops.wm.tool_set_by_id, name="ltsh.drag_brightness_tool")
     for step in (1, 2):
         yield from at(rig, LIT)
@@ -204,6 +206,7 @@ def by_tool(rig):
     yield from hands.typed(rig, "ctrl+z")
     yield from hands.comes(rig, lambda: place() == before, "one undo takes it back")
     hands.operate(rig, bpy.ops.wm.tool_set_by_id, name="builtin.select_box")
+    bpy.context.preferences.inputs.use_mouse_emulate_3_button = False
 
 
 def on_edge(point):

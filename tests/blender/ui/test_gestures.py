@@ -286,6 +286,19 @@ def test_why_a_drag_cannot_begin_is_told_until_the_mouse_moves():
     assert gesture.asked == ["press", "hover"]
 
 
+def test_no_tool_needs_alt_which_may_make_the_left_button_the_middle_one():
+    """*Emulate 3 Button Mouse* turns Alt and the left button into the middle one, before an operator sees it."""
+    for gesture in gestures.GESTURES:
+        ((_, keys, _),) = gestures._tool_of(gesture).bl_keymap
+        assert keys == {"type": "LEFTMOUSE", "value": "PRESS"}
+    # Alt that is held changes nothing of a drag.
+    gesture, (context, _) = Recorded(), window()
+    gesture.invoke(context, event("LEFTMOUSE", alt=True))
+    for what in (("MOUSEMOVE", "NOTHING"), ("LEFT_ALT", "PRESS"), ("LEFTMOUSE", "RELEASE")):
+        answer = gesture.modal(context, event(*what, alt=True))
+    assert gesture.asked == ["press", "follow"] and answer == {"FINISHED"}
+
+
 def test_a_gesture_that_fails_puts_everything_back():
     gesture, (context, there) = Recorded(), window()
     gesture.invoke(context, event("LEFTMOUSE", "PRESS"))

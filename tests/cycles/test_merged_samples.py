@@ -109,7 +109,8 @@ def test_highlights_thinner_than_pixels_do_not_fall_between_points(points):
     errors = []
     for seed in range(60):
         samples, film = ball(points, seed, 0.05)
-        errors.append([picture(one, film) - truth for one in (samples, gbuffer.with_widened_lobes(samples, film, points))])
+        both = samples, gbuffer.with_widened_lobes(samples, film, points)
+        errors.append([picture(one, film) - truth for one in both])
     plain, widened = np.sqrt(np.square(errors).mean(axis=(0, 2, 3)))
     # Twice as many points, or more, would have this error without wider lobes.
     assert widened < 0.65 * plain

@@ -196,10 +196,10 @@ def merged(samples: SurfaceSamples, film: Film) -> tuple[SurfaceSamples, Film]:
 MOST_TURN, WIDENING, MOST_WIDENING = math.radians(60.0), 0.5, 0.18
 
 
-def with_widened_lobes(samples: SurfaceSamples, film: Film) -> SurfaceSamples:
-    """`samples` with specular lobes that take in how the normal turns between the points of a pixel, so that highlights
-    thinner than pixels do not fall between them (Kaplanyan, Hill, Patney and Lefohn 2016, Filtering Distributions of
-    Normals for Shading Antialiasing). Pixels with one point stay as they are."""
+def with_widened_lobes(samples: SurfaceSamples, film: Film, points: int) -> SurfaceSamples:
+    """`samples` with specular lobes that take in how the normal turns between the points of a pixel, of which `points`
+    will be shaded, so that highlights thinner than pixels do not fall between them (Kaplanyan, Hill, Patney and Lefohn
+    2016, Filtering Distributions of Normals for Shading Antialiasing). Pixels with one sample stay as they are."""
     starts = np.arange(len(samples)) if film.first is None else np.flatnonzero(film.first)
     lengths = np.diff(starts, append=len(samples))
     slot = np.arange(len(samples)) - np.repeat(starts, lengths)
@@ -222,7 +222,7 @@ def with_widened_lobes(samples: SurfaceSamples, film: Film) -> SurfaceSamples:
     variance = np.empty(len(order))
     # Half of the mean squared distance. Each of the points stands for its share of the pixel.
     variance[order] = 0.5 * total / np.maximum(count, 1.0)
-    added = np.minimum(WIDENING * variance / film.sub_samples, MOST_WIDENING)
+    added = np.minimum(WIDENING * variance / points, MOST_WIDENING)
     alpha, across = np.square(samples.roughness), np.maximum(1.0 - samples.anisotropy, 1e-6)
     along, across = (np.sqrt(np.square(one) + added) for one in (alpha / across, alpha * across))
     is_wider = has_lobe(samples)[1] & (added > 0.0)

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..lobes.edge_integrals import bump_shadowing
 from ..lobes.lobe_integrals import LEAST_SHARE
 from ..lobes.lookup_table import bent_cosines
 from ..lobes.polygon import cross, dot
@@ -207,14 +208,6 @@ class ShadowedCosineAtPoint:
         squares = dot(coordinates[:3], coordinates[:3])
         values *= bump_shadowing(coordinates[3], squares, self.bump_alpha2[columns])
         return _sum(values, weights)[None]
-
-
-def bump_shadowing(along, squares, bump_alpha2):
-    """Bump shadowing (...) at heights (...) over the plane of the smooth normal and squared distances (...)."""
-    along = np.maximum(along, np.float32(1e-15) * np.sqrt(squares) + np.float32(1e-18))
-    tangent2 = np.maximum(squares / (along * along) - np.float32(1.0), np.float32(0.0))
-    shadowing = np.sqrt(np.float32(1.0) + bump_alpha2.astype(np.float32) * tangent2)
-    return np.float32(2.0) / (np.float32(1.0) + shadowing)
 
 
 class LobeAtPoint:

@@ -8,6 +8,20 @@ ridge functions (u . w)^n with u = (u_x, 0, u_z). With X = a x b for an edge fro
 
 So the moments of a polygon determine its integrals: the solid angle, and sum_edges (u.X) K_k for k + 2 directions u per
 k. (These are the same integrals as in Wang and Ramamoorthi 2018 and Belcour et al. 2018, without zonal rotations.)
+
+Cycles shadows bump-mapped diffuse lobes. With the smooth normal s, z = s.omega and alpha^2 = `bump_alpha2`, the factor
+is (Estevez, Lecocq and Stein 2019, doi:10.1007/978-1-4842-4427-2_12)
+
+    g(z) = 2 / (1 + sqrt(1 + alpha^2 (1 - z^2) / z^2)).
+
+By Stokes' theorem, the integral of (n.omega) g(z) over a polygon is the sum, over its edges, of the means of
+
+    (n.X) Q(z) + (n.s) (s.X) D(z),   Q(z) = (integral of t g(t) from 0 to z) / z^2,   D(z) = (Q(1) - Q(z)) / (1 - z^2).
+
+X is the edge's normal, as long as its arc. Without shadowing Q = 1 / 2 and D = 0, which is Lambert's formula. Here
+Q(z) = z / (a + b z + c r), where r^2 = k + (1 - k) z^2. This makes D as simple, and stands for a g at most 0.4 %
+off. The result is divided by its error in the mean direction, so that small polygons get g itself. Q and D have no
+poles, so few nodes do an arc. They lie closer toward its lower end, where g is steep.
 """
 
 from __future__ import annotations
@@ -24,6 +38,17 @@ RIDGE_DIRECTIONS = np.array([[1, 0], [0, 1], [1, 1], [1, -1], [1, 2], [2, 1], [1
 MAX_DEGREE = len(RIDGE_DIRECTIONS) - 1
 # Accurate to 6e-15 on half a circle for powers up to 7.
 _ARC_QUADRATURE = np.polynomial.legendre.leggauss(18)
+# For bump shadowing: Gauss-Legendre nodes u in [0, 1], moved to (u + u^2) / 2, their places between the ends of an arc,
+# and weights.
+_NODES, _WEIGHTS = ((0.5 * values).tolist() for values in np.polynomial.legendre.leggauss(5))
+BUMP_NODES = [((u + 0.5) * (u + 1.5) / 2.0, w * (1.0 + u)) for u, w in zip(_NODES, _WEIGHTS, strict=True)]
+# Quartics in alpha, constant first, fitted to g for alpha^2 <= 4: k / alpha^2, a / alpha, (b + c - 2) / alpha, and c.
+TERM_POLYNOMIALS = (
+    (2.1783, -3.2715, 3.6047, -1.7641, 0.2940),
+    (0.3047, 0.9373, -0.8150, 0.3676, -0.0900),
+    (-0.1847, 0.3115, -0.4986, 0.2880, -0.0324),
+    (0.8052, -0.0050, 0.0225, -0.1359, 0.0963),
+)
 
 
 # Degrees of the polynomial for psi that suffice in single and in double precision.
@@ -210,3 +235,57 @@ def _in_moment_directions(u: np.ndarray, k: int) -> np.ndarray:
 
     system = np.stack([monomials(direction) for direction in RIDGE_DIRECTIONS[: k + 1]], axis=1)
     return np.linalg.solve(system, monomials(u))
+
+
+def bump_shadowing(along, squares, bump_alpha2):
+    """Bump shadowing (...) at heights (...) over the plane of the smooth normal and squared distances (...)."""
+    along = np.maximum(along, np.float32(1e-15) * np.sqrt(squares) + np.float32(1e-18))
+    tangent2 = np.maximum(squares / (along * along) - np.float32(1.0), np.float32(0.0))
+    shadowing = np.sqrt(np.float32(1.0) + bump_alpha2.astype(np.float32) * tangent2)
+    return np.float32(2.0) / (np.float32(1.0) + shadowing)
+
+
+def shadowing_terms(bump_alpha2: np.ndarray) -> np.ndarray:
+    """alpha^2, k, a, b and c (5, P) of the formulas above, for alpha^2 (P,) in [0, 4]."""
+    alpha = np.sqrt(bump_alpha2)
+    k, a, both, c = (np.polynomial.polynomial.polyval(alpha, terms) for terms in TERM_POLYNOMIALS)
+    return np.stack([bump_alpha2, k * bump_alpha2, a * alpha, 2.0 + both * alpha - c, c]).astype(bump_alpha2.dtype)
+
+
+def shadowed_integral(toward, heights, shifted, mean, terms):
+    """Signed integrals (P,) of cosine times shadowing over polygons above both horizons.
+
+    `toward` (2, V, P) are products of the edges' normals, whose lengths are the angles theta of the edges, with n and
+    with (n.s) s; `heights` (2, V, P) those of the edges' ends with s; `shifted` (V, P) is 1 + cos theta, and
+    `mean` (P,) the cosine between s and the mean direction. `terms` (5, P) are `shadowing_terms`.
+    """
+    alpha2, k, a, b, c = terms
+    half = np.sqrt(0.5 * shifted)
+    # Close ends have a straight line between them, at any small angle.
+    np.minimum(half, 1.0 - 1e-6, out=half)
+    middle = heights[0] + heights[1]
+    middle /= 2.0 * half
+    np.arccos(half, out=half)
+    rise = np.abs(heights[1] - heights[0])
+    rise /= 2.0 * np.sin(half)
+    ck, rest = c * k, 1.0 - k
+    plain = mixed = 0.0
+    for place, weight in BUMP_NODES:
+        angle = half * (2.0 * place - 1.0)
+        z = np.cos(angle)
+        z *= middle
+        z += np.sin(angle, out=angle) * rise
+        np.maximum(z, 1e-6, out=z)
+        root = np.sqrt(rest * z * z + k)
+        share = weight / (a + b * z + c * root)
+        plain = plain + share * z
+        root += z
+        z += 1.0
+        mixed = mixed + share * (ck / root + a / z)
+    integral = (toward[0] * plain + toward[1] * mixed / (a + b + c)).sum(axis=0)
+    z = np.maximum(mean, 1e-6)
+    squared = z * z
+    root = np.sqrt(rest * squared + k)
+    share = a + b * z + c * root
+    slope = 3.0 * share - z * (b + c * rest * z / root)
+    return integral * (2.0 * share * share / ((z + np.sqrt(alpha2 + (1.0 - alpha2) * squared)) * slope))

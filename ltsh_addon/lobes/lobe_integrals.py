@@ -122,13 +122,15 @@ def polygon_integrals(table: LookupTable, lobe: Lobe, polygon: np.ndarray, coeff
     return np.stack([(vector * ridge_moments).sum(axis=0) for vector in coefficients])
 
 
-def integrals_on_sphere(integral, vertices: np.ndarray) -> np.ndarray:
-    """integral(unit) (..., P) of polygons (3, V, P) projected to the sphere. Edges near half a circle are split."""
+def integrals_on_sphere(integral, vertices: np.ndarray, *others: np.ndarray) -> np.ndarray:
+    """integral(unit, *others) (..., P) of polygons (3, V, P) projected to the sphere; `others` are (..., P). Edges near
+    half a circle are split."""
     unit = project_to_sphere(vertices)
-    result = integral(unit)
+    result = integral(unit, *others)
     long = np.nonzero(one_plus_cosine(edge_sums(unit)).min(axis=0) < LONG_EDGE)[0]
     if len(long):
-        result[..., long] = integral(project_to_sphere(split_long_edges(vertices[:, :, long])))
+        split = project_to_sphere(split_long_edges(vertices[:, :, long]))
+        result[..., long] = integral(split, *(values[..., long] for values in others))
     return result
 
 

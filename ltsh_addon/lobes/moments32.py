@@ -14,7 +14,7 @@ from math import prod
 
 import numpy as np
 
-from .edge_integrals import RIDGE_DIRECTIONS, arc_polynomial
+from .edge_integrals import RIDGE_DIRECTIONS, arc_polynomial, shadowed_integral
 from .lookup_table import MIN_ALPHA, LookupTable, warp_entries
 from .spherical_harmonics import coefficient_count
 
@@ -162,28 +162,44 @@ def cosine_integral(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Signed integral (P,) of z over polygons (>= 3 rows, V, P) in z >= 0, and the mask (P,) of points that need
     float64."""
-    integrals, needs_float64 = _direction_integrals(corners, (2,), scratch, smallest)
-    return integrals[0], needs_float64
-
-
-def vector_irradiance(
-    corners: np.ndarray, scratch: Scratch, smallest: float = SMALLEST_SAFE
-) -> tuple[np.ndarray, np.ndarray]:
-    """Signed integrals (3, P) of the direction over polygons (>= 3 rows, V, P), and the mask (P,) of points that need
-    float64."""
-    return _direction_integrals(corners, (0, 1, 2), scratch, smallest)
-
-
-def _direction_integrals(corners, axes, scratch, smallest):
     unit, shifted, needs_float64 = _edges(corners, scratch, smallest)
     phi = _phi(shifted, scratch)
-    integrals = np.empty((len(axes), corners.shape[2]), dtype=np.float32)
-    for axis, out in zip(axes, integrals, strict=True):
-        normal = _cross_component(unit, (axis + 1) % 3, (axis + 2) % 3, scratch, scratch("normal", shifted.shape))
-        normal *= phi
-        np.add.reduce(normal, axis=0, out=out)
-    integrals *= np.float32(0.5)
-    return integrals, needs_float64
+    normal = _cross_component(unit, 0, 1, scratch, scratch("normal", shifted.shape))
+    normal *= phi
+    integral = np.add.reduce(normal, axis=0)
+    integral *= np.float32(0.5)
+    return integral, needs_float64
+
+
+def shadowed_cosine_integral(
+    corners: np.ndarray, smooth: np.ndarray, terms: np.ndarray, scratch: Scratch, smallest: float = SMALLEST_SAFE
+) -> tuple[np.ndarray, np.ndarray]:
+    """As `cosine_integral`, of z times bump shadowing with `shadowing_terms` (5, P).
+
+    `smooth` (2, P) are the x and z of the smooth normal, whose y is 0. Row 3 of the corners (>= 4, V, P) are their
+    products with it, which are not negative."""
+    count, points = corners.shape[1:]
+    integral, needs_float64 = np.empty(points, np.float32), np.empty(points, bool)
+    for piece in pieces(points, PIECE_CORNERS // count):
+        unit, shifted, needs_float64[piece] = _edges(corners[:, :, piece], scratch, smallest)
+        # Double precision splits such long edges, and then finds other nodes.
+        needs_float64[piece] |= np.minimum.reduce(shifted, axis=0) < np.float32(2.01 * SHORTEST_SAFE)
+        heights = scratch("heights", unit.shape[1:])
+        np.multiply(corners[3, :, piece], scratch("two", shifted.shape), out=heights[:-1])  # 1 / lengths, of `_edges`
+        heights[-1] = heights[0]
+        normal, (sine, cosine) = scratch("normal", (3, *shifted.shape)), smooth[:, piece]
+        for row, (first, second) in zip(normal, ((1, 2), (2, 0), (0, 1)), strict=True):
+            _cross_component(unit, first, second, scratch, row)
+        normal *= _phi(shifted, scratch)
+        total = np.add.reduce(normal, axis=1)
+        along = sine * total[0] + cosine * total[2]
+        mean = np.abs(along) / np.sqrt((total * total).sum(axis=0) + _TINY)
+        normal[0] *= sine
+        normal[0] += cosine * normal[2]
+        normal[0] *= cosine
+        ends = heights[:-1], heights[1:]
+        integral[piece] = shadowed_integral(normal[::-2], ends, shifted, mean, terms[:, piece])
+    return integral, needs_float64
 
 
 def form_matrix(degree: int, more: int = 0) -> np.ndarray:

@@ -55,7 +55,7 @@ def shade_diffuse(samples, lights, radiance, scratch):
             clip_rows, integrate, at_point = (2,), lobes32.FormFactor(scratch), small_lights.CosineAtPoint(rows)
             if is_bumped:
                 smooth, bump_alpha2 = lobes32.as_columns(samples.smooth_normal, index), samples.bump_alpha2[index]
-                rows, clip_rows = np.concatenate([rows, smooth[None]]), (3, 2)
+                rows, clip_rows = np.stack([*lobes32.frames_toward(rows[2], smooth)[0], smooth]), (3, 2)
                 integrate = lobes32.ShadowedFormFactor(rows, bump_alpha2.astype(np.float32), scratch)
                 at_point = small_lights.ShadowedCosineAtPoint(rows, bump_alpha2.astype(np.float32))
             colors = lobes32.as_columns(samples.diffuse_albedo, index)[None]

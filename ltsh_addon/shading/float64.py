@@ -15,9 +15,9 @@ from ..emitters.facing import FacingDisk
 from ..emitters.light_polygons import LocalFrames, PatchTree, has_lobe, light_view, to_local, visible_polygons_by_level
 from ..emitters.tails import LightFromPoints, TailLimits
 from ..lobes import brdf, diffuse, lobe_integrals
-from ..lobes.edge_integrals import vector_irradiance
+from ..lobes.edge_integrals import arc_factors, shadowed_integral, shadowing_terms
 from ..lobes.lookup_table import MIN_ALPHA, Lobe, LookupTable
-from ..lobes.polygon import dot
+from ..lobes.polygon import dot, edge_sums, one_plus_cosine
 from ..lobes.spherical_harmonics import coefficient_index
 from ..scene import REFERENCE, PolygonLight
 from .reference import anisotropic_integrals, reference_integrals
@@ -240,13 +240,23 @@ def _profiled(light, view, level, integral, count):
 
 
 def _bump_shadowing(framed, index, polygon):
-    """The bump shadowing (Q,) of `SurfaceSamples` in the mean direction of the polygon."""
-    samples, direction = framed.samples, -lobe_integrals.integrals_on_sphere(vector_irradiance, polygon)
-    smooth = to_local(framed.frame[:, :, index], samples.smooth_normal[index].T)
-    along = (direction * smooth).sum(axis=0)
-    tangent2 = (direction * direction).sum(axis=0) / np.maximum(along, 1e-30) ** 2 - 1.0
-    shadowing = 2.0 / (1.0 + np.sqrt(1.0 + samples.bump_alpha2[index] * np.maximum(tangent2, 0.0)))
-    return np.where(along > 0.0, shadowing, 0.0)
+    """The mean (Q,) over polygons of the bump shadowing of `SurfaceSamples`, with the cosine as the weight."""
+    smooth = to_local(framed.frame[:, :, index], framed.samples.smooth_normal[index].T)
+    terms = shadowing_terms(framed.samples.bump_alpha2[index].astype(np.float64))
+    shadowed, whole = lobe_integrals.integrals_on_sphere(_shadowed_and_whole, polygon, smooth, terms)
+    return np.clip(np.divide(shadowed, whole, out=np.zeros_like(whole), where=whole != 0.0), 0.0, 1.0)
+
+
+def _shadowed_and_whole(unit, smooth, terms):
+    """Signed integrals (2, Q) of z, with and without bump shadowing, over spherical polygons (3, V, Q)."""
+    total = edge_sums(unit)
+    shifted = one_plus_cosine(total)
+    normal = np.cross(unit, total, axis=0) * arc_factors(shifted)[0]
+    heights = (unit * smooth[:, None]).sum(axis=0)
+    along, total = (normal * smooth[:, None]).sum(axis=0), normal.sum(axis=1)
+    mean = np.abs(along.sum(axis=0)) / np.sqrt(np.maximum(dot(total, total), 1e-300))
+    toward, ends = (normal[2], smooth[2] * along), (heights, np.roll(heights, -1, axis=0))
+    return np.stack([shadowed_integral(toward, ends, shifted, mean, terms), 0.5 * total[2]])
 
 
 def shade_specular(samples, lights, table, radiance, error=None):

@@ -15,7 +15,6 @@ import numpy as np
 from ..emitters import light_profile, small_lights
 from ..emitters.light_polygons import interpolated
 from ..emitters.sky_map import SkyMap, share_above, to_world
-from ..emitters.small_lights import bump_shadowing
 from ..emitters.tails import TailLimits
 from ..lobes import moments32
 from ..lobes.brdf import (
@@ -27,6 +26,7 @@ from ..lobes.brdf import (
     visible_directions,
 )
 from ..lobes.diffuse import diffuse_factor
+from ..lobes.edge_integrals import bump_shadowing, shadowing_terms
 from ..lobes.lobe_integrals import LEAST_SHARE
 from ..lobes.lookup_table import MIN_ALPHA
 from ..lobes.polygon import cross, dot, normal_frames
@@ -302,19 +302,17 @@ class FormFactor:
 
 
 class ShadowedFormFactor:
-    """Form factors (1, Q) times the bump shadowing of `SurfaceSamples` in the mean direction of the polygon."""
+    """As `FormFactor`, under the bump shadowing of `SurfaceSamples`. The smooth normal, rows[3], has y = 0."""
 
     def __init__(self, rows, bump_alpha2, scratch):
-        self.smooth = np.stack([dot(row, rows[3]) for row in rows[:3]])
-        self.bump_alpha2, self.scratch = bump_alpha2, scratch
+        self.smooth = np.stack([dot(row, rows[3]) for row in rows[:3:2]])
+        self.terms, self.scratch = shadowing_terms(bump_alpha2), scratch
 
     def __call__(self, columns, corners, index, smallest=moments32.SMALLEST_SAFE):
-        smooth, bump_alpha2 = (_selected(values, columns, index) for values in (self.smooth, self.bump_alpha2))
-        integrals, needs_float64 = moments32.vector_irradiance(corners, self.scratch, smallest)
-        direction = np.negative(integrals, out=integrals)
-        shadowing = bump_shadowing(dot(direction, smooth), dot(direction, direction), bump_alpha2)
-        values = np.maximum(direction[2], np.float32(0.0)) * shadowing * np.float32(1.0 / np.pi)
-        return values[None], needs_float64
+        smooth, terms = (_selected(values, columns, index) for values in (self.smooth, self.terms))
+        integral, needs_float64 = moments32.shadowed_cosine_integral(corners, smooth, terms, self.scratch, smallest)
+        integral *= np.float32(-1.0 / np.pi)
+        return np.maximum(integral, np.float32(0.0))[None], needs_float64
 
 
 class LobeIntegral:

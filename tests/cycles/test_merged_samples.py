@@ -109,7 +109,8 @@ def test_highlights_thinner_than_pixels_do_not_fall_between_points(points):
     errors = []
     for seed in range(60):
         samples, film = ball(points, seed, 0.05)
-        errors.append([picture(one, film) - truth for one in (samples, gbuffer.with_widened_lobes(samples, film))])
+        both = samples, gbuffer.with_widened_lobes(samples, film, points)
+        errors.append([picture(one, film) - truth for one in both])
     plain, widened = np.sqrt(np.square(errors).mean(axis=(0, 2, 3)))
     # Twice as many points, or more, would have this error without wider lobes.
     assert widened < 0.65 * plain
@@ -117,20 +118,20 @@ def test_highlights_thinner_than_pixels_do_not_fall_between_points(points):
 
 def test_what_is_flat_or_an_edge_or_rough_stays_as_sharp():
     samples, film = hits(0)
-    np.testing.assert_array_equal(gbuffer.with_widened_lobes(samples, film).roughness, samples.roughness)
+    np.testing.assert_array_equal(gbuffer.with_widened_lobes(samples, film, POINTS).roughness, samples.roughness)
     # Two walls at a right angle in each pixel.
     wall = np.where((np.arange(len(samples)) % 2 == 0)[:, None], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
     walls = replace(samples, **dict.fromkeys(("normal", "geometric_normal"), wall))
-    np.testing.assert_array_equal(gbuffer.with_widened_lobes(walls, film).roughness, samples.roughness)
+    np.testing.assert_array_equal(gbuffer.with_widened_lobes(walls, film, POINTS).roughness, samples.roughness)
     bent, film = hits(0, bend=0.3)
-    widened = gbuffer.with_widened_lobes(bent, film).roughness
+    widened = gbuffer.with_widened_lobes(bent, film, POINTS).roughness
     assert (widened >= bent.roughness).all() and widened.max() < 1.01 * bent.roughness.max()
 
 
 def test_each_axis_of_a_brushed_lobe_takes_the_same_in():
     samples, film = ball(4, 1, 0.2)
     samples = replace(samples, anisotropy=np.full(len(samples), 0.5))
-    widened = gbuffer.with_widened_lobes(samples, film)
+    widened = gbuffer.with_widened_lobes(samples, film, 4)
 
     def squares(one):
         alpha, across = one.roughness**2, 1.0 - one.anisotropy

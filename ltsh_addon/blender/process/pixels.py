@@ -365,9 +365,12 @@ class _SampleRenders:
 def with_points(extraction: Extraction, count: int) -> Extraction:
     """`extraction` with the first `count` points of each pixel of a finished picture.
 
-    One sample stands for all points of a pixel on the same smooth surface, but not with depth of field.
+    One sample stands for all points of a pixel on the same smooth surface, and lobes take in how normals turn between
+    points, but not with depth of field.
     """
     samples, film, points = extraction.samples, extraction.film, extraction.points
+    if not extraction.picture.has_lens:
+        samples = gbuffer.with_widened_lobes(samples, film, count)
     if count < film.sub_samples:
         mask = points.number < count
         samples, film = samples.take(mask), replace(film.take(mask), sub_samples=count)
@@ -376,7 +379,7 @@ def with_points(extraction: Extraction, count: int) -> Extraction:
             film = film.unspread().shared(points.weights[:count], points.number[mask], is_rendered)
     # With depth of field the points of a pixel may be far from each other.
     if not extraction.picture.has_lens and len(samples):
-        samples, film = gbuffer.merged(gbuffer.with_widened_lobes(samples, film), film)
+        samples, film = gbuffer.merged(samples, film)
     return replace(extraction, samples=samples, film=film, points=PixelPoints())
 
 

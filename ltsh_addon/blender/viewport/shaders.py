@@ -18,6 +18,7 @@ from ...emitters.light_polygons import FOCUSED_ROUND_CORNERS, ROUND_CORNERS
 from ...emitters.tails import NEAR_RADII
 from ...lobes import moments32
 from ...lobes.diffuse import ARC_NODES, albedo_slope, mean_slope_above
+from ...lobes.edge_integrals import BUMP_NODES, TERM_POLYNOMIALS
 from ...lobes.lobe_integrals import LEAST_SHARE
 from ...lobes.lookup_table import MIN_ALPHA, LookupTable
 from ...shading import header
@@ -378,7 +379,15 @@ def _diffuse_text(features) -> str:
         if features.rough:
             sum_value = "vec4(diffuse_rough_factors(lobe, sum), 0.0, 0.0)"
         values["FOCUSED"] = _focused_text("diffuse", "", sum_value, "diffuse_frame(lobe)")
-    return header.filled(glsl("diffuse"), values)
+    return (_bumped_text() if features.bumped else "") + header.filled(glsl("diffuse"), values)
+
+
+def _bumped_text() -> str:
+    terms = (f"    value = value * alpha + {_vector(row)};" for row in np.transpose(TERM_POLYNOMIALS)[::-1])
+    nodes = ((2.0 * place - 1.0, weight) for place, weight in BUMP_NODES)
+    calls = (", ".join(map(header.float_literal, node)) for node in nodes)
+    lines = (f"    sum += ltsh_bump_node(arc, toward, {call});" for call in calls)
+    return header.filled(glsl("bumped"), {"TERMS": "\n".join(terms), "NODES": "\n".join(lines)})
 
 
 def slope_text() -> str:

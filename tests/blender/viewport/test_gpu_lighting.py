@@ -18,6 +18,8 @@ WIDTH, HEIGHT = 32, 16
 TECHNIQUES = ("ltc", "ltsh2", "ltsh4", "ltsh4c")
 # What the preview promises: below the differences between techniques, and nothing the eye could see.
 RELATIVE, ABSOLUTE = 1e-3, 1e-5
+# Points of small lights follow bump shadowing less closely where it is steep, near the horizon.
+RELATIVE_OF_BUMPS = 3e-3
 # The quadrature over a profile is good to 3e-3 in both, and which one is taken may depend on rounding.
 RELATIVE_OF_PROFILES = 3e-3
 CONES = 5e-3
@@ -105,7 +107,8 @@ def test_radiance_is_that_of_the_integrator(surface, kinds, techniques):
                         # Fewer points than there say what a cone leaves of the light where it ends.
                         assert distance(found, shaded) < CONES, (kind, technique, name)
                         continue
-                    relative = RELATIVE_OF_PROFILES if lights[0].has_profile else RELATIVE
+                    relative = RELATIVE_OF_BUMPS if (surface, name) == ("tilted", "diffuse") else RELATIVE
+                    relative = RELATIVE_OF_PROFILES if lights[0].has_profile else relative
                     relative = RELATIVE_OF_CAPS if kind in random_surfaces.FACING_LIGHTS else relative
                     times = excess(found, shaded, relative)
                     brightest[name] = max(brightest[name], float(shaded.max()))

@@ -1,17 +1,20 @@
 struct diffuse_lobe {
-    vec3 plane_0; vec3 plane_1; vec3 plane_2; bool is_spare; float bump_alpha2;
+    vec3 plane_0; vec3 plane_1; vec3 plane_2; bool is_spare;
 #ifdef LTSH_SHEEN
     /* The frame around the normal, with the view on the side of the first axis. a = 1 and b = 0 are Lambert's lobe. */
     ltsh_frame frame; float a; float b;
 #endif
 };
-#ifdef LTSH_ROUGH
-/* Twice the integral of the direction over a polygon, and the integrals of rough.glsl. */
-struct diffuse_sum { vec3 total; vec2 rough; };
-#else
-/* Twice the integral of the direction over a polygon. */
-struct diffuse_sum { vec3 total; };
+/* Twice the integral of the direction over a polygon, and of the shadowed cosine; and the integrals of rough.glsl. */
+struct diffuse_sum {
+    vec3 total;
+#ifdef LTSH_BUMPED
+    float shadowed;
 #endif
+#ifdef LTSH_ROUGH
+    vec2 rough;
+#endif
+};
 
 vec3 diffuse_warped(diffuse_lobe lobe, vec3 v)
 {
@@ -52,6 +55,9 @@ diffuse_sum diffuse_empty()
 {
     diffuse_sum sum;
     sum.total = vec3(0.0);
+#ifdef LTSH_BUMPED
+    sum.shadowed = 0.0;
+#endif
 #ifdef LTSH_ROUGH
     sum.rough = vec2(0.0);
 #endif
@@ -62,6 +68,9 @@ diffuse_sum diffuse_with_edge(diffuse_sum sum, vec3 start, vec3 end)
 {
     ltsh_edge edge = ltsh_edge_between(start, end);
     sum.total += edge.phi * edge.normal;
+#ifdef LTSH_BUMPED
+    sum.shadowed += ltsh_bump_edge(start, end);
+#endif
 #ifdef LTSH_ROUGH
     sum.rough += ltsh_rough_edge(start, end);
 #endif
@@ -74,6 +83,10 @@ diffuse_sum diffuse_with_edge(diffuse_sum sum, vec3 start, vec3 end)
 diffuse_sum diffuse_with_spot(diffuse_sum sum, vec3 direction, float solid_angle)
 {
     sum.total += 2.0 * solid_angle * direction;
+#ifdef LTSH_BUMPED
+    float height = max(dot(direction, ltsh_smooth_normal), 1e-6);
+    sum.shadowed += 2.0 * solid_angle * dot(direction, ltsh_bent_normal) * ltsh_modeled_shadowing(height);
+#endif
 #ifdef LTSH_ROUGH
     sum.rough += solid_angle * ltsh_diffuse_spot(direction);
 #endif
@@ -98,13 +111,12 @@ diffuse_lobe diffuse_at(ltsh_point point, ivec2 texel)
     lobe.plane_1 = vec3(0.0);
     lobe.plane_2 = vec3(0.0);
     lobe.is_spare = true;
-    lobe.bump_alpha2 = 0.0;
 #ifdef LTSH_BUMPED
     vec4 normal = texelFetch(diffuse_normals, texel, 0);
     lobe.plane_0 = normal.xyz;
     lobe.plane_1 = texelFetch(smooth_normals, texel, 0).xyz;
     lobe.is_spare = ltsh_is_same(lobe.plane_0, lobe.plane_1);
-    lobe.bump_alpha2 = all(equal(lobe.plane_0, lobe.plane_1)) ? 0.0 : normal.w;
+    ltsh_set_bump(lobe.plane_0, lobe.plane_1, all(equal(lobe.plane_0, lobe.plane_1)) ? 0.0 : normal.w);
 #elif defined(LTSH_TURNED)
     lobe.plane_0 = texelFetch(diffuse_normals, texel, 0).xyz;
 #endif
@@ -120,15 +132,12 @@ diffuse_lobe diffuse_at(ltsh_point point, ivec2 texel)
     return lobe;
 }
 
-/* The form factor of a sum. Bump shadowing, see `scene.SurfaceSamples`, is evaluated at the light's mean direction. */
+/* The form factor of a sum. */
 float diffuse_form_factor(diffuse_lobe lobe, diffuse_sum sum)
 {
 #ifdef LTSH_BUMPED
-    vec3 direction = -0.5 * sum.total;
-    float along = max(dot(direction, lobe.plane_1), 1e-15);
-    float tangent2 = max(dot(direction, direction) / (along * along) - 1.0, 0.0);
-    float shadowing = 2.0 / (1.0 + sqrt(1.0 + lobe.bump_alpha2 * tangent2));
-    return max(dot(lobe.plane_0, direction), 0.0) * shadowing * LTSH_ONE_OVER_PI;
+    float mean = -dot(sum.total, lobe.plane_1) * inversesqrt(max(dot(sum.total, sum.total), 1e-37));
+    return max(-0.5 * LTSH_ONE_OVER_PI * sum.shadowed, 0.0) * ltsh_bump_correction(clamp(mean, 1e-6, 1.0));
 #else
     return max(-0.5 * LTSH_ONE_OVER_PI * dot(lobe.plane_0, sum.total), 0.0);
 #endif
@@ -147,7 +156,10 @@ vec2 diffuse_rough_factors(diffuse_lobe lobe, diffuse_sum sum)
 /* True if `diffuse_of_cap` can integrate the lobe over a cap of the sphere. */
 bool diffuse_has_caps(diffuse_lobe lobe, bool whole)
 {
-    bool has = whole || (lobe.is_spare && lobe.bump_alpha2 == 0.0);
+    bool has = whole || lobe.is_spare;
+#ifdef LTSH_BUMPED
+    has = has && ltsh_bump_alpha2 == 0.0;
+#endif
 #ifdef LTSH_SHEEN
     has = has && lobe.a == 1.0 && lobe.b == 0.0;
 #endif
@@ -167,9 +179,7 @@ float diffuse_of_cap(diffuse_lobe lobe, ltsh_light light)
     float radius2 = dot(light.half_u, light.half_u);
     float sine2 = radius2 / (squared + radius2);
     vec3 axis = inversesqrt(squared) * light.offset;
-    diffuse_sum sum;
-    sum.total = -2.0 * LTSH_PI * sine2 * axis;
-    float whole = diffuse_form_factor(lobe, sum);
+    float whole = diffuse_form_factor(lobe, diffuse_with_spot(diffuse_empty(), axis, -LTSH_PI * sine2));
     float cosine = clamp(dot(lobe.plane_0, axis), -1.0, 1.0);
     float slope2 = squared / max(radius2, 1e-37);
     float root = sqrt(max(slope2 * (1.0 - cosine * cosine / max(sine2, 1e-37)), 0.0));

@@ -128,6 +128,12 @@ vec3 ltsh_sky_diffuse(diffuse_lobe lobe, vec4 mean)
 {
     diffuse_sum sum;
     sum.total = -LTSH_PI * (lobe.plane_0 + (lobe.is_spare ? lobe.plane_0 : lobe.plane_1));
+#ifdef LTSH_BUMPED
+    /* Both horizons are half circles around the same ends. */
+    vec3 side = ltsh_make_frame(lobe.plane_0, lobe.plane_1).bitangent;
+    sum.shadowed = ltsh_bump_edge(side, cross(side, lobe.plane_0)) + ltsh_bump_edge(cross(lobe.plane_1, side), side);
+    sum.shadowed *= 2.0;
+#endif
     vec3 light = mean.rgb;
     if (mean.w > 0.0) {
         light = ltsh_sky_at(lobe.plane_0, ivec2(0, LTSH_SKY_SIZE + 3), LTSH_IRRADIANCE_SIZE);

@@ -289,7 +289,9 @@ class Occluders:
         number = np.repeat(chosen, [len(largest[self.mesh[number]][0]) for number in chosen])
         matrix = self.matrices[number]
         corners = np.einsum("tkj,tij->tki", corners, matrix[:, :, :3]) + matrix[:, None, :, 3]
-        return PlacedTriangles(number, index, corners), _Planes.of(corners)
+        triangles = PlacedTriangles(number, index, corners)
+        triangles = triangles.take(np.isfinite(corners).all(axis=(1, 2)))
+        return triangles, _Planes.of(triangles.corners)
 
     def _all_in_planes(self, triangles, planes, chosen):
         """All triangles of the instances of those `chosen` that are in planes with these."""

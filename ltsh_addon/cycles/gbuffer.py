@@ -200,10 +200,8 @@ def with_widened_lobes(samples: SurfaceSamples, film: Film, points: int) -> Surf
     """`samples` with specular lobes that take in how the normal turns between the points of a pixel, of which `points`
     will be shaded, so that highlights thinner than pixels do not fall between them (Kaplanyan, Hill, Patney and Lefohn
     2016, Filtering Distributions of Normals for Shading Antialiasing). Pixels with one sample stay as they are."""
-    starts = np.arange(len(samples)) if film.first is None else np.flatnonzero(film.first)
-    lengths = np.diff(starts, append=len(samples))
-    slot = np.arange(len(samples)) - np.repeat(starts, lengths)
-    keys = film.pixel, slot, np.repeat(lengths, lengths), samples.receiver
+    _, lengths, lobe = _hits(samples, film)
+    keys = film.pixel, lobe, np.repeat(lengths, lengths), samples.receiver
     order = np.lexsort(keys)
     keys = [key[order] for key in keys]
     normal, position, face = (values[order] for values in (samples.normal, samples.position, samples.geometric_normal))
@@ -252,11 +250,17 @@ def _together(film: Film, leaders: np.ndarray, group: np.ndarray) -> Film:
     return replace(merged_film, spread=np.stack(sums, axis=1).astype(np.float32).reshape(merged_film.spread.shape))
 
 
+def _hits(samples: SurfaceSamples, film: Film) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of each hit its first sample (H,) and how many it has (H,); and the number (P,) of each sample in its hit."""
+    starts = np.arange(len(samples)) if film.first is None else np.flatnonzero(film.first)
+    lengths = np.diff(starts, append=len(samples))
+    return starts, lengths, np.arange(len(samples)) - np.repeat(starts, lengths)
+
+
 def _groups(samples: SurfaceSamples, film: Film, looseness: float) -> tuple[np.ndarray, np.ndarray]:
     """The samples (Q,) that stand for others of their pixel, and for each sample (P,) the number of the one that
     stands for it."""
-    starts = np.arange(len(samples)) if film.first is None else np.flatnonzero(film.first)
-    lengths = np.diff(starts, append=len(samples))
+    starts, lengths, lobe_of_sample = _hits(samples, film)
     pixel, target = film.pixel[starts], np.arange(len(starts))
     free, shines = np.ones(len(starts), bool), has_lobe(samples)[1]
     for _ in range(MERGED_ROUNDS):
@@ -275,8 +279,7 @@ def _groups(samples: SurfaceSamples, film: Film, looseness: float) -> tuple[np.n
         target[others[same]] = leader[same]
         free[others[same]] = False
     # Go from hits to their samples.
-    lobe = np.arange(len(samples)) - np.repeat(starts, lengths)
-    of_sample = np.repeat(starts[target], lengths) + lobe
+    of_sample = np.repeat(starts[target], lengths) + lobe_of_sample
     leading = np.flatnonzero(of_sample == np.arange(len(samples)))
     return leading, np.searchsorted(leading, of_sample)
 

@@ -146,10 +146,12 @@ class _Problem:
         Each move is the one with the least excess by first differences of the logarithms of all samples (a minimax
         problem, by sequential linear programming; the moves are so few that all of them are looked at).
         """
+        if not len(starts):
+            return None, np.inf
         best, least = starts, np.full(len(starts), np.inf)
         slopes = axes = np.zeros((len(starts), 2, 0))
         logs, reach, now = np.zeros((len(starts), 0)), np.full(len(starts), REACH * self.lobe), starts
-        for _ in range(most_moves if len(starts) else 0):
+        for _ in range(most_moves):
             axes_now = np.array([_axes(direction) for direction in now])
             tried = np.concatenate([now[:, None], _unit(now[:, None] + PROBE * self.lobe * axes_now)], axis=1)
             radiance = self._specular(tried.reshape(-1, 3), self.samples).reshape(len(now), 3, -1)
@@ -168,8 +170,6 @@ class _Problem:
             expected = (logs[:, None] + (MOVES @ slopes) * reach[:, None, None]).max(axis=-1)
             moves = reach[:, None] * MOVES[np.argmin(expected, axis=-1)]
             now = _unit(best + np.einsum("ni,nij->nj", moves, axes))
-        if not len(starts):
-            return None, np.inf
         first = int(np.argmin(least))
         return best[first], float(least[first])
 

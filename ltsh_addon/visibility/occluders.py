@@ -28,6 +28,8 @@ GAP = float(np.finfo(np.float32).eps)
 # heights in units of the largest coordinate, round to as many steps; PLANE_KEYS make a number of that.
 MOST_IN_PLANES, LARGEST, PLANE_POINTS, MOST_TESTS, PLANE_STEPS = 1 << 17, 1024, 2048, 2_000_000, 1e4
 PLANE_KEYS = np.array([1, 3_000_017, 9_000_000_000_023, 27_000_000_000_000_029])
+# Tells the two sides of planes apart; no common plane holds it.
+OBLIQUE = np.array([0.61, 0.553, 0.567])
 
 
 @dataclass(frozen=True)
@@ -427,7 +429,7 @@ class _Planes:
         normal = _crosses(corners)
         length = np.linalg.norm(normal, axis=1)
         normal /= np.maximum(length, 1e-300)[:, None]
-        facing = np.where(normal @ (0.61, 0.553, 0.567) < 0.0, -1.0, 1.0)
+        facing = np.where(normal @ OBLIQUE < 0.0, -1.0, 1.0)
         height = (normal * corners[:, 0]).sum(axis=1) / np.abs(corners).max(initial=1e-300)
         # The offset keeps round numbers from where numbers round up or down.
         plane = np.rint(np.column_stack([normal, height]) * (facing * PLANE_STEPS)[:, None] + 0.123)

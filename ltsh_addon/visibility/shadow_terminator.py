@@ -9,7 +9,7 @@ import numpy as np
 
 from ..lobes.polygon import dot
 from ..scene import SurfaceSamples
-from .occluders import ALL_RAYS, GAP, STEP, Hits, OccluderMesh, Occluders
+from .occluders import ALL_RAYS, GAP, OBLIQUE, STEP, Hits, OccluderMesh, Occluders
 
 # Distance from its triangle at which a ray does not meet it, as a share of the size of coordinates: 8 times their
 # rounding in single precision. 2 times are too few; 4 seem to suffice.
@@ -17,8 +17,6 @@ CLEARANCE = 2.0**-21
 # NEARBY: distance from a sample, in m near the origin, within which its surface is looked for. LAYERS: most surfaces
 # looked at. CERTAIN: share of that distance at which a surface is close enough to stop looking.
 NEARBY, LAYERS, CERTAIN = 2.0**-14, 4, 2.0**-3
-# Tells the two sides of planes apart; no common plane holds it.
-CANONICAL = np.array([0.61, 0.553, 0.567])
 
 
 class ShadowTerminator:
@@ -83,14 +81,14 @@ class ShadowTerminator:
 
     def _triangles_at(self, position, normal, reach) -> Hits:
         """Hits on the triangles on which samples lie, within `reach` (P,) m or within the triangles' thickness."""
-        hits = self._nearest(position, normal, reach)
+        hits = _nearest(self._caster, position, normal, reach)
         thickest = np.float32(self._thickness.max(initial=0.0))
         if thickest == 0.0:
             return hits
         rest = np.ones(len(position), bool)
         rest[hits.ray] = False
         rest = np.flatnonzero(rest)
-        wider = self._nearest(position[rest], normal[rest], np.full(len(rest), thickest))
+        wider = _nearest(self._caster, position[rest], normal[rest], np.full(len(rest), thickest))
         within = np.zeros(len(wider.ray), bool)
         for number in np.unique(wider.instance[self._thickness[wider.instance] > 0.0]):
             here = np.flatnonzero(wider.instance == number)
@@ -98,9 +96,6 @@ class ShadowTerminator:
         wider = Hits(rest[wider.ray], *(getattr(wider, field.name) for field in fields(Hits)[1:]))
         joined = zip(*((getattr(each, field.name) for field in fields(Hits)) for each in (hits, wider)), strict=True)
         return Hits(*(np.concatenate([one, other[within]]) for one, other in joined))
-
-    def _nearest(self, position, normal, reach) -> Hits:
-        return _nearest(self._caster, position, normal, reach)
 
     def close(self) -> None:
         """Free what the casters of opposed faces hold."""
@@ -118,7 +113,7 @@ class OpposedFaces:
         normals = np.cross(*np.moveaxis(opposed.corners[:, 1:] - opposed.corners[:, :1], 1, 0))
         normals *= occluders.handedness()[opposed.instance, None]
         for side in (1.0, -1.0):
-            triangles = opposed.take(side * (normals @ CANONICAL) > 0.0)
+            triangles = opposed.take(side * (normals @ OBLIQUE) > 0.0)
             corners = triangles.corners.reshape(-1, 3)
             self._triangles.append(triangles)
             mesh = OccluderMesh(corners, np.arange(len(corners)).reshape(-1, 3))
@@ -135,7 +130,7 @@ class OpposedFaces:
 
         As in Cycles, what is in the plane of a sample blocks, and what is below by more than rounding does not.
         """
-        occluders, is_up = self._occluders, normal @ CANONICAL > 0.0
+        occluders, is_up = self._occluders, normal @ OBLIQUE > 0.0
         masks, shares = np.zeros(len(position), np.uint32), np.ones(len(position), np.float32)
         for triangles, caster, chosen in zip(self._triangles, self._casters, (~is_up, is_up), strict=True):
             for start in range(0, len(position) if len(triangles.instance) else 0, caster.chunk):

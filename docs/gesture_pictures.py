@@ -88,7 +88,7 @@ def main() -> None:
     lamp = scene()
     pictures = {"Before": (picture("before"), None)}
     pose = LightPose.of(lamp)
-    around = hits_around(lambda offset: hit(np.array(HIGHLIGHT[1]) + offset))
+    around = hits_around(lambda offsets: [hit(HIGHLIGHT[1] + offset) for offset in offsets])
     distance = (pose.matrix.translation - around.hits[0].position).length
     matrix, note = place_of(lamp, pose, around, distance, ShownTextures())
     print("highlight:", note or "at the mouse")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -77,14 +78,13 @@ def place_for_highlight(
     radiance, which is 0 at the peak, from the mirrored view on: of rough and curved surfaces the peak is elsewhere.
     Where that fails, the directions around are tried; if `is_thorough`, many more.
     """
-    mirror = mirrored(samples.view[0], samples.normal[0])
     problem = _Problem(samples, light, technique, max(float(samples.sharpest_roughness[0]) ** 2, 1e-3))
-    direction, is_peak = problem.by_newton(mirror) if has_stencil else (mirror, False)
+    direction, is_peak = problem.by_newton(problem.mirror) if has_stencil else (problem.mirror, False)
     excess = float(problem.excess([direction])[0][0])
     if is_peak and excess <= STRICT:
         return HighlightPlace(direction, excess)
     count, moves = THOROUGH if is_thorough else QUICK
-    starts = problem.starts(mirror, [direction] if excess < np.inf else [])
+    starts = problem.starts([direction] if excess < np.inf else [])
     searched, least = problem.by_search(starts[:count], moves)
     if least < excess:
         direction, excess = searched, least
@@ -99,6 +99,16 @@ class _Problem:
     light: MovedLight
     technique: object
     lobe: float  # its angle in rad
+
+    @cached_property
+    def mirror(self) -> np.ndarray:
+        """The direction (3,) of the mirrored view."""
+        return mirrored(self.samples.view[0], self.samples.normal[0])
+
+    @cached_property
+    def _light_at_mirror(self) -> tuple[np.ndarray, Light]:
+        matrix = self.light.matrix_at(self.mirror)
+        return matrix, self.light.at(matrix)
 
     def by_newton(self, direction: np.ndarray) -> tuple[np.ndarray, bool]:
         """The direction (3,) to which Newton's method leads, and whether it is that of a peak."""
@@ -130,8 +140,9 @@ class _Problem:
         here = radiance[:, 0]
         return np.where(here > 0.0, radiance.max(axis=-1) / np.maximum(here, 1e-30) - 1.0, np.inf), here
 
-    def starts(self, mirror: np.ndarray, further: list) -> np.ndarray:
+    def starts(self, further: list) -> np.ndarray:
         """The directions (N, 3) around the mirrored view from which to search, the most promising first."""
+        mirror = self.mirror
         turned = np.tensordot(np.sin(ANGLES), _circle() @ _axes(mirror), axes=0).reshape(-1, 3)
         tried = np.stack([mirror, *further, *(turned + np.cos(ANGLES).repeat(TURNS)[:, None] * mirror)])
         few = np.concatenate([np.arange(len(STENCIL)), np.arange(len(STENCIL), len(self.samples), THINNED)])
@@ -180,11 +191,12 @@ class _Problem:
         """
         options = {"passes": ("specular",), "workers": 1, "dtype": dtype}
         matrices = np.array([self.light.matrix_at(direction) for direction in directions])
-        moves = matrices[0] @ np.linalg.inv(matrices)
+        place, light = self._light_at_mirror
+        moves = place @ np.linalg.inv(matrices)
         if np.abs(moves[:, :3, :3] @ moves[:, :3, :3].transpose(0, 2, 1) - np.eye(3)).max() < RIGID:
             moved = samples.take(np.tile(np.arange(len(samples)), len(moves)))
             arrays = {name: _moved(moves, getattr(samples, name), name == "position") for name in SPATIAL}
-            shading = shade(replace(moved, **arrays), [self.light.at(matrices[0])], self.technique, **options)
+            shading = shade(replace(moved, **arrays), [light], self.technique, **options)
             return shading.specular.sum(axis=(0, 2)).reshape(len(moves), len(samples))
         lights = [self.light.at(matrix) for matrix in matrices]
         return shade(samples, lights, self.technique, rows=range(len(lights)), **options).specular.sum(axis=-1)

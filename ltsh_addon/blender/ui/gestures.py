@@ -22,7 +22,7 @@ from .light_pose import (
     reason_to_keep_look,
     reason_to_keep_power,
 )
-from .lit_point import LightShare, SceneLights, SurfaceHit, share_line, surface_hit
+from .lit_point import LightShare, SceneLights, SurfaceHit, share_line, surface_hits
 from .preview import PASSED_ON, active_light, lights_of, region_under
 from .shadow_edge import NEAR_EDGE, OccluderRays, shadow_edge_near
 
@@ -297,7 +297,7 @@ class MovingGesture(Gesture):
         hit = hit_at(context, region, mouse) if self._is_dragged and event.ctrl and region is not None else None
         if hit is None or hit.face is None:
             return
-        places = (hit.matrix @ Vector(place) for place in (*hit.face.corners, hit.face.corners.mean(axis=0)))
+        places = (hit.matrix @ Vector(place) for place in (*hit.face.corners, np.mean(hit.face.corners, axis=0)))
         pixels = [view3d_utils.location_3d_to_region_2d(region, region.data, place) for place in places]
         pixels = np.array([pixel for pixel in pixels if pixel is not None])
         if len(pixels):
@@ -369,8 +369,7 @@ class LTSH_OT_drag_highlight(MovingGesture, bpy.types.Operator):
         region, mouse = view_under(context, self._mouse)
         if region is None:
             return None
-        depsgraph, faces = context.evaluated_depsgraph_get(), {}
-        return hits_around(lambda offset: hit_at(context, region, mouse + offset, depsgraph, faces), disk)
+        return hits_around(lambda offsets: hits_at(context, region, mouse + offsets), disk)
 
 
 class LTSH_OT_drag_brightness(Gesture, bpy.types.Operator):
@@ -460,7 +459,7 @@ class LTSH_OT_drag_shadow(MovingGesture, bpy.types.Operator):
         depsgraph = context.evaluated_depsgraph_get()
         self._edge, self._note = shadow_edge_near(
             OccluderRays(context.scene, depsgraph, self._light),
-            lambda offset: hit_at(context, region, mouse + offset, depsgraph),
+            lambda offset: hit_at(context, region, mouse + offset),
             self._pose.matrix, self._light.data.type, NEAR_EDGE * self._scale,
         )  # fmt: skip
         return self._edge is not None and self.follow(context, event)
@@ -548,8 +547,16 @@ def unregister() -> None:
         bpy.utils.unregister_tool(_tools.pop())
 
 
-def hit_at(context, region, pixel: tuple[float, float], depsgraph=None, faces=None) -> SurfaceHit | None:
-    """What the view of a region meets at a pixel; `faces` as for `surface_hit`."""
-    start = view3d_utils.region_2d_to_origin_3d(region, region.data, pixel)
-    direction = view3d_utils.region_2d_to_vector_3d(region, region.data, pixel)
-    return surface_hit(context.scene, depsgraph or context.evaluated_depsgraph_get(), start, direction, faces)
+def hit_at(context, region, pixel: np.ndarray) -> SurfaceHit | None:
+    """What the view of a region meets at a pixel (2,)."""
+    return hits_at(context, region, pixel[None])[0]
+
+
+def hits_at(context, region, pixels: np.ndarray) -> list[SurfaceHit | None]:
+    """What the view of a region meets at pixels (P, 2)."""
+    rays = [
+        (view3d_utils.region_2d_to_origin_3d(region, region.data, pixel),
+         view3d_utils.region_2d_to_vector_3d(region, region.data, pixel))
+        for pixel in pixels.tolist()
+    ]  # fmt: skip
+    return surface_hits(context.scene, context.evaluated_depsgraph_get(), rays)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from mathutils import Matrix, Vector
@@ -47,11 +48,21 @@ class HitsAround:
     pixels: np.ndarray  # (P, 2) of the hits, from the mouse
     has_stencil: bool  # the first nine are those of STENCIL; False at rims
 
+    @cached_property
+    def _material(self) -> PreviewMaterial:
+        material = self.hits[0].material
+        return preview_of(None if material is None else material.original)
 
-def glossy_lobe(material) -> PreviewMaterial | None:
-    """The first lobe of a material that has highlights."""
-    lobes = preview_of(None if material is None else material.original).lobes
-    return next((lobe for lobe in lobes if lobe.kind not in DULL and not lobe.is_clear), None)
+    @cached_property
+    def lobe(self) -> PreviewMaterial | None:
+        """The first lobe of the material that has highlights."""
+        return next((lobe for lobe in self._material.lobes if lobe.kind not in DULL and not lobe.is_clear), None)
+
+    @property
+    def unread(self) -> str:
+        """What of the material's normals is not read, and moves its highlights; "" without any."""
+        notes = self._material.notes
+        return ", ".join(note for note in notes if "normals from" in note or "anisotropy" in note)
 
 
 def samples_of(hits: list[SurfaceHit], lobe: PreviewMaterial, textures: ShownTextures) -> SurfaceSamples:
@@ -59,7 +70,7 @@ def samples_of(hits: list[SurfaceHit], lobe: PreviewMaterial, textures: ShownTex
     map."""
     count, white = len(hits), np.ones((len(hits), 3))
     position, view, normal, true = (
-        np.array([getattr(hit, name) for hit in hits]) for name in ("position", "view", "normal", "face_normal")
+        np.array([getattr(hit, name)[:] for hit in hits]) for name in ("position", "view", "normal", "face_normal")
     )
     smooth, coat, brush = normal, lobe.coat if lobe.kind == COAT else None, lobe.brush
     if lobe.normal is not None:
@@ -116,8 +127,7 @@ def place_of(
     ob, pose: LightPose, around: HitsAround, distance: float, textures: ShownTextures, is_thorough=False
 ) -> tuple[Matrix, str]:
     """The matrix of the light object `ob` for a highlight at the mouse; and what there is to say about it."""
-    hit = around.hits[0]
-    lobe = glossy_lobe(hit.material)
+    hit, lobe = around.hits[0], around.lobe
 
     def matrix_at(direction: np.ndarray) -> Matrix:
         return pose.facing(hit.position, Vector(direction), distance)
@@ -128,7 +138,7 @@ def place_of(
     samples = samples_of(around.hits, lobe, textures)
     place = place_for_highlight(samples, light, shipped_table(), around.has_stencil, is_thorough)
     note = "" if place.is_peak else BEHIND if math.isinf(place.excess) else BESIDE
-    return matrix_at(place.direction), unlinked(ob, hit) or note or unread(hit.material)
+    return matrix_at(place.direction), unlinked(ob, hit) or note or around.unread
 
 
 def unlinked(ob, hit: SurfaceHit) -> str:
@@ -138,17 +148,10 @@ def unlinked(ob, hit: SurfaceHit) -> str:
     return "" if is_lit else f"{ob.name} does not light {hit.ob.name}, by light linking"
 
 
-def unread(material) -> str:
-    """What of a material's normals is not read, and moves its highlights; "" without any."""
-    notes = preview_of(None if material is None else material.original).notes
-    return ", ".join(note for note in notes if "normals from" in note or "anisotropy" in note)
-
-
 def note_by_pixels(ob, matrix: Matrix, around: HitsAround, textures: ShownTextures) -> str:
     """Why the highlight of the light object `ob`, at `matrix` now, is not at the mouse, by all that is `around`; ""
     where it is."""
-    hits = around.hits
-    lobe = glossy_lobe(hits[0].material)
+    hits, lobe = around.hits, around.lobe
     if lobe is None:
         return NO_HIGHLIGHT
     if note := unlinked(ob, hits[0]):
@@ -160,7 +163,7 @@ def note_by_pixels(ob, matrix: Matrix, around: HitsAround, textures: ShownTextur
     if here <= 0.0:
         return BEHIND
     is_there = radiance.max() <= (1.0 + BRIGHTER) * here or np.hypot(*around.pixels[np.argmax(radiance)]) <= NEAR
-    return unread(hits[0].material) if is_there else BESIDE
+    return around.unread if is_there else BESIDE
 
 
 def place_by_pixels(
@@ -182,13 +185,14 @@ def _light(ob, matrix: np.ndarray):
     return replace(area_light(ob, matrix, EmitterTraits("", True, True), Receivers([ob])), receivers=None)
 
 
-def hits_around(hit_at: Callable[[np.ndarray], SurfaceHit | None], disk: np.ndarray = DISK) -> HitsAround | None:
-    """What a view shows around the mouse in the `disk` (P, 2), by `hit_at` for pixels from there; None without a
-    surface at the mouse."""
+def hits_around(hits_at: Callable[[np.ndarray], list], disk: np.ndarray = DISK) -> HitsAround | None:
+    """What a view shows around the mouse in the `disk` (P, 2), by `hits_at` for pixels (P, 2) from there; None without
+    a surface at the mouse."""
     stencil = SPACING * STENCIL
-    at_mouse, *near = map(hit_at, stencil)
+    pixels = np.concatenate([stencil, disk])
+    hits = hits_at(pixels)
+    at_mouse = hits[0]
     if at_mouse is None:
         return None
-    hits, pixels = [at_mouse, *near, *map(hit_at, disk)], np.concatenate([stencil, disk])
     same = [n for n, hit in enumerate(hits) if hit and (hit.ob, hit.material) == (at_mouse.ob, at_mouse.material)]
     return HitsAround([hits[n] for n in same], pixels[same], same[: len(stencil)] == list(range(len(stencil))))

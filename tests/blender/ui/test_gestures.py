@@ -18,13 +18,12 @@ from ltsh_addon.blender.ui import gestures
 from ltsh_addon.blender.ui.highlight_place import (
     NO_HIGHLIGHT,
     HitsAround,
-    glossy_lobe,
     note_by_pixels,
     place_of,
     samples_of,
 )
 from ltsh_addon.blender.ui.light_pose import LightPose, locked_place, reason_to_keep_look
-from ltsh_addon.blender.ui.lit_point import surface_hit
+from ltsh_addon.blender.ui.lit_point import surface_hits
 from ltsh_addon.shading import shade
 from ltsh_addon.shading.highlight import STENCIL
 
@@ -49,7 +48,7 @@ def hits_at(scene, pixels, target):
     right = toward.cross(Vector((0.0, 0.0, 1.0))).normalized()
     above = right.cross(toward)
     rays = [(toward + PIXEL * (x * right + y * above)).normalized() for x, y in pixels.tolist()]
-    return [surface_hit(scene, depsgraph, EYE, ray) for ray in rays]
+    return surface_hits(scene, depsgraph, [(EYE, ray) for ray in rays])
 
 
 @pytest.mark.parametrize("target", [(0.2, -0.5, 1.1), (-0.4, -0.4, 0.9), (1.3, -0.8, 0.0), (-1.0, -1.4, 0.0)])
@@ -68,7 +67,7 @@ def test_the_highlight_is_where_the_mouse_is(scene, target):
               if hit is not None and hit.material == middle.material]  # fmt: skip
     pixels, seen = np.array([pixel for pixel, _ in around]), [hit for _, hit in around]
     lamp = area_light(light, np.array(matrix), EmitterTraits("", True, True), Receivers([]))
-    samples = samples_of(seen, glossy_lobe(middle.material), ShownTextures())
+    samples = samples_of(seen, HitsAround(hits, 2.0 * STENCIL, True).lobe, ShownTextures())
     radiance = shade(samples, [lamp], passes=("specular",), workers=1).specular.sum(axis=(0, 2))
     lost = 1.0 - radiance[(pixels == 0).all(axis=-1)][0] / radiance.max()
     # Facets of 64 segments bend the interpolated normals by a little.

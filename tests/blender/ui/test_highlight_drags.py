@@ -15,7 +15,7 @@ from ltsh_addon.blender.lights.textures import ShownTextures
 from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels
 from ltsh_addon.blender.ui import highlight_place
 from ltsh_addon.blender.ui.light_pose import LightPose
-from ltsh_addon.blender.ui.lit_point import surface_hit
+from ltsh_addon.blender.ui.lit_point import surface_hits
 from ltsh_addon.cycles.horizons import end_at_horizons_of_cycles
 from ltsh_addon.shading import shade
 
@@ -134,11 +134,12 @@ class Drags:
         self.corners = [camera.matrix_world @ corner for corner in camera.data.view_frame(scene=scene)]
         self.eye, self.textures = camera.matrix_world.translation.copy(), ShownTextures()
 
-    def hit(self, pixel, depsgraph, faces):
-        """What the camera shows at a pixel (column, row from the top), whose middle has whole numbers."""
+    def hits(self, pixels):
+        """What the camera shows at pixels (column, row from the top), whose middles have whole numbers."""
         right, up = self.corners[0] - self.corners[3], self.corners[0] - self.corners[1]
-        point = self.corners[3] + float(pixel[0] + 0.5) / WIDTH * right - float(pixel[1] + 0.5) / HEIGHT * up
-        return surface_hit(self.scene, depsgraph, self.eye, (point - self.eye).normalized(), faces)
+        points = [self.corners[3] + (x + 0.5) / WIDTH * right - (y + 0.5) / HEIGHT * up for x, y in pixels.tolist()]
+        rays = [(self.eye, (point - self.eye).normalized()) for point in points]
+        return surface_hits(self.scene, bpy.context.evaluated_depsgraph_get(), rays)
 
     def rim(self):
         """The mask of the object's pixels that are two pixels or less from its end in the picture."""
@@ -155,15 +156,14 @@ class Drags:
         is_in = self.rim() if at_rim else self.row >= 0
         inside = np.argwhere(is_in[NEAR:-NEAR, NEAR:-NEAR]) + NEAR
         mouse = inside[random.integers(len(inside))][::-1]
-        depsgraph, faces = bpy.context.evaluated_depsgraph_get(), {}
 
-        def hit_at(offset):
-            return self.hit(mouse + np.array([offset[0], -offset[1]]), depsgraph, faces)
+        def hits_at(offsets):
+            return self.hits(mouse + offsets * (1.0, -1.0))
 
-        around = highlight_place.hits_around(hit_at)
+        around = highlight_place.hits_around(hits_at)
         distance = float(random.uniform(1.5, 4.0))
         matrix, _ = highlight_place.place_of(self.light, LightPose.of(self.light), around, distance, self.textures)
-        around = highlight_place.hits_around(hit_at, highlight_place.PIXELS)
+        around = highlight_place.hits_around(hits_at, highlight_place.PIXELS)
         matrix, note = highlight_place.place_by_pixels(
             self.light, LightPose.of(self.light), matrix, around, self.textures
         )
@@ -196,13 +196,15 @@ def told_and_missed(make, folder, count, seed, at_rim=False):
 @pytest.mark.parametrize("make", [cone, monkey, pebble])
 def test_normals_are_those_of_cycles(make, tmp_path):
     """Cycles cuts faces into triangles before it interpolates: on this cone that turns normals by up to a degree."""
-    scene, depsgraph, faces = Drags(make, tmp_path), bpy.context.evaluated_depsgraph_get(), {}
+    scene = Drags(make, tmp_path)
     seen = np.argwhere(scene.row >= 0)
-    off = []
-    for row, column in seen[np.random.default_rng(0).integers(len(seen), size=300)]:
-        hit = scene.hit((column, row), depsgraph, faces)
-        if hit is not None:
-            off.append(np.array(hit.normal) @ scene.samples.diffuse_normal[scene.row[row, column]])
+    seen = seen[np.random.default_rng(0).integers(len(seen), size=300)]
+    normals = scene.samples.diffuse_normal[scene.row[*seen.T]]
+    off = [
+        np.array(hit.normal) @ normal
+        for hit, normal in zip(scene.hits(seen[:, ::-1]), normals, strict=True)
+        if hit is not None
+    ]
     # AOVs are single precision.
     assert len(off) > 290 and np.degrees(np.arccos(np.clip(off, -1.0, 1.0))).max() < 0.05
 

@@ -34,7 +34,7 @@ BRIGHTER, STRICT, GOOD = 0.01, 0.006, 0.003
 # of the mirrored view take moves of at most REACH times the lobe, which a move that leads to no better place makes
 # SHORTER. QUICK, THOROUGH: how many searches, and moves of each.
 ANGLES, TURNS, THINNED, DIM = (0.04, 0.12, 0.25, 0.5, 0.8), 8, 4, 0.1
-REACH, SHORTER, QUICK, THOROUGH = 0.5, 0.3, (2, 5), (4, 12)
+REACH, SHORTER, QUICK, THOROUGH = 0.5, 0.3, (2, 3), (4, 12)
 # MOVES: the moves (M, 2) that are looked at, in units of the longest.
 MOVES = np.concatenate([
     radius * np.stack([np.cos(turns), np.sin(turns)], axis=-1)

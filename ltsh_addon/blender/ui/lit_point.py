@@ -64,7 +64,7 @@ class MeshFaces:
         self._by_vertex, self._flat = kind_of_normals(mesh)
         self._mesh, self._normals = mesh, mesh.vertex_normals if self._by_vertex else mesh.corner_normals
         self._layers = {layer.name: layer.uv for layer in mesh.uv_layers}
-        self._layers |= {"": layer.uv for layer in mesh.uv_layers if layer.active_render}
+        self._layers.update(("", layer.uv) for layer in mesh.uv_layers if layer.active_render)
         self._faces: dict[int, MeshFace] = {}
 
     def face(self, number: int) -> MeshFace:

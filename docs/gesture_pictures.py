@@ -18,9 +18,8 @@ sys.path.insert(0, str(ROOT))
 
 from ltsh_addon import imaging  # noqa: E402
 from ltsh_addon.blender.lights.textures import ShownTextures  # noqa: E402
-from ltsh_addon.blender.ui.gestures import power_for  # noqa: E402
 from ltsh_addon.blender.ui.highlight_place import hits_around, place_of  # noqa: E402
-from ltsh_addon.blender.ui.light_pose import LightPose  # noqa: E402
+from ltsh_addon.blender.ui.light_pose import LightPose, power_for  # noqa: E402
 from ltsh_addon.blender.ui.lit_point import surface_hit  # noqa: E402
 from ltsh_addon.blender.ui.shadow_edge import OccluderRays, shadow_edge_near  # noqa: E402
 

@@ -14,15 +14,18 @@ from mathutils import Matrix, Vector
 from ...scene import error_line
 from ..lights.groups import reason_to_stay
 from ..lights.textures import ShownTextures
-from .highlight_place import DISK, PIXELS, HitsAround, hits_around, note_by_pixels, place_by_pixels, place_of
-from .light_pose import (
-    LightLook,
-    LightPose,
-    locked_place,
-    reason_to_keep_look,
-    reason_to_keep_power,
+from .highlight_place import (
+    DISK,
+    PIXELS,
+    HitsAround,
+    hits_around,
+    note_by_pixels,
+    place_by_pixels,
+    place_of,
+    warm_up,
 )
-from .lit_point import LightShare, SceneLights, SurfaceHit, share_line, surface_hits
+from .light_pose import LightLook, LightPose, locked_place, power_for, reason_to_keep_look, reason_to_keep_power
+from .lit_point import LightShare, SceneLights, SurfaceHit, hit_at, hits_at, share_line
 from .preview import PASSED_ON, active_light, lights_of, region_under
 from .shadow_edge import NEAR_EDGE, OccluderRays, shadow_edge_near
 
@@ -36,19 +39,14 @@ AXES, MODES = "XYZ", {"D": "distance", "S": "size", "C": "color"}
 # REST_SECONDS: after so long without a move the shares of the lights at the mouse are told, which may take a while.
 REST_SECONDS = 0.2
 # MOVING_KEYS: what the status bar says of keys while a light is moved.
-MOVING_KEYS = "Wheel, D: distance    S: size    C: color    X, Y, Z: lock    Shift: precise    Ctrl: corners"
+MOVING_KEYS = "Wheel, D, number: distance    S: size    C: color    X, Y, Z: lock    Shift: precise    Ctrl: corners"
 # FOLLOWED: what a drag follows.
 FOLLOWED = ("MOUSEMOVE", "LEFT_SHIFT", "LEFT_CTRL", "RIGHT_SHIFT", "RIGHT_CTRL")
+LEAST_DISTANCE = 1e-3  # m, of a light from what it faces
 NO_SURFACE = "there is no surface under the mouse"
 
 
 _logger = logging.getLogger(__name__)
-
-
-def power_for(factor: float, power: float, share: float) -> float:
-    """The power of a light with which a point gets `factor` times its light, of which a light of this `power` gives
-    the `share`, over 0; never below 0."""
-    return max(0.0, power * (1.0 + (factor - 1.0) / share))
 
 
 def view_under(context, mouse: np.ndarray) -> tuple:
@@ -68,11 +66,13 @@ class Gesture:
 
     def invoke(self, context, event):
         self._is_dragged, self._note, self._scene_lights, self._textures = False, "", None, ShownTextures()
+        self._typed = ""
         self._scale, self._is_told, self._is_still = context.preferences.system.ui_scale, False, False
         self._mouse = self._last = pointer(event)
         self._timer = context.window_manager.event_timer_add(REST_SECONDS, window=context.window)
         context.window.cursor_modal_set("CROSSHAIR")
         context.workspace.status_text_set(f"{self.words(context)}    Esc: Cancel")
+        warm_up(context.scene)
         # A tool starts it by the press itself, a button by its release.
         if event.type == "LEFTMOUSE" and event.value == "PRESS":
             try:
@@ -120,13 +120,14 @@ class Gesture:
         if event.type in ("ESC", "RIGHTMOUSE"):
             self.cancel(context)
             return {"CANCELLED"}
-        if event.type == "LEFTMOUSE":
-            if event.value == "RELEASE" and self._is_dragged:
+        is_confirmed = event.type in ("RET", "NUMPAD_ENTER") and event.value == "PRESS"
+        if event.type == "LEFTMOUSE" or is_confirmed:
+            if (event.value == "RELEASE" or is_confirmed) and self._is_dragged:
                 if not self._is_told and (warning := self.warning(context, event)):
                     self.report({"WARNING"}, warning)
                 self._end(context)
                 return {"FINISHED" if self.is_changed() else "CANCELLED"}
-            if event.value in ("PRESS", "DOUBLE_CLICK"):
+            if event.value in ("PRESS", "DOUBLE_CLICK") and not is_confirmed:
                 self._is_dragged = self._do(context, event, self.press)
                 # Why a drag cannot begin is told until the mouse moves.
                 self._is_told = not self._is_dragged
@@ -137,9 +138,10 @@ class Gesture:
             now = pointer(event)
             way, self._last = (PRECISE if event.shift else 1.0) * (now - self._last), now
             self._is_told = self._is_still = False
-            self.move(way)
-            self._do(context, event, self.follow)
-        elif self._is_dragged and event.value == "PRESS" and self.key(event):
+            if not self._typed:
+                self.move(way)
+                self._do(context, event, self.follow)
+        elif self._is_dragged and event.value == "PRESS" and (self._type(event) or self.key(event)):
             self._do(context, event, self.follow)
         elif event.type == "MOUSEMOVE":
             self._is_told = self._is_still = False
@@ -168,6 +170,19 @@ class Gesture:
         """Take a key that is pressed while dragging; False if it has no meaning."""
         return False
 
+    def number(self, value: float) -> None:
+        """Take a number, not below 0, that is typed while dragging. Until it is erased the mouse changes nothing."""
+
+    def _type(self, event) -> bool:
+        """Take a key of a number; False if it is none."""
+        typed = self._typed[:-1] if event.type == "BACK_SPACE" else self._typed + event.ascii
+        if typed == self._typed or typed.strip("0123456789.") or typed.count(".") > 1:
+            return False
+        self._typed = typed
+        if typed.strip("."):
+            self.number(float(typed))
+        return True
+
     def warning(self, context, event) -> str:
         """What is wrong with what the drag has reached, if telling takes longer than a move may; "" if nothing."""
         return ""
@@ -191,7 +206,7 @@ class Gesture:
 
     def _do(self, context, event, step) -> bool:
         is_done = step(context, event)
-        self._tell(context, self._note)
+        self._tell(context, f"[{self._typed}]    {self._note}" if self._typed else self._note)
         return is_done
 
     def _rest(self, context, event) -> bool:
@@ -268,10 +283,20 @@ class MovingGesture(Gesture):
             free = tuple((axis == event.type) != event.shift for axis in AXES)
             self._free = (True, True, True) if free == self._free else free
         elif event.type in MODES:
-            self._mode = "" if self._mode == event.type else event.type
+            self._mode, self._typed = "" if self._mode == event.type else event.type, ""
         else:
             return False
         return True
+
+    def number(self, value: float) -> None:
+        """As `Gesture.number`: the distance, after S the size."""
+        if self._mode == "S" and not reason_to_keep_look(self._light, "size"):
+            self._look.resize(self._light, value)
+        elif self._mode in ("", "D"):
+            self.set_distance(max(value, LEAST_DISTANCE))
+
+    def set_distance(self, distance: float) -> None:
+        """Take a distance that is typed."""
 
     def move(self, way: np.ndarray) -> None:
         """As `Gesture.move`; after a key of MODES it changes what that says."""
@@ -332,6 +357,10 @@ class LTSH_OT_drag_highlight(MovingGesture, bpy.types.Operator):
         """Change the distance."""
         self._distance *= factor
 
+    def set_distance(self, distance: float) -> None:
+        """As `MovingGesture.set_distance`."""
+        self._distance = distance
+
     def press(self, context, event) -> bool:
         """Move the light so that its highlight is at the mouse; False where no surface is."""
         return self.follow(context, event)
@@ -343,7 +372,7 @@ class LTSH_OT_drag_highlight(MovingGesture, bpy.types.Operator):
             self._note = NO_SURFACE
             return False
         middle = around.hits[0].position
-        self._distance = self._distance or max((self._pose.matrix.translation - middle).length, 1e-3)
+        self._distance = self._distance or max((self._pose.matrix.translation - middle).length, LEAST_DISTANCE)
         matrix, note = place_of(self._light, self._pose, around, self._distance, self._textures)
         if not all(self._free):
             way = locked_place(self._pose.matrix.translation, middle, matrix.translation, self._free) - middle
@@ -378,7 +407,10 @@ class LTSH_OT_drag_brightness(Gesture, bpy.types.Operator):
     bl_idname = "ltsh.drag_brightness"
     bl_label = "Drag Brightness"
     bl_options = {"UNDO"}
-    KEYS = "Press on a surface, drag up or down: its brightness follows    Shift: precise    Ctrl: thirds of a stop"
+    KEYS = (
+        "Press on a surface, drag up or down: its brightness follows    Number: so many times    Shift: precise    "
+        "Ctrl: thirds of a stop"
+    )
     ICON = "ops.curve.radius"
 
     @classmethod
@@ -410,13 +442,14 @@ class LTSH_OT_drag_brightness(Gesture, bpy.types.Operator):
         """Change the power by the way of the mouse."""
         stops = (self._mouse - self._start)[1] / (STOP * self._scale)
         stops = round(SNAPS * stops) / SNAPS if event.ctrl else stops
-        factor = 2.0**stops
+        factor = float(self._typed) if self._typed.strip(".") else 2.0**stops
         power = power_for(factor, self._power, self._share)
         self._light.data.energy = power
         unit = "W/m²" if self._light.data.type == "SUN" else "W"
         text = f"{self._light.name}: {self._power:.4g} to {power:.4g} {unit}"
         if power > 0.0 or factor >= 1.0:
-            text += f"    here {factor:.3g} times the direct light, {stops:+.2f} stops"
+            text += f"    here {factor:.3g} times the direct light"
+            text += f", {math.log2(factor):+.2f} stops" if factor > 0.0 else ""
         else:
             text += f"    off: the other lights leave {1.0 - self._share:.3g} times the direct light here"
         self._note = f"{text}    before: {self._shares}"
@@ -449,6 +482,11 @@ class LTSH_OT_drag_shadow(MovingGesture, bpy.types.Operator):
     def wheel(self, factor: float) -> None:
         """Change the distance from what the light faces."""
         self._edge = replace(self._edge, distance=factor * self._edge.distance)
+
+    def set_distance(self, distance: float) -> None:
+        """As `MovingGesture.set_distance`."""
+        if not self._pose.is_sun:
+            self._edge = replace(self._edge, distance=distance)
 
     def press(self, context, event) -> bool:
         """Choose the edge of a shadow near the mouse; False where there is none."""
@@ -523,6 +561,7 @@ _tools: list[type] = []
 
 def _tool_of(gesture) -> type:
     def draw_settings(context, layout, tool):
+        warm_up(context.scene)
         layout.label(text=gesture.reason_against(context) or gesture.words(context))
 
     return type(f"{gesture.__name__}_tool", (bpy.types.WorkSpaceTool,), {
@@ -545,18 +584,3 @@ def unregister() -> None:
     """Take them away."""
     while _tools:
         bpy.utils.unregister_tool(_tools.pop())
-
-
-def hit_at(context, region, pixel: np.ndarray) -> SurfaceHit | None:
-    """What the view of a region meets at a pixel (2,)."""
-    return hits_at(context, region, pixel[None])[0]
-
-
-def hits_at(context, region, pixels: np.ndarray) -> list[SurfaceHit | None]:
-    """What the view of a region meets at pixels (P, 2)."""
-    rays = [
-        (view3d_utils.region_2d_to_origin_3d(region, region.data, pixel),
-         view3d_utils.region_2d_to_vector_3d(region, region.data, pixel))
-        for pixel in pixels.tolist()
-    ]  # fmt: skip
-    return surface_hits(context.scene, context.evaluated_depsgraph_get(), rays)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import bpy
 import numpy as np
 from mathutils import Matrix, Vector
 
@@ -20,7 +21,8 @@ from ..lights.linking import Receivers, linked_objects, receiver_collection
 from ..lights.textures import ShownTextures
 from ..materials.preview_material import COAT, METALS, PreviewMaterial, preview_of
 from .light_pose import LightPose
-from .lit_point import SurfaceHit, shipped_table, value_at_hits
+from .lit_point import SurfaceHit, hits_at, shipped_table, value_at_hits
+from .preview import lights_of
 
 # SPACING: pixels between the nine rays around the mouse. DISK: further rays, pixels from it, in which no highlight may
 # be brighter than at the mouse: rings, denser near it.
@@ -33,6 +35,8 @@ DISK = np.concatenate([
 NEAR = 2.0
 _GRID = np.stack(np.meshgrid(np.arange(-20.0, 21.0), np.arange(-20.0, 21.0)), axis=-1).reshape(-1, 2)
 PIXELS = _GRID[np.hypot(*_GRID.T) <= 20.0]
+# GRID: by how many pixels, across and up, `prepare_view` looks for surfaces.
+GRID = 9
 # Kinds of lobes without a highlight.
 DULL = ("diffuse", "sheen", "velvet", "translucent")
 NO_HIGHLIGHT = "this surface has no highlight"
@@ -196,3 +200,34 @@ def hits_around(hits_at: Callable[[np.ndarray], list], disk: np.ndarray = DISK) 
         return None
     same = [n for n, hit in enumerate(hits) if hit and (hit.ob, hit.material) == (at_mouse.ob, at_mouse.material)]
     return HitsAround([hits[n] for n in same], pixels[same], same[: len(stencil)] == list(range(len(stencil))))
+
+
+# By session_uid, the scenes that `warm_up` has prepared.
+_warm: set[int] = set()
+
+
+def warm_up(scene) -> None:
+    """Soon do, once for a scene, what the first move of a drag would wait for."""
+    if scene.session_uid not in _warm:
+        _warm.add(scene.session_uid)
+        bpy.app.timers.register(_prepare, first_interval=0.0)
+
+
+def _prepare() -> None:
+    """Try a move in each view: that reads the table, and Blender builds the trees in which its rays find surfaces."""
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            region = next((one for one in area.regions if one.type == "WINDOW"), None)
+            if area.type == "VIEW_3D" and region is not None:
+                with bpy.context.temp_override(window=window, area=area, region=region):
+                    prepare_view(bpy.context, region)
+
+
+def prepare_view(context, region) -> None:
+    """Try a move of a light in the view of a region; nothing is changed."""
+    grid = (np.indices((GRID, GRID)).reshape(2, -1).T + 0.5) / GRID * (region.width, region.height)
+    shown = [pixel for pixel, hit in zip(grid, hits_at(context, region, grid), strict=True) if hit is not None]
+    light = next(iter(lights_of(context.scene)), None)
+    if shown and light is not None:
+        around = hits_around(lambda offsets: hits_at(context, region, shown[len(shown) // 2] + offsets))
+        place_of(light, LightPose.of(light), around, 1.0, ShownTextures())

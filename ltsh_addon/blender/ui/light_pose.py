@@ -90,6 +90,11 @@ class LightLook:
         for name in self.sizes:
             setattr(ob.data, name, factor * max(getattr(ob.data, name), 1e-3))
 
+    def resize(self, ob, size: float) -> None:
+        """Give the light a size in m, that of a sun in degrees; of rectangles and ellipses their first side."""
+        name = next(iter(self.sizes))
+        self.scale(ob, (math.radians(size) if name == "angle" else size) / max(getattr(ob.data, name), 1e-3))
+
     def tint(self, ob, hue: float, saturation: float) -> None:
         """Turn the light's hue, and add to its saturation; its brightest channel stays as bright."""
         h, s, v = colorsys.rgb_to_hsv(*ob.data.color)
@@ -128,6 +133,12 @@ def locked_place(start: Vector, point: Vector, place: Vector, free: tuple[bool, 
             return moved
     moved[axis] = place[axis]
     return moved
+
+
+def power_for(factor: float, power: float, share: float) -> float:
+    """The power of a light with which a point gets `factor` times its light, of which a light of this `power` gives
+    the `share`, over 0; never below 0."""
+    return max(0.0, power * (1.0 + (factor - 1.0) / share))
 
 
 def reason_to_keep_power(ob) -> str:

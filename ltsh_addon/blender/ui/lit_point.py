@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 
 import bpy
 import numpy as np
+from bpy_extras import view3d_utils
 from mathutils import Matrix, Vector
 
 from ...cycles.horizons import end_at_horizons_of_cycles, unit
@@ -194,6 +195,21 @@ def surface_hits(scene, depsgraph, rays: Sequence[tuple[Vector, Vector]]) -> lis
             normals = side * smooth, side * normal
             hits[n] = SurfaceHit(position, normals[0], -direction, material, normals[1], uv, original, matrix, face)
     return hits
+
+
+def hit_at(context, region, pixel: np.ndarray) -> SurfaceHit | None:
+    """What the view of a region meets at a pixel (2,)."""
+    return hits_at(context, region, pixel[None])[0]
+
+
+def hits_at(context, region, pixels: np.ndarray) -> list[SurfaceHit | None]:
+    """What the view of a region meets at pixels (P, 2)."""
+    rays = [
+        (view3d_utils.region_2d_to_origin_3d(region, region.data, pixel),
+         view3d_utils.region_2d_to_vector_3d(region, region.data, pixel))
+        for pixel in pixels.tolist()
+    ]  # fmt: skip
+    return surface_hits(context.scene, context.evaluated_depsgraph_get(), rays)
 
 
 @functools.cache

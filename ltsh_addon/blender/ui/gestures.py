@@ -12,6 +12,7 @@ from bpy_extras import view3d_utils
 from mathutils import Matrix, Vector
 
 from ...scene import error_line
+from ...shading.highlight import QUICK, THOROUGH
 from ..lights.groups import reason_to_stay
 from ..lights.textures import ShownTextures
 from .highlight_place import (
@@ -42,6 +43,8 @@ REST_SECONDS = 0.2
 MOVING_KEYS = "Wheel, D, number: distance    S: size    C: color    X, Y, Z: lock    Shift: precise    Ctrl: corners"
 # FOLLOWED: what a drag follows.
 FOLLOWED = ("MOUSEMOVE", "LEFT_SHIFT", "LEFT_CTRL", "RIGHT_SHIFT", "RIGHT_CTRL")
+# LIVE, AT_REST: how long highlights are searched during a move of the mouse, and after it.
+LIVE, AT_REST = replace(QUICK, seconds=0.03), replace(THOROUGH, seconds=1.0)
 LEAST_DISTANCE = 1e-3  # m, of a light from what it faces
 NO_SURFACE = "there is no surface under the mouse"
 
@@ -373,7 +376,7 @@ class LTSH_OT_drag_highlight(MovingGesture, bpy.types.Operator):
             return False
         middle = around.hits[0].position
         self._distance = self._distance or max((self._pose.matrix.translation - middle).length, LEAST_DISTANCE)
-        matrix, note = place_of(self._light, self._pose, around, self._distance, self._textures)
+        matrix, note = place_of(self._light, self._pose, around, self._distance, self._textures, LIVE)
         if not all(self._free):
             way = locked_place(self._pose.matrix.translation, middle, matrix.translation, self._free) - middle
             matrix = self._pose.facing(middle, way.normalized(), way.length)
@@ -389,7 +392,7 @@ class LTSH_OT_drag_highlight(MovingGesture, bpy.types.Operator):
             return NO_SURFACE
         if not all(self._free):
             return note_by_pixels(self._light, self._matrix, around, self._textures)
-        self._matrix, note = place_by_pixels(self._light, self._pose, self._matrix, around, self._textures)
+        self._matrix, note = place_by_pixels(self._light, self._pose, self._matrix, around, self._textures, AT_REST)
         self._put(self._matrix)
         return note
 

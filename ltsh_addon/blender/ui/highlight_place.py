@@ -14,14 +14,14 @@ from mathutils import Matrix, Vector
 from ...cycles.horizons import end_at_horizons_of_cycles, unit, valid_specular_normal
 from ...scene import SurfaceSamples
 from ...shading import shade
-from ...shading.highlight import BRIGHTER, STENCIL, MovedLight, mirrored, place_for_highlight
+from ...shading.highlight import BRIGHTER, QUICK, STENCIL, THOROUGH, MovedLight, mirrored, place_for_highlight
 from ..evaluated import EmitterTraits
 from ..lights.area import area_light
 from ..lights.linking import Receivers, linked_objects, receiver_collection
 from ..lights.textures import ShownTextures
 from ..materials.preview_material import COAT, METALS, PreviewMaterial, preview_of
 from .light_pose import LightPose
-from .lit_point import SurfaceHit, hits_at, shipped_table, value_at_hits
+from .lit_point import SurfaceHit, directions_around, hits_at, shipped_table, value_at_hits
 from .preview import lights_of
 
 # SPACING: pixels between the nine rays around the mouse. DISK: further rays, pixels from it, in which no highlight may
@@ -83,7 +83,7 @@ def samples_of(hits: list[SurfaceHit], lobe: PreviewMaterial, textures: ShownTex
     anisotropy, tangent = 0.0, np.zeros((count, 3))
     if brush is not None:
         anisotropy = 1.0 - brush.aspect
-        along = np.array([_brush_direction(hit, brush) for hit in hits])
+        along = _brush_directions(hits, brush)
         along = unit(along - (along * smooth).sum(axis=-1, keepdims=True) * smooth)
         axis = bent if lobe.kind == "glossy" else normal
         beside = (axis * along).sum(axis=-1, keepdims=True) * axis
@@ -119,16 +119,16 @@ def _mapped_normals(hits: list[SurfaceHit], normals: np.ndarray, lobe: PreviewMa
     return unit(np.where([[frame is None] for frame in frames], normals, mapped))
 
 
-def _brush_direction(hit: SurfaceHit, brush) -> np.ndarray:
-    """The direction (3,) of an anisotropic lobe, before its rotation."""
-    if not brush.direction:
-        frame = hit.uv_frame(brush.uv_map)
-        return np.zeros(3) if frame is None else frame[0]
-    return hit.around("XYZ".index(brush.direction))
+def _brush_directions(hits: list[SurfaceHit], brush) -> np.ndarray:
+    """The directions (P, 3) of an anisotropic lobe, before its rotation."""
+    if brush.direction:
+        return directions_around(hits, "XYZ".index(brush.direction))
+    frames = [hit.uv_frame(brush.uv_map) for hit in hits]
+    return np.array([np.zeros(3) if frame is None else frame[0] for frame in frames])
 
 
 def place_of(
-    ob, pose: LightPose, around: HitsAround, distance: float, textures: ShownTextures, is_thorough=False
+    ob, pose: LightPose, around: HitsAround, distance: float, textures: ShownTextures, effort=QUICK
 ) -> tuple[Matrix, str]:
     """The matrix of the light object `ob` for a highlight at the mouse; and what there is to say about it."""
     hit, lobe = around.hits[0], around.lobe
@@ -140,7 +140,7 @@ def place_of(
         return matrix_at(mirrored(np.array(hit.view), np.array(hit.normal))), NO_HIGHLIGHT
     light = MovedLight(lambda direction: np.array(matrix_at(direction)), lambda matrix: _light(ob, matrix))
     samples = samples_of(around.hits, lobe, textures)
-    place = place_for_highlight(samples, light, shipped_table(), around.has_stencil, is_thorough)
+    place = place_for_highlight(samples, light, shipped_table(), around.has_stencil, effort)
     note = "" if place.is_peak else BEHIND if math.isinf(place.excess) else BESIDE
     return matrix_at(place.direction), unlinked(ob, hit) or note or around.unread
 
@@ -171,14 +171,14 @@ def note_by_pixels(ob, matrix: Matrix, around: HitsAround, textures: ShownTextur
 
 
 def place_by_pixels(
-    ob, pose: LightPose, matrix: Matrix, around: HitsAround, textures: ShownTextures
+    ob, pose: LightPose, matrix: Matrix, around: HitsAround, textures: ShownTextures, effort=THOROUGH
 ) -> tuple[Matrix, str]:
     """As `place_of`, by all pixels `around`, where the light object `ob` is not yet right at `matrix`: what shines
     between the samples of a move may be brighter. Takes too long for a move."""
     note = note_by_pixels(ob, matrix, around, textures)
     if note == BESIDE:
         distance = (matrix.translation - around.hits[0].position).length
-        better, _ = place_of(ob, pose, around, distance, textures, is_thorough=True)
+        better, _ = place_of(ob, pose, around, distance, textures, effort)
         if (again := note_by_pixels(ob, better, around, textures)) != BESIDE:
             return better, again
     return matrix, note

@@ -146,13 +146,16 @@ class SurfaceHit:
         sizes = np.linalg.norm(along, axis=-1, keepdims=True)
         return tuple(along / sizes) if sizes.all() else None
 
-    def around(self, axis: int) -> np.ndarray:
-        """The direction (3,) in the world around an axis of the object, as a Tangent node has it."""
-        mesh = self.ob.data
-        place = np.array(self.matrix.inverted_safe() @ self.position)
-        if isinstance(mesh, bpy.types.Mesh):
-            place = (place - np.array(mesh.texspace_location)) / np.maximum(mesh.texspace_size, 1e-30)
-        return np.array(self.matrix.to_3x3().inverted_safe().transposed()) @ np.cross(np.eye(3)[axis], place)
+
+def directions_around(hits: list[SurfaceHit], axis: int) -> np.ndarray:
+    """The directions (P, 3) in the world around an axis of the object of P `hits`, as a Tangent node has them."""
+    inverses, mesh = {hit.matrix: hit.matrix.inverted_safe() for hit in hits}, hits[0].ob.data
+    places = np.array([(inverses[hit.matrix] @ hit.position)[:] for hit in hits])
+    if isinstance(mesh, bpy.types.Mesh):
+        places = (places - np.array(mesh.texspace_location)) / np.maximum(mesh.texspace_size, 1e-30)
+    turns = {matrix: np.array(inverse.to_3x3()) for matrix, inverse in inverses.items()}
+    around = np.cross(np.eye(3)[axis], places)
+    return np.einsum("pi,pij->pj", around, np.array([turns[hit.matrix] for hit in hits]))
 
 
 def surface_hit(scene, depsgraph, start: Vector, direction: Vector) -> SurfaceHit | None:

@@ -6,9 +6,9 @@ import colorsys
 import math
 from dataclasses import dataclass
 
-from mathutils import Matrix, Vector
+from mathutils import Euler, Matrix, Vector
 
-from ..lights.groups import is_animated, is_linked
+from ..lights.groups import is_animated, is_linked, reason_to_keep, reason_to_stay
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,31 @@ class LightPose:
     def put(self, ob, matrix: Matrix) -> None:
         """Put `ob` there; `matrix` is one of `facing`."""
         ob.matrix_basis = self.parent.inverted_safe() @ matrix
+
+
+def match_lights(scene, records: list[dict]) -> tuple[int, list[str]]:
+    """Give light objects the powers, colors, places and directions of the lights in the report of `match`; how many
+    moved, and problems."""
+    moved, problems = 0, []
+    for record in records:
+        name = record["name"]
+        ob = scene.objects.get(name)
+        if ob is None or ob.type != "LIGHT":
+            problems.append(f"{name}: not in the scene any more")
+            continue
+        if reason := reason_to_keep(ob):
+            problems.append(f"{name}: {reason}")
+            continue
+        ob.data.energy, ob.data.color = record["power_after"], record["color"]
+        if all(record[f"{key}_after"] == record[f"{key}_before"] for key in ("location", "rotation")):
+            continue
+        if reason := reason_to_stay(ob):
+            problems.append(f"{name}: {reason}")
+            continue
+        turn = Euler([math.radians(angle) for angle in record["rotation_after"]])
+        ob.matrix_world = Matrix.LocRotScale(Vector(record["location_after"]), turn, ob.matrix_world.to_scale())
+        moved += 1
+    return moved, problems
 
 
 # SIZES: the settings of a light's size, by its type.

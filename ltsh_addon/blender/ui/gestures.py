@@ -27,7 +27,7 @@ from .highlight_place import (
 )
 from .light_pose import LightLook, LightPose, locked_place, power_for, reason_to_keep_look, reason_to_keep_power
 from .lit_point import LightShare, SceneLights, SurfaceHit, hit_at, hits_at, share_line
-from .preview import PASSED_ON, active_light, lights_of, region_under
+from .preview import PASSED_ON, active_light, lights_of, pointer, view_under
 from .shadow_edge import NEAR_EDGE, OccluderRays, shadow_edge_near
 
 # FARTHER: the factor of the distance by a step of the wheel.
@@ -45,17 +45,13 @@ MOVING_KEYS = "Wheel, D, number: distance    S: size    C: color    X, Y, Z: loc
 FOLLOWED = ("MOUSEMOVE", "LEFT_SHIFT", "LEFT_CTRL", "RIGHT_SHIFT", "RIGHT_CTRL")
 # LIVE, AT_REST: how long highlights are searched during a move of the mouse, and after it.
 LIVE, AT_REST = replace(QUICK, seconds=0.03), replace(THOROUGH, seconds=1.0)
+# MOST_GLOSSY: the light whose highlight is dragged if none is active.
+MOST_GLOSSY = "the light that gives the pressed point the most glossy light"
 LEAST_DISTANCE = 1e-3  # m, of a light from what it faces
 NO_SURFACE = "there is no surface under the mouse"
 
 
 _logger = logging.getLogger(__name__)
-
-
-def view_under(context, mouse: np.ndarray) -> tuple:
-    """The region of the 3D view under the `mouse` (2,) of the window, None where there is none, and the pixel in it."""
-    region = region_under(context, *mouse.tolist())
-    return region, mouse if region is None else mouse - (region.x, region.y)
 
 
 class Gesture:
@@ -240,35 +236,35 @@ class Gesture:
         return None if region is None else hit_at(context, region, mouse)
 
 
-def pointer(event) -> np.ndarray:
-    """Where the mouse is (2,) in the window."""
-    return np.array([event.mouse_x, event.mouse_y], float)
-
-
 class MovingGesture(Gesture):
-    """A gesture that moves the active light. LOCKS: axes may be locked."""
+    """A gesture that moves the active light. LOCKS: axes may be locked. CHOOSES: without an active light its `press`
+    takes another."""
 
-    LOCKS = True
+    LOCKS, CHOOSES = True, False
 
     @classmethod
     def reason_against(cls, context) -> str:
         """As `Gesture.reason_against`."""
         light = active_light(context)
-        if light is None:
+        if light is None and not (cls.CHOOSES and lights_of(context.scene)):
             return "No light is active"
-        reason = reason_to_stay(light)
+        reason = "" if light is None else reason_to_stay(light)
         return super().reason_against(context) or (f"{light.name}: {reason}" if reason else "")
 
     @classmethod
     def words(cls, context) -> str:
         """As `Gesture.words`."""
-        return cls.KEYS.format(active_light(context).name)
+        light = active_light(context)
+        return cls.KEYS.format(MOST_GLOSSY if light is None else light.name)
 
     def invoke(self, context, event):
-        self._light = active_light(context)
-        self._pose, self._look, self._distance = LightPose.of(self._light), LightLook.of(self._light), 0.0
-        self._free, self._mode = (True, True, True), ""
+        self._light, self._distance, self._free, self._mode = active_light(context), 0.0, (True, True, True), ""
+        if self._light is not None:
+            self._take(self._light)
         return super().invoke(context, event)
+
+    def _take(self, light) -> None:
+        self._light, self._pose, self._look = light, LightPose.of(light), LightLook.of(light)
 
     def put_back(self) -> None:
         """Put the light back where it was, as it was."""
@@ -348,13 +344,13 @@ class MovingGesture(Gesture):
 
 
 class LTSH_OT_drag_highlight(MovingGesture, bpy.types.Operator):
-    """Drag the highlight of the active light over surfaces in a 3D view: the light follows, keeps its distance and
-    faces them"""
+    """Drag the highlight of the active light, or without one of the light that gives the pressed point the most glossy
+    light, over surfaces in a 3D view: the light follows, keeps its distance and faces them"""
 
     bl_idname = "ltsh.drag_highlight"
     bl_label = "Drag Highlight"
     bl_options = {"UNDO"}
-    KEYS, ICON = f"Drag the highlight of {{}}    {MOVING_KEYS}", "ops.transform.tosphere"
+    KEYS, ICON, CHOOSES = f"Drag the highlight of {{}}    {MOVING_KEYS}", "ops.transform.tosphere", True
 
     def wheel(self, factor: float) -> None:
         """Change the distance."""
@@ -365,8 +361,23 @@ class LTSH_OT_drag_highlight(MovingGesture, bpy.types.Operator):
         self._distance = distance
 
     def press(self, context, event) -> bool:
-        """Move the light so that its highlight is at the mouse; False where no surface is."""
-        return self.follow(context, event)
+        """Move the light so that its highlight is at the mouse; False where no surface is, or no light to choose."""
+        return (self._light is not None or self._choose(context, event)) and self.follow(context, event)
+
+    def _choose(self, context, event) -> bool:
+        """Take the light that gives the pressed point the most glossy light."""
+        hit = self.hit_under(context, event)
+        shares = [] if hit is None else [share for share in self.shares_at(context, hit) if share.is_lamp]
+        first = max(shares, key=lambda share: share.glossy, default=None)
+        if first is None or first.glossy <= 0.0:
+            self._note = NO_SURFACE if hit is None else "No light has a highlight here: choose one"
+            return False
+        light = context.scene.objects.get(first.name) or bpy.data.objects[first.name]
+        if reason := reason_to_stay(light):
+            self._note = f"{light.name}: {reason}"
+            return False
+        self._take(light)
+        return True
 
     def follow(self, context, event) -> bool:
         """As `press`."""
@@ -382,7 +393,7 @@ class LTSH_OT_drag_highlight(MovingGesture, bpy.types.Operator):
             matrix = self._pose.facing(middle, way.normalized(), way.length)
         self._matrix = matrix
         self._put(matrix)
-        self._note = self._noted((matrix.translation - middle).length, note)
+        self._note = f"{self._light.name}    {self._noted((matrix.translation - middle).length, note)}"
         return True
 
     def warning(self, context, event) -> str:

@@ -285,6 +285,7 @@ class LightShare:
     name: str
     is_lamp: bool  # a light object; False: a glowing mesh or the world
     luminance: float  # of the reflected light, W m^-2 sr^-1
+    glossy: float = 0.0  # of it, specular
 
 
 @dataclass
@@ -330,12 +331,12 @@ class SceneLights:
         if self.tracing is not None:
             traced = trace_visibility(samples, lights, self.tracing.tracer, ShadowSampling(), workers=self.tracing.pool)
             radiance = {name: values * traced.of_lights(name)[..., None] for name, values in radiance.items()}
-        luminance = sum(values.sum(axis=1) @ GRAY for values in radiance.values())
-        by_light: dict[tuple, float] = {}
-        for number, (light, value) in enumerate(zip(lights, luminance.tolist(), strict=True)):
+        glossy, diffuse = (radiance[name].sum(axis=1) @ GRAY for name in ("specular", "diffuse"))
+        by_light: dict[tuple, np.ndarray] = {}
+        for number, (light, *values) in enumerate(zip(lights, glossy + diffuse, glossy, strict=True)):
             key = light.name, number < len(self.lights) and not isinstance(light, PolygonLight)
-            by_light[key] = by_light.get(key, 0.0) + value
-        shares = (LightShare(*key, value) for key, value in by_light.items())
+            by_light[key] = by_light.get(key, 0.0) + np.array(values)
+        shares = (LightShare(*key, *values.tolist()) for key, values in by_light.items())
         return sorted(shares, key=lambda share: -share.luminance)
 
     def is_exact_at(self, hit: SurfaceHit) -> bool:

@@ -25,7 +25,7 @@ from ltsh_addon.blender.ui.highlight_place import (
     samples_of,
 )
 from ltsh_addon.blender.ui.light_pose import LightLook, LightPose, locked_place, reason_to_keep_look
-from ltsh_addon.blender.ui.lit_point import shipped_table, surface_hits
+from ltsh_addon.blender.ui.lit_point import SceneLights, shipped_table, surface_hits
 from ltsh_addon.shading import shade
 from ltsh_addon.shading.highlight import STENCIL
 
@@ -168,11 +168,15 @@ def test_each_gesture_is_a_tool_that_says_why_it_cannot_begin(addon):
     layout = SimpleNamespace(label=lambda text: texts.append(text))
     ours[0].draw_settings(bpy.context, layout, None)
     light = parts.add_area_light("Key")
+    bpy.context.view_layer.objects.active = None
+    for tool in ours[:2]:
+        tool.draw_settings(bpy.context, layout, None)
     bpy.context.view_layer.objects.active = light
     ours[0].draw_settings(bpy.context, layout, None)
     light.lock_rotation[0] = True
     ours[1].draw_settings(bpy.context, layout, None)
     assert texts == [
+        "No light is active", f"Drag the highlight of {gestures.MOST_GLOSSY}    {gestures.MOVING_KEYS}",
         "No light is active", f"Drag the highlight of Key    {gestures.MOVING_KEYS}",
         "Key: its location or rotation is locked: unlock it in the tab Item",
     ]  # fmt: skip
@@ -412,6 +416,29 @@ def test_a_move_is_tried_in_a_view_and_changes_nothing(scene):
         bpy.data.objects.remove(ob)
         bpy.context.view_layer.update()
         prepare_view(bpy.context, SimpleNamespace(width=96, height=54, data=data))
+
+
+def test_without_an_active_light_the_one_with_the_most_glossy_light_is_taken(addon, scene):
+    far = parts.add_area_light("Far", location=(2.0, 3.0, 2.0), energy=1000.0)
+    bpy.context.view_layer.objects.active = None
+    bpy.context.view_layer.update()
+    (hit,) = hits_at(scene, np.zeros((1, 2)), Vector((1.3, -0.8, 0.0)))
+    lights = SceneLights.of(bpy.context)
+    shares = lights.shares_at(hit)
+    lights.close()
+    glossy = {share.name: share.glossy for share in shares}
+    most, least = sorted(glossy, key=glossy.get, reverse=True)
+    this = SimpleNamespace(hit_under=lambda *_: hit, shares_at=lambda *_: shares, _light=None, _taken=[])
+    this._take = this._taken.append
+    kind = gestures.LTSH_OT_drag_highlight
+    assert kind._choose(this, bpy.context, None) and this._taken == [bpy.data.objects[most]]
+    bpy.data.objects[most].lock_location[0] = True
+    assert not kind._choose(this, bpy.context, None) and f"{most}: its location" in this._note
+    this.shares_at = lambda *_: []
+    assert not kind._choose(this, bpy.context, None) and this._note == "No light has a highlight here: choose one"
+    this.hit_under = lambda *_: None
+    assert not kind._choose(this, bpy.context, None) and this._note == gestures.NO_SURFACE
+    assert glossy[most] > glossy[least] >= 0.0 and far.name in glossy
 
 
 def test_with_shift_the_mouse_goes_a_tenth_of_its_way(moved):

@@ -66,6 +66,10 @@ class RayBatch:
         """First and last number of the points that choose directions by the lobe."""
         return tuple(n - even for n, even in zip((self.first, self.last), self.light_points, strict=True))
 
+    def places(self, seeds: np.ndarray) -> np.ndarray:
+        """Which of the three places (S, Q) of their sample the rays start at, in turn."""
+        return (np.arange(self.first, self.last)[:, None] + (seeds >> np.uint32(16))) % 3
+
     def add_to(self, halves, weight):
         """Add weights (S, Q) to the sums (2, Q) of the first and of the second half of all rays."""
         start, stop = self.light_points
@@ -446,10 +450,15 @@ class SampleRows:
         tracer,
         ray_origins: RayOrigins | None = None,
         lobes: JoinedLobes | None = None,
+        extent: np.ndarray | None = None,
     ):
         self.tracer, self.ray_origins = tracer, tracer.ray_origins(samples) if ray_origins is None else ray_origins
         self.position = np.ascontiguousarray(samples.position.T)
         self.receiver = samples.receiver
+        # (3, 3, P) m: from each sample to itself, and to two others that stand for it, see `Film.extent`.
+        self.extent = None
+        if extent is not None:
+            self.extent = np.concatenate([np.zeros_like(extent[:, :1]), extent], axis=1).transpose(2, 1, 0)
         self.seeds = seeds_of(samples.position)
         self._known: list[np.ndarray] = []
         self.normal, self.view = self._rows(samples.normal), self._rows(samples.view)

@@ -31,8 +31,8 @@ def test_a_sample_has_the_mean_shadow_of_the_places_for_which_it_stands():
         for name in PASSES:
             share = getattr(found, name)[0]
             expected = np.mean([getattr(one, name)[0] for one in alone], axis=0)
-            # Not all numbers of rays are multiples of three; lobes weigh the rays of a large light differently.
-            assert np.abs(share - expected).max() < (0.02 if light is SUN else 0.15), (light.name, name)
+            # A third of 8 rays is 2 or 3; lobes weigh the rays of a large light differently.
+            assert np.abs(share - expected).max() < (0.1 if light is SUN else 0.15), (light.name, name)
             assert np.abs(share - expected).mean() < error
         crossed = (expected > 0.2) & (expected < 0.8)
         assert crossed.any()

@@ -22,9 +22,6 @@ MOST_RECOLORING = 3.0  # how many times the color of LTSH's points Cycles' color
 # SLOPE_RADIUS: the points of pixels that are at most so far away tell the slope. RIDGE: what is added to the variance
 # of normals there, so that nearly even surfaces have none. MOST_BEND: the factors by which the slope changes light.
 SLOPE_RADIUS, RIDGE, MOST_BEND = 2, 1e-3, (0.5, 2.0)
-# SURE: of the squared difference between both mean normals, the share that the variance among the points must explain.
-# Otherwise Cycles' normal is another one, as that of what a mirror shows.
-SURE = 1.0
 LEAST_COLOR = 1e-3  # points with darker colors tell no slope
 
 
@@ -43,12 +40,13 @@ def factor_of_samples(film: Film, samples, radiance: np.ndarray, color: np.ndarr
         for values in (samples.diffuse_albedo, radiance)
     )
     own_normals = samples.diffuse_normal[first].astype(np.float64)
+    # What the variance among the points does not explain of the difference between both means is that Cycles' normal is
+    # another one, as that of what a mirror shows. What it explains for as many samples as Cycles has is Cycles' error.
     slope, variance = _slope(hits.unspread(), own_normals, light / np.maximum(albedo, LEAST_COLOR))
     apart = normal - hits.image(own_normals)
-    off = box_mean(np.square(apart).sum(axis=-1), SLOPE_RADIUS)
-    sure = SURE * box_mean(variance, SLOPE_RADIUS) / (film.sub_samples * np.maximum(off, 1e-12))
-    # Both means have errors.
-    sure = np.clip(sure, 0.0, 1.0) * count / (count + film.sub_samples)
+    off = np.maximum(box_mean(np.square(apart).sum(axis=-1), SLOPE_RADIUS), 1e-12)
+    variance = np.maximum(box_mean(variance, SLOPE_RADIUS), 0.0)
+    sure = np.minimum(variance / (film.sub_samples * off), 1.0) * np.maximum(1.0 - variance / (count * off), 0.0)
     change = color * np.einsum("hwk,hwkc->hwc", sure[..., None] * apart, slope)
     image = factor * film.image(radiance)
     return factor * (1.0 + np.divide(change, image, out=np.zeros_like(image), where=image > 0.0)).clip(*MOST_BEND)
@@ -56,7 +54,7 @@ def factor_of_samples(film: Film, samples, radiance: np.ndarray, color: np.ndarr
 
 def _slope(film: Film, normals: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The slope (H, W, 3, 3) of the `values` (P, 3) over the `normals` (P, 3) of the points around each pixel, and the
-    variance (H, W) of these within pixels, means over SLOPE_RADIUS - 1."""
+    variance (H, W) of these within it."""
 
     def mean(values: np.ndarray) -> np.ndarray:
         """Means over the points around each pixel."""
@@ -74,7 +72,7 @@ def _slope(film: Film, normals: np.ndarray, values: np.ndarray) -> tuple[np.ndar
     for i, j in np.ndindex(3, 3):
         product[..., i, j] = mean(normals[:, i] * values[:, j]) - normal[..., i] * value[..., j]
     within = film.image(np.square(normals).sum(axis=1)) - np.square(film.image(normals)).sum(axis=-1)
-    return np.linalg.solve(square, product), np.maximum(box_mean(within, SLOPE_RADIUS - 1), 0.0)
+    return np.linalg.solve(square, product), np.maximum(within, 0.0)
 
 
 def box_mean(image: np.ndarray, radius: int) -> np.ndarray:

@@ -458,6 +458,9 @@ class SampleRows:
         # (3, 3, P) m: from each sample to itself, and to two others that stand for it, see `Film.extent`.
         self.extent = None
         if extent is not None:
+            # Where rays do not start at the sample, as on faces that are only near it, they stay there.
+            stays = (self.ray_origins.position == samples.position.astype(np.float32)).all(axis=1)
+            extent = np.where(stays[:, None, None], extent, np.float32(0.0))
             self.extent = np.concatenate([np.zeros_like(extent[:, :1]), extent], axis=1).transpose(2, 1, 0)
         self.seeds = seeds_of(samples.position)
         self._known: list[np.ndarray] = []

@@ -406,6 +406,7 @@ def _after_warp(density, length):
 
 
 _MIN_ALPHA = np.float32(1e-5)
+EVEN = 1e-3  # places of a sample are in the plane of its triangle up to so much of their distance
 
 
 class JoinedLobes:
@@ -458,9 +459,13 @@ class SampleRows:
         # (3, 3, P) m: from each sample to itself, and to two others that stand for it, see `Film.extent`.
         self.extent = None
         if extent is not None:
-            # Where rays do not start at the sample, as on faces that are only near it, they stay there.
-            stays = (self.ray_origins.position == samples.position.astype(np.float32)).all(axis=1)
-            extent = np.where(stays[:, None, None], extent, np.float32(0.0))
+            # Rays start there only in the plane of the sample's triangle: on others they may meet their own surface.
+            origins, reach = self.ray_origins, np.linalg.norm(extent, axis=-1, keepdims=True)
+            normal = origins.geometric_normal[:, None]
+            height = (extent * normal).sum(axis=-1, keepdims=True)
+            moved = np.linalg.norm(origins.position - samples.position.astype(np.float32), axis=1)
+            is_even = np.maximum(np.abs(height), moved[:, None, None]) <= EVEN * reach
+            extent = np.where(is_even, extent - height * normal, 0.0).astype(np.float32)
             self.extent = np.concatenate([np.zeros_like(extent[:, :1]), extent], axis=1).transpose(2, 1, 0)
         self.seeds = seeds_of(samples.position)
         self._known: list[np.ndarray] = []

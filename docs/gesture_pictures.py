@@ -18,9 +18,8 @@ sys.path.insert(0, str(ROOT))
 
 from ltsh_addon import imaging  # noqa: E402
 from ltsh_addon.blender.lights.textures import ShownTextures  # noqa: E402
-from ltsh_addon.blender.ui.gestures import power_for  # noqa: E402
 from ltsh_addon.blender.ui.highlight_place import hits_around, place_of  # noqa: E402
-from ltsh_addon.blender.ui.light_pose import LightPose  # noqa: E402
+from ltsh_addon.blender.ui.light_pose import LightPose, power_for  # noqa: E402
 from ltsh_addon.blender.ui.lit_point import surface_hit  # noqa: E402
 from ltsh_addon.blender.ui.shadow_edge import OccluderRays, shadow_edge_near  # noqa: E402
 
@@ -88,7 +87,7 @@ def main() -> None:
     lamp = scene()
     pictures = {"Before": (picture("before"), None)}
     pose = LightPose.of(lamp)
-    around = hits_around(lambda offset: hit(np.array(HIGHLIGHT[1]) + offset))
+    around = hits_around(lambda offsets: [hit(HIGHLIGHT[1] + offset) for offset in offsets])
     distance = (pose.matrix.translation - around.hits[0].position).length
     matrix, note = place_of(lamp, pose, around, distance, ShownTextures())
     print("highlight:", note or "at the mouse")

@@ -36,6 +36,8 @@ def perform(job: dict) -> None:
         if report is None:
             send({"error": complaint})
             return
+        if run["arguments"][0] == "match":
+            continue
         progress("images", 0.0)
         try:
             output = Path(run["output"])

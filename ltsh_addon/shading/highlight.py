@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -15,7 +17,7 @@ from .integrator import shade
 STENCIL = np.stack(np.meshgrid([0.0, -1.0, 1.0], [0.0, -1.0, 1.0]), axis=-1).reshape(-1, 2)
 _FIT = np.linalg.pinv(np.stack([np.ones(9), *STENCIL.T, *(0.5 * STENCIL**2).T, STENCIL.prod(axis=1)], axis=-1))
 # STEPS: of Newton's method from each start. NEAR: steps of the stencil from the cursor to the peak at which it ends.
-STEPS, NEAR = 6, 0.05
+STEPS, NEAR = 5, 0.05
 # FLAT: a gradient, per step of the stencil, of a radiance that hardly varies around the cursor: large lights in smooth
 # surfaces.
 FLAT = 5e-4
@@ -31,14 +33,28 @@ BRIGHTER, STRICT, GOOD = 0.01, 0.006, 0.003
 # Where Newton's method fails, directions around the mirrored view are tried: on circles at ANGLES rad, TURNS on each,
 # by the first samples and every THINNED-th of the others. Searches from the best ones with at least DIM of the radiance
 # of the mirrored view take moves of at most REACH times the lobe, which a move that leads to no better place makes
-# SHORTER. QUICK, THOROUGH: how many searches, and moves of each.
+# SHORTER.
 ANGLES, TURNS, THINNED, DIM = (0.04, 0.12, 0.25, 0.5, 0.8), 8, 4, 0.1
-REACH, SHORTER, QUICK, THOROUGH = 0.5, 0.3, (2, 5), (4, 12)
+REACH, SHORTER = 0.5, 0.3
+# HALF: of the time of a search. Where Newton's method took more, no directions around are tried.
+HALF = 0.5
 # MOVES: the moves (M, 2) that are looked at, in units of the longest.
 MOVES = np.concatenate([
     radius * np.stack([np.cos(turns), np.sin(turns)], axis=-1)
     for radius in (0.05, 0.15, 0.3, 0.5, 0.75, 1.0) for turns in [2.0 * np.pi * np.arange(24) / 24]
 ])  # fmt: skip
+
+
+@dataclass(frozen=True)
+class SearchEffort:
+    """How long a place is searched where Newton's method fails."""
+
+    starts: int
+    moves: int  # from each start
+    seconds: float = np.inf  # of processor time, after which no step begins
+
+
+QUICK, THOROUGH = SearchEffort(2, 3), SearchEffort(4, 12)
 
 
 @dataclass(frozen=True)
@@ -68,24 +84,25 @@ def mirrored(view: np.ndarray, normal: np.ndarray) -> np.ndarray:
 
 
 def place_for_highlight(
-    samples: SurfaceSamples, light: MovedLight, technique="ltsh4c", has_stencil=True, is_thorough=False
+    samples: SurfaceSamples, light: MovedLight, technique="ltsh4c", has_stencil=True, effort=QUICK
 ) -> HighlightPlace:
     """The direction for which the specular radiance of a light has its peak at the first one of the `samples`; no other
     may be brighter.
 
     If the first nine are those of the pixels of STENCIL: Newton's method for the gradient of the logarithm of the
     radiance, which is 0 at the peak, from the mirrored view on: of rough and curved surfaces the peak is elsewhere.
-    Where that fails, the directions around are tried; if `is_thorough`, many more.
+    Where that fails, the directions around are tried, by the `effort`.
     """
-    mirror = mirrored(samples.view[0], samples.normal[0])
-    problem = _Problem(samples, light, technique, max(float(samples.sharpest_roughness[0]) ** 2, 1e-3))
-    direction, is_peak = problem.by_newton(mirror) if has_stencil else (mirror, False)
+    lobe = max(float(samples.sharpest_roughness[0]) ** 2, 1e-3)
+    problem = _Problem(samples, light, technique, lobe, (time.thread_time(), effort.seconds))
+    direction, is_peak = problem.by_newton(problem.mirror) if has_stencil else (problem.mirror, False)
     excess = float(problem.excess([direction])[0][0])
     if is_peak and excess <= STRICT:
         return HighlightPlace(direction, excess)
-    count, moves = THOROUGH if is_thorough else QUICK
-    starts = problem.starts(mirror, [direction] if excess < np.inf else [])
-    searched, least = problem.by_search(starts[:count], moves)
+    further = [direction] if excess < np.inf else []
+    # Lobes that take long are searched from there alone.
+    starts = np.array([*further, problem.mirror]) if problem.is_late(HALF) else problem.starts(further)
+    searched, least = problem.by_search(starts[: effort.starts], effort.moves)
     if least < excess:
         direction, excess = searched, least
     return HighlightPlace(direction, excess)
@@ -99,6 +116,22 @@ class _Problem:
     light: MovedLight
     technique: object
     lobe: float  # its angle in rad
+    clock: tuple[float, float]  # processor time of this thread at the start, and how long the search may take
+
+    def is_late(self, share: float = 1.0) -> bool:
+        """True if this share of the time is over."""
+        start, seconds = self.clock
+        return time.thread_time() > start + share * seconds
+
+    @cached_property
+    def mirror(self) -> np.ndarray:
+        """The direction (3,) of the mirrored view."""
+        return mirrored(self.samples.view[0], self.samples.normal[0])
+
+    @cached_property
+    def _light_at_mirror(self) -> tuple[np.ndarray, Light]:
+        matrix = self.light.matrix_at(self.mirror)
+        return matrix, self.light.at(matrix)
 
     def by_newton(self, direction: np.ndarray) -> tuple[np.ndarray, bool]:
         """The direction (3,) to which Newton's method leads, and whether it is that of a peak."""
@@ -115,7 +148,7 @@ class _Problem:
             if best is None or offset < best[0]:
                 is_flat = float(np.linalg.norm(gradient[0])) < FLAT
                 best = offset, direction, is_flat or (values.max() < 0.0 and offset < 1.0)
-            if offset < NEAR and values.max() < 0.0:
+            if (offset < NEAR and values.max() < 0.0) or self.is_late():
                 break
             jacobian = (gradient[1:] - gradient[0]).T / (PROBE * self.lobe)
             step = np.linalg.lstsq(jacobian, -gradient[0], rcond=None)[0]
@@ -130,8 +163,9 @@ class _Problem:
         here = radiance[:, 0]
         return np.where(here > 0.0, radiance.max(axis=-1) / np.maximum(here, 1e-30) - 1.0, np.inf), here
 
-    def starts(self, mirror: np.ndarray, further: list) -> np.ndarray:
+    def starts(self, further: list) -> np.ndarray:
         """The directions (N, 3) around the mirrored view from which to search, the most promising first."""
+        mirror = self.mirror
         turned = np.tensordot(np.sin(ANGLES), _circle() @ _axes(mirror), axes=0).reshape(-1, 3)
         tried = np.stack([mirror, *further, *(turned + np.cos(ANGLES).repeat(TURNS)[:, None] * mirror)])
         few = np.concatenate([np.arange(len(STENCIL)), np.arange(len(STENCIL), len(self.samples), THINNED)])
@@ -165,7 +199,7 @@ class _Problem:
                 axes[is_better] = axes_now[is_better]
                 reach[~is_better] *= SHORTER
             best, least = np.where(is_better[:, None], now, best), np.where(is_better, excess, least)
-            if least.min() <= GOOD:
+            if least.min() <= GOOD or self.is_late():
                 break
             expected = (logs[:, None] + (MOVES @ slopes) * reach[:, None, None]).max(axis=-1)
             moves = reach[:, None] * MOVES[np.argmin(expected, axis=-1)]
@@ -180,11 +214,12 @@ class _Problem:
         """
         options = {"passes": ("specular",), "workers": 1, "dtype": dtype}
         matrices = np.array([self.light.matrix_at(direction) for direction in directions])
-        moves = matrices[0] @ np.linalg.inv(matrices)
+        place, light = self._light_at_mirror
+        moves = place @ np.linalg.inv(matrices)
         if np.abs(moves[:, :3, :3] @ moves[:, :3, :3].transpose(0, 2, 1) - np.eye(3)).max() < RIGID:
             moved = samples.take(np.tile(np.arange(len(samples)), len(moves)))
             arrays = {name: _moved(moves, getattr(samples, name), name == "position") for name in SPATIAL}
-            shading = shade(replace(moved, **arrays), [self.light.at(matrices[0])], self.technique, **options)
+            shading = shade(replace(moved, **arrays), [light], self.technique, **options)
             return shading.specular.sum(axis=(0, 2)).reshape(len(moves), len(samples))
         lights = [self.light.at(matrix) for matrix in matrices]
         return shade(samples, lights, self.technique, rows=range(len(lights)), **options).specular.sum(axis=-1)

@@ -6,7 +6,7 @@ from surface_scenes import area_light, unit
 
 from ltsh_addon.scene import SurfaceSamples
 from ltsh_addon.shading import shade
-from ltsh_addon.shading.highlight import STENCIL, MovedLight, mirrored, place_for_highlight
+from ltsh_addon.shading.highlight import STENCIL, MovedLight, SearchEffort, mirrored, place_for_highlight
 
 # A camera at EYE looks at the origin; a pixel is 1/500 of the distance wide.
 PIXEL = 0.002
@@ -102,3 +102,18 @@ def test_the_peak_is_at_the_cursor_or_is_said_not_to_be(drags):
         lost, pixels = scene.miss(mirror(scene))
         missed += lost > 0.01 and pixels > 2.0
     assert missed > 0.2 * len(drags)
+
+
+def test_a_search_without_time_still_says_how_far_off_it_is(drags):
+    for scene, place in drags:
+        samples = scene.samples(FEW[scene.rays(FEW)[1]])
+        light, effort = MovedLight(scene.matrix_at, scene.light), SearchEffort(2, 3, seconds=0.0)
+        hasty = place_for_highlight(samples, light, effort=effort)
+        here, *around = (
+            shade(samples, [scene.light(scene.matrix_at(hasty.direction))], passes=("specular",), workers=1)
+            .specular.sum(axis=(0, 2)).tolist()
+        )  # fmt: skip
+        excess = max(here, *around) / here - 1.0 if here > 0.0 else np.inf
+        # Single precision of light in tails of a lobe.
+        assert hasty.excess == pytest.approx(excess, rel=1e-2, abs=1e-4)
+        assert np.linalg.norm(hasty.direction) == pytest.approx(1.0) and place.excess <= max(hasty.excess, 0.01)

@@ -12,18 +12,22 @@ from bpy_extras import view3d_utils
 from mathutils import Matrix, Vector
 
 from ...scene import error_line
+from ...shading.highlight import QUICK, THOROUGH
 from ..lights.groups import reason_to_stay
 from ..lights.textures import ShownTextures
-from .highlight_place import DISK, PIXELS, HitsAround, hits_around, note_by_pixels, place_by_pixels, place_of
-from .light_pose import (
-    LightLook,
-    LightPose,
-    locked_place,
-    reason_to_keep_look,
-    reason_to_keep_power,
+from .highlight_place import (
+    DISK,
+    PIXELS,
+    HitsAround,
+    hits_around,
+    note_by_pixels,
+    place_by_pixels,
+    place_of,
+    warm_up,
 )
-from .lit_point import LightShare, SceneLights, SurfaceHit, share_line, surface_hit
-from .preview import PASSED_ON, active_light, lights_of, region_under
+from .light_pose import LightLook, LightPose, locked_place, power_for, reason_to_keep_look, reason_to_keep_power
+from .lit_point import LightShare, SceneLights, SurfaceHit, hit_at, hits_at, share_line
+from .preview import PASSED_ON, active_light, lights_of, pointer, view_under
 from .shadow_edge import NEAR_EDGE, OccluderRays, shadow_edge_near
 
 # FARTHER: the factor of the distance by a step of the wheel.
@@ -36,25 +40,18 @@ AXES, MODES = "XYZ", {"D": "distance", "S": "size", "C": "color"}
 # REST_SECONDS: after so long without a move the shares of the lights at the mouse are told, which may take a while.
 REST_SECONDS = 0.2
 # MOVING_KEYS: what the status bar says of keys while a light is moved.
-MOVING_KEYS = "Wheel, D: distance    S: size    C: color    X, Y, Z: lock    Shift: precise    Ctrl: corners"
+MOVING_KEYS = "Wheel, D, number: distance    S: size    C: color    X, Y, Z: lock    Shift: precise    Ctrl: corners"
 # FOLLOWED: what a drag follows.
 FOLLOWED = ("MOUSEMOVE", "LEFT_SHIFT", "LEFT_CTRL", "RIGHT_SHIFT", "RIGHT_CTRL")
+# LIVE, AT_REST: how long highlights are searched during a move of the mouse, and after it.
+LIVE, AT_REST = replace(QUICK, seconds=0.03), replace(THOROUGH, seconds=1.0)
+# MOST_GLOSSY: the light whose highlight is dragged if none is active.
+MOST_GLOSSY = "the light that gives the pressed point the most glossy light"
+LEAST_DISTANCE = 1e-3  # m, of a light from what it faces
 NO_SURFACE = "there is no surface under the mouse"
 
 
 _logger = logging.getLogger(__name__)
-
-
-def power_for(factor: float, power: float, share: float) -> float:
-    """The power of a light with which a point gets `factor` times its light, of which a light of this `power` gives
-    the `share`, over 0; never below 0."""
-    return max(0.0, power * (1.0 + (factor - 1.0) / share))
-
-
-def view_under(context, mouse: np.ndarray) -> tuple:
-    """The region of the 3D view under the `mouse` (2,) of the window, None where there is none, and the pixel in it."""
-    region = region_under(context, *mouse.tolist())
-    return region, mouse if region is None else mouse - (region.x, region.y)
 
 
 class Gesture:
@@ -68,11 +65,13 @@ class Gesture:
 
     def invoke(self, context, event):
         self._is_dragged, self._note, self._scene_lights, self._textures = False, "", None, ShownTextures()
+        self._typed = ""
         self._scale, self._is_told, self._is_still = context.preferences.system.ui_scale, False, False
         self._mouse = self._last = pointer(event)
         self._timer = context.window_manager.event_timer_add(REST_SECONDS, window=context.window)
         context.window.cursor_modal_set("CROSSHAIR")
         context.workspace.status_text_set(f"{self.words(context)}    Esc: Cancel")
+        warm_up(context.scene)
         # A tool starts it by the press itself, a button by its release.
         if event.type == "LEFTMOUSE" and event.value == "PRESS":
             try:
@@ -120,13 +119,14 @@ class Gesture:
         if event.type in ("ESC", "RIGHTMOUSE"):
             self.cancel(context)
             return {"CANCELLED"}
-        if event.type == "LEFTMOUSE":
-            if event.value == "RELEASE" and self._is_dragged:
+        is_confirmed = event.type in ("RET", "NUMPAD_ENTER") and event.value == "PRESS"
+        if event.type == "LEFTMOUSE" or is_confirmed:
+            if (event.value == "RELEASE" or is_confirmed) and self._is_dragged:
                 if not self._is_told and (warning := self.warning(context, event)):
                     self.report({"WARNING"}, warning)
                 self._end(context)
                 return {"FINISHED" if self.is_changed() else "CANCELLED"}
-            if event.value in ("PRESS", "DOUBLE_CLICK"):
+            if event.value in ("PRESS", "DOUBLE_CLICK") and not is_confirmed:
                 self._is_dragged = self._do(context, event, self.press)
                 # Why a drag cannot begin is told until the mouse moves.
                 self._is_told = not self._is_dragged
@@ -137,9 +137,10 @@ class Gesture:
             now = pointer(event)
             way, self._last = (PRECISE if event.shift else 1.0) * (now - self._last), now
             self._is_told = self._is_still = False
-            self.move(way)
-            self._do(context, event, self.follow)
-        elif self._is_dragged and event.value == "PRESS" and self.key(event):
+            if not self._typed:
+                self.move(way)
+                self._do(context, event, self.follow)
+        elif self._is_dragged and event.value == "PRESS" and (self._type(event) or self.key(event)):
             self._do(context, event, self.follow)
         elif event.type == "MOUSEMOVE":
             self._is_told = self._is_still = False
@@ -168,6 +169,19 @@ class Gesture:
         """Take a key that is pressed while dragging; False if it has no meaning."""
         return False
 
+    def number(self, value: float) -> None:
+        """Take a number, not below 0, that is typed while dragging. Until it is erased the mouse changes nothing."""
+
+    def _type(self, event) -> bool:
+        """Take a key of a number; False if it is none."""
+        typed = self._typed[:-1] if event.type == "BACK_SPACE" else self._typed + event.ascii
+        if typed == self._typed or typed.strip("0123456789.") or typed.count(".") > 1:
+            return False
+        self._typed = typed
+        if typed.strip("."):
+            self.number(float(typed))
+        return True
+
     def warning(self, context, event) -> str:
         """What is wrong with what the drag has reached, if telling takes longer than a move may; "" if nothing."""
         return ""
@@ -191,7 +205,7 @@ class Gesture:
 
     def _do(self, context, event, step) -> bool:
         is_done = step(context, event)
-        self._tell(context, self._note)
+        self._tell(context, f"[{self._typed}]    {self._note}" if self._typed else self._note)
         return is_done
 
     def _rest(self, context, event) -> bool:
@@ -222,35 +236,35 @@ class Gesture:
         return None if region is None else hit_at(context, region, mouse)
 
 
-def pointer(event) -> np.ndarray:
-    """Where the mouse is (2,) in the window."""
-    return np.array([event.mouse_x, event.mouse_y], float)
-
-
 class MovingGesture(Gesture):
-    """A gesture that moves the active light. LOCKS: axes may be locked."""
+    """A gesture that moves the active light. LOCKS: axes may be locked. CHOOSES: without an active light its `press`
+    takes another."""
 
-    LOCKS = True
+    LOCKS, CHOOSES = True, False
 
     @classmethod
     def reason_against(cls, context) -> str:
         """As `Gesture.reason_against`."""
         light = active_light(context)
-        if light is None:
+        if light is None and not (cls.CHOOSES and lights_of(context.scene)):
             return "No light is active"
-        reason = reason_to_stay(light)
+        reason = "" if light is None else reason_to_stay(light)
         return super().reason_against(context) or (f"{light.name}: {reason}" if reason else "")
 
     @classmethod
     def words(cls, context) -> str:
         """As `Gesture.words`."""
-        return cls.KEYS.format(active_light(context).name)
+        light = active_light(context)
+        return cls.KEYS.format(MOST_GLOSSY if light is None else light.name)
 
     def invoke(self, context, event):
-        self._light = active_light(context)
-        self._pose, self._look, self._distance = LightPose.of(self._light), LightLook.of(self._light), 0.0
-        self._free, self._mode = (True, True, True), ""
+        self._light, self._distance, self._free, self._mode = active_light(context), 0.0, (True, True, True), ""
+        if self._light is not None:
+            self._take(self._light)
         return super().invoke(context, event)
+
+    def _take(self, light) -> None:
+        self._light, self._pose, self._look = light, LightPose.of(light), LightLook.of(light)
 
     def put_back(self) -> None:
         """Put the light back where it was, as it was."""
@@ -268,10 +282,20 @@ class MovingGesture(Gesture):
             free = tuple((axis == event.type) != event.shift for axis in AXES)
             self._free = (True, True, True) if free == self._free else free
         elif event.type in MODES:
-            self._mode = "" if self._mode == event.type else event.type
+            self._mode, self._typed = "" if self._mode == event.type else event.type, ""
         else:
             return False
         return True
+
+    def number(self, value: float) -> None:
+        """As `Gesture.number`: the distance, after S the size."""
+        if self._mode == "S" and not reason_to_keep_look(self._light, "size"):
+            self._look.resize(self._light, value)
+        elif self._mode in ("", "D"):
+            self.set_distance(max(value, LEAST_DISTANCE))
+
+    def set_distance(self, distance: float) -> None:
+        """Take a distance that is typed."""
 
     def move(self, way: np.ndarray) -> None:
         """As `Gesture.move`; after a key of MODES it changes what that says."""
@@ -297,7 +321,7 @@ class MovingGesture(Gesture):
         hit = hit_at(context, region, mouse) if self._is_dragged and event.ctrl and region is not None else None
         if hit is None or hit.face is None:
             return
-        places = (hit.matrix @ Vector(place) for place in (*hit.face.corners, hit.face.corners.mean(axis=0)))
+        places = (hit.matrix @ Vector(place) for place in (*hit.face.corners, np.mean(hit.face.corners, axis=0)))
         pixels = [view3d_utils.location_3d_to_region_2d(region, region.data, place) for place in places]
         pixels = np.array([pixel for pixel in pixels if pixel is not None])
         if len(pixels):
@@ -320,21 +344,40 @@ class MovingGesture(Gesture):
 
 
 class LTSH_OT_drag_highlight(MovingGesture, bpy.types.Operator):
-    """Drag the highlight of the active light over surfaces in a 3D view: the light follows, keeps its distance and
-    faces them"""
+    """Drag the highlight of the active light, or without one of the light that gives the pressed point the most glossy
+    light, over surfaces in a 3D view: the light follows, keeps its distance and faces them"""
 
     bl_idname = "ltsh.drag_highlight"
     bl_label = "Drag Highlight"
     bl_options = {"UNDO"}
-    KEYS, ICON = f"Drag the highlight of {{}}    {MOVING_KEYS}", "ops.transform.tosphere"
+    KEYS, ICON, CHOOSES = f"Drag the highlight of {{}}    {MOVING_KEYS}", "ops.transform.tosphere", True
 
     def wheel(self, factor: float) -> None:
         """Change the distance."""
         self._distance *= factor
 
+    def set_distance(self, distance: float) -> None:
+        """As `MovingGesture.set_distance`."""
+        self._distance = distance
+
     def press(self, context, event) -> bool:
-        """Move the light so that its highlight is at the mouse; False where no surface is."""
-        return self.follow(context, event)
+        """Move the light so that its highlight is at the mouse; False where no surface is, or no light to choose."""
+        return (self._light is not None or self._choose(context, event)) and self.follow(context, event)
+
+    def _choose(self, context, event) -> bool:
+        """Take the light that gives the pressed point the most glossy light."""
+        hit = self.hit_under(context, event)
+        shares = [] if hit is None else [share for share in self.shares_at(context, hit) if share.is_lamp]
+        first = max(shares, key=lambda share: share.glossy, default=None)
+        if first is None or first.glossy <= 0.0:
+            self._note = NO_SURFACE if hit is None else "No light has a highlight here: choose one"
+            return False
+        light = context.scene.objects.get(first.name) or bpy.data.objects[first.name]
+        if reason := reason_to_stay(light):
+            self._note = f"{light.name}: {reason}"
+            return False
+        self._take(light)
+        return True
 
     def follow(self, context, event) -> bool:
         """As `press`."""
@@ -343,14 +386,14 @@ class LTSH_OT_drag_highlight(MovingGesture, bpy.types.Operator):
             self._note = NO_SURFACE
             return False
         middle = around.hits[0].position
-        self._distance = self._distance or max((self._pose.matrix.translation - middle).length, 1e-3)
-        matrix, note = place_of(self._light, self._pose, around, self._distance, self._textures)
+        self._distance = self._distance or max((self._pose.matrix.translation - middle).length, LEAST_DISTANCE)
+        matrix, note = place_of(self._light, self._pose, around, self._distance, self._textures, LIVE)
         if not all(self._free):
             way = locked_place(self._pose.matrix.translation, middle, matrix.translation, self._free) - middle
             matrix = self._pose.facing(middle, way.normalized(), way.length)
         self._matrix = matrix
         self._put(matrix)
-        self._note = self._noted((matrix.translation - middle).length, note)
+        self._note = f"{self._light.name}    {self._noted((matrix.translation - middle).length, note)}"
         return True
 
     def warning(self, context, event) -> str:
@@ -360,7 +403,7 @@ class LTSH_OT_drag_highlight(MovingGesture, bpy.types.Operator):
             return NO_SURFACE
         if not all(self._free):
             return note_by_pixels(self._light, self._matrix, around, self._textures)
-        self._matrix, note = place_by_pixels(self._light, self._pose, self._matrix, around, self._textures)
+        self._matrix, note = place_by_pixels(self._light, self._pose, self._matrix, around, self._textures, AT_REST)
         self._put(self._matrix)
         return note
 
@@ -369,8 +412,7 @@ class LTSH_OT_drag_highlight(MovingGesture, bpy.types.Operator):
         region, mouse = view_under(context, self._mouse)
         if region is None:
             return None
-        depsgraph, faces = context.evaluated_depsgraph_get(), {}
-        return hits_around(lambda offset: hit_at(context, region, mouse + offset, depsgraph, faces), disk)
+        return hits_around(lambda offsets: hits_at(context, region, mouse + offsets), disk)
 
 
 class LTSH_OT_drag_brightness(Gesture, bpy.types.Operator):
@@ -379,7 +421,10 @@ class LTSH_OT_drag_brightness(Gesture, bpy.types.Operator):
     bl_idname = "ltsh.drag_brightness"
     bl_label = "Drag Brightness"
     bl_options = {"UNDO"}
-    KEYS = "Press on a surface, drag up or down: its brightness follows    Shift: precise    Ctrl: thirds of a stop"
+    KEYS = (
+        "Press on a surface, drag up or down: its brightness follows    Number: so many times    Shift: precise    "
+        "Ctrl: thirds of a stop"
+    )
     ICON = "ops.curve.radius"
 
     @classmethod
@@ -411,13 +456,14 @@ class LTSH_OT_drag_brightness(Gesture, bpy.types.Operator):
         """Change the power by the way of the mouse."""
         stops = (self._mouse - self._start)[1] / (STOP * self._scale)
         stops = round(SNAPS * stops) / SNAPS if event.ctrl else stops
-        factor = 2.0**stops
+        factor = float(self._typed) if self._typed.strip(".") else 2.0**stops
         power = power_for(factor, self._power, self._share)
         self._light.data.energy = power
         unit = "W/m²" if self._light.data.type == "SUN" else "W"
         text = f"{self._light.name}: {self._power:.4g} to {power:.4g} {unit}"
         if power > 0.0 or factor >= 1.0:
-            text += f"    here {factor:.3g} times the direct light, {stops:+.2f} stops"
+            text += f"    here {factor:.3g} times the direct light"
+            text += f", {math.log2(factor):+.2f} stops" if factor > 0.0 else ""
         else:
             text += f"    off: the other lights leave {1.0 - self._share:.3g} times the direct light here"
         self._note = f"{text}    before: {self._shares}"
@@ -451,6 +497,11 @@ class LTSH_OT_drag_shadow(MovingGesture, bpy.types.Operator):
         """Change the distance from what the light faces."""
         self._edge = replace(self._edge, distance=factor * self._edge.distance)
 
+    def set_distance(self, distance: float) -> None:
+        """As `MovingGesture.set_distance`."""
+        if not self._pose.is_sun:
+            self._edge = replace(self._edge, distance=distance)
+
     def press(self, context, event) -> bool:
         """Choose the edge of a shadow near the mouse; False where there is none."""
         region, mouse = view_under(context, self._mouse)
@@ -460,7 +511,7 @@ class LTSH_OT_drag_shadow(MovingGesture, bpy.types.Operator):
         depsgraph = context.evaluated_depsgraph_get()
         self._edge, self._note = shadow_edge_near(
             OccluderRays(context.scene, depsgraph, self._light),
-            lambda offset: hit_at(context, region, mouse + offset, depsgraph),
+            lambda offset: hit_at(context, region, mouse + offset),
             self._pose.matrix, self._light.data.type, NEAR_EDGE * self._scale,
         )  # fmt: skip
         return self._edge is not None and self.follow(context, event)
@@ -524,6 +575,7 @@ _tools: list[type] = []
 
 def _tool_of(gesture) -> type:
     def draw_settings(context, layout, tool):
+        warm_up(context.scene)
         layout.label(text=gesture.reason_against(context) or gesture.words(context))
 
     return type(f"{gesture.__name__}_tool", (bpy.types.WorkSpaceTool,), {
@@ -546,10 +598,3 @@ def unregister() -> None:
     """Take them away."""
     while _tools:
         bpy.utils.unregister_tool(_tools.pop())
-
-
-def hit_at(context, region, pixel: tuple[float, float], depsgraph=None, faces=None) -> SurfaceHit | None:
-    """What the view of a region meets at a pixel; `faces` as for `surface_hit`."""
-    start = view3d_utils.region_2d_to_origin_3d(region, region.data, pixel)
-    direction = view3d_utils.region_2d_to_vector_3d(region, region.data, pixel)
-    return surface_hit(context.scene, depsgraph or context.evaluated_depsgraph_get(), start, direction, faces)

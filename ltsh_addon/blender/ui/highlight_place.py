@@ -5,21 +5,24 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
+import bpy
 import numpy as np
 from mathutils import Matrix, Vector
 
 from ...cycles.horizons import end_at_horizons_of_cycles, unit, valid_specular_normal
 from ...scene import SurfaceSamples
 from ...shading import shade
-from ...shading.highlight import BRIGHTER, STENCIL, MovedLight, mirrored, place_for_highlight
+from ...shading.highlight import BRIGHTER, QUICK, STENCIL, THOROUGH, MovedLight, mirrored, place_for_highlight
 from ..evaluated import EmitterTraits
 from ..lights.area import area_light
 from ..lights.linking import Receivers, linked_objects, receiver_collection
 from ..lights.textures import ShownTextures
 from ..materials.preview_material import COAT, METALS, PreviewMaterial, preview_of
 from .light_pose import LightPose
-from .lit_point import SurfaceHit, shipped_table, value_at_hits
+from .lit_point import SurfaceHit, directions_around, hits_at, shipped_table, value_at_hits
+from .preview import lights_of
 
 # SPACING: pixels between the nine rays around the mouse. DISK: further rays, pixels from it, in which no highlight may
 # be brighter than at the mouse: rings, denser near it.
@@ -32,6 +35,8 @@ DISK = np.concatenate([
 NEAR = 2.0
 _GRID = np.stack(np.meshgrid(np.arange(-20.0, 21.0), np.arange(-20.0, 21.0)), axis=-1).reshape(-1, 2)
 PIXELS = _GRID[np.hypot(*_GRID.T) <= 20.0]
+# GRID: by how many pixels, across and up, `prepare_view` looks for surfaces.
+GRID = 9
 # Kinds of lobes without a highlight.
 DULL = ("diffuse", "sheen", "velvet", "translucent")
 NO_HIGHLIGHT = "this surface has no highlight"
@@ -47,11 +52,21 @@ class HitsAround:
     pixels: np.ndarray  # (P, 2) of the hits, from the mouse
     has_stencil: bool  # the first nine are those of STENCIL; False at rims
 
+    @cached_property
+    def _material(self) -> PreviewMaterial:
+        material = self.hits[0].material
+        return preview_of(None if material is None else material.original)
 
-def glossy_lobe(material) -> PreviewMaterial | None:
-    """The first lobe of a material that has highlights."""
-    lobes = preview_of(None if material is None else material.original).lobes
-    return next((lobe for lobe in lobes if lobe.kind not in DULL and not lobe.is_clear), None)
+    @cached_property
+    def lobe(self) -> PreviewMaterial | None:
+        """The first lobe of the material that has highlights."""
+        return next((lobe for lobe in self._material.lobes if lobe.kind not in DULL and not lobe.is_clear), None)
+
+    @property
+    def unread(self) -> str:
+        """What of the material's normals is not read, and moves its highlights; "" without any."""
+        notes = self._material.notes
+        return ", ".join(note for note in notes if "normals from" in note or "anisotropy" in note)
 
 
 def samples_of(hits: list[SurfaceHit], lobe: PreviewMaterial, textures: ShownTextures) -> SurfaceSamples:
@@ -59,7 +74,7 @@ def samples_of(hits: list[SurfaceHit], lobe: PreviewMaterial, textures: ShownTex
     map."""
     count, white = len(hits), np.ones((len(hits), 3))
     position, view, normal, true = (
-        np.array([getattr(hit, name) for hit in hits]) for name in ("position", "view", "normal", "face_normal")
+        np.array([getattr(hit, name)[:] for hit in hits]) for name in ("position", "view", "normal", "face_normal")
     )
     smooth, coat, brush = normal, lobe.coat if lobe.kind == COAT else None, lobe.brush
     if lobe.normal is not None:
@@ -68,7 +83,7 @@ def samples_of(hits: list[SurfaceHit], lobe: PreviewMaterial, textures: ShownTex
     anisotropy, tangent = 0.0, np.zeros((count, 3))
     if brush is not None:
         anisotropy = 1.0 - brush.aspect
-        along = np.array([_brush_direction(hit, brush) for hit in hits])
+        along = _brush_directions(hits, brush)
         along = unit(along - (along * smooth).sum(axis=-1, keepdims=True) * smooth)
         axis = bent if lobe.kind == "glossy" else normal
         beside = (axis * along).sum(axis=-1, keepdims=True) * axis
@@ -104,20 +119,19 @@ def _mapped_normals(hits: list[SurfaceHit], normals: np.ndarray, lobe: PreviewMa
     return unit(np.where([[frame is None] for frame in frames], normals, mapped))
 
 
-def _brush_direction(hit: SurfaceHit, brush) -> np.ndarray:
-    """The direction (3,) of an anisotropic lobe, before its rotation."""
-    if not brush.direction:
-        frame = hit.uv_frame(brush.uv_map)
-        return np.zeros(3) if frame is None else frame[0]
-    return hit.around("XYZ".index(brush.direction))
+def _brush_directions(hits: list[SurfaceHit], brush) -> np.ndarray:
+    """The directions (P, 3) of an anisotropic lobe, before its rotation."""
+    if brush.direction:
+        return directions_around(hits, "XYZ".index(brush.direction))
+    frames = [hit.uv_frame(brush.uv_map) for hit in hits]
+    return np.array([np.zeros(3) if frame is None else frame[0] for frame in frames])
 
 
 def place_of(
-    ob, pose: LightPose, around: HitsAround, distance: float, textures: ShownTextures, is_thorough=False
+    ob, pose: LightPose, around: HitsAround, distance: float, textures: ShownTextures, effort=QUICK
 ) -> tuple[Matrix, str]:
     """The matrix of the light object `ob` for a highlight at the mouse; and what there is to say about it."""
-    hit = around.hits[0]
-    lobe = glossy_lobe(hit.material)
+    hit, lobe = around.hits[0], around.lobe
 
     def matrix_at(direction: np.ndarray) -> Matrix:
         return pose.facing(hit.position, Vector(direction), distance)
@@ -126,9 +140,9 @@ def place_of(
         return matrix_at(mirrored(np.array(hit.view), np.array(hit.normal))), NO_HIGHLIGHT
     light = MovedLight(lambda direction: np.array(matrix_at(direction)), lambda matrix: _light(ob, matrix))
     samples = samples_of(around.hits, lobe, textures)
-    place = place_for_highlight(samples, light, shipped_table(), around.has_stencil, is_thorough)
+    place = place_for_highlight(samples, light, shipped_table(), around.has_stencil, effort)
     note = "" if place.is_peak else BEHIND if math.isinf(place.excess) else BESIDE
-    return matrix_at(place.direction), unlinked(ob, hit) or note or unread(hit.material)
+    return matrix_at(place.direction), unlinked(ob, hit) or note or around.unread
 
 
 def unlinked(ob, hit: SurfaceHit) -> str:
@@ -138,17 +152,10 @@ def unlinked(ob, hit: SurfaceHit) -> str:
     return "" if is_lit else f"{ob.name} does not light {hit.ob.name}, by light linking"
 
 
-def unread(material) -> str:
-    """What of a material's normals is not read, and moves its highlights; "" without any."""
-    notes = preview_of(None if material is None else material.original).notes
-    return ", ".join(note for note in notes if "normals from" in note or "anisotropy" in note)
-
-
 def note_by_pixels(ob, matrix: Matrix, around: HitsAround, textures: ShownTextures) -> str:
     """Why the highlight of the light object `ob`, at `matrix` now, is not at the mouse, by all that is `around`; ""
     where it is."""
-    hits = around.hits
-    lobe = glossy_lobe(hits[0].material)
+    hits, lobe = around.hits, around.lobe
     if lobe is None:
         return NO_HIGHLIGHT
     if note := unlinked(ob, hits[0]):
@@ -160,18 +167,18 @@ def note_by_pixels(ob, matrix: Matrix, around: HitsAround, textures: ShownTextur
     if here <= 0.0:
         return BEHIND
     is_there = radiance.max() <= (1.0 + BRIGHTER) * here or np.hypot(*around.pixels[np.argmax(radiance)]) <= NEAR
-    return unread(hits[0].material) if is_there else BESIDE
+    return around.unread if is_there else BESIDE
 
 
 def place_by_pixels(
-    ob, pose: LightPose, matrix: Matrix, around: HitsAround, textures: ShownTextures
+    ob, pose: LightPose, matrix: Matrix, around: HitsAround, textures: ShownTextures, effort=THOROUGH
 ) -> tuple[Matrix, str]:
     """As `place_of`, by all pixels `around`, where the light object `ob` is not yet right at `matrix`: what shines
     between the samples of a move may be brighter. Takes too long for a move."""
     note = note_by_pixels(ob, matrix, around, textures)
     if note == BESIDE:
         distance = (matrix.translation - around.hits[0].position).length
-        better, _ = place_of(ob, pose, around, distance, textures, is_thorough=True)
+        better, _ = place_of(ob, pose, around, distance, textures, effort)
         if (again := note_by_pixels(ob, better, around, textures)) != BESIDE:
             return better, again
     return matrix, note
@@ -182,13 +189,45 @@ def _light(ob, matrix: np.ndarray):
     return replace(area_light(ob, matrix, EmitterTraits("", True, True), Receivers([ob])), receivers=None)
 
 
-def hits_around(hit_at: Callable[[np.ndarray], SurfaceHit | None], disk: np.ndarray = DISK) -> HitsAround | None:
-    """What a view shows around the mouse in the `disk` (P, 2), by `hit_at` for pixels from there; None without a
-    surface at the mouse."""
+def hits_around(hits_at: Callable[[np.ndarray], list], disk: np.ndarray = DISK) -> HitsAround | None:
+    """What a view shows around the mouse in the `disk` (P, 2), by `hits_at` for pixels (P, 2) from there; None without
+    a surface at the mouse."""
     stencil = SPACING * STENCIL
-    at_mouse, *near = map(hit_at, stencil)
+    pixels = np.concatenate([stencil, disk])
+    hits = hits_at(pixels)
+    at_mouse = hits[0]
     if at_mouse is None:
         return None
-    hits, pixels = [at_mouse, *near, *map(hit_at, disk)], np.concatenate([stencil, disk])
     same = [n for n, hit in enumerate(hits) if hit and (hit.ob, hit.material) == (at_mouse.ob, at_mouse.material)]
     return HitsAround([hits[n] for n in same], pixels[same], same[: len(stencil)] == list(range(len(stencil))))
+
+
+# By session_uid, the scenes that `warm_up` has prepared.
+_warm: set[int] = set()
+
+
+def warm_up(scene) -> None:
+    """Soon do, once for a scene, what the first move of a drag would wait for."""
+    if scene.session_uid not in _warm:
+        _warm.add(scene.session_uid)
+        bpy.app.timers.register(_prepare, first_interval=0.0)
+
+
+def _prepare() -> None:
+    """Try a move in each view: that reads the table, and Blender builds the trees in which its rays find surfaces."""
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            region = next((one for one in area.regions if one.type == "WINDOW"), None)
+            if area.type == "VIEW_3D" and region is not None:
+                with bpy.context.temp_override(window=window, area=area, region=region):
+                    prepare_view(bpy.context, region)
+
+
+def prepare_view(context, region) -> None:
+    """Try a move of a light in the view of a region; nothing is changed."""
+    grid = (np.indices((GRID, GRID)).reshape(2, -1).T + 0.5) / GRID * (region.width, region.height)
+    shown = [pixel for pixel, hit in zip(grid, hits_at(context, region, grid), strict=True) if hit is not None]
+    light = next(iter(lights_of(context.scene)), None)
+    if shown and light is not None:
+        around = hits_around(lambda offsets: hits_at(context, region, shown[len(shown) // 2] + offsets))
+        place_of(light, LightPose.of(light), around, 1.0, ShownTextures())

@@ -15,10 +15,14 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 
 import bpy
+import numpy as np
 from bpy.app.translations import pgettext_iface as translated
 
-from ...pipeline.options import BakeOptions, CompareOptions, PictureOptions, command_line
+from ...imaging.exr import write_channels
+from ...pipeline.match import PIXELS, ROUNDS
+from ...pipeline.options import BakeOptions, CompareOptions, MatchOptions, PictureOptions, command_line
 from ...scene import ATLAS, DEFAULT_TECHNIQUE, REFERENCE, TECHNIQUES
+from ..extract.match import is_telling, light_of_image
 from ..process import blender_process
 from . import preflight
 from .settings import preferences
@@ -41,6 +45,8 @@ STAGE_TITLES = {
     "Cycles B": "Cycles, Second Half",
     "shadows": "Trace Shadows",
     "denoise": "Denoise",
+    "target": "Read the Target",
+    "search": "Place Lights",
     **{technique.title: technique.label for technique in TECHNIQUES.values()},
     "write": "Write Files",
     "images": "Make Pictures",
@@ -64,6 +70,9 @@ USUAL_RAYS = 256
 DIFFUSE_SHARE = 0.1  # of shading, without the specular lobe
 EDGE_POINTS = 2.0  # a texel, with bounces, for the edges of shadows: 16 for an eighth of the texels
 REFERENCE_POINTS = 0.15
+SEARCH_SECONDS = 8.0  # of a round in which lights are placed
+# The files of `write_target`.
+TARGET, MASK = "ltsh-target.exr", "ltsh-mask.exr"
 
 
 @dataclass(frozen=True)
@@ -71,7 +80,7 @@ class Run:
     """One command of a job."""
 
     command: str
-    options: PictureOptions | BakeOptions
+    options: PictureOptions | BakeOptions | MatchOptions
     partial: str = ""  # what its pictures lack, if a later command of the job adds it
     resumes: bool = False  # do only what has changed
 
@@ -85,6 +94,8 @@ def runs_of(context, command: str, scene_file: Path) -> list[Run]:
     """The commands of a job."""
     if command == "bake":
         return [Run(command, bake_options(context, scene_file), resumes=context.scene.ltsh.bake_changed)]
+    if command == "match":
+        return [Run(command, match_options(context.scene, scene_file))]
     wanted = picture_options(context.scene, command, scene_file)
     first = tuple(name for name in wanted.techniques if name != REFERENCE)
     if command == "shade" or not first:
@@ -138,6 +149,28 @@ def bake_options(context, scene_file: Path) -> BakeOptions:
     )
 
 
+def match_options(scene, scene_file: Path) -> MatchOptions:
+    """The options of "match" by the settings of `scene`, with the files of `write_target` beside `scene_file`."""
+    return MatchOptions(
+        scene=scene_file,
+        output=output_folder(scene, "match"),
+        target=scene_file.with_name(TARGET),
+        mask=scene_file.with_name(MASK),
+        colors=scene.ltsh.match_colors,
+        move=True,
+        shadow_rays=scene.ltsh.shadow_rays,
+    )
+
+
+def write_target(scene, folder: Path) -> None:
+    """Write the light of the target of `scene`, and the mask of what of it is not clipped. Raises SceneError."""
+    light, encoded = light_of_image(scene.ltsh.match_target, scene, None, folder)
+    is_known = is_telling(light, encoded)
+    planes = np.moveaxis(np.where(is_known[..., None], light, 0.0).astype(np.float32), -1, 0)
+    write_channels(folder / TARGET, dict(zip("RGB", planes, strict=True)))
+    write_channels(folder / MASK, dict.fromkeys("RGB", is_known.astype(np.float32)))
+
+
 def chosen(settings, key: str) -> tuple[str, ...]:
     """The chosen members of a set property, in the order in which they are offered."""
     items = settings.bl_rna.properties[key].enum_items.keys()
@@ -171,7 +204,10 @@ def steps(runs: list[Run]) -> list[Step]:
     """The stages of a job, in order."""
     stages = [Step(STARTING, START_SECONDS)]
     for run in runs:
-        stages += _bake(run.options) if run.command == "bake" else _picture(run.options, run.command == "compare")
+        if run.command == "match":
+            stages += _match(run.options)
+        else:
+            stages += _bake(run.options) if run.command == "bake" else _picture(run.options, run.command == "compare")
     return stages
 
 
@@ -210,6 +246,15 @@ def finished_steps(pixels: float, cycles_samples: int) -> list[Step]:
         Step("Cycles", RENDER_SECONDS + CYCLES_SECONDS * pixels * cycles_samples),
         Step("denoise", DENOISE_SECONDS * pixels),
     ]
+
+
+def _match(options: MatchOptions) -> list[Step]:
+    """A picture, and a search and another picture in each round."""
+    pixels = 1e-6 * PIXELS
+    sampling, shading = shading_steps(pixels, 1, options.shadow_rays, options.techniques)
+    picture = [*sampling, *shading, *finished_steps(pixels, options.cycles_samples)]
+    search = [Step("search", SEARCH_SECONDS), Step("write", OPEN_SECONDS), *picture]
+    return [Step("target", OPEN_SECONDS), *picture, *(ROUNDS * search), Step("write", OPEN_SECONDS)]
 
 
 def _rays(options) -> int:
@@ -378,7 +423,7 @@ class Job:
     title: str
     plan: Plan
     folder: Path  # temporary, removed at the end
-    command: str  # shade, compare or bake
+    command: str  # shade, compare, bake or match
     scene: int  # session uid of its scene
     shown: int = 0  # how many of the results the window shows
     output: Path | None = None  # folder of files for the user

@@ -6,9 +6,9 @@ import colorsys
 import math
 from dataclasses import dataclass
 
-from mathutils import Matrix, Vector
+from mathutils import Euler, Matrix, Vector
 
-from ..lights.groups import is_animated, is_linked
+from ..lights.groups import is_animated, is_linked, reason_to_keep, reason_to_stay
 
 
 @dataclass(frozen=True)
@@ -54,6 +54,31 @@ class LightPose:
         ob.matrix_basis = self.parent.inverted_safe() @ matrix
 
 
+def match_lights(scene, records: list[dict]) -> tuple[int, list[str]]:
+    """Give light objects the powers, colors, places and directions of the lights in the report of `match`; how many
+    moved, and problems."""
+    moved, problems = 0, []
+    for record in records:
+        name = record["name"]
+        ob = scene.objects.get(name)
+        if ob is None or ob.type != "LIGHT":
+            problems.append(f"{name}: not in the scene any more")
+            continue
+        if reason := reason_to_keep(ob):
+            problems.append(f"{name}: {reason}")
+            continue
+        ob.data.energy, ob.data.color = record["power_after"], record["color"]
+        if all(record[f"{key}_after"] == record[f"{key}_before"] for key in ("location", "rotation")):
+            continue
+        if reason := reason_to_stay(ob):
+            problems.append(f"{name}: {reason}")
+            continue
+        turn = Euler([math.radians(angle) for angle in record["rotation_after"]])
+        ob.matrix_world = Matrix.LocRotScale(Vector(record["location_after"]), turn, ob.matrix_world.to_scale())
+        moved += 1
+    return moved, problems
+
+
 # SIZES: the settings of a light's size, by its type.
 SIZES = {"AREA": ("size", "size_y"), "POINT": ("shadow_soft_size",), "SPOT": ("shadow_soft_size",), "SUN": ("angle",)}
 
@@ -89,6 +114,11 @@ class LightLook:
         """Make the light larger by a factor."""
         for name in self.sizes:
             setattr(ob.data, name, factor * max(getattr(ob.data, name), 1e-3))
+
+    def resize(self, ob, size: float) -> None:
+        """Give the light a size in m, that of a sun in degrees; of rectangles and ellipses their first side."""
+        name = next(iter(self.sizes))
+        self.scale(ob, (math.radians(size) if name == "angle" else size) / max(getattr(ob.data, name), 1e-3))
 
     def tint(self, ob, hue: float, saturation: float) -> None:
         """Turn the light's hue, and add to its saturation; its brightest channel stays as bright."""
@@ -128,6 +158,12 @@ def locked_place(start: Vector, point: Vector, place: Vector, free: tuple[bool, 
             return moved
     moved[axis] = place[axis]
     return moved
+
+
+def power_for(factor: float, power: float, share: float) -> float:
+    """The power of a light with which a point gets `factor` times its light, of which a light of this `power` gives
+    the `share`, over 0; never below 0."""
+    return max(0.0, power * (1.0 + (factor - 1.0) / share))
 
 
 def reason_to_keep_power(ob) -> str:

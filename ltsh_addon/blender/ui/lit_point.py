@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import bpy
 import numpy as np
+from bpy_extras import view3d_utils
 from mathutils import Matrix, Vector
 
 from ...cycles.horizons import end_at_horizons_of_cycles, unit
@@ -34,52 +36,91 @@ UNKNOWN = np.full(3, 0.5)
 NAMED = 4
 
 
+@dataclass(frozen=True)
 class MeshFace:
     """A face of a mesh, in its object, and the triangles in which Cycles interpolates."""
 
-    def __init__(self, mesh, number: int, has_vertex_normals: bool, is_flat: bool):
-        face = mesh.polygons[number]
-        loops, vertices = list(face.loop_indices), list(face.vertices)
-        self.slot, self.is_flat = face.material_index, is_flat
-        self.corners = np.array([mesh.vertices[vertex].co for vertex in vertices])  # (K, 3)
-        self.uv = {layer.name: np.array([layer.uv[loop].vector for loop in loops]) for layer in mesh.uv_layers}
-        rendered = [uv for layer, uv in zip(mesh.uv_layers, self.uv.values(), strict=True) if layer.active_render]
-        self.uv |= {"": rendered[0]} if rendered else {}
-        normals, at = (mesh.vertex_normals, vertices) if has_vertex_normals else (mesh.corner_normals, loops)
-        self._normals = np.array([normals[index].vector for index in at])
-        # Before a face of K corners its mesh has so many loops less two for each face.
-        first = face.loop_start - 2 * number
-        triangles = [mesh.loop_triangles[first + index].loops for index in range(len(loops) - 2)]
-        self._triangles = np.array(triangles) - face.loop_start  # (T, 3)
-        self._ends = self.corners[self._triangles[:, 2]]
-        edges = self.corners[self._triangles[:, :2]] - self._ends[:, None]
-        self._weights = np.linalg.pinv(edges.transpose(0, 2, 1))  # (T, 2, 3)
-        self._growth: dict[str, np.ndarray | None] = {}
+    slot: int
+    is_flat: bool
+    corners: list[tuple]  # (K, 3)
+    normals: list[tuple]  # (K, 3)
+    triangles: list[tuple]  # (T, 3) of numbers of corners
+    uv: dict[str, list[tuple]]  # (K, 2) by UV map; "" is the one that renders
 
-    def at(self, place: np.ndarray, inverse: np.ndarray) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
-        """The normals (3,) in the world, that of the triangle and the interpolated one, at a place (3,) of the object
-        on the face, and its coordinates (2,) in each UV map. `inverse` (3, 3) leads from the world into the object.
+    @functools.cached_property
+    def growth(self) -> dict[str, np.ndarray]:
+        """The vectors (2, 3) in the object along which u and v grow, by UV map."""
+        corners, by_name = np.array(self.corners), {name: np.array(uv) for name, uv in self.uv.items()}
+        return {
+            name: np.linalg.lstsq(uv - uv.mean(axis=0), corners - corners.mean(axis=0), rcond=None)[0]
+            for name, uv in by_name.items()
+        }
+
+
+class MeshFaces:
+    """Faces of an evaluated mesh, each read when it is first wanted."""
+
+    def __init__(self, mesh):
+        mesh.calc_loop_triangles()
+        self._by_vertex, self._flat = kind_of_normals(mesh)
+        self._mesh, self._normals = mesh, mesh.vertex_normals if self._by_vertex else mesh.corner_normals
+        self._layers = {layer.name: layer.uv for layer in mesh.uv_layers}
+        self._layers.update(("", layer.uv) for layer in mesh.uv_layers if layer.active_render)
+        self._faces: dict[int, MeshFace] = {}
+
+    def face(self, number: int) -> MeshFace:
+        """That of a number."""
+        if number not in self._faces:
+            mesh, face = self._mesh, self._mesh.polygons[number]
+            first, count, vertices = face.loop_start, face.loop_total, face.vertices
+            loops = range(first, first + count)
+            # Before a face its mesh has a triangle for each loop, but for two of each face.
+            triangles = (mesh.loop_triangles[first - 2 * number + index].loops for index in range(count - 2))
+            self._faces[number] = MeshFace(
+                face.material_index, bool(self._flat[number]),
+                [mesh.vertices[vertex].co[:] for vertex in vertices],
+                [self._normals[index].vector[:] for index in (vertices if self._by_vertex else loops)],
+                [tuple(loop - first for loop in triangle) for triangle in triangles],
+                {name: [layer[loop].vector[:] for loop in loops] for name, layer in self._layers.items()},
+            )  # fmt: skip
+        return self._faces[number]
+
+    def at(
+        self, numbers: list[int], places: np.ndarray, inverse: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+        """The normals (P, 3) in the world, those of the triangles and the interpolated ones, at places (P, 3) of the
+        object on P faces, and the coordinates (P, 2) in each UV map; "" is the one that renders. `inverse` (3, 3) leads
+        from the world into the object.
 
         As in Cycles, what is interpolated are unit vectors of the world.
         """
-        two = np.einsum("tij,tj->ti", self._weights, place - self._ends)
-        weights = np.append(two, 1.0 - two.sum(axis=-1, keepdims=True), axis=-1)
-        best = int(np.argmax(weights.min(axis=-1)))
-        weights, corners = weights[best], self._triangles[best]
-        coordinates = {name: weights @ uv[corners] for name, uv in self.uv.items()}
-        first, second, third = self.corners[corners]
-        flat = unit(np.cross(second - first, third - first) @ inverse)
-        return flat, flat if self.is_flat else unit(weights @ unit(self._normals[corners] @ inverse)), coordinates
-
-    def growth(self, uv_map: str) -> np.ndarray | None:
-        """The vectors (2, 3) in the object along which u and v grow on the face; None without the map."""
-        if uv_map not in self._growth:
-            uv = self.uv.get(uv_map)
-            vectors = None
-            if uv is not None:
-                vectors = np.linalg.lstsq(uv - uv.mean(axis=0), self.corners - self.corners.mean(axis=0), rcond=None)[0]
-            self._growth[uv_map] = vectors
-        return self._growth[uv_map]
+        faces = {number: self.face(number) for number in numbers}
+        counts = np.array([len(face.corners) for face in faces.values()])
+        triangles = np.concatenate([face.triangles for face in faces.values()])  # (T, 3), then of all corners
+        triangles += np.repeat(np.cumsum(counts) - counts, counts - 2)[:, None]
+        corners, normals = (
+            np.array([corner for face in faces.values() for corner in getattr(face, name)])
+            for name in ("corners", "normals")
+        )
+        # Each place in all triangles of its face: it is in the one whose least weight is largest.
+        first_triangle = dict(zip(faces, (np.cumsum(counts - 2) - counts + 2).tolist(), strict=True))
+        first_triangle = np.array([first_triangle[number] for number in numbers])
+        lengths = np.array([len(faces[number].triangles) for number in numbers])
+        ends, place = np.cumsum(lengths), np.repeat(np.arange(len(numbers)), lengths)
+        triangle = triangles[np.arange(len(place)) + (first_triangle - ends + lengths)[place]]
+        one, two, three = corners[triangle].transpose(1, 0, 2)
+        along, across, inside = one - three, two - three, places[place] - three
+        normal = np.cross(along, across)
+        square = np.maximum((normal**2).sum(axis=-1), 1e-300)
+        areas = np.stack([np.cross(inside, across), np.cross(along, inside)])
+        weights = ((areas * normal).sum(axis=-1) / square).T
+        weights = np.append(weights, 1.0 - weights.sum(axis=-1, keepdims=True), axis=-1)
+        best = np.lexsort((weights.min(axis=-1), place))[ends - 1]
+        weights, triangle, flat = weights[best, :, None], triangle[best], unit(normal[best] @ inverse)
+        smooth = unit((weights * unit(normals[triangle] @ inverse)).sum(axis=1))
+        smooth = np.where([[faces[number].is_flat] for number in numbers], flat, smooth)
+        uv = {name: np.array([uv for face in faces.values() for uv in face.uv[name]]) for name in self._layers}
+        return flat, smooth, {name: (weights * values[triangle]).sum(axis=1) for name, values in uv.items()}
 
 
 @dataclass(frozen=True)
@@ -98,49 +139,80 @@ class SurfaceHit:
 
     def uv_frame(self, uv_map: str) -> tuple[np.ndarray, np.ndarray] | None:
         """The directions (3,) in the world in which u and v grow on the face; None where they do not."""
-        growth = None if self.face is None else self.face.growth(uv_map)
+        growth = None if self.face is None else self.face.growth.get(uv_map)
         if growth is None:
             return None
         along = growth @ np.array(self.matrix.to_3x3()).T
         sizes = np.linalg.norm(along, axis=-1, keepdims=True)
         return tuple(along / sizes) if sizes.all() else None
 
-    def around(self, axis: int) -> np.ndarray:
-        """The direction (3,) in the world around an axis of the object, as a Tangent node has it."""
-        mesh = self.ob.data
-        place = np.array(self.matrix.inverted_safe() @ self.position)
-        if isinstance(mesh, bpy.types.Mesh):
-            place = (place - np.array(mesh.texspace_location)) / np.maximum(mesh.texspace_size, 1e-30)
-        return np.array(self.matrix.to_3x3().inverted_safe().transposed()) @ np.cross(np.eye(3)[axis], place)
+
+def directions_around(hits: list[SurfaceHit], axis: int) -> np.ndarray:
+    """The directions (P, 3) in the world around an axis of the object of P `hits`, as a Tangent node has them."""
+    inverses, mesh = {hit.matrix: hit.matrix.inverted_safe() for hit in hits}, hits[0].ob.data
+    places = np.array([(inverses[hit.matrix] @ hit.position)[:] for hit in hits])
+    if isinstance(mesh, bpy.types.Mesh):
+        places = (places - np.array(mesh.texspace_location)) / np.maximum(mesh.texspace_size, 1e-30)
+    turns = {matrix: np.array(inverse.to_3x3()) for matrix, inverse in inverses.items()}
+    around = np.cross(np.eye(3)[axis], places)
+    return np.einsum("pi,pij->pj", around, np.array([turns[hit.matrix] for hit in hits]))
 
 
-def surface_hit(scene, depsgraph, start: Vector, direction: Vector, faces: dict | None = None) -> SurfaceHit | None:
-    """The first surface in a unit `direction` from `start`; None where there is none. Of many rays at once, those that
-    share the dictionary `faces` read each mesh and face once."""
-    is_hit, position, normal, number, ob, matrix = scene.ray_cast(depsgraph, start, direction)
-    if not is_hit:
-        return None
-    mesh, slots, slot, uv, face = ob.evaluated_get(depsgraph).data, ob.material_slots, 0, {}, None
-    smooth = normal
-    if isinstance(mesh, bpy.types.Mesh) and number < len(mesh.polygons):
-        faces, key = {} if faces is None else faces, (ob.session_uid, number)
-        if key[0] not in faces:
-            mesh.calc_loop_triangles()
-            faces[key[0]] = kind_of_normals(mesh)
-        if key not in faces:
-            has_vertex_normals, flat = faces[key[0]]
-            faces[key] = MeshFace(mesh, number, has_vertex_normals, bool(flat[number]))
-        face = faces[key]
-        inverse, slot = matrix.inverted_safe(), face.slot
-        # Blender 4.5 returns other normals of unevenly scaled objects.
-        normal, smooth, uv = face.at(np.array(inverse @ position), np.array(inverse.to_3x3()))
-        normal, smooth = Vector(normal), Vector(smooth)
-    side = -1.0 if normal.dot(direction) > 0.0 else 1.0
-    override = depsgraph.view_layer_eval.material_override
-    material = override or (slots[min(slot, len(slots) - 1)].material if len(slots) else None)
-    return SurfaceHit(
-        position, side * smooth, -direction, material, side * normal, uv, ob.original, matrix.copy(), face
-    )
+def surface_hit(scene, depsgraph, start: Vector, direction: Vector) -> SurfaceHit | None:
+    """The first surface in a unit `direction` from `start`; None where there is none."""
+    return surface_hits(scene, depsgraph, [(start, direction)])[0]
+
+
+def surface_hits(scene, depsgraph, rays: Sequence[tuple[Vector, Vector]]) -> list[SurfaceHit | None]:
+    """As `surface_hit`, of many rays: their starts and unit directions. Each face is read once."""
+    met = [scene.ray_cast(depsgraph, start, direction) for start, direction in rays]
+    by_object: dict[tuple, list[int]] = {}
+    for ray, (is_hit, *_, ob, matrix) in enumerate(met):
+        if is_hit:
+            by_object.setdefault((ob.session_uid, matrix.freeze()), []).append(ray)
+    hits: list[SurfaceHit | None] = [None] * len(met)
+    override, all_faces = depsgraph.view_layer_eval.material_override, {}
+    for (uid, matrix), numbers in by_object.items():
+        ob, inverse = met[numbers[0]][4], matrix.inverted_safe()
+        mesh, slots, original = ob.evaluated_get(depsgraph).data, ob.material_slots, ob.original
+        materials = [slot.material for slot in slots] or [None]
+        on_mesh = [n for n in numbers if isinstance(mesh, bpy.types.Mesh) and met[n][3] < len(mesh.polygons)]
+        geometry = {}
+        if on_mesh:
+            faces = all_faces[uid] = all_faces.get(uid) or MeshFaces(mesh)
+            places, indices = np.array([(inverse @ met[n][1])[:] for n in on_mesh]), [met[n][3] for n in on_mesh]
+            # Blender 4.5 returns other normals of unevenly scaled objects.
+            flat, smooth, uv = faces.at(indices, places, np.array(inverse.to_3x3()))
+            geometry = {
+                n: (Vector(flat[k]), Vector(smooth[k]), {name: values[k] for name, values in uv.items()})
+                for k, n in enumerate(on_mesh)
+            }
+        for n in numbers:
+            _, position, normal, index, _, _ = met[n]
+            face, (normal, smooth, uv) = None, geometry.get(n, (normal, normal, {}))
+            if n in geometry:
+                face = faces.face(index)
+            direction = rays[n][1]
+            side = -1.0 if normal.dot(direction) > 0.0 else 1.0
+            material = override or materials[min(0 if face is None else face.slot, len(materials) - 1)]
+            normals = side * smooth, side * normal
+            hits[n] = SurfaceHit(position, normals[0], -direction, material, normals[1], uv, original, matrix, face)
+    return hits
+
+
+def hit_at(context, region, pixel: np.ndarray) -> SurfaceHit | None:
+    """What the view of a region meets at a pixel (2,)."""
+    return hits_at(context, region, pixel[None])[0]
+
+
+def hits_at(context, region, pixels: np.ndarray) -> list[SurfaceHit | None]:
+    """What the view of a region meets at pixels (P, 2)."""
+    rays = [
+        (view3d_utils.region_2d_to_origin_3d(region, region.data, pixel),
+         view3d_utils.region_2d_to_vector_3d(region, region.data, pixel))
+        for pixel in pixels.tolist()
+    ]  # fmt: skip
+    return surface_hits(context.scene, context.evaluated_depsgraph_get(), rays)
 
 
 @functools.cache
@@ -213,6 +285,7 @@ class LightShare:
     name: str
     is_lamp: bool  # a light object; False: a glowing mesh or the world
     luminance: float  # of the reflected light, W m^-2 sr^-1
+    glossy: float = 0.0  # of it, specular
 
 
 @dataclass
@@ -258,12 +331,12 @@ class SceneLights:
         if self.tracing is not None:
             traced = trace_visibility(samples, lights, self.tracing.tracer, ShadowSampling(), workers=self.tracing.pool)
             radiance = {name: values * traced.of_lights(name)[..., None] for name, values in radiance.items()}
-        luminance = sum(values.sum(axis=1) @ GRAY for values in radiance.values())
-        by_light: dict[tuple, float] = {}
-        for number, (light, value) in enumerate(zip(lights, luminance.tolist(), strict=True)):
+        glossy, diffuse = (radiance[name].sum(axis=1) @ GRAY for name in ("specular", "diffuse"))
+        by_light: dict[tuple, np.ndarray] = {}
+        for number, (light, *values) in enumerate(zip(lights, glossy + diffuse, glossy, strict=True)):
             key = light.name, number < len(self.lights) and not isinstance(light, PolygonLight)
-            by_light[key] = by_light.get(key, 0.0) + value
-        shares = (LightShare(*key, value) for key, value in by_light.items())
+            by_light[key] = by_light.get(key, 0.0) + np.array(values)
+        shares = (LightShare(*key, *values.tolist()) for key, values in by_light.items())
         return sorted(shares, key=lambda share: -share.luminance)
 
     def is_exact_at(self, hit: SurfaceHit) -> bool:

@@ -19,7 +19,7 @@ from ..lights.area import area_light, reason_to_leave_out
 from ..lights.groups import reason_to_keep
 from ..lights.linking import Receivers
 from . import comparison, results
-from .panels import draw_text, gray, in_both_places, split_names
+from .panels import draw_job, draw_text, gray, in_both_places, split_names
 
 UPDATE, MOVED = "Update Moved Lights", "moved since this picture"
 # UNMOVED: smaller changes, relative to a light's distance and size, do not count as a move.
@@ -170,6 +170,8 @@ class _Mixer:
         row = layout.row(align=True)
         row.operator("ltsh.match_target", icon="LIGHT")
         row.prop(settings, "match_colors", toggle=True)
+        if not draw_job(layout, "match"):
+            layout.operator("ltsh.match_move", icon="LIGHT_AREA")
         for note in notes(context.scene):
             draw_text(gray(layout), context, note, "INFO")
 
@@ -291,6 +293,7 @@ class LTSH_OT_paint_target(_NeedsMixer, bpy.types.Operator):
         image = bpy.data.images.new("LTSH Target", *pixels.shape[1::-1], float_buffer=True)
         image.colorspace_settings.name = results.linear_space()
         image.pixels.foreach_set(np.ascontiguousarray(pixels).ravel())
+        image[results.DIRECT_ONLY] = results.is_direct_only(context.scene)
         context.scene.ltsh.match_target = image
         if context.area is not None and context.area.type == "IMAGE_EDITOR":
             context.space_data.image, context.space_data.mode = image, "PAINT"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import json
 import logging
 import re
 import shutil
@@ -21,8 +22,19 @@ from ...scene import SceneError, error_line, listed
 from ..extract.apply import restore_materials, show_texture, shows_texture
 from ..process.bake import BakedTextures
 from ..saving import save_working_copy
-from . import comparison, preflight, results
-from .job import Job, Plan, clock, output_folder, progress_text, runs_of, session_times, stage_title, steps
+from . import comparison, light_pose, preflight, results
+from .job import (
+    Job,
+    Plan,
+    clock,
+    output_folder,
+    progress_text,
+    runs_of,
+    session_times,
+    stage_title,
+    steps,
+    write_target,
+)
 
 TIMER_SECONDS, WAITING_SECONDS = 0.1, 0.005
 
@@ -118,6 +130,8 @@ class _JobOperator:
         )
         job.output = runs[-1].options.output
         try:
+            if self.command == "match":
+                write_target(context.scene, folder)
             save_working_copy(copy)
             job.start([run.to_dict() for run in runs], background=not bpy.app.background)
         except (RuntimeError, OSError, SceneError) as error:
@@ -187,6 +201,8 @@ class _JobOperator:
         elif job.cancelled:
             remains = self._what_remains()
             self.report({"WARNING"}, f"{job.title} was cancelled; {remains}")
+        elif job.command == "match":
+            self._put_lights()
         else:
             self._report_success()
         return {"FINISHED"} if job.shown else {"CANCELLED"}
@@ -200,6 +216,19 @@ class _JobOperator:
             return f"what was finished is in {job.output}" if job.command == "bake" else "nothing was finished yet"
         names = next(iter(result.groups.values()))["labels"].values()
         return f"kept: {', '.join(names)}"
+
+    def _put_lights(self) -> None:
+        """Give the lights of the scene the places and powers with which it comes closest to the target."""
+        scene, report = results.scene_of(self._job.scene), json.loads((self._job.output / "report.json").read_text())
+        if scene is None:
+            return
+        moved, problems = light_pose.match_lights(scene, report["lights"])
+        for problem in [*problems, *report["warnings"]]:
+            self.report({"WARNING"}, problem)
+        before, after = (f"{100.0 * report[f'error_{when}']:.1f} %" for when in ("before", "after"))
+        took = f"{self._job.title} took {clock(self._job.seconds())}"
+        self.report({"INFO"}, f"{took}: the picture is {after} from the target, it was {before}; moved: {moved}")
+        self._job.shown = 1
 
     def _report_success(self) -> None:
         result = results.result_in(str(self._job.results[-1])) if self._job.results else None
@@ -236,6 +265,28 @@ class LTSH_OT_bake(_JobOperator, bpy.types.Operator):
     bl_idname = "ltsh.bake"
     bl_label = "Bake Selected"
     command = "bake"
+
+
+class LTSH_OT_match_move(_JobOperator, bpy.types.Operator):
+    """Move and turn the lights of the scene and change their powers, so that its finished picture, bounces included,
+    comes closest to the target. Takes a minute or more"""
+
+    bl_idname = "ltsh.match_move"
+    bl_label = "Match and Move"
+    command = "match"
+
+    @classmethod
+    def poll(cls, context):
+        if not super().poll(context):
+            return False
+        target = context.scene.ltsh.match_target
+        if target is None:
+            cls.poll_message_set("Choose a target, or paint one")
+        elif target.get(results.DIRECT_ONLY):
+            cls.poll_message_set(
+                f"{target.name} was painted on direct light alone: render with Complete and Keep Lights, paint on that"
+            )
+        return target is not None and not target.get(results.DIRECT_ONLY)
 
 
 class LTSH_OT_watch(_JobOperator, bpy.types.Operator):

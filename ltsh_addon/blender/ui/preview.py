@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 
 import bpy
+import numpy as np
 from bpy.app.handlers import persistent
 from bpy.props import BoolProperty, EnumProperty, FloatProperty, FloatVectorProperty
 from bpy_extras import view3d_utils
@@ -258,6 +259,17 @@ def region_under(context, x: int, y: int):
         if area.type == "VIEW_3D" and [region.type for region in regions] == ["WINDOW"]:
             return regions[0]
     return None
+
+
+def pointer(event) -> np.ndarray:
+    """Where the mouse is (2,) in the window."""
+    return np.array([event.mouse_x, event.mouse_y], float)
+
+
+def view_under(context, mouse: np.ndarray) -> tuple:
+    """The region of the 3D view under the `mouse` (2,) of the window, None where there is none, and the pixel in it."""
+    region = region_under(context, *mouse.tolist())
+    return region, mouse if region is None else mouse - (region.x, region.y)
 
 
 def _surface_at(context, region, pixel, role: str = "SURFACE") -> tuple[Vector, Vector, float] | None:

@@ -284,6 +284,18 @@ def mixer_of(scene) -> Mixer | None:
     return _mixer["mixer"]
 
 
+# The property of images that were painted on a picture of direct light.
+DIRECT_ONLY = "ltsh_direct_only"
+
+
+def is_direct_only(scene) -> bool:
+    """True if the mixer of `scene` has a picture of direct light alone, without what Cycles adds."""
+    if scene.name not in _rendered:
+        return True
+    data = _rendered[scene.name][1]
+    return data is not None and not data.taken
+
+
 def is_mixer_read(scene, folder: Path) -> bool:
     """True if `mixer_of` can return the mixer of the results in `folder` at once; else a thread begins to read it."""
     result = result_in(str(folder))

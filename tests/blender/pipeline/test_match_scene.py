@@ -8,6 +8,8 @@ import pytest
 from scene_parts import add_area_light, add_camera, add_plane, add_sphere, empty_scene, link, principled, save
 
 from ltsh_addon.blender.lights.groups import own_light_groups
+from ltsh_addon.blender.ui.light_pose import match_lights
+from ltsh_addon.blender.ui.results import DIRECT_ONLY
 from ltsh_addon.pipeline.match import match_scene
 from ltsh_addon.pipeline.options import MatchOptions
 from ltsh_addon.scene import SceneError
@@ -77,8 +79,9 @@ def test_the_powers_of_a_target_come_back(room, number, tmp_path):
         assert ob.lightgroup == ""
 
 
-def test_a_moved_light_comes_back_through_its_parent_and_others_stay(tmp_path):
-    empty_scene(96, 64)
+def test_a_moved_light_comes_back_through_its_parent_and_others_stay(addon, tmp_path):
+    """By the panel, whose job runs the command; its scene gets what the saved one has."""
+    addon.render.resolution_x, addon.render.resolution_y = 96, 64
     add_plane(principled("Floor", **{"Base Color": (0.7, 0.6, 0.5, 1.0), "Roughness": 0.6})[0])
     add_sphere(principled("Ball", **{"Base Color": (0.3, 0.5, 0.8, 1.0)})[0], radius=0.5, location=(0.2, 0.0, 0.5))
     add_camera()
@@ -97,12 +100,19 @@ def test_a_moved_light_comes_back_through_its_parent_and_others_stay(tmp_path):
     bpy.context.view_layer.update()
     start = np.array(key.matrix_world)
     path = save(tmp_path / "start.blend")
-    options = {"techniques": ("ltsh2",), "cycles_samples": 32, "move": True}
-    report = match_scene(MatchOptions(scene=path, output=tmp_path / "out", target=target, **options))
+    addon.ltsh.match_target, addon.ltsh.output_folder = bpy.data.images.load(str(target)), str(tmp_path / "out")
+    assert bpy.ops.ltsh.match_move() == {"FINISHED"}
+    bpy.context.view_layer.update()
+    here = np.array(key.matrix_world)
+    # A painted picture of direct light alone would be matched by one with bounces.
+    addon.ltsh.match_target[DIRECT_ONLY] = True
+    assert not bpy.ops.ltsh.match_move.poll()
+    report = json.loads((tmp_path / "out" / "match" / "report.json").read_text())
     assert any("light 'Fill' keeps its place: its constraint 'Track To' moves it" in one for one in report["warnings"])
     of_key = next(light for light in report["lights"] if light["name"] == "Key")
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "out" / "matched.blend"))
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "out" / "match" / "matched.blend"))
     moved = np.array(bpy.data.objects["Key"].matrix_world)
+    np.testing.assert_allclose(here, moved, atol=1e-4)
     np.testing.assert_allclose(of_key["location_before"], start[:3, 3], atol=1e-4)
     np.testing.assert_allclose(of_key["location_after"], moved[:3, 3], atol=1e-4)
     # 3 % of the 2.9 m to what it lights; it began 0.12 m off.
@@ -111,7 +121,8 @@ def test_a_moved_light_comes_back_through_its_parent_and_others_stay(tmp_path):
     assert of_key["power_after"] == pytest.approx(100.0, rel=0.05)
     assert report["error_after"] < 0.3 * report["error_before"]
     with pytest.raises(SceneError, match="no light can be moved: 'Fill', its constraint 'Track To' moves it"):
-        match_scene(MatchOptions(scene=path, output=tmp_path / "no", target=target, lights=("Fill",), **options))
+        options = {"lights": ("Fill",), "cycles_samples": 32, "move": True}
+        match_scene(MatchOptions(scene=path, output=tmp_path / "no", target=target, **options))
     assert not (tmp_path / "no" / "matched.blend").exists()
 
 
@@ -174,3 +185,24 @@ def test_lights_that_cannot_change_are_in_no_group():
     assert own_light_groups(scene, ()) == {"Light 1": [one, twin]}
     # Whoever names one of two with common data changes both.
     assert own_light_groups(scene, ("Twin",)) == {"Light 1": [one, twin]}
+
+
+def test_places_of_a_report_are_those_of_the_lights_and_others_keep_theirs(addon):
+    lights = {name: add_area_light(name=name) for name in ("Key", "Locked", "Driven")}
+    lights["Locked"].lock_location[0] = True
+    lights["Driven"].data.keyframe_insert("energy", frame=1)
+    lights["Key"].scale = 2.0, 2.0, 2.0
+    before, after = (
+        {"location": [0.0] * 3, "rotation": [0.0] * 3},
+        {"location": [1.0, 2.0, 3.0], "rotation": [0, 90, 0]},
+    )
+    record = {f"{key}_{when}": one[key] for when, one in (("before", before), ("after", after)) for key in one}
+    record |= {"power_after": 7.0, "color": [0.5, 1.0, 0.25]}
+    bpy.context.view_layer.update()
+    moved, problems = match_lights(addon, [{**record, "name": name} for name in (*lights, "Gone")])
+    bpy.context.view_layer.update()
+    assert moved == 1 and [problem.partition(":")[0] for problem in problems] == ["Locked", "Driven", "Gone"]
+    np.testing.assert_allclose(lights["Key"].matrix_world.translation, (1.0, 2.0, 3.0), atol=1e-6)
+    np.testing.assert_allclose(lights["Key"].matrix_world.col[2].xyz, (2.0, 0.0, 0.0), atol=1e-5)
+    assert lights["Key"].data.energy == lights["Locked"].data.energy == 7.0 != lights["Driven"].data.energy
+    assert tuple(lights["Key"].data.color) == (0.5, 1.0, 0.25)

@@ -1,5 +1,6 @@
 """Lights that the mouse drags by their highlight, and lights that must stay."""
 
+import math
 from types import SimpleNamespace
 
 import bpy
@@ -7,7 +8,7 @@ import numpy as np
 import pytest
 import scene_parts as parts
 from bl_ui.space_toolsystem_toolbar import VIEW3D_PT_tools_active
-from mathutils import Vector
+from mathutils import Matrix, Vector
 
 from ltsh_addon.blender.evaluated import EmitterTraits
 from ltsh_addon.blender.lights.area import area_light
@@ -18,13 +19,13 @@ from ltsh_addon.blender.ui import gestures
 from ltsh_addon.blender.ui.highlight_place import (
     NO_HIGHLIGHT,
     HitsAround,
-    glossy_lobe,
     note_by_pixels,
     place_of,
+    prepare_view,
     samples_of,
 )
-from ltsh_addon.blender.ui.light_pose import LightPose, locked_place, reason_to_keep_look
-from ltsh_addon.blender.ui.lit_point import surface_hit
+from ltsh_addon.blender.ui.light_pose import LightLook, LightPose, locked_place, reason_to_keep_look
+from ltsh_addon.blender.ui.lit_point import SceneLights, shipped_table, surface_hits
 from ltsh_addon.shading import shade
 from ltsh_addon.shading.highlight import STENCIL
 
@@ -49,7 +50,7 @@ def hits_at(scene, pixels, target):
     right = toward.cross(Vector((0.0, 0.0, 1.0))).normalized()
     above = right.cross(toward)
     rays = [(toward + PIXEL * (x * right + y * above)).normalized() for x, y in pixels.tolist()]
-    return [surface_hit(scene, depsgraph, EYE, ray) for ray in rays]
+    return surface_hits(scene, depsgraph, [(EYE, ray) for ray in rays])
 
 
 @pytest.mark.parametrize("target", [(0.2, -0.5, 1.1), (-0.4, -0.4, 0.9), (1.3, -0.8, 0.0), (-1.0, -1.4, 0.0)])
@@ -68,7 +69,7 @@ def test_the_highlight_is_where_the_mouse_is(scene, target):
               if hit is not None and hit.material == middle.material]  # fmt: skip
     pixels, seen = np.array([pixel for pixel, _ in around]), [hit for _, hit in around]
     lamp = area_light(light, np.array(matrix), EmitterTraits("", True, True), Receivers([]))
-    samples = samples_of(seen, glossy_lobe(middle.material), ShownTextures())
+    samples = samples_of(seen, HitsAround(hits, 2.0 * STENCIL, True).lobe, ShownTextures())
     radiance = shade(samples, [lamp], passes=("specular",), workers=1).specular.sum(axis=(0, 2))
     lost = 1.0 - radiance[(pixels == 0).all(axis=-1)][0] / radiance.max()
     # Facets of 64 segments bend the interpolated normals by a little.
@@ -167,11 +168,15 @@ def test_each_gesture_is_a_tool_that_says_why_it_cannot_begin(addon):
     layout = SimpleNamespace(label=lambda text: texts.append(text))
     ours[0].draw_settings(bpy.context, layout, None)
     light = parts.add_area_light("Key")
+    bpy.context.view_layer.objects.active = None
+    for tool in ours[:2]:
+        tool.draw_settings(bpy.context, layout, None)
     bpy.context.view_layer.objects.active = light
     ours[0].draw_settings(bpy.context, layout, None)
     light.lock_rotation[0] = True
     ours[1].draw_settings(bpy.context, layout, None)
     assert texts == [
+        "No light is active", f"Drag the highlight of {gestures.MOST_GLOSSY}    {gestures.MOVING_KEYS}",
         "No light is active", f"Drag the highlight of Key    {gestures.MOVING_KEYS}",
         "Key: its location or rotation is locked: unlock it in the tab Item",
     ]  # fmt: skip
@@ -180,7 +185,8 @@ def test_each_gesture_is_a_tool_that_says_why_it_cannot_begin(addon):
 def event(kind, value="PRESS", mouse=(0, 0), **held):
     """An event of a key or the mouse; `held`: shift, ctrl."""
     held = {"shift": False, "ctrl": False, "alt": False, **held}
-    return SimpleNamespace(type=kind, value=value, mouse_x=mouse[0], mouse_y=mouse[1], **held)
+    ascii = {"PERIOD": ".", "MINUS": "-"}.get(kind, kind if kind.isdigit() else "")
+    return SimpleNamespace(type=kind, value=value, mouse_x=mouse[0], mouse_y=mouse[1], ascii=ascii, **held)
 
 
 class Recorded(gestures.Gesture):
@@ -234,7 +240,7 @@ def window():
             screen=SimpleNamespace(areas=[area]),
         ),
         workspace=SimpleNamespace(status_text_set=lambda text: there.update(status=text)),
-        preferences=bpy.context.preferences,
+        preferences=bpy.context.preferences, scene=bpy.context.scene,
     )  # fmt: skip
     return context, there
 
@@ -324,6 +330,9 @@ class Moved(gestures.MovingGesture):
         assert type(factor) is float  # numbers of numpy make arrays of vectors
         self.distance *= factor
 
+    def set_distance(self, distance):
+        self.distance = distance
+
 
 @pytest.fixture
 def moved(scene):
@@ -358,6 +367,78 @@ def test_keys_change_distance_size_and_color_and_escape_puts_all_back(moved):
     assert (gesture._mouse - mouse).tolist() == [10.0, 0.0]
     assert send("ESC") == {"CANCELLED"}
     assert (data.size, data.size_y, tuple(data.color)) == before
+
+
+def test_a_typed_number_is_the_distance_or_the_size_until_it_is_erased(moved):
+    (gesture, send), data = moved, bpy.data.objects["Key"].data
+    ratio = data.size_y / data.size
+    for key in ("1", "PERIOD", "PERIOD", "MINUS", "5"):
+        send(key)
+    assert gesture.distance == 1.5 and gesture._typed == "1.5"
+    mouse = gesture._mouse
+    send("MOUSEMOVE", "NOTHING", (50, 0))
+    assert (gesture._mouse == mouse).all()
+    for _ in range(3):
+        send("BACK_SPACE")
+    send("MOUSEMOVE", "NOTHING", (60, 0))
+    assert (gesture._mouse - mouse).tolist() == [10.0, 0.0] and gesture.distance == 1.0
+    for key in ("S", "2"):
+        send(key)
+    assert (data.size, data.size_y) == pytest.approx((2.0, 2.0 * ratio)) and gesture.distance == 1.0
+    send("C")
+    send("3")
+    assert data.size == 2.0 and gesture.distance == 1.0
+    assert send("RET") == {"FINISHED"} and data.size == 2.0
+
+
+@pytest.mark.parametrize(("kind", "size", "name"), [
+    ("SUN", math.radians(2.0), "angle"), ("POINT", 2.0, "shadow_soft_size"), ("AREA", 2.0, "size"),
+])  # fmt: skip
+def test_a_typed_size_is_in_meters_or_degrees(kind, size, name):
+    ob = parts.link(bpy.data.objects.new("Light", bpy.data.lights.new("Light", kind)))
+    LightLook.of(ob).resize(ob, 2.0)
+    assert getattr(ob.data, name) == pytest.approx(size)
+
+
+def test_a_move_is_tried_in_a_view_and_changes_nothing(scene):
+    """What a tool does once it is chosen, so that the first move need not read the table."""
+    light, view = bpy.data.objects["Key"], Matrix.LocRotScale(EYE, EYE.to_track_quat("Z", "Y"), None).inverted()
+    camera = parts.add_camera(EYE)
+    lens = camera.calc_matrix_camera(bpy.context.evaluated_depsgraph_get(), x=96, y=54)
+    data = SimpleNamespace(is_perspective=True, view_matrix=view, perspective_matrix=lens @ view)
+    before, users = LightPose.of(light), len(bpy.data.objects)
+    shipped_table.cache_clear()
+    prepare_view(bpy.context, SimpleNamespace(width=96, height=54, data=data))
+    assert shipped_table.cache_info().currsize == 1
+    assert LightPose.of(light) == before and len(bpy.data.objects) == users
+    # Also where nothing is shown, or no light is there.
+    for ob in list(bpy.data.objects):
+        bpy.data.objects.remove(ob)
+        bpy.context.view_layer.update()
+        prepare_view(bpy.context, SimpleNamespace(width=96, height=54, data=data))
+
+
+def test_without_an_active_light_the_one_with_the_most_glossy_light_is_taken(addon, scene):
+    far = parts.add_area_light("Far", location=(2.0, 3.0, 2.0), energy=1000.0)
+    bpy.context.view_layer.objects.active = None
+    bpy.context.view_layer.update()
+    (hit,) = hits_at(scene, np.zeros((1, 2)), Vector((1.3, -0.8, 0.0)))
+    lights = SceneLights.of(bpy.context)
+    shares = lights.shares_at(hit)
+    lights.close()
+    glossy = {share.name: share.glossy for share in shares}
+    most, least = sorted(glossy, key=glossy.get, reverse=True)
+    this = SimpleNamespace(hit_under=lambda *_: hit, shares_at=lambda *_: shares, _light=None, _taken=[])
+    this._take = this._taken.append
+    kind = gestures.LTSH_OT_drag_highlight
+    assert kind._choose(this, bpy.context, None) and this._taken == [bpy.data.objects[most]]
+    bpy.data.objects[most].lock_location[0] = True
+    assert not kind._choose(this, bpy.context, None) and f"{most}: its location" in this._note
+    this.shares_at = lambda *_: []
+    assert not kind._choose(this, bpy.context, None) and this._note == "No light has a highlight here: choose one"
+    this.hit_under = lambda *_: None
+    assert not kind._choose(this, bpy.context, None) and this._note == gestures.NO_SURFACE
+    assert glossy[most] > glossy[least] >= 0.0 and far.name in glossy
 
 
 def test_with_shift_the_mouse_goes_a_tenth_of_its_way(moved):

@@ -141,7 +141,7 @@ def drag(hit, lights, *moves):
     """What a drag of the brightness that is pressed at `hit` leaves; `moves` are (y, shift, ctrl)."""
     this = SimpleNamespace(
         _scale=1.0, hit_under=lambda context, event: hit, shares_at=lambda context, hit: lights.shares_at(hit),
-        share_line=lambda hit, shares: share_line(shares), _mouse=np.array([0.0, 100.0]),
+        share_line=lambda hit, shares: share_line(shares), _mouse=np.array([0.0, 100.0]), _typed="",
     )  # fmt: skip
     kind = gestures.LTSH_OT_drag_brightness
     this.follow = lambda context, event: kind.follow(this, context, event)
@@ -172,6 +172,12 @@ def test_the_point_gets_as_much_brighter_as_the_mouse_says(floor, moves, factor)
     assert is_pressed and this._light == key and rim.data.energy == 30.0
     assert luminance_of_ball(key) + luminance_of_ball(rim) == pytest.approx(factor * before, rel=1e-3)
     assert f"Key: 100 to {key.data.energy:.4g} W" in this._note and "Rim" in this._note
+    for typed in ("3.5", "0.5"):
+        this._typed = typed
+        this.follow(bpy.context, SimpleNamespace(ctrl=False))
+        bpy.context.view_layer.update()
+        now = luminance_of_ball(key) + luminance_of_ball(rim)
+        assert now == pytest.approx(float(typed) * before, rel=1e-3) and f"here {typed} times" in this._note
     gestures.LTSH_OT_drag_brightness.put_back(this)
     assert key.data.energy == 100.0
 

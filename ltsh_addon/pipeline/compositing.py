@@ -33,6 +33,7 @@ from ..imaging.denoise import NoDenoiser, open_denoiser
 from ..imaging.exr import by_group, layer_name
 from ..scene import Cancelled
 from ..workers.pool import cores
+from .aliasing import box_mean, factor_of_samples
 from .comparison import Comparison
 from .lighting import light_groups
 
@@ -46,7 +47,6 @@ ERROR_RADIUS, ERROR_POWER, LEAST_ERROR = 4, 2, 0.1
 # MEAN_SHARE: the share that the mean of the denoised halves has in a denoised picture. Each is blurred in a way of its
 # own: in six scenes 0.25 takes 2.6 % of FLIP's error away and 1.5 % of L2 without the brightest, 0.2 to 0.35 as much.
 MEAN_SHARE = 0.25
-MOST_RECOLORING = 3.0  # how many times the color of LTSH's points Cycles' color of a pixel counts at most
 MOST_FACTOR = 3.0  # direct light of the finished picture is at most this many times LTSH's
 
 
@@ -60,12 +60,16 @@ class DirectPass:
     light: np.ndarray  # (H, W, 3)
     color: np.ndarray  # (H, W, 3)
     names: tuple[str, ...] = ()  # of the channels that `light` is the sum of
-    recoloring: np.ndarray | float = 1.0  # (H, W, 3) of `image`, see `recoloring_of_points`
+    recoloring: np.ndarray | float = 1.0  # (H, W, 3) of `image`, see `aliasing`
+
+    def by_cycles(self, half=None) -> np.ndarray:
+        """Cycles' direct light (H, W, 3), or what a `CyclesHalf` shows of it."""
+        light = self.light if half is None else sum(read_layer(half.channels, name, "RGB") for name in self.names)
+        return np.asarray(light, np.float64) * self.color
 
     def replaced(self, half=None) -> np.ndarray:
-        """Cycles' direct light (H, W, 3) where it is replaced, 0 elsewhere; or what a `CyclesHalf` shows of it."""
-        light = self.light if half is None else sum(read_layer(half.channels, name, "RGB") for name in self.names)
-        return np.where(self.is_replaced[..., None], np.asarray(light, np.float64) * self.color, 0.0)
+        """`by_cycles` where it is replaced, 0 elsewhere."""
+        return np.where(self.is_replaced[..., None], self.by_cycles(half), 0.0)
 
     def share_of_group(self, group: str) -> np.ndarray:
         """The share (H, W, 3) of it that is light of a light group."""
@@ -109,7 +113,9 @@ def direct_passes(comparison: Comparison, cycles) -> dict[str, DirectPass]:
         image, is_replaced = comparison.images[technique, name], ~extraction.left_to_cycles.by_pass[name]
         recoloring = np.ones(color.shape)
         if name == "diffuse" and film.sub_samples < cycles.samples and not extraction.picture.has_lens:
-            recoloring = recoloring_of_points(film.image(extraction.samples.diffuse_albedo), color)
+            radiance, normal = result.shading.diffuse.sum(axis=0), read_layer(cycles.guides, *NORMAL) @ cycles.to_camera
+            surfaces = color.astype(np.float64), normal, cycles.samples
+            recoloring = factor_of_samples(film, extraction.samples, radiance, *surfaces)
         recoloring = np.where(is_replaced[..., None], recoloring, 0.0)
         values = extraction.picture.exposure * getattr(result.shading, name)
         images = [film.image(one) for one in values] if len(values) > 1 else [image]
@@ -117,13 +123,6 @@ def direct_passes(comparison: Comparison, cycles) -> dict[str, DirectPass]:
         names = (cycles.names[keys[0]],)
         passes[name] = DirectPass(recoloring * image, groups, is_replaced, light, color, names, recoloring)
     return passes
-
-
-def recoloring_of_points(own_color: np.ndarray, color: np.ndarray) -> np.ndarray:
-    """Factor (H, W, 3) of LTSH's diffuse light: the `color` (H, W, 3) that Cycles' many samples find over that of
-    LTSH's few points, `own_color`. So borders of objects and textures are as smooth as Cycles'."""
-    factor = np.divide(color, own_color, out=np.ones_like(own_color), where=own_color > 1e-6)
-    return np.minimum(factor, MOST_RECOLORING)
 
 
 def variance_of_points(extraction, result, name: str) -> np.ndarray:
@@ -136,12 +135,9 @@ def variance_of_points(extraction, result, name: str) -> np.ndarray:
     return np.maximum(hits.image(np.square(radiance)) - np.square(hits.image(radiance)), 0.0)
 
 
-def box_mean(image: np.ndarray, radius: int = ERROR_RADIUS) -> np.ndarray:
-    """Means (H, W) over squares with sides of 2 `radius` + 1 pixels."""
-    side = 2 * radius + 1
-    sums = np.pad(image, ((radius + 1, radius), (radius + 1, radius)), mode="edge").cumsum(axis=0).cumsum(axis=1)
-    box = sums[side:, side:] - sums[:-side, side:] - sums[side:, :-side] + sums[:-side, :-side]
-    return np.maximum(box, 0.0) / side**2
+def _mean_around(image: np.ndarray) -> np.ndarray:
+    """Means (H, W) over all pixels that are at most ERROR_RADIUS away, at least 0."""
+    return np.maximum(box_mean(image, ERROR_RADIUS), 0.0)
 
 
 # The picture:
@@ -159,11 +155,11 @@ def composite(cycles, passes: dict[str, DirectPass], extraction, denoise: str, p
     direct = 0.0 if is_noisy else sum(one.image for one in passes.values())
 
     def pictures(half=None) -> list[np.ndarray]:
-        """Combined, and without each combination of replaced passes, on all pixels: in one picture, these would bleed
-        into each other at their borders."""
+        """Combined, and without each combination of replaced passes, on all pixels, also where they are not replaced:
+        the denoiser would blur the borders."""
         whole = rest[..., :3] if half is None else read_layer(half.channels, "Combined", "RGB").astype(np.float64)
         whole = whole - shining.replaced(half)
-        without = [one.replaced(half) - (one.image if is_noisy else 0.0) for one in passes.values()]
+        without = [one.by_cycles(half) - (one.image if is_noisy else 0.0) for one in passes.values()]
         return [whole, *(whole - np.compress(chosen, without, axis=0).sum(axis=0) for chosen in combinations)]
 
     keys = (key for key in cycles.channels if key.startswith(GROUP_PREFIX))
@@ -232,9 +228,9 @@ def _weights(noisy, others, samples) -> tuple[list[np.ndarray], tuple[float, flo
         return 0.5 * squares.mean(axis=-1)
 
     def mean(products) -> np.ndarray:
-        return box_mean(0.5 * sum(products).mean(axis=-1))
+        return _mean_around(0.5 * sum(products).mean(axis=-1))
 
-    noise = box_mean(0.5 * (variance / number + variance / other).mean(axis=-1))
+    noise = _mean_around(0.5 * (variance / number + variance / other).mean(axis=-1))
     denoised, lit = zip(*others, strict=True)
     steps = [ours - theirs for ours, theirs in zip(lit, denoised, strict=True)]
     # The step from the denoised picture towards LTSH's that is nearest to the other half: the least squares have far
@@ -243,7 +239,7 @@ def _weights(noisy, others, samples) -> tuple[list[np.ndarray], tuple[float, flo
     wanted = mean(step * (half - one) for step, half, one in zip(steps, (second, first), denoised, strict=True))
     share = ((wanted + unsure) / (mean(map(np.square, steps)) + unsure + 1e-20)).clip(0.0, 1.0)
     lit = [one + share[..., None] * step for one, step in zip(denoised, steps, strict=True)]
-    errors = [np.maximum(box_mean(error(*pair)), LEAST_ERROR * noise) for pair in (lit, denoised)]
+    errors = [np.maximum(_mean_around(error(*pair)), LEAST_ERROR * noise) for pair in (lit, denoised)]
     powers = [(one + 1e-20) ** -ERROR_POWER for one in (errors[0], noise)]
     clean, noisy = (one / sum(powers) for one in powers)
     # A mean errs at most as much as its parts do on average.

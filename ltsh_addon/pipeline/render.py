@@ -259,9 +259,11 @@ class DirectLightShader:
         comparison = self.shaded(squares, self.shadows(squares))
         (technique, result), *_ = comparison.results.items()
         variance = compositing.variance_of_points(squares, result, "specular")
-        variance = variance[~squares.left_to_cycles.by_pass["specular"]].sum()
-        squared = np.square(sum(comparison.images[technique, name].mean(axis=-1) for name in PASSES)).sum()
-        contrast = float(np.sqrt(variance / squared)) if squared > 0.0 else 0.0
+        light = sum(comparison.images[technique, name].mean(axis=-1) for name in PASSES)
+        shown = squares.film.coverage() > 0.0
+        relative = variance / np.square(light + max(light.sum() / max(shown.sum(), 1), 1e-30))
+        shown &= ~squares.left_to_cycles.by_pass["specular"]
+        contrast = float(np.sqrt(relative[shown].sum() / max(shown.sum(), 1)))
         return plan.Probe(int(np.count_nonzero(chosen)), time.process_time() - start, contrast)
 
 

@@ -21,6 +21,8 @@ class Film:
     first: np.ndarray | None = None
     # (P,) how many samples each one stands for, below 1 in pixels that have more than `sub_samples`; None: 1 each.
     count: np.ndarray | None = None
+    # (P, 2, 3) m, from each sample to two others for which it stands, as its shadow does; None: the shadow is its own.
+    extent: np.ndarray | None = None
     # (P, D, D) weights of each sample in the pixels around its own, rows from top to bottom; None: its own pixel only.
     spread: np.ndarray | None = None
     # (H, W) sums of these weights per pixel, absent samples included.
@@ -28,7 +30,7 @@ class Film:
 
     def take(self, index) -> Film:
         """The film of the samples at `index`: integers (Q,), a boolean mask (P,) or a slice."""
-        arrays = {name: getattr(self, name) for name in ("first", "count", "spread")}
+        arrays = {name: getattr(self, name) for name in ("first", "count", "extent", "spread")}
         arrays = {name: None if values is None else values[index] for name, values in arrays.items()}
         return replace(self, pixel=self.pixel[index], **arrays)
 

@@ -20,6 +20,7 @@ from .light_cluster import LightCluster
 from .light_selection import LightSelection
 from .occluders import GAP
 from .ray_sampler import PROBES, RayBatch, RaySampler, SampleRows
+from .shadow_terminator import toward
 
 MOST_RAYS = 1024
 # Rays of a block, few enough for its arrays to stay in the cache.
@@ -468,6 +469,11 @@ class RatioEstimator:
         flat = np.flatnonzero(met)
         *aimed, lifted = self.surface.ray_origins.aimed(sampler.index, directions, distance, self.at_surface)
         origins, *rest = (_taken(rows, flat) for rows in aimed)
+        moved = None
+        if self.surface.extent is not None:
+            place = batch.places(self.surface.seeds[sampler.index]).ravel()[flat]
+            moved = self.surface.extent[:, place, sampler.index[flat % visibility.shape[1]]]
+            origins, rest = origins + moved, toward(*rest, moved)
         visibility.ravel()[flat] = _ONE
         if self.chosen_by.light:
             falling = sampler.falling.ravel()[flat] if self.is_mesh or self.margin else _ONE
@@ -477,8 +483,10 @@ class RatioEstimator:
             if self.meet_the_same:
                 is_lifted = np.zeros(visibility.size, bool)
                 is_lifted[lifted] = True
-                origins, flat = origins[:, is_lifted[flat]], flat[is_lifted[flat]]
-            others = self._chosen_by_surface(sampler, (directions, distance), flat, origins, visibility)
+                lifted = is_lifted[flat]
+                origins, flat = origins[:, lifted], flat[lifted]
+                moved = None if moved is None else moved[:, lifted]
+            others = self._chosen_by_surface(sampler, (directions, distance), flat, (origins, moved), visibility)
         least, most = visibility, visibility
         if others is not None:
             least, most = visibility.copy(), visibility.copy()
@@ -500,14 +508,16 @@ class RatioEstimator:
                 sums[:, block] = halves
                 weight *= passing
 
-    def _chosen_by_surface(self, sampler, rays, flat, origins, light_visibility):
+    def _chosen_by_surface(self, sampler, rays, flat, starts, light_visibility):
         """The rays at the places `flat` (R,) that the surface would choose and that then meet something else than the
-        light's rays did; None if there are none. The light's rays start at `origins` (3, R), with
-        `light_visibility` (S, Q)."""
-        ray_origins = self.surface.ray_origins
+        light's rays did; None if there are none. `starts` are the origins (3, R) of the light's rays, which have
+        `light_visibility` (S, Q), and how far (3, R) they are from the sample, or None."""
+        ray_origins, (origins, moved) = self.surface.ray_origins, starts
         directions, distance = (_taken(rows, flat) for rows in rays)
         index = sampler.index[flat % light_visibility.shape[1]]
-        start, toward, distance = ray_origins.from_surface(index, directions, distance)
+        start, *ray = ray_origins.from_surface(index, directions, distance)
+        if moved is not None:
+            start, ray = start + moved, toward(*ray, moved)
         # The light chooses directions above the smooth horizon; the surface chooses directions above the mesh's.
         smooth, flat_facing = (
             dot(np.take(normal, index, axis=0).T, directions)
@@ -519,7 +529,7 @@ class RatioEstimator:
             chosen &= (start != origins).any(axis=0)
         chosen = np.flatnonzero(chosen)
         falling = sampler.falling.ravel()[flat[chosen]] if self.is_mesh or self.margin else _ONE
-        rays = start[:, chosen], toward[:, chosen], distance[chosen]
+        rays = start[:, chosen], *(rows[..., chosen] for rows in ray)
         visibility = self._transmittance(index[chosen], self.surface_mask, falling, *rays)
         differ = np.flatnonzero(visibility != light_visibility.ravel()[flat[chosen]])
         if len(differ) == 0:

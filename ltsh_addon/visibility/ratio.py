@@ -205,7 +205,8 @@ class ShadowTask:
         visibility = {name: np.ones(shape, np.float32) for name in self.passes}
         radiance, variance = ({name: np.zeros(shape[1], np.float32) for name in self.passes} for _ in range(2))
         mixed, traced = np.zeros(shape, bool), 0
-        surface = SampleRows(samples, self.passes, tracer, ray_origins, joined)
+        extent = None if film is None else film.extent
+        surface = SampleRows(samples, self.passes, tracer, ray_origins, joined, extent)
         neighbors = PixelNeighbors(film, surface)
         # What each sample counts for its pixel.
         importance = np.ones(shape[1], np.float32)

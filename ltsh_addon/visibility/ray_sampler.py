@@ -66,6 +66,10 @@ class RayBatch:
         """First and last number of the points that choose directions by the lobe."""
         return tuple(n - even for n, even in zip((self.first, self.last), self.light_points, strict=True))
 
+    def places(self, seeds: np.ndarray) -> np.ndarray:
+        """Which of the three places (S, Q) of their sample the rays start at, in turn."""
+        return (np.arange(self.first, self.last)[:, None] + (seeds >> np.uint32(16))) % 3
+
     def add_to(self, halves, weight):
         """Add weights (S, Q) to the sums (2, Q) of the first and of the second half of all rays."""
         start, stop = self.light_points
@@ -402,6 +406,7 @@ def _after_warp(density, length):
 
 
 _MIN_ALPHA = np.float32(1e-5)
+EVEN = 1e-3  # places of a sample are in the plane of its triangle up to so much of their distance
 
 
 class JoinedLobes:
@@ -446,10 +451,22 @@ class SampleRows:
         tracer,
         ray_origins: RayOrigins | None = None,
         lobes: JoinedLobes | None = None,
+        extent: np.ndarray | None = None,
     ):
         self.tracer, self.ray_origins = tracer, tracer.ray_origins(samples) if ray_origins is None else ray_origins
         self.position = np.ascontiguousarray(samples.position.T)
         self.receiver = samples.receiver
+        # (3, 3, P) m: from each sample to itself, and to two others that stand for it, see `Film.extent`.
+        self.extent = None
+        if extent is not None:
+            # Rays start there only in the plane of the sample's triangle: on others they may meet their own surface.
+            origins, reach = self.ray_origins, np.linalg.norm(extent, axis=-1, keepdims=True)
+            normal = origins.geometric_normal[:, None]
+            height = (extent * normal).sum(axis=-1, keepdims=True)
+            moved = np.linalg.norm(origins.position - samples.position.astype(np.float32), axis=1)
+            is_even = np.maximum(np.abs(height), moved[:, None, None]) <= EVEN * reach
+            extent = np.where(is_even, extent - height * normal, 0.0).astype(np.float32)
+            self.extent = np.concatenate([np.zeros_like(extent[:, :1]), extent], axis=1).transpose(2, 1, 0)
         self.seeds = seeds_of(samples.position)
         self._known: list[np.ndarray] = []
         self.normal, self.view = self._rows(samples.normal), self._rows(samples.view)

@@ -255,7 +255,7 @@ class RayOrigins:
         surface do so."""
         normal = self.geometric_normal[index].T
         moved = np.copysign(self.clearance[index], dot(normal, directions)) * normal
-        return moved + self.position[index].T, *_toward(directions, distances, moved)
+        return moved + self.position[index].T, *toward(directions, distances, moved)
 
     def aimed(
         self, index: np.ndarray, directions: np.ndarray, distances: np.ndarray, at_surface: bool = False
@@ -269,18 +269,18 @@ class RayOrigins:
         """
         origins, lifted = self._origins_of_rows(index, directions)
         if at_surface:
-            return origins, *_toward(directions, distances, origins - self.position[index].T[:, None]), lifted
+            return origins, *toward(directions, distances, origins - self.position[index].T[:, None]), lifted
         sample = index[lifted % len(index)]
         moved = origins.reshape(3, -1)[:, lifted] - self.position[sample].T
         high = dot(moved, moved) > 4.0 * self.clearance[sample] ** 2
         if high.any():
             directions, distances, chosen = directions.copy(), distances.copy(), lifted[high]
             rows, ends = directions.reshape(3, -1), distances.ravel()
-            rows[:, chosen], ends[chosen] = _toward(rows[:, chosen], ends[chosen], moved[:, high])
+            rows[:, chosen], ends[chosen] = toward(rows[:, chosen], ends[chosen], moved[:, high])
         return origins, directions, distances, lifted
 
 
-def _toward(directions, distances, moved):
+def toward(directions, distances, moved):
     """Unit directions (3, ...) and distances (...) of rays that start `moved` (3, ...) m away from others, and end
     where these end."""
     toward = directions * distances - moved

@@ -24,7 +24,7 @@ class Tracer:
         return ChosenBy(surface=False)
 
     def ray_origins(self, samples):
-        self.position = samples.position
+        self.position, self.geometric_normal = samples.position, samples.geometric_normal
         return self
 
     def aimed(self, index, directions, distances, at_surface=False):

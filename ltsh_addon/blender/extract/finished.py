@@ -77,6 +77,7 @@ def render_finished(job: FinishedJob, folder: Path, progress) -> dict:
     return {
         "frame": scene.frame_current,
         "camera": camera.name,
+        "to_camera": _to_camera(camera),
         "layer": layer.name,
         "files": files,
         "least_seconds": least - started,
@@ -116,6 +117,12 @@ def reasons_for_cycles(scene, layer) -> list[str]:
         reasons[f"volume {ob.name!r}"] = ob.type == "VOLUME"
         reasons[f"shadow catcher {ob.name!r}"] = ob.type in SURFACE_TYPES and ob.is_shadow_catcher
     return [reason for reason, is_there in reasons.items() if is_there]
+
+
+def _to_camera(camera) -> list[list[float]]:
+    """Rows of the matrix that turns directions into Cycles' camera space, whose z axis points into the scene."""
+    rows = camera.matrix_world.to_3x3().normalized().transposed()
+    return [list(rows[0]), list(rows[1]), list(-rows[2])]
 
 
 def _prepare(scene, layer, warnings: list[str]) -> None:

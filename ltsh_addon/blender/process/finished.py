@@ -49,6 +49,7 @@ class CyclesPicture:
 
     channels: dict[str, np.ndarray]  # (H, W) each, by name without that of the view layer
     guides: dict[str, np.ndarray]  # the channels for the denoiser
+    to_camera: np.ndarray  # (3, 3) turns directions, as columns, into the space of the normals among them
     names: dict[str, str]  # of passes, as in `pass_names`
     samples: int
     halves: tuple[CyclesHalf, ...]  # of its samples, with noise of their own; () if there is one file
@@ -70,6 +71,7 @@ def render_finished(job: FinishedJob, folder: Path, *, progress: Progress | None
     return CyclesPicture(
         channels={name: plane for name, plane in channels.items() if not name.startswith(dropped)},
         guides={name: plane for name, plane in channels.items() if name.startswith("Denoising ")},
+        to_camera=np.array(manifest["to_camera"]),
         names=manifest["passes"],
         samples=samples,
         halves=halves,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -215,6 +216,7 @@ def warm_up(scene) -> None:
 
 def _prepare() -> None:
     """Try a move in each view: that reads the table, and Blender builds the trees in which its rays find surfaces."""
+    gc.collect()  # 50 ms that would come during some move
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             region = next((one for one in area.regions if one.type == "WINDOW"), None)

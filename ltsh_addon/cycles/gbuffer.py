@@ -227,7 +227,7 @@ def with_widened_lobes(samples: SurfaceSamples, film: Film, points: int) -> Surf
     roughness = np.where(is_wider, np.minimum((along * across) ** 0.25, 1.0), samples.roughness)
     anisotropy = samples.anisotropy
     if anisotropy.any():
-        anisotropy = np.where(is_wider & (anisotropy != 0.0), 1.0 - np.sqrt(across / along), anisotropy)
+        anisotropy = np.where(is_wider & (anisotropy != 0.0), 1.0 - np.sqrt(across / np.maximum(along, 1e-30)), anisotropy)
     return replace(samples, roughness=roughness, anisotropy=anisotropy)
 
 

@@ -154,3 +154,11 @@ def test_each_axis_of_a_brushed_lobe_takes_the_same_in():
     added = squares(widened) - squares(samples)
     np.testing.assert_allclose(added[0], added[1], rtol=1e-9, atol=1e-12)
     assert (added > 0.0).all()
+
+
+def test_flat_mirrors_stay_mirrors():
+    samples, film = hits(0)
+    nothing, brushed = np.zeros(len(samples)), np.full(len(samples), 0.5)
+    mirror = replace(samples, roughness=nothing, anisotropy=brushed, specular_f0=np.ones((len(samples), 3)))
+    widened = gbuffer.with_widened_lobes(mirror, film, POINTS)
+    assert (widened.roughness == 0.0).all() and np.isfinite(widened.anisotropy).all()

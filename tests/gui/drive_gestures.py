@@ -1,5 +1,5 @@
 """Gestures by the mouse, in Solid shading and in the preview: shares where it rests, a highlight, the edge of a shadow
-and a brightness dragged; Escape and the right button put back, a release is one step of undo."""
+and a brightness dragged; Escape and the right button put back, a release is one step of undo. Then Match and Move."""
 
 import bpy
 import hands
@@ -8,10 +8,12 @@ from bpy_extras import view3d_utils
 from mathutils import Vector
 
 SIZE = "1400x1000"
-SECONDS = 900
+SECONDS = 1500
+MATCH_SECONDS = 400
 # Points of the floor: lit by both lights, at the edge of the box's shadow, and where that edge is dragged.
 LIT, EDGE, NEW_EDGE = Vector((-1.2, 0.8, 0.0)), Vector((0.9, 0.0, 0.0)), Vector((1.4, 0.3, 0.0))
 KEY, RIM = 100.0, 40.0  # W
+ASIDE = Vector((0.3, 0.0, 0.1))  # m, from the light's place in the target of Match and Move
 
 
 def main(rig):
@@ -32,8 +34,10 @@ def main(rig):
         yield from moved(rig, told, shading, "drag_highlight", LIT, Vector((-0.9, -0.6, 0.0)))
     yield from by_tool(rig)
     yield from by_keys(rig, told)
+    yield from numbers(rig, told)
     yield from refused(rig, told)
     yield from second_view(rig)
+    yield from matched(rig)
 
 
 def heard():
@@ -342,3 +346,57 @@ def refused(rig, told):
     yield from hands.keys(rig, "Escape")
     yield from hands.comes(rig, lambda: told[-1] is None, "Escape ends it")
     rig.check(power() == KEY, f"its power stays: {power()}")
+
+
+def numbers(rig, told):
+    """No light is active: the one with the most glossy light is taken, and goes to a typed distance."""
+    before = place()
+    bpy.context.view_layer.objects.active = None
+    hands.operate(rig, bpy.ops.ltsh.drag_highlight, "INVOKE_DEFAULT")
+    yield from at(rig, LIT)
+    rig.xdo("mousedown", 1)
+    yield from hands.comes(rig, lambda: (told[-1] or "").startswith("Key    "), lambda: f"Key is taken: {told[-1:]}")
+    yield from hands.keys(rig, "2", "period", "5")
+    yield from hands.comes(
+        rig, lambda: "[2.5]" in (told[-1] or "") and "Distance 2.5 m" in told[-1], lambda: f"2.5 m: {told[-1:]}"
+    )
+    rig.shot("09_typed.png")
+    yield from hands.keys(rig, "Return")
+    yield from hands.comes(rig, lambda: told[-1] is None, "Enter ends the drag")
+    rig.xdo("mouseup", 1)
+    yield 1
+    rig.check(abs((Vector([row[3] for row in place()][:3]) - LIT).length - 2.5) < 0.02, f"it is there: {place()}")
+    yield from hands.typed(rig, "ctrl+z")
+    yield from hands.comes(rig, lambda: place() == before, "one undo takes it back")
+
+
+def matched(rig):
+    """A target of Cycles, with the light elsewhere."""
+    bpy.data.objects["Key"].data.animation_data_clear()
+    scene = bpy.context.scene
+    scene.render.resolution_x, scene.render.resolution_y, scene.render.engine = 96, 64, "CYCLES"
+    scene.cycles.samples, scene.render.image_settings.file_format = 128, "OPEN_EXR"
+    scene.render.filepath = str(rig.out / "target.exr")
+    hands.operate(rig, bpy.ops.render.render, write_still=True)
+    scene.ltsh.match_target = bpy.data.images.load(scene.render.filepath)
+    true = bpy.data.objects["Key"].location.copy()
+    bpy.data.objects["Key"].location += ASIDE
+    yield 1
+    hands.operate(rig, bpy.ops.ed.undo_push, message="Moved")
+    before = place()
+    hands.operate(rig, bpy.ops.ltsh.match_move, "INVOKE_DEFAULT")
+    yield from hands.job_started(rig, "Match and Move starts a job")
+    yield 4
+    rig.shot("10_job.png")
+    yield from hands.typed(rig, "Escape")
+    yield from hands.comes(rig, lambda: hands.job() is None and place() == before, "Escape ends it, and nothing moved")
+    hands.operate(rig, bpy.ops.ltsh.match_move, "INVOKE_DEFAULT")
+    yield from hands.job_started(rig, "it starts again")
+    yield from hands.wait_for_job(rig, MATCH_SECONDS)
+    yield 1
+    off = (bpy.data.objects["Key"].location - true).length
+    rig.fact("how far the light is from where it was, in m", round(off, 4))
+    rig.check(off < 0.03 * 4.0, f"the light is back within 3 % of its distance: {off:.3f} m")
+    rig.shot("11_matched.png")
+    yield from hands.typed(rig, "ctrl+z")
+    yield from hands.comes(rig, lambda: place() == before, "one undo takes it back")

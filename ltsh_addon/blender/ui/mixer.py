@@ -147,6 +147,8 @@ class _Mixer:
         if not rows:
             layout.prop(settings, "keep_lights")
             draw_text(layout, context, "Shade the picture with it, or bake Per Light: then lights change here", "INFO")
+            layout.prop(settings, "match_target")
+            _draw_move(layout)
             return
         layout.template_list("LTSH_UL_mixer", "", settings, "mixed", settings, "mixed_active", rows=min(len(rows), 8))
         item = settings.mixed[settings.mixed_active] if settings.mixed_active < len(settings.mixed) else None
@@ -170,10 +172,15 @@ class _Mixer:
         row = layout.row(align=True)
         row.operator("ltsh.match_target", icon="LIGHT")
         row.prop(settings, "match_colors", toggle=True)
-        if not draw_job(layout, "match"):
-            layout.operator("ltsh.match_move", icon="LIGHT_AREA")
+        _draw_move(layout)
         for note in notes(context.scene):
             draw_text(gray(layout), context, note, "INFO")
+
+
+def _draw_move(layout) -> None:
+    """The button that also moves lights, or the progress of its job."""
+    if not draw_job(layout, "match"):
+        layout.operator("ltsh.match_move", icon="LIGHT_AREA")
 
 
 def _draw_update(layout) -> None:

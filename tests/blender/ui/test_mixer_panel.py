@@ -356,3 +356,11 @@ def test_a_target_of_another_size_is_named_and_changes_nothing(scene):
     assert items(scene)["Key"].power == 3.0
     scene.ltsh.match_target = None
     assert not bpy.ops.ltsh.match_target.poll()
+
+
+def test_lights_move_to_a_target_also_without_a_picture(addon):
+    shown = drawn(mixer.LTSH_PT_IMAGE_mixer)
+    assert "match_target" in {item.what for item in shown} and "ltsh.match_move" in buttons(shown)
+    assert not bpy.ops.ltsh.match_move.poll()
+    addon.ltsh.match_target = bpy.data.images.new("Target", WIDTH, HEIGHT)
+    assert bpy.ops.ltsh.match_move.poll()

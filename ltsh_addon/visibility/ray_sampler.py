@@ -458,7 +458,7 @@ class SampleRows:
         self.receiver = samples.receiver
         # (3, 1 + N, P) m: from each sample to itself, and to others for which it stands, see `Film.extent`.
         self.extent = None
-        if extent is not None:
+        if extent is not None and extent.shape[1]:
             # Where the sample is not on its triangle by more than rounding, only places in the plane of that are exact.
             origins = self.ray_origins
             normal, clearance = origins.geometric_normal[:, None], origins.clearance[:, None, None]

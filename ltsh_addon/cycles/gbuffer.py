@@ -170,6 +170,7 @@ def join(renders: list[tuple[SurfaceSamples, np.ndarray]], width: int, height: i
 LOBE_SHARE, MOST_ANGLE, OFF_PLANE, LEAST_ALPHA = 0.02, 0.01, 0.2, 0.01
 MERGED_ROUNDS = 3  # most surfaces of a pixel that are merged
 SHADOW_LOOSENESS = 40.0  # hits share their shadow rays up to this many times the angle for shading
+MOST_PLACES = 8  # of a sample, from which its shadow rays start
 COLORS = ("specular_f0", "specular_f90", "specular_dip", "dielectric", "diffuse_albedo", "diffuse_rebound")
 SAME = ("roughness", "ior", "diffuse_roughness", "sheen_a", "sheen_b", "receiver", "anisotropy")
 
@@ -227,7 +228,8 @@ def with_widened_lobes(samples: SurfaceSamples, film: Film, points: int) -> Surf
     roughness = np.where(is_wider, np.minimum((along * across) ** 0.25, 1.0), samples.roughness)
     anisotropy = samples.anisotropy
     if anisotropy.any():
-        anisotropy = np.where(is_wider & (anisotropy != 0.0), 1.0 - np.sqrt(across / along), anisotropy)
+        ratio = across / np.maximum(along, 1e-30)
+        anisotropy = np.where(is_wider & (anisotropy != 0.0), 1.0 - np.sqrt(ratio), anisotropy)
     return replace(samples, roughness=roughness, anisotropy=anisotropy)
 
 
@@ -253,11 +255,11 @@ def _together(samples: SurfaceSamples, film: Film, leaders: np.ndarray, group: n
 
 def _extent(samples: SurfaceSamples, film: Film, leaders: np.ndarray, group: np.ndarray) -> np.ndarray:
     """`Film.extent` of the `leaders` (Q,); of those that had one already, this."""
-    extent = np.zeros((len(leaders), 2, 3), np.float32)
-    order = np.argsort(group, kind="stable")
-    rank = np.arange(len(order)) - np.searchsorted(group[order], group[order])
-    others, number = order[rank > 0], np.minimum(rank[rank > 0], 2) - 1
-    extent[group[others], number] = samples.position[others] - samples.position[leaders[group[others]]]
+    order, size = np.argsort(group, kind="stable"), np.bincount(group, minlength=len(leaders))
+    count = min(size.max(initial=1), MOST_PLACES) if film.extent is None else 1 + film.extent.shape[1]
+    # Of groups with fewer samples some are there several times.
+    others = order[(np.cumsum(size) - size)[:, None] + np.arange(1, count) % size[:, None]]
+    extent = (samples.position[others] - samples.position[leaders][:, None]).astype(np.float32)
     if film.extent is None:
         return extent
     before = film.extent[leaders]

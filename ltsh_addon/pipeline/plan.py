@@ -116,7 +116,9 @@ def direct_light_plan(scene: SceneMeasurements) -> DirectLightPlan:
     affordable = counts[expected <= allowed]
     if len(affordable) == 0:
         return by_cycles
-    return DirectLightPlan(0, TOO_THIN) if large.contrast > THIN_CONTRAST else DirectLightPlan(int(affordable[-1]))
+    # Either may miss them.
+    is_thin = max(small.contrast, large.contrast) > THIN_CONTRAST
+    return DirectLightPlan(0, TOO_THIN) if is_thin else DirectLightPlan(int(affordable[-1]))
 
 
 def shadow_rays(most: int, budget: float | None, pairs: float) -> int:

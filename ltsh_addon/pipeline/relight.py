@@ -37,7 +37,7 @@ from .options import PictureOptions
 # The two files of `write_relight_data`: the samples with all that shading needs, and the occluders.
 RELIGHT_SUFFIX, OCCLUDERS_SUFFIX = ".samples.npz", ".occluders.npz"
 RELIGHT_OPTIONS = ("techniques", "passes", "sub_samples", "reference_samples", "shadows", "shadow_rays")
-FILM_ARRAYS = ("first", "count", "spread", "whole")  # the optional arrays of a film
+FILM_ARRAYS = ("first", "count", "extent", "spread", "whole")  # the optional arrays of a film
 NOT_REFLECTED = ("emission", "background")  # optional arrays of `Extraction.cycles`
 FINISHED = ("rest", "taken", "edges")  # fields of a RelightData that only finished pictures have
 # Warnings:

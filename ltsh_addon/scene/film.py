@@ -21,7 +21,7 @@ class Film:
     first: np.ndarray | None = None
     # (P,) how many samples each one stands for, below 1 in pixels that have more than `sub_samples`; None: 1 each.
     count: np.ndarray | None = None
-    # (P, 2, 3) m, from each sample to two others for which it stands, as its shadow does; None: the shadow is its own.
+    # (P, N, 3) m, from each sample to others for which it stands, as its shadow does; None: the shadow is its own.
     extent: np.ndarray | None = None
     # (P, D, D) weights of each sample in the pixels around its own, rows from top to bottom; None: its own pixel only.
     spread: np.ndarray | None = None

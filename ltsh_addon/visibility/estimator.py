@@ -471,7 +471,7 @@ class RatioEstimator:
         origins, *rest = (_taken(rows, flat) for rows in aimed)
         moved = None
         if self.surface.extent is not None:
-            place = batch.places(self.surface.seeds[sampler.index]).ravel()[flat]
+            place = batch.places(self.surface.seeds[sampler.index], self.surface.extent.shape[1]).ravel()[flat]
             moved = self.surface.extent[:, place, sampler.index[flat % visibility.shape[1]]]
             origins, rest = origins + moved, toward(*rest, moved)
         visibility.ravel()[flat] = _ONE

@@ -66,9 +66,9 @@ class RayBatch:
         """First and last number of the points that choose directions by the lobe."""
         return tuple(n - even for n, even in zip((self.first, self.last), self.light_points, strict=True))
 
-    def places(self, seeds: np.ndarray) -> np.ndarray:
-        """Which of the three places (S, Q) of their sample the rays start at, in turn."""
-        return (np.arange(self.first, self.last)[:, None] + (seeds >> np.uint32(16))) % 3
+    def places(self, seeds: np.ndarray, count: int) -> np.ndarray:
+        """At which of so many places (S, Q) of their sample the rays start: in turn."""
+        return (np.arange(self.first, self.last)[:, None] + (seeds >> np.uint32(16))) % count
 
     def add_to(self, halves, weight):
         """Add weights (S, Q) to the sums (2, Q) of the first and of the second half of all rays."""
@@ -406,7 +406,7 @@ def _after_warp(density, length):
 
 
 _MIN_ALPHA = np.float32(1e-5)
-EVEN = 1e-3  # places of a sample are in the plane of its triangle up to so much of their distance
+EVEN = 0.5  # clearances from the plane of its triangle up to which a place is in it
 
 
 class JoinedLobes:
@@ -456,16 +456,16 @@ class SampleRows:
         self.tracer, self.ray_origins = tracer, tracer.ray_origins(samples) if ray_origins is None else ray_origins
         self.position = np.ascontiguousarray(samples.position.T)
         self.receiver = samples.receiver
-        # (3, 3, P) m: from each sample to itself, and to two others that stand for it, see `Film.extent`.
+        # (3, 1 + N, P) m: from each sample to itself, and to others for which it stands, see `Film.extent`.
         self.extent = None
-        if extent is not None:
-            # Rays start there only in the plane of the sample's triangle: on others they may meet their own surface.
-            origins, reach = self.ray_origins, np.linalg.norm(extent, axis=-1, keepdims=True)
-            normal = origins.geometric_normal[:, None]
+        if extent is not None and extent.shape[1]:
+            # Where the sample is not on its triangle by more than rounding, only places in the plane of that are exact.
+            origins = self.ray_origins
+            normal, clearance = origins.geometric_normal[:, None], origins.clearance[:, None, None]
             height = (extent * normal).sum(axis=-1, keepdims=True)
-            moved = np.linalg.norm(origins.position - samples.position.astype(np.float32), axis=1)
-            is_even = np.maximum(np.abs(height), moved[:, None, None]) <= EVEN * reach
-            extent = np.where(is_even, extent - height * normal, 0.0).astype(np.float32)
+            is_exact = (origins.position == samples.position.astype(np.float32)).all(axis=1)
+            even = np.where(np.abs(height) <= EVEN * clearance, extent - height * normal, 0.0)
+            extent = np.where(is_exact[:, None, None], extent, even).astype(np.float32)
             self.extent = np.concatenate([np.zeros_like(extent[:, :1]), extent], axis=1).transpose(2, 1, 0)
         self.seeds = seeds_of(samples.position)
         self._known: list[np.ndarray] = []

@@ -24,7 +24,8 @@ class Tracer:
         return ChosenBy(surface=False)
 
     def ray_origins(self, samples):
-        self.position, self.geometric_normal = samples.position, samples.geometric_normal
+        self.position, self.geometric_normal = samples.position.astype(np.float32), samples.geometric_normal
+        self.clearance = np.zeros(len(samples), np.float32)
         return self
 
     def aimed(self, index, directions, distances, at_surface=False):

@@ -1,12 +1,15 @@
-"""Where the edge of a shadow crosses a pixel, a sample that stands for three places has the mean of their shadows."""
+"""Where the edge of a shadow crosses a pixel, a sample that stands for three points has the mean of their shadows."""
 
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from known_tracers import Tracer, floor, panel
+from occluder_scenes import samples_on
 
-from ltsh_addon.scene import PASSES, light_of
-from ltsh_addon.visibility import ShadowSampling, trace_visibility
+from ltsh_addon.blender.process.blender_process import embree_libraries
+from ltsh_addon.scene import PASSES, Film, light_of
+from ltsh_addon.visibility import OccluderMesh, Occluders, ShadowSampling, open_tracer, trace_visibility
 
 SUN = light_of(
     {"name": "Sun", "shape": "DISK", "center": np.array([0.0, 0.0, 1e4]), "direction": np.array([0.0, 0.0, -1.0]),
@@ -39,3 +42,29 @@ def test_a_sample_has_the_mean_shadow_of_the_places_for_which_it_stands():
     # Without the places there is no sun in part.
     own = trace_visibility(samples, [SUN], Tracer(edge), ShadowSampling(rays=64, film=film))
     assert set(np.unique(own.diffuse.round(1))) == {0.0, 1.0}
+
+
+def test_no_place_lies_below_a_hollow_surface():
+    """Samples in strips of a trough, 2 cm wide each and 5e-4 rad apart, stand for points on the strips beside."""
+    if not embree_libraries():
+        pytest.skip("this Python has no bpy, which brings Embree")
+    x = 0.02 * np.arange(-50, 51)
+    y, z = np.meshgrid([-1.0, 1.0], 0.0125 * x * x, indexing="ij")
+    vertices = np.stack([np.tile(x, 2), y.ravel(), z.ravel()], axis=1)
+    first = np.arange(100)
+    quads = np.stack([first, first + 1, first + 102, first + 101], axis=1)
+    mesh = OccluderMesh(vertices.astype(np.float32), np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]]))
+    samples = samples_on(mesh, np.eye(3, 4), np.random.default_rng(0), 400)
+    low, high = samples.geometric_normal, samples.position.copy()
+    samples = replace(samples, **dict.fromkeys(("geometric_normal", "smooth_normal"), low * np.sign(low[:, 2:])))
+    strip = np.floor(samples.position[:, 0] / 0.02)
+    on_next = 0.02 * (strip + 1.5)
+    high[:, 0] = on_next
+    high[:, 2] = np.interp(on_next, x, 0.0125 * x * x)
+    extent = (high - samples.position).astype(np.float32)[:, None]
+    film = Film(20, 20, np.arange(400), extent=extent)
+    with open_tracer(Occluders((mesh,), [0], [np.eye(3, 4)]), embree_libraries()) as tracer:
+        for off in (0.0, 2e-6):  # as Cycles has it, and as graphics cards do
+            near = replace(samples, position=samples.position + np.float32(off) * samples.geometric_normal)
+            found = trace_visibility(near, [SUN], tracer, ShadowSampling(rays=8, film=film))
+            assert (found.diffuse == 1.0).all()

@@ -15,7 +15,7 @@ from mathutils import Matrix, Vector
 from ...cycles.horizons import end_at_horizons_of_cycles, unit, valid_specular_normal
 from ...scene import SurfaceSamples
 from ...shading import shade
-from ...shading.highlight import BRIGHTER, QUICK, STENCIL, THOROUGH, MovedLight, mirrored, place_for_highlight
+from ...shading.highlight import BRIGHTER, QUICK, STENCIL, STRICT, THOROUGH, MovedLight, mirrored, place_for_highlight
 from ..evaluated import EmitterTraits
 from ..lights.area import area_light
 from ..lights.linking import Receivers, linked_objects, receiver_collection
@@ -32,8 +32,9 @@ DISK = np.concatenate([
     radius * np.stack([np.cos(turns), np.sin(turns)], axis=-1)
     for radius, count in RINGS for turns in [2.0 * np.pi * (np.arange(count) + 0.5 * (count % 4)) / count]
 ])  # fmt: skip
-# PIXELS: those that DISK stands for. NEAR: pixels from the mouse to a peak that counts as there.
-NEAR = 2.0
+# PIXELS: those that DISK stands for; a search by all of them takes every FEWER-th. NEAR: pixels from the mouse to a
+# peak that counts as there.
+NEAR, FEWER = 2.0, 2
 _GRID = np.stack(np.meshgrid(np.arange(-20.0, 21.0), np.arange(-20.0, 21.0)), axis=-1).reshape(-1, 2)
 PIXELS = _GRID[np.hypot(*_GRID.T) <= 20.0]
 # GRID: by how many pixels, across and up, `prepare_view` looks for surfaces.
@@ -153,9 +154,9 @@ def unlinked(ob, hit: SurfaceHit) -> str:
     return "" if is_lit else f"{ob.name} does not light {hit.ob.name}, by light linking"
 
 
-def note_by_pixels(ob, matrix: Matrix, around: HitsAround, textures: ShownTextures) -> str:
+def note_by_pixels(ob, matrix: Matrix, around: HitsAround, textures: ShownTextures, brighter=BRIGHTER) -> str:
     """Why the highlight of the light object `ob`, at `matrix` now, is not at the mouse, by all that is `around`; ""
-    where it is."""
+    where it is. `brighter`: by how much a pixel may be brighter than the mouse."""
     hits, lobe = around.hits, around.lobe
     if lobe is None:
         return NO_HIGHLIGHT
@@ -167,7 +168,7 @@ def note_by_pixels(ob, matrix: Matrix, around: HitsAround, textures: ShownTextur
     here = radiance[0]
     if here <= 0.0:
         return BEHIND
-    is_there = radiance.max() <= (1.0 + BRIGHTER) * here or np.hypot(*around.pixels[np.argmax(radiance)]) <= NEAR
+    is_there = radiance.max() <= (1.0 + brighter) * here or np.hypot(*around.pixels[np.argmax(radiance)]) <= NEAR
     return around.unread if is_there else BESIDE
 
 
@@ -176,13 +177,17 @@ def place_by_pixels(
 ) -> tuple[Matrix, str]:
     """As `place_of`, by all pixels `around`, where the light object `ob` is not yet right at `matrix`: what shines
     between the samples of a move may be brighter. Takes too long for a move."""
-    note = note_by_pixels(ob, matrix, around, textures)
-    if note == BESIDE:
-        distance = (matrix.translation - around.hits[0].position).length
-        better, _ = place_of(ob, pose, around, distance, textures, effort)
-        if (again := note_by_pixels(ob, better, around, textures)) != BESIDE:
-            return better, again
-    return matrix, note
+    note = note_by_pixels(ob, matrix, around, textures, STRICT)
+    if note != BESIDE:
+        return matrix, note
+    distance = (matrix.translation - around.hits[0].position).length
+    few = [n for n in range(len(around.hits)) if n < len(STENCIL) or n % FEWER == 0]
+    fewer = replace(around, hits=[around.hits[n] for n in few], pixels=around.pixels[few])
+    better, _ = place_of(ob, pose, fewer, distance, textures, effort)
+    for one, brighter in ((better, STRICT), (matrix, BRIGHTER), (better, BRIGHTER)):
+        if (note := note_by_pixels(ob, one, around, textures, brighter)) != BESIDE:
+            return one, note
+    return matrix, BESIDE
 
 
 def _light(ob, matrix: np.ndarray):

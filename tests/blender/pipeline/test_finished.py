@@ -560,3 +560,17 @@ def test_borders_of_colors_are_as_smooth_as_in_cycles(tmp_path):
         off[samples] = np.linalg.norm(made.ours["ltsh4c.diffuse"] - light * color)
     # 64 random samples know a border twice as well as the points of about three pixels, which share one each.
     assert off[64] < 0.6 * off[1], off
+
+
+def test_normals_of_cycles_are_those_of_the_samples(tmp_path):
+    floor_and_ball(gray(), 1)
+    camera = bpy.context.scene.camera
+    camera.location, camera.rotation_euler, camera.scale = (2.0, -3.5, 2.5), (1.0, 0.3, 0.5), (2.0, 2.0, 2.0)
+    cycles = by_cycles(tmp_path, 64)
+    extraction = extract_pixels(PixelJob(parts.save(tmp_path / "room.blend"), sub_samples=16, for_finished=True))
+    normal = read_layer(cycles.guides, "Denoising Normal", "XYZ") @ cycles.to_camera
+    expected, shown = extraction.film.image(extraction.samples.diffuse_normal), extraction.film.coverage() > 0.99
+    assert 0.5 < shown.mean()
+    # At the ball's border the points, and the samples, are few.
+    apart = np.linalg.norm(normal - expected, axis=-1)[shown]
+    assert np.median(apart) < 0.005 and np.quantile(apart, 0.9) < 0.1

@@ -86,7 +86,7 @@ def first_and_most_points(options: RenderOptions) -> tuple[int, int]:
 
 def direct_light_plan(scene: SceneMeasurements) -> DirectLightPlan:
     """The points per pixel that the remaining budget allows, or why Cycles does better with that time."""
-    from ..blender.process.pixels import TOO_THIN, too_small
+    from ..blender.process.pixels import LEAST_POINTS, TOO_THIN, too_small
 
     if scene.seconds_left is None or scene.samples == 0:
         return DirectLightPlan(scene.points)
@@ -97,7 +97,7 @@ def direct_light_plan(scene: SceneMeasurements) -> DirectLightPlan:
     # All points of a pixel but the first make about equally many samples.
     counts = np.array([scene.points])
     if not scene.has_lens:
-        counts = np.arange(1, max(scene.points, scene.most_points) + 1)
+        counts = np.arange(min(LEAST_POINTS, scene.points), max(scene.points, scene.most_points) + 1)
     one = scene.samples_of_one_point
     samples = one + (counts - 1) * (scene.samples - one) / max(scene.points - 1, 1)
     # More points than there are need all samples anew.

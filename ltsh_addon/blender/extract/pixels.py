@@ -20,7 +20,7 @@ from ..lights.world import blocks_nothing, take_world, world_behind, world_light
 from ..materials import aovs
 from ..materials.graph import images_behind
 from ..process.blender_process import job_start, newer
-from ..process.pixels import BEHIND, EDGE_SECONDS, PixelJob, too_small
+from ..process.pixels import BEHIND, EDGE_SECONDS, LEAST_POINTS, PixelJob, too_small
 from .occluders import collect_occluders, with_baked_shares, with_displacement
 
 # FAST_PIXELS: up to this many samples (about 1 GB of files), files are compressed fast instead of well.
@@ -361,7 +361,8 @@ def extract_pixels(job: PixelJob, folder: Path, progress) -> dict:
             count = job.sub_samples
         if end is not None and not has_lens and count:
             now = time.process_time()
-            count = min(affordable_points(end - now, pixels, len(inventory.lights), now - opened), count)
+            affordable = affordable_points(end - now, pixels, len(inventory.lights), now - opened)
+            count = 0 if affordable < min(LEAST_POINTS, count) else min(affordable, count)
     if is_sharp and for_finished:
         points = f"with fewer than {FINISHED_LENS} points per pixel (--aa)"
         inventory.left_to_cycles.everything.append(f"depth of field of camera {camera.name!r} {points}")

@@ -26,6 +26,7 @@ REASONS, LEAST_PERCENT = 5, 0.1
 SHARP_REFLECTION = 0.2  # surfaces of a smaller roughness show the patches of a world with fine detail
 # EDGE_SECONDS: processor seconds that a million pixels of `finished.FinishedJob.edges` take.
 EDGE_SECONDS = 12.0
+LEAST_POINTS = 2  # per pixel, with a budget: one alone leaves more error than Cycles does in that time
 BEHIND = "behind"  # the folder of the renders of what is behind glass
 # THROUGH_GLASS: what a picture shows behind glass, by whether that was rendered.
 THROUGH_GLASS = {

@@ -12,8 +12,6 @@ linear regression of renderings (Moon, Carr and Yoon 2014, Adaptive Rendering Ba
 
 from __future__ import annotations
 
-from itertools import combinations_with_replacement
-
 import numpy as np
 
 from ..scene import Film
@@ -33,17 +31,14 @@ def factor_of_samples(film: Film, samples, radiance: np.ndarray, color: np.ndarr
     own_color = film.image(samples.diffuse_albedo)
     factor = np.divide(color, own_color, out=np.ones_like(own_color), where=own_color > 1e-6)
     factor = np.minimum(factor, MOST_RECOLORING)
-    first = np.ones(len(film.pixel), bool) if film.first is None else film.first
-    hits, hit = film.take(first), np.cumsum(first) - 1
-    albedo, light = (
-        np.stack([np.bincount(hit, column, len(hits.pixel)) for column in values.T], axis=1)
-        for values in (samples.diffuse_albedo, radiance)
-    )
+    hits, sums = film.hits(*samples.diffuse_albedo.T, *radiance.T)
+    albedo, light = np.stack(sums[:3], axis=1), np.stack(sums[3:], axis=1)
+    first = slice(None) if film.first is None else film.first
     own_normals = samples.diffuse_normal[first].astype(np.float64)
     # What the variance among the points does not explain of the difference between both means is that Cycles' normal is
     # another one, as that of what a mirror shows. What it explains for as many samples as Cycles has is Cycles' error.
-    slope, variance = _slope(hits.unspread(), own_normals, light / np.maximum(albedo, LEAST_COLOR))
-    apart = normal - hits.image(own_normals)
+    slope, variance = _slope(hits, own_normals, light / np.maximum(albedo, LEAST_COLOR))
+    apart = normal - film.take(first).image(own_normals)
     off = np.maximum(box_mean(np.square(apart).sum(axis=-1), SLOPE_RADIUS), 1e-12)
     variance = np.maximum(box_mean(variance, SLOPE_RADIUS), 0.0)
     sure = np.minimum(variance / (film.sub_samples * off), 1.0) * np.maximum(1.0 - variance / (count * off), 0.0)
@@ -64,12 +59,8 @@ def _slope(film: Film, normals: np.ndarray, values: np.ndarray) -> tuple[np.ndar
     weight = box_mean(film.image(np.ones(len(normals))), SLOPE_RADIUS)
     normal, value = (np.stack([mean(column) for column in array.T], axis=-1) for array in (normals, values))
     square, product = RIDGE * np.ones((*shape, 1, 1)) * np.eye(3), np.empty((*shape, 3, 3))
-    for i, j in combinations_with_replacement(range(3), 2):
-        one = mean(normals[:, i] * normals[:, j]) - normal[..., i] * normal[..., j]
-        square[..., i, j] += one
-        if i != j:
-            square[..., j, i] += one
     for i, j in np.ndindex(3, 3):
+        square[..., i, j] += mean(normals[:, i] * normals[:, j]) - normal[..., i] * normal[..., j]
         product[..., i, j] = mean(normals[:, i] * values[:, j]) - normal[..., i] * value[..., j]
     within = film.image(np.square(normals).sum(axis=1)) - np.square(film.image(normals)).sum(axis=-1)
     return np.linalg.solve(square, product), np.maximum(within, 0.0)

@@ -129,9 +129,7 @@ def variance_of_points(extraction, result, name: str) -> np.ndarray:
     """The variance (H, W) of a pass among the points of each pixel, of its exposed radiance: the sum over light groups,
     the mean over color channels."""
     radiance = extraction.picture.exposure * getattr(result.shading, name).sum(axis=0).mean(axis=-1)
-    film, hits = extraction.film, extraction.film.unspread()
-    if film.first is not None:
-        radiance, hits = np.bincount(np.cumsum(film.first) - 1, radiance), hits.take(film.first)
+    hits, (radiance,) = extraction.film.hits(radiance)
     return np.maximum(hits.image(np.square(radiance)) - np.square(hits.image(radiance)), 0.0)
 
 

@@ -116,7 +116,7 @@ def direct_light_plan(scene: SceneMeasurements) -> DirectLightPlan:
     affordable = counts[expected <= allowed]
     if len(affordable) == 0:
         return by_cycles
-    # Either may miss them.
+    # Either probe may miss the highlights.
     is_thin = max(small.contrast, large.contrast) > THIN_CONTRAST
     return DirectLightPlan(0, TOO_THIN) if is_thin else DirectLightPlan(int(affordable[-1]))
 

@@ -38,6 +38,13 @@ class Film:
         """The same samples, each only in its own pixel."""
         return replace(self, spread=None, whole=None)
 
+    def hits(self, *arrays: np.ndarray) -> tuple[Film, list[np.ndarray]]:
+        """The film of the hits, each only in its own pixel, and of per-sample `arrays` (P,) the sums of each hit."""
+        if self.first is None:
+            return self.unspread(), list(arrays)
+        hit = np.cumsum(self.first) - 1
+        return self.unspread().take(self.first), [np.bincount(hit, values) for values in arrays]
+
     @property
     def points(self) -> int:
         """The approximate number of samples of a pixel."""

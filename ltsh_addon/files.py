@@ -6,8 +6,6 @@ file then deletes the leftover. Names with the mark of another machine are left 
 machines. Temporary folders are treated in the same way.
 """
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import os

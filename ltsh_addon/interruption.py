@@ -1,7 +1,5 @@
 """Ctrl-C and SIGTERM as exceptions, so that any command cleans up and ends within seconds."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket

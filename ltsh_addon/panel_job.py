@@ -1,7 +1,5 @@
 """Entry point of the process that a panel starts: `panel_job.py job.json`, with pip's bpy or inside Blender."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib
 import io

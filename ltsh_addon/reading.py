@@ -4,8 +4,6 @@ Each reader refuses malformed files within about a second, with an error of one 
 OSError means that the file cannot be read, Malformed that its contents are wrong; the caller adds the file's name.
 """
 
-from __future__ import annotations
-
 import errno
 import io
 import json

@@ -3,8 +3,6 @@
 Needs scipy, and `plot` matplotlib, which the add-on does not need.
 """
 
-from __future__ import annotations
-
 import argparse
 import functools
 import json

@@ -7,8 +7,6 @@ The scene is a floor with a sphere, a cylinder and a box under one rectangular l
 it in numpy, page/surface.glsl as a shader; both take their numbers from here.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 import os

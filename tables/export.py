@@ -4,8 +4,6 @@ The EXR has every stored quantity as a channel over the grid of the table. The h
 functions that shade with them, the .wgsl these functions, the .dds the numbers as textures.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """The BRDFs with their quadrature, and the families of original distributions under a warp that are fitted to them."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -31,7 +29,7 @@ class Family:
     degree: int
     powers: tuple[tuple[int, int], ...] = ()
     bend: tuple[float, float, float] | None = None
-    second: Family | None = None
+    second: "Family | None" = None
 
     @property
     def parameters(self) -> int:

@@ -1,7 +1,5 @@
 """Fits tables and writes them, reproducibly byte by byte. Keeps the state of unfinished fits."""
 
-from __future__ import annotations
-
 import io
 import json
 import zipfile

@@ -4,8 +4,6 @@ The header is core.h of `ltsh_addon/shading/glsl`, the same for all tables, and 
 module writes the lines that depend on a table's numbers and degree.
 """
 
-from __future__ import annotations
-
 import re
 import struct
 from pathlib import Path

@@ -14,8 +14,6 @@ fields:
 A lobe is the same for any multiple of its matrix. `Layout.unit` says which multiple is stored.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 import struct

@@ -11,8 +11,6 @@ integrals over disks of 10, 20 and 35 degrees, all over the hemisphere, relative
 1 are possible, because the fit of the tables takes lights into account and the search does not.
 """
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -8,8 +8,6 @@ coefficients together, for the same sum of errors as `refine.refine`, at POINTS 
 tables/pack.dds. Channel c of a table is channel c % 4 of layer FIRST_LAYERS[name] + c // 4. `sheen.py` fits sheen.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 from pathlib import Path

@@ -7,8 +7,6 @@ of the exact dielectric reflectance over index of refraction and angle, by weigh
 alternating least squares (Srebro and Jaakkola 2003).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 

@@ -20,8 +20,6 @@ The squared error of a point is a sum of four terms, all relative to the true lo
 - EXCESS_WEIGHT times the square of the excess of the negative mass, relative to the albedo, above NEGATIVE_SHARE.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -5,8 +5,6 @@ interpolates its albedo, a and b between 32 x 32 nodes. `fit` finds the spline c
 difference of the lobes, linearized at those of Cycles: one linear system. The result is a layer of tables/pack.dds.
 """
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -6,8 +6,6 @@ at the horizon and at the plane of incidence. The second set matters because a l
 needle at the horizon that samples of the BRDF alone never see.
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np

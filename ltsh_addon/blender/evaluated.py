@@ -1,7 +1,5 @@
 """What the evaluated scene holds: surfaces, instances and the traits of emitters."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from types import SimpleNamespace
@@ -120,7 +118,7 @@ class EmitterTraits:
     glossy: bool
 
     @classmethod
-    def of(cls, instance) -> EmitterTraits:
+    def of(cls, instance) -> "EmitterTraits":
         """The traits of a depsgraph instance.
 
         As in Cycles, the outermost instancer may switch lobes off, and its group is used if the object has none.
@@ -145,7 +143,7 @@ class RenderedSurface:
     material_slots: tuple[SimpleNamespace, ...]
 
     @classmethod
-    def of(cls, ob) -> RenderedSurface:
+    def of(cls, ob) -> "RenderedSurface":
         """The surface of the evaluated object `ob`."""
         materials = [slot.material for slot in ob.material_slots]
         slots = (SimpleNamespace(material=material and material.original) for material in materials)

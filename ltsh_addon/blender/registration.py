@@ -1,7 +1,5 @@
 """Adds LTSH to a running Blender: the command `blender [FILE] --command ltsh ...` and all of `PARTS`."""
 
-from __future__ import annotations
-
 import atexit
 import importlib
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Settings with which samples and references are rendered: camera, size, pixel filter, view layer, neutral values."""
 
-from __future__ import annotations
-
 from contextlib import contextmanager
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Copies of the open file: compressed and checked for completeness, or quickly for a second Blender."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 from pathlib import Path

@@ -4,8 +4,6 @@ Exit codes: 0 done; 1 a file, scene or folder is wrong; 2 the arguments are wron
 by SIGTERM.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import errno

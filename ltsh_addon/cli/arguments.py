@@ -3,8 +3,6 @@
 All mistakes in a job file are reported before anything starts.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 from collections.abc import Callable, Iterable

@@ -3,8 +3,6 @@
 That function takes the arguments, the progress bar and the file that Blender has open, and returns the exit code.
 """
 
-from __future__ import annotations
-
 import argparse
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The output of the command line: a progress bar, a log, and documents on stdout."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os
@@ -29,7 +27,7 @@ class RunLog:
         except OSError as error:
             self._fail(error)
 
-    def __enter__(self) -> RunLog:
+    def __enter__(self) -> "RunLog":
         return self
 
     def __exit__(self, *exception) -> None:

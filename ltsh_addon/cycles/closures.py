@@ -1,7 +1,5 @@
 """Reflectance of Cycles' closures: Fresnel terms, and albedos of microfacet, glass and sheen lobes."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 

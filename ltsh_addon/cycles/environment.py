@@ -5,8 +5,6 @@ are a tree of parts, each with its own mean; parts like their whole are not cut 
 and bright as the sun becomes a light of its own, and the pictures keep the rest.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -201,7 +199,7 @@ class _SkyQuadtree:
     errors: list[np.ndarray]  # (2^k, 2^k) about the mean absolute difference from the mean, times solid angle
 
     @classmethod
-    def of(cls, picture: SkyPicture) -> _SkyQuadtree:
+    def of(cls, picture: SkyPicture) -> "_SkyQuadtree":
         """For a picture whose side is a power of two pixels."""
         weight = picture.solid_angles()
         light, squares = picture.radiance * weight[..., None], np.square(picture.radiance).mean(axis=-1) * weight

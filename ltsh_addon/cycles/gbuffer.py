@@ -4,8 +4,6 @@ Cycles evaluates every texture, bump map and node group itself. The values arriv
 file, so nothing is averaged across an edge.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import fields, replace
 

@@ -1,7 +1,5 @@
 """The normals that Cycles bends, and the horizons that end its lobes where smooth normals differ from the mesh's."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -280,7 +278,7 @@ class _LightsOfKind:
     is_side: bool  # True for sides of the cube around the world; a direction meets exactly one
 
     @classmethod
-    def of(cls, lights, number, share) -> _LightsOfKind:
+    def of(cls, lights, number, share) -> "_LightsOfKind":
         """The lights of these numbers, which are of one kind; the `share` (L,) of each shines."""
         alike = [lights[n] for n in number]
         center, corners = (np.array([light.center for light in alike]), np.array([light.polygon() for light in alike]))
@@ -430,7 +428,7 @@ class _HorizonDirections:
     angle: np.ndarray  # (AROUND,) from the first of these to the second
 
     @classmethod
-    def of(cls, samples, is_quick: bool = False, is_side: bool = False) -> _HorizonDirections:
+    def of(cls, samples, is_quick: bool = False, is_side: bool = False) -> "_HorizonDirections":
         """The directions of `samples`. If any is True, each angle around the normal has only one of HEIGHTS; if both
         are, there are half as many angles. A few suffice for a light as large as a side of the sky."""
         mirrored = 2.0 * (samples.normal * samples.view).sum(axis=1, keepdims=True) * samples.normal - samples.view

@@ -1,7 +1,5 @@
 """The lobes of a surface as AOVs carry them, and the samples that follow from them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 
@@ -131,7 +129,7 @@ class SurfaceHits:
     receiver: np.ndarray  # (P,) integers
     diffuse_albedo: np.ndarray | None  # (P, 3) sum over all lobes; None: estimated lobe by lobe
 
-    def take(self, index) -> SurfaceHits:
+    def take(self, index) -> "SurfaceHits":
         """The hits at `index`."""
         values = {item.name: getattr(self, item.name) for item in fields(self)}
         return SurfaceHits(**{name: None if value is None else value[index] for name, value in values.items()})

@@ -5,8 +5,6 @@ the radiance and its patch is below `ERROR` of the mean radiance. The larger pat
 uses the coarsest ones that its lobe cannot resolve (`shading.light_polygons`).
 """
 
-from __future__ import annotations
-
 import heapq
 import itertools
 from collections.abc import Iterator
@@ -36,9 +34,9 @@ class Patch:
 
     cell: tuple[float, float, float, float]
     radiance: np.ndarray
-    parts: tuple[Patch, ...] = ()
+    parts: "tuple[Patch, ...]" = ()
 
-    def smallest(self) -> Iterator[Patch]:
+    def smallest(self) -> "Iterator[Patch]":
         """The uncut patches in this one."""
         if not self.parts:
             yield self
@@ -96,7 +94,7 @@ def cut_into_patches(image: np.ndarray, covered: np.ndarray, most: int = GRID * 
     return Patches(_patch(whole, halves_of, pixels), float(share))
 
 
-def _patch(cell, halves_of: dict, pixels: _Pixels) -> Patch | None:
+def _patch(cell, halves_of: dict, pixels: "_Pixels") -> Patch | None:
     cells, radiance = [cell] if cell in halves_of else [], pixels.mean(cell)
     for _ in range(CUTS):
         cells = [half for inner in cells for half in halves_of.get(inner, (inner,))]

@@ -4,8 +4,6 @@ Needs no bpy. Measured with 4.5.15 and 5.2.3: 8-bit images in sRGB are decoded a
 is black outside and blends to black within half a pixel.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -101,7 +99,7 @@ class TexelMesh:
     object: int | np.ndarray = 0  # number of the object of the atlas
 
     @classmethod
-    def joined(cls, meshes: Sequence[TexelMesh]) -> TexelMesh:
+    def joined(cls, meshes: "Sequence[TexelMesh]") -> "TexelMesh":
         """All `meshes` as one; what may hold for a whole mesh must be arrays (T,)."""
         return cls(**{item.name: np.concatenate([getattr(mesh, item.name) for mesh in meshes]) for item in fields(cls)})
 
@@ -115,7 +113,7 @@ class TexelMesh:
         np.savez(path, **{item.name: getattr(self, item.name) for item in fields(self)})
 
     @classmethod
-    def load(cls, path) -> TexelMesh:
+    def load(cls, path) -> "TexelMesh":
         """Read what `save` wrote."""
         with np.load(Path(path)) as data:
             return cls(**{item.name: data[item.name] for item in fields(cls)})
@@ -193,7 +191,7 @@ class BakeMaterial:
     moved: tuple[int, ...] = ()  # displaced: the maps of `maps.SURFACE`
 
     @classmethod
-    def of(cls, record: dict, images: Path, uv_maps: dict[str, Path]) -> BakeMaterial:
+    def of(cls, record: dict, images: Path, uv_maps: dict[str, Path]) -> "BakeMaterial":
         """From a JSON record, the folder of `images`, and the files of UV maps by name."""
         textures = []
         for entry in record["textures"]:

@@ -1,7 +1,5 @@
 """UV maps: which face a texel lies on, and where the surface goes on beyond a seam."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
@@ -37,7 +35,7 @@ class Texels:
     overlaps: int  # number of texels that are covered more than once
     unbaked: int = 0  # number of further texels that Cycles left out
 
-    def baked(self, is_baked: np.ndarray) -> Texels:
+    def baked(self, is_baked: np.ndarray) -> "Texels":
         """The texels that Cycles baked, given by the mask `is_baked` (Q,)."""
         unbaked = int(np.count_nonzero(~is_baked))
         remaining = self.index[is_baked], self.triangle[is_baked], self.barycentric[is_baked]
@@ -53,7 +51,7 @@ class UvTriangles:
     height: int
 
     @classmethod
-    def in_tile(cls, uv: np.ndarray, width: int, height: int, tile: tuple[int, int] = (0, 0)) -> UvTriangles:
+    def in_tile(cls, uv: np.ndarray, width: int, height: int, tile: tuple[int, int] = (0, 0)) -> "UvTriangles":
         """Triangles uv (T, 3, 2) on a texture of width x height texels that fills the unit square at `tile`."""
         # Single precision, as in Blender: otherwise rounding would move texels from one side of an edge to the other.
         size = np.array([width, height], dtype=np.float32)
@@ -125,7 +123,7 @@ class PointWeights:
     slope: np.ndarray  # (Q, 5) change of the weight with each moment
 
     @classmethod
-    def of(cls, triangles: UvTriangles, texels: Texels, points: Iterable[np.ndarray], width: float) -> PointWeights:
+    def of(cls, triangles: UvTriangles, texels: Texels, points: Iterable[np.ndarray], width: float) -> "PointWeights":
         """The weights for `points`, each (Q, 2), in a square of `width` texels."""
         center, half = triangles.places(texels), 0.5 * width
         wanted = np.tile((0.0, 0.0, 1.0 / 3.0, 0.0, 1.0 / 3.0), (len(center), 1))

@@ -6,8 +6,6 @@ has lights. It is exact where it has few corners. Of more corners, lobes that ca
 the same area and centroid in the plane square to the way to the body.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 

@@ -5,8 +5,6 @@ the half space over the lobe's normal stands for it. Cones and patterns make som
 `mean_emission` weights them by the lobe.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -67,7 +65,7 @@ class FacingDisk:
     gain: np.ndarray  # (Q,) factor of the radiance, below 1 for disks that are enlarged
 
     @classmethod
-    def of(cls, light, offset: np.ndarray, normal: np.ndarray) -> FacingDisk:
+    def of(cls, light, offset: np.ndarray, normal: np.ndarray) -> "FacingDisk":
         """For points from which the center of `light` is at `offset` (3, Q). Their lobes have the `normal` (3, Q)."""
         radius = offset.dtype.type(np.sqrt((light.half_u**2).sum()))
         squared = dot(offset, offset)
@@ -92,11 +90,11 @@ class FacingDisk:
         half_u, half_v = (disk_radius * axis for axis in normal_frames(-offset / length)[:2])
         return cls(offset, half_u, half_v, length, disk_radius, gain)
 
-    def take(self, index) -> FacingDisk:
+    def take(self, index) -> "FacingDisk":
         """The disks of the points `index`."""
         return FacingDisk(*(values[..., index] for values in vars(self).values()))
 
-    def along(self, cone) -> FacingDisk:
+    def along(self, cone) -> "FacingDisk":
         """The same disks turned so that the factor of `cone` changes most along u; unchanged without a cone."""
         if cone is None:
             return self
@@ -215,7 +213,7 @@ def pattern_values(pattern, normals: np.ndarray) -> np.ndarray:
     return (above * (1.0 - down) + below * down).astype(normals.dtype)
 
 
-def mean_emission(light, offset: np.ndarray, disk: FacingDisk, lobe: AnalyticLobe) -> np.ndarray | float:
+def mean_emission(light, offset: np.ndarray, disk: FacingDisk, lobe: "AnalyticLobe") -> np.ndarray | float:
     """Mean factor (Q,) of the light's radiance for the lobes; 1.0 if it is 1 everywhere. The light's center is at
     `offset` (3, Q).
 
@@ -272,7 +270,7 @@ class AnalyticLobe:
     view: np.ndarray | None = None  # (3, Q)
     alpha: np.ndarray | None = None  # (Q,)
 
-    def take(self, index) -> AnalyticLobe:
+    def take(self, index) -> "AnalyticLobe":
         """The lobes of the samples `index`."""
         return AnalyticLobe(*(None if values is None else values[..., index] for values in vars(self).values()))
 

@@ -1,7 +1,5 @@
 """How neighboring lights are grouped: binary trees of nodes, sums over their lights, stand-ins for many lights."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from ..scene import Light, QuadLight

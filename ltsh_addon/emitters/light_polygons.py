@@ -8,8 +8,6 @@ the integrand changes. For diffuse lobes that length is the distance. For specul
 the angle from its peak if that is larger.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -238,7 +236,7 @@ class LocalFrames:
     frame: np.ndarray
 
     @classmethod
-    def of(cls, samples: SurfaceSamples, normal: np.ndarray) -> LocalFrames:
+    def of(cls, samples: SurfaceSamples, normal: np.ndarray) -> "LocalFrames":
         """Frames around the normals (P, 3) of one of the lobes."""
         return cls(samples, local_frames(normal, samples.view))
 
@@ -320,12 +318,12 @@ class PatchTree:
     count: np.ndarray  # (N,) number of children
 
     @classmethod
-    def of(cls, light: Light) -> PatchTree:
+    def of(cls, light: Light) -> "PatchTree":
         """The patches of a light with children, built once."""
         return cached_on_children("_patch_tree", [light], cls._made)
 
     @classmethod
-    def _made(cls, lights) -> PatchTree:
+    def _made(cls, lights) -> "PatchTree":
         (light,), first = lights, []
         patches = [light]
         for patch in patches:  # the list grows meanwhile

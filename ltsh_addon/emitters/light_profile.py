@@ -15,8 +15,6 @@ give J. A Gauss-Legendre rule integrates over rho; its nodes are dense where the
 lobe makes J a step there.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 
@@ -57,7 +55,7 @@ class Profile:
     smooth: float
 
     @classmethod
-    def of(cls, light) -> Profile:
+    def of(cls, light) -> "Profile":
         """The profile of `light`."""
         tangent, share = spread_tangent(light.spread) if light.has_spread else (WIDE_OPEN, WIDE_OPEN)
         return cls(tangent, share, light.falloff, light.smooth)
@@ -163,7 +161,7 @@ class LightView:
     axis_v: np.ndarray  # (C, P) the second
 
     @classmethod
-    def of(cls, light, offset, along) -> LightView:
+    def of(cls, light, offset, along) -> "LightView":
         """The view from points at which the light's center has the offsets (3, P). along(vector (3,)) -> (C, P) returns
         the coordinates of a vector."""
         axes = plane_axes(light)
@@ -173,7 +171,7 @@ class LightView:
         foot = -distance * along(light.direction)
         return cls(distance, center, extent, foot, along(axes[0]), along(axes[1]))
 
-    def take(self, index) -> LightView:
+    def take(self, index) -> "LightView":
         """The view of the points at `index`: integers (Q,), a boolean mask (P,) or a slice."""
         columns = (self.foot[:, index], self.axis_u[:, index], self.axis_v[:, index])
         return LightView(self.distance[index], self.center[:, index], self.extent, *columns)

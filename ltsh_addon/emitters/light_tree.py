@@ -16,8 +16,6 @@ the light of ten samples of a tile is interpolated to the others, except for nea
 "Lightcuts", with tiles instead of points, doi:10.1145/1073204.1073318.)
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 from functools import cached_property
 
@@ -99,7 +97,7 @@ class LightTree:
     is_even: bool  # all lights are equally bright
 
     @classmethod
-    def of(cls, lights, bodies=()) -> LightTree:
+    def of(cls, lights, bodies=()) -> "LightTree":
         """The tree of lights whose radiance is positive, some of which form `bodies`."""
         center, area, covariance, diagonal, rim = small_lights.moments_of(lights)
         radiance = np.array([light.radiance for light in lights])
@@ -208,7 +206,7 @@ class NodeDistances:
     parallax: np.ndarray  # rad: how much directions from points of the tile to points of the node may differ
 
     @classmethod
-    def of(cls, tree: LightTree, tiles: Tiles, tile, node) -> NodeDistances:
+    def of(cls, tree: LightTree, tiles: Tiles, tile, node) -> "NodeDistances":
         """For the numbers (K,) of tiles and nodes."""
         offset = (tree.center[node] - tiles.center[tile]).astype(np.float32)
         half, reach, extent, radius = tiles.half[tile], tree.reach[node], tree.radius[node], tiles.radius[tile]
@@ -248,7 +246,7 @@ class TileNodePairs:
     crossed: np.ndarray  # light that is wrong where horizons and planes cross the node
 
     @classmethod
-    def of(cls, tree: LightTree, tiles: Tiles, tile, node) -> TileNodePairs:
+    def of(cls, tree: LightTree, tiles: Tiles, tile, node) -> "TileNodePairs":
         """For the numbers (K,) of tiles and nodes."""
         between = NodeDistances.of(tree, tiles, tile, node)
         size, tile_size = between.reach / between.nearest, between.radius / between.nearest
@@ -308,12 +306,12 @@ class TileNodePairs:
         for number, start, end in zip(numbers, first, np.append(first, len(pairs.tile))[1:], strict=True):
             yield number, pairs.take(slice(start, end))
 
-    def take(self, index) -> TileNodePairs:
+    def take(self, index) -> "TileNodePairs":
         """The pairs at `index` (Q,)."""
         return TileNodePairs(*(getattr(self, item.name)[index] for item in fields(self)))
 
     @classmethod
-    def joined(cls, pieces) -> TileNodePairs:
+    def joined(cls, pieces) -> "TileNodePairs":
         """All pairs of the `pieces`."""
         return cls(*(np.concatenate([getattr(pairs, item.name) for pairs in pieces]) for item in fields(cls)))
 

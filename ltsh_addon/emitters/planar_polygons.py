@@ -1,7 +1,5 @@
 """The largest flat polygons of a triangle mesh, and its outer side. Needs no bpy."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ A point sees a region of the light: the part in the cone of its spread and above
 suffice for most regions, at a tenth to a hundredth of the cost of `light_profile.layers`.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from ..lobes.polygon import dot

@@ -7,8 +7,6 @@ is interpolated between the centers of patches, so that sharp reflections show n
 patches themselves, `light_polygons.PatchTree`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 
@@ -43,12 +41,12 @@ class SkyMap:
     directions: np.ndarray  # (len(ROUGHNESS),) how many lobes take
 
     @classmethod
-    def of(cls, lights) -> SkyMap:
+    def of(cls, lights) -> "SkyMap":
         """The map of `SkyLight`s with children, made once."""
         return cached_on_children("_sky_map", lights, cls._made)
 
     @classmethod
-    def _made(cls, lights) -> SkyMap:
+    def _made(cls, lights) -> "SkyMap":
         trees = [PatchTree.of(light) for light in lights]
         grids = [_grid(tree) for tree in trees]
         side = min(max(FEWEST_TEXELS, *(grid.shape[1] for grid in grids)), MOST_TEXELS)

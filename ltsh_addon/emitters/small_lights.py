@@ -7,8 +7,6 @@ light. Such a light has at most 2 LARGEST^2 sr, so the error is 3e-6 per unit of
 The dots in shapes (...) stand for lights, samples or both; arrays broadcast over them.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -39,7 +37,7 @@ class SmallLight:
     diagonal: float  # m^2: square of the longer half diagonal of the parallelogram around it
 
     @classmethod
-    def of(cls, light) -> SmallLight:
+    def of(cls, light) -> "SmallLight":
         """For a `Light`."""
         (center,), (area,), _, (diagonal,), (radius,) = moments_of([light])
         return cls(center, float(radius), area, float(diagonal))
@@ -95,7 +93,7 @@ class RaysToCenters:
     slack: np.ndarray | None = None  # (...): relative change of a specular lobe over the light
 
     @classmethod
-    def along(cls, offset, area_vector, diagonal) -> RaysToCenters:
+    def along(cls, offset, area_vector, diagonal) -> "RaysToCenters":
         """Rays to lights with `area_vector` (3, ...) whose centers are at `offset` from the samples."""
         squares = dot(offset, offset)
         flux = np.maximum(-dot(area_vector, offset), np.float32(0.0))
@@ -105,7 +103,7 @@ class RaysToCenters:
         """Dot products (...) of the offsets with vectors (3, Q)."""
         return dot(vectors, self.offset)
 
-    def take(self, index) -> RaysToCenters:
+    def take(self, index) -> "RaysToCenters":
         """The rays `index` (Q,) of the last axis."""
         chosen = (values[..., index] for values in (self.offset, self.squares, self.distance, self.flux))
         diagonal = self.diagonal[index] if np.ndim(self.diagonal) else self.diagonal

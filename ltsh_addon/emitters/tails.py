@@ -9,8 +9,6 @@ follows from the center and the corners (Stroud 1971, "Approximate calculation o
 tails its error was at most SLACK times the fourth power of the contrast of the values in about 97 %.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,7 +51,7 @@ class LightFromPoints:
         return sum(np.where(np.abs(share - fills) < 1e-3, weight, 0.0) for fills, weight in CORNER_WEIGHTS)
 
     @classmethod
-    def of(cls, light, offset, toward) -> LightFromPoints:
+    def of(cls, light, offset, toward) -> "LightFromPoints":
         """For a `Light` or a `float64.LightOfEachSample`, in the precision of `offset`."""
         vectors = np.stack([light.half_u + light.half_v, light.half_u - light.half_v, light.area_vector])
         vectors = vectors[..., None] if vectors.ndim == 2 else vectors.transpose(0, 2, 1)
@@ -62,14 +60,14 @@ class LightFromPoints:
         return cls(offset, toward, vectors[:2].astype(offset.dtype), squares[:2], np.sqrt(squares[2]), profile)
 
     @classmethod
-    def of_plain(cls, halves, area, offset, toward) -> LightFromPoints:
+    def of_plain(cls, halves, area, offset, toward) -> "LightFromPoints":
         """For lights without a profile, given by two half axes (3, Q) and area vectors (3, Q)."""
         u, v = halves
         diagonals = np.stack([u + v, u - v])
         return cls(offset, toward, diagonals, (diagonals * diagonals).sum(axis=1), np.sqrt(dot(area, area)), None)
 
     @classmethod
-    def of_disk(cls, disk) -> LightFromPoints:
+    def of_disk(cls, disk) -> "LightFromPoints":
         """For a FacingDisk."""
         u, v = disk.half_u, disk.half_v
         square = disk.radius * disk.radius
@@ -103,7 +101,7 @@ class TailLimits:
     ior: np.ndarray | None  # (Q,) if the last integral is that of a dielectric
 
     @classmethod
-    def of(cls, axes, roughness, second, schlick, ior) -> TailLimits:
+    def of(cls, axes, roughness, second, schlick, ior) -> "TailLimits":
         """For samples with the normals and views `axes` (whose precision it takes), `roughness` (Q,), and `ior` (Q,) or
         None."""
         normal, view = axes
@@ -112,7 +110,7 @@ class TailLimits:
         ior = None if ior is None else np.maximum(ior, 1.0).astype(normal.dtype)
         return cls(normal, view, dot(normal, view), alpha * alpha, second, schlick, ior)
 
-    def take(self, columns) -> TailLimits:
+    def take(self, columns) -> "TailLimits":
         """The limits of the samples `columns`: integers (Q',) or a slice."""
         values = self.normal, self.view, self.cosine, self.alpha_squared, self.second, self.ior
         *values, ior = (value if value is None else value[..., columns] for value in values)

@@ -4,8 +4,6 @@ A tile has bounds on the positions and the lobes of its samples. On smooth surfa
 is interpolated to the others by cubics.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,7 +29,7 @@ class Tiles:
     only_tails: bool  # True: nodes must be in the tails of the lobes, `small_lights.SHARP_TAIL` from their peaks
 
     @classmethod
-    def of(cls, lobes, position, columns) -> Tiles:
+    def of(cls, lobes, position, columns) -> "Tiles":
         """The tiles with these `columns`, of samples with x, y, z in `position` (3, Q)."""
         every = np.concatenate(columns)
         first = np.concatenate([[0], np.cumsum([len(tile) for tile in columns])[:-1]])
@@ -65,7 +63,7 @@ class TileCubics:
     are_smooth: np.ndarray  # (T,) True if all that the lobes depend on is close to such a cubic
 
     @classmethod
-    def of(cls, tiles, keys, shape) -> TileCubics:
+    def of(cls, tiles, keys, shape) -> "TileCubics":
         """For tiles of the samples `tiles`. `keys` (D, Q) come from `neighbor_keys`; `shape` (S, Q) is what the lobes
         depend on, in units of the lengths over which they change."""
         count = max(map(len, tiles))

@@ -3,8 +3,6 @@
 PNG specification, third edition (W3C 2025), with an sRGB chunk.
 """
 
-from __future__ import annotations
-
 import os
 import struct
 import zlib

@@ -4,8 +4,6 @@ Functions and arguments are those of oidn.h of Open Image Denoise 2. As in Blend
 of their albedo and normal, which are denoised first.
 """
 
-from __future__ import annotations
-
 import ctypes
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager

@@ -3,8 +3,6 @@
 Files are written atomically, as one part of scanlines with ZIP compression.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import itertools
@@ -154,7 +152,7 @@ def writing_rows(
     pixel_aspect: float = 1.0,
     *,
     half: Sequence[str] = (),
-) -> Iterator[RowWriter]:
+) -> "Iterator[RowWriter]":
     """Context with a RowWriter for a file of `size` (width, height) with the channels `names`.
 
     Those of `half` are stored as half floats, values beyond theirs as the largest. The other arguments are those of

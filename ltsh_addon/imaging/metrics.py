@@ -9,8 +9,6 @@ Images", Proc. ACM Comput. Graph. Interact. Tech. 3(2), 2020, DOI 10.1145/340618
 low-dynamic-range version, for which radiance is brought to display values by one exposure for both pictures.
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass
 
 import numpy as np

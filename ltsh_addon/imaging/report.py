@@ -1,7 +1,5 @@
 """report.json, report.html and the index of pictures."""
 
-from __future__ import annotations
-
 import html
 import json
 import math

@@ -3,8 +3,6 @@
 It has no text: report.html labels it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

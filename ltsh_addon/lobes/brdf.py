@@ -17,8 +17,6 @@ v = (k^2 - 1 / k^2) cos(phi) sin(phi) and a = roughness^2 sqrt(u). Here phi is t
 and k = 1 / (1 - anisotropy). The frame of h' is turned so that o' has y = 0. Isotropic lobes have u = 1 and v = 0.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -222,7 +220,7 @@ class HalfVectors:
     along: np.ndarray  # (P,) v
 
     @classmethod
-    def of(cls, samples, frame, cosine) -> HalfVectors:
+    def of(cls, samples, frame, cosine) -> "HalfVectors":
         """For SurfaceSamples (P) in local frames (3, 3, P): rows tangent, bitangent, normal."""
         x, y = (sum(row[axis] * samples.tangent[:, axis] for axis in range(3)) for row in frame[:2])
         across, along = stretch(x, y, samples.anisotropy)
@@ -230,12 +228,12 @@ class HalfVectors:
         cosine = np.clip(cosine, 0.0, 1.0)
         return cls(np.sqrt(1.0 - cosine * cosine), cosine, alpha, across, along)
 
-    def take(self, index) -> HalfVectors:
+    def take(self, index) -> "HalfVectors":
         """For the samples `index`."""
         values = self.sine, self.cosine, self.alpha, self.across, self.along
         return HalfVectors(*(value[index] for value in values))
 
-    def astype(self, dtype) -> HalfVectors:
+    def astype(self, dtype) -> "HalfVectors":
         """The same in another precision."""
         values = self.sine, self.cosine, self.alpha, self.across, self.along
         return HalfVectors(*(value.astype(dtype) for value in values))
@@ -282,7 +280,7 @@ class HalfBoundary:
     encloses: np.ndarray  # (P,) True if e_z, the mirrored view, is inside
 
     @classmethod
-    def of(cls, halves: HalfVectors, polygon: np.ndarray) -> HalfBoundary:
+    def of(cls, halves: HalfVectors, polygon: np.ndarray) -> "HalfBoundary":
         """For polygons (3, V, P) above the horizon of local frames."""
         corner = project_to_sphere(polygon)
         following = np.roll(corner, -1, axis=1)

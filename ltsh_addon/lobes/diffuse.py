@@ -15,8 +15,6 @@ cut of the polygon at x = 0.
 Velvet, Ashikhmin's sheen, has no closed form. It takes Gauss-Legendre nodes in the triangles of the polygon.
 """
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

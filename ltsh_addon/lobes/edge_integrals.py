@@ -24,8 +24,6 @@ off. The result is divided by its error in the mean direction, so that small pol
 poles, so few nodes do an arc. They lie closer toward its lower end, where g is steep.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from math import comb
 

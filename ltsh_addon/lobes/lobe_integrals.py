@@ -4,8 +4,6 @@ LTC is Heitz et al. 2016 (doi:10.1145/2897824.2925895), LTSH is Allmenroeder and
 the horizon, transform it, and integrate the original distribution over it.
 """
 
-from __future__ import annotations
-
 from functools import partial
 
 import numpy as np

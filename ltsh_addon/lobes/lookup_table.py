@@ -20,8 +20,6 @@ and 2 are 1, (1 - c)^5 (Schlick 1994) and c (1 - c)^6 (the F82 tint of metals). 
 dielectrics.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from pathlib import Path
@@ -73,11 +71,11 @@ class Lobe:
             [self.xx * vectors[0] + self.xz * vectors[2], self.yy * vectors[1], self.zz * vectors[2]], axis=0
         )
 
-    def with_coefficients(self, coefficients: np.ndarray) -> Lobe:
+    def with_coefficients(self, coefficients: np.ndarray) -> "Lobe":
         """The same warps with other coefficients (F, K, P)."""
         return replace(self, coefficients=coefficients)
 
-    def take(self, index) -> Lobe:
+    def take(self, index) -> "Lobe":
         """The lobes at `index`: integers (Q,) or a boolean mask (P,)."""
         tilt = None if self.tilt is None else self.tilt[index]
         entries = (self.xx[index], self.xz[index], self.yy[index], self.zz[index])

@@ -6,8 +6,6 @@ accurate; the caller computes these again in double precision. Temporary arrays 
 overwrites them.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from functools import cache
 from math import prod

@@ -4,8 +4,6 @@ Batches of polygons are arrays (3, V, P): coordinate, corner, point. Unused corn
 between equal corners contributes exactly zero to every integral.
 """
 
-from __future__ import annotations
-
 from functools import cache
 
 import numpy as np

@@ -5,8 +5,6 @@ Y_lm = K_lm * P_l^(m)(z) * Re((x + i y)^m), m = 0..l, where P_l^(m) is the m-th 
 (0,0), (1,0), (1,1), (2,0), (2,1), (2,2), ... The BRDF is mirror-symmetric in y, so sine terms never appear.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from math import factorial, isqrt, pi, sqrt
 

@@ -10,8 +10,6 @@ and 7). The slope of the light over the normal is found by least squares among a
 linear regression of renderings (Moon, Carr and Yoon 2014, Adaptive Rendering Based on Weighted Local Regression).
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from ..scene import Film

@@ -1,7 +1,5 @@
 """Many tasks one after another, and their reports merged."""
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """The techniques of one scene beside each other and beside Cycles: error figures, EXR layers, sheet and report."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
@@ -38,7 +36,7 @@ class Comparison:
     extraction: Any  # blender.process.pixels.Extraction, which the core does not import
     results: dict[str, TechniqueResult]
     shadows: lighting.Shadows | None = None
-    transmitted: Comparison | None = None  # what is seen through glass
+    transmitted: "Comparison | None" = None  # what is seen through glass
 
     @property
     def film(self) -> Film:

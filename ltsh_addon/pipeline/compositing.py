@@ -21,8 +21,6 @@ What shines in sight, lamps and the world, has no noise, only jagged edges, whic
 of the denoiser. Cycles renders it once more by itself, with many samples at its edges.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -75,7 +73,7 @@ class DirectPass:
         """The share (H, W, 3) of it that is light of a light group."""
         return np.divide(self.groups[group], self.image, out=np.zeros_like(self.image), where=self.image != 0.0)
 
-    def scaled(self, factor: np.ndarray) -> DirectPass:
+    def scaled(self, factor: np.ndarray) -> "DirectPass":
         """The same with `factor` (H, W, 3) times LTSH's light."""
         groups = {group: factor * one for group, one in self.groups.items()}
         return replace(self, image=factor * self.image, groups=groups)

@@ -1,7 +1,5 @@
 """Results as one small EXR per picture, for Blender's Image Editor, and an index of them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -6,8 +6,6 @@ Pereyra 1973, "The differentiation of pseudo-inverses and nonlinear least square
 doi:10.1137/0710036), with the derivative of Kaufman 1975 (doi:10.1007/BF01932995). The rest is Levenberg-Marquardt.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -212,7 +210,7 @@ class TargetSamples:
     exposure: float = 1.0
 
     @classmethod
-    def of(cls, extraction, target: np.ndarray, weights: np.ndarray, squares, rays, technique) -> TargetSamples:
+    def of(cls, extraction, target: np.ndarray, weights: np.ndarray, squares, rays, technique) -> "TargetSamples":
         """Random points of an `Extraction` in each of the squares of a `target` (H, W, 3), whose pixels have `weights`
         (H, W). `squares` are the side in pixels and the most points in each; `rays` are a tracer and the most of a
         point."""

@@ -3,8 +3,6 @@
 radiance = closed form x visibility of the light. The visibility is the same for every technique.
 """
 
-from __future__ import annotations
-
 import itertools
 import time
 from collections import Counter
@@ -63,11 +61,11 @@ class Shadows:
     tracer: str  # name of the ray tracer
     seconds: float = 0.0
 
-    def take(self, index: np.ndarray) -> Shadows:
+    def take(self, index: np.ndarray) -> "Shadows":
         """The shadows of the samples at `index` (Q,)."""
         return replace(self, shares={name: values[:, index] for name, values in self.shares.items()})
 
-    def of_lights(self, numbers: Sequence[int]) -> Shadows:
+    def of_lights(self, numbers: Sequence[int]) -> "Shadows":
         """The shadows of the lights with these sorted `numbers`, renumbered from 0.
 
         Of lights that share their rays, `numbers` must hold all or none.
@@ -150,7 +148,7 @@ def trace_shadows(
         return tracer.trace(samples, sampling, workers=workers, progress=progress).take(index)
 
 
-def tell_expected(extraction, tables: dict[str, Shader], passes: Sequence[str], rays: int, progress) -> None:
+def tell_expected(extraction, tables: "dict[str, Shader]", passes: Sequence[str], rays: int, progress) -> None:
     """Call `progress.expect`, if there is one, with the seconds of stages to come, measured on LOOKS of the samples."""
     from ..blender.process.pixels import ended_at_horizons
 

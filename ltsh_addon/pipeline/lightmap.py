@@ -1,7 +1,5 @@
 """The bounced light of a lightmap: Cycles' indirect light, denoised island by island; and what a bake takes."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable

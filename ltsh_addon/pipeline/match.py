@@ -4,8 +4,6 @@ Radiance is linear in that of each light. The finished picture is a sum of one p
 none; the factors of these pictures are those of non-negative least squares (Lawson and Hanson 1974, chapter 23).
 """
 
-from __future__ import annotations
-
 import math
 import time
 from contextlib import contextmanager

@@ -3,8 +3,6 @@
 Radiance is linear in that of each light: each picture is multiplied by a factor per color channel.
 """
 
-from __future__ import annotations
-
 import json
 import zipfile
 from collections.abc import Callable, Sequence
@@ -53,7 +51,7 @@ class MixerRow:
     share: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of this bounced light, per channel
 
     @classmethod
-    def of(cls, record: dict) -> MixerRow:
+    def of(cls, record: dict) -> "MixerRow":
         """The row of a JSON record of its fields. Raises KeyError, TypeError."""
         return cls(**{**record, **{name: tuple(record[name]) for name in ("lights", "color", "share")}})
 
@@ -74,7 +72,7 @@ class LightPictures:
             np.savez(file, document=json.dumps(document), layers=self.layers, alpha=self.alpha)
 
     @classmethod
-    def load(cls, path: Path) -> LightPictures:
+    def load(cls, path: Path) -> "LightPictures":
         """Raises OSError, and ValueError where the file is not what `save` writes."""
         try:
             with Path(path).open("rb") as file, np.load(file) as data:

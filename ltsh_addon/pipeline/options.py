@@ -4,8 +4,6 @@ The command line has an argument for every such field, and job files have the sa
 the second Blender takes the fields that it shares. Records of finished tasks hold a digest of the fields that matter.
 """
 
-from __future__ import annotations
-
 import math
 import re
 import string

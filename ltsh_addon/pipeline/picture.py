@@ -3,8 +3,6 @@
 A baseline is the report of an earlier comparison: what got worse since, and where.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, nullcontext
@@ -293,7 +291,7 @@ class Baseline:
     pictures: dict[tuple, dict]  # by scene, camera and frame
 
     @classmethod
-    def read(cls, path: Path) -> Baseline:
+    def read(cls, path: Path) -> "Baseline":
         """Raises OSError where the file is missing, ValueError where it is no report of a comparison."""
         try:
             document = read_json(path)

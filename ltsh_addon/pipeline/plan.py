@@ -3,8 +3,6 @@
 All of it follows from measured numbers alone: nothing here opens a scene or shades.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

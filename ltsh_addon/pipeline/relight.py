@@ -3,8 +3,6 @@
 `--keep-visibility` writes the samples of a picture with all that this needs, RelightData.
 """
 
-from __future__ import annotations
-
 import json
 import zipfile
 import zlib
@@ -85,7 +83,7 @@ class RelightData:
         return taken if name not in self.edges else taken * np.atleast_3d(self.edges[name])
 
     @classmethod
-    def load(cls, path: Path) -> RelightData:
+    def load(cls, path: Path) -> "RelightData":
         """Raises OSError, and ValueError where the file is not what `write_relight_data` writes."""
         try:
             with Path(path).open("rb") as file, np.load(file) as data:
@@ -97,7 +95,7 @@ class RelightData:
             raise ValueError(f"{path}: {problem}; run the picture again") from error
 
     @classmethod
-    def _of(cls, document, arrays) -> RelightData:
+    def _of(cls, document, arrays) -> "RelightData":
         from ..blender.process.pixels import CyclesPasses, Extraction, ExtractionTimes, PictureFacts
 
         facts = document["extraction"]

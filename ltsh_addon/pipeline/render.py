@@ -4,8 +4,6 @@ LTSH's light is a specular and a diffuse picture, which replace Cycles' direct l
 shade as Cycles does, they are black and Cycles' light stays: no light counts twice, and none is lost.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """Tasks of a job: the names of their files, shards, and records of finished tasks."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

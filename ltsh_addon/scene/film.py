@@ -1,7 +1,5 @@
 """Film: where samples lie in a picture, which part of it was rendered, and in which color space."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import dataclass, replace
 
@@ -28,17 +26,17 @@ class Film:
     # (H, W) sums of these weights per pixel, absent samples included.
     whole: np.ndarray | None = None
 
-    def take(self, index) -> Film:
+    def take(self, index) -> "Film":
         """The film of the samples at `index`: integers (Q,), a boolean mask (P,) or a slice."""
         arrays = {name: getattr(self, name) for name in ("first", "count", "extent", "spread")}
         arrays = {name: None if values is None else values[index] for name, values in arrays.items()}
         return replace(self, pixel=self.pixel[index], **arrays)
 
-    def unspread(self) -> Film:
+    def unspread(self) -> "Film":
         """The same samples, each only in its own pixel."""
         return replace(self, spread=None, whole=None)
 
-    def hits(self, *arrays: np.ndarray) -> tuple[Film, list[np.ndarray]]:
+    def hits(self, *arrays: np.ndarray) -> "tuple[Film, list[np.ndarray]]":
         """The film of the hits, each only in its own pixel, and of per-sample `arrays` (P,) the sums of each hit."""
         if self.first is None:
             return self.unspread(), list(arrays)
@@ -77,7 +75,7 @@ class Film:
         inside = slice(around, around + self.height), slice(around, around + self.width)
         return np.moveaxis(sums.reshape(-1, *shape), 0, -1)[inside]
 
-    def shared(self, weights: np.ndarray, sub_sample: np.ndarray, rendered: np.ndarray) -> Film:
+    def shared(self, weights: np.ndarray, sub_sample: np.ndarray, rendered: np.ndarray) -> "Film":
         """The film whose pixels share their samples. `weights` (N, D, D) are those of the N points of a pixel,
         `sub_sample` (P,) is the point of each sample, `rendered` (H, W) the mask of the rendered pixels."""
         every = replace(self, pixel=np.flatnonzero(rendered))

@@ -11,8 +11,6 @@
 A textured light, and a side of the sky, is a tree: its `children` are finer lights, each of one radiance.
 """
 
-from __future__ import annotations
-
 import base64
 import itertools
 from collections.abc import Iterable
@@ -95,7 +93,7 @@ class Light:
     spread: ClassVar[float] = np.pi
     falloff: ClassVar[int] = 0
     smooth: ClassVar[float] = 0.0
-    children: ClassVar[tuple[Light, ...]] = ()
+    children: "ClassVar[tuple[Light, ...]]" = ()
     corners: ClassVar[np.ndarray | None] = None
     cone: ClassVar[SpotCone | None] = None
     pattern: ClassVar[Pattern | None] = None
@@ -120,12 +118,12 @@ class Light:
             object.__setattr__(self, "children", tuple(self.children))
 
     @classmethod
-    def like(cls, light: Light, **changes) -> Light:
+    def like(cls, light: "Light", **changes) -> "Light":
         """A light of this kind: the fields `changes`, and all others that `light` has too."""
         names = [name for name in _field_names(cls) if name in _field_names(type(light)) and name != "shape"]
         return cls(**{**{name: getattr(light, name) for name in names}, **changes})
 
-    def altered(self, **changes) -> Light:
+    def altered(self, **changes) -> "Light":
         """A copy with the fields `changes`, unchecked: `dataclasses.replace` takes too long for 100,000 lights."""
         light = object.__new__(type(self))
         light.__dict__.update({name: self.__dict__[name] for name in _field_names(type(self))}, **changes)
@@ -148,7 +146,7 @@ class Light:
         return {**record, "detail": [child.record() for child in self.children]}
 
     @property
-    def leaves(self) -> tuple[Light, ...]:
+    def leaves(self) -> "tuple[Light, ...]":
         """The finest lights that together are this one: this light itself where it has no children."""
         return tuple(leaf for child in self.children for leaf in child.leaves) if self.children else (self,)
 

@@ -1,7 +1,5 @@
 """Surface samples: the points that are shaded, with all that shading needs."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -81,13 +79,13 @@ class SurfaceSamples:
         across = np.maximum(1.0 - self.anisotropy, 1e-6)
         return self.roughness * np.sqrt(np.minimum(across, 1.0 / across))
 
-    def take(self, index) -> SurfaceSamples:
+    def take(self, index) -> "SurfaceSamples":
         """The samples at `index`: integers (Q,), a boolean mask (P,) or a slice."""
         count = len(self.position[index])
         return replace(self, **{field.name: _taken(getattr(self, field.name), index, count) for field in fields(self)})
 
     @classmethod
-    def joined(cls, pieces: list[SurfaceSamples]) -> SurfaceSamples:
+    def joined(cls, pieces: "list[SurfaceSamples]") -> "SurfaceSamples":
         """The samples of all `pieces`, at least one, one after another."""
         if len(pieces) == 1:
             return pieces[0]

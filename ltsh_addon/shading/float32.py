@@ -4,8 +4,6 @@
 points so close to a light's plane that an edge spans half a circle, tiny lights, and sharp lobes.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

@@ -3,8 +3,6 @@
 `float32` is the fast path; it leaves the points for which it is not accurate to this module.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from itertools import chain
 
@@ -50,7 +48,7 @@ class LightOfEachSample:
     has_falloff: bool = False
     children: tuple = ()
 
-    def take(self, index) -> LightOfEachSample:
+    def take(self, index) -> "LightOfEachSample":
         """The lights of the samples `index`."""
         names = ("center", "direction", "radiance", "half_u", "half_v", "area_vector")
         return replace(self, **{name: getattr(self, name)[index] for name in names})

@@ -4,8 +4,6 @@ The text is in `glsl/`: core.h is the same for all tables. This module reads it 
 table's numbers and degree. `tables/header.py` makes headers of it.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from functools import cache

@@ -1,7 +1,5 @@
 """Where a light must be for its highlight to be at a given pixel: the peak of its specular radiance in the picture."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace

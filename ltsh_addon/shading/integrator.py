@@ -3,8 +3,6 @@
 A `Task` shades each block. It is the same in this process and in worker processes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,7 +1,5 @@
 """The lights of one pass as single precision takes them: trees of many, lights with equally many corners, skies."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -34,7 +32,7 @@ class AlikeLights:
     column: np.ndarray  # (N,) column here of each of the N lights; -1 for those not here or too narrow
 
     @classmethod
-    def of(cls, lights, numbers) -> AlikeLights:
+    def of(cls, lights, numbers) -> "AlikeLights":
         """Those of `lights`, (light, row, corners), with these `numbers` (L,)."""
         alike = [lights[number][0] for number in numbers]
         centroid, area, _, diagonal, radius = small_lights.moments_of(alike)
@@ -60,7 +58,7 @@ class Lights(list):
     leaf_count = 0
 
     @classmethod
-    def of(cls, lights, name, leaves=()) -> Lights:
+    def of(cls, lights, name, leaves=()) -> "Lights":
         """Those of `lights` and `leaves` that affect the pass `name`. A Lights object is returned as it is."""
         if isinstance(lights, Lights):
             return lights

@@ -4,8 +4,6 @@ Arrays of vectors are (3, Q). The warp of a lobe (and its tilt, for "ltc") is mu
 so that one product takes the corners of a light into the coordinates in which the lobe is integrated.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial

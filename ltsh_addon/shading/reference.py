@@ -11,8 +11,6 @@ order grows until two orders agree. Lights are exact ellipses, convex pieces of 
 cone.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 
@@ -58,13 +56,13 @@ class PolygonBoundary:
     unit: np.ndarray
 
     @classmethod
-    def warped(cls, warp: Lobe, polygon: np.ndarray) -> PolygonBoundary:
+    def warped(cls, warp: Lobe, polygon: np.ndarray) -> "PolygonBoundary":
         """For polygons (3, V, P) in the local frame."""
         return cls(project_to_sphere(warp.to_original_domain(polygon)))
 
     pieces = property(lambda self: self.unit.shape[1])
 
-    def take(self, index) -> PolygonBoundary:
+    def take(self, index) -> "PolygonBoundary":
         """The boundaries of the points `index` (Q,)."""
         return PolygonBoundary(self.unit[:, :, index])
 
@@ -100,7 +98,7 @@ class EllipseBoundary:
     reach: np.ndarray  # (P,), pi if the whole ellipse is above the horizon, 0 if none of it is
 
     @classmethod
-    def warped(cls, warp: Lobe, center, half_u, half_v) -> EllipseBoundary:
+    def warped(cls, warp: Lobe, center, half_u, half_v) -> "EllipseBoundary":
         """For ellipses with centers and half axes (3, P) in the local frame."""
         center, half_u, half_v = (warp.to_original_domain(vector) for vector in (center, half_u, half_v))
         swing = np.hypot(half_u[2], half_v[2])
@@ -109,7 +107,7 @@ class EllipseBoundary:
 
     pieces = _ELLIPSE_PIECES + 1
 
-    def take(self, index) -> EllipseBoundary:
+    def take(self, index) -> "EllipseBoundary":
         """The boundaries of the points `index` (Q,)."""
         vectors = (self.center[:, index], self.half_u[:, index], self.half_v[:, index])
         return EllipseBoundary(*vectors, self.middle[index], self.reach[index])
@@ -168,7 +166,7 @@ class FacingEmission:
         """False everywhere: there is no tip."""
         return np.zeros(self.offset.shape[1], bool)
 
-    def take(self, index) -> FacingEmission:
+    def take(self, index) -> "FacingEmission":
         """The emission for the points `index` (Q,)."""
         return FacingEmission(self.light, self.frame[:, :, index], self.offset[:, index])
 
@@ -188,7 +186,7 @@ class Cone:
     profile: light_profile.Profile
     at_foot: np.ndarray  # (P,) True if the light is best integrated around `axis`, where the factor has its tip
 
-    def take(self, index) -> Cone:
+    def take(self, index) -> "Cone":
         """The cones of the points `index` (Q,)."""
         return Cone(self.axis[:, index], self.distance[index], self.profile, self.at_foot[index])
 

@@ -4,8 +4,6 @@
 they go. `rays` traces them, and `ratio` turns what they meet into the visibility of lights (`trace_visibility`).
 """
 
-from __future__ import annotations
-
 from .light_cluster import shared_numbers
 from .occluders import Hits, OccluderMesh, Occluders, Transparency
 from .ratio import ShadowSampling, Visibility, trace_ray_origins, trace_visibility

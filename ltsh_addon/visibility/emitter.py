@@ -4,8 +4,6 @@ Where a round, polygonal or textured light leaves the quadrilateral dark, the di
 `Sky` is the emitter of all sides of a sky.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

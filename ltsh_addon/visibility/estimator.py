@@ -4,8 +4,6 @@ Every pair of a sample and a light gets a few probe rays. If all arrive, or all 
 a neighbor in the picture says otherwise. The other pairs get more rays, the more light they reflect.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

@@ -1,7 +1,5 @@
 """`LightCluster`: many plain lights of one color as one emitter; and which lights share their rays."""
 
-from __future__ import annotations
-
 import heapq
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -92,7 +90,7 @@ class LightCluster:
                 heapq.heappush(nodes, (-float(size[half]), half))
         return np.array(sorted(node for _, node in nodes))
 
-    def pick(self, x: np.ndarray, lobes: Sequence[LobeBound], lobe_of_row: np.ndarray):
+    def pick(self, x: np.ndarray, lobes: "Sequence[LobeBound]", lobe_of_row: np.ndarray):
         """The leaves (S, Q) to which S rays from each of Q samples go, the probabilities (L, S, Q) of these by lobe,
         and the numbers x (S, Q) in [0, 1), rescaled for reuse. Row r of the rays chooses by lobe `lobe_of_row[r]`."""
         shape, sample, count = x.shape, np.tile(np.arange(x.shape[1]), len(x)), len(self.cut)

@@ -1,7 +1,5 @@
 """Who chooses a shadow ray in Cycles, the light or the lobes of the surface."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

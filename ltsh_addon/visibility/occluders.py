@@ -1,7 +1,5 @@
 """Occluders: triangle meshes, instances of them, and how much light they let through."""
 
-from __future__ import annotations
-
 import json
 import os
 from dataclasses import dataclass, field
@@ -272,7 +270,7 @@ class Occluders:
             result[first, other] = result.get((first, other), 0.0) + share
         return result
 
-    def opposed(self) -> PlacedTriangles:
+    def opposed(self) -> "PlacedTriangles":
         """The triangles in whose planes others face the other way, as where a box stands on a floor."""
         triangles, planes = self._large_triangles(np.flatnonzero(self.masks != 0))
         facing = planes.facing * self.handedness()[triangles.instance]
@@ -345,7 +343,7 @@ class Occluders:
             np.savez(file, **arrays)
 
     @classmethod
-    def load(cls, path: str | os.PathLike) -> Occluders:
+    def load(cls, path: str | os.PathLike) -> "Occluders":
         """The occluders that `save` wrote. Raises OSError and ValueError."""
         with np.load(Path(path)) as data:
             arrays = {name: data[name] for name in data.files}
@@ -407,7 +405,7 @@ class PlacedTriangles:
     triangle: np.ndarray  # (T,)
     corners: np.ndarray  # (T, 3, 3)
 
-    def take(self, index: np.ndarray) -> PlacedTriangles:
+    def take(self, index: np.ndarray) -> "PlacedTriangles":
         """The triangles at `index`: integers or a mask."""
         return PlacedTriangles(self.instance[index], self.triangle[index], self.corners[index])
 
@@ -424,7 +422,7 @@ class _Planes:
     group: np.ndarray  # (T,)
 
     @classmethod
-    def of(cls, corners: np.ndarray) -> _Planes:
+    def of(cls, corners: np.ndarray) -> "_Planes":
         """The planes of triangles (T, 3, 3)."""
         normal = _crosses(corners)
         length = np.linalg.norm(normal, axis=1)

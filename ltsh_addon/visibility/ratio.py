@@ -10,8 +10,6 @@ Like samples of pixels beside each other share their rays to a sky or to many li
 pixels", doi:10.1145/3414685.3417881), so that the result depends on the block. All else depends on neighbors alone.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack

@@ -9,8 +9,6 @@ Everything is in single precision. Arrays are (S, Q), S directions from each of 
 components first.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -86,7 +84,7 @@ class RaySampler:
 
     def __init__(
         self,
-        surface: SampleRows,
+        surface: "SampleRows",
         index: np.ndarray,
         emitter: Emitter | LightCluster,
         lobes: tuple[str, ...],

@@ -6,8 +6,6 @@ each packet. These calls are too short for threads to share a process, so a `Tra
 that traces opens its own.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import threading
@@ -252,7 +250,7 @@ class EmbreeCaster:
         self._packets = _Packets(embree.width, RAY_ROWS)
         self._hits = _Packets(embree.width, HIT_ROWS)
 
-    def of(self, occluders: Occluders) -> EmbreeCaster:
+    def of(self, occluders: Occluders) -> "EmbreeCaster":
         """A caster for other occluders."""
         return EmbreeCaster(occluders, self._embree)
 
@@ -300,7 +298,7 @@ class Tracer:
         # A worker process opens a tracer of its own.
         return open_tracer, (self.occluders, (self.library,))
 
-    def __enter__(self) -> Tracer:
+    def __enter__(self) -> "Tracer":
         return self
 
     def __exit__(self, *error) -> None:

@@ -4,8 +4,6 @@ Everything is in single precision. Arrays are (S, Q), S directions from each of 
 components first.
 """
 
-from __future__ import annotations
-
 import copy
 
 import numpy as np
@@ -42,7 +40,7 @@ class SphericalQuads:
         self.has_solid_angle = self.solid_angle > _LEAST_SOLID_ANGLE
         np.maximum(self.solid_angle, _LEAST_SOLID_ANGLE, out=self.solid_angle)
 
-    def take_rows(self, rows: slice) -> SphericalQuads:
+    def take_rows(self, rows: slice) -> "SphericalQuads":
         """The quadrilaterals of these `rows`, if they are (3, 4, S, Q): each sample sees several."""
         quads = copy.copy(self)
         for name in ("apex", "both"):

@@ -1,7 +1,5 @@
 """Where shadow rays start: on the triangle of a sample, or as far above it as Cycles lifts them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 from functools import cached_property
 
@@ -32,7 +30,7 @@ class ShadowTerminator:
             self._thickness[number] = self._thickness_of(number, slice(None)).max()
         self._opposed: OpposedFaces | None = None  # made by the first call of `ray_origins`
 
-    def ray_origins(self, samples: SurfaceSamples) -> RayOrigins:
+    def ray_origins(self, samples: SurfaceSamples) -> "RayOrigins":
         """Where rays from `samples` start: as in Cycles, on the triangle, which they leave without meeting it.
 
         A smooth surface would hide light that falls on its triangles at a grazing angle. There, rays start on a curved
@@ -190,18 +188,18 @@ class RayOrigins:
     touching_share: np.ndarray
 
     @classmethod
-    def empty(cls, count: int) -> RayOrigins:
+    def empty(cls, count: int) -> "RayOrigins":
         """Room for those of `count` samples, see `put`."""
         vectors, numbers = np.zeros((5, count, 3), np.float32), np.zeros((3, count), np.float32)
         return cls(*vectors[:3], numbers[0], vectors[3:], numbers[1], np.zeros(count, np.uint32), numbers[2])
 
-    def put(self, block: slice, values: RayOrigins) -> None:
+    def put(self, block: slice, values: "RayOrigins") -> None:
         """Set those of the samples of a block."""
         for field in fields(self):
             rows = getattr(self, field.name)
             (rows[:, block] if field.name == "lift" else rows[block])[:] = getattr(values, field.name)
 
-    def take(self, index) -> RayOrigins:
+    def take(self, index) -> "RayOrigins":
         """The starts of the samples at `index`: integers (Q,) or a slice."""
         lift = self.lift[:, index]
         return RayOrigins(*(lift if each.name == "lift" else getattr(self, each.name)[index] for each in fields(self)))
@@ -306,7 +304,7 @@ class _TrianglePoints:
     size: np.ndarray  # (Q,) m, extent of the triangle, plus its distance from the origin of the instance if not applied
 
     @classmethod
-    def of(cls, occluders: Occluders, hits: Hits, is_applied: np.ndarray) -> _TrianglePoints:
+    def of(cls, occluders: Occluders, hits: Hits, is_applied: np.ndarray) -> "_TrianglePoints":
         """For `hits`. Instances for which `is_applied` (I,) is True are in world space."""
         corners, normals = np.zeros((2, len(hits.ray), 3, 3))
         is_smooth, mesh = np.zeros(len(hits.ray), bool), occluders.mesh[hits.instance]
@@ -337,7 +335,7 @@ class _TrianglePoints:
             size,
         )
 
-    def take(self, index: np.ndarray) -> _TrianglePoints:
+    def take(self, index: np.ndarray) -> "_TrianglePoints":
         """The points at `index`."""
         return _TrianglePoints(*(getattr(self, each.name)[index] for each in fields(self)))
 

@@ -6,8 +6,6 @@ happens in a job does not depend on who does it, so the results do not depend on
 can be started, this process does everything.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import subprocess
@@ -65,7 +63,7 @@ class WorkerPool:
         self._workers: list[Worker] = []
         self.changed, self._is_closed = threading.Condition(), False
 
-    def __enter__(self) -> WorkerPool:
+    def __enter__(self) -> "WorkerPool":
         return self
 
     def __exit__(self, *error) -> None:
@@ -111,7 +109,7 @@ class WorkerPool:
         self._is_closed, context = False, worker.packed(self._context)
         self._workers = [Worker(self, context) for _ in range(count)]
 
-    def next_job(self) -> tuple[_Run, int] | None:
+    def next_job(self) -> "tuple[_Run, int] | None":
         """The run and number of the next job for a worker; waits for one. None if the pool is closed."""
         with self.changed:
             while not self._is_closed:

@@ -5,8 +5,6 @@ jobs need. Each later one has a job, and the task if that is a new one. The answ
 what `task.do` returned.
 """
 
-from __future__ import annotations
-
 import importlib
 import io
 import os

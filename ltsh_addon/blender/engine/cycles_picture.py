@@ -1,7 +1,5 @@
 """The Cycles picture that a view can show beside its own."""
 
-from __future__ import annotations
-
 import functools
 import hashlib
 from dataclasses import dataclass

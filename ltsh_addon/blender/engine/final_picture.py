@@ -1,7 +1,5 @@
 """The finished picture of one view layer and its passes, made as the command line makes it. Uses no bpy."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """What is drawn over a view: notes, captions, the line about what is left out, and the handle of a split view."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -23,7 +21,7 @@ CAPTION_COLOR = (1.0, 1.0, 1.0, 0.95)
 BRIGHTER_COLOR, DARKER_COLOR = (1.0, 0.45, 0.4, 1.0), (0.5, 0.6, 1.0, 1.0)
 
 
-def captions_of(settings, mode: str) -> Captions:
+def captions_of(settings, mode: str) -> "Captions":
     """What stands at the upper end of the view."""
     first = TECHNIQUES[settings.technique].label
     second = "Cycles" if settings.second_technique == CYCLES else TECHNIQUES[settings.second_technique].label

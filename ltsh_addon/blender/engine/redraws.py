@@ -1,7 +1,5 @@
 """When views are drawn again: while they are refined, and when shadows, worlds or lights have new results."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import math

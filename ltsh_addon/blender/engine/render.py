@@ -1,7 +1,5 @@
 """The engine's class, and how Blender's final renders (F12) call it."""
 
-from __future__ import annotations
-
 import logging
 import queue
 import tempfile

@@ -1,7 +1,5 @@
 """Settings of the view and final renders, and the panels of Cycles that our engine shares."""
 
-from __future__ import annotations
-
 import bpy
 
 from ...scene import CYCLES, DEFAULT_TECHNIQUE, SHIPPED_TABLES, TECHNIQUES

@@ -1,7 +1,5 @@
 """A 3D view with the engine: takes over the changes of the scene and draws its picture."""
 
-from __future__ import annotations
-
 import logging
 import math
 import time

@@ -1,7 +1,5 @@
 """Materials that show baked textures, in the open file or in a new .blend (a task of the child)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import bpy

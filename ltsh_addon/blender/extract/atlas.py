@@ -1,7 +1,5 @@
 """The atlas of a bake: a UV map in which many objects share one texture, each with texels that no other has."""
 
-from __future__ import annotations
-
 import math
 from contextlib import contextmanager
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ With bounced light an object depends on all that is rendered. Direct light depen
 objects, on materials that glow or let light through, and on the object's own materials.
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterable
 from pathlib import Path

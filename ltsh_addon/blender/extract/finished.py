@@ -1,7 +1,5 @@
 """The untouched scene as Cycles renders it, for finished pictures (runs in the child)."""
 
-from __future__ import annotations
-
 import math
 import time
 from functools import cache

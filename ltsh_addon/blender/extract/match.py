@@ -1,7 +1,5 @@
 """What `match` needs of Blender: target pictures as light, and changed lights (runs in the child)."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

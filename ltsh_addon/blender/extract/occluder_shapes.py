@@ -1,8 +1,6 @@
 """The shapes of what blocks light: meshes by their transparency, and hair and points as meshes: tubes and balls with
 flat faces and the mean width of round ones."""
 
-from __future__ import annotations
-
 import math
 from functools import cache
 

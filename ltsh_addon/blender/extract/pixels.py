@@ -1,7 +1,5 @@
 """The samples, the lights and the Cycles reference of a picture (runs in the child)."""
 
-from __future__ import annotations
-
 import time
 from contextlib import nullcontext, suppress
 from pathlib import Path

@@ -10,8 +10,6 @@ They are as in Cycles 4.5 and 5.2, measured to 2e-5. The strength is S = color *
 - Suns of half angle h: L = S / (pi sin^2 h), or S without Normalize.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from typing import Any

@@ -1,7 +1,5 @@
 """What lights emit: read from the node tree of a light, or from a render of the light where that is not enough."""
 
-from __future__ import annotations
-
 import tempfile
 import time
 from contextlib import contextmanager
@@ -83,7 +81,7 @@ class Falloff:
     power: int = 0
     smooth: float = 0.0
 
-    def times(self, other: Falloff) -> Falloff | None:
+    def times(self, other: "Falloff") -> "Falloff | None":
         """The product of both falloffs; None where a light cannot express it."""
         power = self.power + other.power
         return None if power > 2 or (self.smooth and other.smooth) else Falloff(power, self.smooth + other.smooth)
@@ -353,7 +351,7 @@ class ObjectFacts:
     random: float = 0.0
 
     @classmethod
-    def of(cls, ob, instance=None) -> ObjectFacts:
+    def of(cls, ob, instance=None) -> "ObjectFacts":
         """The facts of an object, or of an instance of it."""
         is_made = instance is not None and instance.is_instance
         random = instance.random_id if is_made else _random_id(ob.name)

@@ -1,7 +1,5 @@
 """Light groups of `match`: one for each light whose settings can be changed."""
 
-from __future__ import annotations
-
 from ...scene import SceneError, listed
 
 

@@ -7,8 +7,6 @@ its own wins over those of children, and that of the last child over those befor
 if that is in any receiver collection, otherwise its own object. Blocker collections work in the same way.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import bpy

@@ -1,7 +1,5 @@
 """Meshes that glow, as polygon lights."""
 
-from __future__ import annotations
-
 import itertools
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Lights with node trees or textures, as patches of constant radiance, patterns of directions, or their mean."""
 
-from __future__ import annotations
-
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """The light of the world as distant lights, made from pictures of it by Cycles (runs in the child)."""
 
-from __future__ import annotations
-
 import math
 from contextlib import contextmanager
 from dataclasses import replace

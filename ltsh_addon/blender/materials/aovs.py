@@ -4,8 +4,6 @@ Each node group gets a tree of its own, transparency and volumes are cut, and ne
 Pictures write all quantities into AOVs, bakes show them as `maps`.
 """
 
-from __future__ import annotations
-
 import functools
 import itertools
 import math

@@ -3,8 +3,6 @@
 All readers of materials get the row of a node from `bsdf_of`; a node without a row has no lobe.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import bpy

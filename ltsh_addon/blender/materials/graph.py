@@ -4,8 +4,6 @@ All readers of materials share this walk, which changes nothing: AOVs and bakes 
 (`preview_material`), the emission of lights, and the overview in the panels.
 """
 
-from __future__ import annotations
-
 import math
 import operator
 from collections.abc import Callable
@@ -143,7 +141,7 @@ class Source:
     groups: tuple = ()  # the group nodes around it, outermost first
     passed: tuple[str, ...] = ()  # types of the sockets of groups and muted nodes between it and what it feeds
 
-    def input(self, name) -> Source | None:
+    def input(self, name) -> "Source | None":
         """The source of the input `name` (or position) of the node."""
         return source_of(self.node.inputs[name], self.groups)
 
@@ -302,7 +300,7 @@ class SurfaceShaders:
     cuts: list[Cut] = field(default_factory=list)
     is_transparent: bool = False  # all of it is transparency
 
-    def _add(self, other: SurfaceShaders, *factors: Factor) -> None:
+    def _add(self, other: "SurfaceShaders", *factors: Factor) -> None:
         positions = {(leaf.node, leaf.groups): position for position, leaf in enumerate(self.leaves)}
         for leaf in other.leaves:
             terms = tuple((*factors, *term) for term in leaf.terms)

@@ -4,8 +4,6 @@ For a bake the material emits the values of a map. A color or normal takes a map
 `baked_transparency` bakes what a surface lets through for shadow rays.
 """
 
-from __future__ import annotations
-
 import math
 from contextlib import contextmanager
 from dataclasses import replace

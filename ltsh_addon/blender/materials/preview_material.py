@@ -1,7 +1,5 @@
 """Materials and worlds as the viewport shows them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 
 import bpy
@@ -48,7 +46,7 @@ class ViewFactor:
     is_complement: bool = False  # the factor is 1 minus the output
 
     @classmethod
-    def of(cls, kind: str, parameter: float, is_blend: bool = False) -> ViewFactor:
+    def of(cls, kind: str, parameter: float, is_blend: bool = False) -> "ViewFactor":
         """From the node's number: an index of refraction, or the Blend of a Layer Weight node."""
         if not is_blend:
             return cls(kind, max(parameter, 1e-5))
@@ -57,7 +55,7 @@ class ViewFactor:
         blend = float(np.clip(parameter, 0.0, 1.0 - 1e-5))
         return cls(kind, 2.0 * blend if blend < 0.5 else 0.5 / (1.0 - blend))
 
-    def complement(self) -> ViewFactor:
+    def complement(self) -> "ViewFactor":
         """1 minus this."""
         return replace(self, is_complement=not self.is_complement)
 
@@ -91,12 +89,12 @@ class PreviewMaterial:
     emission: np.ndarray = field(default_factory=lambda: np.zeros(3))
     glow: float = 0.0  # strength of a material that only emits, by the image of its color
     notes: tuple[str, ...] = ()
-    further: tuple[PreviewMaterial, ...] = ()  # lobes that are added to this one
+    further: "tuple[PreviewMaterial, ...]" = ()  # lobes that are added to this one
     is_clear: bool = False  # nothing is drawn
     is_stand_in: bool = False  # it stands for a node that is not shaded
 
     @property
-    def lobes(self) -> tuple[PreviewMaterial, ...]:
+    def lobes(self) -> "tuple[PreviewMaterial, ...]":
         """This lobe and the further ones."""
         return (self, *self.further)
 
@@ -219,7 +217,7 @@ class LobeWeight:
         """Its image as the quantity "weight" of a `PreviewMaterial`; {} without one."""
         return {} if self.image is None else {"weight": self.image}
 
-    def times(self, factor: Value | ViewFactor | None) -> LobeWeight | None:
+    def times(self, factor: Value | ViewFactor | None) -> "LobeWeight | None":
         """This share times `factor`; None if the product cannot be expressed."""
         if isinstance(factor, ViewFactor) and self.curve is None:
             return replace(self, curve=factor, shining=0.5 * self.shining)

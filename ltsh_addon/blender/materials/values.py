@@ -1,7 +1,5 @@
 """Values behind sockets: constants, image textures, and these after simple nodes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -44,12 +42,12 @@ class Value:
     def is_constant(self) -> bool:
         return self.image is None
 
-    def mapped(self, matrix: np.ndarray, offset=0.0) -> Value:
+    def mapped(self, matrix: np.ndarray, offset=0.0) -> "Value":
         """`matrix` (3, 3) times this value, plus `offset`."""
         image_matrix = None if self.matrix is None else matrix @ self.matrix
         return Value(matrix @ self.offset + offset, image_matrix, self.image)
 
-    def as_number(self, kind: str = "RGBA") -> Value:
+    def as_number(self, kind: str = "RGBA") -> "Value":
         """What a number socket makes of this color, or of this vector (`kind` VECTOR), in all three components."""
         return self if is_gray(self) else self.mapped(np.broadcast_to(TO_NUMBER[kind], (3, 3)))
 
@@ -96,11 +94,11 @@ class Curved:
     def is_constant(self) -> bool:
         return False
 
-    def mapped(self, factor: float, offset: float) -> Curved:
+    def mapped(self, factor: float, offset: float) -> "Curved":
         """`factor` times this number, plus `offset`."""
         return Curved(self.value, self.places, tuple(factor * number + offset for number in self.numbers))
 
-    def limited(self, low: float, high: float) -> Curved:
+    def limited(self, low: float, high: float) -> "Curved":
         """This number, limited to [low, high]."""
         places, numbers = np.array(self.places), np.array(self.numbers)
         for level in (low, high):

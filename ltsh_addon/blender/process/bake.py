@@ -1,7 +1,5 @@
 """The jobs of a bake: what there is to bake, its texels, and objects that show textures. Imports no bpy."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 

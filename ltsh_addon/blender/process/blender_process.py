@@ -5,8 +5,6 @@ The child answers with messages: lines of stdout that consist of LTSH and JSON. 
 for error texts. The end of stdin tells the child that the parent is gone.
 """
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import importlib.metadata

@@ -1,7 +1,5 @@
 """The job of a finished picture: the unchanged scene as Cycles renders it, and its PNG. Imports no bpy."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

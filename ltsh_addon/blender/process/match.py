@@ -1,7 +1,5 @@
 """The jobs of `match`: reading a target picture, and a copy of the scene with changed lights. Imports no bpy."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The job of a picture's samples: lights, surface samples and Cycles' picture of a .blend. Imports no bpy."""
 
-from __future__ import annotations
-
 import errno
 import math
 from collections.abc import Callable
@@ -87,7 +85,7 @@ class PictureFacts:
     color_space: ColorSpace = REC709
 
     @classmethod
-    def of(cls, record: dict) -> PictureFacts:
+    def of(cls, record: dict) -> "PictureFacts":
         """The facts that `record` describes; other keys of it are ignored."""
         fields = {name: record[name] for name in cls.__dataclass_fields__}
         border, space = record["border"], record["color_space"]
@@ -160,7 +158,7 @@ class Extraction:
     occluders: Occluders | None = None  # None without shadows
     light_settings: dict[str, list[float]] = field(default_factory=dict)  # power, exposure, red, green, blue by object
     glass: np.ndarray | None = None  # (H, W) share of the points of a pixel that show glass; None: no glass in view
-    behind: Extraction | None = None  # what is seen through the glass, tinted
+    behind: "Extraction | None" = None  # what is seen through the glass, tinted
     # Of finished pictures:
     left_to_cycles: LeftToCycles | None = None
     points: PixelPoints = field(default_factory=PixelPoints)

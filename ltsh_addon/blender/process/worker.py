@@ -3,8 +3,6 @@
 It does this job, and then the jobs whose paths come on stdin. The result of a job is manifest.json beside it.
 """
 
-from __future__ import annotations
-
 import importlib
 import json
 import os

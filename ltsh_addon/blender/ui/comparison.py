@@ -1,7 +1,5 @@
 """The picture of a comparison in the Image Editor: composes two results, and draws the wipe line."""
 
-from __future__ import annotations
-
 import functools
 import logging
 

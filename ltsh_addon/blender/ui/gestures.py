@@ -1,7 +1,5 @@
 """Gestures: lights by what they do. The mouse drags a light's highlight or shadow, or how bright a surface is."""
 
-from __future__ import annotations
-
 import logging
 import math
 from dataclasses import replace

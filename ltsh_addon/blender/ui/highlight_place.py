@@ -1,7 +1,5 @@
 """Where a light object must be for its highlight to be at the mouse: the surface around the mouse, read by rays."""
 
-from __future__ import annotations
-
 import gc
 import math
 from collections.abc import Callable

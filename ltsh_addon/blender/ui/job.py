@@ -1,7 +1,5 @@
 """A job in a second Blender: its arguments, its process, and the plan that estimates the time left."""
 
-from __future__ import annotations
-
 import json
 import math
 import shutil

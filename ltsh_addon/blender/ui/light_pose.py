@@ -1,7 +1,5 @@
 """How a light object stands, how a gesture may put it elsewhere and back, and what holds it."""
 
-from __future__ import annotations
-
 import colorsys
 import math
 from dataclasses import dataclass
@@ -21,7 +19,7 @@ class LightPose:
     is_sun: bool
 
     @classmethod
-    def of(cls, ob) -> LightPose:
+    def of(cls, ob) -> "LightPose":
         """That of the light object `ob` now."""
         names = ("location", "rotation_euler", "rotation_quaternion", "rotation_axis_angle", "scale")
         channels = {name: tuple(getattr(ob, name)) for name in names}
@@ -97,7 +95,7 @@ class LightLook:
     sizes: dict[str, float]
 
     @classmethod
-    def of(cls, ob) -> LightLook:
+    def of(cls, ob) -> "LightLook":
         """That of the light object `ob` now."""
         return cls(tuple(ob.data.color), {name: getattr(ob.data, name) for name in _sizes_of(ob.data)})
 

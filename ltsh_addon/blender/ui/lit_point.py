@@ -1,7 +1,5 @@
 """The point of a surface under the mouse: its material there, and how much each light gives it, shadows included."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -300,7 +298,7 @@ class SceneLights:
     textures: ShownTextures = field(default_factory=ShownTextures)
 
     @classmethod
-    def of(cls, context) -> SceneLights:
+    def of(cls, context) -> "SceneLights":
         """Those of the scene of `context`, with world and shadows as far as its preview has them."""
         scene, depsgraph, textures = context.scene, context.evaluated_depsgraph_get(), ShownTextures()
         lights, notes = view_lights(depsgraph, visibility(depsgraph, view_of(context)), textures)

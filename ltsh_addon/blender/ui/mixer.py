@@ -1,7 +1,5 @@
 """The panel of the light mixer: changes power, exposure and color of each light in a finished picture at once."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import replace
 from typing import ClassVar

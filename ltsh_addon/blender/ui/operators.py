@@ -1,7 +1,5 @@
 """Operators that start, follow and stop jobs, that show and save results, and that open the manual."""
 
-from __future__ import annotations
-
 import atexit
 import json
 import logging

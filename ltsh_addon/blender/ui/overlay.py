@@ -1,7 +1,5 @@
 """Text and shapes drawn over an image or a view."""
 
-from __future__ import annotations
-
 import blf
 import gpu
 from gpu_extras.batch import batch_for_shader

@@ -1,7 +1,5 @@
 """Panels of the 3D viewport's sidebar, of the render properties and of the image editor."""
 
-from __future__ import annotations
-
 import textwrap
 
 import bpy

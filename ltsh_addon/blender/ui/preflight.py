@@ -5,8 +5,6 @@ Lights and materials are read from the nodes without evaluating the scene, so it
 also knows about instances, textures and the state of the render.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 import os

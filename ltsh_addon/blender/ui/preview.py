@@ -4,8 +4,6 @@ Files are saved with the artist's engine and viewport shading, so that they open
 and redo leave the preview as it is: it is no change of the scene.
 """
 
-from __future__ import annotations
-
 import math
 
 import bpy

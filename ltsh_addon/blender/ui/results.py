@@ -1,7 +1,5 @@
 """Results as images of Blender: each picture of a job is a float image, loaded from its own EXR."""
 
-from __future__ import annotations
-
 import queue
 import threading
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Settings of the scene, preferences of the user, presets."""
 
-from __future__ import annotations
-
 import logging
 import os
 from dataclasses import dataclass

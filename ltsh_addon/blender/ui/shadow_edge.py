@@ -4,8 +4,6 @@ As seen from that point, the light is at the outline of the object: on the line 
 light just passes it. Of area lights that is their center.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -26,7 +26,7 @@ from .values import IDENTITY, READERS, is_srgb, opaque_pixels
 
 # UV_MAP: number of the map that shows the coordinates of the UV map being baked.
 UV_MAP = -1
-# SURFACE: outputs of the Geometry node for `cycles.texels.BakeMaterial.moved`, the last without bumps, unless from a mesh.
+# SURFACE: outputs of the Geometry node for `cycles.texels.BakeMaterial.moved`, the last one without bumps.
 SURFACE = "Position", "Normal", "True Normal", "Normal"
 # SAME_SPACE: the working space is Rec.709 if its matrix to Rec.709 differs less from the identity.
 SAME_SPACE = 1e-4

@@ -25,7 +25,7 @@ from .highlight_place import (
 )
 from .light_pose import LightLook, LightPose, locked_place, power_for, reason_to_keep_look, reason_to_keep_power
 from .lit_point import LightShare, SceneLights, SurfaceHit, hit_at, hits_at, share_line
-from .preview import PASSED_ON, active_light, lights_of, pointer, view_under
+from .preview import PASSED_ON, LTSHOperator, active_light, lights_of, pointer, view_under
 from .shadow_edge import NEAR_EDGE, OccluderRays, shadow_edge_near
 
 # FARTHER: the factor of the distance by a step of the wheel.
@@ -52,14 +52,14 @@ NO_SURFACE = "there is no surface under the mouse"
 _logger = logging.getLogger(__name__)
 
 
-class Gesture:
+class Gesture(LTSHOperator):
     """A modal operator: a drag with the left button over surfaces changes a light, until the button is released.
 
     Subclasses have `press`, `follow`, `put_back`, KEYS and the ICON of their tool. The headers of the 3D views tell the
     share of each light where the mouse rests, during a drag what `follow` notes.
     """
 
-    KEYS = ""  # what the status bar says
+    KEYS, NEEDS_OBJECT_MODE = "", True  # KEYS: what the status bar says
 
     def invoke(self, context, event):
         self._is_dragged, self._note, self._scene_lights, self._textures = False, "", None, ShownTextures()
@@ -82,17 +82,6 @@ class Gesture:
                 return {"CANCELLED"}
         context.window_manager.modal_handler_add(self)
         return {"RUNNING_MODAL"}
-
-    @classmethod
-    def poll(cls, context):
-        if reason := cls.reason_against(context):
-            cls.poll_message_set(reason)
-        return not reason
-
-    @classmethod
-    def reason_against(cls, context) -> str:
-        """Why the gesture cannot begin; "" if it can."""
-        return "" if context.mode == "OBJECT" else "Lights are dragged in Object Mode"
 
     @classmethod
     def words(cls, context) -> str:
@@ -345,7 +334,6 @@ class LTSH_OT_drag_highlight(MovingGesture, bpy.types.Operator):
     """Drag the highlight of the active light, or without one of the light that gives the pressed point the most glossy
     light, over surfaces in a 3D view: the light follows, keeps its distance and faces them"""
 
-    bl_idname = "ltsh.drag_highlight"
     bl_label = "Drag Highlight"
     bl_options = {"UNDO"}
     KEYS, ICON, CHOOSES = f"Drag the highlight of {{}}    {MOVING_KEYS}", "ops.transform.tosphere", True
@@ -416,7 +404,6 @@ class LTSH_OT_drag_highlight(MovingGesture, bpy.types.Operator):
 class LTSH_OT_drag_brightness(Gesture, bpy.types.Operator):
     """Press on a surface in a 3D view and drag up or down: the light that gives it the most changes its power"""
 
-    bl_idname = "ltsh.drag_brightness"
     bl_label = "Drag Brightness"
     bl_options = {"UNDO"}
     KEYS = (
@@ -480,7 +467,6 @@ class LTSH_OT_drag_shadow(MovingGesture, bpy.types.Operator):
     """Drag the edge of a shadow of the active light over surfaces in a 3D view: the light follows, keeps its distance
     from what it faces, and goes on facing it"""
 
-    bl_idname = "ltsh.drag_shadow"
     bl_label = "Drag Shadow"
     bl_options = {"UNDO"}
     KEYS, ICON = f"Drag the edge of a shadow of {{}}    {MOVING_KEYS}", "ops.transform.shear"
@@ -538,7 +524,6 @@ class LTSH_OT_drag_shadow(MovingGesture, bpy.types.Operator):
 class LTSH_OT_aim_light(MovingGesture, bpy.types.Operator):
     """Turn the active light, where it is, to face the point of a surface under the mouse in a 3D view"""
 
-    bl_idname = "ltsh.aim_light"
     bl_label = "Aim Light"
     bl_options = {"UNDO"}
     KEYS = "Press where {} shall shine, and drag    S: size    C: color    Shift: precise    Ctrl: corners"

@@ -33,6 +33,7 @@ from .job import (
     steps,
     write_target,
 )
+from .preview import LTSHOperator
 
 TIMER_SECONDS, WAITING_SECONDS = 0.1, 0.005
 
@@ -42,36 +43,48 @@ def running_job() -> Job | None:
     return results.state["job"]
 
 
-class _JobOperator:
-    """A job, watched by a timer; Esc ends it."""
+class WatchedOperator(LTSHOperator):
+    """An operator that a timer follows until it ends: it begins by `_begin`, and `_wait` waits for it."""
 
-    # Not REGISTER: "Repeat Last" would run `execute`, which waits.
-    bl_options = {"UNDO"}
-    command = ""
-    _opened = False  # the next results are set in the scene, but the comparison does not show them yet
-
-    @classmethod
-    def poll(cls, context):
-        if running_job() is not None:
-            cls.poll_message_set("A job is running: wait for it, or cancel it")
-            return False
-        return context.scene is not None
+    _timer = None
 
     def invoke(self, context, event):
         if not self._begin(context):
             return {"CANCELLED"}
-        self._progress = None
-        manager = context.window_manager
-        self._timer = manager.event_timer_add(TIMER_SECONDS, window=context.window)
-        manager.modal_handler_add(self)
+        self._timer = context.window_manager.event_timer_add(TIMER_SECONDS, window=context.window)
+        context.window_manager.modal_handler_add(self)
         self._show_progress(context)
         return {"RUNNING_MODAL"}
 
     def execute(self, context):
         """Without a window, as from scripts, wait for the end."""
-        self._timer = None
-        if not self._begin(context):
-            return {"CANCELLED"}
+        return self._wait(context) if self._begin(context) else {"CANCELLED"}
+
+    def _show_progress(self, context) -> None:
+        comparison.redraw_panels()
+
+    def _end_timer(self, context) -> None:
+        if self._timer is not None:
+            context.window_manager.event_timer_remove(self._timer)
+            self._timer = None
+
+
+class _JobOperator(WatchedOperator):
+    """A job; Esc ends it."""
+
+    # Not REGISTER: "Repeat Last" would run `execute`, which waits.
+    bl_options = {"UNDO"}
+    command = ""
+    _opened = False  # the next results are set in the scene, but the comparison does not show them yet
+    _progress = None
+
+    @classmethod
+    def reason_against(cls, context) -> str:
+        """As `LTSHOperator.reason_against`."""
+        busy = "A job is running: wait for it, or cancel it"
+        return super().reason_against(context) or (busy if running_job() is not None else "")
+
+    def _wait(self, context):
         try:
             self._job.wait()
             self._show_all_results(context)
@@ -178,11 +191,6 @@ class _JobOperator:
         while self._show_some_results(context):
             time.sleep(WAITING_SECONDS)
 
-    def _end_timer(self, context) -> None:
-        if self._timer is not None:
-            context.window_manager.event_timer_remove(self._timer)
-            self._timer = None
-
     def _finish(self, context):
         job = self._job
         self._end_timer(context)
@@ -243,7 +251,6 @@ class _JobOperator:
 class LTSH_OT_shade(_JobOperator, bpy.types.Operator):
     """Shade what the active camera sees, with the chosen technique"""
 
-    bl_idname = "ltsh.shade"
     bl_label = "Shade Camera View"
     command = "shade"
 
@@ -252,7 +259,6 @@ class LTSH_OT_compare(_JobOperator, bpy.types.Operator):
     """Shade what the active camera sees, render it with Cycles too, and measure the difference.
     Direct light on both sides, without bounces"""
 
-    bl_idname = "ltsh.compare"
     bl_label = "Compare with Cycles"
     command = "compare"
 
@@ -260,7 +266,6 @@ class LTSH_OT_compare(_JobOperator, bpy.types.Operator):
 class LTSH_OT_bake(_JobOperator, bpy.types.Operator):
     """Bake the light on the selected objects into textures, one EXR for each"""
 
-    bl_idname = "ltsh.bake"
     bl_label = "Bake Selected"
     command = "bake"
 
@@ -269,49 +274,41 @@ class LTSH_OT_match_move(_JobOperator, bpy.types.Operator):
     """Move and turn the lights of the scene and change their powers, so that its finished picture, bounces included,
     comes closest to the target. Takes a minute or more"""
 
-    bl_idname = "ltsh.match_move"
     bl_label = "Match and Move"
     command = "match"
 
     @classmethod
-    def poll(cls, context):
-        if not super().poll(context):
-            return False
+    def reason_against(cls, context) -> str:
+        """As `LTSHOperator.reason_against`."""
+        if reason := super().reason_against(context) or results.reason_without_target(context.scene):
+            return reason
         target = context.scene.ltsh.match_target
-        if target is None:
-            cls.poll_message_set("Choose a target, or paint one")
-        elif target.get(results.DIRECT_ONLY):
-            cls.poll_message_set(
-                f"{target.name} was painted on direct light alone: render with Complete and Keep Lights, paint on that"
-            )
-        return target is not None and not target.get(results.DIRECT_ONLY)
+        direct = "was painted on direct light alone: render with Complete and Keep Lights, paint on that"
+        return f"{target.name} {direct}" if target.get(results.DIRECT_ONLY) else ""
 
 
-class LTSH_OT_watch(_JobOperator, bpy.types.Operator):
+class _OnRunningJob(LTSHOperator):
+    @classmethod
+    def reason_against(cls, context) -> str:
+        """As `LTSHOperator.reason_against`."""
+        return "No job is running" if running_job() is None else ""
+
+
+class LTSH_OT_watch(_OnRunningJob, _JobOperator, bpy.types.Operator):
     """Watch the job that runs, whose own window was closed"""
 
-    bl_idname = "ltsh.watch"
     bl_label = "Watch Job"
     bl_options = {"UNDO", "INTERNAL"}
-
-    @classmethod
-    def poll(cls, context):
-        return running_job() is not None
 
     def _begin(self, context) -> bool:
         self._job = running_job()
         return True
 
 
-class LTSH_OT_cancel(bpy.types.Operator):
+class LTSH_OT_cancel(_OnRunningJob, bpy.types.Operator):
     """Stop the job; pictures that are finished are kept"""
 
-    bl_idname = "ltsh.cancel"
     bl_label = "Cancel"
-
-    @classmethod
-    def poll(cls, context):
-        return running_job() is not None
 
     def execute(self, context):
         running_job().cancel()
@@ -353,19 +350,17 @@ COMMANDS = (
 )
 
 
-class _NeedsResults:
+class _NeedsResults(LTSHOperator):
     @classmethod
-    def poll(cls, context):
-        if context.scene is None or results.result_of(context.scene) is None:
-            cls.poll_message_set("There are no results yet: shade, compare or bake first")
-            return False
-        return True
+    def reason_against(cls, context) -> str:
+        """As `LTSHOperator.reason_against`."""
+        missing = context.scene is None or results.result_of(context.scene) is None
+        return "There are no results yet: shade, compare or bake first" if missing else ""
 
 
 class LTSH_OT_open_results(_NeedsResults, bpy.types.Operator):
     """Show the pictures in an Image Editor that is open, or in a window of their own"""
 
-    bl_idname = "ltsh.open_results"
     bl_label = "Open in Image Editor"
 
     def execute(self, context):
@@ -376,10 +371,9 @@ class LTSH_OT_open_results(_NeedsResults, bpy.types.Operator):
         return {"CANCELLED"}
 
 
-class LTSH_OT_show_results(bpy.types.Operator):
+class LTSH_OT_show_results(LTSHOperator, bpy.types.Operator):
     """Look at what this command left last"""
 
-    bl_idname = "ltsh.show_results"
     bl_label = "Show Results"
     bl_options = {"UNDO"}
 
@@ -396,10 +390,9 @@ class LTSH_OT_show_results(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LTSH_OT_choose(bpy.types.Operator):
+class LTSH_OT_choose(LTSHOperator, bpy.types.Operator):
     """Choose what is shown of the results"""
 
-    bl_idname = "ltsh.choose"
     bl_label = "Choose"
     bl_options = {"UNDO", "INTERNAL"}
 
@@ -418,7 +411,6 @@ class LTSH_OT_choose(bpy.types.Operator):
 class LTSH_OT_swap(_NeedsResults, bpy.types.Operator):
     """Exchange the two pictures"""
 
-    bl_idname = "ltsh.swap"
     bl_label = "Swap A and B"
     bl_options = {"UNDO"}
 
@@ -429,19 +421,18 @@ class LTSH_OT_swap(_NeedsResults, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LTSH_OT_apply_bake(bpy.types.Operator):
+class LTSH_OT_apply_bake(LTSHOperator, bpy.types.Operator):
     """Let the objects of the last bake show their textures: they get copies of their materials"""
 
-    bl_idname = "ltsh.apply_bake"
     bl_label = "Apply Bake"
     bl_options = {"REGISTER", "UNDO"}
+    NEEDS_OBJECT_MODE = True
 
     @classmethod
-    def poll(cls, context):
-        if context.scene is None or last_bake(context.scene) is None:
-            cls.poll_message_set("There is no bake yet: bake first")
-            return False
-        return context.mode == "OBJECT"
+    def reason_against(cls, context) -> str:
+        """As `LTSHOperator.reason_against`."""
+        reason = super().reason_against(context)
+        return reason or ("There is no bake yet: bake first" if last_bake(context.scene) is None else "")
 
     def execute(self, context):
         result, gone, shown = last_bake(context.scene), [], []
@@ -466,19 +457,18 @@ class LTSH_OT_apply_bake(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LTSH_OT_restore_materials(bpy.types.Operator):
+class LTSH_OT_restore_materials(LTSHOperator, bpy.types.Operator):
     """Give objects that show baked textures their materials back"""
 
-    bl_idname = "ltsh.restore_materials"
     bl_label = "Restore Materials"
     bl_options = {"REGISTER", "UNDO"}
+    NEEDS_OBJECT_MODE = True
 
     @classmethod
-    def poll(cls, context):
-        if context.scene is None or not any(shows_texture(ob) for ob in context.scene.objects):
-            cls.poll_message_set("No object shows a baked texture")
-            return False
-        return context.mode == "OBJECT"
+    def reason_against(cls, context) -> str:
+        """As `LTSHOperator.reason_against`."""
+        reason = super().reason_against(context)
+        return reason or ("" if any(map(shows_texture, context.scene.objects)) else "No object shows a baked texture")
 
     def execute(self, context):
         restored = [ob.name for ob in context.scene.objects if restore_materials(ob)]
@@ -521,10 +511,9 @@ def baked_texture(scene, result, record: dict) -> BakedTextures:
     return BakedTextures(bake_members(record), record["uv"], f"{record['name']} {layer}", files)
 
 
-class LTSH_OT_manual(bpy.types.Operator):
+class LTSH_OT_manual(LTSHOperator, bpy.types.Operator):
     """Read the manual of LTSH, one page, in a new window"""
 
-    bl_idname = "ltsh.manual"
     bl_label = "Manual"
 
     def execute(self, context):

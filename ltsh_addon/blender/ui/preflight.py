@@ -33,7 +33,7 @@ from ..materials.graph import shaders_behind, surface_of
 from ..materials.preview_material import preview_of
 from ..render_settings import CAMERA_KINDS, CAMERA_TYPES, picture_size
 from . import results
-from .preview import ENGINE, lights_of, view_of
+from .preview import ENGINE, LTSHOperator, lights_of, view_of
 
 EXACT, APPROXIMATED, LEFT_OUT = "exact", "approximated", "left out"
 UNWRAPPED_SIDE = 128  # the least texels a side for which islands of an object keep their distance
@@ -250,10 +250,9 @@ class LTSH_UL_baked(bpy.types.UIList):
             side.label(text=BAKE_STATES[state][0], icon=BAKE_STATES[state][1])
 
 
-class LTSH_OT_add_camera(bpy.types.Operator):
+class LTSH_OT_add_camera(LTSHOperator, bpy.types.Operator):
     """Add a camera that looks as the 3D viewport does, and make it the scene's active camera"""
 
-    bl_idname = "ltsh.add_camera"
     bl_label = "Add Camera"
     bl_options = {"REGISTER", "UNDO"}
 
@@ -269,18 +268,14 @@ class LTSH_OT_add_camera(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LTSH_OT_add_uv_map(bpy.types.Operator):
+class LTSH_OT_add_uv_map(LTSHOperator, bpy.types.Operator):
     """Unwrap the object into a new UV map (Smart UV Project)"""
 
-    bl_idname = "ltsh.add_uv_map"
     bl_label = "Unwrap"
     bl_options = {"REGISTER", "UNDO"}
+    NEEDS_OBJECT_MODE = True
 
     object_name: StringProperty(name="Object", description="Name of the object")
-
-    @classmethod
-    def poll(cls, context):
-        return context.mode == "OBJECT"
 
     def execute(self, context):
         ob = context.view_layer.objects.get(self.object_name)
@@ -293,17 +288,13 @@ class LTSH_OT_add_uv_map(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LTSH_OT_make_atlas(bpy.types.Operator):
+class LTSH_OT_make_atlas(LTSHOperator, bpy.types.Operator):
     """Unwrap the selected objects into one texture, on a UV map Lightmap that is added; all others stay.
     Objects that share a mesh get one each"""
 
-    bl_idname = "ltsh.make_atlas"
     bl_label = "Make Atlas"
     bl_options = {"REGISTER", "UNDO"}
-
-    @classmethod
-    def poll(cls, context):
-        return context.mode == "OBJECT"
+    NEEDS_OBJECT_MODE = True
 
     def execute(self, context):
         try:
@@ -318,10 +309,9 @@ class LTSH_OT_make_atlas(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LTSH_OT_pack_image(bpy.types.Operator):
+class LTSH_OT_pack_image(LTSHOperator, bpy.types.Operator):
     """Keep the changes of the image in the .blend"""
 
-    bl_idname = "ltsh.pack_image"
     bl_label = "Pack Image"
     bl_options = {"REGISTER", "UNDO"}
 

@@ -24,10 +24,20 @@ import numpy as np
 from ..lobes.polygon import dot
 from ..scene import Light
 from . import small_lights
-from .convex_bodies import ConvexBody
-from .light_nodes import NodeSums, node_ranges, normal_spreads, over_lights
+from .light_nodes import (
+    NodeSums,
+    TileCubics,
+    Tiles,
+    lengths,
+    neighbor_keys,
+    node_ranges,
+    normal_spreads,
+    over_lights,
+    products,
+    split_columns,
+)
+from .mesh_polygons import ConvexBody
 from .tails import NEAR_RADII
-from .tiles import TileCubics, Tiles, lengths, neighbor_keys, products, split_columns
 
 # A group with fewer lights is shaded light by light.
 FEWEST = 64

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..cycles.texels import TexelMesh
 from ..cycles.uv import cross, repeated
-from ..emitters.planar_polygons import connected
+from ..emitters.mesh_polygons import connected
 
 # SAME_PLACE: corners that are nearer count as one, relative to the size of all. SAME_UV: the same in texels.
 SAME_PLACE, SAME_UV = 1e-6, 1.0 / 64.0

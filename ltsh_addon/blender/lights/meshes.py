@@ -8,8 +8,8 @@ import bpy
 import numpy as np
 
 from ...cycles.patches import GRID, cut_into_patches, note_patches, split_light
-from ...emitters import planar_polygons
-from ...emitters.planar_polygons import FlatPolygon
+from ...emitters import mesh_polygons
+from ...emitters.mesh_polygons import FlatPolygon
 from ...scene import Light, PolygonLight, QuadLight
 from ..evaluated import SURFACE_TYPES, EmitterTraits, RenderedSurface, is_rendered, read_values, surface_instancer
 from ..materials.graph import computed, ensure_nodes, fill_with_bsdf, is_displaced, live_link, material_output, mixed
@@ -241,10 +241,10 @@ def _emitting_side(mesh_light: MeshLight, eye: np.ndarray) -> int:
     sides = set()
     for placement in mesh_light.placements:
         vertices = placement.vertices
-        triangles = planar_polygons.welded(vertices, placement.triangles)
-        closed = planar_polygons.is_closed(triangles)
-        outward = planar_polygons.outward_side(vertices, triangles) if closed else 0
-        sides.add(-outward if closed and planar_polygons.is_inside(eye, vertices, triangles) else outward)
+        triangles = mesh_polygons.welded(vertices, placement.triangles)
+        closed = mesh_polygons.is_closed(triangles)
+        outward = mesh_polygons.outward_side(vertices, triangles) if closed else 0
+        sides.add(-outward if closed and mesh_polygons.is_inside(eye, vertices, triangles) else outward)
     return sides.pop() if len(sides) == 1 else 0
 
 
@@ -255,9 +255,7 @@ def _polygons(mesh_light: MeshLight, radiance) -> list[tuple[Placement, list[Fla
     placed_polygons = []
     for placement in mesh_light.placements:
         chosen = shines[placement.slots]
-        polygons = planar_polygons.flat_polygons(
-            placement.vertices, placement.triangles[chosen], placement.slots[chosen]
-        )
+        polygons = mesh_polygons.flat_polygons(placement.vertices, placement.triangles[chosen], placement.slots[chosen])
         placed_polygons.append((placement, polygons))
     return placed_polygons
 

@@ -11,7 +11,7 @@ from mathutils import Matrix, Vector
 
 from ...scene import error_line
 from ...shading.highlight import QUICK, THOROUGH
-from ..lights.groups import reason_to_stay
+from ..lights.linking import reason_to_stay
 from ..lights.textures import ShownTextures
 from .highlight_place import (
     DISK,

@@ -78,10 +78,6 @@ class DirectPass:
         """`by_cycles` where it is replaced, 0 elsewhere."""
         return np.where(self.is_replaced[..., None], self.by_cycles(half), 0.0)
 
-    def share_of_group(self, group: str) -> np.ndarray:
-        """The share (H, W, 3) of it that is light of a light group."""
-        return np.divide(self.groups[group], self.image, out=np.zeros_like(self.image), where=self.image != 0.0)
-
     def scaled(self, factor: np.ndarray) -> "DirectPass":
         """The same with `factor` (H, W, 3) times LTSH's light."""
         groups = {group: factor * one for group, one in self.groups.items()}
@@ -282,7 +278,9 @@ def _rest_of_group(cycles, passes: dict[str, DirectPass], group: str) -> np.ndar
     rest = read_layer(cycles.channels, f"{GROUP_PREFIX}{group}", "RGB").astype(np.float64)
     for one in passes.values():
         if group in one.groups:
-            rest -= one.share_of_group(group) * one.replaced()
+            light = one.groups[group]
+            share = np.divide(light, one.image, out=np.zeros_like(light), where=one.image != 0.0)
+            rest -= share * one.replaced()
     return rest
 
 

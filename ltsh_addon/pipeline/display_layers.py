@@ -36,7 +36,11 @@ def write(command: str, output: Path, report: dict, partial: str = "", groups: d
         groups = {"": _group(output / FILES[command], folder, "", report["passes"])}
     index = {"command": command, "partial": partial, "groups": groups, "report": report}
     write_index(folder, index)
-    _remove_others(folder, groups)
+    # Pictures of an earlier run would be mistaken for those of this one.
+    names = {FILE} | {name for group in groups.values() for name in group["files"].values()}
+    for path in folder.iterdir():
+        if path.name not in names and path.suffix == ".exr":
+            path.unlink()
     return folder
 
 
@@ -143,11 +147,3 @@ def _measured(layers, names, pass_name) -> dict:
             mask = hit & picture.any(axis=-1) if name == REFERENCE else hit
             rows[name] = against_cycles(picture, halves, mask)
     return {"noise": imaging.reference_noise(*halves, hit), "techniques": rows}
-
-
-def _remove_others(folder: Path, groups: dict) -> None:
-    """Remove pictures of an earlier run, which would be mistaken for those of this one."""
-    names = {FILE} | {name for group in groups.values() for name in group["files"].values()}
-    for path in folder.iterdir():
-        if path.name not in names and path.suffix == ".exr":
-            path.unlink()

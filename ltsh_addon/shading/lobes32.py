@@ -256,7 +256,7 @@ def add_specular_of_sky(sky: SkyMap, samples, index, radiance, table) -> None:
                         # Without an albedo, which is NaN, the scale is 1.
                         scale = albedo / np.maximum(curve.sum(axis=0), np.float32(1e-30))
                         reflected += color * ((light * curve).sum(axis=1) * np.where(scale >= 0.0, scale, 1.0))
-                if sky.is_positive:
+                if sky.reflected.min() >= 0.0:
                     # Terms that cancel in the Fresnel factor may leave a rest below zero.
                     np.maximum(reflected, np.float32(0.0), out=reflected)
                 radiance[chosen] += reflected.T

@@ -446,7 +446,7 @@ class Studio:
         axes[:3, 0], axes[:3, 1], axes[:3, 2], axes[:3, 3] = right, up, direction, center + distance * direction
         self.camera.matrix_world = Matrix(axes.tolist())
         lens = self.camera.data
-        lens.ortho_scale = width
+        lens.type, lens.ortho_scale = "ORTHO", width
         lens.clip_start, lens.clip_end = max(1.0 - depth, 1e-3) * distance, (1.0 + depth) * distance
         self._fit_pixels(width / height, pixels)
         light = self.picture()
@@ -466,10 +466,7 @@ class Studio:
         lens.type, lens.angle, lens.clip_start, lens.clip_end = "PERSP", angle, 1e-3 * reach, reach
         render.resolution_x = render.resolution_y = pixels
         render.pixel_aspect_x = render.pixel_aspect_y = 1.0
-        try:
-            return self.picture()[..., :3]
-        finally:
-            lens.type = "ORTHO"
+        return self.picture()[..., :3]
 
     def picture(self) -> np.ndarray:
         """The camera's picture (H, W, 4), RGBA, row 0 on top."""
@@ -477,7 +474,13 @@ class Studio:
             path = Path(name) / "look.exr"
             self.scene.render.filepath = str(path)
             bpy.ops.render.render(write_still=True, scene=self.scene.name)
-            return _read_pixels(path)
+            # In a child started inside Blender the package's own reader of EXR may lack its library.
+            image = bpy.data.images.load(str(path))
+            try:
+                image.colorspace_settings.name, image.alpha_mode = "Non-Color", "CHANNEL_PACKED"
+                return image_pixels(image)[::-1].astype(np.float64)
+            finally:
+                bpy.data.images.remove(image)
 
     def _fit_pixels(self, ratio: float, pixels: int) -> None:
         """Set resolution and pixel aspect for a rectangle of `ratio` width to height, with up to `pixels` squared."""
@@ -492,20 +495,6 @@ class Studio:
         render.pixel_aspect_x, render.pixel_aspect_y = max(aspect, 1.0), max(1.0 / aspect, 1.0)
 
 
-def _read_pixels(path: Path) -> np.ndarray:
-    """The single-layer EXR `path` as (H, W, 4) float64, row 0 on top.
-
-    Blender itself reads it: in a child started inside Blender the package's own reader may lack its library.
-    """
-    image = bpy.data.images.load(str(path))
-    try:
-        image.colorspace_settings.name = "Non-Color"
-        image.alpha_mode = "CHANNEL_PACKED"
-        return image_pixels(image)[::-1].astype(np.float64)
-    finally:
-        bpy.data.images.remove(image)
-
-
 @contextmanager
 def open_studio(of_scene):
     """A `Studio` at the frame of `of_scene`; its data is removed afterwards."""
@@ -518,7 +507,7 @@ def open_studio(of_scene):
         for ob in (camera, base):
             scene.collection.objects.link(ob)
         scene.camera, scene.world = camera, None
-        lens.type, lens.sensor_fit = "ORTHO", "HORIZONTAL"
+        lens.sensor_fit = "HORIZONTAL"
         render, cycles = scene.render, scene.cycles
         render.engine, render.film_transparent, render.resolution_percentage = "CYCLES", True, 100
         render.use_file_extension = render.use_overwrite = True

@@ -169,7 +169,11 @@ def mesh_area_lights(mesh_lights: list[MeshLight], studio: Studio, eye: np.ndarr
     A closed mesh emits from the side where the camera is. Objects that shine get the custom property SIDE_PROPERTY.
     """
     for mesh_light in mesh_lights:
-        _warn_of_emission(mesh_light, warn)
+        for material, emission in zip(mesh_light.materials, mesh_light.emission, strict=True):
+            for problem in emission_warnings(emission, is_light=False) if emission.emits else ():
+                warn(f"material {material.name!r}: {problem}")
+            if emission.emits and is_displaced(material):
+                warn(f"material {material.name!r}: it emits from where its faces are without displacement")
     materials = {material.name_full: material for light in mesh_lights for material in light.materials if material}
     # Displacement could move faces out of the camera's sight.
     undisplaced = [(material, "displacement_method", "BUMP") for material in materials.values()]
@@ -226,14 +230,6 @@ def mark_transparent(ob, side: int, materials: list) -> None:
     for material in materials:
         if material is not None:
             material[SIDE_PROPERTY] = 0
-
-
-def _warn_of_emission(mesh_light: MeshLight, warn) -> None:
-    for material, emission in zip(mesh_light.materials, mesh_light.emission, strict=True):
-        for problem in emission_warnings(emission, is_light=False) if emission.emits else ():
-            warn(f"material {material.name!r}: {problem}")
-        if emission.emits and is_displaced(material):
-            warn(f"material {material.name!r}: it emits from where its faces are without displacement")
 
 
 def _emitting_side(mesh_light: MeshLight, eye: np.ndarray) -> int:

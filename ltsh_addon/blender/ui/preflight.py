@@ -120,7 +120,12 @@ def bake_objects(context) -> tuple[list, list[Problem]]:
     if not selected:
         return [], [Problem("No selected object is checked: check those to bake")]
     baked = [ob for ob in selected if shows_texture(ob) and not ob.hide_render]
-    usable, problems = [], [_textures_shown(baked)] if baked else []
+    usable, problems = [], []
+    if baked:  # one click restores them all
+        which = f"Object {baked[0].name!r} shows a baked texture" if len(baked) == 1 else None
+        text = f"{which or f'{len(baked)} objects show baked textures'} in place of "
+        text += "its materials" if which else "their materials"
+        problems.append(Problem(text, True, "ltsh.restore_materials", "Restore"))
     for ob in selected:
         if ob in baked:
             continue
@@ -135,15 +140,6 @@ def bake_objects(context) -> tuple[list, list[Problem]]:
         text = f"Not in the atlas yet: {listed(map(repr, bare))}"
         problems.append(Problem(text, True, "ltsh.make_atlas", "Make Atlas"))
     return usable, problems
-
-
-def _textures_shown(baked) -> Problem:
-    """One problem for all objects that show baked textures, since one click restores them all."""
-    if len(baked) == 1:
-        text = f"Object {baked[0].name!r} shows a baked texture in place of its materials"
-    else:
-        text = f"{len(baked)} objects show baked textures in place of their materials"
-    return Problem(text, True, "ltsh.restore_materials", "Restore")
 
 
 def _object_problem(ob, settings) -> Problem | None:

@@ -197,7 +197,8 @@ class LTSH_OT_add_light(LTSHOperator, bpy.types.Operator):
             return {"CANCELLED"}
         if event.type.startswith(PASSED_ON):
             return {"PASS_THROUGH"}
-        surface = surface_under(context, event.mouse_x, event.mouse_y, self.role)
+        region, mouse = view_under(context, pointer(event))
+        surface = None if region is None else surface_at(context, region, mouse, self.role)
         if surface is None:
             return {"RUNNING_MODAL"}
         self.location, self.normal, self.distance = surface
@@ -249,13 +250,6 @@ def add_lights_to_menu(menu, context) -> None:
         column.operator("ltsh.add_light", text=f"LTSH {label}", icon="LIGHT_AREA").role = role
 
 
-def surface_under(context, x: int, y: int, role: str = "SURFACE") -> tuple[Vector, Vector, float] | None:
-    """The point of a surface at a pixel of the window in any 3D view, the direction from there to a light of this role,
-    by default its normal towards the view, and the light's distance; None where there is none."""
-    region = region_under(context, x, y)
-    return None if region is None else _surface_at(context, region, (x - region.x, y - region.y), role)
-
-
 def toward_role(role: str, toward_eye: Vector) -> Vector:
     """The direction in which a point that the eye sees in the direction `toward_eye` has a light of this role."""
     degrees, height = (math.radians(angle) for angle in ROLES[role][1][:2])
@@ -287,7 +281,9 @@ def view_under(context, mouse: np.ndarray) -> tuple:
     return region, mouse if region is None else mouse - (region.x, region.y)
 
 
-def _surface_at(context, region, pixel, role: str = "SURFACE") -> tuple[Vector, Vector, float] | None:
+def surface_at(context, region, pixel, role: str = "SURFACE") -> tuple[Vector, Vector, float] | None:
+    """The point of a surface at a pixel of a 3D view, the direction from there to a light of this role, by default its
+    normal towards the view, and the light's distance; None where there is none."""
     scene, depsgraph, data = context.scene, context.evaluated_depsgraph_get(), region.data
     start = view3d_utils.region_2d_to_origin_3d(region, data, pixel)
     direction = view3d_utils.region_2d_to_vector_3d(region, data, pixel)

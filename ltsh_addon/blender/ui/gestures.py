@@ -13,16 +13,7 @@ from ...scene import error_line
 from ...shading.highlight import QUICK, THOROUGH
 from ..lights.linking import reason_to_stay
 from ..lights.textures import ShownTextures
-from .highlight_place import (
-    DISK,
-    PIXELS,
-    HitsAround,
-    hits_around,
-    note_by_pixels,
-    place_by_pixels,
-    place_of,
-    warm_up,
-)
+from . import highlight_place
 from .light_pose import LightLook, LightPose, locked_place, power_for, reason_to_keep_look, reason_to_keep_power
 from .lit_point import LightShare, SceneLights, SurfaceHit, hit_at, hits_at, share_line
 from .preview import PASSED_ON, LTSHOperator, active_light, lights_of, pointer, view_under
@@ -69,7 +60,7 @@ class Gesture(LTSHOperator):
         self._timer = context.window_manager.event_timer_add(REST_SECONDS, window=context.window)
         context.window.cursor_modal_set("CROSSHAIR")
         context.workspace.status_text_set(f"{self.words(context)}    Esc: Cancel")
-        warm_up(context.scene)
+        highlight_place.warm_up(context.scene)
         # A tool starts it by the press itself, a button by its release.
         if event.type == "LEFTMOUSE" and event.value == "PRESS":
             try:
@@ -367,13 +358,13 @@ class LTSH_OT_drag_highlight(MovingGesture, bpy.types.Operator):
 
     def follow(self, context, event) -> bool:
         """As `press`."""
-        around = self._hits(context, event, DISK)
+        around = self._hits(context, event, highlight_place.DISK)
         if around is None:
             self._note = NO_SURFACE
             return False
         middle = around.hits[0].position
         self._distance = self._distance or max((self._pose.matrix.translation - middle).length, LEAST_DISTANCE)
-        matrix, note = place_of(self._light, self._pose, around, self._distance, self._textures, LIVE)
+        matrix, note = highlight_place.place_of(self._light, self._pose, around, self._distance, self._textures, LIVE)
         if not all(self._free):
             way = locked_place(self._pose.matrix.translation, middle, matrix.translation, self._free) - middle
             matrix = self._pose.facing(middle, way.normalized(), way.length)
@@ -384,21 +375,23 @@ class LTSH_OT_drag_highlight(MovingGesture, bpy.types.Operator):
 
     def warning(self, context, event) -> str:
         """As `Gesture.warning`: by all pixels around the mouse."""
-        around = self._hits(context, event, PIXELS)
+        around = self._hits(context, event, highlight_place.PIXELS)
         if around is None:
             return NO_SURFACE
         if not all(self._free):
-            return note_by_pixels(self._light, self._matrix, around, self._textures)
-        self._matrix, note = place_by_pixels(self._light, self._pose, self._matrix, around, self._textures, AT_REST)
+            return highlight_place.note_by_pixels(self._light, self._matrix, around, self._textures)
+        self._matrix, note = highlight_place.place_by_pixels(
+            self._light, self._pose, self._matrix, around, self._textures, AT_REST
+        )
         self._put(self._matrix)
         return note
 
-    def _hits(self, context, event, disk) -> HitsAround | None:
+    def _hits(self, context, event, disk) -> highlight_place.HitsAround | None:
         self._snap(context, event)
         region, mouse = view_under(context, self._mouse)
         if region is None:
             return None
-        return hits_around(lambda offsets: hits_at(context, region, mouse + offsets), disk)
+        return highlight_place.hits_around(lambda offsets: hits_at(context, region, mouse + offsets), disk)
 
 
 class LTSH_OT_drag_brightness(Gesture, bpy.types.Operator):
@@ -558,7 +551,7 @@ _tools: list[type] = []
 
 def _tool_of(gesture) -> type:
     def draw_settings(context, layout, tool):
-        warm_up(context.scene)
+        highlight_place.warm_up(context.scene)
         layout.label(text=gesture.reason_against(context) or gesture.words(context))
 
     return type(f"{gesture.__name__}_tool", (bpy.types.WorkSpaceTool,), {

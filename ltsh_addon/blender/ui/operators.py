@@ -21,24 +21,13 @@ from ..extract.apply import restore_materials, show_texture, shows_texture
 from ..process.bake import BakedTextures
 from ..saving import save_working_copy
 from . import comparison, light_pose, preflight, results
-from .job import (
-    Job,
-    Plan,
-    clock,
-    output_folder,
-    progress_text,
-    runs_of,
-    session_times,
-    stage_title,
-    steps,
-    write_target,
-)
+from . import job as jobs
 from .preview import LTSHOperator
 
 TIMER_SECONDS, WAITING_SECONDS = 0.1, 0.005
 
 
-def running_job() -> Job | None:
+def running_job() -> jobs.Job | None:
     """The job that runs now, or None."""
     return results.state["job"]
 
@@ -135,14 +124,18 @@ class _JobOperator(WatchedOperator):
             return False
         folder = Path(tempfile.mkdtemp(prefix="ltsh-"))
         copy = folder / (Path(bpy.data.filepath).name or "untitled.blend")
-        runs = runs_of(context, self.command, copy)
-        job = Job(
-            self.bl_label, Plan(steps(runs), measured=session_times), folder, self.command, context.scene.session_uid
+        runs = jobs.runs_of(context, self.command, copy)
+        job = jobs.Job(
+            self.bl_label,
+            jobs.Plan(jobs.steps(runs), measured=jobs.session_times),
+            folder,
+            self.command,
+            context.scene.session_uid,
         )
         job.output = runs[-1].options.output
         try:
             if self.command == "match":
-                write_target(context.scene, folder)
+                jobs.write_target(context.scene, folder)
             save_working_copy(copy)
             job.start([run.to_dict() for run in runs], background=not bpy.app.background)
         except (RuntimeError, OSError, SceneError) as error:
@@ -157,9 +150,9 @@ class _JobOperator(WatchedOperator):
     def _show_progress(self, context) -> None:
         """Redraw progress if its text has changed."""
         job = self._job
-        done = f"{job.title}: {stage_title(job.stage)}  {progress_text(job.plan, job.seconds())}"
+        done = f"{job.title}: {jobs.stage_title(job.stage)}  {jobs.progress_text(job.plan, job.seconds())}"
         text = f"{done}    {translated('Esc')}: {translated('Cancel')}"
-        shown = text, clock(job.seconds())
+        shown = text, jobs.clock(job.seconds())
         if shown != self._progress:
             self._progress = shown
             context.workspace.status_text_set(text)
@@ -232,7 +225,7 @@ class _JobOperator(WatchedOperator):
         for problem in [*problems, *report["warnings"]]:
             self.report({"WARNING"}, problem)
         before, after = (f"{100.0 * report[f'error_{when}']:.1f} %" for when in ("before", "after"))
-        took = f"{self._job.title} took {clock(self._job.seconds())}"
+        took = f"{self._job.title} took {jobs.clock(self._job.seconds())}"
         self.report({"INFO"}, f"{took}: the picture is {after} from the target, it was {before}; moved: {moved}")
         self._job.shown = 1
 
@@ -245,7 +238,7 @@ class _JobOperator(WatchedOperator):
         noted = f", {count} warning{'s' if count > 1 else ''}" if count else ""
         if unchanged := sum(state == "unchanged" for state in self._job.objects.values()):
             noted += f", not baked again since nothing has changed: {unchanged} of {len(self._job.objects)}"
-        self.report({"INFO"}, f"{self._job.title} took {clock(self._job.seconds())}{noted}")
+        self.report({"INFO"}, f"{self._job.title} took {jobs.clock(self._job.seconds())}{noted}")
 
 
 class LTSH_OT_shade(_JobOperator, bpy.types.Operator):
@@ -316,7 +309,7 @@ class LTSH_OT_cancel(_OnRunningJob, bpy.types.Operator):
         return {"FINISHED"}
 
 
-def _watch_elsewhere(job: Job) -> None:
+def _watch_elsewhere(job: jobs.Job) -> None:
     """Let the first remaining window watch `job`."""
     windows = bpy.context.window_manager.windows
     if running_job() is job and windows:
@@ -478,7 +471,7 @@ class LTSH_OT_restore_materials(LTSHOperator, bpy.types.Operator):
 
 def last_folder(scene, command: str) -> Path:
     """The folder of the last results of `command`, wherever the file and new results are saved since."""
-    return results.folder_of(scene, command, output_folder(scene, command) / "images")
+    return results.folder_of(scene, command, jobs.output_folder(scene, command) / "images")
 
 
 def last_bake(scene):

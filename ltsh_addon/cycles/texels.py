@@ -188,7 +188,7 @@ class BakeMaterial:
     corrected: bool
     lobes: tuple[dict[str, MapValue | TextureValue | float | list], ...]
     textures: tuple[tuple[ImageTexture, np.ndarray], ...] = ()  # each with its UV map (T, 3, 2)
-    moved: tuple[int, ...] = ()  # displaced: the maps of positions, shading normals and normals of faces
+    moved: tuple[int, ...] = ()  # displaced: the maps of `maps.SURFACE`
 
     @classmethod
     def of(cls, record: dict, images: Path, uv_maps: dict[str, Path]) -> "BakeMaterial":
@@ -247,17 +247,17 @@ def _lobes_of_texels(mesh, materials, texels, read_map, view):
         triangle, weights = texels.triangle[block], texels.barycentric[block]
         position = _interpolated(mesh.corners, triangle, weights)
         smooth_normal = unit(_interpolated(mesh.normals, triangle, weights))
-        true_normal = true_normals[triangle]
+        true_normal, unbumped = true_normals[triangle], smooth_normal.copy()
         number = mesh.material[triangle]
         for which, material in enumerate(materials):
             if material.moved:
                 at = np.flatnonzero(number == which)
-                surface = position, smooth_normal, true_normal
-                for quantity, of_map in zip(surface, material.moved, strict=True):
+                surface = position, smooth_normal, true_normal, unbumped
+                for quantity, of_map in zip(surface, material.moved, strict=False):
                     quantity[at] = maps[of_map][block][at]
         hits = SurfaceHits(
             position=position,
-            view=view.towards(position, smooth_normal, true_normal),
+            view=view.towards(position, unbumped, true_normal),
             smooth_normal=smooth_normal,
             true_normal=true_normal,
             corrected=corrected[number],

@@ -26,8 +26,8 @@ from .values import IDENTITY, READERS, is_srgb, opaque_pixels
 
 # UV_MAP: number of the map that shows the coordinates of the UV map being baked.
 UV_MAP = -1
-# SURFACE: outputs of the Geometry node for `cycles.texels.BakeMaterial.moved`.
-SURFACE = "Position", "Normal", "True Normal"
+# SURFACE: outputs of the Geometry node for `cycles.texels.BakeMaterial.moved`, the last one without bumps.
+SURFACE = "Position", "Normal", "True Normal", "Normal"
 # SAME_SPACE: the working space is Rec.709 if its matrix to Rec.709 differs less from the identity.
 SAME_SPACE = 1e-4
 
@@ -129,7 +129,9 @@ class MaterialPlan:
     def add_surface(self) -> None:
         """Add the maps of SURFACE, for objects that materials displace, where their mesh does not tell them."""
         self._geometry = self.tree.nodes.new(GEOMETRY)
-        self._moved = [self._color_map(self._geometry.outputs[name]) for name in SURFACE]
+        self._method = self.material.displacement_method
+        count = 3 if self._method == "BUMP" else 4
+        self._moved = [self._color_map(self._geometry.outputs[name]) for name in SURFACE[:count]]
 
     def record(self) -> dict:
         """The record of the material for `cycles.texels.BakeMaterial.of`."""
@@ -221,6 +223,9 @@ class MaterialPlan:
                 self.tree.links.new(self._surface, surface)
         elif number in self._emissions:
             self.tree.links.new(self._emissions[number].outputs[0], surface)
+        if self._moved:
+            is_smooth = self._method == "BOTH" and number == self._moved[-1]
+            self.material.displacement_method = "DISPLACEMENT" if is_smooth else self._method
 
     def target(self, image) -> None:
         """Make `image` the target of bakes."""

@@ -78,16 +78,30 @@ def bent_normals():
     ground(moved_material(0.6, "BUMP"), 2)
 
 
+def bumpy_hills():
+    """Displaced, stretched, and bumped by what the mesh is too coarse for."""
+    ob = ground(moved_material(0.3, "BOTH"))
+    ob.scale, ob.rotation_euler = (1.0, 0.6, 2.0), (0.0, 0.0, 0.3)
+
+
+def smooth_bumpy_hills():
+    bumpy_hills()
+    bpy.ops.object.shade_smooth()
+
+
 def smooth_ball():
     parts.add_sphere(moved_material(0.4), 0.8, segments=48, location=(0.0, 0.0, 0.8))
 
 
-@pytest.mark.parametrize(
-    "build", [hilly_ground, stretched_ground, two_slots, bent_normals, smooth_ball], ids=lambda build: build.__name__
-)
+BAKED = [hilly_ground, stretched_ground, two_slots, bent_normals, bumpy_hills, smooth_bumpy_hills, smooth_ball]
+
+
+@pytest.mark.parametrize("build", BAKED, ids=lambda build: build.__name__)
 def test_baked_texels_lie_on_the_displaced_surface(tmp_path, build):
     """Diffuse light was 5 to 11 % off and specular light 80 % where texels lay on the surface without displacement.
-    Within 3 %: four points of a texel beside the means over it."""
+    Where views were bent by the bumped normal and not by that of the displaced mesh, specular light was 6 % off.
+    Within 3 %, four points of a texel beside the means over it, and 4 % where bumps turn within a texel: of 16 points
+    it is 1 %."""
     parts.empty_scene(96, 64)
     build()
     parts.add_area_light("Key", (1.5, -1.5, 2.5), (0.6, 0.4, 0.3))
@@ -97,8 +111,7 @@ def test_baked_texels_lie_on_the_displaced_surface(tmp_path, build):
     report = bake_scene(BakeOptions(path, tmp_path / "out", size=(64, 64), margin=0, **quality))
     errors = report["objects"][0]["tiles"]["1001"]["errors"]
     off = {name: error["techniques"]["reference"]["unbiased_error"] for name, error in errors.items()}
-    # Stretched, specular light is 2.1 % off in Blender 5.2 and 4.1 % in 4.5, with more samples and points too.
-    assert off["diffuse"] < 0.03 and off["specular"] < (0.05 if build is stretched_ground else 0.03), off
+    assert off["diffuse"] < 0.03 and off["specular"] < (0.04 if "bumpy" in build.__name__ else 0.03), off
     assert not [line for line in report["warnings"] if "displacement" in line]
 
 

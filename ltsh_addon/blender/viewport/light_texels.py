@@ -4,8 +4,6 @@ Pictures of all directions are octahedral maps: an octahedron around the eye, un
 the inner square, which is turned by 45 degrees.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 

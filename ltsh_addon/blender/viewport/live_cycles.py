@@ -1,7 +1,5 @@
 """Worlds and lights with nodes as Cycles sees them: a second Blender looks at them while views go on."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable

@@ -4,8 +4,6 @@ Only what has changed is drawn again. While nothing changes, every further frame
 the picture is their mean.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Collection
 from dataclasses import dataclass, replace
@@ -40,7 +38,7 @@ from .surfaces import SurfacePass, has_bent_lobes
 class SurfaceLayer:
     """The G-buffer of one layer, surfaces or glass, and the horizons that end its lobes."""
 
-    def __init__(self, before: SurfaceLayer | None = None):
+    def __init__(self, before: "SurfaceLayer | None" = None):
         self._surfaces = SurfacePass(None if before is None else before._surfaces)
         self._horizons = defaultdict(HorizonPass)  # of the first lobes (False), which stay, and of further ones (True)
         self._gbuffer: GBufferTextures | None = None
@@ -119,7 +117,7 @@ class Frame:
     world: bool  # with the light of the world
 
     @classmethod
-    def of(cls, mirror: SceneMirror, view: ViewCamera, size: tuple[int, int], shown: ShownPicture) -> Frame:
+    def of(cls, mirror: SceneMirror, view: ViewCamera, size: tuple[int, int], shown: ShownPicture) -> "Frame":
         """The frame that has the picture `shown`."""
         pictures = [(shown.technique, shown.passes)]
         if shown.mode != "single" and shown.second_picture is None:

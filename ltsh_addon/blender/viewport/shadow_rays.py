@@ -1,7 +1,5 @@
 """The visibility of each light at the pixels of a view, traced as for pictures, with the same occluders."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from functools import cached_property
@@ -87,7 +85,7 @@ class ShadowRays:
     version, waits, traces_lobes = 0, False, True
 
     @property
-    def of_glass(self) -> ShadowRays:
+    def of_glass(self) -> "ShadowRays":
         """The tracer for the glass in front of the surfaces: the same."""
         return self
 

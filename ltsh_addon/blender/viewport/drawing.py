@@ -326,12 +326,8 @@ _REQUIRED = ("position", "normal", "base", "f0", "f90", "dielectric")
 _OPTIONAL = ("diffuse_normal", "smooth_normal", "geometric_normal", "tangent", "rebound")
 
 
-def gbuffer_samples(gbuffer: GBufferTextures, view: ViewCamera) -> tuple[SurfaceSamples, np.ndarray]:
-    """The samples (P) of a G-buffer, and their texels (P,), counted from the lower left."""
-    return samples_of_texels(gbuffer_texels(gbuffer), view)
-
-
 def samples_of_texels(texels: dict[str, np.ndarray], view: ViewCamera) -> tuple[SurfaceSamples, np.ndarray]:
+    """The samples (P) of a G-buffer by its `gbuffer_texels`, and their texels (P,), counted from the lower left."""
     pixel = np.flatnonzero(texels["position"][:, :, 3] > 0.0)
     values = {name: rows.reshape(-1, 4)[pixel].astype(np.float64) for name, rows in texels.items()}
     position, normal, base, f0, f90, dielectric = (values[name] for name in _REQUIRED)

@@ -291,11 +291,6 @@ def varied_sky(like: Light | None, light, lights, background: np.ndarray) -> Sho
     return ShownSky(sides, tuple(lights), unfolded(light, SKY_SIZE), background)
 
 
-def background_of(pictures: list[SkyPicture]) -> np.ndarray:
-    """The map (N, N, 3) of a background from the pictures of a cube."""
-    return unfolded(pictures, min(2 * len(pictures[0].radiance), BACKGROUND_SIZE))
-
-
 def coarse(picture: SkyPicture) -> SkyPicture:
     """The picture, reduced to at most `CUBE_SIZE` pixels along each side."""
     while len(picture.radiance) > CUBE_SIZE:

@@ -13,7 +13,7 @@ from ...workers.pool import WorkerPool, cores
 from ..extract.occluders import collect_occluders
 from ..lights.world import blocks_nothing
 from ..process.blender_process import embree_libraries
-from .drawing import GBufferTextures, ViewCamera, VisibilityGrid, float_buffer, gbuffer_samples
+from .drawing import GBufferTextures, ViewCamera, VisibilityGrid, float_buffer, gbuffer_texels, samples_of_texels
 from .pictures import is_equal
 
 Lights = Sequence[Light]
@@ -104,7 +104,7 @@ class ShadowRays:
         """The visibility of `lights`, and last that of the `sides` of a sky if there are any; None without surfaces or
         lights. Raises SceneError."""
         start = time.perf_counter()
-        samples, pixel = gbuffer_samples(gbuffer, view)
+        samples, pixel = samples_of_texels(gbuffer_texels(gbuffer), view)
         if not len(samples) or not (lights or sides):
             return None
         width, height = gbuffer.size

@@ -10,7 +10,7 @@ import numpy as np
 
 from .. import render_settings
 from ..evaluated import SURFACE_TYPES
-from ..lights.linking import regroup
+from ..lights.groups import regroup
 from ..materials.aovs import give_default_material, objects_without_material
 from ..materials.bsdfs import emits, is_emission
 from ..materials.graph import cut, ensure_nodes, is_seen_through, material_output, shaders_behind, tree_in_use

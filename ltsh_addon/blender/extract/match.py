@@ -9,7 +9,7 @@ from mathutils import Matrix, Vector
 
 from ...scene import Light, SceneError, light_of, listed
 from .. import render_settings
-from ..lights.linking import own_light_groups, reason_to_stay
+from ..lights.groups import own_light_groups, reason_to_stay
 from ..process.match import TARGET, LightsJob, TargetJob
 from ..saving import save_copy
 from .pixels import open_scene

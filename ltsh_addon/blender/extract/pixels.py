@@ -12,7 +12,7 @@ from .. import render_settings
 from ..evaluated import SURFACE_TYPES, owner_of, read_values, rendered_surfaces, with_render_depsgraph
 from ..lights.area import LightInventory, collect_lights, note_colors, note_overlaps, rendered_lights
 from ..lights.emission import LookTooLong
-from ..lights.linking import regroup
+from ..lights.groups import regroup
 from ..lights.meshes import SIDE_PROPERTY, let_light_through
 from ..lights.world import blocks_nothing, take_world, world_behind, world_lights
 from ..materials import aovs

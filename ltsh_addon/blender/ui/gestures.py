@@ -11,7 +11,7 @@ from mathutils import Matrix, Vector
 
 from ...scene import error_line
 from ...shading.highlight import QUICK, THOROUGH
-from ..lights.linking import reason_to_stay
+from ..lights.groups import reason_to_stay
 from ..lights.textures import ShownTextures
 from . import highlight_place
 from .light_pose import LightLook, LightPose, locked_place, power_for, reason_to_keep_look, reason_to_keep_power

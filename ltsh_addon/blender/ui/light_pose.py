@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from mathutils import Euler, Matrix, Vector
 
-from ..lights.linking import is_animated, is_linked, reason_to_keep, reason_to_stay
+from ..lights.groups import is_animated, is_linked, reason_to_keep, reason_to_stay
 
 
 @dataclass(frozen=True)

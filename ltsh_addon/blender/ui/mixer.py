@@ -14,7 +14,8 @@ from ...scene import Cancelled, Light, SceneError, error_line, light_of, listed
 from ..evaluated import EmitterTraits
 from ..extract.match import is_telling, light_of_image
 from ..lights.area import area_light, reason_to_leave_out
-from ..lights.linking import Receivers, reason_to_keep
+from ..lights.groups import reason_to_keep
+from ..lights.linking import Receivers
 from . import comparison, results
 from .operators import TIMER_SECONDS, WatchedOperator
 from .panels import draw_job, draw_text, gray, in_both_places, split_names

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scene_parts import add_area_light, add_camera, add_plane, add_sphere, empty_scene, link, principled, save
 
-from ltsh_addon.blender.lights.linking import own_light_groups
+from ltsh_addon.blender.lights.groups import own_light_groups
 from ltsh_addon.blender.ui.light_pose import match_lights
 from ltsh_addon.blender.ui.results import DIRECT_ONLY
 from ltsh_addon.pipeline.match import match_scene

@@ -12,7 +12,8 @@ from mathutils import Matrix, Vector
 
 from ltsh_addon.blender.evaluated import EmitterTraits
 from ltsh_addon.blender.lights.area import area_light
-from ltsh_addon.blender.lights.linking import Receivers, reason_to_stay
+from ltsh_addon.blender.lights.groups import reason_to_stay
+from ltsh_addon.blender.lights.linking import Receivers
 from ltsh_addon.blender.lights.textures import ShownTextures
 from ltsh_addon.blender.ui import gestures
 from ltsh_addon.blender.ui.highlight_place import (

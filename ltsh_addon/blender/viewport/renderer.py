@@ -6,6 +6,7 @@ the picture is their mean.
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Collection
 from dataclasses import dataclass, replace
@@ -62,10 +63,10 @@ class SurfaceLayer:
         """The colors of their first lobes."""
         return {"diffuse_colors": self._gbuffer.base, "specular_colors": self._gbuffer.f0}
 
-    def draw(self, mirror, view: ViewCamera, size) -> None:
-        """Draw the surfaces."""
+    def draw(self, mirror, view: ViewCamera, size, points: float) -> None:
+        """Draw the surfaces, see `SurfacePass.draw`."""
         self._first_lobe, self._further_lobe = None, (0, None)
-        self._gbuffer = self._surfaces.draw(mirror.instances, view, size)
+        self._gbuffer = self._surfaces.draw(mirror.instances, view, size, points)
 
     def choose_horizons(self, mirror, view: ViewCamera, lights: UploadedLights) -> None:
         """Choose the horizons of specular lobes as Cycles does; diffuse lobes keep a second one only if they need it.
@@ -299,11 +300,13 @@ class ViewRenderer:
         self._has_glass = has_glass
         if not is_drawn:
             self._drawn = None
-            self._surfaces.draw(frame.mirror, frame.view, frame.size)
+            # Pictures with bounces are finished ones, whose lobes are widened.
+            points = self.samples + 1 if self.has_bounces else math.inf
+            self._surfaces.draw(frame.mirror, frame.view, frame.size, points)
             if has_glass:
                 if self._glass is None:
                     self._glass, self._veil = SurfaceLayer(self._surfaces), VeilPass()
-                self._glass.draw(frame.mirror, frame.view, frame.size)
+                self._glass.draw(frame.mirror, frame.view, frame.size, points)
             self._drawn = frame.surfaces
         self._upload_lights(frame)
         is_lit, self._horizons_of = self._horizons_of is self._lights, self._lights

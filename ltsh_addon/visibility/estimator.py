@@ -53,6 +53,9 @@ LIKE_NORMAL, LIKE_LOBE, LIKE_ALPHA = np.float32(0.1), np.float32(0.4), np.float3
 MOST_BIAS, ENOUGH_RAYS = 0.01, 64
 # Samples that see nothing share nothing, unless that is as likely as this by what is seen around: few rays count.
 BY_CHANCE = 1e-7
+# Texels have the mean share of like ones around where it is at most MOST_OFF standard deviations from their own, and by
+# its curvature at most MOST_BENT of them wrong.
+MOST_OFF, MOST_BENT = np.float32(3.0), np.float32(0.5)
 # Pairs of opposite pixels (y, x) around a pixel that share rays. The weights of the kernel (1, 2, 2, 2, 1) x (1, 2, 2,
 # 2, 1) count all places of a square of 4 x 4 pixels alike. TILE: how many pixels this is worth, as measured.
 AROUND = [(y, x) for y in range(-2, 3) for x in range(-2, 3) if (y, x) > (0, 0)]
@@ -560,6 +563,19 @@ class RatioEstimator:
         # Pairs with probes only have no second half of rays: take the deviation of independent rays.
         usual = np.sqrt(ratio * (_ONE - ratio) / count)
         return ratio, np.where((sum_w > 0.0).all(axis=0), 0.5 * np.abs(halves[0] - halves[1]), usual)
+
+    def smoothed(self, name: str, ratio: np.ndarray, deviation: np.ndarray) -> np.ndarray:
+        """The shares `ratio` (Q,) of a pass, with this standard deviation: where it is all in which they differ from
+        those of like samples around, the mean of these."""
+        mixed = self.wanted[name] & self.visible & self.blocked & (self.count > PROBES)
+        if not mixed.any():
+            return ratio
+        near, index = self._neighbors, self.index
+        mean, variance = near.shared(name, index, np.stack([ratio, deviation * deviation]))
+        deviation = np.sqrt(variance)
+        mixed &= np.abs(mean - ratio) <= MOST_OFF * deviation
+        mixed &= np.abs(near.bend(name, index, mean)) <= MOST_BENT * deviation
+        return np.where(mixed, mean, ratio)
 
 
 def _taken(rows, flat):

@@ -221,6 +221,8 @@ class ShadowTask:
             mixed[number, index] = estimator.visible & estimator.blocked
             for name in self.passes:
                 ratio, noise = estimator.visibility_ratio(name)
+                if self.is_baked and name == "diffuse" and film is not None and not estimator.is_shared.any():
+                    ratio = estimator.smoothed(name, ratio, noise)
                 unshadowed = estimator.unshadowed(name)
                 visibility[name][number, index] = ratio
                 radiance[name][index] += unshadowed * ratio

@@ -298,8 +298,8 @@ class ViewRenderer:
         self._has_glass = has_glass
         if not is_drawn:
             self._drawn = None
-            # Pictures with bounces are finished ones, whose lobes are widened.
-            points = self.samples + 1 if self.has_bounces else math.inf
+            # Points of pixels add up to a picture only with lobes as narrow as they are.
+            points = 1 if self.step > 1 else math.inf
             self._surfaces.draw(frame.mirror, frame.view, frame.size, points)
             if has_glass:
                 if self._glass is None:

@@ -15,9 +15,9 @@ from ..lobes.polygon import dot
 from ..scene import FARTHEST, PASSES, Film, FlatLight, PointLight, PolygonLight, round_outline
 from .emitter import Emitter, Sky
 from .light_cluster import LightCluster
-from .light_selection import LightSelection
 from .occluders import GAP
 from .ray_sampler import PROBES, RayBatch, RaySampler, SampleRows
+from .sampling import LightSelection
 from .shadow_terminator import toward
 
 MOST_RAYS = 1024
@@ -53,6 +53,9 @@ LIKE_NORMAL, LIKE_LOBE, LIKE_ALPHA = np.float32(0.1), np.float32(0.4), np.float3
 MOST_BIAS, ENOUGH_RAYS = 0.01, 64
 # Samples that see nothing share nothing, unless that is as likely as this by what is seen around: few rays count.
 BY_CHANCE = 1e-7
+# Texels have the mean share of like ones around where it is at most MOST_OFF standard deviations from their own, and by
+# its curvature at most MOST_BENT of them wrong.
+MOST_OFF, MOST_BENT = np.float32(3.0), np.float32(0.5)
 # Pairs of opposite pixels (y, x) around a pixel that share rays. The weights of the kernel (1, 2, 2, 2, 1) x (1, 2, 2,
 # 2, 1) count all places of a square of 4 x 4 pixels alike. TILE: how many pixels this is worth, as measured.
 AROUND = [(y, x) for y in range(-2, 3) for x in range(-2, 3) if (y, x) > (0, 0)]
@@ -207,12 +210,13 @@ class RatioEstimator:
     def __init__(self, surface: SampleRows, emitter: Emitter | LightCluster, number: int, selection: LightSelection):
         light = emitter.light
         self.surface, self.emitter, self.light = surface, emitter, light
-        self.mask = np.uint32(surface.tracer.mask_of(light.name))
-        self.surface_mask = np.uint32(surface.tracer.surface_mask_of(light.name))
+        occluders = surface.tracer.occluders
+        self.mask = np.uint32(occluders.mask_of(light.name))
+        self.surface_mask = np.uint32(occluders.surface_mask_of(light.name))
         # The faces of a mesh light block rays to the mesh itself.
         self.is_mesh = emitter.has_mesh if isinstance(emitter, LightCluster) else isinstance(light, PolygonLight)
         self.at_surface = self.is_mesh or isinstance(emitter, LightCluster)
-        self.chosen_by, self.number, self.selection = surface.tracer.chosen_by(light.name), number, selection
+        self.chosen_by, self.number, self.selection = occluders.chosen_by(light.name), number, selection
         # Rays that the surface and the light choose meet the same, but for those that are lifted.
         self.meet_the_same = self.chosen_by.light and self.mask == self.surface_mask
         origins = light.viewpoint(surface.position)
@@ -559,6 +563,19 @@ class RatioEstimator:
         # Pairs with probes only have no second half of rays: take the deviation of independent rays.
         usual = np.sqrt(ratio * (_ONE - ratio) / count)
         return ratio, np.where((sum_w > 0.0).all(axis=0), 0.5 * np.abs(halves[0] - halves[1]), usual)
+
+    def smoothed(self, name: str, ratio: np.ndarray, deviation: np.ndarray) -> np.ndarray:
+        """The shares `ratio` (Q,) of a pass, with this standard deviation: where it is all in which they differ from
+        those of like samples around, the mean of these."""
+        mixed = self.wanted[name] & self.visible & self.blocked & (self.count > PROBES)
+        if not mixed.any():
+            return ratio
+        near, index = self._neighbors, self.index
+        mean, variance = near.shared(name, index, np.stack([ratio, deviation * deviation]))
+        deviation = np.sqrt(variance)
+        mixed &= np.abs(mean - ratio) <= MOST_OFF * deviation
+        mixed &= np.abs(near.bend(name, index, mean)) <= MOST_BENT * deviation
+        return np.where(mixed, mean, ratio)
 
 
 def _taken(rows, flat):

@@ -22,8 +22,8 @@ from ..workers.pool import WorkerPool
 from .emitter import Emitter
 from .estimator import MOST_RAYS, PixelNeighbors, RatioEstimator
 from .light_cluster import LightCluster, emitters_of
-from .light_selection import LightSelection
 from .ray_sampler import PROBES, JoinedLobes, SampleRows
+from .sampling import LightSelection
 from .shadow_terminator import RayOrigins
 
 # Samples that one process takes at a time, approximately.
@@ -221,6 +221,8 @@ class ShadowTask:
             mixed[number, index] = estimator.visible & estimator.blocked
             for name in self.passes:
                 ratio, noise = estimator.visibility_ratio(name)
+                if self.is_baked and name == "diffuse" and film is not None and not estimator.is_shared.any():
+                    ratio = estimator.smoothed(name, ratio, noise)
                 unshadowed = estimator.unshadowed(name)
                 visibility[name][number, index] = ratio
                 radiance[name][index] += unshadowed * ratio

@@ -3,10 +3,10 @@
 python tests/benchmarks/lightmaps.py [--scene corridor] [--size 256] [--samples 64] [--points 1] [--objects A B]
 
 Scenes: a room of twelve objects with a window and two lamps; a corridor; an artist's first hour's scene. Printed for
-each object: the errors beside two converged bakes of Cycles, relative to the light and without their noise, and what
-ours are of the others. Processor seconds are of all processes, with starting Blender and reading the scene, of both
-with denoising. Texels of
-Cycles' bake are means over the texel: with more `--points` ours are, too, and at edges of shadows they are anyway.
+each object: the errors beside two converged bakes of Cycles, relative to the light and without their noise, what
+ours are of the others, and how uncertain ours are by that noise. Processor seconds are of all processes, with starting
+Blender and reading the scene, of both with denoising. Texels of Cycles' bake are means over the texel: with more
+`--points` ours are, too, and at edges of shadows they are anyway.
 """
 
 import argparse
@@ -183,10 +183,12 @@ def ours(folder, options, points):
     return light, covered, calls, (_processor_seconds() - before, sum(taken))
 
 
-def error(light, halves) -> float:
-    """The error of light (N, 3) beside halves (2, N, 3), without the noise of these."""
+def error(light, halves) -> tuple[float, float]:
+    """The error of light (N, 3) beside halves (2, N, 3), without the noise of these; and its standard deviation."""
     light, a, b = light.astype(float), *halves.astype(float)
-    return math.sqrt(max(((light - a) * (light - b)).mean(), 0.0) / (a * b).mean())
+    squared, power = ((light - a) * (light - b)).mean(axis=1), (a * b).mean()
+    found = math.sqrt(max(squared.mean(), 0.0) / power)
+    return found, squared.std() / math.sqrt(len(squared)) / (2.0 * power * max(found, 1e-9))
 
 
 def main(options):
@@ -211,9 +213,9 @@ def main(options):
                 hit, halves = covered[number], truth[:, number][:, covered[number]]
                 (smooth,) = denoised_rest({("diffuse", 0): noisy[number]}, *calls[number][:2], samples)[0].values()
                 pictures = light[number], noisy[number], smooth.reshape(noisy[number].shape)
-                mine, plain, best = (error(one[hit], halves) for one in pictures)
+                (mine, off), (plain, _), (best, _) = (error(one[hit], halves) for one in pictures)
                 others = f"Cycles {plain:.2%} ({mine / plain:.2f} of it), denoised {best:.2%} ({mine / best:.2f} of it)"
-                print(f"  {name:<8} {mine:.2%}, {others}", flush=True)
+                print(f"  {name:<8} {mine:.2%} +- {off:.2%}, {others}", flush=True)
 
 
 if __name__ == "__main__":

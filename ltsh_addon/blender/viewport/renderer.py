@@ -4,8 +4,7 @@ Only what has changed is drawn again. While nothing changes, every further frame
 the picture is their mean.
 """
 
-from __future__ import annotations
-
+import math
 from collections import defaultdict
 from collections.abc import Collection
 from dataclasses import dataclass, replace
@@ -40,7 +39,7 @@ from .surfaces import SurfacePass, has_bent_lobes
 class SurfaceLayer:
     """The G-buffer of one layer, surfaces or glass, and the horizons that end its lobes."""
 
-    def __init__(self, before: SurfaceLayer | None = None):
+    def __init__(self, before: "SurfaceLayer | None" = None):
         self._surfaces = SurfacePass(None if before is None else before._surfaces)
         self._horizons = defaultdict(HorizonPass)  # of the first lobes (False), which stay, and of further ones (True)
         self._gbuffer: GBufferTextures | None = None
@@ -62,10 +61,10 @@ class SurfaceLayer:
         """The colors of their first lobes."""
         return {"diffuse_colors": self._gbuffer.base, "specular_colors": self._gbuffer.f0}
 
-    def draw(self, mirror, view: ViewCamera, size) -> None:
-        """Draw the surfaces."""
+    def draw(self, mirror, view: ViewCamera, size, points: float) -> None:
+        """Draw the surfaces, see `SurfacePass.draw`."""
         self._first_lobe, self._further_lobe = None, (0, None)
-        self._gbuffer = self._surfaces.draw(mirror.instances, view, size)
+        self._gbuffer = self._surfaces.draw(mirror.instances, view, size, points)
 
     def choose_horizons(self, mirror, view: ViewCamera, lights: UploadedLights) -> None:
         """Choose the horizons of specular lobes as Cycles does; diffuse lobes keep a second one only if they need it.
@@ -119,7 +118,7 @@ class Frame:
     world: bool  # with the light of the world
 
     @classmethod
-    def of(cls, mirror: SceneMirror, view: ViewCamera, size: tuple[int, int], shown: ShownPicture) -> Frame:
+    def of(cls, mirror: SceneMirror, view: ViewCamera, size: tuple[int, int], shown: ShownPicture) -> "Frame":
         """The frame that has the picture `shown`."""
         pictures = [(shown.technique, shown.passes)]
         if shown.mode != "single" and shown.second_picture is None:
@@ -299,11 +298,13 @@ class ViewRenderer:
         self._has_glass = has_glass
         if not is_drawn:
             self._drawn = None
-            self._surfaces.draw(frame.mirror, frame.view, frame.size)
+            # Points of pixels add up to a picture only with lobes as narrow as they are.
+            points = 1 if self.step > 1 else math.inf
+            self._surfaces.draw(frame.mirror, frame.view, frame.size, points)
             if has_glass:
                 if self._glass is None:
                     self._glass, self._veil = SurfaceLayer(self._surfaces), VeilPass()
-                self._glass.draw(frame.mirror, frame.view, frame.size)
+                self._glass.draw(frame.mirror, frame.view, frame.size, points)
             self._drawn = frame.surfaces
         self._upload_lights(frame)
         is_lit, self._horizons_of = self._horizons_of is self._lights, self._lights

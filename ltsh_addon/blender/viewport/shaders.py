@@ -4,8 +4,6 @@ Their text is in `glsl/`, with `core.h` of the exported headers. Constants of Py
 compiled for become macros LTSH_... Python generates only lines that repeat per horizon, moment or corner.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass
 from itertools import combinations
@@ -211,8 +209,7 @@ def _level_lines() -> Iterator[str]:
 _WAYS = {
     "spots": "{name}_in_spots(sight, light.is_round)",
     "whole": "{name}_of_whole(sight, light)",
-    "cut": "{name}_of_part({lobe}, sight, light, false)",
-    "tiny": "{name}_of_part({lobe}, sight, light, true)",
+    "cut": "{name}_of_part({lobe}, sight, light, sight.size < LTSH_TINY)",
 }
 
 
@@ -237,7 +234,7 @@ def _loops(name: str, lobe: str, light: Callable, features: Features) -> Iterato
     def body(way, integral):
         if way != "focused":
             yield f"{name}_view sight = {name}_viewed({lobe}, light);"
-        if way in ("whole", "cut", "tiny"):
+        if way in ("whole", "cut"):
             yield "light = ltsh_with_corners(light, sight.wide, sight.whole);"
             yield "light.count = left != 0u ? light.count : 1;"
         yield from light(integral)

@@ -1,7 +1,6 @@
 """The first pass: draws the surfaces of a mirrored scene into a G-buffer, lobe by lobe."""
 
-from __future__ import annotations
-
+import math
 import time
 from dataclasses import replace
 
@@ -9,6 +8,7 @@ import bpy
 import gpu
 import numpy as np
 
+from ...cycles.gbuffer import MOST_WIDENING
 from ...shading.header import definitions, filled
 from ..materials.preview_material import IMAGE_SLOTS, is_missing
 from .drawing import (
@@ -49,11 +49,12 @@ class SurfacePass:
     its depth buffer.
     """
 
-    def __init__(self, before: SurfacePass | None = None):
+    def __init__(self, before: "SurfacePass | None" = None):
         self._before, self._is_glass = before, before is not None
         self._through: tuple | None = None
         self._shares: list | None = None
         self._size = self._depth = None
+        self._widening = 0.0
         self._targets: dict = {}
         if before is not None:
             self._shaders, self._tables = before._shaders, before._tables
@@ -67,11 +68,16 @@ class SurfacePass:
         self._black_image = float_texture(np.zeros((1, 1, 4)))
         self._missing_image = float_texture(np.array(MISSING_COLOR).reshape(1, 1, 4))
 
-    def draw(self, instances: list[ShownInstance], view: ViewCamera, size: tuple[int, int]) -> GBufferTextures:
+    def draw(
+        self, instances: list[ShownInstance], view: ViewCamera, size: tuple[int, int], points: float = math.inf
+    ) -> GBufferTextures:
         """The G-buffer of `instances`, `size` (width, height) in pixels; valid until the next call.
 
-        It has further normals if any surface is smooth or bent.
+        It has further normals if any surface is smooth or bent. Specular lobes take in how normals turn within a pixel,
+        of which this is one of so many `points`.
         """
+        # The variance of a square of one pixel is 1 / 12 in either direction.
+        self._widening = 1.0 / (12.0 * points)
         if size != self._size:
             self._size, self._targets = size, {}
             self._depth = gpu.types.GPUTexture(size, format="DEPTH_COMPONENT32F")
@@ -190,7 +196,7 @@ class SurfacePass:
         shader.bind()
         if is_later:
             shader.uniform_sampler("positions", self._target(SURFACES, False)[0]["position"])
-        values = np.vstack([view.projection.T, view.homogeneous_eye])
+        values = np.vstack([view.projection.T, view.homogeneous_eye, (self._widening, MOST_WIDENING, 0.0, 0.0)])
         # Kept alive, because the card reads it only when it draws.
         self._view_values = uniform_buffer(values)
         shader.uniform_block("view", self._view_values)
@@ -235,7 +241,8 @@ def has_bent_lobes(instances: list[ShownInstance]) -> bool:
 def _shader(outputs, is_further: bool = False):
     info = gpu.types.GPUShaderCreateInfo()
     info.typedef_source(
-        f"struct SurfaceView {{ mat4 projection; vec4 eye; }};\nstruct SurfaceLook {{ vec4 data[{LOOK_SIZE}]; }};\n"
+        "struct SurfaceView { mat4 projection; vec4 eye; vec4 widening; };\n"
+        f"struct SurfaceLook {{ vec4 data[{LOOK_SIZE}]; }};\n"
     )
     for name, value in DEFINES.items():
         info.define(name, value)

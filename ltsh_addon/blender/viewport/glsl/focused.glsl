@@ -116,8 +116,8 @@ vec4 @name@_focused(@name@_lobe lobe, @ARGUMENTS@ltsh_light light, int header, f
                 for (int piece = 0; piece < (tiny ? 0 : edges); ++piece) {
                     sum = @name@_with_edge(sum, before, last);
                 }
-                for (int piece = 0; piece < (tiny ? edges : 0); ++piece) {
-                    sum = @name@_with_triangle(sum, pivot_warped, before, last);
+                for (int piece = 0; piece < (tiny ? 3 * edges : 0); ++piece) {
+                    sum = @name@_with_third(sum, pivot_warped, before, last, piece);
                 }
                 before = last;
             }

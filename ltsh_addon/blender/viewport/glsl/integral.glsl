@@ -89,17 +89,14 @@ struct @name@_view {
     return sum;
 }
 
-/* Adds the triangle of `center` and an edge, whose ends are relative to it. Exact for polynomials of degree 2. */
-@name@_sum @name@_with_triangle(@name@_sum sum, vec3 center, vec3 start, vec3 end)
+/* Adds a third, number `k`, of the triangle of `center` and an edge, whose ends are relative to it. All three are exact
+   for polynomials of degree 2. */
+@name@_sum @name@_with_third(@name@_sum sum, vec3 center, vec3 start, vec3 end, int k)
 {
-    vec3 both = (1.0 / 6.0) * (start + end);
     float weight = (1.0 / 6.0) * dot(center, cross(start, end));
-    for (int k = 0; k < 3; ++k) {
-        vec3 place = center + both + (k == 0 ? vec3(0.0) : 0.5 * (k == 1 ? start : end));
-        float inverse = inversesqrt(max(dot(place, place), 1e-37));
-        sum = @name@_with_spot(sum, inverse * place, weight * inverse * inverse * inverse);
-    }
-    return sum;
+    vec3 place = center + (1.0 / 6.0) * (start + end) + (k == 0 ? vec3(0.0) : 0.5 * (k == 1 ? start : end));
+    float inverse = inversesqrt(max(dot(place, place), 1e-37));
+    return @name@_with_spot(sum, inverse * place, weight * inverse * inverse * inverse);
 }
 
 /* The integral over the part of any light above all horizons. `tiny` lights are integrated by triangles: their edges
@@ -139,24 +136,25 @@ struct @name@_view {
             /* An edge without a length adds nothing. */
             from = used ? from : vec3(0.0, 0.0, 1.0);
             to = used ? to : from;
-            if (tiny) {
-                sum = @name@_with_triangle(sum, center, from, to);
-            } else {
-                /* An arc of almost half a circle is split at its nearest point: its ends hardly tell its plane. */
-                vec3 last = ltsh_unit(to);
-                vec3 before = ltsh_unit(from);
-                vec3 both = before + last;
-                bool far = dot(both, both) < 0.04;
-                vec3 along = to - from;
-                float nearest = ltsh_clamped(-dot(from, along) / max(dot(along, along), 1e-37), 1.0);
-                vec3 next = far ? ltsh_unit(from + nearest * along) : last;
-                int piece = 0;
-                do {
+            /* An arc of almost half a circle is split at its nearest point: its ends hardly tell its plane. */
+            vec3 last = ltsh_unit(to);
+            vec3 before = ltsh_unit(from);
+            vec3 both = before + last;
+            bool far = dot(both, both) < 0.04;
+            vec3 along = to - from;
+            float nearest = ltsh_clamped(-dot(from, along) / max(dot(along, along), 1e-37), 1.0);
+            vec3 next = far ? ltsh_unit(from + nearest * along) : last;
+            int pieces = tiny ? 3 : (far ? 2 : 1);
+            int piece = 0;
+            do {
+                if (tiny) {
+                    sum = @name@_with_third(sum, center, from, to, piece);
+                } else {
                     sum = @name@_with_edge(sum, before, next);
-                    before = next;
-                    next = last;
-                } while (++piece < (far ? 2 : 1));
-            }
+                }
+                before = next;
+                next = last;
+            } while (++piece < pieces);
         } while (++slot < slots);
         start = end;
         start_height = end_height;

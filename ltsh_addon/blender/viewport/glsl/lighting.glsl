@@ -39,10 +39,10 @@ vec2 ltsh_seen(ltsh_nearby near, int light)
 #endif
 
 /* Sets of up to 32 lights, a bit for each, by the way in which a lobe is integrated over them. `spots`: by four spots.
-   `whole`: by their edges. `cut`: by the edges of the part above horizons. `tiny`: by triangles of that part.
-   `focused`: by their profile. `uneven`: not equally bright all over. Each way has a loop of its own, because software
-   renderers execute both sides of a branch for every light. */
-struct ltsh_todo { uint spots; uint whole; uint cut; uint tiny; uint focused; uint uneven; };
+   `whole`: by their edges. `cut`: by the part above horizons. `focused`: by their profile. `uneven`: not equally bright
+   all over. Each way has a loop of its own, because software renderers execute both sides of a branch for every
+   light. */
+struct ltsh_todo { uint spots; uint whole; uint cut; uint focused; uint uneven; };
 
 /* The same sets, reduced to the lights in `kept`. */
 ltsh_todo ltsh_todo_among(ltsh_todo todo, uint kept)
@@ -50,23 +50,21 @@ ltsh_todo ltsh_todo_among(ltsh_todo todo, uint kept)
     todo.spots &= kept;
     todo.whole &= kept;
     todo.cut &= kept;
-    todo.tiny &= kept;
     return todo;
 }
 
 ltsh_todo ltsh_todo_with(ltsh_todo todo, int number, bool used, ltsh_light light, bool whole, float size)
 {
     uint bit = used ? 1u << uint(number) : 0u;
-    bool tiny = size < LTSH_TINY;
     bool small = whole && size < LTSH_SMALL && (light.is_round || light.first == LTSH_QUAD_FIRST);
     bool focused = (light.flags & LTSH_PROFILE_FLAG) != 0;
     todo.focused |= focused ? bit : 0u;
     bit = focused ? 0u : bit;
     todo.uneven |= (light.flags & LTSH_UNEVEN_FLAG) != 0 ? bit : 0u;
     todo.spots |= small ? bit : 0u;
-    todo.whole |= whole && !tiny ? bit : 0u;
-    todo.cut |= !whole && !tiny ? bit : 0u;
-    todo.tiny |= tiny && !small ? bit : 0u;
+    bit = small ? 0u : bit;
+    todo.whole |= whole && size >= LTSH_TINY ? bit : 0u;
+    todo.cut |= whole && size >= LTSH_TINY ? 0u : bit;
     return todo;
 }
 
@@ -162,7 +160,7 @@ void main()
     ltsh_nearby near = ltsh_grid_at(point);
 #endif
     int count = here ? draw_range.y - draw_range.x : 0;
-    ltsh_todo nothing = ltsh_todo(0u, 0u, 0u, 0u, 0u, 0u);
+    ltsh_todo nothing = ltsh_todo(0u, 0u, 0u, 0u, 0u);
 #ifdef LTSH_SPECULAR
     {
     ltsh_todo todo = nothing;

@@ -114,6 +114,11 @@ vec2 brushed_alphas(float roughness)
   return brush.z < 0.5 ? vec2(alpha) : min(vec2(alpha / brush.x, alpha * brush.x), vec2(1.0));
 }
 
+float mean_roughness(vec2 alphas)
+{
+  return sqrt(sqrt(alphas.x * alphas.y));
+}
+
 struct Lobe {
   vec3 f0;
   vec3 f90;

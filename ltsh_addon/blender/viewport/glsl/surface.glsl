@@ -12,6 +12,17 @@ bool is_seen()
 #endif
 
 @FUNCTIONS@
+#if defined(DRAWS_SURFACES) || defined(DRAWS_TANGENTS)
+/* Both alphas of a lobe that takes in how its `normal` turns within a point's share of a pixel: as
+   `gbuffer.with_widened_lobes` does. */
+vec2 widened(vec2 alphas, vec3 normal)
+{
+  vec3 right = dFdx(normal);
+  vec3 up = dFdy(normal);
+  return sqrt(alphas * alphas + min(view.widening.x * (dot(right, right) + dot(up, up)), view.widening.y));
+}
+#endif
+
 #ifdef DRAWS_EMISSION
 void main()
 {
@@ -48,7 +59,7 @@ void main()
 #if defined(DRAWS_SURFACES) || defined(DRAWS_THROUGH)
   vec3 color = max(slot_value(color_image, COLOR_SLOT, v_uv), vec3(0.0));
   vec2 alphas = brushed_alphas(clamp(slot_value(roughness_image, ROUGHNESS_SLOT, v_uv).x, 0.0, 1.0));
-  float roughness = sqrt(sqrt(alphas.x * alphas.y));
+  float roughness = mean_roughness(alphas);
   float metallic = clamp(slot_value(metallic_image, METALLIC_SLOT, v_uv).x, 0.0, 1.0);
   float ior = max(slot_value(ior_image, IOR_SLOT, v_uv).x, 1e-5);
   float cosine = clamp(dot(specular_normal, towards_eye), 0.0, 1.0);
@@ -73,13 +84,15 @@ void main()
   /* As in `cycles.lobes`. */
   lobe.diffuse *= dot(diffuse_normal, smooth_normal) <= 0.0 ? 0.0 : 1.0;
   out_position = vec4(v_position, 1.0 + placement.x);
-  out_normal = vec4(specular_normal, lobe.roughness);
+  bool is_fuzz = int(look.data[0].x + 0.5) == SHEEN;
+  out_normal = vec4(specular_normal, is_fuzz ? lobe.roughness : mean_roughness(widened(alphas, specular_normal)));
   out_base = vec4(weight * lobe.diffuse, lobe.ior);
   out_f0 = vec4(weight * lobe.f0, weight.r * lobe.dip.r);
   out_f90 = vec4(weight * lobe.f90, weight.g * lobe.dip.g);
   out_dielectric = vec4(weight * lobe.dielectric, weight.b * lobe.dip.b);
 #elif defined(DRAWS_TANGENTS)
   vec2 alphas = brushed_alphas(clamp(slot_value(roughness_image, ROUGHNESS_SLOT, v_uv).x, 0.0, 1.0));
+  alphas = widened(alphas, specular_normal);
   float ratio = alphas.x > 0.0 ? sqrt(alphas.y / alphas.x) : 1.0;
   vec3 axis = int(look.data[0].x + 0.5) == GLOSSY ? specular_normal : diffuse_normal;
   out_tangent = vec4(turned_tangent(smooth_normal, axis), 1.0 - ratio);

@@ -18,7 +18,7 @@ sys.path.insert(0, str(ROOT))
 
 from ltsh_addon import imaging  # noqa: E402
 from ltsh_addon.imaging.color import color_bar  # noqa: E402
-from ltsh_addon.imaging.sheet import common_error_scale  # noqa: E402
+from ltsh_addon.imaging.report import common_error_scale  # noqa: E402
 
 matplotlib.use("Agg")
 DEMO, OBJECT = ROOT / "out" / "demo", "floor"

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from ltsh_addon.files import write_bytes
-from ltsh_addon.pipeline.options import table
+from ltsh_addon.pipeline.options import one_table
 from ltsh_addon.shading import SHIPPED_TABLES, TableError, load_table
 
 from . import bench, export, families, fit, header, layouts, optimum, pack, sheen, validate
@@ -110,7 +110,7 @@ def _name(text):
 
 def _table(text):
     try:
-        return table(text)
+        return one_table(text)[0]
     except ValueError as error:
         raise argparse.ArgumentTypeError(str(error)) from error
 

@@ -78,13 +78,6 @@ def choose_camera(scene, name: str | None):
     return camera
 
 
-def hold_still(scene, camera) -> None:
-    """Remove the animation of scene and lens: a render evaluates it again, which would undo our settings."""
-    for owner in (scene, camera.data):
-        if owner.animation_data is not None:
-            owner.animation_data_clear()
-
-
 def picture_size(scene) -> tuple[int, int]:
     """Width and height of the whole picture in pixels, whether or not there is a border."""
     render = scene.render
@@ -155,13 +148,10 @@ def shifted_pixels(scene, offset: np.ndarray):
     width, height = size[0] * render.pixel_aspect_x, size[1] * render.pixel_aspect_y
     fits_width = lens.sensor_fit == "HORIZONTAL" or (lens.sensor_fit == "AUTO" and width >= height)
     unit = width if fits_width else height
-    before = lens.shift_x, lens.shift_y
-    try:
-        lens.shift_x += offset[0] * render.pixel_aspect_x / unit
-        lens.shift_y += offset[1] * render.pixel_aspect_y / unit
+    shift_x = lens.shift_x + offset[0] * render.pixel_aspect_x / unit
+    shift_y = lens.shift_y + offset[1] * render.pixel_aspect_y / unit
+    with changed_properties([(lens, "shift_x", shift_x), (lens, "shift_y", shift_y)]):
         yield
-    finally:
-        lens.shift_x, lens.shift_y = before
 
 
 # CENTER_FILTER_WIDTH: in pixels, of a filter that puts all rays in the center of a pixel. The least width in Blender's
@@ -338,7 +328,10 @@ def neutralize(scene, view_layer, camera, warnings: list[str]) -> None:
             setattr(owner, name, False)
     warnings.extend(steps_after_rendering(scene))
     scene.camera = camera
-    hold_still(scene, camera)
+    # A render would evaluate the animation of scene and lens again, which would undo our settings.
+    for owner in (scene, camera.data):
+        if owner.animation_data is not None:
+            owner.animation_data_clear()
     render_with_cycles(scene)
     # With an opaque film only holdouts have alpha 0; the passes do not change.
     render.film_transparent = False

@@ -153,7 +153,10 @@ class ProgressBar:
             return f"({elapsed:.1f} s)"
         if elapsed < 1.0 or fraction < 0.02:
             return ""
-        return f"({duration(elapsed / fraction - elapsed)} left)"
+        left = elapsed / fraction - elapsed
+        if left < 100.0:
+            return f"({left:.0f} s left)"
+        return f"({left / 60.0:.0f} min left)" if left < 6000.0 else f"({left / 3600.0:.1f} h left)"
 
     def finish(self) -> None:
         """End the current line, so that further output starts on a new one."""
@@ -172,13 +175,6 @@ class ProgressBar:
                 self._stream.flush()
             except OSError:
                 self._stream, self._quiet = None, True
-
-
-def duration(seconds: float) -> str:
-    """Seconds as text: 40 s, 12 min, 3.3 h."""
-    if seconds < 100.0:
-        return f"{seconds:.0f} s"
-    return f"{seconds / 60.0:.0f} min" if seconds < 6000.0 else f"{seconds / 3600.0:.1f} h"
 
 
 def print_out(text: str) -> None:

@@ -315,6 +315,11 @@ def _joined(hits: SurfaceHits, batches: list[_LobeSamples]) -> tuple[SurfaceSamp
             width = (3,) if count == 3 else ()
             values = [batch.shape.get(name, np.zeros((len(batch.index), *width))) for batch in batches]
             shape[name] = np.concatenate(values)[order]
+    diffuse = joined["diffuse"]
+    if hits.diffuse_albedo is not None:
+        diffuse = _split(hits.diffuse_albedo, diffuse, index)
+    # Cycles lights no diffuse lobe whose bumped normal is behind the surface.
+    hidden = (joined["diffuse_normal"] * smooth_normal).sum(axis=1) <= 0.0
     samples = SurfaceSamples(
         position=at_hit.position,
         view=at_hit.view,
@@ -323,9 +328,7 @@ def _joined(hits: SurfaceHits, batches: list[_LobeSamples]) -> tuple[SurfaceSamp
         roughness=joined["roughness"],
         **dict(zip(SPECULAR_FIELDS, specular, strict=True)),
         ior=joined["ior"],
-        diffuse_albedo=joined["diffuse"]
-        if hits.diffuse_albedo is None
-        else _split(hits.diffuse_albedo, joined["diffuse"], index),
+        diffuse_albedo=np.where(hidden[:, None], 0.0, diffuse),
         geometric_normal=at_hit.true_normal,
         smooth_normal=smooth_normal,
         receiver=at_hit.receiver,

@@ -346,12 +346,6 @@ class PatchTree:
         direction = light.direction.astype(center.dtype)
         return cls(tuple(patches), center, half_u, half_v, radiance, direction, diagonal, reach, largest, first, count)
 
-    @property
-    def size_on_plane(self) -> np.ndarray:
-        """Diagonals (N,) in units of that of the whole light."""
-        squares = dot(self.half_u, self.half_u) + dot(self.half_v, self.half_v)
-        return np.sqrt(squares / squares[0])
-
     def places(self, toward):
         """Where directions (3, ...) meet the plane: s and t (...) along the half axes of the whole light, and the mask
         (...) of those inside it."""

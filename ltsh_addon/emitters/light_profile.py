@@ -95,12 +95,6 @@ def plane_axes(light) -> np.ndarray:
     return np.stack([first, np.cross(light.direction, first)])
 
 
-def has_shear(light) -> bool:
-    """Whether the angle between the half axes differs from a right angle by more than rounding."""
-    u, v = light.half_u, light.half_v
-    return abs(u @ v) > SHEAR * np.linalg.norm(u) * np.linalg.norm(v)
-
-
 @dataclass(frozen=True)
 class DiskLayers:
     """Number of disks around the foot over which integrals run, and of chords per arc of a disk; at least 2 chords."""

@@ -23,11 +23,9 @@ import numpy as np
 
 from ..lobes.polygon import dot
 from ..scene import Light
-from . import small_lights
-from .convex_bodies import ConvexBody
-from .light_nodes import NodeSums, node_ranges, normal_spreads, over_lights
+from . import light_nodes, small_lights
+from .mesh_polygons import ConvexBody
 from .tails import NEAR_RADII
-from .tiles import TileCubics, Tiles, lengths, neighbor_keys, products, split_columns
 
 # A group with fewer lights is shaded light by light.
 FEWEST = 64
@@ -106,10 +104,10 @@ class LightTree:
         body = np.arange(len(lights)) + len(bodies)
         for number_of_body, one in enumerate(bodies):
             body[one.numbers] = number_of_body
-        order, start, end, children = node_ranges(center, normal, body=body if bodies else None)
+        order, start, end, children = light_nodes.node_ranges(center, normal, body=body if bodies else None)
         body_of_node = np.where(body[order[start]] == body[order[end - 1]], body[order[start]], -1)
         body_of_node[body_of_node >= len(bodies)] = -1
-        sums = NodeSums(order, start, end)
+        sums = light_nodes.NodeSums(order, start, end)
         origin = center.mean(axis=0)
         offset = center - origin
         total, middle, spread, axis, length = sums.moments(power, offset, covariance, normal)
@@ -138,12 +136,14 @@ class LightTree:
         turn = (width * turn.transpose(1, 2, 0)).astype(np.float32)
         turned = np.maximum(1.0 - (length / total) ** 2, 0.0) * (end - start > 1)
         swing = (total * np.maximum(np.sqrt(1.5 * turned), TURNED)).astype(np.float32)
-        normal_spread = normal_spreads(axis, normal[order], start, end)
+        normal_spread = light_nodes.normal_spreads(axis, normal[order], start, end)
         number = np.where(end - start == 1, order[start], -1)
         diagonal = (sums(power * diagonal) / total).astype(np.float32)
         reach = np.sqrt(3.0 * variances.sum(axis=1))
-        radius = over_lights(
-            np.maximum, lambda node, light: lengths(offset[light] - middle[node]) + rim[light], (order, start, end)
+        radius = light_nodes.over_lights(
+            np.maximum,
+            lambda node, light: light_nodes.lengths(offset[light] - middle[node]) + rim[light],
+            (order, start, end),
         )
         sizes = (values.astype(np.float32) for values in (reach, radius))
         directions = (values.astype(np.float32) for values in (axis, normal_spread))
@@ -180,7 +180,7 @@ class LightTree:
 
 def _angles(offset, distance, axis):
     """Angles (K,) in rad between vectors `offset` (K, 3), `distance` (K,) long, and the unit vectors `axis` (K, 3)."""
-    return np.arccos(np.clip(products(offset, axis) / distance, -1.0, 1.0))
+    return np.arccos(np.clip(light_nodes.products(offset, axis) / distance, -1.0, 1.0))
 
 
 def _heights(ranges, offset, axis, cone):
@@ -188,8 +188,8 @@ def _heights(ranges, offset, axis, cone):
     they may differ (K,) within `ranges`: the radius (K,) of the node, half the box (K, 3) of the tile, and the largest
     distance (K,) between them. Normals are within `cone` (K,) in rad of the axis."""
     reach, half, farthest = ranges
-    slack = reach + products(half, np.abs(axis)) + np.sin(np.minimum(cone, 0.5 * np.pi)) * farthest
-    return products(offset, axis), slack
+    slack = reach + light_nodes.products(half, np.abs(axis)) + np.sin(np.minimum(cone, 0.5 * np.pi)) * farthest
+    return light_nodes.products(offset, axis), slack
 
 
 @dataclass(frozen=True)
@@ -206,12 +206,12 @@ class NodeDistances:
     parallax: np.ndarray  # rad: how much directions from points of the tile to points of the node may differ
 
     @classmethod
-    def of(cls, tree: LightTree, tiles: Tiles, tile, node) -> "NodeDistances":
+    def of(cls, tree: LightTree, tiles: light_nodes.Tiles, tile, node) -> "NodeDistances":
         """For the numbers (K,) of tiles and nodes."""
         offset = (tree.center[node] - tiles.center[tile]).astype(np.float32)
         half, reach, extent, radius = tiles.half[tile], tree.reach[node], tree.radius[node], tiles.radius[tile]
         gap = np.maximum(np.abs(offset) - half, 0.0)
-        distance, nearest = (np.maximum(lengths(vectors), LEAST) for vectors in (offset, gap))
+        distance, nearest = (np.maximum(light_nodes.lengths(vectors), LEAST) for vectors in (offset, gap))
         both = radius + extent
         parallax = np.where(both < distance, np.arcsin(np.minimum(both / distance, 1.0)), np.float32(np.pi))
         return cls(offset, half, reach, extent, radius, distance, nearest, parallax)
@@ -246,7 +246,7 @@ class TileNodePairs:
     crossed: np.ndarray  # light that is wrong where horizons and planes cross the node
 
     @classmethod
-    def of(cls, tree: LightTree, tiles: Tiles, tile, node) -> "TileNodePairs":
+    def of(cls, tree: LightTree, tiles: light_nodes.Tiles, tile, node) -> "TileNodePairs":
         """For the numbers (K,) of tiles and nodes."""
         between = NodeDistances.of(tree, tiles, tile, node)
         size, tile_size = between.reach / between.nearest, between.radius / between.nearest
@@ -345,10 +345,10 @@ def add_far_lights(tree: LightTree, lobes, position, chosen, total) -> tuple[tup
     `position` (3, Q). Returns the pairs (K,) that are left: columns, and numbers of the lights to shade as polygons;
     then columns, and numbers of the bodies to shade as outlines."""
     is_specular = lobes.sharpest is not None
-    keys = neighbor_keys(lobes, position, chosen)
-    tile_members = split_columns(keys, np.arange(len(chosen)), TILE[is_specular])
-    tiles = Tiles.of(lobes, position, [chosen[members] for members in tile_members])
-    cubics = TileCubics.of(tile_members, keys, lobes.shape[:, chosen])
+    keys = light_nodes.neighbor_keys(lobes, position, chosen)
+    tile_members = light_nodes.split_columns(keys, np.arange(len(chosen)), TILE[is_specular])
+    tiles = light_nodes.Tiles.of(lobes, position, [chosen[members] for members in tile_members])
+    cubics = light_nodes.TileCubics.of(tile_members, keys, lobes.shape[:, chosen])
     coarse = _refined(tree, tiles, lambda pairs: pairs.size < COARSE)
     light = np.bincount(coarse.tile, coarse.mean, len(tile_members))
     most = ERROR[is_specular] * light
@@ -374,13 +374,15 @@ def add_far_lights(tree: LightTree, lobes, position, chosen, total) -> tuple[tup
         if len(tile_pairs.node) <= MANY_LEAVES:
             remaining.append((tiles.columns[number], tile_pairs))
             continue
-        for members in split_columns(keys, tile_members[number], FINER_TILE):
+        for members in light_nodes.split_columns(keys, tile_members[number], FINER_TILE):
             tile.append(np.full(len(tile_pairs.node), len(finer)))
             node.append(tile_pairs.node)
             finer.append((chosen[members], light[number]))
     if finer:
         columns, light = zip(*finer, strict=True)
-        pairs = TileNodePairs.of(tree, Tiles.of(lobes, position, columns), np.concatenate(tile), np.concatenate(node))
+        pairs = TileNodePairs.of(
+            tree, light_nodes.Tiles.of(lobes, position, columns), np.concatenate(tile), np.concatenate(node)
+        )
         pairs = pairs.take(~pairs.is_dark)
         light = light + np.bincount(pairs.tile, pairs.mean, len(finer))
         near = pairs.are_near(FINER_LEAF_ERROR * light[pairs.tile])

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..lobes.polygon import dot
 from ..scene import EllipseLight, QuadLight
-from .light_profile import TINY, WIDE_OPEN, LightView, Profile, cross2, dot2, gauss_legendre, has_shear
+from .light_profile import SHEAR, TINY, WIDE_OPEN, LightView, Profile, cross2, dot2, gauss_legendre
 
 # Least width of a peak in m.
 TINY_WIDTH = 1e-9
@@ -57,8 +57,10 @@ class ProfileRegions:
 
     @staticmethod
     def suit(light) -> bool:
-        """Whether the light is a rectangle, or an ellipse given by its principal axes."""
-        return isinstance(light, (QuadLight, EllipseLight)) and not has_shear(light)
+        """Whether the light is a rectangle, or an ellipse given by its principal axes, but for rounding."""
+        u, v = light.half_u, light.half_v
+        is_square = abs(u @ v) <= SHEAR * np.linalg.norm(u) * np.linalg.norm(v)
+        return isinstance(light, (QuadLight, EllipseLight)) and is_square
 
     def _turns(self, dtype):
         """Unit vectors (2, P) along s. They follow the longer side of a long light. For other round lights they point

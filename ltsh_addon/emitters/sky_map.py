@@ -83,11 +83,6 @@ class SkyMap:
         """True if the sky has one radiance, but for rounding."""
         return bool((np.ptp(self.texels, axis=1) <= 1e-6 * np.abs(self.texels).max(axis=1)).all())
 
-    @property
-    def is_positive(self) -> bool:
-        """True if the sky takes no light away."""
-        return bool(self.reflected.min() >= 0.0)
-
     def _fewest(self, roughness: float) -> int:
         """The number of directions that lobes of a `roughness` need."""
         height, *turned = spiral(TRIALS).astype(np.float64)[..., 0]
@@ -240,7 +235,8 @@ def _grid(tree: PatchTree) -> np.ndarray:
     between the centers of patches, and patches keep their means."""
     leaves = np.flatnonzero(tree.count == 0)
     s, t, _ = tree.places(tree.center[:, leaves])
-    level = np.rint(-np.log2(tree.size_on_plane[leaves])).astype(int)
+    squares = dot(tree.half_u, tree.half_u) + dot(tree.half_v, tree.half_v)
+    level = np.rint(-np.log2(np.sqrt((squares / squares[0])[leaves]))).astype(int)
     finest = int(level.max())
     row, column = ((0.5 * (coordinate + 1.0) * 2.0**level).astype(int) for coordinate in (t, s))
     means, known = [], []

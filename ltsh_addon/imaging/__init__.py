@@ -15,5 +15,4 @@ from .metrics import (
     reference_noise,
     unbiased_relative_error,
 )
-from .report import MOST_SHOWN, grouped, on_screen, write_html, write_json, write_overview
-from .sheet import Tile, comparison_sheet
+from .report import MOST_SHOWN, Tile, comparison_sheet, grouped, on_screen, write_html, write_json, write_overview

@@ -161,12 +161,10 @@ def encode_png(image: np.ndarray) -> bytes:
     pixels = zlib.compress(_filtered(image).tobytes(), 6)
     perceptual = b"\0"
     color = [(b"sRGB", perceptual)] if image.shape[2] == 3 else []
-    chunks = [(b"IHDR", header), *color, (b"IDAT", pixels), (b"IEND", b"")]
-    return _SIGNATURE + b"".join(_chunk(kind, data) for kind, data in chunks)
-
-
-def _chunk(kind: bytes, data: bytes) -> bytes:
-    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+    file, chunks = _SIGNATURE, [(b"IHDR", header), *color, (b"IDAT", pixels), (b"IEND", b"")]
+    for kind, data in chunks:
+        file += struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+    return file
 
 
 def _filtered(image: np.ndarray) -> np.ndarray:

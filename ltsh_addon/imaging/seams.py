@@ -4,8 +4,6 @@ Works on one texture with any number of objects. Texels are counted from the low
 center of the first one is at (.5, .5).
 """
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable
@@ -15,7 +13,7 @@ import numpy as np
 
 from ..cycles.texels import TexelMesh
 from ..cycles.uv import cross, repeated
-from ..emitters.planar_polygons import connected
+from ..emitters.mesh_polygons import connected
 
 # SAME_PLACE: corners that are nearer count as one, relative to the size of all. SAME_UV: the same in texels.
 SAME_PLACE, SAME_UV = 1e-6, 1.0 / 64.0
@@ -44,7 +42,7 @@ class TexelGrid:
     normals: np.ndarray  # (T, 3, 3) unit
 
     @classmethod
-    def of(cls, triangle: np.ndarray, uv: np.ndarray, mesh: TexelMesh) -> TexelGrid:
+    def of(cls, triangle: np.ndarray, uv: np.ndarray, mesh: TexelMesh) -> "TexelGrid":
         """The grid of one mesh, whose UV map is `uv` (T, 3, 2), in texels."""
         return cls(triangle, uv, mesh.corners, mesh.normals)
 

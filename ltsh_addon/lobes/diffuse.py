@@ -19,13 +19,14 @@ from functools import cache
 
 import numpy as np
 
+from .edge_integrals import bump_shadowing
 from .lobe_integrals import form_factor
 from .polygon import project_to_sphere, split_at_horizon
 
 # Nodes of an arc, or of each of its parts if it is cut at the kink of t, z = cos(theta_o).
 ARC_NODES = 8
 # Nodes along both sides of a triangle.
-VELVET_NODES = 16
+NODES = 16
 _ANGLES = 2048
 
 
@@ -52,8 +53,30 @@ def velvet_lobe(x, z, cosine, sigma):
 
 def velvet_integral(polygon: np.ndarray, cosine: np.ndarray, sigma: np.ndarray) -> np.ndarray:
     """Integral (P,) of `velvet_lobe` over polygons (3, V, P) in z >= 0, either way around."""
-    corners, total = project_to_sphere(polygon), 0.0
-    count = VELVET_NODES if corners.shape[1] <= 8 else VELVET_NODES // 2
+    total = 0.0
+    for (x, _, z), weight in _nodes_of_triangles(polygon):
+        total = total + (weight * velvet_lobe(x, z, cosine, sigma)).sum(axis=0)
+    return np.abs(total)
+
+
+def shadowed_mean(polygon: np.ndarray, cosine: np.ndarray, shape: np.ndarray, smooth: np.ndarray, bump_alpha2):
+    """The mean (P,) of bump shadowing over polygons (3, V, P) in z >= 0, weighted by lobes with the `shape` (4, P) of
+    `diffuse_factor`. `cosine` (P,) is that of the view, which has y = 0; `smooth` (3, P) is the smooth normal."""
+    up, view = np.zeros((2, 3, len(cosine)))
+    up[2], view[0], view[2] = 1.0, np.sqrt(np.maximum(1.0 - cosine * cosine, 0.0)), cosine
+    total = shadowed = 0.0
+    for direction, weight in _nodes_of_triangles(polygon):
+        lobe = weight * direction[2] * diffuse_factor(direction, direction[2], up, view, shape)
+        total = total + lobe.sum(axis=0)
+        above = (smooth[:, None] * direction).sum(axis=0)
+        shadowed = shadowed + (lobe * bump_shadowing(above, np.float32(1.0), bump_alpha2)).sum(axis=0)
+    return np.clip(np.divide(shadowed, total, out=np.zeros_like(total), where=total != 0.0), 0.0, 1.0)
+
+
+def _nodes_of_triangles(polygon: np.ndarray):
+    """Unit directions (3, N, P) and signed weights in sr (N, P), in several pieces, for polygons (3, V, P)."""
+    corners = project_to_sphere(polygon)
+    count = NODES if corners.shape[1] <= 8 else NODES // 2
     nodes, weights = np.polynomial.legendre.leggauss(count)
     nodes, weights = 0.5 * (nodes[:, None] + 1.0), 0.5 * weights[:, None]
     for corner in range(1, corners.shape[1] - 1):
@@ -61,11 +84,9 @@ def velvet_integral(polygon: np.ndarray, cosine: np.ndarray, sigma: np.ndarray) 
         volume = (first * np.cross(second, third, axis=0)).sum(axis=0)
         for share, weight in zip(nodes[:, 0], weights[:, 0], strict=True):
             # Go toward the second corner, and from there toward the third.
-            x, y, z = first[:, None] + share * ((second - first)[:, None] + nodes * (third - second)[:, None])
-            inverse = 1.0 / np.sqrt(np.maximum(x * x + y * y + z * z, 1e-30))
-            values = velvet_lobe(x * inverse, z * inverse, cosine, sigma) * inverse**3
-            total = total + share * weight * volume * (weights * values).sum(axis=0)
-    return np.abs(total)
+            place = first[:, None] + share * ((second - first)[:, None] + nodes * (third - second)[:, None])
+            inverse = 1.0 / np.sqrt(np.maximum((place * place).sum(axis=0), 1e-30))
+            yield place * inverse, share * weight * volume * weights * inverse**3
 
 
 def rough_terms(roughness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,7 +1,5 @@
 """Bakes: the texels of objects, shaded block by block into the files of `bake_files`, and the report about them."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 import math

@@ -1,8 +1,6 @@
 """Files of a bake: planes of texels with margins, pictures of errors, the .blend and .glb that show
 them."""
 
-from __future__ import annotations
-
 import json
 import math
 import struct

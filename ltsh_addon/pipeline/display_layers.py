@@ -7,8 +7,7 @@ import numpy as np
 
 from .. import imaging
 from ..imaging import exr
-from ..imaging.report import FILE, write_index
-from ..imaging.sheet import common_error_scale
+from ..imaging.report import FILE, common_error_scale, write_index
 from ..scene import BAKE_PASSES, CYCLES, REFERENCE, TECHNIQUES, Progress
 from .comparison import against_cycles
 from .mixer import MIXER_FILE, MixerRow, baked_light_pictures, light_pictures, mixer_file
@@ -37,7 +36,11 @@ def write(command: str, output: Path, report: dict, partial: str = "", groups: d
         groups = {"": _group(output / FILES[command], folder, "", report["passes"])}
     index = {"command": command, "partial": partial, "groups": groups, "report": report}
     write_index(folder, index)
-    _remove_others(folder, groups)
+    # Pictures of an earlier run would be mistaken for those of this one.
+    names = {FILE} | {name for group in groups.values() for name in group["files"].values()}
+    for path in folder.iterdir():
+        if path.name not in names and path.suffix == ".exr":
+            path.unlink()
     return folder
 
 
@@ -144,11 +147,3 @@ def _measured(layers, names, pass_name) -> dict:
             mask = hit & picture.any(axis=-1) if name == REFERENCE else hit
             rows[name] = against_cycles(picture, halves, mask)
     return {"noise": imaging.reference_noise(*halves, hit), "techniques": rows}
-
-
-def _remove_others(folder: Path, groups: dict) -> None:
-    """Remove pictures of an earlier run, which would be mistaken for those of this one."""
-    names = {FILE} | {name for group in groups.values() for name in group["files"].values()}
-    for path in folder.iterdir():
-        if path.name not in names and path.suffix == ".exr":
-            path.unlink()

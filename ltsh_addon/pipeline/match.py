@@ -17,17 +17,7 @@ from ..files import temporary_folder, write_bytes
 from ..imaging.color import luminance
 from ..imaging.exr import group_names, parse_layer_name
 from ..scene import Cancelled, Light, Progress, SceneError, listed
-from .light_search import (
-    LightFreedom,
-    LightMove,
-    LightSearch,
-    TargetSamples,
-    added_light,
-    in_squares,
-    non_negative_least_squares,
-    searched,
-    sums_in_squares,
-)
+from . import light_search
 from .lighting import light_groups, load_tables, prepare
 from .options import MatchOptions, RenderOptions, child_job
 from .picture import view_transformed
@@ -73,9 +63,9 @@ def matched_factors(
     The `weights` (H, W) count pixels. Errors are relative to the target's luminance, where it is above its mean, and
     else to this mean. Each layer has one factor, with `colors` one for each channel.
     """
-    count = sums_in_squares(weights, (0, 1))
+    count = light_search.sums_in_squares(weights, (0, 1))
     layers, fixed, target = (
-        in_squares(image, weights).reshape(*image.shape[:-3], -1, 3)[..., count.ravel() > 0.0, :]
+        light_search.in_squares(image, weights).reshape(*image.shape[:-3], -1, 3)[..., count.ravel() > 0.0, :]
         for image in (layers, fixed, target)
     )
     weights = count[count > 0.0]
@@ -87,7 +77,9 @@ def matched_factors(
     def solved(channels) -> np.ndarray:
         matrix = scaled[..., channels].reshape(len(layers), -1).T
         rest = (wanted - scale * fixed)[:, channels].ravel()
-        return non_negative_least_squares(np.vstack([matrix, steady]), np.concatenate([rest, steady.sum(axis=1)]))
+        return light_search.non_negative_least_squares(
+            np.vstack([matrix, steady]), np.concatenate([rest, steady.sum(axis=1)])
+        )
 
     if colors:
         factors = np.stack([solved(slice(number, number + 1)) for number in range(3)], axis=-1)
@@ -205,7 +197,7 @@ class _Matching:
         self,
         path: Path,
         factors: dict[str, np.ndarray],
-        moves: dict[str, LightMove] | None = None,
+        moves: dict[str, light_search.LightMove] | None = None,
         added: dict | None = None,
     ) -> None:
         """Save the scene with changed lights, and a new one of the record `added`, as `path`, and go on with that."""
@@ -227,7 +219,7 @@ class _Matching:
         with self._places(now) as places_of:
             places, layers, fixed = places_of(*COARSE)
             try:
-                light = added_light(places, layers, fixed)
+                light = light_search.added_light(places, layers, fixed)
             except ValueError as error:
                 raise SceneError(f"{self._options.scene}: {error}; lower --add") from error
         self.seconds += time.process_time() - start
@@ -244,22 +236,24 @@ class _Matching:
                 f"{name!r}, {reason}" for name, reason in self.staying.items()))  # fmt: skip
         with self._places(now) as places_of:
 
-            def search(side: int, points: int, rays: int) -> LightSearch:
+            def search(side: int, points: int, rays: int) -> light_search.LightSearch:
                 places, layers, fixed = places_of(side, points, rays)
                 is_moving = np.isin(now.groups, list(moving))
                 lights = [moving[group] for group in now.groups if group in moving]
-                freedoms = [LightFreedom(light, places.distance(light), self._options.sizes) for light in lights]
+                freedoms = [
+                    light_search.LightFreedom(light, places.distance(light), self._options.sizes) for light in lights
+                ]
                 direct = np.array([places.picture(light) for light in lights])
                 rest, others = layers[is_moving] - direct, layers[~is_moving]
                 of_lights = tuple(freedoms), rest, others, fixed, direct.sum(axis=1)
-                return LightSearch(places, *of_lights, self._options.colors)
+                return light_search.LightSearch(places, *of_lights, self._options.colors)
 
             def report(share: float) -> None:
                 if self._progress is not None and self._progress("search", share) is False:
                     raise Cancelled("stopped before the lights were placed")
 
             fine = search(*FINE)
-            x = searched(search(*COARSE) if number == 0 else None, fine, progress=report)
+            x = light_search.searched(search(*COARSE) if number == 0 else None, fine, progress=report)
             factors = np.stack(fine.factors(x), axis=-1)
         factors = np.broadcast_to(factors, (len(factors), 3))
         names = [group for group in now.groups if group in moving]
@@ -288,8 +282,12 @@ class _Matching:
         weights = np.where(np.logical_or(*extraction.left_to_cycles.by_pass.values()), 0.0, self._weights)
         with visibility.open_tracer(extraction.occluders, embree_libraries()) as tracer:
 
-            def places_of(side: int, points: int, rays: int) -> tuple[TargetSamples, np.ndarray, np.ndarray]:
-                places = TargetSamples.of(extraction, self._target, weights, (side, points), (tracer, rays), table)
+            def places_of(
+                side: int, points: int, rays: int
+            ) -> tuple[light_search.TargetSamples, np.ndarray, np.ndarray]:
+                places = light_search.TargetSamples.of(
+                    extraction, self._target, weights, (side, points), (tracer, rays), table
+                )
                 return places, *(places.mean(image, weights, side) for image in (now.layers, now.fixed))
 
             yield places_of

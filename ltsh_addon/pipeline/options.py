@@ -45,35 +45,23 @@ def real_number(text: str) -> float:
         return math.nan
 
 
-def techniques(text: str) -> tuple[str, ...]:
-    """Names of techniques, or paths of tables, separated by commas."""
-    names = _names(text)
-    unknown = [name for name in names if name not in TECHNIQUES and not name.endswith(".npz")]
-    if unknown or not names:
-        raise ValueError(
-            f"technique {(unknown or [text])[0]!r} is unknown, expected some of {', '.join(TECHNIQUES)} "
-            "or the path of a table (.npz)"
-        )
-    return names
+def names_or_tables(what: str, known: Iterable[str], *, is_one: bool = False) -> Callable[[str], tuple[str, ...]]:
+    """The parser of `known` names and paths of tables, separated by commas; errors begin with `what`."""
+
+    def parse(text: str) -> tuple[str, ...]:
+        names = (text,) if is_one else _names(text)
+        unknown = [name for name in names if name not in known and not name.endswith(".npz")]
+        if unknown or not names:
+            wanted = f"expected some of {', '.join(known)} or the path of a table (.npz)"
+            raise ValueError(f"{what} {(unknown or [text])[0]!r} is unknown, {wanted}")
+        return names
+
+    return parse
 
 
-def table(text: str) -> str:
-    """A shipped table or a path."""
-    if text in SHIPPED_TABLES or text.endswith(".npz"):
-        return text
-    raise ValueError(
-        f"table {text!r} is unknown, expected some of {', '.join(SHIPPED_TABLES)} or the path of a table (.npz)"
-    )
-
-
-def tables(text: str) -> tuple[str, ...]:
-    """Shipped tables or paths, separated by commas."""
-    return tuple(table(name) for name in _names(text) or ("",))
-
-
-def one_table(text: str) -> tuple[str, ...]:
-    """A shipped table or a path."""
-    return (table(text),)
+techniques = names_or_tables("technique", TECHNIQUES)
+tables = names_or_tables("table", SHIPPED_TABLES)
+one_table = names_or_tables("table", SHIPPED_TABLES, is_one=True)
 
 
 def amount(what: str, expected: str) -> Callable[[str], float]:
@@ -108,31 +96,20 @@ def _names(text) -> tuple[str, ...]:
     return tuple(dict.fromkeys(name for name in text.split(",") if name))
 
 
-def resolution(text: str) -> tuple[int, int]:
-    """WIDTHxHEIGHT in pixels."""
-    sides = _sides(text, PICTURE_SIDES)
-    if len(sides) == 2:
-        return sides
-    smallest, largest = PICTURE_SIDES
-    raise ValueError(
-        f"resolution is {text!r}, expected WIDTHxHEIGHT such as 960x540, each from {smallest} to {largest}"
-    )
+def sides(what: str, expected: str, limits: tuple[int, int], counts: tuple[int, ...]) -> Callable:
+    """The parser of the sides of a rectangle, as many as `counts` allows; errors begin with `what`."""
+
+    def parse(text: str) -> tuple[int, int]:
+        numbers = [int(side) if side.isdecimal() else -1 for side in text.split("x")]
+        if len(numbers) in counts and all(limits[0] <= number <= limits[1] for number in numbers):
+            return numbers[0], numbers[-1]
+        raise ValueError(f"{what} {text!r}, expected {expected}, each from {limits[0]} to {limits[1]}")
+
+    return parse
 
 
-def size(text: str) -> tuple[int, int]:
-    """N or WIDTHxHEIGHT in texels."""
-    sides = _sides(text, TEXTURE_SIDES)
-    if len(sides) in (1, 2):
-        return sides[0], sides[-1]
-    smallest, largest = TEXTURE_SIDES
-    raise ValueError(f"size is {text!r}, expected N or WIDTHxHEIGHT such as 2048, each from {smallest} to {largest}")
-
-
-def _sides(text, limits) -> tuple[int, ...]:
-    """Whole numbers separated by x; () where one is none or beyond the limits."""
-    sides = text.split("x")
-    numbers = tuple(int(side) for side in sides if side.isdecimal())
-    return numbers if len(numbers) == len(sides) and all(limits[0] <= n <= limits[1] for n in numbers) else ()
+resolution = sides("resolution is", "WIDTHxHEIGHT such as 960x540", PICTURE_SIDES, (2,))  # in pixels
+size = sides("size is", "N or WIDTHxHEIGHT such as 2048", TEXTURE_SIDES, (1, 2))  # in texels
 
 
 def frames(text: str) -> tuple[int, ...]:
@@ -175,8 +152,6 @@ def whole_number(what: str, least: int, most: int) -> Callable[[str], int]:
 refinements = whole_number("refine is", 1, MOST_REFINEMENTS)  # number of pictures whose mean is a view
 shadow_rays = whole_number("shadow rays are", *SHADOW_RAYS)  # number of rays per light and point
 margin = whole_number("margin is", 0, MOST_MARGIN)  # width of the margin around islands in texels
-
-
 atlas = whole_number("atlas is", *TEXTURE_SIDES)  # texels on each side of the texture that all objects share
 
 

@@ -6,7 +6,6 @@ World space is Blender's: metres, right-handed, z up. Radiance is scene-referred
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
-from .film import REC709, Border, ColorSpace, Film
 from .lights import (
     FARTHEST,
     DistantLight,
@@ -26,7 +25,7 @@ from .lights import (
     lights_of,
     round_outline,
 )
-from .samples import SCALAR_FIELDS, SurfaceSamples, is_constant
+from .samples import REC709, SCALAR_FIELDS, Border, ColorSpace, Film, SurfaceSamples, is_constant
 
 VERSION = "0.1.0"  # also in blender_manifest.toml and pyproject.toml
 

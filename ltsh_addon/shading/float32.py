@@ -187,7 +187,11 @@ class _Lighting:
         if light.has_spread or light.cone is not None:
             near = may_reach(light, position)
             allowed = near if allowed is None else allowed & near
-        is_hard = light.spread < NARROW_SPREAD or _is_narrow(light, corners) or _is_in_pieces(light, corners)
+        # Terms of the long edges of narrow lights cancel, and all pieces of a light need the same precision.
+        is_narrow = np.linalg.norm(light.area_vector) < NARROWEST * np.square(corners - corners[0]).sum(axis=1).max()
+        is_hard = light.spread < NARROW_SPREAD or is_narrow
+        if light.has_profile and isinstance(light, PolygonLight):
+            is_hard |= len(convex_pieces(corners)) > 1
         if lobes.only_tails and not (is_hard or light.has_profile):
             tail = lobes.sharpest.are_tails(light, position) & ~float64.has_bent_fresnel(self.samples)[index]
             self.needs_float64[number].append(index[~tail if allowed is None else ~tail & allowed])
@@ -494,17 +498,6 @@ def _scatter(integrals, columns, radiance, total) -> None:
     for sums, values in zip(total, integrals, strict=True):
         for channel in range(3):
             sums[channel] += np.bincount(columns, values * radiance[channel], sums.shape[1])
-
-
-def _is_narrow(light, corners) -> bool:
-    """True for lights so narrow that the terms of their long edges cancel beyond single precision."""
-    sides = corners - corners[0]
-    return np.linalg.norm(light.area_vector) < NARROWEST * (sides * sides).sum(axis=1).max()
-
-
-def _is_in_pieces(light, corners) -> bool:
-    """True for lights that `light_levels` cuts into pieces. Double precision must then shade all of the pieces."""
-    return light.has_profile and isinstance(light, PolygonLight) and len(convex_pieces(corners)) > 1
 
 
 def _chosen(columns, index):

@@ -186,19 +186,29 @@ def _diffuse_kinds(framed, lit):
     def lambert(polygon, _):
         return np.abs(lobe_integrals.form_factor(polygon))[None]
 
+    def cosine(index):
+        return (samples.diffuse_normal[index] * samples.view[index]).sum(axis=1).astype(np.float64)
+
     def sheen(polygon, index):
         return np.abs(diffuse.sheen_form_factor(polygon, samples.sheen_a[index], samples.sheen_b[index]))[None]
 
     def velvet(polygon, index):
-        cosine = (samples.diffuse_normal[index] * samples.view[index]).sum(axis=1)
-        return diffuse.velvet_integral(polygon, cosine, -samples.sheen_a[index])[None]
+        return diffuse.velvet_integral(polygon, cosine(index), -samples.sheen_a[index])[None]
 
     def rough(polygon, index):
-        cosine = (samples.diffuse_normal[index] * samples.view[index]).sum(axis=1)
-        return diffuse.rough_integrals(polygon, cosine, samples.diffuse_roughness[index])
+        return diffuse.rough_integrals(polygon, cosine(index), samples.diffuse_roughness[index])
 
     def shadowed(lobe):
-        return lambda polygon, index: lobe(polygon, index) * _bump_shadowing(framed, index, polygon)
+        return lambda polygon, index: lobe(polygon, index) * mean_shadowing(lobe, polygon, index)
+
+    def mean_shadowing(lobe, polygon, index):
+        smooth = to_local(framed.frame[:, :, index], samples.smooth_normal[index].T)
+        alpha2 = samples.bump_alpha2[index].astype(np.float64)
+        if lobe is lambert:
+            return _bump_shadowing(polygon, smooth, alpha2)
+        shape = np.zeros((4, len(index)))
+        shape[:3] = samples.diffuse_roughness[index], samples.sheen_a[index], samples.sheen_b[index]
+        return diffuse.shadowed_mean(polygon, cosine(index), shape, smooth, alpha2)
 
     bumped = (samples.diffuse_normal[lit] != samples.smooth_normal[lit]).any(axis=1)
     shiny, soft = samples.sheen_a[lit] > 0.0, samples.sheen_a[lit] < 0.0
@@ -237,10 +247,9 @@ def _profiled(light, view, level, integral, count):
     return result
 
 
-def _bump_shadowing(framed, index, polygon):
+def _bump_shadowing(polygon, smooth, alpha2):
     """The mean (Q,) over polygons of the bump shadowing of `SurfaceSamples`, with the cosine as the weight."""
-    smooth = to_local(framed.frame[:, :, index], framed.samples.smooth_normal[index].T)
-    terms = shadowing_terms(framed.samples.bump_alpha2[index].astype(np.float64))
+    terms = shadowing_terms(alpha2)
     shadowed, whole = lobe_integrals.integrals_on_sphere(_shadowed_and_whole, polygon, smooth, terms)
     return np.clip(np.divide(shadowed, whole, out=np.zeros_like(whole), where=whole != 0.0), 0.0, 1.0)
 

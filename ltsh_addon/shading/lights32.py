@@ -6,8 +6,8 @@ from functools import cached_property
 import numpy as np
 
 from ..emitters import small_lights
-from ..emitters.convex_bodies import ConvexBody, convex_bodies
 from ..emitters.light_tree import FEWEST, LightTree, is_special
+from ..emitters.mesh_polygons import ConvexBody, convex_bodies
 from ..emitters.sky_map import SkyMap
 from ..lobes.lobe_integrals import NARROWEST
 

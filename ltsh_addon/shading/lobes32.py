@@ -14,15 +14,7 @@ from ..emitters import light_profile, small_lights
 from ..emitters.light_polygons import interpolated
 from ..emitters.sky_map import SkyMap, share_above, to_world
 from ..emitters.tails import TailLimits
-from ..lobes import moments32
-from ..lobes.brdf import (
-    clipped_metals,
-    dielectric_reflectance,
-    f82_reflectance,
-    schlick_curve,
-    spiral,
-    visible_directions,
-)
+from ..lobes import brdf, moments32
 from ..lobes.diffuse import diffuse_factor
 from ..lobes.edge_integrals import bump_shadowing, shadowing_terms
 from ..lobes.lobe_integrals import LEAST_SHARE
@@ -192,7 +184,7 @@ def add_diffuse_of_sky(sky: SkyMap, samples, index, radiance) -> None:
     radiance[plain] += interpolated(sky.reflected, samples.diffuse_normal[plain]).T * samples.diffuse_albedo[plain]
     # Velvet is brightest near the horizon.
     for chosen, is_shaped, more in ((bumped & ~shaped, False, 1), (shaped & ~velvet, True, 1), (velvet, True, 4)):
-        (height, *turn), members = spiral(more * sky.directions[-1]), index[chosen]
+        (height, *turn), members = brdf.spiral(more * sky.directions[-1]), index[chosen]
         up = (np.float32(1.0) - height) ** np.float32(DENSE)
         local = [*(np.sqrt(np.float32(1.0) - up * up) * turn), up]
         angles = np.float32(2.0 * np.pi / len(height) * DENSE) * up / (np.float32(1.0) - height)
@@ -229,7 +221,7 @@ def add_specular_of_sky(sky: SkyMap, samples, index, radiance, table) -> None:
     kinds = [*fresnel_kinds(samples, index[~bent[index]]), ("bent", index[bent[index]], None)]
     for vectors, members, colors_of in kinds:
         for count in np.unique(counts[members]):
-            alike, nodes = members[counts[members] == count], spiral(count)
+            alike, nodes = members[counts[members] == count], brdf.spiral(count)
             for piece in moments32.pieces(len(alike), SKY_NODES // count, 128):
                 chosen = alike[piece]
                 normal, view, tangent, geometric = (
@@ -238,7 +230,7 @@ def add_specular_of_sky(sky: SkyMap, samples, index, radiance, table) -> None:
                 )
                 frames, _ = frames_toward(normal, np.where(anisotropic[chosen], normal + tangent, view))
                 local = np.stack([dot(axis, view) for axis in frames])
-                directions, angle, weight, half = visible_directions(nodes, local, alphas[:, chosen])
+                directions, angle, weight, half = brdf.visible_directions(nodes, local, alphas[:, chosen])
                 toward = to_world(frames, directions)
                 light = sky.means(toward, angle)
                 if (geometric != normal).any():
@@ -256,7 +248,7 @@ def add_specular_of_sky(sky: SkyMap, samples, index, radiance, table) -> None:
                         # Without an albedo, which is NaN, the scale is 1.
                         scale = albedo / np.maximum(curve.sum(axis=0), np.float32(1e-30))
                         reflected += color * ((light * curve).sum(axis=1) * np.where(scale >= 0.0, scale, 1.0))
-                if sky.is_positive:
+                if sky.reflected.min() >= 0.0:
                     # Terms that cancel in the Fresnel factor may leave a rest below zero.
                     np.maximum(reflected, np.float32(0.0), out=reflected)
                 radiance[chosen] += reflected.T
@@ -267,12 +259,14 @@ def _fresnel_curve(vector, half, ior, albedos):
     albedos (F, Q) of the table's curves."""
     table, albedos = albedos
     if isinstance(vector, int):
-        curve = np.ones_like(half) if vector == 0 else schlick_curve(half)
+        curve = np.ones_like(half) if vector == 0 else brdf.schlick_curve(half)
         if vector == 2:
             curve *= half * (np.float32(1.0) - half)
         return curve, albedos[vector]
     ior = ior.astype(np.float32)
-    return dielectric_reflectance(half, ior), (table.dielectric_weights(ior) * albedos).sum(axis=0).astype(np.float32)
+    return brdf.dielectric_reflectance(half, ior), (table.dielectric_weights(ior) * albedos).sum(axis=0).astype(
+        np.float32
+    )
 
 
 def _bent_reflectance(samples, index, half):
@@ -282,9 +276,9 @@ def _bent_reflectance(samples, index, half):
         as_columns(getattr(samples, name), slice(None))[:, None]
         for name in ("specular_f0", "specular_f90", "specular_dip", "dielectric")
     )
-    metal = f82_reflectance(half, f0, f90, dip)
-    metal = np.where(clipped_metals(samples), np.maximum(metal, np.float32(0.0)), metal)
-    return metal + dielectric * dielectric_reflectance(half, samples.ior.astype(np.float32))
+    metal = brdf.f82_reflectance(half, f0, f90, dip)
+    metal = np.where(brdf.clipped_metals(samples), np.maximum(metal, np.float32(0.0)), metal)
+    return metal + dielectric * brdf.dielectric_reflectance(half, samples.ior.astype(np.float32))
 
 
 class FormFactor:

@@ -15,9 +15,9 @@ from ..lobes.polygon import dot
 from ..scene import FARTHEST, PASSES, Film, FlatLight, PointLight, PolygonLight, round_outline
 from .emitter import Emitter, Sky
 from .light_cluster import LightCluster
-from .light_selection import LightSelection
 from .occluders import GAP
 from .ray_sampler import PROBES, RayBatch, RaySampler, SampleRows
+from .sampling import LightSelection
 from .shadow_terminator import toward
 
 MOST_RAYS = 1024
@@ -210,12 +210,13 @@ class RatioEstimator:
     def __init__(self, surface: SampleRows, emitter: Emitter | LightCluster, number: int, selection: LightSelection):
         light = emitter.light
         self.surface, self.emitter, self.light = surface, emitter, light
-        self.mask = np.uint32(surface.tracer.mask_of(light.name))
-        self.surface_mask = np.uint32(surface.tracer.surface_mask_of(light.name))
+        occluders = surface.tracer.occluders
+        self.mask = np.uint32(occluders.mask_of(light.name))
+        self.surface_mask = np.uint32(occluders.surface_mask_of(light.name))
         # The faces of a mesh light block rays to the mesh itself.
         self.is_mesh = emitter.has_mesh if isinstance(emitter, LightCluster) else isinstance(light, PolygonLight)
         self.at_surface = self.is_mesh or isinstance(emitter, LightCluster)
-        self.chosen_by, self.number, self.selection = surface.tracer.chosen_by(light.name), number, selection
+        self.chosen_by, self.number, self.selection = occluders.chosen_by(light.name), number, selection
         # Rays that the surface and the light choose meet the same, but for those that are lifted.
         self.meet_the_same = self.chosen_by.light and self.mask == self.surface_mask
         origins = light.viewpoint(surface.position)

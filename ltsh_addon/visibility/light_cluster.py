@@ -257,7 +257,7 @@ def shared_numbers(lights: Sequence[Light], tracer=None) -> tuple[tuple[int, ...
     masks: dict[str, tuple] = {}
     for number, light in enumerate(lights):
         if tracer is not None and light.name not in masks:
-            ways = (tracer.mask_of, tracer.surface_mask_of, tracer.chosen_by)
+            ways = (tracer.occluders.mask_of, tracer.occluders.surface_mask_of, tracer.occluders.chosen_by)
             masks[light.name] = tuple(way(light.name) for way in ways)
         shared.setdefault(_kind(light, number, masks.get(light.name)), []).append(number)
     groups = []

@@ -16,7 +16,7 @@ from itertools import repeat
 import numpy as np
 
 from ..scene import SceneError, SurfaceSamples, error_line, listed
-from .occluders import ALL_RAYS, STEP, ChosenBy, Hits, OccluderMesh, Occluders, Transparency
+from .occluders import ALL_RAYS, STEP, Hits, OccluderMesh, Occluders, Transparency
 from .shadow_terminator import RayOrigins, ShadowTerminator
 
 # Names under which the system may know the library.
@@ -360,18 +360,6 @@ class Tracer:
                 transmittance[index[here]] *= occluder.transparency.transmittance(*place, cosine)
             index = index[transmittance[index] > 0.0]
         transmittance[index] = 0.0
-
-    def mask_of(self, light: str) -> int:
-        """Mask for `transmittance` of the rays to the light of that name; 0 if nothing is in its way."""
-        return self.occluders.mask_of(light)
-
-    def surface_mask_of(self, light: str) -> int:
-        """As `mask_of`, for rays that the surface chooses."""
-        return self.occluders.surface_mask_of(light)
-
-    def chosen_by(self, light: str) -> ChosenBy:
-        """Which kinds of rays to the light of that name exist."""
-        return self.occluders.chosen_by(light)
 
     def ray_origins(self, samples: SurfaceSamples) -> RayOrigins:
         """Where rays from `samples` start, see `ShadowTerminator.ray_origins`."""

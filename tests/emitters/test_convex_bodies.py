@@ -8,8 +8,8 @@ import pytest
 from surface_scenes import random_samples, unit
 
 from ltsh_addon import shading
-from ltsh_addon.emitters.convex_bodies import convex_bodies, fewer_corners
 from ltsh_addon.emitters.light_tree import FEWEST
+from ltsh_addon.emitters.mesh_polygons import convex_bodies, fewer_corners
 from ltsh_addon.scene import PolygonLight
 from ltsh_addon.shading import float32
 

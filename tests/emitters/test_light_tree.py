@@ -8,7 +8,7 @@ from kills import all_ended
 from surface_scenes import area_light, random_samples, shifted, unit
 
 from ltsh_addon import shading
-from ltsh_addon.emitters import light_nodes, light_tree, tiles
+from ltsh_addon.emitters import light_nodes, light_tree
 from ltsh_addon.emitters.light_tree import LightTree
 from ltsh_addon.scene import EllipseLight, PolygonLight, QuadLight
 from ltsh_addon.shading import float32, integrator, lights32
@@ -181,14 +181,14 @@ def test_cubics_of_two_coordinates_are_interpolated_and_nothing_else():
         (np.exp(u), False),
         (0.01 * generator.normal(size=180), False),
     ):
-        cubics = tiles.TileCubics.of(parts, keys, shape[None].astype(np.float32))
+        cubics = light_nodes.TileCubics.of(parts, keys, shape[None].astype(np.float32))
         assert (cubics.are_smooth == is_cubic).all()
         for part, anchors, weights in zip(parts, cubics.anchors, cubics.weights, strict=True):
             exact = (u - v) ** 3 + 1.0
             assert np.allclose(weights @ exact[part][anchors], exact[part], atol=2e-5)
     # Samples in a line, and all in one place, have no two coordinates.
     for keys in (np.stack([u, u, 0.0 * u]), np.zeros((3, 180), np.float32)):
-        assert not tiles.TileCubics.of(parts, keys, u[None]).are_smooth.any()
+        assert not light_nodes.TileCubics.of(parts, keys, u[None]).are_smooth.any()
 
 
 def test_a_ring_of_many_faces_shines_as_its_faces():

@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ltsh_addon.emitters import planar_polygons
-from ltsh_addon.emitters.planar_polygons import flat_polygons, is_closed, is_inside, signed_volume
+from ltsh_addon.emitters import mesh_polygons
+from ltsh_addon.emitters.mesh_polygons import flat_polygons, is_closed, is_inside, signed_volume
 
 CUBE = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
 CUBE_QUADS = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
@@ -76,7 +76,7 @@ def test_bent_and_cut_quads_are_what_they_are_one_by_one(monkeypatch):
     first = 4 * np.arange(len(shapes))[:, None]
     triangles = np.stack([first + [0, 1, 2], first + [2, 3, 0]], axis=1).reshape(-1, 3)
     found = flat_polygons(vertices, triangles, labels(triangles))
-    monkeypatch.setattr(planar_polygons, "_quads", none_at_once)
+    monkeypatch.setattr(mesh_polygons, "_quads", none_at_once)
     expected = flat_polygons(vertices, triangles, labels(triangles))
     assert len(found) == len(expected) == len(shapes) + 1
     for polygon, other in zip(found, expected, strict=True):

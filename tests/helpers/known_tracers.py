@@ -15,6 +15,10 @@ class Tracer:
 
     library = None
 
+    @property
+    def occluders(self):
+        return self
+
     def mask_of(self, name):
         return 0xFFFFFFFF
 

@@ -1,7 +1,10 @@
 """The mean of bump shadowing over lights, beside quadrature over their area."""
 
+from functools import partial
+
 import numpy as np
 import pytest
+import quadrature
 from surface_scenes import area_light, single_sample, unit
 
 from ltsh_addon.shading import shade
@@ -72,3 +75,53 @@ def test_bump_shadowing_is_its_mean_over_the_light(size, dtype):
     assert len(errors) > 10
     assert errors.max() < PROMISED
     assert np.sqrt((errors**2).mean()) < 0.2 * PROMISED
+
+
+def by_grid(light, normal, smooth, alpha2, lobe, count=400):
+    """As `by_quadrature`, of a lobe times cosine, by the middles of `count` x `count` equal pieces of the light."""
+    u, v = np.meshgrid(*[2.0 * (np.arange(count) + 0.5) / count - 1.0] * 2)
+    point = light.center + u[..., None] * light.half_u + v[..., None] * light.half_v
+    distance = np.linalg.norm(point, axis=2)
+    direction, area = point / distance[..., None], np.cross(light.half_u, light.half_v) * (2.0 / count) ** 2
+    cosine, z = direction @ normal, direction @ smooth
+    shadowing = 2.0 / (1.0 + np.sqrt(1.0 + alpha2 * (1.0 / np.maximum(z, 1e-12) ** 2 - 1.0)))
+    values = np.abs(direction @ area) / distance**2 * shadowing * lobe(direction)
+    return values[(cosine > 0.0) & (z > 0.0)].sum()
+
+
+def sheen(directions, normal, view, a, b):
+    """A linearly transformed cosine (Zeltner, Burley and Chiang 2022)."""
+    across = np.cross(normal, unit(view - (view @ normal) * normal))
+    x, y, z = (directions @ axis for axis in (np.cross(across, normal), across, normal))
+    z = np.maximum(z, 0.0)
+    return z / np.pi * (a / ((a * x + b * z) ** 2 + (a * y) ** 2 + z * z)) ** 2
+
+
+SHAPES = {"rough": {"diffuse_roughness": 0.7}, "velvet": {"sheen_a": -0.5}, "sheen": {"sheen_a": 0.5, "sheen_b": -0.7}}
+
+LOBES = {
+    "rough": lambda normal, view: lambda directions: quadrature.rough(directions, normal, view, 0.7)[0],
+    "velvet": lambda normal, view: partial(quadrature.velvet, normal=normal, view=view, sigma=0.5),
+    "sheen": lambda normal, view: partial(sheen, normal=normal, view=view, a=0.5, b=-0.7),
+}
+
+
+@pytest.mark.parametrize("kind", SHAPES)
+def test_bump_shadowing_of_shaped_lobes_is_weighted_by_them(kind):
+    """Weighted by the cosine, sheen and velvet were 8 % off (relative L2), rough diffuse 1.2 %. Within .1 %: the kinks
+    of velvet's masking."""
+    random, sums = np.random.default_rng(11), []
+    for number in range(60):
+        smooth = unit(random.normal(size=3))
+        normal = unit(smooth + np.tan(np.radians(25.0)) * unit(np.cross(smooth, random.normal(size=3))))
+        view = unit(normal + random.uniform(0.0, 3.0) * unit(np.cross(normal, random.normal(size=3))))
+        alpha2 = np.tan(np.radians(25.0)) ** 2 / 8.0
+        light = next(iter(lights(SIZES[number % 4], random)))
+        sample = single_sample(
+            diffuse_normal=normal, smooth_normal=smooth, view=view, bump_alpha2=alpha2, **SHAPES[kind]
+        )
+        lobe = LOBES[kind](normal, view)
+        expected = light.radiance[0] * by_grid(light, normal, smooth, alpha2, lobe)
+        sums.append((shade(sample, [light], workers=1, passes=("diffuse",)).diffuse[0, 0, 0], expected))
+    reflected, expected = np.array(sums).T
+    assert np.linalg.norm(reflected - expected) < 1e-3 * np.linalg.norm(expected)

@@ -285,15 +285,10 @@ PARKED_SECONDS = 2.0
 
 @persistent
 def _park_views(*_) -> None:
-    """Let the views of previews outlast the save that begins."""
+    """Let the views of previews outlast the save that begins; then those end that nothing shows any more."""
     if not keeps_engine() and any(map(is_previewing, bpy.data.scenes)):
         _parked.update({view.region: view for view in redraws.open_views})
-        bpy.app.timers.register(_let_parked_go, first_interval=PARKED_SECONDS)
-
-
-def _let_parked_go() -> None:
-    """End those that nothing shows any more."""
-    _parked.clear()
+        bpy.app.timers.register(_parked.clear, first_interval=PARKED_SECONDS)
 
 
 HANDLERS = (

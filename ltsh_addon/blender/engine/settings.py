@@ -149,8 +149,9 @@ def _asked_as_cycles(poll):
 _changed: dict[type, dict] = {}
 
 
-def _share_panels() -> None:
-    """Show the shared panels with our engine."""
+def register() -> None:
+    """Add the settings, and show the shared panels."""
+    bpy.types.Scene.ltsh_view = bpy.props.PointerProperty(type=LTSH_ViewSettings)
     for panel in shared_panels():
         # Each panel gets its own set, because all panels of Cycles share one, also those of its render settings.
         shown = {"COMPAT_ENGINES": {*panel.COMPAT_ENGINES, ENGINE}}
@@ -162,8 +163,8 @@ def _share_panels() -> None:
             setattr(panel, name, value)
 
 
-def _unshare_panels() -> None:
-    """Restore the shared panels."""
+def unregister() -> None:
+    """Remove what `register` added."""
     while _changed:
         panel, former = _changed.popitem()
         for name, value in former.items():
@@ -171,15 +172,4 @@ def _unshare_panels() -> None:
                 delattr(panel, name)
             else:
                 setattr(panel, name, value)
-
-
-def register() -> None:
-    """Add the settings, and show the shared panels."""
-    bpy.types.Scene.ltsh_view = bpy.props.PointerProperty(type=LTSH_ViewSettings)
-    _share_panels()
-
-
-def unregister() -> None:
-    """Remove what `register` added."""
-    _unshare_panels()
     del bpy.types.Scene.ltsh_view

@@ -1,7 +1,5 @@
 """Bakes of objects: the surfaces of their texels, the lights, and Cycles' own bake (runs in the child)."""
 
-from __future__ import annotations
-
 import shutil
 import tempfile
 import time

@@ -1,7 +1,5 @@
 """The meshes that are baked: which objects, and their meshes and UV maps as they are rendered (runs in the child)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

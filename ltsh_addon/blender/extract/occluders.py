@@ -4,8 +4,6 @@ As in Cycles, every object that is visible to shadow rays blocks them, holdouts 
 What their shapes are is in `occluder_shapes`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -329,7 +327,7 @@ class _Collector:
         is_out = beyond or (shown[:, 2] < -margin).all(), away > of_scene("distance_cull_margin")
         return all(out for is_asked, out in zip(asked, is_out, strict=True) if is_asked)
 
-    def _clear_of(self, material) -> _ClearMaterial | None:
+    def _clear_of(self, material) -> "_ClearMaterial | None":
         """The light that a material lets through; None if it blocks all."""
         if material is None:
             return None
@@ -367,14 +365,14 @@ class _Collector:
             _ClearMaterial(value, curve) if np.interp(image, *curve or ((0.0, 1.0), (0.0, 1.0))).max() > 0.0 else None
         )
 
-    def _gray(self, colors: np.ndarray, material) -> _ClearMaterial | None:
+    def _gray(self, colors: np.ndarray, material) -> "_ClearMaterial | None":
         """What lets through the means of `colors` (A, 3), which is noted if they are colored; None if all are 0."""
         shares = colors.mean(axis=1)
         if (off := np.abs(colors - shares[:, None]).max()) > LEAST_COLOR:
             self._note(COLORED.format(_percent(off)), material)
         return _ClearMaterial(shares=tuple(shares.tolist())) if shares.max() > 0.0 else None
 
-    def _unread_material(self, material) -> _ClearMaterial:
+    def _unread_material(self, material) -> "_ClearMaterial":
         if self._unread is not None:
             return _ClearMaterial()
         share = 0.5 * _most_at(surface_of(material))

@@ -205,15 +205,6 @@ def _is_lost(image) -> bool:
     return not all(path.with_name(path.name.replace("<UDIM>", str(number))).is_file() for number in numbers)
 
 
-def lost_libraries() -> list[str]:
-    """A warning for each library that is missing."""
-    return [
-        f"library {library.name!r}: {library.filepath} is missing, and what it held with it"
-        for library in bpy.data.libraries
-        if not Path(bpy.path.abspath(library.filepath)).is_file()
-    ]
-
-
 _files_opened = 0
 
 
@@ -241,7 +232,9 @@ def open_scene(path: Path, warnings: list[str], scripts: bool = False) -> None:
     if bpy.app.autoexec_fail:
         saved = "what they set stays as it was saved; --enable-autoexec runs them"
         warnings.append(f"scripts in {path.name} do not run, {saved}: {bpy.app.autoexec_fail_message}")
-    warnings.extend(lost_libraries())
+    for library in bpy.data.libraries:
+        if not Path(bpy.path.abspath(library.filepath)).is_file():
+            warnings.append(f"library {library.name!r}: {library.filepath} is missing, and what it held with it")
 
 
 def _reason(error: RuntimeError, path: Path) -> str:
@@ -392,7 +385,12 @@ def extract_pixels(job: PixelJob, folder: Path, progress) -> dict:
 
     started, reference = time.monotonic(), None
     if job.cycles_samples > 0:
-        _prepare_reference(scene, inventory)
+        # Cycles lights the scene as the techniques do, with or without shadows.
+        if has_shadows:
+            scene.cycles.transparent_max_bounces = inventory.occluders.transparent_surfaces
+        else:
+            remove_occlusion(scene)
+        scene.world = inventory.world
         reference = render_reference(scene, view_layer, folder, job.cycles_samples, job.sub_samples, progress)
     seconds["cycles"] = time.monotonic() - started
     # A later task may save this picture as a PNG with the file's own settings.
@@ -429,15 +427,6 @@ def _look_through_glass(scene, inventory: LightInventory) -> None:
     if inventory.behind is not None:
         visibility = inventory.behind.cycles_visibility
         visibility.camera = visibility.transmission
-
-
-def _prepare_reference(scene, inventory: LightInventory) -> None:
-    """Make Cycles light the scene as the techniques do, with or without shadows."""
-    if inventory.occluders is None:
-        remove_occlusion(scene)
-    else:
-        scene.cycles.transparent_max_bounces = inventory.occluders.transparent_surfaces
-    scene.world = inventory.world
 
 
 def scene_named(name: str | None):

@@ -173,18 +173,13 @@ def overlapping_pairs(lights: list[Light]) -> list[tuple[Light, Light, float]]:
             lights_of_pair = lights[start + first], lights[start + second]
             receivers = [light.receivers for light in lights_of_pair]
             never_meet = None not in receivers and not set(receivers[0]) & set(receivers[1])
-            share = 0.0 if never_meet else _overlap(*lights_of_pair)
+            small, large = sorted(lights_of_pair, key=lambda light: np.linalg.norm(light.area_vector))
+            share = 0.0 if never_meet else float(np.mean(_is_inside(_points_of(small), large)))
             if share > 0.0:
                 pairs.append((*lights_of_pair, share))
             if len(pairs) == MOST_PAIRS:
                 return pairs
     return pairs
-
-
-def _overlap(first: Light, second: Light) -> float:
-    """The share of the smaller of two lights in one plane that lies in the other."""
-    small, large = sorted((first, second), key=lambda light: np.linalg.norm(light.area_vector))
-    return float(np.mean(_is_inside(_points_of(small), large)))
 
 
 def _points_of(light: Light) -> np.ndarray:

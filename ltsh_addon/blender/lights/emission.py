@@ -12,19 +12,8 @@ from mathutils import Color, Euler, Matrix, Vector
 
 from ...scene import listed
 from ..evaluated import image_pixels
+from ..materials import graph
 from ..materials.bsdfs import EMISSION, emission_sockets, emits
-from ..materials.graph import (
-    Source,
-    feed_instead,
-    is_group,
-    is_socket,
-    replaced_by_number,
-    shaders_behind,
-    source_of,
-    surface_of,
-    tree_in_use,
-    value_of,
-)
 from ..materials.values import value_at
 from ..render_settings import enable_passes
 
@@ -105,17 +94,17 @@ class Emission:
 
 def emission_of(data) -> Emission:
     """What the nodes of a material or light emit."""
-    emission, surface, values = Emission(), surface_of(data), []
-    leaves = [] if surface is None else shaders_behind(surface).leaves
+    emission, surface, values = Emission(), graph.surface_of(data), []
+    leaves = [] if surface is None else graph.shaders_behind(surface).leaves
     if len(leaves) == 1 and leaves[0].terms == ((),) and leaves[0].node.bl_idname == EMISSION:
-        color, strength = (value_of(socket) for socket in emission_sockets(leaves[0].node))
-        emission.plain = strength == 1.0 and not is_socket(color) and color[:3] == (1.0, 1.0, 1.0)
+        color, strength = (graph.value_of(socket) for socket in emission_sockets(leaves[0].node))
+        emission.plain = strength == 1.0 and not graph.is_socket(color) and color[:3] == (1.0, 1.0, 1.0)
     for leaf in leaves:
         if not emits(leaf.node):
             continue
         emission.emits = True
         alpha = (leaf.node.inputs["Alpha"],) if "Alpha" in leaf.node.inputs else ()
-        values += [source_of(value, leaf.groups) for value in (*emission_sockets(leaf.node), *alpha)]
+        values += [graph.source_of(value, leaf.groups) for value in (*emission_sockets(leaf.node), *alpha)]
         values += [factor.source for term in leaf.terms for factor in term]
     for source in _sources_behind(values):
         _note_value(source, emission)
@@ -129,14 +118,14 @@ def _falloff_of(leaf) -> Falloff | None:
     """The falloff that scales the emission of one shader node; None where falloff is not a factor of it."""
     others = [factor.source for term in leaf.terms for factor in term]
     if "Alpha" in leaf.node.inputs:
-        others.append(source_of(leaf.node.inputs["Alpha"], leaf.groups))
+        others.append(graph.source_of(leaf.node.inputs["Alpha"], leaf.groups))
     if any(_has_falloff(source) for source in others):
         return None
     factors = factors_of(leaf.source)
     return None if factors is None else factors[1]
 
 
-def factors_of(source: Source) -> tuple[list[tuple], Falloff] | None:
+def factors_of(source: graph.Source) -> tuple[list[tuple], Falloff] | None:
     """The factors of what the node of `source` emits: input sockets that do not depend on the distance, each as
     (socket, groups around it), and the falloff. None where falloff is not a factor."""
     both = [_factors(socket, source.groups) for socket in emission_sockets(source.node)]
@@ -154,7 +143,7 @@ def _joined(products) -> tuple[list[tuple], Falloff] | None:
 
 def _factors(socket, groups) -> tuple[list[tuple], Falloff] | None:
     """As `factors_of` for an input socket."""
-    source = source_of(socket, groups)
+    source = graph.source_of(socket, groups)
     if not _has_falloff(source):
         return [(socket, groups)], Falloff()
     node, groups, kinds = source.node, source.groups, {socket.type, *source.passed}
@@ -188,15 +177,17 @@ def _multiplied(node, as_number: bool):
         entries, is_clamped = node.inputs[1:3], node.use_clamp
     else:
         return None
-    return entries if node.blend_type == "MULTIPLY" and not is_clamped and value_of(node.inputs[0]) == 1.0 else None
+    return (
+        entries if node.blend_type == "MULTIPLY" and not is_clamped and graph.value_of(node.inputs[0]) == 1.0 else None
+    )
 
 
-def _has_falloff(source: Source | None) -> bool:
+def _has_falloff(source: graph.Source | None) -> bool:
     """True if a Light Falloff node is among the nodes behind `source`."""
     return any(one.node.bl_idname == LIGHT_FALLOFF for one in _sources_behind([source]))
 
 
-def _sources_behind(sources: list) -> list[Source]:
+def _sources_behind(sources: list) -> list[graph.Source]:
     """All that the values of `sources` depend on, themselves included, each once."""
     behind, waiting = {}, list(sources)
     while waiting:
@@ -206,7 +197,7 @@ def _sources_behind(sources: list) -> list[Source]:
         key = source.node, source.socket.identifier, source.groups
         if key not in behind:
             behind[key] = source
-            waiting += [source_of(entry, source.groups) for entry in source.node.inputs]
+            waiting += [graph.source_of(entry, source.groups) for entry in source.node.inputs]
     return list(behind.values())
 
 
@@ -240,12 +231,12 @@ def without_falloff(blocks):
 
 def trees_of(blocks) -> list:
     """The node trees of materials, lights and worlds, and of the groups in them."""
-    trees, waiting = [], [tree_in_use(block) for block in blocks if block is not None]
+    trees, waiting = [], [graph.tree_in_use(block) for block in blocks if block is not None]
     while waiting:
         tree = waiting.pop()
         if tree is not None and tree not in trees:
             trees.append(tree)
-            waiting += [node.node_tree for node in tree.nodes if is_group(node)]
+            waiting += [node.node_tree for node in tree.nodes if graph.is_group(node)]
     return trees
 
 
@@ -298,7 +289,7 @@ def _value(value):
     return value
 
 
-def _note_value(source: Source, emission: Emission) -> None:
+def _note_value(source: graph.Source, emission: Emission) -> None:
     """Note in `emission` what the value of `source` depends on by itself."""
     node, kind, output = source.node, source.node.bl_idname, source.socket.name
     vector = node.inputs.get("Vector") if kind.startswith("ShaderNodeTex") else None
@@ -317,7 +308,7 @@ def _note_value(source: Source, emission: Emission) -> None:
     emission.varies |= kind not in CONSTANT_NODES
 
 
-def _is_among(source: Source, kinds: dict[str, tuple]) -> bool:
+def _is_among(source: graph.Source, kinds: dict[str, tuple]) -> bool:
     outputs = kinds.get(source.node.bl_idname)
     return outputs is not None and (not outputs or source.socket.name in outputs)
 
@@ -382,11 +373,11 @@ def without_camera_rays(blocks, random: float):
         for tree in trees_of(blocks):
             for node in [node for node in tree.nodes if node.bl_idname in values]:
                 name, value = values[node.bl_idname]
-                moved.append((replaced_by_number(node.outputs[name], value), node.outputs[name]))
+                moved.append((graph.replaced_by_number(node.outputs[name], value), node.outputs[name]))
         yield
     finally:
         for number, output in moved:
-            feed_instead(number, output)
+            graph.feed_instead(number, output)
             number.id_data.nodes.remove(number.node)
 
 
@@ -446,7 +437,7 @@ class Studio:
         axes[:3, 0], axes[:3, 1], axes[:3, 2], axes[:3, 3] = right, up, direction, center + distance * direction
         self.camera.matrix_world = Matrix(axes.tolist())
         lens = self.camera.data
-        lens.ortho_scale = width
+        lens.type, lens.ortho_scale = "ORTHO", width
         lens.clip_start, lens.clip_end = max(1.0 - depth, 1e-3) * distance, (1.0 + depth) * distance
         self._fit_pixels(width / height, pixels)
         light = self.picture()
@@ -466,10 +457,7 @@ class Studio:
         lens.type, lens.angle, lens.clip_start, lens.clip_end = "PERSP", angle, 1e-3 * reach, reach
         render.resolution_x = render.resolution_y = pixels
         render.pixel_aspect_x = render.pixel_aspect_y = 1.0
-        try:
-            return self.picture()[..., :3]
-        finally:
-            lens.type = "ORTHO"
+        return self.picture()[..., :3]
 
     def picture(self) -> np.ndarray:
         """The camera's picture (H, W, 4), RGBA, row 0 on top."""
@@ -477,7 +465,13 @@ class Studio:
             path = Path(name) / "look.exr"
             self.scene.render.filepath = str(path)
             bpy.ops.render.render(write_still=True, scene=self.scene.name)
-            return _read_pixels(path)
+            # In a child started inside Blender the package's own reader of EXR may lack its library.
+            image = bpy.data.images.load(str(path))
+            try:
+                image.colorspace_settings.name, image.alpha_mode = "Non-Color", "CHANNEL_PACKED"
+                return image_pixels(image)[::-1].astype(np.float64)
+            finally:
+                bpy.data.images.remove(image)
 
     def _fit_pixels(self, ratio: float, pixels: int) -> None:
         """Set resolution and pixel aspect for a rectangle of `ratio` width to height, with up to `pixels` squared."""
@@ -492,20 +486,6 @@ class Studio:
         render.pixel_aspect_x, render.pixel_aspect_y = max(aspect, 1.0), max(1.0 / aspect, 1.0)
 
 
-def _read_pixels(path: Path) -> np.ndarray:
-    """The single-layer EXR `path` as (H, W, 4) float64, row 0 on top.
-
-    Blender itself reads it: in a child started inside Blender the package's own reader may lack its library.
-    """
-    image = bpy.data.images.load(str(path))
-    try:
-        image.colorspace_settings.name = "Non-Color"
-        image.alpha_mode = "CHANNEL_PACKED"
-        return image_pixels(image)[::-1].astype(np.float64)
-    finally:
-        bpy.data.images.remove(image)
-
-
 @contextmanager
 def open_studio(of_scene):
     """A `Studio` at the frame of `of_scene`; its data is removed afterwards."""
@@ -518,7 +498,7 @@ def open_studio(of_scene):
         for ob in (camera, base):
             scene.collection.objects.link(ob)
         scene.camera, scene.world = camera, None
-        lens.type, lens.sensor_fit = "ORTHO", "HORIZONTAL"
+        lens.sensor_fit = "HORIZONTAL"
         render, cycles = scene.render, scene.cycles
         render.engine, render.film_transparent, render.resolution_percentage = "CYCLES", True, 100
         render.use_file_extension = render.use_overwrite = True

@@ -72,7 +72,10 @@ class Blockers:
                 else:
                     self.unnumbered.append(ob.name)
             if ob.type == "LIGHT":
-                is_met = cycles_setting(ob.data, "use_multiple_importance_sampling") and _has_size(ob.data)
+                # Random rays hit no light of zero size.
+                size = {"POINT": "shadow_soft_size", "SPOT": "shadow_soft_size", "SUN": "angle"}.get(ob.data.type)
+                is_met = cycles_setting(ob.data, "use_multiple_importance_sampling")
+                is_met = is_met and (size is None or getattr(ob.data, size) > 0.0)
                 if not ob.data.use_shadow and not is_met:
                     mask = 0
                 elif not (ob.data.use_shadow and is_met):
@@ -86,12 +89,6 @@ class Blockers:
         if instance.is_instance and instance.parent is not None and instance.parent.original.name_full in self._named:
             name = instance.parent.original.name_full
         return OTHER_LIGHTS | sum(2 << number for number, linked in enumerate(self._sets) if linked.reach(name))
-
-
-def _has_size(light) -> bool:
-    """False for lights of zero size, which no random ray hits."""
-    size = {"POINT": "shadow_soft_size", "SPOT": "shadow_soft_size", "SUN": "angle"}.get(light.type)
-    return size is None or getattr(light, size) > 0.0
 
 
 class Receivers:

@@ -8,8 +8,8 @@ import bpy
 import numpy as np
 
 from ...cycles.patches import GRID, cut_into_patches, note_patches, split_light
-from ...emitters import planar_polygons
-from ...emitters.planar_polygons import FlatPolygon
+from ...emitters import mesh_polygons
+from ...emitters.mesh_polygons import FlatPolygon
 from ...scene import Light, PolygonLight, QuadLight
 from ..evaluated import SURFACE_TYPES, EmitterTraits, RenderedSurface, is_rendered, read_values, surface_instancer
 from ..materials.graph import computed, ensure_nodes, fill_with_bsdf, is_displaced, live_link, material_output, mixed
@@ -169,7 +169,11 @@ def mesh_area_lights(mesh_lights: list[MeshLight], studio: Studio, eye: np.ndarr
     A closed mesh emits from the side where the camera is. Objects that shine get the custom property SIDE_PROPERTY.
     """
     for mesh_light in mesh_lights:
-        _warn_of_emission(mesh_light, warn)
+        for material, emission in zip(mesh_light.materials, mesh_light.emission, strict=True):
+            for problem in emission_warnings(emission, is_light=False) if emission.emits else ():
+                warn(f"material {material.name!r}: {problem}")
+            if emission.emits and is_displaced(material):
+                warn(f"material {material.name!r}: it emits from where its faces are without displacement")
     materials = {material.name_full: material for light in mesh_lights for material in light.materials if material}
     # Displacement could move faces out of the camera's sight.
     undisplaced = [(material, "displacement_method", "BUMP") for material in materials.values()]
@@ -228,23 +232,15 @@ def mark_transparent(ob, side: int, materials: list) -> None:
             material[SIDE_PROPERTY] = 0
 
 
-def _warn_of_emission(mesh_light: MeshLight, warn) -> None:
-    for material, emission in zip(mesh_light.materials, mesh_light.emission, strict=True):
-        for problem in emission_warnings(emission, is_light=False) if emission.emits else ():
-            warn(f"material {material.name!r}: {problem}")
-        if emission.emits and is_displaced(material):
-            warn(f"material {material.name!r}: it emits from where its faces are without displacement")
-
-
 def _emitting_side(mesh_light: MeshLight, eye: np.ndarray) -> int:
     """The value of SIDE_PROPERTY for an object."""
     sides = set()
     for placement in mesh_light.placements:
         vertices = placement.vertices
-        triangles = planar_polygons.welded(vertices, placement.triangles)
-        closed = planar_polygons.is_closed(triangles)
-        outward = planar_polygons.outward_side(vertices, triangles) if closed else 0
-        sides.add(-outward if closed and planar_polygons.is_inside(eye, vertices, triangles) else outward)
+        triangles = mesh_polygons.welded(vertices, placement.triangles)
+        closed = mesh_polygons.is_closed(triangles)
+        outward = mesh_polygons.outward_side(vertices, triangles) if closed else 0
+        sides.add(-outward if closed and mesh_polygons.is_inside(eye, vertices, triangles) else outward)
     return sides.pop() if len(sides) == 1 else 0
 
 
@@ -255,9 +251,7 @@ def _polygons(mesh_light: MeshLight, radiance) -> list[tuple[Placement, list[Fla
     placed_polygons = []
     for placement in mesh_light.placements:
         chosen = shines[placement.slots]
-        polygons = planar_polygons.flat_polygons(
-            placement.vertices, placement.triangles[chosen], placement.slots[chosen]
-        )
+        polygons = mesh_polygons.flat_polygons(placement.vertices, placement.triangles[chosen], placement.slots[chosen])
         placed_polygons.append((placement, polygons))
     return placed_polygons
 

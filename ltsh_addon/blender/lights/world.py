@@ -8,29 +8,10 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
-from ...cycles.environment import (
-    CUBE,
-    SMOOTH_SKY,
-    SkyPicture,
-    bright_spots,
-    fine_detail,
-    sky_lights,
-    spot_frame,
-    spot_light,
-    without_spots,
-)
+from ...cycles import environment
 from ...cycles.patches import note_patches
 from ...scene import Light, SkyLight, listed
-from ..materials.graph import (
-    is_group,
-    is_socket,
-    own_groups,
-    replaced_by_number,
-    source_of,
-    surface_of,
-    tree_in_use,
-    value_of,
-)
+from ..materials import graph
 from .emission import COMPARE_TELLS, CONSTANT_NODES, LIGHT_PATH, OF_CAMERA, open_studio, trees_of
 
 # Pixels along each side of a picture of a world. PLAIN: a world of one color. SMOOTH: one without fine detail.
@@ -120,56 +101,56 @@ def world_lights(scene, world, warn) -> tuple[list[Light], float]:
     if like is None:
         return [], 0.0
     pictures, lights = light_pictures(scene, world, like, warn)
-    sky, error = sky_lights(like, pictures)
+    sky, error = environment.sky_lights(like, pictures)
     if error > COARSE:
         note_patches(f"world {world.name!r}: it", sum(len(light.leaves) for light in sky), error, warn)
-    return sky + lights, fine_detail(pictures)
+    return sky + lights, environment.fine_detail(pictures)
 
 
-def light_pictures(scene, world, like: Light, warn) -> tuple[list[SkyPicture], list[Light]]:
+def light_pictures(scene, world, like: Light, warn) -> tuple[list[environment.SkyPicture], list[Light]]:
     """Six pictures (a cube) of `world` as surfaces see it, without small, bright spots, and lights like `like` for
     these."""
     with _observatory(scene, world, warn) as look:
         for pixels in _pixels(world):
-            pictures = [look(*axes, pixels, SAMPLES if pixels < MOST else SAMPLES // 2) for axes in CUBE]
-            if fine_detail(pictures) <= SMOOTH_SKY:
+            pictures = [look(*axes, pixels, SAMPLES if pixels < MOST else SAMPLES // 2) for axes in environment.CUBE]
+            if environment.fine_detail(pictures) <= environment.SMOOTH_SKY:
                 break
-        spots = bright_spots(pictures)
+        spots = environment.bright_spots(pictures)
         lights = []
         for number, spot in enumerate(spots):
-            close = look(*spot_frame(spot), SPOT_PIXELS, SPOT_SAMPLES)
-            lights += spot_light(like, without_spots(close, spots[:number]), spot)
-    return [without_spots(picture, spots) for picture in pictures], lights
+            close = look(*environment.spot_frame(spot), SPOT_PIXELS, SPOT_SAMPLES)
+            lights += environment.spot_light(like, environment.without_spots(close, spots[:number]), spot)
+    return [environment.without_spots(picture, spots) for picture in pictures], lights
 
 
-def background_pictures(scene, world, warn) -> list[SkyPicture]:
+def background_pictures(scene, world, warn) -> list[environment.SkyPicture]:
     """Six pictures (a cube) of the `world` of `scene` as cameras see it."""
     with _observatory(scene, world, warn, by_cameras=True) as look:
         *_, pixels = _pixels(world)
         pixels = pixels if pixels == PLAIN else max(pixels, 2 * PROCEDURAL)
-        return [look(*axes, pixels, SAMPLES // 2) for axes in CUBE]
+        return [look(*axes, pixels, SAMPLES // 2) for axes in environment.CUBE]
 
 
 def may_shine(world) -> bool:
     """False if `world` is None or plainly dark."""
     if world is None:
         return False
-    if tree_in_use(world) is None:
+    if graph.tree_in_use(world) is None:
         return max(world.color) > 0.0
-    surface = surface_of(world)
-    source = None if surface is None else source_of(surface)
+    surface = graph.surface_of(world)
+    source = None if surface is None else graph.source_of(surface)
     if source is None or source.node is None:
         return False
     if source.node.bl_idname != "ShaderNodeBackground":
         return True
-    color, strength = (value_of(source.node.inputs[name]) for name in ("Color", "Strength"))
-    return not (strength == 0.0 or (not is_socket(color) and max(color[:3]) <= 0.0))
+    color, strength = (graph.value_of(source.node.inputs[name]) for name in ("Color", "Strength"))
+    return not (strength == 0.0 or (not graph.is_socket(color) and max(color[:3]) <= 0.0))
 
 
 def _pixels(world) -> tuple[int, ...]:
     """Pixels along each side of pictures of `world` that span a quarter of the horizon, to be tried in turn until one
     shows no fine detail. Images, which take long to read, have detail: they are looked at once."""
-    if all(is_group(node) or node.bl_idname in EVERYWHERE_THE_SAME for node in _nodes(world)):
+    if all(graph.is_group(node) or node.bl_idname in EVERYWHERE_THE_SAME for node in _nodes(world)):
         return (PLAIN,)
     widths = [node.image.size[0] for node in _nodes(world) if getattr(node, "image", None) is not None]
     if not widths:
@@ -194,8 +175,8 @@ def _observatory(scene, world, warn, by_cameras: bool = False):
         _store(copied.cycles, "sampling_method", NOT_SAMPLED)
         if not by_cameras:
             _store(copied.cycles_visibility, "camera", True)
-        if tree_in_use(copied) is not None and not by_cameras:
-            groups = own_groups(copied.node_tree)
+        if graph.tree_in_use(copied) is not None and not by_cameras:
+            groups = graph.own_groups(copied.node_tree)
             _as_surfaces_see(copied, world.name, warn)
         with open_studio(scene) as studio:
             studio.scene.world = copied
@@ -218,7 +199,7 @@ def _observatory(scene, world, warn, by_cameras: bool = False):
                     share = f"on {100.0 * odd.mean():.2g} % of a side of the sky, dark there"
                     warn(f"world {world.name!r}: its radiance is not finite, or beyond {MOST_RADIANCE:g}, {share}")
                     radiance[odd] = 0.0
-                return SkyPicture(ahead, right, up, radiance)
+                return environment.SkyPicture(ahead, right, up, radiance)
 
             _note_cameras(copied, world.name, warn)
             yield look
@@ -230,7 +211,7 @@ def _observatory(scene, world, warn, by_cameras: bool = False):
 
 def _without_volume(world) -> bool:
     """Remove the volume of `world`; True if there was one."""
-    tree = tree_in_use(world)
+    tree = graph.tree_in_use(world)
     outputs = () if tree is None else [node for node in tree.nodes if node.bl_idname == "ShaderNodeOutputWorld"]
     links = [link for node in outputs for link in node.inputs["Volume"].links]
     for link in links:
@@ -262,7 +243,7 @@ def _as_surfaces_see(world, name: str, warn) -> None:
         for output in [output for output in node.outputs if output.is_linked]:
             if output.name not in SEEN_BY_SURFACES:
                 unclear.add(output.name)
-            replaced_by_number(output, SEEN_BY_SURFACES.get(output.name, 0.0))
+            graph.replaced_by_number(output, SEEN_BY_SURFACES.get(output.name, 0.0))
     if unclear:
         warn(
             f"world {name!r}: its light depends on {listed(sorted(unclear))} of a Light Path node, of which Cycles "

@@ -81,7 +81,12 @@ def refresh(scene) -> bool:
 
 def _show(scene, pixels: np.ndarray, as_render: bool) -> None:
     _store(viewer_image(scene), pixels, as_render)
-    _settle_later(scene)
+    # The image is packed once nothing has changed for a moment: else Blender asks to save it when it quits.
+    _state["settling"].add(scene.name)
+    if not bpy.app.background:
+        if bpy.app.timers.is_registered(settle):
+            bpy.app.timers.unregister(settle)
+        bpy.app.timers.register(settle, first_interval=SETTLE_SECONDS)
     redraw_editors("IMAGE_EDITOR")
 
 
@@ -176,15 +181,6 @@ def _error_lookup() -> np.ndarray:
     """Linear colors (N, 3) that Blender's default display shows as the colors of `signed_error_colors`."""
     values = np.append(np.linspace(-1.0, 1.0, _LOOKUP_SIZE - 1), np.nan)
     return srgb_decode(signed_error_colors(values[None], 1.0)[0]).astype(np.float32)
-
-
-def _settle_later(scene) -> None:
-    """Pack the image once nothing has changed for a moment. Blender asks to save unpacked changes when it quits."""
-    _state["settling"].add(scene.name)
-    if not bpy.app.background:
-        if bpy.app.timers.is_registered(settle):
-            bpy.app.timers.unregister(settle)
-        bpy.app.timers.register(settle, first_interval=SETTLE_SECONDS)
 
 
 def settle() -> None:

@@ -13,19 +13,10 @@ from ...scene import error_line
 from ...shading.highlight import QUICK, THOROUGH
 from ..lights.groups import reason_to_stay
 from ..lights.textures import ShownTextures
-from .highlight_place import (
-    DISK,
-    PIXELS,
-    HitsAround,
-    hits_around,
-    note_by_pixels,
-    place_by_pixels,
-    place_of,
-    warm_up,
-)
+from . import highlight_place
 from .light_pose import LightLook, LightPose, locked_place, power_for, reason_to_keep_look, reason_to_keep_power
 from .lit_point import LightShare, SceneLights, SurfaceHit, hit_at, hits_at, share_line
-from .preview import PASSED_ON, active_light, lights_of, pointer, view_under
+from .preview import PASSED_ON, LTSHOperator, active_light, lights_of, pointer, view_under
 from .shadow_edge import NEAR_EDGE, OccluderRays, shadow_edge_near
 
 # FARTHER: the factor of the distance by a step of the wheel.
@@ -52,14 +43,14 @@ NO_SURFACE = "there is no surface under the mouse"
 _logger = logging.getLogger(__name__)
 
 
-class Gesture:
+class Gesture(LTSHOperator):
     """A modal operator: a drag with the left button over surfaces changes a light, until the button is released.
 
     Subclasses have `press`, `follow`, `put_back`, KEYS and the ICON of their tool. The headers of the 3D views tell the
     share of each light where the mouse rests, during a drag what `follow` notes.
     """
 
-    KEYS = ""  # what the status bar says
+    KEYS, NEEDS_OBJECT_MODE = "", True  # KEYS: what the status bar says
 
     def invoke(self, context, event):
         self._is_dragged, self._note, self._scene_lights, self._textures = False, "", None, ShownTextures()
@@ -69,7 +60,7 @@ class Gesture:
         self._timer = context.window_manager.event_timer_add(REST_SECONDS, window=context.window)
         context.window.cursor_modal_set("CROSSHAIR")
         context.workspace.status_text_set(f"{self.words(context)}    Esc: Cancel")
-        warm_up(context.scene)
+        highlight_place.warm_up(context.scene)
         # A tool starts it by the press itself, a button by its release.
         if event.type == "LEFTMOUSE" and event.value == "PRESS":
             try:
@@ -82,17 +73,6 @@ class Gesture:
                 return {"CANCELLED"}
         context.window_manager.modal_handler_add(self)
         return {"RUNNING_MODAL"}
-
-    @classmethod
-    def poll(cls, context):
-        if reason := cls.reason_against(context):
-            cls.poll_message_set(reason)
-        return not reason
-
-    @classmethod
-    def reason_against(cls, context) -> str:
-        """Why the gesture cannot begin; "" if it can."""
-        return "" if context.mode == "OBJECT" else "Lights are dragged in Object Mode"
 
     @classmethod
     def words(cls, context) -> str:
@@ -345,7 +325,6 @@ class LTSH_OT_drag_highlight(MovingGesture, bpy.types.Operator):
     """Drag the highlight of the active light, or without one of the light that gives the pressed point the most glossy
     light, over surfaces in a 3D view: the light follows, keeps its distance and faces them"""
 
-    bl_idname = "ltsh.drag_highlight"
     bl_label = "Drag Highlight"
     bl_options = {"UNDO"}
     KEYS, ICON, CHOOSES = f"Drag the highlight of {{}}    {MOVING_KEYS}", "ops.transform.tosphere", True
@@ -379,13 +358,13 @@ class LTSH_OT_drag_highlight(MovingGesture, bpy.types.Operator):
 
     def follow(self, context, event) -> bool:
         """As `press`."""
-        around = self._hits(context, event, DISK)
+        around = self._hits(context, event, highlight_place.DISK)
         if around is None:
             self._note = NO_SURFACE
             return False
         middle = around.hits[0].position
         self._distance = self._distance or max((self._pose.matrix.translation - middle).length, LEAST_DISTANCE)
-        matrix, note = place_of(self._light, self._pose, around, self._distance, self._textures, LIVE)
+        matrix, note = highlight_place.place_of(self._light, self._pose, around, self._distance, self._textures, LIVE)
         if not all(self._free):
             way = locked_place(self._pose.matrix.translation, middle, matrix.translation, self._free) - middle
             matrix = self._pose.facing(middle, way.normalized(), way.length)
@@ -396,27 +375,28 @@ class LTSH_OT_drag_highlight(MovingGesture, bpy.types.Operator):
 
     def warning(self, context, event) -> str:
         """As `Gesture.warning`: by all pixels around the mouse."""
-        around = self._hits(context, event, PIXELS)
+        around = self._hits(context, event, highlight_place.PIXELS)
         if around is None:
             return NO_SURFACE
         if not all(self._free):
-            return note_by_pixels(self._light, self._matrix, around, self._textures)
-        self._matrix, note = place_by_pixels(self._light, self._pose, self._matrix, around, self._textures, AT_REST)
+            return highlight_place.note_by_pixels(self._light, self._matrix, around, self._textures)
+        self._matrix, note = highlight_place.place_by_pixels(
+            self._light, self._pose, self._matrix, around, self._textures, AT_REST
+        )
         self._put(self._matrix)
         return note
 
-    def _hits(self, context, event, disk) -> HitsAround | None:
+    def _hits(self, context, event, disk) -> highlight_place.HitsAround | None:
         self._snap(context, event)
         region, mouse = view_under(context, self._mouse)
         if region is None:
             return None
-        return hits_around(lambda offsets: hits_at(context, region, mouse + offsets), disk)
+        return highlight_place.hits_around(lambda offsets: hits_at(context, region, mouse + offsets), disk)
 
 
 class LTSH_OT_drag_brightness(Gesture, bpy.types.Operator):
     """Press on a surface in a 3D view and drag up or down: the light that gives it the most changes its power"""
 
-    bl_idname = "ltsh.drag_brightness"
     bl_label = "Drag Brightness"
     bl_options = {"UNDO"}
     KEYS = (
@@ -480,7 +460,6 @@ class LTSH_OT_drag_shadow(MovingGesture, bpy.types.Operator):
     """Drag the edge of a shadow of the active light over surfaces in a 3D view: the light follows, keeps its distance
     from what it faces, and goes on facing it"""
 
-    bl_idname = "ltsh.drag_shadow"
     bl_label = "Drag Shadow"
     bl_options = {"UNDO"}
     KEYS, ICON = f"Drag the edge of a shadow of {{}}    {MOVING_KEYS}", "ops.transform.shear"
@@ -538,7 +517,6 @@ class LTSH_OT_drag_shadow(MovingGesture, bpy.types.Operator):
 class LTSH_OT_aim_light(MovingGesture, bpy.types.Operator):
     """Turn the active light, where it is, to face the point of a surface under the mouse in a 3D view"""
 
-    bl_idname = "ltsh.aim_light"
     bl_label = "Aim Light"
     bl_options = {"UNDO"}
     KEYS = "Press where {} shall shine, and drag    S: size    C: color    Shift: precise    Ctrl: corners"
@@ -573,7 +551,7 @@ _tools: list[type] = []
 
 def _tool_of(gesture) -> type:
     def draw_settings(context, layout, tool):
-        warm_up(context.scene)
+        highlight_place.warm_up(context.scene)
         layout.label(text=gesture.reason_against(context) or gesture.words(context))
 
     return type(f"{gesture.__name__}_tool", (bpy.types.WorkSpaceTool,), {

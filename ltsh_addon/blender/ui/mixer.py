@@ -17,12 +17,13 @@ from ..lights.area import area_light, reason_to_leave_out
 from ..lights.groups import reason_to_keep
 from ..lights.linking import Receivers
 from . import comparison, results
+from .operators import TIMER_SECONDS, WatchedOperator
 from .panels import draw_job, draw_text, gray, in_both_places, split_names
+from .preview import LTSHOperator
 
 UPDATE, MOVED = "Update Moved Lights", "moved since this picture"
 # UNMOVED: smaller changes, relative to a light's distance and size, do not count as a move.
 UNMOVED = 1e-5
-TIMER_SECONDS = 0.1
 
 
 def plain_lights(depsgraph) -> dict[str, Light]:
@@ -212,19 +213,17 @@ class LTSH_PT_IMAGE_mixer(_Mixer, bpy.types.Panel):
     bl_options = set()
 
 
-class _NeedsMixer:
+class _NeedsMixer(LTSHOperator):
     @classmethod
-    def poll(cls, context):
-        if results.mixer_of(context.scene) is None:
-            cls.poll_message_set("Shade a picture first, with Keep Lights, or bake Per Light")
-            return False
-        return True
+    def reason_against(cls, context) -> str:
+        """As `LTSHOperator.reason_against`."""
+        reason = "Shade a picture first, with Keep Lights, or bake Per Light"
+        return reason if results.mixer_of(context.scene) is None else super().reason_against(context)
 
 
 class LTSH_OT_reset_mixer(_NeedsMixer, bpy.types.Operator):
     """Show all lights as they were rendered"""
 
-    bl_idname = "ltsh.reset_mixer"
     bl_label = "Reset"
     bl_options = {"UNDO"}
 
@@ -237,7 +236,6 @@ class LTSH_OT_reset_mixer(_NeedsMixer, bpy.types.Operator):
 class LTSH_OT_apply_mixer(_NeedsMixer, bpy.types.Operator):
     """Give the lights of the scene the values that the mixer shows, and hide muted ones in renders"""
 
-    bl_idname = "ltsh.apply_mixer"
     bl_label = "Apply to Scene"
     bl_options = {"UNDO"}
 
@@ -289,7 +287,6 @@ def _reason_not_to_apply(ob, values, given: dict) -> str:
 class LTSH_OT_paint_target(_NeedsMixer, bpy.types.Operator):
     """Make a target to paint on: a copy of the picture as the mixer shows it"""
 
-    bl_idname = "ltsh.paint_target"
     bl_label = "Paint a Target"
     bl_options = {"UNDO"}
 
@@ -309,16 +306,13 @@ class LTSH_OT_paint_target(_NeedsMixer, bpy.types.Operator):
 class LTSH_OT_match_target(_NeedsMixer, bpy.types.Operator):
     """Give the lights the powers with which the picture comes closest to the target"""
 
-    bl_idname = "ltsh.match_target"
     bl_label = "Match"
     bl_options = {"UNDO"}
 
     @classmethod
-    def poll(cls, context):
-        if context.scene.ltsh.match_target is None:
-            cls.poll_message_set("Choose a target, or paint one")
-            return False
-        return super().poll(context)
+    def reason_against(cls, context) -> str:
+        """As `LTSHOperator.reason_against`."""
+        return results.reason_without_target(context.scene) or super().reason_against(context)
 
     def execute(self, context):
         scene, settings = context.scene, context.scene.ltsh
@@ -354,34 +348,19 @@ def match_mixer(scene, image, colors: bool) -> LightFactors:
     return result
 
 
-class LTSH_OT_update_moved_lights(_NeedsMixer, bpy.types.Operator):
+class LTSH_OT_update_moved_lights(_NeedsMixer, WatchedOperator, bpy.types.Operator):
     """Shade lights that have been moved or resized since the picture where they are now; the others stay.
     Lights that are moved meanwhile are followed"""
 
-    bl_idname = "ltsh.update_moved_lights"
     bl_label = UPDATE
 
     @classmethod
-    def poll(cls, context):
-        if results.state["update"] is not None:
-            cls.poll_message_set("Moved lights are being shaded")
-            return False
-        return super().poll(context)
+    def reason_against(cls, context) -> str:
+        """As `LTSHOperator.reason_against`."""
+        is_busy = results.state["update"] is not None
+        return "Moved lights are being shaded" if is_busy else super().reason_against(context)
 
-    def invoke(self, context, event):
-        if not self._begin(context):
-            return {"CANCELLED"}
-        manager = context.window_manager
-        self._timer = manager.event_timer_add(TIMER_SECONDS, window=context.window)
-        manager.modal_handler_add(self)
-        comparison.redraw_panels()
-        return {"RUNNING_MODAL"}
-
-    def execute(self, context):
-        """Without a window, as from scripts, wait for the end."""
-        self._timer = None
-        if not self._begin(context):
-            return {"CANCELLED"}
+    def _wait(self, context):
         while not self._update.is_finished:
             self._update.take()
             time.sleep(TIMER_SECONDS)
@@ -432,8 +411,7 @@ class LTSH_OT_update_moved_lights(_NeedsMixer, bpy.types.Operator):
         update = self._update
         if results.state["update"] is update:
             results.state["update"] = None
-        if self._timer is not None:
-            context.window_manager.event_timer_remove(self._timer)
+        self._end_timer(context)
         if update.error is not None and not isinstance(update.error, Cancelled):
             self.report({"ERROR"}, error_line(update.error))
         scene = results.scene_of(self._scene_uid)
@@ -443,10 +421,9 @@ class LTSH_OT_update_moved_lights(_NeedsMixer, bpy.types.Operator):
         return {"FINISHED"} if update.error is None else {"CANCELLED"}
 
 
-class LTSH_OT_cancel_moved_lights(bpy.types.Operator):
+class LTSH_OT_cancel_moved_lights(LTSHOperator, bpy.types.Operator):
     """Show the lights as they were before"""
 
-    bl_idname = "ltsh.cancel_moved_lights"
     bl_label = "Cancel"
 
     def execute(self, context):

@@ -21,57 +21,59 @@ from ..extract.apply import restore_materials, show_texture, shows_texture
 from ..process.bake import BakedTextures
 from ..saving import save_working_copy
 from . import comparison, light_pose, preflight, results
-from .job import (
-    Job,
-    Plan,
-    clock,
-    output_folder,
-    progress_text,
-    runs_of,
-    session_times,
-    stage_title,
-    steps,
-    write_target,
-)
+from . import job as jobs
+from .preview import LTSHOperator
 
 TIMER_SECONDS, WAITING_SECONDS = 0.1, 0.005
 
 
-def running_job() -> Job | None:
+def running_job() -> jobs.Job | None:
     """The job that runs now, or None."""
     return results.state["job"]
 
 
-class _JobOperator:
-    """A job, watched by a timer; Esc ends it."""
+class WatchedOperator(LTSHOperator):
+    """An operator that a timer follows until it ends: it begins by `_begin`, and `_wait` waits for it."""
 
-    # Not REGISTER: "Repeat Last" would run `execute`, which waits.
-    bl_options = {"UNDO"}
-    command = ""
-    _opened = False  # the next results are set in the scene, but the comparison does not show them yet
-
-    @classmethod
-    def poll(cls, context):
-        if running_job() is not None:
-            cls.poll_message_set("A job is running: wait for it, or cancel it")
-            return False
-        return context.scene is not None
+    _timer = None
 
     def invoke(self, context, event):
         if not self._begin(context):
             return {"CANCELLED"}
-        self._progress = None
-        manager = context.window_manager
-        self._timer = manager.event_timer_add(TIMER_SECONDS, window=context.window)
-        manager.modal_handler_add(self)
+        self._timer = context.window_manager.event_timer_add(TIMER_SECONDS, window=context.window)
+        context.window_manager.modal_handler_add(self)
         self._show_progress(context)
         return {"RUNNING_MODAL"}
 
     def execute(self, context):
         """Without a window, as from scripts, wait for the end."""
-        self._timer = None
-        if not self._begin(context):
-            return {"CANCELLED"}
+        return self._wait(context) if self._begin(context) else {"CANCELLED"}
+
+    def _show_progress(self, context) -> None:
+        comparison.redraw_panels()
+
+    def _end_timer(self, context) -> None:
+        if self._timer is not None:
+            context.window_manager.event_timer_remove(self._timer)
+            self._timer = None
+
+
+class _JobOperator(WatchedOperator):
+    """A job; Esc ends it."""
+
+    # Not REGISTER: "Repeat Last" would run `execute`, which waits.
+    bl_options = {"UNDO"}
+    command = ""
+    _opened = False  # the next results are set in the scene, but the comparison does not show them yet
+    _progress = None
+
+    @classmethod
+    def reason_against(cls, context) -> str:
+        """As `LTSHOperator.reason_against`."""
+        busy = "A job is running: wait for it, or cancel it"
+        return super().reason_against(context) or (busy if running_job() is not None else "")
+
+    def _wait(self, context):
         try:
             self._job.wait()
             self._show_all_results(context)
@@ -122,14 +124,18 @@ class _JobOperator:
             return False
         folder = Path(tempfile.mkdtemp(prefix="ltsh-"))
         copy = folder / (Path(bpy.data.filepath).name or "untitled.blend")
-        runs = runs_of(context, self.command, copy)
-        job = Job(
-            self.bl_label, Plan(steps(runs), measured=session_times), folder, self.command, context.scene.session_uid
+        runs = jobs.runs_of(context, self.command, copy)
+        job = jobs.Job(
+            self.bl_label,
+            jobs.Plan(jobs.steps(runs), measured=jobs.session_times),
+            folder,
+            self.command,
+            context.scene.session_uid,
         )
         job.output = runs[-1].options.output
         try:
             if self.command == "match":
-                write_target(context.scene, folder)
+                jobs.write_target(context.scene, folder)
             save_working_copy(copy)
             job.start([run.to_dict() for run in runs], background=not bpy.app.background)
         except (RuntimeError, OSError, SceneError) as error:
@@ -144,9 +150,9 @@ class _JobOperator:
     def _show_progress(self, context) -> None:
         """Redraw progress if its text has changed."""
         job = self._job
-        done = f"{job.title}: {stage_title(job.stage)}  {progress_text(job.plan, job.seconds())}"
+        done = f"{job.title}: {jobs.stage_title(job.stage)}  {jobs.progress_text(job.plan, job.seconds())}"
         text = f"{done}    {translated('Esc')}: {translated('Cancel')}"
-        shown = text, clock(job.seconds())
+        shown = text, jobs.clock(job.seconds())
         if shown != self._progress:
             self._progress = shown
             context.workspace.status_text_set(text)
@@ -177,11 +183,6 @@ class _JobOperator:
     def _show_all_results(self, context) -> None:
         while self._show_some_results(context):
             time.sleep(WAITING_SECONDS)
-
-    def _end_timer(self, context) -> None:
-        if self._timer is not None:
-            context.window_manager.event_timer_remove(self._timer)
-            self._timer = None
 
     def _finish(self, context):
         job = self._job
@@ -224,7 +225,7 @@ class _JobOperator:
         for problem in [*problems, *report["warnings"]]:
             self.report({"WARNING"}, problem)
         before, after = (f"{100.0 * report[f'error_{when}']:.1f} %" for when in ("before", "after"))
-        took = f"{self._job.title} took {clock(self._job.seconds())}"
+        took = f"{self._job.title} took {jobs.clock(self._job.seconds())}"
         self.report({"INFO"}, f"{took}: the picture is {after} from the target, it was {before}; moved: {moved}")
         self._job.shown = 1
 
@@ -237,13 +238,12 @@ class _JobOperator:
         noted = f", {count} warning{'s' if count > 1 else ''}" if count else ""
         if unchanged := sum(state == "unchanged" for state in self._job.objects.values()):
             noted += f", not baked again since nothing has changed: {unchanged} of {len(self._job.objects)}"
-        self.report({"INFO"}, f"{self._job.title} took {clock(self._job.seconds())}{noted}")
+        self.report({"INFO"}, f"{self._job.title} took {jobs.clock(self._job.seconds())}{noted}")
 
 
 class LTSH_OT_shade(_JobOperator, bpy.types.Operator):
     """Shade what the active camera sees, with the chosen technique"""
 
-    bl_idname = "ltsh.shade"
     bl_label = "Shade Camera View"
     command = "shade"
 
@@ -252,7 +252,6 @@ class LTSH_OT_compare(_JobOperator, bpy.types.Operator):
     """Shade what the active camera sees, render it with Cycles too, and measure the difference.
     Direct light on both sides, without bounces"""
 
-    bl_idname = "ltsh.compare"
     bl_label = "Compare with Cycles"
     command = "compare"
 
@@ -260,7 +259,6 @@ class LTSH_OT_compare(_JobOperator, bpy.types.Operator):
 class LTSH_OT_bake(_JobOperator, bpy.types.Operator):
     """Bake the light on the selected objects into textures, one EXR for each"""
 
-    bl_idname = "ltsh.bake"
     bl_label = "Bake Selected"
     command = "bake"
 
@@ -269,49 +267,41 @@ class LTSH_OT_match_move(_JobOperator, bpy.types.Operator):
     """Move and turn the lights of the scene and change their powers, so that its finished picture, bounces included,
     comes closest to the target. Takes a minute or more"""
 
-    bl_idname = "ltsh.match_move"
     bl_label = "Match and Move"
     command = "match"
 
     @classmethod
-    def poll(cls, context):
-        if not super().poll(context):
-            return False
+    def reason_against(cls, context) -> str:
+        """As `LTSHOperator.reason_against`."""
+        if reason := super().reason_against(context) or results.reason_without_target(context.scene):
+            return reason
         target = context.scene.ltsh.match_target
-        if target is None:
-            cls.poll_message_set("Choose a target, or paint one")
-        elif target.get(results.DIRECT_ONLY):
-            cls.poll_message_set(
-                f"{target.name} was painted on direct light alone: render with Complete and Keep Lights, paint on that"
-            )
-        return target is not None and not target.get(results.DIRECT_ONLY)
+        direct = "was painted on direct light alone: render with Complete and Keep Lights, paint on that"
+        return f"{target.name} {direct}" if target.get(results.DIRECT_ONLY) else ""
 
 
-class LTSH_OT_watch(_JobOperator, bpy.types.Operator):
+class _OnRunningJob(LTSHOperator):
+    @classmethod
+    def reason_against(cls, context) -> str:
+        """As `LTSHOperator.reason_against`."""
+        return "No job is running" if running_job() is None else ""
+
+
+class LTSH_OT_watch(_OnRunningJob, _JobOperator, bpy.types.Operator):
     """Watch the job that runs, whose own window was closed"""
 
-    bl_idname = "ltsh.watch"
     bl_label = "Watch Job"
     bl_options = {"UNDO", "INTERNAL"}
-
-    @classmethod
-    def poll(cls, context):
-        return running_job() is not None
 
     def _begin(self, context) -> bool:
         self._job = running_job()
         return True
 
 
-class LTSH_OT_cancel(bpy.types.Operator):
+class LTSH_OT_cancel(_OnRunningJob, bpy.types.Operator):
     """Stop the job; pictures that are finished are kept"""
 
-    bl_idname = "ltsh.cancel"
     bl_label = "Cancel"
-
-    @classmethod
-    def poll(cls, context):
-        return running_job() is not None
 
     def execute(self, context):
         running_job().cancel()
@@ -319,7 +309,7 @@ class LTSH_OT_cancel(bpy.types.Operator):
         return {"FINISHED"}
 
 
-def _watch_elsewhere(job: Job) -> None:
+def _watch_elsewhere(job: jobs.Job) -> None:
     """Let the first remaining window watch `job`."""
     windows = bpy.context.window_manager.windows
     if running_job() is job and windows:
@@ -353,19 +343,17 @@ COMMANDS = (
 )
 
 
-class _NeedsResults:
+class _NeedsResults(LTSHOperator):
     @classmethod
-    def poll(cls, context):
-        if context.scene is None or results.result_of(context.scene) is None:
-            cls.poll_message_set("There are no results yet: shade, compare or bake first")
-            return False
-        return True
+    def reason_against(cls, context) -> str:
+        """As `LTSHOperator.reason_against`."""
+        missing = context.scene is None or results.result_of(context.scene) is None
+        return "There are no results yet: shade, compare or bake first" if missing else ""
 
 
 class LTSH_OT_open_results(_NeedsResults, bpy.types.Operator):
     """Show the pictures in an Image Editor that is open, or in a window of their own"""
 
-    bl_idname = "ltsh.open_results"
     bl_label = "Open in Image Editor"
 
     def execute(self, context):
@@ -376,10 +364,9 @@ class LTSH_OT_open_results(_NeedsResults, bpy.types.Operator):
         return {"CANCELLED"}
 
 
-class LTSH_OT_show_results(bpy.types.Operator):
+class LTSH_OT_show_results(LTSHOperator, bpy.types.Operator):
     """Look at what this command left last"""
 
-    bl_idname = "ltsh.show_results"
     bl_label = "Show Results"
     bl_options = {"UNDO"}
 
@@ -396,10 +383,9 @@ class LTSH_OT_show_results(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LTSH_OT_choose(bpy.types.Operator):
+class LTSH_OT_choose(LTSHOperator, bpy.types.Operator):
     """Choose what is shown of the results"""
 
-    bl_idname = "ltsh.choose"
     bl_label = "Choose"
     bl_options = {"UNDO", "INTERNAL"}
 
@@ -418,7 +404,6 @@ class LTSH_OT_choose(bpy.types.Operator):
 class LTSH_OT_swap(_NeedsResults, bpy.types.Operator):
     """Exchange the two pictures"""
 
-    bl_idname = "ltsh.swap"
     bl_label = "Swap A and B"
     bl_options = {"UNDO"}
 
@@ -429,19 +414,18 @@ class LTSH_OT_swap(_NeedsResults, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LTSH_OT_apply_bake(bpy.types.Operator):
+class LTSH_OT_apply_bake(LTSHOperator, bpy.types.Operator):
     """Let the objects of the last bake show their textures: they get copies of their materials"""
 
-    bl_idname = "ltsh.apply_bake"
     bl_label = "Apply Bake"
     bl_options = {"REGISTER", "UNDO"}
+    NEEDS_OBJECT_MODE = True
 
     @classmethod
-    def poll(cls, context):
-        if context.scene is None or last_bake(context.scene) is None:
-            cls.poll_message_set("There is no bake yet: bake first")
-            return False
-        return context.mode == "OBJECT"
+    def reason_against(cls, context) -> str:
+        """As `LTSHOperator.reason_against`."""
+        reason = super().reason_against(context)
+        return reason or ("There is no bake yet: bake first" if last_bake(context.scene) is None else "")
 
     def execute(self, context):
         result, gone, shown = last_bake(context.scene), [], []
@@ -466,19 +450,18 @@ class LTSH_OT_apply_bake(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LTSH_OT_restore_materials(bpy.types.Operator):
+class LTSH_OT_restore_materials(LTSHOperator, bpy.types.Operator):
     """Give objects that show baked textures their materials back"""
 
-    bl_idname = "ltsh.restore_materials"
     bl_label = "Restore Materials"
     bl_options = {"REGISTER", "UNDO"}
+    NEEDS_OBJECT_MODE = True
 
     @classmethod
-    def poll(cls, context):
-        if context.scene is None or not any(shows_texture(ob) for ob in context.scene.objects):
-            cls.poll_message_set("No object shows a baked texture")
-            return False
-        return context.mode == "OBJECT"
+    def reason_against(cls, context) -> str:
+        """As `LTSHOperator.reason_against`."""
+        reason = super().reason_against(context)
+        return reason or ("" if any(map(shows_texture, context.scene.objects)) else "No object shows a baked texture")
 
     def execute(self, context):
         restored = [ob.name for ob in context.scene.objects if restore_materials(ob)]
@@ -488,7 +471,7 @@ class LTSH_OT_restore_materials(bpy.types.Operator):
 
 def last_folder(scene, command: str) -> Path:
     """The folder of the last results of `command`, wherever the file and new results are saved since."""
-    return results.folder_of(scene, command, output_folder(scene, command) / "images")
+    return results.folder_of(scene, command, jobs.output_folder(scene, command) / "images")
 
 
 def last_bake(scene):
@@ -521,10 +504,9 @@ def baked_texture(scene, result, record: dict) -> BakedTextures:
     return BakedTextures(bake_members(record), record["uv"], f"{record['name']} {layer}", files)
 
 
-class LTSH_OT_manual(bpy.types.Operator):
+class LTSH_OT_manual(LTSHOperator, bpy.types.Operator):
     """Read the manual of LTSH, one page, in a new window"""
 
-    bl_idname = "ltsh.manual"
     bl_label = "Manual"
 
     def execute(self, context):

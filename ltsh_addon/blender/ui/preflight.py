@@ -33,7 +33,7 @@ from ..materials.graph import shaders_behind, surface_of
 from ..materials.preview_material import preview_of
 from ..render_settings import CAMERA_KINDS, CAMERA_TYPES, picture_size
 from . import results
-from .preview import ENGINE, lights_of, view_of
+from .preview import ENGINE, LTSHOperator, lights_of, view_of
 
 EXACT, APPROXIMATED, LEFT_OUT = "exact", "approximated", "left out"
 UNWRAPPED_SIDE = 128  # the least texels a side for which islands of an object keep their distance
@@ -120,7 +120,12 @@ def bake_objects(context) -> tuple[list, list[Problem]]:
     if not selected:
         return [], [Problem("No selected object is checked: check those to bake")]
     baked = [ob for ob in selected if shows_texture(ob) and not ob.hide_render]
-    usable, problems = [], [_textures_shown(baked)] if baked else []
+    usable, problems = [], []
+    if baked:  # one click restores them all
+        which = f"Object {baked[0].name!r} shows a baked texture" if len(baked) == 1 else None
+        text = f"{which or f'{len(baked)} objects show baked textures'} in place of "
+        text += "its materials" if which else "their materials"
+        problems.append(Problem(text, True, "ltsh.restore_materials", "Restore"))
     for ob in selected:
         if ob in baked:
             continue
@@ -135,15 +140,6 @@ def bake_objects(context) -> tuple[list, list[Problem]]:
         text = f"Not in the atlas yet: {listed(map(repr, bare))}"
         problems.append(Problem(text, True, "ltsh.make_atlas", "Make Atlas"))
     return usable, problems
-
-
-def _textures_shown(baked) -> Problem:
-    """One problem for all objects that show baked textures, since one click restores them all."""
-    if len(baked) == 1:
-        text = f"Object {baked[0].name!r} shows a baked texture in place of its materials"
-    else:
-        text = f"{len(baked)} objects show baked textures in place of their materials"
-    return Problem(text, True, "ltsh.restore_materials", "Restore")
 
 
 def _object_problem(ob, settings) -> Problem | None:
@@ -250,10 +246,9 @@ class LTSH_UL_baked(bpy.types.UIList):
             side.label(text=BAKE_STATES[state][0], icon=BAKE_STATES[state][1])
 
 
-class LTSH_OT_add_camera(bpy.types.Operator):
+class LTSH_OT_add_camera(LTSHOperator, bpy.types.Operator):
     """Add a camera that looks as the 3D viewport does, and make it the scene's active camera"""
 
-    bl_idname = "ltsh.add_camera"
     bl_label = "Add Camera"
     bl_options = {"REGISTER", "UNDO"}
 
@@ -269,18 +264,14 @@ class LTSH_OT_add_camera(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LTSH_OT_add_uv_map(bpy.types.Operator):
+class LTSH_OT_add_uv_map(LTSHOperator, bpy.types.Operator):
     """Unwrap the object into a new UV map (Smart UV Project)"""
 
-    bl_idname = "ltsh.add_uv_map"
     bl_label = "Unwrap"
     bl_options = {"REGISTER", "UNDO"}
+    NEEDS_OBJECT_MODE = True
 
     object_name: StringProperty(name="Object", description="Name of the object")
-
-    @classmethod
-    def poll(cls, context):
-        return context.mode == "OBJECT"
 
     def execute(self, context):
         ob = context.view_layer.objects.get(self.object_name)
@@ -293,17 +284,13 @@ class LTSH_OT_add_uv_map(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LTSH_OT_make_atlas(bpy.types.Operator):
+class LTSH_OT_make_atlas(LTSHOperator, bpy.types.Operator):
     """Unwrap the selected objects into one texture, on a UV map Lightmap that is added; all others stay.
     Objects that share a mesh get one each"""
 
-    bl_idname = "ltsh.make_atlas"
     bl_label = "Make Atlas"
     bl_options = {"REGISTER", "UNDO"}
-
-    @classmethod
-    def poll(cls, context):
-        return context.mode == "OBJECT"
+    NEEDS_OBJECT_MODE = True
 
     def execute(self, context):
         try:
@@ -318,10 +305,9 @@ class LTSH_OT_make_atlas(bpy.types.Operator):
         return {"FINISHED"}
 
 
-class LTSH_OT_pack_image(bpy.types.Operator):
+class LTSH_OT_pack_image(LTSHOperator, bpy.types.Operator):
     """Keep the changes of the image in the .blend"""
 
-    bl_idname = "ltsh.pack_image"
     bl_label = "Pack Image"
     bl_options = {"REGISTER", "UNDO"}
 

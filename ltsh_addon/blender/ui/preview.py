@@ -21,15 +21,37 @@ from ..saving import keeps_engine
 ENGINE = "LTSH"
 
 
+class LTSHOperator:
+    """What our operators share: Blender knows `LTSH_OT_bake` as "ltsh.bake", and `reason_against` grays its button."""
+
+    NEEDS_OBJECT_MODE = False
+
+    def __init_subclass__(cls):
+        super().__init_subclass__()
+        cls.bl_idname = cls.__name__.lower().replace("_ot_", ".")
+
+    @classmethod
+    def poll(cls, context):
+        if reason := cls.reason_against(context):
+            cls.poll_message_set(reason)
+        return not reason
+
+    @classmethod
+    def reason_against(cls, context) -> str:
+        """Why it cannot begin; "" if it can."""
+        if context.scene is None:
+            return "There is no scene"
+        return "Only in Object Mode" if cls.NEEDS_OBJECT_MODE and context.mode != "OBJECT" else ""
+
+
 def is_previewing(scene) -> bool:
     """True while `scene` has our engine for a preview."""
     return scene.render.engine == ENGINE and bool(scene.ltsh_view.artist_engine)
 
 
-class LTSH_OT_preview(bpy.types.Operator):
+class LTSH_OT_preview(LTSHOperator, bpy.types.Operator):
     """Show the scene in this view with LTSH; once more: give the former engine and shading back"""
 
-    bl_idname = "ltsh.preview"
     bl_label = "Preview with LTSH"
 
     def execute(self, context):
@@ -143,13 +165,12 @@ MOST_CROSSED = 16  # surfaces of the object itself that the way to such a light 
 PASSED_ON = ("MIDDLE", "WHEEL", "TRACKPAD", "NDOF", "TIMER")
 
 
-class LTSH_OT_add_light(bpy.types.Operator):
+class LTSH_OT_add_light(LTSHOperator, bpy.types.Operator):
     """Add an area light: click a surface in a 3D view, which the light then faces"""
 
-    bl_idname = "ltsh.add_light"
     bl_label = "Add Light"
     bl_options = {"REGISTER", "UNDO"}
-    _light = None
+    NEEDS_OBJECT_MODE, _light = True, None
 
     location: FloatVectorProperty(name="Location", description="What the light shines on", subtype="TRANSLATION")
     normal: FloatVectorProperty(name="Normal", description="From there to the light", default=(0.0, 0.0, 1.0))
@@ -162,10 +183,6 @@ class LTSH_OT_add_light(bpy.types.Operator):
         options={"HIDDEN", "SKIP_SAVE"},
     )  # fmt: skip
     selects: BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})  # the light, and nothing else
-
-    @classmethod
-    def poll(cls, context):
-        return context.mode == "OBJECT"
 
     def invoke(self, context, event):
         context.window_manager.modal_handler_add(self)
@@ -180,7 +197,8 @@ class LTSH_OT_add_light(bpy.types.Operator):
             return {"CANCELLED"}
         if event.type.startswith(PASSED_ON):
             return {"PASS_THROUGH"}
-        surface = surface_under(context, event.mouse_x, event.mouse_y, self.role)
+        region, mouse = view_under(context, pointer(event))
+        surface = None if region is None else surface_at(context, region, mouse, self.role)
         if surface is None:
             return {"RUNNING_MODAL"}
         self.location, self.normal, self.distance = surface
@@ -232,13 +250,6 @@ def add_lights_to_menu(menu, context) -> None:
         column.operator("ltsh.add_light", text=f"LTSH {label}", icon="LIGHT_AREA").role = role
 
 
-def surface_under(context, x: int, y: int, role: str = "SURFACE") -> tuple[Vector, Vector, float] | None:
-    """The point of a surface at a pixel of the window in any 3D view, the direction from there to a light of this role,
-    by default its normal towards the view, and the light's distance; None where there is none."""
-    region = region_under(context, x, y)
-    return None if region is None else _surface_at(context, region, (x - region.x, y - region.y), role)
-
-
 def toward_role(role: str, toward_eye: Vector) -> Vector:
     """The direction in which a point that the eye sees in the direction `toward_eye` has a light of this role."""
     degrees, height = (math.radians(angle) for angle in ROLES[role][1][:2])
@@ -270,7 +281,9 @@ def view_under(context, mouse: np.ndarray) -> tuple:
     return region, mouse if region is None else mouse - (region.x, region.y)
 
 
-def _surface_at(context, region, pixel, role: str = "SURFACE") -> tuple[Vector, Vector, float] | None:
+def surface_at(context, region, pixel, role: str = "SURFACE") -> tuple[Vector, Vector, float] | None:
+    """The point of a surface at a pixel of a 3D view, the direction from there to a light of this role, by default its
+    normal towards the view, and the light's distance; None where there is none."""
     scene, depsgraph, data = context.scene, context.evaluated_depsgraph_get(), region.data
     start = view3d_utils.region_2d_to_origin_3d(region, data, pixel)
     direction = view3d_utils.region_2d_to_vector_3d(region, data, pixel)
@@ -291,22 +304,20 @@ def _surface_at(context, region, pixel, role: str = "SURFACE") -> tuple[Vector, 
     return point, toward, min(distance, FREE_SHARE * (other - point).length) if is_hit else distance
 
 
-class OnActiveLight:
+class OnActiveLight(LTSHOperator):
     """An operator on the active light."""
 
+    NEEDS_OBJECT_MODE = True
+
     @classmethod
-    def poll(cls, context):
-        light = active_light(context)
-        if light is None or context.mode != "OBJECT":
-            cls.poll_message_set("No light is active")
-            return False
-        return True
+    def reason_against(cls, context) -> str:
+        """As `LTSHOperator.reason_against`."""
+        return super().reason_against(context) or ("No light is active" if active_light(context) is None else "")
 
 
 class LTSH_OT_duplicate_light(OnActiveLight, bpy.types.Operator):
     """Duplicate the active light; in a 3D view the mouse moves the copy until a click"""
 
-    bl_idname = "ltsh.duplicate_light"
     bl_label = "Duplicate Light"
     bl_options = {"REGISTER", "UNDO"}
 
@@ -326,7 +337,6 @@ class LTSH_OT_duplicate_light(OnActiveLight, bpy.types.Operator):
 class LTSH_OT_delete_light(OnActiveLight, bpy.types.Operator):
     """Delete the active light"""
 
-    bl_idname = "ltsh.delete_light"
     bl_label = "Delete Light"
     bl_options = {"REGISTER", "UNDO"}
 
@@ -346,16 +356,17 @@ def looks_through(space):
     return space.camera if is_local and space.camera is not None and space.camera.type == "LIGHT" else None
 
 
-class LTSH_OT_look_through_light(bpy.types.Operator):
+class LTSH_OT_look_through_light(LTSHOperator, bpy.types.Operator):
     """Look through the active light as through a camera, and move it by moving the view; once more: return"""
 
-    bl_idname = "ltsh.look_through_light"
     bl_label = "Look Through Light"
 
     @classmethod
-    def poll(cls, context):
+    def reason_against(cls, context) -> str:
+        """As `LTSHOperator.reason_against`."""
         space = view_of(context)
-        return space is not None and (active_light(context) is not None or looks_through(space) is not None)
+        is_lit = active_light(context) is not None or looks_through(space) is not None
+        return super().reason_against(context) or ("" if space is not None and is_lit else "No light is active")
 
     def execute(self, context):
         space, light = view_of(context), active_light(context)
@@ -394,10 +405,9 @@ def _put_before(socket, kind: str):
     return node
 
 
-class LTSH_OT_open_environment(bpy.types.Operator, ImportHelper):
+class LTSH_OT_open_environment(LTSHOperator, bpy.types.Operator, ImportHelper):
     """Light the scene by a picture, an Environment Texture of the world. Nodes that are there stay, unlinked"""
 
-    bl_idname = "ltsh.open_environment"
     bl_label = "Open Environment Texture"
     bl_options = {"REGISTER", "UNDO"}
 

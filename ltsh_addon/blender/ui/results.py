@@ -286,6 +286,11 @@ def mixer_of(scene) -> Mixer | None:
 DIRECT_ONLY = "ltsh_direct_only"
 
 
+def reason_without_target(scene) -> str:
+    """Why nothing can be matched in `scene`; "" if it has a target."""
+    return "Choose a target, or paint one" if scene.ltsh.match_target is None else ""
+
+
 def is_direct_only(scene) -> bool:
     """True if the mixer of `scene` has a picture of direct light alone, without what Cycles adds."""
     if scene.name not in _rendered:

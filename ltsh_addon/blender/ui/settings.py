@@ -8,16 +8,7 @@ from pathlib import Path
 import bpy
 from bl_operators.presets import AddPresetBase
 from bl_ui.utils import PresetPanel
-from bpy.props import (
-    BoolProperty,
-    CollectionProperty,
-    EnumProperty,
-    FloatProperty,
-    FloatVectorProperty,
-    IntProperty,
-    PointerProperty,
-    StringProperty,
-)
+from bpy import props
 
 from ...scene import COMPARED_TECHNIQUES, CYCLES, DEFAULT_TECHNIQUE, REFERENCE, TECHNIQUES
 from ...workers.pool import CORES_VARIABLE
@@ -162,29 +153,31 @@ MODES = (
 class LTSH_PG_mixed_light(bpy.types.PropertyGroup):
     """What the light mixer makes of a light, by its name."""
 
-    power: FloatProperty(
+    power: props.FloatProperty(
         name="Power", description="Factor of the power that the light had in the picture",
         min=0.0, soft_max=10.0, step=5, precision=3, default=1.0, update=mixed,
     )  # fmt: skip
-    exposure: FloatProperty(
+    exposure: props.FloatProperty(
         name="Exposure", description="Each step doubles the power",
         min=-32.0, max=32.0, soft_min=-5.0, soft_max=5.0, default=0.0, update=mixed,
     )  # fmt: skip
-    color: FloatVectorProperty(
+    color: props.FloatVectorProperty(
         name="Color", description="Color in place of the light's own; its brightest channel counts as 1",
         subtype="COLOR", size=3, min=0.0, soft_max=1.0, default=(1.0, 1.0, 1.0), update=mixed,
     )  # fmt: skip
-    muted: BoolProperty(name="Mute", description="This light is dark", update=mixed)
-    solo: BoolProperty(name="Solo", description="All other lights are dark, unless they are solo too", update=mixed)
-    applied: BoolProperty(description="The scene has values of the mixer", options={"HIDDEN"})
+    muted: props.BoolProperty(name="Mute", description="This light is dark", update=mixed)
+    solo: props.BoolProperty(
+        name="Solo", description="All other lights are dark, unless they are solo too", update=mixed
+    )
+    applied: props.BoolProperty(description="The scene has values of the mixer", options={"HIDDEN"})
     # Settings of the light in Blender when the picture was made; the values above belong to them.
-    settings: FloatVectorProperty(size=5, options={"HIDDEN"})
+    settings: props.FloatVectorProperty(size=5, options={"HIDDEN"})
 
 
 class LTSH_PG_last_result(bpy.types.PropertyGroup):
     """Where the last results of a command are, by its name."""
 
-    folder: StringProperty(subtype="DIR_PATH", options={"HIDDEN", "PATH_SUPPORTS_BLEND_RELATIVE"})
+    folder: props.StringProperty(subtype="DIR_PATH", options={"HIDDEN", "PATH_SUPPORTS_BLEND_RELATIVE"})
 
 
 NOT_HELD = -1
@@ -253,139 +246,143 @@ def _set_muted(settings, muted: bool) -> None:
 class LTSH_PG_light(bpy.types.PropertyGroup):
     """What the list of lights changes in an object."""
 
-    mute: BoolProperty(
+    mute: props.BoolProperty(
         name="Mute", description="Hide the light in views and renders; also closed where H hides it",
         get=_is_muted, set=_set_muted,
     )  # fmt: skip
-    solo: BoolProperty(
+    solo: props.BoolProperty(
         name="Solo", description="Hide all lights that are not on solo, in views and renders, until this is off again",
         update=_follow_solo,
     )  # fmt: skip
-    held: IntProperty(default=NOT_HELD, options={"HIDDEN"})  # bits of `_hidden` to restore after a solo of others
+    held: props.IntProperty(default=NOT_HELD, options={"HIDDEN"})  # bits of `_hidden` to restore after a solo of others
 
 
 class LTSH_PG_scene(bpy.types.PropertyGroup):
     """What to shade, bake and look at in a scene."""
 
-    techniques: EnumProperty(
+    techniques: props.EnumProperty(
         name="Compared",
         description="Techniques whose pictures are put beside that of Cycles. Shift-click to choose several",
         items=TECHNIQUE_ITEMS, options={"ENUM_FLAG"}, default=set(COMPARED_TECHNIQUES),
     )  # fmt: skip
-    resolution_percentage: IntProperty(
+    resolution_percentage: props.IntProperty(
         name="Resolution", description="Percentage of the scene's render resolution",
         subtype="PERCENTAGE", min=1, max=400, soft_max=100, default=100,
     )  # fmt: skip
-    anti_aliasing: IntProperty(
+    anti_aliasing: props.IntProperty(
         name="Anti-Aliasing",
         description="Points per pixel, drawn from the scene's pixel filter, or per texel of a bake; 1 takes centers",
         min=1, max=256, soft_max=64, default=4,
     )  # fmt: skip
-    cycles_samples: IntProperty(
+    cycles_samples: props.IntProperty(
         name="Cycles Samples",
         description="Samples per pixel of Cycles: of its picture beside the techniques and of what it adds to complete "
         "renders; noise falls with their square root",
         min=2, max=1 << 20, soft_max=8192, default=256,
     )  # fmt: skip
-    shadows: BoolProperty(
+    shadows: props.BoolProperty(
         name="Shadows",
         description="Surfaces stand in each other's light, in the Cycles reference too; without, pictures show how "
         "well a technique shades alone",
         default=True, update=_redraw,
     )  # fmt: skip
-    shadow_rays: IntProperty(
+    shadow_rays: props.IntProperty(
         name="Shadow Rays",
         description="At most so many per light and pixel or texel, where a light is neither seen whole nor not at all",
         min=8, max=1024, default=256,
     )  # fmt: skip
-    output_folder: StringProperty(
+    output_folder: props.StringProperty(
         name="Output",
         description="Folder for the results, in folders of their own for shading, comparing and baking; // is the "
         "folder of the .blend. Empty takes the one of the preferences, as does a file that is not saved yet",
         subtype="DIR_PATH", options={"PATH_SUPPORTS_BLEND_RELATIVE"}, default="//ltsh/",
     )  # fmt: skip
-    bake_size: EnumProperty(name="Size", description="Texels on each side of the texture", items=SIZES, default="1024")
-    bake_margin: IntProperty(
+    bake_size: props.EnumProperty(
+        name="Size", description="Texels on each side of the texture", items=SIZES, default="1024"
+    )
+    bake_margin: props.IntProperty(
         name="Margin", description="How far colors go on beyond the borders of UV islands, in texels",
         subtype="PIXEL", min=0, max=256, soft_max=64, default=16,
     )  # fmt: skip
-    bake_view: EnumProperty(name="View From", description="From where surfaces are seen", items=VIEWS, default="camera")
-    bake_atlas: BoolProperty(
+    bake_view: props.EnumProperty(
+        name="View From", description="From where surfaces are seen", items=VIEWS, default="camera"
+    )
+    bake_atlas: props.BoolProperty(
         name="Atlas", description="The selected objects share one texture, on a UV map of its own that Make Atlas adds",
     )  # fmt: skip
-    bake_uv_map: StringProperty(
+    bake_uv_map: props.StringProperty(
         name="UV Map",
         description="Name of the UV map to bake into; empty for the active one, highlighted in the list UV Maps",
     )
-    bake_passes: EnumProperty(
+    bake_passes: props.EnumProperty(
         name="Bake Passes", description="Parts of the reflected light. Shift-click to choose several",
         items=BAKE_PASS_ITEMS, options={"ENUM_FLAG"}, default={"specular", "diffuse"},
     )  # fmt: skip
-    bake_active: IntProperty(options={"HIDDEN"})  # the row that is marked in the list of objects
-    bake_bounces: BoolProperty(
+    bake_active: props.IntProperty(options={"HIDDEN"})  # the row that is marked in the list of objects
+    bake_bounces: props.BoolProperty(
         name="Bounces", description="Add bounced light by Cycles, denoised, and fit light at the seams of UV maps",
     )  # fmt: skip
-    bake_rest_samples: IntProperty(
+    bake_rest_samples: props.IntProperty(
         name="Bounce Samples", description="Samples per texel of Cycles for the bounced light",
         default=64, min=1, max=65536,
     )  # fmt: skip
-    bake_per_light: BoolProperty(
+    bake_per_light: props.BoolProperty(
         name="Per Light", description="Bake each light by itself too, so that the Light Mixer can change the textures",
     )  # fmt: skip
-    bake_changed: BoolProperty(
+    bake_changed: props.BoolProperty(
         name="Only Changed", default=True,
         description="Keep the textures of objects that would be the same as those of the last bake; off: bake all",
     )  # fmt: skip
-    bake_error: BoolProperty(
+    bake_error: props.BoolProperty(
         name="Compare with Cycles", description="Bake the same texels with Cycles too and measure the signed error",
         default=False,
     )  # fmt: skip
-    keep_lights: BoolProperty(
+    keep_lights: props.BoolProperty(
         name="Keep Lights",
         description="Keep a picture of each light, so that the Light Mixer can change them in the finished picture",
         default=True,
     )  # fmt: skip
-    match_target: PointerProperty(
+    match_target: props.PointerProperty(
         name="Target", description="Picture of the same size that the lights should come closest to",
         type=bpy.types.Image,
     )  # fmt: skip
-    match_colors: BoolProperty(name="Colors", description="Also change the colors of the lights", default=False)
-    mixed: CollectionProperty(type=LTSH_PG_mixed_light, options={"HIDDEN"})
-    mixed_active: IntProperty(name="Light", options={"HIDDEN"})
-    active_light: IntProperty(
+    match_colors: props.BoolProperty(name="Colors", description="Also change the colors of the lights", default=False)
+    mixed: props.CollectionProperty(type=LTSH_PG_mixed_light, options={"HIDDEN"})
+    mixed_active: props.IntProperty(name="Light", options={"HIDDEN"})
+    active_light: props.IntProperty(
         name="Active Light", description="Click a light to select it", get=_active_index, set=_select,
         options={"HIDDEN"},
     )  # fmt: skip
-    last_results: CollectionProperty(type=LTSH_PG_last_result, options={"HIDDEN"})
-    result_folder: StringProperty(
+    last_results: props.CollectionProperty(type=LTSH_PG_last_result, options={"HIDDEN"})
+    result_folder: props.StringProperty(
         name="Results", description="Folder of the pictures that are shown",
         subtype="DIR_PATH", options={"HIDDEN", "PATH_SUPPORTS_BLEND_RELATIVE"},
     )  # fmt: skip
     # What the Image Editor shows of the results:
 
-    mode: EnumProperty(
+    mode: props.EnumProperty(
         name="View", description="How the two pictures are shown", items=MODES, default="WIPE", update=changed
     )
-    mode_before_mix: StringProperty(default="WIPE", options={"HIDDEN"})
-    groups: CollectionProperty(type=bpy.types.PropertyGroup)
-    group: StringProperty(name="Object", description="Which baked texture is shown", update=changed)
-    first: EnumProperty(
+    mode_before_mix: props.StringProperty(default="WIPE", options={"HIDDEN"})
+    groups: props.CollectionProperty(type=bpy.types.PropertyGroup)
+    group: props.StringProperty(name="Object", description="Which baked texture is shown", update=changed)
+    first: props.EnumProperty(
         name="A", description="The first picture, left of the line",
         items=PICTURE_ITEMS, default=DEFAULT_TECHNIQUE, update=changed,
     )  # fmt: skip
-    second: EnumProperty(
+    second: props.EnumProperty(
         name="B", description="The second picture, right of the line",
         items=PICTURE_ITEMS, default=CYCLES, update=changed,
     )  # fmt: skip
-    pass_name: EnumProperty(
+    pass_name: props.EnumProperty(
         name="Pass", description="Which part of the light is shown", items=BAKE_PASS_ITEMS, default="combined",
         update=changed,
     )  # fmt: skip
-    split: FloatProperty(
+    split: props.FloatProperty(
         name="Split", description="Where the line between the two pictures is; it can also be dragged in the image",
         subtype="FACTOR", min=0.0, max=1.0, default=0.5, update=changed,
     )  # fmt: skip
-    error_scale: FloatProperty(
+    error_scale: props.FloatProperty(
         name="Scale", description="Difference in radiance at which the colors end; 0 takes the one of the report",
         min=0.0, soft_max=10.0, precision=4, default=0.0, update=changed,
     )  # fmt: skip
@@ -424,9 +421,9 @@ PRESETS_PARENT = str(Path(__file__).parent)
 def register() -> None:
     """Add settings and presets, and apply the preferences."""
     apply(bpy.context)
-    bpy.types.Scene.ltsh = PointerProperty(type=LTSH_PG_scene, name="LTSH")
-    bpy.types.Object.ltsh_light = PointerProperty(type=LTSH_PG_light, name="LTSH Light")
-    bpy.types.Object.ltsh_baked = BoolProperty(
+    bpy.types.Scene.ltsh = props.PointerProperty(type=LTSH_PG_scene, name="LTSH")
+    bpy.types.Object.ltsh_light = props.PointerProperty(type=LTSH_PG_light, name="LTSH Light")
+    bpy.types.Object.ltsh_baked = props.BoolProperty(
         name="Bake", description="Bake this object where it is selected", default=True
     )
     bpy.utils.register_preset_path(PRESETS_PARENT)

@@ -35,9 +35,6 @@ class OccluderRays:
         blockers = light.light_linking.blocker_collection
         self._linked = None if blockers is None else linked_objects(blockers)
 
-    def _is_blocker(self, ob) -> bool:
-        return ob.visible_shadow and (self._linked is None or self._linked.reach(ob.name_full))
-
     def blocker(self, hit: SurfaceHit, toward: Vector, distance: float, only=None) -> tuple | None:
         """As `first`, from the surface at `hit` on."""
         lift = LIFT + LIFT_SHARE * hit.position.length
@@ -50,8 +47,10 @@ class OccluderRays:
             is_hit, point, _, _, ob, matrix = self._scene.ray_cast(self._depsgraph, start, toward, distance=distance)
             if not is_hit:
                 return None
-            if self._is_blocker(ob.original) if only is None else (ob.original, matrix) == only:
-                return ob.original, matrix.copy(), point
+            own, linked = ob.original, self._linked
+            is_blocker = own.visible_shadow and (linked is None or linked.reach(own.name_full))
+            if is_blocker if only is None else (own, matrix) == only:
+                return own, matrix.copy(), point
             way = (point - start).length + LIFT + LIFT_SHARE * point.length
             start, distance = start + way * toward, distance - way
             if distance <= 0.0:
@@ -135,14 +134,6 @@ def _outline(is_blocked: Callable[[float], bool], size: float) -> tuple[float, f
     return (sign * near, sign * far) if is_inside else (sign * far, sign * near)
 
 
-def _across(dark: Vector, lit: Vector, center: Vector | None) -> Vector:
-    """The unit direction from a ray to a dark point to one to a lit point, both from the light at `center` on, across
-    the first; None: a sun."""
-    if center is None:
-        return (lit - dark).normalized()
-    return ((lit - center).normalized() - (dark - center).normalized()).normalized()
-
-
 def shadow_edge_near(
     rays: OccluderRays, hit_at: Callable[[np.ndarray], SurfaceHit | None], matrix: Matrix, kind: str, radius: float
 ) -> tuple[ShadowEdge | None, str]:
@@ -180,7 +171,10 @@ def shadow_edge_near(
     across = None
     if lit is not None:
         (hit, (*_, point)), (beside, _) = blocked(dark, only), blocked(lit, only)
-        across = _across(hit.position, beside.position, None if kind == "SUN" else center)
+        # Across the ray to the light, from the dark point to the lit one.
+        ends = hit.position, beside.position
+        ends = ends if kind == "SUN" else [(end - center).normalized() for end in ends]
+        across = (ends[1] - ends[0]).normalized()
         for _ in range(HALVINGS // 2):
             between = 0.5 * (dark + lit)
             around = blocked(between, only)

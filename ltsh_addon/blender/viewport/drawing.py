@@ -1,8 +1,6 @@
 """What all passes draw with: textures, buffers, the G-buffer, shaders that run once per pixel, and the state of
 the graphics card."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -210,14 +208,14 @@ class ViewCamera:
     is_parallel: bool
 
     @classmethod
-    def of(cls, view_matrix: Matrix, window_matrix: Matrix, is_parallel: bool) -> ViewCamera:
+    def of(cls, view_matrix: Matrix, window_matrix: Matrix, is_parallel: bool) -> "ViewCamera":
         """The view of a region with these matrices."""
         to_view = np.array(view_matrix, np.float64)
         to_world = np.linalg.inv(to_view)
         eye = to_world[:3, 2] / np.linalg.norm(to_world[:3, 2]) if is_parallel else to_world[:3, 3]
         return cls(np.array(window_matrix, np.float64) @ to_view, eye, is_parallel)
 
-    def shifted(self, offset: np.ndarray, size: tuple[int, int]) -> ViewCamera:
+    def shifted(self, offset: np.ndarray, size: tuple[int, int]) -> "ViewCamera":
         """The same view, in which pixels show the point `offset` (2,) pixels right and up of their centers.
 
         `size` is that of the picture in pixels.
@@ -328,12 +326,8 @@ _REQUIRED = ("position", "normal", "base", "f0", "f90", "dielectric")
 _OPTIONAL = ("diffuse_normal", "smooth_normal", "geometric_normal", "tangent", "rebound")
 
 
-def gbuffer_samples(gbuffer: GBufferTextures, view: ViewCamera) -> tuple[SurfaceSamples, np.ndarray]:
-    """The samples (P) of a G-buffer, and their texels (P,), counted from the lower left."""
-    return samples_of_texels(gbuffer_texels(gbuffer), view)
-
-
 def samples_of_texels(texels: dict[str, np.ndarray], view: ViewCamera) -> tuple[SurfaceSamples, np.ndarray]:
+    """The samples (P) of a G-buffer by its `gbuffer_texels`, and their texels (P,), counted from the lower left."""
     pixel = np.flatnonzero(texels["position"][:, :, 3] > 0.0)
     values = {name: rows.reshape(-1, 4)[pixel].astype(np.float64) for name, rows in texels.items()}
     position, normal, base, f0, f90, dielectric = (values[name] for name in _REQUIRED)

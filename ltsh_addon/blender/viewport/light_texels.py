@@ -4,8 +4,6 @@ Pictures of all directions are octahedral maps: an octahedron around the eye, un
 the inner square, which is turned by 45 degrees.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -291,11 +289,6 @@ def varied_sky(like: Light | None, light, lights, background: np.ndarray) -> Sho
     if not sides:
         return ShownSky(lights=tuple(lights), background=background)
     return ShownSky(sides, tuple(lights), unfolded(light, SKY_SIZE), background)
-
-
-def background_of(pictures: list[SkyPicture]) -> np.ndarray:
-    """The map (N, N, 3) of a background from the pictures of a cube."""
-    return unfolded(pictures, min(2 * len(pictures[0].radiance), BACKGROUND_SIZE))
 
 
 def coarse(picture: SkyPicture) -> SkyPicture:

@@ -3,8 +3,6 @@
 Lights, tables and integrals are those of `shading.shade`, in float32 throughout.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Worlds and lights with nodes as Cycles sees them: a second Blender looks at them while views go on."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable
@@ -20,7 +18,7 @@ from ..lights.textures import NodeEmission, NodeLight, node_emission, state_of
 from ..lights.world import background_pictures, light_of_world, light_pictures
 from ..process import view
 from ..process.view import NODE_LIGHTS, NodeLightFile, NodeLightJob, WorldJob
-from .light_texels import ShownSky, background_of, coarse, varied_sky
+from .light_texels import BACKGROUND_SIZE, ShownSky, coarse, unfolded, varied_sky
 from .mirror import NOT_RESOLVED, NOT_YET
 
 
@@ -255,7 +253,9 @@ def rendered_world(scene, world, warn: Callable) -> tuple[list[SkyPicture], list
     like, light, lights = light_of_world(world), [], []
     if like is not None:
         light, lights = light_pictures(scene, world, like, warn)
-    return [coarse(picture) for picture in light], lights, background_of(background_pictures(scene, world, warn))
+    behind = background_pictures(scene, world, warn)
+    background = unfolded(behind, min(2 * len(behind[0].radiance), BACKGROUND_SIZE))
+    return [coarse(picture) for picture in light], lights, background
 
 
 def render_world(job: WorldJob, folder: Path, progress) -> dict:

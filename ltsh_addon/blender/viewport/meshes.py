@@ -1,8 +1,6 @@
 """Evaluated meshes as batches for the graphics card, one per material slot, with the normals and tangents of Cycles;
 materials and tables of closures as textures and buffers."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import gpu

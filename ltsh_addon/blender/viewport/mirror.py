@@ -1,7 +1,5 @@
 """The viewport's copy of a scene, lights included: after a change only what it touches is read again."""
 
-from __future__ import annotations
-
 import functools
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -234,10 +232,10 @@ class ShownLook:
     look: PreviewMaterial
     uniforms: object  # its uniform buffer
     textures: dict | None = None  # by slot; made at the first draw
-    further: tuple[ShownLook, ...] = ()  # the other lobes
+    further: "tuple[ShownLook, ...]" = ()  # the other lobes
 
     @property
-    def lobes(self) -> tuple[ShownLook, ...]:
+    def lobes(self) -> "tuple[ShownLook, ...]":
         """This lobe and the further ones; none where the look is clear."""
         return () if self.look.is_clear else (self, *self.further)
 

@@ -1,7 +1,5 @@
 """The pictures of a view: sums of samples, and the passes that show, copy and join them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields, is_dataclass
 
 import gpu
@@ -195,7 +193,7 @@ class LightingState:
     lights: tuple
     sources: tuple
 
-    def changes(self, new: LightingState) -> frozenset[int] | None:
+    def changes(self, new: "LightingState") -> frozenset[int] | None:
         """Numbers of the lights that are others in the picture `new`; None where more has changed."""
         count = len(self.lights)
         if not same_state(new.state, self.state) or len(new.lights) != count or count > MOST_COMPARED:
@@ -203,7 +201,7 @@ class LightingState:
         pairs = zip(self.lights, new.lights, strict=True)
         return frozenset(number for number, (a, b) in enumerate(pairs) if not is_equal(a, b))
 
-    def has_same_visibility(self, new: LightingState, changed: frozenset[int]) -> bool:
+    def has_same_visibility(self, new: "LightingState", changed: frozenset[int]) -> bool:
         """True if the visibility is the same, but for that of the lights `changed`."""
         if len(self.sources) != len(new.sources):
             return False

@@ -4,8 +4,6 @@ Only what has changed is drawn again. While nothing changes, every further frame
 the picture is their mean.
 """
 
-from __future__ import annotations
-
 import math
 from collections import defaultdict
 from collections.abc import Collection
@@ -41,7 +39,7 @@ from .surfaces import SurfacePass, has_bent_lobes
 class SurfaceLayer:
     """The G-buffer of one layer, surfaces or glass, and the horizons that end its lobes."""
 
-    def __init__(self, before: SurfaceLayer | None = None):
+    def __init__(self, before: "SurfaceLayer | None" = None):
         self._surfaces = SurfacePass(None if before is None else before._surfaces)
         self._horizons = defaultdict(HorizonPass)  # of the first lobes (False), which stay, and of further ones (True)
         self._gbuffer: GBufferTextures | None = None
@@ -120,7 +118,7 @@ class Frame:
     world: bool  # with the light of the world
 
     @classmethod
-    def of(cls, mirror: SceneMirror, view: ViewCamera, size: tuple[int, int], shown: ShownPicture) -> Frame:
+    def of(cls, mirror: SceneMirror, view: ViewCamera, size: tuple[int, int], shown: ShownPicture) -> "Frame":
         """The frame that has the picture `shown`."""
         pictures = [(shown.technique, shown.passes)]
         if shown.mode != "single" and shown.second_picture is None:
@@ -300,8 +298,8 @@ class ViewRenderer:
         self._has_glass = has_glass
         if not is_drawn:
             self._drawn = None
-            # Pictures with bounces are finished ones, whose lobes are widened.
-            points = self.samples + 1 if self.has_bounces else math.inf
+            # Points of pixels add up to a picture only with lobes as narrow as they are.
+            points = 1 if self.step > 1 else math.inf
             self._surfaces.draw(frame.mirror, frame.view, frame.size, points)
             if has_glass:
                 if self._glass is None:

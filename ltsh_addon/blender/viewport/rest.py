@@ -9,8 +9,6 @@ Surfaces `is_of_cycles` are Cycles' alone. An AOV tells their share m of a pixel
     rest = Combined - (1 - m) (direct light + background),  picture = (1 - M) (own light + background) + rest
 """
 
-from __future__ import annotations
-
 import math
 import threading
 import time
@@ -162,7 +160,7 @@ class _RestStep:
     job: RestJob
     wanted: RestView  # that of the job, unless another is wanted meanwhile
     seconds: float = 0.0  # that Cycles took
-    picture: _RestPicture | None = None
+    picture: "_RestPicture | None" = None
     error: str = ""
     thread: threading.Thread | None = None
 

@@ -4,8 +4,6 @@ Their text is in `glsl/`, with `core.h` of the exported headers. Constants of Py
 compiled for become macros LTSH_... Python generates only lines that repeat per horizon, moment or corner.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass
 from itertools import combinations

@@ -1,7 +1,5 @@
 """The visibility of each light at the pixels of a view, traced as for pictures, with the same occluders."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from functools import cached_property
@@ -15,7 +13,7 @@ from ...workers.pool import WorkerPool, cores
 from ..extract.occluders import collect_occluders
 from ..lights.world import blocks_nothing
 from ..process.blender_process import embree_libraries
-from .drawing import GBufferTextures, ViewCamera, VisibilityGrid, float_buffer, gbuffer_samples
+from .drawing import GBufferTextures, ViewCamera, VisibilityGrid, float_buffer, gbuffer_texels, samples_of_texels
 from .pictures import is_equal
 
 Lights = Sequence[Light]
@@ -87,7 +85,7 @@ class ShadowRays:
     version, waits, traces_lobes = 0, False, True
 
     @property
-    def of_glass(self) -> ShadowRays:
+    def of_glass(self) -> "ShadowRays":
         """The tracer for the glass in front of the surfaces: the same."""
         return self
 
@@ -106,7 +104,7 @@ class ShadowRays:
         """The visibility of `lights`, and last that of the `sides` of a sky if there are any; None without surfaces or
         lights. Raises SceneError."""
         start = time.perf_counter()
-        samples, pixel = gbuffer_samples(gbuffer, view)
+        samples, pixel = samples_of_texels(gbuffer_texels(gbuffer), view)
         if not len(samples) or not (lights or sides):
             return None
         width, height = gbuffer.size

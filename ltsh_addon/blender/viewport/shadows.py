@@ -1,7 +1,5 @@
 """Shadows of a view while an artist works: a thread traces the visibility of lights, coarse at first, then finer."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque
@@ -98,7 +96,7 @@ class PixelGrid:
         return samples, Film(columns, rows, pixel)
 
     @cached_property
-    def around(self) -> CoarsePixels:
+    def around(self) -> "CoarsePixels":
         """What level QUICK traces at first. It stays when only lights change."""
         return CoarsePixels.of(*self.samples())
 
@@ -115,7 +113,7 @@ class CoarsePixels:
     is_far: np.ndarray
 
     @classmethod
-    def of(cls, samples: SurfaceSamples, film: Film) -> CoarsePixels:
+    def of(cls, samples: SurfaceSamples, film: Film) -> "CoarsePixels":
         """Those of a picture."""
         row_and_column, first = np.stack(np.divmod(film.pixel, film.width)), QUICK_STEP // 2
         height, width = (-(-(side - first) // QUICK_STEP) for side in (film.height, film.width))
@@ -249,7 +247,7 @@ class LiveShadows:
 
     traces_lobes = False  # all lobes use the shadows of the first lobe
 
-    def __init__(self, behind: LiveShadows | None = None):
+    def __init__(self, behind: "LiveShadows | None" = None):
         self._behind, self._glass = behind, None
         self._traced_scene = TracedScene() if behind is None else behind._traced_scene
         self._version, self._problem, self._traced = 0, "", 0  # _traced: the version of the occluders
@@ -280,14 +278,14 @@ class LiveShadows:
         self._blank: VisibilityGrid | None = None
 
     @property
-    def of_glass(self) -> LiveShadows:
+    def of_glass(self) -> "LiveShadows":
         """The shadows of the glass in front of the surfaces."""
         if self._glass is None:
             self._glass = LiveShadows(self)
         return self._glass
 
     @property
-    def _both(self) -> tuple[LiveShadows, ...]:
+    def _both(self) -> "tuple[LiveShadows, ...]":
         return (self,) if self._glass is None else (self, self._glass)
 
     @property

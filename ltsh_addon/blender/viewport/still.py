@@ -1,7 +1,5 @@
 """The viewport's picture without a window, through a camera of the scene (runs in the child): `ltsh view`."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -119,7 +117,7 @@ class OpenScene:
         self._changes = Changes()
         return self._mirror
 
-    def shadows(self, rays: int) -> FrameShadows:
+    def shadows(self, rays: int) -> "FrameShadows":
         """The shadows of frames."""
         if self._shadows is None or self._shadows.tracing is not self.tracing:
             self._shadows = FrameShadows(self.tracing, rays)
@@ -146,7 +144,7 @@ class FrameShadows:
         self._state, self._points, self._known, self._grid = None, None, {}, None
 
     @cached_property
-    def of_glass(self) -> FrameShadows:
+    def of_glass(self) -> "FrameShadows":
         """The shadows of the glass in front of the surfaces."""
         return FrameShadows(self.tracing, self._rays)
 

@@ -1,7 +1,5 @@
 """The first pass: draws the surfaces of a mirrored scene into a G-buffer, lobe by lobe."""
 
-from __future__ import annotations
-
 import math
 import time
 from dataclasses import replace
@@ -51,7 +49,7 @@ class SurfacePass:
     its depth buffer.
     """
 
-    def __init__(self, before: SurfacePass | None = None):
+    def __init__(self, before: "SurfacePass | None" = None):
         self._before, self._is_glass = before, before is not None
         self._through: tuple | None = None
         self._shares: list | None = None

@@ -78,7 +78,7 @@ def seen_by_rays(occluders, light=LIGHT, name="Key"):
             directions = light - origins
             distances = np.linalg.norm(directions, axis=1)
             directions /= distances[:, None]
-            masks = np.full(len(points), tracer.mask_of(name), np.uint32)
+            masks = np.full(len(points), tracer.occluders.mask_of(name), np.uint32)
             shares.append(tracer.transmittance(origins, directions, distances, masks))
     return shares[0], np.ptp(shares, axis=0) < 0.02
 

@@ -72,20 +72,20 @@ def test_a_light_is_added_over_the_surface_under_the_mouse_within_the_room(scene
     camera.matrix_world = Matrix.Translation((1.0, 2.0, 10.0))
     camera.data.type, camera.data.ortho_scale = kind, 4.0
     width = 10.0 * camera.data.sensor_width / camera.data.lens if kind == "PERSP" else 4.0
-    point, normal, distance = preview._surface_at(bpy.context, seen_from(camera), (80, 45))
+    point, normal, distance = preview.surface_at(bpy.context, seen_from(camera), (80, 45))
     assert (point - Vector((1.0, 2.0, 0.0))).length < 1e-4 and (normal - Vector((0.0, 0.0, 1.0))).length < 1e-5
     assert distance == pytest.approx(preview.DISTANCE * width, rel=1e-4)
     # A second floor below the ceiling that the ground becomes, looked at from between.
     lower = parts.add_plane(None, size=40.0)
     lower.location.z, camera.matrix_world = -0.5, Matrix.Translation((0.0, 0.0, -0.4)) @ Matrix.Rotation(np.pi, 4, "X")
     camera.data.ortho_scale = 8.0
-    point, normal, distance = preview._surface_at(bpy.context, seen_from(camera), (20, 30))
+    point, normal, distance = preview.surface_at(bpy.context, seen_from(camera), (20, 30))
     assert abs(point.z) < 1e-5 and normal.z < -0.999
     shown = 0.04 * width if kind == "PERSP" else 8.0
     assert distance == pytest.approx(min(0.5 * preview.FREE_SHARE, preview.DISTANCE * shown), rel=1e-3)
     bpy.data.objects.remove(lower)
     bpy.data.objects.remove(ground)
-    assert preview._surface_at(bpy.context, seen_from(camera), (80, 45)) is None
+    assert preview.surface_at(bpy.context, seen_from(camera), (80, 45)) is None
 
 
 def test_duplicates_and_deletes_the_active_light_alone(scene):
@@ -198,13 +198,13 @@ def test_lights_by_role_stand_around_the_object_as_the_view_sees_it(scene, role,
     parts.add_sphere(radius=0.5, location=(0.0, 0.0, 0.5))
     scene.camera.matrix_world = Matrix.Translation((0.0, -10.0, 0.5)) @ Matrix.Rotation(np.pi / 2.0, 4, "X")
     scene.camera.data.type, scene.camera.data.ortho_scale = "ORTHO", 4.0
-    point, direction, distance = preview._surface_at(bpy.context, seen_from(scene.camera), (80, 45), role)
+    point, direction, distance = preview.surface_at(bpy.context, seen_from(scene.camera), (80, 45), role)
     assert (point - Vector((0.0, -0.5, 0.5))).length < 0.01 and (direction - Vector(toward)).length < 1e-3
     # The ball itself, which the way to the rim light crosses, does not bound it.
     assert distance == pytest.approx(preview.DISTANCE * 4.0, rel=1e-3)
     wall = parts.add_plane(size=40.0, name="Wall", location=(0.0, 1.5, 0.0), rotation=(np.pi / 2.0, 0.0, 0.0))
     bpy.context.view_layer.update()
-    *_, distance = preview._surface_at(bpy.context, seen_from(scene.camera), (80, 45), role)
+    *_, distance = preview.surface_at(bpy.context, seen_from(scene.camera), (80, 45), role)
     free = 2.0 / toward[1] if toward[1] > 0.0 else np.inf
     assert distance == pytest.approx(min(preview.DISTANCE * 4.0, preview.FREE_SHARE * free), rel=0.01)
     bpy.data.objects.remove(wall)

@@ -15,7 +15,8 @@ from graphics_card import edits_with_graphics, with_graphics
 from view_pictures import OpenView
 
 from ltsh_addon.blender.engine import redraws
-from ltsh_addon.blender.viewport import drawing, shadow_rays, shadows
+from ltsh_addon.blender.render_settings import balanced_points, sub_pixel_offsets
+from ltsh_addon.blender.viewport import drawing, shadow_rays, shadows, surfaces
 from ltsh_addon.blender.viewport.drawing import (
     ShadersMissing,
     float_texture,
@@ -101,9 +102,10 @@ def test_a_picture_that_is_wanted_sooner_does_not_wait_for_a_later_one(monkeypat
 
 
 @pytest.mark.newest
-def test_a_picture_with_fewer_pixels_is_interpolated_and_as_bright_and_leaves_nothing_behind():
+def test_a_picture_with_fewer_pixels_is_interpolated_and_as_bright_and_leaves_nothing_behind(monkeypatch):
     """While a view moves. The truth is numpy's interpolation of the picture of a smaller view, with the rest."""
     camera, shown, step = set_up_scene(), ShownPicture("ltsh4", "combined", transparent=True), 3
+    monkeypatch.setattr(surfaces, "MOST_WIDENING", 0.0)  # smaller views keep narrow lobes
 
     def draw():
         with OpenView(camera, SIZE) as opened:
@@ -327,6 +329,37 @@ def test_a_drawing_that_has_no_time_loads_one_slow_image(monkeypatch):
     drawings, picture, expected = with_graphics(draw)
     assert drawings == 2 and sorted(loaded) == ["image 0", "image 1"]
     np.testing.assert_array_equal(picture, expected)
+
+
+@pytest.mark.newest
+def test_highlights_smaller_than_the_pixels_of_a_moving_view_are_there():
+    """Metal balls of a few pixels, once drawn with fewer pixels, beside many points of lobes as narrow as they are."""
+    parts.empty_scene(*SIZE)
+    metal = parts.principled("Metal", Metallic=1.0, Roughness=0.2)[0]
+    for number in range(15):
+        row, column = divmod(number, 5)
+        parts.add_sphere(metal, radius=0.28, name=f"Ball {number}", location=(0.57 * column - 1.2, 0.6 * row - 0.6, 0))
+    parts.add_area_light(location=(0.5, -1.0, 3.0), rotation=(0.3, 0.0, 0.0), size=0.3)
+    camera, step = parts.add_camera((0.0, 0.0, 4.0), (0.0, 0.0, 0.0)), 3
+    bpy.context.view_layer.update()
+
+    def picture(step, size, count=1):
+        with OpenView(camera, size) as opened:
+            opened.renderer.step = step
+            points = sub_pixel_offsets(bpy.context.scene, count, balanced_points)
+            for _ in points:
+                pixels = opened.light("ltsh4c", "specular", points)
+            return pixels
+
+    def draw():
+        large, small = (144, 96), (144 // step, 96 // step)
+        return picture(step, large), picture(1, small), picture(1, small, 101)
+
+    moving, narrow, truth = with_graphics(draw)
+    errors = [np.linalg.norm(each - truth) / np.linalg.norm(truth) for each in (moving, narrow)]
+    # Lobes that are Gaussians and curvatures that are even would leave nothing.
+    assert errors[0] < 0.6 * errors[1], errors
+    assert abs(moving.sum() / truth.sum() - 1.0) < 0.5 * abs(narrow.sum() / truth.sum() - 1.0)
 
 
 @edits_with_graphics

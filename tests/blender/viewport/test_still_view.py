@@ -24,7 +24,6 @@ from lit_plane import into_collection, light_tree
 from view_pictures import OpenView, textured
 
 from ltsh_addon import imaging
-from ltsh_addon.blender import render_settings
 from ltsh_addon.blender.extract.occluders import collect_occluders
 from ltsh_addon.blender.render_settings import filter_points
 from ltsh_addon.blender.viewport import shadows
@@ -577,29 +576,3 @@ def test_a_view_after_a_render_with_grease_pencil(capsys, tmp_path):
         found.append(layers["ltsh4c.combined"])
         made(capsys, "render", path, tmp_path / "render", "--resolution", "8x8", "--cycles-samples", 2)
     np.testing.assert_array_equal(*found)
-
-
-@pytest.mark.newest
-def test_highlights_smaller_than_pixels_are_there_at_the_first_point_of_views_with_bounces():
-    """Metal balls of ten pixels. The truth are many points of lobes that stay as narrow as they are."""
-    parts.empty_scene(*SIZE)
-    metal = parts.principled("Metal", Metallic=1.0, Roughness=0.2)[0]
-    for number in range(15):
-        row, column = divmod(number, 5)
-        parts.add_sphere(metal, radius=0.28, name=f"Ball {number}", location=(0.57 * column - 1.2, 0.6 * row - 0.6, 0))
-    parts.add_area_light(location=(0.5, -1.0, 3.0), rotation=(0.3, 0.0, 0.0), size=0.3)
-    camera = parts.add_camera((0.0, 0.0, 4.0), (0.0, 0.0, 0.0))
-    bpy.context.view_layer.update()
-
-    def picture(count, has_bounces):
-        with OpenView(camera, SIZE) as opened:
-            opened.renderer.has_bounces = has_bounces
-            points = render_settings.sub_pixel_offsets(bpy.context.scene, count, render_settings.balanced_points)
-            for _ in points:
-                pixels = opened.light("ltsh4c", "specular", points)
-            return pixels
-
-    truth, narrow, wide = with_graphics(lambda: [picture(*each) for each in ((101, False), (1, False), (1, True))])
-    # Lobes that are Gaussians and curvatures that are even would leave nothing.
-    assert relative(wide, truth) < 0.6 * relative(narrow, truth)
-    assert abs(wide.sum() / truth.sum() - 1.0) < 0.4 * abs(narrow.sum() / truth.sum() - 1.0)

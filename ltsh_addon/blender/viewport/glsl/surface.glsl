@@ -81,6 +81,8 @@ void main()
 #elif defined(DRAWS_SURFACES)
   bool leaves = backfacing && int(look.data[0].x + 0.5) == GLASS;
   Lobe lobe = lobe_of_look(color, roughness, metallic, leaves ? 1.0 / ior : ior, cosine);
+  /* As in `cycles.lobes`. */
+  lobe.diffuse *= dot(diffuse_normal, smooth_normal) <= 0.0 ? 0.0 : 1.0;
   out_position = vec4(v_position, 1.0 + placement.x);
   bool is_fuzz = int(look.data[0].x + 0.5) == SHEEN;
   out_normal = vec4(specular_normal, is_fuzz ? lobe.roughness : mean_roughness(widened(alphas, specular_normal)));

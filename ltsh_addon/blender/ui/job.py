@@ -262,11 +262,10 @@ def _rays(options) -> int:
 def _bake(options: BakeOptions) -> list[Step]:
     texels, bounces = 1e-6 * math.prod(options.size), options.bounces == "on"
     samples = options.cycles_samples * len(options.passes) if options.error else options.sub_samples
-    shading = sum(_shading(name, texels) for name in options.techniques)
+    has_lobes = bool({"specular", "combined"} & set(options.passes))
+    shading = (1.0 if has_lobes else DIFFUSE_SHARE) * sum(_shading(name, texels) for name in options.techniques)
     shadows = SHADOW_SECONDS * texels * math.sqrt(_rays(options) / USUAL_RAYS)
-    if not {"specular", "combined"} & set(options.passes):
-        shading, shadows = shading * DIFFUSE_SHARE, shadows * DIFFUSE_SHADOWS
-    shading += shadows
+    shading += (1.0 if has_lobes else DIFFUSE_SHADOWS) * shadows
     points = options.sub_samples + (EDGE_POINTS if bounces else 0.0)
     stages = [Step("open scene", OPEN_SECONDS)]
     for name in (ATLAS,) if options.atlas else options.objects:

@@ -174,7 +174,7 @@ def test_shadows_of_a_bake_and_the_points_at_their_edges_are_expected_to_take_ti
         return next(step.cost for step in steps([run]) if step.stage == "shade A")
 
     bare, shadowed = shading(shadows="off"), shading(shadows="on")
-    # Measured on a floor: shading 0.1 s, shadows 2.5 s, of which two thirds are points at edges; in a room a half, where
+    # Measured on a floor: shading 0.1 s, shadows 2.5 s, two thirds of it are points at edges; in a room a half. There
     # 0.22 million texels took 5.6 s of two cores.
     assert shadowed > 5.0 * bare
     assert 2.0 * shadowed < shading(shadows="on", bounces="on") < 4.0 * shadowed

@@ -65,8 +65,8 @@ CYCLES_SECONDS = 3.0  # per sample of Cycles, of direct light or of all
 SHADING_SECONDS = {"ltc": 6.5, "ltsh2": 8.0, "ltsh4": 10.0, "ltsh4c": 11.5, REFERENCE: 160.0}
 SHADOW_SECONDS, DENOISE_SECONDS = 30.0, 4.0  # shadows: with USUAL_RAYS rays
 USUAL_RAYS = 256
-DIFFUSE_SHARE = 0.1  # of shading, without the specular lobe
-EDGE_POINTS = 2.0  # a texel, with bounces, for the edges of shadows: 16 for an eighth of the texels
+DIFFUSE_SHARE, DIFFUSE_SHADOWS = 0.1, 0.6  # of shading and of shadows, without the specular lobe
+EDGE_POINTS = 1.2  # a texel, with bounces, for the edges of shadows: 16 with few rays for an eighth of the texels
 REFERENCE_POINTS = 0.15
 SEARCH_SECONDS = 8.0  # of a round in which lights are placed
 # The files of `write_target`.
@@ -262,10 +262,10 @@ def _rays(options) -> int:
 def _bake(options: BakeOptions) -> list[Step]:
     texels, bounces = 1e-6 * math.prod(options.size), options.bounces == "on"
     samples = options.cycles_samples * len(options.passes) if options.error else options.sub_samples
-    shading = sum(_shading(name, texels) for name in options.techniques)
-    if not {"specular", "combined"} & set(options.passes):
-        shading *= DIFFUSE_SHARE
-    shading += SHADOW_SECONDS * texels * math.sqrt(_rays(options) / USUAL_RAYS)
+    has_lobes = bool({"specular", "combined"} & set(options.passes))
+    shading = (1.0 if has_lobes else DIFFUSE_SHARE) * sum(_shading(name, texels) for name in options.techniques)
+    shadows = SHADOW_SECONDS * texels * math.sqrt(_rays(options) / USUAL_RAYS)
+    shading += (1.0 if has_lobes else DIFFUSE_SHADOWS) * shadows
     points = options.sub_samples + (EDGE_POINTS if bounces else 0.0)
     stages = [Step("open scene", OPEN_SECONDS)]
     for name in (ATLAS,) if options.atlas else options.objects:

@@ -343,12 +343,16 @@ def factor_of_samples(film: Film, samples, radiance: np.ndarray, color: np.ndarr
 
     `color` and `normal` (H, W, 3) are means over `count` samples of Cycles.
     """
-    own_color = film.image(samples.diffuse_albedo)
+    own_color, first = film.image(samples.diffuse_albedo), slice(None) if film.first is None else film.first
+    # Cycles' color counts normals behind their surface, which reflect nothing.
+    ahead = ((samples.diffuse_normal * samples.smooth_normal).sum(axis=1) > 0.0)[first].astype(np.float64)
+    everything = film.take(first).image(np.ones(len(ahead)))
+    share = np.divide(film.take(first).image(ahead), everything, out=np.ones_like(everything), where=everything > 0.0)
+    color = color * share[..., None]
     factor = np.divide(color, own_color, out=np.ones_like(own_color), where=own_color > 1e-6)
     factor = np.minimum(factor, MOST_RECOLORING)
     hits, sums = film.hits(*samples.diffuse_albedo.T, *radiance.T)
     albedo, light = np.stack(sums[:3], axis=1), np.stack(sums[3:], axis=1)
-    first = slice(None) if film.first is None else film.first
     own_normals = samples.diffuse_normal[first].astype(np.float64)
     # What the variance among the points does not explain of the difference between both means is that Cycles' normal is
     # another one, as that of what a mirror shows. What it explains for as many samples as Cycles has is Cycles' error.

@@ -369,12 +369,12 @@ _OF_CLEAR = "share", "extension", "interpolation", "outside", "curve", "cosines"
 _SETTINGS = "transparent_surfaces", "light_masks", "lone_choices", "surface_shift"
 
 
-def overlap_within(meshes: list[OccluderMesh]) -> float:
-    """The share of the area of the triangles of an object that lies in others of the same plane which face alike; at
-    least so much if there are more than MOST_IN_PLANES."""
+def overlap_within(meshes: list[OccluderMesh], any_way: bool = False) -> float:
+    """The share of the area of the triangles of an object that lies in others of the same plane which face alike, or
+    `any_way`; at least so much if there are more than MOST_IN_PLANES."""
     corners = _joined([_largest(mesh, MOST_IN_PLANES) for mesh in meshes])[1]
     owners, numbers = np.zeros(len(corners), np.int64), np.arange(len(corners))
-    return float(overlaps_in_planes(corners, owners, np.zeros(1, bool), numbers)[2].sum())
+    return float(overlaps_in_planes(corners, owners, np.full(1, any_way), numbers)[2].sum())
 
 
 def _crosses(corners):

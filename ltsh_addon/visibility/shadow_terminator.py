@@ -126,19 +126,23 @@ class OpposedFaces:
         """The masks (P,) of the faces that touch samples from above, within their clearances (P,) m, 0 for none; and
         the shares (P,) of light that these let through.
 
-        As in Cycles, what is in the plane of a sample blocks, and what is below by more than rounding does not.
+        As in Cycles, what is in the plane of a sample blocks, and what is below by more than rounding does not. A face
+        that is seen from behind faces as those do, and blocks nothing of its own light.
         """
         occluders, is_up = self._occluders, normal @ OBLIQUE > 0.0
         masks, shares = np.zeros(len(position), np.uint32), np.ones(len(position), np.float32)
-        for triangles, caster, chosen in zip(self._triangles, self._casters, (~is_up, is_up), strict=True):
+        sides = zip(self._triangles, self._casters, self._casters[::-1], (~is_up, is_up), strict=True)
+        for triangles, caster, of_samples, chosen in sides:
             for start in range(0, len(position) if len(triangles.instance) else 0, caster.chunk):
                 index = start + np.flatnonzero(chosen[start : start + caster.chunk])
                 reach = (NEARBY * (1.0 + np.abs(position[index]).max(axis=1, initial=0.0))).astype(np.float32)
                 hits = _nearest(caster, position[index], normal[index], reach)
-                index, faces = index[hits.ray], triangles.take(hits.triangle)
+                index, reach, faces = index[hits.ray], reach[hits.ray], triangles.take(hits.triangle)
                 height = _dot(faces.corners[:, 0].astype(np.float32) - position[index], normal[index])
                 rounding = GAP * np.abs(_dot(position[index], normal[index]))
                 touches = np.flatnonzero((height >= -rounding) & (height <= clearance[index]))
+                at = index[touches]
+                touches = touches[_nearest(of_samples, position[at], normal[at], reach[touches]).ray]
                 masks[index[touches]] = occluders.masks[faces.instance[touches]]
                 mesh = occluders.mesh[faces.instance]
                 for number in np.unique(mesh[touches]):

@@ -90,3 +90,23 @@ def test_what_casts_no_shadow_blocks_nothing_where_it_touches(libraries):
     assert shares(libraries, occluders).all()
     occluders = Occluders((FLOOR, body()), [0, 1], (HERE, HERE), masks=[1, 2], light_masks={"Lamp": 3})
     assert not shares(libraries, occluders).any()
+
+
+def turned(mesh):
+    """`mesh`, its faces turned around."""
+    return OccluderMesh(mesh.vertices, mesh.triangles[:, ::-1], mesh.transparency)
+
+
+ASIDE = np.column_stack([np.eye(3), [1.9, 0.0, 0.0]])
+# The meshes of a scene, and their matrices: of its first face, points that nothing is near see all of a lamp.
+BEHIND = {
+    "a box and its floor, both turned": ((turned(FLOOR), turned(body())), (HERE, ASIDE)),
+    "a turned sheet beside another": ((turned(FLOOR), grid(0.1)), (HERE, ASIDE)),
+    "a mirrored floor": ((FLOOR, turned(body())), (MIRROR, ASIDE)),
+}
+
+
+@pytest.mark.parametrize("case", BEHIND)
+def test_a_face_seen_from_behind_is_not_in_its_own_way(libraries, case):
+    """Where another face in its plane faced the other way, all of a floor was black."""
+    assert np.array_equal(shares(libraries, Occluders(BEHIND[case][0], [0, 1], BEHIND[case][1])), np.ones(200))

@@ -129,6 +129,8 @@ def _prepare(scene, layer, warnings: list[str]) -> None:
     warnings.extend(render_settings.steps_after_rendering(scene))
     if render.use_multiview:
         warnings.append("stereoscopy is switched off")
+    if cycles.sample_clamp_direct:
+        warnings.append(f"direct light by LTSH is not clamped to {cycles.sample_clamp_direct:g} as that of Cycles is")
     # A render evaluates the scene's animation again, which would undo these settings.
     if scene.animation_data is not None:
         scene.animation_data_clear()

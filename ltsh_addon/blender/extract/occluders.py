@@ -29,6 +29,9 @@ from . import occluder_shapes as shapes
 # that is named. TINY: radius of a light in m below which the geometry does not tell on which side of a face it is.
 # LEAST_COLOR: least difference of a color of transparent surfaces from the mean of all three that is named, as COLORED.
 NAMED, LEAST_DOUBLED, TINY, LEAST_COLOR = 3, 1e-3, 1e-4, 0.01
+# TWO_SIDED: an object is a sheet with two sides if more of its faces lie in others; of touching solids fewer do.
+TWO_SIDED = 0.9
+IN_CYCLES = "Cycles is black there, tilted faces are lit at random by about half"
 COLORED = "colored transparency counts by its mean, up to {} of the light off in a color, as shadows are gray"
 # A light is sampled by rays toward points on the light, and by rays in directions that the surface chooses.
 # SURFACE_SHIFT: the bits of a mask for the latter are this much higher, if some object blocks only one kind of ray.
@@ -229,7 +232,7 @@ class _Collector:
                 texts[frozenset(names)] = f"{_percent(share)} of those of {names[0]!r} in {names[1]!r}"
         if texts:
             warn(
-                f"shadows: faces in one plane: {listed(texts.values(), NAMED)}: Cycles is black there, here faces that "
+                f"shadows: faces in one plane: {listed(texts.values(), NAMED)}: {IN_CYCLES}, here faces that "
                 "face alike are lit; move one off by 0.1 mm"
             )
 
@@ -241,7 +244,7 @@ class _Collector:
         )
         if first is mesh_and_name or not _is_same(mesh, self._meshes[first[0]]):
             return False
-        self._note(f"in the same place as {first[1]!r}: Cycles is black there, here both are lit; remove one", ob)
+        self._note(f"in the same place as {first[1]!r}: {IN_CYCLES}, here both are lit; remove one", ob)
         return True
 
     # Surfaces:
@@ -266,7 +269,10 @@ class _Collector:
             else:
                 meshes = shapes.split_by_slot(ob, clear, self._image)
                 if (share := overlap_within(meshes)) > LEAST_DOUBLED:
-                    text = "of its faces where others are: Cycles is black there, here all are lit"
+                    text = f"of its faces where others are: {IN_CYCLES}, here all are lit"
+                    self._note(f"{_percent(share)} {text}", ob)
+                elif (share := overlap_within(meshes, any_way=True)) > TWO_SIDED:
+                    text = f"of its faces where others face the other way: {IN_CYCLES}, here all are dark"
                     self._note(f"{_percent(share)} {text}", ob)
             self._shapes[key] = self._number(meshes), matrices
             self._remember_unread(instance, matrix, materials, self._shapes[key][0])

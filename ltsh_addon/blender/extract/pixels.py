@@ -10,7 +10,7 @@ import numpy as np
 from ...scene import SceneError, error_line, light_records, listed
 from .. import render_settings
 from ..evaluated import SURFACE_TYPES, owner_of, read_values, rendered_surfaces, with_render_depsgraph
-from ..lights.area import LightInventory, collect_lights, note_colors, note_overlaps, rendered_lights
+from ..lights.area import LightInventory, collect_lights, half_hidden, note_colors, note_overlaps, rendered_lights
 from ..lights.emission import LookTooLong
 from ..lights.groups import regroup
 from ..lights.meshes import SIDE_PROPERTY, let_light_through
@@ -306,6 +306,8 @@ def add_world(inventory: LightInventory, scene, world) -> None:
     inventory.lights = rendered_lights(scene, inventory) + of_world
     note_overlaps(inventory)
     inventory.world = world if of_world else None
+    if of_world and of_world[0].affects_diffuse != of_world[0].affects_specular:
+        inventory.warn(half_hidden(of_world[0]))
     if inventory.occluders is not None:
         note_colors(inventory)
         inventory.occluders = blocks_nothing(inventory.occluders, inventory.world)

@@ -246,9 +246,10 @@ def color_spread(leaves: list[Light]) -> float:
 def half_hidden(light: Light) -> str:
     """The warning about a light that is hidden from diffuse or from glossy rays, but not from both."""
     kind = "glossy" if light.affects_diffuse else "diffuse"
+    kinds, off = ("world", "8 % of diffuse and 35 %") if light.is_side else ("light", "3 % of diffuse and 19 %")
     return (
-        f"light {light.name!r}: it is hidden from {kind} rays; Cycles still lets up to 3 % of it through on surfaces "
-        "that are both diffuse and glossy, the techniques let none"
+        f"{kinds} {light.name!r}: it is hidden from {kind} rays; on surfaces that are both diffuse and glossy Cycles "
+        f"takes some for others, up to {off} of specular light, most of what is large; the techniques do not"
     )
 
 

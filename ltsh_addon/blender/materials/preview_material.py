@@ -190,11 +190,12 @@ def preview_of(material) -> PreviewMaterial:
         return plain_preview(0.0)
     shaders = graph.shaders_behind(surface)
     look = _PreviewReader(material, shaders).look()
-    lost = ["volume"] if graph.live_link(surface.node.inputs["Volume"]) is not None else []
+    lost = ["volume is not shown"] if graph.live_link(surface.node.inputs["Volume"]) is not None else []
     if graph.has_displacement(material):
         height = graph.displacement_height(material)
-        lost.append("displacement" if height is None else f"displacement, by up to {height:.3g} m,")
-    notes = (*look.notes, *(f"{material.name}: its {name} is not shown" for name in lost))
+        size = "" if height is None else f", by up to {height:.3g} m,"
+        lost.append(f"displacement{size} is not shown: its light is 10 to 50 % off")
+    notes = (*look.notes, *(f"{material.name}: its {text}" for text in lost))
     return replace(look, notes=notes, is_clear=graph.is_seen_through(surface.node, shaders))
 
 

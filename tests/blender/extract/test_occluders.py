@@ -362,6 +362,7 @@ NAMED = {
     "instance in the same place": "in the same place as 'Pane'",
     "doubled": "67 % of its faces where others are",
     "overlapped": "50 % of its faces where others are",
+    "back to back": "100 % of its faces where others face the other way",
     "rug in its plane": "100 % of those of 'Pane' in 'Rug'",
     "light in its plane": "in the plane of a face: 'Flush' in 'Pane'",
     "point in its plane": "in the plane of a face: 'Flush' in 'Pane'",
@@ -405,6 +406,10 @@ def test_what_is_not_as_in_cycles_is_named(name):
         square, up = [(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)], [(-1, -1, 0.1), (1, -1, 0.1), (0, 1, 0.1)]
         faces = [(0, 1, 2), (2, 3, 0), (6, 4, 5), (6, 7, 4), (10, 9, 8), (8, 9, 10)]
         hidden(scene_parts.add_mesh("Pane", 2 * square + up, faces, location=(0.3, 0.2, 1.0)))
+    elif name == "back to back":
+        square = [(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]
+        turned = {"location": (0.3, 0.2, 1.0), "rotation": (0.4, 0.3, 0.2)}
+        hidden(scene_parts.add_mesh("Pane", 2 * square, [(0, 1, 2, 3), (7, 6, 5, 4)], **turned))
     elif name == "overlapped":
         # Two squares in one plane share half of each, as tiles of an Array modifier do.
         squares = [(x + left, y, 0) for left in (-1.5, -0.5) for x, y in ((0, -1), (2, -1), (2, 1), (0, 1))]

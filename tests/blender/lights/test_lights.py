@@ -113,6 +113,18 @@ def test_visibility_is_kept_and_named(rays):
     assert (light.affects_diffuse, light.affects_specular) == (rays == "glossy", rays == "diffuse")
 
 
+@pytest.mark.parametrize("rays", ["glossy", "diffuse"])
+def test_a_world_that_some_rays_do_not_see_is_named(rays):
+    """Without a word specular light of a glossy floor was 91 % off."""
+    scene = scene_parts.empty_scene()
+    scene_parts.add_camera()
+    scene_parts.add_plane()
+    scene_parts.add_white_world()
+    setattr(scene.world.cycles_visibility, rays, False)
+    warnings = scene_parts.prepare()[3]
+    assert sum(f"it is hidden from {rays} rays" in line and "35 % of specular" in line for line in warnings) == 1
+
+
 def test_the_oracle_reproduces_the_form_factor_of_a_parallel_disk():
     """A point under the center of a disk of radius r at height h receives pi r^2 / (r^2 + h^2) per unit radiance."""
     up, one = np.array([[0.0, 0.0, 1.0]]), np.ones(1)

@@ -312,7 +312,7 @@ def test_lobes_have_their_shares_and_what_is_not_shown_is_named(shader, lobes, n
     ],
     ids=["about the middle", "inward", "vectors", "varying scale", "no node of displacement"],
 )
-def test_displacement_that_is_not_shown_is_named_with_its_height(kind, values, size):
+def test_displacement_that_is_not_shown_is_named_with_its_height_and_error(kind, values, size):
     parts.empty_scene()
     material = made("Hill", "BsdfDiffuse", {})()
     nodes, links = material.node_tree.nodes, material.node_tree.links
@@ -323,7 +323,7 @@ def test_displacement_that_is_not_shown_is_named_with_its_height(kind, values, s
         else:
             node.inputs[name].default_value = value
     links.new(node.outputs[0], nodes["Material Output"].inputs["Displacement"])
-    assert preview_of(material).notes == (f"Hill: its displacement{size} is not shown",)
+    assert preview_of(material).notes == (f"Hill: its displacement{size} is not shown: its light is 10 to 50 % off",)
 
 
 @pytest.mark.parametrize(("emitter", "strength"), [("Emission", "Strength"), ("BsdfPrincipled", "Emission Strength")])

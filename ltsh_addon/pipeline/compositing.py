@@ -346,8 +346,9 @@ def factor_of_samples(film: Film, samples, radiance: np.ndarray, color: np.ndarr
     own_color, first = film.image(samples.diffuse_albedo), slice(None) if film.first is None else film.first
     # Cycles' color counts normals behind their surface, which reflect nothing.
     ahead = ((samples.diffuse_normal * samples.smooth_normal).sum(axis=1) > 0.0)[first].astype(np.float64)
-    everything = film.take(first).image(np.ones(len(ahead)))
-    share = np.divide(film.take(first).image(ahead), everything, out=np.ones_like(everything), where=everything > 0.0)
+    film_of_hits = film.take(first)
+    everything = film_of_hits.image(np.ones(len(ahead)))
+    share = np.divide(film_of_hits.image(ahead), everything, out=np.ones_like(everything), where=everything > 0.0)
     color = color * share[..., None]
     factor = np.divide(color, own_color, out=np.ones_like(own_color), where=own_color > 1e-6)
     factor = np.minimum(factor, MOST_RECOLORING)
@@ -357,7 +358,7 @@ def factor_of_samples(film: Film, samples, radiance: np.ndarray, color: np.ndarr
     # What the variance among the points does not explain of the difference between both means is that Cycles' normal is
     # another one, as that of what a mirror shows. What it explains for as many samples as Cycles has is Cycles' error.
     slope, variance = _slope(hits, own_normals, light / np.maximum(albedo, LEAST_COLOR))
-    apart = normal - film.take(first).image(own_normals)
+    apart = normal - film_of_hits.image(own_normals)
     off = np.maximum(box_mean(np.square(apart).sum(axis=-1), SLOPE_RADIUS), 1e-12)
     variance = np.maximum(box_mean(variance, SLOPE_RADIUS), 0.0)
     sure = np.minimum(variance / (film.sub_samples * off), 1.0) * np.maximum(1.0 - variance / (count * off), 0.0)

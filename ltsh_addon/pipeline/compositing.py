@@ -37,6 +37,7 @@ import numpy as np
 
 from .. import imaging
 from ..cycles.lobes import read_layer
+from ..emitters.light_polygons import has_lobe
 from ..imaging.denoise import NoDenoiser, open_denoiser
 from ..imaging.exr import by_group, layer_name
 from ..scene import Cancelled, Film
@@ -336,6 +337,7 @@ MOST_RECOLORING = 3.0  # how many times the color of LTSH's points Cycles' color
 # of normals there, so that nearly even surfaces have none. MOST_BEND: the factors by which the slope changes light.
 SLOPE_RADIUS, RIDGE, MOST_BEND = 2, 1e-3, (0.5, 2.0)
 LEAST_COLOR = 1e-3  # points with darker colors tell no slope
+SAME_NORMAL = 1e-3  # largest difference of the components of one normal
 
 
 def factor_of_samples(film: Film, samples, radiance: np.ndarray, color: np.ndarray, normal: np.ndarray, count: int):
@@ -344,27 +346,28 @@ def factor_of_samples(film: Film, samples, radiance: np.ndarray, color: np.ndarr
     `color` and `normal` (H, W, 3) are means over `count` samples of Cycles.
     """
     own_color, first = film.image(samples.diffuse_albedo), slice(None) if film.first is None else film.first
-    # Cycles' color counts normals behind their surface, which reflect nothing.
-    ahead = ((samples.diffuse_normal * samples.smooth_normal).sum(axis=1) > 0.0)[first].astype(np.float64)
-    film_of_hits = film.take(first)
-    everything = film_of_hits.image(np.ones(len(ahead)))
-    share = np.divide(film_of_hits.image(ahead), everything, out=np.ones_like(everything), where=everything > 0.0)
-    color = color * share[..., None]
     factor = np.divide(color, own_color, out=np.ones_like(own_color), where=own_color > 1e-6)
     factor = np.minimum(factor, MOST_RECOLORING)
-    hits, sums = film.hits(*samples.diffuse_albedo.T, *radiance.T)
-    albedo, light = np.stack(sums[:3], axis=1), np.stack(sums[3:], axis=1)
+    hit = slice(None) if film.first is None else np.cumsum(film.first) - 1
     own_normals = samples.diffuse_normal[first].astype(np.float64)
+    # Cycles' color counts normals behind their surface, which reflect nothing. Its normal is the mean of all lobes'.
+    behind = (samples.diffuse_normal * samples.smooth_normal).sum(axis=1) <= 0.0
+    bent = np.abs(samples.normal - own_normals[hit]).max(axis=1) > SAME_NORMAL
+    bent &= has_lobe(samples)[1]
+    hits, sums = film.hits(*samples.diffuse_albedo.T, *radiance.T, behind, bent)
+    albedo, light = np.stack(sums[:3], axis=1), np.stack(sums[3:6], axis=1)
+    is_behind, is_bent = (box_mean(hits.image(one), SLOPE_RADIUS)[..., None] > 1e-6 for one in sums[6:])
     # What the variance among the points does not explain of the difference between both means is that Cycles' normal is
     # another one, as that of what a mirror shows. What it explains for as many samples as Cycles has is Cycles' error.
     slope, variance = _slope(hits, own_normals, light / np.maximum(albedo, LEAST_COLOR))
-    apart = normal - film_of_hits.image(own_normals)
+    apart = normal - film.take(first).image(own_normals)
     off = np.maximum(box_mean(np.square(apart).sum(axis=-1), SLOPE_RADIUS), 1e-12)
     variance = np.maximum(box_mean(variance, SLOPE_RADIUS), 0.0)
     sure = np.minimum(variance / (film.sub_samples * off), 1.0) * np.maximum(1.0 - variance / (count * off), 0.0)
-    change = color * np.einsum("hwk,hwkc->hwc", sure[..., None] * apart, slope)
+    change = color * np.einsum("hwk,hwkc->hwc", np.where(is_bent, 0.0, sure[..., None] * apart), slope)
     image = factor * film.image(radiance)
-    return factor * (1.0 + np.divide(change, image, out=np.zeros_like(image), where=image > 0.0)).clip(*MOST_BEND)
+    factor *= (1.0 + np.divide(change, image, out=np.zeros_like(image), where=image > 0.0)).clip(*MOST_BEND)
+    return np.where(is_behind, 1.0, factor)
 
 
 def _slope(film: Film, normals: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -15,4 +15,5 @@ from .metrics import (
     reference_noise,
     unbiased_relative_error,
 )
-from .report import MOST_SHOWN, Tile, comparison_sheet, grouped, on_screen, write_html, write_json, write_overview
+from .report import MOST_SHOWN, grouped, on_screen, write_html, write_json, write_overview
+from .sheet import Tile, comparison_sheet

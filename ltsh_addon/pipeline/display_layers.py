@@ -7,7 +7,8 @@ import numpy as np
 
 from .. import imaging
 from ..imaging import exr
-from ..imaging.report import FILE, common_error_scale, write_index
+from ..imaging.report import FILE, write_index
+from ..imaging.sheet import common_error_scale
 from ..scene import BAKE_PASSES, CYCLES, REFERENCE, TECHNIQUES, Progress
 from .comparison import against_cycles
 from .mixer import MIXER_FILE, MixerRow, baked_light_pictures, light_pictures, mixer_file

@@ -15,9 +15,9 @@ from ..lobes.polygon import dot
 from ..scene import FARTHEST, PASSES, Film, FlatLight, PointLight, PolygonLight, round_outline
 from .emitter import Emitter, Sky
 from .light_cluster import LightCluster
+from .light_selection import LightSelection
 from .occluders import GAP
 from .ray_sampler import PROBES, RayBatch, RaySampler, SampleRows
-from .sampling import LightSelection
 from .shadow_terminator import toward
 
 MOST_RAYS = 1024

@@ -247,7 +247,9 @@ class Occluders:
         mesh, matrix = self.meshes[self.mesh[number]], self.matrices[number]
         vertices = mesh.vertices @ matrix[:, :3].T + matrix[:, 3]
         if normal is not None:
-            index = np.flatnonzero((np.abs((vertices - point) @ normal) <= near)[mesh.triangles].all(axis=1))
+            is_near = np.abs((vertices - point) @ normal) <= near
+            index = np.flatnonzero(is_near[mesh.triangles[:, 0]])
+            index = index[is_near[mesh.triangles[index]].all(axis=1)]
             return index, vertices[mesh.triangles[index]]
         corners = vertices[mesh.triangles]
         face = _crosses(corners)
@@ -264,9 +266,13 @@ class Occluders:
         corners, owners = found.corners, owners[found.instance]
         is_mirrored = self.handedness()[found.instance] < 0.0
         corners[is_mirrored] = corners[is_mirrored, ::-1]
-        result = {}
-        points = overlaps_in_planes(corners, owners, is_sheet)
-        for first, other, share in zip(*map(np.ndarray.tolist, points), strict=True):
+        pairs = overlaps_in_planes(corners, owners)
+        first, other = owners[pairs.triangle], owners[pairs.other]
+        # Of a box that stands on another nothing shows, of sheets one side or the other.
+        shown = pairs.take(pairs.faces_alike | is_sheet[first] & is_sheet[other])
+        pairs = shown.take(np.unique(shown.point, return_index=True)[1])
+        result, columns = {}, (owners[pairs.triangle], owners[pairs.other], pairs.share)
+        for first, other, share in zip(*map(np.ndarray.tolist, columns), strict=True):
             result[first, other] = result.get((first, other), 0.0) + share
         return result
 
@@ -369,12 +375,14 @@ _OF_CLEAR = "share", "extension", "interpolation", "outside", "curve", "cosines"
 _SETTINGS = "transparent_surfaces", "light_masks", "lone_choices", "surface_shift"
 
 
-def overlap_within(meshes: list[OccluderMesh], any_way: bool = False) -> float:
-    """The share of the area of the triangles of an object that lies in others of the same plane which face alike, or
-    `any_way`; at least so much if there are more than MOST_IN_PLANES."""
+def overlaps_within(meshes: list[OccluderMesh]) -> tuple[float, float]:
+    """The shares of the area of the triangles of an object that lie in others of the same plane, which face alike, and
+    which face any way; at least so much if there are more than MOST_IN_PLANES."""
     corners = _joined([_largest(mesh, MOST_IN_PLANES) for mesh in meshes])[1]
-    owners, numbers = np.zeros(len(corners), np.int64), np.arange(len(corners))
-    return float(overlaps_in_planes(corners, owners, np.full(1, any_way), numbers)[2].sum())
+    pairs = overlaps_in_planes(corners, np.zeros(len(corners), np.int64), np.arange(len(corners)))
+    alike = pairs.take(pairs.faces_alike)
+    points, alike_points = (np.unique(one.point, return_index=True)[1] for one in (pairs, alike))
+    return float(alike.share[alike_points].sum()), float(pairs.share[points].sum())
 
 
 def _crosses(corners):
@@ -451,29 +459,38 @@ class _Planes:
         return result
 
 
-def overlaps_in_planes(
-    corners: np.ndarray, owners: np.ndarray, is_sheet: np.ndarray, numbers: np.ndarray | None = None
-):
-    """Where triangles `corners` (T, 3, 3) of `owners` (T,) lie in triangles of other `numbers` (T,), by default of
-    other owners: S points, as their owners (S,), those of the others (S,), and the shares (S,) of the areas of their
-    owners for which they stand.
+@dataclass(frozen=True)
+class PlanePairs:
+    """S pairs of a point of a triangle and another triangle in the same plane that holds it."""
 
-    Both must face the same way, unless both owners are among those that are one flat face, `is_sheet`: where a box
-    stands on another, nothing shows.
-    """
+    point: np.ndarray  # (S,) its number
+    triangle: np.ndarray  # (S,) of the point
+    other: np.ndarray  # (S,)
+    faces_alike: np.ndarray  # (S,) bool, False where both face opposite ways
+    share: np.ndarray  # (S,) of the area of the owner of the triangle for which the point stands
+
+    def take(self, index: np.ndarray) -> "PlanePairs":
+        """The pairs at `index`: integers or a mask."""
+        return PlanePairs(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+
+
+def overlaps_in_planes(corners: np.ndarray, owners: np.ndarray, numbers: np.ndarray | None = None) -> PlanePairs:
+    """Where triangles `corners` (T, 3, 3) of `owners` (T,) lie in triangles of other `numbers` (T,), by default of
+    other owners."""
     numbers, planes = owners if numbers is None else numbers, _Planes.of(corners)
-    normal, facing, group, sides = planes.normal, planes.facing, planes.group, corners[:, 1:] - corners[:, :1]
+    group, sides = planes.group, corners[:, 1:] - corners[:, :1]
     areas = np.bincount(owners, planes.area).clip(min=1e-300)
     weight = np.cumsum(planes.area * planes.shared_by(numbers)[group] / areas[owners])
-    empty = np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0)
     if not weight[-1:].sum() > 0.0:
-        return empty
+        empty = np.zeros(0, np.int64)
+        return PlanePairs(empty, empty, empty, empty == 0, np.zeros(0))
     number = np.arange(PLANE_POINTS) + 0.5
     own = np.searchsorted(weight, number * (weight[-1] / PLANE_POINTS)).clip(max=len(group) - 1)
     # A sequence of Roberts 2018 ("The Unreasonable Effectiveness of Quasirandom Sequences"), folded into triangles.
     weights = np.outer(number, (0.7548776662466927, 0.5698402909980532)) % 1.0
     weights = np.where(weights.sum(axis=1, keepdims=True) > 1.0, 1.0 - weights, weights)
     points = corners[own, 0] + (weights[:, :, None] * sides[own]).sum(axis=1)
+    near = 4.0 * GAP * np.abs(corners[own]).max(axis=(1, 2))
     plane, order = group[own], np.argsort(group, kind="stable")
     members, tried = np.bincount(group), np.bincount(plane, minlength=group.max() + 1)
     step = -(-tried * members // MOST_TESTS)
@@ -481,27 +498,31 @@ def overlaps_in_planes(
     rank[np.argsort(plane, kind="stable")] = np.arange(len(own)) - np.repeat(np.cumsum(tried) - tried, tried)
     chosen = np.flatnonzero(rank % step[plane] == 0)
     stands_for = weight[-1] / PLANE_POINTS * (tried / np.bincount(plane[chosen], minlength=len(tried)).clip(min=1))
-    # Rows that give the barycentric coordinates of a point in a triangle, and its height above it.
+    # Rows of (3, 4, T) that give the barycentric coordinates of a point (x, y, z, 1) in a triangle, and its height.
     one, other = np.moveaxis(sides, 1, 0)
-    frames = np.stack([np.cross(other, normal), np.cross(normal, one)], axis=1)
-    frames = np.append(frames / (2.0 * planes.area).clip(min=1e-300)[:, None, None], normal[:, None], axis=1)
+    rows = np.stack([np.cross(other, planes.normal), np.cross(planes.normal, one)])
+    rows = np.append(rows / (2.0 * planes.area).clip(min=1e-300)[:, None], planes.normal[None], axis=0)
+    rows = np.append(rows, -(rows * corners[:, 0]).sum(axis=2, keepdims=True), axis=2).transpose(0, 2, 1).copy()
+    columns = np.append(points, np.ones((len(points), 1)), axis=1).T.copy()
+
+    def values(row: int, point: np.ndarray, member: np.ndarray) -> np.ndarray:
+        return sum(rows[row, k][member] * columns[k][point] for k in range(4))
+
     first, pairs = np.cumsum(members) - members, np.cumsum(members[plane[chosen]])
-    result = [empty]
+    result = []
     for block in np.split(chosen, np.flatnonzero(np.diff(pairs // MOST_TESTS)) + 1):
         count = members[plane[block]]
         point, number = np.repeat(block, count), np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
         member = order[first[plane[point]] + number]
-        away = points[point] - corners[member, 0]
-        u, v, height = np.einsum("pij,pj->ip", frames[member], away)
-        is_in = (u > 1e-6) & (v > 1e-6) & (u + v < 1.0 - 1e-6)
-        point, member, height = point[is_in], member[is_in], height[is_in]
-        is_in = np.abs(height) <= 4.0 * GAP * np.abs(corners[own[point]]).max(axis=(1, 2))
-        is_in &= numbers[member] != numbers[own[point]]
-        is_flat = is_sheet[owners[member]] & is_sheet[owners[own[point]]]
-        is_in &= is_flat | (facing[member] == facing[own[point]])
-        point, index = np.unique(point[is_in], return_index=True)
-        result.append((owners[own[point]], owners[member[is_in][index]], stands_for[plane[point]]))
-    return tuple(map(np.concatenate, zip(*result, strict=True)))
+        u = values(0, point, member)
+        is_in = (u > 1e-6) & (u < 1.0 - 1e-6) & (numbers[member] != numbers[own[point]])
+        point, member, u = point[is_in], member[is_in], u[is_in]
+        v = values(1, point, member)
+        is_in = (v > 1e-6) & (u + v < 1.0 - 1e-6) & (np.abs(values(2, point, member)) <= near[point])
+        point, member = point[is_in], member[is_in]
+        alike = planes.facing[member] == planes.facing[own[point]]
+        result.append((point, own[point], member, alike, stands_for[plane[point]]))
+    return PlanePairs(*map(np.concatenate, zip(*result, strict=True)))
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,8 @@ from ..workers.pool import WorkerPool
 from .emitter import Emitter
 from .estimator import MOST_RAYS, PixelNeighbors, RatioEstimator
 from .light_cluster import LightCluster, emitters_of
+from .light_selection import LightSelection
 from .ray_sampler import PROBES, JoinedLobes, SampleRows
-from .sampling import LightSelection
 from .shadow_terminator import RayOrigins
 
 # Samples that one process takes at a time, approximately.

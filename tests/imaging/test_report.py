@@ -6,7 +6,7 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from ltsh_addon.imaging import Tile, comparison_sheet, report
+from ltsh_addon.imaging import Tile, comparison_sheet, report, sheet
 from ltsh_addon.imaging.color import exposure_factor, to_srgb8
 
 
@@ -100,7 +100,7 @@ def test_every_picture_stands_on_the_sheet_pixel_for_pixel(count):
 
 def test_large_images_are_reduced_without_changing_their_mean():
     image = picture(1000, 333)
-    reduced = report._reduced(image)
+    reduced = sheet._reduced(image)
     assert reduced.shape == (111, 333, 3)
     assert reduced.mean() == pytest.approx(image[:, :999].mean(), rel=1e-9)
 
@@ -112,7 +112,7 @@ def test_pixels_that_were_not_taken_are_gray_and_change_no_mean():
         image = np.where(missing[..., None], 0.0, 0.5) * np.ones(3)
         page, _ = comparison_sheet(np.full((height, width, 3), 0.5), [Tile("T", image, 0.0 * image, missing)])
         bright, gray = to_srgb8(np.array([0.9, 0.9, 0.9])), np.array([128, 128, 128], np.uint8)
-        share = report._reduced((~missing[..., None]).astype(float))
+        share = sheet._reduced((~missing[..., None]).astype(float))
         assert contains(page, np.where(share > 0.0, bright, gray).astype(np.uint8))
         assert not (page == 0).all(axis=-1).any()
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from surface_scenes import single_sample
 
-from ltsh_addon.pipeline.compositing import factor_of_samples
+from ltsh_addon.pipeline.aliasing import factor_of_samples
 from ltsh_addon.scene import Film
 
 SIDE, POINTS, MANY = 12, 3, 2000

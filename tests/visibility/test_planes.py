@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ltsh_addon.visibility import OccluderMesh, Occluders
-from ltsh_addon.visibility.occluders import PLANE_POINTS, overlap_within
+from ltsh_addon.visibility.occluders import PLANE_POINTS, overlaps_within
 
 # Each of two objects gets half of the points, which are evenly spread: few of them, here 8, are in an area too many.
 SLACK = 8.0 / (PLANE_POINTS / 2)
@@ -72,9 +72,11 @@ def test_an_owner_does_not_overlap_itself_and_one_without_a_number_counts_not():
 def test_many_triangles_of_one_object_in_a_plane():
     """A fine grid overlaps nothing; two, of which one is moved by half a side, share half of each."""
     mesh = grid(2.0, 60)
-    assert overlap_within([mesh]) == 0.0
+    assert overlaps_within([mesh]) == (0.0, 0.0)
     moved = OccluderMesh(mesh.vertices + [1.0, 0.0, 0.0], mesh.triangles)
-    assert overlap_within([mesh, moved]) == pytest.approx(0.5, abs=SLACK)
+    assert overlaps_within([mesh, moved]) == pytest.approx((0.5, 0.5), abs=SLACK)
+    back = OccluderMesh(mesh.vertices, mesh.triangles[:, ::-1])
+    assert overlaps_within([mesh, back]) == pytest.approx((0.0, 1.0), abs=SLACK)
 
 
 @pytest.mark.parametrize(("height", "held"), [(0.0, True), (1e-5, False), (-1e-5, False)])

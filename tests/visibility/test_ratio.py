@@ -12,8 +12,8 @@ from ltsh_addon import shading
 from ltsh_addon.scene import PASSES, Cancelled, Film, SurfaceSamples, light_of
 from ltsh_addon.visibility import estimator, ratio
 from ltsh_addon.visibility.emitter import Emitter
+from ltsh_addon.visibility.light_selection import LightSelection
 from ltsh_addon.visibility.ray_sampler import SampleRows
-from ltsh_addon.visibility.sampling import LightSelection
 
 KINDS = [*((surface, "plain") for surface in random_surfaces.SURFACES)] + [
     ("plain", light)

@@ -12,8 +12,8 @@ from ltsh_addon.scene import PASSES, Film, SkyLight, SurfaceSamples
 from ltsh_addon.visibility import ratio
 from ltsh_addon.visibility.emitter import Sky
 from ltsh_addon.visibility.estimator import MOST_RAYS, RatioEstimator
+from ltsh_addon.visibility.light_selection import LightSelection
 from ltsh_addon.visibility.ray_sampler import JoinedLobes, SampleRows
-from ltsh_addon.visibility.sampling import LightSelection
 
 SKY = sky_lights(
     SkyLight("Sky", [0, 0, 1], [1, 0, 0], [0, 1, 0], [0, 0, -1], np.ones(3)),

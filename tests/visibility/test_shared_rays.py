@@ -15,8 +15,8 @@ from ltsh_addon.pipeline.relight import RelightData
 from ltsh_addon.scene import PASSES, PolygonLight, light_of
 from ltsh_addon.visibility import estimator, light_cluster, ratio, shared_numbers
 from ltsh_addon.visibility.light_cluster import LightCluster
+from ltsh_addon.visibility.light_selection import LightSelection
 from ltsh_addon.visibility.ray_sampler import SampleRows
-from ltsh_addon.visibility.sampling import LightSelection
 
 THREE_SPHERES = past_spheres(((0.0, 0.3, 0.6), 0.35), ((-1.0, -0.5, 0.3), 0.3), ((1.0, 1.2, 1.0), 0.3))
 

@@ -16,7 +16,7 @@ from mathutils import Vector
 
 from ...cycles.texels import srgb_decode
 from ...scene import FARTHEST, listed
-from ...visibility.occluders import TERMINATOR_OFFSET, OccluderMesh, Occluders, Transparency, overlap_within
+from ...visibility.occluders import TERMINATOR_OFFSET, OccluderMesh, Occluders, Transparency, overlaps_within
 from ..evaluated import SURFACE_TYPES, image_pixels, is_rendered, owner_of
 from ..lights.emission import ObjectFacts, open_studio, trees_of
 from ..lights.linking import MOST_BLOCKER_SETS, OTHER_LIGHTS, Blockers
@@ -268,12 +268,13 @@ class _Collector:
                 meshes, matrices = shapes.balls(ob, clear[0], self._note)
             else:
                 meshes = shapes.split_by_slot(ob, clear, self._image)
-                if (share := overlap_within(meshes)) > LEAST_DOUBLED:
+                alike, any_way = overlaps_within(meshes)
+                if alike > LEAST_DOUBLED:
                     text = f"of its faces where others are: {IN_CYCLES}, here all are lit"
-                    self._note(f"{_percent(share)} {text}", ob)
-                elif (share := overlap_within(meshes, any_way=True)) > TWO_SIDED:
+                    self._note(f"{_percent(alike)} {text}", ob)
+                elif any_way > TWO_SIDED:
                     text = f"of its faces where others face the other way: {IN_CYCLES}, here all are dark"
-                    self._note(f"{_percent(share)} {text}", ob)
+                    self._note(f"{_percent(any_way)} {text}", ob)
             self._shapes[key] = self._number(meshes), matrices
             self._remember_unread(instance, matrix, materials, self._shapes[key][0])
             if any(material is not None and is_displaced(material) for material in materials):

@@ -439,7 +439,7 @@ class SceneMirror:
 
     def _read_instances(self, depsgraph, changes: Changes, in_view) -> None:
         override = depsgraph.view_layer_eval.material_override
-        receivers = Receivers([ob.original for ob in depsgraph.objects if ob.type == "LIGHT"])
+        receivers = Receivers([ob.original for ob in depsgraph.objects])
         instances, meshes, looks = [], {}, {}
         users = Counter()  # instances by evaluated data, those out of view included
         for instance in depsgraph.object_instances:

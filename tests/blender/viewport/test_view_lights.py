@@ -353,7 +353,7 @@ def test_only_what_may_change_a_value_changes_the_text_of_nodes():
 
 
 def lit_scene():
-    """A plane and a sphere under one light of every kind; one of them lights the plane alone. The camera."""
+    """A plane and a sphere under one light of every kind; a lamp and a mesh light the plane alone. The camera."""
     parts.empty_scene(*SIZE)
     plane = parts.add_plane(parts.principled("Floor", Roughness=0.4)[0], size=7.0)
     ball = parts.add_sphere(parts.principled("Ball", Roughness=0.5, Metallic=1.0)[0], 0.7, segments=48)
@@ -367,6 +367,10 @@ def lit_scene():
     linked.light_linking.receiver_collection = group
     lamp = add_lamp_plane(location=(-1.2, -1.2, 1.0), rotation=(0.5, -0.4, 0.0), scale=(0.8, 0.6, -1.0))
     lamp.visible_camera = False
+    spared = bpy.data.collections.new("Not lit by it")
+    spared.objects.link(ball)
+    spared.collection_objects[0].light_linking.link_state = "EXCLUDE"
+    lamp.light_linking.receiver_collection = spared
     camera = parts.add_camera((0.0, -4.5, 2.6), (1.1, 0.0, 0.0))
     bpy.context.view_layer.update()
     return camera, ball

@@ -176,7 +176,10 @@ def shade_direct_light(
     with ShadowTracer(extraction.occluders, extraction.lights) as tracer:
         shader = DirectLightShader(picture, options.budget, tables, tracer)
         opening = extraction.times.processor - extraction.times.direct
-        chosen = shader.planned(extraction, seconds_left(extraction), clock.seconds() - opening)
+        seconds = seconds_left(extraction)
+        if options.budget is None:
+            seconds = plan.seconds_of_samples(options, extraction.film.width * extraction.film.height)
+        chosen = shader.planned(extraction, seconds, clock.seconds() - opening)
         clock.end("choice")
         if chosen.reason:
             cycles = extraction.left_to_cycles
@@ -230,7 +233,9 @@ class DirectLightShader:
             seconds_left=seconds_left,
             sampling_seconds=sampling_seconds,
             # Cycles will read the scene in half the time that was needed here, and render what shines in sight.
-            cycles_seconds=0.5 * extraction.times.direct + EDGE_SECONDS * film.width * film.height / 1e6,
+            cycles_seconds=0.0
+            if self.budget is None
+            else 0.5 * extraction.times.direct + EDGE_SECONDS * film.width * film.height / 1e6,
             points=film.sub_samples,
             most_points=self.options.sub_samples,
             samples_of_one_point=np.count_nonzero(extraction.points.number == 0),

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from ltsh_addon.blender.process.pixels import TOO_THIN, too_small
+from ltsh_addon.blender.process.pixels import TOO_LONG, TOO_THIN, too_small
 from ltsh_addon.pipeline import plan
 from ltsh_addon.pipeline.options import RenderOptions
 
@@ -66,6 +66,19 @@ def test_without_a_budget_or_without_surfaces_all_points_are_shaded():
         assert plan.direct_light_plan(scene) == plan.DirectLightPlan(2)
     # Without any time no probe is worth its time.
     assert plan.direct_light_plan(replace(SCENE, seconds_left=0.0)) == plan.DirectLightPlan(0, too_small(9.0))
+
+
+def test_samples_without_a_budget_stand_for_the_time_that_cycles_needs_for_them(tmp_path):
+    pixels, options = 100_000, RenderOptions(tmp_path / "room.blend", output=tmp_path)
+    for given in ({}, {"cycles_samples": 8, "sub_samples": 4}, {"cycles_samples": 8, "keep_visibility": True}):
+        assert plan.seconds_of_samples(replace(options, **given), pixels) is None
+    few, many = (plan.seconds_of_samples(replace(options, cycles_samples=count), pixels) for count in (1, 1000))
+    # A little time is there beside one sample, too; and beside many as much as Cycles' samples win in it.
+    assert plan.DIRECT_SHARE * few == pytest.approx(plan.FREE_SECONDS)
+    assert (1.0 - plan.DIRECT_SHARE) * many == pytest.approx(1000 * pixels * plan.SAMPLE_SECONDS)
+    scenes = [replace(SCENE, budget=None, cycles_seconds=0.0, most_points=2, seconds_left=one) for one in (few, many)]
+    plans = [planned(scene, lambda count: 0.02 * count, contrast=2.0) for scene in scenes]
+    assert plans == [plan.DirectLightPlan(0, TOO_LONG), plan.DirectLightPlan(2)]
 
 
 def test_depth_of_field_has_all_of_its_points_or_none():

@@ -61,6 +61,7 @@ def too_small(budget: float) -> str:
     return f"the budget is too small for it, {budget:g} s"
 
 
+TOO_LONG = "it takes longer than it wins beside so few samples (more of them, --budget or --aa change that)"
 TOO_THIN = "highlights are thinner than pixels almost everywhere, of which Cycles tells more in the time of the budget"
 
 

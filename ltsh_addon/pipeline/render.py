@@ -150,7 +150,7 @@ def shade_direct_light(
     `scene_and_layer` are fields of the child's job. `clock` is told the ends of stages; `seconds_left(extraction)` are
     those of the budget.
     """
-    from ..blender.process.pixels import PixelJob, ended_at_horizons, extract_pixels, with_points
+    from ..blender.process.pixels import PixelJob, ended_at_horizons, extract_pixels, seconds_of_samples, with_points
 
     tables = load_tables(options.techniques)
     width, height = options.resolution or (None, None)
@@ -163,6 +163,7 @@ def shade_direct_light(
         width=width,
         height=height,
         seconds=options.budget,
+        samples_beside=plan.samples_beside(options),
         sub_samples=first,
         reserve=(plan.FIRST_DENOISING_SECONDS + 2.0 * plan.NEXT_DENOISING_SECONDS) / 1e6,
         cycles_samples=0,
@@ -177,8 +178,8 @@ def shade_direct_light(
         shader = DirectLightShader(picture, options.budget, tables, tracer)
         opening = extraction.times.processor - extraction.times.direct
         seconds = seconds_left(extraction)
-        if options.budget is None:
-            seconds = plan.seconds_of_samples(options, extraction.film.width * extraction.film.height)
+        if job.samples_beside is not None:
+            seconds = seconds_of_samples(job.samples_beside, extraction.film.width * extraction.film.height)
         chosen = shader.planned(extraction, seconds, clock.seconds() - opening)
         clock.end("choice")
         if chosen.reason:

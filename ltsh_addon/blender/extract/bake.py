@@ -22,7 +22,7 @@ from ..lights.area import collect_lights
 from ..lights.emission import emission_of
 from ..lights.world import may_shine, take_world
 from ..materials import aovs
-from ..materials.graph import cut, ensure_nodes, has_displacement
+from ..materials.graph import cut, ensure_nodes, has_displacement, live_link, surface_of
 from ..materials.maps import UV_MAP, MaterialPlan, SavedImages
 from ..process.bake import BakeFactsJob, BakeJob
 from ..render_settings import changed_properties, working_space
@@ -268,6 +268,7 @@ def _open(job: BakeJob) -> BakeScene:
         override = view_layer.material_override.name
         warnings.append(f"material override {override!r} is switched off: objects are baked with their own")
         view_layer.material_override = None
+    bake_meshes.switch_off_holdouts(view_layer, objects, warnings)
     folder = tempfile.TemporaryDirectory(prefix="ltsh-meshes-", ignore_cleanup_errors=True)
     has_shadows = job.shadows == "on"
     bake_meshes.apply_modifiers(scene, objects)
@@ -396,6 +397,17 @@ def _look_from(scene, camera, wanted) -> None:
     bpy.context.view_layer.update()
 
 
+def _volumes(surfaces) -> list[str]:
+    """Warnings about the volumes of the materials of `surfaces`."""
+    materials = {slot.material for surface in surfaces for slot in surface.material_slots if slot.material is not None}
+    sockets = {material.name: surface_of(material) for material in materials}
+    return [
+        f"material {name!r}: its volume is not shaded, light passes it as if it were not there"
+        for name, socket in sorted(sockets.items())
+        if socket is not None and live_link(socket.node.inputs["Volume"]) is not None
+    ]
+
+
 def _inspect(scene, world, objects, uv_name, files):
     """The lights, meshes by object name, problems of the other objects by name, objects without material, warnings."""
     folder, with_occluders = files
@@ -420,7 +432,8 @@ def _inspect(scene, world, objects, uv_name, files):
         if with_occluders:
             lists = unread, displaced
             inventory.occluders = collect_occluders(depsgraph, None, inventory.warn, inventory.left_out, *lists)
-        return inventory, meshes, problems, bare, pixels.missing_images(depsgraph, world)
+        lost = [*_volumes(rendered.values()), *pixels.missing_images(depsgraph, world)]
+        return inventory, meshes, problems, bare, lost
 
     unread, displaced = [], []
     inventory, *others = with_render_depsgraph(scene, visit)

@@ -18,6 +18,18 @@ class ObjectError(Exception):
     """An object cannot be baked; the message is one line and names it."""
 
 
+def switch_off_holdouts(view_layer, objects, warnings: list[str]) -> None:
+    """Let Cycles bake `objects` that are holdouts, which it bakes black."""
+    for ob in objects:
+        if ob.holdout_get(view_layer=view_layer):
+            warnings.append(f"object {ob.name!r}: holdout is switched off, it is baked like any surface")
+        ob.is_holdout = False
+    collections = [view_layer.layer_collection]
+    for collection in collections:
+        collection.holdout = False
+        collections.extend(collection.children)
+
+
 def chosen_objects(scene, view_layer, wanted) -> list:
     """Objects to bake: "all" meshes that render, the "selected" ones, or those named. Raises SceneError."""
     if isinstance(wanted, str):

@@ -316,6 +316,38 @@ def test_objects_that_only_renders_show_are_baked_as_cycles_renders_them(how, tm
     assert np.linalg.norm(ours - cycles) <= 0.1 * np.linalg.norm(cycles)  # the noise of penumbras; a shadow is 25 %
 
 
+@pytest.mark.newest
+@pytest.mark.parametrize("how", ["object", "collection"])
+def test_holdouts_are_named_and_baked_like_any_surface(how, tmp_path):
+    """Cycles bakes them black."""
+    start()
+    ob, collection = add_plane(principled("Plain", Roughness=0.6)[0], name="Floor"), bpy.data.collections.new("Held")
+    bpy.context.scene.collection.children.link(collection)
+    bpy.context.scene.collection.objects.unlink(ob)
+    collection.objects.link(ob)
+    ob.is_holdout = how == "object"
+    bpy.context.view_layer.layer_collection.children["Held"].holdout = how == "collection"
+    report, files = baked(save(tmp_path), tmp_path / "out", passes=("diffuse",), error=True, cycles_samples=16)
+    assert report["warnings"] == ["object 'Floor': holdout is switched off, it is baked like any surface"]
+    layers = files["Floor.exr"]
+    ours, cycles = layers["ltsh4c.diffuse"], layers["cycles.diffuse"]
+    assert np.linalg.norm(ours - cycles) <= 0.1 * np.linalg.norm(cycles)
+
+
+@pytest.mark.newest
+@pytest.mark.parametrize("surface", [True, False])
+def test_volumes_between_lights_and_what_is_baked_are_named(surface, tmp_path):
+    start()
+    add_plane(principled("Plain")[0], name="Floor")
+    material, tree, output = scene_parts.new_material("Fog")
+    tree.links.new(scene_parts.add_node(tree, "ShaderNodeVolumeScatter").outputs[0], output.inputs["Volume"])
+    if surface:
+        tree.links.new(scene_parts.add_node(tree, "ShaderNodeBsdfTransparent").outputs[0], output.inputs["Surface"])
+    add_plane(material, size=0.5, name="Cloud", location=(0.0, 0.0, 0.7))
+    report, _ = baked(save(tmp_path), tmp_path / "out", objects=("Floor",), passes=("diffuse",))
+    assert report["warnings"] == ["material 'Fog': its volume is not shaded, light passes it as if it were not there"]
+
+
 def test_a_bake_of_one_block_tells_how_far_its_shadows_are(tmp_path):
     start()
     add_plane(principled("Gray")[0], size=2.0, name="Floor")

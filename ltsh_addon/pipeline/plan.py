@@ -25,9 +25,9 @@ MOST_OVER = 1.1  # how many times the budget a picture may take without a warnin
 # least 0.45, from the second 0.49 to 0.7 in six scenes of 32,400 pixels, and 0.84 with nine times as many.
 # MADE_ONCE: how many times too long the first may seem, since it also makes what all others have (maps of skies).
 PROBES, MADE_ONCE = ((0.01, 0.45), (0.04, 0.6)), 2.0
-# Of the remaining budget: the share that direct light may take with the first points, and with more points. With as
+# Of the remaining budget direct light may take DIRECT_SHARE with the first points, MORE_SHARE with more points. With as
 # many samples it leaves 0.75 to 0.95 of the error, for which so much time makes up.
-DIRECT_SHARE, MORE_SHARE = 0.3, 0.2
+MORE_SHARE = 0.2
 # THIN_CONTRAST: from this `Probe.contrast` on, highlights are thinner than pixels, and time is better spent on samples
 # of Cycles. In seven scenes the contrast is at most 0.11, of flakes in a car's paint 0.18, on the example scene more.
 THIN_CONTRAST = 0.14
@@ -48,8 +48,8 @@ class Probe:
 class SceneMeasurements:
     """What is known of a scene after its first samples; times are processor seconds."""
 
-    budget: float | None  # of the whole picture; None: no limit
-    seconds_left: float | None  # of the budget, before denoising
+    budget: float | None  # of the whole picture; None: none is given
+    seconds_left: float | None  # of the budget, or that samples stand for, before denoising; None: no limit
     sampling_seconds: float  # of the first points
     cycles_seconds: float  # that Cycles needs beside its samples
     points: int  # per pixel, of the samples that are there
@@ -84,7 +84,7 @@ def first_and_most_points(options: RenderOptions) -> tuple[int, int]:
 
 def direct_light_plan(scene: SceneMeasurements) -> DirectLightPlan:
     """The points per pixel that the remaining budget allows, or why Cycles does better with that time."""
-    from ..blender.process.pixels import LEAST_POINTS, TOO_THIN, too_small
+    from ..blender.process.pixels import DIRECT_SHARE, LEAST_POINTS, TOO_THIN, too_small
 
     if scene.seconds_left is None or scene.samples == 0:
         return DirectLightPlan(scene.points)
@@ -115,8 +115,15 @@ def direct_light_plan(scene: SceneMeasurements) -> DirectLightPlan:
     if len(affordable) == 0:
         return by_cycles
     # Either probe may miss the highlights.
-    is_thin = max(small.contrast, large.contrast) > THIN_CONTRAST
+    is_thin = scene.budget is not None and max(small.contrast, large.contrast) > THIN_CONTRAST
     return DirectLightPlan(0, TOO_THIN) if is_thin else DirectLightPlan(int(affordable[-1]))
+
+
+def samples_beside(options: RenderOptions) -> int | None:
+    """The samples of Cycles whose time limits that of direct light; None: a budget does, or nothing, where its points
+    are given or kept, or where the file says how many samples there are."""
+    is_free = options.budget is not None or options.sub_samples is not None or options.keep_visibility
+    return None if is_free else options.cycles_samples
 
 
 def shadow_rays(most: int, budget: float | None, pairs: float) -> int:

@@ -24,6 +24,9 @@ REASONS, LEAST_PERCENT = 5, 0.1
 SHARP_REFLECTION = 0.2  # surfaces of a smaller roughness show the patches of a world with fine detail
 # EDGE_SECONDS: processor seconds that a million pixels of `finished.FinishedJob.edges` take.
 EDGE_SECONDS = 12.0
+# Samples without a budget stand for the time that Cycles needs for them, SAMPLE_SECONDS for each pixel (3 to 8 us in
+# nine scenes), and for the share of direct light in all; LEAST_SECONDS for the fewest.
+SAMPLE_SECONDS, LEAST_SECONDS, DIRECT_SHARE = 5e-6, 8.0, 0.3
 LEAST_POINTS = 2  # per pixel, with a budget: one alone leaves more error than Cycles does in that time
 BEHIND = "behind"  # the folder of the renders of what is behind glass
 # THROUGH_GLASS: what a picture shows behind glass, by whether that was rendered.
@@ -52,13 +55,22 @@ class PixelJob:
     shadows: str = "off"  # "on": also the occluders, which then block light in the Cycles reference, too
     for_finished: bool = False  # also what a finished picture leaves to Cycles; no light is needed
     seconds: float | None = None  # processor time for the whole picture, which limits its sub-samples
+    samples_beside: int | None = None  # of Cycles, whose time limits them if `seconds` do not
     own_groups: tuple[str, ...] | None = None  # as in `finished.FinishedJob`
     reserve: float = 0.0  # the seconds of it that each pixel takes last, for denoising
 
 
-def too_small(budget: float) -> str:
-    """The reason why a `budget` in seconds leaves all direct light to Cycles."""
-    return f"the budget is too small for it, {budget:g} s"
+TOO_LONG = "it takes longer than it wins beside so few samples (more of them, --budget or --aa change that)"
+
+
+def seconds_of_samples(samples: int, pixels: int) -> float:
+    """The processor seconds for which so many samples of Cycles stand in place of a budget."""
+    return max(samples * pixels * SAMPLE_SECONDS / (1.0 - DIRECT_SHARE), LEAST_SECONDS)
+
+
+def too_small(budget: float | None) -> str:
+    """The reason why a `budget` in seconds, or else few samples, leave all direct light to Cycles."""
+    return TOO_LONG if budget is None else f"the budget is too small for it, {budget:g} s"
 
 
 TOO_THIN = "highlights are thinner than pixels almost everywhere, of which Cycles tells more in the time of the budget"

@@ -3,7 +3,7 @@
 import shutil
 import tempfile
 import time
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -15,7 +15,7 @@ from ...cycles.gbuffer import rounded_positions
 from ...cycles.texels import NOT_BAKED, BakeView, TexelMesh
 from ...cycles.uv import column_and_row, tiles_of
 from ...files import save_array
-from ...scene import ATLAS, error_line, light_records
+from ...scene import ATLAS, SceneError, error_line, light_records
 from .. import render_settings
 from ..evaluated import rendered_surfaces, with_render_depsgraph
 from ..lights.area import collect_lights
@@ -378,9 +378,12 @@ def _points_in_boxes(objects) -> np.ndarray:
 
 
 def _camera(scene, job):
-    """The camera of the view, or a new one, which a render needs in any case."""
+    """The camera of the view; from above that of the scene, which nodes know; else a new one, as a render needs one."""
     if job.view == "camera":
         return render_settings.choose_camera(scene, job.camera)
+    if job.view == "above":
+        with suppress(SceneError):
+            return render_settings.choose_camera(scene, None)
     camera = bpy.data.objects.new("ltsh bake", bpy.data.cameras.new("ltsh bake"))
     if job.view == "above":
         camera.data.type = "ORTHO"  # a point of a surface might be where a camera stands

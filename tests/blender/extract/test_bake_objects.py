@@ -335,6 +335,22 @@ def test_holdouts_are_named_and_baked_like_any_surface(how, tmp_path):
 
 
 @pytest.mark.newest
+@pytest.mark.parametrize("output", ["View Distance", "Window"])
+def test_seen_from_above_nodes_know_the_camera_of_the_scene(output, tmp_path):
+    start(camera=(0.0, -3.0, 2.0))
+    material, node = scene_parts.bsdf_material("ShaderNodeBsdfDiffuse")
+    source = material.node_tree.nodes.new(f"ShaderNode{'TexCoord' if output == 'Window' else 'CameraData'}")
+    material.node_tree.links.new(source.outputs[output], node.inputs["Color"])
+    add_plane(material, size=2.0, name="Floor")
+    path, layers = save(tmp_path), {}
+    for view in ("above", "camera"):
+        _, files = baked(path, tmp_path / view, passes=("diffuse",), view=view)
+        layers[view] = files["Floor.exr"]["ltsh4c.diffuse"]
+    assert layers["camera"].max() > 0.0
+    np.testing.assert_allclose(layers["above"], layers["camera"], rtol=1e-5)
+
+
+@pytest.mark.newest
 @pytest.mark.parametrize("surface", [True, False])
 def test_volumes_between_lights_and_what_is_baked_are_named(surface, tmp_path):
     start()

@@ -171,6 +171,32 @@ def test_shadows_that_are_stopped_leave_nothing_of_their_picture():
         gc.enable()
 
 
+def test_what_only_views_or_only_renders_show_is_named(tmp_path, capsys):
+    with_graphics(lambda: None)
+    set_up_scene()
+    scene, hidden = bpy.context.scene, bpy.data.collections.new("Hidden in renders")
+    scene.collection.children.link(hidden)
+    hidden.hide_render = True
+    inside, eye, camera, grid, empty = (parts.add_plane(name=name, size=0.1, location=(0, 0, -9)) for name in (
+        "In it", "Eye", "Camera icon", "Grid", "Of both"))  # fmt: skip
+    hidden.objects.link(inside)
+    scene.collection.objects.unlink(inside)
+    eye.hide_set(True)
+    camera.hide_render = True
+    grid.instance_type, grid.show_instancer_for_render = "VERTS", False
+    empty.hide_viewport = empty.hide_render = True
+    lamp = parts.add_area_light("Lamp", energy=1.0)
+    lamp.hide_viewport = True
+    parts.link(bpy.data.objects.new("Null", None)).hide_render = True
+    path = parts.save(tmp_path / "room.blend")
+    code, stdout, _ = run(
+        capsys, "view", path, "-o", tmp_path / "out", "--refine", 1, "--resolution", "16x12", "--json", "--quiet"
+    )
+    warnings = json.loads(stdout)["warnings"]
+    assert code == 0
+    assert "only views show Camera icon, Grid, In it" in warnings and "only renders show Eye, Lamp" in warnings
+
+
 def test_what_a_view_leaves_out_is_named(capsys, tmp_path):
     with_graphics(lambda: None)
     camera = set_up_scene()

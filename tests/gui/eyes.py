@@ -87,7 +87,10 @@ def inside(image):
 
 
 def is_coming(region):
-    """True while the view of a region compiles shaders, or while what moves is shown with fewer pixels."""
+    """True while the view of a region compiles shaders, while what moves has fewer pixels, or while a second Blender
+    looks at a world."""
+    if any(look.thread is not None for look in module("viewport.live_cycles")._world_looks.values()):
+        return True
     texts = module("engine.overlay")._texts.get(region.as_pointer())
     is_compiling = texts is not None and module("engine.view").COMPILING in texts.notes
     return is_compiling or any(view._pixel_size.step > 1 for view in module("engine.redraws").open_views)

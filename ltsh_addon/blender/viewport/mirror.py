@@ -158,7 +158,7 @@ def patterns_of(scene, depsgraph, known: dict[tuple, tuple]) -> dict[tuple, tupl
             wanted[source.key] = state_of(data, source), source
         return NOT_YET
 
-    receivers, sources = Receivers([]), (ShownTextures(), note)
+    receivers, sources = Receivers([ob.original for ob in depsgraph.objects]), (ShownTextures(), note)
     for instance in depsgraph.object_instances:
         ob = instance.object
         if ob.type == "LIGHT" and tree_in_use(ob.data) is not None:

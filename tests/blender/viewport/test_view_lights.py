@@ -176,6 +176,15 @@ def wait_for(lamps):
     assert news and not lamps.is_busy
 
 
+def test_lights_with_nodes_may_have_receivers():
+    parts.empty_scene()
+    bulb, _ = add_bulb("Striped", "POINT", stripes)
+    bulb.light_linking.receiver_collection = bpy.data.collections.new("Lit by it")
+    parts.add_camera()
+    scene, depsgraph = bpy.context.scene, bpy.context.evaluated_depsgraph_get()
+    assert len(mirror.patterns_of(scene, depsgraph, {})) == 1
+
+
 @pytest.mark.newest
 def test_windows_get_the_patterns_of_lights_from_a_second_blender(tmp_path):
     parts.empty_scene()

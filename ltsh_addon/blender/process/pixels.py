@@ -24,8 +24,8 @@ REASONS, LEAST_PERCENT = 5, 0.1
 SHARP_REFLECTION = 0.2  # surfaces of a smaller roughness show the patches of a world with fine detail
 # EDGE_SECONDS: processor seconds that a million pixels of `finished.FinishedJob.edges` take.
 EDGE_SECONDS = 12.0
-# Samples without a budget stand for the time that Cycles needs for them, SAMPLE_SECONDS for each pixel (3 to 8 us in
-# nine scenes), and for the share of direct light in all; LEAST_SECONDS for the fewest.
+# Samples without a budget stand for the time that Cycles needs for them, SAMPLE_SECONDS for each pixel (4 to 8 us in
+# four scenes), and for the share of direct light in all; LEAST_SECONDS for the fewest.
 SAMPLE_SECONDS, LEAST_SECONDS, DIRECT_SHARE = 5e-6, 8.0, 0.3
 LEAST_POINTS = 2  # per pixel, with a budget: one alone leaves more error than Cycles does in that time
 BEHIND = "behind"  # the folder of the renders of what is behind glass

@@ -396,7 +396,9 @@ def note_unsupported(ob, matrix: np.ndarray, inventory: LightInventory) -> None:
     if _is_sheared(ob, matrix):
         u, v = matrix[:3, 0], matrix[:3, 1]
         more = np.linalg.norm(u) * np.linalg.norm(v) / max(np.linalg.norm(np.cross(u, v)), 1e-30) - 1.0
-        size = f"Cycles samples it as a rectangle, some {100.0 * more:.2g} % too bright far away"
+        skew = abs(np.dot(u, v)) / max(np.linalg.norm(u) * np.linalg.norm(v), 1e-30)
+        off = f"some {100.0 * more:.2g} % too bright far away, some {100.0 * skew:.2g} % off near it"
+        size = f"Cycles samples it as a rectangle, {off}"
         inventory.warn(f"light {name!r}: its transform is sheared: {size}")
 
 

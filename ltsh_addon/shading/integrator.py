@@ -133,8 +133,8 @@ class Task:
     def _by_pass(self, lights, leaves=()):
         lights, leaves = _prepared(lights), _prepared(leaves)
         lights_by_pass = {name: float32.Lights.of(lights, name, leaves) for name in self.passes}
-        # If all lights affect both passes, these share their trees.
-        if len({len(pass_lights) for pass_lights in lights_by_pass.values()}) > 1:
+        # If the same lights affect both passes, these share their trees.
+        if len({tuple(id(light) for light, _, _ in of_pass) for of_pass in lights_by_pass.values()}) > 1:
             return lights_by_pass
         return dict.fromkeys(lights_by_pass, lights_by_pass[self.passes[0]])
 

@@ -138,6 +138,11 @@ def test_lights_affect_only_what_they_should(technique):
     no_specular = shade(samples, [area_light(affects_specular=False)], technique)
     assert np.array_equal(no_diffuse.specular, full.specular) and not no_diffuse.diffuse.any()
     assert np.array_equal(no_specular.diffuse, full.diffuse) and not no_specular.specular.any()
+    # As many lights affect one pass as the other, but others.
+    other = area_light(affects_specular=False, center=(-0.8, 0.3, 1.5), radiance=(1.0, 5.0, 2.0))
+    both = shade(samples, [area_light(affects_diffuse=False), other], technique)
+    assert np.array_equal(both.specular[0], full.specular[0]) and not both.specular[1].any()
+    assert np.array_equal(both.diffuse[1], shade(samples, [other], technique).diffuse[0]) and not both.diffuse[0].any()
 
 
 @pytest.mark.parametrize("height", [0.3, 1.0, 4.0])

@@ -55,6 +55,7 @@ ATTRIBUTES = {
     "QUATERNION": ("value", 4, np.float32),
     "FLOAT4X4": ("value", 16, np.float32),
 }
+CAMERA_OUTPUTS = ("Camera", "Window")  # of the node Texture Coordinate
 STILL = ("FILE", "GENERATED", "TILED")  # sources of images whose content is told by their files
 
 
@@ -82,12 +83,15 @@ def dependencies(depsgraph, names: Iterable[str], job: BakeFactsJob) -> dict[str
         matrix = np.array(instance.matrix_world, np.float32).tobytes()
         shown = instance.show_self, instance.show_particles, instance.random_id
         instances.append(_digest(owner.name_full, ob.name_full, shapes[key], matrix, shown))
-    texts = {one.name_full: (_material(one), one) for slots in owned.values() for one in slots if one is not None}
+    eye = scene.camera and (np.array(scene.camera.matrix_world, np.float32).tobytes(), _settings(scene.camera.data))
+    eye = _digest(eye, scene.render.resolution_x, scene.render.resolution_y)
+    materials = {one for slots in owned.values() for one in slots if one is not None}
+    texts = {one.name_full: (_digest(_material(one), _reads_camera(one) and eye), one) for one in materials}
     shared = [text for text, one in texts.values() if job.bounces == "on" or not _is_opaque(one)]
     world = getattr(layer, "world_override", None) or scene.world
     whole = _digest(working_space(), _settings(scene.cycles), _world(world), sorted(instances), sorted(shared))
     own = {name: [texts[one.name_full][0] if one else "" for one in owned.get(name, ())] for name in names}
-    return {name: _digest(whole, materials) for name, materials in own.items()}
+    return {name: _digest(whole, of_slots) for name, of_slots in own.items()}
 
 
 def _digest(*parts) -> str:
@@ -152,6 +156,14 @@ def _attributes(ob, data) -> list:
 def _material(material) -> str:
     settings = [text for text in _settings(material) if not text.startswith(UNSEEN_IN_MATERIALS)]
     return _digest(material.name_full, settings, _settings(material.cycles), _nodes(material))
+
+
+def _reads_camera(material) -> bool:
+    """True if a node knows where the camera is."""
+    nodes = [node for tree in trees_of([material]) for node in tree.nodes]
+    places = [node for node in nodes if node.bl_idname == "ShaderNodeTexCoord"]
+    is_linked = any(node.outputs[name].is_linked for node in places for name in CAMERA_OUTPUTS)
+    return is_linked or any(node.bl_idname == "ShaderNodeCameraData" for node in nodes)
 
 
 def _world(world) -> list | None:

@@ -23,7 +23,7 @@ from ..evaluated import (
     owner_of,
     visibility,
 )
-from ..lights.area import area_light, node_light, note_unsupported, reason_to_leave_out
+from ..lights.area import area_light, half_hidden, node_light, note_unsupported, reason_to_leave_out
 from ..lights.emission import emission_of, factors_of, open_studio
 from ..lights.linking import Receivers
 from ..lights.meshes import collect_mesh_lights, constant_mesh_lights
@@ -499,6 +499,8 @@ class SceneMirror:
         points = [shown.center[:3] for shown in self.instances] + [light.center for light in self.lights]
         points = np.array(points).reshape(-1, 3)
         self._limit_notes += rounded_positions(points[np.abs(points).max(axis=1) > FAR], self.lights)
+        halves = {light.name: light for light in self.lights if light.affects_diffuse != light.affects_specular}
+        self._limit_notes += map(half_hidden, halves.values())
 
 
 def _shown_look(material) -> ShownLook:

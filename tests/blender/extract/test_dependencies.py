@@ -127,6 +127,17 @@ def test_a_change_is_noticed_by_the_objects_that_it_changes(room, change):
         assert changed == (set() if change in OF_NONE else expected[bounces]), bounces
 
 
+def test_a_moved_camera_is_noticed_by_materials_that_read_it(room):
+    """Seen from above, where the view is not the camera's."""
+    tree = bpy.data.materials["Red"].node_tree
+    place = tree.nodes.new("ShaderNodeTexCoord")
+    tree.links.new(place.outputs["Window"], node("Red").inputs["Base Color"])
+    before = digests(view="above")
+    bpy.context.scene.camera.location.x += 0.1
+    after = digests(view="above")
+    assert after["Floor"] == before["Floor"] and after["Ball"] != before["Ball"]
+
+
 def bake(path, *arguments):
     """What the command line tells, and the objects that it baked."""
     words = ["--object", "Floor", "--object", "Ball", "--view", "above", "--size", "64", "--resume", *arguments]

@@ -496,3 +496,18 @@ def test_texts_and_curves_are_drawn_and_shine_once():
     depsgraph = bpy.context.evaluated_depsgraph_get()
     names = [instance.object.name for instance in depsgraph.object_instances if is_surface(instance)]
     assert sorted(names) == ["BézierCircle", "Text"]
+
+
+@pytest.mark.newest
+def test_lights_that_are_hidden_from_one_kind_of_rays_are_named():
+    parts.empty_scene()
+    parts.add_area_light("Lamp").visible_glossy = False
+    parts.add_area_light("Plain")
+    lights, _ = seen()
+    shown = mirror.SceneMirror()
+    shown.lights_without_world = lights
+    shown.take_sky(ShownSky(lights=(replace(lights[1], name="Sky", affects_diffuse=False),)))
+    assert [note.partition(";")[0] for note in shown.notes] == [
+        "light 'Lamp': it is hidden from glossy rays",
+        "light 'Sky': it is hidden from diffuse rays",
+    ]

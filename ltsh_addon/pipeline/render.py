@@ -155,7 +155,8 @@ def shade_direct_light(
     tables = load_tables(options.techniques)
     width, height = options.resolution or (None, None)
     first, most = plan.first_and_most_points(options)
-    picture = child_job(PictureOptions, options, passes=PASSES, sub_samples=max(most, 1), shadows="on", cycles_samples=2)
+    needed = {"passes": PASSES, "sub_samples": max(most, 1), "shadows": "on", "cycles_samples": 2}
+    picture = child_job(PictureOptions, options, **needed)
     job = child_job(
         PixelJob,
         picture,

@@ -453,8 +453,8 @@ class RenderOptions(CameraOptions):
     techniques: tuple[str, ...] = _techniques(SHIPPED_TABLES, parse=one_table)
     sub_samples: int | None = option(
         "--aa", default=None, type=positive, metavar="N",
-        help="points per pixel of the direct light, shared by the pixel filter (default: 3 to 9 by the samples of "
-        "Cycles, or by the budget)",
+        help="points per pixel of the direct light, shared by the pixel filter (default: by the samples of "
+        "Cycles, none below 64, or by the budget)",
     )  # fmt: skip
     cycles_samples: int | None = option(
         "--cycles-samples", default=None, type=cycles_samples, metavar="N", help="of Cycles; default: as in the file"

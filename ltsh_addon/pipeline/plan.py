@@ -9,10 +9,10 @@ import numpy as np
 
 from .options import SHADOW_RAYS, RenderOptions
 
-# Points per pixel. Without a budget, one for SAMPLES_OF_POINT samples of Cycles, from FIRST_POINTS to DEFAULT_POINTS:
-# beside few samples more points cost more than they win. With one, FIRST_POINTS: of the samples on which the plan
-# rests, and MOST_POINTS: at most.
-FIRST_POINTS, DEFAULT_POINTS, SAMPLES_OF_POINT, MOST_POINTS = 3, 9, 16, 17
+# Points per pixel. Without a budget, one for SAMPLES_OF_POINT samples of Cycles, up to DEFAULT_POINTS: a point takes 80
+# us, a sample 4 to 8. What fewer than LEAST_POINTS win, as many more samples of Cycles win as well. With a budget,
+# FIRST_POINTS: of the samples on which the plan rests, and MOST_POINTS: at most.
+FIRST_POINTS, DEFAULT_POINTS, SAMPLES_OF_POINT, MOST_POINTS = 3, 9, 32, 17
 # Processor seconds of denoising. DENOISER_START_SECONDS: always. FIRST_DENOISING_SECONDS: for a picture of a million
 # pixels. NEXT_DENOISING_SECONDS: for each further picture of that size.
 DENOISER_START_SECONDS, FIRST_DENOISING_SECONDS, NEXT_DENOISING_SECONDS = 0.25, 12.0, 4.0
@@ -25,9 +25,9 @@ MOST_OVER = 1.1  # how many times the budget a picture may take without a warnin
 # least 0.45, from the second 0.49 to 0.7 in six scenes of 32,400 pixels, and 0.84 with nine times as many.
 # MADE_ONCE: how many times too long the first may seem, since it also makes what all others have (maps of skies).
 PROBES, MADE_ONCE = ((0.01, 0.45), (0.04, 0.6)), 2.0
-# Of the remaining budget direct light may take DIRECT_SHARE with the first points, MORE_SHARE with more points. With as
+# Of the remaining budget: the share that direct light may take with the first points, and with more points. With as
 # many samples it leaves 0.75 to 0.95 of the error, for which so much time makes up.
-MORE_SHARE = 0.2
+DIRECT_SHARE, MORE_SHARE = 0.3, 0.2
 # THIN_CONTRAST: from this `Probe.contrast` on, highlights are thinner than pixels, and time is better spent on samples
 # of Cycles. In seven scenes the contrast is at most 0.11, of flakes in a car's paint 0.18, on the example scene more.
 THIN_CONTRAST = 0.14
@@ -48,8 +48,8 @@ class Probe:
 class SceneMeasurements:
     """What is known of a scene after its first samples; times are processor seconds."""
 
-    budget: float | None  # of the whole picture; None: none is given
-    seconds_left: float | None  # of the budget, or that samples stand for, before denoising; None: no limit
+    budget: float | None  # of the whole picture; None: no limit
+    seconds_left: float | None  # of the budget, before denoising
     sampling_seconds: float  # of the first points
     cycles_seconds: float  # that Cycles needs beside its samples
     points: int  # per pixel, of the samples that are there
@@ -73,22 +73,28 @@ class DirectLightPlan:
 
 
 def first_and_most_points(options: RenderOptions) -> tuple[int, int]:
-    """Points per pixel of the first samples, and the most that the plan may ask for."""
+    """Points per pixel of the first samples, and the most that the plan may ask for; 0: all direct light is left to
+    Cycles, whose samples are too few."""
+    from ..blender.process.pixels import LEAST_POINTS
+
     most = options.sub_samples or MOST_POINTS
     if options.budget is None and options.sub_samples is None:
-        samples = options.cycles_samples or SAMPLES_OF_POINT * DEFAULT_POINTS
-        most = int(np.clip(samples // SAMPLES_OF_POINT, FIRST_POINTS, DEFAULT_POINTS))
+        most = DEFAULT_POINTS
+        if options.cycles_samples is not None:
+            most = min(options.cycles_samples // SAMPLES_OF_POINT, DEFAULT_POINTS)
+        if most < LEAST_POINTS:
+            most = LEAST_POINTS if options.keep_visibility else 0
     # Depth of field needs all of its points from the start.
     return (most if options.budget is None or most > MOST_POINTS else min(FIRST_POINTS, most)), most
 
 
 def direct_light_plan(scene: SceneMeasurements) -> DirectLightPlan:
     """The points per pixel that the remaining budget allows, or why Cycles does better with that time."""
-    from ..blender.process.pixels import DIRECT_SHARE, LEAST_POINTS, TOO_THIN, too_small
+    from ..blender.process.pixels import LEAST_POINTS, TOO_THIN, too_little
 
     if scene.seconds_left is None or scene.samples == 0:
         return DirectLightPlan(scene.points)
-    by_cycles = DirectLightPlan(0, too_small(scene.budget))
+    by_cycles = DirectLightPlan(0, too_little(scene.budget))
     seconds = scene.seconds_left - scene.cycles_seconds
     if seconds <= 0.0:
         return by_cycles
@@ -115,15 +121,8 @@ def direct_light_plan(scene: SceneMeasurements) -> DirectLightPlan:
     if len(affordable) == 0:
         return by_cycles
     # Either probe may miss the highlights.
-    is_thin = scene.budget is not None and max(small.contrast, large.contrast) > THIN_CONTRAST
+    is_thin = max(small.contrast, large.contrast) > THIN_CONTRAST
     return DirectLightPlan(0, TOO_THIN) if is_thin else DirectLightPlan(int(affordable[-1]))
-
-
-def samples_beside(options: RenderOptions) -> int | None:
-    """The samples of Cycles whose time limits that of direct light; None: a budget does, or nothing, where its points
-    are given or kept, or where the file says how many samples there are."""
-    is_free = options.budget is not None or options.sub_samples is not None or options.keep_visibility
-    return None if is_free else options.cycles_samples
 
 
 def shadow_rays(most: int, budget: float | None, pairs: float) -> int:

@@ -150,12 +150,13 @@ def shade_direct_light(
     `scene_and_layer` are fields of the child's job. `clock` is told the ends of stages; `seconds_left(extraction)` are
     those of the budget.
     """
-    from ..blender.process.pixels import PixelJob, ended_at_horizons, extract_pixels, seconds_of_samples, with_points
+    from ..blender.process.pixels import PixelJob, ended_at_horizons, extract_pixels, with_points
 
     tables = load_tables(options.techniques)
     width, height = options.resolution or (None, None)
     first, most = plan.first_and_most_points(options)
-    picture = child_job(PictureOptions, options, passes=PASSES, sub_samples=most, shadows="on", cycles_samples=2)
+    needed = {"passes": PASSES, "sub_samples": max(most, 1), "shadows": "on", "cycles_samples": 2}
+    picture = child_job(PictureOptions, options, **needed)
     job = child_job(
         PixelJob,
         picture,
@@ -163,7 +164,6 @@ def shade_direct_light(
         width=width,
         height=height,
         seconds=options.budget,
-        samples_beside=plan.samples_beside(options),
         sub_samples=first,
         reserve=(plan.FIRST_DENOISING_SECONDS + 2.0 * plan.NEXT_DENOISING_SECONDS) / 1e6,
         cycles_samples=0,
@@ -177,10 +177,7 @@ def shade_direct_light(
     with ShadowTracer(extraction.occluders, extraction.lights) as tracer:
         shader = DirectLightShader(picture, options.budget, tables, tracer)
         opening = extraction.times.processor - extraction.times.direct
-        seconds = seconds_left(extraction)
-        if job.samples_beside is not None:
-            seconds = seconds_of_samples(job.samples_beside, extraction.film.width * extraction.film.height)
-        chosen = shader.planned(extraction, seconds, clock.seconds() - opening)
+        chosen = shader.planned(extraction, seconds_left(extraction), clock.seconds() - opening)
         clock.end("choice")
         if chosen.reason:
             cycles = extraction.left_to_cycles
@@ -234,9 +231,7 @@ class DirectLightShader:
             seconds_left=seconds_left,
             sampling_seconds=sampling_seconds,
             # Cycles will read the scene in half the time that was needed here, and render what shines in sight.
-            cycles_seconds=0.0
-            if self.budget is None
-            else 0.5 * extraction.times.direct + EDGE_SECONDS * film.width * film.height / 1e6,
+            cycles_seconds=0.5 * extraction.times.direct + EDGE_SECONDS * film.width * film.height / 1e6,
             points=film.sub_samples,
             most_points=self.options.sub_samples,
             samples_of_one_point=np.count_nonzero(extraction.points.number == 0),

@@ -4,15 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from ltsh_addon.blender.process.pixels import (
-    DIRECT_SHARE,
-    LEAST_SECONDS,
-    SAMPLE_SECONDS,
-    TOO_LONG,
-    TOO_THIN,
-    seconds_of_samples,
-    too_small,
-)
+from ltsh_addon.blender.process.pixels import TOO_THIN, too_little
 from ltsh_addon.pipeline import plan
 from ltsh_addon.pipeline.options import RenderOptions
 
@@ -57,13 +49,13 @@ def test_direct_light_gets_no_more_points_than_probes_say_there_is_time_for(each
 
     chosen = planned(scene, seconds_of, contrast=0.1)
     number = chosen.points_per_pixel
-    assert number in points and chosen.reason == ("" if number else too_small(9.0))
+    assert number in points and chosen.reason == ("" if number else too_little(9.0))
     if number == 0:
         return
     samples = 1000 + 200 * (number - 1)
     # The plan goes on from the second probe with a power of its own.
     (_, (share, expected)) = plan.PROBES
-    share_of_time = (plan.MORE_SHARE if number > 2 else DIRECT_SHARE) * share ** min(expected - power, 0.0)
+    share_of_time = (plan.MORE_SHARE if number > 2 else plan.DIRECT_SHARE) * share ** min(expected - power, 0.0)
     assert seconds_of(samples) <= share_of_time * SECONDS
     # With thin highlights Cycles does better with the time.
     assert planned(scene, seconds_of, contrast=2.0) == plan.DirectLightPlan(0, TOO_THIN)
@@ -73,22 +65,7 @@ def test_without_a_budget_or_without_surfaces_all_points_are_shaded():
     for scene in (replace(SCENE, budget=None, seconds_left=None), replace(SCENE, samples=0)):
         assert plan.direct_light_plan(scene) == plan.DirectLightPlan(2)
     # Without any time no probe is worth its time.
-    assert plan.direct_light_plan(replace(SCENE, seconds_left=0.0)) == plan.DirectLightPlan(0, too_small(9.0))
-
-
-def test_samples_without_a_budget_stand_for_the_time_that_cycles_needs_for_them(tmp_path):
-    options = RenderOptions(tmp_path / "room.blend", output=tmp_path, cycles_samples=8)
-    assert plan.samples_beside(options) == 8
-    for free in ({"cycles_samples": None}, {"budget": 5.0}, {"sub_samples": 4}, {"keep_visibility": True}):
-        assert plan.samples_beside(replace(options, **free)) is None
-    pixels = 100_000
-    few, many = (seconds_of_samples(count, pixels) for count in (1, 1000))
-    # A small picture has a little time in any case, and many samples leave direct light its share of all.
-    assert few == LEAST_SECONDS
-    assert (1.0 - DIRECT_SHARE) * many == pytest.approx(1000 * pixels * SAMPLE_SECONDS)
-    scenes = [replace(SCENE, budget=None, cycles_seconds=0.0, most_points=2, seconds_left=one) for one in (few, many)]
-    plans = [planned(scene, lambda count: 0.02 * count, contrast=2.0) for scene in scenes]
-    assert plans == [plan.DirectLightPlan(0, TOO_LONG), plan.DirectLightPlan(2)]
+    assert plan.direct_light_plan(replace(SCENE, seconds_left=0.0)) == plan.DirectLightPlan(0, too_little(9.0))
 
 
 def test_depth_of_field_has_all_of_its_points_or_none():
@@ -97,11 +74,19 @@ def test_depth_of_field_has_all_of_its_points_or_none():
     assert planned(scene, lambda count: 0.03 * count).points_per_pixel == 0
 
 
-def test_first_points_are_few_only_with_a_budget(tmp_path):
+def test_without_a_budget_points_follow_the_samples_alone_so_that_every_run_gives_the_same_picture(tmp_path):
     options = RenderOptions(tmp_path / "room.blend", output=tmp_path)
     assert plan.first_and_most_points(options) == (plan.DEFAULT_POINTS, plan.DEFAULT_POINTS)
-    few = [plan.first_and_most_points(replace(options, cycles_samples=count))[1] for count in (1, 32, 80, 4096)]
-    assert few == [plan.FIRST_POINTS, plan.FIRST_POINTS, 5, plan.DEFAULT_POINTS]
+    points = [plan.first_and_most_points(replace(options, cycles_samples=count)) for count in (1, 63, 64, 128, 4096)]
+    assert points == [(0, 0), (0, 0), (2, 2), (4, 4), (plan.DEFAULT_POINTS, plan.DEFAULT_POINTS)]
+    few = replace(options, cycles_samples=1)
+    # What was asked for is shaded, as is what later powers of lights need.
+    assert plan.first_and_most_points(replace(few, sub_samples=5)) == (5, 5)
+    assert plan.first_and_most_points(replace(few, keep_visibility=True)) == (2, 2)
+
+
+def test_first_points_are_few_only_with_a_budget(tmp_path):
+    options = RenderOptions(tmp_path / "room.blend", output=tmp_path)
     budget = replace(options, budget=5.0)
     assert plan.first_and_most_points(budget) == (plan.FIRST_POINTS, plan.MOST_POINTS)
     assert plan.first_and_most_points(replace(budget, sub_samples=2)) == (2, 2)

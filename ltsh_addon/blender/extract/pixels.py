@@ -18,15 +18,7 @@ from ..lights.world import blocks_nothing, take_world, world_behind, world_light
 from ..materials import aovs
 from ..materials.graph import images_behind
 from ..process.blender_process import job_start, newer
-from ..process.pixels import (
-    BEHIND,
-    DIRECT_SHARE,
-    EDGE_SECONDS,
-    LEAST_POINTS,
-    PixelJob,
-    seconds_of_samples,
-    too_small,
-)
+from ..process.pixels import BEHIND, EDGE_SECONDS, LEAST_POINTS, PixelJob, too_little
 from .occluders import collect_occluders, with_baked_shares, with_displacement
 
 # FAST_PIXELS: up to this many samples (about 1 GB of files), files are compressed fast instead of well.
@@ -69,9 +61,9 @@ FINISHED_LENS = 32
 # Processor seconds of direct light. START_SECONDS: always. LOOKS: how many more looks at the scene there are, by us for
 # more points, and by Cycles for these and for its picture. POINT_SECONDS: for a point of a pixel, which grows by
 # LIGHT_SHARE with each light, up to MOST_LIGHTS.
-# POINTS_SHARE: of the seconds that are left, at most for points, as DIRECT_SHARE is for all of direct light.
+# Shares of the seconds that are left. POINTS_SHARE: at most for points. DIRECT_SHARE: at most for all of direct light.
 START_SECONDS, LOOKS, POINT_SECONDS, LIGHT_SHARE = 1.8, 3, 1.2e-5, 0.125
-POINTS_SHARE, MOST_LIGHTS = 0.15, 100
+POINTS_SHARE, DIRECT_SHARE, MOST_LIGHTS = 0.15, 0.3, 100
 
 
 def affordable_points(seconds: float, pixels: int, lights: int, looked: float = 0.0) -> int:
@@ -353,10 +345,9 @@ def extract_pixels(job: PixelJob, folder: Path, progress) -> dict:
     end, pixels = None, picture["width"] * picture["height"]
     if job.seconds is not None:
         end = job_start() + job.seconds - (job.reserve + 1e-6 * EDGE_SECONDS) * pixels
-    elif job.samples_beside is not None:
-        end = opened + seconds_of_samples(job.samples_beside, pixels)
     inventory, count = LightInventory(), 0
-    if end is None or affordable_points(end - opened, pixels, 1):  # otherwise a look at the scene would be wasted
+    # Otherwise a look at the scene would be wasted.
+    if job.sub_samples and (end is None or affordable_points(end - opened, pixels, 1)):
         look_until = np.inf if end is None or has_lens else opened + longest_look(end - opened, pixels)
         options = {"with_occluders": job.shadows == "on", "look_until": look_until if for_finished else None}
         with suppress(LookTooLong):
@@ -370,7 +361,7 @@ def extract_pixels(job: PixelJob, folder: Path, progress) -> dict:
         points = f"with fewer than {FINISHED_LENS} points per pixel (--aa)"
         inventory.left_to_cycles.everything.append(f"depth of field of camera {camera.name!r} {points}")
     if count == 0:
-        inventory.left_to_cycles.everything.append(too_small(job.seconds))
+        inventory.left_to_cycles.everything.append(too_little(job.seconds))
     has_shadows = inventory.occluders is not None
     if has_shadows:
         inventory.occluders.save(folder / OCCLUDERS)

@@ -24,9 +24,6 @@ REASONS, LEAST_PERCENT = 5, 0.1
 SHARP_REFLECTION = 0.2  # surfaces of a smaller roughness show the patches of a world with fine detail
 # EDGE_SECONDS: processor seconds that a million pixels of `finished.FinishedJob.edges` take.
 EDGE_SECONDS = 12.0
-# Samples without a budget stand for the time that Cycles needs for them, SAMPLE_SECONDS for each pixel (4 to 8 us in
-# four scenes), and for the share of direct light in all; LEAST_SECONDS for the fewest.
-SAMPLE_SECONDS, LEAST_SECONDS, DIRECT_SHARE = 5e-6, 8.0, 0.3
 LEAST_POINTS = 2  # per pixel, with a budget: one alone leaves more error than Cycles does in that time
 BEHIND = "behind"  # the folder of the renders of what is behind glass
 # THROUGH_GLASS: what a picture shows behind glass, by whether that was rendered.
@@ -43,7 +40,7 @@ class PixelJob:
     scene: Path
     width: int | None = None
     height: int | None = None
-    sub_samples: int = 1
+    sub_samples: int = 1  # of finished pictures also 0
     cycles_samples: int = 0
     frame: int | None = None
     camera: str | None = None
@@ -55,22 +52,15 @@ class PixelJob:
     shadows: str = "off"  # "on": also the occluders, which then block light in the Cycles reference, too
     for_finished: bool = False  # also what a finished picture leaves to Cycles; no light is needed
     seconds: float | None = None  # processor time for the whole picture, which limits its sub-samples
-    samples_beside: int | None = None  # of Cycles, whose time limits them if `seconds` do not
     own_groups: tuple[str, ...] | None = None  # as in `finished.FinishedJob`
     reserve: float = 0.0  # the seconds of it that each pixel takes last, for denoising
 
 
-TOO_LONG = "it takes longer than it wins beside so few samples (more of them, --budget or --aa change that)"
-
-
-def seconds_of_samples(samples: int, pixels: int) -> float:
-    """The processor seconds for which so many samples of Cycles stand in place of a budget."""
-    return max(samples * pixels * SAMPLE_SECONDS / (1.0 - DIRECT_SHARE), LEAST_SECONDS)
-
-
-def too_small(budget: float | None) -> str:
+def too_little(budget: float | None) -> str:
     """The reason why a `budget` in seconds, or else few samples, leave all direct light to Cycles."""
-    return TOO_LONG if budget is None else f"the budget is too small for it, {budget:g} s"
+    if budget is None:
+        return "beside so few samples it takes longer than it wins (more of them change that, or --aa)"
+    return f"the budget is too small for it, {budget:g} s"
 
 
 TOO_THIN = "highlights are thinner than pixels almost everywhere, of which Cycles tells more in the time of the budget"
@@ -196,7 +186,7 @@ def extract_pixels(
     `look` gets the extraction before its lobes end at horizons, which may take long. For finished pictures it stays so.
     Raises SceneError if the scene or file cannot be used, Cancelled if `progress(stage, fraction)` returned False.
     """
-    if job.sub_samples < 1 or job.cycles_samples < 0:
+    if job.sub_samples < (not job.for_finished) or job.cycles_samples < 0:
         raise ValueError(
             f"sub_samples is {job.sub_samples} and cycles_samples {job.cycles_samples}, expected at least 1 and 0"
         )

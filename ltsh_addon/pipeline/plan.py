@@ -82,8 +82,10 @@ def first_and_most_points(options: RenderOptions) -> tuple[int, int]:
         most = DEFAULT_POINTS
         if options.cycles_samples is not None:
             most = min(options.cycles_samples // SAMPLES_OF_POINT, DEFAULT_POINTS)
-        if most < LEAST_POINTS:
-            most = LEAST_POINTS if options.keep_visibility else 0
+        if options.keep_visibility or options.own_groups is not None:
+            most = max(most, FIRST_POINTS)  # each light by itself is wanted
+        elif most < LEAST_POINTS:
+            most = 0
     # Depth of field needs all of its points from the start.
     return (most if options.budget is None or most > MOST_POINTS else min(FIRST_POINTS, most)), most
 

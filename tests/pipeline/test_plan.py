@@ -80,9 +80,10 @@ def test_without_a_budget_points_follow_the_samples_alone_so_that_every_run_give
     points = [plan.first_and_most_points(replace(options, cycles_samples=count)) for count in (1, 63, 64, 128, 4096)]
     assert points == [(0, 0), (0, 0), (2, 2), (4, 4), (plan.DEFAULT_POINTS, plan.DEFAULT_POINTS)]
     few = replace(options, cycles_samples=1)
-    # What was asked for is shaded, as is what later powers of lights need.
+    # What was asked for is shaded, as is what other powers of lights need.
     assert plan.first_and_most_points(replace(few, sub_samples=5)) == (5, 5)
-    assert plan.first_and_most_points(replace(few, keep_visibility=True)) == (2, 2)
+    for wanted in ({"keep_visibility": True}, {"own_groups": ()}):
+        assert plan.first_and_most_points(replace(few, **wanted)) == (plan.FIRST_POINTS, plan.FIRST_POINTS)
 
 
 def test_first_points_are_few_only_with_a_budget(tmp_path):

@@ -79,9 +79,8 @@ def first_and_most_points(options: RenderOptions) -> tuple[int, int]:
 
     most = options.sub_samples or MOST_POINTS
     if options.budget is None and options.sub_samples is None:
-        most = DEFAULT_POINTS
-        if options.cycles_samples is not None:
-            most = min(options.cycles_samples // SAMPLES_OF_POINT, DEFAULT_POINTS)
+        samples = options.cycles_samples or SAMPLES_OF_POINT * DEFAULT_POINTS
+        most = min(samples // SAMPLES_OF_POINT, DEFAULT_POINTS)
         if options.keep_visibility or options.own_groups is not None:
             most = max(most, FIRST_POINTS)  # each light by itself is wanted
         elif most < LEAST_POINTS:

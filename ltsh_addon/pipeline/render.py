@@ -155,8 +155,7 @@ def shade_direct_light(
     tables = load_tables(options.techniques)
     width, height = options.resolution or (None, None)
     first, most = plan.first_and_most_points(options)
-    needed = {"passes": PASSES, "sub_samples": max(most, 1), "shadows": "on", "cycles_samples": 2}
-    picture = child_job(PictureOptions, options, **needed)
+    picture = child_job(PictureOptions, options, passes=PASSES, sub_samples=most or 1, shadows="on", cycles_samples=2)
     job = child_job(
         PixelJob,
         picture,

@@ -22,7 +22,7 @@ from ..lights.area import collect_lights
 from ..lights.emission import emission_of
 from ..lights.world import may_shine, take_world
 from ..materials import aovs
-from ..materials.graph import cut, ensure_nodes, has_displacement, live_link, surface_of
+from ..materials.graph import cut, ensure_nodes, has_displacement, has_volume
 from ..materials.maps import UV_MAP, MaterialPlan, SavedImages
 from ..process.bake import BakeFactsJob, BakeJob
 from ..render_settings import changed_properties, working_space
@@ -403,11 +403,9 @@ def _look_from(scene, camera, wanted) -> None:
 def _volumes(surfaces) -> list[str]:
     """Warnings about the volumes of the materials of `surfaces`."""
     materials = {slot.material for surface in surfaces for slot in surface.material_slots if slot.material is not None}
-    sockets = {material.name: surface_of(material) for material in materials}
     return [
         f"material {name!r}: its volume is not shaded, light passes it as if it were not there"
-        for name, socket in sorted(sockets.items())
-        if socket is not None and live_link(socket.node.inputs["Volume"]) is not None
+        for name in sorted(material.name for material in materials if has_volume(material))
     ]
 
 

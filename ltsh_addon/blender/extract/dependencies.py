@@ -12,7 +12,7 @@ import bpy
 import numpy as np
 
 from ..evaluated import SURFACE_TYPES, mesh_key, owner_of, read_values
-from ..lights.emission import nodes_as_text, trees_of, values_as_text
+from ..lights.emission import camera_outputs, nodes_as_text, trees_of, values_as_text
 from ..lights.linking import linked_objects
 from ..materials.graph import is_group
 from ..process.bake import BakeFactsJob
@@ -55,7 +55,6 @@ ATTRIBUTES = {
     "QUATERNION": ("value", 4, np.float32),
     "FLOAT4X4": ("value", 16, np.float32),
 }
-CAMERA_OUTPUTS = ("Camera", "Window")  # of the node Texture Coordinate
 STILL = ("FILE", "GENERATED", "TILED")  # sources of images whose content is told by their files
 
 
@@ -160,10 +159,7 @@ def _material(material) -> str:
 
 def _reads_camera(material) -> bool:
     """True if a node knows where the camera is."""
-    nodes = [node for tree in trees_of([material]) for node in tree.nodes]
-    places = [node for node in nodes if node.bl_idname == "ShaderNodeTexCoord"]
-    is_linked = any(node.outputs[name].is_linked for node in places for name in CAMERA_OUTPUTS)
-    return is_linked or any(node.bl_idname == "ShaderNodeCameraData" for node in nodes)
+    return any(camera_outputs(node) for tree in trees_of([material]) for node in tree.nodes)
 
 
 def _world(world) -> list | None:

@@ -346,7 +346,7 @@ def extract_pixels(job: PixelJob, folder: Path, progress) -> dict:
     if job.seconds is not None:
         end = job_start() + job.seconds - (job.reserve + 1e-6 * EDGE_SECONDS) * pixels
     inventory, count = LightInventory(), 0
-    # Otherwise a look at the scene would be wasted.
+    # Without points, or time for one, a look at the scene would be wasted.
     if job.sub_samples and (end is None or affordable_points(end - opened, pixels, 1)):
         look_until = np.inf if end is None or has_lens else opened + longest_look(end - opened, pixels)
         options = {"with_occluders": job.shadows == "on", "look_until": look_until if for_finished else None}

@@ -308,6 +308,13 @@ def _note_value(source: graph.Source, emission: Emission) -> None:
     emission.varies |= kind not in CONSTANT_NODES
 
 
+def camera_outputs(node) -> set[str]:
+    """The names of the linked outputs of a `node` that depend on the camera of the picture."""
+    outputs = OF_CAMERA.get(node.bl_idname)
+    linked = {output.name for output in node.outputs if output.is_linked}
+    return set() if outputs is None else {name for name in linked if not outputs or name in outputs}
+
+
 def _is_among(source: graph.Source, kinds: dict[str, tuple]) -> bool:
     outputs = kinds.get(source.node.bl_idname)
     return outputs is not None and (not outputs or source.socket.name in outputs)

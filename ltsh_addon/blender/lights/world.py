@@ -12,7 +12,7 @@ from ...cycles import environment
 from ...cycles.patches import note_patches
 from ...scene import Light, SkyLight, listed
 from ..materials import graph
-from .emission import COMPARE_TELLS, CONSTANT_NODES, LIGHT_PATH, OF_CAMERA, open_studio, trees_of
+from .emission import COMPARE_TELLS, CONSTANT_NODES, LIGHT_PATH, camera_outputs, open_studio, trees_of
 
 # Pixels along each side of a picture of a world. PLAIN: a world of one color. SMOOTH: one without fine detail.
 # PROCEDURAL: another without images. LEAST, MOST: limits for one with images. SPOT_PIXELS: a small, bright spot.
@@ -221,12 +221,7 @@ def _without_volume(world) -> bool:
 
 def _note_cameras(world, name: str, warn) -> None:
     """Warn of nodes whose values depend on the camera."""
-    labels = set()
-    for node in _nodes(world):
-        outputs = OF_CAMERA.get(node.bl_idname)
-        if outputs is not None:
-            used = {output.name for output in node.outputs if output.is_linked}
-            labels |= {f"{node.bl_label}: {output}" for output in used if not outputs or output in outputs}
+    labels = {f"{node.bl_label}: {output}" for node in _nodes(world) for output in camera_outputs(node)}
     if labels:
         warn(
             f"world {name!r}: it depends on the camera ({listed(sorted(labels))}); its light and its background are "

@@ -81,6 +81,12 @@ def surface_of(data):
     return None if output is None else output.inputs["Surface"]
 
 
+def has_volume(material) -> bool:
+    """True if the Volume socket of `material` has a shader."""
+    surface = surface_of(material)
+    return surface is not None and live_link(surface.node.inputs["Volume"]) is not None
+
+
 def is_displaced(material) -> bool:
     """True if the Displacement socket of `material` moves its surface, and not its normals alone."""
     return has_displacement(material) and material.displacement_method != "BUMP"

@@ -186,10 +186,10 @@ def extract_pixels(
     `look` gets the extraction before its lobes end at horizons, which may take long. For finished pictures it stays so.
     Raises SceneError if the scene or file cannot be used, Cancelled if `progress(stage, fraction)` returned False.
     """
-    if job.sub_samples < (not job.for_finished) or job.cycles_samples < 0:
-        raise ValueError(
-            f"sub_samples is {job.sub_samples} and cycles_samples {job.cycles_samples}, expected at least 1 and 0"
-        )
+    fewest = 0 if job.for_finished else 1
+    if job.sub_samples < fewest or job.cycles_samples < 0:
+        counts = f"sub_samples is {job.sub_samples} and cycles_samples {job.cycles_samples}"
+        raise ValueError(f"{counts}, expected at least {fewest} and 0")
     with temporary_folder() as folder:
         manifest = run_scene_job(job, folder, progress)
         renders = _SampleRenders(job, manifest)

@@ -26,7 +26,7 @@ from ...scene import SceneError, error_line
 from .. import render_settings
 from ..extract.finished import reasons_for_cycles
 from ..extract.pixels import files_opened, open_scene, scene_named
-from ..materials.graph import ensure_nodes, live_link, material_output, tree_in_use
+from ..materials.graph import ensure_nodes, has_volume
 from ..materials.preview_material import preview_of
 from ..process.blender_process import BlenderProcess
 from ..process.view import REST_PICTURE, REST_RENDER, RestJob, RestPictureJob, RestSum, RestView
@@ -554,12 +554,7 @@ def _is_everything(scene, layer) -> bool:
     """True if the whole picture is Cycles': views cannot draw what is between the eye and the surfaces."""
     shown = [ob for ob in scene.objects if not ob.hide_render]
     materials = {slot.material for ob in shown for slot in ob.material_slots} - {None}
-    return bool(reasons_for_cycles(scene, layer)) or any(map(_has_hair, shown)) or any(map(_has_volume, materials))
-
-
-def _has_volume(material) -> bool:
-    output = None if tree_in_use(material) is None else material_output(material.node_tree)
-    return output is not None and live_link(output.inputs["Volume"]) is not None
+    return bool(reasons_for_cycles(scene, layer)) or any(map(_has_hair, shown)) or any(map(has_volume, materials))
 
 
 def _has_hair(ob) -> bool:

@@ -180,6 +180,21 @@ def is_rendered(ob) -> bool:
     return ob.type not in ("CURVE", "FONT", "SURFACE", "META") or isinstance(ob.data, bpy.types.Mesh)
 
 
+def objects_in_views(layer) -> list:
+    """The objects of a view layer that views show, but for local views."""
+    return [ob for ob in layer.objects if ob.visible_get(view_layer=layer)]
+
+
+def objects_in_renders(layer) -> set:
+    """Objects of a view layer that renders show: neither they nor their collections are hidden there."""
+    shown, collections = set(), [layer.layer_collection]
+    for one in collections:
+        if not one.collection.hide_render:
+            shown.update(ob for ob in one.collection.objects if not (one.exclude or ob.hide_render))
+            collections.extend(one.children)
+    return shown
+
+
 def owner_of(instance):
     """The object that brings an instance into the scene: its instancer, or itself if it has none."""
     return instance.parent if instance.is_instance and instance.parent else instance.object

@@ -9,7 +9,7 @@ import numpy as np
 from ...cycles.texels import TexelMesh
 from ...cycles.uv import tiles_of
 from ...scene import FARTHEST, SceneError, listed
-from ..evaluated import normals_at_corners, read_values, with_render_depsgraph
+from ..evaluated import normals_at_corners, objects_in_renders, read_values, with_render_depsgraph
 
 UV_LAYER = "ltsh_texels"
 
@@ -33,9 +33,10 @@ def switch_off_holdouts(view_layer, objects, warnings: list[str]) -> None:
 def chosen_objects(scene, view_layer, wanted) -> list:
     """Objects to bake: "all" meshes that render, the "selected" ones, or those named. Raises SceneError."""
     if isinstance(wanted, str):
+        rendered = objects_in_renders(view_layer)
         objects = [
             ob for ob in view_layer.objects
-            if ob.type == "MESH" and not ob.hide_render and (wanted == "all" or ob.select_get())
+            if ob.type == "MESH" and ob in rendered and (wanted == "all" or ob.select_get())
         ]  # fmt: skip
         if not objects:
             raise SceneError(

@@ -19,6 +19,7 @@ from bpy.props import StringProperty
 from ...pipeline.lightmap import announced
 from ...pipeline.options import BakeOptions
 from ...scene import ATLAS, SceneError, error_line, listed
+from ..evaluated import objects_in_renders
 from ..extract.apply import shows_texture
 from ..extract.atlas import make_atlas
 from ..extract.bake import rows_of_lights
@@ -82,7 +83,7 @@ def problems(context, command: str) -> list[Problem]:
         result.append(Problem("No pass is chosen: choose at least one"))
     needs_camera = command != "bake" or settings.bake_view == "camera"
     result += _camera(scene) if needs_camera else []
-    result += _lights(scene)
+    result += _lights(scene, objects_in_renders(context.view_layer))
     if command == "bake":
         result += bake_objects(context)[1] + [Problem(line, False) for line in _announced(scene)]
     elif min(picture_of(scene)) < 4:
@@ -120,7 +121,7 @@ def bake_objects(context) -> tuple[list, list[Problem]]:
     if not selected:
         return [], [Problem("No selected object is checked: check those to bake")]
     baked = [ob for ob in selected if shows_texture(ob) and not ob.hide_render]
-    usable, problems = [], []
+    usable, problems, rendered = [], [], objects_in_renders(context.view_layer)
     if baked:  # one click restores them all
         which = f"Object {baked[0].name!r} shows a baked texture" if len(baked) == 1 else None
         text = f"{which or f'{len(baked)} objects show baked textures'} in place of "
@@ -129,7 +130,7 @@ def bake_objects(context) -> tuple[list, list[Problem]]:
     for ob in selected:
         if ob in baked:
             continue
-        problem = _object_problem(ob, context.scene.ltsh)
+        problem = _object_problem(ob, rendered, context.scene.ltsh)
         if problem is None:
             usable.append(ob)
         else:
@@ -142,10 +143,10 @@ def bake_objects(context) -> tuple[list, list[Problem]]:
     return usable, problems
 
 
-def _object_problem(ob, settings) -> Problem | None:
+def _object_problem(ob, rendered: set, settings) -> Problem | None:
     uv_map = settings.bake_uv_map
-    if ob.hide_render:
-        return _hidden(ob, f"Object {ob.name!r} is hidden in renders")
+    if ob not in rendered:
+        return _hidden(ob, f"Object {ob.name!r}")
     try:
         check_object(ob)
     except ObjectError as error:
@@ -163,9 +164,12 @@ def _object_problem(ob, settings) -> Problem | None:
     return None
 
 
-def _hidden(ob, text: str) -> Problem:
+def _hidden(ob, name: str, more: str = "") -> Problem:
+    """The problem of an object, called `name` in its text, that renders do not show."""
+    if not ob.hide_render:
+        return Problem(f"{name} is in a collection that renders do not show{more}")
     values = {"data_path": f"scene.objects[{ob.name!r}].hide_render", "value": False}
-    return Problem(text, True, "wm.context_set_boolean", "Show", values)
+    return Problem(f"{name} is hidden in renders{more}", True, "wm.context_set_boolean", "Show", values)
 
 
 def _camera(scene) -> list[Problem]:
@@ -182,15 +186,15 @@ def _camera(scene) -> list[Problem]:
     return []
 
 
-def _lights(scene) -> list[Problem]:
-    if may_shine(scene.world):
-        return []
+def _lights(scene, rendered: set) -> list[Problem]:
     lights = lights_of(scene)
-    if any(not ob.hide_render for ob in lights) or any(emission_of(material).emits for material in materials_of(scene)):
+    if may_shine(scene.world) or not rendered.isdisjoint(lights):
         return []
-    if lights:
-        return [_hidden(lights[0], f"Light {lights[0].name!r} is hidden in renders, and no other light is there")]
-    return [Problem("No light", True, "ltsh.add_light", "Add Light", {"selects": False})]
+    if any(emission_of(material).emits for material in materials_of(scene)):
+        return []
+    if not lights:
+        return [Problem("No light", True, "ltsh.add_light", "Add Light", {"selects": False})]
+    return [_hidden(lights[0], f"Light {lights[0].name!r}", ", and no other light is there")]
 
 
 def _files(settings) -> list[Problem]:

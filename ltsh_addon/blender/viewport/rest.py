@@ -24,6 +24,7 @@ from mathutils import Matrix
 from ...files import save_array, temporary_folder
 from ...scene import SceneError, error_line
 from .. import render_settings
+from ..evaluated import objects_in_views
 from ..extract.finished import reasons_for_cycles
 from ..extract.pixels import files_opened, open_scene, scene_named
 from ..materials.graph import ensure_nodes, has_volume
@@ -368,11 +369,6 @@ class LiveRest:
             stack.close()
 
 
-def shown_objects(layer) -> list:
-    """The objects of a view layer that views show, but for local views."""
-    return [ob for ob in layer.objects if ob.visible_get(view_layer=layer)]
-
-
 def _settings_of(depsgraph) -> tuple:
     """The settings of a scene that change its light."""
     scene, layer = depsgraph.scene, depsgraph.view_layer
@@ -385,7 +381,7 @@ def _settings_of(depsgraph) -> tuple:
         *(None if block is None else block.name_full for block in blocks),
         *(getattr(scene.render, name) for name in SCENE_SETTINGS),
         *(str(getattr(cycles, name)) for name in names),
-        *(ob.name for ob in shown_objects(layer)),
+        *(ob.name for ob in objects_in_views(layer)),
     )
 
 
@@ -492,7 +488,7 @@ def _take_changes(scene, file: str, blocks: list, moved: dict) -> None:
 
 def _show_as_views(scene, layer, hidden: tuple[str, ...]) -> None:
     """Let renders show what views show, in their detail; but for the objects `hidden`."""
-    shown = {ob for ob in shown_objects(layer) if ob.name not in hidden}
+    shown = {ob for ob in objects_in_views(layer) if ob.name not in hidden}
     for collection in bpy.data.collections:
         collection.hide_render = False
     for ob in bpy.data.objects:

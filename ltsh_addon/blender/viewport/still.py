@@ -14,7 +14,7 @@ from ...files import save_array
 from ...scene import SceneError, error_line, listed
 from ...workers.pool import cores
 from .. import render_settings
-from ..evaluated import SURFACE_TYPES, with_render_depsgraph
+from ..evaluated import SURFACE_TYPES, objects_in_renders, objects_in_views, with_render_depsgraph
 from ..extract.occluders import with_baked_shares
 from ..extract.pixels import files_opened, missing_images, no_light, open_scene
 from ..lights.area import collect_lights, note_overlaps
@@ -297,7 +297,7 @@ def _not_shown(scene, camera) -> list[str]:
         "the render region": scene.render.use_border,
     }
     notes = [f"{name} is not shown in views" for name, is_asked in asked.items() if is_asked]
-    others = sorted(ob.name for ob in _layer(scene).objects if not ob.hide_render and _differs_in_renders(ob))
+    others = sorted(ob.name for ob in objects_in_renders(_layer(scene)) if _differs_in_renders(ob))
     if others:
         notes.append(f"views and renders have other modifiers or levels of subdivision of {listed(others, 4, ', ')}")
     notes += _shown_apart(_layer(scene))
@@ -309,19 +309,14 @@ def _not_shown(scene, camera) -> list[str]:
 
 def _shown_apart(layer) -> list[str]:
     """Notes about the objects of the view `layer` that views show and renders do not, and the other way round."""
-    rendered, collections = set(), [layer.layer_collection]
-    for one in collections:
-        if not one.collection.hide_render:
-            rendered.update(ob.name for ob in one.collection.objects if not ob.hide_render)
-            collections.extend(one.children)
-    notes = {"views": [], "renders": []}
+    viewed, rendered, notes = set(objects_in_views(layer)), objects_in_renders(layer), {"views": [], "renders": []}
     for ob in layer.objects:
         if not (ob.type in (*SURFACE_TYPES, "LIGHT") or ob.is_instancer):
             continue
         # An instancer need not show its own mesh.
         own = ob.type in SURFACE_TYPES and ob.is_instancer
-        in_views = ob.visible_get(view_layer=layer) and not (own and not ob.show_instancer_for_viewport)
-        in_renders = ob.name in rendered and not (own and not ob.show_instancer_for_render)
+        in_views = ob in viewed and not (own and not ob.show_instancer_for_viewport)
+        in_renders = ob in rendered and not (own and not ob.show_instancer_for_render)
         if in_views != in_renders:
             notes["views" if in_views else "renders"].append(ob.name)
     return [f"only {name} show {listed(sorted(names), 4, ', ')}" for name, names in notes.items() if names]

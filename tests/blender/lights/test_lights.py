@@ -72,7 +72,7 @@ def test_a_sheared_light_is_named_and_a_narrow_one_left_out():
     scene_parts.add_area_light("Sheared").parent = parent
     _, _, inventory, warnings = scene_parts.prepare()
     assert [light.name for light in inventory.lights] == ["Sheared"] and len(inventory.warnings) == 2
-    for name, word in {"Laser": "spread is 0 degrees", "Sheared": "sheared"}.items():
+    for name, word in {"Laser": "spread is 0 degrees", "Sheared": "% off near it"}.items():
         assert any(f"light {name!r}" in line and word in line for line in warnings), warnings
 
 

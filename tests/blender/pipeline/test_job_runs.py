@@ -26,7 +26,8 @@ ROOT = Path(__file__).resolve().parents[3]
 
 @pytest.fixture
 def room(tmp_path):
-    """A light that moves from frame 1 to 5, a plane with a texture, one that cannot be baked, two cameras."""
+    """A light that moves from frame 1 to 5, two cameras, and planes: with a texture, one that cannot be baked, one that
+    is not rendered."""
     scene = scene_parts.empty_scene(16, 12)
     material, node = scene_parts.principled("Wave", Roughness=0.4)
     texture = material.node_tree.nodes.new("ShaderNodeTexWave")
@@ -34,6 +35,12 @@ def room(tmp_path):
     scene_parts.add_plane(material, name="Floor")
     scene_parts.add_plane(scene_parts.principled("Metal", Metallic=1.0)[0], size=1.0, location=(0, 0, 0.3), name="Slab")
     scene_parts.add_mesh("Bare", [(0, 0, 1), (0.2, 0, 1), (0, 0.2, 1)], [(0, 1, 2)])
+    drafts = bpy.data.collections.new("Drafts")
+    drafts.hide_render = True
+    scene.collection.children.link(drafts)
+    draft = scene_parts.add_plane(name="Draft")
+    scene.collection.objects.unlink(draft)
+    drafts.objects.link(draft)
     scene_parts.add_area_light("Key")
     light = bpy.data.objects["Key"]
     light.keyframe_insert("location", frame=1)

@@ -78,6 +78,23 @@ def test_what_can_be_mended_is_mended_by_one_click(scene, spoil, commands, text)
     assert bpy.context.selected_objects == selected and bpy.context.mode == "OBJECT"
 
 
+@pytest.mark.parametrize(("name", "command"), [("Floor", "bake"), ("Light", "shade")])
+def test_what_stands_in_a_collection_that_renders_do_not_show_is_named(scene, name, command):
+    ob, collection = bpy.data.objects[name], bpy.data.collections.new("Drafts")
+    above = bpy.data.collections.new("Above")
+    scene.collection.children.link(above)
+    above.children.link(collection)
+    for one in ob.users_collection:
+        one.objects.unlink(ob)
+    collection.objects.link(ob)
+    ob.select_set(True)
+    assert problems(command) == []
+    above.hide_render = True
+    (problem,) = problems(command)
+    text = f"{'Light' if name == 'Light' else 'Object'} {name!r} is in a collection that renders do not show"
+    assert problem.blocks and problem.text.startswith(text)
+
+
 def test_what_a_large_bake_takes_is_told_before_it_starts(scene):
     settings = scene.ltsh
     settings.bake_size, settings.bake_bounces, settings.bake_per_light = "4096", True, True

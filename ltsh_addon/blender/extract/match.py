@@ -7,6 +7,7 @@ import bpy
 import numpy as np
 from mathutils import Matrix, Vector
 
+from ...imaging.exr import COMBINED, read_layers
 from ...scene import Light, SceneError, light_of, listed
 from .. import render_settings
 from ..lights.groups import own_light_groups, reason_to_stay
@@ -22,6 +23,9 @@ SPACES = {
     "Filmic": "Filmic sRGB",
     "Khronos PBR Neutral": "Khronos PBR Neutral sRGB",
 }
+UNREADABLE = "{}: Blender cannot read it as a picture, expected EXR, HDR, PNG, JPEG or TIFF"
+# Layers of a picture as Blender and `render` call them; COMPOSITED: in place of those of its view layers.
+PICTURE_LAYERS, COMPOSITED = ("Combined", COMBINED), "Composite.Combined"
 # Channels of 8 bits: nearer to black or white than these, they are clipped, or rounded by more than 2 %.
 CLIPPED = (8.0 / 255.0, 252.0 / 255.0)
 
@@ -62,12 +66,21 @@ def _picture(path: Path, scene, view: str | None, folder: Path) -> tuple[np.ndar
     """`light_of_image` of a picture file."""
     try:
         image = bpy.data.images.load(str(path), check_existing=False)
-        width, _ = image.size
-    except RuntimeError:
-        width = 0
-    if width == 0:
-        raise SceneError(f"{path}: Blender cannot read it as a picture, expected EXR, HDR, PNG, JPEG or TIFF")
+    except RuntimeError as error:
+        raise SceneError(UNREADABLE.format(path)) from error
     return light_of_image(image, scene, view, folder)
+
+
+def _picture_in_layers(path: Path) -> np.ndarray:
+    """The light (H, W, 3) of the picture in an EXR of several layers, the composited one first. Raises SceneError."""
+    try:
+        layers = read_layers(path)
+    except (OSError, ValueError) as error:
+        raise SceneError(UNREADABLE.format(path)) from error
+    named = {name: pixels for name, pixels in layers.items() if name.rpartition(".")[2] in PICTURE_LAYERS}
+    if not named:
+        raise SceneError(f"{path}: has layers {listed(map(repr, layers))}, expected one called {PICTURE_LAYERS[0]!r}")
+    return named.get(COMPOSITED, next(iter(named.values())))[..., :3].astype(np.float32)
 
 
 def light_of_image(image, scene, view: str | None, folder: Path) -> tuple[np.ndarray, np.ndarray | None]:
@@ -75,6 +88,8 @@ def light_of_image(image, scene, view: str | None, folder: Path) -> tuple[np.nda
 
     Images of floats are light. `folder` is temporary. Raises SceneError where there is no way back to light.
     """
+    if image.size[0] == 0:
+        return _picture_in_layers(Path(bpy.path.abspath(image.filepath))), None
     if image.is_float:
         return _pixels(image), None
     settings = scene.view_settings

@@ -334,11 +334,11 @@ def match_mixer(scene, image, colors: bool) -> LightFactors:
     """Set the mixer's lights so that its picture comes closest to `image`. Raises SceneError."""
     mixer = results.mixer_of(scene)
     layers, size = mixer.pictures.layers, mixer.pictures.alpha.shape[::-1]
-    if tuple(image.size) != size:
-        found = "x".join(map(str, image.size))
-        raise SceneError(f"image {image.name!r} is {found} pixels, expected {size[0]}x{size[1]} as the picture")
     with temporary_folder() as folder:
         target, encoded = light_of_image(image, scene, None, folder)
+    if target.shape[1::-1] != size:
+        found = f"{target.shape[1]}x{target.shape[0]} pixels"
+        raise SceneError(f"image {image.name!r} is {found}, expected {size[0]}x{size[1]} as the picture")
     of_lights = np.array([bool(row.lights) for row in mixer.rows])
     weights = is_telling(target, encoded).astype(np.float64)
     target = np.where(weights[..., None] > 0.0, target, 0.0)

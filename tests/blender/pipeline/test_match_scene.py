@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 from scene_parts import add_area_light, add_camera, add_plane, add_sphere, empty_scene, link, principled, save
 
+from ltsh_addon.blender.extract.match import light_of_image
 from ltsh_addon.blender.lights.groups import own_light_groups
 from ltsh_addon.blender.ui.light_pose import match_lights
 from ltsh_addon.blender.ui.results import DIRECT_ONLY
+from ltsh_addon.imaging.exr import write_channels
 from ltsh_addon.pipeline.match import match_scene
 from ltsh_addon.pipeline.options import MatchOptions
 from ltsh_addon.scene import SceneError
@@ -25,7 +27,7 @@ def render(path, samples=256, **settings):
     scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", samples, False
     image = scene.render.image_settings
     if bpy.app.version >= (5, 0, 0):
-        image.media_type = "IMAGE"
+        image.media_type = "MULTI_LAYER_IMAGE" if settings["file_format"] == "OPEN_EXR_MULTILAYER" else "IMAGE"
     for name, value in settings.items():
         setattr(image, name, value)
     scene.render.filepath = str(path)
@@ -54,7 +56,15 @@ def room(tmp_path_factory):
         bpy.data.objects[name].data.energy *= factor
     exr = render(folder / "target.exr", file_format="OPEN_EXR", color_depth="32")
     png = render(folder / "target.png", file_format="PNG", color_depth="8")
-    return path, exr, png
+    layers = render(folder / "layers.exr", file_format="OPEN_EXR_MULTILAYER", color_depth="16")
+    return path, exr, png, layers
+
+
+def test_a_target_may_be_the_picture_of_several_layers(room, tmp_path):
+    images = [bpy.data.images.load(str(path), check_existing=False) for path in (room[1], room[3])]
+    (plain, _), (layered, _) = (light_of_image(image, bpy.context.scene, None, tmp_path) for image in images)
+    assert plain.shape == (SIZE[1], SIZE[0], 3) and plain.max() > 0.0
+    assert np.allclose(layered, plain, rtol=2.0**-11, atol=1e-6)  # half floats
 
 
 @pytest.mark.parametrize("number", [1, 2])
@@ -156,6 +166,8 @@ def test_what_does_not_fit_is_named_and_nothing_is_written(room, tmp_path):
     text.write_text("no picture")
     empty_scene(50, 50)
     add_camera()
+    layers = tmp_path / "layers.exr"
+    write_channels(layers, {f"{name}.{channel}": np.zeros((4, 6), np.float32) for name in "ab" for channel in "RGB"})
     wide = render(tmp_path / "wide.exr", samples=1, file_format="OPEN_EXR")
     black = np.zeros((SIZE[1], SIZE[0], 4), np.float32)
     image = bpy.data.images.new("black", *SIZE)
@@ -164,6 +176,7 @@ def test_what_does_not_fit_is_named_and_nothing_is_written(room, tmp_path):
     image.save()
     for options, message in (
         ({"target": text}, "cannot read it as a picture"),
+        ({"target": layers}, "has layers 'a', 'b', expected one called 'Combined'"),
         ({"target": wide}, "is 50x50 pixels, expected the shape of the scene's picture, 60x40"),
         ({"target": room[2], "target_view": "Film"}, "'Film' has no way back to light, expected one of Standard, AgX"),
         ({"target": room[2], "mask": wide}, "is 50x50 pixels, expected the target's 60x40"),

@@ -1,7 +1,9 @@
 """The samples, the lights and the Cycles reference of a picture (runs in the child)."""
 
 import time
+from collections.abc import Callable
 from contextlib import nullcontext, suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 import bpy
@@ -327,7 +329,7 @@ def extract_pixels(job: PixelJob, folder: Path, progress) -> dict:
 
     The budget of the job counts from `job_start` on.
     """
-    started, warnings, seconds = time.monotonic(), [], {}
+    times, warnings = [time.monotonic()], []
     progress("open scene", 0.0)
     open_scene(Path(job.scene), warnings, job.scripts)
     opened = time.process_time()
@@ -337,88 +339,118 @@ def extract_pixels(job: PixelJob, folder: Path, progress) -> dict:
     view_layer = render_settings.choose_view_layer(scene, warnings, job.view_layer)
     if job.own_groups is not None:
         regroup(scene, tuple(job.own_groups))
-    picture, for_finished = _picture(scene, job), job.for_finished
-    # The points of a pixel give the depth of field. With a reference there is none: its lens points would differ.
-    lens, fewest = camera.data.dof, FINISHED_LENS if for_finished else 2
-    has_lens = lens.use_dof and job.sub_samples >= fewest and not job.cycles_samples
-    is_sharp = lens.use_dof = lens.use_dof and not has_lens
-    end, pixels = None, picture["width"] * picture["height"]
-    if job.seconds is not None:
-        end = job_start() + job.seconds - (job.reserve + 1e-6 * EDGE_SECONDS) * pixels
-    inventory, count = LightInventory(), 0
-    # Without points, or time for one, a look at the scene would be wasted.
-    if job.sub_samples and (end is None or affordable_points(end - opened, pixels, 1)):
-        look_until = np.inf if end is None or has_lens else opened + longest_look(end - opened, pixels)
-        options = {"with_occluders": job.shadows == "on", "look_until": look_until if for_finished else None}
-        with suppress(LookTooLong):
-            inventory = prepare_scene(scene, view_layer, camera, warnings, **options)
-            count = job.sub_samples
-        if end is not None and not has_lens and count:
-            now = time.process_time()
-            affordable = affordable_points(end - now, pixels, len(inventory.lights), now - opened)
-            count = 0 if affordable < min(LEAST_POINTS, count) else min(affordable, count)
-    if is_sharp and for_finished:
-        points = f"with fewer than {FINISHED_LENS} points per pixel (--aa)"
-        inventory.left_to_cycles.everything.append(f"depth of field of camera {camera.name!r} {points}")
-    if count == 0:
-        inventory.left_to_cycles.everything.append(too_little(job.seconds))
-    has_shadows = inventory.occluders is not None
-    if has_shadows:
+    picture = _OpenPicture(job, scene, view_layer, camera, _picture(scene, job), folder, progress)
+    inventory, count = picture.prepared_in_time(warnings, opened)
+    if inventory.occluders is not None:
         inventory.occluders.save(folder / OCCLUDERS)
-    seconds["start"] = time.monotonic() - started
-
-    started = time.monotonic()
-    lens.use_dof = has_lens
-    offsets, weights = render_settings.sub_pixel_offsets(scene, count), None
-    if for_finished:
-        # If all direct light is left to Cycles, no samples are needed.
-        count = 0 if inventory.left_to_cycles.everything else count
-        offsets, weights = render_settings.sub_pixel_offsets(scene, count, render_settings.shared_points)
-    with world_behind(scene, inventory.behind if job.rest and not picture["film_transparent"] else None):
-        passes = (*(REST_PASSES if job.rest else ()), *job.indices)
-        # Lights that the camera sees are part of the rest.
-        with nullcontext() if job.rest else render_settings.without_lights(scene):
-            samples = render_pixel_samples(scene, view_layer, folder, offsets, progress, passes)
-    behind = None
-    if inventory.glass and job.rest and not job.cycles_samples:
-        _look_through_glass(scene, inventory)
-        with world_behind(scene, inventory.behind):
-            behind = render_pixel_samples(scene, view_layer, folder / BEHIND, offsets, progress, REST_PASSES)
-    seconds["samples"] = time.monotonic() - started
-
-    started, reference = time.monotonic(), None
-    if job.cycles_samples > 0:
-        # Cycles lights the scene as the techniques do, with or without shadows.
-        if has_shadows:
-            scene.cycles.transparent_max_bounces = inventory.occluders.transparent_surfaces
-        else:
-            remove_occlusion(scene)
-        scene.world = inventory.world
-        reference = render_reference(scene, view_layer, folder, job.cycles_samples, job.sub_samples, progress)
-    seconds["cycles"] = time.monotonic() - started
+    times.append(time.monotonic())
+    rendered = picture.rendered_points(inventory, count)
+    times.append(time.monotonic())
+    reference = picture.rendered_reference(inventory) if job.cycles_samples else None
+    times.append(time.monotonic())
     # A later task may save this picture as a PNG with the file's own settings.
-    scene.render.film_transparent = picture["film_transparent"]
+    scene.render.film_transparent = picture.facts["film_transparent"]
+    theirs = {**vars(inventory.left_to_cycles), "warnings": inventory.warnings} if job.for_finished else None
     return {
         "blender_version": bpy.app.version_string,
         "frame": scene.frame_current,
         "camera": camera.name,
-        **picture,
+        **picture.facts,
         "lights": light_records(inventory.lights),
         "sky_detail": inventory.sky_detail,
         "light_settings": inventory.settings,
-        "occluders": OCCLUDERS if has_shadows else None,
+        "occluders": None if inventory.occluders is None else OCCLUDERS,
         "warnings": warnings,
         "unshaded": inventory.unshaded,
-        "left_to_cycles": {**vars(inventory.left_to_cycles), "warnings": inventory.warnings} if for_finished else None,
-        "samples": samples,
-        "behind": behind,
-        "has_lens": has_lens,
-        "weights": None if weights is None else weights[: len(samples)].tolist(),
+        "left_to_cycles": theirs,
+        "has_lens": picture.has_lens,
+        **rendered,
         "reference": reference,
         "passes": render_settings.pass_names(),
-        "seconds": seconds,
+        "seconds": dict(zip(("start", "samples", "cycles"), np.diff(times).tolist(), strict=True)),
         "direct_seconds": time.process_time() - opened,
     }
+
+
+@dataclass
+class _OpenPicture:
+    """A picture of a scene whose file is open."""
+
+    job: PixelJob
+    scene: bpy.types.Scene
+    view_layer: bpy.types.ViewLayer
+    camera: bpy.types.Object
+    facts: dict  # of `_picture`
+    folder: Path
+    progress: Callable
+    has_lens: bool = False  # whether the points of a pixel give the depth of field
+
+    def prepared_in_time(self, warnings: list[str], opened: float) -> tuple[LightInventory, int]:
+        """Prepare the scene, whose file was `opened` at that processor time, as far as the job's budget allows.
+
+        Returns what shines, and the points per pixel: 0 where all direct light is left to Cycles.
+        """
+        job, pixels = self.job, self.facts["width"] * self.facts["height"]
+        # With a reference there is no depth of field: its lens points would differ.
+        lens, fewest = self.camera.data.dof, FINISHED_LENS if job.for_finished else 2
+        self.has_lens = lens.use_dof and job.sub_samples >= fewest and not job.cycles_samples
+        is_sharp = lens.use_dof = lens.use_dof and not self.has_lens
+        inventory, count, end = LightInventory(), 0, None
+        if job.seconds is not None:
+            end = job_start() + job.seconds - (job.reserve + 1e-6 * EDGE_SECONDS) * pixels
+        # Without points, or time for one, a look at the scene would be wasted.
+        if job.sub_samples and (end is None or affordable_points(end - opened, pixels, 1)):
+            look_until = np.inf if end is None or self.has_lens else opened + longest_look(end - opened, pixels)
+            options = {"with_occluders": job.shadows == "on", "look_until": look_until if job.for_finished else None}
+            with suppress(LookTooLong):
+                inventory = prepare_scene(self.scene, self.view_layer, self.camera, warnings, **options)
+                count = job.sub_samples
+            if end is not None and not self.has_lens and count:
+                now = time.process_time()
+                affordable = affordable_points(end - now, pixels, len(inventory.lights), now - opened)
+                count = 0 if affordable < min(LEAST_POINTS, count) else min(affordable, count)
+        lens.use_dof = self.has_lens
+        theirs = inventory.left_to_cycles.everything
+        if is_sharp and job.for_finished:
+            points = f"with fewer than {FINISHED_LENS} points per pixel (--aa)"
+            theirs.append(f"depth of field of camera {self.camera.name!r} {points}")
+        if count == 0:
+            theirs.append(too_little(job.seconds))
+        return inventory, 0 if job.for_finished and theirs else count
+
+    def rendered_points(self, inventory: LightInventory, count: int) -> dict:
+        """Render `count` points of each pixel, and what is behind glass; entries of the manifest."""
+        job, scene, weights = self.job, self.scene, None
+        if job.for_finished:
+            offsets, weights = render_settings.sub_pixel_offsets(scene, count, render_settings.shared_points)
+        else:
+            offsets = render_settings.sub_pixel_offsets(scene, count)
+
+        def rendered(folder: Path, world, passes) -> list:
+            with world_behind(scene, world):
+                return render_pixel_samples(scene, self.view_layer, folder, offsets, self.progress, passes)
+
+        shows_world = job.rest and not self.facts["film_transparent"]
+        passes = (*(REST_PASSES if job.rest else ()), *job.indices)
+        # Lights that the camera sees are part of the rest.
+        with nullcontext() if job.rest else render_settings.without_lights(scene):
+            samples = rendered(self.folder, inventory.behind if shows_world else None, passes)
+        behind = None
+        if inventory.glass and job.rest and not job.cycles_samples:
+            _look_through_glass(scene, inventory)
+            behind = rendered(self.folder / BEHIND, inventory.behind, REST_PASSES)
+        weights = None if weights is None else weights[: len(samples)].tolist()
+        return {"samples": samples, "behind": behind, "weights": weights}
+
+    def rendered_reference(self, inventory: LightInventory) -> list:
+        """Cycles' picture, lit as the techniques light it: with or without shadows."""
+        job, scene = self.job, self.scene
+        if inventory.occluders is not None:
+            scene.cycles.transparent_max_bounces = inventory.occluders.transparent_surfaces
+        else:
+            remove_occlusion(scene)
+        scene.world = inventory.world
+        return render_reference(scene, self.view_layer, self.folder, job.cycles_samples, job.sub_samples, self.progress)
 
 
 def _look_through_glass(scene, inventory: LightInventory) -> None:

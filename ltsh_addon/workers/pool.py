@@ -22,6 +22,9 @@ from . import worker
 PATIENCE_SECONDS = 0.1
 ENDING_SECONDS = 5.0
 CORES_VARIABLE = "LTSH_CORES"
+NICENESS = 10  # of processes that work while somebody waits for this one
+# For `subprocess.Popen`, of such processes; elsewhere than on Windows `lower_priority` is needed as well.
+BACKGROUND = getattr(subprocess, "BELOW_NORMAL_PRIORITY_CLASS", 0)
 _logger = logging.getLogger(__name__)
 
 
@@ -40,6 +43,12 @@ def interpreter() -> str | None:
     return path
 
 
+def lower_priority(process: subprocess.Popen) -> None:
+    """Give a process that was just started, and those that it will start, a lower priority than this one."""
+    if hasattr(os, "setpriority"):
+        os.setpriority(os.PRIO_PROCESS, process.pid, os.getpriority(os.PRIO_PROCESS, 0) + NICENESS)
+
+
 class WorkerTask(Protocol):
     """What a pool does with each job. Workers have copies of it, by pickle."""
 
@@ -52,12 +61,14 @@ class WorkerTask(Protocol):
 class WorkerPool:
     """This process and others, `processes` in all (None: `cores`), which do jobs until `close`.
 
-    `context` is what all tasks need; each worker gets a copy when it starts, by pickle. Use the pool as a context
-    manager, or call `close`. One thread at a time may run it.
+    `context` is what all tasks need; each worker gets a copy when it starts, by pickle. In the `background` workers
+    have a lower priority than this process. Use the pool as a context manager, or call `close`. One thread at a time
+    may run it.
     """
 
-    def __init__(self, context: Any = None, processes: int | None = None):
+    def __init__(self, context: Any = None, processes: int | None = None, *, background: bool = False):
         self._context, self._count = context, cores() if processes is None else processes
+        self._background = background
         self._task, self._packed_task = None, b""
         self._run: _Run | None = None
         self._workers: list[Worker] = []
@@ -107,7 +118,7 @@ class WorkerPool:
 
     def _start(self, count: int) -> None:
         self._is_closed, context = False, worker.packed(self._context)
-        self._workers = [Worker(self, context) for _ in range(count)]
+        self._workers = [Worker(self, context, self._background) for _ in range(count)]
 
     def next_job(self) -> "tuple[_Run, int] | None":
         """The run and number of the next job for a worker; waits for one. None if the pool is closed."""
@@ -174,7 +185,7 @@ class _Run:
 class Worker:
     """A child process that does jobs of a pool, and the thread that feeds it."""
 
-    def __init__(self, pool: WorkerPool, context: bytes):
+    def __init__(self, pool: WorkerPool, context: bytes, background: bool):
         self._pool, self._process, self._context = pool, None, context
         self._thread = threading.Thread(target=self._serve, name="ltsh-worker", daemon=True)
         try:
@@ -187,8 +198,10 @@ class Worker:
                 env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
                 # Ctrl-C goes to the parent alone, which ends the worker. No console window on Windows.
                 process_group=0,
-                creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
+                creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0) | (BACKGROUND if background else 0),
             )
+            if background:
+                lower_priority(self._process)
         except OSError as error:
             _logger.warning("worker process: %s cannot be started (%s); this one goes on alone", interpreter(), error)
             return

@@ -97,7 +97,7 @@ def main(rig):
     shade.objects.active = ob
     yield 2
     rig.check(rest()._wanted.version == before.version, "selecting renders nothing again")
-    child, opened = rest()._process._child, id(rest())
+    child, opened = rest()._blender.process._child, id(rest())
     rig.check(child is not None and child.poll() is None, "the second Blender waits for changes")
     bpy.ops.wm.save_mainfile()
     yield 3
@@ -119,8 +119,10 @@ def main(rig):
     rig.shot("off.png")
     view().bounces = True
     yield 0.5
-    yield from waited(rig, lambda: rest()._stack is not None and rest()._process._child is not None, NEXT_SECONDS)
-    child = rest()._process._child
+    yield from waited(
+        rig, lambda: rest()._blender is not None and rest()._blender.process._child is not None, NEXT_SECONDS
+    )
+    child = rest()._blender.process._child
     start = time.monotonic()
     with rig.override():
         bpy.ops.ltsh.preview()

@@ -1,6 +1,7 @@
 """Processes that trace shadow rays: the same bytes for any number, and for those that fail."""
 
 import logging
+import os
 
 import numpy as np
 import pytest
@@ -61,7 +62,8 @@ def test_any_number_of_processes_gives_the_same_bytes(scene, monkeypatch):
 def test_a_pool_that_stays_gives_the_same_bytes(scene):
     shares, started, tracer = scene
     alone = shares(workers=1)
-    with pool.WorkerPool(tracer, 2) as both:
+    own = os.getpriority(os.PRIO_PROCESS, 0) if hasattr(os, "setpriority") else None
+    with pool.WorkerPool(tracer, 2, background=True) as both:
         for number in range(3):
             if number == 2:
                 # What has begun is not waited for, and is not taken for a result later on.
@@ -76,6 +78,8 @@ def test_a_pool_that_stays_gives_the_same_bytes(scene):
                 np.testing.assert_array_equal(getattr(found, name), getattr(alone, name))
             assert found.rays == alone.rays
         assert len(started) == 1 and started[0].poll() is None
+        if own is not None:
+            assert os.getpriority(os.PRIO_PROCESS, started[0].pid) == min(own + pool.NICENESS, 19)
         started[0].kill()
         started[0].wait()
         np.testing.assert_array_equal(shares(workers=both).diffuse, alone.diffuse)

@@ -9,8 +9,10 @@ import weakref
 
 import bpy
 
+from ..ui.preview import ENGINE
 from ..viewport.live_cycles import LiveNodeLights
 from ..viewport.pictures import same_state
+from ..viewport.rest import end_spare, spare
 
 # Points of a pixel of which a view at rest is the mean.
 REFINEMENTS = 64
@@ -20,12 +22,14 @@ QUICK_SECONDS = 0.03
 POLL_SECONDS = 0.05
 # After so long without new shadows the processes end that help to trace them.
 IDLE_SECONDS = 60.0
-# FREEING_SECONDS: after a view is left, until Blender has freed its textures.
-FREEING_SECONDS = 0.3
+# FREEING_SECONDS: after a view is left, until Blender has freed its textures. SPARE_SECONDS: until its second Blender
+# ends, if no other view takes it; looked at every LOOK_SECONDS.
+FREEING_SECONDS, SPARE_SECONDS, LOOK_SECONDS = 0.3, 60.0, 0.05
 # Pictures of a view that changes take about FRAME_SECONDS, with a pixel for each of 1, 2 x 2 or 4 x 4. A view that has
-# not changed for MOVING_SECONDS gets all its pixels. Slow ones come WAITING_SECONDS later while they would delay the
-# first shadows or bounces, and are refined HELD_SECONDS later while that delays all pixels of bounces.
-FRAME_SECONDS, STEPS, MOVING_SECONDS, WAITING_SECONDS, HELD_SECONDS = 0.1, (1, 2, 4), 0.5, 1.5, 20.0
+# not changed for MOVING_SECONDS gets all its pixels. Slow ones come SHADOWS_SECONDS or BOUNCES_SECONDS later while they
+# would delay the first of these, and are refined HELD_SECONDS later while that delays all pixels of bounces.
+FRAME_SECONDS, STEPS, MOVING_SECONDS = 0.1, (1, 2, 4), 0.5
+SHADOWS_SECONDS, BOUNCES_SECONDS, HELD_SECONDS = 1.5, 4.0, 20.0
 # All views, their shadows, and what they know of lights with nodes.
 open_views: weakref.WeakSet = weakref.WeakSet()
 live_shadows: weakref.WeakSet = weakref.WeakSet()
@@ -173,6 +177,16 @@ def view_left() -> None:
     """Take note that a view is freed: once its textures are too, the system gets their memory back."""
     if sys.platform == "linux":
         _start(_give_back_memory, FREEING_SECONDS)
+    if spare and not bpy.app.timers.is_registered(_watch_spare):
+        bpy.app.timers.register(_watch_spare, first_interval=LOOK_SECONDS, persistent=True)
+
+
+def _watch_spare() -> float | None:
+    """End the second Blenders of views that were left, once no scene has the engine any more, or after a while."""
+    is_left = all(scene.render.engine != ENGINE for scene in bpy.data.scenes)
+    if is_left or any(time.monotonic() - blender.left > SPARE_SECONDS for blender in spare):
+        end_spare()
+    return LOOK_SECONDS if spare else None
 
 
 def _give_back_memory() -> None:
@@ -183,11 +197,12 @@ def _give_back_memory() -> None:
 
 def stop() -> None:
     """End all timers, and all work for views."""
-    for timer in (redraw, _watch_shadows, _end_helpers, _watch_cycles, _give_back_memory):
+    for timer in (redraw, _watch_shadows, _end_helpers, _watch_cycles, _give_back_memory, _watch_spare):
         if bpy.app.timers.is_registered(timer):
             bpy.app.timers.unregister(timer)
     for shadows in live_shadows:
         shadows.stop()
     for view in open_views:
         view.rest.stop()
+    end_spare()
     node_lights.stop()

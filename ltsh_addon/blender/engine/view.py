@@ -54,7 +54,7 @@ class EngineView:
         # Blender lets go of a view that shows something else, or is closed: nothing here may be part of a circle.
         self._shadows.stop()
         self._world.stop()
-        self.rest.stop()
+        self.rest.stop(keeps=True)
         redraws.open_views.discard(self)
         redraws.view_left()
         if not redraws.open_views:
@@ -181,7 +181,9 @@ class EngineView:
     @property
     def _wait(self) -> float:
         """How many seconds a whole picture waits for the first shadows and bounces, which it would hold up."""
-        return redraws.WAITING_SECONDS if self._shadows.is_busy or self.rest.is_new else 0.0
+        if self.rest.is_new:
+            return redraws.BOUNCES_SECONDS
+        return redraws.SHADOWS_SECONDS if self._shadows.is_busy else 0.0
 
     @property
     def _held_until(self) -> float:

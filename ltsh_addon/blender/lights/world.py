@@ -18,8 +18,9 @@ from .emission import COMPARE_TELLS, CONSTANT_NODES, LIGHT_PATH, camera_outputs,
 # PROCEDURAL: another without images. LEAST, MOST: limits for one with images. SPOT_PIXELS: a small, bright spot.
 PLAIN, SMOOTH, PROCEDURAL, LEAST, MOST = 8, 64, 256, 256, 1024
 SPOT_PIXELS, SAMPLES, SPOT_SAMPLES = 128, 8, 16
-# COARSE: mean relative error of patches above which there is a warning.
-COARSE = 0.05
+# COARSE: mean relative error of patches above which there is a warning. PLAIN_BACKGROUND: the `fine_detail` of skies
+# without edges or lines: a horizon has 0.004.
+COARSE, PLAIN_BACKGROUND = 0.05, 1e-3
 MOST_RADIANCE = 1e15  # W m^-2 sr^-1
 SAMPLING_METHODS = ("NONE", "AUTOMATIC", "MANUAL")  # of a world, in the order of their numbers
 NOT_SAMPLED, SAMPLED_BY_ITSELF = 0, 1
@@ -123,11 +124,15 @@ def light_pictures(scene, world, like: Light, warn) -> tuple[list[environment.Sk
     return [environment.without_spots(picture, spots) for picture in pictures], lights
 
 
-def background_pictures(scene, world, warn) -> list[environment.SkyPicture]:
-    """Six pictures (a cube) of the `world` of `scene` as cameras see it."""
+def background_pictures(scene, world, warn, light=()) -> list[environment.SkyPicture]:
+    """Six pictures (a cube) of the `world` of `scene` as cameras see it. `light` are those of `light_pictures`, which
+    may tell that few pixels are enough."""
+    is_plain = environment.fine_detail(light) <= PLAIN_BACKGROUND and all(len(one.radiance) == SMOOTH for one in light)
     with _observatory(scene, world, warn, by_cameras=True) as look:
         *_, pixels = _pixels(world)
-        pixels = pixels if pixels == PLAIN else max(pixels, 2 * PROCEDURAL)
+        if pixels != PLAIN:
+            is_seen_alike = not any(node.bl_idname == LIGHT_PATH for node in _nodes(world))
+            pixels = 2 * SMOOTH if light and is_plain and is_seen_alike else max(pixels, 2 * PROCEDURAL)
         return [look(*axes, pixels, SAMPLES // 2) for axes in environment.CUBE]
 
 

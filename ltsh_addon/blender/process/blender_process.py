@@ -27,13 +27,13 @@ from pathlib import Path
 
 from ...reading import check_name
 from ...scene import Cancelled, Progress, SceneError
+from ...workers.pool import BACKGROUND, lower_priority
 
 WORKER = Path(__file__).with_name("worker.py")
 BPY_FOR_PYTHON = {(3, 11): "4.5.15", (3, 13): "5.2.3"}
 MESSAGE = "LTSH "
 LISTENER = "ltsh-parent"
 OUTPUT_LINES_KEPT = 12
-NICENESS = 10
 # How a child deletes its folders. DELETIONS: tries. DELETION_SECONDS: how long the process waits for them at most.
 DELETIONS, DELETION_SECONDS = 40, 60.0
 
@@ -179,11 +179,11 @@ def start(command: list[str], folder: Path, *, background: bool = False) -> subp
         # Ctrl-C goes only to the parent, which ends the child. A group, not a session: Linux shares the processor
         # between sessions first, and niceness counts only within a session.
         process_group=0,
-        creationflags=getattr(subprocess, "BELOW_NORMAL_PRIORITY_CLASS", 0) if background else 0,
+        creationflags=BACKGROUND if background else 0,
     )
     _started.add(process)
-    if background and hasattr(os, "setpriority"):
-        os.setpriority(os.PRIO_PROCESS, process.pid, os.getpriority(os.PRIO_PROCESS, 0) + NICENESS)
+    if background:
+        lower_priority(process)
     return process
 
 

@@ -13,11 +13,13 @@ import numpy as np
 from ...cycles.environment import CUBE, SkyPicture
 from ...files import save_array, temporary_folder
 from ...scene import Cancelled, Light, SceneError, error_line
-from ..lights.emission import ObjectFacts, open_studio
+from ..lights.emission import ObjectFacts, nodes_as_text, open_studio
 from ..lights.textures import NodeEmission, NodeLight, node_emission, state_of
 from ..lights.world import background_pictures, light_of_world, light_pictures
+from ..materials.graph import images_behind, tree_in_use
 from ..process import view
 from ..process.view import NODE_LIGHTS, NodeLightFile, NodeLightJob, WorldJob
+from ..render_settings import working_space
 from .light_texels import BACKGROUND_SIZE, ShownSky, coarse, unfolded, varied_sky
 from .mirror import NOT_RESOLVED, NOT_YET
 
@@ -163,6 +165,7 @@ class _WorldLook:
 
     def __init__(self, name: str):
         self.name, self.users, self.stopped = name, 0, threading.Event()
+        self.state: tuple | None = None  # `_state_of_world` that it has looked at; None: not known
         # The sky that was found (None after errors) and notes about it; None: it was not looked at yet.
         self.outcome: tuple[ShownSky | None, list[str]] | None = None
         self.sky: ShownSky | None = None  # the last one that was found
@@ -187,7 +190,7 @@ class _WorldLook:
         world = next((one for one in bpy.data.worlds if one.name_full == self.name), None)
         if world is None:
             return
-        name, like, stopped = world.name, light_of_world(world), self.stopped
+        name, like, stopped, self.state = world.name, light_of_world(world), self.stopped, _state_of_world(world)
 
         def work(folder: Path, paths: list[Path]) -> None:
             try:
@@ -200,8 +203,21 @@ class _WorldLook:
         self.thread = _start("world", [world], work)
 
 
-# By the full name of the world.
+# By the full name of the world; those that no view shows any more stay, until their world has changed.
 _world_looks: dict[str, _WorldLook] = {}
+
+
+def _state_of_world(world) -> tuple | None:
+    """All that a look at a world depends on; None where that cannot be told, as of images that are painted."""
+    files = []
+    for image in images_behind(world):
+        path = Path(bpy.path.abspath(image.filepath, library=image.library))
+        if image.source != "FILE" or image.packed_file is not None or image.is_dirty or not path.is_file():
+            return None
+        files.append((str(path), path.stat().st_mtime_ns, image.colorspace_settings.name, image.alpha_mode))
+    sees, names = world.cycles_visibility, ("camera", "diffuse", "glossy", "transmission", "scatter")
+    traits = tuple(world.color), world.lightgroup, *(getattr(sees, name) for name in names)
+    return working_space()["name"], tree_in_use(world) is not None, nodes_as_text(world), files, *traits
 
 
 class LiveWorld:
@@ -218,17 +234,23 @@ class LiveWorld:
             look.users -= 1
             if not look.users:
                 look.stopped.set()
-                _world_looks.pop(look.name, None)
+                if look.state is None or look.outcome is None or look.changed is not None or look.thread is not None:
+                    _world_looks.pop(look.name, None)
 
     def look(self, world) -> ShownSky | None:
         """Request a look at a new or changed `world`. Returns its last result; None where there is none."""
         is_other = self._look is None or self._look.name != world.name_full
         if is_other:
             self.stop()
-            self._look = _world_looks.setdefault(world.name_full, _WorldLook(world.name_full))
+            before = _world_looks.get(world.name_full)
+            # Other views of this world know its changes; after a while without any it may have changed.
+            if before is None or not before.users and before.state != _state_of_world(world.original):
+                _world_looks[world.name_full] = before = _WorldLook(world.name_full)
+                before.changed = time.monotonic()
+            self._look = before
             self._look.users += 1
-        # Other views of this world have asked for it, and know its changes.
-        if not is_other or self._look.users == 1:
+            self._look.stopped.clear()
+        else:
             self._look.changed = time.monotonic()
         return self._look.sky
 
@@ -253,7 +275,7 @@ def rendered_world(scene, world, warn: Callable) -> tuple[list[SkyPicture], list
     like, light, lights = light_of_world(world), [], []
     if like is not None:
         light, lights = light_pictures(scene, world, like, warn)
-    behind = background_pictures(scene, world, warn)
+    behind = background_pictures(scene, world, warn, light)
     background = unfolded(behind, min(2 * len(behind[0].radiance), BACKGROUND_SIZE))
     return [coarse(picture) for picture in light], lights, background
 

@@ -197,11 +197,43 @@ class _RestPicture:
         return self.shown
 
 
+class SecondBlender:
+    """A second Blender, with a folder of its own, that renders the rest for one view after another."""
+
+    def __init__(self):
+        with ExitStack() as stack:
+            self.folder = stack.enter_context(temporary_folder())
+            self.process = BlenderProcess(self.folder, background=True)
+            stack.callback(self.process.end)
+            self._stack = stack.pop_all()
+        self.step: threading.Thread | None = None  # the last one
+        self.left = 0.0  # the moment at which its view was left
+
+    @property
+    def is_busy(self) -> bool:
+        """True while it does a step, perhaps for a view that was left."""
+        return self.step is not None and self.step.is_alive()
+
+    def end(self) -> None:
+        """End the process, whatever it is doing, and remove its files."""
+        self._stack.close()
+
+
+# Those of views that were left, for the next ones: undo makes all views new, and artists go to Solid and back.
+spare: list[SecondBlender] = []
+
+
+def end_spare() -> None:
+    """End the second Blenders that no view has."""
+    while spare:
+        spare.pop().end()
+
+
 class LiveRest:
     """The rest of one view. A second Blender renders it in steps while the view goes on; stale ones are not shown."""
 
     def __init__(self):
-        self._stack: ExitStack | None = None
+        self._blender: SecondBlender | None = None
         self._wanted: RestView | None = None
         self._changed = 0.0
         self._step: _RestStep | None = None  # the one on its way
@@ -310,6 +342,10 @@ class LiveRest:
         # A render of the artist's has the processor for itself.
         is_at_rest = time.monotonic() - self._changed > REST_SECONDS and not bpy.app.is_job_running("RENDER")
         if self._wanted is not None and is_at_rest and self.is_busy:
+            if self._blender is None:
+                self._blender, self._opened = spare.pop() if spare else SecondBlender(), None
+            if self._blender.is_busy:
+                return news
             try:
                 self._begin()
             except (OSError, RuntimeError) as error:
@@ -339,34 +375,32 @@ class LiveRest:
 
     def _begin(self) -> None:
         """Start the next step of what is wanted."""
-        wanted = self._wanted
-        if self._stack is None:
-            self._stack = ExitStack()
-            self._folder = self._stack.enter_context(temporary_folder())
-            self._process, self._opened = BlenderProcess(self._folder, background=True), None
-            self._stack.callback(self._process.end)
+        wanted, blender = self._wanted, self._blender
         pixels = math.prod(wanted.size)
         self._work = self._work or FEWEST
         state = wanted.scene, wanted.view_layer, wanted.frame, wanted.hidden, wanted.world
         path = changes = None
         if state != self._opened or self._changes.everything:
-            path, self._opened = self._folder / "scene.blend", state
+            path, self._opened = blender.folder / "scene.blend", state
             save_working_copy(path, keep_engine=True)
         elif self._changes.objects or self._changes.blocks:
-            changes = self._changes.written(bpy.data.scenes[wanted.scene], self._folder / "changes.blend")
+            changes = self._changes.written(bpy.data.scenes[wanted.scene], blender.folder / "changes.blend")
         self._changes = RestChanges(everything=False)
         job = next_job(self._done, wanted, self._work / pixels)
         self._step = _RestStep(replace(job, scene=path, changes=changes), wanted)
-        arguments = {"target": self._step.do, "args": (self._process, self._folder), "name": "LTSH rest"}
-        self._step.thread = threading.Thread(**arguments, daemon=True)
-        self._step.thread.start()
+        arguments = {"target": self._step.do, "args": (blender.process, blender.folder), "name": "LTSH rest"}
+        self._step.thread = blender.step = threading.Thread(**arguments, daemon=True)
+        blender.step.start()
 
-    def stop(self) -> None:
-        """End the second Blender, and forget what it has rendered."""
-        stack = self._stack
+    def stop(self, *, keeps: bool = False) -> None:
+        """Forget what was rendered, and end the second Blender; or keep it, as `spare`."""
+        blender = self._blender
         vars(self).update(vars(LiveRest()))
-        if stack is not None:
-            stack.close()
+        if blender is not None and keeps:
+            blender.left = time.monotonic()
+            spare.append(blender)
+        elif blender is not None:
+            blender.end()
 
 
 def _settings_of(depsgraph) -> tuple:

@@ -36,7 +36,7 @@ class ViewTracer:
     def tracer(self) -> Tracer:
         """The tracer. Raises SceneError where Embree is missing."""
         tracer = open_tracer(self.occluders, embree_libraries())
-        self.pool = WorkerPool(tracer, min(cores(), self._processes))
+        self.pool = WorkerPool(tracer, min(cores(), self._processes), background=True)
         return tracer
 
     def close(self) -> None:

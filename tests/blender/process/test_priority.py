@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from ltsh_addon.blender.process import blender_process
+from ltsh_addon.workers.pool import NICENESS
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "setpriority"), reason="Windows has classes of priority instead")
 ROOT = Path(__file__).resolve().parents[3]
@@ -31,6 +32,6 @@ def test_a_job_and_what_it_starts_come_after_this_process(tmp_path, background):
     output, _ = process.communicate(timeout=60)
     lines = [[int(word) for word in line.split()] for line in output.splitlines() if line]
     own = os.getpriority(os.PRIO_PROCESS, 0)
-    niceness = min(own + blender_process.NICENESS, 19) if background else own
+    niceness = min(own + NICENESS, 19) if background else own
     assert [line[:2] for line in lines] == [[niceness, os.getsid(0)]] * 2, output
     assert len({os.getpgid(0), *(line[2] for line in lines)}) == 3, output

@@ -1,5 +1,7 @@
 """What the interface says is what is so: no state has a second copy that undo, saving or other results leave behind."""
 
+import os
+
 import bpy
 import numpy as np
 import pytest
@@ -148,6 +150,42 @@ def test_views_of_one_world_look_at_it_once(monkeypatch):
     for live in (first, second, late):
         live.stop()
     assert not live_cycles._world_looks
+
+
+@pytest.mark.parametrize("change", ["nothing", "strength", "visibility", "image", "painted image"])
+def test_the_next_view_of_a_world_that_has_not_changed_need_not_look_at_it(monkeypatch, tmp_path, change):
+    parts.empty_scene(8, 8)
+    world, begun, sky = parts.add_world()[0], [], live_cycles.ShownSky()
+    texture = world.node_tree.nodes.new("ShaderNodeTexEnvironment")
+    image = texture.image = bpy.data.images.new("sky", 4, 2)
+    image.filepath_raw, image.file_format = str(tmp_path / "sky.png"), "PNG"
+    image.save()
+    image.source = "FILE"
+    shine = world.node_tree.nodes["Background"]
+    world.node_tree.links.new(texture.outputs["Color"], shine.inputs["Color"])
+    monkeypatch.setattr(live_cycles, "REST_SECONDS", -1.0)
+    monkeypatch.setattr(live_cycles, "_world_looks", {})
+    monkeypatch.setattr(live_cycles._WorldLook, "_begin", lambda look, frame: begun.append(look) or found(look))
+
+    def found(look):
+        look.changed, look.outcome, look.sky = None, (sky, []), sky
+        look.state = live_cycles._state_of_world(world)
+
+    first = live_cycles.LiveWorld()
+    assert first.look(world) is None and first.step(1) == (sky, []) and len(begun) == 1
+    first.stop()
+    if change == "strength":
+        shine.inputs["Strength"].default_value = 2.0
+    elif change == "visibility":
+        world.cycles_visibility.glossy = False
+    elif change == "image":
+        os.utime(tmp_path / "sky.png", (1, 1))
+    elif change == "painted image":
+        image.pixels[0] = 0.5
+    second = live_cycles.LiveWorld()
+    assert (second.look(world) is sky) == (change == "nothing")
+    assert second.step(1) == (sky, []) and len(begun) == (1 if change == "nothing" else 2)
+    second.stop()
 
 
 def test_a_final_render_and_other_results_leave_the_mix(scene, tmp_path, show_results):

@@ -156,7 +156,7 @@ def test_changes_are_handed_over_by_themselves_and_show_what_a_whole_file_shows(
         chrome.select_set(True)
         bpy.context.view_layer.update()
         assert followed(live, context, monkeypatch)[1] == []
-        child = live._process._child
+        child = live._blender.process._child
         live.stop()
         assert child.poll() is not None
         live.note(bpy.context.view_layer.depsgraph)
@@ -166,9 +166,13 @@ def test_changes_are_handed_over_by_themselves_and_show_what_a_whole_file_shows(
         without, _ = followed(live, context, monkeypatch, world=False)
         bpy.context.scene.world.cycles_visibility.diffuse = bpy.context.scene.world.cycles_visibility.glossy = False
         bpy.context.scene.world.cycles_visibility.transmission = False
-        live.stop()
+        # The next view takes the second Blender of one that was left.
+        live.stop(keeps=True)
+        (left,), live = rest.spare, rest.LiveRest()
+        child = left.process._child
         live.note(bpy.context.view_layer.depsgraph)
         unseen, _ = followed(live, context, monkeypatch)
+        assert live._blender is left and left.process._child is child and not rest.spare
         chrome.modifiers.new("Wave", "SUBSURF")
         bpy.context.view_layer.update()
         assert live._changes.everything

@@ -10,6 +10,7 @@ from fake_scene import run
 from graphics_card import with_graphics
 
 from ltsh_addon import imaging
+from ltsh_addon.blender.lights.world import SMOOTH, background_pictures, light_of_world, light_pictures
 from ltsh_addon.blender.viewport import light_texels as sky
 from ltsh_addon.blender.viewport.live_cycles import LiveWorld
 from ltsh_addon.cycles.environment import CUBE, SkyPicture
@@ -116,6 +117,27 @@ def test_windows_get_the_world_from_a_second_blender(tmp_path, is_linked):
     bpy.data.worlds.remove(world)
     live.step(1)
     assert not live.is_busy or live.step(1) is None
+
+
+@pytest.mark.newest
+@pytest.mark.parametrize("kind", ["gradient", "horizon", "other for cameras"])
+def test_a_background_has_few_pixels_only_where_they_show_all(kind):
+    scene = parts.empty_scene(*SIZE)
+    world = add_gradient()
+    nodes = world.node_tree.nodes
+    if kind != "other for cameras":
+        nodes.remove(next(node for node in nodes if node.bl_idname == "ShaderNodeLightPath"))
+        mix = next(node for node in nodes if node.bl_idname == "ShaderNodeMixShader")
+        mix.inputs[0].default_value = 0.0
+    if kind == "horizon":
+        ramp = next(node for node in nodes if node.bl_idname == "ShaderNodeValToRGB").color_ramp
+        ramp.interpolation, ramp.elements[1].position = "CONSTANT", 0.5
+    light, _ = light_pictures(scene, world, light_of_world(world), print)
+    few, many = (background_pictures(scene, world, print, one) for one in (light, ()))
+    assert [len(one[0].radiance) for one in (few, many)] == [2 * SMOOTH if kind == "gradient" else 512, 512]
+    if kind == "gradient":
+        found, expected = (sky.unfolded(pictures, 256) for pictures in (few, many))
+        np.testing.assert_allclose(found, expected, atol=2e-3 * expected.max())
 
 
 def test_pictures_of_all_directions_are_folded_without_a_seam():

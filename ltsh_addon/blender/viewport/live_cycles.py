@@ -211,7 +211,7 @@ def _state_of_world(world) -> tuple | None:
     """All that a look at a world depends on; None where that cannot be told, as of images that are painted."""
     files = []
     for image in images_behind(world):
-        path = Path(bpy.path.abspath(image.filepath, library=image.library))
+        path = Path(image.filepath_from_user())
         if image.source != "FILE" or image.packed_file is not None or image.is_dirty or not path.is_file():
             return None
         files.append((str(path), path.stat().st_mtime_ns, image.colorspace_settings.name, image.alpha_mode))

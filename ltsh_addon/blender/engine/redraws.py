@@ -12,7 +12,7 @@ import bpy
 from ..ui.preview import ENGINE
 from ..viewport.live_cycles import LiveNodeLights
 from ..viewport.pictures import same_state
-from ..viewport.rest import end_spare, spare
+from ..viewport.second_blender import end_spare, spare
 
 # Points of a pixel of which a view at rest is the mean.
 REFINEMENTS = 64

@@ -13,7 +13,7 @@ import math
 import threading
 import time
 from collections.abc import Callable
-from contextlib import ExitStack, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -21,7 +21,7 @@ import bpy
 import numpy as np
 from mathutils import Matrix
 
-from ...files import save_array, temporary_folder
+from ...files import save_array
 from ...scene import SceneError, error_line
 from .. import render_settings
 from ..evaluated import objects_in_views
@@ -35,6 +35,7 @@ from ..render_settings import render_exr
 from ..saving import save_working_copy
 from .drawing import ViewCamera, float_texture
 from .pictures import ShownRest
+from .second_blender import SecondBlender, spare
 
 # MASK: the AOV with the share of a pixel that is Cycles' alone. SENSOR: the width of the camera's sensor in mm.
 MASK, SENSOR = "ltsh_of_cycles", 36.0
@@ -195,38 +196,6 @@ class _RestPicture:
             camera = ViewCamera.of(*map(Matrix, self.view.matrices), self.view.matrices[1][3][3] == 1.0)
             self.shown = ShownRest(float_texture(self.pixels[::-1]), camera, self.is_everything, tuple(self.ambient))
         return self.shown
-
-
-class SecondBlender:
-    """A second Blender, with a folder of its own, that renders the rest for one view after another."""
-
-    def __init__(self):
-        with ExitStack() as stack:
-            self.folder = stack.enter_context(temporary_folder())
-            self.process = BlenderProcess(self.folder, background=True)
-            stack.callback(self.process.end)
-            self._stack = stack.pop_all()
-        self.step: threading.Thread | None = None  # the last one
-        self.left = 0.0  # the moment at which its view was left
-
-    @property
-    def is_busy(self) -> bool:
-        """True while it does a step, perhaps for a view that was left."""
-        return self.step is not None and self.step.is_alive()
-
-    def end(self) -> None:
-        """End the process, whatever it is doing, and remove its files."""
-        self._stack.close()
-
-
-# Those of views that were left, for the next ones: undo makes all views new, and artists go to Solid and back.
-spare: list[SecondBlender] = []
-
-
-def end_spare() -> None:
-    """End the second Blenders that no view has."""
-    while spare:
-        spare.pop().end()
 
 
 class LiveRest:

@@ -89,7 +89,7 @@ def light_of_image(image, scene, view: str | None, folder: Path) -> tuple[np.nda
     Images of floats are light. `folder` is temporary. Raises SceneError where there is no way back to light.
     """
     if image.size[0] == 0:
-        return _picture_in_layers(Path(bpy.path.abspath(image.filepath))), None
+        return _picture_in_layers(Path(image.filepath_from_user())), None
     if image.is_float:
         return _pixels(image), None
     settings = scene.view_settings

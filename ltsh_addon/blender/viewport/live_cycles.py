@@ -234,7 +234,8 @@ class LiveWorld:
             look.users -= 1
             if not look.users:
                 look.stopped.set()
-                if look.state is None or look.outcome is None or look.changed is not None or look.thread is not None:
+                is_known = look.state is not None and look.outcome is not None and look.outcome[0] is not None
+                if not is_known or look.changed is not None or look.thread is not None:
                     _world_looks.pop(look.name, None)
 
     def look(self, world) -> ShownSky | None:

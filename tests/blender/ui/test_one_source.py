@@ -152,7 +152,7 @@ def test_views_of_one_world_look_at_it_once(monkeypatch):
     assert not live_cycles._world_looks
 
 
-@pytest.mark.parametrize("change", ["nothing", "strength", "visibility", "image", "painted image"])
+@pytest.mark.parametrize("change", ["nothing", "strength", "visibility", "image", "painted image", "failed"])
 def test_the_next_view_of_a_world_that_has_not_changed_need_not_look_at_it(monkeypatch, tmp_path, change):
     parts.empty_scene(8, 8)
     world, begun, sky = parts.add_world()[0], [], live_cycles.ShownSky()
@@ -182,6 +182,14 @@ def test_the_next_view_of_a_world_that_has_not_changed_need_not_look_at_it(monke
         os.utime(tmp_path / "sky.png", (1, 1))
     elif change == "painted image":
         image.pixels[0] = 0.5
+    elif change == "failed":
+        live_cycles._world_looks.clear()
+        third = live_cycles.LiveWorld()
+        third.look(world)
+        third.step(1)
+        third._look.outcome, third._look.sky = (None, ["no Blender"]), None
+        third.stop()
+        begun.pop()
     second = live_cycles.LiveWorld()
     assert (second.look(world) is sky) == (change == "nothing")
     assert second.step(1) == (sky, []) and len(begun) == (1 if change == "nothing" else 2)

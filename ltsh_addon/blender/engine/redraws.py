@@ -133,7 +133,7 @@ def _start(timer, seconds: float) -> None:
 
 def _watch_shadows() -> float | None:
     """Draw the views again for which there are new shadows; look again while any are on their way."""
-    if any(shadows.has_news for shadows in live_shadows):
+    if any(view.has_new_shadows for view in open_views):
         # What moves is drawn soon in any case.
         if time.monotonic() - moments["drawn"] < REST_SECONDS:
             return POLL_SECONDS

@@ -192,6 +192,13 @@ class EngineView:
         return self._pixel_size.end + redraws.HELD_SECONDS if self._pixel_size.is_slow and self.rest.is_urgent else 0.0
 
     @property
+    def has_new_shadows(self) -> bool:
+        """True if a picture with new shadows is due. Whole ones that take long wait a while for bounces."""
+        now, drawn = time.monotonic(), redraws.moments["drawn"]
+        waits = self._pixel_size.step == 1 and now < min(self._held_until, drawn + redraws.BOUNCES_SECONDS)
+        return self._shadows.has_news and not waits
+
+    @property
     def _draws_shadows(self) -> bool:
         return self._renderer is not None and self._renderer.shadows is not None
 

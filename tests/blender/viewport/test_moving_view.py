@@ -14,7 +14,7 @@ import scene_parts as parts
 from graphics_card import edits_with_graphics, with_graphics
 from view_pictures import OpenView
 
-from ltsh_addon.blender.engine import redraws
+from ltsh_addon.blender.engine import redraws, view
 from ltsh_addon.blender.render_settings import balanced_points, sub_pixel_offsets
 from ltsh_addon.blender.viewport import drawing, shadow_rays, shadows, surfaces
 from ltsh_addon.blender.viewport.drawing import (
@@ -83,6 +83,31 @@ def test_pictures_of_what_moves_have_as_many_pixels_as_the_time_allows(monkeypat
     # Another view of a slow machine begins with few pixels.
     step("k", slow)
     assert redraws.PixelSize().follow(((light,), ("k",))) == 4
+
+
+@pytest.mark.parametrize(
+    ("news", "step", "seconds", "is_urgent", "passed", "is_due"),
+    [
+        (True, 1, 1.0, True, 1.0, False),
+        (True, 1, 1.0, True, redraws.BOUNCES_SECONDS, True),
+        (True, 4, 1.0, True, 1.0, True),  # few pixels take no time
+        (True, 1, 0.01, True, 1.0, True),  # nor do all of a quick machine
+        (True, 1, 1.0, False, 1.0, True),
+        (False, 1, 1.0, False, 9.0, False),
+    ],
+)
+def test_new_shadows_of_slow_pictures_wait_for_bounces(monkeypatch, news, step, seconds, is_urgent, passed, is_due):
+    now = 100.0
+    monkeypatch.setattr(redraws.time, "monotonic", lambda: now)
+    monkeypatch.setattr(redraws, "moments", {"drawn": now - passed})
+    size = redraws.PixelSize()
+    size.note(seconds)
+    size.step, size._changed = step, now - passed
+    parts_of_view = SimpleNamespace(
+        _pixel_size=size, _shadows=SimpleNamespace(has_news=news), rest=SimpleNamespace(is_urgent=is_urgent)
+    )
+    parts_of_view._held_until = view.EngineView._held_until.fget(parts_of_view)
+    assert view.EngineView.has_new_shadows.fget(parts_of_view) is is_due
 
 
 def test_a_picture_that_is_wanted_sooner_does_not_wait_for_a_later_one(monkeypatch):

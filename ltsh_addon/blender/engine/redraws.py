@@ -178,7 +178,7 @@ def view_left() -> None:
     if sys.platform == "linux":
         _start(_give_back_memory, FREEING_SECONDS)
     if spare and not bpy.app.timers.is_registered(_watch_spare):
-        bpy.app.timers.register(_watch_spare, first_interval=LOOK_SECONDS, persistent=True)
+        bpy.app.timers.register(_watch_spare, persistent=True)
 
 
 def _watch_spare() -> float | None:

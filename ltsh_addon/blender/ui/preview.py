@@ -17,6 +17,7 @@ from mathutils import Vector
 from ...scene import error_line
 from ..materials import graph
 from ..saving import keeps_engine
+from ..viewport.second_blender import end_spare
 
 ENGINE = "LTSH"
 
@@ -122,6 +123,7 @@ def stop_preview(scene) -> None:
     except TypeError:
         # The former engine is not registered any more.
         scene.render.engine = "CYCLES"
+    end_spare()
 
 
 def lights_of(scene) -> list:

@@ -13,7 +13,7 @@ import numpy as np
 from ...cycles.environment import CUBE, SkyPicture
 from ...files import save_array, temporary_folder
 from ...scene import Cancelled, Light, SceneError, error_line
-from ..lights.emission import ObjectFacts, nodes_as_text, open_studio
+from ..lights.emission import ObjectFacts, nodes_as_text, open_studio, trees_of
 from ..lights.textures import NodeEmission, NodeLight, node_emission, state_of
 from ..lights.world import background_pictures, light_of_world, light_pictures
 from ..materials.graph import images_behind, tree_in_use
@@ -173,6 +173,12 @@ class _WorldLook:
         self.thread: threading.Thread | None = None
         self._result: tuple[ShownSky, list[str]] | Exception | None = None
 
+    @property
+    def is_final(self) -> bool:
+        """True if the sky of its `state` was found, and no other is wanted."""
+        was_found = self.outcome is not None and self.outcome[0] is not None
+        return self.state is not None and was_found and self.changed is None and self.thread is None
+
     def step(self, frame: int) -> None:
         """Do the next step, in the main thread."""
         if self.thread is None:
@@ -208,7 +214,12 @@ _world_looks: dict[str, _WorldLook] = {}
 
 
 def _state_of_world(world) -> tuple | None:
-    """All that a look at a world depends on; None where that cannot be told, as of images that are painted."""
+    """All that a look at a world depends on; None where that cannot be told, as of images that are painted.
+
+    Files are told by their dates: to read them, as `extract.dependencies` does, would hold up the window.
+    """
+    if any(getattr(node, "filepath", "") for tree in trees_of([world]) for node in tree.nodes):
+        return None  # an IES texture or a script
     files = []
     for image in images_behind(world):
         path = Path(image.filepath_from_user())
@@ -234,8 +245,7 @@ class LiveWorld:
             look.users -= 1
             if not look.users:
                 look.stopped.set()
-                is_known = look.state is not None and look.outcome is not None and look.outcome[0] is not None
-                if not is_known or look.changed is not None or look.thread is not None:
+                if not look.is_final:
                     _world_looks.pop(look.name, None)
 
     def look(self, world) -> ShownSky | None:
@@ -243,14 +253,14 @@ class LiveWorld:
         is_other = self._look is None or self._look.name != world.name_full
         if is_other:
             self.stop()
-            before = _world_looks.get(world.name_full)
+            look = _world_looks.get(world.name_full)
             # Other views of this world know its changes; after a while without any it may have changed.
-            if before is None or not before.users and before.state != _state_of_world(world.original):
-                _world_looks[world.name_full] = before = _WorldLook(world.name_full)
-                before.changed = time.monotonic()
-            self._look = before
-            self._look.users += 1
-            self._look.stopped.clear()
+            if look is None or not look.users and look.state != _state_of_world(world.original):
+                look = _world_looks[world.name_full] = _WorldLook(world.name_full)
+                look.changed = time.monotonic()
+            look.users += 1
+            look.stopped.clear()
+            self._look = look
         else:
             self._look.changed = time.monotonic()
         return self._look.sky

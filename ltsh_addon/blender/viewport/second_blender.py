@@ -11,11 +11,10 @@ class SecondBlender:
     """A second Blender, with a folder of its own, that renders the rest for one view after another."""
 
     def __init__(self):
-        with ExitStack() as stack:
-            self.folder = stack.enter_context(temporary_folder())
-            self.process = BlenderProcess(self.folder, background=True)
-            stack.callback(self.process.end)
-            self._stack = stack.pop_all()
+        self._stack = ExitStack()
+        self.folder = self._stack.enter_context(temporary_folder())
+        self.process = BlenderProcess(self.folder, background=True)
+        self._stack.callback(self.process.end)
         self.step: threading.Thread | None = None  # the last one
         self.left = 0.0  # the moment at which its view was left
 

@@ -56,24 +56,19 @@ vec3 slot_value(sampler2D image, int slot, vec2 uv)
   int extension = code % EXTENSIONS;
   bool encode = code >= EXTENSIONS;
   bool by_alpha = code >= 2 * EXTENSIONS;
+  bool is_closest = row_u.w > 0.5;
+  encode = is_closest ? by_alpha : encode;
   ivec2 size = textureSize(image, 0);
-  vec2 texel = vec2(dot(row_u.xyz, place), dot(row_v.xyz, place)) * vec2(size);
-  vec4 value;
-  if (row_u.w > 0.5) {
-    value = texel_at(image, ivec2(floor(texel)), size, extension, by_alpha, by_alpha);
-    encode = by_alpha;
-  }
-  else {
-    texel -= 0.5;
-    ivec2 corner = ivec2(floor(texel));
-    vec2 share = texel - floor(texel);
-    vec4 low = mix(texel_at(image, corner, size, extension, encode, by_alpha),
-                   texel_at(image, corner + ivec2(1, 0), size, extension, encode, by_alpha),
-                   share.x);
-    vec4 high = mix(texel_at(image, corner + ivec2(0, 1), size, extension, encode, by_alpha),
-                    texel_at(image, corner + ivec2(1, 1), size, extension, encode, by_alpha),
-                    share.x);
-    value = mix(low, high, share.y);
+  vec2 texel = vec2(dot(row_u.xyz, place), dot(row_v.xyz, place)) * vec2(size) - (is_closest ? 0.0 : 0.5);
+  ivec2 corner = ivec2(floor(texel));
+  vec2 share = is_closest ? vec2(0.0) : texel - floor(texel);
+  vec4 value = vec4(0.0);
+  /* Compilers unroll loops of a constant length: this shader would take them a second for each of its outputs. */
+  int corners = is_closest ? 1 : 4;
+  for (int number = 0; number < corners; number++) {
+    ivec2 beside = ivec2(number & 1, number >> 1);
+    vec2 weight = mix(1.0 - share, share, vec2(beside));
+    value += weight.x * weight.y * texel_at(image, corner + beside, size, extension, encode, by_alpha);
   }
   if (encode) {
     value.rgb = vec3(decoded(value.r), decoded(value.g), decoded(value.b));

@@ -21,12 +21,15 @@ import numpy as np
 
 from .edge_integrals import bump_shadowing
 from .lobe_integrals import form_factor
-from .polygon import project_to_sphere, split_at_horizon
+from .polygon import dot, project_to_sphere, split_at_horizon
 
 # Nodes of an arc, or of each of its parts if it is cut at the kink of t, z = cos(theta_o).
 ARC_NODES = 8
-# Nodes along both sides of a triangle.
+# Nodes along both sides of a triangle. MEAN_NODES: for means over polygons with corners farther from their middle than
+# 0.8, 0.4 and 0.1 rad, and over smaller ones. Errors are at most 1e-4, with two nodes less five times as much.
 NODES = 16
+MEAN_NODES, EXTENTS = (10, 8, 6, 4), np.cos([0.8, 0.4, 0.1])
+NODES_AT_A_TIME = 1 << 14  # of all polygons
 _ANGLES = 2048
 
 
@@ -53,8 +56,8 @@ def velvet_lobe(x, z, cosine, sigma):
 
 def velvet_integral(polygon: np.ndarray, cosine: np.ndarray, sigma: np.ndarray) -> np.ndarray:
     """Integral (P,) of `velvet_lobe` over polygons (3, V, P) in z >= 0, either way around."""
-    total = 0.0
-    for (x, _, z), weight in _nodes_of_triangles(polygon):
+    total, corners = 0.0, project_to_sphere(polygon)
+    for (x, _, z), weight in _nodes_of_triangles(corners, NODES if corners.shape[1] <= 8 else NODES // 2):
         total = total + (weight * velvet_lobe(x, z, cosine, sigma)).sum(axis=0)
     return np.abs(total)
 
@@ -62,31 +65,44 @@ def velvet_integral(polygon: np.ndarray, cosine: np.ndarray, sigma: np.ndarray) 
 def shadowed_mean(polygon: np.ndarray, cosine: np.ndarray, shape: np.ndarray, smooth: np.ndarray, bump_alpha2):
     """The mean (P,) of bump shadowing over polygons (3, V, P) in z >= 0, weighted by lobes with the `shape` (4, P) of
     `diffuse_factor`. `cosine` (P,) is that of the view, which has y = 0; `smooth` (3, P) is the smooth normal."""
-    up, view = np.zeros((2, 3, len(cosine)))
+    up, view = np.zeros((2, 3, len(cosine)), np.float32)
     up[2], view[0], view[2] = 1.0, np.sqrt(np.maximum(1.0 - cosine * cosine, 0.0)), cosine
-    total = shadowed = 0.0
-    for direction, weight in _nodes_of_triangles(polygon):
-        lobe = weight * direction[2] * diffuse_factor(direction, direction[2], up, view, shape)
-        total = total + lobe.sum(axis=0)
-        above = (smooth[:, None] * direction).sum(axis=0)
-        shadowed = shadowed + (lobe * bump_shadowing(above, np.float32(1.0), bump_alpha2)).sum(axis=0)
-    return np.clip(np.divide(shadowed, total, out=np.zeros_like(total), where=total != 0.0), 0.0, 1.0)
+    corners, result = project_to_sphere(polygon), np.zeros(len(cosine))
+    middle = corners.sum(axis=1)
+    extent = dot(corners, middle[:, None]).min(axis=0) / np.maximum(np.sqrt(dot(middle, middle)), 1e-30)
+    level, shape, smooth = np.searchsorted(EXTENTS, extent), shape.astype(np.float32), smooth.astype(np.float32)
+    for number in np.unique(level):
+        some, total, shadowed = np.flatnonzero(level == number), 0.0, 0.0
+        surfaces = up[:, some], view[:, some], shape[:, some]
+        for direction, weight in _nodes_of_triangles(corners[..., some], MEAN_NODES[number], np.float32):
+            lobe = weight * direction[2] * diffuse_factor(direction, direction[2], *surfaces)
+            total = total + lobe.sum(axis=0)
+            above = dot(smooth[:, None, some], direction)
+            shadowed = shadowed + (lobe * bump_shadowing(above, np.float32(1.0), bump_alpha2[some])).sum(axis=0)
+        result[some] = np.divide(shadowed, total, out=np.zeros_like(total), where=total != 0.0)
+    return np.clip(result, 0.0, 1.0)
 
 
-def _nodes_of_triangles(polygon: np.ndarray):
-    """Unit directions (3, N, P) and signed weights in sr (N, P), in several pieces, for polygons (3, V, P)."""
-    corners = project_to_sphere(polygon)
-    count = NODES if corners.shape[1] <= 8 else NODES // 2
+def _nodes_of_triangles(corners: np.ndarray, count: int, dtype=np.float64):
+    """Unit directions (3, N, P) and signed weights in sr (N, P) of a `dtype`, in several pieces, for spherical polygons
+    (3, V, P), with `count` nodes along both sides of their triangles."""
     nodes, weights = np.polynomial.legendre.leggauss(count)
-    nodes, weights = 0.5 * (nodes[:, None] + 1.0), 0.5 * weights[:, None]
+    nodes = 0.5 * (nodes + 1.0)
+    # Go toward the second corner, and from there toward the third.
+    along, across = (values.reshape(-1, 1) for values in np.meshgrid(nodes, nodes, indexing="ij"))
+    weights = along * np.outer(0.5 * weights, 0.5 * weights).reshape(-1, 1)
+    along, across, weights = (values.astype(dtype) for values in (along, across, weights))
+    rows = max(NODES_AT_A_TIME // max(corners.shape[2], 1), 1)
     for corner in range(1, corners.shape[1] - 1):
         first, second, third = corners[:, 0], corners[:, corner], corners[:, corner + 1]
-        volume = (first * np.cross(second, third, axis=0)).sum(axis=0)
-        for share, weight in zip(nodes[:, 0], weights[:, 0], strict=True):
-            # Go toward the second corner, and from there toward the third.
-            place = first[:, None] + share * ((second - first)[:, None] + nodes * (third - second)[:, None])
-            inverse = 1.0 / np.sqrt(np.maximum((place * place).sum(axis=0), 1e-30))
-            yield place * inverse, share * weight * volume * weights * inverse**3
+        volume = dot(first, np.cross(second, third, axis=0)).astype(dtype)
+        sides = first, second - first, third - second
+        first, to_second, to_third = (side[:, None].astype(dtype) for side in sides)
+        for start in range(0, count * count, rows):
+            piece = slice(start, start + rows)
+            place = first + along[piece] * (to_second + across[piece] * to_third)
+            inverse = np.reciprocal(np.sqrt(np.maximum(dot(place, place), dtype(1e-30))))
+            yield place * inverse, weights[piece] * volume * inverse**3
 
 
 def rough_terms(roughness: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -185,18 +201,22 @@ def diffuse_factor(directions, height, normal, view, shape):
     samples with normals and views (3, Q). `shape` (4, Q) is sigma, a and b of sheen, and R. The factor is 1 if all of
     these are 0. Velvet has a below 0."""
     sigma, sheen_a, sheen_b, scattered = shape
-    cosine = (normal * view).sum(axis=0)
+    cosine = dot(normal, view)
     # The part of the view along the surface; its length is the sine.
-    along = ((view - cosine * normal)[:, None] * directions).sum(axis=0)
-    sine = np.sqrt(np.maximum(1.0 - cosine * cosine, 1e-12))
-    x = along / sine
-    squared = np.maximum(1.0 - height * height - x * x, 0.0)
-    q = (sheen_a * x + sheen_b * height) ** 2 + sheen_a * sheen_a * squared + height * height
-    sheen = (sheen_a / np.maximum(q, 1e-12)) ** 2
-    if (sheen_a < 0.0).any():
-        velvet = np.pi * velvet_lobe(x, np.maximum(height, 1e-6), cosine, np.maximum(-sheen_a, 1e-2))
-        sheen = np.where(sheen_a < 0.0, velvet / np.maximum(height, 1e-6), sheen)
-    a, b = rough_terms(sigma)
-    t = np.where(along > 0.0, along / np.maximum(np.maximum(height, cosine), 1e-6), along)
-    rough = np.pi * (a + b * t + scattered * (1.0 - np.pi * a - b * albedo_slope(height)))
-    return np.where(sheen_a != 0.0, sheen, np.where(sigma != 0.0, rough, 1.0)).astype(height.dtype)
+    along = dot((view - cosine * normal)[:, None], directions)
+    factor = np.ones_like(height)
+    if (sigma != 0.0).any():
+        a, b = rough_terms(sigma)
+        t = np.where(along > 0.0, along / np.maximum(np.maximum(height, cosine), 1e-6), along)
+        rough = np.pi * (a + b * t + scattered * (1.0 - np.pi * a - b * albedo_slope(height)))
+        factor = np.where(sigma != 0.0, rough, factor)
+    if (sheen_a != 0.0).any():
+        x = along / np.sqrt(np.maximum(1.0 - cosine * cosine, 1e-12))
+        squared = np.maximum(1.0 - height * height - x * x, 0.0)
+        q = (sheen_a * x + sheen_b * height) ** 2 + sheen_a * sheen_a * squared + height * height
+        sheen = (sheen_a / np.maximum(q, 1e-12)) ** 2
+        if (sheen_a < 0.0).any():
+            velvet = np.pi * velvet_lobe(x, np.maximum(height, 1e-6), cosine, np.maximum(-sheen_a, 1e-2))
+            sheen = np.where(sheen_a < 0.0, velvet / np.maximum(height, 1e-6), sheen)
+        factor = np.where(sheen_a != 0.0, sheen, factor)
+    return factor.astype(height.dtype)

@@ -29,7 +29,7 @@ from .. import imaging
 from ..cycles.lobes import read_layer
 from ..imaging.denoise import NoDenoiser, open_denoiser
 from ..imaging.exr import by_group, layer_name
-from ..scene import Cancelled
+from ..scene import PASSES, Cancelled
 from ..workers.pool import cores
 from .aliasing import box_mean, factor_of_samples
 from .comparison import Comparison
@@ -45,6 +45,7 @@ ERROR_RADIUS, ERROR_POWER, LEAST_ERROR = 4, 2, 0.1
 # MEAN_SHARE: the share that the mean of the denoised halves has in a denoised picture. Each is blurred in a way of its
 # own: in six scenes 0.25 takes 2.6 % of FLIP's error away and 1.5 % of L2 without the brightest, 0.2 to 0.35 as much.
 MEAN_SHARE = 0.25
+BRIGHTEST = 0.002  # the share of the pixels, the brightest, that `first_errors` leaves out
 MOST_FACTOR = 3.0  # direct light of the finished picture is at most this many times LTSH's
 
 
@@ -119,12 +120,21 @@ def direct_passes(comparison: Comparison, cycles) -> dict[str, DirectPass]:
     return passes
 
 
-def variance_of_points(extraction, result, name: str) -> np.ndarray:
-    """The variance (H, W) of a pass among the points of each pixel, of its exposed radiance: the sum over light groups,
-    the mean over color channels."""
-    radiance = extraction.picture.exposure * getattr(result.shading, name).sum(axis=0).mean(axis=-1)
-    hits, (radiance,) = extraction.film.hits(radiance)
-    return np.maximum(hits.image(np.square(radiance)) - np.square(hits.image(radiance)), 0.0)
+def variance_of_points(extraction, result) -> np.ndarray:
+    """The unbiased variance (H, W) of LTSH's exposed light among the points of each pixel, where it is to replace
+    Cycles'; a mean over color channels. `DirectPass.recoloring` takes the variance of diffuse colors away."""
+    film, points = extraction.film, extraction.film.sub_samples
+    albedo, total = extraction.samples.diffuse_albedo.mean(axis=-1), 0.0
+    for name in PASSES:
+        radiance = extraction.picture.exposure * getattr(result.shading, name).sum(axis=0).mean(axis=-1)
+        if name == "diffuse":
+            hits, (radiance, color) = film.hits(radiance, albedo)
+            radiance, color = radiance / np.maximum(color, 1e-6), hits.image(color)
+        else:
+            (hits, (radiance,)), color = film.hits(radiance), 1.0
+        variance = np.maximum(hits.image(np.square(radiance)) - np.square(hits.image(radiance)), 0.0)
+        total = total + np.where(extraction.left_to_cycles.by_pass[name], 0.0, variance * np.square(color))
+    return total * points / max(points - 1, 1)
 
 
 def _mean_around(image: np.ndarray) -> np.ndarray:
@@ -214,10 +224,8 @@ def _weights(noisy, others, samples) -> tuple[list[np.ndarray], tuple[float, flo
     number, other = samples
     variance = np.square(first - second) * (number * other / (number + other))  # of one sample
 
-    def error(ours, theirs) -> np.ndarray:
-        """The squared error (H, W) of pictures of both halves, each compared with the other half."""
-        squares = np.square(ours - second) - variance / other + np.square(theirs - first) - variance / number
-        return 0.5 * squares.mean(axis=-1)
+    def error(*pictures) -> np.ndarray:
+        return 0.5 * sum(_squared_errors(pictures, (first, second), samples))
 
     def mean(products) -> np.ndarray:
         return _mean_around(0.5 * sum(products).mean(axis=-1))
@@ -239,6 +247,48 @@ def _weights(noisy, others, samples) -> tuple[list[np.ndarray], tuple[float, flo
     ours = clean * errors[0] + noisy * noise
     weights = [clean * share, clean * (1.0 - share), noisy]
     return weights, tuple(float(np.sqrt(one.mean() / light)) for one in (ours, errors[1]))
+
+
+@dataclass(frozen=True)
+class FirstErrors:
+    """What the first samples of Cycles tell of its errors, as squares (H, W) in means around each pixel, without the
+    brightest pixels."""
+
+    samples: float  # half of the first, which have these errors
+    whole: np.ndarray  # of Cycles' picture
+    rest: np.ndarray  # of the picture without the direct light that LTSH would replace
+    is_denoised: bool
+
+
+def first_errors(cycles, by_pass: dict[str, np.ndarray], denoise: str, progress) -> FirstErrors | None:
+    """The errors of the two halves of a picture that was only begun; None if it has none. `by_pass` are the masks
+    (H, W) of the direct light that is left to Cycles."""
+    if len(cycles.halves) < 2:
+        return None
+    whole, rest = [], []
+    colors = {name: read_layer(cycles.channels, cycles.names[color], "RGB") for name, (_, color) in DIRECT.items()}
+    for half in cycles.halves:
+
+        def read(key, half=half):
+            return read_layer(half.channels, cycles.names[key], "RGB").astype(np.float64)
+
+        light = read_layer(half.channels, "Combined", "RGB") - read("emission") - read("background")
+        direct = sum(~by_pass[name][..., None] * read(key) * colors[name] for name, (key, _) in DIRECT.items())
+        whole.append(np.nan_to_num(light))
+        rest.append(np.nan_to_num(light - direct))
+    (_, clean, _), denoiser, _ = _denoised([[], [*whole, *rest], []], cycles.guides, denoise, progress)
+    brightness, counts = sum(clean[:2]).mean(axis=-1), [half.samples for half in cycles.halves]
+    counts_at_all = brightness <= np.quantile(brightness, 1.0 - BRIGHTEST)
+    errors = [_squared_errors(*pair, counts) for pair in ((clean[:2], whole), (clean[2:], rest))]
+    maps = (_mean_around(np.where(counts_at_all, 0.5 * sum(one), 0.0)) for one in errors)
+    return FirstErrors(0.5 * sum(counts), *maps, bool(denoiser))
+
+
+def _squared_errors(pictures, noisy, samples) -> list[np.ndarray]:
+    """Squared errors (H, W) of the `pictures` of two halves with so many `samples`, each by the other half, `noisy`."""
+    variance = np.square(noisy[0] - noisy[1]) / sum(1.0 / count for count in samples)  # of one sample
+    pairs = zip(pictures, noisy[::-1], samples[::-1], strict=True)
+    return [(np.square(one - half) - variance / count).mean(axis=-1) for one, half, count in pairs]
 
 
 def most_denoisings(extraction) -> int:

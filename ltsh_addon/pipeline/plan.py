@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .compositing import FirstErrors
 from .options import SHADOW_RAYS, RenderOptions
 
 # Points per pixel. Without a budget, one for SAMPLES_OF_POINT samples of Cycles, up to DEFAULT_POINTS: a point takes 80
@@ -20,28 +21,27 @@ DENOISER_START_SECONDS, FIRST_DENOISING_SECONDS, NEXT_DENOISING_SECONDS = 0.25, 
 # SOFT_SHARE: the share of the pairs of a pixel and a light that lie in soft shadows.
 SHADOWS_SHARE, RAY_SECONDS, SOFT_SHARE = 0.02, 6e-7, 0.1
 MOST_OVER = 1.1  # how many times the budget a picture may take without a warning
-# The time of direct light is extrapolated from a few squares of the picture. PROBES: the share of the samples that
-# these have, and the power of the number of samples with which the time grows from there: from the first squares at
-# least 0.45, from the second 0.49 to 0.7 in six scenes of 32,400 pixels, and 0.84 with nine times as many.
-# MADE_ONCE: how many times too long the first may seem, since it also makes what all others have (maps of skies).
-PROBES, MADE_ONCE = ((0.01, 0.45), (0.04, 0.6)), 2.0
-# Of the remaining budget: the share that direct light may take with the first points, and with more points. With as
-# many samples it leaves 0.75 to 0.95 of the error, for which so much time makes up.
-DIRECT_SHARE, MORE_SHARE = 0.3, 0.2
-# THIN_CONTRAST: from this `Probe.contrast` on, highlights are thinner than pixels, and time is better spent on samples
-# of Cycles. In seven scenes the contrast is at most 0.11, of flakes in a car's paint 0.18, on the example scene more.
-THIN_CONTRAST = 0.14
+# The time of direct light is extrapolated from a few squares of the picture. PROBE_SHARE: the share of the samples that
+# these have. PROBE_POWER: of the number of samples, with which the time grows from there; in six scenes 0.65 to 0.95.
+PROBE_SHARE, PROBE_POWER = 0.04, 0.75
+# SAMPLES_POWER: with n samples of Cycles the squared error of a denoised picture falls as n to this power, of a noisy
+# one as n to -1. In seven scenes, from 10 to 60 samples: -0.42 to -0.72, of what direct light leaves -0.3 to -0.6.
+# POINTS_FACTOR, POINTS_POWER: what of their variance is the squared error of one point, and of several: these are
+# spread evenly. In five scenes 0.12 to 0.5, and from one to three points -1 to -2. LEAST_GAIN: by this share direct
+# light must make the squared error less, to be shaded: what is left of it is more than the plan foretells.
+SAMPLES_POWER, POINTS_FACTOR, POINTS_POWER, LEAST_GAIN = -0.56, 0.5, -1.5, 0.5
 
 
 @dataclass(frozen=True)
 class Probe:
-    """What a few squares of the picture, fully shaded, tell of the whole."""
+    """What squares of the picture, fully shaded, tell of the whole: sums over their pixels, those of each square
+    divided by how likely it was chosen."""
 
     samples: int
     seconds: float  # processor time of their direct light
-    # Root mean square, over all pixels, of the deviation of specular light among the points of a pixel, in units of the
-    # light of the pixel and of the mean.
-    contrast: float = 0.0
+    whole: float  # the `FirstErrors`
+    rest: float
+    variance: float  # of direct light among the points of a pixel
 
 
 @dataclass(frozen=True)
@@ -51,25 +51,28 @@ class SceneMeasurements:
     budget: float | None  # of the whole picture; None: no limit
     seconds_left: float | None  # of the budget, before denoising
     sampling_seconds: float  # of the first points
-    cycles_seconds: float  # that Cycles needs beside its samples
+    edge_seconds: float  # that Cycles needs beside its samples
     points: int  # per pixel, of the samples that are there
     most_points: int
     samples_of_one_point: int
     samples: int  # of all `points`, after equal ones are merged
     has_lens: bool  # depth of field, which needs all points from the start
-    probes: tuple[Probe, ...] = ()
+    cycles_samples: int = 0  # of Cycles that are there
+    sample_seconds: float = 0.0  # of one more
+    errors: FirstErrors | None = None  # of these samples
+    probe: Probe | None = None
 
 
 @dataclass(frozen=True)
 class DirectLightPlan:
     """How many points per pixel LTSH shades; 0: all direct light is left to Cycles, for the `reason`.
 
-    While `probe_share` is above 0 the plan is not final: a `Probe` with that share of the samples is needed.
+    If `needs_probe`, the plan is not final: a `Probe` with PROBE_SHARE of the samples is needed.
     """
 
     points_per_pixel: int = 0
     reason: str = ""
-    probe_share: float = 0.0
+    needs_probe: bool = False
 
 
 def first_and_most_points(options: RenderOptions) -> tuple[int, int]:
@@ -90,40 +93,44 @@ def first_and_most_points(options: RenderOptions) -> tuple[int, int]:
 
 
 def direct_light_plan(scene: SceneMeasurements) -> DirectLightPlan:
-    """The points per pixel that the remaining budget allows, or why Cycles does better with that time."""
-    from ..blender.process.pixels import LEAST_POINTS, TOO_THIN, too_little
+    """The points per pixel with which the remaining budget leaves the least error, or why Cycles does better alone.
+
+    With n samples, of which some are there and the others follow in the time that direct light leaves, the squared
+    error is that of Cycles' picture, or that of its rest and that of direct light by its points.
+    """
+    from ..blender.process.pixels import TOO_LITTLE_GAIN, too_little
 
     if scene.seconds_left is None or scene.samples == 0:
         return DirectLightPlan(scene.points)
-    by_cycles = DirectLightPlan(0, too_little(scene.budget))
-    seconds = scene.seconds_left - scene.cycles_seconds
-    if seconds <= 0.0:
-        return by_cycles
+    seconds, errors = scene.seconds_left - scene.edge_seconds, scene.errors
+    if seconds <= 0.0 or errors is None:
+        return DirectLightPlan(0, too_little(scene.budget))
     # All points of a pixel but the first make about equally many samples.
-    counts = np.array([scene.points])
-    if not scene.has_lens:
-        counts = np.arange(min(LEAST_POINTS, scene.points), max(scene.points, scene.most_points) + 1)
+    counts = np.array([scene.points]) if scene.has_lens else np.arange(1, max(scene.points, scene.most_points) + 1)
     one = scene.samples_of_one_point
     samples = one + (counts - 1) * (scene.samples - one) / max(scene.points - 1, 1)
     # More points than there are need all samples anew.
     again = np.where(counts > scene.points, scene.sampling_seconds * (1.0 + counts / scene.points), 0.0)
-    allowed = np.where(counts > scene.points, MORE_SHARE, DIRECT_SHARE) * seconds - again
-    (small_share, small_power), (large_share, large_power) = PROBES
-    if not scene.probes:
-        return DirectLightPlan(probe_share=small_share)
-    small, *large = scene.probes
-    if small.seconds * (samples[0] / small.samples) ** small_power > MADE_ONCE * allowed[0]:
-        return by_cycles
-    if not large:
-        return DirectLightPlan(probe_share=large_share)
-    (large,) = large
-    expected = large.seconds * (samples / large.samples) ** large_power
-    affordable = counts[expected <= allowed]
-    if len(affordable) == 0:
-        return by_cycles
-    # Either probe may miss the highlights.
-    is_thin = max(small.contrast, large.contrast) > THIN_CONTRAST
-    return DirectLightPlan(0, TOO_THIN) if is_thin else DirectLightPlan(int(affordable[-1]))
+
+    def noise(taken) -> np.ndarray:
+        """The factor of squared errors where direct light has `taken` so many seconds; inf where they are too many."""
+        more = (seconds - taken) / scene.sample_seconds
+        power = SAMPLES_POWER if errors.is_denoised else -1.0
+        return np.where(more > 0.0, ((scene.cycles_samples + np.maximum(more, 0.0)) / errors.samples) ** power, np.inf)
+
+    def is_worth(whole, left) -> bool:
+        return left <= (1.0 - LEAST_GAIN) * whole * noise(0.0)
+
+    by_cycles, probe = DirectLightPlan(0, TOO_LITTLE_GAIN), scene.probe
+    if probe is None:
+        least = errors.rest.mean() * noise(0.0)
+        return DirectLightPlan(needs_probe=True) if is_worth(errors.whole.mean(), least) else by_cycles
+    expected = probe.seconds * (samples / probe.samples) ** PROBE_POWER + again
+    # With depth of field direct light is denoised as well.
+    factors = 0.0 * counts if scene.has_lens else POINTS_FACTOR * counts**POINTS_POWER
+    left = probe.rest * noise(expected) + factors * probe.variance
+    best = int(np.argmin(left))
+    return DirectLightPlan(int(counts[best])) if is_worth(probe.whole, left[best]) else by_cycles
 
 
 def shadow_rays(most: int, budget: float | None, pairs: float) -> int:

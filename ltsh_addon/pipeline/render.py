@@ -29,8 +29,8 @@ from .relight import RELIGHT_SUFFIX, write_relight_data
 from .tasks import TaskResult, check_before_writing, write_reports
 
 NAMED = 8  # of what is left to Cycles, in a warning
-# SQUARE: the squares of a probe, in pixels on a side.
-SQUARE = 8
+# SQUARE: the squares of a probe, in pixels on a side. LEAST_WEIGHT: in units of the mean, added to Cycles' error there.
+SQUARE, LEAST_WEIGHT = 8, 0.1
 
 
 @dataclass(frozen=True)
@@ -96,25 +96,15 @@ def finish(
     `shaded` is called with the direct light before Cycles begins.
     """
     from ..blender.process.blender_process import shared_blender
-    from ..blender.process.finished import FinishedJob, render_finished
 
     start, clock = time.perf_counter(), _ProcessorClock()
     scene_and_layer = {"scene_name": scene_name, "view_layer": view_layer}
-
-    def seconds_left(extraction) -> float | None:
-        pixels, denoisings = extraction.film.width * extraction.film.height, compositing.most_denoisings(extraction)
-        return plan.seconds_before_denoising(options.budget, clock.seconds(), pixels, denoisings)
-
     with temporary_folder() as folder, shared_blender(folder):
-        comparison = shade_direct_light(options, scene_and_layer, clock, seconds_left, progress)
+        timed = _TimedCycles(options, scene_and_layer, folder, clock, progress)
+        comparison = shade_direct_light(options, scene_and_layer, timed, progress)
         extraction = comparison.extraction
         shaded(comparison)
-        width, height = options.resolution or (None, None)
-        edges = not (extraction.picture.has_lens or extraction.left_to_cycles.everything)
-        size = {"width": width, "height": height, "seconds": seconds_left(extraction), "edges": edges}
-        job = child_job(FinishedJob, options, **scene_and_layer, **size)
-        cycles = render_finished(job, folder, progress=progress)
-        clock.end("cycles", cycles.processor_seconds)
+        cycles = timed.picture(extraction)
         passes = compositing.direct_passes(comparison, cycles)
         picture = compositing.composite(cycles, passes, extraction, options.denoise, progress)
         clock.end("denoise")
@@ -128,7 +118,7 @@ def finish(
             )
         # The least is to start Blender, open the file, render the first samples of Cycles, and denoise.
         opening = extraction.times.processor - extraction.times.direct
-        least = opening + cycles.least_seconds + clock.stages["denoise"]
+        least = opening + cycles.begun["least"] + clock.stages["denoise"]
         report["warnings"] += plan.over_budget(options.budget, clock.seconds(), least)
         report["warnings"] = imaging.grouped(report["warnings"])
         seconds = {
@@ -142,17 +132,48 @@ def finish(
     return Finished(*written, comparison, cycles)
 
 
-def shade_direct_light(
-    options: RenderOptions, scene_and_layer: dict, clock, seconds_left: Callable, progress
-) -> Comparison:
+class _TimedCycles:
+    """Cycles' part of one finished picture, in the processor time that is left of a budget."""
+
+    def __init__(self, options: RenderOptions, scene_and_layer: dict, folder: Path, clock, progress):
+        self._options, self._scene_and_layer, self._folder = options, scene_and_layer, folder
+        self.clock, self._progress, self._begun = clock, progress, None
+
+    def seconds_left(self, extraction) -> float | None:
+        """The processor seconds of the budget before denoising."""
+        pixels, denoisings = extraction.film.width * extraction.film.height, compositing.most_denoisings(extraction)
+        return plan.seconds_before_denoising(self._options.budget, self.clock.seconds(), pixels, denoisings)
+
+    def first_samples(self, extraction):
+        """The `CyclesPicture` of some samples, which `picture` goes on with."""
+        picture = self._rendered(extraction, begins=True)
+        self._begun = picture.begun
+        return picture
+
+    def picture(self, extraction):
+        """The whole `CyclesPicture`."""
+        return self._rendered(extraction, begun=self._begun)
+
+    def _rendered(self, extraction, **more):
+        from ..blender.process.finished import FinishedJob, render_finished
+
+        width, height = self._options.resolution or (None, None)
+        edges = not (extraction.picture.has_lens or extraction.left_to_cycles.everything)
+        size = {"width": width, "height": height, "seconds": self.seconds_left(extraction), "edges": edges}
+        job = child_job(FinishedJob, self._options, **self._scene_and_layer, **size, **more)
+        picture = render_finished(job, self._folder, progress=self._progress)
+        self.clock.end("cycles", picture.processor_seconds)
+        return picture
+
+
+def shade_direct_light(options: RenderOptions, scene_and_layer: dict, timed: _TimedCycles, progress) -> Comparison:
     """The direct light by the technique, with shadows; without results where all of it is left to Cycles.
 
-    `scene_and_layer` are fields of the child's job. `clock` is told the ends of stages; `seconds_left(extraction)` are
-    those of the budget.
+    `scene_and_layer` are fields of the child's job. With a budget Cycles' first samples tell whether it is worth it.
     """
     from ..blender.process.pixels import PixelJob, ended_at_horizons, extract_pixels, with_points
 
-    tables = load_tables(options.techniques)
+    tables, clock = load_tables(options.techniques), timed.clock
     width, height = options.resolution or (None, None)
     first, most = plan.first_and_most_points(options)
     picture = child_job(PictureOptions, options, passes=PASSES, sub_samples=most or 1, shadows="on", cycles_samples=2)
@@ -175,8 +196,13 @@ def shade_direct_light(
         return Comparison(picture, extraction, {}, None)
     with ShadowTracer(extraction.occluders, extraction.lights) as tracer:
         shader = DirectLightShader(picture, options.budget, tables, tracer)
-        opening = extraction.times.processor - extraction.times.direct
-        chosen = shader.planned(extraction, seconds_left(extraction), clock.seconds() - opening)
+        sampling = clock.seconds() - (extraction.times.processor - extraction.times.direct)
+        cycles = errors = None
+        if options.budget is not None and len(extraction.samples):
+            cycles = timed.first_samples(extraction)
+            by_pass = extraction.left_to_cycles.by_pass
+            errors = compositing.first_errors(cycles, by_pass, options.denoise, progress)
+        chosen = shader.planned(extraction, timed.seconds_left(extraction), sampling, cycles, errors)
         clock.end("choice")
         if chosen.reason:
             cycles = extraction.left_to_cycles
@@ -219,8 +245,9 @@ class DirectLightShader:
         results = evaluated(self.tables, extraction, shadows, self.options, progress)
         return Comparison(self.options, extraction, results, shadows)
 
-    def planned(self, extraction, seconds_left: float | None, sampling_seconds: float) -> plan.DirectLightPlan:
-        """The plan by samples of the first points of each pixel, which took `sampling_seconds`, and by probes."""
+    def planned(self, extraction, seconds_left, sampling_seconds: float, cycles, errors) -> plan.DirectLightPlan:
+        """The plan by samples of the first points of each pixel, which took `sampling_seconds`, by the picture `cycles`
+        that was begun with its `errors`, and by probes."""
         from ..blender.process.pixels import EDGE_SECONDS, with_points
 
         film = extraction.film
@@ -229,40 +256,44 @@ class DirectLightShader:
             budget=self.budget,
             seconds_left=seconds_left,
             sampling_seconds=sampling_seconds,
-            # Cycles will read the scene in half the time that was needed here, and render what shines in sight.
-            cycles_seconds=0.5 * extraction.times.direct + EDGE_SECONDS * film.width * film.height / 1e6,
+            edge_seconds=EDGE_SECONDS * film.width * film.height / 1e6,
             points=film.sub_samples,
             most_points=self.options.sub_samples,
             samples_of_one_point=np.count_nonzero(extraction.points.number == 0),
             samples=len(merged.samples),
             has_lens=extraction.picture.has_lens,
+            cycles_samples=cycles.samples if cycles else 0,
+            sample_seconds=cycles.begun["each"] if cycles else 0.0,
+            errors=errors,
         )
-        while (chosen := plan.direct_light_plan(measured)).probe_share > 0.0:
-            probe = self.probe(merged, chosen.probe_share)
-            measured = replace(measured, probes=(*measured.probes, probe))
+        chosen = plan.direct_light_plan(measured)
+        if chosen.needs_probe:
+            chosen = plan.direct_light_plan(replace(measured, probe=self.probe(merged, errors)))
         return chosen
 
-    def probe(self, extraction, share: float) -> plan.Probe:
-        """Shades a few random squares of the picture that have a `share` of its samples."""
+    def probe(self, extraction, errors: compositing.FirstErrors, share: float = plan.PROBE_SHARE) -> plan.Probe:
+        """Shades squares of the picture that have a `share` of its samples, chosen at random by Cycles' error there."""
         from ..blender.process.pixels import ended_at_horizons
 
         film, start = extraction.film, time.process_time()
-        row, column = np.divmod(film.pixel, film.width)
-        square = row // SQUARE * film.width + column // SQUARE
-        order = np.random.default_rng(round(1.0 / share)).permutation(film.width * film.height)
-        count = np.cumsum(np.bincount(square, minlength=len(order))[order])
-        chosen = np.isin(square, order[: 1 + np.searchsorted(count, share * len(square))])
-        squares = replace(extraction, samples=extraction.samples.take(chosen), film=film.take(chosen))
-        squares = ended_at_horizons(squares)
-        comparison = self.shaded(squares, self.shadows(squares))
-        (technique, result), *_ = comparison.results.items()
-        variance = compositing.variance_of_points(squares, result, "specular")
-        light = sum(comparison.images[technique, name].mean(axis=-1) for name in PASSES)
-        shown = squares.film.coverage() > 0.0
-        relative = variance / np.square(light + max(light.sum() / max(shown.sum(), 1), 1e-30))
-        shown &= ~squares.left_to_cycles.by_pass["specular"]
-        contrast = float(np.sqrt(relative[shown].sum() / max(shown.sum(), 1)))
-        return plan.Probe(int(np.count_nonzero(chosen)), time.process_time() - start, contrast)
+        row, column = np.indices((film.height, film.width)) // SQUARE
+        square_of_pixel = (row * film.width + column).ravel()
+        whole, rest = (np.bincount(square_of_pixel, one.ravel()) for one in (errors.whole, errors.rest))
+        # By races whose rates are the weights (Efraimidis and Spirakis 2006).
+        weight = np.where(np.bincount(square_of_pixel) > 0, whole + LEAST_WEIGHT * whole.mean() + 1e-30, 0.0)
+        race = np.random.default_rng(SQUARE).exponential(size=len(whole))
+        order = np.argsort(np.divide(race, weight, out=np.full(len(whole), np.inf), where=weight > 0.0))
+        square = square_of_pixel[film.pixel]
+        count = np.cumsum(np.bincount(square, minlength=len(whole))[order])
+        squares = order[: 1 + np.searchsorted(count, share * len(square))]
+        chosen = np.isin(square, squares)
+        some = replace(extraction, samples=extraction.samples.take(chosen), film=film.take(chosen))
+        some = ended_at_horizons(some)
+        comparison = self.shaded(some, self.shadows(some))
+        variance = compositing.variance_of_points(some, next(iter(comparison.results.values())))
+        variance = np.bincount(square_of_pixel, variance.ravel())
+        sums = (float((one[squares] / weight[squares]).sum()) for one in (whole, rest, variance))
+        return plan.Probe(int(np.count_nonzero(chosen)), time.process_time() - start, *sums)
 
 
 class _ProcessorClock:
@@ -337,7 +368,8 @@ def summary(report: dict, seconds: dict) -> list[str]:
     gained = ""
     if error is not None and "processor" in seconds:
         # Cycles alone could take all the time for samples.
-        alone *= np.sqrt(seconds["processor"]["cycles"] / seconds["processor"]["total"])
+        more_samples = seconds["processor"]["total"] / seconds["processor"]["cycles"]
+        alone *= more_samples ** (0.5 * plan.SAMPLES_POWER)
         gained = f"; error of half the samples {100 * error:.1f} %, of Cycles alone in this time {100 * alone:.1f} %"
     return [
         f"{width}x{height}, {report['sub_samples']} points per pixel, {report['cycles_samples']} samples of Cycles, "

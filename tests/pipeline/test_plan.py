@@ -2,75 +2,106 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
-from ltsh_addon.blender.process.pixels import TOO_THIN, too_little
+from ltsh_addon.blender.process.pixels import TOO_LITTLE_GAIN, too_little
 from ltsh_addon.pipeline import plan
+from ltsh_addon.pipeline.compositing import FirstErrors
 from ltsh_addon.pipeline.options import RenderOptions
 
 SECONDS = 3.0  # that remain for direct light and Cycles' samples
+# Without direct light a quarter of the squared error remains.
+ERRORS = FirstErrors(10.0, np.full((3, 4), 4.0), np.full((3, 4), 1.0), True)
 SCENE = plan.SceneMeasurements(
     budget=9.0,
     seconds_left=SECONDS + 0.5,
     sampling_seconds=0.1,
-    cycles_seconds=0.5,
+    edge_seconds=0.5,
     points=2,
     most_points=5,
     samples_of_one_point=1000,
     samples=1200,
     has_lens=False,
+    cycles_samples=20,
+    sample_seconds=0.01,
+    errors=ERRORS,
 )
 
 
-def planned(scene, seconds_of, **probe):
+def planned(scene, seconds_of, variance=0.0):
     """The final plan of a scene whose direct light takes `seconds_of` a number of samples."""
-    while (chosen := plan.direct_light_plan(scene)).probe_share > 0.0:
-        count = max(round(chosen.probe_share * scene.samples), 1)
-        scene = replace(scene, probes=(*scene.probes, plan.Probe(count, seconds_of(count), **probe)))
-    return chosen
+    chosen = plan.direct_light_plan(scene)
+    if not chosen.needs_probe:
+        return chosen
+    count = round(plan.PROBE_SHARE * scene.samples)
+    rest = scene.errors.rest.mean() * count
+    probe = plan.Probe(count, seconds_of(count), 4.0 * count, rest, variance * count)
+    return plan.direct_light_plan(replace(scene, probe=probe))
 
 
-@pytest.mark.parametrize(
-    ("each", "power", "sampling_seconds", "points"),
-    [
-        (1e-5, 1.0, 0.1, [5]),  # seconds of a sample: all points
-        (1e-5, 1.0, 9.0, [2]),  # no time for a second extraction
-        (1e-5, 1.0, 0.22, [3, 4]),
-        (0.009, 0.7, 0.1, [0, 2, 3, 4]),  # never one alone
-        (0.03, 1.0, 0.1, [0]),
-        (1.0, 0.5, 0.1, [0]),
-    ],
-)
-def test_direct_light_gets_no_more_points_than_probes_say_there_is_time_for(each, power, sampling_seconds, points):
-    scene = replace(SCENE, sampling_seconds=sampling_seconds)
+def left_error(scene, points, seconds, variance):
+    """The squared error with so many points whose light takes so many seconds, in the words of the plan's docstring."""
+    samples = scene.cycles_samples + (SECONDS - seconds) / scene.sample_seconds
+    return (samples / 10.0) ** plan.SAMPLES_POWER + plan.POINTS_FACTOR * variance * points**plan.POINTS_POWER
 
-    def seconds_of(count):
-        return each * count**power
 
-    chosen = planned(scene, seconds_of, contrast=0.1)
-    number = chosen.points_per_pixel
-    assert number in points and chosen.reason == ("" if number else too_little(9.0))
-    if number == 0:
-        return
-    samples = 1000 + 200 * (number - 1)
-    # The plan goes on from the second probe with a power of its own.
-    (_, (share, expected)) = plan.PROBES
-    share_of_time = (plan.MORE_SHARE if number > 2 else plan.DIRECT_SHARE) * share ** min(expected - power, 0.0)
-    assert seconds_of(samples) <= share_of_time * SECONDS
-    # With thin highlights Cycles does better with the time.
-    assert planned(scene, seconds_of, contrast=2.0) == plan.DirectLightPlan(0, TOO_THIN)
+@pytest.mark.parametrize("variance", [0.0, 0.3, 30.0])
+@pytest.mark.parametrize("each", [1e-7, 3e-4, 1e-3, 2e-3, 1.0])
+def test_direct_light_gets_the_points_that_leave_the_least_error(each, variance):
+    """Of a scene whose samples all take the same time. What the plan expects of all from the probe is less, by its
+    power."""
+    scene = replace(SCENE, sampling_seconds=0.0)
+    chosen, errors = planned(scene, lambda count: each * count, variance), {}
+    for points in range(1, 6):
+        samples = 1000 + 200 * (points - 1)
+        seconds = each * samples * (samples / round(plan.PROBE_SHARE * 1200)) ** (plan.PROBE_POWER - 1.0)
+        errors[points] = left_error(SCENE, points, seconds, variance) if seconds < SECONDS else np.inf
+    best = min(errors, key=errors.get)
+    is_less = errors[best] <= (1.0 - plan.LEAST_GAIN) * 4.0 * left_error(SCENE, 1, 0.0, 0.0)
+    assert chosen == (plan.DirectLightPlan(best) if is_less else plan.DirectLightPlan(0, TOO_LITTLE_GAIN))
+    if each == 1.0 or variance == 30.0:
+        assert chosen.points_per_pixel == 0
+    if each == 1e-7 and variance < 30.0:
+        assert chosen.points_per_pixel == (5 if variance else 1)
+
+
+def test_more_points_than_there_are_pay_for_their_extraction():
+    def points(sampling_seconds):
+        scene = replace(SCENE, sampling_seconds=sampling_seconds)
+        return planned(scene, lambda count: 1e-7 * count, 0.3).points_per_pixel
+
+    assert [points(seconds) for seconds in (0.0, 9.0)] == [5, 2]
+
+
+def test_where_direct_light_is_not_what_is_noisy_not_even_a_probe_is_shaded():
+    few = replace(ERRORS, rest=0.9 * ERRORS.whole)
+    assert plan.direct_light_plan(replace(SCENE, errors=few)) == plan.DirectLightPlan(0, TOO_LITTLE_GAIN)
+    assert plan.direct_light_plan(SCENE).needs_probe
+
+
+def test_without_a_denoiser_samples_count_for_more():
+    """So direct light may take less of the time."""
+    worth = {}
+    for is_denoised in (True, False):
+        errors = replace(ERRORS, rest=0.3 * ERRORS.whole, is_denoised=is_denoised)
+        scene = replace(SCENE, errors=errors)
+        times = np.geomspace(1e-6, 1e-2, 40)
+        worth[is_denoised] = sum(planned(scene, lambda n, t=t: t * n).points_per_pixel > 0 for t in times)
+    assert worth[True] > worth[False] > 0
 
 
 def test_without_a_budget_or_without_surfaces_all_points_are_shaded():
     for scene in (replace(SCENE, budget=None, seconds_left=None), replace(SCENE, samples=0)):
         assert plan.direct_light_plan(scene) == plan.DirectLightPlan(2)
     # Without any time no probe is worth its time.
-    assert plan.direct_light_plan(replace(SCENE, seconds_left=0.0)) == plan.DirectLightPlan(0, too_little(9.0))
+    for scene in (replace(SCENE, seconds_left=0.0), replace(SCENE, errors=None)):
+        assert plan.direct_light_plan(scene) == plan.DirectLightPlan(0, too_little(9.0))
 
 
 def test_depth_of_field_has_all_of_its_points_or_none():
     scene = replace(SCENE, has_lens=True, points=17, most_points=17)
-    assert planned(scene, lambda count: 1e-5 * count).points_per_pixel == 17
+    assert planned(scene, lambda count: 1e-5 * count, 9.0).points_per_pixel == 17
     assert planned(scene, lambda count: 0.03 * count).points_per_pixel == 0
 
 

@@ -2,6 +2,8 @@
 
 import math
 import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 
@@ -17,15 +19,16 @@ from ..materials.graph import cut, ensure_nodes, is_seen_through, material_outpu
 from ..process.finished import FinishedJob, ShowJob
 from ..process.pixels import EDGE_SECONDS, rendered_channels
 from ..render_settings import enable_passes, render_exr
-from .pixels import REST_PASSES, open_scene, scene_named
+from .pixels import REST_PASSES, files_opened, open_scene, scene_named
 
 # A given number of samples is rendered in files, so that progress can be told: the fewest samples of a file, and the
 # most files of a half.
 FEWEST, MOST_OF_HALF = 16, 3
-# A budget is spent in files as well. PROBES: the most samples of the first ones. PROBED: the share of those that fit
-# which a probe may be; three samples alone seem up to a fifth too slow. SPENT: the share of the time that all files may
-# take. FILE_SECONDS: the processor seconds that a file takes beside its samples, for a million pixels.
-PROBES, PROBED, SPENT, FILE_SECONDS = (1, 3, 16), 1.0 / 8.0, 0.97, 1.0
+# A budget is spent in files as well. PROBES: the most samples of the first ones, of which halves are made. PROBED: the
+# share of those that fit which a probe may be; three samples alone seem up to a fifth too slow. SPENT: the share of the
+# time that all files may take. FILE_SECONDS: the processor seconds that a file takes beside its samples, for a million
+# pixels.
+PROBES, PROBED, SPENT, FILE_SECONDS = (1, 3, 8, 8), 1.0 / 8.0, 0.97, 1.0
 # PASSES: what a finished picture takes its parts from, and artists put together. GUIDES: what the denoiser needs.
 LIGHT_PASSES = tuple(
     f"{kind}_{factor}" for kind in ("diffuse", "glossy", "transmission") for factor in ("direct", "indirect", "color")
@@ -43,49 +46,73 @@ REFLECTING = ("Color", "Base Color", "Metallic", "Specular IOR Level", "Transmis
 
 def render_finished(job: FinishedJob, folder: Path, progress) -> dict:
     """Do the `job` and write EXRs into `folder`. Returns the manifest."""
-    warnings, started, seconds = [], time.process_time(), job.seconds
-    progress("open scene", 0.0)
-    open_scene(Path(job.scene), warnings, job.scripts)
-    scene = scene_named(job.scene_name)
-    render_settings.go_to_frame(scene, job.frame)
-    camera = render_settings.choose_camera(scene, job.camera)
-    layer = render_settings.only_view_layer(scene, warnings, job.view_layer, "rendered")
-    width, height = render_settings.set_resolution(scene, job.width, job.height)
-    render_settings.render_border(scene)  # an error where it is less than a pixel
-    if job.own_groups is not None:
-        render_settings.remove_extra_passes(layer)
-        for name in regroup(scene, tuple(job.own_groups)):
-            layer.lightgroups.add(name=name)
-    everything = reasons_for_cycles(scene, layer)
-    dropped = () if layer.cycles.denoising_store_passes else NOT_WRITTEN
-    _prepare(scene, layer, warnings)
-    has_edges, end = job.edges and not (everything or camera.data.dof.use_dof), None
-    shines = cache(_anything_shines)
-    if seconds is not None:
+    started, prepared = time.process_time(), _prepared.pop() if _prepared else None
+    if job.begun is None or prepared is None or prepared.files_opened != files_opened():
+        prepared = _PreparedScene(job, progress)
+    scene, layer = prepared.scene, prepared.layer
+    has_edges = job.edges and not (job.begins or prepared.everything or prepared.camera.data.dof.use_dof)
+    shines, pixels = cache(_anything_shines), math.prod(render_settings.picture_size(scene))
 
-        def end(first: Path) -> float:
-            reserve = has_edges and shines(first)
-            return started + SPENT * max(seconds - reserve * EDGE_SECONDS * width * height / 1e6, 0.0)
+    def end(first: Path) -> float:
+        reserve = has_edges and shines(first)
+        return started + SPENT * max(job.seconds - reserve * EDGE_SECONDS * pixels / 1e6, 0.0)
 
-    files, least = _render_chunks(scene, layer, folder, job.cycles_samples, end, progress)
+    if job.seconds is None:
+        files, least, each = *_render_chunks(scene, layer, folder, job.cycles_samples, progress), 0.0
+    else:
+        timed = _TimedFiles(scene, layer, prepared.seed, folder, end, progress, **(job.begun or {}))
+        timed.render_first()
+        if not job.begins:
+            timed.render_rest()
+        files, least, each = timed.files, timed.least, timed.each
+    if job.begins:
+        _prepared.append(prepared)
     # Their time is reserved; the last file may have taken a little longer than it should.
-    in_time = seconds is None or time.process_time() < started + LATEST_EDGES * seconds
+    in_time = job.seconds is None or time.process_time() < started + LATEST_EDGES * job.seconds
     if has_edges := has_edges and in_time and shines(folder / files[0][0]):
         _render_edges(scene, layer, folder, progress)
     return {
         "frame": scene.frame_current,
-        "camera": camera.name,
-        "to_camera": _to_camera(camera),
+        "camera": prepared.camera.name,
+        "to_camera": _to_camera(prepared.camera),
         "layer": layer.name,
         "files": files,
-        "least_seconds": least - started,
+        "each": each,
+        "least": least if job.begun else least - started,
         "edges": [EDGES, EDGE_SAMPLES[1]] if has_edges else None,
         "film_transparent": scene.render.film_transparent,
-        "dropped": dropped,
+        "dropped": prepared.dropped,
         "passes": render_settings.pass_names(),
-        "everything": everything,
-        "warnings": warnings,
+        "everything": prepared.everything,
+        "warnings": prepared.warnings,
     }
+
+
+class _PreparedScene:
+    """The scene of a job, opened and prepared, and what there is to say of it."""
+
+    def __init__(self, job: FinishedJob, progress):
+        self.warnings: list[str] = []
+        progress("open scene", 0.0)
+        open_scene(Path(job.scene), self.warnings, job.scripts)
+        self.files_opened, self.scene = files_opened(), scene_named(job.scene_name)
+        render_settings.go_to_frame(self.scene, job.frame)
+        self.camera = render_settings.choose_camera(self.scene, job.camera)
+        self.layer = render_settings.only_view_layer(self.scene, self.warnings, job.view_layer, "rendered")
+        render_settings.set_resolution(self.scene, job.width, job.height)
+        render_settings.render_border(self.scene)  # an error where it is less than a pixel
+        if job.own_groups is not None:
+            render_settings.remove_extra_passes(self.layer)
+            for name in regroup(self.scene, tuple(job.own_groups)):
+                self.layer.lightgroups.add(name=name)
+        self.everything = reasons_for_cycles(self.scene, self.layer)
+        self.dropped = () if self.layer.cycles.denoising_store_passes else NOT_WRITTEN
+        self.seed = self.scene.cycles.seed
+        _prepare(self.scene, self.layer, self.warnings)
+
+
+# Of the last job, if that only began a picture: the next one may go on with it.
+_prepared: list[_PreparedScene] = []
 
 
 def show_finished(job: ShowJob, folder: Path, progress) -> dict:
@@ -145,18 +172,15 @@ def _prepare(scene, layer, warnings: list[str]) -> None:
     layer.cycles.denoising_store_passes = True
 
 
-def _render_chunks(scene, layer, folder: Path, samples, end, progress) -> tuple[list[list], float]:
-    """Render `samples` samples; or as many as fit until the processor time `end(first file)`; or what the file says.
+def _render_chunks(scene, layer, folder: Path, samples, progress) -> tuple[list[list], float]:
+    """Render `samples` samples, or what the file says.
 
     Returns [file name in `folder`, samples in it] for each file, and the processor time after the first one.
     """
     cycles, files, done, first = scene.cycles, [], 0, 0.0
-    if samples is None and end is None:
+    if samples is None:
         return _render_as_saved(scene, layer, folder), time.process_time()
-    layer.samples, cycles.use_adaptive_sampling, cycles.time_limit = 0, False, 0.0
-    cycles.use_sample_subset = True
-    if end is not None:
-        return _render_until(end, scene, folder, progress)
+    _take_all_samples(scene, layer)
     half = -(-samples // 2)  # no file has more samples, so that there are two halves
     chunk = -(-half // max(1, min(half // FEWEST, MOST_OF_HALF)))
     while done < samples:
@@ -168,41 +192,65 @@ def _render_chunks(scene, layer, folder: Path, samples, end, progress) -> tuple[
     return files, first
 
 
-def _render_until(end, scene, folder: Path, progress) -> tuple[list[list], float]:
-    """As `_render_chunks`: files that tell what a sample takes, and then the halves of one sequence.
+def _take_all_samples(scene, layer) -> None:
+    """Let Cycles render as many samples as it is told, everywhere."""
+    layer.samples, scene.cycles.use_adaptive_sampling, scene.cycles.time_limit = 0, False, 0.0
+    scene.cycles.use_sample_subset = True
 
-    Its noise is spread more evenly than that of several: 222 samples of the product shot have 9 % less error.
+
+@dataclass
+class _TimedFiles:
+    """Files as `_render_chunks` renders them, as many samples as fit until the processor time `end(first file)`.
+
+    The first tell what a sample takes; then come the halves of one sequence. Its noise is spread more evenly than that
+    of several: 222 samples of the product shot have 9 % less error.
     """
-    cycles, files, first = scene.cycles, [], 0.0
-    of_file, seed = FILE_SECONDS * math.prod(render_settings.picture_size(scene)) / 1e6, cycles.seed
 
-    def render(count: int, sequence: int, offset: int = 0) -> float:
-        """Render samples of a sequence; the seconds that each takes."""
-        progress("Cycles", len(files) / (2 + len(PROBES)))
-        started, cycles.seed = time.process_time(), (seed + len(files) - (offset > 0)) % 2**31
+    scene: bpy.types.Scene
+    layer: bpy.types.ViewLayer
+    seed: int
+    folder: Path
+    end: Callable[[Path], float]
+    progress: Callable
+    files: list[list] = field(default_factory=list)
+    each: float = 0.0  # seconds of a sample
+    least: float = 0.0  # the processor time after the first file
+
+    def __post_init__(self):
+        self._of_file = FILE_SECONDS * math.prod(render_settings.picture_size(self.scene)) / 1e6
+        _take_all_samples(self.scene, self.layer)
+
+    def render_first(self) -> None:
+        """Render the PROBES, unless they are there."""
+        for count in PROBES[len(self.files) :]:
+            # The first file takes longer, since Cycles looks at the scene.
+            count = min(count, int(PROBED * self._affordable())) if self.files else count
+            if count < 1 and len(self.files) > 1:
+                break  # two files there are always
+            self._render(max(count, 1), max(count, 1))
+            self.least = self.least or time.process_time()
+
+    def render_rest(self) -> None:
+        """Render what still fits."""
+        if (sequence := self._affordable(2)) > 1:
+            half = -(-sequence // 2)
+            self._render(half, sequence)
+            if (rest := min(self._affordable(), sequence - half)) > 0:
+                self._render(rest, sequence, half)
+
+    def _render(self, count: int, sequence: int, offset: int = 0) -> None:
+        """Render samples of a sequence."""
+        cycles, number = self.scene.cycles, len(self.files)
+        self.progress("Cycles", number / (2 + len(PROBES)))
+        started, cycles.seed = time.process_time(), (self.seed + number - (offset > 0)) % 2**31
         cycles.samples, cycles.sample_offset, cycles.sample_subset_length = sequence, offset, count
-        _render_file(scene, folder, files, count)
+        _render_file(self.scene, self.folder, self.files, count)
         took = time.process_time() - started
-        return max(took - of_file, 0.1 * took) / count
+        self.each = max(took - self._of_file, 0.1 * took) / count
 
-    def affordable(files: int = 1) -> int:
-        return int((until - time.process_time() - files * of_file) / each)
-
-    for count in PROBES:
-        # The first file takes longer, since Cycles looks at the scene.
-        count = min(count, int(PROBED * affordable())) if files else count
-        if count < 1 and len(files) > 1:
-            break  # two files there are always
-        each = render(max(count, 1), max(count, 1))
-        if not first:
-            first = time.process_time()
-            until = end(folder / files[0][0])
-    if (sequence := affordable(2)) > 1:
-        half = -(-sequence // 2)
-        each = render(half, sequence)
-        if (rest := min(affordable(), sequence - half)) > 0:
-            render(rest, sequence, half)
-    return files, first
+    def _affordable(self, files: int = 1) -> int:
+        until = self.end(self.folder / self.files[0][0])
+        return int((until - time.process_time() - files * self._of_file) / self.each)
 
 
 def _render_file(scene, folder: Path, files: list[list], count: int) -> None:

@@ -31,6 +31,8 @@ class FinishedJob:
     scripts: bool = False  # run the scripts in the file
     own_groups: tuple[str, ...] | None = None  # lights, () for all, that get light groups of their own
     edges: bool = True  # also render what emits in sight separately, with smooth edges
+    begins: bool = False  # only the first files
+    begun: dict | None = None  # the `CyclesPicture.begun` that another job has begun in the same folder, to go on with
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,7 @@ class CyclesPicture:
     camera: str
     frame: int
     processor_seconds: float
-    least_seconds: float  # how many of them every picture of the scene takes
+    begun: dict  # its files, and processor seconds: `each` of a sample, the `least` that every picture of it takes
 
 
 def render_finished(job: FinishedJob, folder: Path, *, progress: Progress | None = None) -> CyclesPicture:
@@ -76,7 +78,8 @@ def render_finished(job: FinishedJob, folder: Path, *, progress: Progress | None
         smooth_emission=_smooth_emission(manifest, folder, channels, samples),
         everything=tuple(manifest["everything"]),
         warnings=tuple(manifest["warnings"]),
-        **{name: manifest[name] for name in ("camera", "frame", "processor_seconds", "least_seconds")},
+        begun={name: manifest[name] for name in ("files", "each", "least")},
+        **{name: manifest[name] for name in ("camera", "frame", "processor_seconds")},
     )
 
 

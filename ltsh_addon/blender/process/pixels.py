@@ -63,7 +63,7 @@ def too_little(budget: float | None) -> str:
     return f"the budget is too small for it, {budget:g} s"
 
 
-TOO_THIN = "highlights are thinner than pixels almost everywhere, of which Cycles tells more in the time of the budget"
+TOO_LITTLE_GAIN = "in the time of the budget it would not make the error less than Cycles' own samples do"
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from ltsh_addon.blender.process.finished import FinishedJob, render_finished
 from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels, with_points
 from ltsh_addon.cli import main
 from ltsh_addon.cycles.lobes import read_layer
-from ltsh_addon.pipeline import PictureOptions, RenderOptions, plan, render, shade_scene
+from ltsh_addon.pipeline import PictureOptions, RenderOptions, compositing, plan, render, shade_scene
 from ltsh_addon.pipeline.lighting import ShadowTracer, load_tables
 from ltsh_addon.pipeline.mixer import light_pictures, moved_light
 from ltsh_addon.pipeline.relight import LightChange, RelightData, relight
@@ -411,9 +411,11 @@ def test_a_budget_excludes_samples(tmp_path, capsys):
 
 
 @pytest.mark.newest
-def test_a_budget_chooses_points_rays_and_samples(tmp_path):
+def test_a_budget_chooses_points_rays_and_samples(tmp_path, monkeypatch):
     floor_and_ball(gray(), 1)
     parts.add_world(Color=(0.2, 0.2, 0.2, 1.0))
+    # However little LTSH's light wins beside thousands of samples.
+    monkeypatch.setattr(plan, "LEAST_GAIN", -1e6)
     # The larger one leaves time for everything, however slowly Blender starts on a busy machine.
     made = {budget: finished(tmp_path, budget=budget) for budget in (0.01, 10.0)}
     small, large = (one.report for one in made.values())
@@ -435,17 +437,29 @@ def test_a_budget_chooses_points_rays_and_samples(tmp_path):
 
 
 @pytest.mark.newest
-def test_highlights_thinner_than_pixels_are_told_from_those_that_points_show(tmp_path):
-    """Two points of each pixel on a smooth and on a crumpled floor, of facets of a third of a pixel."""
-    thin = {}
-    for name, height in (("smooth", 0.0), ("crumpled", 0.01)):
+def test_points_tell_what_highlights_they_miss_but_not_what_colors(tmp_path):
+    """Two points of each pixel on a smooth and on a crumpled floor, of facets of a third of a pixel, and on a flat one
+    with as fine checks, whose colors Cycles' samples tell."""
+
+    def checked():
+        material, bsdf = parts.principled(Roughness=1.0)
+        tree = material.node_tree
+        checks = tree.nodes.new("ShaderNodeTexChecker")
+        checks.inputs["Scale"].default_value = 25.0
+        checks.inputs["Color2"].default_value = (0.0, 0.0, 0.0, 1.0)
+        tree.links.new(checks.outputs["Color"], bsdf.inputs["Base Color"])
+        return material
+
+    variance, errors = {}, compositing.FirstErrors(4.0, *np.ones((2, SIZE, SIZE)), True)
+    for name, height in (("smooth", 0.0), ("crumpled", 0.01), ("checked", 0.0)):
         parts.empty_scene(SIZE, SIZE)
         side = np.linspace(-2.0, 2.0, 100)
         x, y = (grid.ravel() for grid in np.meshgrid(side, side))
         z = height * np.random.default_rng(2).random(len(x))
         corner = (np.arange(99)[:, None] * 100 + np.arange(99)).ravel()
         floor = parts.add_mesh(name, np.stack([x, y, z], axis=1), corner[:, None] + np.array([0, 1, 101, 100]))
-        floor.data.materials.append(parts.principled(Metallic=1.0, Roughness=0.1)[0])
+        metal = parts.principled(Metallic=1.0, Roughness=0.1)[0]
+        floor.data.materials.append(checked() if name == "checked" else metal)
         parts.add_camera((0.0, 0.0, 4.0), (0.0, 0.0, 0.0))
         parts.add_area_light(location=(0.5, 0.0, 3.0), size=0.2)
         path = parts.save(tmp_path / f"{name}.blend")
@@ -454,8 +468,13 @@ def test_highlights_thinner_than_pixels_are_told_from_those_that_points_show(tmp
         own = PictureOptions(path, output=tmp_path, sub_samples=2, shadows="on")
         with ShadowTracer(found.occluders, found.lights) as tracer:
             shader = render.DirectLightShader(own, 9.0, load_tables(("ltsh4c",)), tracer)
-            thin[name] = shader.probe(with_points(found, 2), 1.0).contrast
-    assert thin["smooth"] < 0.5 * plan.THIN_CONTRAST and thin["crumpled"] > 1.5 * plan.THIN_CONTRAST
+            probe = shader.probe(with_points(found, 2), errors, 1.0)
+            result = next(iter(shader.shaded(found, shader.shadows(found)).results.values()))
+        light = found.film.image(result.shading.diffuse.sum(axis=0) + result.shading.specular.sum(axis=0))
+        # The sum over squares of the picture, all as likely; relative to the light.
+        variance[name] = probe.variance / np.square(light.mean(axis=-1)).sum()
+    assert 0.0 < 30.0 * variance["smooth"] < variance["crumpled"]
+    assert 30.0 * variance["checked"] < variance["crumpled"]
 
 
 def test_the_files_of_a_budget_share_no_noise(tmp_path):
@@ -483,22 +502,36 @@ def test_a_budget_renders_the_samples_that_cycles_would_render_at_once(tmp_path,
     monkeypatch.setattr(finished_module, "_render_file", render_file)
     monkeypatch.setattr(finished_module, "FILE_SECONDS", 1e6 / SIZE**2)
     monkeypatch.setattr(finished_module.time, "process_time", lambda: clock[0])
-    rendered, first = finished_module._render_until(lambda path: 28.5, scene, tmp_path, lambda *told: None)
+
+    def timed(until, **begun):
+        layer = scene.view_layers[0]
+        return finished_module._TimedFiles(scene, layer, 0, tmp_path, lambda path: until, lambda *told: None, **begun)
+
+    first = timed(28.5)
+    first.render_first()
+    # Another job goes on with them.
+    rest = timed(28.5, files=first.files, each=first.each, least=first.least)
+    rest.render_first()
+    rest.render_rest()
+    rendered = rest.files
     counts = [count for _, count in rendered]
-    assert counts == [1, 3, 2, 9, 8] and first == 2.0 and clock[0] == 28.0
-    halves = [imaging.read_layers(tmp_path / name)["ViewLayer.Combined"] for name, _ in rendered[3:]]
-    scene.cycles.use_sample_subset, scene.cycles.samples, scene.cycles.seed = False, 17, 3
+    assert counts == [1, 3, 2, 2, 7, 7] and rest.least == 2.0 and clock[0] == 28.0
+    halves = [imaging.read_layers(tmp_path / name)["ViewLayer.Combined"] for name, _ in rendered[4:]]
+    scene.cycles.use_sample_subset, scene.cycles.samples, scene.cycles.seed = False, 14, 4
     render_settings.render_exr(scene, tmp_path / "whole.exr")
     whole = imaging.read_layers(tmp_path / "whole.exr")["ViewLayer.Combined"]
     # Sums in another order.
     assert (
-        np.abs(np.average(halves, axis=0, weights=counts[3:]) - whole).max()
+        np.abs(np.average(halves, axis=0, weights=counts[4:]) - whole).max()
         < 1e-5
         < 1e-2
         < np.abs(halves[0] - whole).max()
     )
     # However little time there is, there are two files.
-    assert len(finished_module._render_until(lambda path: 0.0, scene, tmp_path, lambda *told: None)[0]) == 2
+    none = timed(0.0)
+    none.render_first()
+    none.render_rest()
+    assert len(none.files) == 2
 
 
 def test_the_first_points_of_a_pixel_are_those_of_a_picture_with_fewer(tmp_path):

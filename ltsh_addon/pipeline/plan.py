@@ -28,8 +28,8 @@ PROBE_SHARE, PROBE_POWER = 0.04, 0.75
 # one as n to -1. In seven scenes, from 10 to 60 samples: -0.42 to -0.72, of what direct light leaves -0.3 to -0.6.
 # POINTS_FACTOR, POINTS_POWER: what of their variance is the squared error of one point, and of several: these are
 # spread evenly. In five scenes 0.12 to 0.5, and from one to three points -1 to -2. LEAST_GAIN: by this share direct
-# light must make the squared error less, to be shaded: what is left of it is more than the plan foretells.
-SAMPLES_POWER, POINTS_FACTOR, POINTS_POWER, LEAST_GAIN = -0.56, 0.5, -1.5, 0.5
+# light must make the squared error less, to be shaded: what the plan foretells is up to 1.5 times wrong.
+SAMPLES_POWER, POINTS_FACTOR, POINTS_POWER, LEAST_GAIN = -0.56, 0.5, -1.5, 0.25
 
 
 @dataclass(frozen=True)
@@ -113,10 +113,9 @@ def direct_light_plan(scene: SceneMeasurements) -> DirectLightPlan:
     again = np.where(counts > scene.points, scene.sampling_seconds * (1.0 + counts / scene.points), 0.0)
 
     def noise(taken) -> np.ndarray:
-        """The factor of squared errors where direct light has `taken` so many seconds; inf where they are too many."""
-        more = (seconds - taken) / scene.sample_seconds
-        power = SAMPLES_POWER if errors.is_denoised else -1.0
-        return np.where(more > 0.0, ((scene.cycles_samples + np.maximum(more, 0.0)) / errors.samples) ** power, np.inf)
+        """The factor of squared errors where direct light has `taken` so many seconds."""
+        samples = scene.cycles_samples + np.maximum(seconds - taken, 0.0) / scene.sample_seconds
+        return (samples / errors.samples) ** (SAMPLES_POWER if errors.is_denoised else -1.0)
 
     def is_worth(whole, left) -> bool:
         return left <= (1.0 - LEAST_GAIN) * whole * noise(0.0)
@@ -128,7 +127,7 @@ def direct_light_plan(scene: SceneMeasurements) -> DirectLightPlan:
     expected = probe.seconds * (samples / probe.samples) ** PROBE_POWER + again
     # With depth of field direct light is denoised as well.
     factors = 0.0 * counts if scene.has_lens else POINTS_FACTOR * counts**POINTS_POWER
-    left = probe.rest * noise(expected) + factors * probe.variance
+    left = np.where(expected < seconds, probe.rest * noise(expected) + factors * probe.variance, np.inf)
     best = int(np.argmin(left))
     return DirectLightPlan(int(counts[best])) if is_worth(probe.whole, left[best]) else by_cycles
 

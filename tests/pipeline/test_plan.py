@@ -80,6 +80,15 @@ def test_where_direct_light_is_not_what_is_noisy_not_even_a_probe_is_shaded():
     assert plan.direct_light_plan(SCENE).needs_probe
 
 
+def test_points_that_there_is_no_time_for_are_not_shaded_even_if_nothing_else_errs():
+    clean = replace(SCENE, errors=replace(ERRORS, rest=0.0 * ERRORS.whole), sampling_seconds=0.0)
+    # One point takes each x 48 x (1000 / 48)^0.75 s, 468 each, and two take 537 each.
+    points = [
+        planned(clean, lambda count, each=each: each * count, 0.1).points_per_pixel for each in (1e-7, 6e-3, 1e-2)
+    ]
+    assert points == [5, 1, 0] and 468 * 6e-3 < SECONDS < 537 * 6e-3
+
+
 def test_without_a_denoiser_samples_count_for_more():
     """So direct light may take less of the time."""
     worth = {}

@@ -272,7 +272,7 @@ def first_errors(cycles, by_pass: dict[str, np.ndarray], denoise: str, progress)
         def read(key, half=half):
             return read_layer(half.channels, cycles.names[key], "RGB").astype(np.float64)
 
-        light = read_layer(half.channels, "Combined", "RGB") - read("emission") - read("background")
+        light = read_layer(half.channels, "Combined", "RGB") - sum(map(read, cycles.shining))
         direct = sum(~by_pass[name][..., None] * read(key) * colors[name] for name, (key, _) in DIRECT.items())
         whole.append(np.nan_to_num(light))
         rest.append(np.nan_to_num(light - direct))

@@ -44,7 +44,8 @@ def test_errors_are_those_that_the_pictures_have():
 
 def begun(*, direct, rest, shining=0.0):
     """A picture of Cycles that was begun: halves of 11 and 9 samples of white surfaces, whose diffuse direct light and
-    other light have normal noise with these deviations of a sample, and what shines in sight."""
+    other light have normal noise with these deviations of a sample, and what shines in sight before a transparent
+    film."""
     random, made = np.random.default_rng(2), []
 
     def planes(name, image):
@@ -53,13 +54,15 @@ def begun(*, direct, rest, shining=0.0):
     for count in (11, 9):
         lit, other = (1.0 + one / np.sqrt(count) * random.standard_normal(SHAPE) for one in (direct, rest))
         black = np.zeros(SHAPE)
-        passes = {"Combined": lit + other + shining, "D": lit, "S": black, "E": black + shining, "B": black}
+        passes = {"Combined": lit + other + shining, "D": lit, "S": black, "E": black + shining, "B": black + 7.0}
         channels = {key: plane for name, image in passes.items() for key, plane in planes(name, image).items()}
         made.append(SimpleNamespace(channels=channels, samples=count))
     names = dict(
         diffuse_light="D", diffuse_color="W", specular_light="S", specular_color="W", emission="E", background="B"
     )
-    return SimpleNamespace(halves=made, channels=planes("W", np.ones(SHAPE)), names=names, guides={})
+    return SimpleNamespace(
+        halves=made, channels=planes("W", np.ones(SHAPE)), names=names, guides={}, shining=("emission",)
+    )
 
 
 @pytest.mark.parametrize("left", [False, True])

@@ -53,6 +53,7 @@ class CyclesPicture:
     names: dict[str, str]  # of passes, as in `pass_names`
     samples: int
     halves: tuple[CyclesHalf, ...]  # of its samples, with noise of their own; () if there is one file
+    shining: tuple[str, ...]  # the keys of the passes with what emits in sight, as far as Combined has it
     smooth_emission: dict[str, np.ndarray]  # (H, W, 3) what emits in sight, with smooth edges, by the key of its pass
     everything: tuple[str, ...]  # reasons why all direct light is left to Cycles
     warnings: tuple[str, ...]
@@ -67,6 +68,7 @@ def render_finished(job: FinishedJob, folder: Path, *, progress: Progress | None
     manifest = run_scene_job(job, folder, progress)
     channels, halves = _mean_of_chunks(manifest, folder)
     samples = sum(count for _, count in manifest["files"])
+    shining = ("emission",) if manifest["film_transparent"] else ("emission", "background")
     dropped = tuple(f"{name}." for name in manifest["dropped"])
     return CyclesPicture(
         channels={name: plane for name, plane in channels.items() if not name.startswith(dropped)},
@@ -75,7 +77,8 @@ def render_finished(job: FinishedJob, folder: Path, *, progress: Progress | None
         names=manifest["passes"],
         samples=samples,
         halves=halves,
-        smooth_emission=_smooth_emission(manifest, folder, channels, samples),
+        shining=shining,
+        smooth_emission=_smooth_emission(manifest, folder, channels, shining, samples),
         everything=tuple(manifest["everything"]),
         warnings=tuple(manifest["warnings"]),
         begun={name: manifest[name] for name in ("files", "each", "least")},
@@ -83,16 +86,14 @@ def render_finished(job: FinishedJob, folder: Path, *, progress: Progress | None
     )
 
 
-def _smooth_emission(manifest: dict, folder: Path, channels: dict[str, np.ndarray], samples: int) -> dict:
+def _smooth_emission(manifest: dict, folder: Path, channels: dict[str, np.ndarray], shining, samples: int) -> dict:
     """`CyclesPicture.smooth_emission`: means over the samples of the whole scene and of EDGES; {} without EDGES."""
     if manifest["edges"] is None:
         return {}
     name, most = manifest["edges"]
     edges = _without_layer(rendered_channels(folder / name), manifest["layer"])
     count = most * edges["Debug Sample Count.X"][..., None]
-    names = {key: manifest["passes"][key] for key in ("emission", "background")}
-    if manifest["film_transparent"]:
-        del names["background"]
+    names = {key: manifest["passes"][key] for key in shining}
     return {
         key: (count * read_layer(edges, name, "RGB") + samples * read_layer(channels, name, "RGB")) / (count + samples)
         for key, name in names.items()

@@ -29,7 +29,7 @@ PROBE_SHARE, PROBE_POWER = 0.04, 0.75
 # POINTS_FACTOR, POINTS_POWER: what of their variance is the squared error of one point, and of several: these are
 # spread evenly. In five scenes 0.12 to 0.5, and from one to three points -1 to -2. LEAST_GAIN: by this share direct
 # light must make the squared error less, to be shaded: what the plan foretells is up to 1.5 times wrong.
-SAMPLES_POWER, POINTS_FACTOR, POINTS_POWER, LEAST_GAIN = -0.56, 0.5, -1.5, 0.25
+SAMPLES_POWER, POINTS_FACTOR, POINTS_POWER, LEAST_GAIN = -0.56, 0.5, -1.5, 0.2
 
 
 @dataclass(frozen=True)

@@ -275,7 +275,7 @@ class DirectLightShader:
         """Shades squares of the picture that have a `share` of its samples, chosen at random by Cycles' error there."""
         from ..blender.process.pixels import ended_at_horizons
 
-        film, start = extraction.film, time.process_time()
+        film = extraction.film
         row, column = np.indices((film.height, film.width)) // SQUARE
         square_of_pixel = (row * film.width + column).ravel()
         whole, rest = (np.bincount(square_of_pixel, one.ravel()) for one in (errors.whole, errors.rest))
@@ -287,9 +287,12 @@ class DirectLightShader:
         count = np.cumsum(np.bincount(square, minlength=len(whole))[order])
         squares = order[: 1 + np.searchsorted(count, share * len(square))]
         chosen = np.isin(square, squares)
-        some = replace(extraction, samples=extraction.samples.take(chosen), film=film.take(chosen))
-        some = ended_at_horizons(some)
-        comparison = self.shaded(some, self.shadows(some))
+        # The first square with samples makes what all others have, such as maps of skies.
+        for mask in (square == order[np.argmax(count > 0)], chosen):
+            start = time.process_time()
+            some = replace(extraction, samples=extraction.samples.take(mask), film=film.take(mask))
+            some = ended_at_horizons(some)
+            comparison = self.shaded(some, self.shadows(some))
         variance = compositing.variance_of_points(some, next(iter(comparison.results.values())))
         variance = np.bincount(square_of_pixel, variance.ravel())
         sums = (float((one[squares] / weight[squares]).sum()) for one in (whole, rest, variance))

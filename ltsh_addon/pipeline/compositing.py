@@ -265,17 +265,15 @@ def first_errors(cycles, by_pass: dict[str, np.ndarray], denoise: str, progress)
     (H, W) of the direct light that is left to Cycles."""
     if len(cycles.halves) < 2:
         return None
-    whole, rest = [], []
-    colors = {name: read_layer(cycles.channels, cycles.names[color], "RGB") for name, (_, color) in DIRECT.items()}
+    whole, rest, passes = [], [], []
+    for name, (key, color) in DIRECT.items():
+        layers = (read_layer(cycles.channels, cycles.names[color], "RGB"), (cycles.names[key],))
+        passes.append(DirectPass(np.zeros(()), {}, ~by_pass[name], np.zeros(()), *layers))
     for half in cycles.halves:
-
-        def read(key, half=half):
-            return read_layer(half.channels, cycles.names[key], "RGB").astype(np.float64)
-
-        light = read_layer(half.channels, "Combined", "RGB") - sum(map(read, cycles.shining))
-        direct = sum(~by_pass[name][..., None] * read(key) * colors[name] for name, (key, _) in DIRECT.items())
+        shining = sum(read_layer(half.channels, cycles.names[key], "RGB").astype(np.float64) for key in cycles.shining)
+        light = read_layer(half.channels, "Combined", "RGB") - shining
         whole.append(np.nan_to_num(light))
-        rest.append(np.nan_to_num(light - direct))
+        rest.append(np.nan_to_num(light - sum(one.replaced(half) for one in passes)))
     (_, clean, _), denoiser, _ = _denoised([[], [*whole, *rest], []], cycles.guides, denoise, progress)
     brightness, counts = sum(clean[:2]).mean(axis=-1), [half.samples for half in cycles.halves]
     counts_at_all = brightness <= np.quantile(brightness, 1.0 - BRIGHTEST)

@@ -105,7 +105,7 @@ def direct_passes(comparison: Comparison, cycles) -> dict[str, DirectPass]:
         if not is_shaded:
             passes[name] = DirectPass(np.zeros((*shape, 3)), {}, np.zeros(shape, bool), light, color)
             continue
-        image, is_replaced = comparison.images[technique, name], ~extraction.left_to_cycles.by_pass[name]
+        image, is_replaced = comparison.images[technique, name], extraction.left_to_cycles.replaced(name)
         recoloring = np.ones(color.shape)
         if name == "diffuse" and film.sub_samples < cycles.samples and not extraction.picture.has_lens:
             radiance, normal = result.shading.diffuse.sum(axis=0), read_layer(cycles.guides, *NORMAL) @ cycles.to_camera
@@ -251,10 +251,10 @@ def _weights(noisy, others, samples) -> tuple[list[np.ndarray], tuple[float, flo
 
 @dataclass(frozen=True)
 class FirstErrors:
-    """What the first samples of Cycles tell of its errors, as squares (H, W) in means around each pixel, without the
-    brightest pixels."""
+    """What the first samples of Cycles tell of its errors: of each half of them squares (2, H, W), in means around each
+    pixel, without the brightest pixels. They may be below 0, since the noise of the other half is taken off."""
 
-    samples: float  # half of the first, which have these errors
+    samples: float  # of a half, which has these errors
     whole: np.ndarray  # of Cycles' picture
     rest: np.ndarray  # of the picture without the direct light that LTSH would replace
     is_denoised: bool
@@ -278,7 +278,7 @@ def first_errors(cycles, by_pass: dict[str, np.ndarray], denoise: str, progress)
     brightness, counts = sum(clean[:2]).mean(axis=-1), [half.samples for half in cycles.halves]
     counts_at_all = brightness <= np.quantile(brightness, 1.0 - BRIGHTEST)
     errors = [_squared_errors(*pair, counts) for pair in ((clean[:2], whole), (clean[2:], rest))]
-    maps = (_mean_around(np.where(counts_at_all, 0.5 * sum(one), 0.0)) for one in errors)
+    maps = (np.stack([box_mean(np.where(counts_at_all, half, 0.0), ERROR_RADIUS) for half in one]) for one in errors)
     return FirstErrors(0.5 * sum(counts), *maps, bool(denoiser))
 
 

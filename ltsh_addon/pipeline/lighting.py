@@ -28,7 +28,7 @@ from ..scene import (
     SurfaceSamples,
     listed,
 )
-from ..workers.pool import cores
+from ..workers.pool import WorkerPool, cores, opened
 
 # MOST_PAIRS: how many pairs of a sample and a light have their radiance in memory at a time.
 MOST_PAIRS = 1 << 25
@@ -99,7 +99,7 @@ def rays_of_samples(rays: int, film: Film) -> int:
 
 
 class ShadowTracer:
-    """Context that finds the shares of `lights` that samples see past `occluders`."""
+    """Context that finds the shares of `lights` that samples see past `occluders`, by the processes of its `pool`."""
 
     def __init__(self, occluders: visibility.Occluders, lights: Sequence[Light]):
         self._occluders, self._lights = occluders, lights
@@ -108,9 +108,11 @@ class ShadowTracer:
         from ..blender.process.blender_process import embree_libraries
 
         self._tracer = visibility.open_tracer(self._occluders, embree_libraries())
+        self.pool = WorkerPool(self._tracer)
         return self
 
     def __exit__(self, *error):
+        self.pool.close()
         self._tracer.close()
 
     def trace(
@@ -124,7 +126,7 @@ class ShadowTracer:
         """The shadows of `samples` under all lights; see `visibility.trace_visibility` for the other arguments."""
         start = time.perf_counter()
         estimate = visibility.trace_visibility(
-            samples, self._lights, self._tracer, sampling, workers=workers, progress=progress
+            samples, self._lights, self._tracer, sampling, workers=workers or self.pool, progress=progress
         )
         shares = {name: getattr(estimate, name) for name in sampling.passes}
         noise = {name: estimate.noise(name, sampling.film) for name in sampling.passes}
@@ -183,7 +185,7 @@ def shade_lights(
     shadowing: Sequence[Shadows | None] = (None,),
     *,
     rows: Sequence[int] | None = None,
-    workers: int | None = None,
+    workers: int | WorkerPool | None = None,
     progress: Callable[[float], bool | None] | None = None,
 ) -> list[shading.Shading]:
     """Radiance of `samples` (P) under `lights` (L): one Shading for each entry of `shadowing`.
@@ -311,12 +313,14 @@ class TechniqueResult:
     unshadowed: shading.Shading | None = None  # the same without shadows, where `shading` has shadows
 
 
-def evaluated(tables, extraction, shadows, options, progress) -> dict[str, TechniqueResult]:
-    """The results of all techniques in `tables` (see `prepare`), by name."""
-    return {name: _evaluate(name, table, extraction, shadows, options, progress) for name, table in tables.items()}
+def evaluated(tables, extraction, shadows, options, progress, workers=None) -> dict[str, TechniqueResult]:
+    """The results of all techniques in `tables` (see `prepare`), by name; `workers` are as for `shade`."""
+    given = extraction, shadows, options, progress
+    with opened(workers) as pool:
+        return {name: _evaluate(name, table, *given, pool) for name, table in tables.items()}
 
 
-def _evaluate(name, table, extraction, shadows, options, progress) -> TechniqueResult:
+def _evaluate(name, table, extraction, shadows, options, progress, pool) -> TechniqueResult:
     """Shade all samples; the reference shades those of randomly chosen pixels where there are too many."""
     samples, subset = extraction.samples, None
     limit = min(options.reference_samples, max(FEWEST_SAMPLES, MOST_REFERENCE_PAIRS // max(len(extraction.lights), 1)))
@@ -334,7 +338,8 @@ def _evaluate(name, table, extraction, shadows, options, progress) -> TechniqueR
         if report(0.0) is False:
             raise Cancelled(f"stopped before {name} shaded the {pass_name} pass")
         start = time.perf_counter()
-        shadings = shade_lights(samples, extraction.lights, table, (pass_name,), wanted, progress=report)
+        shaded = samples, extraction.lights, table, (pass_name,), wanted
+        shadings = shade_lights(*shaded, workers=pool, progress=report)
         for of_pass, shaded in zip(lit, shadings, strict=True):
             of_pass[pass_name] = shaded
         seconds[pass_name] = time.perf_counter() - start

@@ -469,6 +469,11 @@ class RenderOptions(CameraOptions):
     keep_visibility: bool = flag("--keep-visibility", "also keep what `relight` needs, beside the EXR as .npz")
     own_groups: tuple[str, ...] | None = option(default=None)  # lights, () for all, that get light groups of their own
 
+    @property
+    def needs_each_light(self) -> bool:
+        """Whether the light of each lamp is wanted by itself, on all of the picture."""
+        return self.keep_visibility or self.own_groups is not None
+
 
 @dataclass(frozen=True)
 class MatchOptions(TaskOptions):

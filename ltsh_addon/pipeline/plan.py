@@ -11,9 +11,9 @@ from .compositing import FirstErrors
 from .options import SHADOW_RAYS, RenderOptions
 
 # Points per pixel. Without a budget, one for SAMPLES_OF_POINT samples of Cycles, up to DEFAULT_POINTS: a point takes 80
-# us, a sample 4 to 8. What fewer than LEAST_POINTS win, as many more samples of Cycles win as well. With a budget,
-# FIRST_POINTS: of the samples on which the plan rests, and MOST_POINTS: at most.
-FIRST_POINTS, DEFAULT_POINTS, SAMPLES_OF_POINT, MOST_POINTS = 3, 9, 32, 17
+# us, a sample 4 to 8. What fewer than LEAST_POINTS win, as many more samples of Cycles win as well. FEWEST_POINTS:
+# with a budget, or where each light by itself is wanted. MOST_POINTS: with a budget, at most.
+FEWEST_POINTS, DEFAULT_POINTS, SAMPLES_OF_POINT, MOST_POINTS = 3, 9, 32, 17
 # Processor seconds of denoising. DENOISER_START_SECONDS: always. FIRST_DENOISING_SECONDS: for a picture of a million
 # pixels. NEXT_DENOISING_SECONDS: for each further picture of that size.
 DENOISER_START_SECONDS, FIRST_DENOISING_SECONDS, NEXT_DENOISING_SECONDS = 0.25, 12.0, 4.0
@@ -21,27 +21,68 @@ DENOISER_START_SECONDS, FIRST_DENOISING_SECONDS, NEXT_DENOISING_SECONDS = 0.25, 
 # SOFT_SHARE: the share of the pairs of a pixel and a light that lie in soft shadows.
 SHADOWS_SHARE, RAY_SECONDS, SOFT_SHARE = 0.02, 6e-7, 0.1
 MOST_OVER = 1.1  # how many times the budget a picture may take without a warning
-# The time of direct light is extrapolated from a few squares of the picture. PROBE_SHARE: the share of the samples that
-# these have. PROBE_POWER: of the number of samples, with which the time grows from there; in six scenes 0.65 to 0.95.
-PROBE_SHARE, PROBE_POWER = 0.04, 0.75
+# With a budget direct light is shaded in those squares of the picture where Cycles errs most. SQUARE: their size in
+# pixels. READ_SHARE: the share of the time for reading their samples. READ_SECONDS: of a point. SHARES: of the squares
+# that are read, of which the plan takes one.
+SQUARE, READ_SHARE, READ_SECONDS, SHARES = 8, 0.03, 6e-6, (0.08, 0.15, 0.25, 0.4, 0.65, 1.0)
+# The time of direct light is extrapolated from a few of these. PROBE_SHARE: the share of the samples that they have.
+# PROBE_POWER: of the number of samples, with which the time grows from there; in six scenes 0.65 to 0.95. LEAST_WEIGHT:
+# with which a square is chosen, in units of the whole error.
+PROBE_SHARE, PROBE_POWER, LEAST_WEIGHT = 0.04, 0.8, 1e-6
 # SAMPLES_POWER: with n samples of Cycles the squared error of a denoised picture falls as n to this power, of a noisy
 # one as n to -1. In seven scenes, from 10 to 60 samples: -0.42 to -0.72, of what direct light leaves -0.3 to -0.6.
-# POINTS_FACTOR, POINTS_POWER: what of their variance is the squared error of one point, and of several: these are
-# spread evenly. In five scenes 0.12 to 0.5, and from one to three points -1 to -2. LEAST_GAIN: by this share direct
-# light must make the squared error less, to be shaded: what the plan foretells is up to 1.5 times wrong.
-SAMPLES_POWER, POINTS_FACTOR, POINTS_POWER, LEAST_GAIN = -0.56, 0.5, -1.5, 0.2
+# POINTS_POWER: with p points the squared error of direct light is their variance times p to this power: they are spread
+# evenly. In five scenes, from one to three points: -1 to -2.
+SAMPLES_POWER, POINTS_POWER = -0.56, -1.5
+# GAIN_SHARE: what remains of the gain that the first samples foretell: the squares where they err most err less
+# afterwards; in four scenes 0.4 to 1.1. LEAST_GAIN: by this share direct light must make the squared error less.
+GAIN_SHARE, LEAST_GAIN = 0.7, 0.15
+
+
+class Squares:
+    """Squares of a picture (H, W), those first where LTSH wins most of Cycles' squared error by its first `errors`.
+
+    Squares that seem best are so by chance in part. So what LTSH wins in those that are best by one half of the samples
+    is told by the other half.
+    """
+
+    def __init__(self, errors: FirstErrors):
+        self.errors, self._shape = errors, errors.whole.shape[1:]
+        height, width = self._shape
+        row, column = np.arange(height)[:, None] // SQUARE, np.arange(width) // SQUARE
+        square = (row * -(-width // SQUARE) + column).ravel()
+        pixels = np.bincount(square)
+        first, second = (np.bincount(square, one.ravel()) for one in errors.whole - errors.rest)
+        mean = 0.5 * (first + second)
+        best, *others = (np.argsort(-one / pixels, kind="stable") for one in (mean, second, first))
+        self._rank = np.argsort(best)[square]  # of the square of each pixel
+        self.whole = 0.5 * errors.whole.sum()  # Cycles' squared error, a sum over all pixels
+        self.gain = mean[best]  # (S,) what LTSH wins of it in each square
+        # (S,) and in the first of them, without chance
+        self.gains = 0.5 * sum(np.cumsum(one[order]) for one, order in zip((first, second), others, strict=True))
+
+    def sums(self, image: np.ndarray | float = 1.0, pixels: np.ndarray | None = None) -> np.ndarray:
+        """Sums (S,) of an `image` (H, W); or of values at `pixels` (P,), which are counted row by row."""
+        rank = self._rank if pixels is None else self._rank[pixels]
+        values = np.broadcast_to(image, self._shape if pixels is None else rank.shape).ravel()
+        return np.bincount(rank, values, minlength=len(self.gain))
+
+    def pixels(self, squares) -> np.ndarray:
+        """Mask (H, W) of the pixels of `squares`, which are numbers or a slice."""
+        chosen = np.zeros(len(self.gain), bool)
+        chosen[squares] = True
+        return chosen[self._rank].reshape(self._shape)
 
 
 @dataclass(frozen=True)
 class Probe:
-    """What squares of the picture, fully shaded, tell of the whole: sums over their pixels, those of each square
-    divided by how likely it was chosen."""
+    """What some of the squares, fully shaded, tell of the others."""
 
     samples: int
     seconds: float  # processor time of their direct light
-    whole: float  # the `FirstErrors`
-    rest: float
-    variance: float  # of direct light among the points of a pixel
+    variances: np.ndarray  # (Q,) of the points of a pixel, over what LTSH wins, of squares drawn by what it wins
+    of_one_point: np.ndarray  # (S,) samples of the first of the squares
+    of_all_points: np.ndarray  # (S,) after equal ones are merged
 
 
 @dataclass(frozen=True)
@@ -50,86 +91,86 @@ class SceneMeasurements:
 
     budget: float | None  # of the whole picture; None: no limit
     seconds_left: float | None  # of the budget, before denoising
-    sampling_seconds: float  # of the first points
     edge_seconds: float  # that Cycles needs beside its samples
-    points: int  # per pixel, of the samples that are there
-    most_points: int
-    samples_of_one_point: int
-    samples: int  # of all `points`, after equal ones are merged
-    has_lens: bool  # depth of field, which needs all points from the start
+    points: int  # of each pixel that are there
+    has_lens: bool  # depth of field, which needs all points
+    needs_all: bool = False  # squares
     cycles_samples: int = 0  # of Cycles that are there
     sample_seconds: float = 0.0  # of one more
-    errors: FirstErrors | None = None  # of these samples
+    squares: Squares | None = None  # with the errors of these samples
     probe: Probe | None = None
 
 
 @dataclass(frozen=True)
 class DirectLightPlan:
-    """How many points per pixel LTSH shades; 0: all direct light is left to Cycles, for the `reason`.
+    """How many points per pixel LTSH shades, and in how many of the squares; without any, all direct light is left to
+    Cycles, for the `reason`.
 
-    If `needs_probe`, the plan is not final: a `Probe` with PROBE_SHARE of the samples is needed.
+    If `needs_probe`, the plan is not final: a `Probe` of so many squares is needed.
     """
 
     points_per_pixel: int = 0
+    squares: int = 0
     reason: str = ""
     needs_probe: bool = False
 
 
-def first_and_most_points(options: RenderOptions) -> tuple[int, int]:
-    """Points per pixel of the first samples, and the most that the plan may ask for; 0: all direct light is left to
-    Cycles, whose samples are too few."""
+def most_points(options: RenderOptions) -> int:
+    """The most points per pixel; 0: all direct light is left to Cycles, whose samples are too few."""
     from ..blender.process.pixels import LEAST_POINTS
 
-    most = options.sub_samples or MOST_POINTS
-    if options.budget is None and options.sub_samples is None:
-        samples = options.cycles_samples or SAMPLES_OF_POINT * DEFAULT_POINTS
-        most = min(samples // SAMPLES_OF_POINT, DEFAULT_POINTS)
-        if options.keep_visibility or options.own_groups is not None:
-            most = max(most, FIRST_POINTS)  # each light by itself is wanted
-        elif most < LEAST_POINTS:
-            most = 0
-    # Depth of field needs all of its points from the start.
-    return (most if options.budget is None or most > MOST_POINTS else min(FIRST_POINTS, most)), most
+    if options.budget is not None or options.sub_samples is not None:
+        return options.sub_samples or MOST_POINTS
+    samples = options.cycles_samples or SAMPLES_OF_POINT * DEFAULT_POINTS
+    most = min(samples // SAMPLES_OF_POINT, DEFAULT_POINTS)
+    if options.needs_each_light:
+        return max(most, FEWEST_POINTS)
+    return most if most >= LEAST_POINTS else 0
 
 
 def direct_light_plan(scene: SceneMeasurements) -> DirectLightPlan:
-    """The points per pixel with which the remaining budget leaves the least error, or why Cycles does better alone.
+    """The points per pixel and the squares with which the remaining budget leaves the least error, or why Cycles does
+    better alone.
 
     With n samples, of which some are there and the others follow in the time that direct light leaves, the squared
-    error is that of Cycles' picture, or that of its rest and that of direct light by its points.
+    error is that of Cycles' picture. Of what its direct light has of it in a square, D, LTSH wins D / (D + A), A that
+    of its points: both pictures are weighed by their errors.
     """
     from ..blender.process.pixels import TOO_LITTLE_GAIN, too_little
 
-    if scene.seconds_left is None or scene.samples == 0:
-        return DirectLightPlan(scene.points)
-    seconds, errors = scene.seconds_left - scene.edge_seconds, scene.errors
-    if seconds <= 0.0 or errors is None:
-        return DirectLightPlan(0, too_little(scene.budget))
-    # All points of a pixel but the first make about equally many samples.
-    counts = np.array([scene.points]) if scene.has_lens else np.arange(1, max(scene.points, scene.most_points) + 1)
-    one = scene.samples_of_one_point
-    samples = one + (counts - 1) * (scene.samples - one) / max(scene.points - 1, 1)
-    # More points than there are need all samples anew.
-    again = np.where(counts > scene.points, scene.sampling_seconds * (1.0 + counts / scene.points), 0.0)
+    seconds, squares, probe = scene.seconds_left - scene.edge_seconds, scene.squares, scene.probe
+    if seconds <= 0.0 or squares is None:
+        return DirectLightPlan(reason=too_little(scene.budget))
+    whole, gain = squares.whole, GAIN_SHARE * squares.gains
 
     def noise(taken) -> np.ndarray:
         """The factor of squared errors where direct light has `taken` so many seconds."""
         samples = scene.cycles_samples + np.maximum(seconds - taken, 0.0) / scene.sample_seconds
-        return (samples / errors.samples) ** (SAMPLES_POWER if errors.is_denoised else -1.0)
+        return (samples / squares.errors.samples) ** (SAMPLES_POWER if squares.errors.is_denoised else -1.0)
 
-    def is_worth(whole, left) -> bool:
-        return left <= (1.0 - LEAST_GAIN) * whole * noise(0.0)
-
-    by_cycles, probe = DirectLightPlan(0, TOO_LITTLE_GAIN), scene.probe
     if probe is None:
-        least = errors.rest.mean() * noise(0.0)
-        return DirectLightPlan(needs_probe=True) if is_worth(errors.whole.mean(), least) else by_cycles
-    expected = probe.seconds * (samples / probe.samples) ** PROBE_POWER + again
+        count = READ_SHARE * seconds / (READ_SECONDS * scene.points * squares.sums().sum())
+        count = len(gain) if scene.needs_all else int(np.ceil(min(count, 1.0) * len(gain)))
+        is_worth = gain[:count].max() >= LEAST_GAIN * whole
+        return DirectLightPlan(0, count, "" if is_worth else TOO_LITTLE_GAIN, needs_probe=is_worth)
+    if not probe.samples:  # no surface is there
+        return DirectLightPlan(reason=TOO_LITTLE_GAIN)
+    # All points of a pixel but the first make about equally many samples.
+    fewest = scene.points if scene.has_lens else min(FEWEST_POINTS, scene.points)
+    points = np.arange(fewest, scene.points + 1)
+    one, every = np.cumsum(probe.of_one_point), np.cumsum(probe.of_all_points)
+    counts = np.ceil(len(one) * np.array(SHARES[-1:] if scene.needs_all else SHARES)).astype(int)[:, None]
+    samples = one[counts - 1] + (points - 1) * ((every - one)[counts - 1] / max(scene.points - 1, 1))
+    taken = probe.seconds * (samples / probe.samples) ** PROBE_POWER
     # With depth of field direct light is denoised as well.
-    factors = 0.0 * counts if scene.has_lens else POINTS_FACTOR * counts**POINTS_POWER
-    left = np.where(expected < seconds, probe.rest * noise(expected) + factors * probe.variance, np.inf)
-    best = int(np.argmin(left))
-    return DirectLightPlan(int(counts[best])) if is_worth(probe.whole, left[best]) else by_cycles
+    of_points = 0.0 * points if scene.has_lens else points**POINTS_POWER
+    won = np.mean(1.0 / (1.0 + of_points[:, None] * probe.variances / noise(taken)[..., None]), axis=-1)
+    left = (whole - won * gain[counts - 1]) * noise(taken)
+    left = np.where(taken < seconds, left, np.inf)
+    row, column = np.unravel_index(np.argmin(left), left.shape)
+    if left[row, column] > (1.0 - LEAST_GAIN) * whole * noise(0.0):
+        return DirectLightPlan(reason=TOO_LITTLE_GAIN)
+    return DirectLightPlan(int(points[column]), int(counts[row, 0]))
 
 
 def shadow_rays(most: int, budget: float | None, pairs: float) -> int:

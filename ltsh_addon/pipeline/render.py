@@ -29,8 +29,7 @@ from .relight import RELIGHT_SUFFIX, write_relight_data
 from .tasks import TaskResult, check_before_writing, write_reports
 
 NAMED = 8  # of what is left to Cycles, in a warning
-# SQUARE: the squares of a probe, in pixels on a side. LEAST_WEIGHT: in units of the mean, added to Cycles' error there.
-SQUARE, LEAST_WEIGHT = 8, 0.1
+PROBE_SEED = 8
 
 
 @dataclass(frozen=True)
@@ -171,11 +170,11 @@ def shade_direct_light(options: RenderOptions, scene_and_layer: dict, timed: _Ti
 
     `scene_and_layer` are fields of the child's job. With a budget Cycles' first samples tell whether it is worth it.
     """
-    from ..blender.process.pixels import PixelJob, ended_at_horizons, extract_pixels, with_points
+    from ..blender.process.pixels import PixelJob, RenderedPixels, ended_at_horizons, with_points
 
     tables, clock = load_tables(options.techniques), timed.clock
     width, height = options.resolution or (None, None)
-    first, most = plan.first_and_most_points(options)
+    most = plan.most_points(options)
     picture = child_job(PictureOptions, options, passes=PASSES, sub_samples=most or 1, shadows="on", cycles_samples=2)
     job = child_job(
         PixelJob,
@@ -184,40 +183,32 @@ def shade_direct_light(options: RenderOptions, scene_and_layer: dict, timed: _Ti
         width=width,
         height=height,
         seconds=options.budget,
-        sub_samples=first,
+        sub_samples=most,
         reserve=(plan.FIRST_DENOISING_SECONDS + 2.0 * plan.NEXT_DENOISING_SECONDS) / 1e6,
         cycles_samples=0,
         for_finished=True,
         own_groups=options.own_groups,
     )
-    extraction = extract_pixels(job, progress=progress)
-    clock.end("extraction", extraction.times.processor)
-    if not extraction.lights or extraction.left_to_cycles.everything:
-        return Comparison(picture, extraction, {}, None)
-    with ShadowTracer(extraction.occluders, extraction.lights) as tracer:
-        shader = DirectLightShader(picture, options.budget, tables, tracer)
-        sampling = clock.seconds() - (extraction.times.processor - extraction.times.direct)
-        cycles = errors = None
-        if options.budget is not None and len(extraction.samples):
-            cycles = timed.first_samples(extraction)
-            by_pass = extraction.left_to_cycles.by_pass
-            errors = compositing.first_errors(cycles, by_pass, options.denoise, progress)
-        chosen = shader.planned(extraction, timed.seconds_left(extraction), sampling, cycles, errors)
-        clock.end("choice")
-        if chosen.reason:
-            cycles = extraction.left_to_cycles
-            cycles = replace(cycles, everything=(*cycles.everything, chosen.reason))
-            return Comparison(picture, replace(extraction, left_to_cycles=cycles), {}, None)
-        points = chosen.points_per_pixel
-        if points > extraction.film.sub_samples:
-            extraction = extract_pixels(replace(job, sub_samples=points, seconds=None), progress=progress)
-            clock.end("extraction", extraction.times.processor)
-        extraction = ended_at_horizons(with_points(extraction, points), progress)
-        clock.end("extraction")
-        shadows = shader.shadows(extraction, progress)
-        clock.end("shadows")
-        comparison = shader.shaded(extraction, shadows, progress)
-        clock.end("shading")
+    with temporary_folder() as folder:
+        rendered = RenderedPixels.of(job, folder, progress)
+        extraction = rendered.extraction(None if options.budget is None else 1)
+        clock.end("extraction", extraction.times.processor)
+        if not extraction.lights or extraction.left_to_cycles.everything:
+            return Comparison(picture, extraction, {}, None)
+        with ShadowTracer(extraction.occluders, extraction.lights) as tracer:
+            shader = DirectLightShader(picture, options.budget, tables, tracer)
+            if options.budget is None or not len(extraction.samples):
+                extraction = with_points(extraction, extraction.film.sub_samples)
+            else:
+                extraction = shader.planned(rendered, extraction, timed, options, progress)
+            if extraction.left_to_cycles.everything:
+                return Comparison(picture, extraction, {}, None)
+            extraction = ended_at_horizons(extraction, progress)
+            clock.end("extraction")
+            shadows = shader.shadows(extraction, progress)
+            clock.end("shadows")
+            comparison = shader.shaded(extraction, shadows, progress)
+            clock.end("shading")
     return comparison
 
 
@@ -242,61 +233,75 @@ class DirectLightShader:
 
     def shaded(self, extraction, shadows: Shadows, progress=None) -> Comparison:
         """The samples of an extraction, shaded with these shadows."""
-        results = evaluated(self.tables, extraction, shadows, self.options, progress)
+        results = evaluated(self.tables, extraction, shadows, self.options, progress, self.tracer.pool)
         return Comparison(self.options, extraction, results, shadows)
 
-    def planned(self, extraction, seconds_left, sampling_seconds: float, cycles, errors) -> plan.DirectLightPlan:
-        """The plan by samples of the first points of each pixel, which took `sampling_seconds`, by the picture `cycles`
-        that was begun with its `errors`, and by probes."""
-        from ..blender.process.pixels import EDGE_SECONDS, with_points
+    def planned(self, rendered, first, timed: _TimedCycles, options: RenderOptions, progress=None):
+        """The extraction of the points and squares of the `DirectLightPlan`, which may leave everything to Cycles.
 
-        film = extraction.film
-        merged = with_points(extraction, film.sub_samples)
+        `first` is the extraction of the first point of each pixel.
+        """
+        from ..blender.process.pixels import EDGE_SECONDS, in_pixels, with_points
+
+        clock, film = timed.clock, first.film
+        cycles = timed.first_samples(first)
+        errors = compositing.first_errors(cycles, first.left_to_cycles.by_pass, options.denoise, progress)
         measured = plan.SceneMeasurements(
             budget=self.budget,
-            seconds_left=seconds_left,
-            sampling_seconds=sampling_seconds,
+            seconds_left=timed.seconds_left(first),
             edge_seconds=EDGE_SECONDS * film.width * film.height / 1e6,
-            points=film.sub_samples,
-            most_points=self.options.sub_samples,
-            samples_of_one_point=np.count_nonzero(extraction.points.number == 0),
-            samples=len(merged.samples),
-            has_lens=extraction.picture.has_lens,
-            cycles_samples=cycles.samples if cycles else 0,
-            sample_seconds=cycles.begun["each"] if cycles else 0.0,
-            errors=errors,
+            points=len(rendered.manifest["samples"]),
+            has_lens=first.picture.has_lens,
+            needs_all=options.needs_each_light,
+            cycles_samples=cycles.samples,
+            sample_seconds=cycles.begun["each"],
+            squares=plan.Squares(errors) if errors else None,
         )
         chosen = plan.direct_light_plan(measured)
         if chosen.needs_probe:
-            chosen = plan.direct_light_plan(replace(measured, probe=self.probe(merged, errors)))
-        return chosen
+            # Warnings are about the whole picture.
+            extraction = rendered.extraction(where=measured.squares.pixels(slice(chosen.squares)))
+            extraction = replace(extraction, warnings=first.warnings, problems=first.problems)
+            probe = self.probe(extraction, measured.points, measured.squares, chosen.squares)
+            chosen = plan.direct_light_plan(replace(measured, probe=probe))
+        clock.end("choice")
+        if chosen.reason:
+            theirs = first.left_to_cycles
+            return replace(first, left_to_cycles=replace(theirs, everything=(*theirs.everything, chosen.reason)))
+        extraction = in_pixels(extraction, measured.squares.pixels(slice(chosen.squares)))
+        return with_points(extraction, chosen.points_per_pixel)
 
-    def probe(self, extraction, errors: compositing.FirstErrors, share: float = plan.PROBE_SHARE) -> plan.Probe:
-        """Shades squares of the picture that have a `share` of its samples, chosen at random by Cycles' error there."""
-        from ..blender.process.pixels import ended_at_horizons
+    def probe(
+        self, extraction, points: int, squares: plan.Squares, count: int, share: float = plan.PROBE_SHARE
+    ) -> plan.Probe:
+        """Shades squares that have a `share` of the samples, chosen at random by what LTSH wins there.
 
+        `extraction` has all `points` per pixel of the first `count` of the squares.
+        """
+        from ..blender.process.pixels import ended_at_horizons, with_points
+
+        of_one_point = squares.sums(pixels=extraction.film.pixel[extraction.points.number == 0])
+        extraction = with_points(extraction, points)
         film = extraction.film
-        row, column = np.indices((film.height, film.width)) // SQUARE
-        square_of_pixel = (row * film.width + column).ravel()
-        whole, rest = (np.bincount(square_of_pixel, one.ravel()) for one in (errors.whole, errors.rest))
+        samples = squares.sums(pixels=film.pixel)
         # By races whose rates are the weights (Efraimidis and Spirakis 2006).
-        weight = np.where(np.bincount(square_of_pixel) > 0, whole + LEAST_WEIGHT * whole.mean() + 1e-30, 0.0)
-        race = np.random.default_rng(SQUARE).exponential(size=len(whole))
-        order = np.argsort(np.divide(race, weight, out=np.full(len(whole), np.inf), where=weight > 0.0))
-        square = square_of_pixel[film.pixel]
-        count = np.cumsum(np.bincount(square, minlength=len(whole))[order])
-        squares = order[: 1 + np.searchsorted(count, share * len(square))]
-        chosen = np.isin(square, squares)
-        # The first square with samples makes what all others have, such as maps of skies.
-        for mask in (square == order[np.argmax(count > 0)], chosen):
+        weight = np.where(samples > 0, np.maximum(squares.gain, plan.LEAST_WEIGHT * squares.whole), 0.0)
+        race = np.random.default_rng(PROBE_SEED).exponential(size=len(weight))
+        order = np.argsort(np.divide(race, weight, out=np.full(len(weight), np.inf), where=weight > 0.0))
+        most = 1 + np.searchsorted(np.cumsum(samples[order]), share * len(film.pixel))
+        order = order[: min(most, np.count_nonzero(weight))]
+        seconds, variances = 0.0, np.zeros(len(order))
+        # The first square makes what all others have, such as maps of skies.
+        for chosen in (order[:1], order) if len(order) else ():
             start = time.process_time()
+            mask = squares.pixels(chosen).ravel()[film.pixel]
             some = replace(extraction, samples=extraction.samples.take(mask), film=film.take(mask))
             some = ended_at_horizons(some)
             comparison = self.shaded(some, self.shadows(some))
-        variance = compositing.variance_of_points(some, next(iter(comparison.results.values())))
-        variance = np.bincount(square_of_pixel, variance.ravel())
-        sums = (float((one[squares] / weight[squares]).sum()) for one in (whole, rest, variance))
-        return plan.Probe(int(np.count_nonzero(chosen)), time.process_time() - start, *sums)
+            seconds = time.process_time() - start
+            variance = compositing.variance_of_points(some, next(iter(comparison.results.values())))
+            variances = squares.sums(variance)[chosen] / weight[chosen]
+        return plan.Probe(int(samples[order].sum()), seconds, variances, of_one_point[:count], samples[:count])
 
 
 class _ProcessorClock:

@@ -18,7 +18,7 @@ from ..lobes import moments32
 from ..lobes.lobe_integrals import FLOAT64_CHUNK
 from ..lobes.lookup_table import LookupTable, load_table
 from ..scene import DEFAULT_TECHNIQUE, PASSES, REFERENCE, Cancelled, Light, SurfaceSamples
-from ..workers.pool import WorkerPool
+from ..workers.pool import WorkerPool, opened
 from . import float32, float64
 
 # Least and greatest number of samples of a block, one or two chunks. One process takes a block at a time, and calls of
@@ -229,7 +229,7 @@ def shade(
     technique: str | Path | LookupTable | OwnTechnique = DEFAULT_TECHNIQUE,
     *,
     passes: Sequence[str] = PASSES,
-    workers: int | None = None,
+    workers: int | WorkerPool | None = None,
     progress: Callable[[float], bool | None] | None = None,
     dtype=np.float32,
     rows: Sequence[int] | None = None,
@@ -241,8 +241,8 @@ def shade(
 
     `technique` is "reference" (quadrature of the true BRDF), a shipped table, a table's path, a LookupTable or an
     OwnTechnique. Diffuse light is exact for polygons in all techniques except the last. `workers` processes (default:
-    all cores) give the same result bit for bit; this process shades few samples alone. `progress(fraction)` may return
-    False to stop: Cancelled is raised. Also raises TableError and ValueError.
+    all cores), or those of a pool, give the same result bit for bit; this process shades few samples alone.
+    `progress(fraction)` may return False to stop: Cancelled is raised. Also raises TableError and ValueError.
 
     With `dtype` float32, radiance is float32 and within 2e-5 of that with float64, per unit of the lights' radiance;
     for lights with a spread, of their radiance straight ahead. Spreads are accurate to 0.3 % (see `light_profile`).
@@ -268,7 +268,7 @@ def shade(
         if error is not None:
             quadrature_error[blocks[number]] = error
 
-    with WorkerPool(processes=workers) as pool:
+    with opened(workers) as pool:
         for done in pool.run(task, len(blocks), lambda number: samples.take(blocks[number]), store, is_worth):
             if progress is not None and progress(done / len(blocks)) is False:
                 raise Cancelled("shading was stopped")

@@ -12,13 +12,12 @@ pixels", doi:10.1145/3414685.3417881), so that the result depends on the block. 
 
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..scene import PASSES, Cancelled, Film, Light, Progress, SurfaceSamples
-from ..workers.pool import WorkerPool
+from ..workers.pool import WorkerPool, opened
 from .emitter import Emitter
 from .estimator import MOST_RAYS, PixelNeighbors, RatioEstimator
 from .light_cluster import LightCluster, emitters_of
@@ -130,8 +129,7 @@ def trace_visibility(
             radiance[name][block], deviation[name][block] = traced_block.radiance[name], traced_block.deviation[name]
         mixed[:, block], traced[number] = traced_block.mixed, traced_block.rays
 
-    with ExitStack() as stack:
-        pool = workers if isinstance(workers, WorkerPool) else stack.enter_context(WorkerPool(tracer, workers))
+    with opened(workers, tracer) as pool:
         for done in pool.run(task, len(blocks), job, store, seconds > SECONDS_WORTH_A_WORKER):
             _go_on(progress, done / len(blocks))
     by_pass = visibility.get("specular"), visibility.get("diffuse")

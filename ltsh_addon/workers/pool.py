@@ -13,7 +13,7 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -141,6 +141,11 @@ class WorkerPool:
         while self._workers:
             self._workers.pop().end()
         self._task, self._run = None, None
+
+
+def opened(workers: int | WorkerPool | None, context: Any = None):
+    """Context manager of `workers` if that is a pool, else of a new one of so many processes."""
+    return nullcontext(workers) if isinstance(workers, WorkerPool) else WorkerPool(context, workers)
 
 
 class _Run:

@@ -60,33 +60,26 @@ def render_pixel_samples(
 
 # FINISHED_LENS: fewest points per pixel for depth of field in a finished picture; with fewer Cycles has less noise.
 FINISHED_LENS = 32
-# Processor seconds of direct light. START_SECONDS: always. LOOKS: how many more looks at the scene there are, by us for
-# more points, and by Cycles for these and for its picture. POINT_SECONDS: for a point of a pixel, which grows by
-# LIGHT_SHARE with each light, up to MOST_LIGHTS.
-# Shares of the seconds that are left. POINTS_SHARE: at most for points. DIRECT_SHARE: at most for all of direct light.
-START_SECONDS, LOOKS, POINT_SECONDS, LIGHT_SHARE = 1.8, 3, 1.2e-5, 0.125
-POINTS_SHARE, DIRECT_SHARE, MOST_LIGHTS = 0.15, 0.3, 100
+# Processor seconds of direct light. START_SECONDS: always, beside another look at the scene by Cycles. LIGHT_SECONDS:
+# for each of up to MOST_LIGHTS. POINT_SECONDS: for a point of a pixel. Shares of the seconds that are left.
+# POINTS_SHARE: at most for points. DIRECT_SHARE: at most for what is needed always.
+START_SECONDS, LIGHT_SECONDS, MOST_LIGHTS, POINT_SECONDS = 1.8, 0.06, 100, 4e-6
+POINTS_SHARE, DIRECT_SHARE = 0.04, 0.3
 
 
 def affordable_points(seconds: float, pixels: int, lights: int, looked: float = 0.0) -> int:
-    """How many points of each pixel processor seconds that are `left` allow; 0: too few would remain for Cycles.
+    """How many points of each pixel the processor seconds that are left allow; 0: too few would remain for Cycles.
 
-    Each further look at the scene is expected to take as long as the first, `looked` seconds.
+    The next look at the scene is expected to take as long as the first, `looked` seconds.
     """
-    each = _seconds_of_point(pixels, lights)
-    if DIRECT_SHARE * seconds < START_SECONDS + LOOKS * looked + each:
+    if DIRECT_SHARE * seconds < START_SECONDS + LIGHT_SECONDS * min(lights, MOST_LIGHTS) + looked:
         return 0
-    return max(int(POINTS_SHARE * (seconds - LOOKS * looked) / each), 1)
+    return max(int(POINTS_SHARE * (seconds - looked) / (POINT_SECONDS * pixels)), 1)
 
 
-def longest_look(seconds: float, pixels: int) -> float:
+def longest_look(seconds: float) -> float:
     """How long a look at the scene may take for `affordable_points` in what is left of so many `seconds` afterwards."""
-    return (DIRECT_SHARE * seconds - START_SECONDS - _seconds_of_point(pixels, 1)) / (LOOKS + DIRECT_SHARE)
-
-
-def _seconds_of_point(pixels: int, lights: int) -> float:
-    """Processor seconds of direct light for a point of each pixel."""
-    return POINT_SECONDS * pixels * (1.0 + LIGHT_SHARE * min(lights, MOST_LIGHTS))
+    return (DIRECT_SHARE * seconds - START_SECONDS - LIGHT_SECONDS) / (1.0 + DIRECT_SHARE)
 
 
 # REST_PASSES: passes of Cycles with the parts of the picture that are not reflected light.
@@ -400,7 +393,7 @@ class _OpenPicture:
             end = job_start() + job.seconds - (job.reserve + 1e-6 * EDGE_SECONDS) * pixels
         # Without points, or time for one, a look at the scene would be wasted.
         if job.sub_samples and (end is None or affordable_points(end - opened, pixels, 1)):
-            look_until = np.inf if end is None or self.has_lens else opened + longest_look(end - opened, pixels)
+            look_until = np.inf if end is None or self.has_lens else opened + longest_look(end - opened)
             options = {"with_occluders": job.shadows == "on", "look_until": look_until if job.for_finished else None}
             with suppress(LookTooLong):
                 inventory = prepare_scene(self.scene, self.view_layer, self.camera, warnings, **options)

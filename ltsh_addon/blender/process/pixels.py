@@ -4,6 +4,7 @@ import errno
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -135,6 +136,12 @@ class LeftToCycles:
     materials: tuple[str, ...]  # materials for which it does
     everything: tuple[str, ...]  # reasons why it does everywhere
     warnings: tuple[str, ...]  # about direct light that is shaded here
+    shaded: np.ndarray | None = None  # mask (H, W) of the pixels that have samples at all; None: all
+
+    def replaced(self, pass_name: str) -> np.ndarray:
+        """Mask (H, W) of the pixels that do not."""
+        mask = ~self.by_pass[pass_name]
+        return mask if self.shaded is None else mask & self.shaded
 
 
 @dataclass(frozen=True)
@@ -186,23 +193,58 @@ def extract_pixels(
     `look` gets the extraction before its lobes end at horizons, which may take long. For finished pictures it stays so.
     Raises SceneError if the scene or file cannot be used, Cancelled if `progress(stage, fraction)` returned False.
     """
-    fewest = 0 if job.for_finished else 1
-    if job.sub_samples < fewest or job.cycles_samples < 0:
-        counts = f"sub_samples is {job.sub_samples} and cycles_samples {job.cycles_samples}"
-        raise ValueError(f"{counts}, expected at least {fewest} and 0")
     with temporary_folder() as folder:
-        manifest = run_scene_job(job, folder, progress)
-        renders = _SampleRenders(job, manifest)
-        for name in manifest["samples"]:
+        extraction = RenderedPixels.of(job, folder, progress).extraction()
+    if job.for_finished:
+        return extraction
+    if look is not None:
+        look(extraction)
+    return ended_at_horizons(extraction, progress)
+
+
+@dataclass(frozen=True)
+class RenderedPixels:
+    """What a job rendered, in a `folder` that must stay while it is read."""
+
+    job: PixelJob
+    folder: Path
+    manifest: dict
+
+    @classmethod
+    def of(cls, job: PixelJob, folder: Path, progress: Progress | None = None) -> "RenderedPixels":
+        """Do the `job`. Raises as `extract_pixels` does."""
+        fewest = 0 if job.for_finished else 1
+        if job.sub_samples < fewest or job.cycles_samples < 0:
+            counts = f"sub_samples is {job.sub_samples} and cycles_samples {job.cycles_samples}"
+            raise ValueError(f"{counts}, expected at least {fewest} and 0")
+        return cls(job, folder, run_scene_job(job, folder, progress))
+
+    @cached_property
+    def _lights(self) -> list[Light]:
+        return lights_of(self.manifest["lights"])
+
+    @cached_property
+    def _occluders(self) -> Occluders | None:
+        name = self.manifest["occluders"]
+        return Occluders.load(self.folder / name) if name else None
+
+    def extraction(self, points: int | None = None, where: np.ndarray | None = None) -> Extraction:
+        """The extraction, by default of all `points` of each pixel.
+
+        Of finished pictures only the pixels of the mask `where` (H, W) have samples; all others are left to Cycles.
+        """
+        job, manifest, folder = self.job, self.manifest, self.folder
+        renders = _SampleRenders(job, manifest, where=where)
+        for name in manifest["samples"][:points]:
             renders.add(rendered_channels(folder / name))
         samples, film = renders.joined()
-        lights = lights_of(manifest["lights"])
+        lights = self._lights
         warnings, problems = renders.messages(samples, film)
         warnings += gbuffer.rounded_positions(samples.position[has_lobe(samples).any(axis=0)], lights)
-        left_to_cycles, points = None, PixelPoints()
+        left_to_cycles, of_points = None, PixelPoints()
         if job.for_finished:
             left_to_cycles = renders.left_to_cycles(film, shows_patches(samples, lights, manifest["sky_detail"]))
-            points = renders.points()
+            of_points = renders.points()
         elif not problems:
             warnings += unlit(samples, lights, manifest["camera"]) + faceted(samples, lights, manifest["sky_detail"])
         times = (manifest[name] for name in ("seconds", "processor_seconds", "direct_seconds"))
@@ -215,19 +257,15 @@ def extract_pixels(
             times=ExtractionTimes(*times),
             warnings=tuple(manifest["warnings"] + warnings),
             problems=tuple(problems),
-            occluders=Occluders.load(folder / manifest["occluders"]) if manifest["occluders"] else None,
+            occluders=self._occluders,
             light_settings=manifest["light_settings"],
             glass=renders.glass,
             left_to_cycles=left_to_cycles,
-            points=points,
+            points=of_points,
         )
         if extraction.glass is not None and manifest["behind"]:
             extraction = replace(extraction, behind=_behind(job, manifest, folder, extraction))
-    if job.for_finished:
         return extraction
-    if look is not None:
-        look(extraction)
-    return ended_at_horizons(extraction, progress)
 
 
 def _behind(job: PixelJob, manifest: dict, folder: Path, extraction: Extraction) -> Extraction:
@@ -243,8 +281,8 @@ def _behind(job: PixelJob, manifest: dict, folder: Path, extraction: Extraction)
 class _SampleRenders:
     """The sample renders of a picture, one for each point of a pixel, as `add` takes them."""
 
-    def __init__(self, job: PixelJob, manifest: dict, *, is_behind: bool = False):
-        self._job, self._manifest, self._is_behind = job, manifest, is_behind
+    def __init__(self, job: PixelJob, manifest: dict, *, is_behind: bool = False, where: np.ndarray | None = None):
+        self._job, self._manifest, self._is_behind, self._where = job, manifest, is_behind, where
         self._glass: np.ndarray | float = 0.0  # (H, W) number of renders that show glass
         self._renders: list[tuple[SurfaceSamples, np.ndarray]] = []  # samples and their pixels
         self._unusable = self._unnamed = 0  # samples that are not shaded
@@ -261,15 +299,17 @@ class _SampleRenders:
         if self._is_behind:
             tint = through
             lobes.read_aov(channels, "hit")[~through.any(axis=-1)] = 0.0
+        if self._job.for_finished:
+            self._left_to_cycles.append(gbuffer.left_to_cycles(channels))
+        self._unnamed += gbuffer.surfaces_without_sample(channels)
+        self._unshaded += gbuffer.unshaded_hits(channels, len(self._unshaded))
+        if self._where is not None:
+            lobes.read_aov(channels, "hit")[~self._where] = 0.0
         samples, pixel, unusable = gbuffer.surface_samples(channels, passes["diffuse_color"])
         if self._is_behind:
             samples = gbuffer.tinted(samples, through.reshape(-1, 3)[pixel])
         self._renders.append((samples, pixel))
         self._unusable += unusable
-        self._unnamed += gbuffer.surfaces_without_sample(channels)
-        self._unshaded += gbuffer.unshaded_hits(channels, len(self._unshaded))
-        if self._job.for_finished:
-            self._left_to_cycles.append(gbuffer.left_to_cycles(channels))
         if self._job.rest:
             rest = gbuffer.not_reflected(channels, passes, self._manifest["film_transparent"])
             rest[..., :3], rest[..., 3:6] = rest[..., :3] * tint, rest[..., 3:6] * tint
@@ -289,14 +329,15 @@ class _SampleRenders:
         """Samples and film of all renders."""
         samples, film = gbuffer.join(self._renders, self._manifest["width"], self._manifest["height"])
         if self._manifest["weights"]:
-            film = film.shared(np.array(self._manifest["weights"]), self.points().number, self._rendered_pixels())
+            points = self.points()
+            film = film.shared(points.weights, points.number, self._rendered_pixels())
         return samples, film
 
     def points(self) -> PixelPoints:
         """The points of the pixels, and the number of each sample's render among them."""
         number = np.repeat(np.arange(len(self._renders)), [len(pixel) for _, pixel in self._renders])
         weights = self._manifest["weights"]
-        return PixelPoints(number, np.array(weights) if weights else None)
+        return PixelPoints(number, np.array(weights[: len(self._renders)]) if weights else None)
 
     def _rendered_pixels(self) -> np.ndarray:
         """Mask (H, W) of the pixels that were rendered."""
@@ -305,7 +346,7 @@ class _SampleRenders:
             rows, columns = (slice(border[a], border[a] + border[b]) for a, b in (("top", "height"), ("left", "width")))
             mask[:] = False
             mask[rows, columns] = True
-        return mask
+        return mask if self._where is None else mask & self._where
 
     def messages(self, samples: SurfaceSamples, film: Film) -> tuple[list[str], list[str]]:
         """Warnings and problems. There is one problem if most of what the camera sees is not shaded."""
@@ -348,7 +389,8 @@ class _SampleRenders:
         }
         by_pass["specular"] |= film.image(is_faceted) > 0.0
         materials = manifest["materials"] + ["sharp reflections of the world (specular)"] * bool(is_faceted.any())
-        return LeftToCycles(by_pass, *map(tuple, (materials, manifest["everything"], manifest["warnings"])))
+        reasons = materials, manifest["everything"], manifest["warnings"]
+        return LeftToCycles(by_pass, *map(tuple, reasons), self._where)
 
     def cycles_passes(self, folder: Path) -> CyclesPasses:
         """What Cycles rendered beside the samples."""
@@ -361,6 +403,18 @@ class _SampleRenders:
             names = [manifest["passes"][key] for key in self._job.indices]
             indices = {name: lobes.read_layer(channels, name, "X") for name in names}
         return CyclesPasses(read_reference(manifest, folder), emission, background, indices)
+
+
+def in_pixels(extraction: Extraction, where: np.ndarray) -> Extraction:
+    """`extraction` of a finished picture with samples only in the pixels of the mask `where` (H, W); all others are
+    left to Cycles."""
+    samples, film, points, theirs = extraction.samples, extraction.film, extraction.points, extraction.left_to_cycles
+    mask = where.ravel()[film.pixel]
+    film, numbers = film.take(mask), points.number[mask]
+    if points.weights is not None:
+        film = film.unspread().shared(points.weights, numbers, np.isfinite(film.whole) & where)
+    changed = {"points": replace(points, number=numbers), "left_to_cycles": replace(theirs, shaded=where)}
+    return replace(extraction, samples=samples.take(mask), film=film, **changed)
 
 
 def with_points(extraction: Extraction, count: int) -> Extraction:

@@ -39,9 +39,12 @@ from .lighting import light_groups
 DIRECT = {"specular": ("specular_light", "specular_color"), "diffuse": ("diffuse_light", "diffuse_color")}
 ALBEDO, NORMAL = ("Denoising Albedo", "RGB"), ("Denoising Normal", "XYZ")
 GROUP_PREFIX = "Combined_"  # of the passes of light groups
-# The errors of pixels are means over those that are at most ERROR_RADIUS away. Noisy and clean pictures weigh by their
-# squared errors to the power -ERROR_POWER, which are at least LEAST_ERROR of Cycles' noise.
-ERROR_RADIUS, ERROR_POWER, LEAST_ERROR = 4, 2, 0.1
+# The errors of pixels are means over those that are at most ERROR_RADIUS away, and not OCTAVES brighter or darker;
+# below DARKEST of the mean brightness all are alike. Without this, squares of noise surround highlights. Noisy and
+# clean pictures weigh by their squared errors to the power -ERROR_POWER, which are at least LEAST_ERROR of Cycles'
+# noise. OWN_SHARE: of the squared noise of a pixel alone, which is at least counted. In six scenes that takes 0 to 2 %
+# of the error away.
+ERROR_RADIUS, OCTAVES, DARKEST, ERROR_POWER, LEAST_ERROR, OWN_SHARE = 4, 2.0, 2.0**-6, 2, 0.1, 0.25
 # MEAN_SHARE: the share that the mean of the denoised halves has in a denoised picture. Each is blurred in a way of its
 # own: in six scenes 0.25 takes 2.6 % of FLIP's error away and 1.5 % of L2 without the brightest, 0.2 to 0.35 as much.
 MEAN_SHARE = 0.25
@@ -137,9 +140,20 @@ def variance_of_points(extraction, result) -> np.ndarray:
     return total * points / max(points - 1, 1)
 
 
-def _mean_around(image: np.ndarray) -> np.ndarray:
-    """Means (H, W) over all pixels that are at most ERROR_RADIUS away, at least 0."""
-    return np.maximum(box_mean(image, ERROR_RADIUS), 0.0)
+class _Around:
+    """Means over all pixels that are at most ERROR_RADIUS away and about as bright, by the `picture` (H, W, 3)."""
+
+    def __init__(self, picture: np.ndarray):
+        brightness = np.maximum(picture.mean(axis=-1), 0.0)
+        level = np.log2(brightness / max(brightness.mean(), 1e-30) + DARKEST) / OCTAVES
+        steps = np.arange(np.floor(level.min()), np.ceil(level.max()) + 1.0)
+        weights = [np.maximum(1.0 - np.abs(level - step), 0.0) for step in steps]
+        self._weights = [(one, box_mean(one, ERROR_RADIUS)) for one in weights if one.any()]
+
+    def mean(self, image: np.ndarray) -> np.ndarray:
+        """Means (H, W) of an `image` (H, W), at least 0."""
+        means = (one * box_mean(one * image, ERROR_RADIUS) / np.maximum(total, 1e-9) for one, total in self._weights)
+        return np.maximum(sum(means), 0.0)
 
 
 # The picture:
@@ -223,15 +237,17 @@ def _weights(noisy, others, samples) -> tuple[list[np.ndarray], tuple[float, flo
     first, second = map(np.nan_to_num, noisy)
     number, other = samples
     variance = np.square(first - second) * (number * other / (number + other))  # of one sample
+    denoised, lit = zip(*others, strict=True)
+    around = _Around(0.5 * sum(denoised))
 
     def error(*pictures) -> np.ndarray:
         return 0.5 * sum(_squared_errors(pictures, (first, second), samples))
 
     def mean(products) -> np.ndarray:
-        return _mean_around(0.5 * sum(products).mean(axis=-1))
+        return around.mean(0.5 * sum(products).mean(axis=-1))
 
-    noise = _mean_around(0.5 * (variance / number + variance / other).mean(axis=-1))
-    denoised, lit = zip(*others, strict=True)
+    noise = 0.5 * (variance / number + variance / other).mean(axis=-1)
+    noise, own = around.mean(noise), noise
     steps = [ours - theirs for ours, theirs in zip(lit, denoised, strict=True)]
     # The step from the denoised picture towards LTSH's that is nearest to the other half: the least squares have far
     # less noise than the difference of both errors. Where the step drowns in noise it is taken whole.
@@ -239,8 +255,9 @@ def _weights(noisy, others, samples) -> tuple[list[np.ndarray], tuple[float, flo
     wanted = mean(step * (half - one) for step, half, one in zip(steps, (second, first), denoised, strict=True))
     share = ((wanted + unsure) / (mean(map(np.square, steps)) + unsure + 1e-20)).clip(0.0, 1.0)
     lit = [one + share[..., None] * step for one, step in zip(denoised, steps, strict=True)]
-    errors = [np.maximum(_mean_around(error(*pair)), LEAST_ERROR * noise) for pair in (lit, denoised)]
-    powers = [(one + 1e-20) ** -ERROR_POWER for one in (errors[0], noise)]
+    errors = [np.maximum(around.mean(error(*pair)), LEAST_ERROR * noise) for pair in (lit, denoised)]
+    # Fireflies are far noisier than the pixels around them.
+    powers = [(one + 1e-20) ** -ERROR_POWER for one in (errors[0], np.maximum(noise, OWN_SHARE * own))]
     clean, noisy = (one / sum(powers) for one in powers)
     # A mean errs at most as much as its parts do on average.
     light = max(np.square(denoised).mean(), 1e-30)
@@ -251,10 +268,10 @@ def _weights(noisy, others, samples) -> tuple[list[np.ndarray], tuple[float, flo
 
 @dataclass(frozen=True)
 class FirstErrors:
-    """What the first samples of Cycles tell of its errors: of each half of them squares (2, H, W), in means around each
-    pixel, without the brightest pixels. They may be below 0, since the noise of the other half is taken off."""
+    """What the first samples of Cycles tell of its errors, as squares (H, W) in means around each pixel, without the
+    brightest pixels. They may be below 0, since noise is taken off."""
 
-    samples: float  # of a half, which has these errors
+    samples: float  # half of the first, which have these errors
     whole: np.ndarray  # of Cycles' picture
     rest: np.ndarray  # of the picture without the direct light that LTSH would replace
     is_denoised: bool
@@ -278,7 +295,7 @@ def first_errors(cycles, by_pass: dict[str, np.ndarray], denoise: str, progress)
     brightness, counts = sum(clean[:2]).mean(axis=-1), [half.samples for half in cycles.halves]
     counts_at_all = brightness <= np.quantile(brightness, 1.0 - BRIGHTEST)
     errors = [_squared_errors(*pair, counts) for pair in ((clean[:2], whole), (clean[2:], rest))]
-    maps = (np.stack([box_mean(np.where(counts_at_all, half, 0.0), ERROR_RADIUS) for half in one]) for one in errors)
+    maps = (box_mean(np.where(counts_at_all, 0.5 * sum(one), 0.0), ERROR_RADIUS) for one in errors)
     return FirstErrors(0.5 * sum(counts), *maps, bool(denoiser))
 
 

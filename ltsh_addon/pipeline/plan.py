@@ -35,31 +35,26 @@ PROBE_SHARE, PROBE_POWER, LEAST_WEIGHT = 0.04, 0.8, 1e-6
 # evenly. In five scenes, from one to three points: -1 to -2.
 SAMPLES_POWER, POINTS_POWER = -0.56, -1.5
 # GAIN_SHARE: what remains of the gain that the first samples foretell: the squares where they err most err less
-# afterwards; in four scenes 0.4 to 1.1. LEAST_GAIN: by this share direct light must make the squared error less.
-GAIN_SHARE, LEAST_GAIN = 0.7, 0.15
+# afterwards; in four scenes 0.4 to 1.1. PROBE_GAIN: the least gain, as a share of the squared error, for which a probe
+# is made, beside what Cycles would win in its PROBE_SECONDS. LEAST_GAIN: in the end.
+GAIN_SHARE, PROBE_GAIN, PROBE_SECONDS, LEAST_GAIN = 0.6, 0.12, 6.0, 0.03
 
 
 class Squares:
-    """Squares of a picture (H, W), those first where LTSH wins most of Cycles' squared error by its first `errors`.
-
-    Squares that seem best are so by chance in part. So what LTSH wins in those that are best by one half of the samples
-    is told by the other half.
-    """
+    """Squares of a picture (H, W), those first where LTSH wins most of Cycles' squared error by its first `errors`."""
 
     def __init__(self, errors: FirstErrors):
-        self.errors, self._shape = errors, errors.whole.shape[1:]
+        self.errors, self._shape = errors, errors.whole.shape
         height, width = self._shape
         row, column = np.arange(height)[:, None] // SQUARE, np.arange(width) // SQUARE
         square = (row * -(-width // SQUARE) + column).ravel()
-        pixels = np.bincount(square)
-        first, second = (np.bincount(square, one.ravel()) for one in errors.whole - errors.rest)
-        mean = 0.5 * (first + second)
-        best, *others = (np.argsort(-one / pixels, kind="stable") for one in (mean, second, first))
-        self._rank = np.argsort(best)[square]  # of the square of each pixel
-        self.whole = 0.5 * errors.whole.sum()  # Cycles' squared error, a sum over all pixels
-        self.gain = mean[best]  # (S,) what LTSH wins of it in each square
-        # (S,) and in the first of them, without chance
-        self.gains = 0.5 * sum(np.cumsum(one[order]) for one, order in zip((first, second), others, strict=True))
+        gain = np.bincount(square, (errors.whole - errors.rest).ravel())
+        order = np.argsort(-gain / np.bincount(square), kind="stable")
+        self._rank = np.argsort(order)[square]  # of the square of each pixel
+        self.whole = errors.whole.sum()  # Cycles' squared error
+        self.gain = gain[order]  # (S,) what LTSH wins of it in each square
+        # (S,) and in the first of them. These seem best by chance in part, so it is at most what all squares win.
+        self.gains = np.minimum(np.cumsum(self.gain), self.gain.sum())
 
     def sums(self, image: np.ndarray | float = 1.0, pixels: np.ndarray | None = None) -> np.ndarray:
         """Sums (S,) of an `image` (H, W); or of values at `pixels` (P,), which are counted row by row."""
@@ -151,7 +146,7 @@ def direct_light_plan(scene: SceneMeasurements) -> DirectLightPlan:
     if probe is None:
         count = READ_SHARE * seconds / (READ_SECONDS * scene.points * squares.sums().sum())
         count = len(gain) if scene.needs_all else int(np.ceil(min(count, 1.0) * len(gain)))
-        is_worth = gain[:count].max() >= LEAST_GAIN * whole
+        is_worth = gain[:count].max() >= (PROBE_GAIN - SAMPLES_POWER * PROBE_SECONDS / seconds) * whole
         return DirectLightPlan(0, count, "" if is_worth else TOO_LITTLE_GAIN, needs_probe=is_worth)
     if not probe.samples:  # no surface is there
         return DirectLightPlan(reason=TOO_LITTLE_GAIN)

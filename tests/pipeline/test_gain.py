@@ -11,11 +11,12 @@ from ltsh_addon.pipeline.render import _gain, summary
 SHAPE, SAMPLES, NOISE, OFF = (60, 120, 3), (30, 20), 1.0, 1.0
 
 
-def halves(*, ours, denoised):
-    """`_weights` of pictures of an edge of light: with normal noise `NOISE` of a sample; and with the errors `ours` and
-    `denoised` (H, W) of those that share no noise."""
+def halves(*, ours, denoised, firefly=0.0):
+    """`_weights` of pictures of an edge of light: with normal noise `NOISE` of a sample, and a `firefly` in one pixel
+    of a half; and with the errors `ours` and `denoised` (H, W) of those that share no noise."""
     random, edge = np.random.default_rng(1), np.where(np.arange(SHAPE[1]) < 60, 1.0, 2.0)[:, None]
     noisy = [edge + NOISE / np.sqrt(count) * random.standard_normal(SHAPE) for count in SAMPLES]
+    noisy[0][30, 20] += firefly
     others = [(edge + denoised[..., None], edge + ours[..., None]) for _ in SAMPLES]
     return compositing._weights(noisy, others, SAMPLES), np.square(edge).mean()
 
@@ -32,6 +33,21 @@ def test_each_pixel_is_of_the_picture_with_the_least_error():
         # The variance of the halves is 1 / 24 of the other errors; what has none counts as 0.1 of that.
         assert values == pytest.approx(expected, abs=0.04)
     assert sum(weights) == pytest.approx(1.0)
+
+
+def test_a_pixel_far_noisier_than_those_around_it_is_not_taken():
+    """The firefly has a squared noise of 18, a mean of 0.26 around; the others err by 1."""
+    wrong = np.full(SHAPE[:2], OFF)
+    ((_, _, noisy), _), _ = halves(ours=wrong, denoised=wrong, firefly=6.0)
+    assert noisy[30, 20] < 0.2 and min(noisy[30, 22], noisy[32, 20]) > 0.8
+
+
+def test_what_errs_in_a_highlight_does_not_count_in_the_dark_around_it():
+    """There the clean pictures err by 20, elsewhere not. The mean of their squares would be 20, of the noise 0.04."""
+    wrong = np.zeros(SHAPE[:2])
+    wrong[30:32, 20:22] = 20.0
+    ((_, _, noisy), _), _ = halves(ours=wrong, denoised=wrong)
+    assert noisy[30:32, 20:22].min() > 0.9 and noisy[30, 23] < 0.1 and noisy[28, 20] < 0.1
 
 
 def test_errors_are_those_that_the_pictures_have():

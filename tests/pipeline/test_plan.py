@@ -10,18 +10,15 @@ from ltsh_addon.pipeline import plan
 from ltsh_addon.pipeline.compositing import FirstErrors
 from ltsh_addon.pipeline.options import RenderOptions
 
-SECONDS = 3.0  # that remain for direct light and Cycles' samples
+SECONDS = 30.0  # that remain for direct light and Cycles' samples
 SIDE = plan.SQUARE
 # Of 4 x 5 squares: what LTSH wins of the squared error in each. All of them err by 1 more.
 WINS = 8.0 * 0.7 ** np.arange(20.0)
 
 
-def errors_of(wins, rest=1.0, noise=0.0, is_denoised=True):
-    """Errors of two halves of Cycles' samples: the `wins` (4 N,) of the squares, row by row, have `noise` of their own
-    in each half."""
-    generator = np.random.default_rng(3)
-    won = [wins + noise * generator.standard_normal(len(wins)) for _ in range(2)]
-    won = np.stack([np.kron(one.reshape(4, -1), np.ones((SIDE, SIDE))) for one in won])
+def errors_of(wins, rest=1.0, is_denoised=True):
+    """Errors of Cycles' samples with these `wins` (4 N,) of the squares, row by row."""
+    won = np.kron(wins.reshape(4, -1), np.ones((SIDE, SIDE)))
     return FirstErrors(10.0, rest + won, np.full(won.shape, rest), is_denoised)
 
 
@@ -32,7 +29,7 @@ SCENE = plan.SceneMeasurements(
     points=5,
     has_lens=False,
     cycles_samples=20,
-    sample_seconds=0.01,
+    sample_seconds=0.1,
     squares=plan.Squares(errors_of(WINS)),
 )
 ONE, EVERY = 50, 90  # samples of a square with one and with five points
@@ -51,7 +48,7 @@ def planned(scene, seconds_of, variance=0.0):
 
 def left_error(points, squares, seconds, variance):
     """The squared error in this case, in the words of the plan's docstring; in units of a square's pixels."""
-    noise = ((20 + (SECONDS - seconds) / 0.01) / 10.0) ** plan.SAMPLES_POWER
+    noise = ((20 + (SECONDS - seconds) / 0.1) / 10.0) ** plan.SAMPLES_POWER
     total = 0.0
     for number, win in enumerate(WINS):
         direct = plan.GAIN_SHARE * win * noise if number < squares else 0.0
@@ -61,7 +58,7 @@ def left_error(points, squares, seconds, variance):
 
 
 @pytest.mark.parametrize("variance", [0.0, 0.3, 30.0])
-@pytest.mark.parametrize("each", [1e-7, 1e-4, 3e-4, 1e-3, 1.0])
+@pytest.mark.parametrize("each", [1e-6, 1e-3, 3e-3, 1e-2, 10.0])
 def test_direct_light_gets_the_points_and_squares_that_leave_the_least_error(each, variance):
     """Of a scene whose samples all take the same time. What the plan expects of all from the probe is less, by its
     power."""
@@ -75,20 +72,20 @@ def test_direct_light_gets_the_points_and_squares_that_leave_the_least_error(eac
     best = min(errors, key=errors.get)
     is_less = errors[best] <= (1.0 - plan.LEAST_GAIN) * left_error(1, 0, 0.0, 0.0)
     assert chosen == (plan.DirectLightPlan(*best) if is_less else plan.DirectLightPlan(reason=TOO_LITTLE_GAIN))
-    if each == 1.0 or variance == 30.0:
+    if each == 10.0 or variance == 30.0:
         assert chosen.points_per_pixel == 0
-    if each == 1e-7 and variance < 30.0:
+    if each == 1e-6 and variance < 30.0:
         assert chosen.points_per_pixel == (5 if variance else 3) and chosen.squares == read
-    if each == 1e-3 and variance == 0.3:
+    if each == 1e-2 and variance == 0.3:
         assert 0 < chosen.squares < read
 
 
 def test_squares_are_read_in_a_share_of_the_time_or_all_where_each_light_is_wanted():
     pixels = 20 * SIDE**2
-    read = [plan.direct_light_plan(replace(SCENE, seconds_left=0.5 + time)).squares for time in (0.2, 3.0)]
+    read = [plan.direct_light_plan(replace(SCENE, seconds_left=0.5 + time)).squares for time in (0.2, 30.0)]
     expected = plan.READ_SHARE * 0.2 / (plan.READ_SECONDS * 5 * pixels)
     assert 0.0 < expected < 1.0 and read == [int(np.ceil(20 * expected)), 20]
-    every = planned(replace(SCENE, seconds_left=0.7, needs_all=True), lambda count: 1e-7 * count)
+    every = planned(replace(SCENE, seconds_left=20.5, points=50, needs_all=True), lambda count: 1e-7 * count)
     assert every.squares == 20
 
 
@@ -96,17 +93,16 @@ def test_where_direct_light_is_not_what_is_noisy_not_even_a_probe_is_shaded():
     few = replace(SCENE, squares=plan.Squares(errors_of(0.1 * WINS)))
     assert plan.direct_light_plan(few) == plan.DirectLightPlan(0, 20, TOO_LITTLE_GAIN)
     assert plan.direct_light_plan(SCENE).needs_probe
+    # A probe takes its time, too.
+    assert not plan.direct_light_plan(replace(SCENE, seconds_left=5.0)).needs_probe
 
 
 def test_what_squares_win_by_chance_does_not_count():
-    """Nothing is won in truth. By the mean of both halves the best half of the squares seems to win 0.56 each."""
-    squares = plan.Squares(errors_of(np.zeros(2000), noise=1.0))
-    seeming = np.cumsum(squares.gain).max() / SIDE**2
-    assert seeming == pytest.approx(1000 * 0.56, rel=0.1)
-    # The sum of up to 2,000 such numbers is at most a few times 45 off.
-    assert np.abs(squares.gains).max() / SIDE**2 < 0.25 * seeming
-    # All squares win what they win, in any order.
-    assert squares.gains[-1] == pytest.approx(squares.gain.sum())
+    """Nothing is won in truth. Those 1,000 of 2,000 squares that seem best seem to win 0.8 each."""
+    squares = plan.Squares(errors_of(np.random.default_rng(3).standard_normal(2000)))
+    assert np.cumsum(squares.gain)[999] / SIDE**2 == pytest.approx(800, rel=0.1)
+    # The sum of all has a deviation of 45.
+    assert squares.gains.max() / SIDE**2 < 3 * 45
 
 
 def test_squares_are_those_of_the_picture():
@@ -117,17 +113,17 @@ def test_squares_are_those_of_the_picture():
     assert squares.sums(pixels=np.flatnonzero(image == 18.0))[1] == SIDE**2
     # A picture may end within a square.
     errors = errors_of(WINS)
-    cut = plan.Squares(replace(errors, whole=errors.whole[:, :-3, :-2], rest=errors.rest[:, :-3, :-2]))
+    cut = plan.Squares(replace(errors, whole=errors.whole[:-3, :-2], rest=errors.rest[:-3, :-2]))
     assert cut.sums().sum() == (4 * SIDE - 3) * (5 * SIDE - 2) and len(cut.gain) == 20
 
 
 def test_squares_that_there_is_no_time_for_are_not_shaded_even_if_nothing_else_errs():
     clean = replace(SCENE, squares=plan.Squares(errors_of(WINS, rest=0.0)))
-    plans = [planned(clean, lambda count, each=each: each * count, 0.1) for each in (1e-7, 1e-2, 1e-1)]
+    plans = [planned(clean, lambda count, each=each: each * count, 0.1) for each in (1e-6, 1e-1, 1.0)]
     assert plans[0] == plan.DirectLightPlan(5, 20) and plans[2].points_per_pixel == 0
     # All squares with three points take each x 90 x (20 x 70 / 90)^0.8 s, 807 each.
     assert plans[1] == plan.DirectLightPlan(reason=TOO_LITTLE_GAIN) or plans[1].squares < 20
-    assert 807 * 1e-2 > SECONDS
+    assert 807 * 1e-1 > SECONDS
 
 
 def test_a_probe_that_meets_no_surface_leaves_all_to_cycles():
@@ -140,7 +136,7 @@ def test_without_a_denoiser_samples_count_for_more():
     worth = {}
     for is_denoised in (True, False):
         scene = replace(SCENE, squares=plan.Squares(errors_of(WINS, is_denoised=is_denoised)))
-        times = np.geomspace(1e-6, 1e-2, 40)
+        times = np.geomspace(1e-5, 1e-1, 40)
         worth[is_denoised] = sum(planned(scene, lambda n, t=t: t * n).points_per_pixel > 0 for t in times)
     assert worth[True] > worth[False] > 0
 
@@ -152,8 +148,8 @@ def test_without_time_or_errors_no_probe_is_shaded():
 
 def test_depth_of_field_has_all_of_its_points_or_none():
     scene = replace(SCENE, has_lens=True)
-    assert planned(scene, lambda count: 1e-6 * count, 9.0).points_per_pixel == 5
-    assert planned(scene, lambda count: 0.1 * count).points_per_pixel == 0
+    assert planned(scene, lambda count: 1e-5 * count, 9.0).points_per_pixel == 5
+    assert planned(scene, lambda count: 1.0 * count).points_per_pixel == 0
 
 
 def test_without_a_budget_points_follow_the_samples_alone_so_that_every_run_gives_the_same_picture(tmp_path):

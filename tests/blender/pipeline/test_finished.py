@@ -453,7 +453,7 @@ def test_points_tell_what_highlights_they_miss_but_not_what_colors(tmp_path):
         return material
 
     variance = {}
-    squares = plan.Squares(compositing.FirstErrors(4.0, *np.full((2, 2, SIZE, SIZE), [[[[2.0]]], [[[1.0]]]]), True))
+    squares = plan.Squares(compositing.FirstErrors(4.0, np.full((SIZE, SIZE), 2.0), np.ones((SIZE, SIZE)), True))
     for name, height in (("smooth", 0.0), ("crumpled", 0.01), ("checked", 0.0)):
         parts.empty_scene(SIZE, SIZE)
         side = np.linspace(-2.0, 2.0, 100)

@@ -17,7 +17,7 @@ from ltsh_addon.blender.extract import finished as finished_module
 from ltsh_addon.blender.extract import pixels as pixels_module
 from ltsh_addon.blender.lights.emission import LookTooLong
 from ltsh_addon.blender.process.finished import FinishedJob, render_finished
-from ltsh_addon.blender.process.pixels import PixelJob, extract_pixels, with_points
+from ltsh_addon.blender.process.pixels import PixelJob, RenderedPixels, extract_pixels, in_pixels, with_points
 from ltsh_addon.cli import main
 from ltsh_addon.cycles.lobes import read_layer
 from ltsh_addon.pipeline import PictureOptions, RenderOptions, compositing, plan, render, shade_scene
@@ -436,6 +436,39 @@ def test_a_budget_chooses_points_rays_and_samples(tmp_path, monkeypatch):
     (line,) = (line for line in small["warnings"] if "the budget is 0.01 s:" in line)
     least, took = (float(text.partition(" s")[0]) for text in re.split("at least|took", line)[1:])
     assert 0.0 < least <= took
+
+
+@pytest.mark.newest
+def test_some_pixels_alone_have_the_light_that_all_have(tmp_path):
+    """Read alone, or taken from all of the picture."""
+    floor_and_ball(gray())
+    job = PixelJob(parts.save(tmp_path / "ball.blend"), sub_samples=3, for_finished=True, shadows="on")
+    rendered = RenderedPixels.of(job, tmp_path)
+    every, first = rendered.extraction(), rendered.extraction(1)
+    where = np.indices((SIZE, SIZE)).sum(axis=0) // 16 % 2 == 0
+    read, taken = rendered.extraction(where=where), in_pixels(every, where)
+    for field in ("position", "view", "normal", "roughness", "specular_f0", "diffuse_albedo"):
+        assert np.array_equal(getattr(read.samples, field), getattr(taken.samples, field))
+    assert np.array_equal(first.samples.position, every.samples.position[every.points.number == 0])
+    for some in (read, taken):
+        assert set(some.film.pixel.tolist()) <= set(np.flatnonzero(where).tolist())
+        for name in PASSES:
+            replaced = some.left_to_cycles.replaced(name)
+            assert np.array_equal(replaced, where & every.left_to_cycles.replaced(name)) and replaced.any()
+        # Pixels share their points with those around them, of which here only some have any.
+        inside = eroded(where)
+        colors = (one.film.image(one.samples.diffuse_albedo.astype(float))[inside] for one in (some, every))
+        assert np.allclose(*colors, atol=1e-6) and inside.sum() > SIZE**2 / 4
+        at_border = where & ~inside
+        coverage = some.film.coverage()[at_border], every.film.coverage()[at_border]
+        assert np.abs(coverage[0] - coverage[1])[coverage[1] > 1.0 - 1e-6].max() < 1e-5
+
+
+def eroded(mask):
+    """The pixels of a `mask` whose eight neighbors are in it as well, or outside of the picture."""
+    grid = np.pad(mask, 1, constant_values=True)
+    size = mask.shape[0]
+    return np.all([grid[y : y + size, x : x + size] for y, x in itertools.product(range(3), repeat=2)], axis=0)
 
 
 @pytest.mark.newest

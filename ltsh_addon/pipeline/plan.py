@@ -36,8 +36,9 @@ PROBE_SHARE, PROBE_POWER, LEAST_WEIGHT = 0.04, 0.8, 1e-6
 SAMPLES_POWER, POINTS_POWER = -0.56, -1.5
 # GAIN_SHARE: what remains of the gain that the first samples foretell: the squares where they err most err less
 # afterwards; in four scenes 0.4 to 1.1. PROBE_GAIN: the least gain, as a share of the squared error, for which a probe
-# is made, beside what Cycles would win in its PROBE_SECONDS. LEAST_GAIN: in the end.
-GAIN_SHARE, PROBE_GAIN, PROBE_SECONDS, LEAST_GAIN = 0.6, 0.12, 6.0, 0.03
+# is made, beside what Cycles would win in the time that it takes: PROBE_SECONDS, and for each pixel. LEAST_GAIN: in the
+# end.
+GAIN_SHARE, PROBE_GAIN, PROBE_SECONDS, LEAST_GAIN = 0.6, 0.12, (2.0, 1.2e-4), 0.03
 
 
 class Squares:
@@ -144,9 +145,11 @@ def direct_light_plan(scene: SceneMeasurements) -> DirectLightPlan:
         return (samples / squares.errors.samples) ** (SAMPLES_POWER if squares.errors.is_denoised else -1.0)
 
     if probe is None:
-        count = READ_SHARE * seconds / (READ_SECONDS * scene.points * squares.sums().sum())
-        count = len(gain) if scene.needs_all else int(np.ceil(min(count, 1.0) * len(gain)))
-        is_worth = gain[:count].max() >= (PROBE_GAIN - SAMPLES_POWER * PROBE_SECONDS / seconds) * whole
+        pixels = squares.errors.whole.size
+        share = READ_SHARE * seconds / (READ_SECONDS * scene.points * pixels)
+        count = len(gain) if scene.needs_all else int(np.ceil(min(share, 1.0) * len(gain)))
+        least = PROBE_GAIN - SAMPLES_POWER * (PROBE_SECONDS[0] + PROBE_SECONDS[1] * pixels) / seconds
+        is_worth = bool(gain[:count].max() >= max(least * whole, 1e-30))
         return DirectLightPlan(0, count, "" if is_worth else TOO_LITTLE_GAIN, needs_probe=is_worth)
     if not probe.samples:  # no surface is there
         return DirectLightPlan(reason=TOO_LITTLE_GAIN)

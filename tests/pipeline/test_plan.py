@@ -93,6 +93,9 @@ def test_where_direct_light_is_not_what_is_noisy_not_even_a_probe_is_shaded():
     few = replace(SCENE, squares=plan.Squares(errors_of(0.1 * WINS)))
     assert plan.direct_light_plan(few) == plan.DirectLightPlan(0, 20, TOO_LITTLE_GAIN)
     assert plan.direct_light_plan(SCENE).needs_probe
+    # Where nothing is noisy the noise that is taken off may be more than the errors.
+    clean = plan.Squares(errors_of(-WINS, rest=-1.0))
+    assert clean.whole < 0.0 and not plan.direct_light_plan(replace(SCENE, squares=clean)).needs_probe
     # A probe takes its time, too.
     assert not plan.direct_light_plan(replace(SCENE, seconds_left=5.0)).needs_probe
 

@@ -12,11 +12,11 @@ from ltsh_addon.pipeline.options import RenderOptions
 
 SECONDS = 30.0  # that remain for direct light and Cycles' samples
 SIDE = plan.SQUARE
-# Of 4 x 5 squares: what LTSH wins of the squared error in each. All of them err by 1 more.
-WINS = 8.0 * 0.7 ** np.arange(20.0)
+# Of 4 x 5 squares: what LTSH wins of the squared error in each. All of them err by REST more.
+WINS, REST = 8.0 * 0.7 ** np.arange(20.0), 0.2
 
 
-def errors_of(wins, rest=1.0, is_denoised=True):
+def errors_of(wins, rest=REST, is_denoised=True):
     """Errors of Cycles' samples with these `wins` (4 N,) of the squares, row by row."""
     won = np.kron(wins.reshape(4, -1), np.ones((SIDE, SIDE)))
     return FirstErrors(10.0, rest + won, np.full(won.shape, rest), is_denoised)
@@ -53,7 +53,7 @@ def left_error(points, squares, seconds, variance):
     for number, win in enumerate(WINS):
         direct = plan.GAIN_SHARE * win * noise if number < squares else 0.0
         of_points = variance * points**plan.POINTS_POWER / noise
-        total += (1.0 + win) * noise - direct / (1.0 + of_points)
+        total += (REST + win) * noise - direct / (1.0 + of_points)
     return total
 
 
@@ -90,14 +90,14 @@ def test_squares_are_read_in_a_share_of_the_time_or_all_where_each_light_is_want
 
 
 def test_where_direct_light_is_not_what_is_noisy_not_even_a_probe_is_shaded():
-    few = replace(SCENE, squares=plan.Squares(errors_of(0.1 * WINS)))
+    few = replace(SCENE, squares=plan.Squares(errors_of(0.1 * WINS, rest=2.0)))
     assert plan.direct_light_plan(few) == plan.DirectLightPlan(0, 20, TOO_LITTLE_GAIN)
     assert plan.direct_light_plan(SCENE).needs_probe
     # Where nothing is noisy the noise that is taken off may be more than the errors.
     clean = plan.Squares(errors_of(-WINS, rest=-1.0))
     assert clean.whole < 0.0 and not plan.direct_light_plan(replace(SCENE, squares=clean)).needs_probe
     # A probe takes its time, too.
-    assert not plan.direct_light_plan(replace(SCENE, seconds_left=5.0)).needs_probe
+    assert not plan.direct_light_plan(replace(SCENE, seconds_left=3.0)).needs_probe
 
 
 def test_what_squares_win_by_chance_does_not_count():

@@ -144,7 +144,7 @@ class _Around:
     """Means over all pixels that are at most ERROR_RADIUS away and about as bright, by the `picture` (H, W, 3)."""
 
     def __init__(self, picture: np.ndarray):
-        brightness = np.maximum(picture.mean(axis=-1), 0.0)
+        brightness = np.clip(np.nan_to_num(picture.mean(axis=-1)), 0.0, 1e30)
         level = np.log2(brightness / max(brightness.mean(), 1e-30) + DARKEST) / OCTAVES
         steps = np.arange(np.floor(level.min()), np.ceil(level.max()) + 1.0)
         weights = [np.maximum(1.0 - np.abs(level - step), 0.0) for step in steps]

@@ -338,8 +338,8 @@ def _evaluate(name, table, extraction, shadows, options, progress, pool) -> Tech
         if report(0.0) is False:
             raise Cancelled(f"stopped before {name} shaded the {pass_name} pass")
         start = time.perf_counter()
-        shaded = samples, extraction.lights, table, (pass_name,), wanted
-        shadings = shade_lights(*shaded, workers=pool, progress=report)
+        given = samples, extraction.lights, table, (pass_name,), wanted
+        shadings = shade_lights(*given, workers=pool, progress=report)
         for of_pass, shaded in zip(lit, shadings, strict=True):
             of_pass[pass_name] = shaded
         seconds[pass_name] = time.perf_counter() - start

@@ -290,17 +290,18 @@ class DirectLightShader:
         order = np.argsort(np.divide(race, weight, out=np.full(len(weight), np.inf), where=weight > 0.0))
         most = 1 + np.searchsorted(np.cumsum(samples[order]), share * len(film.pixel))
         order = order[: min(most, np.count_nonzero(weight))]
-        seconds, variances = 0.0, np.zeros(len(order))
+        if not len(order):
+            return plan.Probe(0, 0.0, np.zeros(0), of_one_point[:count], samples[:count])
         # The first square makes what all others have, such as maps of skies.
-        for chosen in (order[:1], order) if len(order) else ():
+        for chosen in order[:1], order:
             start = time.process_time()
             mask = squares.pixels(chosen).ravel()[film.pixel]
             some = replace(extraction, samples=extraction.samples.take(mask), film=film.take(mask))
             some = ended_at_horizons(some)
             comparison = self.shaded(some, self.shadows(some))
-            seconds = time.process_time() - start
-            variance = compositing.variance_of_points(some, next(iter(comparison.results.values())))
-            variances = squares.sums(variance)[chosen] / weight[chosen]
+        seconds = time.process_time() - start
+        variance = compositing.variance_of_points(some, next(iter(comparison.results.values())))
+        variances = squares.sums(variance)[order] / weight[order]
         return plan.Probe(int(samples[order].sum()), seconds, variances, of_one_point[:count], samples[:count])
 
 

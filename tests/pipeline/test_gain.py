@@ -50,6 +50,14 @@ def test_what_errs_in_a_highlight_does_not_count_in_the_dark_around_it():
     assert noisy[30:32, 20:22].min() > 0.9 and noisy[30, 23] < 0.1 and noisy[28, 20] < 0.1
 
 
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+def test_a_pixel_without_a_finite_value_spoils_no_others():
+    wrong = np.zeros(SHAPE[:2])
+    wrong[30, 20] = np.inf
+    (weights, _), _ = halves(ours=wrong, denoised=wrong)
+    assert np.isfinite(sum(weights)[:20, :]).all() and sum(weights)[:20, :] == pytest.approx(1.0)
+
+
 def test_errors_are_those_that_the_pictures_have():
     flat = np.full(SHAPE[:2], 0.1)
     (_, (ours, denoised)), light = halves(ours=0.0 * flat, denoised=flat)

@@ -139,7 +139,7 @@ class LeftToCycles:
     shaded: np.ndarray | None = None  # mask (H, W) of the pixels that have samples at all; None: all
 
     def replaced(self, pass_name: str) -> np.ndarray:
-        """Mask (H, W) of the pixels that do not."""
+        """Mask (H, W) of the pixels whose light of this pass is LTSH's."""
         mask = ~self.by_pass[pass_name]
         return mask if self.shaded is None else mask & self.shaded
 

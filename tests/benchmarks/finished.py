@@ -1,6 +1,8 @@
 """Finished pictures beside Cycles and its denoiser at equal processor time of whole processes, by three figures.
 
-python tests/benchmarks/finished.py [--scenes NAME ...] [--budgets S ...] [--seeds N] [--true-samples N]
+python tests/benchmarks/finished.py [--scenes NAME ...] [--budgets S ...] [--samples N ...] [--seeds N]
+
+Pictures of so many seconds, or of so many samples of Cycles without a budget.
 
 The figures: relative L2 over all pixels, and without the brightest 0.2 %, both free of the noise of the truth; FLIP.
 The room is what direct light without noise and cost would leave of Cycles' error: the perfect direct light, and
@@ -141,11 +143,11 @@ class Scene:
             path.write_text(json.dumps([figures(pair, self.halves).tolist() for pair in pairs]))
         return np.array(json.loads(path.read_text()))
 
-    def ours(self, seed: int, budget: float, more=()) -> tuple[np.ndarray, float, dict]:
-        """The figures of `ltsh render`, its processor seconds and its report."""
+    def ours(self, seed: int, more) -> tuple[np.ndarray, float, dict]:
+        """The figures of `ltsh render` with `more` options, its processor seconds and its report."""
         with tempfile.TemporaryDirectory() as folder:
             size = "x".join(map(str, self.size))
-            options = ("--resolution", size, "--budget", budget, "--quiet", *more)
+            options = ("--resolution", size, "--quiet", *more)
             seconds = measure.run("-m", "ltsh_addon", "render", self.blend(seed), "-o", folder, *options).processor
             image = read_layer(read_channels(Path(folder) / "render.exr"), COMBINED, "RGB").astype(float)
             report = json.loads((Path(folder) / "report.json").read_text())
@@ -162,9 +164,9 @@ def direct_light(channels: dict) -> np.ndarray:
     return sum(one(light) * one(color) for light, color in DIRECT)
 
 
-def compare(scene: Scene, budget: float, seeds: int, more=()) -> np.ndarray:
-    """Print the lines of a scene and budget; ratio, room and goal (3, 3)."""
-    ours = [scene.ours(seed, budget, more) for seed in range(seeds)]
+def compare(scene: Scene, amount: str, seeds: int, more) -> np.ndarray:
+    """Print the lines of a scene with `more` options, which say the `amount`; ratio, room and goal (3, 3)."""
+    ours = [scene.ours(seed, more) for seed in range(seeds)]
     theirs = [scene.by_cycles(seed, seconds) for seed, (_, seconds, _) in enumerate(ours)]
     rooms = np.median([scene.room(seed, one[2]) for seed, one in enumerate(theirs)], axis=0)
     report = ours[0][2]
@@ -174,7 +176,7 @@ def compare(scene: Scene, budget: float, seeds: int, more=()) -> np.ndarray:
     medians = [np.median([one[0] for one in runs], axis=0) for runs in (ours, theirs)]
     took = [np.median([one[1] for one in runs]) for runs in (ours, theirs)]
     for row, label in enumerate(labels):
-        start = f"{scene.name:<10}{kind:<9}{budget:>4g} s" if row == 0 else " " * 25
+        start = f"{scene.name:<10}{kind:<9}{amount:>6}" if row == 0 else " " * 25
         first, second, flip = medians[row]
         print(f"{start}  {label:<16}{took[row]:>7.1f} s{100 * first:>10.2f} %{100 * second:>10.2f} %{flip:>12.4f}")
     # An error that drowns in the noise of the truth is 0.
@@ -189,7 +191,8 @@ def compare(scene: Scene, budget: float, seeds: int, more=()) -> np.ndarray:
 def main(arguments=()) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="+", default=TUNED + HELD_OUT, metavar="NAME", help="or: tuned, held-out")
-    parser.add_argument("--budgets", nargs="+", type=float, default=[8.0, 30.0], metavar="S")
+    parser.add_argument("--budgets", nargs="*", type=float, default=[8.0, 30.0], metavar="S")
+    parser.add_argument("--samples", nargs="+", type=int, default=[], metavar="N")
     parser.add_argument("--seeds", type=int, default=3, metavar="N")
     parser.add_argument("--true-samples", type=int, default=4096, metavar="N")
     parser.add_argument("--size", default="240x135", metavar="WxH")
@@ -205,18 +208,19 @@ def main(arguments=()) -> None:
         f"{'scene':<19}{'budget':>6}  {'points + samples':<16}{'processor':>9}"
         + "".join(f"{one:>12}" for one in FIGURES)
     )
-    tables, budgets = {}, options.budgets
+    amounts = {f"{one:g} s": ("--budget", one) for one in options.budgets}
+    amounts |= {str(one): ("--cycles-samples", one) for one in options.samples}
+    tables = {}
     for name in names:
         scene = Scene(name, options.cache, size, options.true_samples)
         scene.find_truth()
-        for budget in budgets:
-            tables[name, budget] = compare(scene, budget, options.seeds, options.options.split())
-    for budget in budgets:
-        middle = np.median([table for (_, one), table in tables.items() if one == budget], axis=0)
+        for amount, more in amounts.items():
+            tables[name, amount] = compare(scene, amount, options.seeds, (*more, *options.options.split()))
+    for amount in amounts:
+        middle = np.median([table for (_, one), table in tables.items() if one == amount], axis=0)
         words = zip(("ratio", "room", "goal"), middle, strict=True)
         print(
-            f"median, {budget:g} s: "
-            + "; ".join(f"{label} " + ", ".join(f"{v:.2f}" for v in row) for label, row in words)
+            f"median, {amount}: " + "; ".join(f"{label} " + ", ".join(f"{v:.2f}" for v in row) for label, row in words)
         )
 
 

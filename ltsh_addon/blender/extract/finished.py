@@ -27,8 +27,8 @@ FEWEST, MOST_OF_HALF = 16, 3
 # A budget is spent in files as well. PROBES: the most samples of the first ones, of which halves are made. PROBED: the
 # share of those that fit which a probe may be; three samples alone seem up to a fifth too slow. SPENT: the share of the
 # time that all files may take. FILE_SECONDS: the processor seconds that a file takes beside its samples, for a million
-# pixels.
-PROBES, PROBED, SPENT, FILE_SECONDS = (1, 3, 8, 8), 1.0 / 8.0, 0.97, 1.0
+# pixels. SEQUENCE: the least length of their sequence of samples; Cycles wants one.
+PROBES, PROBED, SPENT, FILE_SECONDS, SEQUENCE = (1, 3, 8, 8), 1.0 / 8.0, 0.97, 1.0, 1024
 # PASSES: what a finished picture takes its parts from, and artists put together. GUIDES: what the denoiser needs.
 LIGHT_PASSES = tuple(
     f"{kind}_{factor}" for kind in ("diffuse", "glossy", "transmission") for factor in ("direct", "indirect", "color")
@@ -60,7 +60,7 @@ def render_finished(job: FinishedJob, folder: Path, progress) -> dict:
     if job.seconds is None:
         files, least, each = *_render_chunks(scene, layer, folder, job.cycles_samples, progress), 0.0
     else:
-        timed = _TimedFiles(scene, layer, prepared.seed, folder, end, progress, **(job.begun or {}))
+        timed = _TimedFiles(scene, layer, folder, end, progress, **(job.begun or {}))
         timed.render_first()
         if not job.begins:
             timed.render_rest()
@@ -107,7 +107,6 @@ class _PreparedScene:
                 self.layer.lightgroups.add(name=name)
         self.everything = reasons_for_cycles(self.scene, self.layer)
         self.dropped = () if self.layer.cycles.denoising_store_passes else NOT_WRITTEN
-        self.seed = self.scene.cycles.seed
         _prepare(self.scene, self.layer, self.warnings)
 
 
@@ -179,7 +178,9 @@ def _render_chunks(scene, layer, folder: Path, samples, progress) -> tuple[list[
     """
     cycles, files, done, first = scene.cycles, [], 0, 0.0
     if samples is None:
-        return _render_as_saved(scene, layer, folder), time.process_time()
+        if cycles.use_adaptive_sampling or cycles.time_limit:
+            return _render_as_saved(scene, layer, folder), time.process_time()
+        samples = layer.samples or cycles.samples
     _take_all_samples(scene, layer)
     half = -(-samples // 2)  # no file has more samples, so that there are two halves
     chunk = -(-half // max(1, min(half // FEWEST, MOST_OF_HALF)))
@@ -202,13 +203,12 @@ def _take_all_samples(scene, layer) -> None:
 class _TimedFiles:
     """Files as `_render_chunks` renders them, as many samples as fit until the processor time `end(first file)`.
 
-    The first tell what a sample takes; then come the halves of one sequence. Its noise is spread more evenly than that
-    of several: 222 samples of the product shot have 9 % less error.
+    The first tell what a sample takes; then come two halves. All are of one sequence, whose noise is spread more evenly
+    than that of several: of 110 samples of the product shot and of the workshop 5 % less error.
     """
 
     scene: bpy.types.Scene
     layer: bpy.types.ViewLayer
-    seed: int
     folder: Path
     end: Callable[[Path], float]
     progress: Callable
@@ -227,23 +227,24 @@ class _TimedFiles:
             count = min(count, int(PROBED * self._affordable())) if self.files else count
             if count < 1 and len(self.files) > 1:
                 break  # two files there are always
-            self._render(max(count, 1), max(count, 1))
+            self._render(max(count, 1))
             self.least = self.least or time.process_time()
 
     def render_rest(self) -> None:
         """Render what still fits."""
-        if (sequence := self._affordable(2)) > 1:
-            half = -(-sequence // 2)
-            self._render(half, sequence)
-            if (rest := min(self._affordable(), sequence - half)) > 0:
-                self._render(rest, sequence, half)
+        if (count := self._affordable(2)) > 1:
+            half = -(-count // 2)
+            self._render(half)
+            if (rest := min(self._affordable(), count - half)) > 0:
+                self._render(rest)
 
-    def _render(self, count: int, sequence: int, offset: int = 0) -> None:
-        """Render samples of a sequence."""
-        cycles, number = self.scene.cycles, len(self.files)
-        self.progress("Cycles", number / (2 + len(PROBES)))
-        started, cycles.seed = time.process_time(), (self.seed + number - (offset > 0)) % 2**31
-        cycles.samples, cycles.sample_offset, cycles.sample_subset_length = sequence, offset, count
+    def _render(self, count: int) -> None:
+        """Render the next samples."""
+        cycles, done = self.scene.cycles, sum(samples for _, samples in self.files)
+        self.progress("Cycles", len(self.files) / (2 + len(PROBES)))
+        started = time.process_time()
+        cycles.samples = max(SEQUENCE, done + count)
+        cycles.sample_offset, cycles.sample_subset_length = done, count
         _render_file(self.scene, self.folder, self.files, count)
         took = time.process_time() - started
         self.each = max(took - self._of_file, 0.1 * took) / count

@@ -19,6 +19,12 @@ DENOISER = "Open Image Denoise"  # how `Denoiser.name` begins
 SYSTEM_LIBRARIES = ("libOpenImageDenoise.so.2", "libOpenImageDenoise.dylib", "OpenImageDenoise.dll")
 _CPU, _FLOAT3 = 1, 3  # OIDNDeviceType, OIDNFormat
 _FAST, _BALANCED, _HIGH = 4, 5, 6  # OIDNQuality
+# Ways to denoise: the weights of the pictures whose mean is taken, by the quality of the network and how the picture is
+# mirrored before, down and right. A network blurs each in a way of its own: in nine scenes, of 96 samples, BEST errs 1
+# to 7 % less than PLAIN in L2, 1 to 10 % in FLIP. HALVES: of two halves of a picture, in 0.4 of the time.
+PLAIN = {(_HIGH, (1, 1)): 1.0}
+BEST = {(_HIGH, (1, 1)): 0.4, (_HIGH, (-1, -1)): 0.4, (_BALANCED, (1, -1)): 0.2}
+HALVES = {(_BALANCED, (1, -1)): 1.0}, {(_BALANCED, (-1, 1)): 1.0}
 _POINTER, _SIZE, _TEXT, _BOOL, _INT = ctypes.c_void_p, ctypes.c_size_t, ctypes.c_char_p, ctypes.c_bool, ctypes.c_int
 _FUNCTIONS = {
     "oidnNewDevice": (_POINTER, _INT),
@@ -70,27 +76,29 @@ class Denoiser:
         self._ReleaseDevice(self._device)
 
     def all_denoised(
-        self, colors: Sequence[np.ndarray], albedo: np.ndarray, normal: np.ndarray, rough: Sequence[int] = ()
+        self, colors: Sequence[np.ndarray], albedo: np.ndarray, normal: np.ndarray, ways: Sequence[dict] | None = None
     ) -> list[np.ndarray]:
         """The denoised pictures, float32 and never negative, of pictures `colors` (H, W, 3) of the same surfaces.
 
-        `albedo` and `normal` (H, W, 3) may be noisy, too. NaN and Inf count as 0. The guides, and the pictures with the
-        indices `rough`, are filtered in 0.4 of the time: with such guides pictures err 0.5 % more.
+        `albedo` and `normal` (H, W, 3) may be noisy, too. NaN and Inf count as 0. `ways` are PLAIN by default.
         """
         images = {"albedo": albedo, "normal": normal}
-        guides = {name: self._filtered({name: one}, quality=_BALANCED) for name, one in images.items()}
-        quality, settings = {True: _BALANCED, False: _HIGH}, {"hdr": True, "cleanAux": True}
-        pictures = [{"color": color, **guides} for color in colors]
-        return [self._filtered(one, quality=quality[i in rough], **settings) for i, one in enumerate(pictures)]
+        guides = [self._filtered({name: one}, quality=_BALANCED) for name, one in images.items()]
+        ways = ways or [PLAIN] * len(colors)
+        return [self.guided(color, *guides, way) for color, way in zip(colors, ways, strict=True)]
 
     def quickly_denoised(self, color: np.ndarray, albedo: np.ndarray, normal: np.ndarray) -> np.ndarray:
         """As `all_denoised` of one picture, with the library's fast quality and the guides as they are."""
         return self._filtered({"color": color, "albedo": albedo, "normal": normal}, hdr=True, quality=_FAST)
 
-    def guided(self, color: np.ndarray, albedo: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    def guided(self, color: np.ndarray, albedo: np.ndarray, normal: np.ndarray, way: dict = BEST) -> np.ndarray:
         """As `all_denoised` of one picture, with guides without noise."""
-        images = {"color": color, "albedo": albedo, "normal": normal}
-        return self._filtered(images, quality=_HIGH, hdr=True, cleanAux=True)
+        images, mean = {"color": color, "albedo": albedo, "normal": normal}, 0.0
+        for (quality, (down, right)), weight in way.items():
+            mirrored = {name: one[::down, ::right] for name, one in images.items()}
+            clean = self._filtered(mirrored, quality=quality, hdr=True, cleanAux=True)
+            mean = mean + np.float32(weight) * clean[::down, ::right]
+        return mean
 
     def _filtered(self, images: dict[str, np.ndarray], **settings: int) -> np.ndarray:
         """The first of the `images`, filtered with the help of the others."""

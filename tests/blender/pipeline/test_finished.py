@@ -16,10 +16,12 @@ from ltsh_addon.blender import render_settings
 from ltsh_addon.blender.extract import finished as finished_module
 from ltsh_addon.blender.extract import pixels as pixels_module
 from ltsh_addon.blender.lights.emission import LookTooLong
+from ltsh_addon.blender.process.blender_process import denoiser_libraries
 from ltsh_addon.blender.process.finished import FinishedJob, render_finished
 from ltsh_addon.blender.process.pixels import PixelJob, RenderedPixels, extract_pixels, in_pixels, with_points
 from ltsh_addon.cli import main
 from ltsh_addon.cycles.lobes import read_layer
+from ltsh_addon.imaging import denoise
 from ltsh_addon.pipeline import PictureOptions, RenderOptions, compositing, plan, render, shade_scene
 from ltsh_addon.pipeline.lighting import ShadowTracer, load_tables
 from ltsh_addon.pipeline.mixer import light_pictures, moved_light
@@ -669,3 +671,18 @@ def test_normals_of_cycles_are_those_of_the_samples(tmp_path):
     # At the ball's border the points, and the samples, are few.
     apart = np.linalg.norm(normal - expected, axis=-1)[shown]
     assert np.median(apart) < 0.005 and np.quantile(apart, 0.9) < 0.1
+
+
+@pytest.mark.parametrize("way", [denoise.PLAIN, denoise.BEST, *denoise.HALVES])
+def test_each_way_to_denoise_keeps_the_picture_in_place(way):
+    """A bright spot off the middle, on a ramp with an edge, loses its noise."""
+    random, (row, column) = np.random.default_rng(4), np.mgrid[:80, :112]
+    true = 0.2 + 0.6 * (column > 30 + 0.3 * row) + 0.004 * row + np.exp(-((row - 20) ** 2 + (column - 85) ** 2) / 40.0)
+    true, plain = np.repeat(true[..., None], 3, axis=-1), np.ones((80, 112, 3))
+    noisy = true * random.gamma(4.0, 0.25, true.shape)
+    with denoise.open_denoiser(denoiser_libraries(), 2) as denoiser:
+        (clean,) = denoiser.all_denoised([noisy], 0.5 * plain, plain, [way])
+    pictures = noisy, true[::-1], true[:, ::-1], clean
+    *others, error = (np.sqrt(np.square(one - true).mean()) / true.mean() for one in pictures)
+    assert error < 0.08 < 0.2 < min(others) and sum(way.values()) == pytest.approx(1.0)
+    assert clean.mean() == pytest.approx(true.mean(), rel=0.02)

@@ -156,7 +156,7 @@ class RestJob:
     scene: Path | None  # None: the one that the last job has opened
     view: RestView  # in the child a dict
     samples: int
-    seed: int = 0  # the samples that the sum has in all rows
+    done: int = 0  # the samples that the sum has in all rows
     shrink: int = 1  # pixels of the view in either direction that share one
     rows: tuple[float, float] = (0.0, 1.0)  # the shares of the height between which it is rendered
     camera: str | None = None  # where the view has no matrices
@@ -167,7 +167,7 @@ class RestJob:
     @property
     def total(self) -> int:
         """The samples that the sum has in all rows after it."""
-        return self.seed + (self.samples if self.rows[1] == 1.0 else 0)
+        return self.done + (self.samples if self.rows[1] == 1.0 else 0)
 
 
 @dataclass(frozen=True)

@@ -222,6 +222,20 @@ def test_rows_that_are_rendered_apart_are_those_of_the_whole_picture(tmp_path):
             np.testing.assert_array_equal(other, whole)
 
 
+@pytest.mark.newest
+def test_samples_of_several_steps_are_those_of_one(tmp_path):
+    """Of one sequence; but where a pixel shows several materials, whose light times color is that of means."""
+    room()
+    path, sums = parts.save(tmp_path / "room.blend"), []
+    for counts in ((8,), (1, 1, 2, 4)):
+        for done, samples in zip((0, *np.cumsum(counts)), counts, strict=False):
+            view = asdict(RestView(size=SIZE))
+            job = RestJob(None if sums or done else path, view, samples, int(done), continues=done > 0)
+            rest.render_rest(job, tmp_path, lambda *stage: None)
+        sums.append(rest._sum[0])
+    assert (np.abs(sums[1].light - sums[0].light).max(axis=-1) < 1e-4).mean() > 0.9
+
+
 @edits_with_graphics
 def test_a_moved_view_keeps_the_rest_where_its_surface_was_seen():
     """A constant rest on a plane: there it is added; beside, and where another surface was, its color tells."""

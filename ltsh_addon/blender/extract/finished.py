@@ -24,11 +24,13 @@ from .pixels import REST_PASSES, files_opened, open_scene, scene_named
 # A given number of samples is rendered in files, so that progress can be told: the fewest samples of a file, and the
 # most files of a half.
 FEWEST, MOST_OF_HALF = 16, 3
-# A budget is spent in files as well. PROBES: the most samples of the first ones, of which halves are made. PROBED: the
-# share of those that fit which a probe may be; three samples alone seem up to a fifth too slow. SPENT: the share of the
-# time that all files may take. FILE_SECONDS: the processor seconds that a file takes beside its samples, for a million
-# pixels. SEQUENCE: the least length of their sequence of samples; Cycles wants one.
-PROBES, PROBED, SPENT, FILE_SECONDS, SEQUENCE = (1, 3, 8, 8), 1.0 / 8.0, 0.97, 1.0, 1024
+# A budget is spent in files as well. PROBES: the most samples of the first ones. OTHER, the last, is of a sequence of
+# its own: halves of one sequence have noise that is alike. PROBED: the share of those that fit which a probe may be;
+# three samples alone seem up to a fifth too slow. SPENT: the share of the time that all files may take. FILE_SECONDS:
+# the processor seconds that a file takes beside its samples, for a million pixels. SEQUENCE: the least length of their
+# sequence of samples; Cycles wants one.
+PROBES, PROBED, SPENT, FILE_SECONDS, SEQUENCE = (1, 3, 8, 12), 1.0 / 8.0, 0.97, 1.0, 1024
+OTHER = len(PROBES) - 1
 # PASSES: what a finished picture takes its parts from, and artists put together. GUIDES: what the denoiser needs.
 LIGHT_PASSES = tuple(
     f"{kind}_{factor}" for kind in ("diffuse", "glossy", "transmission") for factor in ("direct", "indirect", "color")
@@ -60,7 +62,7 @@ def render_finished(job: FinishedJob, folder: Path, progress) -> dict:
     if job.seconds is None:
         files, least, each = *_render_chunks(scene, layer, folder, job.cycles_samples, progress), 0.0
     else:
-        timed = _TimedFiles(scene, layer, folder, end, progress, **(job.begun or {}))
+        timed = _TimedFiles(scene, layer, prepared.seed, folder, end, progress, **(job.begun or {}))
         timed.render_first()
         if not job.begins:
             timed.render_rest()
@@ -106,6 +108,7 @@ class _PreparedScene:
             for name in regroup(self.scene, tuple(job.own_groups)):
                 self.layer.lightgroups.add(name=name)
         self.everything = reasons_for_cycles(self.scene, self.layer)
+        self.seed = self.scene.cycles.seed
         self.dropped = () if self.layer.cycles.denoising_store_passes else NOT_WRITTEN
         _prepare(self.scene, self.layer, self.warnings)
 
@@ -203,12 +206,13 @@ def _take_all_samples(scene, layer) -> None:
 class _TimedFiles:
     """Files as `_render_chunks` renders them, as many samples as fit until the processor time `end(first file)`.
 
-    The first tell what a sample takes; then come two halves. All are of one sequence, whose noise is spread more evenly
-    than that of several: of 110 samples of the product shot and of the workshop 5 % less error.
+    The first tell what a sample takes; then come two halves. All but OTHER are of one sequence, whose noise is spread
+    more evenly than that of several: of 110 samples of the product shot and of the workshop 5 % less error.
     """
 
     scene: bpy.types.Scene
     layer: bpy.types.ViewLayer
+    seed: int
     folder: Path
     end: Callable[[Path], float]
     progress: Callable
@@ -240,9 +244,10 @@ class _TimedFiles:
 
     def _render(self, count: int) -> None:
         """Render the next samples."""
-        cycles, done = self.scene.cycles, sum(samples for _, samples in self.files)
-        self.progress("Cycles", len(self.files) / (2 + len(PROBES)))
-        started = time.process_time()
+        cycles, number = self.scene.cycles, len(self.files)
+        done = sum(samples for _, samples in self.files[:OTHER] + self.files[OTHER + 1 :]) if number != OTHER else 0
+        self.progress("Cycles", number / (2 + len(PROBES)))
+        started, cycles.seed = time.process_time(), (self.seed + (number == OTHER)) % 2**31
         cycles.samples = max(SEQUENCE, done + count)
         cycles.sample_offset, cycles.sample_subset_length = done, count
         _render_file(self.scene, self.folder, self.files, count)

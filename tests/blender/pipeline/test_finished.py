@@ -544,7 +544,7 @@ def test_a_budget_renders_the_samples_that_cycles_would_render_at_once(tmp_path,
 
     def timed(until, **begun):
         layer = scene.view_layers[0]
-        return finished_module._TimedFiles(scene, layer, tmp_path, lambda path: until, lambda *told: None, **begun)
+        return finished_module._TimedFiles(scene, layer, 0, tmp_path, lambda path: until, lambda *told: None, **begun)
 
     first = timed(28.5)
     first.render_first()
@@ -556,17 +556,16 @@ def test_a_budget_renders_the_samples_that_cycles_would_render_at_once(tmp_path,
     counts = [count for _, count in rendered]
     assert counts == [1, 3, 2, 2, 7, 7] and rest.least == 2.0 and clock[0] == 28.0
     pieces = [imaging.read_layers(tmp_path / name)["ViewLayer.Combined"] for name, _ in rendered]
-    cycles, longest = scene.cycles, finished_module.SEQUENCE
-    cycles.samples, cycles.sample_offset, cycles.sample_subset_length = longest, 0, sum(counts)
-    render_settings.render_exr(scene, tmp_path / "whole.exr")
-    whole = imaging.read_layers(tmp_path / "whole.exr")["ViewLayer.Combined"]
-    # Sums in another order.
-    assert (
-        np.abs(np.average(pieces, axis=0, weights=counts) - whole).max()
-        < 1e-5
-        < 1e-2
-        < np.abs(pieces[-1] - whole).max()
-    )
+    for seed, numbers in ((0, [0, 1, 2, 4, 5]), (1, [3])):
+        parts_of_it, weights = [pieces[number] for number in numbers], [counts[number] for number in numbers]
+        cycles = scene.cycles
+        cycles.seed, cycles.samples = seed, finished_module.SEQUENCE
+        cycles.sample_offset, cycles.sample_subset_length = 0, sum(weights)
+        render_settings.render_exr(scene, tmp_path / "whole.exr")
+        whole = imaging.read_layers(tmp_path / "whole.exr")["ViewLayer.Combined"]
+        # Sums in another order.
+        assert np.abs(np.average(parts_of_it, axis=0, weights=weights) - whole).max() < 1e-5
+        assert np.abs(pieces[5 if seed else 3] - whole).max() > 1e-2
     # However little time there is, there are two files.
     none = timed(0.0)
     none.render_first()

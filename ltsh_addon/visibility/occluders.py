@@ -316,12 +316,6 @@ class Occluders:
         number, corners = _joined(faces)
         return PlacedTriangles(np.repeat(triangles.instance[index], [len(one) for one, _ in faces]), number, corners)
 
-    @property
-    def triangle_count(self) -> int:
-        """Number of triangles over all instances."""
-        sizes = np.array([len(mesh.triangles) for mesh in self.meshes], np.int64)
-        return int(sizes[self.mesh].sum()) if len(self.mesh) else 0
-
     def save(self, path: str | os.PathLike) -> None:
         """Write an .npz, all or nothing, which `load` reads back bit for bit."""
         images: dict[int, np.ndarray] = {}

@@ -271,9 +271,11 @@ def _render_as_saved(scene, layer, folder: Path) -> list[list]:
     samples, seed = layer.samples or cycles.samples, cycles.seed
     counts = [count for count in (-(-samples // 2), samples // 2) if count]
     if len(counts) == 2:
-        # Halves with sqrt(2) of the noise together have as much as the picture should have.
-        cycles.adaptive_threshold *= math.sqrt(2.0)
-        cycles.adaptive_min_samples = -(-cycles.adaptive_min_samples // 2)
+        # Halves with sqrt(2) of the noise together have as much as the picture should have. Without a least number of
+        # samples Cycles takes one by the threshold, and would take that of each half.
+        threshold = cycles.adaptive_threshold or max(1.0 / samples, 0.001)
+        least = cycles.adaptive_min_samples or math.ceil(16.0 / threshold**0.3)
+        cycles.adaptive_threshold, cycles.adaptive_min_samples = math.sqrt(2.0) * threshold, -(-least // 2)
         cycles.time_limit *= 0.5
     layer.samples = 0
     for number, count in enumerate(counts):

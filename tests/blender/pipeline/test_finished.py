@@ -22,6 +22,7 @@ from ltsh_addon.blender.process.pixels import PixelJob, RenderedPixels, extract_
 from ltsh_addon.cli import main
 from ltsh_addon.cycles.lobes import read_layer
 from ltsh_addon.imaging import denoise
+from ltsh_addon.imaging.exr import read_channels
 from ltsh_addon.pipeline import PictureOptions, RenderOptions, compositing, plan, render, shade_scene
 from ltsh_addon.pipeline.lighting import ShadowTracer, load_tables
 from ltsh_addon.pipeline.mixer import light_pictures, moved_light
@@ -571,6 +572,40 @@ def test_a_budget_renders_the_samples_that_cycles_would_render_at_once(tmp_path,
     none.render_first()
     none.render_rest()
     assert len(none.files) == 2
+
+
+@pytest.mark.newest
+@pytest.mark.parametrize("threshold", [0.1, 0.01, 0.0])
+def test_halves_as_saved_take_no_more_samples_than_the_file_asks_for(threshold, tmp_path):
+    """Without noise Cycles takes its least number of samples, in steps of 16. What never ends is a plane whose light
+    is rare and strong."""
+    scene = parts.empty_scene(SIZE, SIZE)
+    parts.add_plane(parts.bsdf_material("ShaderNodeEmission")[0], size=40.0)
+    noisy, node = parts.bsdf_material("ShaderNodeEmission", "Noisy", Strength=100.0)
+    position, random, rare = (
+        parts.add_node(noisy.node_tree, f"ShaderNode{kind}") for kind in ("NewGeometry", "TexWhiteNoise", "Gamma")
+    )
+    rare.inputs["Gamma"].default_value = 30.0
+    for source, target in (
+        (position.outputs[0], random.inputs[0]),
+        (random.outputs["Color"], rare.inputs["Color"]),
+        (rare.outputs[0], node.inputs["Color"]),
+    ):
+        noisy.node_tree.links.new(source, target)
+    parts.add_plane(noisy, size=1.0, name="Noisy", location=(0.0, 0.0, 0.1))
+    parts.add_camera((0.0, 0.0, 3.0), (0.0, 0.0, 0.0))
+    scene.render.engine, layer = "CYCLES", scene.view_layers[0]
+    scene.cycles.use_adaptive_sampling, scene.cycles.adaptive_threshold, scene.cycles.samples = True, threshold, 512
+    scene.cycles.use_denoising, layer.cycles.pass_debug_sample_count = False, True
+
+    def samples(name, most):
+        return most * read_channels(tmp_path / name)["ViewLayer.Debug Sample Count.X"].min()
+
+    render_settings.render_exr(scene, tmp_path / "whole.exr")
+    whole = samples("whole.exr", 512)
+    files = finished_module._render_as_saved(scene, layer, tmp_path)
+    assert len(files) == 2 and 16.0 <= whole < 256.0
+    assert whole - 1.0 < sum(samples(*file) for file in files) < whole + 32.0
 
 
 def test_the_first_points_of_a_pixel_are_those_of_a_picture_with_fewer(tmp_path):

@@ -94,6 +94,7 @@ class SceneMeasurements:
     cycles_samples: int = 0  # of Cycles that are there
     sample_seconds: float = 0.0  # of one more
     squares: Squares | None = None  # with the errors of these samples
+    look_seconds: float = 0.0  # that a look at the lights will take first
     probe: Probe | None = None
 
 
@@ -148,7 +149,8 @@ def direct_light_plan(scene: SceneMeasurements) -> DirectLightPlan:
         pixels = squares.errors.whole.size
         share = READ_SHARE * seconds / (READ_SECONDS * scene.points * pixels)
         count = len(gain) if scene.needs_all else int(np.ceil(min(share, 1.0) * len(gain)))
-        least = PROBE_GAIN - SAMPLES_POWER * (PROBE_SECONDS[0] + PROBE_SECONDS[1] * pixels) / seconds
+        first = scene.look_seconds + PROBE_SECONDS[0] + PROBE_SECONDS[1] * pixels
+        least = PROBE_GAIN - SAMPLES_POWER * first / seconds
         is_worth = bool(gain[:count].max() >= max(least * whole, 1e-30))
         return DirectLightPlan(0, count, "" if is_worth else TOO_LITTLE_GAIN, needs_probe=is_worth)
     if not probe.samples:  # no surface is there

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -138,27 +139,49 @@ class _TimedCycles:
         self._options, self._scene_and_layer, self._folder = options, scene_and_layer, folder
         self.clock, self._progress, self._begun = clock, progress, None
 
-    def seconds_left(self, extraction) -> float | None:
-        """The processor seconds of the budget before denoising."""
-        pixels, denoisings = extraction.film.width * extraction.film.height, compositing.most_denoisings(extraction)
+    def seconds_left(self, extraction=None) -> float | None:
+        """The processor seconds of the budget before denoising; without an extraction, of the whole budget."""
+        pixels = denoisings = 0
+        if extraction is not None:
+            pixels, denoisings = extraction.film.width * extraction.film.height, compositing.most_denoisings(extraction)
         return plan.seconds_before_denoising(self._options.budget, self.clock.seconds(), pixels, denoisings)
 
-    def first_samples(self, extraction):
+    @cached_property
+    def first_samples(self):
         """The `CyclesPicture` of some samples, which `picture` goes on with."""
-        picture = self._rendered(extraction, begins=True)
+        picture = self._rendered(begins=True)
         self._begun = picture.begun
         return picture
+
+    def measured(self, extraction, points: int, **more) -> plan.SceneMeasurements:
+        """What the first samples tell of direct light with so many `points` per pixel."""
+        from ..blender.process.pixels import EDGE_SECONDS
+
+        cycles, film, by_pass = self.first_samples, extraction.film, extraction.left_to_cycles.by_pass
+        errors = compositing.first_errors(cycles, by_pass, self._options.denoise, self._progress)
+        return plan.SceneMeasurements(
+            budget=self._options.budget,
+            seconds_left=self.seconds_left(extraction),
+            edge_seconds=EDGE_SECONDS * film.width * film.height / 1e6,
+            points=points,
+            has_lens=extraction.picture.has_lens,
+            needs_all=self._options.needs_each_light,
+            cycles_samples=cycles.samples,
+            sample_seconds=cycles.begun["each"],
+            squares=plan.Squares(errors) if errors else None,
+            **more,
+        )
 
     def picture(self, extraction):
         """The whole `CyclesPicture`."""
         return self._rendered(extraction, begun=self._begun)
 
-    def _rendered(self, extraction, **more):
+    def _rendered(self, extraction=None, **more):
         from ..blender.process.finished import FinishedJob, render_finished
 
         width, height = self._options.resolution or (None, None)
-        edges = not (extraction.picture.has_lens or extraction.left_to_cycles.everything)
-        size = {"width": width, "height": height, "seconds": self.seconds_left(extraction), "edges": edges}
+        edges = extraction and not (extraction.picture.has_lens or extraction.left_to_cycles.everything)
+        size = {"width": width, "height": height, "seconds": self.seconds_left(extraction), "edges": bool(edges)}
         job = child_job(FinishedJob, self._options, **self._scene_and_layer, **size, **more)
         picture = render_finished(job, self._folder, progress=self._progress)
         self.clock.end("cycles", picture.processor_seconds)
@@ -168,7 +191,8 @@ class _TimedCycles:
 def shade_direct_light(options: RenderOptions, scene_and_layer: dict, timed: _TimedCycles, progress) -> Comparison:
     """The direct light by the technique, with shadows; without results where all of it is left to Cycles.
 
-    `scene_and_layer` are fields of the child's job. With a budget Cycles' first samples tell whether it is worth it.
+    `scene_and_layer` are fields of the child's job. With a budget Cycles' first samples tell whether it is worth a look
+    at the lights.
     """
     from ..blender.process.pixels import PixelJob, RenderedPixels, ended_at_horizons, with_points
 
@@ -182,7 +206,6 @@ def shade_direct_light(options: RenderOptions, scene_and_layer: dict, timed: _Ti
         **scene_and_layer,
         width=width,
         height=height,
-        seconds=options.budget,
         sub_samples=most,
         reserve=(plan.FIRST_DENOISING_SECONDS + 2.0 * plan.NEXT_DENOISING_SECONDS) / 1e6,
         cycles_samples=0,
@@ -190,7 +213,13 @@ def shade_direct_light(options: RenderOptions, scene_and_layer: dict, timed: _Ti
         own_groups=options.own_groups,
     )
     with temporary_folder() as folder:
-        rendered = RenderedPixels.of(job, folder, progress)
+        if options.budget is not None and not options.needs_each_light:
+            extraction = RenderedPixels(job, folder, timed.first_samples.pixels).extraction()
+            reasons = _reasons_not_to_look(timed, extraction, options)
+            clock.end("choice")
+            if reasons is not None:
+                return Comparison(picture, extraction.by_cycles(*reasons), {}, None)
+        rendered = RenderedPixels.of(replace(job, seconds=timed.seconds_left()), folder, progress)
         extraction = rendered.extraction(None if options.budget is None else 1)
         clock.end("extraction", extraction.times.processor)
         if not extraction.lights or extraction.left_to_cycles.everything:
@@ -200,7 +229,7 @@ def shade_direct_light(options: RenderOptions, scene_and_layer: dict, timed: _Ti
             if options.budget is None or not len(extraction.samples):
                 extraction = with_points(extraction, extraction.film.sub_samples)
             else:
-                extraction = shader.planned(rendered, extraction, timed, options, progress)
+                extraction = shader.planned(rendered, extraction, timed)
             if extraction.left_to_cycles.everything:
                 return Comparison(picture, extraction, {}, None)
             extraction = ended_at_horizons(extraction, progress)
@@ -210,6 +239,18 @@ def shade_direct_light(options: RenderOptions, scene_and_layer: dict, timed: _Ti
             comparison = shader.shaded(extraction, shadows, progress)
             clock.end("shading")
     return comparison
+
+
+def _reasons_not_to_look(timed: _TimedCycles, extraction, options: RenderOptions) -> tuple[str, ...] | None:
+    """Why direct light is left to Cycles without a look at the lights, beside Cycles' own reasons; None: it is not."""
+    from ..blender.process.pixels import START_SECONDS, affordable_points, too_little
+
+    pixels = extraction.film.width * extraction.film.height
+    points = min(affordable_points(timed.seconds_left(extraction), pixels, 1), plan.most_points(options))
+    if timed.first_samples.everything or not points:
+        return () if timed.first_samples.everything else (too_little(options.budget),)
+    reason = plan.direct_light_plan(timed.measured(extraction, points, look_seconds=START_SECONDS)).reason
+    return (reason,) if reason else None
 
 
 @dataclass(frozen=True)
@@ -236,27 +277,14 @@ class DirectLightShader:
         results = evaluated(self.tables, extraction, shadows, self.options, progress, self.tracer.pool)
         return Comparison(self.options, extraction, results, shadows)
 
-    def planned(self, rendered, first, timed: _TimedCycles, options: RenderOptions, progress=None):
+    def planned(self, rendered, first, timed: _TimedCycles):
         """The extraction of the points and squares of the `DirectLightPlan`, which may leave everything to Cycles.
 
         `first` is the extraction of the first point of each pixel.
         """
-        from ..blender.process.pixels import EDGE_SECONDS, in_pixels, with_points
+        from ..blender.process.pixels import in_pixels, with_points
 
-        clock, film = timed.clock, first.film
-        cycles = timed.first_samples(first)
-        errors = compositing.first_errors(cycles, first.left_to_cycles.by_pass, options.denoise, progress)
-        measured = plan.SceneMeasurements(
-            budget=self.budget,
-            seconds_left=timed.seconds_left(first),
-            edge_seconds=EDGE_SECONDS * film.width * film.height / 1e6,
-            points=len(rendered.manifest["samples"]),
-            has_lens=first.picture.has_lens,
-            needs_all=options.needs_each_light,
-            cycles_samples=cycles.samples,
-            sample_seconds=cycles.begun["each"],
-            squares=plan.Squares(errors) if errors else None,
-        )
+        measured = timed.measured(first, len(rendered.manifest["samples"]))
         chosen = plan.direct_light_plan(measured)
         if chosen.needs_probe:
             # Warnings are about the whole picture.
@@ -264,10 +292,9 @@ class DirectLightShader:
             extraction = replace(extraction, warnings=first.warnings, problems=first.problems)
             probe = self.probe(extraction, measured.points, measured.squares, chosen.squares)
             chosen = plan.direct_light_plan(replace(measured, probe=probe))
-        clock.end("choice")
+        timed.clock.end("choice")
         if chosen.reason:
-            theirs = first.left_to_cycles
-            return replace(first, left_to_cycles=replace(theirs, everything=(*theirs.everything, chosen.reason)))
+            return first.by_cycles(chosen.reason)
         extraction = in_pixels(extraction, measured.squares.pixels(slice(chosen.squares)))
         return with_points(extraction, chosen.points_per_pixel)
 

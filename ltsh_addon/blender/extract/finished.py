@@ -12,14 +12,16 @@ import numpy as np
 
 from .. import render_settings
 from ..evaluated import SURFACE_TYPES
+from ..lights.area import LightInventory
 from ..lights.groups import regroup
 from ..materials.aovs import give_default_material, objects_without_material
 from ..materials.bsdfs import emits, is_emission
 from ..materials.graph import cut, ensure_nodes, is_seen_through, material_output, shaders_behind, tree_in_use
+from ..process.blender_process import job_start
 from ..process.finished import FinishedJob, ShowJob
 from ..process.pixels import EDGE_SECONDS, rendered_channels
 from ..render_settings import enable_passes, render_exr
-from .pixels import REST_PASSES, files_opened, open_scene, scene_named
+from .pixels import REST_PASSES, files_opened, manifest_of, open_scene, picture_facts, scene_named
 
 # A given number of samples is rendered in files, so that progress can be told: the fewest samples of a file, and the
 # most files of a half.
@@ -48,7 +50,7 @@ REFLECTING = ("Color", "Base Color", "Metallic", "Specular IOR Level", "Transmis
 
 def render_finished(job: FinishedJob, folder: Path, progress) -> dict:
     """Do the `job` and write EXRs into `folder`. Returns the manifest."""
-    started, prepared = time.process_time(), _prepared.pop() if _prepared else None
+    started, prepared = job_start(), _prepared.pop() if _prepared else None
     if job.begun is None or prepared is None or prepared.files_opened != files_opened():
         prepared = _PreparedScene(job, progress)
     scene, layer = prepared.scene, prepared.layer
@@ -87,6 +89,7 @@ def render_finished(job: FinishedJob, folder: Path, progress) -> dict:
         "passes": render_settings.pass_names(),
         "everything": prepared.everything,
         "warnings": prepared.warnings,
+        "pixels": manifest_of(scene, prepared.camera, prepared.facts, LightInventory(), []),
     }
 
 
@@ -101,8 +104,7 @@ class _PreparedScene:
         render_settings.go_to_frame(self.scene, job.frame)
         self.camera = render_settings.choose_camera(self.scene, job.camera)
         self.layer = render_settings.only_view_layer(self.scene, self.warnings, job.view_layer, "rendered")
-        render_settings.set_resolution(self.scene, job.width, job.height)
-        render_settings.render_border(self.scene)  # an error where it is less than a pixel
+        self.facts = picture_facts(self.scene, job)
         if job.own_groups is not None:
             render_settings.remove_extra_passes(self.layer)
             for name in regroup(self.scene, tuple(job.own_groups)):

@@ -20,7 +20,15 @@ from ..lights.world import blocks_nothing, take_world, world_behind, world_light
 from ..materials import aovs
 from ..materials.graph import images_behind
 from ..process.blender_process import job_start, newer
-from ..process.pixels import BEHIND, EDGE_SECONDS, LEAST_POINTS, PixelJob, too_little
+from ..process.pixels import (
+    BEHIND,
+    EDGE_SECONDS,
+    LEAST_POINTS,
+    PixelJob,
+    affordable_points,
+    longest_look,
+    too_little,
+)
 from .occluders import collect_occluders, with_baked_shares, with_displacement
 
 # FAST_PIXELS: up to this many samples (about 1 GB of files), files are compressed fast instead of well.
@@ -60,28 +68,6 @@ def render_pixel_samples(
 
 # FINISHED_LENS: fewest points per pixel for depth of field in a finished picture; with fewer Cycles has less noise.
 FINISHED_LENS = 32
-# Processor seconds of direct light. START_SECONDS: always, beside another look at the scene by Cycles. LIGHT_SECONDS:
-# for each of up to MOST_LIGHTS. POINT_SECONDS: for a point of a pixel. Shares of the seconds that are left.
-# POINTS_SHARE: at most for points. DIRECT_SHARE: at most for what is needed always.
-START_SECONDS, LIGHT_SECONDS, MOST_LIGHTS, POINT_SECONDS = 1.8, 0.06, 100, 4e-6
-POINTS_SHARE, DIRECT_SHARE = 0.04, 0.3
-
-
-def affordable_points(seconds: float, pixels: int, lights: int, looked: float = 0.0) -> int:
-    """How many points of each pixel the processor seconds that are left allow; 0: too few would remain for Cycles.
-
-    The next look at the scene is expected to take as long as the first, `looked` seconds.
-    """
-    if DIRECT_SHARE * seconds < START_SECONDS + LIGHT_SECONDS * min(lights, MOST_LIGHTS) + looked:
-        return 0
-    return max(int(POINTS_SHARE * (seconds - looked) / (POINT_SECONDS * pixels)), 1)
-
-
-def longest_look(seconds: float) -> float:
-    """How long a look at the scene may take for `affordable_points` in what is left of so many `seconds` afterwards."""
-    return (DIRECT_SHARE * seconds - START_SECONDS - LIGHT_SECONDS) / (1.0 + DIRECT_SHARE)
-
-
 # REST_PASSES: passes of Cycles with the parts of the picture that are not reflected light.
 REST_PASSES = ("emit", "environment")
 # OCCLUDERS: the file with the occluders.
@@ -332,7 +318,7 @@ def extract_pixels(job: PixelJob, folder: Path, progress) -> dict:
     view_layer = render_settings.choose_view_layer(scene, warnings, job.view_layer)
     if job.own_groups is not None:
         regroup(scene, tuple(job.own_groups))
-    picture = _OpenPicture(job, scene, view_layer, camera, _picture(scene, job), folder, progress)
+    picture = _OpenPicture(job, scene, view_layer, camera, picture_facts(scene, job), folder, progress)
     inventory, count = picture.prepared_in_time(warnings, opened)
     if inventory.occluders is not None:
         inventory.occluders.save(folder / OCCLUDERS)
@@ -343,25 +329,36 @@ def extract_pixels(job: PixelJob, folder: Path, progress) -> dict:
     times.append(time.monotonic())
     # A later task may save this picture as a PNG with the file's own settings.
     scene.render.film_transparent = picture.facts["film_transparent"]
-    theirs = {**vars(inventory.left_to_cycles), "warnings": inventory.warnings} if job.for_finished else None
+    return {
+        **manifest_of(scene, camera, picture.facts, inventory, warnings),
+        "has_lens": picture.has_lens,
+        **rendered,
+        "reference": reference,
+        "seconds": dict(zip(("start", "samples", "cycles"), np.diff(times).tolist(), strict=True)),
+        "direct_seconds": time.process_time() - opened,
+    }
+
+
+def manifest_of(scene, camera, facts: dict, inventory: LightInventory, warnings: list[str]) -> dict:
+    """The manifest of a picture without samples; `facts` are those of `picture_facts`."""
     return {
         "blender_version": bpy.app.version_string,
         "frame": scene.frame_current,
         "camera": camera.name,
-        **picture.facts,
+        **facts,
         "lights": light_records(inventory.lights),
         "sky_detail": inventory.sky_detail,
         "light_settings": inventory.settings,
         "occluders": None if inventory.occluders is None else OCCLUDERS,
         "warnings": warnings,
         "unshaded": inventory.unshaded,
-        "left_to_cycles": theirs,
-        "has_lens": picture.has_lens,
-        **rendered,
-        "reference": reference,
+        "left_to_cycles": {**vars(inventory.left_to_cycles), "warnings": inventory.warnings},
         "passes": render_settings.pass_names(),
-        "seconds": dict(zip(("start", "samples", "cycles"), np.diff(times).tolist(), strict=True)),
-        "direct_seconds": time.process_time() - opened,
+        "has_lens": False,
+        "samples": [],
+        "seconds": {},
+        **dict.fromkeys(("processor_seconds", "direct_seconds"), 0.0),
+        **dict.fromkeys(("behind", "weights", "reference")),
     }
 
 
@@ -373,7 +370,7 @@ class _OpenPicture:
     scene: bpy.types.Scene
     view_layer: bpy.types.ViewLayer
     camera: bpy.types.Object
-    facts: dict  # of `_picture`
+    facts: dict  # of `picture_facts`
     folder: Path
     progress: Callable
     has_lens: bool = False  # whether the points of a pixel give the depth of field
@@ -467,8 +464,8 @@ def scene_named(name: str | None):
     return bpy.data.scenes[name]
 
 
-def _picture(scene, job: PixelJob) -> dict:
-    """Set the size of the picture; returns its entries of the manifest."""
+def picture_facts(scene, job) -> dict:
+    """Set the size of the picture of a `PixelJob` or `FinishedJob`; returns its entries of the manifest."""
     width, height = render_settings.set_resolution(scene, job.width, job.height)
     border = render_settings.render_border(scene)
     cropped = border is not None and border.cropped

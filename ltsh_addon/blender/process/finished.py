@@ -61,6 +61,7 @@ class CyclesPicture:
     frame: int
     processor_seconds: float
     begun: dict  # its files, and processor seconds: `each` of a sample, the `least` that every picture of it takes
+    pixels: dict  # the manifest of a `PixelJob` of it without samples
 
 
 def render_finished(job: FinishedJob, folder: Path, *, progress: Progress | None = None) -> CyclesPicture:
@@ -82,7 +83,7 @@ def render_finished(job: FinishedJob, folder: Path, *, progress: Progress | None
         everything=tuple(manifest["everything"]),
         warnings=tuple(manifest["warnings"]),
         begun={name: manifest[name] for name in ("files", "each", "least")},
-        **{name: manifest[name] for name in ("camera", "frame", "processor_seconds")},
+        **{name: manifest[name] for name in ("camera", "frame", "processor_seconds", "pixels")},
     )
 
 

@@ -34,6 +34,28 @@ THROUGH_GLASS = {
 }
 
 
+# Processor seconds of direct light. START_SECONDS: always, beside another look at the scene by Cycles. LIGHT_SECONDS:
+# for each of up to MOST_LIGHTS. POINT_SECONDS: for a point of a pixel. Shares of the seconds that are left.
+# POINTS_SHARE: at most for points. DIRECT_SHARE: at most for what is needed always.
+START_SECONDS, LIGHT_SECONDS, MOST_LIGHTS, POINT_SECONDS = 1.8, 0.06, 100, 4e-6
+POINTS_SHARE, DIRECT_SHARE = 0.04, 0.3
+
+
+def affordable_points(seconds: float, pixels: int, lights: int, looked: float = 0.0) -> int:
+    """How many points of each pixel the processor seconds that are left allow; 0: too few would remain for Cycles.
+
+    The next look at the scene is expected to take as long as the first, `looked` seconds.
+    """
+    if DIRECT_SHARE * seconds < START_SECONDS + LIGHT_SECONDS * min(lights, MOST_LIGHTS) + looked:
+        return 0
+    return max(int(POINTS_SHARE * (seconds - looked) / (POINT_SECONDS * pixels)), 1)
+
+
+def longest_look(seconds: float) -> float:
+    """How long a look at the scene may take for `affordable_points` in what is left of so many `seconds` afterwards."""
+    return (DIRECT_SHARE * seconds - START_SECONDS - LIGHT_SECONDS) / (1.0 + DIRECT_SHARE)
+
+
 @dataclass(frozen=True)
 class PixelJob:
     """What to extract from which file. `cycles_samples` 0 means no Cycles reference; None means as in the file."""
@@ -183,6 +205,11 @@ class Extraction:
             return None
         light = self.picture.exposure * (self.cycles.emission + self.cycles.background[..., :3])
         return np.concatenate([light, self.cycles.background[..., 3:]], axis=-1)
+
+    def by_cycles(self, *reasons: str) -> "Extraction":
+        """The same of a finished picture that leaves all direct light to Cycles."""
+        theirs = self.left_to_cycles
+        return replace(self, left_to_cycles=replace(theirs, everything=(*theirs.everything, *reasons)))
 
 
 def extract_pixels(

@@ -18,7 +18,15 @@ from ltsh_addon.blender.extract import pixels as pixels_module
 from ltsh_addon.blender.lights.emission import LookTooLong
 from ltsh_addon.blender.process.blender_process import denoiser_libraries
 from ltsh_addon.blender.process.finished import FinishedJob, render_finished
-from ltsh_addon.blender.process.pixels import PixelJob, RenderedPixels, extract_pixels, in_pixels, with_points
+from ltsh_addon.blender.process.pixels import (
+    PixelJob,
+    RenderedPixels,
+    affordable_points,
+    extract_pixels,
+    in_pixels,
+    longest_look,
+    with_points,
+)
 from ltsh_addon.cli import main
 from ltsh_addon.cycles.lobes import read_layer
 from ltsh_addon.imaging import denoise
@@ -382,20 +390,18 @@ def test_bounced_light_follows_the_lights_of_its_light_group(out, tmp_path):
 @pytest.mark.newest
 def test_budgets_buy_points_by_what_they_cost():
     pixels = 240 * 135
-    points = [pixels_module.affordable_points(seconds, pixels, 1) for seconds in (1.0, 8.0, 24.0, 96.0)]
+    points = [affordable_points(seconds, pixels, 1) for seconds in (1.0, 8.0, 24.0, 96.0)]
     assert points[0] == 0 and 1 <= points[1] < points[2] and points[3] == pytest.approx(4 * points[2], abs=4)
     # Each light takes time, but thousands of lights are clustered.
-    lit = [pixels_module.affordable_points(24.0, pixels, lights) for lights in (1, 60, 120)]
+    lit = [affordable_points(24.0, pixels, lights) for lights in (1, 60, 120)]
     assert lit[0] >= lit[1] > lit[2] == 0
-    assert pixels_module.affordable_points(64.0, pixels, 100) == pixels_module.affordable_points(64.0, pixels, 9999)
+    assert affordable_points(64.0, pixels, 100) == affordable_points(64.0, pixels, 9999)
     # Of large scenes each look takes long.
-    looked = [pixels_module.affordable_points(16.0, pixels, 1, seconds) for seconds in (0.0, 1.0, 4.0)]
+    looked = [affordable_points(16.0, pixels, 1, seconds) for seconds in (0.0, 1.0, 4.0)]
     assert looked[0] >= looked[1] > looked[2] == 0
     for seconds in (8.0, 16.0, 32.0):
-        most = pixels_module.longest_look(seconds)
-        after = [
-            pixels_module.affordable_points(seconds - look, pixels, 1, look) for look in (0.99 * most, 1.01 * most)
-        ]
+        most = longest_look(seconds)
+        after = [affordable_points(seconds - look, pixels, 1, look) for look in (0.99 * most, 1.01 * most)]
         assert after[0] >= 1 and after[1] == 0
 
 

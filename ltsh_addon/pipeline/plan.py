@@ -35,10 +35,10 @@ PROBE_SHARE, PROBE_POWER, LEAST_WEIGHT = 0.04, 0.8, 1e-6
 # evenly. In five scenes, from one to three points: -1 to -2.
 SAMPLES_POWER, POINTS_POWER = -0.56, -1.5
 # GAIN_SHARE: what remains of the gain that the first samples foretell: the squares where they err most err less
-# afterwards; in four scenes 0.4 to 1.1. PROBE_GAIN: the least gain, as a share of the squared error, for which a probe
-# is made, beside what Cycles would win in the time that it takes: PROBE_SECONDS, and for each pixel. LEAST_GAIN: in the
-# end; where 0.13 and 0.26 were foretold, FLIP and L2 were 1.15 and 1.4 times those of Cycles.
-GAIN_SHARE, PROBE_GAIN, PROBE_SECONDS, LEAST_GAIN = 0.6, 0.12, (2.0, 1.2e-4), 0.3
+# afterwards; in four scenes 0.4 to 1.1. LEAST_GAIN: the least gain, as a share of the squared error; where 0.13 and
+# 0.26 were foretold, FLIP and L2 were 1.15 and 1.4 times those of Cycles. A probe is made where there is as much beside
+# what Cycles would win in the time that it takes: PROBE_SECONDS, and for each pixel.
+GAIN_SHARE, LEAST_GAIN, PROBE_SECONDS = 0.6, 0.3, (2.0, 1.2e-4)
 
 
 class Squares:
@@ -85,8 +85,7 @@ class Probe:
 class SceneMeasurements:
     """What is known of a scene after its first samples; times are processor seconds."""
 
-    budget: float | None  # of the whole picture; None: no limit
-    seconds_left: float | None  # of the budget, before denoising
+    seconds_left: float  # of the budget, before denoising
     edge_seconds: float  # that Cycles needs beside its samples
     points: int  # of each pixel that are there
     has_lens: bool  # depth of field, which needs all points
@@ -133,11 +132,11 @@ def direct_light_plan(scene: SceneMeasurements) -> DirectLightPlan:
     error is that of Cycles' picture. Of what its direct light has of it in a square, D, LTSH wins D / (D + A), A that
     of its points: both pictures are weighed by their errors.
     """
-    from ..blender.process.pixels import TOO_LITTLE_GAIN, too_little
+    from ..blender.process.pixels import TOO_LITTLE_GAIN, TOO_LITTLE_TIME
 
     seconds, squares, probe = scene.seconds_left - scene.edge_seconds, scene.squares, scene.probe
     if seconds <= 0.0 or squares is None:
-        return DirectLightPlan(reason=too_little(scene.budget))
+        return DirectLightPlan(reason=TOO_LITTLE_TIME)
     whole, gain = squares.whole, GAIN_SHARE * squares.gains
 
     def noise(taken) -> np.ndarray:
@@ -150,7 +149,7 @@ def direct_light_plan(scene: SceneMeasurements) -> DirectLightPlan:
         share = READ_SHARE * seconds / (READ_SECONDS * scene.points * pixels)
         count = len(gain) if scene.needs_all else int(np.ceil(min(share, 1.0) * len(gain)))
         first = scene.look_seconds + PROBE_SECONDS[0] + PROBE_SECONDS[1] * pixels
-        least = PROBE_GAIN - SAMPLES_POWER * first / seconds
+        least = LEAST_GAIN - SAMPLES_POWER * first / seconds
         is_worth = bool(gain[:count].max() >= max(least * whole, 1e-30))
         return DirectLightPlan(0, count, "" if is_worth else TOO_LITTLE_GAIN, needs_probe=is_worth)
     if not probe.samples:  # no surface is there

@@ -160,7 +160,6 @@ class _TimedCycles:
         cycles, film, by_pass = self.first_samples, extraction.film, extraction.left_to_cycles.by_pass
         errors = compositing.first_errors(cycles, by_pass, self._options.denoise, self._progress)
         return plan.SceneMeasurements(
-            budget=self._options.budget,
             seconds_left=self.seconds_left(extraction),
             edge_seconds=EDGE_SECONDS * film.width * film.height / 1e6,
             points=points,
@@ -207,19 +206,19 @@ def shade_direct_light(options: RenderOptions, scene_and_layer: dict, timed: _Ti
         width=width,
         height=height,
         sub_samples=most,
-        reserve=(plan.FIRST_DENOISING_SECONDS + 2.0 * plan.NEXT_DENOISING_SECONDS) / 1e6,
         cycles_samples=0,
         for_finished=True,
         own_groups=options.own_groups,
     )
     with temporary_folder() as folder:
-        if options.budget is not None and not options.needs_each_light:
+        if options.budget is not None:
             extraction = RenderedPixels(job, folder, timed.first_samples.pixels).extraction()
-            reasons = _reasons_not_to_look(timed, extraction, options)
+            reasons = None if options.needs_each_light else _reasons_not_to_look(timed, extraction, options)
             clock.end("choice")
             if reasons is not None:
                 return Comparison(picture, extraction.by_cycles(*reasons), {}, None)
-        rendered = RenderedPixels.of(replace(job, seconds=timed.seconds_left()), folder, progress)
+            job = replace(job, seconds=timed.seconds_left(extraction))
+        rendered = RenderedPixels.of(job, folder, progress)
         extraction = rendered.extraction(None if options.budget is None else 1)
         clock.end("extraction", extraction.times.processor)
         if not extraction.lights or extraction.left_to_cycles.everything:
@@ -243,12 +242,12 @@ def shade_direct_light(options: RenderOptions, scene_and_layer: dict, timed: _Ti
 
 def _reasons_not_to_look(timed: _TimedCycles, extraction, options: RenderOptions) -> tuple[str, ...] | None:
     """Why direct light is left to Cycles without a look at the lights, beside Cycles' own reasons; None: it is not."""
-    from ..blender.process.pixels import START_SECONDS, affordable_points, too_little
+    from ..blender.process.pixels import START_SECONDS, TOO_LITTLE_TIME, affordable_points
 
     pixels = extraction.film.width * extraction.film.height
     points = min(affordable_points(timed.seconds_left(extraction), pixels, 1), plan.most_points(options))
     if timed.first_samples.everything or not points:
-        return () if timed.first_samples.everything else (too_little(options.budget),)
+        return () if timed.first_samples.everything else (TOO_LITTLE_TIME,)
     reason = plan.direct_light_plan(timed.measured(extraction, points, look_seconds=START_SECONDS)).reason
     return (reason,) if reason else None
 

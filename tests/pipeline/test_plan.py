@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ltsh_addon.blender.process.pixels import TOO_LITTLE_GAIN, too_little
+from ltsh_addon.blender.process.pixels import TOO_LITTLE_GAIN, TOO_LITTLE_TIME
 from ltsh_addon.pipeline import plan
 from ltsh_addon.pipeline.compositing import FirstErrors
 from ltsh_addon.pipeline.options import RenderOptions
@@ -23,7 +23,6 @@ def errors_of(wins, rest=REST, is_denoised=True):
 
 
 SCENE = plan.SceneMeasurements(
-    budget=9.0,
     seconds_left=SECONDS + 0.5,
     edge_seconds=0.5,
     points=5,
@@ -146,7 +145,7 @@ def test_without_a_denoiser_samples_count_for_more():
 
 def test_without_time_or_errors_no_probe_is_shaded():
     for scene in (replace(SCENE, seconds_left=0.0), replace(SCENE, squares=None)):
-        assert plan.direct_light_plan(scene) == plan.DirectLightPlan(reason=too_little(9.0))
+        assert plan.direct_light_plan(scene) == plan.DirectLightPlan(reason=TOO_LITTLE_TIME)
 
 
 def test_depth_of_field_has_all_of_its_points_or_none():

@@ -24,10 +24,11 @@ from ..process.pixels import (
     BEHIND,
     EDGE_SECONDS,
     LEAST_POINTS,
+    TOO_FEW_SAMPLES,
+    TOO_LITTLE_TIME,
     PixelJob,
     affordable_points,
     longest_look,
-    too_little,
 )
 from .occluders import collect_occluders, with_baked_shares, with_displacement
 
@@ -387,7 +388,7 @@ class _OpenPicture:
         is_sharp = lens.use_dof = lens.use_dof and not self.has_lens
         inventory, count, end = LightInventory(), 0, None
         if job.seconds is not None:
-            end = job_start() + job.seconds - (job.reserve + 1e-6 * EDGE_SECONDS) * pixels
+            end = job_start() + job.seconds - 1e-6 * EDGE_SECONDS * pixels
         # Without points, or time for one, a look at the scene would be wasted.
         if job.sub_samples and (end is None or affordable_points(end - opened, pixels, 1)):
             look_until = np.inf if end is None or self.has_lens else opened + longest_look(end - opened)
@@ -405,7 +406,7 @@ class _OpenPicture:
             points = f"with fewer than {FINISHED_LENS} points per pixel (--aa)"
             theirs.append(f"depth of field of camera {self.camera.name!r} {points}")
         if count == 0:
-            theirs.append(too_little(job.seconds))
+            theirs.append(TOO_FEW_SAMPLES if job.seconds is None else TOO_LITTLE_TIME)
         return inventory, 0 if job.for_finished and theirs else count
 
     def rendered_points(self, inventory: LightInventory, count: int) -> dict:

@@ -74,18 +74,13 @@ class PixelJob:
     indices: tuple[str, ...] = ()  # keys of index passes, such as "object_index"; see `render_settings.pass_names`
     shadows: str = "off"  # "on": also the occluders, which then block light in the Cycles reference, too
     for_finished: bool = False  # also what a finished picture leaves to Cycles; no light is needed
-    seconds: float | None = None  # processor time for the whole picture, which limits its sub-samples
+    seconds: float | None = None  # processor time that is left before denoising, which limits its sub-samples
     own_groups: tuple[str, ...] | None = None  # as in `finished.FinishedJob`
-    reserve: float = 0.0  # the seconds of it that each pixel takes last, for denoising
 
 
-def too_little(budget: float | None) -> str:
-    """The reason why a `budget` in seconds, or else few samples, leave all direct light to Cycles."""
-    if budget is None:
-        return "beside so few samples it takes longer than it wins (more of them change that, or --aa)"
-    return f"the budget is too small for it, {budget:g} s"
-
-
+# Why all direct light is left to Cycles.
+TOO_FEW_SAMPLES = "beside so few samples it takes longer than it wins (more of them change that, or --aa)"
+TOO_LITTLE_TIME = "the budget is too small for it"
 TOO_LITTLE_GAIN = "in the time of the budget it would not make the error less than Cycles' own samples do"
 
 

@@ -19,6 +19,7 @@ from ltsh_addon.blender.lights.emission import LookTooLong
 from ltsh_addon.blender.process.blender_process import denoiser_libraries
 from ltsh_addon.blender.process.finished import FinishedJob, render_finished
 from ltsh_addon.blender.process.pixels import (
+    TOO_LITTLE_GAIN,
     PixelJob,
     RenderedPixels,
     affordable_points,
@@ -445,6 +446,18 @@ def test_a_budget_chooses_points_rays_and_samples(tmp_path, monkeypatch):
     (line,) = (line for line in small["warnings"] if "the budget is 0.01 s:" in line)
     least, took = (float(text.partition(" s")[0]) for text in re.split("at least|took", line)[1:])
     assert 0.0 < least <= took
+
+
+@pytest.mark.newest
+def test_where_direct_light_can_win_nothing_there_is_no_look_at_the_lights(tmp_path, monkeypatch):
+    """Each light lights each point evenly: Cycles' direct light has next to no noise beside that of bounces."""
+    scene = floor_and_ball(gray(), 4)
+    bpy.data.objects["Light"].data.size = 0.001
+    monkeypatch.setattr(RenderedPixels, "of", None)
+    made = finished(tmp_path, budget=10.0, resolution=(96, 96))
+    assert made.report["finished"]["all_by_cycles"] == [TOO_LITTLE_GAIN]
+    assert made.report["resolution"] == [96, 96] and made.report["camera"] == scene.camera.name
+    assert made.cycles.samples > 24 and np.any(made.combined[..., :3])
 
 
 @pytest.mark.newest

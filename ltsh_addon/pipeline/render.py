@@ -158,7 +158,7 @@ class _TimedCycles:
         from ..blender.process.pixels import EDGE_SECONDS
 
         cycles, film, by_pass = self.first_samples, extraction.film, extraction.left_to_cycles.by_pass
-        errors = compositing.first_errors(cycles, by_pass, self._options.denoise, self._progress)
+        errors = self._errors(by_pass) if any(mask.any() for mask in by_pass.values()) else self._errors_of_all
         return plan.SceneMeasurements(
             seconds_left=self.seconds_left(extraction),
             edge_seconds=EDGE_SECONDS * film.width * film.height / 1e6,
@@ -170,6 +170,14 @@ class _TimedCycles:
             squares=plan.Squares(errors) if errors else None,
             **more,
         )
+
+    def _errors(self, by_pass) -> compositing.FirstErrors | None:
+        return compositing.first_errors(self.first_samples, by_pass, self._options.denoise, self._progress)
+
+    @cached_property
+    def _errors_of_all(self) -> compositing.FirstErrors | None:
+        """Where LTSH would replace all direct light: before a look at the lights, and often after it."""
+        return self._errors(dict.fromkeys(PASSES, np.zeros((), bool)))
 
     def picture(self, extraction):
         """The whole `CyclesPicture`."""

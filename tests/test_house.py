@@ -14,8 +14,8 @@ import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "ltsh_addon"
-MOST_FILES = 191
-MOST_LINES = 50864  # of the package
+MOST_FILES = 193
+MOST_LINES = 51215  # of the package
 MOST_LINES_OF_A_FILE = 600
 # Files that hold one subject and are longer: why.
 LONGER = {}

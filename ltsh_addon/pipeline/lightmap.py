@@ -130,17 +130,14 @@ def read_rest(
     folder: Path, tile: int, options: BakeOptions, groups: tuple[str, ...], has_soft: bool
 ) -> tuple[dict[tuple[str, int], np.ndarray], np.ndarray]:
     """Cycles' light (H, W, 3) of a tile by kind and row of lights, NOT_BAKED where there is none, and the mask (H, W)
-    of where there is. Soft light counts as bounced where no light group asks for it: one picture is denoised in half of
-    the time of two."""
+    of where there is. Soft light counts as bounced where no light group asks for it."""
     keys = [*itertools.product(rest_passes(options.passes), range(len(groups) if options.per_light else 1))]
-    keys += [(SOFT, 0)] if has_soft else []
+    keys += [(SOFT, 0)] if has_soft and groups != ("",) else []
     firsts, rest = range(0, options.size[1], rest_rows(options.size)), {}
     for kind, row in keys:
         rows = [np.load(folder / f"rest_{kind}_{row}_{tile}_{first}.npy") for first in firsts]
         rest[kind, row] = np.concatenate(rows)
     is_baked = next(iter(rest.values()))[..., 0] != np.float32(NOT_BAKED)
-    if has_soft and groups == ("",):
-        rest["diffuse", 0] += np.where(is_baked[..., None], rest.pop((SOFT, 0)), 0.0)
     return rest, is_baked
 
 

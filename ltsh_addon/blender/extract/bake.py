@@ -3,8 +3,8 @@
 import shutil
 import tempfile
 import time
-from contextlib import contextmanager, nullcontext, suppress
-from dataclasses import dataclass, field, replace
+from contextlib import nullcontext, suppress
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -19,15 +19,16 @@ from ...scene import ATLAS, SceneError, error_line, light_records
 from .. import render_settings
 from ..evaluated import rendered_surfaces, with_render_depsgraph
 from ..lights.area import collect_lights
-from ..lights.emission import emission_of
-from ..lights.world import may_shine, take_world
+from ..lights.world import take_world
 from ..materials import aovs
-from ..materials.graph import cut, ensure_nodes, has_displacement, has_volume
+from ..materials.graph import ensure_nodes, has_displacement, has_volume
 from ..materials.maps import UV_MAP, MaterialPlan, SavedImages
 from ..process.bake import BakeFactsJob, BakeJob
 from ..render_settings import changed_properties, working_space
 from . import atlas, bake_meshes, pixels
+from .bounces import bounces_of, lights_by_row, lit_by, rows_of_lights
 from .dependencies import NotJudged, dependencies
+from .final_gather import FinalGather
 from .occluders import collect_occluders, with_baked_shares, with_displacement
 from .pixels import OCCLUDERS, SEEDS, remove_occlusion
 
@@ -120,16 +121,17 @@ class ObjectBake:
         light = light if kind == "diffuse_light" else {*light, "COLOR"}
         return np.array([self.radiance(block, kind, (seed, samples), light) for seed in SEEDS.values()])
 
-    def radiance(self, block: Block, kind: str, sampling: tuple[int, int], light: set[str]) -> np.ndarray:
-        """Cycles' light (rows, W, 3) of the passes `light`; `sampling` is a seed and a number of samples."""
+    def radiance(self, block: Block, kind: str, sampling: tuple[int, int], light: set[str], how=None) -> np.ndarray:
+        """Cycles' light (rows, W, 3) of the passes `light`, within the context `how`; `sampling` is a seed and a number
+        of samples."""
         for plan in self.plans:
             plan.show(None)
-        self.scene.cycles.seed, self.scene.cycles.samples = sampling
-        bake = self.scene.render.bake
+        cycles, bake = self.scene.cycles, self.scene.render.bake
+        cycles.seed, cycles.samples = sampling
         # Diffuse light is the same from everywhere. Seen from above, faces whose smooth normals turn away show that of
         # their other side.
         view = "ACTIVE_CAMERA" if CYCLES_TYPES[kind] == "DIFFUSE" and "COLOR" not in light else bake.view_from
-        with changed_properties([(bake, "view_from", view)]):
+        with how or nullcontext(), changed_properties([(bake, "view_from", view)]):
             return self._bake(block, CYCLES_TYPES[kind], light)
 
     def _bake(self, block: Block, kind: str, pass_filter) -> np.ndarray:
@@ -200,6 +202,7 @@ class BakeScene:
     world: object  # of the file, or None
     settings: dict[str, list[float]]  # of light objects, by name
     folder: tempfile.TemporaryDirectory = field(repr=False)
+    gather: FinalGather | None = None  # for bounced diffuse light, made when it is asked for
 
     def plans(self, objects, images) -> tuple[dict[str, MaterialPlan], list[str]]:
         """The plan of each material of `objects` by its full name, and warnings about them."""
@@ -308,63 +311,6 @@ def _open(job: BakeJob) -> BakeScene:
     facts = names, meshes, problems | unfit, lobes, densities
     lights = lights_by_row(scene, world, inventory.lights) if job.per_light else inventory.lights
     return BakeScene(scene, name, view, lights, warnings, *facts, bounces, world, inventory.settings, folder)
-
-
-# BOUNCES: settings of Cycles on which indirect light depends, and which pictures of direct light switch off.
-BOUNCES = ("max_bounces", "sample_clamp_indirect", "blur_glossy", "caustics_reflective", "use_fast_gi")
-# GLOW: the row of all surfaces that glow. EMITTING: sockets that make surfaces glow, by node.
-GLOW = "Glowing surfaces"
-EMITTING = {"ShaderNodeEmission": "Strength", "ShaderNodeBsdfPrincipled": "Emission Strength"}
-
-
-def bounces_of(scene) -> list[tuple]:
-    """The settings of the file, as for `changed_properties`, on which its indirect light depends."""
-    owners = [(scene.cycles, name) for name in BOUNCES]
-    owners += [(material.cycles, "emission_sampling") for material in bpy.data.materials]
-    return [(owner, name, getattr(owner, name)) for owner, name in owners]
-
-
-def lights_by_row(scene, world, lights: list) -> list:
-    """The lights with the group by whose name they are baked for themselves: their own, else one of their name."""
-    alone = {ob.name for ob in scene.objects if ob.type == "LIGHT"} | ({world.name} if world is not None else set())
-    return [replace(one, group=(one.group or one.name) if one.name in alone else GLOW) for one in lights]
-
-
-def rows_of_lights(scene) -> int:
-    """About how many rows `lights_by_row` makes, told by the file alone."""
-    rows = {ob.lightgroup or ob.name for ob in scene.objects if ob.type == "LIGHT" and not ob.hide_render}
-    if scene.world is not None and may_shine(scene.world):
-        rows.add(scene.world.lightgroup or scene.world.name)
-    return len(rows) + any(emission_of(material).emits for material in aovs.materials_of(scene))
-
-
-@contextmanager
-def lit_by(opened: BakeScene, names: set[str] | None = None):
-    """Within this context only the lights `names` shine, and bounce as the file has it; None: all do."""
-    scene, world, dark, cuts = opened.scene, opened.world, [], []
-    if names is not None:
-        lamps = {ob for ob in scene.objects if ob.type == "LIGHT"}
-        dark = [ob for ob in lamps if ob.name not in names]
-        alone = {ob.name for ob in lamps} | ({world.name} if world is not None else set())
-        world = world if world is not None and world.name in names else None
-        cuts = [] if names - alone else _glowing_sockets()
-    changes = [*opened.bounces, (scene, "world", world), *((ob, "hide_render", True) for ob in dark)]
-    links = [(link.from_socket, link.to_socket) for socket in cuts for link in socket.links]
-    for socket in cuts:
-        cut(socket)
-    try:
-        with changed_properties(changes + [(socket, "default_value", 0.0) for socket in cuts]):
-            yield
-    finally:
-        for source, socket in links:
-            socket.id_data.links.new(source, socket)
-
-
-def _glowing_sockets() -> list:
-    """The sockets by which surfaces glow, in materials and in groups."""
-    owners = [material.node_tree for material in bpy.data.materials] + list(bpy.data.node_groups)
-    nodes = [node for tree in owners if tree is not None and tree.type == "SHADER" for node in tree.nodes]
-    return [node.inputs[EMITTING[node.bl_idname]] for node in nodes if node.bl_idname in EMITTING]
 
 
 def _points_in_boxes(objects) -> np.ndarray:
@@ -519,6 +465,9 @@ def _objects(opened, names, images, job, folder, progress) -> dict:
         save_array(folder / file, np.concatenate(list(maps)))
     record["maps"] = any(plan.count for plan in plans.values())
     if record["maps"] or job.cycles_samples or job.bounces == "on":
+        if "diffuse" in job.rest_passes and opened.gather is None:
+            view_layer = opened.scene.view_layers[render_settings.VIEW_LAYER]
+            opened.gather = FinalGather.of(opened.scene, view_layer, max(job.width, job.height))
         tiles = [tile for tile in tiles_of(joined.uv)[0] if job.tile in (None, tile)]
         uv_names = {ob: opened.meshes[ob.name].uv_name for ob in objects}
         bake = ObjectBake(opened.scene, uv_names, list(plans.values()))
@@ -546,17 +495,43 @@ def _bake(bake, tiles, job, opened, files) -> None:
         # One light by itself has less noise, since no sample goes to others.
         samples = job.rest_samples if len(rows) == 1 else max(job.rest_samples // 2, 1)
         tasks = [(kind, row, names) for row, names in enumerate(rows) for kind in job.rest_passes]
-        if sky := {one.name for one in opened.lights if one.is_side and one.affects_diffuse}:
-            tasks += [("soft", 0, sky)] * ("diffuse" in job.rest_passes)
+        sides = [one for one in opened.lights if one.is_side and one.affects_diffuse and "diffuse" in job.rest_passes]
+        sky = {one.name for one in sides}
+        is_joined = {one.group for one in opened.lights} == {""}  # as for `pipeline.lightmap.read_rest`
+        tasks += [("soft", 0, sky)] * (bool(sky) and not is_joined)
         steps = [(block, *task) for block in (rest if has_bounces else ()) for task in tasks]
         for number, (block, kind, row, names) in enumerate(steps):
             progress(f"bounces {name}", number / len(steps))
-            with lit_by(opened, names):
-                light = {"diffuse": {"INDIRECT"}, "specular": {"INDIRECT", "COLOR"}, "soft": {"DIRECT"}}[kind]
-                baked = bake.radiance(block, kind, (SEEDS["A"], samples), light)
+            sampling = SEEDS["A"], samples
+            if kind == "diffuse":
+                baked = _bounced(bake, opened, block, (names, sides if is_joined else []), sampling)
+            else:
+                light = {"specular": {"INDIRECT", "COLOR"}, "soft": {"DIRECT"}}[kind]
+                with lit_by(opened, names):
+                    baked = bake.radiance(block, kind, sampling, light)
             save_array(folder / f"rest_{kind}_{row}_{block.name}.npy", baked)
     finally:
         bake.close()
+
+
+def _bounced(bake, opened, block, lights, sampling) -> np.ndarray:
+    """Diffuse light of a block, without color. `lights`: names of those that bounce, and the sky, whose direct light is
+    in it too."""
+    names, sky = lights
+    with lit_by(opened, names):
+        is_gathered = opened.gather.serves()
+        # Samples for the direct light of an uneven sky go to its bright parts, if they are for it alone.
+        has_sky = is_gathered and bool(sky) and not any(one.children for one in sky)
+        if is_gathered:
+            gathering = opened.gather.gathering(names and frozenset(names), sampling[1], has_sky)
+            light = bake.radiance(block, "diffuse", sampling, {"DIRECT", "INDIRECT"}, gathering)
+        else:
+            light = bake.radiance(block, "diffuse", sampling, {"INDIRECT"})
+    if sky and not has_sky:
+        with lit_by(opened, {one.name for one in sky}):
+            direct = bake.radiance(block, "soft", sampling, {"DIRECT"})
+        light = np.where(light == np.float32(NOT_BAKED), light, light + direct)
+    return light
 
 
 def _blocks(job: BakeJob, tiles, rows: int) -> list[Block]:

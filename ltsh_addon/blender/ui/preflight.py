@@ -22,8 +22,8 @@ from ...scene import ATLAS, SceneError, error_line, listed
 from ..evaluated import objects_in_renders
 from ..extract.apply import shows_texture
 from ..extract.atlas import make_atlas
-from ..extract.bake import rows_of_lights
 from ..extract.bake_meshes import ObjectError, check_object
+from ..extract.bounces import rows_of_lights
 from ..lights.area import LightInventory, node_light, reason_to_leave_out
 from ..lights.area import note_unsupported as note_unsupported_light
 from ..lights.emission import emission_of

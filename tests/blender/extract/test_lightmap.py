@@ -8,7 +8,8 @@ import pytest
 from bake_scenes import SIZE, baked, save, start
 from scene_parts import add_bump, add_mesh, add_plane, add_sphere, add_world, principled
 
-from ltsh_addon.blender.extract.bake import SAMPLED_TEXELS, rows_of_lights
+from ltsh_addon.blender.extract.bake import SAMPLED_TEXELS
+from ltsh_addon.blender.extract.bounces import rows_of_lights
 
 TRUTH = 256  # samples; a half of them is off by 1.5 % of the light
 

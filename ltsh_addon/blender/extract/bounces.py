@@ -1,0 +1,68 @@
+"""Which lights shine, and bounce, while Cycles bakes (runs in the child)."""
+
+from contextlib import contextmanager
+from dataclasses import replace
+
+import bpy
+
+from ..lights.emission import emission_of
+from ..lights.world import may_shine
+from ..materials import aovs, bsdfs, graph
+from ..render_settings import changed_properties
+
+# BOUNCES: settings of Cycles on which indirect light depends, and which pictures of direct light switch off.
+BOUNCES = ("max_bounces", "sample_clamp_indirect", "blur_glossy", "caustics_reflective", "use_fast_gi")
+# GLOW: the row of all surfaces that glow. EMITTING: sockets that make surfaces glow, by node.
+GLOW = "Glowing surfaces"
+EMITTING = {bsdfs.EMISSION: "Strength", graph.PRINCIPLED: "Emission Strength"}
+
+
+def bounces_of(scene) -> list[tuple]:
+    """The settings of the file, as for `changed_properties`, on which its indirect light depends."""
+    owners = [(scene.cycles, name) for name in BOUNCES]
+    owners += [(material.cycles, "emission_sampling") for material in bpy.data.materials]
+    return [(owner, name, getattr(owner, name)) for owner, name in owners]
+
+
+def lights_by_row(scene, world, lights: list) -> list:
+    """The lights with the group by whose name they are baked for themselves: their own, else one of their name."""
+    alone = {ob.name for ob in scene.objects if ob.type == "LIGHT"} | ({world.name} if world is not None else set())
+    return [replace(one, group=(one.group or one.name) if one.name in alone else GLOW) for one in lights]
+
+
+def rows_of_lights(scene) -> int:
+    """About how many rows `lights_by_row` makes, told by the file alone."""
+    rows = {ob.lightgroup or ob.name for ob in scene.objects if ob.type == "LIGHT" and not ob.hide_render}
+    if scene.world is not None and may_shine(scene.world):
+        rows.add(scene.world.lightgroup or scene.world.name)
+    return len(rows) + any(emission_of(material).emits for material in aovs.materials_of(scene))
+
+
+@contextmanager
+def lit_by(opened, names: set[str] | None = None):
+    """Within this context only the lights `names` of a `bake.BakeScene` shine, and bounce as the file has it; None: all
+    do."""
+    scene, world, dark, cuts = opened.scene, opened.world, [], []
+    if names is not None:
+        lamps = {ob for ob in scene.objects if ob.type == "LIGHT"}
+        dark = [ob for ob in lamps if ob.name not in names]
+        alone = {ob.name for ob in lamps} | ({world.name} if world is not None else set())
+        world = world if world is not None and world.name in names else None
+        cuts = [] if names - alone else _glowing_sockets()
+    changes = [*opened.bounces, (scene, "world", world), *((ob, "hide_render", True) for ob in dark)]
+    links = [(link.from_socket, link.to_socket) for socket in cuts for link in socket.links]
+    for socket in cuts:
+        graph.cut(socket)
+    try:
+        with changed_properties(changes + [(socket, "default_value", 0.0) for socket in cuts]):
+            yield
+    finally:
+        for source, socket in links:
+            socket.id_data.links.new(source, socket)
+
+
+def _glowing_sockets() -> list:
+    """The sockets by which surfaces glow, in materials and in groups."""
+    owners = [material.node_tree for material in bpy.data.materials] + list(bpy.data.node_groups)
+    nodes = [node for tree in owners if tree is not None and tree.type == "SHADER" for node in tree.nodes]
+    return [node.inputs[EMITTING[node.bl_idname]] for node in nodes if node.bl_idname in EMITTING]

@@ -22,12 +22,13 @@ from ..render_settings import changed_properties
 from . import atlas, bake_meshes
 from .bounces import EMITTING
 
-# MOST_OBJECTS, MOST_FACES: of the surfaces with textures. Each object takes a bake, which reads the scene again.
-MOST_OBJECTS, MOST_FACES = 24, 100_000
+# MOST_OBJECTS, MOST_FACES: of the surfaces with textures. Each object takes a bake, which reads the scene again: there
+# are fewer, but LEAST_OBJECTS, where their number times the faces of the scene would be more than READ_FACES.
+MOST_OBJECTS, MOST_FACES, LEAST_OBJECTS, READ_FACES = 24, 100_000, 4, 4_000_000
 # MOST_UV_MAPS: of such a surface. Blender has eight, this takes one, and a bake another.
 MOST_UV_MAPS = 6
 # SIDES: the least and the most texels a side of the texture; between them half of what is baked.
-SIDES = 128, 1024
+SIDES = 64, 1024
 # REACH: property of objects, texels of the texture on a metre: what is nearer than a texel is traced.
 UV_MAP, REACH, NAME = "ltsh gather", "ltsh_reach", "ltsh gather"
 SEED = 77
@@ -117,12 +118,14 @@ def _candidates(scene, view_layer) -> list:
     instanced, chosen, faces = with_render_depsgraph(scene, visit), [], 0
     if instanced.intersection(lamps):
         return []
+    affordable = READ_FACES // max(sum(len(ob.data.polygons) for ob in meshes), 1)
+    most = min(max(affordable, LEAST_OBJECTS), MOST_OBJECTS)
     for ob in sorted(meshes, key=lambda ob: (-_size(ob), ob.name)):
         has_nodes = [slot.material is not None and graph.tree_in_use(slot.material) for slot in ob.material_slots]
         is_plain = not (ob.modifiers or ob.data.shape_keys or ob.is_holdout or ob in instanced)
         if is_plain and has_nodes and all(has_nodes) and len(ob.data.uv_layers) <= MOST_UV_MAPS:
             faces += len(ob.data.polygons)
-            if faces > MOST_FACES or len(chosen) == MOST_OBJECTS:
+            if faces > MOST_FACES or len(chosen) == most:
                 break
             chosen.append(ob)
     return chosen

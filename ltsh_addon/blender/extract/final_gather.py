@@ -27,7 +27,8 @@ from .bounces import EMITTING
 MOST_OBJECTS, MOST_FACES, LEAST_OBJECTS, READ_FACES = 24, 100_000, 4, 4_000_000
 # MOST_UV_MAPS: of such a surface. Blender has eight, this takes one, and a bake another.
 MOST_UV_MAPS = 6
-# SIDES: the least and the most texels a side of the texture; between them half of what is baked.
+# SIDES: the least and the most texels a side of the texture; between them as many as are baked. They get a quarter of
+# the samples: means over many texels are gathered.
 SIDES = 64, 1024
 # REACH: property of objects, texels of the texture on a metre: what is nearer than a texel is traced.
 UV_MAP, REACH, NAME = "ltsh gather", "ltsh_reach", "ltsh gather"
@@ -51,7 +52,7 @@ class FinalGather:
     @classmethod
     def of(cls, scene, view_layer, size: int) -> "FinalGather":
         """For bakes of `size` texels a side."""
-        side, candidates = int(np.clip(size // 2, *SIDES)), _candidates(scene, view_layer)
+        side, candidates = int(np.clip(size, *SIDES)), _candidates(scene, view_layer)
         densities, _ = atlas.make_atlas(candidates, side, name=UV_MAP) if candidates else ({}, {})
         objects = [scene.objects[name] for name in densities]
         for ob in objects:
@@ -81,7 +82,7 @@ class FinalGather:
         """The irradiance over pi (side * side * 4,) of the surfaces, with one bounce less than texels have."""
         cycles = self.scene.cycles
         image = bpy.data.images.new(NAME, self.side, self.side, float_buffer=True, is_data=True)
-        values = [("samples", samples), ("seed", SEED)]
+        values = [("samples", max(samples // 4, 1)), ("seed", SEED)]
         values += [(name, getattr(cycles, name) - 1) for name in ("max_bounces", "diffuse_bounces")]
         view = (self.scene.render.bake, "view_from", "ACTIVE_CAMERA")  # as in `bake.ObjectBake.radiance`
         with changed_properties([*((cycles, *value) for value in values), view]), _Changes() as changes:

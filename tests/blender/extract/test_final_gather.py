@@ -136,7 +136,7 @@ def test_what_is_gathered_is_what_cycles_traces(floor, has_sky):
     with gather().gathering(None, 128, has_sky):
         gathered = floor({"DIRECT", "INDIRECT"}, 256, 3)
     blocks = [light.reshape(8, SIDE // 8, 8, SIDE // 8, 3).mean(axis=(1, 3)) for light in (gathered, truth)]
-    # The texture has 16 texels a metre; light that counts twice, or not at all, would be 5 % and more.
+    # The texture has 25 texels a metre; light that counts twice, or not at all, would be 5 % and more.
     assert gathered.mean() == pytest.approx(truth.mean(), rel=0.015)
     assert root_mean_square(blocks[0] - blocks[1]) < 0.03 * truth.mean()
 

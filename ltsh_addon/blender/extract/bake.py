@@ -519,11 +519,12 @@ def _bounced(bake, opened, block, lights, sampling) -> np.ndarray:
     in it too."""
     names, sky = lights
     with lit_by(opened, names):
-        is_gathered = opened.gather.serves()
+        of_lights = names and frozenset(names)
+        is_gathered = opened.gather.serves(of_lights, sampling[1])
         # Samples for the direct light of an uneven sky go to its bright parts, if they are for it alone.
         has_sky = is_gathered and bool(sky) and not any(one.children for one in sky)
         if is_gathered:
-            gathering = opened.gather.gathering(names and frozenset(names), sampling[1], has_sky)
+            gathering = opened.gather.gathering(of_lights, has_sky)
             light = bake.radiance(block, "diffuse", sampling, {"DIRECT", "INDIRECT"}, gathering)
         else:
             light = bake.radiance(block, "diffuse", sampling, {"INDIRECT"})

@@ -56,21 +56,26 @@ class FinalGather:
         densities, _ = atlas.make_atlas(candidates, side, name=UV_MAP) if candidates else ({}, {})
         objects = [scene.objects[name] for name in densities]
         for ob in objects:
-            ob[REACH], ob.hide_viewport = densities[ob.name], False
-            ob.hide_set(False, view_layer=view_layer)  # Cycles' bake refuses what is hidden
+            ob[REACH] = densities[ob.name]
         return cls(scene, view_layer, objects, side)
 
-    def serves(self) -> bool:
-        """True if light bounces as the file has it, and finds a texture."""
+    def serves(self, names: frozenset | None, samples: int) -> bool:
+        """True if the light of the lights `names`, which shine, finds a texture when it bounces as the file has it; the
+        texture is made."""
         cycles = self.scene.cycles
-        return bool(self.objects) and min(cycles.max_bounces, cycles.diffuse_bounces) > 0 and not cycles.use_fast_gi
+        if min(cycles.max_bounces, cycles.diffuse_bounces) < 1 or cycles.use_fast_gi or not self.objects:
+            return False
+        if names not in self.textures:
+            try:
+                self.textures[names] = self._irradiance(samples)
+            except RuntimeError:  # Cycles refuses to bake one
+                self.objects.clear()
+        return bool(self.objects)
 
     @contextmanager
-    def gathering(self, names: frozenset | None, samples: int, has_sky: bool):
-        """Within this context direct diffuse light on texels is the bounced light of the lights `names`, which shine;
-        with that of the world if `has_sky`."""
-        if names not in self.textures:
-            self.textures[names] = self._irradiance(samples)
+    def gathering(self, names: frozenset | None, has_sky: bool):
+        """Within this context direct diffuse light on texels is the bounced light of the lights `names`, which `serves`
+        knows; with that of the world if `has_sky`."""
         image = bpy.data.images.new(NAME, self.side, self.side, float_buffer=True, is_data=True)
         image.pixels.foreach_set(self.textures[names])
         with _Changes() as changes:
@@ -123,8 +128,12 @@ def _candidates(scene, view_layer) -> list:
     most = min(max(affordable, LEAST_OBJECTS), MOST_OBJECTS)
     for ob in sorted(meshes, key=lambda ob: (-_size(ob), ob.name)):
         has_nodes = [slot.material is not None and graph.tree_in_use(slot.material) for slot in ob.material_slots]
-        is_plain = not (ob.modifiers or ob.data.shape_keys or ob.is_holdout or ob in instanced)
+        is_plain = not (ob.modifiers or ob.data.shape_keys or ob in instanced or ob.holdout_get(view_layer=view_layer))
         if is_plain and has_nodes and all(has_nodes) and len(ob.data.uv_layers) <= MOST_UV_MAPS:
+            ob.hide_viewport = False
+            ob.hide_set(False, view_layer=view_layer)
+            if not ob.visible_get(view_layer=view_layer):  # Cycles' bake refuses it
+                continue
             faces += len(ob.data.polygons)
             if faces > MOST_FACES or len(chosen) == most:
                 break
@@ -269,17 +278,21 @@ class _Changes(ExitStack):
 
     def _hide(self, light, rules, name: str) -> None:
         """Let a light or world shine where the output `name` of the `rules` is 1."""
-        if graph.tree_in_use(light) is None:
+        is_world, has_nodes = isinstance(light, bpy.types.World), graph.tree_in_use(light) is not None
+        if not has_nodes:
             self.set(light, "use_nodes", True)
-            if isinstance(light, bpy.types.World):
-                light.node_tree.nodes["Background"].inputs["Color"].default_value = (*light.color, 1.0)
         tree = graph.tree_in_use(light)
-        output = graph.material_output(tree)
-        link = output and graph.live_link(output.inputs["Surface"])
-        if link:
+        output = graph.material_output(tree) or self.add(tree, f"ShaderNodeOutput{'World' if is_world else 'Light'}")
+        link = graph.live_link(output.inputs["Surface"])
+        source = link and link.from_socket
+        if not has_nodes:
+            node = self.add(tree, "ShaderNodeBackground" if is_world else EMISSION)
+            node.inputs["Color"].default_value = (*light.color, 1.0) if is_world else (1.0, 1.0, 1.0, 1.0)
+            source = node.outputs[0]
+        if source is not None:
             mix = self.add(tree, graph.MIX)
             tree.links.new(self._ruled(tree, rules)[name], mix.inputs[0])
-            tree.links.new(link.from_socket, mix.inputs[2])
+            tree.links.new(source, mix.inputs[2])
             self._relink(output.inputs["Surface"], mix.outputs[0])
 
 

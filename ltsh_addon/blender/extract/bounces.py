@@ -7,14 +7,13 @@ import bpy
 
 from ..lights.emission import emission_of
 from ..lights.world import may_shine
-from ..materials import aovs, bsdfs, graph
+from ..materials import aovs, graph
+from ..materials.bsdfs import emission_sockets
 from ..render_settings import changed_properties
 
 # BOUNCES: settings of Cycles on which indirect light depends, and which pictures of direct light switch off.
 BOUNCES = ("max_bounces", "sample_clamp_indirect", "blur_glossy", "caustics_reflective", "use_fast_gi")
-# GLOW: the row of all surfaces that glow. EMITTING: sockets that make surfaces glow, by node.
-GLOW = "Glowing surfaces"
-EMITTING = {bsdfs.EMISSION: "Strength", graph.PRINCIPLED: "Emission Strength"}
+GLOW = "Glowing surfaces"  # the row of all that glow
 
 
 def bounces_of(scene) -> list[tuple]:
@@ -61,8 +60,12 @@ def lit_by(opened, names: set[str] | None = None):
             socket.id_data.links.new(source, socket)
 
 
+def shader_nodes() -> list:
+    """The nodes of all materials and of groups of shader nodes."""
+    trees = [graph.tree_in_use(material) for material in bpy.data.materials] + list(bpy.data.node_groups)
+    return [node for tree in trees if tree is not None and tree.type == "SHADER" for node in tree.nodes]
+
+
 def _glowing_sockets() -> list:
     """The sockets by which surfaces glow, in materials and in groups."""
-    owners = [material.node_tree for material in bpy.data.materials] + list(bpy.data.node_groups)
-    nodes = [node for tree in owners if tree is not None and tree.type == "SHADER" for node in tree.nodes]
-    return [node.inputs[EMITTING[node.bl_idname]] for node in nodes if node.bl_idname in EMITTING]
+    return [sockets[1] for sockets in map(emission_sockets, shader_nodes()) if sockets]

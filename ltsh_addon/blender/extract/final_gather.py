@@ -17,10 +17,10 @@ from ...cycles.closures import dielectric_albedo, specular_level_applied
 from ..evaluated import objects_in_renders, with_render_depsgraph
 from ..lights.emission import emission_of
 from ..materials import graph
-from ..materials.bsdfs import EMISSION
+from ..materials.bsdfs import EMISSION, emission_sockets
 from ..render_settings import changed_properties
 from . import atlas, bake_meshes
-from .bounces import EMITTING
+from .bounces import shader_nodes
 
 # MOST_OBJECTS, MOST_FACES: of the surfaces with textures. Each object takes a bake, which reads the scene again: there
 # are fewer, but LEAST_OBJECTS, where their number times the faces of the scene would be more than READ_FACES.
@@ -174,15 +174,13 @@ class _Changes(ExitStack):
 
     def gather(self, scene, image, has_sky: bool) -> None:
         """Change surfaces and lights so that they light texels by the irradiance over pi of `image` alone."""
-        rules = _rules(image)
+        nodes, rules = [node for node in shader_nodes() if not node.mute], _rules(image)
         self.callback(bpy.data.node_groups.remove, rules)
         for material in bpy.data.materials:
             if graph.tree_in_use(material) is not None and not emission_of(material).emits:
                 self.set(material.cycles, "emission_sampling", "NONE")
-        trees = [graph.tree_in_use(material) for material in bpy.data.materials] + list(bpy.data.node_groups)
-        trees = [tree for tree in trees if tree not in (None, rules) and tree.type == "SHADER"]
-        for node in [node for tree in trees for node in tree.nodes if not node.mute]:
-            if node.bl_idname in EMITTING or node.bl_idname in COLORS:
+        for node in nodes:
+            if emission_sockets(node) or node.bl_idname in COLORS:
                 self._limit(node, rules)
         for lamp in [ob for ob in bpy.data.objects if ob.type == "LIGHT" and ob.users_collection]:
             if not lamp.hide_render and not lamp.data.cycles.is_portal:
@@ -199,27 +197,27 @@ class _Changes(ExitStack):
     def _limit(self, node, rules) -> None:
         """Let a shader node glow at texels by what is known of its diffuse light alone."""
         given = self._ruled(node.id_data, rules)
-        if node.bl_idname in EMITTING:
-            strength = node.inputs[EMITTING[node.bl_idname]]
+        for strength in emission_sockets(node)[1:]:
             self._relink(strength, self._math("MULTIPLY", graph.value_of(strength), given["Later"]))
         unknown = [name for name in UNKNOWN if name in node.inputs]
         if node.bl_idname not in COLORS or any(
             not graph.is_constant(graph.value_of(node.inputs[name]), UNKNOWN[name]) for name in unknown
         ):
             return
-        known, share = given["Known"], given["Known"]
+        known, factors = given["Known"], []
         if node.bl_idname == graph.PRINCIPLED:
             # Metal and glass have no diffuse light; half of either counts as such, or as none.
             for name in ("Metallic", "Transmission Weight"):
                 value = graph.value_of(node.inputs[name])
                 if not graph.is_constant(value, 0.0):
                     known = self._math("MULTIPLY", known, self._math("LESS_THAN", value, 0.5, known))
-                    share = self._math("MULTIPLY", share, self._math("SUBTRACT", 1.0, value, known))
+                    factors.append(self._math("SUBTRACT", 1.0, value, known))
             smooth, rough = _left_by_specular(node)
             left = self._math("MULTIPLY", graph.value_of(node.inputs["Roughness"]), rough - smooth, known)
-            share = self._math("MULTIPLY", share, self._math("ADD", left, smooth))
-            share = self._math("MULTIPLY", share, graph.value_of(node.inputs["Alpha"]))
-            share = self._math("MULTIPLY", share, known)
+            factors += [self._math("ADD", left, smooth), graph.value_of(node.inputs["Alpha"])]
+        share = known
+        for factor in factors:
+            share = self._math("MULTIPLY", share, factor)
         socket, output = node.inputs[COLORS[node.bl_idname]], node.outputs[0]
         color = graph.value_of(socket)
         color = color if graph.is_socket(color) else color[:3]

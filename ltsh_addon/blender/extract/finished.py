@@ -110,8 +110,8 @@ class _PreparedScene:
             for name in regroup(self.scene, tuple(job.own_groups)):
                 self.layer.lightgroups.add(name=name)
         self.everything = reasons_for_cycles(self.scene, self.layer)
-        self.dropped = () if self.layer.cycles.denoising_store_passes else NOT_WRITTEN
         self.seed = self.scene.cycles.seed
+        self.dropped = () if self.layer.cycles.denoising_store_passes else NOT_WRITTEN
         _prepare(self.scene, self.layer, self.warnings)
 
 

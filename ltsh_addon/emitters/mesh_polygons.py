@@ -215,6 +215,49 @@ def is_inside(point: np.ndarray, vertices: np.ndarray, triangles: np.ndarray) ->
     return bool(abs(2.0 * np.arctan2(volume, plane).sum()) > 2.0 * np.pi)
 
 
+# Surfaces are spheres whose corners are off one by at most BALL_CORNERS of its radius, and whose faces lie at least
+# BALL_FACES of it from its center: an icosahedron whose edges were halved twice does.
+BALL_CORNERS, BALL_FACES = 0.01, 0.93
+
+
+@dataclass(frozen=True)
+class Ball:
+    """A part of a closed triangle mesh that is nearly a sphere."""
+
+    center: np.ndarray  # (3,)
+    radius: float  # that of the corners
+    area: float  # of the triangles
+    label: int
+    triangles: np.ndarray  # numbers of them
+
+
+def balls(vertices: np.ndarray, triangles: np.ndarray, labels: np.ndarray) -> list[Ball]:
+    """The connected parts of closed `triangles` (T, 3), indices of `vertices` (N, 3), that are nearly spheres and have
+    one of the `labels` (T,) each.
+
+    From all sides together a convex body is seen as large as a sphere with its surface area (Cauchy 1832).
+    """
+    triangles = welded(vertices, triangles)
+    edges = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=-1).reshape(-1, 2)
+    part = connected(len(vertices), edges)[triangles[:, 0]]
+    found, order = [], np.argsort(part, kind="stable")
+    for members in np.split(order, np.flatnonzero(np.diff(part[order])) + 1):
+        corners = vertices[triangles[members]]
+        crossed = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        area = 0.5 * np.linalg.norm(crossed, axis=-1)
+        if len(np.unique(labels[members])) > 1 or not area.all():
+            continue
+        center = np.average(corners.mean(axis=1), axis=0, weights=area)
+        distances = np.linalg.norm(corners - center, axis=-1)
+        heights = np.abs(((corners[:, 0] - center) * crossed).sum(axis=-1)) / (2.0 * area)
+        radius = distances.max()
+        is_ball = distances.min() > (1.0 - BALL_CORNERS) * radius and heights.min() > BALL_FACES * radius
+        # Several spheres may be in one place: the area tells.
+        if is_ball and BALL_FACES**2 < area.sum() / (4.0 * np.pi * radius**2) < 1.0:
+            found.append(Ball(center, float(radius), float(area.sum()), int(labels[members[0]]), members))
+    return found
+
+
 # A body has at least so many lights. Smaller ones gain little.
 FEWEST_LIGHTS = 16
 # How far neighbors may be above the plane of a light, as a share of the distance, and all of the body, as a share of

@@ -9,8 +9,8 @@ from surface_scenes import random_samples, unit
 
 from ltsh_addon import shading
 from ltsh_addon.emitters.light_tree import FEWEST
-from ltsh_addon.emitters.mesh_polygons import convex_bodies, fewer_corners
-from ltsh_addon.scene import PolygonLight
+from ltsh_addon.emitters.mesh_polygons import balls, convex_bodies, fewer_corners
+from ltsh_addon.scene import PointLight, PolygonLight
 from ltsh_addon.shading import float32
 
 # What an outline of 32 corners and the points of a light tree may be off; the closed form of a ball besides what its
@@ -184,3 +184,50 @@ def test_fewer_corners_keep_area_and_centroid_and_stay_where_outlines_turn():
         areas.append(0.5 * (x * np.roll(y, -1) - y * np.roll(x, -1)).sum())
     np.testing.assert_allclose(areas[1], areas[0], rtol=1e-6)
     assert np.abs(coarse[0]).max() == pytest.approx(6.0, rel=3e-3)
+
+
+def mesh_of(*bodies):
+    """Vertices, triangles and labels, by body, of the faces of several bodies; no vertex is shared."""
+    faces = [(number, face) for number, body in enumerate(bodies) for face in body]
+    triangles, labels = [], []
+    for number, face in faces:
+        triangles += [face[[0, side, side + 1]] for side in range(1, len(face) - 1)]
+        labels += [number] * (len(face) - 2)
+    vertices = np.concatenate(triangles)
+    return vertices, np.arange(len(vertices)).reshape(-1, 3), np.array(labels)
+
+
+def moved(faces, scale, offset):
+    return [scale * face + offset for face in faces]
+
+
+def test_parts_of_meshes_that_are_nearly_spheres_are_known():
+    apart = np.array([5.0, 0.0, 0.0])
+    parts = ball(8), moved(ball(12), 0.5, apart), egg(), moved(capsule(), 1.0, 2.0 * apart), cut_gem()
+    parts = [moved(part, 1.0, number * apart[[1, 0, 2]]) for number, part in enumerate(parts)]
+    vertices, triangles, labels = mesh_of(*parts)
+    found = sorted(balls(vertices, triangles, labels), key=lambda one: one.label)
+    assert [one.label for one in found] == [0, 1] and [one.radius for one in found] == pytest.approx([1.0, 0.5])
+    np.testing.assert_allclose([one.center for one in found], [[0.0, 0.0, 0.0], [5.0, 5.0, 0.0]], atol=1e-9)
+    for one in found:
+        assert (labels[one.triangles] == one.label).all() and len(one.triangles) == (labels == one.label).sum()
+    # One sphere of two materials, and two in one place.
+    half = np.where(vertices[triangles].mean(axis=1)[:, 0] > 0.0, 1, 0)
+    assert not [one for one in balls(vertices, triangles, half) if one.radius > 0.9]
+    vertices, triangles, labels = mesh_of(ball(8), ball(8))
+    assert not balls(vertices, triangles, 0 * labels)
+
+
+@pytest.mark.parametrize(("count", "off"), [(8, 0.02), (16, 0.005)])
+def test_a_sphere_with_the_power_of_a_ball_s_faces_lights_as_they_do(count, off):
+    """Faces of a ball of 8 rings lie up to 4 % nearer to its center than its corners, of 16 rings 1 %."""
+    (one,) = balls(*mesh_of(ball(count)))
+    radiance = np.array([3.0, 2.0, 1.0])
+    axes = {"half_u": one.radius * np.eye(3)[0], "half_v": one.radius * np.eye(3)[1], "direction": np.eye(3)[2]}
+    share = one.area / (4.0 * np.pi * one.radius**2)
+    light = PointLight(name="Lamp", center=one.center, radiance=share * radiance, **axes)
+    faces, samples = lights_of(ball(count), radiance=radiance), samples_around(200, 0.3)
+    expected = shading.shade(samples, faces, "ltsh4", workers=1, rows=[0] * len(faces), dtype=np.float64)
+    found = shading.shade(samples, [light], "ltsh4", workers=1)
+    for name in ("diffuse", "specular"):
+        assert relative_error(getattr(found, name)[0], getattr(expected, name)[0]) < off, name

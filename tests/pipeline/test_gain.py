@@ -35,11 +35,11 @@ def test_each_pixel_is_of_the_picture_with_the_least_error():
     assert sum(weights) == pytest.approx(1.0)
 
 
-def test_a_pixel_far_noisier_than_those_around_it_is_not_taken():
-    """The firefly has a squared noise of 18, a mean of 0.26 around; the others err by 1."""
+def test_no_noise_surrounds_a_firefly():
+    """It has a squared noise of 40, a mean of 0.5 around, by which that is a third of the light; the others err by 1."""
     wrong = np.full(SHAPE[:2], OFF)
-    ((_, _, noisy), _), _ = halves(ours=wrong, denoised=wrong, firefly=6.0)
-    assert noisy[30, 20] < 0.2 and min(noisy[30, 22], noisy[32, 20]) > 0.8
+    ((_, _, noisy), _), _ = halves(ours=wrong, denoised=wrong, firefly=9.0)
+    assert noisy[26:35, 16:25].max() < 0.1 and noisy[20, 20] > 0.8
 
 
 def test_what_errs_in_a_highlight_does_not_count_in_the_dark_around_it():

@@ -10,7 +10,7 @@ import numpy as np
 from ...cycles.patches import GRID, cut_into_patches, note_patches, split_light
 from ...emitters import mesh_polygons
 from ...emitters.mesh_polygons import FlatPolygon
-from ...scene import Light, PolygonLight, QuadLight
+from ...scene import Light, PointLight, PolygonLight, QuadLight
 from ..evaluated import SURFACE_TYPES, EmitterTraits, RenderedSurface, is_rendered, read_values, surface_instancer
 from ..materials.graph import computed, ensure_nodes, fill_with_bsdf, is_displaced, live_link, material_output, mixed
 from ..render_settings import changed_properties
@@ -153,6 +153,7 @@ SIDE_PROPERTY = "ltsh_emitting_side"
 # Limits on the emitting polygons of one object. MOST_POLYGONS: in pictures and bakes, where 20,000 take about 13 s of
 # processor time. MOST_SHOWN: in the viewport.
 MOST_POLYGONS, MOST_SHOWN = 200_000, 2000
+AROUND_FACES = 1.001  # radius of the light around a ball, in units of the ball's
 # MOST_RENDERED_POLYGONS: up to this many textured polygons of one object are rendered one by one. Of an object with
 # more, only the STAND_INS largest of each instance are rendered, and all get their mean.
 MOST_RENDERED_POLYGONS = 256
@@ -208,11 +209,14 @@ def _lights_of_all(mesh_lights: list[MeshLight], studio: Studio, eye: np.ndarray
 
 
 def constant_mesh_lights(mesh_lights: list[MeshLight], radiance_of, eye: np.ndarray, warn) -> list[Light]:
-    """The area lights of `mesh_lights`, without falloff, for known radiances `radiance_of(material)` (3,)."""
+    """The lights of `mesh_lights`, without falloff, for known radiances `radiance_of(material)` (3,): of what is nearly
+    a sphere seen from outside one for all of its faces, which a card would draw one by one."""
     lights = []
     for mesh_light in mesh_lights:
         radiance = [np.tile(radiance_of(material), (2, 1)) for material in mesh_light.materials]
         side = _emitting_side(mesh_light, eye)
+        mesh_light, of_balls = _without_balls(mesh_light, radiance, side)
+        lights.extend(of_balls)
         of_mesh = _constant_lights(mesh_light, _polygons(mesh_light, radiance), radiance, side)
         of_mesh = [replace(light, falloff=0, smooth=0.0) for light in of_mesh]
         if (step := -(-len(of_mesh) // MOST_SHOWN)) > 1:
@@ -222,6 +226,28 @@ def constant_mesh_lights(mesh_lights: list[MeshLight], radiance_of, eye: np.ndar
             of_mesh = [replace(light, radiance=more * light.radiance) for light in of_mesh[::step]]
         lights.extend(of_mesh)
     return lights
+
+
+def _without_balls(mesh_light: MeshLight, radiance, side: int) -> tuple[MeshLight, list[PointLight]]:
+    """The light without the parts that are nearly spheres, and these as lights around them with the same power."""
+    placements, lights = [], []
+    for placement in mesh_light.placements:
+        remain = np.ones(len(placement.triangles), bool)
+        seen = mesh_polygons.outward_side(placement.vertices, placement.triangles)
+        is_seen = side == seen and mesh_polygons.is_closed(mesh_polygons.welded(placement.vertices, placement.triangles))
+        for ball in mesh_polygons.balls(placement.vertices, placement.triangles, placement.slots) if is_seen else ():
+            remain[ball.triangles] = False
+            # Rays to the light end before they meet the faces.
+            radius = AROUND_FACES * ball.radius
+            share = ball.area / (4.0 * np.pi * radius**2)
+            shape = {"center": ball.center, "half_u": radius * np.eye(3)[0], "half_v": radius * np.eye(3)[1]}
+            glow = share * radiance[ball.label][0]
+            if glow.any():
+                lights.append(PointLight.like(mesh_light.light, radiance=glow, direction=-np.eye(3)[2], **shape))
+        if remain.any():
+            chosen = {"triangles": placement.triangles[remain], "slots": placement.slots[remain]}
+            placements.append(replace(placement, **chosen))
+    return replace(mesh_light, placements=placements), lights
 
 
 def mark_transparent(ob, side: int, materials: list) -> None:

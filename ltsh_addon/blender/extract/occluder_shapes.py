@@ -41,8 +41,21 @@ def tubes_of_curves(ob, clear, note) -> list[OccluderMesh]:
     return [_tubes(positions, radii, first, _constant_transparency(clear, ob, note))]
 
 
-def tubes_of_hair(ob, system, count, steps, clear) -> OccluderMesh:
-    """Tubes along the hair of a particle system, in world space."""
+def hairs_of(system, is_view: bool) -> tuple[range, int]:
+    """The hairs of a particle system that Cycles shows, by their numbers, and how many points each has. Children hide
+    their parents, and only they have the extra points of spirals. Views and renders have points of their own; what is
+    beyond them is the world's origin."""
+    settings, parents, children = system.settings, len(system.particles), len(system.child_particles)
+    steps = settings.display_step if is_view else settings.render_step
+    if is_view:
+        children = children * settings.display_percentage // 100
+    has_children = settings.child_type != "NONE" and children > 0
+    extra = settings.kink_extra_steps if has_children and settings.kink == "SPIRAL" else 0
+    return range(parents if has_children else 0, parents + children), 2**steps + 1 + extra
+
+
+def tubes_of_hair(ob, system, numbers, steps, clear) -> OccluderMesh:
+    """Tubes along the hairs `numbers` of a particle system, with `steps` points each, in world space."""
     settings = system.settings
     along = np.linspace(0.0, 1.0, steps)
     root, tip = 0.5 * settings.radius_scale * settings.root_radius, 0.5 * settings.radius_scale * settings.tip_radius
@@ -52,11 +65,11 @@ def tubes_of_hair(ob, system, count, steps, clear) -> OccluderMesh:
     if settings.use_close_tip:
         radius[-1] = 0.0
     positions = np.array(
-        [system.co_hair(object=ob, particle_no=number, step=step) for number in range(count) for step in range(steps)],
+        [system.co_hair(object=ob, particle_no=number, step=step) for number in numbers for step in range(steps)],
         np.float32,
     ).reshape(-1, 3)
-    radii = np.tile(radius, count).astype(np.float32)
-    return _tubes(positions, radii, np.arange(count) * steps, _constant_transparency(clear))
+    radii = np.tile(radius, len(numbers)).astype(np.float32)
+    return _tubes(positions, radii, np.arange(len(numbers)) * steps, _constant_transparency(clear))
 
 
 def _constant_transparency(clear, ob=None, note=None) -> Transparency | None:

@@ -409,14 +409,14 @@ class _Collector:
             if instance.is_instance:
                 self._note("hair on instances blocks nothing, in Cycles it has its shadow; make the instances real", ob)
                 continue
-            count, steps = len(system.particles) + len(system.child_particles), 2**settings.render_step + 1
-            if count * steps > shapes.MOST_PIECES:
-                self._note(shapes.TOO_MANY.format(count * steps), ob)
+            numbers, steps = shapes.hairs_of(system, is_view=self._depsgraph.mode == "VIEWPORT")
+            if len(numbers) * steps > shapes.MOST_PIECES:
+                self._note(shapes.TOO_MANY.format(len(numbers) * steps), ob)
                 continue
             self._note(shapes.TUBES, ob)
             slot = min(settings.material, len(ob.material_slots)) - 1
             material = self._override or (ob.material_slots[slot].material if slot >= 0 else None)
-            meshes = [shapes.tubes_of_hair(ob, system, count, steps, self._clear_of(material))]
+            meshes = [shapes.tubes_of_hair(ob, system, numbers, steps, self._clear_of(material))]
             # The positions of particles are in world space.
             self._add_instances(instance, np.eye(4), self._number(meshes))
 

@@ -23,6 +23,7 @@ from panes import (
     textured,
 )
 
+from ltsh_addon.blender.viewport.shadow_rays import view_occluders
 from ltsh_addon.visibility import Occluders
 
 # Shapes:
@@ -556,16 +557,45 @@ def test_hair_curves_have_the_shadow_of_tubes(tmp_path):
     assert_mean_shadow(tmp_path, "tubes", 0.015)
 
 
-def test_hair_of_particles_has_the_shadow_of_tubes(tmp_path):
+def particle_hair(count=60):
+    """A ball with hair 80 cm long and 3 to 10 cm thick."""
     start()
     bpy.ops.mesh.primitive_uv_sphere_add(radius=0.3, location=(0.0, 0.0, 1.5))
     ob = hidden(bpy.context.object)
     bpy.ops.object.particle_system_add()
     settings = ob.particle_systems[0].settings
-    settings.type, settings.count, settings.hair_length, settings.render_step = "HAIR", 60, 0.8, 3
+    settings.type, settings.count, settings.hair_length, settings.render_step = "HAIR", count, 0.8, 3
     settings.root_radius, settings.tip_radius, settings.radius_scale = 1.0, 0.3, 0.1
     ob.location.x = 0.2
+    return settings
+
+
+@pytest.mark.parametrize("kind", ["plain", "children", "spiral", "spiral children"])
+def test_hair_of_particles_has_the_shadow_of_tubes(tmp_path, kind):
+    """Children hide their parents; spirals have points of their own."""
+    settings = particle_hair(20 if "children" in kind else 60)
+    if "children" in kind:
+        settings.child_type, settings.rendered_child_count = "SIMPLE", 3
+        settings.child_radius = 0.4
+    if "spiral" in kind:
+        settings.kink, settings.kink_extra_steps, settings.kink_amplitude = "SPIRAL", 12, 0.1
     assert_mean_shadow(tmp_path, "tubes", 0.015)
+
+
+@pytest.mark.newest
+@pytest.mark.parametrize("percentage", [100, 50])
+def test_hair_of_particles_ends_where_views_show_its_end(percentage):
+    """What a view does not know of a hair would be at the world's origin."""
+    settings = particle_hair()
+    settings.child_type, settings.child_percent, settings.display_percentage = "SIMPLE", 2, percentage
+    settings.display_step = 2
+    graph = bpy.context.evaluated_depsgraph_get()
+    assert graph.mode == "VIEWPORT"
+    tubes = max(view_occluders(graph, lambda *_: None).meshes, key=lambda mesh: len(mesh.triangles))
+    points = tubes.vertices.reshape(-1, 5, 3, 3).mean(axis=2)
+    assert len(points) == 120 * percentage // 100
+    lengths = np.linalg.norm(np.diff(points, axis=1), axis=-1).sum(axis=1)
+    assert lengths == pytest.approx(0.8, rel=0.05)
 
 
 # Lights:

@@ -310,6 +310,13 @@ def render_with_cycles(scene) -> None:
     cycles.use_denoising = cycles.use_animated_seed = cycles.use_sample_subset = False
 
 
+def take_samples(scene, first: int, count: int, of: int) -> None:
+    """Let Cycles render `count` samples, from number `first` on, of a sequence of so many, which it spreads evenly."""
+    cycles = scene.cycles
+    cycles.use_sample_subset, cycles.samples = True, of
+    cycles.sample_offset, cycles.sample_subset_length = first, count
+
+
 def neutralize(scene, view_layer, camera, warnings: list[str]) -> None:
     """Switch off all effects that would alter the passes of single camera rays; warns if the picture changes.
 

@@ -36,7 +36,7 @@ def test_each_pixel_is_of_the_picture_with_the_least_error():
 
 
 def test_no_noise_surrounds_a_firefly():
-    """It has a squared noise of 40, a mean of 0.5 around, by which that is a third of the light; the others err by 1."""
+    """It has a squared noise of 40, a mean of 0.5 around: its root is a third of the light. The others err by 1."""
     wrong = np.full(SHAPE[:2], OFF)
     ((_, _, noisy), _), _ = halves(ours=wrong, denoised=wrong, firefly=9.0)
     assert noisy[26:35, 16:25].max() < 0.1 and noisy[20, 20] > 0.8

@@ -102,8 +102,8 @@ class ObjectBake:
         """
         maps, cycles = [], self.scene.cycles
         # With a fixed seed the bytes do not depend on what was baked before.
-        cycles.seed, cycles.samples, cycles.use_sample_subset = 0, points, True
-        cycles.sample_offset, cycles.sample_subset_length = point, 1
+        cycles.seed = 0
+        render_settings.take_samples(self.scene, point, 1, points)
         try:
             count = max((plan.count for plan in self.plans), default=0)
             for number in range(count) if point == 0 else (*range(count), UV_MAP):

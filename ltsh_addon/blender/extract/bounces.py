@@ -9,7 +9,6 @@ from ..lights.emission import emission_of
 from ..lights.world import may_shine
 from ..materials import aovs, graph
 from ..materials.bsdfs import emission_sockets
-from ..render_settings import changed_properties
 
 # BOUNCES: settings of Cycles on which indirect light depends, and which pictures of direct light switch off.
 BOUNCES = ("max_bounces", "sample_clamp_indirect", "blur_glossy", "caustics_reflective", "use_fast_gi")
@@ -48,16 +47,13 @@ def lit_by(opened, names: set[str] | None = None):
         alone = {ob.name for ob in lamps} | ({world.name} if world is not None else set())
         world = world if world is not None and world.name in names else None
         cuts = [] if names - alone else _glowing_sockets()
-    changes = [*opened.bounces, (scene, "world", world), *((ob, "hide_render", True) for ob in dark)]
-    links = [(link.from_socket, link.to_socket) for socket in cuts for link in socket.links]
-    for socket in cuts:
-        graph.cut(socket)
-    try:
-        with changed_properties(changes + [(socket, "default_value", 0.0) for socket in cuts]):
-            yield
-    finally:
-        for source, socket in links:
-            socket.id_data.links.new(source, socket)
+    with graph.Changes() as changes:
+        for change in (*opened.bounces, (scene, "world", world), *((ob, "hide_render", True) for ob in dark)):
+            changes.set(*change)
+        for socket in cuts:
+            changes.relink(socket)
+            changes.set(socket, "default_value", 0.0)
+        yield
 
 
 def shader_nodes() -> list:

@@ -7,7 +7,7 @@ Illumination"). All else is traced as ever: specular light, surfaces without a t
 so near that the texels of the texture would show.
 """
 
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import bpy
@@ -159,18 +159,8 @@ def _left_by_specular(node) -> tuple[float, float]:
     return float(shares[0]), float(shares[1])
 
 
-class _Changes(ExitStack):
-    """Changes of nodes and properties, undone at the end."""
-
-    def set(self, owner, name: str, value) -> None:
-        """Give a property another value."""
-        self.enter_context(changed_properties([(owner, name, value)]))
-
-    def add(self, tree, kind: str):
-        """A new node."""
-        node = tree.nodes.new(kind)
-        self.callback(tree.nodes.remove, node)
-        return node
+class _Changes(graph.Changes):
+    """The changes of nodes and lights by which irradiance is gathered."""
 
     def gather(self, scene, image, has_sky: bool) -> None:
         """Change surfaces and lights so that they light texels by the irradiance over pi of `image` alone."""
@@ -198,7 +188,7 @@ class _Changes(ExitStack):
         """Let a shader node glow at texels by what is known of its diffuse light alone."""
         given = self._ruled(node.id_data, rules)
         for strength in emission_sockets(node)[1:]:
-            self._relink(strength, self._math("MULTIPLY", graph.value_of(strength), given["Later"]))
+            self.relink(strength, self._math("MULTIPLY", graph.value_of(strength), given["Later"]))
         unknown = [name for name in UNKNOWN if name in node.inputs]
         if node.bl_idname not in COLORS or any(
             not graph.is_constant(graph.value_of(node.inputs[name]), UNKNOWN[name]) for name in unknown
@@ -224,12 +214,12 @@ class _Changes(ExitStack):
         emission, both = self.add(node.id_data, EMISSION), self.add(node.id_data, graph.ADD)
         graph.feed(emission.inputs["Color"], self._vector("MULTIPLY", color, given["Light"]))
         graph.feed(emission.inputs["Strength"], share)
-        self._relink(socket, self._vector("SCALE", color, self._math("SUBTRACT", 1.0, known)))
+        self.relink(socket, self._vector("SCALE", color, self._math("SUBTRACT", 1.0, known)))
         targets = [link.to_socket for link in output.links]
         node.id_data.links.new(output, both.inputs[0])
         node.id_data.links.new(emission.outputs[0], both.inputs[1])
         for target in targets:
-            self._relink(target, both.outputs[0])
+            self.relink(target, both.outputs[0])
 
     def _math(self, operation, first, second, of=None):
         node = self.add(next(one for one in (first, second, of) if graph.is_socket(one)).id_data, "ShaderNodeMath")
@@ -244,18 +234,6 @@ class _Changes(ExitStack):
         graph.feed(node.inputs[0], first)
         graph.feed(node.inputs["Scale" if operation == "SCALE" else 1], second)
         return node.outputs[0]
-
-    def _relink(self, socket, source) -> None:
-        """Let `source` feed an input."""
-        before = [(link.from_socket, link.is_muted) for link in socket.links]
-        graph.cut(socket)
-        socket.id_data.links.new(source, socket)
-
-        def restore():
-            for one, is_muted in before:
-                socket.id_data.links.new(one, socket).is_muted = is_muted
-
-        self.callback(restore)
 
     def _split(self, lamp, rules) -> None:
         """Let a lamp light no diffuse surface, and a second one only these, but for texels.
@@ -291,7 +269,7 @@ class _Changes(ExitStack):
             mix = self.add(tree, graph.MIX)
             tree.links.new(self._ruled(tree, rules)[name], mix.inputs[0])
             tree.links.new(source, mix.inputs[2])
-            self._relink(output.inputs["Surface"], mix.outputs[0])
+            self.relink(output.inputs["Surface"], mix.outputs[0])
 
 
 def _rules(image):

@@ -192,7 +192,7 @@ def _render_chunks(scene, layer, folder: Path, samples, progress) -> tuple[list[
     while done < samples:
         progress("Cycles", done / samples)
         count = min(chunk, samples - done)
-        cycles.samples, cycles.sample_offset, cycles.sample_subset_length = samples, done, count
+        render_settings.take_samples(scene, done, count, samples)
         _render_file(scene, folder, files, count)
         first, done = first or time.process_time(), done + count
     return files, first
@@ -201,7 +201,6 @@ def _render_chunks(scene, layer, folder: Path, samples, progress) -> tuple[list[
 def _take_all_samples(scene, layer) -> None:
     """Let Cycles render as many samples as it is told, everywhere."""
     layer.samples, scene.cycles.use_adaptive_sampling, scene.cycles.time_limit = 0, False, 0.0
-    scene.cycles.use_sample_subset = True
 
 
 @dataclass
@@ -246,12 +245,11 @@ class _TimedFiles:
 
     def _render(self, count: int) -> None:
         """Render the next samples."""
-        cycles, number = self.scene.cycles, len(self.files)
+        number = len(self.files)
         done = sum(samples for _, samples in self.files[:OTHER] + self.files[OTHER + 1 :]) if number != OTHER else 0
         self.progress("Cycles", number / (2 + len(PROBES)))
-        started, cycles.seed = time.process_time(), (self.seed + (number == OTHER)) % 2**31
-        cycles.samples = max(SEQUENCE, done + count)
-        cycles.sample_offset, cycles.sample_subset_length = done, count
+        started, self.scene.cycles.seed = time.process_time(), (self.seed + (number == OTHER)) % 2**31
+        render_settings.take_samples(self.scene, done, count, max(SEQUENCE, done + count))
         _render_file(self.scene, self.folder, self.files, count)
         took = time.process_time() - started
         self.each = max(took - self._of_file, 0.1 * took) / count

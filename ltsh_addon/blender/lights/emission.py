@@ -204,29 +204,13 @@ def _sources_behind(sources: list) -> list[graph.Source]:
 @contextmanager
 def without_falloff(blocks):
     """Within this context the Light Falloff nodes of materials and lights give their Strength at any distance."""
-    links, smooths = [], []
-    try:
-        for tree in trees_of(blocks):
-            for node in tree.nodes:
-                if node.bl_idname != LIGHT_FALLOFF:
-                    continue
-                smooth = node.inputs["Smooth"]
-                smooths.append((smooth, smooth.default_value, [link.from_socket for link in smooth.links]))
-                for link in list(smooth.links):
-                    tree.links.remove(link)
-                smooth.default_value = 0.0
-                ends = [(output, link.to_socket) for output in node.outputs for link in output.links]
-                links += ends
-                for _, target in ends:
-                    tree.links.new(node.outputs["Quadratic"], target)
+    with graph.Changes() as changes:
+        for node in [node for tree in trees_of(blocks) for node in tree.nodes if node.bl_idname == LIGHT_FALLOFF]:
+            changes.relink(node.inputs["Smooth"])
+            changes.set(node.inputs["Smooth"], "default_value", 0.0)
+            for target in [link.to_socket for output in node.outputs for link in output.links]:
+                changes.relink(target, node.outputs["Quadratic"])
         yield
-    finally:
-        for start, end in links:
-            start.id_data.links.new(start, end)
-        for smooth, value, starts in smooths:
-            smooth.default_value = value
-            for start in starts:
-                smooth.id_data.links.new(start, smooth)
 
 
 def trees_of(blocks) -> list:

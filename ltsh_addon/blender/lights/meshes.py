@@ -233,17 +233,19 @@ def _without_balls(mesh_light: MeshLight, radiance, side: int) -> tuple[MeshLigh
     placements, lights = [], []
     for placement in mesh_light.placements:
         remain = np.ones(len(placement.triangles), bool)
-        seen = mesh_polygons.outward_side(placement.vertices, placement.triangles)
-        is_seen = side == seen and mesh_polygons.is_closed(mesh_polygons.welded(placement.vertices, placement.triangles))
-        for ball in mesh_polygons.balls(placement.vertices, placement.triangles, placement.slots) if is_seen else ():
+        shape = placement.vertices, placement.triangles
+        is_outside = side == mesh_polygons.outward_side(*shape) and mesh_polygons.is_closed(
+            mesh_polygons.welded(*shape)
+        )
+        for ball in mesh_polygons.balls(*shape, placement.slots) if is_outside else ():
             remain[ball.triangles] = False
             # Rays to the light end before they meet the faces.
             radius = AROUND_FACES * ball.radius
             share = ball.area / (4.0 * np.pi * radius**2)
-            shape = {"center": ball.center, "half_u": radius * np.eye(3)[0], "half_v": radius * np.eye(3)[1]}
-            glow = share * radiance[ball.label][0]
+            glow, (x, y, z) = share * radiance[ball.label][0], np.eye(3)
             if glow.any():
-                lights.append(PointLight.like(mesh_light.light, radiance=glow, direction=-np.eye(3)[2], **shape))
+                place = {"center": ball.center, "half_u": radius * x, "half_v": radius * y, "direction": -z}
+                lights.append(PointLight.like(mesh_light.light, radiance=glow, **place))
         if remain.any():
             chosen = {"triangles": placement.triangles[remain], "slots": placement.slots[remain]}
             placements.append(replace(placement, **chosen))

@@ -7,6 +7,7 @@ All readers of materials share this walk, which changes nothing: AOVs and bakes 
 import math
 import operator
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -368,6 +369,35 @@ def cut(socket) -> None:
     """Remove all links to the input `socket`."""
     for link in list(socket.links):
         socket.id_data.links.remove(link)
+
+
+class Changes(ExitStack):
+    """Changes of nodes, links and properties, which are undone where its context ends, the last first."""
+
+    def set(self, owner, name: str, value) -> None:
+        """Give a property another value."""
+        self.callback(setattr, owner, name, getattr(owner, name))
+        setattr(owner, name, value)
+
+    def add(self, tree, kind: str):
+        """A new node."""
+        node = tree.nodes.new(kind)
+        self.callback(tree.nodes.remove, node)
+        return node
+
+    def relink(self, socket, source=None) -> None:
+        """Let the output `source` feed the input `socket`, or nothing."""
+        before = [(link.from_socket, link.is_muted) for link in socket.links]
+        cut(socket)
+        if source is not None:
+            socket.id_data.links.new(source, socket)
+
+        def restore():
+            cut(socket)
+            for one, is_muted in before:
+                socket.id_data.links.new(one, socket).is_muted = is_muted
+
+        self.callback(restore)
 
 
 def feed(socket, value) -> None:

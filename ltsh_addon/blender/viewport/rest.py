@@ -431,10 +431,9 @@ def render_rest(job: RestJob, folder: Path, progress) -> dict:
     render.border_min_x, render.border_max_x = 0.0, 1.0
     # Blender rounds down.
     render.border_min_y, render.border_max_y = ((height - row + 0.5) / height for row in (last, first))
-    cycles = scene.cycles
     # All steps are of one sequence, whose noise is spread more evenly than that of several.
-    cycles.use_sample_subset, cycles.seed, cycles.samples = True, 0, max(job.done + job.samples, TOTALS[-1])
-    cycles.sample_offset, cycles.sample_subset_length = job.done, job.samples
+    scene.cycles.seed = 0
+    render_settings.take_samples(scene, job.done, job.samples, max(job.done + job.samples, TOTALS[-1]))
     progress("bounces", 0.0)
     started = time.monotonic()
     render_exr(scene, folder / REST_RENDER, "NONE")

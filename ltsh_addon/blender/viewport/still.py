@@ -243,8 +243,9 @@ def _drawn(opened: OpenScene, job: ViewJob, folder: Path, progress) -> dict:
 
 def overlaps_of_lights(depsgraph) -> list[str]:
     """Warnings about area lights that overlap in a plane."""
-    lights = [each.object for each in depsgraph.object_instances if each.object.type == "LIGHT"]
-    if sum(light.data.type == "AREA" for light in lights) < 2:
+    # The object of an instance is another one after its turn.
+    objects = (instance.object for instance in depsgraph.object_instances)
+    if sum(ob.type == "LIGHT" and ob.data.type == "AREA" for ob in objects) < 2:
         return []
     inventory = collect_lights(depsgraph, depsgraph.view_layer_eval.material_override)
     inventory.warnings.clear()

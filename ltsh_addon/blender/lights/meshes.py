@@ -220,10 +220,13 @@ def constant_mesh_lights(mesh_lights: list[MeshLight], radiance_of, eye: np.ndar
         of_mesh = _constant_lights(mesh_light, _polygons(mesh_light, radiance), radiance, side)
         of_mesh = [replace(light, falloff=0, smooth=0.0) for light in of_mesh]
         if (step := -(-len(of_mesh) // MOST_SHOWN)) > 1:
-            power = [np.linalg.norm(light.area_vector) * light.radiance.sum() for light in of_mesh]
-            more, count = sum(power) / max(sum(power[::step]), 1e-30), len(of_mesh)
+            power = np.array([np.linalg.norm(light.area_vector) * light.radiance.sum() for light in of_mesh])
+            # One of each `step`, by chance: in every order of faces some kind comes at even distances, such as backs.
+            first, count = np.arange(0, len(of_mesh), step), len(of_mesh)
+            chosen = np.minimum(first + np.random.default_rng(0).integers(step, size=len(first)), count - 1)
+            more = power.sum() / max(power[chosen].sum(), 1e-30)
             warn(f"object {mesh_light.ob.name!r}: of its {count} flat faces one in {step} shines for all, in views")
-            of_mesh = [replace(light, radiance=more * light.radiance) for light in of_mesh[::step]]
+            of_mesh = [replace(of_mesh[number], radiance=more * of_mesh[number].radiance) for number in chosen]
         lights.extend(of_mesh)
     return lights
 

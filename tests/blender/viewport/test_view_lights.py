@@ -487,6 +487,27 @@ def test_some_of_very_many_glowing_faces_shine_for_all():
 
 
 @pytest.mark.newest
+def test_of_very_many_faces_as_many_backs_as_fronts_shine():
+    """An open mesh shines on both sides; of a grid all fronts look up. Of 1,800 the share is known to 1.2 %."""
+    parts.empty_scene()
+    parts.add_camera()
+    bpy.ops.mesh.primitive_grid_add(x_subdivisions=60, y_subdivisions=60)
+    bpy.context.object.data.vertices.foreach_set("co", crumpled(bpy.context.object.data))
+    bpy.context.object.data.materials.append(glowing())
+    lights, _ = seen()
+    power = np.array([np.linalg.norm(light.area_vector) * light.radiance[0] for light in lights])
+    is_up = np.array([light.direction[2] > 0.0 for light in lights])
+    assert len(lights) <= MOST_SHOWN and power[is_up].sum() / power.sum() == pytest.approx(0.5, abs=0.06)
+
+
+def crumpled(mesh):
+    """Coordinates of the vertices, of which no four are in a plane any more."""
+    coordinates = np.empty((len(mesh.vertices), 3), np.float32)
+    mesh.vertices.foreach_get("co", coordinates.ravel())
+    return coordinates.ravel() + np.random.default_rng(0).normal(0.0, 0.003, coordinates.size)
+
+
+@pytest.mark.newest
 @pytest.mark.parametrize("flipped", [False, True])
 def test_what_is_nearly_a_sphere_shines_as_one_light(flipped):
     """A bulb and a box of one mesh; the camera is outside, then inside of the bulb, which then shines inward."""

@@ -47,7 +47,7 @@ def lit_by(opened, names: set[str] | None = None):
         alone = {ob.name for ob in lamps} | ({world.name} if world is not None else set())
         world = world if world is not None and world.name in names else None
         cuts = [] if names - alone else _glowing_sockets()
-    with graph.Changes() as changes:
+    with graph.TreeChanges() as changes:
         for change in (*opened.bounces, (scene, "world", world), *((ob, "hide_render", True) for ob in dark)):
             changes.set(*change)
         for socket in cuts:

@@ -159,7 +159,7 @@ def _left_by_specular(node) -> tuple[float, float]:
     return float(shares[0]), float(shares[1])
 
 
-class _Changes(graph.Changes):
+class _Changes(graph.TreeChanges):
     """The changes of nodes and lights by which irradiance is gathered."""
 
     def gather(self, scene, image, has_sky: bool) -> None:

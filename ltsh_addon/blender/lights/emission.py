@@ -204,7 +204,7 @@ def _sources_behind(sources: list) -> list[graph.Source]:
 @contextmanager
 def without_falloff(blocks):
     """Within this context the Light Falloff nodes of materials and lights give their Strength at any distance."""
-    with graph.Changes() as changes:
+    with graph.TreeChanges() as changes:
         for node in [node for tree in trees_of(blocks) for node in tree.nodes if node.bl_idname == LIGHT_FALLOFF]:
             changes.relink(node.inputs["Smooth"])
             changes.set(node.inputs["Smooth"], "default_value", 0.0)

@@ -371,7 +371,7 @@ def cut(socket) -> None:
         socket.id_data.links.remove(link)
 
 
-class Changes(ExitStack):
+class TreeChanges(ExitStack):
     """Changes of nodes, links and properties, which are undone where its context ends, the last first."""
 
     def set(self, owner, name: str, value) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import quadrature
 import scene_parts
-from lit_plane import measured
+from lit_plane import add_instancer, into_collection, measured
 
 from ltsh_addon.blender.lights.area import overlapping_pairs
 from ltsh_addon.blender.viewport import still
@@ -44,6 +44,17 @@ def test_views_name_them_too(apart, count):
     two_lights(apart)
     warnings = still.overlaps_of_lights(bpy.context.evaluated_depsgraph_get())
     assert len(warnings) == count and all("'Upper' and 'Lower' (100 %)" in line for line in warnings)
+
+
+def test_views_look_at_instanced_lights():
+    """An object that the depsgraph makes for an instance is another one afterwards: here a mesh, which has no kind."""
+    scene_parts.empty_scene()
+    lamp, box = scene_parts.add_area_light("Lamp"), scene_parts.add_plane(name="Box", size=0.2)
+    collection = into_collection("Lamps", lamp, box)
+    for x in (0.0, 3.0, 6.0):
+        add_instancer(collection, f"Lamp at {x}", location=(x, 0.0, 1.0))
+    bpy.context.view_layer.update()
+    assert still.overlaps_of_lights(bpy.context.evaluated_depsgraph_get()) == []
 
 
 @pytest.mark.parametrize("settings", [{"apart": 1e-4}, {"energy": 0.0}], ids=["apart", "dark"])

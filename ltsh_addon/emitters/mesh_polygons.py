@@ -222,7 +222,7 @@ BALL_CORNERS, BALL_FACES = 0.01, 0.93
 
 @dataclass(frozen=True)
 class Ball:
-    """A part of a closed triangle mesh that is nearly a sphere."""
+    """A component of a closed triangle mesh that is nearly a sphere."""
 
     center: np.ndarray  # (3,)
     radius: float  # that of the corners
@@ -231,17 +231,17 @@ class Ball:
     triangles: np.ndarray  # numbers of them
 
 
-def balls(vertices: np.ndarray, triangles: np.ndarray, labels: np.ndarray) -> list[Ball]:
-    """The connected parts of closed `triangles` (T, 3), indices of `vertices` (N, 3), that are nearly spheres and have
-    one of the `labels` (T,) each.
+def balls(vertices: np.ndarray, triangles: np.ndarray, labels: np.ndarray, side: int = 1) -> list[Ball]:
+    """The connected components of closed `triangles` (T, 3), indices of `vertices` (N, 3), that are nearly spheres,
+    have one of the `labels` (T,) each, and whose normals times `side` (1 or -1) point outward.
 
     From all sides together a convex body is seen as large as a sphere with its surface area (Cauchy 1832).
     """
     triangles = welded(vertices, triangles)
     edges = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=-1).reshape(-1, 2)
-    part = connected(len(vertices), edges)[triangles[:, 0]]
-    found, order = [], np.argsort(part, kind="stable")
-    for members in np.split(order, np.flatnonzero(np.diff(part[order])) + 1):
+    component = connected(len(vertices), edges)[triangles[:, 0]]
+    spheres, order = [], np.argsort(component, kind="stable")
+    for members in np.split(order, np.flatnonzero(np.diff(component[order])) + 1):
         corners = vertices[triangles[members]]
         crossed = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         area = 0.5 * np.linalg.norm(crossed, axis=-1)
@@ -249,13 +249,13 @@ def balls(vertices: np.ndarray, triangles: np.ndarray, labels: np.ndarray) -> li
             continue
         center = np.average(corners.mean(axis=1), axis=0, weights=area)
         distances = np.linalg.norm(corners - center, axis=-1)
-        heights = np.abs(((corners[:, 0] - center) * crossed).sum(axis=-1)) / (2.0 * area)
+        heights = side * ((corners[:, 0] - center) * crossed).sum(axis=-1) / (2.0 * area)
         radius = distances.max()
         is_ball = distances.min() > (1.0 - BALL_CORNERS) * radius and heights.min() > BALL_FACES * radius
         # Several spheres may be in one place: the area tells.
         if is_ball and BALL_FACES**2 < area.sum() / (4.0 * np.pi * radius**2) < 1.0:
-            found.append(Ball(center, float(radius), float(area.sum()), int(labels[members[0]]), members))
-    return found
+            spheres.append(Ball(center, float(radius), float(area.sum()), int(labels[members[0]]), members))
+    return spheres
 
 
 # A body has at least so many lights. Smaller ones gain little.

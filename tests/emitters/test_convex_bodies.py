@@ -216,6 +216,10 @@ def test_parts_of_meshes_that_are_nearly_spheres_are_known():
     assert not [one for one in balls(vertices, triangles, half) if one.radius > 0.9]
     vertices, triangles, labels = mesh_of(ball(8), ball(8))
     assert not balls(vertices, triangles, 0 * labels)
+    # A shell: its inside shines inward.
+    vertices, triangles, labels = mesh_of(ball(8), [face[::-1] for face in moved(ball(8), 0.9, 0.0)])
+    for side, radius in ((1, 1.0), (-1, 0.9)):
+        assert [one.radius for one in balls(vertices, triangles, labels, side)] == pytest.approx([radius])
 
 
 @pytest.mark.parametrize(("count", "off"), [(8, 0.02), (16, 0.005)])

@@ -240,7 +240,7 @@ def _without_balls(mesh_light: MeshLight, radiance, side: int) -> tuple[MeshLigh
         is_outside = side == mesh_polygons.outward_side(*shape) and mesh_polygons.is_closed(
             mesh_polygons.welded(*shape)
         )
-        for ball in mesh_polygons.balls(*shape, placement.slots) if is_outside else ():
+        for ball in mesh_polygons.balls(*shape, placement.slots, side) if is_outside else ():
             remain[ball.triangles] = False
             # Rays to the light end before they meet the faces.
             radius = AROUND_FACES * ball.radius

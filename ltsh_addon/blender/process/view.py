@@ -175,6 +175,21 @@ class RestPictureJob:
     """Write REST_PICTURE: the denoised mean (H, W, 4) of the sum, row 0 on top; alpha is `marked_depth`."""
 
 
+# Files of a LiveRestJob in its folder: while STOP is there, it ends after its step; its pictures, by number, and what
+# there is to say of each.
+STOP, LIVE_PICTURE, LIVE_FACTS = "stop", "live_{}.npy", "live_{}.json"
+
+
+@dataclass(frozen=True)
+class LiveRestJob:
+    """Render the rest of a view in steps, and write one picture after another, each with more samples or pixels."""
+
+    scene: Path | None  # as those of a RestJob
+    view: RestView  # in the child a dict
+    changes: dict | None
+    work: float  # samples of single pixels that a step takes
+
+
 NEAR = 0.05  # depths that differ by this share are those of different surfaces
 
 

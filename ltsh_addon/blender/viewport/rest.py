@@ -9,6 +9,7 @@ Surfaces `is_of_cycles` are Cycles' alone. An AOV tells their share m of a pixel
     rest = Combined - (1 - m) (direct light + background),  picture = (1 - M) (own light + background) + rest
 """
 
+import json
 import math
 import threading
 import time
@@ -30,7 +31,18 @@ from ..extract.pixels import files_opened, open_scene, scene_named
 from ..materials.graph import ensure_nodes, has_volume
 from ..materials.preview_material import preview_of
 from ..process.blender_process import BlenderProcess
-from ..process.view import REST_PICTURE, REST_RENDER, RestJob, RestPictureJob, RestSum, RestView
+from ..process.view import (
+    LIVE_FACTS,
+    LIVE_PICTURE,
+    REST_PICTURE,
+    REST_RENDER,
+    STOP,
+    LiveRestJob,
+    RestJob,
+    RestPictureJob,
+    RestSum,
+    RestView,
+)
 from ..render_settings import render_exr
 from ..saving import save_working_copy
 from .drawing import ViewCamera, float_texture
@@ -60,6 +72,7 @@ STEP_SECONDS, SHRINKS, TOTALS, REST_SECONDS = 0.5, (4, 2, 1), (1, 2, 4, 8, 16, 3
 # FEWEST: samples of single pixels that a step takes at least: the first picture of 1000 x 640 pixels. MOST_CHANGE: how
 # many times as many or as few the next one takes.
 FEWEST, MOST_CHANGE = 160_000, 2.0
+PICTURE = "picture"  # a stage of live jobs; its fraction is the number of the picture
 # Settings of a scene that change its light, beside those of Cycles.
 SCENE_SETTINGS = ("use_simplify", "simplify_subdivision", "film_transparent", "hair_type")
 
@@ -156,26 +169,35 @@ def makes_picture(job: RestJob) -> bool:
 
 
 @dataclass
-class _RestStep:
-    """A job on its way."""
+class _RestRun:
+    """A job on its way. Its pictures come while the window draws, which may keep this process busy for seconds."""
 
-    job: RestJob
-    wanted: RestView  # that of the job, unless another is wanted meanwhile
-    seconds: float = 0.0  # that Cycles took
-    picture: "_RestPicture | None" = None
+    job: LiveRestJob
+    folder: Path
+    last: "tuple[_RestPicture, dict] | None" = None  # the last picture and its facts, see `render_live_rest`
     error: str = ""
     thread: threading.Thread | None = None
 
-    def do(self, process: BlenderProcess, folder: Path) -> None:
+    def do(self, process: BlenderProcess) -> None:
         """Do the job, in a thread of its own."""
         try:
-            self.seconds, view = process.do(self.job, folder, None)["seconds"], self.job.view
-            if makes_picture(self.job) and self.wanted == view:
-                facts = process.do(RestPictureJob(), folder, None)
-                facts = {name: facts[name] for name in ("is_everything", "ambient", "problem")}
-                self.picture = _RestPicture(view, np.load(folder / REST_PICTURE), **facts)
+            process.do(self.job, self.folder, self._take)
         except Exception as error:
             self.error = f"Bounces: {error_line(error)}"
+
+    def _take(self, stage: str, fraction: float) -> None:
+        if stage == PICTURE:
+            number = round(fraction)
+            facts = json.loads((self.folder / LIVE_FACTS.format(number)).read_text(encoding="utf-8"))
+            shown = {name: facts[name] for name in ("is_everything", "ambient", "problem")}
+            path = self.folder / LIVE_PICTURE.format(number)
+            pixels = np.load(path)
+            path.unlink()
+            self.last = _RestPicture(self.job.view, pixels, **shown), facts
+
+    def stop(self) -> None:
+        """Let it end after its step."""
+        (self.folder / STOP).touch()
 
 
 @dataclass
@@ -205,11 +227,11 @@ class LiveRest:
         self._blender: SecondBlender | None = None
         self._wanted: RestView | None = None
         self._changed = 0.0
-        self._step: _RestStep | None = None  # the one on its way
-        self._done: RestJob | None = None  # the last one of those whose sum the second Blender has
+        self._run: _RestRun | None = None  # the one on its way
+        self._done: tuple[RestView, int] | None = None  # the view of the last picture, its samples of all pixels
         self._opened: tuple | None = None  # the scene that the second Blender has
         self._changes = RestChanges()  # since then
-        self._work, self._seconds = 0.0, 0.0  # samples of single pixels in a step; seconds of one; 0: not known
+        self._work, self._seconds = FEWEST, 0.0  # samples of single pixels in a step; seconds of one; 0: not known
         self._picture: _RestPicture | None = None  # the last one
         self._version, self._surfaces, self._settings = 0, 0, None  # of the scene; of all in it but lights
         self.problem = ""  # why there is no picture
@@ -237,8 +259,6 @@ class LiveRest:
         wanted = RestView(*names, version, depsgraph.scene.frame_current, hidden, world, matrices, size)
         if wanted != self._wanted:
             self._wanted, self._changed = wanted, time.monotonic()
-            if self._step is not None:
-                self._step.wanted = wanted
 
     def pause(self) -> None:
         """Nothing is wanted at the moment."""
@@ -277,7 +297,7 @@ class LiveRest:
     def is_busy(self) -> bool:
         """True while a better picture is to come."""
         is_short = self._wanted is not None and self._samples < TOTALS[-1]
-        return self._step is not None or (is_short and not self.problem)
+        return self._run is not None or (is_short and not self.problem)
 
     @property
     def is_urgent(self) -> bool:
@@ -292,8 +312,7 @@ class LiveRest:
     @property
     def _samples(self) -> int:
         """Samples in full resolution of what is wanted."""
-        done = self._done
-        return done.total if done is not None and (done.view, done.shrink) == (self._wanted, 1) else 0
+        return self._done[1] if self._done is not None and self._done[0] == self._wanted else 0
 
     @property
     def seconds(self) -> float | None:
@@ -302,15 +321,19 @@ class LiveRest:
         return None if self._wanted is None else self._seconds * math.prod(self._wanted.size) * missing or None
 
     def step(self) -> bool:
-        """Do the next step, in the main thread; True if there is a new picture."""
-        news = False
-        if self._step is not None:
-            if self._step.thread.is_alive():
-                return False
-            news = self._finish()
+        """Take what has come, and start what is wanted, in the main thread; True if there is a new picture."""
+        run, news = self._run, False
         # A render of the artist's has the processor for itself.
-        is_at_rest = time.monotonic() - self._changed > REST_SECONDS and not bpy.app.is_job_running("RENDER")
-        if self._wanted is not None and is_at_rest and self.is_busy:
+        may_run = self._wanted is not None and not bpy.app.is_job_running("RENDER")
+        if run is not None:
+            is_over = not run.thread.is_alive()
+            news = run.job.view == self._wanted and self._take(run)
+            if not is_over:
+                if run.job.view != self._wanted or not may_run:
+                    run.stop()
+                return news
+            news |= self._finish(run)
+        if may_run and time.monotonic() - self._changed > REST_SECONDS and self.is_busy:
             if self._blender is None:
                 self._blender, self._opened = spare.pop() if spare else SecondBlender(), None
             if self._blender.is_busy:
@@ -322,31 +345,29 @@ class LiveRest:
                 news = True
         return news
 
-    def _finish(self) -> bool:
-        """Take over what the last step has brought."""
-        step, self._step = self._step, None
-        if step.error:
+    def _take(self, run: _RestRun) -> bool:
+        """Take over the last picture; True if it is a new one."""
+        picture, facts = run.last or (None, {})
+        # A run that was stopped by a render of the artist's begins anew.
+        is_worse = self._done is not None and picture is not None and facts["total"] < self._done[1]
+        if picture is None or picture is self._picture or is_worse:
+            return False
+        self._picture, self._done = picture, (picture.view, facts["total"])
+        self._work, self._seconds = facts["work"], facts["seconds"]
+        return True
+
+    def _finish(self, run: _RestRun) -> bool:
+        """A run has ended; True if there is something to say about it."""
+        self._run = None
+        if run.error:
             self._opened = self._done = None
             # What cannot be handed over piece by piece goes as a whole.
-            self.problem = "" if step.job.changes is not None else step.error
-            return bool(self.problem)
-        job = step.job
-        work = math.prod(job.view.size) / job.shrink**2 * job.samples * (job.rows[1] - job.rows[0])
-        self._seconds = step.seconds / work
-        work *= min(max(STEP_SECONDS / step.seconds, 1.0 / MOST_CHANGE), MOST_CHANGE)
-        if job.scene is None:
-            self._work = max(work, FEWEST if step.seconds > STEP_SECONDS else self._work)
-        is_of_wanted = job.view == self._wanted and (step.picture is not None or not makes_picture(job))
-        self._done = job if is_of_wanted else None
-        if is_of_wanted and step.picture is not None:
-            self._picture = step.picture
-        return self.has_news
+            self.problem = "" if run.job.changes is not None else run.error
+        return bool(self.problem)
 
     def _begin(self) -> None:
-        """Start the next step of what is wanted."""
+        """Start to render what is wanted."""
         wanted, blender = self._wanted, self._blender
-        pixels = math.prod(wanted.size)
-        self._work = self._work or FEWEST
         state = wanted.scene, wanted.view_layer, wanted.frame, wanted.hidden, wanted.world
         path = changes = None
         if state != self._opened or self._changes.everything:
@@ -355,15 +376,19 @@ class LiveRest:
         elif self._changes.objects or self._changes.blocks:
             changes = self._changes.written(bpy.data.scenes[wanted.scene], blender.folder / "changes.blend")
         self._changes = RestChanges(everything=False)
-        job = next_job(self._done, wanted, self._work / pixels)
-        self._step = _RestStep(replace(job, scene=path, changes=changes), wanted)
-        arguments = {"target": self._step.do, "args": (blender.process, blender.folder), "name": "LTSH rest"}
-        self._step.thread = blender.step = threading.Thread(**arguments, daemon=True)
+        if self._done is not None and self._done[0] != wanted:
+            self._done = None
+        (blender.folder / STOP).unlink(missing_ok=True)
+        run = self._run = _RestRun(LiveRestJob(path, wanted, changes, self._work), blender.folder)
+        arguments = {"target": run.do, "args": (blender.process,), "name": "LTSH rest"}
+        run.thread = blender.step = threading.Thread(**arguments, daemon=True)
         blender.step.start()
 
     def stop(self, *, keeps: bool = False) -> None:
         """Forget what was rendered, and end the second Blender; or keep it, as `spare`."""
         blender = self._blender
+        if self._run is not None:
+            self._run.stop()
         vars(self).update(vars(LiveRest()))
         if blender is not None and keeps:
             blender.left = time.monotonic()
@@ -445,6 +470,32 @@ def render_rest(job: RestJob, folder: Path, progress) -> dict:
     total.add(folder / REST_RENDER, first, job.samples, {**render_settings.pass_names(), "mask": MASK})
     total.samples = job.total
     return {"seconds": seconds}
+
+
+def render_live_rest(job: LiveRestJob, folder: Path, progress) -> dict:
+    """Do the `job`. Each picture has facts: those of `RestSum`, the samples of all pixels that it has (`total`), the
+    seconds of one of a single pixel, and how many of these a step takes (`work`). Returns no manifest."""
+    view, work, number, before = RestView(**job.view), job.work, 0, None
+    pixels, more = math.prod(view.size), {"scene": job.scene, "changes": job.changes}
+    while before is None or before.total < TOTALS[-1] or before.shrink > 1:
+        step = next_job(before, view, work / pixels)
+        seconds = render_rest(replace(step, view=job.view, **more), folder, progress)["seconds"]
+        done = pixels / step.shrink**2 * step.samples * (step.rows[1] - step.rows[0])
+        if not more["scene"]:
+            wanted = done * min(max(STEP_SECONDS / seconds, 1.0 / MOST_CHANGE), MOST_CHANGE)
+            work = max(wanted, FEWEST if seconds > STEP_SECONDS else work)
+        before, more = step, {"scene": None, "changes": None}
+        if makes_picture(step) and not (folder / STOP).exists():
+            total = _sum[0]
+            save_array(folder / LIVE_PICTURE.format(number), total.picture())
+            facts = {"is_everything": total.is_everything, "ambient": total.ambient, "problem": total.problem}
+            facts |= {"total": step.total if step.shrink == 1 else 0, "seconds": seconds / done, "work": work}
+            (folder / LIVE_FACTS.format(number)).write_text(json.dumps(facts), encoding="utf-8")
+            progress(PICTURE, float(number))
+            number += 1
+        if (folder / STOP).exists():
+            break
+    return {}
 
 
 # The state of the last job's scene, if its next frame needs no other one.

@@ -108,7 +108,7 @@ def followed(live, context, monkeypatch, world=True):
 
     def noted(self):
         begin(self)
-        jobs.append(self._step.job)
+        jobs.append(self._run.job)
 
     monkeypatch.setattr(rest.LiveRest, "_begin", noted)
     live.follow(context, SimpleNamespace(scene=bpy.context.scene, view_layer=bpy.context.view_layer), world)
@@ -131,7 +131,6 @@ def context_of(camera):
 
 
 def test_changes_are_handed_over_by_themselves_and_show_what_a_whole_file_shows(monkeypatch):
-    monkeypatch.setattr(rest, "TOTALS", (4,))
     monkeypatch.setattr(rest, "REST_SECONDS", 0.0)
     camera = room()
     context, live = context_of(camera), rest.LiveRest()
@@ -141,7 +140,7 @@ def test_changes_are_handed_over_by_themselves_and_show_what_a_whole_file_shows(
     handlers.append(note)
     try:
         first, jobs = followed(live, context, monkeypatch)
-        assert [(job.scene is None, job.shrink, job.rows) for job in jobs] == [(False, 1, (0.0, 1.0))]
+        assert [job.scene is None for job in jobs] == [False]
         light, chrome = bpy.data.objects["Light"], bpy.data.objects["Chrome"]
         light.data.energy *= 2.0
         light.location.x -= 0.5

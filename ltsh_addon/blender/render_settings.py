@@ -10,7 +10,7 @@ import numpy as np
 from ..files import check_room_after
 from ..scene import Border, SceneError, listed
 from ..workers.pool import cores
-from .evaluated import SURFACE_TYPES
+from .evaluated import SURFACE_TYPES, objects_in_views
 
 DEFAULTS = {
     "film_exposure": 1.0,
@@ -496,3 +496,36 @@ def save_png(scene, pixels: np.ndarray, path: Path) -> None:
     settings.color_mode = "RGBA" if scene.render.film_transparent else "RGB"
     image.save_render(str(path), scene=scene)
     bpy.data.images.remove(image)
+
+
+# Pairs of properties: what views take, and what renders take.
+LEVELS = (
+    ("show_viewport", "show_render"),
+    ("levels", "render_levels"),
+    ("resolution_u", "render_resolution_u"),
+    ("resolution_v", "render_resolution_v"),
+    ("resolution", "render_resolution"),
+    ("show_instancer_for_viewport", "show_instancer_for_render"),
+    ("simplify_subdivision", "simplify_subdivision_render"),
+    ("simplify_child_particles", "simplify_child_particles_render"),
+)
+
+
+def show_as_views(scene, layer, hidden: tuple[str, ...]) -> None:
+    """Let renders show what views show, in their detail; but for the objects `hidden`."""
+    shown = {ob for ob in objects_in_views(layer) if ob.name not in hidden}
+    for collection in bpy.data.collections:
+        collection.hide_render = False
+    for ob in bpy.data.objects:
+        ob.hide_render = ob not in shown if ob.name in layer.objects else ob.hide_viewport
+        details = [ob, *ob.modifiers, *(() if ob.data is None else (ob.data,))]
+        for owner in details:
+            _take_levels(owner)
+    _take_levels(scene.render)
+
+
+def _take_levels(owner) -> None:
+    """Let renders take the values of LEVELS that views take."""
+    for name, of_renders in LEVELS:
+        if hasattr(owner, name) and hasattr(owner, of_renders):
+            setattr(owner, of_renders, getattr(owner, name))

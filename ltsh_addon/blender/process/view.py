@@ -131,7 +131,7 @@ def render_node_lights(lights: list[NodeLightFile], frame: int, folder: Path, ta
     run_job(NodeLightJob([asdict(light) for light in lights], frame), folder, watched)
 
 
-# REST_RENDER: what Cycles renders for a RestJob. REST_PICTURE: the picture of a RestPictureJob.
+# REST_RENDER: what Cycles renders for a RestJob. REST_PICTURE: the picture of that.
 REST_RENDER, REST_PICTURE = "rest.exr", "rest.npy"
 
 
@@ -168,16 +168,6 @@ class RestJob:
     def total(self) -> int:
         """The samples that the sum has in all rows after it."""
         return self.done + (self.samples if self.rows[1] == 1.0 else 0)
-
-
-@dataclass(frozen=True)
-class RestPictureJob:
-    """Write REST_PICTURE: the denoised mean (H, W, 4) of the sum, row 0 on top; alpha is `marked_depth`."""
-
-
-# Files of a LiveRestJob in its folder: while STOP is there, it ends after its step; its pictures, by number, and what
-# there is to say of each.
-STOP, LIVE_PICTURE, LIVE_FACTS = "stop", "live_{}.npy", "live_{}.json"
 
 
 @dataclass(frozen=True)
@@ -253,7 +243,7 @@ class RestSum:
 
 
 def render_rest(job: RestJob, folder: Path, *, progress: Progress | None = None) -> dict:
-    """Write what Cycles adds to the view of `job` as REST_PICTURE into `folder`; returns its manifest: "is_everything",
-    "problem" and "ambient" as of `RestSum`. Needs a `shared_blender`. Raises as `pixels.extract_pixels` does."""
-    run_scene_job(job, folder, progress)
-    return run_job(RestPictureJob(), folder, progress)
+    """Write what Cycles adds to the view of `job` as REST_PICTURE into `folder`: the denoised mean (H, W, 4), row 0 on
+    top, whose alpha is `marked_depth`. Returns its manifest: "is_everything", "problem" and "ambient" as of `RestSum`.
+    Raises as `pixels.extract_pixels` does."""
+    return run_scene_job(job, folder, progress)

@@ -53,7 +53,6 @@ JOBS = {
     "LightsJob": ("match", "extract.match", "save_lights"),
     "ViewJob": ("view", "viewport.still", "draw_view"),
     "RestJob": ("view", "viewport.rest", "render_rest"),
-    "RestPictureJob": ("view", "viewport.rest", "denoise_rest"),
     "LiveRestJob": ("view", "viewport.rest", "render_live_rest"),
     "WorldJob": ("view", "viewport.live_cycles", "render_world"),
     "NodeLightJob": ("view", "viewport.live_cycles", "render_node_lights"),

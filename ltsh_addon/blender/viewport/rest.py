@@ -31,18 +31,7 @@ from ..extract.pixels import files_opened, open_scene, scene_named
 from ..materials.graph import ensure_nodes, has_volume
 from ..materials.preview_material import preview_of
 from ..process.blender_process import BlenderProcess
-from ..process.view import (
-    LIVE_FACTS,
-    LIVE_PICTURE,
-    REST_PICTURE,
-    REST_RENDER,
-    STOP,
-    LiveRestJob,
-    RestJob,
-    RestPictureJob,
-    RestSum,
-    RestView,
-)
+from ..process.view import REST_PICTURE, REST_RENDER, LiveRestJob, RestJob, RestSum, RestView
 from ..render_settings import render_exr
 from ..saving import save_working_copy
 from .drawing import ViewCamera, float_texture
@@ -53,17 +42,6 @@ from .second_blender import SecondBlender, spare
 MASK, SENSOR = "ltsh_of_cycles", 36.0
 CAMERA = "LTSH view"
 PASSES = ("combined", "diffuse_direct", "diffuse_color", "glossy_direct", "glossy_color", "environment", "z")
-# Pairs of properties: what views take, and what renders take.
-LEVELS = (
-    ("show_viewport", "show_render"),
-    ("levels", "render_levels"),
-    ("resolution_u", "render_resolution_u"),
-    ("resolution_v", "render_resolution_v"),
-    ("resolution", "render_resolution"),
-    ("show_instancer_for_viewport", "show_instancer_for_render"),
-    ("simplify_subdivision", "simplify_subdivision_render"),
-    ("simplify_child_particles", "simplify_child_particles_render"),
-)
 # A step takes about STEP_SECONDS: so long a new state may wait for the step of an old one. SHRINKS: pixels in either
 # direction that share one, in the pictures that come one after another; the first is the finest that takes one step.
 # TOTALS: the samples after which a picture is shown; denoised, one of all pixels is nearer than four of a quarter of
@@ -72,7 +50,8 @@ STEP_SECONDS, SHRINKS, TOTALS, REST_SECONDS = 0.5, (4, 2, 1), (1, 2, 4, 8, 16, 3
 # FEWEST: samples of single pixels that a step takes at least: the first picture of 1000 x 640 pixels. MOST_CHANGE: how
 # many times as many or as few the next one takes.
 FEWEST, MOST_CHANGE = 160_000, 2.0
-PICTURE = "picture"  # a stage of live jobs; its fraction is the number of the picture
+# Of live jobs. PICTURE: a stage; its fraction is the number of a picture, with two files. STOP: a file that ends them.
+PICTURE, LIVE_PICTURE, LIVE_FACTS, STOP = "picture", "live_{}.npy", "live_{}.json", "stop"
 # Settings of a scene that change its light, beside those of Cycles.
 SCENE_SETTINGS = ("use_simplify", "simplify_subdivision", "film_transparent", "hair_type")
 
@@ -332,7 +311,12 @@ class LiveRest:
                 if run.job.view != self._wanted or not may_run:
                     run.stop()
                 return news
-            news |= self._finish(run)
+            self._run = None
+            if run.error:
+                self._opened = self._done = None
+                # What cannot be handed over piece by piece goes as a whole.
+                self.problem = "" if run.job.changes is not None else run.error
+            news |= bool(self.problem)
         if may_run and time.monotonic() - self._changed > REST_SECONDS and self.is_busy:
             if self._blender is None:
                 self._blender, self._opened = spare.pop() if spare else SecondBlender(), None
@@ -355,15 +339,6 @@ class LiveRest:
         self._picture, self._done = picture, (picture.view, facts["total"])
         self._work, self._seconds = facts["work"], facts["seconds"]
         return True
-
-    def _finish(self, run: _RestRun) -> bool:
-        """A run has ended; True if there is something to say about it."""
-        self._run = None
-        if run.error:
-            self._opened = self._done = None
-            # What cannot be handed over piece by piece goes as a whole.
-            self.problem = "" if run.job.changes is not None else run.error
-        return bool(self.problem)
 
     def _begin(self) -> None:
         """Start to render what is wanted."""
@@ -419,7 +394,20 @@ _sum: list[RestSum] = []
 
 
 def render_rest(job: RestJob, folder: Path, progress) -> dict:
-    """Do the `job`: adds to the sum. Returns the manifest: the seconds that Cycles took."""
+    """Do the `job`; returns the manifest, see `process.view.render_rest`."""
+    render_step(job, folder, progress)
+    return _write_picture(folder / REST_PICTURE)
+
+
+def _write_picture(path: Path) -> dict:
+    """Write the picture of the sum; returns what there is to say of it."""
+    total = _sum[0]
+    save_array(path, total.picture())
+    return {"is_everything": total.is_everything, "ambient": total.ambient, "problem": total.problem}
+
+
+def render_step(job: RestJob, folder: Path, progress) -> float:
+    """Add what `job` asks for to the sum; returns the seconds that Cycles took."""
     view, warnings = RestView(**job.view), []
     if job.scene is not None and _state_of(job, view) != _opened[0]:
         progress("open scene", 0.0)
@@ -427,14 +415,14 @@ def render_rest(job: RestJob, folder: Path, progress) -> dict:
         scene = scene_named(view.scene)
         render_settings.go_to_frame(scene, view.frame)
         layer = render_settings.only_view_layer(scene, warnings, view.view_layer)
-        _show_as_views(scene, layer, view.hidden)
+        render_settings.show_as_views(scene, layer, view.hidden)
         # The animation of the scene itself ends here.
         _opened[0] = None if scene.animation_data is not None else _state_of(job, view)
         _prepare(scene, layer)
     elif job.scene is not None:
         scene = scene_named(view.scene)
         render_settings.go_to_frame(scene, view.frame)
-        _show_as_views(scene, next(layer for layer in scene.view_layers if layer.use), view.hidden)
+        render_settings.show_as_views(scene, next(layer for layer in scene.view_layers if layer.use), view.hidden)
         _mark_materials()
     scene = scene_named(view.scene)
     if job.changes is not None:
@@ -469,7 +457,7 @@ def render_rest(job: RestJob, folder: Path, progress) -> dict:
     total = _sum[0]
     total.add(folder / REST_RENDER, first, job.samples, {**render_settings.pass_names(), "mask": MASK})
     total.samples = job.total
-    return {"seconds": seconds}
+    return seconds
 
 
 def render_live_rest(job: LiveRestJob, folder: Path, progress) -> dict:
@@ -479,16 +467,14 @@ def render_live_rest(job: LiveRestJob, folder: Path, progress) -> dict:
     pixels, more = math.prod(view.size), {"scene": job.scene, "changes": job.changes}
     while before is None or before.total < TOTALS[-1] or before.shrink > 1:
         step = next_job(before, view, work / pixels)
-        seconds = render_rest(replace(step, view=job.view, **more), folder, progress)["seconds"]
+        seconds = render_step(replace(step, view=job.view, **more), folder, progress)
         done = pixels / step.shrink**2 * step.samples * (step.rows[1] - step.rows[0])
         if not more["scene"]:
             wanted = done * min(max(STEP_SECONDS / seconds, 1.0 / MOST_CHANGE), MOST_CHANGE)
             work = max(wanted, FEWEST if seconds > STEP_SECONDS else work)
         before, more = step, {"scene": None, "changes": None}
         if makes_picture(step) and not (folder / STOP).exists():
-            total = _sum[0]
-            save_array(folder / LIVE_PICTURE.format(number), total.picture())
-            facts = {"is_everything": total.is_everything, "ambient": total.ambient, "problem": total.problem}
+            facts = _write_picture(folder / LIVE_PICTURE.format(number))
             facts |= {"total": step.total if step.shrink == 1 else 0, "seconds": seconds / done, "work": work}
             (folder / LIVE_FACTS.format(number)).write_text(json.dumps(facts), encoding="utf-8")
             progress(PICTURE, float(number))
@@ -506,13 +492,6 @@ def _state_of(job: RestJob, view: RestView) -> tuple:
     """What an open scene is of."""
     modified = Path(job.scene).stat().st_mtime_ns
     return files_opened(), job.scene, modified, job.camera, job.scripts, replace(view, frame=None)
-
-
-def denoise_rest(job: RestPictureJob, folder: Path, progress) -> dict:
-    """Do the `job`; returns the manifest, see `process.view.render_rest`."""
-    total = _sum[0]
-    save_array(folder / REST_PICTURE, total.picture())
-    return {"is_everything": total.is_everything, "ambient": total.ambient, "problem": total.problem}
 
 
 def _take_changes(scene, file: str, blocks: list, moved: dict) -> None:
@@ -540,26 +519,6 @@ def _take_changes(scene, file: str, blocks: list, moved: dict) -> None:
     for name, (_, world) in moved.items():
         if not np.allclose(scene.objects[name].matrix_world, world, rtol=1e-5, atol=1e-5):
             raise SceneError(f"object {name!r} does not follow")
-
-
-def _show_as_views(scene, layer, hidden: tuple[str, ...]) -> None:
-    """Let renders show what views show, in their detail; but for the objects `hidden`."""
-    shown = {ob for ob in objects_in_views(layer) if ob.name not in hidden}
-    for collection in bpy.data.collections:
-        collection.hide_render = False
-    for ob in bpy.data.objects:
-        ob.hide_render = ob not in shown if ob.name in layer.objects else ob.hide_viewport
-        details = [ob, *ob.modifiers, *(() if ob.data is None else (ob.data,))]
-        for owner in details:
-            _take_levels(owner)
-    _take_levels(scene.render)
-
-
-def _take_levels(owner) -> None:
-    """Let renders take the values of LEVELS that views take."""
-    for name, of_renders in LEVELS:
-        if hasattr(owner, name) and hasattr(owner, of_renders):
-            setattr(owner, of_renders, getattr(owner, name))
 
 
 def _prepare(scene, layer) -> None:

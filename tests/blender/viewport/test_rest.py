@@ -185,6 +185,33 @@ def test_changes_are_handed_over_by_themselves_and_show_what_a_whole_file_shows(
 
 
 @pytest.mark.newest
+def test_the_second_blender_goes_on_while_the_window_draws(monkeypatch):
+    """One look at it brings the last picture; what is not wanted any more ends after its step."""
+    monkeypatch.setattr(rest, "REST_SECONDS", 0.0)
+    camera = room()
+    context, live = context_of(camera), rest.LiveRest()
+    scene = SimpleNamespace(scene=bpy.context.scene, view_layer=bpy.context.view_layer)
+    live.note(bpy.context.view_layer.depsgraph)
+    try:
+        live.follow(context, scene)
+        live.step()
+        live._run.thread.join(120.0)
+        assert live.step() and live._samples == rest.TOTALS[-1] and not live.is_busy
+        camera.location.x += 0.1
+        bpy.context.view_layer.update()
+        live.follow(context_of(camera), scene)
+        live.step()
+        run = live._run
+        live.pause()
+        live.step()
+        run.thread.join(60.0)
+        assert not run.thread.is_alive() and not run.error
+        assert run.last is None or run.last[1]["total"] < rest.TOTALS[-1]
+    finally:
+        live.stop()
+
+
+@pytest.mark.newest
 def test_a_step_takes_what_there_is_time_for_and_pictures_come_with_more_and_more_pixels():
     """Each picture has all its samples, whatever the share of a picture that a step takes."""
     one, other = RestView(scene="one"), RestView(scene="other")
@@ -212,7 +239,7 @@ def test_rows_that_are_rendered_apart_are_those_of_the_whole_picture(tmp_path):
         for number, rows in enumerate(bands):
             view = asdict(RestView(matrices=matrices, size=SIZE))
             job = RestJob(None if sums or number else path, view, 2, rows=rows, continues=number > 0)
-            rest.render_rest(job, tmp_path, lambda *stage: None)
+            rest.render_step(job, tmp_path, lambda *stage: None)
         sums.append(rest._sum[0])
     assert [one.samples for one in sums] == [2, 2, 2]
     for name in ("light", "guides"):
@@ -230,7 +257,7 @@ def test_samples_of_several_steps_are_those_of_one(tmp_path):
         for done, samples in zip((0, *np.cumsum(counts)), counts, strict=False):
             view = asdict(RestView(size=SIZE))
             job = RestJob(None if sums or done else path, view, samples, int(done), continues=done > 0)
-            rest.render_rest(job, tmp_path, lambda *stage: None)
+            rest.render_step(job, tmp_path, lambda *stage: None)
         sums.append(rest._sum[0])
     assert (np.abs(sums[1].light - sums[0].light).max(axis=-1) < 1e-4).mean() > 0.9
 
@@ -312,5 +339,5 @@ def test_the_depth_of_a_mirror_is_its_own(tmp_path):
     parts.add_area_light()
     parts.add_camera((0.0, 0.0, 3.0), (0.0, 0.0, 0.0))
     path = parts.save(tmp_path / "mirror.blend")
-    rest.render_rest(RestJob(path, asdict(RestView(size=SIZE)), 2), tmp_path, lambda *stage: None)
+    rest.render_step(RestJob(path, asdict(RestView(size=SIZE)), 2), tmp_path, lambda *stage: None)
     np.testing.assert_allclose(rest._sum[0].picture()[..., 3], 3.0, rtol=1e-5)

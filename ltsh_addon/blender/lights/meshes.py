@@ -236,11 +236,8 @@ def _without_balls(mesh_light: MeshLight, radiance, side: int) -> tuple[MeshLigh
     placements, lights = [], []
     for placement in mesh_light.placements:
         remain = np.ones(len(placement.triangles), bool)
-        shape = placement.vertices, placement.triangles
-        is_outside = side == mesh_polygons.outward_side(*shape) and mesh_polygons.is_closed(
-            mesh_polygons.welded(*shape)
-        )
-        for ball in mesh_polygons.balls(*shape, placement.slots, side) if is_outside else ():
+        shape = placement.vertices, placement.triangles, placement.slots
+        for ball in mesh_polygons.balls(*shape, side) if side else ():
             remain[ball.triangles] = False
             # Rays to the light end before they meet the faces.
             radius = AROUND_FACES * ball.radius

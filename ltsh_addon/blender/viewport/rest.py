@@ -153,7 +153,7 @@ class _RestRun:
 
     job: LiveRestJob
     folder: Path
-    last: "tuple[_RestPicture, dict] | None" = None  # the last picture and its facts, see `render_live_rest`
+    picture: "_RestPicture | None" = None  # the last one
     error: str = ""
     thread: threading.Thread | None = None
 
@@ -168,11 +168,10 @@ class _RestRun:
         if stage == PICTURE:
             number = round(fraction)
             facts = json.loads((self.folder / LIVE_FACTS.format(number)).read_text(encoding="utf-8"))
-            shown = {name: facts[name] for name in ("is_everything", "ambient", "problem")}
             path = self.folder / LIVE_PICTURE.format(number)
             pixels = np.load(path)
             path.unlink()
-            self.last = _RestPicture(self.job.view, pixels, **shown), facts
+            self.picture = _RestPicture(self.job.view, pixels, **facts)
 
     def stop(self) -> None:
         """Let it end after its step."""
@@ -188,6 +187,9 @@ class _RestPicture:
     is_everything: bool
     ambient: list[float]
     problem: str
+    total: int  # samples of all pixels of the view; 0: it has fewer pixels
+    seconds: float  # of a sample of a single pixel
+    work: float  # samples of single pixels that a step takes
     shown: ShownRest | None = None  # on the graphics card
     light: tuple | None = None  # the mean of the direct light that belongs to it, and what it depends on
 
@@ -207,10 +209,8 @@ class LiveRest:
         self._wanted: RestView | None = None
         self._changed = 0.0
         self._run: _RestRun | None = None  # the one on its way
-        self._done: tuple[RestView, int] | None = None  # the view of the last picture, its samples of all pixels
         self._opened: tuple | None = None  # the scene that the second Blender has
         self._changes = RestChanges()  # since then
-        self._work, self._seconds = FEWEST, 0.0  # samples of single pixels in a step; seconds of one; 0: not known
         self._picture: _RestPicture | None = None  # the last one
         self._version, self._surfaces, self._settings = 0, 0, None  # of the scene; of all in it but lights
         self.problem = ""  # why there is no picture
@@ -291,13 +291,14 @@ class LiveRest:
     @property
     def _samples(self) -> int:
         """Samples in full resolution of what is wanted."""
-        return self._done[1] if self._done is not None and self._done[0] == self._wanted else 0
+        return self._picture.total if self._picture is not None and self._picture.view == self._wanted else 0
 
     @property
     def seconds(self) -> float | None:
         """About how long the last picture will still take; None: not known yet."""
-        missing = TOTALS[-1] - self._samples
-        return None if self._wanted is None else self._seconds * math.prod(self._wanted.size) * missing or None
+        if self._wanted is None or self._picture is None:
+            return None
+        return self._picture.seconds * math.prod(self._wanted.size) * (TOTALS[-1] - self._samples) or None
 
     def step(self) -> bool:
         """Take what has come, and start what is wanted, in the main thread; True if there is a new picture."""
@@ -313,7 +314,7 @@ class LiveRest:
                 return news
             self._run = None
             if run.error:
-                self._opened = self._done = None
+                self._opened = None
                 # What cannot be handed over piece by piece goes as a whole.
                 self.problem = "" if run.job.changes is not None else run.error
             news |= bool(self.problem)
@@ -331,13 +332,10 @@ class LiveRest:
 
     def _take(self, run: _RestRun) -> bool:
         """Take over the last picture; True if it is a new one."""
-        picture, facts = run.last or (None, {})
         # A run that was stopped by a render of the artist's begins anew.
-        is_worse = self._done is not None and picture is not None and facts["total"] < self._done[1]
-        if picture is None or picture is self._picture or is_worse:
+        if run.picture is None or run.picture is self._picture or run.picture.total < self._samples:
             return False
-        self._picture, self._done = picture, (picture.view, facts["total"])
-        self._work, self._seconds = facts["work"], facts["seconds"]
+        self._picture = run.picture
         return True
 
     def _begin(self) -> None:
@@ -351,10 +349,9 @@ class LiveRest:
         elif self._changes.objects or self._changes.blocks:
             changes = self._changes.written(bpy.data.scenes[wanted.scene], blender.folder / "changes.blend")
         self._changes = RestChanges(everything=False)
-        if self._done is not None and self._done[0] != wanted:
-            self._done = None
+        work = FEWEST if self._picture is None else self._picture.work
         (blender.folder / STOP).unlink(missing_ok=True)
-        run = self._run = _RestRun(LiveRestJob(path, wanted, changes, self._work), blender.folder)
+        run = self._run = _RestRun(LiveRestJob(path, wanted, changes, work), blender.folder)
         arguments = {"target": run.do, "args": (blender.process,), "name": "LTSH rest"}
         run.thread = blender.step = threading.Thread(**arguments, daemon=True)
         blender.step.start()
@@ -461,8 +458,7 @@ def render_step(job: RestJob, folder: Path, progress) -> float:
 
 
 def render_live_rest(job: LiveRestJob, folder: Path, progress) -> dict:
-    """Do the `job`. Each picture has facts: those of `RestSum`, the samples of all pixels that it has (`total`), the
-    seconds of one of a single pixel, and how many of these a step takes (`work`). Returns no manifest."""
+    """Do the `job`. Each picture has a file of facts, fields of a `_RestPicture`. Returns no manifest."""
     view, work, number, before = RestView(**job.view), job.work, 0, None
     pixels, more = math.prod(view.size), {"scene": job.scene, "changes": job.changes}
     while before is None or before.total < TOTALS[-1] or before.shrink > 1:

@@ -206,7 +206,7 @@ def test_the_second_blender_goes_on_while_the_window_draws(monkeypatch):
         live.step()
         run.thread.join(60.0)
         assert not run.thread.is_alive() and not run.error
-        assert run.last is None or run.last[1]["total"] < rest.TOTALS[-1]
+        assert run.picture is None or run.picture.total < rest.TOTALS[-1]
     finally:
         live.stop()
 

@@ -197,7 +197,8 @@ class RestSum:
     """The sum of the samples of one view, row 0 on top."""
 
     light: np.ndarray  # (H, W, 3)
-    guides: np.ndarray  # (H, W, 7) albedo, normal and depth
+    guides: np.ndarray  # (H, W, 6) albedo and normal
+    depth: np.ndarray  # (H, W) of the first sample: Cycles writes no other
     samples: int = 0
     is_everything: bool = False  # no light of the view itself remains
     problem: str = ""  # of the denoiser
@@ -209,8 +210,8 @@ class RestSum:
         light = np.mean(self.light, axis=(0, 1), dtype=np.float64)
         return tuple(np.nan_to_num(light / np.maximum(albedo, 0.05 * self.samples)).tolist())
 
-    def add(self, path: Path, row: int, count: int, names: dict[str, str]) -> None:
-        """Add `count` samples of the EXR `path`, rows from `row` on: Combined without what the view draws itself.
+    def add(self, path: Path, row: int, job: RestJob, names: dict[str, str]) -> None:
+        """Add the samples of `job` in the EXR `path`, rows from `row` on: Combined without what the view draws itself.
 
         `names` are those of passes by our keys, and of the AOV "mask".
         """
@@ -223,23 +224,25 @@ class RestSum:
             )
             drawn = 1.0 - np.minimum(read_layer(channels, names["mask"], "X"), 1.0)
             light = light - drawn[..., None] * (specular * specular_color + diffuse * diffuse_color + background)
-        # Cycles' denoising depth is that of what a mirror shows.
-        names = ("Denoising Albedo", "RGB"), ("Denoising Normal", "XYZ"), ("Depth", "Z")
-        guides = [np.atleast_3d(np.minimum(read_layer(channels, *name), FARTHEST)) for name in names]
-        rows = slice(row, row + len(light))
-        self.light[rows] += np.float32(count) * light
-        self.guides[rows] += np.float32(count) * np.concatenate(guides, axis=-1)
+        guides = [read_layer(channels, *name) for name in (("Denoising Albedo", "RGB"), ("Denoising Normal", "XYZ"))]
+        rows, count = slice(row, row + len(light)), np.float32(job.samples)
+        self.light[rows] += count * light
+        self.guides[rows] += count * np.concatenate(guides, axis=-1)
+        if job.done == 0:
+            # Cycles' denoising depth is that of what a mirror shows.
+            self.depth[rows] = np.minimum(read_layer(channels, "Depth", "Z"), FARTHEST)
+        self.samples = job.total
 
     def picture(self) -> np.ndarray:
         """The denoised mean (H, W, 4); alpha is `marked_depth`."""
         light, guides = (each / np.float32(self.samples) for each in (self.light, self.guides))
         try:
             with open_denoiser(denoiser_libraries(), cores()) as denoiser:
-                light = denoiser.quickly_denoised(light, guides[..., :3], guides[..., 3:6])
+                light = denoiser.quickly_denoised(light, guides[..., :3], guides[..., 3:])
         except NoDenoiser:
-            light = smoothed(light, guides, self.samples)
+            light = smoothed(light, np.concatenate([guides, self.depth[..., None]], axis=-1), self.samples)
             self.problem = "Bounces are smoothed, not denoised: this Blender has no denoiser"
-        return np.concatenate([light, marked_depth(guides[..., 6])[..., None]], axis=-1)
+        return np.concatenate([light, marked_depth(self.depth)[..., None]], axis=-1)
 
 
 def render_rest(job: RestJob, folder: Path, *, progress: Progress | None = None) -> dict:

@@ -449,11 +449,9 @@ def render_step(job: RestJob, folder: Path, progress) -> float:
     render_exr(scene, folder / REST_RENDER, "NONE")
     seconds = time.monotonic() - started
     if not job.continues:
-        sizes = [(height, width, channels) for channels in (3, 7)]
+        sizes = (height, width, 3), (height, width, 6), (height, width)
         _sum[:] = [RestSum(*(np.zeros(size, np.float32) for size in sizes), is_everything=_is_everything(scene, layer))]
-    total = _sum[0]
-    total.add(folder / REST_RENDER, first, job.samples, {**render_settings.pass_names(), "mask": MASK})
-    total.samples = job.total
+    _sum[0].add(folder / REST_RENDER, first, job, {**render_settings.pass_names(), "mask": MASK})
     return seconds
 
 

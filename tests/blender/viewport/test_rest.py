@@ -242,7 +242,7 @@ def test_rows_that_are_rendered_apart_are_those_of_the_whole_picture(tmp_path):
             rest.render_step(job, tmp_path, lambda *stage: None)
         sums.append(rest._sum[0])
     assert [one.samples for one in sums] == [2, 2, 2]
-    for name in ("light", "guides"):
+    for name in ("light", "guides", "depth"):
         whole, *others = (getattr(one, name) for one in sums)
         for other in others:
             np.testing.assert_array_equal(other, whole)
@@ -331,7 +331,7 @@ def test_light_of_few_pixels_stays_on_its_surface():
 
 @pytest.mark.newest
 def test_the_depth_of_a_mirror_is_its_own(tmp_path):
-    """Not that of what it shows: a moved view finds its light by the place of its surface."""
+    """Not that of what it shows, after further samples too: a moved view finds its light by the place of its surface."""
     parts.empty_scene(*SIZE)
     mirror = parts.principled("mirror", Metallic=1.0, Roughness=0.0)[0]
     parts.add_plane(mirror, size=40.0)
@@ -339,5 +339,7 @@ def test_the_depth_of_a_mirror_is_its_own(tmp_path):
     parts.add_area_light()
     parts.add_camera((0.0, 0.0, 3.0), (0.0, 0.0, 0.0))
     path = parts.save(tmp_path / "mirror.blend")
-    rest.render_step(RestJob(path, asdict(RestView(size=SIZE)), 2), tmp_path, lambda *stage: None)
+    view = asdict(RestView(size=SIZE))
+    for job in (RestJob(path, view, 2), RestJob(None, view, 2, 2, continues=True)):
+        rest.render_step(job, tmp_path, lambda *stage: None)
     np.testing.assert_allclose(rest._sum[0].picture()[..., 3], 3.0, rtol=1e-5)

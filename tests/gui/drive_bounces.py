@@ -67,9 +67,9 @@ def main(rig):
     rig.fact("problem", rest().problem)
     yield 1
     rig.shot("first.png")
-    seconds = yield from waited(rig, lambda: not rest().is_urgent, LAST_SECONDS)
+    seconds = yield from waited(rig, lambda: not rest().lacks(1), LAST_SECONDS)
     rig.fact("full resolution after further seconds", round(seconds, 1))
-    rig.check(not rest().is_urgent, "bounces come in full resolution")
+    rig.check(not rest().lacks(1), "bounces come in full resolution")
     yield 1
     rig.shot("last.png")
     light = next(ob for ob in bpy.data.objects if ob.type == "LIGHT")

@@ -58,13 +58,16 @@ class QuietLine:
     panel: str = MATERIALS_PANEL
 
 
-def left_out(mirror, scene, rest=None) -> QuietLine:
-    """What no view of this scene shows, but its Cycles pictures do; or when the `rest` of a view that has one comes."""
+def left_out(mirror, scene, rest=None, shows_whole: bool = False) -> QuietLine:
+    """What no view of this scene shows, but its Cycles pictures do; or when the `rest` of a view that has one comes.
+
+    With `shows_whole` the view shows Cycles' picture meanwhile.
+    """
     if rest is None:
         parts = ["No bounces", *["glass without refraction"] * mirror.has_glass]
     else:
         coming = "Bounces are coming" if rest.seconds is None else f"Bounces: {max(rest.seconds, 1.0):.0f} s"
-        parts = [coming] * rest.is_busy
+        parts = ["Cycles' picture for now"] * shows_whole + [coming] * rest.is_busy
     if not scene.ltsh.shadows:
         parts.append("no shadows")
     if not scene.ltsh_view.world and mirror.sky.sides:

@@ -27,7 +27,8 @@ IDLE_SECONDS = 60.0
 FREEING_SECONDS, SPARE_SECONDS, LOOK_SECONDS = 0.3, 60.0, 0.05
 # Pictures of a view that changes take about FRAME_SECONDS, with a pixel for each of 1, 2 x 2 or 4 x 4. A view that has
 # not changed for MOVING_SECONDS gets all its pixels. Slow ones come SHADOWS_SECONDS or BOUNCES_SECONDS later while they
-# would delay the first of these, and are refined HELD_SECONDS later while that delays all pixels of bounces.
+# would delay the first of these. They come, or are refined, HELD_SECONDS later while that delays all pixels of bounces,
+# or a better picture of Cycles that is shown meanwhile.
 FRAME_SECONDS, STEPS, MOVING_SECONDS = 0.1, (1, 2, 4), 0.5
 SHADOWS_SECONDS, BOUNCES_SECONDS, HELD_SECONDS = 1.5, 4.0, 20.0
 # All views, their shadows, and what they know of lights with nodes.

@@ -16,7 +16,7 @@ from ..viewport.live_cycles import LiveWorld
 from ..viewport.mirror import SceneMirror
 from ..viewport.pictures import ShownPicture
 from ..viewport.renderer import ViewRenderer
-from ..viewport.rest import LiveRest
+from ..viewport.rest import WHOLE_SAMPLES, LiveRest
 from ..viewport.shadow_rays import too_many, view_occluders
 from ..viewport.shadows import LiveShadows
 from . import redraws
@@ -47,6 +47,7 @@ class EngineView:
         self._pixel_size = redraws.PixelSize()
         self.rest = LiveRest()
         self._occluder_notes: list[str] = []
+        self._shown: tuple[ViewCamera, ShownPicture] | None = None  # what was drawn last
         redraws.live_shadows.add(self._shadows)
         redraws.open_views.add(self)
 
@@ -93,6 +94,7 @@ class EngineView:
 
     def draw(self, context, depsgraph) -> None:
         """Draw into the region of `context`, and ask to be drawn again while the picture can be refined."""
+        self._shown = None
         start, target, self.region = time.monotonic(), gpu.state.active_framebuffer_get(), context.region.as_pointer()
         if not _has_drawn[0]:
             _has_drawn[0] = True
@@ -107,7 +109,8 @@ class EngineView:
         except ShadersMissing:
             # Drawings that compile draw all before that shader again.
             self._pixel_size.begin_small()
-            _clear(target)
+            if self._shown is None or not self._renderer.show_whole(*self._shown, target):
+                _clear(target)
             show(context.region, ViewTexts(notes=(COMPILING,)))
             redraws.redraw_at(time.monotonic() + redraws.POLL_SECONDS)
             return
@@ -120,7 +123,8 @@ class EngineView:
         notes += self.rest.notes
         if not texts.error and not self.mirror.lights and not self.mirror.sky.sides:
             notes.insert(0, NO_LIGHTS)
-        quiet = left_out(self.mirror, depsgraph.scene, self.rest if has_rest or self.rest.is_busy else None)
+        rest = self.rest if has_rest or self.rest.is_busy else None
+        quiet = left_out(self.mirror, depsgraph.scene, rest, has_rest and self._renderer.shows_whole)
         show(context.region, replace(texts, notes=tuple(dict.fromkeys(notes)), quiet=quiet))
         self._redraw_later(start, bool(texts.error))
         redraws.moments["drawn"] = time.monotonic()
@@ -158,6 +162,7 @@ class EngineView:
         wait = math.inf if has_news else self._wait
         self._renderer.step = self._pixel_size.follow(_state_of(self.mirror, camera, size), wait)
         self._shadows.hold(time.monotonic() < self._held_until)
+        self._shown = camera, shown
         self._renderer.draw(self.mirror, camera, size, shown, target, points)
         if self._pixel_size.is_new:
             self._renderer.wait()
@@ -171,7 +176,7 @@ class EngineView:
         renderer, is_wanted = self._renderer, depsgraph.scene.ltsh_view.bounces and shown.takes_rest
         renderer.has_bounces = is_wanted
         if is_wanted:
-            self.rest.follow(context, depsgraph, shown.world)
+            self.rest.follow(context, depsgraph, shown.world, self._draws_shadows and shown.may_be_whole)
         elif depsgraph.scene.ltsh_view.bounces:
             self.rest.pause()
         else:
@@ -183,13 +188,21 @@ class EngineView:
         """How many seconds a whole picture waits for the first shadows and bounces, which it would hold up."""
         if self.rest.is_new:
             return redraws.BOUNCES_SECONDS
+        if self._has_better_to_come and self._renderer.shows_whole:
+            return redraws.HELD_SECONDS
         return redraws.SHADOWS_SECONDS if self._shadows.is_busy else 0.0
 
     @property
     def _held_until(self) -> float:
         """The moment until which bounces come before further points of pixels and the last shadows. All share the
         processor where pictures take long."""
-        return self._pixel_size.end + redraws.HELD_SECONDS if self._pixel_size.is_slow and self.rest.is_urgent else 0.0
+        is_held = self._pixel_size.is_slow and self._has_better_to_come
+        return self._pixel_size.end + redraws.HELD_SECONDS if is_held else 0.0
+
+    @property
+    def _has_better_to_come(self) -> bool:
+        """True while bounces are to come that improve the picture more than anything else."""
+        return self.rest.lacks(WHOLE_SAMPLES if self._renderer.shows_whole else 1)
 
     @property
     def has_new_shadows(self) -> bool:

@@ -160,7 +160,7 @@ class RestJob:
     shrink: int = 1  # pixels of the view in either direction that share one
     rows: tuple[float, float] = (0.0, 1.0)  # the shares of the height between which it is rendered
     camera: str | None = None  # where the view has no matrices
-    changes: dict | None = None  # of the scene that the last job has opened, see `viewport.rest.RestChanges`
+    changes: dict | None = None  # of the scene that the last job has opened, see `viewport.second_blender.RestChanges`
     continues: bool = False  # the sum of the last job; else it is begun anew
     scripts: bool = False  # run the scripts in the file
 
@@ -178,6 +178,7 @@ class LiveRestJob:
     view: RestView  # in the child a dict
     changes: dict | None
     work: float  # samples of single pixels that a step takes
+    has_whole: bool  # also Cycles' whole picture, which then comes before the rest
 
 
 NEAR = 0.05  # depths that differ by this share are those of different surfaces
@@ -196,7 +197,8 @@ def marked_depth(depth: np.ndarray) -> np.ndarray:
 class RestSum:
     """The sum of the samples of one view, row 0 on top."""
 
-    light: np.ndarray  # (H, W, 3)
+    light: np.ndarray  # (H, W, 3) Combined without what the view draws itself
+    whole: np.ndarray  # (H, W, 3) Combined
     guides: np.ndarray  # (H, W, 6) albedo and normal
     depth: np.ndarray  # (H, W) of the first sample: Cycles writes no other
     samples: int = 0
@@ -211,12 +213,12 @@ class RestSum:
         return tuple(np.nan_to_num(light / np.maximum(albedo, 0.05 * self.samples)).tolist())
 
     def add(self, path: Path, row: int, job: RestJob, names: dict[str, str]) -> None:
-        """Add the samples of `job` in the EXR `path`, rows from `row` on: Combined without what the view draws itself.
+        """Add the samples of `job` in the EXR `path`, rows from `row` on.
 
         `names` are those of passes by our keys, and of the AOV "mask".
         """
         channels = rendered_channels(path)
-        light = read_layer(channels, "Combined", "RGB")
+        light = whole = read_layer(channels, "Combined", "RGB")
         if not self.is_everything:
             keys = "specular_light", "specular_color", "diffuse_light", "diffuse_color", "background"
             specular, specular_color, diffuse, diffuse_color, background = (
@@ -227,6 +229,7 @@ class RestSum:
         guides = [read_layer(channels, *name) for name in (("Denoising Albedo", "RGB"), ("Denoising Normal", "XYZ"))]
         rows, count = slice(row, row + len(light)), np.float32(job.samples)
         self.light[rows] += count * light
+        self.whole[rows] += count * whole
         self.guides[rows] += count * np.concatenate(guides, axis=-1)
         if job.done == 0:
             # Cycles' denoising depth is that of what a mirror shows.
@@ -235,14 +238,20 @@ class RestSum:
 
     def picture(self) -> np.ndarray:
         """The denoised mean (H, W, 4); alpha is `marked_depth`."""
-        light, guides = (each / np.float32(self.samples) for each in (self.light, self.guides))
+        return np.concatenate([self._denoised(self.light), marked_depth(self.depth)[..., None]], axis=-1)
+
+    def whole_picture(self) -> np.ndarray:
+        """The denoised mean (H, W, 3) with what the view draws itself."""
+        return self._denoised(self.whole)
+
+    def _denoised(self, light: np.ndarray) -> np.ndarray:
+        light, guides = (each / np.float32(self.samples) for each in (light, self.guides))
         try:
             with open_denoiser(denoiser_libraries(), cores()) as denoiser:
-                light = denoiser.quickly_denoised(light, guides[..., :3], guides[..., 3:])
+                return denoiser.quickly_denoised(light, guides[..., :3], guides[..., 3:])
         except NoDenoiser:
-            light = smoothed(light, np.concatenate([guides, self.depth[..., None]], axis=-1), self.samples)
             self.problem = "Bounces are smoothed, not denoised: this Blender has no denoiser"
-        return np.concatenate([light, marked_depth(self.depth)[..., None]], axis=-1)
+            return smoothed(light, np.concatenate([guides, self.depth[..., None]], axis=-1), self.samples)
 
 
 def render_rest(job: RestJob, folder: Path, *, progress: Progress | None = None) -> dict:

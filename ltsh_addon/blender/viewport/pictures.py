@@ -7,6 +7,7 @@ import numpy as np
 from mathutils import Matrix
 
 from ...imaging.denoise import FARTHEST
+from ...scene import DEFAULT_TECHNIQUE
 from ...shading.header import definitions, filled
 from ..process.view import NEAR
 from .drawing import PixelShader, ViewCamera, drawing, empty_texture, frame_buffer, glsl, size_of
@@ -39,6 +40,12 @@ class ShownPicture:
     def takes_rest(self) -> bool:
         """True if Cycles' rest belongs to it: neither to passes alone, nor beside a picture of direct light."""
         return self.passes == "combined" and (self.mode == "single" or self.second_picture is None)
+
+    @property
+    def may_be_whole(self) -> bool:
+        """True if Cycles' whole picture may stand for it: not for a technique that is chosen for its errors."""
+        is_plain = self.mode == "single" and not self.transparent
+        return self.takes_rest and is_plain and self.technique == DEFAULT_TECHNIQUE
 
 
 class PicturePass:
@@ -107,6 +114,7 @@ class ShownRest:
     is_everything: bool = False  # it is the whole picture
     ambient: tuple = (0.0, 0.0, 0.0)  # a guess of it over the colors of surfaces, where it is not known
     light: np.ndarray | None = None  # the mean (3,) of the direct light that belongs to it; None: that of the picture
+    whole: gpu.types.GPUTexture | None = None  # RGB, with the direct light; None: not of what is shown
 
     def is_of(self, view: ViewCamera) -> bool:
         """True if it was rendered for this very view."""
@@ -117,18 +125,19 @@ class RestPass:
     """Draws a picture with its rest; needs an active GPU context."""
 
     def __init__(self):
-        samplers = ("picture", "of_cycles", "rest", "positions", "front_positions", "diffuse_colors", "specular_colors")
-        constants = {"projection": "MAT4", **dict.fromkeys(("scale", "ambient"), "VEC4")}
+        samplers = ("picture", "of_cycles", "rest", "whole", "positions", "front_positions")
+        samplers += "diffuse_colors", "specular_colors"
+        constants = {"projection": "MAT4", "whole_share": "FLOAT", **dict.fromkeys(("scale", "ambient"), "VEC4")}
         constants |= dict.fromkeys(("has_moved", "is_parallel"), "INT")
         source = definitions({"FARTHEST": FARTHEST, "NEAR": NEAR}) + _between("rest") + glsl("rest")
         self._shader = PixelShader(source, samplers, constants)
 
-    def draw(self, textures: dict[str, gpu.types.GPUTexture], weight: float, rest: ShownRest, view: ViewCamera, scale):
+    def draw(self, textures: dict, weight: float, rest: ShownRest, view: ViewCamera, scale, whole_share: float):
         """The picture (RGBA texture, valid until the next call with the same `picture`) with the `rest`.
 
         `textures` are by the names of the samplers: `picture` and `of_cycles`, the share of pixels that is Cycles'
         alone, which count times `weight`; positions and colors of the surfaces, and positions of glass before them.
-        The rest counts times `scale` (3,).
+        The rest counts times `scale` (3,). Cycles' whole picture has the share `whole_share` of the result.
         """
         size = size_of(textures["picture"])
         target = SampleSum(size)
@@ -138,9 +147,10 @@ class RestPass:
             "ambient": (*rest.ambient, float(rest.is_everything)),
             "has_moved": not rest.is_of(view),
             "is_parallel": rest.view.is_parallel,
+            "whole_share": whole_share,
         }
         with drawing(target.within(), (0, 0, *size)):
-            self._shader.bind({**textures, "rest": rest.texture}, constants)
+            self._shader.bind({**textures, "rest": rest.texture, "whole": rest.whole or rest.texture}, constants)
             self._shader.draw()
         return target.texture
 

@@ -14,7 +14,7 @@ import gpu
 import numpy as np
 
 from ...scene import PASSES
-from .drawing import GBufferTextures, PixelShader, ViewCamera, VisibilityGrid, float_texture, read_texture
+from .drawing import GBufferTextures, PixelShader, ViewCamera, VisibilityGrid, float_texture, read_texture, size_of
 from .light_texels import UploadedLights, background_texels, sky_texels, upload_lights
 from .lighting import GOLDEN, HorizonPass, LightingPass
 from .mirror import SceneMirror
@@ -32,7 +32,7 @@ from .pictures import (
     same_state,
 )
 from .shadow_rays import ShadowRays
-from .shadows import LiveShadows
+from .shadows import FIRST_POINTS, LiveShadows
 from .surfaces import SurfacePass, has_bent_lobes
 
 
@@ -169,6 +169,7 @@ class ViewRenderer:
         self.shadows: ShadowRays | LiveShadows | None = None
         # Pictures get a rest, and this one as soon as there is one; `_of_cycles`: what is Cycles' alone, a sum.
         self.has_bounces, self.rest = False, None  # bool, ShownRest | None
+        self.shows_whole = False  # Cycles' picture stands for the view's own
         self._rest_pass: RestPass | None = None
         self._of_cycles: list[SampleSum] = []
 
@@ -212,17 +213,45 @@ class ViewRenderer:
         """Draw the picture `number` of those drawn last, as `draw` does; `shown` must have its passes."""
         self._show([number], view, shown, target)
 
+    def _whole_share(self, shown: ShownPicture) -> float:
+        """The share of Cycles' whole picture in what is shown, which gives way with every point under fine shadows.
+
+        Its noise errs less than few points of pixels and coarse shadows.
+        """
+        if not self._has_whole(shown):
+            return 0.0
+        if self.step > 1:
+            return 1.0
+        if size_of(self.rest.whole) != self._size:
+            return 0.0
+        return max(1.0 - self.samples / FIRST_POINTS, 0.0) if self.shadows.is_fine else 1.0
+
+    def _has_whole(self, shown: ShownPicture) -> bool:
+        has_one = self.has_bounces and self.rest is not None and self.rest.whole is not None
+        return has_one and self.shadows is not None and shown.may_be_whole
+
+    def show_whole(self, view: ViewCamera, shown: ShownPicture, target) -> bool:
+        """Show Cycles' whole picture where there is one, after a `draw` that failed; False where there is none."""
+        if self._has_whole(shown):
+            with target.bind():
+                self._picture.draw([self.rest.whole], [1.0], view, self._size, shown, self._background)
+        return self._has_whole(shown)
+
     def _show(self, numbers, view, shown, target) -> None:
+        whole_share = self._whole_share(shown)
+        self.shows_whole = whole_share == 1.0
         pictures, weights = [self._sums[number].texture for number in numbers], [1.0 / self.samples] * len(numbers)
-        if self.has_bounces and self.rest is not None and shown.takes_rest:
-            pictures, weights = [self._with_rest(one, view) for one in pictures], [1.0] * len(pictures)
+        if self.shows_whole:
+            pictures, weights = [self.rest.whole], [1.0]
+        elif self.has_bounces and self.rest is not None and shown.takes_rest:
+            pictures, weights = [self._with_rest(one, view, whole_share) for one in pictures], [1.0] * len(pictures)
         if shown.mode != "single" and shown.second_picture is not None:
             pictures, weights = [*pictures, shown.second_picture], [*weights, 1.0]
         # The sample has bound other buffers, and Blender's own binding is unknown to Python.
         with target.bind():
             self._picture.draw(pictures, weights, view, self._size, shown, self._background)
 
-    def _with_rest(self, picture: gpu.types.GPUTexture, view: ViewCamera) -> gpu.types.GPUTexture:
+    def _with_rest(self, picture: gpu.types.GPUTexture, view: ViewCamera, whole_share: float) -> gpu.types.GPUTexture:
         """The mean of a picture's samples with the rest."""
         if self._rest_pass is None:
             self._rest_pass = RestPass()
@@ -232,7 +261,7 @@ class ViewRenderer:
         scale, light = np.ones(3), self.rest.light
         if light is not None:
             scale = np.divide(self.mean_light(), light, out=scale, where=light > 0.0)
-        return self._rest_pass.draw(textures, 1.0 / self.samples, self.rest, view, scale)
+        return self._rest_pass.draw(textures, 1.0 / self.samples, self.rest, view, scale, whole_share)
 
     def wait(self) -> None:
         """Wait until the card has finished the picture."""

@@ -15,7 +15,7 @@ import threading
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import bpy
@@ -36,7 +36,7 @@ from ..render_settings import render_exr
 from ..saving import save_working_copy
 from .drawing import ViewCamera, float_texture
 from .pictures import ShownRest
-from .second_blender import SecondBlender, spare
+from .second_blender import RestChanges, SecondBlender, spare
 
 # MASK: the AOV with the share of a pixel that is Cycles' alone. SENSOR: the width of the camera's sensor in mm.
 MASK, SENSOR = "ltsh_of_cycles", 36.0
@@ -46,82 +46,17 @@ PASSES = ("combined", "diffuse_direct", "diffuse_color", "glossy_direct", "gloss
 # direction that share one, in the pictures that come one after another; the first is the finest that takes one step.
 # TOTALS: the samples after which a picture is shown; denoised, one of all pixels is nearer than four of a quarter of
 # them. REST_SECONDS: how long a view must stay as it is before.
-STEP_SECONDS, SHRINKS, TOTALS, REST_SECONDS = 0.5, (4, 2, 1), (1, 2, 4, 8, 16, 32, 64), 0.3
+STEP_SECONDS, SHRINKS, TOTALS, REST_SECONDS = 0.7, (4, 2, 1), (1, 2, 4, 8, 16, 32, 64), 0.3
 # FEWEST: samples of single pixels that a step takes at least: the first picture of 1000 x 640 pixels. MOST_CHANGE: how
 # many times as many or as few the next one takes.
 FEWEST, MOST_CHANGE = 160_000, 2.0
-# Of live jobs. PICTURE: a stage; its fraction is the number of a picture, with two files. STOP: a file that ends them.
-PICTURE, LIVE_PICTURE, LIVE_FACTS, STOP = "picture", "live_{}.npy", "live_{}.json", "stop"
+# Of live jobs. PICTURE: a stage; its fraction is the number of a picture, with files. STOP: a file that ends them.
+PICTURE, LIVE_REST, LIVE_WHOLE, LIVE_FACTS, STOP = "picture", "rest_{}.npy", "whole_{}.npy", "live_{}.json", "stop"
+# WHOLE_SAMPLES: so many of Cycles' whole picture, where it is shown at first, come before the view's own. The rest is
+# denoised for the first picture, which is kept after changes, and from then on: that takes a quarter of a sample.
+WHOLE_SAMPLES = 8
 # Settings of a scene that change its light, beside those of Cycles.
 SCENE_SETTINGS = ("use_simplify", "simplify_subdivision", "film_transparent", "hair_type")
-
-
-# REPLACED: data-blocks that are handed over by themselves, and the collections of `bpy.data` that have them.
-# NOT_NOTED: kinds that change nothing themselves; scenes have settings, and node trees come with their users.
-NOT_NOTED = ("Scene", "Camera", "Object")
-REPLACED = {bpy.types.Light: "lights", bpy.types.Material: "materials", bpy.types.World: "worlds"}
-
-
-@dataclass
-class RestChanges:
-    """What has changed in a scene since the second Blender has it."""
-
-    everything: bool = True  # too much to hand it over piece by piece
-    objects: set[str] = field(default_factory=set)  # names of those that were moved
-    blocks: set[tuple[str, str]] = field(default_factory=set)  # names of collections of `bpy.data`, and in these
-
-    def add(self, depsgraph, has_new_settings: bool) -> tuple[bool, bool]:
-        """Add what an update of the depsgraph changes; returns whether it is any light, and anything else."""
-        blocks = [(update, update.id.original) for update in depsgraph.updates]
-        has_material = any(isinstance(block, bpy.types.Material) for _, block in blocks)
-        has_lamp = any(isinstance(block, bpy.types.Light) for _, block in blocks)
-        has_light, has_other = False, has_new_settings
-        for update, block in blocks:
-            kind = next((name for one, name in REPLACED.items() if isinstance(block, one)), "")
-            if kind:
-                self.blocks.add((kind, block.name))
-                self.everything |= block.library is not None or _refers_to_objects(block)
-                has_light, has_other = has_light or kind != "materials", has_other or kind == "materials"
-            elif isinstance(block, bpy.types.Object) and block.type != "CAMERA":
-                is_light = block.type == "LIGHT"
-                has_light, has_other = has_light or is_light, has_other or not is_light
-                if update.is_updated_transform:
-                    self.objects.add(block.name)
-                # The geometry of lights is that of their data-blocks, and materials come with their users.
-                has_shape = update.is_updated_geometry and not is_light
-                is_known = update.is_updated_transform or (has_lamp if is_light else has_material)
-                self.everything |= has_shape or not is_known
-            elif block.bl_rna.identifier in NOT_NOTED or isinstance(block, bpy.types.NodeTree):
-                pass
-            elif not isinstance(block, bpy.types.Mesh) or update.is_updated_geometry:
-                has_other = self.everything = True
-        self.everything |= has_new_settings
-        return has_light, has_other
-
-    def written(self, scene, path: Path) -> dict:
-        """The record of the changes for the second Blender; data-blocks go to the .blend `path`."""
-        blocks = {getattr(bpy.data, kind)[name, None] for kind, name in self.blocks}
-        if blocks:
-            bpy.data.libraries.write(str(path), blocks, path_remap="ABSOLUTE", fake_user=True)
-        objects = {name: scene.objects[name] for name in sorted(self.objects)}
-        moved = {
-            name: [[*map(tuple, one)] for one in (ob.matrix_basis, ob.matrix_world)] for name, ob in objects.items()
-        }
-        return {"file": str(path), "blocks": sorted(self.blocks), "moved": moved}
-
-
-def _refers_to_objects(block) -> bool:
-    """True if nodes of the data-block, or of its groups, take coordinates or more from objects."""
-    trees, names = [block.node_tree], set()
-    while trees:
-        tree = trees.pop()
-        if tree is None or tree.name_full in names:
-            continue
-        names.add(tree.name_full)
-        if any(getattr(node, "object", None) is not None for node in tree.nodes):
-            return True
-        trees += [node.node_tree for node in tree.nodes if getattr(node, "node_tree", None) is not None]
-    return False
 
 
 def next_job(before: RestJob | None, view: RestView, share: float) -> RestJob:
@@ -168,14 +103,22 @@ class _RestRun:
         if stage == PICTURE:
             number = round(fraction)
             facts = json.loads((self.folder / LIVE_FACTS.format(number)).read_text(encoding="utf-8"))
-            path = self.folder / LIVE_PICTURE.format(number)
-            pixels = np.load(path)
-            path.unlink()
-            self.picture = _RestPicture(self.job.view, pixels, **facts)
+            rest, whole = (_taken(self.folder / name.format(number)) for name in (LIVE_REST, LIVE_WHOLE))
+            rest = self.picture.rest if rest is None else rest
+            self.picture = _RestPicture(self.job.view, rest, whole, **facts)
 
     def stop(self) -> None:
         """Let it end after its step."""
         (self.folder / STOP).touch()
+
+
+def _taken(path: Path) -> np.ndarray | None:
+    """The array in a file, which is removed; None: there is no file."""
+    if not path.exists():
+        return None
+    values = np.load(path)
+    path.unlink()
+    return values
 
 
 @dataclass
@@ -183,7 +126,8 @@ class _RestPicture:
     """A denoised picture of the second Blender's."""
 
     view: RestView
-    pixels: np.ndarray  # (H, W, 4), row 0 on top
+    rest: np.ndarray  # (H, W, 4), row 0 on top, as of `RestSum.picture`
+    whole: np.ndarray | None  # (H, W, 3), Cycles' whole picture
     is_everything: bool
     ambient: list[float]
     problem: str
@@ -197,7 +141,10 @@ class _RestPicture:
         """The picture on the graphics card; needs an active GPU context."""
         if self.shown is None:
             camera = ViewCamera.of(*map(Matrix, self.view.matrices), self.view.matrices[1][3][3] == 1.0)
-            self.shown = ShownRest(float_texture(self.pixels[::-1]), camera, self.is_everything, tuple(self.ambient))
+            self.shown = ShownRest(float_texture(self.rest[::-1]), camera, self.is_everything, tuple(self.ambient))
+            if self.whole is not None:
+                whole = np.pad(self.whole[::-1], ((0, 0), (0, 0), (0, 1)), constant_values=1.0)
+                self.shown = replace(self.shown, whole=float_texture(whole))
         return self.shown
 
 
@@ -213,6 +160,7 @@ class LiveRest:
         self._changes = RestChanges()  # since then
         self._picture: _RestPicture | None = None  # the last one
         self._version, self._surfaces, self._settings = 0, 0, None  # of the scene; of all in it but lights
+        self._has_whole = False  # Cycles' whole picture is wanted, too
         self.problem = ""  # why there is no picture
 
     def note(self, depsgraph) -> None:
@@ -225,8 +173,12 @@ class LiveRest:
             self._version, self._settings, self.problem = self._version + 1, settings, ""
             self._surfaces += has_other
 
-    def follow(self, context, depsgraph, world: bool = True) -> None:
-        """Want the rest of the region of `context`, with the light of the `world` or without."""
+    def follow(self, context, depsgraph, world: bool = True, has_whole: bool = False) -> None:
+        """Want the rest of the region of `context`, with the light of the `world` or without.
+
+        With `has_whole` also Cycles' whole picture.
+        """
+        self._has_whole = has_whole
         region, view, space = context.region, context.region_data, context.space_data
         hidden = ()
         if space.local_view is not None:
@@ -250,10 +202,12 @@ class LiveRest:
 
     def shown(self) -> ShownRest | None:
         """The last picture; needs an active GPU context. After changes of lights alone it follows the direct light."""
-        picture, shown = self._picture, None if self._picture is None else self._picture.upload()
-        if shown is None or picture.light is None or self._wanted.version == picture.view.version:
-            return shown
-        return replace(shown, light=picture.light[1]) if picture.light[0] == self._light_key else shown
+        picture = self._picture
+        if picture is None or picture.view == self._wanted:
+            return None if picture is None else picture.upload()
+        has_same_surfaces = picture.light is not None and picture.light[0] == self._light_key
+        follows = has_same_surfaces and self._wanted.version != picture.view.version
+        return replace(picture.upload(), whole=None, light=picture.light[1] if follows else None)
 
     @property
     def _light_key(self) -> tuple:
@@ -278,10 +232,9 @@ class LiveRest:
         is_short = self._wanted is not None and self._samples < TOTALS[-1]
         return self._run is not None or (is_short and not self.problem)
 
-    @property
-    def is_urgent(self) -> bool:
-        """True while the first picture of this view in full resolution is to come."""
-        return self.is_busy and self._samples < TOTALS[0]
+    def lacks(self, samples: int) -> bool:
+        """True while a picture of this view with so many samples of all pixels is to come."""
+        return self.is_busy and self._samples < samples
 
     @property
     def is_new(self) -> bool:
@@ -351,7 +304,7 @@ class LiveRest:
         self._changes = RestChanges(everything=False)
         work = FEWEST if self._picture is None else self._picture.work
         (blender.folder / STOP).unlink(missing_ok=True)
-        run = self._run = _RestRun(LiveRestJob(path, wanted, changes, work), blender.folder)
+        run = self._run = _RestRun(LiveRestJob(path, wanted, changes, work, self._has_whole), blender.folder)
         arguments = {"target": run.do, "args": (blender.process,), "name": "LTSH rest"}
         run.thread = blender.step = threading.Thread(**arguments, daemon=True)
         blender.step.start()
@@ -393,13 +346,13 @@ _sum: list[RestSum] = []
 def render_rest(job: RestJob, folder: Path, progress) -> dict:
     """Do the `job`; returns the manifest, see `process.view.render_rest`."""
     render_step(job, folder, progress)
-    return _write_picture(folder / REST_PICTURE)
+    save_array(folder / REST_PICTURE, _sum[0].picture())
+    return _facts()
 
 
-def _write_picture(path: Path) -> dict:
-    """Write the picture of the sum; returns what there is to say of it."""
+def _facts() -> dict:
+    """What there is to say of the sum."""
     total = _sum[0]
-    save_array(path, total.picture())
     return {"is_everything": total.is_everything, "ambient": total.ambient, "problem": total.problem}
 
 
@@ -449,8 +402,8 @@ def render_step(job: RestJob, folder: Path, progress) -> float:
     render_exr(scene, folder / REST_RENDER, "NONE")
     seconds = time.monotonic() - started
     if not job.continues:
-        sizes = (height, width, 3), (height, width, 6), (height, width)
-        _sum[:] = [RestSum(*(np.zeros(size, np.float32) for size in sizes), is_everything=_is_everything(scene, layer))]
+        arrays = [np.zeros((height, width, count), np.float32) for count in (3, 3, 6, 1)]
+        _sum[:] = [RestSum(*arrays[:3], arrays[3][..., 0], is_everything=_is_everything(scene, layer))]
     _sum[0].add(folder / REST_RENDER, first, job, {**render_settings.pass_names(), "mask": MASK})
     return seconds
 
@@ -468,8 +421,11 @@ def render_live_rest(job: LiveRestJob, folder: Path, progress) -> dict:
             work = max(wanted, FEWEST if seconds > STEP_SECONDS else work)
         before, more = step, {"scene": None, "changes": None}
         if makes_picture(step) and not (folder / STOP).exists():
-            facts = _write_picture(folder / LIVE_PICTURE.format(number))
-            facts |= {"total": step.total if step.shrink == 1 else 0, "seconds": seconds / done, "work": work}
+            if number == 0 or step.total >= WHOLE_SAMPLES or not job.has_whole:
+                save_array(folder / LIVE_REST.format(number), _sum[0].picture())
+            if job.has_whole:
+                save_array(folder / LIVE_WHOLE.format(number), _sum[0].whole_picture())
+            facts = _facts() | {"total": step.total if step.shrink == 1 else 0, "seconds": seconds / done, "work": work}
             (folder / LIVE_FACTS.format(number)).write_text(json.dumps(facts), encoding="utf-8")
             progress(PICTURE, float(number))
             number += 1

@@ -316,6 +316,11 @@ class LiveShadows:
         return any(one._thread is not None for one in self._both)
 
     @property
+    def is_fine(self) -> bool:
+        """True if the last level is there, or never comes."""
+        return all(one._next_level() is None for one in self._both)
+
+    @property
     def has_news(self) -> bool:
         """True if a thread has results or has ended."""
         return any(one._thread is not None and (one._outcomes or not one._thread.is_alive()) for one in self._both)

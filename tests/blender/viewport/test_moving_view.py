@@ -86,17 +86,21 @@ def test_pictures_of_what_moves_have_as_many_pixels_as_the_time_allows(monkeypat
 
 
 @pytest.mark.parametrize(
-    ("news", "step", "seconds", "is_urgent", "passed", "is_due"),
+    ("news", "step", "seconds", "samples", "is_whole", "passed", "is_due"),
     [
-        (True, 1, 1.0, True, 1.0, False),
-        (True, 1, 1.0, True, redraws.BOUNCES_SECONDS, True),
-        (True, 4, 1.0, True, 1.0, True),  # few pixels take no time
-        (True, 1, 0.01, True, 1.0, True),  # nor do all of a quick machine
-        (True, 1, 1.0, False, 1.0, True),
-        (False, 1, 1.0, False, 9.0, False),
+        (True, 1, 1.0, 0, False, 1.0, False),
+        (True, 1, 1.0, 0, False, redraws.BOUNCES_SECONDS, True),
+        (True, 4, 1.0, 0, False, 1.0, True),  # few pixels take no time
+        (True, 1, 0.01, 0, False, 1.0, True),  # nor do all of a quick machine
+        (True, 1, 1.0, 1, False, 1.0, True),
+        (False, 1, 1.0, 1, False, 9.0, False),
+        (True, 1, 1.0, 1, True, 1.0, False),  # samples improve what is shown, and shadows do not
+        (True, 1, 1.0, view.WHOLE_SAMPLES, True, 1.0, True),
     ],
 )
-def test_new_shadows_of_slow_pictures_wait_for_bounces(monkeypatch, news, step, seconds, is_urgent, passed, is_due):
+def test_new_shadows_of_slow_pictures_wait_for_bounces(
+    monkeypatch, news, step, seconds, samples, is_whole, passed, is_due
+):
     now = 100.0
     monkeypatch.setattr(redraws.time, "monotonic", lambda: now)
     monkeypatch.setattr(redraws, "moments", {"drawn": now - passed})
@@ -104,9 +108,13 @@ def test_new_shadows_of_slow_pictures_wait_for_bounces(monkeypatch, news, step, 
     size.note(seconds)
     size.step, size._changed = step, now - passed
     parts_of_view = SimpleNamespace(
-        _pixel_size=size, _shadows=SimpleNamespace(has_news=news), rest=SimpleNamespace(is_urgent=is_urgent)
+        _pixel_size=size,
+        _shadows=SimpleNamespace(has_news=news),
+        _renderer=SimpleNamespace(shows_whole=is_whole),
+        rest=SimpleNamespace(lacks=lambda count: samples < count),
     )
-    parts_of_view._held_until = view.EngineView._held_until.fget(parts_of_view)
+    for name in ("_has_better_to_come", "_held_until"):
+        setattr(parts_of_view, name, getattr(view.EngineView, name).fget(parts_of_view))
     assert view.EngineView.has_new_shadows.fget(parts_of_view) is is_due
 
 

@@ -2,8 +2,9 @@
 changes."""
 
 import json
+import math
 import time
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from itertools import pairwise
 from types import SimpleNamespace
 
@@ -16,11 +17,15 @@ from graphics_card import edits_with_graphics, with_graphics
 from view_pictures import OpenView
 
 from ltsh_addon.blender.process.view import RestJob, RestView, marked_depth
+from ltsh_addon.blender.render_settings import render_exr
 from ltsh_addon.blender.viewport import rest
 from ltsh_addon.blender.viewport.drawing import float_texture, read_texture
 from ltsh_addon.blender.viewport.pictures import ShownPicture, ShownRest
+from ltsh_addon.blender.viewport.shadow_rays import ShadowRays, ViewTracer, view_occluders
+from ltsh_addon.blender.viewport.shadows import FIRST_POINTS
 from ltsh_addon.cycles.lobes import read_layer
 from ltsh_addon.imaging.exr import read_channels
+from ltsh_addon.scene import DEFAULT_TECHNIQUE
 
 SIZE = (48, 32)
 # Cycles' steps between float32 sums of other seeds' order, and rounding of matrices that were set.
@@ -115,11 +120,19 @@ def followed(live, context, monkeypatch, world=True):
     end = time.monotonic() + 120.0
     while live.is_busy and time.monotonic() < end:
         if live.step() and live.has_news:
-            pixels = live._picture.pixels
+            pixels = live._picture.rest
         time.sleep(0.02)
     monkeypatch.setattr(rest.LiveRest, "_begin", begin)
     assert not live.problem and not live.is_busy
     return pixels, jobs
+
+
+def picture_of_cycles(folder):
+    """Cycles' own picture (H, W, 3) of the open scene, with 64 samples."""
+    scene = bpy.context.scene
+    scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", 64, False
+    render_exr(scene, folder / "own.exr", "NONE")
+    return read_layer(read_channels(folder / "own.exr"), "Combined", "RGB")
 
 
 def context_of(camera):
@@ -185,21 +198,35 @@ def test_changes_are_handed_over_by_themselves_and_show_what_a_whole_file_shows(
 
 
 @pytest.mark.newest
-def test_the_second_blender_goes_on_while_the_window_draws(monkeypatch):
-    """One look at it brings the last picture; what is not wanted any more ends after its step."""
+def test_the_second_blender_goes_on_while_the_window_draws(monkeypatch, tmp_path):
+    """One look at it brings the last picture, with the whole one of Cycles; what is not wanted any more ends after its
+    step."""
     monkeypatch.setattr(rest, "REST_SECONDS", 0.0)
     camera = room()
     context, live = context_of(camera), rest.LiveRest()
     scene = SimpleNamespace(scene=bpy.context.scene, view_layer=bpy.context.view_layer)
     live.note(bpy.context.view_layer.depsgraph)
     try:
-        live.follow(context, scene)
+        live.follow(context, scene, has_whole=True)
         live.step()
         live._run.thread.join(120.0)
         assert live.step() and live._samples == rest.TOTALS[-1] and not live.is_busy
+        path, last = live._blender.folder, round(math.log2(rest.TOTALS[-1]))
+        files = [(path / name.format(last)).exists() for name in (rest.LIVE_REST, rest.LIVE_WHOLE)]
+        assert files == [False, False], "files of pictures that were read are removed"
+        # 48 x 32 pixels after 64 samples, denoised: the noise in the mean is below 1 %.
+        picture = live._picture
+        own, whole, part = (
+            one[..., :3].mean(axis=(0, 1)) for one in (picture_of_cycles(tmp_path), picture.whole, picture.rest)
+        )
+        np.testing.assert_allclose(whole, own, rtol=0.03)
+        assert np.all(whole > 1.1 * part)
+        live._picture.shown = ShownRest(None, None, whole="whole")
+        assert live.shown().whole == "whole"
         camera.location.x += 0.1
         bpy.context.view_layer.update()
         live.follow(context_of(camera), scene)
+        assert live.shown().whole is None, "the whole picture is of no other view"
         live.step()
         run = live._run
         live.pause()
@@ -260,6 +287,49 @@ def test_samples_of_several_steps_are_those_of_one(tmp_path):
             rest.render_step(job, tmp_path, lambda *stage: None)
         sums.append(rest._sum[0])
     assert (np.abs(sums[1].light - sums[0].light).max(axis=-1) < 1e-4).mean() > 0.9
+
+
+@edits_with_graphics
+def test_cycles_whole_picture_gives_way_to_points_under_fine_shadows():
+    """It stands for few pixels, for coarse shadows and for drawings that fail; never for a technique that is chosen."""
+    camera, whole, default = room(), np.full((*SIZE[::-1], 4), (0.5, 0.25, 0.125, 1.0)), DEFAULT_TECHNIQUE
+    points = np.zeros((2 * FIRST_POINTS, 2))
+    occluders = view_occluders(bpy.context.evaluated_depsgraph_get(), lambda text: None)
+
+    def pictures():
+        with OpenView(camera, SIZE) as opened:
+            renderer = opened.renderer
+            renderer.shadows, renderer.has_bounces = ShadowRays(ViewTracer(occluders), 8), True
+            black = float_texture(np.zeros_like(whole))
+            shown = ShownRest(black, opened.view)
+            renderer.rest, renderer.shadows.is_fine, found = shown, True, {}
+            found["own"] = opened.draw(ShownPicture(default, "combined"))
+            renderer.rest = replace(shown, whole=float_texture(whole))
+            found["one point"] = opened.draw(ShownPicture(default, "combined"))
+            found["other"] = opened.draw(ShownPicture("ltsh4", "combined"))
+            renderer.shadows.is_fine = False
+            found["coarse"] = opened.draw(ShownPicture(default, "combined"), points)
+            while renderer.samples < FIRST_POINTS:
+                found["coarse, points"] = opened.draw(ShownPicture(default, "combined"), points)
+            renderer.shadows.is_fine = True
+            found["fine"] = opened.draw(ShownPicture(default, "combined"), points[:FIRST_POINTS])
+            renderer.step = 4
+            found["few pixels"] = opened.draw(ShownPicture(default, "combined"))
+            with opened.canvas.buffer.bind():
+                opened.canvas.buffer.clear(color=(0.0, 0.0, 0.0, 0.0))
+            assert renderer.show_whole(opened.view, ShownPicture(default, "combined"), opened.canvas.buffer)
+            found["failed"] = opened.canvas.read()
+            renderer.rest = shown
+            assert not renderer.show_whole(opened.view, ShownPicture(default, "combined"), opened.canvas.buffer)
+            return {name: picture[..., :3] for name, picture in found.items()}
+
+    found, whole = with_graphics(pictures), whole[..., :3]
+    share = 1.0 / FIRST_POINTS
+    np.testing.assert_allclose(found["one point"], (1.0 - share) * whole + share * found["own"], atol=1e-5)
+    np.testing.assert_allclose(found["fine"], found["own"], atol=1e-4)
+    assert np.abs(found["other"] - whole).mean() > 0.05
+    for name in ("coarse", "coarse, points", "few pixels", "failed"):
+        np.testing.assert_allclose(found[name], whole, atol=1e-6, err_msg=name)
 
 
 @edits_with_graphics
@@ -331,7 +401,7 @@ def test_light_of_few_pixels_stays_on_its_surface():
 
 @pytest.mark.newest
 def test_the_depth_of_a_mirror_is_its_own(tmp_path):
-    """Not that of what it shows, after further samples too: a moved view finds its light by the place of its surface."""
+    """Not that of what it shows, after all samples: a moved view finds its light by the place of its surface."""
     parts.empty_scene(*SIZE)
     mirror = parts.principled("mirror", Metallic=1.0, Roughness=0.0)[0]
     parts.add_plane(mirror, size=40.0)

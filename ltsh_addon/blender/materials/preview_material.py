@@ -9,7 +9,7 @@ from ...cycles.lobes import BRUSHED_KINDS, SMALLEST_WEIGHT, aspect_of
 from ..render_settings import cycles_setting
 from . import graph
 from .bsdfs import REFRACTION_NODE, Bsdf, bsdf_of, emission_sockets, has_alpha, is_emission
-from .values import ImageUse, Value, constant, constant_inputs, input_value, is_gray, value_at
+from .values import GRAY, ImageUse, Value, colors_at, constant, constant_inputs, input_value, is_gray, value_at
 
 # Quantities that may come from an image; all others are constants.
 IMAGE_SLOTS = ("color", "roughness", "metallic", "ior", "normal", "weight")
@@ -87,8 +87,10 @@ class PreviewMaterial:
     # Sheen over the lobe and its coat: its largest weight over the colors, and its roughness.
     sheen: tuple[float, float] | None = None
     emission: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    emission_image: Value | None = None  # what shines beside reflecting, by an image; it is added to `emission`
     glow: float = 0.0  # strength of a material that only emits, by the image of its color
     notes: tuple[str, ...] = ()
+    light_notes: tuple[str, ...] = ()  # those of `notes` about the light that it casts
     further: "tuple[PreviewMaterial, ...]" = ()  # lobes that are added to this one
     is_clear: bool = False  # nothing is drawn
     is_stand_in: bool = False  # it stands for a node that is not shaded
@@ -112,12 +114,12 @@ class PreviewMaterial:
     @property
     def is_of_cycles(self) -> bool:
         """True if a view with bounces shows it whole as Cycles does: what shines, glass, and what is not resolved."""
-        shines = self.glow > 0.0 or bool(np.any(self.emission))
+        shines = self.glow > 0.0 or bool(np.any(self.emission)) or self.emission_image is not None
         return not self.is_clear and (shines or bool(self.notes) or any(lobe.through > 0.0 for lobe in self.lobes))
 
     def notes_in_view(self, with_bounces: bool) -> tuple[str, ...]:
-        """What views do not show of it as Cycles does. With bounces that is the light of what shines alone."""
-        return self.notes if self.glow > 0.0 or not with_bounces else ()
+        """What views do not show of it as Cycles does. With bounces that is the light that it casts alone."""
+        return self.light_notes if with_bounces else self.notes
 
     @property
     def is_mirror(self) -> bool:
@@ -258,7 +260,7 @@ class _PreviewReader:
     """Makes the preview of a material from its leaves."""
 
     def __init__(self, material, shaders: graph.SurfaceShaders):
-        self.material, self.notes = material, []
+        self.material, self.notes, self.light_notes, self.emission_image = material, [], [], None
         pairs = [(leaf, share) for leaf in shaders.leaves if not leaf.is_transparent for share in self._shares(leaf)]
         guesses, self.notes = self.notes, []
         self.emitters = [(leaf.source, share) for leaf, share in pairs if is_emission(leaf.node)]
@@ -272,6 +274,11 @@ class _PreviewReader:
                 size = "that varies" if alpha is None else f"of {float(alpha[0][0]):.2g}"
                 self.note(f"alpha {size} is not shown, the surface is opaque")
         self.notes += guesses
+
+    def note_light(self, message: str) -> None:
+        """Take a note about the light that it casts."""
+        self.note(message)
+        self.light_notes.append(self.notes[-1])
 
     def note(self, message: str) -> None:
         """Note a difference between the material and what the viewport shows."""
@@ -309,17 +316,18 @@ class _PreviewReader:
             return glow
         emission = np.zeros(3)
         for source, share in self.emitters:
-            emission = emission + self._shining(share, self._emission(source))
+            emission = emission + self._shining(share, self._emission(source, share))
         lobes: list[PreviewMaterial] = []
         for source, share in sorted(self.leaves, key=lambda pair: -pair[1].estimate):
-            emission = emission + self._shining(share, self._emission(source))
+            emission = emission + self._shining(share, self._emission(source, share))
             lobes += self._lobes_of(source, share)
         if not lobes:
             lobes = [plain_preview(0.0)]
         if len(lobes) > MOST_LOBES:
             self.note(f"of its {len(lobes)} lobes only {MOST_LOBES} are shown")
         first, *further = lobes[:MOST_LOBES]
-        return replace(first, emission=emission, notes=tuple(dict.fromkeys(self.notes)), further=tuple(further))
+        shining = {"emission": emission, "emission_image": self.emission_image}
+        return replace(first, **shining, further=tuple(further), **self._all_notes())
 
     def _glow(self) -> PreviewMaterial | None:
         """The preview of a material that only emits an image, like a baked texture; None for other materials."""
@@ -331,15 +339,16 @@ class _PreviewReader:
             return None
         if share.image is not None or share.curve is not None:
             return None
-        self.note("its emission varies: it lights as the mean of its image, with over 64 triangles not at all")
+        self.note_light("its emission varies: it lights as the mean of its image, with over 64 triangles not at all")
         glow = share.shining * float(strength.offset[0])
-        return PreviewMaterial(
-            "diffuse", {"color": color}, weight=0.0, glow=glow, notes=tuple(dict.fromkeys(self.notes))
-        )
+        return PreviewMaterial("diffuse", {"color": color}, weight=0.0, glow=glow, **self._all_notes())
+
+    def _all_notes(self) -> dict[str, tuple[str, ...]]:
+        return {name: tuple(dict.fromkeys(getattr(self, name))) for name in ("notes", "light_notes")}
 
     def _shining(self, share: LobeWeight, emission: np.ndarray) -> np.ndarray:
         if emission.any() and (share.image is not None or share.curve is not None):
-            self.note("its emission varies: half of it is shown")
+            self.note_light("its emission varies: half of it is shown")
         return share.shining * emission
 
     def _lobes_of(self, source: graph.Source, share: LobeWeight) -> list[PreviewMaterial]:
@@ -466,17 +475,31 @@ class _PreviewReader:
             return None, 1.0
         return color, float(strength[0][0])
 
-    def _emission(self, source: graph.Source) -> np.ndarray:
-        values = [value_at(socket, source.groups) for socket in emission_sockets(source.node)]
+    def _emission(self, source: graph.Source, share: LobeWeight) -> np.ndarray:
+        """The emission (3,) of a node, of one that varies about the mean; that of an image is `emission_image`."""
+        sockets = emission_sockets(source.node)
+        values = [value_at(socket, source.groups) for socket in sockets]
         known = [value.offset for value in values if value is not None and value.is_constant]
         whole = np.prod(known, axis=0) * np.ones(3) if known else np.zeros(3)
         if len(known) == len(values) or (known and not whole.any()):
             return whole
-        if values[1] is None or not values[1].is_constant:
-            self.note("the strength of its emission varies: it is not shown and lights nothing")
+        color, strength = (colors_at(socket, source.groups) for socket in sockets)
+        is_plain = self.emission_image is None and share.image is None and share.curve is None
+        if is_plain and color is None and values[0] is not None and values[1] is not None:
+            self.note("the image of its emission is shown as its mean")
+            self.emission_image = values[0].mapped(share.shining * whole * np.eye(3))
             return np.zeros(3)
-        self.note("the color of its emission varies: half of its strength is shown, at most as much off")
-        return 0.5 * whole
+        if strength is None:
+            self.note_light("the strength of its emission varies: it is not shown and lights nothing")
+            return np.zeros(3)
+        if color is None:
+            self.note_light("the color of its emission varies: half of its strength is shown, at most as much off")
+            return 0.5 * strength.mean(axis=0)
+        product = (color[:, None] * (strength @ GRAY)[:, None]).reshape(-1, 3)
+        mean = product.mean(axis=0)
+        off = 100.0 * np.abs(product - mean).sum(axis=-1).mean() / max(mean.sum(), 1e-30)
+        self.note_light(f"its emission varies: it shines as about the mean of its colors, {off:.0f} % off them")
+        return mean
 
 
 def _direction_of(node) -> tuple[str | None, str]:

@@ -475,6 +475,50 @@ READERS: dict[str, Callable[[Source], Value | Curved | None]] = {
     "ShaderNodeClamp": _clamp,
 }
 
+# EVENLY: what a number between 0 and 1 may be of which nothing else is known, each as often.
+EVENLY = np.linspace(0.0, 1.0, 17)
+# TWO_COLORS: nodes of patterns with two colors. OF_FILES: textures that are not patterns.
+TWO_COLORS = ("ShaderNodeTexChecker", "ShaderNodeTexBrick")
+OF_FILES = ("ShaderNodeTexImage", "ShaderNodeTexEnvironment", "ShaderNodeTexSky", "ShaderNodeTexIES")
+
+
+def colors_at(socket, groups: tuple = ()) -> np.ndarray | None:
+    """Colors (K, 3) that a socket may have, about each as often as the others, from what its nodes mix; None: unknown.
+
+    Patterns are taken to have all numbers from 0 to 1 equally often, and two colors half of their area each.
+    """
+    value, source = value_at(socket, groups), source_of(socket, groups)
+    if value is not None and value.is_constant:
+        return value.offset[None]
+    if source is None or source.node is None:
+        return None
+    node = source.node
+    if node.bl_idname == "ShaderNodeValToRGB":
+        factors = colors_at(node.inputs[0], source.groups)
+        positions = EVENLY if factors is None else factors @ GRAY
+        return np.array([node.color_ramp.evaluate(float(position))[:3] for position in positions], np.float64)
+    if node.bl_idname in TWO_COLORS:
+        both = [colors_at(node.inputs[name], source.groups) for name in ("Color1", "Color2")]
+        return None if any(one is None for one in both) else _mixed(*both, np.array([0.0, 1.0]))
+    is_mix = node.bl_idname == "ShaderNodeMixRGB" or (node.bl_idname == "ShaderNodeMix" and node.data_type == "RGBA")
+    if is_mix and node.blend_type == "MIX":
+        first = 1 if node.bl_idname == "ShaderNodeMixRGB" else 6
+        both = [colors_at(node.inputs[number], source.groups) for number in (first, first + 1)]
+        factors = colors_at(node.inputs[0], source.groups)
+        factors = EVENLY if factors is None else np.clip(factors @ GRAY, 0.0, 1.0)
+        return None if any(one is None for one in both) else _mixed(*both, factors)
+    is_pattern = node.bl_idname.startswith("ShaderNodeTex") and hasattr(node, "texture_mapping")
+    return np.outer(EVENLY, np.ones(3)) if is_pattern and node.bl_idname not in OF_FILES else None
+
+
+def _mixed(first: np.ndarray, second: np.ndarray, factors: np.ndarray) -> np.ndarray:
+    """Mixes of any color of the `first` (K, 3) and any of the `second` (L, 3); of many only the means are mixed."""
+    if len(first) * len(second) > len(EVENLY):
+        first, second = (one.mean(axis=0, keepdims=True) for one in (first, second))
+    share = factors[:, None, None, None]
+    return ((1.0 - share) * first[:, None] + share * second).reshape(-1, 3)
+
+
 # Color space of the image -> whether its values are sRGB. Only Cycles can decode other spaces, and floats in sRGB.
 BYTE_SPACES = {"sRGB": True, "Non-Color": False, "Linear Rec.709": False}
 FLOAT_SPACES = {"Non-Color": False, "Linear Rec.709": False}

@@ -80,8 +80,8 @@ def view_lights(
         if not instance.show_self or not in_view(instance):
             continue
         if ob.type in SURFACE_TYPES and not emits:
-            few = textures if len(getattr(ob.data, "polygons", ())) <= MOST_TRIANGLES else None
-            emits = any(np.any(_emission(slot.material, few, [])) for slot in ob.material_slots)
+            is_small = len(getattr(ob.data, "polygons", ())) <= MOST_TRIANGLES
+            emits = any(np.any(_emission(slot.material, textures, is_small, [])) for slot in ob.material_slots)
         if ob.type != "LIGHT":
             continue
         matrix = np.array(instance.matrix_world, dtype=np.float64)
@@ -121,16 +121,30 @@ def strongest(lights: Sequence[Light], notes: list[str], most: int = MOST_LIGHTS
     return [lights[index] for index in chosen]
 
 
-def _emission(material, textures: ShownTextures | None, notes: list[str]) -> np.ndarray:
-    """The mean emission (3,) of a material; without `textures` that of an image counts as 0."""
-    look = None if material is None else preview_of(material.original)
-    if look is None or not look.glow or textures is None:
-        return np.zeros(3) if look is None else look.emission
-    mean, spread = textures.mean(look.value("color"))
-    if spread > ERROR:
+def _preview(material, textures: ShownTextures) -> PreviewMaterial:
+    """The preview of a material, whose `emission` has the mean of its image."""
+    look = preview_of(None if material is None else material.original)
+    if look.emission_image is None:
+        return look
+    emission = look.emission + textures.mean(look.emission_image)[0]
+    return replace(look, emission=emission)
+
+
+def _emission(material, textures: ShownTextures, is_small: bool, notes: list[str]) -> np.ndarray:
+    """The mean emission (3,) of a material; that of an image that only shines is 0 on a mesh that is not small."""
+    if material is None:
+        return np.zeros(3)
+    look = _preview(material, textures)
+    image = look.value("color") if look.glow and is_small else look.emission_image
+    if image is None:
+        return look.emission
+    mean, spread = textures.mean(image)
+    if not mean.any():
+        notes.append(f"{material.name}: only Cycles can read the image that shines, it lights nothing")
+    elif spread > ERROR:
         off = f"which is {100.0 * spread:.0f} % off its colors"
         notes.append(f"{material.name}: it lights as the mean of its image, {off}")
-    return look.glow * mean
+    return look.glow * mean if look.glow else look.emission
 
 
 def _mesh_lights(depsgraph, receivers: Receivers, textures: ShownTextures, notes: list[str]) -> list[Light]:
@@ -141,8 +155,8 @@ def _mesh_lights(depsgraph, receivers: Receivers, textures: ShownTextures, notes
     lights = []
     for mesh_light in mesh_lights:
         count = sum(len(placement.triangles) for placement in mesh_light.placements)
-        few = textures if count <= MOST_TRIANGLES else None
-        radiance_of = functools.partial(_emission, textures=few, notes=notes)
+        given = {"textures": textures, "is_small": count <= MOST_TRIANGLES, "notes": notes}
+        radiance_of = functools.partial(_emission, **given)
         lights += constant_mesh_lights([mesh_light], radiance_of, eye, notes.append)
     return lights
 
@@ -434,6 +448,7 @@ class SceneMirror:
             self._looks.pop(name, None)
         if changes.images:
             self._light_textures.clear()
+            self._looks = {name: one for name, one in self._looks.items() if one.look.emission_image is None}
             for shown in (lobe for look in self._looks.values() for lobe in look.lobes):
                 shown.textures = None
 
@@ -461,7 +476,7 @@ class SceneMirror:
             for material in materials:
                 name = _name(material)
                 if name not in looks:
-                    looks[name] = self._looks.get(name) or _shown_look(material)
+                    looks[name] = self._looks.get(name) or _shown_look(material, self._light_textures)
             shown = tuple(looks[_name(material)] for material in materials)
             for lobe in (lobe.look for look in shown for lobe in look.lobes):
                 if lobe.has_uv_tangent:
@@ -503,8 +518,8 @@ class SceneMirror:
         self._limit_notes += map(half_hidden, halves.values())
 
 
-def _shown_look(material) -> ShownLook:
-    look = preview_of(None if material is None else material.original)
+def _shown_look(material, textures: ShownTextures) -> ShownLook:
+    look = _preview(material, textures)
     further = tuple(ShownLook(lobe, uniform_buffer(look_values(lobe))) for lobe in look.further)
     return ShownLook(look, uniform_buffer(look_values(look)), further=further)
 

@@ -458,7 +458,7 @@ def missing_image():
 @pytest.mark.parametrize(
     ("node", "color", "note"),
     [("ShaderNodeTexImage", (1.0, 0.0, 1.0), "mean of its image"), ("ShaderNodeVertexColor", (0.5,) * 3, "half of"),
-     ("ShaderNodeTexNoise", (0.5,) * 3, "at most as much off")],
+     ("ShaderNodeTexNoise", (0.5,) * 3, "about the mean of its colors")],
 )  # fmt: skip
 def test_glowing_faces_of_colors_that_views_cannot_read_shine(node, color, note):
     """Missing images are pink in Cycles; other colors from 0 to 1 are taken as half, and named."""

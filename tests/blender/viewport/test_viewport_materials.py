@@ -30,6 +30,7 @@ from ltsh_addon.blender.ui import panels, preflight
 from ltsh_addon.blender.viewport.light_texels import constant_sky
 from ltsh_addon.blender.viewport.mirror import SceneMirror, ShownLook
 from ltsh_addon.blender.viewport.pictures import ShownPicture
+from ltsh_addon.cycles.lobes import read_layer
 
 RED, GOLD, AMBER = (0.6, 0.25, 0.1, 1.0), (0.9, 0.7, 0.3, 1.0), (0.9, 0.6, 0.3, 1.0)
 TINT = (0.2, 0.4, 0.6, 1.0)
@@ -543,3 +544,54 @@ def test_glass_shows_what_is_behind_tinted_and_the_reflection_before_it(kind):
         np.testing.assert_allclose(at(transmitted, x, y), is_glass * through * behind, rtol=5e-3, err_msg=f"{x}, {y}")
     # The stick is before the glass.
     np.testing.assert_allclose(at(combined, 1.0, 0.0), glow, rtol=5e-3)
+
+
+# What varies over the UV square of a plane, by the kind of its nodes.
+TILES = {"Color1": (0.1, 0.4, 1.0, 1.0), "Color2": (1.0, 0.1, 0.3, 1.0), "Scale": 8.0}
+SHINING = {
+    "checker": {"Emission Color": ("TexChecker", TILES)},
+    "ramp": {"Emission Color": ("ValToRGB", {"Fac": ("TexGradient", {})})},
+    "mix": {"Emission Color": ("MixRGB", {0: ("TexGradient", {}), 1: RED, 2: TINT})},
+    "strength": {"Emission Color": AMBER, "Emission Strength": ("TexChecker", TILES)},
+    "image": {"Emission Color": ("TexImage", {})},
+}
+
+
+@edits_with_graphics
+@pytest.mark.parametrize("kind", SHINING)
+def test_what_shines_by_a_pattern_lights_as_its_mean_and_is_named_with_bounces_too(tmp_path, kind):
+    """The oracle is Cycles' picture of the surface, which reflects nothing, from above."""
+    parts.empty_scene(256, 256)
+    black = {"Base Color": (0.0, 0.0, 0.0, 1.0), "Specular IOR Level": 0.0, "Emission Strength": 2.0}
+    material = made("Wall", "BsdfPrincipled", {**black, **SHINING[kind]})()
+    for node in material.node_tree.nodes:
+        if node.bl_idname == "ShaderNodeValToRGB":
+            for element, color in zip(node.color_ramp.elements, ((0.9, 0.1, 0, 1), (0.1, 0.2, 0.6, 1)), strict=True):
+                element.color = color
+        if node.bl_idname == "ShaderNodeTexImage":
+            node.image = bpy.data.images.new("screen", 2, 2, float_buffer=True, is_data=True)
+            colors = np.linspace(0.1, 1.0, 16).reshape(4, 4)
+            node.image.pixels.foreach_set(np.c_[colors[:, :3], np.ones(4)].astype(np.float32).ravel())
+        if node.bl_idname.startswith("ShaderNodeTex") and kind != "image":
+            place = material.node_tree.nodes.new("ShaderNodeTexCoord")
+            material.node_tree.links.new(place.outputs["UV"], node.inputs["Vector"])
+    parts.add_plane(material, size=2.0)
+    parts.add_top_camera(2.0)
+    bpy.context.view_layer.update()
+
+    def read():
+        mirror = SceneMirror()
+        mirror.sync(bpy.context.evaluated_depsgraph_get())
+        return mirror.lights, mirror.notes_with_rest
+
+    lights, notes = with_graphics(read)
+    picture = read_layer(parts.cycles_channels(tmp_path, 4), "Combined", "RGB")
+    mean = picture.mean(axis=(0, 1))
+    off = 100.0 * np.abs(picture - mean).sum(axis=-1).mean() / mean.sum()
+    assert lights
+    for light in lights:
+        np.testing.assert_allclose(light.radiance, mean, rtol=0.03)
+    (note,) = notes
+    assert note.startswith("Wall: it")
+    told = float(note.partition(" %")[0].split()[-1])
+    assert told == pytest.approx(off, abs=4.0)

@@ -31,7 +31,7 @@ from ..extract.pixels import files_opened, open_scene, scene_named
 from ..materials.graph import ensure_nodes, has_volume
 from ..materials.preview_material import preview_of
 from ..process.blender_process import BlenderProcess
-from ..process.view import REST_PICTURE, REST_RENDER, LiveRestJob, RestJob, RestSum, RestView
+from ..process.view import REST_PICTURE, REST_RENDER, LiveRestJob, RestJob, RestSum, RestView, WholePictureError
 from ..render_settings import render_exr
 from ..saving import save_working_copy
 from .drawing import ViewCamera, float_texture
@@ -341,6 +341,7 @@ def _settings_of(depsgraph) -> tuple:
 # In the child:
 
 _sum: list[RestSum] = []
+_whole_error = [WholePictureError()]  # of the open scene
 
 
 def render_rest(job: RestJob, folder: Path, progress) -> dict:
@@ -361,6 +362,7 @@ def render_step(job: RestJob, folder: Path, progress) -> float:
     view, warnings = RestView(**job.view), []
     if job.scene is not None and _state_of(job, view) != _opened[0]:
         progress("open scene", 0.0)
+        _whole_error[0] = WholePictureError()
         open_scene(Path(job.scene), warnings, job.scripts)
         scene = scene_named(view.scene)
         render_settings.go_to_frame(scene, view.frame)
@@ -421,10 +423,8 @@ def render_live_rest(job: LiveRestJob, folder: Path, progress) -> dict:
             work = max(wanted, FEWEST if seconds > STEP_SECONDS else work)
         before, more = step, {"scene": None, "changes": None}
         if makes_picture(step) and not (folder / STOP).exists():
-            if number == 0 or step.total >= WHOLE_SAMPLES or not job.has_whole:
-                save_array(folder / LIVE_REST.format(number), _sum[0].picture())
-            if job.has_whole:
-                save_array(folder / LIVE_WHOLE.format(number), _sum[0].whole_picture())
+            for name, values in _pictures(step, job.has_whole, number == 0).items():
+                save_array(folder / name.format(number), values)
             facts = _facts() | {"total": step.total if step.shrink == 1 else 0, "seconds": seconds / done, "work": work}
             (folder / LIVE_FACTS.format(number)).write_text(json.dumps(facts), encoding="utf-8")
             progress(PICTURE, float(number))
@@ -432,6 +432,24 @@ def render_live_rest(job: LiveRestJob, folder: Path, progress) -> dict:
         if (folder / STOP).exists():
             break
     return {}
+
+
+def _pictures(step: RestJob, has_whole: bool, is_first: bool) -> dict[str, np.ndarray]:
+    """The pictures of the sum by the names of their files: the rest, and Cycles' whole one where that errs less than
+    the view's own, which is measured at first."""
+    total, samples, error, pictures = _sum[0], step.total / step.shrink**2, _whole_error[0], {}
+    has_whole = has_whole and not total.is_everything
+    measures = has_whole and error.lacks(samples)
+    if is_first or measures or step.total >= WHOLE_SAMPLES or not (has_whole and error.is_small(samples)):
+        pictures[LIVE_REST] = total.picture()
+    if has_whole and not total.problem and (measures or error.is_small(samples)):
+        whole = total.whole_picture()
+        if measures:
+            exposure = 2.0 ** scene_named(step.view.scene).view_settings.exposure
+            error.add(samples, pictures[LIVE_REST][..., :3], whole, exposure)
+        if error.is_small(samples):
+            pictures[LIVE_WHOLE] = whole
+    return pictures
 
 
 # The state of the last job's scene, if its next frame needs no other one.

@@ -16,7 +16,7 @@ from fake_scene import run
 from graphics_card import edits_with_graphics, with_graphics
 from view_pictures import OpenView
 
-from ltsh_addon.blender.process.view import RestJob, RestView, marked_depth
+from ltsh_addon.blender.process.view import OWN_ERROR, RestJob, RestView, WholePictureError, marked_depth
 from ltsh_addon.blender.render_settings import render_exr
 from ltsh_addon.blender.viewport import rest
 from ltsh_addon.blender.viewport.drawing import float_texture, read_texture
@@ -413,3 +413,21 @@ def test_the_depth_of_a_mirror_is_its_own(tmp_path):
     for job in (RestJob(path, view, 2), RestJob(None, view, 2, 2, continues=True)):
         rest.render_step(job, tmp_path, lambda *stage: None)
     np.testing.assert_allclose(rest._sum[0].picture()[..., 3], 3.0, rtol=1e-5)
+
+
+@pytest.mark.newest
+@pytest.mark.parametrize("noise", [(0.02, 0.05), (0.03, 0.03)])
+def test_the_excess_of_cycles_whole_picture_is_measured_by_two_samples(noise):
+    """Of pictures whose noise is known; on a screen, around a gray whose slope is known, too."""
+    random, light = np.random.default_rng(3), 0.4
+    samples = [[random.normal(scale=size, size=(200, 200, 3)) for size in noise] for _ in range(2)]
+    error = WholePictureError()
+    assert not error.is_small(1e6) and error.lacks(1.0) and not error.lacks(0.25)
+    (rest_1, whole_1), (rest_2, whole_2) = samples
+    error.add(1.0, rest_1, light + whole_1, 1.0)
+    error.add(2.0, 0.5 * (rest_1 + rest_2), light + 0.5 * (whole_1 + whole_2), 1.0)
+    # The slope of sRGB (IEC 61966-2-1) at this light; its bend counts 1 % at such noise.
+    slope = 1.055 / 2.4 * light ** (1.0 / 2.4 - 1.0)
+    expected = slope**2 * (noise[1] ** 2 - noise[0] ** 2)
+    np.testing.assert_allclose(error.excess, expected, rtol=0.05, atol=0.03 * (slope * noise[1]) ** 2)
+    assert error.is_small(1.0) == (expected < OWN_ERROR**2) and error.is_small(10.0) and not error.lacks(1.0)

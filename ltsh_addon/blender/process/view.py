@@ -268,11 +268,12 @@ class WholePictureError:
     """
 
     excess: float | None = None  # of one sample; None: not known yet
+    is_old: bool = False  # it should be measured again
     first: tuple[np.ndarray, np.ndarray] | None = None  # rest and whole picture of one sample
 
     def lacks(self, samples: float) -> bool:
         """True if pictures of so many samples are needed, see `add`."""
-        return self.excess is None and samples in (1.0, 2.0)
+        return (self.excess is None or self.is_old) and samples in (1.0, 2.0)
 
     def add(self, samples: float, rest: np.ndarray, whole: np.ndarray, exposure: float) -> None:
         """Take denoised pictures (H, W, 3) of one sample, then of these and another one."""
@@ -282,7 +283,7 @@ class WholePictureError:
             plain = srgb_encode(exposure * whole)
             changed = [whole + first - second for first, second in zip(self.first, (rest, whole), strict=True)]
             of_rest, of_whole = (2.0 * float(np.mean((srgb_encode(exposure * one) - plain) ** 2)) for one in changed)
-            self.excess, self.first = of_whole - of_rest, None
+            self.excess, self.is_old, self.first = of_whole - of_rest, False, None
 
     def is_small(self, samples: float) -> bool:
         """True if the whole picture of so many samples is known to err less than the view's own."""

@@ -115,6 +115,7 @@ class ShownRest:
     ambient: tuple = (0.0, 0.0, 0.0)  # a guess of it over the colors of surfaces, where it is not known
     light: np.ndarray | None = None  # the mean (3,) of the direct light that belongs to it; None: that of the picture
     whole: gpu.types.GPUTexture | None = None  # RGB, with the direct light; None: not of what is shown
+    whole_errs_less: bool = False  # than the view's own picture with few points of pixels and coarse shadows
 
     def is_of(self, view: ViewCamera) -> bool:
         """True if it was rendered for this very view."""

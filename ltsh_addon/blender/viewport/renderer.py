@@ -214,11 +214,9 @@ class ViewRenderer:
         self._show([number], view, shown, target)
 
     def _whole_share(self, shown: ShownPicture) -> float:
-        """The share of Cycles' whole picture in what is shown, which gives way with every point under fine shadows.
-
-        Its noise errs less than few points of pixels and coarse shadows.
-        """
-        if not self._has_whole(shown):
+        """The share of Cycles' whole picture in what is shown. Where it errs less than few points of pixels and coarse
+        shadows, it gives way with every point under fine ones."""
+        if not (self._has_whole(shown) and self.rest.whole_errs_less):
             return 0.0
         if self.step > 1:
             return 1.0

@@ -128,6 +128,7 @@ class _RestPicture:
     view: RestView
     rest: np.ndarray  # (H, W, 4), row 0 on top, as of `RestSum.picture`
     whole: np.ndarray | None  # (H, W, 3), Cycles' whole picture
+    whole_errs_less: bool  # than the view's own with few points and coarse shadows
     is_everything: bool
     ambient: list[float]
     problem: str
@@ -144,7 +145,7 @@ class _RestPicture:
             self.shown = ShownRest(float_texture(self.rest[::-1]), camera, self.is_everything, tuple(self.ambient))
             if self.whole is not None:
                 whole = np.pad(self.whole[::-1], ((0, 0), (0, 0), (0, 1)), constant_values=1.0)
-                self.shown = replace(self.shown, whole=float_texture(whole))
+                self.shown = replace(self.shown, whole=float_texture(whole), whole_errs_less=self.whole_errs_less)
         return self.shown
 
 
@@ -341,7 +342,7 @@ def _settings_of(depsgraph) -> tuple:
 # In the child:
 
 _sum: list[RestSum] = []
-_whole_error = [WholePictureError()]  # of the open scene
+_whole_error = [WholePictureError()]  # of the open scene; until it is measured, of the one before
 
 
 def render_rest(job: RestJob, folder: Path, progress) -> dict:
@@ -362,7 +363,7 @@ def render_step(job: RestJob, folder: Path, progress) -> float:
     view, warnings = RestView(**job.view), []
     if job.scene is not None and _state_of(job, view) != _opened[0]:
         progress("open scene", 0.0)
-        _whole_error[0] = WholePictureError()
+        _whole_error[0].is_old = True
         open_scene(Path(job.scene), warnings, job.scripts)
         scene = scene_named(view.scene)
         render_settings.go_to_frame(scene, view.frame)
@@ -426,6 +427,7 @@ def render_live_rest(job: LiveRestJob, folder: Path, progress) -> dict:
             for name, values in _pictures(step, job.has_whole, number == 0).items():
                 save_array(folder / name.format(number), values)
             facts = _facts() | {"total": step.total if step.shrink == 1 else 0, "seconds": seconds / done, "work": work}
+            facts["whole_errs_less"] = _whole_error[0].is_small(step.total / step.shrink**2)
             (folder / LIVE_FACTS.format(number)).write_text(json.dumps(facts), encoding="utf-8")
             progress(PICTURE, float(number))
             number += 1
@@ -436,19 +438,17 @@ def render_live_rest(job: LiveRestJob, folder: Path, progress) -> dict:
 
 def _pictures(step: RestJob, has_whole: bool, is_first: bool) -> dict[str, np.ndarray]:
     """The pictures of the sum by the names of their files: the rest, and Cycles' whole one where that errs less than
-    the view's own, which is measured at first."""
+    the view's own, or until that is known: it is measured at first."""
     total, samples, error, pictures = _sum[0], step.total / step.shrink**2, _whole_error[0], {}
     has_whole = has_whole and not total.is_everything
     measures = has_whole and error.lacks(samples)
     if is_first or measures or step.total >= WHOLE_SAMPLES or not (has_whole and error.is_small(samples)):
         pictures[LIVE_REST] = total.picture()
-    if has_whole and not total.problem and (measures or error.is_small(samples)):
-        whole = total.whole_picture()
+    if has_whole and not total.problem and (measures or error.excess is None or error.is_small(samples)):
+        whole = pictures[LIVE_WHOLE] = total.whole_picture()
         if measures:
             exposure = 2.0 ** scene_named(step.view.scene).view_settings.exposure
             error.add(samples, pictures[LIVE_REST][..., :3], whole, exposure)
-        if error.is_small(samples):
-            pictures[LIVE_WHOLE] = whole
     return pictures
 
 

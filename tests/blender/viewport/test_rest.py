@@ -305,6 +305,8 @@ def test_cycles_whole_picture_gives_way_to_points_under_fine_shadows():
             renderer.rest, renderer.shadows.is_fine, found = shown, True, {}
             found["own"] = opened.draw(ShownPicture(default, "combined"))
             renderer.rest = replace(shown, whole=float_texture(whole))
+            found["errs more"] = opened.draw(ShownPicture(default, "combined"))
+            renderer.rest = replace(renderer.rest, whole_errs_less=True)
             found["one point"] = opened.draw(ShownPicture(default, "combined"))
             found["other"] = opened.draw(ShownPicture("ltsh4", "combined"))
             renderer.shadows.is_fine = False
@@ -326,6 +328,7 @@ def test_cycles_whole_picture_gives_way_to_points_under_fine_shadows():
     found, whole = with_graphics(pictures), whole[..., :3]
     share = 1.0 / FIRST_POINTS
     np.testing.assert_allclose(found["one point"], (1.0 - share) * whole + share * found["own"], atol=1e-5)
+    np.testing.assert_array_equal(found["errs more"], found["own"])
     np.testing.assert_allclose(found["fine"], found["own"], atol=1e-4)
     assert np.abs(found["other"] - whole).mean() > 0.05
     for name in ("coarse", "coarse, points", "few pixels", "failed"):
@@ -431,3 +434,5 @@ def test_the_excess_of_cycles_whole_picture_is_measured_by_two_samples(noise):
     expected = slope**2 * (noise[1] ** 2 - noise[0] ** 2)
     np.testing.assert_allclose(error.excess, expected, rtol=0.05, atol=0.03 * (slope * noise[1]) ** 2)
     assert error.is_small(1.0) == (expected < OWN_ERROR**2) and error.is_small(10.0) and not error.lacks(1.0)
+    error.is_old = True
+    assert error.lacks(1.0) and error.is_small(10.0), "what is known holds until it is measured again"

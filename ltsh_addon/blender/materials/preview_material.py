@@ -485,7 +485,7 @@ class _PreviewReader:
             return whole
         color, strength = (colors_at(socket, source.groups) for socket in sockets)
         is_plain = self.emission_image is None and share.image is None and share.curve is None
-        if is_plain and color is None and values[0] is not None and values[1] is not None:
+        if is_plain and values[0] is not None and values[0].image is not None and known:
             self.note("the image of its emission is shown as its mean")
             self.emission_image = values[0].mapped(share.shining * whole * np.eye(3))
             return np.zeros(3)

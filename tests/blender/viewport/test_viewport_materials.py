@@ -595,3 +595,14 @@ def test_what_shines_by_a_pattern_lights_as_its_mean_and_is_named_with_bounces_t
     assert note.startswith("Wall: it")
     told = float(note.partition(" %")[0].split()[-1])
     assert told == pytest.approx(off, abs=4.0)
+
+
+def test_emission_whose_strength_is_an_image_lights_nothing_and_is_named():
+    parts.empty_scene()
+    material = made("Wall", "BsdfPrincipled", {"Emission Color": AMBER, "Emission Strength": ("TexImage", {})})()
+    (node,) = [one for one in material.node_tree.nodes if one.bl_idname == "ShaderNodeTexImage"]
+    node.image = bpy.data.images.new("mask", 2, 2, float_buffer=True, is_data=True)
+    look = preview_of(material)
+    assert not look.emission.any() and look.emission_image is None
+    (note,) = look.notes_in_view(with_bounces=True)
+    assert note == "Wall: the strength of its emission varies: it is not shown and lights nothing"

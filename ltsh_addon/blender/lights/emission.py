@@ -359,17 +359,15 @@ def without_camera_rays(blocks, random: float):
     """Within this context the nodes of materials and lights get 0 for Is Camera Ray and `random` for Object Info's
     Random."""
     values = {LIGHT_PATH: (CAMERA_RAY, 0.0), "ShaderNodeObjectInfo": ("Random", random)}
-    moved = []
-    try:
+    with graph.TreeChanges() as changes:
         for tree in trees_of(blocks):
             for node in [node for node in tree.nodes if node.bl_idname in values]:
                 name, value = values[node.bl_idname]
-                moved.append((graph.replaced_by_number(node.outputs[name], value), node.outputs[name]))
+                number = changes.add(tree, "ShaderNodeValue").outputs[0]
+                number.default_value = value
+                for socket in [link.to_socket for link in node.outputs[name].links if not link.is_muted]:
+                    changes.relink(socket, number)
         yield
-    finally:
-        for number, output in moved:
-            graph.feed_instead(number, output)
-            number.id_data.nodes.remove(number.node)
 
 
 # PIXELS: along each side of a picture.

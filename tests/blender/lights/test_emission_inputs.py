@@ -12,6 +12,7 @@ from lit_plane import LAMP_CORNERS, add_lamp, combined_by_group, lamp_material, 
 
 from ltsh_addon import shading
 from ltsh_addon.blender.lights import meshes, textures
+from ltsh_addon.blender.lights.emission import without_camera_rays
 
 # Outputs by node, with the names that they have below.
 INPUTS = {
@@ -169,3 +170,19 @@ def test_what_nodes_of_worlds_read_is_what_cycles_gives_them(tmp_path, inputs):
     for channel, name in enumerate(inputs):
         own, expected = found[:, channel : channel + 1], halves["diffuse"][..., channel : channel + 1]
         assert quadrature.relative_l2(own, expected) < 0.015 and abs(quadrature.bias(own, expected)) < 0.01, name
+
+
+def test_links_from_what_camera_rays_are_told_come_back_and_muted_ones_stay_muted():
+    scene_parts.empty_scene()
+    material, tree, _ = scene_parts.new_material("Lamp")
+    path, emission = (tree.nodes.new(f"ShaderNode{kind}") for kind in ("LightPath", "Emission"))
+    link = tree.links.new(path.outputs["Is Camera Ray"], emission.inputs["Strength"])
+    muted = tree.links.new(path.outputs["Is Camera Ray"], emission.inputs["Color"])
+    muted.is_muted = True
+    before, count = emission.inputs["Color"].links[0].from_node.name, len(tree.nodes)
+    with without_camera_rays([material], 0.5):
+        assert emission.inputs["Strength"].links[0].from_node.outputs[0].default_value == 0.0
+        assert emission.inputs["Color"].links[0].is_muted
+    del link, muted
+    assert len(tree.nodes) == count and emission.inputs["Strength"].links[0].from_node == path
+    assert emission.inputs["Color"].links[0].is_muted and emission.inputs["Color"].links[0].from_node.name == before

@@ -379,18 +379,18 @@ def _cut(operation: str, value: Value, threshold: float) -> Curved | None:
     return None
 
 
+def _ends(node) -> tuple[int, ...]:
+    """Positions of what Mix and MixRGB mix; () for other types."""
+    return (1, 2) if node.bl_idname == "ShaderNodeMixRGB" else {"FLOAT": (2, 3), "RGBA": (6, 7)}.get(node.data_type, ())
+
+
 def _mix(source: Source) -> Value | Curved | None:
     """Mix and MixRGB by a constant factor."""
-    node = source.node
-    is_number = node.bl_idname == "ShaderNodeMix" and node.data_type == "FLOAT"
-    if is_number:
-        first, second = (curved_at(node.inputs[number], source.groups) for number in (2, 3))
-    elif node.bl_idname == "ShaderNodeMixRGB":
-        first, second = input_value(source, 1), input_value(source, 2)
-    elif node.data_type == "RGBA":
-        first, second = input_value(source, 6), input_value(source, 7)
-    else:
+    node, ends = source.node, _ends(source.node)
+    if not ends:
         return None
+    is_number = node.inputs[ends[0]].type == "VALUE"
+    first, second = ((curved_at if is_number else value_at)(node.inputs[number], source.groups) for number in ends)
     shares = constant_inputs(source, 0)
     if shares is None:
         return None
@@ -500,10 +500,9 @@ def colors_at(socket, groups: tuple = ()) -> np.ndarray | None:
     if node.bl_idname in TWO_COLORS:
         both = [colors_at(node.inputs[name], source.groups) for name in ("Color1", "Color2")]
         return None if any(one is None for one in both) else _mixed(*both, np.array([0.0, 1.0]))
-    is_mix = node.bl_idname == "ShaderNodeMixRGB" or (node.bl_idname == "ShaderNodeMix" and node.data_type == "RGBA")
-    if is_mix and node.blend_type == "MIX":
-        first = 1 if node.bl_idname == "ShaderNodeMixRGB" else 6
-        both = [colors_at(node.inputs[number], source.groups) for number in (first, first + 1)]
+    ends = _ends(node) if READERS.get(node.bl_idname) is _mix and node.blend_type == "MIX" else ()
+    if ends and node.inputs[ends[0]].type == "RGBA":
+        both = [colors_at(node.inputs[number], source.groups) for number in ends]
         factors = colors_at(node.inputs[0], source.groups)
         factors = EVENLY if factors is None else np.clip(factors @ GRAY, 0.0, 1.0)
         return None if any(one is None for one in both) else _mixed(*both, factors)

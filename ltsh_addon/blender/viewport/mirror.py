@@ -126,8 +126,7 @@ def _preview(material, textures: ShownTextures) -> PreviewMaterial:
     look = preview_of(None if material is None else material.original)
     if look.emission_image is None:
         return look
-    emission = look.emission + textures.mean(look.emission_image)[0]
-    return replace(look, emission=emission)
+    return replace(look, emission=look.emission + textures.mean(look.emission_image)[0])
 
 
 def _emission(material, textures: ShownTextures, is_small: bool, notes: list[str]) -> np.ndarray:
@@ -140,7 +139,7 @@ def _emission(material, textures: ShownTextures, is_small: bool, notes: list[str
         return look.emission
     mean, spread = textures.mean(image)
     if not mean.any():
-        notes.append(f"{material.name}: only Cycles can read the image that shines, it lights nothing")
+        notes.append(f"{material.name}: the image that shines is black or only Cycles can read it: it lights nothing")
     elif spread > ERROR:
         off = f"which is {100.0 * spread:.0f} % off its colors"
         notes.append(f"{material.name}: it lights as the mean of its image, {off}")
@@ -155,8 +154,7 @@ def _mesh_lights(depsgraph, receivers: Receivers, textures: ShownTextures, notes
     lights = []
     for mesh_light in mesh_lights:
         count = sum(len(placement.triangles) for placement in mesh_light.placements)
-        given = {"textures": textures, "is_small": count <= MOST_TRIANGLES, "notes": notes}
-        radiance_of = functools.partial(_emission, **given)
+        radiance_of = functools.partial(_emission, textures=textures, is_small=count <= MOST_TRIANGLES, notes=notes)
         lights += constant_mesh_lights([mesh_light], radiance_of, eye, notes.append)
     return lights
 

@@ -423,11 +423,12 @@ def render_live_rest(job: LiveRestJob, folder: Path, progress) -> dict:
             wanted = done * min(max(STEP_SECONDS / seconds, 1.0 / MOST_CHANGE), MOST_CHANGE)
             work = max(wanted, FEWEST if seconds > STEP_SECONDS else work)
         before, more = step, {"scene": None, "changes": None}
+        samples = step.total / step.shrink**2  # of a pixel of the view
         if makes_picture(step) and not (folder / STOP).exists():
-            for name, values in _pictures(step, job.has_whole, number == 0).items():
+            for name, values in _pictures(step, samples, job.has_whole, number == 0).items():
                 save_array(folder / name.format(number), values)
             facts = _facts() | {"total": step.total if step.shrink == 1 else 0, "seconds": seconds / done, "work": work}
-            facts["whole_errs_less"] = _whole_error[0].is_small(step.total / step.shrink**2)
+            facts["whole_errs_less"] = _whole_error[0].is_small(samples)
             (folder / LIVE_FACTS.format(number)).write_text(json.dumps(facts), encoding="utf-8")
             progress(PICTURE, float(number))
             number += 1
@@ -436,15 +437,15 @@ def render_live_rest(job: LiveRestJob, folder: Path, progress) -> dict:
     return {}
 
 
-def _pictures(step: RestJob, has_whole: bool, is_first: bool) -> dict[str, np.ndarray]:
+def _pictures(step: RestJob, samples: float, has_whole: bool, is_first: bool) -> dict[str, np.ndarray]:
     """The pictures of the sum by the names of their files: the rest, and Cycles' whole one where that errs less than
     the view's own, or until that is known: it is measured at first."""
-    total, samples, error, pictures = _sum[0], step.total / step.shrink**2, _whole_error[0], {}
+    total, error, pictures = _sum[0], _whole_error[0], {}
     has_whole = has_whole and not total.is_everything
-    measures = has_whole and error.lacks(samples)
-    if is_first or measures or step.total >= WHOLE_SAMPLES or not (has_whole and error.is_small(samples)):
+    measures, errs_less = has_whole and error.lacks(samples), has_whole and error.is_small(samples)
+    if is_first or measures or step.total >= WHOLE_SAMPLES or not errs_less:
         pictures[LIVE_REST] = total.picture()
-    if has_whole and not total.problem and (measures or error.excess is None or error.is_small(samples)):
+    if has_whole and not total.problem and (measures or errs_less or error.excess is None):
         whole = pictures[LIVE_WHOLE] = total.whole_picture()
         if measures:
             exposure = 2.0 ** scene_named(step.view.scene).view_settings.exposure

@@ -82,7 +82,7 @@ class ShadowRays:
     A pixel takes at most `rays` rays per light.
     """
 
-    version, waits, traces_lobes = 0, False, True
+    version, waits, is_fine, traces_lobes = 0, False, True, True
 
     @property
     def of_glass(self) -> "ShadowRays":

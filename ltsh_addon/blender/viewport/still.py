@@ -137,7 +137,7 @@ class FrameShadows:
     """Shadows of the frames of a playblast, as views have them soon after they come to rest: once for all points of a
     pixel. A light that stays keeps them as long as the surfaces and the camera stay."""
 
-    version, waits, traces_lobes = 0, False, False
+    version, waits, is_fine, traces_lobes = 0, False, True, False
 
     def __init__(self, tracing: ViewTracer, rays: int):
         self.tracing, self._rays, self.seconds = tracing, rays, 0.0

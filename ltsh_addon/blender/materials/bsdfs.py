@@ -3,6 +3,7 @@
 All readers of materials get the row of a node from `bsdf_of`; a node without a row has no lobe.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import bpy
@@ -19,6 +20,8 @@ SUBSURFACE = "ShaderNodeSubsurfaceScattering"
 REFRACTION_NODE = "ShaderNodeBsdfRefraction"
 SEEN_THROUGH = "shows what is behind it sharp, in views also without refraction; comparisons and bakes leave it out"
 NOT_SUPPORTED = "is not supported, it is not shaded"
+OTHER_PASS = "is in the diffuse pass, in Cycles its Ashikhmin sheen is specular"
+SHOWN_RIGHT = SEEN_THROUGH, OTHER_PASS  # ends of notes that do not matter where the passes of a view are one picture
 # Node -> the property that selects one of its rows.
 VARIANTS = {METALLIC: "fresnel_type", SHEEN: "distribution", TOON: "component"}
 
@@ -74,9 +77,7 @@ BSDFS = {
         CONDUCTOR, {**BRUSHED, "color": "IOR", "tint": "Extinction"}, "", OF_METALLIC
     ),
     (SHEEN, "MICROFIBER"): Bsdf("sheen", {**COLOR, **ROUGHNESS}),
-    (SHEEN, "ASHIKHMIN"): Bsdf(
-        "velvet", {**COLOR, **ROUGHNESS}, "is in the diffuse pass, in Cycles its Ashikhmin sheen is specular"
-    ),
+    (SHEEN, "ASHIKHMIN"): Bsdf("velvet", {**COLOR, **ROUGHNESS}, OTHER_PASS),
     # The other component is in Cycles' glossy pass, where no diffuse lobe can replace it.
     (TOON, "DIFFUSE"): Bsdf("diffuse", COLOR, f"{AS_DIFFUSE} of the same albedo, 27 to 72 % off"),
     (SUBSURFACE, ""): Bsdf("diffuse", COLOR, f"{AS_DIFFUSE}, {SUBSURFACE_ERROR}"),
@@ -232,9 +233,14 @@ def notes_of(node) -> list[str]:
     if bsdf is None:
         return [f"node {node.name!r} {SEEN_THROUGH if node.bl_idname == REFRACTION_NODE else NOT_SUPPORTED}"]
     notes = [f"Alpha of {node.name!r} is cut, the surface is shaded and rendered opaque"] if has_alpha(node) else []
-    notes += [f"node {node.name!r} {bsdf.nearest}"] if bsdf.nearest else []
+    return notes + lobe_notes(node, bsdf, lambda name, value: is_constant(value_of(node.inputs[name]), value))
+
+
+def lobe_notes(node, bsdf: Bsdf, is_at: Callable[[str, float], bool]) -> list[str]:
+    """Those about its lobes; `is_at` tells whether the input of a name is a constant value."""
+    notes = [f"node {node.name!r} {bsdf.nearest}"] if bsdf.nearest else []
     for name, (neutral, done) in bsdf.not_shaded.items():
-        if name in node.inputs and not is_constant(value_of(node.inputs[name]), neutral):
+        if name in node.inputs and not is_at(name, neutral):
             notes.append(f"{name} of {node.name!r} {done}")
     distribution = getattr(node, "distribution", "")
     if distribution in NEAREST_ALPHA:

@@ -8,7 +8,7 @@ import numpy as np
 from ...cycles.lobes import BRUSHED_KINDS, SMALLEST_WEIGHT, aspect_of
 from ..render_settings import cycles_setting
 from . import graph
-from .bsdfs import REFRACTION_NODE, Bsdf, bsdf_of, emission_sockets, has_alpha, is_emission
+from .bsdfs import REFRACTION_NODE, SHOWN_RIGHT, Bsdf, bsdf_of, emission_sockets, has_alpha, is_emission, lobe_notes
 from .values import GRAY, ImageUse, Value, colors_at, constant, constant_inputs, input_value, is_gray, value_at
 
 # Quantities that may come from an image; all others are constants.
@@ -20,10 +20,10 @@ NEUTRAL = {"color": 0.8, "roughness": 1.0, "metallic": 0.0, "ior": 1.5, "specula
 METALS, SMOOTH = ("glossy", "metal", "conductor", "conductor_4_5"), 0.3
 # ROUGH_KINDS: kinds whose diffuse part may be rough.
 ROUGH_KINDS = ("principled", "diffuse")
-# Two kinds beside those of `cycles.lobes.LOBE_KINDS`. COAT: the coat of another lobe. REFRACTION: lobes that only let
-# light through.
-COAT = "coat"
-REFRACTION = "refraction"
+# Kinds beside those of `cycles.lobes.LOBE_KINDS`. COAT: of another lobe. REFRACTION and FILTER: what only lets light
+# through, which crosses both sides of a body, or one surface.
+COAT, REFRACTION, FILTER = OTHER_KINDS = ("coat", "refraction", "filter")
+CLEAREST = 0.999  # the color from which on a surface that lets light through is not drawn
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ class Brush:
 class PreviewMaterial:
     """One lobe of a material in the viewport. The first lobe also holds the other lobes, emission and notes."""
 
-    kind: str  # of `cycles.lobes.LOBE_KINDS`, COAT or REFRACTION
+    kind: str  # of `cycles.lobes.LOBE_KINDS` or OTHER_KINDS
     values: dict[str, Value]  # by the names of NEUTRAL
     normal: Value | None = None  # of a tangent space normal map
     normal_strength: float = 1.0
@@ -93,7 +93,7 @@ class PreviewMaterial:
     light_notes: tuple[str, ...] = ()  # those of `notes` about the light that it casts
     further: "tuple[PreviewMaterial, ...]" = ()  # lobes that are added to this one
     is_clear: bool = False  # nothing is drawn
-    is_stand_in: bool = False  # it stands for a node that is not shaded
+    is_stand_in: bool = False  # it stands for a node that reflects nothing, or is not shaded
 
     @property
     def lobes(self) -> "tuple[PreviewMaterial, ...]":
@@ -107,7 +107,7 @@ class PreviewMaterial:
     @property
     def through(self) -> float:
         """The share of the lobe, apart from metal, that lets the view through."""
-        if self.kind in ("glass", REFRACTION):
+        if self.kind in ("glass", REFRACTION, FILTER):
             return 1.0
         return float(np.clip(self.value("transmission").offset[0], 0.0, 1.0)) if self.kind == "principled" else 0.0
 
@@ -198,7 +198,14 @@ def preview_of(material) -> PreviewMaterial:
         size = "" if height is None else f", by up to {height:.3g} m,"
         lost.append(f"displacement{size} is not shown: its light is 10 to 50 % off")
     notes = (*look.notes, *(f"{material.name}: its {text}" for text in lost))
-    return replace(look, notes=notes, is_clear=graph.is_seen_through(surface.node, shaders))
+    is_clear = graph.is_seen_through(surface.node, shaders) and all(map(_is_clear, look.lobes))
+    return replace(look, notes=notes, is_clear=is_clear)
+
+
+def _is_clear(lobe: PreviewMaterial) -> bool:
+    """True for lobes that change no light: a black stand-in for a surface without any, or a white filter."""
+    color = lobe.value("color")
+    return lobe.kind != FILTER or (color.is_constant and bool(np.min(color.offset) >= CLEAREST))
 
 
 @dataclass(frozen=True)
@@ -261,15 +268,19 @@ class _PreviewReader:
 
     def __init__(self, material, shaders: graph.SurfaceShaders):
         self.material, self.notes, self.light_notes, self.emission_image = material, [], [], None
-        pairs = [(leaf, share) for leaf in shaders.leaves if not leaf.is_transparent for share in self._shares(leaf)]
+        drawn = [leaf for leaf in shaders.leaves if not leaf.is_transparent]
+        if shaders.is_transparent:
+            drawn = [leaf for leaf in shaders.leaves if leaf.node.bl_idname == graph.CLEAR]
+        pairs = [(leaf, share) for leaf in drawn for share in self._shares(leaf)]
         guesses, self.notes = self.notes, []
         self.emitters = [(leaf.source, share) for leaf, share in pairs if is_emission(leaf.node)]
         self.leaves = [(leaf.source, share) for leaf, share in pairs if not is_emission(leaf.node)]
-        if (self.leaves or self.emitters) and (shaders.cuts or any(leaf.is_transparent for leaf in shaders.leaves)):
+        has_clear = shaders.cuts or any(leaf.is_transparent for leaf in shaders.leaves)
+        if (self.leaves or self.emitters) and has_clear and not shaders.is_transparent:
             opaque = sum(share.shining for _, share in pairs) / sum(share.estimate for _, share in pairs)
             self.note(f"transparency of about {100.0 * (1.0 - min(opaque, 1.0)):.0f} % is not shown")
         for leaf in shaders.leaves:
-            if has_alpha(leaf.node):
+            if has_alpha(leaf.node) and not leaf.is_transparent:
                 alpha = constant_inputs(leaf.source, "Alpha")
                 size = "that varies" if alpha is None else f"of {float(alpha[0][0]):.2g}"
                 self.note(f"alpha {size} is not shown, the surface is opaque")
@@ -354,12 +365,13 @@ class _PreviewReader:
     def _lobes_of(self, source: graph.Source, share: LobeWeight) -> list[PreviewMaterial]:
         """The lobes of one BSDF node."""
         bsdf = bsdf_of(source.node)
-        if source.node.bl_idname == REFRACTION_NODE:
-            kind, color = REFRACTION, self._value(source, "color", "Color")
-        elif bsdf is None:
-            self.note(f"{source.node.bl_label} is not shown, its viewport color is")
-            kind, color = "diffuse", constant(self.material.diffuse_color)
-        if source.node.bl_idname == REFRACTION_NODE or bsdf is None:
+        kind = {REFRACTION_NODE: REFRACTION, graph.CLEAR: FILTER}.get(source.node.bl_idname, "diffuse")
+        if bsdf is None:
+            if kind == "diffuse":
+                self.note(f"{source.node.bl_label} is not shown, its viewport color is")
+                color = constant(self.material.diffuse_color)
+            else:
+                color = self._value(source, "color", "Color")
             values = self._on_one_uv_map({"color": color, **share.values})
             return [PreviewMaterial(kind, values, weight=share.constant, view_factor=share.curve, is_stand_in=True)]
         look = self._lobe(source, bsdf, share)
@@ -382,7 +394,9 @@ class _PreviewReader:
         values = self._on_one_uv_map({**values, **share.values})
         if bsdf.roughness_factor != 1.0:
             values["roughness"] = values["roughness"].mapped(bsdf.roughness_factor * np.eye(3))
-            self.note(f"distribution {node.distribution} is shown as GGX")
+        for note in lobe_notes(node, bsdf, lambda name, value: _is_at(source, name, value)):
+            if not note.endswith(SHOWN_RIGHT):
+                self.note(note)
         normal, strength = self._normal(source, values)
         corrected = cycles_setting(self.material, "use_bump_map_correction")
         look = PreviewMaterial(
@@ -500,6 +514,12 @@ class _PreviewReader:
         off = 100.0 * np.abs(product - mean).sum(axis=-1).mean() / max(mean.sum(), 1e-30)
         self.note_light(f"its emission varies: it shines as about the mean of its colors, {off:.0f} % off them")
         return mean
+
+
+def _is_at(source: graph.Source, name: str, value: float) -> bool:
+    """True if the input `name` of a node is the constant `value`."""
+    given = constant_inputs(source, name)
+    return given is not None and bool(np.all(given[0] == value))
 
 
 def _direction_of(node) -> tuple[str | None, str]:

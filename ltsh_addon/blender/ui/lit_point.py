@@ -21,7 +21,7 @@ from ..evaluated import kind_of_normals, visibility
 from ..lights.linking import Receivers
 from ..lights.textures import ShownTextures
 from ..lights.world import light_of_world
-from ..materials.preview_material import COAT, REFRACTION, PreviewMaterial, ViewFactor, preview_of, world_radiance
+from ..materials.preview_material import OTHER_KINDS, PreviewMaterial, ViewFactor, preview_of, world_radiance
 from ..materials.values import Value
 from ..viewport.light_texels import constant_sky
 from ..viewport.mirror import view_lights
@@ -245,7 +245,7 @@ def samples_at_hit(hit: SurfaceHit, textures: ShownTextures, receiver: int = 0) 
             sheen = {"weight": most, "tint": fuzz["color"] / most, "roughness": fuzz["roughness"]}
             lobes[-1] |= {f"sheen_{name}": _of_one(f"sheen_{name}", value) for name, value in sheen.items()}
             before = None
-        elif lobe.kind not in (COAT, REFRACTION):
+        elif lobe.kind not in OTHER_KINDS:
             lobes.append(_lobe_at(lobe, hit, cosine, textures))
             before = lobe
     return samples_of_lobes(hits, lobes)[0]

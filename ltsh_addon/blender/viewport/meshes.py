@@ -10,7 +10,7 @@ from ...cycles import closures, horizons
 from ...cycles.horizons import unit
 from ...cycles.lobes import LEAST_VELVET, LOBE_KINDS
 from ..evaluated import interpolated_normals, read_values
-from ..materials.preview_material import COAT, IMAGE_SLOTS, REFRACTION, PreviewMaterial
+from ..materials.preview_material import IMAGE_SLOTS, OTHER_KINDS, PreviewMaterial
 from ..materials.values import EXTENSIONS, Value
 
 # _SAME: normals of a face and of its triangle count as equal if no component differs by more.
@@ -255,7 +255,7 @@ LOOK_SIZE = LAYERS + 5
 # Numbers for the direction of tangents of anisotropic lobes, by `Brush.direction`; 0: not anisotropic.
 DIRECTIONS = {"X": 1, "Y": 2, "Z": 3, "": 4}
 VIEW_FACTORS = {"fresnel": 1, "facing": 2}
-KINDS = {**LOBE_KINDS, COAT: max(LOBE_KINDS.values()) + 1, REFRACTION: max(LOBE_KINDS.values()) + 2}
+KINDS = {**LOBE_KINDS, **{kind: max(LOBE_KINDS.values()) + n for n, kind in enumerate(OTHER_KINDS, 1)}}
 DEFINES = {
     **{name.upper(): str(int(number)) for name, number in KINDS.items()},
     **{f"{name.upper()}_SLOT": str(position) for position, name in enumerate(IMAGE_SLOTS)},

@@ -25,6 +25,7 @@ from ltsh_addon.blender.engine.overlay import LIGHTS_PANEL, MATERIALS_PANEL, Qui
 from ltsh_addon.blender.lights.emission import emission_of
 from ltsh_addon.blender.lights.world import light_of_world
 from ltsh_addon.blender.materials import preview_material
+from ltsh_addon.blender.materials.bsdfs import AS_DIFFUSE, SUBSURFACE_ERROR
 from ltsh_addon.blender.materials.preview_material import preview_of
 from ltsh_addon.blender.ui import panels, preflight
 from ltsh_addon.blender.viewport.light_texels import constant_sky
@@ -278,6 +279,7 @@ for number in range(preview_material.MOST_LOBES + 1):
     ONION = ("AddShader", {0: ONION, 1: gloss(0.1 * (number + 1))})
 HALF = "factor of 'Mix Shader' is not resolved, half of each side is shown"
 NOT_BRUSHED = "its anisotropy is not resolved, it is shown without"
+SUBSURFACE = f"node 'Subsurface Scattering' {AS_DIFFUSE}, {SUBSURFACE_ERROR}"
 TOO_MANY = f"of its {preview_material.MOST_LOBES + 2} lobes only {preview_material.MOST_LOBES} are shown"
 
 
@@ -290,8 +292,27 @@ TOO_MANY = f"of its {preview_material.MOST_LOBES + 2} lobes only {preview_materi
         (ONION, {"glossy": preview_material.MOST_LOBES - 1, "diffuse": 1}, [TOO_MANY]),
         (("BsdfAnisotropic", {"Anisotropy": ("TexNoise", {})}), {"glossy": 1.0}, [NOT_BRUSHED]),
         (("BsdfAnisotropic", {"Anisotropy": 0.5, "Tangent": ("TexNoise", {})}), {"glossy": 1.0}, [NOT_BRUSHED]),
+        (("BsdfTransparent", {"Color": GOLD}), {"filter": 1.0}, []),
+        (("BsdfToon", {}), {"diffuse": 1.0}, [f"node 'Toon BSDF' {AS_DIFFUSE} of the same albedo, 27 to 72 % off"]),
+        (
+            ("SubsurfaceScattering", {}),
+            {"diffuse": 1.0},
+            [SUBSURFACE],
+        ),
+        (
+            ("BsdfPrincipled", {"Subsurface Weight": 0.1, "Thin Film Thickness": 400.0}),
+            {"principled": 1.0},
+            [
+                f"Subsurface Weight of 'Principled BSDF' is shaded as diffuse reflection: {SUBSURFACE_ERROR}",
+                "Thin Film Thickness of 'Principled BSDF' is shaded as 0",
+            ],
+        ),
+        (("BsdfSheen", {"distribution": "ASHIKHMIN"}), {"velvet": 1.0}, []),
     ],
-    ids=["mixed", "factor that depends on more", "transparent part", "too many", "varying anisotropy", "any tangent"],
+    ids=[
+        *("mixed", "factor that depends on more", "transparent part", "too many", "varying anisotropy", "any tangent"),
+        *("colored filter", "toon", "subsurface node", "layers", "velvet"),
+    ],
 )
 def test_lobes_have_their_shares_and_what_is_not_shown_is_named(shader, lobes, notes):
     parts.empty_scene()
@@ -510,7 +531,8 @@ def glass_wall(kind):
     black = {"Base Color": (0.0, 0.0, 0.0, 1.0), "Specular IOR Level": 0.0}
     glow = {"Emission Color": (0.2, 0.4, 0.8, 1.0), "Emission Strength": 1.0}
     parts.add_plane(parts.principled("glowing", **black, **glow)[0], size=2.0, location=(0.0, 0.0, -1.0))
-    glass = parts.bsdf_material(f"ShaderNodeBsdf{kind}", "glass", Color=(0.9, 0.5, 0.7, 1.0), Roughness=0.2, IOR=1.5)[0]
+    bending = {} if kind == "Transparent" else {"Roughness": 0.2, "IOR": 1.5}
+    glass = parts.bsdf_material(f"ShaderNodeBsdf{kind}", "glass", Color=(0.9, 0.5, 0.7, 1.0), **bending)[0]
     parts.add_plane(glass, size=4.0, location=(2.0, 0.0, 0.0))
     parts.add_plane(parts.principled("stick", **black, **glow)[0], size=0.4, location=(1.0, 0.0, 0.5))
     camera = parts.add_top_camera(4.0)
@@ -519,10 +541,10 @@ def glass_wall(kind):
 
 
 @edits_with_graphics
-@pytest.mark.parametrize("kind", ["Glass", "Refraction"])
+@pytest.mark.parametrize("kind", ["Glass", "Refraction", "Transparent"])
 def test_glass_shows_what_is_behind_tinted_and_the_reflection_before_it(kind):
     """Seen from above, of an orthographic camera: what crosses both sides of a pane is (1 - F)^2 color^2, and F is 0 of
-    what only lets light through."""
+    what only lets light through. A transparent pane has one side."""
     camera = glass_wall(kind)
 
     def draw():
@@ -533,7 +555,7 @@ def test_glass_shows_what_is_behind_tinted_and_the_reflection_before_it(kind):
     combined, specular, transmitted = with_graphics(draw)
     world, glow = np.array([0.3, 0.2, 0.1]), np.array([0.2, 0.4, 0.8])
     fresnel = 0.04 if kind == "Glass" else 0.0
-    through = (1.0 - fresnel) ** 2 * np.array([0.9, 0.5, 0.7]) ** 2
+    through = (1.0 - fresnel) ** 2 * np.array([0.9, 0.5, 0.7]) ** (1 if kind == "Transparent" else 2)
     # What is reflected of an even world is about F of it.
     reflected = at(specular, 0.5, 0.3)
     np.testing.assert_allclose(reflected, fresnel * np.array([0.9, 0.5, 0.7]) * world, rtol=0.05)

@@ -206,18 +206,19 @@ Lobe lobe_of_look(vec3 color, float roughness, float metallic, float ior, float 
     lobe.ior = -max(fuzz.y, 1e-6);
     lobe.roughness = fuzz.z;
   }
-  else if (kind != REFRACTION) {
+  else if (kind != REFRACTION && kind != FILTER) {
     lobe.diffuse = color;
   }
   return lobe;
 }
 
-/* The share of light from behind that is seen: it crosses the surface twice, on its way in and on its way out. */
+/* The share of light from behind that is seen: it crosses the surface twice, on its way in and on its way out, but that
+   of a filter once. */
 vec3 let_through(vec3 color, float metallic, float ior, float cosine)
 {
   int kind = int(look.data[0].x + 0.5);
   bool principled = kind == PRINCIPLED;
   float share = look.data[1].w * (principled ? 1.0 - metallic : 1.0);
-  float left = kind == REFRACTION ? 1.0 : 1.0 - fresnel_of_dielectric(cosine, ior);
-  return share * left * left * (principled ? color : color * color);
+  float left = kind == REFRACTION || kind == FILTER ? 1.0 : 1.0 - fresnel_of_dielectric(cosine, ior);
+  return share * left * left * (principled || kind == FILTER ? color : color * color);
 }

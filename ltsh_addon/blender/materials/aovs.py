@@ -219,10 +219,13 @@ def notes_of_material(output, shaders: graph.SurfaceShaders, emitter: bool = Fal
 
 def _tinted(leaves) -> list[str]:
     """Notes about transparency that is not clear."""
-    white = 1.0, 1.0, 1.0
-    nodes = [leaf.node for leaf in leaves if leaf.node.bl_idname == graph.CLEAR]
-    nodes = [node for node in nodes if not graph.is_constant(graph.value_of(node.inputs["Color"]), white)]
-    return [f"node {node.name!r} is shaded as clear; its color is {LEFT_OUT}" for node in nodes]
+    notes = []
+    for node in (leaf.node for leaf in leaves if leaf.node.bl_idname == graph.CLEAR):
+        color = graph.value_of(node.inputs["Color"])
+        lost = "what varies" if graph.is_socket(color) else f"up to {100.0 * (1.0 - min(color[:3])):.0f} %"
+        if not graph.is_constant(color, (1.0, 1.0, 1.0)):
+            notes.append(f"node {node.name!r} is shaded as clear, {lost} of what is behind it too much; {LEFT_OUT}")
+    return notes
 
 
 def shaded_leaves(shaders: graph.SurfaceShaders) -> tuple[list[graph.WeightedShader], list[graph.WeightedShader]]:

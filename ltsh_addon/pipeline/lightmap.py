@@ -35,14 +35,17 @@ SOFT = "soft"  # the kind of direct light that is denoised, beside the kinds of 
 
 
 def crisp_and_soft(lights: tuple[Light, ...], options: BakeOptions) -> tuple[list[Light], list[Light]]:
-    """The lights that a bake shades as they are, and those whose diffuse light Cycles bakes with the bounces: the sky.
+    """The lights that a bake shades as they are, and those whose diffuse light Cycles bakes with the bounces: the sky,
+    and with it the sun that the same world shows.
 
     Through a window few rays meet it, of ours as of Cycles' samples, and its shadows are seldom crisp.
     """
     is_soft = options.bounces == "on" and "diffuse" in rest_passes(options.passes)
     soft = [light for light in lights if is_soft and light.is_side and light.affects_diffuse]
     names = {light.name for light in soft}
-    return [replace(one, affects_diffuse=False) if one.name in names and one.is_side else one for one in lights], soft
+    return [
+        replace(one, affects_diffuse=False) if one.is_distant and one.name in names else one for one in lights
+    ], soft
 
 
 def of_passes(light: dict[tuple[str, int], np.ndarray], texels: np.ndarray, color: np.ndarray) -> tuple[dict, dict]:

@@ -115,9 +115,10 @@ class Lights(list):
         for light, row, _ in self:
             kinds.setdefault((row, light.receivers), []).append(light)
         maps = [SkyMap.of(lights) for lights in kinds.values()]
-        # With the same directions for all, the parts of a sky in several rows add up.
-        most = np.max([sky.directions for sky in maps], axis=0)
-        maps = [replace(sky, directions=most) for sky in maps]
+        if len(maps) > 1:
+            # With the same directions for all, the parts of a sky in several rows add up.
+            most = np.max([sky.directions for sky in maps], axis=0)
+            maps = [replace(sky, directions=most) for sky in maps]
         return [(sky, lights[0], row) for sky, ((row, _), lights) in zip(maps, kinds.items(), strict=True)]
 
     @cached_property

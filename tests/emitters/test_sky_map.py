@@ -51,6 +51,13 @@ def test_patches_chosen_by_lobes_give_what_the_smallest_do(technique, dtype):
         assert np.linalg.norm(own - exact) < most * np.linalg.norm(exact), name
 
 
+@pytest.mark.parametrize("passes", [("diffuse",), ("specular", "diffuse")])
+def test_a_sky_that_is_hidden_from_a_pass_gives_it_no_light(passes):
+    samples, lights = random_samples(9, seed=2), sky_lights(LIKE, pictures(8))[0]
+    found = shade(samples, [replace(light, affects_diffuse=False) for light in lights], passes=passes, workers=1)
+    assert not found.diffuse.any() and ("specular" not in passes or found.specular.any())
+
+
 SKIES = {
     "gradient": lambda d: (0.3 + 0.5 * (1.0 + d[..., 2:])) * [0.5, 0.6, 0.9],
     "sun": lambda d: [0.25, 0.45, 0.9] + (3.0 * np.exp((d @ SUN - 1.0) / 0.03))[..., None] * [1.0, 0.9, 0.7],

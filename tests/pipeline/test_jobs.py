@@ -78,6 +78,20 @@ def test_shards_of_other_options_or_scenes_are_missing(capsys, child, room, tmp_
     assert run(capsys, "merge", out)[2] == "missing: shade_0002\n"
 
 
+def test_a_fault_of_one_task_leaves_the_others(child, room, tmp_path, monkeypatch):
+    perform = batch._perform
+
+    def faulty(job, task, *others):
+        if task.frame == 2:
+            raise ValueError("zero-size array")
+        return perform(job, task, *others)
+
+    monkeypatch.setattr(batch, "_perform", faulty)
+    result = batch.run_tasks(job(room, tmp_path / "out", frames=(1, 2, 3)))
+    assert result.problems == ("shade_0002: unexpected error: ValueError: zero-size array",) and result.done == 3
+    assert {path.name for path in (tmp_path / "out").glob("*.exr")} == {"shade_0001.exr", "shade_0003.exr"}
+
+
 def test_resuming_keeps_what_the_same_job_has_done(child, room, tmp_path):
     wanted = job(room, tmp_path / "out", frames=(1, 2, 3))
     assert batch.run_tasks(wanted).done == 3

@@ -204,6 +204,12 @@ class BakeScene:
     folder: tempfile.TemporaryDirectory = field(repr=False)
     gather: FinalGather | None = None  # for bounced diffuse light, made when it is asked for
 
+    @property
+    def has_sun(self) -> bool:
+        """True if the world shows a sun, or something else that is as small and bright."""
+        name = self.world and self.world.name
+        return any(one.is_distant and not one.is_side and one.name == name for one in self.lights)
+
     def plans(self, objects, images) -> tuple[dict[str, MaterialPlan], list[str]]:
         """The plan of each material of `objects` by its full name, and warnings about them."""
         made, warnings, uv_names, displaced = {}, [], {}, set()
@@ -520,7 +526,9 @@ def _bounced(bake, opened, block, lights, sampling) -> np.ndarray:
     names, sky = lights
     with lit_by(opened, names):
         of_lights = names and frozenset(names)
-        is_gathered = opened.gather.serves(of_lights, sampling[1])
+        # Where texels should not meet the sky, later bounces meet it by chance alone, and its sun never.
+        has_sun = opened.has_sun and (names is None or opened.world.name in names)
+        is_gathered = not has_sun and opened.gather.serves(of_lights, sampling[1])
         # Samples for the direct light of an uneven sky go to its bright parts, if they are for it alone.
         has_sky = is_gathered and bool(sky) and not any(one.children for one in sky)
         if is_gathered:

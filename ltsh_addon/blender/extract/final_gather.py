@@ -29,7 +29,7 @@ MOST_OBJECTS, MOST_FACES, LEAST_OBJECTS, READ_FACES = 24, 100_000, 4, 4_000_000
 MOST_UV_MAPS = 6
 # SIDES: the least and the most texels a side of the texture; between them as many as are baked. They get a quarter of
 # the samples: means over many texels are gathered.
-SIDES = 64, 1024
+SIDES = 256, 1024
 # REACH: property of objects, texels of the texture on a metre: what is nearer than a texel is traced.
 UV_MAP, REACH, NAME = "ltsh gather", "ltsh_reach", "ltsh gather"
 SEED = 77

@@ -78,6 +78,25 @@ def test_direct_and_bounced_light_are_that_of_cycles(tmp_path):
     assert report["warnings"] == []
 
 
+@pytest.mark.parametrize("kind", ["sun", "patterns"])
+def test_a_sky_that_varies_counts_once(tmp_path, kind):
+    """It was the end of a bake; then a sun counted twice, and the gloss of surfaces that it lights was missing."""
+    corner()
+    tree = bpy.context.scene.world.node_tree
+    background = tree.nodes["Background"]
+    sky = tree.nodes.new("ShaderNodeTexSky" if kind == "sun" else "ShaderNodeTexChecker")
+    if kind == "sun":
+        sky.sun_elevation, sky.sun_rotation, background.inputs["Strength"].default_value = 0.9, 2.0, 0.05
+    else:
+        sky.inputs["Scale"].default_value = 4.0
+        tree.links.new(tree.nodes.new("ShaderNodeTexCoord").outputs["Generated"], sky.inputs["Vector"])
+    tree.links.new(sky.outputs["Color"], background.inputs["Color"])
+    _, layers, covered = lightmap(tmp_path)
+    error, mean = off(layers["ltsh4c.diffuse_light"][covered], by_cycles()[:, covered])
+    # 64 samples without the denoiser are 4.5 % off.
+    assert abs(mean) < 0.005 and error < 0.025
+
+
 def test_faces_whose_smooth_normals_turn_away_have_the_bounces_of_a_render(tmp_path):
     corner()
     # A narrow face is folded back below a wide one, to which it owes its smooth normals at the fold.

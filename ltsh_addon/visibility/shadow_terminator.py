@@ -13,8 +13,8 @@ from .occluders import ALL_RAYS, GAP, OBLIQUE, STEP, Hits, OccluderMesh, Occlude
 # rounding in single precision. 2 times are too few; 4 seem to suffice.
 CLEARANCE = 2.0**-21
 # NEARBY: distance from a sample, in m near the origin, within which its surface is looked for. LAYERS: most surfaces
-# looked at. CERTAIN: share of that distance at which a surface is close enough to stop looking.
-NEARBY, LAYERS, CERTAIN = 2.0**-14, 4, 2.0**-3
+# looked at. CERTAIN: share of that distance, 8 roundings far from the origin, at which a surface is that of the sample.
+NEARBY, LAYERS, CERTAIN = 2.0**-14, 4, 2.0**-6
 
 
 class ShadowTerminator:

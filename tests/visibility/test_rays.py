@@ -381,6 +381,20 @@ def test_lifted_rays_go_to_the_same_points(libraries):
     np.testing.assert_allclose(np.linalg.norm(aimed, axis=0), 1.0, rtol=1e-6)
 
 
+@pytest.mark.parametrize("place", [0.0, 2e4])
+def test_a_sample_below_a_near_surface_starts_on_its_own(libraries, place):
+    """Below a shelf: its light comes in sideways. 20 km away, positions are rounded to 2 mm."""
+    square = np.array([(-1.0, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)])
+    vertices = np.concatenate([square, 0.5 * square + (0.0, 0.0, 0.08)]) + (place, 0.0, 0.0)
+    mesh = OccluderMesh(vertices.astype(np.float32), np.array([(0, 1, 2), (0, 2, 3), (4, 5, 6), (4, 6, 7)]))
+    rng = np.random.default_rng(3)
+    position = np.concatenate([rng.uniform(-0.4, 0.4, (50, 2)), np.zeros((50, 1))], axis=1) + (place, 0.0, 0.0)
+    up = np.tile([0.0, 0.0, 1.0], (50, 1))
+    with open_tracer(Occluders((mesh,), [0], [np.eye(3, 4)]), libraries) as tracer:
+        starts, share = seen(tracer, surface_samples(position, up, up), np.arange(50), up.astype(np.float32))
+    assert np.abs(starts.position[:, 2]).max() < 0.01 and not share.any()
+
+
 def test_a_sample_off_all_triangles_starts_beside_its_surface(libraries):
     mesh = OccluderMesh(*sphere(8))
     with open_tracer(Occluders((mesh,), [0], [np.eye(3, 4)]), libraries) as tracer:

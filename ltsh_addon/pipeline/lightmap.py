@@ -43,9 +43,13 @@ def crisp_and_soft(lights: tuple[Light, ...], options: BakeOptions) -> tuple[lis
     is_soft = options.bounces == "on" and "diffuse" in rest_passes(options.passes)
     soft = [light for light in lights if is_soft and light.is_side and light.affects_diffuse]
     names = {light.name for light in soft}
-    return [
-        replace(one, affects_diffuse=False) if one.is_distant and one.name in names else one for one in lights
-    ], soft
+    return [_not_diffuse(one) if one.is_distant and one.name in names else one for one in lights], soft
+
+
+def _not_diffuse(light: Light) -> Light:
+    """The light, hidden from diffuse lobes with all that it is made of."""
+    parts = {"children": tuple(map(_not_diffuse, light.children))} if light.children else {}
+    return replace(light, affects_diffuse=False, **parts)
 
 
 def of_passes(light: dict[tuple[str, int], np.ndarray], texels: np.ndarray, color: np.ndarray) -> tuple[dict, dict]:

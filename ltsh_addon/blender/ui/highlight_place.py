@@ -18,7 +18,7 @@ from ..evaluated import EmitterTraits
 from ..lights.area import area_light
 from ..lights.linking import Receivers, linked_objects, receiver_collection
 from ..lights.textures import ShownTextures
-from ..materials.preview_material import COAT, METALS, PreviewMaterial, preview_of
+from ..materials.preview_material import COAT, FILTER, METALS, REFRACTION, PreviewMaterial, preview_of
 from .light_pose import LightPose
 from .lit_point import SurfaceHit, directions_around, hits_at, shipped_table, value_at_hits
 from .preview import lights_of
@@ -38,7 +38,7 @@ PIXELS = _GRID[np.hypot(*_GRID.T) <= 20.0]
 # GRID: by how many pixels, across and up, `prepare_view` looks for surfaces.
 GRID = 9
 # Kinds of lobes without a highlight.
-DULL = ("diffuse", "sheen", "velvet", "translucent")
+DULL = ("diffuse", "sheen", "velvet", "translucent", REFRACTION, FILTER)
 NO_HIGHLIGHT = "this surface has no highlight"
 BEHIND = "the light does not reach this side of the surface"
 BESIDE = "the surface bends: its highlight beside the mouse is brighter"

@@ -88,11 +88,13 @@ def test_normals_are_those_of_the_smooth_surface(scene):
 
 
 def test_dull_surfaces_say_so_and_a_sun_stays_where_it_is(scene):
-    bpy.data.objects["Plane"].data.materials[0] = parts.bsdf_material("ShaderNodeBsdfDiffuse")[0]
-    hits = hits_at(scene, 2.0 * STENCIL, Vector((1.3, -0.8, 0.0)))
     key = bpy.data.objects["Key"]
-    _, note = place_of(key, LightPose.of(key), HitsAround(hits, 2.0 * STENCIL, True), 2.0, ShownTextures())
-    assert note == NO_HIGHLIGHT
+    for kind in ("Diffuse", "Refraction", "Transparent"):
+        dull = parts.bsdf_material(f"ShaderNodeBsdf{kind}", Color=(0.9, 0.4, 0.2, 1.0))[0]
+        bpy.data.objects["Plane"].data.materials[0] = dull
+        hits = hits_at(scene, 2.0 * STENCIL, Vector((1.3, -0.8, 0.0)))
+        _, note = place_of(key, LightPose.of(key), HitsAround(hits, 2.0 * STENCIL, True), 2.0, ShownTextures())
+        assert note == NO_HIGHLIGHT, kind
     sun = parts.link(bpy.data.objects.new("Sun", bpy.data.lights.new("Sun", "SUN")), (1.0, 2.0, 3.0))
     bpy.context.view_layer.update()
     hits = hits_at(scene, 2.0 * STENCIL, Vector((0.2, -0.5, 1.1)))

@@ -304,7 +304,7 @@ TOO_MANY = f"of its {preview_material.MOST_LOBES + 2} lobes only {preview_materi
             {"principled": 1.0},
             [
                 f"Subsurface Weight of 'Principled BSDF' is shaded as diffuse reflection: {SUBSURFACE_ERROR}",
-                "Thin Film Thickness of 'Principled BSDF' is shaded as 0",
+                "Thin Film Thickness of 'Principled BSDF' is shaded as 0, 2 to 27 % off",
             ],
         ),
         (("BsdfSheen", {"distribution": "ASHIKHMIN"}), {"velvet": 1.0}, []),

@@ -7,7 +7,6 @@ by SIGTERM.
 import argparse
 import contextlib
 import errno
-import logging
 import re
 import shlex
 import sys
@@ -15,7 +14,7 @@ import sys
 from .. import interruption
 from ..pipeline.tasks import NameClash
 from ..reading import is_text
-from ..scene import VERSION, Cancelled, SceneError, error_line
+from ..scene import VERSION, Cancelled, SceneError, error_line, unexpected_error_line
 from ..shading import TableError
 from .arguments import Mistakes, Misuse
 from .commands import add_demo, add_job, add_match, add_merge, add_relight, add_run
@@ -100,8 +99,7 @@ def _explained(error) -> tuple[list[str], int]:
     if isinstance(error, KeyboardInterrupt):
         return [interruption.message(error)], interruption.exit_code(error)
     if not isinstance(error, TableError | OSError | ValueError | ImportError | Cancelled | MemoryError | SceneError):
-        logging.getLogger(__name__).error("unexpected error", exc_info=error)
-        text = f"unexpected error: {type(error).__name__}: {text}"
+        text = unexpected_error_line(error)
     return [text], 1
 
 

@@ -1,7 +1,6 @@
 """Many tasks one after another, and their reports merged."""
 
 import json
-import logging
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields, replace
@@ -11,7 +10,7 @@ from pathlib import Path
 from ..files import no_empty_folder, temporary_folder
 from ..imaging import grouped, write_json, write_overview
 from ..reading import NUMBER, Malformed, read_json
-from ..scene import Cancelled, Progress, SceneError, error_line
+from ..scene import Cancelled, Progress, SceneError, error_line, unexpected_error_line
 from . import bake, bake_files, picture, render
 from . import tasks as batch_tasks
 from .lighting import prepare
@@ -112,12 +111,8 @@ def _attempt(job, task, following, progress, alone) -> tuple[dict, dict, tuple[s
     except Exception as error:
         if alone or isinstance(error, Cancelled):
             raise
-        text = error_line(error)
-        if not isinstance(error, SceneError | OSError):
-            logging.getLogger(__name__).error("unexpected error", exc_info=error)
-            text = f"unexpected error: {type(error).__name__}: {text}"
-        problem = f"{task.name}: {text}"
-        return {"problem": problem}, {"total": time.perf_counter() - start}, ()
+        line = error_line if isinstance(error, SceneError | OSError) else unexpected_error_line
+        return {"problem": f"{task.name}: {line(error)}"}, {"total": time.perf_counter() - start}, ()
 
 
 def _finished(records, task, existing) -> dict | None:

@@ -3,6 +3,7 @@
 World space is Blender's: metres, right-handed, z up. Radiance is scene-referred linear RGB in W m^-2 sr^-1.
 """
 
+import logging
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
@@ -100,6 +101,12 @@ Progress = Callable[[str, float], "bool | None"]
 def error_line(error: BaseException) -> str:
     """The message of an error in one line of readable length; the name of its class where the message is empty."""
     return shortened(" ".join(str(error).split())) or type(error).__name__
+
+
+def unexpected_error_line(error: BaseException) -> str:
+    """The line of an error that is a fault of this program; where it happened goes to the log."""
+    logging.getLogger(__name__).error("unexpected error", exc_info=error)
+    return f"unexpected error: {type(error).__name__}: {error_line(error)}"
 
 
 def shortened(text: str, most: int = 1000) -> str:

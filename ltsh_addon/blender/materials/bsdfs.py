@@ -238,7 +238,7 @@ def notes_of(node) -> list[str]:
 
 
 def lobe_notes(node, bsdf: Bsdf, is_at: Callable[[str, float], bool]) -> list[str]:
-    """Those about its lobes; `is_at` tells whether the input of a name is a constant value."""
+    """Those of `notes_of` about the lobes; `is_at` tells whether the input of a name is a constant value."""
     notes = [f"node {node.name!r} {bsdf.nearest}"] if bsdf.nearest else []
     for name, (neutral, done) in bsdf.not_shaded.items():
         if name in node.inputs and not is_at(name, neutral):

@@ -294,11 +294,7 @@ TOO_MANY = f"of its {preview_material.MOST_LOBES + 2} lobes only {preview_materi
         (("BsdfAnisotropic", {"Anisotropy": 0.5, "Tangent": ("TexNoise", {})}), {"glossy": 1.0}, [NOT_BRUSHED]),
         (("BsdfTransparent", {"Color": GOLD}), {"filter": 1.0}, []),
         (("BsdfToon", {}), {"diffuse": 1.0}, [f"node 'Toon BSDF' {AS_DIFFUSE} of the same albedo, 27 to 72 % off"]),
-        (
-            ("SubsurfaceScattering", {}),
-            {"diffuse": 1.0},
-            [SUBSURFACE],
-        ),
+        (("SubsurfaceScattering", {}), {"diffuse": 1.0}, [SUBSURFACE]),
         (
             ("BsdfPrincipled", {"Subsurface Weight": 0.1, "Thin Film Thickness": 400.0}),
             {"principled": 1.0},

@@ -113,6 +113,8 @@ class ObjectBake:
                     maps.append(self._bake(block, "EMIT", set()))
         finally:
             cycles.use_sample_subset = False
+            for plan in self.plans:
+                plan.show(None)
         return np.array(maps)
 
     def halves(self, block: Block, kind: str, samples: int, light: set[str]) -> np.ndarray:
@@ -124,8 +126,6 @@ class ObjectBake:
     def radiance(self, block: Block, kind: str, sampling: tuple[int, int], light: set[str], how=None) -> np.ndarray:
         """Cycles' light (rows, W, 3) of the passes `light`, within the context `how`; `sampling` is a seed and a number
         of samples."""
-        for plan in self.plans:
-            plan.show(None)
         cycles, bake = self.scene.cycles, self.scene.render.bake
         cycles.seed, cycles.samples = sampling
         # Diffuse light is the same from everywhere. Seen from above, faces whose smooth normals turn away show that of

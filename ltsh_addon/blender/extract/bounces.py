@@ -42,11 +42,13 @@ def lit_by(opened, names: set[str] | None = None):
     do."""
     scene, world, dark, cuts = opened.scene, opened.world, [], []
     if names is not None:
-        lamps = {ob for ob in scene.objects if ob.type == "LIGHT"}
-        dark = [ob for ob in lamps if ob.name not in names]
-        alone = {ob.name for ob in lamps} | ({world.name} if world is not None else set())
+        lamps = {ob for ob in bpy.data.objects if ob.type == "LIGHT"}
+        alone = lamps.intersection(scene.objects)
+        has_glow = bool(names - {ob.name for ob in alone} - ({world.name} if world is not None else set()))
+        # Lamps that only instances bring shine with what glows.
+        dark = [ob for ob in lamps if not (ob.name in names if ob in alone else has_glow)]
         world = world if world is not None and world.name in names else None
-        cuts = [] if names - alone else _glowing_sockets()
+        cuts = [] if has_glow else _glowing_sockets()
     with graph.TreeChanges() as changes:
         for change in (*opened.bounces, (scene, "world", world), *((ob, "hide_render", True) for ob in dark)):
             changes.set(*change)

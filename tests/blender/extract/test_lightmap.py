@@ -104,6 +104,46 @@ def test_a_sky_that_varies_counts_once(tmp_path, kind):
     assert abs(mean) < 0.005 and error < 0.025
 
 
+@pytest.mark.parametrize("points", [1, 4])
+def test_surfaces_that_are_baked_light_those_after_them(tmp_path, points):
+    """Colors by nodes, and points off the centers of texels, are read from what the material emits for a while."""
+    corner()
+    uv = bpy.data.objects["Wall"].data.uv_layers.new(name="UVMap")
+    uv.uv.foreach_set("vector", [0.0, 0.0, 1.0, 0.0, 1.0, 1.0, 0.0, 1.0])
+    tree = bpy.data.materials["White"].node_tree
+    checker = tree.nodes.new("ShaderNodeTexChecker")
+    checker.inputs["Scale"].default_value = 2.0
+    checker.inputs["Color2"].default_value = (0.8, 0.8, 0.8, 1.0)
+    tree.links.new(checker.outputs["Color"], tree.nodes["Principled BSDF"].inputs["Base Color"])
+    options = {"passes": ("diffuse_light",), "shadows": "on", "bounces": "on", "sub_samples": points}
+    _, files = baked(save(tmp_path), tmp_path / "out", objects=("Floor", "Wall"), view="above", **options)
+    layers, truth = files["Wall.exr"], by_cycles("Wall")
+    covered = layers["coverage.hit"].reshape(SIZE, SIZE) > 0.0
+    error, mean = off(layers["ltsh4c.diffuse_light"][covered], truth[:, covered])
+    # A black floor takes .22 of the light. 64 samples without the denoiser are 5 % off.
+    assert abs(mean) < 0.01 and error < 0.03
+
+
+def test_lamps_of_instances_count_once(tmp_path):
+    corner()
+    scene, lamp, lamps = bpy.context.scene, bpy.data.objects["Key"], bpy.data.collections.new("Lamps")
+    scene.collection.objects.unlink(lamp)
+    lamps.objects.link(lamp)
+    for x in (-0.3, 0.3):
+        place = bpy.data.objects.new("Place", None)
+        place.instance_type, place.instance_collection, place.location = "COLLECTION", lamps, (x, 0.0, 0.0)
+        scene.collection.objects.link(place)
+    light = by_cycles()
+    _, layers, covered = lightmap(tmp_path)
+    error, mean = off(layers["ltsh4c.diffuse_light"][covered], light[:, covered])
+    assert abs(mean) < 0.01 and error < 0.02
+    _, layers, _ = lightmap(tmp_path / "apart", per_light=True)
+    of_lights = {name.partition("@")[2]: light for name, light in layers.items() if "@" in name}
+    assert set(of_lights) == {"World", "Glowing surfaces"}
+    whole = sum(light.astype(float) for light in of_lights.values())[covered]
+    assert abs(off(whole, light[:, covered])[1]) < 0.01
+
+
 def test_faces_whose_smooth_normals_turn_away_have_the_bounces_of_a_render(tmp_path):
     corner()
     # A narrow face is folded back below a wide one, to which it owes its smooth normals at the fold.

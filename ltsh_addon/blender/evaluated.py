@@ -75,6 +75,10 @@ def normals_at_corners(mesh) -> tuple[np.ndarray, np.ndarray]:
     return normal, flat
 
 
+GREASE_PENCIL = ("GREASEPENCIL", "GPENCIL")
+# STEPS_OF_RENDERS: what Blender does beside the engine. Freestyle, which finds no lines, would end it; compositing may
+# write files.
+STEPS_OF_RENDERS = ("use_freestyle", "use_compositing", "use_sequencer")
 SURFACE_TYPES = ("MESH", "CURVE", "SURFACE", "FONT", "META", "CURVES", "POINTCLOUD")
 
 
@@ -93,13 +97,17 @@ def with_render_depsgraph(scene, visit: Callable, *, graphics: bool = False):
             except Exception as error:
                 outcome["error"] = error
 
-    engine, filepath = scene.render.engine, scene.render.filepath
+    render = scene.render
+    saved = {name: getattr(render, name) for name in ("engine", "filepath", *STEPS_OF_RENDERS)}
     bpy.utils.register_class(Engine)
     try:
-        scene.render.engine = Engine.bl_idname
+        for name in STEPS_OF_RENDERS:
+            setattr(render, name, False)
+        render.engine = Engine.bl_idname
         bpy.ops.render.render(scene=scene.name)
     finally:
-        scene.render.engine, scene.render.filepath = engine, filepath
+        for name, value in saved.items():
+            setattr(render, name, value)
         # Blender 4.5 hangs at exit when an engine is still registered.
         bpy.utils.unregister_class(Engine)
     if not outcome:

@@ -10,7 +10,7 @@ import numpy as np
 from ..files import check_room_after
 from ..scene import Border, SceneError, listed
 from ..workers.pool import cores
-from .evaluated import SURFACE_TYPES, objects_in_views
+from .evaluated import GREASE_PENCIL, SURFACE_TYPES, objects_in_views
 
 DEFAULTS = {
     "film_exposure": 1.0,
@@ -413,9 +413,6 @@ def steps_after_rendering(scene) -> list[str]:
     if render.use_sequencer and editor is not None and len(editor.strips):
         steps.append("the video sequencer")
     return [f"scene {scene.name!r}: {step} is switched off, the passes are as rendered" for step in steps]
-
-
-GREASE_PENCIL = ("GREASEPENCIL", "GPENCIL")
 
 
 def leave_out_objects(scene, names: set[str], warnings: list[str]) -> None:

@@ -14,7 +14,7 @@ from ...files import save_array
 from ...scene import SceneError, error_line, listed
 from ...workers.pool import cores
 from .. import render_settings
-from ..evaluated import SURFACE_TYPES, objects_in_renders, objects_in_views, with_render_depsgraph
+from ..evaluated import GREASE_PENCIL, SURFACE_TYPES, objects_in_renders, objects_in_views, with_render_depsgraph
 from ..extract.occluders import with_baked_shares
 from ..extract.pixels import files_opened, missing_images, no_light, open_scene
 from ..lights.area import collect_lights, note_overlaps
@@ -302,6 +302,10 @@ def _not_shown(scene, camera) -> list[str]:
     if others:
         notes.append(f"views and renders have other modifiers or levels of subdivision of {listed(others, 4, ', ')}")
     notes += _shown_apart(_layer(scene))
+    drawn = sorted(ob.name for ob in objects_in_renders(_layer(scene)) if ob.type in GREASE_PENCIL)
+    if drawn:
+        text = "grease pencil is not in pictures of views; Blender draws it over live views and renders"
+        notes.append(f"{listed(drawn, 4, ', ')}: {text}")
     used = [layer.name for layer in scene.view_layers if layer.use]
     if len(used) > 1:
         notes.append(f"scene {scene.name!r}: only view layer {used[0]!r} of {len(used)} is shown")

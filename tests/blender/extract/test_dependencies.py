@@ -11,7 +11,7 @@ from material_scenes import Build
 from scene_parts import add_plane, add_sphere, add_world, principled
 
 from ltsh_addon import cli
-from ltsh_addon.blender.evaluated import with_render_depsgraph
+from ltsh_addon.blender.evaluated import STEPS_OF_RENDERS, with_render_depsgraph
 from ltsh_addon.blender.extract.dependencies import NotJudged, dependencies
 from ltsh_addon.blender.process.bake import BakeFactsJob
 
@@ -182,3 +182,13 @@ def test_what_cannot_be_judged_is_baked(room, capsys):
     bake(scene_parts.save(room / "again.blend"))
     assert "'Floor' has hair particles: all objects are baked again, unless" in capsys.readouterr().err
     assert not {*written(room).values()} & {*before.values()}
+
+
+def test_steps_after_a_render_do_not_run_where_a_scene_is_only_evaluated(room):
+    """Freestyle that finds no lines ends Blender; a compositor may write files."""
+    render = bpy.context.scene.render
+    render.use_freestyle = True
+    before = [getattr(render, name) for name in STEPS_OF_RENDERS]
+    bake(scene_parts.save(room / "lines.blend"))
+    digests()
+    assert [getattr(render, name) for name in STEPS_OF_RENDERS] == before

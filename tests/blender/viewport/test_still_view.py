@@ -565,7 +565,7 @@ def test_what_helps_to_trace_ends_at_rest_but_not_at_work():
 
 
 def test_what_a_view_leaves_out_is_named_and_hides_nothing(capsys, tmp_path):
-    """Hair, points, fur and a shadow catcher; and what only contributes indirectly, which nobody sees."""
+    """Hair, fur and a shadow catcher; and what only contributes indirectly, which nobody sees."""
     with_graphics(lambda: None)
     set_up_scene()
     wall = parts.add_plane(None, 4.0, "Wall", location=(0.0, -1.0, 1.0), rotation=(1.4, 0.0, 0.0))
@@ -574,7 +574,6 @@ def test_what_a_view_leaves_out_is_named_and_hides_nothing(capsys, tmp_path):
     bpy.context.view_layer.layer_collection.children["Indirect"].indirect_only = True
     path = parts.save(tmp_path / "without.blend")
     parts.link(bpy.data.objects.new("Hair", parts.hair_curves(3)))
-    parts.link(bpy.data.objects.new("Cloud", parts.point_cloud(3)))
     bpy.data.objects["Sign"].modifiers.new("Fur", "PARTICLE_SYSTEM")
     bpy.data.objects["Sign"].particle_systems[0].settings.type = "HAIR"
     bpy.data.objects["Plane"].is_shadow_catcher = True
@@ -583,7 +582,7 @@ def test_what_a_view_leaves_out_is_named_and_hides_nothing(capsys, tmp_path):
         made(capsys, "view", file, tmp_path / file.stem, "--refine", 1, "--shadows", "off") for file in (path, more)
     )
     assert plain[0]["warnings"] == []
-    for part in ("Hair", "Sign", "Cloud: point clouds", "Plane: shown as any surface"):
+    for part in ("Hair", "Sign", "Plane: shown as any surface"):
         assert any(part in line for line in report["warnings"]), (part, report["warnings"])
     np.testing.assert_array_equal(plain[1]["ltsh4c.combined"], layers["ltsh4c.combined"])
     _, shade = made(capsys, "shade", path, tmp_path / "shade", "--techniques", "ltsh4c")
@@ -598,7 +597,8 @@ def test_a_view_after_a_render_with_grease_pencil(capsys, tmp_path):
     parts.link(bpy.data.objects.new("Strokes", kinds.new("Strokes")))
     path, found = parts.save(tmp_path / "room.blend"), []
     for _ in range(2):
-        layers = made(capsys, "view", path, tmp_path / "view", "--refine", 1, "--shadows", "off")[1]
+        report, layers = made(capsys, "view", path, tmp_path / "view", "--refine", 1, "--shadows", "off")
+        assert any(line.startswith("Strokes: grease pencil is not in") for line in report["warnings"])
         found.append(layers["ltsh4c.combined"])
         made(capsys, "render", path, tmp_path / "render", "--resolution", "8x8", "--cycles-samples", 2)
     np.testing.assert_array_equal(*found)

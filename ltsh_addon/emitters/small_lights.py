@@ -138,7 +138,8 @@ class SharpestLobes:
 
 def relative_sizes(lobes, columns, rays: RaysToCenters, radius) -> np.ndarray:
     """Radii (...) of lights of `radius` m, in units of the length over which the lobes `columns` change."""
-    size = np.float32(radius) / rays.distance
+    with np.errstate(divide="ignore"):  # a sample may lie in the center of a face that shines
+        size = np.float32(radius) / rays.distance
     return size if lobes.sharpest is None else size / lobes.sharpest.lengths(columns, rays, size)
 
 

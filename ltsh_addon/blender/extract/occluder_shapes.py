@@ -4,6 +4,7 @@ flat faces and the mean width of round ones."""
 import math
 from functools import cache
 
+import bmesh
 import bpy
 import numpy as np
 
@@ -120,47 +121,43 @@ def balls(ob, clear, note) -> tuple[list[OccluderMesh], np.ndarray]:
     if not count:
         return [], ONE_INSTANCE
     note("points block as balls of 80 flat faces: the outlines of their shadows are up to 4 % of the radius off", ob)
-    radii = np.full(count, POINT_RADIUS, np.float32)
-    if "radius" in cloud.attributes:
-        radii = read_values(cloud.attributes["radius"].data, "value", (count,), np.float32)
+    positions, radii = points_of(cloud)
     matrices = np.zeros((count, 4, 4))
     matrices[:, range(3), range(3)] = radii[:, None]
-    matrices[:, :3, 3] = read_values(cloud.attributes["position"].data, "vector", (count, 3), np.float32)
+    matrices[:, :3, 3] = positions
     matrices[:, 3, 3] = 1.0
-    vertices, triangles = _ball()
+    vertices, triangles = _ball_as_wide()
     transparency, thickness = _constant_transparency(clear, ob, note), np.full(len(triangles), BALL_THICKNESS)
     return [OccluderMesh(vertices, triangles, transparency, thickness=thickness)], matrices
 
 
-@cache
-def _ball():
+def points_of(cloud) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (N, 3) and radii (N,) of a point cloud, in m."""
+    count = len(cloud.points)
+    radii = np.full(count, POINT_RADIUS, np.float32)
+    if "radius" in cloud.attributes:
+        radii = read_values(cloud.attributes["radius"].data, "value", (count,), np.float32)
+    return read_values(cloud.attributes["position"].data, "vector", (count, 3), np.float32), radii
+
+
+def _ball_as_wide():
     """Vertices and triangles of a ball of 80 triangles with the same mean shadow as a sphere of radius 1."""
-    golden = (1.0 + math.sqrt(5.0)) / 2.0
-    corners = [(0.0, a, b * golden) for a in (-1.0, 1.0) for b in (-1.0, 1.0)]
-    corners = np.array([np.roll(corner, turn) for turn in range(3) for corner in corners])
-    apart = np.linalg.norm(corners[:, None] - corners, axis=-1)
-    near = np.abs(apart - 2.0) < 1e-9
-    faces = [
-        (a, b, c) for a in range(12) for b in range(a) for c in range(b) if near[a, b] and near[b, c] and near[a, c]
-    ]
-    vertices, triangles, middles = list(corners), [], {}
-    for face in faces:
-        between = []
-        for a, b in ((0, 1), (1, 2), (2, 0)):
-            pair = tuple(sorted((face[a], face[b])))
-            if pair not in middles:
-                middles[pair] = len(vertices)
-                vertices.append(0.5 * (corners[pair[0]] + corners[pair[1]]))
-            between.append(middles[pair])
-        ab, bc, ca = between
-        triangles += [(face[0], ab, ca), (face[1], bc, ab), (face[2], ca, bc), (ab, bc, ca)]
-    vertices = np.array(vertices)
-    vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)
-    triangles = np.array(triangles)
+    vertices, triangles = ball(2)
     a, b, c = np.moveaxis(vertices[triangles], 1, 0)
     # The mean shadow of a convex body is a quarter of its surface area.
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
     return vertices * math.sqrt(4.0 * math.pi / area), triangles
+
+
+@cache
+def ball(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (V, 3) of length 1 and outward triangles (T, 3) of an icosphere: 20 for 1 subdivision, 80 for 2."""
+    mesh = bmesh.new()
+    bmesh.ops.create_icosphere(mesh, subdivisions=subdivisions, radius=1.0)
+    vertices = np.array([vertex.co for vertex in mesh.verts])
+    triangles = np.array([[vertex.index for vertex in face.verts] for face in mesh.faces])
+    mesh.free()
+    return vertices / np.linalg.norm(vertices, axis=1, keepdims=True), triangles
 
 
 def shape_key(ob) -> tuple:

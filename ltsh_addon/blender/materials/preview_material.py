@@ -512,7 +512,8 @@ class _PreviewReader:
         product = (color[:, None] * (strength @ GRAY)[:, None]).reshape(-1, 3)
         mean = product.mean(axis=0)
         off = 100.0 * np.abs(product - mean).sum(axis=-1).mean() / max(mean.sum(), 1e-30)
-        self.note_light(f"its emission varies: it shines as about the mean of its colors, {off:.0f} % off them")
+        if off > 0.0:
+            self.note_light(f"its emission varies: it shines as about the mean of its colors, {off:.0f} % off them")
         return mean
 
 

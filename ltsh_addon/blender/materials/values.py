@@ -7,8 +7,10 @@ from typing import Any
 
 import bpy
 import numpy as np
+from mathutils import Color
 
 from ...cycles.texels import EXTENSIONS, GRAY, INTERPOLATIONS
+from ...imaging.color import blackbody
 from ..evaluated import image_pixels
 from .graph import Source, source_of
 
@@ -497,6 +499,10 @@ def colors_at(socket, groups: tuple = ()) -> np.ndarray | None:
         factors = colors_at(node.inputs[0], source.groups)
         positions = EVENLY if factors is None else factors @ GRAY
         return np.array([node.color_ramp.evaluate(float(position))[:3] for position in positions], np.float64)
+    if node.bl_idname == "ShaderNodeBlackbody":
+        temperatures = colors_at(node.inputs[0], source.groups)
+        colors = () if temperatures is None else map(blackbody, temperatures @ GRAY)
+        return np.array([Color(one).from_rec709_linear_to_scene_linear() for one in colors]) if colors else None
     if node.bl_idname in TWO_COLORS:
         both = [colors_at(node.inputs[name], source.groups) for name in ("Color1", "Color2")]
         return None if any(one is None for one in both) else _mixed(*both, np.array([0.0, 1.0]))

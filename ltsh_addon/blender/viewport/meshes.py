@@ -10,9 +10,12 @@ from ...cycles import closures, horizons
 from ...cycles.horizons import unit
 from ...cycles.lobes import LEAST_VELVET, LOBE_KINDS
 from ..evaluated import interpolated_normals, read_values
+from ..extract.occluder_shapes import ball, points_of
 from ..materials.preview_material import IMAGE_SLOTS, OTHER_KINDS, PreviewMaterial
 from ..materials.values import EXTENSIONS, Value
 
+# MOST_TRIANGLES: of a point cloud, where its balls can have fewer.
+MOST_TRIANGLES = 1 << 20
 # _SAME: normals of a face and of its triangle count as equal if no component differs by more.
 _SAME = 1e-5
 
@@ -189,8 +192,10 @@ def mesh_batches(ob) -> MeshBatches | None:
 
 
 def _arrays(ob) -> _Arrays | None:
-    # Asking hair and points for a mesh is an error.
-    mesh = None if ob.type in ("CURVES", "POINTCLOUD") else ob.to_mesh()
+    if ob.type == "POINTCLOUD":
+        return _balls(*points_of(ob.data))
+    # Asking hair for a mesh is an error.
+    mesh = None if ob.type == "CURVES" else ob.to_mesh()
     if mesh is None:
         return None
     try:
@@ -217,6 +222,19 @@ def _arrays(ob) -> _Arrays | None:
     finally:
         ob.to_mesh_clear()
     return _Arrays(triangles, slots, vertex, position, normal, uv, middle, not flat.all())
+
+
+def _balls(center: np.ndarray, radius: np.ndarray) -> _Arrays | None:
+    """Smooth balls, of fewer triangles where there are many."""
+    if not len(center):
+        return None
+    normal, triangles = ball(int(np.clip(np.log2(MOST_TRIANGLES / (5.0 * len(center))) // 2.0, 1, 4)))
+    triangles = (triangles + len(normal) * np.arange(len(center))[:, None, None]).reshape(-1, 3).astype(np.int32)
+    position = (center[:, None] + radius[:, None, None] * normal).reshape(-1, 3).astype(np.float32)
+    normal = np.tile(normal, (len(center), 1)).astype(np.float32)
+    middle = 0.5 * (position.min(axis=0) + position.max(axis=0)).astype(np.float64)
+    slots, vertex = np.zeros(len(triangles), np.int32), np.arange(len(position), dtype=np.int32)
+    return _Arrays(triangles, slots, vertex, position, normal, {}, middle, is_smooth=True)
 
 
 def texture_space(ob, vertex: np.ndarray) -> np.ndarray:

@@ -229,7 +229,6 @@ def _with_nodes(light: Light, instance, sources: tuple, notes: list[str]) -> lis
 # NOT_SHOWN: notes about types of objects that views leave out. NAMED: the most names of objects in such a note.
 NOT_SHOWN = {
     "CURVES": "hair is not shown in views",
-    "POINTCLOUD": "point clouds are not shown in views",
     "VOLUME": "volumes are not shown in views",
 }
 NAMED = 3
@@ -330,11 +329,12 @@ class Changes:
             self.geometry.add(block.session_uid)
 
 
-def object_notes(depsgraph) -> list[str]:
-    """Notes about objects that renders of `depsgraph` show and views do not, kind by kind."""
+def object_notes(depsgraph, known: dict[str, str]) -> list[str]:
+    """Notes about objects that renders of `depsgraph` show otherwise than views, kind by kind; `known` are those of
+    some objects by name."""
     names_by_kind: dict[str, list[str]] = {}
     for ob in depsgraph.objects:
-        kind = NOT_SHOWN.get(ob.type)
+        kind = known.get(ob.name)
         if kind is None and ob.type in SURFACE_TYPES and ob.is_shadow_catcher:
             kind = "shown as any surface, not as shadow catcher"
         if kind is None and any(system.settings.type == "HAIR" for system in ob.particle_systems):
@@ -453,10 +453,12 @@ class SceneMirror:
     def _read_instances(self, depsgraph, changes: Changes, in_view) -> None:
         override = depsgraph.view_layer_eval.material_override
         receivers = Receivers([ob.original for ob in depsgraph.objects])
-        instances, meshes, looks = [], {}, {}
+        instances, meshes, looks, notes = [], {}, {}, {}
         users = Counter()  # instances by evaluated data, those out of view included
         for instance in depsgraph.object_instances:
             ob = instance.object
+            if instance.show_self and ob.type in NOT_SHOWN:
+                notes[ob.name] = NOT_SHOWN[ob.type]
             if not is_surface(instance):
                 continue
             data = data_pointer(ob)
@@ -479,16 +481,18 @@ class SceneMirror:
             for lobe in (lobe.look for look in shown for lobe in look.lobes):
                 if lobe.has_uv_tangent:
                     mesh.add_tangents(ob, lobe.uv_map)
-                if lobe.brush is not None and lobe.brush.direction:
+                if lobe.brush is not None and lobe.brush.direction and ob.type != "POINTCLOUD":
                     mesh.add_around(ob)
             receiver = _receiver(instance, receivers, depsgraph.view_layer)
+            if receiver == HOLDOUT and not depsgraph.scene.render.film_transparent:
+                notes[ob.name] = "the holdout shows the world in views, renders show black"
             model = instance.matrix_world.copy()
             side = -1.0 if model.determinant() < 0.0 else 1.0
             center = np.array(model) @ [*mesh.middle, 1.0]
             instances.append((data, (mesh, model, shown, receiver, side, center)))
         self.instances = [ShownInstance(*values, is_only_user=users[data] == 1) for data, values in instances]
         self._meshes, self._looks = meshes, looks
-        self._object_notes = tuple(object_notes(depsgraph))
+        self._object_notes = tuple(object_notes(depsgraph, notes))
 
     def _read_world(self, world) -> None:
         radiance, whole = world_radiance(world)

@@ -473,6 +473,23 @@ def test_glowing_faces_of_colors_that_views_cannot_read_shine(node, color, note)
     assert any(note in line for line in preview_of(bpy.data.materials["Glow"]).notes)
 
 
+@pytest.mark.parametrize("temperature", [2000.0, 3200.0, 6500.0, 15000.0])
+def test_faces_that_glow_by_their_temperature_have_its_color(temperature):
+    """That of a lamp, which Blender tells."""
+    parts.empty_scene()
+    parts.add_camera()
+    material = glowing("ShaderNodeBlackbody")
+    node = next(one for one in material.node_tree.nodes if one.bl_idname == "ShaderNodeBlackbody")
+    node.inputs[0].default_value = temperature
+    parts.add_plane(material, size=1.0)
+    lamp = bpy.data.lights.new("Lamp", "POINT")
+    lamp.use_temperature, lamp.temperature = True, temperature
+    for light in seen()[0]:
+        # Of the color matching functions' sums of lobes.
+        np.testing.assert_allclose(light.radiance, 3.0 * np.array(lamp.temperature_color[:3]), rtol=0.03, atol=0.01)
+    assert not preview_of(material).notes
+
+
 @pytest.mark.newest
 def test_some_of_very_many_glowing_faces_shine_for_all():
     parts.empty_scene()

@@ -27,11 +27,41 @@ def test_what_cameras_do_not_see_is_not_shown(tmp_path):
     bpy.context.view_layer.update()
     ((picture, notes),) = with_graphics(lambda: [viewport_picture(camera, "diffuse")])
     expected, square = sampled_pictures(tmp_path / "hidden.blend", ("diffuse",), 1)
-    assert notes == []
+    assert notes == ["Plane.002: the holdout shows the world in views, renders show black"]
     hidden = expected["diffuse"].max(axis=-1) == 0.0
     assert hidden.sum() > 100 and not hidden.all()
     same = (times_too_far(picture, expected["diffuse"]) < 1.0).all(axis=-1)
     assert same[away_from_edges(np.where(hidden, 99, square))].all()
+    bpy.context.scene.render.film_transparent = True
+    bpy.context.view_layer.update()
+    assert with_graphics(lambda: [viewport_picture(camera, "diffuse")])[0][1] == []
+
+
+@edits_with_graphics
+def test_points_are_balls_also_where_nodes_make_them(tmp_path):
+    _, camera = patches_of([chalk] * 4)
+    cloud = parts.link(bpy.data.objects.new("Cloud", parts.point_cloud(6)))
+    cloud.data.materials.append(chalk())
+    cloud.scale, cloud.location = (1.5, 1.5, 1.5), (0.0, 0.0, -1.0)
+    nodes = bpy.data.node_groups.new("Points", "GeometryNodeTree")
+    nodes.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
+    made, radius, end = (
+        nodes.nodes.new(kind) for kind in ("GeometryNodePoints", "GeometryNodeSetMaterial", "NodeGroupOutput")
+    )
+    made.inputs["Count"].default_value, made.inputs["Radius"].default_value = 1, 0.5
+    made.inputs["Position"].default_value, radius.inputs["Material"].default_value = (1.0, 0.0, 0.5), chalk()
+    nodes.links.new(made.outputs[0], radius.inputs[0])
+    nodes.links.new(radius.outputs[0], end.inputs[0])
+    bpy.data.objects["Plane"].modifiers.new("Points", "NODES").node_group = nodes
+    bpy.context.view_layer.update()
+    ((picture, notes),) = with_graphics(lambda: [viewport_picture(camera, "diffuse")])
+    expected = sampled_pictures(tmp_path / "points.blend", ("diffuse",), 1)[0]["diffuse"]
+    assert notes == []
+    lit, shown = (one.max(axis=-1) > 0.0 for one in (expected, picture))
+    # Balls of 1,280 flat faces reach up to .5 % of their radius less far, and shade by the normals of spheres.
+    assert (lit != shown).sum() < 0.01 * lit.sum()
+    far = np.abs(picture - expected).max(axis=-1) > 0.1 * expected.mean()
+    assert far.sum() < 0.03 * lit.sum()
 
 
 @edits_with_graphics
@@ -90,11 +120,11 @@ def test_metaballs_that_a_view_misses_are_named():
         bpy.context.view_layer.update()
         graph = bpy.context.evaluated_depsgraph_get()
         faces = sum(len(one.object.to_mesh().polygons) for one in graph.object_instances if one.object.type == "MESH")
-        notes = object_notes(graph)
+        notes = object_notes(graph, {})
         missing += faces == 0
         silent += not notes
         assert faces or "Balls: balls smaller" in notes[0]
         balls.render_resolution = balls.resolution
         bpy.context.view_layer.update()
-        assert not object_notes(bpy.context.evaluated_depsgraph_get())  # renders miss it too
+        assert not object_notes(bpy.context.evaluated_depsgraph_get(), {})  # renders miss it too
     assert missing > 4 and silent > 4

@@ -79,18 +79,26 @@ class Planes:
         return np.unpackbits(self._covered[first:last], axis=1, count=self.shape[1]).view(bool)
 
     def fit(self, seams: SeamFit) -> None:
-        """Let light, as far as it is not an error or Cycles' own, fit at smooth seams; the margin there goes on."""
+        """Let light, as far as it is not an error or Cycles' own, fit at smooth seams; the margin there goes on. Light
+        of which each light's own is kept is the sum of these."""
         height, width = self.shape
-        for layer in dict.fromkeys(name.rpartition(".")[0] for name in self.names):
+        layers = list(dict.fromkeys(name.rpartition(".")[0] for name in self.names))
+        for layer in sorted(layers, key=lambda layer: "@" not in layer):
             names = [f"{layer}.{letter}" for letter in "RGB"]
-            image = np.stack([self._rows(name, 0, height) for name in names], axis=-1)
-            seams.fit(image, changed=not layer.startswith((exr.ERROR, *exr.CYCLES_LAYERS)))
+            of_lights = [one for one in layers if one.startswith(f"{layer}@")]
+            image = sum(map(self._image, of_lights)) if of_lights else self._image(layer)
+            if not of_lights:
+                seams.fit(image, changed=not layer.startswith((exr.ERROR, *exr.CYCLES_LAYERS)))
             for name, plane in zip(names, np.moveaxis(image, -1, 0), strict=True):
                 self._files[name].seek(0)
                 self._files[name].write(np.ascontiguousarray(plane))
         margin = np.zeros(height * width, bool)
         margin[seams.margin] = True
         self._beyond_seams = np.packbits(margin.reshape(height, width), axis=1)
+
+    def _image(self, layer: str) -> np.ndarray:
+        """The image (H, W, 3) of a layer."""
+        return np.stack([self._rows(f"{layer}.{letter}", 0, self.shape[0]) for letter in "RGB"], axis=-1)
 
     def _known(self, first: int, last: int) -> np.ndarray:
         """Mask (last - first, W) of the texels that have values."""

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from bake_scenes import SIZE, baked, save, start
 from material_scenes import Build
-from scene_parts import add_mesh, add_plane, add_sphere, add_world, principled
+from scene_parts import add_area_light, add_mesh, add_plane, add_sphere, add_world, principled
 
 pytestmark = pytest.mark.newest
 LIGHTMAP = {"shadows": "on", "bounces": "on", "view": "above"}
@@ -70,6 +70,22 @@ def test_steps_at_seams_are_below_a_hundredth_of_the_light(kind, tmp_path):
     steps = np.abs(one - other).max(axis=-1) / mean
     # A tenth of it was seen, a quarter in the dark without a sky.
     assert len(steps) > 500 and steps.max() < 0.01
+
+
+def test_a_lightmap_is_the_sum_of_its_lights_at_seams_too(tmp_path):
+    """Each is fitted, and kept from swinging below black, by itself."""
+    chalk = lit_floor()
+    bpy.ops.mesh.primitive_monkey_add(size=0.8, location=(0.0, 0.0, 0.5))
+    bpy.context.object.name = "Many islands"
+    bpy.context.object.data.polygons.foreach_set("use_smooth", [True] * len(bpy.context.object.data.polygons))
+    bpy.context.object.data.materials.append(chalk)
+    add_area_light("Side", (1.0, -1.0, 1.0), (0.9, 0.0, 0.8), size=0.05, size_y=0.05)
+    options = {"passes": ("diffuse_light",), "objects": ("Many islands",), "per_light": True, "margin": 4}
+    _, files = baked(save(tmp_path), tmp_path / "out", size=(128, 128), atlas=128, **options, **LIGHTMAP)
+    (layers,) = files.values()
+    whole = sum(layer.astype(float) for name, layer in layers.items() if "@" in name)
+    # Half floats have 11 bits.
+    assert np.abs(whole - layers["ltsh4c.diffuse_light"]).max() < 1e-3 * whole.max()
 
 
 def normal_map():

@@ -510,11 +510,11 @@ LEVELS = (
 
 def show_as_views(scene, layer, hidden: tuple[str, ...]) -> None:
     """Let renders show what views show, in their detail; but for the objects `hidden`."""
-    shown = {ob for ob in objects_in_views(layer) if ob.name not in hidden}
+    shown, of_layer = {ob for ob in objects_in_views(layer) if ob.name not in hidden}, set(layer.objects)
     for collection in bpy.data.collections:
         collection.hide_render = False
     for ob in bpy.data.objects:
-        ob.hide_render = ob not in shown if ob.name in layer.objects else ob.hide_viewport
+        ob.hide_render = ob not in shown if ob in of_layer else ob.hide_viewport
         details = [ob, *ob.modifiers, *(() if ob.data is None else (ob.data,))]
         for owner in details:
             _take_levels(owner)

@@ -43,10 +43,10 @@ def lit_by(opened, names: set[str] | None = None):
     scene, world, dark, cuts = opened.scene, opened.world, [], []
     if names is not None:
         lamps = {ob for ob in bpy.data.objects if ob.type == "LIGHT"}
-        alone = lamps.intersection(scene.objects)
-        has_glow = bool(names - {ob.name for ob in alone} - ({world.name} if world is not None else set()))
-        # Lamps that only instances bring shine with what glows.
-        dark = [ob for ob in lamps if not (ob.name in names if ob in alone else has_glow)]
+        alone = {ob.name for ob in lamps.intersection(scene.objects)}
+        has_glow = bool(names - alone - ({world.name} if world is not None else set()))
+        # Lamps that only instances bring shine with what glows, or with one of the scene that has the same name.
+        dark = [ob for ob in lamps if not (ob.name in names if ob.name in alone else has_glow)]
         world = world if world is not None and world.name in names else None
         cuts = [] if has_glow else _glowing_sockets()
     with graph.TreeChanges() as changes:

@@ -17,7 +17,7 @@ from graphics_card import edits_with_graphics, with_graphics
 from view_pictures import OpenView
 
 from ltsh_addon.blender.process.view import OWN_ERROR, RestJob, RestView, WholePictureError, marked_depth
-from ltsh_addon.blender.render_settings import render_exr
+from ltsh_addon.blender.render_settings import render_exr, show_as_views
 from ltsh_addon.blender.viewport import rest
 from ltsh_addon.blender.viewport.drawing import float_texture, read_texture
 from ltsh_addon.blender.viewport.pictures import ShownPicture, ShownRest
@@ -81,6 +81,25 @@ def test_a_view_with_bounces_is_the_picture_of_cycles(tmp_path, capsys):
         assert any("not resolved" in line for line in report["warnings"]) == (bounces == "off")
     # 64 samples, denoised, and 17 points at the edges of highlights leave some percent; without, a fifth is missing.
     assert errors["on"] < 0.06 and errors["off"] > 0.2, errors
+
+
+def test_linked_objects_that_have_the_name_of_a_local_one_are_rendered(tmp_path):
+    parts.empty_scene()
+    lamps = bpy.data.collections.new("Lamps")
+    bpy.context.scene.collection.children.link(lamps)
+    lamps.objects.link(parts.add_area_light("Key"))
+    library = str(parts.save(tmp_path / "library.blend"))
+    scene = parts.empty_scene()
+    parts.add_area_light("Key")
+    with bpy.data.libraries.load(library, link=True) as (_, wanted):
+        wanted.collections = ["Lamps"]
+    place = parts.link(bpy.data.objects.new("Place", None))
+    place.instance_type, place.instance_collection = "COLLECTION", wanted.collections[0]
+    show_as_views(scene, bpy.context.view_layer, ())
+    keys = [ob for ob in bpy.data.objects if ob.name == "Key"]
+    assert len(keys) == 2 and not any(ob.hide_render for ob in keys)
+    show_as_views(scene, bpy.context.view_layer, ("Key",))
+    assert {ob.library is None: ob.hide_render for ob in keys} == {True: True, False: False}
 
 
 @pytest.mark.newest

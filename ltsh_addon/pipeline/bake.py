@@ -250,7 +250,7 @@ class ObjectBaker:
         if options.atlas is not None:
             counts["member_texels"] = dict(zip(self.record["members"], of_members.tolist(), strict=True))
         if seams is not None:
-            planes.fit(seams)
+            planes.fit(seams, is_sum=options.per_light)
         return {**counts, "unshaded_texels": unshaded, "unbaked_texels": unbaked, "is_lit": lit, **facts}
 
     def _tell(self, progress, stage: str, share: float) -> None:

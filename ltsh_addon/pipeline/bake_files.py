@@ -78,14 +78,16 @@ class Planes:
         """Mask (last - first, W) of the texels that were put."""
         return np.unpackbits(self._covered[first:last], axis=1, count=self.shape[1]).view(bool)
 
-    def fit(self, seams: SeamFit) -> None:
-        """Let light, as far as it is not an error or Cycles' own, fit at smooth seams; the margin there goes on. Light
-        of which each light's own is kept is the sum of these."""
+    def fit(self, seams: SeamFit, *, is_sum: bool) -> None:
+        """Let light, as far as it is not an error or Cycles' own, fit at smooth seams; the margin there goes on.
+
+        `is_sum`: light of which that of each light is kept is the sum of these.
+        """
         height, width = self.shape
         layers = list(dict.fromkeys(name.rpartition(".")[0] for name in self.names))
         for layer in sorted(layers, key=lambda layer: "@" not in layer):
             names = [f"{layer}.{letter}" for letter in "RGB"]
-            of_lights = [one for one in layers if one.startswith(f"{layer}@")]
+            of_lights = [one for one in layers if is_sum and one.startswith(f"{layer}@")]
             image = sum(map(self._image, of_lights)) if of_lights else self._image(layer)
             if not of_lights:
                 seams.fit(image, changed=not layer.startswith((exr.ERROR, *exr.CYCLES_LAYERS)))

@@ -66,8 +66,12 @@ def lightmap(tmp_path, **options):
     return report, layers, layers["coverage.hit"].reshape(SIZE, SIZE) > 0.0
 
 
-def test_direct_and_bounced_light_are_that_of_cycles(tmp_path):
+@pytest.mark.parametrize("group", ["", "Lamps"])
+def test_direct_and_bounced_light_are_that_of_cycles(tmp_path, group):
     corner()
+    if group:
+        bpy.context.view_layer.lightgroups.add(name=group)
+        bpy.data.objects["Key"].lightgroup = group
     report, layers, covered = lightmap(tmp_path)
     truth = by_cycles()[:, covered]
     error, mean = off(layers["ltsh4c.diffuse_light"][covered], truth)

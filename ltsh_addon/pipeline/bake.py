@@ -378,11 +378,12 @@ class ObjectBaker:
             shaded = lighting.shade_lights(samples, self.lights, table, wanted, (shadows,), workers=workers)[0]
             radiance = {name: _summed(getattr(shaded, name), texel, count) for name in wanted}
         if "diffuse_light" in self.options.passes:
-            first = _first_samples(texel)
-            white = replace(samples.take(first), diffuse_albedo=np.ones((len(first), 3)))
-            shadows = None if shadows is None else shadows.take(first)
+            share = lightmap.diffuse_shares(samples.diffuse_albedo, texel)
+            some = np.flatnonzero(share.any(axis=1))
+            white = replace(samples.take(some), diffuse_albedo=share[some])
+            shadows = None if shadows is None else shadows.take(some)
             (lit,) = lighting.shade_lights(white, self.lights, table, ("diffuse",), (shadows,), workers=workers)
-            radiance["diffuse_light"] = _summed(lit.diffuse, texel[first], count)
+            radiance["diffuse_light"] = _summed(lit.diffuse, texel[some], count)
         if COMBINED in self.options.passes:
             radiance[COMBINED] = radiance["specular"] + radiance["diffuse"]
         return {name: radiance[name] for name in self.options.passes}

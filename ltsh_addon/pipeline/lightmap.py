@@ -52,6 +52,15 @@ def _not_diffuse(light: Light) -> Light:
     return replace(light, affects_diffuse=False, **parts)
 
 
+def diffuse_shares(albedo: np.ndarray, texel: np.ndarray) -> np.ndarray:
+    """The shares (S, 3) of samples in the diffuse `albedo` (S, 3) of their sorted texels (S,); of one that is black, all
+    is that of its first sample."""
+    is_first = np.ones(len(texel), bool)
+    is_first[1:] = texel[1:] != texel[:-1]
+    total = np.add.reduceat(albedo, np.flatnonzero(is_first))[np.cumsum(is_first) - 1]
+    return np.where(total > 0.0, albedo / np.where(total > 0.0, total, 1.0), is_first[:, None])
+
+
 def of_passes(light: dict[tuple[str, int], np.ndarray], texels: np.ndarray, color: np.ndarray) -> tuple[dict, dict]:
     """Denoised `light` by pass on the `texels` (Q,) of the diffuse `color` (Q, 3): bounced (R, Q, 3), and soft (Q, 3).
 

@@ -6,6 +6,7 @@ import bpy
 import numpy as np
 import pytest
 from bake_scenes import SIZE, baked, save, start
+from material_scenes import Build
 from scene_parts import add_bump, add_mesh, add_plane, add_sphere, add_world, principled
 
 from ltsh_addon.blender.extract.bake import SAMPLED_TEXELS
@@ -125,6 +126,20 @@ def test_surfaces_that_are_baked_light_those_after_them(tmp_path, points):
     covered = layers["coverage.hit"].reshape(SIZE, SIZE) > 0.0
     error, mean = off(layers["ltsh4c.diffuse_light"][covered], truth[:, covered])
     # A black floor takes .22 of the light. 64 samples without the denoiser are 5 % off.
+    assert abs(mean) < 0.01 and error < 0.03
+
+
+def test_leaves_are_lit_from_both_sides(tmp_path):
+    """A lightmap's light is that of all diffuse lobes of a texel, by their shares in its color."""
+    corner()
+    made = Build("Leaf")
+    front = made.shader("BsdfDiffuse", Color=(0.2, 0.6, 0.2, 1.0))
+    made.show(made.mix(0.5, front, made.shader("BsdfTranslucent", Color=(0.6, 0.6, 0.2, 1.0))))
+    add_plane(made.material, size=0.8, name="Leaf", location=(-0.3, 0.0, 0.7))
+    light = by_cycles("Leaf")
+    _, layers, covered = lightmap(tmp_path, objects=("Leaf",))
+    error, mean = off(layers["ltsh4c.diffuse_light"][covered], light[:, covered])
+    # One side alone would be 86 % too bright.
     assert abs(mean) < 0.01 and error < 0.03
 
 

@@ -53,8 +53,8 @@ def _not_diffuse(light: Light) -> Light:
 
 
 def diffuse_shares(albedo: np.ndarray, texel: np.ndarray) -> np.ndarray:
-    """The shares (S, 3) of samples in the diffuse `albedo` (S, 3) of their sorted texels (S,); of one that is black, all
-    is that of its first sample."""
+    """The shares (S, 3) of samples in the diffuse `albedo` (S, 3) of their sorted texels (S,); of one that is black,
+    all is that of its first sample."""
     is_first = np.ones(len(texel), bool)
     is_first[1:] = texel[1:] != texel[:-1]
     total = np.add.reduceat(albedo, np.flatnonzero(is_first))[np.cumsum(is_first) - 1]

@@ -430,6 +430,9 @@ class BakeOptions(TaskOptions):
     def __post_init__(self):
         if self.atlas is not None:
             object.__setattr__(self, "size", (self.atlas, self.atlas))
+        if set(self.passes) == {"diffuse_light"}:
+            # The same from everywhere, but for lobes that turn away from a camera.
+            object.__setattr__(self, "view", "above")
 
 
 @dataclass(frozen=True)

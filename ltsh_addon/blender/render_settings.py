@@ -509,12 +509,13 @@ LEVELS = (
 
 
 def show_as_views(scene, layer, hidden: tuple[str, ...]) -> None:
-    """Let renders show what views show, in their detail; but for the objects `hidden`."""
+    """Let renders show what views show, in their detail; but for the objects `hidden` and for grease pencil."""
     shown, of_layer = {ob for ob in objects_in_views(layer) if ob.name not in hidden}, set(layer.objects)
     for collection in bpy.data.collections:
         collection.hide_render = False
     for ob in bpy.data.objects:
-        ob.hide_render = ob not in shown if ob in of_layer else ob.hide_viewport
+        is_hidden = ob not in shown if ob in of_layer else ob.hide_viewport
+        ob.hide_render = is_hidden or ob.type in GREASE_PENCIL  # Blender draws that over renders and views
         details = [ob, *ob.modifiers, *(() if ob.data is None else (ob.data,))]
         for owner in details:
             _take_levels(owner)

@@ -523,12 +523,7 @@ def _summed(radiance, texel, count):
     """Radiance (G, count, 3) of texels: the sums over their samples (G, S, 3)."""
     if len(texel) == count:
         return radiance
-    return np.add.reduceat(radiance, _first_samples(texel), axis=1)
-
-
-def _first_samples(texel: np.ndarray) -> np.ndarray:
-    """The number of the first sample of each texel, of the sorted texels (S,) of samples."""
-    return np.flatnonzero(np.concatenate([[True], texel[1:] != texel[:-1]])) if len(texel) else texel
+    return np.add.reduceat(radiance, lightmap.first_samples(texel), axis=1)
 
 
 def _report(options, manifest, records) -> dict:

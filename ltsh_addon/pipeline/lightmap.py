@@ -55,10 +55,15 @@ def _not_diffuse(light: Light) -> Light:
 def diffuse_shares(albedo: np.ndarray, texel: np.ndarray) -> np.ndarray:
     """The shares (S, 3) of samples in the diffuse `albedo` (S, 3) of their sorted texels (S,); of one that is black,
     all is that of its first sample."""
-    is_first = np.ones(len(texel), bool)
-    is_first[1:] = texel[1:] != texel[:-1]
-    total = np.add.reduceat(albedo, np.flatnonzero(is_first))[np.cumsum(is_first) - 1]
-    return np.where(total > 0.0, albedo / np.where(total > 0.0, total, 1.0), is_first[:, None])
+    first, otherwise = first_samples(texel), np.zeros_like(albedo[:, :1])
+    otherwise[first] = 1.0
+    total = np.add.reduceat(albedo, first).repeat(np.diff(first, append=len(texel)), axis=0)
+    return np.where(total > 0.0, albedo / np.where(total > 0.0, total, 1.0), otherwise)
+
+
+def first_samples(texel: np.ndarray) -> np.ndarray:
+    """The number of the first sample of each texel, of the sorted texels (S,) of samples."""
+    return np.flatnonzero(np.concatenate([[True], texel[1:] != texel[:-1]])) if len(texel) else texel
 
 
 def of_passes(light: dict[tuple[str, int], np.ndarray], texels: np.ndarray, color: np.ndarray) -> tuple[dict, dict]:

@@ -118,7 +118,7 @@ class EngineView:
             texts = ViewTexts(self._note(error))
             _clear(target)
         has_rest = self._renderer is not None and self._renderer.rest is not None
-        of_scene = self.mirror.notes_with_rest if has_rest else self.mirror.notes
+        of_scene = self.mirror.notes_with_rest(self._renderer.rest.is_everything) if has_rest else self.mirror.notes
         notes = [*texts.notes, *of_scene, *self._shadow_notes(context.region)]
         notes += self.rest.notes
         if not texts.error and not self.mirror.lights and not self.mirror.sky.sides:

@@ -24,8 +24,13 @@ def bounces_of(scene) -> list[tuple]:
 
 def lights_by_row(scene, world, lights: list) -> list:
     """The lights with the group by whose name they are baked for themselves: their own, else one of their name."""
-    alone = {ob.name for ob in scene.objects if ob.type == "LIGHT"} | ({world.name} if world is not None else set())
+    alone = _alone(scene, world)
     return [replace(one, group=(one.group or one.name) if one.name in alone else GLOW) for one in lights]
+
+
+def _alone(scene, world) -> set[str]:
+    """The names of the scene's own lamps and of its world, which have rows of their own."""
+    return {ob.name for ob in scene.objects if ob.type == "LIGHT"} | ({world.name} if world is not None else set())
 
 
 def rows_of_lights(scene) -> int:
@@ -42,9 +47,8 @@ def lit_by(opened, names: set[str] | None = None):
     do."""
     scene, world, dark, cuts = opened.scene, opened.world, [], []
     if names is not None:
-        lamps = {ob for ob in bpy.data.objects if ob.type == "LIGHT"}
-        alone = {ob.name for ob in lamps.intersection(scene.objects)}
-        has_glow = bool(names - alone - ({world.name} if world is not None else set()))
+        alone = _alone(scene, world)
+        has_glow, lamps = not names <= alone, [ob for ob in bpy.data.objects if ob.type == "LIGHT"]
         # Lamps that only instances bring shine with what glows, or with one of the scene that has the same name.
         dark = [ob for ob in lamps if not (ob.name in names if ob.name in alone else has_glow)]
         world = world if world is not None and world.name in names else None

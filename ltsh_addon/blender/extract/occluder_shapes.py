@@ -34,10 +34,7 @@ def tubes_of_curves(ob, clear, note) -> list[OccluderMesh]:
     if not points:
         return []
     note(TUBES, ob)
-    positions = read_values(curves.attributes["position"].data, "vector", (points, 3), np.float32)
-    radii = np.full(points, POINT_RADIUS, np.float32)
-    if "radius" in curves.attributes:
-        radii = read_values(curves.attributes["radius"].data, "value", (points,), np.float32)
+    positions, radii = points_of(curves)
     first = read_values(curves.curves, "first_point_index", (len(curves.curves),), np.int32)
     return [_tubes(positions, radii, first, _constant_transparency(clear, ob, note))]
 
@@ -121,23 +118,22 @@ def balls(ob, clear, note) -> tuple[list[OccluderMesh], np.ndarray]:
     if not count:
         return [], ONE_INSTANCE
     note("points block as balls of 80 flat faces: the outlines of their shadows are up to 4 % of the radius off", ob)
-    positions, radii = points_of(cloud)
     matrices = np.zeros((count, 4, 4))
+    matrices[:, :3, 3], radii = points_of(cloud)
     matrices[:, range(3), range(3)] = radii[:, None]
-    matrices[:, :3, 3] = positions
     matrices[:, 3, 3] = 1.0
     vertices, triangles = _ball_as_wide()
     transparency, thickness = _constant_transparency(clear, ob, note), np.full(len(triangles), BALL_THICKNESS)
     return [OccluderMesh(vertices, triangles, transparency, thickness=thickness)], matrices
 
 
-def points_of(cloud) -> tuple[np.ndarray, np.ndarray]:
-    """Positions (N, 3) and radii (N,) of a point cloud, in m."""
-    count = len(cloud.points)
+def points_of(data) -> tuple[np.ndarray, np.ndarray]:
+    """Positions (N, 3) and radii (N,) of the points of a point cloud or of hair curves, in m."""
+    count = len(data.points)
     radii = np.full(count, POINT_RADIUS, np.float32)
-    if "radius" in cloud.attributes:
-        radii = read_values(cloud.attributes["radius"].data, "value", (count,), np.float32)
-    return read_values(cloud.attributes["position"].data, "vector", (count, 3), np.float32), radii
+    if "radius" in data.attributes:
+        radii = read_values(data.attributes["radius"].data, "value", (count,), np.float32)
+    return read_values(data.attributes["position"].data, "vector", (count, 3), np.float32), radii
 
 
 def _ball_as_wide():

@@ -501,8 +501,10 @@ def colors_at(socket, groups: tuple = ()) -> np.ndarray | None:
         return np.array([node.color_ramp.evaluate(float(position))[:3] for position in positions], np.float64)
     if node.bl_idname == "ShaderNodeBlackbody":
         temperatures = colors_at(node.inputs[0], source.groups)
-        colors = () if temperatures is None else map(blackbody, temperatures @ GRAY)
-        return np.array([Color(one).from_rec709_linear_to_scene_linear() for one in colors]) if colors else None
+        if temperatures is None:
+            return None
+        colors = [Color(blackbody(one)) for one in temperatures @ GRAY]
+        return np.array([color.from_rec709_linear_to_scene_linear() for color in colors])
     if node.bl_idname in TWO_COLORS:
         both = [colors_at(node.inputs[name], source.groups) for name in ("Color1", "Color2")]
         return None if any(one is None for one in both) else _mixed(*both, np.array([0.0, 1.0]))

@@ -389,11 +389,11 @@ class SceneMirror:
         notes = self.material_notes, self._object_notes, self._light_notes, self._world_note, self._limit_notes
         return list(dict.fromkeys(note for kind in notes for note in kind))
 
-    @property
-    def notes_with_rest(self) -> list[str]:
-        """Those of them that remain when Cycles adds the rest."""
-        of_materials = [note for shown in self._looks.values() for note in shown.look.notes_in_view(with_bounces=True)]
-        return list(dict.fromkeys([*of_materials, *self._light_notes, *self._world_note, *self._limit_notes]))
+    def notes_with_rest(self, is_everything: bool) -> list[str]:
+        """Those of them that remain when Cycles adds the rest; `is_everything`: that is the whole picture."""
+        materials = [note for shown in self._looks.values() for note in shown.look.notes_in_view(with_bounces=True)]
+        objects = () if is_everything else self._object_notes
+        return list(dict.fromkeys([*materials, *objects, *self._light_notes, *self._world_note, *self._limit_notes]))
 
     @property
     def material_notes(self) -> list[str]:

@@ -25,7 +25,7 @@ from mathutils import Matrix
 from ...files import save_array
 from ...scene import SceneError, error_line
 from .. import render_settings
-from ..evaluated import GREASE_PENCIL, objects_in_views
+from ..evaluated import objects_in_views
 from ..extract.finished import reasons_for_cycles
 from ..extract.pixels import files_opened, open_scene, scene_named
 from ..materials.graph import ensure_nodes, has_volume
@@ -505,9 +505,6 @@ def _prepare(scene, layer) -> None:
     layer.cycles.denoising_store_passes = True
     aov = layer.aovs.add()
     aov.name, aov.type = MASK, "VALUE"
-    for ob in scene.objects:
-        # Blender draws it over every render and view.
-        ob.hide_render |= ob.type in GREASE_PENCIL
     _mark_materials()
 
 

@@ -357,7 +357,7 @@ def _draw(
     scene, mirror, depsgraph = opened.scene, opened.mirror(), opened.depsgraph()
     if not mirror.lights and not mirror.sky.sides:
         raise no_light(scene, mirror.notes)
-    notes, shadows = list(mirror.notes if job.rest is None else mirror.notes_with_rest), None
+    notes, shadows = mirror.notes if job.rest is None else mirror.notes_with_rest(job.is_everything), None
     if opened.tracing is not None:
         problem = too_many(len(mirror.lights), size)
         rays = max(min(FEWEST_RAYS, job.shadow_rays), job.shadow_rays // job.refine)

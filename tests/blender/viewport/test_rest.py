@@ -102,6 +102,17 @@ def test_linked_objects_that_have_the_name_of_a_local_one_are_rendered(tmp_path)
     assert {ob.library is None: ob.hide_render for ob in keys} == {True: True, False: False}
 
 
+def test_grease_pencil_is_not_in_the_rest():
+    scene = parts.empty_scene()
+    kinds = bpy.data.grease_pencils_v3 if hasattr(bpy.data, "grease_pencils_v3") else bpy.data.grease_pencils
+    strokes = parts.link(bpy.data.objects.new("Strokes", kinds.new("Strokes")))
+    light = parts.add_area_light()
+    # Jobs with other frames, or things to hide, choose again.
+    for _ in range(2):
+        show_as_views(scene, bpy.context.view_layer, ())
+        assert strokes.hide_render and not light.hide_render
+
+
 @pytest.mark.newest
 @pytest.mark.parametrize("kind", ["shifted", "parallel"])
 def test_the_camera_of_a_region_has_its_matrices(kind):

@@ -5,7 +5,7 @@ import numpy as np
 import scene_parts as parts
 from graphics_card import edits_with_graphics, with_graphics
 from lit_plane import add_instancer, into_collection
-from view_pictures import SIZE, away_from_edges, patches_of, sampled_pictures, times_too_far, viewport_picture
+from view_pictures import SIZE, OpenView, away_from_edges, patches_of, sampled_pictures, times_too_far, viewport_picture
 
 from ltsh_addon.blender.viewport.mirror import object_notes
 
@@ -32,6 +32,13 @@ def test_what_cameras_do_not_see_is_not_shown(tmp_path):
     assert hidden.sum() > 100 and not hidden.all()
     same = (times_too_far(picture, expected["diffuse"]) < 1.0).all(axis=-1)
     assert same[away_from_edges(np.where(hidden, 99, square))].all()
+
+    def with_rest():
+        with OpenView(camera) as opened:
+            return [opened.mirror.notes_with_rest(is_everything) for is_everything in (False, True)]
+
+    # With bounces too, but where all of the picture is Cycles'.
+    assert with_graphics(with_rest) == [notes, []]
     bpy.context.scene.render.film_transparent = True
     bpy.context.view_layer.update()
     assert with_graphics(lambda: [viewport_picture(camera, "diffuse")])[0][1] == []
@@ -45,13 +52,13 @@ def test_points_are_balls_also_where_nodes_make_them(tmp_path):
     cloud.scale, cloud.location = (1.5, 1.5, 1.5), (0.0, 0.0, -1.0)
     nodes = bpy.data.node_groups.new("Points", "GeometryNodeTree")
     nodes.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
-    made, radius, end = (
+    made, painted, end = (
         nodes.nodes.new(kind) for kind in ("GeometryNodePoints", "GeometryNodeSetMaterial", "NodeGroupOutput")
     )
     made.inputs["Count"].default_value, made.inputs["Radius"].default_value = 1, 0.5
-    made.inputs["Position"].default_value, radius.inputs["Material"].default_value = (1.0, 0.0, 0.5), chalk()
-    nodes.links.new(made.outputs[0], radius.inputs[0])
-    nodes.links.new(radius.outputs[0], end.inputs[0])
+    made.inputs["Position"].default_value, painted.inputs["Material"].default_value = (1.0, 0.0, 0.5), chalk()
+    nodes.links.new(made.outputs[0], painted.inputs[0])
+    nodes.links.new(painted.outputs[0], end.inputs[0])
     bpy.data.objects["Plane"].modifiers.new("Points", "NODES").node_group = nodes
     bpy.context.view_layer.update()
     ((picture, notes),) = with_graphics(lambda: [viewport_picture(camera, "diffuse")])

@@ -600,7 +600,7 @@ def test_what_shines_by_a_pattern_lights_as_its_mean_and_is_named_with_bounces_t
     def read():
         mirror = SceneMirror()
         mirror.sync(bpy.context.evaluated_depsgraph_get())
-        return mirror.lights, mirror.notes_with_rest
+        return mirror.lights, mirror.notes_with_rest(is_everything=False)
 
     lights, notes = with_graphics(read)
     picture = read_layer(parts.cycles_channels(tmp_path, 4), "Combined", "RGB")

@@ -104,6 +104,8 @@ def run_tasks(
 
 def _attempt(job, task, following, progress, alone) -> tuple[dict, dict, tuple[str, ...]]:
     """Do a task; returns its "report" or "problem" for the record, its seconds and files. `alone`: failures raise."""
+    if task.problem is not None:
+        return {"problem": f"{task.name}: {task.problem}"}, {"total": 0.0}, ()
     start = time.perf_counter()
     try:
         made = _perform(job, task, following, progress)

@@ -15,7 +15,7 @@ import numpy as np
 
 from ..imaging import write_json
 from ..reading import Malformed, check, file_name, read_json, some
-from ..scene import ATLAS, VERSION, Cancelled, Progress, shortened
+from ..scene import ATLAS, VERSION, Cancelled, Progress, SceneError, error_line, shortened
 from . import lightmap
 from .options import child_job, what_matters
 
@@ -27,7 +27,7 @@ LONGEST_STEM, LONGEST_NAME = 100, 200
 # Shapes that documents must have (see `reading.check`).
 _TASK = {
     **dict.fromkeys(("scene", "key"), str),
-    **dict.fromkeys(("camera", "object"), str | None),
+    **dict.fromkeys(("camera", "object", "problem"), str | None),
     **dict.fromkeys(("frame", "tile"), int | None),
     "name": file_name,
 }
@@ -92,6 +92,7 @@ class BatchTask:
     name: str  # stem of its files, below the output folder
     key: str  # digest of all that its results depend on, see `options_digest`
     tile: int | None = None
+    problem: str | None = None  # of a file whose tasks are unknown; it has no other task
 
     @property
     def stem(self) -> str:
@@ -155,7 +156,8 @@ class NameClash(ValueError):
 def tasks_of(job: BatchJob, progress=None, *, resumed: bool = False) -> list[BatchTask]:
     """All tasks of `job`. Opens the files in Blender if tasks or names depend on their contents.
 
-    Where the job is `resumed`, it is told if changes cannot be judged object by object.
+    Where the job is `resumed`, it is told if changes cannot be judged object by object. Where one of several files
+    fails, its only task is its problem.
 
     Raises NameClash where two tasks would write the same file, or a name is too long, SceneError, OSError.
     """
@@ -166,7 +168,13 @@ def tasks_of(job: BatchJob, progress=None, *, resumed: bool = False) -> list[Bat
     tasks = []
     camera_stems = file_stems(job.cameras) or [None]
     for scene, stem in zip(job.scenes, file_stems(Path(scene).stem for scene in job.scenes), strict=True):
-        facts = _facts(job, scene, progress)
+        try:
+            facts = _facts(job, scene, progress)
+        except SceneError as error:
+            if len(job.scenes) == 1:
+                raise
+            tasks.append(BatchTask(str(scene), None, None, None, stem, "", problem=error_line(error)))
+            continue
         if job.command == "bake":
             _announce(job.options, max((of_frame["lights"] for of_frame in facts), default=0), progress)
             if (unknown := facts[0]["not_judged"]) and resumed and progress is not None:

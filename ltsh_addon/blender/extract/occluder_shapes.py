@@ -41,32 +41,34 @@ def tubes_of_curves(ob, clear, note) -> list[OccluderMesh]:
 
 def hairs_of(system, is_view: bool) -> tuple[range, int]:
     """The hairs of a particle system that Cycles shows, by their numbers, and how many points each has. Children hide
-    their parents, and only they have the extra points of spirals. Views and renders have points of their own; what is
-    beyond them is the world's origin."""
+    their parents, and only they have the extra points of spirals, which end a point early. Views and renders have
+    points of their own; what is beyond them is the world's origin."""
     settings, parents, children = system.settings, len(system.particles), len(system.child_particles)
     steps = settings.display_step if is_view else settings.render_step
     if is_view:
         children = children * settings.display_percentage // 100
     has_children = settings.child_type != "NONE" and children > 0
-    extra = settings.kink_extra_steps if has_children and settings.kink == "SPIRAL" else 0
-    return range(parents if has_children else 0, parents + children), 2**steps + 1 + extra
+    more = max(settings.kink_extra_steps, 1) if has_children and settings.kink == "SPIRAL" else 1
+    return range(parents if has_children else 0, parents + children), 2**steps + more
 
 
 def tubes_of_hair(ob, system, numbers, steps, clear) -> OccluderMesh:
     """Tubes along the hairs `numbers` of a particle system, with `steps` points each, in world space."""
     settings = system.settings
-    along = np.linspace(0.0, 1.0, steps)
+    positions = np.array(
+        [[system.co_hair(object=ob, particle_no=number, step=step) for step in range(steps)] for number in numbers],
+        np.float32,
+    ).reshape(-1, steps, 3)
+    positions = np.where(np.isfinite(positions), positions, np.roll(positions, 1, axis=1))  # spirals of one step
+    along = np.linalg.norm(np.diff(positions, axis=1, prepend=positions[:, :1]), axis=2).cumsum(axis=1)
+    along /= np.maximum(along[:, -1:], 1e-30)
     root, tip = 0.5 * settings.radius_scale * settings.root_radius, 0.5 * settings.radius_scale * settings.tip_radius
     shape = settings.shape
     power = 1.0 + shape if shape < 0.0 else 1.0 / max(1.0 - shape, 1e-6)
-    radius = tip + (root - tip) * (1.0 - along) ** power
+    radii = (tip + (root - tip) * np.maximum(1.0 - along, 0.0) ** power).astype(np.float32)
     if settings.use_close_tip:
-        radius[-1] = 0.0
-    positions = np.array(
-        [system.co_hair(object=ob, particle_no=number, step=step) for number in numbers for step in range(steps)],
-        np.float32,
-    ).reshape(-1, 3)
-    radii = np.tile(radius, len(numbers)).astype(np.float32)
+        radii[:, -1] = 0.0
+    positions, radii = positions.reshape(-1, 3), radii.ravel()
     return _tubes(positions, radii, np.arange(len(numbers)) * steps, _constant_transparency(clear))
 
 

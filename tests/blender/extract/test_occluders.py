@@ -582,6 +582,17 @@ def test_hair_of_particles_has_the_shadow_of_tubes(tmp_path, kind):
     assert_mean_shadow(tmp_path, "tubes", 0.015)
 
 
+@pytest.mark.parametrize("steps", [1, 12])
+def test_spirals_end_where_their_last_turn_does(steps):
+    """The point after it is the world's origin, or no number at all."""
+    settings = particle_hair(20)
+    settings.child_type, settings.rendered_child_count = "SIMPLE", 3
+    settings.kink, settings.kink_extra_steps, settings.kink_amplitude = "SPIRAL", steps, 0.1
+    tubes = max(scene_parts.collected_occluders()[0].meshes, key=lambda mesh: len(mesh.triangles))
+    points = tubes.vertices.reshape(60, 8 + steps, 3, 3).mean(axis=2)
+    assert np.linalg.norm(np.diff(points, axis=1), axis=-1).max() < 0.2  # a hair of 80 cm has 8 pieces before them
+
+
 @pytest.mark.newest
 @pytest.mark.parametrize("percentage", [100, 50])
 def test_hair_of_particles_ends_where_views_show_its_end(percentage):

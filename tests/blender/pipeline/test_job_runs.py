@@ -76,14 +76,19 @@ def test_one_blender_for_all_frames_gives_the_bytes_of_one_for_each(room, tmp_pa
     assert len(set(frames)) == 3
 
 
-def test_after_an_error_the_next_task_gets_a_new_blender(room, tmp_path, own_blender):
+@pytest.mark.parametrize("pattern", ["compare_{scene}", "{scene}_{camera}"])
+def test_after_an_error_the_next_task_gets_a_new_blender(room, tmp_path, own_blender, pattern):
+    """Also where the name of the task is only in the file."""
     bad = tmp_path / "bad.blend"
     bad.write_bytes(b"BLENDER no more\n" * 9)
-    wanted = job(room, tmp_path / "out", scenes=(bad, room))
+    wanted = job(room, tmp_path / "out", scenes=(bad, room), name=pattern)
     (problem,) = batch.run_tasks(wanted).problems
     assert "bad.blend" in problem and "cannot open it" in problem
     merged = merge(tmp_path / "out")
-    assert merged.problems == (problem,) and [report["name"] for report in merged.report["reports"]] == ["compare_room"]
+    (report,) = merged.report["reports"]
+    assert merged.problems == (problem,) and report["name"] == pattern.format(scene="room", camera="Camera")
+    with pytest.raises(blender_process.SceneError, match="cannot open it"):
+        batch.run_tasks(job(room, tmp_path / "alone", scenes=(bad,), name=pattern))
 
 
 def test_a_killed_blender_is_one_failed_task(room, tmp_path, own_blender):

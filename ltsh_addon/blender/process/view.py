@@ -201,8 +201,11 @@ class RestSum:
     light: np.ndarray  # (H, W, 3) Combined without what the view draws itself
     whole: np.ndarray  # (H, W, 3) Combined
     guides: np.ndarray  # (H, W, 6) albedo and normal
+    mixed: np.ndarray  # (H, W, 7) of the first steps, of one sample each: see `_lost`
     depth: np.ndarray  # (H, W) of the first sample: Cycles writes no other
     samples: int = 0
+    singles: int = 0  # the number of these steps
+    merged: int = 0  # the samples that came with another in a later step
     is_everything: bool = False  # no light of the view itself remains
     problem: str = ""  # of the denoiser
 
@@ -225,8 +228,13 @@ class RestSum:
             specular, specular_color, diffuse, diffuse_color, background = (
                 read_layer(channels, names[key], "RGB") for key in keys
             )
-            drawn = 1.0 - np.minimum(read_layer(channels, names["mask"], "X"), 1.0)
-            light = light - drawn[..., None] * (specular * specular_color + diffuse * diffuse_color + background)
+            mask = np.minimum(read_layer(channels, names["mask"], "X"), 1.0)[..., None]
+            drawn = specular * specular_color + diffuse * diffuse_color + background
+            light = light - (1.0 - mask) * drawn
+            if job.samples == 1 and self.merged == 0:
+                self.mixed[row : row + len(light)] += np.concatenate([mask, drawn, mask * drawn], axis=-1)
+                self.singles = job.total
+            self.merged += job.samples - 1
         guides = [read_layer(channels, *name) for name in (("Denoising Albedo", "RGB"), ("Denoising Normal", "XYZ"))]
         rows, count = slice(row, row + len(light)), np.float32(job.samples)
         self.light[rows] += count * light
@@ -239,7 +247,14 @@ class RestSum:
 
     def picture(self) -> np.ndarray:
         """The denoised mean (H, W, 4); alpha is `marked_depth`."""
-        return np.concatenate([self._denoised(self.light), marked_depth(self.depth)[..., None]], axis=-1)
+        light = self.light + (self._lost() if self.merged and self.singles > 1 else 0.0)
+        return np.concatenate([self._denoised(light), marked_depth(self.depth)[..., None]], axis=-1)
+
+    def _lost(self) -> np.ndarray:
+        """What `light` lacks (H, W, 3) at outlines of what is Cycles' alone. Of several samples in a step it has the
+        product of mean share and mean direct light, not that of each: their covariance, which the first steps tell."""
+        share, drawn, both = np.split(self.mixed / np.float32(self.singles), (1, 4), axis=-1)
+        return self.merged * self.singles / (self.singles - 1) * (both - share * drawn)
 
     def whole_picture(self) -> np.ndarray:
         """The denoised mean (H, W, 3) with what the view draws itself."""

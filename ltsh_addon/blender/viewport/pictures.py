@@ -132,13 +132,22 @@ class RestPass:
         constants |= dict.fromkeys(("has_moved", "is_parallel"), "INT")
         source = definitions({"FARTHEST": FARTHEST, "NEAR": NEAR}) + _between("rest") + glsl("rest")
         self._shader = PixelShader(source, samplers, constants)
+        self._given = PixelShader(glsl("given"), ("picture", "share"), {"weight": "FLOAT"})
+
+    def add_given(self, sums: "list[SampleSum]", share: "SampleSum", targets: "list[SampleSum]", weight: float) -> None:
+        """Add to `targets` what a sample has of what is Cycles' alone, its `share` of pixels: call it with the `sums`
+        before the sample and `weight` -1, then with those after it and 1."""
+        for each, target in zip(sums, targets, strict=True):
+            with drawing(target.within(), (0, 0, *each.size), "ADDITIVE_PREMULT"):
+                self._given.bind({"picture": each.texture, "share": share.texture}, {"weight": weight})
+                self._given.draw()
 
     def draw(self, textures: dict, weight: float, rest: ShownRest, view: ViewCamera, scale, whole_share: float):
         """The picture (RGBA texture, valid until the next call with the same `picture`) with the `rest`.
 
-        `textures` are by the names of the samplers: `picture` and `of_cycles`, the share of pixels that is Cycles'
-        alone, which count times `weight`; positions and colors of the surfaces, and positions of glass before them.
-        The rest counts times `scale` (3,). Cycles' whole picture has the share `whole_share` of the result.
+        `textures` are by the names of the samplers: `picture` and `of_cycles`, the sum by `add_given`, which count
+        times `weight`; positions and colors of the surfaces, and positions of glass before them. The rest counts times
+        `scale` (3,). Cycles' whole picture has the share `whole_share` of the result.
         """
         size = size_of(textures["picture"])
         target = SampleSum(size)

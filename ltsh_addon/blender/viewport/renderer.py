@@ -167,10 +167,10 @@ class ViewRenderer:
         self.step = 1  # pixels in either direction for which one is drawn, as while a view moves
         self._size = (1, 1)  # of what is shown
         self.shadows: ShadowRays | LiveShadows | None = None
-        # Pictures get a rest, and this one as soon as there is one; `_of_cycles`: what is Cycles' alone, a sum.
+        # Pictures get a rest, and this one as soon as there is one; `_of_cycles`: their light of what is Cycles' alone.
         self.has_bounces, self.rest = False, None  # bool, ShownRest | None
         self.shows_whole = False  # Cycles' picture stands for the view's own
-        self._rest_pass: RestPass | None = None
+        self._share: list[SampleSum] = []  # of the last sample
         self._of_cycles: list[SampleSum] = []
 
     def draw(
@@ -242,20 +242,22 @@ class ViewRenderer:
         if self.shows_whole:
             pictures, weights = [self.rest.whole], [1.0]
         elif self.has_bounces and self.rest is not None and shown.takes_rest:
-            pictures, weights = [self._with_rest(one, view, whole_share) for one in pictures], [1.0] * len(pictures)
+            pictures, weights = [self._with_rest(one, view, whole_share) for one in numbers], [1.0] * len(pictures)
         if shown.mode != "single" and shown.second_picture is not None:
             pictures, weights = [*pictures, shown.second_picture], [*weights, 1.0]
         # The sample has bound other buffers, and Blender's own binding is unknown to Python.
         with target.bind():
             self._picture.draw(pictures, weights, view, self._size, shown, self._background)
 
-    def _with_rest(self, picture: gpu.types.GPUTexture, view: ViewCamera, whole_share: float) -> gpu.types.GPUTexture:
+    @cached_property
+    def _rest_pass(self) -> RestPass:
+        return RestPass()
+
+    def _with_rest(self, number: int, view: ViewCamera, whole_share: float) -> gpu.types.GPUTexture:
         """The mean of a picture's samples with the rest."""
-        if self._rest_pass is None:
-            self._rest_pass = RestPass()
         front = self._surfaces if self._glass is None or not self._has_glass else self._glass
-        textures = {"picture": picture, "of_cycles": self._of_cycles[0].texture, "positions": self._surfaces.position}
-        textures |= {"front_positions": front.position, **self._surfaces.colors}
+        textures = {"picture": self._sums[number].texture, "of_cycles": self._of_cycles[number].texture}
+        textures |= {"positions": self._surfaces.position, "front_positions": front.position, **self._surfaces.colors}
         scale, light = np.ones(3), self.rest.light
         if light is not None:
             scale = np.divide(self.mean_light(), light, out=scale, where=light > 0.0)
@@ -286,13 +288,23 @@ class ViewRenderer:
             return False
         self._sums = _cleared(self._sums, frame, self.samples == 0)
         if self.has_bounces:
-            self._of_cycles = _cleared(self._of_cycles, replace(frame, pictures=frame.pictures[:1]), self.samples == 0)
+            self._of_cycles = _cleared(self._of_cycles, frame, self.samples == 0)
+            self._share = _cleared(self._share, replace(frame, pictures=frame.pictures[:1]), True)
             for layer in layers:
-                layer.add_share_of_cycles(frame.mirror.instances, frame.view, self._of_cycles[0].within())
+                layer.add_share_of_cycles(frame.mirror.instances, frame.view, self._share[0].within())
+            if self.samples > 0:
+                self._rest_pass.add_given(self._sums, self._share[0], self._of_cycles, -1.0)
+        self._light_layers(layers, frame, state)
+        if self.has_bounces:
+            self._rest_pass.add_given(self._sums, self._share[0], self._of_cycles, 1.0)
+        return True
+
+    def _light_layers(self, layers: list[SurfaceLayer], frame: Frame, state: tuple | None) -> None:
+        """Add the light of the sample to the pictures."""
         if len(layers) == 1:
             self._light_surfaces(frame, self._sums, state)
             self._add_emission(self._surfaces, frame, self._sums)
-            return True
+            return
         self._behind = _cleared(self._behind, frame, True)
         behind = [(technique, "combined" if passes == TRANSMITTED else passes) for technique, passes in frame.pictures]
         behind = replace(frame, pictures=tuple(behind))
@@ -310,7 +322,6 @@ class ViewRenderer:
         frame, sums = replace(frame, pictures=tuple(pair[0] for pair in front)), [pair[1] for pair in front]
         self._light(self._glass, frame, sums, "ADDITIVE")
         self._add_emission(self._glass, frame, sums)
-        return True
 
     def _take_point(self) -> None:
         """Take the layers of the next point, and keep those of the last one."""

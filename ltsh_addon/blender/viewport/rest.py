@@ -4,9 +4,9 @@ A view shows LTSH's direct light and, of surfaces that it cannot resolve, a gues
 view with Cycles, `render_rest`. What the view draws itself is taken out of each of its samples, so that its noise goes
 with it; what remains is denoised and added to the view.
 
-Surfaces `is_of_cycles` are Cycles' alone. An AOV tells their share m of a pixel, and the view draws the same share M:
+Surfaces `is_of_cycles` are Cycles' alone. An AOV tells whether a sample is of them, m = 1, or not, m = 0:
 
-    rest = Combined - (1 - m) (direct light + background),  picture = (1 - M) (own light + background) + rest
+    rest = mean of (Combined - (1 - m) (direct light + background)),  picture = mean of ((1 - m) own light) + rest
 """
 
 import json
@@ -50,6 +50,7 @@ STEP_SECONDS, SHRINKS, TOTALS, REST_SECONDS = 0.7, (4, 2, 1), (1, 2, 4, 8, 16, 3
 # FEWEST: samples of single pixels that a step takes at least: the first picture of 1000 x 640 pixels. MOST_CHANGE: how
 # many times as many or as few the next one takes.
 FEWEST, MOST_CHANGE = 160_000, 2.0
+SINGLES = 8  # first samples in steps of their own, see `RestSum`
 # Of live jobs. PICTURE: a stage; its fraction is the number of a picture, with files. STOP: a file that ends them.
 PICTURE, LIVE_REST, LIVE_WHOLE, LIVE_FACTS, STOP = "picture", "rest_{}.npy", "whole_{}.npy", "live_{}.json", "stop"
 # WHOLE_SAMPLES: so many of Cycles' whole picture, where it is shown at first, come before the view's own. The rest is
@@ -73,6 +74,7 @@ def next_job(before: RestJob | None, view: RestView, share: float) -> RestJob:
     last = first + 1.0 / math.ceil(1.0 / most)
     if first == 0.0 and most >= 1.0:
         samples = min(next(count for count in TOTALS if count > done) - done, int(most))
+    samples = 1 if shrink == 1 and done < SINGLES else samples
     rows = first, last if last < 0.99 else 1.0
     return RestJob(None, view, samples, done, shrink, rows, continues=before is not None)
 
@@ -347,7 +349,11 @@ _whole_error = [WholePictureError()]  # of the open scene; until it is measured,
 
 def render_rest(job: RestJob, folder: Path, progress) -> dict:
     """Do the `job`; returns the manifest, see `process.view.render_rest`."""
-    render_step(job, folder, progress)
+    done = 0
+    while done < job.samples:
+        samples = 1 if done < SINGLES else job.samples - done
+        render_step(replace(job, samples=samples, done=done, continues=done > 0), folder, progress)
+        job, done = replace(job, scene=None), done + samples
     save_array(folder / REST_PICTURE, _sum[0].picture())
     return _facts()
 
@@ -405,8 +411,8 @@ def render_step(job: RestJob, folder: Path, progress) -> float:
     render_exr(scene, folder / REST_RENDER, "NONE")
     seconds = time.monotonic() - started
     if not job.continues:
-        arrays = [np.zeros((height, width, count), np.float32) for count in (3, 3, 6, 1)]
-        _sum[:] = [RestSum(*arrays[:3], arrays[3][..., 0], is_everything=_is_everything(scene, layer))]
+        arrays = [np.zeros((height, width, count), np.float32) for count in (3, 3, 6, 7, 1)]
+        _sum[:] = [RestSum(*arrays[:4], arrays[4][..., 0], is_everything=_is_everything(scene, layer))]
     _sum[0].add(folder / REST_RENDER, first, job, {**render_settings.pass_names(), "mask": MASK})
     return seconds
 

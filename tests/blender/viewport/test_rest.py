@@ -83,6 +83,36 @@ def test_a_view_with_bounces_is_the_picture_of_cycles(tmp_path, capsys):
     assert errors["on"] < 0.06 and errors["off"] > 0.2, errors
 
 
+@pytest.mark.parametrize("samples", [8, 64])
+def test_outlines_of_what_is_cycles_alone_have_the_light_of_both_sides(tmp_path, capsys, samples):
+    """Before a lit wall stand a sign that shines and a card by nodes. Samples of a pixel are of one side or the other:
+    products of means would have f (1 - f) of the difference of both sides, up to a quarter of it."""
+    with_graphics(lambda: None)
+    parts.empty_scene(*SIZE)
+    wall = parts.principled("wall", **{"Base Color": (0.6, 0.6, 0.6, 1.0), "Specular IOR Level": 0.0})[0]
+    parts.add_plane(wall, size=9.0)
+    sign = parts.bsdf_material("ShaderNodeEmission", "sign", Color=(1.0, 0.5, 0.2, 1.0))[0]
+    parts.add_plane(sign, size=0.7, location=(-0.5, 0.0, 0.2), rotation=(0.0, 0.0, 0.3))
+    card, node = parts.principled("card", **{"Specular IOR Level": 0.0})
+    wave = card.node_tree.nodes.new("ShaderNodeTexWave")
+    card.node_tree.links.new(wave.outputs["Color"], node.inputs["Base Color"])
+    parts.add_plane(card, size=0.7, location=(0.5, 0.0, 0.2), rotation=(0.0, 0.0, 0.3))
+    parts.add_area_light(location=(0.0, -0.3, 4.0), energy=40.0)
+    parts.add_camera((0.0, 0.0, 3.0), (0.0, 0.0, 0.0))
+    path = parts.save(tmp_path / "cards.blend")
+    arguments = ("--refine", 64, "--bounces", "on", "--rest-samples", samples, "--techniques", "ltsh4c", "--quiet")
+    assert run(capsys, "view", path, "-o", tmp_path, *arguments)[0] == 0
+    channels = read_channels(tmp_path / "view.exr")
+    picture = np.stack([channels[f"ltsh4c.combined.{letter}"] for letter in "RGB"], axis=-1)
+    expected = read_layer(parts.cycles_channels(tmp_path, 256), "Combined", "RGB")
+    sides = [np.roll(expected, step, axis) for axis in (0, 1) for step in (-1, 1)]
+    contrast = np.ptp([expected, *sides], axis=0)
+    edges = contrast > 0.15
+    assert 100 < edges.sum() < 1000
+    bias = np.mean((picture - expected)[edges]) / np.mean(contrast[edges])
+    assert abs(bias) < 0.04, bias  # 8 samples leave .15 of noise in some 100 pixels
+
+
 def test_linked_objects_that_have_the_name_of_a_local_one_are_rendered(tmp_path):
     parts.empty_scene()
     lamps = bpy.data.collections.new("Lamps")

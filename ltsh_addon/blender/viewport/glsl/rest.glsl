@@ -21,8 +21,8 @@ vec4 rest_of_surface(vec2 place, float depth)
   return vec4(sum.rgb / max(sum.a, 1e-20), sum.a);
 }
 
-/* The light of the view itself, but where the surface is Cycles' alone, and the rest, found by the surface's place; a
-share of it gives way to Cycles' whole picture of the same view. */
+/* The light of the view itself, but for samples of surfaces that are Cycles' alone, and the rest, found by the surface's
+place; a share of it gives way to Cycles' whole picture of the same view. */
 void main()
 {
   ivec2 texel = ivec2(gl_FragCoord.xy);
@@ -48,8 +48,8 @@ void main()
   vec3 colors = texelFetch(diffuse_colors, texel, 0).rgb + texelFetch(specular_colors, texel, 0).rgb;
   vec3 guess = texelFetch(positions, texel, 0).w > 0.0 ? ambient.rgb * colors : vec3(0.0);
   vec3 added = scale.rgb * mix(guess, light, is_known);
-  float share = is_known * max(clamp(weight * texelFetch(of_cycles, texel, 0).x, 0.0, 1.0), is_everything);
-  color = vec4((1.0 - share) * lit.rgb + added, 1.0 - (1.0 - share) * (1.0 - lit.a));
+  vec4 given = is_everything > 0.0 ? vec4(lit.rgb, 1.0 - lit.a) : weight * texelFetch(of_cycles, texel, 0);
+  color = lit + vec4(added, 0.0) - is_known * vec4(given.rgb, -given.a);
   if (whole_share > 0.0) {
     color = mix(color, vec4(texelFetch(whole, texel, 0).rgb, 1.0), whole_share);
   }

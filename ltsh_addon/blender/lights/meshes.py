@@ -37,6 +37,7 @@ class Placement:
     slots: np.ndarray  # (T,) index of the material slot
     matrix: np.ndarray  # (4, 4)
     mesh: object = None  # copy of the evaluated mesh, if a texture must be rendered
+    uv_maps: dict = field(default_factory=dict)  # (T, 3, 2) by name, "" the one that renders: of few faces in views
     facts: ObjectFacts = ObjectFacts()
 
 
@@ -132,6 +133,8 @@ def _placement(ob, matrix: np.ndarray, light: MeshLight, depsgraph) -> Placement
         count = len(mesh.loop_triangles)
         triangles = read_values(mesh.loop_triangles, "vertices", (count, 3), np.int32)
         slots = read_values(mesh.loop_triangles, "material_index", (count,), np.int32)
+        is_read = light.varies and depsgraph is None and count <= MOST_TRIANGLES
+        uv_maps = _uv_maps(mesh, np.linalg.det(matrix[:3, :3]) < 0.0) if is_read else {}
     finally:
         ob.to_mesh_clear()
     slots = np.clip(slots, 0, len(light.materials) - 1)
@@ -144,7 +147,15 @@ def _placement(ob, matrix: np.ndarray, light: MeshLight, depsgraph) -> Placement
     triangles = triangles.astype(np.int64)
     if np.linalg.det(matrix[:3, :3]) < 0.0:
         triangles = triangles[:, ::-1]
-    return Placement(world, triangles, slots, matrix, copy)
+    return Placement(world, triangles, slots, matrix, copy, uv_maps=uv_maps)
+
+
+def _uv_maps(mesh, is_mirrored: bool) -> dict[str, np.ndarray]:
+    corners = read_values(mesh.loop_triangles, "loops", (len(mesh.loop_triangles), 3), np.int32)
+    corners = corners[:, :: -1 if is_mirrored else 1]
+    layers = [(layer.name, layer) for layer in mesh.uv_layers]
+    layers += [("", layer) for layer in mesh.uv_layers if layer.active_render]
+    return {name: read_values(layer.uv, "vector", (len(mesh.loops), 2), np.float32)[corners] for name, layer in layers}
 
 
 # SIDE_PROPERTY: custom property of objects that let light through in the reference: objects that shine, and surfaces
@@ -153,6 +164,9 @@ SIDE_PROPERTY = "ltsh_emitting_side"
 # Limits on the emitting polygons of one object. MOST_POLYGONS: in pictures and bakes, where 20,000 take about 13 s of
 # processor time. MOST_SHOWN: in the viewport.
 MOST_POLYGONS, MOST_SHOWN = 200_000, 2000
+# MOST_TRIANGLES: of objects that light by an image in views; more are mostly baked, with their light in the image.
+# COPLANAR: farthest that their corners are from a plane, as a share of its polygon.
+MOST_TRIANGLES, COPLANAR = 64, 1e-4
 AROUND_FACES = 1.001  # radius of the light around a ball, in units of the ball's
 # MOST_RENDERED_POLYGONS: up to this many textured polygons of one object are rendered one by one. Of an object with
 # more, only the STAND_INS largest of each instance are rendered, and all get their mean.
@@ -208,16 +222,22 @@ def _lights_of_all(mesh_lights: list[MeshLight], studio: Studio, eye: np.ndarray
     return lights
 
 
-def constant_mesh_lights(mesh_lights: list[MeshLight], radiance_of, eye: np.ndarray, warn) -> list[Light]:
+def constant_mesh_lights(mesh_lights: list[MeshLight], radiance_of, split, eye: np.ndarray, warn) -> list[Light]:
     """The lights of `mesh_lights`, without falloff, for known radiances `radiance_of(material)` (3,): of what is nearly
-    a sphere seen from outside one for all of its faces, which a card would draw one by one."""
+    a sphere seen from outside one for all of its faces, which a card would draw one by one; for `split` see
+    `_without_images`."""
     lights = []
     for mesh_light in mesh_lights:
-        radiance = [np.tile(radiance_of(material), (2, 1)) for material in mesh_light.materials]
         side = _emitting_side(mesh_light, eye)
+        mesh_light, of_images = _without_images(mesh_light, side, split)
+        remain = {slot for placement in mesh_light.placements for slot in np.unique(placement.slots).tolist()}
+        radiance = [
+            np.tile(radiance_of(material), (2, 1)) if slot in remain else np.zeros((2, 3))
+            for slot, material in enumerate(mesh_light.materials)
+        ]
         mesh_light, of_balls = _without_balls(mesh_light, radiance, side)
         lights.extend(of_balls)
-        of_mesh = _constant_lights(mesh_light, _polygons(mesh_light, radiance), radiance, side)
+        of_mesh = of_images + _constant_lights(mesh_light, _polygons(mesh_light, radiance), radiance, side)
         of_mesh = [replace(light, falloff=0, smooth=0.0) for light in of_mesh]
         if (step := -(-len(of_mesh) // MOST_SHOWN)) > 1:
             power = np.array([np.linalg.norm(light.area_vector) * light.radiance.sum() for light in of_mesh])
@@ -229,6 +249,32 @@ def constant_mesh_lights(mesh_lights: list[MeshLight], radiance_of, eye: np.ndar
             of_mesh = [replace(of_mesh[number], radiance=more * of_mesh[number].radiance) for number in chosen]
         lights.extend(of_mesh)
     return lights
+
+
+def _without_images(mesh_light: MeshLight, side: int, split) -> tuple[MeshLight, list[Light]]:
+    """The light without the flat polygons that shine by an image, and these as lights. `split(material, light,
+    triangles, uv_maps, share)` makes those of a `light` of radiance 1, which `triangles` (T, 3, 3) cover, with this
+    share of the patches of the object; None: it cannot."""
+    placements, lights = [], []
+    for placement in mesh_light.placements:
+        corners, remain = placement.vertices[placement.triangles], np.ones(len(placement.triangles), bool)
+        shape = placement.vertices, placement.triangles, placement.slots
+        polygons = mesh_polygons.flat_polygons(*shape) if placement.uv_maps else ()
+        polygons = [polygon for polygon in polygons if mesh_light.emission[polygon.label].varies]
+        for polygon in polygons:
+            height = np.abs((corners - polygon.corners[0]) @ polygon.normal).max(axis=1)
+            flat = (placement.slots == polygon.label) & (height < COPLANAR * np.ptp(polygon.corners, axis=0).max())
+            uv_maps = {name: uv[flat] for name, uv in placement.uv_maps.items()}
+            for way in _sides(side):
+                light = polygon_light(mesh_light.light_of(polygon.label), polygon, way, np.ones(3))
+                share = 1.0 / (len(polygons) * len(_sides(side)) * len(mesh_light.placements))
+                shown = split(mesh_light.materials[polygon.label], light, corners[flat], uv_maps, share)
+                if shown is not None:
+                    lights, remain = lights + shown, remain & ~flat
+        if remain.any():
+            chosen = {"triangles": placement.triangles[remain], "slots": placement.slots[remain]}
+            placements.append(replace(placement, **chosen))
+    return replace(mesh_light, placements=placements), lights
 
 
 def _without_balls(mesh_light: MeshLight, radiance, side: int) -> tuple[MeshLight, list[PointLight]]:

@@ -357,8 +357,9 @@ def _with_factor(light: Light, factor: np.ndarray, warn) -> list[Light]:
     return split_light(light, patches)
 
 
-# MOST_PATCHES: of one light in the viewport, where each patch costs as much as a light.
-MOST_PATCHES = 64
+# MOST_PATCHES: of one light in the viewport, where each patch costs as much as a light. PATCHES_OF_OBJECT: of one that
+# shines by an image, which often does so on both sides.
+MOST_PATCHES, PATCHES_OF_OBJECT = 64, 16
 # POINTS: along each side of the grid on which an image is read. SUB: each point is the mean of SUB x SUB.
 POINTS, SUB = 128, 2
 
@@ -395,7 +396,16 @@ class ShownTextures:
 
         Coarse patches are reported in `notes`.
         """
-        patches = self._patches_of(light.is_round, factor)
+        patches = self._patches_of(light.is_round, factor, lambda: _uv_of_light(light.is_round))
+        return None if patches is None else _shown_patches(light, patches, notes)
+
+    def split_polygon(self, light: Light, factor: Value, triangles, uv, share: float, notes) -> list[Light] | None:
+        """As `split`, for a polygon that `triangles` (T, 3, 3) with UV coordinates `uv` (T, 3, 2) cover; it gets this
+        `share` of PATCHES_OF_OBJECT."""
+        axes = np.stack([half / np.dot(half, half) for half in (light.half_u, light.half_v)])
+        places = np.round((triangles - light.center) @ axes.T, 4)
+        shape, most = (places.tobytes(), uv.tobytes(), share), max(round(share * PATCHES_OF_OBJECT), 1)
+        patches = self._patches_of(shape, factor, lambda: (*_uv_within(places, uv), most))
         return None if patches is None else _shown_patches(light, patches, notes)
 
     def split_by_nodes(self, light: Light, emission: NodeEmission, notes: list[str]) -> list[Light]:
@@ -413,18 +423,21 @@ class ShownTextures:
     def mean(self, factor: Value) -> tuple[np.ndarray, float]:
         """The mean color (3,) of an image on all of its UV square, and the mean difference from it as a share of it; 0
         where only Cycles knows its colors."""
-        patches = self._patches_of(False, factor)
+        patches = self._patches_of(False, factor, lambda: _uv_of_light(False))
         return (
             (np.zeros(3), 0.0) if patches is None or patches.whole is None else (patches.whole.radiance, patches.spread)
         )
 
-    def _patches_of(self, is_round: bool, factor: Value) -> Patches | None:
+    def _patches_of(self, shape, factor: Value, uv_of) -> Patches | None:
+        """The patches of an image on a light of the `shape`, for which `uv_of()` gives what `_cut` takes."""
         use = factor.image
-        key = (use.image.session_uid, use.mapping, use.closest, use.extension, is_round,
+        key = (use.image.session_uid, use.mapping, use.closest, use.extension, shape,
                factor.matrix.tobytes(), factor.offset.tobytes())  # fmt: skip
         if key not in self._patches:
+            if len(self._patches) >= MOST_CACHED:
+                self._patches.clear()
             texture = _texture(use)
-            self._patches[key] = None if texture is None else _cut(texture, factor, is_round)
+            self._patches[key] = None if texture is None else _cut(texture, factor, *uv_of())
         return self._patches[key]
 
 
@@ -444,13 +457,40 @@ def _texture(use) -> ImageTexture | None:
     return ImageTexture(pixels, use.extension, "Closest" if use.closest else "Linear", srgb)
 
 
-def _cut(texture: ImageTexture, factor: Value, is_round: bool) -> Patches:
-    count = POINTS * SUB
-    step = (np.arange(count) + 0.5) / count
-    u, v = np.meshgrid(step, 1.0 - step)
-    mapping = np.array(factor.image.mapping)
-    uv = np.stack([u, v, np.ones_like(u)], axis=-1).reshape(-1, 3) @ mapping.T
-    colors = factor.offset + texture.colors(uv) @ factor.matrix[:, :3].T + factor.matrix[:, 3]
-    image = colors.reshape(POINTS, SUB, POINTS, SUB, 3).mean(axis=(1, 3))
-    x, y = np.meshgrid(*2 * [2.0 * (np.arange(POINTS) + 0.5) / POINTS - 1.0])
-    return cut_into_patches(image, (np.hypot(x, y) < 1.0) | (not is_round), MOST_PATCHES)
+def _cut(
+    texture: ImageTexture, factor: Value, uv: np.ndarray, covered: np.ndarray, most: int = MOST_PATCHES
+) -> Patches:
+    """The patches of an image at points `uv` (N, N, 2) of a light, row 0 on top, of which those `covered` (N, N) count;
+    SUB x SUB of them are one of POINTS x POINTS."""
+    count = len(uv)
+    mapped = np.append(uv.reshape(-1, 2), np.ones((count * count, 1)), axis=1) @ np.array(factor.image.mapping).T
+    colors = factor.offset + texture.colors(mapped) @ factor.matrix[:, :3].T + factor.matrix[:, 3]
+    share = covered.reshape(POINTS, SUB, POINTS, SUB, 1).mean(axis=(1, 3))
+    image = (covered.reshape(-1, 1) * colors).reshape(POINTS, SUB, POINTS, SUB, 3).mean(axis=(1, 3))
+    return cut_into_patches(image / np.maximum(share, 1e-9), share[..., 0] >= 0.5, most)
+
+
+def _points() -> np.ndarray:
+    """The points (N, N, 2) of a light at which its image is read, in units of half_u and half_v, row 0 on top."""
+    step = 2.0 * (np.arange(POINTS * SUB) + 0.5) / (POINTS * SUB) - 1.0
+    return np.stack(np.meshgrid(step, -step), axis=-1)
+
+
+def _uv_of_light(is_round: bool) -> tuple[np.ndarray, np.ndarray]:
+    """UV coordinates (N, N, 2) of an area light at `_points`, and which of them are inside (N, N)."""
+    points = _points()
+    return 0.5 + 0.5 * points, (np.hypot(*np.moveaxis(points, -1, 0)) < 1.0) | (not is_round)
+
+
+def _uv_within(places: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """As `_uv_of_light`, within triangles with corners at `places` (T, 3, 2)."""
+    points = _points()
+    found, covered = np.zeros_like(points), np.zeros(points.shape[:2], bool)
+    for corners, of_corners in zip(places, uv, strict=True):
+        edges = np.stack([corners[1] - corners[0], corners[2] - corners[0]], axis=1)
+        if abs(np.linalg.det(edges)) > 1e-9:
+            weights = (points - corners[0]) @ np.linalg.inv(edges).T
+            inside = (weights >= 0.0).all(axis=-1) & (weights.sum(axis=-1) <= 1.0)
+            found[inside] = of_corners[0] + weights[inside] @ (of_corners[1:] - of_corners[0])
+            covered |= inside
+    return found, covered

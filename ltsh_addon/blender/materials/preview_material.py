@@ -350,7 +350,6 @@ class _PreviewReader:
             return None
         if share.image is not None or share.curve is not None:
             return None
-        self.note_light("its emission varies: it lights as the mean of its image, with over 64 triangles not at all")
         glow = share.shining * float(strength.offset[0])
         return PreviewMaterial("diffuse", {"color": color}, weight=0.0, glow=glow, **self._all_notes())
 

@@ -26,7 +26,7 @@ from ..evaluated import (
 from ..lights.area import area_light, half_hidden, node_light, note_unsupported, reason_to_leave_out
 from ..lights.emission import emission_of, factors_of, open_studio
 from ..lights.linking import Receivers
-from ..lights.meshes import collect_mesh_lights, constant_mesh_lights
+from ..lights.meshes import MOST_TRIANGLES, collect_mesh_lights, constant_mesh_lights
 from ..lights.textures import (
     MOST_INSTANCES,
     NodeEmission,
@@ -52,7 +52,6 @@ FAR = 2000.0
 # One layer of the texture of visibility is that of the sky's sides; cards take 2048 layers.
 MOST_LIGHTS = 2047
 MOST_VALUES = 1 << 24  # of all patterns: they fill a quarter of the largest texture of lights
-MOST_TRIANGLES = 64  # of objects that light by an image; more are mostly baked, with their light in the image
 # Reasons why a light has no pattern.
 NOT_RESOLVED = "its nodes are not resolved, it shines as without them, how far off that is only Cycles can tell"
 NOT_YET = "it shines as without its nodes until Cycles has sources at them"
@@ -129,12 +128,25 @@ def _preview(material, textures: ShownTextures) -> PreviewMaterial:
     return replace(look, emission=look.emission + textures.mean(look.emission_image)[0])
 
 
+def _split(material, light: Light, triangles, uv_maps: dict, share, textures: ShownTextures, notes):
+    """Patches of a `light` that shines by an image, or None, see `constant_mesh_lights`."""
+    look = None if material is None else preview_of(material)
+    image = None if look is None else look.value("color") if look.glow else look.emission_image
+    uv = None if image is None or image.image is None else uv_maps.get(image.image.uv_map)
+    if uv is None:
+        return None
+    factor = image.mapped((look.glow or 1.0) * np.eye(3), look.emission)
+    return textures.split_polygon(light, factor, triangles, uv, share, notes)
+
+
 def _emission(material, textures: ShownTextures, is_small: bool, notes: list[str]) -> np.ndarray:
     """The mean emission (3,) of a material; that of an image that only shines is 0 on a mesh that is not small."""
     if material is None:
         return np.zeros(3)
     look = _preview(material, textures)
     image = look.value("color") if look.glow and is_small else look.emission_image
+    if look.glow and not is_small:
+        notes.append(f"{material.name}: more than {MOST_TRIANGLES} triangles shine by its image, they light nothing")
     if image is None:
         return look.emission
     mean, spread = textures.mean(image)
@@ -155,7 +167,8 @@ def _mesh_lights(depsgraph, receivers: Receivers, textures: ShownTextures, notes
     for mesh_light in mesh_lights:
         count = sum(len(placement.triangles) for placement in mesh_light.placements)
         radiance_of = functools.partial(_emission, textures=textures, is_small=count <= MOST_TRIANGLES, notes=notes)
-        lights += constant_mesh_lights([mesh_light], radiance_of, eye, notes.append)
+        split = functools.partial(_split, textures=textures, notes=notes)
+        lights += constant_mesh_lights([mesh_light], radiance_of, split, eye, notes.append)
     return lights
 
 

@@ -463,7 +463,7 @@ def test_colors_under_alpha_are_those_of_cycles(is_used, interpolation):
 
 
 @edits_with_graphics
-def test_an_image_that_shines_is_seen_and_lights_as_its_mean():
+def test_an_image_that_shines_is_seen_and_lights_as_its_colors():
     """As a baked texture does; seen from above, by an orthographic camera."""
     parts.empty_scene(*SIZE)
     colors = np.array([[[0.2, 0.4, 0.6, 1.0], [0.8, 0.1, 0.0, 1.0]], [[0.0, 0.5, 0.1, 1.0], [0.3, 0.3, 0.9, 1.0]]])
@@ -486,14 +486,14 @@ def test_an_image_that_shines_is_seen_and_lights_as_its_mean():
         seen = at(picture, column - 0.5, row - 0.5)
         # Pictures of views are half floats.
         np.testing.assert_allclose(seen, 2.0 * colors[row, column, :3], rtol=2.0**-11, atol=1e-6)
-    # It lights on both sides, as the mean of its image.
-    assert [light.name for light in lights] == ["Plane", "Plane"]
+    # It lights on both sides, each quarter of the plane with its color.
+    power = np.zeros((2, 2, 2, 3))
     for light in lights:
-        np.testing.assert_allclose(light.radiance, 2.0 * colors[..., :3].mean(axis=(0, 1)), rtol=1e-5)
-    mean = colors[..., :3].mean(axis=(0, 1))
-    size = 100.0 * np.abs(colors[..., :3] - mean).sum(axis=-1).mean() / mean.sum()
-    assert notes[0].startswith("Baked: its emission varies: it lights as the mean of its image")
-    assert notes[1:] == [f"Baked: it lights as the mean of its image, which is {size:.0f} % off its colors"]
+        column, row, _ = (light.center > 0.0).astype(int)
+        np.testing.assert_allclose(light.radiance, 2.0 * colors[row, column, :3], rtol=1e-5)
+        power[int(light.direction[2] > 0.0), row, column] += np.linalg.norm(light.area_vector) * light.radiance
+    np.testing.assert_allclose(power, 2.0 * np.tile(colors[..., :3], (2, 1, 1, 1)), rtol=1e-5)
+    assert not notes
 
 
 def test_what_reads_a_material_changes_nothing_of_the_file():
@@ -578,7 +578,7 @@ SHINING = {
 @edits_with_graphics
 @pytest.mark.parametrize("kind", SHINING)
 def test_what_shines_by_a_pattern_lights_as_its_mean_and_is_named_with_bounces_too(tmp_path, kind):
-    """The oracle is Cycles' picture of the surface, which reflects nothing, from above."""
+    """An image as its colors. The oracle is Cycles' picture of the surface, which reflects nothing, from above."""
     parts.empty_scene(256, 256)
     black = {"Base Color": (0.0, 0.0, 0.0, 1.0), "Specular IOR Level": 0.0, "Emission Strength": 2.0}
     material = made("Wall", "BsdfPrincipled", {**black, **SHINING[kind]})()
@@ -606,6 +606,16 @@ def test_what_shines_by_a_pattern_lights_as_its_mean_and_is_named_with_bounces_t
     picture = read_layer(parts.cycles_channels(tmp_path, 4), "Combined", "RGB")
     mean = picture.mean(axis=(0, 1))
     off = 100.0 * np.abs(picture - mean).sum(axis=-1).mean() / mean.sum()
+    if kind == "image":
+        power = sum(np.linalg.norm(light.area_vector) * light.radiance for light in lights)
+        np.testing.assert_allclose(power / 8.0, mean, rtol=0.01)
+        for light in lights:
+            size = np.abs(light.half_u) + np.abs(light.half_v)
+            bounds = np.rint(128.0 + 128.0 * np.stack([light.center - size, light.center + size])).astype(int)
+            (left, right), (low, high) = bounds.T[:2]
+            within = picture[256 - high : 256 - low, left:right]
+            np.testing.assert_allclose(light.radiance, within.mean(axis=(0, 1)), rtol=0.02)
+        return
     assert lights
     for light in lights:
         np.testing.assert_allclose(light.radiance, mean, rtol=0.03)

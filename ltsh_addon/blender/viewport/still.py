@@ -30,7 +30,7 @@ from .mirror import NOT_RESOLVED, Changes, SceneMirror, patterns_of
 from .pictures import TRANSMITTED, ShownPicture, ShownRest
 from .renderer import ViewRenderer
 from .shadow_rays import MOST_BYTES, ShadowRays, ViewTracer, too_many, view_occluders, visibility_texture
-from .shadows import QUICK, QUICK_RAYS, PixelGrid, ShadowRequest, shape_of, shape_of_sky
+from .shadows import MANY_POINTS, QUICK, QUICK_RAYS, PixelGrid, ShadowRequest, shape_of, shape_of_sky
 
 # FEWEST_RAYS: a point of a pixel takes at least so many rays per light, however many points share those of the pixel.
 FEWEST_RAYS = 32
@@ -177,7 +177,8 @@ class FrameShadows:
         return self._grid
 
     def _traced(self, key, lights) -> np.ndarray:
-        work = ShadowRequest((), QUICK, 0, (0,), (key,), (lights,), self._points, self._rays, self.tracing)
+        level = QUICK if np.prod(self._state[1]) > MANY_POINTS else 1
+        work = ShadowRequest((), level, 0, (0,), (key,), (lights,), self._points, self._rays, self.tracing)
         return work.visibility(lambda stage, fraction: None)[0]
 
     def facts(self, samples: int) -> dict:

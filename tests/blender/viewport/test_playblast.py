@@ -103,3 +103,24 @@ def test_bounces_of_a_playblast_are_those_of_its_frames(capsys, tmp_path):
             f"frame {frame} tests nothing"
         )
         before = picture
+
+
+@pytest.mark.newest
+def test_shadows_of_a_small_playblast_are_those_of_a_still(capsys, tmp_path):
+    """A ball on a floor: its shadow is thinner than what larger pictures skip of rays."""
+    with_graphics(lambda: None)
+    parts.empty_scene()
+    parts.add_plane(parts.principled("floor", Roughness=0.9)[0], size=6.0)
+    parts.add_sphere(parts.principled("ball", Roughness=0.9)[0], radius=0.5, location=(0.0, 0.0, 0.5))
+    parts.add_area_light(location=(-0.3, -0.4, 3.0), size=0.3)
+    parts.add_camera((0.3, -4.0, 2.6), (1.02, 0.1, 0.05))
+    path = parts.save(tmp_path / "ball.blend")
+    pictures = []
+    for count in (1, 2):
+        command = ("view", path, "-o", tmp_path / str(count), "--frames", f"1-{count}", "--resolution", "96x64")
+        assert run(capsys, *command, "--techniques", "ltsh2", "--refine", 1, "--shadow-rays", 256, "--quiet")[0] == 0
+        (file,) = (tmp_path / str(count)).glob("view*1.exr" if count == 2 else "view.exr")
+        pictures.append(imaging.read_layers(file)["ltsh2.combined"])
+    # 32 rays in place of 256: the deviation of a stratified penumbra is below .05 of the light.
+    off = np.abs(pictures[1] - pictures[0]).max() / pictures[0].max()
+    assert off < 0.12, off

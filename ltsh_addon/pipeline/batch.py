@@ -177,7 +177,7 @@ def merge(output: Path, progress=None) -> Merged:
     output = Path(output)
     job = _read_job(output)
     tasks = [
-        batch_tasks.BatchTask(**{item.name: task[item.name] for item in fields(batch_tasks.BatchTask)})
+        batch_tasks.BatchTask(**{item.name: task.get(item.name) for item in fields(batch_tasks.BatchTask)})
         for task in job["tasks"]
     ]
     records = _task_records(output, job["command"])

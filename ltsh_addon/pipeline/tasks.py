@@ -27,7 +27,7 @@ LONGEST_STEM, LONGEST_NAME = 100, 200
 # Shapes that documents must have (see `reading.check`).
 _TASK = {
     **dict.fromkeys(("scene", "key"), str),
-    **dict.fromkeys(("camera", "object", "problem"), str | None),
+    **dict.fromkeys(("camera", "object", "problem?"), str | None),
     **dict.fromkeys(("frame", "tile"), int | None),
     "name": file_name,
 }

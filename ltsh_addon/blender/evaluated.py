@@ -15,6 +15,16 @@ def read_values(collection, name: str, shape: tuple[int, ...], dtype) -> np.ndar
     return values.reshape(shape)
 
 
+def uv_maps(mesh) -> dict[str, np.ndarray]:
+    """The UV maps (C, 2) of a mesh with C corners by name, "" the one that renders."""
+    maps = {}
+    for layer in mesh.uv_layers:
+        maps[layer.name] = read_values(layer.uv, "vector", (len(mesh.loops), 2), np.float32)
+        if layer.active_render:
+            maps[""] = maps[layer.name]
+    return maps
+
+
 def image_pixels(image) -> np.ndarray:
     """Pixels (H, W, 4) float32 of an image, row 0 at the bottom."""
     width, height = image.size

@@ -9,7 +9,7 @@ import numpy as np
 from ...cycles.texels import TexelMesh
 from ...cycles.uv import tiles_of
 from ...scene import FARTHEST, SceneError, listed
-from ..evaluated import normals_at_corners, objects_in_renders, read_values, with_render_depsgraph
+from ..evaluated import normals_at_corners, objects_in_renders, read_values, uv_maps, with_render_depsgraph
 
 UV_LAYER = "ltsh_texels"
 
@@ -131,7 +131,7 @@ def _read(ob, mesh, matrix, uv_name):
     loops, vertices = (read_values(mesh.loop_triangles, name, (3 * count,), np.int32) for name in ("loops", "vertices"))
     positions = read_values(mesh.vertices, "co", (len(mesh.vertices), 3), np.float32)
     normals, flat = normals_at_corners(mesh)
-    maps = {other.name: uv_of(other, len(mesh.loops))[loops].reshape(count, 3, 2) for other in mesh.uv_layers}
+    maps = {name: of_corners[loops].reshape(count, 3, 2) for name, of_corners in uv_maps(mesh).items()}
     uv = maps[layer.name]
     linear = matrix[:3, :3]
     if not np.isfinite(matrix).all() or abs(np.linalg.det(linear)) < 1e-30:
@@ -158,8 +158,7 @@ def _read(ob, mesh, matrix, uv_name):
             f"object {ob.name!r}: all of UV map {layer.name!r} lies outside of the texture, expected some of it "
             "between 0 and 1, or whole faces in UDIM tiles: move it"
         )
-    rendered = next((other.name for other in mesh.uv_layers if other.active_render), layer.name)
-    return texel_mesh, layer.name, {**maps, "": maps[rendered]}
+    return texel_mesh, layer.name, {"": maps[layer.name], **maps}
 
 
 def uv_of(layer, count):

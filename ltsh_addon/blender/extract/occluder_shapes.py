@@ -63,13 +63,12 @@ def tubes_of_hair(ob, system, numbers, steps, clear) -> OccluderMesh:
     along = np.linalg.norm(np.diff(positions, axis=1, prepend=positions[:, :1]), axis=2).cumsum(axis=1)
     along /= np.maximum(along[:, -1:], 1e-30)
     root, tip = 0.5 * settings.radius_scale * settings.root_radius, 0.5 * settings.radius_scale * settings.tip_radius
-    shape = settings.shape
-    power = 1.0 + shape if shape < 0.0 else 1.0 / max(1.0 - shape, 1e-6)
+    power = 1.0 + settings.shape if settings.shape < 0.0 else 1.0 / max(1.0 - settings.shape, 1e-6)
     radii = (tip + (root - tip) * np.maximum(1.0 - along, 0.0) ** power).astype(np.float32)
     if settings.use_close_tip:
         radii[:, -1] = 0.0
-    positions, radii = positions.reshape(-1, 3), radii.ravel()
-    return _tubes(positions, radii, np.arange(len(numbers)) * steps, _constant_transparency(clear))
+    first = np.arange(len(numbers)) * steps
+    return _tubes(positions.reshape(-1, 3), radii.ravel(), first, _constant_transparency(clear))
 
 
 def _constant_transparency(clear, ob=None, note=None) -> Transparency | None:

@@ -11,7 +11,15 @@ from ...cycles.patches import GRID, cut_into_patches, note_patches, split_light
 from ...emitters import mesh_polygons
 from ...emitters.mesh_polygons import FlatPolygon
 from ...scene import Light, PointLight, PolygonLight, QuadLight
-from ..evaluated import SURFACE_TYPES, EmitterTraits, RenderedSurface, is_rendered, read_values, surface_instancer
+from ..evaluated import (
+    SURFACE_TYPES,
+    EmitterTraits,
+    RenderedSurface,
+    is_rendered,
+    read_values,
+    surface_instancer,
+    uv_maps,
+)
 from ..materials.graph import computed, ensure_nodes, fill_with_bsdf, is_displaced, live_link, material_output, mixed
 from ..render_settings import changed_properties
 from .emission import (
@@ -37,7 +45,7 @@ class Placement:
     slots: np.ndarray  # (T,) index of the material slot
     matrix: np.ndarray  # (4, 4)
     mesh: object = None  # copy of the evaluated mesh, if a texture must be rendered
-    uv_maps: dict = field(default_factory=dict)  # (T, 3, 2) by name, "" the one that renders: of few faces in views
+    uv_maps: dict = field(default_factory=dict)  # (T, 3, 2) by name, as `uv_maps`: of few faces in views
     facts: ObjectFacts = ObjectFacts()
 
 
@@ -133,8 +141,10 @@ def _placement(ob, matrix: np.ndarray, light: MeshLight, depsgraph) -> Placement
         count = len(mesh.loop_triangles)
         triangles = read_values(mesh.loop_triangles, "vertices", (count, 3), np.int32)
         slots = read_values(mesh.loop_triangles, "material_index", (count,), np.int32)
-        is_read = light.varies and depsgraph is None and count <= MOST_TRIANGLES
-        uv_maps = _uv_maps(mesh, np.linalg.det(matrix[:3, :3]) < 0.0) if is_read else {}
+        maps, way = {}, -1 if np.linalg.det(matrix[:3, :3]) < 0.0 else 1
+        if light.varies and depsgraph is None and count <= MOST_TRIANGLES:
+            corners = read_values(mesh.loop_triangles, "loops", (count, 3), np.int32)[:, ::way]
+            maps = {name: uv[corners] for name, uv in uv_maps(mesh).items()}
     finally:
         ob.to_mesh_clear()
     slots = np.clip(slots, 0, len(light.materials) - 1)
@@ -144,18 +154,7 @@ def _placement(ob, matrix: np.ndarray, light: MeshLight, depsgraph) -> Placement
     if light.varies and depsgraph is not None:
         copy = bpy.data.meshes.new_from_object(ob, preserve_all_data_layers=True, depsgraph=depsgraph)
     world = vertices.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
-    triangles = triangles.astype(np.int64)
-    if np.linalg.det(matrix[:3, :3]) < 0.0:
-        triangles = triangles[:, ::-1]
-    return Placement(world, triangles, slots, matrix, copy, uv_maps=uv_maps)
-
-
-def _uv_maps(mesh, is_mirrored: bool) -> dict[str, np.ndarray]:
-    corners = read_values(mesh.loop_triangles, "loops", (len(mesh.loop_triangles), 3), np.int32)
-    corners = corners[:, :: -1 if is_mirrored else 1]
-    layers = [(layer.name, layer) for layer in mesh.uv_layers]
-    layers += [("", layer) for layer in mesh.uv_layers if layer.active_render]
-    return {name: read_values(layer.uv, "vector", (len(mesh.loops), 2), np.float32)[corners] for name, layer in layers}
+    return Placement(world, triangles.astype(np.int64)[:, ::way], slots, matrix, copy, maps)
 
 
 # SIDE_PROPERTY: custom property of objects that let light through in the reference: objects that shine, and surfaces
@@ -231,10 +230,8 @@ def constant_mesh_lights(mesh_lights: list[MeshLight], radiance_of, split, eye: 
         side = _emitting_side(mesh_light, eye)
         mesh_light, of_images = _without_images(mesh_light, side, split)
         remain = {slot for placement in mesh_light.placements for slot in np.unique(placement.slots).tolist()}
-        radiance = [
-            np.tile(radiance_of(material), (2, 1)) if slot in remain else np.zeros((2, 3))
-            for slot, material in enumerate(mesh_light.materials)
-        ]
+        shining = (material if slot in remain else None for slot, material in enumerate(mesh_light.materials))
+        radiance = [np.tile(radiance_of(material), (2, 1)) for material in shining]
         mesh_light, of_balls = _without_balls(mesh_light, radiance, side)
         lights.extend(of_balls)
         of_mesh = of_images + _constant_lights(mesh_light, _polygons(mesh_light, radiance), radiance, side)
@@ -255,20 +252,19 @@ def _without_images(mesh_light: MeshLight, side: int, split) -> tuple[MeshLight,
     """The light without the flat polygons that shine by an image, and these as lights. `split(material, light,
     triangles, uv_maps, share)` makes those of a `light` of radiance 1, which `triangles` (T, 3, 3) cover, with this
     share of the patches of the object; None: it cannot."""
+    if not any(placement.uv_maps for placement in mesh_light.placements):
+        return mesh_light, []
     placements, lights = [], []
-    for placement in mesh_light.placements:
+    for placement, polygons in _polygons(mesh_light, np.zeros((len(mesh_light.materials), 3))):
         corners, remain = placement.vertices[placement.triangles], np.ones(len(placement.triangles), bool)
-        shape = placement.vertices, placement.triangles, placement.slots
-        polygons = mesh_polygons.flat_polygons(*shape) if placement.uv_maps else ()
-        polygons = [polygon for polygon in polygons if mesh_light.emission[polygon.label].varies]
         for polygon in polygons:
             height = np.abs((corners - polygon.corners[0]) @ polygon.normal).max(axis=1)
             flat = (placement.slots == polygon.label) & (height < COPLANAR * np.ptp(polygon.corners, axis=0).max())
-            uv_maps = {name: uv[flat] for name, uv in placement.uv_maps.items()}
+            maps = {name: uv[flat] for name, uv in placement.uv_maps.items()}
+            share = 1.0 / (len(polygons) * len(_sides(side)) * len(mesh_light.placements))
             for way in _sides(side):
                 light = polygon_light(mesh_light.light_of(polygon.label), polygon, way, np.ones(3))
-                share = 1.0 / (len(polygons) * len(_sides(side)) * len(mesh_light.placements))
-                shown = split(mesh_light.materials[polygon.label], light, corners[flat], uv_maps, share)
+                shown = split(mesh_light.materials[polygon.label], light, corners[flat], maps, share)
                 if shown is not None:
                     lights, remain = lights + shown, remain & ~flat
         if remain.any():

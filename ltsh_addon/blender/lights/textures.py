@@ -457,9 +457,7 @@ def _texture(use) -> ImageTexture | None:
     return ImageTexture(pixels, use.extension, "Closest" if use.closest else "Linear", srgb)
 
 
-def _cut(
-    texture: ImageTexture, factor: Value, uv: np.ndarray, covered: np.ndarray, most: int = MOST_PATCHES
-) -> Patches:
+def _cut(texture, factor: Value, uv: np.ndarray, covered: np.ndarray, most: int = MOST_PATCHES) -> Patches:
     """The patches of an image at points `uv` (N, N, 2) of a light, row 0 on top, of which those `covered` (N, N) count;
     SUB x SUB of them are one of POINTS x POINTS."""
     count = len(uv)

@@ -117,6 +117,11 @@ class PreviewMaterial:
         shines = self.glow > 0.0 or bool(np.any(self.emission)) or self.emission_image is not None
         return not self.is_clear and (shines or bool(self.notes) or any(lobe.through > 0.0 for lobe in self.lobes))
 
+    @property
+    def shining_image(self) -> Value | None:
+        """The image by which it shines: times `glow` if it only shines, else beside `emission`."""
+        return self.value("color") if self.glow else self.emission_image
+
     def notes_in_view(self, with_bounces: bool) -> tuple[str, ...]:
         """What views do not show of it as Cycles does. With bounces that is the light that it casts alone."""
         return self.light_notes if with_bounces else self.notes

@@ -9,7 +9,7 @@ import numpy as np
 from ...cycles import closures, horizons
 from ...cycles.horizons import unit
 from ...cycles.lobes import LEAST_VELVET, LOBE_KINDS
-from ..evaluated import interpolated_normals, read_values
+from ..evaluated import interpolated_normals, read_values, uv_maps
 from ..extract.occluder_shapes import ball, points_of
 from ..materials.preview_material import IMAGE_SLOTS, OTHER_KINDS, PreviewMaterial
 from ..materials.values import EXTENSIONS, Value
@@ -209,7 +209,7 @@ def _arrays(ob) -> _Arrays | None:
         vertex = read_values(mesh.attributes[".corner_vert"].data, "value", (len(mesh.loops),), np.int32)
         position = read_values(mesh.attributes["position"].data, "vector", (len(mesh.vertices), 3), np.float32)
         middle = 0.5 * (position.min(axis=0) + position.max(axis=0)).astype(np.float64)
-        position, uv = position.take(vertex, axis=0), _uv_maps(mesh, len(vertex))
+        position, uv = position.take(vertex, axis=0), uv_maps(mesh)
         normal, flat = interpolated_normals(mesh, vertex)
         if flat.any():
             chosen, face_normals = non_planar_normals(mesh, flat, triangles, position, normal)
@@ -253,15 +253,6 @@ def _slots(mesh, count: int, slots: int) -> np.ndarray:
     if slots == 1:
         return np.zeros(count, np.int32)
     return np.clip(read_values(mesh.loop_triangles, "material_index", (count,), np.int32), 0, slots - 1)
-
-
-def _uv_maps(mesh, corners: int) -> dict[str, np.ndarray]:
-    maps = {}
-    for layer in mesh.uv_layers:
-        maps[layer.name] = read_values(layer.uv, "vector", (corners, 2), np.float32)
-        if layer.active_render:
-            maps[""] = maps[layer.name]
-    return maps
 
 
 # The layout of a look's uniform buffer in units of vec4: start and size of the slots, start of the terms of conductors,

@@ -131,7 +131,7 @@ def _preview(material, textures: ShownTextures) -> PreviewMaterial:
 def _split(material, light: Light, triangles, uv_maps: dict, share, textures: ShownTextures, notes):
     """Patches of a `light` that shines by an image, or None, see `constant_mesh_lights`."""
     look = None if material is None else preview_of(material)
-    image = None if look is None else look.value("color") if look.glow else look.emission_image
+    image = None if look is None else look.shining_image
     uv = None if image is None or image.image is None else uv_maps.get(image.image.uv_map)
     if uv is None:
         return None
@@ -144,9 +144,10 @@ def _emission(material, textures: ShownTextures, is_small: bool, notes: list[str
     if material is None:
         return np.zeros(3)
     look = _preview(material, textures)
-    image = look.value("color") if look.glow and is_small else look.emission_image
+    image = look.shining_image
     if look.glow and not is_small:
         notes.append(f"{material.name}: more than {MOST_TRIANGLES} triangles shine by its image, they light nothing")
+        return look.emission
     if image is None:
         return look.emission
     mean, spread = textures.mean(image)

@@ -1,6 +1,7 @@
 """The pictures of a view: sums of samples, and the passes that show, copy and join them."""
 
 from dataclasses import dataclass, fields, is_dataclass
+from functools import cached_property
 
 import gpu
 import numpy as np
@@ -123,16 +124,20 @@ class ShownRest:
 
 
 class RestPass:
-    """Draws a picture with its rest; needs an active GPU context."""
+    """Draws a picture with its rest; needs an active GPU context. Its shaders compile when they are first used."""
 
-    def __init__(self):
+    @cached_property
+    def _shader(self) -> PixelShader:
         samplers = ("picture", "of_cycles", "rest", "whole", "positions", "front_positions")
         samplers += "diffuse_colors", "specular_colors"
         constants = {"projection": "MAT4", "whole_share": "FLOAT", **dict.fromkeys(("scale", "ambient"), "VEC4")}
         constants |= dict.fromkeys(("has_moved", "is_parallel"), "INT")
         source = definitions({"FARTHEST": FARTHEST, "NEAR": NEAR}) + _between("rest") + glsl("rest")
-        self._shader = PixelShader(source, samplers, constants)
-        self._given = PixelShader(glsl("given"), ("picture", "share"), {"weight": "FLOAT"})
+        return PixelShader(source, samplers, constants)
+
+    @cached_property
+    def _given(self) -> PixelShader:
+        return PixelShader(glsl("given"), ("picture", "share"), {"weight": "FLOAT"})
 
     def add_given(self, sums: "list[SampleSum]", share: "SampleSum", targets: "list[SampleSum]", weight: float) -> None:
         """Add to `targets` what a sample has of what is Cycles' alone, its `share` of pixels: call it with the `sums`

@@ -170,6 +170,7 @@ class ViewRenderer:
         # Pictures get a rest, and this one as soon as there is one; `_of_cycles`: their light of what is Cycles' alone.
         self.has_bounces, self.rest = False, None  # bool, ShownRest | None
         self.shows_whole = False  # Cycles' picture stands for the view's own
+        self._rest_pass = RestPass()
         self._share: list[SampleSum] = []  # of the last sample
         self._of_cycles: list[SampleSum] = []
 
@@ -248,10 +249,6 @@ class ViewRenderer:
         # The sample has bound other buffers, and Blender's own binding is unknown to Python.
         with target.bind():
             self._picture.draw(pictures, weights, view, self._size, shown, self._background)
-
-    @cached_property
-    def _rest_pass(self) -> RestPass:
-        return RestPass()
 
     def _with_rest(self, number: int, view: ViewCamera, whole_share: float) -> gpu.types.GPUTexture:
         """The mean of a picture's samples with the rest."""

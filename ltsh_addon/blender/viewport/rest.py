@@ -72,9 +72,8 @@ def next_job(before: RestJob | None, view: RestView, share: float) -> RestJob:
     done, first = (0, 0.0) if before is None else (before.total, before.rows[1] % 1.0)
     samples, most = 1, share * shrink**2  # most: samples in a step
     last = first + 1.0 / math.ceil(1.0 / most)
-    if first == 0.0 and most >= 1.0:
+    if first == 0.0 and most >= 1.0 and (shrink > 1 or done >= SINGLES):
         samples = min(next(count for count in TOTALS if count > done) - done, int(most))
-    samples = 1 if shrink == 1 and done < SINGLES else samples
     rows = first, last if last < 0.99 else 1.0
     return RestJob(None, view, samples, done, shrink, rows, continues=before is not None)
 

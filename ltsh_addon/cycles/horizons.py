@@ -234,7 +234,7 @@ def _with_stand_ins(lights) -> tuple[tuple[Light, ...], np.ndarray]:
     for group in kinds.values():
         share = np.ones(len(group))
         if len(group) > MOST_LIGHTS:
-            group, share = stand_ins(group, MOST_LIGHTS)
+            group, share, _ = stand_ins(group, MOST_LIGHTS)
         others += group
         shares.append(share)
     return tuple(others), np.concatenate(shares)

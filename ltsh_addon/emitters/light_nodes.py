@@ -5,6 +5,8 @@ with bounds on their positions and lobes. On smooth surfaces the light of ten sa
 others by cubics.
 """
 
+import heapq
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,17 +43,25 @@ class NodeSums:
         return total, middle, spread, np.where(length > 1e-9 * total[:, None], axis, first), length[:, 0]
 
 
-def stand_ins(lights, most: int) -> tuple[list[Light], np.ndarray]:
-    """Rectangles that stand for many flat lights with an area, and the share (N,) of each that shines. Each stands
-    for neighbors that face alike. There are N = `most`, a power of two and at most as many as there are lights."""
+# LEAST_STAND_INS: of a group of lights, if there are as many. TURN: a turn by 1 rad counts as much as a way of so many
+# times the size of the group.
+LEAST_STAND_INS, TURN = 8, 0.1
+
+
+def stand_ins(lights, most: int, group=0) -> tuple[list[Light], np.ndarray, list[np.ndarray]]:
+    """Rectangles that stand for many flat lights with an area, the share (N,) of each that shines, and the numbers of
+    the lights for which it stands: neighbors that face alike, of one `group` (L,). There are at most `most`, or up to
+    LEAST_STAND_INS for each group."""
     center, area, covariance, _, _ = small_lights.moments_of(lights)
     size = np.linalg.norm(area, axis=1)
-    normal = area / size[:, None]
-    order, start, end, _ = node_ranges(center, normal, most)
-    sums = NodeSums(order, start[-most:], end[-most:])
+    normal, radiance = area / size[:, None], np.array([light.radiance for light in lights])
+    group, weight = np.broadcast_to(group, size.shape), size * np.abs(radiance).sum(axis=1)
+    members = _neighbors(center, normal, weight, [np.flatnonzero(group == one) for one in np.unique(group)], most)
+    end = np.cumsum([len(numbers) for numbers in members])
+    sums = NodeSums(np.concatenate(members), np.append(0, end[:-1]), end)
     origin = center.mean(axis=0)
     whole, middle, spread, axis, _ = sums.moments(size, center - origin, covariance, normal)
-    radiance = sums(size[:, None] * np.array([light.radiance for light in lights])) / whole[:, None]
+    radiance = sums(size[:, None] * radiance) / whole[:, None]
     along = np.eye(3) - axis[:, :, None] * axis[:, None, :]
     variances, axes = np.linalg.eigh(along @ spread @ along)
     # Uniform rectangles with these variances, but no smaller than their shining area.
@@ -61,19 +71,45 @@ def stand_ins(lights, most: int) -> tuple[list[Light], np.ndarray]:
     rows = zip(middle + origin, half_u[:, None] * axes[:, :, 2], half_v[:, None] * axes[:, :, 1], axis, strict=True)
     share = whole / (4.0 * half_u * half_v)
     radiance *= share[:, None]
-    like = QuadLight.like(lights[0])
     names = ("center", "half_u", "half_v", "direction")
     rectangles = [
-        like.altered(**dict(zip(names, row, strict=True)), radiance=mean)
-        for row, mean in zip(rows, radiance, strict=True)
+        QuadLight.like(lights[numbers[0]], **dict(zip(names, row, strict=True)), radiance=mean)
+        for row, mean, numbers in zip(rows, radiance, members, strict=True)
     ]
-    return rectangles, share
+    return rectangles, share, members
 
 
-def node_ranges(center, normal, most=np.inf, body=None):
+def _neighbors(center, normal, weight, groups, most) -> list[np.ndarray]:
+    """The numbers of lights in each group, of which those are halved again and again that have the most weight and
+    differ most in place and direction."""
+    key, ties = np.concatenate([center, normal], axis=1), itertools.count()
+    for numbers in groups:
+        key[numbers, 3:] *= TURN * np.linalg.norm(np.ptp(center[numbers], axis=0))
+
+    def node(numbers):
+        share = weight[numbers] / weight[numbers].sum()
+        away = key[numbers] - share @ key[numbers]
+        spread = (away * share[:, None]).T @ away
+        ahead = away @ np.linalg.eigh(spread)[1][:, -1] > 0.0
+        worth = weight[numbers].sum() * np.trace(spread) if ahead.any() and not ahead.all() else 0.0
+        return -worth, next(ties), numbers, ahead
+
+    def halved(heap, count):
+        heapq.heapify(heap)
+        while len(heap) < count and heap[0][0] < 0.0:
+            *_, numbers, ahead = heapq.heappop(heap)
+            for half in (numbers[ahead], numbers[~ahead]):
+                heapq.heappush(heap, node(half))
+        return heap
+
+    nodes = halved([one for numbers in groups for one in halved([node(numbers)], min(LEAST_STAND_INS, most))], most)
+    return [numbers for *_, numbers, _ in nodes]
+
+
+def node_ranges(center, normal, body=None):
     """The order (L,) of the lights, the starts and the ends (N,) of the nodes in that order, and the children (N, 2) of
-    the nodes. Each level halves the nodes above it where their lights differ most. The last level is the first that has
-    `most` nodes. Lights of the same `body` (L,) stay together, until a node has no others."""
+    the nodes. Each level halves the nodes above it where their lights differ most. Lights of the same `body` (L,) stay
+    together, until a node has no others."""
     count = len(center)
     order = np.arange(count)
     if body is not None:
@@ -88,7 +124,7 @@ def node_ranges(center, normal, most=np.inf, body=None):
         child = np.full((len(start), 2), -1)
         child[inner] = first + np.arange(2 * len(inner)).reshape(-1, 2)
         children.append(child)
-        if len(inner) == 0 or len(start) >= most:
+        if len(inner) == 0:
             return order, np.concatenate(starts), np.concatenate(ends), np.concatenate(children)
         start, end = start[inner], end[inner]
         first += 2 * len(inner)

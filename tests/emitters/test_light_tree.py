@@ -235,7 +235,8 @@ def test_workers_do_not_change_one_bit(started, children_only, monkeypatch):
 
 def test_stand_ins_have_the_light_and_the_place_of_their_lights():
     lights = many_lights(300)
-    found, share = light_nodes.stand_ins(lights, 16)
+    found, share, numbers = light_nodes.stand_ins(lights, 16)
+    assert sorted(np.concatenate(numbers)) == list(range(300))
     assert len(found) == 16 and (0.0 < share).all() and (share < 1.0).all()
     for own in (lights, found):
         assert all(light.direction @ light.area_vector != 0.0 for light in own)
@@ -250,7 +251,7 @@ def test_stand_ins_have_the_light_and_the_place_of_their_lights():
         area_light("Part", "RECTANGLE", (x, y, 3.0), (1 / 16, 0, 0), (0, -1 / 16, 0), direction=(0, 0, -1))
         for x in step for y in step
     ]  # fmt: skip
-    (whole,), share = light_nodes.stand_ins(parts, 1)
+    (whole,), share, _ = light_nodes.stand_ins(parts, 1)
     assert np.allclose(np.linalg.norm([whole.half_u, whole.half_v], axis=1), 1.0) and np.allclose(share, 1.0)
     assert np.allclose(whole.radiance, parts[0].radiance) and np.allclose(whole.center, (0, 0, 3))
 

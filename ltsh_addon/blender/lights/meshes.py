@@ -6,9 +6,11 @@ from dataclasses import dataclass, field, replace
 
 import bpy
 import numpy as np
+from mathutils.geometry import convex_hull_2d
 
 from ...cycles.patches import GRID, cut_into_patches, note_patches, split_light
-from ...emitters import mesh_polygons
+from ...emitters import light_tree, mesh_polygons
+from ...emitters.light_nodes import stand_ins
 from ...emitters.mesh_polygons import FlatPolygon
 from ...scene import Light, PointLight, PolygonLight, QuadLight
 from ..evaluated import (
@@ -161,8 +163,10 @@ def _placement(ob, matrix: np.ndarray, light: MeshLight, depsgraph) -> Placement
 # that instance lights. Its value is 1 if only the front of the faces shines, -1 if only the back does, 0 for both.
 SIDE_PROPERTY = "ltsh_emitting_side"
 # Limits on the emitting polygons of one object. MOST_POLYGONS: in pictures and bakes, where 20,000 take about 13 s of
-# processor time. MOST_SHOWN: in the viewport.
-MOST_POLYGONS, MOST_SHOWN = 200_000, 2000
+# processor time. MOST_SHOWN: of all objects, in views.
+MOST_POLYGONS, MOST_SHOWN = 200_000, 112
+# MOST_CORNERS: of a polygon that stands for faces.
+MOST_CORNERS = 6
 # MOST_TRIANGLES: of objects that light by an image in views; more are mostly baked, with their light in the image.
 # COPLANAR: farthest that their corners are from a plane, as a share of its polygon.
 MOST_TRIANGLES, COPLANAR = 64, 1e-4
@@ -236,16 +240,54 @@ def constant_mesh_lights(mesh_lights: list[MeshLight], radiance_of, split, eye: 
         lights.extend(of_balls)
         of_mesh = of_images + _constant_lights(mesh_light, _polygons(mesh_light, radiance), radiance, side)
         of_mesh = [replace(light, falloff=0, smooth=0.0) for light in of_mesh]
-        if (step := -(-len(of_mesh) // MOST_SHOWN)) > 1:
-            power = np.array([np.linalg.norm(light.area_vector) * light.radiance.sum() for light in of_mesh])
-            # One of each `step`, by chance: in every order of faces some kind comes at even distances, such as backs.
-            first, count = np.arange(0, len(of_mesh), step), len(of_mesh)
-            chosen = np.minimum(first + np.random.default_rng(0).integers(step, size=len(first)), count - 1)
-            more = power.sum() / max(power[chosen].sum(), 1e-30)
-            warn(f"object {mesh_light.ob.name!r}: of its {count} flat faces one in {step} shines for all, in views")
-            of_mesh = [replace(of_mesh[number], radiance=more * of_mesh[number].radiance) for number in chosen]
         lights.extend(of_mesh)
     return lights
+
+
+@dataclass(frozen=True)
+class StandInLight(PolygonLight):
+    """A polygon that shines in place of neighboring faces of a mesh. Its visibility is that of all `faces`."""
+
+    faces: tuple[Light, ...] = ()  # those for which it and its neighbors stand
+
+
+def fewer_lights(lights: list[Light], warn) -> list[Light]:
+    """`lights` of meshes: of more than MOST_SHOWN faces, polygons stand for those of one object and radiance, if they
+    are so many that they share their rays. At a tenth of its size a sign of neon tubes then lights 4 to 10 % off."""
+    alike: dict[tuple, list[Light]] = {}
+    for number, light in enumerate(lights):
+        key = (light.name, light.group, light.receivers, *light.radiance.tolist())
+        alike.setdefault(number if light.is_facing else key, []).append(light)
+    groups = [tuple(group) for group in alike.values() if len(group) >= light_tree.FEWEST]
+    faces = tuple(itertools.chain.from_iterable(groups))
+    if len(faces) <= MOST_SHOWN:
+        return lights
+    shown = [light for group in alike.values() if len(group) < light_tree.FEWEST for light in group]
+    group = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
+    for rectangle, _, numbers in zip(*stand_ins(faces, MOST_SHOWN, group), strict=True):
+        corners = np.concatenate([faces[number].polygon() for number in numbers])
+        shown.append(_around(rectangle, corners, groups[group[numbers[0]]]))
+    names = ", ".join(dict.fromkeys(repr(light.name) for light in faces))
+    count = sum(isinstance(light, StandInLight) for light in shown)
+    warn(f"{names}: {count} polygons stand for {len(faces)} flat faces that shine, in views")
+    return shown
+
+
+def _around(rectangle: QuadLight, corners: np.ndarray, faces: tuple[Light, ...]) -> StandInLight:
+    """The light of `rectangle` from the convex outline of `corners` (V, 3): in a dome it leaves almost no gaps between
+    neighbors. If they are on a line, from the rectangle."""
+    axes, away = np.stack([rectangle.half_u, rectangle.half_v]), corners - rectangle.center
+    flat = away @ np.linalg.pinv(axes)
+    hull = np.array(convex_hull_2d(flat))
+    while len(hull) > MOST_CORNERS:
+        before, after = (np.roll(flat[hull], step, axis=0) - flat[hull] for step in (1, -1))
+        hull = np.delete(hull, np.argmin(np.abs(before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0])))
+    height, flat = max((away[hull] @ rectangle.direction).mean(), 0.0), flat[hull]
+    area = 0.5 * abs(np.sum(flat[:, 0] * np.roll(flat[:, 1], -1) - flat[:, 1] * np.roll(flat[:, 0], -1)))
+    if area < 0.1:  # of the rectangle's 4
+        height, flat, area = 0.0, np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]]), 4.0
+    center, radiance = rectangle.center + height * rectangle.direction, 4.0 / area * rectangle.radiance
+    return StandInLight.like(rectangle, center=center, corners=center + flat @ axes, radiance=radiance, faces=faces)
 
 
 def _without_images(mesh_light: MeshLight, side: int, split) -> tuple[MeshLight, list[Light]]:

@@ -26,7 +26,7 @@ from ..evaluated import (
 from ..lights.area import area_light, half_hidden, node_light, note_unsupported, reason_to_leave_out
 from ..lights.emission import emission_of, factors_of, open_studio
 from ..lights.linking import Receivers
-from ..lights.meshes import MOST_TRIANGLES, collect_mesh_lights, constant_mesh_lights
+from ..lights.meshes import MOST_TRIANGLES, collect_mesh_lights, constant_mesh_lights, fewer_lights
 from ..lights.textures import (
     MOST_INSTANCES,
     NodeEmission,
@@ -170,7 +170,7 @@ def _mesh_lights(depsgraph, receivers: Receivers, textures: ShownTextures, notes
         radiance_of = functools.partial(_emission, textures=textures, is_small=count <= MOST_TRIANGLES, notes=notes)
         split = functools.partial(_split, textures=textures, notes=notes)
         lights += constant_mesh_lights([mesh_light], radiance_of, split, eye, notes.append)
-    return lights
+    return fewer_lights(lights, notes.append)
 
 
 def patterns_of(scene, depsgraph, known: dict[tuple, tuple]) -> dict[tuple, tuple[tuple, NodeEmission]]:

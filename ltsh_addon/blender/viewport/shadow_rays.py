@@ -11,6 +11,7 @@ from ...scene import PASSES, Film, Light
 from ...visibility import Occluders, ShadowSampling, Tracer, open_tracer, trace_visibility
 from ...workers.pool import WorkerPool, cores
 from ..extract.occluders import collect_occluders
+from ..lights.meshes import StandInLight
 from ..lights.world import blocks_nothing
 from ..process.blender_process import embree_libraries
 from .drawing import GBufferTextures, ViewCamera, VisibilityGrid, float_buffer, gbuffer_texels, samples_of_texels
@@ -111,11 +112,11 @@ class ShadowRays:
         tracer = self._tracing.tracer
         film = Film(width, height, pixel)
         sampling, pool = ShadowSampling(rays=self._rays, film=film), self._tracing.pool
-        traced = trace_visibility(samples, (*lights, *sides), tracer, sampling, workers=pool)
-        count = len(lights) + bool(sides)
-        values = np.ones((count, height * width, len(PASSES)), np.float32)
+        traced_lights, first = rays_to(shadowed_lights(lights, sides))
+        traced = trace_visibility(samples, traced_lights, tracer, sampling, workers=pool)
+        values = np.ones((len(first), height * width, len(PASSES)), np.float32)
         for index, name in enumerate(PASSES):
-            values[:, pixel, index] = traced.of_lights(name)[:count]
+            values[:, pixel, index] = traced.of_lights(name)[first]
             for row, of_passes in enumerate((traced.radiance, traced.deviation)):
                 self._power[name][row] += np.square(of_passes[name], dtype=np.float64).sum()
         self.seconds += time.perf_counter() - start
@@ -130,6 +131,20 @@ class ShadowRays:
             for name, (power, variance) in self._power.items()
         }
         return {"rays": self.traced, "noise": noise, "tracer": self.description, "seconds": self.seconds}
+
+
+def shadowed_lights(lights: Lights, sides: Lights) -> tuple[Lights, ...]:
+    """Where rays to each of `lights` go, and last to the `sides` of a sky, if any: to the lights themselves, to all
+    faces for which they stand, or to the sides together."""
+    alone = (light.faces if isinstance(light, StandInLight) else (light,) for light in lights)
+    return (*alone, *((sides,) if sides else ()))
+
+
+def rays_to(shadowed: Sequence[Lights]) -> tuple[Lights, list[int]]:
+    """The lights of all tuples of `shadowed`, each tuple once, and the number of the first light of each tuple."""
+    once = {id(lights): lights for lights in shadowed}
+    first = dict(zip(once, np.cumsum([0, *map(len, once.values())]).tolist(), strict=False))
+    return [light for lights in once.values() for light in lights], [first[id(lights)] for lights in shadowed]
 
 
 def view_occluders(depsgraph, note: Callable[[str], None], unread: list | None = None) -> Occluders:

@@ -24,7 +24,7 @@ from .drawing import (
     samples_of_texels,
     unit_xyz,
 )
-from .shadow_rays import Lights, TracedScene, ViewTracer, too_many, visibility_texture
+from .shadow_rays import Lights, TracedScene, ViewTracer, rays_to, shadowed_lights, too_many, visibility_texture
 
 
 def _blank() -> VisibilityGrid:
@@ -181,9 +181,7 @@ class ShadowRequest:
         """The shares of `samples`, as `visibility` returns them."""
         tracer, results = self.tracing.tracer, {}
         origins = self.points.ray_origins(self.tracing.pool, progress) if self.level == 1 else None
-        lights = [light for lights in self.lights for light in lights]
-        starts = np.cumsum([0, *map(len, self.lights)])[:-1]
-        index_of = dict(zip(starts.tolist(), range(len(starts)), strict=True))
+        lights, first = rays_to(self.lights)
         groups = shared_numbers(lights, tracer)
         step = BATCH if self.level == 1 else len(groups)
         sampling = ShadowSampling(rays=self.rays, film=film)
@@ -199,10 +197,10 @@ class ShadowRequest:
             self.tracing.rays += traced.rays
             by_pass = [traced.of_lights(name) for name in PASSES]
             for row, number in enumerate(chosen):
-                if number in index_of:
-                    values = np.ones((film.height * film.width, len(PASSES)), np.float32)
-                    values[film.pixel] = np.stack([of_pass[row] for of_pass in by_pass], axis=-1)
-                    results[index_of[number]] = values.reshape(film.height, film.width, len(PASSES))
+                if number in first:
+                    values = np.ones((film.height, film.width, len(PASSES)), np.float32)
+                    values.reshape(-1, len(PASSES))[film.pixel] = np.stack([one[row] for one in by_pass], axis=-1)
+                    results |= {index: values for index, start in enumerate(first) if start == number}
         return results
 
 
@@ -391,7 +389,7 @@ class LiveShadows:
         """
         if self._given is None or lights is not self._given[0] or sides is not self._given[1]:
             self._given = lights, sides
-            self._lights = (*((light,) for light in lights), *((sides,) if sides else ()))
+            self._lights = shadowed_lights(lights, sides)
             self._keys = (*map(shape_of, lights), *((shape_of_sky(sides),) if sides else ()))
             if self._grid is not None and len(self._keys) != len(self._layers):
                 self._latest = {}

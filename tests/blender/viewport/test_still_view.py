@@ -121,6 +121,25 @@ def test_shadows_of_a_view_are_those_of_shade(capsys, tmp_path):
     assert relative(shade["ltsh4_unshadowed.diffuse"], shade["ltsh4.diffuse"]) > 0.1
 
 
+@pytest.mark.newest
+def test_a_lamp_of_very_many_faces_hides_itself_as_in_pictures(capsys, tmp_path):
+    """Half of the faces of an open mesh shine inside. Rays to the polygons that stand for them would get there: the
+    floor was 1.3 times too bright."""
+    with_graphics(lambda: None)
+    parts.empty_scene(*SIZE)
+    black = {"Base Color": (0.0, 0.0, 0.0, 1.0), "Specular IOR Level": 0.0}
+    glowing = parts.principled("glowing", **black, **{"Emission Color": (1.0, 1.0, 1.0, 1.0), "Emission Strength": 5.0})
+    bpy.ops.mesh.primitive_monkey_add(location=(0.0, 0.0, 1.3))
+    bpy.context.object.data.materials.append(glowing[0])
+    parts.add_plane(parts.principled("floor")[0], size=6.0)
+    parts.add_camera((0.3, -4.0, 2.6), (1.02, 0.1, 0.05))
+    path = parts.save(tmp_path / "lamp.blend")
+    (_, view), (_, shade) = (made(capsys, command, path, tmp_path / command) for command in ("view", "shade"))
+    # Of one point, with the noise of both pictures' shadows.
+    assert relative(view["ltsh4c.diffuse"], shade["ltsh4c.diffuse"]) < 0.2
+    assert view["ltsh4c.diffuse"].sum() / shade["ltsh4c.diffuse"].sum() == pytest.approx(1.0, abs=0.05)
+
+
 def test_a_view_shows_lamps_of_files_as_pictures_do(capsys, tmp_path):
     """Measured beams (IES) of a point and of a spot light."""
     with_graphics(lambda: None)

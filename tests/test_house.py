@@ -15,7 +15,7 @@ import pytest
 ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "ltsh_addon"
 MOST_FILES = 193
-MOST_LINES = 51971  # of the package
+MOST_LINES = 51975  # of the package
 MOST_LINES_OF_A_FILE = 600
 # Files that hold one subject and are longer: why.
 LONGER = {}

@@ -225,23 +225,17 @@ def _lights_of_all(mesh_lights: list[MeshLight], studio: Studio, eye: np.ndarray
     return lights
 
 
-def constant_mesh_lights(mesh_lights: list[MeshLight], radiance_of, split, eye: np.ndarray, warn) -> list[Light]:
-    """The lights of `mesh_lights`, without falloff, for known radiances `radiance_of(material)` (3,): of what is nearly
-    a sphere seen from outside one for all of its faces, which a card would draw one by one; for `split` see
-    `_without_images`."""
-    lights = []
-    for mesh_light in mesh_lights:
-        side = _emitting_side(mesh_light, eye)
-        mesh_light, of_images = _without_images(mesh_light, side, split)
-        remain = {slot for placement in mesh_light.placements for slot in np.unique(placement.slots).tolist()}
-        shining = (material if slot in remain else None for slot, material in enumerate(mesh_light.materials))
-        radiance = [np.tile(radiance_of(material), (2, 1)) for material in shining]
-        mesh_light, of_balls = _without_balls(mesh_light, radiance, side)
-        lights.extend(of_balls)
-        of_mesh = of_images + _constant_lights(mesh_light, _polygons(mesh_light, radiance), radiance, side)
-        of_mesh = [replace(light, falloff=0, smooth=0.0) for light in of_mesh]
-        lights.extend(of_mesh)
-    return lights
+def constant_mesh_lights(mesh_light: MeshLight, radiance_of, split, eye: np.ndarray) -> list[Light]:
+    """The lights of `mesh_light`, without falloff, for known radiances `radiance_of(material)` (3,): of what is nearly
+    a sphere seen from outside one for all of its faces; for `split` see `_without_images`."""
+    side = _emitting_side(mesh_light, eye)
+    mesh_light, of_images = _without_images(mesh_light, side, split)
+    remain = {slot for placement in mesh_light.placements for slot in np.unique(placement.slots).tolist()}
+    shining = (material if slot in remain else None for slot, material in enumerate(mesh_light.materials))
+    radiance = [np.tile(radiance_of(material), (2, 1)) for material in shining]
+    mesh_light, of_balls = _without_balls(mesh_light, radiance, side)
+    of_faces = of_images + _constant_lights(mesh_light, _polygons(mesh_light, radiance), radiance, side)
+    return of_balls + [replace(light, falloff=0, smooth=0.0) for light in of_faces]
 
 
 @dataclass(frozen=True)

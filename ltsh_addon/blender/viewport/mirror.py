@@ -169,7 +169,7 @@ def _mesh_lights(depsgraph, receivers: Receivers, textures: ShownTextures, notes
         count = sum(len(placement.triangles) for placement in mesh_light.placements)
         radiance_of = functools.partial(_emission, textures=textures, is_small=count <= MOST_TRIANGLES, notes=notes)
         split = functools.partial(_split, textures=textures, notes=notes)
-        lights += constant_mesh_lights([mesh_light], radiance_of, split, eye, notes.append)
+        lights += constant_mesh_lights(mesh_light, radiance_of, split, eye)
     return fewer_lights(lights, notes.append)
 
 

@@ -158,24 +158,28 @@ class ShadowRequest:
         if self.level > 0:
             return results
         surface = _surface_of(samples, film)
-        return {number: _smoothed(values, *surface) for number, values in results.items()}
+        return _once(lambda number: _smoothed(results[number], *surface), results)
 
     def _quick(self, samples: SurfaceSamples, film: Film, progress: Callable) -> dict[int, np.ndarray]:
         """The shares at some pixels, smoothed, and what lies between these or is traced where that does not do."""
         around = self.points.around
         results = self._traced(samples.take(around.pixels), around.film, progress)
         index, differs = around.index, around.is_far.all(axis=0)
-        for number, values in results.items():
-            near_values, skipped = values.reshape(-1, 2)[index], around.is_far[..., None]
-            most, least = (np.where(skipped, one, near_values) for one in (0.0, 1.0))
+        skipped = around.is_far[..., None]
+        for values in {id(values): values for values in results.values()}.values():
+            most, least = (np.where(skipped, one, values.reshape(-1, 2)[index]) for one in (0.0, 1.0))
             differs |= (most.max(axis=0) - least.min(axis=0) > QUICK_DIFFERENCE).any(axis=-1)
-            smooth = _smoothed(values, *around.surface).reshape(-1, 2)[index]
-            results[number] = np.ones((film.height, film.width, 2), np.float32)
-            results[number].reshape(-1, 2)[film.pixel] = np.einsum("kp,kpc->pc", around.weights, smooth)
-        pixel = film.pixel[differs]
-        for number, values in self._traced(samples.take(differs), film.take(differs), progress).items():
-            results[number].reshape(-1, 2)[pixel] = values.reshape(-1, 2)[pixel]
-        return results
+        traced = self._traced(samples.take(differs), film.take(differs), progress)
+
+        def between(number):
+            smooth = _smoothed(results[number], *around.surface).reshape(-1, 2)[index]
+            whole = np.ones((film.height, film.width, 2), np.float32)
+            whole.reshape(-1, 2)[film.pixel] = np.einsum("kp,kpc->pc", around.weights, smooth)
+            if number in traced:
+                whole.reshape(-1, 2)[film.pixel[differs]] = traced[number].reshape(-1, 2)[film.pixel[differs]]
+            return whole
+
+        return _once(between, results)
 
     def _traced(self, samples: SurfaceSamples, film: Film, progress: Callable) -> dict[int, np.ndarray]:
         """The shares of `samples`, as `visibility` returns them."""
@@ -202,6 +206,12 @@ class ShadowRequest:
                     values.reshape(-1, len(PASSES))[film.pixel] = np.stack([one[row] for one in by_pass], axis=-1)
                     results |= {index: values for index, start in enumerate(first) if start == number}
         return results
+
+
+def _once(function: Callable, results: dict[int, np.ndarray]) -> dict[int, np.ndarray]:
+    """What `function` makes of the numbers of `results`, once for those with one array."""
+    made = {key: function(number) for key, number in {id(values): n for n, values in results.items()}.items()}
+    return {number: made[id(values)] for number, values in results.items()}
 
 
 def _surface_of(samples: SurfaceSamples, film: Film) -> tuple[np.ndarray, np.ndarray]:

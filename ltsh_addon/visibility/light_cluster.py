@@ -259,7 +259,7 @@ def shared_numbers(lights: Sequence[Light], tracer=None) -> tuple[tuple[int, ...
         if tracer is not None and light.name not in masks:
             ways = (tracer.occluders.mask_of, tracer.occluders.surface_mask_of, tracer.occluders.chosen_by)
             masks[light.name] = tuple(way(light.name) for way in ways)
-        shared.setdefault(_kind(light, number, masks.get(light.name)), []).append(number)
+        shared.setdefault(sharing_key(light, number, masks.get(light.name)), []).append(number)
     groups = []
     for kind, numbers in shared.items():
         is_one = kind[0] == "sky" or len(numbers) >= light_tree.FEWEST
@@ -267,8 +267,8 @@ def shared_numbers(lights: Sequence[Light], tracer=None) -> tuple[tuple[int, ...
     return tuple(sorted(groups))
 
 
-def _kind(light, number, masks) -> tuple:
-    """A key that is equal for lights that share their rays."""
+def sharing_key(light: Light, number: int, masks: tuple | None = None) -> tuple:
+    """A key that is equal for lights that share their rays if they are many; `masks`: of their shadow linking."""
     if light.is_side:
         return "sky", light.name
     is_plain = isinstance(light, FlatLight) and not (light.has_profile or light.children)

@@ -13,6 +13,7 @@ from ...emitters import light_tree, mesh_polygons
 from ...emitters.light_nodes import stand_ins
 from ...emitters.mesh_polygons import FlatPolygon
 from ...scene import Light, PointLight, PolygonLight, QuadLight
+from ...visibility.light_cluster import sharing_key
 from ..evaluated import (
     SURFACE_TYPES,
     EmitterTraits,
@@ -162,8 +163,8 @@ def _placement(ob, matrix: np.ndarray, light: MeshLight, depsgraph) -> Placement
 # SIDE_PROPERTY: custom property of objects that let light through in the reference: objects that shine, and surfaces
 # that instance lights. Its value is 1 if only the front of the faces shines, -1 if only the back does, 0 for both.
 SIDE_PROPERTY = "ltsh_emitting_side"
-# Limits on the emitting polygons of one object. MOST_POLYGONS: in pictures and bakes, where 20,000 take about 13 s of
-# processor time. MOST_SHOWN: of all objects, in views.
+# MOST_POLYGONS: emitting polygons of an object in pictures and bakes, where 20,000 take about 13 s of processor time.
+# MOST_SHOWN: polygons that stand for the faces of all objects in views.
 MOST_POLYGONS, MOST_SHOWN = 200_000, 112
 # MOST_CORNERS: of a polygon that stands for faces.
 MOST_CORNERS = 6
@@ -250,8 +251,8 @@ def fewer_lights(lights: list[Light], warn) -> list[Light]:
     are so many that they share their rays. At a tenth of its size a sign of neon tubes then lights 4 to 10 % off."""
     alike: dict[tuple, list[Light]] = {}
     for number, light in enumerate(lights):
-        key = (light.name, light.group, light.receivers, *light.radiance.tolist())
-        alike.setdefault(number if light.is_facing else key, []).append(light)
+        key = (light.name, *light.radiance.tolist(), *sharing_key(light, number))
+        alike.setdefault(key, []).append(light)
     groups = [tuple(group) for group in alike.values() if len(group) >= light_tree.FEWEST]
     faces = tuple(itertools.chain.from_iterable(groups))
     if len(faces) <= MOST_SHOWN:

@@ -164,8 +164,7 @@ class ShadowRequest:
         """The shares at some pixels, smoothed, and what lies between these or is traced where that does not do."""
         around = self.points.around
         results = self._traced(samples.take(around.pixels), around.film, progress)
-        index, differs = around.index, around.is_far.all(axis=0)
-        skipped = around.is_far[..., None]
+        index, differs, skipped = around.index, around.is_far.all(axis=0), around.is_far[..., None]
         for values in {id(values): values for values in results.values()}.values():
             most, least = (np.where(skipped, one, values.reshape(-1, 2)[index]) for one in (0.0, 1.0))
             differs |= (most.max(axis=0) - least.min(axis=0) > QUICK_DIFFERENCE).any(axis=-1)

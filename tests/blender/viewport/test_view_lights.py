@@ -16,7 +16,7 @@ from view_pictures import SIZE, viewport_picture
 from ltsh_addon import shading
 from ltsh_addon.blender.evaluated import is_surface
 from ltsh_addon.blender.lights.emission import nodes_as_text
-from ltsh_addon.blender.lights.meshes import MOST_SHOWN, StandInLight
+from ltsh_addon.blender.lights.meshes import MOST_SHOWN, StandInLight, fewer_lights
 from ltsh_addon.blender.lights.textures import ShownTextures
 from ltsh_addon.blender.materials.graph import ensure_nodes, fill_with_bsdf
 from ltsh_addon.blender.materials.preview_material import preview_of
@@ -560,6 +560,20 @@ def test_polygons_stand_for_very_many_glowing_faces():
         lit = shading.shade(single_sample(place, -out, -out), lights, passes=("diffuse",), workers=1)
         found.append(np.pi * lit.diffuse.sum(axis=0)[0, 0])
     assert np.linalg.norm(np.subtract(found, expected)) < 0.08 * np.linalg.norm(expected)
+
+
+@pytest.mark.newest
+def test_faces_that_other_lobes_see_are_not_drawn_together():
+    parts.empty_scene()
+    parts.add_camera()
+    bpy.ops.mesh.primitive_torus_add()
+    bpy.context.object.data.materials.append(glowing())
+    faces = seen()[0][0].faces
+    both = [*faces, *(replace(face, affects_specular=False) for face in faces)]
+    shown = fewer_lights(both, lambda warning: None)
+    assert {light.affects_specular for light in shown} == {True, False}
+    for light in shown:
+        assert {face.affects_specular for face in light.faces} == {light.affects_specular}
 
 
 @pytest.mark.newest
